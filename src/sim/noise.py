@@ -1,0 +1,60 @@
+"""Counter-based random numbers: a number is a function of (key, counter) and of nothing else.
+
+A key is built from words such as (seed, split, clip, view, stage); a counter numbers the element
+(pixel, frame, wave ...).  No state is kept, so a crop, another batch order, another number of
+workers or another device draws the same numbers: integers bit for bit, floats to rounding.
+
+The mixing function is the two-multiply 32-bit finaliser `lowbias32` (C. Wellons, 2018), applied to
+the low and the high half of the counter in turn, each time under half of the 64-bit key.
+"""
+
+import hashlib
+import math
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+MASK = 0xFFFFFFFF
+
+
+def key(*words: int | str) -> int:
+    """Return the 63-bit key of `words`; stable across processes, machines and Python versions."""
+    text = "\x1f".join(f"{type(word).__name__}:{word}" for word in words)
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "big") >> 1
+
+
+def generator(key: int) -> torch.Generator:
+    """Return a CPU generator seeded with `key`, for drawing the parameters of a sample."""
+    return torch.Generator().manual_seed(key)
+
+
+def base_key(generator: torch.Generator) -> int:
+    """Draw one 62-bit number from `generator`, to derive the keys of views and stages from."""
+    return int(torch.randint(2**62, (), generator=generator))
+
+
+def bits(key: int, counters: Int[Tensor, "..."]) -> Int[Tensor, "..."]:
+    """Return 32 random bits per counter as int64 in [0, 2**32); `counters` are in [0, 2**63)."""
+    low, high = key & MASK, (key >> 32) & MASK
+    mixed = _mix((counters & MASK) ^ low)
+    return _mix((mixed + (counters >> 32) * 0x9E3779B9 + high) & MASK)
+
+
+def uniform(key: int, counters: Int[Tensor, "..."]) -> Float[Tensor, "..."]:
+    """Return float32 uniforms in the open interval (0, 1), from the upper 23 bits."""
+    return ((bits(key, counters) >> 9).to(torch.float32) + 0.5) * 2.0**-23
+
+
+def normal(key: int, counters: Int[Tensor, "..."]) -> Float[Tensor, "..."]:
+    """Return float32 standard normals (Box-Muller on counters 2k and 2k + 1)."""
+    radius = torch.sqrt(-2.0 * torch.log(uniform(key, 2 * counters)))
+    return radius * torch.cos(2.0 * math.pi * uniform(key, 2 * counters + 1))
+
+
+def _mix(x: Tensor) -> Tensor:
+    x = x ^ (x >> 16)
+    x = (x * 0x7FEB352D) & MASK
+    x = x ^ (x >> 15)
+    x = (x * 0x846CA68B) & MASK
+    return x ^ (x >> 16)

@@ -1,0 +1,27 @@
+"""Annotations of `src` and `baselines` are checked while the tests run; shared fixtures."""
+
+from pathlib import Path
+
+import pytest
+from jaxtyping import install_import_hook
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def checked_modules() -> list[str]:
+    """Return every module but the `engines` packages, whose kernels a wrapper would not compile."""
+    files = [file for room in ("src", "baselines") for file in (ROOT / room).rglob("*.py")]
+    names = [".".join(file.relative_to(ROOT).with_suffix("").parts) for file in files]
+    return [name for name in names if ".engines" not in name and not name.endswith("__init__")]
+
+
+install_import_hook(checked_modules(), "tests.typecheck.check")
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Return the folder of photographs and recordings beside the checkout, or skip."""
+    folder = ROOT.parent / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip(f"no data folder at {folder}")
+    return folder
