@@ -1,5 +1,6 @@
 """What every door (train, eval, simulate ...) shares: one line for a wrong value, exit code 2."""
 
+import os
 import sys
 from collections.abc import Callable
 
@@ -10,9 +11,9 @@ from omegaconf.errors import OmegaConfBaseException
 def run(main: Callable[[], None]) -> None:
     """Call the Hydra entry point `main`; a wrong value ends in one line on stderr and exit code 2.
 
-    `main` must be called with `HYDRA_FULL_ERROR=1` in effect (set below) so that the errors of the
-    job reach us instead of being printed by Hydra with a traceback.
+    `HYDRA_FULL_ERROR=1` makes Hydra hand the errors of the job to us instead of printing them.
     """
+    os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
         main()
     except (ValueError, HydraException, OmegaConfBaseException) as error:

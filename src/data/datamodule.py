@@ -1,0 +1,148 @@
+"""Batches for training, validation and test: clip number -> draw -> sample, simulated on the fly."""
+
+from collections.abc import Callable, Iterator, Sequence
+
+import torch
+from lightning import LightningDataModule
+from torch.utils.data import DataLoader, Dataset, Sampler
+
+from src.data.augment import Augment
+from src.sim import noise
+from src.sim.pipeline import Draw, Pipeline, Sample
+
+
+class LightFieldData(LightningDataModule):
+    """`pipelines` has one Pipeline for each of train, val and test.
+
+    `epoch_clips`: training clips between two validations; `val_clips`, `test_clips`: their numbers.
+    `workers`: processes that simulate beside the training; 0 simulates in the training process.
+    `simulate_on`: `worker` (CPU) or `device` (the training device, for GPUs).
+    """
+
+    def __init__(
+        self,
+        pipelines: dict[str, Pipeline],
+        augment: Augment | None = None,
+        *,
+        batch_size: int = 8,
+        epoch_clips: int = 216,
+        val_clips: int = 27,
+        test_clips: int = 27,
+        workers: int = 0,
+        simulate_on: str = "worker",
+        seed: int = 0,
+    ):
+        super().__init__()
+        if simulate_on not in ("worker", "device"):
+            raise ValueError(f"data.simulate_on must be worker or device, got {simulate_on}")
+        for name, value in (("batch_size", batch_size), ("epoch_clips", epoch_clips)):
+            if value < 1:
+                raise ValueError(f"data.{name} must be >= 1, got {value}")
+        if epoch_clips < batch_size:
+            raise ValueError(f"data.epoch_clips must be >= data.batch_size, got {epoch_clips}")
+        self.pipelines, self.augment, self.seed = pipelines, augment, seed
+        self.batch_size, self.epoch_clips = batch_size, epoch_clips
+        self.val_clips, self.test_clips = val_clips, test_clips
+        self.workers, self.simulate_on = workers, simulate_on
+
+    def train_dataloader(self) -> DataLoader:
+        """Return endless fresh clips, from the trainer's step on: a resumed run goes on seamlessly."""
+        trainer = self.trainer
+        sampler = StepSampler(
+            self.batch_size,
+            self.epoch_clips // self.batch_size,
+            lambda: trainer.global_step,
+            rank=trainer.global_rank,
+            world=trainer.world_size,
+        )
+        return self._loader("train", batch_sampler=sampler)
+
+    def val_dataloader(self) -> DataLoader:
+        """Return clips 0 .. val_clips - 1 of the validation split, one at a time."""
+        return self._loader("val", sampler=range(self.val_clips))
+
+    def test_dataloader(self) -> DataLoader:
+        """Return clips 0 .. test_clips - 1 of the test split, one at a time."""
+        return self._loader("test", sampler=range(self.test_clips))
+
+    def on_after_batch_transfer(self, batch: Sample | list, dataloader_idx: int) -> Sample:
+        """Simulate drawn clips on the training device when no worker has."""
+        if isinstance(batch, Sample):
+            return batch
+        split = "train" if self.trainer.training else "test" if self.trainer.testing else "val"
+        return self._simulator(split, self.trainer.strategy.root_device)(batch)
+
+    def transfer_batch_to_device(self, batch, device: torch.device, dataloader_idx: int):
+        """Leave drawn clips where they are; move samples."""
+        return batch.to(device) if isinstance(batch, Sample) else batch
+
+    def _loader(self, split: str, **sampling) -> DataLoader:
+        on_worker = self.simulate_on == "worker"
+        return DataLoader(
+            Numbered(self.pipelines[split]),
+            num_workers=self.workers,
+            collate_fn=self._simulator(split, "cpu") if on_worker else list,
+            worker_init_fn=_one_thread,
+            persistent_workers=self.workers > 0,
+            **sampling,
+        )
+
+    def _simulator(self, split: str, device) -> Callable[[Sequence], Sample]:
+        augment = self.augment if split == "train" else None
+        return Simulator(self.pipelines[split], augment, self.seed, device)
+
+
+class Simulator:
+    """Turns numbered draws into a batch; picklable, so that a worker can be given one."""
+
+    def __init__(self, pipeline: Pipeline, augment: Augment | None, seed: int, device):
+        self.pipeline, self.augment, self.seed, self.device = pipeline, augment, seed, device
+
+    def __call__(self, numbered: Sequence[tuple[int, Draw]]) -> Sample:
+        sample = self.pipeline.simulate([draw for _, draw in numbered], self.device)
+        if self.augment is None:
+            return sample
+        return self.augment(sample, [noise.key(self.seed, "augment", n) for n, _ in numbered])
+
+
+class Numbered(Dataset):
+    """The draws of a pipeline by their number."""
+
+    def __init__(self, pipeline: Pipeline):
+        self.pipeline = pipeline
+
+    def __getitem__(self, number: int) -> tuple[int, Draw]:
+        return number, self.pipeline.draw(number)
+
+
+class StepSampler(Sampler[list[int]]):
+    """Batch s holds the clip numbers s * size .. (s + 1) * size - 1; starts at the step reached.
+
+    An epoch ends when the step is a multiple of `steps_per_epoch`.  With several processes each
+    takes its own slice of the joint batch, so that no two simulate the same clip.
+    """
+
+    def __init__(
+        self,
+        batch_size: int,
+        steps_per_epoch: int,
+        step: Callable[[], int],
+        *,
+        rank: int = 0,
+        world: int = 1,
+    ):
+        self.batch_size, self.steps_per_epoch = batch_size, steps_per_epoch
+        self.step, self.rank, self.world = step, rank, world
+
+    def __len__(self) -> int:
+        return self.steps_per_epoch
+
+    def __iter__(self) -> Iterator[list[int]]:
+        first = self.step()
+        for step in range(first, (first // self.steps_per_epoch + 1) * self.steps_per_epoch):
+            start = (step * self.world + self.rank) * self.batch_size
+            yield list(range(start, start + self.batch_size))
+
+
+def _one_thread(worker: int) -> None:
+    torch.set_num_threads(1)

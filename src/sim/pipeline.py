@@ -1,0 +1,191 @@
+"""The stages in order: scene -> turbulence -> optics -> sensor -> voxel grids.  Only this file knows all.
+
+A sample is made in two steps.  `draw` fixes everything random about a clip from keys; it is cheap.
+`simulate` is deterministic and runs where it is told to, one clip at a time so that memory stays
+that of one clip.  A sample is a function of (configuration, number): not of the batch, the
+workers or the device, and view i depends on the draws of view i only.
+"""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from src.sim import noise
+from src.sim.atmosphere import Atmosphere, sample_atmosphere
+from src.sim.optics import Optics
+from src.sim.scenes import Clip
+from src.sim.sensor import EventSensor, decode_srgb
+from src.sim.turbulence import Turbulence
+
+Crop = tuple[int, int, int, int]  # top, left, height, width
+
+
+@dataclass(frozen=True)
+class Draw:
+    """All that is random about one clip, before anything is simulated."""
+
+    clip: Clip
+    crop: Crop
+    atmosphere: Atmosphere | None
+    threshold: float
+    key: int
+
+
+@dataclass
+class Sample:
+    """A batch of simulated clips.
+
+    `voxels` (n, windows, views, bins, h, w); `target` (n, windows, 1, h, w), the clean frame at the
+    end of each window; `turbulent`, the same instants seen by the centre view; `drawn`, what was
+    drawn for each clip; `seconds`, how long the simulation took.
+    """
+
+    voxels: Tensor
+    target: Tensor
+    turbulent: Tensor
+    fps: float
+    drawn: list[dict] = field(default_factory=list)
+    seconds: float = 0.0
+
+    def to(self, device: torch.device | str, non_blocking: bool = False) -> "Sample":
+        """Return the sample with its tensors on `device`."""
+        moved = {
+            name: getattr(self, name).to(device, non_blocking=non_blocking)
+            for name in ("voxels", "target", "turbulent")
+        }
+        return replace(self, **moved)
+
+
+class Pipeline:
+    """From the number of a clip to a sample.
+
+    `scene` has `clip(index)` with `windows * substeps + 1` frames; `turbulence` holds the keyword
+    arguments of `sample_atmosphere` under `atmosphere` and those of `Turbulence` beside it, or is
+    None; `sensor` holds those of `EventSensor`, with `threshold` a number or a range [low, high]
+    drawn uniformly per clip.  `crop` is the side of the square to simulate (None: the whole
+    frame), placed at random if `random_crop`, else in the middle.  `clips` is the number of
+    different clips: number k shows clip k modulo `clips` (None: every number is a new clip).
+    """
+
+    def __init__(
+        self,
+        scene,
+        optics: Optics,
+        turbulence: Mapping | None,
+        sensor: Mapping,
+        *,
+        split: str,
+        seed: int = 0,
+        bins: int = 5,
+        substeps: int = 1,
+        crop: int | None = None,
+        random_crop: bool = False,
+        clips: int | None = None,
+    ):
+        self.scene, self.optics, self.turbulence = scene, optics, turbulence
+        self.sensor, self.split, self.seed = dict(sensor), split, seed
+        self.bins, self.substeps = bins, substeps
+        self.crop, self.random_crop, self.clips = crop, random_crop, clips
+
+    def draw(self, number: int) -> Draw:
+        """Draw everything random about clip `number`."""
+        index = number if self.clips is None else number % self.clips
+        key = noise.key(self.seed, self.split, index)
+        clip = self.scene.clip(index)
+        crop = self._crop(clip.frames.shape[-2:], noise.key(key, number, "crop"))
+        atmosphere = None
+        if self.turbulence is not None:
+            drawer = noise.generator(noise.key(key, "atmosphere"))
+            atmosphere = sample_atmosphere(generator=drawer, **self.turbulence["atmosphere"])
+        return Draw(clip, crop, atmosphere, self._threshold(noise.key(key, "threshold")), key)
+
+    def simulate(self, draws: Sequence[Draw], device: torch.device | str = "cpu") -> Sample:
+        """Simulate the drawn clips on `device`."""
+        start = time.perf_counter()
+        samples = [self._simulate(draw, device) for draw in draws]
+        return Sample(
+            voxels=torch.cat([sample.voxels for sample in samples]),
+            target=torch.cat([sample.target for sample in samples]),
+            turbulent=torch.cat([sample.turbulent for sample in samples]),
+            fps=samples[0].fps,
+            drawn=[drawn for sample in samples for drawn in sample.drawn],
+            seconds=time.perf_counter() - start,
+        )
+
+    def _simulate(self, draw: Draw, device: torch.device | str) -> Sample:
+        top, left, height, width = draw.crop
+        clean = draw.clip.frames.to(device)[None]
+        target = clean[:, self.substeps :: self.substeps, top : top + height, left : left + width]
+        views, weather = self._degrade(clean, draw)
+        sensor = EventSensor(**self.sensor | {"threshold": draw.threshold, "seed": self.seed})
+        voxels = sensor.voxels(
+            views,
+            draw.clip.fps,
+            self.bins,
+            substeps=self.substeps,
+            clips=[draw.key],
+            views=self.optics.view_ids,
+            origin=(top, left),
+            full_width=clean.shape[-1],
+        )
+        drawn = {"name": draw.clip.name, "threshold": draw.threshold} | weather
+        turbulent = views[:, self.optics.centre, self.substeps :: self.substeps]
+        return Sample(
+            voxels=voxels.transpose(1, 2),
+            target=target[:, :, None],
+            turbulent=turbulent[:, :, None],
+            fps=draw.clip.fps / self.substeps,
+            drawn=[drawn],
+        )
+
+    def _degrade(self, clean: Tensor, draw: Draw) -> tuple[Tensor, dict]:
+        """Return what each view's optics put on the sensor, and the numbers of the atmosphere."""
+        radiance = decode_srgb(clean) if self.sensor.get("input") == "srgb" else clean
+        operator = {k: v for k, v in (self.turbulence or {}).items() if k != "atmosphere"}
+        turbulence = Turbulence(
+            draw.atmosphere,
+            views=self.optics.positions,
+            height=clean.shape[-2],
+            width=clean.shape[-1],
+            fps=draw.clip.fps,
+            **operator,
+        )
+        drawer = noise.generator(noise.key(draw.key, "turbulence"))
+        views = turbulence.degrade(radiance, drawer, crop=draw.crop)
+        views = self.optics.misalign(
+            views, draw.key, origin=draw.crop[:2], full_size=tuple(clean.shape[-2:])
+        )
+        return views, asdict(turbulence.fidelity)
+
+    def _crop(self, size: Sequence[int], key: int) -> Crop:
+        height, width = size
+        side = self.crop
+        if side is None:
+            return 0, 0, height, width
+        if not 8 <= side <= min(height, width):
+            raise ValueError(
+                f"data.crop must be in 8..{min(height, width)} (the frame), got {side}"
+            )
+        if not self.random_crop:
+            return (height - side) // 2, (width - side) // 2, side, side
+        top, left = noise.uniform(key, torch.arange(2)).tolist()
+        return int(top * (height - side + 1)), int(left * (width - side + 1)), side, side
+
+    def _threshold(self, key: int) -> float:
+        value = self.sensor["threshold"]
+        if isinstance(value, int | float):
+            return float(value)
+        low, high = value
+        if not 0 < low <= high:
+            raise ValueError(f"sensor.threshold must be a number or 0 < low <= high, got {value}")
+        return low + (high - low) * float(noise.uniform(key, torch.tensor(0)))
+
+
+def simulate(
+    pipeline: Pipeline, numbers: Sequence[int], device: torch.device | str = "cpu"
+) -> Sample:
+    """Draw and simulate the clips `numbers`."""
+    return pipeline.simulate([pipeline.draw(number) for number in numbers], device)
