@@ -1,0 +1,44 @@
+"""One pass over a list of events: look its view up, add it to that view's voxel grid."""
+
+from numba import njit
+
+
+@njit(nogil=True, cache=True)
+def splat(t, x, y, p, view, place, grid, t0, t1, nearest):
+    """Add events to `grid` (views, bins, h, w) in their order; return how many were in no view.
+
+    `t` in microseconds as `t0` and `t1`, the edges of the window; `view` (sensor h, sensor w)
+    holds the index of the view or -1 and `place` (sensor h, sensor w, 2) the (u, v) in that view.
+    In time the weight is E2VID's hat on bins - 1 intervals (Rebecq et al. 2019, eq. 1); in space
+    bilinear, or 1 at the nearest pixel.  Places are clamped to the grid, so that no mass is lost.
+    """
+    _, bins, height, width = grid.shape
+    rate = (bins - 1) / (t1 - t0)
+    outside = 0
+    for i in range(t.size):
+        index = view[y[i], x[i]]
+        if index < 0:
+            outside += 1
+            continue
+        tau = min(max((t[i] - t0) * rate, 0.0), bins - 1.0)
+        b = min(int(tau), max(bins - 2, 0))
+        late = tau - b
+        u = min(max(place[y[i], x[i], 0], 0.0), width - 1.0)
+        v = min(max(place[y[i], x[i], 1], 0.0), height - 1.0)
+        if nearest:
+            u, v = float(int(u + 0.5)), float(int(v + 0.5))
+        c, r = int(u), int(v)
+        right, down = u - c, v - r
+        for k in range(2):
+            weight = p[i] * (late if k else 1.0 - late)
+            if weight == 0.0:
+                continue
+            plane = grid[index, b + k]
+            plane[r, c] += weight * (1.0 - right) * (1.0 - down)
+            if right > 0.0:
+                plane[r, c + 1] += weight * right * (1.0 - down)
+            if down > 0.0:
+                plane[r + 1, c] += weight * (1.0 - right) * down
+            if right > 0.0 and down > 0.0:
+                plane[r + 1, c + 1] += weight * right * down
+    return outside

@@ -1,0 +1,94 @@
+"""The sensor lookup: one pass over a stream splits it into registered views."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+
+from src.recordings.engines.splat import splat
+from src.recordings.views import Size, Views
+
+
+@dataclass(frozen=True)
+class Lookup:
+    """For each sensor pixel the index of its view (-1: none) and its (u, v) in the model picture."""
+
+    view: Int[np.ndarray, "h w"]
+    place: Float[np.ndarray, "h w 2"]
+    views: int
+    model: Size
+
+    @property
+    def pixels(self) -> Int[np.ndarray, " views"]:
+        """Sensor pixels of each view: what event rates are divided by."""
+        return np.bincount(self.view[self.view >= 0], minlength=self.views)
+
+    def empty(self, bins: int) -> Float[np.ndarray, "views bins h w"]:
+        """Return a voxel grid of zeros, float32."""
+        return np.zeros((self.views, bins, *self.model), np.float32)
+
+    def add(
+        self,
+        events: np.ndarray,
+        grid: Float[np.ndarray, "views bins h w"],
+        t0: float,
+        t1: float,
+        *,
+        nearest: bool = False,
+    ) -> int:
+        """Add `events` (fields t x y p) to `grid` and return how many lie in no view.
+
+        `t0 < t1` are the edges of the grid's window in microseconds; an event weighs by the hat of
+        E2VID in time, and bilinearly (its polarity is kept in the sum) or at the nearest pixel in
+        space.  Raises ValueError for an event off the sensor.
+        """
+        self.check(events)
+        fields = (events[name] for name in "txyp")
+        return splat(*fields, self.view, self.place, grid, float(t0), float(t1), nearest)
+
+    def split(self, events: np.ndarray) -> tuple[np.ndarray, Int[np.ndarray, " k"]]:
+        """Return the events inside views, at their nearest model pixel, and the view of each."""
+        self.check(events)
+        view = self.view[events["y"], events["x"]]
+        inside = view >= 0
+        kept = events[inside].copy()
+        place = self.place[kept["y"], kept["x"]] + 0.5
+        limit = np.array(self.model[::-1]) - 1
+        kept["x"], kept["y"] = np.clip(place.astype(np.int64), 0, limit).T
+        return kept, view[inside].astype(np.int64)
+
+    def check(self, events: np.ndarray) -> None:
+        """Raise ValueError where an event lies off the sensor."""
+        height, width = self.view.shape
+        if events.size and (events["x"].max() >= width or events["y"].max() >= height):
+            reach = int(events["x"].max()), int(events["y"].max())
+            raise ValueError(
+                f"events must lie on the {width}x{height} sensor of views, got (x, y) up to {reach}"
+            )
+
+
+def build(views: Views) -> Lookup:
+    """Return the lookup of `views`; where two overlap, the one whose middle is nearer wins."""
+    height, width = views.sensor
+    y, x = np.mgrid[:height, :width].astype(np.float64)
+    sensor = np.stack([x, y], axis=-1)
+    best = np.full((height, width), np.inf)
+    owner = np.full((height, width), -1, np.int16)
+    place = np.zeros((height, width, 2), np.float32)
+    middle = (np.array(views.model[::-1]) - 1) / 2
+    half = np.array(views.model[::-1]) / 2
+    for index, view in enumerate(views.views):
+        matrix = views.to_model(view)
+        uv = cv2.perspectiveTransform(sensor, matrix)
+        front = _in_front(matrix, sensor, views.outline(view).mean(0))
+        distance = np.abs((uv - middle) / half).max(-1)
+        mine = front & (distance <= 1) & (distance < best)
+        best[mine], owner[mine], place[mine] = distance[mine], index, uv[mine]
+    return Lookup(owner, place, len(views.views), views.model)
+
+
+def _in_front(matrix: np.ndarray, sensor: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """Pixels on the view's side of the homography's horizon, beyond which the plane comes again."""
+    depth = sensor @ matrix[2, :2] + matrix[2, 2]
+    return depth * (centre @ matrix[2, :2] + matrix[2, 2]) > 0

@@ -1,0 +1,230 @@
+"""Several views on one sensor: where each lies and how it is mirrored, as a readable file.
+
+A kaleidoscope shows the scene 3x3 times on one chip.  Each view has a homography from its own
+sensor pixels to those of the centre view; a rectangle of the centre view, the field, becomes the
+model picture.  Sizes are (height, width).  Pixel (0, 0) is the centre of the top left pixel; x runs
+right, y down.
+"""
+
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+from jaxtyping import Float
+
+Size = tuple[int, int]
+LARGEST_SIDE = 8192
+LARGEST_FILE = 1 << 20
+SEEN = 0.75  # the share of a view that has to lie on the sensor
+
+
+def apply(
+    matrix: Float[np.ndarray, "3 3"], points: Float[np.ndarray, "k 2"]
+) -> Float[np.ndarray, "k 2"]:
+    """Return `points` (x, y) mapped by a homography; not finite on its horizon."""
+    mapped = points @ matrix[:, :2].T + matrix[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return mapped[:, :2] / mapped[:, 2:]
+
+
+@dataclass(frozen=True)
+class View:
+    """One sub-aperture: grid position (row, col) relative to the centre view and its homography.
+
+    `homography` maps sensor pixels (x, y, 1) of this view to those of the centre view; a negative
+    determinant is a mirrored view.  `error_px` is the rms residual of the `points` it was fitted
+    to, in sensor pixels of the centre view.
+    """
+
+    position: tuple[int, int]
+    homography: Float[np.ndarray, "3 3"]
+    error_px: float = 0.0
+    points: int = 0
+
+
+@dataclass(frozen=True)
+class Views:
+    """The views of one sensor; `field` is the rectangle (left, top, right, bottom) of the centre
+    view, in sensor pixels, that becomes the model picture.
+
+    Raises ValueError where a size is out of range, a number is not finite, a position comes twice
+    or less than three quarters of a view lies on the sensor.
+    """
+
+    sensor: Size
+    model: Size
+    field: tuple[float, float, float, float]
+    views: tuple[View, ...]
+
+    def __post_init__(self):
+        for name, size in (("sensor", self.sensor), ("model", self.model)):
+            if not all(1 <= side <= LARGEST_SIDE for side in size):
+                raise ValueError(f"views.{name} must be in 1..{LARGEST_SIDE} pixels, got {size}")
+        left, top, right, bottom = self.field
+        if not (np.isfinite(self.field).all() and right - left >= 1 and bottom - top >= 1):
+            raise ValueError(f"views.field must be left, top, right, bottom, got {self.field}")
+        positions = self.positions
+        if not positions or len(set(positions)) != len(positions):
+            raise ValueError(
+                f"views.views must be one or more different positions, got {positions}"
+            )
+        for view in self.views:
+            self._check(view)
+
+    def _check(self, view: View) -> None:
+        matrix = view.homography
+        if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-9:
+            raise ValueError(
+                f"views: homography of view {view.position} must be finite and regular"
+            )
+        height, width = self.sensor
+        x, y = self._on_sensor(view, self._field_grid(9)).T
+        share = np.mean((x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5))
+        if share < SEEN:
+            raise ValueError(
+                f"views: view {view.position} must lie on the {width}x{height} sensor"
+                f" by {SEEN:.0%}, got {share:.0%}"
+            )
+
+    @classmethod
+    def single(cls, sensor: Size, model: Size) -> "Views":
+        """Return the whole sensor as one view, resampled to the model picture."""
+        height, width = sensor
+        whole = (-0.5, -0.5, width - 0.5, height - 0.5)
+        return cls(sensor, model, whole, (View((0, 0), np.eye(3)),))
+
+    @property
+    def positions(self) -> list[tuple[int, int]]:
+        """The grid position (row, col) of each view."""
+        return [view.position for view in self.views]
+
+    def to_model(self, view: View) -> Float[np.ndarray, "3 3"]:
+        """Return the homography from sensor pixels of `view` to pixels of the model picture."""
+        left, top, right, bottom = self.field
+        a, b = self.model[1] / (right - left), self.model[0] / (bottom - top)
+        scale = np.array([[a, 0, -left * a - 0.5], [0, b, -top * b - 0.5], [0, 0, 1]])
+        return scale @ view.homography
+
+    def outline(self, view: View) -> Float[np.ndarray, "4 2"]:
+        """Return the corners of `view` on the sensor: the field's, clockwise from top left."""
+        return self._on_sensor(view, self._field_grid(2))[[0, 1, 3, 2]]
+
+    def mirrored(self, view: View) -> tuple[bool, bool]:
+        """Return whether `view` is mirrored in x and in y (both: it is turned by 180 degrees)."""
+        corners = self.outline(view)
+        return bool(corners[1, 0] < corners[0, 0]), bool(corners[3, 1] < corners[0, 1])
+
+    def only(self, positions: Sequence[tuple[int, int]]) -> "Views":
+        """Return the views at `positions`, in that order.  Raises ValueError for one not there."""
+        found = dict(zip(self.positions, self.views, strict=True))
+        missing = [position for position in positions if position not in found]
+        if missing:
+            raise ValueError(f"views has no view at {missing}, only {self.positions}")
+        chosen = tuple(found[position] for position in positions)
+        return Views(self.sensor, self.model, self.field, chosen)
+
+    def register(
+        self, picture: Float[np.ndarray, "sensor_h sensor_w"]
+    ) -> Float[np.ndarray, "views h w"]:
+        """Return every view of one sensor picture in model pixels (bilinear, float32)."""
+        height, width = self.model
+        flat = picture.astype(np.float32)
+        warped = [
+            cv2.warpPerspective(flat, self.to_model(view), (width, height)) for view in self.views
+        ]
+        return np.stack(warped)
+
+    def _field_grid(self, side: int) -> np.ndarray:
+        left, top, right, bottom = self.field
+        x, y = np.meshgrid(np.linspace(left, right, side), np.linspace(top, bottom, side))
+        return np.stack([x.ravel(), y.ravel()], axis=1)
+
+    @staticmethod
+    def _on_sensor(view: View, points: np.ndarray) -> np.ndarray:
+        return apply(np.linalg.inv(view.homography), points)
+
+    def save(self, path: Path | str) -> None:
+        """Write a YAML file that `load` reads back exactly; it appears whole or not at all."""
+        path = Path(path)
+        text = HEADER + yaml.safe_dump(
+            self._plain(), sort_keys=False, default_flow_style=None, width=100
+        )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name)
+        with os.fdopen(handle, "w") as file:
+            file.write(text)
+        os.replace(name, path)
+
+    def _plain(self) -> dict:
+        views = [
+            {
+                "position": list(view.position),
+                "mirrored": list(self.mirrored(view)),
+                "error_px": round(view.error_px, 4),
+                "points": view.points,
+                "homography": view.homography.tolist(),
+            }
+            for view in self.views
+        ]
+        sizes = {"sensor": list(self.sensor), "model": list(self.model)}
+        return {**sizes, "field": [float(edge) for edge in self.field], "views": views}
+
+
+HEADER = """\
+# Views of one sensor. Sizes: [height, width]. Pixel (0, 0) is the centre of the top left pixel.
+# field: [left, top, right, bottom] of the centre view, in sensor pixels, becomes the model picture.
+# position: [row, col] relative to the centre view; mirrored: [in x, in y];
+# homography: sensor pixels of this view -> sensor pixels of the centre view;
+# error_px: rms residual over the calibration's points, sensor pixels of the centre view.
+"""
+
+
+def load(path: Path | str, sensor: Size | None = None) -> Views:
+    """Read a file of `Views.save`, or one written by hand (`mirrored` and `error_px` may be absent).
+
+    Raises ValueError for a file that is absent, too large or not such a file, a value out of range,
+    a `mirrored` its homography contradicts, or another sensor than `sensor` (height, width).
+    """
+    try:
+        with open(path, encoding="utf-8") as file:
+            plain = yaml.safe_load(file.read(LARGEST_FILE))
+        views = Views(
+            _numbers(plain["sensor"], int, 2),
+            _numbers(plain["model"], int, 2),
+            _numbers(plain["field"], float, 4),
+            tuple(_view(entry) for entry in plain["views"]),
+        )
+        told = [entry.get("mirrored") for entry in plain["views"]]
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError) as error:
+        why = f"{type(error).__name__} {error}"
+        raise ValueError(
+            f"views must be a file of calibrate task=views, got {path}: {why}"
+        ) from None
+    for view, mirrored in zip(views.views, told, strict=True):
+        if mirrored not in (None, list(views.mirrored(view))):
+            raise ValueError(f"{path}: mirrored of {view.position} contradicts its homography")
+    if sensor is not None and tuple(sensor) != views.sensor:
+        raise ValueError(f"{path}: sensor must be the recording's {sensor}, got {views.sensor}")
+    return views
+
+
+def _view(entry: dict) -> View:
+    rows = entry["homography"]
+    if not isinstance(rows, list) or len(rows) != 3:
+        raise TypeError("homography must have 3 rows")
+    matrix = np.array([_numbers(row, float, 3) for row in rows])
+    (error,) = _numbers([entry.get("error_px", 0.0)], float, 1)
+    (points,) = _numbers([entry.get("points", 0)], int, 1)
+    return View(_numbers(entry["position"], int, 2), matrix, error, points)
+
+
+def _numbers(values: list, kind: type, count: int) -> tuple:
+    numbers = isinstance(values, list) and len(values) == count
+    if not numbers or any(type(value) not in (int, kind) for value in values):
+        raise TypeError(f"expected a list of {count} x {kind.__name__}")
+    return tuple(kind(value) for value in values)
