@@ -1,11 +1,17 @@
-"""What every door (train, eval, simulate ...) shares: one line for a wrong value, exit code 2."""
+"""What every door (train, eval, simulate ...) shares: a job's folder, its errors, its end."""
 
 import os
 import sys
+import time
 from collections.abc import Callable
 
+import rich
+import torch
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from rich.syntax import Syntax
 
 
 def run(main: Callable[[], None]) -> None:
@@ -20,6 +26,35 @@ def run(main: Callable[[], None]) -> None:
         sys.exit(_refuse(error))
     except KeyboardInterrupt:
         sys.exit(130)
+
+
+def job(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:
+    """Run `work` in the folder Hydra made for this job; print the config once; end W&B's run."""
+    cfg.paths.run = HydraConfig.get().runtime.output_dir
+    rich.print(Syntax(resolved(cfg), "yaml", background_color="default"))
+    try:
+        work(cfg)
+    finally:
+        if "wandb" in sys.modules:  # else the next job of a multirun would write into this run
+            sys.modules["wandb"].finish(quiet=True)
+
+
+def resolved(cfg: DictConfig) -> str:
+    """Return the whole config as YAML, interpolations filled in."""
+    return OmegaConf.to_yaml(cfg, resolve=True)
+
+
+def facts(cfg: DictConfig, start: float) -> dict:
+    """Return what `results.json` says of a run besides its numbers; `start` by perf_counter."""
+    gpu = cfg.trainer.accelerator == "gpu" and torch.cuda.is_available()
+    return {
+        "task": cfg.task,
+        "experiment": cfg.name,
+        "seed": cfg.seed,
+        "resumed_from": cfg.ckpt if cfg.task == "train" else None,
+        "wall_s": round(time.perf_counter() - start, 1),
+        "device": torch.cuda.get_device_name() if gpu else f"cpu, {torch.get_num_threads()} threads",
+    }
 
 
 def _refuse(error: Exception) -> int:

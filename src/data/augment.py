@@ -20,7 +20,8 @@ class Augment:
     """`noise_std`: standard deviation added to every voxel entry, in events.
     `hot_fraction`: the share of hot pixels of a sequence is uniform in [0, hot_fraction];
     `hot_std`: standard deviation of a hot pixel's value, the same in all bins, views and windows.
-    `pause`: probability that a running sequence pauses at a window; `stay`: that a paused one stays.
+    `pause`: probability that a running sequence pauses at a window; `stay`: that a paused one
+    stays paused.
     `flip`: probability of a flip, for each axis.
     """
 

@@ -1,4 +1,4 @@
-"""Batches for training, validation and test: clip number -> draw -> sample, simulated on the fly."""
+"""Batches for training, validation and test, simulated on the fly: number -> draw -> sample."""
 
 from collections.abc import Callable, Iterator, Sequence
 
@@ -46,7 +46,7 @@ class LightFieldData(LightningDataModule):
         self.workers, self.simulate_on = workers, simulate_on
 
     def train_dataloader(self) -> DataLoader:
-        """Return endless fresh clips, from the trainer's step on: a resumed run goes on seamlessly."""
+        """Return endless clips, from the trainer's step on: a resumed run goes on seamlessly."""
         trainer = self.trainer
         sampler = StepSampler(
             self.batch_size,

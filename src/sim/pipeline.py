@@ -1,5 +1,6 @@
-"""The stages in order: scene -> turbulence -> optics -> sensor -> voxel grids.  Only this file knows all.
+"""The stages in order: scene -> turbulence -> optics -> sensor -> voxel grids.
 
+Only this file knows them all.
 A sample is made in two steps.  `draw` fixes everything random about a clip from keys; it is cheap.
 `simulate` is deterministic and runs where it is told to, one clip at a time so that memory stays
 that of one clip.  A sample is a function of (configuration, number): not of the batch, the

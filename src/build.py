@@ -1,0 +1,127 @@
+"""From a configuration to objects: the one place below the doors that sees a config.
+
+`hydra.utils.instantiate` is called here only, so that what a config may name is decided here.
+"""
+
+from typing import Any
+
+import lightning
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from torch import nn
+
+import src.models
+from src.data.datamodule import LightFieldData
+from src.metrics import evaluation
+from src.metrics.scores import Scores
+from src.models.reconstructor import Reconstructor
+from src.sim.pipeline import Pipeline
+
+ROOMS = ("src.", "baselines.", "lightning.", "torch.optim.")
+
+
+def make(node: Any, **kwargs) -> Any:
+    """Instantiate a config node with `_target_`; raises ValueError for a target outside our rooms."""
+    target = str(node.get("_target_"))
+    if not target.startswith(ROOMS):
+        raise ValueError(f"_target_ must start with one of {', '.join(ROOMS)}, got {target}")
+    return instantiate(node, _convert_="all", **kwargs)
+
+
+def pipeline(cfg: DictConfig, split: str) -> Pipeline:
+    """Return the simulation of one split: train, val or test."""
+    training = split == "train"
+    windows = cfg.data.windows if training else cfg.data.test_windows
+    substeps = cfg.data.substeps
+    scene = make(
+        cfg.scene,
+        split=split,
+        seed=cfg.seed,
+        frames=windows * substeps + 1,
+        fps=cfg.fps * substeps,
+    )
+    return Pipeline(
+        scene,
+        make(cfg.optics),
+        OmegaConf.to_container(cfg.turbulence, resolve=True),
+        OmegaConf.to_container(cfg.sensor, resolve=True),
+        split=split,
+        seed=cfg.seed,
+        bins=cfg.bins,
+        substeps=substeps,
+        crop=cfg.data.crop if training else cfg.data.test_crop,
+        random_crop=training,
+        clips=cfg.data.clips if training else None,
+    )
+
+
+def data(cfg: DictConfig, splits: tuple[str, ...] = ("train", "val", "test")) -> LightFieldData:
+    """Return the data module with the pipelines of `splits`."""
+    return LightFieldData(
+        {split: pipeline(cfg, split) for split in splits},
+        make(cfg.augment) if "train" in splits else None,
+        batch_size=cfg.data.batch_size,
+        epoch_clips=cfg.data.epoch_clips,
+        val_clips=cfg.data.val_clips,
+        test_clips=cfg.data.test_clips,
+        workers=cfg.data.workers,
+        simulate_on=cfg.data.simulate_on,
+        seed=cfg.seed,
+    )
+
+
+def network(cfg: DictConfig) -> tuple[nn.Module, dict]:
+    """Return a fresh network and the plain dict (target, kwargs) that builds it again."""
+    kwargs = OmegaConf.to_container(cfg.model, resolve=True)
+    target = kwargs.pop("_target_")
+    return make(cfg.model), {"target": target, "kwargs": kwargs}
+
+
+def frozen(cfg: DictConfig) -> nn.Module:
+    """Return the network that `ckpt` or else `baseline` names, in eval mode.
+
+    Raises ValueError if neither is given or if it wants another number of views than `optics`.
+    """
+    if cfg.ckpt:
+        found = src.models.load(cfg.ckpt)
+    elif cfg.get("baseline"):
+        found = make(cfg.baseline).eval()
+    else:
+        raise ValueError("ckpt or baseline must name a network, got neither")
+    wanted = found.views
+    if wanted is not None and wanted != cfg.optics.views and not cfg.get("baseline"):
+        raise ValueError(f"optics.views must be {wanted} for ckpt={cfg.ckpt}, got {cfg.optics.views}")
+    return found
+
+
+def scores(cfg: DictConfig) -> Scores:
+    """Return what is measured: without `metrics.lpips`, everything but LPIPS."""
+    return Scores(make(cfg.metrics.lpips) if cfg.metrics.lpips else None)
+
+
+def reconstructor(cfg: DictConfig, net: nn.Module, spec: dict) -> Reconstructor:
+    """Return the Lightning module that trains and tests `net`."""
+    return Reconstructor(
+        net,
+        spec,
+        loss=make(cfg.loss),
+        optimizer=make(cfg.optimizer),
+        scores=scores(cfg),
+        detach_every=cfg.data.detach_every,
+        warmup=cfg.data.warmup,
+    )
+
+
+def trainer(cfg: DictConfig) -> lightning.Trainer:
+    """Return the trainer with its loggers and callbacks."""
+    loggers = [make(logger) for logger in cfg.logger.values()]
+    callbacks = [make(callback) for callback in cfg.callbacks.values()]
+    return make(cfg.trainer, logger=loggers, callbacks=callbacks)
+
+
+def test(
+    cfg: DictConfig, name: str, net: nn.Module, data: LightFieldData, measures: Scores
+) -> evaluation.Row:
+    """Return the scores of `net` on the test clips; no logger, no callback."""
+    quiet = make(cfg.trainer, logger=False, callbacks=[], enable_checkpointing=False)
+    return evaluation.test(name, net, data, measures, trainer=quiet, warmup=cfg.data.warmup)

@@ -1,0 +1,125 @@
+"""The record of a run: its folder, the resolved config, `results.json`, `clips.csv`, the table."""
+
+import csv
+import hashlib
+import io
+import json
+import os
+import shutil
+import statistics
+import subprocess
+from pathlib import Path
+
+import rich
+from rich.table import Table
+
+from src.metrics.evaluation import Row
+
+SCHEMA = 1
+LEAST_FREE_BYTES = 200 * 2**20
+METRICS = ("lpips", "ssim", "psnr", "psnr_aligned", "wobble")
+
+
+def open_run(run: Path, config: str) -> None:
+    """Make the folder `run` and store the resolved `config` (YAML) in it.
+
+    Raises ValueError where the folder cannot be made or the disk is nearly full.
+    """
+    try:
+        run.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"paths.out must be a folder to write to, got {run}: {error}") from error
+    free = shutil.disk_usage(run).free
+    if free < LEAST_FREE_BYTES:
+        needed = LEAST_FREE_BYTES // 2**20
+        raise ValueError(
+            f"paths.out must have {needed} MiB free, got {free // 2**20} MiB at {run}"
+        )
+    write_text(run / "config.yaml", config)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write `text` to `path` whole or not at all: to a temporary name, then renamed."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text)
+    os.replace(partial, path)
+
+
+def summary(clips: list[dict]) -> dict:
+    """Return {clips, metric: {mean, std}} over clips; the spread of one clip is 0."""
+    found = [metric for metric in METRICS if clips and metric in clips[0]]
+    values = {metric: [clip[metric] for clip in clips] for metric in found}
+    return {"clips": len(clips)} | {
+        metric: {"mean": statistics.fmean(v), "std": statistics.pstdev(v)}
+        for metric, v in values.items()
+    }
+
+
+def write(run: Path, config: str, rows: list[Row], **facts) -> dict:
+    """Write `results.json` and `clips.csv` of the first row into `run`, print the table.
+
+    `facts`: task, experiment, seed, wall_s, device ...  Returns the content of `results.json`.
+    """
+    first = rows[0]
+    record = {
+        "schema": SCHEMA,
+        **facts,
+        "git": commit(),
+        "config_sha256": hashlib.sha256(config.encode()).hexdigest(),
+        "model": {
+            "name": first.name,
+            "params": first.params,
+            "macs_per_frame": first.macs_per_frame,
+        },
+        "test": summary(first.clips),
+        "latency_ms": first.latency_ms,
+        "compared": {row.name: summary(row.clips) for row in rows[1:]},
+    }
+    write_text(run / "clips.csv", clips_csv(first.clips))
+    write_text(run / "results.json", json.dumps(record, indent=2) + "\n")
+    rich.print(table(rows))
+    return record
+
+
+def clips_csv(clips: list[dict]) -> str:
+    """Return one line per clip: what was drawn for it and its scores."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, fieldnames=list(clips[0]))
+    writer.writeheader()
+    writer.writerows(clips)
+    return text.getvalue()
+
+
+def table(rows: list[Row]) -> Table:
+    """Return the rows as a table: mean over clips; the arrow says which way is better."""
+    heads = {
+        "lpips": "LPIPS ↓",
+        "ssim": "SSIM ↑",
+        "psnr": "PSNR ↑",
+        "psnr_aligned": "aligned PSNR ↑",
+        "wobble": "wobble px ↓",
+    }
+    picture = Table(title=f"{len(rows[0].clips)} test clips, mean of per-frame values")
+    picture.add_column("network")
+    for metric in METRICS:
+        picture.add_column(heads[metric], justify="right")
+    picture.add_column("ms/frame", justify="right")
+    for row in rows:
+        means = summary(row.clips)
+        cells = [f"{means[m]['mean']:.4f}" if m in means else "-" for m in METRICS]
+        picture.add_row(row.name, *cells, f"{next(iter(row.latency_ms.values())):.1f}")
+    return picture
+
+
+def commit() -> str:
+    """Return the commit of the working tree, with `-dirty` where it differs; else `unknown`."""
+    try:
+        return subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--abbrev=12"],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"

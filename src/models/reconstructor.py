@@ -1,0 +1,103 @@
+"""Training, validation and test of any network that turns voxel grids into frames."""
+
+from collections.abc import Callable
+
+import torch
+from lightning import LightningModule
+from torch import Tensor, nn
+from torch.nn.utils import parametrize
+
+from src.metrics.scores import Scores
+from src.models.unroll import chunks, detach, unroll
+from src.sim.pipeline import Sample
+
+
+class Reconstructor(LightningModule):
+    """`network`: see the contract in docs/conventions.md; `target` and `kwargs` of `network_spec`
+    say how to build it again and go into the checkpoint.
+    `loss` maps (n, 1, h, w) frames and targets in [0, 1] to (n,); `optimizer` makes an optimiser
+    from parameters.
+    `detach_every`: windows between two cuts of the graph (truncated back-propagation through time;
+    0: none).  Memory is that of one chunk; the optimiser steps once per batch.
+    `scores` measures frames against targets; the first `warmup` windows of a clip are not scored.
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        network_spec: dict,
+        *,
+        loss: Callable[[Tensor, Tensor], Tensor] | None = None,
+        optimizer: Callable | None = None,
+        scores: Scores | None = None,
+        detach_every: int = 0,
+        warmup: int = 0,
+    ):
+        super().__init__()
+        if detach_every < 0:
+            raise ValueError(f"data.detach_every must be >= 0, got {detach_every}")
+        self.automatic_optimization = False
+        self.network, self.network_spec = network, network_spec
+        self.optimizer, self.detach_every, self.warmup = optimizer, detach_every, warmup
+        # In a tuple, so that their backbones stay out of the parameters and the checkpoint.
+        self._measures = (loss, scores)
+        self.clips: list[dict] = []
+
+    @property
+    def loss(self) -> Callable[[Tensor, Tensor], Tensor]:
+        """The training loss."""
+        return self._measures[0]
+
+    @property
+    def scores(self) -> Scores:
+        """What is measured in validation and test."""
+        return self._measures[1]
+
+    def on_fit_start(self) -> None:
+        """Move the loss to the training device."""
+        self.loss.to(self.device)
+
+    def training_step(self, sample: Sample, batch_idx: int) -> Tensor:
+        """One optimiser step on a batch of sequences; returns the loss averaged over windows."""
+        windows = sample.voxels.shape[1]
+        state, total = None, torch.zeros((), device=self.device)
+        self.optimizers().zero_grad()
+        for part in chunks(windows, self.detach_every):
+            # One normalised weight per chunk: spectral norm iterates once, not once per window.
+            with parametrize.cached():
+                frames, state = unroll(self.network, sample.voxels[:, part], detach(state))
+            share = (part.stop - part.start) / windows
+            loss = share * self.loss(frames.flatten(0, 1), sample.target[:, part].flatten(0, 1)).mean()
+            self.manual_backward(loss)
+            total += loss.detach()
+        self.optimizers().step()
+        self.log("train/loss", total, prog_bar=True, batch_size=len(sample.voxels))
+        return total
+
+    def validation_step(self, sample: Sample, batch_idx: int) -> None:
+        """Log the mean of every score over the validation clips."""
+        for clip in self._measure(sample):
+            values = {f"val/{name}": clip[name] for name in self.scores.names}
+            self.log_dict(values, on_epoch=True, prog_bar=False, batch_size=1)
+
+    def on_test_start(self) -> None:
+        """Forget the clips of an earlier test."""
+        self.clips = []
+
+    def test_step(self, sample: Sample, batch_idx: int) -> None:
+        """Append the scores of each clip, with what was drawn for it, to `clips`."""
+        self.clips += self._measure(sample)
+
+    def _measure(self, sample: Sample) -> list[dict]:
+        frames, _ = unroll(self.network, sample.voxels)
+        frames, target = frames[:, self.warmup :], sample.target[:, self.warmup :]
+        clips = zip(frames, target, sample.drawn, strict=True)
+        return [drawn | self.scores(ours, truth) for ours, truth, drawn in clips]
+
+    def configure_optimizers(self):
+        """Return the optimiser over all parameters."""
+        return self.optimizer(self.network.parameters())
+
+    def on_save_checkpoint(self, checkpoint: dict) -> None:
+        """Add how to build the network again (plain data: loads with weights_only=True)."""
+        checkpoint["network"] = self.network_spec
