@@ -21,7 +21,7 @@ ROOMS = ("src.", "baselines.", "lightning.", "torch.optim.")
 
 
 def make(node: Any, **kwargs) -> Any:
-    """Instantiate a config node with `_target_`; raises ValueError for a target outside our rooms."""
+    """Instantiate a config node; raises ValueError for a `_target_` outside our rooms."""
     target = str(node.get("_target_"))
     if not target.startswith(ROOMS):
         raise ValueError(f"_target_ must start with one of {', '.join(ROOMS)}, got {target}")
@@ -90,7 +90,9 @@ def frozen(cfg: DictConfig) -> nn.Module:
         raise ValueError("ckpt or baseline must name a network, got neither")
     wanted = found.views
     if wanted is not None and wanted != cfg.optics.views and not cfg.get("baseline"):
-        raise ValueError(f"optics.views must be {wanted} for ckpt={cfg.ckpt}, got {cfg.optics.views}")
+        raise ValueError(
+            f"optics.views must be {wanted} for ckpt={cfg.ckpt}, got {cfg.optics.views}"
+        )
     return found
 
 

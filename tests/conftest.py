@@ -5,6 +5,8 @@ from pathlib import Path
 import pytest
 from jaxtyping import install_import_hook
 
+import tests.typecheck  # noqa: F401 - the hook below names it in a string
+
 ROOT = Path(__file__).resolve().parents[1]
 
 

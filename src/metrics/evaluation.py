@@ -52,7 +52,7 @@ def test(
 def latency_ms(
     network: nn.Module, height: int, width: int, views: int, bins: int, repeats: int = 5
 ) -> float:
-    """Return the median wall time of one frame, batch 1, state carried, after one warm-up, in ms."""
+    """Return the median wall time of one frame in ms: batch 1, state carried, after a warm-up."""
     network.eval()
     device = next((parameter.device for parameter in network.parameters()), torch.device("cpu"))
     voxels = torch.randn(1, views, bins, height, width, device=device)

@@ -32,9 +32,7 @@ def open_run(run: Path, config: str) -> None:
     free = shutil.disk_usage(run).free
     if free < LEAST_FREE_BYTES:
         needed = LEAST_FREE_BYTES // 2**20
-        raise ValueError(
-            f"paths.out must have {needed} MiB free, got {free // 2**20} MiB at {run}"
-        )
+        raise ValueError(f"paths.out must have {needed} MiB free, got {free // 2**20} MiB at {run}")
     write_text(run / "config.yaml", config)
 
 
