@@ -53,7 +53,9 @@ def facts(cfg: DictConfig, start: float) -> dict:
         "seed": cfg.seed,
         "resumed_from": cfg.ckpt if cfg.task == "train" else None,
         "wall_s": round(time.perf_counter() - start, 1),
-        "device": torch.cuda.get_device_name() if gpu else f"cpu, {torch.get_num_threads()} threads",
+        "device": torch.cuda.get_device_name()
+        if gpu
+        else f"cpu, {torch.get_num_threads()} threads",
     }
 
 

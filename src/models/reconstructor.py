@@ -67,7 +67,9 @@ class Reconstructor(LightningModule):
             with parametrize.cached():
                 frames, state = unroll(self.network, sample.voxels[:, part], detach(state))
             share = (part.stop - part.start) / windows
-            loss = share * self.loss(frames.flatten(0, 1), sample.target[:, part].flatten(0, 1)).mean()
+            loss = (
+                share * self.loss(frames.flatten(0, 1), sample.target[:, part].flatten(0, 1)).mean()
+            )
             self.manual_backward(loss)
             total += loss.detach()
         self.optimizers().step()
