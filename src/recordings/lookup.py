@@ -12,7 +12,7 @@ from src.recordings.views import Size, Views
 
 @dataclass(frozen=True)
 class Lookup:
-    """For each sensor pixel the index of its view (-1: none) and its (u, v) in the model picture."""
+    """For each sensor pixel the index of its view, -1 for none, and its (u, v) in model pixels."""
 
     view: Int[np.ndarray, "h w"]
     place: Float[np.ndarray, "h w 2"]

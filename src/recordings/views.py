@@ -185,9 +185,9 @@ HEADER = """\
 
 
 def load(path: Path | str, sensor: Size | None = None) -> Views:
-    """Read a file of `Views.save`, or one written by hand (`mirrored` and `error_px` may be absent).
+    """Read a file of `Views.save` or one by hand (`mirrored`, `error_px`, `points` are optional).
 
-    Raises ValueError for a file that is absent, too large or not such a file, a value out of range,
+    Raises ValueError for a file that is absent or not such a file, a value out of range,
     a `mirrored` its homography contradicts, or another sensor than `sensor` (height, width).
     """
     try:

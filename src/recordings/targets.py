@@ -1,0 +1,185 @@
+"""Calibration targets: the points of a checkerboard, circle grid or ChArUco board in a picture.
+
+A target has two jobs.  `features` finds points of its kind anywhere in a picture that shows it many
+times, mirrored or not; `find` finds one whole target in a crop and returns its points in order.
+Pictures are (h, w) uint8; points are (x, y) pixels, (0, 0) the centre of the top left pixel.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+from scipy import ndimage
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+Picture = UInt8[np.ndarray, "h w"]
+Points = Float[np.ndarray, "_ 2"]
+
+
+class Target(Protocol):
+    """`shape`: (rows, columns) of its points; `count`: features of a whole one; `ordered`: `find`
+    knows which point is which, and finds nothing in a mirrored picture."""
+
+    shape: tuple[int, int]
+    count: int
+    ordered: bool
+
+    def features(self, picture: Picture) -> Points: ...
+
+    def find(self, picture: Picture) -> Points | None:
+        """Return its points row by row, NaN where one is not seen; None for no target."""
+        ...
+
+
+@dataclass(frozen=True)
+class Checkerboard:
+    """`rows` x `cols` inner corners, each at least 3."""
+
+    rows: int = 5
+    cols: int = 7
+    ordered = False
+
+    def __post_init__(self):
+        _check_shape(self.rows, self.cols)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.rows, self.cols
+
+    @property
+    def count(self) -> int:
+        return self.rows * self.cols
+
+    def features(self, picture: Picture) -> Points:
+        """Saddle points: where the determinant of the Hessian is most negative."""
+        smooth = ndimage.gaussian_filter(picture.astype(np.float64), 2.0)
+        dy, dx = np.gradient(smooth)
+        yy, yx = np.gradient(dy)
+        saddle = yx**2 - yy * np.gradient(dx, axis=1)
+        peaks = saddle == ndimage.maximum_filter(saddle, size=7)
+        strongest = np.sort(saddle[peaks])[::-1][: 9 * self.rows * self.cols]
+        y, x = np.nonzero(peaks & (saddle > 0.2 * np.median(strongest)))
+        return np.stack([x, y], axis=1).astype(np.float64)
+
+    def find(self, picture: Picture) -> Points | None:
+        flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
+        found, points = cv2.findChessboardCornersSB(picture, (self.cols, self.rows), flags=flags)
+        return points.reshape(-1, 2).astype(np.float64) if found else None
+
+
+@dataclass(frozen=True)
+class Circles:
+    """`rows` x `cols` dots on a square lattice, each at least 3; `dark` dots on a bright ground."""
+
+    rows: int = 5
+    cols: int = 7
+    dark: bool = True
+    ordered = False
+
+    def __post_init__(self):
+        _check_shape(self.rows, self.cols)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.rows, self.cols
+
+    @property
+    def count(self) -> int:
+        return self.rows * self.cols
+
+    def features(self, picture: Picture) -> Points:
+        spots = self._detector().detect(self._dark(picture))
+        return np.array([spot.pt for spot in spots], dtype=np.float64).reshape(-1, 2)
+
+    def find(self, picture: Picture) -> Points | None:
+        flags = cv2.CALIB_CB_SYMMETRIC_GRID | cv2.CALIB_CB_CLUSTERING
+        found, points = cv2.findCirclesGrid(
+            self._dark(picture), (self.cols, self.rows), flags=flags, blobDetector=self._detector()
+        )
+        return points.reshape(-1, 2).astype(np.float64) if found else None
+
+    def _dark(self, picture: Picture) -> Picture:
+        return picture if self.dark else 255 - picture
+
+    @staticmethod
+    def _detector() -> cv2.SimpleBlobDetector:
+        settings = cv2.SimpleBlobDetector_Params()
+        settings.minArea, settings.maxArea = 12.0, 5000.0
+        settings.minDistBetweenBlobs = 4.0
+        settings.minCircularity, settings.filterByCircularity = 0.6, True
+        return cv2.SimpleBlobDetector_create(settings)
+
+
+@dataclass(frozen=True)
+class Charuco:
+    """A ChArUco board of `rows` x `cols` squares; a marker's side is `marker` of a square's."""
+
+    rows: int = 6
+    cols: int = 6
+    marker: float = 0.7
+    dictionary: str = "DICT_4X4_50"
+    ordered = True
+
+    def __post_init__(self):
+        _check_shape(self.rows, self.cols)
+        if not 0 < self.marker < 1:
+            raise ValueError(f"target.marker must be in (0, 1), got {self.marker}")
+        if not self.dictionary.startswith("DICT_") or not hasattr(cv2.aruco, self.dictionary):
+            raise ValueError(f"target.dictionary must be one of OpenCV's, got {self.dictionary}")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.rows - 1, self.cols - 1
+
+    @property
+    def count(self) -> int:
+        return self.rows * self.cols // 2
+
+    def features(self, picture: Picture) -> Points:
+        """Markers of both hands: those of the picture and of the picture mirrored in x."""
+        detector = cv2.aruco.ArucoDetector(self._board().getDictionary())
+        plain = _middles(detector.detectMarkers(picture)[0])
+        mirrored = _middles(detector.detectMarkers(cv2.flip(picture, 1))[0])
+        mirrored[:, 0] = picture.shape[1] - 1 - mirrored[:, 0]
+        return np.concatenate([plain, mirrored])
+
+    def find(self, picture: Picture) -> Points | None:
+        corners, names, *_ = cv2.aruco.CharucoDetector(self._board()).detectBoard(picture)
+        if names is None or len(names) < 6:
+            return None
+        points = np.full((self.shape[0] * self.shape[1], 2), np.nan)
+        points[names.ravel()] = corners.reshape(-1, 2)
+        return points
+
+    def _board(self) -> cv2.aruco.CharucoBoard:
+        book = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+        return cv2.aruco.CharucoBoard((self.cols, self.rows), 1.0, self.marker, book)
+
+
+def groups(points: Points, expected: int) -> list[Points]:
+    """Return the clusters of `points` that have half to twice `expected` members.
+
+    Two points are linked when they are closer than 1.3 times the median distance of nearest
+    neighbours, so that targets have to stand at least that far apart.
+    """
+    if len(points) < expected:
+        return []
+    tree = cKDTree(points)
+    nearest = np.median(tree.query(points, k=2)[0][:, 1])
+    links = tree.sparse_distance_matrix(tree, 1.3 * nearest)
+    count, label = connected_components(links, directed=False)
+    clusters = [points[label == name] for name in range(count)]
+    return [cluster for cluster in clusters if expected / 2 <= len(cluster) <= 2 * expected]
+
+
+def _middles(markers: Sequence[np.ndarray]) -> Points:
+    return np.array([marker.reshape(4, 2).mean(0) for marker in markers]).reshape(-1, 2)
+
+
+def _check_shape(rows: int, cols: int) -> None:
+    if not (3 <= rows <= 100 and 3 <= cols <= 100):
+        raise ValueError(f"target.rows and target.cols must be in 3..100, got {rows} and {cols}")
