@@ -6,6 +6,7 @@
 from typing import Any
 
 import lightning
+from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
@@ -21,11 +22,19 @@ ROOMS = ("src.", "baselines.", "lightning.", "torch.optim.")
 
 
 def make(node: Any, **kwargs) -> Any:
-    """Instantiate a config node; raises ValueError for a `_target_` outside our rooms."""
+    """Instantiate a config node; raises ValueError for a `_target_` outside our rooms.
+
+    A ValueError of the object itself comes through as it is, not wrapped by Hydra.
+    """
     target = str(node.get("_target_"))
     if not target.startswith(ROOMS):
         raise ValueError(f"_target_ must start with one of {', '.join(ROOMS)}, got {target}")
-    return instantiate(node, _convert_="all", **kwargs)
+    try:
+        return instantiate(node, _convert_="all", **kwargs)
+    except InstantiationException as error:
+        if isinstance(error.__cause__, ValueError):
+            raise error.__cause__ from None
+        raise
 
 
 def pipeline(cfg: DictConfig, split: str) -> Pipeline:

@@ -60,6 +60,5 @@ def facts(cfg: DictConfig, start: float) -> dict:
 
 
 def _refuse(error: Exception) -> int:
-    cause = error.__cause__ if isinstance(error, HydraException) and error.__cause__ else error
-    print("error: " + " ".join(str(cause).split()), file=sys.stderr)
+    print("error: " + " ".join(str(error).split()), file=sys.stderr)
     return 2

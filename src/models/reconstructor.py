@@ -1,6 +1,7 @@
 """Training, validation and test of any network that turns voxel grids into frames."""
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import torch
 from lightning import LightningModule
@@ -9,7 +10,9 @@ from torch.nn.utils import parametrize
 
 from src.metrics.scores import Scores
 from src.models.unroll import chunks, detach, unroll
-from src.sim.pipeline import Sample
+
+if TYPE_CHECKING:  # a network knows nothing of the simulation; a sample is read, never made
+    from src.sim.pipeline import Sample
 
 
 class Reconstructor(LightningModule):
@@ -54,11 +57,14 @@ class Reconstructor(LightningModule):
         return self._measures[1]
 
     def on_fit_start(self) -> None:
-        """Move the loss to the training device."""
+        """Move the loss, which is no submodule, to the training device."""
         self.loss.to(self.device)
 
-    def training_step(self, sample: Sample, batch_idx: int) -> Tensor:
-        """One optimiser step on a batch of sequences; returns the loss averaged over windows."""
+    def training_step(self, sample: "Sample", batch_idx: int) -> Tensor:
+        """One optimiser step on a batch of sequences; returns the loss averaged over windows.
+
+        Raises ValueError, with the clips, when the loss is not finite; no step is taken then.
+        """
         windows = sample.voxels.shape[1]
         state, total = None, torch.zeros((), device=self.device)
         self.optimizers().zero_grad()
@@ -66,17 +72,17 @@ class Reconstructor(LightningModule):
             # One normalised weight per chunk: spectral norm iterates once, not once per window.
             with parametrize.cached():
                 frames, state = unroll(self.network, sample.voxels[:, part], detach(state))
-            share = (part.stop - part.start) / windows
-            loss = (
-                share * self.loss(frames.flatten(0, 1), sample.target[:, part].flatten(0, 1)).mean()
-            )
+                errors = self.loss(frames.flatten(0, 1), sample.target[:, part].flatten(0, 1))
+            loss = errors.sum() / (windows * len(sample.voxels))
             self.manual_backward(loss)
             total += loss.detach()
+        if not torch.isfinite(total):
+            raise ValueError(f"loss is {float(total)} at step {self.global_step}: {sample.drawn}")
         self.optimizers().step()
         self.log("train/loss", total, prog_bar=True, batch_size=len(sample.voxels))
         return total
 
-    def validation_step(self, sample: Sample, batch_idx: int) -> None:
+    def validation_step(self, sample: "Sample", batch_idx: int) -> None:
         """Log the mean of every score over the validation clips."""
         for clip in self._measure(sample):
             values = {f"val/{name}": clip[name] for name in self.scores.names}
@@ -86,12 +92,13 @@ class Reconstructor(LightningModule):
         """Forget the clips of an earlier test."""
         self.clips = []
 
-    def test_step(self, sample: Sample, batch_idx: int) -> None:
+    def test_step(self, sample: "Sample", batch_idx: int) -> None:
         """Append the scores of each clip, with what was drawn for it, to `clips`."""
         self.clips += self._measure(sample)
 
-    def _measure(self, sample: Sample) -> list[dict]:
-        frames, _ = unroll(self.network, sample.voxels)
+    def _measure(self, sample: "Sample") -> list[dict]:
+        with parametrize.cached():
+            frames, _ = unroll(self.network, sample.voxels)
         frames, target = frames[:, self.warmup :], sample.target[:, self.warmup :]
         clips = zip(frames, target, sample.drawn, strict=True)
         return [drawn | self.scores(ours, truth) for ours, truth, drawn in clips]

@@ -1,0 +1,114 @@
+"""The doors train and eval on every config, at a tiny size; resuming; wrong values."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+from src.eval import evaluate
+from src.train import train
+from tests.conftest import ROOT
+
+TINY = ["debug=fdr", "trainer.enable_progress_bar=false", "loss=l1", "metrics.lpips=null"]
+
+
+def config(name: str, run: Path, *overrides: str) -> DictConfig:
+    with initialize_config_dir(str(ROOT / "conf"), version_base=None):
+        cfg = compose(name, [*overrides, f"paths.out={run}"])
+    cfg.paths.run = str(run)
+    return cfg
+
+
+def names(group: str) -> list[str]:
+    folder = ROOT / "conf" / group
+    return sorted(str(f.relative_to(folder).with_suffix("")) for f in folder.rglob("*.yaml"))
+
+
+@pytest.mark.parametrize("experiment", names("experiment"))
+def test_every_experiment_takes_a_step(experiment, tmp_path):
+    train(config("train", tmp_path, f"experiment={experiment}", *TINY))
+    record = json.loads((tmp_path / "results.json").read_text())
+    assert record["experiment"] == experiment and record["schema"] == 1
+    assert record["test"]["clips"] == 1 and 0 <= record["test"]["ssim"]["mean"] <= 1
+    assert record["model"]["params"] > 1000 and record["model"]["macs_per_frame"] > 1000
+    assert (tmp_path / "checkpoints" / "last.ckpt").is_file()
+    assert list((tmp_path / "samples").glob("*.gif")) and list((tmp_path / "samples").glob("*.png"))
+
+
+@pytest.mark.parametrize("debug", [name for name in names("debug") if name != "default"])
+def test_every_debug_preset_takes_a_step(debug, tmp_path):
+    small = ["trainer.max_steps=1", "data.epoch_clips=1", "data.batch_size=1", "data.test_clips=1"]
+    small += ["scene.height=64", "scene.width=64", "data.crop=32", "data.windows=2"]
+    small += ["data.test_windows=3", "data.warmup=1", "data.val_clips=1", "model.base_channels=4"]
+    train(config("train", tmp_path, f"debug={debug}", *TINY[1:], *small))
+    assert (tmp_path / "results.json").is_file()
+
+
+@pytest.mark.parametrize("group", ["budget", "logger", "trainer", "optics", "turbulence", "sensor"])
+def test_every_choice_composes(group, tmp_path):
+    for choice in names(group):
+        cfg = config("train", tmp_path, f"{group}={choice}")
+        assert cfg.name == "lf3x3"
+
+
+def test_resuming_equals_not_having_stopped(tmp_path):
+    steps = ["data.epoch_clips=2", "augment.noise_std=0.1"]
+    whole, first, second = (tmp_path / name for name in ("whole", "first", "second"))
+    train(config("train", whole, *TINY, *steps, "trainer.max_steps=5"))
+    train(config("train", first, *TINY, *steps, "trainer.max_steps=3"))
+    ckpt = first / "checkpoints" / "last.ckpt"
+    logs = (first / "logs" / "metrics.csv").read_text()
+    train(config("train", second, *TINY, *steps, "trainer.max_steps=5", f"ckpt={ckpt}"))
+    one = torch.load(whole / "checkpoints" / "last.ckpt", weights_only=True)
+    two = torch.load(second / "checkpoints" / "last.ckpt", weights_only=True)
+    assert one["global_step"] == two["global_step"] == 5
+    for name, value in one["state_dict"].items():
+        assert torch.equal(value, two["state_dict"][name]), name
+    assert (first / "logs" / "metrics.csv").read_text() == logs
+
+
+def test_the_same_seed_gives_the_same_loss_curve(tmp_path):
+    curves = []
+    for run in ("a", "b"):
+        train(config("train", tmp_path / run, *TINY, "trainer.max_steps=2", "data.epoch_clips=2"))
+        curves.append((tmp_path / run / "logs" / "metrics.csv").read_text())
+    assert curves[0] == curves[1]
+
+
+def test_eval_equals_the_test_of_training(tmp_path):
+    train(config("train", tmp_path / "train", *TINY))
+    ckpt = tmp_path / "train" / "checkpoints" / "last.ckpt"
+    same = [f"ckpt={ckpt}", "scene.height=64", "scene.width=64", "data.test_clips=1"]
+    same += ["data.test_windows=4", "data.warmup=1", "data.workers=0", "metrics.lpips=null"]
+    evaluate(config("eval", tmp_path / "eval", *same, "trainer.enable_progress_bar=false"))
+    first, second = (
+        json.loads((tmp_path / door / "results.json").read_text())["test"]
+        for door in ("train", "eval")
+    )
+    assert first == second
+
+
+@pytest.mark.parametrize(
+    ("overrides", "key"),
+    [
+        (["scene.root=/nowhere"], "scene.root"),
+        (["data.crop=100"], "data.crop"),
+        (["data.batch_size=0"], "data.batch_size"),
+        (["optics.views=7"], "optics.views"),
+        (["sensor.threshold=-1"], "sensor.threshold"),
+        (["augment.pause=2"], "augment.pause"),
+        (["data.simulate_on=moon"], "data.simulate_on"),
+        (["paths.out=/dev/null/x"], "paths.out"),
+        (["scene._target_=os.system"], "_target_"),
+        (["ckpt=/nowhere.ckpt"], "ckpt"),
+    ],
+)
+def test_a_wrong_value_names_its_key(overrides, key, tmp_path):
+    cfg = config("train", tmp_path, *TINY, *[o for o in overrides if not o.startswith("paths")])
+    if key == "paths.out":
+        cfg.paths.run = "/dev/null/x"
+    with pytest.raises(ValueError, match=key):
+        train(cfg)
