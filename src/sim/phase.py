@@ -1,0 +1,98 @@
+"""Zernike coefficients over picture, time and views, as a sum of plane waves.
+
+Turbulence along the path is Kolmogorov phase, a sum of plane waves exp(2 pi i f.x), each in a thin
+layer at its own distance z (sparse spectrum: Charnotskii 2013, J. Opt. Soc. Am. A 30, 479).  An
+object point x sees the layer through a disc of diameter D_l = D (1 - z/L) centred at x z/L, so
+Noll's coefficient j there is
+
+    a_j(x, t) = Re sum_m c_m(t) w_m Q_j(D_l f_m) exp(2 pi i f_m . x z_m / L)
+
+with Q_j the Fourier transform of the mode (src/sim/zernike.py) and independent complex normal c_m.
+All covariances, between modes, points, times and views, follow from this one sum: nothing is
+periodic, and frequencies reach down to zero.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from src.sim import noise
+from src.sim.atmosphere import Atmosphere
+from src.sim.zernike import SPECTRUM, pupil_filter
+
+LOW, HIGH = 0.08, 0.32  # limits of the three power laws that kappa is drawn from; HIGH per (n + 1)
+SHARES = (0.25, 0.65, 0.10)  # of the waves below LOW, between, above HIGH
+
+
+@dataclass(frozen=True)
+class Waves:
+    """The plane waves of one clip; the same for its views, only their amplitudes differ.
+
+    `frequency` (waves, 2): f z / L in cycles per pixel at the object along (x, y).
+    `layer` (waves, 2): f in cycles per metre in the layer; `place` (waves,): z / L.
+    `response` (modes, 2 waves): w_m Q_j, real and imaginary part, in rad.
+    """
+
+    frequency: Float[Tensor, "waves 2"]
+    layer: Float[Tensor, "waves 2"]
+    place: Float[Tensor, " waves"]
+    response: Float[Tensor, "modes waves 2"]
+
+
+def draw_waves(atmosphere: Atmosphere, key: int, *, modes: int, waves: int, width_px: int) -> Waves:
+    """Draw `waves` plane waves that carry Noll modes 2..modes + 1.
+
+    kappa = D_l |f|, its angle and z are drawn by a shifted Kronecker sequence; z with the density
+    Cn2 (1 - z/L)^(5/3) that makes the layers count alike, kappa from a broken power law over all of
+    (0, inf), and the weights w_m divide by that density, so the expected covariance is exact.
+    """
+    u = _sequence(key, waves)
+    kappa, density = _radius(u[:, 0], modes)
+    angle = 2 * math.pi * u[:, 1]
+    place, strength = atmosphere.path
+    share = strength * (1 - place) ** (5 / 3)
+    steps = torch.cumsum(share, 0)
+    slot = torch.searchsorted(steps, u[:, 2] * steps[-1]).clamp(max=len(place) - 1)
+    diameter = atmosphere.aperture_m * (1 - place[slot])
+    variance = SPECTRUM * 2 * math.pi * kappa ** (-8 / 3) / (density * waves)
+    amplitude = variance.sqrt() * atmosphere.d_over_r0 ** (5 / 6)
+    layer = torch.stack([angle.cos(), angle.sin()], dim=-1) * (kappa / diameter)[:, None]
+    pixel = atmosphere.object_pixel_m(width_px)
+    return Waves(
+        frequency=layer * place[slot, None] * pixel,
+        layer=layer,
+        place=place[slot],
+        response=pupil_filter(kappa, angle, modes) * amplitude[:, None],
+    )
+
+
+def _sequence(key: int, count: int) -> Float[Tensor, "count 3"]:
+    """Return a rank-1 Kronecker sequence in the unit cube, shifted at random (Roberts' R2)."""
+    shift = noise.uniform(key, torch.arange(3)).double()
+    golden = 1.324717957244746  # root of x^3 = x + 1
+    step = torch.tensor([1 / count, 1 / golden, 1 / golden**2], dtype=torch.float64)
+    return (shift * torch.tensor([1 / count, 1, 1]) + torch.arange(count)[:, None] * step) % 1.0
+
+
+def _radius(u: Tensor, modes: int) -> tuple[Tensor, Tensor]:
+    """Return kappa and its density at the quantiles `u`: kappa^(-2/3), then 1/kappa, then ^-5.
+
+    The first law makes all waves below LOW count alike for the tilt, whose variance converges as
+    slowly as kappa^(1/3) towards zero.
+    """
+    order = (math.isqrt(8 * (modes + 1) - 7) - 1) // 2
+    high = HIGH * (order + 1) + 0.6
+    below, between, above = SHARES
+    ratio = math.log(high / LOW)
+    first = LOW * (u / below).clamp(max=1) ** 3
+    middle = LOW * torch.exp(((u - below) / between).clamp(0, 1) * ratio)
+    last = high * (1 - ((u - below - between) / above).clamp(0, 1 - 1e-9)) ** (-1 / 4)
+    kappa = torch.where(u < below, first, torch.where(u < below + between, middle, last))
+    kappa = kappa.clamp(min=1e-30)
+    low_density = below / (3 * LOW ** (1 / 3)) * kappa ** (-2 / 3)
+    high_density = above * 4 * high**4 * kappa**-5
+    density = torch.where(kappa < high, between / (ratio * kappa), high_density)
+    return kappa, torch.where(kappa < LOW, low_density, density)

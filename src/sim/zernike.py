@@ -1,0 +1,122 @@
+"""Zernike modes of a circular pupil under Kolmogorov turbulence, in Noll's order and scaling.
+
+Coefficients are in rad of phase; mode j has unit RMS over the pupil.  j = 1 is piston, 2 and 3 the
+tilts along x and y; x points right, y down, as the columns and rows of an image do.  Noll 1976,
+"Zernike polynomials and atmospheric turbulence".
+"""
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy import special
+from torch import Tensor
+
+SPECTRUM = 0.022896  # of phase: SPECTRUM r0^(-5/3) f^(-11/3) rad^2 m^2, f in cycles / m
+COVARIANCE = 2.246061  # Noll's 2.2424 without the rounding of his 0.023
+
+
+def noll_index(mode: int) -> tuple[int, int]:
+    """Return (n, m) of Noll mode `mode` >= 1; m > 0 is a cosine, m < 0 a sine."""
+    n = (math.isqrt(8 * mode - 7) - 1) // 2
+    place = mode - n * (n + 1) // 2 - 1
+    m = 2 * ((place + 1) // 2) if n % 2 == 0 else 2 * (place // 2) + 1
+    return n, m if mode % 2 == 0 else -m
+
+
+def noll_covariance(modes: int) -> Float[Tensor, "modes modes"]:
+    """Return the covariance of Noll coefficients 2..modes + 1 at D/r0 = 1, in rad^2, float64.
+
+    Noll 1976, eq. 25; it scales with (D/r0)^(5/3).
+    """
+    indices = [noll_index(mode) for mode in range(2, modes + 2)]
+    rows = [[_covariance(a, b) for b in indices] for a in indices]
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def noll_residual(modes: int) -> float:
+    """Return the phase variance left at D/r0 = 1 when Noll modes 1..modes are known, in rad^2.
+
+    From the variances, summed over whole orders; 1.0324 for modes = 1 (Noll 1976, table IV).
+    """
+    return _structure_variance() - sum(
+        _covariance(i, i) for i in map(noll_index, range(2, modes + 1))
+    )
+
+
+def zernike_basis(modes: int, size: int) -> tuple[Float[Tensor, "modes p"], Float[Tensor, "p 2"]]:
+    """Return Noll modes 2..modes + 1 at the points of a `size` x `size` grid inside the unit disc.
+
+    Also the (x, y) of the points, in pupil radii.
+    """
+    axis = (torch.arange(size, dtype=torch.float64) + 0.5) * 2 / size - 1
+    y, x = torch.meshgrid(axis, axis, indexing="ij")
+    inside = x**2 + y**2 <= 1
+    points = torch.stack([x[inside], y[inside]], dim=-1)
+    radius, angle = points.norm(dim=-1), torch.atan2(points[:, 1], points[:, 0])
+    return torch.stack([_mode(noll_index(j), radius, angle) for j in range(2, modes + 2)]), points
+
+
+def pupil_filter(
+    kappa: Float[Tensor, " waves"], angle: Float[Tensor, " waves"], modes: int
+) -> Float[Tensor, "modes waves 2"]:
+    """Return what a plane wave exp(2 pi i f.x) across the pupil gives to Noll modes 2..modes + 1.
+
+    `kappa` = D |f| and the wave's `angle`; real and imaginary part of
+    i^n sqrt(n + 1) 2 J_{n+1}(pi kappa) / (pi kappa) {1, sqrt2 cos(m angle), sqrt2 sin(m angle)}
+    (Noll 1976, eq. 8, for the phase at the pupil's centre).
+    """
+    out = torch.zeros(modes, len(kappa), 2, dtype=torch.float64)
+    x = math.pi * kappa.double().numpy()
+    radial: dict[int, Tensor] = {}
+    for row, (n, m) in enumerate(map(noll_index, range(2, modes + 2))):
+        if n not in radial:
+            bessel = np.divide(special.jv(n + 1, x), x, out=np.zeros_like(x), where=x > 0)
+            radial[n] = torch.from_numpy(2 * math.sqrt(n + 1) * bessel)
+        sign = -1 if n % 4 in (2, 3) else 1
+        out[row, :, n % 2] = sign * radial[n] * _azimuth(m, angle.double())
+    return out
+
+
+def _covariance(a: tuple[int, int], b: tuple[int, int]) -> float:
+    (n, m), (n2, m2) = a, b
+    if m != m2:
+        return 0.0
+    sign = -1 if ((n + n2 - 2 * abs(m)) // 2) % 2 else 1
+    gammas = (
+        special.gammaln((n + n2 - 5 / 3) / 2)
+        - special.gammaln((n - n2 + 17 / 3) / 2)
+        - special.gammaln((n2 - n + 17 / 3) / 2)
+        - special.gammaln((n + n2 + 23 / 3) / 2)
+    )
+    lows = special.gammasgn((n - n2 + 17 / 3) / 2) * special.gammasgn((n2 - n + 17 / 3) / 2)
+    return sign * lows * COVARIANCE * math.sqrt((n + 1) * (n2 + 1)) * math.exp(gammas)
+
+
+def _structure_variance() -> float:
+    """Piston-removed variance at D/r0 = 1: half the mean over the pupil of 6.88 (s/D)^(5/3).
+
+    The distance s of two points of a disc has the density 16 s / pi (acos s - s sqrt(1 - s^2)) in
+    units of its diameter; the mean is then a difference of beta functions.
+    """
+    structure = 2 * (24 / 5 * special.gamma(6 / 5)) ** (5 / 6)  # 6.8839
+    power = 5 / 3
+    half = (power + 3) / 2
+    mean = special.beta(half, 0.5) / (power + 2) - special.beta(half, 1.5)
+    return float(structure / 2 * 8 / math.pi * mean)
+
+
+def _azimuth(m: int, angle: Tensor) -> Tensor:
+    if m == 0:
+        return torch.ones_like(angle)
+    return math.sqrt(2) * (torch.cos(m * angle) if m > 0 else torch.sin(-m * angle))
+
+
+def _mode(index: tuple[int, int], radius: Tensor, angle: Tensor) -> Tensor:
+    n, m = index[0], abs(index[1])
+    total = torch.zeros_like(radius)
+    for s in range((n - m) // 2 + 1):
+        weight = (-1) ** s * math.comb(n - s, s) * math.comb(n - 2 * s, (n - m) // 2 - s)
+        total = total + weight * radius ** (n - 2 * s)
+    return math.sqrt(n + 1) * total * _azimuth(index[1], angle)
