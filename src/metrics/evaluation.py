@@ -36,9 +36,7 @@ def test(
     """Return the row of `network` on the test clips of `data`."""
     module = Reconstructor(network, {}, scores=scores, warmup=warmup)
     trainer.test(module, data, verbose=False)
-    pipeline = data.pipelines["test"]
-    views, bins = pipeline.optics.views, pipeline.bins
-    height, width = pipeline.size
+    views, bins, height, width = module.voxel_shape
     return Row(
         name,
         module.clips,

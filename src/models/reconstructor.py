@@ -94,6 +94,7 @@ class Reconstructor(LightningModule):
 
     def test_step(self, sample: "Sample", batch_idx: int) -> None:
         """Append the scores of each clip, with what was drawn for it, to `clips`."""
+        self.voxel_shape = tuple(sample.voxels.shape[2:])
         self.clips += self._measure(sample)
 
     def _measure(self, sample: "Sample") -> list[dict]:

@@ -64,30 +64,34 @@ class Pipeline:
     """From the number of a clip to a sample.
 
     `scene` has `clip(index)` with `windows * substeps + 1` frames; `turbulence` holds the keyword
-    arguments of `sample_atmosphere` under `atmosphere` and those of `Turbulence` beside it, or is
-    None; `sensor` holds those of `EventSensor`, with `threshold` a number or a range [low, high]
-    drawn uniformly per clip.  `crop` is the side of the square to simulate (None: the whole
-    frame), placed at random if `random_crop`, else in the middle.  `clips` is the number of
-    different clips: number k shows clip k modulo `clips` (None: every number is a new clip).
+    arguments of `sample_atmosphere` under `atmosphere` and those of `Turbulence` beside it;
+    `sensor` holds those of `EventSensor`.  `crop` is the side of the square to simulate: pixels
+    (int), a share of the frame (float in (0, 1]) or None for all of it; it lies at random if
+    `random_crop`, else in the middle.  `clips` is the number of different clips: number k shows
+    clip k modulo `clips` (None: every number is a new clip).
     """
 
     def __init__(
         self,
         scene,
         optics: Optics,
-        turbulence: Mapping | None,
+        turbulence: Mapping,
         sensor: Mapping,
         *,
         split: str,
         seed: int = 0,
         bins: int = 5,
         substeps: int = 1,
-        crop: int | None = None,
+        crop: int | float | None = None,
         random_crop: bool = False,
         clips: int | None = None,
     ):
         self.scene, self.optics, self.turbulence = scene, optics, turbulence
-        self.sensor, self.split, self.seed = dict(sensor), split, seed
+        # sRGB is decoded before the turbulence, which acts on light; the sensor then gets light.
+        self.decode = sensor.get("input") == "srgb"
+        light = {"input": "linear"} if self.decode else {}
+        self.sensor = EventSensor(**dict(sensor) | light, seed=seed)
+        self.split, self.seed = split, seed
         self.bins, self.substeps = bins, substeps
         self.crop, self.random_crop, self.clips = crop, random_crop, clips
 
@@ -97,11 +101,10 @@ class Pipeline:
         key = noise.key(self.seed, self.split, index)
         clip = self.scene.clip(index)
         crop = self._crop(clip.frames.shape[-2:], noise.key(key, number, "crop"))
-        atmosphere = None
-        if self.turbulence is not None:
-            drawer = noise.generator(noise.key(key, "atmosphere"))
-            atmosphere = sample_atmosphere(generator=drawer, **self.turbulence["atmosphere"])
-        return Draw(clip, crop, atmosphere, self._threshold(noise.key(key, "threshold")), key)
+        drawer = noise.generator(noise.key(key, "atmosphere"))
+        atmosphere = sample_atmosphere(generator=drawer, **self.turbulence["atmosphere"])
+        threshold = self.sensor.sample_threshold(noise.generator(noise.key(key, "threshold")))
+        return Draw(clip, crop, atmosphere, threshold, key)
 
     def simulate(self, draws: Sequence[Draw], device: torch.device | str = "cpu") -> Sample:
         """Simulate the drawn clips on `device`."""
@@ -121,8 +124,7 @@ class Pipeline:
         clean = draw.clip.frames.to(device)[None]
         target = clean[:, self.substeps :: self.substeps, top : top + height, left : left + width]
         views, weather = self._degrade(clean, draw)
-        sensor = EventSensor(**self.sensor | {"threshold": draw.threshold, "seed": self.seed})
-        voxels = sensor.voxels(
+        voxels = self.sensor.voxels(
             views,
             draw.clip.fps,
             self.bins,
@@ -131,6 +133,7 @@ class Pipeline:
             views=self.optics.view_ids,
             origin=(top, left),
             full_width=clean.shape[-1],
+            threshold=torch.tensor([draw.threshold]),
         )
         drawn = {"name": draw.clip.name, "threshold": draw.threshold} | weather
         turbulent = views[:, self.optics.centre, self.substeps :: self.substeps]
@@ -144,8 +147,8 @@ class Pipeline:
 
     def _degrade(self, clean: Tensor, draw: Draw) -> tuple[Tensor, dict]:
         """Return what each view's optics put on the sensor, and the numbers of the atmosphere."""
-        radiance = decode_srgb(clean) if self.sensor.get("input") == "srgb" else clean
-        operator = {k: v for k, v in (self.turbulence or {}).items() if k != "atmosphere"}
+        radiance = decode_srgb(clean) if self.decode else clean
+        operator = {k: v for k, v in self.turbulence.items() if k != "atmosphere"}
         turbulence = Turbulence(
             draw.atmosphere,
             views=self.optics.positions,
@@ -163,9 +166,11 @@ class Pipeline:
 
     def _crop(self, size: Sequence[int], key: int) -> Crop:
         height, width = size
-        side = self.crop
-        if side is None:
+        if self.crop is None:
             return 0, 0, height, width
+        side = self.crop
+        if isinstance(side, float):
+            side = round(side * min(height, width))
         if not 8 <= side <= min(height, width):
             raise ValueError(
                 f"data.crop must be in 8..{min(height, width)} (the frame), got {side}"
@@ -174,15 +179,6 @@ class Pipeline:
             return (height - side) // 2, (width - side) // 2, side, side
         top, left = noise.uniform(key, torch.arange(2)).tolist()
         return int(top * (height - side + 1)), int(left * (width - side + 1)), side, side
-
-    def _threshold(self, key: int) -> float:
-        value = self.sensor["threshold"]
-        if isinstance(value, int | float):
-            return float(value)
-        low, high = value
-        if not 0 < low <= high:
-            raise ValueError(f"sensor.threshold must be a number or 0 < low <= high, got {value}")
-        return low + (high - low) * float(noise.uniform(key, torch.tensor(0)))
 
 
 def simulate(
