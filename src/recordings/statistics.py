@@ -199,7 +199,7 @@ def write_csv(
         writer.writerows(rows)
 
 
-def _mean(values: np.ndarray, axis: int) -> np.ndarray:
+def _mean(values: np.ndarray, axis: int) -> np.ndarray | float:
     """The mean of what is finite; NaN, without a warning, where nothing is."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)

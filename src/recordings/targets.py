@@ -1,13 +1,15 @@
 """Calibration targets: the points of a checkerboard, circle grid or ChArUco board in a picture.
 
 A target has two jobs.  `features` finds points of its kind anywhere in a picture that shows it many
-times, mirrored or not; `find` finds one whole target in a crop and returns its points in order.
+times, mirrored or not; `find` returns the points of the one target in a crop row by row, NaN where
+one is not seen, or None.  `shape` is (rows, columns) of these points, `count` the number of
+features of a whole target; one that is `ordered` knows which point is which and is not found in a
+mirrored picture.
 Pictures are (h, w) uint8; points are (x, y) pixels, (0, 0) the centre of the top left pixel.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -18,21 +20,6 @@ from scipy.spatial import cKDTree
 
 Picture = UInt8[np.ndarray, "h w"]
 Points = Float[np.ndarray, "_ 2"]
-
-
-class Target(Protocol):
-    """`shape`: (rows, columns) of its points; `count`: features of a whole one; `ordered`: `find`
-    knows which point is which, and finds nothing in a mirrored picture."""
-
-    shape: tuple[int, int]
-    count: int
-    ordered: bool
-
-    def features(self, picture: Picture) -> Points: ...
-
-    def find(self, picture: Picture) -> Points | None:
-        """Return its points row by row, NaN where one is not seen; None for no target."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -158,6 +145,9 @@ class Charuco:
     def _board(self) -> cv2.aruco.CharucoBoard:
         book = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         return cv2.aruco.CharucoBoard((self.cols, self.rows), 1.0, self.marker, book)
+
+
+Target = Checkerboard | Circles | Charuco
 
 
 def groups(points: Points, expected: int) -> list[Points]:

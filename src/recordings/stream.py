@@ -1,0 +1,224 @@
+"""Events of any length to windows of voxel grids to frames, in memory that does not grow.
+
+Windows are cut by time, one frame every 1 / fps seconds, or by a count of events.  Times are
+microseconds of the recording's clock in float64, frames carry seconds.
+
+How the voxel scale is handled at high frame rates.  A network trained on windows of 1/120 s that is
+fed windows of 1/12000 s sees a hundredth of the events and runs its recurrence a hundred times as
+often: it fades.  So `span` windows overlap: each is round(trained * fps) frames long and is fed to
+the recurrent state of the window that ended where it starts.  Every one of these interleaved phases
+is exactly the reconstruction at the trained rate, and every event counts once per phase.
+"""
+
+import inspect
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from src.recordings.lookup import Lookup
+
+COVERED = 0.99  # of the last window, or the recording ends before it
+
+
+@dataclass(frozen=True)
+class Window:
+    """The voxel grid of the events in [start_us, end_us): `events` in views, `outside` in none."""
+
+    start_us: float
+    end_us: float
+    events: int
+    outside: int
+    voxels: Float[np.ndarray, "views bins h w"]
+
+
+@dataclass(frozen=True)
+class Rule:
+    """How windows are cut: by time, `overlap` windows over each other, or by `count` of events.
+
+    A window by time is overlap / fps long and ends 1 / fps after the one before it.  `start_s` and
+    `end_s` count from the recording's first event.
+    """
+
+    fps: float | None = None
+    count: int | None = None
+    overlap: int = 1
+    bins: int = 5
+    nearest: bool = False
+    start_s: float = 0.0
+    end_s: float = float("inf")
+
+    def __post_init__(self):
+        if (self.fps is None) == (self.count is None):
+            raise ValueError(f"give either fps or count, got fps={self.fps} count={self.count}")
+        if self.fps is not None and not 0 < self.fps <= 1e6:
+            raise ValueError(f"fps must be in (0, 1e6], got {self.fps}")
+        if self.count is not None and self.count < 1:
+            raise ValueError(f"count must be >= 1, got {self.count}")
+        if self.overlap < 1 or self.bins < 1:
+            raise ValueError(f"overlap and bins must be >= 1, got {self.overlap} and {self.bins}")
+        if not 0 <= self.start_s < self.end_s:
+            raise ValueError(f"start must be >= 0 and before end, got {self.start_s}, {self.end_s}")
+
+
+def overlap(span: str, fps: float, trained_s: float = 1 / 120) -> int:
+    """Return how many frames a window spans: `frame` one; `trained` the trained length, if longer.
+
+    Raises ValueError for another `span`.
+    """
+    if span not in ("frame", "trained"):
+        raise ValueError(f"span must be frame or trained, got {span}")
+    return max(1, round(trained_s * fps)) if span == "trained" else 1
+
+
+def windows(chunks: Iterable[np.ndarray], lookup: Lookup, rule: Rule) -> Iterator[Window]:
+    """Cut chunks of events (fields t x y p, in order of time) into windows by `rule`.
+
+    Raises ValueError for time running backwards, an event off the sensor, or a recording that is
+    shorter than one window.
+    """
+    cut = _by_time if rule.count is None else _by_count
+    none = True
+    for window in cut(_checked(chunks, lookup, rule), lookup, rule):
+        none = False
+        yield window
+    if none:
+        length = f"1/{rule.fps} s" if rule.count is None else f"{rule.count} events"
+        raise ValueError(f"recording must be longer than one window of {length}, got less")
+
+
+def _checked(chunks: Iterable[np.ndarray], lookup: Lookup, rule: Rule) -> Iterator[np.ndarray]:
+    last, origin = None, None
+    for chunk in chunks:
+        t = chunk["t"]
+        if not t.size:
+            continue
+        origin = int(t[0]) if origin is None else origin
+        if (np.diff(t) < 0).any() or (last is not None and t[0] < last):
+            raise ValueError(f"recording must not run backwards in time, it does after {last} us")
+        last = int(t[-1])
+        lookup.check(chunk)
+        edges = origin + 1e6 * rule.start_s, origin + 1e6 * rule.end_s
+        first, end = np.searchsorted(t, edges)
+        if end > first:
+            yield chunk[first:end]
+        if end < t.size:
+            return
+
+
+def _by_time(chunks: Iterable[np.ndarray], lookup: Lookup, rule: Rule) -> Iterator[Window]:
+    period, start, pending, k = 1e6 / rule.fps, None, None, 1
+    for chunk in chunks:
+        start = int(chunk["t"][0]) if start is None else start
+        pending = chunk if pending is None else np.concatenate([pending, chunk])
+        last = int(chunk["t"][-1])
+        while start + k * period <= last:
+            yield _window(pending, lookup, rule, start, k)
+            k += 1
+        oldest = start + (k - rule.overlap) * period
+        pending = pending[np.searchsorted(pending["t"], oldest) :]
+    if pending is None:
+        return
+    while start + (k - 1 + COVERED) * period <= last + 1:
+        yield _window(pending, lookup, rule, start, k)
+        k += 1
+
+
+def _window(events: np.ndarray, lookup: Lookup, rule: Rule, start: int, k: int) -> Window:
+    end = start + k * 1e6 / rule.fps
+    begin = start + (k - rule.overlap) * 1e6 / rule.fps
+    first, stop = np.searchsorted(events["t"], [begin, end])
+    return _grid(events[first:stop], lookup, rule, begin, end)
+
+
+def _grid(events: np.ndarray, lookup: Lookup, rule: Rule, begin: float, end: float) -> Window:
+    if not events.size:
+        nothing = np.broadcast_to(np.float32(0), (lookup.views, rule.bins, *lookup.model))
+        return Window(begin, end, 0, 0, nothing)
+    grid = lookup.empty(rule.bins)
+    outside = lookup.add(events, grid, begin, end, nearest=rule.nearest)
+    return Window(begin, end, len(events) - outside, outside, grid)
+
+
+def _by_count(chunks: Iterable[np.ndarray], lookup: Lookup, rule: Rule) -> Iterator[Window]:
+    pending, begin = None, None
+    for chunk in chunks:
+        begin = float(chunk["t"][0]) if begin is None else begin
+        pending = chunk if pending is None else np.concatenate([pending, chunk])
+        inside = np.flatnonzero(lookup.view[pending["y"], pending["x"]] >= 0)
+        stop = 0
+        for nth in inside[rule.count - 1 :: rule.count]:
+            events, stop = pending[stop : nth + 1], nth + 1
+            end = max(float(events["t"][-1]), begin + 1.0)
+            yield _grid(events, lookup, rule, begin, end)
+            begin = end
+        pending = pending[stop:]
+
+
+@dataclass
+class Carry:
+    """What lives from frame to frame: a recurrent state per phase, the picture, frames so far."""
+
+    states: list[Any] = field(default_factory=list)
+    picture: Tensor | None = None
+    frames: int = 0
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A picture (h, w) float32 in [0, 1] at `time_s`, the end of its window, and its events."""
+
+    time_s: float
+    picture: Float[np.ndarray, "h w"]
+    events: int
+    outside: int
+
+
+def wanted(network: nn.Module, views: int) -> bool:
+    """Return whether `network` takes all `views`; False: it takes the centre view alone.
+
+    Raises ValueError where it wants another number of views.
+    """
+    wants = getattr(network, "views", None)
+    if wants not in (None, 1, views):
+        raise ValueError(
+            f"ckpt wants {wants} views, the recording has {views}; give views=views.yaml"
+        )
+    return wants != 1 or views == 1
+
+
+@torch.inference_mode()
+def frames(
+    windows: Iterable[Window],
+    network: nn.Module,
+    *,
+    overlap: int = 1,
+    positions: Sequence[tuple[int, int]] | None = None,
+    device: torch.device | str = "cpu",
+    carry: Carry | None = None,
+) -> Iterator[Frame]:
+    """Reconstruct one frame per window; a window without events holds the picture at no cost.
+
+    `overlap` is that of the windows' rule: the window k continues the state of window k - overlap.
+    A network that takes `window_s` and `positions` is told them.  `carry` of an earlier call makes
+    this one its continuation (law 6); it is kept up to date.
+    """
+    carry = Carry() if carry is None else carry
+    carry.states.extend([None] * (overlap - len(carry.states)))
+    takes = inspect.signature(network.forward).parameters
+    for window in windows:
+        phase = carry.frames % overlap
+        if window.events:
+            known = {"window_s": (window.end_us - window.start_us) * 1e-6, "positions": positions}
+            told = {name: known[name] for name in known if name in takes}
+            voxels = torch.from_numpy(window.voxels)[None].to(device)
+            picture, carry.states[phase] = network(voxels, carry.states[phase], **told)
+            carry.picture = picture[0, 0].clamp(0, 1).float().cpu()
+        elif carry.picture is None:
+            carry.picture = torch.full(window.voxels.shape[-2:], 0.5)
+        carry.frames += 1
+        yield Frame(window.end_us * 1e-6, carry.picture.numpy(), window.events, window.outside)
