@@ -13,6 +13,7 @@ is exactly the reconstruction at the trained rate, and every event counts once p
 import inspect
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -81,54 +82,55 @@ def windows(chunks: Iterable[np.ndarray], lookup: Lookup, rule: Rule) -> Iterato
     Raises ValueError for time running backwards, an event off the sensor, or a recording that is
     shorter than one window.
     """
-    cut = _by_time if rule.count is None else _by_count
+    ordered = _ordered(chunks, lookup)
+    first = next(ordered, None)
     none = True
-    for window in cut(_checked(chunks, lookup, rule), lookup, rule):
-        none = False
-        yield window
+    if first is not None:
+        start, end = first["t"][0] + 1e6 * np.array([rule.start_s, rule.end_s])
+        later = (chunk[np.searchsorted(chunk["t"], start) :] for chunk in chain([first], ordered))
+        cut = _by_time if rule.count is None else _by_count
+        for window in cut(filter(len, later), lookup, rule, start, end):
+            none = False
+            yield window
     if none:
         length = f"1/{rule.fps} s" if rule.count is None else f"{rule.count} events"
         raise ValueError(f"recording must be longer than one window of {length}, got less")
 
 
-def _checked(chunks: Iterable[np.ndarray], lookup: Lookup, rule: Rule) -> Iterator[np.ndarray]:
-    last, origin = None, None
-    for chunk in chunks:
+def _ordered(chunks: Iterable[np.ndarray], lookup: Lookup) -> Iterator[np.ndarray]:
+    last = None
+    for chunk in filter(len, chunks):
         t = chunk["t"]
-        if not t.size:
-            continue
-        origin = int(t[0]) if origin is None else origin
         if (np.diff(t) < 0).any() or (last is not None and t[0] < last):
-            raise ValueError(f"recording must not run backwards in time, it does after {last} us")
-        last = int(t[-1])
+            raise ValueError(
+                "recording must not run backwards in time, an event is before the last"
+            )
+        last = t[-1]
         lookup.check(chunk)
-        edges = origin + 1e6 * rule.start_s, origin + 1e6 * rule.end_s
-        first, end = np.searchsorted(t, edges)
-        if end > first:
-            yield chunk[first:end]
-        if end < t.size:
-            return
+        yield chunk
 
 
-def _by_time(chunks: Iterable[np.ndarray], lookup: Lookup, rule: Rule) -> Iterator[Window]:
-    period, start, pending, k = 1e6 / rule.fps, None, None, 1
+def _by_time(
+    chunks: Iterable[np.ndarray], lookup: Lookup, rule: Rule, start: float, end: float
+) -> Iterator[Window]:
+    period, k, last = 1e6 / rule.fps, 1, start
+    pending = None
     for chunk in chunks:
-        start = int(chunk["t"][0]) if start is None else start
         pending = chunk if pending is None else np.concatenate([pending, chunk])
-        last = int(chunk["t"][-1])
-        while start + k * period <= last:
+        last = min(float(chunk["t"][-1]) + 1, end)
+        while start + k * period < last:
             yield _window(pending, lookup, rule, start, k)
             k += 1
         oldest = start + (k - rule.overlap) * period
         pending = pending[np.searchsorted(pending["t"], oldest) :]
-    if pending is None:
-        return
-    while start + (k - 1 + COVERED) * period <= last + 1:
+        if last == end:
+            break
+    while start + (k - 1 + COVERED) * period <= last:
         yield _window(pending, lookup, rule, start, k)
         k += 1
 
 
-def _window(events: np.ndarray, lookup: Lookup, rule: Rule, start: int, k: int) -> Window:
+def _window(events: np.ndarray, lookup: Lookup, rule: Rule, start: float, k: int) -> Window:
     end = start + k * 1e6 / rule.fps
     begin = start + (k - rule.overlap) * 1e6 / rule.fps
     first, stop = np.searchsorted(events["t"], [begin, end])
@@ -144,19 +146,23 @@ def _grid(events: np.ndarray, lookup: Lookup, rule: Rule, begin: float, end: flo
     return Window(begin, end, len(events) - outside, outside, grid)
 
 
-def _by_count(chunks: Iterable[np.ndarray], lookup: Lookup, rule: Rule) -> Iterator[Window]:
-    pending, begin = None, None
+def _by_count(
+    chunks: Iterable[np.ndarray], lookup: Lookup, rule: Rule, begin: float, end: float
+) -> Iterator[Window]:
+    pending = None
     for chunk in chunks:
-        begin = float(chunk["t"][0]) if begin is None else begin
-        pending = chunk if pending is None else np.concatenate([pending, chunk])
+        early = chunk[: np.searchsorted(chunk["t"], end)]
+        pending = early if pending is None else np.concatenate([pending, early])
         inside = np.flatnonzero(lookup.view[pending["y"], pending["x"]] >= 0)
         stop = 0
         for nth in inside[rule.count - 1 :: rule.count]:
             events, stop = pending[stop : nth + 1], nth + 1
-            end = max(float(events["t"][-1]), begin + 1.0)
-            yield _grid(events, lookup, rule, begin, end)
-            begin = end
+            last = max(float(events["t"][-1]), begin + 1.0)
+            yield _grid(events, lookup, rule, begin, last)
+            begin = last
         pending = pending[stop:]
+        if len(early) < len(chunk):
+            return
 
 
 @dataclass

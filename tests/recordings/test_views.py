@@ -1,0 +1,221 @@
+"""The calibration finds what the simulated kaleidoscope is; the lookup splits without loss."""
+
+import numpy as np
+import pytest
+import torch
+
+from src.recordings import alignment, capture, lookup, views
+from src.recordings.targets import Charuco, Checkerboard, Circles
+from src.sim.optics import layout
+from src.sim.voxel import voxel_grid
+from tests.recordings import pictures
+
+SENSOR, SIDE = (720, 1280), pictures.SIDE
+TARGETS = {
+    "checkerboard": (Checkerboard(5, 7), pictures.checkerboard(5, 7)),
+    "square checkerboard": (Checkerboard(6, 6), pictures.checkerboard(6, 6, angle=-0.08)),
+    "circles": (Circles(5, 7), pictures.circles(5, 7)),
+    "charuco": (Charuco(6, 6), pictures.charuco()),
+}
+EVENT = np.dtype([("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)])
+
+
+@pytest.fixture(scope="module")
+def truth() -> views.Views:
+    return capture.kaleidoscope(list(layout(9)), model=(SIDE, SIDE), sensor=SENSOR, key=3)
+
+
+def shown(
+    truth: views.Views, picture: np.ndarray, keep=range(9), noise: float = 0.02
+) -> np.ndarray:
+    """Return what the sensor sees (uint8) when the views `keep` show `picture`."""
+    frames = torch.zeros(9, 1, *picture.shape)
+    frames[list(keep)] = torch.from_numpy(picture)
+    table = lookup.build(truth)
+    seen = capture.sensor_frames(frames, table, capture.vignette(table), slice(None))[0].numpy()
+    seen = seen + np.random.default_rng(0).normal(0, noise, seen.shape)
+    return np.clip(seen * 255, 0, 255).astype(np.uint8)
+
+
+def distance_px(found: views.Views, truth: views.Views) -> dict:
+    """Return the mean distance over the field between the true and the found place of a pixel."""
+    true = {view.position: view.homography for view in truth.views}
+    left, top, right, bottom = found.field
+    field = np.stack(np.meshgrid(np.linspace(left, right, 9), np.linspace(top, bottom, 9)), -1)
+    field = field.reshape(-1, 2)
+    far = {}
+    for view in found.views:
+        on_sensor = views.apply(np.linalg.inv(true[view.position]), field)
+        offset = views.apply(view.homography, on_sensor) - field
+        far[view.position] = np.linalg.norm(offset, axis=1).mean()
+    return far
+
+
+def calibrate(picture, target, **options):
+    found = alignment.find(picture, target, **options)
+    return alignment.align(found, sensor=SENSOR, model=(176, 176)).views
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_homographies_within_a_third_of_a_pixel_and_flips_right(truth, name):
+    target, picture = TARGETS[name]
+    found = calibrate(shown(truth, picture), target)
+    assert found.positions == list(layout(9))
+    assert max(distance_px(found, truth).values()) < 0.3
+    for mine, true in zip(found.views, truth.views, strict=True):
+        assert found.mirrored(mine) == truth.mirrored(true)
+        odd = sum(mine.position) % 2
+        assert np.sign(np.linalg.det(mine.homography)) == (-1 if odd else 1)
+
+
+def test_field_is_the_centre_tile_less_its_margin(truth):
+    target, picture = TARGETS["checkerboard"]
+    found = calibrate(shown(truth, picture), target)
+    left, top, right, bottom = truth.field
+    expected = np.array([left, top, right, bottom]) + 0.04 * (right - left) * np.array(
+        [1, 1, -1, -1]
+    )
+    assert np.abs(np.array(found.field) - expected).max() < 4  # misaligned by 3 px a corner
+
+
+def test_charuco_finds_unmirrored_views_by_itself(truth):
+    target, picture = TARGETS["charuco"]
+    seen = shown(truth, picture)
+    assert calibrate(seen, target, mirrors=False) == calibrate(seen, target, mirrors=True)
+
+
+def test_a_view_that_does_not_show_the_target_is_left_out(truth):
+    target, picture = TARGETS["circles"]
+    found = calibrate(shown(truth, picture, keep=[0, 1, 3, 4, 5]), target)
+    assert found.positions == [(-1, -1), (-1, 0), (0, -1), (0, 0), (0, 1)]
+    assert max(distance_px(found, truth).values()) < 0.3
+
+
+def test_fewer_than_four_views_are_refused_but_reported(truth):
+    target, picture = TARGETS["circles"]
+    found = alignment.find(shown(truth, picture, keep=[3, 4, 5]), target)
+    assert sorted(found.points) == [(0, -1), (0, 0), (0, 1)]
+    with pytest.raises(ValueError, match="in 4 or more views .* got 3"):
+        alignment.align(found, sensor=SENSOR, model=(176, 176))
+
+
+def test_a_picture_without_targets_shows_none():
+    noise = np.random.default_rng(0).integers(0, 255, SENSOR).astype(np.uint8)
+    assert not alignment.find(noise, Circles(5, 7)).points
+
+
+def test_corners_by_hand_give_the_true_homographies(truth):
+    corners = {view.position: truth.outline(view) for view in truth.views}
+    by_hand = alignment.by_hand(corners, sensor=SENSOR, model=(176, 176))
+    assert max(distance_px(by_hand, truth).values()) < 0.01
+
+
+def test_file_comes_back_exactly(truth, tmp_path):
+    truth.save(tmp_path / "views.yaml")
+    back = views.load(tmp_path / "views.yaml", SENSOR)
+    assert (back.sensor, back.model, back.field) == (truth.sensor, truth.model, truth.field)
+    for mine, true in zip(back.views, truth.views, strict=True):
+        assert np.array_equal(mine.homography, true.homography)
+    assert not list(tmp_path.glob("views.yaml?*"))
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (("sensor: [720, 1280]", "sensor: [480, 640]"), "lie on the 640x480 sensor"),
+        (("mirrored: [true, true]", "mirrored: [false, true]"), "contradicts"),
+        (("model: [240, 240]", "model: [240, 2400000]"), "views.model must be in"),
+        (("model: [240, 240]", "model: [240]"), "TypeError"),
+        (("position: [-1, -1]", "position: [0, 0]"), "different positions"),
+        (("field: [", "field: [.nan, "), "TypeError"),
+        (("- [0", "- [.inf"), "finite and regular"),
+        (("views:", "windows:"), "KeyError"),
+        (("sensor:", "{ sensor:"), "must be a file of calibrate"),
+    ],
+)
+def test_a_spoilt_file_is_refused_in_one_line(truth, tmp_path, change, message):
+    path = tmp_path / "views.yaml"
+    truth.save(path)
+    text = path.read_text()
+    path.write_text(text.replace(*change) if change[0] in text else text.replace("[", "{", 1))
+    with pytest.raises(ValueError, match=message):
+        views.load(path)
+
+
+def test_views_of_another_sensor_are_refused(truth, tmp_path):
+    truth.save(tmp_path / "views.yaml")
+    with pytest.raises(ValueError, match="must be the recording's"):
+        views.load(tmp_path / "views.yaml", (480, 640))
+
+
+def test_an_absent_file_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="FileNotFoundError"):
+        views.load(tmp_path / "none.yaml")
+
+
+def stream(count: int, sensor=SENSOR, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    events = np.zeros(count, EVENT)
+    events["t"] = np.sort(rng.integers(0, 10_000, count))
+    events["x"], events["y"] = rng.integers(0, sensor[1], count), rng.integers(0, sensor[0], count)
+    events["p"] = rng.choice([-1, 1], count)
+    return events
+
+
+@pytest.mark.parametrize("nearest", [False, True])
+def test_splitting_keeps_the_mass_of_each_view_and_counts_the_rest(truth, nearest):
+    table, events = lookup.build(truth), stream(50_000)
+    grid = table.empty(5)
+    outside = table.add(events, grid, 0, 10_000, nearest=nearest)
+    view = table.view[events["y"], events["x"]]
+    assert outside == (view < 0).sum() > 0
+    for index in range(9):
+        assert grid[index].sum() == pytest.approx(events["p"][view == index].sum(), abs=1e-2)
+
+
+def test_nearest_splat_is_the_voxel_grid_of_each_views_events(truth):
+    table, events = lookup.build(truth), stream(50_000)
+    grid = table.empty(5)
+    table.add(events, grid, 0, 10_000, nearest=True)
+    kept, view = table.split(events)
+    for index in range(9):
+        mine = kept[view == index]
+        fields = (mine[name] for name in "txyp")
+        expected = voxel_grid(*fields, t0=0, t1=10_000, bins=5, height=SIDE, width=SIDE)
+        assert np.abs(grid[index] - expected.numpy()).max() < 1e-4
+
+
+def test_bilinear_splat_is_a_hat_around_each_place(truth):
+    table, event = lookup.build(truth), stream(1)
+    event["x"], event["y"], event["t"], event["p"] = 700, 380, 2500, -1
+    grid = table.empty(5)
+    table.add(event, grid, 0, 10_000)
+    u, v = table.place[380, 700]
+    x, y = np.arange(SIDE), np.arange(SIDE)[:, None]
+    hat = np.clip(1 - abs(x - u), 0, None) * np.clip(1 - abs(y - v), 0, None)
+    assert np.abs(grid[4, 1] + hat).max() < 1e-5  # 2500 us is the place of bin 1 of 5
+    assert np.abs(grid[4, [0, 2, 3, 4]]).max() < 1e-5
+
+
+def test_one_view_at_sensor_size_is_the_plain_voxel_grid():
+    events = stream(5000, (60, 80))
+    table = lookup.build(views.Views.single((60, 80), (60, 80)))
+    grid = table.empty(3)
+    assert table.add(events, grid, 0, 10_000) == 0
+    fields = (events[name] for name in "txyp")
+    expected = voxel_grid(*fields, t0=0, t1=10_000, bins=3, height=60, width=80)
+    assert np.abs(grid[0] - expected.numpy()).max() < 1e-5
+
+
+def test_an_event_off_the_sensor_is_refused(truth):
+    table, events = lookup.build(truth), stream(10)
+    events["x"][3] = 1280
+    with pytest.raises(ValueError, match="1280x720 sensor"):
+        table.add(events, table.empty(5), 0, 10_000)
+
+
+def test_registered_views_agree_with_the_scene(truth):
+    picture = pictures.circles(5, 7)
+    registered = truth.register(shown(truth, picture, noise=0.0) / 255.0)
+    inner = (slice(None), slice(60, -60), slice(60, -60))
+    assert np.corrcoef(registered[inner].mean(0).ravel(), picture[inner[1:]].ravel())[0, 1] > 0.99
