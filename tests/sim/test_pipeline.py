@@ -1,0 +1,144 @@
+"""The laws of the whole chain (numbers as in docs/conventions.md)."""
+
+import math
+
+import pytest
+import torch
+
+from src.data.augment import Augment
+from src.data.datamodule import LightFieldData, StepSampler
+from src.sim.optics import Optics
+from src.sim.pipeline import Pipeline, simulate
+from src.sim.scenes import Clip
+
+IDEAL = {"threshold": 0.2, "refractory_s": 0.0}
+STRONG = {"atmosphere": {"severity": "strong"}}
+CALM = {"atmosphere": {"severity": "none"}}
+
+
+class Waves:
+    """A scene of two drifting gratings; a function of the index."""
+
+    def __init__(self, frames: int = 5, side: int = 48, contrast: float = 0.35):
+        self.frames, self.side, self.contrast = frames, side, contrast
+
+    def clip(self, index: int) -> Clip:
+        x = torch.arange(self.side).float()
+        phase = torch.arange(self.frames).float().reshape(-1, 1, 1) * 0.4 + index
+        frames = 0.5 + self.contrast * torch.sin(0.35 * x + phase) * torch.cos(
+            0.22 * x[:, None] - phase
+        )
+        return Clip(frames, 120.0, f"waves{index}")
+
+
+def pipeline(turbulence=CALM, sensor=IDEAL, optics=None, scene=None, **kwargs) -> Pipeline:
+    return Pipeline(
+        scene or Waves(), optics or Optics(9), turbulence, sensor, split="test", **kwargs
+    )
+
+
+def test_law_1_without_turbulence_events_follow_the_log_intensity_within_a_threshold():
+    chain = pipeline()
+    sample = simulate(chain, [3])
+    frames = chain.scene.clip(3).frames
+    summed = IDEAL["threshold"] * sample.voxels.sum(3).cumsum(1)  # (1, windows, views, h, w)
+    change = (frames[1:] / frames[0]).log()[None, :, None]
+    assert float((summed - change).abs().max()) < IDEAL["threshold"] + 1e-5
+    assert float(summed.abs().max()) > 3 * IDEAL["threshold"]
+    assert torch.equal(sample.target[0, :, 0], frames[1:])
+
+
+@pytest.mark.parametrize("misalignment_px", [0.0, 0.5])
+def test_law_2_single_is_the_centre_view_of_3x3(misalignment_px):
+    nine = simulate(pipeline(STRONG, optics=Optics(9, misalignment_px=misalignment_px)), [5])
+    one = simulate(pipeline(STRONG, optics=Optics(1, misalignment_px=misalignment_px)), [5])
+    assert torch.equal(nine.voxels[:, :, 4:5], one.voxels)
+    assert torch.equal(nine.turbulent, one.turbulent)
+    assert int((nine.voxels[:, :, 0] != nine.voxels[:, :, 4]).sum()) > 100
+
+
+def test_law_3_a_view_depends_on_its_own_draws_only():
+    all_nine = simulate(pipeline(STRONG), [5]).voxels
+    some = Optics(3, positions=[(1, 1), (0, 0), (-1, 0)])
+    chosen = simulate(pipeline(STRONG, optics=some), [5]).voxels
+    assert torch.equal(all_nine[:, :, [8, 4, 1]], chosen)
+
+
+def test_law_3_a_sample_does_not_depend_on_its_batch():
+    chain = pipeline(STRONG, sensor={"threshold": [0.1, 0.7], "shot_hz": 5.0})
+    together, alone = simulate(chain, [4, 9]), simulate(chain, [9])
+    assert torch.equal(together.voxels[1:], alone.voxels)
+    assert together.drawn[1] == alone.drawn[0]
+    assert together.drawn[0]["threshold"] != together.drawn[1]["threshold"]
+
+
+def test_law_5_a_crop_is_the_crop_of_the_whole_away_from_the_border():
+    sensor = {"threshold": 0.3, "shot_hz": 20.0, "mismatch": 0.1}
+    whole = simulate(pipeline(STRONG, sensor, scene=Waves(side=96)), [2])
+    crop = simulate(pipeline(STRONG, sensor, scene=Waves(side=96), crop=48), [2])
+    assert crop.voxels.shape[-2:] == (48, 48)
+    inner = (whole.voxels[..., 24:72, 24:72] - crop.voxels).abs() > 1e-4
+    # The same light to float rounding: a crossing may fall on the other side of a tie.
+    assert float(inner.float().mean()) < 2e-3
+    assert torch.equal(whole.target[..., 24:72, 24:72], crop.target)
+
+
+def test_law_7_a_flat_scene_stays_flat_and_makes_no_event():
+    sample = simulate(pipeline(STRONG, scene=Waves(contrast=0.0)), [1])
+    assert torch.allclose(sample.turbulent, torch.full_like(sample.turbulent, 0.5), atol=1e-4)
+    assert float(sample.voxels.abs().max()) == 0
+
+
+def test_sub_frame_samples_refine_the_same_windows():
+    fine = pipeline(scene=Waves(frames=9), substeps=2)
+    sample = simulate(fine, [0])
+    assert sample.voxels.shape[1] == sample.target.shape[1] == 4 and sample.fps == 60.0
+    assert torch.equal(sample.target[0, :, 0], Waves(frames=9).clip(0).frames[2::2])
+
+
+def test_what_was_drawn_is_recorded():
+    drawn = simulate(pipeline(STRONG, sensor={"threshold": [0.1, 0.7]}), [0]).drawn[0]
+    assert 4 <= drawn["d_over_r0"] < 10 and 0.1 <= drawn["threshold"] <= 0.7
+    assert drawn["tilt_px"] > 0 and math.isfinite(drawn["tilt_px"])
+
+
+def test_finite_clips_come_again_with_other_crops():
+    chain = pipeline(STRONG, crop=16, random_crop=True, clips=3)
+    first, again = chain.draw(1), chain.draw(4)
+    assert first.key == again.key and first.crop != again.crop
+
+
+@pytest.mark.parametrize("crop", [0, 4, 49, 1.5])
+def test_a_crop_that_does_not_fit_names_its_key(crop):
+    with pytest.raises(ValueError, match="data.crop"):
+        pipeline(crop=crop).draw(0)
+
+
+def test_workers_change_nothing():
+    def batches(workers: int) -> list[torch.Tensor]:
+        chain = pipeline(STRONG, sensor={"threshold": [0.1, 0.7]}, crop=16, random_crop=True)
+        data = LightFieldData(
+            {"train": chain}, Augment(), batch_size=2, epoch_clips=4, workers=workers
+        )
+        data.trainer = FakeTrainer()
+        return [batch.voxels for batch in data.train_dataloader()]
+
+    for zero, two in zip(batches(0), batches(2), strict=True):
+        assert torch.equal(zero, two)
+
+
+class FakeTrainer:
+    global_step, global_rank, world_size = 0, 0, 1
+
+
+def test_sampler_goes_on_where_the_training_stopped():
+    whole = list(StepSampler(2, 4, lambda: 0))
+    assert whole == [[0, 1], [2, 3], [4, 5], [6, 7]]
+    assert list(StepSampler(2, 4, lambda: 3)) == whole[3:]
+    assert list(StepSampler(2, 4, lambda: 4))[0] == [8, 9]
+
+
+def test_processes_share_a_batch_without_overlap():
+    shards = [list(StepSampler(2, 3, lambda: 0, rank=rank, world=2)) for rank in (0, 1)]
+    joint = list(StepSampler(4, 3, lambda: 0))
+    assert [a + b for a, b in zip(*shards, strict=True)] == joint
