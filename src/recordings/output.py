@@ -1,0 +1,122 @@
+"""Frames to a file as they come: MP4, GIF, PNG or HDF5, with a table of their time stamps.
+
+Every format keeps what was written when the run is stopped, and holds one frame at a time.
+"""
+
+import csv
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import GifImagePlugin, Image
+
+from src.recordings.stream import Frame
+
+Picture = UInt8[np.ndarray, "h w"]
+Add = Callable[[Picture, Frame], None]
+
+
+@contextmanager
+def sink(kind: str, folder: Path, size: tuple[int, int], playback_fps: float = 30.0):
+    """Open `video.mp4`, `video.gif`, `frames/` or `video.h5` in `folder`; yield `write(frame)`.
+
+    `size` is (height, width); `playback_fps` how fast an MP4 or GIF is shown.  `frames.csv` gets
+    each frame's index, time in seconds, events in views and outside.  Raises ValueError for another
+    `kind`, or where the file cannot be written.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"output must be one of {', '.join(KINDS)}, got {kind}")
+    if not 0.1 <= playback_fps <= 1000:
+        raise ValueError(f"playback must be in [0.1, 1000] fps, got {playback_fps}")
+    folder.mkdir(parents=True, exist_ok=True)
+    with (
+        open(folder / "frames.csv", "w", newline="") as file,
+        KINDS[kind](folder, size, playback_fps) as add,
+    ):
+        table = csv.writer(file)
+        table.writerow(["frame", "time_s", "events", "outside"])
+        count = 0
+
+        def write(frame: Frame) -> None:
+            nonlocal count
+            add(eight_bits(frame.picture), frame)
+            table.writerow([count, f"{frame.time_s:.6f}", frame.events, frame.outside])
+            count += 1
+
+        yield write
+
+
+def eight_bits(picture: Float[np.ndarray, "h w"]) -> Picture:
+    """Return a picture in [0, 1] as uint8, rounded."""
+    return (np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+@contextmanager
+def _mp4(folder: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
+    code = cv2.VideoWriter_fourcc(*"vp09")  # what both browsers and the OpenCV wheel know
+    writer = cv2.VideoWriter(str(folder / "video.mp4"), code, fps, size[::-1], False)
+    if not writer.isOpened():
+        raise ValueError(f"output=mp4 must be writable at {folder}, got no encoder; try output=png")
+    try:
+        yield lambda picture, frame: writer.write(picture)
+    finally:
+        writer.release()
+
+
+@contextmanager
+def _gif(folder: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
+    hundredths = max(2, round(100 / fps))
+    with open(folder / "video.gif", "wb") as file:
+        blank = Image.new("L", size[::-1])
+        file.write(b"".join(GifImagePlugin.getheader(blank, info={"loop": 0})[0]))
+
+        def add(picture: Picture, frame: Frame) -> None:
+            image = Image.fromarray(picture)
+            file.write(b"".join(GifImagePlugin.getdata(image, duration=10 * hundredths)))
+
+        try:
+            yield add
+        finally:
+            file.write(b";")
+
+
+@contextmanager
+def _png(folder: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
+    frames = folder / "frames"
+    frames.mkdir(exist_ok=True)
+    count = 0
+
+    def add(picture: Picture, frame: Frame) -> None:
+        nonlocal count
+        cv2.imwrite(str(frames / f"{count:07d}.png"), picture)
+        count += 1
+
+    yield add
+
+
+@contextmanager
+def _hdf5(folder: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
+    with h5py.File(folder / "video.h5", "w") as file:
+        frames = file.create_dataset(
+            "frames",
+            (0, *size),
+            np.uint8,
+            maxshape=(None, *size),
+            chunks=(1, *size),
+            compression="lzf",
+        )
+        times = file.create_dataset("time_s", (0,), np.float64, maxshape=(None,), chunks=(4096,))
+
+        def add(picture: Picture, frame: Frame) -> None:
+            for data, value in ((frames, picture), (times, frame.time_s)):
+                data.resize(len(data) + 1, axis=0)
+                data[-1] = value
+
+        yield add
+
+
+KINDS = {"mp4": _mp4, "gif": _gif, "png": _png, "hdf5": _hdf5}

@@ -1,0 +1,84 @@
+"""Every format gives back the frames and their times, also of a run that was stopped."""
+
+import csv
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+
+from src.recordings.output import sink
+from src.recordings.stream import Frame
+
+SIZE = (48, 64)
+
+
+def frames(count: int = 5) -> list[Frame]:
+    ramp = np.linspace(0, 0.8, SIZE[1], dtype=np.float32) * np.ones((SIZE[0], 1), np.float32)
+    return [Frame(0.25 * k, ramp + 0.04 * k, 10 * k, k) for k in range(count)]
+
+
+def video(path) -> np.ndarray:
+    file, found = cv2.VideoCapture(str(path)), []
+    while (read := file.read())[0]:
+        found.append(read[1][..., 0])
+    return np.stack(found)
+
+
+def gif(path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.stack([_seek(image, k) for k in range(image.n_frames)])
+
+
+def _seek(image, k):
+    image.seek(k)
+    return np.asarray(image.convert("L"))
+
+
+def png(folder) -> np.ndarray:
+    return np.stack([cv2.imread(str(path), 0) for path in sorted(folder.glob("*.png"))])
+
+
+def hdf5(path) -> np.ndarray:
+    with h5py.File(path) as file:
+        assert file["time_s"][:].tolist() == [0.25 * k for k in range(len(file["frames"]))]
+        return file["frames"][:]
+
+
+READERS = {
+    "mp4": (video, "video.mp4", 6),
+    "gif": (gif, "video.gif", 0),
+    "png": (png, "frames", 0),
+    "hdf5": (hdf5, "video.h5", 0),
+}
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_frames_come_back(kind, tmp_path):
+    with sink(kind, tmp_path, SIZE) as write:
+        for frame in frames():
+            write(frame)
+    read, name, loss = READERS[kind]
+    expected = np.stack([np.round(frame.picture * 255) for frame in frames()])
+    assert np.abs(read(tmp_path / name).astype(float) - expected).max() <= loss + 1
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_what_was_done_is_kept_when_the_run_fails(kind, tmp_path):
+    with pytest.raises(ValueError, match="halfway"), sink(kind, tmp_path, SIZE) as write:
+        for frame in frames(3):
+            write(frame)
+        raise ValueError("halfway")
+    read, name, _ = READERS[kind]
+    assert len(read(tmp_path / name)) == 3
+    with open(tmp_path / "frames.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["time_s"]) for row in rows] == [0, 0.25, 0.5]
+    assert rows[2]["events"] == "20" and rows[2]["outside"] == "2"
+
+
+@pytest.mark.parametrize("kind, playback, message", [("avi", 30, "output"), ("mp4", 0, "playback")])
+def test_a_wrong_choice_is_refused(kind, playback, message, tmp_path):
+    with pytest.raises(ValueError, match=message), sink(kind, tmp_path, SIZE, playback):
+        pass
