@@ -135,7 +135,7 @@ def test_sampler_goes_on_where_the_training_stopped():
     whole = list(StepSampler(2, 4, lambda: 0))
     assert whole == [[0, 1], [2, 3], [4, 5], [6, 7]]
     assert list(StepSampler(2, 4, lambda: 3)) == whole[3:]
-    assert list(StepSampler(2, 4, lambda: 4))[0] == [8, 9]
+    assert next(iter(StepSampler(2, 4, lambda: 4))) == [8, 9]
 
 
 def test_processes_share_a_batch_without_overlap():

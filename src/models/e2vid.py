@@ -1,0 +1,97 @@
+"""E2VID (Rebecq et al., TPAMI 2019), all of it here, on one or many views.
+
+Views are stacked as channels (channel = view * bins + bin), the only change of the paper:
+head -> three recurrent encoders (stride 2) -> two residual blocks -> three decoders with skip sums
+-> skip sum with the head -> one channel.  10,710,401 parameters with 5 input channels and base 32.
+"""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.nn.utils.parametrizations import spectral_norm as normalise_spectrum
+
+from src.models.layers import ConvGRU, ConvLSTM, ResidualBlock, pad_to_multiple
+
+CELLS = {"convlstm": ConvLSTM, "convgru": ConvGRU}
+ACTIVATIONS = {"sigmoid": torch.sigmoid, "none": lambda x: x}
+SCALES = 3
+
+
+class E2VID(nn.Module):
+    """Voxel grids of `views` views and `bins` bins to frames, window by window.
+
+    `base_channels`: channels of the head, doubled at each of three scales.  `recurrent`: convlstm
+    or convgru.  `kernel_size`: of head, encoders and decoders (published: 5).  `final_activation`:
+    sigmoid or none.  `spectral_norm`: keep the largest singular value of the gate kernels at one
+    (Miyato et al. 2018); wrap an unroll in `torch.nn.utils.parametrize.cached()` so that it is
+    computed once.  Raises ValueError for values outside these.
+    """
+
+    def __init__(
+        self,
+        views: int = 1,
+        bins: int = 5,
+        base_channels: int = 32,
+        recurrent: str = "convlstm",
+        kernel_size: int = 5,
+        final_activation: str = "sigmoid",
+        spectral_norm: bool = False,
+    ):
+        super().__init__()
+        _choose("recurrent", recurrent, CELLS)
+        _choose("final_activation", final_activation, ACTIVATIONS)
+        if kernel_size % 2 == 0 or kernel_size < 1:
+            raise ValueError(f"model.kernel_size must be odd and >= 1, got {kernel_size}")
+        self.views, self.bins, self.activation = views, bins, ACTIVATIONS[final_activation]
+        widths = [base_channels * 2**scale for scale in range(SCALES + 1)]
+        pairs = list(zip(widths, widths[1:], strict=False))
+        cell = CELLS[recurrent]
+        self.head = _conv(views * bins, base_channels, kernel_size)
+        self.encoders = nn.ModuleList(_conv(a, b, kernel_size, stride=2) for a, b in pairs)
+        self.cells = nn.ModuleList(cell(width) for width in widths[1:])
+        self.resblocks = nn.ModuleList(ResidualBlock(widths[-1]) for _ in range(2))
+        self.decoders = nn.ModuleList(_conv(b, a, kernel_size) for a, b in reversed(pairs))
+        self.pred = nn.Conv2d(base_channels, 1, 1)
+        if spectral_norm:
+            for gate in (m for c in self.cells for m in c.children()):
+                normalise_spectrum(gate)
+
+    def forward(
+        self, voxels: Float[Tensor, "n views bins h w"], state: Any = None
+    ) -> tuple[Float[Tensor, "n 1 h w"], Any]:
+        """Return the frame at the end of the window and the state, one entry per scale.
+
+        Raises ValueError when views or bins are not the network's.
+        """
+        height, width = voxels.shape[-2:]
+        if tuple(voxels.shape[1:3]) != (self.views, self.bins):
+            wanted, got = (self.views, self.bins), tuple(voxels.shape[1:3])
+            raise ValueError(f"optics.views, bins must be {wanted} for this network, got {got}")
+        x, (top, left) = pad_to_multiple(voxels.flatten(1, 2), 2**SCALES)
+        head = x = self.head(x).relu()
+        skips, after = [], []
+        for encoder, cell, before in zip(
+            self.encoders, self.cells, state or [None] * SCALES, strict=True
+        ):
+            x, new = cell(encoder(x).relu(), before)
+            skips.append(x)
+            after.append(new)
+        for block in self.resblocks:
+            x = block(x)
+        for decoder, skip in zip(self.decoders, reversed(skips), strict=True):
+            x = functional.interpolate(x + skip, scale_factor=2, mode="bilinear")
+            x = decoder(x).relu()
+        frame = self.activation(self.pred(x + head))
+        return frame[..., top : top + height, left : left + width], tuple(after)
+
+
+def _conv(inputs: int, outputs: int, kernel_size: int, stride: int = 1) -> nn.Conv2d:
+    return nn.Conv2d(inputs, outputs, kernel_size, stride, padding=kernel_size // 2)
+
+
+def _choose(name: str, value: str, allowed: dict) -> None:
+    if value not in allowed:
+        raise ValueError(f"model.{name} must be one of {', '.join(allowed)}, got {value}")
