@@ -61,8 +61,8 @@ def _outline(axes: Axes, views: Views, view) -> None:
     axes.plot(*outline[0], "o", color="tab:green", markersize=5)  # the field's top left corner
     row, col = view.position
     text = f"({row}, {col}) {view.error_px:.2f} px"
-    top = outline.min(0) + [np.ptp(outline[:, 0]) / 2, 12]
-    axes.text(*top, text, color="black", ha="center", fontsize=8, bbox=LABEL)
+    x, y = outline[:, 0].mean(), outline[:, 1].min() + 12
+    axes.text(x, y, text, color="black", ha="center", fontsize=8, bbox=LABEL)
 
 
 def turbulence(statistics: Statistics, positions: list[tuple[int, int]], path: Path) -> None:

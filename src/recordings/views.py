@@ -32,7 +32,7 @@ def apply(
         return mapped[:, :2] / mapped[:, 2:]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class View:
     """One sub-aperture: grid position (row, col) relative to the centre view and its homography.
 
@@ -47,7 +47,7 @@ class View:
     points: int = 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Views:
     """The views of one sensor; `field` is the rectangle (left, top, right, bottom) of the centre
     view, in sensor pixels, that becomes the model picture.

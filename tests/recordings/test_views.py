@@ -1,5 +1,7 @@
 """The calibration finds what the simulated kaleidoscope is; the lookup splits without loss."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -80,8 +82,8 @@ def test_field_is_the_centre_tile_less_its_margin(truth):
 
 def test_charuco_finds_unmirrored_views_by_itself(truth):
     target, picture = TARGETS["charuco"]
-    seen = shown(truth, picture)
-    assert calibrate(seen, target, mirrors=False) == calibrate(seen, target, mirrors=True)
+    found = calibrate(shown(truth, picture), target, mirrors=False)
+    assert max(distance_px(found, truth).values()) < 0.3
 
 
 def test_a_view_that_does_not_show_the_target_is_left_out(truth):
@@ -122,13 +124,13 @@ def test_file_comes_back_exactly(truth, tmp_path):
 @pytest.mark.parametrize(
     "change, message",
     [
-        (("sensor: [720, 1280]", "sensor: [480, 640]"), "lie on the 640x480 sensor"),
-        (("mirrored: [true, true]", "mirrored: [false, true]"), "contradicts"),
-        (("model: [240, 240]", "model: [240, 2400000]"), "views.model must be in"),
-        (("model: [240, 240]", "model: [240]"), "TypeError"),
-        (("position: [-1, -1]", "position: [0, 0]"), "different positions"),
-        (("field: [", "field: [.nan, "), "TypeError"),
-        (("- [0", "- [.inf"), "finite and regular"),
+        ((r"sensor: \[720, 1280\]", "sensor: [480, 640]"), "lie on the 640x480 sensor"),
+        ((r"mirrored: \[true", "mirrored: [false"), "contradicts"),
+        ((r"model: \[240", "model: [2400000"), "views.model must be in"),
+        ((r"model: \[240, 240\]", "model: [240]"), "TypeError"),
+        ((r"position: \[-1, -1\]", "position: [0, 0]"), "different positions"),
+        ((r"\nfield: \[", "\nfield: [.nan, "), "TypeError"),
+        ((r"  - \[[^,]+", "  - [.inf"), "finite and regular"),
         (("views:", "windows:"), "KeyError"),
         (("sensor:", "{ sensor:"), "must be a file of calibrate"),
     ],
@@ -136,8 +138,9 @@ def test_file_comes_back_exactly(truth, tmp_path):
 def test_a_spoilt_file_is_refused_in_one_line(truth, tmp_path, change, message):
     path = tmp_path / "views.yaml"
     truth.save(path)
-    text = path.read_text()
-    path.write_text(text.replace(*change) if change[0] in text else text.replace("[", "{", 1))
+    text, count = re.subn(*change, path.read_text(), count=1)
+    assert count == 1
+    path.write_text(text)
     with pytest.raises(ValueError, match=message):
         views.load(path)
 
@@ -218,4 +221,4 @@ def test_registered_views_agree_with_the_scene(truth):
     picture = pictures.circles(5, 7)
     registered = truth.register(shown(truth, picture, noise=0.0) / 255.0)
     inner = (slice(None), slice(60, -60), slice(60, -60))
-    assert np.corrcoef(registered[inner].mean(0).ravel(), picture[inner[1:]].ravel())[0, 1] > 0.99
+    assert np.corrcoef(registered[inner].mean(0).ravel(), picture[inner[1:]].ravel())[0, 1] > 0.98
