@@ -1,0 +1,1 @@
+def voxels(job, grids): raise NotImplementedError
