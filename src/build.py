@@ -86,17 +86,18 @@ def network(cfg: DictConfig) -> tuple[nn.Module, dict]:
     return make(cfg.model), {"target": target, "kwargs": kwargs}
 
 
-def frozen(cfg: DictConfig) -> nn.Module:
-    """Return the network that `ckpt` or else `baseline` names, in eval mode.
-
-    Raises ValueError if neither is given or if it wants another number of views than `optics`.
-    """
+def chosen(cfg: DictConfig) -> nn.Module:
+    """Return the network that `ckpt` or else `baseline` names, in eval mode."""
     if cfg.ckpt:
-        found = src.models.load(cfg.ckpt)
-    elif cfg.get("baseline"):
-        found = make(cfg.baseline).eval()
-    else:
-        raise ValueError("ckpt or baseline must name a network, got neither")
+        return src.models.load(cfg.ckpt)
+    if cfg.get("baseline"):
+        return make(cfg.baseline).eval()
+    raise ValueError("ckpt or baseline must name a network, got neither")
+
+
+def frozen(cfg: DictConfig) -> nn.Module:
+    """Return the chosen network; ValueError if it wants another number of views than `optics`."""
+    found = chosen(cfg)
     wanted = found.views
     if wanted is not None and wanted != cfg.optics.views and not cfg.get("baseline"):
         raise ValueError(

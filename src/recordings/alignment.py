@@ -7,13 +7,15 @@ Points are (x, y) in sensor pixels, float64.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
+import yaml
 from jaxtyping import Float, UInt8
 
 from src.recordings.targets import Target, groups
-from src.recordings.views import Size, View, Views, apply
+from src.recordings.views import LARGEST_FILE, Size, View, Views, apply
 
 Position = tuple[int, int]
 Points = Float[np.ndarray, "_ 2"]
@@ -200,3 +202,22 @@ def by_hand(corners: Mapping[Position, Points], *, sensor: Size, model: Size) ->
     ]
     field = (*centre.min(0).tolist(), *centre.max(0).tolist())
     return Views(sensor, model, field, tuple(views))
+
+
+def read_corners(path: Path | str) -> dict[Position, Points]:
+    """Read corners given by hand: a YAML list of {position: [row, col], corners: four [x, y]}.
+
+    Raises ValueError for anything else.
+    """
+    try:
+        with open(path, encoding="utf-8") as file:
+            entries = yaml.safe_load(file.read(LARGEST_FILE))
+        return {
+            tuple(int(number) for number in entry["position"]): np.array(entry["corners"], float)
+            for entry in entries
+        }
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError) as error:
+        why = f"{type(error).__name__} {error}"
+        raise ValueError(
+            f"corners must be a list of position and corners, got {path}: {why}"
+        ) from None

@@ -75,6 +75,21 @@ class Statistics:
         """Correlation of tilt between the views, of the middle dot."""
         return correlation(self.tilt[:, :, self.middle].swapaxes(0, 1))
 
+    def summary(self) -> dict[str, float]:
+        """Return what the five panels show in numbers, of the middle dot of the centre view."""
+        dot, view = self.middle, self.centre
+        off = ~np.eye(len(self.tilt), dtype=bool)
+        return {
+            "frames": self.tilt.shape[1],
+            "failed": int(self.failed.sum()),
+            "tilt_rms_px": float(np.sqrt(_mean(self.tilt[view, :, dot] ** 2, None))),
+            "tilt_decay_s": decay_s(self.autocorrelation, self.fps),
+            "across_views": float(self.across_views[off].mean()) if off.any() else float("nan"),
+            "blur_ratio": float(self.blur_ratio[view, dot]),
+            "scintillation": float(self.scintillation[view, dot]),
+            "still_scintillation": float(self.still_scintillation[view, dot]),
+        }
+
     @property
     def middle(self) -> int:
         """The index of the middle dot."""
@@ -118,6 +133,12 @@ def find_dots(
         raise ValueError(f"turbulence: a {rows}x{cols} grid of dots must be seen, got none")
     by_row = points[np.argsort(points[:, 1])].reshape(rows, cols, 2)
     return np.concatenate([row[np.argsort(row[:, 0])] for row in by_row])
+
+
+def radius(places: Float[np.ndarray, "dots 2"]) -> int:
+    """Return half the distance of neighbouring dots, less a pixel: what a dot has to itself."""
+    apart = np.linalg.norm(places[:, None] - places, axis=-1)
+    return max(2, int(apart[apart > 0].min() / 2) - 1)
 
 
 def autocorrelation(tilt: Float[np.ndarray, "frames 2"], lags: int) -> Float[np.ndarray, " lags"]:
@@ -199,7 +220,7 @@ def write_csv(
         writer.writerows(rows)
 
 
-def _mean(values: np.ndarray, axis: int) -> np.ndarray | float:
+def _mean(values: np.ndarray, axis: int | None) -> np.ndarray | float:
     """The mean of what is finite; NaN, without a warning, where nothing is."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)

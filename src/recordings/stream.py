@@ -174,6 +174,19 @@ class Carry:
     frames: int = 0
 
 
+@torch.inference_mode()
+def each_view(
+    windows: Iterable[Window], network: nn.Module, *, overlap: int = 1
+) -> Iterator[Float[np.ndarray, "views h w"]]:
+    """Reconstruct every view by itself, with a network of one view; empty windows hold."""
+    states, pictures = [None] * overlap, None
+    for count, window in enumerate(windows):
+        if window.events or pictures is None:
+            voxels = torch.from_numpy(window.voxels.copy())[:, None]
+            pictures, states[count % overlap] = network(voxels, states[count % overlap])
+        yield pictures[:, 0].clamp(0, 1).numpy()
+
+
 @dataclass(frozen=True)
 class Frame:
     """A picture (h, w) float32 in [0, 1] at `time_s`, the end of its window, and its events."""
@@ -197,6 +210,11 @@ def wanted(network: nn.Module, views: int) -> bool:
     return wants != 1 or views == 1
 
 
+def takes(network: nn.Module, name: str) -> bool:
+    """Return whether the network's `forward` has a parameter `name`."""
+    return name in inspect.signature(network.forward).parameters
+
+
 @torch.inference_mode()
 def frames(
     windows: Iterable[Window],
@@ -215,12 +233,12 @@ def frames(
     """
     carry = Carry() if carry is None else carry
     carry.states.extend([None] * (overlap - len(carry.states)))
-    takes = inspect.signature(network.forward).parameters
+    asks = [name for name in ("window_s", "positions") if takes(network, name)]
     for window in windows:
         phase = carry.frames % overlap
         if window.events:
             known = {"window_s": (window.end_us - window.start_us) * 1e-6, "positions": positions}
-            told = {name: known[name] for name in known if name in takes}
+            told = {name: known[name] for name in asks}
             voxels = torch.from_numpy(window.voxels)[None].to(device)
             picture, carry.states[phase] = network(voxels, carry.states[phase], **told)
             carry.picture = picture[0, 0].clamp(0, 1).float().cpu()

@@ -1,0 +1,75 @@
+"""From a recording to video: python -m src.reconstruct recording=cap.raw views=views.yaml ckpt=...
+
+Writes the video and `frames.csv`: the time stamp and the events of each frame.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+from torch import nn
+
+from src import build, door
+from src.metrics import results
+from src.recordings import lookup, output, progress, sources, stream
+from src.recordings.views import Views, load
+
+
+def reconstruct(cfg: DictConfig) -> Path:
+    """Reconstruct `cfg.recording` frame by frame.  Returns the folder of the video.
+
+    Raises ValueError for a recording, views, network or window that do not go together.
+    """
+    run, net = Path(cfg.paths.run), build.chosen(cfg).to(cfg.device)
+    views = views_for(cfg, net)
+    results.open_run(run, door.resolved(cfg))
+    with output.sink(cfg.output, run, views.model, cfg.playback) as write:
+        for frame in progress.tell(frames(cfg, net, views), overlap(cfg, net)):
+            write(frame)
+    return run
+
+
+def views_for(cfg: DictConfig, net: nn.Module) -> Views:
+    """Return the views that `net` takes of the recording: all, or the centre one alone."""
+    sensor = sources.sensor_size(cfg.recording, cfg.sensor_size)
+    size = tuple(cfg.resolution) if cfg.resolution else None
+    there = load(cfg.views, sensor) if cfg.views else Views.single(sensor, size or sensor)
+    there = Views(sensor, size or there.model, there.field, there.views)
+    return there if stream.wanted(net, len(there.views)) else there.only([(0, 0)])
+
+
+def overlap(cfg: DictConfig, net: nn.Module) -> int:
+    """Return how many frames a window spans; a network that is told its length needs no overlap."""
+    if cfg.count:
+        return 1
+    span = cfg.span or ("frame" if stream.takes(net, "window_s") else "trained")
+    return stream.overlap(span, cfg.fps)
+
+
+def frames(cfg: DictConfig, net: nn.Module, views: Views) -> Iterator[stream.Frame]:
+    """Read, cut into windows and reconstruct, a chunk of the recording at a time."""
+    rule = stream.Rule(
+        fps=None if cfg.count else cfg.fps,
+        count=cfg.count,
+        overlap=overlap(cfg, net),
+        bins=cfg.bins,
+        nearest=cfg.splat == "nearest",
+        start_s=cfg.start,
+        end_s=cfg.end,
+    )
+    chunks = sources.events(cfg.recording, views.sensor, cfg.chunk_s)
+    windows = stream.windows(chunks, lookup.build(views), rule)
+    return stream.frames(
+        windows, net, overlap=rule.overlap, positions=views.positions, device=cfg.device
+    )
+
+
+@hydra.main(version_base=None, config_path="../conf", config_name="reconstruct")
+def main(cfg: DictConfig) -> None:
+    """Glue between Hydra and `reconstruct`."""
+    door.job(reconstruct, cfg)
+
+
+if __name__ == "__main__":
+    door.run(main)

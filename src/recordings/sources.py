@@ -1,0 +1,105 @@
+"""What is looked at: events of a sensor of known size, a sensor picture, a film."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+from jaxtyping import Float
+
+from src.recordings import formats
+from src.recordings.views import Size
+
+PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+FILMS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".gif")
+
+
+def sensor_size(path: Path | str, sensor: Size | None = None) -> Size:
+    """Return (height, width) of the recording's sensor; `sensor` for a file that does not say.
+
+    Raises ValueError where neither says, or both do and differ.
+    """
+    told = formats.open_events(path).size
+    told = told if told is None else told[::-1]
+    if told is None and sensor is None:
+        raise ValueError(f"{path} does not state its sensor; give sensor=[height,width]")
+    if None not in (told, sensor) and tuple(sensor) != told:
+        raise ValueError(f"sensor must be {told}, as {path} states, got {tuple(sensor)}")
+    return told or tuple(sensor)
+
+
+def events(path: Path | str, sensor: Size, seconds: float = 0.05) -> Iterator[np.ndarray]:
+    """Yield the events of a recording, `seconds` at a time."""
+    return formats.iter_events(path, seconds=seconds, size=sensor[::-1])
+
+
+def sensor_picture(path: Path | str, sensor: Size | None = None) -> Float[np.ndarray, "h w"]:
+    """Return a picture in [0, 1], the mean of a film, or the events of each pixel of a recording.
+
+    A target on a blinking screen makes events where it is bright, so that their count shows it.
+    Raises ValueError for a file that cannot be read.
+    """
+    path = Path(path)
+    if path.suffix.lower() in PICTURES:
+        return _picture(path)
+    if not holds_events(path):
+        total, count = 0.0, 0
+        for frame in film(path):
+            total, count = total + frame, count + 1
+        return total / count
+    counts = np.zeros(sensor_size(path, sensor))
+    for chunk in events(path, counts.shape):
+        pixels = np.ravel_multi_index((chunk["y"], chunk["x"]), counts.shape)
+        counts += np.bincount(pixels, minlength=counts.size).reshape(counts.shape)
+    return counts
+
+
+def holds_events(path: Path | str) -> bool:
+    """Return whether `path` is none of: folder of pictures, picture, film, our `video.h5`."""
+    path = Path(path)
+    if path.is_dir() or path.suffix.lower() in PICTURES + FILMS:
+        return False
+    return not (path.suffix == ".h5" and _has_frames(path))
+
+
+def film(path: Path | str) -> Iterator[Float[np.ndarray, "h w"]]:
+    """Yield the grey frames in [0, 1], float32, of a film, a folder of pictures or our `video.h5`.
+
+    Raises ValueError for a file that cannot be read or has no frame.
+    """
+    path, none = Path(path), True
+    for frame in _frames(path):
+        none = False
+        yield frame
+    if none:
+        raise ValueError(f"recording must be a film or a folder of pictures, got {path}")
+
+
+def _frames(path: Path) -> Iterator[np.ndarray]:
+    if path.is_dir():
+        names = sorted(name for name in path.iterdir() if name.suffix.lower() in PICTURES)
+        yield from map(_picture, names)
+    elif path.suffix == ".h5":
+        with h5py.File(path) as file:
+            for frame in file["frames"]:
+                yield frame.astype(np.float32) / 255
+    else:
+        file = cv2.VideoCapture(str(path))
+        while (read := file.read())[0]:
+            yield cv2.cvtColor(read[1], cv2.COLOR_BGR2GRAY).astype(np.float32) / 255
+
+
+def _picture(path: Path) -> np.ndarray:
+    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    if picture is None:
+        raise ValueError(f"recording must be a readable picture, got {path}")
+    return picture.astype(np.float32) / np.iinfo(picture.dtype).max
+
+
+def _has_frames(path: Path) -> bool:
+    try:
+        with h5py.File(path) as file:
+            return "frames" in file
+    except OSError:
+        return False
