@@ -30,7 +30,7 @@ CUTOUT_SIDE = 192  # of a cut-out's texture
 
 # The photographs inside the scikit-image wheel; no split shares one with another.
 EMBEDDED = {
-    "train": "astronaut brick camera clock_motion coins grass gravel hubble_deep_field moon retina",
+    "train": "astronaut brick camera coins grass gravel hubble_deep_field moon retina",
     "val": "chelsea",
     "test": "coffee motorcycle_left rocket",
 }
@@ -100,7 +100,7 @@ class Photographs:
 
     def _background(self, photo: NDArray, rng: np.random.Generator) -> "_Layer":
         zoom = rng.uniform(*self.zoom) * REFERENCE_WIDTH / self.size[1]
-        centre = rng.uniform(0.2, 0.8, 2) * photo.shape[::-1]
+        centre = rng.uniform(0.35, 0.65, 2) * photo.shape[::-1]
         return _Layer(_smooth(photo, zoom), None, centre, zoom, _Motion(rng, self.speed))
 
     def _cutout(self, rng: np.random.Generator) -> "_Layer":
@@ -116,15 +116,16 @@ class Photographs:
         return _Layer(_smooth(texture, zoom), mask, centre, zoom, _Motion(rng, self.speed))
 
     def _render(self, layers: Sequence["_Layer"], time: float) -> NDArray:
-        frame = None
-        for layer in layers:
+        background, *cutouts = layers
+        frame = _warp(background.picture, background.matrix(time, self.size), self.size)
+        for layer in cutouts:
             matrix = layer.matrix(time, self.size)
-            picture = _warp(layer.picture, matrix, self.size, cv2.BORDER_REFLECT_101)
-            if layer.mask is None:
-                frame = picture
-                continue
-            alpha = _warp(layer.mask, matrix, self.size, cv2.BORDER_CONSTANT)
-            frame = frame + alpha * (picture - frame)
+            rows, columns = _seen(layer.mask.shape, matrix, self.size)
+            behind = frame[rows, columns]
+            if behind.size:
+                matrix[:, 2] += matrix[:, :2] @ (columns.start, rows.start)
+                alpha = _warp(layer.mask, matrix, behind.shape, cv2.BORDER_CONSTANT)
+                behind += alpha * (_warp(layer.picture, matrix, behind.shape) - behind)
         return frame
 
 
@@ -219,17 +220,30 @@ def _smooth(picture: NDArray, zoom: float) -> NDArray:
 
 def _blob(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray:
     """Return a mask, 1 inside a random smooth outline that keeps off the picture's border."""
-    height, width = shape
-    y, x = np.mgrid[:height, :width]
-    x, y = (x - width / 2) / (width / 2), (y - height / 2) / (height / 2)
+    y, x = np.mgrid[-1:1:64j, -1:1:64j]
     angle = np.arctan2(y, x)
-    radius = np.full(shape, rng.uniform(0.5, 0.7))
+    radius = rng.uniform(0.5, 0.7)
     for order in range(2, 7):
         swing = rng.uniform(0, 0.3) / order
-        radius += swing * np.cos(order * angle + rng.uniform(0, 2 * math.pi))
-    return (np.hypot(x, y) < np.minimum(radius, 0.92)).astype(np.float32)
+        radius = radius + swing * np.cos(order * angle + rng.uniform(0, 2 * math.pi))
+    inside = 32 * (np.minimum(radius, 0.92) - np.hypot(x, y))
+    smooth = cv2.resize(inside.astype(np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC)
+    return np.clip(smooth, 0, 1)
 
 
-def _warp(picture: NDArray, matrix: NDArray, size: tuple[int, int], border: int) -> NDArray:
+def _seen(shape: tuple[int, ...], matrix: NDArray, size: tuple[int, int]) -> tuple[slice, slice]:
+    """Return the rows and columns of the frame that a picture of `shape` can touch."""
+    height, width = shape
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - matrix[:, 2]
+    x, y = np.linalg.solve(matrix[:, :2], corners.T)
+    spans = ((y.min(), y.max(), size[0]), (x.min(), x.max(), size[1]))
+    return tuple(
+        slice(max(0, int(low) - 1), max(0, min(int(high) + 2, n))) for low, high, n in spans
+    )
+
+
+def _warp(
+    picture: NDArray, matrix: NDArray, size: Sequence[int], border: int = cv2.BORDER_REFLECT_101
+) -> NDArray:
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return cv2.warpAffine(picture, matrix, size[::-1], flags=flags, borderMode=border)
