@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from src.sim import noise
-from src.sim.engines import sensor_eager, sensor_numba
+from src.sim.engines import sensor_cpu, sensor_eager
 from src.sim.engines.job import DEFER, DELETE, HOLD, Job, State
 from src.sim.response import EXTRA, UNIT, decode_srgb, nodes, response_table
 
 __all__ = ["EVENT", "EventSensor", "State", "decode_srgb"]
 
-EVENT = sensor_numba.EVENT
+EVENT = sensor_cpu.EVENT
 MODES = {"defer": DEFER, "delete": DELETE, "hold": HOLD}
 CHOICES = {
     "refractory": tuple(MODES),
@@ -43,7 +43,7 @@ RANGES = {
     "cutoff_hz": (0, 1e6),
 }
 THRESHOLDS = (0.01, 5)
-SHY = 2  # units by which thresholds are lowered: n C of change makes n events, however it is rounded
+SHY = 2  # thresholds are lowered by so many units: a change of n C makes n events, rounded or not
 
 
 class EventSensor:
@@ -109,7 +109,7 @@ class EventSensor:
         views: Sequence[int] | None = None,
         origin: tuple[int, int] = (0, 0),
         full_width: int | None = None,
-        threshold: Float[Tensor, "n"] | None = None,
+        threshold: Float[Tensor, " n"] | None = None,
     ) -> Float[Tensor, "n views windows bins h w"]:
         """Return one grid per window of `substeps` frame intervals, float32 on the frames' device.
 
@@ -146,7 +146,7 @@ class EventSensor:
             raise ValueError(f"{job.intervals} intervals are not whole windows of {substeps}")
         n, views, _, h, w = frames.shape
         shape = (n, views, job.intervals // substeps, bins, h, w)
-        engine = sensor_numba if frames.device.type == "cpu" else sensor_eager
+        engine = sensor_cpu if frames.device.type == "cpu" else sensor_eager
         grids = engine.voxels(job, torch.empty(shape, device=frames.device))
         job.state.frame += job.intervals
         return grids, job.state
@@ -155,7 +155,7 @@ class EventSensor:
         self, frames: Float[Tensor, "n views frames h w"], fps: float, **keys
     ) -> Int[Tensor, "n views 2"]:
         """Return the numbers of ON and OFF events of each clip and view; `keys` as in `voxels`."""
-        return sensor_numba.counts(self._job(frames.cpu(), fps, None, 1, **keys))
+        return sensor_cpu.counts(self._job(frames.cpu(), fps, None, 1, **keys))
 
     def events(
         self, frames: Float[Tensor, "frames h w"], fps: float, *, clip: int = 0, view: int = 0,
@@ -166,7 +166,7 @@ class EventSensor:
         Time starts at the first frame.  Raises ValueError as `voxels` does.
         """
         keys = {"clips": [clip], "views": [view], "origin": origin, "full_width": full_width}
-        return sensor_numba.events(self._job(frames[None, None].cpu(), fps, None, 1, **keys))
+        return sensor_cpu.events(self._job(frames[None, None].cpu(), fps, None, 1, **keys))
 
     def _job(
         self, frames, fps, state, substeps, *, clips=None, views=None, origin=(0, 0),
@@ -220,7 +220,7 @@ class EventSensor:
         return np.stack([*parts, np.full(n, spread), np.full(n, hot)], 1).astype(np.int64)
 
     def _tables(self, fps: float, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the tables of level, decay and lag; one node each for the last two without a filter.
+        """Return the tables of level, decay and lag; the last two of one node without a filter.
 
         The photoreceptor is one pole whose corner frequency is proportional to intensity (v2e). For
         a level that moves linearly by D in an interval dt and a/tau = 2 pi f dt the exact solution

@@ -1,12 +1,14 @@
 """What an engine is given: a sensor's numbers as integers, keys, clock and memory."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtri
 from torch import Tensor
 
 DEFER, DELETE, HOLD = 0, 1, 2
+VOXELS, COUNT, LIST = 0, 1, 2
 NORMAL_CELLS = 4096
 
 
@@ -59,6 +61,54 @@ class Job:
     def intervals(self) -> int:
         """Return the number of frame intervals to simulate."""
         return self.frames.shape[2] - self.fresh
+
+
+class Chip(NamedTuple):
+    """A Job's numbers as a kernel takes them."""
+
+    tables: tuple
+    normals: np.ndarray
+    chips: np.ndarray
+    chip_keys: np.ndarray
+    shot_keys: np.ndarray
+    place: tuple
+    mode: int
+    v2e: bool
+    wait: np.float32
+    leak: int
+    shot: int
+    hot: int
+
+
+class Memory(NamedTuple):
+    """A State as a kernel takes it."""
+
+    level: np.ndarray
+    source: np.ndarray
+    reference: np.ndarray
+    dead: np.ndarray
+
+
+class Sink(NamedTuple):
+    """Where events go: grids, or numbers per row and polarity, or a list at each row's offset."""
+
+    output: int
+    voxels: np.ndarray
+    counts: np.ndarray
+    offsets: np.ndarray
+    events: np.ndarray
+
+
+class Scratch(NamedTuple):
+    """What a unit of rows needs: arrays (rows, w), and room for the events of one pixel."""
+
+    on: np.ndarray
+    off: np.ndarray
+    hot: np.ndarray
+    level: np.ndarray
+    source: np.ndarray
+    when: np.ndarray
+    sign: np.ndarray
 
 
 def normal_table() -> np.ndarray:

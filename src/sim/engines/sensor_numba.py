@@ -1,86 +1,144 @@
-"""The sensor on the CPU: rows of (clip, view) through all intervals, straight into voxel grids.
+"""The sensor's kernels for the CPU (numba), all in one file: its cache does not see other files.
 
-The kernels release the interpreter's lock and are run by plain threads over disjoint units, so
-that they work in any thread and after a fork.  A unit is one row; v2e's time stamps need the
-busiest pixel of the whole view, so there it is one view.
+Levels are integers (2**-20 nat), times are float32 fractions of the frame interval.  An event comes
+at the first moment at which the pixel is not dead and the level is a threshold or more from the
+reference; between frames the level moves linearly, so that each crossing costs one division.
 """
 
-import copy
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
-from itertools import pairwise
-
 import numpy as np
-import torch
 from numba import njit, uint32, uint64
-from torch import Tensor
 
-from src.sim.engines.job import NORMALS, Job
-from src.sim.engines.sensor_pixel import (
-    HOLD,
-    bits,
-    linear_events,
-    v2e_events,
-    v2e_crossings,
-)
+from src.sim.engines.job import COUNT, DELETE, HOLD, VOXELS, Scratch
 
-EVENT = np.dtype([("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)])
-VOXELS, COUNT, LIST = 0, 1, 2
-NO_VOXELS = np.empty((0, 0, 0, 2, 0, 0), np.float32)
-NO_COUNTS, NO_OFFSETS, NO_EVENTS = np.empty((0, 2), np.int64), np.empty(0, np.int64), np.empty(0, EVENT)
 f32 = np.float32
 
 
-def voxels(job: Job, grids: Tensor) -> Tensor:
-    """Fill `grids` (n, views, windows, bins, h, w) and return them."""
-    _run(job, VOXELS, voxels=grids.numpy())
-    return grids
+@njit(nogil=True, inline="always")
+def mix(x):
+    """The 32-bit finaliser of src.sim.noise."""
+    x = uint32(x)
+    x ^= x >> uint32(16)
+    x = uint32(x * uint32(0x7FEB352D))
+    x ^= x >> uint32(15)
+    x = uint32(x * uint32(0x846CA68B))
+    return uint32(x ^ (x >> uint32(16)))
 
 
-def counts(job: Job) -> Tensor:
-    """Return the numbers of ON and OFF events, (n, views, 2)."""
-    n, views, _, height, _ = job.frames.shape
-    return torch.from_numpy(_counts(job).reshape(n, views, height, 2).sum(2))
+@njit(nogil=True, inline="always")
+def bits(key, high, low):
+    """src.sim.noise.bits(key, high * 2**32 + low), the same 32 bits."""
+    mixed = mix(uint32(low) ^ uint32(uint64(key) & uint64(0xFFFFFFFF)))
+    upper = uint32(uint64(key) >> uint64(32))
+    return mix(uint32(mixed + uint32(uint32(high) * uint32(0x9E3779B9)) + upper))
 
 
-def events(job: Job) -> np.ndarray:
-    """Return the events in order of time: counted row by row, then filled in, then sorted."""
-    state = copy.deepcopy(job.state)
-    rows = _counts(job).sum(1)
-    listed = np.empty(rows.sum(), EVENT)
-    _run(replace(job, state=state), LIST, offsets=np.cumsum(rows) - rows, events=listed)
-    return listed[np.argsort(listed["t"], kind="stable")]
+@njit(nogil=True, inline="always")
+def level_at(start, delta, u):
+    """Return the level at fraction `u` of an interval that begins at `start`."""
+    return start + np.int64(np.rint(f32(u) * f32(delta)))
 
 
-def _counts(job: Job) -> np.ndarray:
-    n, views, _, height, _ = job.frames.shape
-    numbers = np.zeros((n * views * height, 2), np.int64)
-    _run(job, COUNT, counts=numbers)
-    return numbers
+@njit(nogil=True)
+def linear_events(l0, l1, ref, dead, on, off, wait, mode, noise_u, noise_sign, when, sign):
+    """Return (events, ref, dead); `noise_u` is the time of a noise event, above 1 for none."""
+    delta = l1 - l0
+    count = 0
+    start = f32(0)
+    stop = min(noise_u, f32(1))
+    holding = mode == HOLD and dead > start
+    while True:
+        if holding and dead <= stop:  # the reset ends
+            ref = level_at(l0, delta, dead)
+            holding = False
+        moved = False
+        if not holding:
+            now = start if mode == DELETE else max(start, dead)
+            u, s = next_crossing(l0, delta, ref, on, off, now)
+            if u <= stop:
+                moved = True
+                ref += on if s > 0 else -off
+                start = u
+                if u >= dead:
+                    when[count] = u
+                    sign[count] = s
+                    count += 1
+                    dead = u + wait
+                    holding = mode == HOLD and wait > 0
+        if moved:
+            continue
+        if stop != noise_u:
+            return count, ref, dead
+        if noise_u >= dead:
+            when[count] = noise_u
+            sign[count] = noise_sign
+            count += 1
+            ref = level_at(l0, delta, noise_u)
+            dead = noise_u + wait
+            holding = mode == HOLD and wait > 0
+        start, stop, noise_u = noise_u, f32(1), f32(2)
 
 
-def _run(job: Job, output: int, voxels=NO_VOXELS, counts=NO_COUNTS, offsets=NO_OFFSETS,
-         events=NO_EVENTS) -> None:  # fmt: skip
-    """Run `simulate` over all units on as many threads as torch would use."""
-    n, views, _, height, _ = job.frames.shape
-    units = n * views * (1 if job.v2e else height)
-    state = job.state
-    arguments = (
-        job.frames.numpy(), int(job.fresh), tuple(part.numpy() for part in job.tables), NORMALS,
-        tuple(part.numpy() for part in (state.level, state.source, state.reference, state.dead)),
-        job.edges, (state.frame, job.substeps, f32(job.wait)),
-        (job.mode, job.v2e, job.leak, job.shot, job.hot), job.chips, job.chip_keys, job.shot_keys,
-        job.place, output, voxels, counts, offsets, events,
-    )  # fmt: skip
-    threads = min(torch.get_num_threads(), units)
-    cuts = [units * i // threads for i in range(threads + 1)]
-    if threads == 1:
-        simulate(0, units, *arguments)
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        parts = [pool.submit(simulate, a, b, *arguments) for a, b in pairwise(cuts)]
-        for part in parts:
-            part.result()
+@njit(nogil=True, inline="always")
+def next_crossing(l0, delta, ref, on, off, now):
+    """Return (time, polarity) of the first threshold exceeded at or after `now`; time 2 if none."""
+    if delta >= 0:
+        ahead, behind, speed, s = ref + on - l0, ref - off - l0, f32(delta), 1
+    else:
+        ahead, behind, speed, s = l0 - ref + off, l0 - ref - on, f32(-delta), -1
+    if behind >= 0 and f32(behind) >= now * speed:  # exceeded before, and still so
+        return now, -s
+    if f32(ahead) > speed:
+        return f32(2), s
+    if ahead <= 0:
+        return now, s
+    return max(now, f32(ahead) / speed), s
+
+
+@njit(nogil=True)
+def v2e_crossings(l0, l1, ref, dead, on, off, mode):
+    """Return (thresholds between the reference and the frame's level, reference)."""
+    if mode == HOLD and dead > 1:
+        return 0, ref
+    if mode == HOLD and dead > 0:
+        ref = level_at(l0, l1 - l0, dead)
+    return (l1 - ref) // on if l1 >= ref else (ref - l1) // off, ref
+
+
+@njit(nogil=True)
+def v2e_events(l0, l1, ref, dead, on, off, wait, mode, steps, noise_u, noise_sign, when, sign):
+    """The same with v2e's time stamps: `steps` for the whole frame, set by its busiest pixel.
+
+    The pixel's first crossings take the first stamps; a stamp within the dead time is refused
+    (compute_events of v2e's emulator).  Where a stamp interval is longer than the refractory
+    period, v2e neither tests nor records it.  Noise is stamped at the end of the interval.
+    """
+    count = 0
+    tested = wait * f32(steps) > 1
+    crossings, ref = v2e_crossings(l0, l1, ref, dead, on, off, mode)
+    for i in range(1, crossings + 1):
+        stamp = f32(i) / f32(steps)
+        s = 1 if l1 - ref >= on else (-1 if ref - l1 >= off else 0)
+        if s == 0:
+            break
+        kept = not tested or stamp > dead
+        if kept:
+            when[count] = stamp
+            sign[count] = s
+            count += 1
+            if tested:
+                dead = stamp + wait
+        if kept or mode == DELETE:
+            ref += on if s > 0 else -off
+        if kept and tested and mode == HOLD:
+            if dead > 1:
+                break
+            ref = level_at(l0, l1 - l0, dead)
+    if noise_u <= 1:
+        when[count] = f32(1)
+        sign[count] = noise_sign
+        count += 1
+        ref = l1
+    return count, ref, dead
 
 
 @njit(nogil=True, inline="always")
@@ -92,17 +150,17 @@ def look(table, place, shift):
 
 
 @njit(nogil=True)
-def pixel_row(chip, normals, view_keys, pixel, on, off, hot):
+def make_row(chip, normals, keys, pixel, on, off, hot):
     """Fill one row of thresholds `on`, `off` and of `hot`: what the chip is, whatever it sees."""
     threshold_on, threshold_off, spread, hot_share = chip
     for x in range(on.size):
         on[x], off[x], hot[x] = threshold_on, threshold_off, False
+        at = pixel + x
         if spread > 0:
-            at = 2 * (pixel + x)
-            on[x] = spread_threshold(threshold_on, spread, normals, bits(view_keys[0], 0, at))
-            off[x] = spread_threshold(threshold_off, spread, normals, bits(view_keys[0], 0, at + 1))
+            on[x] = spread_threshold(threshold_on, spread, normals, bits(keys[0], 0, 2 * at))
+            off[x] = spread_threshold(threshold_off, spread, normals, bits(keys[0], 0, 2 * at + 1))
         if hot_share > 0:
-            hot[x] = bits(view_keys[1], 0, pixel + x) < hot_share
+            hot[x] = bits(keys[1], 0, at) < hot_share
 
 
 @njit(nogil=True, inline="always")
@@ -115,7 +173,7 @@ def spread_threshold(threshold, spread, normals, drawn):
 
 @njit(nogil=True)
 def new_levels(frame, table, decay, ramp, source, level, new_source, new_level):
-    """Fill one row with the levels of a frame, through the photoreceptor's low-pass if there is one."""
+    """Fill one row with the levels of a frame, before and after the low-pass if there is one."""
     places = frame.view(np.int32)
     for x in range(frame.size):
         place = np.int64(min(max(places[x], 0x38800000), 0x3FFFFFFF) - 0x38800000)
@@ -128,20 +186,17 @@ def new_levels(frame, table, decay, ramp, source, level, new_source, new_level):
 
 
 @njit(nogil=True, inline="always")
-def noise_event(key, frame, pixel, rate):
-    """Return (time, polarity) of a noise event of probability rate / 2**32; time 2 for none."""
+def noise_event(key, frame, pixel, intensity, shot):
+    """Return (time, polarity) of the noise event of a pixel and interval; time 2 for none.
+
+    `shot` is its probability at black in 2**-32; at white it is a quarter (v2e).
+    """
+    seen = np.int64(min(max(intensity, f32(0)), f32(1)) * f32(256))
     drawn = bits(key, frame, 2 * pixel)
-    if uint64(drawn) >= uint64(rate):
+    if np.int64(drawn) >= shot - (shot >> 8) * ((3 * seen) >> 2):
         return f32(2), 1
     at = bits(key, frame, 2 * pixel + 1)
     return (f32(at >> uint32(9)) + f32(0.5)) * f32(2.0**-23), 1 if at & uint32(1) else -1
-
-
-@njit(nogil=True, inline="always")
-def noise_rate(base, x):
-    """Return the probability of a noise event at intensity x: a quarter at white (v2e)."""
-    seen = np.int64(min(max(x, f32(0)), f32(1)) * f32(256))
-    return base - (base >> 8) * ((3 * seen) >> 2)
 
 
 @njit(nogil=True, inline="always")
@@ -163,130 +218,131 @@ def add_to_grid(grid, y, x, ticks, scale, sign):
 
 
 @njit(nogil=True)
-def begin(frame, table, chip, normals, keys, pixel, fresh, memory, on, off, hot):
-    """Set up one row: its pixels, and if it is `fresh` the memory of the first frame."""
-    source, level, reference, dead = memory
-    pixel_row(chip, normals, keys, pixel, on, off, hot)
-    if fresh:
-        new_levels(frame, table, table[:1], table[:1], source, level, source, level)
-        reference[:] = level
-        dead[:] = f32(0)
-
-
-@njit(nogil=True)
-def busiest(levels, new_level, references, deads, on, off, leak, frame, mode):
+def busiest(chip, memory, scratch, c, v, frame):
     """Return the largest number of crossings of any pixel of a view, at least 1."""
     steps = np.int64(1)
-    for y in range(levels.shape[0]):
-        for x in range(levels.shape[1]):
-            l1 = new_level[y, x] + leaked(leak, on[y, x], frame)
+    for y in range(scratch.on.shape[0]):
+        for x in range(scratch.on.shape[1]):
+            on, off = scratch.on[y, x], scratch.off[y, x]
             crossings, _ = v2e_crossings(
-                np.int64(levels[y, x]), l1, np.int64(references[y, x]), deads[y, x],
-                on[y, x], off[y, x], mode,
+                np.int64(memory.level[c, v, y, x]),
+                scratch.level[y, x] + leaked(chip.leak, on, frame),
+                np.int64(memory.reference[c, v, y, x]),
+                memory.dead[c, v, y, x], on, off, chip.mode,
             )  # fmt: skip
             steps = max(steps, crossings)
     return steps
 
 
+@njit(nogil=True)
+def advance(chip, memory, sink, scratch, intensity, where, frame, steps, clock):
+    """Take one row through one interval; `clock`: window, its start and scale, interval's edges."""
+    c, v, y, r = where
+    level, reference = memory.level[c, v, y], memory.reference[c, v, y]
+    dead_row = memory.dead[c, v, y]
+    pixel = (chip.place[0] + y) * chip.place[2] + chip.place[1]
+    for x in range(level.size):
+        on, off, hot = scratch.on[r, x], scratch.off[r, x], scratch.hot[r, x]
+        l0, ref, dead = np.int64(level[x]), np.int64(reference[x]), dead_row[x]
+        drift = leaked(chip.leak, on, frame) if chip.leak else np.int64(0)
+        l1 = scratch.level[r, x] + drift
+        u, s = f32(2), 1
+        if hot:
+            u, s = noise_event(chip.shot_keys[c, v], frame, pixel + x, f32(0), chip.hot)
+        elif chip.shot:
+            u, s = noise_event(chip.shot_keys[c, v], frame, pixel + x, intensity[x], chip.shot)
+        quiet = max(l0, l1) < ref + on and min(l0, l1) > ref - off
+        if not quiet or u <= 1 or (chip.mode == HOLD and dead > 0):
+            if chip.v2e:
+                count, ref, dead = v2e_events(
+                    l0, l1, ref, dead, on, off, chip.wait, chip.mode, steps, u, s,
+                    scratch.when, scratch.sign,
+                )  # fmt: skip
+            else:
+                count, ref, dead = linear_events(
+                    l0, l1, ref, dead, on, off, chip.wait, chip.mode, u, s,
+                    scratch.when, scratch.sign,
+                )  # fmt: skip
+            for k in range(count):
+                emit(sink, c, v, y, x, scratch.when[k], scratch.sign[k], clock)
+        reference[x], dead_row[x] = ref - drift, max(dead - f32(1), f32(0))
+        level[x] = scratch.level[r, x]
+    memory.source[c, v, y] = scratch.source[r]
+
+
 @njit(nogil=True, inline="always")
-def noise_at(model, frame, x, intensity, hot, key, pixel):
-    """Return (time, polarity) of the noise event of one pixel and interval, time 2 for none."""
-    shot, hot_rate = model[3], model[4]
-    if shot == 0 and not hot:
-        return f32(2), 1
-    return noise_event(key, frame, pixel, hot_rate if hot else noise_rate(shot, intensity))
+def emit(sink, c, v, y, x, u, sign, clock):
+    """Send one event at fraction `u` of the interval where it goes, stamped with its tick."""
+    window, origin, scale, start, end = clock
+    t = start + max(np.int64(np.ceil(u * f32(end - start))) - 1, 0)
+    row = (c * sink.voxels.shape[1] + v) * sink.voxels.shape[4] + y
+    if sink.output == VOXELS:
+        add_to_grid(sink.voxels[c, v, window], y, x, t - origin, scale, sign)
+    elif sink.output == COUNT:
+        sink.counts[row, 0 if sign > 0 else 1] += 1
+    else:
+        event = sink.events[sink.offsets[row]]
+        event.t, event.x, event.y, event.p = t, x, y, sign
+        sink.offsets[row] += 1
+
+
+@njit(nogil=True)
+def make_scratch(rows, width, smallest):
+    """Return the scratch; a pixel has no more events in an interval than thresholds in 32 nat."""
+    room = 32 + (1 << 25) // max(smallest >> 2, 1024)
+    return Scratch(
+        np.empty((rows, width), np.int64), np.empty((rows, width), np.int64),
+        np.empty((rows, width), np.bool_), np.empty((rows, width), np.int32),
+        np.empty((rows, width), np.int32), np.empty(room, np.float32), np.empty(room, np.int8),
+    )  # fmt: skip
+
+
+@njit(nogil=True)
+def begin(chip, memory, scratch, frame, where, fresh):
+    """Set up one row: its pixels, and if it is fresh the memory of the first frame."""
+    c, v, y, r = where
+    pixel = (chip.place[0] + y) * chip.place[2] + chip.place[1]
+    row = (chip.chips[c, 0], chip.chips[c, 1], chip.chips[c, 2], chip.chips[c, 3])
+    make_row(
+        row, chip.normals, chip.chip_keys[v], pixel, scratch.on[r], scratch.off[r], scratch.hot[r]
+    )
+    if fresh:
+        table, level = chip.tables[0], memory.level[c, v, y]
+        new_levels(frame, table, table[:1], table[:1], level, level, level, level)
+        memory.source[c, v, y] = level
+        memory.reference[c, v, y] = level
+        memory.dead[c, v, y] = f32(0)
 
 
 @njit(nogil=True, cache=True)
-def simulate(
-    first_unit, last_unit, frames, fresh, tables, normals, state, edges, clock, model, chips,
-    chip_keys, shot_keys, place, output, voxels, counts, offsets, events,
-):  # fmt: skip
-    """Simulate units first_unit .. last_unit - 1; src.sim.sensor makes the arguments."""
-    levels, sources, references, deads = state
-    first_frame, substeps, wait = clock
-    mode, v2e, leak = model[0], model[1], model[2]
-    top, left, full_width = place
+def simulate(first_unit, last_unit, frames, fresh, chip, memory, edges, first, substeps, sink):
+    """Simulate units first_unit .. last_unit - 1: one row of a view each, with v2e's stamps all."""
     _, views, samples, height, width = frames.shape
-    rows = height if v2e else 1
-    on, off = np.empty((rows, width), np.int64), np.empty((rows, width), np.int64)
-    hot = np.empty((rows, width), np.bool_)
-    new_level, new_source = np.empty((2, rows, width), np.int32)
-    room = 32 + (1 << 25) // max(chips[:, :2].min() >> 2, 1024)
-    when, sign = np.empty(room, np.float32), np.empty(room, np.int8)
+    bins = sink.voxels.shape[3]
+    rows = height if chip.v2e else 1
+    units = height // rows
+    scratch = make_scratch(rows, width, chip.chips[:, :2].min())
     for unit in range(first_unit, last_unit):
-        c, v, y0 = locate(unit, views, height // rows, rows)
+        c, v, y0 = unit // (views * units), unit // units % views, unit % units * rows
         for r in range(rows):
-            y = y0 + r
-            memory = (sources[c, v, y], levels[c, v, y], references[c, v, y], deads[c, v, y])
-            begin(
-                frames[c, v, 0, y], tables[0], chips[c], normals, chip_keys[v],
-                (top + y) * full_width + left, fresh, memory, on[r], off[r], hot[r],
-            )  # fmt: skip
+            begin(chip, memory, scratch, frames[c, v, 0, y0 + r], (c, v, y0 + r, r), fresh)
         for i in range(samples - fresh):
-            frame = first_frame + i
             for r in range(rows):
-                y = y0 + r
                 new_levels(
-                    frames[c, v, i + fresh, y], tables[0], tables[1], tables[2],
-                    sources[c, v, y], levels[c, v, y], new_source[r], new_level[r],
+                    frames[c, v, i + fresh, y0 + r], chip.tables[0], chip.tables[1],
+                    chip.tables[2], memory.source[c, v, y0 + r], memory.level[c, v, y0 + r],
+                    scratch.source[r], scratch.level[r],
                 )  # fmt: skip
             steps = np.int64(1)
-            if v2e:
-                steps = busiest(
-                    levels[c, v], new_level, references[c, v], deads[c, v], on, off, leak, frame,
-                    mode,
-                )  # fmt: skip
+            if chip.v2e:
+                steps = busiest(chip, memory, scratch, c, v, first + i)
             window = i // substeps
             origin, end = edges[window * substeps], edges[(window + 1) * substeps]
-            scale = f32(f32(voxels.shape[3] - 1) / f32(end - origin))
+            clock = (window, origin, f32(f32(bins - 1) / f32(end - origin)), edges[i], edges[i + 1])
             for r in range(rows):
-                y = y0 + r
-                row = (c * views + v) * height + y
-                if output == VOXELS and i % substeps == 0:
-                    voxels[c, v, window, :, y, :] = f32(0)
-                level, reference, dead_row = levels[c, v, y], references[c, v, y], deads[c, v, y]
-                seen = frames[c, v, i + fresh, y]
-                pixel = (top + y) * full_width + left
-                for x in range(width):
-                    l0, ref, dead = np.int64(level[x]), np.int64(reference[x]), dead_row[x]
-                    drift = leaked(leak, on[r, x], frame) if leak else np.int64(0)
-                    l1 = np.int64(new_level[r, x]) + drift
-                    u, s = noise_at(
-                        model, frame, x, seen[x], hot[r, x], shot_keys[c, v], pixel + x
-                    )
-                    quiet = max(l0, l1) < ref + on[r, x] and min(l0, l1) > ref - off[r, x]
-                    count = 0
-                    if not quiet or u <= 1 or (mode == HOLD and dead > 0):
-                        if v2e:
-                            count, ref, dead = v2e_events(
-                                l0, l1, ref, dead, on[r, x], off[r, x], wait, mode, steps,
-                                u, s, when, sign,
-                            )  # fmt: skip
-                        else:
-                            count, ref, dead = linear_events(
-                                l0, l1, ref, dead, on[r, x], off[r, x], wait, mode,
-                                u, s, when, sign,
-                            )  # fmt: skip
-                    reference[x] = ref - drift
-                    dead_row[x] = max(dead - f32(1), f32(0))
-                    for k in range(count):
-                        tick = np.int64(np.ceil(when[k] * f32(edges[i + 1] - edges[i]))) - 1
-                        t = edges[i] + max(tick, 0)
-                        if output == VOXELS:
-                            add_to_grid(voxels[c, v, window], y, x, t - origin, scale, sign[k])
-                        elif output == COUNT:
-                            counts[row, 0 if sign[k] > 0 else 1] += 1
-                        else:
-                            at = offsets[row]
-                            offsets[row] = at + 1
-                            events[at].t, events[at].x, events[at].y = t, x, y
-                            events[at].p = sign[k]
-                    level[x] = new_level[r, x]
-                sources[c, v, y] = new_source[r]
-
-
-@njit(nogil=True, inline="always")
-def locate(unit, views, units, rows):
-    """Return (clip, view, first row) of a unit."""
-    return unit // (views * units), unit // units % views, unit % units * rows
+                if sink.output == VOXELS and i % substeps == 0:
+                    sink.voxels[c, v, window, :, y0 + r, :] = f32(0)
+                advance(
+                    chip, memory, sink, scratch, frames[c, v, i + fresh, y0 + r],
+                    (c, v, y0 + r, r), first + i, steps, clock,
+                )  # fmt: skip
