@@ -137,7 +137,7 @@ def write_recording(
     write_events(path, events, width=width, height=height)
     views.save(path.with_suffix(".views.yaml"))
     with h5py.File(path.with_suffix(".truth.h5"), "w") as file:
-        file.attrs["fps"] = fps
+        file.attrs["fps"], file.attrs["first_event_us"] = fps, events["t"][0]
         file["centre"] = frames[views.positions.index((0, 0))].numpy()
         if tilt is not None:
             file["tilt"] = tilt.numpy()

@@ -139,8 +139,18 @@ class Charuco:
         if names is None or len(names) < 6:
             return None
         points = np.full((self.shape[0] * self.shape[1], 2), np.nan)
-        points[names.ravel()] = corners.reshape(-1, 2)
+        points[names.ravel()] = self._refine(picture, corners)
         return points
+
+    def _refine(self, picture: Picture, corners: np.ndarray) -> Points:
+        """Move corners to their saddles, within what is free of markers around them."""
+        corners = corners.reshape(-1, 2).astype(np.float32, copy=True)
+        square = np.median(cKDTree(corners).query(corners, k=2)[0][:, 1])
+        reach = max(2, int((1 - self.marker) / 2 * square))
+        until = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-3)
+        smooth = cv2.GaussianBlur(picture, (0, 0), 1.5)
+        cv2.cornerSubPix(smooth, corners, (reach, reach), (-1, -1), until)  # in place
+        return corners.astype(np.float64)
 
     def _board(self) -> cv2.aruco.CharucoBoard:
         book = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
