@@ -14,7 +14,6 @@ from pathlib import Path
 import faery
 import numpy as np
 from faery.file_encoder import events_to_file
-from numpy.typing import NDArray
 
 from src.recordings import tables
 from src.recordings.engines.decode import adopt
@@ -35,7 +34,7 @@ class Recording:
     path: Path
     size: tuple[int, int] | None
 
-    def __iter__(self) -> Iterator[NDArray[np.void]]:
+    def __iter__(self) -> Iterator[np.ndarray]:
         """Yield the events in pieces, not empty, in order of time; warn of what was wrong."""
         last, back, outside = -HIGHEST, 0, 0
         width, height = self.size or (0, 0)
@@ -77,7 +76,7 @@ def sensor_size(path: str | Path) -> tuple[int, int]:
     return size
 
 
-def read_events(path: str | Path, size: tuple[int, int] | None = None) -> NDArray[np.void]:
+def read_events(path: str | Path, size: tuple[int, int] | None = None) -> np.ndarray:
     """Return all events of a file: t int64 us, x, y uint16, p int8 in {-1, 1}, in order of time.
 
     Raises ValueError for a file that cannot be read; warns of events that go back in time (they
@@ -89,7 +88,7 @@ def read_events(path: str | Path, size: tuple[int, int] | None = None) -> NDArra
 
 def iter_events(
     path: str | Path, *, seconds: float = 0.1, size: tuple[int, int] | None = None
-) -> Iterator[NDArray[np.void]]:
+) -> Iterator[np.ndarray]:
     """Yield the events of a file in chunks of `seconds`, counted from the first event.
 
     A span without events yields nothing, however long it is.  Memory is that of one chunk and one
@@ -114,7 +113,7 @@ def iter_events(
 
 
 def write_events(
-    path: str | Path, events: NDArray[np.void], *, width: int, height: int, version: str = "evt3"
+    path: str | Path, events: np.ndarray, *, width: int, height: int, version: str = "evt3"
 ) -> None:
     """Write events (t, x, y, p, in order of time) in the format of the path's ending.
 
@@ -166,7 +165,7 @@ def _pieces(path: Path) -> Iterator[tuple]:
         yield events["t"].view(np.int64), events["x"], events["y"], events["on"]
 
 
-def _decoder(path: Path) -> Iterable[NDArray[np.void]]:
+def _decoder(path: Path) -> Iterable[np.ndarray]:
     kind = BINARY[path.suffix]
     fallback = None
     if kind == "evt":
@@ -182,7 +181,7 @@ def _decoder(path: Path) -> Iterable[NDArray[np.void]]:
     )
 
 
-def _decoded(path: Path, stream: Iterable[NDArray[np.void]]) -> Iterator[NDArray[np.void]]:
+def _decoded(path: Path, stream: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
     """Yield what the decoder yields; its errors, panics of compiled code too, name the file."""
     pieces = iter(stream)
     while True:

@@ -33,7 +33,7 @@ def pieces(path: Path) -> Iterator[tuple]:
         raise ValueError(f"{path}: cannot be read as a table of events: {error}") from error
 
 
-def write(path: Path, events: NDArray[np.void], size: tuple[int, int]) -> None:
+def write(path: Path, events: np.ndarray, size: tuple[int, int]) -> None:
     """Write the events with the sensor's (width, height); times in microseconds."""
     columns = {name: events[name] for name in "txyp"}
     if path.suffix == ".npz":

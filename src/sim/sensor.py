@@ -160,7 +160,7 @@ class EventSensor:
     def events(
         self, frames: Float[Tensor, "frames h w"], fps: float, *, clip: int = 0, view: int = 0,
         origin: tuple[int, int] = (0, 0), full_width: int | None = None,
-    ) -> NDArray[np.void]:  # fmt: skip
+    ) -> np.ndarray:  # fmt: skip
         """Return the events of one view in order of time: t int64 us, x, y uint16, p int8 -1 or 1.
 
         Time starts at the first frame.  Raises ValueError as `voxels` does.
@@ -211,7 +211,7 @@ class EventSensor:
                     f"sensor.threshold is the range {low} to {high}: draw one per clip, "
                     "sample_threshold, and give it as `threshold`"
                 )
-            threshold = torch.full((n,), low)
+            threshold = torch.full((n,), low, dtype=torch.float64)
         on = threshold.double().cpu().numpy()
         _within("sensor.threshold", float(on.min()), *THRESHOLDS)
         _within("sensor.threshold", float(on.max()), *THRESHOLDS)
