@@ -1,9 +1,9 @@
 """Scores of single frames.  Pictures (n, 1, h, w) on [0, 1], data range 1; one value per frame."""
 
+import kornia.metrics
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torchmetrics.functional.image import structural_similarity_index_measure
 
 
 class L1(nn.Module):
@@ -40,9 +40,8 @@ def ssim(
 ) -> Float[Tensor, " n"]:
     """Return the structural similarity (Wang et al. 2004), the prediction clipped to [0, 1].
 
-    Gaussian window of 11 pixels and standard deviation 1.5, population covariance.
+    Gaussian window of 11 pixels and standard deviation 1.5, population covariance, mean over the
+    places where the window lies inside the frame, as scikit-image has it.
     """
-    value = structural_similarity_index_measure(
-        prediction.clamp(0, 1), target, data_range=1.0, reduction="none"
-    )
-    return value.reshape(len(prediction))
+    values = kornia.metrics.ssim(prediction.clamp(0, 1), target, 11, padding="valid")
+    return values.mean((1, 2, 3))
