@@ -129,7 +129,7 @@ def write_events(
         return
     listed = np.empty(len(events), faery.EVENTS_DTYPE)
     listed["t"], listed["x"], listed["y"], listed["on"] = t, x, y, p > 0
-    pieces = (listed[i : i + PIECE] for i in range(0, len(listed), PIECE))
+    pieces = (listed[i : i + PIECE] for i in range(0, max(len(listed), 1), PIECE))
     numbers = {".raw": version, ".dat": "dat2"}
     kind = BINARY[path.suffix]
     events_to_file(
@@ -161,6 +161,8 @@ def _pieces(path: Path) -> Iterator[tuple]:
     if path.suffix in tables.SUFFIXES:
         yield from tables.pieces(path)
         return
+    if path.suffix in (".raw", ".dat") and len(_header(path)) == path.stat().st_size:
+        return  # a recording without events
     for events in _decoded(path, _decoder(path)):
         yield events["t"].view(np.int64), events["x"], events["y"], events["on"]
 
