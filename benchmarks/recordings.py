@@ -1,0 +1,94 @@
+"""Splitting, voxelising and reconstructing a recording: python -m benchmarks.recordings
+
+Limits: 15 million events per second split and voxelised on two threads; 2 GB for any length.
+Events are uniform over a 1280x720 sensor with nine views, the worst case for a cache.  Thread time
+is the minimum over repeats of one thread's CPU time; real time is wall time.
+"""
+
+import multiprocessing
+import resource
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from src.models.e2vid import E2VID
+from src.recordings import formats, lookup, stream
+from src.recordings.capture import kaleidoscope
+from src.recordings.formats import EVENT
+from src.sim.optics import layout
+
+SENSOR, MODEL = (720, 1280), (176, 176)
+
+
+def events(count: int, seconds: float, first_us: int = 0) -> np.ndarray:
+    """Return uniform events in order of time."""
+    rng = np.random.default_rng(first_us)
+    made = np.empty(count, EVENT)
+    made["t"] = first_us + np.sort(rng.integers(0, int(seconds * 1e6), count))
+    made["x"], made["y"] = rng.integers(0, SENSOR[1], count), rng.integers(0, SENSOR[0], count)
+    made["p"] = rng.integers(0, 2, count) * 2 - 1
+    return made
+
+
+def table() -> lookup.Lookup:
+    """Return the lookup of a kaleidoscope whose views are 176x176."""
+    return lookup.build(kaleidoscope(list(layout(9)), model=MODEL, sensor=SENSOR))
+
+
+def least(work: Callable[[], object], clock=time.thread_time, repeats: int = 15) -> float:
+    """Return the least seconds that `work` took."""
+    taken = []
+    for _ in range(repeats + 1):
+        start = clock()
+        work()
+        taken.append(clock() - start)
+    return min(taken[1:])
+
+
+def splitting() -> None:
+    """Events per second of one thread: one window of 2 million events into nine grids."""
+    views, made = table(), events(2_000_000, 1 / 120)
+    grid = views.empty(5)
+    for nearest in (False, True):
+        seconds = least(lambda near=nearest: views.add(made, grid, 0, 8333, nearest=near))
+        kind = "nearest" if nearest else "bilinear"
+        print(f"split + voxelise, {kind}, one thread: {len(made) / seconds / 1e6:.1f} Mev/s")
+
+
+def end_to_end(path: Path, seconds: float, count: int) -> None:
+    """Times real time from the file to pictures, decoding to network, at 120 and 600 fps."""
+    views, net = table(), E2VID(views=9, base_channels=8).eval()
+    for fps in (120, 600):
+        start, frames = time.perf_counter(), 0
+        rule = stream.Rule(fps=fps, bins=5)
+        chunks = formats.iter_events(path, seconds=0.05)
+        for _ in stream.frames(stream.windows(chunks, views, rule), net):
+            frames += 1
+        wall = time.perf_counter() - start
+        print(
+            f"file to {frames} frames, {fps} fps, E2VID base 8, {torch.get_num_threads()} threads:"
+            f" {seconds / wall:.2f} x real time, {count / wall / 1e6:.1f} Mev/s"
+        )
+
+
+def main() -> None:
+    """Print everything; a process of its own reads the file, so that its memory is known."""
+    splitting()
+    with tempfile.TemporaryDirectory() as folder:
+        path, count, seconds = Path(folder) / "long.raw", 20_000_000, 4.0
+        formats.write_events(path, events(count, seconds), width=SENSOR[1], height=SENSOR[0])
+        reader = multiprocessing.get_context("spawn").Process(
+            target=end_to_end, args=(path, seconds, count)
+        )
+        reader.start()
+        reader.join()
+        peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
+        print(f"peak memory of the process that read {count:,} events: {peak:.2f} GB")
+
+
+if __name__ == "__main__":
+    main()
