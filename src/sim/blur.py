@@ -1,70 +1,116 @@
-"""Sampling on lattices, warping and scattering of images: tilt first, then blur.
+"""What turbulence does to a picture: tilt first, then blur, as light is scattered.
 
-A lattice holds every `pitch`-th pixel of an endless picture, pixel 0 being the frame's first; what
-lies between its nodes is interpolated by cubics.  Outside the frame the scene is its reflection.
+Chan 2022 (arXiv 2207.06377): tilt, then blur; Chimitt et al. 2023 (arXiv 2303.05687): every point
+spreads its light by the PSF it sees.  The sum is divided by what a white scene would give, as the
+radiance of an endless uniform scene survives a medium that only bends light: flat stays flat.
+Outside the frame the scene is its reflection.  On the CPU the two steps are compiled
+(src/sim/engines), elsewhere they are the torch expressions below; one pixel more or less of float32
+rounding is all they differ by.
 """
+
+from concurrent.futures import ThreadPoolExecutor
+from itertools import product
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-Nodes = tuple[int, int]  # first node and number of nodes of a lattice along one axis
+from src.sim.engines import scatter as scatter_engine
+from src.sim.engines import warp as warp_engine
+from src.sim.lattice import Lattice
 
 
-def nodes_for(start: int, count: int, pitch: int) -> Nodes:
-    """Return the nodes that cubics need to cover pixels start .. start + count - 1."""
-    if pitch == 1:
-        return start, count
-    first = start // pitch - 1
-    return first, (start + count - 1) // pitch + 2 - first + 1
+def degrade(
+    frames: Float[Tensor, "frames height width"],
+    tilts: list[Float[Tensor, "frames 2 h w"]],
+    kernels: list[Float[Tensor, "frames rows k k columns"]],
+    rows: Lattice,
+    columns: Lattice,
+) -> Float[Tensor, "views frames hout wout"]:
+    """Warp the frames by each view's tilt, then scatter them by its PSFs.
+
+    Tilts are in pixels over the window of `rows` and `columns`, on whose nodes the PSFs stand.  The
+    result lacks k // 2 pixels on each side.
+    """
+    if frames.device.type != "cpu":
+        return torch.stack(
+            [_eager(frames, *both, rows, columns) for both in zip(tilts, kernels, strict=True)]
+        )
+
+    def one(place: tuple[int, int]) -> Tensor:
+        view, index = place
+        tilt, kernel = tilts[view][index].numpy(), kernels[view][index].numpy()
+        tilted = warp_engine.warp(frames[index].numpy(), tilt, rows.start, columns.start)
+        if kernel.shape[1] > 1:
+            tilted = scatter_engine.scatter(tilted, kernel, rows.offset, columns.offset, rows.pitch)
+        return torch.from_numpy(tilted)
+
+    places = list(product(range(len(tilts)), range(len(frames))))
+    threads = min(torch.get_num_threads(), len(places))
+    if threads == 1:
+        light = [one(place) for place in places]
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            light = list(pool.map(one, places))
+    return torch.stack(light).unflatten(0, (len(tilts), len(frames)))
 
 
-def interpolation(start: int, count: int, pitch: int) -> Float[Tensor, "count nodes"]:
-    """Return the weights of the nodes in the pixels (four-point Lagrange cubic; rows sum to 1)."""
-    first, number = nodes_for(start, count, pitch)
-    pixel = torch.arange(start, start + count, dtype=torch.float64)
-    if pitch == 1:
-        return torch.eye(count, dtype=torch.float64)
-    cell = torch.div(pixel, pitch, rounding_mode="floor")
-    t = pixel / pitch - cell
-    taps = torch.stack(
-        [
-            -t * (t - 1) * (t - 2) / 6,
-            (t + 1) * (t - 1) * (t - 2) / 2,
-            -(t + 1) * t * (t - 2) / 2,
-            (t + 1) * t * (t - 1) / 6,
-        ],
-        dim=-1,
-    )
-    columns = (cell.long() - first)[:, None] + torch.arange(-1, 3)
-    return torch.zeros(count, number, dtype=torch.float64).scatter_(1, columns, taps)
+def _eager(
+    frames: Tensor, tilt: Tensor, kernels: Tensor, rows: Lattice, columns: Lattice
+) -> Tensor:
+    tilted = warp(frames, tilt, rows.start, columns.start)
+    return scatter(tilted, kernels, rows.weights().to(tilt), columns.weights().to(tilt))
 
 
 def warp(
-    frames: Float[Tensor, "b h w"],
-    tilt: Float[Tensor, "b 2 rows columns"],
+    frames: Float[Tensor, "frames height width"],
+    tilt: Float[Tensor, "frames 2 h w"],
     top: int,
     left: int,
-) -> Float[Tensor, "b rows columns"]:
-    """Return the scene as the tilt shows it: at pixel x the frame's value at x - tilt (bilinear).
+) -> Float[Tensor, "frames h w"]:
+    """Return frame(x - tilt(x)) over the window whose first pixel is (`top`, `left`).
 
-    `tilt` is (x, y) in pixels over the window whose first pixel is (`top`, `left`) of the frame.
+    Keys' cubic (a = -1/2), held within each frame's own range.
     """
     height, width = frames.shape[-2:]
     rows = torch.arange(tilt.shape[-2], device=tilt.device)[:, None] + top
     columns = torch.arange(tilt.shape[-1], device=tilt.device) + left
     x, y = columns - tilt[:, 0], rows - tilt[:, 1]
-    x0, y0 = x.floor(), y.floor()
-    u, v = x - x0, y - y0
-    flat = frames.reshape(len(frames), -1)
+    r, c = y.floor(), x.floor()
+    down, across = _keys(y - r), _keys(x - c)
+    flat = frames.flatten(1)
+    total = torch.zeros_like(x)
+    for k in range(4):
+        row = reflect(r.long() + k - 1, height) * width
+        for m in range(4):
+            index = row + reflect(c.long() + m - 1, width)
+            total += down[k] * across[m] * flat.gather(1, index.flatten(1)).reshape(x.shape)
+    return total.clamp(*(limit[:, None, None] for limit in torch.aminmax(flat, dim=1)))
 
-    def pick(row: Tensor, column: Tensor) -> Tensor:
-        index = reflect(row.long(), height) * width + reflect(column.long(), width)
-        return flat.gather(1, index.reshape(len(flat), -1)).reshape(index.shape)
 
-    above = pick(y0, x0) * (1 - u) + pick(y0, x0 + 1) * u
-    below = pick(y0 + 1, x0) * (1 - u) + pick(y0 + 1, x0 + 1) * u
-    return above * (1 - v) + below * v
+def scatter(
+    image: Float[Tensor, "frames h w"],
+    kernels: Float[Tensor, "frames rows k k columns"],
+    vertical: Float[Tensor, "h rows"],
+    horizontal: Float[Tensor, "w columns"],
+) -> Float[Tensor, "frames hout wout"]:
+    """Spread every pixel's light by the PSF there, over what a white scene would give.
+
+    `vertical` and `horizontal` interpolate the PSFs between the nodes.
+    """
+    size = kernels.shape[2]
+    height, width = image.shape[-2] - size + 1, image.shape[-1] - size + 1
+    light = image.new_zeros(len(image), height, width)
+    white = torch.zeros_like(light)
+    for v in range(size):
+        rows = slice(size - 1 - v, size - 1 - v + height)
+        nodes = kernels[:, :, v].transpose(1, 2)
+        for u in range(size):
+            columns = slice(size - 1 - u, size - 1 - u + width)
+            share = vertical[rows] @ nodes[:, u] @ horizontal[columns].T
+            light += share * image[:, rows, columns]
+            white += share
+    return light / white
 
 
 def reflect(index: Int[Tensor, "..."], size: int) -> Int[Tensor, "..."]:
@@ -73,29 +119,11 @@ def reflect(index: Int[Tensor, "..."], size: int) -> Int[Tensor, "..."]:
     return torch.minimum(folded, 2 * size - 1 - folded)
 
 
-def scatter(
-    image: Float[Tensor, "b h w"],
-    psfs: Float[Tensor, "b rows columns k k"],
-    vertical: Float[Tensor, "h rows"],
-    horizontal: Float[Tensor, "w columns"],
-) -> Float[Tensor, "b hout wout"]:
-    """Spread every pixel's light by the PSF there, and divide by what a white scene would give.
-
-    The PSFs stand on lattice nodes; `vertical` and `horizontal` interpolate them.  The result lacks
-    the outermost k // 2 pixels on each side, which light from outside the window would reach.
-    """
-    size = psfs.shape[-1]
-    height, width = image.shape[-2] - size + 1, image.shape[-1] - size + 1
-    light = image.new_zeros(len(image), height, width)
-    white = torch.zeros_like(light)
-    for row in range(size):
-        for column in range(size):
-            share = vertical @ psfs[..., row, column] @ horizontal.T
-            window = (
-                slice(None),
-                slice(size - 1 - row, size - 1 - row + height),
-                slice(size - 1 - column, size - 1 - column + width),
-            )
-            light += share[window] * image[window]
-            white += share[window]
-    return light / white
+def _keys(t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the weights of the pixels -1, 0, 1, 2 at `t` in [0, 1) (Keys 1981)."""
+    return (
+        0.5 * t * (t * (2 - t) - 1),
+        1 + 0.5 * t * t * (3 * t - 5),
+        0.5 * t * (t * (4 - 3 * t) + 1),
+        0.5 * t * t * (t - 1),
+    )

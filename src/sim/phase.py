@@ -16,11 +16,12 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from torch import Tensor
 
 from src.sim import noise
 from src.sim.atmosphere import Atmosphere
+from src.sim.lattice import Lattice
 from src.sim.zernike import SPECTRUM, pupil_filter
 
 LOW, HIGH = 0.08, 0.32  # limits of the three power laws that kappa is drawn from; HIGH per (n + 1)
@@ -33,7 +34,7 @@ class Waves:
 
     `frequency` (waves, 2): f z / L in cycles per pixel at the object along (x, y).
     `layer` (waves, 2): f in cycles per metre in the layer; `place` (waves,): z / L.
-    `response` (modes, 2 waves): w_m Q_j, real and imaginary part, in rad.
+    `response` (modes, waves, 2): w_m Q_j, real and imaginary part, in rad.
     """
 
     frequency: Float[Tensor, "waves 2"]
@@ -67,6 +68,82 @@ def draw_waves(atmosphere: Atmosphere, key: int, *, modes: int, waves: int, widt
         place=place[slot],
         response=pupil_filter(kappa, angle, modes) * amplitude[:, None],
     )
+
+
+class Field:
+    """The Noll coefficients of `modes` (0 is x-tilt) on the nodes of two lattices, in rad.
+
+    `size` is the frame's (height, width); the axis of the camera goes through its middle.
+    """
+
+    def __init__(
+        self,
+        waves: Waves,
+        modes: slice,
+        rows: Lattice,
+        columns: Lattice,
+        size: tuple[int, int],
+        device: torch.device,
+    ):
+        self.response = torch.view_as_complex(waves.response[modes]).to(device, torch.complex64)
+        down = _turns(waves.frequency[:, 1], rows, size[0])
+        across = _turns(waves.frequency[:, 0], columns, size[1])
+        both = down.to(device)[:, :, None] * across.to(device)[:, None]
+        self.nodes = torch.stack([both.real, -both.imag], dim=1).flatten(2).flatten(0, 1)
+        self.shape = both.shape[1:]
+        self.vertical, self.horizontal = rows.weights().to(device), columns.weights().T.to(device)
+
+    def at_nodes(
+        self, amplitudes: Complex[Tensor, "frames waves"]
+    ) -> Float[Tensor, "frames modes rows columns"]:
+        """Return the coefficients on the nodes: Re sum_m c_m w_m Q_j exp(2 pi i f_m . x)."""
+        turn = self.response * amplitudes[:, None]
+        field = torch.view_as_real(turn).flatten(2).flatten(0, 1) @ self.nodes
+        return field.reshape(*turn.shape[:2], *self.shape)
+
+    def at_pixels(
+        self, amplitudes: Complex[Tensor, "frames waves"]
+    ) -> Float[Tensor, "frames modes h w"]:
+        """Return the coefficients on all pixels that the lattices serve."""
+        return self.vertical @ self.at_nodes(amplitudes) @ self.horizontal
+
+
+def evolve(
+    fresh: Float[Tensor, "views frames waves 2"], alpha: float
+) -> Complex[Tensor, "views frames waves"]:
+    """Return c_t = alpha c_{t-1} + sqrt(1 - alpha^2) e_t, stationary from the first frame."""
+    state, states = fresh[:, 0], [fresh[:, 0]]
+    for step in fresh.unbind(1)[1:]:
+        state = alpha * state + math.sqrt(1 - alpha**2) * step
+        states.append(state)
+    return torch.view_as_complex(torch.stack(states, dim=1))
+
+
+def flow(
+    waves: Waves,
+    fresh: Float[Tensor, "views 1 waves 2"],
+    wind: tuple[float, float],
+    seconds: Float[Tensor, " frames"],
+) -> Complex[Tensor, "views frames waves"]:
+    """Return the amplitudes of turbulence that the `wind` (x, y) in m/s carries along unchanged.
+
+    Taylor's hypothesis: phase(x, t) = phase(x - v t, 0), exact at any time.
+    """
+    speed = waves.layer @ torch.tensor(wind, dtype=torch.float64)
+    return torch.view_as_complex(fresh) * torch.exp(-2j * math.pi * seconds[:, None] * speed)
+
+
+def look_from(waves: Waves, baselines: Float[Tensor, "views 2"]) -> Complex[Tensor, "views waves"]:
+    """Return the phase of each wave seen from sub-apertures at `baselines` (x, y) in metres.
+
+    Their line of sight to an object point crosses a layer baseline (1 - z/L) away.
+    """
+    return torch.exp(2j * math.pi * (baselines @ waves.layer.T) * (1 - waves.place))
+
+
+def _turns(frequency: Tensor, lattice: Lattice, size: int) -> Tensor:
+    place = lattice.pixels.double() - (size - 1) / 2
+    return torch.exp(2j * math.pi * frequency[:, None] * place).to(torch.complex64)
 
 
 def _sequence(key: int, count: int) -> Float[Tensor, "count 3"]:

@@ -1,0 +1,138 @@
+"""What each simplification of the blur costs in a natural picture, measured on exact PSFs.
+
+All in the metric of src/sim/fidelity.py; part of `python -m scripts.fit_p2s`.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from src.sim.atmosphere import Atmosphere
+from src.sim.fidelity import band_for
+from src.sim.p2s import FINE_PER_AIRY
+from src.sim.phase import draw_waves
+from src.sim.psf import fraunhofer_psf
+from src.sim.zernike import noll_covariance
+
+STRENGTHS = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.0, 10.0)
+AIRY = (0.25, 0.5, 1.0, 2.0)
+MODES = (5, 9, 14, 20, 27, 35, 44, 54, 65, 77)
+PITCHES = (0.025, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0)  # of D, at the object
+RANKS = (4, 8, 12, 16, 20, 24, 32, 40, 48)
+ALL_MODES = 119
+FINE, GRID = 47, 96  # samples of a PSF, and of its transform
+SPATIAL_WAVES = 256
+
+
+def picture_power(count: int) -> Tensor:
+    """Return the power spectrum 1 / f^2 of a natural picture on a `count` x `count` grid."""
+    f = torch.fft.fftfreq(count, dtype=torch.float64)
+    return 1 / (f[:, None].square() + f.square()).clamp(min=1 / 128**2)
+
+
+def picture_metric(fine: int) -> Tensor:
+    """Return the quadratic form (fine^2, fine^2) of a PSF's error in a natural picture."""
+    count = 2 * fine
+    correlation = torch.fft.ifft2(picture_power(count)).real
+    lag = (torch.arange(fine)[:, None] - torch.arange(fine)) % count
+    return correlation[lag[:, None, :, None], lag[None, :, None, :]].reshape(fine**2, fine**2)
+
+
+def measure() -> dict[str, Tensor]:
+    """Return the tables: power and shares per strength and lambda / D in pixels."""
+    torch.manual_seed(0)
+    rows = [_row(strength) for strength in STRENGTHS]
+    tables = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
+    axes = {"strength": STRENGTHS, "airy": AIRY, "modes_axis": MODES, "pitch_axis": PITCHES}
+    tables |= {name: torch.tensor(values) for name, values in axes.items()}
+    tables["rank_axis"] = torch.tensor(RANKS)
+    return {f"errors.{name}": value.float().contiguous() for name, value in tables.items()}
+
+
+def _row(strength: float) -> dict[str, Tensor]:
+    phase = _draw(600, ALL_MODES, strength)
+    full = _exact(phase)
+    power = _power(full - full.mean(0))
+    modes = [_power(_exact(phase[:, :count]) - full) / power for count in MODES]
+    pitch = [_pitch_error(strength, pitch) / power for pitch in PITCHES]
+    rank = [error / power for error in _rank_errors(strength)]
+    return {
+        "power": power,
+        "modes": torch.stack(modes),
+        "pitch": torch.stack(pitch),
+        "rank": torch.stack(rank),
+        "half_light": _half_light(full.mean(0)),
+    }
+
+
+def _draw(count: int, modes: int, strength: float) -> Tensor:
+    mix = torch.linalg.cholesky(noll_covariance(modes)).float()
+    phase = torch.randn(count, modes) @ mix.T * strength ** (5 / 6)
+    phase[:, :2] = 0
+    return phase
+
+
+def _exact(phase: Tensor, fine: int = FINE) -> Tensor:
+    return fraunhofer_psf(phase, airy_px=FINE_PER_AIRY, size=fine, pupil=fine - 3, points=1)
+
+
+def _power(error: Tensor) -> Tensor:
+    """Return the mean power that PSF errors (n, fine, fine) make in a picture, per AIRY."""
+    spectrum = torch.fft.fft2(error, s=(GRID, GRID)).abs().square().mean(0).double()
+    f = torch.fft.fftfreq(GRID, dtype=torch.float64)
+    out = []
+    for airy in AIRY:
+        step = FINE_PER_AIRY / airy  # samples a pixel
+        seen = ((f.abs() * step)[:, None] <= 0.5) & (f.abs() * step <= 0.5)
+        picture = picture_power(GRID) * seen
+        picture[0, 0] = 0
+        box = torch.sinc(f * step).square()
+        out.append((spectrum * picture * box[:, None] * box).sum() / picture.sum())
+    return torch.stack(out)
+
+
+def _pitch_error(strength: float, pitch: float) -> Tensor:
+    """Return the power of linear interpolation of PSFs between nodes `pitch` D apart."""
+    path = Atmosphere(0.1, 1.0, 1000.0, 0.1, 525e-9, 1e-14, 0.0).at(strength)
+    cells, clips = 24, 12
+    t = torch.rand(clips, cells, 2, dtype=torch.float64)
+    nodes = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]], dtype=torch.float64)
+    phases = []
+    for clip in range(clips):
+        waves = draw_waves(path, 1000 + clip, modes=44, waves=SPATIAL_WAVES, width_px=1)
+        corner = 100 * torch.rand(cells, 1, 2, dtype=torch.float64)
+        places = corner + pitch * torch.cat([nodes.expand(cells, 4, 2), t[clip, :, None]], 1)
+        wave = torch.exp(2j * math.pi * (waves.frequency @ places.reshape(-1, 2).T))
+        random = torch.randn(SPATIAL_WAVES, dtype=torch.complex128) * math.sqrt(2)
+        phases.append(((torch.view_as_complex(waves.response) * random) @ wave).real.T)
+    phase = torch.cat(phases).float()
+    phase[:, :2] = 0
+    psfs = _exact(phase).reshape(clips * cells, 5, FINE, FINE)
+    x, y = t.reshape(-1, 2).float().unbind(-1)
+    weight = torch.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], 1)
+    return _power((weight[..., None, None] * psfs[:, :4]).sum(1) - psfs[:, 4])
+
+
+def _rank_errors(strength: float) -> list[Tensor]:
+    """Return the power of basis and network together, per rank."""
+    band = band_for(strength)
+    phase = _draw(1000, band.modes, strength)
+    psfs = _exact(phase, band.mean.shape[-1])
+    out = []
+    for rank in RANKS:
+        basis = band.basis[:rank]
+        weights = band.weights(phase[:, 2:], rank)
+        out.append(_power(band.mean + torch.tensordot(weights, basis, 1) - psfs))
+    return out
+
+
+def _half_light(psf: Tensor) -> Tensor:
+    """Return the radius, in lambda / D, that holds half of the light of a PSF (fine, fine)."""
+    axis = (torch.arange(FINE) - FINE // 2) / FINE_PER_AIRY
+    radius = (axis[:, None].square() + axis.square()).sqrt().flatten()
+    order = radius.argsort()
+    inside = psf.flatten()[order].cumsum(0)
+    at = int((inside < 0.5).sum())
+    share = (0.5 - inside[at - 1]) / (inside[at] - inside[at - 1])
+    return radius[order][at - 1] + share * (radius[order][at] - radius[order][at - 1])

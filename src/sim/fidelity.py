@@ -1,0 +1,197 @@
+"""No more than a scene needs: how finely an atmosphere is simulated, and what that costs in error.
+
+Errors are powers, as shares of the power by which turbulence at random changes a picture (its blur
+against the mean blur, tilt apart) with the spectrum 1 / f^2 of natural ones.  The tables behind
+them are measured on exact PSFs by scripts/p2s_errors.py and kept beside the networks.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import torch
+from jaxtyping import Float
+from safetensors.torch import load_file
+from torch import Tensor
+
+from src.sim.atmosphere import Atmosphere
+from src.sim.lattice import cubic_taps
+from src.sim.p2s import FILE, FINE_PER_AIRY, Band, bands
+from src.sim.phase import draw_waves
+
+CONTRAST = 0.2  # rms contrast of a natural picture
+UNSEEN = 0.5 / 255  # rms error that nobody needs to go below
+SHARES = {"modes": 0.5, "pitch": 0.3, "rank": 0.2}  # of the tolerance
+BEYOND = 1.06  # the networks are fitted a little beyond the edge of their band
+EXACT_MODES = 119  # whole orders up to n = 14, for D/r0 beyond the tables
+MAX_PITCH = 64
+
+
+@dataclass(frozen=True)
+class Fidelity:
+    """One atmosphere in pixels, and how it is simulated.
+
+    `tilt_px`: standard deviation along one axis; `airy_px`: lambda / D; `blur_px`: the radius that
+    holds half of the light of a point, tilt removed.  `modes` Noll modes from tilt on, `rank` basis
+    functions (0: exact PSFs), `kernel` pixels across the PSF, `pitch` and `tilt_pitch` pixels
+    between the nodes of the phase.  `error_modes`, `error_pitch`, `error_rank`: shares of the
+    random power; `error`: the rms error they make together in a picture of rms contrast 1.
+    """
+
+    d_over_r0: float = 0.0
+    severity: str = "none"
+    rytov: float = 0.0
+    alpha: float = 1.0
+    tilt_px: float = 0.0
+    airy_px: float = 0.0
+    blur_px: float = 0.0
+    modes: int = 0
+    rank: int = 0
+    kernel: int = 1
+    pitch: int = 1
+    tilt_pitch: int = 1
+    error_modes: float = 0.0
+    error_pitch: float = 0.0
+    error_rank: float = 0.0
+    error_tilt_px: float = 0.0
+    error: float = 0.0
+
+
+def choose(atmosphere: Atmosphere, width_px: int, tolerance: float, exact: bool) -> Fidelity:
+    """Return the cheapest fidelity whose errors keep within `tolerance` of the random power.
+
+    An rms error of half a grey level of 256 is always allowed.  With `exact` PSFs there is no rank.
+    """
+    strength, airy = atmosphere.d_over_r0, atmosphere.airy_px(width_px)
+    power = _random_power(strength, airy)
+    allowed = max(tolerance, (UNSEEN / CONTRAST) ** 2 / power)
+    band = band_for(strength)
+    exact = exact or band is None
+    modes, error_modes = _cheapest("modes", strength, airy, allowed)
+    rank, error_rank = (0.0, 0.0) if exact else _cheapest("rank", strength, airy, allowed)
+    step, error_pitch = _widest(strength, airy, allowed)
+    if strength > _table("strength")[-1]:
+        modes = EXACT_MODES
+    elif not exact:
+        modes = min(modes, band.modes)
+    tilt_px = atmosphere.tilt_std_px(width_px)
+    tilt_pitch, error_tilt = _tilt_pitch(atmosphere, width_px, tilt_px, tolerance)
+    pixel = atmosphere.object_pixel_m(width_px) / atmosphere.aperture_m
+    return Fidelity(
+        d_over_r0=strength,
+        severity=atmosphere.severity,
+        rytov=atmosphere.rytov,
+        alpha=atmosphere.alpha,
+        tilt_px=tilt_px,
+        airy_px=airy,
+        blur_px=airy * _half_light(strength),
+        modes=int(modes),
+        rank=0 if exact else min(int(rank), len(band.basis)),
+        kernel=_kernel(strength, airy),
+        pitch=int(min(max(step / pixel, 1), MAX_PITCH)),
+        tilt_pitch=tilt_pitch,
+        error_modes=error_modes,
+        error_pitch=error_pitch if step >= pixel else 0.0,
+        error_rank=error_rank,
+        error_tilt_px=error_tilt,
+        error=math.sqrt(power * (error_modes + error_pitch + error_rank)),
+    )
+
+
+def band_for(strength: float) -> Band | None:
+    """Return the weakest band that covers D/r0 = `strength`; None beyond the last."""
+    return next((band for band in bands() if strength <= BEYOND * band.edge), None)
+
+
+def _kernel(strength: float, airy: float) -> int:
+    """Return the odd number of pixels that the window of the basis covers."""
+    band = band_for(strength)
+    across = band.mean.shape[-1] / FINE_PER_AIRY if band else 12 + 1.2 * strength
+    return 2 * math.floor(across * airy / 2) + 1
+
+
+def _cheapest(name: str, strength: float, airy: float, allowed: float) -> tuple[float, float]:
+    """Return the first entry of the table's axis within its share of `allowed`, and its error."""
+    errors = _at(name, strength, airy)
+    within = (errors <= SHARES[name] * allowed).nonzero()
+    index = int(within[0]) if len(within) else len(errors) - 1
+    return float(_table(f"{name}_axis")[index]), float(errors[index])
+
+
+def _widest(strength: float, airy: float, allowed: float) -> tuple[float, float]:
+    """Return the widest pitch in units of D at the object whose error is allowed, and the error."""
+    errors = _at("pitch", strength, airy).cummax(0).values
+    limit, axis = SHARES["pitch"] * allowed, _table("pitch_axis")
+    if limit <= errors[0]:  # the error falls at least with the first power of the pitch
+        return float(axis[0] * limit / errors[0]), float(limit)
+    index = min(int((errors <= limit).sum()) - 1, len(axis) - 2)
+    share = (limit - errors[index]) / (errors[index + 1] - errors[index]).clamp(min=1e-9)
+    share = float(share.clamp(0, 1))
+    step = axis[index] * (axis[index + 1] / axis[index]) ** share
+    return float(step), float(errors[index] + share * (errors[index + 1] - errors[index]))
+
+
+def _tilt_pitch(
+    atmosphere: Atmosphere, width_px: int, tilt_px: float, tolerance: float
+) -> tuple[int, float]:
+    """Return the widest pitch that errs by 0.02 px or 5 % of the tolerance's rms."""
+    allowed = max(0.02, 0.05 * math.sqrt(tolerance) * tilt_px)
+    pitches = [1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64]
+    errors = [e * tilt_px for e in _tilt_errors(atmosphere, width_px, pitches)]
+    best = max(i for i, error in enumerate(errors) if error <= allowed)
+    return pitches[best], errors[best]
+
+
+def _tilt_errors(atmosphere: Atmosphere, width_px: int, pitches: Sequence[int]) -> list[float]:
+    """Return the rms error of cubic interpolation between nodes, per pitch in pixels.
+
+    As a share of the tilt's standard deviation; from the waves' own spectrum.
+    """
+    waves = draw_waves(atmosphere, 0, modes=2, waves=256, width_px=width_px)
+    power = waves.response.square().sum((0, 2))
+    place = (torch.arange(4, dtype=torch.float64) + 0.5) / 4
+    taps = cubic_taps(place)
+    steps = torch.arange(-1, 3, dtype=torch.float64)
+    errors = []
+    for pitch in pitches:
+        turn = 2 * math.pi * pitch * waves.frequency[..., None]
+        off = (torch.exp(1j * turn[..., None, :] * steps) * taps).sum(-1) - torch.exp(
+            1j * turn * place
+        )
+        error = off.abs().square().mean(-1).sum(-1)
+        errors.append(math.sqrt(float((power * error).sum() / power.sum())) if pitch > 1 else 0.0)
+    return errors
+
+
+def _random_power(strength: float, airy: float) -> float:
+    """Return the power of the random change of a picture of unit contrast; grows as d^(5/3)."""
+    weak = min(strength / float(_table("strength")[0]), 1.0) ** (5 / 3)
+    return max(float(_at("power", strength, airy)) * weak, 1e-30)
+
+
+def _half_light(strength: float) -> float:
+    return float(_between(_table("half_light"), _table("strength"), strength))
+
+
+def _at(name: str, strength: float, airy: float) -> Float[Tensor, "*axis"]:
+    """Interpolate a table (strength, ..., airy) in the logarithm of both."""
+    table = _between(_table(name), _table("strength"), strength)
+    return _between(table.movedim(-1, 0), _table("airy"), airy)
+
+
+def _between(table: Tensor, axis: Tensor, value: float) -> Tensor:
+    place = max(value, float(axis[0]))
+    high = int((axis < place).sum().clamp(1, len(axis) - 1))
+    low = high - 1
+    share = math.log(place / float(axis[low])) / math.log(float(axis[high] / axis[low]))
+    return table[low] + (table[high] - table[low]) * min(share, 1.0)
+
+
+@cache
+def _tables() -> dict[str, Tensor]:
+    return load_file(FILE)
+
+
+def _table(name: str) -> Tensor:
+    return _tables()[f"errors.{name}"]
