@@ -1,0 +1,143 @@
+"""What turbulence does to a video and PSNR hardly sees: it moves things that should not move.
+
+The residual displacement of a reconstruction against the truth is measured block by block with
+gradient least squares (Lucas & Kanade 1981), iterated; its change from frame to frame is wobble.
+Gain and offset of each block are fitted away first, so brightness does not matter.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+BLOCK = 16  # side of a block in pixels
+REACH = 3.0  # largest displacement that is believed, in pixels
+SMOOTHING = (7, 7, 7, 1, 1, 1)  # side of the box blur of each iteration: coarse to fine
+TEXTURE = 1e-4  # least mean square gradient, in (grey levels / pixel)^2, of a block that is used
+
+
+def displacement(
+    frames: Float[Tensor, "frames 1 h w"], target: Float[Tensor, "frames 1 h w"]
+) -> tuple[Float[Tensor, "frames 2 rows columns"], Float[Tensor, "frames rows columns"]]:
+    """Return by how much each block of `frames` is shifted against `target`, (x, y) in pixels, and
+    its weight: the target's mean square gradient along its weaker direction, 0 without texture.
+
+    Blocks are 16 pixels wide; shifts are cut at 3 pixels.
+    """
+    weight = _texture(target)
+    shift = torch.zeros(len(target), 2, *weight.shape[1:], dtype=target.dtype, device=target.device)
+    for side in SMOOTHING:
+        shift = _improve(_smooth(frames, side), _smooth(target, side), shift)
+    return shift * (weight > 0)[:, None], weight
+
+
+def residual(
+    frames: Float[Tensor, "frames 1 h w"], target: Float[Tensor, "frames 1 h w"]
+) -> Float[Tensor, " frames"]:
+    """Return the rms displacement of each frame against the truth, in pixels per axis."""
+    shift, weight = displacement(frames, target)
+    return _rms(shift, weight)
+
+
+def wobble(
+    frames: Float[Tensor, "frames 1 h w"], target: Float[Tensor, "frames 1 h w"]
+) -> Float[Tensor, " frames-1"]:
+    """Return the rms change of the displacement from each frame to the next, in pixels per axis.
+
+    A block counts as much as its weaker weight in the two frames.
+    """
+    shift, weight = displacement(frames, target)
+    return _rms(shift[1:] - shift[:-1], torch.minimum(weight[1:], weight[:-1]))
+
+
+def straightness(path: Float[Tensor, "frames 2"], truth: Float[Tensor, "frames 2"]) -> float:
+    """Return the rms distance in pixels of a path (x, y) from the known one, after removing the
+    constant offset between them.
+    """
+    error = path - truth
+    return float((error - error.mean(0)).square().sum(1).mean().sqrt())
+
+
+def flicker(
+    frames: Float[Tensor, "frames 1 h w"],
+    target: Float[Tensor, "frames 1 h w"],
+    still: float = 1 / 255,
+) -> float:
+    """Return the mean temporal standard deviation of the pixels that stay within `still` in the
+    truth; 0 if none does.
+    """
+    calm = (target.amax(0) - target.amin(0)) <= still
+    spread = frames.std(0, unbiased=False)
+    return float(spread[calm].mean()) if calm.any() else 0.0
+
+
+def _texture(target: Tensor) -> Tensor:
+    """Return the smaller eigenvalue of every block's structure tensor, 0 below TEXTURE."""
+    a, b, c = _structure(*_gradients(target))
+    weaker = (a + c) / 2 - ((a - c) ** 2 / 4 + b * b).sqrt()
+    return torch.where(weaker > TEXTURE, weaker, torch.zeros_like(weaker))
+
+
+def _structure(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
+    return _blocks(torch.cat([x * x, x * y, y * y], dim=1)).unbind(1)
+
+
+def _improve(frames: Tensor, target: Tensor, shift: Tensor) -> Tensor:
+    """Return `shift` after one least-squares step."""
+    x, y = _gradients(target)
+    a, b, c = _structure(x, y)
+    difference = _matched(_pull(frames, shift), target) - target
+    u, v = _blocks(torch.cat([x * difference, y * difference], dim=1)).unbind(1)
+    determinant = (a * c - b * b).clamp(min=1e-12)
+    step = torch.stack([c * u - b * v, a * v - b * u], dim=1) / determinant[:, None]
+    return (shift - step.clamp(-1, 1)).clamp(-REACH, REACH)
+
+
+def _smooth(pictures: Tensor, side: int) -> Tensor:
+    half = side // 2
+    rows = functional.avg_pool2d(pictures, (side, 1), 1, (half, 0), count_include_pad=False)
+    return functional.avg_pool2d(rows, (1, side), 1, (0, half), count_include_pad=False)
+
+
+def _gradients(pictures: Tensor) -> tuple[Tensor, Tensor]:
+    padded = functional.pad(pictures, (1, 1, 1, 1), mode="replicate")
+    x = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) / 2
+    y = (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) / 2
+    return x, y
+
+
+def _blocks(maps: Tensor) -> Tensor:
+    return functional.avg_pool2d(maps, min(BLOCK, *maps.shape[-2:]))
+
+
+def _pull(frames: Tensor, shift: Tensor) -> Tensor:
+    """Undo the shift of every block; between block centres it is interpolated."""
+    height, width = frames.shape[-2:]
+    smooth = functional.interpolate(shift, (height, width), mode="bilinear", align_corners=False)
+    y, x = torch.meshgrid(
+        torch.arange(height).to(frames), torch.arange(width).to(frames), indexing="ij"
+    )
+    grid = torch.stack(
+        [(2 * (x + smooth[:, 0]) + 1) / width - 1, (2 * (y + smooth[:, 1]) + 1) / height - 1], -1
+    )
+    return functional.grid_sample(frames, grid, padding_mode="border", align_corners=False)
+
+
+def _matched(frames: Tensor, target: Tensor) -> Tensor:
+    """Fit the gain and offset of `frames` to `target` over each block and its neighbours."""
+
+    def mean(maps: Tensor) -> Tensor:
+        return functional.avg_pool2d(_blocks(maps), 3, 1, 1, count_include_pad=False)
+
+    m, n = mean(frames), mean(target)
+    covariance = mean(frames * target) - m * n
+    gain = (covariance / (mean(frames * frames) - m * m).clamp(min=1e-6)).clamp(min=0)
+    fit = torch.cat([gain, n - gain * m], dim=1)
+    gain, offset = functional.interpolate(fit, frames.shape[-2:], mode="bilinear").split(1, dim=1)
+    return gain * frames + offset
+
+
+def _rms(shift: Tensor, weight: Tensor) -> Tensor:
+    squared = shift.square().mean(1)
+    total = weight.sum((1, 2))
+    return ((squared * weight).sum((1, 2)) / total.clamp(min=1e-12)).sqrt()
