@@ -63,11 +63,11 @@ def write_video(path: Path, frames: Video, fps: float) -> None:
 
 
 def _titled(video: Video, name: str) -> Video:
-    strip = np.ones((TITLE_PX, video.shape[2], 3), np.float32)
-    cv2.putText(
-        strip, name, (3, TITLE_PX - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA
-    )
-    return np.concatenate([np.broadcast_to(strip, (len(video), *strip.shape)), video], axis=1)
+    strip = np.full((TITLE_PX, video.shape[2], 3), 255, np.uint8)
+    font, place = cv2.FONT_HERSHEY_SIMPLEX, (3, TITLE_PX - 5)
+    strip = cv2.putText(strip, name, place, font, 0.42, (0, 0, 0), 1, cv2.LINE_AA) / 255
+    above = np.broadcast_to(strip.astype(np.float32), (len(video), *strip.shape))
+    return np.concatenate([above, video], axis=1)
 
 
 def _enlarge(video: Video, factor: int) -> Video:

@@ -5,6 +5,7 @@ head -> three recurrent encoders (stride 2) -> two residual blocks -> three deco
 -> skip sum with the head -> one channel.  10,710,401 parameters with 5 input channels and base 32.
 """
 
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -47,7 +48,7 @@ class E2VID(nn.Module):
             raise ValueError(f"model.kernel_size must be odd and >= 1, got {kernel_size}")
         self.views, self.bins, self.activation = views, bins, ACTIVATIONS[final_activation]
         widths = [base_channels * 2**scale for scale in range(SCALES + 1)]
-        pairs = list(zip(widths, widths[1:], strict=False))
+        pairs = list(pairwise(widths))
         cell = CELLS[recurrent]
         self.head = _conv(views * bins, base_channels, kernel_size)
         self.encoders = nn.ModuleList(_conv(a, b, kernel_size, stride=2) for a, b in pairs)

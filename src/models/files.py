@@ -1,0 +1,131 @@
+"""Networks on disk: shipped weights (safetensors) and training checkpoints (.ckpt).
+
+A file says which network it holds: {"target": "src.models.e2vid.E2VID", "kwargs": {...}}.  Nothing
+in a file is executed: only classes of `src.models` and `baselines` are built, from plain values.
+"""
+
+import json
+import os
+import pickle
+from importlib import import_module
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+from torch.nn.utils import parametrize
+
+WEIGHTS = Path(__file__).resolve().parents[2] / "weights"
+ROOMS = ("src.models.", "baselines.")
+
+
+def load(name_or_path: str | Path) -> nn.Module:
+    """Return the network of a file, float32, in eval mode, spectral norm folded into its weights.
+
+    A word names a file of `weights/`; a path is a `.safetensors` file written by `save` or a
+    checkpoint of a training run.  Raises ValueError, beginning with `ckpt`, for a file that is not
+    there, is no such file, or holds other weights than its network has.
+    """
+    path = Path(name_or_path)
+    shipped = WEIGHTS / f"{name_or_path}.safetensors"
+    if not path.is_file() and shipped.is_file():
+        path = shipped
+    if not path.is_file():
+        names = ", ".join(sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))) or "none yet"
+        raise ValueError(f"ckpt must be a file or one of weights/ ({names}), got {name_or_path}")
+    spec, weights = (_safetensors if path.suffix == ".safetensors" else _checkpoint)(path)
+    network = _build(spec, path)
+    _fill(network, weights, path)
+    fold(network)
+    return network.float().eval()
+
+
+def save(path: Path, network: nn.Module, spec: dict, card: dict) -> None:
+    """Write `network`, spectral norm folded, as float16 safetensors with `spec` and `card` (plain
+    values: data, seeds, commit, metrics ...) in its header; whole or not at all.
+    """
+    spec = {"target": spec["target"], "kwargs": spec["kwargs"] | _unnormalised(spec)}
+    plain = _build(spec, path)
+    plain.load_state_dict(folded(network))
+    halves = {name: value.half().contiguous() for name, value in plain.state_dict().items()}
+    partial = path.with_name(path.name + ".partial")
+    save_file(halves, partial, {"network": json.dumps(spec), "card": json.dumps(card)})
+    os.replace(partial, path)
+
+
+def fold(network: nn.Module) -> None:
+    """Replace every parametrised weight by its value, in place."""
+    for module in network.modules():
+        if parametrize.is_parametrized(module, "weight"):
+            module.eval()  # else folding would take one more power iteration
+            parametrize.remove_parametrizations(module, "weight")
+
+
+def folded(network: nn.Module) -> dict[str, Tensor]:
+    """Return the state dict of `network` as if its parametrisations were folded."""
+    values = {}
+    for prefix, module in network.named_modules():
+        if parametrize.is_parametrized(module, "weight"):
+            module.eval()
+            values[f"{prefix}.weight"] = module.weight.detach().clone()
+    kept = {
+        name: value
+        for name, value in network.state_dict().items()
+        if "parametrizations" not in name
+    }
+    return kept | values
+
+
+def _unnormalised(spec: dict) -> dict:
+    return {"spectral_norm": False} if "spectral_norm" in spec["kwargs"] else {}
+
+
+def _safetensors(path: Path) -> tuple[dict, dict[str, Tensor]]:
+    try:
+        with safe_open(path, "pt") as file:
+            header = file.metadata() or {}
+            weights = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118
+        return json.loads(header["network"]), weights
+    except (SafetensorError, KeyError, ValueError, OSError) as error:
+        raise ValueError(f"ckpt must be a network written by this project, got {path}") from error
+
+
+def _checkpoint(path: Path) -> tuple[dict, dict[str, Tensor]]:
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        state = content["state_dict"]
+        weights = {n.removeprefix("network."): v for n, v in state.items() if "network." in n}
+        return content["network"], weights
+    except (RuntimeError, KeyError, TypeError, EOFError, OSError, pickle.UnpicklingError) as error:
+        raise ValueError(f"ckpt must be a checkpoint of src.train, got {path}") from error
+
+
+def _build(spec: dict, path: Path) -> nn.Module:
+    try:
+        target, kwargs = str(spec["target"]), dict(spec["kwargs"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"ckpt must name its network, got {path}") from error
+    if not target.startswith(ROOMS):
+        raise ValueError(
+            f"ckpt must hold a network of {' or '.join(ROOMS)}, got {target} in {path}"
+        )
+    room, _, name = target.rpartition(".")
+    try:
+        kind = getattr(import_module(room), name)
+        assert issubclass(kind, nn.Module)
+        return kind(**kwargs)
+    except (ImportError, AttributeError, AssertionError, TypeError) as error:
+        raise ValueError(f"ckpt names a network that is not here: {target} in {path}") from error
+
+
+def _fill(network: nn.Module, weights: dict[str, Tensor], path: Path) -> None:
+    own = network.state_dict()
+    missing, extra = sorted(own.keys() - weights.keys()), sorted(weights.keys() - own.keys())
+    other = [n for n in own.keys() & weights.keys() if own[n].shape != weights[n].shape]
+    if missing or extra or other:
+        raise ValueError(
+            f"ckpt does not fit {type(network).__name__} in {path}: missing {missing}, "
+            f"extra {extra}, of another shape {sorted(other)}"
+        )
+    network.load_state_dict(weights)
