@@ -12,7 +12,7 @@ TITLE_PX = 18  # height of the strip with a panel's name
 GAP_PX = 4
 SMALLEST_PX = 160  # panels lower than this are enlarged by a whole factor
 
-Video = Float[np.ndarray, "frames h w 3"]
+Video = Float[np.ndarray, "_frames _h _w 3"]
 
 
 def event_picture(
@@ -34,14 +34,10 @@ def row(panels: dict[str, Video]) -> Video:
         _titled(_enlarge(video, tallest // video.shape[1]), n) for n, video in panels.items()
     ]
     height = max(column.shape[1] for column in columns)
+    below = [(0, height - column.shape[1]) for column in columns]
     columns = [
-        np.pad(
-            column,
-            ((0, 0), (0, height - column.shape[1]), (0, GAP_PX), (0, 0)),
-            "constant",
-            constant_values=1,
-        )
-        for column in columns
+        np.pad(column, ((0, 0), rows, (0, GAP_PX), (0, 0)), constant_values=1)
+        for column, rows in zip(columns, below, strict=True)
     ]
     return np.concatenate(columns, axis=2)[:, :, :-GAP_PX]
 
