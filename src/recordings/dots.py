@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 STEPS = 40
-SETTLED = 1e-5  # the largest change of a parameter in the last step
+SETTLED = 1e-5  # the change of a parameter after which its fit is done
 CHUNK = 512  # fits at a time: 512 patches of 31x31 hold 25 MB of derivatives
 EXPLAINED = 0.5  # of the patch's variance, or it is no dot
 
@@ -80,22 +80,17 @@ def _fit(values: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return fitted
     values = values[finite]
     guess = _start(values, x, y)
-    damping = np.full(len(values), 1e-3)
-    cost = _residual(guess, values, x, y)[1]
+    damping, cost = np.full(len(values), 1e-3), _residual(guess, values, x, y)[1]
+    active = np.arange(len(values))
     for _ in range(STEPS):
-        residual, _, slope = _derivatives(guess, values, x, y)
-        gradient = slope @ residual[..., None]
-        curvature = slope @ slope.transpose(0, 2, 1)
-        diagonal = curvature[:, range(6), range(6)]
-        curvature[:, range(6), range(6)] += damping[:, None] * diagonal + 1e-12
-        trial = guess - np.linalg.solve(curvature, gradient)[..., 0]
-        trial[:, 2:4] = np.clip(trial[:, 2:4], -2.5, 5.0)
-        trial_cost = _residual(trial, values, x, y)[1]
-        better = trial_cost < cost
-        step = np.abs(trial - guess).max()
-        guess[better], cost[better] = trial[better], trial_cost[better]
-        damping = np.clip(np.where(better, damping / 5, damping * 4), 1e-9, 1e9)
-        if step < SETTLED:
+        trial = _step(guess[active], damping[active], values[active], x, y)
+        trial_cost = _residual(trial, values[active], x, y)[1]
+        better = trial_cost < cost[active]
+        far = np.abs(trial - guess[active]).max(1) > SETTLED
+        guess[active[better]], cost[active[better]] = trial[better], trial_cost[better]
+        damping[active] = np.clip(damping[active] * np.where(better, 0.2, 4), 1e-9, 1e9)
+        active = active[far]
+        if not active.size:
             break
     fitted[finite] = _accept(guess, cost, values, x, y)
     return fitted
@@ -116,6 +111,17 @@ def _start(values: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.stack([cx, cy, log_sigma, log_sigma, amplitude[:, 0], background], axis=1)
 
 
+def _step(guess, damping, values, x, y) -> np.ndarray:
+    residual, slope = _derivatives(guess, values, x, y)
+    gradient = slope @ residual[..., None]
+    curvature = slope @ slope.transpose(0, 2, 1)
+    diagonal = curvature[:, range(6), range(6)]
+    curvature[:, range(6), range(6)] += damping[:, None] * diagonal + 1e-12
+    trial = guess - np.linalg.solve(curvature, gradient)[..., 0]
+    trial[:, 2:4] = np.clip(trial[:, 2:4], -2.5, 5.0)
+    return trial
+
+
 def _residual(guess, values, x, y):
     cx, cy, lx, ly, amplitude, background = (column[:, None] for column in guess.T)
     across, along = (x - cx) / np.exp(lx), (y - cy) / np.exp(ly)
@@ -125,7 +131,7 @@ def _residual(guess, values, x, y):
 
 
 def _derivatives(guess, values, x, y):
-    residual, cost, (across, along, bell) = _residual(guess, values, x, y)
+    residual, _, (across, along, bell) = _residual(guess, values, x, y)
     _, _, lx, ly, amplitude, _ = (column[:, None] for column in guess.T)
     peak = amplitude * bell
     slopes = (
@@ -134,7 +140,7 @@ def _derivatives(guess, values, x, y):
         peak * across**2,
         peak * along**2,
     )
-    return residual, cost, np.stack([*slopes, bell, np.ones_like(bell)], axis=1)
+    return residual, np.stack([*slopes, bell, np.ones_like(bell)], axis=1)
 
 
 def _accept(guess, cost, values, x, y):

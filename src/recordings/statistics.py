@@ -83,7 +83,7 @@ class Statistics:
             "frames": self.tilt.shape[1],
             "failed": int(self.failed.sum()),
             "tilt_rms_px": float(np.sqrt(_mean(self.tilt[view, :, dot] ** 2, None))),
-            "tilt_decay_s": decay_s(self.autocorrelation, self.fps),
+            "tilt_decay_s": float(decay_s(self.autocorrelation, self.fps)),
             "across_views": float(self.across_views[off].mean()) if off.any() else float("nan"),
             "blur_ratio": float(self.blur_ratio[view, dot]),
             "scintillation": float(self.scintillation[view, dot]),
@@ -136,9 +136,9 @@ def find_dots(
 
 
 def radius(places: Float[np.ndarray, "dots 2"]) -> int:
-    """Return half the distance of neighbouring dots, less a pixel: what a dot has to itself."""
+    """Return a third of the distance of neighbouring dots: room for a dot that wanders."""
     apart = np.linalg.norm(places[:, None] - places, axis=-1)
-    return max(2, int(apart[apart > 0].min() / 2) - 1)
+    return max(3, round(apart[apart > 0].min() / 3))
 
 
 def autocorrelation(tilt: Float[np.ndarray, "frames 2"], lags: int) -> Float[np.ndarray, " lags"]:
