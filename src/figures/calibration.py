@@ -7,6 +7,7 @@ from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from src.figures import plots
 from src.recordings.alignment import Alignment, Found
 from src.recordings.statistics import Statistics, decay_s
 from src.recordings.views import Views
@@ -21,7 +22,7 @@ def views_found(picture: UInt8[np.ndarray, "h w"], found: Found, path: Path) -> 
     for position, points in found.points.items():
         axes.plot(*points.T, ".", markersize=2, label=str(position))
     axes.set_title(f"target found in {len(found.points)} views")
-    figure.savefig(path, dpi=150)
+    plots.save(figure, Path(path))
 
 
 def views_aligned(picture: UInt8[np.ndarray, "h w"], alignment: Alignment, path: Path) -> None:
@@ -35,7 +36,7 @@ def views_aligned(picture: UInt8[np.ndarray, "h w"], alignment: Alignment, path:
         for start, end in zip(points, ends, strict=True):
             axes.plot(*np.stack([start, end]).T, color="tab:red", linewidth=0.8)
     axes.set_title(f"views in the sensor's pixels; residuals in red, {MAGNIFIED} times too long")
-    figure.savefig(path, dpi=150)
+    plots.save(figure, Path(path))
 
 
 def views_by_hand(picture: UInt8[np.ndarray, "h w"], views: Views, path: Path) -> None:
@@ -43,7 +44,7 @@ def views_by_hand(picture: UInt8[np.ndarray, "h w"], views: Views, path: Path) -
     figure, axes = _sensor(picture)
     for view in views.views:
         _outline(axes, views, view)
-    figure.savefig(path, dpi=150)
+    plots.save(figure, Path(path))
 
 
 def _sensor(picture: np.ndarray) -> tuple[Figure, Axes]:
@@ -81,7 +82,7 @@ def turbulence(statistics: Statistics, positions: list[tuple[int, int]], path: P
     _intensity(panels[4], statistics, view, dot)
     failed = int(statistics.failed.sum())
     figure.suptitle(f"{statistics.blur.size} fits, {failed} failed", fontsize=9)
-    figure.savefig(path, dpi=120)
+    plots.save(figure, Path(path))
 
 
 def _autocorrelation(axes: Axes, statistics: Statistics) -> None:

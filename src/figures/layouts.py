@@ -9,6 +9,8 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from src.figures import plots
+
 LINE = "gold"
 
 
@@ -57,7 +59,7 @@ def comparison(
         time = length_s * sample / max(shortest - 1, 1)
         panel.set_title(f"{1e3 * time:.1f} ms", fontsize=8)
     grid[0, -1].set_title(f"{axis}-t, {1e3 * length_s:.0f} ms", fontsize=8)
-    figure.savefig(path, dpi=150)
+    plots.save(figure, Path(path))
 
 
 def _frame(panel: Axes, picture: np.ndarray) -> None:

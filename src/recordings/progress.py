@@ -19,10 +19,10 @@ def tell(frames: Iterable[Frame], overlap: int = 1) -> Iterator[Frame]:
             events, outside = events + frame.events, outside + frame.outside
             wall, length = time.perf_counter() - began, frame.time_s - first
             rate = (events + outside) / overlap / wall / 1e6
+            share = outside / max(events + outside, 1)
             text = (
-                f"{count} frames, {length:.3f} s of recording, {rate:.2f} Mev/s,"
-                f" {length / wall:.2f} x real time, {outside / max(events + outside, 1):.1%} of"
-                " events in no view"
+                f"{count} frames, {length:.3f} s, {rate:.2f} Mev/s, {length / wall:.2f} x real time,"
+                f" {share:.0%} in no view"
             )
             progress.update(task, description=text)
             yield frame
