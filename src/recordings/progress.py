@@ -21,8 +21,8 @@ def tell(frames: Iterable[Frame], overlap: int = 1) -> Iterator[Frame]:
             rate = (events + outside) / overlap / wall / 1e6
             share = outside / max(events + outside, 1)
             text = (
-                f"{count} frames, {length:.3f} s, {rate:.2f} Mev/s, {length / wall:.2f} x real time,"
-                f" {share:.0%} in no view"
+                f"{count} frames, {length:.3f} s, {rate:.2f} Mev/s, {length / wall:.2f} x real time"
+                f", {share:.0%} in no view"
             )
             progress.update(task, description=text)
             yield frame
