@@ -100,13 +100,16 @@ class Sink(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """What a unit of rows needs: arrays (rows, w), and room for the events of one pixel."""
+    """Arrays (rows, w) of a unit, (w) of one row at a time, and room for one pixel's events."""
 
     on: np.ndarray
     off: np.ndarray
     hot: np.ndarray
     level: np.ndarray
     source: np.ndarray
+    active: np.ndarray
+    noise_u: np.ndarray
+    noise_sign: np.ndarray
     when: np.ndarray
     sign: np.ndarray
 

@@ -47,7 +47,7 @@ def _run(job: Job, output: int, **targets) -> None:
     """Run `simulate` over all units on as many threads as torch would use."""
     n, views, _, height, width = job.frames.shape
     nowhere = {
-        "voxels": np.empty((n, views, 0, 2, height, width), np.float32),
+        "voxels": np.empty((n, views, 1, 1, height, width), np.float32),
         "counts": np.empty((0, 2), np.int64),
         "offsets": np.empty(0, np.int64),
         "events": np.empty(0, EVENT),

@@ -202,19 +202,20 @@ def noise_event(key, frame, pixel, intensity, shot):
 @njit(nogil=True, inline="always")
 def leaked(leak, threshold, frame):
     """Return how far the reference leaks in interval `frame`, by its whole units so far."""
-    return ((threshold * leak * (frame + 1)) >> 24) - ((threshold * leak * frame) >> 24)
+    rate = np.int64(threshold) * leak
+    return ((rate * (frame + 1)) >> 24) - ((rate * frame) >> 24)
 
 
 @njit(nogil=True, inline="always")
-def add_to_grid(grid, y, x, ticks, scale, sign):
-    """Add one event `ticks` microseconds into the window to `grid` (bins, h, w)."""
+def add_to_grid(grid, x, ticks, scale, sign):
+    """Add one event `ticks` microseconds into the window to one row's `grid` (bins, w)."""
     bins = grid.shape[0]
     tau = f32(f32(ticks) * scale)
     b = min(np.int64(tau), bins - 1)
     late = f32(np.rint((tau - f32(b)) * f32(2**20)) * f32(2.0**-20))
-    grid[b, y, x] += f32(sign) * (f32(1) - late)
+    grid[b, x] += f32(sign) * (f32(1) - late)
     if late > 0 and b + 1 < bins:
-        grid[b + 1, y, x] += f32(sign) * late
+        grid[b + 1, x] += f32(sign) * late
 
 
 @njit(nogil=True)
@@ -223,7 +224,7 @@ def busiest(chip, memory, scratch, c, v, frame):
     steps = np.int64(1)
     for y in range(scratch.on.shape[0]):
         for x in range(scratch.on.shape[1]):
-            on, off = scratch.on[y, x], scratch.off[y, x]
+            on, off = np.int64(scratch.on[y, x]), np.int64(scratch.off[y, x])
             crossings, _ = v2e_crossings(
                 np.int64(memory.level[c, v, y, x]),
                 scratch.level[y, x] + leaked(chip.leak, on, frame),
@@ -235,49 +236,81 @@ def busiest(chip, memory, scratch, c, v, frame):
 
 
 @njit(nogil=True)
+def find_active(chip, scratch, r, level, reference, dead, frame):
+    """List the pixels of a row that have something to do in `scratch.active`; return how many.
+
+    Without a branch: most pixels are quiet in most intervals, and which are is not predictable.
+    """
+    new, on, off = scratch.level[r], scratch.on[r], scratch.off[r]
+    active, noise_u = scratch.active, scratch.noise_u
+    holds, count = chip.mode == HOLD, 0
+    for x in range(level.size):
+        l0, l1, ref = level[x], new[x], reference[x]
+        if chip.leak:
+            l1 += np.int32(leaked(chip.leak, on[x], frame))
+        reached = (max(l0, l1) >= ref + on[x]) | (min(l0, l1) <= ref - off[x])
+        active[count] = x
+        count += reached | (noise_u[x] <= 1) | (holds & (dead[x] > 0))
+    return count
+
+
+@njit(nogil=True)
+def draw_noise(chip, scratch, r, c, v, pixel, frame, intensity):
+    """Fill the row's times and polarities of noise events; time 2 for none."""
+    key = chip.shot_keys[c, v]
+    for x in range(intensity.size):
+        u, s = f32(2), 1
+        if scratch.hot[r, x]:
+            u, s = noise_event(key, frame, pixel + x, f32(0), chip.hot)
+        elif chip.shot:
+            u, s = noise_event(key, frame, pixel + x, intensity[x], chip.shot)
+        scratch.noise_u[x], scratch.noise_sign[x] = u, s
+
+
+@njit(nogil=True)
 def advance(chip, memory, sink, scratch, intensity, where, frame, steps, clock):
     """Take one row through one interval; `clock`: window, its start and scale, interval's edges."""
     c, v, y, r = where
     level, reference = memory.level[c, v, y], memory.reference[c, v, y]
-    dead_row = memory.dead[c, v, y]
+    dead, new = memory.dead[c, v, y], scratch.level[r]
     pixel = (chip.place[0] + y) * chip.place[2] + chip.place[1]
-    for x in range(level.size):
-        on, off, hot = scratch.on[r, x], scratch.off[r, x], scratch.hot[r, x]
-        l0, ref, dead = np.int64(level[x]), np.int64(reference[x]), dead_row[x]
+    if chip.shot or chip.hot:
+        draw_noise(chip, scratch, r, c, v, pixel, frame, intensity)
+    row = (c * sink.voxels.shape[1] + v) * sink.voxels.shape[4] + y
+    grid = sink.voxels[c, v, min(clock[0], sink.voxels.shape[2] - 1), :, y]
+    for k in range(find_active(chip, scratch, r, level, reference, dead, frame)):
+        x = scratch.active[k]
+        on, off = np.int64(scratch.on[r, x]), np.int64(scratch.off[r, x])
         drift = leaked(chip.leak, on, frame) if chip.leak else np.int64(0)
-        l1 = scratch.level[r, x] + drift
-        u, s = f32(2), 1
-        if hot:
-            u, s = noise_event(chip.shot_keys[c, v], frame, pixel + x, f32(0), chip.hot)
-        elif chip.shot:
-            u, s = noise_event(chip.shot_keys[c, v], frame, pixel + x, intensity[x], chip.shot)
-        quiet = max(l0, l1) < ref + on and min(l0, l1) > ref - off
-        if not quiet or u <= 1 or (chip.mode == HOLD and dead > 0):
-            if chip.v2e:
-                count, ref, dead = v2e_events(
-                    l0, l1, ref, dead, on, off, chip.wait, chip.mode, steps, u, s,
-                    scratch.when, scratch.sign,
-                )  # fmt: skip
-            else:
-                count, ref, dead = linear_events(
-                    l0, l1, ref, dead, on, off, chip.wait, chip.mode, u, s,
-                    scratch.when, scratch.sign,
-                )  # fmt: skip
-            for k in range(count):
-                emit(sink, c, v, y, x, scratch.when[k], scratch.sign[k], clock)
-        reference[x], dead_row[x] = ref - drift, max(dead - f32(1), f32(0))
-        level[x] = scratch.level[r, x]
+        l0, l1, ref = np.int64(level[x]), new[x] + drift, np.int64(reference[x])
+        u, s = scratch.noise_u[x], np.int64(scratch.noise_sign[x])
+        if chip.v2e:
+            count, ref, dead[x] = v2e_events(
+                l0, l1, ref, dead[x], on, off, chip.wait, chip.mode, steps, u, s,
+                scratch.when, scratch.sign,
+            )  # fmt: skip
+        else:
+            count, ref, dead[x] = linear_events(
+                l0, l1, ref, dead[x], on, off, chip.wait, chip.mode, u, s,
+                scratch.when, scratch.sign,
+            )  # fmt: skip
+        reference[x] = ref
+        for i in range(count):
+            emit(sink, grid, row, y, x, scratch.when[i], scratch.sign[i], clock)
+    for x in range(level.size):
+        if chip.leak:
+            reference[x] -= np.int32(leaked(chip.leak, scratch.on[r, x], frame))
+        level[x], dead[x] = new[x], max(dead[x] - f32(1), f32(0))
     memory.source[c, v, y] = scratch.source[r]
 
 
 @njit(nogil=True, inline="always")
-def emit(sink, c, v, y, x, u, sign, clock):
+def emit(sink, grid, row, y, x, u, sign, clock):
     """Send one event at fraction `u` of the interval where it goes, stamped with its tick."""
-    window, origin, scale, start, end = clock
+    _, origin, scale, start, end = clock
     t = start + max(np.int64(np.ceil(u * f32(end - start))) - 1, 0)
-    row = (c * sink.voxels.shape[1] + v) * sink.voxels.shape[4] + y
     if sink.output == VOXELS:
-        add_to_grid(sink.voxels[c, v, window], y, x, t - origin, scale, sign)
+        add_to_grid(grid, x, t - origin, scale, sign)
     elif sink.output == COUNT:
         sink.counts[row, 0 if sign > 0 else 1] += 1
     else:
@@ -291,9 +324,11 @@ def make_scratch(rows, width, smallest):
     """Return the scratch; a pixel has no more events in an interval than thresholds in 32 nat."""
     room = 32 + (1 << 25) // max(smallest >> 2, 1024)
     return Scratch(
-        np.empty((rows, width), np.int64), np.empty((rows, width), np.int64),
+        np.empty((rows, width), np.int32), np.empty((rows, width), np.int32),
         np.empty((rows, width), np.bool_), np.empty((rows, width), np.int32),
-        np.empty((rows, width), np.int32), np.empty(room, np.float32), np.empty(room, np.int8),
+        np.empty((rows, width), np.int32), np.empty(width + 1, np.int64),
+        np.full(width, f32(2)), np.ones(width, np.int8),
+        np.empty(room, np.float32), np.empty(room, np.int8),
     )  # fmt: skip
 
 

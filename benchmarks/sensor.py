@@ -1,0 +1,148 @@
+"""Time the sensor, the voxel grids and the event files: python -m benchmarks.sensor [--eager].
+
+Nine views of a clip of 1/f texture and hard discs that pans by one pixel a frame and shakes by one.
+Milliseconds are per frame interval of all nine views, the smallest CPU time of the thread over the
+repeats (wall time with two threads): the machine may be shared.
+"""
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.nn import functional
+
+from src.recordings.formats import iter_events, write_events
+from src.sim.engines import sensor_eager
+from src.sim.sensor import EventSensor
+from src.sim.voxel import voxel_grid
+
+SIDE, FPS = 256, 120.0
+
+
+def clip(views: int, frames: int, seed: int = 0) -> torch.Tensor:
+    """Return (1, views, frames, 256, 256) in 8-bit code values / 255."""
+    g = torch.Generator().manual_seed(seed)
+    wide = 2 * SIDE
+    axis = torch.fft.fftfreq(wide)
+    spectrum = torch.randn(wide, wide, dtype=torch.complex64, generator=g)
+    texture = torch.fft.ifft2(spectrum / (axis[:, None] ** 2 + axis**2).sqrt().clamp(min=1 / wide))
+    picture = torch.sigmoid(0.6 * texture.real / texture.real.std())
+    y, x = torch.meshgrid(torch.arange(wide), torch.arange(wide), indexing="ij")
+    for cx, cy, r, value in torch.rand(40, 4, generator=g) * torch.tensor([wide, wide, 30, 0.8]) + 0.1:
+        picture[(x - cx) ** 2 + (y - cy) ** 2 < r**2] = value
+    out = torch.empty(1, views, frames, SIDE, SIDE)
+    for v in range(views):
+        shake = functional.avg_pool1d(torch.randn(2, frames + 4, generator=g), 5, 1) * 5**0.5
+        for k in range(frames):
+            dx, dy = 100 + k + float(shake[0, k]), 100 + float(shake[1, k])
+            shift = torch.tensor([[1, 0, dx], [0, 1, dy]])
+            place = torch.stack([x, y, torch.ones_like(x)], -1)[:SIDE, :SIDE].float() @ shift.T
+            grid = (place / (wide - 1) * 2 - 1)[None]
+            out[0, v, k] = functional.grid_sample(picture[None, None], grid, align_corners=True)[
+                0, 0
+            ]
+    return (out * 255).round() / 255
+
+
+def best(call, repeats: int, clock=time.thread_time) -> float:
+    """Return the smallest time of a call in seconds."""
+    times = []
+    for _ in range(repeats):
+        start = clock()
+        call()
+        times.append(clock() - start)
+    return min(times)
+
+
+def sensors(frames: torch.Tensor, repeats: int, eager: bool) -> None:
+    """Print milliseconds per interval of nine views for several sensors."""
+    noisy = {"mismatch": 0.25, "leak_hz": 0.1, "shot_hz": 5.0, "cutoff_hz": 30.0}
+    cases = {
+        "C 0.1, 5 ms": {"threshold": 0.1},
+        "C 0.2, 5 ms": {"threshold": 0.2},
+        "C 0.5, 5 ms": {"threshold": 0.5},
+        "C 0.1, 0": {"threshold": 0.1, "refractory_s": 0.0},
+        "C 0.2, 5 ms, delete": {"threshold": 0.2, "refractory": "delete"},
+        "C 0.2, 5 ms, hold": {"threshold": 0.2, "refractory": "hold"},
+        "C 0.2, 5 ms, v2e stamps": {"threshold": 0.2, "stamps": "v2e"},
+        "C 0.2, 5 ms, noisy": {"threshold": 0.2, **noisy},
+    }
+    intervals = frames.shape[2] - 1
+    print(
+        f"{'sensor':26} {'ev/px/s':>8} {'1 thread':>9} {'2 threads':>9} {'eager':>8}  ms/interval"
+    )
+    for name, settings in cases.items():
+        sensor = EventSensor(**settings)
+        rate = float(sensor.counts(frames, FPS).sum()) / frames[0, :, 0].numel() / intervals * FPS
+        torch.set_num_threads(2)
+        two = best(lambda s=sensor: s.voxels(frames, FPS), repeats, time.perf_counter)
+        torch.set_num_threads(1)
+        one = best(lambda s=sensor: s.voxels(frames, FPS), repeats)
+        slow = float("nan")
+        if eager:
+            few = frames[:, :, :4].contiguous()
+            job = sensor._job(few, FPS, None, 1)
+            grids = torch.empty(1, 9, 3, 5, SIDE, SIDE)
+            slow = best(lambda j=job, g=grids: sensor_eager.voxels(j, g), 2) / 3 * intervals
+        times = " ".join(f"{1e3 * t / intervals:9.2f}" for t in (one, two, slow))
+        print(f"{name:26} {rate:8.1f} {times}")
+
+
+def voxelising(repeats: int) -> None:
+    """Print million events per second of list -> voxel grid and of EVT3 file -> voxel windows."""
+    g = np.random.default_rng(0)
+    n = 1_000_000
+    t = np.sort(g.integers(0, 100_000, n))
+    x, y = g.integers(0, 1280, n).astype(np.uint16), g.integers(0, 720, n).astype(np.uint16)
+    p = g.choice(np.array([-1, 1], np.int8), n)
+    size = {"bins": 5, "height": 720, "width": 1280}
+    seconds = best(lambda: voxel_grid(t, x, y, p, t0=0, t1=100_000, **size), repeats)
+    print(f"list to voxel grid, 1280x720, scattered: {n / seconds / 1e6:.0f} Mev/s")
+    near_x, near_y = (x % 256).astype(np.uint16), (y % 256).astype(np.uint16)
+    small = {"bins": 5, "height": 256, "width": 256}
+    seconds = best(lambda: voxel_grid(t, near_x, near_y, p, t0=0, t1=100_000, **small), repeats)
+    print(f"list to voxel grid, 256x256, scattered: {n / seconds / 1e6:.0f} Mev/s")
+    files(repeats)
+
+
+def files(repeats: int) -> None:
+    """Print how fast the events of a panning view come out of an EVT3 file as windows."""
+    frames = clip(1, 31)[0, 0]
+    one = EventSensor(0.1, refractory_s=0.0).events(frames, FPS)
+    length = int(one["t"][-1]) + 1
+    events = np.concatenate([one] * 8)
+    events["t"] += np.repeat(np.arange(8), len(one)) * length
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.raw"
+        write_events(path, events, width=SIDE, height=SIDE)
+
+        def read() -> None:
+            for part in iter_events(path, seconds=1 / FPS):
+                ends = {"t0": int(part["t"][0]), "t1": int(part["t"][0]) + 8334}
+                columns = (part[name] for name in "txyp")
+                voxel_grid(*columns, **ends, bins=5, height=SIDE, width=SIDE)
+
+        whole = best(read, max(3, repeats // 4))
+        only = best(lambda: sum(map(len, iter_events(path))), max(3, repeats // 4))
+    n = len(events)
+    print(f"EVT3 file of {n} events: read {n / only / 1e6:.0f} Mev/s, to voxel windows", end=" ")
+    print(f"{n / whole / 1e6:.0f} Mev/s")
+
+
+def main() -> None:
+    """Print everything."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeats", type=int, default=20)
+    parser.add_argument("--frames", type=int, default=11)
+    parser.add_argument("--eager", action="store_true", help="time plain torch as well")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    voxelising(arguments.repeats)
+    sensors(clip(9, arguments.frames), arguments.repeats, arguments.eager)
+
+
+if __name__ == "__main__":
+    main()
