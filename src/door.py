@@ -1,5 +1,6 @@
 """What every door (train, eval, simulate ...) shares: a job's folder, its errors, its end."""
 
+import logging
 import os
 import sys
 import time
@@ -31,6 +32,8 @@ def run(main: Callable[[], None]) -> None:
 def job(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:
     """Run `work` in the folder Hydra made for this job; print the config once; end W&B's run."""
     cfg.paths.run = HydraConfig.get().runtime.output_dir
+    for chatty in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):
+        logging.getLogger(chatty).setLevel(logging.WARNING)
     rich.print(Syntax(resolved(cfg), "yaml", background_color="default"))
     try:
         work(cfg)

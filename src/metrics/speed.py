@@ -13,7 +13,7 @@ class SpeedSplit(Callback):
     """
 
     def __init__(self, after: int = 20):
-        self.after = after
+        self.after, self.seen = after, 0
         self.simulated, self.trained, self.started = 0.0, 0.0, 0.0
 
     def on_train_batch_start(self, trainer, module, batch, batch_idx: int) -> None:
@@ -22,10 +22,11 @@ class SpeedSplit(Callback):
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx: int) -> None:
         """Add up; print when enough steps are seen."""
-        if self.after // 2 <= batch_idx < self.after:
+        self.seen += 1
+        if self.after // 2 < self.seen <= self.after:
             self.simulated += batch.seconds
             self.trained += time.perf_counter() - self.started
-        if batch_idx == self.after:
+        if self.seen == self.after:
             trainer.print(self.text(self.after - self.after // 2))
 
     def text(self, steps: int) -> str:

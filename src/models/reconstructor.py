@@ -57,8 +57,9 @@ class Reconstructor(LightningModule):
         return self._measures[1]
 
     def on_fit_start(self) -> None:
-        """Move the loss, which is no submodule, to the training device."""
+        """Move the loss, which is no submodule, to the training device; undo a test's eval mode."""
         self.loss.to(self.device)
+        self.train()
 
     def training_step(self, sample: "Sample", batch_idx: int) -> Tensor:
         """One optimiser step on a batch of sequences; returns the loss averaged over windows.
