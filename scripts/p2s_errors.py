@@ -20,6 +20,7 @@ AIRY = (0.25, 0.5, 1.0, 2.0)
 MODES = (5, 9, 14, 20, 27, 35, 44, 54, 65, 77)
 PITCHES = (0.025, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0)  # of D, at the object
 RANKS = (4, 8, 12, 16, 20, 24, 32, 40, 48)
+REACHES = (3.0, 4.0, 5.0, 6.0, 7.0, 8.5, 11.5)  # half the kernel, in lambda / D
 ALL_MODES = 119
 FINE, GRID = 47, 96  # samples of a PSF, and of its transform
 SPATIAL_WAVES = 256
@@ -46,7 +47,7 @@ def measure() -> dict[str, Tensor]:
     tables = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
     axes = {"strength": STRENGTHS, "airy": AIRY, "modes_axis": MODES, "pitch_axis": PITCHES}
     tables |= {name: torch.tensor(values) for name, values in axes.items()}
-    tables["rank_axis"] = torch.tensor(RANKS)
+    tables |= {"rank_axis": torch.tensor(RANKS), "kernel_axis": torch.tensor(REACHES)}
     return {f"errors.{name}": value.float().contiguous() for name, value in tables.items()}
 
 
@@ -57,11 +58,13 @@ def _row(strength: float) -> dict[str, Tensor]:
     modes = [_power(_exact(phase[:, :count]) - full) / power for count in MODES]
     pitch = [_pitch_error(strength, pitch) / power for pitch in PITCHES]
     rank = [error / power for error in _rank_errors(strength)]
+    kernel = [_power(_cut(full, reach) - full) / power for reach in REACHES]
     return {
         "power": power,
         "modes": torch.stack(modes),
         "pitch": torch.stack(pitch),
         "rank": torch.stack(rank),
+        "kernel": torch.stack(kernel),
         "half_light": _half_light(full.mean(0)),
     }
 
@@ -125,6 +128,13 @@ def _rank_errors(strength: float) -> list[Tensor]:
         weights = band.weights(phase[:, 2:], rank)
         out.append(_power(band.mean + torch.tensordot(weights, basis, 1) - psfs))
     return out
+
+
+def _cut(psfs: Tensor, reach: float) -> Tensor:
+    """Return the PSFs without what lies `reach` lambda / D or more off the axes; they sum to 1."""
+    inside = (torch.arange(FINE) - FINE // 2).abs() <= reach * FINE_PER_AIRY
+    cut = psfs * inside * inside[:, None]
+    return cut / cut.sum((1, 2), keepdim=True)
 
 
 def _half_light(psf: Tensor) -> Tensor:

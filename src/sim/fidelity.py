@@ -22,7 +22,7 @@ from src.sim.phase import draw_waves
 
 CONTRAST = 0.2  # rms contrast of a natural picture
 UNSEEN = 0.5 / 255  # rms error that nobody needs to go below
-SHARES = {"modes": 0.5, "pitch": 0.3, "rank": 0.2}  # of the tolerance
+SHARES = {"modes": 0.42, "pitch": 0.33, "rank": 0.15, "kernel": 0.1}  # of the tolerance
 BEYOND = 1.06  # the networks are fitted a little beyond the edge of their band
 EXACT_MODES = 119  # whole orders up to n = 14, for D/r0 beyond the tables
 MAX_PITCH = 64
@@ -35,8 +35,8 @@ class Fidelity:
     `tilt_px`: standard deviation along one axis; `airy_px`: lambda / D; `blur_px`: the radius that
     holds half of the light of a point, tilt removed.  `modes` Noll modes from tilt on, `rank` basis
     functions (0: exact PSFs), `kernel` pixels across the PSF, `pitch` and `tilt_pitch` pixels
-    between the nodes of the phase.  `error_modes`, `error_pitch`, `error_rank`: shares of the
-    random power; `error`: the rms error they make together in a picture of rms contrast 1.
+    between the nodes of the phase.  `error_modes`, `error_pitch`, `error_rank`, `error_kernel`:
+    shares of the random power; `error`: the rms error they make together in a picture of rms contrast 1.
     """
 
     d_over_r0: float = 0.0
@@ -54,6 +54,7 @@ class Fidelity:
     error_modes: float = 0.0
     error_pitch: float = 0.0
     error_rank: float = 0.0
+    error_kernel: float = 0.0
     error_tilt_px: float = 0.0
     error: float = 0.0
 
@@ -70,6 +71,7 @@ def choose(atmosphere: Atmosphere, width_px: int, tolerance: float, exact: bool)
     exact = exact or band is None
     modes, error_modes = _cheapest("modes", strength, airy, allowed)
     rank, error_rank = (0.0, 0.0) if exact else _cheapest("rank", strength, airy, allowed)
+    reach, error_kernel = _cheapest("kernel", strength, airy, allowed)
     step, error_pitch = _widest(strength, airy, allowed)
     if strength > _table("strength")[-1]:
         modes = EXACT_MODES
@@ -88,14 +90,15 @@ def choose(atmosphere: Atmosphere, width_px: int, tolerance: float, exact: bool)
         blur_px=airy * _half_light(strength),
         modes=int(modes),
         rank=0 if exact else min(int(rank), len(band.basis)),
-        kernel=_kernel(strength, airy),
+        kernel=_kernel(strength, airy, reach),
         pitch=int(min(max(step / pixel, 1), MAX_PITCH)),
         tilt_pitch=tilt_pitch,
         error_modes=error_modes,
         error_pitch=error_pitch if step >= pixel else 0.0,
         error_rank=error_rank,
+        error_kernel=error_kernel,
         error_tilt_px=error_tilt,
-        error=math.sqrt(power * (error_modes + error_pitch + error_rank)),
+        error=math.sqrt(power * (error_modes + error_pitch + error_rank + error_kernel)),
     )
 
 
@@ -104,11 +107,13 @@ def band_for(strength: float) -> Band | None:
     return next((band for band in bands() if strength <= BEYOND * band.edge), None)
 
 
-def _kernel(strength: float, airy: float) -> int:
-    """Return the odd number of pixels that the window of the basis covers."""
+def _kernel(strength: float, airy: float, reach: float) -> int:
+    """Return the odd number of pixels that `reach` lambda / D cover, within the basis if any."""
     band = band_for(strength)
-    across = band.mean.shape[-1] / FINE_PER_AIRY if band else 12 + 1.2 * strength
-    return 2 * math.floor(across * airy / 2) + 1
+    widest = band.mean.shape[-1] / FINE_PER_AIRY / 2 if band else 6 + 0.6 * strength
+    if strength > _table("strength")[-1]:
+        reach = widest
+    return 2 * math.floor(min(reach + 0.5 / airy, widest) * airy) + 1
 
 
 def _cheapest(name: str, strength: float, airy: float, allowed: float) -> tuple[float, float]:
@@ -135,8 +140,8 @@ def _widest(strength: float, airy: float, allowed: float) -> tuple[float, float]
 def _tilt_pitch(
     atmosphere: Atmosphere, width_px: int, tilt_px: float, tolerance: float
 ) -> tuple[int, float]:
-    """Return the widest pitch that errs by 0.02 px or 5 % of the tolerance's rms."""
-    allowed = max(0.02, 0.05 * math.sqrt(tolerance) * tilt_px)
+    """Return the widest pitch that errs by 0.03 px or a tenth of the tolerance's rms."""
+    allowed = max(0.03, 0.1 * math.sqrt(tolerance) * tilt_px)
     pitches = [1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64]
     errors = [e * tilt_px for e in _tilt_errors(atmosphere, width_px, pitches)]
     best = max(i for i, error in enumerate(errors) if error <= allowed)

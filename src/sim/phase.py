@@ -88,9 +88,12 @@ class Field:
         self.response = torch.view_as_complex(waves.response[modes]).to(device, torch.complex64)
         down = _turns(waves.frequency[:, 1], rows, size[0])
         across = _turns(waves.frequency[:, 0], columns, size[1])
-        both = down.to(device)[:, :, None] * across.to(device)[:, None]
-        self.nodes = torch.stack([both.real, -both.imag], dim=1).flatten(2).flatten(0, 1)
-        self.shape = both.shape[1:]
+        down, across = down.to(device)[:, :, None], across.to(device)[:, None]
+        self.shape = (down.shape[1], across.shape[2])
+        nodes = torch.empty(len(down), 2, *self.shape, device=device)
+        torch.mul(down.real, across.real, out=nodes[:, 0]).addcmul_(down.imag, -across.imag)
+        torch.mul(down.real, -across.imag, out=nodes[:, 1]).addcmul_(down.imag, -across.real)
+        self.nodes = nodes.flatten(2).flatten(0, 1)
         self.vertical, self.horizontal = rows.weights().to(device), columns.weights().T.to(device)
 
     def at_nodes(
@@ -147,10 +150,13 @@ def _turns(frequency: Tensor, lattice: Lattice, size: int) -> Tensor:
 
 
 def _sequence(key: int, count: int) -> Float[Tensor, "count 3"]:
-    """Return a rank-1 Kronecker sequence in the unit cube, shifted at random (Roberts' R2)."""
+    """Return a Kronecker sequence in the unit cube, shifted at random: strata, angle, path.
+
+    sqrt 3 for the angle because none of its small multiples, the m of the modes, is near a whole
+    number; that would tie the angle to the radius and spoil the mode's variance in every clip.
+    """
     shift = noise.uniform(key, torch.arange(3)).double()
-    golden = 1.324717957244746  # root of x^3 = x + 1
-    step = torch.tensor([1 / count, 1 / golden, 1 / golden**2], dtype=torch.float64)
+    step = torch.tensor([1 / count, math.sqrt(3) - 1, (math.sqrt(5) - 1) / 2], dtype=torch.float64)
     return (shift * torch.tensor([1 / count, 1, 1]) + torch.arange(count)[:, None] * step) % 1.0
 
 

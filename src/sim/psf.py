@@ -32,7 +32,7 @@ def fraunhofer_psf(
     if size % 2 == 0 or size < 1 or not airy_px > 0:
         raise ValueError(f"psf needs an odd size and airy_px > 0, got {size}, {airy_px}")
     pupil = pupil or max(24, math.ceil(1.5 * size / airy_px) + 8)
-    points = points or max(1, math.ceil(3 / airy_px))
+    points = points or max(1, math.ceil(5 / airy_px))
     flat = coefficients.reshape(-1, coefficients.shape[-1])
     inside, basis = _pupil(flat.shape[-1], pupil)
     inside, basis = inside.to(flat), basis.to(flat)

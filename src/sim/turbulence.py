@@ -18,7 +18,7 @@ from src.sim.psf import fraunhofer_psf
 
 Crop = tuple[int, int, int, int]  # top, left, height, width
 ALPHA_FPS = 120.0  # the frame rate that Atmosphere.alpha is stated for
-WAVES = 256
+WAVES = 192
 TILE = 320  # pixels; larger pictures are made tile by tile, to bound the memory
 CHUNK, GROUP = 6_000_000, 60_000_000  # numbers in the PSFs of a view, and of all, at a time
 
@@ -44,7 +44,7 @@ class Turbulence:
         height: int,
         width: int,
         fps: float = 120.0,
-        tolerance: float = 0.2,
+        tolerance: float = 0.35,
         psf: str = "fitted",
         temporal: str = "ar1",
         wind_m_s: float = 3.0,
