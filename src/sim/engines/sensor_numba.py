@@ -11,9 +11,11 @@ from numba import njit, uint32, uint64
 from src.sim.engines.job import COUNT, DELETE, HOLD, VOXELS, Scratch
 
 f32 = np.float32
+kernel = njit(nogil=True, error_model="numpy")  # no test for a zero divisor
+small = njit(nogil=True, error_model="numpy", inline="always")
 
 
-@njit(nogil=True, inline="always")
+@small
 def mix(x):
     """The 32-bit finaliser of src.sim.noise."""
     x = uint32(x)
@@ -24,7 +26,7 @@ def mix(x):
     return uint32(x ^ (x >> uint32(16)))
 
 
-@njit(nogil=True, inline="always")
+@small
 def bits(key, high, low):
     """src.sim.noise.bits(key, high * 2**32 + low), the same 32 bits."""
     mixed = mix(uint32(low) ^ uint32(uint64(key) & uint64(0xFFFFFFFF)))
@@ -32,13 +34,13 @@ def bits(key, high, low):
     return mix(uint32(mixed + uint32(uint32(high) * uint32(0x9E3779B9)) + upper))
 
 
-@njit(nogil=True, inline="always")
+@small
 def level_at(start, delta, u):
     """Return the level at fraction `u` of an interval that begins at `start`."""
     return start + np.int64(np.rint(f32(u) * f32(delta)))
 
 
-@njit(nogil=True)
+@kernel
 def linear_events(l0, l1, ref, dead, on, off, wait, mode, noise_u, noise_sign, when, sign):
     """Return (events, ref, dead); `noise_u` is the time of a noise event, above 1 for none."""
     delta = l1 - l0
@@ -78,23 +80,25 @@ def linear_events(l0, l1, ref, dead, on, off, wait, mode, noise_u, noise_sign, w
         start, stop, noise_u = noise_u, f32(1), f32(2)
 
 
-@njit(nogil=True, inline="always")
+@small
 def next_crossing(l0, delta, ref, on, off, now):
     """Return (time, polarity) of the first threshold exceeded at or after `now`; time 2 if none."""
     if delta >= 0:
-        ahead, behind, speed, s = ref + on - l0, ref - off - l0, f32(delta), 1
+        ahead, behind, span, s = ref + on - l0, ref - off - l0, delta, 1
     else:
-        ahead, behind, speed, s = l0 - ref + off, l0 - ref - on, f32(-delta), -1
-    if behind >= 0 and f32(behind) >= now * speed:  # exceeded before, and still so
-        return now, -s
-    if f32(ahead) > speed:
+        ahead, behind, span, s = l0 - ref + off, l0 - ref - on, -delta, -1
+    if behind >= 0:  # exceeded before: still so?
+        if f32(behind) >= now * f32(span):
+            return now, -s
+    if ahead > span:
         return f32(2), s
     if ahead <= 0:
         return now, s
-    return max(now, f32(ahead) / speed), s
+    u = f32(ahead) / f32(span)
+    return (u if u > now else now), s
 
 
-@njit(nogil=True)
+@kernel
 def v2e_crossings(l0, l1, ref, dead, on, off, mode):
     """Return (thresholds between the reference and the frame's level, reference)."""
     if mode == HOLD and dead > 1:
@@ -104,7 +108,7 @@ def v2e_crossings(l0, l1, ref, dead, on, off, mode):
     return (l1 - ref) // on if l1 >= ref else (ref - l1) // off, ref
 
 
-@njit(nogil=True)
+@kernel
 def v2e_events(l0, l1, ref, dead, on, off, wait, mode, steps, noise_u, noise_sign, when, sign):
     """The same with v2e's time stamps: `steps` for the whole frame, set by its busiest pixel.
 
@@ -141,7 +145,7 @@ def v2e_events(l0, l1, ref, dead, on, off, wait, mode, steps, noise_u, noise_sig
     return count, ref, dead
 
 
-@njit(nogil=True, inline="always")
+@small
 def look(table, place, shift):
     """Return the table's value at the bits of one intensity, as src.sim.response.lookup does."""
     cell, inside = place >> 13, place & 8191
@@ -149,7 +153,7 @@ def look(table, place, shift):
     return (left + (((table[cell + 1] - left) * inside) >> 13) + (1 << (shift - 1))) >> shift
 
 
-@njit(nogil=True)
+@kernel
 def make_row(chip, normals, keys, pixel, on, off, hot):
     """Fill one row of thresholds `on`, `off` and of `hot`: what the chip is, whatever it sees."""
     threshold_on, threshold_off, spread, hot_share = chip
@@ -163,7 +167,7 @@ def make_row(chip, normals, keys, pixel, on, off, hot):
             hot[x] = bits(keys[1], 0, at) < hot_share
 
 
-@njit(nogil=True, inline="always")
+@small
 def spread_threshold(threshold, spread, normals, drawn):
     """Return threshold * (1 + spread * normal), at least a quarter of the threshold."""
     cell, inside = np.int64(drawn >> uint32(20)), np.int64(drawn & uint32(0xFFFFF))
@@ -171,7 +175,7 @@ def spread_threshold(threshold, spread, normals, drawn):
     return max(threshold + ((((threshold * spread) >> 20) * normal) >> 20), threshold >> 2)
 
 
-@njit(nogil=True)
+@kernel
 def new_levels(frame, table, decay, ramp, source, level, new_source, new_level):
     """Fill one row with the levels of a frame, before and after the low-pass if there is one."""
     places = frame.view(np.int32)
@@ -185,7 +189,7 @@ def new_levels(frame, table, decay, ramp, source, level, new_source, new_level):
             new_level[x] = y + ((old + 524288) >> 20)
 
 
-@njit(nogil=True, inline="always")
+@small
 def noise_event(key, frame, pixel, intensity, shot):
     """Return (time, polarity) of the noise event of a pixel and interval; time 2 for none.
 
@@ -199,14 +203,14 @@ def noise_event(key, frame, pixel, intensity, shot):
     return (f32(at >> uint32(9)) + f32(0.5)) * f32(2.0**-23), 1 if at & uint32(1) else -1
 
 
-@njit(nogil=True, inline="always")
+@small
 def leaked(leak, threshold, frame):
     """Return how far the reference leaks in interval `frame`, by its whole units so far."""
     rate = np.int64(threshold) * leak
     return ((rate * (frame + 1)) >> 24) - ((rate * frame) >> 24)
 
 
-@njit(nogil=True, inline="always")
+@small
 def add_to_grid(grid, x, ticks, scale, sign):
     """Add one event `ticks` microseconds into the window to one row's `grid` (bins, w)."""
     bins = grid.shape[0]
@@ -218,7 +222,7 @@ def add_to_grid(grid, x, ticks, scale, sign):
         grid[b + 1, x] += f32(sign) * late
 
 
-@njit(nogil=True)
+@kernel
 def busiest(chip, memory, scratch, c, v, frame):
     """Return the largest number of crossings of any pixel of a view, at least 1."""
     steps = np.int64(1)
@@ -235,91 +239,97 @@ def busiest(chip, memory, scratch, c, v, frame):
     return steps
 
 
-@njit(nogil=True)
+@kernel
 def find_active(chip, scratch, r, level, reference, dead, frame):
     """List the pixels of a row that have something to do in `scratch.active`; return how many.
 
     Without a branch: most pixels are quiet in most intervals, and which are is not predictable.
     """
     new, on, off = scratch.level[r], scratch.on[r], scratch.off[r]
-    active, noise_u = scratch.active, scratch.noise_u
+    active, noise_u, leak = scratch.active, scratch.noise_u, chip.leak
     holds, count = chip.mode == HOLD, 0
     for x in range(level.size):
         l0, l1, ref = level[x], new[x], reference[x]
-        if chip.leak:
-            l1 += np.int32(leaked(chip.leak, on[x], frame))
+        if leak:
+            l1 += np.int32(leaked(leak, on[x], frame))
         reached = (max(l0, l1) >= ref + on[x]) | (min(l0, l1) <= ref - off[x])
         active[count] = x
         count += reached | (noise_u[x] <= 1) | (holds & (dead[x] > 0))
     return count
 
 
-@njit(nogil=True)
+@kernel
 def draw_noise(chip, scratch, r, c, v, pixel, frame, intensity):
     """Fill the row's times and polarities of noise events; time 2 for none."""
-    key = chip.shot_keys[c, v]
+    key, hot, shot, hot_rate = chip.shot_keys[c, v], scratch.hot[r], chip.shot, chip.hot
+    noise_u, noise_sign = scratch.noise_u, scratch.noise_sign
     for x in range(intensity.size):
         u, s = f32(2), 1
-        if scratch.hot[r, x]:
-            u, s = noise_event(key, frame, pixel + x, f32(0), chip.hot)
-        elif chip.shot:
-            u, s = noise_event(key, frame, pixel + x, intensity[x], chip.shot)
-        scratch.noise_u[x], scratch.noise_sign[x] = u, s
+        if hot[x]:
+            u, s = noise_event(key, frame, pixel + x, f32(0), hot_rate)
+        elif shot:
+            u, s = noise_event(key, frame, pixel + x, intensity[x], shot)
+        noise_u[x], noise_sign[x] = u, s
 
 
-@njit(nogil=True)
+@kernel
 def advance(chip, memory, sink, scratch, intensity, where, frame, steps, clock):
-    """Take one row through one interval; `clock`: window, its start and scale, interval's edges."""
+    """Take one row through one interval; `clock`: window, its start and scale, interval's edges.
+
+    Arrays are taken out of their tuples before the loops: in a loop each would be counted as a
+    reference, which costs more than the pixel.
+    """
     c, v, y, r = where
     level, reference = memory.level[c, v, y], memory.reference[c, v, y]
     dead, new = memory.dead[c, v, y], scratch.level[r]
-    pixel = (chip.place[0] + y) * chip.place[2] + chip.place[1]
+    on_row, off_row = scratch.on[r], scratch.off[r]
+    active, noise_u, noise_sign = scratch.active, scratch.noise_u, scratch.noise_sign
+    when, sign, leak, wait, mode = scratch.when, scratch.sign, chip.leak, chip.wait, chip.mode
     if chip.shot or chip.hot:
+        pixel = (chip.place[0] + y) * chip.place[2] + chip.place[1]
         draw_noise(chip, scratch, r, c, v, pixel, frame, intensity)
     row = (c * sink.voxels.shape[1] + v) * sink.voxels.shape[4] + y
     grid = sink.voxels[c, v, min(clock[0], sink.voxels.shape[2] - 1), :, y]
+    counts, offsets, events = sink.counts, sink.offsets, sink.events
     for k in range(find_active(chip, scratch, r, level, reference, dead, frame)):
-        x = scratch.active[k]
-        on, off = np.int64(scratch.on[r, x]), np.int64(scratch.off[r, x])
-        drift = leaked(chip.leak, on, frame) if chip.leak else np.int64(0)
+        x = active[k]
+        on, off = np.int64(on_row[x]), np.int64(off_row[x])
+        drift = leaked(leak, on, frame) if leak else np.int64(0)
         l0, l1, ref = np.int64(level[x]), new[x] + drift, np.int64(reference[x])
-        u, s = scratch.noise_u[x], np.int64(scratch.noise_sign[x])
+        u, s = noise_u[x], np.int64(noise_sign[x])
         if chip.v2e:
             count, ref, dead[x] = v2e_events(
-                l0, l1, ref, dead[x], on, off, chip.wait, chip.mode, steps, u, s,
-                scratch.when, scratch.sign,
-            )  # fmt: skip
+                l0, l1, ref, dead[x], on, off, wait, mode, steps, u, s, when, sign
+            )
         else:
             count, ref, dead[x] = linear_events(
-                l0, l1, ref, dead[x], on, off, chip.wait, chip.mode, u, s,
-                scratch.when, scratch.sign,
-            )  # fmt: skip
+                l0, l1, ref, dead[x], on, off, wait, mode, u, s, when, sign
+            )
         reference[x] = ref
         for i in range(count):
-            emit(sink, grid, row, y, x, scratch.when[i], scratch.sign[i], clock)
+            t = stamp(when[i], clock)
+            if sink.output == VOXELS:
+                add_to_grid(grid, x, t - clock[1], clock[2], sign[i])
+            elif sink.output == COUNT:
+                counts[row, 0 if sign[i] > 0 else 1] += 1
+            else:
+                at = offsets[row]
+                events[at].t, events[at].x, events[at].y, events[at].p = t, x, y, sign[i]
+                offsets[row] = at + 1
     for x in range(level.size):
-        if chip.leak:
-            reference[x] -= np.int32(leaked(chip.leak, scratch.on[r, x], frame))
+        if leak:
+            reference[x] -= np.int32(leaked(leak, on_row[x], frame))
         level[x], dead[x] = new[x], max(dead[x] - f32(1), f32(0))
     memory.source[c, v, y] = scratch.source[r]
 
 
-@njit(nogil=True, inline="always")
-def emit(sink, grid, row, y, x, u, sign, clock):
-    """Send one event at fraction `u` of the interval where it goes, stamped with its tick."""
-    _, origin, scale, start, end = clock
-    t = start + max(np.int64(np.ceil(u * f32(end - start))) - 1, 0)
-    if sink.output == VOXELS:
-        add_to_grid(grid, x, t - origin, scale, sign)
-    elif sink.output == COUNT:
-        sink.counts[row, 0 if sign > 0 else 1] += 1
-    else:
-        event = sink.events[sink.offsets[row]]
-        event.t, event.x, event.y, event.p = t, x, y, sign
-        sink.offsets[row] += 1
+@small
+def stamp(u, clock):
+    """Return the tick of the sensor's clock in which fraction `u` of the interval falls."""
+    return clock[3] + max(np.int64(np.ceil(u * f32(clock[4] - clock[3]))) - 1, 0)
 
 
-@njit(nogil=True)
+@kernel
 def make_scratch(rows, width, smallest):
     """Return the scratch; a pixel has no more events in an interval than thresholds in 32 nat."""
     room = 32 + (1 << 25) // max(smallest >> 2, 1024)
@@ -332,7 +342,7 @@ def make_scratch(rows, width, smallest):
     )  # fmt: skip
 
 
-@njit(nogil=True)
+@kernel
 def begin(chip, memory, scratch, frame, where, fresh):
     """Set up one row: its pixels, and if it is fresh the memory of the first frame."""
     c, v, y, r = where
@@ -349,7 +359,7 @@ def begin(chip, memory, scratch, frame, where, fresh):
         memory.dead[c, v, y] = f32(0)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def simulate(first_unit, last_unit, frames, fresh, chip, memory, edges, first, substeps, sink):
     """Simulate units first_unit .. last_unit - 1: one row of a view each, with v2e's stamps all."""
     _, views, samples, height, width = frames.shape
