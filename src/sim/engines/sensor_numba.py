@@ -87,9 +87,8 @@ def next_crossing(l0, delta, ref, on, off, now):
         ahead, behind, span, s = ref + on - l0, ref - off - l0, delta, 1
     else:
         ahead, behind, span, s = l0 - ref + off, l0 - ref - on, -delta, -1
-    if behind >= 0:  # exceeded before: still so?
-        if f32(behind) >= now * f32(span):
-            return now, -s
+    if behind >= 0 and f32(behind) >= now * f32(span):  # exceeded before, and still so
+        return now, -s
     if ahead > span:
         return f32(2), s
     if ahead <= 0:
