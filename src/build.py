@@ -70,6 +70,7 @@ def data(cfg: DictConfig, splits: tuple[str, ...] = ("train", "val", "test")) ->
         {split: pipeline(cfg, split) for split in splits},
         make(cfg.augment) if "train" in splits else None,
         batch_size=cfg.data.batch_size,
+        reuse=cfg.data.reuse,
         epoch_clips=cfg.data.epoch_clips,
         val_clips=cfg.data.val_clips,
         test_clips=cfg.data.test_clips,

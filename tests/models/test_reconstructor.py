@@ -13,6 +13,9 @@ from src.models.unroll import chunks, detach, unroll
 from src.sim.pipeline import Sample
 
 
+pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`")
+
+
 class Leaky(nn.Module):
     """A recurrent network of two numbers: state <- a * state + b * sum of the voxels."""
 
@@ -51,6 +54,7 @@ def fit(network: nn.Module, detach_every: int, steps: int = 1) -> nn.Module:
         max_steps=steps,
         accelerator="cpu",
         logger=False,
+        log_every_n_steps=1,
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,

@@ -5,8 +5,6 @@ import math
 import pytest
 import torch
 
-from src.data.augment import Augment
-from src.data.datamodule import LightFieldData, StepSampler
 from src.sim.optics import Optics
 from src.sim.pipeline import Pipeline, simulate
 from src.sim.scenes import Clip
@@ -112,33 +110,3 @@ def test_finite_clips_come_again_with_other_crops():
 def test_a_crop_that_does_not_fit_names_its_key(crop):
     with pytest.raises(ValueError, match="data.crop"):
         pipeline(crop=crop).draw(0)
-
-
-def test_workers_change_nothing():
-    def batches(workers: int) -> list[torch.Tensor]:
-        chain = pipeline(STRONG, sensor={"threshold": [0.1, 0.7]}, crop=16, random_crop=True)
-        data = LightFieldData(
-            {"train": chain}, Augment(), batch_size=2, epoch_clips=4, workers=workers
-        )
-        data.trainer = FakeTrainer()
-        return [batch.voxels for batch in data.train_dataloader()]
-
-    for zero, two in zip(batches(0), batches(2), strict=True):
-        assert torch.equal(zero, two)
-
-
-class FakeTrainer:
-    global_step, global_rank, world_size = 0, 0, 1
-
-
-def test_sampler_goes_on_where_the_training_stopped():
-    whole = list(StepSampler(2, 4, lambda: 0))
-    assert whole == [[0, 1], [2, 3], [4, 5], [6, 7]]
-    assert list(StepSampler(2, 4, lambda: 3)) == whole[3:]
-    assert next(iter(StepSampler(2, 4, lambda: 4))) == [8, 9]
-
-
-def test_processes_share_a_batch_without_overlap():
-    shards = [list(StepSampler(2, 3, lambda: 0, rank=rank, world=2)) for rank in (0, 1)]
-    joint = list(StepSampler(4, 3, lambda: 0))
-    assert [a + b for a, b in zip(*shards, strict=True)] == joint
