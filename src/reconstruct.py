@@ -54,7 +54,7 @@ def frames(cfg: DictConfig, net: nn.Module, views: Views) -> Iterator[stream.Fra
         count=cfg.count,
         overlap=overlap(cfg, net),
         bins=cfg.bins,
-        nearest=cfg.splat == "nearest",
+        splat=cfg.splat,
         start_s=cfg.start,
         end_s=cfg.end,
     )

@@ -1,6 +1,6 @@
 """What is looked at: events of a sensor of known size, a sensor picture, a film."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -15,7 +15,7 @@ PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 FILMS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".gif")
 
 
-def sensor_size(path: Path | str, sensor: Size | None = None) -> Size:
+def sensor_size(path: Path | str, sensor: Sequence[int] | None = None) -> Size:
     """Return (height, width) of the recording's sensor; `sensor` for a file that does not say.
 
     Raises ValueError where neither says, or both do and differ.
@@ -34,10 +34,12 @@ def events(path: Path | str, sensor: Size, seconds: float = 0.05) -> Iterator[np
     return formats.iter_events(path, seconds=seconds, size=sensor[::-1])
 
 
-def sensor_picture(path: Path | str, sensor: Size | None = None) -> Float[np.ndarray, "h w"]:
+def sensor_picture(
+    path: Path | str, sensor: Sequence[int] | None = None
+) -> Float[np.ndarray, "h w"]:
     """Return a picture in [0, 1], the mean of a film, or the events of each pixel of a recording.
 
-    A target on a blinking screen makes events where it is bright, so that their count shows it.
+    A target that blinks on a dark screen makes events where it is bright: their count shows it.
     Raises ValueError for a file that cannot be read.
     """
     path = Path(path)

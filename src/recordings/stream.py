@@ -49,7 +49,7 @@ class Rule:
     count: int | None = None
     overlap: int = 1
     bins: int = 5
-    nearest: bool = False
+    splat: str = "bilinear"
     start_s: float = 0.0
     end_s: float = float("inf")
 
@@ -60,6 +60,8 @@ class Rule:
             raise ValueError(f"fps must be in (0, 1e6], got {self.fps}")
         if self.count is not None and self.count < 1:
             raise ValueError(f"count must be >= 1, got {self.count}")
+        if self.splat not in ("bilinear", "nearest"):
+            raise ValueError(f"splat must be bilinear or nearest, got {self.splat}")
         if self.overlap < 1 or self.bins < 1:
             raise ValueError(f"overlap and bins must be >= 1, got {self.overlap} and {self.bins}")
         if not 0 <= self.start_s < self.end_s:
@@ -142,7 +144,7 @@ def _grid(events: np.ndarray, lookup: Lookup, rule: Rule, begin: float, end: flo
         nothing = np.broadcast_to(np.float32(0), (lookup.views, rule.bins, *lookup.model))
         return Window(begin, end, 0, 0, nothing)
     grid = lookup.empty(rule.bins)
-    outside = lookup.add(events, grid, begin, end, nearest=rule.nearest)
+    outside = lookup.add(events, grid, begin, end, nearest=rule.splat == "nearest")
     return Window(begin, end, len(events) - outside, outside, grid)
 
 

@@ -42,14 +42,20 @@ class Checkerboard:
         return self.rows * self.cols
 
     def features(self, picture: Picture) -> Points:
-        """Saddle points: where the determinant of the Hessian is most negative."""
+        """Saddle points: where the Hessian's determinant is most negative for the contrast there.
+
+        The threshold is half of what the corners of four whole boards have in the median.
+        """
         smooth = ndimage.gaussian_filter(picture.astype(np.float64), 2.0)
         dy, dx = np.gradient(smooth)
         yy, yx = np.gradient(dy)
-        saddle = yx**2 - yy * np.gradient(dx, axis=1)
+        mean = ndimage.gaussian_filter(smooth, 6.0)
+        contrast = ndimage.gaussian_filter(smooth**2, 6.0) - mean**2
+        contrast += 0.1 * np.percentile(contrast, 99)
+        saddle = (yx**2 - yy * np.gradient(dx, axis=1)) / np.maximum(contrast, 1e-9)
         peaks = saddle == ndimage.maximum_filter(saddle, size=7)
-        strongest = np.sort(saddle[peaks])[::-1][: 9 * self.rows * self.cols]
-        y, x = np.nonzero(peaks & (saddle > 0.2 * np.median(strongest)))
+        strongest = np.sort(saddle[peaks])[::-1][: 4 * self.count]
+        y, x = np.nonzero(peaks & (saddle > 0.5 * np.median(strongest)))
         return np.stack([x, y], axis=1).astype(np.float64)
 
     def find(self, picture: Picture) -> Points | None:

@@ -1,0 +1,170 @@
+"""From a simulated recording to views.yaml to video to statistics, through the doors."""
+
+import csv
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+
+from src.calibrate import calibrate
+from src.reconstruct import reconstruct
+from src.recordings import capture, lookup, views
+from src.sim.optics import layout
+from src.sim.sensor import EventSensor
+from tests.conftest import ROOT
+from tests.recordings import pictures
+
+SENSOR, SIDE = (360, 640), 120
+HIGHPASS = "+baseline._target_=baselines.highpass.HighPass"
+
+
+def config(name: str, run: Path, *overrides: str):
+    with initialize_config_dir(str(ROOT / "conf"), version_base=None):
+        cfg = compose(name, list(overrides))
+    run.mkdir(exist_ok=True)
+    cfg.paths.run = str(run)
+    return cfg
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Return a folder with board.raw, a blinking board, and dot.raw, a moving dot."""
+    folder = tmp_path_factory.mktemp("camera")
+    truth = capture.kaleidoscope(list(layout(9)), model=(SIDE, SIDE), sensor=SENSOR, tile_px=116.0)
+    sensor = EventSensor(0.5, refractory_s=5e-4, shot_hz=0.5)
+    board = torch.from_numpy(pictures.checkerboard(5, 7, 25)).reshape(SIDE, 2, SIDE, 2).mean((1, 3))
+    blink = torch.stack([board if k % 2 else torch.full_like(board, 0.05) for k in range(5)])
+    path = np.stack([np.linspace(30, 90, 31), np.linspace(80, 50, 31)], axis=1)
+    dot = pictures.dot_grid(path[:, None], np.full((31, 1), 4.0), np.full((31, 1), 0.9), SIDE) - 0.7
+    for name, film in (("board", blink), ("dot", torch.from_numpy(dot).float().clamp(0, 1))):
+        frames = film[None].expand(9, -1, -1, -1)
+        capture.write_recording(folder / f"{name}.raw", frames, 300.0, truth, sensor)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def found(folder) -> Path:
+    """Return the views.yaml that the door made of board.raw."""
+    path = folder / "views.yaml"
+    recording = f"recording={folder}/board.raw"
+    calibrate(
+        config(
+            "calibrate", folder / "a", "task=views", recording, f"save={path}", "resolution=[88,88]"
+        )
+    )
+    return path
+
+
+def test_calibrating_the_views_leaves_a_file_and_pictures(folder, found):
+    there = views.load(found, SENSOR)
+    assert there.positions == list(layout(9)) and there.model == (88, 88)
+    assert max(view.error_px for view in there.views) < 0.5
+    for name in ("views.yaml", "views.png", "found.png"):
+        assert (folder / "a" / name).stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    "extra", ["fps=120", "count=500", "fps=1200", "fps=300 start=0.02 end=0.06"]
+)
+def test_reconstructing_gives_a_picture_and_a_time_per_window(folder, found, extra, tmp_path):
+    chosen = [f"recording={folder}/dot.raw", f"views={found}", HIGHPASS, "output=hdf5"]
+    run = reconstruct(config("reconstruct", tmp_path / "run", *chosen, *extra.split()))
+    with h5py.File(run / "video.h5") as file:
+        frames, times = file["frames"][:], file["time_s"][:]
+    assert frames.shape[1:] == (88, 88) and len(frames) == len(times) > 5
+    assert (np.diff(times) > 0).all() and frames.std() > 1
+    with open(run / "frames.csv") as file:
+        assert len(list(csv.DictReader(file))) == len(frames)
+
+
+def test_the_reconstructed_dot_moves_as_the_true_one(folder, found, tmp_path):
+    chosen = [f"recording={folder}/dot.raw", f"views={found}", HIGHPASS, "output=hdf5", "fps=300"]
+    run = reconstruct(config("reconstruct", tmp_path / "run", *chosen))
+    with h5py.File(run / "video.h5") as file:
+        bright = np.clip(file["frames"][:].astype(float) - 140, 0, None)
+    x = (bright.sum(1) @ np.arange(88)) / bright.sum((1, 2))
+    assert np.corrcoef(x[5:], np.arange(len(x) - 5))[0, 1] > 0.99
+
+
+def test_without_views_the_sensor_is_one_view(folder, tmp_path):
+    chosen = [f"recording={folder}/dot.raw", HIGHPASS, "output=png", "resolution=[90,160]"]
+    run = reconstruct(config("reconstruct", tmp_path / "run", *chosen))
+    assert cv2.imread(str(run / "frames/0000000.png"), 0).shape == (90, 160)
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        ("recording=nowhere.raw", "nowhere.raw"),
+        ("sensor_size=[480,640]", "sensor must be"),
+        ("fps=1", "longer than one window"),
+        ("fps=-1", "fps must be"),
+        ("output=avi", "output must be one of"),
+        ("splat=hat", "splat must be"),
+        ("start=3.0 end=2.0", "start must be"),
+        ("ckpt=null", "must name a network"),
+    ],
+)
+def test_wrong_values_are_refused(folder, wrong, message, tmp_path):
+    chosen = [f"recording={folder}/dot.raw", *([HIGHPASS] if wrong != "ckpt=null" else [])]
+    with pytest.raises(ValueError, match=message):
+        reconstruct(config("reconstruct", tmp_path / "run", *chosen, *wrong.split()))
+
+
+def test_a_calibration_that_fails_leaves_what_was_found(folder, tmp_path):
+    chosen = ["task=views", f"recording={folder}/dot.raw"]
+    with pytest.raises(ValueError, match="seen in 4 or more views"):
+        calibrate(config("calibrate", tmp_path / "run", *chosen))
+    assert (tmp_path / "run" / "found.png").is_file()
+
+
+def test_corners_by_hand_replace_the_target(folder, found, tmp_path):
+    there = views.load(found)
+    lines = [
+        f"- {{position: {list(view.position)}, corners: {there.outline(view).tolist()}}}"
+        for view in there.views
+    ]
+    (tmp_path / "corners.yaml").write_text("\n".join(lines))
+    chosen = ["task=views", f"recording={folder}/board.raw", f"corners={tmp_path}/corners.yaml"]
+    calibrate(config("calibrate", tmp_path / "run", *chosen))
+    by_hand = views.load(tmp_path / "run" / "views.yaml")
+    for mine, auto in zip(by_hand.views, there.views, strict=True):
+        assert by_hand.mirrored(mine) == there.mirrored(auto)
+
+
+def test_turbulence_of_a_film_of_dots(folder, found, tmp_path):
+    there = views.load(found)
+    at_full = views.Views(there.sensor, (SIDE, SIDE), there.field, there.views)
+    grid = np.array([[x, y] for y in (30.0, 60.0, 90.0) for x in (30.0, 60.0, 90.0)])
+    rng = np.random.default_rng(0)
+    for name, spread, frames in (("still", 0.0, 8), ("dots", 0.7, 24)):
+        centres = grid + spread * rng.normal(size=(frames, 9, 2))
+        film = pictures.dot_grid(
+            centres, np.full((frames, 9), 3.0), np.full((frames, 9), -0.6), SIDE
+        )
+        table = lookup.build(at_full)
+        light = capture.vignette(table, 0.2)
+        films = torch.from_numpy(film).float()[None].expand(9, -1, -1, -1)
+        (tmp_path / name).mkdir()
+        for k, seen in enumerate(capture.sensor_frames(films, table, light, slice(None)).numpy()):
+            cv2.imwrite(
+                str(tmp_path / name / f"{k:03d}.png"), np.clip(seen * 255, 0, 255).astype(np.uint8)
+            )
+    chosen = [f"recording={tmp_path}/dots", f"still={tmp_path}/still", f"views={found}"]
+    calibrate(config("calibrate", tmp_path / "run", "task=turbulence", *chosen))
+    with open(tmp_path / "run" / "turbulence.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 81 and sum(int(row["failed"]) for row in rows) == 0
+    scale = 88 / (there.field[2] - there.field[0]) * (at_full.field[2] - at_full.field[0]) / SIDE
+    rms = np.mean([float(row["tilt_x_rms_px"]) for row in rows])
+    assert rms == pytest.approx(0.7 * scale, rel=0.15)
+    assert (tmp_path / "run" / "turbulence.png").is_file()
+
+
+def test_another_task_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="task must be one of"):
+        calibrate(config("calibrate", tmp_path / "run", "task=guess", "recording=a.raw"))
