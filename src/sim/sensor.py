@@ -18,31 +18,13 @@ from torch import Tensor
 
 from src.sim import noise
 from src.sim.engines import sensor_cpu, sensor_eager
-from src.sim.engines.job import DEFER, DELETE, HOLD, Job, State
+from src.sim.engines.job import Job, State
+from src.sim.limits import MODES, THRESHOLDS, check, check_frames, threshold_range, within
 from src.sim.response import EXTRA, UNIT, decode_srgb, nodes, response_table
 
 __all__ = ["EVENT", "EventSensor", "State", "decode_srgb"]
 
 EVENT = sensor_cpu.EVENT
-MODES = {"defer": DEFER, "delete": DELETE, "hold": HOLD}
-CHOICES = {
-    "refractory": tuple(MODES),
-    "stamps": ("linear", "v2e"),
-    "input": ("linear", "srgb"),
-    "response": ("log", "linlog"),
-}
-RANGES = {
-    "refractory_s": (0, 10),
-    "mismatch": (0, 1),
-    "leak_hz": (0, 1e4),
-    "shot_hz": (0, 1e6),
-    "floor": (1e-3, 1),
-    "off_ratio": (0.1, 10),
-    "hot_fraction": (0, 1),
-    "hot_hz": (0, 1e6),
-    "cutoff_hz": (0, 1e6),
-}
-THRESHOLDS = (0.01, 5)
 SHY = 2  # thresholds are lowered by so many units: a change of n C makes n events, rounded or not
 
 
@@ -175,9 +157,9 @@ class EventSensor:
         full_width=None, threshold=None,
     ) -> Job:  # fmt: skip
         n, v, _, h, w = frames.shape
-        _check_frames(frames, fps, state)
+        check_frames(frames, fps, state)
         for name in ("shot_hz", "hot_hz"):
-            _within(f"sensor.{name}", getattr(self, name), 0, fps)
+            within(f"sensor.{name}", getattr(self, name), 0, fps)
         clips, views = range(n) if clips is None else clips, range(v) if views is None else views
         first = 0 if state is None else state.frame
         return Job(
@@ -215,8 +197,8 @@ class EventSensor:
                 )
             threshold = torch.full((n,), low, dtype=torch.float64)
         on = threshold.double().cpu().numpy()
-        _within("sensor.threshold", float(on.min()), *THRESHOLDS)
-        _within("sensor.threshold", float(on.max()), *THRESHOLDS)
+        within("sensor.threshold", float(on.min()), *THRESHOLDS)
+        within("sensor.threshold", float(on.max()), *THRESHOLDS)
         spread, hot = round(self.mismatch * UNIT), round(self.hot_fraction * 2**32)
         parts = [np.floor(on * UNIT) - SHY, np.floor(on * self.off_ratio * UNIT) - SHY]
         return np.stack([*parts, np.full(n, spread), np.full(n, hot)], 1).astype(np.int64)
@@ -238,50 +220,6 @@ class EventSensor:
         decay, lag = np.exp(-a), -np.expm1(-a) / a
         scaled = [np.rint(part * UNIT * 2**EXTRA).astype(np.int32) for part in (decay, lag)]
         return level, *(torch.from_numpy(part).to(device) for part in scaled)
-
-
-def threshold_range(threshold: float | Sequence[float]) -> tuple[float, float]:
-    """Return (low, high) of `sensor.threshold`, a number or a range."""
-    ends = (threshold, threshold) if isinstance(threshold, int | float) else tuple(threshold)
-    if len(ends) != 2 or ends[0] > ends[1]:
-        raise ValueError(f"sensor.threshold must be a number or [low, high], got {list(ends)}")
-    for end in ends:
-        _within("sensor.threshold", end, *THRESHOLDS)
-    return float(ends[0]), float(ends[1])
-
-
-def check(settings: dict) -> None:
-    """Raise ValueError for the first of a sensor's settings that is outside its range."""
-    for name, allowed in CHOICES.items():
-        if settings[name] not in allowed:
-            raise ValueError(
-                f"sensor.{name} must be one of {', '.join(allowed)}, got {settings[name]!r}"
-            )
-    for name, (low, high) in RANGES.items():
-        _within(f"sensor.{name}", settings[name], low, high)
-    threshold_range(settings["threshold"])
-
-
-def _within(name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise ValueError(f"{name} must be in [{low:g}, {high:g}], got {value}")
-
-
-def _check_frames(frames: Tensor, fps: float, state: State | None) -> None:
-    if frames.ndim != 5 or frames.dtype != torch.float32:
-        raise ValueError(
-            f"frames must be float32 (n, views, frames, h, w), got {frames.dtype} "
-            f"{tuple(frames.shape)}"
-        )
-    _within("fps", fps, 1e-3, 1e6)
-    n, v, count, h, w = frames.shape
-    if min(n, v, h, w) < 1 or count < (2 if state is None else 1):
-        raise ValueError(f"events need two frames of at least one pixel, got {tuple(frames.shape)}")
-    low, high = torch.aminmax(frames)
-    if not (low >= -1e-4 and high <= 1 + 1e-4):
-        raise ValueError(f"frames must be finite and in [0, 1], got {low:g} to {high:g}")
-    if state is not None and state.level.shape != (n, v, h, w):
-        raise ValueError(f"state is of {tuple(state.level.shape)}, frames are {(n, v, h, w)}")
 
 
 def _clock(fps: float, first: int, count: int) -> NDArray[np.int64]:
