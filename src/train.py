@@ -18,10 +18,12 @@ def train(cfg: DictConfig) -> dict:
     Everything goes below `cfg.paths.run`.  Returns the content of `results.json`.
     """
     run, start = Path(cfg.paths.run), time.perf_counter()
-    results.open_run(run, door.resolved(cfg))
+    if cfg.ckpt and not Path(cfg.ckpt).is_file():
+        raise ValueError(f"ckpt must be a checkpoint to go on from, got {cfg.ckpt}")
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
     net, spec = build.network(cfg)
     module, data = build.reconstructor(cfg, net, spec), build.data(cfg)
+    results.open_run(run, door.resolved(cfg))
     untrained = build.test(cfg, "untrained", net, data, module.scores)
     build.trainer(cfg).fit(module, data, ckpt_path=cfg.ckpt)
     trained = build.test(cfg, cfg.name, net, data, module.scores)

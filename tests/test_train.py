@@ -12,7 +12,7 @@ from src.eval import evaluate
 from src.train import train
 from tests.conftest import ROOT
 
-TINY = ["debug=fdr", "trainer.enable_progress_bar=false", "loss=l1", "metrics.lpips=null"]
+TINY = ["debug=fdr", "~callbacks.progress", "loss=l1", "metrics.lpips=null"]
 
 
 def config(name: str, run: Path, *overrides: str) -> DictConfig:
@@ -83,7 +83,7 @@ def test_eval_equals_the_test_of_training(tmp_path):
     ckpt = tmp_path / "train" / "checkpoints" / "last.ckpt"
     same = [f"ckpt={ckpt}", "scene.height=64", "scene.width=64", "data.test_clips=1"]
     same += ["data.test_windows=4", "data.warmup=1", "data.workers=0", "metrics.lpips=null"]
-    evaluate(config("eval", tmp_path / "eval", *same, "trainer.enable_progress_bar=false"))
+    evaluate(config("eval", tmp_path / "eval", *same))
     first, second = (
         json.loads((tmp_path / door / "results.json").read_text())["test"]
         for door in ("train", "eval")
