@@ -20,7 +20,7 @@ def seed(number: int = 0) -> torch.Generator:
 
 
 def leaves(size: int) -> torch.Tensor:
-    """Return opaque discs of power-law sizes (size, size): edges and spectrum of natural pictures."""
+    """Return opaque discs of many sizes (size, size): edges and spectrum as in nature."""
     generator = seed(4)
     y, x = torch.meshgrid(torch.arange(size), torch.arange(size), indexing="ij")
     picture = torch.full((size, size), 0.5)
@@ -173,7 +173,7 @@ def test_interpolation_reproduces_straight_lines(order):
 def test_any_strength_is_finite(strength):
     seen = operator(strength, size=24, width_m=0.05).degrade(torch.rand(1, 1, 24, 24), seed())
     assert seen.isfinite().all()
-    assert 0 <= seen.min()
+    assert seen.min() >= 0
     assert seen.max() <= 1.0001
 
 

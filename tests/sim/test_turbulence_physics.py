@@ -107,7 +107,7 @@ def test_07_centroid_of_a_rendered_point():
         replace(PATH.at(1.0), alpha=0.0, scene_width_m=0.5), views=9, height=65, width=65
     )
     bell = torch.exp(-((torch.arange(65.0) - 32) ** 2) / 8)  # smooth, so that the warp is exact
-    point = (bell[:, None] * bell).expand(1, 40, -1, -1)
+    point = (bell[:, None] * bell).expand(1, 16, -1, -1)
     seen = turbulence.degrade(point, torch.Generator().manual_seed(0))[0].flatten(0, 1)
     seen = seen / seen.sum((1, 2), keepdim=True)
     place = torch.arange(65.0) - 32
@@ -115,7 +115,7 @@ def test_07_centroid_of_a_rendered_point():
     share = 0.5 * (x.var() + y.var()) / turbulence.fidelity.airy_px**2
     slack = 4 * share * math.sqrt(2 / (2 * len(x)))
     assert 0.1698 - slack < share < 0.1819 + slack  # between G-tilt and Z-tilt
-    drawn = turbulence.tilt(40, torch.Generator().manual_seed(0), crop=(32, 32, 1, 1))
+    drawn = turbulence.tilt(16, torch.Generator().manual_seed(0), crop=(32, 32, 1, 1))
     same = torch.corrcoef(torch.stack([x, drawn.flatten(0, 1)[:, 0, 0, 0]]))[0, 1]
     assert same > 0.9  # the light goes where the tilt says
 
