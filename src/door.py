@@ -4,6 +4,7 @@ import logging
 import os
 import sys
 import time
+import warnings
 from collections.abc import Callable
 
 import rich
@@ -32,6 +33,8 @@ def run(main: Callable[[], None]) -> None:
 def job(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:
     """Run `work` in the folder Hydra made for this job; print the config once; end W&B's run."""
     cfg.paths.run = HydraConfig.get().runtime.output_dir
+    warnings.filterwarnings("ignore", "The dirpath has changed")  # a resumed run has its own folder
+    warnings.filterwarnings("ignore", ".*LeafSpec")  # inside Lightning 2.6 with torch 2.13
     for chatty in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
     rich.print(Syntax(resolved(cfg), "yaml", background_color="default"))

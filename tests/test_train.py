@@ -42,7 +42,13 @@ def test_every_experiment_takes_a_step(experiment, tmp_path):
 def test_every_debug_preset_takes_a_step(debug, tmp_path):
     small = ["trainer.max_steps=1", "data.epoch_clips=1", "data.batch_size=1", "data.test_clips=1"]
     small += ["scene.height=64", "scene.width=64", "data.crop=32", "data.windows=2"]
-    small += ["data.test_windows=3", "data.warmup=1", "data.val_clips=1", "width=4"]
+    small += [
+        "data.test_windows=3",
+        "data.warmup=1",
+        "data.val_clips=1",
+        "width=4",
+        "trainer.log_every_n_steps=1",
+    ]
     train(config("train", tmp_path, f"debug={debug}", *TINY[1:], *small))
     assert (tmp_path / "results.json").is_file()
 
