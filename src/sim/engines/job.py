@@ -108,6 +108,7 @@ class Scratch(NamedTuple):
     level: np.ndarray
     source: np.ndarray
     active: np.ndarray
+    busy: np.ndarray
     noise_u: np.ndarray
     noise_sign: np.ndarray
     when: np.ndarray

@@ -245,15 +245,17 @@ def find_active(chip, scratch, r, level, reference, dead, frame):
     Without a branch: most pixels are quiet in most intervals, and which are is not predictable.
     """
     new, on, off = scratch.level[r], scratch.on[r], scratch.off[r]
-    active, noise_u, leak = scratch.active, scratch.noise_u, chip.leak
-    holds, count = chip.mode == HOLD, 0
+    active, noise_u, busy = scratch.active, scratch.noise_u, scratch.busy
+    leak, holds, count = chip.leak, chip.mode == HOLD, 0
     for x in range(level.size):
         l0, l1, ref = level[x], new[x], reference[x]
         if leak:
             l1 += np.int32(leaked(leak, on[x], frame))
-        reached = (max(l0, l1) >= ref + on[x]) | (min(l0, l1) <= ref - off[x])
+        reached = (max(l0, l1) - ref >= on[x]) | (ref - min(l0, l1) >= off[x])
+        busy[x] = reached | (noise_u[x] <= 1) | (holds & (dead[x] > 0))
+    for x in range(level.size):
         active[count] = x
-        count += reached | (noise_u[x] <= 1) | (holds & (dead[x] > 0))
+        count += busy[x]
     return count
 
 
@@ -335,7 +337,7 @@ def make_scratch(rows, width, smallest):
     return Scratch(
         np.empty((rows, width), np.int32), np.empty((rows, width), np.int32),
         np.empty((rows, width), np.bool_), np.empty((rows, width), np.int32),
-        np.empty((rows, width), np.int32), np.empty(width + 1, np.int64),
+        np.empty((rows, width), np.int32), np.empty(width + 1, np.int64), np.empty(width, np.uint8),
         np.full(width, f32(2)), np.ones(width, np.int8),
         np.empty(room, np.float32), np.empty(room, np.int8),
     )  # fmt: skip
