@@ -33,10 +33,7 @@ def run(main: Callable[[], None]) -> None:
 def job(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:
     """Run `work` in the folder Hydra made for this job; print the config once; end W&B's run."""
     cfg.paths.run = HydraConfig.get().runtime.output_dir
-    warnings.filterwarnings("ignore", "The dirpath has changed")  # a resumed run has its own folder
-    warnings.filterwarnings("ignore", ".*LeafSpec")  # inside Lightning 2.6 with torch 2.13
-    for chatty in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):
-        logging.getLogger(chatty).setLevel(logging.WARNING)
+    _quieten()
     rich.print(Syntax(resolved(cfg), "yaml", background_color="default"))
     try:
         work(cfg)
@@ -63,6 +60,18 @@ def facts(cfg: DictConfig, start: float) -> dict:
         if gpu
         else f"cpu, {torch.get_num_threads()} threads",
     }
+
+
+def _quieten() -> None:
+    """Drop what Lightning says in every run and is expected here."""
+    for expected in (
+        "The dirpath has changed",  # a resumed run has a folder of its own
+        "You're resuming from a checkpoint that ended",  # our sampler starts at the step reached
+        ".*LeafSpec",  # inside Lightning 2.6 with torch 2.13
+    ):
+        warnings.filterwarnings("ignore", expected)
+    for chatty in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):
+        logging.getLogger(chatty).setLevel(logging.WARNING)
 
 
 def _refuse(error: Exception) -> int:
