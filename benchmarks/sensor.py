@@ -31,7 +31,8 @@ def clip(views: int, frames: int, seed: int = 0) -> torch.Tensor:
     texture = torch.fft.ifft2(spectrum / (axis[:, None] ** 2 + axis**2).sqrt().clamp(min=1 / wide))
     picture = torch.sigmoid(0.6 * texture.real / texture.real.std())
     y, x = torch.meshgrid(torch.arange(wide), torch.arange(wide), indexing="ij")
-    for cx, cy, r, value in torch.rand(40, 4, generator=g) * torch.tensor([wide, wide, 30, 0.8]) + 0.1:
+    discs = torch.rand(40, 4, generator=g) * torch.tensor([wide, wide, 30, 0.8]) + 0.1
+    for cx, cy, r, value in discs:
         picture[(x - cx) ** 2 + (y - cy) ** 2 < r**2] = value
     out = torch.empty(1, views, frames, SIDE, SIDE)
     for v in range(views):
