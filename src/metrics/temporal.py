@@ -2,7 +2,9 @@
 
 The residual displacement of a reconstruction against the truth is measured block by block with
 gradient least squares (Lucas & Kanade 1981), iterated; its change from frame to frame is wobble.
-Gain and offset of each block are fitted away first, so brightness does not matter.
+Gain and offset of each block are fitted away first, so brightness does not matter.  On a photograph
+warped smoothly by 0.5 to 3 px rms, wobble and residual read 7 to 16 % high; blur that the truth
+has not shows in residual (0.3 px at a blur of 1 px rms) and not in wobble.
 """
 
 import torch
@@ -11,8 +13,8 @@ from torch import Tensor
 from torch.nn import functional
 
 BLOCK = 16  # side of a block in pixels
-REACH = 3.0  # largest displacement that is believed, in pixels
-SMOOTHING = (7, 7, 7, 1, 1, 1)  # side of the box blur of each iteration: coarse to fine
+REACH = 8.0  # largest displacement that is believed, in pixels: over 2.5 sigma of strong tilt
+SMOOTHING = (15, 15, 7, 1, 1)  # side of the box blur of each iteration: coarse to fine
 TEXTURE = 1e-4  # least mean square gradient, in (grey levels / pixel)^2, of a block that is used
 
 
@@ -22,12 +24,14 @@ def displacement(
     """Return by how much each block of `frames` is shifted against `target`, (x, y) in pixels, and
     its weight: the target's mean square gradient along its weaker direction, 0 without texture.
 
-    Blocks are 16 pixels wide; shifts are cut at 3 pixels.
+    Blocks are 16 pixels wide; shifts are cut at 8 pixels.
     """
     weight = _texture(target)
     shift = torch.zeros(len(target), 2, *weight.shape[1:], dtype=target.dtype, device=target.device)
     for side in SMOOTHING:
-        shift = _improve(_smooth(frames, side), _smooth(target, side), shift)
+        step = _step(_smooth(frames, side), _smooth(target, side), shift)
+        longest = max(1.0, side / 5)  # beyond, the picture is no plane to a blur of this side
+        shift = (shift + step.clamp(-longest, longest)).clamp(-REACH, REACH)
     return shift * (weight > 0)[:, None], weight
 
 
@@ -82,15 +86,14 @@ def _structure(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
     return _blocks(torch.cat([x * x, x * y, y * y], dim=1)).unbind(1)
 
 
-def _improve(frames: Tensor, target: Tensor, shift: Tensor) -> Tensor:
-    """Return `shift` after one least-squares step."""
+def _step(frames: Tensor, target: Tensor, shift: Tensor) -> Tensor:
+    """Return the least-squares correction of `shift`."""
     x, y = _gradients(target)
     a, b, c = _structure(x, y)
     difference = _matched(_pull(frames, shift), target) - target
     u, v = _blocks(torch.cat([x * difference, y * difference], dim=1)).unbind(1)
     determinant = (a * c - b * b).clamp(min=1e-12)
-    step = torch.stack([c * u - b * v, a * v - b * u], dim=1) / determinant[:, None]
-    return (shift - step.clamp(-1, 1)).clamp(-REACH, REACH)
+    return torch.stack([b * v - c * u, b * u - a * v], dim=1) / determinant[:, None]
 
 
 def _smooth(pictures: Tensor, side: int) -> Tensor:

@@ -33,7 +33,7 @@ def swing(amplitude: float) -> torch.Tensor:
 STILL = torch.zeros(FRAMES, 2)
 
 
-@pytest.mark.parametrize("amplitude", [0.2, 0.7, 1.8])
+@pytest.mark.parametrize("amplitude", [0.2, 0.7, 1.8, 4.0])
 @pytest.mark.parametrize("gain", [1.0, 0.5])
 def test_known_shifts_are_found(amplitude, gain):
     shifts = swing(amplitude)
@@ -42,7 +42,7 @@ def test_known_shifts_are_found(amplitude, gain):
     assert torch.allclose(mean, shifts, atol=0.05 + 0.04 * amplitude)
 
 
-@pytest.mark.parametrize("amplitude", [0.2, 0.7, 1.8])
+@pytest.mark.parametrize("amplitude", [0.2, 0.7, 1.8, 4.0])
 def test_wobble_and_residual_of_a_known_swing(amplitude):
     shifts = swing(amplitude)
     frames, target = photo(shifts), photo(STILL)
