@@ -9,19 +9,22 @@ from omegaconf import DictConfig
 from src import build, door
 from src.figures import samples
 from src.metrics import results
-from src.sim.pipeline import simulate as run_pipeline
 
 
 def simulate(cfg: DictConfig) -> dict:
-    """Simulate test clip `index` and write `views.png`, `views.gif` into `cfg.paths.run`.
+    """Simulate test clip `index`; write clean, views, tilt and events as `views.gif`, `views.png`.
 
     Returns what was drawn: D/r0, tilt and blur in pixels, threshold ...
     """
     run = Path(cfg.paths.run)
     pipeline = build.pipeline(cfg, "test")
-    sample = run_pipeline(pipeline, [cfg.index])
+    draw = pipeline.draw(cfg.index)
+    sample, views = pipeline.simulate([draw]), pipeline.views(draw)[0]
+    frames = views.shape[1]
+    tilt = pipeline.operator(draw).tilt(frames, pipeline.drawer(draw), crop=draw.crop)
+    windows = slice(cfg.data.substeps, None, cfg.data.substeps)
     results.open_run(run, door.resolved(cfg))
-    samples.write_views(run, sample, pipeline.optics)
+    samples.write_views(run, sample, views[:, windows], tilt[:, windows], pipeline.optics)
     rich.print(sample.drawn[0], f"in {run}")
     return sample.drawn[0]
 

@@ -39,18 +39,31 @@ def write(folder: Path, network: nn.Module, pipeline: Pipeline, clips: int = 2) 
     return written
 
 
-def write_views(folder: Path, sample: Sample, views: Tensor, optics: Optics) -> list[Path]:
-    """Write `views.png` (the last window) and `views.gif`: the clean clip, what every view of the
-    first clip sees, `views` (views, windows, h, w), and its events, in the views' arrangement.
+def write_views(
+    folder: Path, sample: Sample, views: Tensor, tilt: Tensor, optics: Optics
+) -> list[Path]:
+    """Write `views.gif` and its last frame `views.png`: the clean clip, what every view sees, its
+    tilt and its events, each in the views' arrangement.
+
+    `views` (views, windows, h, w) light in [0, 1]; `tilt` (views, windows, 2, h, w) in pixels: blue
+    where the picture is pushed right or down, red where left or up, mean of both axes.
     """
     clean = sample.target[0, :, 0].numpy()
     events = [event_picture(part.sum(1).numpy()) for part in sample.voxels[0].unbind(1)]
-    light = _mosaic([_rgb(view.numpy()) for view in views], optics)
-    ink = _mosaic(events, optics)
-    frames = row({"clean": _enlarge(_rgb(clean), light.shape[1]), "views": light, "events": ink})
-    write_video(folder / "views.gif", frames, PLAYBACK_FPS)
-    write_video(folder / "views.png", frames[-1:], PLAYBACK_FPS)
-    return [folder / "views.gif", folder / "views.png"]
+    reach = float(tilt.abs().max().clamp(min=1e-6))
+    pushed = [event_picture(part.mean(1).numpy(), full=reach) for part in tilt]
+    mosaic = _mosaic([_rgb(view.numpy()) for view in views], optics)
+    panels = {
+        "clean": _enlarge(_rgb(clean), mosaic.shape[1]),
+        "views": mosaic,
+        f"tilt, +-{reach:.1f} px": _mosaic(pushed, optics),
+        "events": _mosaic(events, optics),
+    }
+    frames = row(panels)
+    paths = [folder / "views.gif", folder / "views.png"]
+    write_video(paths[0], frames, PLAYBACK_FPS)
+    write_video(paths[1], frames[-1:], PLAYBACK_FPS)
+    return paths
 
 
 def _gif(path: Path, videos: dict[str, np.ndarray], sample: Sample, optics: Optics) -> Path:

@@ -123,7 +123,7 @@ class Pipeline:
         top, left, height, width = draw.crop
         clean = draw.clip.frames.to(device)[None]
         target = clean[:, self.substeps :: self.substeps, top : top + height, left : left + width]
-        views, weather = self._degrade(clean, draw)
+        views = self.views(draw, device)
         voxels = self.sensor.voxels(
             views,
             draw.clip.fps,
@@ -135,7 +135,8 @@ class Pipeline:
             full_width=clean.shape[-1],
             threshold=torch.tensor([draw.threshold]),
         )
-        drawn = {"name": draw.clip.name, "threshold": draw.threshold} | weather
+        drawn = {"name": draw.clip.name, "threshold": draw.threshold}
+        drawn |= asdict(self.operator(draw).fidelity)
         turbulent = views[:, self.optics.centre, self.substeps :: self.substeps]
         return Sample(
             voxels=voxels.transpose(1, 2),
@@ -145,24 +146,29 @@ class Pipeline:
             drawn=[drawn],
         )
 
-    def _degrade(self, clean: Tensor, draw: Draw) -> tuple[Tensor, dict]:
-        """Return what each view's optics put on the sensor, and the numbers of the atmosphere."""
+    def views(self, draw: Draw, device: torch.device | str = "cpu") -> Tensor:
+        """Return what every view's optics put on the sensor, (1, views, frames, h, w), light."""
+        clean = draw.clip.frames.to(device)[None]
         radiance = decode_srgb(clean) if self.decode else clean
-        operator = {k: v for k, v in self.turbulence.items() if k != "atmosphere"}
-        turbulence = Turbulence(
+        views = self.operator(draw).degrade(radiance, self.drawer(draw), crop=draw.crop)
+        size = tuple(clean.shape[-2:])
+        return self.optics.misalign(views, draw.key, origin=draw.crop[:2], full_size=size)
+
+    def operator(self, draw: Draw) -> Turbulence:
+        """Return the turbulence of a clip."""
+        height, width = draw.clip.frames.shape[-2:]
+        return Turbulence(
             draw.atmosphere,
             views=self.optics.positions,
-            height=clean.shape[-2],
-            width=clean.shape[-1],
+            height=height,
+            width=width,
             fps=draw.clip.fps,
-            **operator,
+            **{name: value for name, value in self.turbulence.items() if name != "atmosphere"},
         )
-        drawer = noise.generator(noise.key(draw.key, "turbulence"))
-        views = turbulence.degrade(radiance, drawer, crop=draw.crop)
-        views = self.optics.misalign(
-            views, draw.key, origin=draw.crop[:2], full_size=tuple(clean.shape[-2:])
-        )
-        return views, asdict(turbulence.fidelity)
+
+    def drawer(self, draw: Draw) -> torch.Generator:
+        """Return the generator that the turbulence of a clip draws from."""
+        return noise.generator(noise.key(draw.key, "turbulence"))
 
     def _crop(self, size: Sequence[int], key: int) -> Crop:
         height, width = size
