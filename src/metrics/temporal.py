@@ -4,7 +4,7 @@ The residual displacement of a reconstruction against the truth is measured bloc
 gradient least squares (Lucas & Kanade 1981), iterated; its change from frame to frame is wobble.
 Gain and offset of each block are fitted away first, so brightness does not matter.  On a photograph
 warped smoothly by 0.5 to 3 px rms, wobble and residual read 7 to 16 % high; blur that the truth
-has not shows in residual (0.3 px at a blur of 1 px rms) and not in wobble.
+has not shows in residual (0.2 px at a blur of 1 px) and not in wobble.
 """
 
 import torch
