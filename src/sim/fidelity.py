@@ -76,6 +76,8 @@ def choose(atmosphere: Atmosphere, width_px: int, tolerance: float, exact: bool)
         modes = min(modes, band.modes)
     tilt_px = atmosphere.tilt_std_px(width_px)
     pixel = atmosphere.object_pixel_m(width_px) / atmosphere.aperture_m
+    pitch = int(min(max(step / pixel, 1), MAX_PITCH))
+    error_pitch = error_pitch if pitch > 1 else 0.0
     tilt_pitch, error_tilt = _tilt_pitch(pixel, tilt_px, tolerance)
     return Fidelity(
         d_over_r0=strength,
@@ -88,10 +90,10 @@ def choose(atmosphere: Atmosphere, width_px: int, tolerance: float, exact: bool)
         modes=int(modes),
         rank=0 if exact else min(int(rank), len(band.basis)),
         kernel=_kernel(strength, airy, reach),
-        pitch=int(min(max(step / pixel, 1), MAX_PITCH)),
+        pitch=pitch,
         tilt_pitch=tilt_pitch,
         error_modes=error_modes,
-        error_pitch=error_pitch if step >= pixel else 0.0,
+        error_pitch=error_pitch,
         error_rank=error_rank,
         error_kernel=error_kernel,
         error_tilt_px=error_tilt,

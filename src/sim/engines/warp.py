@@ -15,41 +15,37 @@ def warp(frame, tilt, top, left):
     rows, columns = frame.shape
     low, high = frame.min(), frame.max()
     out = np.empty((height, width), np.float32)
-    across = np.empty(4, np.float32)
+    across, down = np.empty(4, np.float32), np.empty(4, np.float32)
+    row, column = np.empty(4, np.int64), np.empty(4, np.int64)
     for i in range(height):
         for j in range(width):
             y, x = i + top - tilt[1, i, j], j + left - tilt[0, i, j]
             r, c = int(np.floor(y)), int(np.floor(x))
+            _taps(np.float32(y - r), down)
             _taps(np.float32(x - c), across)
             inside = r >= 1 and c >= 1 and r + 2 < rows and c + 2 < columns
-            v = np.float32(y - r)
+            for k in range(4):
+                row[k] = r + k - 1 if inside else _reflect(r + k - 1, rows)
+                column[k] = c + k - 1 if inside else _reflect(c + k - 1, columns)
             total = np.float32(0.0)
             for k in range(4):
-                line = frame[r + k - 1 if inside else _reflect(r + k - 1, rows)]
-                part = np.float32(0.0)
-                for m in range(4):
-                    column = c + m - 1 if inside else _reflect(c + m - 1, columns)
-                    part += across[m] * line[column]
-                total += _tap(v, k) * part
+                total += down[k] * (
+                    across[0] * frame[row[k], column[0]]
+                    + across[1] * frame[row[k], column[1]]
+                    + across[2] * frame[row[k], column[2]]
+                    + across[3] * frame[row[k], column[3]]
+                )
             out[i, j] = min(max(total, low), high)
     return out
 
 
 @njit(nogil=True, fastmath=True, inline="always")
 def _taps(t, taps):
-    for k in range(4):
-        taps[k] = _tap(t, k)
-
-
-@njit(nogil=True, fastmath=True, inline="always")
-def _tap(t, k):
-    if k == 0:
-        return np.float32(0.5) * t * (t * (np.float32(2.0) - t) - np.float32(1.0))
-    if k == 1:
-        return np.float32(1.0) + np.float32(0.5) * t * t * (np.float32(3.0) * t - np.float32(5.0))
-    if k == 2:
-        return np.float32(0.5) * t * (t * (np.float32(4.0) - np.float32(3.0) * t) + np.float32(1.0))
-    return np.float32(0.5) * t * t * (t - np.float32(1.0))
+    half = np.float32(0.5) * t
+    taps[0] = half * (t * (np.float32(2.0) - t) - np.float32(1.0))
+    taps[1] = np.float32(1.0) + half * t * (np.float32(3.0) * t - np.float32(5.0))
+    taps[2] = half * (t * (np.float32(4.0) - np.float32(3.0) * t) + np.float32(1.0))
+    taps[3] = half * t * (t - np.float32(1.0))
 
 
 @njit(nogil=True, inline="always")
