@@ -3,74 +3,59 @@
 from pathlib import Path
 
 import hydra
-import numpy as np
 import rich
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from src import build, door
-from src.figures import calibration
 from src.metrics import results
-from src.recordings import alignment, dots, lookup, sources, statistics, stream, views
+from src.recordings import calibration
 
 
-def align(cfg: DictConfig, run: Path) -> None:
-    """Find the views and write `views.yaml`, `views.png`; of a failure `found.png` remains."""
-    picture = alignment.picture_of(sources.sensor_picture(cfg.recording, cfg.sensor_size))
-    sizes = {"sensor": picture.shape, "model": tuple(cfg.resolution)}
-    if cfg.corners:
-        found = alignment.by_hand(alignment.read_corners(cfg.corners), **sizes)
-        calibration.views_by_hand(picture, found, run / "views.png")
-    else:
-        seen = alignment.find(picture, build.make(cfg.target), cfg.mirrors)
-        calibration.views_found(picture, seen, run / "found.png")
-        aligned = alignment.align(seen, margin=cfg.margin, threshold_px=cfg.threshold_px, **sizes)
-        calibration.views_aligned(picture, aligned, run / "views.png")
-        found = aligned.views
-    for path in filter(None, (run / "views.yaml", cfg.save)):
-        found.save(path)
-    errors = {str(view.position): round(view.error_px, 3) for view in found.views}
-    rich.print("reprojection error in pixels", errors, f"in {run}")
+def views(cfg: DictConfig, run: Path) -> dict:
+    """Find the views and their homographies: `views.yaml`, also at `cfg.save`."""
+    names = ("resolution", "sensor_size", "mirrors", "margin", "threshold_px", "corners")
+    options = {name: cfg[name] for name in names}
+    found = calibration.align_views(cfg.recording, run, build.make(cfg.target), **options)
+    if cfg.save:
+        found.save(cfg.save)
+    return {f"error_px of {view.position}": round(view.error_px, 3) for view in found.views}
 
 
-def characterise(cfg: DictConfig, run: Path) -> None:
-    """Write `turbulence.png` and `turbulence.csv` of a dot grid with and without turbulence."""
-    there = views.load(cfg.views) if cfg.views else None
-    positions = there.positions if there else [(0, 0)]
-    still, turbulent = (registered(cfg, path, there) for path in (cfg.still, cfg.recording))
-    centre = positions.index((0, 0))
-    grid = cfg.dots
-    places = statistics.find_dots(still[centre].mean(0), grid.rows, grid.cols, grid.dark)
-    radius = grid.radius or statistics.radius(places)
-    fits = [[dots.fit(film, places, radius) for film in films] for films in (turbulent, still)]
-    found = statistics.measure(*fits, fps=cfg.fps, centre=centre)
-    statistics.write_csv(found, run / "turbulence.csv", positions)
-    calibration.turbulence(found, positions, run / "turbulence.png")
-    rich.print(found.summary(), f"in {run}")
+def threshold(cfg: DictConfig, run: Path) -> dict:
+    """Find the contrast threshold by comparing event rates with the configured simulation's."""
+    pipeline = build.pipeline(cfg, "test")
+    clips = [pipeline.views(pipeline.draw(index))[0] for index in range(cfg.clips)]
+    settings = OmegaConf.to_container(cfg.sensor, resolve=True)
+    settings |= {"input": "linear"} if pipeline.decode else {}
+    found = calibration.find_threshold(
+        cfg.recording, run, clips, cfg.fps * cfg.data.substeps, settings,
+        views=cfg.views, sensor_size=cfg.sensor_size,
+    )  # fmt: skip
+    return {"ON (value, low, high)": found.on, "OFF": found.off}
 
 
-def registered(cfg: DictConfig, path: str, there: views.Views | None) -> np.ndarray:
-    """Return (views, frames, h, w) of a film, or of a recording reconstructed view by view."""
-    if not sources.holds_events(path):
-        frames = [there.register(frame) if there else frame[None] for frame in sources.film(path)]
-        return np.stack(frames, axis=1)
-    sensor = sources.sensor_size(path, cfg.sensor_size)
-    overlap = stream.overlap("trained", cfg.fps)
-    rule = stream.Rule(fps=cfg.fps, overlap=overlap, bins=cfg.bins)
-    table = lookup.build(there or views.Views.single(sensor, sensor))
-    windows = stream.windows(sources.events(path, sensor), table, rule)
-    return np.stack(list(stream.each_view(windows, build.chosen(cfg), overlap=overlap)), axis=1)
+def turbulence(cfg: DictConfig, run: Path) -> dict:
+    """Measure tilt, blur and scintillation of a dot grid against the same without turbulence."""
+    network = build.chosen(cfg) if cfg.ckpt or cfg.get("baseline") else None
+    found = calibration.characterise(
+        cfg.recording, cfg.still, run, fps=cfg.fps, network=network, views=cfg.views,
+        sensor_size=cfg.sensor_size, **cfg.dots,
+    )  # fmt: skip
+    return found.summary()
 
 
-TASKS = {"views": align, "turbulence": characterise}
+TASKS = {"views": views, "threshold": threshold, "turbulence": turbulence}
 
 
-def calibrate(cfg: DictConfig) -> None:
+def calibrate(cfg: DictConfig) -> dict:
     """Do `cfg.task`; everything goes below `cfg.paths.run`.  Raises ValueError for another task."""
     if cfg.task not in TASKS:
         raise ValueError(f"task must be one of {', '.join(TASKS)}, got {cfg.task}")
     run = Path(cfg.paths.run)
     results.open_run(run, door.resolved(cfg))
-    TASKS[cfg.task](cfg, run)
+    found = TASKS[cfg.task](cfg, run)
+    rich.print(found, f"in {run}")
+    return found
 
 
 @hydra.main(version_base=None, config_path="../conf", config_name="calibrate")

@@ -168,3 +168,17 @@ def test_turbulence_of_a_film_of_dots(folder, found, tmp_path):
 def test_another_task_is_refused(tmp_path):
     with pytest.raises(ValueError, match="task must be one of"):
         calibrate(config("calibrate", tmp_path / "run", "task=guess", "recording=a.raw"))
+
+
+def test_threshold_of_a_recording_is_found_by_the_door(folder, found, tmp_path):
+    small = [
+        "scene.height=64",
+        "scene.width=64",
+        "data.test_windows=8",
+        "turbulence=none",
+        "clips=2",
+    ]
+    chosen = [f"recording={folder}/dot.raw", f"views={found}", *small]
+    calibrate(config("calibrate", tmp_path / "run", "task=threshold", *chosen))
+    assert (tmp_path / "run" / "threshold.csv").is_file()
+    assert (tmp_path / "run" / "threshold.png").is_file()
