@@ -6,7 +6,7 @@ them are measured on exact PSFs by scripts/p2s_errors.py and kept beside the net
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 from jaxtyping import Float
@@ -61,33 +61,24 @@ def choose(atmosphere: Atmosphere, width_px: int, tolerance: float, exact: bool)
 
     An rms error of half a grey level of 256 is always allowed.  With `exact` PSFs there is no rank.
     """
-    strength, airy = atmosphere.d_over_r0, atmosphere.airy_px(width_px)
+    seen = _seen(atmosphere, width_px)
+    strength, airy = seen.d_over_r0, seen.airy_px
     power = _random_power(strength, airy)
     allowed = max(tolerance, (UNSEEN / CONTRAST) ** 2 / power)
     band = band_for(strength)
     exact = exact or band is None
     modes, error_modes = _cheapest("modes", strength, airy, allowed)
+    known = EXACT_MODES if exact else band.modes
     rank, error_rank = (0.0, 0.0) if exact else _cheapest("rank", strength, airy, allowed)
     reach, error_kernel = _cheapest("kernel", strength, airy, allowed)
-    step, error_pitch = _widest(strength, airy, allowed)
-    if strength > _table("strength")[-1]:
-        modes = EXACT_MODES
-    elif not exact:
-        modes = min(modes, band.modes)
-    tilt_px = atmosphere.tilt_std_px(width_px)
     pixel = atmosphere.object_pixel_m(width_px) / atmosphere.aperture_m
+    step, error_pitch = _widest(strength, airy, allowed)
     pitch = int(min(max(step / pixel, 1), MAX_PITCH))
     error_pitch = error_pitch if pitch > 1 else 0.0
-    tilt_pitch, error_tilt = _tilt_pitch(pixel, tilt_px, tolerance)
-    return Fidelity(
-        d_over_r0=strength,
-        severity=atmosphere.severity,
-        rytov=atmosphere.rytov,
-        alpha=atmosphere.alpha,
-        tilt_px=tilt_px,
-        airy_px=airy,
-        blur_px=airy * _half_light(strength),
-        modes=int(modes),
+    tilt_pitch, error_tilt = _tilt_pitch(pixel, seen.tilt_px, tolerance)
+    return replace(
+        seen,
+        modes=EXACT_MODES if band is None else min(int(modes), known),
         rank=0 if exact else min(int(rank), len(band.basis)),
         kernel=_kernel(strength, airy, reach),
         pitch=pitch,
@@ -101,6 +92,20 @@ def choose(atmosphere: Atmosphere, width_px: int, tolerance: float, exact: bool)
     )
 
 
+def _seen(atmosphere: Atmosphere, width_px: int) -> Fidelity:
+    """Return what the atmosphere is in pixels, before anything is chosen."""
+    strength, airy = atmosphere.d_over_r0, atmosphere.airy_px(width_px)
+    return Fidelity(
+        d_over_r0=strength,
+        severity=atmosphere.severity,
+        rytov=atmosphere.rytov,
+        alpha=atmosphere.alpha,
+        tilt_px=atmosphere.tilt_std_px(width_px),
+        airy_px=airy,
+        blur_px=airy * _half_light(strength),
+    )
+
+
 def band_for(strength: float) -> Band | None:
     """Return the weakest band that covers D/r0 = `strength`; None beyond the last."""
     return next((band for band in bands() if strength <= BEYOND * band.edge), None)
@@ -110,8 +115,7 @@ def _kernel(strength: float, airy: float, reach: float) -> int:
     """Return the odd number of pixels that `reach` lambda / D cover, within the basis if any."""
     band = band_for(strength)
     widest = band.mean.shape[-1] / FINE_PER_AIRY / 2 if band else 6 + 0.6 * strength
-    if strength > _table("strength")[-1]:
-        reach = widest
+    reach = reach if band else widest
     return 2 * math.floor(min(reach + 0.5 / airy, widest) * airy) + 1
 
 

@@ -169,7 +169,7 @@ def test_interpolation_reproduces_straight_lines(order):
     torch.testing.assert_close(line, torch.arange(-7.0, 23.0))
 
 
-@pytest.mark.parametrize("strength", [1e-6, 0.1, 3.0, 10.0, 30.0])
+@pytest.mark.parametrize("strength", [1e-6, 0.1, 3.0, 10.0, 10.4, 30.0])
 def test_any_strength_is_finite(strength):
     seen = operator(strength, size=24, width_m=0.05).degrade(torch.rand(1, 1, 24, 24), seed())
     assert seen.isfinite().all()
