@@ -11,6 +11,7 @@ import torch
 from hydra import compose, initialize_config_dir
 
 from src.calibrate import calibrate
+from src.compare import compare
 from src.reconstruct import reconstruct
 from src.recordings import capture, lookup, views
 from src.sim.optics import layout
@@ -182,3 +183,27 @@ def test_threshold_of_a_recording_is_found_by_the_door(folder, found, tmp_path):
     calibrate(config("calibrate", tmp_path / "run", "task=threshold", *chosen))
     assert (tmp_path / "run" / "threshold.csv").is_file()
     assert (tmp_path / "run" / "threshold.png").is_file()
+
+
+def test_comparing_videos_draws_them_and_measures_their_slices(folder, found, tmp_path):
+    chosen = [f"recording={folder}/dot.raw", f"views={found}", HIGHPASS, "output=hdf5", "fps=300"]
+    videos = []
+    for source in ("centre", "median"):
+        wanted = [*chosen, f"+baseline.source={source}"]
+        videos.append(reconstruct(config("reconstruct", tmp_path / source, *wanted)) / "video.h5")
+    line = ["line=[[0,70],[87,20]]", "fps=300", f"videos=[{videos[0]},{videos[1]}]"]
+    numbers = compare(config("compare", tmp_path / "run", *line))
+    assert set(numbers) == {"centre", "median"}
+    assert (tmp_path / "run" / "comparison.png").is_file()
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [("line=null", "either line or circle"), ("line=[[0,0],[500,0]]", "must stay")],
+)
+def test_a_slice_that_cannot_be_taken_is_refused(wrong, message, tmp_path):
+    (tmp_path / "film").mkdir()
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / "film" / f"{k}.png"), np.zeros((20, 30), np.uint8))
+    with pytest.raises(ValueError, match=message):
+        compare(config("compare", tmp_path / "run", f"videos=[{tmp_path}/film]", wrong))
