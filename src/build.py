@@ -3,9 +3,11 @@
 `hydra.utils.instantiate` is called here only, so that what a config may name is decided here.
 """
 
+import os
 from typing import Any
 
 import lightning
+import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -123,6 +125,12 @@ def reconstructor(cfg: DictConfig, net: nn.Module, spec: dict) -> Reconstructor:
         detach_every=cfg.data.detach_every,
         warmup=cfg.data.warmup,
     )
+
+
+def share_cores(cfg: DictConfig) -> None:
+    """Leave a core to each simulating worker: threads that fight for a core wait for each other."""
+    if cfg.trainer.accelerator == "cpu":
+        torch.set_num_threads(max(1, (os.cpu_count() or 1) - cfg.data.workers))
 
 
 def trainer(cfg: DictConfig) -> lightning.Trainer:

@@ -17,6 +17,7 @@ def evaluate(cfg: DictConfig) -> dict:
     Everything goes below `cfg.paths.run`.  Returns the content of `results.json`.
     """
     run, start = Path(cfg.paths.run), time.perf_counter()
+    build.share_cores(cfg)
     net, data = build.frozen(cfg), build.data(cfg, splits=("test",))
     results.open_run(run, door.resolved(cfg))
     row = build.test(cfg, cfg.name, net, data, build.scores(cfg))

@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 from src import build, door
 from src.figures import samples
 from src.metrics import results
+from src.models import files
 
 
 def train(cfg: DictConfig) -> dict:
@@ -18,10 +19,11 @@ def train(cfg: DictConfig) -> dict:
     Everything goes below `cfg.paths.run`.  Returns the content of `results.json`.
     """
     run, start = Path(cfg.paths.run), time.perf_counter()
-    if cfg.ckpt and not Path(cfg.ckpt).is_file():
-        raise ValueError(f"ckpt must be a checkpoint to go on from, got {cfg.ckpt}")
+    build.share_cores(cfg)
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
     net, spec = build.network(cfg)
+    if cfg.ckpt:
+        files.require(cfg.ckpt, spec)
     module, data = build.reconstructor(cfg, net, spec), build.data(cfg)
     results.open_run(run, door.resolved(cfg))
     untrained = build.test(cfg, "untrained", net, data, module.scores)

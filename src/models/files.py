@@ -41,6 +41,15 @@ def load(name_or_path: str | Path) -> nn.Module:
     return network.float().eval()
 
 
+def require(path: str, spec: dict) -> None:
+    """Raise ValueError unless `path` is a checkpoint of just the network `spec`, to go on from."""
+    if not Path(path).is_file():
+        raise ValueError(f"ckpt must be a checkpoint to go on from, got {path}")
+    found, _ = _checkpoint(Path(path))
+    if found != spec:
+        raise ValueError(f"ckpt must be of the network {spec} to go on from, got {found} in {path}")
+
+
 def save(path: Path, network: nn.Module, spec: dict, card: dict) -> None:
     """Write `network`, spectral norm folded, as float16 safetensors with `spec` and `card` (plain
     values: data, seeds, commit, metrics ...) in its header; whole or not at all.

@@ -86,7 +86,8 @@ class Spots:
         pixels = (grid @ shapes @ grid.T).flatten(1)
         self.band, self.rank, self.size = band, rank, size
         self.shapes = pixels / pixels[:1].sum()
-        self.shapes[1:] -= self.shapes[1:].sum(1, keepdim=True) * self.shapes[:1]  # all PSFs sum to 1
+        # The basis sums to nothing, so that every PSF sums to one.
+        self.shapes[1:] -= self.shapes[1:].sum(1, keepdim=True) * self.shapes[:1]
 
     def __call__(
         self, phase: Float[Tensor, "frames blurmodes rows columns"]
