@@ -12,7 +12,6 @@ from src.models.reconstructor import Reconstructor
 from src.models.unroll import chunks, detach, unroll
 from src.sim.pipeline import Sample
 
-
 pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`")
 
 
