@@ -54,6 +54,7 @@ def frames(cfg: DictConfig, net: nn.Module, views: Views) -> Iterator[stream.Fra
         overlap=overlap(cfg, net),
         bins=cfg.bins,
         splat=cfg.splat,
+        unit=cfg.unit,
         start_s=cfg.start,
         end_s=cfg.end,
     )

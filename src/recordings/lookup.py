@@ -1,6 +1,7 @@
 """The sensor lookup: one pass over a stream splits it into registered views."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -8,6 +9,8 @@ from jaxtyping import Float, Int
 
 from src.recordings.engines.splat import splat
 from src.recordings.views import Size, Views
+
+THINNEST = 0.1  # of `density`: where fewer sensor pixels than this look, events are not scaled up
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,19 @@ class Lookup:
         self.check(events)
         fields = (events[name] for name in "txyp")
         return splat(*fields, self.view, self.place, grid, float(t0), float(t1), nearest)
+
+    @cached_property
+    def densities(self) -> dict[str, Float[np.ndarray, "views 1 h w"]]:
+        """What one event of every sensor pixel lays into each model pixel, `bilinear`, `nearest`.
+
+        It ripples where views are resampled; a grid over it is in events per sensor pixel.
+        """
+        y, x = np.nonzero(self.view >= 0)
+        time, one = np.zeros(len(x), np.int64), np.ones(len(x), np.int8)
+        grids = {"bilinear": self.empty(1), "nearest": self.empty(1)}
+        for kind, grid in grids.items():
+            splat(time, x, y, one, self.view, self.place, grid, 0.0, 1.0, kind == "nearest")
+        return {kind: np.maximum(grid, THINNEST) for kind, grid in grids.items()}
 
     def split(self, events: np.ndarray) -> tuple[np.ndarray, Int[np.ndarray, " k"]]:
         """Return the events inside views, at their nearest model pixel, and the view of each."""

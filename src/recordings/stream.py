@@ -41,8 +41,9 @@ class Window:
 class Rule:
     """How windows are cut: by time, `overlap` windows over each other, or by `count` of events.
 
-    A window by time is overlap / fps long and ends 1 / fps after the one before it.  `start_s` and
-    `end_s` count from the recording's first event.
+    `unit`: a grid holds events per sensor `pixel`, as in training whatever the resampling, or all
+    their `mass`.  A window by time is overlap / fps long and ends 1 / fps after the one before it.
+    `start_s` and `end_s` count from the recording's first event.
     """
 
     fps: float | None = None
@@ -50,6 +51,7 @@ class Rule:
     overlap: int = 1
     bins: int = 5
     splat: str = "bilinear"
+    unit: str = "pixel"
     start_s: float = 0.0
     end_s: float = float("inf")
 
@@ -62,6 +64,8 @@ class Rule:
             raise ValueError(f"count must be >= 1, got {self.count}")
         if self.splat not in ("bilinear", "nearest"):
             raise ValueError(f"splat must be bilinear or nearest, got {self.splat}")
+        if self.unit not in ("pixel", "mass"):
+            raise ValueError(f"unit must be pixel or mass, got {self.unit}")
         if self.overlap < 1 or self.bins < 1:
             raise ValueError(f"overlap and bins must be >= 1, got {self.overlap} and {self.bins}")
         if not 0 <= self.start_s < self.end_s:
@@ -145,6 +149,8 @@ def _grid(events: np.ndarray, lookup: Lookup, rule: Rule, begin: float, end: flo
         return Window(begin, end, 0, 0, nothing)
     grid = lookup.empty(rule.bins)
     outside = lookup.add(events, grid, begin, end, nearest=rule.splat == "nearest")
+    if rule.unit == "pixel":
+        grid /= lookup.densities[rule.splat]
     return Window(begin, end, len(events) - outside, outside, grid)
 
 

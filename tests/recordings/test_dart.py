@@ -54,7 +54,7 @@ def test_nine_views_fly_the_dart_straighter_than_one(tmp_path):
     wander = {}
     for views in (1, None):
         chunks = formats.iter_events(tmp_path / "dart.raw", seconds=0.001)
-        windows = stream.windows(chunks, table, stream.Rule(fps=FPS))
+        windows = stream.windows(chunks, table, stream.Rule(fps=FPS, unit="mass"))
         time, found = path(list(stream.frames(windows, Integrator(views)))[LENGTH + 5 :])
         steps = (time - time[0]) * FPS
         # A straight line at the true speed; the file's clock starts at the first event.

@@ -176,6 +176,21 @@ def test_splitting_keeps_the_mass_of_each_view_and_counts_the_rest(truth, neares
         assert grid[index].sum() == pytest.approx(events["p"][view == index].sum(), abs=1e-2)
 
 
+@pytest.mark.parametrize("kind", ["bilinear", "nearest"])
+def test_an_event_of_every_pixel_is_flat_per_sensor_pixel(truth, kind):
+    there = views.Views(truth.sensor, (176, 176), truth.field, truth.views)
+    table = lookup.build(there)
+    events = np.zeros(SENSOR[0] * SENSOR[1], EVENT)
+    events["y"], events["x"] = np.indices(SENSOR).reshape(2, -1)
+    events["p"] = 1
+    grid = table.empty(1)
+    table.add(events, grid, 0, 1, nearest=kind == "nearest")
+    inner = (slice(None), 0, slice(4, -4), slice(4, -4))
+    assert grid[inner].mean() == pytest.approx((230 / 176) ** 2, rel=0.03)
+    assert grid[inner].std() > 0.1  # it ripples
+    assert np.abs((grid / table.densities[kind])[inner] - 1).max() < 1e-5
+
+
 def test_nearest_splat_is_the_voxel_grid_of_each_views_events(truth):
     table, events = lookup.build(truth), stream(50_000)
     grid = table.empty(5)
