@@ -4,7 +4,6 @@ Log intensity is the sum of polarity times threshold; without the first frame on
 known, and errors pile up, so old events are forgotten exponentially (Scheerlinck et al. 2018).
 """
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 

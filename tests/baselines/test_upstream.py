@@ -1,0 +1,129 @@
+"""Published weights load, reproduce the published outputs, and nothing of a file is executed."""
+
+import os
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+from PIL import Image
+from scipy import ndimage
+
+from baselines import upstream
+from baselines.e2vid_plus import E2VIDPlus
+from baselines.firenet import FireNet
+from src.build import make
+from src.sim.voxel import voxel_grid
+from tests.conftest import ROOT
+
+CONFIGS = ROOT / "conf" / "baseline"
+FILES = {
+    "firenet": "FireNet/firenet_state_dict.pth",
+    "firenet_plus": "FireNet+/firenet_plus_state_dict.pth",
+}
+
+
+class Shell:
+    def __reduce__(self):
+        return os.system, ("false",)
+
+
+class Config:
+    pass
+
+
+@pytest.fixture(scope="module")
+def slider(shared_data):
+    folder = shared_data / "events" / "slider_depth"
+    rows = np.loadtxt(folder / "events_chunk.txt")
+    image = Image.open(folder / "images" / "frame_00000004.png").convert("L")
+    windows = []
+    for part in np.split(rows, 10):
+        t = np.round(part[:, 0] * 1e6).astype(np.int64)
+        x, y = part[:, 1].astype(np.uint16), part[:, 2].astype(np.uint16)
+        p = np.where(part[:, 3] > 0, 1, -1).astype(np.int8)
+        windows.append(
+            voxel_grid(
+                t, x, y, p, t0=t[0] * 1e-6, t1=t[-1] * 1e-6, bins=5, height=180, width=240,
+                window="first_last",
+            )
+        )  # fmt: skip
+    return torch.stack(windows).float(), np.asarray(image, dtype=float) / 255
+
+
+@pytest.mark.parametrize(
+    ("name", "pixels", "gradients"), [("firenet", 0.601, 0.406), ("firenet_plus", 0.421, 0.328)]
+)
+def test_published_weights_reach_the_published_correlation(
+    shared_data, slider, name, pixels, gradients
+):
+    network = upstream.load(name, shared_data / "weights" / FILES[name])
+    voxels, truth = slider
+    state = None
+    for grid in voxels:
+        frame, state = network(grid[None, None], state)
+    ours = frame[0, 0].numpy().astype(float)
+    found = np.corrcoef(ours.ravel(), truth.ravel())[0, 1]
+    # The numbers come without a definition of gradient.  Of central and forward differences and
+    # Sobel, signed and as magnitude, only the Sobel magnitude agrees for both networks.
+    steep = [np.hypot(ndimage.sobel(a, 0), ndimage.sobel(a, 1)).ravel() for a in (ours, truth)]
+    assert found == pytest.approx(pixels, abs=0.01)
+    assert np.corrcoef(*steep)[0, 1] == pytest.approx(gradients, abs=0.01)
+
+
+def test_parameter_counts():
+    count = {k: sum(p.numel() for p in k().parameters()) for k in (FireNet, E2VIDPlus)}
+    assert count == {FireNet: 37_777, E2VIDPlus: 10_710_401}
+
+
+@pytest.mark.parametrize("name", list(upstream.NETWORKS))
+def test_names_round_trip(name, tmp_path):
+    kind, how, _ = upstream.NETWORKS[name]
+    network = kind(**how, **{upstream._width(kind): 8}).eval()
+    published = upstream.export(name, network)
+    path = tmp_path / "published.pth"
+    torch.save({"state_dict": published, "config": Config()}, path)
+    again = upstream.load(name, path)
+    voxels = torch.randn(2, 9, 5, 16, 16)
+    assert torch.equal(network(voxels, None)[0], again(voxels, None)[0])
+
+
+def test_e2vid_has_the_published_names():
+    names = upstream.export("e2vid_plus", E2VIDPlus(base_channels=8))
+    assert len(names) == 30
+    assert "unetrecurrent.encoders.2.recurrent_block.Gates.bias" in names
+    assert "unetrecurrent.encoders.0.conv.conv2d.weight" in names
+
+
+def test_widened_head_gives_equal_views_what_one_gave():
+    head, x = torch.randn(4, 5, 5, 5).double(), torch.randn(1, 5, 8, 8).double()
+    one = torch.conv2d(x, head)
+    torch.testing.assert_close(torch.conv2d(x.repeat(1, 9, 1, 1), upstream.widen(head, 9)), one)
+
+
+def test_missing_and_extra_weights_are_listed():
+    weights = upstream.export("firenet", FireNet())
+    weights["stranger"] = weights.pop("net.pred.conv2d.bias")
+    with pytest.raises(ValueError, match=r"missing \['net.pred.conv2d.bias'\], extra \['stranger"):
+        upstream.load("firenet", weights)
+
+
+def test_a_pickle_that_wants_to_run_code_is_refused(tmp_path):
+    path = tmp_path / "bad.pth"
+    torch.save({"state_dict": Shell()}, path)
+    with pytest.raises(ValueError, match="must hold tensors"):
+        upstream.load("firenet", path)
+    path.write_bytes(pickle.dumps(Shell()))
+    with pytest.raises(ValueError, match=r"baseline\.weights"):
+        upstream.load("firenet", path)
+
+
+@pytest.mark.parametrize("name", list(upstream.NETWORKS))
+def test_every_published_network_has_a_config(name, tmp_path):
+    kind, how, _ = upstream.NETWORKS[name]
+    path = tmp_path / "published.pth"
+    torch.save(upstream.export(name, kind(**how, **{upstream._width(kind): 8})), path)
+    node = OmegaConf.load(CONFIGS / f"{name}.yaml")
+    node.weights = str(path)
+    assert make(node).normalise == how["normalise"]
