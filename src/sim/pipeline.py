@@ -8,6 +8,7 @@ workers or the device, and view i depends on the draws of view i only.
 """
 
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 
@@ -21,6 +22,7 @@ from src.sim.scenes import Clip
 from src.sim.sensor import EventSensor, decode_srgb
 from src.sim.turbulence import Turbulence
 
+WEAK_SCATTER = 0.3  # Rytov variance up to which phase alone will do (Andrews & Phillips 2005)
 Crop = tuple[int, int, int, int]  # top, left, height, width
 
 
@@ -94,6 +96,7 @@ class Pipeline:
         self.split, self.seed = split, seed
         self.bins, self.substeps = bins, substeps
         self.crop, self.random_crop, self.clips = crop, random_crop, clips
+        self.warned = False
 
     def draw(self, number: int) -> Draw:
         """Draw everything random about clip `number`."""
@@ -103,6 +106,7 @@ class Pipeline:
         crop = self._crop(clip.frames.shape[-2:], noise.key(key, number, "crop"))
         drawer = noise.generator(noise.key(key, "atmosphere"))
         atmosphere = sample_atmosphere(generator=drawer, **self.turbulence["atmosphere"])
+        self._check_scatter(atmosphere)
         threshold = self.sensor.sample_threshold(noise.generator(noise.key(key, "threshold")))
         return Draw(clip, crop, atmosphere, threshold, key)
 
@@ -169,6 +173,17 @@ class Pipeline:
     def drawer(self, draw: Draw) -> torch.Generator:
         """Return the generator that the turbulence of a clip draws from."""
         return noise.generator(noise.key(draw.key, "turbulence"))
+
+    def _check_scatter(self, atmosphere: Atmosphere | None) -> None:
+        """Warn, once, of an atmosphere that phase alone does not describe."""
+        if atmosphere is None or self.warned or atmosphere.rytov <= WEAK_SCATTER:
+            return
+        self.warned = True
+        warnings.warn(
+            f"turbulence.atmosphere: a Rytov variance of {atmosphere.rytov:.2f} is above "
+            f"{WEAK_SCATTER}: scintillation, which is left out, matters there",
+            stacklevel=3,
+        )
 
     def _crop(self, size: Sequence[int], key: int) -> Crop:
         height, width = size
