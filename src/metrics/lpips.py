@@ -152,7 +152,7 @@ def _backbone(net: str, path: str | None) -> dict[str, Tensor]:
 
 
 def _download(net: str) -> dict[str, Tensor] | None:
-    """Return PyTorch's file, its hash checked and no code of it run; None where it cannot be had."""
+    """Return PyTorch's file, hash checked, no code of it run; None if it cannot be had."""
     patience = socket.getdefaulttimeout()
     socket.setdefaulttimeout(PATIENCE_S)  # the hub has no time-out of its own
     try:
