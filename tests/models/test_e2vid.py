@@ -1,0 +1,133 @@
+"""E2VID: published sizes, any frame size, pure state, spectral norm, learning."""
+
+import pytest
+import torch
+from torch.nn.utils import parametrize
+
+from src.models.cost import macs_per_frame
+from src.models.e2vid import E2VID
+from src.models.unroll import unroll
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "parameters"),
+    [
+        ({}, 10_710_401),
+        ({"views": 9}, 10_742_401),
+        ({"recurrent": "convgru"}, 9_161_665),
+        ({"base_channels": 16}, 2_679_489),
+        ({"base_channels": 8}, 670_817),
+        ({"kernel_size": 3}, 9_331_585),
+    ],
+)
+def test_published_parameter_counts(kwargs, parameters):
+    assert sum(p.numel() for p in E2VID(**kwargs).parameters()) == parameters
+
+
+@pytest.mark.parametrize(("views", "giga"), [(1, 14.07), (9, 15.06)])
+def test_published_cost_at_176(views, giga):
+    assert abs(macs_per_frame(E2VID(views), 176, 176, views=views) / 1e9 - giga) < 0.01
+
+
+def small(**kwargs) -> E2VID:
+    torch.manual_seed(0)
+    return E2VID(**{"views": 2, "bins": 3, "base_channels": 4} | kwargs)
+
+
+def voxels(n: int = 2, windows: int = 4, side: int = 16) -> torch.Tensor:
+    return torch.randn(n, windows, 2, 3, side, side, generator=torch.Generator().manual_seed(1))
+
+
+@pytest.mark.parametrize("size", [(16, 16), (17, 23), (30, 9)])
+@torch.no_grad()
+def test_any_size_comes_back(size):
+    frame, state = small()(torch.randn(1, 2, 3, *size), None)
+    assert frame.shape == (1, 1, *size) and 0 <= float(frame.min()) <= float(frame.max()) <= 1
+    assert len(state) == 3
+
+
+@torch.no_grad()
+def test_no_activation_is_unbounded():
+    network = small(final_activation="none")
+    assert float(network(50 * torch.randn(1, 2, 3, 16, 16), None)[0].min()) < 0
+
+
+@pytest.mark.parametrize("recurrent", ["convlstm", "convgru"])
+@torch.no_grad()
+def test_law_6_two_chunks_equal_one(recurrent):
+    network = small(recurrent=recurrent)
+    whole, _ = unroll(network, voxels())
+    first, state = unroll(network, voxels()[:, :1])
+    second, _ = unroll(network, voxels()[:, 1:], state)
+    assert torch.equal(whole, torch.cat([first, second], 1))
+
+
+@torch.no_grad()
+def test_clips_of_a_batch_do_not_meet():
+    network = small()
+    alone, _ = unroll(network, voxels()[1:])
+    together, _ = unroll(network, voxels())
+    assert torch.allclose(together[1:], alone, atol=1e-6)
+
+
+def test_views_are_stacked_view_by_view():
+    network = small()
+    one = torch.zeros(1, 2, 3, 16, 16)
+    one[:, 1, 2] = 1.0
+    assert torch.equal(one.flatten(1, 2)[:, 5], torch.ones(1, 16, 16))
+    assert network.head.in_channels == 6
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 3, 16, 16), (1, 2, 5, 16, 16)])
+def test_other_views_or_bins_are_refused(shape):
+    with pytest.raises(ValueError, match=r"optics.views, bins must be \(2, 3\)"):
+        small()(torch.zeros(shape), None)
+
+
+@pytest.mark.parametrize("wrong", [{"recurrent": "lstm"}, {"final_activation": "tanh"}])
+def test_unknown_choices_name_their_key(wrong):
+    with pytest.raises(ValueError, match=f"model.{next(iter(wrong))}"):
+        E2VID(**wrong)
+    with pytest.raises(ValueError, match="model.kernel_size"):
+        E2VID(kernel_size=4)
+
+
+def test_spectral_norm_keeps_the_gates_at_one():
+    network = small(spectral_norm=True)
+    for _ in range(30):  # power iterations
+        unroll(network, voxels())
+    network.eval()
+    for cell in network.cells:
+        sigma = torch.linalg.matrix_norm(cell.gates.weight.flatten(1), 2)
+        assert abs(float(sigma) - 1) < 1e-3
+
+
+def test_spectral_norm_is_computed_once_in_a_cached_unroll():
+    network = small(spectral_norm=True).train()
+    gate = network.cells[0].gates
+    with parametrize.cached():
+        assert gate.weight is gate.weight
+
+
+@pytest.mark.parametrize("recurrent", ["convlstm", "convgru"])
+def test_gradients_reach_every_parameter(recurrent):
+    network = small(recurrent=recurrent)
+    frames, _ = unroll(network, voxels())
+    (frames * torch.randn_like(frames)).sum().backward()
+    assert all(float(p.grad.abs().sum()) > 0 for p in network.parameters())
+
+
+def test_it_can_learn_one_batch_by_heart():
+    network = small(base_channels=8)
+    target = torch.rand(2, 4, 1, 16, 16, generator=torch.Generator().manual_seed(2))
+    target = torch.nn.functional.avg_pool2d(target.flatten(0, 1), 5, 1, 2).view_as(target)
+    optimizer = torch.optim.Adam(network.parameters(), 3e-3)
+    losses = []
+    for _ in range(80):
+        frames, _ = unroll(network, voxels())
+        loss = (frames - target).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < 0.25 * losses[0]

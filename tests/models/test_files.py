@@ -1,0 +1,100 @@
+"""Networks on disk: what is saved comes back; what is wrong is named; nothing is executed."""
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from src.models import files, load, save
+from src.models.e2vid import E2VID
+from src.models.unroll import unroll
+
+KWARGS = {"views": 2, "bins": 3, "base_channels": 4, "spectral_norm": True}
+SPEC = {"target": "src.models.e2vid.E2VID", "kwargs": KWARGS}
+
+
+def trained() -> E2VID:
+    torch.manual_seed(0)
+    network = E2VID(**KWARGS)
+    unroll(network, voxels())  # a power iteration, so that its vectors are not those of the start
+    return network.eval()
+
+
+def voxels() -> torch.Tensor:
+    return torch.randn(1, 3, 2, 3, 16, 16, generator=torch.Generator().manual_seed(1))
+
+
+@torch.no_grad()
+def test_saved_weights_come_back_folded_and_rounded_to_half(tmp_path):
+    network, path = trained(), tmp_path / "net.safetensors"
+    save(path, network, SPEC, {"steps": 3})
+    found = load(path)
+    assert not found.training and found.views == 2
+    assert all(p.dtype == torch.float32 for p in found.parameters())
+    assert torch.allclose(unroll(found, voxels())[0], unroll(network, voxels())[0], atol=2e-3)
+    assert not list(tmp_path.glob("*.partial"))
+
+
+@torch.no_grad()
+def test_a_training_checkpoint_loads_exactly(tmp_path):
+    network, path = trained(), tmp_path / "last.ckpt"
+    state = {f"network.{name}": value for name, value in network.state_dict().items()}
+    torch.save({"network": SPEC, "state_dict": state}, path)
+    assert torch.allclose(unroll(load(path), voxels())[0], unroll(network, voxels())[0], atol=1e-6)
+
+
+def test_a_word_names_shipped_weights(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "WEIGHTS", tmp_path)
+    save(tmp_path / "mine.safetensors", trained(), SPEC, {})
+    assert isinstance(load("mine"), E2VID)
+    with pytest.raises(ValueError, match=r"weights/ \(mine\), got other"):
+        load("other")
+
+
+def test_other_weights_are_listed(tmp_path):
+    path, state = tmp_path / "last.ckpt", trained().state_dict()
+    state = {f"network.{name}": value for name, value in state.items()}
+    state["network.stranger"] = state.pop("network.pred.bias")
+    torch.save({"network": SPEC, "state_dict": state}, path)
+    with pytest.raises(ValueError, match=r"missing \['pred.bias'\], extra \['stranger'\]"):
+        load(path)
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "os.system",
+        "src.build.network",
+        "src.models.files.save",
+        "src.models.absent.X",
+        "baselines.",
+    ],
+)
+def test_only_our_networks_are_built(target, tmp_path):
+    path = tmp_path / "last.ckpt"
+    torch.save({"network": {"target": target, "kwargs": {}}, "state_dict": {}}, path)
+    with pytest.raises(ValueError, match="ckpt"):
+        load(path)
+
+
+class Bomb:
+    def __reduce__(self):
+        return (exec, ("raise SystemExit('executed')",))
+
+
+def test_nothing_is_executed(tmp_path):
+    path = tmp_path / "bomb.ckpt"
+    torch.save({"network": SPEC, "state_dict": Bomb()}, path)
+    with pytest.raises(ValueError, match="ckpt must be a checkpoint"):
+        load(path)
+
+
+@pytest.mark.parametrize("suffix", [".ckpt", ".safetensors"])
+def test_files_that_are_no_networks(suffix, tmp_path):
+    path = tmp_path / f"x{suffix}"
+    for content in (b"", b"hello", b"\x00" * 100):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match="ckpt must be"):
+            load(path)
+    save_file({"a": torch.zeros(1)}, tmp_path / "plain.safetensors")
+    with pytest.raises(ValueError, match="ckpt must be a network written by"):
+        load(tmp_path / "plain.safetensors")
