@@ -98,7 +98,7 @@ def test_spectral_norm_keeps_the_gates_at_one():
         unroll(network, voxels())
     network.eval()
     for cell in network.cells:
-        sigma = torch.linalg.matrix_norm(cell.gates.weight.flatten(1), 2)
+        sigma = torch.linalg.matrix_norm(cell.gates.weight.detach().flatten(1), 2)
         assert abs(float(sigma) - 1) < 1e-3
 
 
