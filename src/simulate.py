@@ -9,10 +9,14 @@ from omegaconf import DictConfig
 from src import build, door
 from src.figures import samples
 from src.metrics import results
+from src.recordings import capture
 
 
 def simulate(cfg: DictConfig) -> dict:
     """Simulate test clip `index`; write clean, views, tilt and events as `views.gif`, `views.png`.
+
+    With `write` the views also go, mirrored and misaligned, onto one sensor whose events are
+    written to that file, and the truth beside it.
 
     Returns what was drawn: D/r0, tilt and blur in pixels, threshold ...
     """
@@ -25,6 +29,11 @@ def simulate(cfg: DictConfig) -> dict:
     windows = slice(cfg.data.substeps, None, cfg.data.substeps)
     results.open_run(run, door.resolved(cfg))
     samples.write_views(run, sample, views[:, windows], tilt[:, windows], pipeline.optics)
+    if cfg.write:
+        size = tuple(views.shape[-2:])
+        camera = capture.kaleidoscope(list(pipeline.optics.positions), model=size, key=draw.key)
+        sensor = pipeline.sensor.at(draw.threshold)
+        capture.write_recording(cfg.write, views, draw.clip.fps, camera, sensor, tilt=tilt)
     rich.print(sample.drawn[0], f"in {run}")
     return sample.drawn[0]
 

@@ -9,6 +9,8 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from src.eval import evaluate
+from src.recordings.formats import read_events
+from src.simulate import simulate
 from src.train import train
 from tests.conftest import ROOT
 
@@ -118,3 +120,14 @@ def test_a_wrong_value_names_its_key(overrides, key, tmp_path):
         cfg.paths.run = "/dev/null/x"
     with pytest.raises(ValueError, match=key):
         train(cfg)
+
+
+@pytest.mark.parametrize("turbulence", ["none", "strong"])
+def test_simulate_draws_the_views_and_writes_a_recording(turbulence, tmp_path):
+    small = ["data.test_windows=3", "data.test_crop=32", f"turbulence={turbulence}"]
+    cfg = config("simulate", tmp_path, *small, f"write={tmp_path / 'cap.raw'}")
+    drawn = simulate(cfg)
+    assert drawn["severity"] == turbulence and (tmp_path / "views.gif").stat().st_size > 1000
+    assert (tmp_path / "views.png").is_file()
+    assert len(read_events(tmp_path / "cap.raw")) > 100
+    assert (tmp_path / "cap.views.yaml").is_file() and (tmp_path / "cap.truth.h5").is_file()

@@ -90,6 +90,25 @@ class LPIPS(nn.Module):
         )
 
 
+class AnchoredLPIPS(LPIPS):
+    """A training loss: LPIPS plus `l1` times the mean absolute error, which anchors brightness and
+    gives short trainings a direction (Lou et al., arXiv 2505.16797, use 1).
+    """
+
+    def __init__(self, net: str = "alex", backbone: str | None = None, l1: float = 1.0):
+        super().__init__(net, backbone)
+        if not 0 <= l1 < float("inf"):
+            raise ValueError(f"loss.l1 must be >= 0, got {l1}")
+        self.l1 = l1
+
+    def forward(
+        self, prediction: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"]
+    ) -> Float[Tensor, " n"]:
+        """Return the loss of each pair."""
+        error = (prediction - target).abs().mean((1, 2, 3))
+        return super().forward(prediction, target) + self.l1 * error
+
+
 def _unit(features: Tensor) -> Tensor:
     """Scale the feature vector of every place to length one.
 

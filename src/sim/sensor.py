@@ -9,6 +9,7 @@ tick in which it falls, in [edge_k, edge_k+1) with edge_k = ceil(k 10^6 / fps).
 
 import math
 from collections.abc import Sequence
+from copy import copy
 
 import numpy as np
 import torch
@@ -74,6 +75,13 @@ class EventSensor:
         self.seed = seed
         check(vars(self))
         self._table = response_table(response, input, floor)
+
+    def at(self, threshold: float) -> "EventSensor":
+        """Return the same sensor with one threshold."""
+        found = copy(self)
+        found.threshold = threshold
+        check(vars(found))
+        return found
 
     def sample_threshold(self, generator: torch.Generator) -> float:
         """Return one clip's threshold: uniform in the range, or the number itself."""
