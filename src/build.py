@@ -121,6 +121,7 @@ def reconstructor(cfg: DictConfig, net: nn.Module, spec: dict) -> Reconstructor:
         spec,
         loss=make(cfg.loss),
         optimizer=make(cfg.optimizer),
+        scheduler=make(cfg.scheduler) if cfg.scheduler else None,
         scores=scores(cfg),
         detach_every=cfg.data.detach_every,
         warmup=cfg.data.warmup,

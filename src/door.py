@@ -2,6 +2,7 @@
 
 import logging
 import os
+import signal
 import sys
 import time
 import warnings
@@ -11,6 +12,7 @@ import rich
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.syntax import Syntax
@@ -27,7 +29,9 @@ def run(main: Callable[[], None]) -> None:
     except (ValueError, HydraException, OmegaConfBaseException) as error:
         sys.exit(_refuse(error))
     except KeyboardInterrupt:
-        sys.exit(130)
+        sys.exit(128 + signal.SIGINT)
+    except SIGTERMException:  # Lightning's; it would end with exit code 0
+        sys.exit(128 + signal.SIGTERM)
 
 
 def job(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:

@@ -46,7 +46,8 @@ def test_a_wrong_value_is_one_line_and_exit_code_2(door, overrides, said, tmp_pa
     assert not list(tmp_path.rglob("results.json"))
 
 
-def test_ctrl_c_leaves_a_checkpoint_that_loads(tmp_path):
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_run_leaves_a_checkpoint_that_loads(stop, tmp_path):
     many = ["trainer.max_steps=100000", "data.epoch_clips=100000"]
     run = subprocess.Popen(
         command("train", *TINY, *many, f"paths.out={tmp_path}"),
@@ -55,9 +56,10 @@ def test_ctrl_c_leaves_a_checkpoint_that_loads(tmp_path):
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
     )
-    wait_for(lambda: b"train/loss" in run.stdout.read1(), run)
-    run.send_signal(signal.SIGINT)
+    wait_for(lambda: b"per step" in run.stdout.read1(), run)
+    run.send_signal(stop)
     run.communicate(timeout=60)
+    assert run.returncode != 0
     (last,) = tmp_path.rglob("last.ckpt")
     content = torch.load(last, weights_only=True)
     assert content["global_step"] > 0 and content["network"]["target"].endswith("E2VID")

@@ -19,7 +19,7 @@ class Reconstructor(LightningModule):
     """`network`: see the contract in docs/conventions.md; `target` and `kwargs` of `network_spec`
     say how to build it again and go into the checkpoint.
     `loss` maps (n, 1, h, w) frames and targets in [0, 1] to (n,); `optimizer` makes an optimiser
-    from parameters.
+    from parameters and `scheduler`, if any, a learning-rate schedule from it, one step a batch.
     `detach_every`: windows between two cuts of the graph (truncated back-propagation through time;
     0: none).  Memory is that of one chunk; the optimiser steps once per batch.
     `scores` measures frames against targets; the first `warmup` windows of a clip are not scored.
@@ -32,6 +32,7 @@ class Reconstructor(LightningModule):
         *,
         loss: Callable[[Tensor, Tensor], Tensor] | None = None,
         optimizer: Callable | None = None,
+        scheduler: Callable | None = None,
         scores: Scores | None = None,
         detach_every: int = 0,
         warmup: int = 0,
@@ -41,7 +42,8 @@ class Reconstructor(LightningModule):
             raise ValueError(f"data.detach_every must be >= 0, got {detach_every}")
         self.automatic_optimization = False
         self.network, self.network_spec = network, network_spec
-        self.optimizer, self.detach_every, self.warmup = optimizer, detach_every, warmup
+        self.optimizer, self.scheduler = optimizer, scheduler
+        self.detach_every, self.warmup = detach_every, warmup
         # In a tuple, so that their backbones stay out of the parameters and the checkpoint.
         self._measures = (loss, scores)
         self.clips: list[dict] = []
@@ -80,6 +82,8 @@ class Reconstructor(LightningModule):
         if not torch.isfinite(total):
             raise ValueError(f"loss is {float(total)} at step {self.global_step}: {sample.drawn}")
         self.optimizers().step()
+        if self.scheduler is not None:
+            self.lr_schedulers().step()
         self.log("train/loss", total, prog_bar=True, batch_size=len(sample.voxels))
         return total
 
@@ -106,8 +110,11 @@ class Reconstructor(LightningModule):
         return [drawn | self.scores(ours, truth) for ours, truth, drawn in clips]
 
     def configure_optimizers(self):
-        """Return the optimiser over all parameters."""
-        return self.optimizer(self.network.parameters())
+        """Return the optimiser over all parameters and its schedule."""
+        optimizer = self.optimizer(self.network.parameters())
+        if self.scheduler is None:
+            return optimizer
+        return [optimizer], [self.scheduler(optimizer)]
 
     def on_save_checkpoint(self, checkpoint: dict) -> None:
         """Add how to build the network again (plain data: loads with weights_only=True)."""

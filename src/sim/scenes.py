@@ -28,11 +28,12 @@ LARGEST_SIDE = 1024  # of a photograph in memory
 REFERENCE_WIDTH = 256  # of the frame that `zoom` speaks of
 CUTOUT_SIDE = 192  # of a cut-out's texture
 
-# The photographs inside the scikit-image wheel; no split shares one with another.
+# The photographs inside the scikit-image wheel; no split shares one with another, each has scenes
+# and textures.
 EMBEDDED = {
-    "train": "astronaut brick camera coins grass gravel hubble_deep_field moon retina",
-    "val": "chelsea",
-    "test": "coffee motorcycle_left rocket",
+    "train": "astronaut brick camera coffee grass hubble_deep_field moon motorcycle_left retina",
+    "val": "coins",
+    "test": "chelsea gravel rocket",
 }
 
 
