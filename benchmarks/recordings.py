@@ -9,12 +9,12 @@ import multiprocessing
 import resource
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from benchmarks.timing import least
 from src.models.e2vid import E2VID
 from src.recordings import formats, lookup, stream
 from src.recordings.capture import kaleidoscope
@@ -37,16 +37,6 @@ def events(count: int, seconds: float, first_us: int = 0) -> np.ndarray:
 def table() -> lookup.Lookup:
     """Return the lookup of a kaleidoscope whose views are 176x176."""
     return lookup.build(kaleidoscope(list(layout(9)), model=MODEL, sensor=SENSOR))
-
-
-def least(work: Callable[[], object], clock=time.thread_time, repeats: int = 15) -> float:
-    """Return the least seconds that `work` took."""
-    taken = []
-    for _ in range(repeats + 1):
-        start = clock()
-        work()
-        taken.append(clock() - start)
-    return min(taken[1:])
 
 
 def splitting() -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
+from benchmarks.timing import least
 from src.recordings.formats import iter_events, write_events
 from src.sim.engines import sensor_eager
 from src.sim.sensor import EventSensor
@@ -48,16 +49,6 @@ def clip(views: int, frames: int, seed: int = 0) -> torch.Tensor:
     return (out * 255).round() / 255
 
 
-def best(call, repeats: int, clock=time.thread_time) -> float:
-    """Return the smallest time of a call in seconds."""
-    times = []
-    for _ in range(repeats):
-        start = clock()
-        call()
-        times.append(clock() - start)
-    return min(times)
-
-
 def sensors(frames: torch.Tensor, repeats: int, eager: bool) -> None:
     """Print milliseconds per interval of nine views for several sensors."""
     noisy = {"mismatch": 0.25, "leak_hz": 0.1, "shot_hz": 5.0, "cutoff_hz": 30.0}
@@ -79,15 +70,17 @@ def sensors(frames: torch.Tensor, repeats: int, eager: bool) -> None:
         sensor = EventSensor(**settings)
         rate = float(sensor.counts(frames, FPS).sum()) / frames[0, :, 0].numel() / intervals * FPS
         torch.set_num_threads(2)
-        two = best(lambda s=sensor: s.voxels(frames, FPS), repeats, time.perf_counter)
+        two = least(lambda s=sensor: s.voxels(frames, FPS), time.perf_counter, repeats)
         torch.set_num_threads(1)
-        one = best(lambda s=sensor: s.voxels(frames, FPS), repeats)
+        one = least(lambda s=sensor: s.voxels(frames, FPS), repeats=repeats)
         slow = float("nan")
         if eager:
             few = frames[:, :, :4].contiguous()
             job = sensor._job(few, FPS, None, 1)
             grids = torch.empty(1, 9, 3, 5, SIDE, SIDE)
-            slow = best(lambda j=job, g=grids: sensor_eager.voxels(j, g), 2) / 3 * intervals
+            slow = (
+                least(lambda j=job, g=grids: sensor_eager.voxels(j, g), repeats=2) / 3 * intervals
+            )
         times = " ".join(f"{1e3 * t / intervals:9.2f}" for t in (one, two, slow))
         print(f"{name:26} {rate:8.1f} {times}")
 
@@ -100,11 +93,13 @@ def voxelising(repeats: int) -> None:
     x, y = g.integers(0, 1280, n).astype(np.uint16), g.integers(0, 720, n).astype(np.uint16)
     p = g.choice(np.array([-1, 1], np.int8), n)
     size = {"bins": 5, "height": 720, "width": 1280}
-    seconds = best(lambda: voxel_grid(t, x, y, p, t0=0, t1=100_000, **size), repeats)
+    seconds = least(lambda: voxel_grid(t, x, y, p, t0=0, t1=100_000, **size), repeats=repeats)
     print(f"list to voxel grid, 1280x720, scattered: {n / seconds / 1e6:.0f} Mev/s")
     near_x, near_y = (x % 256).astype(np.uint16), (y % 256).astype(np.uint16)
     small = {"bins": 5, "height": 256, "width": 256}
-    seconds = best(lambda: voxel_grid(t, near_x, near_y, p, t0=0, t1=100_000, **small), repeats)
+    seconds = least(
+        lambda: voxel_grid(t, near_x, near_y, p, t0=0, t1=100_000, **small), repeats=repeats
+    )
     print(f"list to voxel grid, 256x256, scattered: {n / seconds / 1e6:.0f} Mev/s")
     files(repeats)
 
@@ -126,8 +121,8 @@ def files(repeats: int) -> None:
                 columns = (part[name] for name in "txyp")
                 voxel_grid(*columns, **ends, bins=5, height=SIDE, width=SIDE)
 
-        whole = best(read, max(3, repeats // 4))
-        only = best(lambda: sum(map(len, iter_events(path))), max(3, repeats // 4))
+        whole = least(read, repeats=max(3, repeats // 4))
+        only = least(lambda: sum(map(len, iter_events(path))), repeats=max(3, repeats // 4))
     n = len(events)
     print(f"EVT3 file of {n} events: read {n / only / 1e6:.0f} Mev/s, to voxel windows", end=" ")
     print(f"{n / whole / 1e6:.0f} Mev/s")

@@ -15,6 +15,7 @@ from dataclasses import replace
 import torch
 from torch import nn
 
+from benchmarks.timing import least
 from src.sim.atmosphere import Atmosphere
 from src.sim.turbulence import Turbulence
 
@@ -27,16 +28,6 @@ def at(d_over_r0: float, pixel: float = 0.04) -> Turbulence:
     distance = pixel * CAMERA.aperture_m**2 / CAMERA.wavelength_m
     path = replace(CAMERA, distance_m=distance, scene_width_m=256 * pixel * CAMERA.aperture_m)
     return Turbulence(path.at(d_over_r0), views=9, height=256, width=256)
-
-
-def least(work: Callable[[], object], clock=time.perf_counter, repeats: int = 8) -> float:
-    """Return the least seconds that `work` took."""
-    taken = []
-    for _ in range(repeats + 1):
-        start = clock()
-        work()
-        taken.append(clock() - start)
-    return min(taken[1:])
 
 
 def naive() -> Callable[[], object]:
@@ -76,7 +67,7 @@ def rows(reference: float) -> None:
                 def work(run=turbulence, crop=crop):
                     return run.degrade(frames, torch.Generator().manual_seed(0), crop=crop)
 
-                real = least(work)
+                real = least(work, time.perf_counter, 8)
                 print(
                     f"pixel {pixel} D, D/r0 {strength}, {side}x{side}: {1e3 * real:.1f} ms real, "
                     f"{reference / real:.0f} times faster than naive at 256x256"
@@ -93,15 +84,15 @@ def one_thread() -> None:
         def work(run=turbulence):
             return run.degrade(frames, torch.Generator().manual_seed(0))
 
-        print(f"D/r0 {strength}, 256x256: {1e3 * least(work, time.thread_time):.0f} ms thread")
+        print(f"D/r0 {strength}, 256x256: {1e3 * least(work):.0f} ms thread")
     turbulence = at(4.0, 0.0156)
 
     def train():
         return turbulence.degrade(clip, torch.Generator().manual_seed(0), crop=(70, 70, 112, 112))
 
-    seconds = least(train, time.thread_time, 2)
+    seconds = least(train, repeats=2)
     print(f"33 frames of nine 112x112 views, D/r0 4, pixel 0.0156 D: {seconds:.2f} s thread")
-    start = least(lambda: at(2.0), time.thread_time)
+    start = least(lambda: at(2.0))
     print(f"choice of fidelity: {1e3 * start:.1f} ms thread")
 
 
@@ -113,11 +104,12 @@ def cuda() -> None:
         turbulence.degrade(frames, torch.Generator().manual_seed(0))
         torch.cuda.synchronize()
 
-    print(f"CUDA: {9 * 32 / least(work):.0f} view-frames per second at 256x256, D/r0 = 2")
+    rate = 9 * 32 / least(work, time.perf_counter, 8)
+    print(f"CUDA: {rate:.0f} view-frames per second at 256x256, D/r0 = 2")
 
 
 if __name__ == "__main__":
-    reference = 9 * least(naive(), repeats=2)
+    reference = 9 * least(naive(), time.perf_counter, 2)
     print(f"naive, nine views of 256x256, phase given: {1e3 * reference:.0f} ms real")
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     rows(reference)
