@@ -1,0 +1,242 @@
+"""SetNet, ours: frames from any number of views, at any rate, at a fraction of E2VID's cost.
+
+All of it is here.  Views come in as a set: a view's kernel follows from its position, so the first
+layer is a stack of views with weights made for whoever is there; the spread across views says where
+they agree.  Leaky sums of events give the network a memory from its first step.  Time passes in
+seconds, not in windows, and only where events come: every decay and every update is raised to the
+power of the time that passed, so that one set of weights serves 120 and 12,000 windows a second,
+and a picture without events stays.
+
+half resolution: stem -> quarter: GRU -> eighth: GRU, residual block -> up, up -> pixel shuffle.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from src.models.layers import ResidualBlock, pad_to_multiple
+from src.sim.optics import layout
+
+SIZES = {  # multiply-accumulates at 176 x 176 with nine views: 0.4, 0.8 and 3 G
+    "small": {"stem": 12, "channels": 32},
+    "medium": {"stem": 16, "channels": 48},
+    "large": {"stem": 32, "channels": 96},
+}
+MEMORIES_S = (0.05, 0.5)  # time constants of the leaky sums
+AWAKE_S = 0.025  # time constant by which a block falls asleep after its last event
+RATE = 120.0  # windows a second at which an update gate is taken as it is
+MAX_VIEWS = 25
+
+Position = tuple[int, int]
+State = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+
+
+class SetNet(nn.Module):
+    """Voxel grids of 1 to 25 views to frames in [0, 1], window by window.
+
+    `stem`: channels at half resolution.  `channels`: at a quarter, doubled at an eighth.  The order
+    of the views is free but the same in all windows of a sequence.
+    """
+
+    views = None
+
+    def __init__(self, bins: int = 5, stem: int = 12, channels: int = 32):
+        super().__init__()
+        self.bins = bins
+        memories = len(MEMORIES_S)
+        self.voxel_stem = ViewConv(bins, stem, 5, stride=2)
+        self.sum_stem = ViewConv(memories, stem, 3)
+        self.spread_stem = nn.Conv2d(memories, stem, 3, padding=1, bias=False)
+        self.down4 = nn.Conv2d(stem, channels, 3, 2, padding=1)
+        self.cell4 = PacedGRU(channels)
+        self.down8 = nn.Conv2d(channels, 2 * channels, 3, 2, padding=1)
+        self.cell8 = PacedGRU(2 * channels)
+        self.block8 = ResidualBlock(2 * channels)
+        self.up4 = nn.Conv2d(2 * channels, channels, 1)
+        self.mix4 = nn.Conv2d(channels, channels, 3, padding=1)
+        self.up2 = nn.Conv2d(channels, stem, 1)
+        self.mix2 = nn.Conv2d(stem, stem, 3, padding=1)
+        self.shuffle = nn.Conv2d(stem, 4, 3, padding=1)
+        # What is drawn without any learning: the leaky sums themselves.
+        self.skip = nn.Parameter(torch.full((memories,), 0.15))
+
+    @classmethod
+    def preset(cls, size: str, bins: int = 5) -> "SetNet":
+        """Return the network of a `size`: small, medium or large; ValueError for another."""
+        if size not in SIZES:
+            raise ValueError(f"model.size must be one of {', '.join(SIZES)}, got {size}")
+        return cls(bins, **SIZES[size])
+
+    def forward(
+        self,
+        voxels: Float[Tensor, "n views bins h w"],
+        state: State | None = None,
+        *,
+        window_s: float | Tensor = 1 / RATE,
+        positions: Sequence[Position] | None = None,
+    ) -> tuple[Float[Tensor, "n 1 h w"], State]:
+        """Return the frame at the end of the window, float32, and the state.
+
+        `window_s`: how long the window lasts, in seconds, a number or one per clip (n,).
+        `positions`: (row, col) of each view from the centre view; default: `optics.layout`.
+        State, float32: leaky sums of the mean view and of each view (half resolution), how awake
+        each block of 8 x 8 is, and two maps in [-1, 1].  Raises ValueError for bins, a number of
+        views, a length of window or a state that do not fit.
+        """
+        n, views, bins, height, width = voxels.shape
+        places = self._places(views, bins, positions)
+        seconds = _seconds(window_s, voxels)
+        padded, (top, left) = pad_to_multiple(voxels.flatten(0, 1), 8)
+        voxels = padded.unflatten(0, (n, views))
+        events = voxels.float().sum(2)
+        coarse = _halved(events)
+        mean_sums, sums, awake, hidden4, hidden8 = self._start(state, coarse)
+
+        awake, passed = _time(_stirred(coarse), awake, seconds)
+        keep = torch.cat([torch.exp(-passed / memory) for memory in MEMORIES_S], 1)
+        sums = _grown(keep, 4)[:, None] * sums + coarse[:, :, None]
+        mean_sums = _grown(keep, 8) * mean_sums + events.mean(1, keepdim=True)
+        spread = (sums - sums.mean(1, keepdim=True)).abs().mean(1)
+
+        stem = self.voxel_stem(voxels, places) + self.sum_stem(sums, places)
+        stem = (stem + self.spread_stem(spread.to(stem.dtype))).relu()
+        pace = RATE * passed
+        hidden4 = self.cell4(self.down4(stem).relu(), hidden4, _grown(pace, 2))
+        after4 = hidden4.to(stem.dtype)
+        hidden8 = self.cell8(self.down8(after4).relu(), hidden8, pace)
+        x = self.block8(hidden8.to(stem.dtype))
+        x = self.mix4((_grown(self.up4(x), 2) + after4).relu()).relu()
+        x = self.mix2((_grown(self.up2(x), 2) + stem).relu()).relu()
+        x = functional.pixel_shuffle(self.shuffle(x), 2).float()
+        frame = (x + (self.skip[:, None, None] * mean_sums).sum(1, keepdim=True)).sigmoid()
+        state = (mean_sums, sums, awake, hidden4, hidden8)
+        return frame[..., top : top + height, left : left + width].float(), state
+
+    def _places(self, views: int, bins: int, positions: Sequence[Position] | None) -> Tensor:
+        if bins != self.bins:
+            raise ValueError(f"bins must be {self.bins} for this network, got {bins}")
+        if not 1 <= views <= MAX_VIEWS:
+            raise ValueError(f"optics.views must be in 1..{MAX_VIEWS}, got {views}")
+        positions = layout(views) if positions is None else positions
+        if len(positions) != views:
+            raise ValueError(f"optics.positions must be {views} (row, col), got {positions}")
+        return torch.tensor([list(p) for p in positions], device=self.skip.device).float()
+
+    def _start(self, state: State | None, coarse: Tensor) -> State:
+        """Return `state`, or zeros of the right sizes; ValueError when they are not right."""
+        n, views, h2, w2 = coarse.shape
+        channels, memories = self.up4.out_channels, len(MEMORIES_S)
+        sizes = [
+            (n, memories, 2 * h2, 2 * w2),
+            (n, views, memories, h2, w2),
+            (n, 1, h2 // 4, w2 // 4),
+            (n, channels, h2 // 2, w2 // 2),
+            (n, 2 * channels, h2 // 4, w2 // 4),
+        ]
+        if state is None:
+            return tuple(coarse.new_zeros(size) for size in sizes)
+        found = [tuple(part.shape) for part in state]
+        if found != sizes:
+            raise ValueError(f"state must have sizes {sizes} for these voxels, got {found}")
+        return state
+
+
+class ViewConv(nn.Module):
+    """A convolution over a set of views, averaged; a view's kernel depends on where it stands.
+
+    kernel(place) = shared + sum over ranks of code(place) * kernels: with as many ranks as views
+    it is an ordinary convolution of stacked views.
+    """
+
+    def __init__(
+        self, inputs: int, outputs: int, kernel_size: int, stride: int = 1, ranks: int = 5
+    ):
+        super().__init__()
+        self.stride, self.padding = stride, kernel_size // 2
+        shape = ((ranks + 1) * outputs, inputs, kernel_size, kernel_size)
+        bound = 1 / math.sqrt(inputs * kernel_size**2)
+        self.kernels = nn.Parameter(torch.empty(shape).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.zeros(outputs))
+        self.code = nn.Sequential(nn.Linear(3, 16), nn.Tanh(), nn.Linear(16, ranks))
+
+    def forward(
+        self, x: Float[Tensor, "n views c h w"], places: Float[Tensor, "views 2"]
+    ) -> Float[Tensor, "n outputs h2 w2"]:
+        """Return one map for all views."""
+        views = len(places)
+        # Positions and the number of views, in units that keep the codes apart.
+        known = torch.cat([places, torch.full_like(places[:, :1], 3 / views)], 1)
+        code = self.code(known.to(self.bias.dtype))
+        code = torch.cat([torch.ones_like(code[:, :1]), code], 1) / views
+        kernels = self.kernels.unflatten(0, (code.shape[1], -1))
+        kernel = torch.einsum("vr,roikl->ovikl", code, kernels).flatten(1, 2)
+        stacked = x.flatten(1, 2).to(self.bias.dtype)
+        return functional.conv2d(stacked, kernel, self.bias, self.stride, self.padding)
+
+
+class PacedGRU(nn.Module):
+    """A ConvGRU (Ballas et al. 2016) in continuous time.
+
+    Of the old state (1 - u) ** pace is left, u the update gate: two windows of half the length do
+    what one does, and no pace changes nothing.  A convex mix with a tanh stays within [-1, 1].
+    """
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.gates = nn.Conv2d(2 * channels, 2 * channels, 3, padding=1)
+        self.candidate = nn.Conv2d(2 * channels, channels, 3, padding=1)
+        # Update gates from 0.05 to 0.5: memories of two to twenty windows from the start.
+        with torch.no_grad():
+            self.gates.bias[channels:].copy_(torch.linspace(-3, 0, channels))
+
+    def forward(
+        self,
+        x: Float[Tensor, "n c h w"],
+        state: Float[Tensor, "n c h w"],
+        pace: Float[Tensor, "n 1 h w"],
+    ) -> Float[Tensor, "n c h w"]:
+        """Return the new state, float32; `pace` is the time passed, in windows at 120 a second."""
+        before = state.to(x.dtype)
+        reset, update = self.gates(torch.cat([x, before], 1)).chunk(2, 1)
+        candidate = self.candidate(torch.cat([x, reset.sigmoid() * before], 1)).float().tanh()
+        # (1 - sigmoid(update)) ** pace, without the infinite slope that a power has at zero.
+        keep = torch.exp(-pace * functional.softplus(update.float()))
+        return torch.lerp(candidate, state, keep)
+
+
+def _seconds(window_s: float | Tensor, voxels: Tensor) -> Tensor:
+    """Return the length of the window as (n or 1, 1, 1, 1)."""
+    if isinstance(window_s, Tensor):
+        return window_s.to(voxels.device).float().view(-1, 1, 1, 1)
+    if not 0 < window_s < math.inf:
+        raise ValueError(f"window_s must be > 0 seconds, got {window_s}")
+    return torch.full((1, 1, 1, 1), window_s, device=voxels.device)
+
+
+def _time(stirred: Tensor, awake: Tensor, seconds: Tensor) -> tuple[Tensor, Tensor]:
+    """Return how awake each block is after the window and the time that passed there, in seconds:
+    all of it with events, without any the integral of falling asleep.
+    """
+    left = torch.exp(-seconds / AWAKE_S)
+    passed = torch.where(stirred, seconds, awake * AWAKE_S * (1 - left))
+    return torch.where(stirred, 1.0, awake * left), passed
+
+
+def _stirred(coarse: Float[Tensor, "n views h2 w2"]) -> Bool[Tensor, "n 1 h8 w8"]:
+    """Return which blocks of 8 x 8 pixels have an event in them or within four pixels around."""
+    seen = coarse.abs().amax(1, keepdim=True)
+    return functional.max_pool2d(seen, 8, 4, padding=2) > 0
+
+
+def _halved(x: Tensor) -> Tensor:
+    """Return the sums of blocks of 2 x 2, several times faster than avg_pool2d on a CPU."""
+    rows = x[..., ::2, :] + x[..., 1::2, :]
+    return rows[..., ::2] + rows[..., 1::2]
+
+
+def _grown(x: Tensor, times: int) -> Tensor:
+    return functional.interpolate(x, scale_factor=times, mode="nearest")

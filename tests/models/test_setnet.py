@@ -1,0 +1,209 @@
+"""SetNet: any views in any order, time in seconds, a state that holds and never runs away."""
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from src.build import make
+from src.models import load, save
+from src.models.cost import macs_per_frame
+from src.models.setnet import SIZES, PacedGRU, SetNet
+from src.models.unroll import unroll
+from src.sim.optics import layout
+from tests.conftest import ROOT
+
+
+def small() -> SetNet:
+    torch.manual_seed(0)
+    return SetNet(bins=3, stem=4, channels=4)
+
+
+def voxels(n: int = 1, windows: int = 4, views: int = 9, side: int = 16) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(1)
+    return torch.randn(n, windows, views, 3, side, side, generator=generator)
+
+
+@pytest.mark.parametrize(("size", "giga"), [("small", 0.42), ("medium", 0.82), ("large", 2.96)])
+def test_cost_and_config_of_each_size(size, giga):
+    network = SetNet.preset(size)
+    assert abs(macs_per_frame(network, 176, 176, views=9) / 1e9 - giga) < 0.02
+    node = OmegaConf.load(ROOT / "conf" / "model" / f"setnet_{size}.yaml")
+    assert {name: node[name] for name in SIZES[size]} == SIZES[size]
+    assert isinstance(make(OmegaConf.merge(node, {"bins": 5})), SetNet)
+
+
+@pytest.mark.parametrize("views", [1, 2, 3, 4, 5, 9, 16, 25])
+@torch.no_grad()
+def test_any_number_of_views_and_any_size(views):
+    frame, state = small()(voxels(2, 1, views, 19)[:, 0], None)
+    assert frame.shape == (2, 1, 19, 19) and 0 <= float(frame.min()) <= float(frame.max()) <= 1
+    assert len(state) == 5
+
+
+@torch.no_grad()
+def test_every_number_up_to_25_with_positions():
+    network, places = small(), layout(25)
+    for views in range(1, 26):
+        network(voxels(1, 1, views)[:, 0], None, positions=places[:views])
+
+
+@torch.no_grad()
+def test_views_come_in_any_order_with_their_positions():
+    network, order = small(), torch.randperm(9, generator=torch.Generator().manual_seed(3))
+    places = [layout(9)[i] for i in order]
+    one = two = None
+    for window in voxels().unbind(1):
+        straight, one = network(window, one)
+        shuffled, two = network(window[:, order], two, positions=places)
+    torch.testing.assert_close(straight, shuffled)
+
+
+@torch.no_grad()
+def test_positions_matter():
+    network, window = small(), voxels()[:, 0]
+    ours, _ = network(window, None)
+    turned, _ = network(window, None, positions=[(col, -row) for row, col in layout(9)])
+    assert float((ours - turned).abs().max()) > 1e-4
+
+
+@torch.no_grad()
+def test_law_6_two_chunks_equal_one():
+    whole, _ = unroll(small(), voxels())
+    first, state = unroll(small(), voxels()[:, :2])
+    second, _ = unroll(small(), voxels()[:, 2:], state)
+    assert torch.equal(whole, torch.cat([first, second], 1))
+
+
+@torch.no_grad()
+def test_clips_of_a_batch_do_not_meet():
+    together, _ = unroll(small(), voxels(2))
+    alone, _ = unroll(small(), voxels(2)[1:])
+    torch.testing.assert_close(together[1:], alone)
+
+
+@torch.no_grad()
+def test_state_stays_bounded_over_500_windows_of_noise():
+    network, state = small(), None
+    for step in range(500):
+        noise = torch.randn(1, 2, 3, 16, 16, generator=torch.Generator().manual_seed(step))
+        frame, state = network(30 * noise + 10, state)
+    *sums, awake, hidden4, hidden8 = state
+    assert max(float(h.abs().max()) for h in (awake, hidden4, hidden8)) <= 1
+    assert torch.isfinite(frame).all()
+    # A leaky sum is at most what comes in a window divided by what leaks out of it.
+    assert max(float(s.abs().max()) for s in sums) < 4 * 3 * (10 + 30 * 6) / (1 - 0.984)
+
+
+@torch.no_grad()
+def test_empty_windows_hold_the_picture():
+    network = small()
+    _, state = unroll(network, voxels())
+    nothing, frames = torch.zeros(1, 9, 3, 16, 16), []
+    for _ in range(1000):
+        frame, state = network(nothing, state)
+        frames.append(frame)
+    assert torch.equal(frames[499], frames[-1])
+    assert float((frames[60] - frames[-1]).abs().max()) < 1e-3
+    assert float(frames[-1].std()) > 1e-3
+
+
+@torch.no_grad()
+def test_nothing_happens_before_the_first_event():
+    _, state = small()(torch.zeros(1, 9, 3, 16, 16), None)
+    assert all(float(part.abs().max()) == 0 for part in state)
+
+
+@torch.no_grad()
+def test_a_window_cut_in_ten_passes_the_same_time():
+    cell = PacedGRU(4).eval()
+    x, state = torch.zeros(1, 4, 8, 8), torch.rand(1, 4, 8, 8)
+    cell.gates.weight.zero_(), cell.candidate.weight.zero_()  # gates do not see the state
+    whole = cell(x, state, torch.ones(1, 1, 8, 8))
+    for _ in range(10):
+        state = cell(x, state, torch.full((1, 1, 8, 8), 0.1))
+    torch.testing.assert_close(state, whole)
+
+
+@torch.no_grad()
+def test_an_empty_window_cut_in_pieces_passes_the_same_time():
+    network, events = small(), voxels(windows=1)[:, 0]
+    nothing = torch.zeros_like(events)
+    _, whole = network(events, None)
+    pieces = whole
+    _, whole = network(nothing, whole, window_s=0.1)
+    for _ in range(100):
+        _, pieces = network(nothing, pieces, window_s=1e-3)
+    for one, other in zip(whole[:3], pieces[:3], strict=True):  # sums and wakefulness
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+
+
+@torch.no_grad()
+def test_window_length_per_clip():
+    network, both = small(), voxels(2)[:, 0]
+    frame, _ = network(both, None, window_s=torch.tensor([1 / 120, 1 / 600]))
+    alone, _ = network(both[1:], None, window_s=1 / 600)
+    torch.testing.assert_close(frame[1:], alone)
+
+
+def test_gradients_reach_every_parameter():
+    network = small()
+    frames, _ = unroll(network, voxels())
+    (frames * torch.randn_like(frames)).sum().backward()
+    assert all(float(p.grad.abs().sum()) > 0 for p in network.parameters())
+
+
+def test_it_can_learn_one_batch_by_heart():
+    network, windows = small(), voxels(2, views=2)
+    target = torch.rand(8, 1, 16, 16, generator=torch.Generator().manual_seed(2))
+    target = torch.nn.functional.avg_pool2d(target, 5, 1, 2).view(2, 4, 1, 16, 16)
+    optimizer = torch.optim.Adam(network.parameters(), 1e-2)
+    losses = []
+    for _ in range(100):
+        frames, _ = unroll(network, windows)
+        loss = (frames - target).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < 0.25 * losses[0]
+
+
+@torch.no_grad()
+def test_bf16_and_channels_last_keep_the_state_in_float32():
+    network = small().bfloat16().to(memory_format=torch.channels_last)
+    reference, _ = unroll(small(), voxels())
+    frames, state = unroll(network, voxels())
+    assert {part.dtype for part in state} == {torch.float32} and frames.dtype == torch.float32
+    assert float((frames - reference).abs().max()) < 0.03
+
+
+def test_the_file_gives_the_network_back(tmp_path):
+    spec = {"target": "src.models.setnet.SetNet", "kwargs": {"bins": 3, "stem": 4, "channels": 4}}
+    save(tmp_path / "net.safetensors", small(), spec, {})
+    again = load(tmp_path / "net.safetensors")
+    assert again.views is None
+    torch.testing.assert_close(
+        again(voxels()[:, 0], None)[0], small()(voxels()[:, 0], None)[0], atol=2e-3, rtol=0
+    )
+
+
+@pytest.mark.parametrize(
+    ("shape", "options", "message"),
+    [
+        ((1, 9, 5, 16, 16), {}, "bins must be 3"),
+        ((1, 26, 3, 16, 16), {}, "optics.views must be in 1..25"),
+        ((1, 7, 3, 16, 16), {}, "optics.views must be"),
+        ((1, 9, 3, 16, 16), {"positions": [(0, 0)]}, "optics.positions must be 9"),
+        ((1, 9, 3, 16, 16), {"window_s": 0.0}, "window_s must be > 0"),
+    ],
+)
+def test_bad_input_names_its_key(shape, options, message):
+    with pytest.raises(ValueError, match=message):
+        small()(torch.zeros(shape), None, **options)
+
+
+def test_a_state_of_another_size_is_refused():
+    network = small()
+    _, state = network(voxels()[:, 0], None)
+    with pytest.raises(ValueError, match="state must have sizes"):
+        network(voxels(side=24)[:, 0], state)
