@@ -14,6 +14,8 @@ from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from src.metrics.image import ssim
+
 CACHE = Path(__file__).resolve().parents[2] / ".cache" / "lpips"
 HUB = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
 PATIENCE_S = 20.0  # with a server that does not answer
@@ -91,22 +93,30 @@ class LPIPS(nn.Module):
 
 
 class AnchoredLPIPS(LPIPS):
-    """A training loss: LPIPS plus `l1` times the mean absolute error, which anchors brightness and
-    gives short trainings a direction (Lou et al., arXiv 2505.16797, use 1).
+    """A training loss: LPIPS + `l1` times the mean absolute error, which anchors brightness, +
+    `ssim` times (1 - SSIM), which anchors structure (Zhao et al., IEEE TCI 2017).
+
+    For short trainings, which LPIPS alone gives too little direction.
     """
 
-    def __init__(self, net: str = "alex", backbone: str | None = None, l1: float = 1.0):
+    def __init__(
+        self, net: str = "alex", backbone: str | None = None, l1: float = 1.0, ssim: float = 1.0
+    ):
         super().__init__(net, backbone)
-        if not 0 <= l1 < float("inf"):
-            raise ValueError(f"loss.l1 must be >= 0, got {l1}")
-        self.l1 = l1
+        for name, weight in (("l1", l1), ("ssim", ssim)):
+            if not 0 <= weight < float("inf"):
+                raise ValueError(f"loss.{name} must be >= 0, got {weight}")
+        self.weights = {"l1": l1, "ssim": ssim}
 
     def forward(
         self, prediction: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"]
     ) -> Float[Tensor, " n"]:
         """Return the loss of each pair."""
+        prediction = prediction.float()
         error = (prediction - target).abs().mean((1, 2, 3))
-        return super().forward(prediction, target) + self.l1 * error
+        structure = 1 - ssim(prediction, target)
+        anchors = self.weights["l1"] * error + self.weights["ssim"] * structure
+        return super().forward(prediction, target) + anchors
 
 
 def _unit(features: Tensor) -> Tensor:
