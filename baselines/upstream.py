@@ -3,10 +3,12 @@
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from baselines.cista import CISTA
 from baselines.e2vid_plus import E2VIDPlus
 from baselines.firenet import FireNet
 from baselines.pickles import read
@@ -34,27 +36,61 @@ FIRENET_PLUS = (
     (r"^cells\.1\.", "G2."),
     (r"^resblocks\.1\.", "R2."),
 )
+CISTA_TC = (
+    (r"^events\.", "We.conv2d."),
+    (r"^previous\.", "Wi.conv2d."),
+    (r"^mix\.", "W0.conv2d."),
+    (r"^code\.", "P0.conv2d."),
+    (r"^steps\.(\d)\.threshold", r"lista_blocks.\1.Lambda"),
+    (r"^steps\.(\d)\.synthesis\.", r"lista_blocks.\1.D.conv2d."),
+    (r"^steps\.(\d)\.analysis\.", r"lista_blocks.\1.P.conv2d."),
+    (r"^agree_before\.", "one_conv_for_prev.conv2d."),
+    (r"^agree_now\.", "one_conv_for_cur.conv2d."),
+    (r"^pulls\.", "alpha."),
+    (r"^decoder\.", "Dg.conv.conv2d."),
+    (r"^cell\.gates\.", "Dg.recurrent_block.Gates."),
+    (r"^up\.", "upsamp_conv.conv2d."),
+    (r"^pred\.", "final_conv.conv2d."),
+)
+
+
+class Published(NamedTuple):
+    """A published network: class, what its authors do before and after it, names, and where its
+    sizes are read: the outputs of the convolution `first` are the argument `width`.
+    """
+
+    kind: type
+    how: dict
+    rules: tuple
+    first: str
+    width: str
+
+
+NORMALISED, RAW = {"normalise": "nonzero"}, {"normalise": "none", "output": "clip"}
 NETWORKS = {
-    "e2vid": (E2VIDPlus, {"normalise": "nonzero", "output": "sigmoid"}, UNET),
-    "e2vid_plus": (E2VIDPlus, {"normalise": "none", "output": "clip"}, UNET),
-    "firenet": (FireNet, {"normalise": "nonzero", "output": "none"}, FIRENET),
-    "firenet_plus": (FireNet, {"normalise": "none", "output": "clip"}, FIRENET_PLUS),
+    "e2vid": Published(
+        E2VIDPlus, NORMALISED | {"output": "sigmoid"}, UNET, "net.head", "base_channels"
+    ),
+    "e2vid_plus": Published(E2VIDPlus, RAW, UNET, "net.head", "base_channels"),
+    "firenet": Published(FireNet, NORMALISED | {"output": "none"}, FIRENET, "head", "channels"),
+    "firenet_plus": Published(FireNet, RAW, FIRENET_PLUS, "head", "channels"),
+    "cista": Published(CISTA, NORMALISED | {"output": "sigmoid"}, CISTA_TC, "events", "channels"),
 }
 
 
 def load(name: str, checkpoint: str | Path | Mapping[str, Tensor]) -> nn.Module:
     """Return the published network `name`, frozen and in eval mode.
 
-    `checkpoint`: a path, or a state dict with the published names.  `name`: e2vid, e2vid_plus,
-    firenet or firenet_plus.  Width and bins follow from the weights.  Raises ValueError with the
-    missing and extra names when the weights are another network's.
+    `checkpoint`: a path, or a state dict with the published names.  `name`: a key of NETWORKS.
+    Width and bins follow from the weights.  Raises ValueError with the missing and extra names when
+    the weights are another network's.
     """
     if name not in NETWORKS:
         raise ValueError(f"baseline.name must be one of {', '.join(NETWORKS)}, got {name}")
-    kind, how, rules = NETWORKS[name]
+    kind, how, rules, first, width = NETWORKS[name]
     weights = _state_dict(checkpoint)
-    head = weights.get(_rename("net.head.weight" if rules is UNET else "head.weight", rules))
-    sizes = {} if head is None else {"bins": head.shape[1], _width(kind): head.shape[0]}
+    head = weights.get(_rename(f"{first}.weight", rules))
+    sizes = {} if head is None else {"bins": head.shape[1], width: head.shape[0]}
     network = kind(**sizes, **how)
     names = {ours: _rename(ours, rules) for ours in network.state_dict()}
     _check(name, names, weights, network.state_dict())
@@ -69,7 +105,7 @@ def from_config(name: str, weights: str) -> nn.Module:
 
 def export(name: str, network: nn.Module) -> dict[str, Tensor]:
     """Return the weights of `network` under published names, spectral norm folded."""
-    rules = NETWORKS[name][2]
+    rules = NETWORKS[name].rules
     return {_rename(ours, rules): value for ours, value in folded(network).items()}
 
 
@@ -79,10 +115,6 @@ def widen(head: Tensor, views: int) -> Tensor:
     Equal views then give what one view gave.
     """
     return head.repeat(1, views, 1, 1) / views
-
-
-def _width(kind: type) -> str:
-    return "channels" if kind is FireNet else "base_channels"
 
 
 def _rename(ours: str, rules: tuple) -> str:

@@ -28,9 +28,9 @@ class ConvLSTM(nn.Module):
     Gate order along the channels: input, forget, output, candidate.
     """
 
-    def __init__(self, channels: int):
+    def __init__(self, channels: int, padding_mode: str = "zeros"):
         super().__init__()
-        self.gates = nn.Conv2d(2 * channels, 4 * channels, 3, padding=1)
+        self.gates = nn.Conv2d(2 * channels, 4 * channels, 3, padding=1, padding_mode=padding_mode)
 
     def forward(
         self, x: Float[Tensor, "n c h w"], state: tuple[Tensor, Tensor] | None

@@ -11,6 +11,7 @@ from PIL import Image
 from scipy import ndimage
 
 from baselines import upstream
+from baselines.cista import CISTA
 from baselines.e2vid_plus import E2VIDPlus
 from baselines.firenet import FireNet
 from src.build import make
@@ -21,6 +22,7 @@ CONFIGS = ROOT / "conf" / "baseline"
 FILES = {
     "firenet": "FireNet/firenet_state_dict.pth",
     "firenet_plus": "FireNet+/firenet_plus_state_dict.pth",
+    "cista": "CISTA-TC/cista-tc.pth.tar",
 }
 
 
@@ -53,7 +55,8 @@ def slider(shared_data):
 
 
 @pytest.mark.parametrize(
-    ("name", "pixels", "gradients"), [("firenet", 0.601, 0.406), ("firenet_plus", 0.421, 0.328)]
+    ("name", "pixels", "gradients"),
+    [("firenet", 0.601, 0.406), ("firenet_plus", 0.421, 0.328), ("cista", 0.717, 0.493)],
 )
 def test_published_weights_reach_the_published_correlation(
     shared_data, slider, name, pixels, gradients
@@ -72,15 +75,19 @@ def test_published_weights_reach_the_published_correlation(
     assert np.corrcoef(*steep)[0, 1] == pytest.approx(gradients, abs=0.01)
 
 
+def small(name: str) -> torch.nn.Module:
+    known = upstream.NETWORKS[name]
+    return known.kind(**known.how, **{known.width: 8})
+
+
 def test_parameter_counts():
-    count = {k: sum(p.numel() for p in k().parameters()) for k in (FireNet, E2VIDPlus)}
-    assert count == {FireNet: 37_777, E2VIDPlus: 10_710_401}
+    published = {FireNet: 37_777, E2VIDPlus: 10_710_401, CISTA: 1_260_867}
+    assert {kind: sum(p.numel() for p in kind().parameters()) for kind in published} == published
 
 
 @pytest.mark.parametrize("name", list(upstream.NETWORKS))
 def test_names_round_trip(name, tmp_path):
-    kind, how, _ = upstream.NETWORKS[name]
-    network = kind(**how, **{upstream._width(kind): 8}).eval()
+    network = small(name).eval()
     published = upstream.export(name, network)
     path = tmp_path / "published.pth"
     torch.save({"state_dict": published, "config": Config()}, path)
@@ -121,9 +128,8 @@ def test_a_pickle_that_wants_to_run_code_is_refused(tmp_path):
 
 @pytest.mark.parametrize("name", list(upstream.NETWORKS))
 def test_every_published_network_has_a_config(name, tmp_path):
-    kind, how, _ = upstream.NETWORKS[name]
     path = tmp_path / "published.pth"
-    torch.save(upstream.export(name, kind(**how, **{upstream._width(kind): 8})), path)
+    torch.save(upstream.export(name, small(name)), path)
     node = OmegaConf.load(CONFIGS / f"{name}.yaml")
     node.weights = str(path)
-    assert make(node).normalise == how["normalise"]
+    assert make(node).normalise == upstream.NETWORKS[name].how["normalise"]

@@ -1,0 +1,98 @@
+"""CISTA-TC (Liu & Dragotti, ICASSP 2022): sparse codes of events, by unfolded shrinkage steps.
+
+Events and the previous frame are measurements x of a code z at half resolution; each step takes
+z to shrink(z + P(x - D z) + pull), the pull being towards the code of the window before, where both
+codes agree.  A recurrent decoder turns the code into a frame.  All 3x3 with reflected borders.
+"""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from baselines.centre import centre_view, declare, finish
+from src.models.layers import ConvLSTM, pad_to_multiple
+
+
+class CISTA(nn.Module):
+    """The centre view's voxel grids to frames; 1,260,867 parameters.
+
+    `channels`: of each of the two stems (published: 32); the code has four times as many.
+    `steps`: unfolded shrinkage steps (published: 5, all with the same weights).  As published:
+    normalise nonzero, output sigmoid.
+    """
+
+    views = None
+
+    def __init__(
+        self,
+        bins: int = 5,
+        channels: int = 32,
+        steps: int = 5,
+        normalise: str = "nonzero",
+        output: str = "sigmoid",
+    ):
+        super().__init__()
+        declare(normalise, output)
+        self.bins, self.normalise, self.output = bins, normalise, output
+        both, code = 2 * channels, 4 * channels
+        self.events, self.previous = _conv(bins, channels), _conv(1, channels)
+        self.mix = _conv(both, both, stride=2)
+        self.code = _conv(both, code)
+        self.steps = nn.ModuleList(Step(both, code) for _ in range(steps))
+        self.agree_before, self.agree_now = _conv(code, 1), _conv(code, 1)
+        self.pulls = nn.ParameterList(1e-3 * torch.rand(1, code, 1, 1) for _ in range(steps))
+        self.decoder = _conv(code, both)
+        self.cell = ConvLSTM(both, padding_mode="reflect")
+        self.up = _conv(both, both)
+        self.pred = _conv(both, 1)
+
+    def forward(
+        self, voxels: Float[Tensor, "n views bins h w"], state: Any = None
+    ) -> tuple[Float[Tensor, "n 1 h w"], Any]:
+        """Return the frame and (code, state of the decoder, frame before cropping)."""
+        height, width = voxels.shape[-2:]
+        view = centre_view(voxels, self.bins, self.normalise)
+        view, (top, left) = pad_to_multiple(view, 2)
+        before, memory, frame = state or (None, None, torch.zeros_like(view[:, :1]))
+        x = self.mix(torch.cat([self.events(view), self.previous(frame)], 1))
+        z = self._unfold(x, before)
+        hidden, memory = self.cell(self.decoder(z).relu(), memory)
+        grown = functional.interpolate(hidden, scale_factor=2, mode="bilinear")
+        frame = finish(self.pred(self.up(grown)), self.output, self.training)
+        shown = frame[..., top : top + height, left : left + width]
+        return shown, (z, memory, frame.detach())
+
+    def _unfold(self, x: Tensor, before: Tensor | None) -> Tensor:
+        z = self.code(x)
+        before = torch.zeros_like(z) if before is None else before
+        known = self.agree_before(before)
+        for step, pull in zip(self.steps, self.pulls, strict=True):
+            agreement = (known * self.agree_now(z)).sigmoid()
+            z = step(x, z, agreement * (before - z) * pull)
+        return z
+
+
+class Step(nn.Module):
+    """One step of iterative shrinkage with learned synthesis D, analysis P and thresholds."""
+
+    def __init__(self, features: int, code: int):
+        super().__init__()
+        self.synthesis, self.analysis = _conv(code, features), _conv(features, code)
+        self.threshold = nn.Parameter(1e-3 * torch.rand(1, code, 1, 1))
+
+    def forward(
+        self,
+        x: Float[Tensor, "n f h w"],
+        z: Float[Tensor, "n c h w"],
+        pull: Float[Tensor, "n c h w"],
+    ) -> Float[Tensor, "n c h w"]:
+        """Return the next code."""
+        z = z + self.analysis(x - self.synthesis(z)) + pull
+        return (z - self.threshold).relu() - (-z - self.threshold).relu()
+
+
+def _conv(inputs: int, outputs: int, stride: int = 1) -> nn.Conv2d:
+    return nn.Conv2d(inputs, outputs, 3, stride, padding=1, padding_mode="reflect")
