@@ -76,6 +76,8 @@ def write(run: Path, config: str, rows: list[Row], **facts) -> dict:
     write_text(run / "clips.csv", clips_csv(first.clips))
     write_text(run / "results.json", json.dumps(record, indent=2) + "\n")
     rich.print(table(rows))
+    files = sorted(str(file.relative_to(run)) for file in run.rglob("*.*") if file.is_file())
+    rich.print(f"in {run}: " + ", ".join(file for file in files if not file.startswith(".")))
     return record
 
 
