@@ -10,11 +10,13 @@ from torch import Tensor, nn
 
 from baselines.cista import CISTA
 from baselines.e2vid_plus import E2VIDPlus
+from baselines.etnet import ETNet
 from baselines.firenet import FireNet
+from baselines.hypere2vid import HyperE2VID
 from baselines.pickles import read
 from src.models.files import folded
 
-# Ours -> published, first match wins.
+# Ours -> published, one rule after the other.
 UNET = (
     (r"^net\.encoders\.(\d)\.", r"unetrecurrent.encoders.\1.conv.conv2d."),
     (r"^net\.cells\.(\d)\.gates\.", r"unetrecurrent.encoders.\1.recurrent_block.Gates."),
@@ -35,6 +37,40 @@ FIRENET_PLUS = (
     (r"^resblocks\.0\.", "R1."),
     (r"^cells\.1\.", "G2."),
     (r"^resblocks\.1\.", "R2."),
+)
+ETNET = (
+    (r"^net\.(head|pred)\.", r"\1.conv2d."),
+    (r"^net\.encoders\.(\d)\.", r"DownsampleConv.\1.conv.conv2d."),
+    (r"^net\.cells\.(\d)\.gates\.", r"DownsampleConv.\1.recurrent_block.Gates."),
+    (r"^net\.decoders\.(\d)\.", r"UpsampleConv.\1.conv2d."),
+    (r"^pyramid\.split\.0\.", "split1."),
+    (r"^pyramid\.split\.1\.", "split2."),
+    (r"\.attention\.project\.", ".self_attn.in_proj_"),
+    (r"\.attention\.out\.", ".self_attn.out_proj."),
+    (r"\.cross\.project\.", ".cross_attn.in_proj_"),
+    (r"\.cross\.out\.", ".cross_attn.out_proj."),
+    (r"\.asker_norm\.", ".norm21."),
+    (r"\.memory_norm\.", ".norm22."),
+    (r"\.mlp\.wide\.", ".linear1."),
+    (r"\.mlp\.back\.", ".linear2."),
+    (r"^(pyramid\.own\..*)\.mlp\.norm\.", r"\1.norm2."),
+    (r"^(pyramid\.across\..*)\.mlp\.norm\.", r"\1.norm3."),
+    (r"\.norm\.", ".norm1."),
+    (r"^pyramid\.own\.(\d)\.(\d)\.", r"trans_encoder\1.encoder.layers.\2."),
+    (r"^pyramid\.across\.(\d)\.(\d)\.", r"trans_decoder\1.decoder.layers.\2."),
+)
+HYPER = (
+    (r"^net\.decoders\.0\.", "unetrecurrent.decoders.1.conv2d."),
+    (r"^net\.decoders\.1\.", "unetrecurrent.decoders.2.conv2d."),
+    (r"^dynamic\.fuse\.", "unetrecurrent.decoders.0.context_fusion.conv."),
+    (r"^dynamic\.weigh\.", "unetrecurrent.decoders.0.dynamic_atom_generation.bases_net."),
+    (r"^dynamic\.functions", "unetrecurrent.decoders.0.dynamic_atom_generation.bases"),
+    (
+        r"^dynamic\.compose\.weight",
+        "unetrecurrent.decoders.0.dynamic_conv.compositional_coefficients",
+    ),
+    (r"^dynamic\.compose\.", "unetrecurrent.decoders.0.dynamic_conv."),
+    *UNET,
 )
 CISTA_TC = (
     (r"^events\.", "We.conv2d."),
@@ -74,6 +110,8 @@ NETWORKS = {
     "e2vid_plus": Published(E2VIDPlus, RAW, UNET, "net.head", "base_channels"),
     "firenet": Published(FireNet, NORMALISED | {"output": "none"}, FIRENET, "head", "channels"),
     "firenet_plus": Published(FireNet, RAW, FIRENET_PLUS, "head", "channels"),
+    "etnet": Published(ETNet, RAW | {"output": "sigmoid"}, ETNET, "net.head", "base_channels"),
+    "hypere2vid": Published(HyperE2VID, RAW, HYPER, "net.head", "base_channels"),
     "cista": Published(CISTA, NORMALISED | {"output": "sigmoid"}, CISTA_TC, "events", "channels"),
 }
 
@@ -119,8 +157,7 @@ def widen(head: Tensor, views: int) -> Tensor:
 
 def _rename(ours: str, rules: tuple) -> str:
     for pattern, published in rules:
-        if re.match(pattern, ours):
-            return re.sub(pattern, published, ours)
+        ours = re.sub(pattern, published, ours)
     return ours
 
 

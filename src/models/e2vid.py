@@ -72,6 +72,17 @@ class E2VID(nn.Module):
             wanted, got = (self.views, self.bins), tuple(voxels.shape[1:3])
             raise ValueError(f"optics.views, bins must be {wanted} for this network, got {got}")
         x, (top, left) = pad_to_multiple(voxels.flatten(1, 2), 2**SCALES)
+        head, skips, after = self.encode(x, state)
+        x = skips[-1]
+        for block in self.resblocks:
+            x = block(x)
+        frame = self.activation(self.decode(x, head, skips))
+        return frame[..., top : top + height, left : left + width], after
+
+    def encode(
+        self, x: Float[Tensor, "n c h w"], state: Any
+    ) -> tuple[Float[Tensor, "n c2 h w"], list[Tensor], tuple]:
+        """Return the head, the hidden map of each scale, finest first, and the state."""
         head = x = self.head(x).relu()
         skips, after = [], []
         for encoder, cell, before in zip(
@@ -80,13 +91,16 @@ class E2VID(nn.Module):
             x, new = cell(encoder(x).relu(), before)
             skips.append(x)
             after.append(new)
-        for block in self.resblocks:
-            x = block(x)
+        return head, skips, tuple(after)
+
+    def decode(
+        self, x: Float[Tensor, "n c h w"], head: Float[Tensor, "n c2 h2 w2"], skips: list[Tensor]
+    ) -> Float[Tensor, "n 1 h2 w2"]:
+        """Return the frame before its activation, from the coarsest map up."""
         for decoder, skip in zip(self.decoders, reversed(skips), strict=True):
             x = functional.interpolate(x + skip, scale_factor=2, mode="bilinear")
             x = decoder(x).relu()
-        frame = self.activation(self.pred(x + head))
-        return frame[..., top : top + height, left : left + width], tuple(after)
+        return self.pred(x + head)
 
 
 def _conv(inputs: int, outputs: int, kernel_size: int, stride: int = 1) -> nn.Conv2d:

@@ -1,0 +1,177 @@
+"""ET-Net (Weng et al., ICCV 2021): E2VID with transformers over three scales in its middle.
+
+The hidden maps at 1/2, 1/4 and 1/8 become equally many tokens; each scale attends to itself, then
+to the coarser one; the mean of all of them replaces the residual blocks.  Attention is fused, so
+that its maps are never stored.
+"""
+
+from itertools import pairwise
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from baselines.centre import centre_view, declare, finish
+from src.models.e2vid import E2VID, SCALES
+from src.models.layers import pad_to_multiple
+
+HEADS, DROPOUT = 8, 0.1
+
+
+class ETNet(nn.Module):
+    """The centre view's voxel grids to frames; 22,175,361 parameters.
+
+    As published: normalise none, output sigmoid.
+    """
+
+    views = None
+
+    def __init__(
+        self,
+        bins: int = 5,
+        base_channels: int = 32,
+        normalise: str = "none",
+        output: str = "sigmoid",
+    ):
+        super().__init__()
+        declare(normalise, output)
+        self.bins, self.normalise, self.output = bins, normalise, output
+        self.net = E2VID(1, bins, base_channels, final_activation="none")
+        self.net.resblocks = nn.ModuleList()
+        self.pyramid = Pyramid([base_channels * 2**scale for scale in range(SCALES, 0, -1)])
+
+    def forward(
+        self, voxels: Float[Tensor, "n views bins h w"], state: Any = None
+    ) -> tuple[Float[Tensor, "n 1 h w"], Any]:
+        """Return the frame and the state of E2VID."""
+        height, width = voxels.shape[-2:]
+        view = centre_view(voxels, self.bins, self.normalise)
+        view, (top, left) = pad_to_multiple(view, 2**SCALES)
+        head, skips, after = self.net.encode(view, state)
+        frame = self.net.decode(self.pyramid(skips[::-1]), head, skips)
+        cropped = frame[..., top : top + height, left : left + width]
+        return finish(cropped, self.output, self.training), after
+
+
+class Pyramid(nn.Module):
+    """Tokens of each scale attend to themselves and to the next coarser scale.
+
+    `widths`: channels of the maps, coarsest first; the tokens have as many as the coarsest.
+    """
+
+    def __init__(self, widths: list[int]):
+        super().__init__()
+        width = widths[0]
+        self.split = nn.ModuleList(
+            nn.Conv2d(inputs, width, 2**scale, 2**scale)
+            for scale, inputs in enumerate(widths[1:], 1)
+        )
+        self.own = nn.ModuleList(nn.ModuleList(Layer(width) for _ in range(3)) for _ in widths)
+        self.across = nn.ModuleList(
+            nn.ModuleList(CrossLayer(width) for _ in range(2)) for _ in widths
+        )
+        for parameter in self.own.parameters():
+            _xavier(parameter)
+        for parameter in self.across.parameters():
+            _xavier(parameter)
+
+    def forward(self, maps: list[Tensor]) -> Float[Tensor, "n c h w"]:
+        """Return the map at the coarsest resolution; `maps` are finest last."""
+        coarse = [maps[0]] + [s(x) for s, x in zip(self.split, maps[1:], strict=True)]
+        tokens = [x.flatten(2).transpose(1, 2) for x in coarse]
+        places = sinusoids(tokens[0].shape[1], tokens[0].shape[2]).to(tokens[0])
+        seen = []
+        for layers, x in zip(self.own, tokens, strict=True):
+            x = x + places
+            for layer in layers:
+                x = layer(x)
+            seen.append(x)
+        compared = []
+        for layers, (memory, x) in zip(self.across, pairwise([seen[0], *seen]), strict=True):
+            for layer in layers:
+                x = layer(x, memory)
+            compared.append(x)
+        return torch.stack(seen + compared).mean(0).transpose(1, 2).view_as(maps[0])
+
+
+class Layer(nn.Module):
+    """Self-attention and a two-layer perceptron, each normalised before and added."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.norm, self.attention = nn.LayerNorm(width), Attention(width)
+        self.mlp = MLP(width)
+
+    def forward(self, x: Float[Tensor, "n tokens c"]) -> Float[Tensor, "n tokens c"]:
+        """Return tokens of the same shape."""
+        normal = self.norm(x)
+        return self.mlp(x + self.attention(normal, normal))
+
+
+class CrossLayer(nn.Module):
+    """Self-attention, attention to a memory, a perceptron, each normalised before and added."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.norm, self.attention = nn.LayerNorm(width), Attention(width)
+        self.asker_norm, self.memory_norm = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.cross = Attention(width)
+        self.mlp = MLP(width)
+
+    def forward(
+        self, x: Float[Tensor, "n tokens c"], memory: Float[Tensor, "n tokens c"]
+    ) -> Float[Tensor, "n tokens c"]:
+        """Return tokens of the same shape."""
+        normal = self.norm(x)
+        x = x + self.attention(normal, normal)
+        return self.mlp(x + self.cross(self.asker_norm(x), self.memory_norm(memory)))
+
+
+class Attention(nn.Module):
+    """Attention with eight heads (Vaswani et al. 2017), fused."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.project, self.out = nn.Linear(width, 3 * width), nn.Linear(width, width)
+
+    def forward(
+        self, x: Float[Tensor, "n tokens c"], memory: Float[Tensor, "n tokens c"]
+    ) -> Float[Tensor, "n tokens c"]:
+        """Return what the tokens `x` find in `memory`; dropped out in training."""
+        weights, biases = self.project.weight.chunk(3), self.project.bias.chunk(3)
+        q, k, v = (
+            functional.linear(source, weight, bias).unflatten(2, (HEADS, -1)).transpose(1, 2)
+            for source, weight, bias in zip((x, memory, memory), weights, biases, strict=True)
+        )
+        rate = DROPOUT if self.training else 0.0
+        found = functional.scaled_dot_product_attention(q, k, v, dropout_p=rate)
+        found = self.out(found.transpose(1, 2).flatten(2))
+        return functional.dropout(found, DROPOUT, self.training)
+
+
+class MLP(nn.Module):
+    """Normalise, four times as wide, ReLU, back, add."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.norm = nn.LayerNorm(width)
+        self.wide, self.back = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
+
+    def forward(self, x: Float[Tensor, "n tokens c"]) -> Float[Tensor, "n tokens c"]:
+        """Return tokens of the same shape."""
+        hidden = functional.dropout(self.wide(self.norm(x)).relu(), DROPOUT, self.training)
+        return x + functional.dropout(self.back(hidden), DROPOUT, self.training)
+
+
+def sinusoids(tokens: int, width: int) -> Float[Tensor, "tokens width"]:
+    """Return the position code of tokens 0 .. tokens - 1 (Vaswani et al. 2017, section 3.5)."""
+    pitch = 10_000.0 ** (-torch.arange(0, width, 2, dtype=torch.float64) / width)
+    angles = torch.arange(tokens, dtype=torch.float64)[:, None] * pitch
+    return torch.stack([angles.sin(), angles.cos()], 2).flatten(1).float()
+
+
+def _xavier(parameter: Tensor) -> None:
+    if parameter.dim() > 1:
+        nn.init.xavier_uniform_(parameter)

@@ -1,0 +1,135 @@
+"""What every frozen network must do, and what is particular to each."""
+
+import pytest
+import torch
+from torch.nn import functional
+
+from baselines import etnet, hypere2vid
+from baselines.cista import CISTA
+from baselines.e2vid_plus import E2VIDPlus
+from baselines.etnet import ETNet
+from baselines.firenet import FireNet
+from baselines.hypere2vid import DynamicDecoder, HyperE2VID, fourier_bessel
+from src.models.unroll import unroll
+
+PUBLISHED = {
+    FireNet: 37_777,
+    E2VIDPlus: 10_710_401,
+    ETNet: 22_175_361,
+    HyperE2VID: 10_149_881,
+    CISTA: 1_260_867,
+}
+
+
+def small(kind: type) -> torch.nn.Module:
+    torch.manual_seed(0)
+    width = "channels" if kind in (FireNet, CISTA) else "base_channels"
+    return kind(bins=3, **{width: 4}).eval()
+
+
+def voxels(n: int = 1, windows: int = 3, views: int = 9, side: int = 24) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(1)
+    return torch.randn(n, windows, views, 3, side, side, generator=generator)
+
+
+@pytest.mark.parametrize("kind", PUBLISHED)
+def test_published_parameter_counts(kind):
+    assert sum(p.numel() for p in kind().parameters()) == PUBLISHED[kind]
+
+
+def test_published_buffers_of_hypere2vid():
+    assert sum(b.numel() for b in HyperE2VID().buffers()) == 574
+
+
+@pytest.mark.parametrize("kind", PUBLISHED)
+@torch.no_grad()
+def test_law_6_two_chunks_equal_one(kind):
+    network = small(kind)
+    whole, _ = unroll(network, voxels())
+    first, state = unroll(network, voxels()[:, :1])
+    second, _ = unroll(network, voxels()[:, 1:], state)
+    assert torch.equal(whole, torch.cat([first, second], 1))
+
+
+@pytest.mark.parametrize("kind", PUBLISHED)
+@torch.no_grad()
+def test_any_size_comes_back_and_only_the_centre_view_counts(kind):
+    network = small(kind)
+    window = voxels(2)[:, 0, ..., :21, :19]
+    frame, _ = network(window, None)
+    alone, _ = network(window[:, 4:5], None)
+    assert frame.shape == (2, 1, 21, 19)
+    assert torch.equal(frame, alone)
+
+
+@pytest.mark.parametrize("kind", PUBLISHED)
+@torch.no_grad()
+def test_clips_of_a_batch_do_not_meet(kind):
+    together, _ = unroll(small(kind), voxels(2))
+    alone, _ = unroll(small(kind), voxels(2)[1:])
+    torch.testing.assert_close(together[1:], alone)
+
+
+@pytest.mark.parametrize("kind", PUBLISHED)
+def test_gradients_reach_every_parameter(kind):
+    network = small(kind).train()
+    frames, _ = unroll(network, voxels())
+    (frames * torch.randn_like(frames)).sum().backward()
+    assert all(float(p.grad.abs().sum()) > 0 for p in network.parameters())
+
+
+@pytest.mark.parametrize("kind", PUBLISHED)
+def test_other_bins_are_refused(kind):
+    with pytest.raises(ValueError, match="bins must be 3"):
+        small(kind)(torch.zeros(1, 1, 5, 24, 24), None)
+
+
+@torch.no_grad()
+def test_fused_attention_is_attention():
+    layer, x, memory = etnet.Attention(16).eval(), torch.randn(2, 7, 16), torch.randn(2, 7, 16)
+    plain = torch.nn.MultiheadAttention(16, etnet.HEADS, batch_first=True).eval()
+    plain.in_proj_weight.copy_(layer.project.weight)
+    plain.in_proj_bias.copy_(layer.project.bias)
+    plain.out_proj.load_state_dict(layer.out.state_dict())
+    torch.testing.assert_close(layer(x, memory), plain(x, memory, memory)[0])
+
+
+def test_sinusoids_start_with_sine_zero_and_cosine_one():
+    table = etnet.sinusoids(5, 8)
+    assert table.shape == (5, 8)
+    assert table[0].tolist() == [0, 1] * 4
+    torch.testing.assert_close(table[:, 0], torch.arange(5.0).sin())
+    torch.testing.assert_close(table[:, 7], (torch.arange(5.0) / 10_000**0.75).cos())
+
+
+@torch.no_grad()
+def test_dynamic_convolution_is_one_with_a_kernel_for_each_pixel():
+    decoder = DynamicDecoder(2, 3, 4).eval()
+    x, context = torch.randn(1, 2, 3, 4), torch.randn(1, 4, 24, 32)
+    small = functional.interpolate(context, scale_factor=0.25, mode="bilinear")
+    weights = decoder.weigh(decoder.fuse(small)).unflatten(1, (hypere2vid.ATOMS, -1))
+    kernels = torch.einsum("nmkhw,kl->nmlhw", weights, decoder.functions)
+    grown = functional.interpolate(x, scale_factor=2, mode="bilinear")
+    patches = functional.unfold(grown, 5, padding=2).view(1, 2, 25, 6, 8)
+    atoms = torch.einsum("nmlhw,nclhw->ncmhw", kernels, patches).flatten(1, 2)
+    torch.testing.assert_close(decoder(x, context), decoder.compose(atoms).relu())
+
+
+def test_fourier_bessel_functions():
+    small, large = fourier_bessel(1), fourier_bessel(2)
+    assert small.shape == (6, 3, 3) and large.shape == (14, 5, 5)
+    # The first is J0, positive, highest in the middle; the published values are these.
+    assert float(small[0, 1, 1]) == pytest.approx(0.6731, abs=1e-4)
+    assert float(large[0, 2, 2]) == pytest.approx(0.4387, abs=1e-4)
+    assert float(large.square().sum((1, 2)).mean()) == pytest.approx(1)
+    torch.testing.assert_close(large[1], large[2].T)  # cos and sin of one turn
+    torch.testing.assert_close(large[1], -large[1].flip(0))
+
+
+@torch.no_grad()
+def test_cista_shrinks_its_code():
+    network = small(CISTA)
+    for step in network.steps:
+        step.threshold.fill_(1e6)
+    _, (code, _, _) = network(voxels()[:, 0], None)
+    assert float(code.abs().max()) == 0
