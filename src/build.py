@@ -129,9 +129,13 @@ def reconstructor(cfg: DictConfig, net: nn.Module, spec: dict) -> Reconstructor:
 
 
 def share_cores(cfg: DictConfig) -> None:
-    """Leave a core to each simulating worker: threads that fight for a core wait for each other."""
+    """Leave a core to each simulating worker: threads that fight for a core wait for each other.
+
+    Threads are only taken away: a smaller OMP_NUM_THREADS stands.
+    """
     if cfg.trainer.accelerator == "cpu":
-        torch.set_num_threads(max(1, (os.cpu_count() or 1) - cfg.data.workers))
+        left = (os.cpu_count() or 1) - cfg.data.workers
+        torch.set_num_threads(max(1, min(torch.get_num_threads(), left)))
 
 
 def trainer(cfg: DictConfig) -> lightning.Trainer:
