@@ -1,0 +1,123 @@
+"""Selective state spaces (Gu & Dao 2023, Mamba) in plain PyTorch, in both directions of a sequence.
+
+    state <- exp(step * rate) * state + step * enter * x        read = leave . state
+
+per channel with its own few states; step, enter and leave follow from the input.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+TAPS = 4  # of the causal convolution before the scan
+EXPAND = 2
+
+
+def scan(
+    x: Float[Tensor, "n length c"],
+    step: Float[Tensor, "n length c"],
+    rate: Float[Tensor, "c s"],
+    enter: Float[Tensor, "n length s"],
+    leave: Float[Tensor, "n length s"],
+) -> Float[Tensor, "n length c"]:
+    """Return what each channel reads; `rate` < 0, `step` > 0, so no decay exceeds one.
+
+    In two levels: pieces of about sqrt(length) run side by side from zero, then each piece gets
+    what the ones before it left, decayed.  2 sqrt(length) steps in a row instead of `length`.
+    """
+    length = x.shape[1]
+    piece = math.ceil(math.sqrt(length))
+    missing = -length % piece
+    if missing:  # step 0 changes nothing
+        x, step, enter, leave = (
+            functional.pad(a, (0, 0, 0, missing)) for a in (x, step, enter, leave)
+        )
+    decay = torch.exp(step[..., None] * rate).unflatten(1, (-1, piece))
+    drive = ((step * x)[..., None] * enter[:, :, None]).unflatten(1, (-1, piece))
+    states, decays = _run(decay, drive, 2)
+    carried, _ = _run(decays[:, :, -1], states[:, :, -1], 1)
+    before = functional.pad(carried[:, :-1], (0, 0, 0, 0, 1, 0))
+    states = (states + decays * before[:, :, None]).flatten(1, 2)
+    return torch.einsum("nlcs,nls->nlc", states, leave)[:, :length]
+
+
+def _run(decay: Tensor, drive: Tensor, axis: int) -> tuple[Tensor, Tensor]:
+    """Return states and products of decays along `axis`, one step after the other, from zero."""
+    decays, drives = decay.unbind(axis), drive.unbind(axis)
+    state, product = drives[0], decays[0]
+    states, products = [state], [product]
+    for factor, new in zip(decays[1:], drives[1:], strict=True):
+        state, product = torch.addcmul(new, factor, state), factor * product
+        states.append(state)
+        products.append(product)
+    return torch.stack(states, axis), torch.stack(products, axis)
+
+
+class Direction(nn.Module):
+    """One direction of a sequence: causal convolution, then the scan.
+
+    `guided`: step, enter and leave follow from a guide instead of from the input.
+    """
+
+    def __init__(self, channels: int, states: int, rank: int, guided: bool):
+        super().__init__()
+        self.rank, self.states = rank, states
+        self.conv = nn.Conv1d(channels, channels, TAPS, padding=TAPS - 1, groups=channels)
+        if guided:
+            self.guide_conv = nn.Conv1d(channels, channels, TAPS, padding=TAPS - 1, groups=channels)
+        self.select = nn.Linear(channels, rank + 2 * states, bias=False)
+        self.step = nn.Linear(rank, channels)
+        self.log_rate = nn.Parameter(torch.arange(1.0, states + 1).log().repeat(channels, 1))
+        self.through = nn.Parameter(torch.ones(channels))
+        # Steps from 0.001 to 0.1, evenly in their logarithm, after the softplus.
+        steps = torch.exp(torch.linspace(math.log(1e-3), math.log(0.1), channels))
+        with torch.no_grad():
+            self.step.bias.copy_(steps + torch.log(-torch.expm1(-steps)))
+        nn.init.uniform_(self.step.weight, -(rank**-0.5), rank**-0.5)
+
+    def forward(
+        self, x: Float[Tensor, "n length c"], guide: Float[Tensor, "n length c"] | None
+    ) -> Float[Tensor, "n length c"]:
+        """Return what position i makes of positions 0 .. i."""
+        x = _causal(self.conv, x)
+        chooser = x if guide is None else _causal(self.guide_conv, guide)
+        sizes = [self.rank, self.states, self.states]
+        step, enter, leave = self.select(chooser).float().split(sizes, dim=-1)
+        step = functional.softplus(self.step(step.to(x.dtype)).float())
+        read = scan(x.float(), step, -self.log_rate.float().exp(), enter, leave)
+        return (read + self.through * x).to(x.dtype)
+
+
+class Mixer(nn.Module):
+    """A gated selective state space in both directions, with or without a guide."""
+
+    def __init__(self, width: int, states: int = 16, guided: bool = False):
+        super().__init__()
+        inner, rank = EXPAND * width, math.ceil(width / 16)
+        self.enter = nn.Linear(width, inner if guided else 2 * inner, bias=False)
+        if guided:
+            self.enter_guide = nn.Linear(2 * width, 2 * inner, bias=False)
+        self.ahead = Direction(inner, states, rank, guided)
+        self.back = Direction(inner, states, rank, guided)
+        self.leave = nn.Linear(inner, width, bias=False)
+
+    def forward(
+        self, x: Float[Tensor, "n length c"], guide: Float[Tensor, "n length c"] | None = None
+    ) -> Float[Tensor, "n length c"]:
+        """Return a sequence of the same shape; the guide, if any, has it too."""
+        if guide is None:
+            x, gate = self.enter(x).chunk(2, dim=-1)
+        else:
+            guide, gate = self.enter_guide(torch.cat([x, guide], -1)).chunk(2, dim=-1)
+            x = self.enter(x)
+        turned = None if guide is None else guide.flip(1)
+        both = self.ahead(x, guide) + self.back(x.flip(1), turned).flip(1)
+        return self.leave(both * functional.silu(gate))
+
+
+def _causal(conv: nn.Conv1d, x: Tensor) -> Tensor:
+    length = x.shape[1]
+    return functional.silu(conv(x.transpose(1, 2))[..., :length]).transpose(1, 2)
