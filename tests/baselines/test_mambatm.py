@@ -1,0 +1,102 @@
+"""The post-processor: published size, any length and frame, every part at work."""
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from baselines.mambatm import MambaTM, scan_orders, window_starts
+from src.build import make
+from tests.conftest import ROOT
+
+
+def small() -> MambaTM:
+    torch.manual_seed(0)
+    return MambaTM(states=2).eval()
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"), [("mambatm", 998_029), ("mambatm_published", 7_239_319)]
+)
+def test_parameter_counts(name, parameters):
+    network = make(OmegaConf.load(ROOT / "conf" / "postprocess" / f"{name}.yaml"))
+    assert sum(p.numel() for p in network.parameters()) == parameters
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 16, 16), (2, 3, 17, 30)])
+@torch.no_grad()
+def test_any_frame_comes_back(shape):
+    n, frames, height, width = shape
+    clean, distortion = small()(torch.rand(n, frames, 1, height, width))
+    assert clean.shape == (n, frames, 1, height, width)
+    assert distortion.shape == (n, frames, 4, height, width)
+
+
+@torch.no_grad()
+def test_clips_of_a_batch_do_not_meet():
+    network, frames = small(), torch.rand(2, 3, 1, 16, 16)
+    torch.testing.assert_close(network(frames)[0][1:], network(frames[1:])[0])
+
+
+@pytest.mark.parametrize(
+    ("frames", "starts"),
+    [(1, [0]), (16, [0]), (17, [0, 1]), (40, [0, 12, 24]), (41, [0, 12, 24, 25])],
+)
+def test_windows_cover_the_video(frames, starts):
+    assert window_starts(frames, 16, 4) == starts
+
+
+@pytest.mark.parametrize("count", [1, 3, 4, 5, 9, 11])
+@torch.no_grad()
+def test_a_video_of_any_length(count):
+    network, frames = small(), torch.rand(1, count, 1, 16, 16)
+    clean = network.restore(frames, window=4, overlap=2)
+    assert clean.shape == frames.shape
+    assert 0 <= float(clean.min()) <= float(clean.max()) <= 1
+    if count <= 4:
+        assert torch.equal(clean, network(frames)[0].clamp(0, 1))
+
+
+@torch.no_grad()
+def test_windows_give_their_inner_frames():
+    network, frames = small(), torch.rand(1, 6, 1, 16, 16)
+    whole = network.restore(frames, window=4, overlap=2)
+    first, last = (network(part)[0].clamp(0, 1) for part in (frames[:, :4], frames[:, 2:]))
+    torch.testing.assert_close(whole, torch.cat([first[:, :3], last[:, 1:]], 1))
+
+
+def test_orders_are_permutations_of_the_box():
+    raster, in_time, curve = scan_orders(3, 4, 5)
+    for order in (raster, in_time, curve):
+        assert torch.equal(order.sort().values, torch.arange(60))
+    assert in_time[:4].tolist() == [0, 20, 40, 5]  # all times of a place, then the place below
+
+
+def test_gradients_reach_every_parameter():
+    network = small().train()
+    clean, distortion = network(torch.rand(1, 5, 1, 16, 16))
+    ((clean * torch.randn_like(clean)).sum() + distortion.sum()).backward()
+    idle = [name for name, p in network.named_parameters() if float(p.grad.abs().sum()) == 0]
+    assert idle == []
+
+
+def test_it_can_learn_one_clip_by_heart():
+    network, frames = small().train(), torch.rand(1, 4, 1, 16, 16)
+    target = torch.nn.functional.avg_pool2d(frames.flatten(0, 1), 3, 1, 1).view_as(frames)
+    optimizer = torch.optim.Adam(network.parameters(), 3e-3)
+    losses = []
+    for _ in range(40):
+        loss = (network(frames)[0] - target).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < 0.2 * losses[0]
+
+
+def test_bad_arguments_name_their_key():
+    with pytest.raises(ValueError, match=r"postprocess\.groups"):
+        MambaTM(groups=1)
+    with pytest.raises(ValueError, match=r"postprocess\.features"):
+        MambaTM(features=4)
+    with pytest.raises(ValueError, match=r"postprocess\.overlap"):
+        small().restore(torch.rand(1, 1, 1, 16, 16), window=4, overlap=4)
