@@ -148,6 +148,7 @@ def trainer(cfg: DictConfig) -> lightning.Trainer:
 def test(
     cfg: DictConfig, name: str, net: nn.Module, data: LightFieldData, measures: Scores
 ) -> evaluation.Row:
-    """Return the scores of `net` on the test clips; no logger, no callback."""
-    quiet = make(cfg.trainer, logger=False, callbacks=[], enable_checkpointing=False)
+    """Return the scores of `net` on the test clips; in float32, whatever it was trained in."""
+    plain = {"precision": "32-true", "logger": False, "enable_checkpointing": False}
+    quiet = make(cfg.trainer, callbacks=[], **plain)
     return evaluation.test(name, net, data, measures, trainer=quiet, warmup=cfg.data.warmup)

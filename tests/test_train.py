@@ -63,7 +63,7 @@ def test_every_choice_composes(group, tmp_path):
 
 
 def test_resuming_equals_not_having_stopped(tmp_path):
-    steps = ["data.epoch_clips=2", "augment.noise_std=0.1"]
+    steps = ["data.epoch_clips=2", "augment.noise_std=0.1", "scheduler.T_max=5"]
     whole, first, second = (tmp_path / name for name in ("whole", "first", "second"))
     train(config("train", whole, *TINY, *steps, "trainer.max_steps=5"))
     train(config("train", first, *TINY, *steps, "trainer.max_steps=3"))
