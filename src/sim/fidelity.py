@@ -22,6 +22,7 @@ SHARES = {"modes": 0.42, "pitch": 0.33, "rank": 0.15, "kernel": 0.1}  # of the t
 BEYOND = 1.06  # the networks are fitted a little beyond the edge of their band
 EXACT_MODES = 119  # whole orders up to n = 14, for D/r0 beyond the tables
 MAX_PITCH = 64
+UNRELATED = 2.0  # the error of a PSF taken from a place that has nothing to do with it
 TILT_ERROR = 0.35  # of the tilt's spread, per D between nodes
 
 
@@ -131,6 +132,8 @@ def _widest(strength: float, airy: float, allowed: float) -> tuple[float, float]
     """Return the widest pitch in units of D at the object whose error is allowed, and the error."""
     errors = _at("pitch", strength, airy).cummax(0).values
     limit, axis = SHARES["pitch"] * allowed, _table("pitch_axis")
+    if limit >= UNRELATED:
+        return math.inf, UNRELATED
     if limit <= errors[0]:  # the error falls at least with the first power of the pitch
         return float(axis[0] * limit / errors[0]), float(limit)
     index = min(int((errors <= limit).sum()) - 1, len(axis) - 2)
