@@ -1,5 +1,6 @@
 """Train a network on simulated light fields and test it: python -m src.train experiment=lf3x3."""
 
+import sys
 import time
 from pathlib import Path
 
@@ -22,18 +23,30 @@ def train(cfg: DictConfig) -> dict:
     build.share_cores(cfg)
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
     net, spec = build.network(cfg)
-    if cfg.ckpt:
-        files.require(cfg.ckpt, spec)
+    start_from = files.require(cfg.ckpt, spec) if cfg.ckpt else None
     module, data = build.reconstructor(cfg, net, spec), build.data(cfg)
     results.open_run(run, door.resolved(cfg))
     untrained = build.test(cfg, "untrained", net, data, module.scores)
-    build.trainer(cfg).fit(module, data, ckpt_path=cfg.ckpt)
+    fit(build.trainer(cfg), module, data, start_from)
     trained = build.test(cfg, cfg.name, net, data, module.scores)
     floor = build.test(cfg, "high-pass, centre view", build.make(cfg.floor), data, module.scores)
     samples.write(run / "samples", net, data.pipelines["test"])
     return results.write(
         run, door.resolved(cfg), [trained, untrained, floor], **door.facts(cfg, start)
     )
+
+
+def fit(trainer: lightning.Trainer, module, data, start_from: Path | None) -> None:
+    """Train; when that is cut short, whatever by, say what to go on from."""
+    try:
+        trainer.fit(module, data, ckpt_path=start_from)
+    except BaseException as error:
+        last = trainer.checkpoint_callback.dirpath if trainer.checkpoint_callback else None
+        if last and any(Path(last).glob("*.ckpt")):
+            print(f"stopped at step {trainer.global_step}; go on with ckpt={last}", file=sys.stderr)
+        if isinstance(error, SystemExit) and isinstance(error.__context__, KeyboardInterrupt):
+            raise KeyboardInterrupt from None  # Lightning makes an exit code 1 of it
+        raise
 
 
 @hydra.main(version_base=None, config_path="../conf", config_name="train")

@@ -16,6 +16,8 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
+from src.models.checkpoints import newest, whole
+
 WEIGHTS = Path(__file__).resolve().parents[2] / "weights"
 ROOMS = ("src.models.", "baselines.")
 
@@ -41,13 +43,18 @@ def load(name_or_path: str | Path) -> nn.Module:
     return network.float().eval()
 
 
-def require(path: str, spec: dict) -> None:
-    """Raise ValueError unless `path` is a checkpoint of just the network `spec`, to go on from."""
-    if not Path(path).is_file():
+def require(name: str | Path, spec: dict) -> Path:
+    """Return the checkpoint to go on from: `name`, or the newest whole one in the folder `name`.
+
+    Raises ValueError unless it is a whole checkpoint of just the network `spec`.
+    """
+    path = newest(Path(name)) if Path(name).is_dir() else Path(name)
+    if not path.is_file():
         raise ValueError(f"ckpt must be a checkpoint to go on from, got {path}")
-    found, _ = _checkpoint(Path(path))
+    found, _ = _checkpoint(path)
     if found != spec:
         raise ValueError(f"ckpt must be of the network {spec} to go on from, got {found} in {path}")
+    return path
 
 
 def save(path: Path, network: nn.Module, spec: dict, card: dict) -> None:
@@ -101,6 +108,8 @@ def _safetensors(path: Path) -> tuple[dict, dict[str, Tensor]]:
 
 
 def _checkpoint(path: Path) -> tuple[dict, dict[str, Tensor]]:
+    if not whole(path):
+        raise ValueError(f"ckpt must be a checkpoint of src.train that is whole, got {path}")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
         state = content["state_dict"]

@@ -1,0 +1,57 @@
+"""Checkpoints that are whole or not there: written to a temporary name beside, then renamed.
+
+Lightning's own writer goes through the system's temporary folder; where that is another disk, as on
+most clusters, its last move is a copy, and a run that is killed then leaves half a checkpoint.
+"""
+
+import os
+import warnings
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+
+
+class WholeFiles(TorchCheckpointIO):
+    """Lightning's plugin that stores checkpoints; on the disk, not in its cache, when it returns."""
+
+    def save_checkpoint(self, checkpoint: dict, path: Any, storage_options: Any = None) -> None:
+        """Write `checkpoint` to `path`; an OSError leaves what was there before."""
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(path.name + ".partial")
+        try:
+            with partial.open("wb") as file:
+                torch.save(checkpoint, file)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(partial, path)
+        except BaseException:
+            partial.unlink(missing_ok=True)
+            raise
+
+
+def whole(path: Path) -> bool:
+    """Return whether every part of a checkpoint has the checksum it was written with.
+
+    PyTorch's own reader does not look at them: a flipped bit would go unnoticed.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return archive.testzip() is None
+    except (OSError, zipfile.BadZipFile, NotImplementedError, ValueError, EOFError):
+        return False
+
+
+def newest(run: Path) -> Path:
+    """Return the newest whole checkpoint in the folder `run` or below; warns of damaged ones.
+
+    Raises ValueError, beginning with `ckpt`, where there is none.
+    """
+    for path in sorted(run.rglob("*.ckpt"), key=lambda path: path.stat().st_mtime_ns)[::-1]:
+        if whole(path):
+            return path
+        warnings.warn(f"{path} is damaged, an older checkpoint is taken", stacklevel=2)
+    raise ValueError(f"ckpt must be a folder with a whole checkpoint, got none in {run}")
