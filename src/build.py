@@ -19,6 +19,7 @@ from src.metrics import evaluation
 from src.metrics.scores import Scores
 from src.models.reconstructor import Reconstructor
 from src.sim.pipeline import Pipeline
+from src.sim.scenes import MixedRates
 
 ROOMS = ("src.", "baselines.", "lightning.", "torch.optim.")
 
@@ -44,15 +45,19 @@ def pipeline(cfg: DictConfig, split: str) -> Pipeline:
     training = split == "train"
     windows = cfg.data.windows if training else cfg.data.test_windows
     substeps = cfg.data.substeps
-    scene = make(
-        cfg.scene,
-        split=split,
-        seed=cfg.seed,
-        frames=windows * substeps + 1,
-        fps=cfg.fps * substeps,
-    )
+    rates = cfg.data.rates if training and cfg.data.rates else [cfg.fps]
+    scenes = [
+        make(
+            cfg.scene,
+            split=split,
+            seed=cfg.seed,
+            frames=windows * substeps + 1,
+            fps=rate * substeps,
+        )
+        for rate in rates
+    ]
     return Pipeline(
-        scene,
+        MixedRates(scenes) if len(scenes) > 1 else scenes[0],
         make(cfg.optics),
         OmegaConf.to_container(cfg.turbulence, resolve=True),
         OmegaConf.to_container(cfg.sensor, resolve=True),

@@ -1,7 +1,8 @@
 """Training augmentation of voxel sequences (Rebecq et al. 2019; Stoffregen et al. 2020; the paper).
 
-Order: pause, flips, noise, hot pixels.  Crops are drawn before the simulation (sim/pipeline.py).
-Every draw comes from the key of the sample, so a batch is the same in any worker.
+Order: pause, flips, misplaced views, noise, hot pixels, dropped views.  Crops are drawn before the
+simulation (sim/pipeline.py).  Every draw comes from the key of the sample, so a batch is the same
+in any worker.
 """
 
 from collections.abc import Sequence
@@ -10,6 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn import functional
 
 from src.sim import noise
 from src.sim.pipeline import Sample
@@ -23,6 +25,8 @@ class Augment:
     `pause`: probability that a running sequence pauses at a window; `stay`: that a paused one
     stays paused.
     `flip`: probability of a flip, for each axis.
+    `misplaced`: probability of a view to lie up to `misplaced_px` whole pixels off, in each axis.
+    `dropped`: probability of a batch to lose views, any of them, one or more but never all.
     """
 
     noise_std: float = 0.4
@@ -31,20 +35,26 @@ class Augment:
     pause: float = 0.05
     stay: float = 0.9
     flip: float = 0.5
+    misplaced: float = 0.0
+    misplaced_px: int = 2
+    dropped: float = 0.0
 
     def __post_init__(self):
-        for name in ("hot_fraction", "pause", "stay", "flip"):
+        for name in ("hot_fraction", "pause", "stay", "flip", "misplaced", "dropped"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"augment.{name} must be in [0, 1], got {getattr(self, name)}")
         for name in ("noise_std", "hot_std"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise ValueError(f"augment.{name} must be >= 0, got {getattr(self, name)}")
+        if self.misplaced_px < 0:
+            raise ValueError(f"augment.misplaced_px must be >= 0, got {self.misplaced_px}")
 
     def __call__(self, sample: Sample, keys: Sequence[int]) -> Sample:
         """Return the augmented sample; `keys` has one key per clip."""
         clips = [self._one(sample, index, key) for index, key in enumerate(keys)]
         voxels, target, turbulent = (torch.stack(part) for part in zip(*clips, strict=True))
-        return replace(sample, voxels=voxels, target=target, turbulent=turbulent)
+        sample = replace(sample, voxels=voxels, target=target, turbulent=turbulent)
+        return drop_views(sample, self.dropped, noise.key(keys[0], "dropped"))
 
     def _one(self, sample: Sample, index: int, key: int) -> tuple[Tensor, Tensor, Tensor]:
         steps, paused = pause_chain(
@@ -54,6 +64,8 @@ class Augment:
         voxels = sample.voxels[index, steps]
         voxels[paused] = 0
         voxels = voxels.flip(axes) if axes else voxels
+        place = noise.key(key, "misplaced")
+        voxels = misplace(voxels, self.misplaced, self.misplaced_px, place)
         voxels = self._corrupt(voxels, key)
         pictures = (sample.target[index, steps], sample.turbulent[index, steps])
         target, turbulent = (part.flip(axes) if axes else part for part in pictures)
@@ -90,6 +102,34 @@ def flip_axes(probability: float, key: int) -> list[int]:
     """Return the axes to flip, out of -2 (upside down) and -1 (mirrored)."""
     draws = noise.uniform(key, torch.arange(2)).tolist()
     return [axis for axis, draw in zip((-2, -1), draws, strict=True) if draw < probability]
+
+
+def misplace(
+    voxels: Float[Tensor, "windows views bins h w"], probability: float, reach: int, key: int
+) -> Float[Tensor, "windows views bins h w"]:
+    """Move each view, at `probability`, by up to `reach` pixels; nothing comes in at the border."""
+    if probability == 0:
+        return voxels
+    height, width = voxels.shape[-2:]
+    draws = noise.uniform(key, torch.arange(3 * voxels.shape[1]).reshape(-1, 3)).tolist()
+    for view, (chance, *place) in enumerate(draws):
+        if chance < probability:
+            down, across = (int(share * (2 * reach + 1)) for share in place)
+            wide = functional.pad(voxels[:, view], (reach,) * 4)
+            voxels[:, view] = wide[..., down : down + height, across : across + width]
+    return voxels
+
+
+def drop_views(sample: Sample, probability: float, key: int) -> Sample:
+    """Return the sample, at `probability` without some of its views; how many is uniform."""
+    views = sample.voxels.shape[2]
+    chance, share, *order = noise.uniform(key, torch.arange(2 + views)).tolist()
+    if chance >= probability or views == 1:
+        return sample
+    count = 1 + int(share * (views - 1))
+    kept = sorted(sorted(range(views), key=order.__getitem__)[:count])
+    positions = tuple(sample.positions[view] for view in kept)
+    return replace(sample, voxels=sample.voxels[:, :, kept], positions=positions)
 
 
 def hot_pixels(size: Sequence[int], fraction: float, std: float, key: int) -> Float[Tensor, "h w"]:

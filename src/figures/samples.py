@@ -25,7 +25,9 @@ def write(folder: Path, network: nn.Module, pipeline: Pipeline, clips: int = 2) 
     written = []
     for index in range(clips):
         sample = simulate(pipeline, [index])
-        frames, _ = unroll(network, sample.voxels)
+        frames, _ = unroll(
+            network, sample.voxels, window_s=sample.window_s, positions=sample.positions
+        )
         parts = {
             "clean": sample.target,
             "centre view": sample.turbulent,
@@ -34,7 +36,7 @@ def write(folder: Path, network: nn.Module, pipeline: Pipeline, clips: int = 2) 
         videos = {name: part[0, :, 0].cpu().numpy() for name, part in parts.items()}
         written += [
             _gif(folder / f"clip{index}.gif", videos, sample, pipeline.optics),
-            _slices(folder / f"clip{index}_slice.png", videos, sample.fps),
+            _slices(folder / f"clip{index}_slice.png", videos, float(sample.window_s[0])),
         ]
     return written
 
@@ -78,13 +80,13 @@ def _gif(path: Path, videos: dict[str, np.ndarray], sample: Sample, optics: Opti
     return path
 
 
-def _slices(path: Path, videos: dict[str, np.ndarray], fps: float) -> Path:
+def _slices(path: Path, videos: dict[str, np.ndarray], window_s: float) -> Path:
     windows, height, width = videos["clean"].shape
     middle = height // 2
     line = np.array([[0, middle], [width - 1, middle]], dtype=float)
     rows = [Row(name, video, video[:, middle]) for name, video in videos.items()]
     picks = [0, windows // 3, 2 * windows // 3, windows - 1]
-    comparison(rows, path, samples=picks, line=line, length_s=(windows - 1) / fps)
+    comparison(rows, path, samples=picks, line=line, length_s=(windows - 1) * window_s)
     return path
 
 

@@ -1,7 +1,7 @@
 """Training, validation and test of any network that turns voxel grids into frames."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from lightning import LightningModule
@@ -74,7 +74,7 @@ class Reconstructor(LightningModule):
         for part in chunks(windows, self.detach_every):
             # One normalised weight per chunk: spectral norm iterates once, not once per window.
             with parametrize.cached():
-                frames, state = unroll(self.network, sample.voxels[:, part], detach(state))
+                frames, state = self._unroll(sample, part, detach(state))
                 errors = self.loss(frames.flatten(0, 1), sample.target[:, part].flatten(0, 1))
             loss = errors.sum() / (windows * len(sample.voxels))
             self.manual_backward(loss)
@@ -104,10 +104,14 @@ class Reconstructor(LightningModule):
 
     def _measure(self, sample: "Sample") -> list[dict]:
         with parametrize.cached():
-            frames, _ = unroll(self.network, sample.voxels)
+            frames, _ = self._unroll(sample)
         frames, target = frames[:, self.warmup :], sample.target[:, self.warmup :]
         clips = zip(frames, target, sample.drawn, strict=True)
         return [drawn | self.scores(ours, truth) for ours, truth, drawn in clips]
+
+    def _unroll(self, sample: "Sample", part: slice = slice(None), state: Any = None):
+        known = {"window_s": sample.window_s, "positions": sample.positions}
+        return unroll(self.network, sample.voxels[:, part], state, **known)
 
     def configure_optimizers(self):
         """Return the optimiser over all parameters and its schedule."""

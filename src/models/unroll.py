@@ -1,6 +1,7 @@
 """A network over a sequence of windows."""
 
-from collections.abc import Iterator
+import inspect
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
@@ -9,14 +10,30 @@ from torch import Tensor, nn
 
 
 def unroll(
-    network: nn.Module, voxels: Float[Tensor, "n windows views bins h w"], state: Any = None
+    network: nn.Module,
+    voxels: Float[Tensor, "n windows views bins h w"],
+    state: Any = None,
+    *,
+    window_s: float | Tensor = 1 / 120,
+    positions: Sequence[tuple[int, int]] | None = None,
 ) -> tuple[Float[Tensor, "n windows 1 h w"], Any]:
-    """Return the frame of every window and the state after the last one."""
+    """Return the frame of every window and the state after the last one.
+
+    `window_s`, the length of a window in seconds, a number or one per clip (n,), and `positions`,
+    the (row, col) of every view, are told to a network that takes them.
+    """
+    facts = {"window_s": window_s, "positions": positions}
+    told = {name: value for name, value in facts.items() if takes(network, name)}
     frames = []
     for window in voxels.unbind(1):
-        frame, state = network(window, state)
+        frame, state = network(window, state, **told)
         frames.append(frame)
     return torch.stack(frames, dim=1), state
+
+
+def takes(network: nn.Module, name: str) -> bool:
+    """Return whether the network's `forward` has a parameter `name`."""
+    return name in inspect.signature(network.forward).parameters
 
 
 def chunks(windows: int, length: int) -> Iterator[slice]:

@@ -10,7 +10,6 @@ the recurrent state of the window that ended where it starts.  Every one of thes
 is exactly the reconstruction at the trained rate, and every event counts once per phase.
 """
 
-import inspect
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
@@ -21,6 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from src.models.unroll import takes
 from src.recordings.lookup import Lookup
 
 COVERED = 0.99  # of the last window, or the recording ends before it
@@ -225,11 +225,6 @@ def default_span(network: nn.Module, fps: float) -> str:
     spans: 0.47 and 0.35 at 600 fps, 0.36 and 0.36 at 3000, 0.14 and 0.36 at 12,000.
     """
     return "frame" if takes(network, "window_s") or fps <= 600 else "trained"
-
-
-def takes(network: nn.Module, name: str) -> bool:
-    """Return whether the network's `forward` has a parameter `name`."""
-    return name in inspect.signature(network.forward).parameters
 
 
 @torch.inference_mode()

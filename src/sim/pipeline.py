@@ -17,7 +17,7 @@ from torch import Tensor
 
 from src.sim import noise
 from src.sim.atmosphere import Atmosphere, sample_atmosphere
-from src.sim.optics import Optics
+from src.sim.optics import Optics, Position
 from src.sim.scenes import Clip
 from src.sim.sensor import EventSensor, decode_srgb
 from src.sim.turbulence import Turbulence
@@ -42,14 +42,16 @@ class Sample:
     """A batch of simulated clips.
 
     `voxels` (n, windows, views, bins, h, w); `target` (n, windows, 1, h, w), the clean frame at the
-    end of each window; `turbulent`, the same instants seen by the centre view; `drawn`, what was
-    drawn for each clip; `seconds`, how long the simulation took.
+    end of each window; `turbulent`, the same instants seen by the centre view; `window_s` (n,), how
+    long a window lasts; `positions`, the (row, col) of every view, None: those of `optics.layout`;
+    `drawn`, what was drawn for each clip; `seconds`, how long the simulation took.
     """
 
     voxels: Tensor
     target: Tensor
     turbulent: Tensor
-    fps: float
+    window_s: Tensor
+    positions: Sequence[Position] | None = None
     drawn: list[dict] = field(default_factory=list)
     seconds: float = 0.0
 
@@ -57,7 +59,7 @@ class Sample:
         """Return the sample with its tensors on `device`."""
         moved = {
             name: getattr(self, name).to(device, non_blocking=non_blocking)
-            for name in ("voxels", "target", "turbulent")
+            for name in ("voxels", "target", "turbulent", "window_s")
         }
         return replace(self, **moved)
 
@@ -118,7 +120,8 @@ class Pipeline:
             voxels=torch.cat([sample.voxels for sample in samples]),
             target=torch.cat([sample.target for sample in samples]),
             turbulent=torch.cat([sample.turbulent for sample in samples]),
-            fps=samples[0].fps,
+            window_s=torch.cat([sample.window_s for sample in samples]),
+            positions=self.optics.positions,
             drawn=[drawn for sample in samples for drawn in sample.drawn],
             seconds=time.perf_counter() - start,
         )
@@ -146,7 +149,7 @@ class Pipeline:
             voxels=voxels.transpose(1, 2),
             target=target[:, :, None],
             turbulent=turbulent[:, :, None],
-            fps=draw.clip.fps / self.substeps,
+            window_s=torch.tensor([self.substeps / draw.clip.fps]),
             drawn=[drawn],
         )
 

@@ -169,6 +169,18 @@ class _Layer:
         return np.column_stack([turn, offset])
 
 
+class MixedRates:
+    """Scenes that differ in frame rate: clip k is that of one of them, drawn by its number."""
+
+    def __init__(self, scenes: Sequence):
+        self.scenes = list(scenes)
+
+    def clip(self, index: int) -> Clip:
+        """Return clip `index` of the scene drawn for it."""
+        draw = float(noise.uniform(noise.key("rate"), torch.tensor(index)))
+        return self.scenes[int(draw * len(self.scenes))].clip(index)
+
+
 def check_frames(height: int, width: int, frames: int, fps: float) -> None:
     """Raise ValueError for a size, a number of frames or a rate that no clip can have."""
     for name, value, least in (("height", height, 8), ("width", width, 8), ("frames", frames, 2)):

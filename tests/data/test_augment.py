@@ -5,7 +5,14 @@ import math
 import pytest
 import torch
 
-from src.data.augment import Augment, flip_axes, hot_pixels, pause_chain
+from src.data.augment import (
+    Augment,
+    drop_views,
+    flip_axes,
+    hot_pixels,
+    misplace,
+    pause_chain,
+)
 from src.sim.pipeline import Sample
 
 OFF = {"noise_std": 0.0, "hot_fraction": 0.0, "pause": 0.0, "flip": 0.0}
@@ -17,7 +24,7 @@ def numbered(windows: int = 6, size: int = 4) -> Sample:
     pixel = torch.arange(size * size).reshape(size, size) / 100
     voxels = (window + pixel).expand(1, windows, 2, 3, size, size)
     target = voxels[:, :, 0, :1] / 10
-    return Sample(voxels.clone(), target.clone(), target.clone(), fps=120.0)
+    return Sample(voxels.clone(), target.clone(), target.clone(), torch.tensor([1 / 120]))
 
 
 def test_nothing_on_changes_nothing():
@@ -80,7 +87,7 @@ def test_noise_has_the_stated_spread_also_in_pauses():
         torch.zeros(1, 20, 3, 5, 32, 32),
         torch.zeros(1, 20, 1, 32, 32),
         torch.zeros(1, 20, 1, 32, 32),
-        fps=120.0,
+        window_s=torch.tensor([1 / 120]),
     )
     out = Augment(**OFF | {"noise_std": 0.4, "pause": 1.0})(sample, [1]).voxels
     assert abs(float(out.std()) - 0.4) < 5 * 0.4 / math.sqrt(2 * out.numel())
@@ -104,16 +111,49 @@ def test_hot_pixel_count_is_uniform_up_to_the_fraction():
 def test_a_clip_is_augmented_the_same_in_any_batch():
     two = numbered()
     batch = Sample(
-        *(torch.cat([part] * 2) for part in (two.voxels, two.target, two.turbulent)), 120.0
+        *(torch.cat([part] * 2) for part in (two.voxels, two.target, two.turbulent)),
+        window_s=torch.full((2,), 1 / 120),
     )
     augment = Augment()
     together, alone = augment(batch, [5, 6]), augment(two, [6])
     assert torch.equal(together.voxels[1], alone.voxels[0])
 
 
+def test_a_misplaced_view_moves_whole_and_leaves_nothing_behind():
+    view = torch.zeros(2, 3, 1, 16, 16)
+    view[..., 8, 8] = 1
+    moved = misplace(view.clone(), 1.0, 2, key=4)
+    places = [tuple(moved[0, i, 0].nonzero()[0].tolist()) for i in range(3)]
+    assert float(moved.sum()) == float(view.sum()) and torch.equal(moved[0], moved[1])
+    assert len(set(places)) > 1 and all(abs(axis - 8) <= 2 for place in places for axis in place)
+    assert torch.equal(misplace(view.clone(), 0.0, 2, key=4), view)
+
+
+def test_dropped_views_take_their_positions_along_and_some_view_stays():
+    places = tuple((0, column) for column in range(4))
+    voxels = torch.arange(4.0).reshape(1, 1, 4, 1, 1, 1)
+    sample = Sample(voxels, voxels, voxels, torch.tensor([1 / 120]), places)
+    counts = set()
+    for key in range(60):
+        left = drop_views(sample, 1.0, key)
+        kept = left.voxels.flatten().tolist()
+        assert [places[int(view)] for view in kept] == list(left.positions)
+        counts.add(len(kept))
+    assert counts == {1, 2, 3} and drop_views(sample, 0.0, 1) is sample
+
+
 @pytest.mark.parametrize(
     "wrong",
-    [{"flip": 1.5}, {"pause": -0.1}, {"noise_std": -1}, {"hot_fraction": 2}, {"hot_std": math.inf}],
+    [
+        {"flip": 1.5},
+        {"pause": -0.1},
+        {"noise_std": -1},
+        {"hot_fraction": 2},
+        {"hot_std": math.inf},
+        {"misplaced": 2},
+        {"misplaced_px": -1},
+        {"dropped": 1.5},
+    ],
 )
 def test_wrong_values_name_their_key(wrong):
     with pytest.raises(ValueError, match=f"augment.{next(iter(wrong))}"):

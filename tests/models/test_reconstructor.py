@@ -39,7 +39,8 @@ def sample(windows: int = 6) -> Sample:
     generator = torch.Generator().manual_seed(0)
     voxels = torch.randn(2, windows, 1, 5, 8, 8, generator=generator)
     target = torch.rand(2, windows, 1, 8, 8, generator=generator)
-    return Sample(voxels, target, target, fps=120.0, drawn=[{"name": "a"}, {"name": "b"}])
+    window_s = torch.full((2,), 1 / 120)
+    return Sample(voxels, target, target, window_s, drawn=[{"name": "a"}, {"name": "b"}])
 
 
 def fit(network: nn.Module, detach_every: int, steps: int = 1) -> nn.Module:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from src.sim.scenes import EMBEDDED, Photographs, photographs
+from src.sim.scenes import EMBEDDED, MixedRates, Photographs, photographs
 
 
 def test_a_clip_is_a_function_of_seed_split_and_index():
@@ -88,3 +88,10 @@ def test_empty_folder_and_unreadable_photographs(tmp_path):
         (tmp_path / f"{number}.jpg").write_bytes(b"not a picture")
     with pytest.raises(ValueError, match="scene.root must hold readable"):
         Photographs(str(tmp_path)).clip(0)
+
+
+def test_mixed_rates_draw_the_rate_of_a_clip_from_its_number():
+    scenes = [Photographs(height=32, width=32, frames=2, fps=fps) for fps in (60.0, 600.0)]
+    mixed = MixedRates(scenes)
+    rates = [mixed.clip(index).fps for index in range(12)]
+    assert set(rates) == {60.0, 600.0} and rates == [mixed.clip(i).fps for i in range(12)]
