@@ -13,6 +13,7 @@ from pathlib import Path
 import rich
 from rich.table import Table
 
+from src.metrics.bootstrap import interval
 from src.metrics.evaluation import Row
 
 SCHEMA = 1
@@ -44,11 +45,14 @@ def write_text(path: Path, text: str) -> None:
 
 
 def summary(clips: list[dict]) -> dict:
-    """Return {clips, metric: {mean, std}} over clips; the spread of one clip is 0."""
+    """Return {clips, metric: {mean, std, interval}} over clips; the spread of one clip is 0.
+
+    `interval`: 95 % of the means of resampled clips.
+    """
     found = [metric for metric in METRICS if clips and metric in clips[0]]
     values = {metric: [clip[metric] for clip in clips] for metric in found}
     return {"clips": len(clips)} | {
-        metric: {"mean": statistics.fmean(v), "std": statistics.pstdev(v)}
+        metric: {"mean": statistics.fmean(v), "std": statistics.pstdev(v), "interval": interval(v)}
         for metric, v in values.items()
     }
 

@@ -1,0 +1,45 @@
+"""Intervals of a mean by resampling (Efron & Tibshirani 1993, percentile method)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+DRAWS = 4000
+
+
+def interval(values: Sequence[float], share: float = 0.95) -> tuple[float, float]:
+    """Return the interval that holds `share` of the means of resampled `values`.
+
+    Clips are resampled.  A single value has an interval of no width.
+    """
+    return difference([values], None, share)
+
+
+def difference(
+    ours: Sequence[Sequence[float]],
+    theirs: Sequence[Sequence[float]] | None,
+    share: float = 0.95,
+) -> tuple[float, float]:
+    """Return the interval of mean(ours) - mean(theirs); rows are seeds, columns the same clips.
+
+    Seeds and clips are resampled, a clip in both at once, seeds of each apart (a network of seed k
+    has nothing to do with another network of seed k).  None stands for zero.  Always the same
+    draws.  Raises ValueError for rows of different lengths.
+    """
+    rng = np.random.default_rng(0)
+    clips = len(ours[0])
+    if any(len(row) != clips for row in [*ours, *(theirs or [])]):
+        raise ValueError(f"every seed must have the same {clips} clips")
+    picked = rng.integers(clips, size=(DRAWS, clips))
+    means = _means(ours, picked, rng)
+    if theirs is not None:
+        means = means - _means(theirs, picked, rng)
+    tail = 50 * (1 - share)
+    low, high = np.percentile(means, [tail, 100 - tail])
+    return float(low), float(high)
+
+
+def _means(rows: Sequence[Sequence[float]], picked: np.ndarray, rng: np.random.Generator):
+    values = np.asarray(rows, dtype=float)
+    seeds = rng.integers(len(values), size=(len(picked), len(values)))
+    return values[seeds[:, :, None], picked[:, None]].mean((1, 2))
