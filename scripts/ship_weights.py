@@ -1,0 +1,119 @@
+"""A trained run to weights/: python -m scripts.ship_weights RUN [--name NAME] [--test FOLDER ...].
+
+Writes `weights/NAME.safetensors` (float16, spectral norm folded) and its model card `NAME.md`.  RUN
+is a folder of src.train, each FOLDER one of src.eval with these weights.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from src.models import files
+
+LARGEST = 16 * 2**20  # bytes of a file
+MEASURES = {"lpips": "LPIPS", "ssim": "SSIM", "psnr": "PSNR", "psnr_aligned": "aligned PSNR"}
+MEASURES |= {"wobble": "wobble, px"}
+
+
+def ship(run: Path, name: str, tests: list[Path]) -> Path:
+    """Write the weights of `run` and their card; returns the path of the weights.
+
+    Raises ValueError for a run without a whole checkpoint and for weights above 16 MiB.
+    """
+    ckpt = files.newest(run)
+    network = files.load(ckpt)
+    content = torch.load(ckpt, map_location="cpu", weights_only=True)
+    record = json.loads((run / "results.json").read_text())
+    card = facts(record, OmegaConf.load(run / "config.yaml"), content["global_step"])
+    path = files.WEIGHTS / f"{name}.safetensors"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    files.save(path, network, content["network"], card)
+    if path.stat().st_size > LARGEST:
+        path.unlink()
+        raise ValueError(f"weights must have at most {LARGEST} bytes; {name} has more")
+    results = [json.loads((test / "results.json").read_text()) for test in tests]
+    configs = [OmegaConf.load(test / "config.yaml") for test in tests]
+    text = describe(name, network, card, list(zip(results, configs, strict=True)))
+    path.with_suffix(".md").write_text(text)
+    return path
+
+
+def facts(record: dict, cfg: DictConfig, steps: int) -> dict:
+    """Return what the header of the file says of the training."""
+    return {
+        "experiment": record["experiment"],
+        "seed": record["seed"],
+        "steps": steps,
+        "commit": record["git"],
+        "config_sha256": record["config_sha256"],
+        "device": record["device"],
+        "hours": round(record["wall_s"] / 3600, 2),
+        "scenes": _scenes(cfg),
+        "turbulence": cfg.turbulence.atmosphere.severity if cfg.turbulence.atmosphere else "none",
+        "views": cfg.optics.views,
+        "windows_per_s": list(cfg.data.get("rates") or [cfg.fps]),
+        "windows": cfg.data.windows,
+        "crop": cfg.data.crop,
+        "batch_size": cfg.data.batch_size,
+        "precision": cfg.trainer.precision,
+    }
+
+
+def describe(name: str, network: torch.nn.Module, card: dict, tests: list[tuple]) -> str:
+    """Return the model card as Markdown."""
+    count = sum(parameter.numel() for parameter in network.parameters())
+    views = "any number of views" if network.views is None else f"{network.views} view(s)"
+    lines = [
+        f"# {name}",
+        "",
+        f"`{type(network).__name__}`, {count:,} parameters, {views}; `ckpt={name}`.",
+        "",
+        "| trained | |",
+        "|---|---|",
+        *(f"| {key} | {value} |" for key, value in card.items()),
+        "",
+        "| tested on | clips | " + " | ".join(MEASURES.values()) + " |",
+        "|---|---|" + "---|" * len(MEASURES),
+        *(_tested(record, cfg) for record, cfg in tests),
+        "",
+        "In brackets: the interval that holds 95 % of the means of resampled clips.",
+        "",
+        "Limits: simulated turbulence and sensor only, grey pictures, photographs in",
+        "planar motion; a training of this length is far from the paper's 64,800 steps.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _tested(record: dict, cfg: DictConfig) -> str:
+    scores = record["test"]
+    cells = []
+    for measure in MEASURES:
+        low, high = scores[measure]["interval"]
+        cells.append(f"{scores[measure]['mean']:.3f} ({low:.3f} to {high:.3f})")
+    what = f"{_scenes(cfg)}, {cfg.turbulence.atmosphere.severity} turbulence"
+    return f"| {what} | {scores['clips']} | " + " | ".join(cells) + " |"
+
+
+def _scenes(cfg: DictConfig) -> str:
+    kind = str(cfg.scene["_target_"]).rpartition(".")[2]
+    root = cfg.scene.get("root")
+    return f"{kind}, {Path(root).name if root else 'embedded'}"
+
+
+def main() -> None:
+    """Read the arguments."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--name", help="default: the run's experiment")
+    parser.add_argument("--test", type=Path, nargs="*", default=[], help="folders of src.eval")
+    arguments = parser.parse_args()
+    record = json.loads((arguments.run / "results.json").read_text())
+    print(ship(arguments.run, arguments.name or record["experiment"], arguments.test))
+
+
+if __name__ == "__main__":
+    main()
