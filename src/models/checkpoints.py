@@ -15,7 +15,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 
 class WholeFiles(TorchCheckpointIO):
-    """Lightning's plugin that stores checkpoints; on the disk, not in its cache, when it returns."""
+    """Lightning's plugin that stores checkpoints; they are on the disk when it returns."""
 
     def save_checkpoint(self, checkpoint: dict, path: Any, storage_options: Any = None) -> None:
         """Write `checkpoint` to `path`; an OSError leaves what was there before."""
