@@ -4,16 +4,18 @@
 """
 
 import os
+from collections.abc import Iterator
 from typing import Any
 
 import lightning
 import torch
 from hydra.errors import InstantiationException
-from hydra.utils import instantiate
+from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 import src.models
+from baselines.upstream import from_config
 from src.data.datamodule import LightFieldData
 from src.metrics import evaluation
 from src.metrics.scores import Scores
@@ -21,23 +23,52 @@ from src.models.reconstructor import Reconstructor
 from src.sim.pipeline import Pipeline
 from src.sim.scenes import MixedRates
 
-ROOMS = ("src.", "baselines.", "lightning.", "torch.optim.")
+ROOMS = (
+    "src.", "baselines.", "torch.optim.", "lightning.pytorch.trainer.",
+    *(f"lightning.pytorch.{room}." for room in ("callbacks", "loggers", "plugins", "profilers")),
+)  # fmt: skip
 
 
 def make(node: Any, **kwargs) -> Any:
-    """Instantiate a config node; raises ValueError for a `_target_` outside our rooms.
+    """Instantiate a config node; raises ValueError for a `_target_`, however deep, that is no class
+    of our rooms.
 
     A ValueError of the object itself comes through as it is, not wrapped by Hydra.
     """
-    target = str(node.get("_target_"))
-    if not target.startswith(ROOMS):
-        raise ValueError(f"_target_ must start with one of {', '.join(ROOMS)}, got {target}")
+    plain = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
+    for target in _targets(plain):
+        _check(target)
     try:
         return instantiate(node, _convert_="all", **kwargs)
     except InstantiationException as error:
         if isinstance(error.__cause__, ValueError):
             raise error.__cause__ from None
         raise
+
+
+def _targets(node: Any) -> Iterator[str]:
+    """Yield every `_target_` in plain dicts and lists."""
+    if isinstance(node, dict):
+        yield from (str(value) for key, value in node.items() if key == "_target_")
+    if isinstance(node, dict | list):
+        for value in node.values() if isinstance(node, dict) else node:
+            yield from _targets(value)
+
+
+def _check(target: str) -> None:
+    """Raise ValueError unless `target` is a class that was written in one of the rooms.
+
+    A name alone says little: `torch.optim.adam.torch.load` begins like an optimiser.
+    """
+    if not target.startswith(("src.", "baselines.", "torch.optim.", "lightning.")):
+        raise ValueError(f"_target_ must be a class of {', '.join(ROOMS)}, got {target}")
+    try:
+        found = get_object(target)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"_target_ must name a class, got {target}") from error
+    home = f"{getattr(found, '__module__', '')}."
+    if found is not from_config and not (isinstance(found, type) and home.startswith(ROOMS)):
+        raise ValueError(f"_target_ must be a class of {', '.join(ROOMS)}, got {target}")
 
 
 def pipeline(cfg: DictConfig, split: str) -> Pipeline:
