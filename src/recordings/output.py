@@ -1,9 +1,12 @@
 """Frames to a file as they come: MP4, GIF, PNG or HDF5, with a table of their time stamps.
 
-Every format keeps what was written when the run is stopped, and holds one frame at a time.
+Every format keeps what was written when the run is stopped, and holds one frame at a time.  Until
+the end files have `partial` in their names, so that none that is cut short is taken for whole.
 """
 
 import csv
+import os
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -33,9 +36,11 @@ def sink(kind: str, folder: Path, size: tuple[int, int], playback_fps: float = 3
     if not 0.1 <= playback_fps <= 1000:
         raise ValueError(f"playback must be in [0.1, 1000] fps, got {playback_fps}")
     folder.mkdir(parents=True, exist_ok=True)
+    make, whole = KINDS[kind]
+    video, table_file = partial(folder / whole), partial(folder / "frames.csv")
     with (
-        open(folder / "frames.csv", "w", newline="") as file,
-        KINDS[kind](folder, size, playback_fps) as add,
+        open(table_file, "w", newline="") as file,
+        make(video, size, playback_fps) as add,
     ):
         table = csv.writer(file)
         table.writerow(["frame", "time_s", "events", "outside"])
@@ -48,6 +53,30 @@ def sink(kind: str, folder: Path, size: tuple[int, int], playback_fps: float = 3
             count += 1
 
         yield write
+    if kind == "mp4":
+        _check_mp4(video, count)
+    _rename(video, folder / whole)
+    _rename(table_file, folder / "frames.csv")
+
+
+def partial(path: Path) -> Path:
+    """Return the name of a file while it is written: `video.partial.mp4`, `frames.partial`."""
+    return path.with_name(f"{path.stem}.partial{path.suffix}")
+
+
+def _rename(made: Path, whole: Path) -> None:
+    if whole.is_dir():
+        shutil.rmtree(whole)  # frames of an earlier run into the same folder
+    os.replace(made, whole)
+
+
+def _check_mp4(path: Path, count: int) -> None:
+    """Raise OSError unless the file holds `count` frames: the encoder is silent on a full disk."""
+    video = cv2.VideoCapture(str(path))
+    found = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+    video.release()
+    if found != count:
+        raise OSError(f"{path} holds {found} of {count} frames; is the disk full?")
 
 
 def eight_bits(picture: Float[np.ndarray, "h w"]) -> Picture:
@@ -56,11 +85,11 @@ def eight_bits(picture: Float[np.ndarray, "h w"]) -> Picture:
 
 
 @contextmanager
-def _mp4(folder: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
+def _mp4(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
     code = cv2.VideoWriter_fourcc(*"vp09")  # what both browsers and the OpenCV wheel know
-    writer = cv2.VideoWriter(str(folder / "video.mp4"), code, fps, size[::-1], False)
+    writer = cv2.VideoWriter(str(path), code, fps, size[::-1], False)
     if not writer.isOpened():
-        raise ValueError(f"output=mp4 must be writable at {folder}, got no encoder; try output=png")
+        raise ValueError(f"output=mp4 must be writable at {path}, got no encoder; try output=png")
     try:
         yield lambda picture, frame: writer.write(picture)
     finally:
@@ -68,9 +97,9 @@ def _mp4(folder: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
 
 
 @contextmanager
-def _gif(folder: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
+def _gif(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
     hundredths = max(2, round(100 / fps))
-    with open(folder / "video.gif", "wb") as file:
+    with open(path, "wb") as file:
         blank = Image.new("L", size[::-1])
         file.write(b"".join(GifImagePlugin.getheader(blank, info={"loop": 0})[0]))
 
@@ -85,22 +114,25 @@ def _gif(folder: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
 
 
 @contextmanager
-def _png(folder: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
-    frames = folder / "frames"
-    frames.mkdir(exist_ok=True)
+def _png(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
+    if path.is_dir():
+        shutil.rmtree(path)  # what a stopped run left
+    path.mkdir()
     count = 0
 
     def add(picture: Picture, frame: Frame) -> None:
         nonlocal count
-        cv2.imwrite(str(frames / f"{count:07d}.png"), picture)
+        name = path / f"{count:07d}.png"
+        if not cv2.imwrite(str(name), picture):
+            raise OSError(f"{name} cannot be written; is the disk full?")
         count += 1
 
     yield add
 
 
 @contextmanager
-def _hdf5(folder: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
-    with h5py.File(folder / "video.h5", "w") as file:
+def _hdf5(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
+    with h5py.File(path, "w") as file:
         frames = file.create_dataset(
             "frames",
             (0, *size),
@@ -119,4 +151,9 @@ def _hdf5(folder: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
         yield add
 
 
-KINDS = {"mp4": _mp4, "gif": _gif, "png": _png, "hdf5": _hdf5}
+KINDS = {
+    "mp4": (_mp4, "video.mp4"),
+    "gif": (_gif, "video.gif"),
+    "png": (_png, "frames"),
+    "hdf5": (_hdf5, "video.h5"),
+}

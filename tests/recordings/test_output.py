@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from src.recordings.output import sink
+from src.recordings.output import partial, sink
 from src.recordings.stream import Frame
 
 SIZE = (48, 64)
@@ -71,8 +71,9 @@ def test_what_was_done_is_kept_when_the_run_fails(kind, tmp_path):
             write(frame)
         raise ValueError("halfway")
     read, name, _ = READERS[kind]
-    assert len(read(tmp_path / name)) == 3
-    with open(tmp_path / "frames.csv") as file:
+    assert not (tmp_path / name).exists() and not (tmp_path / "frames.csv").exists()
+    assert len(read(partial(tmp_path / name))) == 3
+    with open(partial(tmp_path / "frames.csv")) as file:
         rows = list(csv.DictReader(file))
     assert [float(row["time_s"]) for row in rows] == [0, 0.25, 0.5]
     assert rows[2]["events"] == "20" and rows[2]["outside"] == "2"
