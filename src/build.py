@@ -161,6 +161,7 @@ def reconstructor(cfg: DictConfig, net: nn.Module, spec: dict) -> Reconstructor:
         scores=scores(cfg),
         detach_every=cfg.data.detach_every,
         warmup=cfg.data.warmup,
+        spike=cfg.spike,
     )
 
 

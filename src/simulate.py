@@ -4,24 +4,31 @@ from pathlib import Path
 
 import hydra
 import rich
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from src import build, door
 from src.figures import samples
 from src.metrics import results
 from src.recordings import capture
 
+SAME = ("scene", "optics", "turbulence", "sensor", "data", "seed", "fps", "bins")
+
 
 def simulate(cfg: DictConfig) -> dict:
-    """Simulate test clip `index`; write clean, views, tilt and events as `views.gif`, `views.png`.
+    """Simulate clip `index` of `split`; write clean, views, tilt and events as `views.gif`, `.png`.
 
+    With `like`, the config of another run, it is just the clip that run saw (not augmented).
     With `write` the views also go, mirrored and misaligned, onto one sensor whose events are
     written to that file, and the truth beside it.
 
     Returns what was drawn: D/r0, tilt and blur in pixels, threshold ...
     """
     run = Path(cfg.paths.run)
-    pipeline = build.pipeline(cfg, "test")
+    if cfg.like:
+        cfg = alike(cfg)
+    pipeline = build.pipeline(cfg, cfg.split)
     draw = pipeline.draw(cfg.index)
     sample, views = pipeline.simulate([draw]), pipeline.views(draw)[0]
     frames = views.shape[1]
@@ -36,6 +43,22 @@ def simulate(cfg: DictConfig) -> dict:
         capture.write_recording(cfg.write, views, draw.clip.fps, camera, sensor, tilt=tilt)
     rich.print(sample.drawn[0], f"in {run}")
     return sample.drawn[0]
+
+
+def alike(cfg: DictConfig) -> DictConfig:
+    """Return `cfg` with all that makes a clip taken from the run whose config is `cfg.like`.
+
+    Raises ValueError for a file that is no such config.
+    """
+    try:
+        other = OmegaConf.load(cfg.like)
+        parts = {name: other[name] for name in SAME}
+    except (OSError, UnicodeDecodeError, YAMLError, KeyError, TypeError, OmegaConfBaseException):
+        raise ValueError(f"like must be the config.yaml of a run, got {cfg.like}") from None
+    found = cfg.copy()
+    for name, part in parts.items():
+        found[name] = part
+    return found
 
 
 @hydra.main(version_base=None, config_path="../conf", config_name="simulate")

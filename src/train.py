@@ -12,6 +12,7 @@ from src import build, door
 from src.figures import samples
 from src.metrics import results
 from src.models import files
+from src.models.guard import NotFinite
 
 
 def train(cfg: DictConfig) -> dict:
@@ -27,7 +28,11 @@ def train(cfg: DictConfig) -> dict:
     module, data = build.reconstructor(cfg, net, spec), build.data(cfg)
     results.open_run(run, door.resolved(cfg))
     untrained = build.test(cfg, "untrained", net, data, module.scores)
-    fit(build.trainer(cfg), module, data, start_from)
+    try:
+        fit(build.trainer(cfg), module, data, start_from)
+    except NotFinite as error:
+        same = f"python -m src.simulate like={run}/config.yaml split=train index={error.clips[0]}"
+        raise ValueError(f"{error}; seed {cfg.seed}; to see the clip: {same}") from error
     trained = build.test(cfg, cfg.name, net, data, module.scores)
     floor = build.test(cfg, "high-pass, centre view", build.make(cfg.floor), data, module.scores)
     samples.write(run / "samples", net, data.pipelines["test"])
@@ -38,12 +43,15 @@ def train(cfg: DictConfig) -> dict:
 
 def fit(trainer: lightning.Trainer, module, data, start_from: Path | None) -> None:
     """Train; when that is cut short, whatever by, say what to go on from."""
+    last = Path(trainer.checkpoint_callback.dirpath) / "last.ckpt"
     try:
         trainer.fit(module, data, ckpt_path=start_from)
+        if not last.is_file():  # nothing was left to do
+            trainer.save_checkpoint(last)
     except BaseException as error:
-        last = trainer.checkpoint_callback.dirpath if trainer.checkpoint_callback else None
-        if last and any(Path(last).glob("*.ckpt")):
-            print(f"stopped at step {trainer.global_step}; go on with ckpt={last}", file=sys.stderr)
+        if any(last.parent.glob("*.ckpt")):
+            step = trainer.global_step
+            print(f"stopped at step {step}; go on with ckpt={last.parent}", file=sys.stderr)
         if isinstance(error, SystemExit) and isinstance(error.__context__, KeyboardInterrupt):
             raise KeyboardInterrupt from None  # Lightning makes an exit code 1 of it
         raise

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from src.metrics.scores import Scores
+from src.models.guard import Guard, NotFinite, finite
 from src.models.unroll import chunks, detach, unroll
 
 if TYPE_CHECKING:  # a network knows nothing of the simulation; a sample is read, never made
@@ -22,6 +23,8 @@ class Reconstructor(LightningModule):
     from parameters and `scheduler`, if any, a learning-rate schedule from it, one step a batch.
     `detach_every`: windows between two cuts of the graph (truncated back-propagation through time;
     0: none).  Memory is that of one chunk; the optimiser steps once per batch.
+    `spike`: a loss so many times the median of the last hundred moves the weights no more than that
+    median would (Guard); None: off.
     `scores` measures frames against targets; the first `warmup` windows of a clip are not scored.
     """
 
@@ -36,6 +39,7 @@ class Reconstructor(LightningModule):
         scores: Scores | None = None,
         detach_every: int = 0,
         warmup: int = 0,
+        spike: float | None = None,
     ):
         super().__init__()
         if detach_every < 0:
@@ -43,7 +47,7 @@ class Reconstructor(LightningModule):
         self.automatic_optimization = False
         self.network, self.network_spec = network, network_spec
         self.optimizer, self.scheduler = optimizer, scheduler
-        self.detach_every, self.warmup = detach_every, warmup
+        self.detach_every, self.warmup, self.guard = detach_every, warmup, Guard(spike)
         # In a tuple, so that their backbones stay out of the parameters and the checkpoint.
         self._measures = (loss, scores)
         self.clips: list[dict] = []
@@ -64,9 +68,10 @@ class Reconstructor(LightningModule):
         self.train()
 
     def training_step(self, sample: "Sample", batch_idx: int) -> Tensor:
-        """One optimiser step on a batch of sequences; returns the loss averaged over windows.
+        """One optimiser step on a batch of sequences; returns the loss averaged over windows (and
+        over processes: all of them decide alike).
 
-        Raises ValueError, with the clips, when the loss is not finite; no step is taken then.
+        Raises NotFinite, with the clips, for a loss or gradient that is not; no step is taken then.
         """
         windows = sample.voxels.shape[1]
         state, total = None, torch.zeros((), device=self.device)
@@ -79,13 +84,24 @@ class Reconstructor(LightningModule):
             loss = errors.sum() / (windows * len(sample.voxels))
             self.manual_backward(loss)
             total += loss.detach()
-        if not torch.isfinite(total):
-            raise ValueError(f"loss is {float(total)} at step {self.global_step}: {sample.drawn}")
+        total = self.all_gather(total).mean()
+        self._protect(total, sample.drawn)
         self.optimizers().step()
         if self.scheduler is not None:
             self.lr_schedulers().step()
         self.log("train/loss", total, prog_bar=True, batch_size=len(sample.voxels))
         return total
+
+    def _protect(self, loss: Tensor, drawn: list[dict]) -> None:
+        """Stop what is not finite, scale down what leaps."""
+        gradients = [parameter.grad for parameter in self.network.parameters()]
+        if not torch.isfinite(loss):
+            raise NotFinite(f"loss is {float(loss)}", self.global_step, drawn)
+        if not finite(gradients):
+            raise NotFinite("a gradient is not finite", self.global_step, drawn)
+        share = self.guard.share(float(loss))
+        if share < 1:
+            torch._foreach_mul_([gradient for gradient in gradients if gradient is not None], share)
 
     def validation_step(self, sample: "Sample", batch_idx: int) -> None:
         """Log the mean of every score over the validation clips."""
@@ -123,3 +139,8 @@ class Reconstructor(LightningModule):
     def on_save_checkpoint(self, checkpoint: dict) -> None:
         """Add how to build the network again (plain data: loads with weights_only=True)."""
         checkpoint["network"] = self.network_spec
+        checkpoint["losses"] = list(self.guard.losses)
+
+    def on_load_checkpoint(self, checkpoint: dict) -> None:
+        """Remember the losses that the guard had seen."""
+        self.guard.losses.extend(checkpoint.get("losses", ()))

@@ -35,6 +35,7 @@ class Draw:
     atmosphere: Atmosphere | None
     threshold: float
     key: int
+    number: int
 
 
 @dataclass
@@ -110,7 +111,7 @@ class Pipeline:
         atmosphere = sample_atmosphere(generator=drawer, **self.turbulence["atmosphere"])
         self._check_scatter(atmosphere)
         threshold = self.sensor.sample_threshold(noise.generator(noise.key(key, "threshold")))
-        return Draw(clip, crop, atmosphere, threshold, key)
+        return Draw(clip, crop, atmosphere, threshold, key, number)
 
     def simulate(self, draws: Sequence[Draw], device: torch.device | str = "cpu") -> Sample:
         """Simulate the drawn clips on `device`."""
@@ -142,7 +143,7 @@ class Pipeline:
             full_width=clean.shape[-1],
             threshold=torch.tensor([draw.threshold]),
         )
-        drawn = {"name": draw.clip.name, "threshold": draw.threshold}
+        drawn = {"clip": draw.number, "name": draw.clip.name, "threshold": draw.threshold}
         drawn |= asdict(self.operator(draw).fidelity)
         turbulent = views[:, self.optics.centre, self.substeps :: self.substeps]
         return Sample(

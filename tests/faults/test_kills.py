@@ -84,8 +84,6 @@ def stopped(run: Run, stop: int, after: float) -> bool:
     run.until(lambda: time.monotonic() > end)
     code = run.stop(stop)
     assert code in (0, -stop, 128 + stop), run.text()
-    if code == 128 + stop and "checkpoints" in run.text():
-        assert "go on with ckpt=" in run.text()
     return code != 0
 
 
@@ -97,7 +95,9 @@ def disturbed(folder: Path, stops: list[int], draw: random.Random, seconds: floa
         if not stopped(run, stop, draw.uniform(0.1, 0.7 * seconds)):
             return harness.outcome(folder / f"run{number}")
         tally.injected += 1
-        found = list(folder.rglob("*.ckpt"))
+        here, found = f"run{number}/checkpoints", list(folder.rglob("*.ckpt"))
+        if "stopped at step" in run.text():
+            assert f"go on with ckpt={folder / here}" in run.text()
         assert all(whole(path) for path in found)
         left = [f"ckpt={newest(folder)}"] if found else []
     run = Run(folder / "log", harness.train, training(folder / "last", *left))

@@ -1,0 +1,100 @@
+"""NaN and infinity stop a training before a step, and say how to see the clip; same bits again."""
+
+import re
+import shlex
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from src import build
+from src.models import reconstructor
+from src.sim.pipeline import Pipeline
+from src.simulate import simulate
+from src.train import train
+from tests.test_train import TINY, config
+
+QUICK = [*TINY, "logger=none", "optics=single", "data.epoch_clips=4", "trainer.max_steps=4"]
+QUICK += ["data.reuse=1"]
+
+
+def poisoned(monkeypatch, clip: int, value: float) -> None:
+    """Make the simulation of one training clip return `value` somewhere."""
+    simulated = Pipeline._simulate
+
+    def spoil(self, draw, device):
+        sample = simulated(self, draw, device)
+        if self.split == "train" and draw.number == clip:
+            sample.voxels[0, 0, 0, 0, 0, 0] = value
+        return sample
+
+    monkeypatch.setattr(Pipeline, "_simulate", spoil)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_number_that_is_none_stops_before_the_step(value, monkeypatch, tmp_path):
+    poisoned(monkeypatch, 2, value)
+    run = tmp_path / "run"
+    with pytest.raises(ValueError, match=r"(loss is|gradient).* at step 2, clips \[2\]") as caught:
+        train(config("train", run, *QUICK, "seed=5"))
+    assert "seed 5" in str(caught.value) and "'d_over_r0'" in str(caught.value)
+    state = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
+    assert state["global_step"] == 2
+    assert all(torch.isfinite(value).all() for value in state["state_dict"].values())
+    monkeypatch.undo()
+    see_the_clip(str(caught.value), tmp_path, run)
+
+
+def see_the_clip(message: str, tmp_path, run) -> None:
+    """Run the command that the message gives; it simulates the clip of the training."""
+    words = shlex.split(re.search(r"python -m src\.simulate (.*)", message).group(1))
+    found = simulate(config("simulate", tmp_path / "seen", *words))
+    trained = OmegaConf.load(run / "config.yaml")
+    pipeline = build.pipeline(trained, "train")
+    assert found == pipeline.simulate([pipeline.draw(2)]).drawn[0] and found["clip"] == 2
+    assert (tmp_path / "seen" / "views.png").is_file()
+
+
+def test_a_file_that_is_no_config_of_a_run_is_refused(tmp_path):
+    for text in ("", "[1, 2]", "a: ]", "\x00"):
+        (tmp_path / "config.yaml").write_text(text)
+        with pytest.raises(ValueError, match="like must be the config.yaml"):
+            simulate(config("simulate", tmp_path, f"like={tmp_path}/config.yaml"))
+
+
+def test_deterministic_mode_gives_the_same_bits(tmp_path):
+    states = []
+    for name in ("a", "b"):
+        train(config("train", tmp_path / name, *QUICK, "trainer.deterministic=true"))
+        last = torch.load(tmp_path / name / "checkpoints" / "last.ckpt", weights_only=True)
+        states.append(last["state_dict"])
+    assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())
+
+
+def test_a_leap_of_the_loss_hardly_moves_the_weights(monkeypatch, tmp_path):
+    def norms(**given) -> list[float]:
+        seen = []
+        step = torch.optim.Adam.step
+
+        def watch(self, *args, **kwargs):
+            gradients = [p.grad for group in self.param_groups for p in group["params"]]
+            seen.append(float(torch.nn.utils.get_total_norm(gradients)))
+            return step(self, *args, **kwargs)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(torch.optim.Adam, "step", watch)
+            patch.setattr(reconstructor, "Guard", lambda spike: given["guard"])
+            train(config("train", tmp_path / str(id(given)), *QUICK))
+        return seen
+
+    class Half:
+        losses = ()
+
+        def share(self, loss: float) -> float:
+            return 0.5
+
+    class Whole(Half):
+        def share(self, loss: float) -> float:
+            return 1.0
+
+    assert norms(guard=Half())[0] == pytest.approx(0.5 * norms(guard=Whole())[0], rel=1e-5)
