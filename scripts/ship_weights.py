@@ -90,12 +90,14 @@ def describe(name: str, network: torch.nn.Module, card: dict, tests: list[tuple]
 
 def _tested(record: dict, cfg: DictConfig) -> str:
     scores = record["test"]
-    cells = []
-    for measure in MEASURES:
-        low, high = scores[measure]["interval"]
-        cells.append(f"{scores[measure]['mean']:.3f} ({low:.3f} to {high:.3f})")
+    cells = [_cell(scores[measure]) if measure in scores else "-" for measure in MEASURES]
     what = f"{_scenes(cfg)}, {cfg.turbulence.atmosphere.severity} turbulence"
     return f"| {what} | {scores['clips']} | " + " | ".join(cells) + " |"
+
+
+def _cell(score: dict) -> str:
+    low, high = score["interval"]
+    return f"{score['mean']:.3f} ({low:.3f} to {high:.3f})"
 
 
 def _scenes(cfg: DictConfig) -> str:

@@ -31,13 +31,13 @@ within() {
 
 for name in $NETWORKS; do
   folder=$OUT/$name
-  if [ ! -f "$folder/trained" ]; then
+  trained() { ls "$folder"/part*/results.json 2>/dev/null | head -1 | xargs -r dirname; }
+  if [ -z "$(trained)" ]; then
     part=$folder/part$(find "$folder" -maxdepth 1 -name 'part*' 2>/dev/null | wc -l)
     resume=()
     find "$folder" -name '*.ckpt' 2>/dev/null | grep -q . && resume=("ckpt=$folder")
     within "$name" $PY -m src.train "experiment=$name" "${scene[@]}" "${resume[@]}" "$@" \
       "hydra.run.dir=$part"
-    echo "$part" >"$folder/trained"
   fi
   for set in test_photos test_targets; do
     views=lf3x3
@@ -45,10 +45,10 @@ for name in $NETWORKS; do
     root=()
     [ $set = test_photos ] && root=("${scene[@]}")
     [ -f "$folder/$set/results.json" ] || within "$name, $set" $PY -m src.eval \
-      "ckpt=$(cat "$folder/trained")/checkpoints/last.ckpt" data=$set optics=$views "${root[@]}" \
+      "ckpt=$(trained)/checkpoints/last.ckpt" data=$set optics=$views "${root[@]}" \
       ${EVAL:-} "hydra.run.dir=$folder/$set"
   done
-  $PY -m scripts.ship_weights "$(cat "$folder/trained")" --name "$name" \
+  $PY -m scripts.ship_weights "$(trained)" --name "$name" \
     --test "$folder/test_photos" "$folder/test_targets"
 done
 echo "all trained"

@@ -1,0 +1,40 @@
+"""From runs to shipped weights and tables of margins."""
+
+import pytest
+import torch
+
+from scripts.margins import margins
+from scripts.ship_weights import ship
+from src.models import files
+from src.models.unroll import unroll
+from src.train import train
+from tests.test_train import TINY, config
+
+
+def test_a_trained_run_is_shipped_whole_with_its_card(tmp_path, monkeypatch):
+    run, weights = tmp_path / "run", tmp_path / "weights"
+    train(config("train", run, *TINY, "trainer.max_steps=2"))
+    monkeypatch.setattr(files, "WEIGHTS", weights)
+    path = ship(run, "tiny/one", [run])
+    shipped, trained = files.load("tiny/one"), files.load(files.newest(run))
+    voxels = torch.randn(1, 2, 9, 5, 16, 16)
+    assert torch.allclose(unroll(shipped, voxels)[0], unroll(trained, voxels)[0], atol=2e-3)
+    card = path.with_suffix(".md").read_text()
+    assert "`ckpt=tiny/one`" in card and "| steps | 2 |" in card and "9 view(s)" in card
+
+
+def clip(name: str, value: float) -> dict[str, str]:
+    metrics = ("lpips", "ssim", "psnr", "psnr_aligned", "wobble")
+    return {"name": name} | dict.fromkeys(metrics, str(value))
+
+
+def test_margins_are_ours_minus_theirs_with_an_interval():
+    ours = [[clip("a", 2.0), clip("b", 5.0)], [clip("a", 2.0), clip("b", 5.0)]]
+    theirs = [[clip("a", 1.0), clip("b", 4.0)]]
+    row = margins(ours, theirs).splitlines()[2]
+    assert row == "| LPIPS | 3.5000 | 2.5000 | +1.0000 | +1.0000 to +1.0000 | -0.0275 |"
+
+
+def test_margins_need_the_same_clips():
+    with pytest.raises(ValueError, match="same clips"):
+        margins([[clip("a", 1.0)]], [[clip("b", 1.0)]])
