@@ -5,9 +5,10 @@ spaces over all tokens of a window - rows first, time first, along a Hilbert cur
 the latent phase distortion (two of tilt, mean and log-variance of a blur latent); one more group
 guided by it; a decoder for the picture.
 
-Differs from the published code where that is at odds with its paper: backward scans are turned back
-also in guided layers, the convolution of local layers runs on the raster and not on the curve, frames
-need not be square, and the few channels that weigh a fusion are GELU, which cannot die, not ReLU.
+Differs from the published code where that is at odds with its paper: backward scans are turned
+back also in guided layers, the convolution of local layers runs on the raster and not on the curve,
+frames need not be square, the few channels that weigh a fusion are GELU, which cannot die, not
+ReLU, and the last decoder draws what is added to the input, so that a short training starts there.
 """
 
 import torch
@@ -28,6 +29,8 @@ class MambaTM(nn.Module):
     trunk.  `groups`: of three layers, the last one guided.  Published: 3, 16, 6 and 16 `states`.
     """
 
+    views = None  # it sees none
+
     def __init__(self, channels: int = 1, features: int = 8, groups: int = 2, states: int = 8):
         super().__init__()
         if groups < 2:
@@ -35,6 +38,7 @@ class MambaTM(nn.Module):
         if features < 8:
             raise ValueError(f"postprocess.features must be >= 8, got {features}")
         width = features * 2**SCALES
+        self.channels = channels
         self.encoder = Encoder(channels, features)
         self.distortion_encoder = Encoder(DISTORTION, features)
         self.distortion_width = nn.Conv2d(width, width, 1)
@@ -48,8 +52,12 @@ class MambaTM(nn.Module):
     def forward(
         self, frames: Float[Tensor, "n frames c h w"]
     ) -> tuple[Float[Tensor, "n frames c h w"], Float[Tensor, "n frames 4 h w"]]:
-        """Return the frames without turbulence, not clipped, and the latent phase distortion."""
-        n, count, _, height, width = frames.shape
+        """Return the frames without turbulence, not clipped, and the latent phase distortion.
+
+        Grey frames may be given to a network of three channels too.
+        """
+        n, count, given, height, width = frames.shape
+        frames = frames.expand(-1, -1, self.channels, -1, -1)
         flat, (top, left) = pad_to_multiple(frames.flatten(0, 1), 2**SCALES)
         *skips, deep = self.encoder(flat)
         grid = (count, *deep.shape[-2:])
@@ -63,11 +71,13 @@ class MambaTM(nn.Module):
         guide = guide.unflatten(0, (n, count)).movedim(2, -1).flatten(1, 3)
         for i, layer in enumerate(self.guided):
             tokens = layer(tokens, grid, orders[i], guide)
-        clean = self.decoder(_maps(tokens, grid), skips)
-        return tuple(
+        added = self.decoder(_maps(tokens, grid), skips)
+        added, distortion = (
             part[..., top : top + height, left : left + width].unflatten(0, (n, count))
-            for part in (clean, distortion)
+            for part in (added, distortion)
         )
+        clean = frames + added
+        return (clean.mean(2, keepdim=True) if given == 1 else clean), distortion
 
     @torch.no_grad()
     def restore(

@@ -14,6 +14,7 @@ from baselines.etnet import ETNet
 from baselines.firenet import FireNet
 from baselines.hypere2vid import HyperE2VID
 from baselines.pickles import read
+from src.models import files
 from src.models.files import folded
 
 # Ours -> published, one rule after the other.
@@ -90,6 +91,9 @@ CISTA_TC = (
 )
 
 
+OURS = (".safetensors", ".ckpt")  # what src.models.files reads
+
+
 class Published(NamedTuple):
     """A published network: class, what its authors do before and after it, names, and where its
     sizes are read: the outputs of the convolution `first` are the argument `width`.
@@ -136,9 +140,31 @@ def load(name: str, checkpoint: str | Path | Mapping[str, Tensor]) -> nn.Module:
     return network.eval().requires_grad_(False)
 
 
-def from_config(name: str, weights: str) -> nn.Module:
-    """Return `load` of the path under `baseline.weights`, the key by which users give it."""
-    return load(name, weights)
+def from_config(name: str, weights: str | None) -> nn.Module:
+    """Return the network `name` with the weights that `baseline.weights` gives, frozen.
+
+    `weights`: a name in weights/ or a path of ours (.safetensors, .ckpt), trained on clean events;
+    or the path of the published checkpoint.  Raises ValueError, which says where to get them, when
+    there are none, and when they are another network's.
+    """
+    path = Path(weights or "")
+    shipped = (files.WEIGHTS / f"{weights}.safetensors").is_file()
+    if shipped or (path.is_file() and path.suffix in OURS):
+        network = files.load(weights).requires_grad_(False)
+        if not isinstance(network, NETWORKS[name].kind):
+            kind = type(network).__name__
+            raise ValueError(f"baseline.weights are not those of {name}: a {kind} is in {weights}")
+        return network
+    if path.is_file():
+        return load(name, path)
+    make = (
+        f"make ours with `python -m src.train experiment=clean/{name}` and scripts.ship_weights, "
+    )
+    raise ValueError(
+        f"baseline.weights must be a file with the weights of {name}, got {weights}; "
+        f"{make if path.parent.name == 'clean' else ''}"
+        "or give the path of its authors' checkpoint"
+    )
 
 
 def export(name: str, network: nn.Module) -> dict[str, Tensor]:

@@ -5,6 +5,7 @@
 
 import os
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import lightning
@@ -15,11 +16,13 @@ from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 import src.models
+from baselines.postprocess import Restoration
 from baselines.upstream import from_config
 from src.data.datamodule import LightFieldData
 from src.metrics import evaluation
 from src.metrics.scores import Scores
 from src.models.reconstructor import Reconstructor
+from src.models.unroll import takes
 from src.sim.pipeline import Pipeline
 from src.sim.scenes import MixedRates
 
@@ -128,31 +131,39 @@ def network(cfg: DictConfig) -> tuple[nn.Module, dict]:
 def chosen(cfg: DictConfig) -> nn.Module:
     """Return the network that `ckpt` or else `baseline` names, in eval mode."""
     if cfg.ckpt:
-        return src.models.load(cfg.ckpt)
+        found = src.models.load(cfg.ckpt)
+        if takes(found, "frames"):
+            use = f"baseline=frames postprocess=mambatm postprocess.restorer={cfg.ckpt}"
+            raise ValueError(f"ckpt must be a network for events, got a post-processor; use {use}")
+        return found
     if cfg.get("baseline"):
         return make(cfg.baseline).eval()
     raise ValueError("ckpt or baseline must name a network, got neither")
 
 
 def frozen(cfg: DictConfig) -> nn.Module:
-    """Return the chosen network; ValueError if it wants another number of views than `optics`."""
+    """Return the chosen network, behind it the chosen post-processor.
+
+    Raises ValueError if it wants another number of views than `optics`.
+    """
     found = chosen(cfg)
     wanted = found.views
     if wanted is not None and wanted != cfg.optics.views and not cfg.get("baseline"):
         raise ValueError(
             f"optics.views must be {wanted} for ckpt={cfg.ckpt}, got {cfg.optics.views}"
         )
-    return found
+    return make(cfg.postprocess, source=found) if cfg.get("postprocess") else found
 
 
 def scores(cfg: DictConfig) -> Scores:
     """Return what is measured: without `metrics.lpips`, everything but LPIPS."""
-    return Scores(make(cfg.metrics.lpips) if cfg.metrics.lpips else None)
+    return Scores(make(cfg.metrics.lpips) if cfg.metrics.lpips else None, cfg.metrics.scale)
 
 
 def reconstructor(cfg: DictConfig, net: nn.Module, spec: dict) -> Reconstructor:
-    """Return the Lightning module that trains and tests `net`."""
-    return Reconstructor(
+    """Return the Lightning module that trains and tests `net`; with a `source`, on its frames."""
+    kind = partial(Restoration, source=make(cfg.source)) if cfg.get("source") else Reconstructor
+    return kind(
         net,
         spec,
         loss=make(cfg.loss),

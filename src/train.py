@@ -27,15 +27,16 @@ def train(cfg: DictConfig) -> dict:
     start_from = files.require(cfg.ckpt, spec) if cfg.ckpt else None
     module, data = build.reconstructor(cfg, net, spec), build.data(cfg)
     results.open_run(run, door.resolved(cfg))
-    untrained = build.test(cfg, "untrained", net, data, module.scores)
+    untrained = build.test(cfg, "untrained", module.method, data, module.scores)
     try:
         fit(build.trainer(cfg), module, data, start_from)
     except NotFinite as error:
         same = f"python -m src.simulate like={run}/config.yaml split=train index={error.clips[0]}"
         raise ValueError(f"{error}; seed {cfg.seed}; to see the clip: {same}") from error
-    trained = build.test(cfg, cfg.name, net, data, module.scores)
-    floor = build.test(cfg, "high-pass, centre view", build.make(cfg.floor), data, module.scores)
-    samples.write(run / "samples", net, data.pipelines["test"])
+    trained = build.test(cfg, cfg.name, module.method, data, module.scores)
+    least = build.make(cfg.floor.method)
+    floor = build.test(cfg, cfg.floor.name, least, data, module.scores)
+    samples.write(run / "samples", module.method, data.pipelines["test"])
     return results.write(
         run, door.resolved(cfg), [trained, untrained, floor], **door.facts(cfg, start)
     )

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from src.figures.layouts import Row, comparison
 from src.figures.video import event_picture, row, write_video
-from src.models.unroll import unroll
+from src.models.unroll import video
 from src.sim.optics import Optics
 from src.sim.pipeline import Pipeline, Sample, simulate
 
@@ -25,9 +25,7 @@ def write(folder: Path, network: nn.Module, pipeline: Pipeline, clips: int = 2) 
     written = []
     for index in range(clips):
         sample = simulate(pipeline, [index])
-        frames, _ = unroll(
-            network, sample.voxels, window_s=sample.window_s, positions=sample.positions
-        )
+        frames = video(network, sample)
         parts = {
             "clean": sample.target,
             "centre view": sample.turbulent,

@@ -9,8 +9,10 @@ from torch import nn
 
 from src.data.datamodule import LightFieldData
 from src.metrics.scores import Scores
-from src.models.cost import macs_per_frame
+from src.models.cost import macs, macs_per_frame
 from src.models.reconstructor import Reconstructor
+from src.models.unroll import video
+from src.sim.pipeline import Sample
 
 
 @dataclass(frozen=True)
@@ -36,14 +38,33 @@ def test(
     """Return the row of `network` on the test clips of `data`."""
     module = Reconstructor(network, {}, scores=scores, warmup=warmup)
     trainer.test(module, data, verbose=False)
-    views, bins, height, width = module.voxel_shape
+    macs_of_frame, milliseconds = cost(network, module.sample)
+    height, width = module.sample.target.shape[-2:]
     return Row(
         name,
         module.clips,
         params=sum(parameter.numel() for parameter in network.parameters()),
-        macs_per_frame=macs_per_frame(network, height, width, views=views, bins=bins),
-        latency_ms={f"{height}x{width}": latency_ms(network, height, width, views, bins)},
+        macs_per_frame=macs_of_frame,
+        latency_ms={f"{height}x{width}": milliseconds},
     )
+
+
+@torch.no_grad()
+def cost(network: nn.Module, sample: Sample) -> tuple[int, float]:
+    """Return multiply-accumulates and milliseconds of one frame.
+
+    A method that makes a whole video at once is given all of `sample`, and its cost shared out.
+    """
+    if not hasattr(network, "video"):
+        views, bins, height, width = sample.voxels.shape[2:]
+        size = {"views": views, "bins": bins}
+        return macs_per_frame(network, height, width, **size), latency_ms(
+            network, height, width, **size
+        )
+    frames, start = sample.target.shape[:2].numel(), time.perf_counter()
+    video(network, sample)
+    seconds = time.perf_counter() - start
+    return macs(lambda: video(network, sample)) // frames, 1e3 * seconds / frames
 
 
 @torch.no_grad()

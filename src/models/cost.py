@@ -1,5 +1,7 @@
 """What a network costs: multiply-accumulates of one frame."""
 
+from collections.abc import Callable
+
 import torch
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
@@ -17,6 +19,11 @@ def macs_per_frame(
     device = next((parameter.device for parameter in network.parameters()), torch.device("cpu"))
     voxels = torch.zeros(1, views, bins, height, width, device=device)
     _, state = network(voxels, None)
+    return macs(lambda: network(voxels, state))
+
+
+def macs(work: Callable[[], object]) -> int:
+    """Return the multiply-accumulates of convolutions and matrix products in a call of `work`."""
     with FlopCounterMode(display=False) as counter:
-        network(voxels, state)
+        work()
     return counter.get_total_flops() // 2

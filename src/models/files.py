@@ -64,10 +64,14 @@ def save(path: Path, network: nn.Module, spec: dict, card: dict) -> None:
     spec = {"target": spec["target"], "kwargs": spec["kwargs"] | _unnormalised(spec)}
     plain = _build(spec, path)
     plain.load_state_dict(folded(network))
-    halves = {name: value.half().contiguous() for name, value in plain.state_dict().items()}
+    halves = {name: _half(value).contiguous() for name, value in plain.state_dict().items()}
     partial = path.with_name(path.name + ".partial")
     save_file(halves, partial, {"network": json.dumps(spec), "card": json.dumps(card)})
     os.replace(partial, path)
+
+
+def _half(value: Tensor) -> Tensor:
+    return value.half() if value.is_floating_point() else value
 
 
 def fold(network: nn.Module) -> None:

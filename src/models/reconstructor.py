@@ -10,7 +10,7 @@ from torch.nn.utils import parametrize
 
 from src.metrics.scores import Scores
 from src.models.guard import Guard, NotFinite, finite
-from src.models.unroll import chunks, detach, unroll
+from src.models.unroll import chunks, detach, unroll, video
 
 if TYPE_CHECKING:  # a network knows nothing of the simulation; a sample is read, never made
     from src.sim.pipeline import Sample
@@ -61,6 +61,11 @@ class Reconstructor(LightningModule):
     def scores(self) -> Scores:
         """What is measured in validation and test."""
         return self._measures[1]
+
+    @property
+    def method(self) -> nn.Module:
+        """What is validated and tested."""
+        return self.network
 
     def on_fit_start(self) -> None:
         """Move the loss, which is no submodule, to the training device; undo a test's eval mode."""
@@ -115,17 +120,17 @@ class Reconstructor(LightningModule):
 
     def test_step(self, sample: "Sample", batch_idx: int) -> None:
         """Append the scores of each clip, with what was drawn for it, to `clips`."""
-        self.voxel_shape = tuple(sample.voxels.shape[2:])
+        self.sample = sample
         self.clips += self._measure(sample)
 
     def _measure(self, sample: "Sample") -> list[dict]:
         with parametrize.cached():
-            frames, _ = self._unroll(sample)
+            frames = video(self.method, sample)
         frames, target = frames[:, self.warmup :], sample.target[:, self.warmup :]
         clips = zip(frames, target, sample.drawn, strict=True)
         return [drawn | self.scores(ours, truth) for ours, truth, drawn in clips]
 
-    def _unroll(self, sample: "Sample", part: slice = slice(None), state: Any = None):
+    def _unroll(self, sample: "Sample", part: slice, state: Any):
         known = {"window_s": sample.window_s, "positions": sample.positions}
         return unroll(self.network, sample.voxels[:, part], state, **known)
 

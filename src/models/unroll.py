@@ -2,11 +2,14 @@
 
 import inspect
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+
+if TYPE_CHECKING:
+    from src.sim.pipeline import Sample
 
 
 def unroll(
@@ -29,6 +32,18 @@ def unroll(
         frame, state = network(window, state, **told)
         frames.append(frame)
     return torch.stack(frames, dim=1), state
+
+
+def video(method: nn.Module, sample: "Sample") -> Float[Tensor, "n windows 1 h w"]:
+    """Return what `method` makes of a whole sample, a frame for each window.
+
+    A method that does not go window by window (frames in, or a post-processor behind) has a `video`
+    of its own; it has the attribute `views` as every network.
+    """
+    if hasattr(method, "video"):
+        return method.video(sample)
+    known = {"window_s": sample.window_s, "positions": sample.positions}
+    return unroll(method, sample.voxels, **known)[0]
 
 
 def takes(network: nn.Module, name: str) -> bool:

@@ -18,7 +18,7 @@ def small() -> MambaTM:
     ("name", "parameters"), [("mambatm", 998_029), ("mambatm_published", 7_239_319)]
 )
 def test_parameter_counts(name, parameters):
-    network = make(OmegaConf.load(ROOT / "conf" / "postprocess" / f"{name}.yaml"))
+    network = make(OmegaConf.load(ROOT / "conf" / "model" / f"{name}.yaml"))
     assert sum(p.numel() for p in network.parameters()) == parameters
 
 
