@@ -11,6 +11,7 @@ import subprocess
 from pathlib import Path
 
 import rich
+import yaml
 from rich.table import Table
 
 from src.metrics.bootstrap import interval
@@ -44,6 +45,39 @@ def write_text(path: Path, text: str) -> None:
     os.replace(partial, path)
 
 
+def content(config: str) -> dict:
+    """Return what a resolved `config` (YAML) says of the numbers, and not of where they are put.
+
+    Left out: `paths`, and for training the `ckpt` it went on from (law 6).
+    """
+    found = yaml.safe_load(config)
+    run = found.pop("paths", {}).get("run")
+    if found.get("task") == "train":
+        found.pop("ckpt", None)
+    return json.loads(json.dumps(found).replace(json.dumps(run)[1:-1], "RUN")) if run else found
+
+
+def digest(config: str) -> str:
+    """Return the SHA-256 of the content of a resolved `config`: the same in every folder."""
+    return hashlib.sha256(json.dumps(content(config), sort_keys=True).encode()).hexdigest()
+
+
+def standing(run: Path, config: str) -> bool:
+    """Return whether `run` holds the results of `config` already.
+
+    Raises ValueError where it holds those of another one: a sweep overwrites no result.
+    """
+    file = run / "results.json"
+    if not file.is_file():
+        return False
+    if json.loads(file.read_text()).get("config_sha256") != digest(config):
+        raise ValueError(
+            f"paths.out must be another folder, or {run} moved away: it holds results of another "
+            "configuration"
+        )
+    return True
+
+
 def summary(clips: list[dict]) -> dict:
     """Return {clips, metric: {mean, std, interval}} over clips; the spread of one clip is 0.
 
@@ -67,7 +101,7 @@ def write(run: Path, config: str, rows: list[Row], **facts) -> dict:
         "schema": SCHEMA,
         **facts,
         "git": commit(),
-        "config_sha256": hashlib.sha256(config.encode()).hexdigest(),
+        "config_sha256": digest(config),
         "model": {
             "name": first.name,
             "params": first.params,

@@ -1,0 +1,58 @@
+"""Tables and one HTML page of runs: python -m src.report run=out/sweep/table1."""
+
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+from src import door
+from src.metrics import results
+from src.reports import cells, page, runs, tables, writers
+
+
+def report(cfg: DictConfig) -> list[tables.Table]:
+    """Write `report.md`, `.csv`, `.tex` and `.html` of the runs below `cfg.run`; return the tables.
+
+    With `into`, the Markdown also replaces that file's section of the same title.
+    """
+    given = cfg.run if isinstance(cfg.run, ListConfig) else [cfg.run]
+    folders, out = [Path(str(folder)) for folder in given], Path(cfg.paths.run)
+    found, plans = runs.find(folders), runs.plans(folders)
+    title = cfg.title or sweep_name(found)
+    keys, made = cells.cells(found, plans)
+    paper = OmegaConf.to_container(cfg.paper) if cfg.get("paper") else None
+    wanted = [
+        tables.main(title, keys, made, paper),
+        tables.by_severity(f"{title}: severities apart", keys, made),
+        tables.compared(f"{title}: on the same clips", keys, made),
+    ]
+    drawn = [table for table in wanted if table and table.rows]
+    commands, figures = [plan.command for plan in plans], runs.figures(folders)
+    text = writers.markdown(drawn, commands)
+    results.open_run(out, door.resolved(cfg))
+    results.write_text(out / "report.md", text)
+    results.write_text(out / "report.csv", writers.comma_separated(drawn))
+    results.write_text(out / "report.tex", writers.latex(drawn))
+    size = int(cfg.media_mib * 2**20)
+    whole = page.html(title, drawn, made, figures, commands=commands, media_bytes=size)
+    results.write_text(out / "report.html", whole)
+    if cfg.into:
+        writers.replace_section(Path(cfg.into), title, text)
+    print(f"{text}\nin {out}: report.md, report.csv, report.tex, report.html")
+    return drawn
+
+
+def sweep_name(found: list[runs.Run]) -> str:
+    """Return the config that all runs were asked for, such as table1; else `runs`."""
+    names = {run.record.get("asked", {}).get("config", "") for run in found}
+    return names.pop() if len(names) == 1 and names != {""} else "runs"
+
+
+@hydra.main(version_base=None, config_path="../conf", config_name="report")
+def main(cfg: DictConfig) -> None:
+    """Glue between Hydra and `report`."""
+    door.job(report, cfg)
+
+
+if __name__ == "__main__":
+    door.run(main)

@@ -1,0 +1,132 @@
+"""A table as Markdown, CSV and LaTeX; a section of a document replaced between its markers."""
+
+import csv
+import io
+import re
+from pathlib import Path
+
+from src.metrics import results
+from src.reports.tables import Column, Table, Value
+
+ARROWS = {1: " ↑", -1: " ↓", 0: ""}
+LATEX = {"&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}"}
+LATEX |= {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"}
+LATEX |= {"±": r"$\pm$", "×": r"$\times$", "↑": r"$\uparrow$", "↓": r"$\downarrow$"}
+
+
+def markdown(tables: list[Table], commands: list[str] = ()) -> str:
+    """Return the tables with their titles, marks and commands."""
+    parts = [f"`{command}`" for command in commands]
+    for table in tables:
+        heads = [head_text(column) for column in table.columns]
+        rules = ["---" if place < table.labels else "--:" for place in range(len(heads))]
+        lines = [f"**{_escaped(table.title)}**", "", _line(heads), _line(rules)]
+        for row in table.rows:
+            texts = []
+            for place, value in enumerate(row):
+                written = _escaped(value_text(value, table.columns[place]))
+                texts.append(f"**{written}**" if is_best(table, place, value) else written)
+            lines.append(_line(texts))
+        parts += ["\n".join(lines), *map(_escaped, remarks(table))]
+    return "\n\n".join(parts) + "\n"
+
+
+def comma_separated(tables: list[Table]) -> str:
+    """Return the tables one under another, full precision, mean and spread in columns."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    for table in tables:
+        names = []
+        for place, column in enumerate(table.columns):
+            spread = any(row[place].spread is not None for row in table.rows)
+            names += [column.name, f"{column.name}_std"] if spread else [column.name]
+        writer.writerow(["table", *names])
+        for row in table.rows:
+            cells = [table.title]
+            for value, column in zip(row, table.columns, strict=True):
+                cells.append(value.words if value.mean is None else value.mean)
+                if f"{column.name}_std" in names:
+                    cells.append("" if value.spread is None else value.spread)
+            writer.writerow(cells)
+    return text.getvalue()
+
+
+def latex(tables: list[Table]) -> str:
+    """Return one booktabs `table` environment per table; best values are bold."""
+    return "\n".join(map(_latex, tables))
+
+
+def replace_section(document: Path, name: str, text: str) -> None:
+    """Put `text` between the markers `<!-- report:name -->` and `<!-- end:name -->`, atomically.
+
+    Raises ValueError where the document is not there or does not hold the two lines once.
+    """
+    start, end = f"<!-- report:{name} -->", f"<!-- end:{name} -->"
+    content = document.read_text() if document.is_file() else ""
+    counts = content.count(start), content.count(end)
+    if counts != (1, 1) or content.index(end) < content.index(start):
+        raise ValueError(f"into must hold the lines {start} and {end} once, got {document}")
+    before, rest = content.split(start)
+    after = rest.split(end)[1]
+    results.write_text(document, f"{before}{start}\n\n{text.strip()}\n\n{end}{after}")
+
+
+def value_text(value: Value, column: Column) -> str:
+    """Return a value as people read it: words, a mean, a mean ± its spread, or a dash."""
+    if value.words:
+        return value.words
+    if value.mean is None:
+        return "-"
+    number = f"{value.mean:,.{column.digits}f}"
+    return number if value.spread is None else f"{number} ± {value.spread:.{column.digits}f}"
+
+
+def head_text(column: Column) -> str:
+    """Return the head of a column with its arrow, and its group in brackets."""
+    group = f" ({column.group})" if column.group else ""
+    return column.head + ARROWS[column.better] + group
+
+
+def is_best(table: Table, place: int, value: Value) -> bool:
+    """Return whether `value` is the best of its column, as printed."""
+    best = table.best(place)
+    digits = table.columns[place].digits
+    return best is not None and value.mean is not None and round(value.mean, digits) == best
+
+
+def remarks(table: Table) -> list[str]:
+    """Return the marks of a table, numbered, and its note."""
+    numbered = [f"[{number}] {mark}" for number, mark in enumerate(table.marks, 1)]
+    return [*numbered, table.note] if table.note else numbered
+
+
+def _line(cells: list[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _escaped(text: str) -> str:
+    return text.replace("\n", " ").replace("|", r"\|").replace("<", "&lt;")
+
+
+def _tex(text: str) -> str:
+    return re.sub(".", lambda found: LATEX.get(found[0], found[0]), text)
+
+
+def _latex(table: Table) -> str:
+    heads = [_tex(head_text(column)) for column in table.columns]
+    lines = [" & ".join(heads) + r" \\", r"\midrule"]
+    for row in table.rows:
+        texts = []
+        for place, value in enumerate(row):
+            written = _tex(value_text(value, table.columns[place]))
+            best = is_best(table, place, value)
+            texts.append(rf"\textbf{{{written}}}" if best else written)
+        lines.append(" & ".join(texts) + r" \\")
+    shape = "l" * table.labels + "r" * (len(table.columns) - table.labels)
+    body = "\n".join(lines)
+    caption = _tex(" ".join([f"{table.title}.", *remarks(table)]))
+    return (
+        "% needs \\usepackage{booktabs}\n\\begin{table}\n\\centering\n"
+        f"\\caption{{{caption}}}\n\\begin{{tabular}}{{{shape}}}\n\\toprule\n{body}\n"
+        "\\bottomrule\n\\end{tabular}\n\\end{table}\n"
+    )
