@@ -15,6 +15,8 @@ from src.models.unroll import chunks, detach, unroll, video
 if TYPE_CHECKING:  # a network knows nothing of the simulation; a sample is read, never made
     from src.sim.pipeline import Sample
 
+PICTURES = 32  # whose losses are computed at a time
+
 
 class Reconstructor(LightningModule):
     """`network`: see the contract in docs/conventions.md; `target` and `kwargs` of `network_spec`
@@ -85,16 +87,29 @@ class Reconstructor(LightningModule):
             # One normalised weight per chunk: spectral norm iterates once, not once per window.
             with parametrize.cached():
                 frames, state = self._unroll(sample, part, detach(state))
-                errors = self.loss(frames.flatten(0, 1), sample.target[:, part].flatten(0, 1))
-            loss = errors.sum() / (windows * len(sample.voxels))
-            self.manual_backward(loss)
-            total += loss.detach()
+            total += self._backward(frames, sample.target[:, part], windows * len(sample.voxels))
         total = self.all_gather(total).mean()
         self._protect(total, sample.drawn)
         self.optimizers().step()
         if self.scheduler is not None:
             self.lr_schedulers().step()
         self.log("train/loss", total, prog_bar=True, batch_size=len(sample.voxels))
+        return total
+
+    def _backward(self, frames: Tensor, target: Tensor, count: int) -> Tensor:
+        """Back-propagate the sum of the losses over `count`; return it.
+
+        The loss sees every picture alone, so its gradient there is had a few pictures at a time,
+        and its own maps (VGG's are larger than the network's) never stand in memory together.
+        """
+        pictures = frames.flatten(0, 1)
+        leaves, total = pictures.detach().requires_grad_(), torch.zeros((), device=self.device)
+        pairs = zip(leaves.split(PICTURES), target.flatten(0, 1).split(PICTURES), strict=True)
+        for ours, truth in pairs:
+            loss = self.loss(ours, truth).sum() / count
+            loss.backward()
+            total += loss.detach()
+        self.manual_backward(pictures, leaves.grad)
         return total
 
     def _protect(self, loss: Tensor, drawn: list[dict]) -> None:
