@@ -22,9 +22,9 @@ def report(cfg: DictConfig) -> list[tables.Table]:
     keys, made = cells.cells(found, plans)
     paper = OmegaConf.to_container(cfg.paper) if cfg.get("paper") else None
     wanted = [
-        tables.main(title, keys, made, paper),
-        tables.by_severity(f"{title}: severities apart", keys, made),
-        tables.compared(f"{title}: on the same clips", keys, made),
+        tables.main("Scores and cost", keys, made, paper),
+        tables.by_severity("Severities apart", keys, made),
+        tables.compared("On the same clips", keys, made),
     ]
     drawn = [table for table in wanted if table and table.rows]
     commands, figures = [plan.command for plan in plans], runs.figures(folders)

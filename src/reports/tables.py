@@ -196,9 +196,10 @@ def _sizes(cells: list[Cell]) -> str:
         return ""
     sizes = {size for record in records for size in record["latency_ms"]}
     clips = {record["test"]["clips"] for record in records}
+    devices = {record["device"] for record in records}
     return (
         f"{_listed(clips)} test clips; ms and GMAC of one frame of {_listed(sizes)}; ± is the "
-        f"sample standard deviation over n seeds; {_listed({record['device'] for record in records})}."
+        f"sample standard deviation over n seeds; {_listed(devices)}."
     )
 
 

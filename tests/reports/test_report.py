@@ -1,0 +1,171 @@
+"""Numbers, marks and gaps as they reach the tables, the documents and the page."""
+
+import csv
+import io
+import math
+from html.parser import HTMLParser
+
+import pytest
+
+from src.report import report
+from src.reports import cells, page, runs, tables, writers
+from tests.reports.runs import clips_of, write_run, write_samples, write_sweep
+from tests.test_train import config
+
+PAPER = {"source": "paper: other data", "rows": [{"when": {"experiment": "lf3x3"}, "psnr": 15.4}]}
+
+
+def built(folder, paper=None):
+    keys, made = cells.cells(runs.find([folder]), runs.plans([folder]))
+    return tables.main("main", keys, made, paper), keys, made
+
+
+def value(table, row, name):
+    place = [column.name for column in table.columns].index(name)
+    return table.rows[row][place]
+
+
+def test_mean_and_sample_deviation_over_seeds(tmp_path):
+    for seed, ssim in enumerate((0.5, 0.6, 0.7)):
+        write_run(tmp_path / str(seed), seed=seed, scores={"ssim": ssim})
+    table, _, _ = built(tmp_path)
+    found = value(table, 0, "ssim")
+    assert math.isclose(found.mean, 0.6) and math.isclose(found.spread, 0.1)
+    assert value(table, 0, "gmac") == tables.Value(0.608) and value(table, 0, "n").words == "3"
+    assert writers.value_text(found, tables.SCORES[1]) == "0.600 ± 0.100"
+
+
+def test_one_seed_has_no_spread_and_a_metric_not_taken_is_a_dash(tmp_path):
+    write_run(tmp_path / "a", scores={"lpips": math.nan})
+    table, _, _ = built(tmp_path)
+    assert value(table, 0, "ssim").spread is None
+    assert writers.value_text(value(table, 0, "lpips"), tables.SCORES[0]) == "-"
+
+
+def test_missing_cells_are_shown(tmp_path):
+    write_sweep(tmp_path, {"experiment": "lf3x3,single256", "seed": "range(2)"})
+    write_run(tmp_path / "a", "lf3x3", 0)
+    table, _, _ = built(tmp_path)
+    assert [value(table, row, "n").words for row in (0, 1)] == ["1 of 2", "missing"]
+    assert value(table, 1, "psnr").mean is None
+
+
+def test_severities_are_means_over_their_clips(tmp_path):
+    write_run(tmp_path / "a", seed=0, clips=clips_of("strong weak weak", lpips=0.3))
+    _, keys, made = built(tmp_path)
+    table = tables.by_severity("split", keys, made)
+    assert math.isclose(value(table, 0, "lpips_weak").mean, 0.45)
+    assert math.isclose(value(table, 0, "lpips_strong").mean, 0.3)
+    assert "lpips_medium" not in [column.name for column in table.columns]
+
+
+def test_one_severity_needs_no_split(tmp_path):
+    write_run(tmp_path / "a", clips=clips_of("weak weak"))
+    _, keys, made = built(tmp_path)
+    assert tables.by_severity("split", keys, made) is None
+
+
+def test_the_papers_numbers_stand_in_columns_of_their_own(tmp_path):
+    write_run(tmp_path / "a", "lf3x3")
+    write_run(tmp_path / "b", "single256")
+    table, _, _ = built(tmp_path, PAPER)
+    assert value(table, 0, "paper_psnr").mean == 15.4 and value(table, 0, "psnr").mean == 17.0
+    assert value(table, 1, "paper_psnr").mean is None
+    assert "PSNR (paper: other data)" in writers.markdown([table])
+    assert "paper_ssim" not in [column.name for column in table.columns]
+
+
+def test_the_best_of_a_column_is_what_is_printed_best(tmp_path):
+    for name, psnr in [("a", 17.001), ("b", 17.0), ("c", 16.0)]:
+        write_run(tmp_path / name, name, scores={"psnr": psnr})
+    table, _, _ = built(tmp_path)
+    place = [column.name for column in table.columns].index("psnr")
+    marked = [writers.is_best(table, place, row[place]) for row in table.rows]
+    assert marked == [True, True, False]
+
+
+def test_csv_has_full_precision_and_mean_and_spread_apart(tmp_path):
+    for seed, ssim in enumerate((0.123456789, 0.2)):
+        write_run(tmp_path / str(seed), seed=seed, scores={"ssim": ssim})
+    (row,) = csv.DictReader(io.StringIO(writers.comma_separated([built(tmp_path)[0]])))
+    assert float(row["ssim"]) == (0.123456789 + 0.2) / 2 and float(row["ssim_std"]) > 0
+    assert row["experiment"] == "lf3x3"
+
+
+def test_latex_is_booktabs_and_escapes(tmp_path):
+    write_run(tmp_path / "a", "a_b&c")
+    text = writers.latex([built(tmp_path)[0]])
+    for part in (r"\toprule", r"\midrule", r"\bottomrule", r"a\_b\&c", r"PSNR $\uparrow$"):
+        assert part in text
+    assert text.count("{") == text.count("}")
+
+
+def test_a_section_is_replaced_and_the_text_around_it_stays(tmp_path):
+    document = tmp_path / "results.md"
+    document.write_text("before\n<!-- report:a -->\nold\n<!-- end:a -->\nafter\n")
+    writers.replace_section(document, "a", "new\n")
+    writers.replace_section(document, "a", "newer\n")
+    wanted = "before\n<!-- report:a -->\n\nnewer\n\n<!-- end:a -->\nafter\n"
+    assert document.read_text() == wanted and list(tmp_path.iterdir()) == [document]
+    with pytest.raises(ValueError, match="<!-- report:b -->"):
+        writers.replace_section(document, "b", "new")
+    assert document.read_text() == wanted
+
+
+class Seen(HTMLParser):
+    """The tags and the addresses of a page; fails where a tag is left open."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.open, self.tags, self.addresses = [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.addresses += [value for key, value in attrs if key in ("src", "href")]
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_the_page_needs_nothing_from_elsewhere_and_keeps_names_harmless(tmp_path):
+    run = write_run(tmp_path / "a", "<script>alert(1)</script>{{body}}")
+    write_samples(run)
+    (tmp_path / "chart.svg").write_text("<svg xmlns='http://www.w3.org/2000/svg'/>")
+    table, _, made = built(tmp_path)
+    text = page.html("t", [table], made, runs.figures([tmp_path]), commands=[], media_bytes=1 << 20)
+    seen = Seen(text)
+    assert seen.open == [] and seen.tags.count("script") == 1 and seen.tags.count("img") == 3
+    assert all(address.startswith("data:image/") for address in seen.addresses)
+
+
+def test_pictures_beyond_the_bound_are_named(tmp_path):
+    run = write_run(tmp_path / "a")
+    write_samples(run, size=64)
+    table, _, made = built(tmp_path)
+    text = page.html("t", [table], made, [], commands=[], media_bytes=100)
+    assert "<img" not in text and "Left out" in text and "clip0.gif" in text
+
+
+def test_the_door_writes_four_files_and_the_section(tmp_path):
+    write_run(tmp_path / "runs" / "a", clips=clips_of())
+    document = tmp_path / "results.md"
+    document.write_text("<!-- report:table1 -->\n<!-- end:table1 -->\n")
+    cfg = config("report", tmp_path / "out", f"run={tmp_path / 'runs'}", f"into={document}")
+    assert [table.title for table in report(cfg)] == [
+        "Scores and cost",
+        "Severities apart",
+        "On the same clips",
+    ]
+    written = {file.name for file in (tmp_path / "out").iterdir()}
+    assert {"report.md", "report.csv", "report.tex", "report.html"} <= written
+    assert "| lf3x3 | **" not in document.read_text() and "| lf3x3 |" in document.read_text()
+
+
+def test_an_empty_folder_is_refused_and_nothing_is_written(tmp_path):
+    (tmp_path / "runs").mkdir()
+    with pytest.raises(ValueError, match="run must hold results.json"):
+        report(config("report", tmp_path / "out", f"run={tmp_path / 'runs'}"))
+    assert not (tmp_path / "out").exists()
