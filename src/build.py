@@ -46,7 +46,7 @@ def make(node: Any, **kwargs) -> Any:
     except InstantiationException as error:
         if isinstance(error.__cause__, ValueError):
             raise error.__cause__ from None
-        raise
+        raise ValueError(f"{plain['_target_']} takes no such values: {error.__cause__}") from error
 
 
 def _targets(node: Any) -> Iterator[str]:
@@ -90,19 +90,22 @@ def pipeline(cfg: DictConfig, split: str) -> Pipeline:
         )
         for rate in rates
     ]
-    return Pipeline(
-        MixedRates(scenes) if len(scenes) > 1 else scenes[0],
-        make(cfg.optics),
-        OmegaConf.to_container(cfg.turbulence, resolve=True),
-        OmegaConf.to_container(cfg.sensor, resolve=True),
-        split=split,
-        seed=cfg.seed,
-        bins=cfg.bins,
-        substeps=substeps,
-        crop=cfg.data.crop if training else cfg.data.test_crop,
-        random_crop=training,
-        clips=cfg.data.clips if training else None,
-    )
+    try:
+        return Pipeline(
+            MixedRates(scenes) if len(scenes) > 1 else scenes[0],
+            make(cfg.optics),
+            OmegaConf.to_container(cfg.turbulence, resolve=True),
+            OmegaConf.to_container(cfg.sensor, resolve=True),
+            split=split,
+            seed=cfg.seed,
+            bins=cfg.bins,
+            substeps=substeps,
+            crop=cfg.data.crop if training else cfg.data.test_crop,
+            random_crop=training,
+            clips=cfg.data.clips if training else None,
+        )
+    except TypeError as error:
+        raise ValueError(f"turbulence or sensor takes no such values: {error}") from error
 
 
 def data(cfg: DictConfig, splits: tuple[str, ...] = ("train", "val", "test")) -> LightFieldData:

@@ -6,12 +6,12 @@ in a file is executed: only classes of `src.models` and `baselines` are built, f
 
 import json
 import os
-import pickle
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
@@ -20,6 +20,7 @@ from src.models.checkpoints import newest, whole
 
 WEIGHTS = Path(__file__).resolve().parents[2] / "weights"
 ROOMS = ("src.models.", "baselines.")
+LARGEST = 4096  # any number in the arguments of a network that a file names
 
 
 def load(name_or_path: str | Path) -> nn.Module:
@@ -37,8 +38,10 @@ def load(name_or_path: str | Path) -> nn.Module:
         names = ", ".join(sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))) or "none yet"
         raise ValueError(f"ckpt must be a file or one of weights/ ({names}), got {name_or_path}")
     spec, weights = (_safetensors if path.suffix == ".safetensors" else _checkpoint)(path)
+    with torch.device("meta"):  # without memory: a small file may name a huge network
+        _check_fit(_build(spec, path), weights, path)
     network = _build(spec, path)
-    _fill(network, weights, path)
+    network.load_state_dict(weights)
     fold(network)
     return network.float().eval()
 
@@ -107,7 +110,7 @@ def _safetensors(path: Path) -> tuple[dict, dict[str, Tensor]]:
             header = file.metadata() or {}
             weights = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118
         return json.loads(header["network"]), weights
-    except (SafetensorError, KeyError, ValueError, OSError) as error:
+    except Exception as error:  # libraries raise all kinds on a broken file
         raise ValueError(f"ckpt must be a network written by this project, got {path}") from error
 
 
@@ -119,7 +122,7 @@ def _checkpoint(path: Path) -> tuple[dict, dict[str, Tensor]]:
         state = content["state_dict"]
         weights = {n.removeprefix("network."): v for n, v in state.items() if "network." in n}
         return content["network"], weights
-    except (RuntimeError, KeyError, TypeError, EOFError, OSError, pickle.UnpicklingError) as error:
+    except Exception as error:  # libraries raise all kinds on a broken file
         raise ValueError(f"ckpt must be a checkpoint of src.train, got {path}") from error
 
 
@@ -132,16 +135,27 @@ def _build(spec: dict, path: Path) -> nn.Module:
         raise ValueError(
             f"ckpt must hold a network of {' or '.join(ROOMS)}, got {target} in {path}"
         )
+    _check_sizes(kwargs, path)
     room, _, name = target.rpartition(".")
     try:
         kind = getattr(import_module(room), name)
-        assert issubclass(kind, nn.Module)
+        if not issubclass(kind, nn.Module):
+            raise TypeError(f"{target} is no network")
         return kind(**kwargs)
-    except (ImportError, AttributeError, AssertionError, TypeError) as error:
+    except Exception as error:  # networks raise all kinds for arguments that are not theirs
         raise ValueError(f"ckpt names a network that is not here: {target} in {path}") from error
 
 
-def _fill(network: nn.Module, weights: dict[str, Tensor], path: Path) -> None:
+def _check_sizes(value: Any, path: Path) -> None:
+    """Raise ValueError for a number beyond LARGEST: such a network would fill the memory."""
+    if isinstance(value, dict | list | tuple):
+        for part in value.values() if isinstance(value, dict) else value:
+            _check_sizes(part, path)
+    elif isinstance(value, int | float) and not abs(value) <= LARGEST:
+        raise ValueError(f"ckpt must hold sizes up to {LARGEST}, got {value} in {path}")
+
+
+def _check_fit(network: nn.Module, weights: dict[str, Tensor], path: Path) -> None:
     own = network.state_dict()
     missing, extra = sorted(own.keys() - weights.keys()), sorted(weights.keys() - own.keys())
     other = [n for n in own.keys() & weights.keys() if own[n].shape != weights[n].shape]
@@ -150,4 +164,3 @@ def _fill(network: nn.Module, weights: dict[str, Tensor], path: Path) -> None:
             f"ckpt does not fit {type(network).__name__} in {path}: missing {missing}, "
             f"extra {extra}, of another shape {sorted(other)}"
         )
-    network.load_state_dict(weights)
