@@ -1,0 +1,49 @@
+"""A network made for running only: bf16, channels-last, folded, idle when nothing happens."""
+
+from collections.abc import Sequence
+from copy import deepcopy
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from src.models.files import fold
+from src.models.unroll import takes
+
+
+class Fast(nn.Module):
+    """`network`, copied, with weights and maps of `dtype` and laid out channels-last.
+
+    `skip_empty`: a window without any event gives the last frame again and leaves the state.  Which
+    views and what else it takes are those of `network`; frames are float32.
+    """
+
+    def __init__(
+        self, network: nn.Module, *, dtype: torch.dtype = torch.bfloat16, skip_empty: bool = True
+    ):
+        super().__init__()
+        inner = deepcopy(network).eval().requires_grad_(False)
+        fold(inner)
+        self.inner = inner.to(dtype=dtype, memory_format=torch.channels_last)
+        self.views, self.dtype, self.skip_empty = network.views, dtype, skip_empty
+        self.told = [name for name in ("window_s", "positions") if takes(network, name)]
+
+    @torch.no_grad()
+    def forward(
+        self,
+        voxels: Float[Tensor, "n views bins h w"],
+        state: Any = None,
+        *,
+        window_s: float | Tensor = 1 / 120,
+        positions: Sequence[tuple[int, int]] | None = None,
+    ) -> tuple[Float[Tensor, "n 1 h w"], Any]:
+        """Return the frame and the state (the network's own, last frame)."""
+        if self.skip_empty and state is not None and not voxels.any():
+            return state[1], state
+        facts = {"window_s": window_s, "positions": positions}
+        told = {name: facts[name] for name in self.told}
+        own = None if state is None else state[0]
+        frame, own = self.inner(voxels.to(self.dtype), own, **told)
+        frame = frame.float()
+        return frame, (own, frame)

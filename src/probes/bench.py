@@ -1,0 +1,140 @@
+"""The bench: standard clips, one subject at a time, and what a probe finds."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from src.metrics.image import aligned_psnr
+from src.models.unroll import takes
+from src.probes.stream import Conditions, Stream, film
+from src.sim.optics import layout
+from src.sim.pipeline import Pipeline
+
+STANDARD = Conditions()
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a probe found: `value` in `unit`, and how it went with what was varied.
+
+    `curve`: (what was set, value) from easy to hard.  It is a failure beyond `limit`; `high`: the
+    higher the better.
+    """
+
+    value: float
+    unit: str
+    limit: float
+    curve: list[tuple[Any, float]] = field(default_factory=list)
+    varied: str = ""
+    high: bool = False
+
+    def fails(self, value: float) -> bool:
+        """Return whether `value` is beyond the limit; what is not a number is."""
+        return not (value >= self.limit if self.high else value <= self.limit)
+
+    @property
+    def failed(self) -> bool:
+        """Whether the value is beyond the limit."""
+        return self.fails(self.value)
+
+    @property
+    def breaks_at(self) -> Any:
+        """What was set where the limit is first exceeded; None: nowhere."""
+        return next((setting for setting, value in self.curve if self.fails(value)), None)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A network with the views it is given: `views` 1 is the centre view."""
+
+    name: str
+    network: nn.Module
+    views: int
+
+    def choose(self, voxels: Tensor, positions: Sequence) -> tuple[Tensor, list]:
+        """Return the views (axis 1 of `voxels`) that the network is given, and where they stand."""
+        chosen = [place for place in layout(self.views) if place in positions]
+        if len(chosen) < self.views:
+            raise ValueError(f"the light field has {len(positions)} views, {self.views} are needed")
+        return voxels[:, [positions.index(place) for place in chosen]], chosen
+
+    @torch.no_grad()
+    def step(
+        self, voxels: Tensor, state: Any, positions: Sequence, window_s: float
+    ) -> tuple[Tensor, Any]:
+        """Return the frame (1, 1, h, w), clipped, float32, and the state."""
+        facts = {"window_s": window_s, "positions": positions}
+        told = {name: value for name, value in facts.items() if takes(self.network, name)}
+        frame, state = self.network(voxels, state, **told)
+        return frame.float().clamp(0, 1), state
+
+    def play(
+        self, windows: Iterable[Tensor], positions: Sequence, window_s: float, state: Any = None
+    ) -> tuple[Tensor, Any]:
+        """Return frames (windows, 1, h, w) and the state after `windows` (1, views, bins, h, w)."""
+        frames = []
+        for voxels in windows:
+            chosen, places = self.choose(voxels, positions)
+            frame, state = self.step(chosen, state, places, window_s)
+            frames.append(frame)
+        return torch.cat(frames), state
+
+    def needs_views(self, least: int = 2) -> None:
+        """Raise ValueError unless it is given at least so many views."""
+        if self.views < least:
+            raise ValueError("it is given the centre view only")
+
+
+class Bench:
+    """Standard clips `numbers` of `pipeline`; frames of the first `warmup` windows do not count."""
+
+    def __init__(self, pipeline: Pipeline, numbers: Sequence[int], warmup: int):
+        self.pipeline, self.numbers, self.warmup = pipeline, numbers, warmup
+        self._films: dict[str, list[Stream]] = {}
+        self._standard: dict[str, float] = {}
+
+    def streams(self, conditions: Conditions = STANDARD) -> list[Stream]:
+        """Return the clips under `conditions`; each is simulated once."""
+        known = repr(conditions)
+        if known not in self._films:
+            found = [film(self.pipeline, number, conditions) for number in self.numbers]
+            self._films[known] = found
+        return self._films[known]
+
+    def quality(self, subject: Subject, conditions: Conditions = STANDARD) -> float:
+        """Return the aligned PSNR in dB at the clips' own rate, the mean over clips."""
+        return self.over_clips(subject, self.streams(conditions), lambda x: x)
+
+    def standard(self, subject: Subject) -> float:
+        """Return `quality` of the standard clips, measured once for each subject."""
+        if subject.name not in self._standard:
+            self._standard[subject.name] = self.quality(subject)
+        return self._standard[subject.name]
+
+    def over_clips(self, subject: Subject, streams: Sequence[Stream], change: Any) -> float:
+        """Return the mean aligned PSNR with every window (1, views, bins, h, w) put through
+        `change`.
+        """
+        values = []
+        for stream in streams:
+            windows = map(change, stream.windows(stream.fps))
+            frames, _ = subject.play(windows, stream.positions, 1 / stream.fps)
+            values.append(self.score(frames, stream.target[1:]))
+        return sum(values) / len(values)
+
+    def losses(self, subject: Subject, settings: dict[Any, Conditions]) -> list[tuple[Any, float]]:
+        """Return (setting, dB lost against the standard clips) for each."""
+        base = self.standard(subject)
+        return [(name, base - self.quality(subject, c)) for name, c in settings.items()]
+
+    def score(self, frames: Tensor, target: Tensor) -> float:
+        """Return the mean aligned PSNR of the frames that count."""
+        return float(aligned_psnr(frames[self.warmup :], target[self.warmup :, None]).mean())
+
+
+def worst(curve: list[tuple[Any, float]], *, unit: str, limit: float, varied: str) -> Finding:
+    """Return the finding whose value is the largest of the curve."""
+    return Finding(max(value for _, value in curve), unit, limit, curve, varied)

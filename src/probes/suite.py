@@ -1,0 +1,109 @@
+"""Every probe on every network: findings, a table of them, and in plain words where each breaks."""
+
+import csv
+import io
+import time
+from collections.abc import Callable, Mapping
+
+import rich
+
+from src.metrics.lineup import Candidate
+from src.probes.bench import Bench, Finding, Subject
+
+Probe = Callable[[Subject, Bench], Finding]
+Cell = Finding | str  # or why there is none
+Found = dict[str, dict[str, Cell]]  # probe -> network -> cell
+
+
+def run(candidates: list[Candidate], probes: Mapping[str, Probe], bench: Bench) -> Found:
+    """Return every cell; a probe that cannot run leaves the reason instead of a finding."""
+    found: Found = {name: {} for name in probes}
+    for candidate in candidates:
+        start = time.perf_counter()
+        for name, probe in probes.items():
+            found[name][candidate.name] = _cell(candidate, probe, bench)
+        rich.print(f"{candidate.name}: {time.perf_counter() - start:.0f} s")
+    return found
+
+
+def _cell(candidate: Candidate, probe: Probe, bench: Bench) -> Cell:
+    if candidate.network is None:
+        return candidate.missing
+    if not candidate.trained:
+        return f"it has no weights: {candidate.missing}"
+    try:
+        return probe(Subject(candidate.name, candidate.network, candidate.views), bench)
+    except ValueError as error:
+        return str(error)
+
+
+def standards(candidates: list[Candidate], bench: Bench) -> dict[str, float]:
+    """Return the aligned PSNR in dB of every network that runs, where nothing is made hard."""
+    able = [c for c in candidates if c.network is not None and c.trained]
+    return {c.name: bench.standard(Subject(c.name, c.network, c.views)) for c in able}
+
+
+def table(found: Found, titles: Mapping[str, str]) -> str:
+    """Return CSV: one line for the value of each cell and for each point of its curve."""
+    text = io.StringIO()
+    writer = csv.writer(text)
+    heads = "network probe title varied setting value unit limit failed reason"
+    writer.writerow(heads.split())
+    for probe, cells in found.items():
+        for network, cell in cells.items():
+            writer.writerows(_lines(network, probe, titles[probe], cell))
+    return text.getvalue()
+
+
+def _lines(network: str, probe: str, title: str, cell: Cell) -> list[list]:
+    head = [network, probe, title]
+    if isinstance(cell, str):
+        return [[*head, "", "", "", "", "", "", cell]]
+    tail = [cell.unit, cell.limit]
+    points = [
+        [*head, cell.varied, setting, f"{value:.6g}", *tail, cell.fails(value), ""]
+        for setting, value in cell.curve
+    ]
+    return [[*head, "", "", f"{cell.value:.6g}", *tail, cell.failed, ""], *points]
+
+
+def words(found: Found, titles: Mapping[str, str], standards: Mapping[str, float]) -> str:
+    """Return, in plain words, where each network breaks."""
+    networks = list(next(iter(found.values()), {}))
+    parts = ["# Where each method breaks\n"]
+    for network in networks:
+        cells = {titles[probe]: row[network] for probe, row in found.items()}
+        parts.append(f"## {network}\n\n{_standard(standards.get(network))}{_account(cells)}\n")
+    return "\n".join(parts)
+
+
+def _standard(quality: float | None) -> str:
+    return "" if quality is None else f"On the standard clips: aligned PSNR {quality:.2f} dB. "
+
+
+def _account(cells: Mapping[str, Cell]) -> str:
+    ran = {title: cell for title, cell in cells.items() if isinstance(cell, Finding)}
+    absent = {title: cell for title, cell in cells.items() if isinstance(cell, str)}
+    failed = {title: cell for title, cell in ran.items() if cell.failed}
+    lines = [f"Breaks in {len(failed)} of {len(ran)} probes that ran."]
+    lines += [f"- {title}: {_sentence(cell)}" for title, cell in failed.items()]
+    held = [f"{title} ({_amount(cell.value)} {cell.unit})" for title, cell in ran.items()
+            if not cell.failed]  # fmt: skip
+    if held:
+        lines += ["", "Holds: " + "; ".join(held) + "."]
+    reasons: dict[str, list[str]] = {}
+    for title, reason in absent.items():
+        reasons.setdefault(reason, []).append(title)
+    lines += [f"\nNot run, because {why}: {'; '.join(t)}." for why, t in reasons.items()]
+    return "\n".join(lines)
+
+
+def _sentence(cell: Finding) -> str:
+    side = "at least" if cell.high else "at most"
+    text = f"{_amount(cell.value)} {cell.unit}, allowed is {side} {cell.limit:g}"
+    where = cell.breaks_at
+    return text if where is None else f"{text}; beyond it from {cell.varied} = {where} on"
+
+
+def _amount(value: float) -> str:
+    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
