@@ -7,7 +7,7 @@ from pathlib import Path
 
 from src.reports.cells import Cell
 from src.reports.tables import Column, Table, Value
-from src.reports.writers import head_text, is_best, remarks, value_text
+from src.reports.writers import ARROWS, is_best, remarks, value_text
 
 TEMPLATE = Path(__file__).with_name("page.html")
 TYPES = {".gif": "image/gif", ".png": "image/png", ".svg": "image/svg+xml"}
@@ -86,9 +86,8 @@ def _table(table: Table) -> str:
 
 
 def _head(column: Column, word: bool) -> str:
-    plain = Column(column.name, column.head, better=column.better)
     kind = "word" if word else "other" if column.name.startswith("paper_") else ""
-    return f'<th class="{kind}"><button>{escape(head_text(plain))}</button></th>'
+    return f'<th class="{kind}"><button>{escape(column.head + ARROWS[column.better])}</button></th>'
 
 
 def _cell(table: Table, place: int, value: Value) -> str:
@@ -111,9 +110,8 @@ def _figure(file: Path, budget: Budget) -> str:
     source = budget.uri(file)
     if source is None:
         return ""
-    return (
-        f'<h2>{escape(file.stem.capitalize())}</h2>\n<figure><img src="{source}" alt=""></figure>'
-    )
+    head = f"<h2>{escape(file.stem.capitalize())}</h2>"
+    return f'{head}\n<figure class="plot"><img src="{source}" alt=""></figure>'
 
 
 def _films(cells: list[Cell], budget: Budget) -> list[str]:

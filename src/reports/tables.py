@@ -51,9 +51,10 @@ class Table:
         """Return the best mean of a column as it is printed; None where there is no best."""
         head = self.columns[column]
         found = [row[column].mean for row in self.rows if row[column].mean is not None]
-        if head.better == 0 or len(found) < 2:
+        printed = {round(mean, head.digits) for mean in found}
+        if head.better == 0 or len(printed) < 2:
             return None
-        return round(max(found) if head.better > 0 else min(found), head.digits)
+        return max(printed) if head.better > 0 else min(printed)
 
 
 SCORES = (
@@ -82,7 +83,7 @@ def main(title: str, keys: tuple[str, ...], cells: list[Cell], paper: dict | Non
     columns += [Column("n", "n"), *(column for column, _ in shown)]
     table = Table(title, columns, [], len(keys))
     for cell in cells:
-        row = [_name(cell, place, table.marks) for place in range(len(keys))]
+        row = _names(cell, table.marks)
         row += [_over_seeds(cell.runs, _scored(column.name)) for column in SCORES]
         row += [_over_seeds(cell.runs, cost, column.better != 0) for column, cost in COSTS]
         row += [_count(cell), *(found(cell) for _, found in shown)]
@@ -103,38 +104,38 @@ def by_severity(title: str, keys: tuple[str, ...], cells: list[Cell]) -> Table |
         Column(f"{score.name}_{severity}", severity, score.digits, score.better, score.head)
         for score, severity in split
     ]
-    rows = [
-        [Value(words=word) for word in cell.label]
-        + [_over_seeds(cell.runs, _among(score.name, severity)) for score, severity in split]
-        for cell in cells
-    ]
-    return Table(title, [*map(_label, keys), *heads], rows, len(keys))
+    table = Table(title, [*map(_label, keys), *heads], [], len(keys))
+    for cell in cells:
+        row = [_over_seeds(cell.runs, _among(score.name, severity)) for score, severity in split]
+        table.rows.append(_names(cell, table.marks) + row)
+    return table
 
 
 def compared(title: str, keys: tuple[str, ...], cells: list[Cell]) -> Table | None:
     """Return what else the runs scored on their clips, such as the untrained network."""
-    rows = []
+    columns = [*map(_label, keys), Column("compared", "compared"), *SCORES]
+    table = Table(title, columns, [], len(keys) + 1)
     for cell in cells:
+        words = _names(cell, table.marks)
         names = dict.fromkeys(name for run in cell.runs for name in run.record.get("compared", {}))
         for name in names:
-            row = [Value(words=word) for word in (*cell.label, name)]
-            row += [_over_seeds(cell.runs, _scored(c.name, name)) for c in SCORES]
-            rows.append(row)
-    columns = [*map(_label, keys), Column("compared", "compared"), *SCORES]
-    return Table(title, columns, rows, len(keys) + 1) if rows else None
+            row = [_over_seeds(cell.runs, _scored(c.name, name)) for c in SCORES]
+            table.rows.append([*words, Value(words=name), *row])
+    return table if table.rows else None
 
 
 def _label(key: str) -> Column:
     return Column(key, key)
 
 
-def _name(cell: Cell, place: int, marks: list[str]) -> Value:
-    """Return a word of the label; the first one carries the marks of the cell's notes."""
-    if place or not cell.notes:
-        return Value(words=cell.label[place])
+def _names(cell: Cell, marks: list[str]) -> list[Value]:
+    """Return the words of the label; the first one carries the numbers of the cell's marks."""
     numbers = ", ".join(str(len(marks) + k) for k in range(1, len(cell.notes) + 1))
     marks += cell.notes
-    return Value(words=f"{cell.label[0]} [{numbers}]")
+    first, *others = cell.label
+    return [Value(words=f"{first} [{numbers}]" if numbers else first)] + [
+        Value(words=word) for word in others
+    ]
 
 
 def _count(cell: Cell) -> Value:

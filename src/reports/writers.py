@@ -3,6 +3,7 @@
 import csv
 import io
 import re
+from itertools import groupby
 from pathlib import Path
 
 from src.metrics import results
@@ -82,9 +83,9 @@ def value_text(value: Value, column: Column) -> str:
 
 
 def head_text(column: Column) -> str:
-    """Return the head of a column with its arrow, and its group in brackets."""
-    group = f" ({column.group})" if column.group else ""
-    return column.head + ARROWS[column.better] + group
+    """Return the head of a column with its group before it and its arrow after it."""
+    group = f"{column.group}: " if column.group else ""
+    return group + column.head + ARROWS[column.better]
 
 
 def is_best(table: Table, place: int, value: Value) -> bool:
@@ -113,8 +114,8 @@ def _tex(text: str) -> str:
 
 
 def _latex(table: Table) -> str:
-    heads = [_tex(head_text(column)) for column in table.columns]
-    lines = [" & ".join(heads) + r" \\", r"\midrule"]
+    heads = [_tex(column.head + ARROWS[column.better]) for column in table.columns]
+    lines = [*_latex_groups(table.columns), " & ".join(heads) + r" \\", r"\midrule"]
     for row in table.rows:
         texts = []
         for place, value in enumerate(row):
@@ -130,3 +131,14 @@ def _latex(table: Table) -> str:
         f"\\caption{{{caption}}}\n\\begin{{tabular}}{{{shape}}}\n\\toprule\n{body}\n"
         "\\bottomrule\n\\end{tabular}\n\\end{table}\n"
     )
+
+
+def _latex_groups(columns: list[Column]) -> list[str]:
+    """Return the row of groups above the heads and the rules below it; none without groups."""
+    cells, rules, first = [], [], 1
+    for group, members in groupby(columns, key=lambda column: column.group):
+        last = first + len(list(members)) - 1
+        cells.append(rf"\multicolumn{{{last - first + 1}}}{{c}}{{{_tex(group)}}}")
+        rules += [rf"\cmidrule(lr){{{first}-{last}}}"] if group else []
+        first = last + 1
+    return [" & ".join(cells) + r" \\", " ".join(rules)] if rules else []

@@ -71,7 +71,7 @@ def test_the_papers_numbers_stand_in_columns_of_their_own(tmp_path):
     table, _, _ = built(tmp_path, PAPER)
     assert value(table, 0, "paper_psnr").mean == 15.4 and value(table, 0, "psnr").mean == 17.0
     assert value(table, 1, "paper_psnr").mean is None
-    assert "PSNR (paper: other data)" in writers.markdown([table])
+    assert "paper: other data: PSNR" in writers.markdown([table])
     assert "paper_ssim" not in [column.name for column in table.columns]
 
 
