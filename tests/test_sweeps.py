@@ -5,17 +5,24 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from hydra import compose, initialize_config_dir
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
+from src import build
+from src.eval import evaluate
 from src.metrics import results
+from src.models import files
 from src.train import train
 from tests.conftest import ROOT
 from tests.test_door import command, environment
 from tests.test_train import TINY, config
 
 SWEEPS = sorted((ROOT / "sweeps").glob("*.yaml"))
+CLEAN = ("firenet_plus", "e2vid_plus", "etnet", "hypere2vid")
+SMALL = ["scene.height=64", "scene.width=64", "data.test_crop=null", "data.test_clips=1"]
+SMALL += ["data.test_windows=5", "data.warmup=1", "data.workers=0", "metrics.lpips=null"]
 
 
 def content(path: Path) -> dict:
@@ -29,18 +36,41 @@ def jobs(path: Path) -> list[list[str]]:
     return BasicSweeper.split_arguments(parsed, max_batch_size=None)[0]
 
 
+def composed(path: Path, run: Path, *overrides: str) -> DictConfig:
+    """The config of a job of the sweep `path`, as `--config-dir sweeps` makes it."""
+    rest = [f"hydra.searchpath=[file://{ROOT / 'conf'}]", f"paths.out={run}"]
+    with initialize_config_dir(str(path.parent), version_base=None):
+        cfg = compose(path.stem, [*overrides, *rest])
+    cfg.paths.run = str(run)
+    return cfg
+
+
+@pytest.fixture
+def weights(tmp_path, monkeypatch):
+    """Files of tiny, untrained networks under the names of weights/."""
+    monkeypatch.setattr(files, "WEIGHTS", tmp_path / "weights")
+    narrow = {"width=4", "~callbacks.progress"}
+    for name in ("lf3x3", "single256", "mambatm", *(f"clean/{n}" for n in CLEAN)):
+        path = files.WEIGHTS / f"{name}.safetensors"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        network, spec = build.network(config("train", tmp_path, f"experiment={name}", *narrow))
+        files.save(path, network, spec, {})
+
+
 @pytest.mark.parametrize("path", SWEEPS, ids=lambda path: path.stem)
-def test_every_job_composes_and_two_run(path, tmp_path):
+def test_every_job_composes_and_two_run(path, tmp_path, weights):
     sweep = content(path)
-    assert sweep["defaults"] == ["train", "_self_"] and sweep["hydra"]["mode"] == "MULTIRUN"
+    door = sweep["defaults"][0]
+    assert sweep["defaults"][-1] == "_self_" and sweep["hydra"]["mode"] == "MULTIRUN"
     assert "sweep" not in sweep["hydra"]  # the folder follows from the name: conf/hydra
     found = jobs(path)
     assert len(found) == len({tuple(job) for job in found}) >= 3
     for override in {override for job in found for override in job}:
-        config("train", tmp_path, override)
+        composed(path, tmp_path, override)
+    tiny, work = {"train": ([*TINY, "logger=none"], train), "eval": (SMALL, evaluate)}[door]
     for place in (0, -1):
         run = tmp_path / str(place)
-        train(config("train", run, *found[place], *TINY, "logger=none"))
+        work(composed(path, run, *found[place], *tiny))
         assert (run / "results.json").is_file()
 
 
