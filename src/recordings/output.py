@@ -5,6 +5,7 @@ the end files have `partial` in their names, so that none that is cut short is t
 """
 
 import csv
+import errno
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -19,6 +20,7 @@ from PIL import GifImagePlugin, Image
 
 from src.recordings.stream import Frame
 
+LEAST_FREE_BYTES = 32 * 2**20
 Picture = UInt8[np.ndarray, "h w"]
 Add = Callable[[Picture, Frame], None]
 
@@ -48,6 +50,7 @@ def sink(kind: str, folder: Path, size: tuple[int, int], playback_fps: float = 3
 
         def write(frame: Frame) -> None:
             nonlocal count
+            _check_room(folder)
             add(eight_bits(frame.picture), frame)
             table.writerow([count, f"{frame.time_s:.6f}", frame.events, frame.outside])
             count += 1
@@ -57,6 +60,12 @@ def sink(kind: str, folder: Path, size: tuple[int, int], playback_fps: float = 3
         _check_mp4(video, count)
     _rename(video, folder / whole)
     _rename(table_file, folder / "frames.csv")
+
+
+def _check_room(folder: Path) -> None:
+    """Raise OSError while there is room left: HDF5's library crashes when it cannot write."""
+    if shutil.disk_usage(folder).free < LEAST_FREE_BYTES:
+        raise OSError(errno.ENOSPC, f"No space left for another frame in {folder}")
 
 
 def partial(path: Path) -> Path:

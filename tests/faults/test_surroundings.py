@@ -1,0 +1,233 @@
+"""The disk is full, a file cannot be read, a loader's worker dies, the cluster wants its node back:
+the run says so, what was whole stays whole, and it goes on to the same numbers."""
+
+import os
+import resource
+import signal
+import stat
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from src.models.checkpoints import WholeFiles, newest, whole
+from src.recordings import output
+from src.recordings.output import partial, sink
+from src.recordings.stream import Frame
+from tests.faults import harness
+from tests.faults.harness import Run, Tally
+from tests.faults.test_kills import STEPS, training
+
+NOBODY = 65534
+
+
+def written(path: Path, number: float) -> None:
+    WholeFiles().save_checkpoint({"state_dict": {"a": torch.full((50_000,), number)}}, path)
+
+
+@contextmanager
+def small_files(size: int) -> Iterator[None]:
+    """Let no file of this process grow beyond `size` bytes: writing on is an OSError."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_full_disk_leaves_the_checkpoint_that_was_there(tmp_path):
+    path = tmp_path / "last.ckpt"
+    written(path, 1.0)
+    with small_files(100_000), pytest.raises((OSError, RuntimeError)):
+        written(path, 2.0)
+    assert whole(path) and torch.load(path)["state_dict"]["a"][0] == 1
+    assert [file.name for file in tmp_path.iterdir()] == ["last.ckpt"]
+
+
+def test_a_damaged_checkpoint_is_passed_over(tmp_path):
+    for number, name in enumerate(("old", "new")):
+        written(tmp_path / f"{name}.ckpt", number)
+        os.utime(tmp_path / f"{name}.ckpt", (number, number))
+    data = bytearray((tmp_path / "new.ckpt").read_bytes())
+    data[len(data) // 2] ^= 1  # one bit of one weight
+    (tmp_path / "new.ckpt").write_bytes(data)
+    os.utime(tmp_path / "new.ckpt", (1, 1))
+    with pytest.warns(UserWarning, match="new.ckpt is damaged"):
+        assert newest(tmp_path).name == "old.ckpt"
+    (tmp_path / "old.ckpt").unlink()
+    with pytest.warns(UserWarning), pytest.raises(ValueError, match="ckpt must be a folder"):
+        newest(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["mp4", "png", "gif"])
+def test_a_file_that_cannot_grow_is_no_whole_video(kind, tmp_path):
+    pictures = np.random.default_rng(0).random((20, 96, 96), np.float32)
+    with (
+        small_files(4_000),
+        pytest.raises((OSError, RuntimeError)),
+        sink(kind, tmp_path, (96, 96)) as write,
+    ):
+        for number, picture in enumerate(pictures):
+            write(Frame(0.01 * number, picture, 1, 0))
+    assert not [file for file in tmp_path.iterdir() if "partial" not in file.name]
+    assert partial(tmp_path / "frames.csv").is_file()
+
+
+@pytest.mark.parametrize("kind", ["mp4", "png", "gif", "hdf5"])
+def test_a_full_disk_is_no_whole_video(kind, tmp_path, monkeypatch):
+    usage = output.shutil.disk_usage(tmp_path)
+    picture = np.zeros((96, 96), np.float32)
+    with pytest.raises(OSError, match="No space left"), sink(kind, tmp_path, (96, 96)) as write:
+        write(Frame(0.0, picture, 1, 0))
+        monkeypatch.setattr(output.shutil, "disk_usage", lambda path: usage._replace(free=1 << 20))
+        write(Frame(0.1, picture, 1, 0))
+    assert not [file for file in tmp_path.iterdir() if "partial" not in file.name]
+
+
+READERS = {
+    "cap.txt": "src.recordings.formats.read_events",
+    "cap.h5": "src.recordings.formats.read_events",
+    "views.yaml": "src.recordings.views.load",
+    "photo.png": "src.sim.scenes._read",
+    "net.ckpt": "src.models.files.load",
+    "net.safetensors": "src.models.files.load",
+    "old.pth": "baselines.pickles.read",
+}
+
+
+def read_as_nobody(path: str, reader: str) -> None:
+    from hydra.utils import get_object
+
+    function = get_object(reader)
+    os.setgid(NOBODY)
+    os.setuid(NOBODY)
+    function(Path(path))
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become somebody who may not read")
+def test_a_file_that_may_not_be_read_is_named(tmp_path):
+    tally = Tally("unreadable files")
+    for folder in (tmp_path, *list(tmp_path.parents)[:2]):
+        folder.chmod(folder.stat().st_mode | stat.S_IXOTH | stat.S_IROTH)
+    for name, reader in READERS.items():
+        path = tmp_path / name
+        path.write_bytes(b"0.1 1 2 1\n")
+        path.chmod(0)
+        with tally.run():
+            tally.injected += 1
+            run = Run(tmp_path / "log", read_as_nobody, str(path), reader)
+            assert run.wait() == 2, run.text()
+            assert "error: " in run.text() and name in run.text(), run.text()
+
+
+def train_and_lose_a_worker(config: str) -> None:
+    """Run the door train; the loader's worker that simulates clip 3 dies as if out of memory."""
+    from src.sim.pipeline import Pipeline
+
+    draw, main = Pipeline.draw, os.getpid()
+
+    def die(self, number: int):
+        if self.split == "train" and number == 3 and os.getpid() != main:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return draw(self, number)
+
+    Pipeline.draw = die
+    harness.train(config)
+
+
+def test_a_worker_that_dies_ends_the_run_and_it_goes_on(tmp_path):
+    more = ["data.workers=1", "data.reuse=1", "callbacks.rotation.every_n_train_steps=1"]
+    tally = Tally("a loader's worker dies")
+    with tally.run():
+        tally.injected += 1
+        run = Run(tmp_path / "log", train_and_lose_a_worker, training(tmp_path / "first", *more))
+        assert run.wait() == 1 and "DataLoader worker" in run.text(), run.text()
+        assert f"go on with ckpt={tmp_path / 'first' / 'checkpoints'}" in run.text()
+        left = [f"ckpt={tmp_path / 'first'}"]
+        outcomes = []
+        for name, given in (("rest", left), ("alone", [])):
+            config = training(tmp_path / name, *more, *given)
+            run = Run(tmp_path / f"{name}.log", harness.train, config)
+            assert run.wait() == 0, run.text()
+            outcomes.append(harness.outcome(tmp_path / name))
+        assert outcomes[0] == outcomes[1]
+
+
+def on_slurm(config: str, folder: str) -> None:
+    """Run the door train as SLURM starts it, with an `scontrol` that writes down its orders."""
+    os.environ |= {
+        "SLURM_JOB_ID": "77", "SLURM_NTASKS": "1", "SLURM_NTASKS_PER_NODE": "1",
+        "SLURM_JOB_NAME": "train", "SLURM_PROCID": "0", "SLURM_LOCALID": "0", "SLURM_NODEID": "0",
+        "SLURM_JOB_NUM_NODES": "1", "PATH": f"{folder}:{os.environ['PATH']}",
+    }  # fmt: skip
+    harness.train(config)
+
+
+def test_a_preempted_job_is_requeued_and_goes_on(tmp_path, alone):
+    numbers, _ = alone
+    order = tmp_path / "scontrol"
+    order.write_text(f'#!/bin/sh\necho "$@" >> {tmp_path}/orders\n')
+    order.chmod(0o755)
+    tally = Tally("preempted on SLURM")
+    with tally.run():
+        config = training(tmp_path / "run", "trainer=slurm")
+        run = Run(tmp_path / "log", on_slurm, config, str(tmp_path))
+        assert run.until(lambda: bool(list((tmp_path / "run").rglob("every*.ckpt"))))
+        os.kill(run.process.pid, signal.SIGUSR1)
+        assert run.until(lambda: (tmp_path / "orders").is_file()), run.text()
+        assert run.stop(signal.SIGTERM) in (0, 143, -15), run.text()
+        tally.injected += 1
+        assert (tmp_path / "orders").read_text() == "requeue 77\n"
+        (kept,) = (tmp_path / "run").glob("hpc_ckpt_*.ckpt")
+        assert 0 < torch.load(kept, weights_only=True)["global_step"] <= STEPS and whole(kept)
+        again = Run(tmp_path / "log2", on_slurm, config, str(tmp_path))
+        assert again.wait() == 0, again.text()
+        assert harness.outcome(tmp_path / "run") == numbers
+
+
+def may_mount() -> bool:
+    return os.geteuid() == 0 and subprocess.run(["unshare", "-m", "true"]).returncode == 0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not may_mount(), reason="mounting a small disk is not permitted here")
+def test_a_disk_that_is_full_in_earnest(tmp_path, alone):
+    numbers, _ = alone
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=210m", "tmpfs", str(disk)], check=True)
+    tally = Tally("disk full (tmpfs)")
+    try:
+        with tally.run():
+            run = Run(tmp_path / "log", harness.train, training(disk / "first"))
+            assert run.until(lambda: bool(list(disk.rglob("every*.ckpt"))))
+            with pytest.raises(OSError, match="No space"), (disk / "ballast").open("wb") as ballast:
+                while True:
+                    ballast.write(bytes(1 << 20))
+                    ballast.flush()
+            tally.injected += 1
+            assert run.wait() != 0 and "No space left" in run.text(), run.text()
+            assert "go on with ckpt=" in run.text()
+            (disk / "ballast").unlink()
+            assert not list(disk.rglob("*.partial"))
+            rest = training(disk / "rest", f"ckpt={disk / 'first'}")
+            assert Run(tmp_path / "log2", harness.train, rest).wait() == 0
+            assert harness.outcome(disk / "rest") == numbers
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+def test_too_little_room_is_said_before_anything_is_done(tmp_path, monkeypatch):
+    from src.metrics import results
+
+    usage = results.shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(results.shutil, "disk_usage", lambda path: usage._replace(free=1 << 20))
+    with pytest.raises(ValueError, match="paths.out must have 200 MiB free, got 1 MiB"):
+        results.open_run(tmp_path / "run", OmegaConf.to_yaml({"a": 1}))
+    assert not (tmp_path / "run" / "config.yaml").exists()
