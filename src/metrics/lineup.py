@@ -1,8 +1,14 @@
 """The networks that are compared: what each is called, which views it is given, what is missing."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from torch import nn
+import torch
+from torch import Tensor, nn
+
+from src.models.unroll import takes
+from src.sim.optics import layout
 
 
 @dataclass(frozen=True)
@@ -19,3 +25,45 @@ class Candidate:
     views: int
     trained: bool = True
     missing: str = ""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A network with the views it is given: `views` 1 is the centre view."""
+
+    name: str
+    network: nn.Module
+    views: int
+
+    def choose(self, voxels: Tensor, positions: Sequence) -> tuple[Tensor, list]:
+        """Return the views (axis 1 of `voxels`) that the network is given, and where they stand."""
+        chosen = [place for place in layout(self.views) if place in positions]
+        if len(chosen) < self.views:
+            raise ValueError(f"the light field has {len(positions)} views, {self.views} are needed")
+        return voxels[:, [positions.index(place) for place in chosen]], chosen
+
+    @torch.no_grad()
+    def step(
+        self, voxels: Tensor, state: Any, positions: Sequence, window_s: float
+    ) -> tuple[Tensor, Any]:
+        """Return the frame (1, 1, h, w), clipped, float32, and the state."""
+        facts = {"window_s": window_s, "positions": positions}
+        told = {name: value for name, value in facts.items() if takes(self.network, name)}
+        frame, state = self.network(voxels, state, **told)
+        return frame.float().clamp(0, 1), state
+
+    def play(
+        self, windows: Iterable[Tensor], positions: Sequence, window_s: float, state: Any = None
+    ) -> tuple[Tensor, Any]:
+        """Return frames (windows, 1, h, w) and the state after `windows` (1, views, bins, h, w)."""
+        frames = []
+        for voxels in windows:
+            chosen, places = self.choose(voxels, positions)
+            frame, state = self.step(chosen, state, places, window_s)
+            frames.append(frame)
+        return torch.cat(frames), state
+
+    def needs_views(self, least: int = 2) -> None:
+        """Raise ValueError unless it is given at least so many views."""
+        if self.views < least:
+            raise ValueError("it is given the centre view only")

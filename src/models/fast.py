@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.utils import parametrize
 
 from src.models.files import fold
 from src.models.unroll import takes
@@ -23,9 +24,7 @@ class Fast(nn.Module):
         self, network: nn.Module, *, dtype: torch.dtype = torch.bfloat16, skip_empty: bool = True
     ):
         super().__init__()
-        inner = deepcopy(network).eval().requires_grad_(False)
-        fold(inner)
-        self.inner = inner.to(dtype=dtype, memory_format=torch.channels_last)
+        self.inner = plain(network).to(dtype=dtype, memory_format=torch.channels_last)
         self.views, self.dtype, self.skip_empty = network.views, dtype, skip_empty
         self.told = [name for name in ("window_s", "positions") if takes(network, name)]
 
@@ -47,3 +46,17 @@ class Fast(nn.Module):
         frame, own = self.inner(voxels.to(self.dtype), own, **told)
         frame = frame.float()
         return frame, (own, frame)
+
+
+def plain(network: nn.Module) -> nn.Module:
+    """Return a copy of `network` for running only, its parametrisations folded."""
+    copied = deepcopy(network).eval().requires_grad_(False)
+    for module in copied.modules():
+        if parametrize.is_parametrized(module):
+            # A copy shares its class, of which folding takes the weight's property, with the
+            # original.
+            kind = type(module)
+            own = {k: v for k, v in vars(kind).items() if k not in ("__dict__", "__weakref__")}
+            module.__class__ = type(kind.__name__, kind.__bases__, own)
+    fold(copied)
+    return copied

@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from src.probes.bench import Bench, Finding, Subject, worst
+from src.metrics.lineup import Subject
+from src.probes.bench import Bench, Finding, worst
 from src.probes.stream import Conditions
 
 

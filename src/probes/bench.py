@@ -1,16 +1,14 @@
 """The bench: standard clips, one subject at a time, and what a probe finds."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from src.metrics.image import aligned_psnr
-from src.models.unroll import takes
+from src.metrics.lineup import Subject
 from src.probes.stream import Conditions, Stream, film
-from src.sim.optics import layout
 from src.sim.pipeline import Pipeline
 
 STANDARD = Conditions()
@@ -44,48 +42,6 @@ class Finding:
     def breaks_at(self) -> Any:
         """What was set where the limit is first exceeded; None: nowhere."""
         return next((setting for setting, value in self.curve if self.fails(value)), None)
-
-
-@dataclass(frozen=True)
-class Subject:
-    """A network with the views it is given: `views` 1 is the centre view."""
-
-    name: str
-    network: nn.Module
-    views: int
-
-    def choose(self, voxels: Tensor, positions: Sequence) -> tuple[Tensor, list]:
-        """Return the views (axis 1 of `voxels`) that the network is given, and where they stand."""
-        chosen = [place for place in layout(self.views) if place in positions]
-        if len(chosen) < self.views:
-            raise ValueError(f"the light field has {len(positions)} views, {self.views} are needed")
-        return voxels[:, [positions.index(place) for place in chosen]], chosen
-
-    @torch.no_grad()
-    def step(
-        self, voxels: Tensor, state: Any, positions: Sequence, window_s: float
-    ) -> tuple[Tensor, Any]:
-        """Return the frame (1, 1, h, w), clipped, float32, and the state."""
-        facts = {"window_s": window_s, "positions": positions}
-        told = {name: value for name, value in facts.items() if takes(self.network, name)}
-        frame, state = self.network(voxels, state, **told)
-        return frame.float().clamp(0, 1), state
-
-    def play(
-        self, windows: Iterable[Tensor], positions: Sequence, window_s: float, state: Any = None
-    ) -> tuple[Tensor, Any]:
-        """Return frames (windows, 1, h, w) and the state after `windows` (1, views, bins, h, w)."""
-        frames = []
-        for voxels in windows:
-            chosen, places = self.choose(voxels, positions)
-            frame, state = self.step(chosen, state, places, window_s)
-            frames.append(frame)
-        return torch.cat(frames), state
-
-    def needs_views(self, least: int = 2) -> None:
-        """Raise ValueError unless it is given at least so many views."""
-        if self.views < least:
-            raise ValueError("it is given the centre view only")
 
 
 class Bench:

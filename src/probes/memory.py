@@ -9,8 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from src.metrics.image import aligned_psnr
+from src.metrics.lineup import Subject
 from src.metrics.temporal import wobble
-from src.probes.bench import Bench, Finding, Subject
+from src.probes.bench import Bench, Finding
 from src.probes.stream import Conditions, Stream
 
 LOOP_SCORED = 4  # every so manyth window of a long run is scored

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from src.metrics.image import aligned_psnr
+from src.metrics.lineup import Subject
 from src.models.fast import Fast
 from src.models.unroll import takes
-from src.probes.bench import Bench, Finding, Subject
+from src.probes.bench import Bench, Finding
 from src.probes.stream import Stream
 from src.sim import noise
 

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from src.metrics.image import aligned_psnr
-from src.probes.bench import Bench, Finding, Subject, worst
+from src.metrics.lineup import Subject
+from src.probes.bench import Bench, Finding, worst
 from src.probes.stream import Conditions, Stream
 from src.sim import noise
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 
 import rich
 
-from src.metrics.lineup import Candidate
-from src.probes.bench import Bench, Finding, Subject
+from src.metrics.lineup import Candidate, Subject
+from src.probes.bench import Bench, Finding
 
 Probe = Callable[[Subject, Bench], Finding]
 Cell = Finding | str  # or why there is none

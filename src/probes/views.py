@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from src.metrics.image import aligned_psnr
-from src.probes.bench import Bench, Finding, Subject, worst
+from src.metrics.lineup import Subject
+from src.probes.bench import Bench, Finding, worst
 from src.probes.stream import Stream
 from src.sim.optics import layout
 

@@ -6,8 +6,9 @@ from torch import nn
 
 from baselines.highpass import HighPass
 from src.models.setnet import SetNet
+from src.metrics.lineup import Subject
 from src.probes import air, memory, numerics, rates, views
-from src.probes.bench import Bench, Finding, Subject
+from src.probes.bench import Bench, Finding
 from src.probes.stream import Conditions, film, strengthened
 from src.sim.atmosphere import sample_atmosphere
 from src.sim.noise import generator
@@ -18,7 +19,7 @@ from src.sim.scenes import Photographs
 FPS = 120.0
 
 
-def pipeline(windows: int = 24) -> Pipeline:
+def pipeline(windows: int = 16) -> Pipeline:
     scene = Photographs(split="test", height=64, width=64, frames=windows + 1)
     air = {"atmosphere": {"severity": "medium", "width_px": 64}}
     options = {"split": "test", "crop": 32}
@@ -93,7 +94,7 @@ def test_a_sum_holds_and_a_leaky_sum_does_not(bench):
 
 def test_a_sum_comes_back_at_any_rate_and_after_any_loop(bench):
     assert abs(rates.Rates(rates=[60, 1200], seconds=0.2)(running(), bench).value) < 1e-3
-    assert abs(memory.LongRun(windows=200)(running(), bench).value) < 1e-3
+    assert abs(memory.LongRun(windows=96)(running(), bench).value) < 1e-3
 
 
 def test_a_difference_in_a_sum_neither_grows_nor_fades(bench):
@@ -118,12 +119,11 @@ def test_every_probe_runs_on_a_set_network(bench):
     torch.manual_seed(0)
     subject = Subject("setnet", SetNet(stem=4, channels=8).eval(), 9)
     probes = [
-        memory.Hold([3]), memory.LongRun(150), memory.StartUp(), memory.Shock(), memory.Still(),
+        memory.Hold([3]), memory.LongRun(96), memory.StartUp(), memory.Shock(), memory.Still(),
         rates.Rates([1200], 0.1), rates.Thresholds([0.3]), rates.FewerEvents([0.1]),
-        rates.SensorNoise("shot_hz", [5.0]), views.Lost([4], 1), views.Permuted(1),
+        views.Lost([4], 1), views.Permuted(1),
         views.Misplaced([2]), views.Late(), views.Parallax([1]), numerics.Growth(),
-        numerics.WorstInput(2, 2), numerics.Bf16(8), air.Strength([4.0]), air.SharedAir([0.0]),
-        air.Wind([3.0]), air.Gain([0.05]),
+        numerics.WorstInput(2, 2), numerics.Bf16(8), air.SharedAir([0.0]), air.Gain([0.05]),
     ]  # fmt: skip
     for probe in probes:
         found = probe(subject, bench)

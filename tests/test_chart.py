@@ -1,0 +1,48 @@
+"""The door chart at a tiny size: figures, tables, and rows without weights."""
+
+import csv
+
+import pytest
+
+from src.chart import chart
+from tests.test_train import config
+
+HIGHPASS = "{baseline: {_target_: baselines.highpass.HighPass}, views: 1}"
+SETNET = "{views: 9, model: {_target_: src.models.setnet.SetNet, stem: 4, channels: 8}}"
+TINY = ["clips=2", "scene.height=64", "scene.width=64", "data.test_crop=32", "data.test_windows=4"]
+TINY += ["data.warmup=1", "metrics.lpips=null", "sizes=[32]", "seconds=0.01", "threads=[1]"]
+TINY += ["severities=[weak]", "forms=[float32,bf16]"]
+
+
+def tiny(tmp_path, *overrides: str):
+    return config("chart", tmp_path, "~networks", *TINY, *overrides)
+
+
+def test_figures_and_tables_are_written_and_untrained_networks_timed_only(tmp_path):
+    found = chart(tiny(tmp_path, f"+networks={{highpass: {HIGHPASS}, ours: {SETNET}}}"))
+    assert found == {"weak": "highpass"}
+    for name in ("chart.png", "chart.svg", "machine.png", "machine.svg", "chart.md"):
+        assert (tmp_path / name).is_file()
+    speeds = list(csv.DictReader((tmp_path / "speed.csv").read_text().splitlines()))
+    ours = [row for row in speeds if row["network"] == "ours"]
+    assert {row["form"] for row in ours} == {"float32", "bf16"}
+    assert all(float(row["ms"]) > 0 and row["trained"] == "False" for row in ours)
+    assert all(float(row["peak_mib"]) > 0 and float(row["limit_ms"]) > 0 for row in ours)
+    scored = list(csv.DictReader((tmp_path / "scores.csv").read_text().splitlines()))
+    assert {row["network"] for row in scored} == {"highpass"} and len(scored) == 2
+    assert "ours (no weights)" in (tmp_path / "chart.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("sizes=[30]", "sizes must be multiples of 8"),
+        ("forms=[int8]", "forms must be of float32"),
+        ("threads=[0]", "threads must be numbers >= 1"),
+        ("devices=[tpu]", "devices must be of cpu, cuda"),
+        ("severities=[]", "severities and clips"),
+    ],
+)
+def test_what_cannot_be_measured_is_named(tmp_path, override, message):
+    with pytest.raises(ValueError, match=message):
+        chart(tiny(tmp_path, "+networks={}", override))
