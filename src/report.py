@@ -20,7 +20,7 @@ def report(cfg: DictConfig) -> list[tables.Table]:
     found, plans = runs.find(folders), runs.plans(folders)
     title = cfg.title or sweep_name(found)
     keys, made = cells.cells(found, plans)
-    paper = OmegaConf.to_container(cfg.paper) if cfg.get("paper") else None
+    paper = OmegaConf.to_container(cfg.paper)
     wanted = [
         tables.main("Scores and cost", keys, made, paper),
         tables.by_severity("Severities apart", keys, made),

@@ -7,7 +7,7 @@ from typing import Any
 
 from src.reports.runs import Plan, Run
 
-FIRST = ("task", "experiment", "baseline", "postprocess", "optics", "turbulence", "sensor")
+FIRST = ("task", "method", "experiment", "resolution", "postprocess", "baseline", "optics")
 LAST = ("budget", "debug")
 
 

@@ -72,7 +72,7 @@ COSTS: tuple[tuple[Column, Callable[[Run], float]], ...] = (
 SPLIT = ("lpips", "psnr_aligned", "wobble")
 
 
-def main(title: str, keys: tuple[str, ...], cells: list[Cell], paper: dict | None = None) -> Table:
+def main(title: str, keys: tuple[str, ...], cells: list[Cell], paper: dict) -> Table:
     """Return scores, cost and number of seeds of each cell.
 
     `paper`: {source, rows: [{when: {key: value}, psnr ...}]}; its numbers stand in columns of their
@@ -112,15 +112,15 @@ def by_severity(title: str, keys: tuple[str, ...], cells: list[Cell]) -> Table |
 
 
 def compared(title: str, keys: tuple[str, ...], cells: list[Cell]) -> Table | None:
-    """Return what else the runs scored on their clips, such as the untrained network."""
-    columns = [*map(_label, keys), Column("compared", "compared"), *SCORES]
+    """Return the networks and what else the runs scored on their clips, such as the untrained one."""
+    columns = [*map(_label, keys), Column("network", "network"), *SCORES]
     table = Table(title, columns, [], len(keys) + 1)
     for cell in cells:
-        words = _names(cell, table.marks)
         names = dict.fromkeys(name for run in cell.runs for name in run.record.get("compared", {}))
-        for name in names:
+        words = _names(cell, table.marks) if names else []
+        for name in (None, *names) if names else ():
             row = [_over_seeds(cell.runs, _scored(c.name, name)) for c in SCORES]
-            table.rows.append([*words, Value(words=name), *row])
+            table.rows.append([*words, Value(words=name or "trained"), *row])
     return table if table.rows else None
 
 
@@ -171,7 +171,7 @@ def _among(metric: str, severity: str) -> Callable[[Run], float | None]:
     return measure
 
 
-def _with_paper(cells: list[Cell], paper: dict | None) -> list[tuple[Column, Callable]]:
+def _with_paper(cells: list[Cell], paper: dict) -> list[tuple[Column, Callable]]:
     """Return the columns of the paper's numbers for these cells, with what fills them."""
 
     def row(cell: Cell) -> dict:
@@ -181,7 +181,7 @@ def _with_paper(cells: list[Cell], paper: dict | None) -> list[tuple[Column, Cal
     def filled(metric: str) -> Callable[[Cell], Value]:
         return lambda cell: Value(row(cell).get(metric))
 
-    if not paper or not any(map(row, cells)):
+    if not any(map(row, cells)):
         return []
     return [
         (Column(f"paper_{c.name}", c.head, c.digits + (c.digits == 3), group=paper["source"]), fill)

@@ -60,13 +60,17 @@ def latex(tables: list[Table]) -> str:
 def replace_section(document: Path, name: str, text: str) -> None:
     """Put `text` between the markers `<!-- report:name -->` and `<!-- end:name -->`, atomically.
 
-    Raises ValueError where the document is not there or does not hold the two lines once.
+    A document without them gets a section of that name at its end.  Raises ValueError where the
+    document is not there, or the markers are not one pair.
     """
+    if not document.is_file():
+        raise ValueError(f"into must be a file, got {document}")
     start, end = f"<!-- report:{name} -->", f"<!-- end:{name} -->"
-    content = document.read_text() if document.is_file() else ""
-    counts = content.count(start), content.count(end)
-    if counts != (1, 1) or content.index(end) < content.index(start):
-        raise ValueError(f"into must hold the lines {start} and {end} once, got {document}")
+    content = document.read_text()
+    if start not in content and end not in content:
+        content = f"{content.rstrip()}\n\n## {name}\n\n{start}\n{end}\n"
+    if (content.count(start), content.count(end)) != (1, 1) or end not in content.split(start)[1]:
+        raise ValueError(f"into must hold {start} and after it {end} once, got {document}")
     before, rest = content.split(start)
     after = rest.split(end)[1]
     results.write_text(document, f"{before}{start}\n\n{text.strip()}\n\n{end}{after}")

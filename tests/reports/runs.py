@@ -9,6 +9,7 @@ from PIL import Image
 from src.metrics import results
 
 SCORES = {"lpips": 0.4, "ssim": 0.6, "psnr": 17.0, "psnr_aligned": 20.0, "wobble": 1.0}
+UNTRAINED = {"untrained": {"clips": 9, "ssim": {"mean": 0.1, "std": 0.0}}}
 
 
 def write_run(
@@ -23,6 +24,7 @@ def write_run(
     clips: list[dict] | None = None,
     task: str = "train",
     config_name: str = "table1",
+    compared: dict | None = None,
 ) -> Path:
     """Write `config.yaml`, `results.json`, `clips.csv` of one run; return its folder."""
     folder.mkdir(parents=True)
@@ -50,7 +52,7 @@ def write_run(
         "test": {"clips": 9}
         | {key: found | {"mean": value} for key, value in (SCORES | (scores or {})).items()},
         "latency_ms": {"128x128": 13.8},
-        "compared": {"untrained": {"clips": 9, "ssim": {"mean": 0.1, "std": 0.0}}},
+        "compared": UNTRAINED if compared is None else compared,
     }
     (folder / "results.json").write_text(json.dumps(record))
     if clips:

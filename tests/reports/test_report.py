@@ -6,16 +6,19 @@ import math
 from html.parser import HTMLParser
 
 import pytest
+from omegaconf import OmegaConf
 
 from src.report import report
 from src.reports import cells, page, runs, tables, writers
+from tests.conftest import ROOT
 from tests.reports.runs import clips_of, write_run, write_samples, write_sweep
 from tests.test_train import config
 
+NO_PAPER = {"source": "none", "rows": []}
 PAPER = {"source": "paper: other data", "rows": [{"when": {"experiment": "lf3x3"}, "psnr": 15.4}]}
 
 
-def built(folder, paper=None):
+def built(folder, paper=NO_PAPER):
     keys, made = cells.cells(runs.find([folder]), runs.plans([folder]))
     return tables.main("main", keys, made, paper), keys, made
 
@@ -75,6 +78,15 @@ def test_the_papers_numbers_stand_in_columns_of_their_own(tmp_path):
     assert "paper_ssim" not in [column.name for column in table.columns]
 
 
+def test_what_else_was_scored_stands_below_its_network(tmp_path):
+    write_run(tmp_path / "a", scores={"ssim": 0.7})
+    write_run(tmp_path / "b", "eval", task="eval", scores={"ssim": 0.3}, compared={})
+    _, keys, made = built(tmp_path)
+    table = tables.compared("compared", keys, made)
+    assert [row[1].words for row in table.rows] == ["trained", "untrained"]
+    assert [row[3].mean for row in table.rows] == [0.7, 0.1]
+
+
 def test_the_best_of_a_column_is_what_is_printed_best(tmp_path):
     for name, psnr in [("a", 17.001), ("b", 17.0), ("c", 16.0)]:
         write_run(tmp_path / name, name, scores={"psnr": psnr})
@@ -107,9 +119,54 @@ def test_a_section_is_replaced_and_the_text_around_it_stays(tmp_path):
     writers.replace_section(document, "a", "newer\n")
     wanted = "before\n<!-- report:a -->\n\nnewer\n\n<!-- end:a -->\nafter\n"
     assert document.read_text() == wanted and list(tmp_path.iterdir()) == [document]
-    with pytest.raises(ValueError, match="<!-- report:b -->"):
-        writers.replace_section(document, "b", "new")
-    assert document.read_text() == wanted
+    writers.replace_section(document, "b", "more")
+    assert document.read_text() == (
+        wanted + "\n## b\n\n<!-- report:b -->\n\nmore\n\n<!-- end:b -->\n"
+    )
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "<!-- report:a -->\nno end",
+        "<!-- end:a -->\n<!-- report:a -->",
+        "<!-- report:a --><!-- report:a --><!-- end:a -->",
+    ],
+)
+def test_markers_that_are_no_pair_are_refused_and_the_document_stays(content, tmp_path):
+    document = tmp_path / "results.md"
+    document.write_text(content)
+    with pytest.raises(ValueError, match="into must hold <!-- report:a -->"):
+        writers.replace_section(document, "a", "new")
+    assert document.read_text() == content
+    with pytest.raises(ValueError, match="into must be a file"):
+        writers.replace_section(tmp_path / "nowhere.md", "a", "new")
+
+
+def test_every_row_of_the_paper_names_choices_that_exist():
+    rows = OmegaConf.load(ROOT / "conf" / "paper" / "reds.yaml").rows
+    rooms = {"method": "sweeps", "resolution": "sweeps", "postprocess": "conf"}
+    for row in rows:
+        for group, choice in row.when.items():
+            if group != "task":
+                assert (ROOT / rooms.get(group, "conf") / group / f"{choice}.yaml").is_file()
+    assert len(rows) == len({str(row.when) for row in rows}) >= 3 + 19
+
+
+def test_the_most_specific_row_of_the_paper_stands_beside_a_run(tmp_path):
+    for place, post in enumerate(("none", "mambatm")):
+        choices = {"method": "firenet_plus", "resolution": "native256", "postprocess": post}
+        write_run(tmp_path / str(place), "firenet_plus", choices=choices, task="eval")
+    paper = {
+        "source": "paper",
+        "rows": [
+            {"when": {"method": "firenet_plus"}, "psnr": 1.0},
+            {"when": {"method": "firenet_plus", "postprocess": "mambatm"}, "psnr": 2.0},
+        ],
+    }
+    table, keys, _ = built(tmp_path, paper)
+    assert keys == ("postprocess",)
+    assert [value(table, row, "paper_psnr").mean for row in (0, 1)] == [1.0, 2.0]
 
 
 class Seen(HTMLParser):
