@@ -22,6 +22,7 @@ from src.models.layers import pad_to_multiple
 
 DISTORTION = 4  # channels: tilt down and right, mean and log-variance of the blur latent
 SCALES = 3
+PIXELS = 2**20  # encoded or decoded at once where no gradient is asked for: 16 frames of 256 x 256
 
 
 class MambaTM(nn.Module):
@@ -59,19 +60,22 @@ class MambaTM(nn.Module):
         n, count, given, height, width = frames.shape
         frames = frames.expand(-1, -1, self.channels, -1, -1)
         flat, (top, left) = pad_to_multiple(frames.flatten(0, 1), 2**SCALES)
-        *skips, deep = self.encoder(flat)
+        parts = parts_of(flat)
+        maps = zip(*(self.encoder(flat[part]) for part in parts), strict=True)
+        *skips, deep = [torch.cat(scale) for scale in maps]
         grid = (count, *deep.shape[-2:])
         orders = scan_orders(*grid)
         orders = [order.to(frames.device) for order in orders]
         tokens = deep.unflatten(0, (n, count)).movedim(2, -1).flatten(1, 3)
         for i, layer in enumerate(self.free):
             tokens = layer(tokens, grid, orders[i % 3])
-        distortion = self.distortion_decoder(self.distortion_width(_maps(tokens, grid)), skips)
-        guide = self.distortion_encoder(distortion)[-1]
+        found = self.distortion_width(_maps(tokens, grid))
+        distortion = _decode(self.distortion_decoder, found, skips, parts)
+        guide = torch.cat([self.distortion_encoder(distortion[part])[-1] for part in parts])
         guide = guide.unflatten(0, (n, count)).movedim(2, -1).flatten(1, 3)
         for i, layer in enumerate(self.guided):
             tokens = layer(tokens, grid, orders[i], guide)
-        added = self.decoder(_maps(tokens, grid), skips)
+        added = _decode(self.decoder, _maps(tokens, grid), skips, parts)
         added, distortion = (
             part[..., top : top + height, left : left + width].unflatten(0, (n, count))
             for part in (added, distortion)
@@ -98,6 +102,17 @@ class MambaTM(nn.Module):
             parts.append(clean[:, done - start : until - start])
             done = until
         return torch.cat(parts, 1).clamp(0, 1)
+
+
+def parts_of(frames: Float[Tensor, "n c h w"]) -> list[slice]:
+    """Return the slices of the frames that are encoded and decoded at once.
+
+    All of them for training; else as many as bound the memory.
+    """
+    count = len(frames)
+    if not torch.is_grad_enabled():
+        count = max(1, PIXELS // (frames.shape[-2] * frames.shape[-1]))
+    return [slice(start, start + count) for start in range(0, len(frames), count)]
 
 
 def window_starts(frames: int, window: int, overlap: int) -> list[int]:
@@ -228,6 +243,10 @@ class Fusion(nn.Module):
         mean = self.squeeze(found.mean((-2, -1), keepdim=True))
         weights = self.weigh(functional.gelu(mean)).sigmoid()
         return x + weights * found
+
+
+def _decode(decoder: "Decoder", deep: Tensor, skips: list[Tensor], parts: list[slice]) -> Tensor:
+    return torch.cat([decoder(deep[part], [skip[part] for skip in skips]) for part in parts])
 
 
 def _maps(tokens: Tensor, grid: tuple[int, int, int]) -> Tensor:

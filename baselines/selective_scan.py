@@ -15,6 +15,7 @@ from torch.nn import functional
 
 TAPS = 4  # of the causal convolution before the scan
 EXPAND = 2
+BLOCK = 16384  # positions whose states are kept at once: 64 MiB at 128 channels of 8 states
 
 
 def scan(
@@ -26,12 +27,27 @@ def scan(
 ) -> Float[Tensor, "n length c"]:
     """Return what each channel reads; `rate` < 0, `step` > 0, so no decay exceeds one.
 
-    On a GPU the kernel of `mamba_ssm`, where that is installed.  Else in two levels: pieces
-    of about sqrt(length) run side by side from zero, then each piece gets what the ones before it
-    left, decayed.  2 sqrt(length) steps in a row instead of `length`.
+    On a GPU the kernel of `mamba_ssm`, where that is installed.  Else block after block, so that
+    the memory of states is that of one block.
     """
     if x.is_cuda and find_spec("mamba_ssm"):
         return _fused(x, step, rate, enter, leave)
+    blocks = zip(*(part.split(BLOCK, 1) for part in (x, step, enter, leave)), strict=True)
+    state, read = x.new_zeros(len(x), *rate.shape), []
+    for x, step, enter, leave in blocks:
+        found, state = _block(x, step, rate, enter, leave, state)
+        read.append(found)
+    return torch.cat(read, 1)
+
+
+def _block(
+    x: Tensor, step: Tensor, rate: Tensor, enter: Tensor, leave: Tensor, state: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return `scan` from `state` (n, c, s) on, and the last state.
+
+    In two levels: pieces of about sqrt(length) run side by side from zero, then each piece gets
+    what the ones before it left, decayed.  2 sqrt(length) steps in a row instead of `length`.
+    """
     length = x.shape[1]
     piece = math.ceil(math.sqrt(length))
     missing = -length % piece
@@ -42,10 +58,12 @@ def scan(
     decay = torch.exp(step[..., None] * rate).unflatten(1, (-1, piece))
     drive = ((step * x)[..., None] * enter[:, :, None]).unflatten(1, (-1, piece))
     states, decays = _run(decay, drive, 2)
-    carried, _ = _run(decays[:, :, -1], states[:, :, -1], 1)
-    before = functional.pad(carried[:, :-1], (0, 0, 0, 0, 1, 0))
+    lasts, fades = states[:, :, -1], decays[:, :, -1]
+    first = lasts[:, :1] + fades[:, :1] * state[:, None]
+    carried, _ = _run(fades, torch.cat([first, lasts[:, 1:]], 1), 1)
+    before = torch.cat([state[:, None], carried[:, :-1]], 1)
     states = (states + decays * before[:, :, None]).flatten(1, 2)
-    return torch.einsum("nlcs,nls->nlc", states, leave)[:, :length]
+    return torch.einsum("nlcs,nls->nlc", states, leave)[:, :length], carried[:, -1]
 
 
 def _fused(x: Tensor, step: Tensor, rate: Tensor, enter: Tensor, leave: Tensor) -> Tensor:

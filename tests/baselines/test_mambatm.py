@@ -4,6 +4,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from baselines import mambatm
 from baselines.mambatm import MambaTM, scan_orders, window_starts
 from src.build import make
 from tests.conftest import ROOT
@@ -43,6 +44,15 @@ def test_clips_of_a_batch_do_not_meet():
 )
 def test_windows_cover_the_video(frames, starts):
     assert window_starts(frames, 16, 4) == starts
+
+
+@torch.no_grad()
+def test_frames_encoded_one_by_one_give_the_same(monkeypatch):
+    network, frames = small(), torch.rand(1, 3, 1, 16, 24)
+    together = network(frames)
+    monkeypatch.setattr(mambatm, "PIXELS", 1)
+    for one, other in zip(network(frames), together, strict=True):
+        torch.testing.assert_close(one, other)
 
 
 @pytest.mark.parametrize("count", [1, 3, 4, 5, 9, 11])

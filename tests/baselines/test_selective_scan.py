@@ -32,6 +32,12 @@ def test_scan_is_the_loop(length):
     torch.testing.assert_close(scan(*inputs(length)), loop(*inputs(length)))
 
 
+@pytest.mark.parametrize("block", [1, 7, 57])
+def test_blocks_go_on_from_each_other(block, monkeypatch):
+    monkeypatch.setattr(selective_scan, "BLOCK", block)
+    torch.testing.assert_close(scan(*inputs(57)), loop(*inputs(57)))
+
+
 def test_gradients_are_the_loop_s():
     ours, theirs = inputs(30), inputs(30)
     for run, given in ((scan, ours), (loop, theirs)):
