@@ -8,6 +8,8 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 import src.models
 from src import build
 from src.metrics.lineup import Candidate
+from src.models.adaptive import Adaptive, Level
+from src.sim.pipeline import Pipeline
 
 KEYS = {"ckpt", "baseline", "model", "views"}
 
@@ -56,3 +58,20 @@ def _entry(name: str, entry: Mapping) -> Candidate:
         reason = str(error)
     network = build.make(entry["model"]).eval() if "model" in entry else None
     return Candidate(name, network, views, trained=False, missing=reason)
+
+
+def under(cfg: DictConfig, severity: str, **data) -> Pipeline:
+    """Return the simulation of test clips under `severity`, with other values of `data`."""
+    changes = {"turbulence": {"atmosphere": {"severity": severity}}, "data": data}
+    return build.pipeline(OmegaConf.merge(cfg, changes), "test")
+
+
+def adaptive(cfg: DictConfig) -> tuple[Adaptive, Pipeline] | str:
+    """Return the adaptive network of `adapt` and the clips to show it on, or why there is none."""
+    try:
+        loaded = {ckpt: src.models.load(ckpt) for ckpt, _ in cfg.adapt.levels}
+    except ValueError as error:
+        return str(error)
+    levels = [Level(loaded[ckpt], views) for ckpt, views in cfg.adapt.levels]
+    options = {name: cfg.adapt[name] for name in ("tolerance", "patience", "handover")}
+    return Adaptive(levels, **options), under(cfg, "strong", test_windows=cfg.adapt.windows)

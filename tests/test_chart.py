@@ -3,15 +3,18 @@
 import csv
 
 import pytest
+import torch
 
 from src.chart import chart
+from src.models import save
+from src.models.setnet import SetNet
 from tests.test_train import config
 
 HIGHPASS = "{baseline: {_target_: baselines.highpass.HighPass}, views: 1}"
 SETNET = "{views: 9, model: {_target_: src.models.setnet.SetNet, stem: 4, channels: 8}}"
 TINY = ["clips=2", "scene.height=64", "scene.width=64", "data.test_crop=32", "data.test_windows=4"]
 TINY += ["data.warmup=1", "metrics.lpips=null", "sizes=[32]", "seconds=0.01", "threads=[1]"]
-TINY += ["severities=[weak]", "forms=[float32,bf16]"]
+TINY += ["severities=[weak]", "forms=[float32,bf16]", "adapt.levels=[[nowhere,1],[nowhere,9]]"]
 
 
 def tiny(tmp_path, *overrides: str):
@@ -33,6 +36,20 @@ def test_figures_and_tables_are_written_and_untrained_networks_timed_only(tmp_pa
     assert "ours (no weights)" in (tmp_path / "chart.md").read_text()
 
 
+def test_the_adaptive_network_is_shown_on_air_that_rises_and_falls(tmp_path):
+    torch.manual_seed(0)
+    network, file = SetNet(stem=4, channels=8), tmp_path / "tiny.safetensors"
+    spec = {"target": "src.models.setnet.SetNet", "kwargs": {"stem": 4, "channels": 8}}
+    save(file, network, spec, {})
+    levels = f"adapt.levels=[[{file},1],[{file},9]]"
+    small = ["adapt.course=[0,4,0]", "adapt.windows=18", "adapt.patience=2", "clips=1"]
+    chart(tiny(tmp_path, f"+networks={{highpass: {HIGHPASS}}}", levels, *small))
+    assert all((tmp_path / f"adapt.{suffix}").is_file() for suffix in ("png", "svg", "csv"))
+    lines = list(csv.DictReader((tmp_path / "adapt.csv").read_text().splitlines()))
+    assert {line["run"] for line in lines} == {"adaptive", "always the least", "always the most"}
+    assert "Lost against always the most" in (tmp_path / "chart.md").read_text()
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -40,7 +57,8 @@ def test_figures_and_tables_are_written_and_untrained_networks_timed_only(tmp_pa
         ("forms=[int8]", "forms must be of float32"),
         ("threads=[0]", "threads must be numbers >= 1"),
         ("devices=[tpu]", "devices must be of cpu, cuda"),
-        ("severities=[]", "severities and clips"),
+        ("severities=[]", "severities must be of"),
+        ("clips=0", "clips must be >= 1"),
     ],
 )
 def test_what_cannot_be_measured_is_named(tmp_path, override, message):

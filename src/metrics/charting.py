@@ -22,7 +22,25 @@ from src.sim.pipeline import Pipeline, simulate
 
 FORMS = ("float32", "bf16", "onnx")
 PEAKS = {"float32": torch.float32, "bf16": torch.bfloat16, "onnx": torch.float32}
+SEVERITIES = ("weak", "medium", "strong", "mixed")
 FILLED = 0.05  # share of a grid's entries that are not zero, as in our streams
+
+
+def check(sizes, threads, forms, devices, severities, clips: int) -> None:
+    """Raise ValueError, naming the key, for what cannot be measured."""
+    rules = {
+        "sizes must be multiples of 8 from 16 on": all(s >= 16 and s % 8 == 0 for s in sizes),
+        "threads must be numbers >= 1": all(count >= 1 for count in threads),
+        f"forms must be of {', '.join(FORMS)}": set(forms) <= set(FORMS),
+        "devices must be of cpu, cuda": set(devices) <= {"cpu", "cuda"},
+        "severities must be of weak, medium, strong, mixed": set(severities) <= set(SEVERITIES),
+    }
+    given = (sizes, threads, forms, devices, severities)
+    for (rule, kept), values in zip(rules.items(), given, strict=True):
+        if not kept or not len(values):
+            raise ValueError(f"{rule}, got {list(values)}")
+    if clips < 1:
+        raise ValueError(f"clips must be >= 1, got {clips}")
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ A clip is simulated once; the same events are then cut into windows of any lengt
 about a clip (turbulence, sensor, gain of a view) is said by `Conditions`.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -30,7 +30,8 @@ class Conditions:
 
     `d_over_r0`: strength of the turbulence, 0 for none (None: as drawn).  `still`: the scene does
     not move.  `gain`: standard deviation of a view's brightness, flickering frame by frame.
-    `turbulence`, `sensor`: arguments of Turbulence and EventSensor that are replaced.
+    `turbulence`, `sensor`: arguments of Turbulence and EventSensor that are replaced.  `course`:
+    instead of one strength, those of equal parts of the clip, in the same moving air.
     """
 
     d_over_r0: float | None = None
@@ -38,6 +39,7 @@ class Conditions:
     gain: float = 0.0
     turbulence: Mapping[str, Any] = field(default_factory=dict)
     sensor: Mapping[str, Any] = field(default_factory=dict)
+    course: Sequence[float] = ()
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,9 @@ def film(pipeline: Pipeline, number: int, conditions: Conditions) -> Stream:
     draw = _changed(pipeline.draw(number), conditions)
     variant = copy(pipeline)
     variant.turbulence = dict(pipeline.turbulence) | dict(conditions.turbulence)
-    views = variant.views(draw)[0]
+    views = (
+        _course(variant, draw, conditions.course) if conditions.course else variant.views(draw)[0]
+    )
     if conditions.gain:
         views = _flicker(views, conditions.gain, noise.key(draw.key, "gain"))
     sensor = copy(pipeline.sensor)
@@ -115,6 +119,20 @@ def strengthened(atmosphere: Atmosphere | None, d_over_r0: float) -> Atmosphere 
         raise ValueError("turbulence must be on for a probe of its strength, got none")
     ratio = d_over_r0 / atmosphere.d_over_r0
     return replace(atmosphere, cn2=atmosphere.cn2 * ratio ** (5 / 3))
+
+
+def _course(pipeline: Pipeline, draw: Draw, strengths: Sequence[float]) -> Tensor:
+    """Return what the views see as the strength goes through `strengths` in equal parts."""
+    frames = len(draw.clip.frames)
+    part = torch.arange(frames) * len(strengths) // frames
+    views = None
+    for strength in sorted(set(strengths)):
+        air = strengthened(draw.atmosphere, strength)
+        seen = pipeline.views(replace(draw, atmosphere=air))[0]
+        views = seen.clone() if views is None else views
+        now = torch.tensor([strengths[k] == strength for k in part])
+        views[:, now] = seen[:, now]
+    return views
 
 
 def _changed(draw: Draw, conditions: Conditions) -> Draw:
