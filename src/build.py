@@ -201,5 +201,6 @@ def test(
 ) -> evaluation.Row:
     """Return the scores of `net` on the test clips; in float32, whatever it was trained in."""
     plain = {"precision": "32-true", "logger": False, "enable_checkpointing": False}
+    plain |= {"devices": 1, "num_nodes": 1, "strategy": "auto"}  # of many, one process tests
     quiet = make(cfg.trainer, callbacks=[], **plain)
     return evaluation.test(name, net, data, measures, trainer=quiet, warmup=cfg.data.warmup)

@@ -47,6 +47,9 @@ def run(main: Callable[[], None]) -> None:
         sys.exit(128 + signal.SIGINT)
     except SIGTERMException:  # Lightning's; it would end with exit code 0
         sys.exit(128 + signal.SIGTERM)
+    except SystemExit as error:  # Lightning makes an exit code 1 of Ctrl-C
+        interrupted = isinstance(error.__context__, KeyboardInterrupt)
+        sys.exit(128 + signal.SIGINT if interrupted else error.code)
 
 
 def job(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import hydra
 import lightning
+from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig
 
 from src import build, door
@@ -18,7 +19,8 @@ from src.models.guard import NotFinite
 def train(cfg: DictConfig) -> dict:
     """Fit, test beside the untrained network and the high-pass baseline, write `results.json`.
 
-    Everything goes below `cfg.paths.run`.  Returns the content of `results.json`.
+    Everything goes below `cfg.paths.run`.  Returns the content of `results.json`; of several
+    processes that train together all but the first train only, and return {}.
     """
     run, start = Path(cfg.paths.run), time.perf_counter()
     build.share_cores(cfg)
@@ -26,6 +28,9 @@ def train(cfg: DictConfig) -> dict:
     net, spec = build.network(cfg)
     start_from = files.require(cfg.ckpt, spec) if cfg.ckpt else None
     module, data = build.reconstructor(cfg, net, spec), build.data(cfg)
+    if rank_zero_only.rank:
+        fit(build.trainer(cfg), module, data, start_from)
+        return {}
     results.open_run(run, door.resolved(cfg))
     untrained = build.test(cfg, "untrained", module.method, data, module.scores)
     try:
@@ -49,12 +54,10 @@ def fit(trainer: lightning.Trainer, module, data, start_from: Path | None) -> No
         trainer.fit(module, data, ckpt_path=start_from)
         if not last.is_file():  # nothing was left to do
             trainer.save_checkpoint(last)
-    except BaseException as error:
+    except BaseException:
         if any(last.parent.glob("*.ckpt")):
             step = trainer.global_step
             print(f"stopped at step {step}; go on with ckpt={last.parent}", file=sys.stderr)
-        if isinstance(error, SystemExit) and isinstance(error.__context__, KeyboardInterrupt):
-            raise KeyboardInterrupt from None  # Lightning makes an exit code 1 of it
         raise
 
 

@@ -56,7 +56,7 @@ class LightFieldData(LightningDataModule):
         trainer = self.trainer
         sampler = StepSampler(
             self.batch_size,
-            self.epoch_clips // self.batch_size,
+            max(1, self.epoch_clips // (self.batch_size * trainer.world_size)),
             lambda: trainer.global_step,
             reuse=self.reuse,
             rank=trainer.global_rank,

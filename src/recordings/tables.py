@@ -5,6 +5,7 @@ seconds.  HDF5 holds `x y t p` at the top or in the group `events`; the group ma
 `t_offset` in microseconds and `ms_to_idx` (Gehrig et al. 2021).
 """
 
+import zipfile
 from collections.abc import Iterator
 from itertools import chain, islice
 from pathlib import Path
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 SUFFIXES = (".txt", ".csv", ".npz", ".h5", ".hdf5")
 PIECE = 2**18  # events in a piece
+PACKED = 200  # most that the columns of a recording shrink when they are packed
 NAMES = {
     "t": ("t", "ts", "time", "timestamp"), "x": ("x", "xs"), "y": ("y", "ys"),
     "p": ("p", "ps", "on", "polarity", "pol"),
@@ -113,10 +115,12 @@ def _layout(line: str) -> tuple[list[int], bool]:
 
 def _columns(path: Path) -> Iterator[tuple]:
     if path.suffix == ".npz":
+        _check_packing(path)
         with np.load(path) as file:
             yield from _sliced(file, 0)
         return
     with h5py.File(path) as file:
+        _check_inside(file)
         if "CD" in file:
             raise ValueError(
                 "Prophesee HDF5 (CD/events) is packed with the vendor's own codec; export the "
@@ -124,6 +128,28 @@ def _columns(path: Path) -> Iterator[tuple]:
             )
         offset = int(np.asarray(file["t_offset"])) if "t_offset" in file else 0
         yield from _sliced(file.get("events", file), offset)
+
+
+def _check_inside(file: h5py.File) -> None:
+    """Raise ValueError where a part of the file is another file: a path leads anywhere."""
+
+    def visit(name: str, link) -> None:
+        if isinstance(link, h5py.ExternalLink):
+            raise ValueError(f"{name} is a link to another file, {link.filename}")
+        part = file.get(name) if isinstance(link, h5py.HardLink) else None
+        if isinstance(part, h5py.Dataset) and (part.external or part.is_virtual):
+            raise ValueError(f"{name} lies in other files")
+
+    file.visititems_links(visit)
+
+
+def _check_packing(path: Path) -> None:
+    """Raise ValueError for a file that unpacks to more than PACKED times its size."""
+    with zipfile.ZipFile(path) as archive:
+        size = sum(part.file_size for part in archive.infolist())
+    most = PACKED * path.stat().st_size + 2**24
+    if size > most:
+        raise ValueError(f"it unpacks to {size} bytes, more than the {most} believed")
 
 
 def _sliced(group, offset: int) -> Iterator[tuple]:

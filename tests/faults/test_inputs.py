@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -12,6 +13,8 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from src.metrics import results
+from src.models import files
+from src.recordings import formats
 from src.recordings.formats import write_events
 from src.recordings.views import Views
 from tests.faults.inputs import Reader, mutate, mutations
@@ -192,6 +195,44 @@ def survive(name: str, folder: Path, count: int) -> None:
 @pytest.mark.parametrize("name", FORMATS)
 def test_broken_files_are_read_or_refused(name, tmp_path):
     survive(name, tmp_path, 100)
+
+
+def test_a_table_leads_to_no_other_file(tmp_path):
+    secret = tmp_path / "elsewhere" / "secret.h5"
+    secret.parent.mkdir()
+    events(secret)
+    (tmp_path / "bytes").write_bytes(bytes(64))
+    with h5py.File(tmp_path / "link.h5", "w") as file:
+        file["events"] = h5py.ExternalLink(str(secret), "/events")
+    with h5py.File(tmp_path / "external.h5", "w") as file:
+        for name in "txyp":
+            place = [(str(tmp_path / "bytes"), 0, 64)]
+            file.create_dataset(f"events/{name}", (8,), np.int64, external=place)
+    with h5py.File(tmp_path / "virtual.h5", "w") as file:
+        layout = h5py.VirtualLayout((200,), np.int64)
+        layout[:] = h5py.VirtualSource(str(secret), "events/t", (200,))
+        file.create_virtual_dataset("events/t", layout)
+    for name in ("link.h5", "external.h5", "virtual.h5"):
+        with pytest.raises(ValueError, match=f"{name}.*other file"):
+            formats.read_events(tmp_path / name, size=(640, 480))
+
+
+def test_a_small_file_unpacks_to_no_flood(tmp_path):
+    zeros = np.zeros(30_000_000, np.int64)
+    np.savez_compressed(tmp_path / "bomb.npz", t=zeros, x=zeros[:9], y=zeros[:9], p=zeros[:9])
+    with pytest.raises(ValueError, match="unpacks to"):
+        formats.read_events(tmp_path / "bomb.npz")
+
+
+def test_a_file_names_no_network_that_fills_the_memory(tmp_path):
+    spec = {"target": "src.models.e2vid.E2VID", "kwargs": {"views": 1, "base_channels": 4096}}
+    torch.save({"network": spec, "state_dict": {}}, tmp_path / "huge.ckpt")
+    with pytest.raises(ValueError, match="ckpt does not fit"):
+        files.load(tmp_path / "huge.ckpt")
+    spec["kwargs"]["base_channels"] = 10**9
+    torch.save({"network": spec, "state_dict": {}}, tmp_path / "vast.ckpt")
+    with pytest.raises(ValueError, match="sizes up to"):
+        files.load(tmp_path / "vast.ckpt")
 
 
 @pytest.mark.slow
