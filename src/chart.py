@@ -9,6 +9,7 @@ from omegaconf import DictConfig
 from src import build, door, lineup
 from src.figures import frontier, rising
 from src.metrics import charting, results
+from src.metrics.stopwatch import Stopwatch
 
 
 def chart(cfg: DictConfig) -> dict:
@@ -21,7 +22,8 @@ def chart(cfg: DictConfig) -> dict:
     charting.check(cfg.sizes, cfg.threads, cfg.forms, cfg.devices, cfg.severities, cfg.clips)
     candidates = lineup.gather(cfg)
     results.open_run(run, door.resolved(cfg))
-    watch = charting.Stopwatch(run, seconds=cfg.seconds, longest_s=cfg.longest_s, bins=cfg.bins)
+    limits = {"longest_s": cfg.longest_s, "bins": cfg.bins, "onnx_side": cfg.onnx_side}
+    watch = Stopwatch(run, seconds=cfg.seconds, **limits)
     what = (cfg.sizes, cfg.threads, cfg.forms, cfg.devices)
     speeds = [row for candidate in candidates for row in watch.rows(candidate, *what)]
     results.write_text(run / "speed.csv", charting.speed_csv(speeds))

@@ -7,8 +7,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from src.figures.plots import MARKERS, save
-from src.metrics.charting import Score, Speed
+from src.metrics.charting import Score
 from src.metrics.pareto import front
+from src.metrics.stopwatch import Speed
 
 PAPER_MS, LIVE_MS = 3.4, 1000 / 600
 HEADS = {

@@ -1,29 +1,19 @@
-"""What the chart shows: speed of every network in every form, and its scores on the same clips."""
+"""The chart's scores on the same clips, its knees, its tables and what they say in words."""
 
 import csv
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from pathlib import Path
-from typing import Any
 
 import rich
-import torch
-from torch import nn
 
-from src.metrics import timing
 from src.metrics.lineup import Candidate, Subject
 from src.metrics.pareto import knee
 from src.metrics.scores import Scores
-from src.models.cost import macs_per_frame
-from src.models.export import OnnxNetwork, export
-from src.models.fast import Fast, plain
+from src.metrics.stopwatch import FORMS, Speed, rounded
 from src.sim.pipeline import Pipeline, simulate
 
-FORMS = ("float32", "bf16", "onnx")
-PEAKS = {"float32": torch.float32, "bf16": torch.bfloat16, "onnx": torch.float32}
 SEVERITIES = ("weak", "medium", "strong", "mixed")
-FILLED = 0.05  # share of a grid's entries that are not zero, as in our streams
 
 
 def check(sizes, threads, forms, devices, severities, clips: int) -> None:
@@ -44,32 +34,6 @@ def check(sizes, threads, forms, devices, severities, clips: int) -> None:
 
 
 @dataclass(frozen=True)
-class Speed:
-    """One network in one form on one size of picture; `limit_ms`, what the arithmetic alone takes.
-
-    `reason`: why there is no time.
-    """
-
-    network: str
-    trained: bool
-    views: int
-    side: int
-    device: str
-    threads: int
-    form: str
-    ms: float | None = None
-    least_ms: float | None = None
-    frames: int = 0
-    clock: str = ""
-    gmac: float | None = None
-    params: int | None = None
-    peak_mib: float | None = None
-    energy_mj: float | None = None
-    limit_ms: float | None = None
-    reason: str = ""
-
-
-@dataclass(frozen=True)
 class Score:
     """The scores of one network in one form on one clip."""
 
@@ -78,90 +42,6 @@ class Score:
     severity: str
     clip: int
     values: Mapping[str, float]
-
-
-class Stopwatch:
-    """Times networks.  `seconds` for each entry; what would take more than `longest_s` a frame by
-    arithmetic alone is left out and says so.  ONNX files go to `folder`.
-    """
-
-    def __init__(self, folder: Path, *, seconds: float, longest_s: float, bins: int):
-        self.folder, self.seconds, self.longest_s = folder, seconds, longest_s
-        self.bins = bins
-        self.peaks: dict[tuple[str, int], float] = {}
-
-    def peak(self, form: str, count: int) -> float:
-        """Return the machine's multiply-accumulates a second, measured once."""
-        if (form, count) not in self.peaks:
-            self.peaks[form, count] = timing.convolution_peak(PEAKS[form], count=count)
-        return self.peaks[form, count]
-
-    def rows(
-        self, candidate: Candidate, sides: Sequence[int], counts: Sequence[int],
-        forms: Sequence[str], devices: Sequence[str],
-    ) -> Iterable[Speed]:  # fmt: skip
-        """Yield one entry for each combination; a GPU has no threads to choose and no ONNX."""
-        for side in sides:
-            for device in devices:
-                for form in forms if device == "cpu" else [f for f in forms if f != "onnx"]:
-                    for count in counts if device == "cpu" else [1]:
-                        yield self._row(candidate, side, device, count, form)
-
-    def _row(self, candidate: Candidate, side: int, device: str, count: int, form: str) -> Speed:
-        known: dict[str, Any] = {
-            "network": candidate.name, "trained": candidate.trained, "views": candidate.views,
-            "side": side, "device": device, "threads": count, "form": form,
-        }  # fmt: skip
-        if candidate.network is None:
-            return Speed(**known, reason=candidate.missing)
-        network = candidate.network
-        macs = macs_per_frame(network, side, side, views=candidate.views, bins=self.bins)
-        known |= {
-            "gmac": macs / 1e9,
-            "params": sum(p.numel() for p in network.parameters()),
-            "energy_mj": 1e3 * macs * timing.JOULE_PER_MAC,
-        }
-        if device == "cpu":
-            known["limit_ms"] = 1e3 * macs / self.peak(form, count)
-            if known["limit_ms"] > 1e3 * self.longest_s:
-                reason = f"more than {self.longest_s:g} s a frame by arithmetic alone"
-                return Speed(**known, reason=reason)
-        try:
-            return self._timed(candidate, known)
-        except ValueError as error:
-            return Speed(**known, reason=str(error))
-
-    def _timed(self, candidate: Candidate, known: dict[str, Any]) -> Speed:
-        side, form, device = known["side"], known["form"], known["device"]
-        size = (1, candidate.views, self.bins, side, side)
-        drawn = torch.Generator().manual_seed(0)
-        voxels = torch.randn(size, generator=drawn)
-        voxels = (voxels * (torch.rand(size, generator=drawn) < FILLED)).to(device)
-        running = self._running(candidate, form, side, known["threads"]).to(device)
-        if form != "onnx":
-            known["peak_mib"] = timing.peak_bytes(running, voxels) / 2**20
-        took = timing.frame(running, voxels, count=known["threads"], seconds=self.seconds)
-        return Speed(
-            **known, ms=took.median_ms, least_ms=took.least_ms, frames=took.frames, clock=took.clock
-        )
-
-    def _running(self, candidate: Candidate, form: str, side: int, count: int) -> nn.Module:
-        if form == "float32":
-            return plain(candidate.network)
-        if form == "bf16":
-            return rounded(candidate.network)
-        path = self.folder / f"{candidate.name}_{side}.onnx"
-        if not path.is_file():
-            size = {"views": candidate.views, "height": side, "width": side, "bins": self.bins}
-            export(candidate.network, path, **size)
-        return OnnxNetwork(path, count)
-
-
-def rounded(network: nn.Module) -> nn.Module:
-    """Return `network` in bf16; ValueError where it has nothing to round."""
-    if not any(True for _ in network.parameters()):
-        raise ValueError("it has no parameters to round")
-    return Fast(network, skip_empty=False)
 
 
 def scores(
