@@ -47,6 +47,9 @@ def run(main: Callable[[], None]) -> None:
         sys.exit(128 + signal.SIGINT)
     except SIGTERMException:  # Lightning's; it would end with exit code 0
         sys.exit(128 + signal.SIGTERM)
+    except OSError as error:  # a full disk, a file that may not be read
+        _refuse(error)
+        sys.exit(1)
     except SystemExit as error:  # Lightning makes an exit code 1 of Ctrl-C
         interrupted = isinstance(error.__context__, KeyboardInterrupt)
         sys.exit(128 + signal.SIGINT if interrupted else error.code)
@@ -144,6 +147,7 @@ def _quieten() -> None:
         "You're resuming from a checkpoint that ended",  # our sampler starts at the step reached
         "Experiment logs directory",  # a job of a sweep that starts again
         "Checkpoint directory",
+        "Using ModelCheckpoint with manual optimization",  # what follows the step is what we want
         ".*LeafSpec",  # inside Lightning 2.6 with torch 2.13
     ):
         warnings.filterwarnings("ignore", expected)

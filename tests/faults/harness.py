@@ -96,6 +96,7 @@ def _work(log: str, work: Callable, arguments: tuple) -> None:
     sys.stdout = os.fdopen(1, "w", buffering=1)
     sys.stderr = os.fdopen(2, "w", buffering=1)
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    multiprocessing.set_start_method("fork", force=True)  # for loaders' workers, as of a door
     torch.set_num_threads(1)
     from src import door
 

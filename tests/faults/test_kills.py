@@ -67,17 +67,6 @@ def reconstruction(run: Path, recording: Path, *more: str) -> str:
     return OmegaConf.to_yaml(config("reconstruct", run, *given, "output=png", *more), resolve=True)
 
 
-@pytest.fixture(scope="session")
-def alone(tmp_path_factory) -> tuple[dict, float]:
-    """The numbers of a training that nobody disturbs, and how many seconds it takes."""
-    folder = tmp_path_factory.mktemp("alone")
-    Run(folder / "nothing", int).wait()  # so that the server is up
-    start = time.monotonic()
-    run = Run(folder / "log", harness.train, training(folder / "run"))
-    assert run.wait() == 0, run.text()
-    return harness.outcome(folder / "run"), time.monotonic() - start
-
-
 def stopped(run: Run, stop: int, after: float) -> bool:
     """Stop a run after so many seconds; return whether it was still there."""
     end = time.monotonic() + after

@@ -4,8 +4,8 @@ the run says so, what was whole stays whole, and it goes on to the same numbers.
 import os
 import resource
 import signal
-import stat
 import subprocess
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -112,18 +112,19 @@ def read_as_nobody(path: str, reader: str) -> None:
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become somebody who may not read")
 def test_a_file_that_may_not_be_read_is_named(tmp_path):
-    tally = Tally("unreadable files")
-    for folder in (tmp_path, *list(tmp_path.parents)[:2]):
-        folder.chmod(folder.stat().st_mode | stat.S_IXOTH | stat.S_IROTH)
+    tally, folder = Tally("unreadable files"), Path(tempfile.mkdtemp())
+    folder.chmod(0o755)  # pytest's own folders are closed to others
     for name, reader in READERS.items():
-        path = tmp_path / name
+        path = folder / name
         path.write_bytes(b"0.1 1 2 1\n")
         path.chmod(0)
         with tally.run():
             tally.injected += 1
             run = Run(tmp_path / "log", read_as_nobody, str(path), reader)
-            assert run.wait() == 2, run.text()
-            assert "error: " in run.text() and name in run.text(), run.text()
+            assert run.wait() in (1, 2), run.text()
+            assert (
+                "Traceback" not in run.text() and "error: " in run.text() and name in run.text()
+            ), run.text()
 
 
 def train_and_lose_a_worker(config: str) -> None:
