@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 
 FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload(
-    ["src.train", "src.eval", "src.reconstruct", "tests.faults.harness", "baselines.highpass"]
+    ["src.train", "src.eval", "src.reconstruct", "baselines.highpass", "tests.faults.test_inputs"]
 )
 SLOWEST = 600.0  # seconds; a run that takes longer hangs, also on a machine at work
 
