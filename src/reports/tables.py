@@ -112,7 +112,7 @@ def by_severity(title: str, keys: tuple[str, ...], cells: list[Cell]) -> Table |
 
 
 def compared(title: str, keys: tuple[str, ...], cells: list[Cell]) -> Table | None:
-    """Return the networks and what else the runs scored on their clips, such as the untrained one."""
+    """Return each network and what else its runs scored, such as the untrained one."""
     columns = [*map(_label, keys), Column("network", "network"), *SCORES]
     table = Table(title, columns, [], len(keys) + 1)
     for cell in cells:
