@@ -18,6 +18,7 @@ from torch import Tensor
 from src.sim import noise
 from src.sim.atmosphere import Atmosphere, sample_atmosphere
 from src.sim.optics import Optics, Position
+from src.sim.response import encode_srgb
 from src.sim.scenes import Clip
 from src.sim.sensor import EventSensor, decode_srgb
 from src.sim.turbulence import Turbulence
@@ -43,8 +44,9 @@ class Sample:
     """A batch of simulated clips.
 
     `voxels` (n, windows, views, bins, h, w); `target` (n, windows, 1, h, w), the clean frame at the
-    end of each window; `turbulent`, the same instants seen by the centre view; `window_s` (n,), how
-    long a window lasts; `positions`, the (row, col) of every view, None: those of `optics.layout`;
+    end of each window; `turbulent`, the same instants as the centre view shows them, code values
+    too; `window_s` (n,), how long a window lasts; `positions`, the (row, col) of every view, None:
+    those of `optics.layout`;
     `drawn`, what was drawn for each clip; `seconds`, how long the simulation took.
     """
 
@@ -146,6 +148,7 @@ class Pipeline:
         drawn = {"clip": draw.number, "name": draw.clip.name, "threshold": draw.threshold}
         drawn |= asdict(self.operator(draw).fidelity)
         turbulent = views[:, self.optics.centre, self.substeps :: self.substeps]
+        turbulent = encode_srgb(turbulent) if self.decode else turbulent
         return Sample(
             voxels=voxels.transpose(1, 2),
             target=target[:, :, None],

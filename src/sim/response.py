@@ -30,6 +30,12 @@ def decode_srgb(values: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     )
 
 
+def encode_srgb(light: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Return the sRGB code values of linear light: the inverse of `decode_srgb`."""
+    curve = 1.055 * light.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
+    return torch.where(light <= 0.0031308, 12.92 * light, curve)
+
+
 def response_table(response: str, source: str, floor: float) -> Int[Tensor, "nodes"]:
     """Return log intensity at the table's nodes, int32 multiples of 2**-24 nat.
 

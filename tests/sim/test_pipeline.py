@@ -120,3 +120,9 @@ def test_strong_scatter_is_said_once():
 def test_a_crop_that_does_not_fit_names_its_key(crop):
     with pytest.raises(ValueError, match="data.crop"):
         pipeline(crop=crop).draw(0)
+
+
+@pytest.mark.parametrize("source", ["linear", "srgb"])
+def test_turbulent_frames_are_code_values_as_the_target(source):
+    sample = simulate(pipeline(sensor=IDEAL | {"input": source}), [0])
+    torch.testing.assert_close(sample.turbulent, sample.target)
