@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from src.models.files import fold
+from src.models.setnet import SetNet
 from src.models.unroll import takes
 
 
@@ -26,6 +27,8 @@ class Fast(nn.Module):
         super().__init__()
         self.inner = plain(network).to(dtype=dtype, memory_format=torch.channels_last)
         self.views, self.dtype, self.skip_empty = network.views, dtype, skip_empty
+        # SetNet adds its events up in float32 and rounds where it convolves.
+        self.rounds_itself = isinstance(network, SetNet)
         self.told = [name for name in ("window_s", "positions") if takes(network, name)]
 
     @torch.no_grad()
@@ -43,7 +46,8 @@ class Fast(nn.Module):
         facts = {"window_s": window_s, "positions": positions}
         told = {name: facts[name] for name in self.told}
         own = None if state is None else state[0]
-        frame, own = self.inner(voxels.to(self.dtype), own, **told)
+        seen = voxels if self.rounds_itself else voxels.to(self.dtype)
+        frame, own = self.inner(seen, own, **told)
         frame = frame.float()
         return frame, (own, frame)
 
