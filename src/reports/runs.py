@@ -15,7 +15,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from src.metrics import results
 
-FIGURES = ("chart.svg", "chart.png", "stress.svg", "stress.png")
+FIGURES = ("chart", "machine", "adapt", "stress")  # of the doors chart and stress
 WITHOUT_NUMBERS = ("seed", "name", "task", "logger", "callbacks", "paths", "hydra")
 MACHINE = ("data.workers", "data.simulate_on", "trainer.accelerator", "trainer.devices")
 
@@ -86,7 +86,7 @@ def figures(folders: list[Path]) -> list[Path]:
     """Return the charts and heat maps at or below `folders`; the vector picture where both are."""
     found = {}
     for folder in folders:
-        for name in reversed(FIGURES):
+        for name in (f"{stem}{suffix}" for stem in FIGURES for suffix in (".png", ".svg")):
             found |= {(f.resolve().parent, f.stem): f for f in sorted(folder.rglob(name))}
     return list(found.values())
 

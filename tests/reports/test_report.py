@@ -198,6 +198,15 @@ def test_the_page_needs_nothing_from_elsewhere_and_keeps_names_harmless(tmp_path
     assert all(address.startswith("data:image/") for address in seen.addresses)
 
 
+def test_a_chart_alone_makes_a_page(tmp_path):
+    (tmp_path / "runs").mkdir()
+    for suffix in ("png", "svg"):
+        (tmp_path / "runs" / f"stress.{suffix}").write_text("<svg/>")
+    assert report(config("report", tmp_path / "out", f"run={tmp_path / 'runs'}")) == []
+    text = (tmp_path / "out" / "report.html").read_text()
+    assert text.count("<img") == 1 and "data:image/svg+xml;base64" in text and "Stress" in text
+
+
 def test_pictures_beyond_the_bound_are_named(tmp_path):
     run = write_run(tmp_path / "a")
     write_samples(run, size=64)
