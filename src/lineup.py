@@ -72,6 +72,6 @@ def adaptive(cfg: DictConfig) -> tuple[Adaptive, Pipeline] | str:
         loaded = {ckpt: src.models.load(ckpt) for ckpt, _ in cfg.adapt.levels}
     except ValueError as error:
         return str(error)
-    levels = [Level(loaded[ckpt], views) for ckpt, views in cfg.adapt.levels]
+    levels = [Level(loaded[ckpt], views, Path(ckpt).stem) for ckpt, views in cfg.adapt.levels]
     options = {name: cfg.adapt[name] for name in ("tolerance", "patience", "handover")}
     return Adaptive(levels, **options), under(cfg, "strong", test_windows=cfg.adapt.windows)

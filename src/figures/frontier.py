@@ -5,6 +5,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator
 
 from src.figures.plots import MARKERS, save
 from src.metrics.charting import Score
@@ -12,6 +13,7 @@ from src.metrics.pareto import front
 from src.metrics.stopwatch import Speed
 
 PAPER_MS, LIVE_MS = 3.4, 1000 / 600
+LEAST_GMAC = 1e-3
 HEADS = {
     "lpips": "LPIPS  (lower is better)",
     "ssim": "SSIM  (higher is better)",
@@ -52,9 +54,9 @@ def machine(path: Path, speeds: Sequence[Speed], peaks: Mapping[tuple[str, int],
     """Draw milliseconds over multiply-accumulates, a panel for each number of threads.
 
     The lines are what the measured peak of a large convolution allows.  Networks without weights
-    carry an asterisk.
+    carry an asterisk; what hardly multiplies, as the high-pass, has no place here.
     """
-    timed = [s for s in speeds if s.ms and s.gmac and s.device == "cpu"]
+    timed = [s for s in speeds if s.ms and (s.gmac or 0) > LEAST_GMAC and s.device == "cpu"]
     counts = sorted({s.threads for s in timed}) or [1]
     names = list(dict.fromkeys(s.network for s in speeds))
     starred = {s.network for s in speeds if not s.trained}
@@ -65,6 +67,8 @@ def machine(path: Path, speeds: Sequence[Speed], peaks: Mapping[tuple[str, int],
             axes.plot(s.gmac, s.ms, linestyle="none", **look)
         _peaks(axes, peaks, count, [s.gmac for s in timed])
         axes.set(xscale="log", yscale="log", xlabel="GMAC a frame", ylabel="ms a frame")
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_major_formatter("{x:g}")
         axes.set_title(f"{count} thread{'s' * (count > 1)}", fontsize=11)
         axes.grid(alpha=0.25, which="major")
     forms = [form for form in FACES if any(s.form == form for s in timed)]
@@ -100,6 +104,8 @@ def _panel(axes, names: list[str], times: Mapping, scores: Sequence[Score], metr
             color="0.4", ha="right", va="top",
         )  # fmt: skip
     axes.set(xscale="log", title=HEADS[metric])
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter("{x:g}")
     axes.title.set_fontsize(10)
     axes.grid(alpha=0.25)
 
@@ -120,7 +126,7 @@ def _peaks(axes, peaks: Mapping[tuple[str, int], float], count: int, macs: list[
                 label=label,
             )
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=8, loc="upper left", frameon=False)
+        axes.legend(fontsize=8, loc="lower right", frameon=False)
 
 
 def _look(place: int, form: str) -> dict:

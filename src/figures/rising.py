@@ -47,9 +47,9 @@ def write(run: Path, found: tuple[Adaptive, Pipeline] | str, course: Sequence[fl
         "always the most": follow(network, stream, only=last),
     }
     results.write_text(run / "adapt.csv", table(shown))
-    views = [level.views for level in network.levels]
+    names = [f"{level.name}, {level.views}" for level in network.levels]
     for suffix in ("png", "svg"):
-        draw(run / f"adapt.{suffix}", shown, views, network.bounds, course, stream.fps)
+        draw(run / f"adapt.{suffix}", shown, names, network.bounds, course, stream.fps)
     return words(shown)
 
 
@@ -95,7 +95,7 @@ def words(shown: dict[str, Shown]) -> str:
 
 
 def draw(
-    path: Path, shown: dict[str, Shown], views: list[int], bounds: list[float],
+    path: Path, shown: dict[str, Shown], names: list[str], bounds: list[float],
     course: Sequence[float], fps: float,
 ) -> Path:  # fmt: skip
     """Draw, over time: strength of the air, disagreement, level, milliseconds, aligned PSNR."""
@@ -108,18 +108,17 @@ def draw(
     for bound in bounds:
         apart.axhline(bound, color="0.6", lw=0.8, ls=":")
     level.step(t, shown["adaptive"].level, where="mid", color=LINES["adaptive"], lw=1.5)
-    names = [f"{k + 1}: {v} view{'s' * (v > 1)}" for k, v in enumerate(views)]
-    level.set_yticks(range(len(views)), names)
-    level.set_ylim(-0.3, len(views) - 0.7)
+    level.set_yticks(range(len(names)), [name.replace("_", " ") for name in names])
+    level.set_ylim(-0.3, len(names) - 0.7)
     for name, s in shown.items():
         cost.plot(t, _smooth(s.ms), color=LINES[name], lw=1.3, label=name)
         quality.plot(t, _smooth(s.psnr), color=LINES[name], lw=1.3)
-    heads = ("D/r0", "disagreement", "level", "ms a window", "aligned PSNR, dB")
+    heads = ("D/r0", "disagreement", "network, views", "ms a window", "aligned PSNR, dB")
     for axes, head in zip((air, apart, level, cost, quality), heads, strict=True):
         axes.set_ylabel(head, fontsize=9)
         axes.grid(alpha=0.25)
     cost.set_ylim(bottom=0)
-    cost.legend(fontsize=8, ncols=3, loc="upper left", frameon=False)
+    figure.legend(*cost.get_legend_handles_labels(), loc="outside upper center", ncols=3)
     quality.set_xlabel("seconds")
     figure.align_ylabels()
     return save(figure, path)

@@ -24,10 +24,11 @@ BELOW = 0.7  # of the bound of a level has to be undercut to leave it
 
 @dataclass(frozen=True)
 class Level:
-    """A network and how many views it is given."""
+    """A network, how many views it is given, and what figures call it."""
 
     network: SetNet
     views: int
+    name: str = ""
 
 
 @dataclass(frozen=True)
