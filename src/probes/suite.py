@@ -85,7 +85,7 @@ def _account(cells: Mapping[str, Cell]) -> str:
     ran = {title: cell for title, cell in cells.items() if isinstance(cell, Finding)}
     absent = {title: cell for title, cell in cells.items() if isinstance(cell, str)}
     failed = {title: cell for title, cell in ran.items() if cell.failed}
-    lines = [f"Breaks in {len(failed)} of {len(ran)} probes that ran."]
+    lines = [f"Breaks in {len(failed)} of {len(ran)} probes that ran."] if ran else []
     lines += [f"- {title}: {_sentence(cell)}" for title, cell in failed.items()]
     held = [f"{title} ({_amount(cell.value)} {cell.unit})" for title, cell in ran.items()
             if not cell.failed]  # fmt: skip

@@ -30,7 +30,7 @@ def noise(windows: int = 3) -> torch.Tensor:
     return torch.randn(windows, 1, 9, 5, 32, 32)
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("name", ["e2vid", "setnet"])
 def test_onnx_gives_the_frames_of_the_network_window_by_window(name, tmp_path):
     pytest.importorskip("onnxruntime", reason="needs the extra onnx")
     pytest.importorskip("onnxscript", reason="needs the extra onnx")
