@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 from jaxtyping import Float
 
-from src.recordings import formats
+from src.recordings import formats, tables
 from src.recordings.views import Size
 
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
@@ -84,6 +84,7 @@ def _frames(path: Path) -> Iterator[np.ndarray]:
         yield from map(_picture, names)
     elif path.suffix == ".h5":
         with h5py.File(path) as file:
+            tables.check_inside(file)
             for frame in file["frames"]:
                 yield frame.astype(np.float32) / 255
     else:

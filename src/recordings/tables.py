@@ -120,7 +120,7 @@ def _columns(path: Path) -> Iterator[tuple]:
             yield from _sliced(file, 0)
         return
     with h5py.File(path) as file:
-        _check_inside(file)
+        check_inside(file)
         if "CD" in file:
             raise ValueError(
                 "Prophesee HDF5 (CD/events) is packed with the vendor's own codec; export the "
@@ -130,17 +130,19 @@ def _columns(path: Path) -> Iterator[tuple]:
         yield from _sliced(file.get("events", file), offset)
 
 
-def _check_inside(file: h5py.File) -> None:
+def check_inside(file: h5py.File) -> None:
     """Raise ValueError where a part of the file is another file: a path leads anywhere."""
 
-    def visit(name: str, link) -> None:
+    def visit(name: str, link) -> str | None:  # an error raised in here would be lost in HDF5
         if isinstance(link, h5py.ExternalLink):
-            raise ValueError(f"{name} is a link to another file, {link.filename}")
+            return f"{name} leads to another file, {link.filename}"
         part = file.get(name) if isinstance(link, h5py.HardLink) else None
         if isinstance(part, h5py.Dataset) and (part.external or part.is_virtual):
-            raise ValueError(f"{name} lies in other files")
+            return f"{name} lies in another file"
+        return None
 
-    file.visititems_links(visit)
+    if found := file.visititems_links(visit):
+        raise ValueError(found)
 
 
 def _check_packing(path: Path) -> None:
