@@ -170,6 +170,7 @@ def test_training_goes_on_to_the_same_numbers(tmp_path, alone):
     disturb_training(tmp_path, alone, 0, [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
 
 
+@pytest.mark.slow
 def test_evaluation_repeats_its_numbers(tmp_path):
     disturb_evaluation(tmp_path, 0, [signal.SIGTERM])
 

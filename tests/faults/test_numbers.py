@@ -71,6 +71,7 @@ def test_deterministic_mode_gives_the_same_bits(tmp_path):
     assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())
 
 
+@pytest.mark.slow
 def test_a_leap_of_the_loss_hardly_moves_the_weights(monkeypatch, tmp_path):
     def norms(**given) -> list[float]:
         seen = []

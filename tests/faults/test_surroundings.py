@@ -128,13 +128,13 @@ def test_a_file_that_may_not_be_read_is_named(tmp_path):
 
 
 def train_and_lose_a_worker(config: str) -> None:
-    """Run the door train; the loader's worker that simulates clip 3 dies as if out of memory."""
+    """Run the door train; the loader's worker that simulates clip 8 dies as if out of memory."""
     from src.sim.pipeline import Pipeline
 
     draw, main = Pipeline.draw, os.getpid()
 
     def die(self, number: int):
-        if self.split == "train" and number == 3 and os.getpid() != main:
+        if self.split == "train" and number == 8 and os.getpid() != main:
             os.kill(os.getpid(), signal.SIGKILL)
         return draw(self, number)
 
@@ -142,22 +142,19 @@ def train_and_lose_a_worker(config: str) -> None:
     harness.train(config)
 
 
-def test_a_worker_that_dies_ends_the_run_and_it_goes_on(tmp_path):
-    more = ["data.workers=1", "data.reuse=1", "callbacks.rotation.every_n_train_steps=1"]
+def test_a_worker_that_dies_ends_the_run_and_it_goes_on(tmp_path, alone):
+    numbers, _ = alone  # computed without a worker
     tally = Tally("a loader's worker dies")
     with tally.run():
         tally.injected += 1
-        run = Run(tmp_path / "log", train_and_lose_a_worker, training(tmp_path / "first", *more))
+        first = training(tmp_path / "first", "data.workers=1")
+        run = Run(tmp_path / "log", train_and_lose_a_worker, first)
         assert run.wait() == 1 and "DataLoader worker" in run.text(), run.text()
         assert f"go on with ckpt={tmp_path / 'first' / 'checkpoints'}" in run.text()
-        left = [f"ckpt={tmp_path / 'first'}"]
-        outcomes = []
-        for name, given in (("rest", left), ("alone", [])):
-            config = training(tmp_path / name, *more, *given)
-            run = Run(tmp_path / f"{name}.log", harness.train, config)
-            assert run.wait() == 0, run.text()
-            outcomes.append(harness.outcome(tmp_path / name))
-        assert outcomes[0] == outcomes[1]
+        rest = training(tmp_path / "rest", "data.workers=1", f"ckpt={tmp_path / 'first'}")
+        run = Run(tmp_path / "rest.log", harness.train, rest)
+        assert run.wait() == 0, run.text()
+        assert harness.outcome(tmp_path / "rest") == numbers
 
 
 def on_slurm(config: str, folder: str) -> None:
