@@ -19,7 +19,7 @@ def report(cfg: DictConfig) -> list[tables.Table]:
     folders, out = [Path(str(folder)) for folder in given], Path(cfg.paths.run)
     found, plans = runs.find(folders), runs.plans(folders)
     title = cfg.title or sweep_name(found)
-    keys, made = cells.cells(found, plans)
+    keys, made = cells.cells(found, plans, tuple(cfg.across))
     paper = OmegaConf.to_container(cfg.paper)
     wanted = [
         tables.main("Scores and cost", keys, made, paper),

@@ -21,19 +21,23 @@ class Cell:
     notes: list[str] = field(default_factory=list)
 
 
-def cells(runs: list[Run], plans: list[Plan] = ()) -> tuple[tuple[str, ...], list[Cell]]:
+def cells(
+    runs: list[Run], plans: list[Plan] = (), across: Iterable[str] = ()
+) -> tuple[tuple[str, ...], list[Cell]]:
     """Return the keys of the labels, and a cell per setting, in the order of the sweeps.
 
-    Runs with one label and other settings are two cells, each with a note that says what differs.
-    Of two runs with one setting and seed the newer counts.
+    Like the seed, the settings `across` do not part cells, such as ckpt for networks of several
+    seeds tested on the same clips.  Runs with one label and other settings are two cells, each with
+    a note that says what differs.  Of two runs with one setting and seed the newer counts.
     """
-    asked = _asked(runs)
+    asked = [key for key in _asked(runs) if key not in across]
     keys = _telling([_values(run, asked) for run in runs])
     found = defaultdict(list)
     for run in runs:
         label = tuple(_values(run, asked).get(key, "-") for key in keys)
-        found[label, tuple(sorted((k, repr(v)) for k, v in run.identity.items()))].append(run)
-    made = [_cell(label, members) for (label, _), members in found.items()]
+        settings = {k: repr(v) for k, v in run.identity.items() if k not in across}
+        found[label, tuple(sorted(settings.items()))].append(run)
+    made = [_cell(label, members, across) for (label, _), members in found.items()]
     _mark(made)
     _count_missing(made, keys, [job for plan in plans for job in plan.jobs])
     return keys, made
@@ -88,9 +92,11 @@ def _telling(rows: list[dict[str, str]]) -> tuple[str, ...]:
     return tuple(chosen) or ("experiment",)
 
 
-def _cell(label: tuple[str, ...], runs: list[Run]) -> Cell:
-    newest = {run.record["seed"]: run for run in runs}  # oldest first: the last one stays
-    cell = Cell(label, [newest[seed] for seed in sorted(newest)])
+def _cell(label: tuple[str, ...], runs: list[Run], across: Iterable[str]) -> Cell:
+    newest = {}
+    for run in runs:  # oldest first: the last one stays
+        newest[run.record["seed"], *(str(run.settings.get(key)) for key in across)] = run
+    cell = Cell(label, [newest[draw] for draw in sorted(newest)])
     if len(newest) < len(runs):
         cell.notes.append(f"{len(runs) - len(newest)} older runs of the same seeds are left out")
     return cell

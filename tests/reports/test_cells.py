@@ -64,6 +64,15 @@ def test_where_and_on_what_machine_it_ran_makes_no_other_cell(tmp_path):
     assert len(grouped(tmp_path)[1]) == 1
 
 
+def test_networks_of_several_seeds_on_the_same_clips_are_one_cell_across_ckpt(tmp_path):
+    for path in ("a.ckpt", "b.ckpt"):
+        settings = {"ckpt": path}
+        write_run(tmp_path / path, overrides=(f"ckpt={path}",), settings=settings, task="eval")
+    assert [cell.label for cell in grouped(tmp_path)[1]] == [("a.ckpt",), ("b.ckpt",)]
+    keys, (cell,) = cells(runs.find([tmp_path]), across=("ckpt",))
+    assert keys == ("experiment",) and len(cell.runs) == 2
+
+
 def test_of_two_runs_of_one_seed_the_newer_counts_and_it_is_said(tmp_path):
     write_run(tmp_path / "b", scores={"ssim": 0.1})
     write_run(tmp_path / "a", scores={"ssim": 0.2})
