@@ -26,10 +26,13 @@ def stress(cfg: DictConfig) -> suite.Found:
     titles = {name: str(node.title) for name, node in cfg.probes.items()}
     results.open_run(run, door.resolved(cfg))
     bench = Bench(build.pipeline(cfg, "test"), range(cfg.clips), cfg.data.warmup)
-    found = suite.run(candidates, probes, bench)
+
+    def keep(found: suite.Found) -> None:
+        results.write_text(run / "stress.csv", suite.table(found, titles))
+
+    found = suite.run(candidates, probes, bench, keep)
     standards = suite.standards(candidates, bench)
     text = suite.words(found, titles, standards)
-    results.write_text(run / "stress.csv", suite.table(found, titles))
     results.write_text(run / "stress.md", text)
     for suffix in ("png", "svg"):
         stress_map(run / f"stress.{suffix}", found, titles, standards)

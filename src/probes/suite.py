@@ -5,8 +5,6 @@ import io
 import time
 from collections.abc import Callable, Mapping
 
-import rich
-
 from src.metrics.lineup import Candidate, Subject
 from src.probes.bench import Bench, Finding
 
@@ -15,14 +13,23 @@ Cell = Finding | str  # or why there is none
 Found = dict[str, dict[str, Cell]]  # probe -> network -> cell
 
 
-def run(candidates: list[Candidate], probes: Mapping[str, Probe], bench: Bench) -> Found:
-    """Return every cell; a probe that cannot run leaves the reason instead of a finding."""
+def run(
+    candidates: list[Candidate],
+    probes: Mapping[str, Probe],
+    bench: Bench,
+    keep: Callable[[Found], None],
+) -> Found:
+    """Return every cell; a probe that cannot run leaves the reason instead of a finding.
+
+    `keep` is called with what is found so far after every network.
+    """
     found: Found = {name: {} for name in probes}
     for candidate in candidates:
         start = time.perf_counter()
         for name, probe in probes.items():
             found[name][candidate.name] = _cell(candidate, probe, bench)
-        rich.print(f"{candidate.name}: {time.perf_counter() - start:.0f} s")
+        keep(found)
+        print(f"{candidate.name}: {time.perf_counter() - start:.0f} s", flush=True)
     return found
 
 
