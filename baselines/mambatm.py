@@ -45,6 +45,8 @@ class MambaTM(nn.Module):
         self.distortion_width = nn.Conv2d(width, width, 1)
         self.distortion_decoder = Decoder(DISTORTION, features)
         self.decoder = Decoder(channels, features)
+        for parameter in self.decoder.out[-1].parameters():
+            nn.init.zeros_(parameter)  # what is added to the input begins with nothing
         self.free = nn.ModuleList(
             Layer(width, states, guided=False) for _ in range(3 * (groups - 1))
         )

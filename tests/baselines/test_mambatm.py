@@ -12,7 +12,15 @@ from tests.conftest import ROOT
 
 def small() -> MambaTM:
     torch.manual_seed(0)
-    return MambaTM(states=2).eval()
+    network = MambaTM(states=2).eval()
+    torch.nn.init.normal_(network.decoder.out[-1].weight, std=0.1)
+    return network
+
+
+@torch.no_grad()
+def test_it_begins_as_the_identity():
+    frames = torch.rand(1, 2, 1, 16, 16)
+    assert torch.equal(MambaTM(states=2)(frames)[0], frames)
 
 
 @pytest.mark.parametrize(
