@@ -5,7 +5,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from src.figures.plots import MARKERS, save
 from src.metrics.charting import Score
@@ -67,8 +67,10 @@ def machine(path: Path, speeds: Sequence[Speed], peaks: Mapping[tuple[str, int],
             axes.plot(s.gmac, s.ms, linestyle="none", **look)
         _peaks(axes, peaks, count, [s.gmac for s in timed])
         axes.set(xscale="log", yscale="log", xlabel="GMAC a frame", ylabel="ms a frame")
-        axes.xaxis.set_major_formatter("{x:g}")
-        axes.yaxis.set_major_formatter("{x:g}")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter(NullFormatter())
         axes.set_title(f"{count} thread{'s' * (count > 1)}", fontsize=11)
         axes.grid(alpha=0.25, which="major")
     forms = [form for form in FACES if any(s.form == form for s in timed)]
@@ -106,6 +108,7 @@ def _panel(axes, names: list[str], times: Mapping, scores: Sequence[Score], metr
     axes.set(xscale="log", title=HEADS[metric])
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.title.set_fontsize(10)
     axes.grid(alpha=0.25)
 

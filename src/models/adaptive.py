@@ -19,6 +19,7 @@ from src.sim.optics import Position, layout
 
 BLOCK = 4  # pixels of a block in which events are added up before views are compared
 MEMORY_S = 0.1  # over which they are
+SETTLED_S = 0.05  # from the start, in which few events say little and no level is left upwards
 BELOW = 0.7  # of the bound of a level has to be undercut to leave it
 
 
@@ -33,7 +34,8 @@ class Level:
 
 @dataclass(frozen=True)
 class Held:
-    """The state: which level runs, with what state, what the views said, for how long it was calm.
+    """The state: which level runs, with what state, what the views said, the windows it was calm,
+    and the time since the start in seconds.
 
     `coming`: the level that takes over, its state, and after how many windows.
     """
@@ -43,6 +45,7 @@ class Held:
     sums: Tensor
     disagreement: float
     calm: int
+    age_s: float
     coming: tuple[int, State, int] | None = None
 
 
@@ -104,14 +107,14 @@ class Adaptive(nn.Module):
         spread = (sums - mean).square().mean().sqrt()
         found = float(spread / mean.square().mean().sqrt().clamp(min=1e-9)) if spread > 0 else 0.0
         if state is None:
-            return Held(sum(found > bound for bound in self.bounds), None, sums, found, 0)
-        return replace(state, sums=sums, disagreement=found)
+            return Held(0, None, sums, found, 0, window_s)
+        return replace(state, sums=sums, disagreement=found, age_s=state.age_s + window_s)
 
     def _decided(self, held: Held, places: list[Position]) -> Held:
         """Go up at once, down one level at a time and only after calm."""
         aim = sum(held.disagreement > bound for bound in self.bounds)
         now = held.level if held.coming is None else held.coming[0]
-        if aim > now:
+        if aim > now and held.age_s > SETTLED_S:
             return self._changed(held, aim, places)
         if now == 0 or held.disagreement > BELOW * self.bounds[now - 1]:
             return replace(held, calm=0)
@@ -124,8 +127,6 @@ class Adaptive(nn.Module):
         held = replace(held, calm=0, coming=None)
         if level == held.level:
             return held
-        if held.own is None:
-            return replace(held, level=level)
         before, after = self.levels[held.level], self.levels[level]
         own = _reviewed(held.own, _chosen(before.views, places), _chosen(after.views, places))
         if before.network is after.network:
