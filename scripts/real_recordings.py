@@ -74,8 +74,10 @@ def panel(picture: np.ndarray, text: str) -> np.ndarray:
     width = round(picture.shape[1] * PANEL / picture.shape[0])
     grey = cv2.resize(picture, (width, PANEL), interpolation=cv2.INTER_AREA)
     grey = np.ascontiguousarray(np.round(255 * grey).astype(np.uint8))
-    for shade, thick in ((0, 3), (255, 1)):
-        cv2.putText(grey, text, (5, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, shade, thick, cv2.LINE_AA)
+    font = (cv2.FONT_HERSHEY_SIMPLEX, 0.45)
+    (wide, _), _ = cv2.getTextSize(text, *font, 1)
+    cv2.rectangle(grey, (0, 0), (wide + 8, 20), 0, cv2.FILLED)
+    cv2.putText(grey, text, (4, 15), *font, 255, 1, cv2.LINE_AA)
     return np.pad(grey, 2, constant_values=255)
 
 

@@ -110,6 +110,9 @@ def pipeline(cfg: DictConfig, split: str) -> Pipeline:
 
 def data(cfg: DictConfig, splits: tuple[str, ...] = ("train", "val", "test")) -> LightFieldData:
     """Return the data module with the pipelines of `splits`."""
+    if not 0 <= cfg.data.warmup <= cfg.data.test_windows - 2:  # wobble needs two frames
+        most = cfg.data.test_windows - 2
+        raise ValueError(f"data.warmup must be in 0..{most} (windows), got {cfg.data.warmup}")
     return LightFieldData(
         {split: pipeline(cfg, split) for split in splits},
         make(cfg.augment) if "train" in splits else None,

@@ -105,6 +105,7 @@ def test_eval_equals_the_test_of_training(tmp_path):
         (["scene.root=/nowhere"], "scene.root"),
         (["data.crop=100"], "data.crop"),
         (["data.batch_size=0"], "data.batch_size"),
+        (["data.warmup=9", "data.test_windows=10"], "data.warmup"),
         (["optics.views=7"], "optics.views"),
         (["sensor.threshold=-1"], "sensor.threshold"),
         (["augment.pause=2"], "augment.pause"),

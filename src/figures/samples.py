@@ -102,7 +102,7 @@ def _mosaic(videos: list[np.ndarray], optics: Optics) -> np.ndarray:
     height, width = videos[0].shape[1:3]
     size = ((max(rows) - min(rows) + 1) * height, (max(columns) - min(columns) + 1) * width)
     canvas = np.ones((len(videos[0]), *size, 3), np.float32)
-    for (r, c), video in zip(optics.positions, videos, strict=True):
+    for (r, c), film in zip(optics.positions, videos, strict=True):
         top, left = (r - min(rows)) * height, (c - min(columns)) * width
-        canvas[:, top : top + height, left : left + width] = video
+        canvas[:, top : top + height, left : left + width] = film
     return canvas
