@@ -29,7 +29,7 @@ def stress_map(
     aligned PSNR in dB of each network where nothing is made hard, written under its name.
     """
     networks = list(next(iter(found.values())))
-    size = (TITLE_IN + COLUMN_IN * len(networks), 1.3 + ROW_IN * len(found))
+    size = (TITLE_IN + COLUMN_IN * len(networks), 1.6 + ROW_IN * len(found))
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots()
     for row, cells in enumerate(found.values()):
@@ -45,8 +45,8 @@ def stress_map(
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
     figure.supxlabel(
-        "under the name: aligned PSNR on the standard clips.  blue: within the limit; orange: "
-        "beyond it, deep at 10 times; hatched: did not run, the text says why",
+        "under the name: aligned PSNR on the standard clips\nblue: within the limit; orange: beyond "
+        "it, deep at 10 times\nhatched: did not run, the text says why",
         fontsize=8,
     )
     return save(figure, path)
