@@ -45,8 +45,8 @@ def stress_map(
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
     figure.supxlabel(
-        "under the name: aligned PSNR on the standard clips\nblue: within the limit; orange: beyond "
-        "it, deep at 10 times\nhatched: did not run, the text says why",
+        "under the name: aligned PSNR on the standard clips\nblue: within the limit; orange: "
+        "beyond it, deep at 10 times\nhatched: did not run, the text says why",
         fontsize=8,
     )
     return save(figure, path)
