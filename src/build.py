@@ -205,5 +205,7 @@ def test(
     """Return the scores of `net` on the test clips; in float32, whatever it was trained in."""
     plain = {"precision": "32-true", "logger": False, "enable_checkpointing": False}
     plain |= {"devices": 1, "num_nodes": 1, "strategy": "auto"}  # of many, one process tests
+    # On SLURM a trainer takes up what a preempted training left in its folder: this one has none.
+    plain["default_root_dir"] = None
     quiet = make(cfg.trainer, callbacks=[], **plain)
     return evaluation.test(name, net, data, measures, trainer=quiet, warmup=cfg.data.warmup)
