@@ -5,8 +5,8 @@ import torch
 from torch import nn
 
 from baselines.highpass import HighPass
-from src.models.setnet import SetNet
 from src.metrics.lineup import Subject
+from src.models.setnet import SetNet
 from src.probes import air, memory, numerics, rates, views
 from src.probes.bench import Bench, Finding
 from src.probes.stream import Conditions, film, strengthened
