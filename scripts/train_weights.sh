@@ -12,7 +12,7 @@ PY=${PY:-.venv/bin/python}
 OUT=${OUT:-out/weights}
 SCENES=${SCENES:-}
 NETWORKS=${NETWORKS:-lf3x3 single256 $(cd conf/experiment && echo clean/*.yaml | sed 's/\.yaml//g') \
-  setnet_small setnet_medium setnet_large}
+  mambatm setnet_small setnet_medium setnet_large}
 end=$((SECONDS + ${SECONDS_LEFT:-10000000}))
 scene=()
 [ -n "$SCENES" ] && scene=("scene.root=$SCENES")
@@ -39,14 +39,17 @@ for name in $NETWORKS; do
     within "$name" $PY -m src.train "experiment=$name" "${scene[@]}" "${resume[@]}" "$@" \
       "hydra.run.dir=$part"
   fi
+  ckpt=$(trained)/checkpoints/last.ckpt
+  case $name in
+    mambatm) method=(baseline=frames postprocess=mambatm "postprocess.restorer=$ckpt" optics=single) ;;
+    single* | clean/*) method=("ckpt=$ckpt" optics=single) ;;
+    *) method=("ckpt=$ckpt") ;;
+  esac
   for set in test_photos test_targets; do
-    views=lf3x3
-    case $name in single* | clean/*) views=single ;; esac
     root=()
     [ $set = test_photos ] && root=("${scene[@]}")
     [ -f "$folder/$set/results.json" ] || within "$name, $set" $PY -m src.eval \
-      "ckpt=$(trained)/checkpoints/last.ckpt" data=$set optics=$views "${root[@]}" \
-      ${EVAL:-} "hydra.run.dir=$folder/$set"
+      "${method[@]}" data=$set "${root[@]}" ${EVAL:-} "hydra.run.dir=$folder/$set"
   done
   $PY -m scripts.ship_weights "$(trained)" --name "$name" \
     --test "$folder/test_photos" "$folder/test_targets"
