@@ -29,6 +29,8 @@ class Fast(nn.Module):
         self.views, self.dtype, self.skip_empty = network.views, dtype, skip_empty
         # SetNet adds its events up in float32 and rounds where it convolves.
         self.rounds_itself = isinstance(network, SetNet)
+        if self.rounds_itself:
+            self.inner.frozen = {}
         self.told = [name for name in ("window_s", "positions") if takes(network, name)]
 
     @torch.no_grad()
@@ -41,7 +43,7 @@ class Fast(nn.Module):
         positions: Sequence[tuple[int, int]] | None = None,
     ) -> tuple[Float[Tensor, "n 1 h w"], Any]:
         """Return the frame and the state (the network's own, last frame)."""
-        if self.skip_empty and state is not None and not voxels.any():
+        if self.skip_empty and state is not None and _silent(voxels):
             return state[1], state
         facts = {"window_s": window_s, "positions": positions}
         told = {name: facts[name] for name in self.told}
@@ -50,6 +52,12 @@ class Fast(nn.Module):
         frame, own = self.inner(seen, own, **told)
         frame = frame.float()
         return frame, (own, frame)
+
+
+def _silent(voxels: Tensor) -> bool:
+    """Return whether there is no event; plane by plane, as the first one mostly has some."""
+    planes = voxels.flatten(0, 2) if voxels.device.type == "cpu" else [voxels]
+    return not any(planes[i].any() for i in range(len(planes)))
 
 
 def plain(network: nn.Module) -> nn.Module:

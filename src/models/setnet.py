@@ -48,8 +48,8 @@ class SetNet(nn.Module):
         super().__init__()
         self.bins = bins
         memories = len(MEMORIES_S)
-        self.voxel_stem = ViewConv(bins, stem, 5, stride=2)
-        self.sum_stem = ViewConv(memories, stem, 3)
+        self.voxel_stem = ViewKernels(bins, stem, 5)
+        self.sum_stem = ViewKernels(memories, stem, 3)
         self.spread_stem = nn.Conv2d(memories, stem, 3, padding=1, bias=False)
         self.down4 = nn.Conv2d(stem, channels, 3, 2, padding=1)
         self.cell4 = PacedGRU(channels)
@@ -61,6 +61,7 @@ class SetNet(nn.Module):
         self.up2 = nn.Conv2d(channels, stem, 1)
         self.mix2 = nn.Conv2d(stem, stem, 3, padding=1)
         self.shuffle = nn.Conv2d(stem, 4, 3, padding=1)
+        self.frozen: dict[tuple, tuple[Tensor, Tensor]] | None = None  # kernels kept, for running
         # What is drawn without any learning: the leaky sums themselves.
         self.skip = nn.Parameter(torch.full((memories,), 0.15))
 
@@ -102,8 +103,7 @@ class SetNet(nn.Module):
         mean_sums = _grown(keep, 8) * mean_sums + events.mean(1, keepdim=True)
         spread = (sums - sums.mean(1, keepdim=True)).abs().mean(1)
 
-        stem = self.voxel_stem(voxels, places) + self.sum_stem(sums, places)
-        stem = (stem + self.spread_stem(spread.to(stem.dtype))).relu()
+        stem = self._stem(voxels, torch.cat([sums.flatten(1, 2), spread], 1), places)
         pace = RATE * passed
         hidden4 = self.cell4(self.down4(stem).relu(), hidden4, _grown(pace, 2))
         after4 = hidden4.to(stem.dtype)
@@ -116,7 +116,31 @@ class SetNet(nn.Module):
         state = (mean_sums, sums, awake, hidden4, hidden8)
         return frame[..., top : top + height, left : left + width].float(), state
 
-    def _places(self, views: int, bins: int, positions: Sequence[Position] | None) -> Tensor:
+    def _stem(
+        self, voxels: Tensor, memory: Tensor, places: tuple[Position, ...]
+    ) -> Float[Tensor, "n stem h2 w2"]:
+        grids, memories = self._kernels(places)
+        stem = functional.conv2d(voxels.flatten(1, 2).to(grids.dtype), grids, None, 2, 2)
+        bias = self.voxel_stem.bias + self.sum_stem.bias
+        stem = stem + functional.conv2d(memory.to(memories.dtype), memories, bias, 1, 1)
+        return stem.relu()
+
+    def _kernels(self, places: tuple[Position, ...]) -> tuple[Tensor, Tensor]:
+        """Return the kernels of the stacked grids, and of the stacked sums and their spread."""
+        device = self.skip.device
+        if self.frozen is not None and (places, device) in self.frozen:
+            return self.frozen[places, device]
+        stood = torch.tensor(places, device=device).float()
+        memories = [self.sum_stem.kernel(stood), self.spread_stem.weight]
+        kernels = self.voxel_stem.kernel(stood), torch.cat(memories, 1)
+        if self.frozen is not None:
+            kernels = kernels[0], kernels[1].contiguous(memory_format=torch.channels_last)
+            self.frozen[places, device] = kernels
+        return kernels
+
+    def _places(
+        self, views: int, bins: int, positions: Sequence[Position] | None
+    ) -> tuple[Position, ...]:
         if bins != self.bins:
             raise ValueError(f"bins must be {self.bins} for this network, got {bins}")
         if not 1 <= views <= MAX_VIEWS:
@@ -124,7 +148,7 @@ class SetNet(nn.Module):
         positions = layout(views) if positions is None else positions
         if len(positions) != views:
             raise ValueError(f"optics.positions must be {views} (row, col), got {positions}")
-        return torch.tensor([list(p) for p in positions], device=self.skip.device).float()
+        return tuple((int(row), int(column)) for row, column in positions)
 
     def _start(self, state: State | None, coarse: Tensor) -> State:
         """Return `state`, or zeros of the right sizes; ValueError when they are not right."""
@@ -145,37 +169,32 @@ class SetNet(nn.Module):
         return state
 
 
-class ViewConv(nn.Module):
-    """A convolution over a set of views, averaged; a view's kernel depends on where it stands.
+class ViewKernels(nn.Module):
+    """The kernels of a convolution over a set of views, averaged; one follows from where it stands.
 
     kernel(place) = shared + sum over ranks of code(place) * kernels: with as many ranks as views
     it is an ordinary convolution of stacked views.
     """
 
-    def __init__(
-        self, inputs: int, outputs: int, kernel_size: int, stride: int = 1, ranks: int = 5
-    ):
+    def __init__(self, inputs: int, outputs: int, kernel_size: int, ranks: int = 5):
         super().__init__()
-        self.stride, self.padding = stride, kernel_size // 2
         shape = ((ranks + 1) * outputs, inputs, kernel_size, kernel_size)
         bound = 1 / math.sqrt(inputs * kernel_size**2)
         self.kernels = nn.Parameter(torch.empty(shape).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.zeros(outputs))
         self.code = nn.Sequential(nn.Linear(3, 16), nn.Tanh(), nn.Linear(16, ranks))
 
-    def forward(
-        self, x: Float[Tensor, "n views c h w"], places: Float[Tensor, "views 2"]
-    ) -> Float[Tensor, "n outputs h2 w2"]:
-        """Return one map for all views."""
+    def kernel(
+        self, places: Float[Tensor, "views 2"]
+    ) -> Float[Tensor, "outputs viewsinputs size size"]:
+        """Return the kernel for the stacked views that stand at `places` (row, col)."""
         views = len(places)
         # Positions and the number of views, in units that keep the codes apart.
         known = torch.cat([places, torch.full_like(places[:, :1], 3 / views)], 1)
         code = self.code(known.to(self.bias.dtype))
         code = torch.cat([torch.ones_like(code[:, :1]), code], 1) / views
         kernels = self.kernels.unflatten(0, (code.shape[1], -1))
-        kernel = torch.einsum("vr,roikl->ovikl", code, kernels).flatten(1, 2)
-        stacked = x.flatten(1, 2).to(self.bias.dtype)
-        return functional.conv2d(stacked, kernel, self.bias, self.stride, self.padding)
+        return torch.einsum("vr,roikl->ovikl", code, kernels).flatten(1, 2)
 
 
 class PacedGRU(nn.Module):
