@@ -6,12 +6,13 @@ from pathlib import Path
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 import src.models
+from baselines.postprocess import load as load_restorer
 from src import build
 from src.metrics.lineup import Candidate
 from src.models.adaptive import Adaptive, Level
 from src.sim.pipeline import Pipeline
 
-KEYS = {"ckpt", "baseline", "model", "views"}
+KEYS = {"ckpt", "baseline", "model", "views", "restorer"}
 
 
 def gather(cfg: DictConfig) -> list[Candidate]:
@@ -50,13 +51,16 @@ def _entry(name: str, entry: Mapping) -> Candidate:
         raise ValueError(f"networks.{name} must have views and of {allowed}, got {entry}")
     views, reason = entry["views"], "it names no weights"
     try:
+        restorer = load_restorer(entry["restorer"]) if "restorer" in entry else None
         if "ckpt" in entry:
-            return Candidate(name, src.models.load(entry["ckpt"]), views)
+            return Candidate(name, src.models.load(entry["ckpt"]), views, restorer=restorer)
         if "baseline" in entry:
-            return Candidate(name, build.make(entry["baseline"]).eval(), views)
+            network = build.make(entry["baseline"]).eval()
+            return Candidate(name, network, views, restorer=restorer)
     except ValueError as error:
         reason = str(error)
-    network = build.make(entry["model"]).eval() if "model" in entry else None
+    timed_only = "model" in entry and "restorer" not in entry
+    network = build.make(entry["model"]).eval() if timed_only else None
     return Candidate(name, network, views, trained=False, missing=reason)
 
 

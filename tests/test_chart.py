@@ -5,6 +5,7 @@ import csv
 import pytest
 import torch
 
+from baselines.mambatm import MambaTM
 from src.chart import chart
 from src.models import save
 from src.models.setnet import SetNet
@@ -34,6 +35,21 @@ def test_figures_and_tables_are_written_and_untrained_networks_timed_only(tmp_pa
     scored = list(csv.DictReader((tmp_path / "scores.csv").read_text().splitlines()))
     assert {row["network"] for row in scored} == {"highpass"} and len(scored) == 2
     assert "ours (no weights)" in (tmp_path / "chart.md").read_text()
+
+
+def test_a_post_processor_is_scored_and_paid_for(tmp_path):
+    torch.manual_seed(0)
+    file = tmp_path / "restorer.safetensors"
+    spec = {"target": "baselines.mambatm.MambaTM", "kwargs": {}}
+    save(file, MambaTM(), spec, {})
+    behind = HIGHPASS.replace("views: 1", f"views: 1, restorer: {file}")
+    chart(tiny(tmp_path, f"+networks={{plain: {HIGHPASS}, behind: {behind}}}", "forms=[float32]"))
+    speeds = list(csv.DictReader((tmp_path / "speed.csv").read_text().splitlines()))
+    cost = {row["network"]: row for row in speeds}
+    for what in ("ms", "gmac", "params"):
+        assert float(cost["behind"][what]) > float(cost["plain"][what])
+    scored = list(csv.DictReader((tmp_path / "scores.csv").read_text().splitlines()))
+    assert {row["network"] for row in scored} == {"plain", "behind"}
 
 
 def test_the_adaptive_network_is_shown_on_air_that_rises_and_falls(tmp_path):

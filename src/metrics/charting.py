@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 
 import rich
+import torch
+from torch import nn
 
 from src.metrics.lineup import Candidate, Subject
 from src.metrics.pareto import knee
@@ -44,6 +46,7 @@ class Score:
     values: Mapping[str, float]
 
 
+@torch.no_grad()
 def scores(
     candidates: Sequence[Candidate], pipelines: Mapping[str, Pipeline], clips: int,
     measure: Scores, *, warmup: int, forms: Sequence[str],
@@ -56,23 +59,29 @@ def scores(
             sample = simulate(pipeline, [clip])
             windows, seconds = sample.voxels[0, :, None], float(sample.window_s[0])
             truth = sample.target[0, warmup:]
-            for form, subject in subjects:
+            for form, subject, restorer in subjects:
                 frames, _ = subject.play(windows, list(sample.positions), seconds)
+                if restorer is not None:
+                    frames = restorer.restore(frames[None])[0]
                 values = measure(frames[warmup:], truth)
                 found.append(Score(subject.name, form, severity, clip, values))
         rich.print(f"scored on {severity} turbulence")
     return found
 
 
-def _subjects(candidates: Sequence[Candidate], forms: Sequence[str]) -> list[tuple[str, Subject]]:
+def _subjects(
+    candidates: Sequence[Candidate], forms: Sequence[str]
+) -> list[tuple[str, Subject, nn.Module | None]]:
+    """Return (form, network, post-processor); what has one, or no weights, is not rounded."""
     found = []
     for candidate in candidates:
         if candidate.network is None or not candidate.trained:
             continue
-        found.append(("float32", Subject(candidate.name, candidate.network, candidate.views)))
-        if "bf16" in forms and any(True for _ in candidate.network.parameters()):
-            half = rounded(candidate.network)
-            found.append(("bf16", Subject(candidate.name, half, candidate.views)))
+        name, network, views = candidate.name, candidate.network, candidate.views
+        found.append(("float32", Subject(name, network, views), candidate.restorer))
+        learned = any(True for _ in network.parameters())
+        if "bf16" in forms and learned and candidate.restorer is None:
+            found.append(("bf16", Subject(name, rounded(network), views), None))
     return found
 
 

@@ -17,7 +17,7 @@ class Candidate:
 
     `views`: how many views of the light field it is given (1: the centre view).  `trained`: its
     weights are here; without them only speed means anything.  `missing`: why there is no network at
-    all, in plain words.
+    all, in plain words.  `restorer`: a post-processor of frames behind it.
     """
 
     name: str
@@ -25,6 +25,12 @@ class Candidate:
     views: int
     trained: bool = True
     missing: str = ""
+    restorer: nn.Module | None = None
+
+    @property
+    def parts(self) -> list[nn.Module]:
+        """The network and what is behind it, as far as they are here."""
+        return [part for part in (self.network, self.restorer) if part is not None]
 
 
 @dataclass(frozen=True)

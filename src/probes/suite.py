@@ -38,6 +38,8 @@ def _cell(candidate: Candidate, probe: Probe, bench: Bench) -> Cell:
         return candidate.missing
     if not candidate.trained:
         return f"it has no weights: {candidate.missing}"
+    if candidate.restorer is not None:
+        return "a post-processor wants the whole video"
     try:
         return probe(Subject(candidate.name, candidate.network, candidate.views), bench)
     except ValueError as error:
