@@ -12,6 +12,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from src.models import files
+from src.models.unroll import takes
 
 LARGEST = 16 * 2**20  # bytes of a file
 MEASURES = {"lpips": "LPIPS", "ssim": "SSIM", "psnr": "PSNR", "psnr_aligned": "aligned PSNR"}
@@ -62,14 +63,22 @@ def facts(record: dict, cfg: DictConfig, steps: int) -> dict:
     }
 
 
+def seen(network: torch.nn.Module) -> str:
+    """Return what a network is given, in words."""
+    if network.views is not None:
+        return f"{network.views} view(s)"
+    if takes(network, "frames"):
+        return "frames in, frames out"
+    return "any number of views" if takes(network, "positions") else "the centre view"
+
+
 def describe(name: str, network: torch.nn.Module, card: dict, tests: list[tuple]) -> str:
     """Return the model card as Markdown."""
     count = sum(parameter.numel() for parameter in network.parameters())
-    views = "any number of views" if network.views is None else f"{network.views} view(s)"
     lines = [
         f"# {name}",
         "",
-        f"`{type(network).__name__}`, {count:,} parameters, {views}; `ckpt={name}`.",
+        f"`{type(network).__name__}`, {count:,} parameters, {seen(network)}; `ckpt={name}`.",
         "",
         "| trained | |",
         "|---|---|",
