@@ -1,15 +1,16 @@
-"""Fit src/sim/p2s.safetensors: python -m scripts.fit_p2s [steps, default 25000].
+"""Fit src/sim/p2s.safetensors: python -m scripts.fit_p2s [steps, default 25000; 0: tables only].
 
 For each band of D/r0: exact PSFs of random Kolmogorov phase, a principal basis of them in the
 metric of a natural picture (power 1 / f^2), a network from phase to weights; then the tables of
-what each simplification costs (src/sim/fidelity.py).  Nothing but physics goes in.
+what each simplification costs (src/sim/fidelity.py), for which 0 steps keep the networks there are.
+Nothing but physics goes in.
 """
 
 import sys
 from dataclasses import dataclass
 
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from scripts.p2s_errors import measure, picture_metric
@@ -41,12 +42,19 @@ PLANS = (
 
 def fit(steps: int) -> None:
     """Fit every band, measure what each simplification costs, and write the file."""
+    if steps:
+        save_file(fit_bands(steps), FILE)
+    networks = {name: t for name, t in load_file(FILE).items() if not name.startswith("errors.")}
+    save_file(networks | measure(), FILE)
+
+
+def fit_bands(steps: int) -> dict[str, Tensor]:
+    """Return what is fitted, by band and name."""
     stored = {"edges": torch.tensor([plan.edge for plan in PLANS])}
     for index, plan in enumerate(PLANS):
         for name, tensor in fit_band(plan, steps).items():
             stored[f"{index}.{name}"] = tensor.contiguous()
-    save_file(stored, FILE)
-    save_file(stored | measure(), FILE)
+    return stored
 
 
 def fit_band(plan: Plan, steps: int) -> dict[str, Tensor]:

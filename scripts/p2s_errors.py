@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor
 
-from src.sim.atmosphere import Atmosphere
+from src.sim.atmosphere import TILT_VARIANCE, Atmosphere
 from src.sim.fidelity import band_for
 from src.sim.p2s import FINE_PER_AIRY
 from src.sim.phase import draw_waves
@@ -20,7 +20,8 @@ AIRY = (0.25, 0.5, 1.0, 2.0)
 MODES = (5, 9, 14, 20, 27, 35, 44, 54, 65, 77)
 PITCHES = (0.025, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0)  # of D, at the object
 RANKS = (4, 8, 12, 16, 20, 24, 32, 40, 48)
-REACHES = (3.0, 4.0, 5.0, 6.0, 7.0, 8.5, 11.5)  # half the kernel, in lambda / D
+REACHES = (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0, 7.0, 8.5)  # half the kernel, lambda / D
+TILTS = 200  # random tilts that the halo is not moved by
 ALL_MODES = 119
 FINE, GRID = 47, 96  # samples of a PSF, and of its transform
 SPATIAL_WAVES = 256
@@ -58,7 +59,8 @@ def _row(strength: float) -> dict[str, Tensor]:
     modes = [_power(_exact(phase[:, :count]) - full) / power for count in MODES]
     pitch = [_pitch_error(strength, pitch) / power for pitch in PITCHES]
     rank = [error / power for error in _rank_errors(strength)]
-    kernel = [_power(_cut(full, reach) - full) / power for reach in REACHES]
+    mean = _round(full.mean(0))
+    kernel = [_kernel_error(full, mean, reach, strength) / power for reach in REACHES]
     return {
         "power": power,
         "modes": torch.stack(modes),
@@ -66,6 +68,7 @@ def _row(strength: float) -> dict[str, Tensor]:
         "rank": torch.stack(rank),
         "kernel": torch.stack(kernel),
         "half_light": _half_light(full.mean(0)),
+        "mean": mean,
     }
 
 
@@ -130,11 +133,32 @@ def _rank_errors(strength: float) -> list[Tensor]:
     return out
 
 
-def _cut(psfs: Tensor, reach: float) -> Tensor:
-    """Return the PSFs without what lies `reach` lambda / D or more off the axes; they sum to 1."""
+def _round(psf: Tensor) -> Tensor:
+    """Return the mean of a PSF (fine, fine) over the symmetries of the square."""
+    four = torch.stack([psf.rot90(turn) for turn in range(4)]).mean(0)
+    return (four + four.T) / 2
+
+
+def _kernel_error(full: Tensor, mean: Tensor, reach: float, strength: float) -> Tensor:
+    """Return the power of PSFs that are the mean beyond `reach` lambda / D off the axes.
+
+    Of that and of the mean, the halo, not being moved by the tilt of a pixel.
+    """
     inside = (torch.arange(FINE) - FINE // 2).abs() <= reach * FINE_PER_AIRY
-    cut = psfs * inside * inside[:, None]
-    return cut / cut.sum((1, 2), keepdim=True)
+    inside = inside & inside[:, None]
+    cut = torch.where(inside, full, mean)
+    random = _power(cut / cut.sum((1, 2), keepdim=True) - full)
+    spread = 2 / math.pi * math.sqrt(TILT_VARIANCE) * strength ** (5 / 6) * FINE_PER_AIRY
+    tilt = spread * torch.randn(TILTS, 2, generator=torch.Generator().manual_seed(1))
+    return random + _power(_moved(mean.masked_fill(inside, 0), tilt))
+
+
+def _moved(psf: Tensor, tilt: Tensor) -> Tensor:
+    """Return by how much PSFs moved by `tilt` (n, 2) samples differ from `psf` (fine, fine)."""
+    f = torch.fft.fftfreq(GRID)
+    turn = tilt[:, :1, None] * f + tilt[:, 1:, None] * f[:, None]
+    spectrum = torch.fft.fft2(psf, s=(GRID, GRID))
+    return torch.fft.ifft2(spectrum * (torch.exp(-2j * math.pi * turn) - 1)).real
 
 
 def _half_light(psf: Tensor) -> Tensor:

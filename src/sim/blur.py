@@ -26,24 +26,31 @@ def degrade(
     kernels: list[Float[Tensor, "frames rows k k columns"]],
     rows: Lattice,
     columns: Lattice,
+    halo: Float[Tensor, "frames hout wout"],
+    share: float,
 ) -> Float[Tensor, "views frames hout wout"]:
-    """Warp the frames by each view's tilt, then scatter them by its PSFs.
+    """Warp the frames by each view's tilt, then scatter them by its PSFs and add their `halo`.
 
     Tilts are in pixels over the window of `rows` and `columns`, on whose nodes the PSFs stand.  The
-    result lacks k // 2 pixels on each side.
+    result lacks k // 2 pixels on each side.  The halo of a white scene would be `share`.
     """
     if frames.device.type != "cpu":
         return torch.stack(
-            [_eager(frames, *both, rows, columns) for both in zip(tilts, kernels, strict=True)]
+            [
+                _eager(frames, *both, rows, columns, halo, share)
+                for both in zip(tilts, kernels, strict=True)
+            ]
         )
 
     def one(place: tuple[int, int]) -> Tensor:
         view, index = place
         tilt, kernel = tilts[view][index].numpy(), kernels[view][index].numpy()
         tilted = warp_engine.warp(frames[index].numpy(), tilt, rows.start, columns.start)
-        if kernel.shape[1] > 1:
-            tilted = scatter_engine.scatter(tilted, kernel, rows.offset, columns.offset, rows.pitch)
-        return torch.from_numpy(tilted)
+        if kernel.shape[1] == 1 and share == 0:
+            return torch.from_numpy(tilted)
+        place = (rows.offset, columns.offset, rows.pitch)
+        light = scatter_engine.scatter(tilted, kernel, *place, halo[index].numpy(), share)
+        return torch.from_numpy(light)
 
     places = list(product(range(len(tilts)), range(len(frames))))
     threads = min(torch.get_num_threads(), len(places))
@@ -56,10 +63,17 @@ def degrade(
 
 
 def _eager(
-    frames: Tensor, tilt: Tensor, kernels: Tensor, rows: Lattice, columns: Lattice
+    frames: Tensor,
+    tilt: Tensor,
+    kernels: Tensor,
+    rows: Lattice,
+    columns: Lattice,
+    halo: Tensor,
+    share: float,
 ) -> Tensor:
     tilted = warp(frames, tilt, rows.start, columns.start)
-    return scatter(tilted, kernels, rows.weights().to(tilt), columns.weights().to(tilt))
+    both = (rows.weights().to(tilt), columns.weights().to(tilt))
+    return scatter(tilted, kernels, *both, halo, share)
 
 
 def warp(
@@ -93,15 +107,17 @@ def scatter(
     kernels: Float[Tensor, "frames rows k k columns"],
     vertical: Float[Tensor, "h rows"],
     horizontal: Float[Tensor, "w columns"],
+    halo: Float[Tensor, "frames hout wout"],
+    share: float,
 ) -> Float[Tensor, "frames hout wout"]:
     """Spread every pixel's light by the PSF there, over what a white scene would give.
 
-    `vertical` and `horizontal` interpolate the PSFs between the nodes.
+    `vertical` and `horizontal` interpolate the PSFs between the nodes; `halo` is the light from
+    beyond them, `share` what it would be of a white scene.
     """
     size = kernels.shape[2]
-    height, width = image.shape[-2] - size + 1, image.shape[-1] - size + 1
-    light = image.new_zeros(len(image), height, width)
-    white = torch.zeros_like(light)
+    height, width = halo.shape[-2:]
+    light, white = halo.clone(), torch.full_like(halo, share)
     for v in range(size):
         rows = slice(size - 1 - v, size - 1 - v + height)
         nodes = kernels[:, :, v].transpose(1, 2)

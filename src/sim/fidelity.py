@@ -93,6 +93,11 @@ def choose(atmosphere: Atmosphere, width_px: int, tolerance: float, exact: bool)
     )
 
 
+def mean_psf(strength: float) -> Float[Tensor, "fine fine"]:
+    """Return the mean PSF at D/r0 = `strength`, tilt removed, sampled at FINE_PER_AIRY."""
+    return _between(_table("mean"), _table("strength"), strength)
+
+
 def _seen(atmosphere: Atmosphere, width_px: int) -> Fidelity:
     """Return what the atmosphere is in pixels, before anything is chosen."""
     strength, airy = atmosphere.d_over_r0, atmosphere.airy_px(width_px)

@@ -77,17 +77,14 @@ class Spots:
     """The PSFs of one atmosphere on the pixels of one camera, from the basis and the network.
 
     `rank` basis functions of `band`, integrated over pixels of lambda / D / `airy_px`, `size` of
-    them across.
+    them across; the light that falls outside them is not in them.
     """
 
     def __init__(self, band: Band, rank: int, airy_px: float, size: int):
         grid = resampling(size, band.mean.shape[-1], FINE_PER_AIRY / airy_px).float()
         shapes = torch.cat([band.mean[None], band.basis[:rank]])
-        pixels = (grid @ shapes @ grid.T).flatten(1)
         self.band, self.rank, self.size = band, rank, size
-        self.shapes = pixels / pixels[:1].sum()
-        # The basis sums to nothing, so that every PSF sums to one.
-        self.shapes[1:] -= self.shapes[1:].sum(1, keepdim=True) * self.shapes[:1]
+        self.shapes = (grid @ (shapes / band.mean.sum()) @ grid.T).flatten(1)
 
     def __call__(
         self, phase: Float[Tensor, "frames blurmodes rows columns"]

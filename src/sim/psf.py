@@ -21,13 +21,15 @@ def fraunhofer_psf(
     size: int,
     pupil: int = 0,
     points: int = 0,
+    whole: bool = False,
 ) -> Float[Tensor, "*n size size"]:
     """Return |Fourier transform of P exp(i phi)|^2 integrated over pixels; each sums to 1.
 
     `coefficients` are Noll 2..modes + 1 in rad, `size` is odd, the axis of the camera falls on the
     middle pixel and a positive a2 moves the light to larger columns.  `pupil`: samples across the
     pupil (0: enough for `size`); `points`: samples per pixel and axis (0: enough for its integral;
-    1: the value at its centre).  Goodman, Introduction to Fourier Optics, 5.2.
+    1: the value at its centre).  With `whole` it is the light of the endless plane that sums to 1,
+    of which the pixels hold a part.  Goodman, Introduction to Fourier Optics, 5.2.
     """
     if size % 2 == 0 or size < 1 or not airy_px > 0:
         raise ValueError(f"psf needs an odd size and airy_px > 0, got {size}, {airy_px}")
@@ -37,8 +39,12 @@ def fraunhofer_psf(
     inside, basis = _pupil(flat.shape[-1], pupil)
     inside, basis = inside.to(flat), basis.to(flat)
     turn = _transform(pupil, size * points, airy_px * points).to(flat)
-    spots = [_spot(part @ basis, inside, turn, size) for part in flat.split(CHUNK)]
-    return torch.cat(spots).reshape(*coefficients.shape[:-1], size, size)
+    spots = torch.cat([_spot(part @ basis, inside, turn, size) for part in flat.split(CHUNK)])
+    if whole:  # Parseval
+        spots /= inside.sum() * (pupil * airy_px * points) ** 2
+    else:
+        spots /= spots.sum((1, 2), keepdim=True)
+    return spots.reshape(*coefficients.shape[:-1], size, size)
 
 
 def resampling(size: int, fine: int, step: float) -> Float[Tensor, "size fine"]:
@@ -57,7 +63,7 @@ def resampling(size: int, fine: int, step: float) -> Float[Tensor, "size fine"]:
 
 
 def _spot(phase: Tensor, inside: Tensor, turn: Tensor, size: int) -> Tensor:
-    """Return the normalised intensity (n, size, size) of pupil phases (n, samples^2)."""
+    """Return the intensity (n, size, size) of pupil phases (n, samples^2)."""
     samples, fine = turn.shape[0] // 2, turn.shape[1] // 2
     wave = torch.stack([phase.cos() * inside, phase.sin() * inside], dim=1)
     rows = wave.reshape(-1, 2, samples, samples).transpose(1, 2)
@@ -68,7 +74,7 @@ def _spot(phase: Tensor, inside: Tensor, turn: Tensor, size: int) -> Tensor:
     points = fine // size
     if points > 1:
         light = light.reshape(-1, size, points, size, points).sum((2, 4))
-    return light / light.sum((1, 2), keepdim=True)
+    return light
 
 
 def _pupil(modes: int, samples: int) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from src.sim import blur, noise
 from src.sim.atmosphere import Atmosphere
-from src.sim.fidelity import Fidelity, band_for, choose
+from src.sim.fidelity import Fidelity, band_for, choose, mean_psf
+from src.sim.halo import Halo
 from src.sim.lattice import Lattice
 from src.sim.optics import layout, view_id
 from src.sim.p2s import Spots
@@ -70,7 +71,7 @@ class Turbulence:
         self.fidelity = Fidelity()
         if not self.clear:
             self.fidelity = choose(atmosphere, width, tolerance, psf == "exact")
-        self.spots = self._spots()
+        self.spots, self.halo = self._spots(), self._halo()
 
     @torch.no_grad()
     def degrade(
@@ -122,6 +123,7 @@ class Turbulence:
         """
         reach, device = self.fidelity.kernel // 2, frames.device
         top, left, height, width = tile
+        halo = self.halo(frames, *tile)
         window = (top - reach, left - reach, height + 2 * reach, width + 2 * reach)
         tilt = self._field(waves, slice(0, 2), window, device)
         rest = self._field(waves, slice(2, None), window, device)
@@ -137,6 +139,8 @@ class Turbulence:
                     [self._tilt_px * tilt.at_pixels(c) for c in some],
                     [self._kernels(rest.at_nodes(c)) for c in some],
                     *lattices,
+                    halo[first : first + step],
+                    self.halo.share,
                 )
 
     def _kernels(
@@ -145,7 +149,8 @@ class Turbulence:
         if self.spots is not None:
             return self.spots(phase)
         flat = torch.nn.functional.pad(phase.permute(0, 2, 3, 1), (2, 0))
-        psf = fraunhofer_psf(flat, airy_px=self.fidelity.airy_px, size=self.fidelity.kernel)
+        size, airy = self.fidelity.kernel, self.fidelity.airy_px
+        psf = fraunhofer_psf(flat, airy_px=airy, size=size, whole=True)
         return psf.permute(0, 1, 3, 4, 2).contiguous()
 
     def _field(self, waves: Waves, modes: slice, window: Crop, device: torch.device) -> Field:
@@ -165,6 +170,12 @@ class Turbulence:
             return None
         band = band_for(self.fidelity.d_over_r0)
         return Spots(band, self.fidelity.rank, self.fidelity.airy_px, self.fidelity.kernel)
+
+    def _halo(self) -> Halo | None:
+        if self.clear:
+            return None
+        mean = mean_psf(self.fidelity.d_over_r0)
+        return Halo(mean, self.fidelity.airy_px, self.fidelity.kernel)
 
     def _draw(
         self, generator: torch.Generator, frames: int

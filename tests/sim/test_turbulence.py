@@ -9,6 +9,8 @@ import torch
 
 from src.sim import blur
 from src.sim.atmosphere import Atmosphere, sample_atmosphere
+from src.sim.fidelity import mean_psf
+from src.sim.halo import Halo
 from src.sim.lattice import Lattice
 from src.sim.turbulence import Turbulence
 
@@ -129,7 +131,9 @@ def test_accuracy_against_exact_psfs_at_every_pixel(strength, decibels, pixel):
     turbulence = Turbulence(path, views=1, height=128, width=128)
     oracle = copy.copy(turbulence)
     oracle.spots = None
-    oracle.fidelity = replace(turbulence.fidelity, pitch=1, kernel=17)
+    oracle.fidelity = replace(turbulence.fidelity, pitch=1, kernel=23)
+    oracle.halo = Halo(mean_psf(strength), 1.0, 23)
+    assert oracle.halo.share == 0
     picture = leaves(128)
     crop = (24, 24, 80, 80)
     seen, exact = (t.degrade(picture[None, None], seed(3), crop=crop) for t in (turbulence, oracle))
@@ -156,9 +160,10 @@ def test_eager_expressions_equal_the_compiled_ones():
     rows, columns = Lattice(-3, 40, 5, 1), Lattice(2, 37, 5, 1)
     frames, tilt = torch.rand(2, 30, 41), 3 * torch.randn(2, 2, 40, 37)
     kernels = torch.rand(2, len(rows.pixels), 7, 7, len(columns.pixels))
-    [ours] = blur.degrade(frames, [tilt], [kernels], rows, columns)
+    halo = 0.2 * torch.rand(2, 34, 31)
+    [ours] = blur.degrade(frames, [tilt], [kernels], rows, columns, halo, 0.1)
     tilted = blur.warp(frames, tilt, -3, 2)
-    eager = blur.scatter(tilted, kernels, rows.weights(), columns.weights())
+    eager = blur.scatter(tilted, kernels, rows.weights(), columns.weights(), halo, 0.1)
     torch.testing.assert_close(ours, eager, atol=2e-5, rtol=0)
 
 

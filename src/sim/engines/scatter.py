@@ -5,17 +5,18 @@ from numba import njit
 
 
 @njit(nogil=True, cache=True, fastmath=True)
-def scatter(image, kernels, row, column, pitch):
+def scatter(image, kernels, row, column, pitch, halo, share):
     """Return the light of `image` (h, w) spread by PSFs over what white light would give.
 
     `kernels` (rows, size, size, columns) stand on a lattice of `pitch` pixels; the first pixel of
     `image` lies `row`, `column` pixels after the first node.  The result lacks size // 2 pixels on
-    every side.  For every row of nodes the kernels are first drawn out to the pixels along x.
+    every side.  `halo` is the light from beyond the kernels, `share` that of a white scene.  For
+    every row of nodes the kernels are first drawn out to the pixels along x.
     """
     height, width = image.shape
     size = kernels.shape[1]
-    light = np.zeros((height - size + 1, width - size + 1), np.float32)
-    white = np.zeros_like(light)
+    light = halo.copy()
+    white = np.full_like(halo, share)
     above = np.empty((size, size, light.shape[1]), np.float32)
     below = np.empty_like(above)
     source = np.empty((size, light.shape[1]), np.float32)
