@@ -1,5 +1,6 @@
 """What every door (train, eval, simulate ...) shares: a job's folder, its errors, its end."""
 
+import hashlib
 import logging
 import os
 import signal
@@ -23,6 +24,18 @@ from rich.syntax import Syntax
 from src.metrics import results
 
 FAILED = "failed.txt"  # in the folder of a sweep's job: why it failed
+LONGEST = 200  # characters of such a folder's name
+
+
+def one_folder(overrides: str) -> str:
+    """Return `overrides` as the name of one folder: no slashes, and not too long for a disk."""
+    name = overrides.replace("/", "-")
+    if len(name) <= LONGEST:
+        return name
+    return f"{name[: LONGEST - 9]}_{hashlib.sha256(overrides.encode()).hexdigest()[:8]}"
+
+
+OmegaConf.register_new_resolver("one_folder", one_folder, replace=True)
 
 
 class JobFailed(Exception):
