@@ -8,8 +8,8 @@ Outside the frame the scene is its reflection.  On the CPU the two steps are com
 rounding is all they differ by.
 """
 
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from itertools import product
 
 import torch
 from jaxtyping import Float, Int
@@ -22,8 +22,7 @@ from src.sim.lattice import Lattice
 
 def degrade(
     frames: Float[Tensor, "frames height width"],
-    tilts: list[Float[Tensor, "frames 2 h w"]],
-    kernels: list[Float[Tensor, "frames rows k k columns"]],
+    seen: Iterable[tuple[Tensor, Tensor]],
     rows: Lattice,
     columns: Lattice,
     halo: Float[Tensor, "frames hout wout"],
@@ -31,35 +30,31 @@ def degrade(
 ) -> Float[Tensor, "views frames hout wout"]:
     """Warp the frames by each view's tilt, then scatter them by its PSFs and add their `halo`.
 
-    Tilts are in pixels over the window of `rows` and `columns`, on whose nodes the PSFs stand.  The
-    result lacks k // 2 pixels on each side.  The halo of a white scene would be `share`.
+    `seen`: of every view, its tilt in pixels (frames, 2, h, w) over the window of `rows` and
+    `columns`, and the PSFs (frames, rows, k, k, columns) on their nodes; views are blurred while
+    the next are still being drawn from it.  The result lacks k // 2 pixels on each side.  The halo
+    of a white scene would be `share`.
     """
     if frames.device.type != "cpu":
-        return torch.stack(
-            [
-                _eager(frames, *both, rows, columns, halo, share)
-                for both in zip(tilts, kernels, strict=True)
-            ]
-        )
+        return torch.stack([_eager(frames, *both, rows, columns, halo, share) for both in seen])
 
-    def one(place: tuple[int, int]) -> Tensor:
-        view, index = place
-        tilt, kernel = tilts[view][index].numpy(), kernels[view][index].numpy()
-        tilted = warp_engine.warp(frames[index].numpy(), tilt, rows.start, columns.start)
+    def one(image: Tensor, tilt: Tensor, kernel: Tensor, halo: Tensor) -> Tensor:
+        tilted = warp_engine.warp(image.numpy(), tilt.numpy(), rows.start, columns.start)
         if kernel.shape[1] == 1 and share == 0:
             return torch.from_numpy(tilted)
-        place = (rows.offset, columns.offset, rows.pitch)
-        light = scatter_engine.scatter(tilted, kernel, *place, halo[index].numpy(), share)
-        return torch.from_numpy(light)
+        nodes = (kernel.numpy(), rows.offset, columns.offset, rows.pitch)
+        return torch.from_numpy(scatter_engine.scatter(tilted, *nodes, halo.numpy(), share))
 
-    places = list(product(range(len(tilts)), range(len(frames))))
-    threads = min(torch.get_num_threads(), len(places))
+    work = (
+        each for tilt, kernels in seen for each in zip(frames, tilt, kernels, halo, strict=True)
+    )
+    threads = torch.get_num_threads()
     if threads == 1:
-        light = [one(place) for place in places]
+        light = [one(*each) for each in work]
     else:
         with ThreadPoolExecutor(threads) as pool:
-            light = list(pool.map(one, places))
-    return torch.stack(light).unflatten(0, (len(tilts), len(frames)))
+            light = [job.result() for job in [pool.submit(one, *each) for each in work]]
+    return torch.stack(light).unflatten(0, (-1, len(frames)))
 
 
 def _eager(

@@ -21,6 +21,7 @@ UNSEEN = 0.5 / 255  # rms error that nobody needs to go below
 SHARES = {"modes": 0.42, "pitch": 0.33, "rank": 0.15, "kernel": 0.1}  # of the tolerance
 BEYOND = 1.06  # the networks are fitted a little beyond the edge of their band
 EXACT_MODES = 119  # whole orders up to n = 14, for D/r0 beyond the tables
+MOST_MODES = 200
 MAX_PITCH = 64
 UNRELATED = 2.0  # the error of a PSF taken from a place that has nothing to do with it
 TILT_ERROR = 0.35  # of the tilt's spread, per D between nodes
@@ -57,10 +58,13 @@ class Fidelity:
     error: float = 0.0
 
 
-def choose(atmosphere: Atmosphere, width_px: int, tolerance: float, exact: bool) -> Fidelity:
+def choose(
+    atmosphere: Atmosphere, width_px: int, tolerance: float, exact: bool, given: int | None = None
+) -> Fidelity:
     """Return the cheapest fidelity whose errors keep within `tolerance` of the random power.
 
     An rms error of half a grey level of 256 is always allowed.  With `exact` PSFs there is no rank.
+    The number of modes may be `given`; ValueError for one that nothing here can simulate.
     """
     seen = _seen(atmosphere, width_px)
     strength, airy = seen.d_over_r0, seen.airy_px
@@ -68,8 +72,7 @@ def choose(atmosphere: Atmosphere, width_px: int, tolerance: float, exact: bool)
     allowed = max(tolerance, (UNSEEN / CONTRAST) ** 2 / power)
     band = band_for(strength)
     exact = exact or band is None
-    modes, error_modes = _cheapest("modes", strength, airy, allowed)
-    known = EXACT_MODES if exact else band.modes
+    modes, error_modes = _modes(strength, airy, allowed, band, exact, given)
     rank, error_rank = (0.0, 0.0) if exact else _cheapest("rank", strength, airy, allowed)
     reach, error_kernel = _cheapest("kernel", strength, airy, allowed)
     pixel = atmosphere.object_pixel_m(width_px) / atmosphere.aperture_m
@@ -79,7 +82,7 @@ def choose(atmosphere: Atmosphere, width_px: int, tolerance: float, exact: bool)
     tilt_pitch, error_tilt = _tilt_pitch(pixel, seen.tilt_px, tolerance)
     return replace(
         seen,
-        modes=EXACT_MODES if band is None else min(int(modes), known),
+        modes=modes,
         rank=0 if exact else min(int(rank), len(band.basis)),
         kernel=_kernel(strength, airy, reach),
         pitch=pitch,
@@ -131,6 +134,21 @@ def _cheapest(name: str, strength: float, airy: float, allowed: float) -> tuple[
     within = (errors <= SHARES[name] * allowed).nonzero()
     index = int(within[0]) if len(within) else len(errors) - 1
     return float(_table(f"{name}_axis")[index]), float(errors[index])
+
+
+def _modes(
+    strength: float, airy: float, allowed: float, band: Band | None, exact: bool, given: int | None
+) -> tuple[int, float]:
+    """Return how many modes to simulate, and the error of the rest; without any blur it is 1."""
+    most = MOST_MODES if exact else band.modes
+    if given is None:
+        modes, error = _cheapest("modes", strength, airy, allowed)
+        return (EXACT_MODES if band is None else min(int(modes), most)), error
+    if not 2 <= given <= most:
+        kind = "exact" if exact else "fitted"
+        raise ValueError(f"turbulence.modes must be in [2, {most}] with {kind} PSFs, got {given}")
+    covered = int((_table("modes_axis") <= given).sum())
+    return given, float(_at("modes", strength, airy)[covered - 1]) if covered else 1.0
 
 
 def _widest(strength: float, airy: float, allowed: float) -> tuple[float, float]:

@@ -91,7 +91,7 @@ class Spots:
     ) -> Float[Tensor, "frames rows size size columns"]:
         """Return the PSFs at nodes for Noll 4, 5, ... in rad; none is negative."""
         frames, modes, rows, columns = phase.shape
-        flat = phase.permute(0, 2, 3, 1).reshape(-1, modes)
+        flat = phase.permute(0, 2, 3, 1).reshape(frames * rows * columns, modes)
         weights = self.band.weights(flat, self.rank)
         weights = weights.reshape(frames * rows, columns, self.rank).transpose(1, 2)
         mean, basis = self.shapes[:1].to(flat), self.shapes[1:].to(flat)

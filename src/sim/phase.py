@@ -14,6 +14,7 @@ periodic, and frequencies reach down to zero.
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Complex, Float
@@ -94,7 +95,7 @@ class Field:
         torch.mul(down.real, across.real, out=nodes[:, 0]).addcmul_(down.imag, -across.imag)
         torch.mul(down.real, -across.imag, out=nodes[:, 1]).addcmul_(down.imag, -across.real)
         self.nodes = nodes.flatten(2).flatten(0, 1)
-        self.vertical, self.horizontal = rows.weights().to(device), columns.weights().T.to(device)
+        self.rows, self.columns = rows, columns
 
     def at_nodes(
         self, amplitudes: Complex[Tensor, "frames waves"]
@@ -108,7 +109,15 @@ class Field:
         self, amplitudes: Complex[Tensor, "frames waves"]
     ) -> Float[Tensor, "frames modes h w"]:
         """Return the coefficients on all pixels that the lattices serve."""
-        return self.vertical @ self.at_nodes(amplitudes) @ self.horizontal
+        return self._vertical @ self.at_nodes(amplitudes) @ self._horizontal
+
+    @cached_property
+    def _vertical(self) -> Float[Tensor, "h rows"]:
+        return self.rows.weights().to(self.nodes.device)
+
+    @cached_property
+    def _horizontal(self) -> Float[Tensor, "columns w"]:
+        return self.columns.weights().T.to(self.nodes.device)
 
 
 def evolve(

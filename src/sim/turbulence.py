@@ -29,9 +29,11 @@ class Turbulence:
 
     `views`: how many (see `optics.layout`) or a list of (row, col); frames are `height` x `width`
     pixels at `fps`.  `tolerance` in (0, 1]: the error allowed, as a share of the power by which the
-    turbulence blurs a picture at random (src/sim/fidelity.py).  `psf`: `fitted` (basis and network)
-    or `exact` (Fraunhofer at every node).  `temporal`: `ar1` (the paper: alpha per frame at 120
-    fps) or `flow`, frozen turbulence carried by a wind of `wind_m_s` in a direction drawn per clip.
+    turbulence blurs a picture at random (src/sim/fidelity.py).  `modes`: how many Noll modes from
+    tilt on, 2 to 200, no more than a fitted network knows; None: as the tolerance asks.  `psf`:
+    `fitted` (basis and network) or `exact` (Fraunhofer at every node).  `temporal`: `ar1` (the
+    paper: alpha per frame at 120 fps) or `flow`, frozen turbulence carried by a wind of `wind_m_s`
+    in a direction drawn per clip.
     `views_correlation`: `independent` (the paper) or `baseline`, sub-apertures `baseline_m` apart
     (None: touching) looking through the same air.  `atmosphere` None is the identity.
     Raises ValueError for values outside their range.
@@ -46,6 +48,7 @@ class Turbulence:
         width: int,
         fps: float = 120.0,
         tolerance: float = 0.35,
+        modes: int | None = None,
         psf: str = "fitted",
         temporal: str = "ar1",
         wind_m_s: float = 3.0,
@@ -70,7 +73,7 @@ class Turbulence:
         self.clear = atmosphere is None or atmosphere.d_over_r0 == 0
         self.fidelity = Fidelity()
         if not self.clear:
-            self.fidelity = choose(atmosphere, width, tolerance, psf == "exact")
+            self.fidelity = choose(atmosphere, width, tolerance, psf == "exact", modes)
         self.spots, self.halo = self._spots(), self._halo()
 
     @torch.no_grad()
@@ -136,8 +139,10 @@ class Turbulence:
                 some = moving[view : view + group, first : first + step]
                 out[view : view + group, first : first + step] = blur.degrade(
                     frames[first : first + step],
-                    [self._tilt_px * tilt.at_pixels(c) for c in some],
-                    [self._kernels(rest.at_nodes(c)) for c in some],
+                    (
+                        (self._tilt_px * tilt.at_pixels(c), self._kernels(rest.at_nodes(c)))
+                        for c in some
+                    ),
                     *lattices,
                     halo[first : first + step],
                     self.halo.share,

@@ -6,6 +6,7 @@ tilts along x and y; x points right, y down, as the columns and rows of an image
 """
 
 import math
+from functools import cache
 
 import numpy as np
 import torch
@@ -67,16 +68,34 @@ def pupil_filter(
     i^n sqrt(n + 1) 2 J_{n+1}(pi kappa) / (pi kappa) {1, sqrt2 cos(m angle), sqrt2 sin(m angle)}
     (Noll 1976, eq. 8, for the phase at the pupil's centre).
     """
-    out = torch.zeros(modes, len(kappa), 2, dtype=torch.float64)
-    x = math.pi * kappa.double().numpy()
-    radial: dict[int, Tensor] = {}
-    for row, (n, m) in enumerate(map(noll_index, range(2, modes + 2))):
-        if n not in radial:
-            bessel = np.divide(special.jv(n + 1, x), x, out=np.zeros_like(x), where=x > 0)
-            radial[n] = torch.from_numpy(2 * math.sqrt(n + 1) * bessel)
-        sign = -1 if n % 4 in (2, 3) else 1
-        out[row, :, n % 2] = sign * radial[n] * _azimuth(m, angle.double())
-    return out
+    n, m = _indices(modes)
+    x, turn = math.pi * kappa.double().numpy(), angle.double().numpy()
+    radial = 2 * np.sqrt(n + 1)[:, None] * _bessel_over_x(x, int(n[-1]) + 1)[n + 1]
+    azimuth = np.cos(abs(m)[:, None] * turn - np.where(m < 0, math.pi / 2, 0)[:, None])
+    scale = np.where(m == 0, 1, math.sqrt(2)) * np.where(np.isin(n % 4, (2, 3)), -1, 1)
+    out = np.zeros((modes, len(x), 2))
+    out[np.arange(modes), :, n % 2] = scale[:, None] * radial * azimuth
+    return torch.from_numpy(out)
+
+
+@cache
+def _indices(modes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return n and m of Noll modes 2..modes + 1."""
+    n, m = np.array([noll_index(mode) for mode in range(2, modes + 2)]).T
+    return n, m
+
+
+def _bessel_over_x(x: np.ndarray, last: int) -> np.ndarray:
+    """Return J_k(x) / x for k = 0..last (last + 1, points), from k = 2 on right at x = 0 too.
+
+    J_(k-1) = (2 k / x) J_k - J_(k+1), which is stable towards smaller k.
+    """
+    inside = np.where(x > 0, x, 1)
+    out = np.empty((last + 1, len(x)))
+    above, out[last] = special.jv(last + 1, x), special.jv(last, x)
+    for k in range(last, 0, -1):
+        out[k - 1] = 2 * k / inside * out[k] - (out[k + 1] if k < last else above)
+    return np.where(x > 0, out / inside, 0)
 
 
 def _covariance(a: tuple[int, int], b: tuple[int, int]) -> float:

@@ -161,7 +161,7 @@ def test_eager_expressions_equal_the_compiled_ones():
     frames, tilt = torch.rand(2, 30, 41), 3 * torch.randn(2, 2, 40, 37)
     kernels = torch.rand(2, len(rows.pixels), 7, 7, len(columns.pixels))
     halo = 0.2 * torch.rand(2, 34, 31)
-    [ours] = blur.degrade(frames, [tilt], [kernels], rows, columns, halo, 0.1)
+    [ours] = blur.degrade(frames, [(tilt, kernels)], rows, columns, halo, 0.1)
     tilted = blur.warp(frames, tilt, -3, 2)
     eager = blur.scatter(tilted, kernels, rows.weights(), columns.weights(), halo, 0.1)
     torch.testing.assert_close(ours, eager, atol=2e-5, rtol=0)
@@ -190,6 +190,41 @@ def test_any_size_is_finite(size):
     )
     assert seen.shape[-2:] == size
     assert seen.isfinite().all()
+
+
+@pytest.mark.parametrize("modes, psf", [(2, "fitted"), (3, "fitted"), (2, "exact"), (200, "exact")])
+def test_any_number_of_modes_keeps_light(modes, psf):
+    turbulence = operator(4.0, size=24, width_m=0.05, modes=modes, psf=psf)
+    assert turbulence.fidelity.modes == modes
+    seen = turbulence.degrade(torch.rand(1, 1, 24, 24), seed())
+    assert seen.isfinite().all()
+    assert seen.min() >= 0
+    assert seen.max() <= 1.0001
+    flat = turbulence.degrade(torch.full((1, 1, 24, 24), 0.6), seed())
+    assert (flat - 0.6).abs().max() < 1e-5
+
+
+def test_bf16_frames_are_simulated_in_float32():
+    frames, turbulence = torch.rand(1, 1, 24, 24).bfloat16(), operator(2.0, size=24)
+    seen = turbulence.degrade(frames, seed())
+    assert seen.dtype == torch.float32
+    assert torch.equal(seen, turbulence.degrade(frames.float(), seed()))
+
+
+@pytest.mark.parametrize("airy", [0.3, 1.0, 1.7])
+@pytest.mark.parametrize("kernel", [1, 7, 41])
+def test_halo_is_the_light_beyond_the_kernel(airy, kernel):
+    whole, halo = (Halo(mean_psf(3.0), airy, size) for size in (1, kernel))
+    assert 0 <= halo.share <= 1 - whole.shape[whole.reach, whole.reach]
+    spark = torch.zeros(1, 101, 101)
+    spark[0, 50, 50] = 1
+    light = halo(spark, 0, 0, 101, 101)[0]
+    far = halo.reach
+    torch.testing.assert_close(
+        light[50 - far : 51 + far, 50 - far : 51 + far], halo.shape, atol=1e-6, rtol=0
+    )
+    part = halo(spark, 40, 45, 9, 30)[0]
+    torch.testing.assert_close(part, light[40:49, 45:75], atol=1e-6, rtol=0)
 
 
 @pytest.mark.slow
@@ -222,6 +257,9 @@ def test_extremes_of_alpha_over_a_thousand_frames(alpha):
         ({"fps": 0.0}, r"turbulence\.fps must be > 0"),
         ({"temporal": "magic"}, r"turbulence\.temporal must be ar1 or flow"),
         ({"views_correlation": "maybe"}, r"turbulence\.views_correlation"),
+        ({"modes": 1}, r"turbulence\.modes must be in \[2, 35\] with fitted PSFs, got 1"),
+        ({"modes": 200}, r"turbulence\.modes must be in \[2, 35\] with fitted PSFs, got 200"),
+        ({"modes": 201, "psf": "exact"}, r"turbulence\.modes must be in \[2, 200\]"),
         ({"psf": "guess"}, r"turbulence\.psf must be fitted or exact"),
         ({"wind_m_s": -1.0}, r"turbulence\.wind_m_s"),
         ({"baseline_m": -1.0}, r"turbulence\.baseline_m"),
