@@ -16,6 +16,7 @@ from src.models.fast import Fast, plain
 
 FORMS = ("float32", "bf16", "onnx")
 PEAKS = {"float32": torch.float32, "bf16": torch.bfloat16, "onnx": torch.float32}
+SMALL = 64  # side of the picture that says what a post-processor costs on larger ones
 FILLED = 0.05  # share of a grid's entries that are not zero, as in our streams
 
 
@@ -58,6 +59,7 @@ class Stopwatch:
         self.bins, self.onnx_side = bins, onnx_side
         self.peaks: dict[tuple[str, int], float] = {}
         self._macs: dict[tuple[str, int], int] = {}
+        self._behind: dict[tuple[str, int, int], float] = {}
         self._bytes: dict[tuple[str, str, int, str], int] = {}
 
     def peak(self, form: str, count: int) -> float:
@@ -112,9 +114,9 @@ class Stopwatch:
             except (NotImplementedError, RuntimeError):  # it looks at values
                 self._macs[which] = macs_per_frame(candidate.network, side, side, **size)
             if candidate.restorer is not None:
-                frames = torch.zeros(1, timing.WINDOW, 1, side, side)
+                frames = torch.zeros(1, timing.WINDOW, 1, SMALL, SMALL)
                 behind = macs(lambda: candidate.restorer.restore(frames))
-                self._macs[which] += behind // timing.FRESH
+                self._macs[which] += behind // timing.FRESH * side**2 // SMALL**2
         return self._macs[which]
 
     def _timed(self, candidate: Candidate, known: dict[str, Any]) -> Speed:
@@ -123,7 +125,7 @@ class Stopwatch:
         if candidate.restorer is not None:
             if form != "float32" or device != "cpu":
                 raise ValueError("with a post-processor it is timed in float32 on the CPU")
-            after = timing.restoration(candidate.restorer, side, count=known["threads"])
+            after = self._restoration(candidate, side, known["threads"])
         size = (1, candidate.views, self.bins, side, side)
         drawn = torch.Generator().manual_seed(0)
         voxels = torch.randn(size, generator=drawn)
@@ -137,6 +139,19 @@ class Stopwatch:
         took = timing.frame(running, voxels, count=known["threads"], seconds=self.seconds)
         ms = {"ms": took.median_ms + after, "least_ms": took.least_ms + after}
         return Speed(**known, **ms, frames=took.frames, clock=took.clock)
+
+    def _restoration(self, candidate: Candidate, side: int, count: int) -> float:
+        """Return the ms of a frame, measured once; ValueError where a small picture says that it
+        takes more than `longest_s`."""
+        for measured in (SMALL, side):
+            which = (candidate.name, measured, count)
+            if which not in self._behind:
+                took = timing.restoration(candidate.restorer, measured, count=count)
+                self._behind[which] = took
+            ms = self._behind[which] * side**2 / measured**2
+            if measured == SMALL and ms > 1e3 * self.longest_s:
+                raise ValueError(f"more than {self.longest_s:g} s a frame")
+        return ms
 
     def _running(self, candidate: Candidate, form: str, side: int, count: int) -> nn.Module:
         if form == "float32":
