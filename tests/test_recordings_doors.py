@@ -197,9 +197,33 @@ def test_comparing_videos_draws_them_and_measures_their_slices(folder, found, tm
     assert (tmp_path / "run" / "comparison.png").is_file()
 
 
+def test_what_turns_uniformly_is_straight_in_theta_and_still_in_r(tmp_path):
+    (tmp_path / "film").mkdir()
+    y, x = np.mgrid[:61, :61]
+    for k in range(24):
+        angle = np.radians(20 + 24 * k)
+        dot = np.hypot(x - 30 - 18 * np.cos(angle), y - 30 - 18 * np.sin(angle))
+        picture = (255 * np.clip(4.5 - dot, 0, 1)).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / f"film/{k:02d}.png"), picture)
+    film = [f"videos=[{tmp_path}/film]", "names=[film]", "fps=120"]
+    along = [*film, "spin=[30,30,28,8,20]"]
+    still = compare(config("compare", tmp_path / "r", *along))["film"]
+    round_ = compare(config("compare", tmp_path / "theta", *film, "circle=[30,30,18]"))["film"]
+    assert still["wander"] < 0.1 and round_["straightness"] < 0.2
+
+
+def test_videos_of_two_sizes_are_not_compared(tmp_path):
+    for side in (20, 30):
+        (tmp_path / str(side)).mkdir()
+        cv2.imwrite(str(tmp_path / f"{side}/0.png"), np.zeros((side, side), np.uint8))
+    films = f"videos=[{tmp_path}/20,{tmp_path}/30]"
+    with pytest.raises(ValueError, match="videos must be of one size"):
+        compare(config("compare", tmp_path / "run", films, "line=[[0,0],[19,0]]"))
+
+
 @pytest.mark.parametrize(
     "wrong, message",
-    [("line=null", "either line or circle"), ("line=[[0,0],[500,0]]", "must stay")],
+    [("line=null", "one of line, circle and spin"), ("line=[[0,0],[500,0]]", "must stay")],
 )
 def test_a_slice_that_cannot_be_taken_is_refused(wrong, message, tmp_path):
     (tmp_path / "film").mkdir()

@@ -48,6 +48,7 @@ def comparison(
     figure = Figure(
         figsize=(2 * columns + 0.8, 2 * len(rows) * height / width + 0.4), layout="constrained"
     )
+    figure.get_layout_engine().set(w_pad=0.12)  # room for half the last number of the last axis
     grid = figure.subplots(len(rows), columns, squeeze=False)
     for row, axes in zip(rows, grid, strict=True):
         for sample, panel in zip(samples, axes, strict=False):

@@ -42,12 +42,37 @@ def straightness(rows: Float[np.ndarray, "frames places"]) -> float:
     Its place is the centroid of what differs from the median in time by more than a third of the
     largest difference; frames that show nothing are left out.  nan with fewer than three left.
     """
+    weight, time = _moving(rows)
+    if len(time) < 3:
+        return float("nan")
+    return _from_line(time, (weight @ np.arange(rows.shape[1])) / weight.sum(1))
+
+
+def turning(rows: Float[np.ndarray, "frames places"]) -> float:
+    """Return the rms distance, in places, from uniform turning of what moves along a closed circle.
+
+    As `straightness`, but the places go round: their angle is that of the centroid on the circle,
+    or, where two ends of a stripe pass, of the centroid of the doubled angles.  Less than half a
+    turn (a quarter for a stripe) between two frames that show something.
+    """
+    weight, time = _moving(rows)
+    if len(time) < 3:
+        return float("nan")
+    angle = 2 * np.pi * np.arange(rows.shape[1]) / rows.shape[1]
+    once, twice = ((weight @ np.exp(1j * k * angle)) for k in (1, 2))
+    ends = 1 if abs(once).sum() >= 0.5 * abs(twice).sum() else 2
+    turned = np.unwrap(np.angle(once if ends == 1 else twice)) / ends
+    return _from_line(time, turned * rows.shape[1] / (2 * np.pi))
+
+
+def _moving(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weight of what moves, in the frames that show it, and the numbers of these."""
     away = np.abs(rows - np.median(rows, axis=0))
     weight = np.clip(away - away.max() / 3, 0, None)
-    seen = weight.sum(1) > 0
-    if seen.sum() < 3:
-        return float("nan")
-    place = (weight[seen] @ np.arange(rows.shape[1])) / weight[seen].sum(1)
-    time = np.flatnonzero(seen)
+    time = np.flatnonzero(weight.sum(1) > 0)
+    return weight[time], time
+
+
+def _from_line(time: np.ndarray, place: np.ndarray) -> float:
     line = np.polyval(np.polyfit(time, place, 1), time)
     return float(np.sqrt(np.mean((place - line) ** 2)))

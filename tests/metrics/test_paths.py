@@ -34,5 +34,19 @@ def test_straightness_is_the_distance_from_the_line_of_uniform_motion(size):
     assert paths.straightness(rows) == pytest.approx(true.std(), abs=0.05)
 
 
+@pytest.mark.parametrize("ends", [1, 2])
+def test_turning_is_the_distance_from_uniform_turning_over_many_rounds(ends):
+    time, rng, places = np.arange(80), np.random.default_rng(0), 120
+    centre = 40 + 7.0 * time + 0.8 * rng.normal(size=80)
+    apart = np.arange(places) - centre[:, None]
+    period = places / ends
+    apart = (apart + period / 2) % period - period / 2
+    rows = 0.2 + 0.7 * np.exp(-(apart**2) / 18)
+    true = centre - np.polyval(np.polyfit(time, centre, 1), time)
+    assert paths.turning(rows) == pytest.approx(true.std(), abs=0.05)
+    assert paths.straightness(rows) > 10
+
+
 def test_a_slice_in_which_nothing_moves_has_no_straightness():
     assert np.isnan(paths.straightness(np.full((10, 50), 0.5)))
+    assert np.isnan(paths.turning(np.full((10, 50), 0.5)))
