@@ -9,6 +9,7 @@ import multiprocessing
 import resource
 import tempfile
 import time
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ import torch
 
 from benchmarks.timing import least
 from src.models.e2vid import E2VID
+from src.models.setnet import SetNet
 from src.recordings import formats, lookup, stream
 from src.recordings.capture import kaleidoscope
 from src.recordings.formats import EVENT
@@ -52,16 +54,21 @@ def splitting() -> None:
 def end_to_end(path: Path, seconds: float) -> None:
     """Times real time of one thread's CPU time, from the file to pictures, at 120 and 600 fps."""
     torch.set_num_threads(1)
-    views, net = table(), E2VID(views=9, base_channels=8).eval()
-    for fps, length in ((120, seconds), (600, min(seconds, 1.0))):
+    views = table()
+    networks = {
+        "E2VID base 8": E2VID(views=9, base_channels=8),
+        "SetNet small": SetNet.preset("small"),
+    }
+    for (name, net), fps in product(networks.items(), (120, 600)):
+        length = seconds if fps == 120 else min(seconds, 1.0)
         rule, start = stream.Rule(fps=fps, end_s=length), time.process_time()
         chunks = formats.iter_events(path, seconds=0.05)
         parts, frames, events = stream.windows(chunks, views, rule), 0, 0
-        for frame in stream.frames(parts, net):
+        for frame in stream.frames(parts, net.eval()):
             frames, events = frames + 1, events + frame.events + frame.outside
         cpu = time.process_time() - start
         print(
-            f"file to {frames} frames, {fps} fps, E2VID base 8, one thread:"
+            f"file to {frames} frames, {fps} fps, {name}, one thread:"
             f" {length / cpu:.2f} x real time, {events / cpu / 1e6:.1f} Mev/s"
         )
 
