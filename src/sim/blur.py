@@ -31,9 +31,8 @@ def degrade(
     """Warp the frames by each view's tilt, then scatter them by its PSFs and add their `halo`.
 
     `seen`: of every view, its tilt in pixels (frames, 2, h, w) over the window of `rows` and
-    `columns`, and the PSFs (frames, rows, k, k, columns) on their nodes; views are blurred while
-    the next are still being drawn from it.  The result lacks k // 2 pixels on each side.  The halo
-    of a white scene would be `share`.
+    `columns`, and the PSFs (frames, rows, k, k, columns) on their nodes.  The result lacks k // 2
+    pixels on each side.  The halo of a white scene would be `share`.
     """
     if frames.device.type != "cpu":
         return torch.stack([_eager(frames, *both, rows, columns, halo, share) for both in seen])
@@ -45,10 +44,11 @@ def degrade(
         nodes = (kernel.numpy(), rows.offset, columns.offset, rows.pitch)
         return torch.from_numpy(scatter_engine.scatter(tilted, *nodes, halo.numpy(), share))
 
-    work = (
+    # All is drawn before any thread starts: torch's own threads would wait for cores in use.
+    work = [
         each for tilt, kernels in seen for each in zip(frames, tilt, kernels, halo, strict=True)
-    )
-    threads = torch.get_num_threads()
+    ]
+    threads = min(torch.get_num_threads(), len(work))
     if threads == 1:
         light = [one(*each) for each in work]
     else:
