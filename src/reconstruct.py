@@ -43,7 +43,7 @@ def overlap(cfg: DictConfig, net: nn.Module) -> int:
     """Return how many frames a window spans; a network that is told its length needs no overlap."""
     if cfg.count:
         return 1
-    return stream.overlap(cfg.span or stream.default_span(net, cfg.fps), cfg.fps)
+    return stream.overlap(cfg.span or stream.default_span(net), cfg.fps)
 
 
 def frames(cfg: DictConfig, net: nn.Module, views: Views) -> Iterator[stream.Frame]:

@@ -218,13 +218,11 @@ def wanted(network: nn.Module, views: int) -> bool:
     return wants != 1 or views == 1
 
 
-def default_span(network: nn.Module, fps: float) -> str:
-    """Return `frame` for a network that is told its window, or up to five times the trained rate.
-
-    FireNet+ on slider_depth, correlation with the camera's frame at .0775 s for frame and trained
-    spans: 0.47 and 0.35 at 600 fps, 0.36 and 0.36 at 3000, 0.14 and 0.36 at 12,000.
+def default_span(network: nn.Module) -> str:
+    """Return `frame` for a network that is told the length of its window, else `trained`: fed
+    shorter windows than in training, most fade (docs/decisions/0005-recordings.md).
     """
-    return "frame" if takes(network, "window_s") or fps <= 600 else "trained"
+    return "frame" if takes(network, "window_s") else "trained"
 
 
 @torch.inference_mode()
