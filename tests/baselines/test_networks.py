@@ -79,6 +79,23 @@ def test_gradients_reach_every_parameter(kind):
 
 
 @pytest.mark.parametrize("kind", PUBLISHED)
+def test_it_can_learn_one_batch_by_heart(kind):
+    network = small(kind).train()
+    target = torch.rand(1, 3, 1, 16, 16, generator=torch.Generator().manual_seed(2))
+    target = functional.avg_pool2d(target.flatten(0, 1), 5, 1, 2).view_as(target)
+    optimizer = torch.optim.Adam(network.parameters(), 5e-3)
+    losses = []
+    for _ in range(60):
+        frames, _ = unroll(network, voxels(side=16))
+        loss = (frames - target).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < 0.5 * losses[0]
+
+
+@pytest.mark.parametrize("kind", PUBLISHED)
 def test_other_bins_are_refused(kind):
     with pytest.raises(ValueError, match="bins must be 3"):
         small(kind)(torch.zeros(1, 1, 5, 24, 24), None)
