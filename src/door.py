@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.syntax import Syntax
 
-from src.metrics import results
+from src.metrics import results, tracking
 
 FAILED = "failed.txt"  # in the folder of a sweep's job: why it failed
 LONGEST = 200  # characters of such a folder's name
@@ -86,8 +86,7 @@ def _job(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:
     try:
         work(cfg)
     finally:
-        if "wandb" in sys.modules:  # else the next job of a multirun would write into this run
-            sys.modules["wandb"].finish(quiet=True)
+        tracking.close()
 
 
 def _job_of_sweep(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:

@@ -7,11 +7,11 @@ from pathlib import Path
 import hydra
 import lightning
 from lightning.pytorch.utilities import rank_zero_only
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from src import build, door
 from src.figures import samples
-from src.metrics import results
+from src.metrics import results, tracking
 from src.models import files
 from src.models.guard import NotFinite
 
@@ -28,23 +28,27 @@ def train(cfg: DictConfig) -> dict:
     net, spec = build.network(cfg)
     start_from = files.require(cfg.ckpt, spec) if cfg.ckpt else None
     module, data = build.reconstructor(cfg, net, spec), build.data(cfg)
+    trainer = build.trainer(cfg)
     if rank_zero_only.rank:
-        fit(build.trainer(cfg), module, data, start_from)
+        fit(trainer, module, data, start_from)
         return {}
     results.open_run(run, door.resolved(cfg))
     untrained = build.test(cfg, "untrained", module.method, data, module.scores)
+    tracking.begin(trainer.loggers, OmegaConf.to_container(cfg, resolve=True))
     try:
-        fit(build.trainer(cfg), module, data, start_from)
+        fit(trainer, module, data, start_from)
     except NotFinite as error:
         same = f"python -m src.simulate like={run}/config.yaml split=train index={error.clips[0]}"
         raise ValueError(f"{error}; seed {cfg.seed}; to see the clip: {same}") from error
     trained = build.test(cfg, cfg.name, module.method, data, module.scores)
     least = build.make(cfg.floor.method)
     floor = build.test(cfg, cfg.floor.name, least, data, module.scores)
-    samples.write(run / "samples", module.method, data.pipelines["test"])
-    return results.write(
+    pictures = samples.write(run / "samples", module.method, data.pipelines["test"])
+    record = results.write(
         run, door.resolved(cfg), [trained, untrained, floor], **door.facts(cfg, start)
     )
+    tracking.end(trainer.loggers, record, pictures)
+    return record
 
 
 def fit(trainer: lightning.Trainer, module, data, start_from: Path | None) -> None:

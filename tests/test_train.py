@@ -9,6 +9,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from src.eval import evaluate
+from src.metrics import tracking
 from src.recordings.formats import read_events
 from src.simulate import simulate
 from src.train import train
@@ -38,6 +39,16 @@ def test_every_experiment_takes_a_step(experiment, tmp_path):
     assert record["model"]["params"] > 1000 and record["model"]["macs_per_frame"] > 1000
     assert (tmp_path / "checkpoints" / "last.ckpt").is_file()
     assert list((tmp_path / "samples").glob("*.gif")) and list((tmp_path / "samples").glob("*.png"))
+
+
+def test_weights_and_biases_holds_config_pictures_and_metrics(tmp_path):
+    train(config("train", tmp_path, *TINY, "logger=wandb"))
+    tracking.close()
+    (run,) = (tmp_path / "wandb").glob("offline-run-*")
+    stored = next(run.glob("*.wandb")).read_bytes()
+    assert all(word in stored for word in (b"test/psnr_aligned", b"train/loss", b"epoch_clips"))
+    pictures = [file.suffix for file in run.rglob("media/**/*") if file.is_file()]
+    assert sorted(set(pictures)) == [".gif", ".png"]
 
 
 @pytest.mark.parametrize("debug", [name for name in names("debug") if name != "default"])
