@@ -37,8 +37,8 @@ def export(
 ) -> "OnnxNetwork":
     """Write `network` to `path`, spectral norm folded; return what runs it, checked against it.
 
-    Raises ValueError without the packages, and where the two differ by more than TOLERANCE over a
-    few windows of noise.
+    Raises ValueError without the packages, for a network that ONNX cannot express, and where the
+    two differ by more than TOLERANCE over a few windows of noise.
     """
     require()
     folded = plain(network).cpu()
@@ -138,13 +138,18 @@ def _write(explicit: _Explicit, example: tuple, path: Path) -> None:
     chatty = logging.getLogger("torch.onnx")
     level = chatty.level
     chatty.setLevel(logging.ERROR)
-    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-        warnings.simplefilter("ignore")  # of the exporter's own parts about each other
-        torch.onnx.export(
-            explicit, example, str(path), dynamo=True, input_names=names, verbose=False,
-            output_names=["frame", *(f"after{k}" for k in states)], external_data=False,
-        )  # fmt: skip
-    chatty.setLevel(level)
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")  # of the exporter's own parts about each other
+            torch.onnx.export(
+                explicit, example, str(path), dynamo=True, input_names=names, verbose=False,
+                output_names=["frame", *(f"after{k}" for k in states)], external_data=False,
+            )  # fmt: skip
+    except torch.onnx.OnnxExporterError as error:
+        kind = type(explicit.network).__name__
+        raise ValueError(f"{kind} has a part that ONNX cannot express") from error
+    finally:
+        chatty.setLevel(level)
 
 
 @torch.no_grad()

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from baselines.firenet import FireNet
+from baselines.highpass import HighPass
 from src.models.e2vid import E2VID
 from src.models.export import OnnxNetwork, export
 from src.models.fast import Fast
@@ -51,6 +52,12 @@ def test_the_running_form_is_as_accurate_as_its_type(name):
     assert torch.allclose(frames(Fast(network, dtype=torch.float32), noise()), plain, atol=1e-5)
     rounded = frames(Fast(network), noise())
     assert rounded.dtype == torch.float32 and (rounded - plain).abs().mean() < 0.02
+
+
+def test_what_onnx_cannot_express_is_said(tmp_path):
+    pytest.importorskip("onnxscript")
+    with pytest.raises(ValueError, match="HighPass has a part that ONNX cannot express"):
+        export(HighPass(source="median"), tmp_path / "a.onnx", views=9, height=16, width=16)
 
 
 def test_an_empty_window_costs_nothing_and_changes_nothing():
