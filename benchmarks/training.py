@@ -22,8 +22,10 @@ from src.sim.pipeline import simulate
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def split(overrides: list[str]) -> dict[str, Callable[[], object]]:
-    """Return the parts of a step as work to be timed, and the number of its clip-frames."""
+def split(overrides: list[str]) -> tuple[dict[str, Callable[[], object]], int, int]:
+    """Return the parts of a step as work to be timed, its clip-frames, and the steps that see a
+    simulated batch.
+    """
     with initialize_config_dir(str(ROOT / "conf"), version_base=None):
         cfg = compose("train", overrides)
     network, spec = build.network(cfg)
@@ -43,20 +45,18 @@ def split(overrides: list[str]) -> dict[str, Callable[[], object]]:
         with half:
             module.loss(shown.detach().requires_grad_(), truth).sum().backward()
 
-    return {
-        "frames": len(truth),
-        "reuse": cfg.data.reuse,
+    parts = {
         "simulation": lambda: simulate(pipeline, clips),
         "forward": forward,
         "forward and backward": lambda: forward().backward(slope),
         "loss": loss,
     }
+    return parts, len(truth), cfg.data.reuse
 
 
 def main() -> None:
     """Print the split on one thread and on two."""
-    parts = split(sys.argv[1:])
-    frames, reuse = parts.pop("frames"), parts.pop("reuse")
+    parts, frames, reuse = split(sys.argv[1:])
     for threads, clock in ((1, time.thread_time), (2, time.perf_counter)):
         torch.set_num_threads(threads)
         took = {name: least(work, clock, 4) for name, work in parts.items()}
