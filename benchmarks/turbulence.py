@@ -85,13 +85,18 @@ def one_thread() -> None:
             return run.degrade(frames, torch.Generator().manual_seed(0))
 
         print(f"D/r0 {strength}, 256x256: {1e3 * least(work):.0f} ms thread")
-    turbulence = at(4.0, 0.0156)
+    for strength, pixel, side in ((2.0, 0.04, 64), (4.0, 0.0156, 112)):
+        turbulence, crop = at(strength, pixel), (70, 70, side, side)
+        for part in (frames, clip):
 
-    def train():
-        return turbulence.degrade(clip, torch.Generator().manual_seed(0), crop=(70, 70, 112, 112))
+            def work(run=turbulence, crop=crop, part=part):
+                return run.degrade(part, torch.Generator().manual_seed(0), crop=crop)
 
-    seconds = least(train, repeats=2)
-    print(f"33 frames of nine 112x112 views, D/r0 4, pixel 0.0156 D: {seconds:.2f} s thread")
+            ms = 1e3 * least(work, repeats=4) / part.shape[1]
+            print(
+                f"pixel {pixel} D, D/r0 {strength}, {side}x{side}, clip of {part.shape[1]}: "
+                f"{ms:.1f} ms thread a frame"
+            )
     start = least(lambda: at(2.0))
     print(f"choice of fidelity: {1e3 * start:.1f} ms thread")
 
