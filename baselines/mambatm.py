@@ -9,6 +9,7 @@ Differs from the published code where that is at odds with its paper: backward s
 back also in guided layers, the convolution of local layers runs on the raster and not on the curve,
 frames need not be square, the few channels that weigh a fusion are GELU, which cannot die, not
 ReLU, and the last decoder draws what is added to the input, so that a short training starts there.
+With `steadied` the input is held still first, and the two latents of tilt say by how much.
 """
 
 import torch
@@ -18,6 +19,7 @@ from torch.nn import functional
 
 from baselines.hilbert import hilbert_order
 from baselines.selective_scan import Mixer
+from baselines.steady import jitter, pull
 from src.models.layers import pad_to_multiple
 
 DISTORTION = 4  # channels: tilt down and right, mean and log-variance of the blur latent
@@ -28,25 +30,37 @@ PIXELS = 2**20  # encoded or decoded at once where no gradient is asked for: 16 
 class MambaTM(nn.Module):
     """`channels`: of a frame, 1 (grey) or 3.  `features`: of the encoder, 8 times as many in the
     trunk.  `groups`: of three layers, the last one guided.  Published: 3, 16, 6 and 16 `states`.
+    `steadied`: the encoder also sees the frames without their jitter (baselines/steady.py), of
+    which the tilt channels take out nothing to twice as much; all of it before any training.
     """
 
     views = None  # it sees none
 
-    def __init__(self, channels: int = 1, features: int = 8, groups: int = 2, states: int = 8):
+    def __init__(
+        self,
+        channels: int = 1,
+        features: int = 8,
+        groups: int = 2,
+        states: int = 8,
+        steadied: bool = False,
+    ):
         super().__init__()
         if groups < 2:
             raise ValueError(f"postprocess.groups must be >= 2, got {groups}")
         if features < 8:
             raise ValueError(f"postprocess.features must be >= 8, got {features}")
         width = features * 2**SCALES
-        self.channels = channels
-        self.encoder = Encoder(channels, features)
+        self.channels, self.steadied = channels, steadied
+        self.encoder = Encoder(2 * channels if steadied else channels, features)
         self.distortion_encoder = Encoder(DISTORTION, features)
         self.distortion_width = nn.Conv2d(width, width, 1)
         self.distortion_decoder = Decoder(DISTORTION, features)
         self.decoder = Decoder(channels, features)
         for parameter in self.decoder.out[-1].parameters():
             nn.init.zeros_(parameter)  # what is added to the input begins with nothing
+        if steadied:
+            for parameter in self.distortion_decoder.out[-1].parameters():
+                nn.init.zeros_(parameter[:2])  # and takes out the jitter that was found
         self.free = nn.ModuleList(
             Layer(width, states, guided=False) for _ in range(3 * (groups - 1))
         )
@@ -61,7 +75,9 @@ class MambaTM(nn.Module):
         """
         n, count, given, height, width = frames.shape
         frames = frames.expand(-1, -1, self.channels, -1, -1)
-        flat, (top, left) = pad_to_multiple(frames.flatten(0, 1), 2**SCALES)
+        shift = jitter(frames) if self.steadied else None
+        seen = frames if shift is None else torch.cat([frames, pull(frames, shift)], 2)
+        flat, (top, left) = pad_to_multiple(seen.flatten(0, 1), 2**SCALES)
         parts = parts_of(flat)
         maps = zip(*(self.encoder(flat[part]) for part in parts), strict=True)
         *skips, deep = [torch.cat(scale) for scale in maps]
@@ -82,6 +98,8 @@ class MambaTM(nn.Module):
             part[..., top : top + height, left : left + width].unflatten(0, (n, count))
             for part in (added, distortion)
         )
+        if shift is not None:
+            frames = pull(frames, 2 * distortion[:, :, :2].sigmoid() * shift)
         clean = frames + added
         return (clean.mean(2, keepdim=True) if given == 1 else clean), distortion
 

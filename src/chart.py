@@ -38,7 +38,8 @@ def chart(cfg: DictConfig) -> dict:
         path = run / f"chart.{suffix}"
         frontier.accuracy(path, speeds, scores, side=cfg.sizes[0], title=title)
         frontier.machine(run / f"machine.{suffix}", speeds, watch.peaks)
-    text += rising.write(run, lineup.adaptive(cfg), cfg.adapt.course)
+    if cfg.adapt:
+        text += rising.write(run, lineup.adaptive(cfg), cfg.adapt.course)
     results.write_text(run / "chart.md", text)
     rich.print(text, f"in {run}")
     return knees

@@ -6,13 +6,14 @@ from omegaconf import OmegaConf
 
 from baselines import mambatm
 from baselines.mambatm import MambaTM, scan_orders, window_starts
+from baselines.steady import jitter, pull
 from src.build import make
 from tests.conftest import ROOT
 
 
-def small() -> MambaTM:
+def small(steadied: bool = False) -> MambaTM:
     torch.manual_seed(0)
-    network = MambaTM(states=2).eval()
+    network = MambaTM(states=2, steadied=steadied).eval()
     torch.nn.init.normal_(network.decoder.out[-1].weight, std=0.1)
     return network
 
@@ -23,8 +24,15 @@ def test_it_begins_as_the_identity():
     assert torch.equal(MambaTM(states=2)(frames)[0], frames)
 
 
+@torch.no_grad()
+def test_steadied_it_begins_as_the_frames_held_still():
+    frames = torch.rand(1, 4, 1, 32, 32)
+    still = pull(frames, jitter(frames))
+    torch.testing.assert_close(MambaTM(states=2, steadied=True)(frames)[0], still)
+
+
 @pytest.mark.parametrize(
-    ("name", "parameters"), [("mambatm", 998_029), ("mambatm_published", 7_239_319)]
+    ("name", "parameters"), [("mambatm", 998_229), ("mambatm_published", 7_239_319)]
 )
 def test_parameter_counts(name, parameters):
     network = make(OmegaConf.load(ROOT / "conf" / "model" / f"{name}.yaml"))
@@ -89,9 +97,10 @@ def test_orders_are_permutations_of_the_box():
     assert in_time[:4].tolist() == [0, 20, 40, 5]  # all times of a place, then the place below
 
 
-def test_gradients_reach_every_parameter():
-    network = small().train()
-    clean, distortion = network(torch.rand(1, 5, 1, 16, 16))
+@pytest.mark.parametrize("steadied", [False, True])
+def test_gradients_reach_every_parameter(steadied):
+    network = small(steadied).train()
+    clean, distortion = network(torch.rand(1, 5, 1, 32, 32))
     ((clean * torch.randn_like(clean)).sum() + distortion.sum()).backward()
     idle = [name for name, p in network.named_parameters() if float(p.grad.abs().sum()) == 0]
     assert idle == []

@@ -1,0 +1,65 @@
+"""How a video shakes, found in the video itself, and the same video held still.
+
+What stands or moves smoothly has a path without corners; what turbulence adds to it changes from
+frame to frame.  Displacements between neighbours, block by block, summed over time are a path; the
+path less its smooth part is jitter (the idea of video stabilisation, Liu et al., "Bundled camera
+paths", 2013, with blocks for cameras).  Motion that turns within a few frames is taken for jitter.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from src.metrics.temporal import displacement
+
+SPAN = 2.0  # frames, standard deviation of the window over which a path is taken for straight
+
+
+@torch.no_grad()
+def jitter(frames: Float[Tensor, "n frames c h w"]) -> Float[Tensor, "n frames 2 h w"]:
+    """Return by how much each frame is shifted, (x, y) in pixels, against where it belongs."""
+    grey = frames.float().mean(2, keepdim=True)
+    with torch.autocast(frames.device.type, enabled=False):
+        return torch.stack([_jitter(clip) for clip in grey])
+
+
+def _jitter(clip: Float[Tensor, "frames 1 h w"]) -> Float[Tensor, "frames 2 h w"]:
+    steps, _ = displacement(clip[1:], clip[:-1])
+    path = functional.pad(steps.cumsum(0), (0, 0, 0, 0, 0, 0, 1, 0))
+    smooth = torch.einsum("ts,s...->t...", smoother(len(path)).to(path), path)
+    return functional.interpolate(path - smooth, clip.shape[-2:], mode="bilinear")
+
+
+def smoother(frames: int) -> Float[Tensor, "frames frames"]:
+    """Return the matrix that fits a straight line around each moment, weighed by a Gaussian, and
+    takes its value there: constants and straight lines come through as they are.
+    """
+    t = torch.arange(float(frames))
+    lag = t - t[:, None]
+    weight = torch.exp(-0.5 * (lag / SPAN) ** 2)
+    total, first, second = ((weight * lag**power).sum(1, keepdim=True) for power in range(3))
+    spread = total * second - first**2
+    return weight * (second - first * lag) / spread if frames > 1 else torch.ones(1, 1)
+
+
+def pull(
+    frames: Float[Tensor, "n frames c h w"], shift: Float[Tensor, "n frames 2 h w"]
+) -> Float[Tensor, "n frames c h w"]:
+    """Return the frames with what lies `shift` (x, y), in pixels, from each pixel brought there."""
+    height, width = frames.shape[-2:]
+    y, x = torch.meshgrid(
+        torch.arange(height, device=shift.device),
+        torch.arange(width, device=shift.device),
+        indexing="ij",
+    )
+    place = torch.stack([x, y], -1) + shift.float().movedim(2, -1).flatten(0, 1)
+    size = torch.tensor([width, height], device=shift.device)
+    pulled = functional.grid_sample(
+        frames.float().flatten(0, 1),
+        (2 * place + 1) / size - 1,
+        mode="bicubic",
+        padding_mode="border",
+        align_corners=False,
+    )
+    return pulled.unflatten(0, frames.shape[:2])
