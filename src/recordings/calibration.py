@@ -105,6 +105,10 @@ def characterise(
     centre = positions.index((0, 0))
     places = statistics.find_dots(calm[centre].mean(0), rows, cols, dark)
     reach = radius or statistics.radius(places)
+    if dark:  # the vignette of a bright ground would pass for a part of the dots
+        grounds = [statistics.ground(film.mean(0), places, reach) for film in calm]
+        light = np.stack(grounds)[:, None]
+        calm, moving = calm / light, moving / light
     fits = [[dots.fit(film, places, reach) for film in films] for films in (moving, calm)]
     found = statistics.measure(*fits, fps=fps, centre=centre)
     statistics.write_csv(found, folder / "turbulence.csv", positions)

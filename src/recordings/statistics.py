@@ -141,6 +141,22 @@ def radius(places: Float[np.ndarray, "dots 2"]) -> int:
     return max(3, round(apart[apart > 0].min() / 3))
 
 
+def ground(
+    picture: Float[np.ndarray, "h w"], places: Float[np.ndarray, "dots 2"], reach: int
+) -> Float[np.ndarray, "h w"]:
+    """Return the light between dark dots, continued under them: a quadratic in x and y, fitted
+    where no dot is within `reach` pixels; at least a twentieth of its largest value."""
+    y, x = (
+        2 * axis / max(axis.max(), 1) - 1 for axis in np.mgrid[: len(picture), : len(picture[0])]
+    )
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+    rows, cols = np.indices(picture.shape)
+    near = [np.hypot(cols - cx, rows - cy) <= reach for cx, cy in places]
+    between = ~np.any(near, axis=0)
+    fitted = terms @ np.linalg.lstsq(terms[between], picture[between], rcond=None)[0]
+    return np.maximum(fitted, 0.05 * fitted.max())
+
+
 def autocorrelation(tilt: Float[np.ndarray, "frames 2"], lags: int) -> Float[np.ndarray, " lags"]:
     """Return (<ax(t) ax(t + lag)> / <ax^2> + the same of y) / 2 for lags of 0, 1, ... frames."""
     power = _mean(tilt**2, 0)

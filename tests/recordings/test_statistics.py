@@ -147,3 +147,11 @@ def test_find_dots_orders_row_by_row():
 def test_find_dots_rejects_a_picture_without_them():
     with pytest.raises(ValueError, match="3x3 grid"):
         statistics.find_dots(np.random.default_rng(0).random((96, 96)), 3, 3)
+
+
+def test_ground_follows_the_vignette_under_the_dots():
+    y, x = np.mgrid[:96, :96] / 47.5 - 1
+    light = 1 - 0.25 * (x**2 + y**2) + 0.05 * x
+    dots_seen = dot_grid(GRID[None], np.full((1, 9), 2.5), np.full((1, 9), -0.6))[0] / 0.8
+    found = statistics.ground(light * dots_seen, GRID, 9)
+    assert np.abs(found - light).max() < 0.005
