@@ -12,7 +12,7 @@ from src.recordings.alignment import Alignment, Found
 from src.recordings.statistics import Statistics, decay_s
 from src.recordings.views import Views
 
-MAGNIFIED = 30  # residuals are drawn this many times too long
+MAGNIFIED = 60  # residuals are drawn this many times too long
 LABEL = {"facecolor": "white", "edgecolor": "none", "pad": 1.5}
 
 
@@ -20,7 +20,9 @@ def views_found(picture: UInt8[np.ndarray, "h w"], found: Found, path: Path) -> 
     """Draw where the target was found on the sensor: what a failed calibration leaves behind."""
     figure, axes = _sensor(picture)
     for position, points in found.points.items():
-        axes.plot(*points.T, ".", markersize=2, label=str(position))
+        axes.plot(*points.T, ".", markersize=5, color="tab:red")
+        x, y = np.nanmean(points[:, 0]), np.nanmin(points[:, 1]) - 45
+        axes.text(x, y, str(position), color="black", ha="center", fontsize=8, bbox=LABEL)
     axes.set_title(f"target found in {len(found.points)} views")
     plots.save(figure, Path(path))
 
@@ -34,7 +36,7 @@ def views_aligned(picture: UInt8[np.ndarray, "h w"], alignment: Alignment, path:
         inward = residuals @ np.linalg.inv(view.homography[:2, :2]).T  # to this view's pixels
         ends = points + MAGNIFIED * inward
         for start, end in zip(points, ends, strict=True):
-            axes.plot(*np.stack([start, end]).T, color="tab:red", linewidth=0.8)
+            axes.plot(*np.stack([start, end]).T, color="red", linewidth=1.4)
     axes.set_title(f"views in the sensor's pixels; residuals in red, {MAGNIFIED} times too long")
     plots.save(figure, Path(path))
 
@@ -61,7 +63,8 @@ def _outline(axes: Axes, views: Views, view) -> None:
     axes.plot(*closed.T, color="tab:green", linewidth=1)
     axes.plot(*outline[0], "o", color="tab:green", markersize=5)  # the field's top left corner
     row, col = view.position
-    text = f"({row}, {col}) {view.error_px:.2f} px"
+    error = f"{view.error_px:.2f} px" if view.position != (0, 0) else "the reference"
+    text = f"({row}, {col}) {error}"
     x, y = outline[:, 0].mean(), outline[:, 1].min() + 12
     axes.text(x, y, text, color="black", ha="center", fontsize=8, bbox=LABEL)
 
