@@ -179,6 +179,23 @@ def test_a_crop_and_another_batch_draw_the_same(settings_):
         torch.set_num_threads(threads)
 
 
+@pytest.mark.parametrize("settings_", [{}, NOISY], ids=["clean", "noisy"])
+def test_how_many_pixels_are_simulated_together_changes_nothing(settings_, monkeypatch):
+    """Neither units that cross rows nor a batch of events that is full before its unit is done."""
+    frames = signals()[None, None]
+    sensor = EventSensor(0.02, refractory_s=0.0, **settings_)
+    place = {"origin": (3, 5), "full_width": 24}
+    grids, state = sensor.step(frames, FPS, **place)
+    counts, events = sensor.counts(frames, FPS), sensor.events(frames[0, 0], FPS, **place)
+    monkeypatch.setattr(sensor_cpu, "UNIT", 5)
+    small_grids, small_state = sensor.step(frames, FPS, **place)
+    assert torch.equal(small_grids, grids)
+    for name in ("level", "source", "reference", "dead"):
+        assert torch.equal(getattr(small_state, name), getattr(state, name)), name
+    assert torch.equal(sensor.counts(frames, FPS), counts)
+    assert np.array_equal(sensor.events(frames[0, 0], FPS, **place), events)
+
+
 def test_the_chip_is_one_over_clips_and_the_noise_is_not():
     frames = torch.full((2, 1, 30, 24, 24), 0.2)
     noise = EventSensor(0.3, shot_hz=30.0).voxels(frames, FPS)

@@ -64,7 +64,7 @@ class Job:
 
 
 class Chip(NamedTuple):
-    """A Job's numbers as a kernel takes them."""
+    """A Job's numbers as a kernel takes them; `place`: top, left, full width, width."""
 
     tables: tuple
     normals: np.ndarray
@@ -90,7 +90,7 @@ class Memory(NamedTuple):
 
 
 class Sink(NamedTuple):
-    """Where events go: grids, or numbers per row and polarity, or a list at each row's offset."""
+    """Where events go: grids, or numbers per unit and polarity, or a list at each unit's offset."""
 
     output: int
     voxels: np.ndarray
@@ -100,17 +100,24 @@ class Sink(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Arrays (rows, w) of a unit, (w) of one row at a time, and room for one pixel's events."""
+    """Arrays over the pixels of a unit for one interval, and a batch of events (the last three).
 
+    `pixel`: the number in the whole frame; `drift`: what the reference leaks; `level`: the new
+    frame's; `active`: those pixels that are `busy`; `who`, `when`, `sign`: an event's pixel of the
+    unit, fraction of the interval and polarity.
+    """
+
+    pixel: np.ndarray
     on: np.ndarray
     off: np.ndarray
     hot: np.ndarray
+    drift: np.ndarray
     level: np.ndarray
-    source: np.ndarray
     active: np.ndarray
     busy: np.ndarray
     noise_u: np.ndarray
     noise_sign: np.ndarray
+    who: np.ndarray
     when: np.ndarray
     sign: np.ndarray
 

@@ -8,7 +8,7 @@ reference; between frames the level moves linearly, so that each crossing costs 
 import numpy as np
 from numba import njit, uint32, uint64
 
-from src.sim.engines.job import COUNT, DELETE, HOLD, VOXELS, Scratch
+from src.sim.engines.job import COUNT, DELETE, HOLD, VOXELS, Memory, Scratch
 
 f32 = np.float32
 kernel = njit(nogil=True, error_model="numpy")  # no test for a zero divisor
@@ -35,87 +35,86 @@ def bits(key, high, low):
 
 
 @small
-def level_at(start, delta, u):
-    """Return the level at fraction `u` of an interval that begins at `start`."""
-    return start + np.int64(np.rint(f32(u) * f32(delta)))
+def way(delta, u):
+    """Return how far a level that moves by `delta` in an interval has come at fraction `u`."""
+    return np.int64(np.rint(f32(u) * f32(delta)))
 
 
-@kernel
-def linear_events(l0, l1, ref, dead, on, off, wait, mode, noise_u, noise_sign, when, sign):
-    """Return (events, ref, dead); `noise_u` is the time of a noise event, above 1 for none."""
-    delta = l1 - l0
-    count = 0
+@small
+def linear_events(x, l0, l1, ref, dead, on, off, wait, mode, noise_u, noise_sign, batch, count):
+    """Append the events of pixel `x` to `batch`, which holds `count`; return (count, ref, dead).
+
+    `noise_u` is the time of a noise event, above 1 for none.  All is seen along the level's way:
+    `span` is its length, `at` the reference's place on it.  The function is drawn into its loop:
+    the arrays of `batch` would cost more to hand over than the pixel.
+    """
+    who, when, sign = batch
+    along = 1 if l1 >= l0 else -1
+    ahead, behind = (on, off) if l1 >= l0 else (off, on)
+    span, at = abs(l1 - l0), (ref - l0) * along
     start = f32(0)
     stop = min(noise_u, f32(1))
     holding = mode == HOLD and dead > start
     while True:
         if holding and dead <= stop:  # the reset ends
-            ref = level_at(l0, delta, dead)
+            at = way(span, dead)
             holding = False
         moved = False
         if not holding:
             now = start if mode == DELETE else max(start, dead)
-            u, s = next_crossing(l0, delta, ref, on, off, now)
+            u, step = next_crossing(span, at, ahead, behind, now)
             if u <= stop:
                 moved = True
-                ref += on if s > 0 else -off
+                at += step
                 start = u
                 if u >= dead:
-                    when[count] = u
-                    sign[count] = s
+                    who[count], when[count], sign[count] = x, u, along if step > 0 else -along
                     count += 1
                     dead = u + wait
                     holding = mode == HOLD and wait > 0
         if moved:
             continue
         if stop != noise_u:
-            return count, ref, dead
+            return count, l0 + at * along, dead
         if noise_u >= dead:
-            when[count] = noise_u
-            sign[count] = noise_sign
+            who[count], when[count], sign[count] = x, noise_u, noise_sign
             count += 1
-            ref = level_at(l0, delta, noise_u)
+            at = way(span, noise_u)
             dead = noise_u + wait
             holding = mode == HOLD and wait > 0
         start, stop, noise_u = noise_u, f32(1), f32(2)
 
 
 @small
-def next_crossing(l0, delta, ref, on, off, now):
-    """Return (time, polarity) of the first threshold exceeded at or after `now`; time 2 if none."""
-    if delta >= 0:
-        ahead, behind, span, s = ref + on - l0, ref - off - l0, delta, 1
-    else:
-        ahead, behind, span, s = l0 - ref + off, l0 - ref - on, -delta, -1
-    if behind >= 0 and f32(behind) >= now * f32(span):  # exceeded before, and still so
-        return now, -s
-    if ahead > span:
-        return f32(2), s
-    if ahead <= 0:
-        return now, s
-    u = f32(ahead) / f32(span)
-    return (u if u > now else now), s
+def next_crossing(span, at, ahead, behind, now):
+    """Return time and step of the first threshold exceeded at or after `now`; time 2 if none."""
+    if at >= behind and f32(at - behind) >= now * f32(span):  # exceeded before, and still so
+        return now, -behind
+    if at + ahead > span:
+        return f32(2), ahead
+    u = f32(at + ahead) / f32(span)
+    return (u if u > now else now), ahead  # now, if it was exceeded before: also at 0 / 0
 
 
-@kernel
+@small
 def v2e_crossings(l0, l1, ref, dead, on, off, mode):
     """Return (thresholds between the reference and the frame's level, reference)."""
     if mode == HOLD and dead > 1:
         return 0, ref
     if mode == HOLD and dead > 0:
-        ref = level_at(l0, l1 - l0, dead)
+        ref = l0 + way(l1 - l0, dead)
     return (l1 - ref) // on if l1 >= ref else (ref - l1) // off, ref
 
 
-@kernel
-def v2e_events(l0, l1, ref, dead, on, off, wait, mode, steps, noise_u, noise_sign, when, sign):
-    """The same with v2e's time stamps: `steps` for the whole frame, set by its busiest pixel.
+@small
+def v2e_events(x, l0, l1, ref, dead, on, off, wait, mode, steps, noise_u, noise_sign, batch, count):
+    """The same with v2e's time stamps: `steps` for the whole view, set by its busiest pixel.
 
     The pixel's first crossings take the first stamps; a stamp within the dead time is refused
     (compute_events of v2e's emulator).  Where a stamp interval is longer than the refractory
     period, v2e neither tests nor records it.  Noise is stamped at the end of the interval.
     """
-    count = 0
+    who, when, sign = batch
     tested = wait * f32(steps) > 1
     crossings, ref = v2e_crossings(l0, l1, ref, dead, on, off, mode)
     for i in range(1, crossings + 1):
@@ -125,8 +124,7 @@ def v2e_events(l0, l1, ref, dead, on, off, wait, mode, steps, noise_u, noise_sig
             break
         kept = not tested or stamp > dead
         if kept:
-            when[count] = stamp
-            sign[count] = s
+            who[count], when[count], sign[count] = x, stamp, s
             count += 1
             if tested:
                 dead = stamp + wait
@@ -135,35 +133,65 @@ def v2e_events(l0, l1, ref, dead, on, off, wait, mode, steps, noise_u, noise_sig
         if kept and tested and mode == HOLD:
             if dead > 1:
                 break
-            ref = level_at(l0, l1 - l0, dead)
+            ref = l0 + way(l1 - l0, dead)
     if noise_u <= 1:
-        when[count] = f32(1)
-        sign[count] = noise_sign
+        who[count], when[count], sign[count] = x, f32(1), noise_sign
         count += 1
         ref = l1
     return count, ref, dead
 
 
 @small
-def look(table, place, shift):
-    """Return the table's value at the bits of one intensity, as src.sim.response.lookup does."""
+def place_of(intensity_bits):
+    """Return the place in the tables of an intensity, given by the bits of its float."""
+    return np.int64(min(max(intensity_bits, 0x38800000), 0x3FFFFFFF) - 0x38800000)
+
+
+@small
+def look(table, place):
+    """Return the table's value at one place, as src.sim.response.lookup does."""
     cell, inside = place >> 13, place & 8191
     left = table[cell]
-    return (left + (((table[cell + 1] - left) * inside) >> 13) + (1 << (shift - 1))) >> shift
+    return (left + (((table[cell + 1] - left) * inside) >> 13) + 8) >> 4
 
 
 @kernel
-def make_row(chip, normals, keys, pixel, on, off, hot):
-    """Fill one row of thresholds `on`, `off` and of `hot`: what the chip is, whatever it sees."""
-    threshold_on, threshold_off, spread, hot_share = chip
+def read_levels(table, intensity, levels):
+    """Fill `levels` with a frame's levels before the low-pass."""
+    places = intensity.view(np.int32)
+    for x in range(places.size):
+        levels[x] = look(table, place_of(places[x]))
+
+
+@kernel
+def low_pass(decay, lag, intensity, memory, level):
+    """Filter the new frame's levels in place; the memory's are those of the frame before."""
+    places, old_source, old_level = intensity.view(np.int32), memory.source, memory.level
+    for x in range(places.size):
+        place, source = place_of(places[x]), level[x]
+        old = np.int64(old_level[x] - old_source[x]) * look(decay, place)
+        old -= np.int64(source - old_source[x]) * look(lag, place)
+        level[x], old_source[x] = source + ((old + 524288) >> 20), source
+
+
+@kernel
+def make_chip(chip, c, v, first, scratch):
+    """Fill what the pixels of a unit are, whatever they see, from pixel `first` of the crop on."""
+    on, off, hot, pixel = scratch.on, scratch.off, scratch.hot, scratch.pixel
+    threshold_on, threshold_off, spread, hot_share = chip.chips[c]
+    mismatch_key, hot_key, normals = chip.chip_keys[v, 0], chip.chip_keys[v, 1], chip.normals
+    top, left, full_width, width = chip.place
     for x in range(on.size):
-        on[x], off[x], hot[x] = threshold_on, threshold_off, False
-        at = pixel + x
+        y = (first + x) // width
+        at = (top + y) * full_width + left + first + x - y * width
+        pixel[x], on[x], off[x], hot[x] = at, threshold_on, threshold_off, False
         if spread > 0:
-            on[x] = spread_threshold(threshold_on, spread, normals, bits(keys[0], 0, 2 * at))
-            off[x] = spread_threshold(threshold_off, spread, normals, bits(keys[0], 0, 2 * at + 1))
+            on[x] = spread_threshold(threshold_on, spread, normals, bits(mismatch_key, 0, 2 * at))
+            off[x] = spread_threshold(
+                threshold_off, spread, normals, bits(mismatch_key, 0, 2 * at + 1)
+            )
         if hot_share > 0:
-            hot[x] = bits(keys[1], 0, at) < hot_share
+            hot[x] = bits(hot_key, 0, at) < hot_share
 
 
 @small
@@ -175,153 +203,128 @@ def spread_threshold(threshold, spread, normals, drawn):
 
 
 @kernel
-def new_levels(frame, table, decay, ramp, source, level, new_source, new_level):
-    """Fill one row with the levels of a frame, before and after the low-pass if there is one."""
-    places = frame.view(np.int32)
-    for x in range(frame.size):
-        place = np.int64(min(max(places[x], 0x38800000), 0x3FFFFFFF) - 0x38800000)
-        y = look(table, place, 4)
-        new_source[x], new_level[x] = y, y
-        if decay.size > 1:
-            keep, lag = look(decay, place, 4), look(ramp, place, 4)
-            old = np.int64(level[x] - source[x]) * keep - np.int64(y - source[x]) * lag
-            new_level[x] = y + ((old + 524288) >> 20)
+def draw_noise(chip, scratch, key, frame, intensity):
+    """Fill times and polarities of the noise events of interval `frame`; time 2 for none.
 
-
-@small
-def noise_event(key, frame, pixel, intensity, shot):
-    """Return (time, polarity) of the noise event of a pixel and interval; time 2 for none.
-
-    `shot` is its probability at black in 2**-32; at white it is a quarter (v2e).
+    `chip.shot` is their probability at black in 2**-32; at white it is a quarter (v2e).
     """
-    seen = np.int64(min(max(intensity, f32(0)), f32(1)) * f32(256))
-    drawn = bits(key, frame, 2 * pixel)
-    if np.int64(drawn) >= shot - (shot >> 8) * ((3 * seen) >> 2):
-        return f32(2), 1
-    at = bits(key, frame, 2 * pixel + 1)
-    return (f32(at >> uint32(9)) + f32(0.5)) * f32(2.0**-23), 1 if at & uint32(1) else -1
-
-
-@small
-def leaked(leak, threshold, frame):
-    """Return how far the reference leaks in interval `frame`, by its whole units so far."""
-    rate = np.int64(threshold) * leak
-    return ((rate * (frame + 1)) >> 24) - ((rate * frame) >> 24)
-
-
-@small
-def add_to_grid(grid, x, ticks, scale, sign):
-    """Add one event `ticks` microseconds into the window to one row's `grid` (bins, w)."""
-    bins = grid.shape[0]
-    tau = f32(f32(ticks) * scale)
-    b = min(np.int64(tau), bins - 1)
-    late = f32(np.rint((tau - f32(b)) * f32(2**20)) * f32(2.0**-20))
-    grid[b, x] += f32(sign) * (f32(1) - late)
-    if late > 0 and b + 1 < bins:
-        grid[b + 1, x] += f32(sign) * late
+    pixel, hot, shot, hot_rate = scratch.pixel, scratch.hot, chip.shot, chip.hot
+    noise_u, noise_sign = scratch.noise_u, scratch.noise_sign
+    for x in range(intensity.size):
+        seen = np.int64(min(max(intensity[x], f32(0)), f32(1)) * f32(256))
+        rate = hot_rate if hot[x] else shot - (shot >> 8) * ((3 * seen) >> 2)
+        at = bits(key, frame, 2 * pixel[x] + 1)
+        u = (f32(at >> uint32(9)) + f32(0.5)) * f32(2.0**-23)
+        noise_u[x] = u if np.int64(bits(key, frame, 2 * pixel[x])) < rate else f32(2)
+        noise_sign[x] = 1 if at & uint32(1) else -1
 
 
 @kernel
-def busiest(chip, memory, scratch, c, v, frame):
-    """Return the largest number of crossings of any pixel of a view, at least 1."""
+def draw_leak(leak, scratch, frame):
+    """Fill how far the references leak in interval `frame`, by the whole units leaked so far."""
+    on, drift = scratch.on, scratch.drift
+    for x in range(on.size):
+        rate = np.int64(on[x]) * leak
+        drift[x] = ((rate * (frame + 1)) >> 24) - ((rate * frame) >> 24)
+
+
+@kernel
+def busiest(mode, memory, scratch):
+    """Return the largest number of crossings of any pixel of a unit, at least 1."""
+    level, reference, dead = memory.level, memory.reference, memory.dead
+    new, drift, on, off = scratch.level, scratch.drift, scratch.on, scratch.off
     steps = np.int64(1)
-    for y in range(scratch.on.shape[0]):
-        for x in range(scratch.on.shape[1]):
-            on, off = np.int64(scratch.on[y, x]), np.int64(scratch.off[y, x])
-            crossings, _ = v2e_crossings(
-                np.int64(memory.level[c, v, y, x]),
-                scratch.level[y, x] + leaked(chip.leak, on, frame),
-                np.int64(memory.reference[c, v, y, x]),
-                memory.dead[c, v, y, x], on, off, chip.mode,
-            )  # fmt: skip
+    for x in range(level.size):
+        l1, ref, up, down = np.int64(new[x]) + drift[x], np.int64(reference[x]), on[x], off[x]
+        more = (l1 - ref >= (steps + 1) * up) | (ref - l1 >= (steps + 1) * down)
+        if more | (mode == HOLD and dead[x] > 0):  # else a division for nothing
+            crossings, _ = v2e_crossings(np.int64(level[x]), l1, ref, dead[x], up, down, mode)
             steps = max(steps, crossings)
     return steps
 
 
 @kernel
-def find_active(chip, scratch, r, level, reference, dead, frame):
-    """List the pixels of a row that have something to do in `scratch.active`; return how many.
+def find_active(mode, memory, scratch):
+    """List the pixels that have something to do in `scratch.active`; return how many.
 
-    Without a branch: most pixels are quiet in most intervals, and which are is not predictable.
+    Without a branch per pixel: which are quiet is not predictable.  But eight in a row often are.
     """
-    new, on, off = scratch.level[r], scratch.on[r], scratch.off[r]
-    active, noise_u, busy = scratch.active, scratch.noise_u, scratch.busy
-    leak, holds, count = chip.leak, chip.mode == HOLD, 0
+    level, reference, dead = memory.level, memory.reference, memory.dead
+    new, drift, on, off = scratch.level, scratch.drift, scratch.on, scratch.off
+    active, busy, noise_u = scratch.active, scratch.busy, scratch.noise_u
+    holds, count = mode == HOLD, 0
     for x in range(level.size):
-        l0, l1, ref = level[x], new[x], reference[x]
-        if leak:
-            l1 += np.int32(leaked(leak, on[x], frame))
+        l0, l1, ref = level[x], np.int32(new[x] + drift[x]), reference[x]
         reached = (max(l0, l1) - ref >= on[x]) | (ref - min(l0, l1) >= off[x])
         busy[x] = reached | (noise_u[x] <= 1) | (holds & (dead[x] > 0))
-    for x in range(level.size):
-        active[count] = x
-        count += busy[x]
+    eights = busy.view(np.uint64)
+    for i in range(eights.size):
+        if eights[i]:
+            for x in range(8 * i, 8 * i + 8):
+                active[count] = x
+                count += busy[x]
     return count
 
 
 @kernel
-def draw_noise(chip, scratch, r, c, v, pixel, frame, intensity):
-    """Fill the row's times and polarities of noise events; time 2 for none."""
-    key, hot, shot, hot_rate = chip.shot_keys[c, v], scratch.hot[r], chip.shot, chip.hot
-    noise_u, noise_sign = scratch.noise_u, scratch.noise_sign
-    for x in range(intensity.size):
-        u, s = f32(2), 1
-        if hot[x]:
-            u, s = noise_event(key, frame, pixel + x, f32(0), hot_rate)
-        elif shot:
-            u, s = noise_event(key, frame, pixel + x, intensity[x], shot)
-        noise_u[x], noise_sign[x] = u, s
+def find_events(chip, memory, scratch, steps, done, last):
+    """Take the active pixels `done` .. `last` - 1 through an interval, until the batch is full.
 
-
-@kernel
-def advance(chip, memory, sink, scratch, intensity, where, frame, steps, clock):
-    """Take one row through one interval; `clock`: window, its start and scale, interval's edges.
-
-    Arrays are taken out of their tuples before the loops: in a loop each would be counted as a
-    reference, which costs more than the pixel.
+    Returns the number of events in the batch and of the pixels that are done.
     """
-    c, v, y, r = where
-    level, reference = memory.level[c, v, y], memory.reference[c, v, y]
-    dead, new = memory.dead[c, v, y], scratch.level[r]
-    on_row, off_row = scratch.on[r], scratch.off[r]
+    level, reference, dead = memory.level, memory.reference, memory.dead
+    new, drift, on_, off_ = scratch.level, scratch.drift, scratch.on, scratch.off
     active, noise_u, noise_sign = scratch.active, scratch.noise_u, scratch.noise_sign
-    when, sign, leak, wait, mode = scratch.when, scratch.sign, chip.leak, chip.wait, chip.mode
-    if chip.shot or chip.hot:
-        pixel = (chip.place[0] + y) * chip.place[2] + chip.place[1]
-        draw_noise(chip, scratch, r, c, v, pixel, frame, intensity)
-    row = (c * sink.voxels.shape[1] + v) * sink.voxels.shape[4] + y
-    grid = sink.voxels[c, v, min(clock[0], sink.voxels.shape[2] - 1), :, y]
-    counts, offsets, events = sink.counts, sink.offsets, sink.events
-    for k in range(find_active(chip, scratch, r, level, reference, dead, frame)):
-        x = active[k]
-        on, off = np.int64(on_row[x]), np.int64(off_row[x])
-        drift = leaked(leak, on, frame) if leak else np.int64(0)
-        l0, l1, ref = np.int64(level[x]), new[x] + drift, np.int64(reference[x])
+    batch = scratch.who, scratch.when, scratch.sign
+    wait, mode, v2e, count = chip.wait, chip.mode, chip.v2e, 0
+    while done < last and count <= level.size:
+        x = active[done]
+        on, off = np.int64(on_[x]), np.int64(off_[x])
+        l0, l1, ref = np.int64(level[x]), np.int64(new[x]) + drift[x], np.int64(reference[x])
         u, s = noise_u[x], np.int64(noise_sign[x])
-        if chip.v2e:
+        if v2e:
             count, ref, dead[x] = v2e_events(
-                l0, l1, ref, dead[x], on, off, wait, mode, steps, u, s, when, sign
+                x, l0, l1, ref, dead[x], on, off, wait, mode, steps, u, s, batch, count
             )
         else:
             count, ref, dead[x] = linear_events(
-                l0, l1, ref, dead[x], on, off, wait, mode, u, s, when, sign
+                x, l0, l1, ref, dead[x], on, off, wait, mode, u, s, batch, count
             )
         reference[x] = ref
-        for i in range(count):
-            t = stamp(when[i], clock)
-            if sink.output == VOXELS:
-                add_to_grid(grid, x, t - clock[1], clock[2], sign[i])
-            elif sink.output == COUNT:
-                counts[row, 0 if sign[i] > 0 else 1] += 1
-            else:
-                at = offsets[row]
-                events[at].t, events[at].x, events[at].y, events[at].p = t, x, y, sign[i]
-                offsets[row] = at + 1
-    for x in range(level.size):
-        if leak:
-            reference[x] -= np.int32(leaked(leak, on_row[x], frame))
-        level[x], dead[x] = new[x], max(dead[x] - f32(1), f32(0))
-    memory.source[c, v, y] = scratch.source[r]
+        done += 1
+    return count, done
+
+
+@kernel
+def deliver(sink, place, scratch, number, clock):
+    """Bring the first `number` events of the batch to where they go; `place` is the unit's."""
+    unit, c, v, first, width = place
+    who, when, sign = scratch.who, scratch.when, scratch.sign
+    counts, offsets, events = sink.counts, sink.offsets, sink.events
+    if sink.output == VOXELS:
+        add_to_grid(sink.voxels[c, v, clock[0], :, first:], who, when, sign, number, clock)
+    elif sink.output == COUNT:
+        for i in range(number):
+            counts[unit, 0 if sign[i] > 0 else 1] += 1
+    else:
+        for i in range(number):
+            at, pixel = offsets[unit] + i, first + who[i]
+            events[at].t, events[at].p = stamp(when[i], clock), sign[i]
+            events[at].x, events[at].y = pixel % width, pixel // width
+        offsets[unit] += number
+
+
+@kernel
+def add_to_grid(grid, who, when, sign, number, clock):
+    """Add events to a unit's grid (bins, pixels), bilinear in time."""
+    origin, scale, bins = clock[1], clock[2], grid.shape[0]
+    for i in range(number):
+        tau = f32(f32(stamp(when[i], clock) - origin) * scale)
+        b = min(np.int64(tau), bins - 1)
+        late = f32(np.rint((tau - f32(b)) * f32(2**20)) * f32(2.0**-20))
+        grid[b, who[i]] += f32(sign[i]) * (f32(1) - late)
+        if late > 0 and b + 1 < bins:
+            grid[b + 1, who[i]] += f32(sign[i]) * late
 
 
 @small
@@ -331,64 +334,85 @@ def stamp(u, clock):
 
 
 @kernel
-def make_scratch(rows, width, smallest):
-    """Return the scratch; a pixel has no more events in an interval than thresholds in 32 nat."""
-    room = 32 + (1 << 25) // max(smallest >> 2, 1024)
-    return Scratch(
-        np.empty((rows, width), np.int32), np.empty((rows, width), np.int32),
-        np.empty((rows, width), np.bool_), np.empty((rows, width), np.int32),
-        np.empty((rows, width), np.int32), np.empty(width + 1, np.int64), np.empty(width, np.uint8),
-        np.full(width, f32(2)), np.ones(width, np.int8),
-        np.empty(room, np.float32), np.empty(room, np.int8),
-    )  # fmt: skip
+def start(table, intensity, memory):
+    """Set the memory to the first frame."""
+    read_levels(table, intensity, memory.level)
+    memory.source[:] = memory.level
+    memory.reference[:] = memory.level
+    memory.dead[:] = f32(0)
 
 
 @kernel
-def begin(chip, memory, scratch, frame, where, fresh):
-    """Set up one row: its pixels, and if it is fresh the memory of the first frame."""
-    c, v, y, r = where
-    pixel = (chip.place[0] + y) * chip.place[2] + chip.place[1]
-    row = (chip.chips[c, 0], chip.chips[c, 1], chip.chips[c, 2], chip.chips[c, 3])
-    make_row(
-        row, chip.normals, chip.chip_keys[v], pixel, scratch.on[r], scratch.off[r], scratch.hot[r]
-    )
-    if fresh:
-        table, level = chip.tables[0], memory.level[c, v, y]
-        new_levels(frame, table, table[:1], table[:1], level, level, level, level)
-        memory.source[c, v, y] = level
-        memory.reference[c, v, y] = level
-        memory.dead[c, v, y] = f32(0)
+def advance(chip, memory, scratch, sink, place, clock):
+    """Take one unit through one interval, at whose end the levels are those of the scratch."""
+    level, reference, dead = memory.level, memory.reference, memory.dead
+    new, drift = scratch.level, scratch.drift
+    steps = busiest(chip.mode, memory, scratch) if chip.v2e else np.int64(1)
+    done, last = 0, find_active(chip.mode, memory, scratch)
+    while done < last:
+        number, done = find_events(chip, memory, scratch, steps, done, last)
+        deliver(sink, place, scratch, number, clock)
+    for x in range(level.size):
+        reference[x] -= drift[x]
+        level[x], dead[x] = new[x], max(dead[x] - f32(1), f32(0))
+
+
+@kernel
+def see(chip, memory, scratch, intensity, key, frame):
+    """Fill the scratch with what interval `frame` brings: levels at its end, noise and leak."""
+    read_levels(chip.tables[0], intensity, scratch.level)
+    if chip.tables[1].size > 1:
+        low_pass(chip.tables[1], chip.tables[2], intensity, memory, scratch.level)
+    if chip.shot or chip.hot:
+        draw_noise(chip, scratch, key, frame, intensity)
+    if chip.leak:
+        draw_leak(chip.leak, scratch, frame)
+
+
+@kernel
+def clock_at(edges, i, substeps, bins):
+    """Return interval `i`'s window, the window's start and bins per microsecond, both edges."""
+    window = i // substeps
+    origin, end = edges[window * substeps], edges[(window + 1) * substeps]
+    return window, origin, f32(f32(bins - 1) / f32(end - origin)), edges[i], edges[i + 1]
+
+
+@kernel
+def make_scratch(size, smallest):
+    """Return the scratch; a pixel has no more events in an interval than thresholds in 32 nat."""
+    whole, room = (size + 7) // 8 * 8, size + 32 + (1 << 25) // max(smallest >> 2, 1024)
+    return Scratch(
+        np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int32),
+        np.empty(size, np.bool_), np.zeros(size, np.int32), np.empty(size, np.int32),
+        np.empty(whole + 1, np.uint32), np.zeros(whole, np.uint8),
+        np.full(size, f32(2)), np.ones(size, np.int8),
+        np.empty(room, np.uint32), np.empty(room, np.float32), np.empty(room, np.int8),
+    )  # fmt: skip
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def simulate(first_unit, last_unit, frames, fresh, chip, memory, edges, first, substeps, sink):
-    """Simulate units first_unit .. last_unit - 1: one row of a view each, with v2e's stamps all."""
-    _, views, samples, height, width = frames.shape
-    bins = sink.voxels.shape[3]
-    rows = height if chip.v2e else 1
-    units = height // rows
-    scratch = make_scratch(rows, width, chip.chips[:, :2].min())
+def simulate(
+    first_unit, last_unit, size, frames, fresh, chip, memory, edges, first, substeps, sink
+):
+    """Simulate units first_unit .. last_unit - 1: `size` consecutive pixels of a view each."""
+    _, views, samples, pixels = frames.shape
+    units = (pixels + size - 1) // size
     for unit in range(first_unit, last_unit):
-        c, v, y0 = unit // (views * units), unit // units % views, unit % units * rows
-        for r in range(rows):
-            begin(chip, memory, scratch, frames[c, v, 0, y0 + r], (c, v, y0 + r, r), fresh)
+        c, v, a = unit // (views * units), unit // units % views, unit % units * size
+        b = min(a + size, pixels)
+        own = Memory(
+            memory.level[c, v, a:b], memory.source[c, v, a:b],
+            memory.reference[c, v, a:b], memory.dead[c, v, a:b],
+        )  # fmt: skip
+        scratch = make_scratch(b - a, chip.chips[:, :2].min())
+        make_chip(chip, c, v, a, scratch)
+        if fresh:
+            start(chip.tables[0], frames[c, v, 0, a:b], own)
         for i in range(samples - fresh):
-            for r in range(rows):
-                new_levels(
-                    frames[c, v, i + fresh, y0 + r], chip.tables[0], chip.tables[1],
-                    chip.tables[2], memory.source[c, v, y0 + r], memory.level[c, v, y0 + r],
-                    scratch.source[r], scratch.level[r],
-                )  # fmt: skip
-            steps = np.int64(1)
-            if chip.v2e:
-                steps = busiest(chip, memory, scratch, c, v, first + i)
-            window = i // substeps
-            origin, end = edges[window * substeps], edges[(window + 1) * substeps]
-            clock = (window, origin, f32(f32(bins - 1) / f32(end - origin)), edges[i], edges[i + 1])
-            for r in range(rows):
-                if sink.output == VOXELS and i % substeps == 0:
-                    sink.voxels[c, v, window, :, y0 + r, :] = f32(0)
-                advance(
-                    chip, memory, sink, scratch, frames[c, v, i + fresh, y0 + r],
-                    (c, v, y0 + r, r), first + i, steps, clock,
-                )  # fmt: skip
+            clock = clock_at(edges, i, substeps, sink.voxels.shape[3])
+            if sink.output == VOXELS and i % substeps == 0:
+                sink.voxels[c, v, clock[0], :, a:b] = f32(0)
+            see(chip, own, scratch, frames[c, v, i + fresh, a:b], chip.shot_keys[c, v], first + i)
+            advance(chip, own, scratch, sink, (unit, c, v, a, chip.place[3]), clock)
+        if chip.tables[1].size == 1:
+            own.source[:] = own.level
