@@ -16,11 +16,14 @@ from src.figures import layouts, slices
 from src.metrics import paths, results
 from src.recordings import sources
 
+NOTES = {"wander": "wander", "straightness": "from a line"}
+
 
 def compare(cfg: DictConfig) -> dict:
-    """Write `comparison.png`.  Returns wander and straightness of each video in places.
+    """Write `comparison.png`.  Returns how far what each video's slice shows strays, in pixels.
 
-    Straightness is that of uniform motion along a line, or of uniform turning along a circle.
+    `wander`, along a line or a ray that turns with the scene, is of what stands still there,
+    `straightness` of what moves uniformly along a line or a circle.
     Raises ValueError for a video that cannot be read or is of another size than the first, or a
     slice that leaves the picture.
     """
@@ -36,9 +39,10 @@ def compare(cfg: DictConfig) -> dict:
     found, rows = {}, []
     for name, film in zip(names, films, strict=True):
         across, points = cut(cfg, film)
-        strays = paths.turning if cfg.circle else paths.straightness
-        found[name] = {"wander": paths.wander(across), "straightness": strays(across)}
-        note = f"wander {found[name]['wander']:.2f}, from a line {found[name]['straightness']:.2f}"
+        found[name] = strays(cfg, across)
+        note = ", ".join(
+            f"{NOTES[measure]} {value:.2f} px" for measure, value in found[name].items()
+        )
         rows.append(layouts.Row(name, film, across, note))
     shortest = min(map(len, films))
     layouts.comparison(
@@ -69,6 +73,34 @@ def cut(cfg: DictConfig, film: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         else slices.circle(tuple(cfg.circle[:2]), cfg.circle[2])
     )
     return slices.sample(film, points), points
+
+
+def strays(cfg: DictConfig, across: np.ndarray) -> dict[str, float]:
+    """Return `wander` and `straightness` of the slice `across` (frames, places), in pixels.
+
+    Nothing stands still on a circle, and nothing moves along a ray that turns with the scene.
+    """
+    found = {}
+    if not cfg.circle:
+        found["wander"] = paths.wander(across)
+    if not cfg.spin:
+        measure = paths.turning if cfg.circle else paths.straightness
+        found["straightness"] = measure(followed(across, cfg.follow))
+    return found
+
+
+def followed(across: np.ndarray, follow: str) -> np.ndarray:
+    """Return `across` with nothing in it but what is `bright` or `dark` against the median in time;
+    with `any`, as it is.  Raises ValueError for another word."""
+    middle = np.median(across, axis=0)
+    kinds = {
+        "any": across,
+        "bright": np.maximum(across, middle),
+        "dark": np.minimum(across, middle),
+    }
+    if follow not in kinds:
+        raise ValueError(f"follow must be one of {', '.join(kinds)}, got {follow}")
+    return kinds[follow]
 
 
 @hydra.main(version_base=None, config_path="../conf", config_name="compare")

@@ -212,6 +212,22 @@ def test_what_turns_uniformly_is_straight_in_theta_and_still_in_r(tmp_path):
     assert still["wander"] < 0.1 and round_["straightness"] < 0.2
 
 
+def test_the_tail_behind_a_bright_dot_is_not_followed(tmp_path):
+    (tmp_path / "film").mkdir()
+    y, x = np.mgrid[:20, :80]
+    for k in range(24):
+        dot = np.clip(4.5 - np.hypot(x - 10 - 2 * k, y - 10), 0, 1)
+        tail = (x < 4 + 2 * k) & (x > 2 * k - 8 - 8 * np.sin(k / 2))
+        picture = (100 + 150 * dot - 90 * tail).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / f"film/{k:02d}.png"), picture)
+    given = [f"videos=[{tmp_path}/film]", "names=[film]", "line=[[0,10],[79,10]]"]
+    found = {
+        follow: compare(config("compare", tmp_path / follow, *given, f"follow={follow}"))["film"]
+        for follow in ("any", "bright")
+    }
+    assert found["bright"]["straightness"] < 0.1 < 1 < found["any"]["straightness"]
+
+
 def test_videos_of_two_sizes_are_not_compared(tmp_path):
     for side in (20, 30):
         (tmp_path / str(side)).mkdir()
@@ -223,11 +239,15 @@ def test_videos_of_two_sizes_are_not_compared(tmp_path):
 
 @pytest.mark.parametrize(
     "wrong, message",
-    [("line=null", "one of line, circle and spin"), ("line=[[0,0],[500,0]]", "must stay")],
+    [
+        ("line=null", "one of line, circle and spin"),
+        ("line=[[0,0],[500,0]]", "must stay"),
+        ("line=[[0,0],[9,0]] follow=all", "follow must be one of"),
+    ],
 )
 def test_a_slice_that_cannot_be_taken_is_refused(wrong, message, tmp_path):
     (tmp_path / "film").mkdir()
     for k in range(3):
         cv2.imwrite(str(tmp_path / "film" / f"{k}.png"), np.zeros((20, 30), np.uint8))
     with pytest.raises(ValueError, match=message):
-        compare(config("compare", tmp_path / "run", f"videos=[{tmp_path}/film]", wrong))
+        compare(config("compare", tmp_path / "run", f"videos=[{tmp_path}/film]", *wrong.split()))
