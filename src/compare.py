@@ -16,7 +16,7 @@ from src.figures import layouts, slices
 from src.metrics import paths, results
 from src.recordings import sources
 
-NOTES = {"wander": "wander", "straightness": "from a line"}
+NOTES = {"wander": "wander of what stands still", "straightness": "what moves, from a line"}
 
 
 def compare(cfg: DictConfig) -> dict:
@@ -40,10 +40,8 @@ def compare(cfg: DictConfig) -> dict:
     for name, film in zip(names, films, strict=True):
         across, points = cut(cfg, film)
         found[name] = strays(cfg, across)
-        note = ", ".join(
-            f"{NOTES[measure]} {value:.2f} px" for measure, value in found[name].items()
-        )
-        rows.append(layouts.Row(name, film, across, note))
+        notes = [f"{NOTES[measure]}: {value:.2f} px" for measure, value in found[name].items()]
+        rows.append(layouts.Row(name, film, across, "\n".join(notes)))
     shortest = min(map(len, films))
     layouts.comparison(
         rows, run / "comparison.png", line=points, length_s=shortest / cfg.fps, axis=cfg.axis,

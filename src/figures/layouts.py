@@ -54,7 +54,7 @@ def comparison(
         for sample, panel in zip(samples, axes, strict=False):
             _frame(panel, row.video[sample])
         axes[0].plot(*line.T, color=LINE, linewidth=1)
-        axes[0].set_ylabel(row.name, fontsize=9)
+        axes[0].set_ylabel(row.name, fontsize=min(9, 170 / max(len(row.name), 1)))
         _slice(axes[-1], row, length_s)
     for sample, panel in zip(samples, grid[0], strict=False):
         time = length_s * sample / max(shortest - 1, 1)
