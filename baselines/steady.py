@@ -3,7 +3,8 @@
 What stands or moves smoothly has a path without corners; what turbulence adds to it changes from
 frame to frame.  Displacements between neighbours, block by block, summed over time are a path; the
 path less its smooth part is jitter (the idea of video stabilisation, Liu et al., "Bundled camera
-paths", 2013, with blocks for cameras).  Motion that turns within a few frames is taken for jitter.
+paths", 2013, with blocks for cameras).  Motion that turns within a few frames is taken for jitter;
+of jitter no larger than what is measured wrong little is believed (Wiener's gain).
 """
 
 import torch
@@ -14,6 +15,8 @@ from torch.nn import functional
 from src.metrics.temporal import displacement
 
 SPAN = 2.0  # frames, standard deviation of the window over which a path is taken for straight
+ERROR = 0.2  # pixels per axis, rms, to which a block's jitter is known
+NEAR = torch.tensor([[1.0, 4.0, 1.0]])  # weights of a block and its neighbours along an axis
 
 
 @torch.no_grad()
@@ -25,10 +28,26 @@ def jitter(frames: Float[Tensor, "n frames c h w"]) -> Float[Tensor, "n frames 2
 
 
 def _jitter(clip: Float[Tensor, "frames 1 h w"]) -> Float[Tensor, "frames 2 h w"]:
-    steps, _ = displacement(clip[1:], clip[:-1])
+    steps = _evened(*displacement(clip[1:], clip[:-1]))
     path = functional.pad(steps.cumsum(0), (0, 0, 0, 0, 0, 0, 1, 0))
-    smooth = torch.einsum("ts,s...->t...", smoother(len(path)).to(path), path)
-    return functional.interpolate(path - smooth, clip.shape[-2:], mode="bilinear")
+    shake = path - torch.einsum("ts,s...->t...", smoother(len(path)).to(path), path)
+    power = shake.square().mean((0, 1))
+    shake = shake * power / (power + ERROR**2)
+    return functional.interpolate(shake, clip.shape[-2:], mode="bilinear")
+
+
+def _evened(
+    steps: Float[Tensor, "steps 2 rows columns"], weight: Float[Tensor, "steps rows columns"]
+) -> Float[Tensor, "steps 2 rows columns"]:
+    """Return each block's mean with its neighbours', as far as they have texture; a block with none
+    around moves as the picture does.
+    """
+    texture = weight.sqrt()[:, None]
+    whole = (texture * steps).sum((2, 3), keepdim=True) / (texture.sum((2, 3), keepdim=True) + 1e-9)
+    near = (NEAR.T * NEAR).to(steps)[None, None].expand(3, 1, 3, 3)
+    summed = torch.cat([texture * (steps - whole), texture], 1)
+    *moved, total = functional.conv2d(summed, near, padding=1, groups=3).split(1, 1)
+    return whole + torch.cat(moved, 1) / (total + 1e-9)
 
 
 def smoother(frames: int) -> Float[Tensor, "frames frames"]:
