@@ -1,14 +1,20 @@
 """Where methods fail: python -m src.stress, or python -m src.stress ckpt=[lf3x3,setnet_small]."""
 
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 
 import hydra
 import rich
-from omegaconf import DictConfig
+import torch
+from omegaconf import DictConfig, OmegaConf
 
 from src import build, door, lineup
 from src.figures.heatmap import stress_map
 from src.metrics import results
+from src.metrics.lineup import Candidate
 from src.probes import suite
 from src.probes.bench import Bench
 
@@ -16,28 +22,58 @@ from src.probes.bench import Bench
 def stress(cfg: DictConfig) -> suite.Found:
     """Put every network through every probe; write the map, `stress.csv` and `stress.md`.
 
-    Returns the findings, probe by probe and network by network.  Raises ValueError for networks or
-    probes that are no such thing.
+    Returns the findings, probe by probe and network by network.  Raises ValueError for networks,
+    probes or a number of processes that are no such thing.
     """
+    if cfg.processes < 1:
+        raise ValueError(f"processes must be >= 1, got {cfg.processes}")
     run = Path(cfg.paths.run)
-    build.share_cores(cfg)
     candidates = lineup.gather(cfg)
-    probes = {name: build.make(node.probe) for name, node in cfg.probes.items()}
     titles = {name: str(node.title) for name, node in cfg.probes.items()}
     results.open_run(run, door.resolved(cfg))
-    bench = Bench(build.pipeline(cfg, "test"), range(cfg.clips), cfg.data.warmup)
 
     def keep(found: suite.Found) -> None:
         results.write_text(run / "stress.csv", suite.table(found, titles))
 
-    found = suite.run(candidates, probes, bench, keep)
-    standards = suite.standards(candidates, bench)
+    found, standards = suite.gather(_accounts(cfg, candidates), keep)
     text = suite.words(found, titles, standards)
     results.write_text(run / "stress.md", text)
     for suffix in ("png", "svg"):
         stress_map(run / f"stress.{suffix}", found, titles, standards)
     rich.print(text, f"in {run}")
     return found
+
+
+def _accounts(cfg: DictConfig, candidates: list[Candidate]) -> Iterator[suite.Account]:
+    """Yield what is found of each network, in their order; several at once in `processes`, each of
+    which loads the networks itself: spectral norms do not travel.
+    """
+    if cfg.processes == 1:
+        build.share_cores(cfg)
+        yield from map(_examiner(cfg), candidates)
+        return
+    plain = OmegaConf.create(OmegaConf.to_container(cfg, resolve=True))
+    context = get_context("spawn")  # a fork would inherit threads that are no longer there
+    with ProcessPoolExecutor(cfg.processes, context, _begin, (plain,)) as pool:
+        yield from pool.map(_examine, range(len(candidates)))
+
+
+def _examiner(cfg: DictConfig) -> partial[suite.Account]:
+    probes = {name: build.make(node.probe) for name, node in cfg.probes.items()}
+    bench = Bench(build.pipeline(cfg, "test"), range(cfg.clips), cfg.data.warmup)
+    return partial(suite.examine, probes=probes, bench=bench)
+
+
+def _begin(cfg: DictConfig) -> None:
+    """Start a process: one thread; networks, clips and probes of its own."""
+    global _here
+    torch.set_num_threads(1)
+    _here = lineup.gather(cfg), _examiner(cfg)
+
+
+def _examine(index: int) -> suite.Account:
+    candidates, examine = _here
+    return examine(candidates[index])
 
 
 @hydra.main(version_base=None, config_path="../conf", config_name="stress")

@@ -14,7 +14,7 @@ PROBES = "{hold: {title: held, probe: {_target_: src.probes.memory.Hold, windows
 PROBES += "lost: {title: lost, probe: {_target_: src.probes.views.Lost, counts: [1], draws: 1}}, "
 PROBES += "fast: {title: fast, probe: {_target_: src.probes.rates.Rates, rates: [1200]}}}"
 TINY = ["clips=1", "scene.height=64", "scene.width=64", "data.test_crop=32", "data.test_windows=20"]
-TINY += ["data.warmup=2", f"+probes={PROBES}"]
+TINY += ["data.warmup=2", "processes=1", f"+probes={PROBES}"]
 
 
 def tiny(tmp_path, *overrides: str):
@@ -46,3 +46,17 @@ def test_a_checkpoint_that_is_not_there_is_named(tmp_path):
 def test_an_entry_of_networks_without_views_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"networks\.bad must have views"):
         stress(tiny(tmp_path, "+networks={bad: {ckpt: nowhere}}"))
+
+
+def test_two_processes_find_what_one_does(tmp_path):
+    one = "one: {baseline: {_target_: baselines.highpass.HighPass}, views: 1}"
+    networks = f"+networks={{median: {HIGHPASS}, {one}}}"
+    stress(tiny(tmp_path / "a", networks))
+    stress(tiny(tmp_path / "b", networks, "processes=2"))
+    texts = [(tmp_path / name / "stress.csv").read_text() for name in "ab"]
+    assert texts[0] == texts[1]
+
+
+def test_no_process_at_all_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="processes must be >= 1, got 0"):
+        stress(tiny(tmp_path, "+networks={}", "processes=0"))

@@ -3,7 +3,8 @@
 import csv
 import io
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 
 from src.metrics.lineup import Candidate, Subject
 from src.probes.bench import Bench, Finding
@@ -13,24 +14,43 @@ Cell = Finding | str  # or why there is none
 Found = dict[str, dict[str, Cell]]  # probe -> network -> cell
 
 
-def run(
-    candidates: list[Candidate],
-    probes: Mapping[str, Probe],
-    bench: Bench,
-    keep: Callable[[Found], None],
-) -> Found:
-    """Return every cell; a probe that cannot run leaves the reason instead of a finding.
+@dataclass(frozen=True)
+class Account:
+    """What was found out about one network: a cell for every probe, the aligned PSNR in dB where
+    nothing is made hard (None: it does not run), and how long it took.
+    """
+
+    network: str
+    cells: dict[str, Cell]
+    standard: float | None
+    seconds: float
+
+
+def examine(candidate: Candidate, probes: Mapping[str, Probe], bench: Bench) -> Account:
+    """Put a network through the probes; one that cannot run leaves the reason for a finding."""
+    start = time.perf_counter()
+    cells = {name: _cell(candidate, probe, bench) for name, probe in probes.items()}
+    standard = None
+    if candidate.network is not None and candidate.trained:
+        standard = bench.standard(Subject(candidate.name, candidate.network, candidate.views))
+    return Account(candidate.name, cells, standard, time.perf_counter() - start)
+
+
+def gather(accounts: Iterable[Account], keep: Callable[[Found], None]) -> tuple[Found, dict]:
+    """Return every cell, probe by probe, and the standard of every network that has one.
 
     `keep` is called with what is found so far after every network.
     """
-    found: Found = {name: {} for name in probes}
-    for candidate in candidates:
-        start = time.perf_counter()
-        for name, probe in probes.items():
-            found[name][candidate.name] = _cell(candidate, probe, bench)
+    found: Found = {}
+    standards: dict[str, float] = {}
+    for account in accounts:
+        for probe, cell in account.cells.items():
+            found.setdefault(probe, {})[account.network] = cell
+        if account.standard is not None:
+            standards[account.network] = account.standard
         keep(found)
-        print(f"{candidate.name}: {time.perf_counter() - start:.0f} s", flush=True)
-    return found
+        print(f"{account.network}: {account.seconds:.0f} s", flush=True)
+    return found, standards
 
 
 def _cell(candidate: Candidate, probe: Probe, bench: Bench) -> Cell:
@@ -44,12 +64,6 @@ def _cell(candidate: Candidate, probe: Probe, bench: Bench) -> Cell:
         return probe(Subject(candidate.name, candidate.network, candidate.views), bench)
     except ValueError as error:
         return str(error)
-
-
-def standards(candidates: list[Candidate], bench: Bench) -> dict[str, float]:
-    """Return the aligned PSNR in dB of every network that runs, where nothing is made hard."""
-    able = [c for c in candidates if c.network is not None and c.trained]
-    return {c.name: bench.standard(Subject(c.name, c.network, c.views)) for c in able}
 
 
 def table(found: Found, titles: Mapping[str, str]) -> str:
