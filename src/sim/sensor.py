@@ -10,6 +10,8 @@ tick in which it falls, in [edge_k, edge_k+1) with edge_k = ceil(k 10^6 / fps).
 import math
 from collections.abc import Sequence
 from copy import copy
+from importlib.util import find_spec
+from types import ModuleType
 
 import numpy as np
 import torch
@@ -139,7 +141,7 @@ class EventSensor:
         if frames.device.type == "cpu":  # numpy's memory is in huge pages: 5 times cheaper
             grids = sensor_cpu.voxels(job, torch.from_numpy(np.empty(shape, np.float32)))
         else:
-            grids = sensor_eager.voxels(job, torch.empty(shape, device=frames.device))
+            grids = _engine(job).voxels(job, torch.empty(shape, device=frames.device))
         job.state.frame += job.intervals
         return grids, job.state
 
@@ -228,6 +230,15 @@ class EventSensor:
         decay, lag = np.exp(-a), -np.expm1(-a) / a
         scaled = [np.rint(part * UNIT * 2**EXTRA).astype(np.int32) for part in (decay, lag)]
         return level, *(torch.from_numpy(part).to(device) for part in scaled)
+
+
+def _engine(job: Job) -> ModuleType:
+    """Return the engine of a device: on CUDA, Triton's where it is installed, else plain torch."""
+    if job.frames.is_cuda and not job.v2e and find_spec("triton"):
+        from src.sim.engines import sensor_triton  # imports Triton, which is not there everywhere
+
+        return sensor_triton
+    return sensor_eager
 
 
 def _clock(fps: float, first: int, count: int) -> NDArray[np.int64]:

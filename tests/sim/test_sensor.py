@@ -127,10 +127,21 @@ def test_engines_agree_bit_for_bit(settings_, stamps, refractory, refractory_s):
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_the_gpu_agrees_bit_for_bit():
-    frames = torch.rand(2, 3, 7, 64, 64)
-    sensor = EventSensor(0.2, **NOISY)
-    assert torch.equal(sensor.voxels(frames.cuda(), FPS).cpu(), sensor.voxels(frames, FPS))
+@pytest.mark.parametrize("settings_", [{}, NOISY], ids=["clean", "noisy"])
+@pytest.mark.parametrize("stamps", ["linear", "v2e"])
+@pytest.mark.parametrize("refractory", ["defer", "delete", "hold"])
+def test_the_gpu_agrees_bit_for_bit(settings_, stamps, refractory):
+    frames = torch.rand(2, 3, 8, 63, 65, generator=torch.Generator().manual_seed(4))
+    sensor = EventSensor(0.2, stamps=stamps, refractory=refractory, **settings_)
+    on_cpu, on_gpu = [], []
+    for found, device in ((on_cpu, "cpu"), (on_gpu, "cuda")):
+        state = None
+        for part in frames.to(device).split([5, 3], 2):
+            grids, state = sensor.step(part, FPS, state, origin=(5, 7), full_width=99)
+            found.append(grids.cpu())
+        memory = (state.level, state.source, state.reference, state.dead)
+        found.extend(part.cpu() for part in memory)
+    assert all(torch.equal(a, b) for a, b in zip(on_cpu, on_gpu, strict=True))
 
 
 @pytest.mark.parametrize("settings_", [{}, NOISY, {"stamps": "v2e"}, {"refractory": "hold"}])
