@@ -16,7 +16,7 @@ from src.metrics.temporal import displacement
 
 SPAN = 2.0  # frames, standard deviation of the window over which a path is taken for straight
 ERROR = 0.2  # pixels per axis, rms, to which a block's jitter is known
-NEAR = torch.tensor([[1.0, 4.0, 1.0]])  # weights of a block and its neighbours along an axis
+NEAR = (1.0, 4.0, 1.0)  # weights of a block and its neighbours along an axis
 
 
 @torch.no_grad()
@@ -44,7 +44,8 @@ def _evened(
     """
     texture = weight.sqrt()[:, None]
     whole = (texture * steps).sum((2, 3), keepdim=True) / (texture.sum((2, 3), keepdim=True) + 1e-9)
-    near = (NEAR.T * NEAR).to(steps)[None, None].expand(3, 1, 3, 3)
+    near = steps.new_tensor(NEAR)
+    near = (near[:, None] * near).expand(3, 1, 3, 3)
     summed = torch.cat([texture * (steps - whole), texture], 1)
     *moved, total = functional.conv2d(summed, near, padding=1, groups=3).split(1, 1)
     return whole + torch.cat(moved, 1) / (total + 1e-9)

@@ -19,8 +19,10 @@ from src.recordings import tables
 from src.recordings.engines.decode import adopt
 
 EVENT = np.dtype([("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)])
+AEDAT4 = b"#!AER-DAT4.0\r\n"  # then the length of the header, four bytes, and the header
 BINARY = {".raw": "evt", ".dat": "dat", ".aedat4": "aedat", ".es": "es"}
 SENSORS = {"gen3": (640, 480), "gen4": (1280, 720), "imx636": (1280, 720), "genx320": (320, 320)}
+SIDE_MAX = 2**16  # pixels: coordinates have 16 bits
 HIGHEST = 2**62  # microseconds; a time beyond is a broken file
 SILENCE_US = 2**24  # EVT3 counts time in 24 bits: the writer cannot bridge a longer silence
 DAT_SPAN_US = 2**32
@@ -65,7 +67,10 @@ def open_events(path: str | Path, size: tuple[int, int] | None = None) -> Record
     if path.suffix not in (*BINARY, *tables.SUFFIXES):
         known = ", ".join((*BINARY, *tables.SUFFIXES))
         raise ValueError(f"{path}: unknown kind of event file, known are {known}")
-    return Recording(path, _size(path) or size)
+    size = _size(path) or size
+    if size is not None and not all(1 <= side <= SIDE_MAX for side in size):
+        raise ValueError(f"{path}: a sensor's sides must be in 1..{SIDE_MAX}, got {size}")
+    return Recording(path, size)
 
 
 def sensor_size(path: str | Path) -> tuple[int, int]:
@@ -175,12 +180,23 @@ def _decoder(path: Path) -> Iterable[np.ndarray]:
         fallback = f"evt{version[0]}"
         if words % (4 if fallback == "evt2" else 2):
             warnings.warn(f"{path}: the file ends within a word, it is truncated", stacklevel=2)
+    if kind == "aedat":
+        _check_aedat_header(path)
     return _guarded(
         path,
         lambda: faery.events_stream_from_file(
             path, file_type=kind, version_fallback=fallback, dimensions_fallback=(65535, 65535)
         ),
     )
+
+
+def _check_aedat_header(path: Path) -> None:
+    """Refuse a header longer than its file, for which the decoder would take that much memory."""
+    with path.open("rb") as file:
+        start = file.read(len(AEDAT4) + 4)
+    length = int.from_bytes(start[len(AEDAT4) :], "little")
+    if len(start) + length > path.stat().st_size:
+        raise ValueError(f"{path}: a header of {length} bytes is longer than the file")
 
 
 def _decoded(path: Path, stream: Iterable[np.ndarray]) -> Iterator[np.ndarray]:

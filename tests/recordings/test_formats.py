@@ -162,6 +162,19 @@ def test_a_missing_file_is_named(tmp_path):
         read_events(tmp_path / "a.raw")
 
 
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.csv", b"9" * 30 + b",1\n5,3,3,1\n", "sides must be in 1..65536"),
+        ("a.aedat4", b"#!AER-DAT4.0\r\n\xb4\x00\x00{" + bytes(99), "longer than the file"),
+    ],
+)
+def test_sizes_that_cannot_be_are_refused(tmp_path, name, content, words):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=words):
+        read_events(tmp_path / name)
+
+
 def test_evt21_says_what_to_export(tmp_path):
     (tmp_path / "a.raw").write_bytes(b"% evt 2.1\n% end\n" + bytes(64))
     with pytest.raises(ValueError, match="export the recording as EVT3 or EVT2"):
