@@ -6,6 +6,7 @@ it, or a warning with the number of events concerned at the end of the reading.
 """
 
 import re
+import struct
 import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -191,12 +192,24 @@ def _decoder(path: Path) -> Iterable[np.ndarray]:
 
 
 def _check_aedat_header(path: Path) -> None:
-    """Refuse a header longer than its file, for which the decoder would take that much memory."""
+    """Refuse headers on which the decoder, compiled code, would bring the whole process down: one
+    longer than its file, and a description (FlatBuffers: table 0, field 2) that is no UTF-8.
+    """
     with path.open("rb") as file:
         start = file.read(len(AEDAT4) + 4)
-    length = int.from_bytes(start[len(AEDAT4) :], "little")
-    if len(start) + length > path.stat().st_size:
-        raise ValueError(f"{path}: a header of {length} bytes is longer than the file")
+        length = int.from_bytes(start[len(AEDAT4) :], "little")
+        if len(start) + length > path.stat().st_size:
+            raise ValueError(f"{path}: a header of {length} bytes is longer than the file")
+        header = file.read(length)
+    try:
+        (table,) = struct.unpack_from("<I", header)
+        fields = table - struct.unpack_from("<i", header, table)[0]
+        (place,) = struct.unpack_from("<H", header, fields + 8)
+        text = table + place + struct.unpack_from("<I", header, table + place)[0]
+        (size,) = struct.unpack_from("<I", header, text)
+        header[text + 4 : text + 4 + size].decode()
+    except (struct.error, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: its header cannot be read: {error}") from error
 
 
 def _decoded(path: Path, stream: Iterable[np.ndarray]) -> Iterator[np.ndarray]:

@@ -175,6 +175,14 @@ def test_sizes_that_cannot_be_are_refused(tmp_path, name, content, words):
         read_events(tmp_path / name)
 
 
+def test_a_description_that_is_no_text_is_refused(tmp_path):
+    path = tmp_path / "a.aedat4"
+    write_events(path, made_up(40), width=640, height=480)
+    path.write_bytes(path.read_bytes().replace(b"</node>", b"\xff" * 7, 1))
+    with pytest.raises(ValueError, match="header cannot be read"):
+        read_events(path)
+
+
 def test_evt21_says_what_to_export(tmp_path):
     (tmp_path / "a.raw").write_bytes(b"% evt 2.1\n% end\n" + bytes(64))
     with pytest.raises(ValueError, match="export the recording as EVT3 or EVT2"):
