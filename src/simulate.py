@@ -30,7 +30,8 @@ def simulate(cfg: DictConfig) -> dict:
         cfg = alike(cfg)
     pipeline = build.pipeline(cfg, cfg.split)
     draw = pipeline.draw(cfg.index)
-    sample, views = pipeline.simulate([draw]), pipeline.views(draw)[0]
+    batch = pipeline.views(draw)
+    sample, views = pipeline.expose(draw, batch), batch[0]
     frames = views.shape[1]
     tilt = pipeline.operator(draw).tilt(frames, pipeline.drawer(draw), crop=draw.crop)
     windows = slice(cfg.data.substeps, None, cfg.data.substeps)

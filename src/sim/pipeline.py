@@ -118,7 +118,7 @@ class Pipeline:
     def simulate(self, draws: Sequence[Draw], device: torch.device | str = "cpu") -> Sample:
         """Simulate the drawn clips on `device`."""
         start = time.perf_counter()
-        samples = [self._simulate(draw, device) for draw in draws]
+        samples = [self.expose(draw, self.views(draw, device)) for draw in draws]
         return Sample(
             voxels=torch.cat([sample.voxels for sample in samples]),
             target=torch.cat([sample.target for sample in samples]),
@@ -129,11 +129,11 @@ class Pipeline:
             seconds=time.perf_counter() - start,
         )
 
-    def _simulate(self, draw: Draw, device: torch.device | str) -> Sample:
+    def expose(self, draw: Draw, views: Tensor) -> Sample:
+        """Return the sample of one clip whose `views` (1, views, frames, h, w) are those drawn."""
         top, left, height, width = draw.crop
-        clean = draw.clip.frames.to(device)[None]
+        clean = draw.clip.frames.to(views.device)[None]
         target = clean[:, self.substeps :: self.substeps, top : top + height, left : left + width]
-        views = self.views(draw, device)
         voxels = self.sensor.voxels(
             views,
             draw.clip.fps,
