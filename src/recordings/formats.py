@@ -6,7 +6,6 @@ it, or a warning with the number of events concerned at the end of the reading.
 """
 
 import re
-import struct
 import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -16,11 +15,10 @@ import faery
 import numpy as np
 from faery.file_encoder import events_to_file
 
-from src.recordings import tables
+from src.recordings import aedat, tables
 from src.recordings.engines.decode import adopt
 
 EVENT = np.dtype([("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)])
-AEDAT4 = b"#!AER-DAT4.0\r\n"  # then the length of the header, four bytes, and the header
 BINARY = {".raw": "evt", ".dat": "dat", ".aedat4": "aedat", ".es": "es"}
 SENSORS = {"gen3": (640, 480), "gen4": (1280, 720), "imx636": (1280, 720), "genx320": (320, 320)}
 SIDE_MAX = 2**16  # pixels: coordinates have 16 bits
@@ -182,34 +180,13 @@ def _decoder(path: Path) -> Iterable[np.ndarray]:
         if words % (4 if fallback == "evt2" else 2):
             warnings.warn(f"{path}: the file ends within a word, it is truncated", stacklevel=2)
     if kind == "aedat":
-        _check_aedat_header(path)
+        aedat.check(path)
     return _guarded(
         path,
         lambda: faery.events_stream_from_file(
             path, file_type=kind, version_fallback=fallback, dimensions_fallback=(65535, 65535)
         ),
     )
-
-
-def _check_aedat_header(path: Path) -> None:
-    """Refuse headers on which the decoder, compiled code, would bring the whole process down: one
-    longer than its file, and a description (FlatBuffers: table 0, field 2) that is no UTF-8.
-    """
-    with path.open("rb") as file:
-        start = file.read(len(AEDAT4) + 4)
-        length = int.from_bytes(start[len(AEDAT4) :], "little")
-        if len(start) + length > path.stat().st_size:
-            raise ValueError(f"{path}: a header of {length} bytes is longer than the file")
-        header = file.read(length)
-    try:
-        (table,) = struct.unpack_from("<I", header)
-        fields = table - struct.unpack_from("<i", header, table)[0]
-        (place,) = struct.unpack_from("<H", header, fields + 8)
-        text = table + place + struct.unpack_from("<I", header, table + place)[0]
-        (size,) = struct.unpack_from("<I", header, text)
-        header[text + 4 : text + 4 + size].decode()
-    except (struct.error, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: its header cannot be read: {error}") from error
 
 
 def _decoded(path: Path, stream: Iterable[np.ndarray]) -> Iterator[np.ndarray]:

@@ -183,6 +183,17 @@ def test_a_description_that_is_no_text_is_refused(tmp_path):
         read_events(path)
 
 
+def test_a_packet_longer_than_its_file_is_refused(tmp_path):
+    path = tmp_path / "a.aedat4"
+    write_events(path, made_up(40), width=640, height=480)
+    content = bytearray(path.read_bytes())
+    first = 18 + int.from_bytes(content[14:18], "little")
+    content[first + 7] = 0x80
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="packet of .* longer than the file"):
+        read_events(path)
+
+
 def test_evt21_says_what_to_export(tmp_path):
     (tmp_path / "a.raw").write_bytes(b"% evt 2.1\n% end\n" + bytes(64))
     with pytest.raises(ValueError, match="export the recording as EVT3 or EVT2"):
