@@ -20,15 +20,15 @@ QUICK += ["data.reuse=1"]
 
 def poisoned(monkeypatch, clip: int, value: float) -> None:
     """Make the simulation of one training clip return `value` somewhere."""
-    simulated = Pipeline._simulate
+    exposed = Pipeline.expose
 
-    def spoil(self, draw, device):
-        sample = simulated(self, draw, device)
+    def spoil(self, draw, views):
+        sample = exposed(self, draw, views)
         if self.split == "train" and draw.number == clip:
             sample.voxels[0, 0, 0, 0, 0, 0] = value
         return sample
 
-    monkeypatch.setattr(Pipeline, "_simulate", spoil)
+    monkeypatch.setattr(Pipeline, "expose", spoil)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
