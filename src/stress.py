@@ -1,6 +1,6 @@
 """Where methods fail: python -m src.stress, or python -m src.stress ckpt=[lf3x3,setnet_small]."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
@@ -28,14 +28,14 @@ def stress(cfg: DictConfig) -> suite.Found:
     if cfg.processes < 1:
         raise ValueError(f"processes must be >= 1, got {cfg.processes}")
     run = Path(cfg.paths.run)
-    candidates = lineup.gather(cfg)
+    candidates, examine = lineup.gather(cfg), _examiner(cfg)
     titles = {name: str(node.title) for name, node in cfg.probes.items()}
     results.open_run(run, door.resolved(cfg))
 
     def keep(found: suite.Found) -> None:
         results.write_text(run / "stress.csv", suite.table(found, titles))
 
-    found, standards = suite.gather(_accounts(cfg, candidates), keep)
+    found, standards = suite.gather(_accounts(cfg, candidates, examine), keep)
     text = suite.words(found, titles, standards)
     results.write_text(run / "stress.md", text)
     for suffix in ("png", "svg"):
@@ -44,13 +44,15 @@ def stress(cfg: DictConfig) -> suite.Found:
     return found
 
 
-def _accounts(cfg: DictConfig, candidates: list[Candidate]) -> Iterator[suite.Account]:
+def _accounts(
+    cfg: DictConfig, candidates: list[Candidate], examine: Callable[[Candidate], suite.Account]
+) -> Iterator[suite.Account]:
     """Yield what is found of each network, in their order; several at once in `processes`, each of
     which loads the networks itself: spectral norms do not travel.
     """
     if cfg.processes == 1:
         build.share_cores(cfg)
-        yield from map(_examiner(cfg), candidates)
+        yield from map(examine, candidates)
         return
     plain = OmegaConf.create(OmegaConf.to_container(cfg, resolve=True))
     context = get_context("spawn")  # a fork would inherit threads that are no longer there
@@ -58,7 +60,8 @@ def _accounts(cfg: DictConfig, candidates: list[Candidate]) -> Iterator[suite.Ac
         yield from pool.map(_examine, range(len(candidates)))
 
 
-def _examiner(cfg: DictConfig) -> partial[suite.Account]:
+def _examiner(cfg: DictConfig) -> Callable[[Candidate], suite.Account]:
+    """Return what puts a network through the probes; ValueError for probes that are none."""
     probes = {name: build.make(node.probe) for name, node in cfg.probes.items()}
     bench = Bench(build.pipeline(cfg, "test"), range(cfg.clips), cfg.data.warmup)
     return partial(suite.examine, probes=probes, bench=bench)
