@@ -10,6 +10,8 @@ from typing import Any
 
 import torch
 
+from src.models.checkpoints import larger_inside
+
 ALLOWED = {
     ("collections", "OrderedDict"): collections.OrderedDict,
     ("torch._utils", "_rebuild_tensor_v2"): torch._utils._rebuild_tensor_v2,
@@ -37,8 +39,11 @@ class Inert:
         """Drop the values."""
 
 
-class Unpickler(pickle.Unpickler):
-    """Builds tensors and containers; unknown classes are inert, the standard library refused."""
+class Unpickler(pickle._Unpickler):
+    """Builds tensors and containers; unknown classes are inert, the standard library refused.
+
+    The one in Python: the compiled one takes the memory for as many objects as a pickle claims.
+    """
 
     def find_class(self, module: str, name: str) -> Any:
         """Return what a name in the pickle stands for; ValueError for what could run code."""
@@ -67,6 +72,8 @@ def read(path: str | Path) -> Any:
         raise ValueError(f"baseline.weights must be a file, got {path}")
     try:
         if zipfile.is_zipfile(path):
+            if larger_inside(path):
+                raise ValueError(f"baseline.weights must hold tensors unpacked, got {path}")
             with zipfile.ZipFile(path) as archive:
                 if any(name.endswith("constants.pkl") for name in archive.namelist()):
                     raise ValueError(f"baseline.weights must hold tensors, got a program in {path}")

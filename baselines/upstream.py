@@ -132,10 +132,13 @@ def load(name: str, checkpoint: str | Path | Mapping[str, Tensor]) -> nn.Module:
     kind, how, rules, first, width = NETWORKS[name]
     weights = _state_dict(checkpoint)
     head = weights.get(_rename(f"{first}.weight", rules))
-    sizes = {} if head is None else {"bins": head.shape[1], width: head.shape[0]}
+    kernel = head is not None and head.dim() == 4 and head.numel() > 0
+    sizes = {"bins": head.shape[1], width: head.shape[0]} if kernel else {}
+    with torch.device("meta"):  # without memory: a small file may ask for a huge network
+        own = kind(**sizes, **how).state_dict()
+    names = {ours: _rename(ours, rules) for ours in own}
+    _check(name, names, weights, own)
     network = kind(**sizes, **how)
-    names = {ours: _rename(ours, rules) for ours in network.state_dict()}
-    _check(name, names, weights, network.state_dict())
     network.load_state_dict({ours: weights[theirs] for ours, theirs in names.items()})
     return network.eval().requires_grad_(False)
 
@@ -193,6 +196,8 @@ def _state_dict(checkpoint: str | Path | Mapping) -> Mapping[str, Tensor]:
     weights = {k: v for k, v in content.items() if isinstance(v, torch.Tensor)}
     if not weights:
         raise ValueError("baseline.weights must hold a state dict, got no tensors")
+    if not isinstance(checkpoint, Mapping):
+        files.check_memory(weights, Path(checkpoint))
     return weights
 
 

@@ -8,7 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from src import build, door
+from src import build, door, plain
 from src.figures import samples
 from src.metrics import results
 from src.recordings import capture
@@ -52,9 +52,9 @@ def alike(cfg: DictConfig) -> DictConfig:
     Raises ValueError for a file that is no such config.
     """
     try:
-        other = OmegaConf.load(cfg.like)
+        other = OmegaConf.create(plain.read(cfg.like))
         parts = {name: other[name] for name in SAME}
-    except (OSError, UnicodeDecodeError, YAMLError, KeyError, TypeError, OmegaConfBaseException):
+    except (OSError, YAMLError, KeyError, TypeError, OmegaConfBaseException):
         raise ValueError(f"like must be the config.yaml of a run, got {cfg.like}") from None
     found = cfg.copy()
     for name, part in parts.items():

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from jaxtyping import install_import_hook
 
+import src  # noqa: F401 - sets OpenCV's limits before a test imports it
 import tests.typecheck  # noqa: F401 - the hook below names it in a string
 
 ROOT = Path(__file__).resolve().parents[1]

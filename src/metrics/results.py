@@ -11,9 +11,9 @@ import subprocess
 from pathlib import Path
 
 import rich
-import yaml
 from rich.table import Table
 
+from src import plain
 from src.metrics.bootstrap import interval
 from src.metrics.evaluation import Row
 
@@ -50,7 +50,7 @@ def content(config: str) -> dict:
 
     Left out: `paths`, and for training the `ckpt` it went on from (law 6).
     """
-    found = yaml.safe_load(config)
+    found = plain.parse(config)
     run = found.pop("paths", {}).get("run")
     if found.get("task") == "train":
         found.pop("ckpt", None)

@@ -38,6 +38,7 @@ def load(name_or_path: str | Path) -> nn.Module:
         names = ", ".join(sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))) or "none yet"
         raise ValueError(f"ckpt must be a file or one of weights/ ({names}), got {name_or_path}")
     spec, weights = (_safetensors if path.suffix == ".safetensors" else _checkpoint)(path)
+    check_memory(weights, path)
     with torch.device("meta"):  # without memory: a small file may name a huge network
         _check_fit(_build(spec, path), weights, path)
     network = _build(spec, path)
@@ -153,6 +154,15 @@ def _check_sizes(value: Any, path: Path) -> None:
             _check_sizes(part, path)
     elif isinstance(value, int | float) and not abs(value) <= LARGEST:
         raise ValueError(f"ckpt must hold sizes up to {LARGEST}, got {value} in {path}")
+
+
+def check_memory(weights: dict[str, Tensor], path: Path) -> None:
+    """Raise ValueError for weights of more numbers than the file has bytes: in a view of a few
+    numbers any size fits, but the network made for it has to hold them all.
+    """
+    numbers, size = sum(value.numel() for value in weights.values()), path.stat().st_size
+    if numbers > size:
+        raise ValueError(f"{path} must hold its weights whole: {numbers} numbers in {size} bytes")
 
 
 def _check_fit(network: nn.Module, weights: dict[str, Tensor], path: Path) -> None:

@@ -14,8 +14,9 @@ import numpy as np
 import yaml
 from jaxtyping import Float, UInt8
 
+from src import plain
 from src.recordings.targets import Target, groups
-from src.recordings.views import LARGEST_FILE, Size, View, Views, apply
+from src.recordings.views import Size, View, Views, apply
 
 Position = tuple[int, int]
 Points = Float[np.ndarray, "_ 2"]
@@ -216,14 +217,14 @@ def read_corners(path: Path | str) -> dict[Position, Points]:
     Raises ValueError for anything else.
     """
     try:
-        with open(path, encoding="utf-8") as file:
-            entries = yaml.safe_load(file.read(LARGEST_FILE))
-        return {
-            tuple(int(number) for number in entry["position"]): np.array(entry["corners"], float)
-            for entry in entries
-        }
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError) as error:
+        return {_place(entry): np.array(entry["corners"], float) for entry in plain.read(path)}
+    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, OverflowError) as error:
         why = f"{type(error).__name__} {error}"
         raise ValueError(
             f"corners must be a list of position and corners, got {path}: {why}"
         ) from None
+
+
+def _place(entry: dict) -> Position:
+    row, column = entry["position"]
+    return int(row), int(column)

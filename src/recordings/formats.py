@@ -167,6 +167,8 @@ def _pieces(path: Path) -> Iterator[tuple]:
         return
     if path.suffix in (".raw", ".dat") and len(_header(path)) == path.stat().st_size:
         return  # a recording without events
+    if path.suffix == ".aedat4":
+        aedat.check_packets(path)
     for events in _decoded(path, _decoder(path)):
         yield events["t"].view(np.int64), events["x"], events["y"], events["on"]
 
@@ -180,7 +182,7 @@ def _decoder(path: Path) -> Iterable[np.ndarray]:
         if words % (4 if fallback == "evt2" else 2):
             warnings.warn(f"{path}: the file ends within a word, it is truncated", stacklevel=2)
     if kind == "aedat":
-        aedat.check(path)
+        aedat.check_header(path)
     return _guarded(
         path,
         lambda: faery.events_stream_from_file(

@@ -1,5 +1,6 @@
 """What is looked at: events of a sensor of known size, a sensor picture, a film."""
 
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from jaxtyping import Float
 
 from src.recordings import formats, tables
 from src.recordings.views import Size
+from src.sim.pictures import LARGEST_PIXELS, read_picture
 
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 FILMS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".gif")
@@ -83,20 +85,34 @@ def _frames(path: Path) -> Iterator[np.ndarray]:
         names = sorted(name for name in path.iterdir() if name.suffix.lower() in PICTURES)
         yield from map(_picture, names)
     elif path.suffix == ".h5":
-        with h5py.File(path) as file:
-            tables.check_inside(file)
-            for frame in file["frames"]:
-                yield frame.astype(np.float32) / 255
+        for frame in _video_h5(path):
+            yield frame.astype(np.float32) / 255
     else:
         file = cv2.VideoCapture(str(path))
         while (read := file.read())[0]:
             yield cv2.cvtColor(read[1], cv2.COLOR_BGR2GRAY).astype(np.float32) / 255
 
 
+def _video_h5(path: Path) -> Iterator[np.ndarray]:
+    try:
+        with h5py.File(path) as file:
+            tables.check_inside(file)
+            frames = file["frames"]
+            if frames.ndim != 3 or frames.dtype != np.uint8:
+                raise ValueError("frames must be uint8 (n, h, w)")
+            if math.prod(frames.shape[1:]) > LARGEST_PIXELS:
+                raise ValueError(f"frames must have {LARGEST_PIXELS} pixels at most")
+            yield from frames
+    except Exception as error:  # HDF5 raises all kinds on a broken file
+        raise ValueError(f"{path}: cannot be read as a video: {error}") from error
+
+
 def _picture(path: Path) -> np.ndarray:
-    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
-    if picture is None:
-        raise ValueError(f"recording must be a readable picture, got {path}")
+    picture = read_picture(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    if picture is None or picture.dtype.kind != "u":
+        raise ValueError(
+            f"recording must be a readable picture of at most {LARGEST_PIXELS} pixels, got {path}"
+        )
     return picture.astype(np.float32) / np.iinfo(picture.dtype).max
 
 

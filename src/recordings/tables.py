@@ -5,6 +5,7 @@ seconds.  HDF5 holds `x y t p` at the top or in the group `events`; the group ma
 `t_offset` in microseconds and `ms_to_idx` (Gehrig et al. 2021).
 """
 
+import math
 import zipfile
 from collections.abc import Iterator
 from itertools import chain, islice
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 SUFFIXES = (".txt", ".csv", ".npz", ".h5", ".hdf5")
 PIECE = 2**18  # events in a piece
+LARGEST_CHUNK = 2**28  # bytes of HDF5 that are unpacked at a time
 PACKED = 200  # most that the columns of a recording shrink when they are packed
 NAMES = {
     "t": ("t", "ts", "time", "timestamp"), "x": ("x", "xs"), "y": ("y", "ys"),
@@ -70,6 +72,7 @@ def size(path: Path) -> tuple[int, int] | None:
             elif len(header) == 2:
                 stated = header
         elif path.suffix == ".npz":
+            _check_packing(path)
             with np.load(path) as file:
                 stated = file["size"].tolist() if "size" in file else None
         else:
@@ -126,19 +129,36 @@ def _columns(path: Path) -> Iterator[tuple]:
                 "Prophesee HDF5 (CD/events) is packed with the vendor's own codec; export the "
                 "recording as RAW (EVT3) or as events/{x,y,t,p}"
             )
-        offset = int(np.asarray(file["t_offset"])) if "t_offset" in file else 0
-        yield from _sliced(file.get("events", file), offset)
+        columns = file.get("events", file)
+        parts = [part for part in columns.values() if isinstance(part, h5py.Dataset)]
+        _check_claim(path, sum(part.nbytes for part in parts))
+        yield from _sliced(columns, _offset(file))
+
+
+def _offset(file: h5py.File) -> int:
+    stated = file.get("t_offset")
+    if stated is None:
+        return 0
+    if stated.size != 1:
+        raise ValueError(f"t_offset must be one number, got {stated.shape}")
+    return int(np.asarray(stated).item())
 
 
 def check_inside(file: h5py.File) -> None:
-    """Raise ValueError where a part of the file is another file: a path leads anywhere."""
+    """Raise ValueError where a part of the file is another file, as a path leads anywhere, or comes
+    in chunks beyond LARGEST_CHUNK, which are unpacked whole.
+    """
 
     def visit(name: str, link) -> str | None:  # an error raised in here would be lost in HDF5
         if isinstance(link, h5py.ExternalLink):
             return f"{name} leads to another file, {link.filename}"
         part = file.get(name) if isinstance(link, h5py.HardLink) else None
-        if isinstance(part, h5py.Dataset) and (part.external or part.is_virtual):
+        if not isinstance(part, h5py.Dataset):
+            return None
+        if part.external or part.is_virtual:
             return f"{name} lies in another file"
+        if part.dtype.itemsize * math.prod(part.chunks or ()) > LARGEST_CHUNK:
+            return f"{name} is packed in chunks of more than {LARGEST_CHUNK} bytes"
         return None
 
     if found := file.visititems_links(visit):
@@ -146,9 +166,12 @@ def check_inside(file: h5py.File) -> None:
 
 
 def _check_packing(path: Path) -> None:
-    """Raise ValueError for a file that unpacks to more than PACKED times its size."""
     with zipfile.ZipFile(path) as archive:
-        size = sum(part.file_size for part in archive.infolist())
+        _check_claim(path, sum(part.file_size for part in archive.infolist()))
+
+
+def _check_claim(path: Path, size: int) -> None:
+    """Raise ValueError for a file that unpacks to more than PACKED times its size."""
     most = PACKED * path.stat().st_size + 2**24
     if size > most:
         raise ValueError(f"it unpacks to {size} bytes, more than the {most} believed")
@@ -161,6 +184,8 @@ def _sliced(group, offset: int) -> Iterator[tuple]:
     if missing:
         raise ValueError(f"no column {', '.join(missing)} among {', '.join(group.keys())}")
     t, x, y, p = (group[found[name]] for name in "txyp")
+    if any(column.ndim != 1 for column in (t, x, y, p)):
+        raise ValueError("columns must have one dimension")
     if not len(t) == len(x) == len(y) == len(p):
         raise ValueError(f"columns differ in length: {len(t)}, {len(x)}, {len(y)}, {len(p)}")
     for i in range(0, len(t), PIECE):

@@ -17,9 +17,10 @@ import numpy as np
 import yaml
 from jaxtyping import Float
 
+from src import plain
+
 Size = tuple[int, int]
 LARGEST_SIDE = 8192
-LARGEST_FILE = 1 << 20
 SEEN = 0.75  # the share of a view that has to lie on the sensor
 
 
@@ -191,16 +192,15 @@ def load(path: Path | str, sensor: Size | None = None) -> Views:
     a `mirrored` its homography contradicts, or another sensor than `sensor` (height, width).
     """
     try:
-        with open(path, encoding="utf-8") as file:
-            plain = yaml.safe_load(file.read(LARGEST_FILE))
+        content = plain.read(path)
         views = Views(
-            _numbers(plain["sensor"], int, 2),
-            _numbers(plain["model"], int, 2),
-            _numbers(plain["field"], float, 4),
-            tuple(_view(entry) for entry in plain["views"]),
+            _numbers(content["sensor"], int, 2),
+            _numbers(content["model"], int, 2),
+            _numbers(content["field"], float, 4),
+            tuple(_view(entry) for entry in content["views"]),
         )
-        told = [entry.get("mirrored") for entry in plain["views"]]
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError) as error:
+        told = [entry.get("mirrored") for entry in content["views"]]
+    except (OSError, yaml.YAMLError, KeyError, TypeError, OverflowError) as error:
         why = f"{type(error).__name__} {error}"
         raise ValueError(
             f"views must be a file of calibrate task=views, got {path}: {why}"

@@ -13,6 +13,7 @@ import yaml
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
+from src import plain
 from src.metrics import results
 
 FIGURES = ("chart", "machine", "adapt", "stress")  # of the doors chart and stress
@@ -79,7 +80,7 @@ def find(folders: list[Path]) -> list[Run]:
 def plans(folders: list[Path]) -> list[Plan]:
     """Return the sweeps whose `multirun.yaml` lies at or below `folders`."""
     files = {f.resolve() for folder in folders for f in folder.rglob("multirun.yaml")}
-    return [_plan(yaml.safe_load(file.read_text())["hydra"]) for file in sorted(files)]
+    return [_plan(plain.read(file)["hydra"]) for file in sorted(files)]
 
 
 def figures(folders: list[Path]) -> list[Path]:
@@ -107,7 +108,7 @@ def _read(file: Path) -> Run:
         record = json.loads(file.read_text())
         schema = record["schema"]
         settings = flat(results.content((file.parent / "config.yaml").read_text()))
-    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, yaml.YAMLError) as error:
         raise ValueError(f"run must hold whole results, got {file}: {error}") from error
     if schema != results.SCHEMA:
         raise ValueError(f"schema must be {results.SCHEMA}, got {schema} in {file}")

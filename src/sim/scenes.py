@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from src.sim import noise
+from src.sim.pictures import read_picture
 
 SPLITS = ("train", "val", "test")
 SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff"}
@@ -212,10 +213,10 @@ def photographs(root: str | None, split: str) -> list[Path]:
 @lru_cache(maxsize=512)
 def _read(path: Path) -> NDArray:
     """Return a photograph's luminance as uint8, at most LARGEST_SIDE long."""
-    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if picture is None or min(picture.shape) < 16:
+    picture = read_picture(path)
+    shrink = 1 if picture is None else min(1, LARGEST_SIDE / max(picture.shape))
+    if picture is None or shrink * min(picture.shape) < 16:
         raise ValueError(f"scene.root must hold readable photographs of 16 px or more, got {path}")
-    shrink = LARGEST_SIDE / max(picture.shape)
     if shrink < 1:
         picture = cv2.resize(picture, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
     return picture

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 from numpy.typing import NDArray
 
+from src.sim.pictures import read_picture
 from src.sim.scenes import SUFFIXES
 
 FILES = {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv"}
@@ -62,7 +63,7 @@ def _read_pictures(
     paths: list[Path], size: tuple[int, int] | None, first: int, stop: int
 ) -> Iterator[NDArray]:
     for path in paths[first:stop]:
-        picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        picture = read_picture(path)
         if picture is None:
             raise ValueError(f"scene.root must hold frames that can be read, got {path}")
         size = size or picture.shape

@@ -4,10 +4,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import cv2
+import faery
 import h5py
 import numpy as np
 import pytest
 import torch
+from faery.file_encoder import events_to_file
 from hypothesis import HealthCheck, given, settings
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -23,14 +25,12 @@ from tests.test_train import TINY, config
 
 
 def read_events(path: Path) -> None:
-    from src.recordings import formats
 
     formats.sensor_size(path)
     formats.read_events(path)
 
 
 def read_table(path: Path) -> None:
-    from src.recordings import formats
 
     formats.read_events(path)
     _ = formats.open_events(path).size
@@ -67,8 +67,14 @@ def read_film(path: Path) -> None:
             pass
 
 
+def read_whole_film(path: Path) -> None:
+    from src.recordings import sources
+
+    for _ in sources.film(path):
+        pass
+
+
 def read_network(path: Path) -> None:
-    from src.models import files
 
     files.load(path)
 
@@ -98,6 +104,12 @@ def evt2(path: Path) -> None:
     events(path, version="evt2")
 
 
+def unpacked(path: Path, compression: tuple | None = None) -> None:
+    listed = np.zeros(200, faery.EVENTS_DTYPE)
+    listed["t"] = np.arange(200)
+    events_to_file([listed], path, (640, 480), compression=compression, file_type="aedat")
+
+
 def picture(path: Path) -> None:
     ramp = np.add.outer(np.arange(40), np.arange(60)).astype(np.uint8)
     assert cv2.imwrite(str(path), ramp)
@@ -111,6 +123,12 @@ def film(path: Path) -> None:
     writer.release()
 
 
+def film_h5(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        frames = np.arange(6 * 16 * 24).reshape(6, 16, 24).astype(np.uint8)
+        file.create_dataset("frames", data=frames, chunks=(1, 16, 24), compression="gzip")
+
+
 def views(path: Path) -> None:
     Views.single((240, 320), (24, 32)).save(path)
 
@@ -120,7 +138,6 @@ def corners(path: Path) -> None:
 
 
 def network(path: Path) -> None:
-    from src.models import files
     from src.models.e2vid import E2VID
 
     spec = {"target": "src.models.e2vid.E2VID", "kwargs": {"views": 1, "base_channels": 2}}
@@ -149,6 +166,7 @@ FORMATS: dict[str, tuple[str, Callable, Callable]] = {
     "EVT2": (".raw", evt2, read_events),
     "DAT": (".dat", events, read_events),
     "AEDAT4": (".aedat4", events, read_events),
+    "AEDAT4 unpacked": (".aedat4", unpacked, read_events),
     "ES": (".es", events, read_events),
     "CSV": (".csv", events, read_table),
     "text": (".txt", events, read_table),
@@ -160,6 +178,7 @@ FORMATS: dict[str, tuple[str, Callable, Callable]] = {
     "BMP": (".bmp", picture, read_picture),
     "MP4": (".mp4", film, read_film),
     "AVI": (".avi", film, read_film),
+    "HDF5 film": (".h5", film_h5, read_whole_film),
     "views.yaml": (".yaml", views, read_views),
     "corners": (".yaml", corners, read_corners),
     "config.yaml": (".yaml", run_config, read_config),
@@ -195,44 +214,6 @@ def survive(name: str, folder: Path, count: int) -> None:
 @pytest.mark.parametrize("name", FORMATS)
 def test_broken_files_are_read_or_refused(name, tmp_path):
     survive(name, tmp_path, 100)
-
-
-def test_a_table_leads_to_no_other_file(tmp_path):
-    secret = tmp_path / "elsewhere" / "secret.h5"
-    secret.parent.mkdir()
-    events(secret)
-    (tmp_path / "bytes").write_bytes(bytes(64))
-    with h5py.File(tmp_path / "link.h5", "w") as file:
-        file["events"] = h5py.ExternalLink(str(secret), "/events")
-    with h5py.File(tmp_path / "external.h5", "w") as file:
-        for name in "txyp":
-            place = [(str(tmp_path / "bytes"), 0, 64)]
-            file.create_dataset(f"events/{name}", (8,), np.int64, external=place)
-    with h5py.File(tmp_path / "virtual.h5", "w") as file:
-        layout = h5py.VirtualLayout((200,), np.int64)
-        layout[:] = h5py.VirtualSource(str(secret), "events/t", (200,))
-        file.create_virtual_dataset("events/t", layout)
-    for name in ("link.h5", "external.h5", "virtual.h5"):
-        with pytest.raises(ValueError, match=f"{name}.*other file"):
-            formats.read_events(tmp_path / name, size=(640, 480))
-
-
-def test_a_small_file_unpacks_to_no_flood(tmp_path):
-    zeros = np.zeros(30_000_000, np.int64)
-    np.savez_compressed(tmp_path / "bomb.npz", t=zeros, x=zeros[:9], y=zeros[:9], p=zeros[:9])
-    with pytest.raises(ValueError, match="unpacks to"):
-        formats.read_events(tmp_path / "bomb.npz")
-
-
-def test_a_file_names_no_network_that_fills_the_memory(tmp_path):
-    spec = {"target": "src.models.e2vid.E2VID", "kwargs": {"views": 1, "base_channels": 4096}}
-    torch.save({"network": spec, "state_dict": {}}, tmp_path / "huge.ckpt")
-    with pytest.raises(ValueError, match="ckpt does not fit"):
-        files.load(tmp_path / "huge.ckpt")
-    spec["kwargs"]["base_channels"] = 10**9
-    torch.save({"network": spec, "state_dict": {}}, tmp_path / "vast.ckpt")
-    with pytest.raises(ValueError, match="sizes up to"):
-        files.load(tmp_path / "vast.ckpt")
 
 
 @pytest.mark.slow
