@@ -35,6 +35,7 @@ class MambaTM(nn.Module):
     """
 
     views = None  # it sees none
+    WINDOW, OVERLAP = 16, 4  # frames that are restored at a time; of them, shared with the next
 
     def __init__(
         self,
@@ -105,7 +106,11 @@ class MambaTM(nn.Module):
 
     @torch.no_grad()
     def restore(
-        self, frames: Float[Tensor, "n frames c h w"], *, window: int = 16, overlap: int = 4
+        self,
+        frames: Float[Tensor, "n frames c h w"],
+        *,
+        window: int = WINDOW,
+        overlap: int = OVERLAP,
     ) -> Float[Tensor, "n frames c h w"]:
         """Return a video of any length without turbulence, in [0, 1], window by window.
 

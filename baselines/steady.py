@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from src.metrics.temporal import displacement
+from src.metrics import temporal
 
 SPAN = 2.0  # frames, standard deviation of the window over which a path is taken for straight
 ERROR = 0.2  # pixels per axis, rms, to which a block's jitter is known
@@ -28,7 +28,7 @@ def jitter(frames: Float[Tensor, "n frames c h w"]) -> Float[Tensor, "n frames 2
 
 
 def _jitter(clip: Float[Tensor, "frames 1 h w"]) -> Float[Tensor, "frames 2 h w"]:
-    steps = _evened(*displacement(clip[1:], clip[:-1]))
+    steps = _evened(*temporal.displacement(clip[1:], clip[:-1]))
     path = functional.pad(steps.cumsum(0), (0, 0, 0, 0, 0, 0, 1, 0))
     shake = path - torch.einsum("ts,s...->t...", smoother(len(path)).to(path), path)
     power = shake.square().mean((0, 1))
@@ -67,19 +67,5 @@ def pull(
     frames: Float[Tensor, "n frames c h w"], shift: Float[Tensor, "n frames 2 h w"]
 ) -> Float[Tensor, "n frames c h w"]:
     """Return the frames with what lies `shift` (x, y), in pixels, from each pixel brought there."""
-    height, width = frames.shape[-2:]
-    y, x = torch.meshgrid(
-        torch.arange(height, device=shift.device),
-        torch.arange(width, device=shift.device),
-        indexing="ij",
-    )
-    place = torch.stack([x, y], -1) + shift.float().movedim(2, -1).flatten(0, 1)
-    size = torch.tensor([width, height], device=shift.device)
-    pulled = functional.grid_sample(
-        frames.float().flatten(0, 1),
-        (2 * place + 1) / size - 1,
-        mode="bicubic",
-        padding_mode="border",
-        align_corners=False,
-    )
-    return pulled.unflatten(0, frames.shape[:2])
+    flat = temporal.pull(frames.float().flatten(0, 1), shift.float().flatten(0, 1), "bicubic")
+    return flat.unflatten(0, frames.shape[:2])

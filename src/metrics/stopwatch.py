@@ -114,9 +114,10 @@ class Stopwatch:
             except (NotImplementedError, RuntimeError):  # it looks at values
                 self._macs[which] = macs_per_frame(candidate.network, side, side, **size)
             if candidate.restorer is not None:
-                frames = torch.zeros(1, timing.WINDOW, 1, SMALL, SMALL)
-                behind = macs(lambda: candidate.restorer.restore(frames))
-                self._macs[which] += behind // timing.FRESH * side**2 // SMALL**2
+                restorer = candidate.restorer
+                frames = torch.zeros(1, restorer.WINDOW, 1, SMALL, SMALL)
+                behind = macs(lambda: restorer.restore(frames)) * side**2 // SMALL**2
+                self._macs[which] += behind // (restorer.WINDOW - restorer.OVERLAP)
         return self._macs[which]
 
     def _timed(self, candidate: Candidate, known: dict[str, Any]) -> Speed:

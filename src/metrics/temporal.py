@@ -35,6 +35,19 @@ def displacement(
     return shift * (weight > 0)[:, None], weight
 
 
+def pull(
+    frames: Float[Tensor, "n c h w"], shift: Float[Tensor, "n 2 h w"], mode: str = "bilinear"
+) -> Float[Tensor, "n c h w"]:
+    """Return the frames with what lies `shift` (x, y), in pixels, from each pixel brought there."""
+    height, width = frames.shape[-2:]
+    y, x = torch.meshgrid(
+        torch.arange(height).to(frames), torch.arange(width).to(frames), indexing="ij"
+    )
+    place = [(2 * (x + shift[:, 0]) + 1) / width - 1, (2 * (y + shift[:, 1]) + 1) / height - 1]
+    grid = torch.stack(place, -1)
+    return functional.grid_sample(frames, grid, mode, padding_mode="border", align_corners=False)
+
+
 def residual(
     frames: Float[Tensor, "frames 1 h w"], target: Float[Tensor, "frames 1 h w"]
 ) -> Float[Tensor, " frames"]:
@@ -90,7 +103,8 @@ def _step(frames: Tensor, target: Tensor, shift: Tensor) -> Tensor:
     """Return the least-squares correction of `shift`."""
     x, y = _gradients(target)
     a, b, c = _structure(x, y)
-    difference = _matched(_pull(frames, shift), target) - target
+    smooth = functional.interpolate(shift, frames.shape[-2:], mode="bilinear")
+    difference = _matched(pull(frames, smooth), target) - target
     u, v = _blocks(torch.cat([x * difference, y * difference], dim=1)).unbind(1)
     determinant = (a * c - b * b).clamp(min=1e-12)
     return torch.stack([b * v - c * u, b * u - a * v], dim=1) / determinant[:, None]
@@ -111,19 +125,6 @@ def _gradients(pictures: Tensor) -> tuple[Tensor, Tensor]:
 
 def _blocks(maps: Tensor) -> Tensor:
     return functional.avg_pool2d(maps, min(BLOCK, *maps.shape[-2:]))
-
-
-def _pull(frames: Tensor, shift: Tensor) -> Tensor:
-    """Undo the shift of every block; between block centres it is interpolated."""
-    height, width = frames.shape[-2:]
-    smooth = functional.interpolate(shift, (height, width), mode="bilinear", align_corners=False)
-    y, x = torch.meshgrid(
-        torch.arange(height).to(frames), torch.arange(width).to(frames), indexing="ij"
-    )
-    grid = torch.stack(
-        [(2 * (x + smooth[:, 0]) + 1) / width - 1, (2 * (y + smooth[:, 1]) + 1) / height - 1], -1
-    )
-    return functional.grid_sample(frames, grid, padding_mode="border", align_corners=False)
 
 
 def _matched(frames: Tensor, target: Tensor) -> Tensor:

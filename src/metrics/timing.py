@@ -17,7 +17,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.weak import WeakIdKeyDictionary
 
 PEAK_SIDE, PEAK_CHANNELS = 176, 64  # of the convolution that shows what the machine can do
-WINDOW, FRESH = 16, 12  # frames a post-processor sees at once; those that the next window lacks
 JOULE_PER_MAC = 4.6e-12  # float32, 45 nm (Horowitz, ISSCC 2014): 3.7 pJ multiply, 0.9 pJ add
 
 
@@ -69,13 +68,13 @@ def frame(
 def restoration(restorer: nn.Module, side: int, *, count: int = 1, repeats: int = 2) -> float:
     """Return the ms that a post-processor takes for each frame of a long video of `side` pixels.
 
-    Its windows overlap: what two of them share is paid for twice.
+    Its windows of WINDOW frames overlap by OVERLAP: what two of them share is paid for twice.
     """
     clock = time.thread_time if count == 1 else time.perf_counter
-    frames = torch.rand(1, WINDOW, 1, side, side)
+    frames = torch.rand(1, restorer.WINDOW, 1, side, side)
     with threads(count):
         took = min(_timed(clock, lambda: restorer.restore(frames)) for _ in range(repeats))
-    return 1e3 * took / FRESH
+    return 1e3 * took / (restorer.WINDOW - restorer.OVERLAP)
 
 
 def _advance(network: nn.Module, voxels: Tensor, state: Any, frames: int) -> Any:
