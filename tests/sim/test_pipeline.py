@@ -70,6 +70,31 @@ def test_law_3_a_sample_does_not_depend_on_its_batch():
     assert together.drawn[0]["threshold"] != together.drawn[1]["threshold"]
 
 
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_cuda_gives_the_same_sample():
+    chain = pipeline(STRONG)
+    ours, theirs = simulate(chain, [5]), simulate(chain, [5], "cuda").to("cpu")
+    assert torch.equal(ours.target, theirs.target)
+    torch.testing.assert_close(ours.turbulent, theirs.turbulent, atol=1e-3, rtol=0)
+    assert moved(ours.voxels, theirs.voxels) < 0.01
+
+
+def test_light_that_differs_by_rounding_moves_few_events():
+    """What two devices may differ by: a hundred times what their light does."""
+    chain = pipeline(STRONG)
+    draw = chain.draw(5)
+    views = chain.views(draw)
+    rounding = 1e-5 * (2 * torch.rand(views.shape, generator=torch.Generator().manual_seed(0)) - 1)
+    ours, theirs = chain.expose(draw, views), chain.expose(draw, views + rounding)
+    assert 0 < moved(ours.voxels, theirs.voxels) < 0.001
+
+
+def moved(ours: torch.Tensor, theirs: torch.Tensor) -> float:
+    """Return the share of events that are elsewhere, in place or in time."""
+    return float((ours - theirs).abs().sum() / ours.abs().sum())
+
+
 def test_law_5_a_crop_is_the_crop_of_the_whole_away_from_the_border():
     sensor = {"threshold": 0.3, "shot_hz": 20.0, "mismatch": 0.1}
     whole = simulate(pipeline(STRONG, sensor, scene=Waves(side=96)), [2])
