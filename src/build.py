@@ -24,7 +24,7 @@ from src.metrics.scores import Scores
 from src.models.reconstructor import Reconstructor
 from src.models.unroll import takes
 from src.sim.pipeline import Pipeline
-from src.sim.scenes import MixedRates
+from src.sim.scenes import MixedRates, Stopping
 
 ROOMS = (
     "src.", "baselines.", "torch.optim.", "lightning.pytorch.trainer.",
@@ -90,9 +90,10 @@ def pipeline(cfg: DictConfig, split: str) -> Pipeline:
         )
         for rate in rates
     ]
+    scene = MixedRates(scenes) if len(scenes) > 1 else scenes[0]
     try:
         return Pipeline(
-            MixedRates(scenes) if len(scenes) > 1 else scenes[0],
+            Stopping(scene, cfg.data.stop) if training and cfg.data.stop else scene,
             make(cfg.optics),
             OmegaConf.to_container(cfg.turbulence, resolve=True),
             OmegaConf.to_container(cfg.sensor, resolve=True),
