@@ -217,7 +217,7 @@ def read_corners(path: Path | str) -> dict[Position, Points]:
     Raises ValueError for anything else.
     """
     try:
-        return {_place(entry): np.array(entry["corners"], float) for entry in plain.read(path)}
+        return dict(map(_corners, plain.read(path)))
     except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, OverflowError) as error:
         why = f"{type(error).__name__} {error}"
         raise ValueError(
@@ -225,6 +225,7 @@ def read_corners(path: Path | str) -> dict[Position, Points]:
         ) from None
 
 
-def _place(entry: dict) -> Position:
+def _corners(entry: dict) -> tuple[Position, Points]:
     row, column = entry["position"]
-    return int(row), int(column)
+    corners = [(float(x), float(y)) for x, y in entry["corners"]]
+    return (int(row), int(column)), np.array(corners).reshape(-1, 2)
