@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from src.recordings import formats, tables
 from src.recordings.views import Size
-from src.sim.pictures import LARGEST_PIXELS, read_picture
+from src.sim.pictures import LARGEST_PIXELS, open_video, read_picture
 
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 FILMS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".gif")
@@ -88,8 +88,8 @@ def _frames(path: Path) -> Iterator[np.ndarray]:
         for frame in _video_h5(path):
             yield frame.astype(np.float32) / 255
     else:
-        file = cv2.VideoCapture(str(path))
-        while (read := file.read())[0]:
+        video = open_video(path, "recording")
+        while (read := video.read())[0]:
             yield cv2.cvtColor(read[1], cv2.COLOR_BGR2GRAY).astype(np.float32) / 255
 
 

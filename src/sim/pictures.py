@@ -1,5 +1,6 @@
-"""Picture files, read by OpenCV."""
+"""Picture and video files, read by OpenCV."""
 
+import math
 import os
 from pathlib import Path
 
@@ -17,3 +18,19 @@ def read_picture(path: Path, flags: int = cv2.IMREAD_GRAYSCALE) -> NDArray | Non
         return cv2.imread(str(path), flags)
     except cv2.error:
         return None
+
+
+def open_video(path: Path, key: str) -> cv2.VideoCapture:
+    """Return a video to read from.
+
+    Raises ValueError, which names `key`, for a file that is none or has frames of more than
+    LARGEST_PIXELS.
+    """
+    video = cv2.VideoCapture(str(path))
+    size = video.get(cv2.CAP_PROP_FRAME_WIDTH), video.get(cv2.CAP_PROP_FRAME_HEIGHT)
+    if not (video.isOpened() and math.prod(size) <= LARGEST_PIXELS):
+        raise ValueError(
+            f"{key} must be a video that OpenCV can read, with frames of at most {LARGEST_PIXELS} "
+            f"pixels, got {path}"
+        )
+    return video

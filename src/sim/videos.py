@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 from numpy.typing import NDArray
 
-from src.sim.pictures import read_picture
+from src.sim.pictures import open_video, read_picture
 from src.sim.scenes import SUFFIXES
 
 FILES = {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv"}
@@ -51,11 +51,11 @@ def _folder(path: Path) -> list[Source]:
 
 
 def _file(path: Path) -> Source:
-    video = cv2.VideoCapture(str(path))
-    count = int(video.get(cv2.CAP_PROP_FRAME_COUNT)) if video.isOpened() else 0
+    video = open_video(path, "scene.root")
+    count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
     video.release()
     if count < 2:
-        raise ValueError(f"scene.root must be a video that OpenCV can read, got {path}")
+        raise ValueError(f"scene.root must be a video of two frames or more, got {path}")
     return Source(path.stem, count, partial(_read_file, path))
 
 
@@ -77,7 +77,7 @@ def _read_pictures(
 
 
 def _read_file(path: Path, first: int, stop: int) -> Iterator[NDArray]:
-    video = cv2.VideoCapture(str(path))
+    video = open_video(path, "scene.root")
     video.set(cv2.CAP_PROP_POS_FRAMES, first)
     for number in range(first, stop):
         there, picture = video.read()

@@ -20,10 +20,10 @@ from baselines.firenet import FireNet
 from src import plain
 from src.models import files
 from src.recordings import aedat, alignment, formats, sources, tables, views
-from src.sim import scenes
+from src.sim import pictures, scenes, videos
 from src.sim.pictures import LARGEST_PIXELS
 from src.simulate import alike
-from tests.faults.test_inputs import network, unpacked
+from tests.faults.test_inputs import film, network, unpacked
 from tests.recordings.test_formats import made_up
 
 GOOD = (
@@ -185,6 +185,16 @@ def test_a_picture_does_not_unpack_without_bound(tmp_path):
 
 
 GROWING = "a: &a [x, x]\nb: &b [*a, *a]\nc: &c [*b, *b]\n"
+
+
+def test_a_video_does_not_unpack_without_bound(tmp_path, monkeypatch):
+    path = tmp_path / "a.avi"
+    film(path)
+    monkeypatch.setattr(pictures, "LARGEST_PIXELS", 64 * 48 - 1)
+    with pytest.raises(ValueError, match="recording must be a video"):
+        next(sources.film(path))
+    with pytest.raises(ValueError, match=r"scene\.root must be a video"):
+        videos.sources(path)
 
 
 @pytest.mark.parametrize(
