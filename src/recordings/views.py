@@ -6,6 +6,7 @@ model picture.  Sizes are (height, width).  Pixel (0, 0) is the centre of the to
 right, y down.
 """
 
+import math
 import os
 import tempfile
 from collections.abc import Sequence
@@ -21,6 +22,7 @@ from src import plain
 
 Size = tuple[int, int]
 LARGEST_SIDE = 8192
+MOST_PIXELS = 2**24  # of a sensor, and of all views' pictures together
 SEEN = 0.75  # the share of a view that has to lie on the sensor
 
 
@@ -63,9 +65,16 @@ class Views:
     views: tuple[View, ...]
 
     def __post_init__(self):
-        for name, size in (("sensor", self.sensor), ("model", self.model)):
+        for name, size, count in (
+            ("sensor", self.sensor, 1),
+            ("model", self.model, len(self.views)),
+        ):
             if not all(1 <= side <= LARGEST_SIDE for side in size):
                 raise ValueError(f"views.{name} must be in 1..{LARGEST_SIDE} pixels, got {size}")
+            if count * math.prod(size) > MOST_PIXELS:
+                raise ValueError(
+                    f"views.{name} must have {MOST_PIXELS} pixels at most, got {count} x {size}"
+                )
         left, top, right, bottom = self.field
         if not (np.isfinite(self.field).all() and right - left >= 1 and bottom - top >= 1):
             raise ValueError(f"views.field must be left, top, right, bottom, got {self.field}")

@@ -222,6 +222,14 @@ def test_a_config_does_not_grow_without_bound(tmp_path, text, words):
             read(tmp_path / "a.yaml")
 
 
+@pytest.mark.parametrize(
+    ("sensor", "model"), [((8192, 8192), (9, 9)), ((99, 99), (8192, 8192)), ((99, 9999), (9, 9))]
+)
+def test_views_have_pictures_of_bounded_size(sensor, model):
+    with pytest.raises(ValueError, match=r"views\.(sensor|model) must"):
+        views.Views.single(sensor, model)
+
+
 def test_a_checkpoint_packs_nothing(tmp_path):
     network(tmp_path / "a.ckpt")
     with zipfile.ZipFile(tmp_path / "a.ckpt") as archive:
