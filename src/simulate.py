@@ -52,9 +52,9 @@ def alike(cfg: DictConfig) -> DictConfig:
     Raises ValueError for a file that is no such config.
     """
     try:
-        other = OmegaConf.create(plain.read(cfg.like))
+        other = OmegaConf.create(dict(plain.read(cfg.like)))
         parts = {name: other[name] for name in SAME}
-    except (OSError, YAMLError, KeyError, TypeError, OmegaConfBaseException):
+    except (OSError, YAMLError, KeyError, TypeError, ValueError, OmegaConfBaseException):
         raise ValueError(f"like must be the config.yaml of a run, got {cfg.like}") from None
     found = cfg.copy()
     for name, part in parts.items():
