@@ -3,8 +3,9 @@
 `hydra.utils.instantiate` is called here only, so that what a config may name is decided here.
 """
 
+import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -39,6 +40,8 @@ def make(node: Any, **kwargs) -> Any:
     A ValueError of the object itself comes through as it is, not wrapped by Hydra.
     """
     plain = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
+    if not isinstance(plain, dict) or "_target_" not in plain:
+        raise ValueError(f"a part of the config must name its class (_target_), got {plain}")
     for target in _targets(plain):
         _check(target)
     try:
@@ -77,9 +80,9 @@ def _check(target: str) -> None:
 def pipeline(cfg: DictConfig, split: str) -> Pipeline:
     """Return the simulation of one split: train, val or test."""
     training = split == "train"
-    windows = cfg.data.windows if training else cfg.data.test_windows
-    substeps = cfg.data.substeps
-    rates = cfg.data.rates if training and cfg.data.rates else [cfg.fps]
+    windows = _count(cfg, "data.windows" if training else "data.test_windows")
+    substeps = _count(cfg, "data.substeps")
+    rates = _rates(cfg, training)
     scenes = [
         make(
             cfg.scene,
@@ -107,6 +110,22 @@ def pipeline(cfg: DictConfig, split: str) -> Pipeline:
         )
     except TypeError as error:
         raise ValueError(f"turbulence or sensor takes no such values: {error}") from error
+
+
+def _count(cfg: DictConfig, key: str) -> int:
+    value = OmegaConf.select(cfg, key)
+    if type(value) is not int or value < 1:
+        raise ValueError(f"{key} must be a whole number >= 1, got {value}")
+    return value
+
+
+def _rates(cfg: DictConfig, training: bool) -> list[float]:
+    key = "data.rates" if training and cfg.data.rates else "fps"
+    found = OmegaConf.select(cfg, key)
+    rates = list(found) if isinstance(found, Sequence) else [found]
+    if not rates or not all(isinstance(r, int | float) and 0 < r < math.inf for r in rates):
+        raise ValueError(f"{key} must be > 0 windows a second, got {found}")
+    return rates
 
 
 def data(cfg: DictConfig, splits: tuple[str, ...] = ("train", "val", "test")) -> LightFieldData:

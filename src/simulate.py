@@ -13,7 +13,8 @@ from src.figures import samples
 from src.metrics import results
 from src.recordings import capture
 
-SAME = ("scene", "optics", "turbulence", "sensor", "data", "seed", "fps", "bins")
+SECTIONS = ("scene", "optics", "turbulence", "sensor", "data")
+SAME = (*SECTIONS, "seed", "fps", "bins")  # what makes a clip
 
 
 def simulate(cfg: DictConfig) -> dict:
@@ -54,6 +55,8 @@ def alike(cfg: DictConfig) -> DictConfig:
     try:
         other = OmegaConf.create(dict(plain.read(cfg.like)))
         parts = {name: other[name] for name in SAME}
+        if not all(isinstance(parts[name], DictConfig) for name in SECTIONS):
+            raise TypeError("a section must be a mapping")
     except (OSError, YAMLError, KeyError, TypeError, ValueError, OmegaConfBaseException):
         raise ValueError(f"like must be the config.yaml of a run, got {cfg.like}") from None
     found = cfg.copy()

@@ -1,6 +1,9 @@
 """A config from elsewhere builds classes of this house and runs nothing else."""
 
+import math
 import sys
+from collections.abc import Iterator
+from itertools import product
 
 import pytest
 import yaml
@@ -9,6 +12,8 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from src import build
+from src.simulate import SAME
+from tests.faults.test_inputs import read_config, run_config
 
 FOREIGN = [
     "os.system",
@@ -60,3 +65,37 @@ def test_no_name_leads_out_of_the_rooms(prefix, name):
 def test_yaml_builds_plain_values_only():
     with pytest.raises(yaml.YAMLError):
         OmegaConf.create("a: !!python/object/apply:os.getcwd []")
+
+
+WRONG = [None, -1, 0, 3, 10**30, 1e308, math.nan, math.inf, True, "x", "${x}", [], [1], [0.5, 0.1]]
+WRONG += [["x"], {}, {"a": 1}]
+
+
+def places(section: dict) -> Iterator[tuple[dict, str]]:
+    """Yield (mapping, key) of every value in nested mappings."""
+    for key, value in section.items():
+        yield section, key
+        if isinstance(value, dict):
+            yield from places(value)
+
+
+@pytest.mark.parametrize("every", [17, pytest.param(1, marks=pytest.mark.slow)])
+def test_wrong_values_are_refused_by_name(every, tmp_path):
+    run_config(tmp_path / "whole.yaml")
+    whole = yaml.safe_load((tmp_path / "whole.yaml").read_text())
+    part = {name: whole[name] for name in SAME}
+    tried = refused = 0
+    for number, ((mapping, key), wrong) in enumerate(product(list(places(part)), WRONG)):
+        if number % every:
+            continue
+        right, mapping[key] = mapping[key], wrong
+        (tmp_path / "wrong.yaml").write_text(yaml.safe_dump(part))
+        mapping[key] = right
+        tried += 1
+        try:
+            read_config(tmp_path / "wrong.yaml")
+        except ValueError as error:
+            assert str(error), (key, wrong)
+            refused += 1
+    print(f"config values: {tried} wrong ones tried, {refused} refused, 0 crashes")
+    assert tried > 1000 / every and refused > tried / 4
