@@ -12,6 +12,7 @@ from torch import nn
 
 from src import build, door
 from src.metrics import results
+from src.models.fast import running
 from src.recordings import lookup, output, progress, sources, stream
 from src.recordings.views import Views, load
 
@@ -21,11 +22,11 @@ def reconstruct(cfg: DictConfig) -> Path:
 
     Raises ValueError for a recording, views, network or window that do not go together.
     """
-    run, net = Path(cfg.paths.run), build.chosen(cfg).to(cfg.device)
-    views = views_for(cfg, net)
+    run, net = Path(cfg.paths.run), build.chosen(cfg)
+    fast, views, span = running(net, cfg.form), views_for(cfg, net), overlap(cfg, net)
     results.open_run(run, door.resolved(cfg))
     with output.sink(cfg.output, run, views.model, cfg.playback) as write:
-        for frame in progress.tell(frames(cfg, net, views), overlap(cfg, net)):
+        for frame in progress.tell(frames(cfg, fast, views, span), span):
             write(frame)
     return run
 
@@ -46,12 +47,12 @@ def overlap(cfg: DictConfig, net: nn.Module) -> int:
     return stream.overlap(cfg.span or stream.default_span(net), cfg.fps)
 
 
-def frames(cfg: DictConfig, net: nn.Module, views: Views) -> Iterator[stream.Frame]:
-    """Read, cut into windows and reconstruct, a chunk of the recording at a time."""
+def frames(cfg: DictConfig, net: nn.Module, views: Views, span: int) -> Iterator[stream.Frame]:
+    """Read, cut into windows that span `span` frames, and reconstruct, chunk by chunk."""
     rule = stream.Rule(
         fps=None if cfg.count else cfg.fps,
         count=cfg.count,
-        overlap=overlap(cfg, net),
+        overlap=span,
         bins=cfg.bins,
         splat=cfg.splat,
         unit=cfg.unit,
@@ -60,9 +61,8 @@ def frames(cfg: DictConfig, net: nn.Module, views: Views) -> Iterator[stream.Fra
     )
     chunks = sources.events(cfg.recording, views.sensor, cfg.chunk_s)
     windows = stream.windows(chunks, lookup.build(views), rule)
-    return stream.frames(
-        windows, net, overlap=rule.overlap, positions=views.positions, device=cfg.device
-    )
+    net = net.to(cfg.device)
+    return stream.frames(windows, net, overlap=span, positions=views.positions, device=cfg.device)
 
 
 @hydra.main(version_base=None, config_path="../conf", config_name="reconstruct")

@@ -82,6 +82,16 @@ def test_reconstructing_gives_a_picture_and_a_time_per_window(folder, found, ext
         assert len(list(csv.DictReader(file))) == len(frames)
 
 
+def test_a_faster_form_gives_nearly_the_same_frames(folder, found, tmp_path):
+    chosen = [f"recording={folder}/dot.raw", f"views={found}", "ckpt=setnet_small", "output=hdf5"]
+    shown = []
+    for form in ("float32", "bf16"):
+        reconstruct(config("reconstruct", tmp_path / form, *chosen, f"form={form}"))
+        with h5py.File(tmp_path / form / "video.h5") as file:
+            shown.append(file["frames"][:].astype(float) / 255)
+    assert 0 < np.abs(shown[0] - shown[1]).mean() < 0.02
+
+
 def test_the_reconstructed_dot_moves_as_the_true_one(folder, found, tmp_path):
     chosen = [f"recording={folder}/dot.raw", f"views={found}", HIGHPASS, "output=hdf5", "fps=300"]
     run = reconstruct(config("reconstruct", tmp_path / "run", *chosen))
@@ -106,6 +116,8 @@ def test_without_views_the_sensor_is_one_view(folder, tmp_path):
         ("fps=-1", "fps must be"),
         ("output=avi", "output must be one of"),
         ("splat=hat", "splat must be"),
+        ("form=half", "form must be one of"),
+        ("form=bf16", "form must be float32 for a network without parameters"),
         ("start=3.0 end=2.0", "start must be"),
         ("ckpt=null", "must name a network"),
     ],

@@ -12,7 +12,8 @@ from torch import nn
 from src.metrics.lineup import Candidate, Subject
 from src.metrics.pareto import knee
 from src.metrics.scores import Scores
-from src.metrics.stopwatch import FORMS, Speed, rounded
+from src.metrics.stopwatch import FORMS, Speed
+from src.models.fast import running
 from src.sim.pipeline import Pipeline, simulate
 
 SEVERITIES = ("weak", "medium", "strong", "mixed")
@@ -81,7 +82,7 @@ def _subjects(
         found.append(("float32", Subject(name, network, views), candidate.restorer))
         learned = any(True for _ in network.parameters())
         if "bf16" in forms and learned and candidate.restorer is None:
-            found.append(("bf16", Subject(name, rounded(network), views), None))
+            found.append(("bf16", Subject(name, running(network, "bf16"), views), None))
     return found
 
 

@@ -1,5 +1,7 @@
-"""A network made for running only: bf16, channels-last, folded, idle when nothing happens."""
+"""A network made for running only: bf16, channels-last, folded, compiled, idle without events."""
 
+import os
+import shutil
 from collections.abc import Sequence
 from copy import deepcopy
 from typing import Any
@@ -13,24 +15,51 @@ from src.models.files import fold
 from src.models.setnet import SetNet
 from src.models.unroll import takes
 
+FORMS = ("float32", "bf16", "compiled")
+
+
+def running(network: nn.Module, form: str, *, skip_empty: bool = False) -> nn.Module:
+    """Return `network` in a form to run it in: `float32`, as it is; `bf16`, a Fast one; `compiled`,
+    that one compiled.  Raises ValueError, naming `form`, for another or where it cannot be made.
+    """
+    if form not in FORMS:
+        raise ValueError(f"form must be one of {', '.join(FORMS)}, got {form}")
+    if form == "float32":
+        return network
+    if not any(True for _ in network.parameters()):
+        raise ValueError(f"form must be float32 for a network without parameters, got {form}")
+    return Fast(network, skip_empty=skip_empty, compiled=form == "compiled")
+
 
 class Fast(nn.Module):
     """`network`, copied, with weights and maps of `dtype` and laid out channels-last.
 
-    `skip_empty`: a window without any event gives the last frame again and leaves the state.  Which
-    views and what else it takes are those of `network`; frames are float32.
+    `skip_empty`: a window without any event gives the last frame again and leaves the state.
+    `compiled`: torch.compile makes one pass of what lies between two convolutions, which takes a
+    C++ compiler, half a minute at the first windows of every size, and as many threads as torch has
+    then.  Which views and what else it takes are those of `network`; frames are float32.
     """
 
     def __init__(
-        self, network: nn.Module, *, dtype: torch.dtype = torch.bfloat16, skip_empty: bool = True
+        self,
+        network: nn.Module,
+        *,
+        dtype: torch.dtype = torch.bfloat16,
+        skip_empty: bool = True,
+        compiled: bool = False,
     ):
         super().__init__()
+        if compiled and not shutil.which(os.environ.get("CXX", "g++")):
+            raise ValueError("form=compiled needs a C++ compiler: g++ or what CXX names")
         self.inner = plain(network).to(dtype=dtype, memory_format=torch.channels_last)
         self.views, self.dtype, self.skip_empty = network.views, dtype, skip_empty
         # SetNet adds its events up in float32 and rounds where it convolves.
         self.rounds_itself = isinstance(network, SetNet)
         if self.rounds_itself:
             self.inner.frozen = {}
+        self.compiled = compiled
+        if compiled:
+            self.inner.compile(dynamic=False)
         self.told = [name for name in ("window_s", "positions") if takes(network, name)]
 
     @torch.no_grad()
@@ -45,6 +74,8 @@ class Fast(nn.Module):
         """Return the frame and the state (the network's own, last frame)."""
         if self.skip_empty and state is not None and _silent(voxels):
             return state[1], state
+        if self.compiled:  # a number would be compiled into the code
+            window_s = torch.as_tensor(window_s, dtype=torch.float32)
         facts = {"window_s": window_s, "positions": positions}
         told = {name: facts[name] for name in self.told}
         own = None if state is None else state[0]

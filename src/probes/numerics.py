@@ -12,7 +12,7 @@ from torch import Tensor
 
 from src.metrics.image import aligned_psnr
 from src.metrics.lineup import Subject
-from src.models.fast import Fast
+from src.models.fast import running
 from src.models.unroll import takes
 from src.probes.bench import Bench, Finding
 from src.probes.stream import Stream
@@ -110,7 +110,7 @@ class Bf16:
             raise ValueError("it has no parameters to round")
         stream = bench.streams()[0]
         exact = self._scores(subject, stream)
-        half = Fast(subject.network, skip_empty=False)
+        half = running(subject.network, "bf16")
         rounded = self._scores(Subject(subject.name, half, subject.views), stream)
         gaps = (exact - rounded).view(4, -1).mean(1).abs().tolist()
         quarter = self.windows // 4

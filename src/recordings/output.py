@@ -21,6 +21,7 @@ from PIL import GifImagePlugin, Image
 from src.recordings.stream import Frame
 
 LEAST_FREE_BYTES = 32 * 2**20
+CACHE_BYTES = 2**20  # of HDF5, for each of its datasets
 Picture = UInt8[np.ndarray, "h w"]
 Add = Callable[[Picture, Frame], None]
 
@@ -141,7 +142,7 @@ def _png(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
 
 @contextmanager
 def _hdf5(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
-    with h5py.File(path, "w") as file:
+    with h5py.File(path, "w", rdcc_nbytes=CACHE_BYTES) as file:
         frames = file.create_dataset(
             "frames",
             (0, *size),

@@ -1,5 +1,9 @@
 """ONNX with explicit state, and the running form: the same frames as the network itself."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -7,9 +11,10 @@ from baselines.firenet import FireNet
 from baselines.highpass import HighPass
 from src.models.e2vid import E2VID
 from src.models.export import OnnxNetwork, export
-from src.models.fast import Fast
+from src.models.fast import Fast, running
 from src.models.setnet import SetNet
 
+ROOT = Path(__file__).resolve().parents[2]
 NETWORKS = {
     "e2vid": lambda: E2VID(views=9, base_channels=4, spectral_norm=True),
     "setnet": lambda: SetNet(stem=4, channels=8),
@@ -52,6 +57,44 @@ def test_the_running_form_is_as_accurate_as_its_type(name):
     assert torch.allclose(frames(Fast(network, dtype=torch.float32), noise()), plain, atol=1e-5)
     rounded = frames(Fast(network), noise())
     assert rounded.dtype == torch.float32 and (rounded - plain).abs().mean() < 0.02
+
+
+def compiled_gap(name: str) -> float:
+    network = NETWORKS[name]().eval()
+    forms = [frames(running(network, form), noise()) for form in ("bf16", "compiled")]
+    return float((forms[0] - forms[1]).abs().max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NETWORKS)
+def test_the_compiled_form_gives_the_frames_of_bf16(name):
+    """In a process of its own, where annotations are not checked: the checks do not compile."""
+    code = f"from tests.models.test_export import compiled_gap; print(compiled_gap({name!r}))"
+    line = [sys.executable, "-c", code]
+    found = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert float(found.stdout) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("form", "network", "words"),
+    [
+        ("float16", E2VID(views=9, base_channels=4), "form must be one of float32, bf16, compiled"),
+        (
+            "bf16",
+            HighPass(source="median"),
+            "form must be float32 for a network without parameters",
+        ),
+    ],
+)
+def test_a_form_that_is_none_is_named(form, network, words):
+    with pytest.raises(ValueError, match=words):
+        running(network, form)
+
+
+def test_without_a_compiler_nothing_is_compiled(monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    with pytest.raises(ValueError, match="form=compiled needs a C.. compiler"):
+        running(E2VID(views=9, base_channels=4), "compiled")
 
 
 def test_what_onnx_cannot_express_is_said(tmp_path):
