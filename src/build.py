@@ -25,7 +25,7 @@ from src.metrics.scores import Scores
 from src.models.reconstructor import Reconstructor
 from src.models.unroll import takes
 from src.sim.pipeline import Pipeline
-from src.sim.scenes import MixedRates, Stopping
+from src.sim.scenes import MixedRates
 
 ROOMS = (
     "src.", "baselines.", "torch.optim.", "lightning.pytorch.trainer.",
@@ -93,10 +93,9 @@ def pipeline(cfg: DictConfig, split: str) -> Pipeline:
         )
         for rate in rates
     ]
-    scene = MixedRates(scenes) if len(scenes) > 1 else scenes[0]
     try:
         return Pipeline(
-            Stopping(scene, cfg.data.stop) if training and cfg.data.stop else scene,
+            MixedRates(scenes) if len(scenes) > 1 else scenes[0],
             make(cfg.optics),
             OmegaConf.to_container(cfg.turbulence, resolve=True),
             OmegaConf.to_container(cfg.sensor, resolve=True),

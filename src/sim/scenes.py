@@ -8,7 +8,7 @@ footage.py.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -180,28 +180,6 @@ class MixedRates:
         """Return clip `index` of the scene drawn for it."""
         draw = float(noise.uniform(noise.key("rate"), torch.tensor(index)))
         return self.scenes[int(draw * len(self.scenes))].clip(index)
-
-
-class Stopping:
-    """A scene of which a `share` of the clips comes to stand, at a moment drawn by its number: the
-    rest of it, a third of them from the start, shows turbulence alone.
-    """
-
-    def __init__(self, scene, share: float):
-        if not 0 <= share <= 1:
-            raise ValueError(f"data.stop must be in [0, 1], got {share}")
-        self.scene, self.share = scene, share
-
-    def clip(self, index: int) -> Clip:
-        """Return clip `index` of the scene; of one that stands, the frame shown last goes on."""
-        clip = self.scene.clip(index)
-        draw, moment = noise.uniform(noise.key("stop", index), torch.arange(2)).tolist()
-        if draw >= self.share:
-            return clip
-        last = max(0, int((1.5 * moment - 0.5) * len(clip.frames)))
-        shown = torch.arange(len(clip.frames)).clamp(max=last)
-        truth = None if clip.truth is None else clip.truth[shown]
-        return replace(clip, frames=clip.frames[shown], truth=truth)
 
 
 def check_frames(height: int, width: int, frames: int, fps: float) -> None:

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from src.sim.scenes import EMBEDDED, MixedRates, Photographs, Stopping, photographs
-from src.sim.targets import Targets
+from src.sim.scenes import EMBEDDED, MixedRates, Photographs, photographs
 
 
 def test_a_clip_is_a_function_of_seed_split_and_index():
@@ -96,28 +95,3 @@ def test_mixed_rates_draw_the_rate_of_a_clip_from_its_number():
     mixed = MixedRates(scenes)
     rates = [mixed.clip(index).fps for index in range(12)]
     assert set(rates) == {60.0, 600.0} and rates == [mixed.clip(i).fps for i in range(12)]
-
-
-def test_a_share_of_the_clips_comes_to_stand():
-    moving = Photographs(split="test", height=32, width=32, frames=9, seed=3)
-    some = Stopping(moving, 0.5)
-    stood = []
-    for index in range(40):
-        frames, original = some.clip(index).frames, moving.clip(index).frames
-        last = max(k for k in range(9) if torch.equal(frames[k], original[k]))
-        assert torch.equal(frames[: last + 1], original[: last + 1])
-        assert all(torch.equal(frame, original[last]) for frame in frames[last:])
-        stood.append(last)
-    assert 8 < sum(last < 8 for last in stood) < 28  # 18 +- 6: some stop at the last frame
-    assert stood.count(0) >= 2 and len(set(stood)) > 4
-    with pytest.raises(ValueError, match=r"data\.stop must be in \[0, 1\]"):
-        Stopping(moving, 1.5)
-
-
-def test_a_target_that_stands_has_a_path_that_does():
-    target = Targets(frames=9, height=32, width=32, kinds=["rotating_dot"])
-    clips = [Stopping(target, 1.0).clip(index) for index in range(6)]
-    for clip in clips:
-        moved = (clip.frames[1:] != clip.frames[:-1]).flatten(1).any(1)
-        assert torch.equal(moved, (clip.truth[1:] != clip.truth[:-1]).any(1))
-    assert any(not (clip.truth[1:] != clip.truth[:-1]).any() for clip in clips)
