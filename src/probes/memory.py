@@ -131,19 +131,24 @@ class Shock:
 class Still:
     """Wobble of a still scene's picture as a share, in %, of what the air does to one view.
 
-    Fails where it would be calmer to look at the scene through one view.
+    `moves`: the share of the clip in which the scene moves before it stands; at 0 its events are
+    all turbulence.  Fails where it would be calmer to look at the scene through one view.
     """
 
     limit: float = 100.0
+    moves: float = 0.0
 
     def __call__(self, subject: Subject, bench: Bench) -> Finding:
         """Return the share; the change of block positions is that of `metrics.temporal.wobble`."""
         shares = []
-        for stream in bench.streams(Conditions(still=True)):
+        for stream in bench.streams(Conditions(moves=self.moves)):
             frames, _ = subject.play(stream.windows(stream.fps), stream.positions, 1 / stream.fps)
             truth = stream.target[1:, None]
-            through = wobble(stream.turbulent[1:, None].clone(), truth)[bench.warmup :].mean()
-            ours = wobble(frames, truth)[bench.warmup :].mean()
+            since = int(self.moves * len(truth)) + bench.warmup
+            if since > len(truth) - 2:
+                raise ValueError(f"data.test_windows must be > {since + 1}, got {len(truth)}")
+            through = wobble(stream.turbulent[1:, None].clone(), truth)[since:].mean()
+            ours = wobble(frames, truth)[since:].mean()
             shares.append(100 * float(ours / through.clamp(min=1e-9)))
         return Finding(sum(shares) / len(shares), "%", self.limit)
 

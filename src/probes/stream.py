@@ -28,14 +28,15 @@ GAIN_MEMORY = 0.9  # of a view's gain from frame to frame
 class Conditions:
     """How a clip differs from the standard one.
 
-    `d_over_r0`: strength of the turbulence, 0 for none (None: as drawn).  `still`: the scene does
-    not move.  `gain`: standard deviation of a view's brightness, flickering frame by frame.
+    `d_over_r0`: strength of the turbulence, 0 for none (None: as drawn).  `moves`: the share
+    of the clip after which the scene stands.  `gain`: standard deviation of a view's brightness,
+    flickering frame by frame.
     `turbulence`, `sensor`: arguments of Turbulence and EventSensor that are replaced.  `course`:
     instead of one strength, those of equal parts of the clip, in the same moving air.
     """
 
     d_over_r0: float | None = None
-    still: bool = False
+    moves: float = 1.0
     gain: float = 0.0
     turbulence: Mapping[str, Any] = field(default_factory=dict)
     sensor: Mapping[str, Any] = field(default_factory=dict)
@@ -136,9 +137,10 @@ def _course(pipeline: Pipeline, draw: Draw, strengths: Sequence[float]) -> Tenso
 
 
 def _changed(draw: Draw, conditions: Conditions) -> Draw:
-    if conditions.still:
-        frames = draw.clip.frames[:1].expand(len(draw.clip.frames), -1, -1)
-        draw = replace(draw, clip=replace(draw.clip, frames=frames))
+    if conditions.moves < 1:
+        last = int(conditions.moves * (len(draw.clip.frames) - 1))
+        shown = torch.arange(len(draw.clip.frames)).clamp(max=last)
+        draw = replace(draw, clip=replace(draw.clip, frames=draw.clip.frames[shown]))
     if conditions.d_over_r0 is not None:
         changed = strengthened(draw.atmosphere, conditions.d_over_r0)
         draw = replace(draw, atmosphere=changed)

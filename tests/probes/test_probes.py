@@ -1,5 +1,6 @@
 """Streams against the pipeline; findings; networks whose answer to a probe is known."""
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
@@ -65,8 +66,16 @@ def test_every_rate_shows_the_same_events(bench):
 
 
 def test_a_still_scene_without_turbulence_makes_no_event(bench):
-    found = film(bench.pipeline, 0, Conditions(still=True, d_over_r0=0.0))
+    found = film(bench.pipeline, 0, Conditions(moves=0.0, d_over_r0=0.0))
     assert sum(map(len, found.events)) == 0
+
+
+def test_a_scene_that_stops_makes_no_event_afterwards(bench):
+    found = film(bench.pipeline, 0, Conditions(moves=0.5, d_over_r0=0.0))
+    half = int(0.5 * (len(found.target) - 1))
+    assert all(torch.equal(frame, found.target[half]) for frame in found.target[half:])
+    times = np.concatenate([events["t"] for events in found.events])
+    assert 0 < times.max() <= 1e6 * (half / found.fps + 0.005)  # what dead time held back
 
 
 def test_strength_is_set_exactly():
