@@ -1,7 +1,8 @@
 """A trained run to weights/: python -m scripts.ship_weights RUN [--name NAME] [--test FOLDER ...].
 
 Writes `weights/NAME.safetensors` (float16, spectral norm folded) and its model card `NAME.md`.  RUN
-is a folder of src.train, each FOLDER one of src.eval with these weights.
+is a folder of src.train, each FOLDER one of src.eval with these weights; where RUN is a name of
+weights/, its card alone is written, with what FOLDERs hold.
 """
 
 import argparse
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import torch
 from omegaconf import DictConfig, OmegaConf
+from safetensors import safe_open
 
 from src.models import files
 from src.models.unroll import takes
@@ -35,6 +37,20 @@ def ship(run: Path, name: str, tests: list[Path]) -> Path:
     if path.stat().st_size > LARGEST:
         path.unlink()
         raise ValueError(f"weights must have at most {LARGEST} bytes; {name} has more")
+    return _write_card(path, name, network, card, tests)
+
+
+def recard(name: str, tests: list[Path]) -> Path:
+    """Write the card of shipped weights anew, with what `tests` hold; returns the weights' path."""
+    path = files.WEIGHTS / f"{name}.safetensors"
+    with safe_open(path, "pt") as file:
+        card = json.loads(file.metadata()["card"])
+    return _write_card(path, name, files.load(path), card, tests)
+
+
+def _write_card(
+    path: Path, name: str, network: torch.nn.Module, card: dict, tests: list[Path]
+) -> Path:
     results = [json.loads((test / "results.json").read_text()) for test in tests]
     configs = [OmegaConf.load(test / "config.yaml") for test in tests]
     text = describe(name, network, card, list(zip(results, configs, strict=True)))
@@ -100,7 +116,7 @@ def describe(name: str, network: torch.nn.Module, card: dict, tests: list[tuple]
 def _tested(record: dict, cfg: DictConfig) -> str:
     scores = record["test"]
     cells = [_cell(scores[measure]) if measure in scores else "-" for measure in MEASURES]
-    what = f"{_scenes(cfg)}, {cfg.turbulence.atmosphere.severity} turbulence"
+    what = f"{_scenes(cfg)}, {cfg.turbulence.atmosphere.severity} turbulence, at {record['git']}"
     return f"| {what} | {scores['clips']} | " + " | ".join(cells) + " |"
 
 
@@ -118,10 +134,13 @@ def _scenes(cfg: DictConfig) -> str:
 def main() -> None:
     """Read the arguments."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("run", type=Path)
+    parser.add_argument("run", type=Path, help="or a name of weights/")
     parser.add_argument("--name", help="default: the run's experiment")
     parser.add_argument("--test", type=Path, nargs="*", default=[], help="folders of src.eval")
     arguments = parser.parse_args()
+    if (files.WEIGHTS / f"{arguments.run}.safetensors").is_file():
+        print(recard(str(arguments.run), arguments.test))
+        return
     record = json.loads((arguments.run / "results.json").read_text())
     print(ship(arguments.run, arguments.name or record["experiment"], arguments.test))
 

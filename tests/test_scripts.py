@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from scripts.margins import margins
-from scripts.ship_weights import ship
+from scripts.ship_weights import recard, ship
 from src.models import files
 from src.models.unroll import unroll
 from src.train import train
@@ -21,6 +21,10 @@ def test_a_trained_run_is_shipped_whole_with_its_card(tmp_path, monkeypatch):
     assert torch.allclose(unroll(shipped, voxels)[0], unroll(trained, voxels)[0], atol=2e-3)
     card = path.with_suffix(".md").read_text()
     assert "`ckpt=tiny/one`" in card and "| steps | 2 |" in card and "9 view(s)" in card
+    whole = path.read_bytes()
+    assert recard("tiny/one", [run, run]) == path and path.read_bytes() == whole
+    anew = path.with_suffix(".md").read_text().splitlines()
+    assert len(anew) == len(card.splitlines()) + 1 and set(anew) == set(card.splitlines())
 
 
 def clip(name: str, value: float) -> dict[str, str]:
