@@ -2,5 +2,5 @@
 
 import os
 
-# of a picture; OpenCV looks when it is imported, so before all else
+# The largest picture that is read: OpenCV looks at this when it is imported, so before all else.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**27))
