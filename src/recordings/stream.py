@@ -182,7 +182,6 @@ class Carry:
     frames: int = 0
 
 
-@torch.inference_mode()
 def each_view(
     windows: Iterable[Window], network: nn.Module, *, overlap: int = 1
 ) -> Iterator[Float[np.ndarray, "views h w"]]:
@@ -191,7 +190,8 @@ def each_view(
     for count, window in enumerate(windows):
         if window.events or pictures is None:
             voxels = torch.from_numpy(window.voxels.copy())[:, None]
-            pictures, states[count % overlap] = network(voxels, states[count % overlap])
+            with torch.inference_mode():
+                pictures, states[count % overlap] = network(voxels, states[count % overlap])
         yield pictures[:, 0].clamp(0, 1).numpy()
 
 
@@ -225,7 +225,6 @@ def default_span(network: nn.Module) -> str:
     return "frame" if takes(network, "window_s") else "trained"
 
 
-@torch.inference_mode()
 def frames(
     windows: Iterable[Window],
     network: nn.Module,
@@ -250,7 +249,8 @@ def frames(
             known = {"window_s": (window.end_us - window.start_us) * 1e-6, "positions": positions}
             told = {name: known[name] for name in asks}
             voxels = torch.from_numpy(window.voxels)[None].to(device)
-            picture, carry.states[phase] = network(voxels, carry.states[phase], **told)
+            with torch.inference_mode():
+                picture, carry.states[phase] = network(voxels, carry.states[phase], **told)
             carry.picture = picture[0, 0].clamp(0, 1).float().cpu()
         elif carry.picture is None:
             carry.picture = torch.full(window.voxels.shape[-2:], 0.5)
