@@ -197,7 +197,7 @@ def _state_dict(checkpoint: str | Path | Mapping) -> Mapping[str, Tensor]:
     if not weights:
         raise ValueError("baseline.weights must hold a state dict, got no tensors")
     if not isinstance(checkpoint, Mapping):
-        files.check_memory(weights, Path(checkpoint))
+        files.check_memory(weights, Path(checkpoint), "baseline.weights")
     return weights
 
 

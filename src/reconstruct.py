@@ -23,7 +23,8 @@ def reconstruct(cfg: DictConfig) -> Path:
     Raises ValueError for a recording, views, network or window that do not go together.
     """
     run, net = Path(cfg.paths.run), build.chosen(cfg)
-    fast, views, span = running(net, cfg.form), views_for(cfg, net), overlap(cfg, net)
+    views, span = views_for(cfg, net), overlap(cfg, net)
+    fast = running(net, cfg.form).to(cfg.device)
     results.open_run(run, door.resolved(cfg))
     with output.sink(cfg.output, run, views.model, cfg.playback) as write:
         for frame in progress.tell(frames(cfg, fast, views, span), span):
@@ -61,7 +62,6 @@ def frames(cfg: DictConfig, net: nn.Module, views: Views, span: int) -> Iterator
     )
     chunks = sources.events(cfg.recording, views.sensor, cfg.chunk_s)
     windows = stream.windows(chunks, lookup.build(views), rule)
-    net = net.to(cfg.device)
     return stream.frames(windows, net, overlap=span, positions=views.positions, device=cfg.device)
 
 

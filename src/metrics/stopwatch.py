@@ -134,13 +134,13 @@ class Stopwatch:
         drawn = torch.Generator().manual_seed(0)
         voxels = torch.randn(size, generator=drawn)
         voxels = (voxels * (torch.rand(size, generator=drawn) < FILLED)).to(device)
-        running = self._running(candidate, form, side, known["threads"]).to(device)
+        network = self._running(candidate, form, side, known["threads"]).to(device)
         if form in ("float32", "bf16"):  # of the others nobody sees the maps
             which = (candidate.name, form, side, device)
             if which not in self._bytes:
-                self._bytes[which] = timing.peak_bytes(running, voxels)
+                self._bytes[which] = timing.peak_bytes(network, voxels)
             known["peak_mib"] = self._bytes[which] / 2**20
-        took = timing.frame(running, voxels, count=known["threads"], seconds=self.seconds)
+        took = timing.frame(network, voxels, count=known["threads"], seconds=self.seconds)
         ms = {"ms": took.median_ms + after, "least_ms": took.least_ms + after}
         return Speed(**known, **ms, frames=took.frames, clock=took.clock)
 
@@ -158,8 +158,10 @@ class Stopwatch:
         return ms
 
     def _running(self, candidate: Candidate, form: str, side: int, count: int) -> nn.Module:
+        if form == "float32":
+            return plain(candidate.network)
         if form != "onnx":
-            return running(plain(candidate.network), form)
+            return running(candidate.network, form)
         path = self.folder / f"{candidate.name}_{side}.onnx"
         if not path.is_file():
             size = {"views": candidate.views, "height": side, "width": side, "bins": self.bins}

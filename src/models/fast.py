@@ -18,7 +18,7 @@ from src.models.unroll import takes
 FORMS = ("float32", "bf16", "compiled")
 
 
-def running(network: nn.Module, form: str, *, skip_empty: bool = False) -> nn.Module:
+def running(network: nn.Module, form: str) -> nn.Module:
     """Return `network` in a form to run it in: `float32`, as it is; `bf16`, a Fast one; `compiled`,
     that one compiled.  Raises ValueError, naming `form`, for another or where it cannot be made.
     """
@@ -28,7 +28,7 @@ def running(network: nn.Module, form: str, *, skip_empty: bool = False) -> nn.Mo
         return network
     if not any(True for _ in network.parameters()):
         raise ValueError(f"form must be float32 for a network without parameters, got {form}")
-    return Fast(network, skip_empty=skip_empty, compiled=form == "compiled")
+    return Fast(network, skip_empty=False, compiled=form == "compiled")
 
 
 class Fast(nn.Module):

@@ -38,7 +38,7 @@ def load(name_or_path: str | Path) -> nn.Module:
         names = ", ".join(sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))) or "none yet"
         raise ValueError(f"ckpt must be a file or one of weights/ ({names}), got {name_or_path}")
     spec, weights = (_safetensors if path.suffix == ".safetensors" else _checkpoint)(path)
-    check_memory(weights, path)
+    check_memory(weights, path, "ckpt")
     with torch.device("meta"):  # without memory: a small file may name a huge network
         _check_fit(_build(spec, path), weights, path)
     network = _build(spec, path)
@@ -156,13 +156,15 @@ def _check_sizes(value: Any, path: Path) -> None:
         raise ValueError(f"ckpt must hold sizes up to {LARGEST}, got {value} in {path}")
 
 
-def check_memory(weights: dict[str, Tensor], path: Path) -> None:
-    """Raise ValueError for weights of more numbers than the file has bytes: in a view of a few
-    numbers any size fits, but the network made for it has to hold them all.
+def check_memory(weights: dict[str, Tensor], path: Path, key: str) -> None:
+    """Raise ValueError, beginning with `key`, for weights of more numbers than the file has bytes:
+    in a view of a few numbers any size fits, but the network made for it has to hold them all.
     """
     numbers, size = sum(value.numel() for value in weights.values()), path.stat().st_size
     if numbers > size:
-        raise ValueError(f"{path} must hold its weights whole: {numbers} numbers in {size} bytes")
+        raise ValueError(
+            f"{key} must hold its weights whole, got {numbers} numbers in {size} bytes of {path}"
+        )
 
 
 def _check_fit(network: nn.Module, weights: dict[str, Tensor], path: Path) -> None:
