@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from baselines.centre import centre_view, declare, finish
+from baselines.single_view import centre_view, declare, finish
 from src.models.e2vid import E2VID, SCALES
 from src.models.layers import pad_to_multiple
 

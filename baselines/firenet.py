@@ -9,7 +9,7 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from baselines.centre import centre_view, declare, finish
+from baselines.single_view import centre_view, declare, finish
 from src.models.layers import ConvGRU, ResidualBlock
 
 

@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from baselines.hilbert import hilbert_order
 from baselines.selective_scan import Mixer
-from baselines.steady import jitter, pull
+from baselines.stabilise import jitter, pull
 from src.models.layers import pad_to_multiple
 
 DISTORTION = 4  # channels: tilt down and right, mean and log-variance of the blur latent
@@ -30,7 +30,7 @@ PIXELS = 2**20  # encoded or decoded at once where no gradient is asked for: 16 
 class MambaTM(nn.Module):
     """`channels`: of a frame, 1 (grey) or 3.  `features`: of the encoder, 8 times as many in the
     trunk.  `groups`: of three layers, the last one guided.  Published: 3, 16, 6 and 16 `states`.
-    `steadied`: the encoder also sees the frames without their jitter (baselines/steady.py), of
+    `steadied`: the encoder also sees the frames without their jitter (baselines/stabilise.py), of
     which the tilt channels take out nothing to twice as much; all of it before any training.
     """
 

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from src.models import files
-from src.models.reconstructor import Reconstructor
 from src.models.unroll import takes, video
+from src.training.reconstructor import Reconstructor
 
 if TYPE_CHECKING:
     from src.sim.pipeline import Sample

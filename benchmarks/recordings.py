@@ -18,9 +18,10 @@ import torch
 from benchmarks.timing import least
 from src.models.e2vid import E2VID
 from src.models.setnet import SetNet
-from src.recordings import formats, lookup, stream
+from src.recordings import lookup, stream
 from src.recordings.capture import kaleidoscope
-from src.recordings.formats import EVENT
+from src.recordings.files import formats
+from src.recordings.files.formats import EVENT
 from src.sim.optics import layout
 
 SENSOR, MODEL = (720, 1280), (176, 176)

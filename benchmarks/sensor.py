@@ -15,9 +15,9 @@ import torch
 from torch.nn import functional
 
 from benchmarks.timing import least
-from src.recordings.formats import iter_events, write_events
-from src.sim.engines import sensor_eager
-from src.sim.sensor import EventSensor
+from src.recordings.files.formats import iter_events, write_events
+from src.sim.sensor.engines import sensor_eager
+from src.sim.sensor.sensor import EventSensor
 from src.sim.voxel import voxel_grid
 
 SIDE, FPS = 256, 120.0

@@ -15,7 +15,7 @@ from hydra import compose, initialize_config_dir
 from torch.nn.utils import parametrize
 
 from benchmarks.timing import least
-from src import build
+from src.app import build
 from src.models.unroll import video
 from src.sim.pipeline import simulate
 

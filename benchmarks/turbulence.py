@@ -16,8 +16,8 @@ import torch
 from torch import nn
 
 from benchmarks.timing import least
-from src.sim.atmosphere import Atmosphere
-from src.sim.turbulence import Turbulence
+from src.sim.turbulence.atmosphere import Atmosphere
+from src.sim.turbulence.operator import Turbulence
 
 CAMERA = Atmosphere(0.1, 0.5, 300.0, 0.4, 525e-9, 1e-14, 0.9)
 BASES, SUPPORT, PAD = 100, 33, 32

@@ -19,11 +19,12 @@ import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
 
-from src import build
+from src.app import build
 from src.metrics.bootstrap import difference, interval
 from src.metrics.temporal import straightness
 from src.reconstruct import reconstruct
-from src.recordings import capture, sources
+from src.recordings import capture
+from src.recordings.files import sources
 from src.sim.pipeline import Draw
 
 CONF = Path(__file__).resolve().parents[1] / "conf"

@@ -19,11 +19,12 @@ import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
 
-from src import build, door
-from src.metrics import results
+from src.app import build, door
 from src.models.e2vid import E2VID
-from src.recordings import formats, lookup, output, sources, stream
+from src.recordings import lookup, output, stream
+from src.recordings.files import formats, sources
 from src.recordings.views import Views
+from src.records import results
 from src.train import fit
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -1,8 +1,8 @@
-"""Fit src/sim/p2s.safetensors: python -m scripts.fit_p2s [steps, default 25000; 0: tables only].
+"""Fit p2s.safetensors: python -m scripts.fit_p2s [steps, default 25000; 0: tables only].
 
 For each band of D/r0: exact PSFs of random Kolmogorov phase, a principal basis of them in the
 metric of a natural picture (power 1 / f^2), a network from phase to weights; then the tables of
-what each simplification costs (src/sim/fidelity.py), for which 0 steps keep the networks there are.
+what each simplification costs (fidelity.py), for which 0 steps keep the networks there are.
 Nothing but physics goes in.
 """
 
@@ -14,9 +14,9 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from scripts.p2s_errors import measure, picture_metric
-from src.sim.p2s import FILE, FINE_PER_AIRY
-from src.sim.psf import fraunhofer_psf
-from src.sim.zernike import noll_covariance
+from src.sim.turbulence.p2s import FILE, FINE_PER_AIRY
+from src.sim.turbulence.psf import fraunhofer_psf
+from src.sim.turbulence.zernike import noll_covariance
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from hydra import compose, initialize_config_dir
 
 from scripts.real_recordings import CONF
 from src.reconstruct import reconstruct
-from src.recordings import sources
+from src.recordings.files import sources
 
 SECONDS, RATES = 0.0875, (120, 600, 12_000)
 

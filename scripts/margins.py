@@ -10,7 +10,7 @@ import csv
 from pathlib import Path
 
 from src.metrics.bootstrap import difference
-from src.metrics.results import METRICS
+from src.records.results import METRICS
 
 NAMES = {"psnr_aligned": "aligned PSNR, dB", "psnr": "PSNR, dB", "lpips": "LPIPS", "ssim": "SSIM"}
 NAMES |= {"wobble": "wobble, px"}

@@ -1,6 +1,6 @@
 """What each simplification of the blur costs in a natural picture, measured on exact PSFs.
 
-All in the metric of src/sim/fidelity.py; part of `python -m scripts.fit_p2s`.
+All in the metric of src/sim/turbulence/fidelity.py; part of `python -m scripts.fit_p2s`.
 """
 
 import math
@@ -8,12 +8,12 @@ import math
 import torch
 from torch import Tensor
 
-from src.sim.atmosphere import TILT_VARIANCE, Atmosphere
-from src.sim.fidelity import band_for
-from src.sim.p2s import FINE_PER_AIRY
-from src.sim.phase import draw_waves
-from src.sim.psf import fraunhofer_psf
-from src.sim.zernike import noll_covariance
+from src.sim.turbulence.atmosphere import TILT_VARIANCE, Atmosphere
+from src.sim.turbulence.fidelity import band_for
+from src.sim.turbulence.p2s import FINE_PER_AIRY
+from src.sim.turbulence.phase import draw_waves
+from src.sim.turbulence.psf import fraunhofer_psf
+from src.sim.turbulence.zernike import noll_covariance
 
 STRENGTHS = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.0, 10.0)
 AIRY = (0.25, 0.5, 1.0, 2.0)

@@ -17,7 +17,7 @@ from hydra import compose, initialize_config_dir
 from src.metrics.image import ssim
 from src.metrics.lpips import LPIPS
 from src.reconstruct import reconstruct
-from src.recordings import sources
+from src.recordings.files import sources
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 FPS, PANEL = 120.0, 200  # frames a second; height of a panel

@@ -2,7 +2,7 @@
 
 A FILM is a film, a folder of pictures or the video.h5 of a reconstruction; all are shrunk to the
 size of the smallest.  Printed for each: the median, over rows and columns 8 px apart, of the rms
-shift of what they show against its mean (src/metrics/paths.py), in pixels, and the contrast, the
+shift of what they show against its mean (metrics/straightness.py), in pixels, and the contrast, the
 standard deviation of a picture's pixels.
 """
 
@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from src.figures import slices
-from src.metrics import paths
-from src.recordings import sources
+from src.metrics import straightness
+from src.recordings.files import sources
 
 STEP = 8  # pixels between two lines, and from the border
 
@@ -25,7 +25,7 @@ def wander(film: np.ndarray) -> float:
     rows = [((STEP, y), (width - 1 - STEP, y)) for y in range(STEP, height - STEP, STEP)]
     columns = [((x, STEP), (x, height - 1 - STEP)) for x in range(STEP, width - STEP, STEP)]
     cuts = (slices.sample(film, slices.line(*ends)) for ends in rows + columns)
-    return float(np.nanmedian([paths.wander(cut) for cut in cuts]))
+    return float(np.nanmedian([straightness.wander(cut) for cut in cuts]))
 
 
 def main() -> None:

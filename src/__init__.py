@@ -4,3 +4,5 @@ import os
 
 # The largest picture that is read: OpenCV looks at this when it is imported, so before all else.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**27))
+
+import src.app.former_names  # noqa: F401

@@ -6,9 +6,9 @@ import hydra
 import rich
 from omegaconf import DictConfig, OmegaConf
 
-from src import build, door
-from src.metrics import results
-from src.recordings import calibration
+from src.app import build, door
+from src.recordings.calibration import tasks as calibration
+from src.records import results
 
 
 def views(cfg: DictConfig, run: Path) -> dict:

@@ -6,10 +6,11 @@ import hydra
 import rich
 from omegaconf import DictConfig
 
-from src import build, door, lineup
-from src.figures import frontier, rising
-from src.metrics import charting, results
-from src.metrics.stopwatch import Stopwatch
+from src.app import build, door, lineup
+from src.bench import charting
+from src.bench.stopwatch import Stopwatch
+from src.figures import changing_air, frontier
+from src.records import results
 
 
 def chart(cfg: DictConfig) -> dict:
@@ -39,7 +40,7 @@ def chart(cfg: DictConfig) -> dict:
         frontier.accuracy(path, speeds, scores, side=cfg.sizes[0], title=title)
         frontier.machine(run / f"machine.{suffix}", speeds, watch.peaks)
     if cfg.adapt:
-        text += rising.write(run, lineup.adaptive(cfg), cfg.adapt.course)
+        text += changing_air.write(run, lineup.adaptive(cfg), cfg.adapt.course)
     results.write_text(run / "chart.md", text)
     rich.print(text, f"in {run}")
     return knees

@@ -11,10 +11,11 @@ import numpy as np
 import rich
 from omegaconf import DictConfig
 
-from src import door
+from src.app import door
 from src.figures import layouts, slices
-from src.metrics import paths, results
-from src.recordings import sources
+from src.metrics import straightness
+from src.recordings.files import sources
+from src.records import results
 
 NOTES = {"wander": "wander of what stands still", "straightness": "what moves, from a line"}
 
@@ -80,9 +81,9 @@ def strays(cfg: DictConfig, across: np.ndarray) -> dict[str, float]:
     """
     found = {}
     if not cfg.circle:
-        found["wander"] = paths.wander(across)
+        found["wander"] = straightness.wander(across)
     if not cfg.spin:
-        measure = paths.turning if cfg.circle else paths.straightness
+        measure = straightness.turning if cfg.circle else straightness.straightness
         found["straightness"] = measure(followed(across, cfg.follow))
     return found
 

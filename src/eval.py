@@ -6,9 +6,9 @@ from pathlib import Path
 import hydra
 from omegaconf import DictConfig
 
-from src import build, door
+from src.app import build, door
 from src.figures import samples
-from src.metrics import results
+from src.records import results
 
 
 def evaluate(cfg: DictConfig) -> dict:

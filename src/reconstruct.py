@@ -10,11 +10,12 @@ import hydra
 from omegaconf import DictConfig
 from torch import nn
 
-from src import build, door
-from src.metrics import results
+from src.app import build, door
 from src.models.fast import running
-from src.recordings import lookup, output, progress, sources, stream
+from src.recordings import lookup, output, progress, stream
+from src.recordings.files import sources
 from src.recordings.views import Views, load
+from src.records import results
 
 
 def reconstruct(cfg: DictConfig) -> Path:

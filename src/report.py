@@ -5,9 +5,9 @@ from pathlib import Path
 import hydra
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from src import door
-from src.metrics import results
-from src.reports import cells, page, runs, tables, writers
+from src.app import door
+from src.records import results, runs
+from src.reports import cells, page, tables, writers
 
 
 def report(cfg: DictConfig) -> list[tables.Table]:

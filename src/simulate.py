@@ -8,10 +8,11 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from src import build, door, plain
+from src.app import build, door
 from src.figures import samples
-from src.metrics import results
 from src.recordings import capture
+from src.recordings.files import plain
+from src.records import results
 
 SECTIONS = ("scene", "optics", "turbulence", "sensor", "data")
 SAME = (*SECTIONS, "seed", "fps", "bins")  # what makes a clip

@@ -11,12 +11,12 @@ import rich
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from src import build, door, lineup
+from src.app import build, door, lineup
+from src.bench.candidates import Candidate
+from src.bench.probes import suite
+from src.bench.probes.standard import Bench
 from src.figures.heatmap import stress_map
-from src.metrics import results
-from src.metrics.lineup import Candidate
-from src.probes import suite
-from src.probes.bench import Bench
+from src.records import results
 
 
 def stress(cfg: DictConfig) -> suite.Found:

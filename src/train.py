@@ -9,11 +9,11 @@ import lightning
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
-from src import build, door
+from src.app import build, door
 from src.figures import samples
-from src.metrics import results, tracking
 from src.models import files
-from src.models.guard import NotFinite
+from src.records import results, tracking
+from src.training.guard import NotFinite
 
 
 def train(cfg: DictConfig) -> dict:

@@ -15,7 +15,7 @@ from src.compare import compare
 from src.reconstruct import reconstruct
 from src.recordings import capture, lookup, views
 from src.sim.optics import layout
-from src.sim.sensor import EventSensor
+from src.sim.sensor.sensor import EventSensor
 from tests.conftest import ROOT
 from tests.recordings import pictures
 

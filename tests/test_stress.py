@@ -10,9 +10,10 @@ from tests.test_train import config
 HIGHPASS = "{baseline: {_target_: baselines.highpass.HighPass, source: median}, views: 9}"
 ABSENT = "{ckpt: nowhere, views: 9}"
 SETNET = "{ckpt: nowhere, views: 9, model: {_target_: src.models.setnet.SetNet}}"
-PROBES = "{hold: {title: held, probe: {_target_: src.probes.memory.Hold, windows: [2, 4]}}, "
-PROBES += "lost: {title: lost, probe: {_target_: src.probes.views.Lost, counts: [1], draws: 1}}, "
-PROBES += "fast: {title: fast, probe: {_target_: src.probes.rates.Rates, rates: [1200]}}}"
+PROBES = "{hold: {title: held, probe: {_target_: src.bench.probes.memory.Hold, windows: [2, 4]}}, "
+PROBES += "lost: {title: lost, probe: {_target_: src.bench.probes.light_field.Lost, "
+PROBES += "counts: [1], draws: 1}}, "
+PROBES += "fast: {title: fast, probe: {_target_: src.bench.probes.sampling.Rates, rates: [1200]}}}"
 TINY = ["clips=1", "scene.height=64", "scene.width=64", "data.test_crop=32", "data.test_windows=20"]
 TINY += ["data.warmup=2", "processes=1", f"+probes={PROBES}"]
 

@@ -10,10 +10,10 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from src import build, door
+from src.app import build, door
 from src.eval import evaluate
-from src.metrics import results
 from src.models import files
+from src.records import results
 from src.train import train
 from tests.conftest import ROOT
 from tests.test_door import command, environment

@@ -9,8 +9,8 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from src.eval import evaluate
-from src.metrics import tracking
-from src.recordings.formats import read_events
+from src.recordings.files.formats import read_events
+from src.records import tracking
 from src.simulate import simulate
 from src.train import train
 from tests.conftest import ROOT

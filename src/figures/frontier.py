@@ -7,10 +7,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from src.bench.charting import Score
+from src.bench.pareto import front
+from src.bench.stopwatch import Speed
 from src.figures.plots import MARKERS, save
-from src.metrics.charting import Score
-from src.metrics.pareto import front
-from src.metrics.stopwatch import Speed
 
 PAPER_MS, LIVE_MS = 3.4, 1000 / 600
 LEAST_GMAC = 1e-3

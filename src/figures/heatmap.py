@@ -9,8 +9,8 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from src.bench.probes.standard import Finding
 from src.figures.plots import save
-from src.probes.bench import Finding
 
 # Blue holds and orange breaks: told apart by the colour-blind and in grey.
 COLOURS = LinearSegmentedColormap.from_list("limits", ["#2f6fab", "#dbe7f3", "#f8ddc4", "#c8501e"])

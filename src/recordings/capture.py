@@ -14,12 +14,12 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from src.recordings.formats import write_events
+from src.recordings.files.formats import write_events
 from src.recordings.lookup import Lookup, build
 from src.recordings.views import Size, View, Views
 from src.sim import noise
 from src.sim.optics import view_id
-from src.sim.sensor import EventSensor
+from src.sim.sensor.sensor import EventSensor
 
 BAND_BYTES = 1 << 28  # of sensor frames at a time
 

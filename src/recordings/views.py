@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 from jaxtyping import Float
 
-from src import plain
+from src.recordings.files import plain
 
 Size = tuple[int, int]
 LARGEST_SIDE = 8192

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-from src.reports.runs import Plan, Run
+from src.records.runs import Plan, Run
 
 FIRST = ("task", "method", "experiment", "resolution", "postprocess", "baseline", "optics")
 LAST = ("budget", "debug")

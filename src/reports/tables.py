@@ -5,8 +5,8 @@ import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from src.records.runs import Run
 from src.reports.cells import Cell, matches
-from src.reports.runs import Run
 
 SEVERITIES = ("none", "weak", "medium", "strong")
 

@@ -6,7 +6,7 @@ import re
 from itertools import groupby
 from pathlib import Path
 
-from src.metrics import results
+from src.records import results
 from src.reports.tables import Column, Table, Value
 
 ARROWS = {1: " ↑", -1: " ↓", 0: ""}

@@ -16,12 +16,12 @@ import torch
 from torch import Tensor
 
 from src.sim import noise
-from src.sim.atmosphere import Atmosphere, sample_atmosphere
 from src.sim.optics import Optics, Position
-from src.sim.response import encode_srgb
-from src.sim.scenes import Clip
-from src.sim.sensor import EventSensor, decode_srgb
-from src.sim.turbulence import Turbulence
+from src.sim.scenes.photographs import Clip
+from src.sim.sensor.response import encode_srgb
+from src.sim.sensor.sensor import EventSensor, decode_srgb
+from src.sim.turbulence.atmosphere import Atmosphere, sample_atmosphere
+from src.sim.turbulence.operator import Turbulence
 
 WEAK_SCATTER = 0.3  # Rytov variance up to which phase alone will do (Andrews & Phillips 2005)
 Crop = tuple[int, int, int, int]  # top, left, height, width

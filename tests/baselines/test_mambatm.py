@@ -6,8 +6,8 @@ from omegaconf import OmegaConf
 
 from baselines import mambatm
 from baselines.mambatm import MambaTM, scan_orders, window_starts
-from baselines.steady import jitter, pull
-from src.build import make
+from baselines.stabilise import jitter, pull
+from src.app.build import make
 from tests.conftest import ROOT
 
 

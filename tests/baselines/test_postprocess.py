@@ -9,12 +9,12 @@ from torch import nn
 from baselines.firenet import FireNet
 from baselines.mambatm import MambaTM
 from baselines.postprocess import CameraFrames, Postprocessed, Restoration
-from src.build import make
-from src.metrics.evaluation import cost
+from src.app.build import make
 from src.metrics.image import L1
 from src.models import files
 from src.models.unroll import unroll, video
 from src.sim.pipeline import Sample
+from src.training.evaluation import cost
 
 
 def sample(windows: int = 10) -> Sample:

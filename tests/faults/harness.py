@@ -98,7 +98,7 @@ def _work(log: str, work: Callable, arguments: tuple) -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     multiprocessing.set_start_method("fork", force=True)  # for loaders' workers, as of a door
     torch.set_num_threads(1)
-    from src import door
+    from src.app import door
 
     door.run(lambda: work(*arguments))
 

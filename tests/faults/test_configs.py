@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from src import build
+from src.app import build
 from src.simulate import SAME
 from tests.faults.test_inputs import read_config, run_config
 
@@ -19,11 +19,11 @@ FOREIGN = [
     "os.system",
     "builtins.eval",
     "subprocess.Popen",
-    "src.build.os.getcwd",
-    "src.build.instantiate",
+    "src.app.build.os.getcwd",
+    "src.app.build.instantiate",
     "src.models.files.save",
-    "src.metrics.results.write_text",
-    "src.metrics.results.Path",
+    "src.records.results.write_text",
+    "src.records.results.Path",
     "torch.optim.adam.torch.load",
     "torch.load",
     "lightning.fabric.utilities.cloud_io._load",

@@ -17,14 +17,15 @@ from omegaconf import OmegaConf
 
 from baselines import upstream
 from baselines.firenet import FireNet
-from src import plain
 from src.models import files
-from src.recordings import aedat, alignment, formats, sources, tables, views
-from src.sim import pictures, scenes, videos
-from src.sim.pictures import LARGEST_PIXELS
+from src.recordings import views
+from src.recordings.calibration import alignment
+from src.recordings.files import aedat, formats, plain, sources, tables
+from src.sim.scenes import photographs, pictures, videos
+from src.sim.scenes.pictures import LARGEST_PIXELS
 from src.simulate import alike
 from tests.faults.test_inputs import film, network, unpacked
-from tests.recordings.test_formats import made_up
+from tests.recordings.files.test_formats import made_up
 
 GOOD = (
     '<dv version="2.0"><node name="outInfo" path="/"><node name="0" path="/0/">'
@@ -181,7 +182,7 @@ def test_a_picture_does_not_unpack_without_bound(tmp_path):
     with pytest.raises(ValueError, match="readable picture of at most"):
         sources.sensor_picture(path)
     with pytest.raises(ValueError, match="readable photographs"):
-        scenes._read(path)
+        photographs._read(path)
 
 
 GROWING = "a: &a [x, x]\nb: &b [*a, *a]\nc: &c [*b, *b]\n"

@@ -14,13 +14,13 @@ from hypothesis import HealthCheck, given, settings
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from src.metrics import results
 from src.models import files
-from src.recordings import formats
-from src.recordings.formats import write_events
+from src.recordings.files import formats
+from src.recordings.files.formats import write_events
 from src.recordings.views import Views
+from src.records import results
 from tests.faults.inputs import Reader, mutate, mutations
-from tests.recordings.test_formats import made_up
+from tests.recordings.files.test_formats import made_up
 from tests.test_train import TINY, config
 
 
@@ -43,22 +43,22 @@ def read_views(path: Path) -> None:
 
 
 def read_corners(path: Path) -> None:
-    from src.recordings import alignment
+    from src.recordings.calibration import alignment
 
     alignment.by_hand(alignment.read_corners(path), sensor=(240, 320), model=(32, 32))
 
 
 def read_picture(path: Path) -> None:
-    from src.recordings import sources
-    from src.sim import scenes
+    from src.recordings.files import sources
+    from src.sim.scenes import photographs
 
     sources.sensor_picture(path)
-    scenes._read(path)
+    photographs._read(path)
 
 
 def read_film(path: Path) -> None:
-    from src.recordings import sources
-    from src.sim import videos
+    from src.recordings.files import sources
+    from src.sim.scenes import videos
 
     for _ in sources.film(path):
         pass
@@ -68,7 +68,7 @@ def read_film(path: Path) -> None:
 
 
 def read_whole_film(path: Path) -> None:
-    from src.recordings import sources
+    from src.recordings.files import sources
 
     for _ in sources.film(path):
         pass
@@ -86,7 +86,8 @@ def read_published(path: Path) -> None:
 
 
 def read_config(path: Path) -> None:
-    from src import build, simulate
+    from src import simulate
+    from src.app import build
 
     cfg = OmegaConf.create({"like": str(path)})
     try:

@@ -11,12 +11,12 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from src.metrics import results
-from src.metrics.evaluation import Row
 from src.models import files
 from src.models.checkpoints import newest, whole
 from src.models.e2vid import E2VID
-from src.recordings.formats import EVENT, write_events
+from src.recordings.files.formats import EVENT, write_events
+from src.records import results
+from src.training.evaluation import Row
 from tests.faults import harness
 from tests.faults.harness import Run, Tally
 from tests.test_train import TINY, config

@@ -7,11 +7,11 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from src import build
-from src.models import reconstructor
+from src.app import build
 from src.sim.pipeline import Pipeline
 from src.simulate import simulate
 from src.train import train
+from src.training import reconstructor
 from tests.test_train import TINY, config
 
 QUICK = [*TINY, "logger=none", "optics=single", "data.epoch_clips=4", "trainer.max_steps=4"]

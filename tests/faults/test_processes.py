@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from src.data.datamodule import StepSampler
+from src.training.datamodule import StepSampler
 from tests.faults import harness
 from tests.faults.harness import Run
 from tests.faults.test_kills import training

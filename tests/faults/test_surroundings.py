@@ -91,10 +91,10 @@ def test_a_full_disk_is_no_whole_video(kind, tmp_path, monkeypatch):
 
 
 READERS = {
-    "cap.txt": "src.recordings.formats.read_events",
-    "cap.h5": "src.recordings.formats.read_events",
+    "cap.txt": "src.recordings.files.formats.read_events",
+    "cap.h5": "src.recordings.files.formats.read_events",
     "views.yaml": "src.recordings.views.load",
-    "photo.png": "src.sim.scenes._read",
+    "photo.png": "src.sim.scenes.photographs._read",
     "net.ckpt": "src.models.files.load",
     "net.safetensors": "src.models.files.load",
     "old.pth": "baselines.pickles.read",
@@ -222,7 +222,7 @@ def test_a_disk_that_is_full_in_earnest(tmp_path, alone):
 
 
 def test_too_little_room_is_said_before_anything_is_done(tmp_path, monkeypatch):
-    from src.metrics import results
+    from src.records import results
 
     usage = results.shutil.disk_usage(tmp_path)
     monkeypatch.setattr(results.shutil, "disk_usage", lambda path: usage._replace(free=1 << 20))

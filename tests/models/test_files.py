@@ -63,7 +63,7 @@ def test_other_weights_are_listed(tmp_path):
     "target",
     [
         "os.system",
-        "src.build.network",
+        "src.app.build.network",
         "src.models.files.save",
         "src.models.absent.X",
         "baselines.",

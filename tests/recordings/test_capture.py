@@ -5,12 +5,14 @@ import numpy as np
 import pytest
 import torch
 
-from src.recordings import alignment, capture, dots, formats, lookup, sources, statistics, views
-from src.recordings.targets import Charuco, Checkerboard, Circles
+from src.recordings import capture, lookup, views
+from src.recordings.calibration import alignment, dots, statistics
+from src.recordings.calibration.boards import Charuco, Checkerboard, Circles
+from src.recordings.files import formats, sources
 from src.sim.optics import layout
-from src.sim.sensor import EventSensor
+from src.sim.sensor.sensor import EventSensor
 from tests.recordings import pictures
-from tests.recordings.test_statistics import series
+from tests.recordings.calibration.test_statistics import series
 from tests.recordings.test_views import distance_px
 
 SENSOR, SIDE, TILE = (360, 640), 120, 116.0

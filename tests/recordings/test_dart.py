@@ -6,13 +6,14 @@ import torch
 from torch import nn
 
 from src.metrics.temporal import straightness
-from src.recordings import capture, formats, lookup, stream
+from src.recordings import capture, lookup, stream
+from src.recordings.files import formats
 from src.sim import noise
-from src.sim.atmosphere import Atmosphere
 from src.sim.optics import layout
-from src.sim.sensor import EventSensor
-from src.sim.targets import Dart
-from src.sim.turbulence import Turbulence
+from src.sim.scenes.targets import Dart
+from src.sim.sensor.sensor import EventSensor
+from src.sim.turbulence.atmosphere import Atmosphere
+from src.sim.turbulence.operator import Turbulence
 
 SIDE, FPS = 128, 12_000.0
 LENGTH = 32  # of the dart in pixels and, at a pixel per frame, the frames until it left its place

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from src.recordings import alignment, capture, lookup, views
-from src.recordings.targets import Charuco, Checkerboard, Circles
+from src.recordings import capture, lookup, views
+from src.recordings.calibration import alignment
+from src.recordings.calibration.boards import Charuco, Checkerboard, Circles
 from src.sim.optics import layout
 from src.sim.voxel import voxel_grid
 from tests.recordings import pictures

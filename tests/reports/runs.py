@@ -6,7 +6,7 @@ from pathlib import Path
 import yaml
 from PIL import Image
 
-from src.metrics import results
+from src.records import results
 
 SCORES = {"lpips": 0.4, "ssim": 0.6, "psnr": 17.0, "psnr_aligned": 20.0, "wobble": 1.0}
 UNTRAINED = {"untrained": {"clips": 9, "ssim": {"mean": 0.1, "std": 0.0}}}

@@ -2,7 +2,7 @@
 
 import pytest
 
-from src.reports import runs
+from src.records import runs
 from src.reports.cells import cells
 from tests.reports.runs import write_run, write_sweep
 

@@ -8,8 +8,9 @@ from html.parser import HTMLParser
 import pytest
 from omegaconf import OmegaConf
 
+from src.records import runs
 from src.report import report
-from src.reports import cells, page, runs, tables, writers
+from src.reports import cells, page, tables, writers
 from tests.conftest import ROOT
 from tests.reports.runs import clips_of, write_run, write_samples, write_sweep
 from tests.test_train import config

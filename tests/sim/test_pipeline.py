@@ -7,7 +7,7 @@ import torch
 
 from src.sim.optics import Optics
 from src.sim.pipeline import Pipeline, simulate
-from src.sim.scenes import Clip
+from src.sim.scenes.photographs import Clip
 
 IDEAL = {"threshold": 0.2, "refractory_s": 0.0}
 STRONG = {"atmosphere": {"severity": "strong"}}

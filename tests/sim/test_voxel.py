@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from src.sim.sensor import EventSensor
+from src.sim.sensor.sensor import EventSensor
 from src.sim.voxel import normalise_nonzero, voxel_grid
 
 SIZE = dict(bins=5, height=6, width=7)

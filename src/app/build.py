@@ -1,0 +1,230 @@
+"""From a configuration to objects: the one place below the doors that sees a config.
+
+`hydra.utils.instantiate` is called here only, so that what a config may name is decided here.
+"""
+
+import math
+import os
+from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import Any
+
+import lightning
+import torch
+from hydra.errors import InstantiationException
+from hydra.utils import get_object, instantiate
+from omegaconf import DictConfig, OmegaConf
+from torch import nn
+
+import src.models
+from baselines.postprocess import Restoration
+from baselines.upstream import from_config
+from src.metrics.scores import Scores
+from src.models.unroll import takes
+from src.sim.pipeline import Pipeline
+from src.sim.scenes.photographs import MixedRates
+from src.training import evaluation
+from src.training.datamodule import LightFieldData
+from src.training.reconstructor import Reconstructor
+
+ROOMS = (
+    "src.", "baselines.", "torch.optim.", "lightning.pytorch.trainer.",
+    *(f"lightning.pytorch.{room}." for room in ("callbacks", "loggers", "plugins", "profilers")),
+)  # fmt: skip
+
+
+def make(node: Any, **kwargs) -> Any:
+    """Instantiate a config node; raises ValueError for a `_target_`, however deep, that is no class
+    of our rooms.
+
+    A ValueError of the object itself comes through as it is, not wrapped by Hydra.
+    """
+    plain = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
+    if not isinstance(plain, dict) or "_target_" not in plain:
+        raise ValueError(f"a part of the config must name its class (_target_), got {plain}")
+    for target in _targets(plain):
+        _check(target)
+    try:
+        return instantiate(node, _convert_="all", **kwargs)
+    except InstantiationException as error:
+        if isinstance(error.__cause__, ValueError):
+            raise error.__cause__ from None
+        raise ValueError(f"{plain['_target_']} takes no such values: {error.__cause__}") from error
+
+
+def _targets(node: Any) -> Iterator[str]:
+    """Yield every `_target_` in plain dicts and lists."""
+    if isinstance(node, dict):
+        yield from (str(value) for key, value in node.items() if key == "_target_")
+    if isinstance(node, dict | list):
+        for value in node.values() if isinstance(node, dict) else node:
+            yield from _targets(value)
+
+
+def _check(target: str) -> None:
+    """Raise ValueError unless `target` is a class that was written in one of the rooms.
+
+    A name alone says little: `torch.optim.adam.torch.load` begins like an optimiser.
+    """
+    if not target.startswith(("src.", "baselines.", "torch.optim.", "lightning.")):
+        raise ValueError(f"_target_ must be a class of {', '.join(ROOMS)}, got {target}")
+    try:
+        found = get_object(target)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"_target_ must name a class, got {target}") from error
+    home = f"{getattr(found, '__module__', '')}."
+    if found is not from_config and not (isinstance(found, type) and home.startswith(ROOMS)):
+        raise ValueError(f"_target_ must be a class of {', '.join(ROOMS)}, got {target}")
+
+
+def pipeline(cfg: DictConfig, split: str) -> Pipeline:
+    """Return the simulation of one split: train, val or test."""
+    training = split == "train"
+    windows = _count(cfg, "data.windows" if training else "data.test_windows")
+    substeps = _count(cfg, "data.substeps")
+    rates = _rates(cfg, training)
+    scenes = [
+        make(
+            cfg.scene,
+            split=split,
+            seed=cfg.seed,
+            frames=windows * substeps + 1,
+            fps=rate * substeps,
+        )
+        for rate in rates
+    ]
+    try:
+        return Pipeline(
+            MixedRates(scenes) if len(scenes) > 1 else scenes[0],
+            make(cfg.optics),
+            OmegaConf.to_container(cfg.turbulence, resolve=True),
+            OmegaConf.to_container(cfg.sensor, resolve=True),
+            split=split,
+            seed=cfg.seed,
+            bins=cfg.bins,
+            substeps=substeps,
+            crop=cfg.data.crop if training else cfg.data.test_crop,
+            random_crop=training,
+            clips=cfg.data.clips if training else None,
+        )
+    except TypeError as error:
+        raise ValueError(f"turbulence or sensor takes no such values: {error}") from error
+
+
+def _count(cfg: DictConfig, key: str) -> int:
+    value = OmegaConf.select(cfg, key)
+    if type(value) is not int or value < 1:
+        raise ValueError(f"{key} must be a whole number >= 1, got {value}")
+    return value
+
+
+def _rates(cfg: DictConfig, training: bool) -> list[float]:
+    key = "data.rates" if training and cfg.data.rates else "fps"
+    found = OmegaConf.select(cfg, key)
+    rates = list(found) if isinstance(found, Sequence) else [found]
+    if not rates or not all(isinstance(r, int | float) and 0 < r < math.inf for r in rates):
+        raise ValueError(f"{key} must be > 0 windows a second, got {found}")
+    return rates
+
+
+def data(cfg: DictConfig, splits: tuple[str, ...] = ("train", "val", "test")) -> LightFieldData:
+    """Return the data module with the pipelines of `splits`."""
+    if not 0 <= cfg.data.warmup <= cfg.data.test_windows - 2:  # wobble needs two frames
+        most = cfg.data.test_windows - 2
+        raise ValueError(f"data.warmup must be in 0..{most} (windows), got {cfg.data.warmup}")
+    return LightFieldData(
+        {split: pipeline(cfg, split) for split in splits},
+        make(cfg.augment) if "train" in splits else None,
+        batch_size=cfg.data.batch_size,
+        reuse=cfg.data.reuse,
+        epoch_clips=cfg.data.epoch_clips,
+        val_clips=cfg.data.val_clips,
+        test_clips=cfg.data.test_clips,
+        workers=cfg.data.workers,
+        simulate_on=cfg.data.simulate_on,
+        seed=cfg.seed,
+    )
+
+
+def network(cfg: DictConfig) -> tuple[nn.Module, dict]:
+    """Return a fresh network and the plain dict (target, kwargs) that builds it again."""
+    kwargs = OmegaConf.to_container(cfg.model, resolve=True)
+    target = kwargs.pop("_target_")
+    return make(cfg.model), {"target": target, "kwargs": kwargs}
+
+
+def chosen(cfg: DictConfig) -> nn.Module:
+    """Return the network that `ckpt` or else `baseline` names, in eval mode."""
+    if cfg.ckpt:
+        found = src.models.load(cfg.ckpt)
+        if takes(found, "frames"):
+            use = f"baseline=frames postprocess=mambatm postprocess.restorer={cfg.ckpt}"
+            raise ValueError(f"ckpt must be a network for events, got a post-processor; use {use}")
+        return found
+    if cfg.get("baseline"):
+        return make(cfg.baseline).eval()
+    raise ValueError("ckpt or baseline must name a network, got neither")
+
+
+def frozen(cfg: DictConfig) -> nn.Module:
+    """Return the chosen network, behind it the chosen post-processor.
+
+    Raises ValueError if it wants another number of views than `optics`.
+    """
+    found = chosen(cfg)
+    wanted = found.views
+    if wanted is not None and wanted != cfg.optics.views and not cfg.get("baseline"):
+        raise ValueError(
+            f"optics.views must be {wanted} for ckpt={cfg.ckpt}, got {cfg.optics.views}"
+        )
+    return make(cfg.postprocess, source=found) if cfg.get("postprocess") else found
+
+
+def scores(cfg: DictConfig) -> Scores:
+    """Return what is measured: without `metrics.lpips`, everything but LPIPS."""
+    return Scores(make(cfg.metrics.lpips) if cfg.metrics.lpips else None, cfg.metrics.scale)
+
+
+def reconstructor(cfg: DictConfig, net: nn.Module, spec: dict) -> Reconstructor:
+    """Return the Lightning module that trains and tests `net`; with a `source`, on its frames."""
+    kind = partial(Restoration, source=make(cfg.source)) if cfg.get("source") else Reconstructor
+    return kind(
+        net,
+        spec,
+        loss=make(cfg.loss),
+        optimizer=make(cfg.optimizer),
+        scheduler=make(cfg.scheduler) if cfg.scheduler else None,
+        scores=scores(cfg),
+        detach_every=cfg.data.detach_every,
+        warmup=cfg.data.warmup,
+        spike=cfg.spike,
+    )
+
+
+def share_cores(cfg: DictConfig) -> None:
+    """Leave a core to each simulating worker: threads that fight for a core wait for each other.
+
+    Threads are only taken away: a smaller OMP_NUM_THREADS stands.
+    """
+    if cfg.trainer.accelerator == "cpu":
+        left = (os.cpu_count() or 1) - cfg.data.workers
+        torch.set_num_threads(max(1, min(torch.get_num_threads(), left)))
+
+
+def trainer(cfg: DictConfig) -> lightning.Trainer:
+    """Return the trainer with its loggers and callbacks."""
+    loggers = [make(logger) for logger in cfg.logger.values()]
+    callbacks = [make(callback) for callback in cfg.callbacks.values()]
+    return make(cfg.trainer, logger=loggers, callbacks=callbacks)
+
+
+def test(
+    cfg: DictConfig, name: str, net: nn.Module, data: LightFieldData, measures: Scores
+) -> evaluation.Row:
+    """Return the scores of `net` on the test clips; in float32, whatever it was trained in."""
+    plain = {"precision": "32-true", "logger": False, "enable_checkpointing": False}
+    plain |= {"devices": 1, "num_nodes": 1, "strategy": "auto"}  # of many, one process tests
+    # On SLURM a trainer takes up what a preempted training left in its folder: this one has none.
+    plain["default_root_dir"] = None
+    quiet = make(cfg.trainer, callbacks=[], **plain)
+    return evaluation.test(name, net, data, measures, trainer=quiet, warmup=cfg.data.warmup)

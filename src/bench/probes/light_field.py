@@ -1,0 +1,166 @@
+"""Probes of the light field itself: views lost, in the wrong order, out of place, late."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from src.bench.candidates import Subject
+from src.bench.probes.clips import Stream
+from src.bench.probes.standard import Bench, Finding, worst
+from src.metrics.image import aligned_psnr
+from src.sim.optics import layout
+
+
+@dataclass(frozen=True)
+class Lost:
+    """Aligned PSNR lost when `counts` of the views are dark from the start, the worst of `draws`.
+
+    A network that takes any number of views is given the others; one of a fixed number sees zeros.
+    """
+
+    counts: Sequence[int] = (1, 2, 4)
+    draws: int = 4
+    limit: float = 0.5
+
+    def __call__(self, subject: Subject, bench: Bench) -> Finding:
+        """Return the worst loss over `counts` and draws."""
+        subject.needs_views(max(self.counts) + 1)
+        base, rng, curve = bench.standard(subject), np.random.default_rng(0), []
+        for count in self.counts:
+            gone = [rng.permutation(subject.views)[:count].tolist() for _ in range(self.draws)]
+            # A draw of this number that takes the centre view is among them.
+            gone[0] = [subject.views // 2, *(v for v in gone[0] if v != subject.views // 2)][:count]
+            losses = [base - _without(subject, bench, views) for views in gone]
+            curve.append((count, max(losses)))
+        return worst(curve, unit="dB", limit=self.limit, varied="views lost")
+
+
+@dataclass(frozen=True)
+class Permuted:
+    """Aligned PSNR lost when the views come in another order than they are said to."""
+
+    draws: int = 3
+    limit: float = 0.5
+
+    def __call__(self, subject: Subject, bench: Bench) -> Finding:
+        """Return the worst loss over `draws` orders."""
+        subject.needs_views()
+        base, rng = bench.standard(subject), np.random.default_rng(1)
+        orders = [rng.permutation(subject.views).tolist() for _ in range(self.draws)]
+        losses = [
+            base - bench.over_clips(subject, bench.streams(), lambda x, o=order: x[:, o])
+            for order in orders
+        ]
+        return Finding(max(losses), "dB", self.limit)
+
+
+@dataclass(frozen=True)
+class Misplaced:
+    """Aligned PSNR lost when one view lies so many `pixels` beside its place."""
+
+    pixels: Sequence[int] = (1, 2, 4)
+    judged: int = 2
+    limit: float = 0.3
+
+    def __call__(self, subject: Subject, bench: Bench) -> Finding:
+        """Return the loss at `judged` pixels."""
+        subject.needs_views()
+        base, curve = bench.standard(subject), []
+        for shift in self.pixels:
+
+            def moved(voxels: Tensor, shift: int = shift) -> Tensor:
+                return shifted(voxels, {_neighbour(voxels): (0, shift)})
+
+            curve.append((shift, base - bench.over_clips(subject, bench.streams(), moved)))
+        return Finding(dict(curve)[self.judged], "dB", self.limit, curve, "px out of place")
+
+
+@dataclass(frozen=True)
+class Late:
+    """Aligned PSNR lost when one view comes `windows` late."""
+
+    windows: int = 1
+    limit: float = 0.3
+
+    def __call__(self, subject: Subject, bench: Bench) -> Finding:
+        """Return the loss."""
+        subject.needs_views()
+        scores = [self._score(subject, bench, stream) for stream in bench.streams()]
+        loss = bench.standard(subject) - sum(scores) / len(scores)
+        return Finding(loss, "dB", self.limit)
+
+    def _score(self, subject: Subject, bench: Bench, stream: Stream) -> float:
+        shown = [window.clone() for window in stream.windows(stream.fps)]
+        view = _neighbour(shown[0])
+        late = [torch.zeros_like(shown[0][:, view])] * self.windows
+        late += [window[:, view].clone() for window in shown]
+        for window, seen in zip(shown, late, strict=False):
+            window[:, view] = seen
+        frames, _ = subject.play(shown, stream.positions, 1 / stream.fps)
+        return bench.score(frames, stream.target[1:])
+
+
+@dataclass(frozen=True)
+class Parallax:
+    """Aligned PSNR lost when the scene is nearer than the plane the views are registered for.
+
+    `pixels`: disparity between neighbouring views.
+    """
+
+    pixels: Sequence[int] = (1, 2, 4)
+    judged: int = 1
+    limit: float = 1.0
+
+    def __call__(self, subject: Subject, bench: Bench) -> Finding:
+        """Return the loss at `judged` pixels a view."""
+        subject.needs_views()
+        places = bench.streams()[0].positions
+        base, curve = bench.standard(subject), []
+        for shift in self.pixels:
+            moves = {i: (shift * row, shift * col) for i, (row, col) in enumerate(places)}
+            score = bench.over_clips(subject, bench.streams(), lambda x, m=moves: shifted(x, m))
+            curve.append((shift, base - score))
+        return Finding(dict(curve)[self.judged], "dB", self.limit, curve, "px of disparity")
+
+
+def shifted(voxels: Tensor, moves: dict[int, tuple[int, int]]) -> Tensor:
+    """Return (n, views, bins, h, w) with view i moved by moves[i] (down, right) pixels; no events
+    come in at the edges.
+    """
+    height, width = voxels.shape[-2:]
+    moved = voxels.clone()
+    for view, (down, right) in moves.items():
+        moved[:, view] = 0
+        to = (_span(down, height), _span(right, width))
+        at = (_span(-down, height), _span(-right, width))
+        moved[:, view, :, to[0], to[1]] = voxels[:, view, :, at[0], at[1]]
+    return moved
+
+
+def _span(shift: int, length: int) -> slice:
+    return slice(max(shift, 0), length + min(shift, 0))
+
+
+def _neighbour(voxels: Tensor) -> int:
+    """Return the index of the view before the centre one."""
+    return voxels.shape[1] // 2 - 1
+
+
+def _without(subject: Subject, bench: Bench, gone: list[int]) -> float:
+    scores = []
+    for stream in bench.streams():
+        places, state, frames = list(layout(subject.views)), None, []
+        kept = [i for i in range(subject.views) if i not in gone]
+        for window in stream.windows(stream.fps):
+            seen, _ = subject.choose(window, stream.positions)
+            if subject.network.views is None:
+                there, seen = [places[i] for i in kept], seen[:, kept]
+            else:
+                there, seen = places, seen.index_fill(1, torch.tensor(gone), 0.0)
+            frame, state = subject.step(seen, state, there, 1 / stream.fps)
+            frames.append(frame)
+        scores.append(aligned_psnr(torch.cat(frames), stream.target[1:, None])[bench.warmup :])
+    return float(torch.stack(scores).mean())

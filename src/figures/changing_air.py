@@ -1,0 +1,130 @@
+"""The adaptive network on air that rises and falls, against its first and its last level alone."""
+
+import csv
+import io
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from src.bench.probes.clips import Conditions, Stream, film
+from src.bench.timing import threads
+from src.figures.plots import save
+from src.metrics.image import aligned_psnr
+from src.models.adaptive import Adaptive
+from src.records import results
+from src.sim.pipeline import Pipeline
+
+WARMUP = 10  # first windows that do not count
+LINES = {"adaptive": "#d1571b", "always the least": "#5aa9e6", "always the most": "#1f5fa8"}
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What one way of running did in every window."""
+
+    ms: Float[np.ndarray, " windows"]
+    psnr: Float[np.ndarray, " windows"]
+    level: Float[np.ndarray, " windows"]
+    disagreement: Float[np.ndarray, " windows"]
+
+
+def write(run: Path, found: tuple[Adaptive, Pipeline] | str, course: Sequence[float]) -> str:
+    """Write `adapt.csv`, PNG and SVG to `run`; return what they say.  A reason is returned."""
+    if isinstance(found, str):
+        return f"\nThe adaptive network is not shown: {found}\n"
+    network, pipeline = found
+    stream = film(pipeline, 0, Conditions(course=tuple(course)))
+    last = len(network.levels) - 1
+    shown = {
+        "adaptive": follow(network, stream),
+        "always the least": follow(network, stream, only=0),
+        "always the most": follow(network, stream, only=last),
+    }
+    results.write_text(run / "adapt.csv", table(shown))
+    names = [f"{level.name}, {level.views}" for level in network.levels]
+    for suffix in ("png", "svg"):
+        draw(run / f"adapt.{suffix}", shown, names, network.bounds, course, stream.fps)
+    return words(shown)
+
+
+@torch.no_grad()
+def follow(network: Adaptive, stream: Stream, only: int | None = None) -> Shown:
+    """Run window by window in thread time; `only`: this level throughout, and no comparing."""
+    state, rows, places = None, [], list(stream.positions)
+    with threads(1):
+        for k, voxels in enumerate(stream.windows(stream.fps)):
+            start, window_s = time.thread_time(), 1 / stream.fps
+            if only is None:
+                frame, state = network(voxels, state, window_s=window_s, positions=places)
+                at, apart = state.level, state.disagreement
+            else:
+                frame, state = network.run(voxels, only, state, places, window_s=window_s)
+                at, apart = only, np.nan
+            ms = 1e3 * (time.thread_time() - start)
+            score = aligned_psnr(frame.float().clamp(0, 1), stream.target[k + 1][None, None])
+            rows.append((ms, float(score[0]), float(at), apart))
+    return Shown(*np.array(rows, dtype=float).T)
+
+
+def table(shown: dict[str, Shown]) -> str:
+    """Return CSV, one line for each window and way of running."""
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(["run", "window", "ms", "aligned_psnr_db", "level", "disagreement"])
+    for name, s in shown.items():
+        rows = zip(s.ms, s.psnr, s.level, s.disagreement, strict=True)
+        writer.writerows([name, k, *(f"{v:.5g}" for v in row)] for k, row in enumerate(rows))
+    return text.getvalue()
+
+
+def words(shown: dict[str, Shown]) -> str:
+    """Return what was spent and what was lost."""
+    lines = ["\n## As much as the air asks for\n", "| run | ms a window | aligned PSNR, dB |",
+             "|---|---:|---:|"]  # fmt: skip
+    for name, s in shown.items():
+        lines.append(f"| {name} | {s.ms[WARMUP:].mean():.2f} | {s.psnr[WARMUP:].mean():.2f} |")
+    lost = shown["always the most"].psnr[WARMUP:].mean() - shown["adaptive"].psnr[WARMUP:].mean()
+    lines.append(f"\nLost against always the most: {lost:.2f} dB.")
+    return "\n".join(lines) + "\n"
+
+
+def draw(
+    path: Path, shown: dict[str, Shown], names: list[str], bounds: list[float],
+    course: Sequence[float], fps: float,
+) -> Path:  # fmt: skip
+    """Draw, over time: strength of the air, disagreement, level, milliseconds, aligned PSNR."""
+    figure = Figure(figsize=(8.5, 8), layout="constrained")
+    air, apart, level, cost, quality = figure.subplots(5, 1, sharex=True)
+    windows = len(shown["adaptive"].ms)
+    t = np.arange(1, windows + 1) / fps
+    air.stairs(course, np.linspace(0, windows / fps, len(course) + 1), color="0.3", lw=1.5)
+    apart.plot(t, shown["adaptive"].disagreement, color=LINES["adaptive"], lw=1.3)
+    for bound in bounds:
+        apart.axhline(bound, color="0.6", lw=0.8, ls=":")
+    level.step(t, shown["adaptive"].level, where="mid", color=LINES["adaptive"], lw=1.5)
+    level.set_yticks(range(len(names)), [name.replace("_", " ") for name in names])
+    level.set_ylim(-0.3, len(names) - 0.7)
+    for name, s in shown.items():
+        cost.plot(t, _smooth(s.ms), color=LINES[name], lw=1.3, label=name)
+        quality.plot(t, _smooth(s.psnr), color=LINES[name], lw=1.3)
+    heads = ("D/r0", "disagreement", "network, views", "ms a window", "aligned PSNR, dB")
+    for axes, head in zip((air, apart, level, cost, quality), heads, strict=True):
+        axes.set_ylabel(head, fontsize=9)
+        axes.grid(alpha=0.25)
+    cost.set_ylim(bottom=0)
+    figure.legend(*cost.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    quality.set_xlabel("seconds")
+    figure.align_ylabels()
+    return save(figure, path)
+
+
+def _smooth(values: Float[np.ndarray, " windows"]) -> Float[np.ndarray, " windows"]:
+    """Return the median over nine windows: single late windows say nothing."""
+    padded = np.pad(values, 4, mode="edge")
+    return np.median(np.lib.stride_tricks.sliding_window_view(padded, 9), axis=1)

@@ -1,0 +1,243 @@
+"""Turbulence statistics of a dot grid seen by several views (the paper's supplement).
+
+Tilt is a dot's displacement from where it lies without turbulence, blur the mean spread of its
+Gaussian, intensity its flux over the flux's mean in time.  Lengths are pixels of the pictures
+given, times seconds.  Frames in which a fit failed are left out of every mean and counted.
+"""
+
+import csv
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from src.recordings.calibration.alignment import picture_of
+from src.recordings.calibration.boards import Circles
+from src.recordings.calibration.dots import Fits
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Of `views` views and `dots` dots, row by row; NaN where a fit failed.
+
+    `tilt` (views, frames, dots, 2); `blur` and `intensity` (views, frames, dots) with turbulence,
+    `still_blur` (views, dots) and `still_intensity` (views, still frames, dots) without.
+    """
+
+    fps: float
+    centre: int
+    tilt: Float[np.ndarray, "views frames dots 2"]
+    blur: Float[np.ndarray, "views frames dots"]
+    intensity: Float[np.ndarray, "views frames dots"]
+    still_blur: Float[np.ndarray, "views dots"]
+    still_intensity: Float[np.ndarray, "views still dots"]
+
+    @property
+    def failed(self) -> Int[np.ndarray, "views dots"]:
+        """Frames whose fit failed."""
+        return np.isnan(self.blur).sum(1)
+
+    @property
+    def blur_ratio(self) -> Float[np.ndarray, "views dots"]:
+        """Mean blur with turbulence over mean blur without."""
+        return _mean(self.blur, 1) / self.still_blur
+
+    @property
+    def scintillation(self) -> Float[np.ndarray, "views dots"]:
+        """The scintillation index with turbulence."""
+        return scintillation(self.intensity)
+
+    @property
+    def still_scintillation(self) -> Float[np.ndarray, "views dots"]:
+        """The scintillation index without turbulence: what noise and the fit alone give."""
+        return scintillation(self.still_intensity)
+
+    @property
+    def lags_s(self) -> Float[np.ndarray, " lags"]:
+        """Lags of `autocorrelation`, up to a quarter of the recording."""
+        return np.arange(max(self.tilt.shape[1] // 4, 2)) / self.fps
+
+    @property
+    def autocorrelation(self) -> Float[np.ndarray, " lags"]:
+        """Of the tilt of the middle dot of the centre view."""
+        return autocorrelation(self.tilt[self.centre, :, self.middle], len(self.lags_s))
+
+    @property
+    def within_view(self) -> Float[np.ndarray, "dots dots"]:
+        """Correlation of tilt between the dots of the centre view."""
+        return correlation(self.tilt[self.centre])
+
+    @property
+    def across_views(self) -> Float[np.ndarray, "views views"]:
+        """Correlation of tilt between the views, of the middle dot."""
+        return correlation(self.tilt[:, :, self.middle].swapaxes(0, 1))
+
+    def summary(self) -> dict[str, float]:
+        """Return what the five panels show in numbers, of the middle dot of the centre view."""
+        dot, view = self.middle, self.centre
+        off = ~np.eye(len(self.tilt), dtype=bool)
+        return {
+            "frames": self.tilt.shape[1],
+            "failed": int(self.failed.sum()),
+            "tilt_rms_px": float(np.sqrt(_mean(self.tilt[view, :, dot] ** 2, None))),
+            "tilt_decay_s": float(decay_s(self.autocorrelation, self.fps)),
+            "across_views": float(self.across_views[off].mean()) if off.any() else float("nan"),
+            "blur_ratio": float(self.blur_ratio[view, dot]),
+            "scintillation": float(self.scintillation[view, dot]),
+            "still_scintillation": float(self.still_scintillation[view, dot]),
+        }
+
+    @property
+    def middle(self) -> int:
+        """The index of the middle dot."""
+        return self.tilt.shape[2] // 2
+
+
+def measure(
+    turbulent: Sequence[Fits], still: Sequence[Fits], *, fps: float, centre: int
+) -> Statistics:
+    """Compare the fits of every view with those of the recording without turbulence.
+
+    Raises ValueError for a dot that was never fitted: it has no reference.
+    """
+    place = np.stack([_mean(fits.centres, 0) for fits in still])
+    lost = ~np.isfinite(place).all(-1) | ~np.stack([fits.ok.any(0) for fits in turbulent])
+    if lost.any():
+        raise ValueError(
+            f"turbulence: every dot must be fitted in some frame, got none for (view, dot)"
+            f" {np.argwhere(lost).tolist()}; look at the picture, change turbulence.radius"
+        )
+    return Statistics(
+        fps=fps,
+        centre=centre,
+        tilt=np.stack([fits.centres for fits in turbulent]) - place[:, None],
+        blur=np.stack([fits.blur for fits in turbulent]),
+        intensity=np.stack([fits.flux / _mean(fits.flux, 0) for fits in turbulent]),
+        still_blur=np.stack([_mean(fits.blur, 0) for fits in still]),
+        still_intensity=np.stack([fits.flux / _mean(fits.flux, 0) for fits in still]),
+    )
+
+
+def find_dots(
+    picture: Float[np.ndarray, "h w"], rows: int, cols: int, dark: bool = True
+) -> Float[np.ndarray, "dots 2"]:
+    """Return the middle (x, y) of each dot, row by row, of an upright grid.
+
+    Raises ValueError where the picture does not show exactly such a grid.
+    """
+    points = Circles(rows, cols, dark).find(picture_of(picture))
+    if points is None:
+        raise ValueError(f"turbulence: a {rows}x{cols} grid of dots must be seen, got none")
+    by_row = points[np.argsort(points[:, 1])].reshape(rows, cols, 2)
+    return np.concatenate([row[np.argsort(row[:, 0])] for row in by_row])
+
+
+def radius(places: Float[np.ndarray, "dots 2"]) -> int:
+    """Return a third of the distance of neighbouring dots: room for a dot that wanders."""
+    apart = np.linalg.norm(places[:, None] - places, axis=-1)
+    return max(3, round(apart[apart > 0].min() / 3))
+
+
+def ground(
+    picture: Float[np.ndarray, "h w"], places: Float[np.ndarray, "dots 2"], reach: int
+) -> Float[np.ndarray, "h w"]:
+    """Return the light between dark dots, continued under them: a quadratic in x and y, fitted
+    where no dot is within `reach` pixels; at least a twentieth of its largest value."""
+    y, x = (
+        2 * axis / max(axis.max(), 1) - 1 for axis in np.mgrid[: len(picture), : len(picture[0])]
+    )
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+    rows, cols = np.indices(picture.shape)
+    near = [np.hypot(cols - cx, rows - cy) <= reach for cx, cy in places]
+    between = ~np.any(near, axis=0)
+    fitted = terms @ np.linalg.lstsq(terms[between], picture[between], rcond=None)[0]
+    return np.maximum(fitted, 0.05 * fitted.max())
+
+
+def autocorrelation(tilt: Float[np.ndarray, "frames 2"], lags: int) -> Float[np.ndarray, " lags"]:
+    """Return (<ax(t) ax(t + lag)> / <ax^2> + the same of y) / 2 for lags of 0, 1, ... frames."""
+    power = _mean(tilt**2, 0)
+    count = len(tilt)
+    products = [_mean(tilt[: count - lag] * tilt[lag:], 0) for lag in range(lags)]
+    return (np.array(products) / power).mean(1)
+
+
+def correlation(tilt: Float[np.ndarray, "frames k 2"]) -> Float[np.ndarray, "k k"]:
+    """Return <a_i . a_j> / sqrt(<|a_i|^2> <|a_j|^2>) over the frames that have both."""
+    both = np.isfinite(tilt).all(-1).astype(float)
+    filled = np.nan_to_num(tilt)
+    products = np.einsum("tic,tjc->ij", filled, filled)
+    power = np.einsum("ti,tj->ij", (filled**2).sum(-1), both)
+    return products / np.sqrt(power * power.T)
+
+
+def scintillation(
+    intensity: Float[np.ndarray, "views frames dots"],
+) -> Float[np.ndarray, "views dots"]:
+    """Return <I^2> / <I>^2 - 1 over the frames."""
+    return _mean(intensity**2, 1) / _mean(intensity, 1) ** 2 - 1
+
+
+def decay_s(
+    correlations: Float[np.ndarray, " lags"], fps: float, level: float = np.exp(-1)
+) -> float:
+    """Return the lag in seconds where a correlation first falls to `level`; inf if nowhere."""
+    below = np.flatnonzero(correlations <= level)
+    if not below.size:
+        return float("inf")
+    k = int(below[0])
+    if k == 0:
+        return 0.0
+    high, low = correlations[k - 1], correlations[k]
+    return (k - 1 + (high - level) / (high - low)) / fps
+
+
+def sampling_error(tilt: Float[np.ndarray, "frames 2"]) -> float:
+    """Return the standard error of a correlation between two independent series like `tilt`.
+
+    Bartlett's formula: variance (1 + 2 sum r(k)^2) / frames per axis, two axes averaged.
+    """
+    r = autocorrelation(tilt, max(len(tilt) // 4, 2))
+    return float(np.sqrt((1 + 2 * (r[1:] ** 2).sum()) / (2 * len(tilt))))
+
+
+def write_csv(
+    statistics: Statistics, path: Path | str, positions: Sequence[tuple[int, int]]
+) -> None:
+    """Write one row per view and dot: failures, tilt, blur, their ratio, scintillation."""
+    rows = []
+    for view, position in enumerate(positions):
+        for dot in range(statistics.tilt.shape[2]):
+            tilt = statistics.tilt[view, :, dot]
+            rows.append(
+                {
+                    "row": position[0],
+                    "col": position[1],
+                    "dot": dot,
+                    "frames": len(tilt),
+                    "failed": int(statistics.failed[view, dot]),
+                    "tilt_x_rms_px": np.sqrt(_mean(tilt[:, 0] ** 2, 0)),
+                    "tilt_y_rms_px": np.sqrt(_mean(tilt[:, 1] ** 2, 0)),
+                    "tilt_decay_s": decay_s(
+                        autocorrelation(tilt, len(statistics.lags_s)), statistics.fps
+                    ),
+                    "blur_px": _mean(statistics.blur[view, :, dot], 0),
+                    "blur_ratio": statistics.blur_ratio[view, dot],
+                    "scintillation": statistics.scintillation[view, dot],
+                    "still_scintillation": statistics.still_scintillation[view, dot],
+                }
+            )
+    with open(path, "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _mean(values: np.ndarray, axis: int | None) -> np.ndarray | float:
+    """The mean of what is finite; NaN, without a warning, where nothing is."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return np.nanmean(values, axis=axis)

@@ -1,0 +1,124 @@
+"""What is looked at: events of a sensor of known size, a sensor picture, a film."""
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+from jaxtyping import Float
+
+from src.recordings.files import formats, tables
+from src.recordings.views import Size
+from src.sim.scenes.pictures import LARGEST_PIXELS, open_video, read_picture
+
+PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+FILMS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".gif")
+
+
+def sensor_size(path: Path | str, sensor: Sequence[int] | None = None) -> Size:
+    """Return (height, width) of the recording's sensor; `sensor` for a file that does not say.
+
+    Raises ValueError where neither says, or both do and differ.
+    """
+    told = formats.open_events(path).size
+    told = told if told is None else told[::-1]
+    if told is None and sensor is None:
+        raise ValueError(f"{path} does not state its sensor; give sensor=[height,width]")
+    if None not in (told, sensor) and tuple(sensor) != told:
+        raise ValueError(f"sensor must be {told}, as {path} states, got {tuple(sensor)}")
+    return told or tuple(sensor)
+
+
+def events(path: Path | str, sensor: Size, seconds: float = 0.05) -> Iterator[np.ndarray]:
+    """Yield the events of a recording, `seconds` at a time."""
+    return formats.iter_events(path, seconds=seconds, size=sensor[::-1])
+
+
+def sensor_picture(
+    path: Path | str, sensor: Sequence[int] | None = None
+) -> Float[np.ndarray, "h w"]:
+    """Return a picture in [0, 1], the mean of a film, or the events of each pixel of a recording.
+
+    A target that blinks on a dark screen makes events where it is bright: their count shows it.
+    Raises ValueError for a file that cannot be read.
+    """
+    path = Path(path)
+    if path.suffix.lower() in PICTURES:
+        return _picture(path)
+    if not holds_events(path):
+        total, count = 0.0, 0
+        for frame in film(path):
+            total, count = total + frame, count + 1
+        return total / count
+    counts = np.zeros(sensor_size(path, sensor))
+    for chunk in events(path, counts.shape):
+        pixels = np.ravel_multi_index((chunk["y"], chunk["x"]), counts.shape)
+        counts += np.bincount(pixels, minlength=counts.size).reshape(counts.shape)
+    return counts
+
+
+def holds_events(path: Path | str) -> bool:
+    """Return whether `path` is none of: folder of pictures, picture, film, our `video.h5`."""
+    path = Path(path)
+    if path.is_dir() or path.suffix.lower() in PICTURES + FILMS:
+        return False
+    return not (path.suffix == ".h5" and _has_frames(path))
+
+
+def film(path: Path | str) -> Iterator[Float[np.ndarray, "h w"]]:
+    """Yield the grey frames in [0, 1], float32, of a film, a folder of pictures or our `video.h5`.
+
+    Raises ValueError for a file that cannot be read or has no frame.
+    """
+    path, none = Path(path), True
+    for frame in _frames(path):
+        none = False
+        yield frame
+    if none:
+        raise ValueError(f"recording must be a film or a folder of pictures, got {path}")
+
+
+def _frames(path: Path) -> Iterator[np.ndarray]:
+    if path.is_dir():
+        names = sorted(name for name in path.iterdir() if name.suffix.lower() in PICTURES)
+        yield from map(_picture, names)
+    elif path.suffix == ".h5":
+        for frame in _video_h5(path):
+            yield frame.astype(np.float32) / 255
+    else:
+        video = open_video(path, "recording")
+        while (read := video.read())[0]:
+            yield cv2.cvtColor(read[1], cv2.COLOR_BGR2GRAY).astype(np.float32) / 255
+
+
+def _video_h5(path: Path) -> Iterator[np.ndarray]:
+    try:
+        with h5py.File(path) as file:
+            tables.check_inside(file)
+            frames = file["frames"]
+            if frames.ndim != 3 or frames.dtype != np.uint8:
+                raise ValueError("frames must be uint8 (n, h, w)")
+            if math.prod(frames.shape[1:]) > LARGEST_PIXELS:
+                raise ValueError(f"frames must have {LARGEST_PIXELS} pixels at most")
+            yield from frames
+    except Exception as error:  # HDF5 raises all kinds on a broken file
+        raise ValueError(f"{path}: cannot be read as a video: {error}") from error
+
+
+def _picture(path: Path) -> np.ndarray:
+    picture = read_picture(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    if picture is None or picture.dtype.kind != "u":
+        raise ValueError(
+            f"recording must be a readable picture of at most {LARGEST_PIXELS} pixels, got {path}"
+        )
+    return picture.astype(np.float32) / np.iinfo(picture.dtype).max
+
+
+def _has_frames(path: Path) -> bool:
+    try:
+        with h5py.File(path) as file:
+            return "frames" in file
+    except OSError:
+        return False

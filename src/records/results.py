@@ -1,0 +1,163 @@
+"""The record of a run: its folder, the resolved config, `results.json`, `clips.csv`, the table."""
+
+import csv
+import hashlib
+import io
+import json
+import os
+import shutil
+import statistics
+import subprocess
+from pathlib import Path
+
+import rich
+from rich.table import Table
+
+from src.metrics.bootstrap import interval
+from src.recordings.files import plain
+from src.training.evaluation import Row
+
+SCHEMA = 1
+LEAST_FREE_BYTES = 200 * 2**20
+METRICS = ("lpips", "ssim", "psnr", "psnr_aligned", "wobble")
+
+
+def open_run(run: Path, config: str) -> None:
+    """Make the folder `run` and store the resolved `config` (YAML) in it.
+
+    Raises ValueError where the folder cannot be made or the disk is nearly full.
+    """
+    try:
+        run.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"paths.out must be a folder to write to, got {run}: {error}") from error
+    free = shutil.disk_usage(run).free
+    if free < LEAST_FREE_BYTES:
+        needed = LEAST_FREE_BYTES // 2**20
+        raise ValueError(f"paths.out must have {needed} MiB free, got {free // 2**20} MiB at {run}")
+    write_text(run / "config.yaml", config)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write `text` to `path` whole or not at all: to a temporary name, then renamed."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text)
+    os.replace(partial, path)
+
+
+def content(config: str) -> dict:
+    """Return what a resolved `config` (YAML) says of the numbers, and not of where they are put.
+
+    Left out: `paths`, and for training the `ckpt` it went on from (law 6).
+    """
+    found = plain.parse(config)
+    run = found.pop("paths", {}).get("run")
+    if found.get("task") == "train":
+        found.pop("ckpt", None)
+    return json.loads(json.dumps(found).replace(json.dumps(run)[1:-1], "RUN")) if run else found
+
+
+def digest(config: str) -> str:
+    """Return the SHA-256 of the content of a resolved `config`: the same in every folder."""
+    return hashlib.sha256(json.dumps(content(config), sort_keys=True).encode()).hexdigest()
+
+
+def standing(run: Path, config: str) -> bool:
+    """Return whether `run` holds the results of `config` already.
+
+    Raises ValueError where it holds those of another one: a sweep overwrites no result.
+    """
+    file = run / "results.json"
+    if not file.is_file():
+        return False
+    if json.loads(file.read_text()).get("config_sha256") != digest(config):
+        raise ValueError(
+            f"paths.out must be another folder, or {run} moved away: it holds results of another "
+            "configuration"
+        )
+    return True
+
+
+def summary(clips: list[dict]) -> dict:
+    """Return {clips, metric: {mean, std, interval}} over clips; the spread of one clip is 0.
+
+    `interval`: 95 % of the means of resampled clips.
+    """
+    found = [metric for metric in METRICS if clips and metric in clips[0]]
+    values = {metric: [clip[metric] for clip in clips] for metric in found}
+    return {"clips": len(clips)} | {
+        metric: {"mean": statistics.fmean(v), "std": statistics.pstdev(v), "interval": interval(v)}
+        for metric, v in values.items()
+    }
+
+
+def write(run: Path, config: str, rows: list[Row], **facts) -> dict:
+    """Write `results.json` and `clips.csv` of the first row into `run`, print the table.
+
+    `facts`: task, experiment, seed, wall_s, device ...  Returns the content of `results.json`.
+    """
+    first = rows[0]
+    record = {
+        "schema": SCHEMA,
+        **facts,
+        "git": commit(),
+        "config_sha256": digest(config),
+        "model": {
+            "name": first.name,
+            "params": first.params,
+            "macs_per_frame": first.macs_per_frame,
+        },
+        "test": summary(first.clips),
+        "latency_ms": first.latency_ms,
+        "compared": {row.name: summary(row.clips) for row in rows[1:]},
+    }
+    write_text(run / "clips.csv", clips_csv(first.clips))
+    write_text(run / "results.json", json.dumps(record, indent=2) + "\n")
+    rich.print(table(rows))
+    files = sorted(str(file.relative_to(run)) for file in run.rglob("*.*") if file.is_file())
+    rich.print(f"in {run}: " + ", ".join(file for file in files if not file.startswith(".")))
+    return record
+
+
+def clips_csv(clips: list[dict]) -> str:
+    """Return one line per clip: what was drawn for it and its scores."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, fieldnames=list(clips[0]))
+    writer.writeheader()
+    writer.writerows(clips)
+    return text.getvalue()
+
+
+def table(rows: list[Row]) -> Table:
+    """Return the rows as a table: mean over clips; the arrow says which way is better."""
+    heads = {
+        "lpips": "LPIPS ↓",
+        "ssim": "SSIM ↑",
+        "psnr": "PSNR ↑",
+        "psnr_aligned": "aligned PSNR ↑",
+        "wobble": "wobble px ↓",
+    }
+    picture = Table(title=f"{len(rows[0].clips)} test clips, mean of per-frame values")
+    picture.add_column("network")
+    for metric in METRICS:
+        picture.add_column(heads[metric], justify="right")
+    picture.add_column("ms/frame", justify="right")
+    for row in rows:
+        means = summary(row.clips)
+        cells = [f"{means[m]['mean']:.4f}" if m in means else "-" for m in METRICS]
+        picture.add_row(row.name, *cells, f"{next(iter(row.latency_ms.values())):.1f}")
+    return picture
+
+
+def commit() -> str:
+    """Return the commit of the working tree, with `-dirty` where it differs; else `unknown`."""
+    try:
+        return subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--abbrev=12"],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"

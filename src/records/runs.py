@@ -1,0 +1,133 @@
+"""Runs as their folders tell of them: `results.json`, `config.yaml`, `clips.csv`, pictures.
+
+What a folder is called says nothing here; what was asked for stands in `results.json`.
+"""
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
+from src.recordings.files import plain
+from src.records import results
+
+FIGURES = ("chart", "machine", "adapt", "stress")  # of the doors chart and stress
+WITHOUT_NUMBERS = ("seed", "name", "task", "logger", "callbacks", "paths", "hydra")
+MACHINE = ("data.workers", "data.simulate_on", "trainer.accelerator", "trainer.devices")
+
+
+@dataclass(frozen=True)
+class Run:
+    """One `results.json`, with the resolved config as {dotted key: value} and its clips' scores."""
+
+    folder: Path
+    record: dict
+    settings: dict[str, Any]
+    clips: list[dict[str, str]]
+
+    @property
+    def choices(self) -> dict[str, str]:
+        """Return group -> choice of the config groups, the experiment first."""
+        chosen = {"task": self.record["task"], "experiment": self.record["experiment"]}
+        asked = self.record.get("asked", {}).get("choices", {})
+        return chosen | {k: str(v) for k, v in asked.items() if k not in WITHOUT_NUMBERS}
+
+    @property
+    def overrides(self) -> list[str]:
+        """Return the overrides of the command line, such as `seed=0`."""
+        return self.record.get("asked", {}).get("overrides", [])
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Return the settings that numbers depend on; runs that agree differ in their seed only."""
+        return {
+            key: value
+            for key, value in self.settings.items()
+            if key.split(".")[0] not in WITHOUT_NUMBERS and key not in MACHINE
+        }
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A sweep as it was started: its command, and the overrides of each of its jobs."""
+
+    command: str
+    jobs: list[list[str]]
+
+
+def find(folders: list[Path]) -> list[Run]:
+    """Return the runs at or below `folders`, oldest first.
+
+    Raises ValueError for a folder that is not there or has no results, and for a file that is no
+    `results.json` of this schema.
+    """
+    found = {}
+    for folder in folders:
+        if not folder.is_dir():
+            raise ValueError(f"run must be folders of runs, got {folder}: no such folder")
+        files = list(folder.rglob("results.json"))
+        if not files and not figures([folder]):
+            raise ValueError(f"run must hold results.json, got {folder}: empty or not finished")
+        found |= {file.resolve(): file for file in files}
+    return sorted(map(_read, found.values()), key=lambda run: _age(run.folder))
+
+
+def plans(folders: list[Path]) -> list[Plan]:
+    """Return the sweeps whose `multirun.yaml` lies at or below `folders`."""
+    files = {f.resolve() for folder in folders for f in folder.rglob("multirun.yaml")}
+    return [_plan(plain.read(file)["hydra"]) for file in sorted(files)]
+
+
+def figures(folders: list[Path]) -> list[Path]:
+    """Return the charts and heat maps at or below `folders`; the vector picture where both are."""
+    found = {}
+    for folder in folders:
+        for name in (f"{stem}{suffix}" for stem in FIGURES for suffix in (".png", ".svg")):
+            found |= {(f.resolve().parent, f.stem): f for f in sorted(folder.rglob(name))}
+    return list(found.values())
+
+
+def flat(node: Any, prefix: str = "") -> dict[str, Any]:
+    """Return {dotted key: value} of nested dicts; lists are values."""
+    if not isinstance(node, dict) or not node:
+        return {prefix: node}
+    return {
+        key: value
+        for name, child in node.items()
+        for key, value in flat(child, f"{prefix}.{name}" if prefix else str(name)).items()
+    }
+
+
+def _read(file: Path) -> Run:
+    try:
+        record = json.loads(file.read_text())
+        schema = record["schema"]
+        settings = flat(results.content((file.parent / "config.yaml").read_text()))
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, yaml.YAMLError) as error:
+        raise ValueError(f"run must hold whole results, got {file}: {error}") from error
+    if schema != results.SCHEMA:
+        raise ValueError(f"schema must be {results.SCHEMA}, got {schema} in {file}")
+    clips = file.parent / "clips.csv"
+    rows = list(csv.DictReader(clips.read_text().splitlines())) if clips.is_file() else []
+    return Run(file.parent, record, settings, rows)
+
+
+def _age(folder: Path) -> tuple[float, str]:
+    return (folder / "results.json").stat().st_mtime, str(folder)
+
+
+def _plan(hydra: dict) -> Plan:
+    asked = list(hydra["overrides"]["task"])
+    params = (hydra["sweeper"].get("params") or {}).items()
+    lines = [f"{key}={value}" for key, value in params] + asked
+    parsed = OverridesParser.create().parse_overrides(lines)
+    door, config = hydra["job"]["name"], hydra["job"]["config_name"]
+    start = f"python -m src.{door} " + (
+        "-m" if door == config else f"--config-dir sweeps --config-name {config}"
+    )
+    return Plan(" ".join([start, *asked]), BasicSweeper.split_arguments(parsed, None)[0])

@@ -1,0 +1,74 @@
+"""What an event sensor accepts, and the errors that say so."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from src.sim.sensor.engines.job import DEFER, DELETE, HOLD, State
+
+MODES = {"defer": DEFER, "delete": DELETE, "hold": HOLD}
+CHOICES = {
+    "refractory": tuple(MODES),
+    "stamps": ("linear", "v2e"),
+    "input": ("linear", "srgb"),
+    "response": ("log", "linlog"),
+}
+RANGES = {
+    "refractory_s": (0, 10),
+    "mismatch": (0, 1),
+    "leak_hz": (0, 1e4),
+    "shot_hz": (0, 1e6),
+    "floor": (1e-3, 1),
+    "off_ratio": (0.1, 10),
+    "hot_fraction": (0, 1),
+    "hot_hz": (0, 1e6),
+    "cutoff_hz": (0, 1e6),
+}
+THRESHOLDS = (0.01, 5)
+
+
+def threshold_range(threshold: float | Sequence[float]) -> tuple[float, float]:
+    """Return (low, high) of `sensor.threshold`, a number or a range."""
+    ends = (threshold, threshold) if isinstance(threshold, int | float) else tuple(threshold)
+    if len(ends) != 2 or ends[0] > ends[1]:
+        raise ValueError(f"sensor.threshold must be a number or [low, high], got {list(ends)}")
+    for end in ends:
+        within("sensor.threshold", end, *THRESHOLDS)
+    return float(ends[0]), float(ends[1])
+
+
+def check(settings: dict) -> None:
+    """Raise ValueError for the first of a sensor's settings that is outside its range."""
+    for name, allowed in CHOICES.items():
+        if settings[name] not in allowed:
+            raise ValueError(
+                f"sensor.{name} must be one of {', '.join(allowed)}, got {settings[name]!r}"
+            )
+    for name, (low, high) in RANGES.items():
+        within(f"sensor.{name}", settings[name], low, high)
+    threshold_range(settings["threshold"])
+
+
+def within(name: str, value: float, low: float, high: float) -> None:
+    """Raise ValueError for a value outside [low, high], or nan."""
+    if not low <= value <= high:
+        raise ValueError(f"{name} must be in [{low:g}, {high:g}], got {value}")
+
+
+def check_frames(frames: Tensor, fps: float, state: State | None) -> None:
+    """Raise ValueError for frames, a rate or a state that a sensor cannot take."""
+    if frames.ndim != 5 or frames.dtype != torch.float32:
+        raise ValueError(
+            f"frames must be float32 (n, views, frames, h, w), got {frames.dtype} "
+            f"{tuple(frames.shape)}"
+        )
+    within("fps", fps, 1e-3, 1e6)
+    n, v, count, h, w = frames.shape
+    if min(n, v, h, w) < 1 or count < (2 if state is None else 1):
+        raise ValueError(f"events need two frames of at least one pixel, got {tuple(frames.shape)}")
+    low, high = torch.aminmax(frames)
+    if not (low >= -1e-4 and high <= 1 + 1e-4):
+        raise ValueError(f"frames must be finite and in [0, 1], got {low:g} to {high:g}")
+    if state is not None and state.level.shape != (n, v, h, w):
+        raise ValueError(f"state is of {tuple(state.level.shape)}, frames are {(n, v, h, w)}")

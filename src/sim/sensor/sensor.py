@@ -1,0 +1,256 @@
+"""The event sensor: frames in, events or voxel grids out, with exact crossing times.
+
+Between two frames the log intensity of a pixel is linear in time; an event is the moment at which
+it is a threshold away from the pixel's reference.  Levels and thresholds are integers and noise is
+a function of (seed, clip, view, pixel, frame), so all engines, crops and batches agree bit for
+bit.  The sensor's clock ticks in microseconds: an event of frame interval k is stamped with the
+tick in which it falls, in [edge_k, edge_k+1) with edge_k = ceil(k 10^6 / fps).
+"""
+
+import math
+from collections.abc import Sequence
+from copy import copy
+from importlib.util import find_spec
+from types import ModuleType
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+from torch import Tensor
+
+from src.sim import noise
+from src.sim.sensor.engines import sensor_cpu, sensor_eager
+from src.sim.sensor.engines.job import Job, State
+from src.sim.sensor.limits import MODES, THRESHOLDS, check, check_frames, threshold_range, within
+from src.sim.sensor.response import EXTRA, UNIT, decode_srgb, nodes, response_table
+
+__all__ = ["EVENT", "EventSensor", "State", "decode_srgb"]
+
+EVENT = sensor_cpu.EVENT
+SHY = 2  # thresholds are lowered by so many units: a change of n C makes n events, rounded or not
+
+
+class EventSensor:
+    """An event camera's pixels.
+
+    `threshold` C, in nat of intensity as `input` has it, one number or a range (low, high) out of
+    which `sample_threshold` draws a clip's; `off_ratio`, the OFF threshold over the ON threshold.
+    `refractory_s` the dead time after an event; `refractory` what becomes of a crossing within it:
+    `defer` (the reference waits, the event comes when the dead time ends; v2e), `delete` (the
+    reference moves on, the event is lost; ESIM), `hold` (the pixel is in reset and starts from the
+    level at the end; hardware).  `stamps`: `linear`, the crossing's own time, or `v2e`, spread
+    evenly by the busiest pixel of the view.  `input`: `linear`, the frames are taken for intensity
+    as they are, or `srgb`, the frames are decoded here; whoever decodes them before passes
+    `linear`.  `response`: `log` of max(intensity, floor), or `linlog`, v2e's.
+    `mismatch`: relative deviation of a pixel's thresholds, fixed per (seed, view, pixel).
+    `leak_hz`: ON events of a pixel in the dark.  `shot_hz`: noise events of a black pixel (a white
+    one has a quarter).  `hot_fraction` of the pixels make `hot_hz` noise events.  `cutoff_hz`: the
+    photoreceptor's low-pass at full intensity, 0 for none.
+    """
+
+    def __init__(
+        self,
+        threshold: float | Sequence[float] = 0.2,
+        *,
+        refractory_s: float = 0.005,
+        refractory: str = "defer",
+        stamps: str = "linear",
+        input: str = "linear",
+        mismatch: float = 0.0,
+        leak_hz: float = 0.0,
+        shot_hz: float = 0.0,
+        seed: int = 0,
+        response: str = "log",
+        floor: float = 1 / 255,
+        off_ratio: float = 1.0,
+        hot_fraction: float = 0.0,
+        hot_hz: float = 0.0,
+        cutoff_hz: float = 0.0,
+    ):
+        self.threshold = threshold if isinstance(threshold, int | float) else tuple(threshold)
+        self.refractory_s, self.refractory, self.stamps = refractory_s, refractory, stamps
+        self.input, self.response, self.floor = input, response, floor
+        self.mismatch, self.off_ratio = mismatch, off_ratio
+        self.leak_hz, self.shot_hz = leak_hz, shot_hz
+        self.hot_fraction, self.hot_hz, self.cutoff_hz = hot_fraction, hot_hz, cutoff_hz
+        self.seed = seed
+        check(vars(self))
+        self._table = response_table(response, input, floor)
+
+    def at(self, threshold: float) -> "EventSensor":
+        """Return the same sensor with one threshold."""
+        found = copy(self)
+        found.threshold = threshold
+        check(vars(found))
+        return found
+
+    def sample_threshold(self, generator: torch.Generator) -> float:
+        """Return one clip's threshold: uniform in the range, or the number itself."""
+        low, high = threshold_range(self.threshold)
+        return low + (high - low) * float(torch.rand((), generator=generator))
+
+    def voxels(
+        self,
+        frames: Float[Tensor, "n views frames h w"],
+        fps: float,
+        bins: int = 5,
+        *,
+        substeps: int = 1,
+        clips: Sequence[int] | None = None,
+        views: Sequence[int] | None = None,
+        origin: tuple[int, int] = (0, 0),
+        full_width: int | None = None,
+        threshold: Float[Tensor, " n"] | None = None,
+    ) -> Float[Tensor, "n views windows bins h w"]:
+        """Return one grid per window of `substeps` frame intervals, float32 on the frames' device.
+
+        `fps` is the rate of `frames`; intensities in [0, 1].  `clips` and `views` (ids) and the
+        crop's `origin` (top, left) in a frame `full_width` wide key the noise.  `threshold`: ON
+        threshold per clip, instead of the sensor's.  Frames after the last whole window are not
+        simulated.  Raises ValueError for frames that are not finite or outside [0, 1], or too few.
+        """
+        usable = (frames.shape[2] - 1) // substeps * substeps + 1
+        if usable < 2:
+            raise ValueError(f"events need at least {substeps + 1} frames, got {frames.shape[2]}")
+        return self.step(
+            frames[:, :, :usable], fps, None, bins, substeps=substeps, clips=clips, views=views,
+            origin=origin, full_width=full_width, threshold=threshold,
+        )[0]  # fmt: skip
+
+    def step(
+        self,
+        frames: Float[Tensor, "n views frames h w"],
+        fps: float,
+        state: State | None = None,
+        bins: int = 5,
+        *,
+        substeps: int = 1,
+        **keys,
+    ) -> tuple[Float[Tensor, "n views windows bins h w"], State]:
+        """Return the grids of a chunk and the state to go on from; `keys` as in `voxels`.
+
+        With `state` None the first frame only sets the references; later chunks hold new frames
+        only, a whole number of windows of them.
+        """
+        job = self._job(frames, fps, state, substeps, **keys)
+        if job.intervals % substeps:
+            raise ValueError(f"{job.intervals} intervals are not whole windows of {substeps}")
+        n, views, _, h, w = frames.shape
+        shape = (n, views, job.intervals // substeps, bins, h, w)
+        if frames.device.type == "cpu":  # numpy's memory is in huge pages: 5 times cheaper
+            grids = sensor_cpu.voxels(job, torch.from_numpy(np.empty(shape, np.float32)))
+        else:
+            grids = _engine(job).voxels(job, torch.empty(shape, device=frames.device))
+        job.state.frame += job.intervals
+        return grids, job.state
+
+    def counts(
+        self, frames: Float[Tensor, "n views frames h w"], fps: float, **keys
+    ) -> Int[Tensor, "n views 2"]:
+        """Return the numbers of ON and OFF events of each clip and view; `keys` as in `voxels`."""
+        return sensor_cpu.counts(self._job(frames.cpu(), fps, None, 1, **keys))
+
+    def events(
+        self, frames: Float[Tensor, "frames h w"], fps: float, *, clip: int = 0, view: int = 0,
+        origin: tuple[int, int] = (0, 0), full_width: int | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        """Return the events of one view in order of time: t int64 us, x, y uint16, p int8 -1 or 1.
+
+        Time starts at the first frame.  Raises ValueError as `voxels` does.
+        """
+        keys = {"clips": [clip], "views": [view], "origin": origin, "full_width": full_width}
+        return sensor_cpu.events(self._job(frames[None, None].cpu(), fps, None, 1, **keys))
+
+    def _job(
+        self, frames, fps, state, substeps, *, clips=None, views=None, origin=(0, 0),
+        full_width=None, threshold=None,
+    ) -> Job:  # fmt: skip
+        n, v, _, h, w = frames.shape
+        check_frames(frames, fps, state)
+        for name in ("shot_hz", "hot_hz"):
+            within(f"sensor.{name}", getattr(self, name), 0, fps)
+        clips, views = range(n) if clips is None else clips, range(v) if views is None else views
+        first = 0 if state is None else state.frame
+        return Job(
+            frames=frames,
+            fresh=state is None,
+            tables=self._tables(fps, frames.device),
+            state=_blank(n, v, h, w, frames.device) if state is None else state,
+            edges=_clock(fps, first, frames.shape[2] + (state is not None)),
+            substeps=substeps,
+            mode=MODES[self.refractory],
+            v2e=self.stamps == "v2e",
+            wait=self.refractory_s * fps,
+            chips=self._chips(n, threshold),
+            leak=round(self.leak_hz / fps * 2**24),
+            shot=round(self.shot_hz / fps * 2**32),
+            hot=round(self.hot_hz / fps * 2**32),
+            chip_keys=np.array(
+                [[noise.key(self.seed, i, word) for word in ("mismatch", "hot")] for i in views],
+                np.int64,
+            ),
+            shot_keys=np.array(
+                [[noise.key(self.seed, c, i, "shot") for i in views] for c in clips], np.int64
+            ),
+            place=(*origin, w if full_width is None else full_width),
+        )
+
+    def _chips(self, n: int, threshold: Tensor | None) -> NDArray[np.int64]:
+        """Return the integers of each clip's chip; see Job."""
+        if threshold is None:
+            low, high = threshold_range(self.threshold)
+            if low < high:
+                raise ValueError(
+                    f"sensor.threshold is the range {low} to {high}: draw one per clip, "
+                    "sample_threshold, and give it as `threshold`"
+                )
+            threshold = torch.full((n,), low, dtype=torch.float64)
+        on = threshold.double().cpu().numpy()
+        within("sensor.threshold", float(on.min()), *THRESHOLDS)
+        within("sensor.threshold", float(on.max()), *THRESHOLDS)
+        spread, hot = round(self.mismatch * UNIT), round(self.hot_fraction * 2**32)
+        parts = [np.floor(on * UNIT) - SHY, np.floor(on * self.off_ratio * UNIT) - SHY]
+        return np.stack([*parts, np.full(n, spread), np.full(n, hot)], 1).astype(np.int64)
+
+    def _tables(self, fps: float, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the tables of level, decay and lag; the last two of one node without a filter.
+
+        The photoreceptor is one pole whose corner frequency is proportional to intensity (v2e). For
+        a level that moves linearly by D in an interval dt and a/tau = 2 pi f dt the exact solution
+        is y1 + (filtered0 - y0) exp(-a) - D (1 - exp(-a)) / a, whatever the interval.
+        """
+        level = self._table.to(device)
+        if self.cutoff_hz == 0:
+            return level, level[:1], level[:1]
+        x = nodes()
+        if self.input == "srgb":
+            x = decode_srgb(torch.from_numpy(x)).numpy()
+        a = 2 * math.pi * self.cutoff_hz / fps * (255 * x + 20) / 275
+        decay, lag = np.exp(-a), -np.expm1(-a) / a
+        scaled = [np.rint(part * UNIT * 2**EXTRA).astype(np.int32) for part in (decay, lag)]
+        return level, *(torch.from_numpy(part).to(device) for part in scaled)
+
+
+def _engine(job: Job) -> ModuleType:
+    """Return the engine of a device: on CUDA, Triton's where it is installed, else plain torch."""
+    if job.frames.is_cuda and not job.v2e and find_spec("triton"):
+        from src.sim.sensor.engines import (
+            sensor_triton,  # imports Triton, which is not there everywhere
+        )
+
+        return sensor_triton
+    return sensor_eager
+
+
+def _clock(fps: float, first: int, count: int) -> NDArray[np.int64]:
+    """Return ceil(k 10^6 / fps) for `count` frames from `first` on; strictly increasing."""
+    return np.ceil(np.arange(first, first + count) * (1e6 / fps) - 1e-6).astype(np.int64)
+
+
+def _blank(n: int, views: int, h: int, w: int, device: torch.device) -> State:
+    shape = (n, views, h, w)
+    level, source, reference = (
+        torch.empty(shape, dtype=torch.int32, device=device) for _ in range(3)
+    )
+    return State(level, source, reference, torch.empty(shape, device=device))

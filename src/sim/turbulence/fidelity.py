@@ -1,0 +1,210 @@
+"""No more than a scene needs: how finely an atmosphere is simulated, and what that costs in error.
+
+Errors are powers, as shares of the power by which turbulence at random changes a picture (its blur
+against the mean blur, tilt apart) with the spectrum 1 / f^2 of natural ones.  The tables behind
+them are measured on exact PSFs by scripts/p2s_errors.py and kept beside the networks.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from functools import cache
+
+from jaxtyping import Float
+from safetensors.torch import load_file
+from torch import Tensor
+
+from src.sim.turbulence.atmosphere import Atmosphere
+from src.sim.turbulence.p2s import FILE, FINE_PER_AIRY, Band, bands
+
+CONTRAST = 0.2  # rms contrast of a natural picture
+UNSEEN = 0.5 / 255  # rms error that nobody needs to go below
+SHARES = {"modes": 0.42, "pitch": 0.33, "rank": 0.15, "kernel": 0.1}  # of the tolerance
+BEYOND = 1.06  # the networks are fitted a little beyond the edge of their band
+EXACT_MODES = 119  # whole orders up to n = 14, for D/r0 beyond the tables
+MOST_MODES = 200
+MAX_PITCH = 64
+UNRELATED = 2.0  # the error of a PSF taken from a place that has nothing to do with it
+TILT_ERROR = 0.35  # of the tilt's spread, per D between nodes
+
+
+@dataclass(frozen=True)
+class Fidelity:
+    """One atmosphere in pixels, and how it is simulated.
+
+    `tilt_px`: standard deviation along one axis; `airy_px`: lambda / D; `blur_px`: the radius that
+    holds half of the light of a point, tilt removed.  `modes` Noll modes from tilt on, `rank` basis
+    functions (0: exact PSFs), `kernel` pixels across the PSF, `pitch` and `tilt_pitch` pixels
+    between the nodes of the phase.  `error_modes`, `error_pitch`, `error_rank`, `error_kernel`:
+    shares of the random power; `error`: the rms error they make together, of a picture's contrast.
+    """
+
+    d_over_r0: float = 0.0
+    severity: str = "none"
+    rytov: float = 0.0
+    alpha: float = 1.0
+    tilt_px: float = 0.0
+    airy_px: float = 0.0
+    blur_px: float = 0.0
+    modes: int = 0
+    rank: int = 0
+    kernel: int = 1
+    pitch: int = 1
+    tilt_pitch: int = 1
+    error_modes: float = 0.0
+    error_pitch: float = 0.0
+    error_rank: float = 0.0
+    error_kernel: float = 0.0
+    error_tilt_px: float = 0.0
+    error: float = 0.0
+
+
+def choose(
+    atmosphere: Atmosphere, width_px: int, tolerance: float, exact: bool, given: int | None = None
+) -> Fidelity:
+    """Return the cheapest fidelity whose errors keep within `tolerance` of the random power.
+
+    An rms error of half a grey level of 256 is always allowed.  With `exact` PSFs there is no rank.
+    The number of modes may be `given`; ValueError for one that nothing here can simulate.
+    """
+    seen = _seen(atmosphere, width_px)
+    strength, airy = seen.d_over_r0, seen.airy_px
+    power = _random_power(strength, airy)
+    allowed = max(tolerance, (UNSEEN / CONTRAST) ** 2 / power)
+    band = band_for(strength)
+    exact = exact or band is None
+    modes, error_modes = _modes(strength, airy, allowed, band, exact, given)
+    rank, error_rank = (0.0, 0.0) if exact else _cheapest("rank", strength, airy, allowed)
+    reach, error_kernel = _cheapest("kernel", strength, airy, allowed)
+    pixel = atmosphere.object_pixel_m(width_px) / atmosphere.aperture_m
+    step, error_pitch = _widest(strength, airy, allowed)
+    pitch = int(min(max(step / pixel, 1), MAX_PITCH))
+    error_pitch = error_pitch if pitch > 1 else 0.0
+    tilt_pitch, error_tilt = _tilt_pitch(pixel, seen.tilt_px, tolerance)
+    return replace(
+        seen,
+        modes=modes,
+        rank=0 if exact else min(int(rank), len(band.basis)),
+        kernel=_kernel(strength, airy, reach),
+        pitch=pitch,
+        tilt_pitch=tilt_pitch,
+        error_modes=error_modes,
+        error_pitch=error_pitch,
+        error_rank=error_rank,
+        error_kernel=error_kernel,
+        error_tilt_px=error_tilt,
+        error=math.sqrt(power * (error_modes + error_pitch + error_rank + error_kernel)),
+    )
+
+
+def mean_psf(strength: float) -> Float[Tensor, "fine fine"]:
+    """Return the mean PSF at D/r0 = `strength`, tilt removed, sampled at FINE_PER_AIRY."""
+    return _between(_table("mean"), _table("strength"), strength)
+
+
+def _seen(atmosphere: Atmosphere, width_px: int) -> Fidelity:
+    """Return what the atmosphere is in pixels, before anything is chosen."""
+    strength, airy = atmosphere.d_over_r0, atmosphere.airy_px(width_px)
+    return Fidelity(
+        d_over_r0=strength,
+        severity=atmosphere.severity,
+        rytov=atmosphere.rytov,
+        alpha=atmosphere.alpha,
+        tilt_px=atmosphere.tilt_std_px(width_px),
+        airy_px=airy,
+        blur_px=airy * _half_light(strength),
+    )
+
+
+def band_for(strength: float) -> Band | None:
+    """Return the weakest band that covers D/r0 = `strength`; None beyond the last."""
+    return next((band for band in bands() if strength <= BEYOND * band.edge), None)
+
+
+def _kernel(strength: float, airy: float, reach: float) -> int:
+    """Return the odd number of pixels that `reach` lambda / D cover, within the basis if any."""
+    band = band_for(strength)
+    widest = band.mean.shape[-1] / FINE_PER_AIRY / 2 if band else 6 + 0.6 * strength
+    reach = reach if band else widest
+    return 2 * math.floor(min(reach + 0.5 / airy, widest) * airy) + 1
+
+
+def _cheapest(name: str, strength: float, airy: float, allowed: float) -> tuple[float, float]:
+    """Return the first entry of the table's axis within its share of `allowed`, and its error."""
+    errors = _at(name, strength, airy)
+    within = (errors <= SHARES[name] * allowed).nonzero()
+    index = int(within[0]) if len(within) else len(errors) - 1
+    return float(_table(f"{name}_axis")[index]), float(errors[index])
+
+
+def _modes(
+    strength: float, airy: float, allowed: float, band: Band | None, exact: bool, given: int | None
+) -> tuple[int, float]:
+    """Return how many modes to simulate, and the error of the rest; without any blur it is 1."""
+    most = MOST_MODES if exact else band.modes
+    if given is None:
+        modes, error = _cheapest("modes", strength, airy, allowed)
+        return (EXACT_MODES if band is None else min(int(modes), most)), error
+    if not 2 <= given <= most:
+        kind = "exact" if exact else "fitted"
+        raise ValueError(f"turbulence.modes must be in [2, {most}] with {kind} PSFs, got {given}")
+    covered = int((_table("modes_axis") <= given).sum())
+    return given, float(_at("modes", strength, airy)[covered - 1]) if covered else 1.0
+
+
+def _widest(strength: float, airy: float, allowed: float) -> tuple[float, float]:
+    """Return the widest pitch in units of D at the object whose error is allowed, and the error."""
+    errors = _at("pitch", strength, airy).cummax(0).values
+    limit, axis = SHARES["pitch"] * allowed, _table("pitch_axis")
+    if limit >= UNRELATED:
+        return math.inf, UNRELATED
+    if limit <= errors[0]:  # the error falls at least with the first power of the pitch
+        return float(axis[0] * limit / errors[0]), float(limit)
+    index = min(int((errors <= limit).sum()) - 1, len(axis) - 2)
+    share = (limit - errors[index]) / (errors[index + 1] - errors[index]).clamp(min=1e-9)
+    share = float(share.clamp(0, 1))
+    step = axis[index] * (axis[index + 1] / axis[index]) ** share
+    return float(step), float(errors[index] + share * (errors[index + 1] - errors[index]))
+
+
+def _tilt_pitch(pixel: float, tilt_px: float, tolerance: float) -> tuple[int, float]:
+    """Return the widest pitch within 0.03 px or a tenth of the tolerance's rms, and its error.
+
+    `pixel` in units of D at the object.  Cubic interpolation between nodes S D apart leaves an rms
+    error of 0.35 S of the tilt's spread, measured on 30,000 waves for a constant Cn2.
+    """
+    allowed = max(0.03, 0.1 * math.sqrt(tolerance) * tilt_px)
+    pitch = int(min(max(allowed / (TILT_ERROR * pixel * tilt_px), 1), MAX_PITCH))
+    return pitch, TILT_ERROR * pitch * pixel * tilt_px if pitch > 1 else 0.0
+
+
+def _random_power(strength: float, airy: float) -> float:
+    """Return the power of the random change of a picture of unit contrast; grows as d^(5/3)."""
+    weak = min(strength / float(_table("strength")[0]), 1.0) ** (5 / 3)
+    return max(float(_at("power", strength, airy)) * weak, 1e-30)
+
+
+def _half_light(strength: float) -> float:
+    return float(_between(_table("half_light"), _table("strength"), strength))
+
+
+def _at(name: str, strength: float, airy: float) -> Float[Tensor, "*axis"]:
+    """Interpolate a table (strength, ..., airy) in the logarithm of both."""
+    table = _between(_table(name), _table("strength"), strength)
+    return _between(table.movedim(-1, 0), _table("airy"), airy)
+
+
+def _between(table: Tensor, axis: Tensor, value: float) -> Tensor:
+    place = max(value, float(axis[0]))
+    high = int((axis < place).sum().clamp(1, len(axis) - 1))
+    low = high - 1
+    share = math.log(place / float(axis[low])) / math.log(float(axis[high] / axis[low]))
+    return table[low] + (table[high] - table[low]) * min(share, 1.0)
+
+
+@cache
+def _tables() -> dict[str, Tensor]:
+    return load_file(FILE)
+
+
+def _table(name: str) -> Tensor:
+    return _tables()[f"errors.{name}"]

@@ -1,0 +1,249 @@
+"""Turbulence as an operator: clean frames in, what every view sees out; tilt first, then blur."""
+
+import math
+from collections.abc import Iterator, Sequence
+
+import torch
+from jaxtyping import Complex, Float
+from torch import Tensor
+
+from src.sim import noise
+from src.sim.optics import layout, view_id
+from src.sim.turbulence import blur
+from src.sim.turbulence.atmosphere import Atmosphere
+from src.sim.turbulence.fidelity import Fidelity, band_for, choose, mean_psf
+from src.sim.turbulence.halo import Halo
+from src.sim.turbulence.lattice import Lattice
+from src.sim.turbulence.p2s import Spots
+from src.sim.turbulence.phase import Field, Waves, draw_waves, evolve, flow, look_from
+from src.sim.turbulence.psf import fraunhofer_psf
+
+Crop = tuple[int, int, int, int]  # top, left, height, width
+ALPHA_FPS = 120.0  # the frame rate that Atmosphere.alpha is stated for
+WAVES = 192
+TILE = 320  # pixels; larger pictures are made tile by tile, to bound the memory
+CHUNK, GROUP = 6_000_000, 60_000_000  # numbers in the PSFs of a view, and of all, at a time
+
+
+class Turbulence:
+    """The atmosphere between a scene and the views of a light field.
+
+    `views`: how many (see `optics.layout`) or a list of (row, col); frames are `height` x `width`
+    pixels at `fps`.  `tolerance` in (0, 1]: the error allowed, as a share of the power by which the
+    turbulence blurs a picture at random (fidelity.py).  `modes`: how many Noll modes from
+    tilt on, 2 to 200, no more than a fitted network knows; None: as the tolerance asks.  `psf`:
+    `fitted` (basis and network) or `exact` (Fraunhofer at every node).  `temporal`: `ar1` (the
+    paper: alpha per frame at 120 fps) or `flow`, frozen turbulence carried by a wind of `wind_m_s`
+    in a direction drawn per clip.
+    `views_correlation`: `independent` (the paper) or `baseline`, sub-apertures `baseline_m` apart
+    (None: touching) looking through the same air.  `atmosphere` None is the identity.
+    Raises ValueError for values outside their range.
+    """
+
+    def __init__(
+        self,
+        atmosphere: Atmosphere | None,
+        *,
+        views: int | Sequence[Sequence[int]],
+        height: int,
+        width: int,
+        fps: float = 120.0,
+        tolerance: float = 0.35,
+        modes: int | None = None,
+        psf: str = "fitted",
+        temporal: str = "ar1",
+        wind_m_s: float = 3.0,
+        views_correlation: str = "independent",
+        baseline_m: float | None = None,
+    ):
+        _require(height >= 1 and width >= 1, "frame", "at least 1 x 1", (height, width))
+        _require(0 < fps < math.inf, "fps", "> 0", fps)
+        _require(0 < tolerance <= 1, "tolerance", "in (0, 1]", tolerance)
+        _require(psf in ("fitted", "exact"), "psf", "fitted or exact", psf)
+        _require(temporal in ("ar1", "flow"), "temporal", "ar1 or flow", temporal)
+        _require(0 <= wind_m_s < math.inf, "wind_m_s", ">= 0", wind_m_s)
+        shared = views_correlation == "baseline"
+        known = shared or views_correlation == "independent"
+        _require(known, "views_correlation", "independent or baseline", views_correlation)
+        valid = baseline_m is None or 0 <= baseline_m < math.inf
+        _require(valid, "baseline_m", ">= 0", baseline_m)
+        self.atmosphere, self.height, self.width, self.fps = atmosphere, height, width, fps
+        self.positions = layout(views) if isinstance(views, int) else tuple(map(tuple, views))
+        self.temporal, self.wind_m_s, self.baseline_m = temporal, wind_m_s, baseline_m
+        self.shared = shared
+        self.clear = atmosphere is None or atmosphere.d_over_r0 == 0
+        self.fidelity = Fidelity()
+        if not self.clear:
+            self.fidelity = choose(atmosphere, width, tolerance, psf == "exact", modes)
+        self.spots, self.halo = self._spots(), self._halo()
+
+    @torch.no_grad()
+    def degrade(
+        self,
+        frames: Float[Tensor, "n frames h w"],
+        generator: torch.Generator,
+        *,
+        crop: Crop | None = None,
+    ) -> Float[Tensor, "n views frames hc wc"]:
+        """Return what every view sees, linear light in and out.
+
+        Only `crop` (top, left, height, width) is simulated; it equals that part of the whole.
+        """
+        window = self._window(frames, crop)
+        if self.clear:
+            top, left, height, width = window
+            part = frames[:, None, :, top : top + height, left : left + width]
+            return part.expand(-1, len(self.positions), -1, -1, -1)
+        out = frames.new_empty(
+            len(frames), len(self.positions), frames.shape[1], *window[2:], dtype=torch.float32
+        )
+        for index, clip in enumerate(frames.float()):
+            waves, moving = self._draw(generator, len(clip))
+            moving = moving.to(clip.device)
+            for tile in _tiles(window):
+                part = _inside(out[index], tile, window)
+                self._clip(clip, waves, moving, tile, part)
+        return out
+
+    @torch.no_grad()
+    def tilt(
+        self, frames: int, generator: torch.Generator, *, crop: Crop | None = None
+    ) -> Float[Tensor, "views frames 2 h w"]:
+        """Return the displacement (x, y) in pixels that `degrade` gives its first clip.
+
+        For a generator in the same state, and that many frames.
+        """
+        window = crop or (0, 0, self.height, self.width)
+        if self.clear:
+            return torch.zeros(len(self.positions), frames, 2, *window[2:])
+        waves, moving = self._draw(generator, frames)
+        field = self._field(waves, slice(0, 2), window, moving.device)
+        return self._tilt_px * torch.stack([field.at_pixels(c) for c in moving])
+
+    def _clip(self, frames: Tensor, waves: Waves, moving: Tensor, tile: Crop, out: Tensor) -> None:
+        """Write what every view sees in `tile` to `out` (views, frames, h, w).
+
+        A view's phase is computed apart, so that its numbers do not depend on its company.
+        """
+        reach, device = self.fidelity.kernel // 2, frames.device
+        top, left, height, width = tile
+        halo = self.halo(frames, *tile)
+        window = (top - reach, left - reach, height + 2 * reach, width + 2 * reach)
+        tilt = self._field(waves, slice(0, 2), window, device)
+        rest = self._field(waves, slice(2, None), window, device)
+        lattices = self._lattices(window, self.fidelity.pitch, 1)
+        numbers = rest.nodes.shape[1] * self.fidelity.kernel**2
+        step = max(1, CHUNK // numbers)
+        group = max(1, GROUP // (step * numbers))
+        for first in range(0, len(frames), step):
+            for view in range(0, len(moving), group):
+                some = moving[view : view + group, first : first + step]
+                out[view : view + group, first : first + step] = blur.degrade(
+                    frames[first : first + step],
+                    (
+                        (self._tilt_px * tilt.at_pixels(c), self._kernels(rest.at_nodes(c)))
+                        for c in some
+                    ),
+                    *lattices,
+                    halo[first : first + step],
+                    self.halo.share,
+                )
+
+    def _kernels(
+        self, phase: Float[Tensor, "frames blurmodes rows columns"]
+    ) -> Float[Tensor, "frames rows k k columns"]:
+        if self.spots is not None:
+            return self.spots(phase)
+        flat = torch.nn.functional.pad(phase.permute(0, 2, 3, 1), (2, 0))
+        size, airy = self.fidelity.kernel, self.fidelity.airy_px
+        psf = fraunhofer_psf(flat, airy_px=airy, size=size, whole=True)
+        return psf.permute(0, 1, 3, 4, 2).contiguous()
+
+    def _field(self, waves: Waves, modes: slice, window: Crop, device: torch.device) -> Field:
+        """Prepare tilt (modes 0, 1) or the modes that blur on the lattice meant for them."""
+        is_tilt = modes.start == 0
+        pitch = self.fidelity.tilt_pitch if is_tilt else self.fidelity.pitch
+        lattices = self._lattices(window, pitch, 3 if is_tilt else 1)
+        return Field(waves, modes, *lattices, (self.height, self.width), device)
+
+    @property
+    def _tilt_px(self) -> float:
+        """Pixels a radian of Noll's a2: (2 / pi) lambda f / (D p)."""
+        return 2 / math.pi * self.fidelity.airy_px
+
+    def _spots(self) -> Spots | None:
+        if self.fidelity.rank == 0:
+            return None
+        band = band_for(self.fidelity.d_over_r0)
+        return Spots(band, self.fidelity.rank, self.fidelity.airy_px, self.fidelity.kernel)
+
+    def _halo(self) -> Halo | None:
+        if self.clear:
+            return None
+        mean = mean_psf(self.fidelity.d_over_r0)
+        return Halo(mean, self.fidelity.airy_px, self.fidelity.kernel)
+
+    def _draw(
+        self, generator: torch.Generator, frames: int
+    ) -> tuple[Waves, Complex[Tensor, "views frames waves"]]:
+        """Draw one clip's waves, and their amplitudes in every view and frame."""
+        key = noise.base_key(generator)
+        waves = draw_waves(
+            self.atmosphere,
+            noise.key(key, "waves"),
+            modes=self.fidelity.modes,
+            waves=WAVES,
+            width_px=self.width,
+        )
+        return waves, self._amplitudes(key, waves, frames).to(torch.complex64)
+
+    def _amplitudes(
+        self, key: int, waves: Waves, frames: int
+    ) -> Complex[Tensor, "views frames waves"]:
+        """Every view counts from its own id, or all from 0 where they share the air."""
+        ids = [0 if self.shared else view_id(position) for position in self.positions]
+        drawn = frames if self.temporal == "ar1" else 1
+        counters = torch.arange(drawn * 2 * len(waves.place)).reshape(drawn, -1, 2)
+        counters = counters + (torch.tensor(ids) << 40)[:, None, None, None]
+        fresh = noise.normal(noise.key(key, "phase"), counters).double()
+        if self.temporal == "ar1":
+            c = evolve(fresh, self.atmosphere.alpha ** (ALPHA_FPS / self.fps))
+        else:
+            turn = 2 * math.pi * float(noise.uniform(noise.key(key, "wind"), torch.tensor(0)))
+            wind = (self.wind_m_s * math.cos(turn), self.wind_m_s * math.sin(turn))
+            c = flow(waves, fresh, wind, torch.arange(frames).double() / self.fps)
+        if self.shared:
+            pitch = self.atmosphere.aperture_m if self.baseline_m is None else self.baseline_m
+            away = torch.tensor(self.positions, dtype=torch.float64).flip(-1) * pitch
+            c = c * look_from(waves, away)[:, None]
+        return c
+
+    def _lattices(self, window: Crop, pitch: int, order: int) -> tuple[Lattice, Lattice]:
+        top, left, height, width = window
+        return Lattice(top, height, pitch, order), Lattice(left, width, pitch, order)
+
+    def _window(self, frames: Tensor, crop: Crop | None) -> Crop:
+        size = (self.height, self.width)
+        _require(tuple(frames.shape[-2:]) == size, "frame", f"{size}", tuple(frames.shape[-2:]))
+        top, left, height, width = crop or (0, 0, *size)
+        inside = 0 <= top <= top + height <= size[0] and 0 <= left <= left + width <= size[1]
+        _require(inside and height > 0 and width > 0, "crop", f"inside the {size} frame", crop)
+        return top, left, height, width
+
+
+def _tiles(window: Crop) -> Iterator[Crop]:
+    top, left, height, width = window
+    for y in range(0, height, TILE):
+        for x in range(0, width, TILE):
+            yield top + y, left + x, min(TILE, height - y), min(TILE, width - x)
+
+
+def _inside(out: Tensor, tile: Crop, window: Crop) -> Tensor:
+    """Return the part of `out`, a picture of `window`, that `tile` covers."""
+    y, x = tile[0] - window[0], tile[1] - window[1]
+    return out[..., y : y + tile[2], x : x + tile[3]]
+
+
+def _require(valid: bool, name: str, allowed: str, value: object) -> None:
+    if not valid:
+        raise ValueError(f"turbulence.{name} must be {allowed}, got {value}")

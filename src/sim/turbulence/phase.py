@@ -1,0 +1,190 @@
+"""Zernike coefficients over picture, time and views, as a sum of plane waves.
+
+Turbulence along the path is Kolmogorov phase, a sum of plane waves exp(2 pi i f.x), each in a thin
+layer at its own distance z (sparse spectrum: Charnotskii 2013, J. Opt. Soc. Am. A 30, 479).  An
+object point x sees the layer through a disc of diameter D_l = D (1 - z/L) centred at x z/L, so
+Noll's coefficient j there is
+
+    a_j(x, t) = Re sum_m c_m(t) w_m Q_j(D_l f_m) exp(2 pi i f_m . x z_m / L)
+
+with Q_j the Fourier transform of the mode (zernike.py) and independent complex normal c_m.
+All covariances, between modes, points, times and views, follow from this one sum: nothing is
+periodic, and frequencies reach down to zero.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Complex, Float
+from torch import Tensor
+
+from src.sim import noise
+from src.sim.turbulence.atmosphere import Atmosphere
+from src.sim.turbulence.lattice import Lattice
+from src.sim.turbulence.zernike import SPECTRUM, pupil_filter
+
+LOW, HIGH = 0.08, 0.32  # limits of the three power laws that kappa is drawn from; HIGH per (n + 1)
+SHARES = (0.25, 0.65, 0.10)  # of the waves below LOW, between, above HIGH
+
+
+@dataclass(frozen=True)
+class Waves:
+    """The plane waves of one clip; the same for its views, only their amplitudes differ.
+
+    `frequency` (waves, 2): f z / L in cycles per pixel at the object along (x, y).
+    `layer` (waves, 2): f in cycles per metre in the layer; `place` (waves,): z / L.
+    `response` (modes, waves, 2): w_m Q_j, real and imaginary part, in rad.
+    """
+
+    frequency: Float[Tensor, "waves 2"]
+    layer: Float[Tensor, "waves 2"]
+    place: Float[Tensor, " waves"]
+    response: Float[Tensor, "modes waves 2"]
+
+
+def draw_waves(atmosphere: Atmosphere, key: int, *, modes: int, waves: int, width_px: int) -> Waves:
+    """Draw `waves` plane waves that carry Noll modes 2..modes + 1.
+
+    kappa = D_l |f|, its angle and z are drawn by a shifted Kronecker sequence; z with the density
+    Cn2 (1 - z/L)^(5/3) that makes the layers count alike, kappa from a broken power law over all of
+    (0, inf), and the weights w_m divide by that density, so the expected covariance is exact.
+    """
+    u = _sequence(key, waves)
+    kappa, density = _radius(u[:, 0], modes)
+    angle = 2 * math.pi * u[:, 1]
+    place, strength = atmosphere.path
+    share = strength * (1 - place) ** (5 / 3)
+    steps = torch.cumsum(share, 0)
+    slot = torch.searchsorted(steps, u[:, 2] * steps[-1]).clamp(max=len(place) - 1)
+    diameter = atmosphere.aperture_m * (1 - place[slot])
+    variance = SPECTRUM * 2 * math.pi * kappa ** (-8 / 3) / (density * waves)
+    amplitude = variance.sqrt() * atmosphere.d_over_r0 ** (5 / 6)
+    layer = torch.stack([angle.cos(), angle.sin()], dim=-1) * (kappa / diameter)[:, None]
+    pixel = atmosphere.object_pixel_m(width_px)
+    return Waves(
+        frequency=layer * place[slot, None] * pixel,
+        layer=layer,
+        place=place[slot],
+        response=pupil_filter(kappa, angle, modes) * amplitude[:, None],
+    )
+
+
+class Field:
+    """The Noll coefficients of `modes` (0 is x-tilt) on the nodes of two lattices, in rad.
+
+    `size` is the frame's (height, width); the axis of the camera goes through its middle.
+    """
+
+    def __init__(
+        self,
+        waves: Waves,
+        modes: slice,
+        rows: Lattice,
+        columns: Lattice,
+        size: tuple[int, int],
+        device: torch.device,
+    ):
+        self.response = torch.view_as_complex(waves.response[modes]).to(device, torch.complex64)
+        down = _turns(waves.frequency[:, 1], rows, size[0])
+        across = _turns(waves.frequency[:, 0], columns, size[1])
+        down, across = down.to(device)[:, :, None], across.to(device)[:, None]
+        self.shape = (down.shape[1], across.shape[2])
+        nodes = torch.empty(len(down), 2, *self.shape, device=device)
+        torch.mul(down.real, across.real, out=nodes[:, 0]).addcmul_(down.imag, -across.imag)
+        torch.mul(down.real, -across.imag, out=nodes[:, 1]).addcmul_(down.imag, -across.real)
+        self.nodes = nodes.flatten(2).flatten(0, 1)
+        self.rows, self.columns = rows, columns
+
+    def at_nodes(
+        self, amplitudes: Complex[Tensor, "frames waves"]
+    ) -> Float[Tensor, "frames modes rows columns"]:
+        """Return the coefficients on the nodes: Re sum_m c_m w_m Q_j exp(2 pi i f_m . x)."""
+        turn = self.response * amplitudes[:, None]
+        field = torch.view_as_real(turn).flatten(2).flatten(0, 1) @ self.nodes
+        return field.reshape(*turn.shape[:2], *self.shape)
+
+    def at_pixels(
+        self, amplitudes: Complex[Tensor, "frames waves"]
+    ) -> Float[Tensor, "frames modes h w"]:
+        """Return the coefficients on all pixels that the lattices serve."""
+        return self._vertical @ self.at_nodes(amplitudes) @ self._horizontal
+
+    @cached_property
+    def _vertical(self) -> Float[Tensor, "h rows"]:
+        return self.rows.weights().to(self.nodes.device)
+
+    @cached_property
+    def _horizontal(self) -> Float[Tensor, "columns w"]:
+        return self.columns.weights().T.to(self.nodes.device)
+
+
+def evolve(
+    fresh: Float[Tensor, "views frames waves 2"], alpha: float
+) -> Complex[Tensor, "views frames waves"]:
+    """Return c_t = alpha c_{t-1} + sqrt(1 - alpha^2) e_t, stationary from the first frame."""
+    state, states = fresh[:, 0], [fresh[:, 0]]
+    for step in fresh.unbind(1)[1:]:
+        state = alpha * state + math.sqrt(1 - alpha**2) * step
+        states.append(state)
+    return torch.view_as_complex(torch.stack(states, dim=1))
+
+
+def flow(
+    waves: Waves,
+    fresh: Float[Tensor, "views 1 waves 2"],
+    wind: tuple[float, float],
+    seconds: Float[Tensor, " frames"],
+) -> Complex[Tensor, "views frames waves"]:
+    """Return the amplitudes of turbulence that the `wind` (x, y) in m/s carries along unchanged.
+
+    Taylor's hypothesis: phase(x, t) = phase(x - v t, 0), exact at any time.
+    """
+    speed = waves.layer @ torch.tensor(wind, dtype=torch.float64)
+    return torch.view_as_complex(fresh) * torch.exp(-2j * math.pi * seconds[:, None] * speed)
+
+
+def look_from(waves: Waves, baselines: Float[Tensor, "views 2"]) -> Complex[Tensor, "views waves"]:
+    """Return the phase of each wave seen from sub-apertures at `baselines` (x, y) in metres.
+
+    Their line of sight to an object point crosses a layer baseline (1 - z/L) away.
+    """
+    return torch.exp(2j * math.pi * (baselines @ waves.layer.T) * (1 - waves.place))
+
+
+def _turns(frequency: Tensor, lattice: Lattice, size: int) -> Tensor:
+    place = lattice.pixels.double() - (size - 1) / 2
+    return torch.exp(2j * math.pi * frequency[:, None] * place).to(torch.complex64)
+
+
+def _sequence(key: int, count: int) -> Float[Tensor, "count 3"]:
+    """Return a Kronecker sequence in the unit cube, shifted at random: strata, angle, path.
+
+    sqrt 3 for the angle because none of its small multiples, the m of the modes, is near a whole
+    number; that would tie the angle to the radius and spoil the mode's variance in every clip.
+    """
+    shift = noise.uniform(key, torch.arange(3)).double()
+    step = torch.tensor([1 / count, math.sqrt(3) - 1, (math.sqrt(5) - 1) / 2], dtype=torch.float64)
+    return (shift * torch.tensor([1 / count, 1, 1]) + torch.arange(count)[:, None] * step) % 1.0
+
+
+def _radius(u: Tensor, modes: int) -> tuple[Tensor, Tensor]:
+    """Return kappa and its density at the quantiles `u`: kappa^(-2/3), then 1/kappa, then ^-5.
+
+    The first law makes all waves below LOW count alike for the tilt, whose variance converges as
+    slowly as kappa^(1/3) towards zero.
+    """
+    order = (math.isqrt(8 * (modes + 1) - 7) - 1) // 2
+    high = HIGH * (order + 1) + 0.6
+    below, between, above = SHARES
+    ratio = math.log(high / LOW)
+    first = LOW * (u / below).clamp(max=1) ** 3
+    middle = LOW * torch.exp(((u - below) / between).clamp(0, 1) * ratio)
+    last = high * (1 - ((u - below - between) / above).clamp(0, 1 - 1e-9)) ** (-1 / 4)
+    kappa = torch.where(u < below, first, torch.where(u < below + between, middle, last))
+    kappa = kappa.clamp(min=1e-30)
+    low_density = below / (3 * LOW ** (1 / 3)) * kappa ** (-2 / 3)
+    high_density = above * 4 * high**4 * kappa**-5
+    density = torch.where(kappa < high, between / (ratio * kappa), high_density)
+    return kappa, torch.where(kappa < LOW, low_density, density)

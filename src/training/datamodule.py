@@ -1,0 +1,171 @@
+"""Batches for training, validation and test, simulated on the fly: number -> draw -> sample."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+import torch
+from lightning import LightningDataModule
+from torch.utils.data import DataLoader, Dataset, Sampler
+
+from src.sim import noise
+from src.sim.pipeline import Draw, Pipeline, Sample
+from src.training.augment import Augment
+
+
+class LightFieldData(LightningDataModule):
+    """`pipelines` has one Pipeline for each of train, val and test.
+
+    `epoch_clips`: training clips between two validations; `val_clips`, `test_clips`: their numbers.
+    `reuse`: steps in a row that train on one simulated batch, each augmented anew; saves
+    simulation with at most one worker.
+    `workers`: processes that simulate beside the training; 0 simulates in the training process.
+    `simulate_on`: `worker` (CPU) or `device` (the training device, for GPUs).
+    """
+
+    def __init__(
+        self,
+        pipelines: dict[str, Pipeline],
+        augment: Augment | None = None,
+        *,
+        batch_size: int = 8,
+        reuse: int = 1,
+        epoch_clips: int = 216,
+        val_clips: int = 27,
+        test_clips: int = 27,
+        workers: int = 0,
+        simulate_on: str = "worker",
+        seed: int = 0,
+    ):
+        super().__init__()
+        if simulate_on not in ("worker", "device"):
+            raise ValueError(f"data.simulate_on must be worker or device, got {simulate_on}")
+        counts = {"batch_size": batch_size, "reuse": reuse, "epoch_clips": epoch_clips}
+        for name, value in counts.items():
+            if value < 1:
+                raise ValueError(f"data.{name} must be >= 1, got {value}")
+        if epoch_clips < batch_size:
+            raise ValueError(f"data.epoch_clips must be >= data.batch_size, got {epoch_clips}")
+        self.pipelines, self.augment, self.seed = pipelines, augment, seed
+        self.batch_size, self.reuse, self.epoch_clips = batch_size, reuse, epoch_clips
+        self.val_clips, self.test_clips = val_clips, test_clips
+        self.workers, self.simulate_on = workers, simulate_on
+
+    def train_dataloader(self) -> DataLoader:
+        """Return endless clips, from the trainer's step on: a resumed run goes on seamlessly."""
+        trainer = self.trainer
+        sampler = StepSampler(
+            self.batch_size,
+            max(1, self.epoch_clips // (self.batch_size * trainer.world_size)),
+            lambda: trainer.global_step,
+            reuse=self.reuse,
+            rank=trainer.global_rank,
+            world=trainer.world_size,
+        )
+        return self._loader("train", batch_sampler=sampler)
+
+    def val_dataloader(self) -> DataLoader:
+        """Return clips 0 .. val_clips - 1 of the validation split, one at a time."""
+        return self._loader("val", sampler=[(clip, clip) for clip in range(self.val_clips)])
+
+    def test_dataloader(self) -> DataLoader:
+        """Return clips 0 .. test_clips - 1 of the test split, one at a time."""
+        return self._loader("test", sampler=[(clip, clip) for clip in range(self.test_clips)])
+
+    def on_after_batch_transfer(self, batch: Sample | list, dataloader_idx: int) -> Sample:
+        """Simulate drawn clips on the training device when no worker has."""
+        if isinstance(batch, Sample):
+            return batch
+        split = "train" if self.trainer.training else "test" if self.trainer.testing else "val"
+        return self._simulator(split, self.trainer.strategy.root_device)(batch)
+
+    def transfer_batch_to_device(self, batch, device: torch.device, dataloader_idx: int):
+        """Leave drawn clips where they are; move samples."""
+        return batch.to(device) if isinstance(batch, Sample) else batch
+
+    def _loader(self, split: str, **sampling) -> DataLoader:
+        on_worker = self.simulate_on == "worker"
+        return DataLoader(
+            Numbered(self.pipelines[split]),
+            num_workers=self.workers,
+            collate_fn=self._simulator(split, "cpu") if on_worker else list,
+            worker_init_fn=_one_thread,
+            persistent_workers=self.workers > 0,
+            **sampling,
+        )
+
+    def _simulator(self, split: str, device) -> Callable[[Sequence], Sample]:
+        augment = self.augment if split == "train" else None
+        return Simulator(self.pipelines[split], augment, self.seed, device)
+
+
+class Simulator:
+    """Turns numbered draws into a batch; picklable, so that a worker can be given one.
+
+    The last simulation is kept: the same draws again are only augmented again.
+    """
+
+    def __init__(self, pipeline: Pipeline, augment: Augment | None, seed: int, device):
+        self.pipeline, self.augment, self.seed, self.device = pipeline, augment, seed, device
+        self.last: tuple[list, Sample | None] = ([], None)
+
+    def __call__(self, numbered: Sequence[tuple[int, Draw]]) -> Sample:
+        start = time.perf_counter()
+        draws = [draw for _, draw in numbered]
+        names = [(draw.key, draw.crop) for draw in draws]
+        if self.last[0] != names:
+            self.last = (names, self.pipeline.simulate(draws, self.device))
+        sample = self.last[1]
+        if self.augment is not None:
+            sample = self.augment(sample, [noise.key(self.seed, "augment", n) for n, _ in numbered])
+        return replace(sample, seconds=time.perf_counter() - start)
+
+
+class Numbered(Dataset):
+    """The draws of a pipeline: (clip, number) to (number, draw of the clip)."""
+
+    def __init__(self, pipeline: Pipeline):
+        self.pipeline = pipeline
+
+    def __getitem__(self, item: tuple[int, int]) -> tuple[int, Draw]:
+        clip, number = item
+        return number, self.pipeline.draw(clip)
+
+
+class StepSampler(Sampler[list[tuple[int, int]]]):
+    """The batch of step s: pairs (clip, number), numbers s * size .. (s + 1) * size - 1.
+
+    The clips are those of step s // reuse * reuse.  Starts at the step reached; an epoch ends when
+    the step is a multiple of `steps_per_epoch`.  With several processes each takes its own slice of
+    the joint batch, so that no two simulate the same clip.
+    """
+
+    def __init__(
+        self,
+        batch_size: int,
+        steps_per_epoch: int,
+        step: Callable[[], int],
+        *,
+        reuse: int = 1,
+        rank: int = 0,
+        world: int = 1,
+    ):
+        self.batch_size, self.steps_per_epoch, self.reuse = batch_size, steps_per_epoch, reuse
+        self.step, self.rank, self.world = step, rank, world
+
+    def __len__(self) -> int:
+        return self.steps_per_epoch
+
+    def __iter__(self) -> Iterator[list[tuple[int, int]]]:
+        first = self.step()
+        for step in range(first, (first // self.steps_per_epoch + 1) * self.steps_per_epoch):
+            clips = self._numbers(step // self.reuse * self.reuse)
+            yield list(zip(clips, self._numbers(step), strict=True))
+
+    def _numbers(self, step: int) -> range:
+        start = (step * self.world + self.rank) * self.batch_size
+        return range(start, start + self.batch_size)
+
+
+def _one_thread(worker: int) -> None:
+    torch.set_num_threads(1)

@@ -1,0 +1,86 @@
+"""One network on the test clips: scores per clip, cost and latency."""
+
+import time
+from dataclasses import dataclass
+
+import lightning
+import torch
+from torch import nn
+
+from src.metrics.scores import Scores
+from src.models.cost import macs, macs_per_frame
+from src.models.unroll import video
+from src.sim.pipeline import Sample
+from src.training.datamodule import LightFieldData
+from src.training.reconstructor import Reconstructor
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a line of a table needs: scores of every clip with what was drawn for it, and cost."""
+
+    name: str
+    clips: list[dict]
+    params: int
+    macs_per_frame: int
+    latency_ms: dict[str, float]
+
+
+def test(
+    name: str,
+    network: nn.Module,
+    data: LightFieldData,
+    scores: Scores,
+    *,
+    trainer: lightning.Trainer,
+    warmup: int = 0,
+) -> Row:
+    """Return the row of `network` on the test clips of `data`."""
+    module = Reconstructor(network, {}, scores=scores, warmup=warmup)
+    trainer.test(module, data, verbose=False)
+    macs_of_frame, milliseconds = cost(network, module.sample)
+    height, width = module.sample.target.shape[-2:]
+    return Row(
+        name,
+        module.clips,
+        params=sum(parameter.numel() for parameter in network.parameters()),
+        macs_per_frame=macs_of_frame,
+        latency_ms={f"{height}x{width}": milliseconds},
+    )
+
+
+@torch.no_grad()
+def cost(network: nn.Module, sample: Sample) -> tuple[int, float]:
+    """Return multiply-accumulates and milliseconds of one frame.
+
+    A method that makes a whole video at once is given all of `sample`, and its cost shared out.
+    """
+    if not hasattr(network, "video"):
+        views, bins, height, width = sample.voxels.shape[2:]
+        size = {"views": views, "bins": bins}
+        return macs_per_frame(network, height, width, **size), latency_ms(
+            network, height, width, **size
+        )
+    frames, start = sample.target.shape[:2].numel(), time.perf_counter()
+    video(network, sample)
+    seconds = time.perf_counter() - start
+    return macs(lambda: video(network, sample)) // frames, 1e3 * seconds / frames
+
+
+@torch.no_grad()
+def latency_ms(
+    network: nn.Module, height: int, width: int, views: int, bins: int, repeats: int = 5
+) -> float:
+    """Return the median wall time of one frame in ms: batch 1, state carried, after a warm-up."""
+    network.eval()
+    device = next((parameter.device for parameter in network.parameters()), torch.device("cpu"))
+    voxels = torch.randn(1, views, bins, height, width, device=device)
+    _, state = network(voxels, None)
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        _, state = network(voxels, state)
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        times.append(1e3 * (time.perf_counter() - start))
+    return sorted(times)[repeats // 2]

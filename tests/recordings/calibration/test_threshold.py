@@ -1,0 +1,122 @@
+"""Event rates and the threshold found by them, on recordings whose threshold is known."""
+
+import numpy as np
+import pytest
+import torch
+
+from src.figures import event_rate
+from src.recordings import event_rates
+from src.recordings.calibration import contrast
+from src.recordings.files.formats import EVENT, open_events, write_events
+from src.sim.sensor.sensor import EventSensor
+
+FPS = 120.0
+GRID = np.geomspace(0.08, 0.8, 12).tolist()
+
+
+def scene(seed: int, frames: int = 24, side: int = 48) -> torch.Tensor:
+    """One view of smooth texture that moves: (1, frames, side, side)."""
+    g = torch.Generator().manual_seed(seed)
+    wide = side + 2 * frames
+    texture = torch.nn.functional.avg_pool2d(torch.randn(1, 1, wide, wide, generator=g), 5, 1, 2)
+    texture = 0.45 + 0.35 * torch.tanh(3 * texture[0, 0])
+    return torch.stack([texture[k : k + side, 2 * k : 2 * k + side] for k in range(frames)])[None]
+
+
+def recorded(sensor: EventSensor, clips) -> list[np.ndarray]:
+    """The events of clips one after the other, as a recording in pieces."""
+    pieces, start = [], 0
+    for index, clip in enumerate(clips):
+        events = sensor.events(clip[0], FPS, clip=index)
+        events["t"] += start
+        start += round((clip.shape[1] - 1) * 1e6 / FPS)
+        pieces.append(events)
+    return pieces
+
+
+@pytest.mark.parametrize(
+    ("on", "off_ratio", "refractory_s"), [(0.15, 1.0, 0.005), (0.3, 1.0, 0.0), (0.25, 1.4, 0.005)]
+)
+def test_a_known_threshold_is_found(on, off_ratio, refractory_s):
+    """Recording and simulation see different parts of one kind of scene."""
+    settings = {"refractory_s": refractory_s}
+    camera = EventSensor(on, off_ratio=off_ratio, **settings)
+    recording = recorded(camera, [scene(seed) for seed in range(8)])
+    measured = event_rates.measure(recording, np.zeros((48, 48), np.int64), slices=40)
+    others = [scene(seed) for seed in range(100, 106)]
+    found = contrast.estimate(measured, others, FPS, settings, GRID)
+    assert abs(np.log(found.on[0] / on)) < 0.12
+    assert abs(np.log(found.off[0] / (on * off_ratio))) < 0.12
+    assert found.on[1] < found.on[0] < found.on[2]
+    assert found.off[1] < found.off[0] < found.off[2]
+
+
+def test_the_same_scene_gives_the_threshold_exactly():
+    clips = [scene(seed) for seed in range(3)]
+    recording = recorded(EventSensor(0.2), clips)
+    measured = event_rates.measure(recording, np.zeros((48, 48), np.int64), slices=40)
+    found = contrast.estimate(measured, clips, FPS, {}, GRID)
+    assert abs(found.on[0] / 0.2 - 1) < 0.02 and abs(found.off[0] / 0.2 - 1) < 0.02
+
+
+def test_rates_of_views_are_events_per_pixel_and_second():
+    view = np.full((6, 10), -1)
+    view[:, :4], view[:3, 6:] = 0, 1
+    events = np.zeros(600, EVENT)
+    g = np.random.default_rng(0)
+    events["t"] = np.linspace(0, 2e6 - 1, 600).astype(np.int64)
+    events["x"], events["y"] = g.integers(0, 10, 600), g.integers(0, 6, 600)
+    events["p"] = g.choice([-1, 1], 600)
+    measured = event_rates.measure([events[:250], events[250:]], view, slices=7)
+    for index, pixels in enumerate((24, 12)):
+        mine = events["p"][view[events["y"], events["x"]] == index]
+        assert measured.pixels[index] == pixels
+        expected = np.array([(mine > 0).sum(), (mine < 0).sum()]) / (pixels * 2.0)
+        assert np.allclose(measured.per_view[index], expected)
+    assert measured.events.shape == (7, 2, 2)
+
+
+def test_hot_pixels_do_not_count():
+    """Above what texture makes; a pixel no busier than the scene around it is left alone."""
+    calm = 0.5 + 0.2 * (scene(0) - 0.5)
+    camera = {"threshold": 0.2, "refractory_s": 0.0, "seed": 1}
+    view = np.zeros((48, 48), np.int64)
+    plain, broken = (
+        event_rates.measure(recorded(EventSensor(**camera, **hot), [calm]), view, slices=10)
+        for hot in ({}, {"hot_fraction": 0.004, "hot_hz": 119.0})
+    )
+    assert plain.hot.sum() == 0
+    assert 2 <= broken.hot.sum() <= 20
+    assert np.abs(np.log(broken.pooled / plain.pooled)).max() < 0.05
+
+
+def test_the_bootstrap_has_the_spread_of_a_poisson_process():
+    """The deviation of a deviation from n / n^(1/3) blocks is a tenth here: three of them."""
+    events = np.random.default_rng(0).poisson(50.0, (4000, 1, 2))
+    made = event_rates.Rates(events, np.array([100]), np.array([0]), 0.01)
+    spread = made.bootstrap(1000).std(0) / made.pooled
+    assert np.abs(spread * np.sqrt(4000 * 50) - 1).max() < 0.3
+
+
+def test_a_rate_that_no_threshold_makes_is_named():
+    recording = recorded(EventSensor(0.2), [scene(0)])
+    measured = event_rates.measure(recording, np.zeros((48, 48), np.int64), slices=10)
+    with pytest.raises(ValueError, match="outside what the grid"):
+        contrast.estimate(measured, [scene(1)], FPS, {}, [0.8, 1.0, 1.4])
+
+
+def test_a_recording_off_the_sensor_is_named():
+    recording = recorded(EventSensor(0.2), [scene(0)])
+    with pytest.raises(ValueError, match="outside the 40x48 sensor"):
+        event_rates.measure(recording, np.zeros((48, 40), np.int64))
+
+
+def test_figure_and_table_are_written_from_a_file(tmp_path):
+    clips = [scene(0)]
+    write_events(tmp_path / "a.raw", recorded(EventSensor(0.2), clips)[0], width=48, height=48)
+    measured = event_rates.measure(open_events(tmp_path / "a.raw"), np.zeros((48, 48), np.int64))
+    found = contrast.estimate(measured, clips, FPS, {}, GRID)
+    event_rate.threshold(found, tmp_path / "threshold.png")
+    contrast.write_csv(found, measured, tmp_path / "threshold.csv")
+    assert (tmp_path / "threshold.png").stat().st_size > 5000
+    assert "estimate,,0." in (tmp_path / "threshold.csv").read_text()

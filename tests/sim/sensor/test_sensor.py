@@ -1,0 +1,351 @@
+"""The sensor against its slow definition, its laws, and the errors it names."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from src.sim.sensor import response
+from src.sim.sensor.engines import sensor_cpu, sensor_eager
+from src.sim.sensor.sensor import EventSensor
+from tests.sim.sensor import sensor_oracle
+
+FPS = 120.0
+EDGES = [math.ceil(k * 1e6 / FPS - 1e-6) for k in range(64)]
+NOISY = dict(
+    mismatch=0.1, leak_hz=5.0, shot_hz=60.0, hot_fraction=0.1, hot_hz=100.0, cutoff_hz=50.0,
+    response="linlog", off_ratio=1.3, seed=3,
+)  # fmt: skip
+
+
+def signals(seed: int = 0, frames: int = 9) -> torch.Tensor:
+    """Frames (frames, 6, 8): walks, ramps, steps, 8-bit walks that return, reversals, rest."""
+    g = torch.Generator().manual_seed(seed)
+    rows = torch.empty(frames, 6, 8)
+    k = torch.arange(frames)[:, None] / (frames - 1)
+    rows[:, 0] = torch.exp(-1.5 + 0.4 * torch.randn(frames, 8, generator=g).cumsum(0)).clamp(
+        0.02, 1
+    )
+    rows[:, 1] = torch.exp(-3 + 3 * k * torch.rand(8, generator=g))
+    rows[:, 2] = torch.where(k < torch.rand(8, generator=g), 0.05, 0.9)
+    rows[:, 3] = torch.randint(0, 6, (frames, 8), generator=g) * 40 / 255
+    rows[:, 4] = torch.where(torch.arange(frames)[:, None] % 2 == 0, 0.2, 0.2 + 0.7 * k)
+    rows[:, 5] = 0.5
+    return rows.clamp(0, 1)
+
+
+def levels_of(sensor: EventSensor, frames: torch.Tensor) -> list[list[int]]:
+    """The level sequence of every pixel, row by row."""
+    return response.lookup(sensor._table, frames).flatten(1).T.tolist()
+
+
+def expected(sensor: EventSensor, frames: torch.Tensor) -> list[list[tuple[int, int]]]:
+    on, off = (int(c) for c in sensor._chips(1, None)[0, :2])
+    wait = sensor_oracle.Fraction(float(np.float32(sensor.refractory_s * FPS)))
+    pixels = levels_of(sensor, frames)
+    if sensor.stamps == "v2e":
+        lists = sensor_oracle.v2e(pixels, on, off, wait, sensor.refractory)
+    else:
+        lists = [sensor_oracle.linear(p, on, off, wait, sensor.refractory)[0] for p in pixels]
+    return [sensor_oracle.ticks(events, EDGES) for events in lists]
+
+
+def listed(events: np.ndarray, height: int, width: int) -> list[list[tuple[int, int]]]:
+    """The events of every pixel, row by row."""
+    out = [[] for _ in range(height * width)]
+    for t, x, y, p in events.tolist():
+        out[y * width + x].append((t, p))
+    return out
+
+
+def same(ours, theirs) -> bool:
+    """Equal polarities in equal order, times within the one tick that a float32 may round."""
+    return all(
+        [p for _, p in a] == [p for _, p in b]
+        and all(abs(s - t) <= 1 for (s, _), (t, _) in zip(a, b, strict=True))
+        for a, b in zip(ours, theirs, strict=True)
+    )
+
+
+@pytest.mark.parametrize("stamps", ["linear", "v2e"])
+@pytest.mark.parametrize("refractory", ["defer", "delete", "hold"])
+@pytest.mark.parametrize("refractory_s", [0.0, 0.00051, 0.005, 0.02])
+def test_events_are_the_definitions(stamps, refractory, refractory_s):
+    for threshold in (0.1, 0.35):
+        sensor = EventSensor(
+            threshold, stamps=stamps, refractory=refractory, refractory_s=refractory_s
+        )
+        frames = signals()
+        assert same(listed(sensor.events(frames, FPS), 6, 8), expected(sensor, frames))
+
+
+@pytest.mark.parametrize("stamps", ["linear", "v2e"])
+def test_a_tie_of_the_level_with_the_threshold_is_an_event(stamps):
+    frames = torch.tensor([100, 200, 100, 200, 200, 100.0])[:, None, None] / 255
+    sensor = EventSensor(0.5, stamps=stamps, refractory_s=0.0)
+    ends = levels_of(sensor, frames)[0][:2]
+    sensor.threshold = (ends[1] - ends[0] + 2.5) / 2**20  # after the sensor's own allowance
+    events = sensor.events(frames, FPS)
+    assert events["p"].tolist() == [1, -1, 1, -1]
+    assert events["t"].tolist() == [EDGES[k] - 1 for k in (1, 2, 3, 5)]
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    codes=st.lists(st.integers(0, 255), min_size=2, max_size=12),
+    threshold=st.floats(0.05, 0.8),
+    refractory=st.sampled_from(["defer", "delete", "hold"]),
+    wait=st.sampled_from([0.0, 0.001, 0.005, 0.03]),
+)
+def test_any_8_bit_signal_gives_the_definitions_events(codes, threshold, refractory, wait):
+    sensor = EventSensor(threshold, refractory=refractory, refractory_s=wait)
+    frames = torch.tensor(codes, dtype=torch.float32)[:, None, None] / 255
+    assert same(listed(sensor.events(frames, FPS), 1, 1), expected(sensor, frames))
+
+
+@pytest.mark.parametrize("settings_", [{}, NOISY], ids=["clean", "noisy"])
+@pytest.mark.parametrize("stamps", ["linear", "v2e"])
+@pytest.mark.parametrize("refractory", ["defer", "delete", "hold"])
+@pytest.mark.parametrize("refractory_s", [0.0, 0.005, 0.02])
+def test_engines_agree_bit_for_bit(settings_, stamps, refractory, refractory_s):
+    sensor = EventSensor(
+        0.2, stamps=stamps, refractory=refractory, refractory_s=refractory_s, **settings_
+    )
+    frames = torch.stack([signals(s, 7) for s in range(6)]).view(2, 3, 7, 6, 8)
+    first, second = (
+        sensor._job(frames, FPS, None, 2, origin=(5, 7), full_width=99) for _ in range(2)
+    )
+    kernel = sensor_cpu.voxels(first, torch.empty(2, 3, 3, 5, 6, 8))
+    eager = sensor_eager.voxels(second, torch.empty(2, 3, 3, 5, 6, 8))
+    assert torch.equal(kernel, eager)
+    for name in ("level", "source", "reference", "dead"):
+        assert torch.equal(getattr(first.state, name), getattr(second.state, name)), name
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("settings_", [{}, NOISY], ids=["clean", "noisy"])
+@pytest.mark.parametrize("stamps", ["linear", "v2e"])
+@pytest.mark.parametrize("refractory", ["defer", "delete", "hold"])
+def test_the_gpu_agrees_bit_for_bit(settings_, stamps, refractory):
+    frames = torch.rand(2, 3, 8, 63, 65, generator=torch.Generator().manual_seed(4))
+    sensor = EventSensor(0.2, stamps=stamps, refractory=refractory, **settings_)
+    on_cpu, on_gpu = [], []
+    for found, device in ((on_cpu, "cpu"), (on_gpu, "cuda")):
+        state = None
+        for part in frames.to(device).split([5, 3], 2):
+            grids, state = sensor.step(part, FPS, state, origin=(5, 7), full_width=99)
+            found.append(grids.cpu())
+        memory = (state.level, state.source, state.reference, state.dead)
+        found.extend(part.cpu() for part in memory)
+    assert all(torch.equal(a, b) for a, b in zip(on_cpu, on_gpu, strict=True))
+
+
+@pytest.mark.parametrize("settings_", [{}, NOISY, {"stamps": "v2e"}, {"refractory": "hold"}])
+def test_in_chunks_is_in_one(settings_):
+    sensor = EventSensor(0.15, **settings_)
+    frames = signals(frames=9)[None, None]
+    whole = sensor.voxels(frames, FPS)
+    head, state = sensor.step(frames[:, :, :4], FPS)
+    middle, state = sensor.step(frames[:, :, 4:5], FPS, state)
+    tail, _ = sensor.step(frames[:, :, 5:], FPS, state)
+    assert torch.equal(torch.cat([head, middle, tail], 2), whole)
+
+
+@pytest.mark.parametrize("response_", ["log", "linlog"])
+def test_an_ideal_sensor_keeps_the_change_of_log_intensity(response_):
+    """Law 1: without dead time and noise, |C sum p - change| < C everywhere, at any frame."""
+    frames = torch.rand(6, 16, 16, generator=torch.Generator().manual_seed(1)) * 0.9 + 0.09
+    threshold = 0.17
+    sensor = EventSensor(threshold, refractory_s=0.0, response=response_)
+    total = sensor.voxels(frames[None, None], FPS)[0, 0].sum(1).cumsum(0).double()
+    change = frames[1:].double().log() - frames[0].double().log()
+    assert (total * threshold - change).abs().max() < threshold
+
+
+def test_a_flat_scene_makes_no_event():
+    """Law 7."""
+    assert len(EventSensor(0.01).events(torch.full((5, 4, 4), 0.3), FPS)) == 0
+
+
+@pytest.mark.parametrize("settings_", [{}, NOISY], ids=["clean", "noisy"])
+def test_a_crop_and_another_batch_draw_the_same(settings_):
+    """Laws 3 and 5: neither crop, batch, order of views nor number of threads changes a pixel."""
+    frames = torch.rand(2, 3, 4, 20, 24, generator=torch.Generator().manual_seed(2))
+    sensor = EventSensor(0.3, **settings_)
+    whole = sensor.voxels(frames, FPS, clips=[7, 9], views=[143, 144, 145])
+    part = sensor.voxels(
+        frames[1:, [2, 0], :, 3:11, 5:17].contiguous(), FPS, clips=[9], views=[145, 143],
+        origin=(3, 5), full_width=24,
+    )  # fmt: skip
+    assert torch.equal(part, whole[1:, [2, 0], :, :, 3:11, 5:17])
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        assert torch.equal(sensor.voxels(frames, FPS, clips=[7, 9], views=[143, 144, 145]), whole)
+    finally:
+        torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize("settings_", [{}, NOISY], ids=["clean", "noisy"])
+def test_how_many_pixels_are_simulated_together_changes_nothing(settings_, monkeypatch):
+    """Neither units that cross rows nor a batch of events that is full before its unit is done."""
+    frames = signals()[None, None]
+    sensor = EventSensor(0.02, refractory_s=0.0, **settings_)
+    place = {"origin": (3, 5), "full_width": 24}
+    grids, state = sensor.step(frames, FPS, **place)
+    counts, events = sensor.counts(frames, FPS), sensor.events(frames[0, 0], FPS, **place)
+    monkeypatch.setattr(sensor_cpu, "UNIT", 5)
+    small_grids, small_state = sensor.step(frames, FPS, **place)
+    assert torch.equal(small_grids, grids)
+    for name in ("level", "source", "reference", "dead"):
+        assert torch.equal(getattr(small_state, name), getattr(state, name)), name
+    assert torch.equal(sensor.counts(frames, FPS), counts)
+    assert np.array_equal(sensor.events(frames[0, 0], FPS, **place), events)
+
+
+def test_the_chip_is_one_over_clips_and_the_noise_is_not():
+    frames = torch.full((2, 1, 30, 24, 24), 0.2)
+    noise = EventSensor(0.3, shot_hz=30.0).voxels(frames, FPS)
+    assert not torch.equal(noise[0], noise[1])
+    flicker = frames.clone()
+    flicker[:, :, 1::2] = 0.3
+    uneven = EventSensor(0.3, mismatch=0.2, refractory_s=0.0).voxels(flicker, FPS)
+    assert torch.equal(uneven[0], uneven[1])
+    assert uneven[0].abs().sum((0, 1, 2)).std() > 0
+
+
+def test_a_sum_of_substeps_is_one_window():
+    frames = signals(frames=9)[None, None]
+    sensor = EventSensor(0.15)
+    fine = sensor.voxels(frames, 960.0)
+    coarse = sensor.voxels(frames, 960.0, substeps=4)
+    assert coarse.shape == (1, 1, 2, 5, 6, 8)
+    assert torch.equal(coarse.sum(3), fine.view(1, 1, 2, 4, 5, 6, 8).sum((3, 4)))
+
+
+def test_a_ramp_cut_into_substeps_keeps_its_events():
+    """Log intensity linear in time: samples in between change nothing but rounding."""
+    coarse = torch.exp(torch.tensor([-2.0, -0.5, -1.7, -0.1]))
+    fine = torch.exp(torch.tensor(np.interp(np.arange(25) / 8, np.arange(4), coarse.log())))
+    sensor = EventSensor(0.1, refractory_s=0.0007)
+    few = sensor.events(coarse[:, None, None], FPS)
+    many = sensor.events(fine.float()[:, None, None], FPS * 8)
+    assert few["p"].tolist() == many["p"].tolist()
+    assert np.abs(few["t"] - many["t"]).max() <= 2
+
+
+def test_the_low_pass_is_exact_at_any_frame_interval():
+    """One pole whose input is linear in time: more samples of the same line, the same output."""
+    sensor = EventSensor(0.1, cutoff_hz=20.0)
+    ends = torch.full((1, 1, 2, 1, 1), 0.5)
+    ends[:, :, 1] = 0.5001
+    ends[:, :, 0] = 0.499
+    fine = torch.lerp(ends[:, :, :1], ends[:, :, 1:], torch.linspace(0, 1, 9).view(1, 1, 9, 1, 1))
+    _, once = sensor.step(ends, FPS)
+    _, often = sensor.step(fine, FPS * 8)
+    moved = int(once.source) - int(response.lookup(sensor._table, ends[0, 0, 0]))
+    assert abs(int(once.level) - int(often.level)) <= 16
+    assert 0.2 < (int(once.level) - int(once.source) + moved) / moved < 0.8
+
+
+def test_the_noise_has_the_rates_it_is_given():
+    frames = torch.zeros(1, 1, 121, 64, 64)
+    counts = EventSensor(0.3, shot_hz=5.0, refractory_s=0.0).counts(frames, FPS).sum()
+    expected_events = 5.0 * 64 * 64
+    assert abs(counts - expected_events) < 4 * math.sqrt(expected_events)
+    white = EventSensor(0.3, shot_hz=5.0, refractory_s=0.0).counts(frames + 1, FPS).sum()
+    assert abs(white - expected_events / 4) < 4 * math.sqrt(expected_events / 4)
+    leak = EventSensor(0.3, leak_hz=3.5, refractory_s=0.0).counts(frames, FPS)[0, 0]
+    assert leak.tolist() == [3 * 64 * 64, 0]
+    hot = EventSensor(0.3, hot_fraction=0.01, hot_hz=60.0, refractory_s=0.0)
+    share = hot.counts(frames, FPS).sum() / (60 * 64 * 64)
+    assert abs(share - 0.01) < 4 * math.sqrt(0.01 / 64**2)
+
+
+def test_noise_comes_at_any_time_of_the_interval():
+    events = EventSensor(0.3, shot_hz=100.0, refractory_s=0.0).events(torch.zeros(2, 64, 64), FPS)
+    share = np.histogram(events["t"], 5, (0, EDGES[1]))[0] / len(events)
+    assert np.abs(share - 0.2).max() < 4 * math.sqrt(0.16 / len(events))
+
+
+def test_mismatch_has_its_deviation_and_its_floor():
+    sensor = EventSensor(0.2, mismatch=0.15, refractory_s=0.0)
+    job = sensor._job(torch.zeros(1, 1, 2, 200, 200), FPS, None, 1)
+    on = sensor_eager.Pixels(job).on.double() / 2**20
+    assert abs(on.mean() - 0.2) < 4 * 0.03 / 200
+    assert abs(on.std() / 0.03 - 1) < 4 / math.sqrt(2 * 200**2)
+    wild = sensor_eager.Pixels(
+        EventSensor(0.2, mismatch=0.9)._job(torch.zeros(1, 1, 2, 99, 99), FPS, None, 1)
+    )
+    assert wild.on.min() >= 0.049 * 2**20
+
+
+@pytest.mark.parametrize("refractory_s", [0.0005, 0.005])
+def test_v2es_single_pixel_step(refractory_s):
+    """A step of 2 nat at C = 0.1: the counts per frame measured on v2e itself."""
+    frames = torch.full((16, 1, 1), math.exp(-0.2))
+    frames[0] = math.exp(-2.2)
+    sensor = EventSensor(0.1, stamps="v2e", refractory_s=refractory_s)
+    per_frame = sensor.voxels(frames[None, None], FPS).sum((0, 1, 3, 4, 5)).int().tolist()
+    want = [10, 10] if refractory_s < 0.001 else [2, 2, 1, 2, 1, 2]
+    assert per_frame[: len(want)] == want
+    assert sum(per_frame) == 20
+
+
+def test_v2es_stamps_are_set_by_the_busiest_pixel():
+    frames = torch.tensor([[0.1, 0.5], [0.9, 0.5 * math.exp(0.25)]])[:, None]
+    events = EventSensor(0.2, stamps="v2e", refractory_s=0.0).events(frames, FPS)
+    quiet = events[events["x"] == 1]
+    assert quiet["t"].tolist() == [math.ceil(EDGES[1] / 10) - 1]
+
+
+def test_levels_are_the_logarithm_to_one_unit():
+    x = torch.rand(20000, dtype=torch.float32) * 0.99 + 0.01
+    for source, light in (("linear", x.double()), ("srgb", ((x.double() + 0.055) / 1.055) ** 2.4)):
+        seen = x >= 0.05
+        level = response.lookup(response.response_table("log", source, 1e-3), x)[seen]
+        exact = light[seen].clamp(min=1e-3).log() * 2**20
+        assert (level - exact).abs().max() < 1.1
+
+
+@pytest.mark.parametrize(
+    ("settings_", "words"),
+    [
+        ({"threshold": -1}, r"sensor.threshold must be in \[0.01, 5\], got -1"),
+        ({"threshold": [0.7, 0.1]}, r"sensor.threshold must be a number or \[low, high\]"),
+        ({"refractory_s": -1.0}, "sensor.refractory_s"),
+        ({"refractory": "drop"}, "sensor.refractory must be one of defer, delete, hold"),
+        ({"stamps": "esim"}, "sensor.stamps"),
+        ({"mismatch": math.nan}, "sensor.mismatch"),
+        ({"floor": 0.0}, "sensor.floor"),
+    ],
+)
+def test_settings_outside_their_range_are_named(settings_, words):
+    with pytest.raises(ValueError, match=words):
+        EventSensor(**settings_)
+
+
+@pytest.mark.parametrize(
+    ("frames", "fps", "words"),
+    [
+        (torch.rand(1, 4, 4), FPS, "two frames|at least 2 frames"),
+        (torch.rand(3, 4, 4) - 0.5, FPS, "finite and in"),
+        (torch.rand(3, 4, 4) * 3, FPS, "finite and in"),
+        (torch.full((3, 4, 4), math.nan), FPS, "finite and in"),
+        (torch.rand(3, 4, 4), -1.0, "fps must be in"),
+        (torch.rand(3, 0, 4), FPS, "at least one pixel"),
+    ],
+)
+def test_frames_that_are_wrong_are_named(frames, fps, words):
+    with pytest.raises(ValueError, match=words):
+        EventSensor().events(frames, fps)
+
+
+def test_black_pixels_are_at_the_floor():
+    frames = torch.zeros(2, 1, 1)
+    frames[1] = 1 / 255
+    assert len(EventSensor(0.05).events(frames, FPS)) == 0

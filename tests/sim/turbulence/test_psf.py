@@ -1,0 +1,106 @@
+"""Point spread functions: the exact one, its resampling, and the fitted one against it."""
+
+import math
+
+import pytest
+import torch
+
+from src.sim.turbulence.p2s import FILE, FINE_PER_AIRY, Spots, bands
+from src.sim.turbulence.psf import fraunhofer_psf, resampling
+from src.sim.turbulence.zernike import noll_covariance
+
+
+def phases(count: int, d_over_r0: float, modes: int) -> torch.Tensor:
+    mix = torch.linalg.cholesky(noll_covariance(modes)).float() * d_over_r0 ** (5 / 6)
+    out = torch.randn(count, modes, generator=torch.Generator().manual_seed(3)) @ mix.T
+    out[:, :2] = 0
+    return out
+
+
+def test_clear_pupil_is_airys_pattern():
+    psf = fraunhofer_psf(torch.zeros(2), airy_px=4.0, size=61, points=1, pupil=256)
+    profile = psf[30, 30:] / psf[30, 30]
+    x = math.pi * torch.arange(31.0) / 4
+    airy = (2 * torch.special.bessel_j1(x) / x.clamp(min=1e-9)) ** 2
+    airy[0] = 1
+    torch.testing.assert_close(profile, airy, atol=2e-3, rtol=0)
+
+
+def test_tilt_moves_the_light_the_way_it_says():
+    tilt = torch.tensor([1.5, -0.8])
+    psf = fraunhofer_psf(tilt, airy_px=2.0, size=63, points=1)
+    straight = fraunhofer_psf(torch.zeros(2), airy_px=2.0, size=63, points=1)
+    moved = psf.flatten().argmax()
+    assert (moved % 63 - 31, moved // 63 - 31) == (
+        round(1.5 * 4 / math.pi),
+        round(-0.8 * 4 / math.pi),
+    )
+    assert straight.argmax() == 31 * 63 + 31
+
+
+@pytest.mark.parametrize("airy", [0.5, 0.7, 1.0, 2.0])
+def test_resampling_equals_integration_over_pixels(airy):
+    size = 2 * int(4 * airy) + 1
+    coefficients = phases(8, 2.0, 35)
+    fine = fraunhofer_psf(coefficients, airy_px=2.0, size=65, pupil=64, points=1)
+    grid = resampling(size, 65, 2.0 / airy).float()
+    ours = grid @ fine @ grid.T
+    exact = fraunhofer_psf(coefficients, airy_px=airy, size=size, pupil=64, points=9)
+    ours = ours / ours.sum((1, 2), keepdim=True)
+    assert (ours - exact).norm() < 0.01 * exact.norm()
+
+
+@pytest.mark.parametrize("band, strength, limit", [(0, 1.0, 0.03), (1, 2.0, 0.08), (2, 4.0, 0.22)])
+def test_fitted_psf_is_close_to_the_exact_one(band, strength, limit):
+    band = bands()[band]
+    coefficients = phases(300, strength, band.modes)
+    size = band.mean.shape[-1]
+    exact = fraunhofer_psf(
+        coefficients, airy_px=FINE_PER_AIRY, size=size, pupil=size - 3, points=1
+    ).flatten(1)
+    weights = band.weights(coefficients[:, 2:], len(band.basis))
+    ours = band.mean.flatten() + weights @ band.basis.flatten(1)
+    assert ((ours - exact).norm(dim=1) / exact.norm(dim=1)).square().mean().sqrt() < limit
+
+
+def test_fitted_psf_without_phase_is_diffraction():
+    band = bands()[0]
+    ours = Spots(band, len(band.basis), 1.0, 17)(torch.zeros(1, 25, 1, 1))[0, 0, :, :, 0]
+    exact = fraunhofer_psf(torch.zeros(2), airy_px=1.0, size=17, points=9)
+    assert (ours - exact).abs().max() < 0.01 * exact.max()
+
+
+def test_the_fitted_file_is_small():
+    assert FILE.stat().st_size < 2_000_000
+
+
+@pytest.mark.slow
+def test_we_are_closer_than_the_public_network(shared_data):
+    """Relative error at D/r0 = 4, at the sampling of the public basis (3.8 pixels a lambda / D)."""
+    state = torch.load(shared_data / "p2s_reference/P2S_state.pt", map_location="cpu")
+    known = torch.load(shared_data / "p2s_reference/kernel_PCA.pt", map_location="cpu")
+    coefficients = phases(300, 4.0, 35)
+    exact = fraunhofer_psf(coefficients, airy_px=3.8, size=65, pupil=48, points=1).flatten(1)
+    layers = list(state.values())
+    x = coefficients[:, 2:]
+    for index in (0, 2, 4):
+        x = torch.nn.functional.linear(x, layers[index], layers[index + 1])
+        x = torch.nn.functional.leaky_relu(x, 0.01) if index < 4 else x
+    public = known["mu"].reshape(1, -1) + x @ known["dictionary"].reshape(len(x.T), -1)
+    band = bands()[2]
+    ours = (
+        Spots(band, len(band.basis), 3.8, 65)(
+            torch.nn.functional.pad(coefficients[:, 2:], (0, band.modes - 35)).T.reshape(
+                1, -1, 1, 300
+            )
+        )[0, 0]
+        .reshape(65 * 65, 300)
+        .T
+    )
+
+    def error(psf):
+        psf, truth = (p / p.sum(1, keepdim=True) for p in (psf, exact))
+        return float(((psf - truth).norm(dim=1) / truth.norm(dim=1)).square().mean().sqrt())
+
+    print(f"public {error(public):.3f}, ours {error(ours):.3f}")
+    assert error(ours) < 0.5 * error(public)

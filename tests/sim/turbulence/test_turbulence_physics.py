@@ -1,0 +1,337 @@
+"""The physics of the turbulence, check by check, numbered as in docs/simulation.md.
+
+Closed forms are compared with what the simulator draws.  Where the expectation over the random
+amplitudes can be taken exactly (a sum over the plane waves) it is, and only the draw of the waves
+is sampled; tolerances come from the sample sizes and are two-sided.
+"""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from src.sim import noise
+from src.sim.turbulence.atmosphere import Atmosphere
+from src.sim.turbulence.fidelity import mean_psf
+from src.sim.turbulence.halo import Halo
+from src.sim.turbulence.operator import WAVES, Turbulence
+from src.sim.turbulence.p2s import Spots, bands
+from src.sim.turbulence.phase import Waves, draw_waves, flow
+from src.sim.turbulence.psf import fraunhofer_psf
+from src.sim.turbulence.zernike import noll_covariance, noll_residual
+
+PATH = Atmosphere(0.05, 0.5, 1000.0, 2.0, 525e-9, 3e-14, 0.9)  # D 5 cm, 1 km, 2 m wide
+
+
+def waves_of(atmosphere: Atmosphere, modes: int, clips: int, width_px: int = 256) -> list[Waves]:
+    return [
+        draw_waves(atmosphere, noise.key(i), modes=modes, waves=WAVES, width_px=width_px)
+        for i in range(clips)
+    ]
+
+
+def covariance(waves: Waves, shift_px: tuple[float, float] = (0.0, 0.0)) -> torch.Tensor:
+    """Return E[a_i(x) a_j(x + shift)] over the amplitudes of one clip."""
+    turn = 2 * math.pi * waves.frequency @ torch.tensor(shift_px, dtype=torch.float64)
+    left = torch.view_as_complex(waves.response)
+    right = left * torch.exp(1j * turn)
+    return (left.conj() @ right.T).real
+
+
+def mean_covariance(clips: list[Waves], shift_px=(0.0, 0.0)) -> torch.Tensor:
+    return torch.stack([covariance(waves, shift_px) for waves in clips]).mean(0)
+
+
+def phases(count: int, d_over_r0: float, modes: int, tilt: bool) -> torch.Tensor:
+    mix = torch.linalg.cholesky(noll_covariance(modes)).float() * d_over_r0 ** (5 / 6)
+    out = torch.randn(count, modes, generator=torch.Generator().manual_seed(1)) @ mix.T
+    out[:, :2] *= tilt
+    return out
+
+
+def still(d_over_r0: float, views=9, **options) -> Turbulence:
+    """Return turbulence whose frames are independent draws."""
+    path = replace(PATH.at(d_over_r0), alpha=0.0)
+    return Turbulence(path, views=views, height=64, width=64, **options)
+
+
+def test_01_fried_parameter():
+    assert PATH.r0_m == pytest.approx(0.01995, rel=0.005)
+    slab = replace(PATH, cn2=(3e-14, 3e-14, 3e-14))
+    assert slab.r0_m == pytest.approx(PATH.r0_m, rel=1e-9)
+    near, far = replace(PATH, cn2=(6e-14, 0.0)), replace(PATH, cn2=(0.0, 6e-14))
+    assert near.r0_m < PATH.r0_m < far.r0_m  # air at the lens hurts most
+
+
+def test_02_03_04_noll_covariances_of_the_waves():
+    clips = waves_of(PATH.at(1.0), 35, 64)
+    expected = noll_covariance(35)
+    scale = expected.diagonal().sqrt()
+    error = (mean_covariance(clips) - expected) / (scale[:, None] * scale)
+    assert error.diagonal().abs().max() < 0.01
+    assert error.abs().max() < 0.02
+    assert expected[0, 0] == pytest.approx(0.4489, abs=1e-4)
+    assert expected[0, 6] == pytest.approx(-0.01416, abs=1e-5)
+    assert expected[1, 5] == pytest.approx(-0.01416, abs=1e-5)
+    assert expected[2, 9] == pytest.approx(-0.00388, abs=1e-5)
+
+
+def test_02_every_clip_has_the_right_tilt_variance():
+    variances = [covariance(waves)[0, 0] for waves in waves_of(PATH.at(1.0), 35, 32)]
+    assert torch.stack(variances).std() < 0.02 * 0.4489
+
+
+def test_05_residuals():
+    table = [1.0324, 0.5835, 0.1347, 0.1114, 0.0882, 0.0650, 0.0588, 0.0526, 0.0464, 0.0402]
+    table += [0.0378, 0.0353, 0.0329, 0.0304, 0.0280, 0.0268, 0.0256, 0.0244, 0.0232, 0.0220]
+    for modes, residual in enumerate([*table, 0.0208], start=1):
+        assert noll_residual(modes) == pytest.approx(residual, abs=6e-5)
+    assert noll_residual(120) == pytest.approx(0.2944 * 120 ** (-math.sqrt(3) / 2), rel=0.03)
+
+
+def test_06_tilt_in_pixels():
+    path = replace(PATH.at(0.05 / 0.0203), alpha=0.0)
+    assert path.tilt_std_px(256) == pytest.approx(1.21, rel=0.01)
+    samples = []
+    for seed in range(12):
+        turbulence = Turbulence(path, views=9, height=256, width=256)
+        generator = torch.Generator().manual_seed(seed)
+        samples.append(turbulence.tilt(100, generator, crop=(128, 128, 1, 1)).flatten())
+    samples = torch.cat(samples)  # 12 x 9 x 100 x 2 draws
+    tolerance = 4 / math.sqrt(2 * samples.numel()) + 0.005
+    assert samples.square().mean().sqrt() == pytest.approx(path.tilt_std_px(256), rel=tolerance)
+    assert samples.abs().max() > 3 * path.tilt_std_px(256)
+
+
+def test_07_centroid_of_a_rendered_point():
+    turbulence = Turbulence(
+        replace(PATH.at(1.0), alpha=0.0, scene_width_m=0.5), views=9, height=65, width=65
+    )
+    bell = torch.exp(-((torch.arange(65.0) - 32) ** 2) / 8)  # smooth, so that the warp is exact
+    point = (bell[:, None] * bell).expand(1, 16, -1, -1)
+    seen = turbulence.degrade(point, torch.Generator().manual_seed(0))[0].flatten(0, 1)
+    seen = seen / seen.sum((1, 2), keepdim=True)
+    place = torch.arange(65.0) - 32
+    x, y = (seen.sum(1) * place).sum(1), (seen.sum(2) * place).sum(1)
+    share = 0.5 * (x.var() + y.var()) / turbulence.fidelity.airy_px**2
+    slack = 4 * share * math.sqrt(2 / (2 * len(x)))
+    assert 0.1698 - slack < share < 0.1819 + slack  # between G-tilt and Z-tilt
+    drawn = turbulence.tilt(16, torch.Generator().manual_seed(0), crop=(32, 32, 1, 1))
+    same = torch.corrcoef(torch.stack([x, drawn.flatten(0, 1)[:, 0, 0, 0]]))[0, 1]
+    assert same > 0.9  # the light goes where the tilt says
+
+
+@pytest.mark.parametrize(
+    "mode, expected",
+    [
+        (4, (0.945, 0.865, 0.666, 0.471, 0.293)),
+        (11, (0.859, 0.705, 0.434, 0.254, 0.136)),
+        (2, (0.993, 0.978, 0.929, 0.860, 0.766)),
+    ],
+)
+def test_08_correlation_along_the_object(mode, expected):
+    clips = waves_of(PATH.at(1.0), 14, 200)
+    pixel = PATH.object_pixel_m(256) / PATH.aperture_m
+    zero = mean_covariance(clips)
+    for separation, value in zip((0.1, 0.2, 0.5, 1.0, 2.0), expected, strict=True):
+        along = mean_covariance(clips, (separation / pixel, 0.0))
+        across = mean_covariance(clips, (0.0, separation / pixel))
+        found = (along + across)[mode - 2, mode - 2] / (2 * zero[mode - 2, mode - 2])
+        assert found == pytest.approx(value, abs=0.02)
+
+
+def test_09_tilt_along_and_across_the_separation():
+    clips = waves_of(PATH.at(1.0), 2, 200)
+    along = mean_covariance(clips, (128.0, 0.0))  # 20 D apart
+    across = mean_covariance(clips, (0.0, 128.0))
+    # Sarazin & Roddier 1990: 0.0968 against 0.145 (d/D)^(-1/3) beyond a few D, in any layer
+    assert along[0, 0] / across[0, 0] == pytest.approx(0.0968 / 0.145, abs=0.05)
+    assert across[1, 1] / along[1, 1] == pytest.approx(0.0968 / 0.145, abs=0.05)
+
+
+@pytest.mark.parametrize("tilt", [True, False], ids=["10_long", "11_short"])
+def test_exposure_transfer_function(tilt):
+    size, airy, strength = 63, 2.0, 2.0
+    flat = torch.zeros(1, 2)
+    spots = fraunhofer_psf(phases(1500, strength, 90, tilt), airy_px=airy, size=size, points=1)
+    limit = fraunhofer_psf(flat, airy_px=airy, size=size, points=1)
+
+    def transfer(psf):
+        total = torch.fft.fft2(psf.mean(0)).abs()
+        return (total[0] + total[:, 0]) / 2
+
+    found = transfer(spots) / transfer(limit)
+    # Fried's short exposure takes tilt and the rest for independent; a lower bound as nu grows
+    for index in (6, 12, 18) if tilt else (3, 6):
+        nu = index / size * airy  # in D / lambda
+        lost = 3.44 * (strength * nu) ** (5 / 3) * (1 if tilt else 1 - nu ** (1 / 3))
+        assert found[index] == pytest.approx(math.exp(-lost), abs=0.035)
+
+
+@pytest.mark.parametrize("strength, strehl", [(1.0, 0.88), (2.0, 0.68), (4.0, 0.39), (6.0, 0.24)])
+def test_12_mean_peak(strength, strehl):
+    spots = fraunhofer_psf(phases(1200, strength, 35, False), airy_px=4.0, size=61, points=1)
+    limit = fraunhofer_psf(torch.zeros(1, 35), airy_px=4.0, size=61, points=1)
+    peak = spots.amax((1, 2)).mean() / limit.max()
+    assert peak == pytest.approx(strehl, rel=0.06)
+
+
+def test_13_isoplanatic_angle():
+    assert PATH.isoplanatic_angle_rad * PATH.distance_m == pytest.approx(
+        0.314 * PATH.r0_m, rel=0.003
+    )
+
+
+def test_14_ar1():
+    path = replace(PATH.at(2.0), alpha=0.8)
+    turbulence = Turbulence(path, views=9, height=32, width=32)
+    runs = [
+        turbulence.tilt(60, torch.Generator().manual_seed(seed), crop=(16, 16, 1, 1))
+        for seed in range(10)
+    ]
+    tilt = torch.stack(runs).flatten(0, 1)[..., 0, 0] / path.tilt_std_px(32)
+    for lag in (1, 2, 5):
+        found = (tilt[:, lag:] * tilt[:, :-lag]).mean()
+        assert found == pytest.approx(0.8**lag, abs=0.12)
+    first = tilt[:, 0].square().mean()  # 10 x 9 x 2 draws
+    assert first == pytest.approx(1.0, abs=4 * math.sqrt(2 / 180))
+    assert torch.equal(
+        runs[3], turbulence.tilt(60, torch.Generator().manual_seed(3), crop=(16, 16, 1, 1))
+    )
+
+
+def test_14_ar1_at_another_frame_rate_has_the_same_time_scale():
+    path = replace(PATH.at(2.0), alpha=0.8)
+    slow = Turbulence(path, views=9, height=32, width=32, fps=120.0)
+    fast = Turbulence(path, views=9, height=32, width=32, fps=480.0)
+    change = []
+    for turbulence, step in ((slow, 1), (fast, 4)):
+        tilt = turbulence.tilt(240 * step, torch.Generator().manual_seed(0), crop=(9, 9, 1, 1))
+        tilt = tilt[:, ::step]
+        change.append((tilt[:, 1:] - tilt[:, :-1]).square().mean())
+    assert change[0] == pytest.approx(float(change[1]), rel=0.15)
+
+
+def test_15_frozen_flow_shifts_the_field():
+    [waves] = waves_of(PATH.at(2.0), 9, 1)
+    middle = torch.full_like(waves.place, 0.5)
+    pixel = PATH.object_pixel_m(256)
+    thin = replace(waves, place=middle, frequency=waves.layer * 0.5 * pixel)
+    fresh = torch.randn(1, 1, WAVES, 2, dtype=torch.float64)
+    speed, seconds = (2.0, -1.0), 0.01
+    later = flow(thin, fresh, speed, torch.tensor([seconds], dtype=torch.float64))[0, 0]
+    # a layer half-way moves v t; the object point behind the same air moves 2 v t the same way
+    shift = torch.tensor(speed, dtype=torch.float64) * seconds / 0.5 / pixel
+    response = torch.view_as_complex(thin.response)
+    at = torch.tensor([7.0, 3.0], dtype=torch.float64)
+    now = (response * later * torch.exp(2j * math.pi * (thin.frequency @ at))).real.sum(1)
+    before = torch.view_as_complex(fresh)[0, 0] * torch.exp(
+        2j * math.pi * (thin.frequency @ (at - shift))
+    )
+    torch.testing.assert_close(now, (response * before).real.sum(1))
+
+
+def test_15_tilt_spectrum_of_frozen_flow():
+    waves = draw_waves(PATH.at(1.0), 5, modes=2, waves=200_000, width_px=256)
+    near = replace(waves, place=torch.zeros_like(waves.place))
+    kappa_x = (near.layer[:, 0].abs() * PATH.aperture_m * (1 - waves.place)).log10()
+    power = near.response[0].square().sum(-1)
+
+    def density(low: float, high: float) -> float:
+        inside = (kappa_x > low) & (kappa_x <= high)
+        return math.log10(float(power[inside].sum()) / (10**high - 10**low))
+
+    slope = (density(-2.0, -1.8) - density(-3.0, -2.8)) / 1.0
+    assert slope == pytest.approx(-2 / 3, abs=0.15)
+    steep = (density(0.9, 1.0) - density(0.5, 0.6)) / 0.4
+    assert steep == pytest.approx(-17 / 3, abs=0.8)  # Conan et al. 1995
+
+
+def test_16_psf_energy():
+    coefficients = phases(200, 4.0, 44, False)
+    exact = fraunhofer_psf(coefficients, airy_px=1.0, size=17)
+    torch.testing.assert_close(exact.sum((1, 2)), torch.ones(200), atol=1e-5, rtol=0)
+    assert exact.min() >= 0
+    for band in bands():
+        coefficients = phases(200, band.edge, band.modes, False)
+        spots = Spots(band, len(band.basis), 1.0, 15)(coefficients[:, 2:].T.reshape(1, -1, 1, 200))
+        assert spots.min() >= 0
+        found = spots.sum((2, 3)).flatten()
+        inside = fraunhofer_psf(coefficients, airy_px=1.0, size=15, whole=True).sum((1, 2))
+        assert inside.max() < 1.001
+        torch.testing.assert_close(found, inside, atol=0.15, rtol=0)
+        halo = Halo(mean_psf(band.edge), 1.0, 15).share
+        assert found.mean() + halo == pytest.approx(1.0, abs=0.02)  # the cut of negative light
+
+
+def test_16_flat_stays_flat():
+    seen = still(6.0, views=4).degrade(torch.full((1, 2, 64, 64), 0.37), torch.Generator())
+    assert (seen - 0.37).abs().max() < 1e-5
+
+
+def test_17_zero_turbulence_is_diffraction_and_moves_nothing():
+    image = torch.rand(1, 1, 64, 64, generator=torch.Generator().manual_seed(0))
+    tiny = replace(PATH, scene_width_m=40.0).at(1e-6)  # a pixel far wider than lambda / D
+    turbulence = Turbulence(tiny, views=1, height=64, width=64)
+    assert turbulence.fidelity.kernel == 1
+    assert (turbulence.degrade(image, torch.Generator()) - image[:, None]).abs().max() < 1e-4
+    point = torch.zeros(1, 1, 65, 65)
+    point[..., 32, 32] = 1
+    sharp = Turbulence(PATH.at(1e-6), views=1, height=65, width=65)
+    airy = sharp.degrade(point, torch.Generator())[0, 0, 0]
+    torch.testing.assert_close(airy, airy.flip(0), atol=2e-3, rtol=0)
+    torch.testing.assert_close(airy, airy.flip(1), atol=2e-3, rtol=0)
+
+
+def test_18_views_are_independent():
+    tilt = still(2.0).tilt(1500, torch.Generator().manual_seed(2), crop=(32, 32, 1, 1))
+    correlation = torch.corrcoef(tilt[:, :, 0, 0, 0])
+    off = correlation - torch.eye(9)
+    assert off.abs().max() < 4.5 / math.sqrt(1500)
+
+
+def test_18_views_on_a_baseline_are_partly_correlated():
+    path = replace(PATH.at(2.0), alpha=0.0)
+    near, far = (
+        Turbulence(
+            path, views=9, height=32, width=32, views_correlation="baseline", baseline_m=baseline
+        ).tilt(400, torch.Generator().manual_seed(2), crop=(16, 16, 1, 1))
+        for baseline in (0.01, 0.2)
+    )
+    close = torch.corrcoef(near[:, :, 0, 0, 0])[0]
+    apart = torch.corrcoef(far[:, :, 0, 0, 0])[0]
+    assert 0.9 < close[1] < 1
+    assert apart[2] < apart[1] < close[1]
+    assert apart[1] > 0.2
+
+
+def test_19_opposite_borders_are_not_locked_together():
+    path = replace(PATH.at(2.0), alpha=0.0)  # 40 D wide
+    turbulence = Turbulence(path, views=9, height=256, width=256)
+    pairs = []
+    for seed in range(8):
+        tilt = turbulence.tilt(50, torch.Generator().manual_seed(seed), crop=(128, 0, 1, 256))
+        pairs.append(tilt[:, :, 1, 0].flatten(0, 1)[:, [0, 128, 255]])
+    correlation = torch.corrcoef(torch.cat(pairs).T)
+    clips = waves_of(PATH.at(2.0), 2, 100)
+    zero = mean_covariance(clips)[1, 1]
+    half, full = (mean_covariance(clips, (shift, 0.0))[1, 1] / zero for shift in (128.0, 255.0))
+    assert correlation[0, 1] == pytest.approx(float(half), abs=0.08)
+    assert correlation[0, 2] == pytest.approx(float(full), abs=0.08)
+    assert full < half < 0.6
+
+
+def test_20_rytov_variance():
+    strong = replace(PATH, cn2=1e-13)
+    k = 2 * math.pi / 525e-9
+    assert strong.rytov == pytest.approx(0.5 * 1e-13 * k ** (7 / 6) * 1000 ** (11 / 6), rel=0.01)
+    assert strong.rytov > 2.5
+
+
+def test_21_scaling():
+    twice = replace(PATH, wavelength_m=1050e-9)
+    assert twice.r0_m == pytest.approx(PATH.r0_m * 2 ** (6 / 5), rel=1e-9)
+    assert twice.tilt_std_px(256) == pytest.approx(PATH.tilt_std_px(256), rel=1e-9)
+    weak, strong = (waves_of(PATH.at(d), 9, 1)[0] for d in (1.0, 8.0))
+    torch.testing.assert_close(strong.response, weak.response * 8 ** (5 / 6))

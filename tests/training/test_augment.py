@@ -1,0 +1,160 @@
+"""The semantics of every augmentation on hand-made sequences."""
+
+import math
+
+import pytest
+import torch
+
+from src.sim.pipeline import Sample
+from src.training.augment import (
+    Augment,
+    drop_views,
+    flip_axes,
+    hot_pixels,
+    misplace,
+    pause_chain,
+)
+
+OFF = {"noise_std": 0.0, "hot_fraction": 0.0, "pause": 0.0, "flip": 0.0}
+
+
+def numbered(windows: int = 6, size: int = 4) -> Sample:
+    """A sample whose voxels and target say which window and pixel they come from."""
+    window = torch.arange(1.0, windows + 1).reshape(1, windows, 1, 1, 1, 1)
+    pixel = torch.arange(size * size).reshape(size, size) / 100
+    voxels = (window + pixel).expand(1, windows, 2, 3, size, size)
+    target = voxels[:, :, 0, :1] / 10
+    return Sample(voxels.clone(), target.clone(), target.clone(), torch.tensor([1 / 120]))
+
+
+def test_nothing_on_changes_nothing():
+    sample = numbered()
+    out = Augment(**OFF)(sample, [1])
+    assert torch.equal(out.voxels, sample.voxels) and torch.equal(out.target, sample.target)
+
+
+def test_a_pause_repeats_the_target_without_events_and_the_clip_goes_on():
+    out = Augment(**OFF | {"pause": 0.5, "stay": 0.5})(numbered(40), [3])
+    steps, paused = pause_chain(40, 0.5, 0.5, key_of(3))
+    assert 5 < int(paused.sum()) < 35 and not paused[0]
+    for step in range(40):
+        shown = float(steps[step]) + 1
+        assert torch.all((out.target[0, step] * 10).floor() == shown)
+        if paused[step]:
+            assert torch.all(out.voxels[0, step] == 0) and steps[step] == steps[step - 1]
+        else:
+            assert torch.all(out.voxels[0, step].floor() == shown)
+            assert step == 0 or steps[step] == steps[step - 1] + 1
+
+
+def key_of(key: int) -> int:
+    from src.sim import noise
+
+    return noise.key(key, "pause")
+
+
+def test_pause_chain_has_the_paper_s_rates():
+    chains = [pause_chain(200, 0.05, 0.9, key)[1] for key in range(100)]
+    paused = torch.stack(chains)[:, 60:].double()  # the chain forgets its start
+    # Stationary share 0.05 / (0.05 + 0.1); neighbours are correlated by 0.85 per step.
+    spread = math.sqrt(1 / 3 * 2 / 3 / paused.numel() * (1 + 0.85) / (1 - 0.85))
+    assert abs(float(paused.mean()) - 1 / 3) < 4 * spread
+
+
+def test_flips_turn_voxels_and_targets_alike():
+    sample = numbered()
+    seen = set()
+    for key in range(40):
+        out = Augment(**OFF | {"flip": 0.5})(sample, [key])
+        axes = [a for a in ([], [-1], [-2], [-2, -1]) if torch.equal(out.voxels, turn(sample, a))]
+        assert len(axes) == 1
+        expected = sample.target.flip(axes[0]) if axes[0] else sample.target
+        assert torch.equal(out.target, expected) and torch.equal(out.turbulent, expected)
+        seen.add(tuple(axes[0]))
+    assert len(seen) == 4
+
+
+def turn(sample: Sample, axes: list[int]) -> torch.Tensor:
+    return sample.voxels.flip(axes) if axes else sample.voxels
+
+
+def test_flip_probabilities():
+    assert flip_axes(1.0, 5) == [-2, -1] and flip_axes(0.0, 5) == []
+
+
+def test_noise_has_the_stated_spread_also_in_pauses():
+    sample = Sample(
+        torch.zeros(1, 20, 3, 5, 32, 32),
+        torch.zeros(1, 20, 1, 32, 32),
+        torch.zeros(1, 20, 1, 32, 32),
+        window_s=torch.tensor([1 / 120]),
+    )
+    out = Augment(**OFF | {"noise_std": 0.4, "pause": 1.0})(sample, [1]).voxels
+    assert abs(float(out.std()) - 0.4) < 5 * 0.4 / math.sqrt(2 * out.numel())
+    assert float(out[0, 5].std()) > 0.3
+
+
+def test_hot_pixels_stay_through_the_sequence():
+    sample = numbered(windows=5, size=64)
+    out = Augment(**OFF | {"hot_fraction": 0.02, "hot_std": 5.0})(sample, [2]).voxels
+    added = out - sample.voxels
+    assert torch.allclose(added, added[:, :1, :1, :1].expand_as(added), atol=1e-5)
+    assert 0 < int((added[0, 0, 0, 0].abs() > 1e-4).sum()) <= 0.02 * 64 * 64
+
+
+def test_hot_pixel_count_is_uniform_up_to_the_fraction():
+    counts = [int((hot_pixels((50, 50), 0.01, 1.0, key) != 0).sum()) for key in range(400)]
+    assert max(counts) <= 25
+    assert abs(sum(counts) / 400 - 12.0) < 4 * 25 / math.sqrt(12 * 400)
+
+
+def test_a_clip_is_augmented_the_same_in_any_batch():
+    two = numbered()
+    batch = Sample(
+        *(torch.cat([part] * 2) for part in (two.voxels, two.target, two.turbulent)),
+        window_s=torch.full((2,), 1 / 120),
+    )
+    augment = Augment()
+    together, alone = augment(batch, [5, 6]), augment(two, [6])
+    assert torch.equal(together.voxels[1], alone.voxels[0])
+
+
+def test_a_misplaced_view_moves_whole_and_leaves_nothing_behind():
+    view = torch.zeros(2, 3, 1, 16, 16)
+    view[..., 8, 8] = 1
+    moved = misplace(view.clone(), 1.0, 2, key=4)
+    places = [tuple(moved[0, i, 0].nonzero()[0].tolist()) for i in range(3)]
+    assert float(moved.sum()) == float(view.sum()) and torch.equal(moved[0], moved[1])
+    assert len(set(places)) > 1 and all(abs(axis - 8) <= 2 for place in places for axis in place)
+    assert torch.equal(misplace(view.clone(), 0.0, 2, key=4), view)
+
+
+def test_dropped_views_take_their_positions_along_and_some_view_stays():
+    places = tuple((0, column) for column in range(4))
+    voxels = torch.arange(4.0).reshape(1, 1, 4, 1, 1, 1)
+    sample = Sample(voxels, voxels, voxels, torch.tensor([1 / 120]), places)
+    counts = set()
+    for key in range(60):
+        left = drop_views(sample, 1.0, key)
+        kept = left.voxels.flatten().tolist()
+        assert [places[int(view)] for view in kept] == list(left.positions)
+        counts.add(len(kept))
+    assert counts == {1, 2, 3} and drop_views(sample, 0.0, 1) is sample
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"flip": 1.5},
+        {"pause": -0.1},
+        {"noise_std": -1},
+        {"hot_fraction": 2},
+        {"hot_std": math.inf},
+        {"misplaced": 2},
+        {"misplaced_px": -1},
+        {"dropped": 1.5},
+    ],
+)
+def test_wrong_values_name_their_key(wrong):
+    with pytest.raises(ValueError, match=f"augment.{next(iter(wrong))}"):
+        Augment(**wrong)

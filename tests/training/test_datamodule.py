@@ -1,0 +1,70 @@
+"""Batches: the same whatever the workers; going on where a training stopped; reuse; shards."""
+
+import pytest
+import torch
+
+from src.training.augment import Augment
+from src.training.datamodule import LightFieldData, Numbered, Simulator, StepSampler
+from tests.sim.test_pipeline import STRONG, pipeline
+
+
+class FakeTrainer:
+    global_step, global_rank, world_size = 0, 0, 1
+
+
+def chain():
+    return pipeline(STRONG, sensor={"threshold": [0.1, 0.7]}, crop=16, random_crop=True)
+
+
+def test_workers_change_nothing():
+    def batches(workers: int) -> list[torch.Tensor]:
+        data = LightFieldData(
+            {"train": chain()}, Augment(), batch_size=2, reuse=2, epoch_clips=6, workers=workers
+        )
+        data.trainer = FakeTrainer()
+        return [batch.voxels for batch in data.train_dataloader()]
+
+    for zero, two in zip(batches(0), batches(2), strict=True):
+        assert torch.equal(zero, two)
+
+
+def test_a_batch_used_again_is_augmented_anew():
+    numbered, make = Numbered(chain()), Simulator(chain(), Augment(pause=0.0), 0, "cpu")
+    first, again, other = (
+        make([numbered[clip, number]]) for clip, number in ((0, 0), (0, 1), (2, 2))
+    )
+    assert not torch.equal(first.voxels, again.voxels)
+    assert first.drawn == again.drawn != other.drawn
+    fresh = Simulator(chain(), Augment(pause=0.0), 0, "cpu")([numbered[0, 1]])
+    assert torch.equal(fresh.voxels, again.voxels)
+
+
+def numbers(sampler: StepSampler) -> list[list[int]]:
+    return [[number for _, number in batch] for batch in sampler]
+
+
+def test_sampler_goes_on_where_the_training_stopped():
+    whole = numbers(StepSampler(2, 4, lambda: 0))
+    assert whole == [[0, 1], [2, 3], [4, 5], [6, 7]]
+    assert numbers(StepSampler(2, 4, lambda: 3)) == whole[3:]
+    assert numbers(StepSampler(2, 4, lambda: 4))[0] == [8, 9]
+
+
+def test_reuse_repeats_clips_but_not_numbers():
+    batches = list(StepSampler(2, 4, lambda: 0, reuse=2))
+    assert batches[:3] == [[(0, 0), (1, 1)], [(0, 2), (1, 3)], [(4, 4), (5, 5)]]
+
+
+def test_processes_share_a_batch_without_overlap():
+    shards = [numbers(StepSampler(2, 3, lambda: 0, rank=rank, world=2)) for rank in (0, 1)]
+    joint = numbers(StepSampler(4, 3, lambda: 0))
+    assert [a + b for a, b in zip(*shards, strict=True)] == joint
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"batch_size": 0}, {"reuse": 0}, {"epoch_clips": 3, "batch_size": 4}, {"simulate_on": "moon"}],
+)
+def test_wrong_values_name_their_key(wrong):
+    with pytest.raises(ValueError, match=f"data.{next(iter(wrong))}"):
+        LightFieldData({}, **wrong)

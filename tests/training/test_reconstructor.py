@@ -1,0 +1,126 @@
+"""The training step: loss averaged over windows, graph cut where asked, one optimiser step."""
+
+import copy
+
+import lightning
+import pytest
+import torch
+from torch import nn
+from torch.utils.data import DataLoader
+
+from src.models.unroll import chunks, detach, unroll
+from src.sim.pipeline import Sample
+from src.training import reconstructor
+from src.training.reconstructor import Reconstructor
+
+pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`")
+
+
+class Leaky(nn.Module):
+    """A recurrent network of two numbers: state <- a * state + b * sum of the voxels."""
+
+    views = None
+
+    def __init__(self):
+        super().__init__()
+        self.a, self.b = nn.Parameter(torch.tensor(0.5)), nn.Parameter(torch.tensor(0.3))
+
+    def forward(self, voxels, state):
+        events = voxels.sum((1, 2))[:, None]
+        state = self.b * events if state is None else self.a * state + self.b * events
+        return state, state
+
+
+class SquaredError(nn.Module):
+    def forward(self, prediction, target):
+        return (prediction - target).square().mean((1, 2, 3))
+
+
+def sample(windows: int = 6) -> Sample:
+    generator = torch.Generator().manual_seed(0)
+    voxels = torch.randn(2, windows, 1, 5, 8, 8, generator=generator)
+    target = torch.rand(2, windows, 1, 8, 8, generator=generator)
+    window_s = torch.full((2,), 1 / 120)
+    return Sample(voxels, target, target, window_s, drawn=[{"name": "a"}, {"name": "b"}])
+
+
+def fit(network: nn.Module, detach_every: int, steps: int = 1) -> nn.Module:
+    def optimizer(parameters):
+        return torch.optim.SGD(parameters, lr=0.05)
+
+    module = Reconstructor(
+        network, {}, loss=SquaredError(), optimizer=optimizer, detach_every=detach_every
+    )
+    trainer = lightning.Trainer(
+        max_steps=steps,
+        accelerator="cpu",
+        logger=False,
+        log_every_n_steps=1,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    trainer.fit(module, DataLoader([sample()] * steps, collate_fn=lambda items: items[0]))
+    return network
+
+
+def by_hand(detach_every: int) -> nn.Module:
+    network, batch = Leaky(), sample()
+    state, losses = None, []
+    for window in range(batch.voxels.shape[1]):
+        if detach_every and window % detach_every == 0:
+            state = detach(state)
+        frame, state = network(batch.voxels[:, window], state)
+        losses.append((frame - batch.target[:, window]).square().mean())
+    torch.stack(losses).mean().backward()
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter -= 0.05 * parameter.grad
+    return network
+
+
+@pytest.mark.parametrize("detach_every", [0, 1, 4, 6])
+def test_a_step_equals_the_step_written_out(detach_every, monkeypatch):
+    monkeypatch.setattr(reconstructor, "PICTURES", 5)  # pieces of the loss cut through clips
+    ours, theirs = fit(Leaky(), detach_every), by_hand(detach_every)
+    for mine, other in zip(ours.parameters(), theirs.parameters(), strict=True):
+        assert torch.allclose(mine, other, atol=1e-6)
+
+
+def test_cutting_the_graph_changes_the_gradient():
+    assert not torch.allclose(by_hand(0).a, by_hand(1).a, atol=1e-6)
+
+
+def test_negative_detach_length_is_refused():
+    with pytest.raises(ValueError, match="data.detach_every"):
+        Reconstructor(Leaky(), {}, detach_every=-1)
+
+
+def test_chunks_cover_every_window_once():
+    assert list(chunks(5, 2)) == [slice(0, 2), slice(2, 4), slice(4, 5)]
+    assert list(chunks(5, 0)) == [slice(0, 5)]
+
+
+def test_two_chunks_with_the_state_carried_over_equal_one():
+    network, voxels = Leaky(), sample().voxels
+    whole, _ = unroll(network, voxels)
+    first, state = unroll(network, voxels[:, :2])
+    second, _ = unroll(network, voxels[:, 2:], state)
+    assert torch.equal(whole, torch.cat([first, second], dim=1))
+
+
+def test_detach_reaches_nested_states():
+    leaf = torch.ones(1, requires_grad=True) * 2
+    state = detach({"h": (leaf, [leaf]), "n": None})
+    assert not state["h"][0].requires_grad and not state["h"][1][0].requires_grad
+    assert leaf.requires_grad and state["n"] is None
+
+
+def test_a_loss_that_is_not_finite_stops_training():
+    network = Leaky()
+    with torch.no_grad():
+        network.b.fill_(float("nan"))
+    before = copy.deepcopy(network.state_dict())
+    with pytest.raises(ValueError, match="loss"):
+        fit(network, 0)
+    assert torch.equal(before["a"], network.a)
