@@ -126,8 +126,8 @@ def fly(out: Path, index: int, turbulence: str, windows: int) -> dict[str, float
         speed = (truth[1] - truth[0]) * FPS
         found[method] = across(pictures, truth[0] + time[:, None] * speed)
         print(f"dart {index}, {turbulence}: {method}: {found[method]:.2f} px", flush=True)
-    if draw.atmosphere:
-        size = draw.atmosphere
+    if draw.air:
+        size = draw.air
         print(f"D/r0 {size.d_over_r0:.1f}, tilt {size.tilt_std_px(SIDE):.2f} px", flush=True)
     return found
 

@@ -23,10 +23,12 @@ from src.metrics.scores import Scores
 from src.models.unroll import takes
 from src.sim.pipeline import Pipeline
 from src.sim.scenes.photographs import MixedRates
+from src.sim.turbulence.model import TurbulenceModel
 from src.training import evaluation
 from src.training.datamodule import LightFieldData
 from src.training.reconstructor import Reconstructor
 
+SIMULATED = "src.sim.turbulence.simulated.SimulatedAir"
 ROOMS = (
     "src.", "baselines.", "torch.optim.", "lightning.pytorch.trainer.",
     *(f"lightning.pytorch.{room}." for room in ("callbacks", "loggers", "plugins", "profilers")),
@@ -97,7 +99,7 @@ def pipeline(cfg: DictConfig, split: str) -> Pipeline:
         return Pipeline(
             MixedRates(scenes) if len(scenes) > 1 else scenes[0],
             make(cfg.optics),
-            OmegaConf.to_container(cfg.turbulence, resolve=True),
+            _turbulence(cfg.turbulence),
             OmegaConf.to_container(cfg.sensor, resolve=True),
             split=split,
             seed=cfg.seed,
@@ -108,7 +110,12 @@ def pipeline(cfg: DictConfig, split: str) -> Pipeline:
             clips=cfg.data.clips if training else None,
         )
     except TypeError as error:
-        raise ValueError(f"turbulence or sensor takes no such values: {error}") from error
+        raise ValueError(f"sensor takes no such values: {error}") from error
+
+
+def _turbulence(node: DictConfig) -> TurbulenceModel:
+    """Return the turbulence model; simulated air where none is named, as older runs name none."""
+    return make(OmegaConf.merge({"_target_": SIMULATED}, node))
 
 
 def _count(cfg: DictConfig, key: str) -> int:

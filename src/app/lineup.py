@@ -66,7 +66,9 @@ def _entry(name: str, entry: Mapping) -> Candidate:
 
 def under(cfg: DictConfig, severity: str, **data) -> Pipeline:
     """Return the simulation of test clips under `severity`, with other values of `data`."""
-    changes = {"turbulence": {"atmosphere": {"severity": severity}}, "data": data}
+    chosen = {"severity": severity}
+    simulated = "atmosphere" in cfg.turbulence
+    changes = {"turbulence": {"atmosphere": chosen} if simulated else chosen, "data": data}
     return build.pipeline(OmegaConf.merge(cfg, changes), "test")
 
 

@@ -8,9 +8,9 @@ workers or the device, and view i depends on the draws of view i only.
 """
 
 import time
-import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,20 +20,19 @@ from src.sim.optics import Optics, Position
 from src.sim.scenes.photographs import Clip
 from src.sim.sensor.response import encode_srgb
 from src.sim.sensor.sensor import EventSensor, decode_srgb
-from src.sim.turbulence.atmosphere import Atmosphere, sample_atmosphere
-from src.sim.turbulence.operator import Turbulence
-
-WEAK_SCATTER = 0.3  # Rytov variance up to which phase alone will do (Andrews & Phillips 2005)
-Crop = tuple[int, int, int, int]  # top, left, height, width
+from src.sim.turbulence.model import Air, Crop, TurbulenceModel
 
 
 @dataclass(frozen=True)
 class Draw:
-    """All that is random about one clip, before anything is simulated."""
+    """All that is random about one clip, before anything is simulated.
+
+    `air`: what the turbulence model drew, an `Atmosphere` where air is simulated.
+    """
 
     clip: Clip
     crop: Crop
-    atmosphere: Atmosphere | None
+    air: Any
     threshold: float
     key: int
     number: int
@@ -70,9 +69,9 @@ class Sample:
 class Pipeline:
     """From the number of a clip to a sample.
 
-    `scene` has `clip(index)` with `windows * substeps + 1` frames; `turbulence` holds the keyword
-    arguments of `sample_atmosphere` under `atmosphere` and those of `Turbulence` beside it;
-    `sensor` holds those of `EventSensor`.  `crop` is the side of the square to simulate: pixels
+    `scene` has `clip(index)` with `windows * substeps + 1` frames; `turbulence` is
+    a model of the air (src/sim/turbulence/model.py); `sensor` holds the keyword arguments of
+    `EventSensor`.  `crop` is the side of the square to simulate: pixels
     (int), a share of the frame (float in (0, 1]) or None for all of it; it lies at random if
     `random_crop`, else in the middle.  `clips` is the number of different clips: number k shows
     clip k modulo `clips` (None: every number is a new clip).
@@ -82,7 +81,7 @@ class Pipeline:
         self,
         scene,
         optics: Optics,
-        turbulence: Mapping,
+        turbulence: TurbulenceModel,
         sensor: Mapping,
         *,
         split: str,
@@ -101,7 +100,6 @@ class Pipeline:
         self.split, self.seed = split, seed
         self.bins, self.substeps = bins, substeps
         self.crop, self.random_crop, self.clips = crop, random_crop, clips
-        self.warned = False
 
     def draw(self, number: int) -> Draw:
         """Draw everything random about clip `number`."""
@@ -109,11 +107,9 @@ class Pipeline:
         key = noise.key(self.seed, self.split, index)
         clip = self.scene.clip(index)
         crop = self._crop(clip.frames.shape[-2:], noise.key(key, number, "crop"))
-        drawer = noise.generator(noise.key(key, "atmosphere"))
-        atmosphere = sample_atmosphere(generator=drawer, **self.turbulence["atmosphere"])
-        self._check_scatter(atmosphere)
+        air = self.turbulence.draw(noise.generator(noise.key(key, "atmosphere")))
         threshold = self.sensor.sample_threshold(noise.generator(noise.key(key, "threshold")))
-        return Draw(clip, crop, atmosphere, threshold, key, number)
+        return Draw(clip, crop, air, threshold, key, number)
 
     def simulate(self, draws: Sequence[Draw], device: torch.device | str = "cpu") -> Sample:
         """Simulate the drawn clips on `device`."""
@@ -146,7 +142,7 @@ class Pipeline:
             threshold=torch.tensor([draw.threshold]),
         )
         drawn = {"clip": draw.number, "name": draw.clip.name, "threshold": draw.threshold}
-        drawn |= asdict(self.operator(draw).fidelity)
+        drawn |= self.operator(draw).facts
         turbulent = views[:, self.optics.centre, self.substeps :: self.substeps]
         turbulent = encode_srgb(turbulent) if self.decode else turbulent
         return Sample(
@@ -165,32 +161,15 @@ class Pipeline:
         size = tuple(clean.shape[-2:])
         return self.optics.misalign(views, draw.key, origin=draw.crop[:2], full_size=size)
 
-    def operator(self, draw: Draw) -> Turbulence:
+    def operator(self, draw: Draw) -> Air:
         """Return the turbulence of a clip."""
         height, width = draw.clip.frames.shape[-2:]
-        return Turbulence(
-            draw.atmosphere,
-            views=self.optics.positions,
-            height=height,
-            width=width,
-            fps=draw.clip.fps,
-            **{name: value for name, value in self.turbulence.items() if name != "atmosphere"},
-        )
+        size = {"height": height, "width": width, "fps": draw.clip.fps}
+        return self.turbulence.operator(draw.air, views=self.optics.positions, **size)
 
     def drawer(self, draw: Draw) -> torch.Generator:
         """Return the generator that the turbulence of a clip draws from."""
         return noise.generator(noise.key(draw.key, "turbulence"))
-
-    def _check_scatter(self, atmosphere: Atmosphere | None) -> None:
-        """Warn, once, of an atmosphere that phase alone does not describe."""
-        if atmosphere is None or self.warned or atmosphere.rytov <= WEAK_SCATTER:
-            return
-        self.warned = True
-        warnings.warn(
-            f"turbulence.atmosphere: a Rytov variance of {atmosphere.rytov:.2f} is above "
-            f"{WEAK_SCATTER}: scintillation, which is left out, matters there",
-            stacklevel=3,
-        )
 
     def _crop(self, size: Sequence[int], key: int) -> Crop:
         height, width = size

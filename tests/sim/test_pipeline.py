@@ -8,10 +8,11 @@ import torch
 from src.sim.optics import Optics
 from src.sim.pipeline import Pipeline, simulate
 from src.sim.scenes.photographs import Clip
+from src.sim.turbulence.simulated import SimulatedAir
 
 IDEAL = {"threshold": 0.2, "refractory_s": 0.0}
-STRONG = {"atmosphere": {"severity": "strong"}}
-CALM = {"atmosphere": {"severity": "none"}}
+STRONG = SimulatedAir({"severity": "strong"})
+CALM = SimulatedAir({"severity": "none"})
 
 
 class Waves:
@@ -133,8 +134,8 @@ def test_finite_clips_come_again_with_other_crops():
 
 
 def test_strong_scatter_is_said_once():
-    wild = {"atmosphere": {"severity": "strong", "rytov_max": 1e9, "distance_m": [900.0, 1000.0]}}
-    chain = pipeline(wild)
+    wild = {"severity": "strong", "rytov_max": 1e9, "distance_m": [900.0, 1000.0]}
+    chain = pipeline(SimulatedAir(wild))
     with pytest.warns(UserWarning, match="Rytov variance of .* is above 0.3") as said:
         for number in range(4):
             chain.draw(number)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from src.bench.candidates import Subject
-from src.bench.probes.clips import Conditions
+from src.bench.probes.clips import Conditions, simulated
 from src.bench.probes.standard import Bench, Finding, worst
 
 
@@ -38,7 +38,8 @@ class SharedAir:
 
     def __call__(self, subject: Subject, bench: Bench) -> Finding:
         """Return the worst loss against independent air."""
-        aperture = bench.pipeline.draw(bench.numbers[0]).atmosphere.aperture_m
+        simulated(bench.pipeline.turbulence)
+        aperture = bench.pipeline.draw(bench.numbers[0]).air.aperture_m
         settings = {
             pitch: Conditions(
                 turbulence={"views_correlation": "baseline", "baseline_m": pitch * aperture}

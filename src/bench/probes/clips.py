@@ -17,6 +17,8 @@ from torch import Tensor
 from src.sim import noise
 from src.sim.pipeline import Draw, Pipeline
 from src.sim.turbulence.atmosphere import Atmosphere
+from src.sim.turbulence.model import TurbulenceModel
+from src.sim.turbulence.simulated import SimulatedAir
 from src.sim.voxel import voxel_grid
 
 BINS = 5
@@ -31,7 +33,7 @@ class Conditions:
     `d_over_r0`: strength of the turbulence, 0 for none (None: as drawn).  `moves`: the share
     of the clip after which the scene stands.  `gain`: standard deviation of a view's brightness,
     flickering frame by frame.
-    `turbulence`, `sensor`: arguments of Turbulence and EventSensor that are replaced.  `course`:
+    `turbulence`, `sensor`: arguments of SimulatedAir and EventSensor that are replaced.  `course`:
     instead of one strength, those of equal parts of the clip, in the same moving air.
     """
 
@@ -41,6 +43,11 @@ class Conditions:
     turbulence: Mapping[str, Any] = field(default_factory=dict)
     sensor: Mapping[str, Any] = field(default_factory=dict)
     course: Sequence[float] = ()
+
+    @property
+    def changes_air(self) -> bool:
+        """Whether the turbulence is another than the standard clip's."""
+        return bool(self.turbulence or self.course) or self.d_over_r0 is not None
 
 
 @dataclass(frozen=True)
@@ -85,11 +92,13 @@ def film(pipeline: Pipeline, number: int, conditions: Conditions) -> Stream:
     """Simulate clip `number` of `pipeline` under `conditions`, the centre of its frame.
 
     All randomness is that of the standard clip, so that conditions are compared on the same air.
-    Raises ValueError for a strength that is asked for where no turbulence is drawn.
+    Raises ValueError for a strength that is asked for where no turbulence is drawn, and for other
+    air where it is not simulated.
     """
-    draw = _changed(pipeline.draw(number), conditions)
     variant = copy(pipeline)
-    variant.turbulence = dict(pipeline.turbulence) | dict(conditions.turbulence)
+    if conditions.changes_air:
+        variant.turbulence = simulated(pipeline.turbulence).having(**conditions.turbulence)
+    draw = _changed(pipeline.draw(number), conditions)
     views = (
         _course(variant, draw, conditions.course) if conditions.course else variant.views(draw)[0]
     )
@@ -112,6 +121,14 @@ def film(pipeline: Pipeline, number: int, conditions: Conditions) -> Stream:
     )
 
 
+def simulated(model: TurbulenceModel) -> SimulatedAir:
+    """Return the model; raises ValueError for air that is not simulated: no probe can change it."""
+    if not isinstance(model, SimulatedAir):
+        kind = type(model).__name__
+        raise ValueError(f"turbulence must be simulated for a probe of it, got {kind}")
+    return model
+
+
 def strengthened(atmosphere: Atmosphere | None, d_over_r0: float) -> Atmosphere | None:
     """Return the same path with another strength: D/r0 goes with cn2 to the power 3/5."""
     if d_over_r0 == 0:
@@ -128,8 +145,8 @@ def _course(pipeline: Pipeline, draw: Draw, strengths: Sequence[float]) -> Tenso
     part = torch.arange(frames) * len(strengths) // frames
     views = None
     for strength in sorted(set(strengths)):
-        air = strengthened(draw.atmosphere, strength)
-        seen = pipeline.views(replace(draw, atmosphere=air))[0]
+        air = strengthened(draw.air, strength)
+        seen = pipeline.views(replace(draw, air=air))[0]
         views = seen.clone() if views is None else views
         now = torch.tensor([strengths[k] == strength for k in part])
         views[:, now] = seen[:, now]
@@ -142,8 +159,8 @@ def _changed(draw: Draw, conditions: Conditions) -> Draw:
         shown = torch.arange(len(draw.clip.frames)).clamp(max=last)
         draw = replace(draw, clip=replace(draw.clip, frames=draw.clip.frames[shown]))
     if conditions.d_over_r0 is not None:
-        changed = strengthened(draw.atmosphere, conditions.d_over_r0)
-        draw = replace(draw, atmosphere=changed)
+        changed = strengthened(draw.air, conditions.d_over_r0)
+        draw = replace(draw, air=changed)
     return draw
 
 

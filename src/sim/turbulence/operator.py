@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 
 import torch
 from jaxtyping import Complex, Float
@@ -76,6 +77,11 @@ class Turbulence:
         if not self.clear:
             self.fidelity = choose(atmosphere, width, tolerance, psf == "exact", modes)
         self.spots, self.halo = self._spots(), self._halo()
+
+    @property
+    def facts(self) -> dict[str, float | int | str]:
+        """What is recorded about the clip: its `fidelity`."""
+        return asdict(self.fidelity)
 
     @torch.no_grad()
     def degrade(

@@ -16,13 +16,14 @@ from src.sim.optics import Optics
 from src.sim.pipeline import Pipeline, simulate
 from src.sim.scenes.photographs import Photographs
 from src.sim.turbulence.atmosphere import sample_atmosphere
+from src.sim.turbulence.simulated import SimulatedAir
 
 FPS = 120.0
 
 
 def pipeline(windows: int = 16) -> Pipeline:
     scene = Photographs(split="test", height=64, width=64, frames=windows + 1)
-    air = {"atmosphere": {"severity": "medium", "width_px": 64}}
+    air = SimulatedAir({"severity": "medium", "width_px": 64})
     options = {"split": "test", "crop": 32}
     return Pipeline(scene, Optics(9), air, {"threshold": 0.15}, **options)
 
