@@ -32,3 +32,13 @@ def test_no_setting_points_outside_a_clone():
         words = [value for value in values(yaml.safe_load(file.read_text())) if type(value) is str]
         outside = [word for word in words if word.startswith(("/", "~", "..")) and "/" in word[1:]]
         assert not outside, (file, outside)
+
+
+@pytest.mark.parametrize("budget", names("budget"))
+def test_the_budget_does_not_undo_a_choice_of_augmentation(budget, tmp_path):
+    chosen = {
+        name: config("train", tmp_path, f"budget={budget}", f"augment={name}").augment.noise_std
+        for name in names("augment")
+    }
+    assert chosen["none"] == chosen["flips"] == 0 and chosen["e2vid_plus"] == 0.1
+    assert chosen["paper"] == chosen["views"] > 0
