@@ -52,7 +52,7 @@ def drawn(door: str, run, split: str, *overrides: str) -> Draw:
 
 
 def same(one: Draw, other: Draw) -> bool:
-    return torch.equal(one.clip.frames, other.clip.frames) and one.atmosphere == other.atmosphere
+    return torch.equal(one.clip.frames, other.clip.frames) and one.air == other.air
 
 
 def test_trainings_of_several_seeds_are_tested_on_the_same_clips(tmp_path):
