@@ -54,7 +54,10 @@ def alike(cfg: DictConfig) -> DictConfig:
     Raises ValueError for a file that is no such config.
     """
     try:
-        other = OmegaConf.create(dict(plain.read(cfg.like)))
+        read = dict(plain.read(cfg.like))
+        # Before there was a seed for them, test clips followed from the training's.
+        read["data"] = {"test_seed": read["seed"]} | read["data"]
+        other = OmegaConf.create(read)
         parts = {name: other[name] for name in SAME}
         if not all(isinstance(parts[name], DictConfig) for name in SECTIONS):
             raise TypeError("a section must be a mapping")

@@ -85,11 +85,12 @@ def pipeline(cfg: DictConfig, split: str) -> Pipeline:
     windows = _count(cfg, "data.windows" if training else "data.test_windows")
     substeps = _count(cfg, "data.substeps")
     rates = _rates(cfg, training)
+    seed = _count(cfg, "data.test_seed" if split == "test" else "seed", least=0)
     scenes = [
         make(
             cfg.scene,
             split=split,
-            seed=cfg.seed,
+            seed=seed,
             frames=windows * substeps + 1,
             fps=rate * substeps,
         )
@@ -102,7 +103,7 @@ def pipeline(cfg: DictConfig, split: str) -> Pipeline:
             _turbulence(cfg.turbulence),
             OmegaConf.to_container(cfg.sensor, resolve=True),
             split=split,
-            seed=cfg.seed,
+            seed=seed,
             bins=cfg.bins,
             substeps=substeps,
             crop=cfg.data.crop if training else cfg.data.test_crop,
@@ -118,10 +119,10 @@ def _turbulence(node: DictConfig) -> TurbulenceModel:
     return make(OmegaConf.merge({"_target_": SIMULATED}, node))
 
 
-def _count(cfg: DictConfig, key: str) -> int:
+def _count(cfg: DictConfig, key: str, least: int = 1) -> int:
     value = OmegaConf.select(cfg, key)
-    if type(value) is not int or value < 1:
-        raise ValueError(f"{key} must be a whole number >= 1, got {value}")
+    if type(value) is not int or value < least:
+        raise ValueError(f"{key} must be a whole number >= {least}, got {value}")
     return value
 
 

@@ -45,11 +45,18 @@ class Run:
     @property
     def identity(self) -> dict[str, Any]:
         """Return the settings that numbers depend on; runs that agree differ in their seed only."""
+        # Where nothing is trained the seed is that of the test clips.
+        same = (*MACHINE, *(["data.test_seed"] if self.record["task"] != "train" else []))
         return {
             key: value
             for key, value in self.settings.items()
-            if key.split(".")[0] not in WITHOUT_NUMBERS and key not in MACHINE
+            if key.split(".")[0] not in WITHOUT_NUMBERS and key not in same
         }
+
+    @property
+    def test_seed(self) -> int:
+        """Return the seed that the test clips follow from."""
+        return self.settings.get("data.test_seed", self.record["seed"])
 
 
 @dataclass(frozen=True)

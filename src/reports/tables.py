@@ -197,8 +197,8 @@ def _sizes(cells: list[Cell]) -> str:
         return ""
     sizes = {size for record in records for size in record["latency_ms"]}
     clips = {record["test"]["clips"] for record in records}
-    seeds = {frozenset(run.record["seed"] for run in cell.runs) for cell in cells if cell.runs}
-    unlike = " Rows differ in their seeds, so in their test clips." if len(seeds) > 1 else ""
+    seeds = {frozenset(run.test_seed for run in cell.runs) for cell in cells if cell.runs}
+    unlike = " Rows differ in the seed of their test clips." if len(seeds) > 1 else ""
     devices = {record["device"] for record in records}
     return (
         f"{_listed(clips)} test clips; ms and GMAC of one frame of {_listed(sizes)}; ± is the "

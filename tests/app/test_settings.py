@@ -1,10 +1,13 @@
 """Settings that are documented can be set, and none reaches outside the repository."""
 
 import pytest
+import torch
 import yaml
+from omegaconf import OmegaConf
 
 from src.app import build
-from src.sim.pipeline import simulate
+from src.sim.pipeline import Draw, simulate
+from src.simulate import alike
 from tests.conftest import ROOT
 from tests.test_train import config, names
 
@@ -32,3 +35,46 @@ def test_no_setting_points_outside_a_clone():
         words = [value for value in values(yaml.safe_load(file.read_text())) if type(value) is str]
         outside = [word for word in words if word.startswith(("/", "~", "..")) and "/" in word[1:]]
         assert not outside, (file, outside)
+
+
+@pytest.mark.parametrize("budget", names("budget"))
+def test_the_budget_does_not_undo_a_choice_of_augmentation(budget, tmp_path):
+    chosen = {
+        name: config("train", tmp_path, f"budget={budget}", f"augment={name}").augment.noise_std
+        for name in names("augment")
+    }
+    assert chosen["none"] == chosen["flips"] == 0 and chosen["e2vid_plus"] == 0.1
+    assert chosen["paper"] == chosen["views"] > 0
+
+
+def drawn(door: str, run, split: str, *overrides: str) -> Draw:
+    return build.pipeline(config(door, run, *SMALL, "data.crop=16", *overrides), split).draw(0)
+
+
+def same(one: Draw, other: Draw) -> bool:
+    return torch.equal(one.clip.frames, other.clip.frames) and one.air == other.air
+
+
+def test_trainings_of_several_seeds_are_tested_on_the_same_clips(tmp_path):
+    tests, trainings = (
+        [drawn("train", tmp_path, split, f"seed={seed}") for seed in (0, 1)]
+        for split in ("test", "train")
+    )
+    assert same(*tests) and not same(*trainings)
+    assert not same(tests[0], drawn("train", tmp_path, "test", "data.test_seed=1"))
+
+
+@pytest.mark.parametrize("door", ["eval", "chart", "stress", "simulate", "calibrate"])
+def test_without_a_training_the_seed_is_that_of_the_test_clips(door, tmp_path):
+    task = ["task=threshold"] if door == "calibrate" else []
+    one, other = (drawn(door, tmp_path, "test", f"seed={seed}", *task) for seed in (0, 1))
+    assert not same(one, other)
+
+
+def test_a_clip_of_a_run_from_before_is_the_one_it_saw(tmp_path):
+    now = config("simulate", tmp_path, *SMALL, "seed=3")
+    before = OmegaConf.to_container(now, resolve=True, throw_on_missing=False)
+    del before["data"]["test_seed"]
+    (tmp_path / "old.yaml").write_text(yaml.safe_dump(before))
+    like = alike(config("simulate", tmp_path, f"like={tmp_path}/old.yaml"))
+    assert same(build.pipeline(like, "test").draw(0), build.pipeline(now, "test").draw(0))

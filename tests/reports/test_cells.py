@@ -64,6 +64,14 @@ def test_where_and_on_what_machine_it_ran_makes_no_other_cell(tmp_path):
     assert len(grouped(tmp_path)[1]) == 1
 
 
+@pytest.mark.parametrize(("task", "cells"), [("eval", 1), ("train", 2)])
+def test_other_test_clips_are_another_cell_of_trainings_only(task, cells, tmp_path):
+    for seed in (0, 1):
+        settings = {"data": {"test_seed": seed}}
+        write_run(tmp_path / str(seed), seed=seed, settings=settings, task=task)
+    assert len(grouped(tmp_path)[1]) == cells
+
+
 def test_networks_of_several_seeds_on_the_same_clips_are_one_cell_across_ckpt(tmp_path):
     for path in ("a.ckpt", "b.ckpt"):
         settings = {"ckpt": path}

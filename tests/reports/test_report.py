@@ -52,13 +52,19 @@ def test_missing_cells_are_shown(tmp_path):
     table, _, _ = built(tmp_path)
     assert [value(table, row, "n").words for row in (0, 1)] == ["1 of 2", "missing"]
     assert value(table, 1, "psnr").mean is None
-    assert "Rows differ in their seeds" not in table.note
+    assert "differ in the seed" not in table.note
 
 
 def test_rows_of_other_seeds_saw_other_clips_and_it_is_said(tmp_path):
     write_run(tmp_path / "a", "lf3x3", 0)
     write_run(tmp_path / "b", "single256", 1)
-    assert "Rows differ in their seeds" in built(tmp_path)[0].note
+    assert "differ in the seed" in built(tmp_path)[0].note
+
+
+def test_trainings_of_other_seeds_saw_the_same_clips(tmp_path):
+    for seed, name in enumerate(("lf3x3", "single256")):
+        write_run(tmp_path / name, name, seed, settings={"data": {"test_seed": 0}})
+    assert "differ in the seed" not in built(tmp_path)[0].note
 
 
 def test_severities_are_means_over_their_clips(tmp_path):
