@@ -17,6 +17,7 @@ from src.sim.turbulence import outer_scale
 from src.sim.turbulence.seeing import blur_growth
 
 WEAK_BELOW, STRONG_FROM = 0.5, 1.2  # spread in px of a frame 256 wide; see docs/simulation.md
+ALPHA_FPS = 120.0  # the frame rate that `alpha` is stated for
 REFERENCE_PX = 256  # the width of the frame that severities speak of
 TILT_VARIANCE = 0.448879  # of Noll's a2 and a3 at D/r0 = 1, in rad^2
 
