@@ -195,8 +195,6 @@ class Atmosphere:
         return 2 * math.pi / self.wavelength_m
 
 
-
-
 def _structure(apart: np.ndarray, outer_scale_m: float) -> np.ndarray:
     """Return the structure function of phase over 2.914 k^2 Int Cn2 dz; apart^(5/3) without L0.
 

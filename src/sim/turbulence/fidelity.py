@@ -32,12 +32,13 @@ TILT_ERROR = 0.35  # of the tilt's spread, per D between nodes
 class Fidelity:
     """One atmosphere in pixels, and how it is simulated.
 
-    `blurring_d_over_r0`: of the Kolmogorov air that blurs as much (an outer scale weakens blur);
-    `spread_px`, `half_length_px`: see Atmosphere; `d_px` the aperture in pixels at the object,
-    `aperture_over_outer_scale` D / L0, `decay_s` the time after which the tilt's correlation is 1/e
-    (`ar1`: of alpha).  `tilt_px`: standard deviation along one axis; `airy_px`: lambda / D; `blur_px`: the radius that
-    holds half of the light of a point, tilt removed.  `modes` Noll modes from tilt on, `rank` basis
-    functions (0: exact PSFs), `kernel` pixels across the PSF, `pitch` and `tilt_pitch` pixels
+    `blurring_d_over_r0`: of the Kolmogorov air that blurs as much (an outer scale weakens blur).
+    `decay_s`: the time after which the tilt's correlation is 1 / e, of `ar1`; `spread_px` and
+    `half_length_px`: see Atmosphere; `d_px`: the aperture at the object;
+    `aperture_over_outer_scale` D / L0; `tilt_px`: standard deviation along one axis; `airy_px`:
+    lambda / D; `blur_px`: the radius that holds half of the light of a point, tilt removed.
+    `modes` Noll modes from tilt on, `rank` basis functions (0: exact PSFs), `kernel` pixels across
+    the PSF, `pitch` and `tilt_pitch` pixels
     between the nodes of the phase.  `error_modes`, `error_pitch`, `error_rank`, `error_kernel`:
     shares of the random power; `error`: the rms error they make together, of a picture's contrast.
     """

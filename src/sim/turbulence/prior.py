@@ -1,9 +1,8 @@
-"""How an atmosphere is drawn: by what a picture shows (`seen`), or by camera and weather (`rigid`).
+"""How an atmosphere is drawn: by what a picture shows of it.
 
 Real air warps a picture locally: its tilt is correlated over some 10 to 25 px of a frame of 256.
-`seen` therefore draws what is seen - spread, half length of the tilt, time of decay - and then
-camera, path and outer scale that give it.  `rigid` draws lenses, distances and Cn2 independently
-and rejects what scintillates; almost all of its tilt then moves the whole view as one.
+So what is seen is drawn - spread, half length of the tilt, time of decay - and then a camera, a
+path and an outer scale that show it.
 """
 
 import math
@@ -13,15 +12,19 @@ from functools import cache
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
 from src.sim.turbulence import outer_scale
 from src.sim.turbulence.atmosphere import (
-    ALPHA_FPS, REFERENCE_PX, STRONG_FROM, TILT_VARIANCE, WEAK_BELOW, Atmosphere,
+    ALPHA_FPS,
+    REFERENCE_PX,
+    STRONG_FROM,
+    TILT_VARIANCE,
+    WEAK_BELOW,
+    Atmosphere,
 )  # fmt: skip
+from src.sim.turbulence.ranges import Draws, Range, choose_severity, log_between, refused
 from src.sim.turbulence.seeing import blur_growth
 
-MIX = {"weak": 0.1, "medium": 0.3, "strong": 0.6}  # of the paper's data set
 SPREADS = {
     "weak": (0.1, WEAK_BELOW),
     "medium": (WEAK_BELOW, STRONG_FROM),
@@ -32,8 +35,6 @@ KNOTS = 121  # of a profile
 CANDIDATES, ROUNDS = 128, 4  # cameras proposed at a time, and how often
 SCALES = np.geomspace(1, 100, 17)  # L0 / D that are drawn from, and infinity
 STRENGTHS = np.geomspace(0.05, 10, 100)  # D/r0 that are drawn from
-Range = Sequence[float]
-Draws = Float[np.ndarray, " candidates"]
 
 
 @dataclass(frozen=True)
@@ -71,9 +72,9 @@ def sample_atmosphere(
     """
     if severity == "none":
         return None
-    spread_px = (SPREADS | dict(spread_px or {}))[_choose(severity, generator)]
+    spread_px = (SPREADS | dict(spread_px or {}))[choose_severity(severity, generator)]
     if not 0 <= near_rigid <= 1:
-        raise _refused("near_rigid", "in [0, 1]", near_rigid)
+        raise refused("near_rigid", "in [0, 1]", near_rigid)
     for _ in range(32):
         u = torch.rand(4, generator=generator, dtype=torch.float64).numpy()
         lengths = (half_length_px, "half_length_px")
@@ -165,122 +166,30 @@ def profile(shape: str | Sequence[float]) -> tuple[float, ...]:
     """
     if isinstance(shape, str):
         if shape not in PLACES:
-            raise _refused("profiles", f"of {', '.join(PLACES)} or tables", shape)
+            raise refused("profiles", f"of {', '.join(PLACES)} or tables", shape)
         place = np.linspace(0, 1, KNOTS)
         low, high = PLACES[shape]
         return tuple(((place >= low) & (place <= high)).astype(float).tolist())
     values = tuple(float(value) for value in shape)
     if not values or min(values) < 0 or not 0 < sum(values) < math.inf:
-        raise _refused("profiles", "tables of Cn2 >= 0, somewhere > 0", list(values))
+        raise refused("profiles", "tables of Cn2 >= 0, somewhere > 0", list(values))
     return values
-
-
-def rigid_atmosphere(
-    severity: str,
-    generator: torch.Generator,
-    *,
-    distance_m: Range = (30.0, 1000.0),
-    focal_length_m: Range = (0.1, 1.0),
-    f_number: Range = (2.8, 24.0),
-    cn2: Range = (0.5e-14, 300e-14),
-    airy_px: Range = (0.4, 2.0),
-    width_px: int = REFERENCE_PX,
-    wavelength_m: float = 525e-9,
-    alpha: Range = (0.7, 0.95),
-    rytov_max: float = 0.3,
-) -> Atmosphere | None:
-    """Draw lens, distance and Cn2 of `severity` by D/r0: weak 0.1-1.5, medium to 4, strong to 10.
-
-    Distance and alpha are uniform in their range, the rest log-uniform; `airy_px` is lambda / D in
-    pixels of a frame `width_px` wide and fixes the width of the scene.  Draws outside the D/r0 of
-    the severity, or above `rytov_max`, are rejected.  Raises as `sample_atmosphere` does.
-    """
-    if severity == "none":
-        return None
-    chosen = _choose(severity, generator)
-    low, high = {"weak": (0.1, 1.5), "medium": (1.5, 4.0), "strong": (4.0, 10.0)}[chosen]
-    for _ in range(64):
-        u = torch.rand(4096, 6, generator=generator, dtype=torch.float64).numpy()
-        length = _between(u[:, 0], distance_m, "distance_m")
-        focal = log_between(u[:, 1], focal_length_m, "focal_length_m")
-        aperture = focal / log_between(u[:, 2], f_number, "f_number")
-        strength = log_between(u[:, 3], cn2, "cn2")
-        k = 2 * math.pi / wavelength_m
-        ratio = aperture * (0.423 * 3 / 8 * k**2 * strength * length) ** 0.6
-        rytov = 0.4965 * strength * k ** (7 / 6) * length ** (11 / 6)
-        fits = (ratio >= low) & (ratio < high) & (rytov <= rytov_max)
-        if not fits.any():
-            continue
-        i = int(fits.nonzero()[0][0])
-        sampling = float(log_between(u[i, 4], airy_px, "airy_px"))
-        diffraction = wavelength_m * float(length[i] / aperture[i])
-        return Atmosphere(
-            aperture_m=float(aperture[i]),
-            focal_length_m=float(focal[i]),
-            distance_m=float(length[i]),
-            scene_width_m=width_px * diffraction / sampling,
-            wavelength_m=wavelength_m,
-            cn2=float(strength[i]),
-            alpha=float(_between(u[i, 5], alpha, "alpha")),
-        )
-    raise ValueError(f"turbulence.atmosphere: no draw within its ranges is {chosen}")
-
-
-PRIORS = {"seen": sample_atmosphere, "rigid": rigid_atmosphere}
-
-
-def draw_atmosphere(
-    generator: torch.Generator, *, prior: str | None = None, **settings
-) -> Atmosphere | None:
-    """Draw from the prior `seen` or `rigid`; None: the one that the settings are of.
-
-    A config that was written before there were two has a range of `cn2`, and is rigid.
-    """
-    prior = prior or ("rigid" if "cn2" in settings else "seen")
-    if prior not in PRIORS:
-        raise _refused("prior", f"of {', '.join(PRIORS)}", prior)
-    return PRIORS[prior](generator=generator, **settings)
-
-
-def log_between(u: Draws | float, limits: Range, name: str) -> Draws | float:
-    """Return log-uniform numbers in `limits` from uniform ones in [0, 1]."""
-    if not limits[0] > 0:
-        raise _refused(name, "a range above 0", list(limits))
-    return np.exp(_between(u, [math.log(limit) for limit in limits], name))
-
-
-def _between(u: Draws | float, limits: Range, name: str) -> Draws | float:
-    low, high = limits
-    if not -math.inf < low <= high < math.inf:
-        raise _refused(name, "a range low <= high", list(limits))
-    return low + (high - low) * u
-
-
-def _choose(severity: str, generator: torch.Generator) -> str:
-    if severity in MIX:
-        return severity
-    if severity != "mixed":
-        raise _refused("severity", ", ".join(["none", *MIX, "mixed"]), severity)
-    u = float(torch.rand((), generator=generator, dtype=torch.float64))
-    return "weak" if u < MIX["weak"] else "medium" if u < 1 - MIX["strong"] else "strong"
 
 
 def _scales(u: Draws, limits: Range, kolmogorov: float) -> Draws:
     """Return L0 / D: SCALES within `limits` alike, and inf at a probability of `kolmogorov`."""
     if not 0 <= kolmogorov <= 1:
-        raise _refused("kolmogorov", "in [0, 1]", kolmogorov)
+        raise refused("kolmogorov", "in [0, 1]", kolmogorov)
     low, high = limits
     if not 0 < low <= high:
-        raise _refused("outer_scale_d", "a range above 0", list(limits))
-    inside = SCALES[(SCALES >= low * 0.999) & (SCALES <= high * 1.001)]
+        raise refused("outer_scale_d", "a range above 0", list(limits))
+    inside = SCALES[(low * 0.999 <= SCALES) & (high * 1.001 >= SCALES)]
     inside = inside if len(inside) else np.array([math.sqrt(low * high)])
     index = ((u - kolmogorov) / max(1 - kolmogorov, 1e-9) * len(inside)).astype(int)
     return np.where(u < kolmogorov, math.inf, inside[index.clip(0, len(inside) - 1)])
 
 
-def _strength(
-    seen: Appearance, airy: Draws, tilt: Draws, higher: Draws
-) -> tuple[Draws, Draws]:
+def _strength(seen: Appearance, airy: Draws, tilt: Draws, higher: Draws) -> tuple[Draws, Draws]:
     """Return the D/r0 that shows what is asked for, nan beyond STRENGTHS, and its blur in pixels.
 
     `tilt`, `higher`: what the outer scale leaves of the variance of these modes.
@@ -323,7 +232,3 @@ def _facts(shape: tuple[float, ...], ratio: float) -> tuple[float, float, float,
 def _decay(shape: tuple[float, ...], ratio: float) -> float:
     """Return the way of the wind, in D, after which the tilt's correlation is 1 / e."""
     return outer_scale.tilt_reach(ratio, shape, wind=True)
-
-
-def _refused(name: str, allowed: str, value: object) -> ValueError:
-    return ValueError(f"turbulence.atmosphere.{name} must be {allowed}, got {value}")
