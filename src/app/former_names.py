@@ -7,11 +7,12 @@ from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 
-_TURBULENCE = "atmosphere blur fidelity halo lattice p2s phase psf zernike"
+_TURBULENCE = "blur fidelity halo lattice p2s phase psf zernike"
 _SCENES = "footage targets shapes pictures videos"
 MOVED = {
     **{f"src.sim.{name}": f"src.sim.turbulence.{name}" for name in _TURBULENCE.split()},
     **{f"src.sim.{name}": f"src.sim.scenes.{name}" for name in _SCENES.split()},
+    "src.sim.atmosphere": "src.sim.turbulence",
     "src.build": "src.app.build",
     "src.data": "src.training",
     "src.data.augment": "src.training.augment",

@@ -133,15 +133,6 @@ def test_finite_clips_come_again_with_other_crops():
     assert first.key == again.key and first.crop != again.crop
 
 
-def test_strong_scatter_is_said_once():
-    wild = {"severity": "strong", "rytov_max": 1e9, "distance_m": [900.0, 1000.0]}
-    chain = pipeline(SimulatedAir(wild))
-    with pytest.warns(UserWarning, match="Rytov variance of .* is above 0.3") as said:
-        for number in range(4):
-            chain.draw(number)
-    assert len(said) == 1
-
-
 @pytest.mark.parametrize("crop", [0, 4, 49, 1.5])
 def test_a_crop_that_does_not_fit_names_its_key(crop):
     with pytest.raises(ValueError, match="data.crop"):

@@ -130,13 +130,12 @@ def simulated(model: TurbulenceModel) -> SimulatedAir:
 
 
 def strengthened(atmosphere: Atmosphere | None, d_over_r0: float) -> Atmosphere | None:
-    """Return the same path with another strength: D/r0 goes with cn2 to the power 3/5."""
+    """Return the same path with another strength; 0 is no turbulence."""
     if d_over_r0 == 0:
         return None
     if atmosphere is None:
         raise ValueError("turbulence must be on for a probe of its strength, got none")
-    ratio = d_over_r0 / atmosphere.d_over_r0
-    return replace(atmosphere, cn2=atmosphere.cn2 * ratio ** (5 / 3))
+    return atmosphere.at(d_over_r0)
 
 
 def _course(pipeline: Pipeline, draw: Draw, strengths: Sequence[float]) -> Tensor:

@@ -1,4 +1,4 @@
-"""One atmosphere and one camera as numbers, what follows from them, and how they are drawn.
+"""One atmosphere and one camera as numbers, and what follows from them.
 
 z is the distance from the camera, 0..L; the object stands at L.  Lengths in metres, angles in
 radians, pixels of a frame `width_px` wide.  k = 2 pi / wavelength.
@@ -8,15 +8,18 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from scipy import optimize, special
 from torch import Tensor
 
-WEAK_BELOW, STRONG_FROM, STRONG_TO = 1.5, 4.0, 10.0  # D/r0; ours, see docs/simulation.md
-MIX = {"weak": 0.1, "medium": 0.3, "strong": 0.6}  # of the paper's data set
+from src.sim.turbulence import outer_scale
+from src.sim.turbulence.seeing import blur_growth
+
+WEAK_BELOW, STRONG_FROM = 0.5, 1.2  # spread in px of a frame 256 wide; see docs/simulation.md
+ALPHA_FPS = 120.0  # the frame rate that `alpha` is stated for
+REFERENCE_PX = 256  # the width of the frame that severities speak of
 TILT_VARIANCE = 0.448879  # of Noll's a2 and a3 at D/r0 = 1, in rad^2
-CANDIDATES = 4096  # atmospheres proposed per round of rejection
-Range = tuple[float, float] | list[float]
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,9 @@ class Atmosphere:
     `aperture_m` D, `focal_length_m` f, `distance_m` L, `scene_width_m` the width the frame covers
     at the object, `wavelength_m`, `cn2` in m^(-2/3): a number, or values at the camera, ..., at the
     object, equally spaced and joined linearly.  `alpha`: correlation of the turbulence from one
-    frame to the next at 120 frames per second.  Raises ValueError for numbers outside their range.
+    frame to the next at 120 frames per second.  `outer_scale_m` L0: the size of the largest eddies
+    (von Karman); inf is Kolmogorov's air.  `wind_m_s`: mean speed of the wind across the path.
+    Raises ValueError for numbers outside their range.
     """
 
     aperture_m: float
@@ -36,12 +41,16 @@ class Atmosphere:
     wavelength_m: float
     cn2: float | tuple[float, ...]
     alpha: float
+    outer_scale_m: float = math.inf
+    wind_m_s: float = 3.0
 
     def __post_init__(self):
         names = ("aperture_m", "focal_length_m", "distance_m", "scene_width_m", "wavelength_m")
         for name in names:
             _require(0 < getattr(self, name) < math.inf, name, "> 0", getattr(self, name))
         _require(0 <= self.alpha <= 1, "alpha", "in [0, 1]", self.alpha)
+        _require(self.outer_scale_m > 0, "outer_scale_m", "> 0", self.outer_scale_m)
+        _require(0 <= self.wind_m_s < math.inf, "wind_m_s", ">= 0", self.wind_m_s)
         profile = self.profile
         valid = len(profile) > 0 and all(0 <= value < math.inf for value in profile)
         _require(valid, "cn2", ">= 0", self.cn2)
@@ -79,18 +88,52 @@ class Atmosphere:
 
     @property
     def severity(self) -> str:
-        """`weak` (D/r0 < 1.5), `medium` (< 4) or `strong`."""
-        if self.d_over_r0 < WEAK_BELOW:
+        """What is seen: `weak`, `medium` or `strong`, by `spread_px` of a frame 256 wide."""
+        spread = self.spread_px(REFERENCE_PX)
+        if spread < WEAK_BELOW:
             return "weak"
-        return "medium" if self.d_over_r0 < STRONG_FROM else "strong"
+        return "medium" if spread < STRONG_FROM else "strong"
+
+    @cached_property
+    def shape(self) -> tuple[float, ...]:
+        """The profile of Cn2 with a sum of 1: where along the path the turbulence is."""
+        total = math.fsum(self.profile)
+        return tuple(value / total for value in self.profile) if total > 0 else (1.0,)
+
+    @property
+    def inverse_outer_scale(self) -> float:
+        """D / L0."""
+        return self.aperture_m / self.outer_scale_m
+
+    @cached_property
+    def blurring_d_over_r0(self) -> float:
+        """D / r0 of the Kolmogorov air whose modes beyond tilt are as strong as this air's."""
+        left = outer_scale.left(self.inverse_outer_scale, self.shape, "higher")
+        return self.d_over_r0 * left**0.6
 
     @property
     def isoplanatic_angle_rad(self) -> float:
-        """theta0 = [2.914 k^2 Int Cn2 z^(5/3) dz]^(-3/5) (Fried 1982), seen from the camera."""
-        place, strength = self.path
-        weighted = (strength * (place * self.distance_m) ** (5 / 3)).sum()
-        integral = 2.914 * self._k**2 * float(weighted)
-        return integral**-0.6 if integral > 0 else math.inf
+        """The angle over which the phase differs by 1 rad rms, seen from the camera; inf if none.
+
+        Without an outer scale theta0 = [2.914 k^2 Int Cn2 z^(5/3) dz]^(-3/5) (Fried 1982).
+        """
+        place, strength = (part.numpy() for part in self.path)
+        z = place * self.distance_m
+        integral = 2.914 * self._k**2 * float((strength * z ** (5 / 3)).sum())
+        if integral == 0:
+            return math.inf
+        angle = integral**-0.6
+        if math.isinf(self.outer_scale_m):
+            return angle
+
+        def excess(log_angle: float) -> float:
+            apart = math.exp(log_angle) * z
+            structure = _structure(apart, self.outer_scale_m)
+            return 2.914 * self._k**2 * float((strength * structure).sum()) - 1
+
+        if excess(math.log(1e6 * angle)) < 0:
+            return math.inf
+        return math.exp(optimize.brentq(excess, math.log(angle), math.log(1e6 * angle)))
 
     @property
     def rytov(self) -> float:
@@ -119,10 +162,26 @@ class Atmosphere:
     def tilt_std_px(self, width_px: int) -> float:
         """Standard deviation of the Zernike tilt along one axis, in pixels.
 
-        (2 / pi) (lambda / D) sqrt(0.4489 (D/r0)^(5/3)) f / p (Noll 1976; Tyler 1994).
+        (2 / pi) (lambda / D) sqrt(0.4489 (D/r0)^(5/3)) f / p (Noll 1976; Tyler 1994), times what
+        the outer scale leaves of it.
         """
-        spread = math.sqrt(TILT_VARIANCE) * self.d_over_r0 ** (5 / 6)
+        left = outer_scale.left(self.inverse_outer_scale, self.shape, "tilt")
+        spread = math.sqrt(TILT_VARIANCE * left) * self.d_over_r0 ** (5 / 6)
         return 2 / math.pi * self.airy_px(width_px) * spread
+
+    def spread_px(self, width_px: int) -> float:
+        """How far turbulence spreads a point over time, along one axis, in pixels (rms).
+
+        Tilt and blur in quadrature; of the blur what exceeds diffraction, as the standard
+        deviation of the Gaussian that holds half of its light within the same radius.
+        """
+        blur = self.airy_px(width_px) * blur_growth(self.blurring_d_over_r0)
+        return math.hypot(self.tilt_std_px(width_px), blur)
+
+    def half_length_px(self, width_px: int) -> float:
+        """The distance at which the correlation of the tilt falls to 1/2, in pixels."""
+        reach = outer_scale.tilt_reach(self.inverse_outer_scale, self.shape)
+        return reach * self.aperture_m / self.object_pixel_m(width_px)
 
     def at(self, d_over_r0: float) -> "Atmosphere":
         """Return the same path and camera with Cn2 scaled to give `d_over_r0`."""
@@ -136,82 +195,15 @@ class Atmosphere:
         return 2 * math.pi / self.wavelength_m
 
 
-def sample_atmosphere(
-    severity: str,
-    generator: torch.Generator,
-    *,
-    distance_m: Range = (30.0, 1000.0),
-    focal_length_m: Range = (0.1, 1.0),
-    f_number: Range = (2.8, 24.0),
-    cn2: Range = (0.5e-14, 300e-14),
-    airy_px: Range = (0.4, 2.0),
-    width_px: int = 256,
-    wavelength_m: float = 525e-9,
-    alpha: Range = (0.7, 0.95),
-    rytov_max: float = 0.3,
-) -> Atmosphere | None:
-    """Draw an atmosphere of `severity`: weak, medium, strong or mixed (10/30/60 %).
+def _structure(apart: np.ndarray, outer_scale_m: float) -> np.ndarray:
+    """Return the structure function of phase over 2.914 k^2 Int Cn2 dz; apart^(5/3) without L0.
 
-    Distance and alpha are uniform in their range, the rest log-uniform; `airy_px` is lambda / D in
-    pixels of a frame `width_px` wide and fixes the width of the scene.  Draws outside the D/r0 of
-    the severity (weak 0.1-1.5, medium 1.5-4, strong 4-10), or above `rytov_max`, are rejected.
-    `none` gives None.  Raises ValueError for an unknown severity or ranges that never meet it.
+    Von Karman: proportional to 1 - 2^(1/6) / Gamma(5/6) x^(5/6) K_(5/6)(x), x = 2 pi apart / L0.
     """
-    if severity == "none":
-        return None
-    chosen = _choose(severity, generator)
-    low, high = {
-        "weak": (0.1, WEAK_BELOW),
-        "medium": (WEAK_BELOW, STRONG_FROM),
-        "strong": (STRONG_FROM, STRONG_TO),
-    }[chosen]
-    for _ in range(64):
-        u = torch.rand(CANDIDATES, 6, generator=generator, dtype=torch.float64)
-        length = _between(u[:, 0], distance_m, "distance_m")
-        focal = _log_between(u[:, 1], focal_length_m, "focal_length_m")
-        aperture = focal / _log_between(u[:, 2], f_number, "f_number")
-        strength = _log_between(u[:, 3], cn2, "cn2")
-        k = 2 * math.pi / wavelength_m
-        ratio = aperture * (0.423 * 3 / 8 * k**2 * strength * length) ** 0.6
-        rytov = 0.4965 * strength * k ** (7 / 6) * length ** (11 / 6)
-        fits = (ratio >= low) & (ratio < high) & (rytov <= rytov_max)
-        if not fits.any():
-            continue
-        i = int(fits.nonzero()[0])
-        sampling = float(_log_between(u[i, 4], airy_px, "airy_px"))
-        diffraction = wavelength_m * float(length[i] / aperture[i])
-        return Atmosphere(
-            aperture_m=float(aperture[i]),
-            focal_length_m=float(focal[i]),
-            distance_m=float(length[i]),
-            scene_width_m=width_px * diffraction / sampling,
-            wavelength_m=wavelength_m,
-            cn2=float(strength[i]),
-            alpha=float(_between(u[i, 5], alpha, "alpha")),
-        )
-    raise ValueError(f"turbulence.atmosphere: no draw within its ranges is {chosen}")
-
-
-def _choose(severity: str, generator: torch.Generator) -> str:
-    if severity in MIX:
-        return severity
-    if severity != "mixed":
-        allowed = ", ".join(["none", *MIX, "mixed"])
-        raise ValueError(f"turbulence.atmosphere.severity must be {allowed}, got {severity}")
-    u = float(torch.rand((), generator=generator, dtype=torch.float64))
-    return "weak" if u < MIX["weak"] else "medium" if u < 1 - MIX["strong"] else "strong"
-
-
-def _between(u: Float[Tensor, "*n"], limits: Range, name: str) -> Float[Tensor, "*n"]:
-    low, high = limits
-    _require(-math.inf < low <= high < math.inf, name, "a range low <= high", list(limits))
-    return low + (high - low) * u
-
-
-def _log_between(u: Float[Tensor, "*n"], limits: Range, name: str) -> Float[Tensor, "*n"]:
-    _require(limits[0] > 0, name, "a range above 0", list(limits))
-    logs = [math.log(limit) for limit in limits]
-    return _between(u, logs, name).exp()
+    x = 2 * math.pi * np.asarray(apart) / outer_scale_m
+    order = 5 / 6
+    near = special.gamma(1 / 6) / special.gamma(11 / 6) * (math.pi / outer_scale_m) ** (5 / 3)
+    return (1 - 2 ** (1 - order) / special.gamma(order) * x**order * special.kv(order, x)) / near
 
 
 def _require(valid: bool, name: str, allowed: str, value: object) -> None:

@@ -13,8 +13,9 @@ from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import Tensor
 
-from src.sim.turbulence.atmosphere import Atmosphere
+from src.sim.turbulence.atmosphere import ALPHA_FPS, TILT_VARIANCE, Atmosphere
 from src.sim.turbulence.p2s import FILE, FINE_PER_AIRY, Band, bands
+from src.sim.turbulence.seeing import half_light
 
 CONTRAST = 0.2  # rms contrast of a natural picture
 UNSEEN = 0.5 / 255  # rms error that nobody needs to go below
@@ -31,17 +32,27 @@ TILT_ERROR = 0.35  # of the tilt's spread, per D between nodes
 class Fidelity:
     """One atmosphere in pixels, and how it is simulated.
 
-    `tilt_px`: standard deviation along one axis; `airy_px`: lambda / D; `blur_px`: the radius that
-    holds half of the light of a point, tilt removed.  `modes` Noll modes from tilt on, `rank` basis
-    functions (0: exact PSFs), `kernel` pixels across the PSF, `pitch` and `tilt_pitch` pixels
+    `blurring_d_over_r0`: of the Kolmogorov air that blurs as much (an outer scale weakens blur).
+    `decay_s`: the time after which the tilt's correlation is 1 / e, of `ar1`; `spread_px` and
+    `half_length_px`: see Atmosphere; `d_px`: the aperture at the object;
+    `aperture_over_outer_scale` D / L0; `tilt_px`: standard deviation along one axis; `airy_px`:
+    lambda / D; `blur_px`: the radius that holds half of the light of a point, tilt removed.
+    `modes` Noll modes from tilt on, `rank` basis functions (0: exact PSFs), `kernel` pixels across
+    the PSF, `pitch` and `tilt_pitch` pixels
     between the nodes of the phase.  `error_modes`, `error_pitch`, `error_rank`, `error_kernel`:
     shares of the random power; `error`: the rms error they make together, of a picture's contrast.
     """
 
     d_over_r0: float = 0.0
+    blurring_d_over_r0: float = 0.0
     severity: str = "none"
     rytov: float = 0.0
     alpha: float = 1.0
+    decay_s: float = math.inf
+    spread_px: float = 0.0
+    half_length_px: float = math.inf
+    d_px: float = 0.0
+    aperture_over_outer_scale: float = 0.0
     tilt_px: float = 0.0
     airy_px: float = 0.0
     blur_px: float = 0.0
@@ -67,7 +78,7 @@ def choose(
     The number of modes may be `given`; ValueError for one that nothing here can simulate.
     """
     seen = _seen(atmosphere, width_px)
-    strength, airy = seen.d_over_r0, seen.airy_px
+    strength, airy = seen.blurring_d_over_r0, seen.airy_px
     power = _random_power(strength, airy)
     allowed = max(tolerance, (UNSEEN / CONTRAST) ** 2 / power)
     band = band_for(strength)
@@ -77,9 +88,10 @@ def choose(
     reach, error_kernel = _cheapest("kernel", strength, airy, allowed)
     pixel = atmosphere.object_pixel_m(width_px) / atmosphere.aperture_m
     step, error_pitch = _widest(strength, airy, allowed)
+    step *= _patch(atmosphere)
     pitch = int(min(max(step / pixel, 1), MAX_PITCH))
     error_pitch = error_pitch if pitch > 1 else 0.0
-    tilt_pitch, error_tilt = _tilt_pitch(pixel, seen.tilt_px, tolerance)
+    tilt_pitch, error_tilt = _tilt_pitch(pixel / _patch(atmosphere), seen, tolerance)
     return replace(
         seen,
         modes=modes,
@@ -103,16 +115,32 @@ def mean_psf(strength: float) -> Float[Tensor, "fine fine"]:
 
 def _seen(atmosphere: Atmosphere, width_px: int) -> Fidelity:
     """Return what the atmosphere is in pixels, before anything is chosen."""
-    strength, airy = atmosphere.d_over_r0, atmosphere.airy_px(width_px)
+    airy = atmosphere.airy_px(width_px)
     return Fidelity(
-        d_over_r0=strength,
+        d_over_r0=atmosphere.d_over_r0,
+        blurring_d_over_r0=atmosphere.blurring_d_over_r0,
         severity=atmosphere.severity,
         rytov=atmosphere.rytov,
         alpha=atmosphere.alpha,
+        decay_s=-1 / (ALPHA_FPS * math.log(atmosphere.alpha)) if 0 < atmosphere.alpha < 1 else 0.0,
+        spread_px=atmosphere.spread_px(width_px),
+        half_length_px=atmosphere.half_length_px(width_px),
+        d_px=atmosphere.aperture_m / atmosphere.object_pixel_m(width_px),
+        aperture_over_outer_scale=atmosphere.inverse_outer_scale,
         tilt_px=atmosphere.tilt_std_px(width_px),
         airy_px=airy,
-        blur_px=airy * _half_light(strength),
+        blur_px=airy * half_light(atmosphere.blurring_d_over_r0),
     )
+
+
+def _patch(atmosphere: Atmosphere) -> float:
+    """Return how large the patches of like phase are, over those of a constant Cn2.
+
+    The ratio of theta0 L / r0, Kolmogorov's: an outer scale does not change small distances.
+    """
+    place, strength = atmosphere.path
+    near = float((strength * (1 - place) ** (5 / 3)).sum())
+    return (near / float((strength * place ** (5 / 3)).sum())) ** 0.6
 
 
 def band_for(strength: float) -> Band | None:
@@ -166,25 +194,24 @@ def _widest(strength: float, airy: float, allowed: float) -> tuple[float, float]
     return float(step), float(errors[index] + share * (errors[index + 1] - errors[index]))
 
 
-def _tilt_pitch(pixel: float, tilt_px: float, tolerance: float) -> tuple[int, float]:
+def _tilt_pitch(pixel: float, seen: Fidelity, tolerance: float) -> tuple[int, float]:
     """Return the widest pitch within 0.03 px or a tenth of the tolerance's rms, and its error.
 
     `pixel` in units of D at the object.  Cubic interpolation between nodes S D apart leaves an rms
-    error of 0.35 S of the tilt's spread, measured on 30,000 waves for a constant Cn2.
+    error of 0.35 S of the spread that Kolmogorov's tilt has, measured on 30,000 waves for a
+    constant Cn2; an outer scale takes away long waves only, so the error stays.
     """
-    allowed = max(0.03, 0.1 * math.sqrt(tolerance) * tilt_px)
-    pitch = int(min(max(allowed / (TILT_ERROR * pixel * tilt_px), 1), MAX_PITCH))
-    return pitch, TILT_ERROR * pitch * pixel * tilt_px if pitch > 1 else 0.0
+    allowed = max(0.03, 0.1 * math.sqrt(tolerance) * seen.tilt_px)
+    kolmogorov = 2 / math.pi * seen.airy_px * math.sqrt(TILT_VARIANCE) * seen.d_over_r0 ** (5 / 6)
+    error = TILT_ERROR * pixel * kolmogorov
+    pitch = int(min(max(allowed / error, 1), MAX_PITCH))
+    return pitch, error * pitch if pitch > 1 else 0.0
 
 
 def _random_power(strength: float, airy: float) -> float:
     """Return the power of the random change of a picture of unit contrast; grows as d^(5/3)."""
     weak = min(strength / float(_table("strength")[0]), 1.0) ** (5 / 3)
     return max(float(_at("power", strength, airy)) * weak, 1e-30)
-
-
-def _half_light(strength: float) -> float:
-    return float(_between(_table("half_light"), _table("strength"), strength))
 
 
 def _at(name: str, strength: float, airy: float) -> Float[Tensor, "*axis"]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from src.sim import noise
 from src.sim.optics import layout, view_id
 from src.sim.turbulence import blur
-from src.sim.turbulence.atmosphere import Atmosphere
+from src.sim.turbulence.atmosphere import ALPHA_FPS, Atmosphere
 from src.sim.turbulence.fidelity import Fidelity, band_for, choose, mean_psf
 from src.sim.turbulence.halo import Halo
 from src.sim.turbulence.lattice import Lattice
@@ -20,7 +20,8 @@ from src.sim.turbulence.phase import Field, Waves, draw_waves, evolve, flow, loo
 from src.sim.turbulence.psf import fraunhofer_psf
 
 Crop = tuple[int, int, int, int]  # top, left, height, width
-ALPHA_FPS = 120.0  # the frame rate that Atmosphere.alpha is stated for
+TEMPORAL = ("ar1", "flow", "mixed")
+OWN_WIND = 0.5  # rms of a layer's own wind over the wind that all layers share
 WAVES = 192
 TILE = 320  # pixels; larger pictures are made tile by tile, to bound the memory
 CHUNK, GROUP = 6_000_000, 60_000_000  # numbers in the PSFs of a view, and of all, at a time
@@ -34,8 +35,9 @@ class Turbulence:
     turbulence blurs a picture at random (fidelity.py).  `modes`: how many Noll modes from
     tilt on, 2 to 200, no more than a fitted network knows; None: as the tolerance asks.  `psf`:
     `fitted` (basis and network) or `exact` (Fraunhofer at every node).  `temporal`: `ar1` (the
-    paper: alpha per frame at 120 fps) or `flow`, frozen turbulence carried by a wind of `wind_m_s`
-    in a direction drawn per clip.
+    paper: alpha per frame at 120 fps), `flow`, frozen turbulence in `wind_layers` layers each
+    carried by a wind of its own, about `wind_m_s` (None: the atmosphere's), or `mixed`, one of the
+    two drawn per clip.
     `views_correlation`: `independent` (the paper) or `baseline`, sub-apertures `baseline_m` apart
     (None: touching) looking through the same air.  `atmosphere` None is the identity.
     Raises ValueError for values outside their range.
@@ -53,7 +55,8 @@ class Turbulence:
         modes: int | None = None,
         psf: str = "fitted",
         temporal: str = "ar1",
-        wind_m_s: float = 3.0,
+        wind_m_s: float | None = None,
+        wind_layers: int = 4,
         views_correlation: str = "independent",
         baseline_m: float | None = None,
     ):
@@ -61,8 +64,10 @@ class Turbulence:
         _require(0 < fps < math.inf, "fps", "> 0", fps)
         _require(0 < tolerance <= 1, "tolerance", "in (0, 1]", tolerance)
         _require(psf in ("fitted", "exact"), "psf", "fitted or exact", psf)
-        _require(temporal in ("ar1", "flow"), "temporal", "ar1 or flow", temporal)
-        _require(0 <= wind_m_s < math.inf, "wind_m_s", ">= 0", wind_m_s)
+        _require(temporal in TEMPORAL, "temporal", "ar1, flow or mixed", temporal)
+        valid = wind_m_s is None or 0 <= wind_m_s < math.inf
+        _require(valid, "wind_m_s", ">= 0 or null", wind_m_s)
+        _require(1 <= wind_layers <= 100, "wind_layers", "in [1, 100]", wind_layers)
         shared = views_correlation == "baseline"
         known = shared or views_correlation == "independent"
         _require(known, "views_correlation", "independent or baseline", views_correlation)
@@ -70,7 +75,8 @@ class Turbulence:
         _require(valid, "baseline_m", ">= 0", baseline_m)
         self.atmosphere, self.height, self.width, self.fps = atmosphere, height, width, fps
         self.positions = layout(views) if isinstance(views, int) else tuple(map(tuple, views))
-        self.temporal, self.wind_m_s, self.baseline_m = temporal, wind_m_s, baseline_m
+        self.temporal, self.wind_layers, self.baseline_m = temporal, wind_layers, baseline_m
+        self.wind_m_s = wind_m_s
         self.shared = shared
         self.clear = atmosphere is None or atmosphere.d_over_r0 == 0
         self.fidelity = Fidelity()
@@ -180,13 +186,13 @@ class Turbulence:
     def _spots(self) -> Spots | None:
         if self.fidelity.rank == 0:
             return None
-        band = band_for(self.fidelity.d_over_r0)
+        band = band_for(self.fidelity.blurring_d_over_r0)
         return Spots(band, self.fidelity.rank, self.fidelity.airy_px, self.fidelity.kernel)
 
     def _halo(self) -> Halo | None:
         if self.clear:
             return None
-        mean = mean_psf(self.fidelity.d_over_r0)
+        mean = mean_psf(self.fidelity.blurring_d_over_r0)
         return Halo(mean, self.fidelity.airy_px, self.fidelity.kernel)
 
     def _draw(
@@ -208,21 +214,40 @@ class Turbulence:
     ) -> Complex[Tensor, "views frames waves"]:
         """Every view counts from its own id, or all from 0 where they share the air."""
         ids = [0 if self.shared else view_id(position) for position in self.positions]
-        drawn = frames if self.temporal == "ar1" else 1
+        flows = self._flows(key)
+        drawn = 1 if flows else frames
         counters = torch.arange(drawn * 2 * len(waves.place)).reshape(drawn, -1, 2)
         counters = counters + (torch.tensor(ids) << 40)[:, None, None, None]
         fresh = noise.normal(noise.key(key, "phase"), counters).double()
-        if self.temporal == "ar1":
-            c = evolve(fresh, self.atmosphere.alpha ** (ALPHA_FPS / self.fps))
+        if flows:
+            c = flow(waves, fresh, self._winds(key), torch.arange(frames).double() / self.fps)
         else:
-            turn = 2 * math.pi * float(noise.uniform(noise.key(key, "wind"), torch.tensor(0)))
-            wind = (self.wind_m_s * math.cos(turn), self.wind_m_s * math.sin(turn))
-            c = flow(waves, fresh, wind, torch.arange(frames).double() / self.fps)
+            c = evolve(fresh, self.atmosphere.alpha ** (ALPHA_FPS / self.fps))
         if self.shared:
             pitch = self.atmosphere.aperture_m if self.baseline_m is None else self.baseline_m
             away = torch.tensor(self.positions, dtype=torch.float64).flip(-1) * pitch
             c = c * look_from(waves, away)[:, None]
         return c
+
+    def _flows(self, key: int) -> bool:
+        """Return whether the wind carries the turbulence of this clip."""
+        if self.temporal != "mixed":
+            return self.temporal == "flow"
+        return float(noise.uniform(noise.key(key, "temporal"), torch.tensor(0))) < 0.5
+
+    def _winds(self, key: int) -> Float[Tensor, "layers 2"]:
+        """Return the wind (x, y) of each layer in m/s: a common one, half as much of its own.
+
+        The mean square is that of `wind_m_s`; a single layer has that very speed.
+        """
+        speed = self.atmosphere.wind_m_s if self.wind_m_s is None else self.wind_m_s
+        turn = 2 * math.pi * float(noise.uniform(noise.key(key, "wind"), torch.tensor(0)))
+        common = torch.tensor([math.cos(turn), math.sin(turn)], dtype=torch.float64)
+        if self.wind_layers == 1:
+            return speed * common[None]
+        counters = torch.arange(2 * self.wind_layers).reshape(-1, 2)
+        own = noise.normal(noise.key(key, "winds"), counters).double() * OWN_WIND / math.sqrt(2)
+        return speed / math.sqrt(1 + OWN_WIND**2) * (common + own)
 
     def _lattices(self, window: Crop, pitch: int, order: int) -> tuple[Lattice, Lattice]:
         top, left, height, width = window

@@ -1,6 +1,6 @@
 """Zernike coefficients over picture, time and views, as a sum of plane waves.
 
-Turbulence along the path is Kolmogorov phase, a sum of plane waves exp(2 pi i f.x), each in a thin
+Turbulence along the path is von Karman phase, a sum of plane waves exp(2 pi i f.x), each in a thin
 layer at its own distance z (sparse spectrum: Charnotskii 2013, J. Opt. Soc. Am. A 30, 479).  An
 object point x sees the layer through a disc of diameter D_l = D (1 - z/L) centred at x z/L, so
 Noll's coefficient j there is
@@ -34,13 +34,15 @@ class Waves:
     """The plane waves of one clip; the same for its views, only their amplitudes differ.
 
     `frequency` (waves, 2): f z / L in cycles per pixel at the object along (x, y).
-    `layer` (waves, 2): f in cycles per metre in the layer; `place` (waves,): z / L.
+    `layer` (waves, 2): f in cycles per metre in the layer; `place` (waves,): z / L; `share`
+    (waves,): how much of the turbulence, as it counts for tilt, lies nearer to the camera.
     `response` (modes, waves, 2): w_m Q_j, real and imaginary part, in rad.
     """
 
     frequency: Float[Tensor, "waves 2"]
     layer: Float[Tensor, "waves 2"]
     place: Float[Tensor, " waves"]
+    share: Float[Tensor, " waves"]
     response: Float[Tensor, "modes waves 2"]
 
 
@@ -49,17 +51,20 @@ def draw_waves(atmosphere: Atmosphere, key: int, *, modes: int, waves: int, widt
 
     kappa = D_l |f|, its angle and z are drawn by a shifted Kronecker sequence; z with the density
     Cn2 (1 - z/L)^(5/3) that makes the layers count alike, kappa from a broken power law over all of
-    (0, inf), and the weights w_m divide by that density, so the expected covariance is exact.
+    (0, inf), and the weights w_m divide by that density, so the expected covariance is exact.  An
+    outer scale weakens waves longer than it, and few of them are drawn.
     """
     u = _sequence(key, waves)
-    kappa, density = _radius(u[:, 0], modes)
+    kappa, density = _radius(u[:, 0], modes, _lowest(atmosphere.inverse_outer_scale, modes))
     angle = 2 * math.pi * u[:, 1]
     place, strength = atmosphere.path
     share = strength * (1 - place) ** (5 / 3)
     steps = torch.cumsum(share, 0)
     slot = torch.searchsorted(steps, u[:, 2] * steps[-1]).clamp(max=len(place) - 1)
     diameter = atmosphere.aperture_m * (1 - place[slot])
-    variance = SPECTRUM * 2 * math.pi * kappa ** (-8 / 3) / (density * waves)
+    kappa0 = diameter / atmosphere.outer_scale_m
+    power = kappa * (kappa**2 + kappa0**2) ** (-11 / 6)
+    variance = SPECTRUM * 2 * math.pi * power / (density * waves)
     amplitude = variance.sqrt() * atmosphere.d_over_r0 ** (5 / 6)
     layer = torch.stack([angle.cos(), angle.sin()], dim=-1) * (kappa / diameter)[:, None]
     pixel = atmosphere.object_pixel_m(width_px)
@@ -67,6 +72,7 @@ def draw_waves(atmosphere: Atmosphere, key: int, *, modes: int, waves: int, widt
         frequency=layer * place[slot, None] * pixel,
         layer=layer,
         place=place[slot],
+        share=u[:, 2],
         response=pupil_filter(kappa, angle, modes) * amplitude[:, None],
     )
 
@@ -134,14 +140,16 @@ def evolve(
 def flow(
     waves: Waves,
     fresh: Float[Tensor, "views 1 waves 2"],
-    wind: tuple[float, float],
+    winds: Float[Tensor, "layers 2"],
     seconds: Float[Tensor, " frames"],
 ) -> Complex[Tensor, "views frames waves"]:
-    """Return the amplitudes of turbulence that the `wind` (x, y) in m/s carries along unchanged.
+    """Return the amplitudes of turbulence that each layer's wind (x, y) in m/s carries along.
 
-    Taylor's hypothesis: phase(x, t) = phase(x - v t, 0), exact at any time.
+    The layers, from the camera on, have equal shares of the turbulence.  Taylor's hypothesis within
+    each: phase(x, t) = phase(x - v t, 0), exact at any time, and smooth in it.
     """
-    speed = waves.layer @ torch.tensor(wind, dtype=torch.float64)
+    wind = winds[(waves.share * len(winds)).long().clamp(max=len(winds) - 1)]
+    speed = (waves.layer * wind).sum(-1)
     return torch.view_as_complex(fresh) * torch.exp(-2j * math.pi * seconds[:, None] * speed)
 
 
@@ -169,22 +177,31 @@ def _sequence(key: int, count: int) -> Float[Tensor, "count 3"]:
     return (shift * torch.tensor([1 / count, 1, 1]) + torch.arange(count)[:, None] * step) % 1.0
 
 
-def _radius(u: Tensor, modes: int) -> tuple[Tensor, Tensor]:
+def _lowest(inverse_outer_scale: float, modes: int) -> float:
+    """Return the kappa below which waves hardly count: LOW, or what the outer scale sets."""
+    return min(max(LOW, 0.3 * inverse_outer_scale), 0.5 * _highest(modes))
+
+
+def _highest(modes: int) -> float:
+    order = (math.isqrt(8 * (modes + 1) - 7) - 1) // 2
+    return HIGH * (order + 1) + 0.6
+
+
+def _radius(u: Tensor, modes: int, low: float) -> tuple[Tensor, Tensor]:
     """Return kappa and its density at the quantiles `u`: kappa^(-2/3), then 1/kappa, then ^-5.
 
-    The first law makes all waves below LOW count alike for the tilt, whose variance converges as
+    The first law makes all waves below `low` count alike for the tilt, whose variance converges as
     slowly as kappa^(1/3) towards zero.
     """
-    order = (math.isqrt(8 * (modes + 1) - 7) - 1) // 2
-    high = HIGH * (order + 1) + 0.6
+    high = _highest(modes)
     below, between, above = SHARES
-    ratio = math.log(high / LOW)
-    first = LOW * (u / below).clamp(max=1) ** 3
-    middle = LOW * torch.exp(((u - below) / between).clamp(0, 1) * ratio)
+    ratio = math.log(high / low)
+    first = low * (u / below).clamp(max=1) ** 3
+    middle = low * torch.exp(((u - below) / between).clamp(0, 1) * ratio)
     last = high * (1 - ((u - below - between) / above).clamp(0, 1 - 1e-9)) ** (-1 / 4)
     kappa = torch.where(u < below, first, torch.where(u < below + between, middle, last))
     kappa = kappa.clamp(min=1e-30)
-    low_density = below / (3 * LOW ** (1 / 3)) * kappa ** (-2 / 3)
+    low_density = below / (3 * low ** (1 / 3)) * kappa ** (-2 / 3)
     high_density = above * 4 * high**4 * kappa**-5
     density = torch.where(kappa < high, between / (ratio * kappa), high_density)
-    return kappa, torch.where(kappa < LOW, low_density, density)
+    return kappa, torch.where(kappa < low, low_density, density)

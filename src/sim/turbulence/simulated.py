@@ -1,27 +1,32 @@
 """Simulated air as a turbulence model (model.py): atmospheres drawn, then computed."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 
 from src.sim.optics import Position
-from src.sim.turbulence.atmosphere import Atmosphere, sample_atmosphere
+from src.sim.turbulence.atmosphere import Atmosphere
 from src.sim.turbulence.operator import Turbulence
+from src.sim.turbulence.prior import sample_atmosphere
+from src.sim.turbulence.ranges import refused
+from src.sim.turbulence.rigid import rigid_atmosphere
 
-WEAK_SCATTER = 0.3  # Rytov variance up to which phase alone will do (Andrews & Phillips 2005)
+PRIORS = {"seen": sample_atmosphere, "rigid": rigid_atmosphere}
 
 
 class SimulatedAir:
-    """`atmosphere`: keyword arguments of `sample_atmosphere`; `options`: those of `Turbulence`.
+    """`atmosphere`: the `prior` that is drawn from, `seen` (prior.py) or `rigid` (rigid.py), and
+    its keyword arguments; `options`: those of `Turbulence`.
 
     Raises ValueError for options that are unknown or outside their range.
     """
 
     def __init__(self, atmosphere: Mapping[str, Any], **options: Any):
         self.atmosphere, self.options = dict(atmosphere), options
-        self.warned = False
+        self.prior = self.atmosphere.pop("prior", None) or _implied(self.atmosphere)
+        if self.prior not in PRIORS:
+            raise refused("prior", f"of {', '.join(PRIORS)}", self.prior)
         try:
             Turbulence(None, views=1, height=1, width=1, **options)
         except TypeError as error:
@@ -30,11 +35,9 @@ class SimulatedAir:
     def draw(self, generator: torch.Generator) -> Atmosphere | None:
         """Draw an atmosphere; None: no turbulence."""
         try:
-            atmosphere = sample_atmosphere(generator=generator, **self.atmosphere)
+            return PRIORS[self.prior](generator=generator, **self.atmosphere)
         except TypeError as error:
             raise ValueError(f"turbulence.atmosphere takes no such values: {error}") from error
-        self._check_scatter(atmosphere)
-        return atmosphere
 
     def operator(
         self,
@@ -48,17 +51,11 @@ class SimulatedAir:
         """Return the operator of an atmosphere."""
         return Turbulence(drawn, views=views, height=height, width=width, fps=fps, **self.options)
 
-    def _check_scatter(self, atmosphere: Atmosphere | None) -> None:
-        """Warn, once, of an atmosphere that phase alone does not describe."""
-        if atmosphere is None or self.warned or atmosphere.rytov <= WEAK_SCATTER:
-            return
-        self.warned = True
-        warnings.warn(
-            f"turbulence.atmosphere: a Rytov variance of {atmosphere.rytov:.2f} is above "
-            f"{WEAK_SCATTER}: scintillation, which is left out, matters there",
-            stacklevel=3,
-        )
-
     def having(self, **options: Any) -> "SimulatedAir":
         """Return the same air with some of its options replaced."""
-        return SimulatedAir(self.atmosphere, **self.options | options)
+        return SimulatedAir({"prior": self.prior} | self.atmosphere, **self.options | options)
+
+
+def _implied(atmosphere: Mapping[str, Any]) -> str:
+    """Return the prior of a config that names none: with a range of Cn2 it is of version 0.1."""
+    return "rigid" if "cn2" in atmosphere else "seen"

@@ -15,7 +15,7 @@ from src.sim.noise import generator
 from src.sim.optics import Optics
 from src.sim.pipeline import Pipeline, simulate
 from src.sim.scenes.photographs import Photographs
-from src.sim.turbulence.atmosphere import sample_atmosphere
+from src.sim.turbulence import sample_atmosphere
 from src.sim.turbulence.simulated import SimulatedAir
 
 FPS = 120.0

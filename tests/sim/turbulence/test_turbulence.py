@@ -7,8 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from src.sim.turbulence import blur
-from src.sim.turbulence.atmosphere import Atmosphere, sample_atmosphere
+from src.sim.turbulence import Atmosphere, blur, sample_atmosphere
 from src.sim.turbulence.fidelity import mean_psf
 from src.sim.turbulence.halo import Halo
 from src.sim.turbulence.lattice import Lattice
@@ -255,7 +254,8 @@ def test_extremes_of_alpha_over_a_thousand_frames(alpha):
         ({"tolerance": -1.0}, r"turbulence\.tolerance must be in \(0, 1\], got -1"),
         ({"tolerance": math.nan}, r"turbulence\.tolerance"),
         ({"fps": 0.0}, r"turbulence\.fps must be > 0"),
-        ({"temporal": "magic"}, r"turbulence\.temporal must be ar1 or flow"),
+        ({"temporal": "magic"}, r"turbulence\.temporal must be ar1, flow or mixed"),
+        ({"wind_layers": 0}, r"turbulence\.wind_layers must be in \[1, 100\], got 0"),
         ({"views_correlation": "maybe"}, r"turbulence\.views_correlation"),
         ({"modes": 1}, r"turbulence\.modes must be in \[2, 35\] with fitted PSFs, got 1"),
         ({"modes": 200}, r"turbulence\.modes must be in \[2, 35\] with fitted PSFs, got 200"),

@@ -219,10 +219,10 @@ def test_15_frozen_flow_shifts_the_field():
     pixel = PATH.object_pixel_m(256)
     thin = replace(waves, place=middle, frequency=waves.layer * 0.5 * pixel)
     fresh = torch.randn(1, 1, WAVES, 2, dtype=torch.float64)
-    speed, seconds = (2.0, -1.0), 0.01
+    speed, seconds = torch.tensor([[2.0, -1.0]], dtype=torch.float64), 0.01
     later = flow(thin, fresh, speed, torch.tensor([seconds], dtype=torch.float64))[0, 0]
     # a layer half-way moves v t; the object point behind the same air moves 2 v t the same way
-    shift = torch.tensor(speed, dtype=torch.float64) * seconds / 0.5 / pixel
+    shift = speed[0] * seconds / 0.5 / pixel
     response = torch.view_as_complex(thin.response)
     at = torch.tensor([7.0, 3.0], dtype=torch.float64)
     now = (response * later * torch.exp(2j * math.pi * (thin.frequency @ at))).real.sum(1)

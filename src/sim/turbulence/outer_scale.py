@@ -1,0 +1,106 @@
+"""Von Karman air: what an outer scale L0 takes from the phase, and how far its tilt reaches.
+
+The phase of a layer has the power SPECTRUM r0^(-5/3) (f^2 + 1/L0^2)^(-11/6) (von Karman); L0 = inf
+is Kolmogorov's.  A layer at z = u L is seen through a disc of D (1 - u), so with kappa = D (1 - u) f
+and kappa0 = (1 - u) D / L0 its tilt has, up to a constant, the covariance
+
+    Cn2(u) (1-u)^(5/3) integral kappa (kappa^2 + kappa0^2)^(-11/6) [2 J2(pi kappa) / (pi kappa)]^2 J0(2 pi kappa x) dkappa
+
+for lines of sight x footprints apart, the mean over directions: x = s u / (1 - u) for points s D
+apart at the object, x = v t / (D (1 - u)) for one point after a time t of wind.  Lengths are in
+units of the aperture D.
+"""  # noqa: E501
+
+import math
+from functools import cache, lru_cache
+
+import numpy as np
+from jaxtyping import Float
+from scipy import special
+from scipy.interpolate import RegularGridInterpolator
+
+Profile = tuple[float, ...]  # Cn2 at equally spaced points from the camera to the object
+Lags = Float[np.ndarray, " lags"]
+
+SLICES = 120  # of the path
+KAPPA = np.exp(np.linspace(math.log(1e-14), math.log(30.0), 1600))
+STEP = math.log(KAPPA[1] / KAPPA[0])
+TILT = (2 * special.jv(2, math.pi * KAPPA) / (math.pi * KAPPA)) ** 2
+PISTON = (2 * special.jv(1, math.pi * KAPPA) / (math.pi * KAPPA)) ** 2
+HIGHER = np.where(KAPPA > 1e-3, 1 - PISTON - 4 * TILT, 0)  # of the modes beyond tilt; kappa^4 at 0
+NEAREST, FARTHEST = 1e-3, 1e4  # D; the ends of what is tabulated as a length
+
+
+def left(ratio: float, profile: Profile, modes: str) -> float:
+    """Return the share of the variance that an outer scale L0 = D / `ratio` leaves.
+
+    `modes`: `tilt`, or `higher`, all modes beyond tilt.
+    """
+    place, weight = _path(profile)
+    powers = np.interp(_log(ratio * (1 - place)), _log(_kappa0()), _powers()[modes])
+    return float(weight @ powers / _powers()[modes][0])
+
+
+def tilt_correlation(ratio: float, profile: Profile, lags: Lags, *, wind: bool = False) -> Lags:
+    """Return the correlation of the tilt of two points `lags` D apart at the object.
+
+    With `wind`: of one point with itself after a wind common to the path moved the air `lags` D.
+    """
+    place, weight = _path(profile)
+    apart = np.multiply.outer(lags, (1 if wind else place) / (1 - place))
+    kappa0 = np.broadcast_to(ratio * (1 - place), apart.shape)
+    covariance = _covariance()((_log(kappa0), np.log(apart.clip(1e-6, 1e7)))) @ weight
+    power = np.interp(_log(ratio * (1 - place)), _log(_kappa0()), _powers()["tilt"]) @ weight
+    return covariance / power
+
+
+@lru_cache(maxsize=4096)
+def tilt_reach(ratio: float, profile: Profile, *, wind: bool = False) -> float:
+    """Return the distance in D at which the tilt's correlation falls to 1/2, with `wind` to 1 / e.
+
+    NEAREST to FARTHEST, which stands for any longer one.
+    """
+    level = math.exp(-1) if wind else 0.5
+    lags = np.geomspace(NEAREST, FARTHEST, 141)
+    correlation = tilt_correlation(ratio, profile, lags, wind=wind)
+    first = int((correlation < level).argmax())
+    if first == 0:
+        return FARTHEST if correlation[0] >= level else NEAREST
+    ends = slice(first - 1, first + 1)
+    return float(np.exp(np.interp(-level, -correlation[ends], np.log(lags[ends]))))
+
+
+@cache
+def _kappa0() -> Float[np.ndarray, " scales"]:
+    return np.concatenate([[0.0], np.geomspace(1e-4, 100, 61)])
+
+
+@cache
+def _spectra() -> Float[np.ndarray, "scales kappa"]:
+    """Return kappa (kappa^2 + kappa0^2)^(-11/6) d kappa."""
+    return KAPPA**2 * (KAPPA**2 + _kappa0()[:, None] ** 2) ** (-11 / 6) * STEP
+
+
+@cache
+def _powers() -> dict[str, Float[np.ndarray, " scales"]]:
+    return {"tilt": _spectra() @ TILT, "higher": _spectra() @ HIGHER}
+
+
+@cache
+def _covariance() -> RegularGridInterpolator:
+    """Return the tilt's covariance over log kappa0 and log of the distance in footprints."""
+    apart = np.geomspace(1e-6, 1e7, 400)
+    values = (_spectra() * TILT) @ special.j0(2 * math.pi * np.multiply.outer(KAPPA, apart))
+    return RegularGridInterpolator((_log(_kappa0()), np.log(apart)), values)
+
+
+def _log(kappa0: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    return np.log(np.clip(kappa0, 1e-6, 100))
+
+
+def _path(profile: Profile) -> tuple[np.ndarray, np.ndarray]:
+    """Return z / L of slices and their weight in the tilt, Cn2 (1 - z/L)^(5/3), summing to 1."""
+    place = (np.arange(SLICES) + 0.5) / SLICES
+    knots = np.linspace(0, 1, len(profile)) if len(profile) > 1 else [0.5]
+    weight = np.interp(place, knots, profile) * (1 - place) ** (5 / 3)
+    return place, weight / weight.sum()
