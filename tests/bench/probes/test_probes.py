@@ -85,7 +85,7 @@ def test_strength_is_set_exactly():
     drawn = sample_atmosphere("medium", generator(1))
     assert strengthened(drawn, 7.0).d_over_r0 == pytest.approx(7.0)
     assert strengthened(drawn, 0.0) is None
-    profile = replace(drawn, cn2=(drawn.cn2, drawn.cn2 / 4, drawn.cn2))
+    profile = replace(drawn, cn2=(3e-14, 1e-14, 2e-14))
     assert strengthened(profile, 7.0).d_over_r0 == pytest.approx(7.0)
 
 
