@@ -5,6 +5,7 @@ z to shrink(z + P(x - D z) + pull), the pull being towards the code of the windo
 codes agree.  A recurrent decoder turns the code into a frame.  All 3x3 with reflected borders.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -14,6 +15,7 @@ from torch.nn import functional
 
 from baselines.single_view import centre_view, declare, finish
 from src.models.layers import ConvLSTM, pad_to_multiple
+from src.sim.optics import Position
 
 
 class CISTA(nn.Module):
@@ -50,11 +52,15 @@ class CISTA(nn.Module):
         self.pred = _conv(both, 1)
 
     def forward(
-        self, voxels: Float[Tensor, "n views bins h w"], state: Any = None
+        self,
+        voxels: Float[Tensor, "n views bins h w"],
+        state: Any = None,
+        *,
+        positions: Sequence[Position] | None = None,
     ) -> tuple[Float[Tensor, "n 1 h w"], Any]:
         """Return the frame and (code, state of the decoder, frame before cropping)."""
         height, width = voxels.shape[-2:]
-        view = centre_view(voxels, self.bins, self.normalise)
+        view = centre_view(voxels, self.bins, self.normalise, positions)
         view, (top, left) = pad_to_multiple(view, 2)
         before, memory, frame = state or (None, None, torch.zeros_like(view[:, :1]))
         x = self.mix(torch.cat([self.events(view), self.previous(frame)], 1))

@@ -1,5 +1,6 @@
 """E2VID+ (Stoffregen et al., ECCV 2020): E2VID without a final activation, on the centre view."""
 
+from collections.abc import Sequence
 from typing import Any
 
 from jaxtyping import Float
@@ -7,6 +8,7 @@ from torch import Tensor, nn
 
 from baselines.single_view import centre_view, declare, finish
 from src.models.e2vid import E2VID
+from src.sim.optics import Position
 
 
 class E2VIDPlus(nn.Module):
@@ -30,9 +32,13 @@ class E2VIDPlus(nn.Module):
         self.net = E2VID(1, bins, base_channels, final_activation="none")
 
     def forward(
-        self, voxels: Float[Tensor, "n views bins h w"], state: Any = None
+        self,
+        voxels: Float[Tensor, "n views bins h w"],
+        state: Any = None,
+        *,
+        positions: Sequence[Position] | None = None,
     ) -> tuple[Float[Tensor, "n 1 h w"], Any]:
         """Return the frame and the state of E2VID."""
-        view = centre_view(voxels, self.bins, self.normalise)
+        view = centre_view(voxels, self.bins, self.normalise, positions)
         frame, state = self.net(view[:, None], state)
         return finish(frame, self.output, self.training), state

@@ -5,6 +5,7 @@ to the coarser one; the mean of all of them replaces the residual blocks.  Atten
 that its maps are never stored.
 """
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -16,6 +17,7 @@ from torch.nn import functional
 from baselines.single_view import centre_view, declare, finish
 from src.models.e2vid import E2VID, SCALES
 from src.models.layers import pad_to_multiple
+from src.sim.optics import Position
 
 HEADS, DROPOUT = 8, 0.1
 
@@ -43,11 +45,15 @@ class ETNet(nn.Module):
         self.pyramid = Pyramid([base_channels * 2**scale for scale in range(SCALES, 0, -1)])
 
     def forward(
-        self, voxels: Float[Tensor, "n views bins h w"], state: Any = None
+        self,
+        voxels: Float[Tensor, "n views bins h w"],
+        state: Any = None,
+        *,
+        positions: Sequence[Position] | None = None,
     ) -> tuple[Float[Tensor, "n 1 h w"], Any]:
         """Return the frame and the state of E2VID."""
         height, width = voxels.shape[-2:]
-        view = centre_view(voxels, self.bins, self.normalise)
+        view = centre_view(voxels, self.bins, self.normalise, positions)
         view, (top, left) = pad_to_multiple(view, 2**SCALES)
         head, skips, after = self.net.encode(view, state)
         frame = self.net.decode(self.pyramid(skips[::-1]), head, skips)

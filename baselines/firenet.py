@@ -4,6 +4,7 @@ Full resolution, 16 channels, all 3x3: head -> ConvGRU -> residual block -> Conv
 block -> one channel.  37,777 parameters.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 from jaxtyping import Float
@@ -11,6 +12,7 @@ from torch import Tensor, nn
 
 from baselines.single_view import centre_view, declare, finish
 from src.models.layers import ConvGRU, ResidualBlock
+from src.sim.optics import Position
 
 
 class FireNet(nn.Module):
@@ -33,10 +35,14 @@ class FireNet(nn.Module):
         self.pred = nn.Conv2d(channels, 1, 1)
 
     def forward(
-        self, voxels: Float[Tensor, "n views bins h w"], state: Any = None
+        self,
+        voxels: Float[Tensor, "n views bins h w"],
+        state: Any = None,
+        *,
+        positions: Sequence[Position] | None = None,
     ) -> tuple[Float[Tensor, "n 1 h w"], Any]:
         """Return the frame and the two hidden maps."""
-        x = self.head(centre_view(voxels, self.bins, self.normalise)).relu()
+        x = self.head(centre_view(voxels, self.bins, self.normalise, positions)).relu()
         after = []
         for cell, block, before in zip(
             self.cells, self.resblocks, state or (None, None), strict=True

@@ -4,8 +4,12 @@ Log intensity is the sum of polarity times threshold; without the first frame on
 known, and errors pile up, so old events are forgotten exponentially (Scheerlinck et al. 2018).
 """
 
+from collections.abc import Sequence
+
 from jaxtyping import Float
 from torch import Tensor, nn
+
+from src.sim.optics import Position, centre, layout
 
 
 class HighPass(nn.Module):
@@ -26,12 +30,16 @@ class HighPass(nn.Module):
         self.keep, self.gain, self.source = keep, gain, source
 
     def forward(
-        self, voxels: Float[Tensor, "n views bins h w"], state: Tensor | None = None
+        self,
+        voxels: Float[Tensor, "n views bins h w"],
+        state: Tensor | None = None,
+        *,
+        positions: Sequence[Position] | None = None,
     ) -> tuple[Float[Tensor, "n 1 h w"], Tensor]:
         """Return the frame in [0, 1] and the leaky sum (n, 1, h, w)."""
         events = voxels.sum(2)
         if self.source == "centre":
-            change = events[:, events.shape[1] // 2, None]
+            change = events[:, centre(positions or layout(events.shape[1])), None]
         else:
             change = events.median(dim=1, keepdim=True).values
         state = change if state is None else self.keep * state + change

@@ -5,6 +5,7 @@ A small network sees the events and the previous frame and mixes, at each pixel,
 """
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -18,6 +19,7 @@ from torch.nn import functional
 from baselines.single_view import centre_view, declare, finish
 from src.models.e2vid import E2VID, SCALES
 from src.models.layers import pad_to_multiple
+from src.sim.optics import Position
 
 ATOMS, FUNCTIONS = 6, 6  # functions of each of the two reaches
 
@@ -41,11 +43,15 @@ class HyperE2VID(nn.Module):
         self.dynamic = DynamicDecoder(8 * base_channels, 4 * base_channels, bins + 1)
 
     def forward(
-        self, voxels: Float[Tensor, "n views bins h w"], state: Any = None
+        self,
+        voxels: Float[Tensor, "n views bins h w"],
+        state: Any = None,
+        *,
+        positions: Sequence[Position] | None = None,
     ) -> tuple[Float[Tensor, "n 1 h w"], Any]:
         """Return the frame and (state of E2VID, frame before output handling and cropping)."""
         height, width = voxels.shape[-2:]
-        view = centre_view(voxels, self.bins, self.normalise)
+        view = centre_view(voxels, self.bins, self.normalise, positions)
         view, (top, left) = pad_to_multiple(view, 2**SCALES)
         before, shown = state or (None, torch.zeros_like(view[:, :1]))
         head, skips, after = self.net.encode(view, before)

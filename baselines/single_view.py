@@ -1,8 +1,11 @@
 """What frozen single-view methods share: one view in, a declared output handling."""
 
+from collections.abc import Sequence
+
 from jaxtyping import Float
 from torch import Tensor
 
+from src.sim.optics import Position, centre, layout
 from src.sim.voxel import normalise_nonzero
 
 NORMALISE = ("none", "nonzero")
@@ -18,15 +21,19 @@ def declare(normalise: str, output: str) -> None:
 
 
 def centre_view(
-    voxels: Float[Tensor, "n views bins h w"], bins: int, normalise: str
+    voxels: Float[Tensor, "n views bins h w"],
+    bins: int,
+    normalise: str,
+    positions: Sequence[Position] | None = None,
 ) -> Float[Tensor, "n bins h w"]:
-    """Return the middle view of a square grid, as it is or with non-zero entries standardised.
+    """Return the centre view, as it is or with non-zero entries standardised.
 
-    Raises ValueError when the grid has another number of bins.
+    `positions`: (row, col) of each view; None: `optics.layout`.  Raises ValueError when the grid
+    has another number of bins.
     """
     if voxels.shape[2] != bins:
         raise ValueError(f"bins must be {bins} for this network, got {voxels.shape[2]}")
-    view = voxels[:, voxels.shape[1] // 2]
+    view = voxels[:, centre(positions or layout(voxels.shape[1]))]
     return normalise_nonzero(view) if normalise == "nonzero" else view
 
 

@@ -85,7 +85,8 @@ def seen(network: torch.nn.Module) -> str:
         return f"{network.views} view(s)"
     if takes(network, "frames"):
         return "frames in, frames out"
-    return "any number of views" if takes(network, "positions") else "the centre view"
+    one = type(network).__module__.startswith("baselines.")
+    return "the centre view" if one else "any number of views"
 
 
 def describe(name: str, network: torch.nn.Module, card: dict, tests: list[tuple]) -> str:

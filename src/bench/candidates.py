@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from src.models.unroll import takes
+from src.models.unroll import accepted
 from src.sim.optics import layout
 
 
@@ -53,9 +53,8 @@ class Subject:
         self, voxels: Tensor, state: Any, positions: Sequence, window_s: float
     ) -> tuple[Tensor, Any]:
         """Return the frame (1, 1, h, w), clipped, float32, and the state."""
-        facts = {"window_s": window_s, "positions": positions}
-        told = {name: value for name, value in facts.items() if takes(self.network, name)}
-        frame, state = self.network(voxels, state, **told)
+        options = accepted(self.network, window_s=window_s, positions=positions)
+        frame, state = self.network(voxels, state, **options)
         return frame.float().clamp(0, 1), state
 
     def play(

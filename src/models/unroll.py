@@ -23,13 +23,12 @@ def unroll(
     """Return the frame of every window and the state after the last one.
 
     `window_s`, the length of a window in seconds, a number or one per clip (n,), and `positions`,
-    the (row, col) of every view, are told to a network that takes them.
+    the (row, col) of every view, are given to a network that takes them.
     """
-    facts = {"window_s": window_s, "positions": positions}
-    told = {name: value for name, value in facts.items() if takes(network, name)}
+    options = accepted(network, window_s=window_s, positions=positions)
     frames = []
     for window in voxels.unbind(1):
-        frame, state = network(window, state, **told)
+        frame, state = network(window, state, **options)
         frames.append(frame)
     return torch.stack(frames, dim=1), state
 
@@ -42,13 +41,18 @@ def video(method: nn.Module, sample: "Sample") -> Float[Tensor, "n windows 1 h w
     """
     if hasattr(method, "video"):
         return method.video(sample)
-    known = {"window_s": sample.window_s, "positions": sample.positions}
-    return unroll(method, sample.voxels, **known)[0]
+    options = {"window_s": sample.window_s, "positions": sample.positions}
+    return unroll(method, sample.voxels, **options)[0]
 
 
 def takes(network: nn.Module, name: str) -> bool:
     """Return whether the network's `forward` has a parameter `name`."""
     return name in inspect.signature(network.forward).parameters
+
+
+def accepted(network: nn.Module, **options: Any) -> dict[str, Any]:
+    """Return those of `options` that the network's `forward` takes."""
+    return {name: value for name, value in options.items() if takes(network, name)}
 
 
 def chunks(windows: int, length: int) -> Iterator[slice]:

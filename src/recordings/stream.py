@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from src.models.unroll import takes
+from src.models.unroll import accepted, takes
 from src.recordings.lookup import Lookup
 
 COVERED = 0.99  # of the last window, or the recording ends before it
@@ -35,6 +35,11 @@ class Window:
     events: int
     outside: int
     voxels: Float[np.ndarray, "views bins h w"]
+
+    @property
+    def seconds(self) -> float:
+        """How long the window lasts."""
+        return (self.end_us - self.start_us) * 1e-6
 
 
 @dataclass(frozen=True)
@@ -189,9 +194,12 @@ def each_view(
     states, pictures = [None] * overlap, None
     for count, window in enumerate(windows):
         if window.events or pictures is None:
+            options = accepted(network, window_s=window.seconds, positions=[(0, 0)])
             voxels = torch.from_numpy(window.voxels.copy())[:, None]
             with torch.inference_mode():
-                pictures, states[count % overlap] = network(voxels, states[count % overlap])
+                pictures, states[count % overlap] = network(
+                    voxels, states[count % overlap], **options
+                )
         yield pictures[:, 0].clamp(0, 1).numpy()
 
 
@@ -237,20 +245,18 @@ def frames(
     """Reconstruct one frame per window; a window without events holds the picture at no cost.
 
     `overlap` is that of the windows' rule: the window k continues the state of window k - overlap.
-    A network that takes `window_s` and `positions` is told them.  `carry` of an earlier call makes
+    A network that takes `window_s` and `positions` is given them.  `carry` of an earlier call makes
     this one its continuation (law 6); it is kept up to date.
     """
     carry = Carry() if carry is None else carry
     carry.states.extend([None] * (overlap - len(carry.states)))
-    asks = [name for name in ("window_s", "positions") if takes(network, name)]
     for window in windows:
         phase = carry.frames % overlap
         if window.events:
-            known = {"window_s": (window.end_us - window.start_us) * 1e-6, "positions": positions}
-            told = {name: known[name] for name in asks}
+            options = accepted(network, window_s=window.seconds, positions=positions)
             voxels = torch.from_numpy(window.voxels)[None].to(device)
             with torch.inference_mode():
-                picture, carry.states[phase] = network(voxels, carry.states[phase], **told)
+                picture, carry.states[phase] = network(voxels, carry.states[phase], **options)
             carry.picture = picture[0, 0].clamp(0, 1).float().cpu()
         elif carry.picture is None:
             carry.picture = torch.full(window.voxels.shape[-2:], 0.5)

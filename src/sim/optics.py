@@ -43,6 +43,11 @@ def layout(views: int) -> tuple[Position, ...]:
     )
 
 
+def centre(positions: Sequence[Position]) -> int:
+    """Return the index of the view nearest to (0, 0): what one camera alone would see."""
+    return min(range(len(positions)), key=lambda i: sum(axis**2 for axis in positions[i]))
+
+
 def view_id(position: Position) -> int:
     """Return the number that keys the random draws of the view at `position` (centre: 144)."""
     row, col = position
@@ -82,8 +87,8 @@ class Optics:
 
     @property
     def centre(self) -> int:
-        """The index of the view nearest to (0, 0)."""
-        return min(range(self.views), key=lambda i: sum(axis**2 for axis in self.positions[i]))
+        """The index of the centre view."""
+        return centre(self.positions)
 
     def misalign(
         self,

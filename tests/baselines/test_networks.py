@@ -9,8 +9,10 @@ from baselines.cista import CISTA
 from baselines.e2vid_plus import E2VIDPlus
 from baselines.etnet import ETNet
 from baselines.firenet import FireNet
+from baselines.highpass import HighPass
 from baselines.hypere2vid import DynamicDecoder, HyperE2VID, fourier_bessel
 from src.models.unroll import unroll
+from src.sim.optics import Optics
 
 PUBLISHED = {
     FireNet: 37_777,
@@ -60,6 +62,19 @@ def test_any_size_comes_back_and_only_the_centre_view_counts(kind):
     alone, _ = network(window[:, 4:5], None)
     assert frame.shape == (2, 1, 21, 19)
     assert torch.equal(frame, alone)
+
+
+@pytest.mark.parametrize(
+    "optics", [Optics(2), Optics(4), Optics(5), Optics(9), Optics(2, [(0, 1), (0, 0)])], ids=str
+)
+@pytest.mark.parametrize("kind", [*PUBLISHED, HighPass])
+@torch.no_grad()
+def test_the_centre_view_is_that_of_the_optics(kind, optics):
+    network = HighPass() if kind is HighPass else small(kind)
+    seen = voxels(views=optics.views)
+    frames, _ = unroll(network, seen, positions=optics.positions)
+    alone, _ = unroll(network, seen[:, :, [optics.centre]])
+    assert torch.equal(frames, alone)
 
 
 @pytest.mark.parametrize("kind", PUBLISHED)

@@ -223,6 +223,13 @@ def test_a_network_that_asks_is_told_the_window_and_the_positions():
     assert network.window_s == pytest.approx(1 / 600) and network.positions == [(0, 0)]
 
 
+def test_view_by_view_a_network_is_told_the_window_too():
+    network = Told()
+    found = stream.windows([events(400, 100_000)], TABLE, Rule(fps=60))
+    list(stream.each_view(found, network))
+    assert network.window_s == pytest.approx(1 / 60) and network.positions == [(0, 0)]
+
+
 @pytest.mark.parametrize(
     "wants, there, all_views", [(None, 9, True), (9, 9, True), (1, 9, False), (1, 1, True)]
 )

@@ -11,7 +11,7 @@ from src.bench.candidates import Subject
 from src.bench.probes.clips import Stream
 from src.bench.probes.standard import Bench, Finding, worst
 from src.metrics.image import aligned_psnr
-from src.sim.optics import layout
+from src.sim.optics import centre, layout
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,8 @@ class Lost:
         for count in self.counts:
             gone = [rng.permutation(subject.views)[:count].tolist() for _ in range(self.draws)]
             # A draw of this number that takes the centre view is among them.
-            gone[0] = [subject.views // 2, *(v for v in gone[0] if v != subject.views // 2)][:count]
+            middle = centre(layout(subject.views))
+            gone[0] = [middle, *(v for v in gone[0] if v != middle)][:count]
             losses = [base - _without(subject, bench, views) for views in gone]
             curve.append((count, max(losses)))
         return worst(curve, unit="dB", limit=self.limit, varied="views lost")
@@ -69,10 +70,11 @@ class Misplaced:
         """Return the loss at `judged` pixels."""
         subject.needs_views()
         base, curve = bench.standard(subject), []
+        view = _neighbour(subject, bench.streams()[0])
         for shift in self.pixels:
 
             def moved(voxels: Tensor, shift: int = shift) -> Tensor:
-                return shifted(voxels, {_neighbour(voxels): (0, shift)})
+                return shifted(voxels, {view: (0, shift)})
 
             curve.append((shift, base - bench.over_clips(subject, bench.streams(), moved)))
         return Finding(dict(curve)[self.judged], "dB", self.limit, curve, "px out of place")
@@ -94,7 +96,7 @@ class Late:
 
     def _score(self, subject: Subject, bench: Bench, stream: Stream) -> float:
         shown = [window.clone() for window in stream.windows(stream.fps)]
-        view = _neighbour(shown[0])
+        view = _neighbour(subject, stream)
         late = [torch.zeros_like(shown[0][:, view])] * self.windows
         late += [window[:, view].clone() for window in shown]
         for window, seen in zip(shown, late, strict=False):
@@ -144,9 +146,12 @@ def _span(shift: int, length: int) -> slice:
     return slice(max(shift, 0), length + min(shift, 0))
 
 
-def _neighbour(voxels: Tensor) -> int:
-    """Return the index of the view before the centre one."""
-    return voxels.shape[1] // 2 - 1
+def _neighbour(subject: Subject, stream: Stream) -> int:
+    """Return the index, in `stream`, of the view that comes before the centre one in the subject's
+    layout (of the last one where the centre comes first).
+    """
+    places = layout(subject.views)
+    return stream.positions.index(places[centre(places) - 1])
 
 
 def _without(subject: Subject, bench: Bench, gone: list[int]) -> float:

@@ -15,7 +15,7 @@ from src.bench.probes.clips import Stream
 from src.bench.probes.standard import Bench, Finding
 from src.metrics.image import aligned_psnr
 from src.models.fast import running
-from src.models.unroll import takes
+from src.models.unroll import accepted
 from src.sim import noise
 
 
@@ -91,9 +91,8 @@ class WorstInput:
         self, subject: Subject, chosen: list, state: Any, extra: Tensor, stream: Stream
     ) -> Tensor:
         for k, (window, places) in enumerate(chosen):
-            facts = {"window_s": 1 / stream.fps, "positions": places}
-            told = {name: v for name, v in facts.items() if takes(subject.network, name)}
-            frame, state = subject.network(window + extra if k == 0 else window, state, **told)
+            options = accepted(subject.network, window_s=1 / stream.fps, positions=places)
+            frame, state = subject.network(window + extra if k == 0 else window, state, **options)
         return frame
 
 

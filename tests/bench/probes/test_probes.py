@@ -1,5 +1,7 @@
 """Streams against the pipeline; findings; networks whose answer to a probe is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -21,11 +23,11 @@ from src.sim.turbulence.simulated import SimulatedAir
 FPS = 120.0
 
 
-def pipeline(windows: int = 16) -> Pipeline:
+def pipeline(windows: int = 16, views: int = 9) -> Pipeline:
     scene = Photographs(split="test", height=64, width=64, frames=windows + 1)
     air = SimulatedAir({"severity": "medium", "width_px": 64})
     options = {"split": "test", "crop": 32}
-    return Pipeline(scene, Optics(9), air, {"threshold": 0.15}, **options)
+    return Pipeline(scene, Optics(views), air, {"threshold": 0.15}, **options)
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +85,8 @@ def test_strength_is_set_exactly():
     drawn = sample_atmosphere("medium", generator(1))
     assert strengthened(drawn, 7.0).d_over_r0 == pytest.approx(7.0)
     assert strengthened(drawn, 0.0) is None
+    profile = replace(drawn, cn2=(3e-14, 1e-14, 2e-14))
+    assert strengthened(profile, 7.0).d_over_r0 == pytest.approx(7.0)
 
 
 @pytest.mark.parametrize(("value", "high", "failed"), [(2, False, True), (2, True, False)])
@@ -123,6 +127,19 @@ def test_what_looks_at_the_centre_alone_minds_no_other_view(bench):
     assert light_field.Misplaced()(subject, bench).value == pytest.approx(0, abs=1e-6)
     assert light_field.Late()(subject, bench).value == pytest.approx(0, abs=1e-6)
     assert light_field.Permuted()(subject, bench).value != 0
+
+
+@pytest.mark.parametrize("views", [2, 4])
+def test_without_a_middle_the_centre_view_is_that_of_the_optics(views):
+    bench, subject = Bench(pipeline(views=views), [0], 4), Subject("centre", HighPass(), views)
+    assert light_field.Lost([1], 1)(subject, bench).value != 0  # the centre view is the one lost
+    assert light_field.Misplaced()(subject, bench).value == 0
+    assert light_field.Late()(subject, bench).value == 0
+
+
+def test_the_view_beside_the_centre_is_one_the_network_sees(bench):
+    subject = Subject("four of nine", HighPass(source="median"), 4)
+    assert light_field.Late()(subject, bench).value != 0
 
 
 def test_every_probe_runs_on_a_set_network(bench):
