@@ -69,8 +69,7 @@ def record(folder: Path, index: int, turbulence: str, windows: int) -> tuple[Dra
     views = pipeline.views(draw)[0]
     camera = capture.kaleidoscope(list(pipeline.optics.positions), model=(SIDE, SIDE), key=draw.key)
     folder.mkdir(parents=True, exist_ok=True)
-    sensor = pipeline.sensor.at(draw.threshold)
-    capture.write_recording(folder / "cap.raw", views, FPS, camera, sensor)
+    capture.write_recording(folder / "cap.raw", views, FPS, camera, draw.sensor)
     camera.only([(0, 0)]).save(folder / "centre.yaml")
     return draw, views
 

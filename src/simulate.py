@@ -34,16 +34,14 @@ def simulate(cfg: DictConfig) -> dict:
     draw = pipeline.draw(cfg.index)
     batch = pipeline.views(draw)
     sample, views = pipeline.expose(draw, batch), batch[0]
-    frames = views.shape[1]
-    tilt = pipeline.operator(draw).tilt(frames, pipeline.drawer(draw), crop=draw.crop)
+    tilt = pipeline.tilt(draw)
     windows = slice(cfg.data.substeps, None, cfg.data.substeps)
     results.open_run(run, door.resolved(cfg))
     samples.write_views(run, sample, views[:, windows], tilt[:, windows], pipeline.optics)
     if cfg.write:
         size = tuple(views.shape[-2:])
         camera = capture.kaleidoscope(list(pipeline.optics.positions), model=size, key=draw.key)
-        sensor = pipeline.sensor.at(draw.threshold)
-        capture.write_recording(cfg.write, views, draw.clip.fps, camera, sensor, tilt=tilt)
+        capture.write_recording(cfg.write, views, draw.clip.fps, camera, draw.sensor, tilt=tilt)
     rich.print(sample.drawn[0], f"in {run}")
     return sample.drawn[0]
 

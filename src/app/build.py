@@ -6,6 +6,7 @@
 import math
 import os
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -21,14 +22,19 @@ from baselines.postprocess import Restoration
 from baselines.upstream import from_config
 from src.metrics.scores import Scores
 from src.models.unroll import takes
+from src.sim.optics import Optics, layout
 from src.sim.pipeline import Pipeline
 from src.sim.scenes.photographs import MixedRates
 from src.sim.turbulence.model import TurbulenceModel
 from src.training import evaluation
+from src.training.bank import Bank, listing
+from src.training.banked import Banked
 from src.training.datamodule import LightFieldData
+from src.training.filling import Filler
 from src.training.reconstructor import Reconstructor
 
 SIMULATED = "src.sim.turbulence.simulated.SimulatedAir"
+CLIP = ("scene", "turbulence")  # sections that make a clip, whatever sees it
 ROOMS = (
     "src.", "baselines.", "torch.optim.", "lightning.pytorch.trainer.",
     *(f"lightning.pytorch.{room}." for room in ("callbacks", "loggers", "plugins", "profilers")),
@@ -82,9 +88,61 @@ def _check(target: str) -> None:
 def pipeline(cfg: DictConfig, split: str) -> Pipeline:
     """Return the simulation of one split: train, val or test."""
     training = split == "train"
-    windows = _count(cfg, "data.windows" if training else "data.test_windows")
+    if training and cfg.data.get("bank") is not None:
+        return Banked(
+            bank(cfg),
+            make(cfg.optics),
+            OmegaConf.to_container(cfg.sensor, resolve=True),
+            windows=_count(cfg, "data.windows"),
+            bins=cfg.bins,
+            crop=cfg.data.crop,
+            independent=cfg.turbulence.get("views_correlation", "independent") == "independent",
+        )
+    return _simulation(
+        cfg,
+        split,
+        windows=_count(cfg, "data.windows" if training else "data.test_windows"),
+        optics=make(cfg.optics),
+        sensor=OmegaConf.to_container(cfg.sensor, resolve=True),
+        crop=cfg.data.crop if training else cfg.data.test_crop,
+        clips=cfg.data.clips if training else None,
+    )
+
+
+def bank(cfg: DictConfig) -> Bank:
+    """Return the bank of air that `data.bank` asks for, named by all that makes its clips.
+
+    Nine views or fewer come out of one bank: view i depends on the draws of view i only.
+    """
+    optics, side = make(cfg.optics), _count(cfg, "data.bank_crop")
+    if set(optics.positions) <= set(layout(9)):
+        optics = replace(optics, views=9, positions=layout(9))
+    light = {"input": cfg.sensor.input}
+    windows, substeps = _count(cfg, "data.bank_windows"), _count(cfg, "data.substeps")
+    source = _simulation(
+        cfg, "train", windows=windows, optics=optics, sensor=light, crop=side, clips=None
+    )
+    parts = {name: OmegaConf.to_container(cfg[name], resolve=True) for name in CLIP}
+    made_of = parts | {
+        "optics": {"positions": optics.positions, "misalignment_px": optics.misalignment_px},
+        "files": listing(parts),
+        "sensor": light,
+        "seed": cfg.seed,
+        "rates": _rates(cfg, True),
+        "frames": {"windows": windows, "substeps": substeps, "crop": side},
+    }
+    gib = cfg.data.bank_gib
+    if not isinstance(gib, int | float):
+        raise ValueError(f"data.bank_gib must be a number, got {gib}")
+    clips, frames = _count(cfg, "data.bank"), windows * substeps + 1
+    return Bank(source, str(cfg.data.bank_root), made_of, clips=clips, frames=frames, gib=gib)
+
+
+def _simulation(
+    cfg: DictConfig, split: str, *, windows: int, optics: Optics, sensor: dict, crop, clips
+) -> Pipeline:
     substeps = _count(cfg, "data.substeps")
-    rates = _rates(cfg, training)
+    rates = _rates(cfg, split == "train")
     seed = _count(cfg, "data.test_seed" if split == "test" else "seed", least=0)
     scenes = [
         make(
@@ -99,16 +157,16 @@ def pipeline(cfg: DictConfig, split: str) -> Pipeline:
     try:
         return Pipeline(
             MixedRates(scenes) if len(scenes) > 1 else scenes[0],
-            make(cfg.optics),
+            optics,
             _turbulence(cfg.turbulence),
-            OmegaConf.to_container(cfg.sensor, resolve=True),
+            sensor,
             split=split,
             seed=seed,
             bins=cfg.bins,
             substeps=substeps,
-            crop=cfg.data.crop if training else cfg.data.test_crop,
-            random_crop=training,
-            clips=cfg.data.clips if training else None,
+            crop=crop,
+            random_crop=split == "train",
+            clips=clips,
         )
     except TypeError as error:
         raise ValueError(f"sensor takes no such values: {error}") from error
@@ -140,9 +198,11 @@ def data(cfg: DictConfig, splits: tuple[str, ...] = ("train", "val", "test")) ->
     if not 0 <= cfg.data.warmup <= cfg.data.test_windows - 2:  # wobble needs two frames
         most = cfg.data.test_windows - 2
         raise ValueError(f"data.warmup must be in 0..{most} (windows), got {cfg.data.warmup}")
+    pipelines = {split: pipeline(cfg, split) for split in splits}
+    train = pipelines.get("train")
     return LightFieldData(
-        {split: pipeline(cfg, split) for split in splits},
-        make(cfg.augment) if "train" in splits else None,
+        pipelines,
+        make(cfg.augment) if train else None,
         batch_size=cfg.data.batch_size,
         reuse=cfg.data.reuse,
         epoch_clips=cfg.data.epoch_clips,
@@ -151,6 +211,7 @@ def data(cfg: DictConfig, splits: tuple[str, ...] = ("train", "val", "test")) ->
         workers=cfg.data.workers,
         simulate_on=cfg.data.simulate_on,
         seed=cfg.seed,
+        filler=Filler(train.bank) if isinstance(train, Banked) else None,
     )
 
 

@@ -33,9 +33,14 @@ class Draw:
     clip: Clip
     crop: Crop
     air: Any
-    threshold: float
+    sensor: EventSensor
     key: int
     number: int
+
+    @property
+    def threshold(self) -> float:
+        """The ON threshold."""
+        return self.sensor.threshold
 
 
 @dataclass
@@ -108,8 +113,7 @@ class Pipeline:
         clip = self.scene.clip(index)
         crop = self._crop(clip.frames.shape[-2:], noise.key(key, number, "crop"))
         air = self.turbulence.draw(noise.generator(noise.key(key, "atmosphere")))
-        threshold = self.sensor.sample_threshold(noise.generator(noise.key(key, "threshold")))
-        return Draw(clip, crop, air, threshold, key, number)
+        return Draw(clip, crop, air, self.sensor.draw(key), key, number)
 
     def simulate(self, draws: Sequence[Draw], device: torch.device | str = "cpu") -> Sample:
         """Simulate the drawn clips on `device`."""
@@ -130,7 +134,7 @@ class Pipeline:
         top, left, height, width = draw.crop
         clean = draw.clip.frames.to(views.device)[None]
         target = clean[:, self.substeps :: self.substeps, top : top + height, left : left + width]
-        voxels = self.sensor.voxels(
+        voxels = draw.sensor.voxels(
             views,
             draw.clip.fps,
             self.bins,
@@ -142,7 +146,8 @@ class Pipeline:
             threshold=torch.tensor([draw.threshold]),
         )
         drawn = {"clip": draw.number, "name": draw.clip.name, "threshold": draw.threshold}
-        drawn |= self.operator(draw).facts
+        drawn |= {name: getattr(draw.sensor, name) for name in self.sensor.drawn}
+        drawn |= self.record(draw)
         turbulent = views[:, self.optics.centre, self.substeps :: self.substeps]
         turbulent = encode_srgb(turbulent) if self.decode else turbulent
         return Sample(
@@ -160,6 +165,15 @@ class Pipeline:
         views = self.operator(draw).degrade(radiance, self.drawer(draw), crop=draw.crop)
         size = tuple(clean.shape[-2:])
         return self.optics.misalign(views, draw.key, origin=draw.crop[:2], full_size=size)
+
+    def record(self, draw: Draw) -> dict:
+        """Return what is known of the air of a clip: its severity, how it is made, errors."""
+        return dict(self.operator(draw).facts)
+
+    def tilt(self, draw: Draw) -> Tensor:
+        """Return how far every view sees each pixel displaced, (views, frames, 2, h, w), pixels."""
+        frames = len(draw.clip.frames)
+        return self.operator(draw).tilt(frames, self.drawer(draw), crop=draw.crop)
 
     def operator(self, draw: Draw) -> Air:
         """Return the turbulence of a clip."""

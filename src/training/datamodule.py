@@ -11,6 +11,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from src.sim import noise
 from src.sim.pipeline import Draw, Pipeline, Sample
 from src.training.augment import Augment
+from src.training.filling import Filler
 
 
 class LightFieldData(LightningDataModule):
@@ -21,6 +22,7 @@ class LightFieldData(LightningDataModule):
     simulation with at most one worker.
     `workers`: processes that simulate beside the training; 0 simulates in the training process.
     `simulate_on`: `worker` (CPU) or `device` (the training device, for GPUs).
+    `filler`: fills the bank of air in the background of a training, where there is one.
     """
 
     def __init__(
@@ -36,6 +38,7 @@ class LightFieldData(LightningDataModule):
         workers: int = 0,
         simulate_on: str = "worker",
         seed: int = 0,
+        filler: Filler | None = None,
     ):
         super().__init__()
         if simulate_on not in ("worker", "device"):
@@ -47,9 +50,21 @@ class LightFieldData(LightningDataModule):
         if epoch_clips < batch_size:
             raise ValueError(f"data.epoch_clips must be >= data.batch_size, got {epoch_clips}")
         self.pipelines, self.augment, self.seed = pipelines, augment, seed
+        self.filler = filler
         self.batch_size, self.reuse, self.epoch_clips = batch_size, reuse, epoch_clips
         self.val_clips, self.test_clips = val_clips, test_clips
         self.workers, self.simulate_on = workers, simulate_on
+
+    def setup(self, stage: str) -> None:
+        """Start filling the bank; one process of each machine does."""
+        if stage == "fit" and self.filler is not None and self.trainer.local_rank == 0:
+            self.trainer.print(self.filler.bank.status())
+            self.filler.start()
+
+    def teardown(self, stage: str) -> None:
+        """Stop filling the bank."""
+        if stage == "fit" and self.filler is not None:
+            self.filler.stop()
 
     def train_dataloader(self) -> DataLoader:
         """Return endless clips, from the trainer's step on: a resumed run goes on seamlessly."""

@@ -1,6 +1,6 @@
 """What an event sensor accepts, and the errors that say so."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -24,8 +24,10 @@ RANGES = {
     "hot_fraction": (0, 1),
     "hot_hz": (0, 1e6),
     "cutoff_hz": (0, 1e6),
+    "residual": (0, 1),
 }
 THRESHOLDS = (0.01, 5)
+FIXED = ("floor",)  # part of the response: not drawn per clip
 
 
 def threshold_range(threshold: float | Sequence[float]) -> tuple[float, float]:
@@ -48,6 +50,21 @@ def check(settings: dict) -> None:
     for name, (low, high) in RANGES.items():
         within(f"sensor.{name}", settings[name], low, high)
     threshold_range(settings["threshold"])
+    check_drawn(settings["drawn"])
+
+
+def check_drawn(drawn: Mapping[str, Sequence[float]]) -> None:
+    """Raise ValueError unless `drawn` maps names of numbers of a sensor to ranges they can have."""
+    allowed = {"threshold": THRESHOLDS} | RANGES
+    for name, ends in drawn.items():
+        if name not in allowed or name in FIXED:
+            names = ", ".join(name for name in allowed if name not in FIXED)
+            raise ValueError(f"sensor.drawn must hold ranges of {names}, got {name}")
+        numbers = isinstance(ends, Sequence) and all(isinstance(end, int | float) for end in ends)
+        if not numbers or len(ends) != 2 or not ends[0] <= ends[1]:
+            raise ValueError(f"sensor.drawn.{name} must be [low, high], got {ends}")
+        for end in ends:
+            within(f"sensor.drawn.{name}", end, *allowed[name])
 
 
 def within(name: str, value: float, low: float, high: float) -> None:

@@ -8,7 +8,7 @@ tick in which it falls, in [edge_k, edge_k+1) with edge_k = ceil(k 10^6 / fps).
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from importlib.util import find_spec
 from types import ModuleType
@@ -23,6 +23,7 @@ from src.sim import noise
 from src.sim.sensor.engines import sensor_cpu, sensor_eager
 from src.sim.sensor.engines.job import Job, State
 from src.sim.sensor.limits import MODES, THRESHOLDS, check, check_frames, threshold_range, within
+from src.sim.sensor.memory import blank, rested
 from src.sim.sensor.response import EXTRA, UNIT, decode_srgb, nodes, response_table
 
 __all__ = ["EVENT", "EventSensor", "State", "decode_srgb"]
@@ -46,7 +47,10 @@ class EventSensor:
     `mismatch`: relative deviation of a pixel's thresholds, fixed per (seed, view, pixel).
     `leak_hz`: ON events of a pixel in the dark.  `shot_hz`: noise events of a black pixel (a white
     one has a quarter).  `hot_fraction` of the pixels make `hot_hz` noise events.  `cutoff_hz`: the
-    photoreceptor's low-pass at full intensity, 0 for none.
+    photoreceptor's low-pass at full intensity, 0 for none.  `residual`: how far a pixel's reference
+    is from its first level, uniform up to so many thresholds either way: what it saw before is not
+    known.  `drawn`: ranges out of which `draw` takes a clip's numbers, log-uniform, or uniform
+    where the range begins with 0.
     """
 
     def __init__(
@@ -67,6 +71,8 @@ class EventSensor:
         hot_fraction: float = 0.0,
         hot_hz: float = 0.0,
         cutoff_hz: float = 0.0,
+        residual: float = 0.0,
+        drawn: Mapping[str, Sequence[float]] | None = None,
     ):
         self.threshold = threshold if isinstance(threshold, int | float) else tuple(threshold)
         self.refractory_s, self.refractory, self.stamps = refractory_s, refractory, stamps
@@ -74,7 +80,7 @@ class EventSensor:
         self.mismatch, self.off_ratio = mismatch, off_ratio
         self.leak_hz, self.shot_hz = leak_hz, shot_hz
         self.hot_fraction, self.hot_hz, self.cutoff_hz = hot_fraction, hot_hz, cutoff_hz
-        self.seed = seed
+        self.residual, self.drawn, self.seed = residual, dict(drawn or {}), seed
         check(vars(self))
         self._table = response_table(response, input, floor)
 
@@ -83,6 +89,20 @@ class EventSensor:
         found = copy(self)
         found.threshold = threshold
         check(vars(found))
+        return found
+
+    def draw(self, key: int, seed: int | None = None) -> "EventSensor":
+        """Return the sensor of one clip, its numbers drawn from `key`; of another `seed`, if any.
+
+        The threshold's own range is uniform, from the stream that `sample_threshold` draws from.
+        """
+        found = copy(self)
+        found.threshold = self.sample_threshold(noise.generator(noise.key(key, "threshold")))
+        for name, (low, high) in self.drawn.items():
+            share = float(noise.uniform(noise.key(key, "sensor", name), torch.tensor(0)))
+            drawn = low * (high / low) ** share if low > 0 else high * share
+            setattr(found, name, min(drawn, high))
+        found.drawn, found.seed = {}, self.seed if seed is None else seed
         return found
 
     def sample_threshold(self, generator: torch.Generator) -> float:
@@ -172,11 +192,11 @@ class EventSensor:
             within(f"sensor.{name}", getattr(self, name), 0, fps)
         clips, views = range(n) if clips is None else clips, range(v) if views is None else views
         first = 0 if state is None else state.frame
-        return Job(
+        job = Job(
             frames=frames,
             fresh=state is None,
             tables=self._tables(fps, frames.device),
-            state=_blank(n, v, h, w, frames.device) if state is None else state,
+            state=blank(n, v, h, w, frames.device) if state is None else state,
             edges=_clock(fps, first, frames.shape[2] + (state is not None)),
             substeps=substeps,
             mode=MODES[self.refractory],
@@ -195,6 +215,7 @@ class EventSensor:
             ),
             place=(*origin, w if full_width is None else full_width),
         )
+        return rested(job, self.residual) if job.fresh and self.residual > 0 else job
 
     def _chips(self, n: int, threshold: Tensor | None) -> NDArray[np.int64]:
         """Return the integers of each clip's chip; see Job."""
@@ -246,11 +267,3 @@ def _engine(job: Job) -> ModuleType:
 def _clock(fps: float, first: int, count: int) -> NDArray[np.int64]:
     """Return ceil(k 10^6 / fps) for `count` frames from `first` on; strictly increasing."""
     return np.ceil(np.arange(first, first + count) * (1e6 / fps) - 1e-6).astype(np.int64)
-
-
-def _blank(n: int, views: int, h: int, w: int, device: torch.device) -> State:
-    shape = (n, views, h, w)
-    level, source, reference = (
-        torch.empty(shape, dtype=torch.int32, device=device) for _ in range(3)
-    )
-    return State(level, source, reference, torch.empty(shape, device=device))

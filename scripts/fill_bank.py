@@ -1,0 +1,54 @@
+"""Fill a bank of air before the trainings that use it, with the config they will have:
+
+    python -m scripts.fill_bank experiment=lf3x3 data.bank=1500 scene.root=... [+workers=2]
+
+Stopped anywhere and started again it goes on; several may fill one bank, trainings may use it.
+"""
+
+import multiprocessing
+import time
+
+import hydra
+import torch
+from omegaconf import DictConfig
+
+from src.app import build, door
+from src.training.bank import Bank
+from src.training.filling import fill
+
+EVERY = 10.0  # seconds between two lines
+
+
+def fill_bank(bank: Bank, workers: int) -> None:
+    """Fill with so many processes; raises OSError where clips could not be kept."""
+    print(bank.status(), flush=True)
+    start, before = time.monotonic(), len(bank.missing())
+    spawn = multiprocessing.get_context("spawn")
+    running = [spawn.Process(target=_work, args=(bank,), daemon=True) for _ in range(workers)]
+    for process in running:
+        process.start()
+    while any(process.is_alive() for process in running):
+        running[0].join(EVERY)
+        left, spent = len(bank.missing()), time.monotonic() - start
+        each = spent / max(before - left, 1)
+        print(f"{bank.clips - left} of {bank.clips} clips, {each:.2f} s each", flush=True)
+    if bank.missing():
+        raise OSError(f"{len(bank.missing())} clips are missing in {bank.folder}")
+
+
+def _work(bank: Bank) -> None:
+    torch.set_num_threads(1)
+    fill(bank)
+
+
+@hydra.main(version_base=None, config_path="../conf", config_name="train")
+def main(cfg: DictConfig) -> None:
+    """Glue between Hydra and `fill_bank`."""
+    workers = cfg.get("workers", 1)
+    if type(workers) is not int or workers < 1:
+        raise ValueError(f"workers must be a whole number >= 1, got {workers}")
+    fill_bank(build.bank(cfg), workers)
+
+
+if __name__ == "__main__":
+    door.run(main)

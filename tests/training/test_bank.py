@@ -1,0 +1,318 @@
+"""The bank of air: the simulation to float16, whoever makes it and whatever is there."""
+
+import json
+import multiprocessing
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from src.app import build
+from src.sim.optics import Optics
+from src.sim.pipeline import Pipeline
+from src.sim.turbulence.simulated import SimulatedAir
+from src.train import train
+from src.training.augment import Augment
+from src.training.bank import MADE_OF, Bank, listing, simulation
+from src.training.banked import EACH, FIRST, Banked
+from src.training.datamodule import LightFieldData
+from src.training.filling import Filler, fill
+from tests.faults.test_surroundings import small_files
+from tests.sim.test_pipeline import Waves
+from tests.test_train import TINY, config
+from tests.training.test_datamodule import FakeTrainer
+
+WEAK = SimulatedAir({"severity": "weak"})
+DRAWN = {"threshold": 0.2, "residual": 1.0, "drawn": {"threshold": [0.1, 0.3], "shot_hz": [0, 5]}}
+
+
+class Slow(Waves):
+    """Waves that take their time."""
+
+    def clip(self, index: int):
+        time.sleep(0.2)
+        return super().clip(index)
+
+
+def source(optics=None, turbulence=WEAK, scene=None, **kwargs) -> Pipeline:
+    return Pipeline(
+        scene or Waves(frames=7, side=40), optics or Optics(9), turbulence, {}, split="train",
+        crop=24, random_crop=True, **kwargs,
+    )  # fmt: skip
+
+
+def bank(root: Path, clips: int = 3, *, made_of=None, gib: float = 1.0, **kwargs) -> Bank:
+    return Bank(source(**kwargs), root, made_of or {"seed": 0}, clips=clips, frames=7, gib=gib)
+
+
+def banked(of: Bank, views: int = 9, sensor=DRAWN, **kwargs) -> Banked:
+    return Banked(of, Optics(views), sensor, **{"windows": 4, "crop": 16} | kwargs)
+
+
+def test_a_sample_is_the_simulation_to_the_rounding_of_float16(tmp_path):
+    chain = banked(bank(tmp_path), sensor={"threshold": 0.2})
+    for number in range(8):
+        draw = chain.draw(number)
+        air = chain.bank.source.draw(draw.index)
+        whole = chain.bank.source.views(air)[0, list(draw.order)]
+        top, left, height, width = draw.crop
+        rows, columns = slice(top, top + height), slice(left, left + width)
+        part = whole[:, draw.first : draw.first + 5, rows, columns]
+        part = part.flip(1) if draw.backwards else part
+        torch.testing.assert_close(chain.views(draw)[0], part, rtol=2**-11, atol=1e-7)
+        clean = air.clip.frames[draw.first :][:5, air.crop[0] :, air.crop[1] :][:, rows, columns]
+        clean = clean.flip(0) if draw.backwards else clean
+        target = chain.expose(draw, chain.views(draw)).target[0, :, 0]
+        torch.testing.assert_close(target, clean[1:], rtol=2**-11, atol=1e-7)
+
+
+def test_a_sample_is_a_function_of_its_number_and_not_of_what_the_bank_holds(tmp_path):
+    full, empty = bank(tmp_path / "full"), bank(tmp_path / "empty")
+    fill(full)
+    for number in (5, 0, 200):
+        ours, theirs = (
+            chain.simulate([chain.draw(number)]) for chain in map(banked, (full, empty))
+        )
+        assert torch.equal(ours.voxels, theirs.voxels) and torch.equal(ours.target, theirs.target)
+        assert ours.drawn == theirs.drawn
+    assert not full.missing()
+
+
+def test_numbers_differ_in_all_that_is_drawn(tmp_path):
+    chain = banked(bank(tmp_path))
+    draws = [chain.draw(number) for number in range(24)]
+    assert {draw.index for draw in draws} == {0, 1, 2}
+    assert {draw.first for draw in draws} == {0, 1, 2} and len({d.crop for d in draws}) > 10
+    assert {draw.backwards for draw in draws} == {False, True}
+    assert len({draw.order for draw in draws}) == len({draw.threshold for draw in draws}) == 24
+    assert len({draw.sensor.seed for draw in draws}) == 24
+
+
+def test_early_numbers_take_the_clips_that_are_filled_first(tmp_path):
+    chain = banked(bank(tmp_path, clips=100), sensor={})
+    assert all(chain.index(number) < FIRST + number // EACH for number in range(40))
+    assert max(chain.index(number) for number in range(1000, 1400)) > 95
+
+
+def test_law_2_a_single_view_is_the_centre_view_of_the_same_bank(tmp_path):
+    of = bank(tmp_path)
+    nine, one = banked(of), banked(of, views=1)
+    for number in range(4):
+        ours, theirs = (chain.simulate([chain.draw(number)]) for chain in (nine, one))
+        assert torch.equal(ours.voxels[:, :, 4:5], theirs.voxels)
+        assert torch.equal(ours.turbulent, theirs.turbulent)
+
+
+def test_law_3_a_batch_changes_nothing(tmp_path):
+    chain = banked(bank(tmp_path))
+    together, alone = (chain.simulate([chain.draw(n) for n in some]) for some in ([4, 9], [9]))
+    assert torch.equal(together.voxels[1:], alone.voxels)
+
+
+def test_views_that_share_their_air_keep_their_places(tmp_path):
+    shared = banked(bank(tmp_path / "a"), independent=False)
+    misaligned = banked(bank(tmp_path / "b", optics=Optics(9, misalignment_px=0.5)))
+    for chain in (shared, misaligned):
+        assert chain.draw(0).order == tuple(range(9))
+
+
+def test_the_fewest_clips_there_can_be_and_more_later(tmp_path):
+    fill(bank(tmp_path, clips=1))
+    more = bank(tmp_path, clips=3)
+    assert more.missing() == [1, 2]
+    assert "1 of 3 clips" in more.status()
+
+
+def flipped(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def test_a_flipped_bit_is_found_and_the_clip_made_again(tmp_path):
+    fill(bank(tmp_path))
+    again, path = bank(tmp_path), bank(tmp_path).path(1)
+    before = path.read_bytes()
+    flipped(path)
+    with pytest.warns(UserWarning, match="000001.pt is damaged and made again"):
+        again.clip(1)
+    assert path.read_bytes() == before
+    again.clip(1)
+
+
+@pytest.mark.parametrize("left", [0, 100, 20_000])
+def test_half_a_file_is_made_again(left, tmp_path):
+    fill(bank(tmp_path, clips=1))
+    path = bank(tmp_path, clips=1).path(0)
+    before = path.read_bytes()
+    path.write_bytes(before[:left])
+    with pytest.warns(UserWarning, match="is damaged"):
+        bank(tmp_path, clips=1).clip(0)
+    assert path.read_bytes() == before
+
+
+def test_a_bank_of_another_config_is_named_and_not_used(tmp_path):
+    fill(bank(tmp_path, made_of={"seed": 0, "scene": {"speed": 1}}))
+    other = bank(tmp_path, made_of={"seed": 1, "scene": {"speed": 1}})
+    assert len(other.missing()) == 3
+    assert "not used, of other configs" in other.status() and "(seed)" in other.status()
+
+
+def test_a_folder_that_says_otherwise_is_refused(tmp_path):
+    note = bank(tmp_path).folder / MADE_OF
+    note.write_text(json.dumps(json.loads(note.read_text()) | {"seed": 5}))
+    with pytest.raises(ValueError, match="data.bank_root: .* by another config .seed.; remove it"):
+        bank(tmp_path)
+    note.write_text("{")
+    with pytest.raises(ValueError, match="cannot be read"):
+        bank(tmp_path)
+
+
+SMALL = ["scene.height=64", "scene.width=64", "data.bank_windows=4", "data.bank_crop=24"]
+SMALL += ["data.windows=3", "data.crop=16", "turbulence=weak", "sensor=drawn"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ("data.bank=0", "data.bank must be a whole number >= 1, got 0"),
+        ("data.bank=2.5", "data.bank must be a whole number >= 1, got 2.5"),
+        ("data.bank=many", "data.bank must be a whole number >= 1, got many"),
+        ("data.bank_gib=big", "data.bank_gib must be a number, got big"),
+        ("data.bank_gib=nan", "data.bank_gib must be >= 0.00 for data.bank=2, .* got nan"),
+        ("data.bank_crop=0", "data.bank_crop must be a whole number >= 1"),
+        ("data.bank_windows=2", "data.windows must be <= data.bank_windows, 2, got 3"),
+        ("sensor.drawn.threshold=[0.1,9]", r"sensor.drawn.threshold must be in \[0.01, 5\], got 9"),
+    ],
+)
+def test_wrong_values_of_a_config_are_one_line(wrong, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        asked = ["data.bank=2", f"data.bank_root={tmp_path}", wrong]
+        build.pipeline(config("train", tmp_path, *SMALL, *asked), "train")
+
+
+@pytest.mark.parametrize(
+    ("changed", "same"),
+    [
+        (["optics=single"], True),
+        (["optics=lf1x3", "data.bank=5", "data.windows=2", "data.crop=20"], True),
+        (["sensor=paper", "augment=none", "data.bank_gib=3"], True),
+        (["optics=lf5x5"], False),
+        (["sensor.input=srgb"], False),
+        (["seed=1"], False),
+        (["turbulence=medium"], False),
+        (["data.rates=[120,240]"], False),
+        (["scene.speed=[0.1,0.2]"], False),
+        (["data.bank_windows=5"], False),
+    ],
+)
+def test_a_bank_is_shared_by_all_that_its_clips_do_not_depend_on(changed, same, tmp_path):
+    asked = ["data.bank=2", f"data.bank_root={tmp_path}"]
+    first, other = (
+        build.bank(config("train", tmp_path, *SMALL, *asked, *more)) for more in ([], changed)
+    )
+    assert (first.folder == other.folder) == same
+
+
+def test_batches_are_the_same_whatever_the_workers_and_the_step_begun_at(tmp_path):
+    def batches(root: str, workers: int, step: int) -> list[torch.Tensor]:
+        data = LightFieldData(
+            {"train": banked(bank(tmp_path / root))}, Augment(), batch_size=2, epoch_clips=8,
+            workers=workers,
+        )  # fmt: skip
+        data.trainer = type("Trainer", (FakeTrainer,), {"global_step": step})
+        return [batch.voxels for batch in data.train_dataloader()]
+
+    whole = batches("a", 0, 0)
+    for others in (batches("b", 2, 0), batches("c", 0, 2)):
+        assert len(others) in (2, 4)
+        assert all(map(torch.equal, whole[-len(others) :], others))
+
+
+def test_a_training_takes_steps_from_a_bank_and_fills_it(tmp_path):
+    asked = [*TINY, *SMALL, "data.bank=3", f"data.bank_root={tmp_path / 'bank'}", "optics=lf2"]
+    train(config("train", tmp_path / "run", *asked, "trainer.max_steps=2", "data.epoch_clips=2"))
+    (folder,) = (tmp_path / "bank").iterdir()
+    assert list(folder.glob("*.pt")) and (tmp_path / "run" / "results.json").is_file()
+
+
+def test_more_than_the_bound_or_the_disk_is_refused(tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match=r"data.bank_gib must be >= 0.08 for data.bank=1000"):
+        bank(tmp_path, clips=1000, gib=0.01)
+    free = type("Usage", (), {"free": 1000})
+    monkeypatch.setattr("shutil.disk_usage", lambda folder: free)
+    with pytest.raises(ValueError, match="data.bank_root must have 0.00 GiB free"):
+        bank(tmp_path)
+
+
+def test_more_windows_than_the_bank_has_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="data.windows must be <= data.bank_windows, 6, got 7"):
+        banked(bank(tmp_path), windows=7)
+
+
+def test_a_full_disk_while_filling(tmp_path):
+    of = bank(tmp_path)
+    other = banked(bank(tmp_path / "other"))
+    whole = other.simulate([other.draw(1)])
+    with small_files(50_000):
+        with pytest.warns(UserWarning, match="is not kept"), pytest.raises(OSError, match="filled"):
+            fill(of)
+        with pytest.warns(UserWarning, match="is not kept"):
+            sample = banked(of).simulate([banked(of).draw(1)])
+    assert torch.equal(sample.voxels, whole.voxels)
+    assert len(of.missing()) == 3 and not list(of.folder.glob("*.partial"))
+
+
+def work(of: Bank) -> None:
+    torch.set_num_threads(1)
+    fill(of)
+
+
+def test_killed_again_and_again_the_bank_is_the_same(tmp_path):
+    fill(alone := bank(tmp_path / "alone", scene=Slow(frames=7, side=40)))
+    of = bank(tmp_path / "killed", scene=Slow(frames=7, side=40))
+    forks = multiprocessing.get_context("fork")
+    for pause in (0.05, 0.25, 0.3, 0.1):
+        process = forks.Process(target=work, args=(of,))
+        process.start()
+        time.sleep(pause)
+        os.kill(process.pid, signal.SIGKILL)
+        process.join()
+    fill(of)  # nobody's lock is left
+    for index in range(3):
+        assert of.path(index).read_bytes() == alone.path(index).read_bytes()
+
+
+def test_who_needs_a_clip_that_another_makes_waits_for_it(tmp_path, monkeypatch):
+    of = bank(tmp_path, scene=Slow(frames=7, side=40), clips=1)
+    process = multiprocessing.get_context("fork").Process(target=work, args=(of,))
+    process.start()
+    while not (of.folder / "clips.lock").exists():
+        time.sleep(0.01)
+    time.sleep(0.1)
+    monkeypatch.setattr(of, "make", lambda index: pytest.fail("made twice"))
+    of.clip(0)
+    process.join()
+
+
+def test_a_filler_fills_in_the_background_and_ends(tmp_path):
+    filler = Filler(bank(tmp_path))
+    filler.start()
+    filler.process.join(120)
+    assert filler.process.exitcode == 0 and not filler.bank.missing()
+    filler.stop()
+    filler.start()
+    assert filler.process is None
+
+
+def test_files_of_a_scene_are_part_of_what_made_a_bank(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"1")
+    node = {"parts": [{"root": [str(tmp_path)]}, {"root": None}]}
+    before = listing(node)
+    assert before == listing(node) == listing({"root": str(tmp_path)})
+    (tmp_path / "b.png").write_bytes(b"1")
+    assert listing(node) != before
+    assert simulation() == simulation() != ""
