@@ -84,6 +84,9 @@ def test_beyond_its_ends_the_footage_is_mirrored_in_place_and_time():
     inside = found.at(np.array([1.3]), np.array([2.0]), np.array([3.0]))
     beyond = found.at(np.array([8 - 1.3]), np.array([-2.0]), np.array([24 - 3.0]))
     torch.testing.assert_close(inside, beyond, atol=1e-5, rtol=0)
+    turn = [at(found, time, 4.0, 5.0) for time in (3.9, 4.0, 4.1)]  # level there: no jerk
+    assert float((turn[1] - turn[0]).abs().max()) < 0.15
+    torch.testing.assert_close(turn[0], turn[2], atol=1e-5, rtol=0)
 
 
 def test_both_sides_of_the_contract_are_kept(model):
@@ -149,6 +152,19 @@ def test_nine_views_look_through_nine_pieces():
             quarter, time = sorted((a, b))
             pieces.add((round(quarter), int(time // 12)))
         assert len(pieces) == 9
+
+
+def test_about_half_of_the_views_play_their_piece_backwards():
+    clock = torch.arange(40.0)[:, None, None, None].expand(40, 2, 8, 8)
+    seen = Fields(clock, 63.0, 63.0)
+    air = RecordedAir(seen, Strength("weak", 1.0), layout(9), (16, 16), 0.25, 0.0)
+    backwards = 0
+    for seed in range(10):
+        time = air.tilt(40, generator(seed)).abs().mean((2, 3, 4))
+        step = time.diff(dim=1)
+        assert torch.equal(step.sign().amin(1), step.sign().amax(1))
+        backwards += int((step.mean(1) < 0).sum())
+    assert 30 < backwards < 60
 
 
 def test_mirrored_and_turned_pieces_stay_gradients():
