@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from src.sim import noise
+from src.sim.scenes.motion import Motion, Tempo
 from src.sim.scenes.pictures import read_picture
 
 SPLITS = ("train", "val", "test")
@@ -53,15 +54,17 @@ class Clip:
 class Photographs:
     """Endless clips of photographs in motion.
 
-    `root`: a folder of photographs, searched recursively (None: those inside scikit-image); 10 % of
-    them serve `val` and 20 % `test`.  `speed`: range of the drift, in frame widths per second;
-    `zoom`: range of photograph pixels per pixel of a frame 256 wide; `cutouts`: most foreground
-    objects.  Raises ValueError where there are no photographs or a range is no range.
+    `root`: a folder of photographs, searched recursively, or several (None: those inside
+    scikit-image); 10 % of each serve `val` and 20 % `test`.  `speed`: range of the drift, in frame
+    widths per second; `zoom`: range of photograph pixels per pixel of a frame 256 wide; `cutouts`:
+    most foreground objects.  `still`: probability that only these move; `rest`: that all pauses,
+    stops or never moves.  Raises ValueError where there are no photographs, or for a value outside
+    its range.
     """
 
     def __init__(
         self,
-        root: str | None = None,
+        root: str | Sequence[str] | None = None,
         *,
         split: str = "train",
         seed: int = 0,
@@ -72,6 +75,8 @@ class Photographs:
         speed: Sequence[float] = (0.1, 1.5),
         zoom: Sequence[float] = (0.9, 1.6),
         cutouts: int = 3,
+        still: float = 0.0,
+        rest: float = 0.0,
     ):
         check_frames(height, width, frames, fps)
         for name, (low, high) in (("speed", speed), ("zoom", zoom)):
@@ -79,20 +84,30 @@ class Photographs:
                 raise ValueError(f"scene.{name} must be a range 0 < low <= high, got {low}, {high}")
         if cutouts < 0:
             raise ValueError(f"scene.cutouts must be >= 0, got {cutouts}")
+        for name, value in (("still", still), ("rest", rest)):
+            if not 0 <= value <= 1:
+                raise ValueError(f"scene.{name} must be in [0, 1], got {value}")
         self.photos = photographs(root, split)
         self.split, self.seed, self.size = split, seed, (height, width)
         self.times = np.arange(frames) / fps
         self.fps, self.speed, self.zoom, self.cutouts = fps, speed, zoom, cutouts
+        self.still, self.rest = still, rest
 
     def clip(self, index: int) -> Clip:
         """Return clip `index`: a function of the seed, the split and the index."""
         key = noise.key(self.seed, self.split, "photographs", index)
         rng = np.random.default_rng(key)
+        apart = np.random.default_rng(noise.key(key, "tempo"))  # `rng` draws as it did without
+        still, rests = apart.uniform(size=2) < (self.still, self.rest)
         name, background = self._photo(rng)
         layers = [self._background(background, rng)]
-        layers += [self._cutout(rng) for _ in range(rng.integers(self.cutouts + 1))]
+        if still:
+            layers[0].motion.stop()
+        objects = max(rng.integers(self.cutouts + 1), int(still and self.cutouts > 0))
+        layers += [self._cutout(rng) for _ in range(objects)]
         gain, offset = rng.uniform(0.75, 1.0), rng.uniform(-0.1, 0.1)
-        frames = np.stack([self._render(layers, time) for time in self.times])
+        times = map(Tempo(apart), self.times) if rests else self.times
+        frames = np.stack([self._render(layers, time) for time in times])
         frames = np.clip(0.5 + offset + gain * (frames - 0.5), 0, 1).astype(np.float32)
         return Clip(torch.from_numpy(frames), self.fps, f"{name}-{index}")
 
@@ -103,7 +118,7 @@ class Photographs:
     def _background(self, photo: NDArray, rng: np.random.Generator) -> "_Layer":
         zoom = rng.uniform(*self.zoom) * REFERENCE_WIDTH / self.size[1]
         centre = rng.uniform(0.35, 0.65, 2) * photo.shape[::-1]
-        return _Layer(_smooth(photo, zoom), None, centre, zoom, _Motion(rng, self.speed))
+        return _Layer(_smooth(photo, zoom), None, centre, zoom, Motion(rng, self.speed))
 
     def _cutout(self, rng: np.random.Generator) -> "_Layer":
         _, photo = self._photo(rng)
@@ -115,7 +130,7 @@ class Photographs:
         # Where the cut-out stands at t = 0, as seen from its own middle.
         place = rng.uniform(-0.5, 0.5, 2) * self.size[::-1]
         centre = np.array(texture.shape[::-1]) / 2 - place * zoom
-        return _Layer(_smooth(texture, zoom), mask, centre, zoom, _Motion(rng, self.speed))
+        return _Layer(_smooth(texture, zoom), mask, centre, zoom, Motion(rng, self.speed))
 
     def _render(self, layers: Sequence["_Layer"], time: float) -> NDArray:
         background, *cutouts = layers
@@ -131,31 +146,13 @@ class Photographs:
         return frame
 
 
-class _Motion:
-    """Drift, sway, turn and zoom as functions of time."""
-
-    def __init__(self, rng: np.random.Generator, speed: Sequence[float]):
-        rate, heading = rng.uniform(*speed), rng.uniform(0, 2 * math.pi)
-        self.drift = 0.6 * rate * np.array([math.cos(heading), math.sin(heading)])
-        self.pace = 2 * math.pi * rng.uniform(0.3, 3.0, 4)  # rad/s of sway x, y, turn and zoom
-        self.phase = rng.uniform(0, 2 * math.pi, 4)
-        swing = np.array([0.4 * rate, 0.4 * rate, rng.uniform(0, 0.8), rng.uniform(0, 0.3)])
-        self.size = swing / self.pace  # so that `swing` is the largest speed of each
-        self.angle = rng.uniform(-0.4, 0.4)
-
-    def at(self, time: float) -> tuple[NDArray, float, float]:
-        """Return the shift (x, y) in frame widths, the angle in rad and the logarithm of zoom."""
-        wave = self.size * (np.sin(self.pace * time + self.phase) - np.sin(self.phase))
-        return self.drift * time + wave[:2], self.angle + wave[2], wave[3]
-
-
 @dataclass(frozen=True)
 class _Layer:
     picture: NDArray
     mask: NDArray | None
     centre: NDArray  # the point of the picture in the middle of the frame at t = 0
     zoom: float  # picture pixels per frame pixel
-    motion: _Motion
+    motion: Motion
 
     def matrix(self, time: float, size: tuple[int, int]) -> NDArray:
         """Return the 2x3 map from frame pixels to picture pixels."""
@@ -191,8 +188,15 @@ def check_frames(height: int, width: int, frames: int, fps: float) -> None:
         raise ValueError(f"fps must be > 0, got {fps}")
 
 
-def photographs(root: str | None, split: str) -> list[Path]:
-    """Return the photographs of a split; raises ValueError where there are none."""
+def photographs(root: str | Sequence[str] | None, split: str) -> list[Path]:
+    """Return the photographs of a split; of several folders, each one's own share of it.
+
+    Raises ValueError where there are none.
+    """
+    if isinstance(root, Sequence) and not isinstance(root, str):
+        if not root:
+            raise ValueError("scene.root must be a folder, or some, got an empty list")
+        return [path for one in root for path in photographs(str(one), split)]
     if split not in SPLITS:
         raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split}")
     if root is None:

@@ -1,6 +1,7 @@
 """What an event sensor accepts, and the errors that say so."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -53,7 +54,7 @@ def check(settings: dict) -> None:
     check_drawn(settings["drawn"])
 
 
-def check_drawn(drawn: Mapping[str, Sequence[float]]) -> None:
+def check_drawn(drawn: Mapping[str, Any]) -> None:
     """Raise ValueError unless `drawn` maps names of numbers of a sensor to ranges they can have."""
     allowed = {"threshold": THRESHOLDS} | RANGES
     for name, ends in drawn.items():

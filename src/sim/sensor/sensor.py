@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from copy import copy
 from importlib.util import find_spec
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import torch
@@ -72,7 +73,7 @@ class EventSensor:
         hot_hz: float = 0.0,
         cutoff_hz: float = 0.0,
         residual: float = 0.0,
-        drawn: Mapping[str, Sequence[float]] | None = None,
+        drawn: Mapping[str, Any] | None = None,
     ):
         self.threshold = threshold if isinstance(threshold, int | float) else tuple(threshold)
         self.refractory_s, self.refractory, self.stamps = refractory_s, refractory, stamps

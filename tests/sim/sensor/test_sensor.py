@@ -349,3 +349,70 @@ def test_black_pixels_are_at_the_floor():
     frames = torch.zeros(2, 1, 1)
     frames[1] = 1 / 255
     assert len(EventSensor(0.05).events(frames, FPS)) == 0
+
+
+def test_a_clips_sensor_is_drawn_within_the_ranges():
+    ranges = {"threshold": [0.1, 0.6], "off_ratio": [0.8, 1.25], "mismatch": [0.0, 0.1]}
+    sensor = EventSensor(0.2, shot_hz=1.0, drawn=ranges)
+    clips = [sensor.draw(key) for key in range(400)]
+    for name, (low, high) in ranges.items():
+        values = np.array([getattr(clip, name) for clip in clips])
+        assert low <= values.min() and values.max() <= high and len(set(values)) > 390
+        middle = np.sqrt(low * high) if low > 0 else high / 2  # log-uniform, or uniform
+        assert 0.4 < (values < middle).mean() < 0.6  # 0.5 +- 0.025
+    assert clips[0].drawn == {} and clips[0].shot_hz == 1.0 and clips[0].seed == sensor.seed
+    assert sensor.draw(3).threshold == clips[3].threshold and sensor.draw(3, 7).seed == 7
+
+
+def test_what_is_not_drawn_is_drawn_as_before():
+    plain = EventSensor([0.1, 0.7]).draw(5)
+    assert (
+        plain.threshold == EventSensor([0.1, 0.7], drawn={"mismatch": [0, 0.1]}).draw(5).threshold
+    )
+
+
+@pytest.mark.parametrize(
+    ("drawn", "message"),
+    [
+        ({"color": [0, 1]}, "sensor.drawn must hold ranges of threshold, .*, got color"),
+        ({"floor": [0.01, 0.1]}, "sensor.drawn must hold ranges of .*, got floor"),
+        ({"threshold": 0.2}, r"sensor.drawn.threshold must be \[low, high\], got 0.2"),
+        ({"threshold": [0.5, 0.1]}, r"sensor.drawn.threshold must be \[low, high\]"),
+        ({"threshold": ["a", "b"]}, r"sensor.drawn.threshold must be \[low, high\]"),
+        ({"threshold": [0.1, 9]}, r"sensor.drawn.threshold must be in \[0.01, 5\], got 9"),
+        ({"mismatch": [-1, 0.5]}, r"sensor.drawn.mismatch must be in \[0, 1\], got -1"),
+    ],
+)
+def test_wrong_ranges_name_their_key(drawn, message):
+    with pytest.raises(ValueError, match=message):
+        EventSensor(drawn=drawn)
+
+
+def test_with_a_residual_the_first_event_comes_anywhere_within_two_thresholds():
+    """A ramp of log intensity: without, all pixels fire at the same moment, one threshold on."""
+    ramp = (
+        torch.exp(torch.linspace(-2.0, -1.0, 101))
+        .reshape(1, 1, -1, 1, 1)
+        .expand(-1, -1, -1, 64, 64)
+    )
+    ramp = ramp.contiguous()
+    firsts = []
+    for residual in (0.0, 1.0):
+        counts = EventSensor(0.2, refractory_s=0.0, residual=residual).voxels(ramp, 100.0).sum(3)
+        firsts.append((counts[0, 0] > 0).float().argmax(0).flatten())  # hundredths of a nat
+    assert firsts[0].unique().numel() == 1
+    waited = (firsts[1] + 0.5) / 100
+    assert waited.min() < 0.01 and waited.max() > 0.38
+    assert float(waited.mean()) == pytest.approx(0.2, abs=0.01)
+
+
+def test_a_residual_makes_no_event_by_itself_and_is_the_same_in_a_crop_and_in_a_list():
+    still = torch.full((1, 2, 4, 32, 32), 0.4)
+    sensor = EventSensor(0.2, residual=1.0, mismatch=0.3, refractory_s=0.0)
+    assert float(sensor.voxels(still, 100.0).abs().sum()) == 0
+    moving = still * torch.linspace(1, 2, 4)[:, None, None]
+    whole = sensor.voxels(moving, 100.0, clips=[3])
+    crop = sensor.voxels(moving[..., 8:24, 8:24], 100.0, clips=[3], origin=(8, 8), full_width=32)
+    assert torch.equal(whole[..., 8:24, 8:24], crop) and float(crop.abs().sum()) > 100
+    listed = sensor.events(moving[0, 1], 100.0, clip=3, view=1)
+    assert int(listed["p"].sum()) == pytest.approx(float(whole[0, 1].sum()))

@@ -1,0 +1,129 @@
+"""Scenes to train on: several kinds by share, still cameras, rests, several folders."""
+
+from functools import partial
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from src.app import build
+from src.sim.scenes.mixture import Mixture
+from src.sim.scenes.motion import Tempo
+from src.sim.scenes.photographs import Photographs, photographs
+from src.sim.scenes.targets import Targets
+from tests.test_train import config
+
+FRAME = {"height": 32, "width": 32, "frames": 3, "fps": 120.0}
+PHOTOS = partial(Photographs, cutouts=0)
+DOTS = partial(Targets, kinds=["dot_grid"])
+
+
+def mixture(photos: float, dots: float, split: str = "train", **more) -> Mixture:
+    parts = {
+        "photos": {"share": photos, "scene": PHOTOS},
+        "dots": {"share": dots, "splits": ["train"], "scene": DOTS},
+    }
+    return Mixture(parts, split=split, **FRAME | more)
+
+
+def kinds(scene: Mixture, clips: int = 200) -> int:
+    """Return how many clips show dots."""
+    return sum(scene.clip(index).name.startswith("DotGrid") for index in range(clips))
+
+
+def test_a_mixture_is_drawn_by_its_shares():
+    assert 30 < kinds(mixture(3, 1)) < 72  # 50 +- 6.1
+    assert kinds(mixture(1, 0)) == kinds(mixture(1, 1, split="val")) == 0
+    assert kinds(mixture(0, 2), 20) == 20
+
+
+def test_a_clip_of_a_mixture_is_that_of_its_part_whatever_the_length():
+    scene, longer = mixture(1, 1, seed=3), mixture(1, 1, seed=3, frames=5)
+    parts = [part(split="train", seed=3, **FRAME) for part in (PHOTOS, DOTS)]
+    for index in range(6):
+        clip = scene.clip(index)
+        assert any(torch.equal(clip.frames, part.clip(index).frames) for part in parts)
+        assert torch.equal(longer.clip(index).frames[:3], clip.frames)
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"a": {"share": -1, "scene": PHOTOS}}, "scene.parts.a.share must be >= 0, got -1"),
+        ({"a": {"share": "x", "scene": PHOTOS}}, "scene.parts.a.share must be >= 0, got x"),
+        ({"a": {"share": 0, "scene": PHOTOS}}, "scene.parts must have a share > 0 for split=train"),
+        ({"a": {"share": 1, "splits": ["exam"], "scene": PHOTOS}}, "scene.parts.a.splits must be"),
+    ],
+)
+def test_wrong_parts_name_their_key(parts, message):
+    with pytest.raises(ValueError, match=message):
+        Mixture(parts, **FRAME)
+
+
+def test_the_scenes_to_train_on_need_no_data(tmp_path):
+    cfg = config("train", tmp_path, "scene=training", "scene.height=64", "scene.width=64")
+    for split in ("train", "val", "test"):
+        scene = build.make(cfg.scene, split=split, seed=0, frames=2, fps=120.0)
+        assert scene.clip(0).frames.shape == (2, 64, 64)
+
+
+def changes(scene: Photographs, index: int) -> torch.Tensor:
+    """Return which pixels ever change, (h, w)."""
+    frames = scene.clip(index).frames
+    return (frames != frames[0]).any(0)
+
+
+def test_a_still_camera_shows_moving_things_before_a_scene_that_stands():
+    moving = [changes(Photographs(frames=9, still=1.0, cutouts=2), index) for index in range(8)]
+    shares = [float(where.float().mean()) for where in moving]
+    assert max(shares) < 0.6 and sum(share > 0 for share in shares) > 4
+    some = [
+        changes(Photographs(frames=3, still=0.5, cutouts=0), index).any() for index in range(40)
+    ]
+    assert 10 < sum(map(bool, some)) < 30
+
+
+def test_what_rests_is_the_same_clip_at_another_pace():
+    times, seen = np.arange(240) / 240, set()
+    for seed in range(40):
+        tempo = Tempo(np.random.default_rng(seed))
+        moved = np.array([tempo(time) for time in times])
+        steps = np.diff(moved)
+        assert moved[0] == 0 and steps.min() > -1e-9 and steps.max() < 1 / 240 + 1e-9
+        pace = {"never": 0, "stops": moved[-1] < 0.31, "pauses": 0 < moved[-1] < 1}[tempo.kind]
+        assert pace or (tempo.kind == "never" and moved[-1] == 0)
+        seen.add(tempo.kind)
+    assert seen == {"pauses", "stops", "never"}
+    for index in range(6):
+        always, rests = (Photographs(**FRAME, rest=rest).clip(index).frames for rest in (0.0, 1.0))
+        assert torch.equal(always[0], rests[0])
+
+
+def test_a_finer_clip_that_rests_holds_the_coarse_one():
+    for index in range(6):
+        coarse = Photographs(frames=4, fps=60.0, rest=1.0, still=0.5).clip(index).frames
+        fine = Photographs(frames=10, fps=180.0, rest=1.0, still=0.5).clip(index).frames
+        torch.testing.assert_close(coarse, fine[::3], atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("name", ["still", "rest"])
+@pytest.mark.parametrize("value", [-0.1, 1.1, float("nan")])
+def test_probabilities_name_their_key(name, value):
+    with pytest.raises(ValueError, match=rf"scene.{name} must be in \[0, 1\]"):
+        Photographs(**{name: value})
+
+
+def test_a_second_folder_leaves_the_splits_of_the_first_as_they_were(tmp_path):
+    roots = [tmp_path / name for name in ("b", "a")]
+    for number in range(46):
+        root = roots[number % 2]
+        root.mkdir(exist_ok=True)
+        cv2.imwrite(str(root / f"{number:03}.png"), np.full((32, 32), number, np.uint8))
+    for split in ("train", "val", "test"):
+        both = photographs([str(root) for root in roots], split)
+        assert both == photographs(str(roots[0]), split) + photographs(str(roots[1]), split)
+    with pytest.raises(ValueError, match="scene.root must be a folder, or some, got an empty"):
+        photographs([], "train")
+    with pytest.raises(ValueError, match="scene.root must be a folder, got /nowhere"):
+        photographs([str(roots[0]), "/nowhere"], "train")
