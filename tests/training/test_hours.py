@@ -39,7 +39,7 @@ def run(folder: Path, *overrides: str) -> dict:
 
 
 def curve(folder: Path) -> list[list[float]]:
-    rows = list(csv.DictReader((folder / "curve.csv").open()))
+    rows = list(csv.DictReader((folder / "curve.csv").read_text().splitlines()))
     return [
         [float(row[name] or 0) for name in ("hours", "steps", "windows", "ssim")] for row in rows
     ]
