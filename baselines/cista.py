@@ -60,8 +60,7 @@ class CISTA(nn.Module):
     ) -> tuple[Float[Tensor, "n 1 h w"], Any]:
         """Return the frame and (code, state of the decoder, frame before cropping)."""
         height, width = voxels.shape[-2:]
-        view = centre_view(voxels, self.bins, self.normalise, positions)
-        view, (top, left) = pad_to_multiple(view, 2)
+        view, (top, left) = pad_to_multiple(self.see(voxels, positions), 2)
         before, memory, frame = state or (None, None, torch.zeros_like(view[:, :1]))
         x = self.mix(torch.cat([self.events(view), self.previous(frame)], 1))
         z = self._unfold(x, before)
@@ -70,6 +69,12 @@ class CISTA(nn.Module):
         frame = finish(self.pred(self.up(grown)), self.output, self.training)
         shown = frame[..., top : top + height, left : left + width]
         return shown, (z, memory, frame.detach())
+
+    def see(
+        self, voxels: Float[Tensor, "n views bins h w"], positions: Sequence[Position] | None
+    ) -> Float[Tensor, "n c h w"]:
+        """Return what the stem of events is given: the centre view."""
+        return centre_view(voxels, self.bins, self.normalise, positions)
 
     def _unfold(self, x: Tensor, before: Tensor | None) -> Tensor:
         z = self.code(x)

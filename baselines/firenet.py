@@ -42,7 +42,7 @@ class FireNet(nn.Module):
         positions: Sequence[Position] | None = None,
     ) -> tuple[Float[Tensor, "n 1 h w"], Any]:
         """Return the frame and the two hidden maps."""
-        x = self.head(centre_view(voxels, self.bins, self.normalise, positions)).relu()
+        x = self.head(self.see(voxels, positions)).relu()
         after = []
         for cell, block, before in zip(
             self.cells, self.resblocks, state or (None, None), strict=True
@@ -51,3 +51,9 @@ class FireNet(nn.Module):
             x = block(x)
             after.append(new)
         return finish(self.pred(x), self.output, self.training), tuple(after)
+
+    def see(
+        self, voxels: Float[Tensor, "n views bins h w"], positions: Sequence[Position] | None
+    ) -> Float[Tensor, "n c h w"]:
+        """Return what the first convolution is given: the centre view."""
+        return centre_view(voxels, self.bins, self.normalise, positions)

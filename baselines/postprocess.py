@@ -76,7 +76,7 @@ class Restoration(Reconstructor):
     @property
     def method(self) -> Postprocessed:
         """The network behind its source."""
-        return Postprocessed(self._source[0], self.network)
+        return Postprocessed(self._source[0], super().method)
 
     def _unroll(self, sample: "Sample", part: slice, state: Any):
         with torch.no_grad():

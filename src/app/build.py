@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 import src.models
+from baselines import widened
 from baselines.postprocess import Restoration
 from baselines.upstream import from_config
 from src.metrics.scores import Scores
@@ -29,6 +30,7 @@ from src.sim.turbulence.model import TurbulenceModel
 from src.training import evaluation
 from src.training.bank import Bank, listing
 from src.training.banked import Banked
+from src.training.clock import Clock
 from src.training.datamodule import LightFieldData
 from src.training.filling import Filler
 from src.training.reconstructor import Reconstructor
@@ -216,10 +218,19 @@ def data(cfg: DictConfig, splits: tuple[str, ...] = ("train", "val", "test")) ->
 
 
 def network(cfg: DictConfig) -> tuple[nn.Module, dict]:
-    """Return a fresh network and the plain dict (target, kwargs) that builds it again."""
-    kwargs = OmegaConf.to_container(cfg.model, resolve=True)
-    target = kwargs.pop("_target_")
-    return make(cfg.model), {"target": target, "kwargs": kwargs}
+    """Return a fresh network and the plain dict (target, kwargs) that builds it again.
+
+    `model.weights`, which a network may be given published weights by, is no part of the dict.
+    """
+    node = OmegaConf.to_container(cfg.model, resolve=True)
+    weights = node.pop("weights", None)
+    net = make(node)
+    if weights:
+        widened.start(net, weights)
+    elif "weights" in cfg.model:
+        print(f"model.weights is null: {cfg.name} is trained from scratch")
+    target = node.pop("_target_")
+    return net, {"target": target, "kwargs": node}
 
 
 def chosen(cfg: DictConfig) -> nn.Module:
@@ -257,6 +268,13 @@ def scores(cfg: DictConfig) -> Scores:
 def reconstructor(cfg: DictConfig, net: nn.Module, spec: dict) -> Reconstructor:
     """Return the Lightning module that trains and tests `net`; with a `source`, on its frames."""
     kind = partial(Restoration, source=make(cfg.source)) if cfg.get("source") else Reconstructor
+    if not 0 <= cfg.data.loss_from < cfg.data.windows:
+        most = f"0..{cfg.data.windows - 1} (data.windows)"
+        raise ValueError(f"data.loss_from must be in {most}, got {cfg.data.loss_from}")
+    if cfg.hours and cfg.scheduler:
+        raise ValueError(f"scheduler must be null with hours={cfg.hours}, which has its own")
+    if cfg.channels_last:
+        net.to(memory_format=torch.channels_last)
     return kind(
         net,
         spec,
@@ -267,6 +285,10 @@ def reconstructor(cfg: DictConfig, net: nn.Module, spec: dict) -> Reconstructor:
         detach_every=cfg.data.detach_every,
         warmup=cfg.data.warmup,
         spike=cfg.spike,
+        loss_from=cfg.data.loss_from,
+        clip=cfg.clip,
+        average=cfg.average,
+        clock=Clock(cfg.clock),
     )
 
 

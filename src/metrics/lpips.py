@@ -96,27 +96,45 @@ class AnchoredLPIPS(LPIPS):
     """A training loss: LPIPS + `l1` times the mean absolute error, which anchors brightness, +
     `ssim` times (1 - SSIM), which anchors structure (Zhao et al., IEEE TCI 2017).
 
-    For short trainings, which LPIPS alone gives too little direction.
+    For trainings far from the end, which LPIPS alone gives too little direction.  `share`: of the
+    pictures whose LPIPS is computed, drawn at random and weighed up, so that its mean stays what it
+    is; the anchors see all of them.
     """
 
     def __init__(
-        self, net: str = "alex", backbone: str | None = None, l1: float = 1.0, ssim: float = 1.0
+        self,
+        net: str = "alex",
+        backbone: str | None = None,
+        l1: float = 1.0,
+        ssim: float = 1.0,
+        share: float = 1.0,
     ):
         super().__init__(net, backbone)
         for name, weight in (("l1", l1), ("ssim", ssim)):
             if not 0 <= weight < float("inf"):
                 raise ValueError(f"loss.{name} must be >= 0, got {weight}")
-        self.weights = {"l1": l1, "ssim": ssim}
+        if not 0 < share <= 1:
+            raise ValueError(f"loss.share must be in (0, 1], got {share}")
+        self.weights, self.share = {"l1": l1, "ssim": ssim}, share
 
     def forward(
-        self, prediction: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"]
+        self,
+        prediction: Float[Tensor, "n c h w"],
+        target: Float[Tensor, "n c h w"],
+        drawer: torch.Generator | None = None,
     ) -> Float[Tensor, " n"]:
-        """Return the loss of each pair."""
+        """Return the loss of each pair; `drawer` draws which pictures LPIPS sees."""
         prediction = prediction.float()
         error = (prediction - target).abs().mean((1, 2, 3))
         structure = 1 - ssim(prediction, target)
         anchors = self.weights["l1"] * error + self.weights["ssim"] * structure
-        return super().forward(prediction, target) + anchors
+        if self.share == 1:
+            return super().forward(prediction, target) + anchors
+        count = len(prediction)
+        seen = torch.randperm(count, generator=drawer)[: max(1, round(self.share * count))]
+        seen = seen.to(prediction.device)
+        distance = super().forward(prediction[seen], target[seen]) * (count / len(seen))
+        return anchors.index_add(0, seen, distance)
 
 
 def _unit(features: Tensor) -> Tensor:

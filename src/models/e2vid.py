@@ -24,8 +24,10 @@ SCALES = 3
 class E2VID(nn.Module):
     """Voxel grids of `views` views and `bins` bins to frames, window by window.
 
-    `base_channels`: channels of the head, doubled at each of three scales.  `recurrent`: convlstm
-    or convgru.  `kernel_size`: of head, encoders and decoders (published: 5).  `final_activation`:
+    `base_channels`: channels of the head, doubled at each of three scales.  `stem_channels`: of one
+    more convolution before, at full resolution, so that many views are not squeezed into a narrow
+    head at once; the head is 3x3 then (None: without, as in the paper).  `recurrent`: convlstm or
+    convgru.  `kernel_size`: of head, encoders and decoders (published: 5).  `final_activation`:
     sigmoid or none.  `spectral_norm`: keep the largest singular value of the gate kernels at one
     (Miyato et al. 2018); wrap an unroll in `torch.nn.utils.parametrize.cached()` so that it is
     computed once.  Raises ValueError for values outside these.
@@ -40,6 +42,7 @@ class E2VID(nn.Module):
         kernel_size: int = 5,
         final_activation: str = "sigmoid",
         spectral_norm: bool = False,
+        stem_channels: int | None = None,
     ):
         super().__init__()
         _choose("recurrent", recurrent, CELLS)
@@ -50,7 +53,11 @@ class E2VID(nn.Module):
         widths = [base_channels * 2**scale for scale in range(SCALES + 1)]
         pairs = list(pairwise(widths))
         cell = CELLS[recurrent]
-        self.head = _conv(views * bins, base_channels, kernel_size)
+        if stem_channels is not None and stem_channels < 1:
+            raise ValueError(f"model.stem_channels must be >= 1 or null, got {stem_channels}")
+        self.stem = _conv(views * bins, stem_channels, kernel_size) if stem_channels else None
+        seen, side = (stem_channels, 3) if stem_channels else (views * bins, kernel_size)
+        self.head = _conv(seen, base_channels, side)
         self.encoders = nn.ModuleList(_conv(a, b, kernel_size, stride=2) for a, b in pairs)
         self.cells = nn.ModuleList(cell(width) for width in widths[1:])
         self.resblocks = nn.ModuleList(ResidualBlock(widths[-1]) for _ in range(2))
@@ -83,6 +90,7 @@ class E2VID(nn.Module):
         self, x: Float[Tensor, "n c h w"], state: Any
     ) -> tuple[Float[Tensor, "n c2 h w"], list[Tensor], tuple]:
         """Return the head, the hidden map of each scale, finest first, and the state."""
+        x = x if self.stem is None else self.stem(x).relu()
         head = x = self.head(x).relu()
         skips, after = [], []
         for encoder, cell, before in zip(

@@ -122,7 +122,8 @@ def _checkpoint(path: Path) -> tuple[dict, dict[str, Tensor]]:
         content = torch.load(path, map_location="cpu", weights_only=True)
         state = content["state_dict"]
         weights = {n.removeprefix("network."): v for n, v in state.items() if "network." in n}
-        return content["network"], weights
+        # The running mean of the weights, where the training has kept one, is what is used.
+        return content["network"], content.get("average", weights)
     except Exception as error:  # libraries raise all kinds on a broken file
         raise ValueError(f"ckpt must be a checkpoint of src.train, got {path}") from error
 

@@ -2,11 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Iterable
 from statistics import median
-
-import torch
-from torch import Tensor
 
 
 class NotFinite(ValueError):
@@ -37,9 +33,3 @@ class Guard:
         leaps = self.factor is not None and loss > self.factor * usual
         self.losses.append(usual if leaps else loss)
         return usual / loss if leaps else 1.0
-
-
-def finite(tensors: Iterable[Tensor | None]) -> bool:
-    """Return whether every number of every tensor is finite."""
-    there = [tensor for tensor in tensors if tensor is not None]
-    return bool(torch.isfinite(torch.nn.utils.get_total_norm(there)))

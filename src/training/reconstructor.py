@@ -9,8 +9,10 @@ from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from src.metrics.scores import Scores
-from src.models.unroll import chunks, detach, unroll, video
-from src.training.guard import Guard, NotFinite, finite
+from src.models.unroll import chunks, detach, takes, unroll, video
+from src.training.average import copy_of, follow
+from src.training.clock import Clock
+from src.training.guard import Guard, NotFinite
 
 if TYPE_CHECKING:  # a network knows nothing of the simulation; a sample is read, never made
     from src.sim.pipeline import Sample
@@ -25,6 +27,10 @@ class Reconstructor(LightningModule):
     from parameters and `scheduler`, if any, a learning-rate schedule from it, one step a batch.
     `detach_every`: windows between two cuts of the graph (truncated back-propagation through time;
     0: none).  Memory is that of one chunk; the optimiser steps once per batch.
+    `loss_from`: the first window of a sequence that the loss sees; those before fill the state.
+    `clip`: longest gradient (Euclidean norm over all parameters; None: as long as it is).
+    `average`: decay of the weights' running mean, which then is what is validated, tested and
+    shipped (average.py); None: none.  `clock` counts the time of training.
     `spike`: a loss so many times the median of the last hundred moves the weights no more than that
     median would (Guard); None: off.
     `scores` measures frames against targets; the first `warmup` windows of a clip are not scored.
@@ -42,14 +48,26 @@ class Reconstructor(LightningModule):
         detach_every: int = 0,
         warmup: int = 0,
         spike: float | None = None,
+        loss_from: int = 0,
+        clip: float | None = None,
+        average: float | None = None,
+        clock: Clock | None = None,
     ):
         super().__init__()
         if detach_every < 0:
             raise ValueError(f"data.detach_every must be >= 0, got {detach_every}")
+        if clip is not None and not clip > 0:
+            raise ValueError(f"clip must be > 0 or null, got {clip}")
+        if average is not None and not 0 <= average < 1:
+            raise ValueError(f"average must be in [0, 1) or null, got {average}")
         self.automatic_optimization = False
         self.network, self.network_spec = network, network_spec
+        # In a tuple: no step trains it, and it has its own place in the checkpoint.
+        self._mean, self.decay = (None if average is None else copy_of(network),), average
         self.optimizer, self.scheduler = optimizer, scheduler
         self.detach_every, self.warmup, self.guard = detach_every, warmup, Guard(spike)
+        self.loss_from, self.clip, self.clock = loss_from, clip, clock or Clock()
+        self.windows_seen, self.rates = 0, []
         # In a tuple, so that their backbones stay out of the parameters and the checkpoint.
         self._measures = (loss, scores)
         self.clips: list[dict] = []
@@ -67,12 +85,27 @@ class Reconstructor(LightningModule):
     @property
     def method(self) -> nn.Module:
         """What is validated and tested."""
-        return self.network
+        return self.network if self.average is None else self.average
+
+    @property
+    def average(self) -> nn.Module | None:
+        """The running mean of the weights."""
+        return self._mean[0]
 
     def on_fit_start(self) -> None:
-        """Move the loss, which is no submodule, to the training device; undo a test's eval mode."""
-        self.loss.to(self.device)
+        """Move what is no submodule to the training device; undo a test's eval mode."""
+        for part in (self.loss, self.average):
+            if part is not None:
+                part.to(self.device)
         self.train()
+
+    def on_train_start(self) -> None:
+        """Count time from here."""
+        self.clock.start()
+
+    def on_validation_end(self) -> None:
+        """Leave the time of validation out."""
+        self.clock.start()
 
     def training_step(self, sample: "Sample", batch_idx: int) -> Tensor:
         """One optimiser step on a batch of sequences; returns the loss averaged over windows (and
@@ -81,20 +114,30 @@ class Reconstructor(LightningModule):
         Raises NotFinite, with the clips, for a loss or gradient that is not; no step is taken then.
         """
         windows = sample.voxels.shape[1]
+        count = (windows - self.loss_from) * len(sample.voxels)
         state, total = None, torch.zeros((), device=self.device)
         self.optimizers().zero_grad()
         for part in chunks(windows, self.detach_every):
+            seen = max(self.loss_from - part.start, 0)  # by nothing but the state
             # One normalised weight per chunk: spectral norm iterates once, not once per window.
-            with parametrize.cached():
+            with parametrize.cached(), torch.set_grad_enabled(part.stop > self.loss_from):
                 frames, state = self._unroll(sample, part, detach(state))
-            total += self._backward(frames, sample.target[:, part], windows * len(sample.voxels))
+            if part.stop > self.loss_from:
+                total += self._backward(frames[:, seen:], sample.target[:, part][:, seen:], count)
         total = self.all_gather(total).mean()
         self._protect(total, sample.drawn)
+        self._step()
+        self.windows_seen += windows * len(sample.voxels) * self.trainer.world_size
+        self.log("train/loss", total, prog_bar=True, batch_size=len(sample.voxels))
+        self.clock.lap()
+        return total
+
+    def _step(self) -> None:
         self.optimizers().step()
         if self.scheduler is not None:
             self.lr_schedulers().step()
-        self.log("train/loss", total, prog_bar=True, batch_size=len(sample.voxels))
-        return total
+        if self.average is not None:
+            follow(self.average, self.network, self.decay, self.global_step)
 
     def _backward(self, frames: Tensor, target: Tensor, count: int) -> Tensor:
         """Back-propagate the sum of the losses over `count`; return it.
@@ -102,30 +145,36 @@ class Reconstructor(LightningModule):
         The loss sees every picture alone, so its gradient there is had a few pictures at a time,
         and its own maps (VGG's are larger than the network's) never stand in memory together.
         """
+        told = {}
+        if takes(self.loss, "drawer"):  # a loss that draws, draws the same again in a resumed run
+            told["drawer"] = torch.Generator().manual_seed(self.global_step)
         pictures = frames.flatten(0, 1)
         leaves, total = pictures.detach().requires_grad_(), torch.zeros((), device=self.device)
         pairs = zip(leaves.split(PICTURES), target.flatten(0, 1).split(PICTURES), strict=True)
         for ours, truth in pairs:
-            loss = self.loss(ours, truth).sum() / count
+            loss = self.loss(ours, truth, **told).sum() / count
             loss.backward()
             total += loss.detach()
         self.manual_backward(pictures, leaves.grad)
         return total
 
     def _protect(self, loss: Tensor, drawn: list[dict]) -> None:
-        """Stop what is not finite, scale down what leaps."""
-        gradients = [parameter.grad for parameter in self.network.parameters()]
+        """Stop what is not finite, scale down what leaps or is too long."""
+        gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
         if not torch.isfinite(loss):
             raise NotFinite(f"loss is {float(loss)}", self.global_step, drawn)
-        if not finite(gradients):
+        norm = torch.nn.utils.get_total_norm(gradients)
+        if not torch.isfinite(norm):
             raise NotFinite("a gradient is not finite", self.global_step, drawn)
         share = self.guard.share(float(loss))
+        if self.clip is not None:
+            share *= min(1.0, self.clip / max(share * float(norm), 1e-12))
         if share < 1:
-            torch._foreach_mul_([gradient for gradient in gradients if gradient is not None], share)
+            torch._foreach_mul_(gradients, share)
 
     def validation_step(self, sample: "Sample", batch_idx: int) -> None:
         """Log the mean of every score over the validation clips."""
-        for clip in self._measure(sample):
+        for clip in self.measure(sample):
             values = {f"val/{name}": clip[name] for name in self.scores.names}
             self.log_dict(values, on_epoch=True, prog_bar=False, batch_size=1)
 
@@ -136,9 +185,10 @@ class Reconstructor(LightningModule):
     def test_step(self, sample: "Sample", batch_idx: int) -> None:
         """Append the scores of each clip, with what was drawn for it, to `clips`."""
         self.sample = sample
-        self.clips += self._measure(sample)
+        self.clips += self.measure(sample)
 
-    def _measure(self, sample: "Sample") -> list[dict]:
+    def measure(self, sample: "Sample") -> list[dict]:
+        """Return the scores of each clip with what was drawn for it."""
         with parametrize.cached():
             frames = video(self.method, sample)
         frames, target = frames[:, self.warmup :], sample.target[:, self.warmup :]
@@ -152,6 +202,8 @@ class Reconstructor(LightningModule):
     def configure_optimizers(self):
         """Return the optimiser over all parameters and its schedule."""
         optimizer = self.optimizer(self.network.parameters())
+        # Before a checkpoint's are restored, which a schedule has changed.
+        self.rates = [group["lr"] for group in optimizer.param_groups]
         if self.scheduler is None:
             return optimizer
         return [optimizer], [self.scheduler(optimizer)]
@@ -160,7 +212,14 @@ class Reconstructor(LightningModule):
         """Add how to build the network again (plain data: loads with weights_only=True)."""
         checkpoint["network"] = self.network_spec
         checkpoint["losses"] = list(self.guard.losses)
+        if self.average is not None:
+            checkpoint["average"] = self.average.state_dict()
+        checkpoint["seconds"], checkpoint["windows"] = self.clock.seconds, self.windows_seen
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
-        """Remember the losses that the guard had seen."""
+        """Go on with the time and the counts so far."""
         self.guard.losses.extend(checkpoint.get("losses", ()))
+        self.clock.seconds = checkpoint.get("seconds", 0.0)
+        self.windows_seen = checkpoint.get("windows", 0)
+        if self.average is not None:
+            self.average.load_state_dict(checkpoint.get("average", self.network.state_dict()))

@@ -63,6 +63,23 @@ def test_a_silent_place_has_a_finite_gradient():
     assert features.grad.isfinite().all()
 
 
+def test_a_share_of_the_pictures_has_the_same_mean():
+    a, b = torch.rand(2, 4, 1, 32, 32, generator=torch.Generator().manual_seed(0))
+    whole, part = (lpips.AnchoredLPIPS("alex", share=share) for share in (1.0, 0.25))
+    distance = LPIPS.forward(whole, a, b)
+    anchors, chosen = whole(a, b) - distance, set()
+    for seed in range(40):
+        drawn, again = (part(a, b, torch.Generator().manual_seed(seed)) for _ in range(2))
+        assert torch.equal(drawn, again)
+        place = int((drawn - anchors).argmax())
+        wanted = anchors.index_add(0, torch.tensor([place]), 4 * distance[[place]])
+        assert torch.allclose(drawn, wanted, atol=1e-5)
+        chosen.add(place)
+    assert chosen == {0, 1, 2, 3}
+    with pytest.raises(ValueError, match="loss.share"):
+        lpips.AnchoredLPIPS("alex", share=0.0)
+
+
 def test_it_never_trains():
     measure = build("alex").train()
     assert not measure.training and not any(p.requires_grad for p in measure.parameters())

@@ -18,6 +18,7 @@ from src.models.unroll import unroll
         ({"base_channels": 16}, 2_679_489),
         ({"base_channels": 8}, 670_817),
         ({"kernel_size": 3}, 9_331_585),
+        ({"views": 9, "base_channels": 8, "stem_channels": 32}, 708_153),
     ],
 )
 def test_published_parameter_counts(kwargs, parameters):

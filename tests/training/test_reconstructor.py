@@ -44,12 +44,12 @@ def sample(windows: int = 6) -> Sample:
     return Sample(voxels, target, target, window_s, drawn=[{"name": "a"}, {"name": "b"}])
 
 
-def fit(network: nn.Module, detach_every: int, steps: int = 1) -> nn.Module:
+def fit(network: nn.Module, detach_every: int, steps: int = 1, **how) -> nn.Module:
     def optimizer(parameters):
         return torch.optim.SGD(parameters, lr=0.05)
 
     module = Reconstructor(
-        network, {}, loss=SquaredError(), optimizer=optimizer, detach_every=detach_every
+        network, {}, loss=SquaredError(), optimizer=optimizer, detach_every=detach_every, **how
     )
     trainer = lightning.Trainer(
         max_steps=steps,
@@ -64,7 +64,7 @@ def fit(network: nn.Module, detach_every: int, steps: int = 1) -> nn.Module:
     return network
 
 
-def by_hand(detach_every: int) -> nn.Module:
+def by_hand(detach_every: int, loss_from: int = 0, clip: float = 1e9) -> nn.Module:
     network, batch = Leaky(), sample()
     state, losses = None, []
     for window in range(batch.voxels.shape[1]):
@@ -72,7 +72,8 @@ def by_hand(detach_every: int) -> nn.Module:
             state = detach(state)
         frame, state = network(batch.voxels[:, window], state)
         losses.append((frame - batch.target[:, window]).square().mean())
-    torch.stack(losses).mean().backward()
+    torch.stack(losses[loss_from:]).mean().backward()
+    torch.nn.utils.clip_grad_norm_(network.parameters(), clip)
     with torch.no_grad():
         for parameter in network.parameters():
             parameter -= 0.05 * parameter.grad
@@ -85,6 +86,14 @@ def test_a_step_equals_the_step_written_out(detach_every, monkeypatch):
     ours, theirs = fit(Leaky(), detach_every), by_hand(detach_every)
     for mine, other in zip(ours.parameters(), theirs.parameters(), strict=True):
         assert torch.allclose(mine, other, atol=1e-6)
+
+
+@pytest.mark.parametrize("detach_every", [0, 2, 4])
+def test_the_loss_begins_where_it_is_told_and_gradients_are_clipped(detach_every):
+    ours, theirs = fit(Leaky(), detach_every, loss_from=3, clip=0.1), by_hand(detach_every, 3, 0.1)
+    for mine, other in zip(ours.parameters(), theirs.parameters(), strict=True):
+        assert torch.allclose(mine, other, atol=1e-6)
+    assert not torch.allclose(theirs.a, by_hand(detach_every, 0, 0.1).a, atol=1e-6)
 
 
 def test_cutting_the_graph_changes_the_gradient():

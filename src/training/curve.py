@@ -1,0 +1,101 @@
+"""The learning curve: scores of fixed validation clips, a line for every hour or so of training."""
+
+import csv
+import io
+from copy import deepcopy
+from pathlib import Path
+
+import torch
+from lightning import Callback, LightningModule, Trainer
+
+from src.models import files
+from src.records.results import write_text
+
+SCORES = ("lpips", "ssim", "psnr", "psnr_aligned", "wobble")
+
+
+class Curve(Callback):
+    """Score the validation clips at the start, every `every_h` hours of the module's clock and at
+    the end (None: never); write all lines so far to the CSV file `path`.
+
+    A line: hours, steps, windows trained on, mean training loss since the line before, scores.  The
+    lines are part of checkpoints, so that the file of a run that goes on begins at the beginning.
+    `export`: also write the weights that were scored to this file (.safetensors, float16).
+    """
+
+    def __init__(self, path: str, every_h: float | None = None, export: str | None = None):
+        if every_h is not None and not every_h > 0:
+            raise ValueError(f"callbacks.curve.every_h must be > 0 or null, got {every_h}")
+        if export is not None and Path(export).suffix != ".safetensors":
+            raise ValueError(f"export must be a .safetensors file or null, got {export}")
+        self.path, self.every_h = Path(path), every_h
+        self.export = Path(export) if export else None
+        self.rows: list[dict] = []
+        self.loss, self.steps = 0.0, 0
+
+    def state_dict(self) -> dict:
+        """Return what a checkpoint holds of the curve."""
+        return {"rows": self.rows, "loss": self.loss, "steps": self.steps}
+
+    def load_state_dict(self, state_dict: dict) -> None:
+        """Go on with the curve of a checkpoint."""
+        self.rows, self.loss = list(state_dict["rows"]), state_dict["loss"]
+        self.steps = state_dict["steps"]
+
+    def on_train_start(self, trainer: Trainer, module: LightningModule) -> None:
+        """Write the lines there are; score the start."""
+        if self.every_h is None or not trainer.is_global_zero:
+            return
+        if self.rows:
+            self._write()
+        else:
+            self._add(trainer, module)
+
+    def on_train_batch_end(
+        self, trainer: Trainer, module: LightningModule, outputs, batch, batch_idx: int
+    ) -> None:
+        """Score when an hour is full, and at the end."""
+        if self.every_h is None or not trainer.is_global_zero:
+            return
+        self.loss += float(trainer.callback_metrics["train/loss"])
+        self.steps += 1
+        full = module.clock.hours // self.every_h > self.rows[-1]["hours"] // self.every_h
+        if full or trainer.should_stop or trainer.global_step == trainer.max_steps:
+            self._add(trainer, module)
+
+    def _add(self, trainer: Trainer, module: LightningModule) -> None:
+        row = {
+            "hours": module.clock.hours,
+            "steps": trainer.global_step,
+            "windows": module.windows_seen,
+            "loss": self.loss / self.steps if self.steps else "",
+        }
+        self.rows.append(row | scores(trainer, module))
+        self.loss, self.steps = 0.0, 0
+        self._write()
+        if self.export is not None:
+            self.export.parent.mkdir(parents=True, exist_ok=True)
+            # A copy: spectral norm is folded in eval mode, and the training goes on in its own.
+            files.save(self.export, deepcopy(module.method), module.network_spec, self.rows[-1])
+        module.clock.start()
+
+    def _write(self) -> None:
+        text = io.StringIO()
+        writer = csv.DictWriter(text, list(self.rows[-1]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(self.rows)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        write_text(self.path, text.getvalue())
+
+
+@torch.no_grad()
+def scores(trainer: Trainer, module: LightningModule) -> dict[str, float]:
+    """Return the mean of every score over the validation clips, in float32."""
+    module.eval()  # the mean of the weights, if there is one, always is
+    found = []
+    for sample in trainer.datamodule.val_dataloader():
+        sample = trainer.datamodule.on_after_batch_transfer(sample, 0)
+        found += module.measure(sample.to(module.device))
+    module.train()
+    names = [name for name in SCORES if name in module.scores.names]
+    return {name: sum(clip[name] for clip in found) / len(found) for name in names}

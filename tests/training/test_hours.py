@@ -1,0 +1,133 @@
+"""Training by time, the running mean and the learning curve: cut, resumed, lengthened."""
+
+import csv
+from pathlib import Path
+
+import pytest
+import torch
+
+from src.models import files
+from src.train import train
+from src.training import clock
+from src.training.average import copy_of, follow
+from src.training.schedule import Hours
+from tests.test_train import TINY, config
+
+HOUR = 3600.0  # by the clock below every step is one hour
+
+
+@pytest.fixture(autouse=True)
+def steps_take_an_hour(monkeypatch):
+    class Ticks:
+        at = 0.0
+
+        def __call__(self) -> float:
+            self.at += HOUR
+            return self.at
+
+    monkeypatch.setitem(clock.KINDS, "wall", Ticks())
+
+
+RECIPE = ["data.epoch_clips=3", "data.loss_from=1", "clip=0.5", "average=0.9", "optimizer.lr=1e-3"]
+RECIPE += ["callbacks.curve.every_h=3", "trainer.max_steps=-1", "scheduler=null"]
+RECIPE += ["trainer.limit_val_batches=0", "augment.noise_std=0.1", "channels_last=true"]
+
+
+def run(folder: Path, *overrides: str) -> dict:
+    train(config("train", folder, *TINY, *RECIPE, *overrides))
+    return torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+
+
+def curve(folder: Path) -> list[list[float]]:
+    rows = list(csv.DictReader((folder / "curve.csv").read_text().splitlines()))
+    return [
+        [float(row[name] or 0) for name in ("hours", "steps", "windows", "ssim")] for row in rows
+    ]
+
+
+def rate(checkpoint: dict) -> float:
+    return checkpoint["optimizer_states"][0]["param_groups"][0]["lr"]
+
+
+def test_a_training_cut_and_resumed_equals_one_left_alone(tmp_path):
+    whole = run(tmp_path / "whole", "hours=7")
+    run(tmp_path / "first", "hours=7", "trainer.max_steps=4")
+    second = run(tmp_path / "second", "hours=7", f"ckpt={tmp_path / 'first' / 'checkpoints'}")
+    assert whole["global_step"] == second["global_step"] == 7 and whole["seconds"] == 7 * HOUR
+    for part in ("state_dict", "average"):
+        for name, value in whole[part].items():
+            assert torch.equal(value, second[part][name]), name
+    assert rate(whole) == rate(second) == pytest.approx(1e-3 * Hours(7.0).share(6.0))
+    one, two = curve(tmp_path / "whole"), curve(tmp_path / "second")
+    assert [row[:3] for row in one] == [[0, 0, 0], [3, 3, 6], [6, 6, 12], [7, 7, 14]]
+    assert [row[:3] for row in two] == [[0, 0, 0], [3, 3, 6], [4, 4, 8], [6, 6, 12], [7, 7, 14]]
+    assert one[-1] == two[-1] and one[1] == two[1]
+
+
+def test_more_hours_go_on_along_the_longer_cosine(tmp_path):
+    first = run(tmp_path / "first", "hours=4")
+    assert rate(first) == pytest.approx(1e-3 * Hours(4.0).share(3.0))
+    second = run(tmp_path / "second", "hours=8", f"ckpt={tmp_path / 'first' / 'checkpoints'}")
+    assert second["global_step"] == 8
+    assert rate(second) == pytest.approx(1e-3 * Hours(8.0).share(7.0))
+    same = run(tmp_path / "same", "hours=4", f"ckpt={tmp_path / 'second' / 'checkpoints'}")
+    assert same["global_step"] == 8, "its hours are over"
+
+
+def test_the_mean_is_exported_and_read_from_a_checkpoint(tmp_path):
+    last = run(tmp_path / "run", "hours=3", f"export={tmp_path / 'now' / 'net.safetensors'}")
+    shipped = files.load(tmp_path / "now" / "net.safetensors")
+    mean = files.load(tmp_path / "run" / "checkpoints" / "last.ckpt")
+    head = last["average"]["head.weight"]
+    assert not torch.equal(head, last["state_dict"]["network.head.weight"])
+    assert torch.equal(mean.head.weight, head)
+    assert torch.allclose(shipped.head.weight, head, atol=1e-3)
+
+
+def test_the_mean_forgets_the_start_and_then_moves_slowly():
+    network = torch.nn.BatchNorm2d(2)
+    mean = copy_of(network)
+    with torch.no_grad():
+        network.weight.fill_(3.0)
+        network.running_mean.fill_(5.0)
+    follow(mean, network, 0.999, 0)
+    assert torch.allclose(mean.weight, torch.full((2,), 1 + 2 * 0.9))
+    follow(mean, network, 0.999, 10**6)
+    assert torch.allclose(mean.weight, torch.full((2,), 3 - 0.2 * 0.999))
+    assert torch.equal(mean.running_mean, network.running_mean) and not mean.training
+    assert not mean.weight.requires_grad
+
+
+@pytest.mark.parametrize(
+    ("overrides", "key"),
+    [
+        (["hours=0"], "hours must be > 0"),
+        (["hours=1"], "scheduler must be null with hours=1"),
+        (["clock=moon"], "clock must be one of wall, processor"),
+        (["clip=0"], "clip must be > 0"),
+        (["average=1"], "average must be in"),
+        (["data.loss_from=2"], "data.loss_from must be in 0..1"),
+        (["callbacks.curve.every_h=0"], "callbacks.curve.every_h"),
+        (["callbacks.hours.floor=2"], "callbacks.hours.floor"),
+        (["export=weights.pt"], "export must be a .safetensors"),
+        (["stem=0"], "model.stem_channels must be >= 1"),
+        (
+            ["model.weights=x", "model._target_=src.models.e2vid.E2VID"],
+            "model.weights must be null",
+        ),
+    ],
+)
+def test_a_wrong_value_names_its_key(overrides, key, tmp_path):
+    added = ["+" + o if "model.weights" in o else o for o in overrides]
+    with pytest.raises(ValueError, match=key):
+        train(config("train", tmp_path, *TINY, *added))
+
+
+def test_a_processor_clock_does_not_count_waiting():
+    watch = clock.Clock("processor")
+    watch.start()
+    import time
+
+    time.sleep(0.2)
+    watch.lap()
+    assert watch.seconds < 0.1 and watch.hours == watch.seconds / 3600
