@@ -12,7 +12,7 @@ import hydra
 import torch
 from omegaconf import DictConfig
 
-from src.app import build, door
+from src.app import door, simulation
 from src.training.bank import Bank
 from src.training.filling import fill
 
