@@ -3,6 +3,7 @@
 Both make a whole video at once, `video(sample)`; see `src.models.unroll.video`.
 """
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -44,15 +45,21 @@ class Postprocessed(nn.Module):
     """A post-processor behind `source`: video in, video out, in windows of `window` frames that
     share `overlap`.  A source with fewer pictures than windows gives each of them once.
 
-    `restorer`: the post-processor, or a name in weights/ or a path of its weights.
+    `restorer`: the post-processor, or a name in weights/ or a path of its weights, of one of the
+    packages `rooms` if not of ours.
     """
 
     def __init__(
-        self, source: nn.Module, restorer: nn.Module | str, window: int = 16, overlap: int = 4
+        self,
+        source: nn.Module,
+        restorer: nn.Module | str,
+        window: int = 16,
+        overlap: int = 4,
+        rooms: Sequence[str] = (),
     ):
         super().__init__()
         self.source = source
-        self.restorer = load(restorer) if isinstance(restorer, str) else restorer
+        self.restorer = load(restorer, rooms) if isinstance(restorer, str) else restorer
         self.views, self.window, self.overlap = source.views, window, overlap
 
     @torch.no_grad()
@@ -84,13 +91,13 @@ class Restoration(Reconstructor):
         return self.network(seen[:, part])[0], None
 
 
-def load(weights: str) -> nn.Module:
+def load(weights: str, rooms: Sequence[str] = ()) -> nn.Module:
     """Return the frozen post-processor of a name in weights/ or a path.
 
     Raises ValueError, which says how to make it, where there is none.
     """
     try:
-        restorer = files.load(weights)
+        restorer = files.load(weights, rooms)
     except ValueError as error:
         raise ValueError(
             f"postprocess.restorer must be a name in weights/ or a path, got {weights} ({error}); "

@@ -12,7 +12,7 @@ import hydra
 import torch
 from omegaconf import DictConfig
 
-from src.app import build, door
+from src.app import door, simulation
 from src.training.bank import Bank
 from src.training.filling import fill
 
@@ -47,7 +47,7 @@ def main(cfg: DictConfig) -> None:
     workers = cfg.get("workers", 1)
     if type(workers) is not int or workers < 1:
         raise ValueError(f"workers must be a whole number >= 1, got {workers}")
-    fill_bank(build.bank(cfg), workers)
+    fill_bank(simulation.bank(cfg), workers)
 
 
 if __name__ == "__main__":

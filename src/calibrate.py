@@ -15,7 +15,7 @@ def views(cfg: DictConfig, run: Path) -> dict:
     """Find the views and their homographies: `views.yaml`, also at `cfg.save`."""
     names = ("resolution", "sensor_size", "mirrors", "margin", "threshold_px", "corners")
     options = {name: cfg[name] for name in names}
-    found = calibration.align_views(cfg.recording, run, build.make(cfg.target), **options)
+    found = calibration.align_views(cfg.recording, run, build.part(cfg, "target"), **options)
     if cfg.save:
         found.save(cfg.save)
     return {f"error_px of {view.position}": round(view.error_px, 3) for view in found.views}

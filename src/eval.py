@@ -6,7 +6,7 @@ from pathlib import Path
 import hydra
 from omegaconf import DictConfig
 
-from src.app import build, door
+from src.app import build, door, simulation
 from src.figures import samples
 from src.records import results
 
@@ -18,7 +18,8 @@ def evaluate(cfg: DictConfig) -> dict:
     """
     run, start = Path(cfg.paths.run), time.perf_counter()
     build.share_cores(cfg)
-    net, data = build.frozen(cfg), build.data(cfg, splits=("test",))
+    net = build.frozen(cfg)
+    data = build.data(cfg, splits=("test",), optics=simulation.light_field(cfg, net))
     results.open_run(run, door.resolved(cfg))
     row = build.test(cfg, cfg.name, net, data, build.scores(cfg))
     samples.write(run / "samples", net, data.pipelines["test"])

@@ -62,7 +62,7 @@ def _accounts(
 
 def _examiner(cfg: DictConfig) -> Callable[[Candidate], suite.Account]:
     """Return what puts a network through the probes; ValueError for probes that are none."""
-    probes = {name: build.make(node.probe) for name, node in cfg.probes.items()}
+    probes = {name: build.part(cfg, f"probes.{name}.probe") for name in cfg.probes}
     bench = Bench(build.pipeline(cfg, "test"), range(cfg.clips), cfg.data.warmup)
     return partial(suite.examine, probes=probes, bench=bench)
 

@@ -41,7 +41,7 @@ def train(cfg: DictConfig) -> dict:
         same = f"python -m src.simulate like={run}/config.yaml split=train index={error.clips[0]}"
         raise ValueError(f"{error}; seed {cfg.seed}; to see the clip: {same}") from error
     trained = build.test(cfg, cfg.name, module.method, data, module.scores)
-    least = build.make(cfg.floor.method)
+    least = build.part(cfg, "floor.method")
     floor = build.test(cfg, cfg.floor.name, least, data, module.scores)
     pictures = samples.write(run / "samples", module.method, data.pipelines["test"])
     record = results.write(

@@ -111,7 +111,7 @@ def test_without_views_the_sensor_is_one_view(folder, tmp_path):
     "wrong, message",
     [
         ("recording=nowhere.raw", "nowhere.raw"),
-        ("sensor_size=[480,640]", "sensor must be"),
+        ("sensor_size=[480,640]", "sensor_size must be"),
         ("fps=1", "longer than one window"),
         ("fps=-1", "fps must be"),
         ("output=avi", "output must be one of"),

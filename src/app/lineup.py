@@ -1,6 +1,6 @@
 """Which networks are compared: from the config's `ckpt`, `baseline` or `networks` to candidates."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
@@ -25,7 +25,7 @@ def gather(cfg: DictConfig) -> list[Candidate]:
     if cfg.ckpt or cfg.get("baseline"):
         return _by_hand(cfg)
     entries = OmegaConf.to_container(cfg.networks, resolve=True)
-    found = [_entry(name, entry) for name, entry in entries.items() if entry]
+    found = [_entry(name, entry, build.rooms(cfg)) for name, entry in entries.items() if entry]
     if not found:
         raise ValueError("networks must name at least one network, got none")
     return found
@@ -35,32 +35,33 @@ def _by_hand(cfg: DictConfig) -> list[Candidate]:
     names = cfg.ckpt if isinstance(cfg.ckpt, ListConfig) else [cfg.ckpt] if cfg.ckpt else []
     found = []
     for name in names:
-        network = src.models.load(name)
+        network = src.models.load(name, build.rooms(cfg))
         label = Path(name).stem if Path(name).suffix else name
         found.append(Candidate(label, network, network.views or cfg.optics.views))
     if cfg.get("baseline"):
         label = str(cfg.baseline.get("name", "baseline"))
-        network = build.make(cfg.baseline).eval()
+        network = build.part(cfg, "baseline").eval()
         found.append(Candidate(label, network, network.views or cfg.optics.views))
     return found
 
 
-def _entry(name: str, entry: Mapping) -> Candidate:
+def _entry(name: str, entry: Mapping, own: Sequence[str]) -> Candidate:
     if not isinstance(entry, Mapping) or set(entry) - KEYS or "views" not in entry:
         allowed = ", ".join(sorted(KEYS))
         raise ValueError(f"networks.{name} must have views and of {allowed}, got {entry}")
     views, reason = entry["views"], "it names no weights"
     try:
-        restorer = load_restorer(entry["restorer"]) if "restorer" in entry else None
+        restorer = load_restorer(entry["restorer"], own) if "restorer" in entry else None
         if "ckpt" in entry:
-            return Candidate(name, src.models.load(entry["ckpt"]), views, restorer=restorer)
+            network = src.models.load(entry["ckpt"], own)
+            return Candidate(name, network, views, restorer=restorer)
         if "baseline" in entry:
-            network = build.make(entry["baseline"]).eval()
+            network = build.make(entry["baseline"], own).eval()
             return Candidate(name, network, views, restorer=restorer)
     except ValueError as error:
         reason = str(error)
     timed_only = "model" in entry and "restorer" not in entry
-    network = build.make(entry["model"]).eval() if timed_only else None
+    network = build.make(entry["model"], own).eval() if timed_only else None
     return Candidate(name, network, views, trained=False, missing=reason)
 
 
@@ -75,7 +76,7 @@ def under(cfg: DictConfig, severity: str, **data) -> Pipeline:
 def adaptive(cfg: DictConfig) -> tuple[Adaptive, Pipeline] | str:
     """Return the adaptive network of `adapt` and the clips to show it on, or why there is none."""
     try:
-        loaded = {ckpt: src.models.load(ckpt) for ckpt, _ in cfg.adapt.levels}
+        loaded = {ckpt: src.models.load(ckpt, build.rooms(cfg)) for ckpt, _ in cfg.adapt.levels}
     except ValueError as error:
         return str(error)
     levels = [Level(loaded[ckpt], views, Path(ckpt).stem) for ckpt, views in cfg.adapt.levels]

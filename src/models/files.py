@@ -6,6 +6,7 @@ in a file is executed: only classes of `src.models` and `baselines` are built, f
 
 import json
 import os
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,12 @@ ROOMS = ("src.models.", "baselines.")
 LARGEST = 4096  # any number in the arguments of a network that a file names
 
 
-def load(name_or_path: str | Path) -> nn.Module:
+def load(name_or_path: str | Path, rooms: Sequence[str] = ()) -> nn.Module:
     """Return the network of a file, float32, in eval mode, spectral norm folded into its weights.
 
     A word names a file of `weights/`; a path is a `.safetensors` file written by `save` or a
-    checkpoint of a training run.  Raises ValueError, beginning with `ckpt`, for a file that is not
+    checkpoint of a training run; its network is of src.models, baselines or one of the packages
+    `rooms`.  Raises ValueError, beginning with `ckpt`, for a file that is not
     there, is no such file, or holds other weights than its network has.
     """
     path = Path(name_or_path)
@@ -40,8 +42,8 @@ def load(name_or_path: str | Path) -> nn.Module:
     spec, weights = (_safetensors if path.suffix == ".safetensors" else _checkpoint)(path)
     check_memory(weights, path, "ckpt")
     with torch.device("meta"):  # without memory: a small file may name a huge network
-        _check_fit(_build(spec, path), weights, path)
-    network = _build(spec, path)
+        _check_fit(_build(spec, path, rooms), weights, path)
+    network = _build(spec, path, rooms)
     network.load_state_dict(weights)
     fold(network)
     return network.float().eval()
@@ -66,7 +68,7 @@ def save(path: Path, network: nn.Module, spec: dict, card: dict) -> None:
     values: data, seeds, commit, metrics ...) in its header; whole or not at all.
     """
     spec = {"target": spec["target"], "kwargs": spec["kwargs"] | _unnormalised(spec)}
-    plain = _build(spec, path)
+    plain = _build(spec, path, [type(network).__module__])
     plain.load_state_dict(folded(network))
     halves = {name: _half(value).contiguous() for name, value in plain.state_dict().items()}
     partial = path.with_name(path.name + ".partial")
@@ -128,14 +130,16 @@ def _checkpoint(path: Path) -> tuple[dict, dict[str, Tensor]]:
         raise ValueError(f"ckpt must be a checkpoint of src.train, got {path}") from error
 
 
-def _build(spec: dict, path: Path) -> nn.Module:
+def _build(spec: dict, path: Path, rooms: Sequence[str] = ()) -> nn.Module:
     try:
         target, kwargs = str(spec["target"]), dict(spec["kwargs"])
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"ckpt must name its network, got {path}") from error
-    if not target.startswith(ROOMS):
+    homes = (*ROOMS, *(f"{room}." for room in rooms))
+    if not target.startswith(homes):
         raise ValueError(
-            f"ckpt must hold a network of {' or '.join(ROOMS)}, got {target} in {path}"
+            f"ckpt must hold a network of {' or '.join(homes)}, got {target} in {path}; "
+            "networks of a package of your own are let in by rooms=[<package>]"
         )
     _check_sizes(kwargs, path)
     room, _, name = target.rpartition(".")

@@ -6,7 +6,7 @@ sub-apertures; rows count downwards.  Axes: see docs/conventions.md.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -89,6 +89,10 @@ class Optics:
     def centre(self) -> int:
         """The index of the centre view."""
         return centre(self.positions)
+
+    def only(self, positions: Sequence[Position]) -> "Optics":
+        """Return these optics with the views at `positions` alone."""
+        return replace(self, views=len(positions), positions=tuple(positions))
 
     def misalign(
         self,

@@ -7,7 +7,7 @@ from omegaconf import OmegaConf
 from baselines import mambatm
 from baselines.mambatm import MambaTM, scan_orders, window_starts
 from baselines.stabilise import jitter, pull
-from src.app.build import make
+from src.app.parts import make
 from tests.conftest import ROOT
 
 

@@ -9,7 +9,7 @@ from torch import nn
 from baselines.firenet import FireNet
 from baselines.mambatm import MambaTM
 from baselines.postprocess import CameraFrames, Postprocessed, Restoration
-from src.app.build import make
+from src.app.parts import make
 from src.metrics.image import L1
 from src.models import files
 from src.models.unroll import unroll, video

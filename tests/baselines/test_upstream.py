@@ -13,7 +13,7 @@ from scipy import ndimage
 from baselines import upstream
 from baselines.e2vid_plus import E2VIDPlus
 from baselines.firenet import FireNet
-from src.app.build import make
+from src.app.parts import make
 from src.sim.voxel import voxel_grid
 from tests.conftest import ROOT
 

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from src.app import build
+from src.app import parts
 from src.simulate import SAME
 from tests.faults.test_inputs import read_config, run_config
 
@@ -20,7 +20,7 @@ FOREIGN = [
     "builtins.eval",
     "subprocess.Popen",
     "src.app.build.os.getcwd",
-    "src.app.build.instantiate",
+    "src.app.parts.instantiate",
     "src.models.files.save",
     "src.records.results.write_text",
     "src.records.results.Path",
@@ -40,7 +40,7 @@ def test_only_classes_of_the_rooms_are_built(target):
     foreign = {"_target_": target}
     for node in (foreign, {"_target_": "src.sim.optics.Optics", "views": {"a": [foreign]}}):
         with pytest.raises(ValueError, match="_target_ must"):
-            build.make(OmegaConf.create(node))
+            parts.make(OmegaConf.create(node))
     assert "antigravity" not in sys.modules
 
 
@@ -55,11 +55,11 @@ NAMES = st.lists(st.sampled_from(WORDS), min_size=1, max_size=5).map(".".join)
 @given(name=NAMES)
 def test_no_name_leads_out_of_the_rooms(prefix, name):
     try:
-        made = build.make(OmegaConf.create({"_target_": prefix + name, "_partial_": True}))
+        made = parts.make(OmegaConf.create({"_target_": prefix + name, "_partial_": True}))
     except ValueError as error:
         assert "_target_" in str(error)
     else:
-        assert f"{made.func.__module__}.".startswith(build.ROOMS)
+        assert f"{made.func.__module__}.".startswith(parts.ROOMS)
 
 
 def test_yaml_builds_plain_values_only():

@@ -4,7 +4,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from src.app.build import make
+from src.app.parts import make
 from src.models import load, save
 from src.models.cost import macs_per_frame
 from src.models.setnet import SIZES, PacedGRU, SetNet

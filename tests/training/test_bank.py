@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from src.app import build
+from src.app import simulation as simulations
 from src.sim.optics import Optics
 from src.sim.pipeline import Pipeline
 from src.sim.turbulence.simulated import SimulatedAir
@@ -212,7 +213,7 @@ def test_wrong_values_of_a_config_are_one_line(wrong, message, tmp_path):
 def test_a_bank_is_shared_by_all_that_its_clips_do_not_depend_on(changed, same, tmp_path):
     asked = ["data.bank=2", f"data.bank_root={tmp_path}"]
     first, other = (
-        build.bank(config("train", tmp_path, *SMALL, *asked, *more)) for more in ([], changed)
+        simulations.bank(config("train", tmp_path, *SMALL, *asked, *more)) for more in ([], changed)
     )
     assert (first.folder == other.folder) == same
 

@@ -25,9 +25,9 @@ def sensor_size(path: Path | str, sensor: Sequence[int] | None = None) -> Size:
     told = formats.open_events(path).size
     told = told if told is None else told[::-1]
     if told is None and sensor is None:
-        raise ValueError(f"{path} does not state its sensor; give sensor=[height,width]")
+        raise ValueError(f"{path} does not state its sensor; give sensor_size=[height,width]")
     if None not in (told, sensor) and tuple(sensor) != told:
-        raise ValueError(f"sensor must be {told}, as {path} states, got {tuple(sensor)}")
+        raise ValueError(f"sensor_size must be {told}, as {path} states, got {tuple(sensor)}")
     return told or tuple(sensor)
 
 

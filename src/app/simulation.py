@@ -1,0 +1,143 @@
+"""The simulation that a config asks for: scenes, air, optics and sensor of one split, or a bank."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+from omegaconf import DictConfig, OmegaConf
+from torch import nn
+
+from src.app.parts import make, part, rooms
+from src.sim.optics import Optics, layout
+from src.sim.pipeline import Pipeline
+from src.sim.scenes.photographs import MixedRates
+from src.sim.turbulence.model import TurbulenceModel
+from src.training.bank import Bank, listing
+from src.training.banked import Banked
+
+SIMULATED = "src.sim.turbulence.simulated.SimulatedAir"
+CLIP = ("scene", "turbulence")  # sections that make a clip, whatever sees it
+
+
+def light_field(cfg: DictConfig, net: nn.Module) -> Optics:
+    """Return the optics as `net` sees them: all views, or of them those that `net` wants.
+
+    Raises ValueError where they have not got them.
+    """
+    whole = part(cfg, "optics")
+    if net.views in (None, whole.views):
+        return whole
+    wanted = layout(net.views)
+    if not set(wanted) <= set(whole.positions):
+        name = cfg.ckpt or "this baseline"
+        raise ValueError(f"optics.views must be {net.views} for {name}, got {whole.views}")
+    return whole.only(wanted)
+
+
+def pipeline(cfg: DictConfig, split: str, optics: Optics | None = None) -> Pipeline:
+    """Return the simulation of one split: train, val or test; `optics`: others than `cfg`'s."""
+    training = split == "train"
+    if training and cfg.data.get("bank") is not None:
+        return Banked(
+            bank(cfg),
+            optics or part(cfg, "optics"),
+            OmegaConf.to_container(cfg.sensor, resolve=True),
+            windows=_count(cfg, "data.windows"),
+            bins=cfg.bins,
+            crop=cfg.data.crop,
+            independent=cfg.turbulence.get("views_correlation", "independent") == "independent",
+        )
+    return _simulation(
+        cfg,
+        split,
+        windows=_count(cfg, "data.windows" if training else "data.test_windows"),
+        optics=optics or part(cfg, "optics"),
+        sensor=OmegaConf.to_container(cfg.sensor, resolve=True),
+        crop=cfg.data.crop if training else cfg.data.test_crop,
+        clips=cfg.data.clips if training else None,
+    )
+
+
+def bank(cfg: DictConfig) -> Bank:
+    """Return the bank of air that `data.bank` asks for, named by all that makes its clips.
+
+    Nine views or fewer come out of one bank: view i depends on the draws of view i only.
+    """
+    optics, side = part(cfg, "optics"), _count(cfg, "data.bank_crop")
+    if set(optics.positions) <= set(layout(9)):
+        optics = replace(optics, views=9, positions=layout(9))
+    light = {"input": cfg.sensor.input}
+    windows, substeps = _count(cfg, "data.bank_windows"), _count(cfg, "data.substeps")
+    source = _simulation(
+        cfg, "train", windows=windows, optics=optics, sensor=light, crop=side, clips=None
+    )
+    parts = {name: OmegaConf.to_container(cfg[name], resolve=True) for name in CLIP}
+    made_of = parts | {
+        "optics": {"positions": optics.positions, "misalignment_px": optics.misalignment_px},
+        "files": listing(parts),
+        "sensor": light,
+        "seed": cfg.seed,
+        "rates": _rates(cfg, True),
+        "frames": {"windows": windows, "substeps": substeps, "crop": side},
+    }
+    gib = cfg.data.bank_gib
+    if not isinstance(gib, int | float):
+        raise ValueError(f"data.bank_gib must be a number, got {gib}")
+    clips, frames = _count(cfg, "data.bank"), windows * substeps + 1
+    return Bank(source, str(cfg.data.bank_root), made_of, clips=clips, frames=frames, gib=gib)
+
+
+def _simulation(
+    cfg: DictConfig, split: str, *, windows: int, optics: Optics, sensor: dict, crop, clips
+) -> Pipeline:
+    substeps = _count(cfg, "data.substeps")
+    rates = _rates(cfg, split == "train")
+    seed = _count(cfg, "data.test_seed" if split == "test" else "seed", least=0)
+    scenes = [
+        part(
+            cfg,
+            "scene",
+            split=split,
+            seed=seed,
+            frames=windows * substeps + 1,
+            fps=rate * substeps,
+        )
+        for rate in rates
+    ]
+    try:
+        return Pipeline(
+            MixedRates(scenes) if len(scenes) > 1 else scenes[0],
+            optics,
+            _turbulence(cfg),
+            sensor,
+            split=split,
+            seed=seed,
+            bins=cfg.bins,
+            substeps=substeps,
+            crop=crop,
+            random_crop=split == "train",
+            clips=clips,
+        )
+    except TypeError as error:
+        raise ValueError(f"sensor takes no such values: {error}") from error
+
+
+def _turbulence(cfg: DictConfig) -> TurbulenceModel:
+    """Return the turbulence model; simulated air where none is named, as older runs name none."""
+    return make(OmegaConf.merge({"_target_": SIMULATED}, cfg.turbulence), rooms(cfg))
+
+
+def _count(cfg: DictConfig, key: str, least: int = 1) -> int:
+    value = OmegaConf.select(cfg, key)
+    if type(value) is not int or value < least:
+        raise ValueError(f"{key} must be a whole number >= {least}, got {value}")
+    return value
+
+
+def _rates(cfg: DictConfig, training: bool) -> list[float]:
+    key = "data.rates" if training and cfg.data.rates else "fps"
+    found = OmegaConf.select(cfg, key)
+    rates = list(found) if isinstance(found, Sequence) else [found]
+    if not rates or not all(isinstance(r, int | float) and 0 < r < math.inf for r in rates):
+        raise ValueError(f"{key} must be > 0 windows a second, got {found}")
+    return rates

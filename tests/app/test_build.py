@@ -1,0 +1,156 @@
+"""From a config to objects: classes of one's own, optics as the network wants them, the trainer."""
+
+import sys
+
+import numpy as np
+import pytest
+from lightning.pytorch.callbacks import ProgressBar
+from omegaconf import OmegaConf
+
+from baselines import postprocess
+from src.app import build, lineup
+from src.eval import evaluate
+from src.models import files
+from src.recordings.files import formats, sources
+from src.train import train
+from tests.conftest import ROOT
+from tests.test_train import TINY, config
+
+OWN = """
+import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.loggers import CSVLogger
+from torch import nn, optim
+
+from baselines.highpass import HighPass
+from baselines.mambatm import MambaTM
+from src.metrics.image import L1
+from src.sim.optics import Optics
+from src.sim.scenes.photographs import Photographs
+from src.sim.turbulence.simulated import SimulatedAir
+from src.training.augment import Augment
+
+
+class Net(nn.Module):
+    views = None
+
+    def __init__(self, gain: float):
+        super().__init__()
+        self.gain = nn.Parameter(torch.tensor(gain))
+
+    def forward(self, voxels, state=None):
+        change = voxels.mean((1, 2))[:, None]
+        state = change if state is None else 0.9 * state + change
+        return (0.5 + self.gain * state).clamp(0, 1), state
+"""
+PARTS = {
+    "scene": "Photographs", "optics": "Optics", "turbulence": "SimulatedAir",
+    "augment": "Augment", "loss": "L1", "optimizer": "Adam", "floor.method": "HighPass",
+    "logger.csv": "CSVLogger", "callbacks.checkpoint": "ModelCheckpoint", "restorer": "MambaTM",
+}  # fmt: skip
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """A package `mypackage` with a class of its own for every part of a config."""
+    classes = [
+        f"class My{name}({'optim.' if name == 'Adam' else ''}{name}):\n    pass\n"
+        for name in PARTS.values()
+    ]
+    (tmp_path / "mypackage").mkdir()
+    (tmp_path / "mypackage" / "__init__.py").write_text("")
+    (tmp_path / "mypackage" / "parts.py").write_text("\n\n".join([OWN, *classes]))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield ["rooms=[mypackage]"]
+    for name in [name for name in sys.modules if name.split(".")[0] == "mypackage"]:
+        del sys.modules[name]
+
+
+def mine(key: str) -> str:
+    return f"{key}._target_=mypackage.parts.My{PARTS[key]}"
+
+
+NET = ["~model", "+model={_target_: mypackage.parts.Net, gain: 0.05}"]
+
+
+def test_every_part_of_a_training_may_be_a_class_of_ones_own(own, tmp_path):
+    chosen = [*NET, *(mine(key) for key in PARTS if key != "restorer")]
+    train(config("train", tmp_path / "a", *TINY, *chosen, *own))
+    ckpt = tmp_path / "a" / "checkpoints" / "last.ckpt"
+    more = ["trainer.max_steps=2", f"ckpt={ckpt}"]
+    train(config("train", tmp_path / "b", *TINY, *chosen, *own, *more))
+    tested = ["debug=fdr", "metrics.lpips=null", f"ckpt={ckpt}"]
+    evaluate(config("eval", tmp_path / "c", *tested, *own))
+    (candidate,) = lineup.gather(config("chart", tmp_path, f"ckpt={ckpt}", *own))
+    assert type(candidate.network).__name__ == "Net"
+    with pytest.raises(ValueError, match=r"rooms=\[<package>\]"):
+        evaluate(config("eval", tmp_path / "d", *tested))
+
+
+@pytest.mark.parametrize("key", [*PARTS, "model"])
+def test_a_class_of_ones_own_is_refused_unless_its_package_is_named(own, key, tmp_path):
+    if key == "restorer":
+        pytest.skip("no part of a training")
+    chosen = NET if key == "model" else [mine(key)]
+    with pytest.raises(ValueError, match=r"_target_ must.*rooms=\[<package>\]"):
+        train(config("train", tmp_path, *TINY, *chosen, "rooms=[other]"))
+
+
+def test_a_post_processor_of_ones_own_is_loaded(own, tmp_path):
+    from mypackage import parts
+
+    spec = {"target": "mypackage.parts.MyMambaTM", "kwargs": {"channels": 1, "features": 8}}
+    files.save(tmp_path / "mine.safetensors", parts.MyMambaTM(1, 8), spec, {})
+    named = f"postprocess.restorer={tmp_path}/mine.safetensors"
+    cfg = config("eval", tmp_path, "postprocess=mambatm", named, "baseline=frames", *own)
+    assert type(build.frozen(cfg).restorer).__name__ == "MyMambaTM"
+    with pytest.raises(ValueError, match="rooms="):
+        postprocess.load(f"{tmp_path}/mine.safetensors")
+
+
+@pytest.mark.parametrize("given", ["mypackage", "[1a]", "[..]", "['']"])
+def test_rooms_are_a_list_of_packages(given, tmp_path):
+    with pytest.raises(ValueError, match="rooms must be a list of packages"):
+        build.rooms(config("eval", tmp_path, f"rooms={given}"))
+
+
+def test_every_door_that_builds_has_rooms_and_they_are_empty():
+    for file in (ROOT / "conf").glob("*.yaml"):
+        if file.stem not in ("compare", "report"):  # they build nothing
+            assert OmegaConf.load(file).rooms == [], file
+
+
+SMALL = ["scene.height=64", "scene.width=64", "data.test_clips=1", "data.test_windows=4"]
+SMALL += ["data.warmup=1", "data.workers=0", "metrics.lpips=null"]
+
+
+def test_a_network_of_one_view_is_given_the_centre_of_nine(tmp_path):
+    scores = [
+        evaluate(config("eval", tmp_path / optics, *SMALL, "ckpt=single256", f"optics={optics}"))
+        for optics in ("single", "lf3x3")
+    ]
+    assert scores[0]["test"] == scores[1]["test"]
+
+
+def test_a_network_of_nine_views_is_not_given_one(tmp_path):
+    with pytest.raises(ValueError, match="optics.views must be 9 for lf3x3, got 1"):
+        evaluate(config("eval", tmp_path, *SMALL, "ckpt=lf3x3", "optics=single"))
+
+
+def test_without_a_progress_bar_training_goes_on_without_it(tmp_path):
+    bars = []
+    for shown in ("true", "false"):
+        cfg = config("train", tmp_path, f"trainer.enable_progress_bar={shown}")
+        trainer = build.trainer(cfg)
+        bars.append(any(isinstance(found, ProgressBar) for found in trainer.callbacks))
+    assert bars == [True, False]
+
+
+def test_a_missing_size_is_asked_for_by_its_key(tmp_path):
+    events = np.array([(0, 1, 1, 1), (5, 2, 2, -1)], formats.EVENT)
+    formats.write_events(tmp_path / "a.raw", events, width=8, height=8)
+    (tmp_path / "a.txt").write_text("0 1 1 1\n5 2 2 0\n")
+    with pytest.raises(ValueError, match=r"give sensor_size=\[height,width\]"):
+        sources.sensor_size(tmp_path / "a.txt")
+    with pytest.raises(ValueError, match=r"sensor_size must be \(8, 8\)"):
+        sources.sensor_size(tmp_path / "a.raw", [4, 4])
