@@ -3,20 +3,20 @@
 `table`: ms a frame of 256x256, clips of 4 frames, two threads, where air is local: a pixel of 0.04
 to 0.4 D at the object, D/r0 0.5 to 4, D^2 / (lambda L) = 4.7, so lambda / D is 0.21 / pixel.
 Limits: 60 ms at 0.08 D and more, 1.5 GB.  `prior`: seconds of one thread for a training clip, 25
-frames of 80x80, over random air.  Both by default.  Another checkout of this repository, an older
-one say, is timed beside this one: the two take turns.  Times are wall time in `table`, CPU time of
-the thread in `prior`, the least of several repeats.  With CUDA: view-frames per second.
+frames of 80x80, over the air that training draws; limit 0.6 s on average.  Both by default.
+Another checkout of this repository, an older one say, is timed beside this one: the two take turns.
+Times are wall time in `table`, CPU time of the thread in `prior`, the least of several repeats.
+With CUDA: view-frames per second.
 """
 
 import json
-import math
 import os
-import random
 import resource
 import statistics
 import subprocess
 import sys
 import time
+from dataclasses import asdict, fields
 from pathlib import Path
 
 import torch
@@ -49,36 +49,32 @@ def frame_ms(pixel: float, strength: float) -> float:
     return 1e3 * min(taken) / 4
 
 
-def clip_s(pixel: float, airy_px: float, strength: float) -> float:
-    """Return seconds of one thread for a training clip, from the atmosphere on."""
+def clip_s(drawn: dict[str, object]) -> float:
+    """Return seconds of one thread for a training clip in drawn air, from the atmosphere on.
+
+    A checkout that knows no outer scale gets the Kolmogorov air that blurs as much.
+    """
     torch.set_num_threads(1)
     frames = torch.rand(1, 25, 256, 256)
+    known = {field.name for field in fields(Atmosphere)}
+    path = Atmosphere(**{name: value for name, value in drawn.items() if name in known})
+    if "outer_scale_m" not in known:
+        path = path.at(drawn["blurring_d_over_r0"])
     taken = []
     for _ in range(2):
         start = time.thread_time()
-        turbulence = air(pixel, airy_px, strength)
+        turbulence = Turbulence(path, views=9, height=256, width=256)
         turbulence.degrade(frames, torch.Generator().manual_seed(0), crop=(70, 70, 80, 80))
         taken.append(time.thread_time() - start)
     return min(taken)
 
 
-def draws() -> list[tuple[float, float, float]]:
-    """Return random air: pixel, lambda / D in pixels and D/r0, as training is meant to see it.
+def draws() -> list[dict[str, object]]:
+    """Return random air as training sees it (turbulence=mixed)."""
+    from src.sim.turbulence import sample_atmosphere
 
-    An aperture of 1 to 60 pixels at the object and lambda / D of 0.4 to 2 pixels, log-uniform,
-    10/30/60 % weak, medium and strong, a Rytov variance up to 3.
-    """
-    generator, out = random.Random(0), []
-    severities = ((0.1, 1.5), (1.5, 4.0), (4.0, 10.0))
-    while len(out) < CLIPS:
-        pixel = math.exp(-generator.uniform(0, math.log(60)))
-        airy = 0.4 * math.exp(generator.uniform(0, math.log(5)))
-        low, high = generator.choices(severities, (0.1, 0.3, 0.6))[0]
-        strength = low * math.exp(generator.uniform(0, math.log(high / low)))
-        fresnel = 1 / (pixel * airy)
-        if 3.15 * strength ** (5 / 3) * (2 * math.pi * fresnel) ** (-5 / 6) <= 3:
-            out.append((pixel, airy, strength))
-    return out
+    paths = (sample_atmosphere("mixed", torch.Generator().manual_seed(n)) for n in range(CLIPS))
+    return [asdict(path) | {"blurring_d_over_r0": path.blurring_d_over_r0} for path in paths]
 
 
 class Checkout:
@@ -95,7 +91,7 @@ class Checkout:
             text=True,
         )
 
-    def __call__(self, work: str, *numbers: float) -> float:
+    def __call__(self, work: str, *numbers: object) -> float:
         """Return what `work` (frame_ms, clip_s or memory_gb) gives for the numbers."""
         print(json.dumps([work, *numbers]), file=self.process.stdin, flush=True)
         return json.loads(self.process.stdout.readline())
@@ -125,7 +121,7 @@ def table(checkouts: list[Checkout]) -> None:
 
 def prior(checkouts: list[Checkout]) -> None:
     """Print mean and 90 % quantile of the seconds of a training clip, ours first."""
-    taken = [[checkout("clip_s", *drawn) for checkout in checkouts] for drawn in draws()]
+    taken = [[checkout("clip_s", drawn) for checkout in checkouts] for drawn in draws()]
     for own in zip(*taken, strict=True):
         tenth = statistics.quantiles(own, n=10)[-1]
         print(f"training clip: mean {statistics.mean(own):.2f} s, 90 % below {tenth:.2f} s")

@@ -7,15 +7,14 @@ them are measured on exact PSFs by scripts/p2s_errors.py and kept beside the net
 
 import math
 from dataclasses import dataclass, replace
-from functools import cache
 
 from jaxtyping import Float
-from safetensors.torch import load_file
 from torch import Tensor
 
 from src.sim.turbulence.atmosphere import ALPHA_FPS, TILT_VARIANCE, Atmosphere
-from src.sim.turbulence.p2s import FILE, FINE_PER_AIRY, Band, bands
+from src.sim.turbulence.p2s import FINE_PER_AIRY, Band, bands
 from src.sim.turbulence.seeing import half_light
+from src.sim.turbulence.tables import at, between, table
 
 CONTRAST = 0.2  # rms contrast of a natural picture
 UNSEEN = 0.5 / 255  # rms error that nobody needs to go below
@@ -109,7 +108,7 @@ def choose(
 
 def mean_psf(strength: float) -> Float[Tensor, "fine fine"]:
     """Return the mean PSF at D/r0 = `strength`, tilt removed, sampled at FINE_PER_AIRY."""
-    return _between(_table("mean"), _table("strength"), strength)
+    return between(table("mean"), table("strength"), strength)
 
 
 def _seen(atmosphere: Atmosphere, width_px: int) -> Fidelity:
@@ -157,10 +156,10 @@ def _kernel(strength: float, airy: float, reach: float) -> int:
 
 def _cheapest(name: str, strength: float, airy: float, limit: float) -> tuple[float, float]:
     """Return the first entry of the table's axis within `limit`, and its error."""
-    errors = _at(name, strength, airy)
+    errors = at(name, strength, airy)
     within = (errors <= limit).nonzero()
     index = int(within[0]) if len(within) else len(errors) - 1
-    return float(_table(f"{name}_axis")[index]), float(errors[index])
+    return float(table(f"{name}_axis")[index]), float(errors[index])
 
 
 def _psf(
@@ -187,8 +186,8 @@ def _psf(
 
 def _left_out(strength: float, airy: float, modes: int) -> float:
     """Return the error of exact PSFs of the first `modes` modes; without any blur it is 1."""
-    covered = int((_table("modes_axis") <= modes).sum())
-    return float(_at("modes", strength, airy)[covered - 1]) if covered else 1.0
+    covered = int((table("modes_axis") <= modes).sum())
+    return float(at("modes", strength, airy)[covered - 1]) if covered else 1.0
 
 
 def _network(
@@ -199,9 +198,9 @@ def _network(
     Of the networks that know `modes` modes.
     """
     number = bands().index(band)
-    table = _between(_table("psf")[number], _table("psf_strength")[number], strength)
-    errors = _between(table.movedim(-1, 0), _table("airy"), airy)
-    ranks = [min(int(rank), len(band.basis)) for rank in _table("rank_axis")]
+    known = between(table("psf")[number], table("psf_strength")[number], strength)
+    errors = between(known.movedim(-1, 0), table("airy"), airy)
+    ranks = [min(int(rank), len(band.basis)) for rank in table("rank_axis")]
     fit = [n for n, network in enumerate(band.networks) if network.modes >= modes]
     some = ((n, r, float(errors[n, i])) for n in fit for i, r in enumerate(ranks))
     within = next((choice for choice in some if choice[2] <= limit), None)
@@ -210,8 +209,8 @@ def _network(
 
 def _widest(strength: float, airy: float, allowed: float) -> tuple[float, float]:
     """Return the widest pitch in units of D at the object whose error is allowed, and the error."""
-    errors = _at("pitch", strength, airy).cummax(0).values
-    limit, axis = SHARES["pitch"] * allowed, _table("pitch_axis")
+    errors = at("pitch", strength, airy).cummax(0).values
+    limit, axis = SHARES["pitch"] * allowed, table("pitch_axis")
     if limit >= UNRELATED:
         return math.inf, UNRELATED
     if limit <= errors[0]:  # the error falls at least with the first power of the pitch
@@ -239,28 +238,5 @@ def _tilt_pitch(pixel: float, seen: Fidelity, tolerance: float) -> tuple[int, fl
 
 def _random_power(strength: float, airy: float) -> float:
     """Return the power of the random change of a picture of unit contrast; grows as d^(5/3)."""
-    weak = min(strength / float(_table("strength")[0]), 1.0) ** (5 / 3)
-    return max(float(_at("power", strength, airy)) * weak, 1e-30)
-
-
-def _at(name: str, strength: float, airy: float) -> Float[Tensor, "*axis"]:
-    """Interpolate a table (strength, ..., airy) in the logarithm of both."""
-    table = _between(_table(name), _table("strength"), strength)
-    return _between(table.movedim(-1, 0), _table("airy"), airy)
-
-
-def _between(table: Tensor, axis: Tensor, value: float) -> Tensor:
-    place = max(value, float(axis[0]))
-    high = int((axis < place).sum().clamp(1, len(axis) - 1))
-    low = high - 1
-    share = math.log(place / float(axis[low])) / math.log(float(axis[high] / axis[low]))
-    return table[low] + (table[high] - table[low]) * min(share, 1.0)
-
-
-@cache
-def _tables() -> dict[str, Tensor]:
-    return load_file(FILE)
-
-
-def _table(name: str) -> Tensor:
-    return _tables()[f"errors.{name}"]
+    weak = min(strength / float(table("strength")[0]), 1.0) ** (5 / 3)
+    return max(float(at("power", strength, airy)) * weak, 1e-30)

@@ -15,6 +15,7 @@ periodic, and frequencies reach down to zero.
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import torch
 from jaxtyping import Complex, Float, Int
@@ -175,8 +176,8 @@ def look_from(waves: Waves, baselines: Float[Tensor, "views 2"]) -> Complex[Tens
 def _orders(first: int, count: int) -> list[slice]:
     """Return the modes first .. first + count - 1 (0 is x-tilt) by order n, numbered from 0."""
     order = [noll_index(mode + 2)[0] for mode in range(first, first + count)]
-    starts = [i for i in range(count) if i == 0 or order[i] != order[i - 1]]
-    return [slice(*pair) for pair in zip(starts, [*starts[1:], count], strict=True)]
+    edges = [i for i in range(count + 1) if i in (0, count) or order[i] != order[i - 1]]
+    return [slice(*pair) for pair in pairwise(edges)]
 
 
 def _seen(response: Complex[Tensor, "modes waves"]) -> Int[Tensor, " some"]:

@@ -10,7 +10,6 @@ from src.sim.turbulence.p2s import FILE, FINE_PER_AIRY, Spots, bands
 from src.sim.turbulence.psf import fraunhofer_psf, resampling
 from src.sim.turbulence.zernike import noll_covariance
 
-
 MODES = 119  # that carry what blurs
 
 

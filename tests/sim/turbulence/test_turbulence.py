@@ -11,8 +11,8 @@ from src.sim.turbulence import Atmosphere, blur, sample_atmosphere
 from src.sim.turbulence.fidelity import mean_psf
 from src.sim.turbulence.halo import Halo
 from src.sim.turbulence.lattice import Lattice
-from src.sim.turbulence.p2s import Spots, bands
 from src.sim.turbulence.operator import Turbulence
+from src.sim.turbulence.p2s import Spots, bands
 
 PATH = Atmosphere(0.1, 0.5, 300.0, 0.4, 525e-9, 1e-14, 0.8)
 
@@ -123,7 +123,9 @@ def test_wind_moves_the_field_smoothly():
 
 
 @pytest.mark.parametrize("strength, decibels", [(1.0, 50.0), (2.0, 45.0), (4.0, 42.0), (6.0, 38.0)])
-@pytest.mark.parametrize("pixel", [0.04, pytest.param(0.15, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "pixel", [0.04, *(pytest.param(pixel, marks=pytest.mark.slow) for pixel in (0.15, 0.4))]
+)
 def test_accuracy_against_exact_psfs_at_every_pixel(strength, decibels, pixel):
     """128 x 128, lambda / D one pixel, a pixel of 0.04 to 0.4 D; normalised scatter by both.
 
