@@ -1,125 +1,154 @@
-"""Turbulence for nine views: python -m benchmarks.turbulence
+"""Turbulence for nine views: python -m benchmarks.turbulence [table | prior] [another checkout]
 
-Limits, two threads: 256x256 at D/r0 = 2 in 120 ms and 1.5 GB, 112x112 in 25 ms, 64x64 in 8 ms;
-D/r0 = 0.5 at most a third of D/r0 = 4; with CUDA 3,000 view-frames per second.  The ratio is to a
-naive simulator in the same run: a 33-200-200-100 network at every pixel and 100 bases convolved at
-full resolution with the picture and with white.  `real` is wall time on the machine's threads,
-`thread` CPU time of one thread; both are the least of several repeats.
+`table`: ms a frame of 256x256, clips of 4 frames, two threads, where air is local: a pixel of 0.04
+to 0.4 D at the object, D/r0 0.5 to 4, D^2 / (lambda L) = 4.7, so lambda / D is 0.21 / pixel.
+Limits: 60 ms at 0.08 D and more, 1.5 GB.  `prior`: seconds of one thread for a training clip, 25
+frames of 80x80, over the air that training draws; limit 0.6 s on average.  Both by default.
+Another checkout of this repository, an older one say, is timed beside this one: the two take turns.
+Times are wall time in `table`, CPU time of the thread in `prior`, the least of several repeats.
+With CUDA: view-frames per second.
 """
 
+import json
+import os
 import resource
+import statistics
+import subprocess
+import sys
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, fields
+from pathlib import Path
 
 import torch
-from torch import nn
 
-from benchmarks.timing import least
+from src.sim.turbulence import Turbulence
 from src.sim.turbulence.atmosphere import Atmosphere
-from src.sim.turbulence.operator import Turbulence
 
-CAMERA = Atmosphere(0.1, 0.5, 300.0, 0.4, 525e-9, 1e-14, 0.9)
-BASES, SUPPORT, PAD = 100, 33, 32
+APERTURE_M, WAVELENGTH_M, FRESNEL = 0.1, 525e-9, 4.7
+PIXELS, STRENGTHS = (0.04, 0.08, 0.16, 0.4), (0.5, 2.0, 4.0)  # of D at the object; D/r0
+CLIPS = 24
 
 
-def at(d_over_r0: float, pixel: float = 0.04) -> Turbulence:
-    """Return nine views of 256x256 with lambda / D = one pixel of `pixel` D at the object."""
-    distance = pixel * CAMERA.aperture_m**2 / CAMERA.wavelength_m
-    path = replace(CAMERA, distance_m=distance, scene_width_m=256 * pixel * CAMERA.aperture_m)
+def air(pixel: float, airy_px: float, d_over_r0: float) -> Turbulence:
+    """Return nine views of 256x256 with pixels of `pixel` D at the object."""
+    distance = airy_px * pixel * APERTURE_M**2 / WAVELENGTH_M
+    width = 256 * pixel * APERTURE_M
+    path = Atmosphere(APERTURE_M, 0.5, distance, width, WAVELENGTH_M, 1e-14, 0.9)
     return Turbulence(path.at(d_over_r0), views=9, height=256, width=256)
 
 
-def naive() -> Callable[[], object]:
-    """Return the naive simulation of one view, one 256x256 frame, phase given."""
-    net = nn.Sequential(
-        nn.Linear(33, 200),
-        nn.LeakyReLU(),
-        nn.Linear(200, 200),
-        nn.LeakyReLU(),
-        nn.Linear(200, BASES),
-    )
-    size = 256 + PAD
-    phase, picture = torch.randn(256 * 256, 33), torch.rand(256, 256)
-    basis = torch.fft.rfft2(torch.randn(BASES, SUPPORT, SUPPORT), s=(size, size))
-
-    @torch.no_grad()
-    def work() -> torch.Tensor:
-        weights = net(phase).T.reshape(BASES, 256, 256)
-        light, white = (
-            torch.fft.irfft2((torch.fft.rfft2(share, s=(size, size)) * basis).sum(0))
-            for share in (weights * picture, weights)
-        )
-        return light / white
-
-    return work
+def frame_ms(pixel: float, strength: float) -> float:
+    """Return wall ms for a frame of nine views."""
+    torch.set_num_threads(2)
+    turbulence, frames = air(pixel, 1 / (pixel * FRESNEL), strength), torch.rand(1, 4, 256, 256)
+    taken = []
+    for _ in range(3):
+        start = time.perf_counter()
+        turbulence.degrade(frames, torch.Generator().manual_seed(0))
+        taken.append(time.perf_counter() - start)
+    return 1e3 * min(taken) / 4
 
 
-def rows(reference: float) -> None:
-    """Print time per frame of nine views, whole and cropped."""
-    frames = torch.rand(1, 1, 256, 256)
-    for pixel in (0.04, 0.0156):
-        for strength in (0.5, 2.0, 4.0, 8.0):
-            turbulence = at(strength, pixel)
-            for side in (256, 112, 64):
-                crop = (70, 70, side, side) if side < 256 else None
+def clip_s(drawn: dict[str, object]) -> float:
+    """Return seconds of one thread for a training clip in drawn air, from the atmosphere on.
 
-                def work(run=turbulence, crop=crop):
-                    return run.degrade(frames, torch.Generator().manual_seed(0), crop=crop)
-
-                real = least(work, time.perf_counter, 8)
-                print(
-                    f"pixel {pixel} D, D/r0 {strength}, {side}x{side}: {1e3 * real:.1f} ms real, "
-                    f"{reference / real:.0f} times faster than naive at 256x256"
-                )
-
-
-def one_thread() -> None:
-    """Print CPU time on one thread: the frame, its parts' choice, and a training clip."""
+    A checkout that knows no outer scale gets the Kolmogorov air that blurs as much.
+    """
     torch.set_num_threads(1)
-    frames, clip = torch.rand(1, 1, 256, 256), torch.rand(1, 33, 256, 256)
-    for strength in (0.5, 2.0, 4.0, 8.0):
-        turbulence = at(strength)
+    frames = torch.rand(1, 25, 256, 256)
+    known = {field.name for field in fields(Atmosphere)}
+    path = Atmosphere(**{name: value for name, value in drawn.items() if name in known})
+    if "outer_scale_m" not in known:
+        path = path.at(drawn["blurring_d_over_r0"])
+    taken = []
+    for _ in range(2):
+        start = time.thread_time()
+        turbulence = Turbulence(path, views=9, height=256, width=256)
+        turbulence.degrade(frames, torch.Generator().manual_seed(0), crop=(70, 70, 80, 80))
+        taken.append(time.thread_time() - start)
+    return min(taken)
 
-        def work(run=turbulence):
-            return run.degrade(frames, torch.Generator().manual_seed(0))
 
-        print(f"D/r0 {strength}, 256x256: {1e3 * least(work):.0f} ms thread")
-    for strength, pixel, side in ((2.0, 0.04, 64), (4.0, 0.0156, 112)):
-        turbulence, crop = at(strength, pixel), (70, 70, side, side)
-        for part in (frames, clip):
+def draws() -> list[dict[str, object]]:
+    """Return random air as training sees it (turbulence=mixed)."""
+    from src.sim.turbulence import sample_atmosphere
 
-            def work(run=turbulence, crop=crop, part=part):
-                return run.degrade(part, torch.Generator().manual_seed(0), crop=crop)
+    paths = (sample_atmosphere("mixed", torch.Generator().manual_seed(n)) for n in range(CLIPS))
+    return [asdict(path) | {"blurring_d_over_r0": path.blurring_d_over_r0} for path in paths]
 
-            ms = 1e3 * least(work, repeats=4) / part.shape[1]
-            print(
-                f"pixel {pixel} D, D/r0 {strength}, {side}x{side}, clip of {part.shape[1]}: "
-                f"{ms:.1f} ms thread a frame"
-            )
-    start = least(lambda: at(2.0))
-    print(f"choice of fidelity: {1e3 * start:.1f} ms thread")
+
+class Checkout:
+    """A process that times the code of one checkout, when asked to."""
+
+    def __init__(self, root: Path):
+        here = Path(__file__).resolve()
+        self.process = subprocess.Popen(
+            [sys.executable, str(here), "serve"],
+            cwd=root,
+            env=os.environ | {"PYTHONPATH": str(root)},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def __call__(self, work: str, *numbers: object) -> float:
+        """Return what `work` (frame_ms, clip_s or memory_gb) gives for the numbers."""
+        print(json.dumps([work, *numbers]), file=self.process.stdin, flush=True)
+        return json.loads(self.process.stdout.readline())
+
+
+def memory_gb() -> float:
+    """Return the most memory that this process has held."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+
+def serve() -> None:
+    """Answer a parent's questions."""
+    known = {"frame_ms": frame_ms, "clip_s": clip_s, "memory_gb": memory_gb}
+    for line in sys.stdin:
+        work, *numbers = json.loads(line)
+        print(json.dumps(known[work](*numbers)), flush=True)
+
+
+def table(checkouts: list[Checkout]) -> None:
+    """Print ms a frame per pixel and strength, ours first."""
+    for pixel in PIXELS:
+        for strength in STRENGTHS:
+            ms = [checkout("frame_ms", pixel, strength) for checkout in checkouts]
+            print(f"pixel {pixel} D, D/r0 {strength}:", *(f"{m:.0f} ms" for m in ms), flush=True)
+    print("most memory:", *(f"{checkout('memory_gb'):.2f} GB" for checkout in checkouts))
+
+
+def prior(checkouts: list[Checkout]) -> None:
+    """Print mean and 90 % quantile of the seconds of a training clip, ours first."""
+    taken = [[checkout("clip_s", drawn) for checkout in checkouts] for drawn in draws()]
+    for own in zip(*taken, strict=True):
+        tenth = statistics.quantiles(own, n=10)[-1]
+        print(f"training clip: mean {statistics.mean(own):.2f} s, 90 % below {tenth:.2f} s")
 
 
 def cuda() -> None:
     """Print view-frames per second on the first CUDA device."""
-    turbulence, frames = at(2.0), torch.rand(1, 32, 256, 256, device="cuda")
-
-    def work():
+    turbulence, frames = air(0.04, 1.0, 2.0), torch.rand(1, 32, 256, 256, device="cuda")
+    taken = []
+    for _ in range(8):
+        start = time.perf_counter()
         turbulence.degrade(frames, torch.Generator().manual_seed(0))
         torch.cuda.synchronize()
+        taken.append(time.perf_counter() - start)
+    print(f"CUDA: {9 * 32 / min(taken):.0f} view-frames per second at 256x256, D/r0 = 2")
 
-    rate = 9 * 32 / least(work, time.perf_counter, 8)
-    print(f"CUDA: {rate:.0f} view-frames per second at 256x256, D/r0 = 2")
+
+def main(words: list[str]) -> None:
+    """Run what the command line asks for."""
+    parts = [word for word in words if word in ("table", "prior")]
+    roots = [Path.cwd(), *(Path(word).resolve() for word in words if word not in parts)]
+    checkouts = [Checkout(root) for root in roots]
+    for part in parts or ("table", "prior"):
+        {"table": table, "prior": prior}[part](checkouts)
+    if torch.cuda.is_available():
+        cuda()
 
 
 if __name__ == "__main__":
-    reference = 9 * least(naive(), time.perf_counter, 2)
-    print(f"naive, nine views of 256x256, phase given: {1e3 * reference:.0f} ms real")
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    rows(reference)
-    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    print(f"most memory {after / 1e6:.2f} GB ({before / 1e6:.2f} GB before)")
-    one_thread()
-    if torch.cuda.is_available():
-        cuda()
+    serve() if sys.argv[1:] == ["serve"] else main(sys.argv[1:])

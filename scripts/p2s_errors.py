@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from src.sim.turbulence.atmosphere import TILT_VARIANCE, Atmosphere
-from src.sim.turbulence.fidelity import band_for
-from src.sim.turbulence.p2s import FINE_PER_AIRY
+from src.sim.turbulence.p2s import FINE_PER_AIRY, Band, bands
 from src.sim.turbulence.phase import draw_waves
 from src.sim.turbulence.psf import fraunhofer_psf
 from src.sim.turbulence.zernike import noll_covariance
@@ -25,6 +24,7 @@ TILTS = 200  # random tilts that the halo is not moved by
 ALL_MODES = 119
 FINE, GRID = 47, 96  # samples of a PSF, and of its transform
 SPATIAL_WAVES = 256
+PLACES = 4  # strengths in a band
 
 
 def picture_power(count: int) -> Tensor:
@@ -49,6 +49,7 @@ def measure() -> dict[str, Tensor]:
     axes = {"strength": STRENGTHS, "airy": AIRY, "modes_axis": MODES, "pitch_axis": PITCHES}
     tables |= {name: torch.tensor(values) for name, values in axes.items()}
     tables |= {"rank_axis": torch.tensor(RANKS), "kernel_axis": torch.tensor(REACHES)}
+    tables |= _networks()
     return {f"errors.{name}": value.float().contiguous() for name, value in tables.items()}
 
 
@@ -58,14 +59,12 @@ def _row(strength: float) -> dict[str, Tensor]:
     power = _power(full - full.mean(0))
     modes = [_power(_exact(phase[:, :count]) - full) / power for count in MODES]
     pitch = [_pitch_error(strength, pitch) / power for pitch in PITCHES]
-    rank = [error / power for error in _rank_errors(strength)]
-    mean = _round(full.mean(0))
+    mean = even(full.mean(0))
     kernel = [_kernel_error(full, mean, reach, strength) / power for reach in REACHES]
     return {
         "power": power,
         "modes": torch.stack(modes),
         "pitch": torch.stack(pitch),
-        "rank": torch.stack(rank),
         "kernel": torch.stack(kernel),
         "half_light": _half_light(full.mean(0)),
         "mean": mean,
@@ -120,20 +119,40 @@ def _pitch_error(strength: float, pitch: float) -> Tensor:
     return _power((weight[..., None, None] * psfs[:, :4]).sum(1) - psfs[:, 4])
 
 
-def _rank_errors(strength: float) -> list[Tensor]:
-    """Return the power of basis and network together, per rank."""
-    band = band_for(strength)
-    phase = _draw(1000, band.modes, strength)
+def _networks() -> dict[str, Tensor]:
+    """Return what basis and networks leave of the random power: bands, strengths, networks, ranks.
+
+    And the strengths, from where each band begins to its edge.
+    """
+    edges = [band.edge for band in bands()]
+    starts = [STRENGTHS[0], *edges[:-1]]
+    axes = [
+        [start * (edge / start) ** (step / (PLACES - 1)) for step in range(PLACES)]
+        for start, edge in zip(starts, edges, strict=True)
+    ]
+    rows = [
+        torch.stack([_psf_errors(band, strength) for strength in axis])
+        for band, axis in zip(bands(), axes, strict=True)
+    ]
+    return {"psf": torch.stack(rows), "psf_strength": torch.tensor(axes)}
+
+
+def _psf_errors(band: Band, strength: float) -> Tensor:
+    """Return the power of basis and network together, per network and rank."""
+    phase = _draw(1500, ALL_MODES, strength)
     psfs = _exact(phase, band.mean.shape[-1])
+    power = _power(psfs - psfs.mean(0))
     out = []
-    for rank in RANKS:
-        basis = band.basis[:rank]
-        weights = band.weights(phase[:, 2:], rank)
-        out.append(_power(band.mean + torch.tensordot(weights, basis, 1) - psfs))
-    return out
+    for network in band.networks:
+        every = torch.arange(len(band.basis))
+        weights = network.weights(phase[:, 2 : network.modes].T, strength, every).T
+        for rank in RANKS:
+            found = torch.tensordot(weights[:, :rank], band.basis[:rank], 1)
+            out.append(_power(band.mean + found - psfs) / power)
+    return torch.stack(out).unflatten(0, (-1, len(RANKS)))
 
 
-def _round(psf: Tensor) -> Tensor:
+def even(psf: Tensor) -> Tensor:
     """Return the mean of a PSF (fine, fine) over the symmetries of the square."""
     four = torch.stack([psf.rot90(turn) for turn in range(4)]).mean(0)
     return (four + four.T) / 2

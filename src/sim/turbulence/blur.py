@@ -8,9 +8,11 @@ Outside the frame the scene is its reflection.  On the CPU the two steps are com
 rounding is all they differ by.
 """
 
-from collections.abc import Iterable
+import math
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -18,11 +20,16 @@ from torch import Tensor
 from src.sim.turbulence.engines import scatter as scatter_engine
 from src.sim.turbulence.engines import warp as warp_engine
 from src.sim.turbulence.lattice import Lattice
+from src.sim.turbulence.p2s import Spots
+
+PIXELS = np.empty((0, 0, 0), np.float32), np.empty(0, np.int64)  # PSFs given pixel by pixel
 
 
 def degrade(
     frames: Float[Tensor, "frames height width"],
-    seen: Iterable[tuple[Tensor, Tensor]],
+    seen: Sequence[tuple[Tensor, Tensor]],
+    size: int,
+    spots: Spots | None,
     rows: Lattice,
     columns: Lattice,
     halo: Float[Tensor, "frames hout wout"],
@@ -30,24 +37,27 @@ def degrade(
 ) -> Float[Tensor, "views frames hout wout"]:
     """Warp the frames by each view's tilt, then scatter them by its PSFs and add their `halo`.
 
-    `seen`: of every view, its tilt in pixels (frames, 2, h, w) over the window of `rows` and
-    `columns`, and the PSFs (frames, rows, k, k, columns) on their nodes.  The result lacks k // 2
-    pixels on each side.  The halo of a white scene would be `share`.
+    `seen`: of every view, its tilt in pixels (2, frames, h, w) over the window of `rows` and
+    `columns`, and on their nodes what its PSFs, `size` pixels across, are (numbers, frames, rows,
+    columns): weights for `spots` or, without them, every pixel.  The result lacks size // 2 pixels
+    on each side.  The halo of a white scene would be `share`.
     """
     if frames.device.type != "cpu":
-        return torch.stack([_eager(frames, *both, rows, columns, halo, share) for both in seen])
+        each = (_eager(frames, *both, spots, rows, columns, halo, share) for both in seen)
+        return torch.stack(list(each))
+    shapes = (spots.quarter, spots.ends) if spots else PIXELS
+    place = (rows.offset, columns.offset, rows.pitch)
 
-    def one(image: Tensor, tilt: Tensor, kernel: Tensor, halo: Tensor) -> Tensor:
-        tilted = warp_engine.warp(image.numpy(), tilt.numpy(), rows.start, columns.start)
-        if kernel.shape[1] == 1 and share == 0:
+    def one(tilt: Tensor, nodes: Tensor, index: int) -> Tensor:
+        at = (index, rows.start, columns.start)
+        tilted = warp_engine.warp(frames[index].numpy(), tilt.numpy(), *at)
+        if size == 1 and share == 0:
             return torch.from_numpy(tilted)
-        nodes = (kernel.numpy(), rows.offset, columns.offset, rows.pitch)
-        return torch.from_numpy(scatter_engine.scatter(tilted, *nodes, halo.numpy(), share))
+        psfs = (nodes.numpy(), index, size, *shapes, *place)
+        return torch.from_numpy(scatter_engine.scatter(tilted, *psfs, halo[index].numpy(), share))
 
     # All is drawn before any thread starts: torch's own threads would wait for cores in use.
-    work = [
-        each for tilt, kernels in seen for each in zip(frames, tilt, kernels, halo, strict=True)
-    ]
+    work = [(*each, index) for each in seen for index in range(len(frames))]
     threads = min(torch.get_num_threads(), len(work))
     if threads == 1:
         light = [one(*each) for each in work]
@@ -60,20 +70,22 @@ def degrade(
 def _eager(
     frames: Tensor,
     tilt: Tensor,
-    kernels: Tensor,
+    nodes: Tensor,
+    spots: Spots | None,
     rows: Lattice,
     columns: Lattice,
     halo: Tensor,
     share: float,
 ) -> Tensor:
     tilted = warp(frames, tilt, rows.start, columns.start)
-    both = (rows.weights().to(tilt), columns.weights().to(tilt))
-    return scatter(tilted, kernels, *both, halo, share)
+    lines = nodes @ columns.weights().T.to(nodes)
+    psfs = spots.psfs(lines) if spots else lines
+    return scatter(tilted, psfs, rows.weights().to(tilt), halo, share)
 
 
 def warp(
     frames: Float[Tensor, "frames height width"],
-    tilt: Float[Tensor, "frames 2 h w"],
+    tilt: Float[Tensor, "2 frames h w"],
     top: int,
     left: int,
 ) -> Float[Tensor, "frames h w"]:
@@ -84,7 +96,7 @@ def warp(
     height, width = frames.shape[-2:]
     rows = torch.arange(tilt.shape[-2], device=tilt.device)[:, None] + top
     columns = torch.arange(tilt.shape[-1], device=tilt.device) + left
-    x, y = columns - tilt[:, 0], rows - tilt[:, 1]
+    x, y = columns - tilt[0], rows - tilt[1]
     r, c = y.floor(), x.floor()
     down, across = _keys(y - r), _keys(x - c)
     flat = frames.flatten(1)
@@ -99,26 +111,24 @@ def warp(
 
 def scatter(
     image: Float[Tensor, "frames h w"],
-    kernels: Float[Tensor, "frames rows k k columns"],
+    psfs: Float[Tensor, "pixels frames rows w"],
     vertical: Float[Tensor, "h rows"],
-    horizontal: Float[Tensor, "w columns"],
     halo: Float[Tensor, "frames hout wout"],
     share: float,
 ) -> Float[Tensor, "frames hout wout"]:
     """Spread every pixel's light by the PSF there, over what a white scene would give.
 
-    `vertical` and `horizontal` interpolate the PSFs between the nodes; `halo` is the light from
-    beyond them, `share` what it would be of a white scene.
+    `vertical` interpolates the PSFs between rows of nodes; `halo` is the light from beyond them,
+    `share` what it would be of a white scene.
     """
-    size = kernels.shape[2]
+    size = math.isqrt(len(psfs))
     height, width = halo.shape[-2:]
     light, white = halo.clone(), torch.full_like(halo, share)
     for v in range(size):
         rows = slice(size - 1 - v, size - 1 - v + height)
-        nodes = kernels[:, :, v].transpose(1, 2)
         for u in range(size):
             columns = slice(size - 1 - u, size - 1 - u + width)
-            share = vertical[rows] @ nodes[:, u] @ horizontal[columns].T
+            share = vertical[rows] @ psfs[v * size + u, :, :, columns]
             light += share * image[:, rows, columns]
             white += share
     return light / white

@@ -7,19 +7,18 @@ them are measured on exact PSFs by scripts/p2s_errors.py and kept beside the net
 
 import math
 from dataclasses import dataclass, replace
-from functools import cache
 
 from jaxtyping import Float
-from safetensors.torch import load_file
 from torch import Tensor
 
 from src.sim.turbulence.atmosphere import ALPHA_FPS, TILT_VARIANCE, Atmosphere
-from src.sim.turbulence.p2s import FILE, FINE_PER_AIRY, Band, bands
+from src.sim.turbulence.p2s import FINE_PER_AIRY, Band, bands
 from src.sim.turbulence.seeing import half_light
+from src.sim.turbulence.tables import at, between, table
 
 CONTRAST = 0.2  # rms contrast of a natural picture
 UNSEEN = 0.5 / 255  # rms error that nobody needs to go below
-SHARES = {"modes": 0.42, "pitch": 0.33, "rank": 0.15, "kernel": 0.1}  # of the tolerance
+SHARES = {"psf": 0.57, "pitch": 0.33, "kernel": 0.1}  # of the tolerance
 BEYOND = 1.06  # the networks are fitted a little beyond the edge of their band
 EXACT_MODES = 119  # whole orders up to n = 14, for D/r0 beyond the tables
 MOST_MODES = 200
@@ -37,10 +36,11 @@ class Fidelity:
     `half_length_px`: see Atmosphere; `d_px`: the aperture at the object;
     `aperture_over_outer_scale` D / L0; `tilt_px`: standard deviation along one axis; `airy_px`:
     lambda / D; `blur_px`: the radius that holds half of the light of a point, tilt removed.
-    `modes` Noll modes from tilt on, `rank` basis functions (0: exact PSFs), `kernel` pixels across
-    the PSF, `pitch` and `tilt_pitch` pixels
-    between the nodes of the phase.  `error_modes`, `error_pitch`, `error_rank`, `error_kernel`:
-    shares of the random power; `error`: the rms error they make together, of a picture's contrast.
+    `modes` Noll modes from tilt on, `network` the one that turns them into weights of `rank` basis
+    functions (0: exact PSFs), `kernel` pixels across the PSF, `pitch` and `tilt_pitch` pixels
+    between the nodes of the phase.  `error_psf` (modes left out, network and basis), `error_pitch`,
+    `error_kernel`: shares of the random power; `error`: the rms error they make together, of a
+    picture's contrast.
     """
 
     d_over_r0: float = 0.0
@@ -57,13 +57,13 @@ class Fidelity:
     airy_px: float = 0.0
     blur_px: float = 0.0
     modes: int = 0
+    network: int = 0
     rank: int = 0
     kernel: int = 1
     pitch: int = 1
     tilt_pitch: int = 1
-    error_modes: float = 0.0
+    error_psf: float = 0.0
     error_pitch: float = 0.0
-    error_rank: float = 0.0
     error_kernel: float = 0.0
     error_tilt_px: float = 0.0
     error: float = 0.0
@@ -81,11 +81,9 @@ def choose(
     strength, airy = seen.blurring_d_over_r0, seen.airy_px
     power = _random_power(strength, airy)
     allowed = max(tolerance, (UNSEEN / CONTRAST) ** 2 / power)
-    band = band_for(strength)
-    exact = exact or band is None
-    modes, error_modes = _modes(strength, airy, allowed, band, exact, given)
-    rank, error_rank = (0.0, 0.0) if exact else _cheapest("rank", strength, airy, allowed)
-    reach, error_kernel = _cheapest("kernel", strength, airy, allowed)
+    band = None if exact else band_for(strength)
+    modes, network, rank, error_psf = _psf(strength, airy, allowed, band, given)
+    reach, error_kernel = _cheapest("kernel", strength, airy, SHARES["kernel"] * allowed)
     pixel = atmosphere.object_pixel_m(width_px) / atmosphere.aperture_m
     step, error_pitch = _widest(strength, airy, allowed)
     step *= _patch(atmosphere)
@@ -95,22 +93,22 @@ def choose(
     return replace(
         seen,
         modes=modes,
-        rank=0 if exact else min(int(rank), len(band.basis)),
+        network=network,
+        rank=rank,
         kernel=_kernel(strength, airy, reach),
         pitch=pitch,
         tilt_pitch=tilt_pitch,
-        error_modes=error_modes,
+        error_psf=error_psf,
         error_pitch=error_pitch,
-        error_rank=error_rank,
         error_kernel=error_kernel,
         error_tilt_px=error_tilt,
-        error=math.sqrt(power * (error_modes + error_pitch + error_rank + error_kernel)),
+        error=math.sqrt(power * (error_psf + error_pitch + error_kernel)),
     )
 
 
 def mean_psf(strength: float) -> Float[Tensor, "fine fine"]:
     """Return the mean PSF at D/r0 = `strength`, tilt removed, sampled at FINE_PER_AIRY."""
-    return _between(_table("mean"), _table("strength"), strength)
+    return between(table("mean"), table("strength"), strength)
 
 
 def _seen(atmosphere: Atmosphere, width_px: int) -> Fidelity:
@@ -156,33 +154,63 @@ def _kernel(strength: float, airy: float, reach: float) -> int:
     return 2 * math.floor(min(reach + 0.5 / airy, widest) * airy) + 1
 
 
-def _cheapest(name: str, strength: float, airy: float, allowed: float) -> tuple[float, float]:
-    """Return the first entry of the table's axis within its share of `allowed`, and its error."""
-    errors = _at(name, strength, airy)
-    within = (errors <= SHARES[name] * allowed).nonzero()
+def _cheapest(name: str, strength: float, airy: float, limit: float) -> tuple[float, float]:
+    """Return the first entry of the table's axis within `limit`, and its error."""
+    errors = at(name, strength, airy)
+    within = (errors <= limit).nonzero()
     index = int(within[0]) if len(within) else len(errors) - 1
-    return float(_table(f"{name}_axis")[index]), float(errors[index])
+    return float(table(f"{name}_axis")[index]), float(errors[index])
 
 
-def _modes(
-    strength: float, airy: float, allowed: float, band: Band | None, exact: bool, given: int | None
-) -> tuple[int, float]:
-    """Return how many modes to simulate, and the error of the rest; without any blur it is 1."""
-    most = MOST_MODES if exact else band.modes
-    if given is None:
-        modes, error = _cheapest("modes", strength, airy, allowed)
-        return (EXACT_MODES if band is None else min(int(modes), most)), error
-    if not 2 <= given <= most:
-        kind = "exact" if exact else "fitted"
+def _psf(
+    strength: float, airy: float, allowed: float, band: Band | None, given: int | None
+) -> tuple[int, int, int, float]:
+    """Return how many modes, which network and basis functions, and their error.
+
+    Without a band PSFs are exact: network and rank are 0.  If the modes are `given`, an error is
+    stated as if the rest were missing, though a network adds their mean blur.
+    """
+    limit = SHARES["psf"] * allowed
+    most = band.networks[-1].modes if band else MOST_MODES
+    if given is not None and not 2 <= given <= most:
+        kind = "fitted" if band else "exact"
         raise ValueError(f"turbulence.modes must be in [2, {most}] with {kind} PSFs, got {given}")
-    covered = int((_table("modes_axis") <= given).sum())
-    return given, float(_at("modes", strength, airy)[covered - 1]) if covered else 1.0
+    left = _left_out(strength, airy, given) if given else 0.0
+    if band is None:
+        modes, error = _cheapest("modes", strength, airy, limit)
+        modes = int(modes) if strength <= BEYOND * bands()[-1].edge else EXACT_MODES
+        return (given, 0, 0, left) if given else (modes, 0, 0, error)
+    network, rank, error = _network(strength, airy, limit, band, given or 0)
+    return given or band.networks[network].modes, network, rank, max(error, left)
+
+
+def _left_out(strength: float, airy: float, modes: int) -> float:
+    """Return the error of exact PSFs of the first `modes` modes; without any blur it is 1."""
+    covered = int((table("modes_axis") <= modes).sum())
+    return float(at("modes", strength, airy)[covered - 1]) if covered else 1.0
+
+
+def _network(
+    strength: float, airy: float, limit: float, band: Band, modes: int
+) -> tuple[int, int, float]:
+    """Return the smallest network and rank within `limit`, or the best, and their error.
+
+    Of the networks that know `modes` modes.
+    """
+    number = bands().index(band)
+    known = between(table("psf")[number], table("psf_strength")[number], strength)
+    errors = between(known.movedim(-1, 0), table("airy"), airy)
+    ranks = [min(int(rank), len(band.basis)) for rank in table("rank_axis")]
+    fit = [n for n, network in enumerate(band.networks) if network.modes >= modes]
+    some = ((n, r, float(errors[n, i])) for n in fit for i, r in enumerate(ranks))
+    within = next((choice for choice in some if choice[2] <= limit), None)
+    return within or (fit[-1], ranks[-1], float(errors[fit[-1], -1]))
 
 
 def _widest(strength: float, airy: float, allowed: float) -> tuple[float, float]:
     """Return the widest pitch in units of D at the object whose error is allowed, and the error."""
-    errors = _at("pitch", strength, airy).cummax(0).values
-    limit, axis = SHARES["pitch"] * allowed, _table("pitch_axis")
+    errors = at("pitch", strength, airy).cummax(0).values
+    limit, axis = SHARES["pitch"] * allowed, table("pitch_axis")
     if limit >= UNRELATED:
         return math.inf, UNRELATED
     if limit <= errors[0]:  # the error falls at least with the first power of the pitch
@@ -210,28 +238,5 @@ def _tilt_pitch(pixel: float, seen: Fidelity, tolerance: float) -> tuple[int, fl
 
 def _random_power(strength: float, airy: float) -> float:
     """Return the power of the random change of a picture of unit contrast; grows as d^(5/3)."""
-    weak = min(strength / float(_table("strength")[0]), 1.0) ** (5 / 3)
-    return max(float(_at("power", strength, airy)) * weak, 1e-30)
-
-
-def _at(name: str, strength: float, airy: float) -> Float[Tensor, "*axis"]:
-    """Interpolate a table (strength, ..., airy) in the logarithm of both."""
-    table = _between(_table(name), _table("strength"), strength)
-    return _between(table.movedim(-1, 0), _table("airy"), airy)
-
-
-def _between(table: Tensor, axis: Tensor, value: float) -> Tensor:
-    place = max(value, float(axis[0]))
-    high = int((axis < place).sum().clamp(1, len(axis) - 1))
-    low = high - 1
-    share = math.log(place / float(axis[low])) / math.log(float(axis[high] / axis[low]))
-    return table[low] + (table[high] - table[low]) * min(share, 1.0)
-
-
-@cache
-def _tables() -> dict[str, Tensor]:
-    return load_file(FILE)
-
-
-def _table(name: str) -> Tensor:
-    return _tables()[f"errors.{name}"]
+    weak = min(strength / float(table("strength")[0]), 1.0) ** (5 / 3)
+    return max(float(at("power", strength, airy)) * weak, 1e-30)

@@ -24,7 +24,7 @@ TEMPORAL = ("ar1", "flow", "mixed")
 OWN_WIND = 0.5  # rms of a layer's own wind over the wind that all layers share
 WAVES = 192
 TILE = 320  # pixels; larger pictures are made tile by tile, to bound the memory
-CHUNK, GROUP = 6_000_000, 60_000_000  # numbers in the PSFs of a view, and of all, at a time
+CHUNK, GROUP = 6_000_000, 60_000_000  # numbers at the nodes of a view, and of all, at a time
 
 
 class Turbulence:
@@ -130,7 +130,7 @@ class Turbulence:
             return torch.zeros(len(self.positions), frames, 2, *window[2:])
         waves, moving = self._draw(generator, frames)
         field = self._field(waves, slice(0, 2), window, moving.device)
-        return self._tilt_px * torch.stack([field.at_pixels(c) for c in moving])
+        return self._tilt_px * torch.stack([field.at_pixels(c).transpose(0, 1) for c in moving])
 
     def _clip(self, frames: Tensor, waves: Waves, moving: Tensor, tile: Crop, out: Tensor) -> None:
         """Write what every view sees in `tile` to `out` (views, frames, h, w).
@@ -144,7 +144,8 @@ class Turbulence:
         tilt = self._field(waves, slice(0, 2), window, device)
         rest = self._field(waves, slice(2, None), window, device)
         lattices = self._lattices(window, self.fidelity.pitch, 1)
-        numbers = rest.nodes.shape[1] * self.fidelity.kernel**2
+        lines = self.fidelity.rank or self.fidelity.kernel**2
+        numbers = max(2, lines) * (height + 2 * reach) * (width + 2 * reach)
         step = max(1, CHUNK // numbers)
         group = max(1, GROUP // (step * numbers))
         for first in range(0, len(frames), step):
@@ -152,24 +153,27 @@ class Turbulence:
                 some = moving[view : view + group, first : first + step]
                 out[view : view + group, first : first + step] = blur.degrade(
                     frames[first : first + step],
-                    (
-                        (self._tilt_px * tilt.at_pixels(c), self._kernels(rest.at_nodes(c)))
+                    [
+                        (self._tilt_px * tilt.at_pixels(c), self._nodes(rest.at_nodes(c)))
                         for c in some
-                    ),
+                    ],
+                    self.fidelity.kernel,
+                    self.spots,
                     *lattices,
                     halo[first : first + step],
                     self.halo.share,
                 )
 
-    def _kernels(
-        self, phase: Float[Tensor, "frames blurmodes rows columns"]
-    ) -> Float[Tensor, "frames rows k k columns"]:
+    def _nodes(
+        self, phase: Float[Tensor, "blurmodes frames rows columns"]
+    ) -> Float[Tensor, "numbers frames rows columns"]:
+        """Return what the PSFs are at the nodes: weights of the basis, or their very pixels."""
         if self.spots is not None:
             return self.spots(phase)
-        flat = torch.nn.functional.pad(phase.permute(0, 2, 3, 1), (2, 0))
+        flat = torch.nn.functional.pad(phase.permute(1, 2, 3, 0), (2, 0))
         size, airy = self.fidelity.kernel, self.fidelity.airy_px
         psf = fraunhofer_psf(flat, airy_px=airy, size=size, whole=True)
-        return psf.permute(0, 1, 3, 4, 2).contiguous()
+        return psf.flatten(3).permute(3, 0, 1, 2).contiguous()
 
     def _field(self, waves: Waves, modes: slice, window: Crop, device: torch.device) -> Field:
         """Prepare tilt (modes 0, 1) or the modes that blur on the lattice meant for them."""
@@ -186,8 +190,9 @@ class Turbulence:
     def _spots(self) -> Spots | None:
         if self.fidelity.rank == 0:
             return None
-        band = band_for(self.fidelity.blurring_d_over_r0)
-        return Spots(band, self.fidelity.rank, self.fidelity.airy_px, self.fidelity.kernel)
+        chosen, strength = self.fidelity, self.fidelity.blurring_d_over_r0
+        numbers = chosen.network, chosen.rank, chosen.airy_px, chosen.kernel
+        return Spots(band_for(strength), *numbers, strength)
 
     def _halo(self) -> Halo | None:
         if self.clear:

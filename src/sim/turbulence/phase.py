@@ -15,17 +15,19 @@ periodic, and frequencies reach down to zero.
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import torch
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 from torch import Tensor
 
 from src.sim import noise
 from src.sim.turbulence.atmosphere import Atmosphere
 from src.sim.turbulence.lattice import Lattice
-from src.sim.turbulence.zernike import SPECTRUM, pupil_filter
+from src.sim.turbulence.zernike import SPECTRUM, noll_index, pupil_filter
 
 LOW, HIGH = 0.08, 0.32  # limits of the three power laws that kappa is drawn from; HIGH per (n + 1)
+FAINT = 1e-4  # of the variance of the modes of an order
 SHARES = (0.25, 0.65, 0.10)  # of the waves below LOW, between, above HIGH
 
 
@@ -80,7 +82,9 @@ def draw_waves(atmosphere: Atmosphere, key: int, *, modes: int, waves: int, widt
 class Field:
     """The Noll coefficients of `modes` (0 is x-tilt) on the nodes of two lattices, in rad.
 
-    `size` is the frame's (height, width); the axis of the camera goes through its middle.
+    `size` is the frame's (height, width); the axis of the camera goes through its middle.  A wave
+    on a lattice is its rows times its columns, so the sum over waves is a product of matrices, one
+    for all modes of an order n, over the waves which that order sees.
     """
 
     def __init__(
@@ -92,38 +96,46 @@ class Field:
         size: tuple[int, int],
         device: torch.device,
     ):
-        self.response = torch.view_as_complex(waves.response[modes]).to(device, torch.complex64)
-        down = _turns(waves.frequency[:, 1], rows, size[0])
-        across = _turns(waves.frequency[:, 0], columns, size[1])
-        down, across = down.to(device)[:, :, None], across.to(device)[:, None]
-        self.shape = (down.shape[1], across.shape[2])
-        nodes = torch.empty(len(down), 2, *self.shape, device=device)
-        torch.mul(down.real, across.real, out=nodes[:, 0]).addcmul_(down.imag, -across.imag)
-        torch.mul(down.real, -across.imag, out=nodes[:, 1]).addcmul_(down.imag, -across.real)
-        self.nodes = nodes.flatten(2).flatten(0, 1)
-        self.rows, self.columns = rows, columns
+        response = torch.view_as_complex(waves.response[modes]).to(device, torch.complex64)
+        down = _turns(waves.frequency[:, 1], rows, size[0]).T.to(device)
+        across = _turns(waves.frequency[:, 0], columns, size[1]).to(device)
+        across = torch.view_as_real(across.conj().resolve_conj()).transpose(1, 2)
+        self.orders = []
+        for own in _orders(modes.start or 0, len(response)):
+            seen = _seen(response[own])
+            parts = response[own][:, seen], down[:, seen], across[seen].flatten(0, 1)
+            self.orders.append((own, seen, *(part.contiguous() for part in parts)))
+        self.shape = (len(response), len(down), across.shape[-1])
+        self.rows, self.columns, self.device = rows, columns, device
 
     def at_nodes(
         self, amplitudes: Complex[Tensor, "frames waves"]
-    ) -> Float[Tensor, "frames modes rows columns"]:
+    ) -> Float[Tensor, "modes frames rows columns"]:
         """Return the coefficients on the nodes: Re sum_m c_m w_m Q_j exp(2 pi i f_m . x)."""
-        turn = self.response * amplitudes[:, None]
-        field = torch.view_as_real(turn).flatten(2).flatten(0, 1) @ self.nodes
-        return field.reshape(*turn.shape[:2], *self.shape)
+        modes, rows, columns = self.shape
+        out = torch.empty(modes, len(amplitudes), rows, columns, device=self.device)
+        for own, seen, response, down, across in self.orders:
+            turn = response[:, None] * amplitudes[:, seen]
+            lines = torch.view_as_real(turn[:, :, None] * down).flatten(3).flatten(0, 2)
+            torch.mm(lines, across, out=out[own].view(-1, columns))
+        return out
 
     def at_pixels(
         self, amplitudes: Complex[Tensor, "frames waves"]
-    ) -> Float[Tensor, "frames modes h w"]:
+    ) -> Float[Tensor, "modes frames h w"]:
         """Return the coefficients on all pixels that the lattices serve."""
-        return self._vertical @ self.at_nodes(amplitudes) @ self._horizontal
+        field = self.at_nodes(amplitudes)
+        if self.rows.pitch > 1:
+            field = self._vertical @ field
+        return field @ self._horizontal if self.columns.pitch > 1 else field
 
     @cached_property
     def _vertical(self) -> Float[Tensor, "h rows"]:
-        return self.rows.weights().to(self.nodes.device)
+        return self.rows.weights().to(self.device)
 
     @cached_property
     def _horizontal(self) -> Float[Tensor, "columns w"]:
-        return self.columns.weights().T.to(self.nodes.device)
+        return self.columns.weights().T.to(self.device)
 
 
 def evolve(
@@ -159,6 +171,21 @@ def look_from(waves: Waves, baselines: Float[Tensor, "views 2"]) -> Complex[Tens
     Their line of sight to an object point crosses a layer baseline (1 - z/L) away.
     """
     return torch.exp(2j * math.pi * (baselines @ waves.layer.T) * (1 - waves.place))
+
+
+def _orders(first: int, count: int) -> list[slice]:
+    """Return the modes first .. first + count - 1 (0 is x-tilt) by order n, numbered from 0."""
+    order = [noll_index(mode + 2)[0] for mode in range(first, first + count)]
+    edges = [i for i in range(count + 1) if i in (0, count) or order[i] != order[i - 1]]
+    return [slice(*pair) for pair in pairwise(edges)]
+
+
+def _seen(response: Complex[Tensor, "modes waves"]) -> Int[Tensor, " some"]:
+    """Return the waves that make up the modes' variance, all but FAINT of it."""
+    share = response.abs().square().sum(0)
+    strength, order = share.sort()
+    kept = order[strength.cumsum(0) > FAINT * strength.sum()]
+    return kept.sort().values
 
 
 def _turns(frequency: Tensor, lattice: Lattice, size: int) -> Tensor:

@@ -5,9 +5,12 @@ import math
 import pytest
 import torch
 
+from src.sim.turbulence.fidelity import band_for
 from src.sim.turbulence.p2s import FILE, FINE_PER_AIRY, Spots, bands
 from src.sim.turbulence.psf import fraunhofer_psf, resampling
 from src.sim.turbulence.zernike import noll_covariance
+
+MODES = 119  # that carry what blurs
 
 
 def phases(count: int, d_over_r0: float, modes: int) -> torch.Tensor:
@@ -50,22 +53,47 @@ def test_resampling_equals_integration_over_pixels(airy):
     assert (ours - exact).norm() < 0.01 * exact.norm()
 
 
-@pytest.mark.parametrize("band, strength, limit", [(0, 1.0, 0.03), (1, 2.0, 0.08), (2, 4.0, 0.22)])
-def test_fitted_psf_is_close_to_the_exact_one(band, strength, limit):
-    band = bands()[band]
-    coefficients = phases(300, strength, band.modes)
+def exact_and_fitted(strength: float, number: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return PSFs (300, fine^2) of all modes, and what network `number` makes of its own."""
+    band = band_for(strength)
+    coefficients = phases(300, strength, MODES)
     size = band.mean.shape[-1]
-    exact = fraunhofer_psf(
-        coefficients, airy_px=FINE_PER_AIRY, size=size, pupil=size - 3, points=1
-    ).flatten(1)
-    weights = band.weights(coefficients[:, 2:], len(band.basis))
-    ours = band.mean.flatten() + weights @ band.basis.flatten(1)
-    assert ((ours - exact).norm(dim=1) / exact.norm(dim=1)).square().mean().sqrt() < limit
+    exact = fraunhofer_psf(coefficients, airy_px=FINE_PER_AIRY, size=size, pupil=size - 3, points=1)
+    network = band.networks[number]
+    known = coefficients[:, 2 : network.modes].T
+    weights = network.weights(known, strength, torch.arange(len(band.basis)))
+    return exact.flatten(1), band.mean.flatten() + weights.T @ band.basis.flatten(1)
+
+
+def relative(error: torch.Tensor, truth: torch.Tensor) -> float:
+    return float((error.norm(dim=1) / truth.norm(dim=1)).square().mean().sqrt())
+
+
+@pytest.mark.parametrize("strength, limit", [(1.0, 0.05), (2.0, 0.12), (4.0, 0.3)])
+def test_fitted_psf_is_close_to_the_exact_one(strength, limit):
+    exact, ours = exact_and_fitted(strength, -1)
+    assert relative(ours - exact, exact) < limit
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+@pytest.mark.parametrize("strength", [0.3, 1.0, 1.5, 3.0, 6.0, 10.0])
+def test_modes_left_out_blur_as_they_do_on_average(strength, number):
+    exact, ours = exact_and_fitted(strength, number)
+    spread = (exact - exact.mean(0)).square().sum(1).mean()
+    assert (ours.mean(0) - exact.mean(0)).square().sum() < 0.02 * spread
+
+
+def test_basis_is_even_or_odd_under_both_mirrors():
+    for band in bands():
+        for axis in (1, 2):
+            turned = band.basis.flip(axis)
+            sign = (turned * band.basis).sum((1, 2), keepdim=True).sign()
+            assert (turned * sign - band.basis).abs().max() < 2e-3 * band.basis.abs().max()
 
 
 def test_fitted_psf_without_phase_is_diffraction():
-    band = bands()[0]
-    ours = Spots(band, len(band.basis), 1.0, 17)(torch.zeros(1, 25, 1, 1))[0, 0, :, :, 0]
+    spots = Spots(bands()[0], -1, 24, 1.0, 17, 0.0)
+    ours = spots.psfs(spots(torch.zeros(25, 1, 1, 1))).reshape(17, 17)
     exact = fraunhofer_psf(torch.zeros(2), airy_px=1.0, size=17, points=9)
     assert (ours - exact).abs().max() < 0.01 * exact.max()
 
@@ -79,28 +107,22 @@ def test_we_are_closer_than_the_public_network(shared_data):
     """Relative error at D/r0 = 4, at the sampling of the public basis (3.8 pixels a lambda / D)."""
     state = torch.load(shared_data / "p2s_reference/P2S_state.pt", map_location="cpu")
     known = torch.load(shared_data / "p2s_reference/kernel_PCA.pt", map_location="cpu")
-    coefficients = phases(300, 4.0, 35)
-    exact = fraunhofer_psf(coefficients, airy_px=3.8, size=65, pupil=48, points=1).flatten(1)
+    coefficients = phases(300, 4.0, MODES)
+    exact = fraunhofer_psf(coefficients, airy_px=3.8, size=65, pupil=64, points=1).flatten(1)
     layers = list(state.values())
-    x = coefficients[:, 2:]
+    x = coefficients[:, 2:35]
     for index in (0, 2, 4):
         x = torch.nn.functional.linear(x, layers[index], layers[index + 1])
         x = torch.nn.functional.leaky_relu(x, 0.01) if index < 4 else x
     public = known["mu"].reshape(1, -1) + x @ known["dictionary"].reshape(len(x.T), -1)
-    band = bands()[2]
-    ours = (
-        Spots(band, len(band.basis), 3.8, 65)(
-            torch.nn.functional.pad(coefficients[:, 2:], (0, band.modes - 35)).T.reshape(
-                1, -1, 1, 300
-            )
-        )[0, 0]
-        .reshape(65 * 65, 300)
-        .T
-    )
+    band = band_for(4.0)
+    spots = Spots(band, -1, len(band.basis), 3.8, 65, 4.0)
+    seen = coefficients[:, 2 : spots.network.modes].T.reshape(-1, 1, 1, 300)
+    ours = spots.psfs(spots(seen)).reshape(65 * 65, 300).T
 
     def error(psf):
         psf, truth = (p / p.sum(1, keepdim=True) for p in (psf, exact))
-        return float(((psf - truth).norm(dim=1) / truth.norm(dim=1)).square().mean().sqrt())
+        return relative(psf - truth, truth)
 
     print(f"public {error(public):.3f}, ours {error(ours):.3f}")
     assert error(ours) < 0.5 * error(public)

@@ -12,6 +12,7 @@ from src.sim.turbulence.fidelity import mean_psf
 from src.sim.turbulence.halo import Halo
 from src.sim.turbulence.lattice import Lattice
 from src.sim.turbulence.operator import Turbulence
+from src.sim.turbulence.p2s import Spots, bands
 
 PATH = Atmosphere(0.1, 0.5, 300.0, 0.4, 525e-9, 1e-14, 0.8)
 
@@ -122,15 +123,21 @@ def test_wind_moves_the_field_smoothly():
 
 
 @pytest.mark.parametrize("strength, decibels", [(1.0, 50.0), (2.0, 45.0), (4.0, 42.0), (6.0, 38.0)])
-@pytest.mark.parametrize("pixel", [0.04, pytest.param(0.15, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "pixel", [0.04, *(pytest.param(pixel, marks=pytest.mark.slow) for pixel in (0.15, 0.4))]
+)
 def test_accuracy_against_exact_psfs_at_every_pixel(strength, decibels, pixel):
-    """128 x 128, lambda / D one pixel, a pixel of 0.04 or 0.15 D; normalised scatter by both."""
+    """128 x 128, lambda / D one pixel, a pixel of 0.04 to 0.4 D; normalised scatter by both.
+
+    The exact PSFs hold all modes that matter, of the same waves.
+    """
     distance = pixel * 0.1**2 / 525e-9
     path = replace(PATH, distance_m=distance, scene_width_m=128 * pixel * 0.1).at(strength)
     turbulence = Turbulence(path, views=1, height=128, width=128)
+    turbulence.fidelity = replace(turbulence.fidelity, modes=119)
     oracle = copy.copy(turbulence)
     oracle.spots = None
-    oracle.fidelity = replace(turbulence.fidelity, pitch=1, kernel=23)
+    oracle.fidelity = replace(turbulence.fidelity, pitch=1, kernel=23, rank=0)
     oracle.halo = Halo(mean_psf(strength), 1.0, 23)
     assert oracle.halo.share == 0
     picture = leaves(128)
@@ -151,18 +158,25 @@ def test_fidelity_follows_the_scene():
     assert loose.pitch > tight.pitch
     assert loose.error > tight.error
     for fidelity in (weak, strong, tight):
-        parts = (fidelity.error_modes, fidelity.error_pitch, fidelity.error_rank)
+        parts = (fidelity.error_psf, fidelity.error_pitch, fidelity.error_kernel)
         assert all(math.isfinite(part) and part >= 0 for part in parts)
 
 
-def test_eager_expressions_equal_the_compiled_ones():
-    rows, columns = Lattice(-3, 40, 5, 1), Lattice(2, 37, 5, 1)
+@pytest.mark.parametrize("pitch", [1, 5])
+@pytest.mark.parametrize("fitted", [True, False])
+def test_eager_expressions_equal_the_compiled_ones(pitch, fitted):
+    rows, columns = Lattice(-3, 40, pitch, 1), Lattice(2, 37, pitch, 1)
     frames, tilt = torch.rand(2, 30, 41), 3 * torch.randn(2, 2, 40, 37)
-    kernels = torch.rand(2, len(rows.pixels), 7, 7, len(columns.pixels))
+    spots = Spots(bands()[2], 0, 20, 1.3, 7, 3.0)
+    nodes = 0.5 * torch.randn(20, 2, len(rows.pixels), len(columns.pixels))
+    if not fitted:
+        spots, nodes = None, spots.psfs(nodes)
     halo = 0.2 * torch.rand(2, 34, 31)
-    [ours] = blur.degrade(frames, [(tilt, kernels)], rows, columns, halo, 0.1)
+    [ours] = blur.degrade(frames, [(tilt, nodes)], 7, spots, rows, columns, halo, 0.1)
     tilted = blur.warp(frames, tilt, -3, 2)
-    eager = blur.scatter(tilted, kernels, rows.weights(), columns.weights(), halo, 0.1)
+    lines = nodes @ columns.weights().T
+    psfs = spots.psfs(lines) if fitted else lines
+    eager = blur.scatter(tilted, psfs, rows.weights(), halo, 0.1)
     torch.testing.assert_close(ours, eager, atol=2e-5, rtol=0)
 
 

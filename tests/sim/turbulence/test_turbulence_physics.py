@@ -254,10 +254,12 @@ def test_16_psf_energy():
     torch.testing.assert_close(exact.sum((1, 2)), torch.ones(200), atol=1e-5, rtol=0)
     assert exact.min() >= 0
     for band in bands():
-        coefficients = phases(200, band.edge, band.modes, False)
-        spots = Spots(band, len(band.basis), 1.0, 15)(coefficients[:, 2:].T.reshape(1, -1, 1, 200))
-        assert spots.min() >= 0
-        found = spots.sum((2, 3)).flatten()
+        coefficients = phases(200, band.edge, 119, False)
+        spots = Spots(band, -1, len(band.basis), 1.0, 15, band.edge)
+        seen = coefficients[:, 2 : spots.network.modes].T.reshape(-1, 1, 1, 200)
+        psfs = spots.psfs(spots(seen))
+        assert psfs.min() >= 0
+        found = psfs.sum(0).flatten()
         inside = fraunhofer_psf(coefficients, airy_px=1.0, size=15, whole=True).sum((1, 2))
         assert inside.max() < 1.001
         torch.testing.assert_close(found, inside, atol=0.15, rtol=0)

@@ -1,86 +1,148 @@
-"""Normalised scatter on the CPU: one pass over a picture, PSFs interpolated on the way."""
+"""Normalised scatter on the CPU: PSFs drawn from their weights, and the light they spread."""
 
 import numpy as np
 from numba import njit
 
 
 @njit(nogil=True, cache=True, fastmath=True)
-def scatter(image, kernels, row, column, pitch, halo, share):
+def scatter(image, nodes, frame, size, shapes, ends, row, column, pitch, halo, share):
     """Return the light of `image` (h, w) spread by PSFs over what white light would give.
 
-    `kernels` (rows, size, size, columns) stand on a lattice of `pitch` pixels; the first pixel of
-    `image` lies `row`, `column` pixels after the first node.  The result lacks size // 2 pixels on
-    every side.  `halo` is the light from beyond the kernels, `share` that of a white scene.  For
-    every row of nodes the kernels are first drawn out to the pixels along x.
+    `nodes` (weights, frames, rows, columns) holds what the PSFs, `size` pixels across, are on a
+    lattice of `pitch` pixels: the weights of a basis, sorted by its symmetries (`ends`: where each
+    of the four ends), or the PSFs themselves, pixel by pixel, where `shapes` is empty.  `shapes`
+    (size // 2 + 1, size // 2 + 1, 1 + rank): mean and basis for the pixels right of and below the
+    middle.  The first pixel of `image` lies `row`, `column` pixels after the first node; the result
+    lacks size // 2 pixels on every side.  `halo` is the light from beyond the kernels, `share` that
+    of a white scene.
     """
     height, width = image.shape
-    size = kernels.shape[1]
     light = halo.copy()
     white = np.full_like(halo, share)
-    above = np.empty((size, size, light.shape[1]), np.float32)
-    below = np.empty_like(above)
-    source = np.empty((size, light.shape[1]), np.float32)
-    current = -2
+    above = np.empty((size, size, width), np.float32)
+    below = np.empty((size, size, width if pitch > 1 else 0), np.float32)
+    lines = np.empty((nodes.shape[0], width), np.float32)
+    sums = np.empty((4, width), np.float32)
+    last, current = nodes.shape[2] - 1, -2
     for y in range(height):
         cell = (y + row) // pitch
         late = np.float32((y + row - cell * pitch) / pitch)
         if cell != current:
-            above, below = below, above
-            if cell != current + 1:
-                _draw_out(kernels[cell], above, column, pitch)
-            _draw_out(kernels[min(cell + 1, kernels.shape[0] - 1)], below, column, pitch)
+            above, below = (below, above) if pitch > 1 else (above, below)
+            if cell != current + 1 or pitch == 1:
+                _stretch(nodes, frame, cell, column, pitch, lines)
+                _draw(lines, shapes, ends, sums, above)
+            if pitch > 1:
+                _stretch(nodes, frame, min(cell + 1, last), column, pitch, lines)
+                _draw(lines, shapes, ends, sums, below)
             current = cell
-        for u in range(size):
-            source[u] = image[y, size - 1 - u : width - u]
         for v in range(max(0, size - 1 - y), min(size, height - y)):
             target = y - size + 1 + v
-            _add_line(light[target], white[target], source, above[v], below[v], late)
+            if late > 0:
+                _add_between(light[target], white[target], image[y], above[v], below[v], late)
+            else:
+                _add(light[target], white[target], image[y], above[v])
     return light / white
 
 
 @njit(nogil=True, cache=True, fastmath=True)
-def _add_line(light, white, source, above, below, late):
-    """Add one line of sources to one line of the result, four columns of the kernel at a time."""
-    size = source.shape[0]
-    whole = size // 4 * 4
-    for u in range(0, whole, 4):
-        for x in range(light.shape[0]):
-            a = above[u, x] + late * (below[u, x] - above[u, x])
-            b = above[u + 1, x] + late * (below[u + 1, x] - above[u + 1, x])
-            c = above[u + 2, x] + late * (below[u + 2, x] - above[u + 2, x])
-            d = above[u + 3, x] + late * (below[u + 3, x] - above[u + 3, x])
-            white[x] += a + b + c + d
-            light[x] += (
-                a * source[u, x]
-                + b * source[u + 1, x]
-                + c * source[u + 2, x]
-                + d * source[u + 3, x]
-            )
-    for u in range(whole, size):
-        for x in range(light.shape[0]):
-            a = above[u, x] + late * (below[u, x] - above[u, x])
-            white[x] += a
-            light[x] += a * source[u, x]
+def _stretch(nodes, frame, row, column, pitch, lines):
+    """Interpolate one row of nodes along x to the pixels."""
+    width, count = lines.shape[1], nodes.shape[3]
+    for i in range(lines.shape[0]):
+        node, line = nodes[i, frame, row], lines[i]
+        if pitch == 1:
+            for x in range(width):
+                line[x] = node[x]
+            continue
+        for x in range(width):
+            cell = (x + column) // pitch
+            late = np.float32((x + column - cell * pitch) / pitch)
+            line[x] = node[cell] + late * (node[min(cell + 1, count - 1)] - node[cell])
 
 
 @njit(nogil=True, cache=True, fastmath=True)
-def _draw_out(kernels, full, column, pitch):
-    """Interpolate one row of nodes (size, size, columns) along x to `full` (size, size, pixels).
+def _draw(lines, shapes, ends, sums, full):
+    """Draw the PSFs `full` (size, size, pixels) of one row; none is negative.
 
-    Element [v, u, x] belongs to the source whose light reaches pixel x through kernel column u.
+    A basis function is even or odd under the mirror of rows and under that of columns, so four
+    pixels of the PSF are the same four sums with different signs.
     """
     size, width = full.shape[0], full.shape[2]
-    cell = np.empty(width, np.int64)
-    upper = np.empty(width, np.int64)
-    late = np.empty(width, np.float32)
-    for u in range(size):
-        for x in range(width):
-            place = x + size - 1 - u + column
-            cell[x] = place // pitch
-            upper[x] = min(cell[x] + 1, kernels.shape[2] - 1)
-            late[x] = (place - cell[x] * pitch) / pitch
-        for v in range(size):
-            node, line = kernels[v, u], full[v, u]
+    if shapes.shape[0] == 0:
+        for i in range(size * size):
             for x in range(width):
-                low = node[cell[x]]
-                line[x] = low + late[x] * (node[upper[x]] - low)
+                full[i // size, i % size, x] = lines[i, x]
+        return
+    middle = size // 2
+    for i in range(middle + 1):
+        for j in range(middle + 1):
+            shape = shapes[i, j]
+            sums[0] = shape[0]
+            sums[1:] = np.float32(0.0)
+            first = 0
+            for kind in range(4):
+                _sum(sums[kind], lines, shape, first, ends[kind])
+                first = ends[kind]
+            _mix(full[middle + i, middle + j], sums, np.float32(1.0), np.float32(1.0))
+            _mix(full[middle + i, middle - j], sums, np.float32(1.0), np.float32(-1.0))
+            _mix(full[middle - i, middle + j], sums, np.float32(-1.0), np.float32(1.0))
+            _mix(full[middle - i, middle - j], sums, np.float32(-1.0), np.float32(-1.0))
+
+
+@njit(nogil=True, cache=True, fastmath=True)
+def _sum(line, lines, shape, first, last):
+    """Add the weighted basis functions first .. last - 1, `shape` of them at one pixel."""
+    pairs = first + (last - first) // 2 * 2
+    for i in range(first, pairs, 2):
+        a, b = shape[1 + i], shape[2 + i]
+        one, two = lines[i], lines[i + 1]
+        for x in range(line.shape[0]):
+            line[x] += a * one[x] + b * two[x]
+    for i in range(pairs, last):
+        a, one = shape[1 + i], lines[i]
+        for x in range(line.shape[0]):
+            line[x] += a * one[x]
+
+
+@njit(nogil=True, cache=True, fastmath=True)
+def _mix(line, sums, down, across):
+    """Join the sums of the four symmetries at a mirrored place; `down`, `across`: 1 or -1."""
+    both = down * across
+    for x in range(line.shape[0]):
+        value = sums[0, x] + across * sums[1, x] + down * sums[2, x] + both * sums[3, x]
+        line[x] = max(value, np.float32(0.0))
+
+
+@njit(nogil=True, cache=True, fastmath=True)
+def _add(light, white, image, psfs):
+    """Add one row of sources to one row of the result, two columns of the PSFs at a time."""
+    size, width = psfs.shape[0], light.shape[0]
+    for u in range(0, size - 1, 2):
+        o = size - 1 - u
+        first, second = psfs[u, o : o + width], psfs[u + 1, o - 1 : o - 1 + width]
+        one, two = image[o : o + width], image[o - 1 : o - 1 + width]
+        for x in range(width):
+            white[x] += first[x] + second[x]
+            light[x] += first[x] * one[x] + second[x] * two[x]
+    psf = psfs[size - 1]
+    for x in range(width):
+        white[x] += psf[x]
+        light[x] += psf[x] * image[x]
+
+
+@njit(nogil=True, cache=True, fastmath=True)
+def _add_between(light, white, image, above, below, late):
+    """Add one row of sources whose PSFs lie `late` of the way between two rows of them."""
+    size, width = above.shape[0], light.shape[0]
+    for u in range(size):
+        o = size - 1 - u
+        early, after, source = (
+            above[u, o : o + width],
+            below[u, o : o + width],
+            image[o : o + width],
+        )
+        for x in range(width):
+            psf = early[x] + late * (after[x] - early[x])
+            white[x] += psf
+            light[x] += psf * source[x]

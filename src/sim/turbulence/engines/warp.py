@@ -5,13 +5,13 @@ from numba import njit
 
 
 @njit(nogil=True, cache=True, fastmath=True)
-def warp(frame, tilt, top, left):
+def warp(frame, tilt, index, top, left):
     """Return frame(x - tilt(x)) over the window whose first pixel is (`top`, `left`).
 
-    `tilt` (2, h, w) is (x, y) in pixels; Keys' cubic (a = -1/2), held within the frame's own range;
-    outside the frame lies its reflection.
+    `tilt` (2, frames, h, w) is (x, y) in pixels, of which the one at `index` counts; Keys' cubic
+    (a = -1/2), held within the frame's own range; outside the frame lies its reflection.
     """
-    height, width = tilt.shape[1:]
+    height, width = tilt.shape[2:]
     rows, columns = frame.shape
     low, high = frame.min(), frame.max()
     out = np.empty((height, width), np.float32)
@@ -19,7 +19,7 @@ def warp(frame, tilt, top, left):
     row, column = np.empty(4, np.int64), np.empty(4, np.int64)
     for i in range(height):
         for j in range(width):
-            y, x = i + top - tilt[1, i, j], j + left - tilt[0, i, j]
+            y, x = i + top - tilt[1, index, i, j], j + left - tilt[0, index, i, j]
             r, c = int(np.floor(y)), int(np.floor(x))
             _taps(np.float32(y - r), down)
             _taps(np.float32(x - c), across)
