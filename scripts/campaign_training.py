@@ -14,7 +14,9 @@ import torch
 from omegaconf import OmegaConf
 
 ROOT = Path(__file__).resolve().parents[1]
-WORD = "campaign-child"  # in the command line of every training
+# In the command line of every training and of what it starts: a filter of warnings is handed on, and
+# no warning begins with these words.
+MARK = "ignore:campaign-child"
 
 
 class Stop(NamedTuple):
@@ -64,11 +66,11 @@ class Training:
         number = int(parts[-1].name[4:]) + 1 if parts else 0
         export = Path(self.plan.export) / f"{self.name}.safetensors"
         return [
-            "nice", "-n", str(self.plan.nice), sys.executable, "-m", "src.train",
+            "nice", "-n", str(self.plan.nice), sys.executable, "-W", MARK, "-m", "src.train",
             f"experiment={self.experiment}", f"hours={self.hours}",
             *self.plan.common, *self.overrides,
             f"export={export}", f"hydra.run.dir={self.folder / f'part{number:03}'}",
-            f"hydra.job.name={WORD}", "~callbacks.progress",
+            "~callbacks.progress",
             *([f"ckpt={self.folder}"] if any(self.folder.rglob("*.ckpt")) else []),
         ]  # fmt: skip
 
