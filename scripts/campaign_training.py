@@ -14,8 +14,8 @@ import torch
 from omegaconf import OmegaConf
 
 ROOT = Path(__file__).resolve().parents[1]
-# In the command line of every training and of what it starts: a filter of warnings is handed on, and
-# no warning begins with these words.
+# In the command lines of a training and of what it starts: filters of warnings are handed on, and
+# no warning begins with this word.
 MARK = "ignore:campaign-child"
 
 
