@@ -22,7 +22,7 @@ from src.sim.turbulence.psf import fraunhofer_psf
 Crop = tuple[int, int, int, int]  # top, left, height, width
 TEMPORAL = ("ar1", "flow", "mixed")
 OWN_WIND = 0.5  # rms of a layer's own wind over the wind that all layers share
-WAVES = 192
+WAVES = 384
 TILE = 320  # pixels; larger pictures are made tile by tile, to bound the memory
 CHUNK, GROUP = 6_000_000, 60_000_000  # numbers at the nodes of a view, and of all, at a time
 

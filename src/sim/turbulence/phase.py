@@ -28,6 +28,7 @@ from src.sim.turbulence.zernike import SPECTRUM, noll_index, pupil_filter
 
 LOW, HIGH = 0.08, 0.32  # limits of the three power laws that kappa is drawn from; HIGH per (n + 1)
 FAINT = 1e-4  # of the variance of the modes of an order
+DEPTH = 1.0  # waves are drawn with the density Cn2 (1 - z/L)^DEPTH
 SHARES = (0.25, 0.65, 0.10)  # of the waves below LOW, between, above HIGH
 
 
@@ -37,7 +38,7 @@ class Waves:
 
     `frequency` (waves, 2): f z / L in cycles per pixel at the object along (x, y).
     `layer` (waves, 2): f in cycles per metre in the layer; `place` (waves,): z / L; `share`
-    (waves,): how much of the turbulence, as it counts for tilt, lies nearer to the camera.
+    (waves,): how much of the turbulence lies nearer to the camera.
     `response` (modes, waves, 2): w_m Q_j, real and imaginary part, in rad.
     """
 
@@ -52,21 +53,23 @@ def draw_waves(atmosphere: Atmosphere, key: int, *, modes: int, waves: int, widt
     """Draw `waves` plane waves that carry Noll modes 2..modes + 1.
 
     kappa = D_l |f|, its angle and z are drawn by a shifted Kronecker sequence; z with the density
-    Cn2 (1 - z/L)^(5/3) that makes the layers count alike, kappa from a broken power law over all of
-    (0, inf), and the weights w_m divide by that density, so the expected covariance is exact.  An
+    Cn2 (1 - z/L), which draws more waves near the object than count there: they are fine, and
+    a strong one would be seen as a stripe; kappa from a broken power law over all of (0, inf).  The
+    weights w_m divide by these densities, so the expected covariance is exact.  An
     outer scale weakens waves longer than it, and few of them are drawn.
     """
     u = _sequence(key, waves)
     kappa, density = _radius(u[:, 0], modes, _lowest(atmosphere.inverse_outer_scale, modes))
     angle = 2 * math.pi * u[:, 1]
     place, strength = atmosphere.path
-    share = strength * (1 - place) ** (5 / 3)
-    steps = torch.cumsum(share, 0)
+    near = 1 - place
+    steps = torch.cumsum(strength * near**DEPTH, 0)
     slot = torch.searchsorted(steps, u[:, 2] * steps[-1]).clamp(max=len(place) - 1)
-    diameter = atmosphere.aperture_m * (1 - place[slot])
+    count = near[slot] ** (5 / 3 - DEPTH) * steps[-1] / (strength * near ** (5 / 3)).sum()
+    diameter = atmosphere.aperture_m * near[slot]
     kappa0 = diameter / atmosphere.outer_scale_m
     power = kappa * (kappa**2 + kappa0**2) ** (-11 / 6)
-    variance = SPECTRUM * 2 * math.pi * power / (density * waves)
+    variance = SPECTRUM * 2 * math.pi * power * count / (density * waves)
     amplitude = variance.sqrt() * atmosphere.d_over_r0 ** (5 / 6)
     layer = torch.stack([angle.cos(), angle.sin()], dim=-1) * (kappa / diameter)[:, None]
     pixel = atmosphere.object_pixel_m(width_px)
