@@ -68,6 +68,8 @@ def network(cfg: DictConfig) -> tuple[nn.Module, dict]:
     elif "weights" in cfg.model:
         print(f"model.weights is null: {cfg.name} is trained from scratch")
     target = node.pop("_target_")
+    if hasattr(net, "arguments"):  # made by a preset: what the preset stands for
+        return net, {"target": target.removesuffix(".preset"), "kwargs": net.arguments}
     return net, {"target": target, "kwargs": node}
 
 

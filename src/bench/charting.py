@@ -124,9 +124,7 @@ def words(
     lines += [
         f"\nMean over all clips; ms a frame of {side}x{side}, computed by one CPU thread.  "
         "Without scores: no weights, timed only.\n",
-        " | ".join(
-            ["| network | form | ms | GMAC | parameters", *(m.heading for m in metrics), ""]
-        ),
+        "| " + " | ".join(["network", "form", "ms", "GMAC", "parameters", *heads]) + " |",
         "|---|---|" + "---:|" * (3 + len(metrics)),
     ]
     for s in speeds:
