@@ -13,12 +13,11 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from safetensors import safe_open
 
+from src.metrics.table import METRICS, Metric
 from src.models import files
 from src.models.unroll import takes
 
 LARGEST = 16 * 2**20  # bytes of a file
-MEASURES = {"lpips": "LPIPS", "ssim": "SSIM", "psnr": "PSNR", "psnr_aligned": "aligned PSNR"}
-MEASURES |= {"wobble": "wobble, px"}
 
 
 def ship(run: Path, name: str, tests: list[Path]) -> Path:
@@ -101,8 +100,8 @@ def describe(name: str, network: torch.nn.Module, card: dict, tests: list[tuple]
         "|---|---|",
         *(f"| {key} | {value} |" for key, value in card.items()),
         "",
-        "| tested on | clips | " + " | ".join(MEASURES.values()) + " |",
-        "|---|---|" + "---|" * len(MEASURES),
+        "| tested on | clips | " + " | ".join(metric.heading for metric in METRICS) + " |",
+        "|---|---|" + "---|" * len(METRICS),
         *(_tested(record, cfg) for record, cfg in tests),
         "",
         "In brackets: the interval that holds 95 % of the means of resampled clips.",
@@ -116,14 +115,16 @@ def describe(name: str, network: torch.nn.Module, card: dict, tests: list[tuple]
 
 def _tested(record: dict, cfg: DictConfig) -> str:
     scores = record["test"]
-    cells = [_cell(scores[measure]) if measure in scores else "-" for measure in MEASURES]
+    cells = [_cell(metric, scores.get(metric.name)) for metric in METRICS]
     what = f"{_scenes(cfg)}, {cfg.turbulence.atmosphere.severity} turbulence, at {record['git']}"
     return f"| {what} | {scores['clips']} | " + " | ".join(cells) + " |"
 
 
-def _cell(score: dict) -> str:
-    low, high = score["interval"]
-    return f"{score['mean']:.3f} ({low:.3f} to {high:.3f})"
+def _cell(metric: Metric, score: dict | None) -> str:
+    if score is None:
+        return metric.written(None)
+    low, high = map(metric.written, score["interval"])
+    return f"{metric.written(score['mean'])} ({low} to {high})"
 
 
 def _scenes(cfg: DictConfig) -> str:

@@ -8,6 +8,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from src.app import door
 from src.records import results, runs
 from src.reports import cells, page, tables, writers
+from src.reports.margins import margins
 
 
 def report(cfg: DictConfig) -> list[tables.Table]:
@@ -15,8 +16,7 @@ def report(cfg: DictConfig) -> list[tables.Table]:
 
     With `into`, the Markdown also replaces that file's section of the same title.
     """
-    given = cfg.run if isinstance(cfg.run, ListConfig) else [cfg.run]
-    folders, out = [Path(str(folder)) for folder in given], Path(cfg.paths.run)
+    folders, out = listed(cfg.run), Path(cfg.paths.run)
     found, plans = runs.find(folders), runs.plans(folders)
     title = cfg.title or sweep_name(found)
     keys, made = cells.cells(found, plans, tuple(cfg.across))
@@ -26,6 +26,9 @@ def report(cfg: DictConfig) -> list[tables.Table]:
         tables.by_severity("Severities apart", keys, made),
         tables.compared("On the same clips", keys, made),
     ]
+    if cfg.against:
+        theirs = runs.find(listed(cfg.against))
+        wanted.append(margins("Clip by clip", found, theirs, paper))
     drawn = [table for table in wanted if table and table.rows]
     commands, figures = [plan.command for plan in plans], runs.figures(folders)
     text = writers.markdown(drawn, commands)
@@ -40,6 +43,11 @@ def report(cfg: DictConfig) -> list[tables.Table]:
         writers.replace_section(Path(cfg.into), title, text)
     print(f"{text}\nin {out}: report.md, report.csv, report.tex, report.html")
     return drawn
+
+
+def listed(given: str | ListConfig) -> list[Path]:
+    """Return one folder, or a list of them, as a list."""
+    return [Path(str(folder)) for folder in (given if isinstance(given, ListConfig) else [given])]
 
 
 def sweep_name(found: list[runs.Run]) -> str:

@@ -1,9 +1,7 @@
-"""From runs to shipped weights and tables of margins."""
+"""From runs to shipped weights."""
 
-import pytest
 import torch
 
-from scripts.margins import margins
 from scripts.ship_weights import recard, ship
 from src.models import files
 from src.models.unroll import unroll
@@ -25,20 +23,3 @@ def test_a_trained_run_is_shipped_whole_with_its_card(tmp_path, monkeypatch):
     assert recard("tiny/one", [run, run]) == path and path.read_bytes() == whole
     anew = path.with_suffix(".md").read_text().splitlines()
     assert len(anew) == len(card.splitlines()) + 1 and set(anew) == set(card.splitlines())
-
-
-def clip(name: str, value: float) -> dict[str, str]:
-    metrics = ("lpips", "ssim", "psnr", "psnr_aligned", "wobble")
-    return {"name": name} | dict.fromkeys(metrics, str(value))
-
-
-def test_margins_are_ours_minus_theirs_with_an_interval():
-    ours = [[clip("a", 2.0), clip("b", 5.0)], [clip("a", 2.0), clip("b", 5.0)]]
-    theirs = [[clip("a", 1.0), clip("b", 4.0)]]
-    row = margins(ours, theirs).splitlines()[2]
-    assert row == "| LPIPS | 3.5000 | 2.5000 | +1.0000 | +1.0000 to +1.0000 | -0.0275 |"
-
-
-def test_margins_need_the_same_clips():
-    with pytest.raises(ValueError, match="same clips"):
-        margins([[clip("a", 1.0)]], [[clip("b", 1.0)]])

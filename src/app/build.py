@@ -19,6 +19,7 @@ from src.app.parts import make, part, rooms
 from src.app.simulation import pipeline
 from src.metrics.scores import Scores
 from src.models.unroll import takes
+from src.records.results import Row
 from src.sim.optics import Optics
 from src.training import evaluation
 from src.training.banked import Banked
@@ -67,6 +68,8 @@ def network(cfg: DictConfig) -> tuple[nn.Module, dict]:
     elif "weights" in cfg.model:
         print(f"model.weights is null: {cfg.name} is trained from scratch")
     target = node.pop("_target_")
+    if hasattr(net, "arguments"):  # made by a preset: what the preset stands for
+        return net, {"target": target.removesuffix(".preset"), "kwargs": net.arguments}
     return net, {"target": target, "kwargs": node}
 
 
@@ -143,9 +146,7 @@ def trainer(cfg: DictConfig) -> lightning.Trainer:
     return part(cfg, "trainer", logger=loggers, callbacks=callbacks)
 
 
-def test(
-    cfg: DictConfig, name: str, net: nn.Module, data: LightFieldData, measures: Scores
-) -> evaluation.Row:
+def test(cfg: DictConfig, name: str, net: nn.Module, data: LightFieldData, measures: Scores) -> Row:
     """Return the scores of `net` on the test clips; in float32, whatever it was trained in."""
     plain = {"precision": "32-true", "logger": False, "enable_checkpointing": False}
     plain |= {"devices": 1, "num_nodes": 1, "strategy": "auto"}  # of many, one process tests

@@ -13,6 +13,7 @@ from src.bench.candidates import Candidate, Subject
 from src.bench.pareto import knee
 from src.bench.stopwatch import FORMS, Speed
 from src.metrics.scores import Scores
+from src.metrics.table import METRICS
 from src.models.fast import running
 from src.sim.pipeline import Pipeline, simulate
 
@@ -116,19 +117,21 @@ def words(
     speeds: Sequence[Speed], found: Sequence[Score], knees: Mapping[str, str], side: int
 ) -> str:
     """Return the knees and a table of the means over all clips, as Markdown."""
-    metrics = list(found[0].values) if found else []
+    metrics = [metric for metric in METRICS if found and metric.name in found[0].values]
+    heads = [metric.heading for metric in metrics]
     lines = ["# Speed against accuracy\n"]
     lines += [f"- {severity} turbulence: take {name}." for severity, name in knees.items()]
     lines += [
         f"\nMean over all clips; ms a frame of {side}x{side}, computed by one CPU thread.  "
         "Without scores: no weights, timed only.\n",
-        "| network | form | ms | GMAC | parameters | " + " | ".join(metrics) + " |",
+        "| " + " | ".join(["network", "form", "ms", "GMAC", "parameters", *heads]) + " |",
         "|---|---|" + "---:|" * (3 + len(metrics)),
     ]
     for s in speeds:
         if s.threads == 1 and s.side == side and s.device == "cpu":
             rows = [r.values for r in found if (r.network, r.form) == (s.network, s.form)]
-            means = [f"{sum(r[m] for r in rows) / len(rows):.3f}" if rows else "" for m in metrics]
+            means = [m.written(sum(r[m.name] for r in rows) / len(rows)) if rows else ""
+                     for m in metrics]  # fmt: skip
             time = s.reason if s.ms is None else f"{s.ms:.2f}"
             size = [f"{s.gmac:.2f}" if s.gmac is not None else "", str(s.params or 0)]
             name = s.network + ("" if s.trained else " (no weights)")

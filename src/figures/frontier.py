@@ -11,16 +11,11 @@ from src.bench.charting import Score
 from src.bench.pareto import front
 from src.bench.stopwatch import Speed
 from src.figures.plots import MARKERS, save
+from src.metrics.table import METRICS, Metric
 
 PAPER_MS, LIVE_MS = 3.4, 1000 / 600
 LEAST_GMAC = 1e-3
-HEADS = {
-    "lpips": "LPIPS  (lower is better)",
-    "ssim": "SSIM  (higher is better)",
-    "psnr_aligned": "aligned PSNR, dB  (higher is better)",
-    "wobble": "wobble, px  (lower is better)",
-}
-HIGH = ("ssim", "psnr_aligned", "psnr")
+SHOWN = tuple(metric for metric in METRICS if metric.name != "psnr")  # aligned PSNR stands for it
 # Twelve that stay apart, also for the colour-blind, in pairs of dark and light.
 PALETTE = (
     "#1f5fa8", "#d1571b", "#2f8f4e", "#8a4fa3", "#c2a11a", "#6b6b6b",
@@ -37,9 +32,10 @@ def accuracy(
     """
     names = list(dict.fromkeys(row.network for row in scores))
     times = {(s.network, s.form): s.ms for s in speeds if _counts(s, side)}
-    metrics = [metric for metric in HEADS if scores and metric in scores[0].values]
-    figure = Figure(figsize=(11, 8.2), layout="constrained")
-    panels = figure.subplots(2, 2)
+    metrics = [metric for metric in SHOWN if scores and metric.name in scores[0].values]
+    rows = max(2, (len(metrics) + 1) // 2)
+    figure = Figure(figsize=(11, 4.1 * rows), layout="constrained")
+    panels = figure.subplots(rows, 2)
     for axes, metric in zip(panels.flat, metrics, strict=False):
         _panel(axes, names, times, scores, metric)
     for axes in panels.flat[len(metrics) :]:
@@ -82,20 +78,19 @@ def _counts(s: Speed, side: int) -> bool:
     return s.ms is not None and s.side == side and s.threads == 1 and s.device == "cpu"
 
 
-def _panel(axes, names: list[str], times: Mapping, scores: Sequence[Score], metric: str) -> None:
+def _panel(axes, names: list[str], times: Mapping, scores: Sequence[Score], metric: Metric) -> None:
     points: dict[tuple[str, str], tuple[float, float]] = {}
     for name in names:
         pair = []
         for form in ("float32", "bf16"):
-            values = [r.values[metric] for r in scores if (r.network, r.form) == (name, form)]
+            values = [r.values[metric.name] for r in scores if (r.network, r.form) == (name, form)]
             if values and (name, form) in times:
                 points[name, form] = times[name, form], sum(values) / len(values)
                 pair.append(points[name, form])
                 axes.plot(*pair[-1], linestyle="none", **_look(names.index(name), form))
         colour = _look(names.index(name), "float32")["color"]
         axes.plot(*zip(*pair, strict=True), color=colour, lw=0.8, alpha=0.6) if pair else None
-    sign = -1 if metric in HIGH else 1
-    best = front({key: (ms, sign * value) for key, (ms, value) in points.items()})
+    best = front({key: (ms, -metric.better * value) for key, (ms, value) in points.items()})
     steps = [points[key] for key in best]
     if steps:
         axes.plot(*zip(*steps, strict=True), color="0.35", ls="--", lw=1.2, zorder=0)
@@ -105,7 +100,8 @@ def _panel(axes, names: list[str], times: Mapping, scores: Sequence[Score], metr
             ms, 0.985, f"{text} ", transform=axes.get_xaxis_transform(), rotation=90, fontsize=7,
             color="0.4", ha="right", va="top",
         )  # fmt: skip
-    axes.set(xscale="log", title=HEADS[metric])
+    side = "higher" if metric.better > 0 else "lower"
+    axes.set(xscale="log", title=f"{metric.heading}  ({side} is better)")
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter(NullFormatter())

@@ -11,6 +11,13 @@ from src.metrics.image import aligned_psnr, psnr, ssim
 from src.metrics.lpips import LPIPS
 from src.metrics.temporal import wobble
 
+MEASURES = {  # name in table.py: a value per frame, or per step from a frame to the next
+    "psnr": psnr,
+    "psnr_aligned": aligned_psnr,
+    "ssim": ssim,
+    "wobble": wobble,
+}
+
 
 class Scores:
     """PSNR, aligned PSNR, SSIM, LPIPS (if a network is given) and wobble of a clip.
@@ -25,7 +32,7 @@ class Scores:
         if not 0 < scale <= 8 or (scale > 1 and scale != int(scale)):
             raise ValueError(f"metrics.scale must be in (0, 1] or one of 2..8, got {scale}")
         self.lpips, self.scale = lpips, scale
-        self.names = ["psnr", "psnr_aligned", "ssim", "wobble"] + ["lpips"] * (lpips is not None)
+        self.names = [*MEASURES] + ["lpips"] * (lpips is not None)
 
     @torch.no_grad()
     def __call__(
@@ -34,12 +41,7 @@ class Scores:
         """Return the value of every name in `names`."""
         frames = self._resample(frames.float().clamp(0, 1))
         target = self._resample(target)
-        values = {
-            "psnr": psnr(frames, target),
-            "psnr_aligned": aligned_psnr(frames, target),
-            "ssim": ssim(frames, target),
-            "wobble": wobble(frames, target),
-        }
+        values = {name: measure(frames, target) for name, measure in MEASURES.items()}
         if self.lpips is not None:
             values["lpips"] = self.lpips.to(frames.device)(frames, target)
         return {name: float(value.mean()) for name, value in values.items()}

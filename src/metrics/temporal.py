@@ -75,19 +75,6 @@ def straightness(path: Float[Tensor, "frames 2"], truth: Float[Tensor, "frames 2
     return float((error - error.mean(0)).square().sum(1).mean().sqrt())
 
 
-def flicker(
-    frames: Float[Tensor, "frames 1 h w"],
-    target: Float[Tensor, "frames 1 h w"],
-    still: float = 1 / 255,
-) -> float:
-    """Return the mean temporal standard deviation of the pixels that stay within `still` in the
-    truth; 0 if none does.
-    """
-    calm = (target.amax(0) - target.amin(0)) <= still
-    spread = frames.std(0, unbiased=False)
-    return float(spread[calm].mean()) if calm.any() else 0.0
-
-
 def _texture(target: Tensor) -> Tensor:
     """Return the smaller eigenvalue of every block's structure tensor, 0 below TEXTURE."""
     a, b, c = _structure(*_gradients(target))

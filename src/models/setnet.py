@@ -46,6 +46,7 @@ class SetNet(nn.Module):
 
     def __init__(self, bins: int = 5, stem: int = 12, channels: int = 32):
         super().__init__()
+        self.arguments = {"bins": bins, "stem": stem, "channels": channels}  # that make it again
         self.bins = bins
         memories = len(MEMORIES_S)
         self.voxel_stem = ViewKernels(bins, stem, 5)

@@ -8,18 +8,29 @@ import os
 import shutil
 import statistics
 import subprocess
+from dataclasses import dataclass
 from pathlib import Path
 
 import rich
 from rich.table import Table
 
 from src.metrics.bootstrap import interval
+from src.metrics.table import METRICS, NAMES
 from src.recordings.files import plain
-from src.training.evaluation import Row
 
 SCHEMA = 1
 LEAST_FREE_BYTES = 200 * 2**20
-METRICS = ("lpips", "ssim", "psnr", "psnr_aligned", "wobble")
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a line of a table needs: scores of every clip with what was drawn for it, and cost."""
+
+    name: str
+    clips: list[dict]
+    params: int
+    macs_per_frame: int
+    latency_ms: dict[str, float]
 
 
 def open_run(run: Path, config: str) -> None:
@@ -83,7 +94,7 @@ def summary(clips: list[dict]) -> dict:
 
     `interval`: 95 % of the means of resampled clips.
     """
-    found = [metric for metric in METRICS if clips and metric in clips[0]]
+    found = [name for name in NAMES if clips and name in clips[0]]
     values = {metric: [clip[metric] for clip in clips] for metric in found}
     return {"clips": len(clips)} | {
         metric: {"mean": statistics.fmean(v), "std": statistics.pstdev(v), "interval": interval(v)}
@@ -130,21 +141,14 @@ def clips_csv(clips: list[dict]) -> str:
 
 def table(rows: list[Row]) -> Table:
     """Return the rows as a table: mean over clips; the arrow says which way is better."""
-    heads = {
-        "lpips": "LPIPS ↓",
-        "ssim": "SSIM ↑",
-        "psnr": "PSNR ↑",
-        "psnr_aligned": "aligned PSNR ↑",
-        "wobble": "wobble px ↓",
-    }
     picture = Table(title=f"{len(rows[0].clips)} test clips, mean of per-frame values")
     picture.add_column("network")
     for metric in METRICS:
-        picture.add_column(heads[metric], justify="right")
+        picture.add_column(f"{metric.heading} {metric.arrow}", justify="right")
     picture.add_column("ms/frame", justify="right")
     for row in rows:
         means = summary(row.clips)
-        cells = [f"{means[m]['mean']:.4f}" if m in means else "-" for m in METRICS]
+        cells = [m.written(means.get(m.name, {}).get("mean")) for m in METRICS]
         picture.add_row(row.name, *cells, f"{next(iter(row.latency_ms.values())):.1f}")
     return picture
 

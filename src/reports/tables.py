@@ -5,6 +5,7 @@ import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from src.metrics.table import METRICS
 from src.records.runs import Run
 from src.reports.cells import Cell, matches
 
@@ -57,13 +58,7 @@ class Table:
         return max(printed) if head.better > 0 else min(printed)
 
 
-SCORES = (
-    Column("lpips", "LPIPS", 3, -1),
-    Column("ssim", "SSIM", 3, 1),
-    Column("psnr", "PSNR", 2, 1),
-    Column("psnr_aligned", "aligned PSNR", 2, 1),
-    Column("wobble", "wobble px", 2, -1),
-)
+SCORES = tuple(Column(m.name, m.heading, m.digits, m.better) for m in METRICS)
 COSTS: tuple[tuple[Column, Callable[[Run], float]], ...] = (
     (Column("ms", "ms/frame", 1, -1), lambda run: next(iter(run.record["latency_ms"].values()))),
     (Column("gmac", "GMAC", 2), lambda run: run.record["model"]["macs_per_frame"] / 1e9),

@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -127,18 +128,9 @@ class Optics:
 
 
 def homography(source: Float[Tensor, "4 2"], target: Float[Tensor, "4 2"]) -> Float[Tensor, "3 3"]:
-    """Return the homography that maps four (x, y) points onto four others, float64.
-
-    Direct linear transform with the last element fixed at one (Hartley & Zisserman, 4.1).
-    """
-    rows, values = [], []
-    for (x, y), (u, v) in zip(source.double().tolist(), target.double().tolist(), strict=True):
-        rows += [[x, y, 1, 0, 0, 0, -u * x, -u * y], [0, 0, 0, x, y, 1, -v * x, -v * y]]
-        values += [u, v]
-    solution = torch.linalg.solve(
-        torch.tensor(rows, dtype=torch.float64), torch.tensor(values, dtype=torch.float64)
-    )
-    return torch.cat([solution, torch.ones(1, dtype=torch.float64)]).reshape(3, 3)
+    """Return the homography that maps four (x, y) points onto four others, float64."""
+    points = (part.float().numpy() for part in (source, target))
+    return torch.from_numpy(cv2.getPerspectiveTransform(*points))
 
 
 def _warp(frames: Tensor, matrix: Tensor, origin: tuple[int, int]) -> Tensor:

@@ -8,10 +8,9 @@ from pathlib import Path
 import torch
 from lightning import Callback, LightningModule, Trainer
 
+from src.metrics.table import NAMES
 from src.models import files
 from src.records.results import write_text
-
-SCORES = ("lpips", "ssim", "psnr", "psnr_aligned", "wobble")
 
 
 class Curve(Callback):
@@ -97,5 +96,5 @@ def scores(trainer: Trainer, module: LightningModule) -> dict[str, float]:
         sample = trainer.datamodule.on_after_batch_transfer(sample, 0)
         found += module.measure(sample.to(module.device))
     module.train()
-    names = [name for name in SCORES if name in module.scores.names]
+    names = [name for name in NAMES if name in module.scores.names]
     return {name: sum(clip[name] for clip in found) / len(found) for name in names}

@@ -1,7 +1,6 @@
 """One network on the test clips: scores per clip, cost and latency."""
 
 import time
-from dataclasses import dataclass
 
 import lightning
 import torch
@@ -10,20 +9,10 @@ from torch import nn
 from src.metrics.scores import Scores
 from src.models.cost import macs, macs_per_frame
 from src.models.unroll import video
+from src.records.results import Row
 from src.sim.pipeline import Sample
 from src.training.datamodule import LightFieldData
 from src.training.reconstructor import Reconstructor
-
-
-@dataclass(frozen=True)
-class Row:
-    """What a line of a table needs: scores of every clip with what was drawn for it, and cost."""
-
-    name: str
-    clips: list[dict]
-    params: int
-    macs_per_frame: int
-    latency_ms: dict[str, float]
 
 
 def test(

@@ -16,7 +16,7 @@ from src.models.checkpoints import newest, whole
 from src.models.e2vid import E2VID
 from src.recordings.files.formats import EVENT, write_events
 from src.records import results
-from src.training.evaluation import Row
+from src.records.results import Row
 from tests.faults import harness
 from tests.faults.harness import Run, Tally
 from tests.test_train import TINY, config

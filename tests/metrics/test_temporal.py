@@ -1,4 +1,4 @@
-"""Displacement, wobble, straightness and flicker on sequences whose motion is known."""
+"""Displacement, wobble and straightness on sequences whose motion is known."""
 
 import math
 
@@ -7,7 +7,7 @@ import skimage
 import torch
 from torch.nn import functional
 
-from src.metrics.temporal import displacement, flicker, residual, straightness, wobble
+from src.metrics.temporal import displacement, residual, straightness, wobble
 
 FRAMES, SIDE = 12, 128
 
@@ -76,12 +76,3 @@ def test_straightness_ignores_a_constant_offset():
     assert straightness(truth + torch.tensor([5.0, -3.0]), truth) < 1e-5
     wavy = truth + 0.5 * torch.tensor([[1.0, 0.0], [-1.0, 0.0]]).repeat(10, 1)
     assert math.isclose(straightness(wavy, truth), 0.5, rel_tol=1e-5)
-
-
-def test_flicker_counts_still_pixels_only():
-    target = torch.zeros(4, 1, 2, 2)
-    target[2, 0, 0, 0] = 1.0
-    frames = torch.zeros(4, 1, 2, 2)
-    frames[::2] = 0.2
-    assert math.isclose(flicker(frames, target), 0.1, rel_tol=1e-5)
-    assert flicker(frames, torch.rand(4, 1, 2, 2)) == 0.0

@@ -4,6 +4,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from src.app import build
 from src.app.parts import make
 from src.models import load, save
 from src.models.cost import macs_per_frame
@@ -11,6 +12,7 @@ from src.models.setnet import SIZES, PacedGRU, SetNet
 from src.models.unroll import unroll
 from src.sim.optics import layout
 from tests.conftest import ROOT
+from tests.test_train import config
 
 
 def small() -> SetNet:
@@ -28,8 +30,15 @@ def test_cost_and_config_of_each_size(size, giga):
     network = SetNet.preset(size)
     assert abs(macs_per_frame(network, 176, 176, views=9) / 1e9 - giga) < 0.02
     node = OmegaConf.load(ROOT / "conf" / "model" / f"setnet_{size}.yaml")
-    assert {name: node[name] for name in SIZES[size]} == SIZES[size]
-    assert isinstance(make(OmegaConf.merge(node, {"bins": 5})), SetNet)
+    made = make(OmegaConf.merge(node, {"bins": 5}))
+    assert isinstance(made, SetNet) and made.arguments == {"bins": 5} | SIZES[size]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_preset_is_stored_as_what_it_stands_for(size, tmp_path):
+    _, spec = build.network(config("train", tmp_path, f"experiment=setnet_{size}"))
+    target = "src.models.setnet.SetNet"
+    assert spec == {"target": target, "kwargs": {"bins": 5} | SIZES[size]}
 
 
 @pytest.mark.parametrize("views", [1, 2, 3, 4, 5, 9, 16, 25])

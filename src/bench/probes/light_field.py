@@ -1,4 +1,4 @@
-"""Probes of the light field itself: views lost, in the wrong order, out of place, late."""
+"""Probes of the light field itself: views lost or out of place, a scene that is near."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -40,25 +40,6 @@ class Lost:
 
 
 @dataclass(frozen=True)
-class Permuted:
-    """Aligned PSNR lost when the views come in another order than they are said to."""
-
-    draws: int = 3
-    limit: float = 0.5
-
-    def __call__(self, subject: Subject, bench: Bench) -> Finding:
-        """Return the worst loss over `draws` orders."""
-        subject.needs_views()
-        base, rng = bench.standard(subject), np.random.default_rng(1)
-        orders = [rng.permutation(subject.views).tolist() for _ in range(self.draws)]
-        losses = [
-            base - bench.over_clips(subject, bench.streams(), lambda x, o=order: x[:, o])
-            for order in orders
-        ]
-        return Finding(max(losses), "dB", self.limit)
-
-
-@dataclass(frozen=True)
 class Misplaced:
     """Aligned PSNR lost when one view lies so many `pixels` beside its place."""
 
@@ -78,31 +59,6 @@ class Misplaced:
 
             curve.append((shift, base - bench.over_clips(subject, bench.streams(), moved)))
         return Finding(dict(curve)[self.judged], "dB", self.limit, curve, "px out of place")
-
-
-@dataclass(frozen=True)
-class Late:
-    """Aligned PSNR lost when one view comes `windows` late."""
-
-    windows: int = 1
-    limit: float = 0.3
-
-    def __call__(self, subject: Subject, bench: Bench) -> Finding:
-        """Return the loss."""
-        subject.needs_views()
-        scores = [self._score(subject, bench, stream) for stream in bench.streams()]
-        loss = bench.standard(subject) - sum(scores) / len(scores)
-        return Finding(loss, "dB", self.limit)
-
-    def _score(self, subject: Subject, bench: Bench, stream: Stream) -> float:
-        shown = [window.clone() for window in stream.windows(stream.fps)]
-        view = _neighbour(subject, stream)
-        late = [torch.zeros_like(shown[0][:, view])] * self.windows
-        late += [window[:, view].clone() for window in shown]
-        for window, seen in zip(shown, late, strict=False):
-            window[:, view] = seen
-        frames, _ = subject.play(shown, stream.positions, 1 / stream.fps)
-        return bench.score(frames, stream.target[1:])
 
 
 @dataclass(frozen=True)

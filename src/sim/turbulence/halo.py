@@ -7,13 +7,12 @@ changes from point to point; what that neglects is measured by scripts/p2s_error
 
 import torch
 from jaxtyping import Float
+from scipy.fft import next_fast_len
 from torch import Tensor
 
 from src.sim.turbulence.blur import reflect
 from src.sim.turbulence.p2s import FINE_PER_AIRY
 from src.sim.turbulence.psf import resampling
-
-FAST = (2, 3, 5)  # the factors of a size that is quickly transformed
 
 
 class Halo:
@@ -45,20 +44,8 @@ class Halo:
         ]
         rows, columns = (side.to(frames.device) for side in sides)
         around = frames[:, rows][:, :, columns]
-        size = [_fast(len(side)) for side in sides]
+        size = [next_fast_len(len(side), real=True) for side in sides]
         spectrum = torch.fft.rfft2(self.shape.to(frames), s=size)
         light = torch.fft.irfft2(torch.fft.rfft2(around, s=size) * spectrum, s=size)
         far = 2 * self.reach
         return light[:, far : far + h, far : far + w].clamp(min=0)
-
-
-def _fast(size: int) -> int:
-    """Return the next size whose only prime factors are small."""
-    while True:
-        rest = size
-        for factor in FAST:
-            while rest % factor == 0:
-                rest //= factor
-        if rest == 1:
-            return size
-        size += 1

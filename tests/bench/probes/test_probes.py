@@ -125,8 +125,6 @@ def test_the_worst_input_of_a_sum_is_found(bench):
 def test_what_looks_at_the_centre_alone_minds_no_other_view(bench):
     subject = running()
     assert light_field.Misplaced()(subject, bench).value == pytest.approx(0, abs=1e-6)
-    assert light_field.Late()(subject, bench).value == pytest.approx(0, abs=1e-6)
-    assert light_field.Permuted()(subject, bench).value != 0
 
 
 @pytest.mark.parametrize("views", [2, 4])
@@ -134,12 +132,11 @@ def test_without_a_middle_the_centre_view_is_that_of_the_optics(views):
     bench, subject = Bench(pipeline(views=views), [0], 4), Subject("centre", HighPass(), views)
     assert light_field.Lost([1], 1)(subject, bench).value != 0  # the centre view is the one lost
     assert light_field.Misplaced()(subject, bench).value == 0
-    assert light_field.Late()(subject, bench).value == 0
 
 
 def test_the_view_beside_the_centre_is_one_the_network_sees(bench):
     subject = Subject("four of nine", HighPass(source="median"), 4)
-    assert light_field.Late()(subject, bench).value != 0
+    assert light_field.Misplaced()(subject, bench).value != 0
 
 
 def test_every_probe_runs_on_a_set_network(bench):
@@ -148,8 +145,8 @@ def test_every_probe_runs_on_a_set_network(bench):
     probes = [
         memory.Hold([3]), memory.LongRun(96), memory.StartUp(), memory.Shock(), memory.Still(),
         sampling.Rates([1200], 0.1), sampling.Thresholds([0.3]), sampling.FewerEvents([0.1]),
-        light_field.Lost([4], 1), light_field.Permuted(1),
-        light_field.Misplaced([2]), light_field.Late(), light_field.Parallax([1]),
+        light_field.Lost([4], 1),
+        light_field.Misplaced([2]), light_field.Parallax([1]),
         numerics.Growth(),
         numerics.WorstInput(2, 2), numerics.Bf16(8), air.SharedAir([0.0]), air.Gain([0.05]),
     ]  # fmt: skip

@@ -1,0 +1,24 @@
+"""One table of metrics: what is computed is named in it, and it needs no PyTorch."""
+
+import subprocess
+import sys
+
+from src.metrics.scores import MEASURES
+from src.metrics.table import METRICS, NAMES
+from tests.conftest import ROOT
+
+
+def test_every_metric_that_is_computed_has_a_line():
+    assert {*MEASURES, "lpips"} == set(NAMES) and len(NAMES) == len(set(NAMES))
+
+
+def test_the_line_says_how_a_value_is_written():
+    wobble = METRICS[-1]
+    assert wobble.written(1.236) == "1.24" and wobble.arrow == "↓" and wobble.written(None) == "-"
+
+
+def test_a_report_loads_no_training_stack():
+    code = "import sys, src.reports.margins; print(*sys.modules)"
+    run = [sys.executable, "-c", code]
+    loaded = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert not {"torch", "lightning"} & set(loaded.split())
