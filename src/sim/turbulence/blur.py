@@ -9,8 +9,6 @@ rounding is all they differ by.
 """
 
 import math
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
@@ -27,44 +25,34 @@ PIXELS = np.empty((0, 0, 0), np.float32), np.empty(0, np.int64)  # PSFs given pi
 
 def degrade(
     frames: Float[Tensor, "frames height width"],
-    seen: Sequence[tuple[Tensor, Tensor]],
+    tilt: Float[Tensor, "2 frames h w"],
+    nodes: Float[Tensor, "numbers frames rows columns"],
     size: int,
     spots: Spots | None,
     rows: Lattice,
     columns: Lattice,
     halo: Float[Tensor, "frames hout wout"],
     share: float,
-) -> Float[Tensor, "views frames hout wout"]:
-    """Warp the frames by each view's tilt, then scatter them by its PSFs and add their `halo`.
+) -> Float[Tensor, "frames hout wout"]:
+    """Warp the frames by `tilt` in pixels, then scatter them by PSFs and add their `halo`.
 
-    `seen`: of every view, its tilt in pixels (2, frames, h, w) over the window of `rows` and
-    `columns`, and on their nodes what its PSFs, `size` pixels across, are (numbers, frames, rows,
-    columns): weights for `spots` or, without them, every pixel.  The result lacks size // 2 pixels
-    on each side.  The halo of a white scene would be `share`.
+    The window is that of `rows` and `columns`; on their `nodes` stands what the PSFs, `size` pixels
+    across, are: weights for `spots` or, without them, every pixel.  The result lacks size // 2
+    pixels on each side.  The halo of a white scene would be `share`.
     """
     if frames.device.type != "cpu":
-        each = (_eager(frames, *both, spots, rows, columns, halo, share) for both in seen)
-        return torch.stack(list(each))
+        return _eager(frames, tilt, nodes, spots, rows, columns, halo, share)
     shapes = (spots.quarter, spots.ends) if spots else PIXELS
     place = (rows.offset, columns.offset, rows.pitch)
-
-    def one(tilt: Tensor, nodes: Tensor, index: int) -> Tensor:
+    light = []
+    for index in range(len(frames)):
         at = (index, rows.start, columns.start)
         tilted = warp_engine.warp(frames[index].numpy(), tilt.numpy(), *at)
-        if size == 1 and share == 0:
-            return torch.from_numpy(tilted)
-        psfs = (nodes.numpy(), index, size, *shapes, *place)
-        return torch.from_numpy(scatter_engine.scatter(tilted, *psfs, halo[index].numpy(), share))
-
-    # All is drawn before any thread starts: torch's own threads would wait for cores in use.
-    work = [(*each, index) for each in seen for index in range(len(frames))]
-    threads = min(torch.get_num_threads(), len(work))
-    if threads == 1:
-        light = [one(*each) for each in work]
-    else:
-        with ThreadPoolExecutor(threads) as pool:
-            light = [job.result() for job in [pool.submit(one, *each) for each in work]]
-    return torch.stack(light).unflatten(0, (-1, len(frames)))
+        if size > 1 or share > 0:
+            psfs = (nodes.numpy(), index, size, *shapes, *place)
+            tilted = scatter_engine.scatter(tilted, *psfs, halo[index].numpy(), share)
+        light.append(torch.from_numpy(tilted))
+    return torch.stack(light)
 
 
 def _eager(

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from itertools import product
 
 import torch
 from jaxtyping import Complex, Float
@@ -18,13 +19,14 @@ from src.sim.turbulence.lattice import Lattice
 from src.sim.turbulence.p2s import Spots
 from src.sim.turbulence.phase import Field, Waves, draw_waves, evolve, flow, look_from
 from src.sim.turbulence.psf import fraunhofer_psf
+from src.sim.turbulence.threads import in_threads
 
 Crop = tuple[int, int, int, int]  # top, left, height, width
 TEMPORAL = ("ar1", "flow", "mixed")
 OWN_WIND = 0.5  # rms of a layer's own wind over the wind that all layers share
 WAVES = 384
 TILE = 320  # pixels; larger pictures are made tile by tile, to bound the memory
-CHUNK, GROUP = 6_000_000, 60_000_000  # numbers at the nodes of a view, and of all, at a time
+CHUNK = 2_000_000  # numbers at the nodes of a view at a time
 
 
 class Turbulence:
@@ -147,22 +149,22 @@ class Turbulence:
         lines = self.fidelity.rank or self.fidelity.kernel**2
         numbers = max(2, lines) * (height + 2 * reach) * (width + 2 * reach)
         step = max(1, CHUNK // numbers)
-        group = max(1, GROUP // (step * numbers))
-        for first in range(0, len(frames), step):
-            for view in range(0, len(moving), group):
-                some = moving[view : view + group, first : first + step]
-                out[view : view + group, first : first + step] = blur.degrade(
-                    frames[first : first + step],
-                    [
-                        (self._tilt_px * tilt.at_pixels(c), self._nodes(rest.at_nodes(c)))
-                        for c in some
-                    ],
-                    self.fidelity.kernel,
-                    self.spots,
-                    *lattices,
-                    halo[first : first + step],
-                    self.halo.share,
-                )
+
+        def one(view: int, first: int) -> None:
+            part = slice(first, first + step)
+            amplitudes = moving[view, part]
+            out[view, part] = blur.degrade(
+                frames[part],
+                self._tilt_px * tilt.at_pixels(amplitudes),
+                self._nodes(rest.at_nodes(amplitudes)),
+                self.fidelity.kernel,
+                self.spots,
+                *lattices,
+                halo[part],
+                self.halo.share,
+            )
+
+        in_threads(one, product(range(len(moving)), range(0, len(frames), step)), device)
 
     def _nodes(
         self, phase: Float[Tensor, "blurmodes frames rows columns"]

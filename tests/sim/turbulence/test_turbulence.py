@@ -78,6 +78,21 @@ def test_law_3_a_frame_does_not_depend_on_later_ones():
     torch.testing.assert_close(turbulence.degrade(frames[:, :2], seed()), whole[:, :, :2])
 
 
+@pytest.mark.parametrize("strength", [0.5, 4.0])
+def test_any_number_of_threads_gives_the_same_bits(strength):
+    frames, turbulence = torch.rand(1, 3, 64, 64), operator(strength, views=4)
+    before, seen = torch.get_num_threads(), []
+    try:
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            seen.append(turbulence.degrade(frames, seed()))
+            assert torch.get_num_threads() == count
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(seen[0], seen[1])
+    assert torch.equal(seen[0], seen[2])
+
+
 @pytest.mark.parametrize("strength", [0.5, 2.0, 6.0])
 @pytest.mark.parametrize("crop", [(0, 0, 32, 40), (17, 9, 33, 48), (63, 63, 1, 1)])
 def test_law_5_a_crop_is_the_crop_of_the_whole(strength, crop):
@@ -172,7 +187,7 @@ def test_eager_expressions_equal_the_compiled_ones(pitch, fitted):
     if not fitted:
         spots, nodes = None, spots.psfs(nodes)
     halo = 0.2 * torch.rand(2, 34, 31)
-    [ours] = blur.degrade(frames, [(tilt, nodes)], 7, spots, rows, columns, halo, 0.1)
+    ours = blur.degrade(frames, tilt, nodes, 7, spots, rows, columns, halo, 0.1)
     tilted = blur.warp(frames, tilt, -3, 2)
     lines = nodes @ columns.weights().T
     psfs = spots.psfs(lines) if fitted else lines

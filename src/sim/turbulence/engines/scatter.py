@@ -23,6 +23,8 @@ def scatter(image, nodes, frame, size, shapes, ends, row, column, pitch, halo, s
     below = np.empty((size, size, width if pitch > 1 else 0), np.float32)
     lines = np.empty((nodes.shape[0], width), np.float32)
     sums = np.empty((4, width), np.float32)
+    cells = (np.arange(width) + column) // pitch
+    lates = ((np.arange(width) + column - cells * pitch) / pitch).astype(np.float32)
     last, current = nodes.shape[2] - 1, -2
     for y in range(height):
         cell = (y + row) // pitch
@@ -30,10 +32,10 @@ def scatter(image, nodes, frame, size, shapes, ends, row, column, pitch, halo, s
         if cell != current:
             above, below = (below, above) if pitch > 1 else (above, below)
             if cell != current + 1 or pitch == 1:
-                _stretch(nodes, frame, cell, column, pitch, lines)
+                _stretch(nodes, frame, cell, pitch, cells, lates, lines)
                 _draw(lines, shapes, ends, sums, above)
             if pitch > 1:
-                _stretch(nodes, frame, min(cell + 1, last), column, pitch, lines)
+                _stretch(nodes, frame, min(cell + 1, last), pitch, cells, lates, lines)
                 _draw(lines, shapes, ends, sums, below)
             current = cell
         for v in range(max(0, size - 1 - y), min(size, height - y)):
@@ -46,19 +48,17 @@ def scatter(image, nodes, frame, size, shapes, ends, row, column, pitch, halo, s
 
 
 @njit(nogil=True, cache=True, fastmath=True)
-def _stretch(nodes, frame, row, column, pitch, lines):
-    """Interpolate one row of nodes along x to the pixels."""
-    width, count = lines.shape[1], nodes.shape[3]
+def _stretch(nodes, frame, row, pitch, cells, lates, lines):
+    """Interpolate one row of nodes along x to the pixels, each `lates` of the way in its cell."""
+    width, end = lines.shape[1], nodes.shape[3] - 1
     for i in range(lines.shape[0]):
         node, line = nodes[i, frame, row], lines[i]
         if pitch == 1:
-            for x in range(width):
-                line[x] = node[x]
+            line[:] = node
             continue
         for x in range(width):
-            cell = (x + column) // pitch
-            late = np.float32((x + column - cell * pitch) / pitch)
-            line[x] = node[cell] + late * (node[min(cell + 1, count - 1)] - node[cell])
+            low, high = node[cells[x]], node[min(cells[x] + 1, end)]
+            line[x] = low + lates[x] * (high - low)
 
 
 @njit(nogil=True, cache=True, fastmath=True)
@@ -135,14 +135,18 @@ def _add(light, white, image, psfs):
 def _add_between(light, white, image, above, below, late):
     """Add one row of sources whose PSFs lie `late` of the way between two rows of them."""
     size, width = above.shape[0], light.shape[0]
-    for u in range(size):
+    for u in range(0, size - 1, 2):
         o = size - 1 - u
-        early, after, source = (
-            above[u, o : o + width],
-            below[u, o : o + width],
-            image[o : o + width],
-        )
+        first, after = above[u, o : o + width], below[u, o : o + width]
+        second, behind = above[u + 1, o - 1 : o - 1 + width], below[u + 1, o - 1 : o - 1 + width]
+        one, two = image[o : o + width], image[o - 1 : o - 1 + width]
         for x in range(width):
-            psf = early[x] + late * (after[x] - early[x])
-            white[x] += psf
-            light[x] += psf * source[x]
+            a = first[x] + late * (after[x] - first[x])
+            b = second[x] + late * (behind[x] - second[x])
+            white[x] += a + b
+            light[x] += a * one[x] + b * two[x]
+    first, after = above[size - 1], below[size - 1]
+    for x in range(width):
+        a = first[x] + late * (after[x] - first[x])
+        white[x] += a
+        light[x] += a * image[x]
