@@ -116,13 +116,13 @@ class RecordedAir:
         top, left, height, width = crop or (0, 0, *self.size)
         window = (top - reach, left - reach, height + 2 * reach, width + 2 * reach)
         rows, columns = (Lattice(window[k], window[k + 2], FAR, 1) for k in (0, 1))
-        nodes = (count, len(rows.pixels), *kernel.shape, len(columns.pixels))
-        kernels = kernel[:, :, None].expand(nodes).contiguous()
+        nodes = (count, len(rows.pixels), len(columns.pixels))
+        psfs = kernel.flatten()[:, None, None, None].expand(-1, *nodes).contiguous()
         halo = torch.zeros(count, height, width, device=device)
-        out = []
+        around, out = (len(kernel), None, rows, columns, halo, 0.0), []
         for clip in frames.float():
-            seen = ((one.to(device), kernels) for one in self.tilt(count, generator, crop=window))
-            out.append(blur.degrade(clip, seen, rows, columns, halo, 0.0))
+            tilt = self.tilt(count, generator, crop=window).transpose(1, 2).to(device)
+            out.append(blur.degrade(clip, [(one, psfs) for one in tilt], *around))
         return torch.stack(out)
 
     def tilt(
