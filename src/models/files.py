@@ -27,15 +27,17 @@ LARGEST = 4096  # any number in the arguments of a network that a file names
 def load(name_or_path: str | Path, rooms: Sequence[str] = ()) -> nn.Module:
     """Return the network of a file, float32, in eval mode, spectral norm folded into its weights.
 
-    A word names a file of `weights/`; a path is a `.safetensors` file written by `save` or a
-    checkpoint of a training run; its network is of src.models, baselines or one of the packages
-    `rooms`.  Raises ValueError, beginning with `ckpt`, for a file that is not
-    there, is no such file, or holds other weights than its network has.
+    A word names a file of `weights/`; a path is a `.safetensors` file written by `save`, a
+    checkpoint of a training run or its folder; its network is of src.models, baselines or one of
+    the packages `rooms`.  Raises ValueError, beginning with `ckpt`, for a file that is not there,
+    is no such file, or holds other weights than its network has.
     """
     path = Path(name_or_path)
     shipped = WEIGHTS / f"{name_or_path}.safetensors"
     if not path.is_file() and shipped.is_file():
         path = shipped
+    if path.is_dir():
+        path = newest(path)
     if not path.is_file():
         names = ", ".join(sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))) or "none yet"
         raise ValueError(f"ckpt must be a file or one of weights/ ({names}), got {name_or_path}")

@@ -19,6 +19,8 @@ from src.recordings.engines.decode import adopt
 from src.recordings.files import aedat, tables
 
 EVENT = np.dtype([("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)])
+# Endings that are read here, by modules with `pieces(path)` and `size(path)` as tables.py has them.
+READERS = dict.fromkeys(tables.SUFFIXES, tables)
 BINARY = {".raw": "evt", ".dat": "dat", ".aedat4": "aedat", ".es": "es"}
 SENSORS = {"gen3": (640, 480), "gen4": (1280, 720), "imx636": (1280, 720), "genx320": (320, 320)}
 SIDE_MAX = 2**16  # pixels: coordinates have 16 bits
@@ -63,8 +65,8 @@ def open_events(path: str | Path, size: tuple[int, int] | None = None) -> Record
     path = Path(path)
     if not path.is_file() or path.stat().st_size == 0:
         raise ValueError(f"{path}: {'the file is empty' if path.is_file() else 'no such file'}")
-    if path.suffix not in (*BINARY, *tables.SUFFIXES):
-        known = ", ".join((*BINARY, *tables.SUFFIXES))
+    if path.suffix not in (*BINARY, *READERS):
+        known = ", ".join((*BINARY, *READERS))
         raise ValueError(f"{path}: unknown kind of event file, known are {known}")
     size = _size(path) or size
     if size is not None and not all(1 <= side <= SIDE_MAX for side in size):
@@ -162,8 +164,8 @@ def _check_writable(path, t, x, y, p, width, height, version) -> None:
 
 def _pieces(path: Path) -> Iterator[tuple]:
     """Yield (t, x, y, p) of a file piece by piece; p is ON where positive."""
-    if path.suffix in tables.SUFFIXES:
-        yield from tables.pieces(path)
+    if path.suffix in READERS:
+        yield from READERS[path.suffix].pieces(path)
         return
     if path.suffix in (".raw", ".dat") and len(_header(path)) == path.stat().st_size:
         return  # a recording without events
@@ -234,8 +236,8 @@ def _evt_version(path: Path) -> str:
 
 def _size(path: Path) -> tuple[int, int] | None:
     """Return (width, height) as the file states it, or None."""
-    if path.suffix in tables.SUFFIXES:
-        return tables.size(path)
+    if path.suffix in READERS:
+        return READERS[path.suffix].size(path)
     if path.suffix in (".es", ".aedat4"):
         return _decoder(path).dimensions()
     header = _header(path).decode("latin-1").lower()

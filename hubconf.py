@@ -1,0 +1,49 @@
+"""Shipped networks for code of one's own, without the rest of the repository:
+
+    net = torch.hub.load("<folder of this repository>", "setnet_small", source="local")
+    frame, state = net(voxels, state)
+
+`voxels` (n, views, bins, h, w): sums of polarity in `bins` hat functions over a window
+(docs/conventions.md); `frame` (n, 1, h, w) in [0, 1]; `state` None starts a sequence.  The networks
+are float32 and in eval mode.  What each was trained and tested on: weights/<name>.md.
+"""
+
+from torch import nn
+
+from src import models
+
+dependencies = ["torch", "numpy", "jaxtyping", "safetensors", "lightning"]
+
+
+def setnet_small() -> nn.Module:
+    """Any number of views at any rate; 0.4 GMAC a frame of 176 x 176 with nine views.
+
+    Takes `window_s`, the length of a window in seconds (1/120), and `positions`, the (row, col) of
+    every view.
+    """
+    return models.load("setnet_small")
+
+
+def setnet_medium() -> nn.Module:
+    """As `setnet_small`, 0.8 GMAC."""
+    return models.load("setnet_medium")
+
+
+def setnet_large() -> nn.Module:
+    """As `setnet_small`, 3 GMAC."""
+    return models.load("setnet_large")
+
+
+def lf3x3() -> nn.Module:
+    """E2VID with the nine views of a 3x3 light field stacked, row by row (the paper's)."""
+    return models.load("lf3x3")
+
+
+def single256() -> nn.Module:
+    """E2VID of one view, trained through turbulence (the paper's baseline)."""
+    return models.load("single256")
+
+
+def network(name: str) -> nn.Module:
+    """The network of a name in weights/, such as clean/etnet, or of a path; ValueError for none."""
+    return models.load(name)
