@@ -21,7 +21,7 @@ from src.sim.turbulence.psf import resampling
 
 FILE = Path(__file__).with_suffix(".safetensors")
 FINE_PER_AIRY = 2.0  # samples of the basis per lambda / D: an intensity is band-limited to this
-CHUNK = 8192  # nodes at a time, so that the hidden layers stay in the cache
+CHUNK = 2048  # nodes at a time, so that the hidden layers stay in the cache
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from src.sim.turbulence.lattice import Lattice
 from src.sim.turbulence.zernike import SPECTRUM, noll_index, pupil_filter
 
 LOW, HIGH = 0.08, 0.32  # limits of the three power laws that kappa is drawn from; HIGH per (n + 1)
-FAINT = 1e-4  # of the variance of the modes of an order
+FAINT = 1e-4, 3e-3  # of the variance of the modes of an order, tilt and the rest, left out
 DEPTH = 1.0  # waves are drawn with the density Cn2 (1 - z/L)^DEPTH
 SHARES = (0.25, 0.65, 0.10)  # of the waves below LOW, between, above HIGH
 
@@ -87,7 +87,8 @@ class Field:
 
     `size` is the frame's (height, width); the axis of the camera goes through its middle.  A wave
     on a lattice is its rows times its columns, so the sum over waves is a product of matrices, one
-    for all modes of an order n, over the waves which that order sees.
+    for all modes of an order n, over the waves which that order sees; of the columns only half is
+    computed, since what is even about the middle column and what is odd serve the other half too.
     """
 
     def __init__(
@@ -99,16 +100,21 @@ class Field:
         size: tuple[int, int],
         device: torch.device,
     ):
-        response = torch.view_as_complex(waves.response[modes]).to(device, torch.complex64)
-        down = _turns(waves.frequency[:, 1], rows, size[0]).T.to(device)
-        across = _turns(waves.frequency[:, 0], columns, size[1]).to(device)
-        across = torch.view_as_real(across.conj().resolve_conj()).transpose(1, 2)
+        response = torch.view_as_complex(waves.response[modes])
+        middle = (columns.pixels[0] + columns.pixels[-1]) / 2
+        response = response * _turns(waves.frequency[:, 0], middle - (size[1] - 1) / 2)
+        down = _turns(waves.frequency[:, 1], rows.pixels - (size[0] - 1) / 2)
+        half = columns.pixels[len(columns.pixels) // 2 :] - middle
+        across = _turns(waves.frequency[:, 0], half)
         self.orders = []
         for own in _orders(modes.start or 0, len(response)):
-            seen = _seen(response[own])
-            parts = response[own][:, seen], down[:, seen], across[seen].flatten(0, 1)
-            self.orders.append((own, seen, *(part.contiguous() for part in parts)))
-        self.shape = (len(response), len(down), across.shape[-1])
+            seen = _seen(response[own], FAINT[own.start + (modes.start or 0) > 1])
+            tables = down[seen].T, across[seen]
+            parts = [part.contiguous() for table in tables for part in (table.real, table.imag)]
+            parts = [part.to(device, torch.float32) for part in parts]
+            own_response = response[own][:, seen].to(device, torch.complex64)
+            self.orders.append((own, seen, own_response, *parts))
+        self.shape = (len(response), len(rows.pixels), len(columns.pixels))
         self.rows, self.columns, self.device = rows, columns, device
 
     def at_nodes(
@@ -117,10 +123,15 @@ class Field:
         """Return the coefficients on the nodes: Re sum_m c_m w_m Q_j exp(2 pi i f_m . x)."""
         modes, rows, columns = self.shape
         out = torch.empty(modes, len(amplitudes), rows, columns, device=self.device)
-        for own, seen, response, down, across in self.orders:
-            turn = response[:, None] * amplitudes[:, seen]
-            lines = torch.view_as_real(turn[:, :, None] * down).flatten(3).flatten(0, 2)
-            torch.mm(lines, across, out=out[own].view(-1, columns))
+        left = columns // 2
+        for own, seen, response, cos_down, sin_down, cos, sin in self.orders:
+            turn = (response[:, None] * amplitudes[:, seen])[:, :, None]
+            real, imag = turn.real.contiguous(), turn.imag.contiguous()
+            even = (real * cos_down).addcmul_(imag, sin_down, value=-1).flatten(0, 2) @ cos
+            odd = (real * sin_down).addcmul_(imag, cos_down).flatten(0, 2) @ sin
+            lines = out[own].view(-1, columns)
+            torch.sub(even, odd, out=lines[:, left:])
+            lines[:, :left] = even.add_(odd)[:, columns % 2 :].flip(1)
         return out
 
     def at_pixels(
@@ -183,17 +194,18 @@ def _orders(first: int, count: int) -> list[slice]:
     return [slice(*pair) for pair in pairwise(edges)]
 
 
-def _seen(response: Complex[Tensor, "modes waves"]) -> Int[Tensor, " some"]:
-    """Return the waves that make up the modes' variance, all but FAINT of it."""
+def _seen(response: Complex[Tensor, "modes waves"], faint: float) -> Int[Tensor, " some"]:
+    """Return the waves that make up the modes' variance, all but `faint` of it."""
     share = response.abs().square().sum(0)
     strength, order = share.sort()
-    kept = order[strength.cumsum(0) > FAINT * strength.sum()]
+    kept = order[strength.cumsum(0) > faint * strength.sum()]
     return kept.sort().values
 
 
-def _turns(frequency: Tensor, lattice: Lattice, size: int) -> Tensor:
-    place = lattice.pixels.double() - (size - 1) / 2
-    return torch.exp(2j * math.pi * frequency[:, None] * place).to(torch.complex64)
+def _turns(frequency: Tensor, place: Tensor) -> Complex[Tensor, "waves ..."]:
+    """Return exp(2 pi i f x) of every wave at every place in pixels, in complex128."""
+    place = torch.as_tensor(place).double()
+    return torch.exp(2j * math.pi * frequency.reshape(-1, *[1] * place.ndim) * place)
 
 
 def _sequence(key: int, count: int) -> Float[Tensor, "count 3"]:
