@@ -1,7 +1,8 @@
 """What is drawn against what is measured: python -m scripts.air_prior [air.yaml ...].
 
-Prints quantiles of the draws of each severity and of the rigid prior, and draws
-docs/figures/air.png: rms tilt against its half length.  `air.yaml` files are those of
+Prints quantiles of the draws of each severity, of the rigid prior and of the clips of
+data=test_photos, and draws docs/figures/air.png: rms tilt against its half length.
+`air.yaml` files are those of
 `python -m src.calibrate task=air`, shown with their intervals.
 """
 
@@ -11,14 +12,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from hydra import compose, initialize_config_dir
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from src.app import build
 from src.figures.plots import save
 from src.recordings.files import plain
 from src.sim.turbulence import Atmosphere, sample_atmosphere
 from src.sim.turbulence.rigid import rigid_atmosphere
 
+CONF = Path(__file__).resolve().parents[1] / "conf"
 COUNT, WIDTH = 400, 256
 COLOURS = {"weak": "tab:green", "medium": "tab:orange", "strong": "tab:red", "rigid": "0.75"}
 FARTHEST = 2000.0  # px; what is longer is drawn there
@@ -47,9 +51,19 @@ def draws() -> dict[str, list[Atmosphere]]:
     return found | {"rigid": rigid}
 
 
+def protocol() -> dict[str, list[Atmosphere]]:
+    """Return the atmospheres of the clips of data=test_photos, by severity."""
+    with initialize_config_dir(str(CONF), version_base=None):
+        cfg = compose("eval", overrides=["data=test_photos", "paths.run=."])
+    pipeline = build.pipeline(cfg, "test")
+    paths = [pipeline.draw(number).air for number in range(cfg.data.test_clips)]
+    names = sorted({path.severity for path in paths}, key=("weak", "medium", "strong").index)
+    return {f"test, {n}": [path for path in paths if path.severity == n] for n in names}
+
+
 def table(found: Mapping[str, Sequence[Atmosphere]]) -> str:
     """Return the 10, 50 and 90 % quantiles of every column as Markdown."""
-    lines = [f"| 10 / 50 / 90 % of {COUNT} | " + " | ".join(COLUMNS) + " |"]
+    lines = ["| 10 / 50 / 90 % | " + " | ".join(COLUMNS) + " |"]
     lines.append("|---" * (len(COLUMNS) + 1) + "|")
     for name, paths in found.items():
         cells = []
@@ -58,7 +72,7 @@ def table(found: Mapping[str, Sequence[Atmosphere]]) -> str:
             cells.append(
                 " / ".join(f"{value:.2g}" if value < 100 else f"{value:.0f}" for value in values)
             )
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+        lines.append(f"| {name} ({len(paths)}) | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
@@ -93,5 +107,5 @@ def draw(found: Mapping[str, Sequence[Atmosphere]], measured: Sequence[Path], pa
 
 if __name__ == "__main__":
     atmospheres = draws()
-    print(table(atmospheres))
+    print(table(atmospheres | protocol()))
     draw(atmospheres, [Path(name) for name in sys.argv[1:]], Path("docs/figures/air.png"))
