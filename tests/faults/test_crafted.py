@@ -20,7 +20,7 @@ from baselines.firenet import FireNet
 from src.models import files
 from src.recordings import views
 from src.recordings.calibration import alignment
-from src.recordings.files import aedat, formats, plain, sources, tables
+from src.recordings.files import aedat, formats, plain, sources
 from src.sim.scenes import photographs, pictures, videos
 from src.sim.scenes.pictures import LARGEST_PIXELS
 from src.simulate import alike
@@ -165,7 +165,7 @@ def test_an_archive_does_not_unpack_without_bound(tmp_path, column):
     with pytest.raises(ValueError, match="unpacks to"):
         formats.read_events(tmp_path / "a.npz")
     with pytest.raises(ValueError, match="unpacks to"):
-        tables.size(tmp_path / "a.npz")
+        columns.size(tmp_path / "a.npz")
 
 
 def test_a_picture_does_not_unpack_without_bound(tmp_path):
