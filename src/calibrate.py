@@ -7,7 +7,7 @@ import rich
 from omegaconf import DictConfig, OmegaConf
 
 from src.app import build, door
-from src.recordings.calibration import tasks as calibration
+from src.app import tasks as calibration
 from src.records import results
 
 

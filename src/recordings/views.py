@@ -19,8 +19,8 @@ import yaml
 from jaxtyping import Float
 
 from src.recordings.files import plain
+from src.recordings.files.sources import Size
 
-Size = tuple[int, int]
 LARGEST_SIDE = 8192
 MOST_PIXELS = 2**24  # of a sensor, and of all views' pictures together
 SEEN = 0.75  # the share of a view that has to lie on the sensor

@@ -20,7 +20,7 @@ from baselines.firenet import FireNet
 from src.models import files
 from src.recordings import views
 from src.recordings.calibration import alignment
-from src.recordings.files import aedat, formats, plain, sources, tables
+from src.recordings.files import aedat, columns, formats, plain, sources
 from src.sim.scenes import photographs, pictures, videos
 from src.sim.scenes.pictures import LARGEST_PIXELS
 from src.simulate import alike
@@ -160,12 +160,12 @@ def test_a_table_leads_to_no_other_file(tmp_path):
 
 @pytest.mark.parametrize("column", ["t", "size"])
 def test_an_archive_does_not_unpack_without_bound(tmp_path, column):
-    columns = dict.fromkeys("txyp", np.zeros(9, np.int64)) | {column: np.zeros(30_000_000)}
-    np.savez_compressed(tmp_path / "a.npz", **columns)
+    packed = dict.fromkeys("txyp", np.zeros(9, np.int64)) | {column: np.zeros(30_000_000)}
+    np.savez_compressed(tmp_path / "a.npz", **packed)
     with pytest.raises(ValueError, match="unpacks to"):
         formats.read_events(tmp_path / "a.npz")
     with pytest.raises(ValueError, match="unpacks to"):
-        tables.size(tmp_path / "a.npz")
+        columns.size(tmp_path / "a.npz")
 
 
 def test_a_picture_does_not_unpack_without_bound(tmp_path):

@@ -15,12 +15,12 @@ import faery
 import numpy as np
 from faery.file_encoder import events_to_file
 
-from src.recordings.engines.decode import adopt
-from src.recordings.files import aedat, tables
+from src.recordings.files import aedat, columns
+from src.recordings.files.engines.decode import adopt
 
 EVENT = np.dtype([("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)])
-# Endings that are read here, by modules with `pieces(path)` and `size(path)` as tables.py has them.
-READERS = dict.fromkeys(tables.SUFFIXES, tables)
+# Endings read here, by modules with `pieces(path)` and `size(path)` as columns.py has them.
+READERS = dict.fromkeys(columns.SUFFIXES, columns)
 BINARY = {".raw": "evt", ".dat": "dat", ".aedat4": "aedat", ".es": "es"}
 SENSORS = {"gen3": (640, 480), "gen4": (1280, 720), "imx636": (1280, 720), "genx320": (320, 320)}
 SIDE_MAX = 2**16  # pixels: coordinates have 16 bits
@@ -130,8 +130,8 @@ def write_events(
     t, x, y, p = (events[name] for name in "txyp")
     _check_writable(path, t, x, y, p, width, height, version)
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix in tables.SUFFIXES:
-        tables.write(path, events, (width, height))
+    if path.suffix in columns.SUFFIXES:
+        columns.write(path, events, (width, height))
         return
     listed = np.empty(len(events), faery.EVENTS_DTYPE)
     listed["t"], listed["x"], listed["y"], listed["on"] = t, x, y, p > 0
@@ -145,7 +145,7 @@ def write_events(
 
 
 def _check_writable(path, t, x, y, p, width, height, version) -> None:
-    if path.suffix not in (*BINARY, *tables.SUFFIXES) or version not in ("evt2", "evt3"):
+    if path.suffix not in (*BINARY, *columns.SUFFIXES) or version not in ("evt2", "evt3"):
         raise ValueError(f"{path}: cannot write {path.suffix or 'no ending'} of version {version}")
     if len(t) == 0:
         return

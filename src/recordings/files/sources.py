@@ -9,10 +9,10 @@ import h5py
 import numpy as np
 from jaxtyping import Float
 
-from src.recordings.files import formats, tables
-from src.recordings.views import Size
+from src.recordings.files import columns, formats
 from src.sim.scenes.pictures import LARGEST_PIXELS, open_video, read_picture
 
+Size = tuple[int, int]  # height, width
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 FILMS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".gif")
 
@@ -96,7 +96,7 @@ def _frames(path: Path) -> Iterator[np.ndarray]:
 def _video_h5(path: Path) -> Iterator[np.ndarray]:
     try:
         with h5py.File(path) as file:
-            tables.check_inside(file)
+            columns.check_inside(file)
             frames = file["frames"]
             if frames.ndim != 3 or frames.dtype != np.uint8:
                 raise ValueError("frames must be uint8 (n, h, w)")

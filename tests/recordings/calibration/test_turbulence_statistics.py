@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
+from src.app import tasks as calibration
 from src.recordings import capture, lookup
 from src.recordings.calibration import dots, statistics
-from src.recordings.calibration import tasks as calibration
 from src.sim import noise
 from src.sim.optics import layout
 from src.sim.turbulence.atmosphere import Atmosphere
