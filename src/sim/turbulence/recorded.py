@@ -21,6 +21,7 @@ from src.sim.turbulence import blur
 from src.sim.turbulence.fields import Fields, fields
 from src.sim.turbulence.lattice import Lattice
 from src.sim.turbulence.model import Crop
+from src.sim.turbulence.threads import in_threads
 
 PLACES, STRETCHES = 2, 3  # pieces of the footage: PLACES x PLACES in the picture, STRETCHES in time
 FAR = 4096  # pixels between the nodes of a blur that is the same everywhere
@@ -119,11 +120,17 @@ class RecordedAir:
         nodes = (count, len(rows.pixels), len(columns.pixels))
         psfs = kernel.flatten()[:, None, None, None].expand(-1, *nodes).contiguous()
         halo = torch.zeros(count, height, width, device=device)
-        around, out = (len(kernel), None, rows, columns, halo, 0.0), []
-        for clip in frames.float():
+        around = (len(kernel), None, rows, columns, halo, 0.0)
+        out = torch.empty(len(frames), len(self.views), count, height, width, device=device)
+        for index, clip in enumerate(frames.float()):
             tilt = self.tilt(count, generator, crop=window).transpose(1, 2).to(device)
-            out.append(blur.degrade(clip, [(one, psfs) for one in tilt], *around))
-        return torch.stack(out)
+            pieces = zip(out[index], tilt.contiguous(), strict=True)
+            in_threads(
+                lambda seen, one, clip=clip: seen.copy_(blur.degrade(clip, one, psfs, *around)),
+                pieces,
+                device,
+            )
+        return out
 
     def tilt(
         self, frames: int, generator: torch.Generator, *, crop: Crop | None = None
