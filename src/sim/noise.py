@@ -34,14 +34,17 @@ def base_key(generator: torch.Generator) -> int:
     return int(torch.randint(2**62, (), generator=generator))
 
 
-def bits(key: int, counters: Int[Tensor, "..."]) -> Int[Tensor, "..."]:
-    """Return 32 random bits per counter as int64 in [0, 2**32); `counters` are in [0, 2**63)."""
+def bits(key: int | Int[Tensor, "..."], counters: Int[Tensor, "..."]) -> Int[Tensor, "..."]:
+    """Return 32 random bits per counter as int64 in [0, 2**32); `counters` are in [0, 2**63).
+
+    Keys that are a tensor are broadcast with the counters.
+    """
     low, high = key & MASK, (key >> 32) & MASK
     mixed = _mix((counters & MASK) ^ low)
     return _mix((mixed + (counters >> 32) * 0x9E3779B9 + high) & MASK)
 
 
-def uniform(key: int, counters: Int[Tensor, "..."]) -> Float[Tensor, "..."]:
+def uniform(key: int | Int[Tensor, "..."], counters: Int[Tensor, "..."]) -> Float[Tensor, "..."]:
     """Return float32 uniforms in the open interval (0, 1), from the upper 23 bits."""
     return ((bits(key, counters) >> 9).to(torch.float32) + 0.5) * 2.0**-23
 

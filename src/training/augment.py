@@ -1,6 +1,6 @@
 """Training augmentation of voxel sequences (Rebecq et al. 2019; Stoffregen et al. 2020; the paper).
 
-Order: pause, flips, misplaced views, noise, hot pixels, dropped views.  Crops are drawn before the
+Order: pause, turn, misplaced views, noise, hot pixels, dropped views.  Crops are drawn before the
 simulation (sim/pipeline.py).  Every draw comes from the key of the sample, so a batch is the same
 in any worker.
 """
@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from src.sim import noise
+from src.sim.optics import Position, layout
 from src.sim.pipeline import Sample
 
 
@@ -24,7 +25,8 @@ class Augment:
     `hot_std`: standard deviation of a hot pixel's value, the same in all bins, views and windows.
     `pause`: probability that a running sequence pauses at a window; `stay`: that a paused one
     stays paused.
-    `flip`: probability of a flip, for each axis.
+    `flip`: probability of a flip, for each axis; `transpose`: that rows and columns change places.
+    The views of a grid change places with their pictures.
     `misplaced`: probability of a view to lie up to `misplaced_px` whole pixels off, in each axis.
     `dropped`: probability of a batch to lose views, any of them, one or more but never all.
     """
@@ -35,12 +37,13 @@ class Augment:
     pause: float = 0.05
     stay: float = 0.9
     flip: float = 0.5
+    transpose: float = 0.0
     misplaced: float = 0.0
     misplaced_px: int = 2
     dropped: float = 0.0
 
     def __post_init__(self):
-        for name in ("hot_fraction", "pause", "stay", "flip", "misplaced", "dropped"):
+        for name in ("hot_fraction", "pause", "stay", "flip", "transpose", "misplaced", "dropped"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"augment.{name} must be in [0, 1], got {getattr(self, name)}")
         for name in ("noise_std", "hot_std"):
@@ -61,14 +64,16 @@ class Augment:
             sample.voxels.shape[1], self.pause, self.stay, noise.key(key, "pause")
         )
         axes = flip_axes(self.flip, noise.key(key, "flip"))
-        voxels = sample.voxels[index, steps]
+        swap = float(noise.uniform(noise.key(key, "transpose"), torch.tensor(0))) < self.transpose
+        order = turned_views(sample.positions, sample.voxels.shape[2], axes, swap)
+        voxels = sample.voxels[index][steps[:, None], order]  # a copy, which the rest works on
         voxels[paused] = 0
-        voxels = voxels.flip(axes) if axes else voxels
+        voxels = turned(voxels, axes, swap)
         place = noise.key(key, "misplaced")
         voxels = misplace(voxels, self.misplaced, self.misplaced_px, place)
         voxels = self._corrupt(voxels, key)
         pictures = (sample.target[index, steps], sample.turbulent[index, steps])
-        target, turbulent = (part.flip(axes) if axes else part for part in pictures)
+        target, turbulent = (turned(part, axes, swap) for part in pictures)
         return voxels, target, turbulent
 
     def _corrupt(self, voxels: Tensor, key: int) -> Tensor:
@@ -76,10 +81,9 @@ class Augment:
             # Device generators differ between CPU and CUDA: same distribution, other numbers.
             drawer = torch.Generator(voxels.device).manual_seed(noise.key(key, "noise"))
             spread = torch.empty_like(voxels).normal_(0, self.noise_std, generator=drawer)
-            voxels = voxels + spread
-        return voxels + hot_pixels(
-            voxels.shape[-2:], self.hot_fraction, self.hot_std, noise.key(key, "hot")
-        ).to(voxels)
+            voxels += spread
+        hot = hot_pixels(voxels.shape[-2:], self.hot_fraction, self.hot_std, noise.key(key, "hot"))
+        return voxels.add_(hot.to(voxels)) if hot.any() else voxels
 
 
 def pause_chain(
@@ -102,6 +106,31 @@ def flip_axes(probability: float, key: int) -> list[int]:
     """Return the axes to flip, out of -2 (upside down) and -1 (mirrored)."""
     draws = noise.uniform(key, torch.arange(2)).tolist()
     return [axis for axis, draw in zip((-2, -1), draws, strict=True) if draw < probability]
+
+
+def turned(pictures: Tensor, axes: list[int], swap: bool) -> Tensor:
+    """Return pictures (..., h, w) flipped along `axes`, then with rows and columns swapped."""
+    if swap and pictures.shape[-2] != pictures.shape[-1]:
+        height, width = pictures.shape[-2:]
+        raise ValueError(
+            f"augment.transpose must be 0 for crops that are no squares, got {height} x {width}"
+        )
+    pictures = pictures.flip(axes) if axes else pictures
+    return pictures.mT if swap else pictures
+
+
+def turned_views(
+    positions: Sequence[Position] | None, views: int, axes: list[int], swap: bool
+) -> Int[Tensor, " views"]:
+    """Return for each view which one's picture, turned, is seen there: that which stands there when
+    the grid is turned with the pictures.  All stay where a turned grid is another one.
+    """
+    here = [tuple(place) for place in positions or layout(views)]
+    ends = [min(column) + max(column) for column in zip(*here, strict=True)]
+    flipped = [[ends[a] - p[a] if a - 2 in axes else p[a] for a in (0, 1)] for p in here]
+    there = [tuple(place[::-1] if swap else place) for place in flipped]
+    same = set(there) == set(here)
+    return torch.tensor([there.index(place) for place in here] if same else range(len(here)))
 
 
 def misplace(

@@ -74,7 +74,7 @@ class Bank:
 
     def clip(self, index: int) -> dict:
         """Return clip `index`, memory-mapped: `views` (views, frames, h, w), what the optics put on
-        the sensor, light; `clean` (frames, h, w), code values; both float16; and `facts`.
+        the sensor, light; `clean` (frames, h, w), code values; both float16; `facts`, JSON.
 
         A clip that is missing or damaged is made, or waited for where somebody is making it.
         """
@@ -92,7 +92,8 @@ class Bank:
         facts = {"name": draw.clip.name, "fps": draw.clip.fps, "record": self.source.record(draw)}
         facts["air"] = repr(draw.air)
         views = self.source.views(draw)[0]
-        found = {"views": views.half().contiguous(), "clean": clean.half(), "facts": facts}
+        found = {"views": views.half().contiguous(), "clean": clean.half().contiguous()}
+        found["facts"] = json.dumps(facts)
         try:
             WholeFiles().save_checkpoint(found, self.path(index))
         except (OSError, RuntimeError) as error:  # PyTorch's writer has an error of its own

@@ -1,5 +1,6 @@
 """Samples from a bank of air: the clip and everything cheap about it is drawn anew for each."""
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -74,7 +75,7 @@ class Banked(Pipeline):
         when, way = noise.uniform(key, torch.arange(2)).tolist()
         index = self.index(number)
         clip = self.bank.clip(index)
-        facts, first = clip["facts"], int(when * (self.bank.frames - self.frames + 1))
+        facts, first = json.loads(clip["facts"]), int(when * (self.bank.frames - self.frames + 1))
         frames = slice(first, first + self.frames)
         clean = self._run(clip["clean"][frames], 0, way < 0.5)
         top, left, height, width = crop = self._crop(clean.shape[-2:], noise.key(key, "crop"))

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from src.sim.optics import layout
 from src.sim.pipeline import Sample
 from src.training.augment import (
     Augment,
@@ -13,6 +14,8 @@ from src.training.augment import (
     hot_pixels,
     misplace,
     pause_chain,
+    turned,
+    turned_views,
 )
 
 OFF = {"noise_std": 0.0, "hot_fraction": 0.0, "pause": 0.0, "flip": 0.0}
@@ -72,6 +75,45 @@ def test_flips_turn_voxels_and_targets_alike():
         assert torch.equal(out.target, expected) and torch.equal(out.turbulent, expected)
         seen.add(tuple(axes[0]))
     assert len(seen) == 4
+
+
+def test_transposition_turns_voxels_and_targets_alike():
+    sample, seen = numbered(), 0
+    for key in range(20):
+        out = Augment(**OFF | {"transpose": 0.5})(sample, [key])
+        swapped = torch.equal(out.voxels, sample.voxels.mT)
+        assert swapped or torch.equal(out.voxels, sample.voxels)
+        assert torch.equal(out.target, sample.target.mT if swapped else sample.target)
+        seen += swapped
+    assert 4 < seen < 16
+    with pytest.raises(ValueError, match="augment.transpose must be 0 for crops that are no"):
+        Augment(**OFF | {"transpose": 1.0})(Sample(*wide(), torch.tensor([1.0])), [0])
+
+
+def wide() -> list[torch.Tensor]:
+    return [torch.zeros(1, 3, 1, 2, 4, 6), torch.zeros(1, 3, 1, 4, 6), torch.zeros(1, 3, 1, 4, 6)]
+
+
+@pytest.mark.parametrize("views", [1, 2, 3, 4, 5, 9, 25])
+def test_views_of_a_grid_turn_with_their_pictures(views):
+    """A light field whose views see a slope according to their position still does when turned."""
+    rows, columns = torch.tensor(layout(views)).float().T
+    y, x = torch.meshgrid(torch.arange(6.0), torch.arange(6.0), indexing="ij")
+    down, across = (place[:, None, None] - place.mean() for place in (rows, columns))
+    field = down * (y - 2.5) + across * (x - 2.5)
+    for axes in ([], [-1], [-2], [-2, -1]):
+        for swap in (False, True):
+            if swap and views in (2, 3):  # a row of views becomes a column: they stay
+                assert turned_views(None, views, axes, swap).tolist() == list(range(views))
+                continue
+            order = turned_views(None, views, axes, swap)
+            assert torch.allclose(turned(field[order], axes, swap), field)
+
+
+def test_the_centre_view_stays_the_centre_view():
+    for axes in ([], [-1], [-2], [-2, -1]):
+        for swap in (False, True):
+            assert turned_views(layout(9), 9, axes, swap)[4] == 4
 
 
 def turn(sample: Sample, axes: list[int]) -> torch.Tensor:

@@ -15,6 +15,7 @@ from src.app import simulation as simulations
 from src.sim.optics import Optics
 from src.sim.pipeline import Pipeline
 from src.sim.turbulence.simulated import SimulatedAir
+from src.simulate import simulate
 from src.train import train
 from src.training.augment import Augment
 from src.training.bank import MADE_OF, Bank, listing, simulation
@@ -238,6 +239,9 @@ def test_a_training_takes_steps_from_a_bank_and_fills_it(tmp_path):
     train(config("train", tmp_path / "run", *asked, "trainer.max_steps=2", "data.epoch_clips=2"))
     (folder,) = (tmp_path / "bank").iterdir()
     assert list(folder.glob("*.pt")) and (tmp_path / "run" / "results.json").is_file()
+    like = ["split=train", "index=5", f"like={tmp_path / 'run' / 'config.yaml'}"]
+    seen = simulate(config("simulate", tmp_path / "seen", *like))
+    assert seen["clip"] == 5 and seen["bank"] < 3 and (tmp_path / "seen" / "views.png").is_file()
 
 
 def test_more_than_the_bound_or_the_disk_is_refused(tmp_path, monkeypatch):
@@ -299,14 +303,49 @@ def test_who_needs_a_clip_that_another_makes_waits_for_it(tmp_path, monkeypatch)
     process.join()
 
 
-def test_a_filler_fills_in_the_background_and_ends(tmp_path):
-    filler = Filler(bank(tmp_path))
+def start_filler(root: Path) -> None:
+    filler = Filler(bank(root, clips=500, scene=Slow(frames=7, side=40)))
     filler.start()
-    filler.process.join(120)
-    assert filler.process.exitcode == 0 and not filler.bank.missing()
-    filler.stop()
-    filler.start()
-    assert filler.process is None
+    (root / "pid").write_text(str(filler.process.pid))
+    time.sleep(600)
+
+
+def test_a_filler_ends_with_the_training_that_started_it(tmp_path):
+    training = multiprocessing.get_context("spawn").Process(target=start_filler, args=(tmp_path,))
+    training.start()
+    until(lambda: list(tmp_path.glob("*/*.pt")))
+    filler = int((tmp_path / "pid").read_text())
+    os.kill(training.pid, signal.SIGKILL)
+    training.join()
+    until(lambda: not runs(filler))
+
+
+def test_of_two_fillers_one_fills_and_the_other_takes_over_and_ends(tmp_path):
+    first, second = (Filler(bank(tmp_path, 6, scene=Slow(frames=7, side=40))) for _ in range(2))
+    first.start()
+    until(lambda: list(tmp_path.glob("*/*.pt")))
+    second.start()
+    first.stop()
+    second.process.join(600)
+    assert second.process.exitcode == 0 and not second.bank.missing()
+    second.stop()
+    second.start()
+    assert second.process is None
+
+
+def until(seen) -> None:
+    end = time.monotonic() + 600  # the lowest priority on a busy machine
+    while not seen():
+        assert time.monotonic() < end, "nothing happened"
+        time.sleep(0.05)
+
+
+def runs(pid: int) -> bool:
+    """Return whether a process is there and no zombie."""
+    try:
+        return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
 
 
 def test_files_of_a_scene_are_part_of_what_made_a_bank(tmp_path):

@@ -23,8 +23,8 @@ def rested(job: Job, residual: float) -> Job:
     pixels, state = sensor_eager.Pixels(job), job.state
     pixels.start(job.frames[:, :, 0])
     keys = [[noise.key(int(key), "residual") for key in row] for row in job.shot_keys]
-    shares = [torch.stack([noise.uniform(key, pixels.pixel) for key in row]) for row in keys]
-    away = (2 * torch.stack(shares) - 1).double() * residual
+    keys = torch.tensor(keys, device=pixels.pixel.device)[:, :, None, None]
+    away = (2 * noise.uniform(keys, pixels.pixel) - 1).double() * residual
     off = (away * torch.where(away > 0, pixels.on, pixels.off)).int()
     state.reference = state.level - off
     return replace(job, frames=job.frames[:, :, 1:], fresh=False)

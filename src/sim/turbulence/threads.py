@@ -19,9 +19,17 @@ def in_threads(work: Callable[..., None], pieces: Iterable[tuple], device: torch
         for piece in pieces:
             work(*piece)
         return
+    inference = (
+        torch.is_inference_mode_enabled()
+    )  # a thread's own, as is the recording of gradients
+
+    def alone(*piece) -> None:
+        with torch.inference_mode(inference), torch.no_grad():
+            work(*piece)
+
     try:
         with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            for job in [pool.submit(work, *piece) for piece in pieces]:
+            for job in [pool.submit(alone, *piece) for piece in pieces]:
                 job.result()
     finally:
         torch.set_num_threads(allowed)  # of threads to come: torch lets the last call decide

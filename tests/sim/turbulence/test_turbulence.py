@@ -87,10 +87,11 @@ def test_any_number_of_threads_gives_the_same_bits(strength):
             torch.set_num_threads(count)
             seen.append(turbulence.degrade(frames, seed()))
             assert torch.get_num_threads() == count
+        with torch.inference_mode():  # as in validation; threads have modes of their own
+            seen.append(turbulence.degrade(frames, seed()))
     finally:
         torch.set_num_threads(before)
-    assert torch.equal(seen[0], seen[1])
-    assert torch.equal(seen[0], seen[2])
+    assert all(torch.equal(seen[0], other) for other in seen[1:])
 
 
 @pytest.mark.parametrize("strength", [0.5, 2.0, 6.0])

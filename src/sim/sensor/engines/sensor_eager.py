@@ -63,20 +63,12 @@ class Pixels:
         self.pixel = rows + torch.arange(left, left + w, device=device)
         chips = torch.from_numpy(job.chips).to(device)[:, :, None, None, None]
         normals = torch.from_numpy(NORMALS).to(device)
+        spread, hot = torch.from_numpy(job.chip_keys).to(device)[:, :, None, None].unbind(1)
         self.on, self.off = (
-            torch.stack(
-                [
-                    _spread(chips[:, side, 0], chips[:, 2, 0], normals,
-                            noise.bits(int(key), 2 * self.pixel + side))
-                    for key in job.chip_keys[:, 0]
-                ],
-                1,
-            )
+            _spread(chips[:, side], chips[:, 2], normals, noise.bits(spread, 2 * self.pixel + side))
             for side in (0, 1)
-        )  # fmt: skip
-        self.hot = torch.stack(
-            [noise.bits(int(key), self.pixel) < job.chips[0, 3] for key in job.chip_keys[:, 1]]
-        ).expand(n, -1, h, w)
+        )
+        self.hot = (noise.bits(hot, self.pixel) < job.chips[0, 3]).expand(n, -1, h, w)
 
     def start(self, frame: Tensor) -> None:
         """Set the memory to the first frame (n, views, h, w)."""
@@ -113,13 +105,8 @@ class Pixels:
         rate = self.job.shot - (self.job.shot >> 8) * ((3 * seen) >> 2)
         rate = torch.where(self.hot, self.job.hot, rate)
         counter = (number << 32) + 2 * self.pixel
-        drawn, at = (
-            torch.stack(
-                [torch.stack([noise.bits(int(key), counter + word) for key in row])
-                 for row in self.job.shot_keys]
-            )
-            for word in (0, 1)
-        )  # fmt: skip
+        keys = torch.from_numpy(self.job.shot_keys).to(frame.device)[:, :, None, None]
+        drawn, at = (noise.bits(keys, counter + word) for word in (0, 1))
         u = ((at >> 9).float() + 0.5) * 2.0**-23
         return torch.where(drawn < rate, u, NEVER), torch.where(at & 1 == 1, 1, -1)
 
