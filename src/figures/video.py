@@ -1,12 +1,13 @@
 """Moving pictures: panels side by side with their names, events in colour, GIF and PNG files."""
 
-import os
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 from PIL import Image
+
+from src.records.whole import written
 
 TITLE_PX = 18  # height of the strip with a panel's name
 GAP_PX = 4
@@ -49,13 +50,13 @@ def write_video(path: Path, frames: Video, fps: float) -> None:
     """
     eight = (np.clip(frames, 0, 1) * 255 + 0.5).astype(np.uint8)
     pictures = [Image.fromarray(frame) for frame in eight]
-    partial = path.with_name(f".partial-{path.name}")
-    if path.suffix == ".gif":
-        shown = [picture.quantize(128, dither=Image.Dither.NONE) for picture in pictures]
-        shown[0].save(partial, save_all=True, append_images=shown[1:], duration=1000 / fps, loop=0)
-    else:
-        pictures[0].save(partial)
-    os.replace(partial, path)
+    with written(path) as partial:
+        if path.suffix == ".gif":
+            first, *rest = (p.quantize(128, dither=Image.Dither.NONE) for p in pictures)
+            time = {"duration": 1000 / fps, "loop": 0}
+            first.save(partial, "GIF", save_all=True, append_images=rest, **time)
+        else:
+            pictures[0].save(partial, Image.registered_extensions()[path.suffix])
 
 
 def _titled(video: Video, name: str) -> Video:

@@ -4,7 +4,6 @@ Lightning's own writer goes through the system's temporary folder; where that is
 most clusters, its last move is a copy, and a run that is killed then leaves half a checkpoint.
 """
 
-import os
 import warnings
 import zipfile
 from pathlib import Path
@@ -13,24 +12,16 @@ from typing import Any
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
+from src.records.whole import written
+
 
 class WholeFiles(TorchCheckpointIO):
     """Lightning's plugin that stores checkpoints; they are on the disk when it returns."""
 
     def save_checkpoint(self, checkpoint: dict, path: Any, storage_options: Any = None) -> None:
         """Write `checkpoint` to `path`; an OSError leaves what was there before."""
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(path.name + ".partial")
-        try:
-            with partial.open("wb") as file:
-                torch.save(checkpoint, file)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(partial, path)
-        except BaseException:
-            partial.unlink(missing_ok=True)
-            raise
+        with written(Path(path)) as partial, partial.open("wb") as file:
+            torch.save(checkpoint, file)
 
 
 def whole(path: Path) -> bool:

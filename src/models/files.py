@@ -5,7 +5,6 @@ in a file is executed: only classes of `src.models` and `baselines` are built, f
 """
 
 import json
-import os
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
@@ -18,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from src.models.checkpoints import newest, whole
+from src.records.whole import written
 
 WEIGHTS = Path(__file__).resolve().parents[2] / "weights"
 ROOMS = ("src.models.", "baselines.")
@@ -73,9 +73,8 @@ def save(path: Path, network: nn.Module, spec: dict, card: dict) -> None:
     plain = _build(spec, path, [type(network).__module__])
     plain.load_state_dict(folded(network))
     halves = {name: _half(value).contiguous() for name, value in plain.state_dict().items()}
-    partial = path.with_name(path.name + ".partial")
-    save_file(halves, partial, {"network": json.dumps(spec), "card": json.dumps(card)})
-    os.replace(partial, path)
+    with written(path) as partial:
+        save_file(halves, partial, {"network": json.dumps(spec), "card": json.dumps(card)})
 
 
 def _half(value: Tensor) -> Tensor:

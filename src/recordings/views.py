@@ -7,8 +7,6 @@ right, y down.
 """
 
 import math
-import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +18,7 @@ from jaxtyping import Float
 
 from src.recordings.files import plain
 from src.recordings.files.sources import Size
+from src.records.whole import write_text
 
 LARGEST_SIDE = 8192
 MOST_PIXELS = 2**24  # of a sensor, and of all views' pictures together
@@ -164,11 +163,7 @@ class Views:
         text = HEADER + yaml.safe_dump(
             self._plain(), sort_keys=False, default_flow_style=None, width=100
         )
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name)
-        with os.fdopen(handle, "w") as file:
-            file.write(text)
-        os.replace(name, path)
+        write_text(path, text)
 
     def _plain(self) -> dict:
         views = [

@@ -4,7 +4,6 @@ import csv
 import hashlib
 import io
 import json
-import os
 import shutil
 import statistics
 import subprocess
@@ -17,6 +16,7 @@ from rich.table import Table
 from src.metrics.bootstrap import interval
 from src.metrics.table import METRICS, NAMES
 from src.recordings.files import plain
+from src.records.whole import write_text
 
 SCHEMA = 1
 LEAST_FREE_BYTES = 200 * 2**20
@@ -47,13 +47,6 @@ def open_run(run: Path, config: str) -> None:
         needed = LEAST_FREE_BYTES // 2**20
         raise ValueError(f"paths.out must have {needed} MiB free, got {free // 2**20} MiB at {run}")
     write_text(run / "config.yaml", config)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write `text` to `path` whole or not at all: to a temporary name, then renamed."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text)
-    os.replace(partial, path)
 
 
 def content(config: str) -> dict:

@@ -1,0 +1,22 @@
+"""A file is whole or not there."""
+
+import pytest
+
+from src.records.whole import write_text, written
+
+
+def test_what_fails_leaves_what_was_there(tmp_path):
+    write_text(tmp_path / "new" / "a.txt", "before")
+    with pytest.raises(OSError, match="full"), written(tmp_path / "new" / "a.txt") as partial:
+        partial.write_text("half")
+        raise OSError("disk full")
+    assert [(file.name, file.read_text()) for file in (tmp_path / "new").iterdir()] == [
+        ("a.txt", "before")
+    ]
+
+
+def test_until_the_end_the_file_has_another_name(tmp_path):
+    with written(tmp_path / "a.txt") as partial:
+        partial.write_text("all")
+        assert not (tmp_path / "a.txt").exists() and partial.suffix == ".partial"
+    assert (tmp_path / "a.txt").read_text() == "all" and not partial.exists()
