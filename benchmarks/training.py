@@ -1,8 +1,10 @@
-"""Where a training step's time goes: python -m benchmarks.training [key=value ...]
+"""How fast a training is: python -m benchmarks.training [table] [key=value ...]
 
-Overrides are those of src.train.  Simulation (shared by the `data.reuse` steps that see a batch),
-the network's forward and backward pass, and the loss with its gradient, on one batch: CPU time of
-the thread on one thread, wall time on two.  Clip-frames are windows of single clips.
+Overrides are those of src.train.  Without `table`, where a step's time goes: simulation (shared by
+the `data.reuse` steps that see a batch), the network's forward and backward pass, and the loss with
+its gradient, on one batch; CPU time of the thread on one thread, wall time on two.  With it, whole
+steps of budget=hours on made-up grids, one thing changed at a time, by CPU time of the one thread.
+Clip-windows are windows of single clips.
 """
 
 import sys
@@ -10,24 +12,48 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import lightning
 import torch
 from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
 from torch.nn.utils import parametrize
+from torch.utils.data import DataLoader
 
 from benchmarks.timing import least
 from src.app import build
 from src.models.unroll import video
-from src.sim.pipeline import simulate
+from src.sim.pipeline import Sample, simulate
 
 ROOT = Path(__file__).resolve().parents[1]
+BEFORE = ["channels_last=false", "optimizer.fused=false", "average=null"]
+CHANGES = {
+    "as before": [],
+    "channels-last": ["channels_last=true"],
+    "fused Adam": ["optimizer.fused=true"],
+    "running mean of the weights": ["average=0.999"],
+    "LPIPS on half the windows": ["loss.share=0.5"],
+    "LPIPS on a quarter": ["loss.share=0.25"],
+    "float32": ["trainer.precision=32-true"],
+    "batch 1": ["data.batch_size=1"],
+    "batch 6": ["data.batch_size=6"],
+    "crop 96, batch 2": ["data.crop=96", "data.batch_size=2"],
+    "channels-last, fused, mean, LPIPS on half": [
+        "channels_last=true", "optimizer.fused=true", "average=0.999", "loss.share=0.5",
+    ],
+}  # fmt: skip
+
+
+def config(overrides: list[str]) -> DictConfig:
+    """Return the config of src.train."""
+    with initialize_config_dir(str(ROOT / "conf"), version_base=None):
+        return compose("train", overrides)
 
 
 def split(overrides: list[str]) -> tuple[dict[str, Callable[[], object]], int, int]:
-    """Return the parts of a step as work to be timed, its clip-frames, and the steps that see a
+    """Return the parts of a step as work to be timed, its clip-windows, and the steps that see a
     simulated batch.
     """
-    with initialize_config_dir(str(ROOT / "conf"), version_base=None):
-        cfg = compose("train", overrides)
+    cfg = config(overrides)
     network, spec = build.network(cfg)
     module, pipeline = build.reconstructor(cfg, network, spec), build.pipeline(cfg, "train")
     clips = list(range(cfg.data.batch_size))
@@ -54,8 +80,53 @@ def split(overrides: list[str]) -> tuple[dict[str, Callable[[], object]], int, i
     return parts, len(truth), cfg.data.reuse
 
 
+class Steps(lightning.Callback):
+    """Notes the CPU time at the end of every step."""
+
+    def __init__(self):
+        self.ends: list[float] = []
+
+    def on_train_batch_end(self, *_) -> None:
+        """Note the time."""
+        self.ends.append(time.thread_time())
+
+
+def step(overrides: list[str], steps: int = 4) -> tuple[float, int]:
+    """Return the least seconds of a whole training step and the pixels of its clip-windows."""
+    cfg = config(["budget=hours", "data.bank=null", "hours=null", *overrides])
+    module = build.reconstructor(cfg, *build.network(cfg))
+    shape = (cfg.data.batch_size, cfg.data.windows)
+    grid = (*shape, cfg.optics.views, cfg.bins, cfg.data.crop, cfg.data.crop)
+    target = torch.rand(*shape, 1, cfg.data.crop, cfg.data.crop)
+    voxels = torch.randn(grid) * (torch.rand(grid) < 0.1)
+    known = {"drawn": [{}] * shape[0], "window_s": torch.full((shape[0],), 1 / cfg.fps)}
+    sample, seen = Sample(voxels, target, target, **known), Steps()
+    quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+    trainer = build.make(cfg.trainer, callbacks=[seen], max_steps=steps + 1, plugins=[], **quiet)
+    trainer.fit(module, DataLoader([sample] * (steps + 1), collate_fn=lambda batch: batch[0]))
+    taken = [end - start for start, end in zip(seen.ends, seen.ends[1:], strict=False)]
+    return min(taken), target.numel()
+
+
+def table(overrides: list[str]) -> None:
+    """Print a Markdown table, a row for each of CHANGES."""
+    print("| | ms a step | clip-windows of 64x64 a second | faster by |\n|---|---|---|---|")
+    first = None
+    for name, change in CHANGES.items():
+        seconds, pixels = step([*BEFORE, *change, *overrides])
+        rate = pixels / 64**2 / seconds
+        first = first or rate
+        print(
+            f"| {name} | {1e3 * seconds:.0f} | {rate:.0f} | {rate / first - 1:+.0%} |", flush=True
+        )
+
+
 def main() -> None:
-    """Print the split on one thread and on two."""
+    """Print the table, or the split on one thread and on two."""
+    if sys.argv[1:2] == ["table"]:
+        torch.set_num_threads(1)
+        table(sys.argv[2:])
+        return
     parts, frames, reuse = split(sys.argv[1:])
     for threads, clock in ((1, time.thread_time), (2, time.perf_counter)):
         torch.set_num_threads(threads)
@@ -64,7 +135,7 @@ def main() -> None:
         took["backward"] = took.pop("forward and backward") - took["forward"]
         whole = sum(took.values())
         shares = ", ".join(f"{name} {100 * t / whole:.0f} %" for name, t in took.items())
-        print(f"{threads} thread(s): {frames / whole:.0f} clip-frames a second; {shares}")
+        print(f"{threads} thread(s): {frames / whole:.0f} clip-windows a second; {shares}")
 
 
 if __name__ == "__main__":

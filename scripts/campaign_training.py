@@ -1,6 +1,5 @@
 """One training of a campaign: a process that can be found, stopped and started again."""
 
-import csv
 import fcntl
 import os
 import signal
@@ -12,6 +11,8 @@ from typing import NamedTuple
 
 import torch
 from omegaconf import OmegaConf
+
+from scripts.learning_curves import curve
 
 ROOT = Path(__file__).resolve().parents[1]
 # In the command lines of a training and of what it starts: filters of warnings are handed on, and
@@ -134,11 +135,7 @@ class Training:
 
     def curve(self) -> list[dict[str, float]]:
         """Return the learning curve so far."""
-        files = sorted(self.folder.glob("part*/curve.csv"), key=lambda path: path.stat().st_mtime)
-        if not files:
-            return []
-        with files[-1].open() as file:
-            return [{k: float(v or "nan") for k, v in row.items()} for row in csv.DictReader(file)]
+        return curve(self.folder)
 
     def flat(self) -> bool:
         """Return whether the last hours brought too little for more to follow."""

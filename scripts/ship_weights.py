@@ -1,8 +1,9 @@
 """A trained run to weights/: python -m scripts.ship_weights RUN [--name NAME] [--test FOLDER ...].
 
-Writes `weights/NAME.safetensors` (float16, spectral norm folded) and its model card `NAME.md`.  RUN
-is a folder of src.train, each FOLDER one of src.eval with these weights; where RUN is a name of
-weights/, its card alone is written, with what FOLDERs hold.
+Writes `weights/NAME.safetensors` (float16, spectral norm folded), its model card `NAME.md` and, of
+a run with a learning curve, that as a figure.  RUN is a folder of src.train, or of a campaign with
+the parts of one training, done or not; each FOLDER one of src.eval with these weights; where RUN is
+a name of weights/, its card alone is written, with what FOLDERs hold.
 """
 
 import argparse
@@ -13,9 +14,12 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from safetensors import safe_open
 
+from scripts.learning_curves import curve
+from src.figures import learning
 from src.metrics.table import METRICS, Metric
 from src.models import files
 from src.models.unroll import takes
+from src.records import results
 
 LARGEST = 16 * 2**20  # bytes of a file
 
@@ -28,10 +32,11 @@ def ship(run: Path, name: str, tests: list[Path]) -> Path:
     ckpt = files.newest(run)
     network = files.load(ckpt)
     content = torch.load(ckpt, map_location="cpu", weights_only=True)
-    record = json.loads((run / "results.json").read_text())
-    card = facts(record, OmegaConf.load(run / "config.yaml"), content["global_step"])
+    card = facts(ckpt.parent.parent, content)
     path = files.WEIGHTS / f"{name}.safetensors"
     path.parent.mkdir(parents=True, exist_ok=True)
+    if rows := curve(run):
+        learning.draw(path.with_suffix(".png"), {name: rows})
     files.save(path, network, content["network"], card)
     if path.stat().st_size > LARGEST:
         path.unlink()
@@ -50,23 +55,30 @@ def recard(name: str, tests: list[Path]) -> Path:
 def _write_card(
     path: Path, name: str, network: torch.nn.Module, card: dict, tests: list[Path]
 ) -> Path:
-    results = [json.loads((test / "results.json").read_text()) for test in tests]
+    records = [json.loads((test / "results.json").read_text()) for test in tests]
     configs = [OmegaConf.load(test / "config.yaml") for test in tests]
-    text = describe(name, network, card, list(zip(results, configs, strict=True)))
+    drawn = path.with_suffix(".png").is_file()
+    text = describe(name, network, card, list(zip(records, configs, strict=True)), drawn)
     path.with_suffix(".md").write_text(text)
     return path
 
 
-def facts(record: dict, cfg: DictConfig, steps: int) -> dict:
-    """Return what the header of the file says of the training."""
+def facts(run: Path, content: dict) -> dict:
+    """Return what the header of the file says of the training in the folder `run`, of which
+    `content` is a checkpoint.
+    """
+    text = (run / "config.yaml").read_text()
+    cfg = OmegaConf.create(text)
     return {
-        "experiment": record["experiment"],
-        "seed": record["seed"],
-        "steps": steps,
-        "commit": record["git"],
-        "config_sha256": record["config_sha256"],
-        "device": record["device"],
-        "hours": round(record["wall_s"] / 3600, 2),
+        "experiment": cfg.name,
+        "started_from": Path(cfg.model.get("weights") or "nothing").name,
+        "seed": cfg.seed,
+        "steps": content["global_step"],
+        "windows_seen": content["windows"],
+        "hours": round(content["seconds"] / 3600, 2),
+        "clock": cfg.clock,
+        "commit": results.commit(),
+        "config_sha256": results.digest(text),
         "scenes": _scenes(cfg),
         "turbulence": cfg.turbulence.atmosphere.severity if cfg.turbulence.atmosphere else "none",
         "views": cfg.optics.views,
@@ -88,8 +100,10 @@ def seen(network: torch.nn.Module) -> str:
     return "the centre view" if one else "any number of views"
 
 
-def describe(name: str, network: torch.nn.Module, card: dict, tests: list[tuple]) -> str:
-    """Return the model card as Markdown."""
+def describe(
+    name: str, network: torch.nn.Module, card: dict, tests: list[tuple], drawn: bool
+) -> str:
+    """Return the model card as Markdown; `drawn`: there is a figure of the learning curve."""
     count = sum(parameter.numel() for parameter in network.parameters())
     lines = [
         f"# {name}",
@@ -100,14 +114,14 @@ def describe(name: str, network: torch.nn.Module, card: dict, tests: list[tuple]
         "|---|---|",
         *(f"| {key} | {value} |" for key, value in card.items()),
         "",
+        *([f"![learning curve]({Path(name).name}.png)", ""] if drawn else []),
         "| tested on | clips | " + " | ".join(metric.heading for metric in METRICS) + " |",
         "|---|---|" + "---|" * len(METRICS),
         *(_tested(record, cfg) for record, cfg in tests),
         "",
         "In brackets: the interval that holds 95 % of the means of resampled clips.",
         "",
-        "Limits: simulated turbulence and sensor only, grey pictures, photographs in",
-        "planar motion; a training of this length is far from the paper's 64,800 steps.",
+        "Limits: simulated turbulence and sensor only, grey pictures, scenes in planar motion.",
         "",
     ]
     return "\n".join(lines)
@@ -143,8 +157,8 @@ def main() -> None:
     if (files.WEIGHTS / f"{arguments.run}.safetensors").is_file():
         print(recard(str(arguments.run), arguments.test))
         return
-    record = json.loads((arguments.run / "results.json").read_text())
-    print(ship(arguments.run, arguments.name or record["experiment"], arguments.test))
+    name = arguments.name or OmegaConf.load(next(arguments.run.rglob("config.yaml"))).name
+    print(ship(arguments.run, name, arguments.test))
 
 
 if __name__ == "__main__":

@@ -57,7 +57,13 @@ def test_weights_and_biases_holds_config_pictures_and_metrics(tmp_path):
 @pytest.mark.parametrize("debug", [name for name in names("debug") if name != "default"])
 def test_every_debug_preset_takes_a_step(debug, tmp_path):
     small = ["trainer.max_steps=1", "data.epoch_clips=1", "data.batch_size=1", "data.test_clips=1"]
-    small += ["scene.height=64", "scene.width=64", "data.crop=32", "data.windows=2"]
+    small += [
+        "scene.height=64",
+        "scene.width=64",
+        "data.crop=32",
+        "data.windows=2",
+        "data.loss_from=0",
+    ]
     small += [
         "data.test_windows=3",
         "data.warmup=1",

@@ -1,6 +1,7 @@
 """Training by time, the running mean and the learning curve: cut, resumed, lengthened."""
 
 import csv
+import time
 from pathlib import Path
 
 import pytest
@@ -126,8 +127,6 @@ def test_a_wrong_value_names_its_key(overrides, key, tmp_path):
 def test_a_processor_clock_does_not_count_waiting():
     watch = clock.Clock("processor")
     watch.start()
-    import time
-
     time.sleep(0.2)
     watch.lap()
     assert watch.seconds < 0.1 and watch.hours == watch.seconds / 3600

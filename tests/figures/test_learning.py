@@ -1,0 +1,27 @@
+"""A figure of learning curves, from the files that trainings write."""
+
+import os
+
+import pytest
+from PIL import Image
+
+from scripts.learning_curves import curve
+from src.figures import learning
+
+
+def test_the_newest_curve_is_drawn(tmp_path):
+    for part, lines in enumerate(("0,0.7,\n", "0,0.7,\n1,0.5,17\n")):
+        folder = tmp_path / "lf" / f"part{part}"
+        folder.mkdir(parents=True)
+        (folder / "curve.csv").write_text("hours,lpips,psnr_aligned\n" + lines)
+        os.utime(folder / "curve.csv", (part, part))
+    rows = curve(tmp_path / "lf")
+    assert [row["hours"] for row in rows] == [0, 1] and rows[1]["psnr_aligned"] == 17
+    path = learning.draw(tmp_path / "a.png", {"lf": rows, "none yet": curve(tmp_path / "no")})
+    with Image.open(path) as picture:
+        assert picture.size[0] > picture.size[1]
+
+
+def test_without_a_line_nothing_is_drawn(tmp_path):
+    with pytest.raises(ValueError, match="curves must have a line"):
+        learning.draw(tmp_path / "a.png", {"none": []})
