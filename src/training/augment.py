@@ -5,17 +5,21 @@ simulation (sim/pipeline.py).  Every draw comes from the key of the sample, so a
 in any worker.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
+from numpy.typing import NDArray
+from scipy.special import ndtri
 from torch import Tensor
 from torch.nn import functional
 
 from src.sim import noise
 from src.sim.optics import Position, layout
-from src.sim.pipeline import Sample
+from src.sim.pipeline import Sample, together
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,9 @@ class Augment:
     def __call__(self, sample: Sample, keys: Sequence[int]) -> Sample:
         """Return the augmented sample; `keys` has one key per clip."""
         clips = [self._one(sample, index, key) for index, key in enumerate(keys)]
-        voxels, target, turbulent = (torch.stack(part) for part in zip(*clips, strict=True))
+        voxels, target, turbulent = (
+            together([clip[None] for clip in part]) for part in zip(*clips, strict=True)
+        )
         sample = replace(sample, voxels=voxels, target=target, turbulent=turbulent)
         return drop_views(sample, self.dropped, noise.key(keys[0], "dropped"))
 
@@ -78,12 +84,32 @@ class Augment:
 
     def _corrupt(self, voxels: Tensor, key: int) -> Tensor:
         if self.noise_std > 0:
-            # Device generators differ between CPU and CUDA: same distribution, other numbers.
-            drawer = torch.Generator(voxels.device).manual_seed(noise.key(key, "noise"))
-            spread = torch.empty_like(voxels).normal_(0, self.noise_std, generator=drawer)
-            voxels += spread
+            spread = normals(voxels.shape, noise.key(key, "noise"), voxels.device)
+            voxels.add_(spread, alpha=self.noise_std)
         hot = hot_pixels(voxels.shape[-2:], self.hot_fraction, self.hot_std, noise.key(key, "hot"))
         return voxels.add_(hot.to(voxels)) if hot.any() else voxels
+
+
+def normals(shape: Sequence[int], key: int, device: torch.device) -> Tensor:
+    """Return standard normals; on the CPU of 2^16 levels up to 4.2 away from 0, at half the cost.
+
+    The devices draw other numbers from the same distribution.
+    """
+    if device.type != "cpu":
+        drawer = torch.Generator(device).manual_seed(key)
+        return torch.empty(shape, device=device).normal_(generator=drawer)
+    count = math.prod(shape)
+    words = np.random.SFC64(key).random_raw(-(-count // 4)).view(np.uint16)
+    return torch.from_numpy(QUANTILES[words[:count]]).reshape(shape)
+
+
+def quantiles(levels: int) -> NDArray[np.float32]:
+    """Return the standard normal's quantiles at equal steps, of deviation 1 in all."""
+    values = ndtri((np.arange(levels) + 0.5) / levels)
+    return (values / values.std()).astype(np.float32)
+
+
+QUANTILES = quantiles(2**16)
 
 
 def pause_chain(

@@ -13,6 +13,7 @@ from src.training.augment import (
     flip_axes,
     hot_pixels,
     misplace,
+    normals,
     pause_chain,
     turned,
     turned_views,
@@ -134,6 +135,18 @@ def test_noise_has_the_stated_spread_also_in_pauses():
     out = Augment(**OFF | {"noise_std": 0.4, "pause": 1.0})(sample, [1]).voxels
     assert abs(float(out.std()) - 0.4) < 5 * 0.4 / math.sqrt(2 * out.numel())
     assert float(out[0, 5].std()) > 0.3
+
+
+def test_normals_are_normal_and_each_its_own():
+    seen = normals((100_000, 7), 5, torch.device("cpu")).double()
+    for power, moment in ((1, 0), (2, 1), (3, 0), (4, 3), (6, 15)):
+        spread = math.sqrt(math.prod(range(2 * power - 1, 0, -2)) / seen.numel())
+        assert abs(float((seen**power).mean()) - moment) < 5 * spread
+    for shift in (1, 4, 7):  # neighbours, those of one word, and of one row
+        flat = seen.flatten()
+        assert abs(float((flat[shift:] * flat[:-shift]).mean())) < 5 / math.sqrt(seen.numel())
+    assert not torch.equal(seen, normals((100_000, 7), 6, torch.device("cpu")).double())
+    assert torch.equal(seen, normals((100_000, 7), 5, torch.device("cpu")).double())
 
 
 def test_hot_pixels_stay_through_the_sequence():
