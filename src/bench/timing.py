@@ -16,6 +16,8 @@ from torch.nn import functional
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.weak import WeakIdKeyDictionary
 
+from src.models.cost import clock
+
 PEAK_SIDE, PEAK_CHANNELS = 176, 64  # of the convolution that shows what the machine can do
 JOULE_PER_MAC = 4.6e-12  # float32, 45 nm (Horowitz, ISSCC 2014): 3.7 pJ multiply, 0.9 pJ add
 
@@ -49,18 +51,17 @@ def frame(
 
     The second frame warms up too.  As many frames as fit into `seconds`, at least `least`.
     """
-    cuda = voxels.device.type == "cuda"
-    clock = time.thread_time if count == 1 and not cuda else time.perf_counter
+    now = clock(count, voxels.device)
     with threads(count):
         state = _advance(network, voxels, None, 2)
         times: list[float] = []
         until = time.perf_counter() + seconds
         while len(times) < least or (time.perf_counter() < until and len(times) < 200):
-            start = clock()
+            start = now()
             state = _advance(network, voxels, state, 1)
-            times.append(1e3 * (clock() - start))
+            times.append(1e3 * (now() - start))
     times.sort()
-    name = "thread" if clock is time.thread_time else "wall"
+    name = "thread" if now is time.thread_time else "wall"
     return Timing(times[len(times) // 2], times[0], len(times), name)
 
 
@@ -70,10 +71,9 @@ def restoration(restorer: nn.Module, side: int, *, count: int = 1, repeats: int 
 
     Its windows of WINDOW frames overlap by OVERLAP: what two of them share is paid for twice.
     """
-    clock = time.thread_time if count == 1 else time.perf_counter
     frames = torch.rand(1, restorer.WINDOW, 1, side, side)
     with threads(count):
-        took = min(_timed(clock, lambda: restorer.restore(frames)) for _ in range(repeats))
+        took = min(_timed(clock(count), lambda: restorer.restore(frames)) for _ in range(repeats))
     return 1e3 * took / (restorer.WINDOW - restorer.OVERLAP)
 
 
@@ -95,18 +95,17 @@ def convolution_peak(dtype: torch.dtype, *, count: int = 1, repeats: int = 8) ->
     x = torch.randn(size).to(dtype).to(memory_format=torch.channels_last)
     kernel = torch.randn(PEAK_CHANNELS, PEAK_CHANNELS, 3, 3).to(dtype)
     kernel = kernel.to(memory_format=torch.channels_last)
-    clock = time.thread_time if count == 1 else time.perf_counter
     with threads(count):
         functional.conv2d(x, kernel, padding=1)
-        best = min(_timed(clock, lambda: functional.conv2d(x, kernel, padding=1))
+        best = min(_timed(clock(count), lambda: functional.conv2d(x, kernel, padding=1))
                    for _ in range(repeats))  # fmt: skip
     return PEAK_SIDE**2 * PEAK_CHANNELS**2 * 9 / best
 
 
-def _timed(clock: Callable[[], float], work: Callable[[], Any]) -> float:
-    start = clock()
+def _timed(now: Callable[[], float], work: Callable[[], Any]) -> float:
+    start = now()
     work()
-    return max(clock() - start, 1e-9)
+    return max(now() - start, 1e-9)
 
 
 class _Live(TorchDispatchMode):

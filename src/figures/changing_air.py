@@ -2,7 +2,6 @@
 
 import csv
 import io
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from src.bench.timing import threads
 from src.figures.plots import save
 from src.metrics.image import aligned_psnr
 from src.models.adaptive import Adaptive
+from src.models.cost import clock
 from src.records import results
 from src.sim.pipeline import Pipeline
 
@@ -56,17 +56,17 @@ def write(run: Path, found: tuple[Adaptive, Pipeline] | str, course: Sequence[fl
 @torch.no_grad()
 def follow(network: Adaptive, stream: Stream, only: int | None = None) -> Shown:
     """Run window by window in thread time; `only`: this level throughout, and no comparing."""
-    state, rows, places = None, [], list(stream.positions)
+    state, rows, places, now = None, [], list(stream.positions), clock(1)
     with threads(1):
         for k, voxels in enumerate(stream.windows(stream.fps)):
-            start, window_s = time.thread_time(), 1 / stream.fps
+            start, window_s = now(), 1 / stream.fps
             if only is None:
                 frame, state = network(voxels, state, window_s=window_s, positions=places)
                 at, apart = state.level, state.disagreement
             else:
                 frame, state = network.run(voxels, only, state, places, window_s=window_s)
                 at, apart = only, np.nan
-            ms = 1e3 * (time.thread_time() - start)
+            ms = 1e3 * (now() - start)
             score = aligned_psnr(frame.float().clamp(0, 1), stream.target[k + 1][None, None])
             rows.append((ms, float(score[0]), float(at), apart))
     return Shown(*np.array(rows, dtype=float).T)

@@ -1,25 +1,36 @@
-"""What a network costs: multiply-accumulates of one frame."""
+"""What a network costs: multiply-accumulates of one frame, and the clock of its time."""
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
+from src.models.unroll import accepted
+from src.sim.optics import Position
+
 
 @torch.no_grad()
 def macs_per_frame(
-    network: nn.Module, height: int, width: int, *, views: int = 1, bins: int = 5
+    network: nn.Module,
+    height: int,
+    width: int,
+    *,
+    views: int = 1,
+    bins: int = 5,
+    positions: Sequence[Position] | None = None,
 ) -> int:
     """Return the multiply-accumulates of one window, batch 1, state carried.
 
-    Counted are convolutions and matrix products (torch's FLOP counter, two FLOPs a MAC), not
-    elementwise work and interpolation.
+    `positions`: (row, col) of each view, None: `optics.layout`.  Counted are convolutions and
+    matrix products (torch's FLOP counter, two FLOPs a MAC), not elementwise work and interpolation.
     """
     device = next((parameter.device for parameter in network.parameters()), torch.device("cpu"))
     voxels = torch.zeros(1, views, bins, height, width, device=device)
-    _, state = network(voxels, None)
-    return macs(lambda: network(voxels, state))
+    options = accepted(network, positions=positions)
+    _, state = network(voxels, None, **options)
+    return macs(lambda: network(voxels, state, **options))
 
 
 def macs(work: Callable[[], object]) -> int:
@@ -27,3 +38,11 @@ def macs(work: Callable[[], object]) -> int:
     with FlopCounterMode(display=False) as counter:
         work()
     return counter.get_total_flops() // 2
+
+
+def clock(threads: int, device: torch.device | str = "cpu") -> Callable[[], float]:
+    """Return the clock, in seconds, of every timing of a network: on one thread of a CPU what that
+    thread computes, which other jobs on the machine hardly disturb, else wall time.
+    """
+    alone = threads == 1 and torch.device(device).type == "cpu"
+    return time.thread_time if alone else time.perf_counter

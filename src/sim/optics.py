@@ -67,7 +67,7 @@ class Optics:
     """
 
     views: int = 9
-    positions: Sequence[Position] | None = None
+    positions: Sequence[Sequence[int]] | None = None  # a config has lists
     misalignment_px: float = 0.0
 
     def __post_init__(self):

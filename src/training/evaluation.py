@@ -1,14 +1,12 @@
 """One network on the test clips: scores per clip, cost and latency."""
 
-import time
-
 import lightning
 import torch
 from torch import nn
 
 from src.metrics.scores import Scores
-from src.models.cost import macs, macs_per_frame
-from src.models.unroll import video
+from src.models.cost import clock, macs, macs_per_frame
+from src.models.unroll import accepted, video
 from src.records.results import Row
 from src.sim.pipeline import Sample
 from src.training.datamodule import LightFieldData
@@ -46,30 +44,30 @@ def cost(network: nn.Module, sample: Sample) -> tuple[int, float]:
     """
     if not hasattr(network, "video"):
         views, bins, height, width = sample.voxels.shape[2:]
-        size = {"views": views, "bins": bins}
-        return macs_per_frame(network, height, width, **size), latency_ms(
-            network, height, width, **size
-        )
-    frames, start = sample.target.shape[:2].numel(), time.perf_counter()
+        size = {"views": views, "bins": bins, "positions": sample.positions}
+        return macs_per_frame(network, height, width, **size), latency_ms(network, sample)
+    now = clock(torch.get_num_threads(), sample.voxels.device)
+    frames, start = sample.target.shape[:2].numel(), now()
     video(network, sample)
-    seconds = time.perf_counter() - start
+    seconds = now() - start
     return macs(lambda: video(network, sample)) // frames, 1e3 * seconds / frames
 
 
 @torch.no_grad()
-def latency_ms(
-    network: nn.Module, height: int, width: int, views: int, bins: int, repeats: int = 5
-) -> float:
-    """Return the median wall time of one frame in ms: batch 1, state carried, after a warm-up."""
+def latency_ms(network: nn.Module, sample: Sample, repeats: int = 5) -> float:
+    """Return the median time of one frame in ms: the first window of the first clip, state carried,
+    after a warm-up.
+    """
     network.eval()
     device = next((parameter.device for parameter in network.parameters()), torch.device("cpu"))
-    voxels = torch.randn(1, views, bins, height, width, device=device)
-    _, state = network(voxels, None)
+    voxels, now = sample.voxels[:1, 0].to(device), clock(torch.get_num_threads(), device)
+    options = accepted(network, positions=sample.positions)
+    _, state = network(voxels, None, **options)
     times = []
     for _ in range(repeats):
-        start = time.perf_counter()
-        _, state = network(voxels, state)
+        start = now()
+        _, state = network(voxels, state, **options)
         if device.type == "cuda":
             torch.cuda.synchronize(device)
-        times.append(1e3 * (time.perf_counter() - start))
+        times.append(1e3 * (now() - start))
     return sorted(times)[repeats // 2]

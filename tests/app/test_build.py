@@ -154,3 +154,10 @@ def test_a_missing_size_is_asked_for_by_its_key(tmp_path):
         sources.sensor_size(tmp_path / "a.txt")
     with pytest.raises(ValueError, match=r"sensor_size must be \(8, 8\)"):
         sources.sensor_size(tmp_path / "a.raw", [4, 4])
+
+
+def test_views_that_stand_anywhere_are_scored_and_timed(tmp_path):
+    places = "[[0,0],[0,1],[0,2],[1,0],[1,1],[1,2]]"  # six: a number without a layout
+    chosen = ["ckpt=setnet_small", "optics.views=6", f"optics.positions={places}"]
+    record = evaluate(config("eval", tmp_path, *SMALL, *chosen))
+    assert record["model"]["macs_per_frame"] > 0 and list(record["latency_ms"]) == ["64x64"]
