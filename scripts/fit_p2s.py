@@ -1,4 +1,4 @@
-"""Fit p2s.safetensors: python -m scripts.fit_p2s [steps, default 20000; 0: tables only].
+"""Fit p2s.safetensors: python -m scripts.fit_p2s [steps, default 16000; 0: tables only].
 
 For each band of D/r0: exact PSFs of random Kolmogorov phase, a principal basis of them in the
 metric of a natural picture (power 1 / f^2), networks from the first modes of the phase to the
@@ -40,7 +40,7 @@ PLANS = (
     Plan(3.0, 4.0, 32, 35, ((14, 48, 32), (27, 64, 48), (44, 128, 96))),
     Plan(4.0, 5.5, 40, 41, ((20, 64, 48), (35, 96, 96), (54, 160, 96))),
     Plan(5.5, 7.0, 40, 47, ((20, 64, 48), (35, 128, 96), (54, 160, 128))),
-    Plan(7.0, 10.0, 48, 47, ((27, 64, 48), (44, 160, 96), (77, 192, 128))),
+    Plan(7.0, 10.0, 48, 47, ((27, 64, 48), (44, 128, 96), (77, 192, 128))),
 )
 
 
@@ -162,4 +162,4 @@ def train(seen: Tensor, weights: Tensor, hidden: list[int], steps: int) -> nn.Se
 
 
 if __name__ == "__main__":
-    fit(int(sys.argv[1]) if len(sys.argv) > 1 else 20_000)
+    fit(int(sys.argv[1]) if len(sys.argv) > 1 else 16_000)

@@ -141,7 +141,7 @@ def _networks() -> dict[str, Tensor]:
 
 def _psf_errors(band: Band, strength: float) -> Tensor:
     """Return the power of basis and network together, per network and rank."""
-    phase = _draw(1500, ALL_MODES, strength)
+    phase = _draw(800, ALL_MODES, strength)
     psfs = _exact(phase, band.mean.shape[-1])
     power = _power(psfs - psfs.mean(0))
     out = []
