@@ -100,20 +100,18 @@ class Field:
         size: tuple[int, int],
         device: torch.device,
     ):
-        response = torch.view_as_complex(waves.response[modes])
         middle = (columns.pixels[0] + columns.pixels[-1]) / 2
-        response = response * _turns(waves.frequency[:, 0], middle - (size[1] - 1) / 2)
+        turned = torch.complex(*_turns(waves.frequency[:, 0], middle - (size[1] - 1) / 2))
+        response = torch.view_as_complex(waves.response[modes]).to(torch.complex64) * turned
         down = _turns(waves.frequency[:, 1], rows.pixels - (size[0] - 1) / 2)
         half = columns.pixels[len(columns.pixels) // 2 :] - middle
         across = _turns(waves.frequency[:, 0], half)
         self.orders = []
         for own in _orders(modes.start or 0, len(response)):
             seen = _seen(response[own], FAINT[own.start + (modes.start or 0) > 1])
-            tables = down[seen].T, across[seen]
-            parts = [part.contiguous() for table in tables for part in (table.real, table.imag)]
-            parts = [part.to(device, torch.float32) for part in parts]
-            own_response = response[own][:, seen].to(device, torch.complex64)
-            self.orders.append((own, seen, own_response, *parts))
+            tables = [part[seen].T.contiguous() for part in down] + [part[seen] for part in across]
+            parts = [part.to(device) for part in (response[own][:, seen], *tables)]
+            self.orders.append((own, seen, *parts))
         self.shape = (len(response), len(rows.pixels), len(columns.pixels))
         self.rows, self.columns, self.device = rows, columns, device
 
@@ -202,10 +200,15 @@ def _seen(response: Complex[Tensor, "modes waves"], faint: float) -> Int[Tensor,
     return kept.sort().values
 
 
-def _turns(frequency: Tensor, place: Tensor) -> Complex[Tensor, "waves ..."]:
-    """Return exp(2 pi i f x) of every wave at every place in pixels, in complex128."""
+def _turns(frequency: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
+    """Return cos and sin of 2 pi f x, float32 (waves, *places), of every wave at every place.
+
+    Whole turns are taken off in float64.
+    """
     place = torch.as_tensor(place).double()
-    return torch.exp(2j * math.pi * frequency.reshape(-1, *[1] * place.ndim) * place)
+    turns = frequency.reshape(-1, *[1] * place.ndim) * place
+    angle = (2 * math.pi * (turns - turns.round())).float()
+    return angle.cos(), angle.sin()
 
 
 def _sequence(key: int, count: int) -> Float[Tensor, "count 3"]:
