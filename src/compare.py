@@ -17,14 +17,19 @@ from src.metrics import straightness
 from src.recordings.files import sources
 from src.records import results
 
-NOTES = {"wander": "wander of what stands still", "straightness": "what moves, from a line"}
+NOTES = {
+    "wander": "wander of what stands still: {:.2f} px",
+    "straightness": "what moves, from a line: {:.2f} px",
+    "contrast": "contrast: {:.3f}",
+}
 
 
 def compare(cfg: DictConfig) -> dict:
     """Write `comparison.png`.  Returns how far what each video's slice shows strays, in pixels.
 
     `wander`, along a line or a ray that turns with the scene, is of what stands still there,
-    `straightness` of what moves uniformly along a line or a circle.
+    `straightness` of what moves uniformly along a line or a circle.  With `still` the whole scene
+    stands: wander is the median over its rows and columns, `contrast` its pictures' deviation.
     Raises ValueError for a video that cannot be read or is of another size than the first, or a
     slice that leaves the picture.
     """
@@ -33,6 +38,7 @@ def compare(cfg: DictConfig) -> dict:
     if len(names) != len(cfg.videos):
         raise ValueError(f"names must be one per video, got {len(names)} for {len(cfg.videos)}")
     films = [np.stack(list(sources.film(path)))[cfg.first : cfg.last] for path in cfg.videos]
+    films = slices.shrunk(films) if cfg.still else films
     sizes = {film.shape[1:] for film in films}
     if len(sizes) > 1:
         raise ValueError(f"videos must be of one size (h, w), got {sorted(sizes)}")
@@ -40,8 +46,8 @@ def compare(cfg: DictConfig) -> dict:
     found, rows = {}, []
     for name, film in zip(names, films, strict=True):
         across, points = cut(cfg, film)
-        found[name] = strays(cfg, across)
-        notes = [f"{NOTES[measure]}: {value:.2f} px" for measure, value in found[name].items()]
+        found[name] = strays(cfg, across) if not cfg.still else stands(film, cfg.still)
+        notes = [NOTES[measure].format(value) for measure, value in found[name].items()]
         rows.append(layouts.Row(name, film, across, "\n".join(notes)))
     shortest = min(map(len, films))
     layouts.comparison(
@@ -54,12 +60,15 @@ def compare(cfg: DictConfig) -> dict:
 
 def cut(cfg: DictConfig, film: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the slice (frames, places) and its points in the first frame: `line` [[x, y], [x, y]],
-    `circle` [x, y, radius] or `spin` [x, y, radius, turns a second, degrees at the first frame].
+    `circle` [x, y, radius] or `spin` [x, y, radius, turns a second, degrees at the first frame];
+    of a `still` scene the middle row.
     """
-    if sum(bool(given) for given in (cfg.line, cfg.circle, cfg.spin)) != 1:
-        raise ValueError(
-            f"give one of line, circle and spin, got {cfg.line}, {cfg.circle}, {cfg.spin}"
-        )
+    given = {name: cfg[name] for name in ("line", "circle", "spin", "still") if cfg[name]}
+    if len(given) != 1:
+        raise ValueError(f"give one of line, circle, spin and still, got {given or 'none'}")
+    if cfg.still:
+        middle = film.shape[1] // 2
+        return film[:, middle], slices.line((0, middle), (film.shape[2] - 1, middle))
     if cfg.spin:
         x, y, radius, turns, degrees = cfg.spin
         angles = math.radians(degrees) + 2 * math.pi * turns * np.arange(len(film)) / cfg.fps
@@ -86,6 +95,12 @@ def strays(cfg: DictConfig, across: np.ndarray) -> dict[str, float]:
         measure = straightness.turning if cfg.circle else straightness.straightness
         found["straightness"] = measure(followed(across, cfg.follow))
     return found
+
+
+def stands(film: np.ndarray, step: int) -> dict[str, float]:
+    """Return `wander`, the median over lines `step` pixels apart, in pixels, and `contrast`."""
+    found = {"wander": straightness.wander_of_all(film, step)}
+    return found | {"contrast": float(film.std((1, 2)).mean())}
 
 
 def followed(across: np.ndarray, follow: str) -> np.ndarray:

@@ -263,3 +263,21 @@ def test_a_slice_that_cannot_be_taken_is_refused(wrong, message, tmp_path):
         cv2.imwrite(str(tmp_path / "film" / f"{k}.png"), np.zeros((20, 30), np.uint8))
     with pytest.raises(ValueError, match=message):
         compare(config("compare", tmp_path / "run", f"videos=[{tmp_path}/film]", *wrong.split()))
+
+
+def test_a_scene_that_stands_wanders_by_its_shifts_whatever_the_size(tmp_path):
+    y, x = np.mgrid[:96, :96]
+    for name, side in (("large", 96), ("small", 48)):
+        (tmp_path / name).mkdir()
+        for k in range(16):
+            shift = 1.5 * np.sin(1.7 * k)
+            picture = 128 + 60 * np.sin((x - shift) / 5) + 60 * np.sin((y - shift) / 7)
+            picture = cv2.resize(picture, (side, side), interpolation=cv2.INTER_AREA)
+            cv2.imwrite(str(tmp_path / name / f"{k:02d}.png"), picture.astype(np.uint8))
+    given = [f"videos=[{tmp_path}/large,{tmp_path}/small]", "names=[large,small]", "still=8"]
+    found = compare(config("compare", tmp_path / "run", *given))
+    for values in found.values():  # both are looked at with 48 pixels
+        assert values["wander"] == pytest.approx(0.75 / 2**0.5, rel=0.1)
+    assert (tmp_path / "run" / "comparison.png").is_file()
+    with pytest.raises(ValueError, match="give one of line, circle, spin and still"):
+        compare(config("compare", tmp_path / "none", *given, "line=[[0,0],[9,9]]"))

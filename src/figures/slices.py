@@ -6,6 +6,7 @@ Coordinates are (x, y) in pixels, the centre of the first pixel is (0, 0), y poi
 """
 
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -68,3 +69,12 @@ def along(
     points = np.array(centre) + radii[None, :, None] * rays[:, None]
     rows = [sample(video[k : k + 1], points[k]) for k in range(len(video))]
     return np.concatenate(rows)
+
+
+def shrunk(videos: Sequence[Float[np.ndarray, "_frames _h _w"]]) -> list[np.ndarray]:
+    """Return the videos shrunk to the size of the smallest, areas averaged."""
+    height, width = min(video.shape[1:] for video in videos)
+    return [
+        np.stack([cv2.resize(f, (width, height), interpolation=cv2.INTER_AREA) for f in video])
+        for video in videos
+    ]

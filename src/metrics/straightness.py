@@ -24,6 +24,18 @@ def wander(rows: Float[np.ndarray, "frames places"]) -> float:
     return float(shifts.std())
 
 
+def wander_of_all(film: Float[np.ndarray, "frames h w"], step: int) -> float:
+    """Return the median wander over rows and columns of a scene that stands still, `step` pixels
+    apart and as far from the border.  Raises ValueError where there is no such line.
+    """
+    inside = film[:, step : film.shape[1] - step, step : film.shape[2] - step]
+    if step < 1 or 0 in inside.shape:
+        raise ValueError(f"still must be in 1..{min(film.shape[1:]) // 2} pixels, got {step}")
+    rows = [wander(inside[:, y]) for y in range(0, inside.shape[1], step)]
+    columns = [wander(inside[:, :, x]) for x in range(0, inside.shape[2], step)]
+    return float(np.nanmedian(rows + columns))
+
+
 def _shift(row: np.ndarray, mean: np.ndarray, places: np.ndarray) -> float:
     shift = 0.0
     for _ in range(ROUNDS):
