@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 LONGEST_SIDE = 768  # pixels of the smaller side up to which footage is enlarged, at most twice
-CORNERS, QUALITY, APART = 2000, 0.005, 5  # at most; share of the best one's; pixels between two
+CORNERS, QUALITY, APART = 1500, 0.02, 5  # at most; share of the best one's; pixels between two
 WINDOW = {"winSize": (21, 21), "maxLevel": 2}
 RETURNED = 0.6  # pixels within which a corner followed forth and back must return
 SEEN = 0.9  # share of the frames in which a corner must be found
