@@ -114,7 +114,10 @@ def test_rooms_are_a_list_of_packages(given, tmp_path):
         build.rooms(config("eval", tmp_path, f"rooms={given}"))
 
 
-@pytest.mark.parametrize("door", "train eval simulate reconstruct calibrate chart stress".split())
+DOORS = ("train", "eval", "simulate", "reconstruct", "calibrate", "chart", "stress")
+
+
+@pytest.mark.parametrize("door", DOORS)
 def test_every_door_that_builds_has_rooms_and_they_are_empty(door):
     assert OmegaConf.load(ROOT / "conf" / f"{door}.yaml").rooms == []
 
