@@ -152,10 +152,11 @@ def _window(events: np.ndarray, lookup: Lookup, rule: Rule, start: float, k: int
     end = start + k * 1e6 / rule.fps
     begin = start + (k - rule.overlap) * 1e6 / rule.fps
     first, stop = np.searchsorted(events["t"], [begin, end])
-    return _filled(events[first:stop], lookup, rule, begin, end)
+    return filled(events[first:stop], lookup, rule, begin, end)
 
 
-def _filled(events: np.ndarray, lookup: Lookup, rule: Rule, begin: float, end: float) -> Window:
+def filled(events: np.ndarray, lookup: Lookup, rule: Rule, begin: float, end: float) -> Window:
+    """Return the window [begin, end) us of `events`, which lie in it, filled as `rule` says."""
     if not rule.grids:
         return _listed(events, lookup, rule, begin, end)
     if not events.size:
@@ -188,7 +189,7 @@ def _by_count(
         for nth in inside[rule.count - 1 :: rule.count]:
             events, stop = pending[stop : nth + 1], nth + 1
             last = max(float(events["t"][-1]), begin + 1.0)
-            yield _filled(events, lookup, rule, begin, last)
+            yield filled(events, lookup, rule, begin, last)
             begin = last
         pending = pending[stop:]
         if len(early) < len(chunk):
