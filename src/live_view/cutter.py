@@ -80,12 +80,15 @@ class Cutter:
         if self.origin is None or self.end_us > until_us:
             return
         events = self.pending[0] if len(self.pending) == 1 else np.concatenate(self.pending)
-        while self.end_us <= until_us:
-            start, end = self.end_us - self.period, self.end_us
-            stop = int(np.searchsorted(events["t"], end))
-            yield EventWindow(start, end, events[:stop], fresh=self.fresh)
-            events, self.fresh, self.cut = events[stop:], False, self.cut + 1
-        self.pending = [events]
+        over = int((until_us - self.origin) / self.period) - self.cut
+        ends = self.end_us + self.period * np.arange(max(over, 1))
+        # Of a contiguous copy: a field of a structured array would be copied for each search.
+        stops = np.searchsorted(np.ascontiguousarray(events["t"]), ends)
+        self.pending, self.cut = [events[stops[-1] :]], self.cut + len(ends)
+        first, self.fresh, before = self.fresh, False, 0
+        for end, stop in zip(ends.tolist(), stops.tolist(), strict=True):
+            yield EventWindow(end - self.period, end, events[before:stop], fresh=first)
+            first, before = False, stop
 
     def _on_sensor(self, events: np.ndarray) -> np.ndarray:
         height, width = self.sensor
