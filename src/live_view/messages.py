@@ -58,9 +58,10 @@ class Page:
         pictures, count = [], self.screen.count
         if whole or count != self.shown:
             self.shown = count
+            pictures.append(("frame", paint.jpeg(self.screen.newest())))
+        if whole or self.marks.windows:
             counts = self.marks.take()
             centre = self.positions.index((0, 0)) if (0, 0) in self.positions else 0
-            pictures.append(("frame", paint.jpeg(self.screen.newest())))
             pictures.append(("events", paint.jpeg(paint.events(counts[centre]))))
             if self.all_views:
                 pictures.append(("views", paint.jpeg(paint.side_by_side(counts, self.positions))))

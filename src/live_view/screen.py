@@ -84,20 +84,22 @@ class EventPicture:
         self.lookup = lookup
         self.lock = threading.Lock()
         self.watched = False
+        self.windows = 0  # added since the last `take`
         self.counts = self._blank()
 
     def _blank(self) -> Int[np.ndarray, "views h w"]:
         return np.zeros((self.lookup.views, *self.lookup.model), np.int32)
 
     def add(self, events: np.ndarray) -> None:
-        """Add events (t x y p) of the sensor."""
+        """Add a window's events (t x y p) of the sensor."""
         if self.watched:
             fields = (events[name] for name in "xyp")
             with self.lock:
                 mark(*fields, self.lookup.view, self.lookup.place, self.counts)
+                self.windows += 1
 
     def take(self) -> Int[np.ndarray, "views h w"]:
         """Return what came since the last call."""
         with self.lock:
-            taken, self.counts = self.counts, self._blank()
+            taken, self.counts, self.windows = self.counts, self._blank(), 0
         return taken
