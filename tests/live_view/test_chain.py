@@ -192,10 +192,10 @@ def test_windows_of_a_quiet_camera_come_by_the_clock_until_it_has_stalled():
 def test_a_stream_that_comes_back_goes_on_from_there():
     later = 0.2 + STALL_S + 0.3
     feed = Script((0, [0, 200_000]), (later, [9_000_000]), (later + 0.05, [9_050_000]))
-    windows, state = live_windows(feed, later + 0.3, Faults())
+    windows, state = live_windows(feed, later + 0.8, Faults())
     assert state == "playing"
     starts = np.array([one.start_us for one in windows])
-    assert (starts >= 9_000_000).sum() >= 4 and not ((starts > 1.5e6) & (starts < 9e6)).any()
+    assert (starts >= 9_000_000).sum() >= 3 and not ((starts > 1.5e6) & (starts < 9e6)).any()
     assert [one.fresh for one in windows].count(True) == 1  # the picture is not thrown away
 
 
