@@ -1,12 +1,14 @@
 # make train: set up what is missing, train the light-field network for minutes, show what it learned.
 # make test:  set up what is missing, run the fast tests.     make test-all: the slow ones too.
+# make demo:  set up what is missing, simulate a recording once, play it live in the browser.
 
 PYTHON ?= python3
 PY := .venv/bin/python
 READY := .venv/ready
 LPIPS := .cache/lpips/alex.safetensors
+DEMO := out/demo
 
-.PHONY: train test test-all lint clean
+.PHONY: train test test-all demo lint clean
 train: $(READY) $(LPIPS)
 	$(PY) -m src.train experiment=lf3x3
 
@@ -16,6 +18,10 @@ test: $(READY) $(LPIPS)
 test-all: $(READY) $(LPIPS)
 	$(PY) -m pytest -q
 
+demo: $(READY) $(DEMO)
+	$(PY) -m src.live recording=$(DEMO)/cap.raw views=$(DEMO)/cap.views.yaml ckpt=setnet_small \
+		loop=true fps=120
+
 lint: $(READY)
 	$(PY) -m ruff check . && $(PY) -m ruff format --check .
 
@@ -23,6 +29,12 @@ lint: $(READY)
 $(READY): pyproject.toml constraints.txt scripts/setup.sh
 	PYTHON=$(PYTHON) bash scripts/setup.sh
 	touch $@
+
+# The folder is there only when the recording in it is whole.
+$(DEMO): | $(READY)
+	@echo "simulating a recording of nine views, once"
+	$(PY) -m src.simulate --config-name demo write=$(DEMO).partial/cap.raw
+	mv $(DEMO).partial $@
 
 $(LPIPS):
 	$(PY) -m scripts.fetch_lpips_backbone

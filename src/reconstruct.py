@@ -11,8 +11,8 @@ from omegaconf import DictConfig
 from torch import nn
 
 from src.app import build, door
-from src.models.fast import running
-from src.recordings import lookup, output, progress, stream
+from src.models.runtime import Runtime
+from src.recordings import listed, lookup, output, progress, stream
 from src.recordings.files import sources
 from src.recordings.views import Views, load
 from src.records import results
@@ -25,7 +25,7 @@ def reconstruct(cfg: DictConfig) -> Path:
     """
     run, net = Path(cfg.paths.run), build.chosen(cfg)
     views, span = views_for(cfg, net), overlap(cfg, net)
-    fast = running(net, cfg.form).to(cfg.device)
+    fast = listed.ready(net, cfg.form, cfg.device, views, cfg.bins)
     results.open_run(run, door.resolved(cfg))
     with output.sink(cfg.output, run, views.model, cfg.playback) as write:
         for frame in progress.tell(frames(cfg, fast, views, span), span):
@@ -49,7 +49,9 @@ def overlap(cfg: DictConfig, net: nn.Module) -> int:
     return stream.overlap(cfg.span or stream.default_span(net), cfg.fps)
 
 
-def frames(cfg: DictConfig, net: nn.Module, views: Views, span: int) -> Iterator[stream.Frame]:
+def frames(
+    cfg: DictConfig, net: nn.Module | Runtime, views: Views, span: int
+) -> Iterator[stream.Frame]:
     """Read, cut into windows that span `span` frames, and reconstruct, chunk by chunk."""
     rule = stream.Rule(
         fps=None if cfg.count else cfg.fps,
@@ -60,9 +62,12 @@ def frames(cfg: DictConfig, net: nn.Module, views: Views, span: int) -> Iterator
         unit=cfg.unit,
         start_s=cfg.start,
         end_s=cfg.end,
+        grids=not isinstance(net, Runtime),
     )
     chunks = sources.events(cfg.recording, views.sensor, cfg.chunk_s)
     windows = stream.windows(chunks, lookup.build(views), rule)
+    if isinstance(net, Runtime):
+        return listed.frames(windows, net, overlap=span)
     return stream.frames(windows, net, overlap=span, positions=views.positions, device=cfg.device)
 
 

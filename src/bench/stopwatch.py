@@ -16,9 +16,10 @@ from src.models.fast import plain, running
 
 PEAKS = {  # what a form computes in
     "float32": torch.float32, "bf16": torch.bfloat16, "compiled": torch.bfloat16,
-    "onnx": torch.float32,
+    "openvino": torch.bfloat16, "onnx": torch.float32,
 }  # fmt: skip
 FORMS = tuple(PEAKS)
+ON_CPU = ("openvino", "onnx")  # and nowhere else
 SMALL = 64  # side of the picture that says what a post-processor costs on larger ones
 FILLED = 0.05  # share of a grid's entries that are not zero, as in our streams
 
@@ -75,11 +76,12 @@ class Stopwatch:
         self, candidate: Candidate, sides: Sequence[int], counts: Sequence[int],
         forms: Sequence[str], devices: Sequence[str],
     ) -> Iterable[Speed]:  # fmt: skip
-        """Yield one entry for each combination; a GPU has no threads to choose and no ONNX."""
+        """Yield one entry for each combination; a GPU has no threads to choose, no OpenVINO and no
+        ONNX."""
         for side in sides:
             for device in devices:
-                with_onnx = device == "cpu" and side <= self.onnx_side
-                for form in forms if with_onnx else [f for f in forms if f != "onnx"]:
+                left_out = ON_CPU if device != "cpu" else ["onnx"] if side > self.onnx_side else []
+                for form in (form for form in forms if form not in left_out):
                     for count in counts if device == "cpu" else [1]:
                         yield self._row(candidate, side, device, count, form)
 

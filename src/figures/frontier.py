@@ -21,7 +21,13 @@ PALETTE = (
     "#1f5fa8", "#d1571b", "#2f8f4e", "#8a4fa3", "#c2a11a", "#6b6b6b",
     "#5aa9e6", "#f0a067", "#7fc99a", "#c49ad6", "#8c5a3c", "#000000",
 )  # fmt: skip
-FACES = {"float32": "full", "bf16": "none", "compiled": "bottom", "onnx": "left"}
+FACES = {
+    "float32": "full",
+    "bf16": "none",
+    "compiled": "bottom",
+    "onnx": "left",
+    "openvino": "right",
+}
 
 
 def accuracy(

@@ -79,19 +79,32 @@ class E2VID(nn.Module):
             wanted, got = (self.views, self.bins), tuple(voxels.shape[1:3])
             raise ValueError(f"optics.views, bins must be {wanted} for this network, got {got}")
         x, (top, left) = pad_to_multiple(voxels.flatten(1, 2), 2**SCALES)
-        head, skips, after = self.encode(x, state)
+        frame, after = self.after_first(self.first(x), state)
+        return frame[..., top : top + height, left : left + width], after
+
+    @property
+    def first(self) -> nn.Conv2d:
+        """The layer that sees the grids."""
+        return self.head if self.stem is None else self.stem
+
+    def after_first(
+        self, x: Float[Tensor, "n c h w"], state: Any
+    ) -> tuple[Float[Tensor, "n 1 h w"], tuple]:
+        """Return the frame, padding and all, and the state; `x` is the first layer's, no ReLU."""
+        head, skips, after = self._scales(x, state)
         x = skips[-1]
         for block in self.resblocks:
             x = block(x)
-        frame = self.activation(self.decode(x, head, skips))
-        return frame[..., top : top + height, left : left + width], after
+        return self.activation(self.decode(x, head, skips)), after
 
     def encode(
         self, x: Float[Tensor, "n c h w"], state: Any
     ) -> tuple[Float[Tensor, "n c2 h w"], list[Tensor], tuple]:
         """Return the head, the hidden map of each scale, finest first, and the state."""
-        x = x if self.stem is None else self.stem(x).relu()
-        head = x = self.head(x).relu()
+        return self._scales(self.first(x), state)
+
+    def _scales(self, x: Tensor, state: Any) -> tuple[Tensor, list[Tensor], tuple]:
+        head = x = x.relu() if self.stem is None else self.head(x.relu()).relu()
         skips, after = [], []
         for encoder, cell, before in zip(
             self.encoders, self.cells, state or [None] * SCALES, strict=True

@@ -8,15 +8,15 @@ import contextlib
 import io
 import logging
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from src.models.explicit import Explicit
 from src.models.fast import plain
 from src.models.unroll import takes
 
@@ -43,7 +43,7 @@ def export(
     require()
     folded = plain(network).cpu()
     voxels = torch.randn(1, views, bins, height, width, generator=torch.Generator().manual_seed(0))
-    explicit = _Explicit(folded, positions)
+    explicit = Explicit(folded, positions)
     with torch.no_grad():
         started = explicit.begin(voxels)
         _write(explicit, (voxels, torch.full((1,), 1 / 120), *started), path)
@@ -95,44 +95,7 @@ class OnnxNetwork(nn.Module):
         return torch.from_numpy(frame), after
 
 
-class _Explicit(nn.Module):
-    """A network whose state is a flat list of tensors."""
-
-    def __init__(self, network: nn.Module, positions: Sequence[tuple[int, int]] | None):
-        super().__init__()
-        self.network, self.form = network, None
-        self.told = {"positions": positions} if takes(network, "positions") else {}
-        self.timed = takes(network, "window_s")
-
-    def begin(self, voxels: Tensor) -> list[Tensor]:
-        """Return the state before the first window, zeros, and note its form."""
-        _, self.form = self.network(voxels, None, **self.told)
-        return [torch.zeros_like(part) for part in flat(self.form)]
-
-    def forward(self, voxels: Tensor, window_s: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
-        told = self.told | ({"window_s": window_s} if self.timed else {})
-        frame, after = self.network(voxels, formed(self.form, iter(state)), **told)
-        return frame, *flat(after)
-
-
-def flat(state: Any) -> list[Tensor]:
-    """Return the tensors of nested tuples, lists and dicts in order."""
-    if isinstance(state, Tensor):
-        return [state]
-    parts = state.values() if isinstance(state, dict) else state
-    return [tensor for part in parts for tensor in flat(part)]
-
-
-def formed(form: Any, tensors: Iterator[Tensor]) -> Any:
-    """Return `tensors` nested as `form` is."""
-    if isinstance(form, Tensor):
-        return next(tensors)
-    if isinstance(form, dict):
-        return {name: formed(part, tensors) for name, part in form.items()}
-    return type(form)(formed(part, tensors) for part in form)
-
-
-def _write(explicit: _Explicit, example: tuple, path: Path) -> None:
+def _write(explicit: Explicit, example: tuple, path: Path) -> None:
     states = range(len(example) - 2)
     names = ["voxels", "window_s", *(f"state{k}" for k in states)]
     chatty = logging.getLogger("torch.onnx")

@@ -15,12 +15,14 @@ from src.models.files import fold
 from src.models.setnet import SetNet
 from src.models.unroll import takes
 
-FORMS = ("float32", "bf16", "compiled")
+FORMS = ("float32", "bf16", "compiled", "openvino")
 
 
 def running(network: nn.Module, form: str) -> nn.Module:
     """Return `network` in a form to run it in: `float32`, as it is; `bf16`, a Fast one; `compiled`,
-    that one compiled.  Raises ValueError, naming `form`, for another or where it cannot be made.
+    that one compiled; `openvino`, on OpenVINO, in bf16 where the CPU computes in it.
+
+    Raises ValueError, naming `form`, for another or where it cannot be made.
     """
     if form not in FORMS:
         raise ValueError(f"form must be one of {', '.join(FORMS)}, got {form}")
@@ -28,6 +30,10 @@ def running(network: nn.Module, form: str) -> nn.Module:
         return network
     if not any(True for _ in network.parameters()):
         raise ValueError(f"form must be float32 for a network without parameters, got {form}")
+    if form == "openvino":
+        from src.models.openvino_cpu import OpenVinoNetwork  # which takes `plain` from here
+
+        return OpenVinoNetwork(network)
     return Fast(network, skip_empty=False, compiled=form == "compiled")
 
 

@@ -62,7 +62,7 @@ class SetNet(nn.Module):
         self.up2 = nn.Conv2d(channels, stem, 1)
         self.mix2 = nn.Conv2d(stem, stem, 3, padding=1)
         self.shuffle = nn.Conv2d(stem, 4, 3, padding=1)
-        self.frozen: dict[tuple, tuple[Tensor, Tensor]] | None = None  # kernels kept, for running
+        self.frozen: dict[tuple, tuple[Tensor, ...]] | None = None  # kernels kept, for running
         # What is drawn without any learning: the leaky sums themselves.
         self.skip = nn.Parameter(torch.full((memories,), 0.15))
 
@@ -90,7 +90,7 @@ class SetNet(nn.Module):
         views, a length of window or a state that do not fit.
         """
         n, views, bins, height, width = voxels.shape
-        places = self._places(views, bins, positions)
+        places = self.places(views, bins, positions)
         seconds = _seconds(window_s, voxels)
         padded, (top, left) = pad_to_multiple(voxels.flatten(0, 1), 8)
         voxels = padded.unflatten(0, (n, views))
@@ -104,42 +104,49 @@ class SetNet(nn.Module):
         mean_sums = _grown(keep, 8) * mean_sums + events.mean(1, keepdim=True)
         spread = (sums - sums.mean(1, keepdim=True)).abs().mean(1)
 
-        stem = self._stem(voxels, torch.cat([sums.flatten(1, 2), spread], 1), places)
-        pace = RATE * passed
+        grids, memories, bias = self.kernels(places)
+        stem = functional.conv2d(voxels.flatten(1, 2).to(grids.dtype), grids, None, 2, 2)
+        memory = torch.cat([sums.flatten(1, 2), spread], 1).to(memories.dtype)
+        stem = stem + functional.conv2d(memory, memories, bias, 1, 1)
+        x, hidden4, hidden8 = self.after_stem(stem, passed, hidden4, hidden8)
+        x = functional.pixel_shuffle(x, 2)
+        frame = (x + (self.skip[:, None, None] * mean_sums).sum(1, keepdim=True)).sigmoid()
+        state = (mean_sums, sums, awake, hidden4, hidden8)
+        return frame[..., top : top + height, left : left + width].float(), state
+
+    def after_stem(
+        self, stem: Tensor, passed: Tensor, hidden4: Tensor, hidden8: Tensor
+    ) -> tuple[Float[Tensor, "n 4 h2 w2"], Tensor, Tensor]:
+        """Return what is drawn, its four phases as channels, float32, and the new hidden maps.
+
+        `stem`: before its ReLU, (n, stem, h2, w2); `passed`: seconds, (n, 1, h8, w8).
+        """
+        stem, pace = stem.relu(), RATE * passed
         hidden4 = self.cell4(self.down4(stem).relu(), hidden4, _grown(pace, 2))
         after4 = hidden4.to(stem.dtype)
         hidden8 = self.cell8(self.down8(after4).relu(), hidden8, pace)
         x = self.block8(hidden8.to(stem.dtype))
         x = self.mix4((_grown(self.up4(x), 2) + after4).relu()).relu()
         x = self.mix2((_grown(self.up2(x), 2) + stem).relu()).relu()
-        x = functional.pixel_shuffle(self.shuffle(x), 2).float()
-        frame = (x + (self.skip[:, None, None] * mean_sums).sum(1, keepdim=True)).sigmoid()
-        state = (mean_sums, sums, awake, hidden4, hidden8)
-        return frame[..., top : top + height, left : left + width].float(), state
+        return self.shuffle(x).float(), hidden4, hidden8
 
-    def _stem(
-        self, voxels: Tensor, memory: Tensor, places: tuple[Position, ...]
-    ) -> Float[Tensor, "n stem h2 w2"]:
-        grids, memories = self._kernels(places)
-        stem = functional.conv2d(voxels.flatten(1, 2).to(grids.dtype), grids, None, 2, 2)
-        bias = self.voxel_stem.bias + self.sum_stem.bias
-        stem = stem + functional.conv2d(memory.to(memories.dtype), memories, bias, 1, 1)
-        return stem.relu()
-
-    def _kernels(self, places: tuple[Position, ...]) -> tuple[Tensor, Tensor]:
-        """Return the kernels of the stacked grids, and of the stacked sums and their spread."""
+    def kernels(self, places: tuple[Position, ...]) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the kernels of the stem for views that stand at `places`: of the stacked grids
+        (stem, views * bins, 5, 5), of the stacked sums and their spread, and the bias.
+        """
         device = self.skip.device
         if self.frozen is not None and (places, device) in self.frozen:
             return self.frozen[places, device]
         stood = torch.tensor(places, device=device).float()
-        memories = [self.sum_stem.kernel(stood), self.spread_stem.weight]
-        kernels = self.voxel_stem.kernel(stood), torch.cat(memories, 1)
+        memories = torch.cat([self.sum_stem.kernel(stood), self.spread_stem.weight], 1)
+        bias = self.voxel_stem.bias + self.sum_stem.bias
+        kernels = self.voxel_stem.kernel(stood), memories, bias
         if self.frozen is not None:
-            kernels = kernels[0], kernels[1].contiguous(memory_format=torch.channels_last)
-            self.frozen[places, device] = kernels
+            memories = memories.contiguous(memory_format=torch.channels_last)
+            self.frozen[places, device] = kernels = kernels[0], memories, bias
         return kernels
 
-    def _places(
+    def places(
         self, views: int, bins: int, positions: Sequence[Position] | None
     ) -> tuple[Position, ...]:
         if bins != self.bins:

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from src.recordings.engines.splat import splat
+from src.recordings.engines.splat import lay, splat
 from src.recordings.views import Size, Views
 
 THINNEST = 0.1  # of `density`: where fewer sensor pixels than this look, events are not scaled up
@@ -50,6 +50,22 @@ class Lookup:
         fields = (events[name] for name in "txyp")
         return splat(*fields, self.view, self.place, grid, float(t0), float(t1), nearest)
 
+    def parts(
+        self, events: np.ndarray, density: Float[np.ndarray, "views 1 h w"], *, nearest: bool
+    ) -> tuple[tuple[np.ndarray, ...], int]:
+        """Return what `add` would add over `density`, one entry for every pixel that an event is
+        laid into: (index of the event, x, y, weight, view), and how many events lie in no view.
+        """
+        self.check(events)
+        count = (1 if nearest else 4) * len(events)
+        kinds = (np.int64, np.int64, np.int64, np.int64, np.float32)
+        index, u, v, which, weight = (np.empty(count, kind) for kind in kinds)
+        fields = (events[name] for name in "xyp")
+        found, outside = lay(
+            *fields, self.view, self.place, density[:, 0], nearest, index, u, v, which, weight
+        )
+        return tuple(part[:found] for part in (index, u, v, weight, which)), outside
+
     @cached_property
     def densities(self) -> dict[str, Float[np.ndarray, "views 1 h w"]]:
         """What one event of every sensor pixel lays into each model pixel, `bilinear`, `nearest`.
@@ -62,6 +78,11 @@ class Lookup:
         for kind, grid in grids.items():
             splat(time, x, y, one, self.view, self.place, grid, 0.0, 1.0, kind == "nearest")
         return {kind: np.maximum(grid, THINNEST) for kind, grid in grids.items()}
+
+    @cached_property
+    def unit(self) -> Float[np.ndarray, "views 1 h w"]:
+        """Ones: no density."""
+        return np.ones((self.views, 1, *self.model), np.float32)
 
     def split(self, events: np.ndarray) -> tuple[np.ndarray, Int[np.ndarray, " k"]]:
         """Return the events inside views, at their nearest model pixel, and the view of each."""

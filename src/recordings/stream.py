@@ -28,13 +28,18 @@ COVERED = 0.99  # of the last window, or the recording ends before it
 
 @dataclass(frozen=True)
 class Window:
-    """The voxel grid of the events in [start_us, end_us): `events` in views, `outside` in none."""
+    """The voxel grid of the events in [start_us, end_us): `events` in views, `outside` in none.
+
+    `parts`, instead of a grid: seconds since the start, x, y, weight and view of all that a network
+    without a grid adds up (`Runtime`).
+    """
 
     start_us: float
     end_us: float
     events: int
     outside: int
-    voxels: Float[np.ndarray, "views bins h w"]
+    voxels: Float[np.ndarray, "views bins h w"] | None = None
+    parts: tuple[np.ndarray, ...] = ()
 
     @property
     def seconds(self) -> float:
@@ -48,7 +53,8 @@ class Rule:
 
     `unit`: a grid holds events per sensor `pixel`, as in training whatever the resampling, or all
     their `mass`.  A window by time is overlap / fps long and ends 1 / fps after the one before it.
-    `start_s` and `end_s` count from the recording's first event.
+    `start_s` and `end_s` count from the recording's first event.  `grids`: windows hold a voxel
+    grid; else the parts of one.
     """
 
     fps: float | None = None
@@ -59,6 +65,7 @@ class Rule:
     unit: str = "pixel"
     start_s: float = 0.0
     end_s: float = float("inf")
+    grids: bool = True
 
     def __post_init__(self):
         if (self.fps is None) == (self.count is None):
@@ -145,10 +152,13 @@ def _window(events: np.ndarray, lookup: Lookup, rule: Rule, start: float, k: int
     end = start + k * 1e6 / rule.fps
     begin = start + (k - rule.overlap) * 1e6 / rule.fps
     first, stop = np.searchsorted(events["t"], [begin, end])
-    return _grid(events[first:stop], lookup, rule, begin, end)
+    return filled(events[first:stop], lookup, rule, begin, end)
 
 
-def _grid(events: np.ndarray, lookup: Lookup, rule: Rule, begin: float, end: float) -> Window:
+def filled(events: np.ndarray, lookup: Lookup, rule: Rule, begin: float, end: float) -> Window:
+    """Return the window [begin, end) us of `events`, which lie in it, filled as `rule` says."""
+    if not rule.grids:
+        return _listed(events, lookup, rule, begin, end)
     if not events.size:
         nothing = np.broadcast_to(np.float32(0), (lookup.views, rule.bins, *lookup.model))
         return Window(begin, end, 0, 0, nothing)
@@ -157,6 +167,14 @@ def _grid(events: np.ndarray, lookup: Lookup, rule: Rule, begin: float, end: flo
     if rule.unit == "pixel":
         grid /= lookup.densities[rule.splat]
     return Window(begin, end, len(events) - outside, outside, grid)
+
+
+def _listed(events: np.ndarray, lookup: Lookup, rule: Rule, begin: float, end: float) -> Window:
+    density = lookup.densities[rule.splat] if rule.unit == "pixel" else lookup.unit
+    parts, outside = lookup.parts(events, density, nearest=rule.splat == "nearest")
+    seconds = np.clip((events["t"] - begin) * 1e-6, 0, (end - begin) * 1e-6)
+    parts = (seconds[parts[0]], *parts[1:])
+    return Window(begin, end, len(events) - outside, outside, parts=parts)
 
 
 def _by_count(
@@ -171,7 +189,7 @@ def _by_count(
         for nth in inside[rule.count - 1 :: rule.count]:
             events, stop = pending[stop : nth + 1], nth + 1
             last = max(float(events["t"][-1]), begin + 1.0)
-            yield _grid(events, lookup, rule, begin, last)
+            yield filled(events, lookup, rule, begin, last)
             begin = last
         pending = pending[stop:]
         if len(early) < len(chunk):

@@ -1,4 +1,4 @@
-"""One pass over a list of events: look its view up, add it to that view's voxel grid."""
+"""One pass over a list of events: look the view up, add to its voxel grid or say what to add."""
 
 from numba import njit
 
@@ -42,3 +42,31 @@ def splat(t, x, y, p, view, place, grid, t0, t1, nearest):
             if right > 0.0 and down > 0.0:
                 plane[r + 1, c + 1] += weight * right * down
     return outside
+
+
+@njit(nogil=True, cache=True)
+def lay(x, y, p, view, place, density, nearest, index, u, v, which, weight):
+    """Write what `splat` adds in space: for each part the index of its event, its pixel (u, v), its
+    view and its weight over `density` (views, h, w).  Return (parts, events in no view).
+    """
+    _, height, width = density.shape
+    outside = parts = 0
+    for i in range(x.size):
+        k = view[y[i], x[i]]
+        if k < 0:
+            outside += 1
+            continue
+        right = min(max(place[y[i], x[i], 0], 0.0), width - 1.0)
+        down = min(max(place[y[i], x[i], 1], 0.0), height - 1.0)
+        if nearest:
+            right, down = float(int(right + 0.5)), float(int(down + 0.5))
+        c, r = int(right), int(down)
+        right, down = right - c, down - r
+        for a in range(2):
+            for b in range(2):
+                part = (down if a else 1.0 - down) * (right if b else 1.0 - right)
+                if part > 0.0:
+                    index[parts], u[parts], v[parts], which[parts] = i, c + b, r + a, k
+                    weight[parts] = p[i] * part / density[k, r + a, c + b]
+                    parts += 1
+    return parts, outside

@@ -1,0 +1,128 @@
+"""The live chain at full load, page and a visitor included: python -m benchmarks.live
+
+Limits, with setnet_small on nine views of 176x176, 600 windows and 5 million events a second, on
+two threads for 60 s: no window dropped; from the end of a window to its frame in the page's buffer
+5 ms in the median, 10 ms at 99 %; the page at 30 pictures a second 5 % of a core.  Events are
+uniform over the views of a 1280x720 sensor, the worst case for a cache.
+"""
+
+import argparse
+import asyncio
+import resource
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import src.models
+from benchmarks.recordings import MODEL, SENSOR, events
+from src.live_view import assembly, feeds
+from src.live_view.faults import Faults
+from src.live_view.step import Running
+from src.recordings import lookup
+from src.recordings.capture import kaleidoscope
+from src.recordings.files import formats
+from src.sim.optics import layout
+
+RATE = 5_000_000  # events a second over all views
+LENGTH_S = 2.0  # of the recording, which is played round and round
+WARM_S = 3.0  # before anything is counted
+PORT = 8611
+
+
+def write(path: Path, views) -> None:
+    """Write LENGTH_S of RATE events a second, all inside the views."""
+    seen = lookup.build(views).view >= 0
+    drawn = events(int(RATE * LENGTH_S / seen.mean() * 1.01), LENGTH_S)
+    inside = drawn[seen[drawn["y"], drawn["x"]]]
+    keep = np.sort(np.random.default_rng(0).permutation(len(inside))[: int(RATE * LENGTH_S)])
+    formats.write_events(path, inside[keep], width=SENSOR[1], height=SENSOR[0])
+
+
+async def measure(server: assembly.Server, seconds: float) -> dict:
+    """Play and serve for `seconds` after WARM_S with a visitor; return what was counted."""
+    player, stop = server.page.player, asyncio.Event()
+    running_server = asyncio.create_task(server.run(player.start, stop))
+    visitor = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "benchmarks.visitor", str(PORT), stdout=asyncio.subprocess.PIPE
+    )
+    await visitor.stdout.readline()
+    await asyncio.sleep(WARM_S)
+    meters, backlog = player.meters, player.intake.backlog
+    meters.span_s = seconds
+    meters.frames.clear()
+    busy, cpu = dict(meters.busy), time.process_time()
+    dropped = backlog.dropped
+    memory, began = _resident(), time.perf_counter()
+    await asyncio.sleep(seconds)
+    wall = time.perf_counter() - began
+    found = meters.rates() | {
+        "dropped": backlog.dropped - dropped,
+        "share": {name: (meters.busy[name] - busy[name]) / wall for name in busy},
+        "cores": (time.process_time() - cpu) / wall,
+        "memory_mb": (memory, _resident()),
+        "faults": player.faults.now(),
+    }
+    stop.set()
+    await running_server
+    player.stop()
+    told = np.array((await visitor.stdout.read()).split(), float).reshape(-1, 2)
+    await visitor.wait()
+    return found | dict(zip(("messages", "bytes"), np.median(told, axis=0), strict=True))
+
+
+def _resident() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 2**20
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--fps", type=float, default=600.0)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--ckpt", default="setnet_small")
+    parser.add_argument("--form", default=None)
+    parser.add_argument("--threads", type=int, default=2)
+    asked = parser.parse_args()
+    torch.set_num_threads(asked.threads)
+    views, faults = kaleidoscope(list(layout(9)), model=MODEL, sensor=SENSOR), Faults()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "uniform.raw"
+        write(path, views)
+        networks = {asked.ckpt: src.models.load(asked.ckpt)}
+        how = Running(asked.fps, form=asked.form)
+        feed = feeds.open_feed(str(path), None, faults, loop=True)
+        server = assembly.assemble(feed, networks, views, how, faults, port=PORT)
+        assembly.first_choice(server.page.controls, asked.ckpt, "all")
+        sys.setswitchinterval(assembly.GIL_S)
+        found = asyncio.run(measure(server, asked.seconds))
+    report(asked, found)
+
+
+def report(asked: argparse.Namespace, found: dict) -> None:
+    """Print what was measured."""
+    height, width = MODEL
+    print(
+        f"{asked.ckpt}, form={asked.form or 'null'}, nine views of {width}x{height},"
+        f" {asked.threads} threads, {asked.seconds:.0f} s: {found['fps']:.1f} of {asked.fps:.0f}"
+        " frames a second,"
+        f" {found['dropped']} windows dropped"
+    )
+    latency = found["latency_ms"]
+    print(f"latency: {latency['median']} ms median, {latency['p99']} ms at 99 %")
+    print(f"events: {found['events_per_s'] / 1e6:.2f} million a second in windows that were shown")
+    shares = ", ".join(f"{name} {share:.1%}" for name, share in found["share"].items())
+    print(f"share of a core: {shares}; the whole process {found['cores']:.2f} cores")
+    before, after = found["memory_mb"]
+    print(
+        f"the visitor got {found['messages']:.0f} messages, {found['bytes'] / 1e6:.2f} MB a second;"
+        f" memory {before:.0f} MB at the start, {after:.0f} MB at the end {found['faults']}"
+    )
+
+
+if __name__ == "__main__":
+    main()

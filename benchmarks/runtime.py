@@ -1,0 +1,127 @@
+"""From a list of events to a frame in memory: python -m benchmarks.runtime
+
+Limits (two threads, nine views of 176x176, 600 fps, 5 million events a second over all views):
+setnet_small 1.67 ms, setnet_medium 3.4 ms, median.  Events are those of a real recording, its
+sensor cut into nine views, its clock set so that they come at that rate.  Beside it, in turns of
+many windows, PyTorch in bf16 from the same lists: grids, then the network.  On one thread the time
+is what the process computes, which other jobs disturb less, else wall time.
+"""
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from src.bench.timing import convolution_peak, threads
+from src.models import load
+from src.models.cost import macs_per_frame
+from src.models.fast import running
+from src.models.runtime import Runtime
+from src.models.unroll import takes
+from src.recordings.files.formats import read_events
+from src.sim.optics import layout
+from src.sim.voxel import voxel_grid
+
+SIDE, FPS, RATE = 176, 600, 5e6
+RECORDING = Path("../shared/data/events/gen3_640x480_evt2.raw")
+NAMES = ("setnet_small", "setnet_medium", "setnet_large", "lf3x3")
+
+
+def windows(path: Path) -> list[tuple]:
+    """Return (t, x, y, p, view, t0, t1) of each window; the sensor's nine tiles are the views."""
+    events = read_events(path)
+    height, width = int(events["y"].max()) + 1, int(events["x"].max()) + 1
+    across, down = (3.0 * events["x"] / width), (3.0 * events["y"] / height)
+    view = 3 * down.astype(int) + across.astype(int)
+    x, y = (SIDE * (across % 1)).astype(np.uint16), (SIDE * (down % 1)).astype(np.uint16)
+    t = (events["t"] - events["t"][0]) * 1e-6
+    t *= len(t) / RATE / t[-1]
+    made = []
+    for k in range(int(t[-1] * FPS)):
+        first, stop = np.searchsorted(t, [k / FPS, (k + 1) / FPS])
+        fields = (part[first:stop] for part in (t, x, y, events["p"], view))
+        made.append((*fields, k / FPS, (k + 1) / FPS))
+    return made
+
+
+def milliseconds(
+    steps: list[Callable], played: list[tuple], seconds: float, clock: Callable[[], float]
+) -> list[list[float]]:
+    """Return the times of each of `steps`, `seconds` of each in four turns: within a turn one runs
+    alone, as it would live, its memory in the caches and no thread of the other one waiting.
+    """
+    taken: list[list[float]] = [[] for _ in steps]
+    for times, step in 4 * list(zip(taken, steps, strict=True)):
+        for window in played[:20]:
+            step(*window)
+        until = time.perf_counter() + seconds / 4
+        while time.perf_counter() < until:
+            for window in played:
+                start = clock()
+                step(*window)
+                times.append(1e3 * (clock() - start))
+    return taken
+
+
+def on_pytorch(network: torch.nn.Module) -> Callable:
+    """Return a step from a list of events through dense grids and PyTorch in bf16."""
+    fast, state = running(network, "bf16"), None
+    told = {"window_s": 1 / FPS} if takes(network, "window_s") else {}
+    size = {"bins": 5, "height": SIDE, "width": SIDE}
+
+    def step(t, x, y, p, view, t0, t1):
+        nonlocal state
+        parts = []
+        for index in range(9):
+            mine = view == index
+            events = t[mine], x[mine], y[mine], p[mine]
+            parts.append(voxel_grid(*events, t0=t0, t1=t1, **size))
+        frame, state = fast(torch.stack(parts)[None], state, **told)
+        return frame
+
+    return step
+
+
+def line(name: str, times: list[float], giga: float, peak: float) -> str:
+    """Return medians and what share of the machine's peak the network's arithmetic is."""
+    median, times = statistics.median(times), sorted(times)
+    low, high = times[len(times) // 10], times[9 * len(times) // 10]
+    rate = giga / median * 1e3
+    share = f"{rate:5.0f} GMAC/s, {rate / peak:.0%} of peak"
+    return f"{name:32s} {median:6.2f} ms ({low:.2f} to {high:.2f})  {share}"
+
+
+def main() -> None:
+    """Print a line for each network, number of threads and form."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", default=NAMES)
+    parser.add_argument("--recording", type=Path, default=RECORDING)
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--seconds", type=float, default=4.0)
+    given = parser.parse_args()
+    played = windows(given.recording)
+    mean = statistics.mean(len(window[0]) for window in played)
+    print(f"{len(played)} windows of 1/{FPS} s, {mean:.0f} events each over nine views of {SIDE}")
+    for count in given.threads:
+        peak = convolution_peak(torch.bfloat16, count=count) / 1e9
+        clock = time.process_time if count == 1 else time.perf_counter
+        kind = "CPU" if count == 1 else "wall"
+        print(f"threads: {count}, {kind} time, median (10 to 90 %); peak {peak:.0f} GMAC/s in bf16")
+        for name in given.names:
+            network = load(name)
+            giga = macs_per_frame(network, SIDE, SIDE, views=9) / 1e9
+            size = {"positions": layout(9), "height": SIDE, "width": SIDE}
+            live = Runtime(network, **size, threads=count, form="openvino")
+            with threads(count):
+                steps = [live.step, on_pytorch(network)]
+                both = milliseconds(steps, played, given.seconds, clock)
+            print(line(f"{name}, openvino", both[0], giga, peak), flush=True)
+            print(line(f"{name}, pytorch", both[1], giga, peak), flush=True)
+
+
+if __name__ == "__main__":
+    main()

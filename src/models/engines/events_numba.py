@@ -1,0 +1,169 @@
+"""From a list of events to the inputs of a network's first layer, without a grid (numba).
+
+A convolution is linear, so that an event adds to the map of the first layer the part of the kernel
+that reaches from where it fell: what a window costs follows its events.
+"""
+
+import numpy as np
+from numba import njit
+
+f32 = np.float32
+
+GOOD, BACKWARDS, OFF_SENSOR, NO_VIEW, NO_NUMBER = range(5)  # what `check` finds
+BLOCK = 4  # half-resolution pixels of a block that has a time of its own
+
+
+@njit(nogil=True, cache=True)
+def check(t, x, y, p, view, views, height, width):
+    """Return (index, what) of the first event that is wrong, or (-1, GOOD)."""
+    for i in range(t.size):
+        if not np.isfinite(t[i]) or not np.isfinite(p[i]):
+            return i, NO_NUMBER
+        if i and t[i] < t[i - 1]:
+            return i, BACKWARDS
+        if not (0 <= x[i] < width and 0 <= y[i] < height):
+            return i, OFF_SENSOR
+        if not 0 <= view[i] < views:
+            return i, NO_VIEW
+    return -1, GOOD
+
+
+@njit(nogil=True, cache=True)
+def add_patches(t, x, y, p, view, t0, t1, down, right, table, stride, out):
+    """Add all events with t0 <= t <= t1 to `out` (h2, w2 * c), weighed in time as `voxel_grid`.
+
+    `table`, `down`, `right`: of `src.models.patches`.
+    """
+    bins, reach, wide = table.shape[1], table.shape[4], table.shape[5]
+    channels, pitch = wide // reach, out.shape[1]
+    flat, to = table.reshape(-1), out.reshape(-1)
+    phase = reach * wide
+    each = stride * stride * phase
+    scale = f32(f32(bins - 1) / f32(t1 - t0))
+    for i in range(t.size):
+        if not t0 <= t[i] <= t1:
+            continue
+        tau = f32(f32(t[i] - t0) * scale)
+        b = min(np.int64(tau), bins - 1)
+        late = f32(np.rint((tau - f32(b)) * f32(2**20)) * f32(2.0**-20))
+        row, column = down[y[i]], right[x[i]]
+        k = (view[i] * bins + b) * each + ((y[i] % stride) * stride + x[i] % stride) * phase
+        k += row[1] * wide + column[1] * channels
+        after = each if b + 1 < bins else 0
+        o = row[0] * pitch + column[0] * channels
+        early, late = p[i] * (f32(1) - late), p[i] * late
+        n = np.uint64(column[2] * channels)
+        for _ in range(row[2]):
+            here, one, two = np.uint64(o), np.uint64(k), np.uint64(k + after)
+            for q in range(n):
+                to[here + q] += early * flat[one + q] + late * flat[two + q]
+            o += pitch
+            k += wide
+
+
+@njit(nogil=True, cache=True)
+def remember(t, x, y, p, view, t0, t1, memories, awake_s, coarse, awake, passed, sums, means):
+    """Let the leaky sums of SetNet leak, then add the events with t0 <= t <= t1.
+
+    In place: `awake`, `passed` (h8, w8); `sums` (views * memories + memories, h2, w2), the last of
+    them the spread of the views; `means` (memories, h2, 4 * w2), the mean view's with the four
+    pixels of a block side by side.  `coarse` (views, h2, w2) is zeros before and after; `memories`
+    are the time constants.
+    """
+    used = np.empty(t.size, np.bool_)
+    for i in range(t.size):
+        used[i] = t0 <= t[i] <= t1
+        if used[i]:
+            coarse[view[i], y[i] >> 1, x[i] >> 1] += p[i]
+    hit = np.zeros((2 * awake.shape[0], 2 * awake.shape[1]), np.bool_)  # 4 x 4 pixels
+    for i in range(t.size):
+        if used[i] and coarse[view[i], y[i] >> 1, x[i] >> 1] != 0:
+            hit[y[i] >> 2, x[i] >> 2] = True
+    _pass_time(hit, f32(t1 - t0), awake_s, awake, passed)
+    _leak(passed, memories, sums, means)
+    part = f32(1) / f32(coarse.shape[0])
+    for i in range(t.size):
+        if used[i]:
+            r, c = y[i] >> 1, x[i] >> 1
+            fell = coarse[view[i], r, c]
+            coarse[view[i], r, c] = 0
+            at = 4 * c + 2 * (y[i] & 1) + (x[i] & 1)
+            for m in range(memories.size):
+                sums[view[i] * memories.size + m, r, c] += fell
+                means[m, r, at] += p[i] * part
+    _spread(memories.size, sums)
+
+
+@njit(nogil=True, cache=True)
+def _pass_time(hit, seconds, awake_s, awake, passed):
+    """A block with an event in it or within four pixels around passes all the time."""
+    left = np.exp(-seconds / awake_s)
+    for i in range(awake.shape[0]):
+        for j in range(awake.shape[1]):
+            near = hit[max(2 * i - 1, 0) : 2 * i + 3, max(2 * j - 1, 0) : 2 * j + 3]
+            if near.any():
+                passed[i, j], awake[i, j] = seconds, f32(1)
+            else:
+                passed[i, j] = awake[i, j] * awake_s * (f32(1) - left)
+                awake[i, j] *= left
+
+
+@njit(nogil=True, cache=True)
+def _leak(passed, memories, sums, means):
+    views, width = sums.shape[0] // memories.size - 1, sums.shape[2]
+    keep, wide = np.empty(width, f32), np.empty(4 * width, f32)
+    for m in range(memories.size):
+        for r in range(sums.shape[1]):
+            for j in range(passed.shape[1]):
+                left = np.exp(-passed[r // BLOCK, j] / memories[m])
+                keep[BLOCK * j : BLOCK * (j + 1)] = left
+                wide[4 * BLOCK * j : 4 * BLOCK * (j + 1)] = left
+            for v in range(views):
+                row = sums[v * memories.size + m, r]
+                for c in range(np.uint64(width)):
+                    row[c] *= keep[c]
+            row = means[m, r]
+            for c in range(np.uint64(4 * width)):
+                row[c] *= wide[c]
+
+
+@njit(nogil=True, cache=True)
+def _spread(memories, sums):
+    """Write the mean distance of the views' sums from their mean behind them."""
+    views, width = sums.shape[0] // memories - 1, sums.shape[2]
+    middle, part = np.empty(width, f32), f32(1) / f32(views)
+    for m in range(memories):
+        for r in range(sums.shape[1]):
+            middle[:] = 0
+            for v in range(views):
+                row = sums[v * memories + m, r]
+                for c in range(np.uint64(width)):
+                    middle[c] += row[c] * part
+            far = sums[views * memories + m, r]
+            far[:] = 0
+            for v in range(views):
+                row = sums[v * memories + m, r]
+                for c in range(np.uint64(width)):
+                    far[c] += abs(row[c] - middle[c]) * part
+
+
+@njit(nogil=True, cache=True)
+def spread_out(blocks, frame):
+    """Write (h2, w2, 4), the four pixels of each block, into `frame` (2 h2, 2 w2)."""
+    for r in range(blocks.shape[0]):
+        for k in range(2):
+            for c in range(np.uint64(blocks.shape[1])):
+                frame[2 * r + k, 2 * c] = blocks[r, c, 2 * k]
+                frame[2 * r + k, 2 * c + 1] = blocks[r, c, 2 * k + 1]
+
+
+@njit(nogil=True, cache=True)
+def weigh(skip, means, drawn):
+    """Write the sum of `means` (memories, h2, w), each times its `skip`, into `drawn` (h2, w)."""
+    for r in range(drawn.shape[0]):
+        row = drawn[r]
+        row[:] = 0
+        for m in range(skip.size):
+            mean, part = means[m, r], skip[m]
+            for c in range(np.uint64(row.size)):
+                row[c] += part * mean[c]

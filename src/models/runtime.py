@@ -1,0 +1,171 @@
+"""Live: from the events of a window to a frame, numpy in and out, the state kept inside.
+
+The dense grid is never made: an event adds its patch of the first layer's kernel to that layer's
+map (`patches`), and what comes behind runs on OpenVINO or PyTorch.  Equal to the network's
+`forward` on `voxel_grid`s up to the order of sums in float32 (1e-5 in a frame, `form="float32"`)
+or to bf16's rounding (0.02).
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import nn
+
+from src.models import openvino_cpu
+from src.models.after import AfterHead, AfterStem, OnOpenVino, OnTorch
+from src.models.e2vid import E2VID
+from src.models.engines import events_numba as kernels
+from src.models.fast import plain
+from src.models.first_layer import HeadFront, StemFront
+from src.models.setnet import SetNet
+from src.sim.optics import Position
+
+FORMS = ("float32", "bf16", "openvino")
+MULTIPLE = 8  # sides are padded to it by reflection, as the networks do
+SHORTEST = 8  # side that can be padded so
+WRONG = {
+    kernels.BACKWARDS: "be in order of time",
+    kernels.OFF_SENSOR: "have x in 0..{w} and y in 0..{h}",
+    kernels.NO_VIEW: "have view in 0..{views}, an index into positions",
+    kernels.NO_NUMBER: "have finite t and p",
+}
+
+
+def runs(network: nn.Module) -> bool:
+    """Return whether `network` has a first layer that events can be added to one by one."""
+    return isinstance(network, SetNet | E2VID)
+
+
+class Runtime:
+    """A `SetNet` or `E2VID` over lists of events, window by window.
+
+    `positions`: (row, col) of each view; `height`, `width`: of a view's picture and of the frame.
+    `form`: openvino, float32 or bf16 (PyTorch); default: openvino where the package is there, else
+    bf16.  `threads`: of what comes behind the first layer, which takes one.  Raises ValueError for
+    another network, form or size and for a number of views that the network does not take.
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        *,
+        positions: Sequence[Position],
+        height: int,
+        width: int,
+        threads: int = 2,
+        form: str | None = None,
+    ):
+        form = form or ("openvino" if openvino_cpu.installed() else "bf16")
+        if form not in FORMS:
+            raise ValueError(f"form must be one of {', '.join(FORMS)}, got {form}")
+        if not runs(network):
+            kind = type(network).__name__
+            raise ValueError(f"a list of events needs a SetNet or an E2VID, got {kind}")
+        if min(height, width) < SHORTEST or threads < 1:
+            raise ValueError(
+                f"height and width must be >= {SHORTEST} and threads >= 1, got {height}, {width}"
+                f" and {threads}"
+            )
+        self.views, self.size = len(positions), (height, width)
+        self.padding = [_padding(side) for side in self.size]
+        padded = tuple(side + sum(pad) for side, pad in zip(self.size, self.padding, strict=True))
+        dtype = {"float32": torch.float32, "bf16": torch.bfloat16}.get(form)
+        dtype = openvino_cpu.precision() if dtype is None else dtype
+        kind = AfterStem if isinstance(network, SetNet) else AfterHead
+        after = kind(plain(network).cpu(), positions, padded, dtype)
+        front = StemFront if isinstance(network, SetNet) else HeadFront
+        self.front = front(after, padded)
+        inputs, state = self.front.inputs(), after.start()
+        self.behind = (
+            OnOpenVino(after, inputs, state, threads)
+            if form == "openvino"
+            else OnTorch(after, inputs, state, threads)
+        )
+
+    def step(
+        self,
+        t: np.ndarray,
+        x: np.ndarray,
+        y: np.ndarray,
+        p: np.ndarray,
+        view: np.ndarray,
+        t0: float,
+        t1: float,
+    ) -> Float[np.ndarray, "h w"]:
+        """Return the frame at `t1`, float32, as the network's `forward` gives it.
+
+        Events of one window in order of time, arrays of one length: `t`, `t0`, `t1` in seconds,
+        `x`, `y` in pixels, `view` an index into positions, `p` in {-1, 1} or, as floats, weights.
+        Those outside t0 <= t <= t1 have no part in it.  Raises ValueError, and leaves the state,
+        for events that are out of order, off the sensor or in no view.
+        """
+        events = self._checked(t, x, y, p, view, t0, t1)
+        self.front.add(*self._reflected(*events), float(t0), float(t1))
+        drawn = self.behind(self.front.inputs())
+        (top, _), (left, _) = self.padding
+        height, width = self.size
+        return self.front.frame(drawn)[top : top + height, left : left + width]
+
+    def reset(self) -> None:
+        """Forget everything: the next window is the first."""
+        self.front.reset()
+        self.behind.reset()
+
+    @property
+    def state(self) -> Any:
+        """What lives from window to window; kept by whoever takes it, for `state = ...`."""
+        return self.front.state(), self.behind.state
+
+    @state.setter
+    def state(self, state: Any) -> None:
+        if state is None:
+            self.reset()
+            return
+        self.front.restore(state[0])
+        self.behind.state = state[1]
+
+    def _checked(self, t, x, y, p, view, t0, t1) -> list[np.ndarray]:
+        given = [np.asarray(part) for part in (t, x, y, p, view)]
+        if len({part.shape for part in given}) != 1 or given[0].ndim != 1:
+            shapes = [part.shape for part in given]
+            raise ValueError(f"t, x, y, p, view must be of one length, got shapes {shapes}")
+        if not (np.isfinite(t0) and np.isfinite(t1) and t0 < t1):
+            raise ValueError(f"a window must have t0 < t1 in seconds, got {t0} and {t1}")
+        t, x, y, p, view = given
+        if len(t) and not all(part.dtype.kind in "iu" for part in (x, y, view)):
+            kinds = [str(part.dtype) for part in (x, y, view)]
+            raise ValueError(f"x, y and view must be whole numbers, got {', '.join(kinds)}")
+        if p.dtype.kind != "f" and (np.abs(p.astype(np.int64)) != 1).any():
+            raise ValueError("p must be -1 or 1 (or weights, as floats), got another number")
+        kinds = (np.float64, np.int64, np.int64, np.float32, np.int64)
+        events = [np.ascontiguousarray(part, kind) for part, kind in zip(given, kinds, strict=True)]
+        at, wrong = kernels.check(*events, self.views, *self.size)
+        if at >= 0:
+            reach = {"h": self.size[0] - 1, "w": self.size[1] - 1, "views": self.views - 1}
+            raise ValueError(
+                f"events must {WRONG[wrong].format(**reach)}, got event {at} with t={t[at]} "
+                f"x={x[at]} y={y[at]} p={p[at]} view={view[at]}"
+            )
+        return events
+
+    def _reflected(self, t, x, y, p, view) -> list[np.ndarray]:
+        """Return the events in padded pixels, those near a padded edge once more behind it."""
+        events = [t, x, y, p, view]
+        for axis, side, (before, behind) in zip((2, 1), self.size, self.padding, strict=True):
+            if before + behind:
+                place = events[axis]
+                low = (place >= 1) & (place <= before)
+                high = (place <= side - 2) & (place >= side - 1 - behind)
+                mirrored = [place, -place[low], 2 * (side - 1) - place[high]]
+                events = [np.concatenate([part, part[low], part[high]]) for part in events]
+                events[axis] = np.concatenate(mirrored) + before
+        return events
+
+
+def _padding(side: int) -> tuple[int, int]:
+    """Return how many rows or columns are added before and behind, as `pad_to_multiple`."""
+    more = -side % MULTIPLE
+    return more // 2, more - more // 2

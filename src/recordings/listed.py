@@ -1,0 +1,51 @@
+"""Reconstruction straight from lists of events, where the network can: no grid is made."""
+
+from collections.abc import Iterable, Iterator
+
+import torch
+from torch import nn
+
+from src.models.fast import running
+from src.models.runtime import FORMS, Runtime, runs
+from src.recordings.stream import Carry, Frame, Window
+from src.recordings.views import Views
+
+
+def ready(
+    network: nn.Module, form: str, device: str, views: Views, bins: int
+) -> nn.Module | Runtime:
+    """Return `network` as it is run: on a CPU a Runtime where there is one for it.
+
+    Raises ValueError for a form, a device or a number of bins that do not go together.
+    """
+    if device != "cpu" and form == "openvino":
+        raise ValueError(f"device must be cpu for form=openvino, got {device}")
+    if device != "cpu" or form not in FORMS or not runs(network):
+        return running(network, form).to(device)
+    if bins != network.bins:
+        raise ValueError(f"bins must be {network.bins} for this network, got {bins}")
+    height, width = views.model
+    threads = torch.get_num_threads()
+    return Runtime(
+        network, positions=views.positions, height=height, width=width, threads=threads, form=form
+    )
+
+
+def frames(
+    windows: Iterable[Window], runtime: Runtime, *, overlap: int = 1, carry: Carry | None = None
+) -> Iterator[Frame]:
+    """As `stream.frames`, of windows without grids (`Rule.grids`)."""
+    carry = Carry() if carry is None else carry
+    carry.states.extend([None] * (overlap - len(carry.states)))
+    for window in windows:
+        phase = carry.frames % overlap
+        if window.events:
+            runtime.state = carry.states[phase]
+            seconds = (window.end_us - window.start_us) * 1e-6
+            picture = runtime.step(*window.parts, 0.0, seconds)
+            carry.states[phase] = runtime.state
+            carry.picture = torch.from_numpy(picture.clip(0, 1))
+        elif carry.picture is None:
+            carry.picture = torch.full(runtime.size, 0.5)
+        carry.frames += 1
+        yield Frame(window.end_us * 1e-6, carry.picture.numpy(), window.events, window.outside)

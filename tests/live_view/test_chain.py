@@ -1,0 +1,336 @@
+"""Feeds, the intake that cuts what they give, and the whole chain on a file, without a browser."""
+
+import asyncio
+import json
+import socket
+import threading
+import time
+
+import faery
+import numpy as np
+import pytest
+import torch
+from aiohttp import ClientSession, WSMsgType
+
+from baselines.highpass import HighPass
+from src.live_view import assembly, feeds
+from src.live_view.backlog import Backlog
+from src.live_view.cutter import Cutter
+from src.live_view.faults import Faults
+from src.live_view.intake import STALL_S, Intake
+from src.live_view.meters import Meters
+from src.live_view.pace import Pace
+from src.live_view.screen import EventPicture
+from src.live_view.step import Running
+from src.models.setnet import SetNet
+from src.recordings import stream
+from src.recordings.files.formats import EVENT, read_events, write_events
+from src.recordings.lookup import build
+from tests.live_view import scenes
+from tests.live_view.browser import free_port
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    path = tmp_path_factory.mktemp("live") / "cap.raw"
+    height, width = scenes.SENSOR
+    write_events(path, scenes.events(0.3), width=width, height=height)
+    return str(path)
+
+
+def received(feed, done) -> np.ndarray:
+    """Return what a feed gives until `done` events are there."""
+    stopped, found, end = threading.Event(), [], time.monotonic() + 20
+    for chunk, _ in feed.chunks(stopped):
+        found.append(chunk)
+        if sum(map(len, found)) >= done or time.monotonic() > end:
+            stopped.set()
+    return np.concatenate(found)
+
+
+@pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")  # faery leaves its socket open
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("kind", list(feeds.PACKETS))
+def test_packets_of_faery_are_read_as_they_were_sent(kind):
+    faults, port = Faults(), free_port(socket.SOCK_DGRAM)
+    sent = np.zeros(3000, faery.EVENTS_DTYPE)
+    rng = np.random.default_rng(0)
+    sent["t"], sent["on"] = np.sort(rng.integers(0, 2**32, 3000)), rng.random(3000) < 0.5
+    sent["x"], sent["y"] = rng.integers(0, 640, 3000), rng.integers(0, 480, 3000)
+    feed = feeds.open_feed(f"udp://127.0.0.1:{port}", (480, 640), faults, udp_format=kind)
+    stream_of = faery.events_stream_from_array(sent, (640, 480))
+    sender = threading.Timer(0.2, lambda: stream_of.to_udp(("127.0.0.1", port), format=kind))
+    sender.start()
+    found = received(feed, 3000)
+    sender.join()
+    feed.close()
+    for name in "txy":
+        assert np.array_equal(found[name], sent[name]), name
+    assert np.array_equal(found["p"] == 1, sent["on"]) and (abs(found["p"]) == 1).all()
+    assert faults.now() == []
+
+
+def test_the_turn_of_a_32_bit_clock_is_no_jump():
+    feed = feeds.Udp(
+        f"udp://127.0.0.1:{free_port(socket.SOCK_DGRAM)}", (4, 4), "t32_x16_y15_on1", Faults()
+    )
+    packed = np.zeros(4, feeds.PACKETS["t32_x16_y15_on1"])
+    packed["t"] = [2**32 - 2, 2**32 - 1, 0, 5]
+    found = np.concatenate([feed._events(packed[:3]), feed._events(packed[3:])])
+    feed.close()
+    assert np.diff(found["t"]).tolist() == [1, 1, 5]
+
+
+@pytest.mark.parametrize(
+    ("address", "sensor", "kind", "named"),
+    [
+        ("udp://127.0.0.1:99999", (4, 4), "t64_x16_y16_on8", "recording must be udp"),
+        ("udp://127.0.0.1", (4, 4), "t64_x16_y16_on8", "recording must be udp"),
+        ("udp://127.0.0.1:0", None, "t64_x16_y16_on8", "sensor_size must be"),
+        ("udp://127.0.0.1:0", (0, 4), "t64_x16_y16_on8", "sensor_size must be"),
+        ("udp://127.0.0.1:0", (4, 4), "t8", "udp_format must be one of"),
+        ("nowhere.raw", None, "t64_x16_y16_on8", "no such file"),
+    ],
+)
+def test_a_feed_that_cannot_be_is_refused(address, sensor, kind, named):
+    with pytest.raises(ValueError, match=named):
+        feeds.open_feed(address, sensor, Faults(), udp_format=kind)
+
+
+def test_a_port_in_use_is_refused():
+    first = feeds.Udp("udp://127.0.0.1:0", (4, 4), "t64_x16_y16_on8", Faults())
+    port = first.socket.getsockname()[1]
+    with pytest.raises(ValueError, match="recording must be udp"):
+        feeds.Udp(f"udp://127.0.0.1:{port}", (4, 4), "t64_x16_y16_on8", Faults())
+    first.close()
+
+
+class FaeryCamera:
+    """What faery's camera looks like: a stream that ends after a packet, as a pulled plug does."""
+
+    def dimensions(self):
+        return 640, 480
+
+    def __iter__(self):
+        packet = np.zeros(5, faery.EVENTS_DTYPE)
+        packet["t"], packet["on"] = np.arange(5), [True, False, True, True, False]
+        yield packet
+
+
+def test_a_camera_is_read_and_looked_for_again_when_it_is_lost(monkeypatch):
+    monkeypatch.setattr(faery, "events_stream_from_camera", FaeryCamera)
+    monkeypatch.setattr(feeds, "RETRY_S", 0.01)
+    faults = Faults()
+    feed = feeds.open_feed("camera://", None, faults)
+    assert feed.sensor == (480, 640) and feed.live
+    found = received(feed, 12)
+    assert found["p"][:5].tolist() == [1, -1, 1, 1, -1] and len(found) == 15
+    assert faults.now() == []
+
+
+def test_no_camera_says_what_to_install():
+    with pytest.raises(ValueError, match="pip install event-camera-drivers neuromorphic-drivers"):
+        feeds.open_feed("camera://", None, Faults())
+
+
+def test_a_file_that_loops_goes_on_in_time(recording):
+    feed, once = feeds.File(recording, scenes.SENSOR, True), read_events(recording)
+    found = received(feed, 2 * len(once))
+    again = found[len(once) : 2 * len(once)]
+    for name in "xyp":
+        assert np.array_equal(again[name], once[name])
+    assert np.ptp(again["t"] - once["t"]) == 0 and (np.diff(found["t"]) >= 0).all()
+
+
+class Script:
+    """A live feed that sends what it is told to, when: (seconds from the start, times in us)."""
+
+    live, sensor = True, scenes.SENSOR
+
+    def __init__(self, *steps):
+        self.steps = steps
+
+    def close(self):
+        pass
+
+    def chunks(self, stopped):
+        began = time.perf_counter()
+        for at, times in self.steps:
+            stopped.wait(max(0.0, began + at - time.perf_counter()))
+            made = np.zeros(len(times), EVENT)
+            made["t"], made["p"] = times, 1
+            yield made, time.perf_counter()
+        stopped.wait(60)
+
+
+def live_windows(feed, seconds: float, faults: Faults):
+    """Return the windows at 100 fps of `seconds` of a live feed, and the intake."""
+    marks, meters, waiting = EventPicture(build(scenes.views())), Meters(), Backlog(10_000)
+    cutter = Cutter(scenes.SENSOR, 100.0, faults)
+    intake = Intake(feed, cutter, waiting, marks, Pace(1.0), meters, faults)
+    stopped = threading.Event()
+    threads = [threading.Thread(target=w, args=(stopped,)) for w in (intake.decode, intake.cut)]
+    for thread in threads:
+        thread.start()
+    time.sleep(seconds)
+    state = intake.state
+    stopped.set()
+    for thread in threads:
+        thread.join()
+    return list(waiting.windows), state
+
+
+def test_windows_of_a_quiet_camera_come_by_the_clock_until_it_has_stalled():
+    faults = Faults()
+    windows, state = live_windows(Script((0, [0])), STALL_S + 0.5, faults)
+    assert 30 < len(windows) <= 101 * STALL_S and state == "stalled"
+    assert "no events for 1 s" in faults.now()[0]
+    dues = [one.due for one in windows]
+    assert np.diff(dues) == pytest.approx(0.01, abs=1e-6)
+
+
+def test_a_stream_that_comes_back_goes_on_from_there():
+    later = 0.2 + STALL_S + 0.3
+    feed = Script((0, [0, 200_000]), (later, [9_000_000]), (later + 0.05, [9_050_000]))
+    windows, state = live_windows(feed, later + 0.8, Faults())
+    assert state == "playing"
+    starts = np.array([one.start_us for one in windows])
+    assert (starts >= 9_000_000).sum() >= 3 and not ((starts > 1.5e6) & (starts < 9e6)).any()
+    assert [one.fresh for one in windows].count(True) == 1  # the picture is not thrown away
+
+
+def test_a_camera_s_clock_that_leaps_does_not_make_windows_without_end():
+    feed = Script((0, [0]), (0.1, [10**12]), (0.15, [10**12 + 50_000]))
+    windows, _ = live_windows(feed, 0.4, Faults())
+    assert len(windows) < 60
+    assert sum(one.start_us >= 10**12 for one in windows) >= 4
+
+
+def test_what_comes_live_is_not_slowed_down():
+    parts = (Backlog(1), EventPicture(build(scenes.views())), Pace(0.5), Meters(), Faults())
+    with pytest.raises(ValueError, match="speed must be 1 for what comes live"):
+        Intake(Script(), Cutter(scenes.SENSOR, 100.0, Faults()), *parts)
+
+
+def served(recording: str, networks, **how) -> assembly.Server:
+    """Return the server of a recording, its port open to be chosen."""
+    views, faults = scenes.views(), Faults()
+    running = Running(how.pop("fps", 100.0), form="float32")
+    feed = feeds.open_feed(recording, None, faults)
+    made = assembly.assemble(feed, networks, views, running, faults, port=free_port(), **how)
+    assembly.first_choice(made.page.controls, next(iter(networks)), "all")
+    return made
+
+
+def test_as_fast_as_it_goes_every_picture_is_that_of_reconstruct(recording):
+    torch.manual_seed(0)
+    network = SetNet.preset("small").eval()
+    made = served(recording, {"net": network}, speed=float("inf"))
+    player, screen = made.page.player, made.page.screen
+    player.start()
+    _until(lambda: player.intake.state == "ended" and not len(player.intake.backlog))
+    _until(lambda: screen.count >= 29)
+    player.stop()
+    rule = stream.Rule(fps=100.0, splat="nearest")
+    windows = stream.windows([read_events(recording)], build(scenes.views()), rule)
+    frames = stream.frames(windows, network, positions=scenes.views().positions)
+    wanted = np.array([np.rint(frame.picture * 255) for frame in frames])
+    assert player.intake.backlog.dropped == 0
+    shown = screen.ring[: screen.count].astype(float)
+    assert np.abs(shown - wanted[: screen.count]).max() <= 1 and shown.std() > 1
+    assert len(wanted) - screen.count in (0, 1)
+
+
+def test_what_cannot_keep_up_drops_windows_and_keeps_its_latency(recording):
+    class Slow(HighPass):
+        def forward(self, *args, **kwargs):
+            time.sleep(0.05)
+            return super().forward(*args, **kwargs)
+
+    made = served(recording, {"slow": Slow()}, fps=400.0, backlog=4)
+    player = made.page.player
+    player.start()
+    _until(lambda: player.intake.state == "ended")
+    status = player.status()
+    player.stop()
+    assert status["dropped"] > 50 and status["waiting"] <= 4
+    assert status["latency_ms"]["median"] < 2000  # four windows and the network, on a busy machine
+
+
+def test_a_file_that_breaks_off_is_told(recording, tmp_path, monkeypatch):
+    def broken(*args):
+        yield read_events(recording)[:1000]
+        raise ValueError(f"{recording}: cannot be decoded: broken")
+
+    monkeypatch.setattr(feeds.sources, "events", broken)
+    made = served(recording, {"net": HighPass()})
+    made.page.player.start()
+    _until(lambda: made.page.player.status()["state"] == "broken")
+    assert "cannot be decoded" in made.page.player.status()["faults"][0]
+    made.page.player.stop()
+
+
+NONSENSE = (
+    '{"line": [0, 0, 87, 87]}',
+    "no json",
+    "[1]",
+    '{"line": ["a"]}',
+    '{"network": "other"}',
+    '{"network": "net", "views": 77}',
+)
+
+
+async def _header(socket) -> dict:
+    """Return the header of the next message, which is whole."""
+    message = await socket.receive(timeout=20)
+    assert message.type == WSMsgType.BINARY
+    length = int.from_bytes(message.data[:4], "little")
+    header = json.loads(message.data[4 : 4 + length])
+    assert len(message.data) - 4 - length == sum(size for _, size in header["pictures"])
+    return header
+
+
+def test_the_server_answers_and_takes_only_what_makes_sense(recording):
+    made = served(recording, {"net": HighPass()}, fps=200.0)
+
+    async def visit() -> list[dict]:
+        stop = asyncio.Event()
+        running = asyncio.create_task(made.run(made.page.player.start, stop))
+        async with ClientSession(f"http://127.0.0.1:{made.port}") as session:
+            await asyncio.sleep(0.5)
+            assert "<canvas" in await (await session.get("/")).text()
+            async with session.ws_connect("/stream") as socket:
+                for asked in NONSENSE:
+                    await socket.send_str(asked)
+                headers = [await _header(socket) for _ in range(12)]
+        stop.set()
+        await running
+        return [header["status"] for header in headers if "status" in header]
+
+    headers = asyncio.run(visit())
+    made.page.player.stop()
+    assert headers[-1]["line"] == [0, 0, 87, 87] and headers[-1]["chosen"]["network"] == "net"
+    assert any("views_used must be in" in fault for one in headers for fault in one["faults"])
+
+
+def test_a_page_s_port_in_use_is_refused(recording):
+    made = served(recording, {"net": HighPass()})
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", made.port))
+        taken.listen()
+        with pytest.raises(ValueError, match=f"port={made.port} cannot be used"):
+            asyncio.run(assembly.serve(made))
+
+
+@pytest.mark.parametrize("use", [2, "many", 0])
+def test_views_that_are_not_there_are_refused(recording, use):
+    made = served(recording, {"net": SetNet.preset("small").eval()})
+    with pytest.raises(ValueError, match="use must be one of all, 1, 3, 5, 9"):
+        assembly.first_choice(made.page.controls, "net", use)
+
+
+def _until(seen, seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not seen():
+        assert time.monotonic() < end
+        time.sleep(0.02)
