@@ -146,6 +146,8 @@ def main(words: list[str]) -> None:
     checkouts = [Checkout(root) for root in roots]
     for part in parts or ("table", "prior"):
         {"table": table, "prior": prior}[part](checkouts)
+    for checkout in checkouts:
+        checkout.process.communicate()  # ends it
     if torch.cuda.is_available():
         cuda()
 
