@@ -27,8 +27,8 @@ def fill_bank(bank: Bank, workers: int) -> None:
     running = [spawn.Process(target=_work, args=(bank,), daemon=True) for _ in range(workers)]
     for process in running:
         process.start()
-    while any(process.is_alive() for process in running):
-        running[0].join(EVERY)
+    while alive := [process for process in running if process.is_alive()]:
+        alive[0].join(EVERY)
         left, spent = len(bank.missing()), time.monotonic() - start
         each = spent / max(before - left, 1)
         print(f"{bank.clips - left} of {bank.clips} clips, {each:.2f} s each", flush=True)

@@ -10,8 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from scripts.fill_bank import fill_bank
 from src.app import build
 from src.app import simulation as simulations
+from src.models.checkpoints import whole
 from src.sim.optics import Optics
 from src.sim.pipeline import Pipeline
 from src.sim.turbulence.simulated import SimulatedAir
@@ -301,6 +303,13 @@ def test_who_needs_a_clip_that_another_makes_waits_for_it(tmp_path, monkeypatch)
     monkeypatch.setattr(of, "make", lambda index: pytest.fail("made twice"))
     of.clip(0)
     process.join()
+
+
+def test_several_processes_fill_a_bank_beforehand(tmp_path, capsys):
+    of = bank(tmp_path, clips=4)
+    fill_bank(of, 2)
+    assert not of.missing() and all(whole(of.path(index)) for index in range(4))
+    assert "0 of 4 clips" in (printed := capsys.readouterr().out) and "4 of 4 clips" in printed
 
 
 def start_filler(root: Path) -> None:
