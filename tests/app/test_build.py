@@ -114,7 +114,7 @@ def test_rooms_are_a_list_of_packages(given, tmp_path):
         build.rooms(config("eval", tmp_path, f"rooms={given}"))
 
 
-DOORS = ("train", "eval", "simulate", "reconstruct", "calibrate", "chart", "stress")
+DOORS = ("train", "eval", "simulate", "reconstruct", "calibrate", "chart", "stress", "live")
 
 
 @pytest.mark.parametrize("door", DOORS)
