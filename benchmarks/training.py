@@ -1,10 +1,11 @@
-"""How fast a training is: python -m benchmarks.training [table] [key=value ...]
+"""How fast a training is: python -m benchmarks.training [changes|networks] [key=value ...]
 
-Overrides are those of src.train.  Without `table`, where a step's time goes: simulation (shared by
-the `data.reuse` steps that see a batch), the network's forward and backward pass, and the loss with
-its gradient, on one batch; CPU time of the thread on one thread, wall time on two.  With it, whole
-steps of budget=hours on made-up grids, one thing changed at a time, by CPU time of the one thread.
-Clip-windows are windows of single clips.
+Overrides are those of src.train.  Without a word before, where a step's time goes: simulation
+(shared by the `data.reuse` steps that see a batch), the network's forward and backward pass, and
+the loss with its gradient, on one batch; CPU time of the thread on one thread, wall time on two.
+`changes`: whole steps of budget=hours on made-up grids, one thing changed at a time, by CPU time of
+the one thread; `networks`: the same of several networks, before and after.  Clip-windows are
+windows of single clips.
 """
 
 import sys
@@ -41,6 +42,15 @@ CHANGES = {
         "channels_last=true", "optimizer.fused=true", "average=0.999", "loss.share=0.5",
     ],
 }  # fmt: skip
+
+
+NETWORKS = {
+    **{f"lf3x3, base {width}": ["experiment=lf3x3", f"width={width}"] for width in (8, 12, 16)},
+    "lf3x3, base 8, stem 32": ["experiment=lf3x3", "width=8", "stem=32"],
+    "lf3x3, base 16, stem 32": ["experiment=lf3x3", "width=16", "stem=32"],
+    "single256, base 16, stem 32": ["experiment=single256", "width=16", "stem=32"],
+    "lf_firenet": ["experiment=lf_firenet"],
+}
 
 
 def config(overrides: list[str]) -> DictConfig:
@@ -91,7 +101,7 @@ class Steps(lightning.Callback):
         self.ends.append(time.thread_time())
 
 
-def step(overrides: list[str], steps: int = 4) -> tuple[float, int]:
+def step(overrides: list[str], steps: int = 3) -> tuple[float, int]:
     """Return the least seconds of a whole training step and the pixels of its clip-windows."""
     cfg = config(["budget=hours", "data.bank=null", "hours=null", *overrides])
     module = build.reconstructor(cfg, *build.network(cfg))
@@ -108,24 +118,35 @@ def step(overrides: list[str], steps: int = 4) -> tuple[float, int]:
     return min(taken), target.numel()
 
 
-def table(overrides: list[str]) -> None:
+def rate(overrides: list[str]) -> float:
+    """Return clip-windows of 64x64 pixels a second."""
+    seconds, pixels = step([*BEFORE, "stem=null", *overrides])
+    return pixels / 64**2 / seconds
+
+
+def changes(overrides: list[str]) -> None:
     """Print a Markdown table, a row for each of CHANGES."""
-    print("| | ms a step | clip-windows of 64x64 a second | faster by |\n|---|---|---|---|")
-    first = None
+    print("| | clip-windows a second | faster by |\n|---|---|---|")
     for name, change in CHANGES.items():
-        seconds, pixels = step([*BEFORE, *change, *overrides])
-        rate = pixels / 64**2 / seconds
-        first = first or rate
-        print(
-            f"| {name} | {1e3 * seconds:.0f} | {rate:.0f} | {rate / first - 1:+.0%} |", flush=True
-        )
+        before = rate(overrides)  # anew for every row: the speed of a shared machine drifts
+        now = rate([*change, *overrides]) if change else before
+        print(f"| {name} | {now:.0f} | {now / before - 1:+.0%} |", flush=True)
+
+
+def networks(overrides: list[str]) -> None:
+    """Print a Markdown table, a row for each of NETWORKS: before, and with the last of CHANGES."""
+    print("| | before | after |\n|---|---|---|")
+    for name, network in NETWORKS.items():
+        pair = [rate([*network, *change, *overrides]) for change in ([], [*CHANGES.values()][-1])]
+        print(f"| {name} | {pair[0]:.0f} | {pair[1]:.0f} |", flush=True)
 
 
 def main() -> None:
-    """Print the table, or the split on one thread and on two."""
-    if sys.argv[1:2] == ["table"]:
+    """Print a table, or the split on one thread and on two."""
+    tables = {"changes": changes, "networks": networks}
+    if len(sys.argv) > 1 and sys.argv[1] in tables:
         torch.set_num_threads(1)
-        table(sys.argv[2:])
+        tables[sys.argv[1]](sys.argv[2:])
         return
     parts, frames, reuse = split(sys.argv[1:])
     for threads, clock in ((1, time.thread_time), (2, time.perf_counter)):
