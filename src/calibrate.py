@@ -1,4 +1,7 @@
-"""Calibrate: python -m src.calibrate task=views|threshold|turbulence recording=..."""
+"""Calibrate: python -m src.calibrate task=views|threshold|turbulence recording=...
+
+Or task=air video=...
+"""
 
 from pathlib import Path
 
@@ -44,13 +47,24 @@ def turbulence(cfg: DictConfig, run: Path) -> dict:
     return found.summary()
 
 
-TASKS = {"views": views, "threshold": threshold, "turbulence": turbulence}
+def air(cfg: DictConfig, run: Path) -> dict:
+    """Measure the air in front of a still scene: `air.yaml`, also at `cfg.save`."""
+    if OmegaConf.is_missing(cfg, "video"):
+        raise ValueError("video must be a film of a still scene, got none")
+    found = calibration.measure_air(cfg.video, run, fps=cfg.fps, save=cfg.save, **cfg.air)
+    return {name: str(value) for name, value in vars(found.found).items()}
+
+
+TASKS = {"views": views, "threshold": threshold, "turbulence": turbulence, "air": air}
+FPS = 120.0  # where `fps` is null and the task needs one
 
 
 def calibrate(cfg: DictConfig) -> dict:
     """Do `cfg.task`; everything goes below `cfg.paths.run`.  Raises ValueError for another task."""
     if cfg.task not in TASKS:
         raise ValueError(f"task must be one of {', '.join(TASKS)}, got {cfg.task}")
+    if cfg.fps is None and cfg.task != "air":
+        cfg.fps = FPS
     run = Path(cfg.paths.run)
     results.open_run(run, door.resolved(cfg))
     found = TASKS[cfg.task](cfg, run)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
@@ -72,9 +73,11 @@ def bank(cfg: DictConfig) -> Bank:
         cfg, "train", windows=windows, optics=optics, sensor=light, crop=side, clips=None
     )
     parts = {name: OmegaConf.to_container(cfg[name], resolve=True) for name in CLIP}
+    measured = parts["turbulence"].get("measured")  # a file; what it holds makes the clips
     made_of = parts | {
         "optics": {"positions": optics.positions, "misalignment_px": optics.misalignment_px},
         "files": listing(parts),
+        "measured": Path(measured).read_text() if measured else None,
         "sensor": light,
         "seed": cfg.seed,
         "rates": _rates(cfg, True),

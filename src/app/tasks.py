@@ -1,21 +1,24 @@
-"""The three calibrations of a camera behind a kaleidoscope: views, threshold, turbulence.
+"""The calibrations: views, threshold and turbulence of a camera behind a kaleidoscope, and air.
 
 Each reads a recording and writes its file, its table and its picture into a folder.
 """
 
 from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from src.figures import event_rate, views_found
+from src.figures import event_rate, measured_air, views_found
 from src.recordings import event_rates, lookup, stream
-from src.recordings.calibration import alignment, contrast, dots, statistics
+from src.recordings.calibration import air_meter, alignment, contrast, dots, statistics
 from src.recordings.calibration.boards import Target
 from src.recordings.files import formats, sources
+from src.recordings.files.measured import SIDE
 from src.recordings.views import Views, load
+from src.records import results
 
 
 def align_views(
@@ -104,6 +107,40 @@ def characterise(
     found = statistics.measure(*fits, fps=fps, centre=centre)
     statistics.write_csv(found, folder / "turbulence.csv", positions)
     views_found.turbulence(found, positions, folder / "turbulence.png")
+    return found
+
+
+def measure_air(
+    video: str,
+    folder: Path,
+    *,
+    fps: float | None = None,
+    frames: int = 240,
+    save: str | None = None,
+) -> air_meter.Air:
+    """Measure the air in a film of a still scene; write `air.yaml`, also at `save`, and `air.png`.
+
+    At most so many `frames` are read; `fps` None: what the film states.  Raises ValueError for a
+    film that cannot be read or shows too little; then nothing is written.
+    """
+    if not Path(video).exists():
+        raise ValueError(f"video must be a film or a folder of pictures, got {video}")
+    if fps is not None and not (isinstance(fps, int | float) and 0 < fps < np.inf):
+        raise ValueError(f"fps must be > 0 frames a second, got {fps}")
+    if frames < air_meter.LEAST_FRAMES:
+        raise ValueError(f"air.frames must be at least {air_meter.LEAST_FRAMES}, got {frames}")
+    film = [air_meter.shrunk(frame) for frame in islice(sources.film(video, "video"), frames)]
+    if len({frame.shape for frame in film}) > 1:
+        raise ValueError(f"video must hold frames of one size, got several in {video}")
+    rate = sources.frame_rate(video) if fps is None else fps
+    found = air_meter.measure(np.stack(film), rate)
+    text = (
+        f"# The air of {Path(video).name}, {found.frames} frames; pixels of a frame whose smaller"
+    )
+    text += f" side is {SIDE}.\n{found.found.text()}"
+    measured_air.air(found, Path(video).name, folder / "air.png")
+    for path in (folder / "air.yaml", *([Path(save)] if save else [])):
+        results.write_text(path, text)
     return found
 
 

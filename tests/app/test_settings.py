@@ -66,7 +66,7 @@ def test_trainings_of_several_seeds_are_tested_on_the_same_clips(tmp_path):
 
 @pytest.mark.parametrize("door", ["eval", "chart", "stress", "simulate", "calibrate"])
 def test_without_a_training_the_seed_is_that_of_the_test_clips(door, tmp_path):
-    task = ["task=threshold"] if door == "calibrate" else []
+    task = ["task=threshold", "fps=120"] if door == "calibrate" else []
     one, other = (drawn(door, tmp_path, "test", f"seed={seed}", *task) for seed in (0, 1))
     assert not same(one, other)
 

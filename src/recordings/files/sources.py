@@ -14,6 +14,7 @@ from src.sim.scenes.pictures import LARGEST_PIXELS, open_video, read_picture
 
 Size = tuple[int, int]  # height, width
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+FASTEST = 1e7  # frames a second that are believed
 FILMS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".gif")
 
 
@@ -67,20 +68,34 @@ def holds_events(path: Path | str) -> bool:
     return not (path.suffix == ".h5" and _has_frames(path))
 
 
-def film(path: Path | str) -> Iterator[Float[np.ndarray, "h w"]]:
+def film(path: Path | str, key: str = "recording") -> Iterator[Float[np.ndarray, "h w"]]:
     """Yield the grey frames in [0, 1], float32, of a film, a folder of pictures or our `video.h5`.
 
-    Raises ValueError for a file that cannot be read or has no frame.
+    Raises ValueError, which names `key`, for a file that cannot be read or has no frame.
     """
     path, none = Path(path), True
-    for frame in _frames(path):
+    for frame in _frames(path, key):
         none = False
         yield frame
     if none:
-        raise ValueError(f"recording must be a film or a folder of pictures, got {path}")
+        raise ValueError(f"{key} must be a film or a folder of pictures, got {path}")
 
 
-def _frames(path: Path) -> Iterator[np.ndarray]:
+def frame_rate(path: Path | str) -> float | None:
+    """Return the frames a second that a film states; None for pictures, and where it says nothing.
+
+    Raises ValueError for a film that cannot be read.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return None
+    if path.suffix == ".h5":
+        return _rate_h5(path)
+    rate = open_video(path, "video").get(cv2.CAP_PROP_FPS)
+    return rate if 0 < rate < FASTEST else None
+
+
+def _frames(path: Path, key: str) -> Iterator[np.ndarray]:
     if path.is_dir():
         names = sorted(name for name in path.iterdir() if name.suffix.lower() in PICTURES)
         yield from map(_picture, names)
@@ -88,7 +103,7 @@ def _frames(path: Path) -> Iterator[np.ndarray]:
         for frame in _video_h5(path):
             yield frame.astype(np.float32) / 255
     else:
-        video = open_video(path, "recording")
+        video = open_video(path, key)
         while (read := video.read())[0]:
             yield cv2.cvtColor(read[1], cv2.COLOR_BGR2GRAY).astype(np.float32) / 255
 
@@ -105,6 +120,16 @@ def _video_h5(path: Path) -> Iterator[np.ndarray]:
             yield from frames
     except Exception as error:  # HDF5 raises all kinds on a broken file
         raise ValueError(f"{path}: cannot be read as a video: {error}") from error
+
+
+def _rate_h5(path: Path) -> float | None:
+    try:
+        with h5py.File(path) as file:
+            columns.check_inside(file)
+            times = file["time_s"][:2] if "time_s" in file else []
+    except Exception as error:  # HDF5 raises all kinds on a broken file
+        raise ValueError(f"{path}: cannot be read as a video: {error}") from error
+    return float(1 / (times[1] - times[0])) if len(times) == 2 and times[1] > times[0] else None
 
 
 def _picture(path: Path) -> np.ndarray:

@@ -29,6 +29,7 @@ TILT = (2 * special.jv(2, math.pi * KAPPA) / (math.pi * KAPPA)) ** 2
 PISTON = (2 * special.jv(1, math.pi * KAPPA) / (math.pi * KAPPA)) ** 2
 HIGHER = np.where(KAPPA > 1e-3, 1 - PISTON - 4 * TILT, 0)  # of the modes beyond tilt; kappa^4 at 0
 NEAREST, FARTHEST = 1e-3, 1e4  # D; the ends of what is tabulated as a length
+LAGS = np.geomspace(NEAREST, FARTHEST, 141)
 
 
 def left(ratio: float, profile: Profile, modes: str) -> float:
@@ -61,13 +62,35 @@ def tilt_reach(ratio: float, profile: Profile, *, wind: bool = False) -> float:
     NEAREST to FARTHEST, which stands for any longer one.
     """
     level = math.exp(-1) if wind else 0.5
-    lags = np.geomspace(NEAREST, FARTHEST, 141)
-    correlation = tilt_correlation(ratio, profile, lags, wind=wind)
+    correlation = _curve(ratio, profile, wind)
     first = int((correlation < level).argmax())
     if first == 0:
         return FARTHEST if correlation[0] >= level else NEAREST
     ends = slice(first - 1, first + 1)
-    return float(np.exp(np.interp(-level, -correlation[ends], np.log(lags[ends]))))
+    return float(np.exp(np.interp(-level, -correlation[ends], np.log(LAGS[ends]))))
+
+
+def whole_share(ratio: float, profile: Profile, view: float) -> float:
+    """Return the share of the tilt's variance that moves all of a square view, `view` D a side.
+
+    The mean correlation of two of its points; the density of their distance: Philip (2007).
+    """
+    apart = math.sqrt(2) * (np.arange(200) + 0.5) / 200
+    far = np.sqrt(np.maximum(apart**2 - 1, 0))
+    density = np.where(
+        apart < 1,
+        apart**2 - 4 * apart + math.pi,
+        4 * far - apart**2 - 2 + math.pi - 4 * np.arctan(far),
+    )
+    weight = apart * density
+    found = np.interp(np.log(apart * view), np.log(LAGS), _curve(ratio, profile, False))
+    return float(weight @ found / weight.sum())
+
+
+@lru_cache(maxsize=4096)
+def _curve(ratio: float, profile: Profile, wind: bool) -> Lags:
+    """Return `tilt_correlation` over LAGS."""
+    return tilt_correlation(ratio, profile, LAGS, wind=wind)
 
 
 @cache

@@ -23,7 +23,7 @@ from src.sim.turbulence.atmosphere import (
     Atmosphere,
 )  # fmt: skip
 from src.sim.turbulence.ranges import Draws, Range, choose_severity, log_between, refused
-from src.sim.turbulence.seeing import blur_growth
+from src.sim.turbulence.seeing import GAUSSIAN, blur_growth, half_light
 
 SPREADS = {
     "weak": (0.1, WEAK_BELOW),
@@ -42,7 +42,9 @@ class Appearance:
     """What a picture shall show, in pixels of a frame 256 wide: `half_length_px` of the tilt,
     `decay_s` to 1 / e, and either `spread_px` (see Atmosphere) or `tilt_px`, rms along one axis.
 
-    `blur_px`: the blur beyond diffraction, rms along one axis, that is wanted most; None: any.
+    Of all that shows this, wanted most are `blur_px`, the blur beyond diffraction, rms along one
+    axis, `blur_ratio`, that of the blurred point to the sharp one, and `whole_share`, the share of
+    the tilt that moves the whole view; None: any.
     """
 
     half_length_px: float
@@ -50,6 +52,8 @@ class Appearance:
     spread_px: float | None = None
     tilt_px: float | None = None
     blur_px: float | None = None
+    blur_ratio: float | None = None
+    whole_share: float | None = None
 
 
 def sample_atmosphere(
@@ -141,7 +145,7 @@ def _find(
         fits &= np.isfinite(strength)
         if not fits.any():
             continue
-        unlike = np.abs(np.log(blur / seen.blur_px)) if seen.blur_px else np.arange(CANDIDATES)
+        unlike = _unlike(seen, blur, airy, [shapes[s] for s in shape], 1 / scale, aperture)
         i = int(np.where(fits, unlike, np.inf).argmin())
         length = float(log_between(u[i, 3], distance_m, "distance_m"))
         diameter = math.sqrt(wavelength_m * length * aperture[i] / airy[i])
@@ -204,6 +208,29 @@ def _strength(seen: Appearance, airy: Draws, tilt: Draws, higher: Draws) -> tupl
     ]
     strength, blur = np.array(rows).T
     return strength, blur
+
+
+def _unlike(
+    seen: Appearance,
+    blur: Draws,
+    airy: Draws,
+    shapes: Sequence[tuple[float, ...]],
+    ratio: Draws,
+    aperture: Draws,
+) -> Draws:
+    """Return how far every candidate is from what is wanted most: 0.1 for 10 % of blur, or a tenth
+    of whole view."""
+    apart = np.zeros(len(blur))
+    if seen.blur_px is not None:
+        apart += np.abs(np.log(blur / seen.blur_px))
+    if seen.blur_ratio is not None:
+        sharp = airy * half_light(0.0) / GAUSSIAN
+        apart += np.abs(np.log(np.hypot(1, blur / sharp) / seen.blur_ratio))
+    if seen.whole_share is not None:
+        views = REFERENCE_PX / aperture
+        found = [outer_scale.whole_share(*one) for one in zip(ratio, shapes, views, strict=True)]
+        apart += np.abs(np.array(found) - seen.whole_share)
+    return apart
 
 
 @cache
