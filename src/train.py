@@ -6,6 +6,7 @@ from pathlib import Path
 
 import hydra
 import lightning
+import torch
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
@@ -40,6 +41,7 @@ def train(cfg: DictConfig) -> dict:
     except NotFinite as error:
         same = f"python -m src.simulate like={run}/config.yaml split=train index={error.clips[0]}"
         raise ValueError(f"{error}; seed {cfg.seed}; to see the clip: {same}") from error
+    module.method.to(memory_format=torch.contiguous_format)  # as it is when it is loaded again
     trained = build.test(cfg, cfg.name, module.method, data, module.scores)
     least = build.part(cfg, "floor.method")
     floor = build.test(cfg, cfg.floor.name, least, data, module.scores)

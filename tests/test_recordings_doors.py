@@ -252,7 +252,7 @@ def test_videos_of_two_sizes_are_not_compared(tmp_path):
 @pytest.mark.parametrize(
     "wrong, message",
     [
-        ("line=null", "one of line, circle and spin"),
+        ("line=null", "one of line, circle, spin and still"),
         ("line=[[0,0],[500,0]]", "must stay"),
         ("line=[[0,0],[9,0]] follow=all", "follow must be one of"),
     ],

@@ -109,7 +109,8 @@ def reconstructor(cfg: DictConfig, net: nn.Module, spec: dict) -> Reconstructor:
     if cfg.hours and cfg.scheduler:
         raise ValueError(f"scheduler must be null with hours={cfg.hours}, which has its own")
     if cfg.channels_last:
-        net.to(memory_format=torch.channels_last)
+        for layer in (layer for layer in net.modules() if isinstance(layer, nn.Conv2d)):
+            layer.to(memory_format=torch.channels_last)
     return kind(
         net,
         spec,

@@ -112,8 +112,9 @@ def test_pictures_come_and_change(server, page, dot):
             before = page.pixels(name)
             _until(lambda name=name, before=before: page.pixels(name) != before)
             assert np.std(before) > 1, name
+        _until(lambda: 0 < server.status()["fps"] < 40)  # frames that were late have caught up
         status = server.status()
-    assert status["asked_fps"] == 30 and 0 < status["fps"] < 40
+    assert status["asked_fps"] == 30
     assert status["events_per_s"] > 1000 and status["views"] == 9
     assert status["latency_ms"]["median"] <= status["latency_ms"]["p99"]
 
