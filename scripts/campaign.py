@@ -1,14 +1,17 @@
-"""Trainings of hours, taken in turn: python -m scripts.campaign PLAN [status] [clone=FOLDER]
+"""Trainings of hours in turn: python -m scripts.campaign PLAN [status] [clone=FOLDER] [KEY=VALUE]
 
     python -m scripts.campaign conf/campaign/default.yaml clone=../campaign           # start, go on
     python -m scripts.campaign conf/campaign/default.yaml clone=../campaign status    # a line each
 
 `clone`: work in a clone of this repository, made at the commit that stands here if it is not there
 yet, so that editing the project does not disturb it.  PLAN: a file as conf/campaign/default.yaml.
+KEY=VALUE: more overrides for all trainings.
 
 Whatever is killed goes on: a training from its last checkpoint when this is running, and trainings
-go on without this.  Each holds a lock while it runs, so that started again this finds them.  Their
-command lines have the word campaign-child.  Ctrl-C and SIGTERM stop all of it, with checkpoints.
+go on without this.  Where no checkpoint is left, as on a new machine, a training goes on from the
+weights it exported, with the hours these have had; seed=1, say, then gives it other clips.  Each
+holds a lock while it runs, so that started again this finds them.  Their command lines have the
+word campaign-child.  Ctrl-C and SIGTERM stop all of it, with checkpoints.
 """
 
 import fcntl
@@ -17,6 +20,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from omegaconf import OmegaConf
@@ -75,13 +79,14 @@ def _end(trainings: list[Training]) -> None:
         time.sleep(0.1)
 
 
-def load(path: Path) -> tuple[Campaign, list[Training]]:
-    """Return what a YAML file says; raises ValueError naming what is wrong."""
+def load(path: Path, overrides: Sequence[str] = ()) -> tuple[Campaign, list[Training]]:
+    """Return what a YAML file says, and `overrides`; raises ValueError naming what is wrong."""
     try:
         content = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
         rows = content.pop("trainings")
         stop = Stop(**content.pop("stop")) if content.get("stop") else content.pop("stop", None)
         plan = Campaign(**content, stop=stop)
+        plan = plan._replace(common=[*plan.common, *overrides])
         trainings = [Training(plan, **row) for row in rows]
     except (OSError, KeyError, TypeError, AttributeError, OmegaConfBaseException) as error:
         raise ValueError(f"{path} must be as conf/campaign/default.yaml is: {error}") from error
@@ -111,13 +116,14 @@ def main() -> None:
     """Read the command line."""
     words = sys.argv[1:]
     folders = [word.removeprefix("clone=") for word in words if word.startswith("clone=")]
-    rest = [word for word in words if not word.startswith("clone=") and word != "status"]
+    rest = [word for word in words if "=" not in word and word != "status"]
+    overrides = [word for word in words if "=" in word and not word.startswith("clone=")]
     if len(rest) != 1 or len(folders) > 1:
         sys.exit(__doc__)
     try:
         if folders:
             clone(Path(folders[0]).resolve())
-        plan, trainings = load(Path(rest[0]))
+        plan, trainings = load(Path(rest[0]), overrides)
         if "status" in words:
             print("\n".join(one.line() for one in trainings))
             return

@@ -13,6 +13,7 @@ import torch
 from omegaconf import OmegaConf
 
 from scripts.learning_curves import curve
+from src.models import files
 
 ROOT = Path(__file__).resolve().parents[1]
 # In the command lines of a training and of what it starts: filters of warnings are handed on, and
@@ -58,6 +59,7 @@ class Training:
         self.plan, self.name, self.hours, self.least = plan, name, hours, least
         self.experiment, self.overrides = experiment or name, list(overrides)
         self.folder = Path(plan.out) / name
+        self.export = Path(plan.export) / f"{name}.safetensors"
         self.failures, self.began = 0, 0.0
         self.process: subprocess.Popen | None = None
 
@@ -65,14 +67,13 @@ class Training:
         """Return the command of the next part."""
         parts = sorted(self.folder.glob("part*"))
         number = int(parts[-1].name[4:]) + 1 if parts else 0
-        export = Path(self.plan.export) / f"{self.name}.safetensors"
+        start = self.folder if any(self.folder.rglob("*.ckpt")) else self.export
         return [
             "nice", "-n", str(self.plan.nice), sys.executable, "-W", MARK, "-m", "src.train",
             f"experiment={self.experiment}", f"hours={self.hours}",
             *self.plan.common, *self.overrides,
-            f"export={export}", f"hydra.run.dir={self.folder / f'part{number:03}'}",
-            "~callbacks.progress",
-            *([f"ckpt={self.folder}"] if any(self.folder.rglob("*.ckpt")) else []),
+            f"export={self.export}", f"hydra.run.dir={self.folder / f'part{number:03}'}",
+            "~callbacks.progress", *([f"ckpt={start}"] if start.exists() else []),
         ]  # fmt: skip
 
     def start(self) -> None:
@@ -135,7 +136,7 @@ class Training:
 
     def curve(self) -> list[dict[str, float]]:
         """Return the learning curve so far."""
-        return curve(self.folder)
+        return curve(self.folder) or self._exported()
 
     def flat(self) -> bool:
         """Return whether the last hours brought too little for more to follow."""
@@ -179,15 +180,21 @@ class Training:
                 return content["seconds"] / 3600, content["global_step"], age
             except Exception:  # it was just removed, or torn: all kinds of errors
                 continue
+        for row in self._exported()[-1:]:
+            return row["hours"], row["steps"], None
         return 0.0, 0, None
 
+    def _exported(self) -> list[dict[str, float]]:
+        """Return the learning curve of the exported weights: all that may be left of a training."""
+        return files.card(self.export)["curve"] if self.export.is_file() else []
+
     def _done(self) -> bool:
-        """Return whether a part has its results after as many hours as are asked for now."""
+        """Return whether a part has its results, or weights, of the hours asked for now."""
         for results in self.folder.glob("part*/results.json"):
             config = OmegaConf.load(results.with_name("config.yaml"))
             if config.hours >= self.hours:
                 return True
-        return False
+        return any(row["hours"] >= self.hours for row in self._exported()[-1:])
 
     def _tidy(self) -> None:
         """Keep the checkpoints of the newest part that has some."""

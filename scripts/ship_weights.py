@@ -12,7 +12,6 @@ from pathlib import Path
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from safetensors import safe_open
 
 from scripts.learning_curves import curve
 from src.figures import learning
@@ -47,9 +46,7 @@ def ship(run: Path, name: str, tests: list[Path]) -> Path:
 def recard(name: str, tests: list[Path]) -> Path:
     """Write the card of shipped weights anew, with what `tests` hold; returns the weights' path."""
     path = files.WEIGHTS / f"{name}.safetensors"
-    with safe_open(path, "pt") as file:
-        card = json.loads(file.metadata()["card"])
-    return _write_card(path, name, files.load(path), card, tests)
+    return _write_card(path, name, files.load(path), files.card(path), tests)
 
 
 def _write_card(

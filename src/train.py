@@ -14,6 +14,7 @@ from src.app import build, door
 from src.figures import samples
 from src.models import files
 from src.records import results, tracking
+from src.training import handover
 from src.training.guard import NotFinite
 
 
@@ -37,6 +38,9 @@ def train(cfg: DictConfig) -> dict:
     untrained = build.test(cfg, "untrained", module.method, data, module.scores)
     tracking.begin(trainer.loggers, OmegaConf.to_container(cfg, resolve=True))
     try:
+        if start_from and files.exported(start_from):
+            handover.take(module, trainer.callbacks, start_from)
+            start_from = None
         fit(trainer, module, data, start_from)
     except NotFinite as error:
         same = f"python -m src.simulate like={run}/config.yaml split=train index={error.clips[0]}"

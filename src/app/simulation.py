@@ -95,7 +95,7 @@ def _simulation(
 ) -> Pipeline:
     substeps = _count(cfg, "data.substeps")
     rates = _rates(cfg, split == "train")
-    seed = _count(cfg, "data.test_seed" if split == "test" else "seed", least=0)
+    seed = _count(cfg, "seed" if split == "train" else "data.test_seed", least=0)
     scenes = [
         part(
             cfg,

@@ -21,6 +21,7 @@ from src.records.whole import written
 
 WEIGHTS = Path(__file__).resolve().parents[2] / "weights"
 ROOMS = ("src.models.", "baselines.")
+POWER_ITERATIONS = 50
 LARGEST = 4096  # any number in the arguments of a network that a file names
 
 
@@ -41,7 +42,7 @@ def load(name_or_path: str | Path, rooms: Sequence[str] = ()) -> nn.Module:
     if not path.is_file():
         names = ", ".join(sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))) or "none yet"
         raise ValueError(f"ckpt must be a file or one of weights/ ({names}), got {name_or_path}")
-    spec, weights = (_safetensors if path.suffix == ".safetensors" else _checkpoint)(path)
+    spec, weights = (_safetensors if exported(path) else _checkpoint)(path)
     check_memory(weights, path, "ckpt")
     with torch.device("meta"):  # without memory: a small file may name a huge network
         _check_fit(_build(spec, path, rooms), weights, path)
@@ -52,17 +53,48 @@ def load(name_or_path: str | Path, rooms: Sequence[str] = ()) -> nn.Module:
 
 
 def require(name: str | Path, spec: dict) -> Path:
-    """Return the checkpoint to go on from: `name`, or the newest whole one in the folder `name`.
+    """Return the file to go on from: `name`, or the newest whole checkpoint in the folder `name`.
 
-    Raises ValueError unless it is a whole checkpoint of just the network `spec`.
+    Raises ValueError unless it is a whole checkpoint, or a file of `save`, of the network `spec`.
     """
     path = newest(Path(name)) if Path(name).is_dir() else Path(name)
     if not path.is_file():
         raise ValueError(f"ckpt must be a checkpoint to go on from, got {path}")
-    found, _ = _checkpoint(path)
-    if found != spec:
+    found, _ = (_safetensors if exported(path) else _checkpoint)(path)
+    wanted = spec | {"kwargs": spec["kwargs"] | _unnormalised(spec)} if exported(path) else spec
+    if found != wanted:
         raise ValueError(f"ckpt must be of the network {spec} to go on from, got {found} in {path}")
     return path
+
+
+def exported(path: Path) -> bool:
+    """Return whether `path` is a file of `save`, without the state of an optimiser."""
+    return path.suffix == ".safetensors"
+
+
+def card(path: Path) -> dict:
+    """Return what `save` was given beside the weights of the file `path`.
+
+    Raises ValueError, beginning with `ckpt`, for another kind of file.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            return json.loads(file.metadata()["card"])
+    except Exception as error:  # libraries raise all kinds on a broken file
+        raise ValueError(f"ckpt must be a network written by this project, got {path}") from error
+
+
+@torch.no_grad()
+def restore(network: nn.Module, path: Path) -> None:
+    """Give `network` the weights of a file of `save`; spectral norms find their vectors anew."""
+    weights = _safetensors(path)[1]
+    for prefix, module in network.named_modules():
+        if parametrize.is_parametrized(module, "weight"):
+            module.weight = weights.pop(f"{prefix}.weight")
+            module.train()
+            for _ in range(POWER_ITERATIONS):
+                module.weight  # noqa: B018  every look is an iteration
+    network.load_state_dict(weights, strict=False)
 
 
 def save(path: Path, network: nn.Module, spec: dict, card: dict) -> None:

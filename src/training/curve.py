@@ -65,7 +65,7 @@ class Curve(Callback):
     def _add(self, trainer: Trainer, module: LightningModule) -> None:
         row = {
             "hours": module.clock.hours,
-            "steps": trainer.global_step,
+            "steps": self.steps + (self.rows[-1]["steps"] if self.rows else 0),
             "windows": module.windows_seen,
             "loss": self.loss / self.steps if self.steps else "",
         }
@@ -75,7 +75,8 @@ class Curve(Callback):
         if self.export is not None:
             self.export.parent.mkdir(parents=True, exist_ok=True)
             # A copy: spectral norm is folded in eval mode, and the training goes on in its own.
-            files.save(self.export, deepcopy(module.method), module.network_spec, self.rows[-1])
+            method, card = deepcopy(module.method), {"curve": self.rows}
+            files.save(self.export, method, module.network_spec, card)
         module.clock.start()
 
     def _write(self) -> None:

@@ -1,0 +1,25 @@
+"""Going on from exported weights where no checkpoint is left; the optimiser starts anew."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from src.models import files
+from src.training.curve import Curve
+from src.training.reconstructor import Reconstructor
+
+
+def take(module: Reconstructor, callbacks: Iterable, path: Path) -> None:
+    """Give `module` the weights, the time and the windows, and the curve among `callbacks` the
+    lines so far, of `path`, a file that a Curve exported.
+
+    Raises ValueError for weights that were written otherwise.
+    """
+    rows = files.card(path).get("curve")
+    if not rows:
+        raise ValueError(f"ckpt must be a checkpoint or what `export` wrote to go on, got {path}")
+    files.restore(module.network, path)
+    if module.average is not None:
+        module.average.load_state_dict(module.network.state_dict())
+    module.clock.seconds, module.windows_seen = 3600 * rows[-1]["hours"], rows[-1]["windows"]
+    for curve in (found for found in callbacks if isinstance(found, Curve)):
+        curve.rows = rows
