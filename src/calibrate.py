@@ -28,10 +28,8 @@ def threshold(cfg: DictConfig, run: Path) -> dict:
     """Find the contrast threshold by comparing event rates with the configured simulation's."""
     pipeline = build.pipeline(cfg, "test")
     clips = [pipeline.views(pipeline.draw(index))[0] for index in range(cfg.clips)]
-    settings = OmegaConf.to_container(cfg.sensor, resolve=True)
-    settings |= {"input": "linear"} if pipeline.decode else {}
     found = calibration.find_threshold(
-        cfg.recording, run, clips, cfg.fps * cfg.data.substeps, settings,
+        cfg.recording, run, clips, cfg.fps * cfg.data.substeps, pipeline.sensor,
         views=cfg.views, sensor_size=cfg.sensor_size,
     )  # fmt: skip
     return {"ON (value, low, high)": found.on, "OFF": found.off}

@@ -15,6 +15,7 @@ from torch import nn
 import src.models
 from baselines import widened
 from baselines.postprocess import Restoration
+from src.app.contracts import keeping
 from src.app.parts import make, part, rooms
 from src.app.simulation import pipeline
 from src.metrics.scores import Scores
@@ -62,7 +63,7 @@ def network(cfg: DictConfig) -> tuple[nn.Module, dict]:
     """
     node = OmegaConf.to_container(cfg.model, resolve=True)
     weights = node.pop("weights", None)
-    net = make(node, rooms(cfg))
+    net = keeping("model", make(node, rooms(cfg)))
     if weights:
         widened.start(net, weights)
     elif "weights" in cfg.model:

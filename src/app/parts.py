@@ -12,10 +12,15 @@ from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from baselines.upstream import from_config
+from src.app.contracts import keeping
 from src.models.setnet import SetNet
 
 FACTORIES = (from_config, SetNet.preset)  # what is no class and may be named all the same
 PACKAGE = r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*"
+OLDER = {  # what a part is where none is named: runs before 0.2 named none
+    "turbulence": "src.sim.turbulence.simulated.SimulatedAir",
+    "sensor": "src.sim.sensor.sensor.EventSensor",
+}
 ROOMS = (
     "src.", "baselines.", "torch.optim.", "lightning.pytorch.trainer.",
     *(f"lightning.pytorch.{room}." for room in ("callbacks", "loggers", "plugins", "profilers")),
@@ -34,8 +39,14 @@ def rooms(cfg: DictConfig) -> tuple[str, ...]:
 
 
 def part(cfg: DictConfig, key: str, **kwargs) -> Any:
-    """Return what the part `key` of the config names, made with its values and `kwargs`."""
-    return make(OmegaConf.select(cfg, key), rooms(cfg), **kwargs)
+    """Return what the part `key` of the config names, made with its values and `kwargs`.
+
+    Raises ValueError as `make` does, and for a class that does not keep the contract of the part.
+    """
+    node = OmegaConf.select(cfg, key)
+    if key in OLDER and "_target_" not in node:
+        node = OmegaConf.merge({"_target_": OLDER[key]}, node)
+    return keeping(key, make(node, rooms(cfg), **kwargs))
 
 
 def make(node: Any, own: Sequence[str] = (), **kwargs) -> Any:

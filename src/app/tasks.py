@@ -19,6 +19,7 @@ from src.recordings.files import formats, sources
 from src.recordings.files.measured import SIDE
 from src.recordings.views import Views, load
 from src.records import results
+from src.sim.sensor import EventSensor
 
 
 def align_views(
@@ -58,7 +59,7 @@ def find_threshold(
     folder: Path,
     clips: Sequence[Float[Tensor, "views frames h w"]],
     fps: float,
-    sensor: dict,
+    sensor: EventSensor,
     *,
     views: str | None = None,
     sensor_size: Sequence[int] | None = None,

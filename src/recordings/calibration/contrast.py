@@ -45,16 +45,16 @@ class Estimate:
 def simulate(
     clips: Iterable[Float[Tensor, "views frames h w"]],
     fps: float,
-    sensor: dict,
+    sensor: EventSensor,
     thresholds: Sequence[float] = GRID,
     *,
     off_ratio: float = 1.0,
 ) -> Curve:
     """Return the rates of a sensor looking at `clips`, at all thresholds with the same noise.
 
-    `sensor` holds the arguments of EventSensor; its `threshold` and `off_ratio` are not used.
+    Its own `threshold` and `off_ratio` are not used.
     """
-    sensor = EventSensor(**sensor | {"threshold": thresholds[0], "off_ratio": off_ratio})
+    sensor = sensor.having(threshold=thresholds[0], off_ratio=off_ratio)
     grid = torch.tensor(thresholds, dtype=torch.float32)
     events, exposure = torch.zeros(len(grid), 2, dtype=torch.float64), 0.0
     for index, frames in enumerate(clips):
@@ -70,7 +70,7 @@ def estimate(
     rates: Rates,
     clips: Sequence[Float[Tensor, "views frames h w"]],
     fps: float,
-    sensor: dict,
+    sensor: EventSensor,
     thresholds: Sequence[float] = GRID,
     *,
     background: Float[np.ndarray, " 2"] | None = None,

@@ -85,11 +85,12 @@ class EventSensor:
         check(vars(self))
         self._table = response_table(response, input, floor)
 
-    def at(self, threshold: float) -> "EventSensor":
-        """Return the same sensor with one threshold."""
+    def having(self, **settings) -> "EventSensor":
+        """Return the same sensor with other `settings`, arguments of the class."""
         found = copy(self)
-        found.threshold = threshold
+        vars(found).update(settings)
         check(vars(found))
+        found._table = response_table(found.response, found.input, found.floor)
         return found
 
     def draw(self, key: int, seed: int | None = None) -> "EventSensor":
