@@ -11,8 +11,8 @@ import rich
 from omegaconf import DictConfig
 
 from src.app import door
-from src.figures import layouts, slices
-from src.metrics import straightness
+from src.figures import comparison, slices
+from src.metrics import slice_motion
 from src.recordings.files import sources
 from src.records import results
 
@@ -29,7 +29,7 @@ def compare(cfg: DictConfig) -> dict:
 
     `wander`, along a line or a ray that turns with the scene, is of what stands still there,
     `straightness` of what moves uniformly along a line or a circle.  With `still` the whole scene
-    stands (`straightness.of_still`).  Raises ValueError for a video that cannot be read or is of
+    stands (`slice_motion.of_still`).  Raises ValueError for a video that cannot be read or is of
     another size than the first, or a slice that leaves the picture.
     """
     run = Path(cfg.paths.run)
@@ -39,7 +39,7 @@ def compare(cfg: DictConfig) -> dict:
     films = [np.stack(list(sources.film(path)))[cfg.first : cfg.last] for path in cfg.videos]
     given = {name: cfg[name] for name in slices.KINDS if cfg[name]}
     if len(given) != 1:
-        raise ValueError(f"give one of {', '.join(slices.KINDS)}, got {given or 'none'}")
+        raise ValueError(f"give one of line, circle, spin and still, got {given or 'none'}")
     films = slices.shrunk(films) if cfg.still else films
     sizes = {film.shape[1:] for film in films}
     if len(sizes) > 1:
@@ -49,13 +49,13 @@ def compare(cfg: DictConfig) -> dict:
     for name, film in zip(names, films, strict=True):
         across, points = slices.cut(film, fps=cfg.fps, **given)
         if cfg.still:
-            found[name] = straightness.of_still(film, cfg.still)
+            found[name] = slice_motion.of_still(film, cfg.still)
         else:
-            found[name] = straightness.of_slice(across, next(iter(given)), cfg.follow)
+            found[name] = slice_motion.of_slice(across, next(iter(given)), cfg.follow)
         notes = [NOTES[measure].format(value) for measure, value in found[name].items()]
-        rows.append(layouts.Row(name, film, across, "\n".join(notes)))
+        rows.append(comparison.Row(name, film, across, "\n".join(notes)))
     shortest = min(map(len, films))
-    layouts.comparison(
+    comparison.comparison(
         rows, run / "comparison.png", line=points, length_s=shortest / cfg.fps, axis=cfg.axis,
         samples=np.linspace(0, shortest - 1, cfg.samples).astype(int).tolist(),
     )  # fmt: skip

@@ -23,10 +23,10 @@ from src.models.unroll import takes
 from src.records.results import Row
 from src.sim.optics import Optics
 from src.training import evaluation
-from src.training.banked import Banked
+from src.training.bank_filler import Filler
+from src.training.bank_samples import Banked
 from src.training.clock import Clock
 from src.training.datamodule import LightFieldData
-from src.training.filling import Filler
 from src.training.reconstructor import Reconstructor
 
 
@@ -77,11 +77,11 @@ def network(cfg: DictConfig) -> tuple[nn.Module, dict]:
 def chosen(cfg: DictConfig) -> nn.Module:
     """Return the network that `ckpt` or else `baseline` names, in eval mode."""
     if cfg.ckpt:
-        found = src.models.load(cfg.ckpt, rooms(cfg))
-        if takes(found, "frames"):
+        net = src.models.load(cfg.ckpt, rooms(cfg))
+        if takes(net, "frames"):
             use = f"baseline=frames postprocess=mambatm postprocess.restorer={cfg.ckpt}"
             raise ValueError(f"ckpt must be a network for events, got a post-processor; use {use}")
-        return found
+        return net
     if cfg.get("baseline"):
         return part(cfg, "baseline").eval()
     raise ValueError("ckpt or baseline must name a network, got neither")
@@ -89,8 +89,8 @@ def chosen(cfg: DictConfig) -> nn.Module:
 
 def frozen(cfg: DictConfig) -> nn.Module:
     """Return the chosen network, behind it the chosen post-processor."""
-    found = chosen(cfg)
-    return part(cfg, "postprocess", source=found) if cfg.get("postprocess") else found
+    net = chosen(cfg)
+    return part(cfg, "postprocess", source=net) if cfg.get("postprocess") else net
 
 
 def scores(cfg: DictConfig) -> Scores:
@@ -146,7 +146,7 @@ def trainer(cfg: DictConfig) -> lightning.Trainer:
     loggers = [make(logger, rooms(cfg)) for logger in cfg.logger.values()]
     callbacks = [make(callback, rooms(cfg)) for callback in cfg.callbacks.values()]
     if not cfg.trainer.enable_progress_bar:  # Lightning refuses a bar then
-        callbacks = [found for found in callbacks if not isinstance(found, ProgressBar)]
+        callbacks = [callback for callback in callbacks if not isinstance(callback, ProgressBar)]
     return part(cfg, "trainer", logger=loggers, callbacks=callbacks)
 
 

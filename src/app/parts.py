@@ -90,10 +90,10 @@ def _check(target: str, own: Sequence[str]) -> None:
     if not target.startswith(("src.", "baselines.", "torch.optim.", "lightning.", *packages)):
         raise ValueError(refusal)
     try:
-        found = get_object(target)
+        named = get_object(target)
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f"_target_ must name a class, got {target}") from error
-    home = f"{getattr(found, '__module__', '')}."
-    written_here = isinstance(found, type) and home.startswith(ROOMS + packages)
-    if found not in FACTORIES and not written_here:
+    home = f"{getattr(named, '__module__', '')}."
+    written_here = isinstance(named, type) and home.startswith(ROOMS + packages)
+    if named not in FACTORIES and not written_here:
         raise ValueError(refusal)

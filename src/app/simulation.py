@@ -14,7 +14,7 @@ from src.sim.pipeline import Pipeline
 from src.sim.scenes.photographs import MixedRates
 from src.sim.sensor.contract import Sensor
 from src.training.bank import Bank, listing
-from src.training.banked import Banked
+from src.training.bank_samples import Banked
 
 CLIP = ("scene", "turbulence")  # sections that make a clip, whatever sees it
 
@@ -102,7 +102,7 @@ def _simulation(
         )
         for rate in rates
     ]
-    found = Pipeline(
+    made = Pipeline(
         MixedRates(scenes) if len(scenes) > 1 else scenes[0],
         optics,
         part(cfg, "turbulence"),
@@ -115,8 +115,8 @@ def _simulation(
         random_crop=split == "train",
         clips=clips,
     )
-    found.sensor = _sensor(cfg, seed)
-    return found
+    made.sensor = _sensor(cfg, seed)
+    return made
 
 
 def _light(cfg: DictConfig) -> dict:
@@ -139,8 +139,8 @@ def _count(cfg: DictConfig, key: str, least: int = 1) -> int:
 
 def _rates(cfg: DictConfig, training: bool) -> list[float]:
     key = "data.rates" if training and cfg.data.rates else "fps"
-    found = OmegaConf.select(cfg, key)
-    rates = list(found) if isinstance(found, Sequence) else [found]
+    given = OmegaConf.select(cfg, key)
+    rates = list(given) if isinstance(given, Sequence) else [given]
     if not rates or not all(isinstance(r, int | float) and 0 < r < math.inf for r in rates):
-        raise ValueError(f"{key} must be > 0 windows a second, got {found}")
+        raise ValueError(f"{key} must be > 0 windows a second, got {given}")
     return rates

@@ -9,7 +9,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from src.bench.charting import Score
 from src.bench.pareto import front
-from src.bench.stopwatch import Speed
+from src.bench.speed import Speed
 from src.figures.plots import MARKERS, save
 from src.metrics.table import METRICS, Metric
 

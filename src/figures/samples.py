@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from src.figures.layouts import Row, comparison
+from src.figures.comparison import Row, comparison
 from src.figures.video import event_picture, row, write_video
 from src.models.unroll import video
 from src.sim.optics import Optics

@@ -60,7 +60,7 @@ def sample(
     return np.concatenate(rows)
 
 
-def straight(start: tuple[float, float], end: tuple[float, float], places: int | None = None) -> Points:
+def straight(start: Sequence[float], end: Sequence[float], places: int | None = None) -> Points:
     """Return points from `start` to `end`, both kept, by default at most a pixel apart.
 
     A row gives x-t, a column y-t, a line from the centre of a rotation r-t.

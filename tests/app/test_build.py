@@ -46,8 +46,9 @@ class Net(nn.Module):
 """
 PARTS = {
     "scene": "Photographs", "optics": "Optics", "turbulence": "SimulatedAir",
-    "sensor": "EventSensor", "augment": "Augment", "loss": "L1",
-    "optimizer": "Adam", "floor.method": "HighPass", "logger.csv": "CSVLogger", "callbacks.checkpoint": "ModelCheckpoint", "restorer": "MambaTM",
+    "sensor": "EventSensor", "augment": "Augment", "loss": "L1", "optimizer": "Adam",
+    "floor.method": "HighPass", "logger.csv": "CSVLogger",
+    "callbacks.checkpoint": "ModelCheckpoint", "restorer": "MambaTM",
 }  # fmt: skip
 
 

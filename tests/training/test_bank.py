@@ -22,9 +22,9 @@ from src.simulate import simulate
 from src.train import train
 from src.training.augment import Augment
 from src.training.bank import MADE_OF, Bank, listing, simulation
-from src.training.banked import EACH, FIRST, Banked
+from src.training.bank_filler import Filler, fill
+from src.training.bank_samples import EACH, FIRST, Banked
 from src.training.datamodule import LightFieldData
-from src.training.filling import Filler, fill
 from tests.faults.test_surroundings import small_files
 from tests.sim.test_pipeline import Waves
 from tests.test_train import TINY, config

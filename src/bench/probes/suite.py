@@ -41,16 +41,16 @@ def gather(accounts: Iterable[Account], keep: Callable[[Found], None]) -> tuple[
 
     `keep` is called with what is found so far after every network.
     """
-    found: Found = {}
+    findings: Found = {}
     standards: dict[str, float] = {}
     for account in accounts:
         for probe, cell in account.cells.items():
-            found.setdefault(probe, {})[account.network] = cell
+            findings.setdefault(probe, {})[account.network] = cell
         if account.standard is not None:
             standards[account.network] = account.standard
-        keep(found)
+        keep(findings)
         print(f"{account.network}: {account.seconds:.0f} s", flush=True)
-    return found, standards
+    return findings, standards
 
 
 def _cell(candidate: Candidate, probe: Probe, bench: Bench) -> Cell:
@@ -66,13 +66,13 @@ def _cell(candidate: Candidate, probe: Probe, bench: Bench) -> Cell:
         return str(error)
 
 
-def table(found: Found, titles: Mapping[str, str]) -> str:
+def table(findings: Found, titles: Mapping[str, str]) -> str:
     """Return CSV: one line for the value of each cell and for each point of its curve."""
     text = io.StringIO()
     writer = csv.writer(text)
     heads = "network probe title varied setting value unit limit failed reason"
     writer.writerow(heads.split())
-    for probe, cells in found.items():
+    for probe, cells in findings.items():
         for network, cell in cells.items():
             writer.writerows(_lines(network, probe, titles[probe], cell))
     return text.getvalue()
@@ -90,12 +90,12 @@ def _lines(network: str, probe: str, title: str, cell: Cell) -> list[list]:
     return [[*head, "", "", f"{cell.value:.6g}", *tail, cell.failed, ""], *points]
 
 
-def words(found: Found, titles: Mapping[str, str], standards: Mapping[str, float]) -> str:
+def words(findings: Found, titles: Mapping[str, str], standards: Mapping[str, float]) -> str:
     """Return, in plain words, where each network breaks."""
-    networks = list(next(iter(found.values()), {}))
+    networks = list(next(iter(findings.values()), {}))
     parts = ["# Where each method breaks\n"]
     for network in networks:
-        cells = {titles[probe]: row[network] for probe, row in found.items()}
+        cells = {titles[probe]: row[network] for probe, row in findings.items()}
         parts.append(f"## {network}\n\n{_standard(standards.get(network))}{_account(cells)}\n")
     return "\n".join(parts)
 
