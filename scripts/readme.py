@@ -24,7 +24,7 @@ from src.reports.writers import replace_section
 from src.sim.pipeline import Sample, simulate
 
 HOME = Path(__file__).resolve().parents[1]
-NINE, ONE = "setnet_medium", "single256"  # of the picture
+NETWORK = "setnet_medium"  # of the picture: the same weights on one view and on nine
 # Local air, whose parts of a view wobble apart.
 AIR = ("turbulence=strong", "turbulence.atmosphere.half_length_px=[10,20]",
        "turbulence.atmosphere.near_rigid=0.0")  # fmt: skip
@@ -85,8 +85,8 @@ def picture(path: Path, index: int, windows: int) -> None:
     sample = simulate(build.pipeline(cfg, "test"), [index])
     panels = {
         "what one view sees": sample.turbulent[0],
-        "one view's events, reconstructed": played(ONE, 1, sample),
-        "nine views' events, reconstructed": played(NINE, 9, sample),
+        "one view, reconstructed": played(NETWORK, 1, sample),
+        "nine views, reconstructed": played(NETWORK, 9, sample),
         "ground truth": sample.target[0],
     }
     figure = Figure(figsize=(10, 4.1), layout="constrained")

@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 from src.app import door
 from src.figures import comparison, slices
 from src.metrics import slice_motion
+from src.recordings import camera_frames
 from src.recordings.files import sources
 from src.records import results
 
@@ -21,6 +22,9 @@ NOTES = {
     "straightness": "what moves, from a line: {:.2f} px",
     "contrast": "contrast: {:.3f}",
     "flicker": "change from frame to frame: {:.3f} of the contrast",
+    "ssim": "SSIM with the camera: {:.3f}",
+    "lpips": "LPIPS: {:.3f}",
+    "correlation": "correlation: {:.3f}",
 }
 
 
@@ -46,12 +50,14 @@ def compare(cfg: DictConfig) -> dict:
         raise ValueError(f"videos must be of one size (h, w), got {sorted(sizes)}")
     results.open_run(run, door.resolved(cfg))
     found, rows = {}, []
-    for name, film in zip(names, films, strict=True):
+    for name, path, film in zip(names, cfg.videos, films, strict=True):
         across, points = slices.cut(film, fps=cfg.fps, **given)
         if cfg.still:
             found[name] = slice_motion.of_still(film, cfg.still)
         else:
             found[name] = slice_motion.of_slice(across, next(iter(given)), cfg.follow)
+        if cfg.camera:
+            found[name] |= camera_frames.agreement(Path(path), Path(cfg.camera))
         notes = [NOTES[measure].format(value) for measure, value in found[name].items()]
         rows.append(comparison.Row(name, film, across, "\n".join(notes)))
     shortest = min(map(len, films))

@@ -1,9 +1,7 @@
 """The chart's scores on the same clips, its knees, its tables and what they say in words."""
 
-import csv
-import io
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import astuple, dataclass, fields
 
 import rich
 import torch
@@ -15,6 +13,7 @@ from src.bench.speed import FORMS, Speed
 from src.metrics.scores import Scores
 from src.metrics.table import METRICS
 from src.models.fast import running
+from src.records.results import csv_text
 from src.sim.pipeline import Pipeline, simulate
 
 SEVERITIES = ("weak", "medium", "strong", "mixed")
@@ -141,25 +140,15 @@ def words(
 
 def speed_csv(rows: Sequence[Speed]) -> str:
     """Return one line per entry."""
-    return _csv([field.name for field in fields(Speed)], [_short(asdict(row)) for row in rows])
+    return csv_text([field.name for field in fields(Speed)], [_short(astuple(row)) for row in rows])
 
 
 def scores_csv(rows: Sequence[Score]) -> str:
     """Return one line per network, form and clip."""
-    lines = [
-        {"network": r.network, "form": r.form, "severity": r.severity, "clip": r.clip} | r.values
-        for r in rows
-    ]
-    return _csv(list(lines[0]) if lines else ["network"], [_short(line) for line in lines])
+    heads = ["network", "form", "severity", "clip", *(rows[0].values if rows else [])]
+    lines = [[r.network, r.form, r.severity, r.clip, *r.values.values()] for r in rows]
+    return csv_text(heads, map(_short, lines))
 
 
-def _short(line: Mapping) -> dict:
-    return {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in line.items()}
-
-
-def _csv(heads: list[str], lines: list[dict]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, heads)
-    writer.writeheader()
-    writer.writerows(lines)
-    return text.getvalue()
+def _short(line: Iterable) -> list:
+    return [f"{value:.6g}" if isinstance(value, float) else value for value in line]

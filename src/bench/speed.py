@@ -10,6 +10,7 @@ from torch import nn
 
 from src.bench import timing
 from src.bench.candidates import Candidate
+from src.models import stopwatch
 from src.models.cost import macs, macs_per_frame
 from src.models.export import OnnxNetwork, export
 from src.models.fast import plain, running
@@ -142,7 +143,7 @@ class Stopwatch:
             if which not in self._bytes:
                 self._bytes[which] = timing.peak_bytes(network, voxels)
             entry["peak_mib"] = self._bytes[which] / 2**20
-        took = timing.frame(network, voxels, count=entry["threads"], seconds=self.seconds)
+        took = stopwatch.frame(network, voxels, count=entry["threads"], seconds=self.seconds)
         ms = {"ms": took.median_ms + after, "least_ms": took.least_ms + after}
         return Speed(**entry, **ms, frames=took.frames, clock=took.clock)
 

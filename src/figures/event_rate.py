@@ -4,6 +4,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from src.figures import plots
 from src.recordings.calibration.contrast_threshold import Estimate
 
 COLOURS = ("tab:blue", "tab:red")
@@ -30,5 +31,4 @@ def threshold(estimate: Estimate, path: Path) -> None:
     axes.set_xticks(TICKS, [f"{tick:g}" for tick in TICKS])
     axes.grid(alpha=0.3, which="both")
     axes.legend(fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
+    plots.save(figure, path)

@@ -7,6 +7,7 @@ import json
 import shutil
 import statistics
 import subprocess
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -125,13 +126,16 @@ def write(run: Path, config: str, rows: list[Row], **facts) -> dict:
     return record
 
 
+def csv_text(heads: Iterable, rows: Iterable[Iterable]) -> str:
+    """Return a table as CSV."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([heads, *rows])
+    return text.getvalue()
+
+
 def clips_csv(clips: list[dict]) -> str:
     """Return one line per clip: what was drawn for it and its scores."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(clips[0]))
-    writer.writeheader()
-    writer.writerows(clips)
-    return text.getvalue()
+    return csv_text(clips[0], [[clip[name] for name in clips[0]] for clip in clips])
 
 
 def table(rows: list[Row]) -> Table:

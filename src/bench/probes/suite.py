@@ -1,13 +1,12 @@
 """Every probe on every network: findings, a table of them, and in plain words where each breaks."""
 
-import csv
-import io
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from src.bench.candidates import Candidate, Subject
 from src.bench.probes.standard import Bench, Finding
+from src.records.results import csv_text
 
 Probe = Callable[[Subject, Bench], Finding]
 Cell = Finding | str  # or why there is none
@@ -68,14 +67,11 @@ def _cell(candidate: Candidate, probe: Probe, bench: Bench) -> Cell:
 
 def table(findings: Found, titles: Mapping[str, str]) -> str:
     """Return CSV: one line for the value of each cell and for each point of its curve."""
-    text = io.StringIO()
-    writer = csv.writer(text)
-    heads = "network probe title varied setting value unit limit failed reason"
-    writer.writerow(heads.split())
+    heads, lines = "network probe title varied setting value unit limit failed reason", []
     for probe, cells in findings.items():
         for network, cell in cells.items():
-            writer.writerows(_lines(network, probe, titles[probe], cell))
-    return text.getvalue()
+            lines += _lines(network, probe, titles[probe], cell)
+    return csv_text(heads.split(), lines)
 
 
 def _lines(network: str, probe: str, title: str, cell: Cell) -> list[list]:
