@@ -19,8 +19,9 @@ from src.app import build
 from src.bench.candidates import Subject
 from src.figures import plots
 from src.metrics.bootstrap import interval
-from src.metrics.table import METRICS
+from src.metrics.table import METRICS, Metric
 from src.reports.writers import replace_section
+from src.sim.optics import layout
 from src.sim.pipeline import Sample, simulate
 
 HOME = Path(__file__).resolve().parents[1]
@@ -48,7 +49,8 @@ def played(name: str, views: int, sample: Sample) -> Tensor:
     """Return the frames (windows, 1, h, w) that a shipped network makes of the centre view or of
     all views of `sample`, a single clip."""
     subject, window_s = Subject(name, models.load(name), views), float(sample.window_s[0])
-    return subject.play(sample.voxels[0, :, None], list(sample.positions), window_s)[0]
+    positions = list(sample.positions or layout(sample.voxels.shape[2]))
+    return subject.play(sample.voxels[0, :, None], positions, window_s)[0]
 
 
 def table(root: str, clips: int) -> str:
@@ -67,15 +69,22 @@ def table(root: str, clips: int) -> str:
     for row, scores in values.items():
         cells = [written(metric, [score[metric.name] for score in scores]) for metric in METRICS]
         lines.append(f"| {row} | " + " | ".join(cells) + " |")
-    return "\n".join(
-        [*lines, "", f"{clips} clips; in brackets 95 % of the means of resampled clips."]
-    )
+    lines.append("| *nine views less one, SetNet medium* | " + " | ".join(gains(values)) + " |")
+    note = "in brackets what holds 95 % of the means, or differences, of resampled clips."
+    return "\n".join([*lines, "", f"{clips} clips; {note}"])
 
 
-def written(metric, values: list[float]) -> str:
+def gains(values: dict[str, list[dict[str, float]]]) -> list[str]:
+    """Return by how much nine views of one network differ from one, clip by clip, per metric."""
+    nine, one = (values[f"{count} SetNet medium"] for count in ("nine views,", "one view,"))
+    pairs = list(zip(nine, one, strict=True))
+    return [written(m, [a[m.name] - b[m.name] for a, b in pairs], "+") for m in METRICS]
+
+
+def written(metric: Metric, values: list[float], sign: str = "") -> str:
     """Return the mean and its interval."""
-    low, high = map(metric.written, interval(values))
-    return f"{metric.written(float(np.mean(values)))} ({low} to {high})"
+    form, (low, high) = f"{sign}.{metric.digits}f", interval(values)
+    return f"{np.mean(values):{form}} ({low:{form}} to {high:{form}})"
 
 
 def picture(path: Path, index: int, windows: int) -> None:
