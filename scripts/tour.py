@@ -26,14 +26,16 @@ def colours(grey: np.ndarray) -> np.ndarray:
     return np.repeat(grey[..., None], 3, -1)
 
 
-def save(name: str, panels: dict[str, np.ndarray]) -> None:
-    """Write pictures (h, w, 3) side by side, each under its name, as `name`.png."""
-    whole = row({title: picture[None] for title, picture in panels.items()})[0]
-    eight = (np.clip(whole, 0, 1)[..., ::-1] * 255 + 0.5).astype(np.uint8)
-    packed = [cv2.IMWRITE_PNG_COMPRESSION, 9]
+def save(name: str, panels: dict[str, np.ndarray], scale: int = 2) -> None:
+    """Write pictures (h, w, 3), `scale` times enlarged, side by side, as `name`.png."""
+    large = {
+        title: picture[None].repeat(scale, 1).repeat(scale, 2) for title, picture in panels.items()
+    }
+    eight = (np.clip(row(large)[0, ..., ::-1], 0, 1) * 255 + 0.5).astype(np.uint8)
     path = OUT / f"{name}.png"
     with written(path) as partial:
-        partial.write_bytes(cv2.imencode(".png", eight, packed)[1].tobytes())
+        packed = cv2.imencode(".png", eight, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]
+        partial.write_bytes(packed.tobytes())
     print(f"{path}: {path.stat().st_size // 1000} kB")
 
 
@@ -48,12 +50,12 @@ def stars(pipeline: Pipeline, draw: Draw) -> np.ndarray:
 
 
 def chip(pipeline: Pipeline, draw: Draw, views: torch.Tensor) -> np.ndarray:
-    """Return the events of one window of all views on one sensor, as a kaleidoscope puts them."""
+    """Return the events of four windows of all views on one sensor, as a kaleidoscope puts them."""
     camera = capture.kaleidoscope(
         list(pipeline.optics.positions), model=(SIDE, SIDE), sensor=(400, 400), tile_px=128.0,
         key=draw.key,
     )  # fmt: skip
-    events = capture.record(views[:, -2:], draw.clip.fps, camera, draw.sensor)
+    events = capture.record(views[:, -5:], draw.clip.fps, camera, draw.sensor)
     counts = np.zeros(camera.sensor, np.float32)
     np.add.at(counts, (events["y"], events["x"]), events["p"])
     return event_picture(counts[None])[0]
@@ -76,11 +78,11 @@ def draw_all(index: int) -> None:
     save("1_scene", {"first frame": colours(truth[0]), "last frame": colours(truth[-1])})
     right, down = event_picture(tilt[centre].numpy(), full=reach)
     save("2_tilt", {f"tilt in x, to {reach:.1f} px": right, "tilt in y": down})
-    first, second = map(colours, stars(pipeline, draw))
-    save("3_psfs", {"points through one view": first, "through its neighbour": second})
+    first, second = map(colours, stars(pipeline, draw)[:, :96, :96])
+    save("3_psfs", {"points through one view": first, "through its neighbour": second}, scale=4)
     grid = mosaic([colours(view[-1:].numpy()) for view in views], pipeline.optics)[0]
-    save("4_views", {"what the nine views see": grid[::2, ::2]})
-    save("5_sensor", {"events of 1/120 s on one sensor": chip(pipeline, draw, views)})
+    save("4_views", {"what the nine views see": grid}, scale=1)
+    save("5_sensor", {"events of 1/30 s on one sensor": chip(pipeline, draw, views)}, scale=1)
     events = event_picture(voxels.sum(1).numpy())[centre : centre + 2]
     save(
         "6_events",
@@ -92,7 +94,7 @@ def draw_all(index: int) -> None:
     save("8_one_view", {"one view, reconstructed": colours(one[-1])} | last)
     save("9_nine_views", {"nine views, reconstructed": colours(nine[-1])} | last)
     films = {"the view": seen, "one view": one, "nine views": nine, "ground truth": truth}
-    save("10_slices", {name: colours(film[:, middle].repeat(4, 0)) for name, film in films.items()})
+    save("10_slices", {name: colours(film[:, middle].repeat(3, 0)) for name, film in films.items()})
 
 
 def main() -> None:
