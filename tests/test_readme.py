@@ -90,7 +90,7 @@ def reader(folder, tmp_path, monkeypatch) -> Path:  # noqa: F811
             writer.write(np.round(255 * frame).astype(np.uint8))
         writer.release()
     (tmp_path / "photos").mkdir()
-    for k in range(8):
+    for k in range(12):
         cv2.imwrite(f"photos/{k}.png", np.round(255 * site[k]).astype(np.uint8))
     return tmp_path
 
