@@ -47,7 +47,9 @@ def splat(t, x, y, p, view, place, grid, t0, t1, nearest):
 @njit(nogil=True, cache=True)
 def lay(x, y, p, view, place, density, index, u, v, which, weight):
     """Write what `splat` adds in space, bilinearly: for each part the index of its event, its pixel
-    (u, v), its view and its weight over `density` (views, h, w).  Return (parts, events in no view).
+    (u, v), its view and its weight over `density` (views, h, w).
+
+    Return how many parts there are and how many events in no view.
     """
     _, height, width = density.shape
     outside = parts = 0
