@@ -1,10 +1,13 @@
-"""From runs to shipped weights."""
+"""From runs to shipped weights and figures."""
 
 import torch
 
+from scripts import air_map as air
 from scripts.ship_weights import recard, ship
+from src.figures import air_map
 from src.models import files
 from src.models.unroll import unroll
+from src.records.runs import Run
 from src.train import train
 from tests.test_train import TINY, config
 
@@ -25,3 +28,24 @@ def test_a_trained_run_is_shipped_whole_with_its_card(tmp_path, monkeypatch):
     assert recard("tiny/one", [run, run]) == path and path.read_bytes() == whole
     anew = path.with_suffix(".md").read_text().splitlines()
     assert len(anew) == len(card.splitlines()) + 1 and set(anew) == set(card.splitlines())
+
+
+def test_a_map_of_air_says_where_views_pay(tmp_path):
+    def run(name: str, half: float, spread: float, lpips: list[float]) -> Run:
+        settings = {air.AIR + ".half_length_px": [half, half]}
+        settings[air.AIR + ".spread_px.strong"] = [spread, spread]
+        clips = [{"lpips": str(value)} for value in lpips]
+        record = {"experiment": name, "test": {"lpips": {"mean": sum(lpips) / len(lpips)}}}
+        return Run(tmp_path, record, settings, clips)
+
+    found = [run("single256", 7, 1, [0.5, 0.6]), run("lf3x3", 7, 1, [0.4, 0.5])]
+    found += [run("single256", 40, 1, [0.5, 0.6]), run("lf3x3", 40, 1, [0.6, 0.5])]
+    found += [run(name, 7, 1, [0.4 + 0.1 / n]) for n, name in air.SETNET.items()]
+    cells = air.places(found)
+    margins = air.margin(cells, "lf3x3", "single256", "lpips", 2)
+    assert {place: text for place, (_, text) in margins.items()} == {
+        (7, 1): "-0.10*",
+        (40, 1): "+0.00",
+    }
+    assert air.enough(cells) == {(7, 1): (9.0, "9")}
+    assert air_map.draw(tmp_path / "map.png", {"a": margins, "b": air.enough(cells)}).is_file()

@@ -51,7 +51,7 @@ def weights(tmp_path, monkeypatch):
     """Files of tiny, untrained networks under the names of weights/."""
     monkeypatch.setattr(files, "WEIGHTS", tmp_path / "weights")
     narrow = {"width=4", "~callbacks.progress"}
-    for name in ("lf3x3", "single256", "mambatm", *(f"clean/{n}" for n in CLEAN)):
+    for name in ("lf3x3", "single256", "setnet_medium", "mambatm", *(f"clean/{n}" for n in CLEAN)):
         path = files.WEIGHTS / f"{name}.safetensors"
         path.parent.mkdir(parents=True, exist_ok=True)
         network, spec = build.network(config("train", tmp_path, f"experiment={name}", *narrow))
