@@ -1,0 +1,197 @@
+"""What the meter of task=air finds in air that is known: python -m scripts.known_air [clips, 20] [first, 1000] [again].
+
+Clip k is a photograph of 256 px seen through air that shows an rms of 0.25 to 1.5 px, a half length
+of 5 to 70 px (both log-uniform) and a decay of 0.04 to 0.2 s: 240 frames at 30 a second, as many as
+task=air reads, `ar1` and `flow` in turn, noise of 1 %, 8 bits.  Printed is what was found "of clip",
+over what that very clip was given: its tilt field less every point's mean, as a film shows no more;
+and "of air", over what its atmosphere gives on average; 1 for `held` where the interval holds that.
+`again`: besides, a clip of the same photograph in air drawn from what was measured
+(turbulence=measured) is measured, over what was found first; of `blur_ratio`, its excess of one.
+"""  # noqa: E501
+
+import math
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from omegaconf import OmegaConf
+
+from src.recordings.calibration import air_meter
+from src.recordings.calibration.air_meter import Air
+from src.recordings.files.measured import AirFile, Estimate, MeasuredAir
+from src.sim.turbulence.atmosphere import ALPHA_FPS, Atmosphere
+from src.sim.turbulence.operator import Turbulence
+from src.sim.turbulence.prior import Appearance, matching
+from src.sim.turbulence.ranges import log_between
+
+PHOTOGRAPHS = Path("../shared/data/photos/bsds500_val")
+CONF = Path(__file__).resolve().parents[1] / "conf/turbulence/measured.yaml"
+SIDE, FRAMES, FPS, NOISE = 256, 240, 30.0, 0.01
+RMS, HALF, DECAY, TIMES = (0.25, 1.5), (5.0, 70.0), (0.04, 0.2), ("ar1", "flow")
+KEYS = ("rms_px", "half_length_px", "whole_share", "decay_s", "blur_ratio")
+
+
+def photograph(k: int) -> Float[np.ndarray, "h w"]:
+    """Return photograph k of PHOTOGRAPHS, the middle square, in [0, 1]."""
+    files = sorted(PHOTOGRAPHS.glob("*.jpg"))
+    picture = cv2.imread(str(files[k % len(files)]), cv2.IMREAD_GRAYSCALE)
+    side = min(picture.shape)
+    top, left = ((length - side) // 2 for length in picture.shape)
+    square = picture[top : top + side, left : left + side]
+    return cv2.resize(square, (SIDE, SIDE), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+
+
+def path_of(k: int) -> Atmosphere:
+    """Return the air of clip k: the first of its draws that a camera shows."""
+    generator = torch.Generator().manual_seed(k)
+    while True:
+        u = torch.rand(3, generator=generator).tolist()
+        seen = Appearance(
+            tilt_px=float(log_between(u[0], RMS, "rms")),
+            half_length_px=float(log_between(u[1], HALF, "half length")),
+            decay_s=float(log_between(u[2], DECAY, "decay")),
+        )
+        try:
+            return matching(seen, generator)
+        except ValueError:
+            continue
+
+
+def film(
+    picture: Float[np.ndarray, "h w"], path: Atmosphere, k: int
+) -> tuple[Float[np.ndarray, "frames h w"], Float[np.ndarray, "frames 2 h w"]]:
+    """Return a film of the picture through the air, and its tilt in pixels."""
+    size = {"views": 1, "height": SIDE, "width": SIDE, "fps": FPS}
+    air = Turbulence(path, temporal=TIMES[k % 2], **size)
+    clean = torch.from_numpy(picture).expand(1, FRAMES, -1, -1)
+    seen = air.degrade(clean, torch.Generator().manual_seed(k))[0, 0].numpy()
+    seen += NOISE * np.random.default_rng(k).standard_normal(seen.shape, np.float32)
+    tilt = air.tilt(FRAMES, torch.Generator().manual_seed(k))[0].numpy()
+    return np.round(seen.clip(0, 1) * 255) / 255, tilt
+
+
+def given(tilt: Float[np.ndarray, "frames 2 h w"]) -> tuple[float, float, float]:
+    """Return rms, half length and share of the whole view of a clip's own tilt, less its mean."""
+    tilt = tilt - tilt.mean(0)
+    wide = 2 * SIDE
+    power = sum(np.abs(np.fft.rfft2(frame, s=(wide, wide))) ** 2 for frame in tilt).sum(0)
+    pairs = np.fft.irfft2(np.abs(np.fft.rfft2(np.ones((SIDE, SIDE)), s=(wide, wide))) ** 2)
+    away = np.fft.fftfreq(wide, 1 / wide)
+    ring = np.round(np.hypot(away[:, None], away)).astype(int).ravel()
+    near = ring < SIDE
+    total = np.bincount(ring[near], np.fft.irfft2(power).ravel()[near])
+    product = total / np.bincount(ring[near], pairs.ravel()[near]) / (2 * len(tilt))
+    below = np.append(product[1:] < product[0] / 2, True)
+    last = int(below.argmax())
+    high, low = product[last], product[min(last + 1, SIDE - 1)]
+    half = last + (high - product[0] / 2) / (high - low) if high > low else np.inf
+    whole = float((tilt.mean((2, 3)) ** 2).mean() / product[0])
+    return float(product[0]) ** 0.5, float(half), whole
+
+
+def drawn_again(found: AirFile, k: int) -> Atmosphere:
+    """Return air drawn from what was found."""
+    options = OmegaConf.to_container(OmegaConf.load(CONF))
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "air.yaml"
+        file.write_text(found.text())
+        options |= {"measured": file}
+        options.pop("_target_")
+        return MeasuredAir(**options).draw(torch.Generator().manual_seed(k))
+
+
+def found_in(frames: Float[np.ndarray, "frames h w"]) -> Air | str:
+    """Return what the meter finds, or why it refuses."""
+    try:
+        return air_meter.measure(frames, FPS)
+    except ValueError as error:
+        return str(error)
+
+
+def compared(path: Atmosphere, tilt: np.ndarray, found: AirFile) -> dict[str, float]:
+    """Return what was found over what is known, and whether the intervals hold the air's."""
+    rms, half, whole = given(tilt)
+    length = _number(found.half_length_px)
+    own, reach = path.tilt_std_px(SIDE), path.half_length_px(SIDE)
+    return {
+        "rms of clip": found.rms_px.value / rms,
+        "rms of air": found.rms_px.value / own,
+        "rms held": _holds(found.rms_px, own),
+        "half length of clip": length / half,
+        "half length of air": length / reach,
+        "half length held": _holds(found.half_length_px, reach),
+        "whole view less clip's": found.whole_share.value - whole,
+        "decay of air": _number(found.decay_s) / decay_s(path),
+    }
+
+
+def repeated(found: AirFile, k: int, picture: Float[np.ndarray, "h w"]) -> dict[str, float]:
+    """Return what is found in a clip drawn from what was found, over that."""
+    again = found_in(film(picture, drawn_again(found, k), k)[0])
+    if isinstance(again, str):
+        return {}
+    ratios = {}
+    for key in KEYS:
+        one, two = (_number(getattr(each, key)) for each in (found, again.found))
+        ratios[f"again {key}"] = (two - 1) / (one - 1) if key == "blur_ratio" else two / one
+    return ratios
+
+
+def decay_s(path: Atmosphere) -> float:
+    """Return the time to 1 / e that an air was drawn with."""
+    return -1 / (ALPHA_FPS * math.log(path.alpha))
+
+
+def _number(one: Estimate) -> float:
+    return math.nan if one.value is None else one.value
+
+
+def _holds(one: Estimate, number: float) -> float:
+    return float((one.low or 0) <= number <= (one.high or math.inf))
+
+
+def summary(rows: Sequence[Mapping[str, float]]) -> Iterator[str]:
+    """Yield, of every number, how many are within 20 % of 1 and quantiles; or how many hold."""
+    for name in dict.fromkeys(name for row in rows for name in row):
+        values = np.array([row[name] for row in rows if name in row])
+        values = values[np.isfinite(values)]
+        if name.endswith("held"):
+            yield f"{name} by its interval: {values.sum():.0f} of {len(values)}"
+            continue
+        near = int((np.abs(values - 1) <= 0.2).sum())
+        low, middle, high = np.percentile(values, [10, 50, 90])
+        within = "" if "less" in name else f"within 20 % {near} of {len(values)}, "
+        yield f"{name}: {within}10 / 50 / 90 % {low:.2f} / {middle:.2f} / {high:.2f}"
+
+
+def main(words: Sequence[str]) -> None:
+    """Print a line for every clip, and what they come to."""
+    numbers = [int(word) for word in words if word != "again"]
+    count, first = (*numbers, *(20, 1000)[len(numbers) :])
+    torch.set_num_threads(1)
+    rows = []
+    for k in range(first, first + count):
+        picture, path = photograph(k), path_of(k)
+        seen, tilt = film(picture, path, k)
+        asked = f"{path.tilt_std_px(SIDE):.2f} px, half length {path.half_length_px(SIDE):.0f} px"
+        print(f"{k} {TIMES[k % 2]}, rms {asked}, decay {decay_s(path):.2f} s", end=", ")
+        print(f"D/r0 {path.d_over_r0:.1f}, lambda / D {path.airy_px(SIDE):.1f} px", end=": ")
+        found = found_in(seen)
+        if isinstance(found, str):
+            print(found, flush=True)
+            continue
+        row = compared(path, tilt, found.found)
+        row |= repeated(found.found, k, picture) if "again" in words else {}
+        rows.append(row)
+        shown = ", ".join(f"{name} {value:.2f}" for name, value in row.items())
+        print(f"{len(found.place)} points, {shown}", flush=True)
+    print(*summary(rows), sep="\n")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
