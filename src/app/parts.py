@@ -13,8 +13,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from baselines.upstream import from_config
 from src.models.setnet import SetNet
+from src.models.setnet2 import SetNet2
 
-FACTORIES = (from_config, SetNet.preset)  # what is no class and may be named all the same
+# What is no class and may be named all the same.
+FACTORIES = (from_config, SetNet.preset, SetNet2.preset)
 PACKAGE = r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*"
 ROOMS = (
     "src.", "baselines.", "torch.optim.", "lightning.pytorch.trainer.",

@@ -6,7 +6,7 @@ from collections import deque
 
 import numpy as np
 
-STAGES = ("decode", "cut", "network", "page")
+STAGES = ("decode", "cut", "events", "network", "page")
 
 
 class Meters:

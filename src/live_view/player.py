@@ -12,7 +12,7 @@ JOIN_S = 2.0  # for which a thread is waited for at the end
 
 
 class Player:
-    """Three threads: decoding, cutting and reconstructing.  What waits between two is bounded."""
+    """Four threads: decoding, cutting, events, network.  What waits between two is bounded."""
 
     def __init__(
         self, intake: Intake, reconstruction: Reconstruction, meters: Meters, faults: Faults
@@ -20,7 +20,7 @@ class Player:
         self.intake, self.reconstruction = intake, reconstruction
         self.meters, self.faults = meters, faults
         self.stopped = threading.Event()
-        works = (intake.decode, intake.cut, reconstruction.run)
+        works = (intake.decode, intake.cut, reconstruction.begin, reconstruction.finish)
         self.threads = [
             threading.Thread(target=self._guarded, args=(work,), name=work.__name__, daemon=True)
             for work in works

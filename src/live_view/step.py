@@ -5,7 +5,9 @@ others on voxel grids.
 """
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +20,8 @@ from src.recordings import listed, stream
 from src.recordings.files.formats import EVENT
 from src.recordings.lookup import build
 from src.recordings.views import Views
+
+Finish = Callable[[], Float[np.ndarray, "h w"]]
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,7 @@ class Running:
 class Step:
     """`network` on `views`, window after window, as `src.reconstruct` runs it; warm when made.
 
-    Raises ValueError for what it cannot run with.
+    The first window must be `fresh`.  Raises ValueError for what it cannot run with.
     """
 
     def __init__(self, network: nn.Module, views: Views, how: Running):
@@ -54,18 +58,30 @@ class Step:
             grids=not isinstance(self.network, Runtime),
         )
         self.lookup = build(views)
+        # One that keeps no overlapping windows apart can begin one while another is finished.
+        self.ahead = isinstance(self.network, Runtime) and self.overlap == 1
         self._warm_up()
 
-    def reset(self) -> None:
-        """Forget every window so far."""
-        self.carry = stream.Carry()
-        self.recent: deque[np.ndarray] = deque(maxlen=self.overlap)
-
-    def step(self, window: EventWindow) -> Float[np.ndarray, "h w"]:
-        """Return the picture at the end of `window`, in [0, 1]."""
+    def begin(self, window: EventWindow, *, fresh: bool = False) -> Finish:
+        """Do what the events of `window` ask for; return what gives the picture, in [0, 1], at its
+        end.  That may run in another thread, window after window.  `fresh`: forget all before.
+        """
+        if fresh:
+            self.recent.clear()
         begin = window.end_us - self.overlap * (window.end_us - window.start_us)
-        filled = stream.filled(self._since(begin, window), self.lookup, self.rule, begin,
-                               window.end_us)  # fmt: skip
+        events = self._since(begin, window)
+        filled = stream.filled(events, self.lookup, self.rule, begin, window.end_us)
+        if not self.ahead:
+            return partial(self._stepped, filled, fresh)
+        if fresh:
+            self.network.front.reset()
+        begun = self.network.begin(*filled.parts, 0.0, filled.seconds) if filled.events else None
+        return partial(self._finished, begun, fresh)
+
+    def _stepped(self, filled: stream.Window, fresh: bool) -> Float[np.ndarray, "h w"]:
+        """Run the network on a window."""
+        if fresh:
+            self.carry = stream.Carry()
         more = {"overlap": self.overlap, "carry": self.carry}
         if isinstance(self.network, Runtime):
             frames = listed.frames([filled], self.network, **more)
@@ -73,6 +89,15 @@ class Step:
             places = self.views.positions
             frames = stream.frames([filled], self.network, positions=places, **more)
         return next(frames).picture
+
+    def _finished(self, begun: list[np.ndarray] | None, fresh: bool) -> Float[np.ndarray, "h w"]:
+        """Run the rest of the network on a window that was begun; one without events holds."""
+        if fresh:
+            self.network.behind.reset()
+            self.held = np.full(self.views.model, 0.5, np.float32)
+        if begun is not None:
+            self.held = self.network.finish(begun).clip(0, 1)
+        return self.held
 
     def _since(self, begin_us: float, window: EventWindow) -> np.ndarray:
         """Return the events since `begin_us`; of the windows in between some may be dropped."""
@@ -88,11 +113,9 @@ class Step:
         events = np.zeros(1000, EVENT)
         events["x"], events["y"] = np.linspace(0, width - 1, len(events)), height // 2
         events["p"] = 1
-        self.reset()
+        self.recent: deque[np.ndarray] = deque(maxlen=self.overlap)
         for _ in range(3):
-            self.step(EventWindow(0.0, 1e6 / self.how.fps, events))
-            self.recent.clear()
-        self.reset()
+            self.begin(EventWindow(0.0, 1e6 / self.how.fps, events), fresh=True)()
 
 
 def fastest(network: nn.Module) -> str:

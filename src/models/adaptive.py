@@ -175,8 +175,6 @@ def _reviewed(own: State, before: list[Position], after: list[Position]) -> Stat
 
 def _emptied(own: State, network: SetNet) -> State:
     """Return the state for another size of network: sums of events stay, its own maps start."""
-    mean_sums, sums, awake, hidden4, hidden8 = own
-    channels = network.up4.out_channels
-    sizes = [(part.shape[0], c, *part.shape[2:]) for part, c in
-             ((hidden4, channels), (hidden8, 2 * channels))]  # fmt: skip
-    return (mean_sums, sums, awake, *(hidden4.new_zeros(size) for size in sizes))
+    mean_sums, sums, awake, hidden4, _ = own
+    sizes = network.hidden(*mean_sums.shape[-2:])
+    return (mean_sums, sums, awake, *(hidden4.new_zeros(len(hidden4), *size) for size in sizes))

@@ -66,18 +66,13 @@ class AfterStem(nn.Module):
         dtype: torch.dtype,
     ):
         super().__init__()
-        self.views, self.stride = len(positions), 2
+        self.views, self.stride = len(positions), network.cell
         places = network.places(self.views, network.bins, positions)
         grids, memories, bias = network.kernels(places)
         self.kernel, self.bias = grids.numpy(), bias.numpy()
         self.memories = memories.to(dtype)
         self.skip = network.skip.numpy()
-        height, width = padded
-        channels = network.up4.out_channels
-        self.sizes = [
-            (1, channels, height // 4, width // 4),
-            (1, 2 * channels, height // 8, width // 8),
-        ]
+        self.sizes = [(1, *size) for size in network.hidden(*padded)]
         self.network = network.to(dtype)
         self.dtype = dtype
 
@@ -87,14 +82,14 @@ class AfterStem(nn.Module):
 
     def forward(
         self,
-        grids: Float[Tensor, "1 h2 w2 stem"],
-        sums: Float[Tensor, "1 sums h2 w2"],
+        grids: Float[Tensor, "1 hc wc stem"],
+        sums: Float[Tensor, "1 sums hc wc"],
         passed: Float[Tensor, "1 1 h8 w8"],
-        drawn: Float[Tensor, "1 h2 w2 4"],
+        drawn: Float[Tensor, "1 hc wc pixels"],
         hidden4: Tensor,
         hidden8: Tensor,
-    ) -> tuple[Float[Tensor, "1 h2 w2 4"], Tensor, Tensor]:
-        """Return the frame's blocks of four pixels and the hidden maps, all float32."""
+    ) -> tuple[Float[Tensor, "1 hc wc pixels"], Tensor, Tensor]:
+        """Return the pixels of each cell and the hidden maps, all float32."""
         stem = functional.conv2d(sums.to(self.dtype), self.memories, None, 1, 1)
         stem = stem + grids.permute(0, 3, 1, 2).to(self.dtype)
         x, hidden4, hidden8 = self.network.after_stem(stem, passed, hidden4, hidden8)
@@ -132,15 +127,15 @@ class OnOpenVino:
     def __init__(self, after: nn.Module, inputs: list, state: list[Tensor], threads: int):
         example = [torch.from_numpy(part) for part in inputs] + state
         self.compiled = openvino_cpu.Compiled(after, example, threads)
-        # The front writes into the same arrays each time.
-        self.given = [openvino_cpu.shared(part) for part in inputs]
+        self.given = len(inputs)
         self.reset()
 
     def __call__(self, inputs: list[np.ndarray]) -> np.ndarray:
         """Return what is drawn and keep the state."""
-        self.drawn, *self.state = self.compiled([*self.given, *self.state])
+        given = [openvino_cpu.shared(part) for part in inputs]
+        self.drawn, *self.state = self.compiled([*given, *self.state])
         return self.drawn.data  # which does not keep the tensor alive
 
     def reset(self) -> None:
         """Start from zeros."""
-        self.state = self.compiled.zeros(len(self.given))
+        self.state = self.compiled.zeros(self.given)

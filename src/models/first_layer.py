@@ -7,6 +7,8 @@ from src.models.engines import events_numba as kernels
 from src.models.patches import patches, spans
 from src.models.setnet import AWAKE_S, MEMORIES_S
 
+NOTHING = [np.empty(0, kind) for kind in (np.float64, np.int64, np.int64, np.float32, np.int64)]
+
 
 class HeadFront:
     """The map of a head that sees stacked grids: 45 channels, say, at full resolution."""
@@ -17,20 +19,22 @@ class HeadFront:
         self.table = patches(kernel, after.views, self.stride)
         self.down, self.right = (spans(side, self.stride, size) for side in padded)
         height, width = (side // self.stride for side in padded)
-        self.bias = np.tile(bias, width)
-        self.map = np.zeros((height, width * channels), np.float32)
-        self.shape = (1, height, width, channels)
+        self.bias, self.shape = np.tile(bias, width), (1, height, width, channels)
 
-    def add(self, t, x, y, p, view, t0: float, t1: float) -> None:
-        """Make the map of a window's events."""
-        self.map[:] = self.bias
+    def add(self, t, x, y, p, view, t0: float, t1: float) -> list[np.ndarray]:
+        """Return what comes behind is given after a window's events: the map (1, h, w, c)."""
+        made = np.empty((self.shape[1], self.bias.size), np.float32)
+        made[:] = self.bias
         kernels.add_patches(
-            t, x, y, p, view, t0, t1, self.down, self.right, self.table, self.stride, self.map
+            t, x, y, p, view, t0, t1, self.down, self.right, self.table, self.stride, made
         )
+        return [made.reshape(self.shape)]
 
-    def inputs(self) -> list[np.ndarray]:
-        """Return what comes behind is given: the map (1, h, w, c)."""
-        return [self.map.reshape(self.shape)]
+    def example(self) -> list[np.ndarray]:
+        """Return what `add` gives for no events at the start."""
+        inputs = self.add(*NOTHING, 0.0, 1.0)
+        self.reset()
+        return inputs
 
     def frame(self, drawn: np.ndarray) -> np.ndarray:
         """Return the frame (h, w), padded, of what came out behind."""
@@ -47,42 +51,39 @@ class HeadFront:
 
 
 class StemFront(HeadFront):
-    """The map of SetNet's stem at half resolution, and its leaky sums."""
+    """The map of SetNet's stem, in cells, and its leaky sums."""
 
     def __init__(self, after: AfterStem, padded: tuple[int, int]):
         super().__init__(after, padded)
-        h2, w2 = padded[0] // 2, padded[1] // 2
+        rows, columns = (side // self.stride for side in padded)
         count, eighth = len(MEMORIES_S), (padded[0] // 8, padded[1] // 8)
         self.memories = np.array(MEMORIES_S, np.float32)
         self.skip = after.skip
-        self.coarse = np.zeros((after.views, h2, w2), np.float32)
-        self.awake, self.passed = np.zeros(eighth, np.float32), np.zeros(eighth, np.float32)
-        self.sums = np.zeros(((after.views + 1) * count, h2, w2), np.float32)
-        self.means = np.zeros((count, h2, 4 * w2), np.float32)
-        self.drawn = np.zeros((h2, 4 * w2), np.float32)
+        self.coarse = np.zeros((after.views, rows, columns), np.float32)
+        self.awake = np.zeros(eighth, np.float32)
+        self.sums = np.zeros(((after.views + 1) * count, rows, columns), np.float32)
+        self.means = np.zeros((count, rows, columns * self.stride**2), np.float32)
 
-    def add(self, t, x, y, p, view, t0: float, t1: float) -> None:
-        """Make the map of a window's events and bring the sums to its end."""
-        super().add(t, x, y, p, view, t0, t1)
+    def add(self, t, x, y, p, view, t0: float, t1: float) -> list[np.ndarray]:
+        """Bring the sums to the end of a window; return the map, the sums and their spread, the
+        time passed, what the sums draw.
+        """
+        passed, drawn = np.empty_like(self.awake), np.empty_like(self.means[0])
         kernels.remember(
             t, x, y, p, view, t0, t1, self.memories, np.float32(AWAKE_S), self.coarse,
-            self.awake, self.passed, self.sums, self.means,
+            self.awake, passed, self.sums, self.means,
         )  # fmt: skip
-        kernels.weigh(self.skip, self.means, self.drawn)
-
-    def inputs(self) -> list[np.ndarray]:
-        """Return the map, sums and their spread, the time passed, what the sums draw."""
-        height, width = self.drawn.shape[0], self.drawn.shape[1] // 4
+        kernels.weigh(self.skip, self.means, drawn)
         return [
-            *super().inputs(),
-            self.sums[None],
-            self.passed[None, None],
-            self.drawn.reshape(1, height, width, 4),
+            *super().add(t, x, y, p, view, t0, t1),
+            self.sums[None].copy(),
+            passed[None, None],
+            drawn.reshape(*self.shape[:3], -1),
         ]
 
     def frame(self, drawn: np.ndarray) -> np.ndarray:
-        """Return the frame (h, w), padded, of its blocks of four pixels."""
-        shown = np.empty((2 * drawn.shape[1], 2 * drawn.shape[2]), np.float32)
+        """Return the frame (h, w), padded, of its cells."""
+        shown = np.empty([self.stride * side for side in self.shape[1:3]], np.float32)
         kernels.spread_out(drawn[0], shown)
         return shown
 

@@ -78,7 +78,7 @@ class Runtime:
         after = kind(plain(network).cpu(), positions, padded, dtype)
         front = StemFront if isinstance(network, SetNet) else HeadFront
         self.front = front(after, padded)
-        inputs, state = self.front.inputs(), after.start()
+        inputs, state = self.front.example(), after.start()
         self.behind = (
             OnOpenVino(after, inputs, state, threads)
             if form == "openvino"
@@ -102,9 +102,18 @@ class Runtime:
         Those outside t0 <= t <= t1 have no part in it.  Raises ValueError, and leaves the state,
         for events that are out of order, off the sensor or in no view.
         """
+        return self.finish(self.begin(t, x, y, p, view, t0, t1))
+
+    def begin(self, t, x, y, p, view, t0: float, t1: float) -> list[np.ndarray]:
+        """Do the first half of `step`, the events; another thread may `finish` it while this one
+        begins the next window.
+        """
         events = self._checked(t, x, y, p, view, t0, t1)
-        self.front.add(*self._reflected(*events), float(t0), float(t1))
-        drawn = self.behind(self.front.inputs())
+        return self.front.add(*self._reflected(*events), float(t0), float(t1))
+
+    def finish(self, begun: list[np.ndarray]) -> Float[np.ndarray, "h w"]:
+        """Return the frame of a window that was begun; in the order in which they were."""
+        drawn = self.behind(begun)
         (top, _), (left, _) = self.padding
         height, width = self.size
         return self.front.frame(drawn)[top : top + height, left : left + width]

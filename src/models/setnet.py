@@ -43,6 +43,8 @@ class SetNet(nn.Module):
     """
 
     views = None
+    cell = 2  # pixels: side of what the first layer sees as one
+    sizes = SIZES
 
     def __init__(self, bins: int = 5, stem: int = 12, channels: int = 32):
         super().__init__()
@@ -69,9 +71,9 @@ class SetNet(nn.Module):
     @classmethod
     def preset(cls, size: str, bins: int = 5) -> "SetNet":
         """Return the network of a `size`: small, medium or large; ValueError for another."""
-        if size not in SIZES:
-            raise ValueError(f"model.size must be one of {', '.join(SIZES)}, got {size}")
-        return cls(bins, **SIZES[size])
+        if size not in cls.sizes:
+            raise ValueError(f"model.size must be one of {', '.join(cls.sizes)}, got {size}")
+        return cls(bins, **cls.sizes[size])
 
     def forward(
         self,
@@ -85,8 +87,8 @@ class SetNet(nn.Module):
 
         `window_s`: how long the window lasts, in seconds, a number or one per clip (n,).
         `positions`: (row, col) of each view from the centre view; default: `optics.layout`.
-        State, float32: leaky sums of the mean view and of each view (half resolution), how awake
-        each block of 8 x 8 is, and two maps in [-1, 1].  Raises ValueError for bins, a number of
+        State, float32: leaky sums of the mean view and, in cells, of each view, how awake each
+        block of 8 x 8 is, and two maps in [-1, 1].  Raises ValueError for bins, a number of
         views, a length of window or a state that do not fit.
         """
         n, views, bins, height, width = voxels.shape
@@ -95,31 +97,33 @@ class SetNet(nn.Module):
         padded, (top, left) = pad_to_multiple(voxels.flatten(0, 1), 8)
         voxels = padded.unflatten(0, (n, views))
         events = voxels.float().sum(2)
-        coarse = _halved(events)
+        coarse = _in_cells(events, self.cell)
         mean_sums, sums, awake, hidden4, hidden8 = self._start(state, coarse)
 
-        awake, passed = _time(_stirred(coarse), awake, seconds)
+        awake, passed = _time(_stirred(coarse, self.cell), awake, seconds)
         keep = torch.cat([torch.exp(-passed / memory) for memory in MEMORIES_S], 1)
-        sums = _grown(keep, 4)[:, None] * sums + coarse[:, :, None]
+        sums = _grown(keep, 8 // self.cell)[:, None] * sums + coarse[:, :, None]
         mean_sums = _grown(keep, 8) * mean_sums + events.mean(1, keepdim=True)
         spread = (sums - sums.mean(1, keepdim=True)).abs().mean(1)
 
         grids, memories, bias = self.kernels(places)
-        stem = functional.conv2d(voxels.flatten(1, 2).to(grids.dtype), grids, None, 2, 2)
+        stem = functional.conv2d(
+            voxels.flatten(1, 2).to(grids.dtype), grids, None, self.cell, grids.shape[-1] // 2
+        )
         memory = torch.cat([sums.flatten(1, 2), spread], 1).to(memories.dtype)
         stem = stem + functional.conv2d(memory, memories, bias, 1, 1)
         x, hidden4, hidden8 = self.after_stem(stem, passed, hidden4, hidden8)
-        x = functional.pixel_shuffle(x, 2)
+        x = functional.pixel_shuffle(x, self.cell)
         frame = (x + (self.skip[:, None, None] * mean_sums).sum(1, keepdim=True)).sigmoid()
         state = (mean_sums, sums, awake, hidden4, hidden8)
         return frame[..., top : top + height, left : left + width].float(), state
 
     def after_stem(
         self, stem: Tensor, passed: Tensor, hidden4: Tensor, hidden8: Tensor
-    ) -> tuple[Float[Tensor, "n 4 h2 w2"], Tensor, Tensor]:
-        """Return what is drawn, its four phases as channels, float32, and the new hidden maps.
+    ) -> tuple[Float[Tensor, "n pixels hc wc"], Tensor, Tensor]:
+        """Return what is drawn, the pixels of a cell as channels, float32, and the new hidden maps.
 
-        `stem`: before its ReLU, (n, stem, h2, w2); `passed`: seconds, (n, 1, h8, w8).
+        `stem`: before its ReLU, (n, stem, hc, wc); `passed`: seconds, (n, 1, h8, w8).
         """
         stem, pace = stem.relu(), RATE * passed
         hidden4 = self.cell4(self.down4(stem).relu(), hidden4, _grown(pace, 2))
@@ -158,16 +162,20 @@ class SetNet(nn.Module):
             raise ValueError(f"optics.positions must be {views} (row, col), got {positions}")
         return tuple((int(row), int(column)) for row, column in positions)
 
+    def hidden(self, height: int, width: int) -> list[tuple[int, int, int]]:
+        """Return the sizes (c, h, w) of the hidden maps of a picture."""
+        quarter, eighth = self.up4.out_channels, self.up4.in_channels
+        return [(quarter, height // 4, width // 4), (eighth, height // 8, width // 8)]
+
     def _start(self, state: State | None, coarse: Tensor) -> State:
         """Return `state`, or zeros of the right sizes; ValueError when they are not right."""
-        n, views, h2, w2 = coarse.shape
-        channels, memories = self.up4.out_channels, len(MEMORIES_S)
+        n, views, rows, columns = coarse.shape
+        height, width = self.cell * rows, self.cell * columns
         sizes = [
-            (n, memories, 2 * h2, 2 * w2),
-            (n, views, memories, h2, w2),
-            (n, 1, h2 // 4, w2 // 4),
-            (n, channels, h2 // 2, w2 // 2),
-            (n, 2 * channels, h2 // 4, w2 // 4),
+            (n, len(MEMORIES_S), height, width),
+            (n, views, len(MEMORIES_S), rows, columns),
+            (n, 1, height // 8, width // 8),
+            *((n, *size) for size in self.hidden(height, width)),
         ]
         if state is None:
             return tuple(coarse.new_zeros(size) for size in sizes)
@@ -253,10 +261,15 @@ def _time(stirred: Tensor, awake: Tensor, seconds: Tensor) -> tuple[Tensor, Tens
     return torch.where(stirred, 1.0, awake * left), passed
 
 
-def _stirred(coarse: Float[Tensor, "n views h2 w2"]) -> Bool[Tensor, "n 1 h8 w8"]:
+def _stirred(coarse: Float[Tensor, "n views hc wc"], cell: int) -> Bool[Tensor, "n 1 h8 w8"]:
     """Return which blocks of 8 x 8 pixels have an event in them or within four pixels around."""
     seen = coarse.abs().amax(1, keepdim=True)
-    return functional.max_pool2d(seen, 8, 4, padding=2) > 0
+    return functional.max_pool2d(seen, 16 // cell, 8 // cell, padding=4 // cell) > 0
+
+
+def _in_cells(x: Tensor, cell: int) -> Tensor:
+    """Return the sums of blocks of `cell` x `cell`, a power of two."""
+    return x if cell == 1 else _in_cells(_halved(x), cell // 2)
 
 
 def _halved(x: Tensor) -> Tensor:

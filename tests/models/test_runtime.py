@@ -11,12 +11,14 @@ from src.models.e2vid import E2VID
 from src.models.openvino_cpu import OpenVinoNetwork
 from src.models.runtime import Runtime
 from src.models.setnet import SetNet
+from src.models.setnet2 import SetNet2
 from src.sim.optics import layout
 from src.sim.voxel import voxel_grid
 
 EXACT, ROUNDED = 1e-5, 0.02  # in grey levels: sums in another order, and bf16
 NETWORKS = {
     "setnet": lambda: SetNet(stem=4, channels=8),
+    "setnet2": lambda: SetNet2(quarter=4, eighth=8),
     "e2vid": lambda: E2VID(views=9, base_channels=4, spectral_norm=True),
     "e2vid_gru_3x3": lambda: E2VID(
         views=9, base_channels=4, recurrent="convgru", kernel_size=3, final_activation="none"

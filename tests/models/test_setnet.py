@@ -8,7 +8,8 @@ from src.app import build
 from src.app.parts import make
 from src.models import load, save
 from src.models.cost import macs_per_frame
-from src.models.setnet import SIZES, PacedGRU, SetNet
+from src.models.setnet import PacedGRU, SetNet
+from src.models.setnet2 import SIZES, PacedUnit, SetNet2
 from src.models.unroll import unroll
 from src.sim.optics import layout
 from tests.conftest import ROOT
@@ -17,7 +18,21 @@ from tests.test_train import config
 
 def small() -> SetNet:
     torch.manual_seed(0)
-    return SetNet(bins=3, stem=4, channels=4)
+    return KIND[0]()
+
+
+KIND = [None]  # of the generation that is tested
+
+
+@pytest.fixture(
+    params=[
+        pytest.param(lambda: SetNet(bins=3, stem=4, channels=4), id="first"),
+        pytest.param(lambda: SetNet2(bins=3, quarter=4, eighth=8), id="second"),
+    ],
+    autouse=True,
+)
+def generation(request, monkeypatch):
+    monkeypatch.setitem(globals(), "KIND", [request.param])
 
 
 def voxels(n: int = 1, windows: int = 4, views: int = 9, side: int = 16) -> torch.Tensor:
@@ -25,19 +40,19 @@ def voxels(n: int = 1, windows: int = 4, views: int = 9, side: int = 16) -> torc
     return torch.randn(n, windows, views, 3, side, side, generator=generator)
 
 
-@pytest.mark.parametrize(("size", "giga"), [("small", 0.42), ("medium", 0.82), ("large", 2.96)])
+@pytest.mark.parametrize(("size", "giga"), [("small", 0.36), ("medium", 1.14), ("large", 3.93)])
 def test_cost_and_config_of_each_size(size, giga):
-    network = SetNet.preset(size)
+    network = SetNet2.preset(size)
     assert abs(macs_per_frame(network, 176, 176, views=9) / 1e9 - giga) < 0.02
     node = OmegaConf.load(ROOT / "conf" / "model" / f"setnet_{size}.yaml")
     made = make(OmegaConf.merge(node, {"bins": 5}))
-    assert isinstance(made, SetNet) and made.arguments == {"bins": 5} | SIZES[size]
+    assert isinstance(made, SetNet2) and made.arguments == {"bins": 5} | SIZES[size]
 
 
 @pytest.mark.parametrize("size", SIZES)
 def test_a_preset_is_stored_as_what_it_stands_for(size, tmp_path):
     _, spec = build.network(config("train", tmp_path, f"experiment=setnet_{size}"))
-    target = "src.models.setnet.SetNet"
+    target = "src.models.setnet2.SetNet2"
     assert spec == {"target": target, "kwargs": {"bins": 5} | SIZES[size]}
 
 
@@ -122,11 +137,13 @@ def test_nothing_happens_before_the_first_event():
     assert all(float(part.abs().max()) == 0 for part in state)
 
 
+@pytest.mark.parametrize("kind", [PacedGRU, PacedUnit])
 @torch.no_grad()
-def test_a_window_cut_in_ten_passes_the_same_time():
-    cell = PacedGRU(4).eval()
+def test_a_window_cut_in_ten_passes_the_same_time(kind):
+    cell = kind(4).eval()
     x, state = torch.zeros(1, 4, 8, 8), torch.rand(1, 4, 8, 8)
-    cell.gates.weight.zero_(), cell.candidate.weight.zero_()  # gates do not see the state
+    for part in cell.children():
+        part.weight.zero_()  # gates do not see the state
     whole = cell(x, state, torch.ones(1, 1, 8, 8))
     for _ in range(10):
         state = cell(x, state, torch.full((1, 1, 8, 8), 0.1))
@@ -187,7 +204,8 @@ def test_bf16_and_channels_last_keep_the_state_in_float32():
 
 
 def test_the_file_gives_the_network_back(tmp_path):
-    spec = {"target": "src.models.setnet.SetNet", "kwargs": {"bins": 3, "stem": 4, "channels": 4}}
+    kind, kwargs = type(small()), small().arguments
+    spec = {"target": f"{kind.__module__}.{kind.__name__}", "kwargs": kwargs}
     save(tmp_path / "net.safetensors", small(), spec, {})
     again = load(tmp_path / "net.safetensors")
     assert again.views is None

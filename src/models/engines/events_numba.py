@@ -10,7 +10,6 @@ from numba import njit
 f32 = np.float32
 
 GOOD, BACKWARDS, OFF_SENSOR, NO_VIEW, NO_NUMBER = range(5)  # what `check` finds
-BLOCK = 4  # half-resolution pixels of a block that has a time of its own
 
 
 @njit(nogil=True, cache=True)
@@ -65,29 +64,30 @@ def add_patches(t, x, y, p, view, t0, t1, down, right, table, stride, out):
 def remember(t, x, y, p, view, t0, t1, memories, awake_s, coarse, awake, passed, sums, means):
     """Let the leaky sums of SetNet leak, then add the events with t0 <= t <= t1.
 
-    In place: `awake`, `passed` (h8, w8); `sums` (views * memories + memories, h2, w2), the last of
-    them the spread of the views; `means` (memories, h2, 4 * w2), the mean view's with the four
-    pixels of a block side by side.  `coarse` (views, h2, w2) is zeros before and after; `memories`
-    are the time constants.
+    In place: `awake`, `passed` (h8, w8); `sums` (views * memories + memories, hc, wc), in cells,
+    the last of them the spread of the views; `means` (memories, hc, wc * pixels), the mean view's
+    with the pixels of a cell side by side.  `coarse` (views, hc, wc) is zeros before and after;
+    `memories` are the time constants.
     """
+    side = 8 * awake.shape[0] // coarse.shape[1]  # pixels of a cell
     used = np.empty(t.size, np.bool_)
     for i in range(t.size):
         used[i] = t0 <= t[i] <= t1
         if used[i]:
-            coarse[view[i], y[i] >> 1, x[i] >> 1] += p[i]
+            coarse[view[i], y[i] // side, x[i] // side] += p[i]
     hit = np.zeros((2 * awake.shape[0], 2 * awake.shape[1]), np.bool_)  # 4 x 4 pixels
     for i in range(t.size):
-        if used[i] and coarse[view[i], y[i] >> 1, x[i] >> 1] != 0:
-            hit[y[i] >> 2, x[i] >> 2] = True
+        if used[i] and coarse[view[i], y[i] // side, x[i] // side] != 0:
+            hit[y[i] // 4, x[i] // 4] = True
     _pass_time(hit, f32(t1 - t0), awake_s, awake, passed)
     _leak(passed, memories, sums, means)
     part = f32(1) / f32(coarse.shape[0])
     for i in range(t.size):
         if used[i]:
-            r, c = y[i] >> 1, x[i] >> 1
+            r, c = y[i] // side, x[i] // side
             fell = coarse[view[i], r, c]
             coarse[view[i], r, c] = 0
-            at = 4 * c + 2 * (y[i] & 1) + (x[i] & 1)
+            at = side * (side * c + y[i] % side) + x[i] % side
             for m in range(memories.size):
                 sums[view[i] * memories.size + m, r, c] += fell
                 means[m, r, at] += p[i] * part
@@ -110,20 +110,21 @@ def _pass_time(hit, seconds, awake_s, awake, passed):
 
 @njit(nogil=True, cache=True)
 def _leak(passed, memories, sums, means):
-    views, width = sums.shape[0] // memories.size - 1, sums.shape[2]
-    keep, wide = np.empty(width, f32), np.empty(4 * width, f32)
+    views, height, width = sums.shape[0] // memories.size - 1, sums.shape[1], sums.shape[2]
+    block, wider = width // passed.shape[1], means.shape[2] // passed.shape[1]
+    keep, wide = np.empty(width, f32), np.empty(means.shape[2], f32)
     for m in range(memories.size):
-        for r in range(sums.shape[1]):
+        for r in range(height):
             for j in range(passed.shape[1]):
-                left = np.exp(-passed[r // BLOCK, j] / memories[m])
-                keep[BLOCK * j : BLOCK * (j + 1)] = left
-                wide[4 * BLOCK * j : 4 * BLOCK * (j + 1)] = left
+                left = np.exp(-passed[r // block, j] / memories[m])
+                keep[block * j : block * (j + 1)] = left
+                wide[wider * j : wider * (j + 1)] = left
             for v in range(views):
                 row = sums[v * memories.size + m, r]
                 for c in range(np.uint64(width)):
                     row[c] *= keep[c]
             row = means[m, r]
-            for c in range(np.uint64(4 * width)):
+            for c in range(np.uint64(row.size)):
                 row[c] *= wide[c]
 
 
@@ -148,18 +149,20 @@ def _spread(memories, sums):
 
 
 @njit(nogil=True, cache=True)
-def spread_out(blocks, frame):
-    """Write (h2, w2, 4), the four pixels of each block, into `frame` (2 h2, 2 w2)."""
-    for r in range(blocks.shape[0]):
-        for k in range(2):
-            for c in range(np.uint64(blocks.shape[1])):
-                frame[2 * r + k, 2 * c] = blocks[r, c, 2 * k]
-                frame[2 * r + k, 2 * c + 1] = blocks[r, c, 2 * k + 1]
+def spread_out(cells, frame):
+    """Write (hc, wc, pixels), the pixels of each cell, into `frame` (h, w)."""
+    side = frame.shape[0] // cells.shape[0]
+    for r in range(cells.shape[0]):
+        for k in range(side):
+            row = frame[side * r + k]
+            for c in range(np.uint64(cells.shape[1])):
+                for q in range(side):
+                    row[side * c + q] = cells[r, c, side * k + q]
 
 
 @njit(nogil=True, cache=True)
 def weigh(skip, means, drawn):
-    """Write the sum of `means` (memories, h2, w), each times its `skip`, into `drawn` (h2, w)."""
+    """Write the sum of `means` (memories, h, w), each times its `skip`, into `drawn` (h, w)."""
     for r in range(drawn.shape[0]):
         row = drawn[r]
         row[:] = 0
