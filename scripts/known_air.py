@@ -1,4 +1,4 @@
-"""What the meter of task=air finds in air that is known: python -m scripts.known_air [clips, 20] [first, 1000] [again].
+"""What the meter of task=air finds in air that is known: python -m scripts.known_air [clips, 20] [first, 1000] [again | warps].
 
 Clip k is a photograph of 256 px seen through air that shows an rms of 0.25 to 1.5 px, a half length
 of 5 to 70 px (both log-uniform) and a decay of 0.04 to 0.2 s: 240 frames at 30 a second, as many as
@@ -7,6 +7,8 @@ over what that very clip was given: its tilt field less every point's mean, as a
 and "of air", over what its atmosphere gives on average; 1 for `held` where the interval holds that.
 `again`: besides, a clip of the same photograph in air drawn from what was measured
 (turbulence=measured) is measured, over what was found first; of `blur_ratio`, its excess of one.
+`warps`: a table of Gaussian warps instead, new in each of 24 frames, of two photographs: rms and
+half length found over those given.
 """  # noqa: E501
 
 import math
@@ -33,6 +35,7 @@ PHOTOGRAPHS = Path("../shared/data/photos/bsds500_val")
 CONF = Path(__file__).resolve().parents[1] / "conf/turbulence/measured.yaml"
 SIDE, FRAMES, FPS, NOISE = 256, 240, 30.0, 0.01
 RMS, HALF, DECAY, TIMES = (0.25, 1.5), (5.0, 70.0), (0.04, 0.2), ("ar1", "flow")
+WARPS = (3.3, 6.7, 13.3, 26.6, 53.3), (0.25, 0.75, 1.5)  # half lengths, rms
 KEYS = ("rms_px", "half_length_px", "whole_share", "decay_s", "blur_ratio")
 
 
@@ -70,9 +73,32 @@ def film(
     air = Turbulence(path, temporal=TIMES[k % 2], **size)
     clean = torch.from_numpy(picture).expand(1, FRAMES, -1, -1)
     seen = air.degrade(clean, torch.Generator().manual_seed(k))[0, 0].numpy()
-    seen += NOISE * np.random.default_rng(k).standard_normal(seen.shape, np.float32)
     tilt = air.tilt(FRAMES, torch.Generator().manual_seed(k))[0].numpy()
-    return np.round(seen.clip(0, 1) * 255) / 255, tilt
+    return _recorded(seen, k), tilt
+
+
+def warped(
+    picture: Float[np.ndarray, "h w"], half: float, rms: float, k: int
+) -> tuple[Float[np.ndarray, "frames h w"], Float[np.ndarray, "frames 2 h w"]]:
+    """Return 24 frames of the picture warped by Gaussian fields, and these, in pixels."""
+    rng, sigma = np.random.default_rng(k), half / math.sqrt(4 * math.log(2))
+    rim = math.ceil(4 * sigma)
+    inside = (slice(rim, rim + SIDE),) * 2
+    drawn = rng.standard_normal((24, 2, SIDE + 2 * rim, SIDE + 2 * rim), np.float32)
+    soft = [[cv2.GaussianBlur(axis, (0, 0), sigma)[inside] for axis in pair] for pair in drawn]
+    tilt = np.array(soft) * np.float32(2 * math.sqrt(math.pi) * sigma * rms)
+    y, x = np.mgrid[:SIDE, :SIDE].astype(np.float32)
+    frames = [
+        cv2.remap(picture, x - dx, y - dy, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        for dx, dy in tilt
+    ]
+    return _recorded(np.stack(frames), k), tilt
+
+
+def _recorded(seen: np.ndarray, k: int) -> np.ndarray:
+    """Return what a camera makes of the light: noise, 8 bits."""
+    noisy = seen + NOISE * np.random.default_rng(k).standard_normal(seen.shape, np.float32)
+    return np.round(noisy.clip(0, 1) * 255) / 255
 
 
 def given(tilt: Float[np.ndarray, "frames 2 h w"]) -> tuple[float, float, float]:
@@ -169,11 +195,33 @@ def summary(rows: Sequence[Mapping[str, float]]) -> Iterator[str]:
         yield f"{name}: {within}10 / 50 / 90 % {low:.2f} / {middle:.2f} / {high:.2f}"
 
 
+def table() -> Iterator[str]:
+    """Yield the rows of the table of warps, as Markdown."""
+    for half in WARPS[0]:
+        cells = []
+        for rms in WARPS[1]:
+            rows = []
+            for k in range(2):
+                frames, tilt = warped(photograph(k), half, rms, k)
+                found, known = found_in(frames), given(tilt)
+                if not isinstance(found, str):
+                    length = _number(found.found.half_length_px)
+                    rows.append((found.found.rms_px.value / known[0], length / known[1]))
+            cells.append(
+                ", ".join("-".join(f"{v:.2f}" for v in sorted(v)) for v in zip(*rows, strict=True))
+            )
+        yield f"| {half} | " + " | ".join(cells) + " |"
+
+
 def main(words: Sequence[str]) -> None:
     """Print a line for every clip, and what they come to."""
+    torch.set_num_threads(1)
+    if "warps" in words:
+        for line in table():
+            print(line, flush=True)
+        return
     numbers = [int(word) for word in words if word != "again"]
     count, first = (*numbers, *(20, 1000)[len(numbers) :])
-    torch.set_num_threads(1)
     rows = []
     for k in range(first, first + count):
         picture, path = photograph(k), path_of(k)

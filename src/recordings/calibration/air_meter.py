@@ -84,7 +84,7 @@ def measure(frames: Float[np.ndarray, "frames h w"], fps: float | None = None) -
         for chosen in _resampled(len(frames), 2 * tilt.decay)
     ]
     found = _air_file(tilt, drawn, unit, fps, len(lags.at)) | {
-        "blur_ratio": blur_ratio(tracks, size)
+        "blur_ratio": blur_ratio(*_coarse(frames, tracks))
     }
     a, b = covariance.centred(tracks)
     power = (a * b).sum((0, 2)) / (2 * tracks.seen.sum(0))
@@ -129,13 +129,27 @@ def _wider(sums: Float[np.ndarray, "3"]) -> float:
     return max(math.sqrt(usual / sharpest), 1.0)
 
 
-def shrunk(frame: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "_h _w"]:
-    """Return a frame as large as it is worked on, LARGEST at most."""
+def shrunk(frame: Float[np.ndarray, "h w"], largest: int = LARGEST) -> Float[np.ndarray, "_h _w"]:
+    """Return a frame whose smaller side has `largest` pixels at most: so large it is worked on."""
     least = min(frame.shape)
-    if least <= LARGEST:
+    if least <= largest:
         return frame
-    height, width = (round(side * LARGEST / least) for side in frame.shape)
+    height, width = (round(side * largest / least) for side in frame.shape)
     return cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _coarse(frames: np.ndarray, tracks: Tracks) -> tuple[Tracks, tuple[int, int]]:
+    """Return the points followed in frames of SIDE pixels, and their size.
+
+    How much blur widens an edge depends on the pixels that it is seen with.
+    """
+    size = frames.shape[1:]
+    if min(size) <= SIDE:
+        return tracks, size
+    small = np.stack([shrunk(frame, SIDE) for frame in frames])
+    place = np.round(tracks.place * SIDE / min(size)).astype(np.float32)
+    again = following.follow(small, place)
+    return again.of(again.seen.mean(0) >= LEAST_SEEN), small.shape[1:]
 
 
 def _even(frames: np.ndarray) -> np.ndarray:
