@@ -1,4 +1,4 @@
-"""What the meter of task=air finds in air that is known: python -m scripts.known_air [clips, 20] [first, 1000] [again | warps].
+"""What the meter of task=air finds in air that is known: python -m scripts.known_air [clips, 20] [first, 1000] [again | warps | air.yaml].
 
 Clip k is a photograph of 256 px seen through air that shows an rms of 0.25 to 1.5 px, a half length
 of 5 to 70 px (both log-uniform) and a decay of 0.04 to 0.2 s: 240 frames at 30 a second, as many as
@@ -7,6 +7,7 @@ over what that very clip was given: its tilt field less every point's mean, as a
 and "of air", over what its atmosphere gives on average; 1 for `held` where the interval holds that.
 `again`: besides, a clip of the same photograph in air drawn from what was measured
 (turbulence=measured) is measured, over what was found first; of `blur_ratio`, its excess of one.
+`air.yaml`: photographs in air drawn from that file instead, and what is found.
 `warps`: a table of Gaussian warps instead, new in each of 24 frames, of two photographs: rms and
 half length found over those given.
 """  # noqa: E501
@@ -25,6 +26,7 @@ from omegaconf import OmegaConf
 
 from src.recordings.calibration import air_meter
 from src.recordings.calibration.air_meter import Air
+from src.recordings.calibration.covariance import crossing
 from src.recordings.files.measured import AirFile, Estimate, MeasuredAir
 from src.sim.turbulence.atmosphere import ALPHA_FPS, Atmosphere
 from src.sim.turbulence.operator import Turbulence
@@ -101,8 +103,9 @@ def _recorded(seen: np.ndarray, k: int) -> np.ndarray:
     return np.round(noisy.clip(0, 1) * 255) / 255
 
 
-def given(tilt: Float[np.ndarray, "frames 2 h w"]) -> tuple[float, float, float]:
-    """Return rms, half length and share of the whole view of a clip's own tilt, less its mean."""
+def given(tilt: Float[np.ndarray, "frames 2 h w"]) -> tuple[float, float, float, float]:
+    """Return rms, half length, share of the whole view and decay in seconds of a clip's own tilt,
+    less its mean."""
     tilt = tilt - tilt.mean(0)
     wide = 2 * SIDE
     power = sum(np.abs(np.fft.rfft2(frame, s=(wide, wide))) ** 2 for frame in tilt).sum(0)
@@ -112,23 +115,27 @@ def given(tilt: Float[np.ndarray, "frames 2 h w"]) -> tuple[float, float, float]
     near = ring < SIDE
     total = np.bincount(ring[near], np.fft.irfft2(power).ravel()[near])
     product = total / np.bincount(ring[near], pairs.ravel()[near]) / (2 * len(tilt))
-    below = np.append(product[1:] < product[0] / 2, True)
-    last = int(below.argmax())
-    high, low = product[last], product[min(last + 1, SIDE - 1)]
-    half = last + (high - product[0] / 2) / (high - low) if high > low else np.inf
     whole = float((tilt.mean((2, 3)) ** 2).mean() / product[0])
-    return float(product[0]) ** 0.5, float(half), whole
+    some = tilt[..., ::8, ::8]
+    lags = [(some[lag:] * some[: len(some) - lag]).mean() for lag in range(len(some) // 2)]
+    half = crossing(np.arange(SIDE), product / product[0], 0.5)
+    decay = crossing(np.arange(len(lags)) / FPS, np.array(lags) / lags[0], math.exp(-1))
+    return float(product[0]) ** 0.5, half, whole, decay
+
+
+def drawn(file: Path, k: int) -> Atmosphere:
+    """Return air drawn from a file of task=air."""
+    options = OmegaConf.to_container(OmegaConf.load(CONF)) | {"measured": file}
+    options.pop("_target_")
+    return MeasuredAir(**options).draw(torch.Generator().manual_seed(k))
 
 
 def drawn_again(found: AirFile, k: int) -> Atmosphere:
     """Return air drawn from what was found."""
-    options = OmegaConf.to_container(OmegaConf.load(CONF))
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "air.yaml"
         file.write_text(found.text())
-        options |= {"measured": file}
-        options.pop("_target_")
-        return MeasuredAir(**options).draw(torch.Generator().manual_seed(k))
+        return drawn(file, k)
 
 
 def found_in(frames: Float[np.ndarray, "frames h w"]) -> Air | str:
@@ -141,7 +148,7 @@ def found_in(frames: Float[np.ndarray, "frames h w"]) -> Air | str:
 
 def compared(path: Atmosphere, tilt: np.ndarray, found: AirFile) -> dict[str, float]:
     """Return what was found over what is known, and whether the intervals hold the air's."""
-    rms, half, whole = given(tilt)
+    rms, half, whole, decay = given(tilt)
     length = _number(found.half_length_px)
     own, reach = path.tilt_std_px(SIDE), path.half_length_px(SIDE)
     return {
@@ -152,6 +159,7 @@ def compared(path: Atmosphere, tilt: np.ndarray, found: AirFile) -> dict[str, fl
         "half length of air": length / reach,
         "half length held": _holds(found.half_length_px, reach),
         "whole view less clip's": found.whole_share.value - whole,
+        "decay of clip": _number(found.decay_s) / decay,
         "decay of air": _number(found.decay_s) / decay_s(path),
     }
 
@@ -207,38 +215,50 @@ def table() -> Iterator[str]:
                 if not isinstance(found, str):
                     length = _number(found.found.half_length_px)
                     rows.append((found.found.rms_px.value / known[0], length / known[1]))
-            cells.append(
-                ", ".join("-".join(f"{v:.2f}" for v in sorted(v)) for v in zip(*rows, strict=True))
-            )
+            ranges = ("-".join(f"{v:.2f}" for v in sorted(v)) for v in zip(*rows, strict=True))
+            cells.append(", ".join(ranges) or "refused")
         yield f"| {half} | " + " | ".join(cells) + " |"
 
 
-def main(words: Sequence[str]) -> None:
-    """Print a line for every clip, and what they come to."""
-    torch.set_num_threads(1)
-    if "warps" in words:
-        for line in table():
-            print(line, flush=True)
-        return
-    numbers = [int(word) for word in words if word != "again"]
-    count, first = (*numbers, *(20, 1000)[len(numbers) :])
+def known(numbers: range, again: bool) -> Iterator[str]:
+    """Yield a line for every clip, and what they come to."""
     rows = []
-    for k in range(first, first + count):
+    for k in numbers:
         picture, path = photograph(k), path_of(k)
         seen, tilt = film(picture, path, k)
-        asked = f"{path.tilt_std_px(SIDE):.2f} px, half length {path.half_length_px(SIDE):.0f} px"
-        print(f"{k} {TIMES[k % 2]}, rms {asked}, decay {decay_s(path):.2f} s", end=", ")
-        print(f"D/r0 {path.d_over_r0:.1f}, lambda / D {path.airy_px(SIDE):.1f} px", end=": ")
+        air = f"{path.tilt_std_px(SIDE):.2f} px, half length {path.half_length_px(SIDE):.0f} px"
+        air = f"{k} {TIMES[k % 2]}, rms {air}, decay {decay_s(path):.2f} s"
+        air += f", D/r0 {path.d_over_r0:.1f}, lambda / D {path.airy_px(SIDE):.1f} px: "
         found = found_in(seen)
         if isinstance(found, str):
-            print(found, flush=True)
+            yield air + found
             continue
         row = compared(path, tilt, found.found)
-        row |= repeated(found.found, k, picture) if "again" in words else {}
+        row |= repeated(found.found, k, picture) if again else {}
         rows.append(row)
         shown = ", ".join(f"{name} {value:.2f}" for name, value in row.items())
-        print(f"{len(found.place)} points, {shown}", flush=True)
-    print(*summary(rows), sep="\n")
+        yield f"{air}{len(found.place)} points, {shown}"
+    yield from summary(rows)
+
+
+def like(file: Path, numbers: range) -> Iterator[str]:
+    """Yield what is found in photographs seen through air drawn from a file of task=air."""
+    for k in numbers:
+        found = found_in(film(photograph(k), drawn(file, k), k)[0])
+        shown = {"refused": found} if isinstance(found, str) else vars(found.found)
+        yield f"{k} " + ", ".join(f"{key} {one}" for key, one in shown.items())
+
+
+def main(words: Sequence[str]) -> None:
+    """Print what the command line asks for."""
+    torch.set_num_threads(1)
+    given_numbers = [int(word) for word in words if word.isdecimal()]
+    count, first = (*given_numbers, *(20, 1000)[len(given_numbers) :])
+    numbers = range(first, first + count)
+    files = [Path(word) for word in words if word.endswith(".yaml")]
+    lines = table() if "warps" in words else known(numbers, "again" in words)
+    for line in like(files[0], numbers) if files else lines:
+        print(line, flush=True)
 
 
 if __name__ == "__main__":

@@ -39,9 +39,10 @@ def test_the_given_tilt_is_described_by_rms_half_length_and_share():
     ]
     local = 0.6 * np.array(local) * 2 * np.sqrt(np.pi) * sigma
     shift = 0.8 * rng.standard_normal((16, 2, 1, 1))
-    rms, half, _ = known_air.given(local)
+    rms, half, _, decay = known_air.given(np.repeat(local, 2, axis=0))
     assert rms == pytest.approx(0.6 * np.sqrt(15 / 16), rel=0.06)
     assert half == pytest.approx(1.665 * sigma, rel=0.1)
+    assert decay * known_air.FPS == pytest.approx(1.3, abs=0.2)  # 1, then a half, then nothing
     assert known_air.given(local + shift)[2] == pytest.approx(0.64, abs=0.12)
 
 
