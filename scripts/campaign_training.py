@@ -136,7 +136,7 @@ class Training:
 
     def curve(self) -> list[dict[str, float]]:
         """Return the learning curve so far."""
-        return curve(self.folder) or self._exported()
+        return curve(self.folder) or self._exported().get("curve", [])
 
     def flat(self) -> bool:
         """Return whether the last hours brought too little for more to follow."""
@@ -180,13 +180,12 @@ class Training:
                 return content["seconds"] / 3600, content["global_step"], age
             except Exception:  # it was just removed, or torn: all kinds of errors
                 continue
-        for row in self._exported()[-1:]:
-            return row["hours"], row["steps"], None
-        return 0.0, 0, None
+        card = self._exported()
+        return card.get("hours", 0.0), card.get("steps", 0), None
 
-    def _exported(self) -> list[dict[str, float]]:
-        """Return the learning curve of the exported weights: all that may be left of a training."""
-        return files.card(self.export)["curve"] if self.export.is_file() else []
+    def _exported(self) -> dict:
+        """Return the card of the exported weights: all that may be left of a training."""
+        return files.card(self.export) if self.export.is_file() else {}
 
     def _done(self) -> bool:
         """Return whether a part has its results, or weights, of the hours asked for now."""
@@ -194,7 +193,7 @@ class Training:
             config = OmegaConf.load(results.with_name("config.yaml"))
             if config.hours >= self.hours:
                 return True
-        return any(row["hours"] >= self.hours for row in self._exported()[-1:])
+        return self._exported().get("hours", 0.0) >= self.hours
 
     def _tidy(self) -> None:
         """Keep the checkpoints of the newest part that has some."""

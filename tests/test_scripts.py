@@ -1,14 +1,13 @@
-"""Scripts: weights that are shipped, air that is known."""
+"""From runs to shipped weights and figures."""
 
-import cv2
-import numpy as np
-import pytest
 import torch
 
-from scripts import known_air
+from scripts import air_map as air
 from scripts.ship_weights import recard, ship
+from src.figures import air_map
 from src.models import files
 from src.models.unroll import unroll
+from src.records.runs import Run
 from src.train import train
 from tests.test_train import TINY, config
 
@@ -31,27 +30,22 @@ def test_a_trained_run_is_shipped_whole_with_its_card(tmp_path, monkeypatch):
     assert len(anew) == len(card.splitlines()) + 1 and set(anew) == set(card.splitlines())
 
 
-def test_the_given_tilt_is_described_by_rms_half_length_and_share():
-    rng, sigma = np.random.default_rng(0), 12.0
-    local = [
-        [cv2.GaussianBlur(axis, (0, 0), sigma)[64:320, 64:320] for axis in frame]
-        for frame in rng.standard_normal((16, 2, 384, 384))
-    ]
-    local = 0.6 * np.array(local) * 2 * np.sqrt(np.pi) * sigma
-    shift = 0.8 * rng.standard_normal((16, 2, 1, 1))
-    rms, half, _, decay = known_air.given(np.repeat(local, 2, axis=0))
-    assert rms == pytest.approx(0.6 * np.sqrt(15 / 16), rel=0.06)
-    assert half == pytest.approx(1.665 * sigma, rel=0.1)
-    assert decay * known_air.FPS == pytest.approx(1.3, abs=0.2)  # 1, then a half, then nothing
-    assert known_air.given(local + shift)[2] == pytest.approx(0.64, abs=0.12)
+def test_a_map_of_air_says_where_views_pay(tmp_path):
+    def run(name: str, half: float, spread: float, lpips: list[float]) -> Run:
+        settings = {air.AIR + ".half_length_px": [half, half]}
+        settings[air.AIR + ".spread_px.strong"] = [spread, spread]
+        clips = [{"lpips": str(value)} for value in lpips]
+        record = {"experiment": name, "test": {"lpips": {"mean": sum(lpips) / len(lpips)}}}
+        return Run(tmp_path, record, settings, clips)
 
-
-@pytest.mark.slow
-@pytest.mark.parametrize("k", [100, 109])
-def test_simulated_air_is_measured_within_a_fifth(k, shared_data):
-    path = known_air.path_of(k)
-    seen, tilt = known_air.film(known_air.photograph(k), path, k)
-    found = known_air.compared(path, tilt, known_air.air_meter.measure(seen, known_air.FPS).found)
-    for name in ("rms of clip", "half length of clip", "rms of air", "half length of air"):
-        assert found[name] == pytest.approx(1, abs=0.2), name
-    assert found["rms held"] and found["half length held"]
+    found = [run("single256", 7, 1, [0.5, 0.6]), run("lf3x3", 7, 1, [0.4, 0.5])]
+    found += [run("single256", 40, 1, [0.5, 0.6]), run("lf3x3", 40, 1, [0.6, 0.5])]
+    found += [run(name, 7, 1, [0.4 + 0.1 / n]) for n, name in air.SETNET.items()]
+    cells = air.places(found)
+    margins = air.margin(cells, "lf3x3", "single256", "lpips", 2)
+    assert {place: text for place, (_, text) in margins.items()} == {
+        (7, 1): "-0.10*",
+        (40, 1): "+0.00",
+    }
+    assert air.enough(cells) == {(7, 1): (9.0, "9")}
+    assert air_map.draw(tmp_path / "map.png", {"a": margins, "b": air.enough(cells)}).is_file()

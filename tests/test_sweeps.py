@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from src.app import build, door
 from src.eval import evaluate
 from src.models import files
+from src.reconstruct import reconstruct
 from src.records import results
 from src.train import train
 from tests.conftest import ROOT
@@ -50,7 +51,7 @@ def weights(tmp_path, monkeypatch):
     """Files of tiny, untrained networks under the names of weights/."""
     monkeypatch.setattr(files, "WEIGHTS", tmp_path / "weights")
     narrow = {"width=4", "~callbacks.progress"}
-    for name in ("lf3x3", "single256", "mambatm", *(f"clean/{n}" for n in CLEAN)):
+    for name in ("lf3x3", "single256", "setnet_medium", "mambatm", *(f"clean/{n}" for n in CLEAN)):
         path = files.WEIGHTS / f"{name}.safetensors"
         path.parent.mkdir(parents=True, exist_ok=True)
         network, spec = build.network(config("train", tmp_path, f"experiment={name}", *narrow))
@@ -67,11 +68,15 @@ def test_every_job_composes_and_two_run(path, tmp_path, weights):
     assert len(found) == len({tuple(job) for job in found}) >= 3
     for override in {override for job in found for override in job}:
         composed(path, tmp_path, override)
-    tiny, work = {"train": ([*TINY, "logger=none"], train), "eval": (SMALL, evaluate)}[door]
+    tiny, work = {
+        "train": ([*TINY, "logger=none"], train),
+        "eval": (SMALL, evaluate),
+        "reconstruct": (["ckpt=lf3x3", "end=0.02"], reconstruct),
+    }[door]
     for place in (0, -1):
         run = tmp_path / str(place)
         work(composed(path, run, *found[place], *tiny))
-        assert (run / "results.json").is_file()
+        assert (run / ("video.h5" if work is reconstruct else "results.json")).is_file()
 
 
 SCORED = ["-m", "baseline=highpass", "debug=fdr", "metrics.lpips=null"]

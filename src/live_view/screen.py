@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from src.live_view.engines.mark import mark
+from src.recordings.engines.splat import mark
 from src.recordings.lookup import Lookup
 from src.recordings.views import Size
 
@@ -95,7 +95,7 @@ class EventPicture:
         if self.watched:
             fields = (events[name] for name in "xyp")
             with self.lock:
-                mark(*fields, self.lookup.view, self.lookup.place, self.counts)
+                mark(*fields, self.lookup.nearest, self.counts)
                 self.windows += 1
 
     def take(self) -> Int[np.ndarray, "views h w"]:

@@ -59,7 +59,6 @@ class StemFront(HeadFront):
         count, eighth = len(MEMORIES_S), (padded[0] // 8, padded[1] // 8)
         self.memories = np.array(MEMORIES_S, np.float32)
         self.skip = after.skip
-        self.coarse = np.zeros((after.views, rows, columns), np.float32)
         self.awake = np.zeros(eighth, np.float32)
         self.sums = np.zeros(((after.views + 1) * count, rows, columns), np.float32)
         self.means = np.zeros((count, rows, columns * self.stride**2), np.float32)
@@ -70,7 +69,7 @@ class StemFront(HeadFront):
         """
         passed, drawn = np.empty_like(self.awake), np.empty_like(self.means[0])
         kernels.remember(
-            t, x, y, p, view, t0, t1, self.memories, np.float32(AWAKE_S), self.coarse,
+            t, x, y, p, view, t0, t1, self.memories, np.float32(AWAKE_S),
             self.awake, passed, self.sums, self.means,
         )  # fmt: skip
         kernels.weigh(self.skip, self.means, drawn)

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from src.recordings.engines.splat import lay, splat
+from src.recordings.engines.splat import lay, lay_nearest, splat
 from src.recordings.views import Size, Views
 
 THINNEST = 0.1  # of `density`: where fewer sensor pixels than this look, events are not scaled up
@@ -60,11 +60,21 @@ class Lookup:
         count = (1 if nearest else 4) * len(events)
         kinds = (np.int64, np.int64, np.int64, np.int64, np.float32)
         index, u, v, which, weight = (np.empty(count, kind) for kind in kinds)
-        fields = (events[name] for name in "xyp")
-        found, outside = lay(
-            *fields, self.view, self.place, density[:, 0], nearest, index, u, v, which, weight
+        fields, made = [events[name] for name in "xyp"], (index, u, v, which, weight)
+        found, outside = (
+            lay_nearest(*fields, self.nearest, density[:, 0], *made)
+            if nearest
+            else lay(*fields, self.view, self.place, density[:, 0], *made)
         )
         return tuple(part[:found] for part in (index, u, v, weight, which)), outside
+
+    @cached_property
+    def nearest(self) -> Int[np.ndarray, "h w"]:
+        """For each sensor pixel its nearest model pixel, counted through all views; -1: none."""
+        limit = np.array(self.model[::-1]) - 1
+        column, row = np.clip((self.place + 0.5).astype(np.int32), 0, limit).transpose(2, 0, 1)
+        pixel = (self.view.astype(np.int32) * self.model[0] + row) * self.model[1] + column
+        return np.where(self.view >= 0, pixel, -1).astype(np.int32)
 
     @cached_property
     def densities(self) -> dict[str, Float[np.ndarray, "views 1 h w"]]:

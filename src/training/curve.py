@@ -1,7 +1,5 @@
 """The learning curve: scores of fixed validation clips, a line for every hour or so of training."""
 
-import csv
-import io
 from copy import deepcopy
 from pathlib import Path
 
@@ -10,7 +8,7 @@ from lightning import Callback, LightningModule, Trainer
 
 from src.metrics.table import NAMES
 from src.models import files
-from src.records.results import write_text
+from src.records.results import csv_text, write_text
 
 
 class Curve(Callback):
@@ -19,7 +17,8 @@ class Curve(Callback):
 
     A line: hours, steps, windows trained on, mean training loss since the line before, scores.  The
     lines are part of checkpoints, so that the file of a run that goes on begins at the beginning.
-    `export`: also write the weights that were scored to this file (.safetensors, float16).
+    `export`: also write the weights to this file (.safetensors, float16), at each line and when the
+    training is cut short.
     """
 
     def __init__(self, path: str, every_h: float | None = None, export: str | None = None):
@@ -62,30 +61,42 @@ class Curve(Callback):
         if full or trainer.should_stop or trainer.global_step == trainer.max_steps:
             self._add(trainer, module)
 
+    def on_exception(self, trainer: Trainer, module: LightningModule, exception) -> None:
+        """Export what a training that is cut short has learned."""
+        if self.rows and trainer.is_global_zero:
+            self._store(module)
+
+    @property
+    def all_steps(self) -> int:
+        """Steps since the start, also of a training before this that it goes on from."""
+        return self.steps + (self.rows[-1]["steps"] if self.rows else 0)
+
     def _add(self, trainer: Trainer, module: LightningModule) -> None:
         row = {
             "hours": module.clock.hours,
-            "steps": self.steps + (self.rows[-1]["steps"] if self.rows else 0),
+            "steps": self.all_steps,
             "windows": module.windows_seen,
             "loss": self.loss / self.steps if self.steps else "",
         }
         self.rows.append(row | scores(trainer, module))
         self.loss, self.steps = 0.0, 0
         self._write()
-        if self.export is not None:
-            self.export.parent.mkdir(parents=True, exist_ok=True)
-            # A copy: spectral norm is folded in eval mode, and the training goes on in its own.
-            method, card = deepcopy(module.method), {"curve": self.rows}
-            files.save(self.export, method, module.network_spec, card)
+        self._store(module)
         module.clock.start()
 
+    def _store(self, module: LightningModule) -> None:
+        """Export the weights with all that a training needs to go on from them (handover.py)."""
+        if self.export is None:
+            return
+        reached = {"hours": module.clock.hours, "windows": module.windows_seen}
+        card = reached | {"steps": self.all_steps, "loss": self.loss, "curve": self.rows}
+        # A copy: spectral norm is folded in eval mode, and the training goes on in its own.
+        files.save(self.export, deepcopy(module.method), module.network_spec, card)
+
     def _write(self) -> None:
-        text = io.StringIO()
-        writer = csv.DictWriter(text, list(self.rows[-1]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(self.rows)
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        write_text(self.path, text.getvalue())
+        heads = list(self.rows[-1])
+        rows = [[row.get(name, "") for name in heads] for row in self.rows]
+        write_text(self.path, csv_text(heads, rows))
 
 
 @torch.no_grad()

@@ -14,12 +14,13 @@ def take(module: Reconstructor, callbacks: Iterable, path: Path) -> None:
 
     Raises ValueError for weights that were written otherwise.
     """
-    rows = files.card(path).get("curve")
-    if not rows:
+    card = files.card(path)
+    if "curve" not in card:
         raise ValueError(f"ckpt must be a checkpoint or what `export` wrote to go on, got {path}")
     files.restore(module.network, path)
     if module.average is not None:
         module.average.load_state_dict(module.network.state_dict())
-    module.clock.seconds, module.windows_seen = 3600 * rows[-1]["hours"], rows[-1]["windows"]
+    module.clock.seconds, module.windows_seen = 3600 * card["hours"], card["windows"]
     for curve in (found for found in callbacks if isinstance(found, Curve)):
-        curve.rows = rows
+        curve.rows, curve.loss = card["curve"], card["loss"]
+        curve.steps = card["steps"] - curve.rows[-1]["steps"]

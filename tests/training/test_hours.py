@@ -12,6 +12,7 @@ from src.models import files
 from src.train import train
 from src.training import clock
 from src.training.average import copy_of, follow
+from src.training.reconstructor import Reconstructor
 from src.training.schedule import Hours
 from tests.test_train import TINY, config
 
@@ -95,9 +96,25 @@ def test_exported_weights_go_on_where_no_checkpoint_is_left(tmp_path):
     assert second["seconds"] == 6 * HOUR and second["global_step"] == 3
     assert second["windows"] == 2 * first["windows"]
     rows = curve(tmp_path / "second")
+    assert files.card(now)["steps"] == 3 and len(files.card(now)["curve"]) == len(before)
     assert [row[:3] for row in rows] == [row[:3] for row in before] + [[6, 6, 12]]
     assert rows[: len(before)] == before
     assert rate(second) == pytest.approx(1e-3 * Hours(6.0).share(5.0) * 3 / 5)
+
+
+def test_a_training_that_is_cut_short_exports_what_it_has_reached(tmp_path, monkeypatch):
+    now, step = tmp_path / "now.safetensors", Reconstructor.training_step
+
+    def interrupted(self, sample, batch_idx):
+        if self.global_step == 2:
+            raise OSError("the disk is full")
+        return step(self, sample, batch_idx)
+
+    monkeypatch.setattr(Reconstructor, "training_step", interrupted)
+    with pytest.raises(OSError, match="the disk is full"):
+        run(tmp_path / "first", "hours=9", f"export={now}")
+    card = files.card(now)
+    assert (card["hours"], card["steps"], len(card["curve"])) == (2, 2, 1)
 
 
 def test_restored_weights_are_those_that_were_exported(tmp_path):

@@ -61,37 +61,38 @@ def add_patches(t, x, y, p, view, t0, t1, down, right, table, stride, out):
 
 
 @njit(nogil=True, cache=True)
-def remember(t, x, y, p, view, t0, t1, memories, awake_s, coarse, awake, passed, sums, means):
-    """Let the leaky sums of SetNet leak, then add the events with t0 <= t <= t1.
+def remember(t, x, y, p, view, t0, t1, memories, awake_s, awake, passed, sums, means):
+    """Let the leaky sums of SetNet leak, and add the events with t0 <= t <= t1.
 
     In place: `awake`, `passed` (h8, w8); `sums` (views * memories + memories, hc, wc), in cells,
     the last of them the spread of the views; `means` (memories, hc, wc * pixels), the mean view's
-    with the pixels of a cell side by side.  `coarse` (views, hc, wc) is zeros before and after;
-    `memories` are the time constants.
+    with the pixels of a cell side by side.  `memories` are the time constants.
     """
-    side = 8 * awake.shape[0] // coarse.shape[1]  # pixels of a cell
-    used = np.empty(t.size, np.bool_)
+    views = sums.shape[0] // memories.size - 1
+    side = 8 * awake.shape[0] // sums.shape[1]  # pixels of a cell
+    coarse, fine = np.zeros((views, *sums.shape[1:]), f32), np.zeros(means.shape[1:], f32)
+    part = f32(1) / f32(views)
     for i in range(t.size):
-        used[i] = t0 <= t[i] <= t1
-        if used[i]:
-            coarse[view[i], y[i] // side, x[i] // side] += p[i]
-    hit = np.zeros((2 * awake.shape[0], 2 * awake.shape[1]), np.bool_)  # 4 x 4 pixels
-    for i in range(t.size):
-        if used[i] and coarse[view[i], y[i] // side, x[i] // side] != 0:
-            hit[y[i] // 4, x[i] // 4] = True
-    _pass_time(hit, f32(t1 - t0), awake_s, awake, passed)
-    _leak(passed, memories, sums, means)
-    part = f32(1) / f32(coarse.shape[0])
-    for i in range(t.size):
-        if used[i]:
+        if t0 <= t[i] <= t1:
             r, c = y[i] // side, x[i] // side
-            fell = coarse[view[i], r, c]
-            coarse[view[i], r, c] = 0
-            at = side * (side * c + y[i] % side) + x[i] % side
-            for m in range(memories.size):
-                sums[view[i] * memories.size + m, r, c] += fell
-                means[m, r, at] += p[i] * part
+            coarse[view[i], r, c] += p[i]
+            fine[r, side * (side * c + y[i] % side) + x[i] % side] += p[i] * part
+    _pass_time(_stirred(coarse, side), f32(t1 - t0), awake_s, awake, passed)
+    _leak(passed, memories, coarse, fine, sums, means)
     _spread(memories.size, sums)
+
+
+@njit(nogil=True, cache=True)
+def _stirred(coarse, side):
+    """Return which blocks of 4 x 4 pixels have an event in them."""
+    views, height, width = coarse.shape
+    hit = np.zeros((height * side // 4, width * side // 4), np.bool_)
+    for v in range(views):
+        for r in range(height):
+            for c in range(width):
+                if coarse[v, r, c] != 0:
+                    hit[r * side // 4, c * side // 4] = True
+    return hit
 
 
 @njit(nogil=True, cache=True)
@@ -109,8 +110,8 @@ def _pass_time(hit, seconds, awake_s, awake, passed):
 
 
 @njit(nogil=True, cache=True)
-def _leak(passed, memories, sums, means):
-    views, height, width = sums.shape[0] // memories.size - 1, sums.shape[1], sums.shape[2]
+def _leak(passed, memories, coarse, fine, sums, means):
+    views, height, width = coarse.shape
     block, wider = width // passed.shape[1], means.shape[2] // passed.shape[1]
     keep, wide = np.empty(width, f32), np.empty(means.shape[2], f32)
     for m in range(memories.size):
@@ -120,12 +121,12 @@ def _leak(passed, memories, sums, means):
                 keep[block * j : block * (j + 1)] = left
                 wide[wider * j : wider * (j + 1)] = left
             for v in range(views):
-                row = sums[v * memories.size + m, r]
+                row, new = sums[v * memories.size + m, r], coarse[v, r]
                 for c in range(np.uint64(width)):
-                    row[c] *= keep[c]
-            row = means[m, r]
+                    row[c] = row[c] * keep[c] + new[c]
+            row, new = means[m, r], fine[r]
             for c in range(np.uint64(row.size)):
-                row[c] *= wide[c]
+                row[c] = row[c] * wide[c] + new[c]
 
 
 @njit(nogil=True, cache=True)

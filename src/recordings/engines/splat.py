@@ -45,9 +45,11 @@ def splat(t, x, y, p, view, place, grid, t0, t1, nearest):
 
 
 @njit(nogil=True, cache=True)
-def lay(x, y, p, view, place, density, nearest, index, u, v, which, weight):
-    """Write what `splat` adds in space: for each part the index of its event, its pixel (u, v), its
-    view and its weight over `density` (views, h, w).  Return (parts, events in no view).
+def lay(x, y, p, view, place, density, index, u, v, which, weight):
+    """Write what `splat` adds in space, bilinearly: for each part the index of its event, its pixel
+    (u, v), its view and its weight over `density` (views, h, w).
+
+    Return how many parts there are and how many events in no view.
     """
     _, height, width = density.shape
     outside = parts = 0
@@ -58,8 +60,6 @@ def lay(x, y, p, view, place, density, nearest, index, u, v, which, weight):
             continue
         right = min(max(place[y[i], x[i], 0], 0.0), width - 1.0)
         down = min(max(place[y[i], x[i], 1], 0.0), height - 1.0)
-        if nearest:
-            right, down = float(int(right + 0.5)), float(int(down + 0.5))
         c, r = int(right), int(down)
         right, down = right - c, down - r
         for a in range(2):
@@ -70,3 +70,33 @@ def lay(x, y, p, view, place, density, nearest, index, u, v, which, weight):
                     weight[parts] = p[i] * part / density[k, r + a, c + b]
                     parts += 1
     return parts, outside
+
+
+@njit(nogil=True, cache=True)
+def lay_nearest(x, y, p, nearest, density, index, u, v, which, weight):
+    """As `lay`, at the nearest pixel: `nearest` (sensor h, sensor w) counts pixels through all
+    views, -1 for none.
+    """
+    _, height, width = density.shape
+    flat = density.reshape(-1)
+    outside = parts = 0
+    for i in range(x.size):
+        pixel = nearest[y[i], x[i]]
+        if pixel < 0:
+            outside += 1
+            continue
+        row = pixel // width
+        index[parts], u[parts], v[parts] = i, pixel - row * width, row % height
+        which[parts], weight[parts] = row // height, p[i] / flat[pixel]
+        parts += 1
+    return parts, outside
+
+
+@njit(nogil=True, cache=True)
+def mark(x, y, p, nearest, counts):
+    """Add the polarity of every event to `counts` (views, h, w); `nearest` as of `lay_nearest`."""
+    flat = counts.reshape(-1)
+    for i in range(x.size):
+        pixel = nearest[y[i], x[i]]
+        if pixel >= 0:
+            flat[pixel] += p[i]
