@@ -5,7 +5,6 @@ z to shrink(z + P(x - D z) + pull), the pull being towards the code of the windo
 codes agree.  A recurrent decoder turns the code into a frame.  All 3x3 with reflected borders.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -13,12 +12,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from baselines.single_view import centre_view, declare, finish
-from src.models.layers import ConvLSTM, pad_to_multiple
-from src.sim.optics import Position
+from baselines.single_view import SingleView
+from src.models.layers import ConvLSTM
 
 
-class CISTA(nn.Module):
+class CISTA(SingleView):
     """The centre view's voxel grids to frames; 1,260,867 parameters.
 
     `channels`: of each of the two stems (published: 32); the code has four times as many.
@@ -26,7 +24,7 @@ class CISTA(nn.Module):
     normalise nonzero, output sigmoid.
     """
 
-    views = None
+    multiple = 2
 
     def __init__(
         self,
@@ -36,9 +34,7 @@ class CISTA(nn.Module):
         normalise: str = "nonzero",
         output: str = "sigmoid",
     ):
-        super().__init__()
-        declare(normalise, output)
-        self.bins, self.normalise, self.output = bins, normalise, output
+        super().__init__(bins, normalise, output)
         both, code = 2 * channels, 4 * channels
         self.events, self.previous = _conv(bins, channels), _conv(1, channels)
         self.mix = _conv(both, both, stride=2)
@@ -51,30 +47,15 @@ class CISTA(nn.Module):
         self.up = _conv(both, both)
         self.pred = _conv(both, 1)
 
-    def forward(
-        self,
-        voxels: Float[Tensor, "n views bins h w"],
-        state: Any = None,
-        *,
-        positions: Sequence[Position] | None = None,
-    ) -> tuple[Float[Tensor, "n 1 h w"], Any]:
+    def reconstruct(self, seen: Tensor, state: Any) -> tuple[Tensor, Any]:
         """Return the frame and (code, state of the decoder, frame before cropping)."""
-        height, width = voxels.shape[-2:]
-        view, (top, left) = pad_to_multiple(self.see(voxels, positions), 2)
-        before, memory, frame = state or (None, None, torch.zeros_like(view[:, :1]))
-        x = self.mix(torch.cat([self.events(view), self.previous(frame)], 1))
+        before, memory, shown = state or (None, None, torch.zeros_like(seen[:, :1]))
+        x = self.mix(torch.cat([self.events(seen), self.previous(shown)], 1))
         z = self._unfold(x, before)
         hidden, memory = self.cell(self.decoder(z).relu(), memory)
         grown = functional.interpolate(hidden, scale_factor=2, mode="bilinear")
-        frame = finish(self.pred(self.up(grown)), self.output, self.training)
-        shown = frame[..., top : top + height, left : left + width]
-        return shown, (z, memory, frame.detach())
-
-    def see(
-        self, voxels: Float[Tensor, "n views bins h w"], positions: Sequence[Position] | None
-    ) -> Float[Tensor, "n c h w"]:
-        """Return what the stem of events is given: the centre view."""
-        return centre_view(voxels, self.bins, self.normalise, positions)
+        frame = self.pred(self.up(grown))
+        return frame, (z, memory, self.finish(frame).detach())
 
     def _unfold(self, x: Tensor, before: Tensor | None) -> Tensor:
         z = self.code(x)

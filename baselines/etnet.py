@@ -5,7 +5,6 @@ to the coarser one; the mean of all of them replaces the residual blocks.  Atten
 that its maps are never stored.
 """
 
-from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -14,21 +13,19 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from baselines.single_view import centre_view, declare, finish
+from baselines.single_view import SingleView
 from src.models.e2vid import E2VID, SCALES
-from src.models.layers import pad_to_multiple
-from src.sim.optics import Position
 
 HEADS, DROPOUT = 8, 0.1
 
 
-class ETNet(nn.Module):
+class ETNet(SingleView):
     """The centre view's voxel grids to frames; 22,175,361 parameters.
 
     As published: normalise none, output sigmoid.
     """
 
-    views = None
+    multiple = 2**SCALES
 
     def __init__(
         self,
@@ -37,28 +34,15 @@ class ETNet(nn.Module):
         normalise: str = "none",
         output: str = "sigmoid",
     ):
-        super().__init__()
-        declare(normalise, output)
-        self.bins, self.normalise, self.output = bins, normalise, output
+        super().__init__(bins, normalise, output)
         self.net = E2VID(1, bins, base_channels, final_activation="none")
         self.net.resblocks = nn.ModuleList()
         self.pyramid = Pyramid([base_channels * 2**scale for scale in range(SCALES, 0, -1)])
 
-    def forward(
-        self,
-        voxels: Float[Tensor, "n views bins h w"],
-        state: Any = None,
-        *,
-        positions: Sequence[Position] | None = None,
-    ) -> tuple[Float[Tensor, "n 1 h w"], Any]:
+    def reconstruct(self, seen: Tensor, state: Any) -> tuple[Tensor, Any]:
         """Return the frame and the state of E2VID."""
-        height, width = voxels.shape[-2:]
-        view = centre_view(voxels, self.bins, self.normalise, positions)
-        view, (top, left) = pad_to_multiple(view, 2**SCALES)
-        head, skips, after = self.net.encode(view, state)
-        frame = self.net.decode(self.pyramid(skips[::-1]), head, skips)
-        cropped = frame[..., top : top + height, left : left + width]
-        return finish(cropped, self.output, self.training), after
+        head, skips, after = self.net.encode(seen, state)
+        return self.net.decode(self.pyramid(skips[::-1]), head, skips), after
 
 
 class Pyramid(nn.Module):

@@ -5,7 +5,6 @@ A small network sees the events and the previous frame and mixes, at each pixel,
 """
 
 import math
-from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -16,52 +15,38 @@ from scipy.special import jn_zeros, jv
 from torch import Tensor, nn
 from torch.nn import functional
 
-from baselines.single_view import centre_view, declare, finish
+from baselines.single_view import SingleView
 from src.models.e2vid import E2VID, SCALES
-from src.models.layers import pad_to_multiple
-from src.sim.optics import Position
 
 ATOMS, FUNCTIONS = 6, 6  # functions of each of the two reaches
 
 
-class HyperE2VID(nn.Module):
+class HyperE2VID(SingleView):
     """The centre view's voxel grids to frames; 10,149,881 parameters and 574 numbers in buffers.
 
     As published: normalise none, output clip.
     """
 
-    views = None
+    multiple = 2**SCALES
 
     def __init__(
         self, bins: int = 5, base_channels: int = 32, normalise: str = "none", output: str = "clip"
     ):
-        super().__init__()
-        declare(normalise, output)
-        self.bins, self.normalise, self.output = bins, normalise, output
+        super().__init__(bins, normalise, output)
         self.net = E2VID(1, bins, base_channels, final_activation="none")
         self.net.decoders = self.net.decoders[1:]
         self.dynamic = DynamicDecoder(8 * base_channels, 4 * base_channels, bins + 1)
 
-    def forward(
-        self,
-        voxels: Float[Tensor, "n views bins h w"],
-        state: Any = None,
-        *,
-        positions: Sequence[Position] | None = None,
-    ) -> tuple[Float[Tensor, "n 1 h w"], Any]:
+    def reconstruct(self, seen: Tensor, state: Any) -> tuple[Tensor, Any]:
         """Return the frame and (state of E2VID, frame before output handling and cropping)."""
-        height, width = voxels.shape[-2:]
-        view = centre_view(voxels, self.bins, self.normalise, positions)
-        view, (top, left) = pad_to_multiple(view, 2**SCALES)
-        before, shown = state or (None, torch.zeros_like(view[:, :1]))
-        head, skips, after = self.net.encode(view, before)
+        before, shown = state or (None, torch.zeros_like(seen[:, :1]))
+        head, skips, after = self.net.encode(seen, before)
         x = skips[-1]
         for block in self.net.resblocks:
             x = block(x)
-        x = self.dynamic(x + skips.pop(), torch.cat([view, shown], 1))
+        x = self.dynamic(x + skips.pop(), torch.cat([seen, shown], 1))
         frame = self.net.decode(x, head, skips)
-        cropped = frame[..., top : top + height, left : left + width]
-        return finish(cropped, self.output, self.training), (after, frame.detach())
+        return frame, (after, frame.detach())
 
 
 class DynamicDecoder(nn.Module):

@@ -18,7 +18,7 @@ from matplotlib.patches import Rectangle
 
 from src.app import build
 from src.figures.plots import save
-from src.recordings.files import plain
+from src.recordings.files import safe_yaml
 from src.sim.turbulence import Atmosphere, sample_atmosphere
 from src.sim.turbulence.rigid import rigid_atmosphere
 
@@ -90,7 +90,7 @@ def draw(found: Mapping[str, Sequence[Atmosphere]], measured: Sequence[Path], pa
     box.set_label("central 80 % of mixed")
     axes.add_patch(box)
     for file, marker in zip(measured, "X*PDv^s", strict=False):
-        air = plain.read(file)
+        air = safe_yaml.read(file)
         at = [air[key]["value"] for key in ("half_length_px", "rms_px")]
         ends = [air[key]["interval"] for key in ("half_length_px", "rms_px")]
         error = [

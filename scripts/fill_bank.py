@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 
 from src.app import door, simulation
 from src.training.bank import Bank
-from src.training.filling import fill
+from src.training.bank_filler import fill
 
 EVERY = 10.0  # seconds between two lines
 

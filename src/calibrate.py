@@ -9,8 +9,7 @@ import hydra
 import rich
 from omegaconf import DictConfig, OmegaConf
 
-from src.app import build, door
-from src.app import tasks as calibration
+from src.app import build, calibrations, door
 from src.records import results
 
 
@@ -18,7 +17,7 @@ def views(cfg: DictConfig, run: Path) -> dict:
     """Find the views and their homographies: `views.yaml`, also at `cfg.save`."""
     names = ("resolution", "sensor_size", "mirrors", "margin", "threshold_px", "corners")
     options = {name: cfg[name] for name in names}
-    found = calibration.align_views(cfg.recording, run, build.part(cfg, "target"), **options)
+    found = calibrations.align_views(cfg.recording, run, build.part(cfg, "target"), **options)
     if cfg.save:
         found.save(cfg.save)
     return {f"error_px of {view.position}": round(view.error_px, 3) for view in found.views}
@@ -28,10 +27,8 @@ def threshold(cfg: DictConfig, run: Path) -> dict:
     """Find the contrast threshold by comparing event rates with the configured simulation's."""
     pipeline = build.pipeline(cfg, "test")
     clips = [pipeline.views(pipeline.draw(index))[0] for index in range(cfg.clips)]
-    settings = OmegaConf.to_container(cfg.sensor, resolve=True)
-    settings |= {"input": "linear"} if pipeline.decode else {}
-    found = calibration.find_threshold(
-        cfg.recording, run, clips, cfg.fps * cfg.data.substeps, settings,
+    found = calibrations.find_threshold(
+        cfg.recording, run, clips, cfg.fps * cfg.data.substeps, pipeline.sensor,
         views=cfg.views, sensor_size=cfg.sensor_size,
     )  # fmt: skip
     return {"ON (value, low, high)": found.on, "OFF": found.off}
@@ -40,7 +37,7 @@ def threshold(cfg: DictConfig, run: Path) -> dict:
 def turbulence(cfg: DictConfig, run: Path) -> dict:
     """Measure tilt, blur and scintillation of a dot grid against the same without turbulence."""
     network = build.chosen(cfg) if cfg.ckpt or cfg.get("baseline") else None
-    found = calibration.characterise(
+    found = calibrations.characterise(
         cfg.recording, cfg.still, run, fps=cfg.fps, network=network, views=cfg.views,
         sensor_size=cfg.sensor_size, **cfg.dots,
     )  # fmt: skip
@@ -51,7 +48,7 @@ def air(cfg: DictConfig, run: Path) -> dict:
     """Measure the air in front of a still scene: `air.yaml`, also at `cfg.save`."""
     if OmegaConf.is_missing(cfg, "video"):
         raise ValueError("video must be a film of a still scene, got none")
-    found = calibration.measure_air(cfg.video, run, fps=cfg.fps, save=cfg.save, **cfg.air)
+    found = calibrations.measure_air(cfg.video, run, fps=cfg.fps, save=cfg.save, **cfg.air)
     return {name: str(value) for name, value in vars(found.found).items()}
 
 

@@ -8,7 +8,7 @@ from omegaconf import DictConfig
 
 from src.app import build, door, lineup
 from src.bench import charting
-from src.bench.stopwatch import Stopwatch
+from src.bench.speed import Stopwatch
 from src.figures import changing_air, frontier
 from src.records import results
 

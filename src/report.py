@@ -17,9 +17,9 @@ def report(cfg: DictConfig) -> list[tables.Table]:
     With `into`, the Markdown also replaces that file's section of the same title.
     """
     folders, out = listed(cfg.run), Path(cfg.paths.run)
-    found, plans = runs.find(folders), runs.plans(folders)
-    title = cfg.title or sweep_name(found)
-    keys, made = cells.cells(found, plans, tuple(cfg.across))
+    ours, plans = runs.find(folders), runs.plans(folders)
+    title = cfg.title or sweep_name(ours)
+    keys, made = cells.cells(ours, plans, tuple(cfg.across))
     paper = OmegaConf.to_container(cfg.paper)
     wanted = [
         tables.main("Scores and cost", keys, made, paper),
@@ -28,7 +28,7 @@ def report(cfg: DictConfig) -> list[tables.Table]:
     ]
     if cfg.against:
         theirs = runs.find(listed(cfg.against))
-        wanted.append(margins("Clip by clip", found, theirs, paper))
+        wanted.append(margins("Clip by clip", ours, theirs, paper))
     drawn = [table for table in wanted if table and table.rows]
     commands, figures = [plan.command for plan in plans], runs.figures(folders)
     text = writers.markdown(drawn, commands)
@@ -50,9 +50,9 @@ def listed(given: str | ListConfig) -> list[Path]:
     return [Path(str(folder)) for folder in (given if isinstance(given, ListConfig) else [given])]
 
 
-def sweep_name(found: list[runs.Run]) -> str:
+def sweep_name(ours: list[runs.Run]) -> str:
     """Return the config that all runs were asked for, such as table1; else `runs`."""
-    names = {run.record.get("asked", {}).get("config", "") for run in found}
+    names = {run.record.get("asked", {}).get("config", "") for run in ours}
     return names.pop() if len(names) == 1 and names != {""} else "runs"
 
 

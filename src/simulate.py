@@ -11,7 +11,7 @@ from yaml import YAMLError
 from src.app import build, door
 from src.figures import samples
 from src.recordings import capture
-from src.recordings.files import plain
+from src.recordings.files import safe_yaml
 from src.records import results
 
 SECTIONS = ("scene", "optics", "turbulence", "sensor", "data")
@@ -40,7 +40,10 @@ def simulate(cfg: DictConfig) -> dict:
     samples.write_views(run, sample, views[:, windows], tilt[:, windows], pipeline.optics)
     if cfg.write:
         size = tuple(views.shape[-2:])
-        camera = capture.kaleidoscope(list(pipeline.optics.positions), model=size, key=draw.key)
+        camera = capture.kaleidoscope(
+            list(pipeline.optics.positions), model=size, key=draw.key,
+            sensor=tuple(cfg.camera.sensor), tile_px=cfg.camera.tile_px,
+        )  # fmt: skip
         capture.write_recording(cfg.write, views, draw.clip.fps, camera, draw.sensor, tilt=tilt)
     rich.print(sample.drawn[0], f"in {run}")
     return sample.drawn[0]
@@ -52,7 +55,7 @@ def alike(cfg: DictConfig) -> DictConfig:
     Raises ValueError for a file that is no such config.
     """
     try:
-        read = dict(plain.read(cfg.like))
+        read = dict(safe_yaml.read(cfg.like))
         # Before there was a seed for them, test clips followed from the training's.
         read["data"] = {"test_seed": read["seed"]} | read["data"]
         other = OmegaConf.create(read)

@@ -32,16 +32,16 @@ def stress(cfg: DictConfig) -> suite.Found:
     titles = {name: str(node.title) for name, node in cfg.probes.items()}
     results.open_run(run, door.resolved(cfg))
 
-    def keep(found: suite.Found) -> None:
-        results.write_text(run / "stress.csv", suite.table(found, titles))
+    def keep(findings: suite.Found) -> None:
+        results.write_text(run / "stress.csv", suite.table(findings, titles))
 
-    found, standards = suite.gather(_accounts(cfg, candidates, examine), keep)
-    text = suite.words(found, titles, standards)
+    findings, standards = suite.gather(_accounts(cfg, candidates, examine), keep)
+    text = suite.words(findings, titles, standards)
     results.write_text(run / "stress.md", text)
     for suffix in ("png", "svg"):
-        stress_map(run / f"stress.{suffix}", found, titles, standards)
+        stress_map(run / f"stress.{suffix}", findings, titles, standards)
     rich.print(text, f"in {run}")
-    return found
+    return findings
 
 
 def _accounts(

@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from src.app import build, door
 from src.eval import evaluate
 from src.models import files
+from src.reconstruct import reconstruct
 from src.records import results
 from src.train import train
 from tests.conftest import ROOT
@@ -67,11 +68,15 @@ def test_every_job_composes_and_two_run(path, tmp_path, weights):
     assert len(found) == len({tuple(job) for job in found}) >= 3
     for override in {override for job in found for override in job}:
         composed(path, tmp_path, override)
-    tiny, work = {"train": ([*TINY, "logger=none"], train), "eval": (SMALL, evaluate)}[door]
+    tiny, work = {
+        "train": ([*TINY, "logger=none"], train),
+        "eval": (SMALL, evaluate),
+        "reconstruct": (["ckpt=lf3x3", "end=0.02"], reconstruct),
+    }[door]
     for place in (0, -1):
         run = tmp_path / str(place)
         work(composed(path, run, *found[place], *tiny))
-        assert (run / "results.json").is_file()
+        assert (run / ("video.h5" if work is reconstruct else "results.json")).is_file()
 
 
 SCORED = ["-m", "baseline=highpass", "debug=fdr", "metrics.lpips=null"]

@@ -15,6 +15,7 @@ from torch import nn
 import src.models
 from baselines import widened
 from baselines.postprocess import Restoration
+from src.app.contracts import keeping
 from src.app.parts import make, part, rooms
 from src.app.simulation import pipeline
 from src.metrics.scores import Scores
@@ -22,10 +23,10 @@ from src.models.unroll import takes
 from src.records.results import Row
 from src.sim.optics import Optics
 from src.training import evaluation
-from src.training.banked import Banked
+from src.training.bank_filler import Filler
+from src.training.bank_samples import Banked
 from src.training.clock import Clock
 from src.training.datamodule import LightFieldData
-from src.training.filling import Filler
 from src.training.reconstructor import Reconstructor
 
 
@@ -62,7 +63,7 @@ def network(cfg: DictConfig) -> tuple[nn.Module, dict]:
     """
     node = OmegaConf.to_container(cfg.model, resolve=True)
     weights = node.pop("weights", None)
-    net = make(node, rooms(cfg))
+    net = keeping("model", make(node, rooms(cfg)))
     if weights:
         widened.start(net, weights)
     elif "weights" in cfg.model:
@@ -76,11 +77,11 @@ def network(cfg: DictConfig) -> tuple[nn.Module, dict]:
 def chosen(cfg: DictConfig) -> nn.Module:
     """Return the network that `ckpt` or else `baseline` names, in eval mode."""
     if cfg.ckpt:
-        found = src.models.load(cfg.ckpt, rooms(cfg))
-        if takes(found, "frames"):
+        net = src.models.load(cfg.ckpt, rooms(cfg))
+        if takes(net, "frames"):
             use = f"baseline=frames postprocess=mambatm postprocess.restorer={cfg.ckpt}"
             raise ValueError(f"ckpt must be a network for events, got a post-processor; use {use}")
-        return found
+        return net
     if cfg.get("baseline"):
         return part(cfg, "baseline").eval()
     raise ValueError("ckpt or baseline must name a network, got neither")
@@ -88,8 +89,8 @@ def chosen(cfg: DictConfig) -> nn.Module:
 
 def frozen(cfg: DictConfig) -> nn.Module:
     """Return the chosen network, behind it the chosen post-processor."""
-    found = chosen(cfg)
-    return part(cfg, "postprocess", source=found) if cfg.get("postprocess") else found
+    net = chosen(cfg)
+    return part(cfg, "postprocess", source=net) if cfg.get("postprocess") else net
 
 
 def scores(cfg: DictConfig) -> Scores:
@@ -145,7 +146,7 @@ def trainer(cfg: DictConfig) -> lightning.Trainer:
     loggers = [make(logger, rooms(cfg)) for logger in cfg.logger.values()]
     callbacks = [make(callback, rooms(cfg)) for callback in cfg.callbacks.values()]
     if not cfg.trainer.enable_progress_bar:  # Lightning refuses a bar then
-        callbacks = [found for found in callbacks if not isinstance(found, ProgressBar)]
+        callbacks = [callback for callback in callbacks if not isinstance(callback, ProgressBar)]
     return part(cfg, "trainer", logger=loggers, callbacks=callbacks)
 
 

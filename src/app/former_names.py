@@ -27,7 +27,7 @@ MOVED = {
     "src.probes.rates": "src.bench.probes.sampling",
     "src.probes.views": "src.bench.probes.light_field",
     "src.recordings.formats": "src.recordings.files.formats",
-    "src.recordings.calibration.tasks": "src.app.tasks",
+    "src.recordings.calibration.tasks": "src.app.calibrations",
     "src.recordings.targets": "src.recordings.calibration.boards",
 }
 

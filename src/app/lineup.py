@@ -25,24 +25,24 @@ def gather(cfg: DictConfig) -> list[Candidate]:
     if cfg.ckpt or cfg.get("baseline"):
         return _by_hand(cfg)
     entries = OmegaConf.to_container(cfg.networks, resolve=True)
-    found = [_entry(name, entry, build.rooms(cfg)) for name, entry in entries.items() if entry]
-    if not found:
+    candidates = [_entry(name, entry, build.rooms(cfg)) for name, entry in entries.items() if entry]
+    if not candidates:
         raise ValueError("networks must name at least one network, got none")
-    return found
+    return candidates
 
 
 def _by_hand(cfg: DictConfig) -> list[Candidate]:
     names = cfg.ckpt if isinstance(cfg.ckpt, ListConfig) else [cfg.ckpt] if cfg.ckpt else []
-    found = []
+    candidates = []
     for name in names:
         network = src.models.load(name, build.rooms(cfg))
         label = Path(name).stem if Path(name).suffix else name
-        found.append(Candidate(label, network, network.views or cfg.optics.views))
+        candidates.append(Candidate(label, network, network.views or cfg.optics.views))
     if cfg.get("baseline"):
         label = str(cfg.baseline.get("name", "baseline"))
         network = build.part(cfg, "baseline").eval()
-        found.append(Candidate(label, network, network.views or cfg.optics.views))
-    return found
+        candidates.append(Candidate(label, network, network.views or cfg.optics.views))
+    return candidates
 
 
 def _entry(name: str, entry: Mapping, own: Sequence[str]) -> Candidate:

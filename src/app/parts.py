@@ -12,12 +12,17 @@ from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from baselines.upstream import from_config
+from src.app.contracts import keeping
 from src.models.setnet import SetNet
 from src.models.setnet2 import SetNet2
 
 # What is no class and may be named all the same.
 FACTORIES = (from_config, SetNet.preset, SetNet2.preset)
 PACKAGE = r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*"
+OLDER = {  # what a part is where none is named: runs before 0.2 named none
+    "turbulence": "src.sim.turbulence.simulated.SimulatedAir",
+    "sensor": "src.sim.sensor.sensor.EventSensor",
+}
 ROOMS = (
     "src.", "baselines.", "torch.optim.", "lightning.pytorch.trainer.",
     *(f"lightning.pytorch.{room}." for room in ("callbacks", "loggers", "plugins", "profilers")),
@@ -36,8 +41,14 @@ def rooms(cfg: DictConfig) -> tuple[str, ...]:
 
 
 def part(cfg: DictConfig, key: str, **kwargs) -> Any:
-    """Return what the part `key` of the config names, made with its values and `kwargs`."""
-    return make(OmegaConf.select(cfg, key), rooms(cfg), **kwargs)
+    """Return what the part `key` of the config names, made with its values and `kwargs`.
+
+    Raises ValueError as `make` does, and for a class that does not keep the contract of the part.
+    """
+    node = OmegaConf.select(cfg, key)
+    if key in OLDER and "_target_" not in node:
+        node = OmegaConf.merge({"_target_": OLDER[key]}, node)
+    return keeping(key, make(node, rooms(cfg), **kwargs))
 
 
 def make(node: Any, own: Sequence[str] = (), **kwargs) -> Any:
@@ -81,10 +92,10 @@ def _check(target: str, own: Sequence[str]) -> None:
     if not target.startswith(("src.", "baselines.", "torch.optim.", "lightning.", *packages)):
         raise ValueError(refusal)
     try:
-        found = get_object(target)
+        named = get_object(target)
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f"_target_ must name a class, got {target}") from error
-    home = f"{getattr(found, '__module__', '')}."
-    written_here = isinstance(found, type) and home.startswith(ROOMS + packages)
-    if found not in FACTORIES and not written_here:
+    home = f"{getattr(named, '__module__', '')}."
+    written_here = isinstance(named, type) and home.startswith(ROOMS + packages)
+    if named not in FACTORIES and not written_here:
         raise ValueError(refusal)

@@ -8,15 +8,14 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
-from src.app.parts import make, part, rooms
+from src.app.parts import part
 from src.sim.optics import Optics, layout
 from src.sim.pipeline import Pipeline
 from src.sim.scenes.photographs import MixedRates
-from src.sim.turbulence.model import TurbulenceModel
+from src.sim.sensor.contract import Sensor
 from src.training.bank import Bank, listing
-from src.training.banked import Banked
+from src.training.bank_samples import Banked
 
-SIMULATED = "src.sim.turbulence.simulated.SimulatedAir"
 CLIP = ("scene", "turbulence")  # sections that make a clip, whatever sees it
 
 
@@ -42,7 +41,7 @@ def pipeline(cfg: DictConfig, split: str, optics: Optics | None = None) -> Pipel
         return Banked(
             bank(cfg),
             optics or part(cfg, "optics"),
-            OmegaConf.to_container(cfg.sensor, resolve=True),
+            _sensor(cfg, _count(cfg, "seed", least=0)),
             windows=_count(cfg, "data.windows"),
             bins=cfg.bins,
             crop=cfg.data.crop,
@@ -53,7 +52,6 @@ def pipeline(cfg: DictConfig, split: str, optics: Optics | None = None) -> Pipel
         split,
         windows=_count(cfg, "data.windows" if training else "data.test_windows"),
         optics=optics or part(cfg, "optics"),
-        sensor=OmegaConf.to_container(cfg.sensor, resolve=True),
         crop=cfg.data.crop if training else cfg.data.test_crop,
         clips=cfg.data.clips if training else None,
     )
@@ -67,18 +65,15 @@ def bank(cfg: DictConfig) -> Bank:
     optics, side = part(cfg, "optics"), _count(cfg, "data.bank_crop")
     if set(optics.positions) <= set(layout(9)):
         optics = replace(optics, views=9, positions=layout(9))
-    light = {"input": cfg.sensor.input}
     windows, substeps = _count(cfg, "data.bank_windows"), _count(cfg, "data.substeps")
-    source = _simulation(
-        cfg, "train", windows=windows, optics=optics, sensor=light, crop=side, clips=None
-    )
+    source = _simulation(cfg, "train", windows=windows, optics=optics, crop=side, clips=None)
     parts = {name: OmegaConf.to_container(cfg[name], resolve=True) for name in CLIP}
     measured = parts["turbulence"].get("measured")  # a file; what it holds makes the clips
     made_of = parts | {
         "optics": {"positions": optics.positions, "misalignment_px": optics.misalignment_px},
         "files": listing(parts),
         "measured": Path(measured).read_text() if measured else None,
-        "sensor": light,
+        "sensor": _light(cfg),
         "seed": cfg.seed,
         "rates": _rates(cfg, True),
         "frames": {"windows": windows, "substeps": substeps, "crop": side},
@@ -91,7 +86,7 @@ def bank(cfg: DictConfig) -> Bank:
 
 
 def _simulation(
-    cfg: DictConfig, split: str, *, windows: int, optics: Optics, sensor: dict, crop, clips
+    cfg: DictConfig, split: str, *, windows: int, optics: Optics, crop, clips
 ) -> Pipeline:
     substeps = _count(cfg, "data.substeps")
     rates = _rates(cfg, split == "train")
@@ -107,27 +102,32 @@ def _simulation(
         )
         for rate in rates
     ]
-    try:
-        return Pipeline(
-            MixedRates(scenes) if len(scenes) > 1 else scenes[0],
-            optics,
-            _turbulence(cfg),
-            sensor,
-            split=split,
-            seed=seed,
-            bins=cfg.bins,
-            substeps=substeps,
-            crop=crop,
-            random_crop=split == "train",
-            clips=clips,
-        )
-    except TypeError as error:
-        raise ValueError(f"sensor takes no such values: {error}") from error
+    made = Pipeline(
+        MixedRates(scenes) if len(scenes) > 1 else scenes[0],
+        optics,
+        part(cfg, "turbulence"),
+        _light(cfg),
+        split=split,
+        seed=seed,
+        bins=cfg.bins,
+        substeps=substeps,
+        crop=crop,
+        random_crop=split == "train",
+        clips=clips,
+    )
+    made.sensor = _sensor(cfg, seed)
+    return made
 
 
-def _turbulence(cfg: DictConfig) -> TurbulenceModel:
-    """Return the turbulence model; simulated air where none is named, as older runs name none."""
-    return make(OmegaConf.merge({"_target_": SIMULATED}, cfg.turbulence), rooms(cfg))
+def _light(cfg: DictConfig) -> dict:
+    """Return what decides about the light in front of the sensor: whether frames are decoded."""
+    return {"input": cfg.sensor.get("input", "linear")}
+
+
+def _sensor(cfg: DictConfig, seed: int) -> Sensor:
+    """Return the sensor; what is decoded before the turbulence reaches it as light."""
+    decoded = {"input": "linear"} if _light(cfg)["input"] == "srgb" else {}
+    return part(cfg, "sensor", seed=seed, **decoded)
 
 
 def _count(cfg: DictConfig, key: str, least: int = 1) -> int:
@@ -139,8 +139,8 @@ def _count(cfg: DictConfig, key: str, least: int = 1) -> int:
 
 def _rates(cfg: DictConfig, training: bool) -> list[float]:
     key = "data.rates" if training and cfg.data.rates else "fps"
-    found = OmegaConf.select(cfg, key)
-    rates = list(found) if isinstance(found, Sequence) else [found]
+    given = OmegaConf.select(cfg, key)
+    rates = list(given) if isinstance(given, Sequence) else [given]
     if not rates or not all(isinstance(r, int | float) and 0 < r < math.inf for r in rates):
-        raise ValueError(f"{key} must be > 0 windows a second, got {found}")
+        raise ValueError(f"{key} must be > 0 windows a second, got {given}")
     return rates

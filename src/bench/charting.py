@@ -1,9 +1,7 @@
 """The chart's scores on the same clips, its knees, its tables and what they say in words."""
 
-import csv
-import io
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import astuple, dataclass, fields
 
 import rich
 import torch
@@ -11,10 +9,11 @@ from torch import nn
 
 from src.bench.candidates import Candidate, Subject
 from src.bench.pareto import knee
-from src.bench.stopwatch import FORMS, Speed
+from src.bench.speed import FORMS, Speed
 from src.metrics.scores import Scores
 from src.metrics.table import METRICS
 from src.models.fast import running
+from src.records.results import csv_text
 from src.sim.pipeline import Pipeline, simulate
 
 SEVERITIES = ("weak", "medium", "strong", "mixed")
@@ -55,7 +54,7 @@ def scores(
 ) -> list[Score]:  # fmt: skip
     """Return the scores of all trained networks on the same `clips` clips of every severity."""
     subjects = _subjects(candidates, forms)
-    found = []
+    rows = []
     for severity, pipeline in pipelines.items():
         for clip in range(clips):
             sample = simulate(pipeline, [clip])
@@ -66,43 +65,43 @@ def scores(
                 if restorer is not None:
                     frames = restorer.restore(frames[None])[0]
                 values = measure(frames[warmup:], truth)
-                found.append(Score(subject.name, form, severity, clip, values))
+                rows.append(Score(subject.name, form, severity, clip, values))
         rich.print(f"scored on {severity} turbulence")
-    return found
+    return rows
 
 
 def _subjects(
     candidates: Sequence[Candidate], forms: Sequence[str]
 ) -> list[tuple[str, Subject, nn.Module | None]]:
     """Return (form, network, post-processor); what has one, or no weights, is not rounded."""
-    found = []
+    subjects = []
     for candidate in candidates:
         if candidate.network is None or not candidate.trained:
             continue
         name, network, views = candidate.name, candidate.network, candidate.views
-        found.append(("float32", Subject(name, network, views), candidate.restorer))
+        subjects.append(("float32", Subject(name, network, views), candidate.restorer))
         learned = any(True for _ in network.parameters())
         if "bf16" in forms and learned and candidate.restorer is None:
-            found.append(("bf16", Subject(name, running(network, "bf16"), views), None))
-    return found
+            subjects.append(("bf16", Subject(name, running(network, "bf16"), views), None))
+    return subjects
 
 
-def knees(speeds: Sequence[Speed], found: Sequence[Score], side: int) -> dict[str, str]:
+def knees(speeds: Sequence[Speed], scored: Sequence[Score], side: int) -> dict[str, str]:
     """Return for each severity the cheapest network within one standard error of the best.
 
     By LPIPS, else by 1 - SSIM; the cost is thread time in ms on pictures of `side`, float32.
     """
     costs = {s.network: s.ms for s in speeds if s.ms and _named(s, side, "float32")}
     return {
-        severity: knee(costs, _errors(found, severity, costs))
-        for severity in dict.fromkeys(row.severity for row in found)
-        if _errors(found, severity, costs)
+        severity: knee(costs, _errors(scored, severity, costs))
+        for severity in dict.fromkeys(row.severity for row in scored)
+        if _errors(scored, severity, costs)
     }
 
 
-def _errors(found: Sequence[Score], severity: str, costs: Mapping) -> dict[str, list[float]]:
+def _errors(scored: Sequence[Score], severity: str, costs: Mapping) -> dict[str, list[float]]:
     errors: dict[str, list[float]] = {}
-    for row in found:
+    for row in scored:
         if (row.severity, row.form) == (severity, "float32") and row.network in costs:
             error = row.values.get("lpips", 1 - row.values["ssim"])
             errors.setdefault(row.network, []).append(error)
@@ -114,10 +113,10 @@ def _named(s: Speed, side: int, form: str) -> bool:
 
 
 def words(
-    speeds: Sequence[Speed], found: Sequence[Score], knees: Mapping[str, str], side: int
+    speeds: Sequence[Speed], scored: Sequence[Score], knees: Mapping[str, str], side: int
 ) -> str:
     """Return the knees and a table of the means over all clips, as Markdown."""
-    metrics = [metric for metric in METRICS if found and metric.name in found[0].values]
+    metrics = [metric for metric in METRICS if scored and metric.name in scored[0].values]
     heads = [metric.heading for metric in metrics]
     lines = ["# Speed against accuracy\n"]
     lines += [f"- {severity} turbulence: take {name}." for severity, name in knees.items()]
@@ -129,7 +128,7 @@ def words(
     ]
     for s in speeds:
         if s.threads == 1 and s.side == side and s.device == "cpu":
-            rows = [r.values for r in found if (r.network, r.form) == (s.network, s.form)]
+            rows = [r.values for r in scored if (r.network, r.form) == (s.network, s.form)]
             means = [m.written(sum(r[m.name] for r in rows) / len(rows)) if rows else ""
                      for m in metrics]  # fmt: skip
             time = s.reason if s.ms is None else f"{s.ms:.2f}"
@@ -141,25 +140,15 @@ def words(
 
 def speed_csv(rows: Sequence[Speed]) -> str:
     """Return one line per entry."""
-    return _csv([field.name for field in fields(Speed)], [_short(asdict(row)) for row in rows])
+    return csv_text([field.name for field in fields(Speed)], [_short(astuple(row)) for row in rows])
 
 
 def scores_csv(rows: Sequence[Score]) -> str:
     """Return one line per network, form and clip."""
-    lines = [
-        {"network": r.network, "form": r.form, "severity": r.severity, "clip": r.clip} | r.values
-        for r in rows
-    ]
-    return _csv(list(lines[0]) if lines else ["network"], [_short(line) for line in lines])
+    heads = ["network", "form", "severity", "clip", *(rows[0].values if rows else [])]
+    lines = [[r.network, r.form, r.severity, r.clip, *r.values.values()] for r in rows]
+    return csv_text(heads, map(_short, lines))
 
 
-def _short(line: Mapping) -> dict:
-    return {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in line.items()}
-
-
-def _csv(heads: list[str], lines: list[dict]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, heads)
-    writer.writeheader()
-    writer.writerows(lines)
-    return text.getvalue()
+def _short(line: Iterable) -> list:
+    return [f"{value:.6g}" if isinstance(value, float) else value for value in line]

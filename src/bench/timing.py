@@ -1,13 +1,6 @@
-"""How long a frame takes and what is needed for it: state carried, after a warm-up.
+"""What a machine can do and what a frame needs: its arithmetic, a post-processor's time, bytes."""
 
-On one thread the time is what that thread computes (other jobs on the machine hardly disturb it),
-else wall time.  docs/results.md says what it was measured on.
-"""
-
-import contextlib
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -16,53 +9,10 @@ from torch.nn import functional
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.weak import WeakIdKeyDictionary
 
-from src.models.cost import clock
+from src.models.stopwatch import clock, threads
 
 PEAK_SIDE, PEAK_CHANNELS = 176, 64  # of the convolution that shows what the machine can do
 JOULE_PER_MAC = 4.6e-12  # float32, 45 nm (Horowitz, ISSCC 2014): 3.7 pJ multiply, 0.9 pJ add
-
-
-@dataclass(frozen=True)
-class Timing:
-    """Milliseconds of a frame, median and least of `frames`, by `clock`: thread or wall."""
-
-    median_ms: float
-    least_ms: float
-    frames: int
-    clock: str
-
-
-@contextlib.contextmanager
-def threads(count: int) -> Iterator[None]:
-    """Let torch compute on `count` threads for as long as this lasts."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-@torch.no_grad()
-def frame(
-    network: nn.Module, voxels: Tensor, *, count: int = 1, seconds: float = 1.0, least: int = 3
-) -> Timing:
-    """Return the time of one window (n, views, bins, h, w) on `count` threads.
-
-    The second frame warms up too.  As many frames as fit into `seconds`, at least `least`.
-    """
-    now = clock(count, voxels.device)
-    with threads(count):
-        state = _advance(network, voxels, None, 2)
-        times: list[float] = []
-        until = time.perf_counter() + seconds
-        while len(times) < least or (time.perf_counter() < until and len(times) < 200):
-            start = now()
-            state = _advance(network, voxels, state, 1)
-            times.append(1e3 * (now() - start))
-    times.sort()
-    name = "thread" if now is time.thread_time else "wall"
-    return Timing(times[len(times) // 2], times[0], len(times), name)
 
 
 @torch.no_grad()
@@ -75,14 +25,6 @@ def restoration(restorer: nn.Module, side: int, *, count: int = 1, repeats: int 
     with threads(count):
         took = min(_timed(clock(count), lambda: restorer.restore(frames)) for _ in range(repeats))
     return 1e3 * took / (restorer.WINDOW - restorer.OVERLAP)
-
-
-def _advance(network: nn.Module, voxels: Tensor, state: Any, frames: int) -> Any:
-    for _ in range(frames):
-        _, state = network(voxels, state)
-    if voxels.device.type == "cuda":
-        torch.cuda.synchronize(voxels.device)
-    return state
 
 
 @torch.no_grad()

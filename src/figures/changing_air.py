@@ -1,7 +1,5 @@
 """The adaptive network on air that rises and falls, against its first and its last level alone."""
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +10,10 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from src.bench.probes.clips import Conditions, Stream, film
-from src.bench.timing import threads
 from src.figures.plots import save
 from src.metrics.image import aligned_psnr
 from src.models.adaptive import Adaptive
-from src.models.cost import clock
+from src.models.stopwatch import clock, threads
 from src.records import results
 from src.sim.pipeline import Pipeline
 
@@ -74,13 +71,11 @@ def follow(network: Adaptive, stream: Stream, only: int | None = None) -> Shown:
 
 def table(shown: dict[str, Shown]) -> str:
     """Return CSV, one line for each window and way of running."""
-    text = io.StringIO()
-    writer = csv.writer(text)
-    writer.writerow(["run", "window", "ms", "aligned_psnr_db", "level", "disagreement"])
+    heads, lines = ("run", "window", "ms", "aligned_psnr_db", "level", "disagreement"), []
     for name, s in shown.items():
         rows = zip(s.ms, s.psnr, s.level, s.disagreement, strict=True)
-        writer.writerows([name, k, *(f"{v:.5g}" for v in row)] for k, row in enumerate(rows))
-    return text.getvalue()
+        lines += [[name, k, *(f"{v:.5g}" for v in row)] for k, row in enumerate(rows)]
+    return results.csv_text(heads, lines)
 
 
 def words(shown: dict[str, Shown]) -> str:

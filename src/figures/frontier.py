@@ -9,7 +9,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from src.bench.charting import Score
 from src.bench.pareto import front
-from src.bench.stopwatch import Speed
+from src.bench.speed import Speed
 from src.figures.plots import MARKERS, save
 from src.metrics.table import METRICS, Metric
 
@@ -69,10 +69,7 @@ def machine(path: Path, speeds: Sequence[Speed], peaks: Mapping[tuple[str, int],
             axes.plot(s.gmac, s.ms, linestyle="none", **look)
         _peaks(axes, peaks, count, [s.gmac for s in timed])
         axes.set(xscale="log", yscale="log", xlabel="GMAC a frame", ylabel="ms a frame")
-        for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            axis.set_major_formatter("{x:g}")
-            axis.set_minor_formatter(NullFormatter())
+        _ticks(axes.xaxis, axes.yaxis)
         axes.set_title(f"{count} thread{'s' * (count > 1)}", fontsize=11)
         axes.grid(alpha=0.25, which="major")
     forms = [form for form in FACES if any(s.form == form for s in timed)]
@@ -108,9 +105,7 @@ def _panel(axes, names: list[str], times: Mapping, scores: Sequence[Score], metr
         )  # fmt: skip
     side = "higher" if metric.better > 0 else "lower"
     axes.set(xscale="log", title=f"{metric.heading}  ({side} is better)")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    _ticks(axes.xaxis)
     axes.title.set_fontsize(10)
     axes.grid(alpha=0.25)
 
@@ -122,16 +117,17 @@ def _peaks(axes, peaks: Mapping[tuple[str, int], float], count: int, macs: list[
         if (form, count) in peaks:
             speed = peaks[form, count] / 1e9
             label = f"{form} limit: {speed:.0f} GMAC/s"
-            axes.plot(
-                ends,
-                [1e3 * gmac / speed for gmac in ends],
-                color="0.4",
-                ls=style,
-                lw=1,
-                label=label,
-            )
+            times = [1e3 * gmac / speed for gmac in ends]
+            axes.plot(ends, times, color="0.4", ls=style, lw=1, label=label)
     if axes.get_legend_handles_labels()[0]:
         axes.legend(fontsize=8, loc="lower right", frameon=False)
+
+
+def _ticks(*axes) -> None:
+    for axis in axes:
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
 
 
 def _look(place: int, form: str) -> dict:

@@ -20,7 +20,7 @@ NOTHING = "#efefef"
 
 def stress_map(
     path: Path,
-    found: Mapping[str, Mapping[str, Finding | str]],
+    findings: Mapping[str, Mapping[str, Finding | str]],
     titles: Mapping[str, str],
     standards: Mapping[str, float],
 ) -> Path:
@@ -28,20 +28,20 @@ def stress_map(
     deepest at ten times, with the limit itself written beside the probe's title.  `standards`: the
     aligned PSNR in dB of each network where nothing is made hard, written under its name.
     """
-    networks = list(next(iter(found.values())))
-    size = (TITLE_IN + COLUMN_IN * len(networks), 1.6 + ROW_IN * len(found))
+    networks = list(next(iter(findings.values())))
+    size = (TITLE_IN + COLUMN_IN * len(networks), 1.6 + ROW_IN * len(findings))
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots()
-    for row, cells in enumerate(found.values()):
+    for row, cells in enumerate(findings.values()):
         for column, cell in enumerate(cells.values()):
             _draw(axes, row, column, cell)
     axes.set_xlim(0, len(networks))
-    axes.set_ylim(len(found), 0)
+    axes.set_ylim(len(findings), 0)
     wrapped = [_heading(name, standards.get(name)) for name in networks]
     axes.set_xticks(np.arange(len(networks)) + 0.5, wrapped, fontsize=9)
     axes.xaxis.tick_top()
-    labels = [f"{titles[probe]}   {_limit(cells)}" for probe, cells in found.items()]
-    axes.set_yticks(np.arange(len(found)) + 0.5, labels, fontsize=9)
+    labels = [f"{titles[probe]}   {_limit(cells)}" for probe, cells in findings.items()]
+    axes.set_yticks(np.arange(len(findings)) + 0.5, labels, fontsize=9)
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
     figure.supxlabel(

@@ -16,8 +16,8 @@ def draw(path: Path, curves: Mapping[str, Sequence[Mapping[str, float]]]) -> Pat
     """
     if not any(curves.values()):
         raise ValueError("curves must have a line or more, got none")
-    known = {name for rows in curves.values() for row in rows for name in row}
-    shown = [metric for metric in METRICS if metric.name in known]
+    names = {name for rows in curves.values() for row in rows for name in row}
+    shown = [metric for metric in METRICS if metric.name in names]
     figure = Figure(figsize=(3.4 * len(shown), 3.4), layout="constrained")
     for axes, metric in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
         for (name, rows), marker in zip(curves.items(), MARKERS * len(curves), strict=False):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from src.records.whole import written
+from src.records.atomic import written
 
 DPI = 150
 MARKERS = "osD^vP*"

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from src.figures.layouts import Row, comparison
+from src.figures.comparison import Row, comparison
 from src.figures.video import event_picture, row, write_video
 from src.models.unroll import video
 from src.sim.optics import Optics
@@ -52,12 +52,12 @@ def write_views(
     events = [event_picture(part.sum(1).numpy()) for part in sample.voxels[0].unbind(1)]
     reach = float(tilt.abs().max().clamp(min=1e-6))
     pushed = [event_picture(part.mean(1).numpy(), full=reach) for part in tilt]
-    mosaic = _mosaic([_rgb(view.numpy()) for view in views], optics)
+    shown = mosaic([_rgb(view.numpy()) for view in views], optics)
     panels = {
-        "clean": _enlarge(_rgb(clean), mosaic.shape[1]),
-        "views": mosaic,
-        f"tilt, +-{reach:.1f} px": _mosaic(pushed, optics),
-        "events": _mosaic(events, optics),
+        "clean": _enlarge(_rgb(clean), shown.shape[1]),
+        "views": shown,
+        f"tilt, +-{reach:.1f} px": mosaic(pushed, optics),
+        "events": mosaic(events, optics),
     }
     frames = row(panels)
     paths = [folder / "views.gif", folder / "views.png"]
@@ -96,7 +96,7 @@ def _enlarge(video: np.ndarray, height: int) -> np.ndarray:
     return video.repeat(height // video.shape[1], 1).repeat(height // video.shape[1], 2)
 
 
-def _mosaic(videos: list[np.ndarray], optics: Optics) -> np.ndarray:
+def mosaic(videos: list[np.ndarray], optics: Optics) -> np.ndarray:
     """Place (windows, h, w, 3) videos where their views stand; gaps are white."""
     rows, columns = zip(*optics.positions, strict=True)
     height, width = videos[0].shape[1:3]

@@ -13,6 +13,31 @@ import numpy as np
 from jaxtyping import Float
 
 Points = Float[np.ndarray, "places 2"]
+KINDS = ("line", "circle", "spin", "still")
+
+
+def cut(
+    video: Float[np.ndarray, "frames h w"],
+    *,
+    fps: float,
+    line: Sequence | None = None,
+    circle: Sequence | None = None,
+    spin: Sequence | None = None,
+    still: int | None = None,
+) -> tuple[Float[np.ndarray, "frames places"], Points]:
+    """Return one slice and its points in the first frame: `line` [[x, y], [x, y]], `circle` [x, y,
+    radius] or `spin` [x, y, radius, turns a second, degrees at the first frame]; of a `still` scene
+    the middle row.
+    """
+    if spin:
+        x, y, radius, turns, degrees = spin
+        angles = math.radians(degrees) + 2 * math.pi * turns * np.arange(len(video)) / fps
+        end = (x + radius * math.cos(angles[0]), y + radius * math.sin(angles[0]))
+        return along(video, (x, y), angles, np.arange(0, radius + 1e-9)), straight((x, y), end)
+    middle = video.shape[1] // 2
+    ends = line or ((0, middle), (video.shape[2] - 1, middle))
+    points = around(tuple(circle[:2]), circle[2]) if circle else straight(*map(tuple, ends))
+    return sample(video, points), points
 
 
 def sample(
@@ -35,7 +60,7 @@ def sample(
     return np.concatenate(rows)
 
 
-def line(start: tuple[float, float], end: tuple[float, float], places: int | None = None) -> Points:
+def straight(start: Sequence[float], end: Sequence[float], places: int | None = None) -> Points:
     """Return points from `start` to `end`, both kept, by default at most a pixel apart.
 
     A row gives x-t, a column y-t, a line from the centre of a rotation r-t.
@@ -44,7 +69,7 @@ def line(start: tuple[float, float], end: tuple[float, float], places: int | Non
     return np.linspace(start, end, places)
 
 
-def circle(centre: tuple[float, float], radius: float, places: int | None = None) -> Points:
+def around(centre: tuple[float, float], radius: float, places: int | None = None) -> Points:
     """Return points once around `centre`, by default at most a pixel apart, for theta-t.
 
     The angle grows from +x towards +y, clockwise as seen; point k stands at 2 pi k / places.
@@ -61,7 +86,7 @@ def along(
     radii: Float[np.ndarray, " places"],
 ) -> Float[np.ndarray, "frames places"]:
     """Return the r-t slice whose ray turns: frame k is sampled at `radii` pixels from `centre`
-    towards `angles[k]` (radians, as in `circle`).
+    towards `angles[k]` (radians, as in `around`).
 
     A dot that circles with these angles draws a straight line at its radius.
     """

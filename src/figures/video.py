@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from src.records.whole import written
+from src.records.atomic import written
 
 TITLE_PX = 18  # height of the strip with a panel's name
 GAP_PX = 4

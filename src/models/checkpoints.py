@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from src.records.whole import written
+from src.records.atomic import written
 
 
 class WholeFiles(TorchCheckpointIO):

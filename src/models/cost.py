@@ -1,6 +1,5 @@
-"""What a network costs: multiply-accumulates of one frame, and the clock of its time."""
+"""What a network costs: multiply-accumulates of one frame."""
 
-import time
 from collections.abc import Callable, Sequence
 
 import torch
@@ -38,11 +37,3 @@ def macs(work: Callable[[], object]) -> int:
     with FlopCounterMode(display=False) as counter:
         work()
     return counter.get_total_flops() // 2
-
-
-def clock(threads: int, device: torch.device | str = "cpu") -> Callable[[], float]:
-    """Return the clock, in seconds, of every timing of a network: on one thread of a CPU what that
-    thread computes, which other jobs on the machine hardly disturb, else wall time.
-    """
-    alone = threads == 1 and torch.device(device).type == "cpu"
-    return time.thread_time if alone else time.perf_counter

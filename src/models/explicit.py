@@ -15,18 +15,18 @@ class Explicit(nn.Module):
     def __init__(self, network: nn.Module, positions: Sequence[tuple[int, int]] | None):
         super().__init__()
         self.network, self.form = network, None
-        self.told = {"positions": positions} if takes(network, "positions") else {}
+        self.options = {"positions": positions} if takes(network, "positions") else {}
         self.timed = takes(network, "window_s")
 
     def begin(self, voxels: Tensor) -> list[Tensor]:
         """Return the state before the first window, zeros, and note its form."""
-        _, self.form = self.network(voxels, None, **self.told)
+        _, self.form = self.network(voxels, None, **self.options)
         return [torch.zeros_like(part) for part in flat(self.form)]
 
     def forward(self, voxels: Tensor, window_s: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
         """Return the frame and the parts of the new state; `window_s` (1,) is in seconds."""
-        told = self.told | ({"window_s": window_s} if self.timed else {})
-        frame, after = self.network(voxels, formed(self.form, iter(state)), **told)
+        options = self.options | ({"window_s": window_s} if self.timed else {})
+        frame, after = self.network(voxels, formed(self.form, iter(state)), **options)
         return frame, *flat(after)
 
 

@@ -47,11 +47,11 @@ def export(
     with torch.no_grad():
         started = explicit.begin(voxels)
         _write(explicit, (voxels, torch.full((1,), 1 / 120), *started), path)
-    found = OnnxNetwork(path)
-    gap = _gap(found, folded, voxels, positions)
+    exported = OnnxNetwork(path)
+    gap = _gap(exported, folded, voxels, positions)
     if not gap <= TOLERANCE:
         raise ValueError(f"export must give PyTorch's frames within {TOLERANCE}, got {gap:.2g}")
-    return found
+    return exported
 
 
 def require() -> None:
@@ -116,12 +116,12 @@ def _write(explicit: Explicit, example: tuple, path: Path) -> None:
 
 
 @torch.no_grad()
-def _gap(found: OnnxNetwork, folded: nn.Module, voxels: Tensor, positions) -> float:
-    told = {"positions": positions} if takes(folded, "positions") else {}
+def _gap(exported: OnnxNetwork, folded: nn.Module, voxels: Tensor, positions) -> float:
+    options = {"positions": positions} if takes(folded, "positions") else {}
     ours, theirs, gap = None, None, 0.0
     for k in range(CHECKED):
         shown = voxels.roll(3 * k, -1)
-        frame, ours = folded(shown, ours, **told)
-        other, theirs = found(shown, theirs)
+        frame, ours = folded(shown, ours, **options)
+        other, theirs = exported(shown, theirs)
         gap = max(gap, float((frame - other).abs().max()))
     return gap

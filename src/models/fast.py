@@ -66,7 +66,7 @@ class Fast(nn.Module):
         self.compiled = compiled
         if compiled:
             self.inner.compile(dynamic=False)
-        self.told = [name for name in ("window_s", "positions") if takes(network, name)]
+        self.options = [name for name in ("window_s", "positions") if takes(network, name)]
 
     @torch.no_grad()
     def forward(
@@ -83,10 +83,10 @@ class Fast(nn.Module):
         if self.compiled:  # a number would be compiled into the code
             window_s = torch.as_tensor(window_s, dtype=torch.float32)
         facts = {"window_s": window_s, "positions": positions}
-        told = {name: facts[name] for name in self.told}
+        options = {name: facts[name] for name in self.options}
         own = None if state is None else state[0]
         seen = voxels if self.rounds_itself else voxels.to(self.dtype)
-        frame, own = self.inner(seen, own, **told)
+        frame, own = self.inner(seen, own, **options)
         frame = frame.float()
         return frame, (own, frame)
 

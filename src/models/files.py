@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from src.models.checkpoints import newest, whole
-from src.records.whole import written
+from src.records.atomic import written
 
 WEIGHTS = Path(__file__).resolve().parents[2] / "weights"
 ROOMS = ("src.models.", "baselines.")

@@ -1,13 +1,15 @@
 """Reconstruction straight from lists of events, where the network can: no grid is made."""
 
 from collections.abc import Iterable, Iterator
+from typing import Any
 
+import numpy as np
 import torch
 from torch import nn
 
 from src.models.fast import running
 from src.models.runtime import FORMS, Runtime, runs
-from src.recordings.stream import Carry, Frame, Window
+from src.recordings.stream import Carry, Frame, Window, carried
 from src.recordings.views import Views
 
 
@@ -35,17 +37,10 @@ def frames(
     windows: Iterable[Window], runtime: Runtime, *, overlap: int = 1, carry: Carry | None = None
 ) -> Iterator[Frame]:
     """As `stream.frames`, of windows without grids (`Rule.grids`)."""
-    carry = Carry() if carry is None else carry
-    carry.states.extend([None] * (overlap - len(carry.states)))
-    for window in windows:
-        phase = carry.frames % overlap
-        if window.events:
-            runtime.state = carry.states[phase]
-            seconds = (window.end_us - window.start_us) * 1e-6
-            picture = runtime.step(*window.parts, 0.0, seconds)
-            carry.states[phase] = runtime.state
-            carry.picture = torch.from_numpy(picture.clip(0, 1))
-        elif carry.picture is None:
-            carry.picture = torch.full(runtime.size, 0.5)
-        carry.frames += 1
-        yield Frame(window.end_us * 1e-6, carry.picture.numpy(), window.events, window.outside)
+
+    def step(window: Window, state: Any) -> tuple[np.ndarray, Any]:
+        runtime.state = state
+        picture = runtime.step(*window.parts, 0.0, (window.end_us - window.start_us) * 1e-6)
+        return picture, runtime.state
+
+    return carried(windows, step, runtime.size, overlap, carry)

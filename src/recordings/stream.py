@@ -10,7 +10,7 @@ the recurrent state of the window that ended where it starts.  Every one of thes
 is exactly the reconstruction at the trained rate, and every event counts once per phase.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import nn
 
 from src.models.unroll import accepted, takes
 from src.recordings.lookup import Lookup
@@ -201,7 +201,7 @@ class Carry:
     """What lives from frame to frame: a recurrent state per phase, the picture, frames so far."""
 
     states: list[Any] = field(default_factory=list)
-    picture: Tensor | None = None
+    picture: Float[np.ndarray, "h w"] | None = None
     frames: int = 0
 
 
@@ -266,17 +266,35 @@ def frames(
     A network that takes `window_s` and `positions` is given them.  `carry` of an earlier call makes
     this one its continuation (law 6); it is kept up to date.
     """
+
+    def step(window: Window, state: Any) -> tuple[np.ndarray, Any]:
+        options = accepted(network, window_s=window.seconds, positions=positions)
+        voxels = torch.from_numpy(window.voxels)[None].to(device)
+        with torch.inference_mode():
+            picture, state = network(voxels, state, **options)
+        return picture[0, 0].float().cpu().numpy(), state
+
+    return carried(windows, step, None, overlap, carry)
+
+
+def carried(
+    windows: Iterable[Window],
+    step: Callable[[Window, Any], tuple[np.ndarray, Any]],
+    size: tuple[int, int] | None,
+    overlap: int,
+    carry: Carry | None,
+) -> Iterator[Frame]:
+    """Yield a frame per window, made by `step` of a window with events and the state of its phase;
+    `size`: of a picture before any event, None: of a window's grid.
+    """
     carry = Carry() if carry is None else carry
     carry.states.extend([None] * (overlap - len(carry.states)))
     for window in windows:
         phase = carry.frames % overlap
         if window.events:
-            options = accepted(network, window_s=window.seconds, positions=positions)
-            voxels = torch.from_numpy(window.voxels)[None].to(device)
-            with torch.inference_mode():
-                picture, carry.states[phase] = network(voxels, carry.states[phase], **options)
-            carry.picture = picture[0, 0].clamp(0, 1).float().cpu()
+            picture, carry.states[phase] = step(window, carry.states[phase])
+            carry.picture = picture.clip(0, 1)
         elif carry.picture is None:
-            carry.picture = torch.full(window.voxels.shape[-2:], 0.5)
+            carry.picture = np.full(size or window.voxels.shape[-2:], 0.5, np.float32)
         carry.frames += 1
-        yield Frame(window.end_us * 1e-6, carry.picture.numpy(), window.events, window.outside)
+        yield Frame(window.end_us * 1e-6, carry.picture, window.events, window.outside)

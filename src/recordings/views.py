@@ -16,9 +16,9 @@ import numpy as np
 import yaml
 from jaxtyping import Float
 
-from src.recordings.files import plain
+from src.recordings.files import safe_yaml
 from src.recordings.files.sources import Size
-from src.records.whole import write_text
+from src.records.atomic import write_text
 
 LARGEST_SIDE = 8192
 MOST_PIXELS = 2**24  # of a sensor, and of all views' pictures together
@@ -196,20 +196,20 @@ def load(path: Path | str, sensor: Size | None = None) -> Views:
     a `mirrored` its homography contradicts, or another sensor than `sensor` (height, width).
     """
     try:
-        content = plain.read(path)
+        content = safe_yaml.read(path)
         views = Views(
             _numbers(content["sensor"], int, 2),
             _numbers(content["model"], int, 2),
             _numbers(content["field"], float, 4),
             tuple(_view(entry) for entry in content["views"]),
         )
-        told = [entry.get("mirrored") for entry in content["views"]]
+        stated = [entry.get("mirrored") for entry in content["views"]]
     except (OSError, yaml.YAMLError, KeyError, TypeError, OverflowError) as error:
         why = f"{type(error).__name__} {error}"
         raise ValueError(
             f"views must be a file of calibrate task=views, got {path}: {why}"
         ) from None
-    for view, mirrored in zip(views.views, told, strict=True):
+    for view, mirrored in zip(views.views, stated, strict=True):
         if mirrored not in (None, list(views.mirrored(view))):
             raise ValueError(f"{path}: mirrored of {view.position} contradicts its homography")
     if sensor is not None and tuple(sensor) != views.sensor:

@@ -7,6 +7,7 @@ import json
 import shutil
 import statistics
 import subprocess
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,8 +16,8 @@ from rich.table import Table
 
 from src.metrics.bootstrap import interval
 from src.metrics.table import METRICS, NAMES
-from src.recordings.files import plain
-from src.records.whole import write_text
+from src.recordings.files import safe_yaml
+from src.records.atomic import write_text
 
 SCHEMA = 1
 LEAST_FREE_BYTES = 200 * 2**20
@@ -54,11 +55,13 @@ def content(config: str) -> dict:
 
     Left out: `paths`, and for training the `ckpt` it went on from (law 6).
     """
-    found = plain.parse(config)
-    run = found.pop("paths", {}).get("run")
-    if found.get("task") == "train":
-        found.pop("ckpt", None)
-    return json.loads(json.dumps(found).replace(json.dumps(run)[1:-1], "RUN")) if run else found
+    settings = safe_yaml.parse(config)
+    run = settings.pop("paths", {}).get("run")
+    if settings.get("task") == "train":
+        settings.pop("ckpt", None)
+    return (
+        json.loads(json.dumps(settings).replace(json.dumps(run)[1:-1], "RUN")) if run else settings
+    )
 
 
 def digest(config: str) -> str:
@@ -87,8 +90,8 @@ def summary(clips: list[dict]) -> dict:
 
     `interval`: 95 % of the means of resampled clips.
     """
-    found = [name for name in NAMES if clips and name in clips[0]]
-    values = {metric: [clip[metric] for clip in clips] for metric in found}
+    present = [name for name in NAMES if clips and name in clips[0]]
+    values = {metric: [clip[metric] for clip in clips] for metric in present}
     return {"clips": len(clips)} | {
         metric: {"mean": statistics.fmean(v), "std": statistics.pstdev(v), "interval": interval(v)}
         for metric, v in values.items()
@@ -123,13 +126,16 @@ def write(run: Path, config: str, rows: list[Row], **facts) -> dict:
     return record
 
 
+def csv_text(heads: Iterable, rows: Iterable[Iterable]) -> str:
+    """Return a table as CSV."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([heads, *rows])
+    return text.getvalue()
+
+
 def clips_csv(clips: list[dict]) -> str:
     """Return one line per clip: what was drawn for it and its scores."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(clips[0]))
-    writer.writeheader()
-    writer.writerows(clips)
-    return text.getvalue()
+    return csv_text(clips[0], [[clip[name] for name in clips[0]] for clip in clips])
 
 
 def table(rows: list[Row]) -> Table:

@@ -13,7 +13,7 @@ import yaml
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from src.recordings.files import plain
+from src.recordings.files import safe_yaml
 from src.records import results
 
 FIGURES = ("chart", "machine", "adapt", "stress")  # of the doors chart and stress
@@ -87,7 +87,7 @@ def find(folders: list[Path]) -> list[Run]:
 def plans(folders: list[Path]) -> list[Plan]:
     """Return the sweeps whose `multirun.yaml` lies at or below `folders`."""
     files = {f.resolve() for folder in folders for f in folder.rglob("multirun.yaml")}
-    return [_plan(plain.read(file)["hydra"]) for file in sorted(files)]
+    return [_plan(safe_yaml.read(file)["hydra"]) for file in sorted(files)]
 
 
 def figures(folders: list[Path]) -> list[Path]:

@@ -11,7 +11,6 @@ unlocks it when the process ends, however it ends.
 import fcntl
 import hashlib
 import json
-import os
 import shutil
 import warnings
 from ast import dump, parse
@@ -24,11 +23,13 @@ import torch
 
 import src.sim
 from src.models.checkpoints import WholeFiles, whole
+from src.records.atomic import write_text
 from src.sim.pipeline import Pipeline
 
 GIB = 2**30
 FACTS = 4096  # bytes of a file beside its pictures, at most
 MADE_OF = "made_of.json"
+NOTE = 1 << 40  # the byte of the lock file that is locked while MADE_OF is written
 LATER = ("sensor", "voxel.py")  # the parts of src/sim that come after the bank
 
 
@@ -130,10 +131,9 @@ class Bank:
         """Make the folder; raise ValueError where it cannot hold this bank."""
         self.folder.mkdir(parents=True, exist_ok=True)
         note = self.folder / MADE_OF
-        if not note.exists():
-            partial = note.with_name(f"{MADE_OF}.{os.getpid()}.partial")
-            partial.write_text(json.dumps(self.made_of, indent=1))
-            os.replace(partial, note)
+        with self.claim(NOTE):
+            if not note.exists():
+                write_text(note, json.dumps(self.made_of, indent=1))
         if difference(note, self.made_of):
             raise ValueError(
                 f"data.bank_root: {self.folder} was made by another config "

@@ -1,7 +1,5 @@
 """The learning curve: scores of fixed validation clips, a line for every hour or so of training."""
 
-import csv
-import io
 from copy import deepcopy
 from pathlib import Path
 
@@ -10,7 +8,7 @@ from lightning import Callback, LightningModule, Trainer
 
 from src.metrics.table import NAMES
 from src.models import files
-from src.records.results import write_text
+from src.records.results import csv_text, write_text
 
 
 class Curve(Callback):
@@ -90,19 +88,15 @@ class Curve(Callback):
         """Export the weights with all that a training needs to go on from them (handover.py)."""
         if self.export is None:
             return
-        self.export.parent.mkdir(parents=True, exist_ok=True)
         reached = {"hours": module.clock.hours, "windows": module.windows_seen}
         card = reached | {"steps": self.all_steps, "loss": self.loss, "curve": self.rows}
         # A copy: spectral norm is folded in eval mode, and the training goes on in its own.
         files.save(self.export, deepcopy(module.method), module.network_spec, card)
 
     def _write(self) -> None:
-        text = io.StringIO()
-        writer = csv.DictWriter(text, list(self.rows[-1]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(self.rows)
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        write_text(self.path, text.getvalue())
+        heads = list(self.rows[-1])
+        rows = [[row.get(name, "") for name in heads] for row in self.rows]
+        write_text(self.path, csv_text(heads, rows))
 
 
 @torch.no_grad()

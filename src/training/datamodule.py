@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from src.sim import noise
 from src.sim.pipeline import Draw, Pipeline, Sample
 from src.training.augment import Augment
-from src.training.filling import Filler
+from src.training.bank_filler import Filler
 
 
 class LightFieldData(LightningDataModule):

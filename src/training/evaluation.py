@@ -5,8 +5,9 @@ import torch
 from torch import nn
 
 from src.metrics.scores import Scores
-from src.models.cost import clock, macs, macs_per_frame
-from src.models.unroll import accepted, video
+from src.models import stopwatch
+from src.models.cost import macs, macs_per_frame
+from src.models.unroll import video
 from src.records.results import Row
 from src.sim.pipeline import Sample
 from src.training.datamodule import LightFieldData
@@ -38,36 +39,23 @@ def test(
 
 @torch.no_grad()
 def cost(network: nn.Module, sample: Sample) -> tuple[int, float]:
-    """Return multiply-accumulates and milliseconds of one frame.
+    """Return multiply-accumulates and milliseconds of a frame, the first window of the first clip.
 
     A method that makes a whole video at once is given all of `sample`, and its cost shared out.
     """
+    network.eval()
     if not hasattr(network, "video"):
         views, bins, height, width = sample.voxels.shape[2:]
         size = {"views": views, "bins": bins, "positions": sample.positions}
-        return macs_per_frame(network, height, width, **size), latency_ms(network, sample)
-    now = clock(torch.get_num_threads(), sample.voxels.device)
+        work = macs_per_frame(network, height, width, **size)
+        device = next((parameter.device for parameter in network.parameters()), torch.device("cpu"))
+        window, threads = sample.voxels[:1, 0].to(device), torch.get_num_threads()
+        took = stopwatch.frame(
+            network, window, positions=sample.positions, count=threads, seconds=0.0, least=5
+        )
+        return work, took.median_ms
+    now = stopwatch.clock(torch.get_num_threads(), sample.voxels.device)
     frames, start = sample.target.shape[:2].numel(), now()
     video(network, sample)
     seconds = now() - start
     return macs(lambda: video(network, sample)) // frames, 1e3 * seconds / frames
-
-
-@torch.no_grad()
-def latency_ms(network: nn.Module, sample: Sample, repeats: int = 5) -> float:
-    """Return the median time of one frame in ms: the first window of the first clip, state carried,
-    after a warm-up.
-    """
-    network.eval()
-    device = next((parameter.device for parameter in network.parameters()), torch.device("cpu"))
-    voxels, now = sample.voxels[:1, 0].to(device), clock(torch.get_num_threads(), device)
-    options = accepted(network, positions=sample.positions)
-    _, state = network(voxels, None, **options)
-    times = []
-    for _ in range(repeats):
-        start = now()
-        _, state = network(voxels, state, **options)
-        if device.type == "cuda":
-            torch.cuda.synchronize(device)
-        times.append(1e3 * (now() - start))
-    return sorted(times)[repeats // 2]

@@ -145,14 +145,14 @@ class Reconstructor(LightningModule):
         The loss sees every picture alone, so its gradient there is had a few pictures at a time,
         and its own maps (VGG's are larger than the network's) never stand in memory together.
         """
-        told = {}
+        options = {}
         if takes(self.loss, "drawer"):  # a loss that draws, draws the same again in a resumed run
-            told["drawer"] = torch.Generator().manual_seed(self.global_step)
+            options["drawer"] = torch.Generator().manual_seed(self.global_step)
         pictures = frames.flatten(0, 1)
         leaves, total = pictures.detach().requires_grad_(), torch.zeros((), device=self.device)
         pairs = zip(leaves.split(PICTURES), target.flatten(0, 1).split(PICTURES), strict=True)
         for ours, truth in pairs:
-            loss = self.loss(ours, truth, **told).sum() / count
+            loss = self.loss(ours, truth, **options).sum() / count
             loss.backward()
             total += loss.detach()
         self.manual_backward(pictures, leaves.grad)
@@ -196,8 +196,8 @@ class Reconstructor(LightningModule):
         return [drawn | self.scores(ours, truth) for ours, truth, drawn in clips]
 
     def _unroll(self, sample: "Sample", part: slice, state: Any):
-        known = {"window_s": sample.window_s, "positions": sample.positions}
-        return unroll(self.network, sample.voxels[:, part], state, **known)
+        options = {"window_s": sample.window_s, "positions": sample.positions}
+        return unroll(self.network, sample.voxels[:, part], state, **options)
 
     def configure_optimizers(self):
         """Return the optimiser over all parameters and its schedule."""

@@ -27,6 +27,7 @@ from baselines.mambatm import MambaTM
 from src.metrics.image import L1
 from src.sim.optics import Optics
 from src.sim.scenes.photographs import Photographs
+from src.sim.sensor.sensor import EventSensor
 from src.sim.turbulence.simulated import SimulatedAir
 from src.training.augment import Augment
 
@@ -45,8 +46,9 @@ class Net(nn.Module):
 """
 PARTS = {
     "scene": "Photographs", "optics": "Optics", "turbulence": "SimulatedAir",
-    "augment": "Augment", "loss": "L1", "optimizer": "Adam", "floor.method": "HighPass",
-    "logger.csv": "CSVLogger", "callbacks.checkpoint": "ModelCheckpoint", "restorer": "MambaTM",
+    "sensor": "EventSensor", "augment": "Augment", "loss": "L1", "optimizer": "Adam",
+    "floor.method": "HighPass", "logger.csv": "CSVLogger",
+    "callbacks.checkpoint": "ModelCheckpoint", "restorer": "MambaTM",
 }  # fmt: skip
 
 

@@ -6,6 +6,7 @@ from torch import nn
 
 from src.bench import timing
 from src.bench.pareto import front, knee, standard_error
+from src.models import stopwatch
 
 
 def test_the_front_holds_what_none_beats_in_both():
@@ -37,6 +38,6 @@ def test_peak_memory_counts_what_is_alive_at_once():
 
 
 def test_a_frame_is_timed_in_thread_time_on_one_thread():
-    took = timing.frame(Doubling(), torch.zeros(1, 1, 5, 64, 64), seconds=0.01)
+    took = stopwatch.frame(Doubling(), torch.zeros(1, 1, 5, 64, 64), seconds=0.01)
     assert took.clock == "thread" and took.frames >= 3 and 0 <= took.least_ms <= took.median_ms
-    assert timing.frame(Doubling(), torch.zeros(1, 1, 1, 8, 8), count=2).clock == "wall"
+    assert stopwatch.frame(Doubling(), torch.zeros(1, 1, 1, 8, 8), count=2).clock == "wall"

@@ -20,7 +20,7 @@ from baselines.firenet import FireNet
 from src.models import files
 from src.recordings import views
 from src.recordings.calibration import alignment
-from src.recordings.files import aedat, columns, formats, plain, sources
+from src.recordings.files import aedat, columns, formats, safe_yaml, sources
 from src.sim.scenes import photographs, pictures, videos
 from src.sim.scenes.pictures import LARGEST_PIXELS
 from src.simulate import alike
@@ -212,8 +212,8 @@ def test_a_video_does_not_unpack_without_bound(tmp_path, monkeypatch):
 )
 def test_a_config_does_not_grow_without_bound(tmp_path, text, words):
     (tmp_path / "a.yaml").write_text(text)
-    with pytest.raises(plain.yaml.YAMLError, match=words):
-        plain.read(tmp_path / "a.yaml")
+    with pytest.raises(safe_yaml.yaml.YAMLError, match=words):
+        safe_yaml.read(tmp_path / "a.yaml")
     for read in (
         views.load,
         alignment.read_corners,

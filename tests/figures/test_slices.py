@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from src.figures.slices import along, circle, line, sample
+from src.figures.slices import along, around, sample, straight
 
 Y, X = np.mgrid[:40, :60].astype(float)
 
@@ -19,15 +19,15 @@ def test_a_plane_is_sampled_exactly_between_pixels():
 
 def test_row_and_column_are_the_video_itself():
     video = np.random.default_rng(0).random((5, 40, 60)).astype(np.float32)
-    assert np.allclose(sample(video, line((0, 12), (59, 12))), video[:, 12], atol=1e-6)
-    assert np.allclose(sample(video, line((7, 0), (7, 39))), video[:, :, 7], atol=1e-6)
+    assert np.allclose(sample(video, straight((0, 12), (59, 12))), video[:, 12], atol=1e-6)
+    assert np.allclose(sample(video, straight((7, 0), (7, 39))), video[:, :, 7], atol=1e-6)
 
 
 def test_a_turning_sector_draws_a_straight_line_of_its_own_speed():
     turn = 2 * math.pi * np.arange(12) / 24
     angle = np.arctan2(Y - 20, X - 30)
     video = np.stack([np.cos(angle - phase) for phase in turn])
-    slices = sample(video, circle((30, 20), 15, 240))
+    slices = sample(video, around((30, 20), 15, 240))
     assert np.array_equal(slices.argmax(1) // 10, np.arange(12))
     assert np.abs(slices.argmax(1) - 10 * np.arange(12)).max() <= 2
 
@@ -43,7 +43,7 @@ def test_a_circling_dot_stays_at_its_radius():
 
 
 def test_points_are_at_most_a_pixel_apart():
-    for points in (line((2, 3), (30.5, 17.2)), circle((20, 20), 9.3)):
+    for points in (straight((2, 3), (30.5, 17.2)), around((20, 20), 9.3)):
         assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() <= 1
 
 

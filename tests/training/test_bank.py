@@ -16,14 +16,15 @@ from src.app import simulation as simulations
 from src.models.checkpoints import whole
 from src.sim.optics import Optics
 from src.sim.pipeline import Pipeline
+from src.sim.sensor.sensor import EventSensor
 from src.sim.turbulence.simulated import SimulatedAir
 from src.simulate import simulate
 from src.train import train
 from src.training.augment import Augment
 from src.training.bank import MADE_OF, Bank, listing, simulation
-from src.training.banked import EACH, FIRST, Banked
+from src.training.bank_filler import Filler, fill
+from src.training.bank_samples import EACH, FIRST, Banked
 from src.training.datamodule import LightFieldData
-from src.training.filling import Filler, fill
 from tests.faults.test_surroundings import small_files
 from tests.sim.test_pipeline import Waves
 from tests.test_train import TINY, config
@@ -53,7 +54,7 @@ def bank(root: Path, clips: int = 3, *, made_of=None, gib: float = 1.0, **kwargs
 
 
 def banked(of: Bank, views: int = 9, sensor=DRAWN, **kwargs) -> Banked:
-    return Banked(of, Optics(views), sensor, **{"windows": 4, "crop": 16} | kwargs)
+    return Banked(of, Optics(views), EventSensor(**sensor), **{"windows": 4, "crop": 16} | kwargs)
 
 
 def test_a_sample_is_the_simulation_to_the_rounding_of_float16(tmp_path):

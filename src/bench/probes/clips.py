@@ -104,9 +104,7 @@ def film(pipeline: Pipeline, number: int, conditions: Conditions) -> Stream:
     )
     if conditions.gain:
         views = _flicker(views, conditions.gain, noise.key(draw.key, "gain"))
-    sensor = copy(pipeline.sensor)
-    vars(sensor).update(conditions.sensor)
-    sensor = sensor.at(sensor.threshold if conditions.sensor.get("threshold") else draw.threshold)
+    sensor = pipeline.sensor.having(**{"threshold": draw.threshold} | dict(conditions.sensor))
     ids = pipeline.optics.view_ids
     top, left, height, width = draw.crop
     return Stream(

@@ -1,13 +1,12 @@
 """Every probe on every network: findings, a table of them, and in plain words where each breaks."""
 
-import csv
-import io
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from src.bench.candidates import Candidate, Subject
 from src.bench.probes.standard import Bench, Finding
+from src.records.results import csv_text
 
 Probe = Callable[[Subject, Bench], Finding]
 Cell = Finding | str  # or why there is none
@@ -41,16 +40,16 @@ def gather(accounts: Iterable[Account], keep: Callable[[Found], None]) -> tuple[
 
     `keep` is called with what is found so far after every network.
     """
-    found: Found = {}
+    findings: Found = {}
     standards: dict[str, float] = {}
     for account in accounts:
         for probe, cell in account.cells.items():
-            found.setdefault(probe, {})[account.network] = cell
+            findings.setdefault(probe, {})[account.network] = cell
         if account.standard is not None:
             standards[account.network] = account.standard
-        keep(found)
+        keep(findings)
         print(f"{account.network}: {account.seconds:.0f} s", flush=True)
-    return found, standards
+    return findings, standards
 
 
 def _cell(candidate: Candidate, probe: Probe, bench: Bench) -> Cell:
@@ -66,16 +65,13 @@ def _cell(candidate: Candidate, probe: Probe, bench: Bench) -> Cell:
         return str(error)
 
 
-def table(found: Found, titles: Mapping[str, str]) -> str:
+def table(findings: Found, titles: Mapping[str, str]) -> str:
     """Return CSV: one line for the value of each cell and for each point of its curve."""
-    text = io.StringIO()
-    writer = csv.writer(text)
-    heads = "network probe title varied setting value unit limit failed reason"
-    writer.writerow(heads.split())
-    for probe, cells in found.items():
+    heads, lines = "network probe title varied setting value unit limit failed reason", []
+    for probe, cells in findings.items():
         for network, cell in cells.items():
-            writer.writerows(_lines(network, probe, titles[probe], cell))
-    return text.getvalue()
+            lines += _lines(network, probe, titles[probe], cell)
+    return csv_text(heads.split(), lines)
 
 
 def _lines(network: str, probe: str, title: str, cell: Cell) -> list[list]:
@@ -90,12 +86,12 @@ def _lines(network: str, probe: str, title: str, cell: Cell) -> list[list]:
     return [[*head, "", "", f"{cell.value:.6g}", *tail, cell.failed, ""], *points]
 
 
-def words(found: Found, titles: Mapping[str, str], standards: Mapping[str, float]) -> str:
+def words(findings: Found, titles: Mapping[str, str], standards: Mapping[str, float]) -> str:
     """Return, in plain words, where each network breaks."""
-    networks = list(next(iter(found.values()), {}))
+    networks = list(next(iter(findings.values()), {}))
     parts = ["# Where each method breaks\n"]
     for network in networks:
-        cells = {titles[probe]: row[network] for probe, row in found.items()}
+        cells = {titles[probe]: row[network] for probe, row in findings.items()}
         parts.append(f"## {network}\n\n{_standard(standards.get(network))}{_account(cells)}\n")
     return "\n".join(parts)
 

@@ -15,7 +15,7 @@ import yaml
 from jaxtyping import Float, UInt8
 
 from src.recordings.calibration.boards import Target, groups
-from src.recordings.files import plain
+from src.recordings.files import safe_yaml
 from src.recordings.views import Size, View, Views, apply
 
 Position = tuple[int, int]
@@ -217,7 +217,7 @@ def read_corners(path: Path | str) -> dict[Position, Points]:
     Raises ValueError for anything else.
     """
     try:
-        return dict(map(_corners, plain.read(path)))
+        return dict(map(_corners, safe_yaml.read(path)))
     except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, OverflowError) as error:
         why = f"{type(error).__name__} {error}"
         raise ValueError(

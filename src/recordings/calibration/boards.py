@@ -23,9 +23,7 @@ Points = Float[np.ndarray, "_ 2"]
 
 
 @dataclass(frozen=True)
-class Checkerboard:
-    """`rows` x `cols` inner corners, each at least 3."""
-
+class _Grid:
     rows: int = 5
     cols: int = 7
     ordered = False
@@ -40,6 +38,10 @@ class Checkerboard:
     @property
     def count(self) -> int:
         return self.rows * self.cols
+
+
+class Checkerboard(_Grid):
+    """`rows` x `cols` inner corners, each at least 3."""
 
     def features(self, picture: Picture) -> Points:
         """Saddle points: where the Hessian's determinant is most negative for the contrast there.
@@ -65,24 +67,10 @@ class Checkerboard:
 
 
 @dataclass(frozen=True)
-class Circles:
+class Circles(_Grid):
     """`rows` x `cols` dots on a square lattice, each at least 3; `dark` dots on a bright ground."""
 
-    rows: int = 5
-    cols: int = 7
     dark: bool = True
-    ordered = False
-
-    def __post_init__(self):
-        _check_shape(self.rows, self.cols)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return self.rows, self.cols
-
-    @property
-    def count(self) -> int:
-        return self.rows * self.cols
 
     def features(self, picture: Picture) -> Points:
         spots = self._detector().detect(self._dark(picture))

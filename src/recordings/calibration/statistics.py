@@ -5,7 +5,6 @@ Gaussian, intensity its flux over the flux's mean in time.  Lengths are pixels o
 given, times seconds.  Frames in which a fit failed are left out of every mean and counted.
 """
 
-import csv
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from jaxtyping import Float, Int
 from src.recordings.calibration.alignment import picture_of
 from src.recordings.calibration.boards import Circles
 from src.recordings.calibration.dots import Fits
+from src.records.results import csv_text, write_text
 
 
 @dataclass(frozen=True)
@@ -230,10 +230,7 @@ def write_csv(
                     "still_scintillation": statistics.still_scintillation[view, dot],
                 }
             )
-    with open(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_text(Path(path), csv_text(rows[0], [row.values() for row in rows]))
 
 
 def _mean(values: np.ndarray, axis: int | None) -> np.ndarray | float:

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 import yaml
 
-from src.recordings.files import plain
+from src.recordings.files import safe_yaml
 from src.sim.turbulence.atmosphere import Atmosphere
 from src.sim.turbulence.prior import Appearance, matching
 from src.sim.turbulence.ranges import Range, between, log_between
@@ -89,7 +89,7 @@ def read(path: Path | str | None) -> AirFile:
     if path is None:
         raise ValueError(wrong)
     try:
-        content = plain.read(path)
+        content = safe_yaml.read(path)
     except (OSError, yaml.YAMLError) as error:
         raise ValueError(f"{wrong}: {error}") from error
     names = [part.name for part in fields(AirFile)]

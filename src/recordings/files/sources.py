@@ -23,13 +23,13 @@ def sensor_size(path: Path | str, sensor: Sequence[int] | None = None) -> Size:
 
     Raises ValueError where neither says, or both do and differ.
     """
-    told = formats.open_events(path).size
-    told = told if told is None else told[::-1]
-    if told is None and sensor is None:
+    stated = formats.open_events(path).size
+    stated = stated if stated is None else stated[::-1]
+    if stated is None and sensor is None:
         raise ValueError(f"{path} does not state its sensor; give sensor_size=[height,width]")
-    if None not in (told, sensor) and tuple(sensor) != told:
-        raise ValueError(f"sensor_size must be {told}, as {path} states, got {tuple(sensor)}")
-    return told or tuple(sensor)
+    if None not in (stated, sensor) and tuple(sensor) != stated:
+        raise ValueError(f"sensor_size must be {stated}, as {path} states, got {tuple(sensor)}")
+    return stated or tuple(sensor)
 
 
 def events(path: Path | str, sensor: Size, seconds: float = 0.05) -> Iterator[np.ndarray]:

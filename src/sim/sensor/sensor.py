@@ -23,9 +23,9 @@ from torch import Tensor
 from src.sim import noise
 from src.sim.sensor.engines import sensor_cpu, sensor_eager
 from src.sim.sensor.engines.job import Job, State
+from src.sim.sensor.initial_state import blank, rested
 from src.sim.sensor.limits import MODES, THRESHOLDS, check, check_frames, threshold_range, within
 from src.sim.sensor.response import EXTRA, UNIT, decode_srgb, nodes, response_table
-from src.sim.sensor.start import blank, rested
 
 __all__ = ["EVENT", "EventSensor", "State", "decode_srgb"]
 
@@ -85,11 +85,12 @@ class EventSensor:
         check(vars(self))
         self._table = response_table(response, input, floor)
 
-    def at(self, threshold: float) -> "EventSensor":
-        """Return the same sensor with one threshold."""
+    def having(self, **settings) -> "EventSensor":
+        """Return the same sensor with other `settings`, arguments of the class."""
         found = copy(self)
-        found.threshold = threshold
+        vars(found).update(settings)
         check(vars(found))
+        found._table = response_table(found.response, found.input, found.floor)
         return found
 
     def draw(self, key: int, seed: int | None = None) -> "EventSensor":

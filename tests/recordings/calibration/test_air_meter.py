@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from src.app import tasks
+from src.app import calibrations
 from src.calibrate import calibrate
 from src.recordings.calibration import air_meter, following
 from src.recordings.files import measured, sources
@@ -153,7 +153,7 @@ def test_the_door_writes_a_file_and_a_figure(folder, tmp_path):
     assert found.decay_s == measured.Estimate(None, None, None)  # pictures have no frame rate
     assert save.read_text() == (run / "air.yaml").read_text()
     assert cv2.imread(str(run / "air.png")).std() > 10
-    timed = tasks.measure_air(str(folder), tmp_path, fps=50.0)
+    timed = calibrations.measure_air(str(folder), tmp_path, fps=50.0)
     assert timed.found.decay_s.value == pytest.approx(timed.tilt.decay / 50)
     assert timed.found.rms_px.value == pytest.approx(found.rms_px.value, rel=1e-3)
 

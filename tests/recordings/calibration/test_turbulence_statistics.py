@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from src.app import tasks as calibration
+from src.app import calibrations
 from src.recordings import capture, lookup
 from src.recordings.calibration import dots, statistics
 from src.sim import noise
@@ -105,7 +105,7 @@ def case(request, tmp_path_factory) -> Case:
     write(folder / "dots.h5", views, camera)
     write(folder / "still.h5", calm.expand(9, 12, -1, -1), camera)
     moving, still, there = (str(folder / name) for name in ("dots.h5", "still.h5", "views.yaml"))
-    found = calibration.characterise(moving, still, folder, fps=FPS, views=there)
+    found = calibrations.characterise(moving, still, folder, fps=FPS, views=there)
     assert found.failed.sum() < 0.01 * found.blur.size
     return Case(alpha, alike, turbulence, views, found)
 

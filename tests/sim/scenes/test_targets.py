@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from src.figures.slices import circle, sample
+from src.figures.slices import around, sample
 from src.sim.scenes.shapes import disc, inside, stripes, turned
 from src.sim.scenes.targets import (
     KINDS,
@@ -67,7 +67,7 @@ def test_a_dot_is_where_its_truth_says_and_circles():
 
 def test_a_stripe_draws_straight_lines_in_theta_and_time():
     clip = SpinningStripe(height=96, width=96, frames=25, speed=2.0).clip(1)
-    slices = sample(clip.frames.numpy(), circle((47.5, 47.5), 30, 720))
+    slices = sample(clip.frames.numpy(), around((47.5, 47.5), 30, 720))
     # The stripe crosses the circle at two opposite angles: the second harmonic turns twice as far.
     phase = np.unwrap(np.angle(np.fft.rfft(slices)[:, 2])) / -2
     assert np.allclose(np.diff(phase), 2 * math.pi * 2.0 / 120, atol=0.003)

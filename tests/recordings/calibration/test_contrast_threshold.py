@@ -6,7 +6,7 @@ import torch
 
 from src.figures import event_rate
 from src.recordings import event_rates
-from src.recordings.calibration import contrast
+from src.recordings.calibration import contrast_threshold
 from src.recordings.files.formats import EVENT, open_events, write_events
 from src.sim.sensor.sensor import EventSensor
 
@@ -44,7 +44,7 @@ def test_a_known_threshold_is_found(on, off_ratio, refractory_s):
     recording = recorded(camera, [scene(seed) for seed in range(8)])
     measured = event_rates.measure(recording, np.zeros((48, 48), np.int64), slices=40)
     others = [scene(seed) for seed in range(100, 106)]
-    found = contrast.estimate(measured, others, FPS, settings, GRID)
+    found = contrast_threshold.estimate(measured, others, FPS, EventSensor(**settings), GRID)
     assert abs(np.log(found.on[0] / on)) < 0.12
     assert abs(np.log(found.off[0] / (on * off_ratio))) < 0.12
     assert found.on[1] < found.on[0] < found.on[2]
@@ -55,7 +55,7 @@ def test_the_same_scene_gives_the_threshold_exactly():
     clips = [scene(seed) for seed in range(3)]
     recording = recorded(EventSensor(0.2), clips)
     measured = event_rates.measure(recording, np.zeros((48, 48), np.int64), slices=40)
-    found = contrast.estimate(measured, clips, FPS, {}, GRID)
+    found = contrast_threshold.estimate(measured, clips, FPS, EventSensor(), GRID)
     assert abs(found.on[0] / 0.2 - 1) < 0.02 and abs(found.off[0] / 0.2 - 1) < 0.02
 
 
@@ -102,7 +102,7 @@ def test_a_rate_that_no_threshold_makes_is_named():
     recording = recorded(EventSensor(0.2), [scene(0)])
     measured = event_rates.measure(recording, np.zeros((48, 48), np.int64), slices=10)
     with pytest.raises(ValueError, match="outside what the grid"):
-        contrast.estimate(measured, [scene(1)], FPS, {}, [0.8, 1.0, 1.4])
+        contrast_threshold.estimate(measured, [scene(1)], FPS, EventSensor(), [0.8, 1.0, 1.4])
 
 
 def test_a_recording_off_the_sensor_is_named():
@@ -115,8 +115,8 @@ def test_figure_and_table_are_written_from_a_file(tmp_path):
     clips = [scene(0)]
     write_events(tmp_path / "a.raw", recorded(EventSensor(0.2), clips)[0], width=48, height=48)
     measured = event_rates.measure(open_events(tmp_path / "a.raw"), np.zeros((48, 48), np.int64))
-    found = contrast.estimate(measured, clips, FPS, {}, GRID)
+    found = contrast_threshold.estimate(measured, clips, FPS, EventSensor(), GRID)
     event_rate.threshold(found, tmp_path / "threshold.png")
-    contrast.write_csv(found, measured, tmp_path / "threshold.csv")
+    contrast_threshold.write_csv(found, measured, tmp_path / "threshold.csv")
     assert (tmp_path / "threshold.png").stat().st_size > 5000
     assert "estimate,,0." in (tmp_path / "threshold.csv").read_text()

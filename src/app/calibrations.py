@@ -11,14 +11,15 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from src.figures import event_rate, measured_air, views_found
+from src.figures import calibration_pictures, event_rate, measured_air
 from src.recordings import event_rates, lookup, stream
-from src.recordings.calibration import air_meter, alignment, contrast, dots, statistics
+from src.recordings.calibration import air_meter, alignment, contrast_threshold, dots, statistics
 from src.recordings.calibration.boards import Target
 from src.recordings.files import formats, sources
 from src.recordings.files.measured import SIDE
 from src.recordings.views import Views, load
 from src.records import results
+from src.sim.sensor import EventSensor
 
 
 def align_views(
@@ -41,16 +42,16 @@ def align_views(
     picture = alignment.picture_of(sources.sensor_picture(recording, sensor_size))
     sizes = {"sensor": picture.shape, "model": tuple(resolution)}
     if corners:
-        found = alignment.by_hand(alignment.read_corners(corners), **sizes)
-        views_found.views_by_hand(picture, found, folder / "views.png")
+        geometry = alignment.by_hand(alignment.read_corners(corners), **sizes)
+        calibration_pictures.views_by_hand(picture, geometry, folder / "views.png")
     else:
         seen = alignment.find(picture, target, mirrors)
-        views_found.views_found(picture, seen, folder / "found.png")
+        calibration_pictures.views_found(picture, seen, folder / "found.png")
         aligned = alignment.align(seen, margin=margin, threshold_px=threshold_px, **sizes)
-        views_found.views_aligned(picture, aligned, folder / "views.png")
-        found = aligned.views
-    found.save(folder / "views.yaml")
-    return found
+        calibration_pictures.views_aligned(picture, aligned, folder / "views.png")
+        geometry = aligned.views
+    geometry.save(folder / "views.yaml")
+    return geometry
 
 
 def find_threshold(
@@ -58,21 +59,21 @@ def find_threshold(
     folder: Path,
     clips: Sequence[Float[Tensor, "views frames h w"]],
     fps: float,
-    sensor: dict,
+    sensor: EventSensor,
     *,
     views: str | None = None,
     sensor_size: Sequence[int] | None = None,
-) -> contrast.Estimate:
+) -> contrast_threshold.Estimate:
     """Match the recording's event rate with that of `sensor` looking at `clips`; write
     `threshold.csv` and `threshold.png`."""
     size = sources.sensor_size(recording, sensor_size)
     there = load(views, size) if views else Views.single(size, size)
     events = formats.open_events(recording, size[::-1])
     measured = event_rates.measure(events, lookup.build(there).view)
-    found = contrast.estimate(measured, clips, fps, sensor)
-    contrast.write_csv(found, measured, folder / "threshold.csv")
-    event_rate.threshold(found, folder / "threshold.png")
-    return found
+    estimate = contrast_threshold.estimate(measured, clips, fps, sensor)
+    contrast_threshold.write_csv(estimate, measured, folder / "threshold.csv")
+    event_rate.threshold(estimate, folder / "threshold.png")
+    return estimate
 
 
 def characterise(
@@ -104,10 +105,10 @@ def characterise(
         light = np.stack(grounds)[:, None]
         calm, moving = calm / light, moving / light
     fits = [[dots.fit(film, places, reach) for film in films] for films in (moving, calm)]
-    found = statistics.measure(*fits, fps=fps, centre=centre)
-    statistics.write_csv(found, folder / "turbulence.csv", positions)
-    views_found.turbulence(found, positions, folder / "turbulence.png")
-    return found
+    fitted = statistics.measure(*fits, fps=fps, centre=centre)
+    statistics.write_csv(fitted, folder / "turbulence.csv", positions)
+    calibration_pictures.turbulence(fitted, positions, folder / "turbulence.png")
+    return fitted
 
 
 def measure_air(
@@ -133,15 +134,13 @@ def measure_air(
     if len({frame.shape for frame in film}) > 1:
         raise ValueError(f"video must hold frames of one size, got several in {video}")
     rate = sources.frame_rate(video) if fps is None else fps
-    found = air_meter.measure(np.stack(film), rate)
-    text = (
-        f"# The air of {Path(video).name}, {found.frames} frames; pixels of a frame whose smaller"
-    )
-    text += f" side is {SIDE}.\n{found.found.text()}"
-    measured_air.air(found, Path(video).name, folder / "air.png")
+    air = air_meter.measure(np.stack(film), rate)
+    text = f"# The air of {Path(video).name}, {air.frames} frames; pixels of a frame whose smaller"
+    text += f" side is {SIDE}.\n{air.found.text()}"
+    measured_air.air(air, Path(video).name, folder / "air.png")
     for path in (folder / "air.yaml", *([Path(save)] if save else [])):
         results.write_text(path, text)
-    return found
+    return air
 
 
 def _films(

@@ -36,6 +36,41 @@ def wander_of_all(film: Float[np.ndarray, "frames h w"], step: int) -> float:
     return float(np.nanmedian(rows + columns))
 
 
+def of_still(film: Float[np.ndarray, "frames h w"], step: int) -> dict[str, float]:
+    """Return of a scene that stands still `wander`, the median over lines `step` pixels apart,
+    `contrast`, the standard deviation of a picture, and `flicker`, the mean change of a pixel from
+    frame to frame over the contrast.
+    """
+    contrast = float(film.std((1, 2)).mean())
+    flicker = float(np.abs(np.diff(film, axis=0)).mean()) / max(contrast, 1e-9)
+    return {"wander": wander_of_all(film, step), "contrast": contrast, "flicker": flicker}
+
+
+def of_slice(
+    rows: Float[np.ndarray, "frames places"], kind: str, follow: str = "any"
+) -> dict[str, float]:
+    """Return `wander` and `straightness` of a slice along a `line`, a `circle` or a ray that turns
+    with the scene (`spin`), in places.
+
+    Nothing stands still on a circle, and nothing moves along such a ray.
+    """
+    found = {} if kind == "circle" else {"wander": wander(rows)}
+    if kind != "spin":
+        measure = turning if kind == "circle" else straightness
+        found["straightness"] = measure(followed(rows, follow))
+    return found
+
+
+def followed(rows: Float[np.ndarray, "frames places"], follow: str) -> np.ndarray:
+    """Return `rows` with nothing in them but what is `bright` or `dark` against the median in time;
+    with `any`, as they are.  Raises ValueError for another word."""
+    middle = np.median(rows, axis=0)
+    kinds = {"any": rows, "bright": np.maximum(rows, middle), "dark": np.minimum(rows, middle)}
+    if follow not in kinds:
+        raise ValueError(f"follow must be one of {', '.join(kinds)}, got {follow}")
+    return kinds[follow]
+
+
 def _shift(row: np.ndarray, mean: np.ndarray, places: np.ndarray) -> float:
     shift = 0.0
     for _ in range(ROUNDS):

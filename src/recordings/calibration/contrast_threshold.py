@@ -5,7 +5,6 @@ that simulated and real scene agree in texture, speed and turbulence: a rate tha
 moves C by 4 to 10 %, and light taken for code values moves it nearly threefold.
 """
 
-import csv
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from src.recordings.event_rates import Rates
+from src.records.results import csv_text, write_text
 from src.sim.sensor.sensor import EventSensor
 
 ROUNDS = 4  # of simulating with the ratio of OFF to ON threshold found so far
@@ -45,16 +45,16 @@ class Estimate:
 def simulate(
     clips: Iterable[Float[Tensor, "views frames h w"]],
     fps: float,
-    sensor: dict,
+    sensor: EventSensor,
     thresholds: Sequence[float] = GRID,
     *,
     off_ratio: float = 1.0,
 ) -> Curve:
     """Return the rates of a sensor looking at `clips`, at all thresholds with the same noise.
 
-    `sensor` holds the arguments of EventSensor; its `threshold` and `off_ratio` are not used.
+    Its own `threshold` and `off_ratio` are not used.
     """
-    sensor = EventSensor(**sensor | {"threshold": thresholds[0], "off_ratio": off_ratio})
+    sensor = sensor.having(threshold=thresholds[0], off_ratio=off_ratio)
     grid = torch.tensor(thresholds, dtype=torch.float32)
     events, exposure = torch.zeros(len(grid), 2, dtype=torch.float64), 0.0
     for index, frames in enumerate(clips):
@@ -70,7 +70,7 @@ def estimate(
     rates: Rates,
     clips: Sequence[Float[Tensor, "views frames h w"]],
     fps: float,
-    sensor: dict,
+    sensor: EventSensor,
     thresholds: Sequence[float] = GRID,
     *,
     background: Float[np.ndarray, " 2"] | None = None,
@@ -135,12 +135,10 @@ def _excess(curve: Curve, on: float, rates: Float[np.ndarray, " 2"]) -> float:
 
 def write_csv(found: Estimate, rates: Rates, path: Path) -> None:
     """Write the curve, the rates of each view and the estimate as one table."""
-    with path.open("w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(["what", "threshold_or_view", "on", "off"])
-        for threshold, pair in zip(found.curve.thresholds, found.curve.rates, strict=True):
-            table.writerow(["simulated_hz", f"{threshold:.4g}", *(f"{r:.5g}" for r in pair)])
-        for index, pair in enumerate(rates.per_view):
-            table.writerow(["measured_hz", index, *(f"{r:.5g}" for r in pair)])
-        for index, name in enumerate(("estimate", "low", "high")):
-            table.writerow([name, "", f"{found.on[index]:.5g}", f"{found.off[index]:.5g}"])
+    curve = zip(found.curve.thresholds, found.curve.rates, strict=True)
+    rows = [("simulated_hz", f"{threshold:.4g}", *pair) for threshold, pair in curve]
+    rows += [("measured_hz", index, *pair) for index, pair in enumerate(rates.per_view)]
+    estimate = zip(("estimate", "low", "high"), found.on, found.off, strict=True)
+    rows += [(name, "", on, off) for name, on, off in estimate]
+    texts = [(what, which, *(f"{value:.5g}" for value in pair)) for what, which, *pair in rows]
+    write_text(path, csv_text(("what", "threshold_or_view", "on", "off"), texts))

@@ -1,7 +1,6 @@
 """Samples from a bank of air: the clip and everything cheap about it is drawn anew for each."""
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -11,6 +10,7 @@ from src.sim import noise
 from src.sim.optics import Optics
 from src.sim.pipeline import Draw, Pipeline
 from src.sim.scenes.photographs import Clip
+from src.sim.sensor.contract import Sensor
 from src.training.bank import Bank
 
 FIRST, EACH = 8, 4  # sample n is of one of the first FIRST + n / EACH clips
@@ -44,7 +44,7 @@ class Banked(Pipeline):
         self,
         bank: Bank,
         optics: Optics,
-        sensor: Mapping,
+        sensor: Sensor,
         *,
         windows: int,
         bins: int = 5,
@@ -52,10 +52,12 @@ class Banked(Pipeline):
         independent: bool = True,
     ):
         source = bank.source
+        light = {"input": "srgb" if source.decode else "linear"}
         super().__init__(
-            source.scene, optics, source.turbulence, sensor, split=source.split, seed=source.seed,
+            source.scene, optics, source.turbulence, light, split=source.split, seed=source.seed,
             bins=bins, substeps=source.substeps, crop=crop, random_crop=True,
         )  # fmt: skip
+        self.sensor = sensor
         self.exchangeable = independent and source.optics.misalignment_px == 0
         self.bank, self.frames = bank, windows * source.substeps + 1
         if self.frames > bank.frames:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from src.records.whole import write_text, written
+from src.records.atomic import write_text, written
 
 
 def test_what_fails_leaves_what_was_there(tmp_path):

@@ -10,6 +10,7 @@ from torch import nn
 
 from src.bench import timing
 from src.bench.candidates import Candidate
+from src.models import stopwatch
 from src.models.cost import macs, macs_per_frame
 from src.models.export import OnnxNetwork, export
 from src.models.fast import plain, running
@@ -86,27 +87,27 @@ class Stopwatch:
                         yield self._row(candidate, side, device, count, form)
 
     def _row(self, candidate: Candidate, side: int, device: str, count: int, form: str) -> Speed:
-        known: dict[str, Any] = {
+        entry: dict[str, Any] = {
             "network": candidate.name, "trained": candidate.trained, "views": candidate.views,
             "side": side, "device": device, "threads": count, "form": form,
         }  # fmt: skip
         if candidate.network is None:
-            return Speed(**known, reason=candidate.missing)
+            return Speed(**entry, reason=candidate.missing)
         work = self._count(candidate, side)
-        known |= {
+        entry |= {
             "gmac": work / 1e9,
             "params": sum(p.numel() for part in candidate.parts for p in part.parameters()),
             "energy_mj": 1e3 * work * timing.JOULE_PER_MAC,
         }
         if device == "cpu":
-            known["limit_ms"] = 1e3 * work / self.peak(form, count)
-            if known["limit_ms"] > 1e3 * self.longest_s:
+            entry["limit_ms"] = 1e3 * work / self.peak(form, count)
+            if entry["limit_ms"] > 1e3 * self.longest_s:
                 reason = f"more than {self.longest_s:g} s a frame by arithmetic alone"
-                return Speed(**known, reason=reason)
+                return Speed(**entry, reason=reason)
         try:
-            return self._timed(candidate, known)
+            return self._timed(candidate, entry)
         except ValueError as error:
-            return Speed(**known, reason=str(error))
+            return Speed(**entry, reason=str(error))
 
     def _count(self, candidate: Candidate, side: int) -> int:
         """Return the multiply-accumulates of a frame, by shapes alone where the network allows."""
@@ -125,26 +126,26 @@ class Stopwatch:
                 self._macs[which] += behind // (restorer.WINDOW - restorer.OVERLAP)
         return self._macs[which]
 
-    def _timed(self, candidate: Candidate, known: dict[str, Any]) -> Speed:
-        side, form, device = known["side"], known["form"], known["device"]
+    def _timed(self, candidate: Candidate, entry: dict[str, Any]) -> Speed:
+        side, form, device = entry["side"], entry["form"], entry["device"]
         after = 0.0
         if candidate.restorer is not None:
             if form != "float32" or device != "cpu":
                 raise ValueError("with a post-processor it is timed in float32 on the CPU")
-            after = self._restoration(candidate, side, known["threads"])
+            after = self._restoration(candidate, side, entry["threads"])
         size = (1, candidate.views, self.bins, side, side)
         drawn = torch.Generator().manual_seed(0)
         voxels = torch.randn(size, generator=drawn)
         voxels = (voxels * (torch.rand(size, generator=drawn) < FILLED)).to(device)
-        network = self._running(candidate, form, side, known["threads"]).to(device)
+        network = self._running(candidate, form, side, entry["threads"]).to(device)
         if form in ("float32", "bf16"):  # of the others nobody sees the maps
             which = (candidate.name, form, side, device)
             if which not in self._bytes:
                 self._bytes[which] = timing.peak_bytes(network, voxels)
-            known["peak_mib"] = self._bytes[which] / 2**20
-        took = timing.frame(network, voxels, count=known["threads"], seconds=self.seconds)
+            entry["peak_mib"] = self._bytes[which] / 2**20
+        took = stopwatch.frame(network, voxels, count=entry["threads"], seconds=self.seconds)
         ms = {"ms": took.median_ms + after, "least_ms": took.least_ms + after}
-        return Speed(**known, **ms, frames=took.frames, clock=took.clock)
+        return Speed(**entry, **ms, frames=took.frames, clock=took.clock)
 
     def _restoration(self, candidate: Candidate, side: int, count: int) -> float:
         """Return the ms of a frame, measured once; ValueError where a small picture says that it

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from src.metrics import straightness
+from src.metrics import slice_motion
 
 
 def edges(shift: np.ndarray, places: int = 100) -> np.ndarray:
@@ -17,12 +17,12 @@ def test_wander_is_the_rms_shift_whatever_the_brightness(size):
     rng = np.random.default_rng(0)
     shift = size * rng.normal(size=200)
     rows = edges(shift) * rng.uniform(0.7, 1.3, (200, 1)) + 0.1 * rng.normal(size=(200, 1))
-    assert straightness.wander(rows) == pytest.approx(shift.std(), rel=0.05)
+    assert slice_motion.wander(rows) == pytest.approx(shift.std(), rel=0.05)
 
 
 def test_a_still_slice_does_not_wander_and_a_blank_one_has_no_answer():
-    assert straightness.wander(edges(np.zeros(10))) < 1e-9
-    assert np.isnan(straightness.wander(np.full((10, 50), 0.5)))
+    assert slice_motion.wander(edges(np.zeros(10))) < 1e-9
+    assert np.isnan(slice_motion.wander(np.full((10, 50), 0.5)))
 
 
 @pytest.mark.parametrize("size", [0.0, 0.3, 1.0])
@@ -31,7 +31,7 @@ def test_straightness_is_the_distance_from_the_line_of_uniform_motion(size):
     centre = 15 + 1.1 * time + size * rng.normal(size=60)
     rows = 0.2 + 0.7 * np.exp(-((np.arange(100) - centre[:, None]) ** 2) / 18)
     true = centre - np.polyval(np.polyfit(time, centre, 1), time)
-    assert straightness.straightness(rows) == pytest.approx(true.std(), abs=0.05)
+    assert slice_motion.straightness(rows) == pytest.approx(true.std(), abs=0.05)
 
 
 @pytest.mark.parametrize("ends", [1, 2])
@@ -43,10 +43,10 @@ def test_turning_is_the_distance_from_uniform_turning_over_many_rounds(ends):
     apart = (apart + period / 2) % period - period / 2
     rows = 0.2 + 0.7 * np.exp(-(apart**2) / 18)
     true = centre - np.polyval(np.polyfit(time, centre, 1), time)
-    assert straightness.turning(rows) == pytest.approx(true.std(), abs=0.05)
-    assert straightness.straightness(rows) > 10
+    assert slice_motion.turning(rows) == pytest.approx(true.std(), abs=0.05)
+    assert slice_motion.straightness(rows) > 10
 
 
 def test_a_slice_in_which_nothing_moves_has_no_straightness():
-    assert np.isnan(straightness.straightness(np.full((10, 50), 0.5)))
-    assert np.isnan(straightness.turning(np.full((10, 50), 0.5)))
+    assert np.isnan(slice_motion.straightness(np.full((10, 50), 0.5)))
+    assert np.isnan(slice_motion.turning(np.full((10, 50), 0.5)))

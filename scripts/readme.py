@@ -1,0 +1,129 @@
+"""The picture and the table of the README: python -m scripts.readme --root PHOTOS [--clips 27].
+
+Both are made anew from the weights that are shipped: docs/figures/nine_views.png, and the section
+between the README's marks `report:results`, scores of test clips of the photographs in PHOTOS
+(data=test_photos), each simulated once for all networks.  Without PHOTOS only the picture.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from hydra import compose, initialize_config_dir
+from matplotlib.figure import Figure
+from omegaconf import DictConfig
+from torch import Tensor
+
+from src import models
+from src.app import build
+from src.bench.candidates import Subject
+from src.figures import plots
+from src.metrics.bootstrap import interval
+from src.metrics.table import METRICS, Metric
+from src.reports.writers import replace_section
+from src.sim.optics import layout
+from src.sim.pipeline import Sample, simulate
+
+HOME = Path(__file__).resolve().parents[1]
+NETWORK = "setnet_medium"  # of the picture: the same weights on one view and on nine
+# Local air, whose parts of a view wobble apart.
+AIR = ("turbulence=strong", "turbulence.atmosphere.half_length_px=[10,20]",
+       "turbulence.atmosphere.near_rigid=0.0")  # fmt: skip
+ROWS = {  # what it is: a network in weights/, how many of the nine views it is given
+    "nine views, SetNet medium": ("setnet_medium", 9),
+    "nine views, SetNet small": ("setnet_small", 9),
+    "nine views, E2VID (the paper's way)": ("lf3x3", 9),
+    "one view, SetNet medium": ("setnet_medium", 1),
+    "one view, E2VID": ("single256", 1),
+    "one view, E2VID+ trained without turbulence": ("clean/e2vid_plus", 1),
+}
+
+
+def config(door: str, *overrides: str) -> DictConfig:
+    """Return the config of a door."""
+    with initialize_config_dir(str(HOME / "conf"), version_base=None):
+        return compose(door, list(overrides))
+
+
+def played(name: str, views: int, sample: Sample) -> Tensor:
+    """Return the frames (windows, 1, h, w) that a shipped network makes of the centre view or of
+    all views of `sample`, a single clip."""
+    subject, window_s = Subject(name, models.load(name), views), float(sample.window_s[0])
+    positions = list(sample.positions or layout(sample.voxels.shape[2]))
+    return subject.play(sample.voxels[0, :, None], positions, window_s)[0]
+
+
+def table(root: str, clips: int) -> str:
+    """Return the scores of every row of ROWS on the same test clips, as Markdown."""
+    cfg = config("eval", "data=test_photos", f"scene.root={root}", f"data.test_clips={clips}")
+    pipeline, measure = build.pipeline(cfg, "test"), build.scores(cfg)
+    values = {row: [] for row in ROWS}
+    for clip in range(clips):
+        sample = simulate(pipeline, [clip])
+        for row, (name, views) in ROWS.items():
+            frames = played(name, views, sample)[cfg.data.warmup :]
+            values[row].append(measure(frames, sample.target[0, cfg.data.warmup :]))
+        print(f"{clip + 1} of {clips} clips", flush=True)
+    heads = [f"{metric.heading} {metric.arrow}" for metric in METRICS]
+    lines = ["| | " + " | ".join(heads) + " |", "|---|" + "---|" * len(heads)]
+    for row, scores in values.items():
+        cells = [written(metric, [score[metric.name] for score in scores]) for metric in METRICS]
+        lines.append(f"| {row} | " + " | ".join(cells) + " |")
+    lines.append("| *nine views less one, SetNet medium* | " + " | ".join(gains(values)) + " |")
+    note = "in brackets what holds 95 % of the means, or differences, of resampled clips."
+    return "\n".join([*lines, "", f"{clips} clips; {note}"])
+
+
+def gains(values: dict[str, list[dict[str, float]]]) -> list[str]:
+    """Return by how much nine views of one network differ from one, clip by clip, per metric."""
+    nine, one = (values[f"{count} SetNet medium"] for count in ("nine views,", "one view,"))
+    pairs = list(zip(nine, one, strict=True))
+    return [written(m, [a[m.name] - b[m.name] for a, b in pairs], "+") for m in METRICS]
+
+
+def written(metric: Metric, values: list[float], sign: str = "") -> str:
+    """Return the mean and its interval."""
+    form, (low, high) = f"{sign}.{metric.digits}f", interval(values)
+    return f"{np.mean(values):{form}} ({low:{form}} to {high:{form}})"
+
+
+def picture(path: Path, index: int, windows: int) -> None:
+    """Draw a clip through strong local air: the last frame and the x-t slice of its middle row."""
+    cfg = config("simulate", *AIR, "scene.height=192", "scene.width=192",
+                 "sensor.threshold=0.15", f"data.test_windows={windows}")  # fmt: skip
+    sample = simulate(build.pipeline(cfg, "test"), [index])
+    panels = {
+        "what one view sees": sample.turbulent[0],
+        "one view, reconstructed": played(NETWORK, 1, sample),
+        "nine views, reconstructed": played(NETWORK, 9, sample),
+        "ground truth": sample.target[0],
+    }
+    figure = Figure(figsize=(10, 4.1), layout="constrained")
+    grid = figure.subplots(2, len(panels), height_ratios=(3, 1))
+    for (name, video), (above, below) in zip(panels.items(), grid.T, strict=True):
+        film = video[:, 0].numpy()
+        middle = film.shape[1] // 2
+        above.imshow(film[-1], cmap="gray", vmin=0, vmax=1)
+        above.axhline(middle, color="gold", linewidth=0.8)
+        above.set_title(name, fontsize=10)
+        below.imshow(film[:, middle], cmap="gray", vmin=0, vmax=1, aspect="auto")
+        for axes in (above, below):
+            axes.set(xticks=[], yticks=[])
+    grid[1, 0].set_ylabel("time, down", fontsize=8)
+    plots.save(figure, path)
+
+
+def main() -> None:
+    """Read the arguments."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--root", help="a folder of photographs that no network was trained on")
+    parser.add_argument("--clips", type=int, default=27)
+    parser.add_argument("--index", type=int, default=0, help="the clip of the picture")
+    given = parser.parse_args()
+    picture(HOME / "docs" / "figures" / "nine_views.png", given.index, 40)
+    if given.root:
+        replace_section(HOME / "README.md", "results", table(given.root, given.clips))
+
+
+if __name__ == "__main__":
+    main()

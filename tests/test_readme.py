@@ -1,0 +1,121 @@
+"""The README's commands: all are run, tiny, one after the other, but those that are only composed.
+
+Composed only, as tests of their own run them: src.live, src.chart, src.stress, a sweep (its first
+job), and what wants data that are not here (REDS).  Files that a reader has (my.mp4, cap.raw,
+board.raw, site.mp4, <photographs>) are made small.  Targets of `make` exist.
+"""
+
+import re
+import shlex
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+
+from src.calibrate import calibrate
+from src.compare import compare
+from src.eval import evaluate
+from src.reconstruct import reconstruct
+from src.report import report
+from src.simulate import simulate
+from src.train import train
+from tests.conftest import ROOT
+from tests.recordings.calibration.test_air_meter import fields, film
+from tests.test_recordings_doors import folder  # noqa: F401 - a fixture
+from tests.test_sweeps import jobs
+from tests.test_train import TINY
+
+SMALL = ["scene.height=64", "scene.width=64", "data.test_windows=4"]
+RUN = {  # door: what runs it, and what makes it tiny
+    "train": (train, [*TINY, "logger=none", "data.bank=null"]),
+    "eval": (evaluate, [*SMALL, "data.test_clips=1", "data.warmup=1", "data.workers=0",
+                        "metrics.lpips=null"]),
+    "simulate": (simulate, [*SMALL, "camera.sensor=[360,640]", "camera.tile_px=116"]),
+    "reconstruct": (reconstruct, ["end=0.05"]),
+    "compare": (compare, []),
+    "calibrate": (calibrate, []),
+    "report": (report, []),
+}  # fmt: skip
+PAGES = ("README.md", "docs/evaluate.md", "docs/recordings.md", "docs/chart.md", "docs/training.md")
+
+
+def commands(page: str) -> list[list[str]]:
+    """The words of every command in the indented blocks of a page."""
+    text = (ROOT / page).read_text().replace("\\\n", " ")
+    lines = re.findall(r"^    ((?:python -m src|make) ?.*)$", text, re.M)
+    return [shlex.split(line, comments=True) for line in lines]
+
+
+def composed(words: list[str], *more: str):
+    """The config that a command asks for."""
+    door, given = words[2].removeprefix("src."), list(words[3:])
+    place, name, search = ROOT / "conf", door, []
+    if "--config-name" in given:
+        at = given.index("--config-dir")
+        _, place, _, name = given[at : at + 4]
+        place, search = ROOT / place, [f"hydra.searchpath=[file://{ROOT / 'conf'}]"]
+        del given[at : at + 4]
+        given += jobs(place / f"{name}.yaml")[0]
+    with initialize_config_dir(str(place), version_base=None):
+        return compose(name, [word for word in [*given, *more] if word != "-m"] + search)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_command_of_a_page_composes(page):
+    found = commands(page)
+    assert len(found) >= 4
+    for words in found:
+        if words[0] == "make":
+            assert f"\n{words[1]}:" in (ROOT / "Makefile").read_text()
+        elif "-m" not in words[3:]:  # several jobs: each is one of the others
+            words = [re.sub(r"<(\w+)[^>]*>", r"\1", word.split("|")[0]) for word in words]
+            assert composed(words) is not None
+
+
+@pytest.fixture
+def reader(folder, tmp_path, monkeypatch) -> Path:  # noqa: F811
+    """The folder of a reader who has recordings, videos and photographs."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "docs").symlink_to(ROOT / "docs")
+    for name, source in (("board", "board"), ("cap", "dot")):
+        (tmp_path / f"{name}.raw").symlink_to(folder / f"{source}.raw")
+    site = film(fields(6, 0.6, 0.5, 16))
+    for name, frames in (("my", np.tile(site[:, :64, :64], (3, 1, 1))), ("site", site)):
+        writer = cv2.VideoWriter(
+            f"{name}.mp4", cv2.VideoWriter.fourcc(*"mp4v"), 60, frames.shape[:0:-1], False
+        )
+        for frame in frames:
+            writer.write(np.round(255 * frame).astype(np.uint8))
+        writer.release()
+    (tmp_path / "photos").mkdir()
+    for k in range(12):
+        cv2.imwrite(f"photos/{k}.png", np.round(255 * site[k]).astype(np.uint8))
+    return tmp_path
+
+
+def test_every_command_of_the_readme_runs(reader):
+    ran, trained = [], None
+    for number, words in enumerate(commands("README.md")):
+        line = " ".join(words)
+        door = words[2].removeprefix("src.") if words[0] == "python" else "make"
+        if door not in RUN or "/data/" in line or "--config-dir" in line:
+            continue
+        place = dict(w.split("=", 1) for w in words if "=" in w).get(
+            "hydra.run.dir", f"out/{number}"
+        )
+        words = [word for word in words if not word.startswith("hydra.")]
+        words = [re.sub(r"out/\S*(<time>|table1)", str(trained), word) for word in words]
+        words = [word.replace("<photographs>", str(reader / "photos")) for word in words]
+        work, tiny = RUN[door]
+        cfg = composed(words, *tiny, f"paths.out={reader}/out")
+        cfg.paths.run = str(reader / place)
+        if door == "compare":  # the other of the two videos that the page made
+            (reader / "one").symlink_to(reader / "nine")
+            cfg.names = ["one", "nine"]
+        work(cfg)
+        trained = trained or (reader / place if door == "train" else None)
+        ran.append(door)
+    assert set(ran) == set(RUN) and len(ran) == 14
+    assert list(reader.rglob("video.gif")) and (reader / "air.yaml").is_file()
