@@ -1,7 +1,8 @@
 """The air in front of a still scene: what its footage shows of tilt and blur, with intervals.
 
 Lengths are in pixels of a frame whose smaller side is 256.  Intervals of 95 % come from resampling
-blocks of frames and squares of the frame (bootstrap): they know of chance only.
+blocks of frames and squares of the frame (bootstrap), which knows of chance only, and, for the
+numbers in METHOD, from what the method itself errs by.
 """
 
 import math
@@ -26,6 +27,9 @@ DRIFT_PX = 4.0  # between the quarters of a film: more is a camera that moves
 LEAST_RMS_PX = 0.01  # less is the error of following
 DRAWS = 200
 LUCKY = 0.1  # the sharpest tenth
+# Errors of the method at 95 %, of the logarithm, added to the intervals: in clips of known air
+# (scripts/known_air.py) windows average, and random blur shifts corners as tilt does.
+METHOD = {"rms_px": 0.15, "half_length_px": 0.3}
 
 
 @dataclass(frozen=True)
@@ -80,7 +84,7 @@ def measure(frames: Float[np.ndarray, "frames h w"], fps: float | None = None) -
         for chosen in _resampled(len(frames), 2 * tilt.decay)
     ]
     found = _air_file(tilt, drawn, unit, fps, len(lags.at)) | {
-        "blur_ratio": blur_ratio(tracks, size)
+        "blur_ratio": blur_ratio(*_coarse(frames, tracks))
     }
     a, b = covariance.centred(tracks)
     power = (a * b).sum((0, 2)) / (2 * tracks.seen.sum(0))
@@ -125,13 +129,27 @@ def _wider(sums: Float[np.ndarray, "3"]) -> float:
     return max(math.sqrt(usual / sharpest), 1.0)
 
 
-def shrunk(frame: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "_h _w"]:
-    """Return a frame as large as it is worked on, LARGEST at most."""
+def shrunk(frame: Float[np.ndarray, "h w"], largest: int = LARGEST) -> Float[np.ndarray, "_h _w"]:
+    """Return a frame whose smaller side has `largest` pixels at most: so large it is worked on."""
     least = min(frame.shape)
-    if least <= LARGEST:
+    if least <= largest:
         return frame
-    height, width = (round(side * LARGEST / least) for side in frame.shape)
+    height, width = (round(side * largest / least) for side in frame.shape)
     return cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _coarse(frames: np.ndarray, tracks: Tracks) -> tuple[Tracks, tuple[int, int]]:
+    """Return the points followed in frames of SIDE pixels, and their size.
+
+    How much blur widens an edge depends on the pixels that it is seen with.
+    """
+    size = frames.shape[1:]
+    if min(size) <= SIDE:
+        return tracks, size
+    small = np.stack([shrunk(frame, SIDE) for frame in frames])
+    place = np.round(tracks.place * SIDE / min(size)).astype(np.float32)
+    again = following.follow(small, place)
+    return again.of(again.seen.mean(0) >= LEAST_SEEN), small.shape[1:]
 
 
 def _even(frames: np.ndarray) -> np.ndarray:
@@ -222,5 +240,8 @@ def _estimate(name: str, value: float, drawn: list[float], most: float = np.inf)
     """Return a value with the middle 95 % of what was drawn; beyond `most` only that is known."""
     low, high = np.percentile(np.nan_to_num(drawn, posinf=1e9), (2.5, 97.5))
     low, high = min(low, value, most), max(high, value)
+    if value <= most and name in METHOD:
+        low = value * math.exp(-math.hypot(math.log(value / max(low, 1e-9)), METHOD[name]))
+        high = value * math.exp(math.hypot(math.log(high / value), METHOD[name]))
     low, middle, top = (float(number) for number in np.clip((low, value, high), *ALLOWED[name]))
     return Estimate(middle if value <= most else None, low, top if high <= most else None)

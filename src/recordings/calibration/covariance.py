@@ -148,9 +148,9 @@ class Model:
         # A film's own mean was taken off: 1 - kept of the power, at every distance alike.
         return Tilt(
             power=float(power / kept),
-            half_px=float(_crossing(self.fitted_px, curve, 0.5)),
+            half_px=float(crossing(self.fitted_px, curve, 0.5)),
             whole=float(np.clip(whole, 0, 1)),
-            decay=float(_crossing(np.arange(len(lags)), memory, np.exp(-1))),
+            decay=float(crossing(np.arange(len(lags)), memory, np.exp(-1))),
             correlation=np.where(count > ENOUGH, correlation, np.nan),
             memory=memory,
             fitted=curve,
@@ -186,7 +186,7 @@ def _memory(product: np.ndarray, power: float, frames: int) -> tuple[np.ndarray,
     return lost + (1 - lost) * measured, 1 - lost
 
 
-def _crossing(at: np.ndarray, curve: np.ndarray, level: float) -> float:
+def crossing(at: np.ndarray, curve: np.ndarray, level: float) -> float:
     """Return where a curve first falls to `level`, joined linearly; inf if nowhere."""
     below = np.flatnonzero(curve <= level)
     if not below.size:

@@ -62,7 +62,8 @@ def test_rms_and_half_length_of_known_warps_are_found(half_px, rms_px, noise):
     rms = push.std(0).mean() * UNIT * np.sqrt(20 / 19)
     assert found.rms_px.value == pytest.approx(rms, rel=0.1)
     assert found.half_length_px.value == pytest.approx(half_px, rel=0.2)
-    assert found.rms_px.low < found.rms_px.value < found.rms_px.high
+    assert found.rms_px.low < 0.87 * found.rms_px.value  # what the method errs by counts too
+    assert found.rms_px.high > 1.15 * found.rms_px.value
     assert found.half_length_px.low < half_px < found.half_length_px.high
     assert found.decay_s.value is None and found.decay_s.high == 1 / 50  # new in every frame
 
@@ -90,19 +91,34 @@ def test_half_length_beyond_the_frame_is_a_bound():
     assert found.half_length_px.low > 100 and found.whole_share.value > 0.95
 
 
-@pytest.mark.parametrize("ratio", [1.0, 1.4])
-def test_blur_is_that_of_a_typical_moment_over_the_sharpest_tenth(ratio):
+def blurred(ratio: float) -> np.ndarray:
+    """Return 30 frames, a tenth of them blurred by 1.2 px, the rest `ratio` times as much."""
     widths = np.full(30, 1.2 * ratio)
     widths[::10] = 1.2
     push = fields(10, 0.2, 0.0, 30)
-    frames = np.stack([
+    return np.stack([
         cv2.GaussianBlur(frame, (0, 0), width)
         for frame, width in zip(film(push, 0.0), widths, strict=True)
     ])  # fmt: skip
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1.4])
+def test_blur_is_that_of_a_typical_moment_over_the_sharpest_tenth(ratio):
+    frames = blurred(ratio)
     frames += 0.01 * np.random.default_rng(0).standard_normal(frames.shape).astype(np.float32)
     found = air_meter.measure(frames).found.blur_ratio
     typical = (27 * ratio + 3) / 30
     assert found.value == pytest.approx(typical, rel=0.2)
+
+
+def test_blur_is_that_of_a_frame_of_256_px():
+    large = np.stack([
+        cv2.resize(frame, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
+        for frame in blurred(1.4)
+    ])  # fmt: skip
+    small = np.stack([air_meter.shrunk(frame, 256) for frame in large])
+    found, wanted = (air_meter.measure(frames).found.blur_ratio for frames in (large, small))
+    assert found.value == pytest.approx(wanted.value, rel=0.08)  # seen at 512 px it is 0.8 of it
 
 
 def test_points_lie_on_corners_not_on_edges():

@@ -140,7 +140,7 @@ def test_wind_moves_the_field_smoothly():
 
 @pytest.mark.parametrize("strength, decibels", [(1.0, 50.0), (2.0, 45.0), (4.0, 42.0), (6.0, 38.0)])
 @pytest.mark.parametrize(
-    "pixel", [0.04, *(pytest.param(pixel, marks=pytest.mark.slow) for pixel in (0.15, 0.4))]
+    "pixel", [0.04, *(pytest.param(pixel, marks=pytest.mark.slow) for pixel in (0.16, 0.4))]
 )
 def test_accuracy_against_exact_psfs_at_every_pixel(strength, decibels, pixel):
     """128 x 128, lambda / D one pixel, a pixel of 0.04 to 0.4 D; normalised scatter by both.
@@ -160,7 +160,9 @@ def test_accuracy_against_exact_psfs_at_every_pixel(strength, decibels, pixel):
     crop = (24, 24, 80, 80)
     seen, exact = (t.degrade(picture[None, None], seed(3), crop=crop) for t in (turbulence, oracle))
     error = (seen - exact).square().mean()
-    assert -10 * math.log10(error) > decibels
+    found = -10 * math.log10(error)
+    print(f"pixel {pixel} D, D/r0 {strength}: {found:.1f} dB")  # for the docs: pytest -rP
+    assert found > decibels
     assert error.sqrt() < turbulence.fidelity.error * picture.std()  # the bound it states
 
 
