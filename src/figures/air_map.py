@@ -12,7 +12,7 @@ Cells = Mapping[tuple[float, float], tuple[float, str]]  # (half length, spread)
 
 
 def draw(path: Path, maps: Mapping[str, Cells]) -> Path:
-    """Draw a panel for each of `maps`, blue below zero and orange above, each cell with its text.
+    """Draw a panel for each of `maps`, purple below zero and orange above, each cell with its text.
 
     A cell that is not there is left grey.
     """

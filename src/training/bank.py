@@ -1,11 +1,11 @@
 """The bank of air: what every view sees of a fixed set of clips, kept on disk for all trainings.
 
 What turbulence does to a clip is slow and stays the same; sensor, crop and augmentation are cheap
-and are drawn anew for every sample (banked.py).  Clip i is a function of what made the bank and of
-i, so it does not matter who makes it: a filler beforehand or in the background (filling.py), or the
-training that finds it missing or damaged.  A clip is one file in float16, written whole, with
-PyTorch's checksum of each part; while it is made, its byte of a lock file is locked, and the system
-unlocks it when the process ends, however it ends.
+and are drawn anew for every sample (bank_samples.py).  Clip i is a function of what made the bank
+and of i, so it does not matter who makes it: a filler beforehand or in the background
+(bank_filler.py), or the training that finds it missing or damaged.  A clip is one file in float16,
+written whole, with PyTorch's checksum of each part; while it is made, its byte of a lock file is
+locked, and the system unlocks it when the process ends, however it ends.
 """
 
 import fcntl
