@@ -50,3 +50,14 @@ def test_turning_is_the_distance_from_uniform_turning_over_many_rounds(ends):
 def test_a_slice_in_which_nothing_moves_has_no_straightness():
     assert np.isnan(slice_motion.straightness(np.full((10, 50), 0.5)))
     assert np.isnan(slice_motion.turning(np.full((10, 50), 0.5)))
+
+
+def test_flicker_is_change_over_contrast():
+    scene = np.tile(np.sin(np.arange(40) / 3), (40, 1)).astype(np.float32)
+    still = slice_motion.of_still(np.stack([scene] * 6), 8)
+    assert still["flicker"] == 0 and still["wander"] < 1e-3
+    assert still["contrast"] == pytest.approx(float(scene.std()), rel=1e-5)
+    restless = np.stack([scene + 0.1 * (k % 2) for k in range(6)])
+    assert slice_motion.of_still(restless, 8)["flicker"] == pytest.approx(
+        0.1 / scene.std(), rel=1e-4
+    )

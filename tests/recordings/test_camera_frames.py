@@ -1,0 +1,49 @@
+"""Reconstructions against the frames of a camera on the same clock."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from src.recordings import camera_frames
+
+FPS, FRAMES = 10, 8
+
+
+@pytest.fixture
+def recording(tmp_path) -> tuple[Path, Path]:
+    """A folder of pictures with its frames.csv, and the list of a camera that saw each of them."""
+    video, camera = tmp_path / "run" / "frames", tmp_path / "camera"
+    video.mkdir(parents=True)
+    camera.mkdir()
+    rng, rows, lines = np.random.default_rng(0), ["frame,time_s"], []
+    for k in range(FRAMES):
+        picture = cv2.GaussianBlur(rng.integers(0, 255, (48, 48)).astype(np.uint8), (9, 9), 2)
+        for folder in (video, camera):
+            cv2.imwrite(str(folder / f"{k:07d}.png"), picture)
+        rows.append(f"{k},{k / FPS}")
+        lines.append(f"{k / FPS + 0.01} {k:07d}.png")
+    (video.parent / "frames.csv").write_text("\n".join(rows))
+    (camera / "images.txt").write_text("\n".join(lines))
+    return video, camera / "images.txt"
+
+
+def test_a_video_agrees_with_itself_and_not_with_the_next_frames(recording):
+    video, listing = recording
+    same = camera_frames.agreement(video, listing)
+    assert same["ssim"] > 0.999 and same["correlation"] > 0.999 and same["lpips"] < 1e-4
+    names = [line.split()[1] for line in listing.read_text().splitlines()]
+    late = [f"{k / FPS} {name}" for k, name in enumerate(names[1:])]
+    listing.write_text("\n".join(late))
+    other = camera_frames.agreement(video, listing)
+    assert other["ssim"] < 0.8 and abs(other["correlation"]) < 0.5 and other["lpips"] > 0.05
+
+
+def test_what_is_not_there_or_not_at_the_same_time_is_named(recording):
+    video, listing = recording
+    with pytest.raises(ValueError, match="camera must be the list of a camera's frames"):
+        camera_frames.agreement(video, listing.with_name("none.txt"))
+    listing.write_text("99.0 0000000.png")
+    with pytest.raises(ValueError, match="camera must have frames within the video's time"):
+        camera_frames.agreement(video, listing)
