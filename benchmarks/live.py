@@ -21,7 +21,7 @@ import src.models
 from benchmarks.recordings import MODEL, SENSOR, events
 from src.live_view import assembly, feeds
 from src.live_view.faults import Faults
-from src.live_view.step import Running
+from src.live_view.network_step import Running
 from src.recordings import lookup
 from src.recordings.capture import kaleidoscope
 from src.recordings.files import formats

@@ -16,7 +16,7 @@ import src.models
 from src.app import build, door
 from src.live_view import assembly, feeds
 from src.live_view.faults import Faults
-from src.live_view.step import Running
+from src.live_view.network_step import Running
 from src.recordings import stream
 from src.recordings.views import Views, load
 

@@ -12,7 +12,7 @@ from torch import nn
 
 from src.app import build, door
 from src.models.runtime import Runtime
-from src.recordings import listed, lookup, output, progress, stream
+from src.recordings import event_lists, lookup, output, progress, stream
 from src.recordings.files import sources
 from src.recordings.views import Views, load
 from src.records import results
@@ -25,7 +25,7 @@ def reconstruct(cfg: DictConfig) -> Path:
     """
     run, net = Path(cfg.paths.run), build.chosen(cfg)
     views, span = views_for(cfg, net), overlap(cfg, net)
-    fast = listed.ready(net, cfg.form, cfg.device, views, cfg.bins)
+    fast = event_lists.ready(net, cfg.form, cfg.device, views, cfg.bins)
     results.open_run(run, door.resolved(cfg))
     with output.sink(cfg.output, run, views.model, cfg.playback) as write:
         for frame in progress.tell(frames(cfg, fast, views, span), span):
@@ -67,7 +67,7 @@ def frames(
     chunks = sources.events(cfg.recording, views.sensor, cfg.chunk_s)
     windows = stream.windows(chunks, lookup.build(views), rule)
     if isinstance(net, Runtime):
-        return listed.frames(windows, net, overlap=span)
+        return event_lists.frames(windows, net, overlap=span)
     return stream.frames(windows, net, overlap=span, positions=views.positions, device=cfg.device)
 
 

@@ -14,12 +14,12 @@ from src.live_view.faults import Faults
 from src.live_view.feeds import Feed
 from src.live_view.intake import Intake
 from src.live_view.meters import Meters
+from src.live_view.network_step import Running
 from src.live_view.pace import Pace
 from src.live_view.player import Player
 from src.live_view.reconstruction import Reconstruction
 from src.live_view.screen import EventPicture, Screen
 from src.live_view.server import THIS_MACHINE, Page, Server
-from src.live_view.step import Running
 from src.recordings.lookup import build
 from src.recordings.views import Views
 

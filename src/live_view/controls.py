@@ -5,10 +5,10 @@ from collections.abc import Mapping, Sequence
 
 from torch import nn
 
-from src.live_view import levels
-from src.live_view.levels import Level, Shedding
+from src.live_view import quality
+from src.live_view.network_step import Running, Step
+from src.live_view.quality import Level, Shedding
 from src.live_view.reconstruction import Choice, Reconstruction
-from src.live_view.step import Running, Step
 from src.recordings.views import Views
 
 ADAPTIVE = "adaptive"
@@ -26,7 +26,7 @@ class Steps:
         """Return the step of a level; raises ValueError where the views are not there."""
         with self.lock:
             if level not in self.made:
-                places = levels.positions(level.views, self.views.positions)
+                places = quality.positions(level.views, self.views.positions)
                 network = self.networks[level.network]
                 self.made[level] = Step(network, self.views.only(places), self.how)
             return self.made[level]
@@ -46,7 +46,7 @@ class Controls:
     ):
         self.reconstruction, self.period_s, self.room = reconstruction, period_s, room
         self.counts = {
-            name: levels.choices(getattr(network, "views", None), places)
+            name: quality.choices(getattr(network, "views", None), places)
             for name, network in networks.items()
         }
         self.chosen: dict[str, int | str] = {}
@@ -77,4 +77,4 @@ class Controls:
     def _ladder(self, network: str) -> list[Level]:
         names = list(self.counts)
         smaller = names[: names.index(network)][::-1]
-        return levels.ladder([network, *smaller], self.counts)
+        return quality.ladder([network, *smaller], self.counts)

@@ -12,10 +12,10 @@ from jaxtyping import Float
 
 from src.live_view.backlog import Backlog
 from src.live_view.cutter import EventWindow
-from src.live_view.levels import Level, Shedding
 from src.live_view.meters import Meters
+from src.live_view.network_step import Finish, Step
+from src.live_view.quality import Level, Shedding
 from src.live_view.screen import Screen
-from src.live_view.step import Finish, Step
 
 FADE_S = 0.2  # of recorded time, in which one network's picture gives way to another's
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from src.models.after import AfterHead, AfterStem
+from src.models.behind_first_layer import AfterHead, AfterStem
 from src.models.engines import events_numba as kernels
-from src.models.patches import patches, spans
+from src.models.kernel_patches import patches, spans
 from src.models.setnet import AWAKE_S, MEMORIES_S
 
 NOTHING = [np.empty(0, kind) for kind in (np.float64, np.int64, np.int64, np.float32, np.int64)]

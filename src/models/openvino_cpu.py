@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from src.models.explicit import Explicit
+from src.models.explicit_state import Explicit
 from src.models.fast import plain
 from src.models.setnet import SetNet
 

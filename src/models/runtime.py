@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import nn
 
 from src.models import openvino_cpu
-from src.models.after import AfterHead, AfterStem, OnOpenVino, OnTorch
+from src.models.behind_first_layer import AfterHead, AfterStem, OnOpenVino, OnTorch
 from src.models.e2vid import E2VID
 from src.models.engines import events_numba as kernels
 from src.models.fast import plain

@@ -19,9 +19,9 @@ from src.live_view.cutter import Cutter
 from src.live_view.faults import Faults
 from src.live_view.intake import STALL_S, Intake
 from src.live_view.meters import Meters
+from src.live_view.network_step import Running
 from src.live_view.pace import Pace
 from src.live_view.screen import EventPicture
-from src.live_view.step import Running
 from src.models.setnet import SetNet
 from src.recordings import stream
 from src.recordings.files.formats import EVENT, read_events, write_events

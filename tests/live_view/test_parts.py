@@ -6,13 +6,13 @@ import time
 import numpy as np
 import pytest
 
-from src.live_view import levels, paint
+from src.live_view import paint, quality
 from src.live_view.backlog import Backlog
 from src.live_view.cutter import BACK_US, Cutter, EventWindow
 from src.live_view.faults import Faults
-from src.live_view.levels import Level, Shedding
 from src.live_view.meters import Meters
 from src.live_view.pace import Pace, StreamClock
+from src.live_view.quality import Level, Shedding
 from src.live_view.screen import COLUMNS, MOST_BYTES, EventPicture, Screen, Slice
 from src.recordings.files.formats import EVENT
 from src.recordings.lookup import build
@@ -169,19 +169,19 @@ def test_a_camera_s_clock_follows_what_came_soonest_and_drifts():
 
 def test_fewer_views_first_then_smaller_networks():
     counts = {"large": [1, 3, 9], "small": [1, 3, 9], "tiny": [1]}
-    found = levels.ladder(["large", "small", "tiny"], counts)
+    found = quality.ladder(["large", "small", "tiny"], counts)
     assert [(one.network, one.views) for one in found] == [
         ("large", 9), ("large", 3), ("large", 1), ("small", 1), ("tiny", 1),
     ]  # fmt: skip
 
 
 def test_views_to_choose_from():
-    assert levels.choices(None, layout(9)) == [1, 3, 5, 9]
-    assert levels.choices(None, layout(4)) == [1, 4]
-    assert levels.choices(9, layout(9)) == [9]
-    assert levels.positions(3, layout(9)) == list(layout(3))
+    assert quality.choices(None, layout(9)) == [1, 3, 5, 9]
+    assert quality.choices(None, layout(4)) == [1, 4]
+    assert quality.choices(9, layout(9)) == [9]
+    assert quality.positions(3, layout(9)) == list(layout(3))
     with pytest.raises(ValueError, match="ckpt wants the views"):
-        levels.positions(9, layout(3))
+        quality.positions(9, layout(3))
 
 
 def test_shedding_goes_down_before_anything_is_dropped_and_up_when_there_is_time():

@@ -31,7 +31,7 @@ def check(t, x, y, p, view, views, height, width):
 def add_patches(t, x, y, p, view, t0, t1, down, right, table, stride, out):
     """Add all events with t0 <= t <= t1 to `out` (h2, w2 * c), weighed in time as `voxel_grid`.
 
-    `table`, `down`, `right`: of `src.models.patches`.
+    `table`, `down`, `right`: of `src.models.kernel_patches`.
     """
     bins, reach, wide = table.shape[1], table.shape[4], table.shape[5]
     channels, pitch = wide // reach, out.shape[1]

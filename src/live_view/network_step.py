@@ -16,7 +16,7 @@ from torch import nn
 from src.live_view.cutter import EventWindow
 from src.models import openvino_cpu
 from src.models.runtime import Runtime, runs
-from src.recordings import listed, stream
+from src.recordings import event_lists, stream
 from src.recordings.files.formats import EVENT
 from src.recordings.lookup import build
 from src.recordings.views import Views
@@ -49,7 +49,7 @@ class Step:
         self.views, self.how = views, how
         self.overlap = stream.overlap(how.span or stream.default_span(network), how.fps)
         form = how.form or fastest(network)
-        self.network = listed.ready(network, form, "cpu", views, how.bins)
+        self.network = event_lists.ready(network, form, "cpu", views, how.bins)
         self.rule = stream.Rule(
             fps=how.fps,
             bins=how.bins,
@@ -84,7 +84,7 @@ class Step:
             self.carry = stream.Carry()
         more = {"overlap": self.overlap, "carry": self.carry}
         if isinstance(self.network, Runtime):
-            frames = listed.frames([filled], self.network, **more)
+            frames = event_lists.frames([filled], self.network, **more)
         else:
             places = self.views.positions
             frames = stream.frames([filled], self.network, positions=places, **more)

@@ -9,7 +9,7 @@ from src.models.e2vid import E2VID
 from src.models.fast import Fast
 from src.models.runtime import Runtime
 from src.models.setnet import SetNet
-from src.recordings import listed, lookup, stream
+from src.recordings import event_lists, lookup, stream
 from src.recordings.capture import kaleidoscope
 from src.recordings.files.formats import EVENT
 from src.sim.optics import layout
@@ -49,10 +49,10 @@ def test_the_frames_are_those_from_grids(name, cut):
     grids = stream.windows([recording()], table, stream.Rule(**cut))
     dense = list(stream.frames(grids, network, overlap=span, positions=VIEWS.positions))
     lists = stream.windows([recording()], table, stream.Rule(**cut, grids=False))
-    runtime, carry = listed.ready(network, "float32", "cpu", VIEWS, 5), stream.Carry()
+    runtime, carry = event_lists.ready(network, "float32", "cpu", VIEWS, 5), stream.Carry()
     found = []
     for window in lists:  # law 6: each window a call of its own
-        found += listed.frames([window], runtime, overlap=span, carry=carry)
+        found += event_lists.frames([window], runtime, overlap=span, carry=carry)
     assert len(found) == len(dense) > 5
     for one, other in zip(dense, found, strict=True):
         assert (one.time_s, one.events, one.outside) == (other.time_s, other.events, other.outside)
@@ -61,9 +61,9 @@ def test_the_frames_are_those_from_grids(name, cut):
 
 def test_what_is_run_follows_from_network_and_device():
     network = SetNet(stem=4, channels=8)
-    assert isinstance(listed.ready(network, "bf16", "cpu", VIEWS, 5), Runtime)
-    assert isinstance(listed.ready(FireNet(), "bf16", "cpu", VIEWS, 5), Fast)
+    assert isinstance(event_lists.ready(network, "bf16", "cpu", VIEWS, 5), Runtime)
+    assert isinstance(event_lists.ready(FireNet(), "bf16", "cpu", VIEWS, 5), Fast)
     with pytest.raises(ValueError, match="bins must be 5 for this network, got 3"):
-        listed.ready(network, "bf16", "cpu", VIEWS, 3)
+        event_lists.ready(network, "bf16", "cpu", VIEWS, 3)
     with pytest.raises(ValueError, match="device must be cpu for form=openvino, got cuda"):
-        listed.ready(network, "openvino", "cuda", VIEWS, 5)
+        event_lists.ready(network, "openvino", "cuda", VIEWS, 5)

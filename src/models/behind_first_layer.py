@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from src.models import openvino_cpu
 from src.models.e2vid import E2VID
-from src.models.explicit import flat, formed
+from src.models.explicit_state import flat, formed
 from src.models.setnet import SetNet
 from src.sim.optics import Position
 
