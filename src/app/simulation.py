@@ -43,7 +43,7 @@ def pipeline(cfg: DictConfig, split: str, optics: Optics | None = None) -> Pipel
             optics or part(cfg, "optics"),
             _sensor(cfg, _count(cfg, "seed", least=0)),
             windows=_count(cfg, "data.windows"),
-            bins=cfg.bins,
+            bins=_count(cfg, "bins"),
             crop=cfg.data.crop,
             independent=cfg.turbulence.get("views_correlation", "independent") == "independent",
         )
@@ -109,7 +109,7 @@ def _simulation(
         _light(cfg),
         split=split,
         seed=seed,
-        bins=cfg.bins,
+        bins=_count(cfg, "bins"),
         substeps=substeps,
         crop=crop,
         random_crop=split == "train",
@@ -121,7 +121,7 @@ def _simulation(
 
 def _light(cfg: DictConfig) -> dict:
     """Return what decides about the light in front of the sensor: whether frames are decoded."""
-    return {"input": cfg.sensor.get("input", "linear")}
+    return {"input": "srgb" if cfg.sensor.get("input") == "srgb" else "linear"}
 
 
 def _sensor(cfg: DictConfig, seed: int) -> Sensor:
