@@ -44,7 +44,7 @@ def pipeline(cfg: DictConfig, split: str, optics: Optics | None = None) -> Pipel
             _sensor(cfg, _count(cfg, "seed", least=0)),
             windows=_count(cfg, "data.windows"),
             bins=_count(cfg, "bins"),
-            crop=cfg.data.crop,
+            crop=_side(cfg, "data.crop"),
             independent=cfg.turbulence.get("views_correlation", "independent") == "independent",
         )
     return _simulation(
@@ -52,8 +52,8 @@ def pipeline(cfg: DictConfig, split: str, optics: Optics | None = None) -> Pipel
         split,
         windows=_count(cfg, "data.windows" if training else "data.test_windows"),
         optics=optics or part(cfg, "optics"),
-        crop=cfg.data.crop if training else cfg.data.test_crop,
-        clips=cfg.data.clips if training else None,
+        crop=_side(cfg, "data.crop" if training else "data.test_crop"),
+        clips=_count(cfg, "data.clips") if training and cfg.data.clips is not None else None,
     )
 
 
@@ -135,6 +135,13 @@ def _count(cfg: DictConfig, key: str, least: int = 1) -> int:
     if type(value) is not int or value < least:
         raise ValueError(f"{key} must be a whole number >= {least}, got {value}")
     return value
+
+
+def _side(cfg: DictConfig, key: str) -> int | float | None:
+    value = OmegaConf.select(cfg, key)
+    if value is None or type(value) in (int, float):
+        return value
+    raise ValueError(f"{key} must be pixels (128), a share of the frame (0.5) or null, got {value}")
 
 
 def _rates(cfg: DictConfig, training: bool) -> list[float]:
