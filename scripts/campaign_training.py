@@ -104,6 +104,8 @@ class Training:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 return True
+        if self.process is not None:
+            self.process.wait()  # its lock is free a moment before it can be looked up as ended
         return False
 
     def terminate(self) -> None:
