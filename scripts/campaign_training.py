@@ -179,7 +179,8 @@ class Training:
             try:
                 content = torch.load(path, weights_only=True, mmap=True)
                 age = time.time() - path.stat().st_mtime
-                return content["seconds"] / 3600, content["global_step"], age
+                steps = content.get("steps", content["global_step"])
+                return content["seconds"] / 3600, steps, age
             except Exception:  # it was just removed, or torn: all kinds of errors
                 continue
         card = self._exported()

@@ -70,7 +70,7 @@ def facts(run: Path, content: dict) -> dict:
         "experiment": cfg.name,
         "started_from": Path(cfg.model.get("weights") or "nothing").name,
         "seed": cfg.seed,
-        "steps": content["global_step"],
+        "steps": content.get("steps", content["global_step"]),
         "windows_seen": content["windows"],
         "hours": round(content["seconds"] / 3600, 2),
         "clock": cfg.clock,

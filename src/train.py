@@ -38,9 +38,6 @@ def train(cfg: DictConfig) -> dict:
     untrained = build.test(cfg, "untrained", module.method, data, module.scores)
     tracking.begin(trainer.loggers, OmegaConf.to_container(cfg, resolve=True))
     try:
-        if start_from and files.exported(start_from):
-            handover.take(module, trainer.callbacks, start_from)
-            start_from = None
         fit(trainer, module, data, start_from)
     except NotFinite as error:
         same = f"python -m src.simulate like={run}/config.yaml split=train index={error.clips[0]}"
@@ -60,6 +57,9 @@ def train(cfg: DictConfig) -> dict:
 def fit(trainer: lightning.Trainer, module, data, start_from: Path | None) -> None:
     """Train; when that is cut short, whatever by, say what to go on from."""
     last = Path(trainer.checkpoint_callback.dirpath) / "last.ckpt"
+    if start_from and files.exported(start_from):
+        handover.take(module, trainer.callbacks, start_from)
+        start_from = None
     try:
         trainer.fit(module, data, ckpt_path=start_from)
         if not last.is_file():  # nothing was left to do

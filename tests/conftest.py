@@ -1,5 +1,6 @@
 """Annotations of `src` and `baselines` are checked while the tests run; shared fixtures."""
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,8 @@ import src  # noqa: F401 - sets OpenCV's limits before a test imports it
 import tests.typecheck  # noqa: F401 - the hook below names it in a string
 
 ROOT = Path(__file__).resolve().parents[1]
+# A shell starts what runs in its background with Ctrl-C ignored, and so would be what tests start.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def checked_modules() -> list[str]:

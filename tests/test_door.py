@@ -56,9 +56,13 @@ def test_a_stopped_run_leaves_a_checkpoint_that_loads(stop, tmp_path):
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
     )
-    wait_for(lambda: b"per step" in run.stdout.read1(), run)
-    run.send_signal(stop)
-    run.communicate(timeout=60)
+    try:
+        wait_for(lambda: b"per step" in run.stdout.read1(), run)
+        run.send_signal(stop)
+        run.communicate(timeout=60)
+    finally:  # or it trains on when a test has failed
+        run.kill()
+        run.communicate()
     assert run.returncode != 0
     (last,) = tmp_path.rglob("last.ckpt")
     content = torch.load(last, weights_only=True)

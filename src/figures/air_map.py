@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from src.figures.plots import save
 
 Cells = Mapping[tuple[float, float], tuple[float, str]]  # (half length, spread), px: value, text
+PALE = 1.8  # times the largest value are the ends of the colours: text is read on all cells
 
 
 def draw(path: Path, maps: Mapping[str, Cells]) -> Path:
@@ -26,7 +27,7 @@ def draw(path: Path, maps: Mapping[str, Cells]) -> Path:
         values = np.array(
             [[cells.get((half, spread), (np.nan, ""))[0] for half in halves] for spread in spreads]
         )
-        most = max(float(np.nanmax(np.abs(values))), 1e-9)
+        most = PALE * max(float(np.nanmax(np.abs(values))), 1e-9)
         axes.set_facecolor("#dddddd")
         axes.imshow(values, "PuOr_r", vmin=-most, vmax=most, origin="lower", aspect="auto")
         for (half, spread), (_, text) in cells.items():

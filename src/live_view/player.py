@@ -20,7 +20,8 @@ class Player:
         self.intake, self.reconstruction = intake, reconstruction
         self.meters, self.faults = meters, faults
         self.stopped = threading.Event()
-        works = (intake.decode, intake.cut, reconstruction.begin, reconstruction.finish)
+        laying, running = reconstruction.lay_events, reconstruction.run_network
+        works = (intake.decode, intake.cut, laying, running)
         self.threads = [
             threading.Thread(target=self._guarded, args=(work,), name=work.__name__, daemon=True)
             for work in works

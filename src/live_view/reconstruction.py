@@ -59,7 +59,7 @@ class Reconstruction:
             self.steps(level)
         self.choice = choice
 
-    def begin(self, stopped: threading.Event) -> None:
+    def lay_events(self, stopped: threading.Event) -> None:
         """Look events up and lay them into the first layer, a window ahead, until `stopped`."""
         while not stopped.is_set():
             window = self.backlog.get(0.1)
@@ -80,7 +80,7 @@ class Reconstruction:
             except queue.Full:
                 continue
 
-    def finish(self, stopped: threading.Event) -> None:
+    def run_network(self, stopped: threading.Event) -> None:
         """Run the network on what was begun, and show the pictures, until `stopped`."""
         while not stopped.is_set():
             try:

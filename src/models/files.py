@@ -45,7 +45,8 @@ def load(name_or_path: str | Path, rooms: Sequence[str] = ()) -> nn.Module:
     spec, weights = (_safetensors if exported(path) else _checkpoint)(path)
     check_memory(weights, path, "ckpt")
     with torch.device("meta"):  # without memory: a small file may name a huge network
-        _check_fit(_build(spec, path, rooms), weights, path)
+        empty = _build(spec, path, rooms)
+    _check_fit(type(empty), empty.state_dict(), weights, path)
     network = _build(spec, path, rooms)
     network.load_state_dict(weights)
     fold(network)
@@ -86,8 +87,12 @@ def card(path: Path) -> dict:
 
 @torch.no_grad()
 def restore(network: nn.Module, path: Path) -> None:
-    """Give `network` the weights of a file of `save`; spectral norms find their vectors anew."""
+    """Give `network` the weights of a file of `save`; spectral norms find their vectors anew.
+
+    Raises ValueError, beginning with `ckpt`, for the weights of another network.
+    """
     weights = _safetensors(path)[1]
+    _check_fit(type(network), folded(network), weights, path)
     for prefix, module in network.named_modules():
         if parametrize.is_parametrized(module, "weight"):
             module.weight = weights.pop(f"{prefix}.weight")
@@ -205,12 +210,12 @@ def check_memory(weights: dict[str, Tensor], path: Path, key: str) -> None:
         )
 
 
-def _check_fit(network: nn.Module, weights: dict[str, Tensor], path: Path) -> None:
-    own = network.state_dict()
+def _check_fit(kind: type, own: dict[str, Tensor], weights: dict[str, Tensor], path: Path) -> None:
+    """Raise ValueError unless `weights` are those of `own`, the state of a network of a `kind`."""
     missing, extra = sorted(own.keys() - weights.keys()), sorted(weights.keys() - own.keys())
     other = [n for n in own.keys() & weights.keys() if own[n].shape != weights[n].shape]
     if missing or extra or other:
         raise ValueError(
-            f"ckpt does not fit {type(network).__name__} in {path}: missing {missing}, "
+            f"ckpt does not fit {kind.__name__} in {path}: missing {missing}, "
             f"extra {extra}, of another shape {sorted(other)}"
         )

@@ -102,8 +102,8 @@ class SetNet(nn.Module):
 
         awake, passed = _time(_stirred(coarse, self.cell), awake, seconds)
         keep = torch.cat([torch.exp(-passed / memory) for memory in MEMORIES_S], 1)
-        sums = _grown(keep, 8 // self.cell)[:, None] * sums + coarse[:, :, None]
-        mean_sums = _grown(keep, 8) * mean_sums + events.mean(1, keepdim=True)
+        sums = grown(keep, 8 // self.cell)[:, None] * sums + coarse[:, :, None]
+        mean_sums = grown(keep, 8) * mean_sums + events.mean(1, keepdim=True)
         spread = (sums - sums.mean(1, keepdim=True)).abs().mean(1)
 
         grids, memories, bias = self.kernels(places)
@@ -126,12 +126,12 @@ class SetNet(nn.Module):
         `stem`: before its ReLU, (n, stem, hc, wc); `passed`: seconds, (n, 1, h8, w8).
         """
         stem, pace = stem.relu(), RATE * passed
-        hidden4 = self.cell4(self.down4(stem).relu(), hidden4, _grown(pace, 2))
+        hidden4 = self.cell4(self.down4(stem).relu(), hidden4, grown(pace, 2))
         after4 = hidden4.to(stem.dtype)
         hidden8 = self.cell8(self.down8(after4).relu(), hidden8, pace)
         x = self.block8(hidden8.to(stem.dtype))
-        x = self.mix4((_grown(self.up4(x), 2) + after4).relu()).relu()
-        x = self.mix2((_grown(self.up2(x), 2) + stem).relu()).relu()
+        x = self.mix4((grown(self.up4(x), 2) + after4).relu()).relu()
+        x = self.mix2((grown(self.up2(x), 2) + stem).relu()).relu()
         return self.shuffle(x).float(), hidden4, hidden8
 
     def kernels(self, places: tuple[Position, ...]) -> tuple[Tensor, Tensor, Tensor]:
@@ -278,5 +278,5 @@ def _halved(x: Tensor) -> Tensor:
     return rows[..., ::2] + rows[..., 1::2]
 
 
-def _grown(x: Tensor, times: int) -> Tensor:
+def grown(x: Tensor, times: int) -> Tensor:
     return functional.interpolate(x, scale_factor=times, mode="nearest")

@@ -1,10 +1,10 @@
 """SetNet, second generation: fewer and fatter layers, all of them at a quarter and an eighth.
 
 What goes in and what is kept is the first's (setnet.py): views as a set, leaky sums, time that
-passes in seconds and only where events come.  New is where the work is done.  On a CPU one of 64
-channels at a quarter of the resolution does five times the arithmetic of a convolution of 12 at a
-half in the same time (docs/decisions/0010-runtime.md), so that the full resolution goes in through
-patches of 7 x 7 pixels and comes out as the sixteen pixels of a cell.
+passes in seconds and only where events come.  New is where the work is done: layers of few channels
+at a half of the resolution are what a CPU is slowest at for their arithmetic (decisions 10 and 11),
+so that the full resolution goes in through patches of 7 x 7 pixels and comes out as the sixteen
+pixels of a cell.
 
 quarter: patches, unit -> eighth: unit, residual block -> quarter: mix -> 4 x 4 pixels a cell.
 """
@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from src.models.layers import ResidualBlock
-from src.models.setnet import MEMORIES_S, RATE, SetNet, ViewKernels, _grown
+from src.models.setnet import MEMORIES_S, RATE, SetNet, ViewKernels, grown
 
 SIZES = {  # multiply-accumulates at 176 x 176 with nine views: 0.4, 1.1 and 3.9 G
     "small": {"quarter": 32, "eighth": 64},
@@ -54,11 +54,11 @@ class SetNet2(SetNet):
     ) -> tuple[Float[Tensor, "n 16 h4 w4"], Tensor, Tensor]:
         """Return what is drawn and the new hidden maps, as SetNet's does."""
         stem, pace = stem.relu(), RATE * passed
-        hidden4 = self.cell4(stem, hidden4, _grown(pace, 2))
+        hidden4 = self.cell4(stem, hidden4, grown(pace, 2))
         after4 = hidden4.to(stem.dtype)
         hidden8 = self.cell8(self.down8(after4).relu(), hidden8, pace)
         x = self.block8(hidden8.to(stem.dtype))
-        x = self.mix4((_grown(self.up4(x), 2) + after4).relu()).relu()
+        x = self.mix4((grown(self.up4(x), 2) + after4).relu()).relu()
         return self.draw4(x).float(), hidden4, hidden8
 
 

@@ -40,7 +40,7 @@ def frames(
 
     def step(window: Window, state: Any) -> tuple[np.ndarray, Any]:
         runtime.state = state
-        picture = runtime.step(*window.parts, 0.0, (window.end_us - window.start_us) * 1e-6)
+        picture = runtime.step(*window.parts, 0.0, window.seconds)
         return picture, runtime.state
 
     return carried(windows, step, runtime.size, overlap, carry)

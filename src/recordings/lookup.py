@@ -97,13 +97,10 @@ class Lookup:
     def split(self, events: np.ndarray) -> tuple[np.ndarray, Int[np.ndarray, " k"]]:
         """Return the events inside views, at their nearest model pixel, and the view of each."""
         self.check(events)
-        view = self.view[events["y"], events["x"]]
-        inside = view >= 0
-        kept = events[inside].copy()
-        place = self.place[kept["y"], kept["x"]] + 0.5
-        limit = np.array(self.model[::-1]) - 1
-        kept["x"], kept["y"] = np.clip(place.astype(np.int64), 0, limit).T
-        return kept, view[inside].astype(np.int64)
+        pixel = self.nearest[events["y"], events["x"]]
+        kept = events[pixel >= 0].copy()
+        view, kept["y"], kept["x"] = np.unravel_index(pixel[pixel >= 0], (self.views, *self.model))
+        return kept, view
 
     def check(self, events: np.ndarray) -> None:
         """Raise ValueError where an event lies off the sensor."""

@@ -66,15 +66,10 @@ class Curve(Callback):
         if self.rows and trainer.is_global_zero:
             self._store(module)
 
-    @property
-    def all_steps(self) -> int:
-        """Steps since the start, also of a training before this that it goes on from."""
-        return self.steps + (self.rows[-1]["steps"] if self.rows else 0)
-
     def _add(self, trainer: Trainer, module: LightningModule) -> None:
         row = {
             "hours": module.clock.hours,
-            "steps": self.all_steps,
+            "steps": module.steps,
             "windows": module.windows_seen,
             "loss": self.loss / self.steps if self.steps else "",
         }
@@ -89,7 +84,7 @@ class Curve(Callback):
         if self.export is None:
             return
         reached = {"hours": module.clock.hours, "windows": module.windows_seen}
-        card = reached | {"steps": self.all_steps, "loss": self.loss, "curve": self.rows}
+        card = reached | {"steps": module.steps, "loss": self.loss, "curve": self.rows}
         # A copy: spectral norm is folded in eval mode, and the training goes on in its own.
         files.save(self.export, deepcopy(module.method), module.network_spec, card)
 

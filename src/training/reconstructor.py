@@ -67,7 +67,7 @@ class Reconstructor(LightningModule):
         self.optimizer, self.scheduler = optimizer, scheduler
         self.detach_every, self.warmup, self.guard = detach_every, warmup, Guard(spike)
         self.loss_from, self.clip, self.clock = loss_from, clip, clock or Clock()
-        self.windows_seen, self.rates = 0, []
+        self.windows_seen, self.steps_before, self.rates = 0, 0, []
         # In a tuple, so that their backbones stay out of the parameters and the checkpoint.
         self._measures = (loss, scores)
         self.clips: list[dict] = []
@@ -91,6 +91,11 @@ class Reconstructor(LightningModule):
     def average(self) -> nn.Module | None:
         """The running mean of the weights."""
         return self._mean[0]
+
+    @property
+    def steps(self) -> int:
+        """Steps so far, also those of a training whose exported weights this goes on from."""
+        return self.steps_before + self.global_step
 
     def on_fit_start(self) -> None:
         """Move what is no submodule to the training device; undo a test's eval mode."""
@@ -215,11 +220,14 @@ class Reconstructor(LightningModule):
         if self.average is not None:
             checkpoint["average"] = self.average.state_dict()
         checkpoint["seconds"], checkpoint["windows"] = self.clock.seconds, self.windows_seen
+        checkpoint["steps"] = self.steps
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
         """Go on with the time and the counts so far."""
         self.guard.losses.extend(checkpoint.get("losses", ()))
         self.clock.seconds = checkpoint.get("seconds", 0.0)
         self.windows_seen = checkpoint.get("windows", 0)
+        step = checkpoint["global_step"]
+        self.steps_before = checkpoint.get("steps", step) - step
         if self.average is not None:
             self.average.load_state_dict(checkpoint.get("average", self.network.state_dict()))

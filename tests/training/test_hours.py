@@ -93,7 +93,7 @@ def test_exported_weights_go_on_where_no_checkpoint_is_left(tmp_path):
     before = curve(tmp_path / "first")
     rise = ["callbacks.hours.rise=4", "seed=1"]
     second = run(tmp_path / "second", "hours=6", f"ckpt={now}", *rise)
-    assert second["seconds"] == 6 * HOUR and second["global_step"] == 3
+    assert second["seconds"] == 6 * HOUR and second["global_step"] == 3 and second["steps"] == 6
     assert second["windows"] == 2 * first["windows"]
     rows = curve(tmp_path / "second")
     assert files.card(now)["steps"] == 3 and len(files.card(now)["curve"]) == len(before)
@@ -130,6 +130,15 @@ def test_restored_weights_are_those_that_were_exported(tmp_path):
         if "gates.weight" in name:  # three steps have not found the largest singular value yet
             wanted = wanted / torch.linalg.matrix_norm(wanted.flatten(1), 2)
         assert torch.allclose(value, wanted, atol=2e-3), name
+
+
+def test_weights_of_another_network_are_refused(tmp_path):
+    now = tmp_path / "now.safetensors"
+    network, spec = build.network(config("train", tmp_path, *TINY, *RECIPE))
+    other, _ = build.network(config("train", tmp_path, *TINY, *RECIPE, "width=8"))
+    files.save(now, network, spec, {})
+    with pytest.raises(ValueError, match="ckpt does not fit E2VID"):
+        files.restore(other, now)
 
 
 def test_weights_without_a_curve_are_none_to_go_on_from(tmp_path):
