@@ -56,7 +56,9 @@ NETWORKS = {
 def config(overrides: list[str]) -> DictConfig:
     """Return the config of src.train."""
     with initialize_config_dir(str(ROOT / "conf"), version_base=None):
-        return compose("train", overrides)
+        cfg = compose("train", overrides)
+    build.choose_precision(cfg)
+    return cfg
 
 
 def split(overrides: list[str]) -> tuple[dict[str, Callable[[], object]], int, int]:

@@ -6,6 +6,7 @@ Stopped anywhere and started again it goes on; several may fill one bank, traini
 """
 
 import multiprocessing
+import os
 import time
 
 import hydra
@@ -24,7 +25,9 @@ def fill_bank(bank: Bank, workers: int) -> None:
     print(bank.status(), flush=True)
     start, before = time.monotonic(), len(bank.missing())
     spawn = multiprocessing.get_context("spawn")
-    running = [spawn.Process(target=_work, args=(bank,), daemon=True) for _ in range(workers)]
+    running = [
+        spawn.Process(target=_work, args=(bank, os.getpid()), daemon=True) for _ in range(workers)
+    ]
     for process in running:
         process.start()
     while alive := [process for process in running if process.is_alive()]:
@@ -36,9 +39,9 @@ def fill_bank(bank: Bank, workers: int) -> None:
         raise OSError(f"{len(bank.missing())} clips are missing in {bank.folder}")
 
 
-def _work(bank: Bank) -> None:
+def _work(bank: Bank, parent: int) -> None:
     torch.set_num_threads(1)
-    fill(bank)
+    fill(bank, lambda: os.getppid() == parent)
 
 
 @hydra.main(version_base=None, config_path="../conf", config_name="train")

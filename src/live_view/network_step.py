@@ -14,8 +14,7 @@ from jaxtyping import Float
 from torch import nn
 
 from src.live_view.cutter import EventWindow
-from src.models import openvino_cpu
-from src.models.runtime import Runtime, runs
+from src.models.runtime import Runtime, fastest, runs
 from src.recordings import event_lists, stream
 from src.recordings.files.formats import EVENT
 from src.recordings.lookup import build
@@ -48,7 +47,7 @@ class Step:
     def __init__(self, network: nn.Module, views: Views, how: Running):
         self.views, self.how = views, how
         self.overlap = stream.overlap(how.span or stream.default_span(network), how.fps)
-        form = how.form or fastest(network)
+        form = how.form or (fastest() if runs(network) else "float32")
         self.network = event_lists.ready(network, form, "cpu", views, how.bins)
         self.rule = stream.Rule(
             fps=how.fps,
@@ -116,10 +115,3 @@ class Step:
         self.recent: deque[np.ndarray] = deque(maxlen=self.overlap)
         for _ in range(3):
             self.begin(EventWindow(0.0, 1e6 / self.how.fps, events), fresh=True)()
-
-
-def fastest(network: nn.Module) -> str:
-    """Return the form in which `network` runs fastest on a CPU with what is installed."""
-    if not runs(network):
-        return "float32"
-    return "openvino" if openvino_cpu.installed() else "bf16"

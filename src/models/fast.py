@@ -18,6 +18,13 @@ from src.models.unroll import takes
 FORMS = ("float32", "bf16", "compiled", "openvino")
 
 
+def computes_bf16() -> bool:
+    """Return whether this processor has instructions for bf16: without, it takes many times longer
+    than float32."""
+    able = torch.cpu.get_capabilities()
+    return any(able.get(name) for name in ("avx512_bf16", "amx_bf16", "bf16"))
+
+
 def running(network: nn.Module, form: str) -> nn.Module:
     """Return `network` in a form to run it in: `float32`, as it is; `bf16`, a Fast one; `compiled`,
     that one compiled; `openvino`, on OpenVINO, in bf16 where the CPU computes in it.

@@ -18,7 +18,7 @@ from src.models import openvino_cpu
 from src.models.behind_first_layer import AfterHead, AfterStem, OnOpenVino, OnTorch
 from src.models.e2vid import E2VID
 from src.models.engines import events_numba as kernels
-from src.models.fast import plain
+from src.models.fast import computes_bf16, plain
 from src.models.first_layer import HeadFront, StemFront
 from src.models.setnet import SetNet
 from src.sim.optics import Position
@@ -34,6 +34,13 @@ WRONG = {
 }
 
 
+def fastest() -> str:
+    """Return the form that runs fastest with this processor and what is installed."""
+    if openvino_cpu.installed():
+        return "openvino"
+    return "bf16" if computes_bf16() else "float32"
+
+
 def runs(network: nn.Module) -> bool:
     """Return whether `network` has a first layer that events can be added to one by one."""
     return isinstance(network, SetNet | E2VID)
@@ -43,8 +50,8 @@ class Runtime:
     """A `SetNet` or `E2VID` over lists of events, window by window.
 
     `positions`: (row, col) of each view; `height`, `width`: of a view's picture and of the frame.
-    `form`: openvino, float32 or bf16 (PyTorch); default: openvino where the package is there, else
-    bf16.  `threads`: of what comes behind the first layer, which takes one.  Raises ValueError for
+    `form`: openvino, float32 or bf16 (PyTorch); default: the `fastest`.
+    `threads`: of what comes behind the first layer, which takes one.  Raises ValueError for
     another network, form or size and for a number of views that the network does not take.
     """
 
@@ -58,7 +65,7 @@ class Runtime:
         threads: int = 2,
         form: str | None = None,
     ):
-        form = form or ("openvino" if openvino_cpu.installed() else "bf16")
+        form = form or fastest()
         if form not in FORMS:
             raise ValueError(f"form must be one of {', '.join(FORMS)}, got {form}")
         if not runs(network):

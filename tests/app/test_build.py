@@ -150,6 +150,24 @@ def test_without_a_progress_bar_training_goes_on_without_it(tmp_path):
     assert bars == [True, False]
 
 
+@pytest.mark.parametrize(
+    ("budget", "device", "able", "precision"),
+    [
+        ("minutes", "cpu", True, "bf16-mixed"),
+        ("hours", "cpu", False, "32-true"),
+        ("hours", "gpu", False, "bf16-mixed"),
+        ("paper", "cpu", True, "32-true"),
+    ],
+)
+def test_precision_is_what_the_device_is_fast_in(
+    budget, device, able, precision, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(build, "computes_bf16", lambda: able)
+    cfg = config("train", tmp_path, f"budget={budget}", f"trainer.accelerator={device}")
+    build.choose_precision(cfg)
+    assert cfg.trainer.precision == precision
+
+
 def test_a_missing_size_is_asked_for_by_its_key(tmp_path):
     events = np.array([(0, 1, 1, 1), (5, 2, 2, -1)], formats.EVENT)
     formats.write_events(tmp_path / "a.raw", events, width=8, height=8)
