@@ -124,6 +124,7 @@ def reconstructor(cfg: DictConfig, net: nn.Module, spec: dict) -> Reconstructor:
         warmup=cfg.data.warmup,
         spike=cfg.spike,
         loss_from=cfg.data.loss_from,
+        steady=cfg.steady,
         clip=cfg.clip,
         average=cfg.average,
         clock=Clock(cfg.clock),

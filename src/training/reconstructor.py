@@ -1,5 +1,6 @@
 """Training, validation and test of any network that turns voxel grids into frames."""
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,8 @@ class Reconstructor(LightningModule):
     `detach_every`: windows between two cuts of the graph (truncated back-propagation through time;
     0: none).  Memory is that of one chunk; the optimiser steps once per batch.
     `loss_from`: the first window of a sequence that the loss sees; those before fill the state.
+    `steady`: weight of the mean change of a picture's error from one window to the next: a picture
+    may be wrong, but not flicker.
     `clip`: longest gradient (Euclidean norm over all parameters; None: as long as it is).
     `average`: decay of the weights' running mean, which then is what is validated, tested and
     shipped (average.py); None: none.  `clock` counts the time of training.
@@ -49,6 +52,7 @@ class Reconstructor(LightningModule):
         warmup: int = 0,
         spike: float | None = None,
         loss_from: int = 0,
+        steady: float = 0.0,
         clip: float | None = None,
         average: float | None = None,
         clock: Clock | None = None,
@@ -56,6 +60,8 @@ class Reconstructor(LightningModule):
         super().__init__()
         if detach_every < 0:
             raise ValueError(f"data.detach_every must be >= 0, got {detach_every}")
+        if not 0 <= steady < math.inf:
+            raise ValueError(f"steady must be >= 0, got {steady}")
         if clip is not None and not clip > 0:
             raise ValueError(f"clip must be > 0 or null, got {clip}")
         if average is not None and not 0 <= average < 1:
@@ -66,7 +72,8 @@ class Reconstructor(LightningModule):
         self._mean, self.decay = (None if average is None else copy_of(network),), average
         self.optimizer, self.scheduler = optimizer, scheduler
         self.detach_every, self.warmup, self.guard = detach_every, warmup, Guard(spike)
-        self.loss_from, self.clip, self.clock = loss_from, clip, clock or Clock()
+        self.loss_from, self.steady, self.clip = loss_from, steady, clip
+        self.clock = clock or Clock()
         self.windows_seen, self.steps_before, self.rates = 0, 0, []
         # In a tuple, so that their backbones stay out of the parameters and the checkpoint.
         self._measures = (loss, scores)
@@ -149,6 +156,7 @@ class Reconstructor(LightningModule):
 
         The loss sees every picture alone, so its gradient there is had a few pictures at a time,
         and its own maps (VGG's are larger than the network's) never stand in memory together.
+        What holds the error steady is added to it.
         """
         options = {}
         if takes(self.loss, "drawer"):  # a loss that draws, draws the same again in a resumed run
@@ -160,6 +168,11 @@ class Reconstructor(LightningModule):
             loss = self.loss(ours, truth, **options).sum() / count
             loss.backward()
             total += loss.detach()
+        if self.steady:
+            error = leaves.unflatten(0, frames.shape[:2]) - target
+            change = self.steady * error.diff(dim=1).abs().mean((2, 3, 4)).sum() / count
+            change.backward()
+            total += change.detach()
         self.manual_backward(pictures, leaves.grad)
         return total
 

@@ -167,6 +167,7 @@ def test_the_mean_forgets_the_start_and_then_moves_slowly():
         (["hours=1"], "scheduler must be null with hours=1"),
         (["clock=moon"], "clock must be one of wall, processor"),
         (["clip=0"], "clip must be > 0"),
+        (["steady=-1"], "steady must be >= 0"),
         (["average=1"], "average must be in"),
         (["data.loss_from=2"], "data.loss_from must be in 0..1"),
         (["callbacks.curve.every_h=0"], "callbacks.curve.every_h"),

@@ -1,6 +1,7 @@
 """The training step: loss averaged over windows, graph cut where asked, one optimiser step."""
 
 import copy
+from itertools import pairwise
 
 import lightning
 import pytest
@@ -64,15 +65,20 @@ def fit(network: nn.Module, detach_every: int, steps: int = 1, **how) -> nn.Modu
     return network
 
 
-def by_hand(detach_every: int, loss_from: int = 0, clip: float = 1e9) -> nn.Module:
+def by_hand(
+    detach_every: int, loss_from: int = 0, clip: float = 1e9, steady: float = 0.0
+) -> nn.Module:
     network, batch = Leaky(), sample()
-    state, losses = None, []
+    state, losses, errors = None, [], []
     for window in range(batch.voxels.shape[1]):
         if detach_every and window % detach_every == 0:
             state = detach(state)
         frame, state = network(batch.voxels[:, window], state)
-        losses.append((frame - batch.target[:, window]).square().mean())
-    torch.stack(losses[loss_from:]).mean().backward()
+        errors.append(frame - batch.target[:, window])
+        losses.append(errors[-1].square().mean())
+    changes = [(b - a).abs().mean() for a, b in pairwise(errors[loss_from:])]
+    loss = torch.stack(losses[loss_from:]).mean()
+    (loss + steady * torch.stack(changes).sum() / len(losses[loss_from:])).backward()
     torch.nn.utils.clip_grad_norm_(network.parameters(), clip)
     with torch.no_grad():
         for parameter in network.parameters():
@@ -94,6 +100,15 @@ def test_the_loss_begins_where_it_is_told_and_gradients_are_clipped(detach_every
     for mine, other in zip(ours.parameters(), theirs.parameters(), strict=True):
         assert torch.allclose(mine, other, atol=1e-6)
     assert not torch.allclose(theirs.a, by_hand(detach_every, 0, 0.1).a, atol=1e-6)
+
+
+@pytest.mark.parametrize("loss_from", [0, 2])
+def test_what_flickers_costs(loss_from):
+    how = {"loss_from": loss_from, "steady": 3.0}
+    ours, theirs = fit(Leaky(), 0, **how), by_hand(0, **how)
+    for mine, other in zip(ours.parameters(), theirs.parameters(), strict=True):
+        assert torch.allclose(mine, other, atol=1e-6)
+    assert not torch.allclose(theirs.a, by_hand(0, loss_from).a, atol=1e-3)
 
 
 def test_cutting_the_graph_changes_the_gradient():
