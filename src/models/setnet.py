@@ -27,7 +27,7 @@ SIZES = {  # multiply-accumulates at 176 x 176 with nine views: 0.4, 0.8 and 3 G
     "large": {"stem": 32, "channels": 96},
 }
 MEMORIES_S = (0.05, 0.5)  # time constants of the leaky sums
-AWAKE_S = 0.01  # time constant by which a block falls asleep after its last event
+AWAKE_S = 0.005  # time constant by which a block falls asleep after its last event
 RATE = 120.0  # windows a second at which an update gate is taken as it is
 MAX_VIEWS = 25
 
