@@ -136,9 +136,9 @@ class Attention(nn.Module):
             for source, weight, bias in zip((x, memory, memory), weights, biases, strict=True)
         )
         rate = DROPOUT if self.training else 0.0
-        found = functional.scaled_dot_product_attention(q, k, v, dropout_p=rate)
-        found = self.out(found.transpose(1, 2).flatten(2))
-        return functional.dropout(found, DROPOUT, self.training)
+        attended = functional.scaled_dot_product_attention(q, k, v, dropout_p=rate)
+        attended = self.out(attended.transpose(1, 2).flatten(2))
+        return functional.dropout(attended, DROPOUT, self.training)
 
 
 class MLP(nn.Module):

@@ -35,8 +35,8 @@ def scan(
     blocks = zip(*(part.split(BLOCK, 1) for part in (x, step, enter, leave)), strict=True)
     state, read = x.new_zeros(len(x), *rate.shape), []
     for x, step, enter, leave in blocks:
-        found, state = _block(x, step, rate, enter, leave, state)
-        read.append(found)
+        piece, state = _block(x, step, rate, enter, leave, state)
+        read.append(piece)
     return torch.cat(read, 1)
 
 

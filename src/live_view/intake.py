@@ -143,8 +143,8 @@ class Intake:
         """Take a live chunk; after a silence or a leap of the camera's clock, time starts anew."""
         if self.arrived is not None:
             stalled = wall - self.arrived > STALL_S
-            known = self.clock.offset is not None
-            if stalled or (known and self.cutter.leaps(events, self.clock.recorded_us(wall))):
+            timed = self.clock.offset is not None
+            if stalled or (timed and self.cutter.leaps(events, self.clock.recorded_us(wall))):
                 self._start_anew()
         self.faults.clear("stall")
         self.arrived = wall

@@ -26,15 +26,15 @@ class Page:
         self.slice = Slice(self.screen)
         self.all_views = False
         self.shown = -1  # count of frames at the last picture
-        self.told = 0.0  # when the meters were last sent
+        self.sent = 0.0  # when the meters were last sent
 
     def message(self, *, whole: bool = False) -> bytes | None:
         """Return what is new since the last call, or everything; None where nothing is."""
         pictures = self._pictures(whole)
         header: dict = {"pictures": [[name, len(data)] for name, data in pictures]}
         now = time.perf_counter()
-        if whole or now - self.told >= STATUS_S:
-            self.told, header["status"] = now, self.status()
+        if whole or now - self.sent >= STATUS_S:
+            self.sent, header["status"] = now, self.status()
         elif not pictures:
             return None
         text = json.dumps(header).encode()

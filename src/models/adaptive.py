@@ -105,10 +105,10 @@ class Adaptive(nn.Module):
             sums = sums + math.exp(-window_s / MEMORY_S) * state.sums
         mean = sums.mean(1, keepdim=True)
         spread = (sums - mean).square().mean().sqrt()
-        found = float(spread / mean.square().mean().sqrt().clamp(min=1e-9)) if spread > 0 else 0.0
+        apart = float(spread / mean.square().mean().sqrt().clamp(min=1e-9)) if spread > 0 else 0.0
         if state is None:
-            return Held(0, None, sums, found, 0, window_s)
-        return replace(state, sums=sums, disagreement=found, age_s=state.age_s + window_s)
+            return Held(0, None, sums, apart, 0, window_s)
+        return replace(state, sums=sums, disagreement=apart, age_s=state.age_s + window_s)
 
     def _decided(self, held: Held, places: list[Position]) -> Held:
         """Go up at once, down one level at a time and only after calm."""

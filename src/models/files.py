@@ -61,10 +61,10 @@ def require(name: str | Path, spec: dict) -> Path:
     path = newest(Path(name)) if Path(name).is_dir() else Path(name)
     if not path.is_file():
         raise ValueError(f"ckpt must be a checkpoint to go on from, got {path}")
-    found, _ = (_safetensors if exported(path) else _checkpoint)(path)
+    saved, _ = (_safetensors if exported(path) else _checkpoint)(path)
     wanted = spec | {"kwargs": spec["kwargs"] | _unnormalised(spec)} if exported(path) else spec
-    if found != wanted:
-        raise ValueError(f"ckpt must be of the network {spec} to go on from, got {found} in {path}")
+    if saved != wanted:
+        raise ValueError(f"ckpt must be of the network {spec} to go on from, got {saved} in {path}")
     return path
 
 

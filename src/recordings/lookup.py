@@ -61,12 +61,12 @@ class Lookup:
         kinds = (np.int64, np.int64, np.int64, np.int64, np.float32)
         index, u, v, which, weight = (np.empty(count, kind) for kind in kinds)
         fields, made = [events[name] for name in "xyp"], (index, u, v, which, weight)
-        found, outside = (
+        entries, outside = (
             lay_nearest(*fields, self.nearest, density[:, 0], *made)
             if nearest
             else lay(*fields, self.view, self.place, density[:, 0], *made)
         )
-        return tuple(part[:found] for part in (index, u, v, weight, which)), outside
+        return tuple(part[:entries] for part in (index, u, v, weight, which)), outside
 
     @cached_property
     def nearest(self) -> Int[np.ndarray, "h w"]:

@@ -83,10 +83,10 @@ def _rename(made: Path, whole: Path) -> None:
 def _check_mp4(path: Path, count: int) -> None:
     """Raise OSError unless the file holds `count` frames: the encoder is silent on a full disk."""
     video = cv2.VideoCapture(str(path))
-    found = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+    frames = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
     video.release()
-    if found != count:
-        raise OSError(f"{path} holds {found} of {count} frames; is the disk full?")
+    if frames != count:
+        raise OSError(f"{path} holds {frames} of {count} frames; is the disk full?")
 
 
 def eight_bits(picture: Float[np.ndarray, "h w"]) -> Picture:

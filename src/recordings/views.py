@@ -130,11 +130,11 @@ class Views:
 
     def only(self, positions: Sequence[tuple[int, int]]) -> "Views":
         """Return the views at `positions`, in that order.  Raises ValueError for one not there."""
-        found = dict(zip(self.positions, self.views, strict=True))
-        missing = [position for position in positions if position not in found]
+        by_position = dict(zip(self.positions, self.views, strict=True))
+        missing = [position for position in positions if position not in by_position]
         if missing:
             raise ValueError(f"views has no view at {missing}, only {self.positions}")
-        chosen = tuple(found[position] for position in positions)
+        chosen = tuple(by_position[position] for position in positions)
         return Views(self.sensor, self.model, self.field, chosen)
 
     def register(

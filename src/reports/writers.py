@@ -114,7 +114,7 @@ def _escaped(text: str) -> str:
 
 
 def _tex(text: str) -> str:
-    return re.sub(".", lambda found: LATEX.get(found[0], found[0]), text)
+    return re.sub(".", lambda match: LATEX.get(match[0], match[0]), text)
 
 
 def _latex(table: Table) -> str:

@@ -83,13 +83,13 @@ def measure(frames: Float[np.ndarray, "frames h w"], fps: float | None = None) -
         model.tilt(*pairs.mean(*chosen), lags.mean(*chosen)[0], len(frames))
         for chosen in _resampled(len(frames), 2 * tilt.decay)
     ]
-    found = _air_file(tilt, drawn, unit, fps, len(lags.at)) | {
+    numbers = _air_file(tilt, drawn, unit, fps, len(lags.at)) | {
         "blur_ratio": blur_ratio(*_coarse(frames, tracks))
     }
     a, b = covariance.centred(tracks)
     power = (a * b).sum((0, 2)) / (2 * tracks.seen.sum(0))
     return Air(
-        found=AirFile(**found),
+        found=AirFile(**numbers),
         tilt=tilt,
         distance_px=pairs.at * unit,
         fitted_px=model.fitted_px * unit,

@@ -120,10 +120,10 @@ def invert(curve: Curve, rates: Float[np.ndarray, " 2"]) -> float:
     mean = np.sqrt(np.maximum(np.prod(curve.rates, axis=1), 1e-30))
     falling = np.minimum.accumulate(np.log(mean))
     target = 0.5 * np.log(np.prod(rates))
-    found = np.interp(
+    log_threshold = np.interp(
         target, falling[::-1], np.log(curve.thresholds)[::-1], left=np.nan, right=np.nan
     )
-    return float(np.exp(found))
+    return float(np.exp(log_threshold))
 
 
 def _excess(curve: Curve, on: float, rates: Float[np.ndarray, " 2"]) -> float:
@@ -133,12 +133,12 @@ def _excess(curve: Curve, on: float, rates: Float[np.ndarray, " 2"]) -> float:
     return float(np.exp(np.log(rates[0] / rates[1]) - expected))
 
 
-def write_csv(found: Estimate, rates: Rates, path: Path) -> None:
+def write_csv(thresholds: Estimate, rates: Rates, path: Path) -> None:
     """Write the curve, the rates of each view and the estimate as one table."""
-    curve = zip(found.curve.thresholds, found.curve.rates, strict=True)
+    curve = zip(thresholds.curve.thresholds, thresholds.curve.rates, strict=True)
     rows = [("simulated_hz", f"{threshold:.4g}", *pair) for threshold, pair in curve]
     rows += [("measured_hz", index, *pair) for index, pair in enumerate(rates.per_view)]
-    estimate = zip(("estimate", "low", "high"), found.on, found.off, strict=True)
+    estimate = zip(("estimate", "low", "high"), thresholds.on, thresholds.off, strict=True)
     rows += [(name, "", on, off) for name, on, off in estimate]
     texts = [(what, which, *(f"{value:.5g}" for value in pair)) for what, which, *pair in rows]
     write_text(path, csv_text(("what", "threshold_or_view", "on", "off"), texts))

@@ -138,11 +138,11 @@ class Model:
         power = weights.sum()
         curve = self._gaussians(self.fitted_px, 0.0) @ weights / max(power, 1e-12)
         correlation = product / max(power, 1e-12)
-        known = np.where(
+        joined = np.where(
             count > ENOUGH, correlation, np.interp(self.distance, self.fitted_px, curve)
         )
         # Beyond the shortest distances what was measured is taken as it is, negative values too.
-        far = np.interp(self.pairs, self.distance[1:], known[1:])
+        far = np.interp(self.pairs, self.distance[1:], joined[1:])
         near = np.interp(self.pairs, self.fitted_px, curve)
         whole = float(np.where(self.pairs < 4 * SPREAD, near, far).mean())
         # A film's own mean was taken off: 1 - kept of the power, at every distance alike.

@@ -63,10 +63,10 @@ def corners(picture: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "points 2"]:
     inside = np.zeros(picture.shape, np.uint8)
     inside[MARGIN:-MARGIN, MARGIN:-MARGIN] = 255
     eight_bits = np.clip(picture * 255, 0, 255).astype(np.uint8)
-    found = cv2.goodFeaturesToTrack(eight_bits, 4 * MOST, QUALITY, APART, mask=inside, blockSize=5)
-    if found is None:
+    peaks = cv2.goodFeaturesToTrack(eight_bits, 4 * MOST, QUALITY, APART, mask=inside, blockSize=5)
+    if peaks is None:
         return np.zeros((0, 2), np.float32)
-    x, y = np.round(found[:, 0]).astype(int).T
+    x, y = np.round(peaks[:, 0]).astype(int).T
     gx, gy = gradient(picture)
     xx, xy, yy = (cv2.GaussianBlur(g, (0, 0), SPREAD)[y, x] for g in (gx * gx, gx * gy, gy * gy))
     half, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)

@@ -103,8 +103,8 @@ def read(path: Path | str | None) -> AirFile:
 
 
 def _estimate(name: str, content: Any) -> Estimate:
-    known = isinstance(content, dict) and set(content) == {"value", "interval"}
-    interval = content["interval"] if known else None
+    complete = isinstance(content, dict) and set(content) == {"value", "interval"}
+    interval = content["interval"] if complete else None
     if not isinstance(interval, list) or len(interval) != 2:
         raise ValueError(f"{name} must hold value and interval: [low, high], got {content}")
     for number in (content["value"], *interval):

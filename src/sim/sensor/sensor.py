@@ -87,25 +87,25 @@ class EventSensor:
 
     def having(self, **settings) -> "EventSensor":
         """Return the same sensor with other `settings`, arguments of the class."""
-        found = copy(self)
-        vars(found).update(settings)
-        check(vars(found))
-        found._table = response_table(found.response, found.input, found.floor)
-        return found
+        sensor = copy(self)
+        vars(sensor).update(settings)
+        check(vars(sensor))
+        sensor._table = response_table(sensor.response, sensor.input, sensor.floor)
+        return sensor
 
     def draw(self, key: int, seed: int | None = None) -> "EventSensor":
         """Return the sensor of one clip, its numbers drawn from `key`; of another `seed`, if any.
 
         The threshold's own range is uniform, from the stream that `sample_threshold` draws from.
         """
-        found = copy(self)
-        found.threshold = self.sample_threshold(noise.generator(noise.key(key, "threshold")))
+        sensor = copy(self)
+        sensor.threshold = self.sample_threshold(noise.generator(noise.key(key, "threshold")))
         for name, (low, high) in self.drawn.items():
             share = float(noise.uniform(noise.key(key, "sensor", name), torch.tensor(0)))
             drawn = low * (high / low) ** share if low > 0 else high * share
-            setattr(found, name, min(drawn, high))
-        found.drawn, found.seed = {}, self.seed if seed is None else seed
-        return found
+            setattr(sensor, name, min(drawn, high))
+        sensor.drawn, sensor.seed = {}, self.seed if seed is None else seed
+        return sensor
 
     def sample_threshold(self, generator: torch.Generator) -> float:
         """Return one clip's threshold: uniform in the range, or the number itself."""
