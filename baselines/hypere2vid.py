@@ -41,10 +41,8 @@ class HyperE2VID(SingleView):
         """Return the frame and (state of E2VID, frame before output handling and cropping)."""
         before, shown = state or (None, torch.zeros_like(seen[:, :1]))
         head, skips, after = self.net.encode(seen, before)
-        x = skips[-1]
-        for block in self.net.resblocks:
-            x = block(x)
-        x = self.dynamic(x + skips.pop(), torch.cat([seen, shown], 1))
+        x = self.net.resblocks(skips[-1]) + skips.pop()
+        x = self.dynamic(x, torch.cat([seen, shown], 1))
         frame = self.net.decode(x, head, skips)
         return frame, (after, frame.detach())
 

@@ -83,8 +83,7 @@ class MambaTM(nn.Module):
         maps = zip(*(self.encoder(flat[part]) for part in parts), strict=True)
         *skips, deep = [torch.cat(scale) for scale in maps]
         grid = (count, *deep.shape[-2:])
-        orders = scan_orders(*grid)
-        orders = [order.to(frames.device) for order in orders]
+        orders = [order.to(frames.device) for order in scan_orders(*grid)]
         tokens = deep.unflatten(0, (n, count)).movedim(2, -1).flatten(1, 3)
         for i, layer in enumerate(self.free):
             tokens = layer(tokens, grid, orders[i % 3])

@@ -52,7 +52,8 @@ def comparison(
     grid = figure.subplots(len(rows), columns, squeeze=False)
     for row, axes in zip(rows, grid, strict=True):
         for sample, panel in zip(samples, axes, strict=False):
-            _frame(panel, row.video[sample])
+            panel.imshow(row.video[sample], cmap="gray", vmin=0, vmax=1)
+            panel.set(xticks=[], yticks=[])
         axes[0].plot(*line.T, color=LINE, linewidth=1)
         axes[0].set_ylabel(row.name, fontsize=min(9, 170 / max(len(row.name), 1)))
         _slice(axes[-1], row, length_s)
@@ -61,11 +62,6 @@ def comparison(
         panel.set_title(f"{1e3 * time:.1f} ms", fontsize=8)
     grid[0, -1].set_title(f"{axis}-t, {1e3 * length_s:.0f} ms", fontsize=8)
     plots.save(figure, Path(path))
-
-
-def _frame(panel: Axes, picture: np.ndarray) -> None:
-    panel.imshow(picture, cmap="gray", vmin=0, vmax=1)
-    panel.set(xticks=[], yticks=[])
 
 
 def _slice(panel: Axes, row: Row, length_s: float) -> None:

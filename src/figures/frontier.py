@@ -37,7 +37,8 @@ def accuracy(
     in bf16; the dashed line is the front of what none beats in both.
     """
     names = list(dict.fromkeys(row.network for row in scores))
-    times = {(s.network, s.form): s.ms for s in speeds if _counts(s, side)}
+    alone = [s for s in speeds if (s.side, s.threads, s.device) == (side, 1, "cpu")]
+    times = {(s.network, s.form): s.ms for s in alone if s.ms is not None}
     metrics = [metric for metric in SHOWN if scores and metric.name in scores[0].values]
     rows = max(2, (len(metrics) + 1) // 2)
     figure = Figure(figsize=(11, 4.1 * rows), layout="constrained")
@@ -75,10 +76,6 @@ def machine(path: Path, speeds: Sequence[Speed], peaks: Mapping[tuple[str, int],
     forms = [form for form in FACES if any(s.form == form for s in timed)]
     _legend(figure, names, forms, starred)
     return save(figure, path)
-
-
-def _counts(s: Speed, side: int) -> bool:
-    return s.ms is not None and s.side == side and s.threads == 1 and s.device == "cpu"
 
 
 def _panel(axes, names: list[str], times: Mapping, scores: Sequence[Score], metric: Metric) -> None:

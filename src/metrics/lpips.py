@@ -5,8 +5,8 @@ are never replaced by random ones: without them there is no LPIPS.
 """
 
 import socket
-from collections.abc import Callable
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 
 import torch
@@ -170,8 +170,7 @@ def _heads(net: str) -> list[Tensor]:
 
 def _fill(stages: nn.ModuleList, weights: dict[str, Tensor], net: str) -> None:
     """Copy `features.<i>.weight` and `.bias` into the convolutions, in their order."""
-    layers = [layer for stage in stages for layer in stage]
-    for place, layer in enumerate(layers):
+    for place, layer in enumerate(chain.from_iterable(stages)):
         if isinstance(layer, nn.Conv2d):
             for part in ("weight", "bias"):
                 name = f"features.{place}.{part}"
@@ -185,10 +184,10 @@ def _backbone(net: str, path: str | None) -> dict[str, Tensor]:
     candidates = [Path(path)] if path else [CACHE / f"{net}.safetensors", hub]
     for candidate in candidates:
         if candidate.is_file():
-            read: Callable = load_file if candidate.suffix == ".safetensors" else _load_pickle
-            return read(candidate)
-    downloaded = _download(net) if path is None else None
-    if downloaded is not None:
+            if candidate.suffix == ".safetensors":
+                return load_file(candidate)
+            return torch.load(candidate, map_location="cpu", weights_only=True)
+    if path is None and (downloaded := _download(net)) is not None:
         return downloaded
     raise ValueError(
         f"loss.backbone: no ImageNet weights of {net} at {candidates[0]}. Get them by "
@@ -214,7 +213,3 @@ def _download(net: str) -> dict[str, Tensor] | None:
         return None
     finally:
         socket.setdefaulttimeout(patience)
-
-
-def _load_pickle(path: Path) -> dict[str, Tensor]:
-    return torch.load(path, map_location="cpu", weights_only=True)

@@ -26,7 +26,9 @@ def displacement(
 
     Blocks are 16 pixels wide; shifts are cut at 8 pixels.
     """
-    weight = _texture(target)
+    a, b, c = _structure(*_gradients(target))
+    weaker = (a + c) / 2 - ((a - c) ** 2 / 4 + b * b).sqrt()  # eigenvalue of each block's tensor
+    weight = torch.where(weaker > TEXTURE, weaker, torch.zeros_like(weaker))
     shift = torch.zeros(len(target), 2, *weight.shape[1:], dtype=target.dtype, device=target.device)
     for side in SMOOTHING:
         step = _step(_smooth(frames, side), _smooth(target, side), shift)
@@ -73,13 +75,6 @@ def straightness(path: Float[Tensor, "frames 2"], truth: Float[Tensor, "frames 2
     """
     error = path - truth
     return float((error - error.mean(0)).square().sum(1).mean().sqrt())
-
-
-def _texture(target: Tensor) -> Tensor:
-    """Return the smaller eigenvalue of every block's structure tensor, 0 below TEXTURE."""
-    a, b, c = _structure(*_gradients(target))
-    weaker = (a + c) / 2 - ((a - c) ** 2 / 4 + b * b).sqrt()
-    return torch.where(weaker > TEXTURE, weaker, torch.zeros_like(weaker))
 
 
 def _structure(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:

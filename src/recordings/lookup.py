@@ -59,13 +59,12 @@ class Lookup:
         self.check(events)
         count = (1 if nearest else 4) * len(events)
         kinds = (np.int64, np.int64, np.int64, np.int64, np.float32)
-        index, u, v, which, weight = (np.empty(count, kind) for kind in kinds)
-        fields, made = [events[name] for name in "xyp"], (index, u, v, which, weight)
-        entries, outside = (
-            lay_nearest(*fields, self.nearest, density[:, 0], *made)
-            if nearest
-            else lay(*fields, self.view, self.place, density[:, 0], *made)
-        )
+        index, u, v, which, weight = made = [np.empty(count, kind) for kind in kinds]
+        fields = [events[name] for name in "xyp"]
+        if nearest:
+            entries, outside = lay_nearest(*fields, self.nearest, density[:, 0], *made)
+        else:
+            entries, outside = lay(*fields, self.view, self.place, density[:, 0], *made)
         return tuple(part[:entries] for part in (index, u, v, weight, which)), outside
 
     @cached_property

@@ -55,9 +55,9 @@ class Budget:
 
 def _fill(template: str, parts: dict[str, str]) -> str:
     """Put the parts where {{name}} stands in the template; parts are not searched."""
-    found = template.split("{{")
-    pieces = [found[0]]
-    for piece in found[1:]:
+    start, *others = template.split("{{")
+    pieces = [start]
+    for piece in others:
         name, rest = piece.split("}}", 1)
         pieces += [parts[name], rest]
     return "".join(pieces)

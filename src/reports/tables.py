@@ -128,9 +128,8 @@ def _names(cell: Cell, marks: list[str]) -> list[Value]:
     numbers = ", ".join(str(len(marks) + k) for k in range(1, len(cell.notes) + 1))
     marks += cell.notes
     first, *others = cell.label
-    return [Value(words=f"{first} [{numbers}]" if numbers else first)] + [
-        Value(words=word) for word in others
-    ]
+    words = [f"{first} [{numbers}]" if numbers else first, *others]
+    return [Value(words=word) for word in words]
 
 
 def _count(cell: Cell) -> Value:

@@ -1,7 +1,6 @@
 """Probes of numbers: growth of a small difference, the worst input, bf16, chunks."""
 
 import math
-from collections.abc import Iterable
 from copy import deepcopy
 from dataclasses import dataclass
 from itertools import cycle, islice
@@ -48,8 +47,7 @@ class Growth:
         )
         difference = (plain - other)[start + self.skip :].double().square().mean((1, 2, 3)).sqrt()
         logs = difference.clamp(min=1e-12).log()
-        times = torch.arange(len(logs), dtype=torch.float64)
-        times = times - times.mean()
+        times = torch.arange(len(logs), dtype=torch.float64) - (len(logs) - 1) / 2
         return float((times * logs).sum() / times.square().sum())
 
 
@@ -120,13 +118,10 @@ class Bf16:
         forth = list(stream.windows(stream.fps))
         back = [-window.flip(2) for window in reversed(forth)]
         truth = torch.cat([stream.target[1:], stream.target[:-1].flip(0)])
-        frames = _every(subject, stream, islice(cycle(forth + back), self.windows // 4 * 4))
+        shown = islice(cycle(forth + back), self.windows // 4 * 4)
+        frames, _ = subject.play(shown, stream.positions, 1 / stream.fps)
         places = torch.arange(len(frames)) % len(truth)
         return aligned_psnr(frames, truth[places, None])
-
-
-def _every(subject: Subject, stream: Stream, windows: Iterable[Tensor]) -> Tensor:
-    return subject.play(windows, stream.positions, 1 / stream.fps)[0]
 
 
 @dataclass(frozen=True)

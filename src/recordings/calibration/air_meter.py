@@ -60,7 +60,9 @@ def measure(frames: Float[np.ndarray, "frames h w"], fps: float | None = None) -
     """
     if len(frames) < LEAST_FRAMES:
         raise ValueError(f"video must have at least {LEAST_FRAMES} frames, got {len(frames)}")
-    frames = _even(frames)
+    level = frames.mean((1, 2), keepdims=True)
+    # To one mean brightness: flicker is not air.
+    frames = (frames * (level.mean() / np.maximum(level, 1e-6))).astype(np.float32)
     size = frames.shape[1:]
     place = following.corners(frames.mean(0))
     if len(place) < LEAST_POINTS:
@@ -150,12 +152,6 @@ def _coarse(frames: np.ndarray, tracks: Tracks) -> tuple[Tracks, tuple[int, int]
     place = np.round(tracks.place * SIDE / min(size)).astype(np.float32)
     again = following.follow(small, place)
     return again.of(again.seen.mean(0) >= LEAST_SEEN), small.shape[1:]
-
-
-def _even(frames: np.ndarray) -> np.ndarray:
-    """Return the frames with one mean brightness: flicker is not air."""
-    level = frames.mean((1, 2), keepdims=True)
-    return (frames * (level.mean() / np.maximum(level, 1e-6))).astype(np.float32)
 
 
 def _usable(tracks: Tracks, size: tuple[int, int]) -> Tracks:

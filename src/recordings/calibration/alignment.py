@@ -87,9 +87,8 @@ def _grid(centres: np.ndarray, sensor: Size) -> list[Position]:
     """Sort centres (k, 2) into (row, col) about the middle of a full 3x3, else of the sensor."""
     if len(centres) < 2:
         return [(0, 0)] * len(centres)
-    apart = np.linalg.norm(centres[:, None] - centres[None], axis=-1) + np.diag(
-        [np.inf] * len(centres)
-    )
+    apart = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+    np.fill_diagonal(apart, np.inf)
     pitch = np.median(apart.min(0))
     middle = (centres.max(0) + centres.min(0)) / 2
     whole = np.abs(np.ptp(centres, axis=0) - 2 * pitch) < 0.5 * pitch

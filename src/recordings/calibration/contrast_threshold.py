@@ -72,18 +72,14 @@ def estimate(
     fps: float,
     sensor: EventSensor,
     thresholds: Sequence[float] = GRID,
-    *,
-    background: Float[np.ndarray, " 2"] | None = None,
 ) -> Estimate:
     """Return the thresholds at which the sensor makes the recording's rates.
 
     The geometric mean of ON and OFF rate gives the size of the thresholds; their quotient gives
     the ratio of OFF to ON, because what rises has to fall: the simulation is repeated with the
-    ratio found.  `background`: rates of a still scene, ON and OFF, that are not the scene's doing.
-    Raises ValueError if a rate is none that the grid makes.
+    ratio found.  Raises ValueError if a rate is none that the grid makes.
     """
-    noise = np.zeros(2) if background is None else background
-    wanted, drawn = rates.pooled - noise, rates.bootstrap() - noise
+    wanted, drawn = rates.pooled, rates.bootstrap()
     if not (wanted > 0).all():
         raise ValueError(f"the recording's rates above the background are not positive: {wanted}")
     ratio = 1.0
@@ -97,10 +93,9 @@ def estimate(
                 f"thresholds {thresholds[0]} to {thresholds[-1]} makes, {low:.3g} to {high:.3g}"
             )
         ratio = float(np.clip(ratio * _excess(curve, on, wanted), 0.1, 10))
-    spread_on = np.array([invert(curve, pair) for pair in np.maximum(drawn, 1e-12)])
-    excess = np.array(
-        [_excess(curve, c, p) for c, p in zip(spread_on, np.maximum(drawn, 1e-12), strict=True)]
-    )
+    pairs = np.maximum(drawn, 1e-12)
+    spread_on = np.array([invert(curve, pair) for pair in pairs])
+    excess = np.array([_excess(curve, c, p) for c, p in zip(spread_on, pairs, strict=True)])
     spread_off = spread_on * curve.off_ratio * excess
     bounds = [np.nanpercentile(spread, (2.5, 97.5)) for spread in (spread_on, spread_off)]
     return Estimate(

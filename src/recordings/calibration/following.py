@@ -87,13 +87,8 @@ def follow(frames: Float[np.ndarray, "frames h w"], place: Float[np.ndarray, "po
     ]
     rough = np.stack([_search(coarse, list(_levels(frame))) for frame in frames])
     fine = _registered(frames, place, rough)
-    moved, sharp, explained = (
-        np.stack(rows)
-        for rows in zip(
-            *(_refine(fine, frame, start) for frame, start in zip(frames, rough, strict=True)),
-            strict=True,
-        )
-    )
+    refined = [_refine(fine, frame, start) for frame, start in zip(frames, rough, strict=True)]
+    moved, sharp, explained = map(np.stack, zip(*refined, strict=True))
     seen = explained > EXPLAINED
     far = np.hypot(*moved.mean(1).transpose(2, 0, 1))
     typical = np.median(far[seen]) / 1.18 if seen.any() else 0.0  # of a Rayleigh distribution
@@ -212,11 +207,7 @@ class _Windows:
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
         seen = frame[y.clip(0, height - 1), x.clip(0, width - 1)]
         here = self.home + (whole - moved)
-        return (
-            seen,
-            self.weight * inside,
-            [_sample(field, here, self.u, self.v) for field in fields],
-        )
+        return seen, self.weight * inside, [_sample(f, here, self.u, self.v) for f in fields]
 
 
 def _sample(picture: np.ndarray, at: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:

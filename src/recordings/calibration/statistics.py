@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 
 from src.recordings.calibration.alignment import picture_of
 from src.recordings.calibration.boards import Circles
+from src.recordings.calibration.covariance import crossing
 from src.recordings.calibration.dots import Fits
 from src.records.results import csv_text, write_text
 
@@ -181,18 +182,9 @@ def scintillation(
     return _mean(intensity**2, 1) / _mean(intensity, 1) ** 2 - 1
 
 
-def decay_s(
-    correlations: Float[np.ndarray, " lags"], fps: float, level: float = np.exp(-1)
-) -> float:
-    """Return the lag in seconds where a correlation first falls to `level`; inf if nowhere."""
-    below = np.flatnonzero(correlations <= level)
-    if not below.size:
-        return float("inf")
-    k = int(below[0])
-    if k == 0:
-        return 0.0
-    high, low = correlations[k - 1], correlations[k]
-    return (k - 1 + (high - level) / (high - low)) / fps
+def decay_s(correlations: Float[np.ndarray, " lags"], fps: float) -> float:
+    """Return the lag in seconds where a correlation first falls to 1/e; inf if nowhere."""
+    return crossing(np.arange(len(correlations)), correlations, np.exp(-1)) / fps
 
 
 def sampling_error(tilt: Float[np.ndarray, "frames 2"]) -> float:
