@@ -135,16 +135,14 @@ def _look(place: int, form: str) -> dict:
 
 
 def _legend(figure: Figure, names: list[str], forms: Sequence[str], starred) -> None:
+    stars = ["  * no weights" if name in starred else "" for name in names]
+    labels = [name.replace("_", " ") + star for name, star in zip(names, stars, strict=True)]
     handles = [
-        Line2D([], [], linestyle="none", **_look(i, "float32"), label=_label(name, starred))
-        for i, name in enumerate(names)
+        Line2D([], [], linestyle="none", **_look(i, "float32"), label=label)
+        for i, label in enumerate(labels)
     ]
     for form in forms:
         look = {"color": "0.3", "marker": "o", "fillstyle": FACES[form], "markersize": 7}
         look |= {"markerfacecoloralt": "white", "linestyle": "none"}
         handles.append(Line2D([], [], **look, label=form))
     figure.legend(handles=handles, loc="outside right center", fontsize=9, frameon=False)
-
-
-def _label(name: str, starred) -> str:
-    return name.replace("_", " ") + ("  * no weights" if name in starred else "")

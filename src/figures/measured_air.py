@@ -50,9 +50,8 @@ def _distance(axes: Axes, air: Air) -> None:
     axes.axhline(0.5, color="gray", lw=0.6)
     _mark(axes, half, "half length", "px")
     axes.set_xscale("symlog", linthresh=2)
-    axes.set_xticks(
-        [0, 1, 2, 5, 10, 20, 50, 100, 200], ["0", "1", "2", "5", "10", "20", "50", "100", "200"]
-    )
+    ticks = [0, 1, 2, 5, 10, 20, 50, 100, 200]
+    axes.set_xticks(ticks, map(str, ticks))
     axes.set(xlim=(-0.1, 1.45 * SIDE), ylim=(-0.3, 1.3))
     axes.set(xlabel=f"distance, px of a frame of {SIDE}", ylabel="correlation of the tilt")
     axes.set_title("the excess at distance 0 is the error of following", fontsize=10)

@@ -77,13 +77,10 @@ class Page:
         if "line" in asked:
             self.slice.line = _line(asked["line"])
         if "network" in asked:
-            self.controls.choose(str(asked["network"]), _views(asked.get("views")))
-
-
-def _views(asked: object) -> int | str:
-    if type(asked) not in (int, str):
-        raise ValueError(f"views_used must be a number or adaptive, got {asked}")
-    return asked
+            views = asked.get("views")
+            if type(views) not in (int, str):
+                raise ValueError(f"views_used must be a number or adaptive, got {views}")
+            self.controls.choose(str(asked["network"]), views)
 
 
 def _line(numbers: object) -> tuple[float, float, float, float]:

@@ -54,8 +54,7 @@ def residual(
     frames: Float[Tensor, "frames 1 h w"], target: Float[Tensor, "frames 1 h w"]
 ) -> Float[Tensor, " frames"]:
     """Return the rms displacement of each frame against the truth, in pixels per axis."""
-    shift, weight = displacement(frames, target)
-    return _rms(shift, weight)
+    return _rms(*displacement(frames, target))
 
 
 def wobble(

@@ -101,16 +101,14 @@ def windows(chunks: Iterable[np.ndarray], lookup: Lookup, rule: Rule) -> Iterato
     shorter than one window.
     """
     ordered = _ordered(chunks, lookup)
-    first = next(ordered, None)
-    none = True
+    first, window = next(ordered, None), None
     if first is not None:
         start, end = first["t"][0] + 1e6 * np.array([rule.start_s, rule.end_s])
         later = (chunk[np.searchsorted(chunk["t"], start) :] for chunk in chain([first], ordered))
         cut = _by_time if rule.count is None else _by_count
         for window in cut(filter(len, later), lookup, rule, start, end):
-            none = False
             yield window
-    if none:
+    if window is None:
         length = f"1/{rule.fps} s" if rule.count is None else f"{rule.count} events"
         raise ValueError(f"recording must be longer than one window of {length}, got less")
 

@@ -191,10 +191,8 @@ def _covered(place: np.ndarray, size: tuple[int, int]) -> float:
 
 def _resampled(frames: int, block: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield how often each frame, in blocks, and each square of the frame is drawn; DRAWS times."""
-    random = np.random.default_rng(0)
-    length = (
-        int(np.clip(np.ceil(block), 1, max(frames // 4, 1))) if np.isfinite(block) else frames // 4
-    )
+    random, most = np.random.default_rng(0), frames // 4
+    length = int(np.clip(np.ceil(block), 1, max(most, 1))) if np.isfinite(block) else most
     for _ in range(DRAWS):
         starts = random.integers(frames, size=math.ceil(frames / length))
         drawn = (starts[:, None] + np.arange(length)).ravel()[:frames] % frames

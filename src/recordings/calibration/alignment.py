@@ -169,9 +169,9 @@ def _field(corners: Found, model: Size, margin: float) -> tuple[float, float, fl
         if at in corners.points:
             between = np.nanmean((centre + corners.points[at]) / 2, axis=0)[axis]
             sides[at] = abs(between - middle[axis]), between
-    reach = np.median([distance for distance, _ in sides.values()]) if sides else None
-    if reach is None:
+    if not sides:
         raise ValueError("calibrate: the target must be seen beside the centre view, got none")
+    reach = np.median([distance for distance, _ in sides.values()])
     edges = [
         sides[at][1] if at in sides else middle[axis] + sign * reach
         for at, axis, sign in (((0, -1), 0, -1), ((-1, 0), 1, -1), ((0, 1), 0, 1), ((1, 0), 1, 1))

@@ -187,15 +187,6 @@ def decay_s(correlations: Float[np.ndarray, " lags"], fps: float) -> float:
     return crossing(np.arange(len(correlations)), correlations, np.exp(-1)) / fps
 
 
-def sampling_error(tilt: Float[np.ndarray, "frames 2"]) -> float:
-    """Return the standard error of a correlation between two independent series like `tilt`.
-
-    Bartlett's formula: variance (1 + 2 sum r(k)^2) / frames per axis, two axes averaged.
-    """
-    r = autocorrelation(tilt, max(len(tilt) // 4, 2))
-    return float(np.sqrt((1 + 2 * (r[1:] ** 2).sum()) / (2 * len(tilt))))
-
-
 def write_csv(
     statistics: Statistics, path: Path | str, positions: Sequence[tuple[int, int]]
 ) -> None:

@@ -74,14 +74,6 @@ def open_events(path: str | Path, size: tuple[int, int] | None = None) -> Record
     return Recording(path, size)
 
 
-def sensor_size(path: str | Path) -> tuple[int, int]:
-    """Return (width, height) of a recording; ValueError where the file does not say."""
-    size = open_events(path).size
-    if size is None:
-        raise ValueError(f"{path}: the file does not state the size of the sensor")
-    return size
-
-
 def read_events(path: str | Path, size: tuple[int, int] | None = None) -> np.ndarray:
     """Return all events of a file: t int64 us, x, y uint16, p int8 in {-1, 1}, in order of time.
 
