@@ -62,9 +62,8 @@ class MambaTM(nn.Module):
         if steadied:
             for parameter in self.distortion_decoder.out[-1].parameters():
                 nn.init.zeros_(parameter[:2])  # and takes out the jitter that was found
-        self.free = nn.ModuleList(
-            Layer(width, states, guided=False) for _ in range(3 * (groups - 1))
-        )
+        free = range(3 * (groups - 1))
+        self.free = nn.ModuleList(Layer(width, states, guided=False) for _ in free)
         self.guided = nn.ModuleList(Layer(width, states, guided=True) for _ in range(3))
 
     def forward(

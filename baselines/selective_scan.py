@@ -52,9 +52,8 @@ def _block(
     piece = math.ceil(math.sqrt(length))
     missing = -length % piece
     if missing:  # step 0 changes nothing
-        x, step, enter, leave = (
-            functional.pad(a, (0, 0, 0, missing)) for a in (x, step, enter, leave)
-        )
+        padding = (0, 0, 0, missing)
+        x, step, enter, leave = (functional.pad(a, padding) for a in (x, step, enter, leave))
     decay = torch.exp(step[..., None] * rate).unflatten(1, (-1, piece))
     drive = ((step * x)[..., None] * enter[:, :, None]).unflatten(1, (-1, piece))
     states, decays = _run(decay, drive, 2)

@@ -94,11 +94,9 @@ def knees(speeds: Sequence[Speed], scored: Sequence[Score], side: int) -> dict[s
     which = (side, "float32", 1, "cpu")
     timed = [s for s in speeds if (s.side, s.form, s.threads, s.device) == which]
     costs = {s.network: s.ms for s in timed if s.ms}
-    return {
-        severity: knee(costs, _errors(scored, severity, costs))
-        for severity in dict.fromkeys(row.severity for row in scored)
-        if _errors(scored, severity, costs)
-    }
+    severities = dict.fromkeys(row.severity for row in scored)
+    errors = {severity: _errors(scored, severity, costs) for severity in severities}
+    return {severity: knee(costs, values) for severity, values in errors.items() if values}
 
 
 def _errors(scored: Sequence[Score], severity: str, costs: Mapping) -> dict[str, list[float]]:

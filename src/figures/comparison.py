@@ -45,9 +45,8 @@ def comparison(
         raise ValueError(f"samples must be in 0..{shortest - 1}, got {list(samples)}")
     columns = len(samples) + 1
     height, width = rows[0].video.shape[1:]
-    figure = Figure(
-        figsize=(2 * columns + 0.8, 2 * len(rows) * height / width + 0.4), layout="constrained"
-    )
+    size = (2 * columns + 0.8, 2 * len(rows) * height / width + 0.4)
+    figure = Figure(figsize=size, layout="constrained")
     figure.get_layout_engine().set(w_pad=0.12)  # room for half the last number of the last axis
     grid = figure.subplots(len(rows), columns, squeeze=False)
     for row, axes in zip(rows, grid, strict=True):

@@ -87,9 +87,8 @@ class LPIPS(nn.Module):
 
     def _normalise(self, picture: Tensor) -> Tensor:
         rgb = picture.expand(-1, 3, -1, -1)
-        return ((2 * rgb - 1 - self.shift) / self.scale).contiguous(
-            memory_format=torch.channels_last
-        )
+        normal = (2 * rgb - 1 - self.shift) / self.scale
+        return normal.contiguous(memory_format=torch.channels_last)
 
 
 class AnchoredLPIPS(LPIPS):

@@ -42,9 +42,8 @@ def pull(
 ) -> Float[Tensor, "n c h w"]:
     """Return the frames with what lies `shift` (x, y), in pixels, from each pixel brought there."""
     height, width = frames.shape[-2:]
-    y, x = torch.meshgrid(
-        torch.arange(height).to(frames), torch.arange(width).to(frames), indexing="ij"
-    )
+    rows, columns = torch.arange(height).to(frames), torch.arange(width).to(frames)
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
     place = [(2 * (x + shift[:, 0]) + 1) / width - 1, (2 * (y + shift[:, 1]) + 1) / height - 1]
     grid = torch.stack(place, -1)
     return functional.grid_sample(frames, grid, mode, padding_mode="border", align_corners=False)

@@ -74,9 +74,8 @@ class Adaptive(nn.Module):
                 f"adapt.patience must be >= 1, handover >= 0, got {patience}, {handover}"
             )
         self.levels, self.patience, self.handover = tuple(levels), patience, handover
-        self.networks = nn.ModuleList(
-            {id(level.network): level.network for level in levels}.values()
-        )
+        different = {id(level.network): level.network for level in levels}
+        self.networks = nn.ModuleList(different.values())
         last = len(levels) - 1
         self.bounds = [tolerance * (k + 1) / last for k in range(last)]
 

@@ -26,11 +26,9 @@ def ready(
         return running(network, form).to(device)
     if bins != network.bins:
         raise ValueError(f"bins must be {network.bins} for this network, got {bins}")
-    height, width = views.model
+    size = dict(zip(("height", "width"), views.model, strict=True))
     threads = torch.get_num_threads()
-    return Runtime(
-        network, positions=views.positions, height=height, width=width, threads=threads, form=form
-    )
+    return Runtime(network, positions=views.positions, threads=threads, form=form, **size)
 
 
 def frames(

@@ -12,7 +12,7 @@ is exactly the reconstruction at the trained rate, and every event counts once p
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, cycle
 from typing import Any
 
 import numpy as np
@@ -208,14 +208,12 @@ def each_view(
 ) -> Iterator[Float[np.ndarray, "views h w"]]:
     """Reconstruct every view by itself, with a network of one view; empty windows hold."""
     states, pictures = [None] * overlap, None
-    for count, window in enumerate(windows):
+    for window, phase in zip(windows, cycle(range(overlap)), strict=False):
         if window.events or pictures is None:
             options = accepted(network, window_s=window.seconds, positions=[(0, 0)])
             voxels = torch.from_numpy(window.voxels.copy())[:, None]
             with torch.inference_mode():
-                pictures, states[count % overlap] = network(
-                    voxels, states[count % overlap], **options
-                )
+                pictures, states[phase] = network(voxels, states[phase], **options)
         yield pictures[:, 0].clamp(0, 1).numpy()
 
 

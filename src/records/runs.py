@@ -134,7 +134,6 @@ def _plan(hydra: dict) -> Plan:
     lines = [f"{key}={value}" for key, value in params] + asked
     parsed = OverridesParser.create().parse_overrides(lines)
     door, config = hydra["job"]["name"], hydra["job"]["config_name"]
-    start = f"python -m src.{door} " + (
-        "-m" if door == config else f"--config-dir sweeps --config-name {config}"
-    )
+    how = "-m" if door == config else f"--config-dir sweeps --config-name {config}"
+    start = f"python -m src.{door} {how}"
     return Plan(" ".join([start, *asked]), BasicSweeper.split_arguments(parsed, None)[0])

@@ -99,9 +99,8 @@ def film(pipeline: Pipeline, number: int, conditions: Conditions) -> Stream:
     if conditions.changes_air:
         variant.turbulence = simulated(pipeline.turbulence).having(**conditions.turbulence)
     draw = _changed(pipeline.draw(number), conditions)
-    views = (
-        _course(variant, draw, conditions.course) if conditions.course else variant.views(draw)[0]
-    )
+    course = conditions.course
+    views = _course(variant, draw, course) if course else variant.views(draw)[0]
     if conditions.gain:
         views = _flicker(views, conditions.gain, noise.key(draw.key, "gain"))
     sensor = pipeline.sensor.having(**{"threshold": draw.threshold} | dict(conditions.sensor))

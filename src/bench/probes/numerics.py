@@ -42,9 +42,8 @@ class Growth:
         # Where there were events anyway, so that no pixel wakes that slept.
         nudged = shown[start] + self.size * drawn * (shown[start] != 0)
         plain, _ = subject.play(shown, stream.positions, 1 / stream.fps)
-        other, _ = subject.play(
-            [*shown[:start], nudged, *shown[start + 1 :]], stream.positions, 1 / stream.fps
-        )
+        changed = [*shown[:start], nudged, *shown[start + 1 :]]
+        other, _ = subject.play(changed, stream.positions, 1 / stream.fps)
         difference = (plain - other)[start + self.skip :].double().square().mean((1, 2, 3)).sqrt()
         logs = difference.clamp(min=1e-12).log()
         times = torch.arange(len(logs), dtype=torch.float64) - (len(logs) - 1) / 2
@@ -138,9 +137,8 @@ class Chunked:
         whole, _ = subject.play(shown, stream.positions, 1 / stream.fps)
         parts, state = [], None
         for start in range(0, len(shown), self.chunk):
-            part, state = subject.play(
-                shown[start : start + self.chunk], stream.positions, 1 / stream.fps, deepcopy(state)
-            )
+            chunk, own = shown[start : start + self.chunk], deepcopy(state)
+            part, state = subject.play(chunk, stream.positions, 1 / stream.fps, own)
             parts.append(part)
         gap = float((whole - torch.cat(parts)).abs().max())
         return Finding(gap, "grey", self.limit)

@@ -85,9 +85,8 @@ def measure(frames: Float[np.ndarray, "frames h w"], fps: float | None = None) -
         model.tilt(*pairs.mean(*chosen), lags.mean(*chosen)[0], len(frames))
         for chosen in _resampled(len(frames), 2 * tilt.decay)
     ]
-    numbers = _air_file(tilt, drawn, unit, fps, len(lags.at)) | {
-        "blur_ratio": blur_ratio(*_coarse(frames, tracks))
-    }
+    numbers = _air_file(tilt, drawn, unit, fps, len(lags.at))
+    numbers["blur_ratio"] = blur_ratio(*_coarse(frames, tracks))
     a, b = covariance.centred(tracks)
     power = (a * b).sum((0, 2)) / (2 * tracks.seen.sum(0))
     return Air(
@@ -197,10 +196,8 @@ def _resampled(frames: int, block: float) -> Iterator[tuple[np.ndarray, np.ndarr
         starts = random.integers(frames, size=math.ceil(frames / length))
         drawn = (starts[:, None] + np.arange(length)).ravel()[:frames] % frames
         squares = random.integers(CELLS**2, size=CELLS**2)
-        yield (
-            np.bincount(drawn, minlength=frames).astype(float),
-            np.bincount(squares, minlength=CELLS**2).astype(float),
-        )
+        times = np.bincount(drawn, minlength=frames), np.bincount(squares, minlength=CELLS**2)
+        yield times[0].astype(float), times[1].astype(float)
 
 
 def _air_file(

@@ -115,10 +115,8 @@ def invert(curve: Curve, rates: Float[np.ndarray, " 2"]) -> float:
     mean = np.sqrt(np.maximum(np.prod(curve.rates, axis=1), 1e-30))
     falling = np.minimum.accumulate(np.log(mean))
     target = 0.5 * np.log(np.prod(rates))
-    log_threshold = np.interp(
-        target, falling[::-1], np.log(curve.thresholds)[::-1], left=np.nan, right=np.nan
-    )
-    return float(np.exp(log_threshold))
+    thresholds = np.log(curve.thresholds)[::-1]
+    return float(np.exp(np.interp(target, falling[::-1], thresholds, np.nan, np.nan)))
 
 
 def _excess(curve: Curve, on: float, rates: Float[np.ndarray, " 2"]) -> float:

@@ -147,11 +147,9 @@ def ground(
 ) -> Float[np.ndarray, "h w"]:
     """Return the light between dark dots, continued under them: a quadratic in x and y, fitted
     where no dot is within `reach` pixels; at least a twentieth of its largest value."""
-    y, x = (
-        2 * axis / max(axis.max(), 1) - 1 for axis in np.mgrid[: len(picture), : len(picture[0])]
-    )
-    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
     rows, cols = np.indices(picture.shape)
+    y, x = (2 * axis / max(axis.max(), 1) - 1 for axis in (rows, cols))
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
     near = [np.hypot(cols - cx, rows - cy) <= reach for cx, cy in places]
     between = ~np.any(near, axis=0)
     fitted = terms @ np.linalg.lstsq(terms[between], picture[between], rcond=None)[0]

@@ -53,8 +53,7 @@ def write(path: Path, events: np.ndarray, size: tuple[int, int]) -> None:
                 file["ms_to_idx"] = marks.astype(np.uint64)
     else:
         comma = "," if path.suffix == ".csv" else " "
-        names = [f"x@{size[0]}", f"y@{size[1]}"]
-        header = comma.join(["t", *names, "p"])
+        header = comma.join(["t", f"x@{size[0]}", f"y@{size[1]}", "p"])
         table = np.stack([column.astype(np.int64) for column in columns.values()], 1)
         np.savetxt(path, table, fmt="%d", delimiter=comma, header=header, comments="")
 
