@@ -25,12 +25,8 @@ def write(folder: Path, network: nn.Module, pipeline: Pipeline, clips: int = 2) 
     written = []
     for index in range(clips):
         sample = simulate(pipeline, [index])
-        frames = video(network, sample)
-        parts = {
-            "clean": sample.target,
-            "centre view": sample.turbulent,
-            "reconstruction": frames.float().clamp(0, 1),
-        }
+        parts = {"clean": sample.target, "centre view": sample.turbulent}
+        parts["reconstruction"] = video(network, sample).float().clamp(0, 1)
         videos = {name: part[0, :, 0].cpu().numpy() for name, part in parts.items()}
         written += [
             _gif(folder / f"clip{index}.gif", videos, sample, pipeline.optics),

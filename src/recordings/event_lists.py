@@ -26,9 +26,11 @@ def ready(
         return running(network, form).to(device)
     if bins != network.bins:
         raise ValueError(f"bins must be {network.bins} for this network, got {bins}")
-    size = dict(zip(("height", "width"), views.model, strict=True))
+    height, width = views.model
     threads = torch.get_num_threads()
-    return Runtime(network, positions=views.positions, threads=threads, form=form, **size)
+    return Runtime(
+        network, positions=views.positions, height=height, width=width, threads=threads, form=form
+    )
 
 
 def frames(

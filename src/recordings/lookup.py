@@ -93,14 +93,6 @@ class Lookup:
         """Ones: no density."""
         return np.ones((self.views, 1, *self.model), np.float32)
 
-    def split(self, events: np.ndarray) -> tuple[np.ndarray, Int[np.ndarray, " k"]]:
-        """Return the events inside views, at their nearest model pixel, and the view of each."""
-        self.check(events)
-        pixel = self.nearest[events["y"], events["x"]]
-        kept = events[pixel >= 0].copy()
-        view, kept["y"], kept["x"] = np.unravel_index(pixel[pixel >= 0], (self.views, *self.model))
-        return kept, view
-
     def check(self, events: np.ndarray) -> None:
         """Raise ValueError where an event lies off the sensor."""
         height, width = self.view.shape
