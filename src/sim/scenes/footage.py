@@ -165,7 +165,7 @@ def _reds(root: Path, split: str) -> list[Source]:
     homes = {
         part: (root / f"{part}_orig", root / part / f"{part}_orig") for part in ("train", "val")
     }
-    found = []
+    videos = []
     for part, number in REDS_SPLIT[split]:
         folders = [home / f"{number:03}" for home in homes[part]]
         folder = next((folder for folder in folders if folder.is_dir()), None)
@@ -175,8 +175,8 @@ def _reds(root: Path, split: str) -> list[Source]:
                 f"got no {part}_orig/{number:03} in {root}"
             )
         paths = [folder / f"{frame:08}.png" for frame in range(REDS_FRAMES)]
-        found.append(pictures(f"{part}-{number:03}", paths, REDS_SIZE))
-    return found
+        videos.append(pictures(f"{part}-{number:03}", paths, REDS_SIZE))
+    return videos
 
 
 def _parts(videos: list[Source], split: str, disjoint: bool) -> list[tuple[Source, int, int]]:

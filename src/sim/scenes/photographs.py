@@ -201,8 +201,8 @@ def photographs(root: str | Sequence[str] | None, split: str) -> list[Path]:
         raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split}")
     if root is None:
         folder = Path(find_spec("skimage").origin).parent / "data"
-        found = {path.stem: path for path in folder.iterdir() if path.suffix in SUFFIXES}
-        return [found[name] for name in EMBEDDED[split].split()]
+        embedded = {path.stem: path for path in folder.iterdir() if path.suffix in SUFFIXES}
+        return [embedded[name] for name in EMBEDDED[split].split()]
     if not Path(root).is_dir():
         raise ValueError(f"scene.root must be a folder, got {root}")
     paths = sorted(path for path in Path(root).rglob("*") if path.suffix.lower() in SUFFIXES)

@@ -71,8 +71,8 @@ class Turbulence:
         _require(valid, "wind_m_s", ">= 0 or null", wind_m_s)
         _require(1 <= wind_layers <= 100, "wind_layers", "in [1, 100]", wind_layers)
         shared = views_correlation == "baseline"
-        known = shared or views_correlation == "independent"
-        _require(known, "views_correlation", "independent or baseline", views_correlation)
+        valid = shared or views_correlation == "independent"
+        _require(valid, "views_correlation", "independent or baseline", views_correlation)
         valid = baseline_m is None or 0 <= baseline_m < math.inf
         _require(valid, "baseline_m", ">= 0", baseline_m)
         self.atmosphere, self.height, self.width, self.fps = atmosphere, height, width, fps

@@ -89,9 +89,9 @@ def sample_atmosphere(
             decay_s=float(log_between(u[2], decay_s, "decay_s")),
             spread_px=float(log_between(u[3], spread_px, "spread_px")),
         )
-        found = _find(seen, generator, **cameras)
-        if found is not None:
-            return found
+        atmosphere = _find(seen, generator, **cameras)
+        if atmosphere is not None:
+            return atmosphere
     raise ValueError(f"turbulence.atmosphere: no camera within its ranges shows {seen}")
 
 
@@ -100,10 +100,10 @@ def matching(seen: Appearance, generator: torch.Generator, **cameras) -> Atmosph
 
     Raises ValueError where there is none.
     """
-    found = _find(seen, generator, **cameras)
-    if found is None:
+    atmosphere = _find(seen, generator, **cameras)
+    if atmosphere is None:
         raise ValueError(f"turbulence.atmosphere: no camera within its ranges shows {seen}")
-    return found
+    return atmosphere
 
 
 def _find(
@@ -228,8 +228,8 @@ def _unlike(
         apart += np.abs(np.log(np.hypot(1, blur / sharp) / seen.blur_ratio))
     if seen.whole_share is not None:
         views = REFERENCE_PX / aperture
-        found = [outer_scale.whole_share(*one) for one in zip(ratio, shapes, views, strict=True)]
-        apart += np.abs(np.array(found) - seen.whole_share)
+        shares = [outer_scale.whole_share(*one) for one in zip(ratio, shapes, views, strict=True)]
+        apart += np.abs(np.array(shares) - seen.whole_share)
     return apart
 
 

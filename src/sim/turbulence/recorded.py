@@ -58,8 +58,8 @@ class RecordedTilt:
     ):
         for name, rms in rms_px.items():
             _require(0 <= rms <= MOST_PX, f"rms_px.{name}", f"in [0, {MOST_PX:g}] pixels", rms)
-        known = severity in ("mixed", *rms_px)
-        _require(known, "severity", ", ".join(["mixed", *rms_px]), severity)
+        valid = severity in ("mixed", *rms_px)
+        _require(valid, "severity", ", ".join(["mixed", *rms_px]), severity)
         _require(0 < rate < math.inf, "rate", "> 0 frames per second", rate)
         _require(0 <= blur <= 2, "blur", "in [0, 2] times the tilt", blur)
         there = root is not None and Path(root).exists()
