@@ -78,7 +78,7 @@ class Photographs:
         still: float = 0.0,
         rest: float = 0.0,
     ):
-        check_frames(height, width, frames, fps)
+        check_frames(height, width, frames, fps, split)
         for name, (low, high) in (("speed", speed), ("zoom", zoom)):
             if not 0 < low <= high < math.inf:
                 raise ValueError(f"scene.{name} must be a range 0 < low <= high, got {low}, {high}")
@@ -179,8 +179,10 @@ class MixedRates:
         return self.scenes[int(draw * len(self.scenes))].clip(index)
 
 
-def check_frames(height: int, width: int, frames: int, fps: float) -> None:
-    """Raise ValueError for a size, a number of frames or a rate that no clip can have."""
+def check_frames(height: int, width: int, frames: int, fps: float, split: str) -> None:
+    """Raise ValueError for a size, a number of frames, a rate or a split that no clip can have."""
+    if split not in SPLITS:
+        raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split}")
     for name, value, least in (("height", height, 8), ("width", width, 8), ("frames", frames, 2)):
         if value < least:
             raise ValueError(f"scene.{name} must be >= {least}, got {value}")
@@ -197,8 +199,6 @@ def photographs(root: str | Sequence[str] | None, split: str) -> list[Path]:
         if not root:
             raise ValueError("scene.root must be a folder, or some, got an empty list")
         return [path for one in root for path in photographs(str(one), split)]
-    if split not in SPLITS:
-        raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split}")
     if root is None:
         folder = Path(find_spec("skimage").origin).parent / "data"
         embedded = {path.stem: path for path in folder.iterdir() if path.suffix in SUFFIXES}

@@ -149,6 +149,8 @@ def _find(
         i = int(np.where(fits, unlike, np.inf).argmin())
         length = float(log_between(u[i, 3], distance_m, "distance_m"))
         diameter = math.sqrt(wavelength_m * length * aperture[i] / airy[i])
+        # Of the wind, in D, after which the tilt's correlation is 1 / e.
+        way = outer_scale.tilt_reach(1 / scale[i], shapes[shape[i]], wind=True)
         return Atmosphere(
             aperture_m=diameter,
             focal_length_m=diameter * float(log_between(u[i, 4], f_number, "f_number")),
@@ -158,7 +160,7 @@ def _find(
             cn2=shapes[shape[i]],
             alpha=math.exp(-1 / (ALPHA_FPS * seen.decay_s)),
             outer_scale_m=diameter * float(scale[i]),
-            wind_m_s=_decay(shapes[shape[i]], 1 / scale[i]) * diameter / seen.decay_s,
+            wind_m_s=way * diameter / seen.decay_s,
         ).at(float(strength[i]))
     return None
 
@@ -253,9 +255,3 @@ def _facts(shape: tuple[float, ...], ratio: float) -> tuple[float, float, float,
         outer_scale.left(ratio, shape, "higher"),
         float(scatter / (strength * (1 - place) ** (5 / 3)).sum()),
     )
-
-
-@cache
-def _decay(shape: tuple[float, ...], ratio: float) -> float:
-    """Return the way of the wind, in D, after which the tilt's correlation is 1 / e."""
-    return outer_scale.tilt_reach(ratio, shape, wind=True)
