@@ -158,12 +158,10 @@ def _root(root: str | None) -> Path:
 
 
 def _reds(root: Path, split: str) -> list[Source]:
-    homes = {
-        part: (root / f"{part}_orig", root / part / f"{part}_orig") for part in ("train", "val")
-    }
     videos = []
     for part, number in REDS_SPLIT[split]:
-        folders = [home / f"{number:03}" for home in homes[part]]
+        homes = (root / f"{part}_orig", root / part / f"{part}_orig")
+        folders = [home / f"{number:03}" for home in homes]
         folder = next((folder for folder in folders if folder.is_dir()), None)
         if folder is None:
             raise ValueError(

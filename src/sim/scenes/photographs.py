@@ -159,9 +159,8 @@ class _Layer:
         height, width = size
         shift, angle, log_zoom = self.motion.at(time)
         scale = self.zoom * math.exp(log_zoom)
-        turn = scale * np.array(
-            [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
-        )
+        cos, sin = math.cos(angle), math.sin(angle)
+        turn = scale * np.array([[cos, -sin], [sin, cos]])
         middle = np.array([(width - 1) / 2, (height - 1) / 2])
         offset = self.centre - shift * width * self.zoom - turn @ middle
         return np.column_stack([turn, offset])

@@ -112,14 +112,14 @@ class Turbulence:
             top, left, height, width = window
             part = frames[:, None, :, top : top + height, left : left + width]
             return part.expand(-1, len(self.positions), -1, -1, -1)
-        out = frames.new_empty(
-            len(frames), len(self.positions), frames.shape[1], *window[2:], dtype=torch.float32
-        )
+        size = (len(frames), len(self.positions), frames.shape[1], *window[2:])
+        out = frames.new_empty(size, dtype=torch.float32)
         for index, clip in enumerate(frames.float()):
             waves, moving = self._draw(generator, len(clip))
             moving = moving.to(clip.device)
             for tile in _tiles(window):
-                part = _inside(out[index], tile, window)
+                y, x = tile[0] - window[0], tile[1] - window[1]
+                part = out[index, ..., y : y + tile[2], x : x + tile[3]]
                 self._clip(clip, waves, moving, tile, part)
         return out
 
@@ -157,16 +157,10 @@ class Turbulence:
         def one(view: int, first: int) -> None:
             part = slice(first, first + step)
             amplitudes = moving[view, part]
-            out[view, part] = blur.degrade(
-                frames[part],
-                self._tilt_px * tilt.at_pixels(amplitudes),
-                self._nodes(rest.at_nodes(amplitudes)),
-                self.fidelity.kernel,
-                self.spots,
-                *lattices,
-                halo[part],
-                self.halo.share,
-            )
+            moved = self._tilt_px * tilt.at_pixels(amplitudes)
+            nodes = self._nodes(rest.at_nodes(amplitudes))
+            around = (self.fidelity.kernel, self.spots, *lattices, halo[part], self.halo.share)
+            out[view, part] = blur.degrade(frames[part], moved, nodes, *around)
 
         in_threads(one, product(range(len(moving)), range(0, len(frames), step)), device)
 
@@ -198,13 +192,8 @@ class Turbulence:
     ) -> tuple[Waves, Complex[Tensor, "views frames waves"]]:
         """Draw one clip's waves, and their amplitudes in every view and frame."""
         key = noise.base_key(generator)
-        waves = draw_waves(
-            self.atmosphere,
-            noise.key(key, "waves"),
-            modes=self.fidelity.modes,
-            waves=WAVES,
-            width_px=self.width,
-        )
+        size = {"modes": self.fidelity.modes, "waves": WAVES, "width_px": self.width}
+        waves = draw_waves(self.atmosphere, noise.key(key, "waves"), **size)
         return waves, self._amplitudes(key, waves, frames).to(torch.complex64)
 
     def _amplitudes(
@@ -265,9 +254,3 @@ def _tiles(window: Crop) -> Iterator[Crop]:
     for y in range(0, height, TILE):
         for x in range(0, width, TILE):
             yield top + y, left + x, min(TILE, height - y), min(TILE, width - x)
-
-
-def _inside(out: Tensor, tile: Crop, window: Crop) -> Tensor:
-    """Return the part of `out`, a picture of `window`, that `tile` covers."""
-    y, x = tile[0] - window[0], tile[1] - window[1]
-    return out[..., y : y + tile[2], x : x + tile[3]]

@@ -135,9 +135,8 @@ def _find(
         airy = log_between(u[:, 0], airy_px, "airy_px")
         shape = (u[:, 1] * len(shapes)).astype(int)
         scale = _scales(u[:, 2], outer_scale_d, kolmogorov)
-        reach, tilt, higher, scatter = np.array(
-            [_facts(shapes[s], 1 / x) for s, x in zip(shape, scale, strict=True)]
-        ).T
+        facts = [_facts(shapes[s], 1 / x) for s, x in zip(shape, scale, strict=True)]
+        reach, tilt, higher, scatter = np.array(facts).T
         aperture = seen.half_length_px / reach
         strength, blur = _strength(seen, airy, tilt, higher)
         rytov = 5.319 * strength ** (5 / 3) * (2 * math.pi * aperture / airy) ** (-5 / 6) * scatter

@@ -143,9 +143,8 @@ class RecordedAir:
         key = noise.base_key(generator)
         pieces = noise.uniform(noise.key(key, "pieces"), torch.arange(PLACES**2 * STRETCHES))
         order, window = pieces.argsort().tolist(), crop or (0, 0, *self.size)
-        return torch.stack(
-            [self._view(position, frames, order, key, window) for position in self.views]
-        )
+        views = [self._view(position, frames, order, key, window) for position in self.views]
+        return torch.stack(views)
 
     def _view(
         self, position: Position, frames: int, order: list[int], key: int, window: Crop
