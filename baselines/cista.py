@@ -60,9 +60,9 @@ class CISTA(SingleView):
     def _unfold(self, x: Tensor, before: Tensor | None) -> Tensor:
         z = self.code(x)
         before = torch.zeros_like(z) if before is None else before
-        known = self.agree_before(before)
+        agreed = self.agree_before(before)
         for step, pull in zip(self.steps, self.pulls, strict=True):
-            agreement = (known * self.agree_now(z)).sigmoid()
+            agreement = (agreed * self.agree_now(z)).sigmoid()
             z = step(x, z, agreement * (before - z) * pull)
         return z
 

@@ -5,7 +5,7 @@ to the coarser one; the mean of all of them replaces the residual blocks.  Atten
 that its maps are never stored.
 """
 
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any
 
 import torch
@@ -36,7 +36,7 @@ class ETNet(SingleView):
     ):
         super().__init__(bins, normalise, output)
         self.net = E2VID(1, bins, base_channels, final_activation="none")
-        self.net.resblocks = nn.ModuleList()
+        self.net.resblocks = nn.Sequential()
         self.pyramid = Pyramid([base_channels * 2**scale for scale in range(SCALES, 0, -1)])
 
     def reconstruct(self, seen: Tensor, state: Any) -> tuple[Tensor, Any]:
@@ -58,26 +58,20 @@ class Pyramid(nn.Module):
             nn.Conv2d(inputs, width, 2**scale, 2**scale)
             for scale, inputs in enumerate(widths[1:], 1)
         )
-        self.own = nn.ModuleList(nn.ModuleList(Layer(width) for _ in range(3)) for _ in widths)
+        self.own = nn.ModuleList(nn.Sequential(*(Layer(width) for _ in range(3))) for _ in widths)
         self.across = nn.ModuleList(
             nn.ModuleList(CrossLayer(width) for _ in range(2)) for _ in widths
         )
-        for parameter in self.own.parameters():
-            _xavier(parameter)
-        for parameter in self.across.parameters():
-            _xavier(parameter)
+        for parameter in chain(self.own.parameters(), self.across.parameters()):
+            if parameter.dim() > 1:
+                nn.init.xavier_uniform_(parameter)
 
     def forward(self, maps: list[Tensor]) -> Float[Tensor, "n c h w"]:
         """Return the map at the coarsest resolution; `maps` are finest last."""
         coarse = [maps[0]] + [s(x) for s, x in zip(self.split, maps[1:], strict=True)]
         tokens = [x.flatten(2).transpose(1, 2) for x in coarse]
         places = sinusoids(tokens[0].shape[1], tokens[0].shape[2]).to(tokens[0])
-        seen = []
-        for layers, x in zip(self.own, tokens, strict=True):
-            x = x + places
-            for layer in layers:
-                x = layer(x)
-            seen.append(x)
+        seen = [layers(x + places) for layers, x in zip(self.own, tokens, strict=True)]
         compared = []
         for layers, (memory, x) in zip(self.across, pairwise([seen[0], *seen]), strict=True):
             for layer in layers:
@@ -136,9 +130,9 @@ class Attention(nn.Module):
             for source, weight, bias in zip((x, memory, memory), weights, biases, strict=True)
         )
         rate = DROPOUT if self.training else 0.0
-        found = functional.scaled_dot_product_attention(q, k, v, dropout_p=rate)
-        found = self.out(found.transpose(1, 2).flatten(2))
-        return functional.dropout(found, DROPOUT, self.training)
+        attended = functional.scaled_dot_product_attention(q, k, v, dropout_p=rate)
+        attended = self.out(attended.transpose(1, 2).flatten(2))
+        return functional.dropout(attended, DROPOUT, self.training)
 
 
 class MLP(nn.Module):
@@ -160,8 +154,3 @@ def sinusoids(tokens: int, width: int) -> Float[Tensor, "tokens width"]:
     pitch = 10_000.0 ** (-torch.arange(0, width, 2, dtype=torch.float64) / width)
     angles = torch.arange(tokens, dtype=torch.float64)[:, None] * pitch
     return torch.stack([angles.sin(), angles.cos()], 2).flatten(1).float()
-
-
-def _xavier(parameter: Tensor) -> None:
-    if parameter.dim() > 1:
-        nn.init.xavier_uniform_(parameter)

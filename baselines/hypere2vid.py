@@ -41,10 +41,8 @@ class HyperE2VID(SingleView):
         """Return the frame and (state of E2VID, frame before output handling and cropping)."""
         before, shown = state or (None, torch.zeros_like(seen[:, :1]))
         head, skips, after = self.net.encode(seen, before)
-        x = skips[-1]
-        for block in self.net.resblocks:
-            x = block(x)
-        x = self.dynamic(x + skips.pop(), torch.cat([seen, shown], 1))
+        x = self.net.resblocks(skips[-1]) + skips.pop()
+        x = self.dynamic(x, torch.cat([seen, shown], 1))
         frame = self.net.decode(x, head, skips)
         return frame, (after, frame.detach())
 
@@ -107,11 +105,11 @@ def fourier_bessel(reach: int) -> Float[Tensor, "functions side side"]:
     r, angle = np.hypot(rows, columns), np.arctan2(columns, rows)
     zeros = {order: jn_zeros(order, 8) for order in range(16)}
     resolved = [(z, k) for k in zeros for z, after in pairwise(zeros[k]) if after <= highest]
-    found = []
+    harmonics = []
     for zero, order in sorted(resolved):
         radial = jv(order, zero * r) / abs(jv(order + 1, zero)) * (r < 1)
         turns = [np.cos(order * angle), np.sin(order * angle)]
-        found += [radial * math.sqrt(2) * turn for turn in turns] if order else [radial]
-    functions = np.stack(found)
+        harmonics += [radial * math.sqrt(2) * turn for turn in turns] if order else [radial]
+    functions = np.stack(harmonics)
     functions /= np.sqrt((functions**2).sum((1, 2)).mean())
     return torch.from_numpy(functions).float()

@@ -62,9 +62,8 @@ class MambaTM(nn.Module):
         if steadied:
             for parameter in self.distortion_decoder.out[-1].parameters():
                 nn.init.zeros_(parameter[:2])  # and takes out the jitter that was found
-        self.free = nn.ModuleList(
-            Layer(width, states, guided=False) for _ in range(3 * (groups - 1))
-        )
+        free = range(3 * (groups - 1))
+        self.free = nn.ModuleList(Layer(width, states, guided=False) for _ in free)
         self.guided = nn.ModuleList(Layer(width, states, guided=True) for _ in range(3))
 
     def forward(
@@ -83,13 +82,12 @@ class MambaTM(nn.Module):
         maps = zip(*(self.encoder(flat[part]) for part in parts), strict=True)
         *skips, deep = [torch.cat(scale) for scale in maps]
         grid = (count, *deep.shape[-2:])
-        orders = scan_orders(*grid)
-        orders = [order.to(frames.device) for order in orders]
+        orders = [order.to(frames.device) for order in scan_orders(*grid)]
         tokens = deep.unflatten(0, (n, count)).movedim(2, -1).flatten(1, 3)
         for i, layer in enumerate(self.free):
             tokens = layer(tokens, grid, orders[i % 3])
-        found = self.distortion_width(_maps(tokens, grid))
-        distortion = _decode(self.distortion_decoder, found, skips, parts)
+        latent = self.distortion_width(_maps(tokens, grid))
+        distortion = _decode(self.distortion_decoder, latent, skips, parts)
         guide = torch.cat([self.distortion_encoder(distortion[part])[-1] for part in parts])
         guide = guide.unflatten(0, (n, count)).movedim(2, -1).flatten(1, 3)
         for i, layer in enumerate(self.guided):
@@ -264,10 +262,10 @@ class Fusion(nn.Module):
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
         """Return a map of the same shape."""
-        found = self.around(functional.gelu(self.inside(x)))
-        mean = self.squeeze(found.mean((-2, -1), keepdim=True))
+        outcome = self.around(functional.gelu(self.inside(x)))
+        mean = self.squeeze(outcome.mean((-2, -1), keepdim=True))
         weights = self.weigh(functional.gelu(mean)).sigmoid()
-        return x + weights * found
+        return x + weights * outcome
 
 
 def _decode(decoder: "Decoder", deep: Tensor, skips: list[Tensor], parts: list[slice]) -> Tensor:

@@ -54,11 +54,8 @@ class Unpickler(pickle._Unpickler):
         return Inert
 
 
-def _load(file: Any, **kwargs: Any) -> Any:
-    return Unpickler(file, **kwargs).load()
-
-
-READER = SimpleNamespace(Unpickler=Unpickler, load=_load, __name__="baselines.pickles")
+READER = SimpleNamespace(Unpickler=Unpickler, __name__="baselines.pickles")
+READER.load = lambda file, **kwargs: Unpickler(file, **kwargs).load()
 
 
 def read(path: str | Path) -> Any:

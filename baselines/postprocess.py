@@ -36,9 +36,8 @@ class CameraFrames(nn.Module):
     def video(self, sample: "Sample") -> Float[Tensor, "n windows 1 h w"]:
         """Return the mean of every `average` frames in the place of each of them."""
         pictures = [part.mean(1, keepdim=True) for part in sample.turbulent.split(self.average, 1)]
-        return torch.cat(pictures, 1).repeat_interleave(self.average, 1)[
-            :, : sample.turbulent.shape[1]
-        ]
+        shown = torch.cat(pictures, 1).repeat_interleave(self.average, 1)
+        return shown[:, : sample.turbulent.shape[1]]
 
 
 class Postprocessed(nn.Module):
@@ -67,9 +66,8 @@ class Postprocessed(nn.Module):
         """Return the restored frame of every window, in [0, 1]."""
         frames = video(self.source, sample).float().clamp(0, 1)
         every = getattr(self.source, "average", 1)
-        restored = self.restorer.restore(
-            frames[:, ::every], window=self.window, overlap=self.overlap
-        )
+        windows = {"window": self.window, "overlap": self.overlap}
+        restored = self.restorer.restore(frames[:, ::every], **windows)
         return restored.repeat_interleave(every, 1)[:, : frames.shape[1]]
 
 

@@ -35,8 +35,8 @@ def scan(
     blocks = zip(*(part.split(BLOCK, 1) for part in (x, step, enter, leave)), strict=True)
     state, read = x.new_zeros(len(x), *rate.shape), []
     for x, step, enter, leave in blocks:
-        found, state = _block(x, step, rate, enter, leave, state)
-        read.append(found)
+        piece, state = _block(x, step, rate, enter, leave, state)
+        read.append(piece)
     return torch.cat(read, 1)
 
 
@@ -52,9 +52,8 @@ def _block(
     piece = math.ceil(math.sqrt(length))
     missing = -length % piece
     if missing:  # step 0 changes nothing
-        x, step, enter, leave = (
-            functional.pad(a, (0, 0, 0, missing)) for a in (x, step, enter, leave)
-        )
+        padding = (0, 0, 0, missing)
+        x, step, enter, leave = (functional.pad(a, padding) for a in (x, step, enter, leave))
     decay = torch.exp(step[..., None] * rate).unflatten(1, (-1, piece))
     drive = ((step * x)[..., None] * enter[:, :, None]).unflatten(1, (-1, piece))
     states, decays = _run(decay, drive, 2)

@@ -49,24 +49,24 @@ def compare(cfg: DictConfig) -> dict:
     if len(sizes) > 1:
         raise ValueError(f"videos must be of one size (h, w), got {sorted(sizes)}")
     results.open_run(run, door.resolved(cfg))
-    found, rows = {}, []
+    scores, rows = {}, []
     for name, path, film in zip(names, cfg.videos, films, strict=True):
         across, points = slices.cut(film, fps=cfg.fps, **given)
         if cfg.still:
-            found[name] = slice_motion.of_still(film, cfg.still)
+            scores[name] = slice_motion.of_still(film, cfg.still)
         else:
-            found[name] = slice_motion.of_slice(across, next(iter(given)), cfg.follow)
+            scores[name] = slice_motion.of_slice(across, next(iter(given)), cfg.follow)
         if cfg.camera:
-            found[name] |= camera_frames.agreement(Path(path), Path(cfg.camera))
-        notes = [NOTES[measure].format(value) for measure, value in found[name].items()]
+            scores[name] |= camera_frames.agreement(Path(path), Path(cfg.camera))
+        notes = [NOTES[measure].format(value) for measure, value in scores[name].items()]
         rows.append(comparison.Row(name, film, across, "\n".join(notes)))
     shortest = min(map(len, films))
     comparison.comparison(
         rows, run / "comparison.png", line=points, length_s=shortest / cfg.fps, axis=cfg.axis,
         samples=np.linspace(0, shortest - 1, cfg.samples).astype(int).tolist(),
     )  # fmt: skip
-    rich.print(found, f"in {run}")
-    return found
+    rich.print(scores, f"in {run}")
+    return scores
 
 
 @hydra.main(version_base=None, config_path="../conf", config_name="compare")

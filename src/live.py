@@ -53,9 +53,8 @@ def networks_for(cfg: DictConfig, name: str, views: int) -> dict[str, nn.Module]
     """
     chosen = build.chosen(cfg)
     stream.wanted(chosen, views)
-    others = {
-        other: src.models.load(other, build.rooms(cfg)) for other in cfg.choices if other != name
-    }
+    rooms = build.rooms(cfg)
+    others = {other: src.models.load(other, rooms) for other in cfg.choices if other != name}
     fit = {other: net for other, net in others.items() if net.views in (None, 1, views)}
     listed = {other: chosen if other == name else fit.get(other) for other in cfg.choices}
     listed.setdefault(name, chosen)

@@ -64,10 +64,10 @@ def alike(cfg: DictConfig) -> DictConfig:
             raise TypeError("a section must be a mapping")
     except (OSError, YAMLError, KeyError, TypeError, ValueError, OmegaConfBaseException):
         raise ValueError(f"like must be the config.yaml of a run, got {cfg.like}") from None
-    found = cfg.copy()
+    merged = cfg.copy()
     for name, part in parts.items():
-        found[name] = part
-    return found
+        merged[name] = part
+    return merged
 
 
 @hydra.main(version_base=None, config_path="../conf", config_name="simulate")

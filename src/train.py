@@ -48,9 +48,8 @@ def train(cfg: DictConfig) -> dict:
     least = build.part(cfg, "floor.method")
     floor = build.test(cfg, cfg.floor.name, least, data, module.scores)
     pictures = samples.write(run / "samples", module.method, data.pipelines["test"])
-    record = results.write(
-        run, door.resolved(cfg), [trained, untrained, floor], **door.facts(cfg, start)
-    )
+    rows, facts = [trained, untrained, floor], door.facts(cfg, start)
+    record = results.write(run, door.resolved(cfg), rows, **facts)
     tracking.end(trainer.loggers, record, pictures)
     return record
 

@@ -158,7 +158,6 @@ def _films(
     sensor = sources.sensor_size(path, sensor_size)
     span = stream.overlap("trained", fps)
     table = lookup.build(there or Views.single(sensor, sensor))
-    windows = stream.windows(
-        sources.events(path, sensor), table, stream.Rule(fps=fps, overlap=span)
-    )
+    rule = stream.Rule(fps=fps, overlap=span)
+    windows = stream.windows(sources.events(path, sensor), table, rule)
     return np.stack(list(stream.each_view(windows, network, overlap=span)), axis=1)

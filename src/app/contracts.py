@@ -46,15 +46,15 @@ CONTRACTS = {
 }  # fmt: skip
 
 
-def keeping(key: str, found: Any) -> Any:
-    """Return `found`, the part `key` of a config; ValueError where it lacks what is asked of it."""
+def keeping(key: str, made: Any) -> Any:
+    """Return `made`, the part `key` of a config; ValueError where it lacks what is asked of it."""
     contract = CONTRACTS.get(key, object)
-    if not isinstance(found, contract):
+    if not isinstance(made, contract):
         members = {*vars(contract), *contract.__annotations__} - set(vars(Protocol))
-        lacks = sorted(n for n in members if n[0] != "_" and not hasattr(found, n))
-        kind = f"{type(found).__module__}.{type(found).__name__}"
+        lacks = sorted(n for n in members if n[0] != "_" and not hasattr(made, n))
+        kind = f"{type(made).__module__}.{type(made).__name__}"
         raise ValueError(
             f"{key}._target_ must be a class with {', '.join(lacks)} "
             f"({contract.__module__}.{contract.__name__}), got {kind}"
         )
-    return found
+    return made

@@ -123,6 +123,7 @@ def resolved(cfg: DictConfig) -> str:
 def facts(cfg: DictConfig, start: float) -> dict:
     """Return what `results.json` says of a run besides its numbers; `start` by perf_counter."""
     gpu = cfg.trainer.accelerator == "gpu" and torch.cuda.is_available()
+    cpu = f"cpu, {torch.get_num_threads()} threads"
     return {
         "task": cfg.task,
         "experiment": cfg.name,
@@ -130,9 +131,7 @@ def facts(cfg: DictConfig, start: float) -> dict:
         "asked": asked(),
         "resumed_from": cfg.ckpt if cfg.task == "train" else None,
         "wall_s": round(time.perf_counter() - start, 1),
-        "device": torch.cuda.get_device_name()
-        if gpu
-        else f"cpu, {torch.get_num_threads()} threads",
+        "device": torch.cuda.get_device_name() if gpu else cpu,
     }
 
 

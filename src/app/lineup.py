@@ -33,16 +33,13 @@ def gather(cfg: DictConfig) -> list[Candidate]:
 
 def _by_hand(cfg: DictConfig) -> list[Candidate]:
     names = cfg.ckpt if isinstance(cfg.ckpt, ListConfig) else [cfg.ckpt] if cfg.ckpt else []
-    candidates = []
-    for name in names:
-        network = src.models.load(name, build.rooms(cfg))
-        label = Path(name).stem if Path(name).suffix else name
-        candidates.append(Candidate(label, network, network.views or cfg.optics.views))
+    labels = [Path(name).stem if Path(name).suffix else name for name in names]
+    networks = [src.models.load(name, build.rooms(cfg)) for name in names]
     if cfg.get("baseline"):
-        label = str(cfg.baseline.get("name", "baseline"))
-        network = build.part(cfg, "baseline").eval()
-        candidates.append(Candidate(label, network, network.views or cfg.optics.views))
-    return candidates
+        labels.append(str(cfg.baseline.get("name", "baseline")))
+        networks.append(build.part(cfg, "baseline").eval())
+    pairs = zip(labels, networks, strict=True)
+    return [Candidate(label, net, net.views or cfg.optics.views) for label, net in pairs]
 
 
 def _entry(name: str, entry: Mapping, own: Sequence[str]) -> Candidate:
@@ -53,8 +50,7 @@ def _entry(name: str, entry: Mapping, own: Sequence[str]) -> Candidate:
     try:
         restorer = load_restorer(entry["restorer"], own) if "restorer" in entry else None
         if "ckpt" in entry:
-            network = src.models.load(entry["ckpt"], own)
-            return Candidate(name, network, views, restorer=restorer)
+            return Candidate(name, src.models.load(entry["ckpt"], own), views, restorer=restorer)
         if "baseline" in entry:
             network = build.make(entry["baseline"], own).eval()
             return Candidate(name, network, views, restorer=restorer)

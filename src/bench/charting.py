@@ -91,12 +91,12 @@ def knees(speeds: Sequence[Speed], scored: Sequence[Score], side: int) -> dict[s
 
     By LPIPS, else by 1 - SSIM; the cost is thread time in ms on pictures of `side`, float32.
     """
-    costs = {s.network: s.ms for s in speeds if s.ms and _named(s, side, "float32")}
-    return {
-        severity: knee(costs, _errors(scored, severity, costs))
-        for severity in dict.fromkeys(row.severity for row in scored)
-        if _errors(scored, severity, costs)
-    }
+    which = (side, "float32", 1, "cpu")
+    timed = [s for s in speeds if (s.side, s.form, s.threads, s.device) == which]
+    costs = {s.network: s.ms for s in timed if s.ms}
+    severities = dict.fromkeys(row.severity for row in scored)
+    errors = {severity: _errors(scored, severity, costs) for severity in severities}
+    return {severity: knee(costs, values) for severity, values in errors.items() if values}
 
 
 def _errors(scored: Sequence[Score], severity: str, costs: Mapping) -> dict[str, list[float]]:
@@ -106,10 +106,6 @@ def _errors(scored: Sequence[Score], severity: str, costs: Mapping) -> dict[str,
             error = row.values.get("lpips", 1 - row.values["ssim"])
             errors.setdefault(row.network, []).append(error)
     return errors
-
-
-def _named(s: Speed, side: int, form: str) -> bool:
-    return (s.side, s.form, s.threads, s.device) == (side, form, 1, "cpu")
 
 
 def words(

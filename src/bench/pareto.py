@@ -7,12 +7,12 @@ from collections.abc import Hashable, Mapping, Sequence
 
 def front(points: Mapping[Hashable, tuple[float, float]]) -> list:
     """Return the names, cheapest first, of the (cost, error) that none beats in both."""
-    found, least = [], math.inf
+    names, least = [], math.inf
     for name, (_, error) in sorted(points.items(), key=lambda item: item[1]):
         if error < least:
-            found.append(name)
+            names.append(name)
             least = error
-    return found
+    return names
 
 
 def knee(costs: Mapping[str, float], errors: Mapping[str, Sequence[float]]) -> str:

@@ -24,9 +24,8 @@ def draw(path: Path, maps: Mapping[str, Cells]) -> Path:
     for axes, (title, cells) in zip(
         figure.subplots(1, len(maps), squeeze=False)[0], maps.items(), strict=True
     ):
-        values = np.array(
-            [[cells.get((half, spread), (np.nan, ""))[0] for half in halves] for spread in spreads]
-        )
+        grid = [[(half, spread) for half in halves] for spread in spreads]
+        values = np.array([[cells.get(place, (np.nan, ""))[0] for place in row] for row in grid])
         most = PALE * max(float(np.nanmax(np.abs(values))), 1e-9)
         axes.set_facecolor("#dddddd")
         axes.imshow(values, "PuOr_r", vmin=-most, vmax=most, origin="lower", aspect="auto")

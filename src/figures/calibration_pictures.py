@@ -16,14 +16,14 @@ MAGNIFIED = 60  # residuals are drawn this many times too long
 LABEL = {"facecolor": "white", "edgecolor": "none", "pad": 1.5}
 
 
-def views_found(picture: UInt8[np.ndarray, "h w"], found: Found, path: Path) -> None:
+def views_found(picture: UInt8[np.ndarray, "h w"], corners: Found, path: Path) -> None:
     """Draw where the target was found on the sensor: what a failed calibration leaves behind."""
     figure, axes = _sensor(picture)
-    for position, points in found.points.items():
+    for position, points in corners.points.items():
         axes.plot(*points.T, ".", markersize=5, color="tab:red")
         x, y = np.nanmean(points[:, 0]), np.nanmin(points[:, 1]) - 45
         axes.text(x, y, str(position), color="black", ha="center", fontsize=8, bbox=LABEL)
-    axes.set_title(f"target found in {len(found.points)} views")
+    axes.set_title(f"target found in {len(corners.points)} views")
     plots.save(figure, Path(path))
 
 

@@ -31,11 +31,11 @@ class Shown:
     disagreement: Float[np.ndarray, " windows"]
 
 
-def write(run: Path, found: tuple[Adaptive, Pipeline] | str, course: Sequence[float]) -> str:
+def write(run: Path, adaptive: tuple[Adaptive, Pipeline] | str, course: Sequence[float]) -> str:
     """Write `adapt.csv`, PNG and SVG to `run`; return what they say.  A reason is returned."""
-    if isinstance(found, str):
-        return f"\nThe adaptive network is not shown: {found}\n"
-    network, pipeline = found
+    if isinstance(adaptive, str):
+        return f"\nThe adaptive network is not shown: {adaptive}\n"
+    network, pipeline = adaptive
     stream = film(pipeline, 0, Conditions(course=tuple(course)))
     last = len(network.levels) - 1
     shown = {

@@ -45,14 +45,14 @@ def comparison(
         raise ValueError(f"samples must be in 0..{shortest - 1}, got {list(samples)}")
     columns = len(samples) + 1
     height, width = rows[0].video.shape[1:]
-    figure = Figure(
-        figsize=(2 * columns + 0.8, 2 * len(rows) * height / width + 0.4), layout="constrained"
-    )
+    size = (2 * columns + 0.8, 2 * len(rows) * height / width + 0.4)
+    figure = Figure(figsize=size, layout="constrained")
     figure.get_layout_engine().set(w_pad=0.12)  # room for half the last number of the last axis
     grid = figure.subplots(len(rows), columns, squeeze=False)
     for row, axes in zip(rows, grid, strict=True):
         for sample, panel in zip(samples, axes, strict=False):
-            _frame(panel, row.video[sample])
+            panel.imshow(row.video[sample], cmap="gray", vmin=0, vmax=1)
+            panel.set(xticks=[], yticks=[])
         axes[0].plot(*line.T, color=LINE, linewidth=1)
         axes[0].set_ylabel(row.name, fontsize=min(9, 170 / max(len(row.name), 1)))
         _slice(axes[-1], row, length_s)
@@ -61,11 +61,6 @@ def comparison(
         panel.set_title(f"{1e3 * time:.1f} ms", fontsize=8)
     grid[0, -1].set_title(f"{axis}-t, {1e3 * length_s:.0f} ms", fontsize=8)
     plots.save(figure, Path(path))
-
-
-def _frame(panel: Axes, picture: np.ndarray) -> None:
-    panel.imshow(picture, cmap="gray", vmin=0, vmax=1)
-    panel.set(xticks=[], yticks=[])
 
 
 def _slice(panel: Axes, row: Row, length_s: float) -> None:

@@ -37,7 +37,8 @@ def accuracy(
     in bf16; the dashed line is the front of what none beats in both.
     """
     names = list(dict.fromkeys(row.network for row in scores))
-    times = {(s.network, s.form): s.ms for s in speeds if _counts(s, side)}
+    alone = [s for s in speeds if (s.side, s.threads, s.device) == (side, 1, "cpu")]
+    times = {(s.network, s.form): s.ms for s in alone if s.ms is not None}
     metrics = [metric for metric in SHOWN if scores and metric.name in scores[0].values]
     rows = max(2, (len(metrics) + 1) // 2)
     figure = Figure(figsize=(11, 4.1 * rows), layout="constrained")
@@ -75,10 +76,6 @@ def machine(path: Path, speeds: Sequence[Speed], peaks: Mapping[tuple[str, int],
     forms = [form for form in FACES if any(s.form == form for s in timed)]
     _legend(figure, names, forms, starred)
     return save(figure, path)
-
-
-def _counts(s: Speed, side: int) -> bool:
-    return s.ms is not None and s.side == side and s.threads == 1 and s.device == "cpu"
 
 
 def _panel(axes, names: list[str], times: Mapping, scores: Sequence[Score], metric: Metric) -> None:
@@ -138,16 +135,14 @@ def _look(place: int, form: str) -> dict:
 
 
 def _legend(figure: Figure, names: list[str], forms: Sequence[str], starred) -> None:
+    stars = ["  * no weights" if name in starred else "" for name in names]
+    labels = [name.replace("_", " ") + star for name, star in zip(names, stars, strict=True)]
     handles = [
-        Line2D([], [], linestyle="none", **_look(i, "float32"), label=_label(name, starred))
-        for i, name in enumerate(names)
+        Line2D([], [], linestyle="none", **_look(i, "float32"), label=label)
+        for i, label in enumerate(labels)
     ]
     for form in forms:
         look = {"color": "0.3", "marker": "o", "fillstyle": FACES[form], "markersize": 7}
         look |= {"markerfacecoloralt": "white", "linestyle": "none"}
         handles.append(Line2D([], [], **look, label=form))
     figure.legend(handles=handles, loc="outside right center", fontsize=9, frameon=False)
-
-
-def _label(name: str, starred) -> str:
-    return name.replace("_", " ") + ("  * no weights" if name in starred else "")

@@ -101,13 +101,8 @@ def written(cell: Finding) -> str:
         return "0"
     if abs(value) < 0.0095:
         return f"{value:.0e}".replace("e-0", "e-")
-    return (
-        f"{value:.0f}"
-        if abs(value) >= 20
-        else f"{value:.1f}"
-        if abs(value) >= 1
-        else f"{value:.2f}"
-    )
+    digits = 0 if abs(value) >= 20 else 1 if abs(value) >= 1 else 2
+    return f"{value:.{digits}f}"
 
 
 def _limit(cells: Mapping[str, Finding | str]) -> str:

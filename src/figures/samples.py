@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from src.figures.comparison import Row, comparison
-from src.figures.video import event_picture, row, write_video
+from src.figures.video import enlarged, event_picture, row, write_video
 from src.models.unroll import video
 from src.sim.optics import Optics
 from src.sim.pipeline import Pipeline, Sample, simulate
@@ -25,12 +25,8 @@ def write(folder: Path, network: nn.Module, pipeline: Pipeline, clips: int = 2) 
     written = []
     for index in range(clips):
         sample = simulate(pipeline, [index])
-        frames = video(network, sample)
-        parts = {
-            "clean": sample.target,
-            "centre view": sample.turbulent,
-            "reconstruction": frames.float().clamp(0, 1),
-        }
+        parts = {"clean": sample.target, "centre view": sample.turbulent}
+        parts["reconstruction"] = video(network, sample).float().clamp(0, 1)
         videos = {name: part[0, :, 0].cpu().numpy() for name, part in parts.items()}
         written += [
             _gif(folder / f"clip{index}.gif", videos, sample, pipeline.optics),
@@ -54,7 +50,7 @@ def write_views(
     pushed = [event_picture(part.mean(1).numpy(), full=reach) for part in tilt]
     shown = mosaic([_rgb(view.numpy()) for view in views], optics)
     panels = {
-        "clean": _enlarge(_rgb(clean), shown.shape[1]),
+        "clean": enlarged(_rgb(clean), shown.shape[1] // clean.shape[1]),
         "views": shown,
         f"tilt, +-{reach:.1f} px": mosaic(pushed, optics),
         "events": mosaic(events, optics),
@@ -68,12 +64,8 @@ def write_views(
 
 def _gif(path: Path, videos: dict[str, np.ndarray], sample: Sample, optics: Optics) -> Path:
     counts = sample.voxels[0, :, optics.centre].sum(1).cpu().numpy()
-    panels = {
-        "clean": _rgb(videos["clean"]),
-        "centre view": _rgb(videos["centre view"]),
-        "events": event_picture(counts),
-        "reconstruction": _rgb(videos["reconstruction"]),
-    }
+    panels = {name: _rgb(videos[name]) for name in ("clean", "centre view")}
+    panels |= {"events": event_picture(counts), "reconstruction": _rgb(videos["reconstruction"])}
     write_video(path, row(panels), PLAYBACK_FPS)
     return path
 
@@ -90,10 +82,6 @@ def _slices(path: Path, videos: dict[str, np.ndarray], window_s: float) -> Path:
 
 def _rgb(video: np.ndarray) -> np.ndarray:
     return np.repeat(video[..., None], 3, axis=-1)
-
-
-def _enlarge(video: np.ndarray, height: int) -> np.ndarray:
-    return video.repeat(height // video.shape[1], 1).repeat(height // video.shape[1], 2)
 
 
 def mosaic(videos: list[np.ndarray], optics: Optics) -> np.ndarray:

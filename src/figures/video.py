@@ -32,7 +32,7 @@ def row(panels: dict[str, Video]) -> Video:
     """
     tallest = max(max(video.shape[1] for video in panels.values()), SMALLEST_PX)
     columns = [
-        _titled(_enlarge(video, tallest // video.shape[1]), n) for n, video in panels.items()
+        _titled(enlarged(video, tallest // video.shape[1]), n) for n, video in panels.items()
     ]
     height = max(column.shape[1] for column in columns)
     below = [(0, height - column.shape[1]) for column in columns]
@@ -67,5 +67,6 @@ def _titled(video: Video, name: str) -> Video:
     return np.concatenate([above, video], axis=1)
 
 
-def _enlarge(video: Video, factor: int) -> Video:
+def enlarged(video: Video, factor: int) -> Video:
+    """Return a video whose pixels are repeated `factor` times along both axes."""
     return video.repeat(factor, axis=1).repeat(factor, axis=2) if factor > 1 else video

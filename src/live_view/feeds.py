@@ -58,13 +58,13 @@ def open_feed(
     address or a format that cannot be read.
     """
     if recording.startswith("udp://"):
-        return Udp(recording, _told(sensor), udp_format, faults)
+        return Udp(recording, _stated(sensor), udp_format, faults)
     if recording.startswith("camera://"):
         return Camera(faults)
     return File(recording, sources.sensor_size(recording, sensor), loop)
 
 
-def _told(sensor: Sequence[int] | None) -> Size:
+def _stated(sensor: Sequence[int] | None) -> Size:
     if sensor is None or not all(1 <= side <= LARGEST_SIDE for side in sensor):
         raise ValueError(
             f"sensor_size must be [height,width] for recording=udp://, got {sensor}; "

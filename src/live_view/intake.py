@@ -96,7 +96,9 @@ class Intake:
         if chunk is None:
             return
         if chunk == "end":
-            self._finish(stopped)
+            if self.cutter.origin is not None:  # the last window, if the file covers it
+                self._play(self.cutter.last + (1 - COVERED) * self.cutter.period + 1, stopped)
+            self.state = "broken" if self.faults.has("file") else "ended"
             return
         self.cutter.add(chunk[0])
         if self.cutter.origin is None:
@@ -112,12 +114,6 @@ class Intake:
             if due is None:
                 return
             self._hand_on(replace(window, due=due), stopped)
-
-    def _finish(self, stopped: threading.Event) -> None:
-        """End with the last window, if the file covers it."""
-        if self.cutter.origin is not None:
-            self._play(self.cutter.last + (1 - COVERED) * self.cutter.period + 1, stopped)
-        self.state = "broken" if self.faults.has("file") else "ended"
 
     def _cut_live(self, stopped: threading.Event) -> None:
         chunk, now = self._next(POLL_S), time.perf_counter()
@@ -143,8 +139,8 @@ class Intake:
         """Take a live chunk; after a silence or a leap of the camera's clock, time starts anew."""
         if self.arrived is not None:
             stalled = wall - self.arrived > STALL_S
-            known = self.clock.offset is not None
-            if stalled or (known and self.cutter.leaps(events, self.clock.recorded_us(wall))):
+            timed = self.clock.offset is not None
+            if stalled or (timed and self.cutter.leaps(events, self.clock.recorded_us(wall))):
                 self._start_anew()
         self.faults.clear("stall")
         self.arrived = wall

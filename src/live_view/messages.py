@@ -26,15 +26,15 @@ class Page:
         self.slice = Slice(self.screen)
         self.all_views = False
         self.shown = -1  # count of frames at the last picture
-        self.told = 0.0  # when the meters were last sent
+        self.sent = 0.0  # when the meters were last sent
 
     def message(self, *, whole: bool = False) -> bytes | None:
         """Return what is new since the last call, or everything; None where nothing is."""
         pictures = self._pictures(whole)
         header: dict = {"pictures": [[name, len(data)] for name, data in pictures]}
         now = time.perf_counter()
-        if whole or now - self.told >= STATUS_S:
-            self.told, header["status"] = now, self.status()
+        if whole or now - self.sent >= STATUS_S:
+            self.sent, header["status"] = now, self.status()
         elif not pictures:
             return None
         text = json.dumps(header).encode()
@@ -77,13 +77,10 @@ class Page:
         if "line" in asked:
             self.slice.line = _line(asked["line"])
         if "network" in asked:
-            self.controls.choose(str(asked["network"]), _views(asked.get("views")))
-
-
-def _views(asked: object) -> int | str:
-    if type(asked) not in (int, str):
-        raise ValueError(f"views_used must be a number or adaptive, got {asked}")
-    return asked
+            views = asked.get("views")
+            if type(views) not in (int, str):
+                raise ValueError(f"views_used must be a number or adaptive, got {views}")
+            self.controls.choose(str(asked["network"]), views)
 
 
 def _line(numbers: object) -> tuple[float, float, float, float]:

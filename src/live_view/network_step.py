@@ -49,16 +49,12 @@ class Step:
         self.overlap = stream.overlap(how.span or stream.default_span(network), how.fps)
         form = how.form or (fastest() if runs(network) else "float32")
         self.network = event_lists.ready(network, form, "cpu", views, how.bins)
-        self.rule = stream.Rule(
-            fps=how.fps,
-            bins=how.bins,
-            splat=how.splat,
-            unit=how.unit,
-            grids=not isinstance(self.network, Runtime),
-        )
+        listed = isinstance(self.network, Runtime)
+        laid = {"bins": how.bins, "splat": how.splat, "unit": how.unit}
+        self.rule = stream.Rule(fps=how.fps, grids=not listed, **laid)
         self.lookup = build(views)
         # One that keeps no overlapping windows apart can begin one while another is finished.
-        self.ahead = isinstance(self.network, Runtime) and self.overlap == 1
+        self.ahead = listed and self.overlap == 1
         self._warm_up()
 
     def begin(self, window: EventWindow, *, fresh: bool = False) -> Finish:

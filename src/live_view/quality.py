@@ -25,8 +25,8 @@ def choices(wants: int | None, places: Sequence[Position]) -> list[int]:
     there = set(places)
     if wants is not None:
         return [wants]
-    known = {count for count in COUNTS if set(layout(count)) <= there}
-    return sorted(known | {len(places)})
+    counts = {count for count in COUNTS if set(layout(count)) <= there}
+    return sorted(counts | {len(places)})
 
 
 def positions(views: int, places: Sequence[Position]) -> list[Position]:

@@ -14,6 +14,7 @@ from src.live_view.messages import Page
 PAGE = Path(__file__).with_name("live.html")
 RATE = 30.0  # pictures a second
 LONGEST = 4096  # bytes of a message from the browser
+FRESH = {"Cache-Control": "no-store"}
 THIS_MACHINE = ("127.0.0.1", "localhost", "::1")
 
 
@@ -81,18 +82,17 @@ class Server:
             "default-src 'none'; img-src 'self' blob: data:; style-src 'unsafe-inline'; "
             f"script-src 'unsafe-inline'; connect-src 'self' ws://{request.host}"
         )
-        headers = {"Content-Security-Policy": policy, "Cache-Control": "no-store"}
+        headers = FRESH | {"Content-Security-Policy": policy}
         return web.Response(text=PAGE.read_text(), content_type="text/html", headers=headers)
 
     async def _status(self, request: web.Request) -> web.Response:
-        return web.json_response(self.page.status(), headers={"Cache-Control": "no-store"})
+        return web.json_response(self.page.status(), headers=FRESH)
 
     async def _frame(self, request: web.Request) -> web.Response:
         newest = self.page.screen.newest()
         if newest is None:
             raise web.HTTPServiceUnavailable(text="no frame yet")
-        headers = {"Cache-Control": "no-store"}
-        return web.Response(body=paint.png(newest), content_type="image/png", headers=headers)
+        return web.Response(body=paint.png(newest), content_type="image/png", headers=FRESH)
 
     async def _stream(self, request: web.Request) -> web.WebSocketResponse:
         socket = web.WebSocketResponse(compress=False, max_msg_size=LONGEST, heartbeat=20)

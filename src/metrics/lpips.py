@@ -5,8 +5,8 @@ are never replaced by random ones: without them there is no LPIPS.
 """
 
 import socket
-from collections.abc import Callable
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 
 import torch
@@ -87,9 +87,8 @@ class LPIPS(nn.Module):
 
     def _normalise(self, picture: Tensor) -> Tensor:
         rgb = picture.expand(-1, 3, -1, -1)
-        return ((2 * rgb - 1 - self.shift) / self.scale).contiguous(
-            memory_format=torch.channels_last
-        )
+        normal = (2 * rgb - 1 - self.shift) / self.scale
+        return normal.contiguous(memory_format=torch.channels_last)
 
 
 class AnchoredLPIPS(LPIPS):
@@ -170,8 +169,7 @@ def _heads(net: str) -> list[Tensor]:
 
 def _fill(stages: nn.ModuleList, weights: dict[str, Tensor], net: str) -> None:
     """Copy `features.<i>.weight` and `.bias` into the convolutions, in their order."""
-    layers = [layer for stage in stages for layer in stage]
-    for place, layer in enumerate(layers):
+    for place, layer in enumerate(chain.from_iterable(stages)):
         if isinstance(layer, nn.Conv2d):
             for part in ("weight", "bias"):
                 name = f"features.{place}.{part}"
@@ -185,10 +183,10 @@ def _backbone(net: str, path: str | None) -> dict[str, Tensor]:
     candidates = [Path(path)] if path else [CACHE / f"{net}.safetensors", hub]
     for candidate in candidates:
         if candidate.is_file():
-            read: Callable = load_file if candidate.suffix == ".safetensors" else _load_pickle
-            return read(candidate)
-    downloaded = _download(net) if path is None else None
-    if downloaded is not None:
+            if candidate.suffix == ".safetensors":
+                return load_file(candidate)
+            return torch.load(candidate, map_location="cpu", weights_only=True)
+    if path is None and (downloaded := _download(net)) is not None:
         return downloaded
     raise ValueError(
         f"loss.backbone: no ImageNet weights of {net} at {candidates[0]}. Get them by "
@@ -203,18 +201,10 @@ def _download(net: str) -> dict[str, Tensor] | None:
     patience = socket.getdefaulttimeout()
     socket.setdefaulttimeout(PATIENCE_S)  # the hub has no time-out of its own
     try:
-        return torch.hub.load_state_dict_from_url(
-            f"https://download.pytorch.org/models/{HUB[net]}",
-            map_location="cpu",
-            progress=False,
-            check_hash=True,
-            weights_only=True,
-        )
+        safely = {"map_location": "cpu", "check_hash": True, "weights_only": True}
+        url = f"https://download.pytorch.org/models/{HUB[net]}"
+        return torch.hub.load_state_dict_from_url(url, progress=False, **safely)
     except (OSError, RuntimeError):  # no network, or what came is not the file (a login page)
         return None
     finally:
         socket.setdefaulttimeout(patience)
-
-
-def _load_pickle(path: Path) -> dict[str, Tensor]:
-    return torch.load(path, map_location="cpu", weights_only=True)

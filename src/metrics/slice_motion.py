@@ -54,11 +54,11 @@ def of_slice(
 
     Nothing stands still on a circle, and nothing moves along such a ray.
     """
-    found = {} if kind == "circle" else {"wander": wander(rows)}
+    values = {} if kind == "circle" else {"wander": wander(rows)}
     if kind != "spin":
         measure = turning if kind == "circle" else straightness
-        found["straightness"] = measure(followed(rows, follow))
-    return found
+        values["straightness"] = measure(followed(rows, follow))
+    return values
 
 
 def followed(rows: Float[np.ndarray, "frames places"], follow: str) -> np.ndarray:

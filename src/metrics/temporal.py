@@ -26,7 +26,9 @@ def displacement(
 
     Blocks are 16 pixels wide; shifts are cut at 8 pixels.
     """
-    weight = _texture(target)
+    a, b, c = _structure(*_gradients(target))
+    weaker = (a + c) / 2 - ((a - c) ** 2 / 4 + b * b).sqrt()  # eigenvalue of each block's tensor
+    weight = torch.where(weaker > TEXTURE, weaker, torch.zeros_like(weaker))
     shift = torch.zeros(len(target), 2, *weight.shape[1:], dtype=target.dtype, device=target.device)
     for side in SMOOTHING:
         step = _step(_smooth(frames, side), _smooth(target, side), shift)
@@ -40,9 +42,8 @@ def pull(
 ) -> Float[Tensor, "n c h w"]:
     """Return the frames with what lies `shift` (x, y), in pixels, from each pixel brought there."""
     height, width = frames.shape[-2:]
-    y, x = torch.meshgrid(
-        torch.arange(height).to(frames), torch.arange(width).to(frames), indexing="ij"
-    )
+    rows, columns = torch.arange(height).to(frames), torch.arange(width).to(frames)
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
     place = [(2 * (x + shift[:, 0]) + 1) / width - 1, (2 * (y + shift[:, 1]) + 1) / height - 1]
     grid = torch.stack(place, -1)
     return functional.grid_sample(frames, grid, mode, padding_mode="border", align_corners=False)
@@ -52,8 +53,7 @@ def residual(
     frames: Float[Tensor, "frames 1 h w"], target: Float[Tensor, "frames 1 h w"]
 ) -> Float[Tensor, " frames"]:
     """Return the rms displacement of each frame against the truth, in pixels per axis."""
-    shift, weight = displacement(frames, target)
-    return _rms(shift, weight)
+    return _rms(*displacement(frames, target))
 
 
 def wobble(
@@ -73,13 +73,6 @@ def straightness(path: Float[Tensor, "frames 2"], truth: Float[Tensor, "frames 2
     """
     error = path - truth
     return float((error - error.mean(0)).square().sum(1).mean().sqrt())
-
-
-def _texture(target: Tensor) -> Tensor:
-    """Return the smaller eigenvalue of every block's structure tensor, 0 below TEXTURE."""
-    a, b, c = _structure(*_gradients(target))
-    weaker = (a + c) / 2 - ((a - c) ** 2 / 4 + b * b).sqrt()
-    return torch.where(weaker > TEXTURE, weaker, torch.zeros_like(weaker))
 
 
 def _structure(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:

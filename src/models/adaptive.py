@@ -74,9 +74,8 @@ class Adaptive(nn.Module):
                 f"adapt.patience must be >= 1, handover >= 0, got {patience}, {handover}"
             )
         self.levels, self.patience, self.handover = tuple(levels), patience, handover
-        self.networks = nn.ModuleList(
-            {id(level.network): level.network for level in levels}.values()
-        )
+        different = {id(level.network): level.network for level in levels}
+        self.networks = nn.ModuleList(different.values())
         last = len(levels) - 1
         self.bounds = [tolerance * (k + 1) / last for k in range(last)]
 
@@ -105,10 +104,10 @@ class Adaptive(nn.Module):
             sums = sums + math.exp(-window_s / MEMORY_S) * state.sums
         mean = sums.mean(1, keepdim=True)
         spread = (sums - mean).square().mean().sqrt()
-        found = float(spread / mean.square().mean().sqrt().clamp(min=1e-9)) if spread > 0 else 0.0
+        apart = float(spread / mean.square().mean().sqrt().clamp(min=1e-9)) if spread > 0 else 0.0
         if state is None:
-            return Held(0, None, sums, found, 0, window_s)
-        return replace(state, sums=sums, disagreement=found, age_s=state.age_s + window_s)
+            return Held(0, None, sums, apart, 0, window_s)
+        return replace(state, sums=sums, disagreement=apart, age_s=state.age_s + window_s)
 
     def _decided(self, held: Held, places: list[Position]) -> Held:
         """Go up at once, down one level at a time and only after calm."""

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from src.models import openvino_cpu
+from src.models import openvino_cpu, stopwatch
 from src.models.e2vid import E2VID
 from src.models.explicit_state import flat, formed
 from src.models.setnet import SetNet
@@ -107,13 +107,9 @@ class OnTorch:
     @torch.inference_mode()
     def __call__(self, inputs: list[np.ndarray]) -> np.ndarray:
         """Return what is drawn and keep the state."""
-        before = torch.get_num_threads()
-        torch.set_num_threads(self.threads)
-        try:
+        with stopwatch.threads(self.threads):
             given = [torch.from_numpy(part) for part in inputs]
             drawn, *self.state = self.after(*given, *self.state)
-        finally:
-            torch.set_num_threads(before)
         return drawn.numpy()
 
     def reset(self) -> None:

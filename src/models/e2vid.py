@@ -60,7 +60,7 @@ class E2VID(nn.Module):
         self.head = _conv(seen, base_channels, side)
         self.encoders = nn.ModuleList(_conv(a, b, kernel_size, stride=2) for a, b in pairs)
         self.cells = nn.ModuleList(cell(width) for width in widths[1:])
-        self.resblocks = nn.ModuleList(ResidualBlock(widths[-1]) for _ in range(2))
+        self.resblocks = nn.Sequential(*(ResidualBlock(widths[-1]) for _ in range(2)))
         self.decoders = nn.ModuleList(_conv(b, a, kernel_size) for a, b in reversed(pairs))
         self.pred = nn.Conv2d(base_channels, 1, 1)
         if spectral_norm:
@@ -92,10 +92,7 @@ class E2VID(nn.Module):
     ) -> tuple[Float[Tensor, "n 1 h w"], tuple]:
         """Return the frame, padding and all, and the state; `x` is the first layer's, no ReLU."""
         head, skips, after = self._scales(x, state)
-        x = skips[-1]
-        for block in self.resblocks:
-            x = block(x)
-        return self.activation(self.decode(x, head, skips)), after
+        return self.activation(self.decode(self.resblocks(skips[-1]), head, skips)), after
 
     def encode(
         self, x: Float[Tensor, "n c h w"], state: Any

@@ -61,10 +61,10 @@ def require(name: str | Path, spec: dict) -> Path:
     path = newest(Path(name)) if Path(name).is_dir() else Path(name)
     if not path.is_file():
         raise ValueError(f"ckpt must be a checkpoint to go on from, got {path}")
-    found, _ = (_safetensors if exported(path) else _checkpoint)(path)
+    saved, _ = (_safetensors if exported(path) else _checkpoint)(path)
     wanted = spec | {"kwargs": spec["kwargs"] | _unnormalised(spec)} if exported(path) else spec
-    if found != wanted:
-        raise ValueError(f"ckpt must be of the network {spec} to go on from, got {found} in {path}")
+    if saved != wanted:
+        raise ValueError(f"ckpt must be of the network {spec} to go on from, got {saved} in {path}")
     return path
 
 
@@ -109,13 +109,12 @@ def save(path: Path, network: nn.Module, spec: dict, card: dict) -> None:
     spec = {"target": spec["target"], "kwargs": spec["kwargs"] | _unnormalised(spec)}
     plain = _build(spec, path, [type(network).__module__])
     plain.load_state_dict(folded(network))
-    halves = {name: _half(value).contiguous() for name, value in plain.state_dict().items()}
+    halves = {
+        name: (value.half() if value.is_floating_point() else value).contiguous()
+        for name, value in plain.state_dict().items()
+    }
     with written(path) as partial:
         save_file(halves, partial, {"network": json.dumps(spec), "card": json.dumps(card)})
-
-
-def _half(value: Tensor) -> Tensor:
-    return value.half() if value.is_floating_point() else value
 
 
 def fold(network: nn.Module) -> None:
@@ -133,12 +132,8 @@ def folded(network: nn.Module) -> dict[str, Tensor]:
         if parametrize.is_parametrized(module, "weight"):
             module.eval()
             values[f"{prefix}.weight"] = module.weight.detach().clone()
-    kept = {
-        name: value
-        for name, value in network.state_dict().items()
-        if "parametrizations" not in name
-    }
-    return kept | values
+    kept = network.state_dict()
+    return {name: kept[name] for name in kept if "parametrizations" not in name} | values
 
 
 def _unnormalised(spec: dict) -> dict:

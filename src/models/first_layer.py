@@ -25,9 +25,8 @@ class HeadFront:
         """Return what comes behind is given after a window's events: the map (1, h, w, c)."""
         made = np.empty((self.shape[1], self.bias.size), np.float32)
         made[:] = self.bias
-        kernels.add_patches(
-            t, x, y, p, view, t0, t1, self.down, self.right, self.table, self.stride, made
-        )
+        patch = (self.down, self.right, self.table, self.stride)
+        kernels.add_patches(t, x, y, p, view, t0, t1, *patch, made)
         return [made.reshape(self.shape)]
 
     def example(self) -> list[np.ndarray]:

@@ -19,11 +19,11 @@ def patches(
     made = np.zeros((*stacked.shape[:2], stride, stride, reach, reach, channels), np.float32)
     for row in range(stride):
         # An output at `first + i` sees the event at row - stride * (first + i) + half.
-        down = [row - stride * (_first(row, stride, half) + i) + half for i in range(reach)]
+        top = _first(row, stride, half)
+        down = [row - stride * (top + i) + half for i in range(reach)]
         for column in range(stride):
-            right = [
-                column - stride * (_first(column, stride, half) + j) + half for j in range(reach)
-            ]
+            left = _first(column, stride, half)
+            right = [column - stride * (left + j) + half for j in range(reach)]
             for i, j in np.ndindex(reach, reach):
                 if down[i] >= 0 and right[j] >= 0:
                     made[:, :, row, column, i, j] = stacked[:, :, down[i], right[j]]

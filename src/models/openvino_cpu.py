@@ -149,9 +149,8 @@ class OpenVinoNetwork(nn.Module):
             state = explicit.begin(voxels.to(self.seen))
             seconds = [torch.full((1,), 1 / 120)] if explicit.timed else []
             example = [voxels.float(), *seconds, *state]
-            self.made[which] = (
-                Compiled(explicit, example, torch.get_num_threads()), explicit.timed
-            )  # fmt: skip
+            compiled = Compiled(explicit, example, torch.get_num_threads())
+            self.made[which] = compiled, explicit.timed
         return self.made[which]
 
 

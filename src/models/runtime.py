@@ -81,16 +81,12 @@ class Runtime:
         padded = tuple(side + sum(pad) for side, pad in zip(self.size, self.padding, strict=True))
         dtype = {"float32": torch.float32, "bf16": torch.bfloat16}.get(form)
         dtype = openvino_cpu.precision() if dtype is None else dtype
-        kind = AfterStem if isinstance(network, SetNet) else AfterHead
-        after = kind(plain(network).cpu(), positions, padded, dtype)
-        front = StemFront if isinstance(network, SetNet) else HeadFront
+        stemmed = isinstance(network, SetNet)
+        rest, front = (AfterStem, StemFront) if stemmed else (AfterHead, HeadFront)
+        after = rest(plain(network).cpu(), positions, padded, dtype)
         self.front = front(after, padded)
-        inputs, state = self.front.example(), after.start()
-        self.behind = (
-            OnOpenVino(after, inputs, state, threads)
-            if form == "openvino"
-            else OnTorch(after, inputs, state, threads)
-        )
+        behind = OnOpenVino if form == "openvino" else OnTorch
+        self.behind = behind(after, self.front.example(), after.start(), threads)
 
     def step(
         self,

@@ -47,9 +47,8 @@ def kaleidoscope(
         mirror = np.array([-1 if col % 2 else 1, -1 if row % 2 else 1])
         tile = middle + corners * mirror + 2 * half * [col, row]
         if (row, col) != (0, 0):
-            draw = noise.normal(
-                noise.key(key, view_id((row, col)), "kaleidoscope"), torch.arange(8)
-            )
+            own = noise.key(key, view_id((row, col)), "kaleidoscope")
+            draw = noise.normal(own, torch.arange(8))
             tile = tile + misalignment_px * draw.reshape(4, 2).numpy()
         onto = (middle + corners).astype(np.float32)
         matrix = cv2.getPerspectiveTransform(tile.astype(np.float32), onto)

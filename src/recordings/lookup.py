@@ -59,14 +59,13 @@ class Lookup:
         self.check(events)
         count = (1 if nearest else 4) * len(events)
         kinds = (np.int64, np.int64, np.int64, np.int64, np.float32)
-        index, u, v, which, weight = (np.empty(count, kind) for kind in kinds)
-        fields, made = [events[name] for name in "xyp"], (index, u, v, which, weight)
-        found, outside = (
-            lay_nearest(*fields, self.nearest, density[:, 0], *made)
-            if nearest
-            else lay(*fields, self.view, self.place, density[:, 0], *made)
-        )
-        return tuple(part[:found] for part in (index, u, v, weight, which)), outside
+        index, u, v, which, weight = made = [np.empty(count, kind) for kind in kinds]
+        fields = [events[name] for name in "xyp"]
+        if nearest:
+            entries, outside = lay_nearest(*fields, self.nearest, density[:, 0], *made)
+        else:
+            entries, outside = lay(*fields, self.view, self.place, density[:, 0], *made)
+        return tuple(part[:entries] for part in (index, u, v, weight, which)), outside
 
     @cached_property
     def nearest(self) -> Int[np.ndarray, "h w"]:
@@ -93,14 +92,6 @@ class Lookup:
     def unit(self) -> Float[np.ndarray, "views 1 h w"]:
         """Ones: no density."""
         return np.ones((self.views, 1, *self.model), np.float32)
-
-    def split(self, events: np.ndarray) -> tuple[np.ndarray, Int[np.ndarray, " k"]]:
-        """Return the events inside views, at their nearest model pixel, and the view of each."""
-        self.check(events)
-        pixel = self.nearest[events["y"], events["x"]]
-        kept = events[pixel >= 0].copy()
-        view, kept["y"], kept["x"] = np.unravel_index(pixel[pixel >= 0], (self.views, *self.model))
-        return kept, view
 
     def check(self, events: np.ndarray) -> None:
         """Raise ValueError where an event lies off the sensor."""

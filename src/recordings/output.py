@@ -10,6 +10,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 
 import cv2
@@ -47,18 +48,18 @@ def sink(kind: str, folder: Path, size: tuple[int, int], playback_fps: float = 3
     ):
         table = csv.writer(file)
         table.writerow(["frame", "time_s", "events", "outside"])
-        count = 0
+        frames = 0
 
         def write(frame: Frame) -> None:
-            nonlocal count
+            nonlocal frames
             _check_room(folder)
             add(eight_bits(frame.picture), frame)
-            table.writerow([count, f"{frame.time_s:.6f}", frame.events, frame.outside])
-            count += 1
+            table.writerow([frames, f"{frame.time_s:.6f}", frame.events, frame.outside])
+            frames += 1
 
         yield write
     if kind == "mp4":
-        _check_mp4(video, count)
+        _check_mp4(video, frames)
     _rename(video, folder / whole)
     _rename(table_file, folder / "frames.csv")
 
@@ -80,13 +81,13 @@ def _rename(made: Path, whole: Path) -> None:
     os.replace(made, whole)
 
 
-def _check_mp4(path: Path, count: int) -> None:
-    """Raise OSError unless the file holds `count` frames: the encoder is silent on a full disk."""
+def _check_mp4(path: Path, written: int) -> None:
+    """Raise OSError unless `written` frames are in it: the encoder is silent on a full disk."""
     video = cv2.VideoCapture(str(path))
-    found = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+    frames = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
     video.release()
-    if found != count:
-        raise OSError(f"{path} holds {found} of {count} frames; is the disk full?")
+    if frames != written:
+        raise OSError(f"{path} holds {frames} of {written} frames; is the disk full?")
 
 
 def eight_bits(picture: Float[np.ndarray, "h w"]) -> Picture:
@@ -128,14 +129,12 @@ def _png(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
     if path.is_dir():
         shutil.rmtree(path)  # what a stopped run left
     path.mkdir()
-    count = 0
+    names = (path / f"{number:07d}.png" for number in count())
 
     def add(picture: Picture, frame: Frame) -> None:
-        nonlocal count
-        name = path / f"{count:07d}.png"
+        name = next(names)
         if not cv2.imwrite(str(name), picture):
             raise OSError(f"{name} cannot be written; is the disk full?")
-        count += 1
 
     yield add
 
@@ -143,14 +142,8 @@ def _png(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
 @contextmanager
 def _hdf5(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
     with h5py.File(path, "w", rdcc_nbytes=CACHE_BYTES) as file:
-        frames = file.create_dataset(
-            "frames",
-            (0, *size),
-            np.uint8,
-            maxshape=(None, *size),
-            chunks=(1, *size),
-            compression="lzf",
-        )
+        growing = {"maxshape": (None, *size), "chunks": (1, *size), "compression": "lzf"}
+        frames = file.create_dataset("frames", (0, *size), np.uint8, **growing)
         times = file.create_dataset("time_s", (0,), np.float64, maxshape=(None,), chunks=(4096,))
 
         def add(picture: Picture, frame: Frame) -> None:

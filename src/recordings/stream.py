@@ -12,7 +12,7 @@ is exactly the reconstruction at the trained rate, and every event counts once p
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, cycle
 from typing import Any
 
 import numpy as np
@@ -101,16 +101,14 @@ def windows(chunks: Iterable[np.ndarray], lookup: Lookup, rule: Rule) -> Iterato
     shorter than one window.
     """
     ordered = _ordered(chunks, lookup)
-    first = next(ordered, None)
-    none = True
+    first, window = next(ordered, None), None
     if first is not None:
         start, end = first["t"][0] + 1e6 * np.array([rule.start_s, rule.end_s])
         later = (chunk[np.searchsorted(chunk["t"], start) :] for chunk in chain([first], ordered))
         cut = _by_time if rule.count is None else _by_count
         for window in cut(filter(len, later), lookup, rule, start, end):
-            none = False
             yield window
-    if none:
+    if window is None:
         length = f"1/{rule.fps} s" if rule.count is None else f"{rule.count} events"
         raise ValueError(f"recording must be longer than one window of {length}, got less")
 
@@ -210,14 +208,12 @@ def each_view(
 ) -> Iterator[Float[np.ndarray, "views h w"]]:
     """Reconstruct every view by itself, with a network of one view; empty windows hold."""
     states, pictures = [None] * overlap, None
-    for count, window in enumerate(windows):
+    for window, phase in zip(windows, cycle(range(overlap)), strict=False):
         if window.events or pictures is None:
             options = accepted(network, window_s=window.seconds, positions=[(0, 0)])
             voxels = torch.from_numpy(window.voxels.copy())[:, None]
             with torch.inference_mode():
-                pictures, states[count % overlap] = network(
-                    voxels, states[count % overlap], **options
-                )
+                pictures, states[phase] = network(voxels, states[phase], **options)
         yield pictures[:, 0].clamp(0, 1).numpy()
 
 

@@ -130,22 +130,19 @@ class Views:
 
     def only(self, positions: Sequence[tuple[int, int]]) -> "Views":
         """Return the views at `positions`, in that order.  Raises ValueError for one not there."""
-        found = dict(zip(self.positions, self.views, strict=True))
-        missing = [position for position in positions if position not in found]
+        by_position = dict(zip(self.positions, self.views, strict=True))
+        missing = [position for position in positions if position not in by_position]
         if missing:
             raise ValueError(f"views has no view at {missing}, only {self.positions}")
-        chosen = tuple(found[position] for position in positions)
+        chosen = tuple(by_position[position] for position in positions)
         return Views(self.sensor, self.model, self.field, chosen)
 
     def register(
         self, picture: Float[np.ndarray, "sensor_h sensor_w"]
     ) -> Float[np.ndarray, "views h w"]:
         """Return every view of one sensor picture in model pixels (bilinear, float32)."""
-        height, width = self.model
-        flat = picture.astype(np.float32)
-        warped = [
-            cv2.warpPerspective(flat, self.to_model(view), (width, height)) for view in self.views
-        ]
+        flat, size = picture.astype(np.float32), self.model[::-1]
+        warped = [cv2.warpPerspective(flat, self.to_model(view), size) for view in self.views]
         return np.stack(warped)
 
     def _field_grid(self, side: int) -> np.ndarray:
@@ -159,11 +156,8 @@ class Views:
 
     def save(self, path: Path | str) -> None:
         """Write a YAML file that `load` reads back exactly; it appears whole or not at all."""
-        path = Path(path)
-        text = HEADER + yaml.safe_dump(
-            self._plain(), sort_keys=False, default_flow_style=None, width=100
-        )
-        write_text(path, text)
+        style = {"sort_keys": False, "default_flow_style": None, "width": 100}
+        write_text(Path(path), HEADER + yaml.safe_dump(self._plain(), **style))
 
     def _plain(self) -> dict:
         views = [

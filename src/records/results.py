@@ -155,12 +155,8 @@ def table(rows: list[Row]) -> Table:
 def commit() -> str:
     """Return the commit of the working tree, with `-dirty` where it differs; else `unknown`."""
     try:
-        return subprocess.run(
-            ["git", "describe", "--always", "--dirty", "--abbrev=12"],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout.strip()
+        words = ["git", "describe", "--always", "--dirty", "--abbrev=12"]
+        how = {"cwd": Path(__file__).parent, "capture_output": True, "text": True, "check": True}
+        return subprocess.run(words, **how).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return "unknown"

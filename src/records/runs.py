@@ -73,15 +73,15 @@ def find(folders: list[Path]) -> list[Run]:
     Raises ValueError for a folder that is not there or has no results, and for a file that is no
     `results.json` of this schema.
     """
-    found = {}
+    unique = {}
     for folder in folders:
         if not folder.is_dir():
             raise ValueError(f"run must be folders of runs, got {folder}: no such folder")
         files = list(folder.rglob("results.json"))
         if not files and not figures([folder]):
             raise ValueError(f"run must hold results.json, got {folder}: empty or not finished")
-        found |= {file.resolve(): file for file in files}
-    return sorted(map(_read, found.values()), key=lambda run: _age(run.folder))
+        unique |= {file.resolve(): file for file in files}
+    return sorted(map(_read, unique.values()), key=lambda run: _age(run.folder))
 
 
 def plans(folders: list[Path]) -> list[Plan]:
@@ -92,11 +92,11 @@ def plans(folders: list[Path]) -> list[Plan]:
 
 def figures(folders: list[Path]) -> list[Path]:
     """Return the charts and heat maps at or below `folders`; the vector picture where both are."""
-    found = {}
+    pictures = {}
     for folder in folders:
         for name in (f"{stem}{suffix}" for stem in FIGURES for suffix in (".png", ".svg")):
-            found |= {(f.resolve().parent, f.stem): f for f in sorted(folder.rglob(name))}
-    return list(found.values())
+            pictures |= {(f.resolve().parent, f.stem): f for f in sorted(folder.rglob(name))}
+    return list(pictures.values())
 
 
 def flat(node: Any, prefix: str = "") -> dict[str, Any]:
@@ -134,7 +134,6 @@ def _plan(hydra: dict) -> Plan:
     lines = [f"{key}={value}" for key, value in params] + asked
     parsed = OverridesParser.create().parse_overrides(lines)
     door, config = hydra["job"]["name"], hydra["job"]["config_name"]
-    start = f"python -m src.{door} " + (
-        "-m" if door == config else f"--config-dir sweeps --config-name {config}"
-    )
+    how = "-m" if door == config else f"--config-dir sweeps --config-name {config}"
+    start = f"python -m src.{door} {how}"
     return Plan(" ".join([start, *asked]), BasicSweeper.split_arguments(parsed, None)[0])

@@ -32,12 +32,12 @@ def cells(
     """
     asked = [key for key in _asked(runs) if key not in across]
     keys = _telling([_values(run, asked) for run in runs])
-    found = defaultdict(list)
+    groups = defaultdict(list)
     for run in runs:
         label = tuple(_values(run, asked).get(key, "-") for key in keys)
         settings = {k: repr(v) for k, v in run.identity.items() if k not in across}
-        found[label, tuple(sorted(settings.items()))].append(run)
-    made = [_cell(label, members, across) for (label, _), members in found.items()]
+        groups[label, tuple(sorted(settings.items()))].append(run)
+    made = [_cell(label, members, across) for (label, _), members in groups.items()]
     _mark(made)
     _count_missing(made, keys, [job for plan in plans for job in plan.jobs])
     return keys, made
@@ -54,8 +54,8 @@ def text(value: Any) -> str:
 
 def matches(run: Run, when: dict) -> bool:
     """Return whether `run` was made with each choice or setting of `when`."""
-    known = {key: text(value) for key, value in run.settings.items()} | run.choices
-    return all(known.get(key) == text(value) for key, value in when.items())
+    settings = {key: text(value) for key, value in run.settings.items()} | run.choices
+    return all(settings.get(key) == text(value) for key, value in when.items())
 
 
 def _asked(runs: list[Run]) -> list[str]:

@@ -55,9 +55,9 @@ class Budget:
 
 def _fill(template: str, parts: dict[str, str]) -> str:
     """Put the parts where {{name}} stands in the template; parts are not searched."""
-    found = template.split("{{")
-    pieces = [found[0]]
-    for piece in found[1:]:
+    start, *others = template.split("{{")
+    pieces = [start]
+    for piece in others:
         name, rest = piece.split("}}", 1)
         pieces += [parts[name], rest]
     return "".join(pieces)
@@ -69,9 +69,7 @@ def _table(table: Table) -> str:
         for group, members in groupby(table.columns, key=lambda column: column.group)
     )
     grouped = any(column.group for column in table.columns)
-    heads = "".join(
-        _head(column, place < table.labels) for place, column in enumerate(table.columns)
-    )
+    heads = "".join(_head(column, k < table.labels) for k, column in enumerate(table.columns))
     rows = "\n".join(
         "<tr>" + "".join(_cell(table, place, value) for place, value in enumerate(row)) + "</tr>"
         for row in table.rows
@@ -132,9 +130,8 @@ def _clip(name: str, shown: list[tuple[Cell, Path]], budget: Budget) -> str:
             if file.is_file() and (source := budget.uri(file))
         ]
         if pictures:
-            figures.append(
-                f"<figure><figcaption>{caption}</figcaption>{''.join(pictures)}</figure>"
-            )
+            both = "".join(pictures)
+            figures.append(f"<figure><figcaption>{caption}</figcaption>{both}</figure>")
     if not figures:
         return ""
     return f'<h2>{escape(name)}</h2>\n<div class="films">\n' + "\n".join(figures) + "\n</div>"

@@ -51,8 +51,8 @@ class Table:
     def best(self, column: int) -> float | None:
         """Return the best mean of a column as it is printed; None where there is no best."""
         head = self.columns[column]
-        found = [row[column].mean for row in self.rows if row[column].mean is not None]
-        printed = {round(mean, head.digits) for mean in found}
+        means = [row[column].mean for row in self.rows if row[column].mean is not None]
+        printed = {round(mean, head.digits) for mean in means}
         if head.better == 0 or len(printed) < 2:
             return None
         return max(printed) if head.better > 0 else min(printed)
@@ -81,7 +81,7 @@ def main(title: str, keys: tuple[str, ...], cells: list[Cell], paper: dict) -> T
         row = _names(cell, table.marks)
         row += [_over_seeds(cell.runs, _scored(column.name)) for column in SCORES]
         row += [_over_seeds(cell.runs, cost, column.better != 0) for column, cost in COSTS]
-        row += [_count(cell), *(found(cell) for _, found in shown)]
+        row += [_count(cell), *(fill(cell) for _, fill in shown)]
         table.rows.append(row)
     table.note = _sizes(cells)
     return table
@@ -91,10 +91,10 @@ def by_severity(title: str, keys: tuple[str, ...], cells: list[Cell]) -> Table |
     """Return the scores of the clips of each severity; None where no cell has clips of several."""
     drawn = {clip["severity"] for cell in cells for run in cell.runs for clip in run.clips}
     several = any(len({c["severity"] for c in r.clips}) > 1 for cell in cells for r in cell.runs)
-    found = [severity for severity in SEVERITIES if severity in drawn]
+    present = [severity for severity in SEVERITIES if severity in drawn]
     if not several:
         return None
-    split = [(score, severity) for score in SCORES if score.name in SPLIT for severity in found]
+    split = [(score, severity) for score in SCORES if score.name in SPLIT for severity in present]
     heads = [
         Column(f"{score.name}_{severity}", severity, score.digits, score.better, score.head)
         for score, severity in split
@@ -128,9 +128,8 @@ def _names(cell: Cell, marks: list[str]) -> list[Value]:
     numbers = ", ".join(str(len(marks) + k) for k in range(1, len(cell.notes) + 1))
     marks += cell.notes
     first, *others = cell.label
-    return [Value(words=f"{first} [{numbers}]" if numbers else first)] + [
-        Value(words=word) for word in others
-    ]
+    words = [f"{first} [{numbers}]" if numbers else first, *others]
+    return [Value(words=word) for word in words]
 
 
 def _count(cell: Cell) -> Value:
@@ -143,11 +142,11 @@ def _count(cell: Cell) -> Value:
 def _over_seeds(
     runs: list[Run], measure: Callable[[Run], float | None], spreads: bool = True
 ) -> Value:
-    found = [value for run in runs if (value := measure(run)) is not None and math.isfinite(value)]
-    if not found:
+    values = [value for run in runs if (value := measure(run)) is not None and math.isfinite(value)]
+    if not values:
         return Value()
-    spread = statistics.stdev(found) if spreads and len(found) > 1 else None
-    return Value(statistics.fmean(found), spread)
+    spread = statistics.stdev(values) if spreads and len(values) > 1 else None
+    return Value(statistics.fmean(values), spread)
 
 
 def _scored(metric: str, compared: str | None = None) -> Callable[[Run], float | None]:
@@ -160,8 +159,8 @@ def _scored(metric: str, compared: str | None = None) -> Callable[[Run], float |
 
 def _among(metric: str, severity: str) -> Callable[[Run], float | None]:
     def measure(run: Run) -> float | None:
-        found = [float(c[metric]) for c in run.clips if c["severity"] == severity and metric in c]
-        return statistics.fmean(found) if found else None
+        scores = [float(c[metric]) for c in run.clips if c["severity"] == severity and metric in c]
+        return statistics.fmean(scores) if scores else None
 
     return measure
 

@@ -1,7 +1,5 @@
 """A table as Markdown, CSV and LaTeX; a section of a document replaced between its markers."""
 
-import csv
-import io
 import re
 from itertools import groupby
 from pathlib import Path
@@ -34,22 +32,22 @@ def markdown(tables: list[Table], commands: list[str] = ()) -> str:
 
 def comma_separated(tables: list[Table]) -> str:
     """Return the tables one under another, full precision, mean and spread in columns."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
+    text = ""
     for table in tables:
         names = []
         for place, column in enumerate(table.columns):
             spread = any(row[place].spread is not None for row in table.rows)
             names += [column.name, f"{column.name}_std"] if spread else [column.name]
-        writer.writerow(["table", *names])
+        lines = []
         for row in table.rows:
             cells = [table.title]
             for value, column in zip(row, table.columns, strict=True):
                 cells.append(value.words if value.mean is None else value.mean)
                 if f"{column.name}_std" in names:
                     cells.append("" if value.spread is None else value.spread)
-            writer.writerow(cells)
-    return text.getvalue()
+            lines.append(cells)
+        text += results.csv_text(["table", *names], lines)
+    return text
 
 
 def latex(tables: list[Table]) -> str:
@@ -114,7 +112,7 @@ def _escaped(text: str) -> str:
 
 
 def _tex(text: str) -> str:
-    return re.sub(".", lambda found: LATEX.get(found[0], found[0]), text)
+    return re.sub(".", lambda match: LATEX.get(match[0], match[0]), text)
 
 
 def _latex(table: Table) -> str:

@@ -39,9 +39,8 @@ def layout(views: int) -> tuple[Position, ...]:
         allowed = f"1, 2, 3, 5 or a square up to {4 * REACH**2}"
         raise ValueError(f"optics.views must be {allowed}, got {views}")
     first = -((side - 1) // 2)
-    return tuple(
-        (row, col) for row in range(first, first + side) for col in range(first, first + side)
-    )
+    axis = range(first, first + side)
+    return tuple((row, col) for row in axis for col in axis)
 
 
 def centre(positions: Sequence[Position]) -> int:
@@ -114,9 +113,8 @@ class Optics:
         warped = frames.clone()
         for index, position in enumerate(self.positions):
             if position != (0, 0):
-                matrix = self._residual(
-                    noise.key(key, view_id(position), "misalignment"), height, width
-                )
+                own = noise.key(key, view_id(position), "misalignment")
+                matrix = self._residual(own, height, width)
                 warped[:, index] = _warp(frames[:, index], matrix, origin)
         return warped
 

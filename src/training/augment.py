@@ -59,16 +59,14 @@ class Augment:
     def __call__(self, sample: Sample, keys: Sequence[int]) -> Sample:
         """Return the augmented sample; `keys` has one key per clip."""
         clips = [self._one(sample, index, key) for index, key in enumerate(keys)]
-        voxels, target, turbulent = (
-            together([clip[None] for clip in part]) for part in zip(*clips, strict=True)
-        )
+        parts = zip(*clips, strict=True)
+        voxels, target, turbulent = (together([clip[None] for clip in part]) for part in parts)
         sample = replace(sample, voxels=voxels, target=target, turbulent=turbulent)
         return drop_views(sample, self.dropped, noise.key(keys[0], "dropped"))
 
     def _one(self, sample: Sample, index: int, key: int) -> tuple[Tensor, Tensor, Tensor]:
-        steps, paused = pause_chain(
-            sample.voxels.shape[1], self.pause, self.stay, noise.key(key, "pause")
-        )
+        windows, own = sample.voxels.shape[1], noise.key(key, "pause")
+        steps, paused = pause_chain(windows, self.pause, self.stay, own)
         axes = flip_axes(self.flip, noise.key(key, "flip"))
         swap = float(noise.uniform(noise.key(key, "transpose"), torch.tensor(0))) < self.transpose
         order = turned_views(sample.positions, sample.voxels.shape[2], axes, swap)

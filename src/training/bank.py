@@ -93,13 +93,13 @@ class Bank:
         facts = {"name": draw.clip.name, "fps": draw.clip.fps, "record": self.source.record(draw)}
         facts["air"] = repr(draw.air)
         views = self.source.views(draw)[0]
-        found = {"views": views.half().contiguous(), "clean": clean.half().contiguous()}
-        found["facts"] = json.dumps(facts)
+        clip = {"views": views.half().contiguous(), "clean": clean.half().contiguous()}
+        clip["facts"] = json.dumps(facts)
         try:
-            WholeFiles().save_checkpoint(found, self.path(index))
+            WholeFiles().save_checkpoint(clip, self.path(index))
         except (OSError, RuntimeError) as error:  # PyTorch's writer has an error of its own
             warnings.warn(f"{self.folder}: clip {index} is not kept: {error}", stacklevel=2)
-        return found
+        return clip
 
     @contextmanager
     def claim(self, index: int, wait: bool = True) -> Iterator[bool]:

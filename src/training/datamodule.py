@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from lightning import LightningDataModule
@@ -147,6 +147,7 @@ class Numbered(Dataset):
         return number, self.pipeline.draw(clip)
 
 
+@dataclass(eq=False)
 class StepSampler(Sampler[list[tuple[int, int]]]):
     """The batch of step s: pairs (clip, number), numbers s * size .. (s + 1) * size - 1.
 
@@ -155,18 +156,12 @@ class StepSampler(Sampler[list[tuple[int, int]]]):
     the joint batch, so that no two simulate the same clip.
     """
 
-    def __init__(
-        self,
-        batch_size: int,
-        steps_per_epoch: int,
-        step: Callable[[], int],
-        *,
-        reuse: int = 1,
-        rank: int = 0,
-        world: int = 1,
-    ):
-        self.batch_size, self.steps_per_epoch, self.reuse = batch_size, steps_per_epoch, reuse
-        self.step, self.rank, self.world = step, rank, world
+    batch_size: int
+    steps_per_epoch: int
+    step: Callable[[], int]
+    reuse: int = field(default=1, kw_only=True)
+    rank: int = field(default=0, kw_only=True)
+    world: int = field(default=1, kw_only=True)
 
     def __len__(self) -> int:
         return self.steps_per_epoch

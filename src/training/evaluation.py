@@ -49,10 +49,9 @@ def cost(network: nn.Module, sample: Sample) -> tuple[int, float]:
         size = {"views": views, "bins": bins, "positions": sample.positions}
         work = macs_per_frame(network, height, width, **size)
         device = next((parameter.device for parameter in network.parameters()), torch.device("cpu"))
-        window, threads = sample.voxels[:1, 0].to(device), torch.get_num_threads()
-        took = stopwatch.frame(
-            network, window, positions=sample.positions, count=threads, seconds=0.0, least=5
-        )
+        window = sample.voxels[:1, 0].to(device)
+        how = {"positions": sample.positions, "count": torch.get_num_threads()}
+        took = stopwatch.frame(network, window, **how, seconds=0.0, least=5)
         return work, took.median_ms
     now = stopwatch.clock(torch.get_num_threads(), sample.voxels.device)
     frames, start = sample.target.shape[:2].numel(), now()

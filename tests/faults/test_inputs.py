@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from src.models import files
-from src.recordings.files import formats
+from src.recordings.files import formats, sources
 from src.recordings.files.formats import write_events
 from src.recordings.views import Views
 from src.records import results
@@ -26,7 +26,7 @@ from tests.test_train import TINY, config
 
 def read_events(path: Path) -> None:
 
-    formats.sensor_size(path)
+    sources.sensor_size(path)
     formats.read_events(path)
 
 

@@ -12,8 +12,8 @@ from src.recordings.files import formats, sources
 from src.sim.optics import layout
 from src.sim.sensor.sensor import EventSensor
 from tests.recordings import pictures
-from tests.recordings.calibration.test_statistics import series
-from tests.recordings.test_views import distance_px
+from tests.recordings.calibration.test_statistics import sampling_error, series
+from tests.recordings.test_views import distance_px, split
 
 SENSOR, SIDE, TILE = (360, 640), 120, 116.0
 
@@ -87,7 +87,7 @@ def test_every_view_shows_the_motion_upright_in_its_place(truth):
     film, path = moving_dot()
     clear = noisy_sensor(mismatch=0.0, shot_hz=0.0, leak_hz=0.0, hot_fraction=0.0)
     events = capture.record(film[None].expand(9, -1, -1, -1).clamp(0, 1), 600.0, truth, clear)
-    kept, view = lookup.build(truth).split(events)
+    kept, view = split(lookup.build(truth), events)
     late = kept["t"] > 30_000
     for index in range(9):
         mine = kept[(view == index) & late & (kept["p"] > 0)]
@@ -163,7 +163,7 @@ def test_statistics_are_those_of_the_simulated_turbulence(truth):
     turbulent, _ = fits_of(films, truth, places)
     found = statistics.measure(turbulent, still, fps=60.0, centre=4)
     assert found.failed.sum() == 0
-    error = statistics.sampling_error(tilt[:, 4, 4])  # 0.09: of these 120 frames
+    error = sampling_error(tilt[:, 4, 4])  # 0.09: of these 120 frames
     true = statistics.autocorrelation(tilt[:, 4, 4], 20)
     assert np.abs(found.autocorrelation[:20] - true).max() < error
     assert np.abs(found.within_view - statistics.correlation(tilt[:, 4])).max() < error

@@ -192,11 +192,19 @@ def test_an_event_of_every_pixel_is_flat_per_sensor_pixel(truth, kind):
     assert np.abs((grid / table.densities[kind])[inner] - 1).max() < 1e-5
 
 
+def split(table: lookup.Lookup, events: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the events inside views, at their nearest model pixel, and the view of each."""
+    pixel = table.nearest[events["y"], events["x"]]
+    kept = events[pixel >= 0].copy()
+    view, kept["y"], kept["x"] = np.unravel_index(pixel[pixel >= 0], (table.views, *table.model))
+    return kept, view
+
+
 def test_nearest_splat_is_the_voxel_grid_of_each_views_events(truth):
     table, events = lookup.build(truth), stream(50_000)
     grid = table.empty(5)
     table.add(events, grid, 0, 10_000, nearest=True)
-    kept, view = table.split(events)
+    kept, view = split(table, events)
     for index in range(9):
         mine = kept[view == index]
         fields = (mine[name] for name in "txyp")

@@ -22,7 +22,7 @@ class Strength:
             (ratio, clear - bench.quality(subject, Conditions(d_over_r0=ratio)))
             for ratio in self.d_over_r0
         ]
-        return worst(curve, unit="dB", limit=self.limit, varied="D/r0")
+        return worst(curve, limit=self.limit, varied="D/r0")
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class SharedAir:
             for pitch in self.pitches
         }
         curve = bench.losses(subject, settings)
-        return worst(curve, unit="dB", limit=self.limit, varied="diameters between views")
+        return worst(curve, limit=self.limit, varied="diameters between views")
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,7 @@ class Wind:
             speed: Conditions(turbulence={"temporal": "flow", "wind_m_s": speed})
             for speed in self.m_s
         }
-        curve = bench.losses(subject, settings)
-        return worst(curve, unit="dB", limit=self.limit, varied="wind in m/s")
+        return worst(bench.losses(subject, settings), limit=self.limit, varied="wind in m/s")
 
 
 @dataclass(frozen=True)
@@ -77,5 +76,4 @@ class Gain:
     def __call__(self, subject: Subject, bench: Bench) -> Finding:
         """Return the worst loss over `spreads`, standard deviations of log brightness."""
         settings = {spread: Conditions(gain=spread) for spread in self.spreads}
-        curve = bench.losses(subject, settings)
-        return worst(curve, unit="dB", limit=self.limit, varied="spread of log gain")
+        return worst(bench.losses(subject, settings), limit=self.limit, varied="spread of log gain")

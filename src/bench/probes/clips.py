@@ -99,9 +99,8 @@ def film(pipeline: Pipeline, number: int, conditions: Conditions) -> Stream:
     if conditions.changes_air:
         variant.turbulence = simulated(pipeline.turbulence).having(**conditions.turbulence)
     draw = _changed(pipeline.draw(number), conditions)
-    views = (
-        _course(variant, draw, conditions.course) if conditions.course else variant.views(draw)[0]
-    )
+    course = conditions.course
+    views = _course(variant, draw, course) if course else variant.views(draw)[0]
     if conditions.gain:
         views = _flicker(views, conditions.gain, noise.key(draw.key, "gain"))
     sensor = pipeline.sensor.having(**{"threshold": draw.threshold} | dict(conditions.sensor))
@@ -142,8 +141,7 @@ def _course(pipeline: Pipeline, draw: Draw, strengths: Sequence[float]) -> Tenso
     part = torch.arange(frames) * len(strengths) // frames
     views = None
     for strength in sorted(set(strengths)):
-        air = strengthened(draw.air, strength)
-        seen = pipeline.views(replace(draw, air=air))[0]
+        seen = pipeline.views(replace(draw, air=strengthened(draw.air, strength)))[0]
         views = seen.clone() if views is None else views
         now = torch.tensor([strengths[k] == strength for k in part])
         views[:, now] = seen[:, now]
@@ -156,8 +154,7 @@ def _changed(draw: Draw, conditions: Conditions) -> Draw:
         shown = torch.arange(len(draw.clip.frames)).clamp(max=last)
         draw = replace(draw, clip=replace(draw.clip, frames=draw.clip.frames[shown]))
     if conditions.d_over_r0 is not None:
-        changed = strengthened(draw.air, conditions.d_over_r0)
-        draw = replace(draw, air=changed)
+        draw = replace(draw, air=strengthened(draw.air, conditions.d_over_r0))
     return draw
 
 

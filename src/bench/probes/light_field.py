@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -36,7 +37,7 @@ class Lost:
             gone[0] = [middle, *(v for v in gone[0] if v != middle)][:count]
             losses = [base - _without(subject, bench, views) for views in gone]
             curve.append((count, max(losses)))
-        return worst(curve, unit="dB", limit=self.limit, varied="views lost")
+        return worst(curve, limit=self.limit, varied="views lost")
 
 
 @dataclass(frozen=True)
@@ -53,10 +54,7 @@ class Misplaced:
         base, curve = bench.standard(subject), []
         view = _neighbour(subject, bench.streams()[0])
         for shift in self.pixels:
-
-            def moved(voxels: Tensor, shift: int = shift) -> Tensor:
-                return shifted(voxels, {view: (0, shift)})
-
+            moved = partial(shifted, moves={view: (0, shift)})
             curve.append((shift, base - bench.over_clips(subject, bench.streams(), moved)))
         return Finding(dict(curve)[self.judged], "dB", self.limit, curve, "px out of place")
 
@@ -79,8 +77,8 @@ class Parallax:
         base, curve = bench.standard(subject), []
         for shift in self.pixels:
             moves = {i: (shift * row, shift * col) for i, (row, col) in enumerate(places)}
-            score = bench.over_clips(subject, bench.streams(), lambda x, m=moves: shifted(x, m))
-            curve.append((shift, base - score))
+            nearer = partial(shifted, moves=moves)
+            curve.append((shift, base - bench.over_clips(subject, bench.streams(), nearer)))
         return Finding(dict(curve)[self.judged], "dB", self.limit, curve, "px of disparity")
 
 

@@ -114,14 +114,11 @@ class Shock:
     def _wait(self, subject: Subject, stream: Stream) -> float:
         shown = list(stream.windows(stream.fps))
         half = len(shown) // 2
-        bins = shown[0].shape[2]
-        flashes = [
-            torch.full_like(shown[0], (-1) ** k * self.events / bins) for k in range(self.length)
-        ]
+        flash = torch.full_like(shown[0], self.events / shown[0].shape[2])
+        flashes = [(-1) ** k * flash for k in range(self.length)]
         calm, _ = subject.play(shown, stream.positions, 1 / stream.fps)
-        shaken, _ = subject.play(
-            chain(shown[:half], flashes, shown[half:]), stream.positions, 1 / stream.fps
-        )
+        flickering = chain(shown[:half], flashes, shown[half:])
+        shaken, _ = subject.play(flickering, stream.positions, 1 / stream.fps)
         truth = stream.target[1 + half :, None]
         lost = aligned_psnr(calm[half:], truth) - aligned_psnr(shaken[half + self.length :], truth)
         return last_beyond(lost, self.within)

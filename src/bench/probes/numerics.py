@@ -1,7 +1,6 @@
 """Probes of numbers: growth of a small difference, the worst input, bf16, chunks."""
 
 import math
-from collections.abc import Iterable
 from copy import deepcopy
 from dataclasses import dataclass
 from itertools import cycle, islice
@@ -43,13 +42,11 @@ class Growth:
         # Where there were events anyway, so that no pixel wakes that slept.
         nudged = shown[start] + self.size * drawn * (shown[start] != 0)
         plain, _ = subject.play(shown, stream.positions, 1 / stream.fps)
-        other, _ = subject.play(
-            [*shown[:start], nudged, *shown[start + 1 :]], stream.positions, 1 / stream.fps
-        )
+        changed = [*shown[:start], nudged, *shown[start + 1 :]]
+        other, _ = subject.play(changed, stream.positions, 1 / stream.fps)
         difference = (plain - other)[start + self.skip :].double().square().mean((1, 2, 3)).sqrt()
         logs = difference.clamp(min=1e-12).log()
-        times = torch.arange(len(logs), dtype=torch.float64)
-        times = times - times.mean()
+        times = torch.arange(len(logs), dtype=torch.float64) - (len(logs) - 1) / 2
         return float((times * logs).sum() / times.square().sum())
 
 
@@ -120,13 +117,10 @@ class Bf16:
         forth = list(stream.windows(stream.fps))
         back = [-window.flip(2) for window in reversed(forth)]
         truth = torch.cat([stream.target[1:], stream.target[:-1].flip(0)])
-        frames = _every(subject, stream, islice(cycle(forth + back), self.windows // 4 * 4))
+        shown = islice(cycle(forth + back), self.windows // 4 * 4)
+        frames, _ = subject.play(shown, stream.positions, 1 / stream.fps)
         places = torch.arange(len(frames)) % len(truth)
         return aligned_psnr(frames, truth[places, None])
-
-
-def _every(subject: Subject, stream: Stream, windows: Iterable[Tensor]) -> Tensor:
-    return subject.play(windows, stream.positions, 1 / stream.fps)[0]
 
 
 @dataclass(frozen=True)
@@ -143,9 +137,8 @@ class Chunked:
         whole, _ = subject.play(shown, stream.positions, 1 / stream.fps)
         parts, state = [], None
         for start in range(0, len(shown), self.chunk):
-            part, state = subject.play(
-                shown[start : start + self.chunk], stream.positions, 1 / stream.fps, deepcopy(state)
-            )
+            chunk, own = shown[start : start + self.chunk], deepcopy(state)
+            part, state = subject.play(chunk, stream.positions, 1 / stream.fps, own)
             parts.append(part)
         gap = float((whole - torch.cat(parts)).abs().max())
         return Finding(gap, "grey", self.limit)

@@ -32,7 +32,7 @@ class Rates:
             own = self._score(subject, stream, stream.fps)
             totals += torch.tensor([own - self._score(subject, stream, r) for r in self.rates])
         curve = list(zip(self.rates, (totals / len(bench.streams())).tolist(), strict=True))
-        return worst(curve, unit="dB", limit=self.limit, varied="windows a second")
+        return worst(curve, limit=self.limit, varied="windows a second")
 
     def _score(self, subject: Subject, stream: Stream, rate: float) -> float:
         """Score the second half, at the instants that all rates share."""
@@ -58,8 +58,7 @@ class Thresholds:
     def __call__(self, subject: Subject, bench: Bench) -> Finding:
         """Return the worst loss over `thresholds`."""
         settings = {c: Conditions(sensor={"threshold": c}) for c in self.thresholds}
-        curve = bench.losses(subject, settings)
-        return worst(curve, unit="dB", limit=self.limit, varied="threshold C")
+        return worst(bench.losses(subject, settings), limit=self.limit, varied="threshold C")
 
 
 @dataclass(frozen=True)
@@ -101,4 +100,4 @@ class SensorNoise:
             for value in self.values
         }
         curve = bench.losses(subject, settings)
-        return worst(curve, unit="dB", limit=self.limit, varied=f"sensor.{self.name}")
+        return worst(curve, limit=self.limit, varied=f"sensor.{self.name}")

@@ -54,11 +54,10 @@ class Bench:
 
     def streams(self, conditions: Conditions = STANDARD) -> list[Stream]:
         """Return the clips under `conditions`; each is simulated once."""
-        known = repr(conditions)
-        if known not in self._films:
-            found = [film(self.pipeline, number, conditions) for number in self.numbers]
-            self._films[known] = found
-        return self._films[known]
+        name = repr(conditions)
+        if name not in self._films:
+            self._films[name] = [film(self.pipeline, n, conditions) for n in self.numbers]
+        return self._films[name]
 
     def quality(self, subject: Subject, conditions: Conditions = STANDARD) -> float:
         """Return the aligned PSNR in dB at the clips' own rate, the mean over clips."""
@@ -91,6 +90,6 @@ class Bench:
         return float(aligned_psnr(frames[self.warmup :], target[self.warmup :, None]).mean())
 
 
-def worst(curve: list[tuple[Any, float]], *, unit: str, limit: float, varied: str) -> Finding:
-    """Return the finding whose value is the largest of the curve."""
-    return Finding(max(value for _, value in curve), unit, limit, curve, varied)
+def worst(curve: list[tuple[Any, float]], *, limit: float, varied: str) -> Finding:
+    """Return the finding whose value is the largest of the curve, in dB."""
+    return Finding(max(value for _, value in curve), "dB", limit, curve, varied)

@@ -60,7 +60,9 @@ def measure(frames: Float[np.ndarray, "frames h w"], fps: float | None = None) -
     """
     if len(frames) < LEAST_FRAMES:
         raise ValueError(f"video must have at least {LEAST_FRAMES} frames, got {len(frames)}")
-    frames = _even(frames)
+    level = frames.mean((1, 2), keepdims=True)
+    # To one mean brightness: flicker is not air.
+    frames = (frames * (level.mean() / np.maximum(level, 1e-6))).astype(np.float32)
     size = frames.shape[1:]
     place = following.corners(frames.mean(0))
     if len(place) < LEAST_POINTS:
@@ -83,13 +85,12 @@ def measure(frames: Float[np.ndarray, "frames h w"], fps: float | None = None) -
         model.tilt(*pairs.mean(*chosen), lags.mean(*chosen)[0], len(frames))
         for chosen in _resampled(len(frames), 2 * tilt.decay)
     ]
-    found = _air_file(tilt, drawn, unit, fps, len(lags.at)) | {
-        "blur_ratio": blur_ratio(*_coarse(frames, tracks))
-    }
+    numbers = _air_file(tilt, drawn, unit, fps, len(lags.at))
+    numbers["blur_ratio"] = blur_ratio(*_coarse(frames, tracks))
     a, b = covariance.centred(tracks)
     power = (a * b).sum((0, 2)) / (2 * tracks.seen.sum(0))
     return Air(
-        found=AirFile(**found),
+        found=AirFile(**numbers),
         tilt=tilt,
         distance_px=pairs.at * unit,
         fitted_px=model.fitted_px * unit,
@@ -152,12 +153,6 @@ def _coarse(frames: np.ndarray, tracks: Tracks) -> tuple[Tracks, tuple[int, int]
     return again.of(again.seen.mean(0) >= LEAST_SEEN), small.shape[1:]
 
 
-def _even(frames: np.ndarray) -> np.ndarray:
-    """Return the frames with one mean brightness: flicker is not air."""
-    level = frames.mean((1, 2), keepdims=True)
-    return (frames * (level.mean() / np.maximum(level, 1e-6))).astype(np.float32)
-
-
 def _usable(tracks: Tracks, size: tuple[int, int]) -> Tracks:
     """Return the points that stand still but for the air; raises ValueError where few do."""
     followed = tracks.seen.mean(0) >= LEAST_SEEN
@@ -195,18 +190,14 @@ def _covered(place: np.ndarray, size: tuple[int, int]) -> float:
 
 def _resampled(frames: int, block: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield how often each frame, in blocks, and each square of the frame is drawn; DRAWS times."""
-    random = np.random.default_rng(0)
-    length = (
-        int(np.clip(np.ceil(block), 1, max(frames // 4, 1))) if np.isfinite(block) else frames // 4
-    )
+    random, most = np.random.default_rng(0), frames // 4
+    length = int(np.clip(np.ceil(block), 1, max(most, 1))) if np.isfinite(block) else most
     for _ in range(DRAWS):
         starts = random.integers(frames, size=math.ceil(frames / length))
         drawn = (starts[:, None] + np.arange(length)).ravel()[:frames] % frames
         squares = random.integers(CELLS**2, size=CELLS**2)
-        yield (
-            np.bincount(drawn, minlength=frames).astype(float),
-            np.bincount(squares, minlength=CELLS**2).astype(float),
-        )
+        times = np.bincount(drawn, minlength=frames), np.bincount(squares, minlength=CELLS**2)
+        yield times[0].astype(float), times[1].astype(float)
 
 
 def _air_file(

@@ -87,9 +87,8 @@ def _grid(centres: np.ndarray, sensor: Size) -> list[Position]:
     """Sort centres (k, 2) into (row, col) about the middle of a full 3x3, else of the sensor."""
     if len(centres) < 2:
         return [(0, 0)] * len(centres)
-    apart = np.linalg.norm(centres[:, None] - centres[None], axis=-1) + np.diag(
-        [np.inf] * len(centres)
-    )
+    apart = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+    np.fill_diagonal(apart, np.inf)
     pitch = np.median(apart.min(0))
     middle = (centres.max(0) + centres.min(0)) / 2
     whole = np.abs(np.ptp(centres, axis=0) - 2 * pitch) < 0.5 * pitch
@@ -122,7 +121,7 @@ class Alignment:
 
 
 def align(
-    found: Found, *, sensor: Size, model: Size, margin: float = 0.04, threshold_px: float = 1.5
+    corners: Found, *, sensor: Size, model: Size, margin: float = 0.04, threshold_px: float = 1.5
 ) -> Alignment:
     """Fit the homography of every view to the centre view.
 
@@ -130,21 +129,21 @@ def align(
     model's aspect and by `margin` of its side.  Points off by more than `threshold_px` are left out
     (RANSAC).  Raises ValueError for fewer than four views, or without the centre one.
     """
-    if len(found.points) < FEWEST_VIEWS or (0, 0) not in found.points:
-        seen = sorted(found.points)
+    if len(corners.points) < FEWEST_VIEWS or (0, 0) not in corners.points:
+        seen = sorted(corners.points)
         raise ValueError(
             f"calibrate: the target must be seen in {FEWEST_VIEWS} or more views and in the centre"
             f" one, got {len(seen)}: {seen}; give corners= by hand or another target="
         )
-    centre = found.points[0, 0]
+    centre = corners.points[0, 0]
     views, used, residuals = [], {}, {}
-    for at in sorted(found.points):
-        both = np.isfinite(found.points[at]).all(1) & np.isfinite(centre).all(1)
-        fit = _fit(found.points[at][both], centre[both], threshold_px, at)
+    for at in sorted(corners.points):
+        both = np.isfinite(corners.points[at]).all(1) & np.isfinite(centre).all(1)
+        fit = _fit(corners.points[at][both], centre[both], threshold_px, at)
         matrix, used[at], residuals[at] = fit
         error = float(np.sqrt((residuals[at] ** 2).sum(1).mean()))
         views.append(View(at, matrix, error, len(used[at])))
-    field = _field(found, model, margin)
+    field = _field(corners, model, margin)
     return Alignment(Views(sensor, model, field, tuple(views)), used, residuals)
 
 
@@ -160,19 +159,19 @@ def _fit(points: Points, onto: Points, threshold_px: float, at: Position):
     return matrix, points[good], apply(matrix, points[good]) - onto[good]
 
 
-def _field(found: Found, model: Size, margin: float) -> tuple[float, float, float, float]:
+def _field(corners: Found, model: Size, margin: float) -> tuple[float, float, float, float]:
     """Bound the centre tile half way between a point and its image in each neighbour."""
-    centre = found.points[0, 0]
+    centre = corners.points[0, 0]
     middle = np.nanmean(centre, axis=0)
     sides = {}
     for at in ((0, -1), (-1, 0), (0, 1), (1, 0)):
         axis = 0 if at[0] == 0 else 1
-        if at in found.points:
-            between = np.nanmean((centre + found.points[at]) / 2, axis=0)[axis]
+        if at in corners.points:
+            between = np.nanmean((centre + corners.points[at]) / 2, axis=0)[axis]
             sides[at] = abs(between - middle[axis]), between
-    reach = np.median([distance for distance, _ in sides.values()]) if sides else None
-    if reach is None:
+    if not sides:
         raise ValueError("calibrate: the target must be seen beside the centre view, got none")
+    reach = np.median([distance for distance, _ in sides.values()])
     edges = [
         sides[at][1] if at in sides else middle[axis] + sign * reach
         for at, axis, sign in (((0, -1), 0, -1), ((-1, 0), 1, -1), ((0, 1), 0, 1), ((1, 0), 1, 1))

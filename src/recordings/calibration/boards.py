@@ -62,8 +62,8 @@ class Checkerboard(_Grid):
 
     def find(self, picture: Picture) -> Points | None:
         flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
-        found, points = cv2.findChessboardCornersSB(picture, (self.cols, self.rows), flags=flags)
-        return points.reshape(-1, 2).astype(np.float64) if found else None
+        complete, points = cv2.findChessboardCornersSB(picture, (self.cols, self.rows), flags=flags)
+        return points.reshape(-1, 2).astype(np.float64) if complete else None
 
 
 @dataclass(frozen=True)
@@ -78,10 +78,10 @@ class Circles(_Grid):
 
     def find(self, picture: Picture) -> Points | None:
         flags = cv2.CALIB_CB_SYMMETRIC_GRID | cv2.CALIB_CB_CLUSTERING
-        found, points = cv2.findCirclesGrid(
+        complete, points = cv2.findCirclesGrid(
             self._dark(picture), (self.cols, self.rows), flags=flags, blobDetector=self._detector()
         )
-        return points.reshape(-1, 2).astype(np.float64) if found else None
+        return points.reshape(-1, 2).astype(np.float64) if complete else None
 
     def _dark(self, picture: Picture) -> Picture:
         return picture if self.dark else 255 - picture

@@ -72,18 +72,14 @@ def estimate(
     fps: float,
     sensor: EventSensor,
     thresholds: Sequence[float] = GRID,
-    *,
-    background: Float[np.ndarray, " 2"] | None = None,
 ) -> Estimate:
     """Return the thresholds at which the sensor makes the recording's rates.
 
     The geometric mean of ON and OFF rate gives the size of the thresholds; their quotient gives
     the ratio of OFF to ON, because what rises has to fall: the simulation is repeated with the
-    ratio found.  `background`: rates of a still scene, ON and OFF, that are not the scene's doing.
-    Raises ValueError if a rate is none that the grid makes.
+    ratio found.  Raises ValueError if a rate is none that the grid makes.
     """
-    noise = np.zeros(2) if background is None else background
-    wanted, drawn = rates.pooled - noise, rates.bootstrap() - noise
+    wanted, drawn = rates.pooled, rates.bootstrap()
     if not (wanted > 0).all():
         raise ValueError(f"the recording's rates above the background are not positive: {wanted}")
     ratio = 1.0
@@ -97,10 +93,9 @@ def estimate(
                 f"thresholds {thresholds[0]} to {thresholds[-1]} makes, {low:.3g} to {high:.3g}"
             )
         ratio = float(np.clip(ratio * _excess(curve, on, wanted), 0.1, 10))
-    spread_on = np.array([invert(curve, pair) for pair in np.maximum(drawn, 1e-12)])
-    excess = np.array(
-        [_excess(curve, c, p) for c, p in zip(spread_on, np.maximum(drawn, 1e-12), strict=True)]
-    )
+    pairs = np.maximum(drawn, 1e-12)
+    spread_on = np.array([invert(curve, pair) for pair in pairs])
+    excess = np.array([_excess(curve, c, p) for c, p in zip(spread_on, pairs, strict=True)])
     spread_off = spread_on * curve.off_ratio * excess
     bounds = [np.nanpercentile(spread, (2.5, 97.5)) for spread in (spread_on, spread_off)]
     return Estimate(
@@ -120,10 +115,8 @@ def invert(curve: Curve, rates: Float[np.ndarray, " 2"]) -> float:
     mean = np.sqrt(np.maximum(np.prod(curve.rates, axis=1), 1e-30))
     falling = np.minimum.accumulate(np.log(mean))
     target = 0.5 * np.log(np.prod(rates))
-    found = np.interp(
-        target, falling[::-1], np.log(curve.thresholds)[::-1], left=np.nan, right=np.nan
-    )
-    return float(np.exp(found))
+    thresholds = np.log(curve.thresholds)[::-1]
+    return float(np.exp(np.interp(target, falling[::-1], thresholds, np.nan, np.nan)))
 
 
 def _excess(curve: Curve, on: float, rates: Float[np.ndarray, " 2"]) -> float:
@@ -133,12 +126,12 @@ def _excess(curve: Curve, on: float, rates: Float[np.ndarray, " 2"]) -> float:
     return float(np.exp(np.log(rates[0] / rates[1]) - expected))
 
 
-def write_csv(found: Estimate, rates: Rates, path: Path) -> None:
+def write_csv(thresholds: Estimate, rates: Rates, path: Path) -> None:
     """Write the curve, the rates of each view and the estimate as one table."""
-    curve = zip(found.curve.thresholds, found.curve.rates, strict=True)
+    curve = zip(thresholds.curve.thresholds, thresholds.curve.rates, strict=True)
     rows = [("simulated_hz", f"{threshold:.4g}", *pair) for threshold, pair in curve]
     rows += [("measured_hz", index, *pair) for index, pair in enumerate(rates.per_view)]
-    estimate = zip(("estimate", "low", "high"), found.on, found.off, strict=True)
+    estimate = zip(("estimate", "low", "high"), thresholds.on, thresholds.off, strict=True)
     rows += [(name, "", on, off) for name, on, off in estimate]
     texts = [(what, which, *(f"{value:.5g}" for value in pair)) for what, which, *pair in rows]
     write_text(path, csv_text(("what", "threshold_or_view", "on", "off"), texts))

@@ -39,9 +39,8 @@ class Products:
         """Return the mean product of every class and the count, frames and squares weighed."""
         frames = np.ones(self.total.shape[0]) if frames is None else frames
         squares = np.ones(self.total.shape[1]) if squares is None else squares
-        total, count = (
-            np.einsum("t,tsk,s->k", frames, sums, squares) for sums in (self.total, self.count)
-        )
+        both = (self.total, self.count)
+        total, count = (np.einsum("t,tsk,s->k", frames, sums, squares) for sums in both)
         return total / np.maximum(count, 1), count
 
 
@@ -138,11 +137,10 @@ class Model:
         power = weights.sum()
         curve = self._gaussians(self.fitted_px, 0.0) @ weights / max(power, 1e-12)
         correlation = product / max(power, 1e-12)
-        known = np.where(
-            count > ENOUGH, correlation, np.interp(self.distance, self.fitted_px, curve)
-        )
+        fitted = np.interp(self.distance, self.fitted_px, curve)
+        joined = np.where(count > ENOUGH, correlation, fitted)
         # Beyond the shortest distances what was measured is taken as it is, negative values too.
-        far = np.interp(self.pairs, self.distance[1:], known[1:])
+        far = np.interp(self.pairs, self.distance[1:], joined[1:])
         near = np.interp(self.pairs, self.fitted_px, curve)
         whole = float(np.where(self.pairs < 4 * SPREAD, near, far).mean())
         # A film's own mean was taken off: 1 - kept of the power, at every distance alike.

@@ -134,13 +134,9 @@ def _derivatives(guess, values, x, y):
     residual, _, (across, along, bell) = _residual(guess, values, x, y)
     _, _, lx, ly, amplitude, _ = (column[:, None] for column in guess.T)
     peak = amplitude * bell
-    slopes = (
-        peak * across / np.exp(lx),
-        peak * along / np.exp(ly),
-        peak * across**2,
-        peak * along**2,
-    )
-    return residual, np.stack([*slopes, bell, np.ones_like(bell)], axis=1)
+    centre = peak * across / np.exp(lx), peak * along / np.exp(ly)
+    spread = peak * across**2, peak * along**2
+    return residual, np.stack([*centre, *spread, bell, np.ones_like(bell)], axis=1)
 
 
 def _accept(guess, cost, values, x, y):

@@ -63,10 +63,10 @@ def corners(picture: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "points 2"]:
     inside = np.zeros(picture.shape, np.uint8)
     inside[MARGIN:-MARGIN, MARGIN:-MARGIN] = 255
     eight_bits = np.clip(picture * 255, 0, 255).astype(np.uint8)
-    found = cv2.goodFeaturesToTrack(eight_bits, 4 * MOST, QUALITY, APART, mask=inside, blockSize=5)
-    if found is None:
+    peaks = cv2.goodFeaturesToTrack(eight_bits, 4 * MOST, QUALITY, APART, mask=inside, blockSize=5)
+    if peaks is None:
         return np.zeros((0, 2), np.float32)
-    x, y = np.round(found[:, 0]).astype(int).T
+    x, y = np.round(peaks[:, 0]).astype(int).T
     gx, gy = gradient(picture)
     xx, xy, yy = (cv2.GaussianBlur(g, (0, 0), SPREAD)[y, x] for g in (gx * gx, gx * gy, gy * gy))
     half, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
@@ -87,13 +87,8 @@ def follow(frames: Float[np.ndarray, "frames h w"], place: Float[np.ndarray, "po
     ]
     rough = np.stack([_search(coarse, list(_levels(frame))) for frame in frames])
     fine = _registered(frames, place, rough)
-    moved, sharp, explained = (
-        np.stack(rows)
-        for rows in zip(
-            *(_refine(fine, frame, start) for frame, start in zip(frames, rough, strict=True)),
-            strict=True,
-        )
-    )
+    refined = [_refine(fine, frame, start) for frame, start in zip(frames, rough, strict=True)]
+    moved, sharp, explained = map(np.stack, zip(*refined, strict=True))
     seen = explained > EXPLAINED
     far = np.hypot(*moved.mean(1).transpose(2, 0, 1))
     typical = np.median(far[seen]) / 1.18 if seen.any() else 0.0  # of a Rayleigh distribution
@@ -212,11 +207,7 @@ class _Windows:
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
         seen = frame[y.clip(0, height - 1), x.clip(0, width - 1)]
         here = self.home + (whole - moved)
-        return (
-            seen,
-            self.weight * inside,
-            [_sample(field, here, self.u, self.v) for field in fields],
-        )
+        return seen, self.weight * inside, [_sample(f, here, self.u, self.v) for f in fields]
 
 
 def _sample(picture: np.ndarray, at: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:

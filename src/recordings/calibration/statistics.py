@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 
 from src.recordings.calibration.alignment import picture_of
 from src.recordings.calibration.boards import Circles
+from src.recordings.calibration.covariance import crossing
 from src.recordings.calibration.dots import Fits
 from src.records.results import csv_text, write_text
 
@@ -146,11 +147,9 @@ def ground(
 ) -> Float[np.ndarray, "h w"]:
     """Return the light between dark dots, continued under them: a quadratic in x and y, fitted
     where no dot is within `reach` pixels; at least a twentieth of its largest value."""
-    y, x = (
-        2 * axis / max(axis.max(), 1) - 1 for axis in np.mgrid[: len(picture), : len(picture[0])]
-    )
-    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
     rows, cols = np.indices(picture.shape)
+    y, x = (2 * axis / max(axis.max(), 1) - 1 for axis in (rows, cols))
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
     near = [np.hypot(cols - cx, rows - cy) <= reach for cx, cy in places]
     between = ~np.any(near, axis=0)
     fitted = terms @ np.linalg.lstsq(terms[between], picture[between], rcond=None)[0]
@@ -181,27 +180,9 @@ def scintillation(
     return _mean(intensity**2, 1) / _mean(intensity, 1) ** 2 - 1
 
 
-def decay_s(
-    correlations: Float[np.ndarray, " lags"], fps: float, level: float = np.exp(-1)
-) -> float:
-    """Return the lag in seconds where a correlation first falls to `level`; inf if nowhere."""
-    below = np.flatnonzero(correlations <= level)
-    if not below.size:
-        return float("inf")
-    k = int(below[0])
-    if k == 0:
-        return 0.0
-    high, low = correlations[k - 1], correlations[k]
-    return (k - 1 + (high - level) / (high - low)) / fps
-
-
-def sampling_error(tilt: Float[np.ndarray, "frames 2"]) -> float:
-    """Return the standard error of a correlation between two independent series like `tilt`.
-
-    Bartlett's formula: variance (1 + 2 sum r(k)^2) / frames per axis, two axes averaged.
-    """
-    r = autocorrelation(tilt, max(len(tilt) // 4, 2))
-    return float(np.sqrt((1 + 2 * (r[1:] ** 2).sum()) / (2 * len(tilt))))
+def decay_s(correlations: Float[np.ndarray, " lags"], fps: float) -> float:
+    """Return the lag in seconds where a correlation first falls to 1/e; inf if nowhere."""
+    return crossing(np.arange(len(correlations)), correlations, np.exp(-1)) / fps
 
 
 def write_csv(

@@ -53,8 +53,7 @@ def write(path: Path, events: np.ndarray, size: tuple[int, int]) -> None:
                 file["ms_to_idx"] = marks.astype(np.uint64)
     else:
         comma = "," if path.suffix == ".csv" else " "
-        names = [f"x@{size[0]}", f"y@{size[1]}"]
-        header = comma.join(["t", *names, "p"])
+        header = comma.join(["t", f"x@{size[0]}", f"y@{size[1]}", "p"])
         table = np.stack([column.astype(np.int64) for column in columns.values()], 1)
         np.savetxt(path, table, fmt="%d", delimiter=comma, header=header, comments="")
 
@@ -161,8 +160,8 @@ def check_inside(file: h5py.File) -> None:
             return f"{name} is packed in chunks of more than {LARGEST_CHUNK} bytes"
         return None
 
-    if found := file.visititems_links(visit):
-        raise ValueError(found)
+    if fault := file.visititems_links(visit):
+        raise ValueError(fault)
 
 
 def _check_packing(path: Path) -> None:
@@ -179,11 +178,11 @@ def _check_claim(path: Path, size: int) -> None:
 
 def _sliced(group, offset: int) -> Iterator[tuple]:
     """Yield slices of the columns of a mapping."""
-    found = {name: next((key for key in NAMES[name] if key in group), None) for name in "txyp"}
-    missing = [name for name, key in found.items() if key is None]
+    keys = {name: next((key for key in NAMES[name] if key in group), None) for name in "txyp"}
+    missing = [name for name, key in keys.items() if key is None]
     if missing:
         raise ValueError(f"no column {', '.join(missing)} among {', '.join(group.keys())}")
-    t, x, y, p = (group[found[name]] for name in "txyp")
+    t, x, y, p = (group[keys[name]] for name in "txyp")
     if any(column.ndim != 1 for column in (t, x, y, p)):
         raise ValueError("columns must have one dimension")
     if not len(t) == len(x) == len(y) == len(p):

@@ -66,20 +66,12 @@ def open_events(path: str | Path, size: tuple[int, int] | None = None) -> Record
     if not path.is_file() or path.stat().st_size == 0:
         raise ValueError(f"{path}: {'the file is empty' if path.is_file() else 'no such file'}")
     if path.suffix not in (*BINARY, *READERS):
-        known = ", ".join((*BINARY, *READERS))
-        raise ValueError(f"{path}: unknown kind of event file, known are {known}")
+        kinds = ", ".join((*BINARY, *READERS))
+        raise ValueError(f"{path}: unknown kind of event file, known are {kinds}")
     size = _size(path) or size
     if size is not None and not all(1 <= side <= SIDE_MAX for side in size):
         raise ValueError(f"{path}: a sensor's sides must be in 1..{SIDE_MAX}, got {size}")
     return Recording(path, size)
-
-
-def sensor_size(path: str | Path) -> tuple[int, int]:
-    """Return (width, height) of a recording; ValueError where the file does not say."""
-    size = open_events(path).size
-    if size is None:
-        raise ValueError(f"{path}: the file does not state the size of the sensor")
-    return size
 
 
 def read_events(path: str | Path, size: tuple[int, int] | None = None) -> np.ndarray:
@@ -222,10 +214,10 @@ def _header(path: Path) -> bytes:
 
 def _evt_version(path: Path) -> str:
     header = _header(path).decode("latin-1").lower()
-    found = re.search(r"% (?:evt (\d(?:\.\d)?)|format evt(\d+))", header)
-    if not found:
+    match = re.search(r"% (?:evt (\d(?:\.\d)?)|format evt(\d+))", header)
+    if not match:
         raise ValueError(f"{path}: no `% evt` line in its header, this is no EVT2 or EVT3 file")
-    version = (found.group(1) or found.group(2)).replace(".0", "")
+    version = (match.group(1) or match.group(2)).replace(".0", "")
     if version not in ("2", "3"):
         raise ValueError(
             f"{path}: EVT {version} is not read, its byte order differs between cameras; "

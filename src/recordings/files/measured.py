@@ -45,9 +45,8 @@ class Estimate:
     def __str__(self) -> str:
         if self.value is self.low is self.high is None:
             return "not known"
-        value, low, high = (
-            "?" if x is None else f"{x:.3g}" for x in (self.value, self.low, self.high)
-        )
+        numbers = (self.value, self.low, self.high)
+        value, low, high = ("?" if x is None else f"{x:.3g}" for x in numbers)
         return f"{value} ({low} to {high})"
 
 
@@ -67,19 +66,15 @@ class AirFile:
     blur_ratio: Estimate
 
     def __post_init__(self):
-        for part in fields(self):
-            _check(part.name, getattr(self, part.name))
+        for name, one in vars(self).items():
+            _check(name, one)
 
     def text(self) -> str:
         """Return the content of the file."""
-        rows = {part.name: getattr(self, part.name) for part in fields(self)}
-        content = {
-            name: {
-                "value": _rounded(one.value),
-                "interval": [_rounded(one.low), _rounded(one.high)],
-            }
-            for name, one in rows.items()
-        }
+        content = {}
+        for name, one in vars(self).items():
+            value, *interval = map(_rounded, (one.value, one.low, one.high))
+            content[name] = {"value": value, "interval": interval}
         return yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
 
 
@@ -103,8 +98,8 @@ def read(path: Path | str | None) -> AirFile:
 
 
 def _estimate(name: str, content: Any) -> Estimate:
-    known = isinstance(content, dict) and set(content) == {"value", "interval"}
-    interval = content["interval"] if known else None
+    complete = isinstance(content, dict) and set(content) == {"value", "interval"}
+    interval = content["interval"] if complete else None
     if not isinstance(interval, list) or len(interval) != 2:
         raise ValueError(f"{name} must hold value and interval: [low, high], got {content}")
     for number in (content["value"], *interval):

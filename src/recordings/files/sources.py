@@ -23,8 +23,8 @@ def sensor_size(path: Path | str, sensor: Sequence[int] | None = None) -> Size:
 
     Raises ValueError where neither says, or both do and differ.
     """
-    stated = formats.open_events(path).size
-    stated = stated if stated is None else stated[::-1]
+    size = formats.open_events(path).size
+    stated = size and size[::-1]
     if stated is None and sensor is None:
         raise ValueError(f"{path} does not state its sensor; give sensor_size=[height,width]")
     if None not in (stated, sensor) and tuple(sensor) != stated:
@@ -73,11 +73,10 @@ def film(path: Path | str, key: str = "recording") -> Iterator[Float[np.ndarray,
 
     Raises ValueError, which names `key`, for a file that cannot be read or has no frame.
     """
-    path, none = Path(path), True
-    for frame in _frames(path, key):
-        none = False
+    frame = None
+    for frame in _frames(Path(path), key):
         yield frame
-    if none:
+    if frame is None:
         raise ValueError(f"{key} must be a film or a folder of pictures, got {path}")
 
 

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from src.sim.scenes.photographs import SPLITS, Clip, check_frames
+from src.sim.scenes.photographs import Clip, check_frames
 from src.sim.scenes.videos import Source, pictures, sources
 
 SHARES = {"train": (0.0, 0.7), "val": (0.7, 0.8), "test": (0.8, 1.0)}
@@ -50,7 +50,7 @@ class Reds:
         frames: int = 41,
         fps: float = 120.0,
     ):
-        check_frames(height, width, frames, fps)
+        check_frames(height, width, frames, fps, split)
         self.times, span = _times(frames, fps, REDS_FPS)
         if span >= REDS_FRAMES:
             raise ValueError(f"a clip of REDS must last at most 3.99 s, got {span / REDS_FPS:.2f}")
@@ -90,9 +90,7 @@ class Footage:
         shrink: float | None = None,
         disjoint: bool = True,
     ):
-        check_frames(height, width, frames, fps)
-        if split not in SPLITS:
-            raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split}")
+        check_frames(height, width, frames, fps, split)
         if not 0 < rate < math.inf:
             raise ValueError(f"scene.rate must be > 0, got {rate}")
         if shrink is not None and not 1 <= shrink < math.inf:
@@ -160,14 +158,10 @@ def _root(root: str | None) -> Path:
 
 
 def _reds(root: Path, split: str) -> list[Source]:
-    if split not in SPLITS:
-        raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split}")
-    homes = {
-        part: (root / f"{part}_orig", root / part / f"{part}_orig") for part in ("train", "val")
-    }
-    found = []
+    videos = []
     for part, number in REDS_SPLIT[split]:
-        folders = [home / f"{number:03}" for home in homes[part]]
+        homes = (root / f"{part}_orig", root / part / f"{part}_orig")
+        folders = [home / f"{number:03}" for home in homes]
         folder = next((folder for folder in folders if folder.is_dir()), None)
         if folder is None:
             raise ValueError(
@@ -175,8 +169,8 @@ def _reds(root: Path, split: str) -> list[Source]:
                 f"got no {part}_orig/{number:03} in {root}"
             )
         paths = [folder / f"{frame:08}.png" for frame in range(REDS_FRAMES)]
-        found.append(pictures(f"{part}-{number:03}", paths, REDS_SIZE))
-    return found
+        videos.append(pictures(f"{part}-{number:03}", paths, REDS_SIZE))
+    return videos
 
 
 def _parts(videos: list[Source], split: str, disjoint: bool) -> list[tuple[Source, int, int]]:

@@ -78,7 +78,7 @@ class Photographs:
         still: float = 0.0,
         rest: float = 0.0,
     ):
-        check_frames(height, width, frames, fps)
+        check_frames(height, width, frames, fps, split)
         for name, (low, high) in (("speed", speed), ("zoom", zoom)):
             if not 0 < low <= high < math.inf:
                 raise ValueError(f"scene.{name} must be a range 0 < low <= high, got {low}, {high}")
@@ -159,9 +159,8 @@ class _Layer:
         height, width = size
         shift, angle, log_zoom = self.motion.at(time)
         scale = self.zoom * math.exp(log_zoom)
-        turn = scale * np.array(
-            [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
-        )
+        cos, sin = math.cos(angle), math.sin(angle)
+        turn = scale * np.array([[cos, -sin], [sin, cos]])
         middle = np.array([(width - 1) / 2, (height - 1) / 2])
         offset = self.centre - shift * width * self.zoom - turn @ middle
         return np.column_stack([turn, offset])
@@ -179,8 +178,10 @@ class MixedRates:
         return self.scenes[int(draw * len(self.scenes))].clip(index)
 
 
-def check_frames(height: int, width: int, frames: int, fps: float) -> None:
-    """Raise ValueError for a size, a number of frames or a rate that no clip can have."""
+def check_frames(height: int, width: int, frames: int, fps: float, split: str) -> None:
+    """Raise ValueError for a size, a number of frames, a rate or a split that no clip can have."""
+    if split not in SPLITS:
+        raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split}")
     for name, value, least in (("height", height, 8), ("width", width, 8), ("frames", frames, 2)):
         if value < least:
             raise ValueError(f"scene.{name} must be >= {least}, got {value}")
@@ -197,12 +198,10 @@ def photographs(root: str | Sequence[str] | None, split: str) -> list[Path]:
         if not root:
             raise ValueError("scene.root must be a folder, or some, got an empty list")
         return [path for one in root for path in photographs(str(one), split)]
-    if split not in SPLITS:
-        raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split}")
     if root is None:
         folder = Path(find_spec("skimage").origin).parent / "data"
-        found = {path.stem: path for path in folder.iterdir() if path.suffix in SUFFIXES}
-        return [found[name] for name in EMBEDDED[split].split()]
+        embedded = {path.stem: path for path in folder.iterdir() if path.suffix in SUFFIXES}
+        return [embedded[name] for name in EMBEDDED[split].split()]
     if not Path(root).is_dir():
         raise ValueError(f"scene.root must be a folder, got {root}")
     paths = sorted(path for path in Path(root).rglob("*") if path.suffix.lower() in SUFFIXES)

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from src.sim import noise
-from src.sim.scenes.photographs import SPLITS, Clip, check_frames
+from src.sim.scenes.photographs import Clip, check_frames
 from src.sim.scenes.shapes import disc, inside, polar, stripes, turned
 
 FASTEST = 20_000.0  # px/s, beyond the dart of the paper; and turns/s
@@ -38,9 +38,7 @@ class Target(ABC):
         seed: int = 0,
         contrast: float = 0.8,
     ):
-        check_frames(height, width, frames, fps)
-        if split not in SPLITS:
-            raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split}")
+        check_frames(height, width, frames, fps, split)
         _check("contrast", contrast, 0.0, 1.0)
         self.split, self.seed, self.contrast = split, seed, contrast
         self.height, self.width, self.side = height, width, min(height, width)

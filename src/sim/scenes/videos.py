@@ -34,13 +34,13 @@ def sources(root: Path, key: str = "scene.root") -> list[Source]:
         return [_file(root, key)]
     entries = sorted(path for path in root.iterdir() if not path.name.startswith("."))
     inside = [path for path in entries if path.is_dir()]
-    found = _folder(root, key) or [
+    videos = _folder(root, key) or [
         *(_file(path, key) for path in entries if path.suffix.lower() in FILES),
         *(source for path in inside for source in _folder(path, key)),
     ]
-    if not found:
+    if not videos:
         raise ValueError(f"{key} must hold videos or folders of frames, got none in {root}")
-    return found
+    return videos
 
 
 def pictures(

@@ -12,10 +12,8 @@ from src.sim.sensor.engines.job import Job, State
 def blank(n: int, views: int, h: int, w: int, device: torch.device) -> State:
     """Return memory to be filled by a first frame."""
     shape = (n, views, h, w)
-    level, source, reference = (
-        torch.empty(shape, dtype=torch.int32, device=device) for _ in range(3)
-    )
-    return State(level, source, reference, torch.empty(shape, device=device))
+    levels = (torch.empty(shape, dtype=torch.int32, device=device) for _ in range(3))
+    return State(*levels, torch.empty(shape, device=device))
 
 
 def rested(job: Job, residual: float) -> Job:

@@ -25,9 +25,8 @@ LINLOG_KNEE = 20 / 255  # v2e: linear below code value 20 (Hu et al. 2021)
 
 def decode_srgb(values: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Return linear light of sRGB code values in [0, 1] (IEC 61966-2-1)."""
-    return torch.where(
-        values <= 0.04045, values / 12.92, ((values.clamp(min=0) + 0.055) / 1.055) ** 2.4
-    )
+    curve = ((values.clamp(min=0) + 0.055) / 1.055) ** 2.4
+    return torch.where(values <= 0.04045, values / 12.92, curve)
 
 
 def encode_srgb(light: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
@@ -43,9 +42,7 @@ def response_table(response: str, source: str, floor: float) -> Int[Tensor, "nod
     zero below code value 20, the logarithm of the code value above.  `source` says what the
     intensities are: `linear`, taken as they are, or `srgb`, decoded to linear light first.
     """
-    x = nodes()
-    if source == "srgb":
-        x = decode_srgb(torch.from_numpy(x)).numpy()
+    x = nodes(source)
     if response == "log":
         y = np.log(np.maximum(x, floor))
     else:
@@ -54,10 +51,11 @@ def response_table(response: str, source: str, floor: float) -> Int[Tensor, "nod
     return torch.from_numpy(np.rint(y * UNIT * 2**EXTRA).astype(np.int32))
 
 
-def nodes() -> np.ndarray:
-    """Return the intensities at the table's nodes, 2**-14 to 2, float64."""
+def nodes(source: str) -> np.ndarray:
+    """Return the light at the table's nodes, 2**-14 to 2 of what `source` says, float64."""
     bits = FIRST + (np.arange((OCTAVES + 1) * NODES + 1, dtype=np.int64) << CELL)
-    return bits.astype(np.int32).view(np.float32).astype(np.float64)
+    x = bits.astype(np.int32).view(np.float32).astype(np.float64)
+    return decode_srgb(torch.from_numpy(x)).numpy() if source == "srgb" else x
 
 
 def lookup(

@@ -87,25 +87,25 @@ class EventSensor:
 
     def having(self, **settings) -> "EventSensor":
         """Return the same sensor with other `settings`, arguments of the class."""
-        found = copy(self)
-        vars(found).update(settings)
-        check(vars(found))
-        found._table = response_table(found.response, found.input, found.floor)
-        return found
+        sensor = copy(self)
+        vars(sensor).update(settings)
+        check(vars(sensor))
+        sensor._table = response_table(sensor.response, sensor.input, sensor.floor)
+        return sensor
 
     def draw(self, key: int, seed: int | None = None) -> "EventSensor":
         """Return the sensor of one clip, its numbers drawn from `key`; of another `seed`, if any.
 
         The threshold's own range is uniform, from the stream that `sample_threshold` draws from.
         """
-        found = copy(self)
-        found.threshold = self.sample_threshold(noise.generator(noise.key(key, "threshold")))
+        sensor = copy(self)
+        sensor.threshold = self.sample_threshold(noise.generator(noise.key(key, "threshold")))
         for name, (low, high) in self.drawn.items():
             share = float(noise.uniform(noise.key(key, "sensor", name), torch.tensor(0)))
             drawn = low * (high / low) ** share if low > 0 else high * share
-            setattr(found, name, min(drawn, high))
-        found.drawn, found.seed = {}, self.seed if seed is None else seed
-        return found
+            setattr(sensor, name, min(drawn, high))
+        sensor.drawn, sensor.seed = {}, self.seed if seed is None else seed
+        return sensor
 
     def sample_threshold(self, generator: torch.Generator) -> float:
         """Return one clip's threshold: uniform in the range, or the number itself."""
@@ -194,6 +194,8 @@ class EventSensor:
             within(f"sensor.{name}", getattr(self, name), 0, fps)
         clips, views = range(n) if clips is None else clips, range(v) if views is None else views
         first = 0 if state is None else state.frame
+        chip_keys = [[noise.key(self.seed, i, w) for w in ("mismatch", "hot")] for i in views]
+        shot_keys = [[noise.key(self.seed, c, i, "shot") for i in views] for c in clips]
         job = Job(
             frames=frames,
             fresh=state is None,
@@ -208,13 +210,8 @@ class EventSensor:
             leak=round(self.leak_hz / fps * 2**24),
             shot=round(self.shot_hz / fps * 2**32),
             hot=round(self.hot_hz / fps * 2**32),
-            chip_keys=np.array(
-                [[noise.key(self.seed, i, word) for word in ("mismatch", "hot")] for i in views],
-                np.int64,
-            ),
-            shot_keys=np.array(
-                [[noise.key(self.seed, c, i, "shot") for i in views] for c in clips], np.int64
-            ),
+            chip_keys=np.array(chip_keys, np.int64),
+            shot_keys=np.array(shot_keys, np.int64),
             place=(*origin, w if full_width is None else full_width),
         )
         return rested(job, self.residual) if job.fresh and self.residual > 0 else job
@@ -246,10 +243,7 @@ class EventSensor:
         level = self._table.to(device)
         if self.cutoff_hz == 0:
             return level, level[:1], level[:1]
-        x = nodes()
-        if self.input == "srgb":
-            x = decode_srgb(torch.from_numpy(x)).numpy()
-        a = 2 * math.pi * self.cutoff_hz / fps * (255 * x + 20) / 275
+        a = 2 * math.pi * self.cutoff_hz / fps * (255 * nodes(self.input) + 20) / 275
         decay, lag = np.exp(-a), -np.expm1(-a) / a
         scaled = [np.rint(part * UNIT * 2**EXTRA).astype(np.int32) for part in (decay, lag)]
         return level, *(torch.from_numpy(part).to(device) for part in scaled)
@@ -258,9 +252,8 @@ class EventSensor:
 def _engine(job: Job) -> ModuleType:
     """Return the engine of a device: on CUDA, Triton's where it is installed, else plain torch."""
     if job.frames.is_cuda and not job.v2e and find_spec("triton"):
-        from src.sim.sensor.engines import (
-            sensor_triton,  # imports Triton, which is not there everywhere
-        )
+        # Here, as Triton is not there everywhere.
+        from src.sim.sensor.engines import sensor_triton
 
         return sensor_triton
     return sensor_eager

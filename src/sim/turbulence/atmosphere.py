@@ -8,9 +8,7 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import numpy as np
 import torch
-from scipy import optimize, special
 from torch import Tensor
 
 from src.sim.turbulence import outer_scale
@@ -112,30 +110,6 @@ class Atmosphere:
         return self.d_over_r0 * left**0.6
 
     @property
-    def isoplanatic_angle_rad(self) -> float:
-        """The angle over which the phase differs by 1 rad rms, seen from the camera; inf if none.
-
-        Without an outer scale theta0 = [2.914 k^2 Int Cn2 z^(5/3) dz]^(-3/5) (Fried 1982).
-        """
-        place, strength = (part.numpy() for part in self.path)
-        z = place * self.distance_m
-        integral = 2.914 * self._k**2 * float((strength * z ** (5 / 3)).sum())
-        if integral == 0:
-            return math.inf
-        angle = integral**-0.6
-        if math.isinf(self.outer_scale_m):
-            return angle
-
-        def excess(log_angle: float) -> float:
-            apart = math.exp(log_angle) * z
-            structure = _structure(apart, self.outer_scale_m)
-            return 2.914 * self._k**2 * float((strength * structure).sum()) - 1
-
-        if excess(math.log(1e6 * angle)) < 0:
-            return math.inf
-        return math.exp(optimize.brentq(excess, math.log(angle), math.log(1e6 * angle)))
-
-    @property
     def rytov(self) -> float:
         """Rytov variance of a spherical wave; above 0.3 scintillation, left out here, matters.
 
@@ -193,17 +167,6 @@ class Atmosphere:
     @property
     def _k(self) -> float:
         return 2 * math.pi / self.wavelength_m
-
-
-def _structure(apart: np.ndarray, outer_scale_m: float) -> np.ndarray:
-    """Return the structure function of phase over 2.914 k^2 Int Cn2 dz; apart^(5/3) without L0.
-
-    Von Karman: proportional to 1 - 2^(1/6) / Gamma(5/6) x^(5/6) K_(5/6)(x), x = 2 pi apart / L0.
-    """
-    x = 2 * math.pi * np.asarray(apart) / outer_scale_m
-    order = 5 / 6
-    near = special.gamma(1 / 6) / special.gamma(11 / 6) * (math.pi / outer_scale_m) ** (5 / 3)
-    return (1 - 2 ** (1 - order) / special.gamma(order) * x**order * special.kv(order, x)) / near
 
 
 def _require(valid: bool, name: str, allowed: str, value: object) -> None:

@@ -41,7 +41,10 @@ def degrade(
     pixels on each side.  The halo of a white scene would be `share`.
     """
     if frames.device.type != "cpu":
-        return _eager(frames, tilt, nodes, spots, rows, columns, halo, share)
+        tilted = warp(frames, tilt, rows.start, columns.start)
+        lines = nodes @ columns.weights().T.to(nodes)
+        psfs = spots.psfs(lines) if spots else lines
+        return scatter(tilted, psfs, rows.weights().to(tilt), halo, share)
     shapes = (spots.quarter, spots.ends) if spots else PIXELS
     place = (rows.offset, columns.offset, rows.pitch)
     light = []
@@ -53,22 +56,6 @@ def degrade(
             tilted = scatter_engine.scatter(tilted, *psfs, halo[index].numpy(), share)
         light.append(torch.from_numpy(tilted))
     return torch.stack(light)
-
-
-def _eager(
-    frames: Tensor,
-    tilt: Tensor,
-    nodes: Tensor,
-    spots: Spots | None,
-    rows: Lattice,
-    columns: Lattice,
-    halo: Tensor,
-    share: float,
-) -> Tensor:
-    tilted = warp(frames, tilt, rows.start, columns.start)
-    lines = nodes @ columns.weights().T.to(nodes)
-    psfs = spots.psfs(lines) if spots else lines
-    return scatter(tilted, psfs, rows.weights().to(tilt), halo, share)
 
 
 def warp(

@@ -45,10 +45,10 @@ def track(
 
 def _follow(mean: NDArray, frame: NDArray, corners: NDArray) -> NDArray:
     """Return how far the corners of `mean` have moved in `frame`, NaN for those that got lost."""
-    there, found, _ = cv2.calcOpticalFlowPyrLK(mean, frame, corners, None, **WINDOW)
+    there, followed, _ = cv2.calcOpticalFlowPyrLK(mean, frame, corners, None, **WINDOW)
     back, again, _ = cv2.calcOpticalFlowPyrLK(frame, mean, there, None, **WINDOW)
     stray = np.abs(back - corners).max((1, 2))
-    good = (found[:, 0] > 0) & (again[:, 0] > 0) & (stray < RETURNED)
+    good = (followed[:, 0] > 0) & (again[:, 0] > 0) & (stray < RETURNED)
     return np.where(good[:, None], (there - corners)[:, 0], np.nan)
 
 
@@ -56,6 +56,6 @@ def _filled(moved: NDArray) -> NDArray:
     """Fill NaN in (frames, corners, 2) linearly in time."""
     times, filled = np.arange(len(moved)), moved.copy()
     for path in filled.reshape(len(moved), -1).T:
-        known = np.isfinite(path)
-        path[~known] = np.interp(times[~known], times[known], path[known])
+        finite = np.isfinite(path)
+        path[~finite] = np.interp(times[~finite], times[finite], path[finite])
     return filled

@@ -15,8 +15,8 @@ from src.sim.turbulence.p2s import FILE
 
 def at(name: str, strength: float, airy: float) -> Float[Tensor, "*axis"]:
     """Interpolate a table (strength, ..., airy) in the logarithm of both."""
-    found = between(table(name), table("strength"), strength)
-    return between(found.movedim(-1, 0), table("airy"), airy)
+    rows = between(table(name), table("strength"), strength)
+    return between(rows.movedim(-1, 0), table("airy"), airy)
 
 
 def between(rows: Tensor, axis: Tensor, value: float) -> Tensor:

@@ -198,8 +198,8 @@ def _network(
     Of the networks that know `modes` modes.
     """
     number = bands().index(band)
-    known = between(table("psf")[number], table("psf_strength")[number], strength)
-    errors = between(known.movedim(-1, 0), table("airy"), airy)
+    rows = between(table("psf")[number], table("psf_strength")[number], strength)
+    errors = between(rows.movedim(-1, 0), table("airy"), airy)
     ranks = [min(int(rank), len(band.basis)) for rank in table("rank_axis")]
     fit = [n for n, network in enumerate(band.networks) if network.modes >= modes]
     some = ((n, r, float(errors[n, i])) for n in fit for i, r in enumerate(ranks))

@@ -58,10 +58,10 @@ def fields(root: Path) -> Fields:
 
     Raises ValueError where there is not one video, it is too short, or too few of its corners stay.
     """
-    found = sources(root, KEY)
-    if len(found) > 1:
-        raise ValueError(f"{KEY} must be one video or one folder of frames, got {len(found)}")
-    footage = list(islice(found[0].read(0, found[0].count), MOST_FRAMES))
+    videos = sources(root, KEY)
+    if len(videos) > 1:
+        raise ValueError(f"{KEY} must be one video or one folder of frames, got {len(videos)}")
+    footage = list(islice(videos[0].read(0, videos[0].count), MOST_FRAMES))
     if len(footage) < FEWEST_FRAMES:
         raise ValueError(f"{KEY} must show {FEWEST_FRAMES} frames or more, got {len(footage)}")
     moved, at, tried = track(footage, SIDE_PX)

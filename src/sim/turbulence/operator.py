@@ -16,12 +16,13 @@ from src.sim.turbulence.atmosphere import ALPHA_FPS, Atmosphere
 from src.sim.turbulence.fidelity import Fidelity, band_for, choose, mean_psf
 from src.sim.turbulence.halo import Halo
 from src.sim.turbulence.lattice import Lattice
+from src.sim.turbulence.model import Crop
 from src.sim.turbulence.p2s import Spots
 from src.sim.turbulence.phase import Field, Waves, draw_waves, evolve, flow, look_from
 from src.sim.turbulence.psf import fraunhofer_psf
+from src.sim.turbulence.ranges import require
 from src.sim.turbulence.threads import in_threads
 
-Crop = tuple[int, int, int, int]  # top, left, height, width
 TEMPORAL = ("ar1", "flow", "mixed")
 OWN_WIND = 0.5  # rms of a layer's own wind over the wind that all layers share
 WAVES = 384
@@ -62,29 +63,32 @@ class Turbulence:
         views_correlation: str = "independent",
         baseline_m: float | None = None,
     ):
-        _require(height >= 1 and width >= 1, "frame", "at least 1 x 1", (height, width))
-        _require(0 < fps < math.inf, "fps", "> 0", fps)
-        _require(0 < tolerance <= 1, "tolerance", "in (0, 1]", tolerance)
-        _require(psf in ("fitted", "exact"), "psf", "fitted or exact", psf)
-        _require(temporal in TEMPORAL, "temporal", "ar1, flow or mixed", temporal)
+        require(height >= 1 and width >= 1, "frame", "at least 1 x 1", (height, width))
+        require(0 < fps < math.inf, "fps", "> 0", fps)
+        require(0 < tolerance <= 1, "tolerance", "in (0, 1]", tolerance)
+        require(psf in ("fitted", "exact"), "psf", "fitted or exact", psf)
+        require(temporal in TEMPORAL, "temporal", "ar1, flow or mixed", temporal)
         valid = wind_m_s is None or 0 <= wind_m_s < math.inf
-        _require(valid, "wind_m_s", ">= 0 or null", wind_m_s)
-        _require(1 <= wind_layers <= 100, "wind_layers", "in [1, 100]", wind_layers)
+        require(valid, "wind_m_s", ">= 0 or null", wind_m_s)
+        require(1 <= wind_layers <= 100, "wind_layers", "in [1, 100]", wind_layers)
         shared = views_correlation == "baseline"
-        known = shared or views_correlation == "independent"
-        _require(known, "views_correlation", "independent or baseline", views_correlation)
+        valid = shared or views_correlation == "independent"
+        require(valid, "views_correlation", "independent or baseline", views_correlation)
         valid = baseline_m is None or 0 <= baseline_m < math.inf
-        _require(valid, "baseline_m", ">= 0", baseline_m)
+        require(valid, "baseline_m", ">= 0", baseline_m)
         self.atmosphere, self.height, self.width, self.fps = atmosphere, height, width, fps
         self.positions = layout(views) if isinstance(views, int) else tuple(map(tuple, views))
-        self.temporal, self.wind_layers, self.baseline_m = temporal, wind_layers, baseline_m
-        self.wind_m_s = wind_m_s
-        self.shared = shared
+        self.temporal, self.wind_layers, self.wind_m_s = temporal, wind_layers, wind_m_s
+        self.shared, self.baseline_m = shared, baseline_m
         self.clear = atmosphere is None or atmosphere.d_over_r0 == 0
-        self.fidelity = Fidelity()
+        self.fidelity, self.spots, self.halo = Fidelity(), None, None
         if not self.clear:
-            self.fidelity = choose(atmosphere, width, tolerance, psf == "exact", modes)
-        self.spots, self.halo = self._spots(), self._halo()
+            chosen = choose(atmosphere, width, tolerance, psf == "exact", modes)
+            strength, airy, kernel = chosen.blurring_d_over_r0, chosen.airy_px, chosen.kernel
+            if chosen.rank:
+                numbers = chosen.network, chosen.rank, airy, kernel
+                self.spots = Spots(band_for(strength), *numbers, strength)
+            self.fidelity, self.halo = chosen, Halo(mean_psf(strength), airy, kernel)
 
     @property
     def facts(self) -> dict[str, float | int | str]:
@@ -108,14 +112,14 @@ class Turbulence:
             top, left, height, width = window
             part = frames[:, None, :, top : top + height, left : left + width]
             return part.expand(-1, len(self.positions), -1, -1, -1)
-        out = frames.new_empty(
-            len(frames), len(self.positions), frames.shape[1], *window[2:], dtype=torch.float32
-        )
+        size = (len(frames), len(self.positions), frames.shape[1], *window[2:])
+        out = frames.new_empty(size, dtype=torch.float32)
         for index, clip in enumerate(frames.float()):
             waves, moving = self._draw(generator, len(clip))
             moving = moving.to(clip.device)
             for tile in _tiles(window):
-                part = _inside(out[index], tile, window)
+                y, x = tile[0] - window[0], tile[1] - window[1]
+                part = out[index, ..., y : y + tile[2], x : x + tile[3]]
                 self._clip(clip, waves, moving, tile, part)
         return out
 
@@ -153,16 +157,10 @@ class Turbulence:
         def one(view: int, first: int) -> None:
             part = slice(first, first + step)
             amplitudes = moving[view, part]
-            out[view, part] = blur.degrade(
-                frames[part],
-                self._tilt_px * tilt.at_pixels(amplitudes),
-                self._nodes(rest.at_nodes(amplitudes)),
-                self.fidelity.kernel,
-                self.spots,
-                *lattices,
-                halo[part],
-                self.halo.share,
-            )
+            moved = self._tilt_px * tilt.at_pixels(amplitudes)
+            nodes = self._nodes(rest.at_nodes(amplitudes))
+            around = (self.fidelity.kernel, self.spots, *lattices, halo[part], self.halo.share)
+            out[view, part] = blur.degrade(frames[part], moved, nodes, *around)
 
         in_threads(one, product(range(len(moving)), range(0, len(frames), step)), device)
 
@@ -189,31 +187,13 @@ class Turbulence:
         """Pixels a radian of Noll's a2: (2 / pi) lambda f / (D p)."""
         return 2 / math.pi * self.fidelity.airy_px
 
-    def _spots(self) -> Spots | None:
-        if self.fidelity.rank == 0:
-            return None
-        chosen, strength = self.fidelity, self.fidelity.blurring_d_over_r0
-        numbers = chosen.network, chosen.rank, chosen.airy_px, chosen.kernel
-        return Spots(band_for(strength), *numbers, strength)
-
-    def _halo(self) -> Halo | None:
-        if self.clear:
-            return None
-        mean = mean_psf(self.fidelity.blurring_d_over_r0)
-        return Halo(mean, self.fidelity.airy_px, self.fidelity.kernel)
-
     def _draw(
         self, generator: torch.Generator, frames: int
     ) -> tuple[Waves, Complex[Tensor, "views frames waves"]]:
         """Draw one clip's waves, and their amplitudes in every view and frame."""
         key = noise.base_key(generator)
-        waves = draw_waves(
-            self.atmosphere,
-            noise.key(key, "waves"),
-            modes=self.fidelity.modes,
-            waves=WAVES,
-            width_px=self.width,
-        )
+        size = {"modes": self.fidelity.modes, "waves": WAVES, "width_px": self.width}
+        waves = draw_waves(self.atmosphere, noise.key(key, "waves"), **size)
         return waves, self._amplitudes(key, waves, frames).to(torch.complex64)
 
     def _amplitudes(
@@ -262,10 +242,10 @@ class Turbulence:
 
     def _window(self, frames: Tensor, crop: Crop | None) -> Crop:
         size = (self.height, self.width)
-        _require(tuple(frames.shape[-2:]) == size, "frame", f"{size}", tuple(frames.shape[-2:]))
+        require(tuple(frames.shape[-2:]) == size, "frame", f"{size}", tuple(frames.shape[-2:]))
         top, left, height, width = crop or (0, 0, *size)
         inside = 0 <= top <= top + height <= size[0] and 0 <= left <= left + width <= size[1]
-        _require(inside and height > 0 and width > 0, "crop", f"inside the {size} frame", crop)
+        require(inside and height > 0 and width > 0, "crop", f"inside the {size} frame", crop)
         return top, left, height, width
 
 
@@ -274,14 +254,3 @@ def _tiles(window: Crop) -> Iterator[Crop]:
     for y in range(0, height, TILE):
         for x in range(0, width, TILE):
             yield top + y, left + x, min(TILE, height - y), min(TILE, width - x)
-
-
-def _inside(out: Tensor, tile: Crop, window: Crop) -> Tensor:
-    """Return the part of `out`, a picture of `window`, that `tile` covers."""
-    y, x = tile[0] - window[0], tile[1] - window[1]
-    return out[..., y : y + tile[2], x : x + tile[3]]
-
-
-def _require(valid: bool, name: str, allowed: str, value: object) -> None:
-    if not valid:
-        raise ValueError(f"turbulence.{name} must be {allowed}, got {value}")

@@ -83,8 +83,8 @@ def whole_share(ratio: float, profile: Profile, view: float) -> float:
         4 * far - apart**2 - 2 + math.pi - 4 * np.arctan(far),
     )
     weight = apart * density
-    found = np.interp(np.log(apart * view), np.log(LAGS), _curve(ratio, profile, False))
-    return float(weight @ found / weight.sum())
+    correlation = np.interp(np.log(apart * view), np.log(LAGS), _curve(ratio, profile, False))
+    return float(weight @ correlation / weight.sum())
 
 
 @lru_cache(maxsize=4096)

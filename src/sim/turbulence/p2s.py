@@ -50,8 +50,8 @@ class Network:
         """
         (first, shift), *rest = ((w.to(coefficients), b.to(coefficients)) for w, b in self.layers)
         shift = shift + first[:, -1] * (d_over_r0 / self.edge) ** (5 / 3)
-        known = min(len(coefficients), self.modes - 2)
-        first, coefficients = first[:, :known].contiguous(), coefficients[:known]
+        count = min(len(coefficients), self.modes - 2)
+        first, coefficients = first[:, :count].contiguous(), coefficients[:count]
         (second, middle), (last, end) = rest
         order = order.to(coefficients.device)
         last, end = last[order], end[order]

@@ -59,7 +59,9 @@ def draw_waves(atmosphere: Atmosphere, key: int, *, modes: int, waves: int, widt
     outer scale weakens waves longer than it, and few of them are drawn.
     """
     u = _sequence(key, waves)
-    kappa, density = _radius(u[:, 0], modes, _lowest(atmosphere.inverse_outer_scale, modes))
+    # Waves hardly count below LOW, or what the outer scale sets.
+    low = min(max(LOW, 0.3 * atmosphere.inverse_outer_scale), 0.5 * _highest(modes))
+    kappa, density = _radius(u[:, 0], modes, low)
     angle = 2 * math.pi * u[:, 1]
     place, strength = atmosphere.path
     near = 1 - place
@@ -220,11 +222,6 @@ def _sequence(key: int, count: int) -> Float[Tensor, "count 3"]:
     shift = noise.uniform(key, torch.arange(3)).double()
     step = torch.tensor([1 / count, math.sqrt(3) - 1, (math.sqrt(5) - 1) / 2], dtype=torch.float64)
     return (shift * torch.tensor([1 / count, 1, 1]) + torch.arange(count)[:, None] * step) % 1.0
-
-
-def _lowest(inverse_outer_scale: float, modes: int) -> float:
-    """Return the kappa below which waves hardly count: LOW, or what the outer scale sets."""
-    return min(max(LOW, 0.3 * inverse_outer_scale), 0.5 * _highest(modes))
 
 
 def _highest(modes: int) -> float:

@@ -89,9 +89,9 @@ def sample_atmosphere(
             decay_s=float(log_between(u[2], decay_s, "decay_s")),
             spread_px=float(log_between(u[3], spread_px, "spread_px")),
         )
-        found = _find(seen, generator, **cameras)
-        if found is not None:
-            return found
+        atmosphere = _find(seen, generator, **cameras)
+        if atmosphere is not None:
+            return atmosphere
     raise ValueError(f"turbulence.atmosphere: no camera within its ranges shows {seen}")
 
 
@@ -100,10 +100,10 @@ def matching(seen: Appearance, generator: torch.Generator, **cameras) -> Atmosph
 
     Raises ValueError where there is none.
     """
-    found = _find(seen, generator, **cameras)
-    if found is None:
+    atmosphere = _find(seen, generator, **cameras)
+    if atmosphere is None:
         raise ValueError(f"turbulence.atmosphere: no camera within its ranges shows {seen}")
-    return found
+    return atmosphere
 
 
 def _find(
@@ -135,9 +135,8 @@ def _find(
         airy = log_between(u[:, 0], airy_px, "airy_px")
         shape = (u[:, 1] * len(shapes)).astype(int)
         scale = _scales(u[:, 2], outer_scale_d, kolmogorov)
-        reach, tilt, higher, scatter = np.array(
-            [_facts(shapes[s], 1 / x) for s, x in zip(shape, scale, strict=True)]
-        ).T
+        facts = [_facts(shapes[s], 1 / x) for s, x in zip(shape, scale, strict=True)]
+        reach, tilt, higher, scatter = np.array(facts).T
         aperture = seen.half_length_px / reach
         strength, blur = _strength(seen, airy, tilt, higher)
         rytov = 5.319 * strength ** (5 / 3) * (2 * math.pi * aperture / airy) ** (-5 / 6) * scatter
@@ -149,6 +148,8 @@ def _find(
         i = int(np.where(fits, unlike, np.inf).argmin())
         length = float(log_between(u[i, 3], distance_m, "distance_m"))
         diameter = math.sqrt(wavelength_m * length * aperture[i] / airy[i])
+        # Of the wind, in D, after which the tilt's correlation is 1 / e.
+        way = outer_scale.tilt_reach(1 / scale[i], shapes[shape[i]], wind=True)
         return Atmosphere(
             aperture_m=diameter,
             focal_length_m=diameter * float(log_between(u[i, 4], f_number, "f_number")),
@@ -158,7 +159,7 @@ def _find(
             cn2=shapes[shape[i]],
             alpha=math.exp(-1 / (ALPHA_FPS * seen.decay_s)),
             outer_scale_m=diameter * float(scale[i]),
-            wind_m_s=_decay(shapes[shape[i]], 1 / scale[i]) * diameter / seen.decay_s,
+            wind_m_s=way * diameter / seen.decay_s,
         ).at(float(strength[i]))
     return None
 
@@ -228,8 +229,8 @@ def _unlike(
         apart += np.abs(np.log(np.hypot(1, blur / sharp) / seen.blur_ratio))
     if seen.whole_share is not None:
         views = REFERENCE_PX / aperture
-        found = [outer_scale.whole_share(*one) for one in zip(ratio, shapes, views, strict=True)]
-        apart += np.abs(np.array(found) - seen.whole_share)
+        shares = [outer_scale.whole_share(*one) for one in zip(ratio, shapes, views, strict=True)]
+        apart += np.abs(np.array(shares) - seen.whole_share)
     return apart
 
 
@@ -253,9 +254,3 @@ def _facts(shape: tuple[float, ...], ratio: float) -> tuple[float, float, float,
         outer_scale.left(ratio, shape, "higher"),
         float(scatter / (strength * (1 - place) ** (5 / 3)).sum()),
     )
-
-
-@cache
-def _decay(shape: tuple[float, ...], ratio: float) -> float:
-    """Return the way of the wind, in D, after which the tilt's correlation is 1 / e."""
-    return outer_scale.tilt_reach(ratio, shape, wind=True)

@@ -37,6 +37,12 @@ def choose_severity(severity: str, generator: torch.Generator) -> str:
     return "weak" if u < MIX["weak"] else "medium" if u < 1 - MIX["strong"] else "strong"
 
 
+def require(valid: bool, name: str, allowed: str, value: object) -> None:
+    """Raise ValueError, naming `turbulence.name`, unless `valid`."""
+    if not valid:
+        raise ValueError(f"turbulence.{name} must be {allowed}, got {value}")
+
+
 def refused(name: str, allowed: str, value: object) -> ValueError:
     """Return the error for a value of `turbulence.atmosphere`."""
     return ValueError(f"turbulence.atmosphere.{name} must be {allowed}, got {value}")

@@ -21,6 +21,7 @@ from src.sim.turbulence import blur
 from src.sim.turbulence.fields import Fields, fields
 from src.sim.turbulence.lattice import Lattice
 from src.sim.turbulence.model import Crop
+from src.sim.turbulence.ranges import require
 from src.sim.turbulence.threads import in_threads
 
 PLACES, STRETCHES = 2, 3  # pieces of the footage: PLACES x PLACES in the picture, STRETCHES in time
@@ -57,13 +58,13 @@ class RecordedTilt:
         blur: float = 0.4,
     ):
         for name, rms in rms_px.items():
-            _require(0 <= rms <= MOST_PX, f"rms_px.{name}", f"in [0, {MOST_PX:g}] pixels", rms)
-        known = severity in ("mixed", *rms_px)
-        _require(known, "severity", ", ".join(["mixed", *rms_px]), severity)
-        _require(0 < rate < math.inf, "rate", "> 0 frames per second", rate)
-        _require(0 <= blur <= 2, "blur", "in [0, 2] times the tilt", blur)
+            require(0 <= rms <= MOST_PX, f"rms_px.{name}", f"in [0, {MOST_PX:g}] pixels", rms)
+        valid = severity in ("mixed", *rms_px)
+        require(valid, "severity", ", ".join(["mixed", *rms_px]), severity)
+        require(0 < rate < math.inf, "rate", "> 0 frames per second", rate)
+        require(0 <= blur <= 2, "blur", "in [0, 2] times the tilt", blur)
         there = root is not None and Path(root).exists()
-        _require(there, "root", "a video or folder of frames of a still scene through air", root)
+        require(there, "root", "a video or folder of frames of a still scene through air", root)
         self.names = list(rms_px) if severity == "mixed" else [severity]
         self.rms_px, self.rate, self.blur = dict(rms_px), rate, blur
         self.fields = fields(Path(root).resolve())
@@ -142,9 +143,8 @@ class RecordedAir:
         key = noise.base_key(generator)
         pieces = noise.uniform(noise.key(key, "pieces"), torch.arange(PLACES**2 * STRETCHES))
         order, window = pieces.argsort().tolist(), crop or (0, 0, *self.size)
-        return torch.stack(
-            [self._view(position, frames, order, key, window) for position in self.views]
-        )
+        views = [self._view(position, frames, order, key, window) for position in self.views]
+        return torch.stack(views)
 
     def _view(
         self, position: Position, frames: int, order: list[int], key: int, window: Crop
@@ -185,8 +185,3 @@ def _gaussian(deviation: float) -> Float[Tensor, "k k"]:
     away = torch.arange(-reach, reach + 1) / max(deviation, 1e-6)
     line = torch.exp(-0.5 * away**2)
     return line[:, None] * line / line.sum() ** 2
-
-
-def _require(valid: bool, name: str, allowed: str, value: object) -> None:
-    if not valid:
-        raise ValueError(f"turbulence.{name} must be {allowed}, got {value}")

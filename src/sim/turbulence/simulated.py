@@ -24,7 +24,9 @@ class SimulatedAir:
 
     def __init__(self, atmosphere: Mapping[str, Any], **options: Any):
         self.atmosphere, self.options = dict(atmosphere), options
-        self.prior = self.atmosphere.pop("prior", None) or _implied(self.atmosphere)
+        # Where none is named, a range of Cn2 says that the config is of version 0.1.
+        implied = "rigid" if "cn2" in self.atmosphere else "seen"
+        self.prior = self.atmosphere.pop("prior", None) or implied
         if self.prior not in PRIORS:
             raise refused("prior", f"of {', '.join(PRIORS)}", self.prior)
         try:
@@ -54,8 +56,3 @@ class SimulatedAir:
     def having(self, **options: Any) -> "SimulatedAir":
         """Return the same air with some of its options replaced."""
         return SimulatedAir({"prior": self.prior} | self.atmosphere, **self.options | options)
-
-
-def _implied(atmosphere: Mapping[str, Any]) -> str:
-    """Return the prior of a config that names none: with a range of Cn2 it is of version 0.1."""
-    return "rigid" if "cn2" in atmosphere else "seen"

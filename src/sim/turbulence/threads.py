@@ -19,9 +19,8 @@ def in_threads(work: Callable[..., None], pieces: Iterable[tuple], device: torch
         for piece in pieces:
             work(*piece)
         return
-    inference = (
-        torch.is_inference_mode_enabled()
-    )  # a thread's own, as is the recording of gradients
+    # A thread's own, as is the recording of gradients.
+    inference = torch.is_inference_mode_enabled()
 
     def alone(*piece) -> None:
         with torch.inference_mode(inference), torch.no_grad():

@@ -36,16 +36,6 @@ def noll_covariance(modes: int) -> Float[Tensor, "modes modes"]:
     return torch.tensor(rows, dtype=torch.float64)
 
 
-def noll_residual(modes: int) -> float:
-    """Return the phase variance left at D/r0 = 1 when Noll modes 1..modes are known, in rad^2.
-
-    From the variances, summed over whole orders; 1.0324 for modes = 1 (Noll 1976, table IV).
-    """
-    return _structure_variance() - sum(
-        _covariance(i, i) for i in map(noll_index, range(2, modes + 1))
-    )
-
-
 def zernike_basis(modes: int, size: int) -> tuple[Float[Tensor, "modes p"], Float[Tensor, "p 2"]]:
     """Return Noll modes 2..modes + 1 at the points of a `size` x `size` grid inside the unit disc.
 
@@ -111,19 +101,6 @@ def _covariance(a: tuple[int, int], b: tuple[int, int]) -> float:
     )
     lows = special.gammasgn((n - n2 + 17 / 3) / 2) * special.gammasgn((n2 - n + 17 / 3) / 2)
     return sign * lows * COVARIANCE * math.sqrt((n + 1) * (n2 + 1)) * math.exp(gammas)
-
-
-def _structure_variance() -> float:
-    """Piston-removed variance at D/r0 = 1: half the mean over the pupil of 6.88 (s/D)^(5/3).
-
-    The distance s of two points of a disc has the density 16 s / pi (acos s - s sqrt(1 - s^2)) in
-    units of its diameter; the mean is then a difference of beta functions.
-    """
-    structure = 2 * (24 / 5 * special.gamma(6 / 5)) ** (5 / 6)  # 6.8839
-    power = 5 / 3
-    half = (power + 3) / 2
-    mean = special.beta(half, 0.5) / (power + 2) - special.beta(half, 1.5)
-    return float(structure / 2 * 8 / math.pi * mean)
 
 
 def _azimuth(m: int, angle: Tensor) -> Tensor:

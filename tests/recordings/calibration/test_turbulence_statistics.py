@@ -19,6 +19,7 @@ from src.sim.optics import layout
 from src.sim.turbulence.atmosphere import Atmosphere
 from src.sim.turbulence.operator import ALPHA_FPS, Turbulence
 from tests.recordings import pictures
+from tests.recordings.calibration.test_statistics import sampling_error
 
 pytestmark = pytest.mark.slow  # 6480 pictures through turbulence
 
@@ -124,7 +125,7 @@ def test_tilt_across_views_is_that_of_the_same_air_looked_at_for_longer(case):
     pairs = np.triu_indices(9, 1)
     true = statistics.correlation(long.swapaxes(0, 1))[pairs]
     assert abs(true.mean()) < 0.02 if case.alike == 9 else true.min() > 0.4
-    error = statistics.sampling_error(long[CENTRE, :FRAMES]) * (1 - true**2)
+    error = sampling_error(long[CENTRE, :FRAMES]) * (1 - true**2)
     found = case.found.across_views[pairs]
     assert abs((found - true) / error).max() < 4
     apart = 36 if case.alike == 9 else 4  # pairs of views in shared air are not independent

@@ -14,7 +14,6 @@ from src.recordings.files.formats import (
     iter_events,
     open_events,
     read_events,
-    sensor_size,
     write_events,
 )
 
@@ -69,7 +68,7 @@ def test_what_is_written_is_read(tmp_path, ending):
     events = made_up()
     path = tmp_path / f"a{ending}"
     write_events(path, events, width=640, height=480)
-    assert sensor_size(path) == (640, 480)
+    assert open_events(path).size == (640, 480)
     assert np.array_equal(read_events(path), events)
 
 
@@ -121,7 +120,7 @@ def test_hdf5_in_the_groups_of_others(tmp_path):
         file["events/ts"] = events["t"] * 1e-6
         file.attrs["sensor_resolution"] = (480, 640)
     assert np.array_equal(read_events(tmp_path / "seconds.h5"), events)
-    assert sensor_size(tmp_path / "seconds.h5") == (640, 480)
+    assert open_events(tmp_path / "seconds.h5").size == (640, 480)
     with h5py.File(tmp_path / "vendor.h5", "w") as file:
         file["CD/events"] = events
     with pytest.raises(ValueError, match="export the recording as RAW"):
@@ -132,7 +131,7 @@ def test_text_of_others(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("240 180\n0.5 1 2 0\n0.6 3 4 1\n")
     assert read_events(path).tolist() == [(500000, 1, 2, -1), (600000, 3, 4, 1)]
-    assert sensor_size(path) == (240, 180)
+    assert open_events(path).size == (240, 180)
     path = tmp_path / "a.csv"
     path.write_text("x,y,polarity,timestamp\n1,2,-1,50\n3,4,1,60\n")
     assert read_events(path).tolist() == [(50, 1, 2, -1), (60, 3, 4, 1)]

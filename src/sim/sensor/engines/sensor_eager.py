@@ -80,7 +80,8 @@ class Pixels:
         """Take all pixels through interval `number`, which ends with `frame`."""
         state, job = self.state, self.job
         source, level = self._levels(frame)
-        drift = _leaked(job.leak, self.on, number)
+        leak = self.on * job.leak
+        drift = ((leak * (number + 1)) >> 24) - ((leak * number) >> 24)
         l0, l1, ref = state.level.long(), level + drift, state.reference.long()
         u, sign = self._noise(frame, number)
         events = _v2e if job.v2e else _linear
@@ -120,10 +121,6 @@ def _spread(threshold: Tensor, spread: Tensor, normals: Tensor, drawn: Tensor) -
     normal = normals[cell] + (((normals[cell + 1] - normals[cell]) * inside) >> 20)
     spread_out = threshold + ((((threshold * spread) >> 20) * normal) >> 20)
     return torch.maximum(spread_out, threshold >> 2)
-
-
-def _leaked(leak: int, threshold: Tensor, frame: int) -> Tensor:
-    return ((threshold * leak * (frame + 1)) >> 24) - ((threshold * leak * frame) >> 24)
 
 
 def _next(l0, delta, ref, on, off, now) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,66 @@
+"""Closed forms and integrals that the simulated air is held against, for the tests beside."""
+
+import math
+
+import numpy as np
+from scipy import optimize, special
+
+from src.sim.turbulence.atmosphere import Atmosphere
+from src.sim.turbulence.zernike import noll_covariance
+
+
+def isoplanatic_angle_rad(path: Atmosphere) -> float:
+    """Return the angle over which the phase differs by 1 rad rms, from the camera; inf if none.
+
+    Without an outer scale theta0 = [2.914 k^2 Int Cn2 z^(5/3) dz]^(-3/5) (Fried 1982).
+    """
+    place, strength = (part.numpy() for part in path.path)
+    z, k = place * path.distance_m, 2 * math.pi / path.wavelength_m
+    integral = 2.914 * k**2 * float((strength * z ** (5 / 3)).sum())
+    if integral == 0:
+        return math.inf
+    angle = integral**-0.6
+    if math.isinf(path.outer_scale_m):
+        return angle
+
+    def excess(log_angle: float) -> float:
+        structure = structure_function(math.exp(log_angle) * z, path.outer_scale_m)
+        return 2.914 * k**2 * float((strength * structure).sum()) - 1
+
+    if excess(math.log(1e6 * angle)) < 0:
+        return math.inf
+    return math.exp(optimize.brentq(excess, math.log(angle), math.log(1e6 * angle)))
+
+
+def structure_function(apart: np.ndarray, outer_scale_m: float) -> np.ndarray:
+    """Return the structure function of phase over 2.914 k^2 Int Cn2 dz; apart^(5/3) without L0.
+
+    Von Karman: proportional to 1 - 2^(1/6) / Gamma(5/6) x^(5/6) K_(5/6)(x), x = 2 pi apart / L0.
+    """
+    x = 2 * math.pi * np.asarray(apart) / outer_scale_m
+    order = 5 / 6
+    near = special.gamma(1 / 6) / special.gamma(11 / 6) * (math.pi / outer_scale_m) ** (5 / 3)
+    return (1 - 2 ** (1 - order) / special.gamma(order) * x**order * special.kv(order, x)) / near
+
+
+def noll_residual(modes: int) -> float:
+    """Return the phase variance left at D/r0 = 1 when Noll modes 1..modes are known, in rad^2.
+
+    From the variances, summed over whole orders; 1.0324 for modes = 1 (Noll 1976, table IV).
+    """
+    known = float(noll_covariance(modes - 1).diagonal().sum()) if modes > 1 else 0.0
+    return structure_variance() - known
+
+
+def structure_variance() -> float:
+    """Return the piston-removed variance at D/r0 = 1: half the mean over the pupil of 6.88
+    (s/D)^(5/3).
+
+    The distance s of two points of a disc has the density 16 s / pi (acos s - s sqrt(1 - s^2)) in
+    units of its diameter; the mean is then a difference of beta functions.
+    """
+    structure = 2 * (24 / 5 * special.gamma(6 / 5)) ** (5 / 6)  # 6.8839
+    power = 5 / 3
+    half = (power + 3) / 2
+    mean = special.beta(half, 0.5) / (power + 2) - special.beta(half, 1.5)
+    return float(structure / 2 * 8 / math.pi * mean)
