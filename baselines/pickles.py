@@ -54,8 +54,11 @@ class Unpickler(pickle._Unpickler):
         return Inert
 
 
-READER = SimpleNamespace(Unpickler=Unpickler, __name__="baselines.pickles")
-READER.load = lambda file, **kwargs: Unpickler(file, **kwargs).load()
+def _load(file: Any, **kwargs: Any) -> Any:
+    return Unpickler(file, **kwargs).load()
+
+
+READER = SimpleNamespace(Unpickler=Unpickler, load=_load, __name__="baselines.pickles")
 
 
 def read(path: str | Path) -> Any:

@@ -66,8 +66,9 @@ class Postprocessed(nn.Module):
         """Return the restored frame of every window, in [0, 1]."""
         frames = video(self.source, sample).float().clamp(0, 1)
         every = getattr(self.source, "average", 1)
-        windows = {"window": self.window, "overlap": self.overlap}
-        restored = self.restorer.restore(frames[:, ::every], **windows)
+        restored = self.restorer.restore(
+            frames[:, ::every], window=self.window, overlap=self.overlap
+        )
         return restored.repeat_interleave(every, 1)[:, : frames.shape[1]]
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from src.bench.speed import PEAKS
 from src.bench.timing import convolution_peak, threads
 from src.models import load
 from src.models.cost import macs_per_frame
@@ -28,6 +29,7 @@ from src.sim.optics import layout
 from src.sim.voxel import voxel_grid
 
 SIDE, FPS, RATE = 176, 600, 5e6
+FORM = "bf16" if computes_bf16() else "float32"
 RECORDING = Path("../shared/data/events/gen3_640x480_evt2.raw")
 NAMES = ("setnet_small", "setnet_medium", "setnet_large", "lf3x3")
 
@@ -70,7 +72,7 @@ def milliseconds(
 
 def on_pytorch(network: torch.nn.Module) -> Callable:
     """Return a step from a list of events through dense grids and PyTorch."""
-    fast, state = running(network, "bf16" if computes_bf16() else "float32"), None
+    fast, state = running(network, FORM), None
     told = {"window_s": 1 / FPS} if takes(network, "window_s") else {}
     size = {"bins": 5, "height": SIDE, "width": SIDE}
 
@@ -108,12 +110,11 @@ def main() -> None:
     mean = statistics.mean(len(window[0]) for window in played)
     print(f"{len(played)} windows of 1/{FPS} s, {mean:.0f} events each over nine views of {SIDE}")
     for count in given.threads:
-        name, dtype = ("bf16", torch.bfloat16) if computes_bf16() else ("float32", torch.float32)
-        peak = convolution_peak(dtype, count=count) / 1e9
+        peak = convolution_peak(PEAKS[FORM], count=count) / 1e9
         clock = time.process_time if count == 1 else time.perf_counter
         kind = "CPU" if count == 1 else "wall"
         print(
-            f"threads: {count}, {kind} time, median (10 to 90 %); peak {peak:.0f} GMAC/s in {name}"
+            f"threads: {count}, {kind} time, median (10 to 90 %); peak {peak:.0f} GMAC/s in {FORM}"
         )
         for name in given.names:
             network = load(name)

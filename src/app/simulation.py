@@ -91,8 +91,11 @@ def _simulation(
     substeps = _count(cfg, "data.substeps")
     rates = _rates(cfg, split == "train")
     seed = _count(cfg, "seed" if split == "train" else "data.test_seed", least=0)
-    clips_of = {"split": split, "seed": seed, "frames": windows * substeps + 1}
-    scenes = [part(cfg, "scene", fps=rate * substeps, **clips_of) for rate in rates]
+    frames = windows * substeps + 1
+    scenes = [
+        part(cfg, "scene", split=split, seed=seed, frames=frames, fps=rate * substeps)
+        for rate in rates
+    ]
     made = Pipeline(
         MixedRates(scenes) if len(scenes) > 1 else scenes[0],
         optics,

@@ -50,8 +50,9 @@ class Step:
         form = how.form or (fastest() if runs(network) else "float32")
         self.network = event_lists.ready(network, form, "cpu", views, how.bins)
         listed = isinstance(self.network, Runtime)
-        laid = {"bins": how.bins, "splat": how.splat, "unit": how.unit}
-        self.rule = stream.Rule(fps=how.fps, grids=not listed, **laid)
+        self.rule = stream.Rule(
+            fps=how.fps, bins=how.bins, splat=how.splat, unit=how.unit, grids=not listed
+        )
         self.lookup = build(views)
         # One that keeps no overlapping windows apart can begin one while another is finished.
         self.ahead = listed and self.overlap == 1

@@ -201,9 +201,13 @@ def _download(net: str) -> dict[str, Tensor] | None:
     patience = socket.getdefaulttimeout()
     socket.setdefaulttimeout(PATIENCE_S)  # the hub has no time-out of its own
     try:
-        safely = {"map_location": "cpu", "check_hash": True, "weights_only": True}
-        url = f"https://download.pytorch.org/models/{HUB[net]}"
-        return torch.hub.load_state_dict_from_url(url, progress=False, **safely)
+        return torch.hub.load_state_dict_from_url(
+            f"https://download.pytorch.org/models/{HUB[net]}",
+            map_location="cpu",
+            progress=False,
+            check_hash=True,
+            weights_only=True,
+        )
     except (OSError, RuntimeError):  # no network, or what came is not the file (a login page)
         return None
     finally:

@@ -142,8 +142,14 @@ def _png(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
 @contextmanager
 def _hdf5(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
     with h5py.File(path, "w", rdcc_nbytes=CACHE_BYTES) as file:
-        growing = {"maxshape": (None, *size), "chunks": (1, *size), "compression": "lzf"}
-        frames = file.create_dataset("frames", (0, *size), np.uint8, **growing)
+        frames = file.create_dataset(
+            "frames",
+            (0, *size),
+            np.uint8,
+            maxshape=(None, *size),
+            chunks=(1, *size),
+            compression="lzf",
+        )
         times = file.create_dataset("time_s", (0,), np.float64, maxshape=(None,), chunks=(4096,))
 
         def add(picture: Picture, frame: Frame) -> None:

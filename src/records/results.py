@@ -156,7 +156,8 @@ def commit() -> str:
     """Return the commit of the working tree, with `-dirty` where it differs; else `unknown`."""
     try:
         words = ["git", "describe", "--always", "--dirty", "--abbrev=12"]
-        how = {"cwd": Path(__file__).parent, "capture_output": True, "text": True, "check": True}
-        return subprocess.run(words, **how).stdout.strip()
+        return subprocess.run(
+            words, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
+        ).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return "unknown"

@@ -180,8 +180,7 @@ class MixedRates:
 
 def check_frames(height: int, width: int, frames: int, fps: float, split: str) -> None:
     """Raise ValueError for a size, a number of frames, a rate or a split that no clip can have."""
-    if split not in SPLITS:
-        raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split}")
+    _check_split(split)
     for name, value, least in (("height", height, 8), ("width", width, 8), ("frames", frames, 2)):
         if value < least:
             raise ValueError(f"scene.{name} must be >= {least}, got {value}")
@@ -189,11 +188,17 @@ def check_frames(height: int, width: int, frames: int, fps: float, split: str) -
         raise ValueError(f"fps must be > 0, got {fps}")
 
 
+def _check_split(split: str) -> None:
+    if split not in SPLITS:
+        raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split}")
+
+
 def photographs(root: str | Sequence[str] | None, split: str) -> list[Path]:
     """Return the photographs of a split; of several folders, each one's own share of it.
 
-    Raises ValueError where there are none.
+    Raises ValueError where there are none, and for a split that is none.
     """
+    _check_split(split)
     if isinstance(root, Sequence) and not isinstance(root, str):
         if not root:
             raise ValueError("scene.root must be a folder, or some, got an empty list")

@@ -192,8 +192,13 @@ class Turbulence:
     ) -> tuple[Waves, Complex[Tensor, "views frames waves"]]:
         """Draw one clip's waves, and their amplitudes in every view and frame."""
         key = noise.base_key(generator)
-        size = {"modes": self.fidelity.modes, "waves": WAVES, "width_px": self.width}
-        waves = draw_waves(self.atmosphere, noise.key(key, "waves"), **size)
+        waves = draw_waves(
+            self.atmosphere,
+            noise.key(key, "waves"),
+            modes=self.fidelity.modes,
+            waves=WAVES,
+            width_px=self.width,
+        )
         return waves, self._amplitudes(key, waves, frames).to(torch.complex64)
 
     def _amplitudes(
