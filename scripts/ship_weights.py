@@ -68,7 +68,7 @@ def facts(run: Path, content: dict) -> dict:
     cfg = OmegaConf.create(text)
     return {
         "experiment": cfg.name,
-        "started_from": Path(cfg.model.get("weights") or "nothing").name,
+        "started_from": _start(cfg),
         "seed": cfg.seed,
         "steps": content.get("steps", content["global_step"]),
         "windows_seen": content["windows"],
@@ -136,6 +136,12 @@ def _cell(metric: Metric, score: dict | None) -> str:
         return metric.written(None)
     low, high = map(metric.written, score["interval"])
     return f"{metric.written(score['mean'])} ({low} to {high})"
+
+
+def _start(cfg: DictConfig) -> str:
+    """Return the name of the published or exported weights that a training began with."""
+    ckpt = cfg.ckpt if files.exported(Path(cfg.ckpt or "")) else None
+    return Path(cfg.model.get("weights") or ckpt or "nothing").name
 
 
 def _scenes(cfg: DictConfig) -> str:

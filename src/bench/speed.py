@@ -13,11 +13,12 @@ from src.bench.candidates import Candidate
 from src.models import stopwatch
 from src.models.cost import macs, macs_per_frame
 from src.models.export import OnnxNetwork, export
-from src.models.fast import plain, running
+from src.models.fast import computes_bf16, plain, running
 
 PEAKS = {  # what a form computes in
     "float32": torch.float32, "bf16": torch.bfloat16, "compiled": torch.bfloat16,
-    "openvino": torch.bfloat16, "onnx": torch.float32,
+    "openvino": torch.bfloat16 if computes_bf16() else torch.float32,
+    "onnx": torch.float32,
 }  # fmt: skip
 FORMS = tuple(PEAKS)
 ON_CPU = ("openvino", "onnx")  # and nowhere else

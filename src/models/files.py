@@ -21,6 +21,7 @@ from src.records.atomic import written
 
 WEIGHTS = Path(__file__).resolve().parents[2] / "weights"
 ROOMS = ("src.models.", "baselines.")
+WIDENED = "src.models.e2vid.E2VID"  # goes on from its weights on one view
 POWER_ITERATIONS = 50
 LARGEST = 4096  # any number in the arguments of a network that a file names
 
@@ -56,14 +57,19 @@ def load(name_or_path: str | Path, rooms: Sequence[str] = ()) -> nn.Module:
 def require(name: str | Path, spec: dict) -> Path:
     """Return the file to go on from: `name`, or the newest whole checkpoint in the folder `name`.
 
-    Raises ValueError unless it is a whole checkpoint, or a file of `save`, of the network `spec`.
+    Raises ValueError unless it is a whole checkpoint, or a file of `save`, of the network `spec`;
+    a file of `save` may also be of the same E2VID on one view.
     """
     path = newest(Path(name)) if Path(name).is_dir() else Path(name)
     if not path.is_file():
         raise ValueError(f"ckpt must be a checkpoint to go on from, got {path}")
     saved, _ = (_safetensors if exported(path) else _checkpoint)(path)
-    wanted = spec | {"kwargs": spec["kwargs"] | _unnormalised(spec)} if exported(path) else spec
-    if saved != wanted:
+    starts = [spec]
+    if exported(path):
+        starts = [spec | {"kwargs": spec["kwargs"] | _unnormalised(spec)}]
+        if spec["target"] == WIDENED:
+            starts += [spec | {"kwargs": starts[0]["kwargs"] | {"views": 1}}]
+    if saved not in starts:
         raise ValueError(f"ckpt must be of the network {spec} to go on from, got {saved} in {path}")
     return path
 
@@ -89,9 +95,12 @@ def card(path: Path) -> dict:
 def restore(network: nn.Module, path: Path) -> None:
     """Give `network` the weights of a file of `save`; spectral norms find their vectors anew.
 
-    Raises ValueError, beginning with `ckpt`, for the weights of another network.
+    An E2VID on many views takes those of one view too (E2VID.widened).  Raises ValueError,
+    beginning with `ckpt`, for the weights of another network.
     """
-    weights = _safetensors(path)[1]
+    spec, weights = _safetensors(path)
+    if spec["target"] == WIDENED and spec["kwargs"]["views"] == 1:
+        weights = network.widened(weights)
     _check_fit(type(network), folded(network), weights, path)
     for prefix, module in network.named_modules():
         if parametrize.is_parametrized(module, "weight"):

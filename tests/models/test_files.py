@@ -50,6 +50,24 @@ def test_a_word_names_shipped_weights(tmp_path, monkeypatch):
         load("other")
 
 
+@pytest.mark.parametrize("stem", [None, 6])
+@torch.no_grad()
+def test_one_view_is_where_many_begin(stem, tmp_path):
+    torch.manual_seed(0)
+    one = KWARGS | {"views": 1, "stem_channels": stem, "spectral_norm": False}
+    path, narrow = tmp_path / "one.safetensors", E2VID(**one).eval()
+    save(path, narrow, {"target": SPEC["target"], "kwargs": one}, {})
+    nine = one | {"views": 9}
+    assert files.require(path, {"target": SPEC["target"], "kwargs": nine}) == path
+    wide = E2VID(**nine).eval()
+    files.restore(wide, path)
+    seen = torch.randn(1, 3, 9, 3, 16, 16)
+    ours, theirs = unroll(wide, seen)[0], unroll(load(path), seen[:, :, 4:5])[0]
+    assert torch.allclose(ours, theirs, atol=1e-6)
+    with pytest.raises(ValueError, match="ckpt must be of the network"):
+        files.require(path, {"target": SPEC["target"], "kwargs": nine | {"bins": 4}})
+
+
 def test_other_weights_are_listed(tmp_path):
     path, state = tmp_path / "last.ckpt", trained().state_dict()
     state = {f"network.{name}": value for name, value in state.items()}

@@ -102,6 +102,15 @@ def test_exported_weights_go_on_where_no_checkpoint_is_left(tmp_path):
     assert rate(second) == pytest.approx(1e-3 * Hours(6.0).share(5.0) * 3 / 5)
 
 
+def test_nine_views_go_on_from_one_with_its_hours(tmp_path):
+    now = tmp_path / "now.safetensors"
+    run(tmp_path / "one", "hours=3", "experiment=single256", f"export={now}")
+    nine = run(tmp_path / "nine", "hours=5", "experiment=lf3x3", f"ckpt={now}")
+    assert nine["seconds"] == 5 * HOUR and nine["global_step"] == 2 and nine["steps"] == 5
+    kernel = nine["state_dict"]["network.stem.weight"]
+    assert kernel[:, 20:25].abs().mean() > 10 * kernel[:, :20].abs().mean() > 0
+
+
 def test_a_training_that_is_cut_short_exports_what_it_has_reached(tmp_path, monkeypatch):
     now, step = tmp_path / "now.safetensors", Reconstructor.training_step
 
