@@ -1,8 +1,10 @@
-"""The picture and the table of the README: python -m scripts.readme --root PHOTOS [--clips 27].
+"""The picture and table of the README: python -m scripts.readme --root PHOTOS [--footage VIDEO].
 
-Both are made anew from the weights that are shipped: docs/figures/nine_views.png, and the section
-between the README's marks `report:results`, scores of test clips of the photographs in PHOTOS
-(data=test_photos), each simulated once for all networks.  Without PHOTOS only the picture.
+Made anew from the weights that are shipped: docs/figures/nine_views.png, and the section between
+the README's marks `report:results`, scores of test clips of the photographs in PHOTOS
+(data=test_photos), each simulated once for all networks.  Without PHOTOS only the picture.  With
+VIDEO, a still scene through air, the same of data=test_footage for docs/results.md, beside the
+published networks whose weights are in `--published`.
 """
 
 import argparse
@@ -16,6 +18,7 @@ from torch import Tensor
 
 from src import models
 from src.app import build
+from src.app.parts import part
 from src.bench.candidates import Subject
 from src.figures import plots
 from src.metrics.bootstrap import interval
@@ -25,7 +28,7 @@ from src.sim.optics import layout
 from src.sim.pipeline import Sample, simulate
 
 HOME = Path(__file__).resolve().parents[1]
-NETWORK = "setnet_medium"  # of the picture: the same weights on one view and on nine
+ONE, NINE = ("single256", 1), ("lf3x3", 9)  # of the picture: trained alike, from the same weights
 # Local air, whose parts of a view wobble apart.
 AIR = ("turbulence=strong", "turbulence.atmosphere.half_length_px=[10,20]",
        "turbulence.atmosphere.near_rigid=0.0")  # fmt: skip
@@ -36,6 +39,15 @@ ROWS = {  # what it is: a network in weights/, how many of the nine views it is 
     "one view, SetNet medium": ("setnet_medium", 1),
     "one view, E2VID": ("single256", 1),
     "one view, E2VID+ trained without turbulence": ("clean/e2vid_plus", 1),
+}
+PUBLISHED = {  # baselines: their files in the folder of published weights
+    "firenet_plus": "FireNet+/firenet_plus_state_dict.pth",
+    "cista": "CISTA-TC/cista-tc.pth.tar",
+}
+OTHERS = {
+    "published FireNet+, one view": ("firenet_plus", 1),
+    "published CISTA-TC, one view": ("cista", 1),
+    "high-pass, one view": ("highpass", 1),
 }
 PAIRS = {  # rows whose difference is shown, clip by clip
     "nine views less one, E2VID": ("nine views, E2VID (the paper's way)", "one view, E2VID"),
@@ -49,23 +61,29 @@ def config(door: str, *overrides: str) -> DictConfig:
         return compose(door, list(overrides))
 
 
-def played(name: str, views: int, sample: Sample) -> Tensor:
-    """Return the frames (windows, 1, h, w) that a shipped network makes of the centre view or of
-    all views of `sample`, a single clip."""
-    subject, window_s = Subject(name, models.load(name), views), float(sample.window_s[0])
+def subject(name: str, views: int, published: Path | None = None) -> Subject:
+    """Return a shipped network, or a baseline with its weights in the folder `published`."""
+    if published is None or name not in (*PUBLISHED, "highpass"):
+        return Subject(name, models.load(name), views)
+    weights = [f"baseline.weights={published / PUBLISHED[name]}"] if name in PUBLISHED else []
+    cfg = config("eval", f"baseline={name}", *weights)
+    return Subject(name, part(cfg, "baseline").eval(), views)
+
+
+def played(network: Subject, sample: Sample) -> Tensor:
+    """Return the frames (windows, 1, h, w) that a network makes of `sample`, a single clip."""
     positions = list(sample.positions or layout(sample.voxels.shape[2]))
-    return subject.play(sample.voxels[0, :, None], positions, window_s)[0]
+    return network.play(sample.voxels[0, :, None], positions, float(sample.window_s[0]))[0]
 
 
-def table(root: str, clips: int) -> str:
-    """Return the scores of every row of ROWS on the same test clips, as Markdown."""
-    cfg = config("eval", "data=test_photos", f"scene.root={root}", f"data.test_clips={clips}")
+def table(cfg: DictConfig, rows: dict[str, Subject]) -> str:
+    """Return the scores of all `rows` on the test clips of `cfg`, as Markdown."""
     pipeline, measure = build.pipeline(cfg, "test"), build.scores(cfg)
-    values = {row: [] for row in ROWS}
+    values, clips = {row: [] for row in rows}, cfg.data.test_clips
     for clip in range(clips):
         sample = simulate(pipeline, [clip])
-        for row, (name, views) in ROWS.items():
-            frames = played(name, views, sample)[cfg.data.warmup :]
+        for row, network in rows.items():
+            frames = played(network, sample)[cfg.data.warmup :]
             values[row].append(measure(frames, sample.target[0, cfg.data.warmup :]))
         print(f"{clip + 1} of {clips} clips", flush=True)
     heads = [f"{metric.heading} {metric.arrow}" for metric in METRICS]
@@ -98,8 +116,8 @@ def picture(path: Path, index: int, windows: int) -> None:
     sample = simulate(build.pipeline(cfg, "test"), [index])
     panels = {
         "what one view sees": sample.turbulent[0],
-        "one view, reconstructed": played(NETWORK, 1, sample),
-        "nine views, reconstructed": played(NETWORK, 9, sample),
+        "one view, reconstructed": played(subject(*ONE), sample),
+        "nine views, reconstructed": played(subject(*NINE), sample),
         "ground truth": sample.target[0],
     }
     figure = Figure(figsize=(10, 4.1), layout="constrained")
@@ -121,12 +139,22 @@ def main() -> None:
     """Read the arguments."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--root", help="a folder of photographs that no network was trained on")
+    parser.add_argument("--footage", help="a video or folder of frames: a still scene through air")
+    parser.add_argument("--published", type=Path, help="a folder of published weights")
     parser.add_argument("--clips", type=int, default=27)
     parser.add_argument("--index", type=int, default=0, help="the clip of the picture")
     given = parser.parse_args()
     picture(HOME / "docs" / "figures" / "nine_views.png", given.index, 40)
+    clips = [f"scene.root={given.root}", f"data.test_clips={given.clips}"]
     if given.root:
-        replace_section(HOME / "README.md", "results", table(given.root, given.clips))
+        rows = {row: subject(*what) for row, what in ROWS.items()}
+        cfg = config("eval", "data=test_photos", *clips)
+        replace_section(HOME / "README.md", "results", table(cfg, rows))
+    if given.root and given.footage:
+        known = ROWS | (OTHERS if given.published else {})
+        rows = {row: subject(*what, given.published) for row, what in known.items()}
+        cfg = config("eval", "data=test_footage", f"turbulence.root={given.footage}", *clips)
+        replace_section(HOME / "docs" / "results.md", "footage", table(cfg, rows))
 
 
 if __name__ == "__main__":
