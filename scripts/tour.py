@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import torch
 
-from scripts.readme import AIR, HOME, NETWORK, config, played
+from scripts.readme import AIR, HOME, NINE, ONE, config, played, subject
 from src.app import build
 from src.figures.samples import mosaic
 from src.figures.video import event_picture, row
@@ -72,7 +72,7 @@ def draw_all(index: int) -> None:
     tilt, voxels = pipeline.tilt(draw)[:, -1], sample.voxels[0, -1]
     centre = pipeline.optics.centre
     truth, seen = sample.target[0, :, 0].numpy(), sample.turbulent[0, :, 0].numpy()
-    one, nine = (played(NETWORK, count, sample)[:, 0].numpy() for count in (1, 9))
+    one, nine = (played(subject(*which), sample)[:, 0].numpy() for which in (ONE, NINE))
     reach = float(tilt.abs().max())
 
     save("1_scene", {"first frame": colours(truth[0]), "last frame": colours(truth[-1])})
