@@ -40,9 +40,10 @@ ROWS = {  # what it is: a network in weights/, how many of the nine views it is 
     "one view, E2VID": ("single256", 1),
     "one view, E2VID+ trained without turbulence": ("clean/e2vid_plus", 1),
 }
-PUBLISHED = {  # baselines: their files in the folder of published weights
-    "firenet_plus": "FireNet+/firenet_plus_state_dict.pth",
-    "cista": "CISTA-TC/cista-tc.pth.tar",
+BASELINES = {  # their files in the folder of published weights
+    "firenet_plus": ["FireNet+/firenet_plus_state_dict.pth"],
+    "cista": ["CISTA-TC/cista-tc.pth.tar"],
+    "highpass": [],
 }
 OTHERS = {
     "published FireNet+, one view": ("firenet_plus", 1),
@@ -62,10 +63,10 @@ def config(door: str, *overrides: str) -> DictConfig:
 
 
 def subject(name: str, views: int, published: Path | None = None) -> Subject:
-    """Return a shipped network, or a baseline with its weights in the folder `published`."""
-    if published is None or name not in (*PUBLISHED, "highpass"):
+    """Return a shipped network, or one of BASELINES with its weights in the folder `published`."""
+    if name not in BASELINES:
         return Subject(name, models.load(name), views)
-    weights = [f"baseline.weights={published / PUBLISHED[name]}"] if name in PUBLISHED else []
+    weights = [f"baseline.weights={published}/{file}" for file in BASELINES[name]]
     cfg = config("eval", f"baseline={name}", *weights)
     return Subject(name, part(cfg, "baseline").eval(), views)
 
@@ -144,15 +145,18 @@ def main() -> None:
     parser.add_argument("--clips", type=int, default=27)
     parser.add_argument("--index", type=int, default=0, help="the clip of the picture")
     given = parser.parse_args()
+    if given.footage and not given.root:
+        parser.error("--footage needs --root, the photographs that it moves")
     picture(HOME / "docs" / "figures" / "nine_views.png", given.index, 40)
+    if not given.root:
+        return
     clips = [f"scene.root={given.root}", f"data.test_clips={given.clips}"]
-    if given.root:
-        rows = {row: subject(*what) for row, what in ROWS.items()}
-        cfg = config("eval", "data=test_photos", *clips)
-        replace_section(HOME / "README.md", "results", table(cfg, rows))
-    if given.root and given.footage:
-        known = ROWS | (OTHERS if given.published else {})
-        rows = {row: subject(*what, given.published) for row, what in known.items()}
+    rows = {row: subject(*what) for row, what in ROWS.items()}
+    cfg = config("eval", "data=test_photos", *clips)
+    replace_section(HOME / "README.md", "results", table(cfg, rows))
+    if given.footage:
+        others = OTHERS if given.published else {}
+        rows |= {row: subject(*what, given.published) for row, what in others.items()}
         cfg = config("eval", "data=test_footage", f"turbulence.root={given.footage}", *clips)
         replace_section(HOME / "docs" / "results.md", "footage", table(cfg, rows))
 

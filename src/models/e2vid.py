@@ -15,7 +15,7 @@ from torch.nn import functional
 from torch.nn.utils.parametrizations import spectral_norm as normalise_spectrum
 
 from src.models.layers import ConvGRU, ConvLSTM, ResidualBlock, pad_to_multiple
-from src.sim.optics import layout
+from src.sim.optics import centre, layout
 
 CELLS = {"convlstm": ConvLSTM, "convgru": ConvGRU}
 ACTIVATIONS = {"sigmoid": torch.sigmoid, "none": lambda x: x}
@@ -92,11 +92,11 @@ class E2VID(nn.Module):
         """Return `weights` of the same network on one view, for this one: the first layer sees the
         centre view as before and the others not yet, so that the frames are one view's.
         """
-        name = "head.weight" if self.stem is None else "stem.weight"
-        kernel = torch.zeros_like(self.first.weight)
-        at = layout(self.views).index((0, 0)) * self.bins
-        kernel[:, at : at + self.bins] = weights[name]
-        return weights | {name: kernel}
+        first = "head.weight" if self.stem is None else "stem.weight"
+        before = centre(layout(self.views)) * self.bins
+        behind = (self.views - 1) * self.bins - before
+        padding = (0, 0, 0, 0, before, behind)
+        return {n: functional.pad(w, padding) if n == first else w for n, w in weights.items()}
 
     def after_first(
         self, x: Float[Tensor, "n c h w"], state: Any

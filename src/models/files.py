@@ -64,12 +64,11 @@ def require(name: str | Path, spec: dict) -> Path:
     if not path.is_file():
         raise ValueError(f"ckpt must be a checkpoint to go on from, got {path}")
     saved, _ = (_safetensors if exported(path) else _checkpoint)(path)
-    starts = [spec]
-    if exported(path):
-        starts = [spec | {"kwargs": spec["kwargs"] | _unnormalised(spec)}]
-        if spec["target"] == WIDENED:
-            starts += [spec | {"kwargs": starts[0]["kwargs"] | {"views": 1}}]
-    if saved not in starts:
+    wanted = spec | {"kwargs": spec["kwargs"] | _unnormalised(spec)} if exported(path) else spec
+    fits = saved == wanted
+    if exported(path) and spec["target"] == WIDENED:
+        fits |= saved == wanted | {"kwargs": wanted["kwargs"] | {"views": 1}}
+    if not fits:
         raise ValueError(f"ckpt must be of the network {spec} to go on from, got {saved} in {path}")
     return path
 
@@ -99,7 +98,7 @@ def restore(network: nn.Module, path: Path) -> None:
     beginning with `ckpt`, for the weights of another network.
     """
     spec, weights = _safetensors(path)
-    if spec["target"] == WIDENED and spec["kwargs"]["views"] == 1:
+    if spec["target"] == WIDENED and spec["kwargs"].get("views", 1) == 1:
         weights = network.widened(weights)
     _check_fit(type(network), folded(network), weights, path)
     for prefix, module in network.named_modules():

@@ -66,6 +66,9 @@ def test_one_view_is_where_many_begin(stem, tmp_path):
     assert torch.allclose(ours, theirs, atol=1e-6)
     with pytest.raises(ValueError, match="ckpt must be of the network"):
         files.require(path, {"target": SPEC["target"], "kwargs": nine | {"bins": 4}})
+    for other in ({"base_channels": 8}, {"bins": 4}, {"stem_channels": 7}, {"kernel_size": 3}):
+        with pytest.raises(ValueError, match="ckpt does not fit E2VID"):
+            files.restore(E2VID(**nine | other), path)
 
 
 def test_other_weights_are_listed(tmp_path):
