@@ -2,6 +2,7 @@
 
 import lightning
 import torch
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 from torch import nn
 
 from src.metrics.scores import Scores
@@ -23,9 +24,14 @@ def test(
     trainer: lightning.Trainer,
     warmup: int = 0,
 ) -> Row:
-    """Return the row of `network` on the test clips of `data`."""
+    """Return the row of `network` on the test clips of `data`.
+
+    Raises SIGTERMException when SIGTERM came, also during the last clip, where Lightning forgets it.
+    """
     module = Reconstructor(network, {}, scores=scores, warmup=warmup)
     trainer.test(module, data, verbose=False)
+    if trainer.received_sigterm:
+        raise SIGTERMException
     macs_of_frame, milliseconds = cost(network, module.sample)
     height, width = module.sample.target.shape[-2:]
     return Row(
