@@ -26,7 +26,7 @@ def test(
 ) -> Row:
     """Return the row of `network` on the test clips of `data`.
 
-    Raises SIGTERMException when SIGTERM came, also during the last clip, where Lightning forgets it.
+    Raises SIGTERMException when SIGTERM came, which Lightning forgets during the last clip.
     """
     module = Reconstructor(network, {}, scores=scores, warmup=warmup)
     trainer.test(module, data, verbose=False)
