@@ -2,9 +2,9 @@
 
 Made anew from the weights that are shipped: docs/figures/nine_views.png, and the section between
 the README's marks `report:results`, scores of test clips of the photographs in PHOTOS
-(data=test_photos), each simulated once for all networks.  Without PHOTOS only the picture.  With
-VIDEO, a still scene through air, the same of data=test_footage for docs/results.md, beside the
-published networks whose weights are in `--published`.
+(data=test_photos), each simulated once for all networks, beside the published ones whose weights
+are in `--published`.  Without PHOTOS only the picture.  With VIDEO, a still scene through air, the
+same of data=test_footage for docs/results.md.
 """
 
 import argparse
@@ -77,8 +77,8 @@ def played(network: Subject, sample: Sample) -> Tensor:
     return network.play(sample.voxels[0, :, None], positions, float(sample.window_s[0]))[0]
 
 
-def table(cfg: DictConfig, rows: dict[str, Subject]) -> str:
-    """Return the scores of all `rows` on the test clips of `cfg`, as Markdown."""
+def scores(cfg: DictConfig, rows: dict[str, Subject]) -> dict[str, list[dict[str, float]]]:
+    """Return the scores of all `rows` on each of the test clips of `cfg`."""
     pipeline, measure = build.pipeline(cfg, "test"), build.scores(cfg)
     values, clips = {row: [] for row in rows}, cfg.data.test_clips
     for clip in range(clips):
@@ -87,15 +87,20 @@ def table(cfg: DictConfig, rows: dict[str, Subject]) -> str:
             frames = played(network, sample)[cfg.data.warmup :]
             values[row].append(measure(frames, sample.target[0, cfg.data.warmup :]))
         print(f"{clip + 1} of {clips} clips", flush=True)
+    return values
+
+
+def table(values: dict[str, list[dict[str, float]]]) -> str:
+    """Return the `scores` of rows as Markdown, and the differences of PAIRS."""
     heads = [f"{metric.heading} {metric.arrow}" for metric in METRICS]
     lines = ["| | " + " | ".join(heads) + " |", "|---|" + "---|" * len(heads)]
-    for row, scores in values.items():
-        cells = [written(metric, [score[metric.name] for score in scores]) for metric in METRICS]
+    for row, clips in values.items():
+        cells = [written(metric, [clip[metric.name] for clip in clips]) for metric in METRICS]
         lines.append(f"| {row} | " + " | ".join(cells) + " |")
     for name, (nine, one) in PAIRS.items():
         lines.append(f"| *{name}* | " + " | ".join(gains(values[nine], values[one])) + " |")
     note = "in brackets what holds 95 % of the means, or differences, of resampled clips."
-    return "\n".join([*lines, "", f"{clips} clips; {note}"])
+    return "\n".join([*lines, "", f"{len(next(iter(values.values())))} clips; {note}"])
 
 
 def gains(nine: list[dict[str, float]], one: list[dict[str, float]]) -> list[str]:
@@ -151,14 +156,13 @@ def main() -> None:
     if not given.root:
         return
     clips = [f"scene.root={given.root}", f"data.test_clips={given.clips}"]
-    rows = {row: subject(*what) for row, what in ROWS.items()}
+    chosen = ROWS | (OTHERS if given.published else {})
+    rows = {row: subject(*what, given.published) for row, what in chosen.items()}
     cfg = config("eval", "data=test_photos", *clips)
-    replace_section(HOME / "README.md", "results", table(cfg, rows))
+    replace_section(HOME / "README.md", "results", table(scores(cfg, rows)))
     if given.footage:
-        others = OTHERS if given.published else {}
-        rows |= {row: subject(*what, given.published) for row, what in others.items()}
         cfg = config("eval", "data=test_footage", f"turbulence.root={given.footage}", *clips)
-        replace_section(HOME / "docs" / "results.md", "footage", table(cfg, rows))
+        replace_section(HOME / "docs" / "results.md", "footage", table(scores(cfg, rows)))
 
 
 if __name__ == "__main__":
