@@ -31,7 +31,7 @@ def ship(run: Path, name: str, tests: list[Path]) -> Path:
     ckpt = files.newest(run)
     network = files.load(ckpt)
     content = torch.load(ckpt, map_location="cpu", weights_only=True)
-    card = facts(ckpt.parent.parent, content)
+    card = facts(ckpt.parent.parent, content, first_config(run))
     path = files.WEIGHTS / f"{name}.safetensors"
     path.parent.mkdir(parents=True, exist_ok=True)
     if rows := curve(run):
@@ -60,15 +60,15 @@ def _write_card(
     return path
 
 
-def facts(run: Path, content: dict) -> dict:
+def facts(run: Path, content: dict, first: DictConfig) -> dict:
     """Return what the header of the file says of the training in the folder `run`, of which
-    `content` is a checkpoint.
+    `content` is a checkpoint, and which began with the config `first`.
     """
     text = (run / "config.yaml").read_text()
     cfg = OmegaConf.create(text)
     return {
         "experiment": cfg.name,
-        "started_from": _start(cfg),
+        "started_from": _start(first),
         "seed": cfg.seed,
         "steps": content.get("steps", content["global_step"]),
         "windows_seen": content["windows"],
@@ -85,6 +85,12 @@ def facts(run: Path, content: dict) -> dict:
         "batch_size": cfg.data.batch_size,
         "precision": cfg.trainer.precision,
     }
+
+
+def first_config(run: Path) -> DictConfig:
+    """Return the config that a run, or the first part of a campaign's training, began with."""
+    parts = sorted(run.glob("part*/config.yaml"))
+    return OmegaConf.load(parts[0] if parts else run / "config.yaml")
 
 
 def seen(network: torch.nn.Module) -> str:
@@ -160,7 +166,7 @@ def main() -> None:
     if (files.WEIGHTS / f"{arguments.run}.safetensors").is_file():
         print(recard(str(arguments.run), arguments.test))
         return
-    name = arguments.name or OmegaConf.load(next(arguments.run.rglob("config.yaml"))).name
+    name = arguments.name or first_config(arguments.run).name
     print(ship(arguments.run, name, arguments.test))
 
 

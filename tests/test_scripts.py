@@ -1,5 +1,7 @@
 """From runs to shipped weights and figures."""
 
+import shutil
+
 import torch
 
 from scripts import air_map as air
@@ -24,6 +26,13 @@ def test_a_trained_run_is_shipped_whole_with_its_card(tmp_path, monkeypatch):
     assert path.with_suffix(".png").is_file() and "![learning curve](one.png)" in card
     assert "| windows_seen | 4 |" in card and "| started_from | nothing |" in card
     assert "`ckpt=tiny/one`" in card and "| steps | 2 |" in card and "9 view(s)" in card
+    first, last = tmp_path / "parts/part000", tmp_path / "parts/part001"
+    shutil.copytree(run, last)
+    first.mkdir()
+    config_of = (run / "config.yaml").read_text()
+    (first / "config.yaml").write_text(config_of.replace("ckpt: null", "ckpt: a/one.safetensors"))
+    parts = ship(tmp_path / "parts", "tiny/parts", []).with_suffix(".md").read_text()
+    assert "| started_from | one.safetensors |" in parts
     whole = path.read_bytes()
     assert recard("tiny/one", [run, run]) == path and path.read_bytes() == whole
     anew = path.with_suffix(".md").read_text().splitlines()
