@@ -15,6 +15,7 @@ from src.eval import evaluate
 from src.models import files
 from src.reconstruct import reconstruct
 from src.records import results
+from src.stress import stress
 from src.train import train
 from tests.conftest import ROOT
 from tests.test_door import command, environment
@@ -72,11 +73,13 @@ def test_every_job_composes_and_two_run(path, tmp_path, weights):
         "train": ([*TINY, "logger=none"], train),
         "eval": (SMALL, evaluate),
         "reconstruct": (["ckpt=lf3x3", "end=0.02"], reconstruct),
+        "stress": (["ckpt=lf3x3", "clips=1", "processes=1", "data.test_windows=60"], stress),
     }[door]
+    output = {reconstruct: "video.h5", stress: "stress.csv"}.get(work, "results.json")
     for place in (0, -1):
         run = tmp_path / str(place)
         work(composed(path, run, *found[place], *tiny))
-        assert (run / ("video.h5" if work is reconstruct else "results.json")).is_file()
+        assert (run / output).is_file()
 
 
 SCORED = ["-m", "baseline=highpass", "debug=fdr", "metrics.lpips=null"]

@@ -1,0 +1,60 @@
+"""The front of a dart: a path that strays by a known amount, a trail, a clip too short to tell."""
+
+import math
+
+import pytest
+import torch
+
+from src.bench.candidates import Subject
+from src.bench.probes.flight import Flight, across
+from src.bench.probes.standard import Bench
+from src.sim.optics import Optics
+from src.sim.pipeline import Pipeline
+from src.sim.scenes.targets import Targets
+from src.sim.turbulence.simulated import SimulatedAir
+from tests.bench.probes.test_probes import Running
+
+SIDE, FRAMES = 128, 100
+
+
+def film(stray: float = 0.0, trail: float = 0.0) -> torch.Tensor:
+    """A blob that flies level, above and below its line by `stray` in turns of 12 frames."""
+    y, x = torch.meshgrid(torch.arange(SIDE), torch.arange(SIDE), indexing="ij")
+    shown, frames = torch.zeros(SIDE, SIDE), []
+    for k in range(FRAMES):
+        row = 64 + stray * math.copysign(1, math.sin(math.pi * (k + 0.5) / 12))
+        blob = torch.exp(-((x - 5 - 1.2 * k) ** 2 + (y - row) ** 2) / 18)
+        shown = torch.maximum(trail * shown, blob)
+        frames.append(shown)
+    return torch.stack(frames)
+
+
+def test_a_straight_flight_does_not_stray():
+    assert across(film(), film()) < 0.01
+
+
+def test_a_front_that_strays_is_measured():
+    assert across(film(stray=1.0), film()) == pytest.approx(1.0, rel=0.25)
+    assert across(film(stray=2.0), film()) > 1.7 * across(film(stray=1.0), film())
+
+
+def test_a_trail_that_stays_does_not_count():
+    assert across(film(trail=0.98), film()) < 0.05
+
+
+def test_a_clip_that_shows_too_little_of_a_flight_is_named():
+    with pytest.raises(ValueError, match=r"data\.test_windows must show more of a flight"):
+        across(film()[:40], film()[:40])
+
+
+def test_the_probe_holds_a_network_against_still_air_and_the_light():
+    scene = Targets(
+        kinds=["dart"], height=SIDE, width=SIDE, frames=61, fps=12_000.0, split="test",
+        options={"dart": {"speed": 16_000.0, "length": 0.25}},
+    )  # fmt: skip
+    air = SimulatedAir({"severity": "strong", "width_px": SIDE})
+    pipeline = Pipeline(scene, Optics(1), air, {"threshold": 0.2}, split="test")
+    found = Flight(limit=0.3)(Subject("running", Running(), 1), Bench(pipeline, [0], 0))
+    (still, calm), (light, seen), (clip, stray) = found.curve
+    assert (still, light, clip) == ("no turbulence", "light of one view", "clip 0")
+    assert found.value == stray and calm < 0.2 and seen > calm
