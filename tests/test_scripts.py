@@ -5,6 +5,7 @@ import shutil
 import torch
 
 from scripts import air_map as air
+from scripts import alignment
 from scripts.ship_weights import recard, ship
 from src.figures import air_map
 from src.models import files
@@ -58,3 +59,29 @@ def test_a_map_of_air_says_where_views_pay(tmp_path):
     }
     assert air.enough(cells) == {(7, 1): (9.0, "9")}
     assert air_map.draw(tmp_path / "map.png", {"a": margins, "b": air.enough(cells)}).is_file()
+
+
+def test_views_brought_back_by_their_own_tilt_are_the_picture_again():
+    y, x = torch.meshgrid(torch.arange(48.0), torch.arange(48.0), indexing="ij")
+
+    def seen(dx: float) -> torch.Tensor:
+        return 0.5 * torch.sin((x - dx) / 3) * torch.cos(y / 4)
+
+    shifts = torch.linspace(-3, 3, 9)
+    events = torch.stack(
+        [torch.stack([seen(dx) for dx in shifts.tolist()]), torch.zeros(9, 48, 48)]
+    )
+    tilt = torch.zeros(9, 2, 2, 48, 48)
+    tilt[:, :, 0] = shifts[:, None, None, None]
+    truth = 0.5 + alignment.GAIN * seen(0.0)
+
+    def error(name: str, moved: torch.Tensor) -> float:
+        film = alignment.drawn(events, moved, keep=1.0)[name][-1, 0]
+        return float((film - truth)[:, 6:-6].abs().mean())
+
+    assert error("nine, local", tilt) < error("nine as they are", tilt) / 5
+    assert error("one view", tilt) < 1e-6
+    assert abs(error("nine, whole", tilt) - error("nine, local", tilt)) < 1e-3
+    torn = tilt.clone()
+    torn[..., 24:, :] *= -1  # whole views do not move
+    assert abs(error("nine, whole", torn) - error("nine as they are", torn)) < 1e-3
