@@ -3,14 +3,16 @@
 Writes the video and `frames.csv`: the time stamp and the events of each frame.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import hydra
+import numpy as np
 from omegaconf import DictConfig
 from torch import nn
 
 from src.app import build, door
+from src.models.look_ahead import checked
 from src.models.runtime import Runtime
 from src.recordings import event_lists, lookup, output, progress, stream
 from src.recordings.files import sources
@@ -64,11 +66,22 @@ def frames(
         end_s=cfg.end,
         grids=not isinstance(net, Runtime),
     )
-    chunks = sources.events(cfg.recording, views.sensor, cfg.chunk_s)
-    windows = stream.windows(chunks, lookup.build(views), rule)
-    if isinstance(net, Runtime):
-        return event_lists.frames(windows, net, overlap=span)
-    return stream.frames(windows, net, overlap=span, positions=views.positions, device=cfg.device)
+
+    def chunks() -> Iterator[np.ndarray]:
+        return sources.events(cfg.recording, views.sensor, cfg.chunk_s)
+
+    def run(windows: Iterable[stream.Window]) -> Iterator[stream.Frame]:
+        more = {"overlap": span, "carry": carry}
+        if isinstance(net, Runtime):
+            return event_lists.frames(windows, net, **more)
+        return stream.frames(windows, net, positions=views.positions, device=cfg.device, **more)
+
+    table, carry = lookup.build(views), stream.Carry()
+    if checked(cfg.look_ahead_s):
+        for _ in run(stream.backwards(chunks(), table, rule, cfg.look_ahead_s)):
+            pass
+        carry.turn()
+    return run(stream.windows(chunks(), table, rule))
 
 
 @hydra.main(version_base=None, config_path="../conf", config_name="reconstruct")

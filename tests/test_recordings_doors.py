@@ -92,6 +92,18 @@ def test_a_faster_form_gives_nearly_the_same_frames(folder, found, tmp_path):
     assert 0 < np.abs(shown[0] - shown[1]).mean() < 0.02
 
 
+def test_what_looking_ahead_adds_is_there_from_the_first_frame_and_fades(folder, found, tmp_path):
+    chosen = [f"recording={folder}/dot.raw", f"views={found}", HIGHPASS, "output=hdf5"]
+    films = []
+    for ahead in (0.0, 0.1):
+        run = tmp_path / str(ahead)
+        reconstruct(config("reconstruct", run, *chosen, f"look_ahead_s={ahead}"))
+        with h5py.File(run / "video.h5") as file:
+            films.append(file["frames"][:].astype(float))
+    added = np.abs(films[1] - films[0]).mean((1, 2))
+    assert added[0] > 0.1 and added[-1] < 0.5 * added[0]
+
+
 def test_the_reconstructed_dot_moves_as_the_true_one(folder, found, tmp_path):
     chosen = [f"recording={folder}/dot.raw", f"views={found}", HIGHPASS, "output=hdf5", "fps=300"]
     run = reconstruct(config("reconstruct", tmp_path / "run", *chosen))
@@ -120,6 +132,8 @@ def test_without_views_the_sensor_is_one_view(folder, tmp_path):
         ("form=bf16", "form must be float32 for a network without parameters"),
         ("start=3.0 end=2.0", "start must be"),
         ("ckpt=null", "must name a network"),
+        ("look_ahead_s=-1", "look_ahead_s must be >= 0"),
+        ("look_ahead_s=1 count=500", "look_ahead_s must be 0 with count=500"),
     ],
 )
 def test_wrong_values_are_refused(folder, wrong, message, tmp_path):

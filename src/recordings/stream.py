@@ -11,7 +11,7 @@ is exactly the reconstruction at the trained rate, and every event counts once p
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain, cycle
 from typing import Any
 
@@ -45,6 +45,13 @@ class Window:
     def seconds(self) -> float:
         """How long the window lasts."""
         return (self.end_us - self.start_us) * 1e-6
+
+    def reversed(self) -> "Window":
+        """Return the window with its events backwards in time: last first, polarity the other."""
+        if self.voxels is not None:
+            return replace(self, voxels=-self.voxels[:, ::-1])
+        t, x, y, weight, view = (part[::-1] for part in self.parts)
+        return replace(self, parts=(self.seconds - t, x, y, -weight, view))
 
 
 @dataclass(frozen=True)
@@ -111,6 +118,35 @@ def windows(chunks: Iterable[np.ndarray], lookup: Lookup, rule: Rule) -> Iterato
     if window is None:
         length = f"1/{rule.fps} s" if rule.count is None else f"{rule.count} events"
         raise ValueError(f"recording must be longer than one window of {length}, got less")
+
+
+def backwards(
+    chunks: Iterable[np.ndarray], lookup: Lookup, rule: Rule, seconds: float
+) -> Iterator[Window]:
+    """Yield the windows by time of the first `seconds`, the last first, each `reversed`.
+
+    As many as are a multiple of the rule's `overlap`, so that `Carry.turn` gives every phase its
+    state.  Holds the events of these seconds.  Raises ValueError as `windows`, and for windows by
+    count.
+    """
+    if rule.fps is None:
+        raise ValueError(f"look_ahead_s must be 0 with count={rule.count}: it wants windows by fps")
+    ordered, period = _ordered(chunks, lookup), 1e6 / rule.fps
+    first = next(ordered, None)
+    if first is None:
+        return
+    start = first["t"][0] + 1e6 * rule.start_s
+    end = start + 1e6 * min(seconds, rule.end_s - rule.start_s)
+    held = []
+    for chunk in chain([first], ordered):
+        held.append(chunk[np.searchsorted(chunk["t"], start) :])
+        if chunk["t"][-1] >= end:
+            break
+    events = np.concatenate(held)
+    last = min(end, float(chunk["t"][-1]) + 1)
+    whole = int((last - start) / period + 1 - COVERED)
+    for k in range(whole // rule.overlap * rule.overlap, 0, -1):
+        yield _window(events, lookup, rule, start, k).reversed()
 
 
 def _ordered(chunks: Iterable[np.ndarray], lookup: Lookup) -> Iterator[np.ndarray]:
@@ -201,6 +237,11 @@ class Carry:
     states: list[Any] = field(default_factory=list)
     picture: Float[np.ndarray, "h w"] | None = None
     frames: int = 0
+
+    def turn(self) -> None:
+        """After windows `backwards`, be ready for the same windows forwards."""
+        self.states.reverse()
+        self.frames = 0
 
 
 def each_view(

@@ -67,3 +67,28 @@ def test_what_is_run_follows_from_network_and_device():
         event_lists.ready(network, "bf16", "cpu", VIEWS, 3)
     with pytest.raises(ValueError, match="device must be cpu for form=openvino, got cuda"):
         event_lists.ready(network, "openvino", "cuda", VIEWS, 5)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("cut", [{"fps": 240.0}, {"fps": 600.0, "overlap": 5}])
+def test_lists_of_events_backwards_are_the_grids_backwards(name, cut):
+    torch.manual_seed(0)
+    network, table = NETWORKS[name]().eval(), lookup.build(VIEWS)
+    span = cut.get("overlap", 1)
+    runtime = event_lists.ready(network, "float32", "cpu", VIEWS, 5)
+    shown = []
+    for grids in (True, False):
+        carry, rule = stream.Carry(), stream.Rule(**cut, grids=grids)
+        more = {"overlap": span, "carry": carry}
+        for windows in (stream.backwards, stream.windows):
+            ahead = [0.03] if windows is stream.backwards else []
+            made = windows([recording()], table, rule, *ahead)
+            if grids:
+                found = list(stream.frames(made, network, positions=VIEWS.positions, **more))
+            else:
+                found = list(event_lists.frames(made, runtime, **more))
+            if ahead:
+                assert len(found) == {240.0: 7, 600.0: 15}[cut["fps"]]
+                carry.turn()
+        shown.append(np.stack([frame.picture for frame in found]))
+    np.testing.assert_allclose(*shown, atol=1e-5)

@@ -249,3 +249,35 @@ def test_nine_view_weights_with_one_view_are_refused():
 def test_pictures_are_in_range_for_any_events():
     found = pictures(events(4000, 50_000), Rule(fps=100), Leaky(keep=1.0))
     assert found.min() >= 0 and found.max() <= 1 and torch.from_numpy(found).isfinite().all()
+
+
+class Sums(torch.nn.Module):
+    """The sum of all events so far, in grey: 0.5 is none."""
+
+    def forward(self, voxels, state=None):
+        change = voxels.sum((1, 2))[:, None]
+        state = change if state is None else state + change
+        return 0.5 + 1e-3 * state, state
+
+
+@pytest.mark.parametrize("overlap, size", [(1, 4000), (4, 4000), (4, 100)])
+def test_what_looked_ahead_begins_with_what_is_missing_to_there(overlap, size):
+    made, rule = events(4000, 100_000), Rule(fps=1000, overlap=overlap, start_s=0.01)
+    once, carry = pictures(made, rule, Sums(), overlap=overlap), Carry()
+    back = list(stream.backwards(chunks(made, size), TABLE, rule, 0.0335))
+    assert [window.end_us - made["t"][0] for window in back] == [
+        1e3 * (10 + k) for k in range(33 // overlap * overlap, 0, -1)
+    ]
+    for _ in stream.frames(back, Sums(), overlap=overlap, carry=carry):
+        pass
+    carry.turn()
+    ahead = pictures(made, rule, Sums(), carry, overlap)
+    there = 33 // overlap * overlap  # the last window of each phase that was looked at
+    for k in range(overlap):
+        base = once[there - overlap + k] - 0.5
+        np.testing.assert_allclose(ahead[k::overlap], once[k::overlap] - base, atol=1e-5)
+
+
+def test_looking_ahead_wants_windows_by_time():
+    with pytest.raises(ValueError, match=r"look_ahead_s must be 0 with count=300"):
+        list(stream.backwards([events(4000, 100_000)], TABLE, Rule(count=300), 1.0))

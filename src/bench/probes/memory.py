@@ -13,6 +13,7 @@ from src.bench.probes.clips import Conditions, Stream
 from src.bench.probes.standard import Bench, Finding
 from src.metrics.image import aligned_psnr
 from src.metrics.temporal import wobble
+from src.models.look_ahead import reversed_grid
 
 LOOP_SCORED = 4  # every so manyth window of a long run is scored
 
@@ -55,8 +56,7 @@ class LongRun:
         """Return the loss in dB; the curve has one entry a tenth of the run."""
         stream = bench.streams()[0]
         forth = list(stream.windows(stream.fps))
-        # Played backwards light changes by the opposite: bins reversed, polarity negated.
-        back = [-window.flip(2) for window in reversed(forth)]
+        back = [reversed_grid(window) for window in reversed(forth)]
         truth = torch.cat([stream.target[1:], stream.target[:-1].flip(0)])
         loop, length = forth + back, 2 * len(forth)
         if self.windows < 3 * length:

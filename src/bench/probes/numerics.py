@@ -14,6 +14,7 @@ from src.bench.probes.clips import Stream
 from src.bench.probes.standard import Bench, Finding
 from src.metrics.image import aligned_psnr
 from src.models.fast import running
+from src.models.look_ahead import reversed_grid
 from src.models.unroll import accepted
 from src.sim import noise
 
@@ -115,7 +116,7 @@ class Bf16:
 
     def _scores(self, subject: Subject, stream: Stream) -> Tensor:
         forth = list(stream.windows(stream.fps))
-        back = [-window.flip(2) for window in reversed(forth)]
+        back = [reversed_grid(window) for window in reversed(forth)]
         truth = torch.cat([stream.target[1:], stream.target[:-1].flip(0)])
         shown = islice(cycle(forth + back), self.windows // 4 * 4)
         frames, _ = subject.play(shown, stream.positions, 1 / stream.fps)
