@@ -13,24 +13,22 @@ the weaker and the stronger half of the clips' air, and for shorter and longer h
 import math
 import sys
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
-from hydra import compose, initialize_config_dir
 from jaxtyping import Float
 from torch import Tensor
 
+from scripts.readme import config, gains
 from src.app import build
-from src.metrics.bootstrap import difference
 from src.metrics.scores import Scores
 from src.metrics.table import METRICS
 from src.metrics.temporal import pull
 from src.sim.pipeline import Pipeline
 
-CONF = Path(__file__).resolve().parents[1] / "conf"
 MEMORY_S = 0.5  # time constant of the leaky sums: SetNet's longer one
 GAIN = 0.45  # grey levels for a change of log intensity by one
+AS_THEY_ARE = "nine as they are"
 Row = dict[str, dict[str, float]]
 
 
@@ -38,14 +36,14 @@ def drawn(
     events: Float[Tensor, "windows views h w"],
     tilt: Float[Tensor, "views windows 2 h w"],
     keep: float,
+    centre: int,
 ) -> dict[str, Float[Tensor, "windows 1 h w"]]:
     """Return the films that each way makes of `events`, log intensity gained; `tilt` in pixels."""
     total, films = torch.zeros_like(events[0]), {}
     for now, moved in zip(events, tilt.transpose(0, 1), strict=True):
         total = keep * total + now
-        centre = len(total) // 2
         whole = moved.mean((2, 3), keepdim=True).expand_as(moved)
-        pictures = {"one view": total[centre, None], "nine as they are": total.mean(0, True)}
+        pictures = {"one view": total[centre, None], AS_THEY_ARE: total.mean(0, True)}
         for name, by in {"nine, whole": whole, "nine, local": moved}.items():
             pictures[name] = pull(total[:, None], by).mean(0)
         for name, picture in pictures.items():
@@ -59,7 +57,7 @@ def clip(pipeline: Pipeline, number: int, scores: Scores, warmup: int) -> tuple[
     sample = pipeline.expose(draw, pipeline.views(draw))
     events = draw.threshold * sample.voxels[0].sum(2)
     keep = math.exp(-float(sample.window_s) / MEMORY_S)
-    films = drawn(events, pipeline.tilt(draw)[:, 1:], keep)
+    films = drawn(events, pipeline.tilt(draw)[:, 1:], keep, pipeline.optics.centre)
     truth = sample.target[0, warmup:]
     row = {name: scores(film[warmup:], truth) for name, film in films.items()}
     return row, sample.drawn[0]
@@ -76,7 +74,7 @@ def table(rows: Sequence[Row], airs: Sequence[dict]) -> Iterator[str]:
     for group, chosen in _groups(airs).items():
         part = [row for row, is_in in zip(rows, chosen, strict=True) if is_in]
         for name in ("nine, whole", "nine, local"):
-            cells = [_gain(part, name, m.name, m.digits) for m in METRICS]
+            cells = gains([row[name] for row in part], [row[AS_THEY_ARE] for row in part])
             yield _line(f"{name}, {group} ({len(part)} clips)", cells)
 
 
@@ -96,19 +94,11 @@ def _groups(airs: Sequence[dict]) -> dict[str, Sequence[bool]]:
     }
 
 
-def _gain(rows: Sequence[Row], name: str, metric: str, digits: int) -> str:
-    sides = [[[row[n][metric] for row in rows]] for n in (name, "nine as they are")]
-    low, high = difference(*sides)
-    value = np.mean(sides[0]) - np.mean(sides[1])
-    return f"{value:+.{digits}f} ({low:+.{digits}f} to {high:+.{digits}f})"
-
-
 def main(overrides: Sequence[str]) -> None:
     """Score the test clips of the config, print the tables."""
     torch.set_num_threads(1)
-    with initialize_config_dir(str(CONF), version_base=None):
-        cfg = compose("eval", list(overrides))
-    pipeline, scores = build.pipeline(cfg, "test"), Scores(build.part(cfg, "metrics.lpips"))
+    cfg = config("eval", *overrides)
+    pipeline, scores = build.pipeline(cfg, "test"), build.scores(cfg)
     both = [clip(pipeline, k, scores, cfg.data.warmup) for k in range(cfg.data.test_clips)]
     print("\n".join(table(*zip(*both, strict=True))))
 

@@ -12,7 +12,6 @@ from omegaconf import DictConfig
 from torch import nn
 
 from src.app import build, door
-from src.models.look_ahead import checked
 from src.models.runtime import Runtime
 from src.recordings import event_lists, lookup, output, progress, stream
 from src.recordings.files import sources
@@ -77,7 +76,7 @@ def frames(
         return stream.frames(windows, net, positions=views.positions, device=cfg.device, **more)
 
     table, carry = lookup.build(views), stream.Carry()
-    if checked(cfg.look_ahead_s):
+    if cfg.look_ahead_s:
         for _ in run(stream.backwards(chunks(), table, rule, cfg.look_ahead_s)):
             pass
         carry.turn()

@@ -20,7 +20,7 @@ from src.app.parts import make, part, rooms
 from src.app.simulation import pipeline
 from src.metrics.scores import Scores
 from src.models.fast import computes_bf16
-from src.models.look_ahead import LookAhead, checked
+from src.models.look_ahead import LookAhead
 from src.models.unroll import takes
 from src.records.results import Row
 from src.sim.optics import Optics
@@ -92,7 +92,7 @@ def chosen(cfg: DictConfig) -> nn.Module:
 def frozen(cfg: DictConfig) -> nn.Module:
     """Return the chosen network, with its look ahead and behind it the chosen post-processor."""
     net = chosen(cfg)
-    if checked(cfg.get("look_ahead_s", 0)):
+    if cfg.get("look_ahead_s"):
         net = LookAhead(net, cfg.look_ahead_s)
     return part(cfg, "postprocess", source=net) if cfg.get("postprocess") else net
 

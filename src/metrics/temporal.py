@@ -67,9 +67,9 @@ def wobble(
     return _rms(shift[1:] - shift[:-1], torch.minimum(weight[1:], weight[:-1]))
 
 
-def straightness(path: Float[Tensor, "frames 2"], truth: Float[Tensor, "frames 2"]) -> float:
-    """Return the rms distance in pixels of a path (x, y) from the known one, after removing the
-    constant offset between them.
+def straightness(path: Float[Tensor, "frames axes"], truth: Float[Tensor, "frames axes"]) -> float:
+    """Return the rms distance in pixels of a path, (x, y) or along one axis, from the known one,
+    after removing the constant offset between them.
     """
     error = path - truth
     return float((error - error.mean(0)).square().sum(1).mean().sqrt())

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import nn
 
+from src.models.look_ahead import checked
 from src.models.unroll import accepted, takes
 from src.recordings.lookup import Lookup
 
@@ -126,8 +127,8 @@ def backwards(
     """Yield the windows by time of the first `seconds`, the last first, each `reversed`.
 
     As many as are a multiple of the rule's `overlap`, so that `Carry.turn` gives every phase its
-    state.  Holds the events of these seconds.  Raises ValueError as `windows`, and for windows by
-    count.
+    state.  Holds the events of these seconds.  Raises ValueError as `windows`, for windows by count
+    and for seconds that are no length of time.
     """
     if rule.fps is None:
         raise ValueError(f"look_ahead_s must be 0 with count={rule.count}: it wants windows by fps")
@@ -136,7 +137,7 @@ def backwards(
     if first is None:
         return
     start = first["t"][0] + 1e6 * rule.start_s
-    end = start + 1e6 * min(seconds, rule.end_s - rule.start_s)
+    end = start + 1e6 * min(checked(seconds), rule.end_s - rule.start_s)
     held = []
     for chunk in chain([first], ordered):
         held.append(chunk[np.searchsorted(chunk["t"], start) :])

@@ -1,5 +1,7 @@
 """The dart at 12,000 frames per second flies straighter through nine views than through one."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -41,20 +43,20 @@ def path(frames: list[stream.Frame]) -> tuple[np.ndarray, np.ndarray]:
     return np.array([frame.time_s for frame in frames]), np.array(places)
 
 
-@pytest.mark.slow
-def test_nine_views_fly_the_dart_straighter_than_one(tmp_path):
+def wander_of(air_seed: int, folder: Path) -> dict[int | None, float]:
+    """How far (px, rms) the dart strays through one view and through all (None) of one air."""
     scene = Dart(height=SIDE, width=SIDE, frames=101, fps=FPS, speed=12_000.0, seed=3)
     clip = scene.clip(0)
     air = Atmosphere(0.08, 0.8, 300.0, 0.5, 5.5e-7, 8e-14, 0.7)  # D/r0 3.3, tilt 0.6 px
     turbulence = Turbulence(air, views=list(layout(9)), height=SIDE, width=SIDE, fps=FPS)
-    seen = turbulence.degrade(clip.frames[None], noise.generator(4))[0].clamp(0, 1)
+    seen = turbulence.degrade(clip.frames[None], noise.generator(air_seed))[0].clamp(0, 1)
     camera = capture.kaleidoscope(list(layout(9)), model=(SIDE, SIDE), key=2)
     sensor = EventSensor(0.25, refractory_s=1e-4, refractory="hold", mismatch=0.05, shot_hz=1.0)
-    capture.write_recording(tmp_path / "dart.raw", seen, FPS, camera, sensor)
+    capture.write_recording(folder / "dart.raw", seen, FPS, camera, sensor)
     table = lookup.build(camera)
     wander = {}
     for views in (1, None):
-        chunks = formats.iter_events(tmp_path / "dart.raw", seconds=0.001)
+        chunks = formats.iter_events(folder / "dart.raw", seconds=0.001)
         windows = stream.windows(chunks, table, stream.Rule(fps=FPS, unit="mass"))
         time, found = path(list(stream.frames(windows, Integrator(views)))[LENGTH + 5 :])
         steps = (time - time[0]) * FPS
@@ -64,5 +66,13 @@ def test_nine_views_fly_the_dart_straighter_than_one(tmp_path):
         wander[views] = straightness(
             torch.from_numpy(found[inside]), torch.from_numpy(true[inside])
         )
-    assert inside.sum() > 20
-    assert wander[None] < 0.75 * wander[1]  # one dart: 0.72 with the air of today
+        assert inside.sum() > 20
+    return wander
+
+
+@pytest.mark.slow
+def test_nine_views_fly_the_dart_straighter_than_one(tmp_path):
+    # A mean over airs: with a single draw, one view may happen to look through a calm one.
+    wanders = [wander_of(seed, tmp_path) for seed in (4, 5, 6)]
+    one, nine = (sum(wander[views] for wander in wanders) for views in (1, None))
+    assert nine < 0.7 * one

@@ -10,6 +10,7 @@ from torch import Tensor
 from src.bench.candidates import Subject
 from src.bench.probes.clips import Conditions, Stream
 from src.bench.probes.standard import Bench, Finding
+from src.metrics.temporal import straightness
 
 LAG = 6  # frames over which brightening is looked at
 GATE = 24.0  # pixels around the true front that are looked at
@@ -65,8 +66,7 @@ def across(frames: Float[Tensor, "frames h w"], truth: Float[Tensor, "frames h w
     found = _centroid((risen - risen.amax((1, 2), keepdim=True) / 3).clamp(min=0))
     along = known[-1] - known[0]
     normal = torch.stack([-along[1], along[0]]) / along.norm()
-    error = (found - known) @ normal
-    return float((error - error.mean()).square().mean().sqrt())
+    return straightness((found @ normal)[:, None], (known @ normal)[:, None])
 
 
 def _centroid(weight: Float[Tensor, "frames h w"]) -> Float[Tensor, "frames 2"]:
