@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.parametrizations import spectral_norm as normalise_spectrum
 
-from src.models.layers import ConvGRU, ConvLSTM, ResidualBlock, in_steps, pad_to_multiple
+from src.models.layers import ConvGRU, ConvLSTM, ResidualBlock, pad_to_multiple
 from src.sim.optics import centre, layout
 
 CELLS = {"convlstm": ConvLSTM, "convgru": ConvGRU}
@@ -27,9 +27,9 @@ class E2VID(nn.Module):
 
     `base_channels`: channels of the head, doubled at each of three scales.  `stem_channels`: of one
     more convolution before, at full resolution, so that many views are not squeezed into a narrow
-    head at once; the head is 3x3 then (None: without, as in the paper).  `state_step`: the finest
-    cell sees its hidden map, in [-1, 1], in steps of so much, so that what no event supports does
-    not creep on from window to window (None: as it is, as in the paper).  `recurrent`: convlstm or
+    head at once; the head is 3x3 then (None: without, as in the paper).  `state_step`: outside
+    training the finest cell sees its hidden map, in [-1, 1], in steps of so much, so that what no
+    event supports does not creep on from window to window (None: as it is, as in the paper).  `recurrent`: convlstm or
     convgru.  `kernel_size`: of head, encoders and decoders (published: 5).  `final_activation`:
     sigmoid or none.  `spectral_norm`: keep the largest singular value of the gate kernels at one
     (Miyato et al. 2018); wrap an unroll in `torch.nn.utils.parametrize.cached()` so that it is
@@ -123,9 +123,9 @@ class E2VID(nn.Module):
     def _scales(self, x: Tensor, state: Any) -> tuple[Tensor, list[Tensor], tuple]:
         head = x = x.relu() if self.stem is None else self.head(x.relu()).relu()
         skips, after, states = [], [], list(state or [None] * SCALES)
-        if self.state_step and state:
+        if state and self.state_step and not self.training:
             hidden, memory = states[0]
-            states[0] = in_steps(hidden, self.state_step), memory
+            states[0] = (hidden / self.state_step).round() * self.state_step, memory
         for encoder, cell, before in zip(self.encoders, self.cells, states, strict=True):
             x, new = cell(encoder(x).relu(), before)
             skips.append(x)

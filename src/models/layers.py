@@ -22,13 +22,6 @@ def pad_to_multiple(
     return functional.pad(x, padding, mode="reflect"), (top, left)
 
 
-def in_steps(x: Float[Tensor, "..."], step: float) -> Float[Tensor, "..."]:
-    """Return `x` rounded to multiples of `step`; its gradient passes as if it were not
-    (straight-through: Bengio et al. 2013, arXiv 1308.3432)."""
-    rounded = (x / step).round() * step
-    return x + (rounded - x).detach() if x.requires_grad else rounded
-
-
 class ConvLSTM(nn.Module):
     """A convolutional LSTM cell (Shi et al. 2015) whose gates are one 3x3 convolution.
 
