@@ -29,9 +29,9 @@ class E2VID(nn.Module):
     more convolution before, at full resolution, so that many views are not squeezed into a narrow
     head at once; the head is 3x3 then (None: without, as in the paper).  `state_step`: outside
     training the finest cell sees its hidden map, in [-1, 1], in steps of so much, so that what no
-    event supports does not creep on from window to window (None: as it is, as in the paper).  `recurrent`: convlstm or
-    convgru.  `kernel_size`: of head, encoders and decoders (published: 5).  `final_activation`:
-    sigmoid or none.  `spectral_norm`: keep the largest singular value of the gate kernels at one
+    event supports does not creep on from window to window (None: as it is, as in the paper).
+    `recurrent`: convlstm or convgru.  `kernel_size`: of head, encoders and decoders (published: 5).
+    `final_activation`: sigmoid or none.  `spectral_norm`: keep the largest singular value of the gate kernels at one
     (Miyato et al. 2018); wrap an unroll in `torch.nn.utils.parametrize.cached()` so that it is
     computed once.  Raises ValueError for values outside these.
     """
