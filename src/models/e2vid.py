@@ -31,9 +31,9 @@ class E2VID(nn.Module):
     training the finest cell sees its hidden map, in [-1, 1], in steps of so much, so that what no
     event supports does not creep on from window to window (None: as it is, as in the paper).
     `recurrent`: convlstm or convgru.  `kernel_size`: of head, encoders and decoders (published: 5).
-    `final_activation`: sigmoid or none.  `spectral_norm`: keep the largest singular value of the gate kernels at one
-    (Miyato et al. 2018); wrap an unroll in `torch.nn.utils.parametrize.cached()` so that it is
-    computed once.  Raises ValueError for values outside these.
+    `final_activation`: sigmoid or none.  `spectral_norm`: keep the largest singular value of the
+    gate kernels at one (Miyato et al. 2018); wrap an unroll in
+    `torch.nn.utils.parametrize.cached()` so that it is computed once.  Raises ValueError for values outside these.
     """
 
     def __init__(
