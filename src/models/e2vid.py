@@ -33,7 +33,8 @@ class E2VID(nn.Module):
     `recurrent`: convlstm or convgru.  `kernel_size`: of head, encoders and decoders (published: 5).
     `final_activation`: sigmoid or none.  `spectral_norm`: keep the largest singular value of the
     gate kernels at one (Miyato et al. 2018); wrap an unroll in
-    `torch.nn.utils.parametrize.cached()` so that it is computed once.  Raises ValueError for values outside these.
+    `torch.nn.utils.parametrize.cached()` so that it is computed once.  Raises ValueError for values
+    outside these.
     """
 
     def __init__(
