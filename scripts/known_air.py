@@ -1,15 +1,15 @@
 """What the meter of task=air finds in air that is known: python -m scripts.known_air [clips, 20] [first, 1000] [again | warps | air.yaml].
 
-Clip k is a photograph of 256 px seen through air that shows an rms of 0.25 to 1.5 px, a half length
-of 5 to 70 px (both log-uniform) and a decay of 0.04 to 0.2 s: 240 frames at 30 a second, as many as
-task=air reads, `ar1` and `flow` in turn, noise of 1 %, 8 bits.  Printed is what was found "of clip",
+Clip k is a photograph seen through air that shows an rms of 0.25 to 1.5 px of 256, a half length
+of 5 to 70 px (both log-uniform) and a decay of 0.04 to 0.2 s: 240 frames of 512 px at 30 a second,
+as many and as large as task=air works on, `ar1` and `flow` in turn, noise of 1 %, 8 bits.  Printed is what was found "of clip",
 over what that very clip was given: its tilt field less every point's mean, as a film shows no more;
 and "of air", over what its atmosphere gives on average; 1 for `held` where the interval holds that.
 `again`: besides, a clip of the same photograph in air drawn from what was measured
 (turbulence=measured) is measured, over what was found first; of `blur_ratio`, its excess of one.
 `air.yaml`: photographs in air drawn from that file instead, and what is found.
-`warps`: a table of Gaussian warps instead, new in each of 24 frames, of two photographs: rms and
-half length found over those given.
+`warps`: a table of Gaussian warps instead, new in each of 24 frames of 256 px, of two photographs:
+rms and half length found over those given.
 """  # noqa: E501
 
 import math
@@ -35,20 +35,21 @@ from src.sim.turbulence.ranges import log_between
 
 PHOTOGRAPHS = Path("../shared/data/photos/bsds500_val")
 CONF = Path(__file__).resolve().parents[1] / "conf/turbulence/measured.yaml"
-SIDE, FRAMES, FPS, NOISE = 256, 240, 30.0, 0.01
+SIDE, FILM, FRAMES, FPS, NOISE = 256, 512, 240, 30.0, 0.01
 RMS, HALF, DECAY, TIMES = (0.25, 1.5), (5.0, 70.0), (0.04, 0.2), ("ar1", "flow")
 WARPS = (3.3, 6.7, 13.3, 26.6, 53.3), (0.25, 0.75, 1.5)  # half lengths, rms
 KEYS = ("rms_px", "half_length_px", "whole_share", "decay_s", "blur_ratio")
 
 
-def photograph(k: int) -> Float[np.ndarray, "h w"]:
-    """Return photograph k of PHOTOGRAPHS, the middle square, in [0, 1]."""
+def photograph(k: int, wide: int = FILM) -> Float[np.ndarray, "h w"]:
+    """Return photograph k of PHOTOGRAPHS, the middle square, `wide` pixels, in [0, 1]."""
     files = sorted(PHOTOGRAPHS.glob("*.jpg"))
     picture = cv2.imread(str(files[k % len(files)]), cv2.IMREAD_GRAYSCALE)
     side = min(picture.shape)
     top, left = ((length - side) // 2 for length in picture.shape)
     square = picture[top : top + side, left : left + side]
-    return cv2.resize(square, (SIDE, SIDE), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+    way = cv2.INTER_AREA if wide < side else cv2.INTER_CUBIC
+    return cv2.resize(square, (wide, wide), interpolation=way).astype(np.float32) / 255
 
 
 def path_of(k: int) -> Atmosphere:
@@ -70,13 +71,13 @@ def path_of(k: int) -> Atmosphere:
 def film(
     picture: Float[np.ndarray, "h w"], path: Atmosphere, k: int
 ) -> tuple[Float[np.ndarray, "frames h w"], Float[np.ndarray, "frames 2 h w"]]:
-    """Return a film of the picture through the air, and its tilt in pixels."""
-    size = {"views": 1, "height": SIDE, "width": SIDE, "fps": FPS}
+    """Return a film of the picture through the air, and its tilt in pixels of SIDE."""
+    size = {"views": 1, "height": FILM, "width": FILM, "fps": FPS}
     air = Turbulence(path, temporal=TIMES[k % 2], **size)
     clean = torch.from_numpy(picture).expand(1, FRAMES, -1, -1)
     seen = air.degrade(clean, torch.Generator().manual_seed(k))[0, 0].numpy()
     tilt = air.tilt(FRAMES, torch.Generator().manual_seed(k))[0].numpy()
-    return _recorded(seen, k), tilt
+    return _recorded(seen, k), tilt * (SIDE / FILM)
 
 
 def warped(
@@ -105,20 +106,21 @@ def _recorded(seen: np.ndarray, k: int) -> np.ndarray:
 
 def given(tilt: Float[np.ndarray, "frames 2 h w"]) -> tuple[float, float, float, float]:
     """Return rms, half length, share of the whole view and decay in seconds of a clip's own tilt,
-    less its mean."""
+    less its mean; lengths in pixels of SIDE."""
     tilt = tilt - tilt.mean(0)
-    wide = 2 * SIDE
+    side = tilt.shape[-1]
+    wide = 2 * side
     power = sum(np.abs(np.fft.rfft2(frame, s=(wide, wide))) ** 2 for frame in tilt).sum(0)
-    pairs = np.fft.irfft2(np.abs(np.fft.rfft2(np.ones((SIDE, SIDE)), s=(wide, wide))) ** 2)
+    pairs = np.fft.irfft2(np.abs(np.fft.rfft2(np.ones((side, side)), s=(wide, wide))) ** 2)
     away = np.fft.fftfreq(wide, 1 / wide)
     ring = np.round(np.hypot(away[:, None], away)).astype(int).ravel()
-    near = ring < SIDE
+    near = ring < side
     total = np.bincount(ring[near], np.fft.irfft2(power).ravel()[near])
     product = total / np.bincount(ring[near], pairs.ravel()[near]) / (2 * len(tilt))
     whole = float((tilt.mean((2, 3)) ** 2).mean() / product[0])
     some = tilt[..., ::8, ::8]
     lags = [(some[lag:] * some[: len(some) - lag]).mean() for lag in range(len(some) // 2)]
-    half = crossing(np.arange(SIDE), product / product[0], 0.5)
+    half = crossing(np.arange(side) * (SIDE / side), product / product[0], 0.5)
     decay = crossing(np.arange(len(lags)) / FPS, np.array(lags) / lags[0], math.exp(-1))
     return float(product[0]) ** 0.5, half, whole, decay
 
@@ -210,7 +212,7 @@ def table() -> Iterator[str]:
         for rms in WARPS[1]:
             rows = []
             for k in range(2):
-                frames, tilt = warped(photograph(k), half, rms, k)
+                frames, tilt = warped(photograph(k, SIDE), half, rms, k)
                 found, known = found_in(frames), given(tilt)
                 if not isinstance(found, str):
                     length = _number(found.found.half_length_px)

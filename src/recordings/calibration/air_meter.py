@@ -18,7 +18,8 @@ from src.recordings.calibration.covariance import CELLS, Model, Tilt
 from src.recordings.calibration.following import Tracks
 from src.recordings.files.measured import ALLOWED, SIDE, AirFile, Estimate
 
-LARGEST = 512  # pixels of the shorter side that is worked on: larger frames are shrunk
+SIZES = (512, 362, 256)  # pixels of the shorter side that is worked on: larger frames are shrunk
+FOLLOWED = 0.75  # of the corners, or the next smaller size is tried
 LEAST_FRAMES, LEAST_POINTS = 16, 40
 LEAST_SEEN = 0.6  # of the frames, or a point is left out
 LEAST_SHARE = 0.2  # of the corners must be followed: where the camera moves, fewer are
@@ -63,14 +64,9 @@ def measure(frames: Float[np.ndarray, "frames h w"], fps: float | None = None) -
     level = frames.mean((1, 2), keepdims=True)
     # To one mean brightness: flicker is not air.
     frames = (frames * (level.mean() / np.maximum(level, 1e-6))).astype(np.float32)
-    size = frames.shape[1:]
-    place = following.corners(frames.mean(0))
-    if len(place) < LEAST_POINTS:
-        raise ValueError(
-            f"video must show texture, {LEAST_POINTS} corners or more, got {len(place)}, in"
-            f" {_covered(place, size):.0%} of the frame"
-        )
-    tracks = _usable(following.follow(frames, place), size)
+    frames, tracks = _followed(frames)
+    size, corners = frames.shape[1:], len(tracks.place)
+    tracks = _usable(tracks, size)
     unit = SIDE / min(size)
     pairs, lags = covariance.over_distance(tracks, size), covariance.over_time(tracks, size)
     model = Model(pairs.at, tracks.window_px2, size)
@@ -98,7 +94,7 @@ def measure(frames: Float[np.ndarray, "frames h w"], fps: float | None = None) -
         place=tracks.place,
         rms_px=np.sqrt(np.maximum(power, 0)) * unit,
         frames=len(frames),
-        corners=len(place),
+        corners=corners,
         fps=fps,
     )
 
@@ -130,7 +126,7 @@ def _wider(sums: Float[np.ndarray, "3"]) -> float:
     return max(math.sqrt(usual / sharpest), 1.0)
 
 
-def shrunk(frame: Float[np.ndarray, "h w"], largest: int = LARGEST) -> Float[np.ndarray, "_h _w"]:
+def shrunk(frame: Float[np.ndarray, "h w"], largest: int = SIZES[0]) -> Float[np.ndarray, "_h _w"]:
     """Return a frame whose smaller side has `largest` pixels at most: so large it is worked on."""
     least = min(frame.shape)
     if least <= largest:
@@ -151,6 +147,28 @@ def _coarse(frames: np.ndarray, tracks: Tracks) -> tuple[Tracks, tuple[int, int]
     place = np.round(tracks.place * SIDE / min(size)).astype(np.float32)
     again = following.follow(small, place)
     return again.of(again.seen.mean(0) >= LEAST_SEEN), small.shape[1:]
+
+
+def _followed(frames: np.ndarray) -> tuple[np.ndarray, Tracks]:
+    """Return the frames at the largest of SIZES at which most corners are followed, and these.
+
+    Strong tilt moves fine frames by more pixels than a corner can be followed over.
+    """
+    least, found = min(frames.shape[1:]), None
+    for side in (min(least, SIZES[0]), *(side for side in SIZES[1:] if side < least)):
+        small = np.stack([shrunk(frame, side) for frame in frames])
+        place = following.corners(small.mean(0))
+        if len(place) < LEAST_POINTS:
+            break
+        found = small, following.follow(small, place)
+        if (found[1].seen.mean(0) >= LEAST_SEEN).mean() >= FOLLOWED:
+            break
+    if found is None:
+        raise ValueError(
+            f"video must show texture, {LEAST_POINTS} corners or more, got {len(place)}, in"
+            f" {_covered(place, small.shape[1:]):.0%} of the frame"
+        )
+    return found
 
 
 def _usable(tracks: Tracks, size: tuple[int, int]) -> Tracks:

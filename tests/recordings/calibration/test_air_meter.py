@@ -68,6 +68,18 @@ def test_rms_and_half_length_of_known_warps_are_found(half_px, rms_px, noise):
     assert found.decay_s.value is None and found.decay_s.high == 1 / 50  # new in every frame
 
 
+def test_tilt_of_many_pixels_of_a_large_frame_is_followed_in_a_smaller_one():
+    push = fields(8 / UNIT, 2.2 / UNIT, 0.0, 16)
+    small = film(push)
+    large = np.stack([
+        cv2.resize(frame, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC) for frame in small
+    ])  # fmt: skip
+    found = air_meter.measure(large)
+    assert found.picture.shape == (256, 256)
+    assert found.found.rms_px.value == pytest.approx(push.std(0).mean() * UNIT * 1.033, rel=0.1)
+    assert found.found.half_length_px.value == pytest.approx(8, rel=0.2)
+
+
 def test_decay_and_the_share_of_the_whole_view_are_found():
     local = fields(8, 0.4, 0.8, 48)
     rng, whole = np.random.default_rng(5), [np.zeros(2)]
