@@ -20,7 +20,7 @@ test-all: $(READY) $(LPIPS)
 
 demo: $(READY) $(DEMO)
 	$(PY) -m src.live recording=$(DEMO)/cap.raw views=$(DEMO)/cap.views.yaml ckpt=lf3x3 \
-		fps=120 speed=0.25 loop=true
+		fps=120 speed=0.2 threads=2 loop=true
 
 lint: $(READY)
 	$(PY) -m ruff check . && $(PY) -m ruff format --check .
