@@ -174,6 +174,6 @@ def _reviewed(own: State, before: list[Position], after: list[Position]) -> Stat
 
 def _emptied(own: State, network: SetNet) -> State:
     """Return the state for another size of network: sums of events stay, its own maps start."""
-    mean_sums, sums, awake, hidden4, _ = own
+    mean_sums, sums, awake, *_ = own
     sizes = network.hidden(*mean_sums.shape[-2:])
-    return (mean_sums, sums, awake, *(hidden4.new_zeros(len(hidden4), *size) for size in sizes))
+    return (mean_sums, sums, awake, *(awake.new_zeros(len(awake), *size) for size in sizes))

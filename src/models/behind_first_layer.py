@@ -86,14 +86,13 @@ class AfterStem(nn.Module):
         sums: Float[Tensor, "1 sums hc wc"],
         passed: Float[Tensor, "1 1 h8 w8"],
         drawn: Float[Tensor, "1 hc wc pixels"],
-        hidden4: Tensor,
-        hidden8: Tensor,
-    ) -> tuple[Float[Tensor, "1 hc wc pixels"], Tensor, Tensor]:
-        """Return the pixels of each cell and the hidden maps, all float32."""
+        *hidden: Tensor,
+    ) -> tuple[Tensor, ...]:
+        """Return the pixels of each cell (1, hc, wc, pixels) and the hidden maps, all float32."""
         stem = functional.conv2d(sums.to(self.dtype), self.memories, None, 1, 1)
         stem = stem + grids.permute(0, 3, 1, 2).to(self.dtype)
-        x, hidden4, hidden8 = self.network.after_stem(stem, passed, hidden4, hidden8)
-        return (x.permute(0, 2, 3, 1) + drawn).sigmoid(), hidden4, hidden8
+        x, *hidden = self.network.after_stem(stem, passed, *hidden)
+        return (x.permute(0, 2, 3, 1) + drawn).sigmoid(), *hidden
 
 
 class OnTorch:

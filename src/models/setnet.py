@@ -32,7 +32,7 @@ RATE = 120.0  # windows a second at which an update gate is taken as it is
 MAX_VIEWS = 25
 
 Position = tuple[int, int]
-State = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+State = tuple[Tensor, ...]
 
 
 class SetNet(nn.Module):
@@ -88,8 +88,8 @@ class SetNet(nn.Module):
         `window_s`: how long the window lasts, in seconds, a number or one per clip (n,).
         `positions`: (row, col) of each view from the centre view; default: `optics.layout`.
         State, float32: leaky sums of the mean view and, in cells, of each view, how awake each
-        block of 8 x 8 is, and two maps in [-1, 1].  Raises ValueError for bins, a number of
-        views, a length of window or a state that do not fit.
+        block of 8 x 8 is, and the `hidden` maps, in [-1, 1].  Raises ValueError for bins, a number
+        of views, a length of window or a state that do not fit.
         """
         n, views, bins, height, width = voxels.shape
         places = self.places(views, bins, positions)
@@ -98,7 +98,7 @@ class SetNet(nn.Module):
         voxels = padded.unflatten(0, (n, views))
         events = voxels.float().sum(2)
         coarse = _in_cells(events, self.cell)
-        mean_sums, sums, awake, hidden4, hidden8 = self._start(state, coarse)
+        mean_sums, sums, awake, *hidden = self._start(state, coarse)
 
         awake, passed = _time(_stirred(coarse, self.cell), awake, seconds)
         keep = torch.cat([torch.exp(-passed / memory) for memory in MEMORIES_S], 1)
@@ -112,10 +112,10 @@ class SetNet(nn.Module):
         )
         memory = torch.cat([sums.flatten(1, 2), spread], 1).to(memories.dtype)
         stem = stem + functional.conv2d(memory, memories, bias, 1, 1)
-        x, hidden4, hidden8 = self.after_stem(stem, passed, hidden4, hidden8)
+        x, *hidden = self.after_stem(stem, passed, *hidden)
         x = functional.pixel_shuffle(x, self.cell)
         frame = (x + (self.skip[:, None, None] * mean_sums).sum(1, keepdim=True)).sigmoid()
-        state = (mean_sums, sums, awake, hidden4, hidden8)
+        state = (mean_sums, sums, awake, *hidden)
         return frame[..., top : top + height, left : left + width].float(), state
 
     def after_stem(

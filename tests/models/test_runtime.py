@@ -18,7 +18,7 @@ from src.sim.voxel import voxel_grid
 EXACT, ROUNDED = 1e-5, 0.02  # in grey levels: sums in another order, and bf16
 NETWORKS = {
     "setnet": lambda: SetNet(stem=4, channels=8),
-    "setnet2": lambda: SetNet2(quarter=4, eighth=8),
+    "setnet2": lambda: SetNet2(half=4),
     "e2vid": lambda: E2VID(views=9, base_channels=4, spectral_norm=True),
     "e2vid_gru_3x3": lambda: E2VID(
         views=9, base_channels=4, recurrent="convgru", kernel_size=3, final_activation="none"
