@@ -15,7 +15,7 @@ from torch.nn import functional
 from src.models import openvino_cpu, stopwatch
 from src.models.e2vid import E2VID
 from src.models.explicit_state import flat, formed
-from src.models.setnet import SetNet
+from src.models.setnet import CELL, SetNet
 from src.sim.optics import Position
 
 
@@ -66,7 +66,7 @@ class AfterStem(nn.Module):
         dtype: torch.dtype,
     ):
         super().__init__()
-        self.views, self.stride = len(positions), network.cell
+        self.views, self.stride = len(positions), CELL
         places = network.places(self.views, network.bins, positions)
         grids, memories, bias = network.kernels(places)
         self.kernel, self.bias = grids.numpy(), bias.numpy()

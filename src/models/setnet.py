@@ -30,6 +30,7 @@ MEMORIES_S = (0.05, 0.5)  # time constants of the leaky sums
 AWAKE_S = 0.005  # time constant by which a block falls asleep after its last event
 RATE = 120.0  # windows a second at which an update gate is taken as it is
 MAX_VIEWS = 25
+CELL = 2  # pixels: side of what the first layer sees as one
 
 Position = tuple[int, int]
 State = tuple[Tensor, ...]
@@ -43,7 +44,6 @@ class SetNet(nn.Module):
     """
 
     views = None
-    cell = 2  # pixels: side of what the first layer sees as one
     sizes = SIZES
 
     def __init__(self, bins: int = 5, stem: int = 12, channels: int = 32):
@@ -55,18 +55,22 @@ class SetNet(nn.Module):
         self.sum_stem = ViewKernels(memories, stem, 3)
         self.spread_stem = nn.Conv2d(memories, stem, 3, padding=1, bias=False)
         self.down4 = nn.Conv2d(stem, channels, 3, 2, padding=1)
-        self.cell4 = PacedGRU(channels)
+        self.cell4 = self.unit(channels)
         self.down8 = nn.Conv2d(channels, 2 * channels, 3, 2, padding=1)
-        self.cell8 = PacedGRU(2 * channels)
+        self.cell8 = self.unit(2 * channels)
         self.block8 = ResidualBlock(2 * channels)
         self.up4 = nn.Conv2d(2 * channels, channels, 1)
         self.mix4 = nn.Conv2d(channels, channels, 3, padding=1)
         self.up2 = nn.Conv2d(channels, stem, 1)
         self.mix2 = nn.Conv2d(stem, stem, 3, padding=1)
-        self.shuffle = nn.Conv2d(stem, 4, 3, padding=1)
+        self.shuffle = nn.Conv2d(stem, CELL**2, 3, padding=1)
         self.frozen: dict[tuple, tuple[Tensor, ...]] | None = None  # kernels kept, for running
         # What is drawn without any learning: the leaky sums themselves.
         self.skip = nn.Parameter(torch.full((memories,), 0.15))
+
+    def unit(self, channels: int) -> nn.Module:
+        """Return a memory of so many channels."""
+        return PacedGRU(channels)
 
     @classmethod
     def preset(cls, size: str, bins: int = 5) -> "SetNet":
@@ -97,23 +101,23 @@ class SetNet(nn.Module):
         padded, (top, left) = pad_to_multiple(voxels.flatten(0, 1), 8)
         voxels = padded.unflatten(0, (n, views))
         events = voxels.float().sum(2)
-        coarse = _in_cells(events, self.cell)
+        coarse = _halved(events)
         mean_sums, sums, awake, *hidden = self._start(state, coarse)
 
-        awake, passed = _time(_stirred(coarse, self.cell), awake, seconds)
+        awake, passed = _time(_stirred(coarse), awake, seconds)
         keep = torch.cat([torch.exp(-passed / memory) for memory in MEMORIES_S], 1)
-        sums = grown(keep, 8 // self.cell)[:, None] * sums + coarse[:, :, None]
+        sums = grown(keep, 8 // CELL)[:, None] * sums + coarse[:, :, None]
         mean_sums = grown(keep, 8) * mean_sums + events.mean(1, keepdim=True)
         spread = (sums - sums.mean(1, keepdim=True)).abs().mean(1)
 
         grids, memories, bias = self.kernels(places)
         stem = functional.conv2d(
-            voxels.flatten(1, 2).to(grids.dtype), grids, None, self.cell, grids.shape[-1] // 2
+            voxels.flatten(1, 2).to(grids.dtype), grids, None, CELL, grids.shape[-1] // 2
         )
         memory = torch.cat([sums.flatten(1, 2), spread], 1).to(memories.dtype)
         stem = stem + functional.conv2d(memory, memories, bias, 1, 1)
         x, *hidden = self.after_stem(stem, passed, *hidden)
-        x = functional.pixel_shuffle(x, self.cell)
+        x = functional.pixel_shuffle(x, CELL)
         frame = (x + (self.skip[:, None, None] * mean_sums).sum(1, keepdim=True)).sigmoid()
         state = (mean_sums, sums, awake, *hidden)
         return frame[..., top : top + height, left : left + width].float(), state
@@ -125,13 +129,19 @@ class SetNet(nn.Module):
 
         `stem`: before its ReLU, (n, stem, hc, wc); `passed`: seconds, (n, 1, h8, w8).
         """
-        stem, pace = stem.relu(), RATE * passed
-        hidden4 = self.cell4(self.down4(stem).relu(), hidden4, grown(pace, 2))
-        after4 = hidden4.to(stem.dtype)
+        return self.below(stem.relu(), passed, hidden4, hidden8)
+
+    def below(
+        self, seen: Tensor, passed: Tensor, hidden4: Tensor, hidden8: Tensor
+    ) -> tuple[Float[Tensor, "n pixels hc wc"], Tensor, Tensor]:
+        """Return what `after_stem` does; `seen`: what is known at half resolution."""
+        pace = RATE * passed
+        hidden4 = self.cell4(self.down4(seen).relu(), hidden4, grown(pace, 2))
+        after4 = hidden4.to(seen.dtype)
         hidden8 = self.cell8(self.down8(after4).relu(), hidden8, pace)
-        x = self.block8(hidden8.to(stem.dtype))
+        x = self.block8(hidden8.to(seen.dtype))
         x = self.mix4((grown(self.up4(x), 2) + after4).relu()).relu()
-        x = self.mix2((grown(self.up2(x), 2) + stem).relu()).relu()
+        x = self.mix2((grown(self.up2(x), 2) + seen).relu()).relu()
         return self.shuffle(x).float(), hidden4, hidden8
 
     def kernels(self, places: tuple[Position, ...]) -> tuple[Tensor, Tensor, Tensor]:
@@ -170,7 +180,7 @@ class SetNet(nn.Module):
     def _start(self, state: State | None, coarse: Tensor) -> State:
         """Return `state`, or zeros of the right sizes; ValueError when they are not right."""
         n, views, rows, columns = coarse.shape
-        height, width = self.cell * rows, self.cell * columns
+        height, width = CELL * rows, CELL * columns
         sizes = [
             (n, len(MEMORIES_S), height, width),
             (n, views, len(MEMORIES_S), rows, columns),
@@ -261,19 +271,14 @@ def _time(stirred: Tensor, awake: Tensor, seconds: Tensor) -> tuple[Tensor, Tens
     return torch.where(stirred, 1.0, awake * left), passed
 
 
-def _stirred(coarse: Float[Tensor, "n views hc wc"], cell: int) -> Bool[Tensor, "n 1 h8 w8"]:
+def _stirred(coarse: Float[Tensor, "n views hc wc"]) -> Bool[Tensor, "n 1 h8 w8"]:
     """Return which blocks of 8 x 8 pixels have an event in them or within four pixels around."""
     seen = coarse.abs().amax(1, keepdim=True)
-    return functional.max_pool2d(seen, 16 // cell, 8 // cell, padding=4 // cell) > 0
-
-
-def _in_cells(x: Tensor, cell: int) -> Tensor:
-    """Return the sums of blocks of `cell` x `cell`, a power of two."""
-    return x if cell == 1 else _in_cells(_halved(x), cell // 2)
+    return functional.max_pool2d(seen, 16 // CELL, 8 // CELL, padding=4 // CELL) > 0
 
 
 def _halved(x: Tensor) -> Tensor:
-    """Return the sums of blocks of 2 x 2, several times faster than avg_pool2d on a CPU."""
+    """Return the sums of blocks of 2 x 2, cells, several times faster than avg_pool2d on a CPU."""
     rows = x[..., ::2, :] + x[..., 1::2, :]
     return rows[..., ::2] + rows[..., 1::2]
 

@@ -2,8 +2,8 @@
 
 What goes in and what is kept is the first's (setnet.py): views as a set, leaky sums, time that
 passes in seconds and only where events come.  New are a memory at half resolution, where a picture
-is fine enough to be kept and not only drawn, and units of one gate beside a candidate, in one
-convolution, which are cheaper on a CPU than a GRU's (docs/decisions/0017-a-finer-memory.md).
+is fine enough to be kept and not only drawn, and units of a gate beside a candidate, which are
+cheaper on a CPU than GRUs (docs/decisions/0017-a-finer-memory.md).
 
 half: stem, kept unit -> quarter: unit -> eighth: unit, residual block -> up, up -> 2 x 2 pixels.
 """
@@ -12,8 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from src.models.layers import ResidualBlock
-from src.models.setnet import MEMORIES_S, RATE, SetNet, ViewKernels, grown
+from src.models.setnet import RATE, SetNet, grown
 
 SIZES = {  # multiply-accumulates at 176 x 176 with nine views: 0.4, 1.1 and 3.0 G
     "small": {"half": 16},
@@ -31,49 +30,30 @@ class SetNet2(SetNet):
     sizes = SIZES
 
     def __init__(self, bins: int = 5, half: int = 16):
-        nn.Module.__init__(self)
+        super().__init__(bins, half, 2 * half)
         self.arguments = {"bins": bins, "half": half}
-        self.bins, self.frozen = bins, None
-        memories, quarter, eighth = len(MEMORIES_S), 2 * half, 4 * half
-        self.voxel_stem = ViewKernels(bins, half, 5)
-        self.sum_stem = ViewKernels(memories, half, 3)
-        self.spread_stem = nn.Conv2d(memories, half, 3, padding=1, bias=False)
         self.cell2 = PacedUnit(half, reach=1)
-        self.down4 = nn.Conv2d(half, quarter, 3, 2, padding=1)
-        self.cell4 = PacedUnit(quarter)
-        self.down8 = nn.Conv2d(quarter, eighth, 3, 2, padding=1)
-        self.cell8 = PacedUnit(eighth)
-        self.block8 = ResidualBlock(eighth)
-        self.up4 = nn.Conv2d(eighth, quarter, 1)
-        self.mix4 = nn.Conv2d(quarter, quarter, 3, padding=1)
-        self.up2 = nn.Conv2d(quarter, half, 1)
-        self.mix2 = nn.Conv2d(half, half, 3, padding=1)
-        self.shuffle = nn.Conv2d(half, self.cell**2, 3, padding=1)
-        self.skip = nn.Parameter(torch.full((memories,), 0.15))
+
+    def unit(self, channels: int) -> nn.Module:
+        """As SetNet's."""
+        return PacedUnit(channels)
 
     def hidden(self, height: int, width: int) -> list[tuple[int, int, int]]:
         """Return the sizes (c, h, w) of the hidden maps of a picture."""
-        half = self.up2.out_channels
-        return [(half * 2**k, height // 2 ** (k + 1), width // 2 ** (k + 1)) for k in range(3)]
+        finest = (self.arguments["half"], height // 2, width // 2)
+        return [finest, *super().hidden(height, width)]
 
     def after_stem(
         self, stem: Tensor, passed: Tensor, hidden2: Tensor, hidden4: Tensor, hidden8: Tensor
     ) -> tuple[Float[Tensor, "n 4 h2 w2"], Tensor, Tensor, Tensor]:
         """Return what is drawn and the new hidden maps, as SetNet's does."""
-        stem, pace = stem.relu(), RATE * passed
-        hidden2 = self.cell2(stem, hidden2, grown(pace, 4))
-        after2 = hidden2.to(stem.dtype)
-        hidden4 = self.cell4(self.down4(after2).relu(), hidden4, grown(pace, 2))
-        after4 = hidden4.to(stem.dtype)
-        hidden8 = self.cell8(self.down8(after4).relu(), hidden8, pace)
-        x = self.block8(hidden8.to(stem.dtype))
-        x = self.mix4((grown(self.up4(x), 2) + after4).relu()).relu()
-        x = self.mix2((grown(self.up2(x), 2) + after2).relu()).relu()
-        return self.shuffle(x).float(), hidden2, hidden4, hidden8
+        hidden2 = self.cell2(stem.relu(), hidden2, grown(RATE * passed, 4))
+        drawn, *coarser = self.below(hidden2.to(stem.dtype), passed, hidden4, hidden8)
+        return drawn, hidden2, *coarser
 
 
 class PacedUnit(nn.Module):
-    """A gate beside a candidate, of one convolution, in continuous time.
+    """A gate beside a candidate in continuous time.
 
     Of the old state exp(-pace * relu(gate)) is left and the rest is the candidate's tanh: without
     pace, or with a gate below zero, nothing changes.  `reach`: pixels, odd, over which a place sees

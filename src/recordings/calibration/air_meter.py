@@ -18,7 +18,7 @@ from src.recordings.calibration.covariance import CELLS, Model, Tilt
 from src.recordings.calibration.following import Tracks
 from src.recordings.files.measured import ALLOWED, SIDE, AirFile, Estimate
 
-SIZES = (512, 362, 256)  # pixels of the shorter side that is worked on: larger frames are shrunk
+SIZES = (512, 362, SIDE)  # pixels of the shorter side that is worked on: larger frames are shrunk
 FOLLOWED = 0.75  # of the corners, or the next smaller size is tried
 LEAST_FRAMES, LEAST_POINTS = 16, 40
 LEAST_SEEN = 0.6  # of the frames, or a point is left out
@@ -156,7 +156,7 @@ def _followed(frames: np.ndarray) -> tuple[np.ndarray, Tracks]:
     """
     least, found = min(frames.shape[1:]), None
     for side in (min(least, SIZES[0]), *(side for side in SIZES[1:] if side < least)):
-        small = np.stack([shrunk(frame, side) for frame in frames])
+        small = frames if side == least else np.stack([shrunk(frame, side) for frame in frames])
         place = following.corners(small.mean(0))
         if len(place) < LEAST_POINTS:
             break
