@@ -11,7 +11,7 @@ half resolution: stem -> quarter: GRU -> eighth: GRU, residual block -> up, up -
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Bool, Float
@@ -95,39 +95,60 @@ class SetNet(nn.Module):
         block of 8 x 8 is, and the `hidden` maps, in [-1, 1].  Raises ValueError for bins, a number
         of views, a length of window or a state that do not fit.
         """
-        n, views, bins, height, width = voxels.shape
+        frames, state = self.sequence(
+            voxels[:, None], state, window_s=window_s, positions=positions
+        )
+        return frames[:, 0], state
+
+    def sequence(
+        self,
+        voxels: Float[Tensor, "n windows views bins h w"],
+        state: State | None = None,
+        *,
+        window_s: float | Tensor = 1 / RATE,
+        positions: Sequence[Position] | None = None,
+    ) -> tuple[Float[Tensor, "n windows 1 h w"], State]:
+        """Return the frame of every window, as window by window, and the state after the last one.
+
+        Layer by layer: only what is remembered goes window by window, all else sees all of them at
+        once, in order of time (windows * n).
+        """
+        n, windows, views, bins, height, width = voxels.shape
         places = self.places(views, bins, positions)
         seconds = _seconds(window_s, voxels)
-        padded, (top, left) = pad_to_multiple(voxels.flatten(0, 1), 8)
-        voxels = padded.unflatten(0, (n, views))
-        events = voxels.float().sum(2)
+        padded, (top, left) = pad_to_multiple(voxels.flatten(0, 2), 8)
+        voxels = padded.unflatten(0, (n, windows, views)).transpose(0, 1)
+        events = voxels.float().sum(3).flatten(0, 1)
         coarse = _halved(events)
-        mean_sums, sums, awake, *hidden = self._start(state, coarse)
+        mean_sums, sums, awake, *hidden = self._start(state, coarse[:n])
 
         awake, passed = _time(_stirred(coarse), awake, seconds)
         keep = torch.cat([torch.exp(-passed / memory) for memory in MEMORIES_S], 1)
-        sums = grown(keep, 8 // CELL)[:, None] * sums + coarse[:, :, None]
-        mean_sums = grown(keep, 8) * mean_sums + events.mean(1, keepdim=True)
-        spread = (sums - sums.mean(1, keepdim=True)).abs().mean(1)
+        kept = grown(keep, 8 // CELL)[:, None]
+        all_sums, sums = over_time(_leaked, sums, kept, coarse[:, :, None])
+        mean = events.mean(1, keepdim=True)
+        all_mean_sums, mean_sums = over_time(_leaked, mean_sums, grown(keep, 8), mean)
+        spread = (all_sums - all_sums.mean(1, keepdim=True)).abs().mean(1)
 
         grids, memories, bias = self.kernels(places)
-        stem = functional.conv2d(
-            voxels.flatten(1, 2).to(grids.dtype), grids, None, CELL, grids.shape[-1] // 2
-        )
-        memory = torch.cat([sums.flatten(1, 2), spread], 1).to(memories.dtype)
+        stacked = _cast(voxels, grids.dtype).reshape(windows * n, views * bins, *voxels.shape[-2:])
+        stem = functional.conv2d(stacked, grids, None, CELL, grids.shape[-1] // 2)
+        memory = torch.cat([all_sums.flatten(1, 2), spread], 1).to(memories.dtype)
         stem = stem + functional.conv2d(memory, memories, bias, 1, 1)
         x, *hidden = self.after_stem(stem, passed, *hidden)
         x = functional.pixel_shuffle(x, CELL)
-        frame = (x + (self.skip[:, None, None] * mean_sums).sum(1, keepdim=True)).sigmoid()
+        frames = (x + (self.skip[:, None, None] * all_mean_sums).sum(1, keepdim=True)).sigmoid()
+        frames = frames[..., top : top + height, left : left + width].float()
         state = (mean_sums, sums, awake, *hidden)
-        return frame[..., top : top + height, left : left + width].float(), state
+        return frames.unflatten(0, (windows, n)).transpose(0, 1), state
 
     def after_stem(
         self, stem: Tensor, passed: Tensor, hidden4: Tensor, hidden8: Tensor
     ) -> tuple[Float[Tensor, "n pixels hc wc"], Tensor, Tensor]:
         """Return what is drawn, the pixels of a cell as channels, float32, and the new hidden maps.
 
-        `stem`: before its ReLU, (n, stem, hc, wc); `passed`: seconds, (n, 1, h8, w8).
+        `stem`: before its ReLU, (windows * n, stem, hc, wc); `passed`: seconds, (windows * n, 1,
+        h8, w8); what is drawn has every window too, the hidden maps are those after the last.
         """
         return self.below(stem.relu(), passed, hidden4, hidden8)
 
@@ -136,10 +157,10 @@ class SetNet(nn.Module):
     ) -> tuple[Float[Tensor, "n pixels hc wc"], Tensor, Tensor]:
         """Return what `after_stem` does; `seen`: what is known at half resolution."""
         pace = RATE * passed
-        hidden4 = self.cell4(self.down4(seen).relu(), hidden4, grown(pace, 2))
-        after4 = hidden4.to(seen.dtype)
-        hidden8 = self.cell8(self.down8(after4).relu(), hidden8, pace)
-        x = self.block8(hidden8.to(seen.dtype))
+        all4, hidden4 = self.cell4(self.down4(seen).relu(), hidden4, grown(pace, 2))
+        after4 = all4.to(seen.dtype)
+        all8, hidden8 = self.cell8(self.down8(after4).relu(), hidden8, pace)
+        x = self.block8(all8.to(seen.dtype))
         x = self.mix4((grown(self.up4(x), 2) + after4).relu()).relu()
         x = self.mix2((grown(self.up2(x), 2) + seen).relu()).relu()
         return self.shuffle(x).float(), hidden4, hidden8
@@ -240,17 +261,47 @@ class PacedGRU(nn.Module):
 
     def forward(
         self,
-        x: Float[Tensor, "n c h w"],
+        x: Float[Tensor, "m c h w"],
         state: Float[Tensor, "n c h w"],
-        pace: Float[Tensor, "n 1 h w"],
-    ) -> Float[Tensor, "n c h w"]:
-        """Return the new state, float32; `pace` is the time passed, in windows at 120 a second."""
-        before = state.to(x.dtype)
-        reset, update = self.gates(torch.cat([x, before], 1)).chunk(2, 1)
-        candidate = self.candidate(torch.cat([x, reset.sigmoid() * before], 1)).float().tanh()
-        # (1 - sigmoid(update)) ** pace, without the infinite slope that a power has at zero.
-        keep = torch.exp(-pace * functional.softplus(update.float()))
-        return torch.lerp(candidate, state, keep)
+        pace: Float[Tensor, "m 1 h w"],
+    ) -> tuple[Float[Tensor, "m c h w"], Float[Tensor, "n c h w"]]:
+        """Return the state, float32, after every one of m = windows * n steps and after the last.
+
+        `pace` is the time passed, in windows at 120 a second.
+        """
+
+        def step(state: Tensor, x: Tensor, pace: Tensor) -> Tensor:
+            before = state.to(x.dtype)
+            reset, update = self.gates(torch.cat([x, before], 1)).chunk(2, 1)
+            candidate = self.candidate(torch.cat([x, reset.sigmoid() * before], 1)).float().tanh()
+            # (1 - sigmoid(update)) ** pace, without the infinite slope that a power has at zero.
+            keep = torch.exp(-pace * functional.softplus(update.float()))
+            return torch.lerp(candidate, state, keep)
+
+        return over_time(step, state, x, pace)
+
+
+def over_time(
+    step: Callable[..., Tensor], state: Float[Tensor, "n ..."], *maps: Float[Tensor, "m ..."]
+) -> tuple[Float[Tensor, "m ..."], Float[Tensor, "n ..."]]:
+    """Return the state after every window and after the last; `step` takes it and a window's part
+    of each of `maps`, which have m = windows * n.
+    """
+    states = []
+    for now in zip(*(part.split(len(state)) for part in maps), strict=True):
+        state = step(state, *now)
+        states.append(state)
+    return torch.cat(states), state
+
+
+def _leaked(sums: Tensor, keep: Tensor, new: Tensor) -> Tensor:
+    return keep * sums + new
+
+
+def _cast(x: Tensor, dtype: torch.dtype) -> Tensor:
+    """Return `x` as a convolution takes it under autocast: sooner, it is copied once only."""
+    kind = x.device.type
+    return x.to(torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else dtype)
 
 
 def _seconds(window_s: float | Tensor, voxels: Tensor) -> Tensor:
@@ -263,12 +314,14 @@ def _seconds(window_s: float | Tensor, voxels: Tensor) -> Tensor:
 
 
 def _time(stirred: Tensor, awake: Tensor, seconds: Tensor) -> tuple[Tensor, Tensor]:
-    """Return how awake each block is after the window and the time that passed there, in seconds:
-    all of it with events, without any the integral of falling asleep.
+    """Return how awake each block is after the last window and the time that passed there in each,
+    in seconds: all of it with events, without any the integral of falling asleep.
     """
-    left = torch.exp(-seconds / AWAKE_S)
-    passed = torch.where(stirred, seconds, awake * AWAKE_S * (1 - left))
-    return torch.where(stirred, 1.0, awake * left), passed
+    left, passed = torch.exp(-seconds / AWAKE_S), []
+    for now in stirred.split(len(awake)):
+        passed.append(torch.where(now, seconds, awake * AWAKE_S * (1 - left)))
+        awake = torch.where(now, 1.0, awake * left)
+    return awake, torch.cat(passed)
 
 
 def _stirred(coarse: Float[Tensor, "n views hc wc"]) -> Bool[Tensor, "n 1 h8 w8"]:

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from src.models.setnet import RATE, SetNet, grown
+from src.models.setnet import RATE, SetNet, grown, over_time
 
 SIZES = {  # multiply-accumulates at 176 x 176 with nine views: 0.4, 1.1 and 3.0 G
     "small": {"half": 16},
@@ -47,8 +47,8 @@ class SetNet2(SetNet):
         self, stem: Tensor, passed: Tensor, hidden2: Tensor, hidden4: Tensor, hidden8: Tensor
     ) -> tuple[Float[Tensor, "n 4 h2 w2"], Tensor, Tensor, Tensor]:
         """Return what is drawn and the new hidden maps, as SetNet's does."""
-        hidden2 = self.cell2(stem.relu(), hidden2, grown(RATE * passed, 4))
-        drawn, *coarser = self.below(hidden2.to(stem.dtype), passed, hidden4, hidden8)
+        all2, hidden2 = self.cell2(stem.relu(), hidden2, grown(RATE * passed, 4))
+        drawn, *coarser = self.below(all2.to(stem.dtype), passed, hidden4, hidden8)
         return drawn, hidden2, *coarser
 
 
@@ -69,11 +69,18 @@ class PacedUnit(nn.Module):
 
     def forward(
         self,
-        x: Float[Tensor, "n c h w"],
+        x: Float[Tensor, "m c h w"],
         state: Float[Tensor, "n c h w"],
-        pace: Float[Tensor, "n 1 h w"],
-    ) -> Float[Tensor, "n c h w"]:
-        """Return the new state, float32; `pace` is the time passed, in windows at 120 a second."""
-        both = (self.seen(x) + self.kept(state.to(x.dtype))).float()
-        gate, candidate = both.chunk(2, 1)
-        return torch.lerp(candidate.tanh(), state, torch.exp(-pace * gate.relu()))
+        pace: Float[Tensor, "m 1 h w"],
+    ) -> tuple[Float[Tensor, "m c h w"], Float[Tensor, "n c h w"]]:
+        """Return the state, float32, after every one of m = windows * n steps and after the last.
+
+        `pace` is the time passed, in windows at 120 a second.
+        """
+
+        def step(state: Tensor, seen: Tensor, pace: Tensor) -> Tensor:
+            both = (seen + self.kept(state.to(x.dtype))).float()
+            gate, candidate = both.chunk(2, 1)
+            return torch.lerp(candidate.tanh(), state, torch.exp(-pace * gate.relu()))
+
+        return over_time(step, state, self.seen(x), pace)

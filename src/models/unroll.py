@@ -11,6 +11,8 @@ from torch import Tensor, nn
 if TYPE_CHECKING:
     from src.sim.pipeline import Sample
 
+AT_ONCE = 40  # windows; more take more memory and no less time
+
 
 def unroll(
     network: nn.Module,
@@ -23,10 +25,16 @@ def unroll(
     """Return the frame of every window and the state after the last one.
 
     `window_s`, the length of a window in seconds, a number or one per clip (n,), and `positions`,
-    the (row, col) of every view, are given to a network that takes them.
+    the (row, col) of every view, are given to a network that takes them.  One that has a method
+    `sequence`, as `forward` but for many windows, is given AT_ONCE of them.
     """
     options = accepted(network, window_s=window_s, positions=positions)
     frames = []
+    if hasattr(network, "sequence"):
+        for part in chunks(voxels.shape[1], AT_ONCE):
+            some, state = network.sequence(voxels[:, part], state, **options)
+            frames.append(some)
+        return torch.cat(frames, dim=1), state
     for window in voxels.unbind(1):
         frame, state = network(window, state, **options)
         frames.append(frame)

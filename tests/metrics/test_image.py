@@ -2,6 +2,7 @@
 
 import math
 
+import kornia.metrics
 import pytest
 import skimage
 import torch
@@ -56,6 +57,27 @@ def test_ssim_agrees_with_scikit_image():
 
 def test_l1_is_not_clipped():
     assert float(L1()(torch.full((1, 1, 4, 4), 2.0), torch.ones(1, 1, 4, 4))) == 1.0
+
+
+@pytest.mark.parametrize("size", [(11, 11), (24, 40)])
+def test_ssim_and_its_slope_agree_with_kornia(size):
+    torch.manual_seed(0)
+    truth, scores = torch.rand(3, 1, *size), []
+    for score in (
+        ssim,
+        lambda *pair: kornia.metrics.ssim(*pair, 11, padding="valid").mean((1, 2, 3)),
+    ):
+        shown = (0.8 * truth + 0.1).requires_grad_()
+        with torch.autocast("cpu", torch.bfloat16):  # which both of them keep out
+            value = score(shown, truth)
+        scores.append([value, torch.autograd.grad(value.sum(), shown)[0]])
+    for ours, theirs in zip(*scores, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-6)
+
+
+def test_ssim_wants_a_window_of_pixels():
+    with pytest.raises(ValueError, match="at least 11 pixels"):
+        ssim(torch.rand(1, 1, 10, 40), torch.rand(1, 1, 10, 40))
 
 
 @pytest.mark.parametrize("score", [psnr, aligned_psnr, ssim])

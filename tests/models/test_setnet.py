@@ -10,7 +10,7 @@ from src.models import load, save
 from src.models.cost import macs_per_frame
 from src.models.setnet import PacedGRU, SetNet
 from src.models.setnet2 import SIZES, PacedUnit, SetNet2
-from src.models.unroll import unroll
+from src.models.unroll import AT_ONCE, unroll
 from src.sim.optics import layout
 from tests.conftest import ROOT
 from tests.test_train import config
@@ -144,10 +144,25 @@ def test_a_window_cut_in_ten_passes_the_same_time(kind):
     x, state = torch.zeros(1, 4, 8, 8), torch.rand(1, 4, 8, 8)
     for part in cell.children():
         part.weight.zero_()  # gates do not see the state
-    whole = cell(x, state, torch.ones(1, 1, 8, 8))
-    for _ in range(10):
-        state = cell(x, state, torch.full((1, 1, 8, 8), 0.1))
-    torch.testing.assert_close(state, whole)
+    _, whole = cell(x, state, torch.ones(1, 1, 8, 8))
+    every, last = cell(x.expand(10, -1, -1, -1), state, torch.full((10, 1, 8, 8), 0.1))
+    torch.testing.assert_close(last, whole)
+    torch.testing.assert_close(every[9:], whole)
+
+
+@pytest.mark.parametrize("side", [16, 20])
+@torch.no_grad()
+def test_a_sequence_at_once_is_what_its_windows_are_one_by_one(side):
+    network, clips = small(), voxels(2, windows=AT_ONCE + 3, side=side)
+    clips[1, 4:9] = 0
+    lengths = {"window_s": torch.tensor([1 / 120, 1 / 600])}
+    frames, state = unroll(network, clips, **lengths)
+    alone = None
+    for window, frame in zip(clips.unbind(1), frames.unbind(1), strict=True):
+        expected, alone = network(window, alone, **lengths)
+        torch.testing.assert_close(frame, expected, rtol=1e-4, atol=1e-5)
+    for one, other in zip(state, alone, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
 
 
 @torch.no_grad()
