@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import Tensor, nn
+from torch.nn import functional
 
 from src.metrics.image import ssim
 
@@ -74,8 +75,8 @@ class LPIPS(nn.Module):
             size, least = tuple(prediction.shape[-2:]), SMALLEST[self.net]
             raise ValueError(f"data.crop must be >= {least} for LPIPS ({self.net}), got {size}")
         total = torch.zeros(len(prediction), device=prediction.device)
-        x, y = self._normalise(prediction), self._normalise(target)
-        for stage, head in zip(self.stages, self.heads, strict=True):
+        x, y = prediction, target
+        for stage, head in zip([self._first, *self.stages[1:]], self.heads, strict=True):
             x, y = stage(x), stage(y)
             difference = (_unit(x) - _unit(y)).square()
             total = total + (difference * head).sum(1).mean((1, 2)).float()
@@ -84,6 +85,22 @@ class LPIPS(nn.Module):
     def train(self, mode: bool = True) -> "LPIPS":
         """Stay in eval mode: a measure does not learn."""
         return super().train(False)
+
+    def _first(self, picture: Tensor) -> Tensor:
+        """Return the features of the first stage.
+
+        Of a grey picture alex's convolution, 11 pixels at steps of 4, is what it is of a black one
+        plus 3x3 steps over its patches of 4x4: a quarter of the time, with the gradient.
+        """
+        if self.net != "alex" or picture.shape[1] == 3:
+            return self.stages[0](self._normalise(picture))
+        convolution, (h, w) = self.stages[0][0], picture.shape[-2:]
+        black = convolution(self._normalise(torch.zeros_like(picture[:1])))
+        grey = (2 / self.scale * convolution.weight).sum(1, keepdim=True)
+        kernel = functional.pixel_unshuffle(functional.pad(grey, (0, 1, 0, 1)), 4)
+        whole = functional.pad(picture, (2, 2 + -w % 4, 2, 2 + -h % 4))
+        lit = functional.conv2d(functional.pixel_unshuffle(whole, 4), kernel)
+        return (black + lit[..., : black.shape[-2], : black.shape[-1]]).relu()
 
     def _normalise(self, picture: Tensor) -> Tensor:
         rgb = picture.expand(-1, 3, -1, -1)

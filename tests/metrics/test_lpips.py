@@ -45,14 +45,17 @@ def test_agrees_with_torchmetrics_on_the_same_weights(net, monkeypatch):
     assert torch.allclose(ours(a, b), reference(2 * a - 1, 2 * b - 1).flatten(), atol=1e-5)
 
 
-def test_grey_equals_grey_repeated_and_gradients_arrive():
-    measure = build("alex")
-    a, b = torch.rand(2, 2, 1, 48, 48, generator=torch.Generator().manual_seed(1))
+@pytest.mark.parametrize("net", ["alex", "vgg"])
+@pytest.mark.parametrize("size", [(48, 48), (35, 49), (66, 64)])
+def test_grey_equals_grey_repeated_and_so_do_gradients(net, size):
+    measure = build(net)
+    a, b = torch.rand(2, 2, 1, *size, generator=torch.Generator().manual_seed(1))
     a.requires_grad_()
-    grey = measure(a, b)
-    assert torch.allclose(grey, measure(a.expand(-1, 3, -1, -1), b.expand(-1, 3, -1, -1)))
-    grey.sum().backward()
-    assert float(a.grad.abs().sum()) > 0
+    grey, colour = measure(a, b), measure(a.expand(-1, 3, -1, -1), b.expand(-1, 3, -1, -1))
+    torch.testing.assert_close(grey, colour, rtol=1e-4, atol=1e-6)
+    slopes = [torch.autograd.grad(value.sum(), a)[0] for value in (grey, colour)]
+    torch.testing.assert_close(*slopes, rtol=1e-3, atol=1e-6)
+    assert float(slopes[0].abs().sum()) > 0
     assert all(parameter.grad is None for parameter in measure.parameters())
     assert float(measure(b, b).abs().max()) == 0
 
