@@ -9,7 +9,7 @@ KEY=VALUE: more overrides for all trainings.
 
 Whatever is killed goes on: a training from its last checkpoint when this is running, and trainings
 go on without this.  Where no checkpoint is left, as on a new machine, a training goes on from the
-weights it exported, with the hours these have had; seed=1, say, then gives it other clips.  Each
+weights it exported, with the hours these have had; seed=1, say, makes a bank of other clips.  Each
 holds a lock while it runs, so that started again this finds them.  Their command lines have the
 word campaign-child.  Ctrl-C and SIGTERM stop all of it, with checkpoints.
 """

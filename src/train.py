@@ -26,6 +26,7 @@ def train(cfg: DictConfig) -> dict:
     """
     run, start = Path(cfg.paths.run), time.perf_counter()
     build.share_cores(cfg)
+    build.keep_memory(cfg)
     build.choose_precision(cfg)
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
     net, spec = build.network(cfg)

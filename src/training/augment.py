@@ -1,6 +1,6 @@
 """Training augmentation of voxel sequences (Rebecq et al. 2019; Stoffregen et al. 2020; the paper).
 
-Order: pause, turn, misplaced views, noise, hot pixels, dropped views.  Crops are drawn before the
+Order: dropped views, pause, turn, misplaced views, noise, hot pixels.  Crops are drawn before the
 simulation (sim/pipeline.py).  Every draw comes from the key of the sample, so a batch is the same
 in any worker.
 """
@@ -58,19 +58,26 @@ class Augment:
 
     def __call__(self, sample: Sample, keys: Sequence[int]) -> Sample:
         """Return the augmented sample; `keys` has one key per clip."""
-        clips = [self._one(sample, index, key) for index, key in enumerate(keys)]
+        views = sample.voxels.shape[2]
+        kept = views_kept(views, self.dropped, noise.key(keys[0], "dropped"))
+        clips = [self._one(sample, index, key, kept) for index, key in enumerate(keys)]
         parts = zip(*clips, strict=True)
         voxels, target, turbulent = (together([clip[None] for clip in part]) for part in parts)
         sample = replace(sample, voxels=voxels, target=target, turbulent=turbulent)
-        return drop_views(sample, self.dropped, noise.key(keys[0], "dropped"))
+        if len(kept) == views:
+            return sample
+        return replace(sample, positions=tuple(sample.positions[view] for view in kept))
 
-    def _one(self, sample: Sample, index: int, key: int) -> tuple[Tensor, Tensor, Tensor]:
+    def _one(
+        self, sample: Sample, index: int, key: int, kept: list[int]
+    ) -> tuple[Tensor, Tensor, Tensor]:
         windows, own = sample.voxels.shape[1], noise.key(key, "pause")
         steps, paused = pause_chain(windows, self.pause, self.stay, own)
         axes = flip_axes(self.flip, noise.key(key, "flip"))
         swap = float(noise.uniform(noise.key(key, "transpose"), torch.tensor(0))) < self.transpose
         order = turned_views(sample.positions, sample.voxels.shape[2], axes, swap)
-        voxels = sample.voxels[index][steps[:, None], order]  # a copy, which the rest works on
+        voxels = sample.voxels[index].index_select(0, steps.to(sample.voxels.device))
+        voxels = voxels.index_select(1, order[kept].to(voxels.device))  # what the rest works on
         voxels[paused] = 0
         voxels = turned(voxels, axes, swap)
         place = noise.key(key, "misplaced")
@@ -173,16 +180,13 @@ def misplace(
     return voxels
 
 
-def drop_views(sample: Sample, probability: float, key: int) -> Sample:
-    """Return the sample, at `probability` without some of its views; how many is uniform."""
-    views = sample.voxels.shape[2]
+def views_kept(views: int, probability: float, key: int) -> list[int]:
+    """Return which views a batch has: at `probability` some are lost; how many is uniform."""
     chance, share, *order = noise.uniform(key, torch.arange(2 + views)).tolist()
     if chance >= probability or views == 1:
-        return sample
+        return list(range(views))
     count = 1 + int(share * (views - 1))
-    kept = sorted(sorted(range(views), key=order.__getitem__)[:count])
-    positions = tuple(sample.positions[view] for view in kept)
-    return replace(sample, voxels=sample.voxels[:, :, kept], positions=positions)
+    return sorted(sorted(range(views), key=order.__getitem__)[:count])
 
 
 def hot_pixels(size: Sequence[int], fraction: float, std: float, key: int) -> Float[Tensor, "h w"]:

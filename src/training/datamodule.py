@@ -67,12 +67,12 @@ class LightFieldData(LightningDataModule):
             self.filler.stop()
 
     def train_dataloader(self) -> DataLoader:
-        """Return endless clips, from the trainer's step on: a resumed run goes on seamlessly."""
+        """Return endless clips, from the training's step on: what goes on sees others."""
         trainer = self.trainer
         sampler = StepSampler(
             self.batch_size,
             max(1, self.epoch_clips // (self.batch_size * trainer.world_size)),
-            lambda: trainer.global_step,
+            lambda: trainer.lightning_module.steps,
             reuse=self.reuse,
             rank=trainer.global_rank,
             world=trainer.world_size,

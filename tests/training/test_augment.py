@@ -9,7 +9,6 @@ from src.sim.optics import layout
 from src.sim.pipeline import Sample
 from src.training.augment import (
     Augment,
-    drop_views,
     flip_axes,
     hot_pixels,
     misplace,
@@ -17,6 +16,7 @@ from src.training.augment import (
     pause_chain,
     turned,
     turned_views,
+    views_kept,
 )
 
 OFF = {"noise_std": 0.0, "hot_fraction": 0.0, "pause": 0.0, "flip": 0.0}
@@ -187,14 +187,27 @@ def test_a_misplaced_view_moves_whole_and_leaves_nothing_behind():
 def test_dropped_views_take_their_positions_along_and_some_view_stays():
     places = tuple((0, column) for column in range(4))
     voxels = torch.arange(4.0).reshape(1, 1, 4, 1, 1, 1)
-    sample = Sample(voxels, voxels, voxels, torch.tensor([1 / 120]), places)
+    picture = torch.zeros(1, 1, 1, 1, 1)
+    sample = Sample(voxels, picture, picture, torch.tensor([1 / 120]), places)
+    lossy = Augment(**OFF, dropped=1.0)
     counts = set()
     for key in range(60):
-        left = drop_views(sample, 1.0, key)
+        left = lossy(sample, [key])
         kept = left.voxels.flatten().tolist()
         assert [places[int(view)] for view in kept] == list(left.positions)
         counts.add(len(kept))
-    assert counts == {1, 2, 3} and drop_views(sample, 0.0, 1) is sample
+    assert counts == {1, 2, 3} and views_kept(4, 0.0, 1) == [0, 1, 2, 3]
+
+
+def test_a_view_that_stays_shows_the_picture_of_its_turned_place():
+    voxels = torch.arange(9.0).reshape(1, 1, 9, 1, 1, 1)
+    picture = torch.zeros(1, 1, 1, 1, 1)
+    sample = Sample(voxels, picture, picture, torch.tensor([1 / 120]), layout(9))
+    mirror = Augment(**OFF | {"flip": 1.0}, dropped=1.0)
+    for key in range(10):
+        left = mirror(sample, [key])
+        shown = [layout(9)[int(view)] for view in left.voxels.flatten()]
+        assert shown == [(-row, -column) for row, column in left.positions]
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """Batches: the same whatever the workers; going on where a training stopped; reuse; shards."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -9,7 +11,7 @@ from tests.sim.test_pipeline import STRONG, pipeline
 
 
 class FakeTrainer:
-    global_step, global_rank, world_size = 0, 0, 1
+    lightning_module, global_rank, world_size = SimpleNamespace(steps=0), 0, 1
 
 
 def chain():
