@@ -5,13 +5,16 @@ passes in seconds and only where events come.  New are a memory at half resoluti
 is fine enough to be kept and not only drawn, and units of a gate beside a candidate, which are
 cheaper on a CPU than GRUs (docs/decisions/0017-a-finer-memory.md).
 
-half: stem, kept unit -> quarter: unit -> eighth: unit, residual block -> up, up -> 2 x 2 pixels.
+half: stem, kept unit -> quarter: unit -> eighth: unit, residual block, surroundings at a sixteenth
+and a thirty-second -> up, up -> 2 x 2 pixels.
 """
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional
 
+from src.models.layers import ResidualBlock
 from src.models.setnet import RATE, SetNet, grown, over_time
 
 SIZES = {  # multiply-accumulates at 176 x 176 with nine views: 0.4, 1.1 and 3.0 G
@@ -33,6 +36,7 @@ class SetNet2(SetNet):
         super().__init__(bins, half, 2 * half)
         self.arguments = {"bins": bins, "half": half}
         self.cell2 = PacedUnit(half, reach=1)
+        self.block8 = nn.Sequential(self.block8, Surroundings(4 * half))
 
     def unit(self, channels: int) -> nn.Module:
         """As SetNet's."""
@@ -50,6 +54,31 @@ class SetNet2(SetNet):
         all2, hidden2 = self.cell2(stem.relu(), hidden2, grown(RATE * passed, 4))
         drawn, *coarser = self.below(all2.to(stem.dtype), passed, hidden4, hidden8)
         return drawn, hidden2, *coarser
+
+
+class Surroundings(nn.Module):
+    """Adds to a map what lies around each place: it is halved twice, and comes back.
+
+    An area without events is known by its edges, which may be far.  Adds nothing before training.
+    """
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.down16 = nn.Conv2d(channels, channels, 3, 2, padding=1)
+        self.down32 = nn.Conv2d(channels, channels, 3, 2, padding=1)
+        self.block32 = ResidualBlock(channels)
+        self.up16 = nn.Conv2d(channels, channels, 1)
+        self.block16 = ResidualBlock(channels)
+        self.up8 = nn.Conv2d(channels, channels, 1)
+        nn.init.zeros_(self.up8.weight)
+        nn.init.zeros_(self.up8.bias)
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
+        """Return a map of the same shape."""
+        x16 = self.down16(x).relu()
+        x32 = self.block32(self.down32(x16).relu())
+        x16 = self.block16(x16 + _stretched(self.up16(x32), x16))
+        return x + _stretched(self.up8(x16), x)
 
 
 class PacedUnit(nn.Module):
@@ -84,3 +113,7 @@ class PacedUnit(nn.Module):
             return torch.lerp(candidate.tanh(), state, torch.exp(-pace * gate.relu()))
 
         return over_time(step, state, self.seen(x), pace)
+
+
+def _stretched(x: Tensor, like: Tensor) -> Tensor:
+    return functional.interpolate(x, like.shape[-2:], mode="bilinear")
