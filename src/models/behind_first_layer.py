@@ -71,7 +71,7 @@ class AfterStem(nn.Module):
         grids, memories, bias = network.kernels(places)
         self.kernel, self.bias = grids.numpy(), bias.numpy()
         self.memories = memories.to(dtype)
-        self.skip = network.skip.numpy()
+        self.skip = np.zeros(0, np.float32) if network.skip is None else network.skip.numpy()
         self.sizes = [(1, *size) for size in network.hidden(*padded)]
         self.network = network.to(dtype)
         self.dtype = dtype

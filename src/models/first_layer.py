@@ -57,19 +57,19 @@ class StemFront(HeadFront):
         rows, columns = (side // self.stride for side in padded)
         count, eighth = len(MEMORIES_S), (padded[0] // 8, padded[1] // 8)
         self.memories = np.array(MEMORIES_S, np.float32)
-        self.skip = after.skip
+        self.skip, self.local = after.skip, after.network.local
         self.awake = np.zeros(eighth, np.float32)
         self.sums = np.zeros(((after.views + 1) * count, rows, columns), np.float32)
-        self.means = np.zeros((count, rows, columns * self.stride**2), np.float32)
+        self.means = np.zeros((len(self.skip), rows, columns * self.stride**2), np.float32)
 
     def add(self, t, x, y, p, view, t0: float, t1: float) -> list[np.ndarray]:
         """Bring the sums to the end of a window; return the map, the sums and their spread, the
         time passed, what the sums draw.
         """
-        passed, drawn = np.empty_like(self.awake), np.empty_like(self.means[0])
+        passed, drawn = np.empty_like(self.awake), np.empty(self.means.shape[1:], np.float32)
         kernels.remember(
             t, x, y, p, view, t0, t1, self.memories, np.float32(AWAKE_S),
-            self.awake, passed, self.sums, self.means,
+            self.local, self.awake, passed, self.sums, self.means,
         )  # fmt: skip
         kernels.weigh(self.skip, self.means, drawn)
         return [

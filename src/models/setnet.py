@@ -45,6 +45,8 @@ class SetNet(nn.Module):
 
     views = None
     sizes = SIZES
+    local = True  # each block falls asleep by itself; False: all of a picture together
+    direct = len(MEMORIES_S)  # of the mean view's leaky sums are drawn without any learning
 
     def __init__(self, bins: int = 5, stem: int = 12, channels: int = 32):
         super().__init__()
@@ -65,8 +67,7 @@ class SetNet(nn.Module):
         self.mix2 = nn.Conv2d(stem, stem, 3, padding=1)
         self.shuffle = nn.Conv2d(stem, CELL**2, 3, padding=1)
         self.frozen: dict[tuple, tuple[Tensor, ...]] | None = None  # kernels kept, for running
-        # What is drawn without any learning: the leaky sums themselves.
-        self.skip = nn.Parameter(torch.full((memories,), 0.15))
+        self.skip = nn.Parameter(torch.full((self.direct,), 0.15)) if self.direct else None
 
     def unit(self, channels: int) -> nn.Module:
         """Return a memory of so many channels."""
@@ -122,12 +123,10 @@ class SetNet(nn.Module):
         coarse = _halved(events)
         mean_sums, sums, awake, *hidden = self._start(state, coarse[:n])
 
-        awake, passed = _time(_stirred(coarse), awake, seconds)
+        awake, passed = _time(_stirred(coarse, self.local), awake, seconds)
         keep = torch.cat([torch.exp(-passed / memory) for memory in MEMORIES_S], 1)
         kept = grown(keep, 8 // CELL)[:, None]
         all_sums, sums = over_time(_leaked, sums, kept, coarse[:, :, None])
-        mean = events.mean(1, keepdim=True)
-        all_mean_sums, mean_sums = over_time(_leaked, mean_sums, grown(keep, 8), mean)
         spread = (all_sums - all_sums.mean(1, keepdim=True)).abs().mean(1)
 
         grids, memories, bias = self.kernels(places)
@@ -137,8 +136,11 @@ class SetNet(nn.Module):
         stem = stem + functional.conv2d(memory, memories, bias, 1, 1)
         x, *hidden = self.after_stem(stem, passed, *hidden)
         x = functional.pixel_shuffle(x, CELL)
-        frames = (x + (self.skip[:, None, None] * all_mean_sums).sum(1, keepdim=True)).sigmoid()
-        frames = frames[..., top : top + height, left : left + width].float()
+        if self.direct:
+            mean = events.mean(1, keepdim=True)
+            every, mean_sums = over_time(_leaked, mean_sums, grown(keep, 8), mean)
+            x = x + (self.skip[:, None, None] * every).sum(1, keepdim=True)
+        frames = x.sigmoid()[..., top : top + height, left : left + width].float()
         state = (mean_sums, sums, awake, *hidden)
         return frames.unflatten(0, (windows, n)).transpose(0, 1), state
 
@@ -169,7 +171,7 @@ class SetNet(nn.Module):
         """Return the kernels of the stem for views that stand at `places`: of the stacked grids
         (stem, views * bins, 5, 5), of the stacked sums and their spread, and the bias.
         """
-        device = self.skip.device
+        device = self.shuffle.bias.device
         if self.frozen is not None and (places, device) in self.frozen:
             return self.frozen[places, device]
         stood = torch.tensor(places, device=device).float()
@@ -203,7 +205,7 @@ class SetNet(nn.Module):
         n, views, rows, columns = coarse.shape
         height, width = CELL * rows, CELL * columns
         sizes = [
-            (n, len(MEMORIES_S), height, width),
+            (n, self.direct, height, width),
             (n, views, len(MEMORIES_S), rows, columns),
             (n, 1, height // 8, width // 8),
             *((n, *size) for size in self.hidden(height, width)),
@@ -324,10 +326,13 @@ def _time(stirred: Tensor, awake: Tensor, seconds: Tensor) -> tuple[Tensor, Tens
     return awake, torch.cat(passed)
 
 
-def _stirred(coarse: Float[Tensor, "n views hc wc"]) -> Bool[Tensor, "n 1 h8 w8"]:
-    """Return which blocks of 8 x 8 pixels have an event in them or within four pixels around."""
+def _stirred(coarse: Float[Tensor, "n views hc wc"], local: bool) -> Bool[Tensor, "n 1 h8 w8"]:
+    """Return which blocks of 8 x 8 pixels have an event in them or within four pixels around; or,
+    if not `local`, anywhere in the picture.
+    """
     seen = coarse.abs().amax(1, keepdim=True)
-    return functional.max_pool2d(seen, 16 // CELL, 8 // CELL, padding=4 // CELL) > 0
+    stirred = functional.max_pool2d(seen, 16 // CELL, 8 // CELL, padding=4 // CELL) > 0
+    return stirred if local else stirred.any(-1, True).any(-2, True).expand_as(stirred)
 
 
 def _halved(x: Tensor) -> Tensor:

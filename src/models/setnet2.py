@@ -1,9 +1,11 @@
 """SetNet, second generation: pictures are remembered at a half, a quarter and an eighth.
 
 What goes in and what is kept is the first's (setnet.py): views as a set, leaky sums, time that
-passes in seconds and only where events come.  New are a memory at half resolution, where a picture
-is fine enough to be kept and not only drawn, and units of a gate beside a candidate, which are
-cheaper on a CPU than GRUs (docs/decisions/0017-a-finer-memory.md).
+passes in seconds.  New are a memory at half resolution, where a picture is fine enough to be kept
+and not only drawn; units of a gate beside a candidate, cheaper on a CPU than GRUs
+(docs/decisions/0017-a-finer-memory.md); and, so that areas are drawn and not only edges, time that
+passes everywhere while anything moves, nothing drawn but what is learned, and a view of what lies
+far around (docs/decisions/0018-areas-without-events.md).
 
 half: stem, kept unit -> quarter: unit -> eighth: unit, residual block, surroundings at a sixteenth
 and a thirty-second -> up, up -> 2 x 2 pixels.
@@ -17,7 +19,7 @@ from torch.nn import functional
 from src.models.layers import ResidualBlock
 from src.models.setnet import RATE, SetNet, grown, over_time
 
-SIZES = {  # multiply-accumulates at 176 x 176 with nine views: 0.4, 1.1 and 3.0 G
+SIZES = {  # multiply-accumulates at 176 x 176 with nine views: 0.5, 1.2 and 3.1 G
     "small": {"half": 16},
     "medium": {"half": 28},
     "large": {"half": 48},
@@ -31,6 +33,7 @@ class SetNet2(SetNet):
     """
 
     sizes = SIZES
+    local, direct = False, 0
 
     def __init__(self, bins: int = 5, half: int = 16):
         super().__init__(bins, half, 2 * half)
@@ -59,7 +62,7 @@ class SetNet2(SetNet):
 class Surroundings(nn.Module):
     """Adds to a map what lies around each place: it is halved twice, and comes back.
 
-    An area without events is known by its edges, which may be far.  Adds nothing before training.
+    An area without events is known by its edges, which may be far.
     """
 
     def __init__(self, channels: int):
@@ -70,8 +73,6 @@ class Surroundings(nn.Module):
         self.up16 = nn.Conv2d(channels, channels, 1)
         self.block16 = ResidualBlock(channels)
         self.up8 = nn.Conv2d(channels, channels, 1)
-        nn.init.zeros_(self.up8.weight)
-        nn.init.zeros_(self.up8.bias)
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
         """Return a map of the same shape."""

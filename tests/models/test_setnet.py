@@ -40,7 +40,7 @@ def voxels(n: int = 1, windows: int = 4, views: int = 9, side: int = 16) -> torc
     return torch.randn(n, windows, views, 3, side, side, generator=generator)
 
 
-@pytest.mark.parametrize(("size", "giga"), [("small", 0.44), ("medium", 1.13), ("large", 2.96)])
+@pytest.mark.parametrize(("size", "giga"), [("small", 0.46), ("medium", 1.18), ("large", 3.11)])
 def test_cost_and_config_of_each_size(size, giga):
     network = SetNet2.preset(size)
     assert abs(macs_per_frame(network, 176, 176, views=9) / 1e9 - giga) < 0.02
@@ -115,7 +115,7 @@ def test_state_stays_bounded_over_500_windows_of_noise():
     assert max(float(h.abs().max()) for h in (awake, *state[3:])) <= 1
     assert torch.isfinite(frame).all()
     # A leaky sum is at most what comes in a window divided by what leaks out of it.
-    assert max(float(s.abs().max()) for s in sums) < 4 * 3 * (10 + 30 * 6) / (1 - 0.984)
+    assert max(float(s.abs().max()) for s in sums if s.numel()) < 4 * 3 * (10 + 30 * 6) / (1 - 0.984)
 
 
 @torch.no_grad()

@@ -61,12 +61,13 @@ def add_patches(t, x, y, p, view, t0, t1, down, right, table, stride, out):
 
 
 @njit(nogil=True, cache=True)
-def remember(t, x, y, p, view, t0, t1, memories, awake_s, awake, passed, sums, means):
+def remember(t, x, y, p, view, t0, t1, memories, awake_s, local, awake, passed, sums, means):
     """Let the leaky sums of SetNet leak, and add the events with t0 <= t <= t1.
 
     In place: `awake`, `passed` (h8, w8); `sums` (views * memories + memories, hc, wc), in cells,
-    the last of them the spread of the views; `means` (memories, hc, wc * pixels), the mean view's
-    with the pixels of a cell side by side.  `memories` are the time constants.
+    the last of them the spread of the views; `means` (memories or none, hc, wc * pixels), the mean
+    view's with the pixels of a cell side by side.  `memories` are the time constants; `local`:
+    blocks fall asleep one by one, not all together.
     """
     views = sums.shape[0] // memories.size - 1
     side = 8 * awake.shape[0] // sums.shape[1]  # pixels of a cell
@@ -77,7 +78,10 @@ def remember(t, x, y, p, view, t0, t1, memories, awake_s, awake, passed, sums, m
             r, c = y[i] // side, x[i] // side
             coarse[view[i], r, c] += p[i]
             fine[r, side * (side * c + y[i] % side) + x[i] % side] += p[i] * part
-    _pass_time(_stirred(coarse, side), f32(t1 - t0), awake_s, awake, passed)
+    hit = _stirred(coarse, side)
+    if not local and hit.any():
+        hit[:] = True
+    _pass_time(hit, f32(t1 - t0), awake_s, awake, passed)
     _leak(passed, memories, coarse, fine, sums, means)
     _spread(memories.size, sums)
 
@@ -124,9 +128,10 @@ def _leak(passed, memories, coarse, fine, sums, means):
                 row, new = sums[v * memories.size + m, r], coarse[v, r]
                 for c in range(np.uint64(width)):
                     row[c] = row[c] * keep[c] + new[c]
-            row, new = means[m, r], fine[r]
-            for c in range(np.uint64(row.size)):
-                row[c] = row[c] * wide[c] + new[c]
+            if m < means.shape[0]:
+                row, new = means[m, r], fine[r]
+                for c in range(np.uint64(row.size)):
+                    row[c] = row[c] * wide[c] + new[c]
 
 
 @njit(nogil=True, cache=True)
