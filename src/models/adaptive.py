@@ -173,7 +173,10 @@ def _reviewed(own: State, before: list[Position], after: list[Position]) -> Stat
 
 
 def _emptied(own: State, network: SetNet) -> State:
-    """Return the state for another size of network: sums of events stay, its own maps start."""
+    """Return the state for another network: sums of events stay, its own maps start."""
     mean_sums, sums, awake, *_ = own
-    sizes = network.hidden(*mean_sums.shape[-2:])
+    size = mean_sums.shape[-2:]
+    if mean_sums.shape[1] != network.direct:  # of another generation
+        mean_sums = mean_sums.new_zeros(len(awake), network.direct, *size)
+    sizes = network.hidden(*size)
     return (mean_sums, sums, awake, *(awake.new_zeros(len(awake), *size) for size in sizes))
