@@ -115,7 +115,8 @@ def test_state_stays_bounded_over_500_windows_of_noise():
     assert max(float(h.abs().max()) for h in (awake, *state[3:])) <= 1
     assert torch.isfinite(frame).all()
     # A leaky sum is at most what comes in a window divided by what leaks out of it.
-    assert max(float(s.abs().max()) for s in sums if s.numel()) < 4 * 3 * (10 + 30 * 6) / (1 - 0.984)
+    most = max(float(part.abs().max()) for part in sums if part.numel())
+    assert most < 4 * 3 * (10 + 30 * 6) / (1 - 0.984)
 
 
 @torch.no_grad()
