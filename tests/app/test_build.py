@@ -1,5 +1,7 @@
 """From a config to objects: classes of one's own, optics as the network wants them, the trainer."""
 
+import platform
+import subprocess
 import sys
 
 import numpy as np
@@ -194,3 +196,28 @@ def test_a_clip_read_backwards_first_is_scored(tmp_path):
     assert ahead["test"]["psnr"]["mean"] != once["test"]["psnr"]["mean"]
     ratio = ahead["model"]["macs_per_frame"] / once["model"]["macs_per_frame"]
     assert ratio == pytest.approx(1.5, rel=0.05)  # two of four windows are read twice
+
+
+KEEPING = """
+import resource, torch
+from omegaconf import OmegaConf
+from src.app import build
+
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    torch.ones(64, 1024, 1024)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+torch.set_num_threads(1)
+given_back = [faults() for _ in range(3)][-1]
+build.keep_memory(OmegaConf.create({"trainer": {"accelerator": "cpu"}}))
+kept = [faults() for _ in range(3)][-1]
+print(given_back, kept)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="memory is kept by glibc only")
+def test_a_training_on_a_cpu_keeps_the_memory_it_frees():
+    ran = subprocess.run([sys.executable, "-c", KEEPING], cwd=ROOT, capture_output=True, text=True)
+    given_back, kept = map(int, ran.stdout.split())
+    assert kept < 0.01 * given_back

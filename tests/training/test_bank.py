@@ -228,7 +228,7 @@ def test_batches_are_the_same_whatever_the_workers_and_the_step_begun_at(tmp_pat
             {"train": banked(bank(tmp_path / root))}, Augment(), batch_size=2, epoch_clips=8,
             workers=workers,
         )  # fmt: skip
-        data.trainer = type("Trainer", (FakeTrainer,), {"global_step": step})
+        data.trainer = FakeTrainer(step)
         return [batch.voxels for batch in data.train_dataloader()]
 
     whole = batches("a", 0, 0)

@@ -11,7 +11,12 @@ from tests.sim.test_pipeline import STRONG, pipeline
 
 
 class FakeTrainer:
-    lightning_module, global_rank, world_size = SimpleNamespace(steps=0), 0, 1
+    """One process whose training has gone `steps`."""
+
+    global_rank, world_size = 0, 1
+
+    def __init__(self, steps: int = 0):
+        self.lightning_module = SimpleNamespace(steps=steps)
 
 
 def chain():
@@ -28,6 +33,12 @@ def test_workers_change_nothing():
 
     for zero, two in zip(batches(0), batches(2), strict=True):
         assert torch.equal(zero, two)
+
+
+def test_a_training_that_goes_on_sees_other_clips():
+    data = LightFieldData({"train": chain()}, batch_size=2, epoch_clips=6)
+    data.trainer = FakeTrainer(steps=4)
+    assert next(iter(data.train_dataloader().batch_sampler)) == [(8, 8), (9, 9)]
 
 
 def test_a_batch_used_again_is_augmented_anew():

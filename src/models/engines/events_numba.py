@@ -77,7 +77,8 @@ def remember(t, x, y, p, view, t0, t1, memories, awake_s, local, awake, passed, 
         if t0 <= t[i] <= t1:
             r, c = y[i] // side, x[i] // side
             coarse[view[i], r, c] += p[i]
-            fine[r, side * (side * c + y[i] % side) + x[i] % side] += p[i] * part
+            if means.shape[0]:
+                fine[r, side * (side * c + y[i] % side) + x[i] % side] += p[i] * part
     hit = _stirred(coarse, side)
     if not local and hit.any():
         hit[:] = True
@@ -123,7 +124,8 @@ def _leak(passed, memories, coarse, fine, sums, means):
             for j in range(passed.shape[1]):
                 left = np.exp(-passed[r // block, j] / memories[m])
                 keep[block * j : block * (j + 1)] = left
-                wide[wider * j : wider * (j + 1)] = left
+                if m < means.shape[0]:
+                    wide[wider * j : wider * (j + 1)] = left
             for v in range(views):
                 row, new = sums[v * memories.size + m, r], coarse[v, r]
                 for c in range(np.uint64(width)):
