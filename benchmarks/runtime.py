@@ -31,7 +31,7 @@ from src.sim.voxel import voxel_grid
 SIDE, FPS, RATE = 176, 600, 5e6
 FORM = "bf16" if computes_bf16() else "float32"
 RECORDING = Path("../shared/data/events/gen3_640x480_evt2.raw")
-NAMES = ("setnet_small", "setnet_medium", "setnet_large", "lf3x3")
+NAMES = ("setnet_small", "setnet_medium", "lf3x3")
 
 
 def windows(path: Path) -> list[tuple]:

@@ -12,7 +12,7 @@ from src.models.setnet import SetNet
 from tests.test_train import config
 
 HIGHPASS = "{baseline: {_target_: baselines.highpass.HighPass}, views: 1}"
-SETNET = "{views: 9, model: {_target_: src.models.setnet.SetNet, stem: 4, channels: 8}}"
+SETNET = "{views: 9, model: {_target_: src.models.setnet.SetNet, half: 4}}"
 TINY = ["clips=2", "scene.height=64", "scene.width=64", "data.test_crop=32", "data.test_windows=4"]
 TINY += ["data.warmup=1", "metrics.lpips=null", "sizes=[32]", "seconds=0.01", "threads=[1]"]
 TINY += ["severities=[weak]", "forms=[float32,bf16]", "adapt.levels=[[nowhere,1],[nowhere,9]]"]
@@ -54,8 +54,8 @@ def test_a_post_processor_is_scored_and_paid_for(tmp_path):
 
 def test_the_adaptive_network_is_shown_on_air_that_rises_and_falls(tmp_path):
     torch.manual_seed(0)
-    network, file = SetNet(stem=4, channels=8), tmp_path / "tiny.safetensors"
-    spec = {"target": "src.models.setnet.SetNet", "kwargs": {"stem": 4, "channels": 8}}
+    network, file = SetNet(half=4), tmp_path / "tiny.safetensors"
+    spec = {"target": "src.models.setnet.SetNet", "kwargs": {"half": 4}}
     save(file, network, spec, {})
     levels = f"adapt.levels=[[{file},1],[{file},9]]"
     small = ["adapt.course=[0,4,0]", "adapt.windows=18", "adapt.patience=2", "clips=1"]

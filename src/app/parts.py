@@ -14,10 +14,9 @@ from omegaconf import DictConfig, OmegaConf
 from baselines.upstream import from_config
 from src.app.contracts import keeping
 from src.models.setnet import SetNet
-from src.models.setnet2 import SetNet2
 
 # What is no class and may be named all the same.
-FACTORIES = (from_config, SetNet.preset, SetNet2.preset)
+FACTORIES = (from_config, SetNet.preset)
 PACKAGE = r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*"
 OLDER = {  # what a part is where none is named: runs before 0.2 named none
     "turbulence": "src.sim.turbulence.simulated.SimulatedAir",

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from src.models.setnet import SetNet, State
+from src.models.setnet import CELL, SetNet, State
 from src.sim.optics import Position, layout
 
 BLOCK = 4  # pixels of a block in which events are added up before views are compared
@@ -166,17 +166,14 @@ def _chosen(views: int, places: list[Position]) -> list[Position]:
 
 def _reviewed(own: State, before: list[Position], after: list[Position]) -> State:
     """Return a state of SetNet for other views: a new one starts from the mean of those known."""
-    mean_sums, sums, *rest = own
+    sums, *rest = own
     mean = sums.mean(1)
     parts = [sums[:, before.index(place)] if place in before else mean for place in after]
-    return (mean_sums, torch.stack(parts, 1), *rest)
+    return (torch.stack(parts, 1), *rest)
 
 
 def _emptied(own: State, network: SetNet) -> State:
     """Return the state for another network: sums of events stay, its own maps start."""
-    mean_sums, sums, awake, *_ = own
-    size = mean_sums.shape[-2:]
-    if mean_sums.shape[1] != network.direct:  # of another generation
-        mean_sums = mean_sums.new_zeros(len(awake), network.direct, *size)
-    sizes = network.hidden(*size)
-    return (mean_sums, sums, awake, *(awake.new_zeros(len(awake), *size) for size in sizes))
+    sums, awake, waited, finest, *_ = own
+    sizes = network.hidden(*(CELL * side for side in finest.shape[-2:]))
+    return (sums, awake, waited, *(sums.new_zeros(len(sums), *size) for size in sizes))

@@ -1,10 +1,10 @@
 """What comes behind the first layer of a network, for one clip: maps in, frame and state out.
 
 Maps come channels last, as events are added to them; `kernel`, `bias`, `stride` and `views` say
-what the first layer is.
+what the first layer is, `between` what is enough while coarse memories rest.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from src.models import openvino_cpu, stopwatch
 from src.models.e2vid import E2VID
 from src.models.explicit_state import flat, formed
 from src.models.setnet import CELL, SetNet
+from src.models.setnet_layers import PartedUnit
 from src.sim.optics import Position
 
 
@@ -51,6 +52,9 @@ class AfterHead(nn.Module):
         frame, after = self.network.after_first(self._seen(head), formed(self.form, iter(state)))
         return frame.float(), *flat(after)
 
+    def between(self) -> None:
+        """Return nothing: no part of it rests."""
+
     def _seen(self, head: Tensor) -> Tensor:
         return head.permute(0, 3, 1, 2).to(self.dtype)
 
@@ -71,8 +75,9 @@ class AfterStem(nn.Module):
         grids, memories, bias = network.kernels(places)
         self.kernel, self.bias = grids.numpy(), bias.numpy()
         self.memories = memories.to(dtype)
-        self.skip = np.zeros(0, np.float32) if network.skip is None else network.skip.numpy()
         self.sizes = [(1, *size) for size in network.hidden(*padded)]
+        for name in ("cell2", "cell4", "cell8"):
+            setattr(network, name, PartedUnit(getattr(network, name)))
         self.network = network.to(dtype)
         self.dtype = dtype
 
@@ -84,53 +89,109 @@ class AfterStem(nn.Module):
         self,
         grids: Float[Tensor, "1 hc wc stem"],
         sums: Float[Tensor, "1 sums hc wc"],
-        passed: Float[Tensor, "1 1 h8 w8"],
-        drawn: Float[Tensor, "1 hc wc pixels"],
+        passed: Float[Tensor, "1 1 1 1"],
+        renewed: Float[Tensor, "1 1 1 1"],
         *hidden: Tensor,
     ) -> tuple[Tensor, ...]:
-        """Return the pixels of each cell (1, hc, wc, pixels) and the hidden maps, all float32."""
+        """Return the pixels of each cell (1, hc, wc, pixels), the hidden maps, all float32, and
+        what the coarse ones tell.
+        """
+        hidden2, hidden4, hidden8 = hidden
+        seen, hidden2 = self.network.fine(self.stem(grids, sums), passed, hidden2)
+        about, hidden4, hidden8 = self.network.coarse(seen, renewed, hidden4, hidden8)
+        return self.pixels(seen, about), hidden2, hidden4, hidden8, about
+
+    def between(self) -> nn.Module:
+        """Return what a window takes in which the coarse memories rest."""
+        return Between(self)
+
+    def stem(self, grids: Tensor, sums: Tensor) -> Tensor:
+        """Return the map of the stem, before its ReLU."""
         stem = functional.conv2d(sums.to(self.dtype), self.memories, None, 1, 1)
-        stem = stem + grids.permute(0, 3, 1, 2).to(self.dtype)
-        x, *hidden = self.network.after_stem(stem, passed, *hidden)
-        return (x.permute(0, 2, 3, 1) + drawn).sigmoid(), *hidden
+        return stem + grids.permute(0, 3, 1, 2).to(self.dtype)
+
+    def pixels(self, seen: Tensor, about: Tensor) -> Tensor:
+        """Return the pixels of each cell."""
+        return self.network.drawn(seen, about).permute(0, 2, 3, 1).sigmoid()
+
+
+class Between(nn.Module):
+    """What of `AfterStem` a window takes in which the coarse memories see no time."""
+
+    def __init__(self, after: AfterStem):
+        super().__init__()
+        self.after = after
+
+    def forward(
+        self, grids: Tensor, sums: Tensor, passed: Tensor, hidden2: Tensor, about: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the pixels of each cell and the fine hidden map; `about`: what the coarse tell."""
+        stem = self.after.stem(grids, sums)
+        seen, hidden2 = self.after.network.fine(stem, passed, hidden2)
+        return self.after.pixels(seen, about), hidden2
+
+
+class Behind:
+    """Runs what comes behind the first layer and keeps its state.
+
+    `make` gives for a module, its inputs and a number of threads what runs it, an `OnTorch`, say.
+    """
+
+    def __init__(
+        self, after: AfterHead | AfterStem, inputs: list[np.ndarray], make: Callable, threads: int
+    ):
+        example = [torch.from_numpy(part) for part in inputs] + after.start()
+        self.whole, self.given, self.between = make(after, example, threads), len(inputs), None
+        between = after.between()
+        if between is not None:
+            with torch.no_grad():
+                _, hidden2, *_, about = after(*example)
+            self.between = make(between, [*example[: self.given - 1], hidden2, about], threads)
+        self.reset()
+
+    def __call__(self, inputs: list[np.ndarray]) -> np.ndarray:
+        """Return what is drawn and keep the state."""
+        if self.between is None:
+            drawn, *self.state = self.whole(inputs, self.state)
+            return drawn
+        *seen, renewed = inputs
+        *hidden, about = self.state
+        if about is None or renewed.any():
+            drawn, *self.state = self.whole(inputs, hidden)
+        else:
+            drawn, hidden2 = self.between(seen, [hidden[0], about])
+            self.state = [hidden2, *self.state[1:]]
+        return drawn
+
+    def reset(self) -> None:
+        """Start from zeros."""
+        start = self.whole.zeros(self.given)
+        self.state = start if self.between is None else [*start, None]
 
 
 class OnTorch:
-    """What comes behind the first layer, on PyTorch."""
+    """A module of `example`'s sizes on PyTorch: arrays and a state in, an array and a state out."""
 
-    def __init__(self, after: nn.Module, inputs: list, state: list[Tensor], threads: int):
-        self.after = after.to(memory_format=torch.channels_last)
-        self.threads, self.zeros = threads, state
-        self.reset()
+    def __init__(self, module: nn.Module, example: list[Tensor], threads: int):
+        self.module = module.to(memory_format=torch.channels_last)
+        self.example, self.threads = example, threads
 
     @torch.inference_mode()
-    def __call__(self, inputs: list[np.ndarray]) -> np.ndarray:
-        """Return what is drawn and keep the state."""
+    def __call__(self, inputs: list[np.ndarray], state: list[Tensor]) -> list:
+        """Return what is drawn and the state."""
         with stopwatch.threads(self.threads):
-            given = [torch.from_numpy(part) for part in inputs]
-            drawn, *self.state = self.after(*given, *self.state)
-        return drawn.numpy()
+            drawn, *state = self.module(*map(torch.from_numpy, inputs), *state)
+        return [drawn.numpy(), *state]
 
-    def reset(self) -> None:
-        """Start from zeros."""
-        self.state = self.zeros
+    def zeros(self, first: int) -> list[Tensor]:
+        """Return zeros for the inputs from the `first` on."""
+        return [torch.zeros_like(part) for part in self.example[first:]]
 
 
-class OnOpenVino:
-    """What comes behind the first layer, on OpenVINO."""
+class OnOpenVino(openvino_cpu.Compiled):
+    """As OnTorch, on OpenVINO."""
 
-    def __init__(self, after: nn.Module, inputs: list, state: list[Tensor], threads: int):
-        example = [torch.from_numpy(part) for part in inputs] + state
-        self.compiled = openvino_cpu.Compiled(after, example, threads)
-        self.given = len(inputs)
-        self.reset()
-
-    def __call__(self, inputs: list[np.ndarray]) -> np.ndarray:
-        """Return what is drawn and keep the state."""
-        given = [openvino_cpu.shared(part) for part in inputs]
-        self.drawn, *self.state = self.compiled([*given, *self.state])
-        return self.drawn.data  # which does not keep the tensor alive
-
-    def reset(self) -> None:
-        """Start from zeros."""
-        self.state = self.compiled.zeros(self.given)
+    def __call__(self, inputs: list[np.ndarray], state: list) -> list:
+        """Return what is drawn and the state."""
+        self.drawn, *state = super().__call__([*map(openvino_cpu.shared, inputs), *state])
+        return [self.drawn.data, *state]  # an array does not keep its tensor alive

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.parametrizations import spectral_norm as normalise_spectrum
 
-from src.models.layers import ConvGRU, ConvLSTM, ResidualBlock, pad_to_multiple
+from src.models.layers import ConvGRU, ConvLSTM, Relu, ResidualBlock, pad_to_multiple
 from src.sim.optics import centre, layout
 
 CELLS = {"convlstm": ConvLSTM, "convgru": ConvGRU}
@@ -74,6 +74,7 @@ class E2VID(nn.Module):
         self.resblocks = nn.Sequential(*(ResidualBlock(widths[-1]) for _ in range(2)))
         self.decoders = nn.ModuleList(_conv(b, a, kernel_size) for a, b in reversed(pairs))
         self.pred = nn.Conv2d(base_channels, 1, 1)
+        self.relu = Relu()
         if spectral_norm:
             for gate in (m for c in self.cells for m in c.children()):
                 normalise_spectrum(gate)
@@ -122,13 +123,13 @@ class E2VID(nn.Module):
         return self._scales(self.first(x), state)
 
     def _scales(self, x: Tensor, state: Any) -> tuple[Tensor, list[Tensor], tuple]:
-        head = x = x.relu() if self.stem is None else self.head(x.relu()).relu()
+        head = x = self.relu(x if self.stem is None else self.head(self.relu(x)))
         skips, after, states = [], [], list(state or [None] * SCALES)
         if state and self.state_step and not self.training:
             hidden, memory = states[0]
             states[0] = (hidden / self.state_step).round() * self.state_step, memory
         for encoder, cell, before in zip(self.encoders, self.cells, states, strict=True):
-            x, new = cell(encoder(x).relu(), before)
+            x, new = cell(self.relu(encoder(x)), before)
             skips.append(x)
             after.append(new)
         return head, skips, tuple(after)
@@ -139,7 +140,7 @@ class E2VID(nn.Module):
         """Return the frame before its activation, from the coarsest map up."""
         for decoder, skip in zip(self.decoders, reversed(skips), strict=True):
             x = functional.interpolate(x + skip, scale_factor=2, mode="bilinear")
-            x = decoder(x).relu()
+            x = self.relu(decoder(x))
         return self.pred(x + head)
 
 

@@ -5,7 +5,7 @@ import numpy as np
 from src.models.behind_first_layer import AfterHead, AfterStem
 from src.models.engines import events_numba as kernels
 from src.models.kernel_patches import patches, spans
-from src.models.setnet import AWAKE_S, MEMORIES_S
+from src.models.setnet import AWAKE_S, MEMORIES_S, RENEWED_S
 
 NOTHING = [np.empty(0, kind) for kind in (np.float64, np.int64, np.int64, np.float32, np.int64)]
 
@@ -50,34 +50,28 @@ class HeadFront:
 
 
 class StemFront(HeadFront):
-    """The map of SetNet's stem, in cells, and its leaky sums."""
+    """The map of SetNet's stem, in cells, its leaky sums and its clock."""
 
     def __init__(self, after: AfterStem, padded: tuple[int, int]):
         super().__init__(after, padded)
-        rows, columns = (side // self.stride for side in padded)
-        count, eighth = len(MEMORIES_S), (padded[0] // 8, padded[1] // 8)
+        rows, columns = self.shape[1:3]
         self.memories = np.array(MEMORIES_S, np.float32)
-        self.skip, self.local = after.skip, after.network.local
-        self.awake = np.zeros(eighth, np.float32)
-        self.sums = np.zeros(((after.views + 1) * count, rows, columns), np.float32)
-        self.means = np.zeros((len(self.skip), rows, columns * self.stride**2), np.float32)
+        self.sums = np.zeros(((after.views + 1) * len(MEMORIES_S), rows, columns), np.float32)
+        self.clock = np.zeros(2, np.float32)  # how awake it is, what its coarse memories wait for
 
     def add(self, t, x, y, p, view, t0: float, t1: float) -> list[np.ndarray]:
         """Bring the sums to the end of a window; return the map, the sums and their spread, the
-        time passed, what the sums draw.
+        time passed, and that which the coarse memories see.
         """
-        passed, drawn = np.empty_like(self.awake), np.empty(self.means.shape[1:], np.float32)
-        kernels.remember(
-            t, x, y, p, view, t0, t1, self.memories, np.float32(AWAKE_S),
-            self.local, self.awake, passed, self.sums, self.means,
-        )  # fmt: skip
-        kernels.weigh(self.skip, self.means, drawn)
-        return [
-            *super().add(t, x, y, p, view, t0, t1),
-            self.sums[None].copy(),
-            passed[None, None],
-            drawn.reshape(*self.shape[:3], -1),
-        ]
+        events = t, x, y, p, view, t0, t1
+        awake, passed = kernels.remember(
+            *events, self.stride, self.memories, np.float32(AWAKE_S), self.clock[0], self.sums
+        )
+        waited = self.clock[1] + passed
+        renewed = waited if waited >= RENEWED_S else np.float32(0)
+        self.clock[:] = awake, waited - renewed
+        times = (np.full((1, 1, 1, 1), seconds, np.float32) for seconds in (passed, renewed))
+        return [*super().add(*events), self.sums[None].copy(), *times]
 
     def frame(self, drawn: np.ndarray) -> np.ndarray:
         """Return the frame (h, w), padded, of its cells."""
@@ -90,10 +84,9 @@ class StemFront(HeadFront):
         self.restore([np.zeros_like(part) for part in self.state()])
 
     def state(self) -> list[np.ndarray]:
-        """Return a copy of the sums, the mean view's and how awake each block is."""
-        return [part.copy() for part in (self.sums, self.means, self.awake)]
+        """Return a copy of the sums and the clock."""
+        return [self.sums.copy(), self.clock.copy()]
 
     def restore(self, state: list[np.ndarray]) -> None:
         """Go on from what `state` gave."""
-        for own, part in zip((self.sums, self.means, self.awake), state, strict=True):
-            own[:] = part
+        self.sums[:], self.clock[:] = state

@@ -6,6 +6,7 @@ in float32 (`SetNet`: its sums and hidden maps) stays so.  Needs the extra `open
 
 import warnings
 from collections.abc import Sequence
+from functools import cache
 from importlib.util import find_spec
 from typing import Any
 
@@ -35,9 +36,7 @@ def require() -> None:
 def precision() -> torch.dtype:
     """Return what to compute in here: bfloat16, or float32 on a CPU without it."""
     require()
-    import openvino
-
-    able = openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+    able = _core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
     return torch.bfloat16 if "BF16" in able else torch.float32
 
 
@@ -50,8 +49,6 @@ class Compiled:
 
     def __init__(self, module: nn.Module, example: Sequence[Tensor], threads: int):
         require()
-        import openvino
-
         model = _converted(module, tuple(example))
         model.reshape({k: list(part.shape) for k, part in enumerate(example)})
         options = {
@@ -61,7 +58,7 @@ class Compiled:
             "PERFORMANCE_HINT": "LATENCY",
             "ENABLE_CPU_PINNING": False,
         }
-        compiled = openvino.Core().compile_model(model, "CPU", options)
+        compiled = _core().compile_model(model, "CPU", options)
         self.request = compiled.create_infer_request()
         self.module = module  # whose weights it may read where they lie
         self.outputs = [(part.element_type, list(part.shape)) for part in compiled.outputs]
@@ -165,6 +162,14 @@ class _Rounding(Explicit):
         seconds, state = (rest[0], rest[1:]) if self.timed else (None, rest)
         frame, *after = super().forward(voxels.to(self.seen), seconds, *state)
         return frame.float(), *after
+
+
+@cache
+def _core() -> Any:
+    """Return the one core of this process."""
+    import openvino
+
+    return openvino.Core()
 
 
 def _converted(module: nn.Module, example: tuple[Tensor, ...]) -> Any:

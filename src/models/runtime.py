@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import nn
 
 from src.models import openvino_cpu
-from src.models.behind_first_layer import AfterHead, AfterStem, OnOpenVino, OnTorch
+from src.models.behind_first_layer import AfterHead, AfterStem, Behind, OnOpenVino, OnTorch
 from src.models.e2vid import E2VID
 from src.models.engines import events_numba as kernels
 from src.models.fast import computes_bf16, plain
@@ -85,8 +85,8 @@ class Runtime:
         rest, front = (AfterStem, StemFront) if stemmed else (AfterHead, HeadFront)
         after = rest(plain(network).cpu(), positions, padded, dtype)
         self.front = front(after, padded)
-        behind = OnOpenVino if form == "openvino" else OnTorch
-        self.behind = behind(after, self.front.example(), after.start(), threads)
+        engine = OnOpenVino if form == "openvino" else OnTorch
+        self.behind = Behind(after, self.front.example(), engine, threads)
 
     def step(
         self,

@@ -1,34 +1,43 @@
 """SetNet, ours: frames from any number of views, at any rate, at a fraction of E2VID's cost.
 
-All of it is here.  Views come in as a set: a view's kernel follows from its position, so the first
-layer is a stack of views with weights made for whoever is there; the spread across views says where
-they agree.  Leaky sums of events give the network a memory from its first step.  Time passes in
-seconds, not in windows, and only where events come: every decay and every update is raised to the
-power of the time that passed, so that one set of weights serves 120 and 12,000 windows a second,
-and a picture without events stays.
+Views come in as a set: a view's kernel follows from its position, so the first layer is a stack of
+views with weights made for whoever is there; the spread across views says where they agree.  Leaky
+sums of events give the network a memory from its first step.  Time passes in seconds, not in
+windows, and only while events come: one set of weights serves 120 and 12,000 windows a second, and
+a picture without events stays.
 
-half resolution: stem -> quarter: GRU -> eighth: GRU, residual block -> up, up -> pixel shuffle.
+half resolution: stem, memory -> quarter: memory -> eighth: memory, residual block, surroundings at
+a sixteenth and a thirty-second -> up, up -> 2 x 2 pixels.  What is below a half, four fifths of the
+cost, is renewed at most 120 times a second and kept in between (docs/decisions/0019).
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from src.models.layers import ResidualBlock, pad_to_multiple
+from src.models.layers import Relu, ResidualBlock, pad_to_multiple
+from src.models.setnet_layers import (
+    PacedUnit,
+    Surroundings,
+    ViewKernels,
+    grown,
+    over_time,
+)  # fmt: skip
 from src.sim.optics import layout
 
-SIZES = {  # multiply-accumulates at 176 x 176 with nine views: 0.4, 0.8 and 3 G
-    "small": {"stem": 12, "channels": 32},
-    "medium": {"stem": 16, "channels": 48},
-    "large": {"stem": 32, "channels": 96},
+SIZES = {  # multiply-accumulates at 176 x 176 with nine views: 0.5, 1.2 and 3.1 G
+    "small": {"half": 16},
+    "medium": {"half": 28},
+    "large": {"half": 48},
 }
 MEMORIES_S = (0.05, 0.5)  # time constants of the leaky sums
-AWAKE_S = 0.005  # time constant by which a block falls asleep after its last event
-RATE = 120.0  # windows a second at which an update gate is taken as it is
+AWAKE_S = 0.005  # time constant by which a picture falls asleep after its last event
+RATE = 120.0  # windows a second at which a gate is taken as it is
+RENEWED_S = 0.98 / RATE  # what has to pass before coarse memories see it; 2 % for rounding
 MAX_VIEWS = 25
 CELL = 2  # pixels: side of what the first layer sees as one
 
@@ -39,46 +48,40 @@ State = tuple[Tensor, ...]
 class SetNet(nn.Module):
     """Voxel grids of 1 to 25 views to frames in [0, 1], window by window.
 
-    `stem`: channels at half resolution.  `channels`: at a quarter, doubled at an eighth.  The order
-    of the views is free but the same in all windows of a sequence.
+    `half`: channels at half resolution, doubled at a quarter and again at an eighth.  The order of
+    the views is free but the same in all windows of a sequence.
     """
 
     views = None
-    sizes = SIZES
-    local = True  # each block falls asleep by itself; False: all of a picture together
-    direct = len(MEMORIES_S)  # of the mean view's leaky sums are drawn without any learning
 
-    def __init__(self, bins: int = 5, stem: int = 12, channels: int = 32):
+    def __init__(self, bins: int = 5, half: int = 16):
         super().__init__()
-        self.arguments = {"bins": bins, "stem": stem, "channels": channels}  # that make it again
+        self.arguments = {"bins": bins, "half": half}  # that make it again
         self.bins = bins
-        memories = len(MEMORIES_S)
-        self.voxel_stem = ViewKernels(bins, stem, 5)
-        self.sum_stem = ViewKernels(memories, stem, 3)
-        self.spread_stem = nn.Conv2d(memories, stem, 3, padding=1, bias=False)
-        self.down4 = nn.Conv2d(stem, channels, 3, 2, padding=1)
-        self.cell4 = self.unit(channels)
-        self.down8 = nn.Conv2d(channels, 2 * channels, 3, 2, padding=1)
-        self.cell8 = self.unit(2 * channels)
-        self.block8 = ResidualBlock(2 * channels)
-        self.up4 = nn.Conv2d(2 * channels, channels, 1)
-        self.mix4 = nn.Conv2d(channels, channels, 3, padding=1)
-        self.up2 = nn.Conv2d(channels, stem, 1)
-        self.mix2 = nn.Conv2d(stem, stem, 3, padding=1)
-        self.shuffle = nn.Conv2d(stem, CELL**2, 3, padding=1)
+        memories, quarter, eighth = len(MEMORIES_S), 2 * half, 4 * half
+        self.voxel_stem = ViewKernels(bins, half, 5)
+        self.sum_stem = ViewKernels(memories, half, 3)
+        self.spread_stem = nn.Conv2d(memories, half, 3, padding=1, bias=False)
+        self.cell2 = PacedUnit(half, reach=1)
+        self.down4 = nn.Conv2d(half, quarter, 3, 2, padding=1)
+        self.cell4 = PacedUnit(quarter)
+        self.down8 = nn.Conv2d(quarter, eighth, 3, 2, padding=1)
+        self.cell8 = PacedUnit(eighth)
+        self.block8 = nn.Sequential(ResidualBlock(eighth), Surroundings(eighth))
+        self.up4 = nn.Conv2d(eighth, quarter, 1)
+        self.mix4 = nn.Conv2d(quarter, quarter, 3, padding=1)
+        self.up2 = nn.Conv2d(quarter, half, 1)
+        self.mix2 = nn.Conv2d(half, half, 3, padding=1)
+        self.shuffle = nn.Conv2d(half, CELL**2, 3, padding=1)
+        self.relu = Relu()
         self.frozen: dict[tuple, tuple[Tensor, ...]] | None = None  # kernels kept, for running
-        self.skip = nn.Parameter(torch.full((self.direct,), 0.15)) if self.direct else None
-
-    def unit(self, channels: int) -> nn.Module:
-        """Return a memory of so many channels."""
-        return PacedGRU(channels)
 
     @classmethod
     def preset(cls, size: str, bins: int = 5) -> "SetNet":
         """Return the network of a `size`: small, medium or large; ValueError for another."""
-        if size not in cls.sizes:
-            raise ValueError(f"model.size must be one of {', '.join(cls.sizes)}, got {size}")
-        return cls(bins, **cls.sizes[size])
+        if size not in SIZES:
+            raise ValueError(f"model.size must be one of {', '.join(SIZES)}, got {size}")
+        return cls(bins, **SIZES[size])
 
     def forward(
         self,
@@ -92,9 +95,9 @@ class SetNet(nn.Module):
 
         `window_s`: how long the window lasts, in seconds, a number or one per clip (n,).
         `positions`: (row, col) of each view from the centre view; default: `optics.layout`.
-        State, float32: leaky sums of the mean view and, in cells, of each view, how awake each
-        block of 8 x 8 is, and the `hidden` maps, in [-1, 1].  Raises ValueError for bins, a number
-        of views, a length of window or a state that do not fit.
+        State, float32: leaky sums of each view, in cells, how awake each picture is, the time in s
+        that its coarse memories have not seen yet, and the `hidden` maps, in [-1, 1].  Raises
+        ValueError for bins, a number of views, a length of window or a state that do not fit.
         """
         frames, state = self.sequence(
             voxels[:, None], state, window_s=window_s, positions=positions
@@ -119,53 +122,59 @@ class SetNet(nn.Module):
         seconds = _seconds(window_s, voxels)
         padded, (top, left) = pad_to_multiple(voxels.flatten(0, 2), 8)
         voxels = padded.unflatten(0, (n, windows, views)).transpose(0, 1)
-        events = voxels.float().sum(3).flatten(0, 1)
-        coarse = _halved(events)
-        mean_sums, sums, awake, *hidden = self._start(state, coarse[:n])
+        cells = _halved(voxels.float().sum(3).flatten(0, 1))
+        sums, awake, waited, hidden2, hidden4, hidden8 = self._start(state, cells[:n])
 
-        awake, passed = _time(_stirred(coarse, self.local), awake, seconds)
-        keep = torch.cat([torch.exp(-passed / memory) for memory in MEMORIES_S], 1)
-        kept = grown(keep, 8 // CELL)[:, None]
-        all_sums, sums = over_time(_leaked, sums, kept, coarse[:, :, None])
-        spread = (all_sums - all_sums.mean(1, keepdim=True)).abs().mean(1)
+        awake, passed = _time(cells, awake, seconds)
+        waited, renewed = _saved_up(passed, waited)
+        kept = torch.stack([torch.exp(-passed / memory) for memory in MEMORIES_S], 2)
+        every, sums = over_time(_leaked, sums, kept, cells[:, :, None])
+        spread = (every - every.mean(1, keepdim=True)).abs().mean(1)
 
         grids, memories, bias = self.kernels(places)
         stacked = _cast(voxels, grids.dtype).reshape(windows * n, views * bins, *voxels.shape[-2:])
         stem = functional.conv2d(stacked, grids, None, CELL, grids.shape[-1] // 2)
-        memory = torch.cat([all_sums.flatten(1, 2), spread], 1).to(memories.dtype)
+        memory = torch.cat([every.flatten(1, 2), spread], 1).to(memories.dtype)
         stem = stem + functional.conv2d(memory, memories, bias, 1, 1)
-        x, *hidden = self.after_stem(stem, passed, *hidden)
-        x = functional.pixel_shuffle(x, CELL)
-        if self.direct:
-            mean = events.mean(1, keepdim=True)
-            every, mean_sums = over_time(_leaked, mean_sums, grown(keep, 8), mean)
-            x = x + (self.skip[:, None, None] * every).sum(1, keepdim=True)
-        frames = x.sigmoid()[..., top : top + height, left : left + width].float()
-        state = (mean_sums, sums, awake, *hidden)
-        return frames.unflatten(0, (windows, n)).transpose(0, 1), state
+        seen, hidden2 = self.fine(stem, passed, hidden2)
+        about, hidden4, hidden8 = self.coarse(seen, renewed, hidden4, hidden8)
+        frames = functional.pixel_shuffle(self.drawn(seen, about), CELL).sigmoid()
+        frames = frames[..., top : top + height, left : left + width]
+        frames = frames.unflatten(0, (windows, n)).transpose(0, 1)
+        return frames, (sums, awake, waited, hidden2, hidden4, hidden8)
 
-    def after_stem(
-        self, stem: Tensor, passed: Tensor, hidden4: Tensor, hidden8: Tensor
-    ) -> tuple[Float[Tensor, "n pixels hc wc"], Tensor, Tensor]:
-        """Return what is drawn, the pixels of a cell as channels, float32, and the new hidden maps.
-
-        `stem`: before its ReLU, (windows * n, stem, hc, wc); `passed`: seconds, (windows * n, 1,
-        h8, w8); what is drawn has every window too, the hidden maps are those after the last.
+    def fine(
+        self, stem: Float[Tensor, "m c h2 w2"], passed: Float[Tensor, "m 1 1 1"], hidden2: Tensor
+    ) -> tuple[Float[Tensor, "m c h2 w2"], Tensor]:
+        """Return what is known at half resolution after each of m = windows * n, and the hidden map
+        after the last; `stem`: before its ReLU, `passed`: seconds.
         """
-        return self.below(stem.relu(), passed, hidden4, hidden8)
+        all2, hidden2 = self.cell2(self.relu(stem), hidden2, RATE * passed)
+        return all2.to(stem.dtype), hidden2
 
-    def below(
-        self, seen: Tensor, passed: Tensor, hidden4: Tensor, hidden8: Tensor
-    ) -> tuple[Float[Tensor, "n pixels hc wc"], Tensor, Tensor]:
-        """Return what `after_stem` does; `seen`: what is known at half resolution."""
-        pace = RATE * passed
-        all4, hidden4 = self.cell4(self.down4(seen).relu(), hidden4, grown(pace, 2))
-        after4 = all4.to(seen.dtype)
-        all8, hidden8 = self.cell8(self.down8(after4).relu(), hidden8, pace)
-        x = self.block8(all8.to(seen.dtype))
-        x = self.mix4((grown(self.up4(x), 2) + after4).relu()).relu()
-        x = self.mix2((grown(self.up2(x), 2) + seen).relu()).relu()
-        return self.shuffle(x).float(), hidden4, hidden8
+    def coarse(
+        self,
+        seen: Float[Tensor, "m c h2 w2"],
+        renewed: Float[Tensor, "m 1 1 1"],
+        hidden4: Tensor,
+        hidden8: Tensor,
+    ) -> tuple[Float[Tensor, "m c h4 w4"], Tensor, Tensor]:
+        """Return what a quarter and an eighth tell of the half, and their hidden maps after the
+        last; where no time is `renewed` they tell what they did before.
+        """
+        pace = RATE * renewed
+        all4, hidden4 = self.cell4(self.relu(self.down4(seen)), hidden4, pace)
+        all4 = all4.to(seen.dtype)
+        all8, hidden8 = self.cell8(self.relu(self.down8(all4)), hidden8, pace)
+        x = grown(self.up4(self.block8(all8.to(seen.dtype))), 2) + all4
+        return self.up2(self.relu(self.mix4(self.relu(x)))), hidden4, hidden8
+
+    def drawn(
+        self, seen: Float[Tensor, "m c h2 w2"], about: Float[Tensor, "m c h4 w4"]
+    ) -> Float[Tensor, "m pixels h2 w2"]:
+        """Return the pixels of each cell as channels, float32, before their sigmoid."""
+        x = grown(about, 2) + seen
+        return self.shuffle(self.relu(self.mix2(self.relu(x)))).float()
 
     def kernels(self, places: tuple[Position, ...]) -> tuple[Tensor, Tensor, Tensor]:
         """Return the kernels of the stem for views that stand at `places`: of the stacked grids
@@ -186,6 +195,7 @@ class SetNet(nn.Module):
     def places(
         self, views: int, bins: int, positions: Sequence[Position] | None
     ) -> tuple[Position, ...]:
+        """Return where the views stand; ValueError for bins or views that do not fit."""
         if bins != self.bins:
             raise ValueError(f"bins must be {self.bins} for this network, got {bins}")
         if not 1 <= views <= MAX_VIEWS:
@@ -196,104 +206,25 @@ class SetNet(nn.Module):
         return tuple((int(row), int(column)) for row, column in positions)
 
     def hidden(self, height: int, width: int) -> list[tuple[int, int, int]]:
-        """Return the sizes (c, h, w) of the hidden maps of a picture."""
-        quarter, eighth = self.up4.out_channels, self.up4.in_channels
-        return [(quarter, height // 4, width // 4), (eighth, height // 8, width // 8)]
+        """Return the sizes (c, h, w) of the hidden maps of a picture: half, quarter, eighth."""
+        half = self.arguments["half"]
+        return [(half * k, height // (2 * k), width // (2 * k)) for k in (1, 2, 4)]
 
-    def _start(self, state: State | None, coarse: Tensor) -> State:
+    def _start(self, state: State | None, cells: Tensor) -> State:
         """Return `state`, or zeros of the right sizes; ValueError when they are not right."""
-        n, views, rows, columns = coarse.shape
-        height, width = CELL * rows, CELL * columns
+        n, views, rows, columns = cells.shape
+        maps = self.hidden(CELL * rows, CELL * columns)
         sizes = [
-            (n, self.direct, height, width),
             (n, views, len(MEMORIES_S), rows, columns),
-            (n, 1, height // 8, width // 8),
-            *((n, *size) for size in self.hidden(height, width)),
+            *[(n, 1, 1, 1)] * 2,
+            *((n, *size) for size in maps),
         ]
         if state is None:
-            return tuple(coarse.new_zeros(size) for size in sizes)
+            return tuple(cells.new_zeros(size) for size in sizes)
         found = [tuple(part.shape) for part in state]
         if found != sizes:
             raise ValueError(f"state must have sizes {sizes} for these voxels, got {found}")
         return state
-
-
-class ViewKernels(nn.Module):
-    """The kernels of a convolution over a set of views, averaged; one follows from where it stands.
-
-    kernel(place) = shared + sum over ranks of code(place) * kernels: with as many ranks as views
-    it is an ordinary convolution of stacked views.
-    """
-
-    def __init__(self, inputs: int, outputs: int, kernel_size: int, ranks: int = 5):
-        super().__init__()
-        shape = ((ranks + 1) * outputs, inputs, kernel_size, kernel_size)
-        bound = 1 / math.sqrt(inputs * kernel_size**2)
-        self.kernels = nn.Parameter(torch.empty(shape).uniform_(-bound, bound))
-        self.bias = nn.Parameter(torch.zeros(outputs))
-        self.code = nn.Sequential(nn.Linear(3, 16), nn.Tanh(), nn.Linear(16, ranks))
-
-    def kernel(
-        self, places: Float[Tensor, "views 2"]
-    ) -> Float[Tensor, "outputs viewsinputs size size"]:
-        """Return the kernel for the stacked views that stand at `places` (row, col)."""
-        views = len(places)
-        # Positions and the number of views, in units that keep the codes apart.
-        known = torch.cat([places, torch.full_like(places[:, :1], 3 / views)], 1)
-        code = self.code(known.to(self.bias.dtype))
-        code = torch.cat([torch.ones_like(code[:, :1]), code], 1) / views
-        kernels = self.kernels.unflatten(0, (code.shape[1], -1))
-        return torch.einsum("vr,roikl->ovikl", code, kernels).flatten(1, 2)
-
-
-class PacedGRU(nn.Module):
-    """A ConvGRU (Ballas et al. 2016) in continuous time.
-
-    Of the old state (1 - u) ** pace is left, u the update gate: two windows of half the length do
-    what one does, and no pace changes nothing.  A convex mix with a tanh stays within [-1, 1].
-    """
-
-    def __init__(self, channels: int):
-        super().__init__()
-        self.gates = nn.Conv2d(2 * channels, 2 * channels, 3, padding=1)
-        self.candidate = nn.Conv2d(2 * channels, channels, 3, padding=1)
-        # Update gates from 0.05 to 0.5: memories of two to twenty windows from the start.
-        with torch.no_grad():
-            self.gates.bias[channels:].copy_(torch.linspace(-3, 0, channels))
-
-    def forward(
-        self,
-        x: Float[Tensor, "m c h w"],
-        state: Float[Tensor, "n c h w"],
-        pace: Float[Tensor, "m 1 h w"],
-    ) -> tuple[Float[Tensor, "m c h w"], Float[Tensor, "n c h w"]]:
-        """Return the state, float32, after every one of m = windows * n steps and after the last.
-
-        `pace` is the time passed, in windows at 120 a second.
-        """
-
-        def step(state: Tensor, x: Tensor, pace: Tensor) -> Tensor:
-            before = state.to(x.dtype)
-            reset, update = self.gates(torch.cat([x, before], 1)).chunk(2, 1)
-            candidate = self.candidate(torch.cat([x, reset.sigmoid() * before], 1)).float().tanh()
-            # (1 - sigmoid(update)) ** pace, without the infinite slope that a power has at zero.
-            keep = torch.exp(-pace * functional.softplus(update.float()))
-            return torch.lerp(candidate, state, keep)
-
-        return over_time(step, state, x, pace)
-
-
-def over_time(
-    step: Callable[..., Tensor], state: Float[Tensor, "n ..."], *maps: Float[Tensor, "m ..."]
-) -> tuple[Float[Tensor, "m ..."], Float[Tensor, "n ..."]]:
-    """Return the state after every window and after the last; `step` takes it and a window's part
-    of each of `maps`, which have m = windows * n.
-    """
-    states = []
-    for now in zip(*(part.split(len(state)) for part in maps), strict=True):
-        state = step(state, *now)
-        states.append(state)
-    return torch.cat(states), state
 
 
 def _leaked(sums: Tensor, keep: Tensor, new: Tensor) -> Tensor:
@@ -315,31 +246,31 @@ def _seconds(window_s: float | Tensor, voxels: Tensor) -> Tensor:
     return torch.full((1, 1, 1, 1), window_s, device=voxels.device)
 
 
-def _time(stirred: Tensor, awake: Tensor, seconds: Tensor) -> tuple[Tensor, Tensor]:
-    """Return how awake each block is after the last window and the time that passed there in each,
-    in seconds: all of it with events, without any the integral of falling asleep.
+def _time(cells: Tensor, awake: Tensor, seconds: Tensor) -> tuple[Tensor, Tensor]:
+    """Return how awake each picture is after the last window and the time that passed there in
+    each, in seconds: all of it with events, without any the integral of falling asleep.
     """
     left, passed = torch.exp(-seconds / AWAKE_S), []
-    for now in stirred.split(len(awake)):
-        passed.append(torch.where(now, seconds, awake * AWAKE_S * (1 - left)))
-        awake = torch.where(now, 1.0, awake * left)
+    for stirred in (cells.abs().amax((1, 2, 3), keepdim=True) > 0).split(len(awake)):
+        passed.append(torch.where(stirred, seconds, awake * AWAKE_S * (1 - left)))
+        awake = torch.where(stirred, 1.0, awake * left)
     return awake, torch.cat(passed)
 
 
-def _stirred(coarse: Float[Tensor, "n views hc wc"], local: bool) -> Bool[Tensor, "n 1 h8 w8"]:
-    """Return which blocks of 8 x 8 pixels have an event in them or within four pixels around; or,
-    if not `local`, anywhere in the picture.
+def _saved_up(passed: Tensor, waited: Tensor) -> tuple[Tensor, Tensor]:
+    """Return what is left after the last window of the time that passed, and what of it is spent in
+    each: none until there is enough, then all.
     """
-    seen = coarse.abs().amax(1, keepdim=True)
-    stirred = functional.max_pool2d(seen, 16 // CELL, 8 // CELL, padding=4 // CELL) > 0
-    return stirred if local else stirred.any(-1, True).any(-2, True).expand_as(stirred)
+    spent = []
+    for now in passed.split(len(waited)):
+        waited = waited + now
+        enough = waited >= RENEWED_S
+        spent.append(torch.where(enough, waited, 0.0))
+        waited = torch.where(enough, 0.0, waited)
+    return waited, torch.cat(spent)
 
 
 def _halved(x: Tensor) -> Tensor:
     """Return the sums of blocks of 2 x 2, cells, several times faster than avg_pool2d on a CPU."""
     rows = x[..., ::2, :] + x[..., 1::2, :]
     return rows[..., ::2] + rows[..., 1::2]
-
-
-def grown(x: Tensor, times: int) -> Tensor:
-    return functional.interpolate(x, scale_factor=times, mode="nearest")

@@ -15,8 +15,9 @@ class Curve(Callback):
     """Score the validation clips at the start, every `every_h` hours of the module's clock and at
     the end (None: never); write all lines so far to the CSV file `path`.
 
-    A line: hours, steps, windows trained on, mean training loss since the line before, scores.  The
-    lines are part of checkpoints, so that the file of a run that goes on begins at the beginning.
+    A line: hours, steps, windows trained on, mean training loss since the line before, the share of
+    channels that got no gradient in the last step (`reconstructor.idle`), scores.  The lines are
+    part of checkpoints, so that the file of a run that goes on begins at the beginning.
     `export`: also write the weights to this file (.safetensors, float16), at each line and when the
     training is cut short.
     """
@@ -72,6 +73,7 @@ class Curve(Callback):
             "steps": module.steps,
             "windows": module.windows_seen,
             "loss": self.loss / self.steps if self.steps else "",
+            "idle": float(trainer.callback_metrics.get("train/idle", 0.0)),
         }
         self.rows.append(row | scores(trainer, module))
         self.loss, self.steps = 0.0, 0

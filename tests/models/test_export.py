@@ -17,7 +17,7 @@ from src.models.setnet import SetNet
 ROOT = Path(__file__).resolve().parents[2]
 NETWORKS = {
     "e2vid": lambda: E2VID(views=9, base_channels=4, spectral_norm=True),
-    "setnet": lambda: SetNet(stem=4, channels=8),
+    "setnet": lambda: SetNet(half=4),
     "firenet": FireNet,
 }
 

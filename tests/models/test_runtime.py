@@ -11,14 +11,12 @@ from src.models.e2vid import E2VID
 from src.models.openvino_cpu import OpenVinoNetwork
 from src.models.runtime import Runtime
 from src.models.setnet import SetNet
-from src.models.setnet2 import SetNet2
 from src.sim.optics import layout
 from src.sim.voxel import voxel_grid
 
 EXACT, ROUNDED = 1e-5, 0.02  # in grey levels: sums in another order, and bf16
 NETWORKS = {
-    "setnet": lambda: SetNet(stem=4, channels=8),
-    "setnet2": lambda: SetNet2(half=4),
+    "setnet": lambda: SetNet(half=4),
     "e2vid": lambda: E2VID(views=9, base_channels=4, spectral_norm=True),
     "e2vid_gru_3x3": lambda: E2VID(
         views=9, base_channels=4, recurrent="convgru", kernel_size=3, final_activation="none"
@@ -91,7 +89,7 @@ def runtime(net: torch.nn.Module, form: str = "float32", views: int = 9, **size)
 @pytest.mark.parametrize(("height", "width"), [(24, 32), (19, 29)])
 def test_events_one_by_one_are_the_dense_grid(name, height, width):
     net, size = network(name), {"height": height, "width": width}
-    windows = [events(seed, 0 if seed == 2 else 400, **size) for seed in range(5)]
+    windows = [events(seed, 0 if seed == 2 else 400, **size) for seed in range(12)]
     found, live = dense(net, windows, **size), runtime(net, **size)
     for window, frame in zip(windows, found, strict=True):
         np.testing.assert_allclose(live.step(**window), frame, atol=EXACT)
@@ -100,7 +98,7 @@ def test_events_one_by_one_are_the_dense_grid(name, height, width):
 @pytest.mark.parametrize("name", NETWORKS)
 @pytest.mark.parametrize("rounded", FORMS)
 def test_rounded_forms_stay_near_the_dense_grid(name, rounded):
-    net, windows = network(name), [events(seed) for seed in range(5)]
+    net, windows = network(name), [events(seed) for seed in range(12)]
     live = runtime(net, form(rounded))
     for window, frame in zip(windows, dense(net, windows), strict=True):
         got = live.step(**window)
@@ -125,7 +123,7 @@ def test_events_that_cancel_in_a_block_wake_nothing():
     }  # fmt: skip
     live = runtime(net)
     np.testing.assert_allclose(live.step(**pair), dense(net, [pair])[0], atol=EXACT)
-    assert float(live.front.awake.max()) == 0
+    assert float(live.front.clock.max()) == 0
 
 
 def test_a_pixel_may_weigh_a_part():

@@ -1,5 +1,7 @@
 """SetNet: any views in any order, time in seconds, a state that holds and never runs away."""
 
+from itertools import pairwise
+
 import pytest
 import torch
 from omegaconf import OmegaConf
@@ -8,8 +10,8 @@ from src.app import build
 from src.app.parts import make
 from src.models import load, save
 from src.models.cost import macs_per_frame
-from src.models.setnet import PacedGRU, SetNet
-from src.models.setnet2 import SIZES, PacedUnit, SetNet2
+from src.models.setnet import SIZES, SetNet
+from src.models.setnet_layers import PacedUnit
 from src.models.unroll import AT_ONCE, unroll
 from src.sim.optics import layout
 from tests.conftest import ROOT
@@ -18,21 +20,7 @@ from tests.test_train import config
 
 def small() -> SetNet:
     torch.manual_seed(0)
-    return KIND[0]()
-
-
-KIND = [None]  # of the generation that is tested
-
-
-@pytest.fixture(
-    params=[
-        pytest.param(lambda: SetNet(bins=3, stem=4, channels=4), id="first"),
-        pytest.param(lambda: SetNet2(bins=3, half=4), id="second"),
-    ],
-    autouse=True,
-)
-def generation(request, monkeypatch):
-    monkeypatch.setitem(globals(), "KIND", [request.param])
+    return SetNet(bins=3, half=4)
 
 
 def voxels(n: int = 1, windows: int = 4, views: int = 9, side: int = 16) -> torch.Tensor:
@@ -42,18 +30,17 @@ def voxels(n: int = 1, windows: int = 4, views: int = 9, side: int = 16) -> torc
 
 @pytest.mark.parametrize(("size", "giga"), [("small", 0.46), ("medium", 1.18), ("large", 3.11)])
 def test_cost_and_config_of_each_size(size, giga):
-    network = SetNet2.preset(size)
+    network = SetNet.preset(size)
     assert abs(macs_per_frame(network, 176, 176, views=9) / 1e9 - giga) < 0.02
     node = OmegaConf.load(ROOT / "conf" / "model" / f"setnet_{size}.yaml")
     made = make(OmegaConf.merge(node, {"bins": 5}))
-    assert isinstance(made, SetNet2) and made.arguments == {"bins": 5} | SIZES[size]
+    assert isinstance(made, SetNet) and made.arguments == {"bins": 5} | SIZES[size]
 
 
 @pytest.mark.parametrize("size", SIZES)
 def test_a_preset_is_stored_as_what_it_stands_for(size, tmp_path):
     _, spec = build.network(config("train", tmp_path, f"experiment=setnet_{size}"))
-    target = "src.models.setnet2.SetNet2"
-    assert spec == {"target": target, "kwargs": {"bins": 5} | SIZES[size]}
+    assert spec == {"target": "src.models.setnet.SetNet", "kwargs": {"bins": 5} | SIZES[size]}
 
 
 @pytest.mark.parametrize("views", [1, 2, 3, 4, 5, 9, 16, 25])
@@ -111,12 +98,11 @@ def test_state_stays_bounded_over_500_windows_of_noise():
     for step in range(500):
         noise = torch.randn(1, 2, 3, 16, 16, generator=torch.Generator().manual_seed(step))
         frame, state = network(30 * noise + 10, state)
-    *sums, awake = state[:3]
-    assert max(float(h.abs().max()) for h in (awake, *state[3:])) <= 1
+    sums, awake, waited, *hidden = state
+    assert max(float(h.abs().max()) for h in (awake, waited, *hidden)) <= 1
     assert torch.isfinite(frame).all()
     # A leaky sum is at most what comes in a window divided by what leaks out of it.
-    most = max(float(part.abs().max()) for part in sums if part.numel())
-    assert most < 4 * 3 * (10 + 30 * 6) / (1 - 0.984)
+    assert float(sums.abs().max()) < 4 * 3 * (10 + 30 * 6) / (1 - 0.984)
 
 
 @torch.no_grad()
@@ -138,15 +124,14 @@ def test_nothing_happens_before_the_first_event():
     assert all(bool((part == 0).all()) for part in state)
 
 
-@pytest.mark.parametrize("kind", [PacedGRU, PacedUnit])
 @torch.no_grad()
-def test_a_window_cut_in_ten_passes_the_same_time(kind):
-    cell = kind(4).eval()
+def test_a_window_cut_in_ten_passes_the_same_time():
+    cell = PacedUnit(4).eval()
     x, state = torch.zeros(1, 4, 8, 8), torch.rand(1, 4, 8, 8)
     for part in cell.children():
         part.weight.zero_()  # gates do not see the state
-    _, whole = cell(x, state, torch.ones(1, 1, 8, 8))
-    every, last = cell(x.expand(10, -1, -1, -1), state, torch.full((10, 1, 8, 8), 0.1))
+    _, whole = cell(x, state, torch.ones(1, 1, 1, 1))
+    every, last = cell(x.expand(10, -1, -1, -1), state, torch.full((10, 1, 1, 1), 0.1))
     torch.testing.assert_close(last, whole)
     torch.testing.assert_close(every[9:], whole)
 
@@ -177,6 +162,30 @@ def test_an_empty_window_cut_in_pieces_passes_the_same_time():
         _, pieces = network(nothing, pieces, window_s=1e-3)
     for one, other in zip(whole[:3], pieces[:3], strict=True):  # sums and wakefulness
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+
+
+@torch.no_grad()
+def test_coarse_memories_are_renewed_120_times_a_second():
+    network, state, kept = small().eval(), None, []
+    for window in voxels(windows=10).unbind(1):
+        _, state = network(window, state, window_s=1 / 600)
+        kept.append(state[3:])
+    changed = [
+        [not torch.equal(one, other) for one, other in zip(before, after, strict=True)]
+        for before, after in pairwise(kept)
+    ]
+    assert [every[0] for every in changed] == [True] * 9  # at half resolution
+    due = [False] * 3 + [True] + [False] * 4 + [True]  # the fifth window and the tenth
+    assert [every[1:] for every in changed] == [[step, step] for step in due]
+
+
+def test_a_shut_gate_can_open():
+    unit = PacedUnit(4)
+    torch.nn.init.constant_(unit.seen.bias[:4], -3.0)
+    every, _ = unit(torch.ones(1, 4, 8, 8), torch.ones(1, 4, 8, 8), torch.ones(1, 1, 1, 1))
+    assert torch.equal(every, torch.ones_like(every))  # it holds all the same
+    every.sum().backward()
+    assert bool((unit.seen.bias.grad[:4] != 0).all())
 
 
 @torch.no_grad()
@@ -220,8 +229,7 @@ def test_bf16_and_channels_last_keep_the_state_in_float32():
 
 
 def test_the_file_gives_the_network_back(tmp_path):
-    kind, kwargs = type(small()), small().arguments
-    spec = {"target": f"{kind.__module__}.{kind.__name__}", "kwargs": kwargs}
+    spec = {"target": "src.models.setnet.SetNet", "kwargs": small().arguments}
     save(tmp_path / "net.safetensors", small(), spec, {})
     again = load(tmp_path / "net.safetensors")
     assert again.views is None

@@ -17,7 +17,7 @@ from src.sim.optics import layout
 SENSOR = {"sensor": (96, 120), "tile_px": 36.0, "misalignment_px": 0.5}
 VIEWS = kaleidoscope(list(layout(9)), model=(24, 32), **SENSOR)
 NETWORKS = {
-    "setnet": lambda: SetNet(stem=4, channels=8),
+    "setnet": lambda: SetNet(half=4),
     "e2vid": lambda: E2VID(views=9, base_channels=4),
 }
 
@@ -60,7 +60,7 @@ def test_the_frames_are_those_from_grids(name, cut):
 
 
 def test_what_is_run_follows_from_network_and_device():
-    network = SetNet(stem=4, channels=8)
+    network = SetNet(half=4)
     assert isinstance(event_lists.ready(network, "bf16", "cpu", VIEWS, 5), Runtime)
     assert isinstance(event_lists.ready(FireNet(), "bf16", "cpu", VIEWS, 5), Fast)
     with pytest.raises(ValueError, match="bins must be 5 for this network, got 3"):

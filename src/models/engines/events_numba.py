@@ -61,79 +61,38 @@ def add_patches(t, x, y, p, view, t0, t1, down, right, table, stride, out):
 
 
 @njit(nogil=True, cache=True)
-def remember(t, x, y, p, view, t0, t1, memories, awake_s, local, awake, passed, sums, means):
-    """Let the leaky sums of SetNet leak, and add the events with t0 <= t <= t1.
+def remember(t, x, y, p, view, t0, t1, side, memories, awake_s, awake, sums):
+    """Let the leaky sums of SetNet leak, and add the events with t0 <= t <= t1; return how awake
+    the picture is afterwards, and the time that passed in it.
 
-    In place: `awake`, `passed` (h8, w8); `sums` (views * memories + memories, hc, wc), in cells,
-    the last of them the spread of the views; `means` (memories or none, hc, wc * pixels), the mean
-    view's with the pixels of a cell side by side.  `memories` are the time constants; `local`:
-    blocks fall asleep one by one, not all together.
+    In place: `sums` (views * memories + memories, hc, wc), in cells of `side` pixels, the last of
+    them the spread of the views.  `memories` are the time constants.
     """
     views = sums.shape[0] // memories.size - 1
-    side = 8 * awake.shape[0] // sums.shape[1]  # pixels of a cell
-    coarse, fine = np.zeros((views, *sums.shape[1:]), f32), np.zeros(means.shape[1:], f32)
-    part = f32(1) / f32(views)
+    new = np.zeros((views, *sums.shape[1:]), f32)
     for i in range(t.size):
         if t0 <= t[i] <= t1:
-            r, c = y[i] // side, x[i] // side
-            coarse[view[i], r, c] += p[i]
-            if means.shape[0]:
-                fine[r, side * (side * c + y[i] % side) + x[i] % side] += p[i] * part
-    hit = _stirred(coarse, side)
-    if not local and hit.any():
-        hit[:] = True
-    _pass_time(hit, f32(t1 - t0), awake_s, awake, passed)
-    _leak(passed, memories, coarse, fine, sums, means)
+            new[view[i], y[i] // side, x[i] // side] += p[i]
+    seconds = f32(t1 - t0)
+    if new.any():
+        passed, awake = seconds, f32(1)
+    else:
+        left = f32(np.exp(-seconds / awake_s))
+        passed, awake = awake * awake_s * (f32(1) - left), awake * left
+    _leak(passed, memories, new, sums)
     _spread(memories.size, sums)
+    return awake, passed
 
 
 @njit(nogil=True, cache=True)
-def _stirred(coarse, side):
-    """Return which blocks of 4 x 4 pixels have an event in them."""
-    views, height, width = coarse.shape
-    hit = np.zeros((height * side // 4, width * side // 4), np.bool_)
-    for v in range(views):
-        for r in range(height):
-            for c in range(width):
-                if coarse[v, r, c] != 0:
-                    hit[r * side // 4, c * side // 4] = True
-    return hit
-
-
-@njit(nogil=True, cache=True)
-def _pass_time(hit, seconds, awake_s, awake, passed):
-    """A block with an event in it or within four pixels around passes all the time."""
-    left = np.exp(-seconds / awake_s)
-    for i in range(awake.shape[0]):
-        for j in range(awake.shape[1]):
-            near = hit[max(2 * i - 1, 0) : 2 * i + 3, max(2 * j - 1, 0) : 2 * j + 3]
-            if near.any():
-                passed[i, j], awake[i, j] = seconds, f32(1)
-            else:
-                passed[i, j] = awake[i, j] * awake_s * (f32(1) - left)
-                awake[i, j] *= left
-
-
-@njit(nogil=True, cache=True)
-def _leak(passed, memories, coarse, fine, sums, means):
-    views, height, width = coarse.shape
-    block, wider = width // passed.shape[1], means.shape[2] // passed.shape[1]
-    keep, wide = np.empty(width, f32), np.empty(means.shape[2], f32)
+def _leak(passed, memories, new, sums):
     for m in range(memories.size):
-        for r in range(height):
-            for j in range(passed.shape[1]):
-                left = np.exp(-passed[r // block, j] / memories[m])
-                keep[block * j : block * (j + 1)] = left
-                if m < means.shape[0]:
-                    wide[wider * j : wider * (j + 1)] = left
-            for v in range(views):
-                row, new = sums[v * memories.size + m, r], coarse[v, r]
-                for c in range(np.uint64(width)):
-                    row[c] = row[c] * keep[c] + new[c]
-            if m < means.shape[0]:
-                row, new = means[m, r], fine[r]
+        keep = f32(np.exp(-passed / memories[m]))
+        for v in range(new.shape[0]):
+            for r in range(new.shape[1]):
+                row, more = sums[v * memories.size + m, r], new[v, r]
                 for c in range(np.uint64(row.size)):
-                    row[c] = row[c] * wide[c] + new[c]
+                    row[c] = row[c] * keep + more[c]
 
 
 @njit(nogil=True, cache=True)
@@ -166,15 +125,3 @@ def spread_out(cells, frame):
             for c in range(np.uint64(cells.shape[1])):
                 for q in range(side):
                     row[side * c + q] = cells[r, c, side * k + q]
-
-
-@njit(nogil=True, cache=True)
-def weigh(skip, means, drawn):
-    """Write the sum of `means` (memories, h, w), each times its `skip`, into `drawn` (h, w)."""
-    for r in range(drawn.shape[0]):
-        row = drawn[r]
-        row[:] = 0
-        for m in range(skip.size):
-            mean, part = means[m, r], skip[m]
-            for c in range(np.uint64(row.size)):
-                row[c] += part * mean[c]

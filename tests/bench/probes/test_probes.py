@@ -141,7 +141,7 @@ def test_the_view_beside_the_centre_is_one_the_network_sees(bench):
 
 def test_every_probe_runs_on_a_set_network(bench):
     torch.manual_seed(0)
-    subject = Subject("setnet", SetNet(stem=4, channels=8).eval(), 9)
+    subject = Subject("setnet", SetNet(half=4).eval(), 9)
     probes = [
         memory.Hold([3]), memory.LongRun(96), memory.StartUp(), memory.Shock(), memory.Still(),
         sampling.Rates([1200], 0.1), sampling.Thresholds([0.3]), sampling.FewerEvents([0.1]),

@@ -1,0 +1,151 @@
+"""What SetNet is made of: kernels for a set of views, memories in continuous time, surroundings."""
+
+import math
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from src.models.layers import Relu, ResidualBlock
+
+
+class ViewKernels(nn.Module):
+    """The kernels of a convolution over a set of views, averaged; one follows from where it stands.
+
+    kernel(place) = shared + sum over ranks of code(place) * kernels: with as many ranks as views
+    it is an ordinary convolution of stacked views.
+    """
+
+    def __init__(self, inputs: int, outputs: int, kernel_size: int, ranks: int = 5):
+        super().__init__()
+        shape = ((ranks + 1) * outputs, inputs, kernel_size, kernel_size)
+        bound = 1 / math.sqrt(inputs * kernel_size**2)
+        self.kernels = nn.Parameter(torch.empty(shape).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.zeros(outputs))
+        self.code = nn.Sequential(nn.Linear(3, 16), nn.Tanh(), nn.Linear(16, ranks))
+
+    def kernel(
+        self, places: Float[Tensor, "views 2"]
+    ) -> Float[Tensor, "outputs viewsinputs size size"]:
+        """Return the kernel for the stacked views that stand at `places` (row, col)."""
+        views = len(places)
+        # Positions and the number of views, in units that keep the codes apart.
+        known = torch.cat([places, torch.full_like(places[:, :1], 3 / views)], 1)
+        code = self.code(known.to(self.bias.dtype))
+        code = torch.cat([torch.ones_like(code[:, :1]), code], 1) / views
+        kernels = self.kernels.unflatten(0, (code.shape[1], -1))
+        return torch.einsum("vr,roikl->ovikl", code, kernels).flatten(1, 2)
+
+
+class PacedUnit(nn.Module):
+    """A gate beside a candidate in continuous time.
+
+    Of the old state exp(-pace * relu(gate)) is left and the rest is the candidate's tanh: without
+    pace, or with a gate below zero, nothing changes.  It stays within [-1, 1].  `reach`: pixels,
+    odd, over which a place sees the state; 1: its own only, so that nothing wanders.
+    """
+
+    def __init__(self, channels: int, reach: int = 3):
+        super().__init__()
+        self.seen = nn.Conv2d(channels, 2 * channels, 3, padding=1)
+        self.kept = nn.Conv2d(channels, 2 * channels, reach, padding=reach // 2, bias=False)
+        with torch.no_grad():  # memories of one to twenty windows from the start
+            self.seen.bias[:channels].copy_(torch.linspace(0.05, 0.7, channels))
+
+    def forward(
+        self,
+        x: Float[Tensor, "m c h w"],
+        state: Float[Tensor, "n c h w"],
+        pace: Float[Tensor, "m 1 1 1"],
+    ) -> tuple[Float[Tensor, "m c h w"], Float[Tensor, "n c h w"]]:
+        """Return the state, float32, after every one of m = windows * n steps and after the last.
+
+        `pace` is the time passed, in windows at 120 a second.
+        """
+
+        def step(state: Tensor, seen: Tensor, pace: Tensor) -> Tensor:
+            both = (seen + self.kept(state.to(x.dtype))).float()
+            gate, candidate = both.chunk(2, 1)
+            return torch.lerp(candidate.tanh(), state, torch.exp(-pace * self._opened(gate)))
+
+        return over_time(step, state, self.seen(x), pace)
+
+    def _opened(self, gate: Tensor) -> Tensor:
+        """Return relu(gate), in training with the gradient of softplus: a shut gate can open."""
+        if not self.training:
+            return gate.relu()
+        soft = functional.softplus(gate)
+        return soft + (gate.relu() - soft).detach()
+
+
+class PartedUnit(nn.Module):
+    """A PacedUnit for running one window: gate and candidate come from convolutions of their own,
+    as to cut a map in two costs as much as a convolution.
+    """
+
+    def __init__(self, unit: PacedUnit):
+        super().__init__()
+        self.seen = nn.ParameterList(unit.seen.weight.chunk(2))
+        self.bias = nn.ParameterList(unit.seen.bias.chunk(2))
+        self.kept = nn.ParameterList(unit.kept.weight.chunk(2))
+        self.reach = unit.kept.padding
+
+    def forward(self, x: Tensor, state: Tensor, pace: Tensor) -> tuple[Tensor, Tensor]:
+        """As PacedUnit's, m = n."""
+        before = state.to(x.dtype)
+        gate, candidate = (
+            functional.conv2d(x, seen, bias, padding=1)
+            + functional.conv2d(before, kept, padding=self.reach)
+            for seen, bias, kept in zip(self.seen, self.bias, self.kept, strict=True)
+        )
+        keep = torch.exp(-pace * gate.relu().float())
+        state = torch.lerp(candidate.tanh().float(), state, keep)
+        return state, state
+
+
+class Surroundings(nn.Module):
+    """Adds to a map what lies around each place: it is halved twice, and comes back.
+
+    An area without events is known by its edges, which may be far.
+    """
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.down16 = nn.Conv2d(channels, channels, 3, 2, padding=1)
+        self.down32 = nn.Conv2d(channels, channels, 3, 2, padding=1)
+        self.block32 = ResidualBlock(channels)
+        self.up16 = nn.Conv2d(channels, channels, 1)
+        self.block16 = ResidualBlock(channels)
+        self.up8 = nn.Conv2d(channels, channels, 1)
+        self.relu = Relu()
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
+        """Return a map of the same shape."""
+        x16 = self.relu(self.down16(x))
+        x32 = self.block32(self.relu(self.down32(x16)))
+        x16 = self.block16(x16 + _stretched(self.up16(x32), x16))
+        return x + _stretched(self.up8(x16), x)
+
+
+def grown(x: Tensor, times: int) -> Tensor:
+    """Return `x` with every pixel repeated."""
+    return functional.interpolate(x, scale_factor=times, mode="nearest")
+
+
+def over_time(
+    step: Callable[..., Tensor], state: Float[Tensor, "n ..."], *maps: Float[Tensor, "m ..."]
+) -> tuple[Float[Tensor, "m ..."], Float[Tensor, "n ..."]]:
+    """Return the state after every window and after the last; `step` takes it and a window's part
+    of each of `maps`, which have m = windows * n.
+    """
+    states = []
+    for now in zip(*(part.split(len(state)) for part in maps), strict=True):
+        state = step(state, *now)
+        states.append(state)
+    return torch.cat(states), state
+
+
+def _stretched(x: Tensor, like: Tensor) -> Tensor:
+    return functional.interpolate(x, like.shape[-2:], mode="bilinear")
