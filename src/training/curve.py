@@ -16,8 +16,9 @@ class Curve(Callback):
     the end (None: never); write all lines so far to the CSV file `path`.
 
     A line: hours, steps, windows trained on, mean training loss since the line before, the share of
-    channels that got no gradient in the last step (`reconstructor.idle`), scores.  The lines are
-    part of checkpoints, so that the file of a run that goes on begins at the beginning.
+    channels that got no gradient in the last step (`reconstructor.idle`, 0 with `leak`), scores.
+    The lines are part of checkpoints, so that the file of a run that goes on begins at the
+    beginning.
     `export`: also write the weights to this file (.safetensors, float16), at each line and when the
     training is cut short.
     """
