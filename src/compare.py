@@ -37,6 +37,8 @@ def compare(cfg: DictConfig) -> dict:
     another size than the first, or a slice that leaves the picture.
     """
     run = Path(cfg.paths.run)
+    if not cfg.videos:
+        raise ValueError("videos must name one file or more, got []")
     names = list(cfg.names or [Path(path).parent.name for path in cfg.videos])
     if len(names) != len(cfg.videos):
         raise ValueError(f"names must be one per video, got {len(names)} for {len(cfg.videos)}")
