@@ -81,8 +81,12 @@ class Relu(nn.Module):
         """Return a map of the same shape."""
         if not (self.training and self.leak):
             return x.relu()
-        soft = functional.leaky_relu(x, self.leak)
-        return soft + (x.relu() - soft).detach()
+        return with_gradient_of(functional.leaky_relu(x, self.leak), x.relu())
+
+
+def with_gradient_of(soft: Tensor, shown: Tensor) -> Tensor:
+    """Return `shown`; its gradient is that of `soft`."""
+    return soft + (shown - soft).detach()
 
 
 class ResidualBlock(nn.Module):

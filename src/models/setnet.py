@@ -20,13 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from src.models.layers import Relu, ResidualBlock, pad_to_multiple
-from src.models.setnet_layers import (
-    PacedUnit,
-    Surroundings,
-    ViewKernels,
-    grown,
-    over_time,
-)  # fmt: skip
+from src.models.setnet_layers import PacedUnit, Surroundings, ViewKernels, grown, over_time
 from src.sim.optics import layout
 
 SIZES = {  # multiply-accumulates at 176 x 176 with nine views: 0.5, 1.2 and 3.1 G
@@ -225,6 +219,9 @@ class SetNet(nn.Module):
         if found != sizes:
             raise ValueError(f"state must have sizes {sizes} for these voxels, got {found}")
         return state
+
+
+SetNet2 = SetNet  # its name in files of before there was one generation only
 
 
 def _leaked(sums: Tensor, keep: Tensor, new: Tensor) -> Tensor:

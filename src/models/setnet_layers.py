@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from src.models.layers import Relu, ResidualBlock
+from src.models.layers import Relu, ResidualBlock, with_gradient_of
 
 
 class ViewKernels(nn.Module):
@@ -76,8 +76,7 @@ class PacedUnit(nn.Module):
         """Return relu(gate), in training with the gradient of softplus: a shut gate can open."""
         if not self.training:
             return gate.relu()
-        soft = functional.softplus(gate)
-        return soft + (gate.relu() - soft).detach()
+        return with_gradient_of(functional.softplus(gate), gate.relu())
 
 
 class PartedUnit(nn.Module):

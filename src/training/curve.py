@@ -9,6 +9,9 @@ from lightning import Callback, LightningModule, Trainer
 from src.metrics.table import NAMES
 from src.models import files
 from src.records.results import csv_text, write_text
+from src.training.idle import idle_share
+
+PROBED = 3  # clips that show which channels are dead
 
 
 class Curve(Callback):
@@ -16,7 +19,7 @@ class Curve(Callback):
     the end (None: never); write all lines so far to the CSV file `path`.
 
     A line: hours, steps, windows trained on, mean training loss since the line before, the share of
-    channels that got no gradient in the last step (`reconstructor.idle`, 0 with `leak`), scores.
+    dead channels (`idle_share` over the first PROBED clips), scores.
     The lines are part of checkpoints, so that the file of a run that goes on begins at the
     beginning.
     `export`: also write the weights to this file (.safetensors, float16), at each line and when the
@@ -74,7 +77,6 @@ class Curve(Callback):
             "steps": module.steps,
             "windows": module.windows_seen,
             "loss": self.loss / self.steps if self.steps else "",
-            "idle": float(trainer.callback_metrics.get("train/idle", 0.0)),
         }
         self.rows.append(row | scores(trainer, module))
         self.loss, self.steps = 0.0, 0
@@ -99,12 +101,16 @@ class Curve(Callback):
 
 @torch.no_grad()
 def scores(trainer: Trainer, module: LightningModule) -> dict[str, float]:
-    """Return the mean of every score over the validation clips, in float32."""
+    """Return the share of dead channels and the mean of every score, over the validation clips."""
     module.eval()  # the mean of the weights, if there is one, always is
-    found = []
+    found, probed = [], []
     for sample in trainer.datamodule.val_dataloader():
-        sample = trainer.datamodule.on_after_batch_transfer(sample, 0)
-        found += module.measure(sample.to(module.device))
+        sample = trainer.datamodule.on_after_batch_transfer(sample, 0).to(module.device)
+        found += module.measure(sample)
+        if len(probed) < PROBED:
+            probed.append(sample)
+    dead = idle_share(module.method, probed)
     module.train()
     names = [name for name in NAMES if name in module.scores.names]
-    return {name: sum(clip[name] for clip in found) / len(found) for name in names}
+    means = {name: sum(clip[name] for clip in found) / len(found) for name in names}
+    return {"idle": dead} | means

@@ -1,7 +1,7 @@
 """Training, validation and test of any network that turns voxel grids into frames."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -181,7 +181,6 @@ class Reconstructor(LightningModule):
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
         if not torch.isfinite(loss):
             raise NotFinite(f"loss is {float(loss)}", self.global_step, drawn)
-        self.log("train/idle", idle(gradients))
         norm = torch.nn.utils.get_total_norm(gradients)
         if not torch.isfinite(norm):
             raise NotFinite("a gradient is not finite", self.global_step, drawn)
@@ -245,11 +244,3 @@ class Reconstructor(LightningModule):
         self.steps_before = checkpoint.get("steps", step) - step
         if self.average is not None:
             self.average.load_state_dict(checkpoint.get("average", self.network.state_dict()))
-
-
-def idle(gradients: Sequence[Tensor]) -> float:
-    """Return the share of the kernels' output channels that no gradient reaches: dead ones, as
-    behind a ReLU that never opens.
-    """
-    silent = [(part == 0).flatten(1).all(1) for part in gradients if part.ndim == 4]
-    return float(torch.cat(silent).float().mean()) if silent else 0.0

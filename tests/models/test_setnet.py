@@ -43,6 +43,12 @@ def test_a_preset_is_stored_as_what_it_stands_for(size, tmp_path):
     assert spec == {"target": "src.models.setnet.SetNet", "kwargs": {"bins": 5} | SIZES[size]}
 
 
+def test_weights_of_before_there_was_one_generation_are_read(tmp_path):
+    spec = {"target": "src.models.setnet2.SetNet2", "kwargs": small().arguments}
+    save(tmp_path / "old.safetensors", small(), spec, {})
+    assert type(load(tmp_path / "old.safetensors")) is SetNet
+
+
 @pytest.mark.parametrize("views", [1, 2, 3, 4, 5, 9, 16, 25])
 @torch.no_grad()
 def test_any_number_of_views_and_any_size(views):
