@@ -86,7 +86,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--ckpt", default="setnet_small")
     parser.add_argument("--form", default=None)
-    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--threads", type=int, default=1)
     asked = parser.parse_args()
     torch.set_num_threads(asked.threads)
     views, faults = kaleidoscope(list(layout(9)), model=MODEL, sensor=SENSOR), Faults()

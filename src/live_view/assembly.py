@@ -34,7 +34,7 @@ def assemble(
     faults: Faults,
     *,
     speed: float = 1.0,
-    backlog: int = 8,
+    backlog: int = 16,
     host: str = "127.0.0.1",
     port: int = 8600,
 ) -> Server:

@@ -16,7 +16,7 @@ from src.models import openvino_cpu, stopwatch
 from src.models.e2vid import E2VID
 from src.models.explicit_state import flat, formed
 from src.models.setnet import CELL, SetNet
-from src.models.setnet_layers import PartedUnit
+from src.models.setnet_layers import PartedUnit, channels_first, channels_last
 from src.sim.optics import Position
 
 
@@ -75,7 +75,7 @@ class AfterStem(nn.Module):
         grids, memories, bias = network.kernels(places)
         self.kernel, self.bias = grids.numpy(), bias.numpy()
         self.memories = memories.to(dtype)
-        self.sizes = [(1, *size) for size in network.hidden(*padded)]
+        self.sizes = [(1, h, w, c) for c, h, w in network.hidden(*padded)]
         for name in ("cell2", "cell4", "cell8"):
             setattr(network, name, PartedUnit(getattr(network, name)))
         self.network = network.to(dtype)
@@ -99,7 +99,7 @@ class AfterStem(nn.Module):
         hidden2, hidden4, hidden8 = hidden
         seen, hidden2 = self.network.fine(self.stem(grids, sums), passed, hidden2)
         about, hidden4, hidden8 = self.network.coarse(seen, renewed, hidden4, hidden8)
-        return self.pixels(seen, about), hidden2, hidden4, hidden8, about
+        return self.pixels(seen, about), hidden2, hidden4, hidden8, channels_last(about)
 
     def between(self) -> nn.Module:
         """Return what a window takes in which the coarse memories rest."""
@@ -108,11 +108,11 @@ class AfterStem(nn.Module):
     def stem(self, grids: Tensor, sums: Tensor) -> Tensor:
         """Return the map of the stem, before its ReLU."""
         stem = functional.conv2d(sums.to(self.dtype), self.memories, None, 1, 1)
-        return stem + grids.permute(0, 3, 1, 2).to(self.dtype)
+        return channels_first(grids.to(self.dtype)) + stem
 
     def pixels(self, seen: Tensor, about: Tensor) -> Tensor:
         """Return the pixels of each cell."""
-        return self.network.drawn(seen, about).permute(0, 2, 3, 1).sigmoid()
+        return channels_last(self.network.drawn(seen, about).sigmoid())
 
 
 class Between(nn.Module):
@@ -128,7 +128,7 @@ class Between(nn.Module):
         """Return the pixels of each cell and the fine hidden map; `about`: what the coarse tell."""
         stem = self.after.stem(grids, sums)
         seen, hidden2 = self.after.network.fine(stem, passed, hidden2)
-        return self.after.pixels(seen, about), hidden2
+        return self.after.pixels(seen, channels_first(about)), hidden2
 
 
 class Behind:

@@ -81,7 +81,8 @@ class PacedUnit(nn.Module):
 
 class PartedUnit(nn.Module):
     """A PacedUnit for running one window: gate and candidate come from convolutions of their own,
-    as to cut a map in two costs as much as a convolution.
+    as to cut a map in two costs as much as a convolution, and the state is kept channels last, as
+    convolutions take maps: to turn it costs as much.
     """
 
     def __init__(self, unit: PacedUnit):
@@ -91,17 +92,29 @@ class PartedUnit(nn.Module):
         self.kept = nn.ParameterList(unit.kept.weight.chunk(2))
         self.reach = unit.kept.padding
 
-    def forward(self, x: Tensor, state: Tensor, pace: Tensor) -> tuple[Tensor, Tensor]:
-        """As PacedUnit's, m = n."""
-        before = state.to(x.dtype)
+    def forward(
+        self, x: Float[Tensor, "1 c h w"], state: Float[Tensor, "1 h w c"], pace: Tensor
+    ) -> tuple[Float[Tensor, "1 c h w"], Float[Tensor, "1 h w c"]]:
+        """Return the state after the window, channels first and as it is kept."""
+        before = channels_first(state.to(x.dtype))
         gate, candidate = (
             functional.conv2d(x, seen, bias, padding=1)
             + functional.conv2d(before, kept, padding=self.reach)
             for seen, bias, kept in zip(self.seen, self.bias, self.kept, strict=True)
         )
         keep = torch.exp(-pace * gate.relu().float())
-        state = torch.lerp(candidate.tanh().float(), state, keep)
-        return state, state
+        state = torch.lerp(candidate.tanh().float(), channels_first(state), keep)
+        return state, channels_last(state)
+
+
+def channels_first(x: Float[Tensor, "n h w c"]) -> Float[Tensor, "n c h w"]:
+    """Return a view of `x`."""
+    return x.permute(0, 3, 1, 2)
+
+
+def channels_last(x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n h w c"]:
+    """Return a view of `x`."""
+    return x.permute(0, 2, 3, 1)
 
 
 class Surroundings(nn.Module):

@@ -1,6 +1,9 @@
 """One pass over a list of events: look the view up, add to its voxel grid or say what to add."""
 
+import numpy as np
 from numba import njit
+
+AHEAD = 256  # events that are looked up before any is laid
 
 
 @njit(nogil=True, cache=True)
@@ -79,24 +82,39 @@ def lay_nearest(x, y, p, nearest, density, index, u, v, which, weight):
     """
     _, height, width = density.shape
     flat = density.reshape(-1)
+    pixels, densities = np.empty(AHEAD, np.int64), np.empty(AHEAD, np.float32)
     outside = parts = 0
-    for i in range(x.size):
-        pixel = nearest[y[i], x[i]]
-        if pixel < 0:
-            outside += 1
-            continue
-        row = pixel // width
-        index[parts], u[parts], v[parts] = i, pixel - row * width, row % height
-        which[parts], weight[parts] = row // height, p[i] / flat[pixel]
-        parts += 1
+    for begin in range(0, x.size, AHEAD):
+        count = min(AHEAD, x.size - begin)
+        _fetch(x, y, begin, count, nearest, pixels)
+        for i in range(count):
+            densities[i] = flat[max(pixels[i], 0)]
+        for i in range(count):
+            pixel = pixels[i]
+            if pixel < 0:
+                outside += 1
+                continue
+            row = pixel // width
+            index[parts], u[parts], v[parts] = begin + i, pixel - row * width, row % height
+            which[parts], weight[parts] = row // height, p[begin + i] / densities[i]
+            parts += 1
     return parts, outside
 
 
 @njit(nogil=True, cache=True)
 def mark(x, y, p, nearest, counts):
     """Add the polarity of every event to `counts` (views, h, w); `nearest` as of `lay_nearest`."""
-    flat = counts.reshape(-1)
-    for i in range(x.size):
-        pixel = nearest[y[i], x[i]]
-        if pixel >= 0:
-            flat[pixel] += p[i]
+    flat, pixels = counts.reshape(-1), np.empty(AHEAD, np.int64)
+    for begin in range(0, x.size, AHEAD):
+        count = min(AHEAD, x.size - begin)
+        _fetch(x, y, begin, count, nearest, pixels)
+        for i in range(count):
+            if pixels[i] >= 0:
+                flat[pixels[i]] += p[begin + i]
+
+
+@njit(nogil=True, cache=True)
+def _fetch(x, y, begin, count, nearest, pixels):
+    """Look up where `count` events fall: nothing else, so that many a wait for memory is one."""
+    for i in range(count):
+        pixels[i] = nearest[y[begin + i], x[begin + i]]
