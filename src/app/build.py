@@ -21,7 +21,6 @@ from src.app.parts import make, part, rooms
 from src.app.simulation import pipeline
 from src.metrics.scores import Scores
 from src.models.fast import computes_bf16
-from src.models.layers import Relu
 from src.models.look_ahead import LookAhead
 from src.models.unroll import takes
 from src.records.results import Row
@@ -117,10 +116,6 @@ def reconstructor(cfg: DictConfig, net: nn.Module, spec: dict) -> Reconstructor:
         raise ValueError(f"data.loss_from must be in {most}, got {cfg.data.loss_from}")
     if cfg.hours and cfg.scheduler:
         raise ValueError(f"scheduler must be null with hours={cfg.hours}, which has its own")
-    if not 0 <= cfg.leak < 1:
-        raise ValueError(f"leak must be in [0, 1), got {cfg.leak}")
-    for layer in (layer for layer in net.modules() if isinstance(layer, Relu)):
-        layer.leak = cfg.leak
     if cfg.channels_last:
         for layer in (layer for layer in net.modules() if isinstance(layer, nn.Conv2d)):
             layer.to(memory_format=torch.channels_last)

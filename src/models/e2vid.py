@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.parametrizations import spectral_norm as normalise_spectrum
 
-from src.models.layers import ConvGRU, ConvLSTM, Relu, ResidualBlock, pad_to_multiple
+from src.models.layers import ConvGRU, ConvLSTM, ResidualBlock, pad_to_multiple
 from src.sim.optics import centre, layout
 
 CELLS = {"convlstm": ConvLSTM, "convgru": ConvGRU}
@@ -74,7 +74,7 @@ class E2VID(nn.Module):
         self.resblocks = nn.Sequential(*(ResidualBlock(widths[-1]) for _ in range(2)))
         self.decoders = nn.ModuleList(_conv(b, a, kernel_size) for a, b in reversed(pairs))
         self.pred = nn.Conv2d(base_channels, 1, 1)
-        self.relu = Relu()
+        self.relu = nn.ReLU()
         if spectral_norm:
             for gate in (m for c in self.cells for m in c.children()):
                 normalise_spectrum(gate)

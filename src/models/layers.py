@@ -70,25 +70,6 @@ class ConvGRU(nn.Module):
         return state, state
 
 
-class Relu(nn.Module):
-    """A ReLU; in training its gradient is that of a leaky one, with the slope `leak` below zero, so
-    that a channel which is shut everywhere can open again.
-    """
-
-    leak = 0.0
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return a map of the same shape."""
-        if not (self.training and self.leak):
-            return x.relu()
-        return with_gradient_of(functional.leaky_relu(x, self.leak), x.relu())
-
-
-def with_gradient_of(soft: Tensor, shown: Tensor) -> Tensor:
-    """Return `shown`; its gradient is that of `soft`."""
-    return soft + (shown - soft).detach()
-
-
 class ResidualBlock(nn.Module):
     """Two 3x3 convolutions with a ReLU inside and after the sum (He et al. 2016, no norm)."""
 
@@ -96,7 +77,7 @@ class ResidualBlock(nn.Module):
         super().__init__()
         self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
         self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
-        self.relu = Relu()
+        self.relu = nn.ReLU()
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
         """Return a map of the same shape."""

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from src.models.layers import Relu, ResidualBlock, pad_to_multiple
+from src.models.layers import ResidualBlock, pad_to_multiple
 from src.models.setnet_layers import PacedUnit, Surroundings, ViewKernels, grown, over_time
 from src.sim.optics import layout
 
@@ -67,7 +67,7 @@ class SetNet(nn.Module):
         self.up2 = nn.Conv2d(quarter, half, 1)
         self.mix2 = nn.Conv2d(half, half, 3, padding=1)
         self.shuffle = nn.Conv2d(half, CELL**2, 3, padding=1)
-        self.relu = Relu()
+        self.relu = nn.ReLU()
         self.frozen: dict[tuple, tuple[Tensor, ...]] | None = None  # kernels kept, for running
 
     @classmethod

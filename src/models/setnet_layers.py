@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from src.models.layers import Relu, ResidualBlock, with_gradient_of
+from src.models.layers import ResidualBlock
 
 
 class ViewKernels(nn.Module):
@@ -68,15 +68,9 @@ class PacedUnit(nn.Module):
         def step(state: Tensor, seen: Tensor, pace: Tensor) -> Tensor:
             both = (seen + self.kept(state.to(x.dtype))).float()
             gate, candidate = both.chunk(2, 1)
-            return torch.lerp(candidate.tanh(), state, torch.exp(-pace * self._opened(gate)))
+            return torch.lerp(candidate.tanh(), state, torch.exp(-pace * gate.relu()))
 
         return over_time(step, state, self.seen(x), pace)
-
-    def _opened(self, gate: Tensor) -> Tensor:
-        """Return relu(gate), in training with the gradient of softplus: a shut gate can open."""
-        if not self.training:
-            return gate.relu()
-        return with_gradient_of(functional.softplus(gate), gate.relu())
 
 
 class PartedUnit(nn.Module):
@@ -131,7 +125,7 @@ class Surroundings(nn.Module):
         self.up16 = nn.Conv2d(channels, channels, 1)
         self.block16 = ResidualBlock(channels)
         self.up8 = nn.Conv2d(channels, channels, 1)
-        self.relu = Relu()
+        self.relu = nn.ReLU()
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
         """Return a map of the same shape."""

@@ -12,6 +12,15 @@ from src.records.results import csv_text, write_text
 from src.training.idle import idle_share
 
 PROBED = 3  # clips that show which channels are dead
+COLLAPSED = 1.5  # times the least mean loss of a line so far
+
+
+class Collapsed(ValueError):
+    """The loss is far above what it was and does not come back, as when all channels are shut."""
+
+    def __init__(self, losses: str, before: dict, export: Path | None):
+        kept = f"; {export} holds the weights of {before['hours']:.2f} hours" if export else ""
+        super().__init__(f"the training has collapsed: its mean loss is {losses}{kept}")
 
 
 class Curve(Callback):
@@ -23,7 +32,8 @@ class Curve(Callback):
     The lines are part of checkpoints, so that the file of a run that goes on begins at the
     beginning.
     `export`: also write the weights to this file (.safetensors, float16), at each line and when the
-    training is cut short.
+    training is cut short.  A training that has collapsed (its loss is COLLAPSED times what it was)
+    is ended by a ValueError, and the export stays that of the line before.
     """
 
     def __init__(self, path: str, every_h: float | None = None, export: str | None = None):
@@ -68,7 +78,7 @@ class Curve(Callback):
 
     def on_exception(self, trainer: Trainer, module: LightningModule, exception) -> None:
         """Export what a training that is cut short has learned."""
-        if self.rows and trainer.is_global_zero:
+        if self.rows and trainer.is_global_zero and not isinstance(exception, Collapsed):
             self._store(module)
 
     def _add(self, trainer: Trainer, module: LightningModule) -> None:
@@ -78,6 +88,9 @@ class Curve(Callback):
             "windows": module.windows_seen,
             "loss": self.loss / self.steps if self.steps else "",
         }
+        losses = [line["loss"] for line in [*self.rows, row] if line["loss"] != ""]
+        if losses and losses[-1] > COLLAPSED * min(losses):
+            raise Collapsed(f"{losses[-1]:.3g} after {min(losses):.3g}", self.rows[-1], self.export)
         self.rows.append(row | scores(trainer, module))
         self.loss, self.steps = 0.0, 0
         self._write()

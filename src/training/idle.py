@@ -20,8 +20,6 @@ WINDOWS = 16  # of a clip that the gradient comes from
 def idle_share(network: nn.Module, samples: Iterable["Sample"]) -> float:
     """Return the share, 0 to 1, of the output channels of `network`'s kernels that get no gradient
     of the mean error over the first WINDOWS of each clip.
-
-    As the network runs: in training a ReLU may pass gradient where it is shut (layers.Relu).
     """
     probe = deepcopy(network).eval().requires_grad_()
     for sample in samples:

@@ -6,7 +6,6 @@ from torch.nn.utils import parametrize
 
 from src.models.cost import macs_per_frame
 from src.models.e2vid import E2VID
-from src.models.layers import Relu
 from src.models.unroll import unroll
 
 
@@ -89,22 +88,6 @@ def test_training_sees_the_hidden_map_as_it_is():
     network, window = small(state_step=0.25), voxels()[:, 0]
     _, state = network(window, None)
     assert torch.equal(network(window, state)[0], small()(window, state)[0])
-
-
-def test_a_shut_relu_draws_the_same_and_can_open_again():
-    networks = [small() for _ in range(2)]
-    for layer in networks[1].modules():
-        if isinstance(layer, Relu):
-            layer.leak = 0.05
-    for network in networks:
-        for kernel in (network.encoders[0], network.resblocks[1].conv1):
-            torch.nn.init.constant_(kernel.bias, -100.0)
-    plain, leaky = (unroll(network, voxels())[0] for network in networks)
-    assert torch.equal(plain, leaky)
-    for frames, network, alive in ((plain, networks[0], False), (leaky, networks[1], True)):
-        frames.sum().backward()
-        for kernel in (network.encoders[0], network.resblocks[1].conv1):
-            assert bool(kernel.bias.grad.any()) == alive
 
 
 def test_views_are_stacked_view_by_view():

