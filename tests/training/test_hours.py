@@ -126,6 +126,14 @@ def test_a_training_that_is_cut_short_exports_what_it_has_reached(tmp_path, monk
     assert (card["hours"], card["steps"], len(card["curve"])) == (2, 2, 1)
 
 
+def test_a_training_that_has_collapsed_ends_and_keeps_what_it_had(tmp_path, monkeypatch):
+    now = tmp_path / "now.safetensors"
+    monkeypatch.setattr("src.training.curve.COLLAPSED", 0.5)
+    with pytest.raises(ValueError, match="collapsed.* holds the weights of 0.00 hours"):
+        run(tmp_path / "first", "hours=9", f"export={now}")
+    assert files.card(now)["hours"] == 0
+
+
 def test_restored_weights_are_those_that_were_exported(tmp_path):
     now = tmp_path / "now.safetensors"
     run(tmp_path / "first", "hours=3", f"export={now}")
