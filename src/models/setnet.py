@@ -23,10 +23,10 @@ from src.models.layers import ResidualBlock, pad_to_multiple
 from src.models.setnet_layers import PacedUnit, Surroundings, ViewKernels, grown, over_time
 from src.sim.optics import layout
 
-SIZES = {  # multiply-accumulates at 176 x 176 with nine views: 0.5, 1.2 and 3.1 G
-    "small": {"half": 16},
-    "medium": {"half": 28},
-    "large": {"half": 48},
+SIZES = {  # channels; multiply-accumulates at 176 x 176 with nine views: 0.5, 1.2 and 3.1 G
+    "small": {"half": 16, "quarter": 32, "eighth": 64},
+    "medium": {"half": 40, "quarter": 56, "eighth": 56},
+    "large": {"half": 48, "quarter": 96, "eighth": 192},
 }
 MEMORIES_S = (0.05, 0.5)  # time constants of the leaky sums
 AWAKE_S = 0.005  # time constant by which a picture falls asleep after its last event
@@ -42,17 +42,21 @@ State = tuple[Tensor, ...]
 class SetNet(nn.Module):
     """Voxel grids of 1 to 25 views to frames in [0, 1], window by window.
 
-    `half`: channels at half resolution, doubled at a quarter and again at an eighth.  The order of
-    the views is free but the same in all windows of a sequence.
+    `half`, `quarter`, `eighth`: channels at these resolutions; by default each has twice those of
+    the finer one.  The order of the views is free but the same in all windows of a sequence.
     """
 
     views = None
 
-    def __init__(self, bins: int = 5, half: int = 16):
+    def __init__(
+        self, bins: int = 5, half: int = 16, quarter: int | None = None, eighth: int | None = None
+    ):
         super().__init__()
-        self.arguments = {"bins": bins, "half": half}  # that make it again
-        self.bins = bins
-        memories, quarter, eighth = len(MEMORIES_S), 2 * half, 4 * half
+        quarter = quarter or 2 * half
+        eighth = eighth or 2 * quarter
+        self.widths = {"half": half, "quarter": quarter, "eighth": eighth}
+        self.arguments = {"bins": bins} | self.widths  # that make it again
+        self.bins, memories = bins, len(MEMORIES_S)
         self.voxel_stem = ViewKernels(bins, half, 5)
         self.sum_stem = ViewKernels(memories, half, 3)
         self.spread_stem = nn.Conv2d(memories, half, 3, padding=1, bias=False)
@@ -201,8 +205,10 @@ class SetNet(nn.Module):
 
     def hidden(self, height: int, width: int) -> list[tuple[int, int, int]]:
         """Return the sizes (c, h, w) of the hidden maps of a picture: half, quarter, eighth."""
-        half = self.arguments["half"]
-        return [(half * k, height // (2 * k), width // (2 * k)) for k in (1, 2, 4)]
+        sides = ((height // k, width // k) for k in (2, 4, 8))
+        return [
+            (channels, *side) for channels, side in zip(self.widths.values(), sides, strict=True)
+        ]
 
     def _start(self, state: State | None, cells: Tensor) -> State:
         """Return `state`, or zeros of the right sizes; ValueError when they are not right."""
