@@ -10,6 +10,7 @@ from src.app import build
 from src.app.parts import make
 from src.models import load, save
 from src.models.cost import macs_per_frame
+from src.models.files import require
 from src.models.setnet import SIZES, SetNet
 from src.models.setnet_layers import PacedUnit
 from src.models.unroll import AT_ONCE, unroll
@@ -47,6 +48,15 @@ def test_weights_of_before_there_was_one_generation_are_read(tmp_path):
     spec = {"target": "src.models.setnet2.SetNet2", "kwargs": small().arguments}
     save(tmp_path / "old.safetensors", small(), spec, {})
     assert type(load(tmp_path / "old.safetensors")) is SetNet
+
+
+def test_a_file_that_names_half_only_can_be_gone_on_from(tmp_path):
+    spec = {"target": "src.models.setnet.SetNet", "kwargs": {"bins": 3, "half": 4}}
+    save(tmp_path / "old.safetensors", small(), spec, {})
+    whole = spec | {"kwargs": small().arguments}
+    assert require(tmp_path / "old.safetensors", whole) == tmp_path / "old.safetensors"
+    with pytest.raises(ValueError, match="to go on from"):
+        require(tmp_path / "old.safetensors", whole | {"kwargs": SetNet(3, 8).arguments})
 
 
 @pytest.mark.parametrize("views", [1, 2, 3, 4, 5, 9, 16, 25])
