@@ -7,8 +7,9 @@ windows, and only while events come: one set of weights serves 120 and 12,000 wi
 a picture without events stays.
 
 half resolution: stem, memory -> quarter: memory -> eighth: memory, residual block, surroundings at
-a sixteenth and a thirty-second -> up, up -> 2 x 2 pixels.  What is below a half, four fifths of the
-cost, is renewed at most 120 times a second and kept in between (docs/decisions/0019).
+a sixteenth and a thirty-second -> up, up -> 2 x 2 pixels.  What is below a half, half to three
+quarters of the cost, is renewed at most 120 times a second and kept in between
+(docs/decisions/0019).
 """
 
 import math
