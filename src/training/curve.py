@@ -122,7 +122,7 @@ def scores(trainer: Trainer, module: LightningModule) -> dict[str, float]:
         found += module.measure(sample)
         if len(probed) < PROBED:
             probed.append(sample)
-    dead = idle_share(module.method, probed)
+    dead = idle_share(module, probed)
     module.train()
     names = [name for name in NAMES if name in module.scores.names]
     means = {name: sum(clip[name] for clip in found) / len(found) for name in names}

@@ -133,7 +133,7 @@ class Reconstructor(LightningModule):
             seen = max(self.loss_from - part.start, 0)  # by nothing but the state
             # One normalised weight per chunk: spectral norm iterates once, not once per window.
             with parametrize.cached(), torch.set_grad_enabled(part.stop > self.loss_from):
-                frames, state = self._unroll(sample, part, detach(state))
+                frames, state = self.unrolled(sample, part, detach(state))
             if part.stop > self.loss_from:
                 total += self._backward(frames[:, seen:], sample.target[:, part][:, seen:], count)
         total = self.all_gather(total).mean()
@@ -213,7 +213,8 @@ class Reconstructor(LightningModule):
         clips = zip(frames, target, sample.drawn, strict=True)
         return [drawn | self.scores(ours, truth) for ours, truth, drawn in clips]
 
-    def _unroll(self, sample: "Sample", part: slice, state: Any):
+    def unrolled(self, sample: "Sample", part: slice, state: Any = None) -> tuple[Tensor, Any]:
+        """Return what the network in training makes of a `part` of the windows, and its state."""
         options = {"window_s": sample.window_s, "positions": sample.positions}
         return unroll(self.network, sample.voxels[:, part], state, **options)
 

@@ -15,6 +15,7 @@ from src.models import files
 from src.models.unroll import unroll, video
 from src.sim.pipeline import Sample
 from src.training.evaluation import cost
+from src.training.idle import idle_share
 
 
 def sample(windows: int = 10) -> Sample:
@@ -80,11 +81,12 @@ def test_training_changes_the_post_processor_and_not_its_source():
     source, restorer = FireNet(), MambaTM(states=2)
     module = Restoration(restorer, {}, source=source, loss=L1())
     assert not any(name.startswith("_source") for name in module.state_dict())
-    frames, state = module._unroll(sample(4), slice(None), None)
+    frames, state = module.unrolled(sample(4), slice(None))
     assert frames.shape == (1, 4, 1, 16, 16) and state is None
     frames.sum().backward()
     assert all(p.grad is None for p in source.parameters())
     assert any(float(p.grad.abs().sum()) > 0 for p in restorer.parameters())
+    assert 0 <= idle_share(module, [sample(4)]) < 1
 
 
 @torch.no_grad()

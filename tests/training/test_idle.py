@@ -6,6 +6,7 @@ from torch import nn
 
 from src.sim.pipeline import Sample
 from src.training.idle import idle_share
+from src.training.reconstructor import Reconstructor
 
 
 class Shut(nn.Module):
@@ -29,6 +30,6 @@ def test_only_what_runs_counts():
     dark = torch.zeros(1, 3, 1, 5, 5)
     clip = Sample(torch.ones(1, 3, 1, 2, 5, 5), dark, dark, torch.ones(1))
     network = Shut().train()
-    assert idle_share(network, [clip]) == pytest.approx(3 / 5)
+    assert idle_share(Reconstructor(network, {}), [clip]) == pytest.approx(3 / 5)
     assert network.training and all(part.grad is None for part in network.parameters())
-    assert idle_share(nn.Identity(), []) == 0.0
+    assert idle_share(Reconstructor(nn.Identity(), {}), []) == 0.0
