@@ -20,7 +20,6 @@ MOVED = {
     "src.metrics.speed": "src.training.step_time",
     "src.models.interruption": "src.training.interruption",
     "src.models.reconstructor": "src.training.reconstructor",
-    "src.models.setnet2": "src.models.setnet",
     "src.probes": "src.bench.probes",
     "src.probes.air": "src.bench.probes.air",
     "src.probes.memory": "src.bench.probes.memory",

@@ -1,7 +1,7 @@
 """What comes behind the first layer of a network, for one clip: maps in, frame and state out.
 
 Maps come channels last, as events are added to them; `kernel`, `bias`, `stride` and `views` say
-what the first layer is, `between` what is enough while coarse memories rest.
+what the first layer is, `between` what is enough while one does not look around.
 """
 
 from collections.abc import Callable, Sequence
@@ -76,8 +76,7 @@ class AfterStem(nn.Module):
         self.kernel, self.bias = grids.numpy(), bias.numpy()
         self.memories = memories.to(dtype)
         self.sizes = [(1, h, w, c) for c, h, w in network.hidden(*padded)]
-        for name in ("cell2", "cell4", "cell8"):
-            setattr(network, name, PartedUnit(getattr(network, name)))
+        network.cell2 = PartedUnit(network.cell2)
         self.network = network.to(dtype)
         self.dtype = dtype
 
@@ -90,19 +89,17 @@ class AfterStem(nn.Module):
         grids: Float[Tensor, "1 hc wc stem"],
         sums: Float[Tensor, "1 sums hc wc"],
         passed: Float[Tensor, "1 1 1 1"],
-        renewed: Float[Tensor, "1 1 1 1"],
-        *hidden: Tensor,
+        hidden: Float[Tensor, "1 hc wc c"],
     ) -> tuple[Tensor, ...]:
-        """Return the pixels of each cell (1, hc, wc, pixels), the hidden maps, all float32, and
-        what the coarse ones tell.
+        """Return the pixels of each cell (1, hc, wc, pixels), the hidden map, both float32, and
+        what lies around (1, hc/2, wc/2, c), of which nothing need be known before.
         """
-        hidden2, hidden4, hidden8 = hidden
-        seen, hidden2 = self.network.fine(self.stem(grids, sums), passed, hidden2)
-        about, hidden4, hidden8 = self.network.coarse(seen, renewed, hidden4, hidden8)
-        return self.pixels(seen, about), hidden2, hidden4, hidden8, channels_last(about)
+        seen, hidden = self.network.fine(self.stem(grids, sums), passed, hidden)
+        about = self.network.around(seen)
+        return self.pixels(seen, about), hidden, channels_last(about.float())
 
     def between(self) -> nn.Module:
-        """Return what a window takes in which the coarse memories rest."""
+        """Return what a window takes in which one does not look around."""
         return Between(self)
 
     def stem(self, grids: Tensor, sums: Tensor) -> Tensor:
@@ -116,19 +113,19 @@ class AfterStem(nn.Module):
 
 
 class Between(nn.Module):
-    """What of `AfterStem` a window takes in which the coarse memories see no time."""
+    """What of `AfterStem` a window takes that is told what lies around."""
 
     def __init__(self, after: AfterStem):
         super().__init__()
         self.after = after
 
     def forward(
-        self, grids: Tensor, sums: Tensor, passed: Tensor, hidden2: Tensor, about: Tensor
+        self, grids: Tensor, sums: Tensor, passed: Tensor, hidden: Tensor, about: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return the pixels of each cell and the fine hidden map; `about`: what the coarse tell."""
+        """Return the pixels of each cell and the hidden map."""
         stem = self.after.stem(grids, sums)
-        seen, hidden2 = self.after.network.fine(stem, passed, hidden2)
-        return self.after.pixels(seen, channels_first(about)), hidden2
+        seen, hidden = self.after.network.fine(stem, passed, hidden)
+        return self.after.pixels(seen, channels_first(about)), hidden
 
 
 class Behind:
@@ -140,13 +137,14 @@ class Behind:
     def __init__(
         self, after: AfterHead | AfterStem, inputs: list[np.ndarray], make: Callable, threads: int
     ):
-        example = [torch.from_numpy(part) for part in inputs] + after.start()
-        self.whole, self.given, self.between = make(after, example, threads), len(inputs), None
-        between = after.between()
-        if between is not None:
-            with torch.no_grad():
-                _, hidden2, *_, about = after(*example)
-            self.between = make(between, [*example[: self.given - 1], hidden2, about], threads)
+        given, state, between = [*map(torch.from_numpy, inputs)], after.start(), after.between()
+        if between is None:
+            self.whole, self.between = make(after, [*given, *state], threads), None
+        else:
+            given.pop()  # whether to look around
+            self.whole = make(after, [*given, state[0]], threads)
+            self.between = make(between, [*given, *state], threads)
+        self.given = len(given)
         self.reset()
 
     def __call__(self, inputs: list[np.ndarray]) -> np.ndarray:
@@ -155,18 +153,17 @@ class Behind:
             drawn, *self.state = self.whole(inputs, self.state)
             return drawn
         *seen, renewed = inputs
-        *hidden, about = self.state
-        if about is None or renewed.any():
-            drawn, *self.state = self.whole(inputs, hidden)
+        hidden, about = self.state
+        if renewed.any():
+            drawn, *self.state = self.whole(seen, [hidden])
         else:
-            drawn, hidden2 = self.between(seen, [hidden[0], about])
-            self.state = [hidden2, *self.state[1:]]
+            drawn, hidden = self.between(seen, [hidden, about])
+            self.state = [hidden, about]
         return drawn
 
     def reset(self) -> None:
         """Start from zeros."""
-        start = self.whole.zeros(self.given)
-        self.state = start if self.between is None else [*start, None]
+        self.state = (self.between or self.whole).zeros(self.given)
 
 
 class OnTorch:

@@ -64,7 +64,6 @@ def require(name: str | Path, spec: dict) -> Path:
     if not path.is_file():
         raise ValueError(f"ckpt must be a checkpoint to go on from, got {path}")
     saved, _ = (_safetensors if exported(path) else _checkpoint)(path)
-    saved = _completed(saved, spec["target"], path)
     wanted = spec | {"kwargs": spec["kwargs"] | _unnormalised(spec)} if exported(path) else spec
     fits = saved == wanted
     if exported(path) and spec["target"] == WIDENED:
@@ -143,15 +142,6 @@ def folded(network: nn.Module) -> dict[str, Tensor]:
             values[f"{prefix}.weight"] = module.weight.detach().clone()
     kept = network.state_dict()
     return {name: kept[name] for name in kept if "parametrizations" not in name} | values
-
-
-def _completed(spec: dict, target: str, path: Path) -> dict:
-    """Return `spec` of a network of `target` with the arguments it had no need to name."""
-    if spec["target"] != target:
-        return spec
-    with torch.device("meta"):
-        network = _build(spec, path, [target.rpartition(".")[0]])
-    return spec | {"kwargs": getattr(network, "arguments", spec["kwargs"])}
 
 
 def _unnormalised(spec: dict) -> dict:

@@ -57,20 +57,20 @@ class StemFront(HeadFront):
         rows, columns = self.shape[1:3]
         self.memories = np.array(MEMORIES_S, np.float32)
         self.sums = np.zeros(((after.views + 1) * len(MEMORIES_S), rows, columns), np.float32)
-        self.clock = np.zeros(2, np.float32)  # how awake it is, what its coarse memories wait for
+        self.clock = np.zeros(2, np.float32)  # how awake it is, how long since it looked around
 
     def add(self, t, x, y, p, view, t0: float, t1: float) -> list[np.ndarray]:
         """Bring the sums to the end of a window; return the map, the sums and their spread, the
-        time passed, and that which the coarse memories see.
+        time passed, and whether to look around.
         """
         events = t, x, y, p, view, t0, t1
         awake, passed = kernels.remember(
             *events, self.stride, self.memories, np.float32(AWAKE_S), self.clock[0], self.sums
         )
         waited = self.clock[1] + passed
-        renewed = waited if waited >= RENEWED_S else np.float32(0)
-        self.clock[:] = awake, waited - renewed
-        times = (np.full((1, 1, 1, 1), seconds, np.float32) for seconds in (passed, renewed))
+        renewed = waited >= RENEWED_S
+        self.clock[:] = awake, 0 if renewed else waited
+        times = np.full((1, 1, 1, 1), passed, np.float32), np.array(renewed)
         return [*super().add(*events), self.sums[None].copy(), *times]
 
     def frame(self, drawn: np.ndarray) -> np.ndarray:

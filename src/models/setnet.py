@@ -6,10 +6,9 @@ sums of events give the network a memory from its first step.  Time passes in se
 windows, and only while events come: one set of weights serves 120 and 12,000 windows a second, and
 a picture without events stays.
 
-half resolution: stem, memory -> quarter: memory -> eighth: memory, residual block, surroundings at
-a sixteenth and a thirty-second -> up, up -> 2 x 2 pixels.  What is below a half, half to three
-quarters of the cost, is renewed at most 120 times a second and kept in between
-(docs/decisions/0019).
+half resolution: stem, memory -> what lies around, at a quarter, an eighth, a sixteenth -> 2 x 2
+pixels.  What lies around is seen at most 120 times a second and kept in between
+(docs/decisions/0019 and 0021).
 """
 
 import math
@@ -20,19 +19,19 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from src.models.layers import ResidualBlock, pad_to_multiple
+from src.models.layers import pad_to_multiple
 from src.models.setnet_layers import PacedUnit, Surroundings, ViewKernels, grown, over_time
 from src.sim.optics import layout
 
-SIZES = {  # channels; multiply-accumulates at 176 x 176 with nine views: 0.5, 1.2 and 3.1 G
-    "small": {"half": 16, "quarter": 32, "eighth": 64},
-    "medium": {"half": 40, "quarter": 56, "eighth": 56},
-    "large": {"half": 48, "quarter": 96, "eighth": 192},
+SIZES = {  # channels; multiply-accumulates at 176 x 176 with nine views: 0.34, 1.1 and 3.0 G
+    "small": {"half": 16, "around": [32, 64, 96]},
+    "medium": {"half": 40, "around": [56, 96, 128]},
+    "large": {"half": 64, "around": [128, 192, 256]},
 }
 MEMORIES_S = (0.05, 0.5)  # time constants of the leaky sums
 AWAKE_S = 0.005  # time constant by which a picture falls asleep after its last event
 RATE = 120.0  # windows a second at which a gate is taken as it is
-RENEWED_S = 0.98 / RATE  # what has to pass before coarse memories see it; 2 % for rounding
+RENEWED_S = 0.98 / RATE  # what has to pass before one looks around again; 2 % for rounding
 MAX_VIEWS = 25
 CELL = 2  # pixels: side of what the first layer sees as one
 
@@ -43,33 +42,21 @@ State = tuple[Tensor, ...]
 class SetNet(nn.Module):
     """Voxel grids of 1 to 25 views to frames in [0, 1], window by window.
 
-    `half`, `quarter`, `eighth`: channels at these resolutions; by default each has twice those of
-    the finer one.  The order of the views is free but the same in all windows of a sequence.
+    `half`: channels at half resolution; `around`: at a quarter and each coarser one.  The order of
+    the views is free but the same in all windows of a sequence.
     """
 
     views = None
 
-    def __init__(
-        self, bins: int = 5, half: int = 16, quarter: int | None = None, eighth: int | None = None
-    ):
+    def __init__(self, bins: int = 5, half: int = 16, around: Sequence[int] = (32, 64, 96)):
         super().__init__()
-        quarter = quarter or 2 * half
-        eighth = eighth or 2 * quarter
-        self.widths = {"half": half, "quarter": quarter, "eighth": eighth}
-        self.arguments = {"bins": bins} | self.widths  # that make it again
-        self.bins, memories = bins, len(MEMORIES_S)
+        self.arguments = {"bins": bins, "half": half, "around": list(around)}  # that make it again
+        self.bins, self.half, memories = bins, half, len(MEMORIES_S)
         self.voxel_stem = ViewKernels(bins, half, 5)
         self.sum_stem = ViewKernels(memories, half, 3)
         self.spread_stem = nn.Conv2d(memories, half, 3, padding=1, bias=False)
-        self.cell2 = PacedUnit(half, reach=1)
-        self.down4 = nn.Conv2d(half, quarter, 3, 2, padding=1)
-        self.cell4 = PacedUnit(quarter)
-        self.down8 = nn.Conv2d(quarter, eighth, 3, 2, padding=1)
-        self.cell8 = PacedUnit(eighth)
-        self.block8 = nn.Sequential(ResidualBlock(eighth), Surroundings(eighth))
-        self.up4 = nn.Conv2d(eighth, quarter, 1)
-        self.mix4 = nn.Conv2d(quarter, quarter, 3, padding=1)
-        self.up2 = nn.Conv2d(quarter, half, 1)
+        self.cell2 = PacedUnit(half)
+        self.around = Surroundings(half, around)
         self.mix2 = nn.Conv2d(half, half, 3, padding=1)
         self.shuffle = nn.Conv2d(half, CELL**2, 3, padding=1)
         self.relu = nn.ReLU()
@@ -95,8 +82,8 @@ class SetNet(nn.Module):
         `window_s`: how long the window lasts, in seconds, a number or one per clip (n,).
         `positions`: (row, col) of each view from the centre view; default: `optics.layout`.
         State, float32: leaky sums of each view, in cells, how awake each picture is, the time in s
-        that its coarse memories have not seen yet, and the `hidden` maps, in [-1, 1].  Raises
-        ValueError for bins, a number of views, a length of window or a state that do not fit.
+        since one last looked around, and the `hidden` maps.  Raises ValueError for bins, a number
+        of views, a length of window or a state that do not fit.
         """
         frames, state = self.sequence(
             voxels[:, None], state, window_s=window_s, positions=positions
@@ -122,7 +109,7 @@ class SetNet(nn.Module):
         padded, (top, left) = pad_to_multiple(voxels.flatten(0, 2), 8)
         voxels = padded.unflatten(0, (n, windows, views)).transpose(0, 1)
         cells = _halved(voxels.float().sum(3).flatten(0, 1))
-        sums, awake, waited, hidden2, hidden4, hidden8 = self._start(state, cells[:n])
+        sums, awake, waited, hidden, about = self._start(state, cells[:n])
 
         awake, passed = _time(cells, awake, seconds)
         waited, renewed = _saved_up(passed, waited)
@@ -135,44 +122,29 @@ class SetNet(nn.Module):
         stem = functional.conv2d(stacked, grids, None, CELL, grids.shape[-1] // 2)
         memory = torch.cat([every.flatten(1, 2), spread], 1).to(memories.dtype)
         stem = stem + functional.conv2d(memory, memories, bias, 1, 1)
-        seen, hidden2 = self.fine(stem, passed, hidden2)
-        about, hidden4, hidden8 = self.coarse(seen, renewed, hidden4, hidden8)
-        frames = functional.pixel_shuffle(self.drawn(seen, about), CELL).sigmoid()
+        seen, hidden = self.fine(stem, passed, hidden)
+        told, about = over_time(_renewed, about, self.around(seen).float(), renewed)
+        frames = functional.pixel_shuffle(self.drawn(seen, told), CELL).sigmoid()
         frames = frames[..., top : top + height, left : left + width]
         frames = frames.unflatten(0, (windows, n)).transpose(0, 1)
-        return frames, (sums, awake, waited, hidden2, hidden4, hidden8)
+        return frames, (sums, awake, waited, hidden, about)
 
     def fine(
-        self, stem: Float[Tensor, "m c h2 w2"], passed: Float[Tensor, "m 1 1 1"], hidden2: Tensor
+        self, stem: Float[Tensor, "m c h2 w2"], passed: Float[Tensor, "m 1 1 1"], hidden: Tensor
     ) -> tuple[Float[Tensor, "m c h2 w2"], Tensor]:
         """Return what is known at half resolution after each of m = windows * n, and the hidden map
         after the last; `stem`: before its ReLU, `passed`: seconds.
         """
-        all2, hidden2 = self.cell2(self.relu(stem), hidden2, RATE * passed)
-        return all2.to(stem.dtype), hidden2
-
-    def coarse(
-        self,
-        seen: Float[Tensor, "m c h2 w2"],
-        renewed: Float[Tensor, "m 1 1 1"],
-        hidden4: Tensor,
-        hidden8: Tensor,
-    ) -> tuple[Float[Tensor, "m c h4 w4"], Tensor, Tensor]:
-        """Return what a quarter and an eighth tell of the half, and their hidden maps after the
-        last; where no time is `renewed` they tell what they did before.
-        """
-        pace = RATE * renewed
-        all4, hidden4 = self.cell4(self.relu(self.down4(seen)), hidden4, pace)
-        all4 = all4.to(seen.dtype)
-        all8, hidden8 = self.cell8(self.relu(self.down8(all4)), hidden8, pace)
-        x = grown(self.up4(self.block8(all8.to(seen.dtype))), 2) + all4
-        return self.up2(self.relu(self.mix4(self.relu(x)))), hidden4, hidden8
+        seen, hidden = self.cell2(self.relu(stem), hidden, RATE * passed)
+        return seen.to(stem.dtype), hidden
 
     def drawn(
         self, seen: Float[Tensor, "m c h2 w2"], about: Float[Tensor, "m c h4 w4"]
     ) -> Float[Tensor, "m pixels h2 w2"]:
-        """Return the pixels of each cell as channels, float32, before their sigmoid."""
-        x = grown(about, 2) + seen
+        """Return the pixels of each cell as channels, float32, before their sigmoid; `about`: what
+        lies around.
+        """
+        x = grown(about.to(seen.dtype), 2) + seen
         return self.shuffle(self.relu(self.mix2(self.relu(x)))).float()
 
     def kernels(self, places: tuple[Position, ...]) -> tuple[Tensor, Tensor, Tensor]:
@@ -205,11 +177,10 @@ class SetNet(nn.Module):
         return tuple((int(row), int(column)) for row, column in positions)
 
     def hidden(self, height: int, width: int) -> list[tuple[int, int, int]]:
-        """Return the sizes (c, h, w) of the hidden maps of a picture: half, quarter, eighth."""
-        sides = ((height // k, width // k) for k in (2, 4, 8))
-        return [
-            (channels, *side) for channels, side in zip(self.widths.values(), sides, strict=True)
-        ]
+        """Return the sizes (c, h, w) of the hidden maps of a picture: what is remembered at half
+        resolution, in [-1, 1], and what lies around, at a quarter.
+        """
+        return [(self.half, height // k, width // k) for k in (2, 4)]
 
     def _start(self, state: State | None, cells: Tensor) -> State:
         """Return `state`, or zeros of the right sizes; ValueError when they are not right."""
@@ -228,11 +199,13 @@ class SetNet(nn.Module):
         return state
 
 
-SetNet2 = SetNet  # its name in files of before there was one generation only
-
 
 def _leaked(sums: Tensor, keep: Tensor, new: Tensor) -> Tensor:
     return keep * sums + new
+
+
+def _renewed(before: Tensor, now: Tensor, renewed: Tensor) -> Tensor:
+    return torch.where(renewed, now, before)
 
 
 def _cast(x: Tensor, dtype: torch.dtype) -> Tensor:
@@ -262,16 +235,15 @@ def _time(cells: Tensor, awake: Tensor, seconds: Tensor) -> tuple[Tensor, Tensor
 
 
 def _saved_up(passed: Tensor, waited: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what is left after the last window of the time that passed, and what of it is spent in
-    each: none until there is enough, then all.
+    """Return the time that has passed since there was enough of it, and whether there is, in each
+    window.
     """
-    spent = []
+    enough = []
     for now in passed.split(len(waited)):
         waited = waited + now
-        enough = waited >= RENEWED_S
-        spent.append(torch.where(enough, waited, 0.0))
-        waited = torch.where(enough, 0.0, waited)
-    return waited, torch.cat(spent)
+        enough.append(waited >= RENEWED_S)
+        waited = torch.where(enough[-1], 0.0, waited)
+    return waited, torch.cat(enough)
 
 
 def _halved(x: Tensor) -> Tensor:

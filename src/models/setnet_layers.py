@@ -1,14 +1,13 @@
-"""What SetNet is made of: kernels for a set of views, memories in continuous time, surroundings."""
+"""What SetNet is made of: kernels for a set of views, a memory in continuous time, surroundings."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 from torch.nn import functional
-
-from src.models.layers import ResidualBlock
 
 
 class ViewKernels(nn.Module):
@@ -43,14 +42,14 @@ class PacedUnit(nn.Module):
     """A gate beside a candidate in continuous time.
 
     Of the old state exp(-pace * relu(gate)) is left and the rest is the candidate's tanh: without
-    pace, or with a gate below zero, nothing changes.  It stays within [-1, 1].  `reach`: pixels,
-    odd, over which a place sees the state; 1: its own only, so that nothing wanders.
+    pace, or with a gate below zero, nothing changes.  It stays within [-1, 1].  A place sees the
+    state of its own only, so that nothing wanders.
     """
 
-    def __init__(self, channels: int, reach: int = 3):
+    def __init__(self, channels: int):
         super().__init__()
         self.seen = nn.Conv2d(channels, 2 * channels, 3, padding=1)
-        self.kept = nn.Conv2d(channels, 2 * channels, reach, padding=reach // 2, bias=False)
+        self.kept = nn.Conv2d(channels, 2 * channels, 1, bias=False)
         with torch.no_grad():  # memories of one to twenty windows from the start
             self.seen.bias[:channels].copy_(torch.linspace(0.05, 0.7, channels))
 
@@ -84,7 +83,6 @@ class PartedUnit(nn.Module):
         self.seen = nn.ParameterList(unit.seen.weight.chunk(2))
         self.bias = nn.ParameterList(unit.seen.bias.chunk(2))
         self.kept = nn.ParameterList(unit.kept.weight.chunk(2))
-        self.reach = unit.kept.padding
 
     def forward(
         self, x: Float[Tensor, "1 c h w"], state: Float[Tensor, "1 h w c"], pace: Tensor
@@ -93,7 +91,7 @@ class PartedUnit(nn.Module):
         before = channels_first(state.to(x.dtype))
         gate, candidate = (
             functional.conv2d(x, seen, bias, padding=1)
-            + functional.conv2d(before, kept, padding=self.reach)
+            + functional.conv2d(before, kept)
             for seen, bias, kept in zip(self.seen, self.bias, self.kept, strict=True)
         )
         keep = torch.exp(-pace * gate.relu().float())
@@ -112,27 +110,48 @@ def channels_last(x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n h w c"]:
 
 
 class Surroundings(nn.Module):
-    """Adds to a map what lies around each place: it is halved twice, and comes back.
+    """What lies around each place: a map is halved once for each of `widths`, the channels there,
+    and what is seen so comes back, scale by scale.
 
-    An area without events is known by its edges, which may be far.
+    An area without events is known by its edges, which may be far.  No ReLU closes a path (He et
+    al. 2016, identity mappings), and what comes back is nothing before training: otherwise a high
+    rate shuts these layers for good (docs/decisions/0021).
     """
+
+    def __init__(self, channels: int, widths: Sequence[int]):
+        super().__init__()
+        pairs = list(pairwise([channels, *widths]))
+        self.downs = nn.ModuleList(nn.Conv2d(a, b, 3, 2, padding=1) for a, b in pairs)
+        self.blocks = nn.ModuleList(Residual(width) for width in widths)
+        self.ups = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairs)
+        self.relu = nn.ReLU()
+        for down, up in zip(self.downs, self.ups, strict=True):
+            _healthy(down)
+            _silent(up)
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h2 w2"]:
+        """Return a map of half the size."""
+        scales = []
+        for down, block in zip(self.downs, self.blocks, strict=True):
+            x = block(down(x))
+            scales.append(x)
+        for scale, up in zip(scales[-2::-1], list(self.ups)[:0:-1], strict=True):
+            x = scale + _stretched(up(self.relu(x)), scale)
+        return self.ups[0](self.relu(x))
+
+
+class Residual(nn.Module):
+    """Adds to a map two 3x3 convolutions of it, a ReLU before each; nothing before training."""
 
     def __init__(self, channels: int):
         super().__init__()
-        self.down16 = nn.Conv2d(channels, channels, 3, 2, padding=1)
-        self.down32 = nn.Conv2d(channels, channels, 3, 2, padding=1)
-        self.block32 = ResidualBlock(channels)
-        self.up16 = nn.Conv2d(channels, channels, 1)
-        self.block16 = ResidualBlock(channels)
-        self.up8 = nn.Conv2d(channels, channels, 1)
+        self.first = _healthy(nn.Conv2d(channels, channels, 3, padding=1))
+        self.second = _silent(nn.Conv2d(channels, channels, 3, padding=1))
         self.relu = nn.ReLU()
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
         """Return a map of the same shape."""
-        x16 = self.relu(self.down16(x))
-        x32 = self.block32(self.relu(self.down32(x16)))
-        x16 = self.block16(x16 + _stretched(self.up16(x32), x16))
-        return x + _stretched(self.up8(x16), x)
+        return x + self.second(self.relu(self.first(self.relu(x))))
 
 
 def grown(x: Tensor, times: int) -> Tensor:
@@ -141,7 +160,7 @@ def grown(x: Tensor, times: int) -> Tensor:
 
 
 def over_time(
-    step: Callable[..., Tensor], state: Float[Tensor, "n ..."], *maps: Float[Tensor, "m ..."]
+    step: Callable[..., Tensor], state: Float[Tensor, "n ..."], *maps: Shaped[Tensor, "m ..."]
 ) -> tuple[Float[Tensor, "m ..."], Float[Tensor, "n ..."]]:
     """Return the state after every window and after the last; `step` takes it and a window's part
     of each of `maps`, which have m = windows * n.
@@ -155,3 +174,17 @@ def over_time(
 
 def _stretched(x: Tensor, like: Tensor) -> Tensor:
     return functional.interpolate(x, like.shape[-2:], mode="bilinear")
+
+
+def _healthy(conv: nn.Conv2d) -> nn.Conv2d:
+    """Return `conv` with maps that are as large behind it as before (He et al. 2015)."""
+    nn.init.kaiming_normal_(conv.weight, nonlinearity="relu")
+    nn.init.zeros_(conv.bias)
+    return conv
+
+
+def _silent(conv: nn.Conv2d) -> nn.Conv2d:
+    """Return `conv` with zeros."""
+    nn.init.zeros_(conv.weight)
+    nn.init.zeros_(conv.bias)
+    return conv
