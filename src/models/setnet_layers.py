@@ -125,9 +125,9 @@ class Surroundings(nn.Module):
         self.blocks = nn.ModuleList(Residual(width) for width in widths)
         self.ups = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairs)
         self.relu = nn.ReLU()
-        for down, up in zip(self.downs, self.ups, strict=True):
-            _healthy(down)
-            _silent(up)
+        for conv in (*self.downs, *self.ups):
+            _healthy(conv)
+        _silent(self.ups[0])
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h2 w2"]:
         """Return a map of half the size."""

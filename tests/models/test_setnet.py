@@ -21,7 +21,7 @@ from tests.test_train import config
 def small() -> SetNet:
     torch.manual_seed(0)
     network = SetNet(bins=3, half=4, around=(8, 8, 8))
-    for part in (*network.around.ups, *(block.second for block in network.around.blocks)):
+    for part in (network.around.ups[0], *(block.second for block in network.around.blocks)):
         torch.nn.init.normal_(part.weight, std=0.1)  # as after training
     return network
 
