@@ -2,13 +2,16 @@
 
 import shutil
 
+import pytest
 import torch
 
 from scripts import air_map as air
-from scripts import alignment
+from scripts import alignment, surroundings
 from scripts.ship_weights import recard, ship
+from src.app import build
 from src.figures import air_map
 from src.models import files
+from src.models.setnet import SetNet
 from src.models.unroll import unroll
 from src.records.runs import Run
 from src.train import train
@@ -85,3 +88,31 @@ def test_views_brought_back_by_their_own_tilt_are_the_picture_again():
     torn = tilt.clone()
     torn[..., 24:, :] *= -1  # whole views do not move
     assert abs(error("nine, whole", torn) - error("nine as they are", torn)) < 1e-3
+
+
+def test_what_lies_around_is_taught_while_the_memory_rests(tmp_path):
+    start, export = tmp_path / "start.safetensors", tmp_path / "taught.safetensors"
+    given = "experiment=setnet_small", f"ckpt={start}", f"export={export}"
+    cfg = config("train", tmp_path, *TINY, *given)
+    network, spec = build.network(cfg)
+    files.save(start, network, spec, {"hours": 1.0, "curve": []})
+    surroundings.teach(cfg, clips=3, steps=2)
+    before, taught = files.load(start).state_dict(), files.load(export).state_dict()
+    rested = [torch.equal(before[n], taught[n]) for n in before if n.startswith("cell2")]
+    assert all(rested) and not torch.equal(before["mix2.weight"], taught["mix2.weight"])
+    assert float(taught["around.ups.0.weight"].abs().max()) > 0
+    card = files.card(files.require(export, spec))
+    assert card["hours"] > 1 and card["curve"] == []
+    for name in ("ckpt", "export"):
+        with pytest.raises(ValueError, match="ckpt and export must be files"):
+            surroundings.teach(config("train", tmp_path, *TINY, *given, f"{name}=null"), 3, 2)
+
+
+def test_areas_are_learned_from_what_is_held():
+    torch.manual_seed(0)
+    network = SetNet(bins=3, half=4, around=(8, 8))
+    truth = torch.rand(64, 1, 1, 1).expand(-1, 1, 16, 16)
+    maps = torch.randn(64, 4, 8, 8) * 0.1
+    maps[:, :, :2, :2] += truth[..., :2, :2]  # told in a corner, wanted everywhere
+    errors = surroundings.learn(network, maps.half(), truth.half(), 300)
+    assert sum(errors[-20:]) < 0.6 * sum(errors[:20])

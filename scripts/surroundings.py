@@ -1,0 +1,132 @@
+"""Teach a SetNet what lies around, before it is trained as a whole:
+
+    python -m scripts.surroundings experiment=setnet_small ... ckpt=FILE export=FILE [+clips=800]
+
+A training step sees a few clips, and of areas they tell little but noise: what follows the memory,
+`SetNet.around` above all, learns nothing from that for hours (docs/decisions/0021).  Here the memory
+of `ckpt` rests.  What it holds in a few windows of many clips is computed once; then what follows,
+begun anew, learns from pictures of many clips a step, by their mean absolute error.  `export` is to
+go on from: `python -m src.train ... ckpt=FILE`.  The config is that of the training.
+"""
+
+import math
+import time
+from collections.abc import Iterable
+from pathlib import Path
+
+import hydra
+import lightning
+import torch
+from jaxtyping import Float
+from omegaconf import DictConfig
+from torch import Tensor
+from torch.nn import functional
+
+from src.app import build, door
+from src.models import files
+from src.models.fast import computes_bf16
+from src.models.setnet import CELL, SetNet
+from src.sim.pipeline import Sample
+from src.training.datamodule import LightFieldData, Simulator
+
+REMEMBERS = ("voxel_stem", "sum_stem", "spread_stem", "cell2")  # parts that rest
+EVERY = 7  # windows between two that are learned from; the last one is
+PICTURES = 24  # a step
+RATE, RISE = 1.5e-3, 50  # of Adam, falling by a cosine; steps over which it rises
+
+
+def rounded() -> torch.autocast:
+    """Return a context that computes in bf16 where the processor does."""
+    return torch.autocast("cpu", torch.bfloat16, enabled=computes_bf16())
+
+
+def begun_anew(network: SetNet) -> SetNet:
+    """Return a fresh network that remembers as `network` does."""
+    fresh = type(network)(**network.arguments)
+    kept = network.state_dict()
+    known = {name: kept[name] for name in kept if name.split(".")[0] in REMEMBERS}
+    fresh.load_state_dict(known, strict=False)
+    return fresh
+
+
+@torch.no_grad()
+def held(
+    network: SetNet, samples: Iterable[Sample]
+) -> tuple[Float[Tensor, "m c h2 w2"], Float[Tensor, "m 1 h w"]]:
+    """Return what the memory holds in every EVERY-th window of all clips, up to the last, and the
+    true pictures; float16.
+    """
+    maps, truth = [], []
+    for sample in samples:
+        clips, windows = sample.voxels.shape[:2]
+        seen: list[Tensor] = []
+        hook = network.around.register_forward_pre_hook(lambda _, x, seen=seen: seen.append(x[0]))
+        with rounded():
+            network.sequence(sample.voxels, window_s=sample.window_s, positions=sample.positions)
+        hook.remove()
+        chosen = slice((windows - 1) % EVERY, None, EVERY)
+        every = seen[0].unflatten(0, (windows, clips))[chosen]
+        maps.append(every.transpose(0, 1).flatten(0, 1).half())
+        truth.append(sample.target[:, chosen].flatten(0, 1).half())
+    return torch.cat(maps), torch.cat(truth)
+
+
+def learn(network: SetNet, maps: Tensor, truth: Tensor, steps: int) -> list[float]:
+    """Train what follows the memory on what `held` returns; return the error of every step."""
+    follows = [part for name, part in network.named_children() if name not in (*REMEMBERS, "relu")]
+    parameters = [parameter for part in follows for parameter in part.parameters()]
+    optimizer, errors = torch.optim.Adam(parameters, RATE), []
+    for step in range(steps):
+        fallen = 0.5 * (1 + math.cos(math.pi * step / steps))
+        optimizer.param_groups[0]["lr"] = RATE * min(1, (step + 1) / RISE) * fallen
+        some = torch.randint(len(maps), (PICTURES,))
+        seen = maps[some].float()
+        with rounded():
+            cells = network.drawn(seen, network.around(seen))
+        frames = functional.pixel_shuffle(cells, CELL).sigmoid()
+        error = (frames - truth[some]).abs().mean()
+        optimizer.zero_grad()
+        error.backward()
+        optimizer.step()
+        errors.append(float(error.detach()))
+        if len(errors) % 100 == 0:
+            print(f"{len(errors)} steps: mean error {sum(errors[-100:]) / 100:.4f}", flush=True)
+    return errors
+
+
+def samples(data: LightFieldData, clips: int) -> Iterable[Sample]:
+    """Return the first training clips, as a training sees them, a batch at a time."""
+    pipeline = data.pipelines["train"]
+    simulated = Simulator(pipeline, data.augment, data.seed, "cpu")
+    for first in range(0, clips, data.batch_size):
+        numbers = range(first, min(first + data.batch_size, clips))
+        yield simulated([(number, pipeline.draw(number)) for number in numbers])
+
+
+def teach(cfg: DictConfig, clips: int, steps: int) -> None:
+    """Read `cfg.ckpt`, write `cfg.export`; the hours that this took are added to its own."""
+    if not (cfg.ckpt and cfg.export):
+        raise ValueError(f"ckpt and export must be files, got {cfg.ckpt} and {cfg.export}")
+    if min(clips, steps) < 1:
+        raise ValueError(f"clips and steps must be >= 1, got {clips} and {steps}")
+    _, spec = build.network(cfg)
+    source, start = files.require(cfg.ckpt, spec), time.process_time()
+    before = files.load(source)
+    if not isinstance(before, SetNet):
+        raise ValueError(f"ckpt must be a SetNet, got {type(before).__name__} in {source}")
+    lightning.seed_everything(cfg.seed, verbose=False)
+    network, card = begun_anew(before), files.card(source)
+    maps, truth = held(network, samples(build.data(cfg), clips))
+    learn(network, maps, truth, steps)
+    card["hours"] = card.get("hours", 0.0) + (time.process_time() - start) / 3600
+    files.save(Path(cfg.export), network, spec, card)
+
+
+@hydra.main(version_base=None, config_path="../conf", config_name="train")
+def main(cfg: DictConfig) -> None:
+    """Glue between Hydra and `teach`."""
+    teach(cfg, cfg.get("clips", 800), cfg.get("steps", 1000))
+
+
+if __name__ == "__main__":
+    door.run(main)
