@@ -3,10 +3,10 @@
     python -m scripts.surroundings experiment=setnet_small ... ckpt=FILE export=FILE [+clips=800]
 
 A training step sees a few clips, and of areas they tell little but noise: what follows the memory,
-`SetNet.around` above all, learns nothing from that for hours (docs/decisions/0021).  Here the memory
-of `ckpt` rests.  What it holds in a few windows of many clips is computed once; then what follows,
-begun anew, learns from pictures of many clips a step, by their mean absolute error.  `export` is to
-go on from: `python -m src.train ... ckpt=FILE`.  The config is that of the training.
+`SetNet.around` above all, learns nothing from that for hours (docs/decisions/0021).  Here the
+memory of `ckpt` rests.  What it holds in a few windows of many clips is computed once; then what
+follows, begun anew, learns from pictures of many clips a step, by their mean absolute error.
+`export` is to go on from: `python -m src.train ... ckpt=FILE`.  The config is that of the training.
 """
 
 import math

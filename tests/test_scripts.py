@@ -7,6 +7,7 @@ import torch
 
 from scripts import air_map as air
 from scripts import alignment, surroundings
+from scripts.scales import missing
 from scripts.ship_weights import recard, ship
 from src.app import build
 from src.figures import air_map
@@ -116,3 +117,17 @@ def test_areas_are_learned_from_what_is_held():
     maps[:, :, :2, :2] += truth[..., :2, :2]  # told in a corner, wanted everywhere
     errors = surroundings.learn(network, maps.half(), truth.half(), 300)
     assert sum(errors[-20:]) < 0.6 * sum(errors[:20])
+
+
+def test_what_is_missing_is_told_by_its_size():
+    torch.manual_seed(0)
+    truth = torch.rand(2, 1, 176, 176)
+    assert float(missing(0.2 + 0.5 * truth, truth).max()) < 1e-6  # gain and offset do not count
+    checkers = (torch.arange(176)[:, None] + torch.arange(176)) % 2 - 0.5
+    fine, *coarser = missing(truth + 0.1 * checkers, truth)
+    assert fine > 0.02 and max(coarser) < 1e-3
+    grey = torch.nn.functional.avg_pool2d(truth, 16)
+    *details, areas, _ = missing(
+        truth - grey.repeat_interleave(16, 2).repeat_interleave(16, 3), truth
+    )
+    assert areas > 0.5 and max(details) < 0.05

@@ -199,7 +199,6 @@ class SetNet(nn.Module):
         return state
 
 
-
 def _leaked(sums: Tensor, keep: Tensor, new: Tensor) -> Tensor:
     return keep * sums + new
 

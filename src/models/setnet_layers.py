@@ -90,8 +90,7 @@ class PartedUnit(nn.Module):
         """Return the state after the window, channels first and as it is kept."""
         before = channels_first(state.to(x.dtype))
         gate, candidate = (
-            functional.conv2d(x, seen, bias, padding=1)
-            + functional.conv2d(before, kept)
+            functional.conv2d(x, seen, bias, padding=1) + functional.conv2d(before, kept)
             for seen, bias, kept in zip(self.seen, self.bias, self.kept, strict=True)
         )
         keep = torch.exp(-pace * gate.relu().float())
