@@ -190,7 +190,8 @@ def _build(spec: dict, path: Path, rooms: Sequence[str] = ()) -> nn.Module:
             raise TypeError(f"{target} is no network")
         return kind(**kwargs)
     except Exception as error:  # networks raise all kinds for arguments that are not theirs
-        raise ValueError(f"ckpt names a network that is not here: {target} in {path}") from error
+        wanted = f"{target} of {kwargs}"
+        raise ValueError(f"ckpt names a network that is not here: {wanted} in {path}") from error
 
 
 def _check_sizes(value: Any, path: Path) -> None:
