@@ -134,8 +134,10 @@ class Surroundings(nn.Module):
         for down, block in zip(self.downs, self.blocks, strict=True):
             x = block(down(x))
             scales.append(x)
-        for scale, up in zip(scales[-2::-1], list(self.ups)[:0:-1], strict=True):
-            x = scale + _stretched(up(self.relu(x)), scale)
+        scales.pop()
+        for up in reversed(self.ups[1:]):
+            finer = scales.pop()
+            x = finer + _stretched(up(self.relu(x)), finer)
         return self.ups[0](self.relu(x))
 
 
