@@ -1,5 +1,6 @@
-"""What of the true picture is missing, by size of detail: python -m scripts.scales CKPT ...
-[--root PHOTOS].
+"""What of the true picture is missing, by size of detail:
+
+    python -m scripts.scales CKPT ... [--root PHOTOS]
 
 Of validation clips of nine views, 176 x 176, 40 windows, as networks were trained on
 (budget=hours); a picture counts after the best affine fit of its brightness, from window 10 on.  An
@@ -16,6 +17,7 @@ from torch.nn import functional
 from scripts.readme import config
 from src import models
 from src.app import build
+from src.metrics.image import aligned
 from src.models.unroll import video
 from src.sim.pipeline import simulate
 
@@ -29,16 +31,9 @@ def missing(
     """Return the power of the error relative to the truth's in details below each of SIDES, in
     pixels, and in what is left: 0 is perfect, 1 what grey has.
     """
-    error = _fitted(frames, truth) - truth
+    error = aligned(frames, truth) - truth
     parts = zip(_scales(error), _scales(truth - truth.mean((2, 3), keepdim=True)), strict=True)
     return torch.stack([wrong.square().mean() / true.square().mean() for wrong, true in parts])
-
-
-def _fitted(frames: Tensor, truth: Tensor) -> Tensor:
-    """Return each frame times what fits the truth best, plus what does."""
-    ours, theirs = (x - x.mean((2, 3), keepdim=True) for x in (frames, truth))
-    gain = (ours * theirs).sum((2, 3), keepdim=True) / ours.square().sum((2, 3), keepdim=True)
-    return gain * ours + truth.mean((2, 3), keepdim=True)
 
 
 def _scales(x: Tensor) -> list[Tensor]:

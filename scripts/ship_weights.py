@@ -88,9 +88,16 @@ def facts(run: Path, content: dict, first: DictConfig) -> dict:
 
 
 def first_config(run: Path) -> DictConfig:
-    """Return the config that a run, or the first part of a campaign's training, began with."""
+    """Return the config that a training began with: of its first part, or of the run that it went
+    on from, as long as that is there.
+    """
     parts = sorted(run.glob("part*/config.yaml"))
-    return OmegaConf.load(parts[0] if parts else run / "config.yaml")
+    cfg = OmegaConf.load(parts[0] if parts else run / "config.yaml")
+    before = Path(cfg.ckpt or "nothing")
+    for folder in (before, *before.parents[:2]):  # a run, its checkpoints or one of them
+        if not files.exported(before) and (folder / "config.yaml").is_file():
+            return first_config(folder)
+    return cfg
 
 
 def seen(network: torch.nn.Module) -> str:
@@ -145,9 +152,8 @@ def _cell(metric: Metric, score: dict | None) -> str:
 
 
 def _start(cfg: DictConfig) -> str:
-    """Return the name of the published or exported weights that a training began with."""
-    ckpt = cfg.ckpt if files.exported(Path(cfg.ckpt or "")) else None
-    return Path(cfg.model.get("weights") or ckpt or "nothing").name
+    """Return the name of the weights that a training began with."""
+    return Path(cfg.model.get("weights") or cfg.ckpt or "nothing").name
 
 
 def _scenes(cfg: DictConfig) -> str:

@@ -1,6 +1,6 @@
 """Teach a SetNet what lies around, before it is trained as a whole:
 
-    python -m scripts.surroundings experiment=setnet_small ... ckpt=FILE export=FILE [+clips=800]
+    python -m scripts.surroundings experiment=setnet_small ckpt=FILE export=FILE [+clips= +steps=]
 
 A training step sees a few clips, and of areas they tell little but noise: what follows the memory,
 `SetNet.around` above all, learns nothing from that for hours (docs/decisions/0021).  Here the
@@ -105,10 +105,13 @@ def samples(data: LightFieldData, clips: int) -> Iterable[Sample]:
 
 def teach(cfg: DictConfig, clips: int, steps: int) -> None:
     """Read `cfg.ckpt`, write `cfg.export`; the hours that this took are added to its own."""
-    if not (cfg.ckpt and cfg.export):
-        raise ValueError(f"ckpt and export must be files, got {cfg.ckpt} and {cfg.export}")
-    if min(clips, steps) < 1:
-        raise ValueError(f"clips and steps must be >= 1, got {clips} and {steps}")
+    if not (cfg.ckpt and cfg.export and files.exported(Path(cfg.export))):
+        got = f"{cfg.ckpt} and {cfg.export}"
+        raise ValueError(f"ckpt and export must be files, export a .safetensors, got {got}")
+    if any(type(count) is not int or count < 1 for count in (clips, steps)):
+        raise ValueError(f"clips and steps must be whole numbers >= 1, got {clips} and {steps}")
+    build.share_cores(cfg)
+    build.keep_memory(cfg)
     _, spec = build.network(cfg)
     source, start = files.require(cfg.ckpt, spec), time.process_time()
     before = files.load(source)

@@ -38,6 +38,11 @@ def test_a_trained_run_is_shipped_whole_with_its_card(tmp_path, monkeypatch):
     (first / "config.yaml").write_text(config_of.replace("ckpt: null", "ckpt: a/one.safetensors"))
     parts = ship(tmp_path / "parts", "tiny/parts", []).with_suffix(".md").read_text()
     assert "| started_from | one.safetensors |" in parts
+    later = tmp_path / "later"
+    shutil.copytree(run, later)
+    (later / "config.yaml").write_text(config_of.replace("ckpt: null", f"ckpt: {first}"))
+    gone_on = ship(later, "tiny/later", []).with_suffix(".md").read_text()
+    assert "| started_from | one.safetensors |" in gone_on
     whole = path.read_bytes()
     assert recard("tiny/one", [run, run]) == path and path.read_bytes() == whole
     anew = path.with_suffix(".md").read_text().splitlines()

@@ -31,12 +31,19 @@ def psnr(
 def aligned_psnr(
     prediction: Float[Tensor, "n 1 h w"], target: Float[Tensor, "n 1 h w"]
 ) -> Float[Tensor, " n"]:
-    """Return the PSNR after the least-squares gain (>= 0) and offset of each frame."""
+    """Return the PSNR of each frame once it is `aligned`."""
+    return psnr(aligned(prediction, target), target)
+
+
+def aligned(
+    prediction: Float[Tensor, "n 1 h w"], target: Float[Tensor, "n 1 h w"]
+) -> Float[Tensor, "n 1 h w"]:
+    """Return each frame after the gain (>= 0) and offset that fit it best, by least squares."""
     x, y = prediction.flatten(1), target.flatten(1)
     centred = x - x.mean(1, keepdim=True)
     gain = (centred * y).mean(1, keepdim=True) / centred.square().mean(1, keepdim=True).clamp(1e-12)
     fitted = gain.clamp(min=0) * centred + y.mean(1, keepdim=True)
-    return psnr(fitted.view_as(prediction), target)
+    return fitted.view_as(prediction)
 
 
 def ssim(
