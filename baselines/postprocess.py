@@ -84,11 +84,18 @@ class Restoration(Reconstructor):
         """The network behind its source."""
         return Postprocessed(self._source[0], super().method)
 
-    def unrolled(self, sample: "Sample", part: slice, state: Any = None) -> tuple[Tensor, None]:
+    def unrolled(
+        self,
+        sample: "Sample",
+        part: slice,
+        state: Any = None,
+        shown: Sequence[int] | None = None,
+    ) -> tuple[Tensor, None]:
         """Return what the post-processor makes of a `part` of the source's frames; no state."""
         with torch.no_grad():
             seen = video(self._source[0].to(self.device), sample).float().clamp(0, 1)
-        return self.network(seen[:, part])[0], None
+        restored = self.network(seen[:, part])[0]
+        return restored if shown is None else restored[:, shown], None
 
 
 def load(weights: str, rooms: Sequence[str] = ()) -> nn.Module:

@@ -114,6 +114,9 @@ def reconstructor(cfg: DictConfig, net: nn.Module, spec: dict) -> Reconstructor:
     if not 0 <= cfg.data.loss_from < cfg.data.windows:
         most = f"0..{cfg.data.windows - 1} (data.windows)"
         raise ValueError(f"data.loss_from must be in {most}, got {cfg.data.loss_from}")
+    pairs, most = cfg.data.loss_pairs, (cfg.data.windows - cfg.data.loss_from) // 2
+    if pairs is not None and not (type(pairs) is int and 1 <= pairs <= most):
+        raise ValueError(f"data.loss_pairs must be in 1..{most} or null, got {pairs}")
     if cfg.hours and cfg.scheduler:
         raise ValueError(f"scheduler must be null with hours={cfg.hours}, which has its own")
     if cfg.channels_last:
@@ -130,6 +133,7 @@ def reconstructor(cfg: DictConfig, net: nn.Module, spec: dict) -> Reconstructor:
         warmup=cfg.data.warmup,
         spike=cfg.spike,
         loss_from=cfg.data.loss_from,
+        loss_pairs=cfg.data.loss_pairs,
         steady=cfg.steady,
         clip=cfg.clip,
         average=cfg.average,

@@ -15,7 +15,7 @@ import math
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -97,11 +97,13 @@ class SetNet(nn.Module):
         *,
         window_s: float | Tensor = 1 / RATE,
         positions: Sequence[Position] | None = None,
-    ) -> tuple[Float[Tensor, "n windows 1 h w"], State]:
-        """Return the frame of every window, as window by window, and the state after the last one.
+        shown: Sequence[int] | None = None,
+    ) -> tuple[Float[Tensor, "n shown 1 h w"], State]:
+        """Return the frames of the windows `shown` (None: of all), as window by window, and the
+        state after the last one.
 
         Layer by layer: only what is remembered goes window by window, all else sees all of them at
-        once, in order of time (windows * n).
+        once, in order of time (windows * n), and what is drawn those that are shown.
         """
         n, windows, views, bins, height, width = voxels.shape
         places = self.places(views, bins, positions)
@@ -123,10 +125,12 @@ class SetNet(nn.Module):
         memory = torch.cat([every.flatten(1, 2), spread], 1).to(memories.dtype)
         stem = stem + functional.conv2d(memory, memories, bias, 1, 1)
         seen, hidden = self.fine(stem, passed, hidden)
-        told, about = over_time(_renewed, about, self.around(seen).float(), renewed)
+        told, about = self.looked(seen, about, renewed, shown)
+        if shown is not None:
+            seen = _windows(seen, n, shown)
         frames = functional.pixel_shuffle(self.drawn(seen, told), CELL).sigmoid()
         frames = frames[..., top : top + height, left : left + width]
-        frames = frames.unflatten(0, (windows, n)).transpose(0, 1)
+        frames = frames.unflatten(0, (-1, n)).transpose(0, 1)
         return frames, (sums, awake, waited, hidden, about)
 
     def fine(
@@ -137,6 +141,26 @@ class SetNet(nn.Module):
         """
         seen, hidden = self.cell2(self.relu(stem), hidden, RATE * passed)
         return seen.to(stem.dtype), hidden
+
+    def looked(
+        self,
+        seen: Float[Tensor, "m c h2 w2"],
+        about: Float[Tensor, "n c h4 w4"],
+        renewed: Bool[Tensor, "m 1 1 1"],
+        shown: Sequence[int] | None,
+    ) -> tuple[Float[Tensor, "s c h4 w4"], Float[Tensor, "n c h4 w4"]]:
+        """Return what lies around in the s = shown * n windows and after the last one, float32;
+        `about`: before the first, `renewed`: whether one looks around then.
+        """
+        if shown is None:
+            return over_time(_renewed, about, self.around(seen).float(), renewed)
+        n, number = len(about), torch.arange(len(seen), device=seen.device).view(-1, 1, 1, 1)
+        never = number.new_full((n, 1, 1, 1), -1)
+        when, last = over_time(_renewed, never, number, renewed)  # one looked around
+        when = torch.cat([_windows(when, n, shown), last])
+        fresh = self.around(seen[when.flatten().clamp(0)]).float()
+        told = torch.where(when < 0, about.repeat(len(shown) + 1, 1, 1, 1), fresh)
+        return told[:-n], told[-n:]
 
     def drawn(
         self, seen: Float[Tensor, "m c h2 w2"], about: Float[Tensor, "m c h4 w4"]
@@ -201,6 +225,11 @@ class SetNet(nn.Module):
 
 def _leaked(sums: Tensor, keep: Tensor, new: Tensor) -> Tensor:
     return keep * sums + new
+
+
+def _windows(maps: Tensor, n: int, shown: Sequence[int]) -> Tensor:
+    """Return those of `maps` (windows * n, ...) that are of the windows `shown`."""
+    return maps.unflatten(0, (-1, n))[list(shown)].flatten(0, 1)
 
 
 def _renewed(before: Tensor, now: Tensor, renewed: Tensor) -> Tensor:

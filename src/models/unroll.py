@@ -21,24 +21,33 @@ def unroll(
     *,
     window_s: float | Tensor = 1 / 120,
     positions: Sequence[tuple[int, int]] | None = None,
-) -> tuple[Float[Tensor, "n windows 1 h w"], Any]:
-    """Return the frame of every window and the state after the last one.
+    shown: Sequence[int] | None = None,
+) -> tuple[Float[Tensor, "n shown 1 h w"], Any]:
+    """Return the frames of the windows `shown`, ascending (None: of all), and the state after the
+    last window.
 
     `window_s`, the length of a window in seconds, a number or one per clip (n,), and `positions`,
     the (row, col) of every view, are given to a network that takes them.  One that has a method
-    `sequence`, as `forward` but for many windows, is given AT_ONCE of them.
+    `sequence`, as `forward` but for many windows, is given AT_ONCE of them and which are shown.
     """
     options = accepted(network, window_s=window_s, positions=positions)
     frames = []
     if hasattr(network, "sequence"):
         for part in chunks(voxels.shape[1], AT_ONCE):
+            options["shown"] = None if shown is None else within(shown, part)
             some, state = network.sequence(voxels[:, part], state, **options)
             frames.append(some)
         return torch.cat(frames, dim=1), state
-    for window in voxels.unbind(1):
+    for number, window in enumerate(voxels.unbind(1)):
         frame, state = network(window, state, **options)
-        frames.append(frame)
+        if shown is None or number in shown:
+            frames.append(frame)
     return torch.stack(frames, dim=1), state
+
+
+def within(shown: Sequence[int], part: slice) -> list[int]:
+    """Return those of the windows `shown` that lie in `part`, counted from its first."""
+    return [window - part.start for window in shown if part.start <= window < part.stop]
 
 
 def video(method: nn.Module, sample: "Sample") -> Float[Tensor, "n windows 1 h w"]:

@@ -1,7 +1,8 @@
 """Training, validation and test of any network that turns voxel grids into frames."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from src.metrics.scores import Scores
-from src.models.unroll import chunks, detach, takes, unroll, video
+from src.models.unroll import chunks, detach, takes, unroll, video, within
 from src.training.average import copy_of, follow
 from src.training.clock import Clock
 from src.training.guard import Guard, NotFinite
@@ -29,6 +30,8 @@ class Reconstructor(LightningModule):
     `detach_every`: windows between two cuts of the graph (truncated back-propagation through time;
     0: none).  Memory is that of one chunk; the optimiser steps once per batch.
     `loss_from`: the first window of a sequence that the loss sees; those before fill the state.
+    `loss_pairs`: of the windows from there on the loss sees so many pairs of neighbours, one in each
+    equal part of them, drawn anew in every step (None: all windows): what is alike is not paid for.
     `steady`: weight of the mean change of a picture's error from one window to the next: a picture
     may be wrong, but not flicker.
     `clip`: longest gradient (Euclidean norm over all parameters; None: as long as it is).
@@ -52,6 +55,7 @@ class Reconstructor(LightningModule):
         warmup: int = 0,
         spike: float | None = None,
         loss_from: int = 0,
+        loss_pairs: int | None = None,
         steady: float = 0.0,
         clip: float | None = None,
         average: float | None = None,
@@ -72,7 +76,8 @@ class Reconstructor(LightningModule):
         self._mean, self.decay = (None if average is None else copy_of(network),), average
         self.optimizer, self.scheduler = optimizer, scheduler
         self.detach_every, self.warmup, self.guard = detach_every, warmup, Guard(spike)
-        self.loss_from, self.steady, self.clip = loss_from, steady, clip
+        self.loss_from, self.loss_pairs = loss_from, loss_pairs
+        self.steady, self.clip = steady, clip
         self.clock = clock or Clock()
         self.windows_seen, self.steps_before, self.rates = 0, 0, []
         # In a tuple, so that their backbones stay out of the parameters and the checkpoint.
@@ -126,16 +131,17 @@ class Reconstructor(LightningModule):
         Raises NotFinite, with the clips, for a loss or gradient that is not; no step is taken then.
         """
         windows = sample.voxels.shape[1]
-        count = (windows - self.loss_from) * len(sample.voxels)
+        chosen = self._chosen(windows)
         state, total = None, torch.zeros((), device=self.device)
         self.optimizers().zero_grad()
         for part in chunks(windows, self.detach_every):
-            seen = max(self.loss_from - part.start, 0)  # by nothing but the state
+            shown = within(chosen, part)  # of the others nothing is learned but to fill the state
             # One normalised weight per chunk: spectral norm iterates once, not once per window.
-            with parametrize.cached(), torch.set_grad_enabled(part.stop > self.loss_from):
-                frames, state = self.unrolled(sample, part, detach(state))
-            if part.stop > self.loss_from:
-                total += self._backward(frames[:, seen:], sample.target[:, part][:, seen:], count)
+            with parametrize.cached(), torch.set_grad_enabled(bool(shown)):
+                frames, state = self.unrolled(sample, part, detach(state), shown or [0])
+            if shown:
+                target, share = sample.target[:, part][:, shown], len(shown) / len(chosen)
+                total += self._backward(frames, target, shown, share)
         total = self.all_gather(total).mean()
         self._protect(total, sample.drawn)
         self._step()
@@ -144,6 +150,18 @@ class Reconstructor(LightningModule):
         self.clock.lap()
         return total
 
+    def _chosen(self, windows: int) -> list[int]:
+        """Return the windows that the loss sees, ascending."""
+        if self.loss_pairs is None:
+            return list(range(self.loss_from, windows))
+        drawer = torch.Generator().manual_seed(self.global_step)
+        ends = [
+            self.loss_from + part * (windows - self.loss_from) // self.loss_pairs
+            for part in range(self.loss_pairs + 1)
+        ]
+        firsts = [int(torch.randint(a, b - 1, (), generator=drawer)) for a, b in pairwise(ends)]
+        return [first + one for first in firsts for one in (0, 1)]
+
     def _step(self) -> None:
         self.optimizers().step()
         if self.scheduler is not None:
@@ -151,8 +169,8 @@ class Reconstructor(LightningModule):
         if self.average is not None:
             follow(self.average, self.network, self.decay, self.global_step)
 
-    def _backward(self, frames: Tensor, target: Tensor, count: int) -> Tensor:
-        """Back-propagate the sum of the losses over `count`; return it.
+    def _backward(self, frames: Tensor, target: Tensor, shown: list[int], share: float) -> Tensor:
+        """Back-propagate `share` of the mean loss of the windows `shown`; return it.
 
         The loss sees every picture alone, so its gradient there is had a few pictures at a time,
         and its own maps (VGG's are larger than the network's) never stand in memory together.
@@ -165,12 +183,13 @@ class Reconstructor(LightningModule):
         leaves, total = pictures.detach().requires_grad_(), torch.zeros((), device=self.device)
         pairs = zip(leaves.split(PICTURES), target.flatten(0, 1).split(PICTURES), strict=True)
         for ours, truth in pairs:
-            loss = self.loss(ours, truth, **options).sum() / count
+            loss = self.loss(ours, truth, **options).sum() * (share / len(pictures))
             loss.backward()
             total += loss.detach()
-        if self.steady:
+        if self.steady and len(shown) > 1:
             error = leaves.unflatten(0, frames.shape[:2]) - target
-            change = self.steady * error.diff(dim=1).abs().mean((2, 3, 4)).sum() / count
+            follows = [b == a + 1 for a, b in pairwise(shown)]
+            change = share * self.steady * error.diff(dim=1)[:, follows].abs().mean()
             change.backward()
             total += change.detach()
         self.manual_backward(pictures, leaves.grad)
@@ -213,9 +232,17 @@ class Reconstructor(LightningModule):
         clips = zip(frames, target, sample.drawn, strict=True)
         return [drawn | self.scores(ours, truth) for ours, truth, drawn in clips]
 
-    def unrolled(self, sample: "Sample", part: slice, state: Any = None) -> tuple[Tensor, Any]:
-        """Return what the network in training makes of a `part` of the windows, and its state."""
-        options = {"window_s": sample.window_s, "positions": sample.positions}
+    def unrolled(
+        self,
+        sample: "Sample",
+        part: slice,
+        state: Any = None,
+        shown: Sequence[int] | None = None,
+    ) -> tuple[Tensor, Any]:
+        """Return what the network in training makes of a `part` of the windows, of those `shown`
+        (None: all), counted from its first, and its state after all of them.
+        """
+        options = {"window_s": sample.window_s, "positions": sample.positions, "shown": shown}
         return unroll(self.network, sample.voxels[:, part], state, **options)
 
     def configure_optimizers(self):

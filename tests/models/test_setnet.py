@@ -154,6 +154,19 @@ def test_a_sequence_at_once_is_what_its_windows_are_one_by_one(side):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("shown", [[2, 3, 17, AT_ONCE + 1], [0], list(range(AT_ONCE + 3))])
+@torch.no_grad()
+def test_windows_that_are_not_shown_change_nothing(shown):
+    network, clips = small(), voxels(2, windows=AT_ONCE + 3)
+    clips[0, 4:9] = 0
+    lengths = {"window_s": torch.tensor([1 / 120, 1 / 600])}
+    frames, state = unroll(network, clips, **lengths)
+    some, same = unroll(network, clips, **lengths, shown=shown)
+    torch.testing.assert_close(some, frames[:, shown], rtol=1e-4, atol=1e-5)
+    for one, other in zip(state, same, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+
+
 @torch.no_grad()
 def test_an_empty_window_cut_in_pieces_passes_the_same_time():
     network, events = small(), voxels(windows=1)[:, 0]

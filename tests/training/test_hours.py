@@ -187,6 +187,7 @@ def test_the_mean_forgets_the_start_and_then_moves_slowly():
         (["steady=-1"], "steady must be >= 0"),
         (["average=1"], "average must be in"),
         (["data.loss_from=2"], "data.loss_from must be in 0..1"),
+        (["data.loss_pairs=2", "data.loss_from=0"], "data.loss_pairs must be in 1..1 or null"),
         (["callbacks.curve.every_h=0"], "callbacks.curve.every_h"),
         (["callbacks.hours.floor=2"], "callbacks.hours.floor"),
         (["export=weights.pt"], "export must be a .safetensors"),

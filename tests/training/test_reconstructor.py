@@ -1,7 +1,8 @@
 """The training step: loss averaged over windows, graph cut where asked, one optimiser step."""
 
 import copy
-from itertools import pairwise
+from collections.abc import Sequence
+from unittest.mock import patch
 
 import lightning
 import pytest
@@ -66,7 +67,11 @@ def fit(network: nn.Module, detach_every: int, steps: int = 1, **how) -> nn.Modu
 
 
 def by_hand(
-    detach_every: int, loss_from: int = 0, clip: float = 1e9, steady: float = 0.0
+    detach_every: int,
+    loss_from: int = 0,
+    clip: float = 1e9,
+    steady: float = 0.0,
+    pairs: Sequence[int] = (),
 ) -> nn.Module:
     network, batch = Leaky(), sample()
     state, losses, errors = None, [], []
@@ -76,9 +81,12 @@ def by_hand(
         frame, state = network(batch.voxels[:, window], state)
         errors.append(frame - batch.target[:, window])
         losses.append(errors[-1].square().mean())
-    changes = [(b - a).abs().mean() for a, b in pairwise(errors[loss_from:])]
-    loss = torch.stack(losses[loss_from:]).mean()
-    (loss + steady * torch.stack(changes).sum() / len(losses[loss_from:])).backward()
+    firsts = pairs or range(loss_from, len(errors) - 1)
+    changes = [(errors[first + 1] - errors[first]).abs().mean() for first in firsts]
+    if pairs:
+        losses = [losses[first + one] for first in pairs for one in (0, 1)]
+    loss = torch.stack(losses[loss_from if not pairs else 0 :]).mean()
+    (loss + steady * torch.stack(changes).mean()).backward()
     torch.nn.utils.clip_grad_norm_(network.parameters(), clip)
     with torch.no_grad():
         for parameter in network.parameters():
@@ -109,6 +117,28 @@ def test_what_flickers_costs(loss_from):
     for mine, other in zip(ours.parameters(), theirs.parameters(), strict=True):
         assert torch.allclose(mine, other, atol=1e-6)
     assert not torch.allclose(theirs.a, by_hand(0, loss_from).a, atol=1e-3)
+
+
+@pytest.mark.parametrize("detach_every", [0, 2])
+def test_the_loss_sees_what_is_chosen(detach_every, monkeypatch):
+    monkeypatch.setattr(Reconstructor, "_chosen", lambda *_: [1, 2, 4, 5])
+    how = {"loss_from": 1, "steady": 0.0 if detach_every else 3.0}
+    ours = fit(Leaky(), detach_every, **how, loss_pairs=2)
+    theirs = by_hand(detach_every, **how, pairs=[1, 4])
+    for mine, other in zip(ours.parameters(), theirs.parameters(), strict=True):
+        assert torch.allclose(mine, other, atol=1e-6)
+
+
+def test_pairs_stay_in_their_parts_and_are_drawn_anew_every_step():
+    module, seen = Reconstructor(Leaky(), {}, loss_from=3, loss_pairs=4), set()
+    for step in range(200):
+        with patch.object(Reconstructor, "global_step", step):
+            chosen = module._chosen(40)
+        seen |= set(chosen)
+        for part, (first, second) in enumerate(zip(chosen[::2], chosen[1::2], strict=True)):
+            assert second == first + 1
+            assert 3 + part * 37 // 4 <= first and second < 3 + (part + 1) * 37 // 4
+    assert seen == set(range(3, 40))
 
 
 def test_cutting_the_graph_changes_the_gradient():
