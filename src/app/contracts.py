@@ -35,8 +35,8 @@ class Network(Protocol):
         """Return the frame at the end of the window, in [0, 1], and the state to go on from.
 
         With a keyword `window_s` or `positions` it is given the length of the window in seconds
-        or the (row, col) of every view; a method `sequence` is given many windows at once; see
-        `src.models.unroll.unroll`.
+        or the (row, col) of every view; a method `sequence` is given many windows at once and which
+        of their frames are wanted (`shown`); see `src.models.unroll.unroll`.
         """
         ...
 

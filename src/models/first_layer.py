@@ -5,7 +5,7 @@ import numpy as np
 from src.models.behind_first_layer import AfterHead, AfterStem
 from src.models.engines import events_numba as kernels
 from src.models.kernel_patches import patches, spans
-from src.models.setnet import AWAKE_S, MEMORIES_S, RENEWED_S
+from src.models.setnet import AWAKE_S, MEMORIES_S, RATE, RENEWED_S
 
 NOTHING = [np.empty(0, kind) for kind in (np.float64, np.int64, np.int64, np.float32, np.int64)]
 
@@ -64,6 +64,7 @@ class StemFront(HeadFront):
         time passed, and whether to look around.
         """
         events = t, x, y, p, view, t0, t1
+        often = np.float32(1 / (RATE * (t1 - t0)))  # as SetNet counts them
         awake, passed = kernels.remember(
             *events, self.stride, self.memories, np.float32(AWAKE_S), self.clock[0], self.sums
         )
@@ -71,7 +72,8 @@ class StemFront(HeadFront):
         renewed = waited >= RENEWED_S
         self.clock[:] = awake, 0 if renewed else waited
         times = np.full((1, 1, 1, 1), passed, np.float32), np.array(renewed)
-        return [*super().add(*events), self.sums[None].copy(), *times]
+        made = super().add(t, x, y, often * p, view, t0, t1)
+        return [*made, self.sums[None].copy(), *times]
 
     def frame(self, drawn: np.ndarray) -> np.ndarray:
         """Return the frame (h, w), padded, of its cells."""

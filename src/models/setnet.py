@@ -123,7 +123,7 @@ class SetNet(nn.Module):
         stacked = _cast(voxels, grids.dtype).reshape(windows * n, views * bins, *voxels.shape[-2:])
         stem = functional.conv2d(stacked, grids, None, CELL, grids.shape[-1] // 2)
         memory = torch.cat([every.flatten(1, 2), spread], 1).to(memories.dtype)
-        stem = stem + functional.conv2d(memory, memories, bias, 1, 1)
+        stem = _as_rates(stem, seconds) + functional.conv2d(memory, memories, bias, 1, 1)
         seen, hidden = self.fine(stem, passed, hidden)
         told, about = self.looked(seen, about, renewed, shown)
         if shown is not None:
@@ -240,6 +240,12 @@ def _cast(x: Tensor, dtype: torch.dtype) -> Tensor:
     """Return `x` as a convolution takes it under autocast: sooner, it is copied once only."""
     kind = x.device.type
     return x.to(torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else dtype)
+
+
+def _as_rates(counted: Tensor, seconds: Tensor) -> Tensor:
+    """Return maps (windows * n, ...) of what a window counts as counts in 1 / RATE s."""
+    often = 1 / (RATE * seconds)
+    return counted * often.repeat(len(counted) // len(often), 1, 1, 1).to(counted.dtype)
 
 
 def _seconds(window_s: float | Tensor, voxels: Tensor) -> Tensor:

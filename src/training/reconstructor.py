@@ -30,8 +30,8 @@ class Reconstructor(LightningModule):
     `detach_every`: windows between two cuts of the graph (truncated back-propagation through time;
     0: none).  Memory is that of one chunk; the optimiser steps once per batch.
     `loss_from`: the first window of a sequence that the loss sees; those before fill the state.
-    `loss_pairs`: of the windows from there on the loss sees so many pairs of neighbours, one in each
-    equal part of them, drawn anew in every step (None: all windows): what is alike is not paid for.
+    `loss_pairs`: of the windows from there on the loss sees so many pairs of neighbours, one in
+    each equal part, drawn anew in every step (None: all windows): what is alike is not paid for.
     `steady`: weight of the mean change of a picture's error from one window to the next: a picture
     may be wrong, but not flicker.
     `clip`: longest gradient (Euclidean norm over all parameters; None: as long as it is).
