@@ -60,7 +60,7 @@ def held(
     for sample in samples:
         clips, windows = sample.voxels.shape[:2]
         seen: list[Tensor] = []
-        hook = network.around.register_forward_pre_hook(lambda _, x, seen=seen: seen.append(x[0]))
+        hook = network.cell2.register_forward_hook(lambda _, x, y, seen=seen: seen.append(y[0]))
         with rounded():
             network.sequence(sample.voxels, window_s=sample.window_s, positions=sample.positions)
         hook.remove()

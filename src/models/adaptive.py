@@ -174,6 +174,6 @@ def _reviewed(own: State, before: list[Position], after: list[Position]) -> Stat
 
 def _emptied(own: State, network: SetNet) -> State:
     """Return the state for another network: sums of events stay, its own maps start."""
-    sums, awake, waited, *_ = own
-    sizes = network.hidden(*(CELL * side for side in sums.shape[-2:]))
-    return (sums, awake, waited, *(sums.new_zeros(len(sums), *size) for size in sizes))
+    sums, awake, recent, *_ = own
+    sizes, never = network.hidden(*(CELL * side for side in sums.shape[-2:])), 0 * recent
+    return (sums, awake, never, *(sums.new_zeros(len(sums), *size) for size in sizes))

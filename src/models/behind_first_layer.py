@@ -89,14 +89,17 @@ class AfterStem(nn.Module):
         grids: Float[Tensor, "1 hc wc stem"],
         sums: Float[Tensor, "1 sums hc wc"],
         passed: Float[Tensor, "1 1 1 1"],
+        recent: Float[Tensor, "1 1 1 1"],
         hidden: Float[Tensor, "1 hc wc c"],
+        about: Float[Tensor, "1 hq wq c"],
     ) -> tuple[Tensor, ...]:
-        """Return the pixels of each cell (1, hc, wc, pixels), the hidden map, both float32, and
-        what lies around (1, hc/2, wc/2, c), of which nothing need be known before.
+        """Return the pixels of each cell (1, hc, wc, pixels), the hidden map and what lies around,
+        all float32.
         """
         seen, hidden = self.network.fine(self.stem(grids, sums), passed, hidden)
-        about = self.network.around(seen)
-        return self.pixels(seen, about), hidden, channels_last(about.float())
+        around = self.network.around
+        about = around.mean(channels_first(about), around(seen).float(), recent)
+        return self.pixels(seen, about), hidden, channels_last(about)
 
     def between(self) -> nn.Module:
         """Return what a window takes in which one does not look around."""
@@ -139,11 +142,11 @@ class Behind:
     ):
         given, state, between = [*map(torch.from_numpy, inputs)], after.start(), after.between()
         if between is None:
-            self.whole, self.between = make(after, [*given, *state], threads), None
+            self.between = None
         else:
+            self.between = make(between, [*given[:-2], *state], threads)
             given.pop()  # whether to look around
-            self.whole = make(after, [*given, state[0]], threads)
-            self.between = make(between, [*given, *state], threads)
+        self.whole = make(after, [*given, *state], threads)
         self.given = len(given)
         self.reset()
 
@@ -152,18 +155,18 @@ class Behind:
         if self.between is None:
             drawn, *self.state = self.whole(inputs, self.state)
             return drawn
-        *seen, renewed = inputs
-        hidden, about = self.state
-        if renewed.any():
-            drawn, *self.state = self.whole(seen, [hidden])
+        *seen, recent, due = inputs
+        if due.any():
+            drawn, *self.state = self.whole([*seen, recent], self.state)
         else:
+            hidden, about = self.state
             drawn, hidden = self.between(seen, [hidden, about])
             self.state = [hidden, about]
         return drawn
 
     def reset(self) -> None:
         """Start from zeros."""
-        self.state = (self.between or self.whole).zeros(self.given)
+        self.state = self.whole.zeros(self.given)
 
 
 class OnTorch:

@@ -5,7 +5,7 @@ import numpy as np
 from src.models.behind_first_layer import AfterHead, AfterStem
 from src.models.engines import events_numba as kernels
 from src.models.kernel_patches import patches, spans
-from src.models.setnet import AWAKE_S, MEMORIES_S, RATE, RENEWED_S
+from src.models.setnet import AWAKE_S, DUE, LOOK_S, MEMORIES_S, RATE
 
 NOTHING = [np.empty(0, kind) for kind in (np.float64, np.int64, np.int64, np.float32, np.int64)]
 
@@ -57,21 +57,21 @@ class StemFront(HeadFront):
         rows, columns = self.shape[1:3]
         self.memories = np.array(MEMORIES_S, np.float32)
         self.sums = np.zeros(((after.views + 1) * len(MEMORIES_S), rows, columns), np.float32)
-        self.clock = np.zeros(2, np.float32)  # how awake it is, how long since it looked around
+        self.clock = np.zeros(2, np.float32)  # how awake it is, how recently it looked around
 
     def add(self, t, x, y, p, view, t0: float, t1: float) -> list[np.ndarray]:
         """Bring the sums to the end of a window; return the map, the sums and their spread, the
-        time passed, and whether to look around.
+        time passed, how recently one looked around, and whether to look again.
         """
         events = t, x, y, p, view, t0, t1
         often = np.float32(1 / (RATE * (t1 - t0)))  # as SetNet counts them
         awake, passed = kernels.remember(
             *events, self.stride, self.memories, np.float32(AWAKE_S), self.clock[0], self.sums
         )
-        waited = self.clock[1] + passed
-        renewed = waited >= RENEWED_S
-        self.clock[:] = awake, 0 if renewed else waited
-        times = np.full((1, 1, 1, 1), passed, np.float32), np.array(renewed)
+        recent = self.clock[1] * np.float32(np.exp(-passed / LOOK_S))
+        due = recent <= DUE and passed > 0
+        self.clock[:] = awake, 1 if due else recent
+        times = *(np.full((1, 1, 1, 1), one, np.float32) for one in (passed, recent)), np.array(due)
         made = super().add(t, x, y, often * p, view, t0, t1)
         return [*made, self.sums[None].copy(), *times]
 

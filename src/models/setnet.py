@@ -7,8 +7,8 @@ windows, and only while events come: one set of weights serves 120 and 12,000 wi
 a picture without events stays.
 
 half resolution: stem, memory -> what lies around, at a quarter, an eighth, a sixteenth -> 2 x 2
-pixels.  What lies around is seen at most 120 times a second and kept in between
-(docs/decisions/0019 and 0021).
+pixels.  One looks around at most 30 times a second, and what was seen there fades into a running
+mean (docs/decisions/0021 and 0022).
 """
 
 import math
@@ -31,7 +31,8 @@ SIZES = {  # channels; multiply-accumulates at 176 x 176 with nine views: 0.34, 
 MEMORIES_S = (0.05, 0.5)  # time constants of the leaky sums
 AWAKE_S = 0.005  # time constant by which a picture falls asleep after its last event
 RATE = 120.0  # windows a second at which a gate is taken as it is
-RENEWED_S = 0.98 / RATE  # what has to pass before one looks around again; 2 % for rounding
+LOOK_S = 1 / 30  # what passes until one looks around again ...
+DUE = math.exp(-0.98)  # ... by how recent that is then; 2 % for rounding
 MAX_VIEWS = 25
 CELL = 2  # pixels: side of what the first layer sees as one
 
@@ -81,8 +82,8 @@ class SetNet(nn.Module):
 
         `window_s`: how long the window lasts, in seconds, a number or one per clip (n,).
         `positions`: (row, col) of each view from the centre view; default: `optics.layout`.
-        State, float32: leaky sums of each view, in cells, how awake each picture is, the time in s
-        since one last looked around, and the `hidden` maps.  Raises ValueError for bins, a number
+        State, float32: leaky sums of each view, in cells, how awake each picture is, how recently
+        one looked around, 1 just now, 0 never, and the `hidden` maps.  Raises ValueError for bins, a number
         of views, a length of window or a state that do not fit.
         """
         frames, state = self.sequence(
@@ -111,10 +112,10 @@ class SetNet(nn.Module):
         padded, (top, left) = pad_to_multiple(voxels.flatten(0, 2), 8)
         voxels = padded.unflatten(0, (n, windows, views)).transpose(0, 1)
         cells = _halved(voxels.float().sum(3).flatten(0, 1))
-        sums, awake, waited, hidden, about = self._start(state, cells[:n])
+        sums, awake, recent, hidden, about = self._start(state, cells[:n])
 
         awake, passed = _time(cells, awake, seconds)
-        waited, renewed = _saved_up(passed, waited)
+        recent, before, due = _looks(passed, recent)
         kept = torch.stack([torch.exp(-passed / memory) for memory in MEMORIES_S], 2)
         every, sums = over_time(_leaked, sums, kept, cells[:, :, None])
         spread = (every - every.mean(1, keepdim=True)).abs().mean(1)
@@ -125,13 +126,13 @@ class SetNet(nn.Module):
         memory = torch.cat([every.flatten(1, 2), spread], 1).to(memories.dtype)
         stem = _as_rates(stem, seconds) + functional.conv2d(memory, memories, bias, 1, 1)
         seen, hidden = self.fine(stem, passed, hidden)
-        told, about = self.looked(seen, about, renewed, shown)
+        told, about = self.looked(seen, about, before, due)
         if shown is not None:
-            seen = _windows(seen, n, shown)
+            seen, told = (_windows(maps, n, shown) for maps in (seen, told))
         frames = functional.pixel_shuffle(self.drawn(seen, told), CELL).sigmoid()
         frames = frames[..., top : top + height, left : left + width]
         frames = frames.unflatten(0, (-1, n)).transpose(0, 1)
-        return frames, (sums, awake, waited, hidden, about)
+        return frames, (sums, awake, recent, hidden, about)
 
     def fine(
         self, stem: Float[Tensor, "m c h2 w2"], passed: Float[Tensor, "m 1 1 1"], hidden: Tensor
@@ -146,21 +147,23 @@ class SetNet(nn.Module):
         self,
         seen: Float[Tensor, "m c h2 w2"],
         about: Float[Tensor, "n c h4 w4"],
-        renewed: Bool[Tensor, "m 1 1 1"],
-        shown: Sequence[int] | None,
-    ) -> tuple[Float[Tensor, "s c h4 w4"], Float[Tensor, "n c h4 w4"]]:
-        """Return what lies around in the s = shown * n windows and after the last one, float32;
-        `about`: before the first, `renewed`: whether one looks around then.
+        recent: Float[Tensor, "m 1 1 1"],
+        due: Bool[Tensor, "m 1 1 1"],
+    ) -> tuple[Float[Tensor, "m c h4 w4"], Float[Tensor, "n c h4 w4"]]:
+        """Return what lies around, float32, in each of m = windows * n and after the last; `about`:
+        before the first, `due`: whether one looks, `recent`: how recently one had.
         """
-        if shown is None:
-            return over_time(_renewed, about, self.around(seen).float(), renewed)
-        n, number = len(about), torch.arange(len(seen), device=seen.device).view(-1, 1, 1, 1)
-        never = number.new_full((n, 1, 1, 1), -1)
-        when, last = over_time(_renewed, never, number, renewed)  # one looked around
-        when = torch.cat([_windows(when, n, shown), last])
-        fresh = self.around(seen[when.flatten().clamp(0)]).float()
-        told = torch.where(when < 0, about.repeat(len(shown) + 1, 1, 1, 1), fresh)
-        return told[:-n], told[-n:]
+        if len(seen) == len(about):
+            now = self.around(seen).float()
+        else:  # the others do not count
+            looks = due.flatten().nonzero().flatten()
+            now = about.new_zeros(len(seen), *about.shape[1:])
+            now = now.index_copy(0, looks, self.around(seen[looks]).float())
+
+        def step(before: Tensor, now: Tensor, recent: Tensor, due: Tensor) -> Tensor:
+            return torch.where(due, self.around.mean(before, now, recent), before)
+
+        return over_time(step, about, now, recent, due)
 
     def drawn(
         self, seen: Float[Tensor, "m c h2 w2"], about: Float[Tensor, "m c h4 w4"]
@@ -232,10 +235,6 @@ def _windows(maps: Tensor, n: int, shown: Sequence[int]) -> Tensor:
     return maps.unflatten(0, (-1, n))[list(shown)].flatten(0, 1)
 
 
-def _renewed(before: Tensor, now: Tensor, renewed: Tensor) -> Tensor:
-    return torch.where(renewed, now, before)
-
-
 def _cast(x: Tensor, dtype: torch.dtype) -> Tensor:
     """Return `x` as a convolution takes it under autocast: sooner, it is copied once only."""
     kind = x.device.type
@@ -268,16 +267,17 @@ def _time(cells: Tensor, awake: Tensor, seconds: Tensor) -> tuple[Tensor, Tensor
     return awake, torch.cat(passed)
 
 
-def _saved_up(passed: Tensor, waited: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the time that has passed since there was enough of it, and whether there is, in each
-    window.
+def _looks(passed: Tensor, recent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return how recently one looked around after the last window and, in each, before one may
+    look again, and whether one does.
     """
-    enough = []
-    for now in passed.split(len(waited)):
-        waited = waited + now
-        enough.append(waited >= RENEWED_S)
-        waited = torch.where(enough[-1], 0.0, waited)
-    return waited, torch.cat(enough)
+    before, due = [], []
+    for now in passed.split(len(recent)):
+        recent = recent * torch.exp(-now / LOOK_S)
+        before.append(recent)
+        due.append((recent <= DUE) & (now > 0))
+        recent = torch.where(due[-1], 1.0, recent)
+    return recent, torch.cat(before), torch.cat(due)
 
 
 def _halved(x: Tensor) -> Tensor:

@@ -10,6 +10,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 
+PACE = 0.9  # what lies around fades by exp(-0.9) from one look to the next, before training
+
+
 class ViewKernels(nn.Module):
     """The kernels of a convolution over a set of views, averaged; one follows from where it stands.
 
@@ -114,7 +117,8 @@ class Surroundings(nn.Module):
 
     An area without events is known by its edges, which may be far.  No ReLU closes a path (He et
     al. 2016, identity mappings), and what comes back is nothing before training: otherwise a high
-    rate shuts these layers for good (docs/decisions/0021).
+    rate shuts these layers for good (docs/decisions/0021).  What is remembered of it is a running
+    mean, each channel's with a time constant of its own, learned.
     """
 
     def __init__(self, channels: int, widths: Sequence[int]):
@@ -127,6 +131,7 @@ class Surroundings(nn.Module):
         for conv in (*self.downs, *self.ups):
             _healthy(conv)
         _silent(self.ups[0])
+        self.pace = nn.Parameter(torch.full((channels, 1, 1), math.log(PACE)))
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h2 w2"]:
         """Return a map of half the size."""
@@ -139,6 +144,17 @@ class Surroundings(nn.Module):
             finer = scales.pop()
             x = finer + _stretched(up(self.relu(x)), finer)
         return self.ups[0](self.relu(x))
+
+    def mean(
+        self,
+        before: Float[Tensor, "n c h2 w2"],
+        now: Float[Tensor, "n c h2 w2"],
+        recent: Float[Tensor, "n 1 1 1"],
+    ) -> Float[Tensor, "n c h2 w2"]:
+        """Return the running mean with what is seen `now`; `recent`: how recent `before` is, 1 just
+        now, 0 nothing yet.
+        """
+        return torch.lerp(now, before, recent ** self.pace.float().exp())
 
 
 class Residual(nn.Module):

@@ -101,8 +101,8 @@ def test_state_stays_bounded_over_500_windows_of_noise():
     for step in range(500):
         noise = torch.randn(1, 2, 3, 16, 16, generator=torch.Generator().manual_seed(step))
         frame, state = network(30 * noise + 10, state)
-    sums, awake, waited, hidden, about = state
-    assert max(float(part.abs().max()) for part in (awake, waited, hidden)) <= 1
+    sums, awake, recent, hidden, about = state
+    assert max(float(part.abs().max()) for part in (awake, recent, hidden)) <= 1
     assert torch.isfinite(frame).all() and torch.isfinite(about).all()
     # A leaky sum is at most what comes in a window divided by what leaks out of it.
     assert float(sums.abs().max()) < 4 * 3 * (10 + 30 * 6) / (1 - 0.984)
@@ -181,18 +181,30 @@ def test_an_empty_window_cut_in_pieces_passes_the_same_time():
 
 
 @torch.no_grad()
-def test_one_looks_around_120_times_a_second():
+def test_one_looks_around_30_times_a_second():
     network, state, kept = small().eval(), None, []
     for window in voxels(windows=10).unbind(1):
-        _, state = network(window, state, window_s=1 / 600)
+        _, state = network(window, state, window_s=1 / 120)
         kept.append(state[3:])
     changed = [
         [not torch.equal(one, other) for one, other in zip(before, after, strict=True)]
         for before, after in pairwise(kept)
     ]
     assert [every[0] for every in changed] == [True] * 9  # at half resolution
-    due = [False] * 3 + [True] + [False] * 4 + [True]  # the fifth window and the tenth
+    due = [window % 4 == 0 for window in range(1, 10)]  # after the first, the fifth and the ninth
     assert [every[1] for every in changed] == due
+
+
+@torch.no_grad()
+def test_what_lies_around_is_a_running_mean_of_what_was_seen():
+    network, windows = small().eval(), voxels(windows=9)
+    looks = []
+    network.around.register_forward_hook(lambda _, x, seen: looks.append(seen))
+    _, state = network.sequence(windows)
+    keep = torch.exp(-4 / 120 * 30 * network.around.pace.exp())
+    first, second, third = looks[0].unbind()
+    expected = keep * (keep * first + (1 - keep) * second) + (1 - keep) * third
+    torch.testing.assert_close(state[4][0], expected)
 
 
 @torch.no_grad()
@@ -205,7 +217,7 @@ def test_window_length_per_clip():
 
 def test_gradients_reach_every_parameter():
     network = small()
-    frames, _ = unroll(network, voxels())
+    frames, _ = unroll(network, voxels(windows=6))
     (frames * torch.randn_like(frames)).sum().backward()
     assert all(float(p.grad.abs().sum()) > 0 for p in network.parameters())
 
