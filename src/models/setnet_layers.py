@@ -9,7 +9,6 @@ from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 from torch.nn import functional
 
-
 PACE = 0.9  # what lies around fades by exp(-0.9) from one look to the next, before training
 
 

@@ -168,6 +168,17 @@ def test_windows_that_are_not_shown_change_nothing(shown):
 
 
 @torch.no_grad()
+def test_events_count_per_time_not_per_window():
+    network, seen = small(), []
+    for part in (network.sum_stem.kernels, network.spread_stem.weight):
+        part.zero_()  # sums leak, the longer a window the more
+    network.cell2.register_forward_pre_hook(lambda _, x: seen.append(x[0]))
+    network(voxels()[:, 0], None, window_s=1 / 600)
+    network(7 * voxels()[:, 0], None, window_s=7 / 600)
+    torch.testing.assert_close(seen[0], seen[1])
+
+
+@torch.no_grad()
 def test_an_empty_window_cut_in_pieces_passes_the_same_time():
     network, events = small(), voxels(windows=1)[:, 0]
     nothing = torch.zeros_like(events)
