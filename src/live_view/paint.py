@@ -14,11 +14,13 @@ STRONG = 2  # events at a pixel that are drawn at full colour
 Positions = Sequence[tuple[int, int]]
 
 
-def _colours() -> UInt8[np.ndarray, "steps 3"]:
-    """Return the colour of -STRONG ... STRONG events."""
+def _colours() -> UInt8[np.ndarray, "256 1 3"]:
+    """Return the colours of -STRONG ... STRONG events, the first ones."""
     share = np.abs(np.linspace(-1, 1, 2 * STRONG + 1))[:, None] ** 0.6
     ends = np.array([OFF] * STRONG + [GROUND] + [ON] * STRONG)
-    return (share * ends + (1 - share) * np.array(GROUND)).astype(np.uint8)
+    table = np.zeros((256, 1, 3), np.uint8)  # as applyColorMap wants it
+    table[: len(ends), 0] = share * ends + (1 - share) * np.array(GROUND)
+    return table
 
 
 COLOURS = _colours()
@@ -26,7 +28,8 @@ COLOURS = _colours()
 
 def events(counts: Int[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
     """Return polarities added up at each pixel in colour (blue, green, red): ON warm, OFF cool."""
-    return COLOURS[np.clip(counts, -STRONG, STRONG) + STRONG]
+    steps = (np.clip(counts, -STRONG, STRONG) + STRONG).astype(np.uint8)
+    return cv2.applyColorMap(steps, COLOURS)
 
 
 def side_by_side(

@@ -85,10 +85,8 @@ class EventPicture:
         self.lock = threading.Lock()
         self.watched = False
         self.windows = 0  # added since the last `take`
-        self.counts = self._blank()
-
-    def _blank(self) -> Int[np.ndarray, "views h w"]:
-        return np.zeros((self.lookup.views, *self.lookup.model), np.int32)
+        size = (lookup.views, *lookup.model)
+        self.counts, self.taken = np.zeros(size, np.int32), np.zeros(size, np.int32)
 
     def add(self, events: np.ndarray) -> None:
         """Add a window's events (t x y p) of the sensor."""
@@ -99,7 +97,8 @@ class EventPicture:
                 self.windows += 1
 
     def take(self) -> Int[np.ndarray, "views h w"]:
-        """Return what came since the last call."""
+        """Return what came since the last call; it holds until the next."""
+        self.taken.fill(0)
         with self.lock:
-            taken, self.counts, self.windows = self.counts, self._blank(), 0
-        return taken
+            self.counts, self.taken, self.windows = self.taken, self.counts, 0
+        return self.taken
