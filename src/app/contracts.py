@@ -36,7 +36,8 @@ class Network(Protocol):
 
         With a keyword `window_s` or `positions` it is given the length of the window in seconds
         or the (row, col) of every view; a method `sequence` is given many windows at once and which
-        of their frames are wanted (`shown`); see `src.models.unroll.unroll`.
+        of their frames are wanted (`shown`), `remember` those that are not; see
+        `src.models.unroll.unroll`.
         """
         ...
 

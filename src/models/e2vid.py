@@ -87,12 +87,19 @@ class E2VID(nn.Module):
         Raises ValueError when views or bins are not the network's.
         """
         height, width = voxels.shape[-2:]
+        x, (top, left) = self._padded(voxels)
+        frame, after = self.after_first(self.first(x), state)
+        return frame[..., top : top + height, left : left + width], after
+
+    def remember(self, voxels: Float[Tensor, "n views bins h w"], state: Any = None) -> tuple:
+        """Return the state that `forward` does, without drawing the frame."""
+        return self._scales(self.first(self._padded(voxels)[0]), state)[2]
+
+    def _padded(self, voxels: Tensor) -> tuple[Tensor, tuple[int, int]]:
         if tuple(voxels.shape[1:3]) != (self.views, self.bins):
             wanted, got = (self.views, self.bins), tuple(voxels.shape[1:3])
             raise ValueError(f"optics.views, bins must be {wanted} for this network, got {got}")
-        x, (top, left) = pad_to_multiple(voxels.flatten(1, 2), 2**SCALES)
-        frame, after = self.after_first(self.first(x), state)
-        return frame[..., top : top + height, left : left + width], after
+        return pad_to_multiple(voxels.flatten(1, 2), 2**SCALES)
 
     @property
     def first(self) -> nn.Conv2d:

@@ -28,7 +28,8 @@ def unroll(
 
     `window_s`, the length of a window in seconds, a number or one per clip (n,), and `positions`,
     the (row, col) of every view, are given to a network that takes them.  One that has a method
-    `sequence`, as `forward` but for many windows, is given AT_ONCE of them and which are shown.
+    `sequence`, as `forward` but for many windows, is given AT_ONCE of them and which are shown; one
+    that has `remember`, windows that are not shown: it returns the state alone.
     """
     options = accepted(network, window_s=window_s, positions=positions)
     frames = []
@@ -39,8 +40,12 @@ def unroll(
             frames.append(some)
         return torch.cat(frames, dim=1), state
     for number, window in enumerate(voxels.unbind(1)):
+        wanted = shown is None or number in shown
+        if not wanted and hasattr(network, "remember"):
+            state = network.remember(window, state, **options)
+            continue
         frame, state = network(window, state, **options)
-        if shown is None or number in shown:
+        if wanted:
             frames.append(frame)
     return torch.stack(frames, dim=1), state
 

@@ -63,6 +63,20 @@ def test_law_6_two_chunks_equal_one(recurrent):
     assert torch.equal(whole, torch.cat([first, second], 1))
 
 
+@pytest.mark.parametrize("state_step", [None, 0.25])
+@torch.no_grad()
+def test_windows_that_are_not_shown_are_remembered(state_step):
+    network, drawn = small(state_step=state_step).eval(), []
+    network.pred.register_forward_hook(lambda *_: drawn.append(1))
+    windows = voxels().repeat(1, 3, 1, 1, 1, 1)
+    whole, state = unroll(network, windows)
+    drawn.clear()
+    some, same = unroll(network, windows, shown=[1, 4])
+    assert torch.equal(some, whole[:, [1, 4]]) and len(drawn) == 2
+    for ours, theirs in zip(same, state, strict=True):
+        assert all(map(torch.equal, ours, theirs))
+
+
 @torch.no_grad()
 def test_clips_of_a_batch_do_not_meet():
     network = small()
