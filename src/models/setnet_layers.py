@@ -176,8 +176,8 @@ def grown(x: Tensor, times: int) -> Tensor:
 
 
 def over_time(
-    step: Callable[..., Tensor], state: Shaped[Tensor, "n ..."], *maps: Shaped[Tensor, "m ..."]
-) -> tuple[Shaped[Tensor, "m ..."], Shaped[Tensor, "n ..."]]:
+    step: Callable[..., Tensor], state: Float[Tensor, "n ..."], *maps: Shaped[Tensor, "m ..."]
+) -> tuple[Float[Tensor, "m ..."], Float[Tensor, "n ..."]]:
     """Return the state after every window and after the last; `step` takes it and a window's part
     of each of `maps`, which have m = windows * n.
     """

@@ -186,9 +186,9 @@ class Reconstructor(LightningModule):
             loss = self.loss(ours, truth, **options).sum() * (share / len(pictures))
             loss.backward()
             total += loss.detach()
-        if self.steady and len(shown) > 1:
+        follows = [b == a + 1 for a, b in pairwise(shown)]
+        if self.steady and any(follows):
             error = leaves.unflatten(0, frames.shape[:2]) - target
-            follows = [b == a + 1 for a, b in pairwise(shown)]
             change = share * self.steady * error.diff(dim=1)[:, follows].abs().mean()
             change.backward()
             total += change.detach()
