@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from src.live_view.faults import Faults
+from src.recordings.files.event_arrays import joined, until
 from src.recordings.views import Size
 
 BACK_US = 50_000  # events may arrive out of order by less; more is another recording
@@ -79,14 +80,13 @@ class Cutter:
         """Yield the windows that are over at `until_us`, each without its `due`."""
         if self.origin is None or self.end_us > until_us:
             return
-        events = self.pending[0] if len(self.pending) == 1 else np.concatenate(self.pending)
+        events = joined(self.pending)
         over = int((until_us - self.origin) / self.period) - self.cut
-        ends = self.end_us + self.period * np.arange(max(over, 1))
-        # Of a contiguous copy: a field of a structured array would be copied for each search.
-        stops = np.searchsorted(np.ascontiguousarray(events["t"]), ends)
+        ends = (self.end_us + self.period * np.arange(max(over, 1))).tolist()
+        stops = [until(events, end) for end in ends]
         self.pending, self.cut = [events[stops[-1] :]], self.cut + len(ends)
         first, self.fresh, before = self.fresh, False, 0
-        for end, stop in zip(ends.tolist(), stops.tolist(), strict=True):
+        for end, stop in zip(ends, stops, strict=True):
             yield EventWindow(end - self.period, end, events[before:stop], fresh=first)
             first, before = False, stop
 

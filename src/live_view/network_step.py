@@ -16,6 +16,7 @@ from torch import nn
 from src.live_view.cutter import EventWindow
 from src.models.runtime import Runtime, fastest, runs
 from src.recordings import event_lists, stream
+from src.recordings.files.event_arrays import joined, until
 from src.recordings.files.formats import EVENT
 from src.recordings.lookup import build
 from src.recordings.views import Views
@@ -100,8 +101,8 @@ class Step:
         self.recent.append(window.events)
         if self.overlap == 1:
             return window.events
-        events = np.concatenate(self.recent)
-        return events[np.searchsorted(events["t"], begin_us) :]
+        events = joined(self.recent)
+        return events[until(events, begin_us) :]
 
     def _warm_up(self) -> None:
         """Run on a few events, so that nothing is compiled while windows wait."""

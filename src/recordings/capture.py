@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+from src.recordings.files.event_arrays import joined
 from src.recordings.files.formats import write_events
 from src.recordings.lookup import Lookup, build
 from src.recordings.views import Size, View, Views
@@ -111,7 +112,7 @@ def record(
         part = sensor.events(seen, fps, origin=(top, 0), full_width=width)
         part["y"] += top
         parts.append(part)
-    events = np.concatenate(parts)
+    events = joined(parts)
     return events[np.argsort(events["t"], kind="stable")]
 
 

@@ -22,6 +22,7 @@ from torch import nn
 
 from src.models.look_ahead import checked
 from src.models.unroll import accepted, takes
+from src.recordings.files.event_arrays import joined, until
 from src.recordings.lookup import Lookup
 
 COVERED = 0.99  # of the last window, or the recording ends before it
@@ -112,7 +113,7 @@ def windows(chunks: Iterable[np.ndarray], lookup: Lookup, rule: Rule) -> Iterato
     first, window = next(ordered, None), None
     if first is not None:
         start, end = first["t"][0] + 1e6 * np.array([rule.start_s, rule.end_s])
-        later = (chunk[np.searchsorted(chunk["t"], start) :] for chunk in chain([first], ordered))
+        later = (chunk[until(chunk, start) :] for chunk in chain([first], ordered))
         cut = _by_time if rule.count is None else _by_count
         for window in cut(filter(len, later), lookup, rule, start, end):
             yield window
@@ -140,10 +141,10 @@ def backwards(
     end = start + 1e6 * min(checked(seconds), rule.end_s - rule.start_s)
     held = []
     for chunk in chain([first], ordered):
-        held.append(chunk[np.searchsorted(chunk["t"], start) :])
+        held.append(chunk[until(chunk, start) :])
         if chunk["t"][-1] >= end:
             break
-    events = np.concatenate(held)
+    events = joined(held)
     last = min(end, float(chunk["t"][-1]) + 1)
     whole = int((last - start) / period + 1 - COVERED)
     for k in range(whole // rule.overlap * rule.overlap, 0, -1):
@@ -169,13 +170,13 @@ def _by_time(
     period, k, last = 1e6 / rule.fps, 1, start
     pending = None
     for chunk in chunks:
-        pending = chunk if pending is None else np.concatenate([pending, chunk])
+        pending = chunk if pending is None else joined([pending, chunk])
         last = min(float(chunk["t"][-1]) + 1, end)
         while start + k * period < last:
             yield _window(pending, lookup, rule, start, k)
             k += 1
         oldest = start + (k - rule.overlap) * period
-        pending = pending[np.searchsorted(pending["t"], oldest) :]
+        pending = pending[until(pending, oldest) :]
         if last == end:
             break
     while start + (k - 1 + COVERED) * period <= last:
@@ -186,8 +187,8 @@ def _by_time(
 def _window(events: np.ndarray, lookup: Lookup, rule: Rule, start: float, k: int) -> Window:
     end = start + k * 1e6 / rule.fps
     begin = start + (k - rule.overlap) * 1e6 / rule.fps
-    first, stop = np.searchsorted(events["t"], [begin, end])
-    return filled(events[first:stop], lookup, rule, begin, end)
+    inside = slice(until(events, begin), until(events, end))
+    return filled(events[inside], lookup, rule, begin, end)
 
 
 def filled(events: np.ndarray, lookup: Lookup, rule: Rule, begin: float, end: float) -> Window:
@@ -217,8 +218,8 @@ def _by_count(
 ) -> Iterator[Window]:
     pending = None
     for chunk in chunks:
-        early = chunk[: np.searchsorted(chunk["t"], end)]
-        pending = early if pending is None else np.concatenate([pending, early])
+        early = chunk[: until(chunk, end)]
+        pending = early if pending is None else joined([pending, early])
         inside = np.flatnonzero(lookup.view[pending["y"], pending["x"]] >= 0)
         stop = 0
         for nth in inside[rule.count - 1 :: rule.count]:

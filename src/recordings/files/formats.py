@@ -17,6 +17,7 @@ from faery.file_encoder import events_to_file
 
 from src.recordings.files import aedat, columns
 from src.recordings.files.engines.decode import adopt
+from src.recordings.files.event_arrays import joined, until
 
 EVENT = np.dtype([("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)])
 # Endings read here, by modules with `pieces(path)` and `size(path)` as columns.py has them.
@@ -81,7 +82,7 @@ def read_events(path: str | Path, size: tuple[int, int] | None = None) -> np.nda
     are given the latest time so far) and of events outside the sensor (they are dropped).
     """
     pieces = list(open_events(path, size))
-    return np.concatenate(pieces) if pieces else np.empty(0, EVENT)
+    return joined(pieces) if pieces else np.empty(0, EVENT)
 
 
 def iter_events(
@@ -98,16 +99,16 @@ def iter_events(
     for events in open_events(path, size):
         start = int(events["t"][0]) if start is None else start
         while len(events):
-            cut = int(np.searchsorted(events["t"], start + span))
+            cut = until(events, start + span)
             held.append(events[:cut])
             events = events[cut:]
             if len(events):
-                chunk = np.concatenate(held)
+                chunk = joined(held)
                 if len(chunk):
                     yield chunk
                 held, start = [], start + (int(events["t"][0]) - start) // span * span
     if held:
-        yield np.concatenate(held)
+        yield joined(held)
 
 
 def write_events(

@@ -1,0 +1,21 @@
+"""Arrays of events joined and cut: numpy copies what has fields field by field, 30 times slower."""
+
+from bisect import bisect_left
+from collections.abc import Sequence
+
+import numpy as np
+
+
+def joined(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the events of `parts`, at least one, each contiguous, one after the other.
+
+    Of a single part itself, not a copy.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    return np.concatenate([part.view(np.uint8) for part in parts]).view(parts[0].dtype)
+
+
+def until(events: np.ndarray, time_us: float) -> int:
+    """Return how many of `events`, in order of time, come before `time_us`."""
+    return bisect_left(events["t"], time_us)
