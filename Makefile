@@ -19,8 +19,8 @@ test-all: $(READY) $(LPIPS)
 	$(PY) -m pytest -q
 
 demo: $(READY) $(DEMO)
-	$(PY) -m src.live recording=$(DEMO)/cap.raw views=$(DEMO)/cap.views.yaml ckpt=lf3x3 \
-		fps=120 speed=0.2 threads=2 loop=true
+	$(PY) -m src.live recording=$(DEMO)/cap.raw views=$(DEMO)/cap.views.yaml ckpt=setnet_small \
+		fps=600 speed=0.2 threads=2 loop=true
 
 lint: $(READY)
 	$(PY) -m ruff check . && $(PY) -m ruff format --check .
