@@ -28,7 +28,7 @@ from src.sim.optics import layout
 from src.sim.pipeline import Sample, simulate
 
 HOME = Path(__file__).resolve().parents[1]
-ONE, NINE = ("single256", 1), ("lf3x3", 9)  # of the picture: trained alike, from the same weights
+ONE, NINE = ("setnet_small", 1), ("setnet_small", 9)  # of the picture
 # Local air, whose parts of a view wobble apart.
 AIR = ("turbulence=strong", "turbulence.atmosphere.half_length_px=[10,20]",
        "turbulence.atmosphere.near_rigid=0.0")  # fmt: skip
