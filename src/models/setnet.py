@@ -153,9 +153,9 @@ class SetNet(nn.Module):
         """Return what lies around, float32, in each of m = windows * n and after the last; `about`:
         before the first, `due`: whether one looks, `recent`: how recently one had.
         """
-        if len(seen) == len(about):
+        if len(seen) == len(about):  # one window, as it is exported: its shapes know no `due`
             now = self.around(seen).float()
-        else:  # the others do not count
+        else:  # the windows in which nobody looks do not count
             looks = due.flatten().nonzero().flatten()
             now = about.new_zeros(len(seen), *about.shape[1:])
             now = now.index_copy(0, looks, self.around(seen[looks]).float())
