@@ -119,16 +119,12 @@ class Pipeline:
     def simulate(self, draws: Sequence[Draw], device: torch.device | str = "cpu") -> Sample:
         """Simulate the drawn clips on `device`."""
         start = time.perf_counter()
-        samples = [self.expose(draw, self.views(draw, device)) for draw in draws]
-        return Sample(
-            voxels=together([sample.voxels for sample in samples]),
-            target=torch.cat([sample.target for sample in samples]),
-            turbulent=torch.cat([sample.turbulent for sample in samples]),
-            window_s=torch.cat([sample.window_s for sample in samples]),
-            positions=self.optics.positions,
-            drawn=[drawn for sample in samples for drawn in sample.drawn],
-            seconds=time.perf_counter() - start,
-        )
+        sample = joined([self.sample(draw, device) for draw in draws])
+        return replace(sample, seconds=time.perf_counter() - start)
+
+    def sample(self, draw: Draw, device: torch.device | str = "cpu") -> Sample:
+        """Simulate one drawn clip on `device`."""
+        return self.expose(draw, self.views(draw, device))
 
     def expose(self, draw: Draw, views: Tensor) -> Sample:
         """Return the sample of one clip whose `views` (1, views, frames, h, w) are those drawn."""
@@ -156,6 +152,7 @@ class Pipeline:
             target=target[:, :, None],
             turbulent=turbulent[:, :, None],
             window_s=torch.tensor([self.substeps / draw.clip.fps]),
+            positions=self.optics.positions,
             drawn=[drawn],
         )
 
@@ -203,14 +200,31 @@ class Pipeline:
         return int(top * (height - side + 1)), int(left * (width - side + 1)), side, side
 
 
+def joined(samples: Sequence[Sample]) -> Sample:
+    """Return the batch of `samples`, which are of one size, in the same order."""
+    return Sample(
+        voxels=together([sample.voxels for sample in samples]),
+        target=torch.cat([sample.target for sample in samples]),
+        turbulent=torch.cat([sample.turbulent for sample in samples]),
+        window_s=torch.cat([sample.window_s for sample in samples]),
+        positions=samples[0].positions,
+        drawn=[drawn for sample in samples for drawn in sample.drawn],
+    )
+
+
 def together(parts: Sequence[Tensor]) -> Tensor:
-    """Return `torch.cat(parts)` of float32, on the CPU in numpy's memory: in huge pages it costs a
-    third to fill.
-    """
-    if parts[0].device.type != "cpu":
-        return torch.cat(parts)
+    """Return `torch.cat(parts)`."""
     shape = (sum(map(len, parts)), *parts[0].shape[1:])
-    return torch.cat(parts, out=torch.from_numpy(np.empty(shape, np.float32)))
+    return torch.cat(parts, out=room(shape, parts[0].device))
+
+
+def room(shape: Sequence[int], device: torch.device) -> Tensor:
+    """Return float32 to be filled, on the CPU in numpy's memory: in huge pages it costs a third to
+    fill.
+    """
+    if device.type != "cpu":
+        return torch.empty(shape, device=device)
+    return torch.from_numpy(np.empty(shape, np.float32))
 
 
 def simulate(

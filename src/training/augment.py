@@ -7,7 +7,7 @@ in any worker.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from src.sim import noise
 from src.sim.optics import Position, layout
-from src.sim.pipeline import Sample, together
+from src.sim.pipeline import Sample, room
 
 
 @dataclass(frozen=True)
@@ -56,43 +56,51 @@ class Augment:
         if self.misplaced_px < 0:
             raise ValueError(f"augment.misplaced_px must be >= 0, got {self.misplaced_px}")
 
-    def __call__(self, sample: Sample, keys: Sequence[int]) -> Sample:
-        """Return the augmented sample; `keys` has one key per clip."""
-        views = sample.voxels.shape[2]
+    def __call__(self, samples: Sequence[Sample], keys: Sequence[int]) -> Sample:
+        """Return the augmented batch of `samples`, a clip each; `keys` has one key per clip."""
+        first = samples[0]
+        windows, views, *grid = first.voxels.shape[1:]
+        places = first.positions or layout(views)
         kept = views_kept(views, self.dropped, noise.key(keys[0], "dropped"))
-        clips = [self._one(sample, index, key, kept) for index, key in enumerate(keys)]
-        parts = zip(*clips, strict=True)
-        voxels, target, turbulent = (together([clip[None] for clip in part]) for part in parts)
-        sample = replace(sample, voxels=voxels, target=target, turbulent=turbulent)
-        if len(kept) == views:
-            return sample
-        return replace(sample, positions=tuple(sample.positions[view] for view in kept))
+        voxels = room((len(keys), windows, len(kept), *grid), first.voxels.device)
+        pictures = [
+            self._one(sample, key, kept, out)
+            for sample, key, out in zip(samples, keys, voxels, strict=True)
+        ]
+        target, turbulent = (torch.stack(part) for part in zip(*pictures, strict=True))
+        return Sample(
+            voxels=voxels,
+            target=target,
+            turbulent=turbulent,
+            window_s=torch.cat([sample.window_s for sample in samples]),
+            positions=tuple(places[view] for view in kept),
+            drawn=[drawn for sample in samples for drawn in sample.drawn],
+        )
 
-    def _one(
-        self, sample: Sample, index: int, key: int, kept: list[int]
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        windows, own = sample.voxels.shape[1], noise.key(key, "pause")
-        steps, paused = pause_chain(windows, self.pause, self.stay, own)
+    def _one(self, sample: Sample, key: int, kept: list[int], out: Tensor) -> tuple[Tensor, Tensor]:
+        """Fill `out` (windows, kept, bins, h, w); return the pictures, clean and turbulent."""
+        voxels = sample.voxels[0]
+        steps, paused = pause_chain(len(voxels), self.pause, self.stay, noise.key(key, "pause"))
         axes = flip_axes(self.flip, noise.key(key, "flip"))
         swap = float(noise.uniform(noise.key(key, "transpose"), torch.tensor(0))) < self.transpose
-        order = turned_views(sample.positions, sample.voxels.shape[2], axes, swap)
-        voxels = sample.voxels[index].index_select(0, steps.to(sample.voxels.device))
-        voxels = voxels.index_select(1, order[kept].to(voxels.device))  # what the rest works on
-        voxels[paused] = 0
-        voxels = turned(voxels, axes, swap)
-        place = noise.key(key, "misplaced")
-        voxels = misplace(voxels, self.misplaced, self.misplaced_px, place)
-        voxels = self._corrupt(voxels, key)
-        pictures = (sample.target[index, steps], sample.turbulent[index, steps])
-        target, turbulent = (turned(part, axes, swap) for part in pictures)
-        return voxels, target, turbulent
+        order = turned_views(sample.positions, voxels.shape[1], axes, swap)[kept].to(voxels.device)
+        for window, step, empty in zip(out, steps.tolist(), paused.tolist(), strict=True):
+            if empty:
+                window.zero_()
+            else:  # window by window: what is turned is in the cache still
+                window.copy_(turned(voxels[step].index_select(0, order), axes, swap))
+        misplace(out, self.misplaced, self.misplaced_px, noise.key(key, "misplaced"))
+        self._corrupt(out, key)
+        pictures = (sample.target[0, steps], sample.turbulent[0, steps])
+        return tuple(turned(part, axes, swap) for part in pictures)
 
-    def _corrupt(self, voxels: Tensor, key: int) -> Tensor:
+    def _corrupt(self, voxels: Tensor, key: int) -> None:
         if self.noise_std > 0:
             spread = normals(voxels.shape, noise.key(key, "noise"), voxels.device)
             voxels.add_(spread, alpha=self.noise_std)
         hot = hot_pixels(voxels.shape[-2:], self.hot_fraction, self.hot_std, noise.key(key, "hot"))
-        return voxels.add_(hot.to(voxels)) if hot.any() else voxels
+        if hot.any():
+            voxels.add_(hot.to(voxels))
 
 
 def normals(shape: Sequence[int], key: int, device: torch.device) -> Tensor:

@@ -9,7 +9,7 @@ from lightning import LightningDataModule
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from src.sim import noise
-from src.sim.pipeline import Draw, Pipeline, Sample
+from src.sim.pipeline import Draw, Pipeline, Sample, joined
 from src.training.augment import Augment
 from src.training.bank_filler import Filler
 
@@ -122,17 +122,20 @@ class Simulator:
 
     def __init__(self, pipeline: Pipeline, augment: Augment | None, seed: int, device):
         self.pipeline, self.augment, self.seed, self.device = pipeline, augment, seed, device
-        self.last: tuple[list, Sample | None] = ([], None)
+        self.last: tuple[list, list[Sample]] = ([], [])
 
     def __call__(self, numbered: Sequence[tuple[int, Draw]]) -> Sample:
         start = time.perf_counter()
         draws = [draw for _, draw in numbered]
         names = [(draw.key, draw.crop) for draw in draws]
         if self.last[0] != names:
-            self.last = (names, self.pipeline.simulate(draws, self.device))
-        sample = self.last[1]
-        if self.augment is not None:
-            sample = self.augment(sample, [noise.key(self.seed, "augment", n) for n, _ in numbered])
+            self.last = (names, [self.pipeline.sample(draw, self.device) for draw in draws])
+        samples = self.last[1]
+        if self.augment is None:
+            sample = joined(samples)
+        else:
+            keys = [noise.key(self.seed, "augment", number) for number, _ in numbered]
+            sample = self.augment(samples, keys)
         return replace(sample, seconds=time.perf_counter() - start)
 
 
