@@ -19,6 +19,7 @@ from src.metrics.table import METRICS, Metric
 from src.models import files
 from src.models.unroll import takes
 from src.records import results
+from src.training.handover import REACHED
 
 LARGEST = 16 * 2**20  # bytes of a file
 
@@ -31,7 +32,7 @@ def ship(run: Path, name: str, tests: list[Path]) -> Path:
     ckpt = files.newest(run)
     network = files.load(ckpt)
     content = torch.load(ckpt, map_location="cpu", weights_only=True)
-    card = facts(ckpt.parent.parent, content, first_config(run))
+    card = facts(ckpt.parent.parent, content, first_config(run)) | going_on(content)
     path = files.WEIGHTS / f"{name}.safetensors"
     path.parent.mkdir(parents=True, exist_ok=True)
     if rows := curve(run):
@@ -87,6 +88,18 @@ def facts(run: Path, content: dict, first: DictConfig) -> dict:
     }
 
 
+def going_on(content: dict) -> dict:
+    """Return what a training goes on from that begins with the shipped weights; nothing where the
+    checkpoint `content` has no learning curve.
+    """
+    for name, curve in content.get("callbacks", {}).items():
+        if name.startswith("Curve") and curve["rows"]:
+            counts = {"windows": content["windows"], "steps": content["steps"]}
+            time = {"hours": content["seconds"] / 3600, "loss": curve["loss"]}
+            return {REACHED: time | counts | {"curve": curve["rows"]}}
+    return {}
+
+
 def first_config(run: Path) -> DictConfig:
     """Return the config that a training began with: of its first part, or of the run that it went
     on from, as long as that is there.
@@ -122,7 +135,7 @@ def describe(
         "",
         "| trained | |",
         "|---|---|",
-        *(f"| {key} | {value} |" for key, value in card.items()),
+        *(f"| {key} | {value} |" for key, value in card.items() if key != REACHED),
         "",
         *([f"![learning curve]({Path(name).name}.png)", ""] if drawn else []),
         "| tested on | clips | " + " | ".join(metric.heading for metric in METRICS) + " |",

@@ -28,6 +28,7 @@ from src.models.fast import computes_bf16
 from src.models.setnet import CELL, SetNet
 from src.sim.pipeline import Sample
 from src.training.datamodule import LightFieldData, Simulator
+from src.training.handover import reached
 
 REMEMBERS = ("voxel_stem", "sum_stem", "spread_stem", "cell2")  # parts that rest
 EVERY = 7  # windows between two that are learned from; the last one is
@@ -118,10 +119,10 @@ def teach(cfg: DictConfig, clips: int, steps: int) -> None:
     if not isinstance(before, SetNet):
         raise ValueError(f"ckpt must be a SetNet, got {type(before).__name__} in {source}")
     lightning.seed_everything(cfg.seed, verbose=False)
-    network, card = begun_anew(before), files.card(source)
+    network, card = begun_anew(before), reached(source)
     maps, truth = held(network, samples(build.data(cfg), clips))
     learn(network, maps, truth, steps)
-    card["hours"] = card.get("hours", 0.0) + (time.process_time() - start) / 3600
+    card["hours"] += (time.process_time() - start) / 3600
     files.save(Path(cfg.export), network, spec, card)
 
 

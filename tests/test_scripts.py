@@ -16,6 +16,7 @@ from src.models.setnet import SetNet
 from src.models.unroll import unroll
 from src.records.runs import Run
 from src.train import train
+from src.training import handover
 from tests.test_train import TINY, config
 
 
@@ -30,6 +31,9 @@ def test_a_trained_run_is_shipped_whole_with_its_card(tmp_path, monkeypatch):
     card = path.with_suffix(".md").read_text()
     assert path.with_suffix(".png").is_file() and "![learning curve](one.png)" in card
     assert "| windows_seen | 4 |" in card and "| started_from | nothing |" in card
+    assert handover.REACHED not in card and handover.reached(path)["steps"] == 2
+    train(config("train", tmp_path / "on", *TINY, "trainer.max_steps=1", f"ckpt={path}"))
+    assert files.newest(tmp_path / "on") and torch.load(files.newest(tmp_path / "on"))["steps"] == 3
     assert "`ckpt=tiny/one`" in card and "| steps | 2 |" in card and "9 view(s)" in card
     first, last = tmp_path / "parts/part000", tmp_path / "parts/part001"
     shutil.copytree(run, last)
