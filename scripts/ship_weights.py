@@ -92,11 +92,11 @@ def going_on(content: dict) -> dict:
     """Return what a training goes on from that begins with the shipped weights; nothing where the
     checkpoint `content` has no learning curve.
     """
-    for name, curve in content.get("callbacks", {}).items():
-        if name.startswith("Curve") and curve["rows"]:
+    for name, state in content.get("callbacks", {}).items():
+        if name.startswith("Curve") and state["rows"]:
             counts = {"windows": content["windows"], "steps": content["steps"]}
-            time = {"hours": content["seconds"] / 3600, "loss": curve["loss"]}
-            return {REACHED: time | counts | {"curve": curve["rows"]}}
+            time = {"hours": content["seconds"] / 3600, "loss": state["loss"]}
+            return {REACHED: time | counts | {"curve": state["rows"]}}
     return {}
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from scripts import air_map as air
-from scripts import alignment, surroundings
+from scripts import alignment, surroundings, widen_setnet
 from scripts.scales import missing
 from scripts.ship_weights import recard, ship
 from src.app import build
@@ -116,6 +116,45 @@ def test_what_lies_around_is_taught_while_the_memory_rests(tmp_path):
     for name in ("ckpt", "export"):
         with pytest.raises(ValueError, match="ckpt and export must be files"):
             surroundings.teach(config("train", tmp_path, *TINY, *given, f"{name}=null"), 3, 2)
+
+
+def talkative(**sizes) -> SetNet:
+    """A SetNet none of whose layers is silent."""
+    network = SetNet(bins=3, **sizes)
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.2)
+    return network
+
+
+@torch.no_grad()
+def test_a_widened_network_draws_what_it_was_begun_as_and_its_copies_part():
+    torch.manual_seed(0)
+    old, wide = talkative(half=6, around=[8, 10]), talkative(half=15, around=[16, 10])
+    widen_setnet.widen(wide, old)
+    voxels = torch.randn(2, 5, 4, 3, 32, 24)
+    expected, drawn = (unroll(network.eval(), voxels)[0] for network in (old, wide))
+    assert float(expected.std()) > 0.01 and torch.allclose(drawn, expected, atol=1e-5)
+    with torch.enable_grad():
+        unroll(wide, voxels)[0].square().mean().backward()
+    same = wide.mix2.bias == wide.mix2.bias[0]
+    steps = wide.mix2.weight.grad.flatten(1)[same]  # of the copies of a channel
+    assert len(steps) > 1
+    assert float(torch.pdist(steps).min()) > 0.1 * float(steps.norm(dim=1).max())
+    for narrow in ({"half": 4, "around": [8, 10]}, {"half": 6, "around": [8]}):
+        with pytest.raises(ValueError, match="a SetNet .* widened, not"):
+            widen_setnet.widen(talkative(**narrow), old)
+
+
+def test_a_size_begins_as_a_smaller_one_with_its_hours(tmp_path):
+    start, export = tmp_path / "start.safetensors", tmp_path / "wide.safetensors"
+    small, spec = build.network(config("train", tmp_path, *TINY, "experiment=setnet_small"))
+    files.save(start, small, spec, {"hours": 1.0, "curve": []})
+    given = "experiment=setnet_medium", f"ckpt={start}", f"export={export}"
+    widen_setnet.begin(config("train", tmp_path, *TINY, *given))
+    assert files.card(export)["hours"] == 1 and files.load(export).half == 40
+    for wrong in ("ckpt=null", "experiment=lf3x3"):
+        with pytest.raises(ValueError, match="ckpt and ex"):
+            widen_setnet.begin(config("train", tmp_path, *TINY, *given, wrong))
 
 
 def test_areas_are_learned_from_what_is_held():

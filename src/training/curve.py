@@ -45,15 +45,20 @@ class Curve(Callback):
         self.export = Path(export) if export else None
         self.rows: list[dict] = []
         self.loss, self.steps = 0.0, 0
+        self.first = 0  # line whose loss is of this training's kind
 
     def state_dict(self) -> dict:
         """Return what a checkpoint holds of the curve."""
-        return {"rows": self.rows, "loss": self.loss, "steps": self.steps}
+        return {"rows": self.rows, "loss": self.loss, "steps": self.steps, "first": self.first}
 
     def load_state_dict(self, state_dict: dict) -> None:
         """Go on with the curve of a checkpoint."""
         self.rows, self.loss = list(state_dict["rows"]), state_dict["loss"]
-        self.steps = state_dict["steps"]
+        self.steps, self.first = state_dict["steps"], state_dict.get("first", 0)
+
+    def go_on(self, rows: list[dict], loss: float, steps: int) -> None:
+        """Go on with the lines of other weights, whose loss may have been another one."""
+        self.rows, self.loss, self.steps, self.first = list(rows), loss, steps, len(rows)
 
     def on_train_start(self, trainer: Trainer, module: LightningModule) -> None:
         """Write the lines there are; score the start."""
@@ -88,7 +93,7 @@ class Curve(Callback):
             "windows": module.windows_seen,
             "loss": self.loss / self.steps if self.steps else "",
         }
-        losses = [line["loss"] for line in [*self.rows, row] if line["loss"] != ""]
+        losses = [line["loss"] for line in [*self.rows[self.first :], row] if line["loss"] != ""]
         if losses and losses[-1] > COLLAPSED * min(losses):
             raise Collapsed(f"{losses[-1]:.3g} after {min(losses):.3g}", self.rows[-1], self.export)
         self.rows.append(row | scores(trainer, module))

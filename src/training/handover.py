@@ -34,5 +34,5 @@ def take(module: Reconstructor, callbacks: Iterable, path: Path) -> None:
     module.clock.seconds, module.windows_seen = 3600 * before["hours"], before["windows"]
     module.steps_before = before["steps"]
     for curve in (found for found in callbacks if isinstance(found, Curve)):
-        curve.rows, curve.loss = before["curve"], before["loss"]
-        curve.steps = before["steps"] - curve.rows[-1]["steps"]
+        rows = before["curve"]
+        curve.go_on(rows, before["loss"], before["steps"] - rows[-1]["steps"])

@@ -134,6 +134,14 @@ def test_a_training_that_has_collapsed_ends_and_keeps_what_it_had(tmp_path, monk
     assert files.card(now)["hours"] == 0
 
 
+def test_what_goes_on_with_another_loss_has_not_collapsed(tmp_path):
+    now = tmp_path / "now.safetensors"
+    run(tmp_path / "first", "hours=3", f"export={now}")
+    run(tmp_path / "second", "hours=6", f"ckpt={now}", "steady=1000")
+    losses = [row["loss"] for row in csv.DictReader((tmp_path / "second/curve.csv").open())]
+    assert float(losses[-1]) > 2 * float(losses[-2])
+
+
 def test_restored_weights_are_those_that_were_exported(tmp_path):
     now = tmp_path / "now.safetensors"
     run(tmp_path / "first", "hours=3", f"export={now}")
