@@ -15,7 +15,7 @@ from torch.nn import functional
 from src.models import openvino_cpu, stopwatch
 from src.models.e2vid import E2VID
 from src.models.explicit_state import flat, formed
-from src.models.setnet import CELL, SetNet
+from src.models.setnet import CELL, SetNet, faded
 from src.models.setnet_layers import PartedUnit, channels_first, channels_last
 from src.sim.optics import Position
 
@@ -92,14 +92,16 @@ class AfterStem(nn.Module):
         recent: Float[Tensor, "1 1 1 1"],
         hidden: Float[Tensor, "1 hc wc c"],
         about: Float[Tensor, "1 hq wq c"],
+        told: Float[Tensor, "1 hq wq c"],
     ) -> tuple[Tensor, ...]:
-        """Return the pixels of each cell (1, hc, wc, pixels), the hidden map and what lies around,
-        all float32.
+        """Return the pixels of each cell (1, hc, wc, pixels), the hidden map, what lies around and
+        what is told of it, all float32.
         """
         seen, hidden = self.network.fine(self.stem(grids, sums), passed, hidden)
         around = self.network.around
         about = around.mean(channels_first(about), around(seen).float(), recent)
-        return self.pixels(seen, about), hidden, channels_last(about)
+        pixels, told = self.pixels(seen, channels_last(about), told, passed)
+        return pixels, hidden, channels_last(about), told
 
     def between(self) -> nn.Module:
         """Return what a window takes in which one does not look around."""
@@ -110,9 +112,12 @@ class AfterStem(nn.Module):
         stem = functional.conv2d(sums.to(self.dtype), self.memories, None, 1, 1)
         return channels_first(grids.to(self.dtype)) + stem
 
-    def pixels(self, seen: Tensor, about: Tensor) -> Tensor:
-        """Return the pixels of each cell."""
-        return channels_last(self.network.drawn(seen, about).sigmoid())
+    def pixels(
+        self, seen: Tensor, about: Tensor, told: Tensor, passed: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the pixels of each cell and what is told of what lies around."""
+        told = faded(told, about, passed)
+        return channels_last(self.network.drawn(seen, channels_first(told)).sigmoid()), told
 
 
 class Between(nn.Module):
@@ -123,12 +128,14 @@ class Between(nn.Module):
         self.after = after
 
     def forward(
-        self, grids: Tensor, sums: Tensor, passed: Tensor, hidden: Tensor, about: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return the pixels of each cell and the hidden map."""
+        self, grids: Tensor, sums: Tensor, passed: Tensor, hidden: Tensor, about: Tensor,
+        told: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+        """Return the pixels of each cell, the hidden map and what is told of what lies around."""
         stem = self.after.stem(grids, sums)
         seen, hidden = self.after.network.fine(stem, passed, hidden)
-        return self.after.pixels(seen, channels_first(about)), hidden
+        pixels, told = self.after.pixels(seen, about, told, passed)
+        return pixels, hidden, told
 
 
 class Behind:
@@ -159,9 +166,9 @@ class Behind:
         if due.any():
             drawn, *self.state = self.whole([*seen, recent], self.state)
         else:
-            hidden, about = self.state
-            drawn, hidden = self.between(seen, [hidden, about])
-            self.state = [hidden, about]
+            hidden, about, told = self.state
+            drawn, hidden, told = self.between(seen, [hidden, about, told])
+            self.state = [hidden, about, told]
         return drawn
 
     def reset(self) -> None:

@@ -7,8 +7,8 @@ windows, and only while events come: one set of weights serves 120 and 12,000 wi
 a picture without events stays.
 
 half resolution: stem, memory -> what lies around, at a quarter, an eighth, a sixteenth -> 2 x 2
-pixels.  One looks around at most 30 times a second, and what was seen there fades into a running
-mean (docs/decisions/0021 and 0022).
+pixels.  One looks around at most 30 times a second; what was seen there goes into a running mean,
+and the picture fades to that, so that areas do not change in steps (docs/decisions/0021 to 0024).
 """
 
 import math
@@ -33,6 +33,7 @@ AWAKE_S = 0.005  # time constant by which a picture falls asleep after its last 
 RATE = 120.0  # windows a second at which a gate is taken as it is
 LOOK_S = 1 / 30  # what passes until one looks around again ...
 DUE = math.exp(-0.98)  # ... by how recent that is then; 2 % for rounding
+FADE_S = 1 / 60  # time constant by which a picture follows what was seen around
 MAX_VIEWS = 25
 CELL = 2  # pixels: side of what the first layer sees as one
 
@@ -83,7 +84,7 @@ class SetNet(nn.Module):
         `window_s`: how long the window lasts, in seconds, a number or one per clip (n,).
         `positions`: (row, col) of each view from the centre view; default: `optics.layout`.
         State, float32: leaky sums of each view, in cells, how awake each picture is, how recently
-        one looked around, 1 just now, 0 never, and the `hidden` maps.  Raises ValueError for bins,
+        one looked around, 1 just now, 0 never, and the maps of `hidden`.  Raises ValueError for bins,
         a number of views, a length of window or a state that do not fit.
         """
         frames, state = self.sequence(
@@ -112,7 +113,7 @@ class SetNet(nn.Module):
         padded, (top, left) = pad_to_multiple(voxels.flatten(0, 2), 8)
         voxels = padded.unflatten(0, (n, windows, views)).transpose(0, 1)
         cells = _halved(voxels.float().sum(3).flatten(0, 1))
-        sums, awake, recent, hidden, about = self._start(state, cells[:n])
+        sums, awake, recent, hidden, about, told = self._start(state, cells[:n])
 
         awake, passed = _time(cells, awake, seconds)
         recent, before, due = _looks(passed, recent)
@@ -126,13 +127,14 @@ class SetNet(nn.Module):
         memory = torch.cat([every.flatten(1, 2), spread], 1).to(memories.dtype)
         stem = _as_rates(stem, seconds) + functional.conv2d(memory, memories, bias, 1, 1)
         seen, hidden = self.fine(stem, passed, hidden)
-        told, about = self.looked(seen, about, before, due)
+        around, about = self.looked(seen, about, before, due)
+        fading, told = over_time(faded, told, around, passed)
         if shown is not None:
-            seen, told = (_windows(maps, n, shown) for maps in (seen, told))
-        frames = functional.pixel_shuffle(self.drawn(seen, told), CELL).sigmoid()
+            seen, fading = (_windows(maps, n, shown) for maps in (seen, fading))
+        frames = functional.pixel_shuffle(self.drawn(seen, fading), CELL).sigmoid()
         frames = frames[..., top : top + height, left : left + width]
         frames = frames.unflatten(0, (-1, n)).transpose(0, 1)
-        return frames, (sums, awake, recent, hidden, about)
+        return frames, (sums, awake, recent, hidden, about, told)
 
     def fine(
         self, stem: Float[Tensor, "m c h2 w2"], passed: Float[Tensor, "m 1 1 1"], hidden: Tensor
@@ -166,12 +168,12 @@ class SetNet(nn.Module):
         return over_time(step, about, now, recent, due)
 
     def drawn(
-        self, seen: Float[Tensor, "m c h2 w2"], about: Float[Tensor, "m c h4 w4"]
+        self, seen: Float[Tensor, "m c h2 w2"], told: Float[Tensor, "m c h4 w4"]
     ) -> Float[Tensor, "m pixels h2 w2"]:
-        """Return the pixels of each cell as channels, float32, before their sigmoid; `about`: what
-        lies around.
+        """Return the pixels of each cell as channels, float32, before their sigmoid; `told`: of
+        what lies around.
         """
-        x = grown(about.to(seen.dtype), 2) + seen
+        x = grown(told.to(seen.dtype), 2) + seen
         return self.shuffle(self.relu(self.mix2(self.relu(x)))).float()
 
     def kernels(self, places: tuple[Position, ...]) -> tuple[Tensor, Tensor, Tensor]:
@@ -205,9 +207,9 @@ class SetNet(nn.Module):
 
     def hidden(self, height: int, width: int) -> list[tuple[int, int, int]]:
         """Return the sizes (c, h, w) of the hidden maps of a picture: what is remembered at half
-        resolution, in [-1, 1], and what lies around, at a quarter.
+        resolution, in [-1, 1], what lies around, at a quarter, and what is told of that.
         """
-        return [(self.half, height // k, width // k) for k in (2, 4)]
+        return [(self.half, height // k, width // k) for k in (2, 4, 4)]
 
     def _start(self, state: State | None, cells: Tensor) -> State:
         """Return `state`, or zeros of the right sizes; ValueError when they are not right."""
@@ -224,6 +226,11 @@ class SetNet(nn.Module):
         if found != sizes:
             raise ValueError(f"state must have sizes {sizes} for these voxels, got {found}")
         return state
+
+
+def faded(told: Tensor, about: Tensor, passed: Tensor) -> Tensor:
+    """Return what is told of what lies around, `passed` seconds after what was told before."""
+    return torch.lerp(about, told, torch.exp(-passed / FADE_S))
 
 
 def _leaked(sums: Tensor, keep: Tensor, new: Tensor) -> Tensor:

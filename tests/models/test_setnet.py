@@ -101,9 +101,9 @@ def test_state_stays_bounded_over_500_windows_of_noise():
     for step in range(500):
         noise = torch.randn(1, 2, 3, 16, 16, generator=torch.Generator().manual_seed(step))
         frame, state = network(30 * noise + 10, state)
-    sums, awake, recent, hidden, about = state
+    sums, awake, recent, hidden, about, told = state
     assert max(float(part.abs().max()) for part in (awake, recent, hidden)) <= 1
-    assert torch.isfinite(frame).all() and torch.isfinite(about).all()
+    assert all(torch.isfinite(part).all() for part in (frame, about, told))
     # A leaky sum is at most what comes in a window divided by what leaks out of it.
     assert float(sums.abs().max()) < 4 * 3 * (10 + 30 * 6) / (1 - 0.984)
 
