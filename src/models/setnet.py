@@ -84,8 +84,8 @@ class SetNet(nn.Module):
         `window_s`: how long the window lasts, in seconds, a number or one per clip (n,).
         `positions`: (row, col) of each view from the centre view; default: `optics.layout`.
         State, float32: leaky sums of each view, in cells, how awake each picture is, how recently
-        one looked around, 1 just now, 0 never, and the maps of `hidden`.  Raises ValueError for bins,
-        a number of views, a length of window or a state that do not fit.
+        one looked around, 1 just now, 0 never, and the maps of `hidden`.  Raises ValueError for
+        bins, a number of views, a length of window or a state that do not fit.
         """
         frames, state = self.sequence(
             voxels[:, None], state, window_s=window_s, positions=positions

@@ -10,7 +10,7 @@ from src.app import build
 from src.app.parts import make
 from src.models import load, save
 from src.models.cost import macs_per_frame
-from src.models.setnet import SIZES, SetNet
+from src.models.setnet import FADE_S, SIZES, SetNet, faded
 from src.models.setnet_layers import PacedUnit
 from src.models.unroll import AT_ONCE, unroll
 from src.sim.optics import layout
@@ -216,6 +216,25 @@ def test_what_lies_around_is_a_running_mean_of_what_was_seen():
     first, second, third = looks[0].unbind()
     expected = keep * (keep * first + (1 - keep) * second) + (1 - keep) * third
     torch.testing.assert_close(state[4][0], expected)
+
+
+@torch.no_grad()
+def test_the_picture_fades_to_what_was_seen_around_and_does_not_step():
+    network, state, told = small().eval(), None, []
+    for window in voxels(windows=9).unbind(1):
+        _, state = network(window, state)
+        told.append(state[5])
+    # One looks in the first, fifth and ninth window; between, what is told goes on.
+    moved = [float((after - before).norm()) for before, after in pairwise(told)]
+    expected = float(torch.exp(torch.tensor(-1 / 120 / FADE_S)))
+    assert [b / a for a, b in pairwise(moved[3:7])] == pytest.approx([expected] * 3, rel=1e-3)
+    seconds = torch.full((1, 1, 1, 1), 0.01)
+    nothing, all_of_it = torch.zeros(1, 1, 1, 1), torch.ones(1, 1, 1, 1)
+    halfway = faded(nothing, all_of_it, seconds)
+    assert torch.allclose(
+        faded(halfway, all_of_it, seconds), faded(nothing, all_of_it, 2 * seconds)
+    )
+    assert torch.allclose(1 - halfway, torch.exp(-seconds / FADE_S))
 
 
 @torch.no_grad()
