@@ -21,6 +21,7 @@ def chart(cfg: DictConfig) -> dict:
     """
     run = Path(cfg.paths.run)
     charting.check(cfg.sizes, cfg.threads, cfg.forms, cfg.devices, cfg.severities, cfg.clips)
+    adaptive = lineup.adaptive(cfg) if cfg.adapt else None
     candidates = lineup.gather(cfg)
     results.open_run(run, door.resolved(cfg))
     limits = {"longest_s": cfg.longest_s, "bins": cfg.bins, "onnx_side": cfg.onnx_side}
@@ -39,8 +40,8 @@ def chart(cfg: DictConfig) -> dict:
         path = run / f"chart.{suffix}"
         frontier.accuracy(path, speeds, scores, side=cfg.sizes[0], title=title)
         frontier.machine(run / f"machine.{suffix}", speeds, watch.peaks)
-    if cfg.adapt:
-        text += changing_air.write(run, lineup.adaptive(cfg), cfg.adapt.course)
+    if adaptive is not None:
+        text += changing_air.write(run, adaptive, cfg.adapt.course, cfg.adapt.clips)
     results.write_text(run / "chart.md", text)
     rich.print(text, f"in {run}")
     return knees

@@ -15,7 +15,12 @@ HIGHPASS = "{baseline: {_target_: baselines.highpass.HighPass}, views: 1}"
 SETNET = "{views: 9, model: {_target_: src.models.setnet.SetNet, half: 4}}"
 TINY = ["clips=2", "scene.height=64", "scene.width=64", "data.test_crop=32", "data.test_windows=4"]
 TINY += ["data.warmup=1", "metrics.lpips=null", "sizes=[32]", "seconds=0.01", "threads=[1]"]
-TINY += ["severities=[weak]", "forms=[float32,bf16]", "adapt.levels=[[nowhere,1],[nowhere,9]]"]
+TINY += [
+    "severities=[weak]",
+    "forms=[float32,bf16]",
+    "adapt=air",
+    "adapt.levels=[[nowhere,1],[nowhere,9]]",
+]
 
 
 def tiny(tmp_path, *overrides: str):
@@ -58,12 +63,19 @@ def test_the_adaptive_network_is_shown_on_air_that_rises_and_falls(tmp_path):
     spec = {"target": "src.models.setnet.SetNet", "kwargs": {"half": 4}}
     save(file, network, spec, {})
     levels = f"adapt.levels=[[{file},1],[{file},9]]"
-    small = ["adapt.course=[0,4,0]", "adapt.windows=18", "adapt.patience=2", "clips=1"]
+    small = [
+        "adapt.course=[0,4,0]",
+        "adapt.windows=18",
+        "adapt.patience=2",
+        "adapt.clips=2",
+        "clips=1",
+    ]
     chart(tiny(tmp_path, f"+networks={{highpass: {HIGHPASS}}}", levels, *small))
     assert all((tmp_path / f"adapt.{suffix}").is_file() for suffix in ("png", "svg", "csv"))
     lines = list(csv.DictReader((tmp_path / "adapt.csv").read_text().splitlines()))
     assert {line["run"] for line in lines} == {"adaptive", "always the least", "always the most"}
-    assert "Lost against always the most" in (tmp_path / "chart.md").read_text()
+    assert {line["clip"] for line in lines} == {"0", "1"}
+    assert "| always the most |" in (tmp_path / "chart.md").read_text()
 
 
 @pytest.mark.parametrize(
@@ -72,6 +84,7 @@ def test_the_adaptive_network_is_shown_on_air_that_rises_and_falls(tmp_path):
         ("sizes=[30]", "sizes must be multiples of 8"),
         ("forms=[int8]", "forms must be of float32"),
         ("threads=[0]", "threads must be numbers >= 1"),
+        ("adapt.clips=0", "adapt.clips must be >= 1"),
         ("devices=[tpu]", "devices must be of cpu, cuda"),
         ("severities=[]", "severities must be of"),
         ("clips=0", "clips must be >= 1"),

@@ -70,7 +70,12 @@ def under(cfg: DictConfig, severity: str, **data) -> Pipeline:
 
 
 def adaptive(cfg: DictConfig) -> tuple[Adaptive, Pipeline] | str:
-    """Return the adaptive network of `adapt` and the clips to show it on, or why there is none."""
+    """Return the adaptive network of `adapt` and the clips to show it on, or why there is none.
+
+    Raises ValueError, naming the key, for values of `adapt` outside their ranges.
+    """
+    if cfg.adapt.clips < 1:
+        raise ValueError(f"adapt.clips must be >= 1, got {cfg.adapt.clips}")
     try:
         loaded = {ckpt: src.models.load(ckpt, build.rooms(cfg)) for ckpt, _ in cfg.adapt.levels}
     except ValueError as error:
