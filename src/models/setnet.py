@@ -36,6 +36,7 @@ DUE = math.exp(-0.98)  # ... by how recent that is then; 2 % for rounding
 FADE_S = 1 / 60  # time constant by which a picture follows what was seen around
 MAX_VIEWS = 25
 CELL = 2  # pixels: side of what the first layer sees as one
+BORDER = 2  # cells beyond the border that the layers which draw see
 
 Position = tuple[int, int]
 State = tuple[Tensor, ...]
@@ -59,8 +60,8 @@ class SetNet(nn.Module):
         self.spread_stem = nn.Conv2d(memories, half, 3, padding=1, bias=False)
         self.cell2 = PacedUnit(half)
         self.around = Surroundings(half, around)
-        self.mix2 = nn.Conv2d(half, half, 3, padding=1)
-        self.shuffle = nn.Conv2d(half, CELL**2, 3, padding=1)
+        self.mix2 = nn.Conv2d(half, half, 3)
+        self.shuffle = nn.Conv2d(half, CELL**2, 3)
         self.relu = nn.ReLU()
         self.frozen: dict[tuple, tuple[Tensor, ...]] | None = None  # kernels kept, for running
 
@@ -171,10 +172,12 @@ class SetNet(nn.Module):
         self, seen: Float[Tensor, "m c h2 w2"], told: Float[Tensor, "m c h4 w4"]
     ) -> Float[Tensor, "m pixels h2 w2"]:
         """Return the pixels of each cell as channels, float32, before their sigmoid; `told`: of
-        what lies around.
+        what lies around.  Maps go on beyond the border as they are there: zeros would make a
+        pattern of its pixels.
         """
-        x = grown(told.to(seen.dtype), 2) + seen
-        return self.shuffle(self.relu(self.mix2(self.relu(x)))).float()
+        x = self.relu(grown(told.to(seen.dtype), 2) + seen)
+        x = functional.pad(x, (BORDER,) * 4, mode="replicate")
+        return self.shuffle(self.relu(self.mix2(x))).float()
 
     def kernels(self, places: tuple[Position, ...]) -> tuple[Tensor, Tensor, Tensor]:
         """Return the kernels of the stem for views that stand at `places`: of the stacked grids

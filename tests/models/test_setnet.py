@@ -238,6 +238,13 @@ def test_the_picture_fades_to_what_was_seen_around_and_does_not_step():
 
 
 @torch.no_grad()
+def test_a_flat_map_is_drawn_flat_up_to_the_border():
+    network = small()
+    flat = network.drawn(torch.ones(1, 4, 8, 8), torch.ones(1, 4, 4, 4))
+    torch.testing.assert_close(flat, flat[:, :, :1, :1].expand_as(flat))
+
+
+@torch.no_grad()
 def test_window_length_per_clip():
     network, both = small(), voxels(2)[:, 0]
     frame, _ = network(both, None, window_s=torch.tensor([1 / 120, 1 / 600]))
