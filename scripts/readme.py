@@ -53,6 +53,14 @@ OTHERS = {
 PAIRS = {  # rows whose difference is shown, clip by clip
     "nine views less one, E2VID": ("nine views, E2VID (the paper's way)", "one view, E2VID"),
     "nine views less one, SetNet medium": ("nine views, SetNet medium", "one view, SetNet medium"),
+    "nine views, SetNet medium less E2VID": (
+        "nine views, SetNet medium",
+        "nine views, E2VID (the paper's way)",
+    ),
+    "nine views, SetNet small less E2VID": (
+        "nine views, SetNet small",
+        "nine views, E2VID (the paper's way)",
+    ),
 }
 
 

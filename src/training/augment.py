@@ -1,8 +1,8 @@
 """Training augmentation of voxel sequences (Rebecq et al. 2019; Stoffregen et al. 2020; the paper).
 
-Order: dropped views, pause, turn, misplaced views, noise, hot pixels.  Crops are drawn before the
-simulation (sim/pipeline.py).  Every draw comes from the key of the sample, so a batch is the same
-in any worker.
+Order: dropped views, pause, turn, misplaced views, noise, hot and firing pixels.  Crops are drawn
+before the simulation (sim/pipeline.py).  Every draw comes from the key of the sample, so a batch is
+the same in any worker.
 """
 
 import math
@@ -21,12 +21,19 @@ from src.sim import noise
 from src.sim.optics import Position, layout
 from src.sim.pipeline import Sample, room
 
+SHARES = (
+    "hot_fraction", "firing_fraction", "pause", "stay", "flip", "transpose", "misplaced", "dropped",
+)  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Augment:
     """`noise_std`: standard deviation added to every voxel entry, in events.
     `hot_fraction`: the share of hot pixels of a sequence is uniform in [0, hot_fraction];
     `hot_std`: standard deviation of a hot pixel's value, the same in all bins, views and windows.
+    `firing_fraction`: the share of pixels of each view that fire on their own, whatever the light,
+    is uniform in [0, firing_fraction]; `firing_hz`: each at a rate log-uniform in this range, 1/s,
+    ON and OFF alike.  What E2VID calls hot does not come and go; a camera's hot pixels do.
     `pause`: probability that a running sequence pauses at a window; `stay`: that a paused one
     stays paused.
     `flip`: probability of a flip, for each axis; `transpose`: that rows and columns change places.
@@ -38,6 +45,8 @@ class Augment:
     noise_std: float = 0.4
     hot_fraction: float = 1e-4
     hot_std: float = 0.1
+    firing_fraction: float = 0.0
+    firing_hz: Sequence[float] = (10.0, 2000.0)
     pause: float = 0.05
     stay: float = 0.9
     flip: float = 0.5
@@ -47,12 +56,15 @@ class Augment:
     dropped: float = 0.0
 
     def __post_init__(self):
-        for name in ("hot_fraction", "pause", "stay", "flip", "transpose", "misplaced", "dropped"):
+        for name in SHARES:
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"augment.{name} must be in [0, 1], got {getattr(self, name)}")
         for name in ("noise_std", "hot_std"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise ValueError(f"augment.{name} must be >= 0, got {getattr(self, name)}")
+        ends = list(self.firing_hz)
+        if len(ends) != 2 or not 0 < ends[0] <= ends[1] < float("inf"):
+            raise ValueError(f"augment.firing_hz must be [low, high] above 0, got {ends}")
         if self.misplaced_px < 0:
             raise ValueError(f"augment.misplaced_px must be >= 0, got {self.misplaced_px}")
 
@@ -90,17 +102,19 @@ class Augment:
             else:  # window by window: what is turned is in the cache still
                 window.copy_(turned(voxels[step].index_select(0, order), axes, swap))
         misplace(out, self.misplaced, self.misplaced_px, noise.key(key, "misplaced"))
-        self._corrupt(out, key)
+        self._corrupt(out, float(sample.window_s[0]), key)
         pictures = (sample.target[0, steps], sample.turbulent[0, steps])
         return tuple(turned(part, axes, swap) for part in pictures)
 
-    def _corrupt(self, voxels: Tensor, key: int) -> None:
+    def _corrupt(self, voxels: Tensor, window_s: float, key: int) -> None:
         if self.noise_std > 0:
             spread = normals(voxels.shape, noise.key(key, "noise"), voxels.device)
             voxels.add_(spread, alpha=self.noise_std)
         hot = hot_pixels(voxels.shape[-2:], self.hot_fraction, self.hot_std, noise.key(key, "hot"))
         if hot.any():
             voxels.add_(hot.to(voxels))
+        rates = [rate * window_s for rate in self.firing_hz]
+        fire(voxels, self.firing_fraction, rates, noise.key(key, "firing"))
 
 
 def normals(shape: Sequence[int], key: int, device: torch.device) -> Tensor:
@@ -205,3 +219,24 @@ def hot_pixels(size: Sequence[int], fraction: float, std: float, key: int) -> Fl
     places = (noise.uniform(key, 1 + torch.arange(count)) * pixels).long()
     picture[places] = std * noise.normal(noise.key(key, "value"), torch.arange(count))
     return picture.reshape(*size)
+
+
+def fire(
+    voxels: Float[Tensor, "windows views bins h w"],
+    fraction: float,
+    often: Sequence[float],
+    key: int,
+) -> None:
+    """Let up to `fraction` of each view's pixels fire on their own: in a window each has as many
+    events as a Poisson process of a mean log-uniform in `often` = (low, high), each ON or OFF.
+    """
+    if fraction == 0:
+        return
+    windows, _, bins, height, width = voxels.shape
+    drawer = np.random.Generator(np.random.SFC64(key))
+    for seen in voxels.unbind(1):
+        count = int(drawer.random() * fraction * height * width)
+        rows, columns = drawer.integers([[height], [width]], size=(2, count))
+        mean = np.exp(drawer.uniform(*np.log(often), count)) / (2 * bins)
+        on, off = drawer.poisson(mean, (2, windows, bins, count))
+        seen[..., rows, columns] += torch.from_numpy(on - off).to(voxels)

@@ -163,6 +163,22 @@ def test_hot_pixel_count_is_uniform_up_to_the_fraction():
     assert abs(sum(counts) / 400 - 12.0) < 4 * 25 / math.sqrt(12 * 400)
 
 
+def test_firing_pixels_come_and_go_at_their_rate_each_view_s_own():
+    sample = numbered(windows=40, size=64)
+    firing = {"firing_fraction": 0.1, "firing_hz": [600.0, 600.0]}
+    out = Augment(**OFF | firing)([sample], [2]).voxels
+    added = (out - sample.voxels)[0].round()  # (windows, views, bins, h, w)
+    fires = (added != 0).any(2).any(0)  # (views, h, w)
+    shares = fires.float().mean((1, 2))
+    assert 0 < float(shares.max()) <= 0.1 and not torch.equal(*fires)
+    # ON less OFF of two Poisson processes: the variance is the number of events, 5 a window
+    spread = added.sum(2).movedim(0, -1)[fires].square().mean()
+    assert (
+        abs(float(spread) - 5) < 0.3
+        and abs(float(added[:, fires[:, None].expand_as(added[0])].mean())) < 0.05
+    )
+
+
 def test_a_clip_is_augmented_the_same_in_any_batch():
     clip, augment = numbered(), Augment()
     together, alone = augment([clip, clip], [5, 6]), augment([clip], [6])
@@ -216,6 +232,9 @@ def test_a_view_that_stays_shows_the_picture_of_its_turned_place():
         {"misplaced": 2},
         {"misplaced_px": -1},
         {"dropped": 1.5},
+        {"firing_fraction": -1},
+        {"firing_hz": [0, 10]},
+        {"firing_hz": [10]},
     ],
 )
 def test_wrong_values_name_their_key(wrong):

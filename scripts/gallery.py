@@ -1,0 +1,100 @@
+"""Recordings through networks, one view each, in one figure:
+
+    python -m scripts.gallery RECORDING ... --out FILE.png [--networks NAME ...] [--published DIR]
+
+A row for each recording, its last frame by each network: one of weights/ or, with the folder of
+published weights, of scripts.readme's baselines.  A recording that does not state the size of its
+sensor is written FILE@HEIGHTxWIDTH.  Where the list of a camera's frames, images.txt, lies beside
+a recording, the frame nearest in time stands last.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from scripts.readme import BASELINES, config
+from src.app import build
+from src.figures import plots
+from src.reconstruct import frames, overlap, views_for
+from src.recordings import event_lists
+from src.recordings.files import sources
+from src.recordings.stream import Frame
+
+FPS = 120
+WIDE = 2.4  # inches: width of a panel
+CAMERA = "images.txt"
+
+
+def last(recording: str, network: str, published: Path | None) -> Frame:
+    """Return the last frame of `recording` by `network`, which is given its one view."""
+    path, _, size = recording.partition("@")
+    chosen = [f"ckpt={network}"]
+    if network in BASELINES:
+        files = [f"baseline.weights={published}/{file}" for file in BASELINES[network]]
+        chosen = [f"baseline={network}", *files]
+    sensor = [f"sensor_size=[{size.replace('x', ',')}]"] if size else []
+    cfg = config("reconstruct", f"recording={path}", f"fps={FPS}", *chosen, *sensor)
+    net = build.chosen(cfg)
+    views = views_for(cfg, net)
+    ready = event_lists.ready(net, cfg.form, cfg.device, views, cfg.bins)
+    *_, frame = frames(cfg, ready, views, overlap(cfg, net))
+    return frame
+
+
+def camera(recording: str, time_s: float) -> Float[np.ndarray, "h w"] | None:
+    """Return the camera's frame nearest to `time_s`, if there is a camera."""
+    listing = Path(recording.partition("@")[0]).parent / CAMERA
+    if not listing.is_file():
+        return None
+    lines = (line.split() for line in listing.read_text().splitlines())
+    _, name = min(lines, key=lambda line: abs(float(line[0]) - time_s))
+    return next(sources.film(listing.parent / name))
+
+
+def gallery(recordings: list[str], networks: list[str], published: Path | None) -> Figure:
+    """Draw a row of last frames for each recording."""
+    rows = [[last(recording, name, published) for name in networks] for recording in recordings]
+    seen = [
+        camera(recording, row[-1].time_s) for recording, row in zip(recordings, rows, strict=True)
+    ]
+    columns = len(networks) + any(picture is not None for picture in seen)
+    shapes = [row[0].picture.shape for row in rows]
+    heights = [WIDE * height / width for height, width in shapes]
+    figure = Figure(figsize=(WIDE * columns, sum(heights) + 0.4), layout="constrained")
+    grid = figure.subplots(len(rows), columns, squeeze=False, height_ratios=heights)
+    for recording, row, picture, axes in zip(recordings, rows, seen, grid, strict=True):
+        pictures = [*(frame.picture for frame in row), picture]
+        for panel, shown in zip(axes, pictures, strict=False):
+            panel.set(xticks=[], yticks=[])
+            if shown is not None:
+                panel.imshow(shown, cmap="gray", vmin=0, vmax=1)
+            else:
+                panel.set_axis_off()
+        path = Path(recording.partition("@")[0])
+        axes[0].set_ylabel(path.parent.name if path.stem == "events" else path.stem, fontsize=7)
+    for panel, name in zip(grid[0], [*networks, "camera"], strict=False):
+        panel.set_title(name, fontsize=9)
+    return figure
+
+
+def main() -> None:
+    """Read the arguments."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("recordings", nargs="+")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument(
+        "--networks", nargs="+", default=["setnet_medium", "setnet_small", "single256"]
+    )
+    parser.add_argument("--published", type=Path, help="a folder of published weights")
+    given = parser.parse_args()
+    unknown = [name for name in given.networks if BASELINES.get(name) and not given.published]
+    if unknown:
+        parser.error(f"--networks {' '.join(unknown)} needs --published")
+    plots.save(gallery(given.recordings, given.networks, given.published), given.out)
+
+
+if __name__ == "__main__":
+    main()
