@@ -36,6 +36,8 @@ def server_for(cfg: DictConfig) -> assembly.Server:
     faults, name = Faults(), str(cfg.ckpt or "baseline")
     sensor = cfg.sensor_size or (load(cfg.views).sensor if cfg.views else None)
     feed = feeds.open_feed(cfg.recording, sensor, faults, loop=cfg.loop, udp_format=cfg.udp_format)
+    if cfg.noise_filter_s is not None:
+        feed = feeds.Filtered(feed, cfg.noise_filter_s)
     views = views_for(cfg, feed.sensor)
     how = Running(cfg.fps, cfg.bins, cfg.splat, cfg.unit, cfg.span, cfg.form)
     server = assembly.assemble(

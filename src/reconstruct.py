@@ -15,6 +15,7 @@ from src.app import build, door
 from src.models.runtime import Runtime
 from src.recordings import event_lists, lookup, output, progress, stream
 from src.recordings.files import sources
+from src.recordings.noise_filter import NoiseFilter
 from src.recordings.views import Views, load
 from src.records import results
 
@@ -67,7 +68,11 @@ def frames(
     )
 
     def chunks() -> Iterator[np.ndarray]:
-        return sources.events(cfg.recording, views.sensor, cfg.chunk_s)
+        read = sources.events(cfg.recording, views.sensor, cfg.chunk_s)
+        if cfg.noise_filter_s is None:
+            return read
+        kept = map(NoiseFilter(views.sensor, cfg.noise_filter_s), read)
+        return (events for events in kept if events.size)
 
     def run(windows: Iterable[stream.Window]) -> Iterator[stream.Frame]:
         more = {"overlap": span, "carry": carry}

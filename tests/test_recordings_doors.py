@@ -133,6 +133,7 @@ def test_without_views_the_sensor_is_one_view(folder, tmp_path):
         ("start=3.0 end=2.0", "start must be"),
         ("ckpt=null", "must name a network"),
         ("look_ahead_s=-1", "look_ahead_s must be >= 0"),
+        ("noise_filter_s=0", "noise_filter_s must be > 0 seconds or null, got 0"),
         ("look_ahead_s=1 count=500", "look_ahead_s must be 0 with count=500"),
     ],
 )

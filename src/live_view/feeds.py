@@ -13,6 +13,7 @@ import numpy as np
 from src.live_view.faults import Faults
 from src.recordings.files import sources
 from src.recordings.files.formats import EVENT
+from src.recordings.noise_filter import NoiseFilter
 from src.recordings.views import LARGEST_SIDE, Size
 
 Chunks = Iterator[tuple[np.ndarray, float]]
@@ -71,6 +72,25 @@ def _stated(sensor: Sequence[int] | None) -> Size:
             "or give views=, which says it"
         )
     return tuple(sensor)
+
+
+class Filtered:
+    """Another feed's events without those that `NoiseFilter` takes away."""
+
+    def __init__(self, feed: Feed, seconds: float):
+        self.feed, self.live, self.sensor = feed, feed.live, feed.sensor
+        self.filter = NoiseFilter(feed.sensor, seconds)
+
+    def chunks(self, stopped: threading.Event) -> Chunks:
+        """Yield what is left of each chunk, if anything is."""
+        for events, arrived in self.feed.chunks(stopped):
+            kept = self.filter(events)
+            if kept.size:
+                yield kept, arrived
+
+    def close(self) -> None:
+        """Close the other feed."""
+        self.feed.close()
 
 
 class File:

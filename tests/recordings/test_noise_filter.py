@@ -1,0 +1,63 @@
+"""What no neighbour supports is taken away, whatever the chunks; edges that move stay."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from src.live_view.feeds import File, Filtered
+from src.recordings.files.formats import EVENT, write_events
+from src.recordings.noise_filter import NoiseFilter
+
+
+def events(*rows: tuple[int, int, int]) -> np.ndarray:
+    """Events ON at (t, x, y)."""
+    return np.array([(*row, 1) for row in rows], EVENT)
+
+
+def test_an_event_needs_a_neighbour_and_soon():
+    found = NoiseFilter((8, 8), 0.005)(
+        events((0, 3, 3), (1000, 4, 4), (1500, 0, 0), (5900, 5, 5), (12_000, 5, 6))
+    )
+    assert found["t"].tolist() == [1000, 5900]
+
+
+def test_a_pixel_does_not_support_itself_nor_the_border_the_border():
+    hot = events(*((100 * k, 7, 2) for k in range(50)), (5000, 0, 2))
+    assert NoiseFilter((8, 8), 0.005)(hot).size == 0
+
+
+def test_chunks_change_nothing():
+    drawer = np.random.default_rng(0)
+    many = np.zeros(5000, EVENT)
+    many["t"] = np.sort(drawer.integers(0, 100_000, 5000))
+    many["x"], many["y"] = drawer.integers(0, 16, (2, 5000))
+    whole, parts = NoiseFilter((16, 16), 2e-4), NoiseFilter((16, 16), 2e-4)
+    kept = np.concatenate([parts(chunk) for chunk in np.array_split(many, 7)])
+    np.testing.assert_array_equal(whole(many), kept)
+    assert 0.2 < len(kept) / len(many) < 0.3  # 1 - exp(-8 neighbours x 0.2 ms x 195 a second)
+
+
+def test_an_edge_that_moves_keeps_its_events_among_noise():
+    edge = [(1000 * x, x, y) for x in range(1, 60) for y in range(64)]
+    drawer = np.random.default_rng(1)
+    noise = [(int(t), int(x), int(y)) for t, x, y in drawer.integers(0, [60_000, 64, 64], (400, 3))]
+    kept = NoiseFilter((64, 64), 0.005)(events(*sorted(edge + noise)))
+    left = set(map(tuple, kept[["t", "x", "y"]].tolist()))
+    assert len(left & set(edge)) > 0.95 * len(edge)
+    assert len(left & (set(noise) - set(edge))) < 0.5 * len(noise)
+
+
+@pytest.mark.parametrize("seconds", [0, -1, float("nan"), float("inf")])
+def test_a_wrong_time_names_its_key(seconds):
+    with pytest.raises(ValueError, match="noise_filter_s must be > 0 seconds or null, got"):
+        NoiseFilter((8, 8), seconds)
+
+
+def test_a_live_feed_is_filtered(tmp_path):
+    path = tmp_path / "few.csv"
+    write_events(path, events((0, 3, 3), (1000, 4, 4), (20_000, 0, 0)), width=8, height=8)
+    feed = Filtered(File(str(path), (8, 8), loop=False), 0.005)
+    assert (feed.live, feed.sensor) == (False, (8, 8))
+    (kept,) = (chunk for chunk, _ in feed.chunks(threading.Event()))
+    assert kept["t"].tolist() == [1000]
