@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from scripts.readme import BASELINES, config
+from scripts.readme import BASELINES, baseline, config
 from src.app import build
 from src.figures import plots
 from src.reconstruct import frames, overlap, views_for
@@ -31,10 +31,7 @@ CAMERA = "images.txt"
 def last(recording: str, network: str, published: Path | None) -> Frame:
     """Return the last frame of `recording` by `network`, which is given its one view."""
     path, _, size = recording.partition("@")
-    chosen = [f"ckpt={network}"]
-    if network in BASELINES:
-        files = [f"baseline.weights={published}/{file}" for file in BASELINES[network]]
-        chosen = [f"baseline={network}", *files]
+    chosen = baseline(network, published) if network in BASELINES else [f"ckpt={network}"]
     sensor = [f"sensor_size=[{size.replace('x', ',')}]"] if size else []
     cfg = config("reconstruct", f"recording={path}", f"fps={FPS}", *chosen, *sensor)
     net = build.chosen(cfg)

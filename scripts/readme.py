@@ -32,10 +32,11 @@ ONE, NINE = ("setnet_small", 1), ("setnet_small", 9)  # of the picture
 # Local air, whose parts of a view wobble apart.
 AIR = ("turbulence=strong", "turbulence.atmosphere.half_length_px=[10,20]",
        "turbulence.atmosphere.near_rigid=0.0")  # fmt: skip
+PAPER = "nine views, E2VID (the paper's way)"
 ROWS = {  # what it is: a network in weights/, how many of the nine views it is given
     "nine views, SetNet medium": ("setnet_medium", 9),
     "nine views, SetNet small": ("setnet_small", 9),
-    "nine views, E2VID (the paper's way)": ("lf3x3", 9),
+    PAPER: ("lf3x3", 9),
     "one view, SetNet medium": ("setnet_medium", 1),
     "one view, E2VID": ("single256", 1),
     "one view, E2VID+ trained without turbulence": ("clean/e2vid_plus", 1),
@@ -51,16 +52,10 @@ OTHERS = {
     "high-pass, one view": ("highpass", 1),
 }
 PAIRS = {  # rows whose difference is shown, clip by clip
-    "nine views less one, E2VID": ("nine views, E2VID (the paper's way)", "one view, E2VID"),
+    "nine views less one, E2VID": (PAPER, "one view, E2VID"),
     "nine views less one, SetNet medium": ("nine views, SetNet medium", "one view, SetNet medium"),
-    "nine views, SetNet medium less E2VID": (
-        "nine views, SetNet medium",
-        "nine views, E2VID (the paper's way)",
-    ),
-    "nine views, SetNet small less E2VID": (
-        "nine views, SetNet small",
-        "nine views, E2VID (the paper's way)",
-    ),
+    "nine views, SetNet medium less E2VID": ("nine views, SetNet medium", PAPER),
+    "nine views, SetNet small less E2VID": ("nine views, SetNet small", PAPER),
 }
 
 
@@ -70,12 +65,17 @@ def config(door: str, *overrides: str) -> DictConfig:
         return compose(door, list(overrides))
 
 
+def baseline(name: str, published: Path | None) -> list[str]:
+    """Return the overrides that choose one of BASELINES, its weights in the folder `published`."""
+    weights = [f"baseline.weights={published}/{file}" for file in BASELINES[name]]
+    return [f"baseline={name}", *weights]
+
+
 def subject(name: str, views: int, published: Path | None = None) -> Subject:
     """Return a shipped network, or one of BASELINES with its weights in the folder `published`."""
     if name not in BASELINES:
         return Subject(name, models.load(name), views)
-    weights = [f"baseline.weights={published}/{file}" for file in BASELINES[name]]
-    cfg = config("eval", f"baseline={name}", *weights)
+    cfg = config("eval", *baseline(name, published))
     return Subject(name, part(cfg, "baseline").eval(), views)
 
 

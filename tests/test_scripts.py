@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from scripts import air_map as air
-from scripts import alignment, surroundings, widen_setnet
+from scripts import alignment, gallery, surroundings, widen_setnet
 from scripts.scales import missing
 from scripts.ship_weights import recard, ship
 from src.app import build
@@ -17,6 +17,7 @@ from src.models.unroll import unroll
 from src.records.runs import Run
 from src.train import train
 from src.training import handover
+from tests.conftest import ROOT
 from tests.test_train import TINY, config
 
 
@@ -179,3 +180,11 @@ def test_what_is_missing_is_told_by_its_size():
         truth - grey.repeat_interleave(16, 2).repeat_interleave(16, 3), truth
     )
     assert areas > 0.5 and max(details) < 0.05
+
+
+def test_a_gallery_has_a_row_for_each_recording_and_a_column_for_each_network():
+    recording = str(ROOT / "docs" / "example" / "cat.raw")
+    figure = gallery.gallery([recording, recording], ["setnet_small", "highpass"], None)
+    assert [panel.get_title() for panel in figure.axes] == ["setnet_small", "highpass", "", ""]
+    assert [panel.get_ylabel() for panel in figure.axes] == ["cat", "", "cat", ""]
+    assert all(panel.images for panel in figure.axes)
