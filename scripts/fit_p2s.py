@@ -1,4 +1,4 @@
-"""Fit p2s.safetensors: python -m scripts.fit_p2s [steps, default 16000; 0: tables only].
+"""Fit p2s.safetensors: python -m scripts.fit_p2s [steps, default 12000; 0: tables only].
 
 For each band of D/r0: exact PSFs of random Kolmogorov phase, a principal basis of them in the
 metric of a natural picture (power 1 / f^2), networks from the first modes of the phase to the
@@ -12,44 +12,36 @@ from dataclasses import dataclass
 
 import torch
 from safetensors.torch import load_file, save_file
-from torch import Tensor, nn
+from torch import Tensor
 
 from scripts.p2s_errors import ALL_MODES, even, measure, picture_metric
-from src.sim.turbulence.fidelity import BEYOND
-from src.sim.turbulence.p2s import FILE, FINE_PER_AIRY
+from src.sim.turbulence.p2s import BEYOND, FILE, FINE_PER_AIRY
+from src.sim.turbulence.p2s_network import Network, shape_kinds
 from src.sim.turbulence.psf import fraunhofer_psf
 from src.sim.turbulence.zernike import noll_covariance
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is fitted for D/r0 from `start` to `edge`; `sizes`: modes and the two hidden layers."""
+    """What is fitted for D/r0 from `start` to `edge`; `sizes`: modes and width of each network."""
 
     start: float
     edge: float
     rank: int
     fine: int
-    sizes: tuple[tuple[int, int, int], ...]
+    sizes: tuple[tuple[int, int], ...]
     samples: int = 160_000
 
 
 PLANS = (
-    Plan(0.0, 1.0, 24, 35, ((9, 24, 16), (14, 32, 24), (27, 64, 48))),
-    Plan(1.0, 2.0, 24, 35, ((9, 32, 24), (20, 48, 32), (35, 96, 64))),
-    Plan(2.0, 3.0, 28, 35, ((14, 48, 32), (20, 64, 48), (44, 96, 96))),
-    Plan(3.0, 4.0, 32, 35, ((14, 48, 32), (27, 64, 48), (44, 128, 96))),
-    Plan(4.0, 5.5, 40, 41, ((20, 64, 48), (35, 96, 96), (54, 160, 96))),
-    Plan(5.5, 7.0, 40, 47, ((20, 64, 48), (35, 128, 96), (54, 160, 128))),
-    Plan(7.0, 10.0, 48, 47, ((27, 64, 48), (44, 128, 96), (77, 192, 128))),
+    Plan(0.0, 1.0, 24, 35, ((9, 16), (14, 16), (20, 32), (35, 64))),
+    Plan(1.0, 2.0, 24, 35, ((9, 16), (14, 16), (20, 32), (35, 64))),
+    Plan(2.0, 3.0, 28, 35, ((9, 16), (14, 16), (20, 32), (44, 64))),
+    Plan(3.0, 4.0, 32, 35, ((9, 16), (14, 16), (20, 32), (44, 64))),
+    Plan(4.0, 5.5, 40, 41, ((14, 16), (20, 32), (35, 48), (54, 80))),
+    Plan(5.5, 7.0, 40, 47, ((14, 16), (20, 32), (35, 48), (54, 96))),
+    Plan(7.0, 10.0, 48, 47, ((20, 32), (35, 48), (54, 80), (77, 112))),
 )
-
-
-class Square(nn.Module):
-    """x squared."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return it."""
-        return x * x
 
 
 def fit(steps: int) -> None:
@@ -64,7 +56,7 @@ def fit_bands(steps: int) -> dict[str, Tensor]:
     """Return what is fitted, by band, network and name."""
     stored = {
         "edges": torch.tensor([plan.edge for plan in PLANS], dtype=torch.float64),
-        "sizes": torch.tensor(len(PLANS[0].sizes)),
+        "sizes": torch.tensor([plan.sizes for plan in PLANS]),
     }
     for index, plan in enumerate(PLANS):
         for name, tensor in fit_band(plan, steps).items():
@@ -82,11 +74,9 @@ def fit_band(plan: Plan, steps: int) -> dict[str, Tensor]:
     weights = torch.cat(
         [(exact(part, plan.fine) - mean).flatten(1) @ project for part in phase.split(2000)]
     )
-    variance = (strength / plan.edge) ** (5 / 3)
     found = {"mean": mean, "basis": basis.half()}
-    for number, (modes, *hidden) in enumerate(plan.sizes):
-        seen = torch.cat([phase[:, 2:modes], variance], dim=1)
-        net = train(seen, weights, hidden, steps)
+    for number, size in enumerate(plan.sizes):
+        net = train(phase, strength, weights, size, shape_kinds(basis), plan.edge, steps)
         found |= {f"{number}.{name}": value.half() for name, value in net.state_dict().items()}
     return found
 
@@ -130,36 +120,41 @@ def principal(psfs: Tensor, rank: int) -> tuple[Tensor, Tensor, Tensor]:
     return mean, basis.float(), (root @ top / scale).float()
 
 
-def train(seen: Tensor, weights: Tensor, hidden: list[int], steps: int) -> nn.Sequential:
+def train(
+    phase: Tensor,
+    strength: Tensor,
+    weights: Tensor,
+    size: tuple[int, int],
+    kinds: Tensor,
+    edge: float,
+    steps: int,
+) -> Network:
     """Return the network after `steps` steps of Adam, their size falling to zero.
 
-    `seen` (n, inputs) ends with (D/r0)^(5/3) of the band's edge, by which the random power grows:
-    errors count as shares of it.
+    Errors count as shares of the random power, which grows as (D/r0)^(5/3).
     """
-    wide, narrow = hidden
-    net = nn.Sequential(
-        nn.Linear(seen.shape[1], wide),
-        Square(),
-        nn.Linear(wide, narrow),
-        nn.SiLU(),
-        nn.Linear(narrow, weights.shape[1]),
-    )
-    with torch.no_grad():
-        net[0].weight /= seen.std(0)
-    power = seen[:, -1].clamp(min=0.05)
+    modes, width = size
+    net = Network(modes, width, torch.bincount(kinds, minlength=4).tolist(), edge)
+    seen, weights = phase[:, 2:modes].contiguous(), weights[:, kinds.argsort(stable=True)]
+    net.see(seen.std(0))
+    power = ((strength / edge) ** (5 / 3)).clamp(min=0.05)[:, 0]
     optimiser = torch.optim.Adam(net.parameters(), fused=True)
+    total = left = 0.0
     for step in range(steps):
         for group in optimiser.param_groups:
             group["lr"] = 3e-3 * (1 - step / steps) ** 1.5
         pick = torch.randint(len(seen), (1024,))
-        error = (net(seen[pick]) - weights[pick]).square().sum(1)
+        error = (net(seen[pick], strength[pick]) - weights[pick]).square().sum(1)
         loss = (error / power[pick]).mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-    print(f"{seen.shape[1] + 1} modes, {hidden}: {float(loss.detach()):.4f} left", flush=True)
+        if step >= 0.9 * steps:
+            left += float(loss.detach())
+            total += float((weights[pick].square().sum(1) / power[pick]).mean())
+    print(f"{modes} modes, {width}: {left / total:.4f} left", flush=True)
     return net
 
 
 if __name__ == "__main__":
-    fit(int(sys.argv[1]) if len(sys.argv) > 1 else 16_000)
+    fit(int(sys.argv[1]) if len(sys.argv) > 1 else 12_000)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from src.sim.turbulence.atmosphere import TILT_VARIANCE, Atmosphere
 from src.sim.turbulence.p2s import FINE_PER_AIRY, Band, bands
+from src.sim.turbulence.p2s_network import shape_kinds
 from src.sim.turbulence.phase import draw_waves
 from src.sim.turbulence.psf import fraunhofer_psf
 from src.sim.turbulence.zernike import noll_covariance
@@ -19,12 +20,27 @@ AIRY = (0.25, 0.5, 1.0, 2.0)
 MODES = (5, 9, 14, 20, 27, 35, 44, 54, 65, 77)
 PITCHES = (0.025, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0)  # of D, at the object
 RANKS = (4, 8, 12, 16, 20, 24, 32, 40, 48)
-REACHES = (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0, 7.0, 8.5)  # half the kernel, lambda / D
+REACHES = (
+    1.0,
+    1.5,
+    2.0,
+    2.5,
+    3.0,
+    3.5,
+    4.0,
+    4.5,
+    5.0,
+    5.5,
+    6.0,
+    7.0,
+    8.5,
+)  # half the kernel, lambda / D
 TILTS = 200  # random tilts that the halo is not moved by
 ALL_MODES = 119
 FINE, GRID = 47, 96  # samples of a PSF, and of its transform
 SPATIAL_WAVES = 256
 PLACES = 4  # strengths in a band
+CLIPS, CELLS = 30, 900  # waves, and places where errors are measured
 
 
 def picture_power(count: int) -> Tensor:
@@ -58,13 +74,12 @@ def _row(strength: float) -> dict[str, Tensor]:
     full = _exact(phase)
     power = _power(full - full.mean(0))
     modes = [_power(_exact(phase[:, :count]) - full) / power for count in MODES]
-    pitch = [_pitch_error(strength, pitch) / power for pitch in PITCHES]
     mean = even(full.mean(0))
     kernel = [_kernel_error(full, mean, reach, strength) / power for reach in REACHES]
     return {
         "power": power,
         "modes": torch.stack(modes),
-        "pitch": torch.stack(pitch),
+        "pitch": _pitch_error(strength) / power,
         "kernel": torch.stack(kernel),
         "half_light": _half_light(full.mean(0)),
         "mean": mean,
@@ -82,11 +97,13 @@ def _exact(phase: Tensor, fine: int = FINE) -> Tensor:
     return fraunhofer_psf(phase, airy_px=FINE_PER_AIRY, size=fine, pupil=fine - 3, points=1)
 
 
-def _power(error: Tensor) -> Tensor:
-    """Return the mean power that PSF errors (n, fine, fine) make in a picture, per AIRY."""
-    parts = error.split(100)  # that stay in the cache
-    spectra = (torch.fft.fft2(part, s=(GRID, GRID)).abs().square().sum(0) for part in parts)
-    spectrum = sum(spectra).double() / len(error)
+def _spectrum(errors: Tensor) -> Tensor:
+    """Return the transforms (n, GRID^2) of PSF errors (n, fine, fine)."""
+    return torch.fft.fft2(errors, s=(GRID, GRID)).flatten(1)
+
+
+def _seen() -> Tensor:
+    """Return how much each entry of a spectrum counts in a picture (airy, GRID^2), per AIRY."""
     f = torch.fft.fftfreq(GRID, dtype=torch.float64)
     out = []
     for airy in AIRY:
@@ -95,36 +112,63 @@ def _power(error: Tensor) -> Tensor:
         picture = picture_power(GRID) * seen
         picture[0, 0] = 0
         box = torch.sinc(f * step).square()
-        out.append((spectrum * picture * box[:, None] * box).sum() / picture.sum())
+        out.append((picture * box[:, None] * box / picture.sum()).flatten())
     return torch.stack(out)
 
 
-def _pitch_error(strength: float, pitch: float) -> Tensor:
-    """Return the power of linear interpolation of PSFs between nodes `pitch` D apart."""
+def _power(error: Tensor) -> Tensor:
+    """Return the mean power that PSF errors (n, fine, fine) make in a picture, per AIRY."""
+    parts = error.split(100)  # that stay in the cache
+    total = sum(_spectrum(part).abs().square().sum(0) for part in parts)
+    return _seen() @ total.double() / len(error)
+
+
+def _places(strength: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Return phases at CELLS places (cells, modes) and at the four nodes about each, for every
+    pitch (pitches, cells, 4, modes), and the nodes' weights in linear interpolation (cells, 4).
+    """
     path = Atmosphere(0.1, 1.0, 1000.0, 0.1, 525e-9, 1e-14, 0.0).at(strength)
-    cells, clips = 24, 12
-    t = torch.rand(clips, cells, 2, dtype=torch.float64)
-    nodes = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]], dtype=torch.float64)
-    phases = []
-    for clip in range(clips):
-        waves = draw_waves(path, 1000 + clip, modes=44, waves=SPATIAL_WAVES, width_px=1)
-        corner = 100 * torch.rand(cells, 1, 2, dtype=torch.float64)
-        places = corner + pitch * torch.cat([nodes.expand(cells, 4, 2), t[clip, :, None]], 1)
-        wave = torch.exp(2j * math.pi * (waves.frequency @ places.reshape(-1, 2).T))
+    at, around, shares = [], [], []
+    for clip in range(CLIPS):
+        waves = draw_waves(path, 1000 + clip, modes=ALL_MODES, waves=SPATIAL_WAVES, width_px=1)
         random = torch.randn(SPATIAL_WAVES, dtype=torch.complex128) * math.sqrt(2)
-        phases.append(((torch.view_as_complex(waves.response) * random) @ wave).real.T)
-    phase = torch.cat(phases).float()
-    phase[:, :2] = 0
-    psfs = _exact(phase).reshape(clips * cells, 5, FINE, FINE)
-    x, y = t.reshape(-1, 2).float().unbind(-1)
-    weight = torch.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], 1)
-    return _power((weight[..., None, None] * psfs[:, :4]).sum(1) - psfs[:, 4])
+        response = torch.view_as_complex(waves.response) * random
+        place = 100 * torch.rand(CELLS // CLIPS, 2, dtype=torch.float64)
+        t = torch.rand(CELLS // CLIPS, 1, 2, dtype=torch.float64)
+        corners = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]], dtype=torch.float64) - t
+        nodes = place[:, None] + torch.tensor(PITCHES).view(-1, 1, 1, 1) * corners
+        at.append(_phase(response, waves.frequency, place))
+        around.append(_phase(response, waves.frequency, nodes))
+        shares.append((1 - corners.abs()).prod(-1))
+    return torch.cat(at), torch.cat(around, 1), torch.cat(shares).float()
+
+
+def _phase(response: Tensor, frequency: Tensor, places: Tensor) -> Tensor:
+    """Return the modes (..., modes) at `places` (..., 2), without tilt."""
+    wave = torch.exp(2j * math.pi * (places @ frequency.T))
+    phase = (wave @ response.T).real.float()
+    phase[..., :2] = 0
+    return phase
+
+
+def _pitch_error(strength: float) -> Tensor:
+    """Return the power of linear interpolation of exact PSFs between nodes, per pitch."""
+    place, nodes, shares = _places(strength)
+    truth = _exact(place)
+    found = (_interpolated(_exact(corners.flatten(0, 1)), shares) for corners in nodes)
+    return torch.stack([_power(psfs - truth) for psfs in found])
+
+
+def _interpolated(nodes: Tensor, shares: Tensor) -> Tensor:
+    """Return what nodes (cells * 4, ...) are at the places between them (cells, ...)."""
+    return torch.einsum("ck,ck...->c...", shares, nodes.unflatten(0, (-1, 4)))
 
 
 def _networks() -> dict[str, Tensor]:
-    """Return what basis and networks leave of the random power: bands, strengths, networks, ranks.
+    """Return what basis, networks and nodes far apart leave of the random power.
 
-    And the strengths, from where each band begins to its edge.
+    Bands, strengths from where each band begins to its edge, networks, pitches (the first is 0),
+    ranks, AIRY.
     """
     edges = [band.edge for band in bands()]
     starts = [STRENGTHS[0], *edges[:-1]]
@@ -140,18 +184,31 @@ def _networks() -> dict[str, Tensor]:
 
 
 def _psf_errors(band: Band, strength: float) -> Tensor:
-    """Return the power of basis and network together, per network and rank."""
-    phase = _draw(800, ALL_MODES, strength)
-    psfs = _exact(phase, band.mean.shape[-1])
-    power = _power(psfs - psfs.mean(0))
+    """Return the power per network, pitch, rank and AIRY.
+
+    What a pixel gets is the network's PSF interpolated between its nodes, against the exact one.
+    """
+    place, nodes, shares = _places(strength)
+    psfs = _exact(place, band.mean.shape[-1]) - band.mean
+    random = _power(psfs - psfs.mean(0)).float()
+    order = shape_kinds(band.basis).argsort(stable=True)
+    truth, shapes, seen = _spectrum(psfs), _spectrum(band.basis[order]), _seen().float()
+    power = seen @ truth.abs().square().T  # (airy, cells)
+    with_truth = torch.einsum("af,cf,rf->acr", seen, truth, shapes.conj()).real
+    among = torch.einsum("af,qf,rf->aqr", seen, shapes, shapes.conj()).real
     out = []
     for network in band.networks:
-        every = torch.arange(len(band.basis))
-        weights = network.weights(phase[:, 2 : network.modes].T, strength, every).T
-        for rank in RANKS:
-            found = torch.tensordot(weights[:, :rank], band.basis[:rank], 1)
-            out.append(_power(band.mean + found - psfs) / power)
-    return torch.stack(out).unflatten(0, (-1, len(RANKS)))
+        own = slice(2, network.modes)
+        found = [network(place[:, own], strength)]
+        for corners in nodes:
+            found.append(_interpolated(network(corners.flatten(0, 1)[:, own], strength), shares))
+        for weights in found:
+            for rank in RANKS:
+                w = weights * (order < rank)
+                left = power - 2 * (with_truth * w).sum(-1)
+                left = left + torch.einsum("cq,aqr,cr->ac", w, among, w)
+                out.append(left.mean(1) / random)
+    return torch.stack(out).unflatten(0, (len(band.networks), 1 + len(PITCHES), len(RANKS)))
 
 
 def even(psf: Tensor) -> Tensor:

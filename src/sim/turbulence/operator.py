@@ -13,15 +13,16 @@ from src.sim import noise
 from src.sim.optics import layout, view_id
 from src.sim.turbulence import blur
 from src.sim.turbulence.atmosphere import ALPHA_FPS, Atmosphere
-from src.sim.turbulence.fidelity import Fidelity, band_for, choose, mean_psf
+from src.sim.turbulence.fidelity import Fidelity, choose, mean_psf
 from src.sim.turbulence.halo import Halo
 from src.sim.turbulence.lattice import Lattice
 from src.sim.turbulence.model import Crop
-from src.sim.turbulence.p2s import Spots
-from src.sim.turbulence.phase import Field, Waves, draw_waves, evolve, flow, look_from
+from src.sim.turbulence.p2s import Spots, band_for
+from src.sim.turbulence.phase import Waves, draw_waves, evolve, flow, look_from
 from src.sim.turbulence.psf import fraunhofer_psf
 from src.sim.turbulence.ranges import require
 from src.sim.turbulence.threads import in_threads
+from src.sim.turbulence.wave_field import Field
 
 TEMPORAL = ("ar1", "flow", "mixed")
 OWN_WIND = 0.5  # rms of a layer's own wind over the wind that all layers share
@@ -54,7 +55,7 @@ class Turbulence:
         height: int,
         width: int,
         fps: float = 120.0,
-        tolerance: float = 0.35,
+        tolerance: float = 0.26,
         modes: int | None = None,
         psf: str = "fitted",
         temporal: str = "ar1",

@@ -1,68 +1,30 @@
 """From phase to space: a PSF basis per band of D/r0 and small networks from phase to its weights.
 
 The idea is Mao, Chimitt & Chan 2021 (ICCV), "Accelerating atmospheric turbulence simulation via
-learned phase-to-space transform".  Basis, networks and error tables are our own, fitted to exact
-Fraunhofer PSFs by `python -m scripts.fit_p2s` and kept in p2s.safetensors.  A network sees the
-first modes only but is fitted to PSFs of all of them: what it gives is their mean under the modes
-it knows, so the modes it does without blur as they do on average.
+learned phase-to-space transform".  Basis, networks (p2s_network.py) and error tables are our own,
+fitted to exact Fraunhofer PSFs by `python -m scripts.fit_p2s` and kept in p2s.safetensors.  A
+network sees the first modes only but is fitted to PSFs of all of them: what it gives is their mean
+under the modes it knows, so the modes it does without blur as they do on average.
 """
 
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import Tensor
 from torch.nn import functional
 
+from src.sim.turbulence.engines import weights as weights_engine
+from src.sim.turbulence.p2s_network import Network, shape_kinds
 from src.sim.turbulence.psf import resampling
 
 FILE = Path(__file__).with_suffix(".safetensors")
+BEYOND = 1.06  # the networks are fitted a little beyond the edge of their band
 FINE_PER_AIRY = 2.0  # samples of the basis per lambda / D: an intensity is band-limited to this
-CHUNK = 2048  # nodes at a time, so that the hidden layers stay in the cache
-
-
-@dataclass(frozen=True)
-class Network:
-    """Weights of the basis from Noll 4..modes + 1 in rad and the phase variance that is usual.
-
-    `layers`: weight and bias of three linear layers; after the first every number is squared, as an
-    intensity is of second order in the phase, after the second SiLU.  The last input is
-    (D/r0 / edge)^(5/3), `edge` that of the band.
-    """
-
-    edge: float
-    layers: tuple[tuple[Tensor, Tensor], ...]
-
-    @property
-    def modes(self) -> int:
-        """Noll modes 2..modes + 1 are known to the network (it needs no tilt)."""
-        return self.layers[0][0].shape[1] + 1
-
-    def weights(
-        self, coefficients: Float[Tensor, "blurmodes n"], d_over_r0: float, order: Tensor
-    ) -> Float[Tensor, "rank n"]:
-        """Return the weights of the basis functions `order` for Noll 4, 5, ... in rad.
-
-        Modes that are not given count as zero, those it does not know by their mean.
-        """
-        (first, shift), *rest = ((w.to(coefficients), b.to(coefficients)) for w, b in self.layers)
-        shift = shift + first[:, -1] * (d_over_r0 / self.edge) ** (5 / 3)
-        count = min(len(coefficients), self.modes - 2)
-        first, coefficients = first[:, :count].contiguous(), coefficients[:count]
-        (second, middle), (last, end) = rest
-        order = order.to(coefficients.device)
-        last, end = last[order], end[order]
-        out = coefficients.new_empty(len(last), coefficients.shape[1])
-        for begin in range(0, out.shape[1], CHUNK):
-            part = slice(begin, begin + CHUNK)
-            x = torch.addmm(shift[:, None], first, coefficients[:, part])
-            x = torch.addmm(middle[:, None], second, x.mul_(x))
-            x = functional.silu(x, inplace=True)
-            torch.addmm(end[:, None], last, x, out=out[:, part])
-        return out
 
 
 @dataclass(frozen=True)
@@ -70,8 +32,8 @@ class Band:
     """The basis and the networks for D/r0 up to `edge`.
 
     `mean` (fine, fine) and `basis` (rank, fine, fine) are PSFs sampled at FINE_PER_AIRY; the basis
-    is ordered by its share in a natural picture, and each function is even or odd under the mirror
-    of its rows and under that of its columns.  `networks`: from few modes to many.
+    is ordered by its share in a natural picture, each function of one kind.  `networks`: from few
+    modes to many.
     """
 
     edge: float
@@ -84,22 +46,25 @@ class Band:
 def bands() -> tuple[Band, ...]:
     """Return the fitted bands, weakest first."""
     stored = load_file(FILE)
-    return tuple(
-        Band(
-            edge=edge,
-            mean=stored[f"{index}.mean"],
-            basis=stored[f"{index}.basis"].float(),
-            networks=tuple(
-                _network(stored, f"{index}.{size}", edge) for size in range(stored["sizes"])
-            ),
-        )
-        for index, edge in enumerate(stored["edges"].tolist())
-    )
+    return tuple(_band(stored, index) for index in range(len(stored["edges"])))
 
 
-def _network(stored: dict[str, Tensor], name: str, edge: float) -> Network:
-    layers = ((stored[f"{name}.{n}.weight"], stored[f"{name}.{n}.bias"]) for n in (0, 2, 4))
-    return Network(edge, tuple((weight.float(), bias.float()) for weight, bias in layers))
+def _band(stored: dict[str, Tensor], index: int) -> Band:
+    edge, basis = float(stored["edges"][index]), stored[f"{index}.basis"].float()
+    counts = torch.bincount(shape_kinds(basis), minlength=4).tolist()
+    networks = []
+    for modes, width in stored["sizes"][index].tolist():
+        network = Network(modes, width, counts, edge).requires_grad_(False)
+        own = f"{index}.{len(networks)}."
+        state = {name: stored[own + name].float() for name in network.state_dict()}
+        network.load_state_dict(state)
+        networks.append(network)
+    return Band(edge, stored[f"{index}.mean"], basis, tuple(networks))
+
+
+def band_for(strength: float) -> Band | None:
+    """Return the weakest band that covers D/r0 = `strength`; None beyond the last."""
+    return next((band for band in bands() if strength <= BEYOND * band.edge), None)
 
 
 class Spots:
@@ -107,29 +72,39 @@ class Spots:
 
     `rank` basis functions of `band`, integrated over pixels of lambda / D / `airy_px`, `size` of
     them across; the light that falls outside them is not in them.
-    Weights are sorted by the symmetry of their functions: even in rows and columns, odd in columns,
-    odd in rows, odd in both; `ends` is where each kind ends.
+    Weights are sorted by the symmetry of their functions, their kind; `ends` is where each ends.
     """
 
     def __init__(
         self, band: Band, network: int, rank: int, airy_px: float, size: int, d_over_r0: float
     ):
         grid = resampling(size, band.mean.shape[-1], FINE_PER_AIRY / airy_px).float()
-        odd = [2 * _odd(shape, 0) + _odd(shape, 1) for shape in band.basis[:rank]]
-        kind = torch.tensor(odd, dtype=torch.long)
-        self.order = kind.argsort(stable=True)
-        self.ends = torch.bincount(kind, minlength=4).cumsum(0).numpy()
-        shapes = torch.cat([band.mean[None], band.basis[self.order]])
+        kind = shape_kinds(band.basis[:rank])
+        counts = torch.bincount(kind, minlength=4)
+        self.ends = counts.cumsum(0).numpy()
+        shapes = torch.cat([band.mean[None], band.basis[kind.argsort(stable=True)]])
         self.shapes = grid @ (shapes / band.mean.sum()) @ grid.T
         quarter = self.shapes[:, size // 2 :, size // 2 :]
         self.quarter = quarter.permute(1, 2, 0).contiguous().numpy()
-        self.network, self.d_over_r0 = band.networks[network], d_over_r0
+        self.network, self.d_over_r0 = band.networks[network].cut(counts.tolist()), d_over_r0
+        self.layers = self.network.matrices()
+        self.own = tuple(np.array(rows, np.int64) for rows in self.network.own)
 
     def __call__(
         self, phase: Float[Tensor, "blurmodes frames rows columns"]
     ) -> Float[Tensor, "rank frames rows columns"]:
-        """Return the weights at nodes for Noll 4, 5, ... in rad."""
-        weights = self.network.weights(phase.flatten(1), self.d_over_r0, self.order)
+        """Return the weights at nodes for Noll 4, 5, ... in rad.
+
+        Modes that are not given count as zero, those the network does not know by their mean.
+        """
+        known, given = self.network.modes - 2, phase.flatten(1)
+        given = functional.pad(given, (0, 0, 0, max(0, known - len(given))))[:known]
+        if given.device.type == "cpu":
+            usual = np.float32((self.d_over_r0 / self.network.edge) ** (5 / 3))
+            found = weights_engine.weights(given.numpy(), self.own, usual, self.layers)
+            weights = torch.from_numpy(found)
+        else:
+            weights = self.network.to(given.device)(given.T, self.d_over_r0).T
         return weights.unflatten(1, phase.shape[1:])
 
     def psfs(
@@ -139,7 +114,3 @@ class Spots:
         mean, basis = self.shapes[0].flatten(), self.shapes[1:].flatten(1)
         flat = torch.addmm(mean[:, None].to(weights), basis.T.to(weights), weights.flatten(1))
         return flat.clamp_(min=0).unflatten(1, weights.shape[1:])
-
-
-def _odd(shape: Float[Tensor, "fine fine"], axis: int) -> bool:
-    return bool((shape * shape.flip(axis)).sum() < 0)

@@ -14,20 +14,16 @@ periodic, and frequencies reach down to zero.
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
-from itertools import pairwise
 
 import torch
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Complex, Float
 from torch import Tensor
 
 from src.sim import noise
 from src.sim.turbulence.atmosphere import Atmosphere
-from src.sim.turbulence.lattice import Lattice
-from src.sim.turbulence.zernike import SPECTRUM, noll_index, pupil_filter
+from src.sim.turbulence.zernike import SPECTRUM, pupil_filter
 
 LOW, HIGH = 0.08, 0.32  # limits of the three power laws that kappa is drawn from; HIGH per (n + 1)
-FAINT = 1e-4, 3e-3  # of the variance of the modes of an order, tilt and the rest, left out
 DEPTH = 1.0  # waves are drawn with the density Cn2 (1 - z/L)^DEPTH
 SHARES = (0.25, 0.65, 0.10)  # of the waves below LOW, between, above HIGH
 
@@ -84,74 +80,6 @@ def draw_waves(atmosphere: Atmosphere, key: int, *, modes: int, waves: int, widt
     )
 
 
-class Field:
-    """The Noll coefficients of `modes` (0 is x-tilt) on the nodes of two lattices, in rad.
-
-    `size` is the frame's (height, width); the axis of the camera goes through its middle.  A wave
-    on a lattice is its rows times its columns, so the sum over waves is a product of matrices, one
-    for all modes of an order n, over the waves which that order sees; of the columns only half is
-    computed, since what is even about the middle column and what is odd serve the other half too.
-    """
-
-    def __init__(
-        self,
-        waves: Waves,
-        modes: slice,
-        rows: Lattice,
-        columns: Lattice,
-        size: tuple[int, int],
-        device: torch.device,
-    ):
-        middle = (columns.pixels[0] + columns.pixels[-1]) / 2
-        turned = torch.complex(*_turns(waves.frequency[:, 0], middle - (size[1] - 1) / 2))
-        response = torch.view_as_complex(waves.response[modes]).to(torch.complex64) * turned
-        down = _turns(waves.frequency[:, 1], rows.pixels - (size[0] - 1) / 2)
-        half = columns.pixels[len(columns.pixels) // 2 :] - middle
-        across = _turns(waves.frequency[:, 0], half)
-        self.orders = []
-        for own in _orders(modes.start or 0, len(response)):
-            seen = _seen(response[own], FAINT[own.start + (modes.start or 0) > 1])
-            tables = [part[seen].T.contiguous() for part in down] + [part[seen] for part in across]
-            parts = [part.to(device) for part in (response[own][:, seen], *tables)]
-            self.orders.append((own, seen, *parts))
-        self.shape = (len(response), len(rows.pixels), len(columns.pixels))
-        self.rows, self.columns, self.device = rows, columns, device
-
-    def at_nodes(
-        self, amplitudes: Complex[Tensor, "frames waves"]
-    ) -> Float[Tensor, "modes frames rows columns"]:
-        """Return the coefficients on the nodes: Re sum_m c_m w_m Q_j exp(2 pi i f_m . x)."""
-        modes, rows, columns = self.shape
-        out = torch.empty(modes, len(amplitudes), rows, columns, device=self.device)
-        left = columns // 2
-        for own, seen, response, cos_down, sin_down, cos, sin in self.orders:
-            turn = (response[:, None] * amplitudes[:, seen])[:, :, None]
-            real, imag = turn.real.contiguous(), turn.imag.contiguous()
-            even = (real * cos_down).addcmul_(imag, sin_down, value=-1).flatten(0, 2) @ cos
-            odd = (real * sin_down).addcmul_(imag, cos_down).flatten(0, 2) @ sin
-            lines = out[own].view(-1, columns)
-            torch.sub(even, odd, out=lines[:, left:])
-            lines[:, :left] = even.add_(odd)[:, columns % 2 :].flip(1)
-        return out
-
-    def at_pixels(
-        self, amplitudes: Complex[Tensor, "frames waves"]
-    ) -> Float[Tensor, "modes frames h w"]:
-        """Return the coefficients on all pixels that the lattices serve."""
-        field = self.at_nodes(amplitudes)
-        if self.rows.pitch > 1:
-            field = self._vertical @ field
-        return field @ self._horizontal if self.columns.pitch > 1 else field
-
-    @cached_property
-    def _vertical(self) -> Float[Tensor, "h rows"]:
-        return self.rows.weights().to(self.device)
-
-    @cached_property
-    def _horizontal(self) -> Float[Tensor, "columns w"]:
-        return self.columns.weights().T.to(self.device)
-
-
 def evolve(
     fresh: Float[Tensor, "views frames waves 2"], alpha: float
 ) -> Complex[Tensor, "views frames waves"]:
@@ -185,32 +113,6 @@ def look_from(waves: Waves, baselines: Float[Tensor, "views 2"]) -> Complex[Tens
     Their line of sight to an object point crosses a layer baseline (1 - z/L) away.
     """
     return torch.exp(2j * math.pi * (baselines @ waves.layer.T) * (1 - waves.place))
-
-
-def _orders(first: int, count: int) -> list[slice]:
-    """Return the modes first .. first + count - 1 (0 is x-tilt) by order n, numbered from 0."""
-    order = [noll_index(mode + 2)[0] for mode in range(first, first + count)]
-    edges = [i for i in range(count + 1) if i in (0, count) or order[i] != order[i - 1]]
-    return [slice(*pair) for pair in pairwise(edges)]
-
-
-def _seen(response: Complex[Tensor, "modes waves"], faint: float) -> Int[Tensor, " some"]:
-    """Return the waves that make up the modes' variance, all but `faint` of it."""
-    share = response.abs().square().sum(0)
-    strength, order = share.sort()
-    kept = order[strength.cumsum(0) > faint * strength.sum()]
-    return kept.sort().values
-
-
-def _turns(frequency: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
-    """Return cos and sin of 2 pi f x, float32 (waves, *places), of every wave at every place.
-
-    Whole turns are taken off in float64.
-    """
-    place = torch.as_tensor(place).double()
-    turns = frequency.reshape(-1, *[1] * place.ndim) * place
-    angle = (2 * math.pi * (turns - turns.round())).float()
-    return angle.cos(), angle.sin()
 
 
 def _sequence(key: int, count: int) -> Float[Tensor, "count 3"]:

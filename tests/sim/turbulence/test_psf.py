@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from src.sim.turbulence.fidelity import band_for
-from src.sim.turbulence.p2s import FILE, FINE_PER_AIRY, Spots, bands
+from src.sim.turbulence.p2s import FILE, FINE_PER_AIRY, Spots, band_for, bands
+from src.sim.turbulence.p2s_network import shape_kinds
 from src.sim.turbulence.psf import fraunhofer_psf, resampling
 from src.sim.turbulence.zernike import noll_covariance
 
@@ -60,9 +60,9 @@ def exact_and_fitted(strength: float, number: int) -> tuple[torch.Tensor, torch.
     size = band.mean.shape[-1]
     exact = fraunhofer_psf(coefficients, airy_px=FINE_PER_AIRY, size=size, pupil=size - 3, points=1)
     network = band.networks[number]
-    known = coefficients[:, 2 : network.modes].T
-    weights = network.weights(known, strength, torch.arange(len(band.basis)))
-    return exact.flatten(1), band.mean.flatten() + weights.T @ band.basis.flatten(1)
+    weights = network(coefficients[:, 2 : network.modes], strength)
+    basis = band.basis[shape_kinds(band.basis).argsort(stable=True)]
+    return exact.flatten(1), band.mean.flatten() + weights @ basis.flatten(1)
 
 
 def relative(error: torch.Tensor, truth: torch.Tensor) -> float:

@@ -1,0 +1,75 @@
+"""The networks from phase to PSF weights: their symmetries, and the CPU engine against torch."""
+
+import numpy as np
+import pytest
+import torch
+
+from src.sim.turbulence.engines.weights import weights
+from src.sim.turbulence.p2s_network import Network, mode_kind, shape_kinds
+from src.sim.turbulence.psf import fraunhofer_psf
+from src.sim.turbulence.zernike import noll_index
+
+COUNTS = [5, 3, 2, 3]
+KINDS = torch.arange(4).repeat_interleave(torch.tensor(COUNTS))
+
+
+def phases(modes: int, count: int = 300) -> torch.Tensor:
+    return torch.randn(count, modes - 2, generator=torch.Generator().manual_seed(1))
+
+
+def network(modes: int, width: int = 16) -> Network:
+    torch.manual_seed(0)
+    return Network(modes, width, COUNTS, edge=4.0).requires_grad_(False)
+
+
+def turned(phase: torch.Tensor, down: bool, across: bool) -> torch.Tensor:
+    """Mirror the rows and the columns of a phase."""
+    kinds = torch.tensor([mode_kind(mode) for mode in range(4, 4 + phase.shape[1])])
+    odd = (down & (kinds // 2 == 1)) ^ (across & (kinds % 2 == 1))
+    return torch.where(odd, -phase, phase)
+
+
+@pytest.mark.parametrize("down, across", [(True, False), (False, True), (True, True)])
+def test_a_mirrored_phase_has_mirrored_weights(down, across):
+    net, phase = network(27), phases(27)
+    odd = (down & (KINDS // 2 == 1)) ^ (across & (KINDS % 2 == 1))
+    mirrored = net(turned(phase, down, across), 3.0)
+    torch.testing.assert_close(mirrored, torch.where(odd, -1, 1) * net(phase, 3.0))
+    assert (mirrored - net(phase, 3.0))[:, odd].abs().max() > 0.01
+
+
+def test_half_a_turn_and_another_sign_change_nothing():
+    """|F(P exp(i phi))| is that of -phi(-x), as that field is the conjugate, turned."""
+    net, phase = network(27), phases(27)
+    even = torch.tensor([noll_index(mode)[0] % 2 == 0 for mode in range(4, 28 + 1)])
+    other = torch.where(even, -phase, phase)
+    torch.testing.assert_close(net(other, 3.0), net(phase, 3.0))
+    full = (torch.nn.functional.pad(some[:2], (2, 0)) for some in (phase, other))
+    one, two = (fraunhofer_psf(some, airy_px=2.0, size=21) for some in full)
+    torch.testing.assert_close(one, two, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("modes, width", [(5, 16), (9, 16), (20, 32), (77, 112)])
+@pytest.mark.parametrize("nodes", [1, 128, 300])
+def test_the_engine_equals_the_network(modes, width, nodes):
+    net, phase = network(modes, width), phases(modes, nodes)
+    own = tuple(np.array(rows, np.int64) for rows in net.own)
+    usual = np.float32((3.0 / 4.0) ** (5 / 3))
+    found = weights(phase.T.contiguous().numpy(), own, usual, net.matrices())
+    torch.testing.assert_close(torch.from_numpy(found).T, net(phase, 3.0), atol=2e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("counts", [[5, 3, 2, 3], [3, 1, 1, 0], [1, 0, 0, 0]])
+def test_a_cut_network_gives_the_first_functions_of_each_kind(counts):
+    net, phase = network(20), phases(20)
+    kept = [np.arange(k) + start for k, start in zip(counts, (0, 5, 8, 10), strict=True)]
+    whole = net(phase, 2.0)[:, np.concatenate(kept)]
+    torch.testing.assert_close(net.cut(counts)(phase, 2.0), whole)
+    assert net.cut(counts).macs(sum(counts)) <= net.macs(13)
+
+
+def test_kinds_of_shapes():
+    x = torch.linspace(-1, 1, 9)
+    even, odd = torch.exp(-(x**2)), x * torch.exp(-(x**2))
+    shapes = [even[:, None] * even, even[:, None] * odd, odd[:, None] * even, odd[:, None] * odd]
+    assert shape_kinds(torch.stack(shapes)).tolist() == [0, 1, 2, 3]
