@@ -4,6 +4,7 @@ A wave on a lattice is its rows times its columns.  On the CPU the passes before
 products are compiled (engines/waves.py), elsewhere they are torch expressions.
 """
 
+from collections.abc import Callable
 from functools import cached_property
 from itertools import pairwise
 from math import pi
@@ -13,7 +14,7 @@ from jaxtyping import Complex, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from src.sim.turbulence.engines import waves as engine
+from src.sim.turbulence.engines import waves as compiled
 from src.sim.turbulence.lattice import Lattice
 from src.sim.turbulence.phase import Waves
 from src.sim.turbulence.zernike import noll_index
@@ -56,17 +57,19 @@ class Field:
         self.rows, self.columns, self.device = rows, columns, device
 
     def at_nodes(
-        self, amplitudes: Complex[Tensor, "frames waves"]
+        self, amplitudes: Complex[Tensor, "frames waves"], engine: Callable | None = None
     ) -> Float[Tensor, "modes frames rows columns"]:
-        """Return the coefficients on the nodes: Re sum_m c_m w_m Q_j exp(2 pi i f_m . x)."""
+        """Return the coefficients on the nodes: Re sum_m c_m w_m Q_j exp(2 pi i f_m . x).
+
+        `engine`: `sums` or `sums_cpu`; None: the one for the device.
+        """
+        engine = engine or (sums_cpu if self.device.type == "cpu" else sums)
         modes, rows, columns = self.shape
         out = torch.empty(modes, len(amplitudes), rows, columns, device=self.device)
         for own, seen, response, *tables in self.orders:
             turn = (response[:, None] * amplitudes[:, seen]).flatten(0, 1)
-            sums = _sums_cpu if self.device.type == "cpu" else _sums
-            sums(
-                turn.real.contiguous(), turn.imag.contiguous(), *tables, out[own].view(-1, columns)
-            )
+            real, imag = turn.real.contiguous(), turn.imag.contiguous()
+            engine(real, imag, *tables, out[own].view(-1, columns))
         return out
 
     def at_pixels(
@@ -87,7 +90,7 @@ class Field:
         return self.columns.weights().T.to(self.device)
 
 
-def _sums(
+def sums(
     real: Float[Tensor, "lines waves"],
     imag: Float[Tensor, "lines waves"],
     cos_down: Float[Tensor, "rows waves"],
@@ -105,12 +108,12 @@ def _sums(
     out[:, :left] = (even + odd)[:, middle : left + middle].flip(1)
 
 
-def _sums_cpu(real, imag, cos_down, sin_down, cos, sin, out) -> None:
+def sums_cpu(real, imag, cos_down, sin_down, cos, sin, out) -> None:
     """Do the same in fewer passes."""
     down = (real, imag, cos_down, sin_down)
-    even, odd = engine.spread(*(part.numpy() for part in down))
+    even, odd = compiled.spread(*(part.numpy() for part in down))
     even, odd = torch.from_numpy(even) @ cos, torch.from_numpy(odd) @ sin
-    engine.join(even.numpy(), odd.numpy(), out.numpy())
+    compiled.join(even.numpy(), odd.numpy(), out.numpy())
 
 
 def _orders(first: int, count: int) -> list[slice]:
