@@ -14,7 +14,7 @@ import pytest
 from tests.conftest import ROOT
 
 SMALL = ["scene.height=64", "scene.width=64", "data.test_windows=4", "data.test_crop=32"]
-SCORED = [*SMALL, "data.test_clips=1", "data.warmup=1", "data.workers=0", "metrics.lpips=null"]
+SCORED = [*SMALL, "data.test_clips=2", "data.warmup=1", "data.workers=0", "metrics.lpips=null"]
 TINY = {  # what is added to a command, so that it is over in seconds
     "train": ["debug=fdr", "loss=l1", "metrics.lpips=null", "logger=none"],
     "eval": SCORED,

@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from src.sim.turbulence.grids import at, between, table
 from src.sim.turbulence.p2s import FINE_PER_AIRY, Band, band_for, bands
-from src.sim.turbulence.tables import at, between, table
 from src.sim.turbulence.zernike import noll_index
 
 SHARES = {"psf": 0.57, "pitch": 0.33, "kernel": 0.1}  # of what is allowed, where PSFs are exact

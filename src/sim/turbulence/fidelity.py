@@ -14,9 +14,9 @@ from torch import Tensor
 from src.sim.turbulence import choice
 from src.sim.turbulence.atmosphere import ALPHA_FPS, TILT_VARIANCE, Atmosphere
 from src.sim.turbulence.choice import MAX_PITCH
+from src.sim.turbulence.grids import at, between, table
 from src.sim.turbulence.p2s import band_for
 from src.sim.turbulence.seeing import half_light
-from src.sim.turbulence.tables import at, between, table
 
 CONTRAST = 0.2  # rms contrast of a natural picture
 UNSEEN = 0.5 / 255  # rms error that nobody needs to go below
