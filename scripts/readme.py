@@ -33,6 +33,8 @@ ONE, NINE = ("setnet_small", 1), ("setnet_small", 9)  # of the picture
 AIR = ("turbulence=strong", "turbulence.atmosphere.half_length_px=[10,20]",
        "turbulence.atmosphere.near_rigid=0.0")  # fmt: skip
 PAPER = "nine views, E2VID (the paper's way)"
+FIRENET, CISTA = "published FireNet+, one view", "published CISTA-TC, one view"
+HIGHPASS = "high-pass, one view"
 ROWS = {  # what it is: a network in weights/, how many of the nine views it is given
     "nine views, SetNet medium": ("setnet_medium", 9),
     "nine views, SetNet small": ("setnet_small", 9),
@@ -47,15 +49,18 @@ BASELINES = {  # their files in the folder of published weights
     "highpass": [],
 }
 OTHERS = {
-    "published FireNet+, one view": ("firenet_plus", 1),
-    "published CISTA-TC, one view": ("cista", 1),
-    "high-pass, one view": ("highpass", 1),
+    FIRENET: ("firenet_plus", 1),
+    CISTA: ("cista", 1),
+    HIGHPASS: ("highpass", 1),
 }
 PAIRS = {  # rows whose difference is shown, clip by clip
     "nine views less one, E2VID": (PAPER, "one view, E2VID"),
     "nine views less one, SetNet medium": ("nine views, SetNet medium", "one view, SetNet medium"),
     "nine views, SetNet medium less E2VID": ("nine views, SetNet medium", PAPER),
     "nine views, SetNet small less E2VID": ("nine views, SetNet small", PAPER),
+    "nine views, E2VID less FireNet+": (PAPER, FIRENET),
+    "nine views, E2VID less CISTA-TC": (PAPER, CISTA),
+    "nine views, E2VID less high-pass": (PAPER, HIGHPASS),
 }
 
 
@@ -105,15 +110,17 @@ def table(values: dict[str, list[dict[str, float]]]) -> str:
     for row, clips in values.items():
         cells = [written(metric, [clip[metric.name] for clip in clips]) for metric in METRICS]
         lines.append(f"| {row} | " + " | ".join(cells) + " |")
-    for name, (nine, one) in PAIRS.items():
-        lines.append(f"| *{name}* | " + " | ".join(gains(values[nine], values[one])) + " |")
+    for name, (first, second) in PAIRS.items():
+        if {first, second} <= set(values):
+            cells = gains(values[first], values[second])
+            lines.append(f"| *{name}* | " + " | ".join(cells) + " |")
     note = "in brackets what holds 95 % of the means, or differences, of resampled clips."
     return "\n".join([*lines, "", f"{len(next(iter(values.values())))} clips; {note}"])
 
 
-def gains(nine: list[dict[str, float]], one: list[dict[str, float]]) -> list[str]:
+def gains(first: list[dict[str, float]], second: list[dict[str, float]]) -> list[str]:
     """Return by how much the scores of the same clips differ, per metric."""
-    pairs = list(zip(nine, one, strict=True))
+    pairs = list(zip(first, second, strict=True))
     return [written(m, [a[m.name] - b[m.name] for a, b in pairs], "+") for m in METRICS]
 
 
