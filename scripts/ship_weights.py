@@ -75,7 +75,7 @@ def facts(run: Path, content: dict, first: DictConfig) -> dict:
         "windows_seen": content["windows"],
         "hours": round(content["seconds"] / 3600, 2),
         "clock": cfg.clock,
-        "commit": results.commit(),
+        "commit": _commit(run),
         "config_sha256": results.digest(text),
         "scenes": _scenes(cfg),
         "turbulence": cfg.turbulence.atmosphere.severity if cfg.turbulence.atmosphere else "none",
@@ -98,6 +98,12 @@ def going_on(content: dict) -> dict:
             time = {"hours": content["seconds"] / 3600, "loss": state["loss"]}
             return {REACHED: time | counts | {"curve": state["rows"]}}
     return {}
+
+
+def _commit(run: Path) -> str:
+    """Return the commit at which `run` ended; of one that has not, that of the working tree."""
+    record = run / "results.json"
+    return json.loads(record.read_text())["git"] if record.is_file() else results.commit()
 
 
 def first_config(run: Path) -> DictConfig:
