@@ -23,7 +23,7 @@ BLURRED = 0.88  # measured at 0.16 D, D/r0 4, two and three pixels between nodes
 UNRELATED = 2.0  # the error of a PSF taken from a place that has nothing to do with it
 WAVES = 540  # that a mode of order n sees, times n
 NS_WAVE, NS_ROW = 0.023, 0.012  # a wave of a mode at a node, and for each pixel between nodes
-NS_LAYER, NS_NODE = 0.057, 25.0  # a weight of a network at a node, and a node itself
+NS_LAYER, NS_NODE = 0.040, 33.0  # a weight of a network at a node, and a node itself
 NS_QUAD, NS_RANK = 1.1, 0.065  # four pixels of a PSF, and each basis function in them
 NS_TAP, NS_BETWEEN = 0.15, 0.2  # a pixel of a PSF at work, on a row of nodes and between two
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-BLOCK = 128  # nodes
+BLOCK = 192  # nodes
 ZERO, THREE, SIX, SIXTH = np.float32(0), np.float32(3), np.float32(6), np.float32(1 / 6)
 
 
@@ -83,23 +83,31 @@ def _gather(phase, own, start, stop, part):
 
 @njit(nogil=True, fastmath=True)
 def _linear(matrix, inputs, out):
-    """Write matrix[:, :-1] @ inputs + matrix[:, -1] to `out`, four inputs at a time."""
+    """Write matrix[:, :-1] @ inputs + matrix[:, -1] to `out`, two rows by four inputs at a time."""
     count, last = out.shape[1], matrix.shape[1] - 1
-    fours = last // 4 * 4
+    twos, fours = len(matrix) // 2 * 2, last // 4 * 4
     for j in range(len(matrix)):
-        row, line = matrix[j], out[j]
-        constant = row[last]
+        line, constant = out[j], matrix[j, last]
         for x in range(count):
             line[x] = constant
+    for j in range(0, twos, 2):
         for i in range(0, fours, 4):
-            a, b, c, d = row[i], row[i + 1], row[i + 2], row[i + 3]
-            one, two, three, four = inputs[i], inputs[i + 1], inputs[i + 2], inputs[i + 3]
-            for x in range(count):
-                line[x] += a * one[x] + b * two[x] + c * three[x] + d * four[x]
-        for i in range(fours, last):
-            a, one = row[i], inputs[i]
+            _two_by_four(matrix[j, i:], matrix[j + 1, i:], inputs[i:], out[j], out[j + 1])
+    for j in range(len(matrix)):
+        for i in range(fours if j < twos else 0, last):
+            a, one, line = matrix[j, i], inputs[i], out[j]
             for x in range(count):
                 line[x] += a * one[x]
+
+
+@njit(nogil=True, fastmath=True, inline="always")
+def _two_by_four(row, other, inputs, line, below):
+    a, b, c, d = row[0], row[1], row[2], row[3]
+    e, f, g, h = other[0], other[1], other[2], other[3]
+    one, two, three, four = inputs[0], inputs[1], inputs[2], inputs[3]
+    for x in range(len(line)):
+        line[x] += a * one[x] + b * two[x] + c * three[x] + d * four[x]
+        below[x] += e * one[x] + f * two[x] + g * three[x] + h * four[x]
 
 
 @njit(nogil=True, fastmath=True)
