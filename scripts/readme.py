@@ -1,10 +1,11 @@
-"""The picture and table of the README: python -m scripts.readme --root PHOTOS [--footage VIDEO].
+"""The README's picture, and shipped weights measured: python -m scripts.readme --root PHOTOS.
 
-Made anew from the weights that are shipped: docs/figures/nine_views.png, and the section between
-the README's marks `report:results`, scores of test clips of the photographs in PHOTOS
-(data=test_photos), each simulated once for all networks, beside the published ones whose weights
-are in `--published`.  Without PHOTOS only the picture.  With VIDEO, a still scene through air, the
-same of data=test_footage for docs/results.md.
+Made anew: docs/figures/nine_views.png, and the section between the README's marks `report:results`,
+scores of test clips of the photographs in PHOTOS (data=test_photos), each simulated once for all
+networks, beside the published ones whose weights are in `--published`.  Without PHOTOS only the
+picture.  The same for docs/results.md of data=test_footage, with `--footage`, a still scene through
+air, and, what differs, of sensors that have faults (sensor=drawn).  The networks' cards are given
+the scores, too, and those of data=test_targets.
 """
 
 import argparse
@@ -23,6 +24,8 @@ from src.bench.candidates import Subject
 from src.figures import plots
 from src.metrics.bootstrap import interval
 from src.metrics.table import METRICS, Metric
+from src.models import files
+from src.records import results
 from src.reports.writers import replace_section
 from src.sim.optics import layout
 from src.sim.pipeline import Sample, simulate
@@ -52,6 +55,11 @@ OTHERS = {
     FIRENET: ("firenet_plus", 1),
     CISTA: ("cista", 1),
     HIGHPASS: ("highpass", 1),
+}
+TABLES = {  # of what is measured: the document, its section, and whether rows are in it
+    "data=test_photos": ("README.md", "results", True),
+    "data=test_footage": ("docs/results.md", "footage", True),
+    "data=test_photos sensor=drawn": ("docs/results.md", "drawn", False),
 }
 PAIRS = {  # rows whose difference is shown, clip by clip
     "nine views less one, E2VID": (PAPER, "one view, E2VID"),
@@ -103,11 +111,11 @@ def scores(cfg: DictConfig, rows: dict[str, Subject]) -> dict[str, list[dict[str
     return values
 
 
-def table(values: dict[str, list[dict[str, float]]]) -> str:
-    """Return the `scores` of rows as Markdown, and the differences of PAIRS."""
+def table(values: dict[str, list[dict[str, float]]], rows: bool) -> str:
+    """Return the scores of `values` as Markdown, where `rows` says so, and differences of PAIRS."""
     heads = [f"{metric.heading} {metric.arrow}" for metric in METRICS]
     lines = ["| | " + " | ".join(heads) + " |", "|---|" + "---|" * len(heads)]
-    for row, clips in values.items():
+    for row, clips in values.items() if rows else ():
         cells = [written(metric, [clip[metric.name] for clip in clips]) for metric in METRICS]
         lines.append(f"| {row} | " + " | ".join(cells) + " |")
     for name, (first, second) in PAIRS.items():
@@ -128,6 +136,18 @@ def written(metric: Metric, values: list[float], sign: str = "") -> str:
     """Return the mean and its interval."""
     form, (low, high) = f"{sign}.{metric.digits}f", interval(values)
     return f"{np.mean(values):{form}} ({low:{form}} to {high:{form}})"
+
+
+def on_card(card: Path, protocol: str, clips: list[dict[str, float]]) -> None:
+    """Put the scores of `clips` on a card, in the place of what was there of their protocol."""
+    what = f"| `{protocol}`, by scripts.readme, at {results.commit()} | {len(clips)} | "
+    cells = (written(metric, [clip[metric.name] for clip in clips]) for metric in METRICS)
+    lines = card.read_text().splitlines()
+    old = [n for n, line in enumerate(lines) if line.startswith(f"| `{protocol}`")]
+    last = lines.index(next(line for line in lines if line.startswith("In brackets"))) - 1
+    place = slice(old[0], old[0] + 1) if old else slice(last, last)
+    lines[place] = [what + " | ".join(cells) + " |"]
+    results.write_text(card, "\n".join(lines) + "\n")
 
 
 def picture(path: Path, index: int, windows: int) -> None:
@@ -170,14 +190,24 @@ def main() -> None:
     picture(HOME / "docs" / "figures" / "nine_views.png", given.index, 40)
     if not given.root:
         return
-    clips = [f"scene.root={given.root}", f"data.test_clips={given.clips}"]
+    photos = [f"scene.root={given.root}", f"data.test_clips={given.clips}"]
+    asked = {
+        "data=test_photos": photos,
+        "data=test_photos sensor=drawn": photos,
+        "data=test_targets": [],
+    }
+    if given.footage:
+        asked["data=test_footage"] = [f"turbulence.root={given.footage}", *photos]
     chosen = ROWS | (OTHERS if given.published else {})
     rows = {row: subject(*what, given.published) for row, what in chosen.items()}
-    cfg = config("eval", "data=test_photos", *clips)
-    replace_section(HOME / "README.md", "results", table(scores(cfg, rows)))
-    if given.footage:
-        cfg = config("eval", "data=test_footage", f"turbulence.root={given.footage}", *clips)
-        replace_section(HOME / "docs" / "results.md", "footage", table(scores(cfg, rows)))
+    cards = {name: row for row, (name, _) in reversed(ROWS.items())}  # the row of most views
+    for protocol, overrides in asked.items():
+        values = scores(config("eval", *protocol.split(), *overrides), rows)
+        if protocol in TABLES:
+            document, section, whole = TABLES[protocol]
+            replace_section(HOME / document, section, table(values, whole))
+        for name, row in cards.items():
+            on_card(files.WEIGHTS / f"{name}.md", protocol, values[row])
 
 
 if __name__ == "__main__":

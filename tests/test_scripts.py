@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from scripts import air_map as air
-from scripts import alignment, gallery, surroundings, widen_setnet
+from scripts import alignment, gallery, readme, surroundings, widen_setnet
 from scripts.scales import missing
 from scripts.ship_weights import recard, ship
 from src.app import build
 from src.figures import air_map
+from src.metrics.table import METRICS
 from src.models import files
 from src.models.setnet import SetNet
 from src.models.unroll import unroll
@@ -52,6 +53,22 @@ def test_a_trained_run_is_shipped_whole_with_its_card(tmp_path, monkeypatch):
     assert recard("tiny/one", [run, run]) == path and path.read_bytes() == whole
     anew = path.with_suffix(".md").read_text().splitlines()
     assert len(anew) == len(card.splitlines()) + 1 and set(anew) == set(card.splitlines())
+
+
+def test_scores_take_the_place_of_older_ones_on_a_card(tmp_path):
+    card = tmp_path / "one.md"
+    card.write_text("| tested on |\n|---|\n\nIn brackets: the interval.\n")
+    scored = {metric.name: 0.5 for metric in METRICS}
+    readme.on_card(card, "data=test_photos", [scored])
+    readme.on_card(card, "data=test_photos sensor=drawn", [scored])
+    readme.on_card(card, "data=test_photos", [scored, scored])
+    rows = card.read_text().splitlines()[2:]
+    assert (
+        rows[0].startswith("| `data=test_photos`, by scripts.readme, at ")
+        and "| 2 | 0.5" in rows[0]
+    )
+    assert rows[1].startswith("| `data=test_photos sensor=drawn`") and "| 1 | 0.5" in rows[1]
+    assert rows[2:] == ["", "In brackets: the interval."]
 
 
 def test_a_map_of_air_says_where_views_pay(tmp_path):

@@ -1,4 +1,4 @@
-"""Every sweep is a multirun whose jobs compose, and whose first and last job run, tiny."""
+"""Every sweep is a multirun whose jobs compose, and whose last job runs, tiny."""
 
 import json
 import subprocess
@@ -60,7 +60,7 @@ def weights(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("path", SWEEPS, ids=lambda path: path.stem)
-def test_every_job_composes_and_two_run(path, tmp_path, weights):
+def test_every_job_composes_and_the_last_runs(path, tmp_path, weights):
     sweep = content(path)
     door = sweep["defaults"][0]
     assert sweep["defaults"][-1] == "_self_" and sweep["hydra"]["mode"] == "MULTIRUN"
@@ -76,10 +76,8 @@ def test_every_job_composes_and_two_run(path, tmp_path, weights):
         "stress": (["ckpt=lf3x3", "clips=1", "processes=1", "data.test_windows=60"], stress),
     }[door]
     output = {reconstruct: "video.h5", stress: "stress.csv"}.get(work, "results.json")
-    for place in (0, -1):
-        run = tmp_path / str(place)
-        work(composed(path, run, *found[place], *tiny))
-        assert (run / output).is_file()
+    work(composed(path, tmp_path / "last", *found[-1], *tiny))
+    assert (tmp_path / "last" / output).is_file()
 
 
 SCORED = ["-m", "baseline=highpass", "debug=fdr", "metrics.lpips=null"]
