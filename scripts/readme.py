@@ -116,14 +116,18 @@ def table(values: dict[str, list[dict[str, float]]], rows: bool) -> str:
     heads = [f"{metric.heading} {metric.arrow}" for metric in METRICS]
     lines = ["| | " + " | ".join(heads) + " |", "|---|" + "---|" * len(heads)]
     for row, clips in values.items() if rows else ():
-        cells = [written(metric, [clip[metric.name] for clip in clips]) for metric in METRICS]
-        lines.append(f"| {row} | " + " | ".join(cells) + " |")
+        lines.append(f"| {row} | " + " | ".join(means(clips)) + " |")
     for name, (first, second) in PAIRS.items():
         if {first, second} <= set(values):
             cells = gains(values[first], values[second])
             lines.append(f"| *{name}* | " + " | ".join(cells) + " |")
     note = "in brackets what holds 95 % of the means, or differences, of resampled clips."
     return "\n".join([*lines, "", f"{len(next(iter(values.values())))} clips; {note}"])
+
+
+def means(clips: list[dict[str, float]]) -> list[str]:
+    """Return the scores of clips, per metric."""
+    return [written(m, [clip[m.name] for clip in clips]) for m in METRICS]
 
 
 def gains(first: list[dict[str, float]], second: list[dict[str, float]]) -> list[str]:
@@ -138,15 +142,16 @@ def written(metric: Metric, values: list[float], sign: str = "") -> str:
     return f"{np.mean(values):{form}} ({low:{form}} to {high:{form}})"
 
 
-def on_card(card: Path, protocol: str, clips: list[dict[str, float]]) -> None:
+def on_card(card: Path, protocol: str, commit: str, clips: list[dict[str, float]]) -> None:
     """Put the scores of `clips` on a card, in the place of what was there of their protocol."""
-    what = f"| `{protocol}`, by scripts.readme, at {results.commit()} | {len(clips)} | "
-    cells = (written(metric, [clip[metric.name] for clip in clips]) for metric in METRICS)
-    lines = card.read_text().splitlines()
-    old = [n for n, line in enumerate(lines) if line.startswith(f"| `{protocol}`")]
-    last = lines.index(next(line for line in lines if line.startswith("In brackets"))) - 1
-    place = slice(old[0], old[0] + 1) if old else slice(last, last)
-    lines[place] = [what + " | ".join(cells) + " |"]
+    start, lines = f"| `{protocol}`", card.read_text().splitlines()
+    what = f"{start}, by scripts.readme, at {commit} | {len(clips)} | "
+    row = what + " | ".join(means(clips)) + " |"
+    place = next(n for n, line in enumerate(lines) if line.startswith((start, "In brackets")))
+    if lines[place].startswith(start):
+        lines[place] = row
+    else:  # at the end of the table, a blank line before what is said of its brackets
+        lines.insert(place - 1, row)
     results.write_text(card, "\n".join(lines) + "\n")
 
 
@@ -187,6 +192,7 @@ def main() -> None:
     given = parser.parse_args()
     if given.footage and not given.root:
         parser.error("--footage needs --root, the photographs that it moves")
+    commit = results.commit()  # before anything is written
     picture(HOME / "docs" / "figures" / "nine_views.png", given.index, 40)
     if not given.root:
         return
@@ -207,7 +213,7 @@ def main() -> None:
             document, section, whole = TABLES[protocol]
             replace_section(HOME / document, section, table(values, whole))
         for name, row in cards.items():
-            on_card(files.WEIGHTS / f"{name}.md", protocol, values[row])
+            on_card(files.WEIGHTS / f"{name}.md", protocol, commit, values[row])
 
 
 if __name__ == "__main__":

@@ -59,14 +59,11 @@ def test_scores_take_the_place_of_older_ones_on_a_card(tmp_path):
     card = tmp_path / "one.md"
     card.write_text("| tested on |\n|---|\n\nIn brackets: the interval.\n")
     scored = {metric.name: 0.5 for metric in METRICS}
-    readme.on_card(card, "data=test_photos", [scored])
-    readme.on_card(card, "data=test_photos sensor=drawn", [scored])
-    readme.on_card(card, "data=test_photos", [scored, scored])
+    readme.on_card(card, "data=test_photos", "abc", [scored])
+    readme.on_card(card, "data=test_photos sensor=drawn", "abc", [scored])
+    readme.on_card(card, "data=test_photos", "abc", [scored, scored])
     rows = card.read_text().splitlines()[2:]
-    assert (
-        rows[0].startswith("| `data=test_photos`, by scripts.readme, at ")
-        and "| 2 | 0.5" in rows[0]
-    )
+    assert rows[0].startswith("| `data=test_photos`, by scripts.readme, at abc | 2 | 0.5")
     assert rows[1].startswith("| `data=test_photos sensor=drawn`") and "| 1 | 0.5" in rows[1]
     assert rows[2:] == ["", "In brackets: the interval."]
 

@@ -102,6 +102,7 @@ def _linear(matrix, inputs, out):
 
 @njit(nogil=True, fastmath=True, inline="always")
 def _two_by_four(row, other, inputs, line, below):
+    """Add the first four of `inputs`, weighed by `row`, to `line`, and by `other`, to `below`."""
     a, b, c, d = row[0], row[1], row[2], row[3]
     e, f, g, h = other[0], other[1], other[2], other[3]
     one, two, three, four = inputs[0], inputs[1], inputs[2], inputs[3]
