@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from src.models.layers import pad_to_multiple
-from src.models.setnet_layers import PacedUnit, Surroundings, ViewKernels, grown, over_time
+from src.models.setnet_layers import Even, PacedUnit, Surroundings, ViewKernels, grown, over_time
 from src.sim.optics import layout
 
 SIZES = {  # channels; multiply-accumulates at 176 x 176 with nine views: 0.34, 1.1 and 3.0 G
@@ -61,7 +61,7 @@ class SetNet(nn.Module):
         self.cell2 = PacedUnit(half)
         self.around = Surroundings(half, around)
         self.mix2 = nn.Conv2d(half, half, 3)
-        self.shuffle = nn.Conv2d(half, CELL**2, 3)
+        self.shuffle = Even(half, CELL**2, 3)
         self.relu = nn.ReLU()
         self.frozen: dict[tuple, tuple[Tensor, ...]] | None = None  # kernels kept, for running
 

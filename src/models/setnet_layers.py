@@ -170,6 +170,18 @@ class Residual(nn.Module):
         return x + self.second(self.relu(self.first(self.relu(x))))
 
 
+class Even(nn.Conv2d):
+    """A convolution whose outputs, the pixels of a cell, are all the same where its input is
+    everywhere the same: an area without detail gets no pattern of its pixels.
+    """
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n pixels _h _w"]:
+        """Return the maps of all pixels of a cell."""
+        answers = self.weight.mean((2, 3), keepdim=True)  # to an input of the same everywhere
+        weight = self.weight - answers + answers.mean(0, keepdim=True)
+        return functional.conv2d(x, weight, self.bias.mean().expand(len(weight)))
+
+
 def grown(x: Tensor, times: int) -> Tensor:
     """Return `x` with every pixel repeated."""
     return functional.interpolate(x, scale_factor=times, mode="nearest")

@@ -238,10 +238,13 @@ def test_the_picture_fades_to_what_was_seen_around_and_does_not_step():
 
 
 @torch.no_grad()
-def test_a_flat_map_is_drawn_flat_up_to_the_border():
+def test_a_flat_map_is_drawn_flat_up_to_the_border_without_a_pattern_of_pixels():
     network = small()
+    torch.nn.init.normal_(network.shuffle.bias)
     flat = network.drawn(torch.ones(1, 4, 8, 8), torch.ones(1, 4, 4, 4))
-    torch.testing.assert_close(flat, flat[:, :, :1, :1].expand_as(flat))
+    torch.testing.assert_close(flat, flat[:, :1, :1, :1].expand_as(flat))
+    edge = network.drawn(torch.ones(1, 4, 8, 8).tril(), torch.ones(1, 4, 4, 4))
+    assert float((edge - edge[:, :1]).abs().max()) > 1e-3
 
 
 @torch.no_grad()
