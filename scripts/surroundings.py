@@ -98,7 +98,7 @@ def learn(network: SetNet, maps: Tensor, truth: Tensor, steps: int) -> list[floa
 def samples(data: LightFieldData, clips: int) -> Iterable[Sample]:
     """Return the first training clips, as a training sees them, a batch at a time."""
     pipeline = data.pipelines["train"]
-    simulated = Simulator(pipeline, data.augment, data.seed, "cpu")
+    simulated = Simulator(pipeline, data.augment, seed=data.seed)
     for first in range(0, clips, data.batch_size):
         numbers = range(first, min(first + data.batch_size, clips))
         yield simulated([(number, pipeline.draw(number)) for number in numbers])

@@ -31,6 +31,7 @@ from src.training.bank_samples import Banked
 from src.training.clock import Clock
 from src.training.datamodule import LightFieldData
 from src.training.reconstructor import Reconstructor
+from src.training.teachers import Teachers
 
 TRIM_THRESHOLD, MMAP_MAX = -1, -4  # of mallopt, in malloc.h
 
@@ -58,7 +59,18 @@ def data(
         simulate_on=cfg.data.simulate_on,
         seed=cfg.seed,
         filler=Filler(train.bank) if isinstance(train, Banked) else None,
+        teachers=teachers(cfg, train.optics.views) if train and cfg.get("teachers") else None,
     )
+
+
+def teachers(cfg: DictConfig, views: int) -> Teachers:
+    """Return the networks that `teachers` names; ValueError where one wants other views."""
+    networks = {name: src.models.load(name, rooms(cfg)) for name in cfg.teachers}
+    for name, net in networks.items():
+        if net.views not in (None, views):
+            raise ValueError(f"teachers must take optics.views={views}, {name} takes {net.views}")
+    rates = tuple(cfg.data.rates or ())
+    return Teachers(networks, cfg.teachers_root, cfg.fps, rates)
 
 
 def network(cfg: DictConfig) -> tuple[nn.Module, dict]:
@@ -135,6 +147,7 @@ def reconstructor(cfg: DictConfig, net: nn.Module, spec: dict) -> Reconstructor:
         loss_from=cfg.data.loss_from,
         loss_pairs=cfg.data.loss_pairs,
         steady=cfg.steady,
+        teach=cfg.teach,
         clip=cfg.clip,
         average=cfg.average,
         clock=Clock(cfg.clock),

@@ -37,6 +37,7 @@ def light_field(cfg: DictConfig, net: nn.Module) -> Optics:
 def pipeline(cfg: DictConfig, split: str, optics: Optics | None = None) -> Pipeline:
     """Return the simulation of one split: train, val or test; `optics`: others than `cfg`'s."""
     training = split == "train"
+    clips = _count(cfg, "data.clips") if training and cfg.data.clips is not None else None
     if training and cfg.data.get("bank") is not None:
         return Banked(
             bank(cfg),
@@ -46,6 +47,7 @@ def pipeline(cfg: DictConfig, split: str, optics: Optics | None = None) -> Pipel
             bins=_count(cfg, "bins"),
             crop=_side(cfg, "data.crop"),
             independent=cfg.turbulence.get("views_correlation", "independent") == "independent",
+            clips=clips,
         )
     return _simulation(
         cfg,
@@ -53,7 +55,7 @@ def pipeline(cfg: DictConfig, split: str, optics: Optics | None = None) -> Pipel
         windows=_count(cfg, "data.windows" if training else "data.test_windows"),
         optics=optics or part(cfg, "optics"),
         crop=_side(cfg, "data.crop" if training else "data.test_crop"),
-        clips=_count(cfg, "data.clips") if training and cfg.data.clips is not None else None,
+        clips=clips,
     )
 
 

@@ -51,7 +51,7 @@ class Sample:
     `voxels` (n, windows, views, bins, h, w); `target` (n, windows, 1, h, w), the clean frame at the
     end of each window; `turbulent`, the same instants as the centre view shows them, code values
     too; `window_s` (n,), how long a window lasts; `positions`, the (row, col) of every view, None:
-    those of `optics.layout`;
+    those of `optics.layout`; `taught`, as `target`, what others make of these clips, if asked for;
     `drawn`, what was drawn for each clip; `seconds`, how long the simulation took.
     """
 
@@ -62,12 +62,14 @@ class Sample:
     positions: Sequence[Position] | None = None
     drawn: list[dict] = field(default_factory=list)
     seconds: float = 0.0
+    taught: Tensor | None = None
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> "Sample":
         """Return the sample with its tensors on `device`."""
         moved = {
             name: getattr(self, name).to(device, non_blocking=non_blocking)
-            for name in ("voxels", "target", "turbulent", "window_s")
+            for name in ("voxels", "target", "turbulent", "window_s", "taught")
+            if getattr(self, name) is not None
         }
         return replace(self, **moved)
 
@@ -202,13 +204,15 @@ class Pipeline:
 
 def joined(samples: Sequence[Sample]) -> Sample:
     """Return the batch of `samples`, which are of one size, in the same order."""
+    first = samples[0]
     return Sample(
         voxels=together([sample.voxels for sample in samples]),
         target=torch.cat([sample.target for sample in samples]),
         turbulent=torch.cat([sample.turbulent for sample in samples]),
         window_s=torch.cat([sample.window_s for sample in samples]),
-        positions=samples[0].positions,
+        positions=first.positions,
         drawn=[drawn for sample in samples for drawn in sample.drawn],
+        taught=None if first.taught is None else torch.cat([sample.taught for sample in samples]),
     )
 
 

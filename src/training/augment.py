@@ -79,7 +79,8 @@ class Augment:
             self._one(sample, key, kept, out)
             for sample, key, out in zip(samples, keys, voxels, strict=True)
         ]
-        target, turbulent = (torch.stack(part) for part in zip(*pictures, strict=True))
+        pictures = [torch.stack(part) for part in zip(*pictures, strict=True)]
+        target, turbulent, *taught = pictures
         return Sample(
             voxels=voxels,
             target=target,
@@ -87,10 +88,11 @@ class Augment:
             window_s=torch.cat([sample.window_s for sample in samples]),
             positions=tuple(places[view] for view in kept),
             drawn=[drawn for sample in samples for drawn in sample.drawn],
+            taught=taught[0] if taught else None,
         )
 
-    def _one(self, sample: Sample, key: int, kept: list[int], out: Tensor) -> tuple[Tensor, Tensor]:
-        """Fill `out` (windows, kept, bins, h, w); return the pictures, clean and turbulent."""
+    def _one(self, sample: Sample, key: int, kept: list[int], out: Tensor) -> list[Tensor]:
+        """Fill `out` (windows, kept, bins, h, w); return the pictures: clean, turbulent, taught."""
         voxels = sample.voxels[0]
         steps, paused = pause_chain(len(voxels), self.pause, self.stay, noise.key(key, "pause"))
         axes = flip_axes(self.flip, noise.key(key, "flip"))
@@ -103,8 +105,8 @@ class Augment:
                 window.copy_(turned(voxels[step].index_select(0, order), axes, swap))
         misplace(out, self.misplaced, self.misplaced_px, noise.key(key, "misplaced"))
         self._corrupt(out, float(sample.window_s[0]), key)
-        pictures = (sample.target[0, steps], sample.turbulent[0, steps])
-        return tuple(turned(part, axes, swap) for part in pictures)
+        pictures = (sample.target, sample.turbulent, sample.taught)
+        return [turned(part[0, steps], axes, swap) for part in pictures if part is not None]
 
     def _corrupt(self, voxels: Tensor, window_s: float, key: int) -> None:
         if self.noise_std > 0:

@@ -36,8 +36,9 @@ class Banked(Pipeline):
     Sample n is a function of (config, n), whether the bank is full or empty: it is of one of the
     first FIRST + n / EACH clips, the order in which a bank is filled, and a clip that is not there
     is made.  Drawn by n as well: `windows` windows on end and which way they run, the crop, which
-    view shows which air, the sensor, its noise.  Airs go round where they are `independent` and
-    the views all registered alike.
+    view shows which air, the sensor, its noise.  Airs go
+    round where they are `independent` and the views all registered alike.  `clips`: how many
+    different samples there are, n modulo `clips`; None: all are.
     """
 
     def __init__(
@@ -50,12 +51,13 @@ class Banked(Pipeline):
         bins: int = 5,
         crop: int | float | None = None,
         independent: bool = True,
+        clips: int | None = None,
     ):
         source = bank.source
         light = {"input": "srgb" if source.decode else "linear"}
         super().__init__(
             source.scene, optics, source.turbulence, light, split=source.split, seed=source.seed,
-            bins=bins, substeps=source.substeps, crop=crop, random_crop=True,
+            bins=bins, substeps=source.substeps, crop=crop, random_crop=True, clips=clips,
         )  # fmt: skip
         self.sensor = sensor
         self.exchangeable = independent and source.optics.misalignment_px == 0
@@ -73,6 +75,7 @@ class Banked(Pipeline):
 
     def draw(self, number: int) -> Taken:
         """Draw everything random about sample `number`; makes its clip if it is not there."""
+        number = number if self.clips is None else number % self.clips
         key = noise.key(self.seed, self.split, "banked", number)
         when, way = noise.uniform(key, torch.arange(2)).tolist()
         index = self.index(number)

@@ -12,6 +12,7 @@ from src.sim import noise
 from src.sim.pipeline import Draw, Pipeline, Sample, joined
 from src.training.augment import Augment
 from src.training.bank_filler import Filler
+from src.training.teachers import Teachers
 
 
 class LightFieldData(LightningDataModule):
@@ -23,6 +24,7 @@ class LightFieldData(LightningDataModule):
     `workers`: processes that simulate beside the training; 0 simulates in the training process.
     `simulate_on`: `worker` (CPU) or `device` (the training device, for GPUs).
     `filler`: fills the bank of air in the background of a training, where there is one.
+    `teachers`: what they make of the training clips is a part of these.
     """
 
     def __init__(
@@ -39,6 +41,7 @@ class LightFieldData(LightningDataModule):
         simulate_on: str = "worker",
         seed: int = 0,
         filler: Filler | None = None,
+        teachers: Teachers | None = None,
     ):
         super().__init__()
         if simulate_on not in ("worker", "device"):
@@ -50,7 +53,7 @@ class LightFieldData(LightningDataModule):
         if epoch_clips < batch_size:
             raise ValueError(f"data.epoch_clips must be >= data.batch_size, got {epoch_clips}")
         self.pipelines, self.augment, self.seed = pipelines, augment, seed
-        self.filler = filler
+        self.filler, self.teachers = filler, teachers
         self.batch_size, self.reuse, self.epoch_clips = batch_size, reuse, epoch_clips
         self.val_clips, self.test_clips = val_clips, test_clips
         self.workers, self.simulate_on = workers, simulate_on
@@ -110,8 +113,8 @@ class LightFieldData(LightningDataModule):
         )
 
     def _simulator(self, split: str, device) -> Callable[[Sequence], Sample]:
-        augment = self.augment if split == "train" else None
-        return Simulator(self.pipelines[split], augment, self.seed, device)
+        training = (self.augment, self.teachers) if split == "train" else (None, None)
+        return Simulator(self.pipelines[split], *training, seed=self.seed, device=device)
 
 
 class Simulator:
@@ -120,8 +123,17 @@ class Simulator:
     The last simulation is kept: the same draws again are only augmented again.
     """
 
-    def __init__(self, pipeline: Pipeline, augment: Augment | None, seed: int, device):
-        self.pipeline, self.augment, self.seed, self.device = pipeline, augment, seed, device
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        augment: Augment | None = None,
+        teachers: Teachers | None = None,
+        *,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+    ):
+        self.pipeline, self.augment, self.teachers = pipeline, augment, teachers
+        self.seed, self.device = seed, device
         self.last: tuple[list, list[Sample]] = ([], [])
 
     def __call__(self, numbered: Sequence[tuple[int, Draw]]) -> Sample:
@@ -129,7 +141,7 @@ class Simulator:
         draws = [draw for _, draw in numbered]
         names = [(draw.key, draw.crop) for draw in draws]
         if self.last[0] != names:
-            self.last = (names, [self.pipeline.sample(draw, self.device) for draw in draws])
+            self.last = (names, [self._made(draw) for draw in draws])
         samples = self.last[1]
         if self.augment is None:
             sample = joined(samples)
@@ -137,6 +149,10 @@ class Simulator:
             keys = [noise.key(self.seed, "augment", number) for number, _ in numbered]
             sample = self.augment(samples, keys)
         return replace(sample, seconds=time.perf_counter() - start)
+
+    def _made(self, draw: Draw) -> Sample:
+        sample = self.pipeline.sample(draw, self.device)
+        return replace(sample, taught=self.teachers(sample)) if self.teachers else sample
 
 
 class Numbered(Dataset):

@@ -34,6 +34,7 @@ class Reconstructor(LightningModule):
     each equal part, drawn anew in every step (None: all windows): what is alike is not paid for.
     `steady`: weight of the mean change of a picture's error from one window to the next: a picture
     may be wrong, but not flicker.
+    `teach`: share of the loss that is against what teachers make of a clip, where there are any.
     `clip`: longest gradient (Euclidean norm over all parameters; None: as long as it is).
     `average`: decay of the weights' running mean, which then is what is validated, tested and
     shipped (average.py); None: none.  `clock` counts the time of training.
@@ -57,6 +58,7 @@ class Reconstructor(LightningModule):
         loss_from: int = 0,
         loss_pairs: int | None = None,
         steady: float = 0.0,
+        teach: float = 0.5,
         clip: float | None = None,
         average: float | None = None,
         clock: Clock | None = None,
@@ -66,6 +68,8 @@ class Reconstructor(LightningModule):
             raise ValueError(f"data.detach_every must be >= 0, got {detach_every}")
         if not 0 <= steady < math.inf:
             raise ValueError(f"steady must be >= 0, got {steady}")
+        if not 0 <= teach <= 1:
+            raise ValueError(f"teach must be in [0, 1], got {teach}")
         if clip is not None and not clip > 0:
             raise ValueError(f"clip must be > 0 or null, got {clip}")
         if average is not None and not 0 <= average < 1:
@@ -77,7 +81,7 @@ class Reconstructor(LightningModule):
         self.optimizer, self.scheduler = optimizer, scheduler
         self.detach_every, self.warmup, self.guard = detach_every, warmup, Guard(spike)
         self.loss_from, self.loss_pairs = loss_from, loss_pairs
-        self.steady, self.clip = steady, clip
+        self.steady, self.teach, self.clip = steady, teach, clip
         self.clock = clock or Clock()
         self.windows_seen, self.steps_before, self.rates = 0, 0, []
         # In a tuple, so that their backbones stay out of the parameters and the checkpoint.
@@ -140,8 +144,8 @@ class Reconstructor(LightningModule):
             with parametrize.cached(), torch.set_grad_enabled(bool(shown)):
                 frames, state = self.unrolled(sample, part, detach(state), shown or [0])
             if shown:
-                target, share = sample.target[:, part][:, shown], len(shown) / len(chosen)
-                total += self._backward(frames, target, shown, share)
+                share = len(shown) / len(chosen)
+                total += self._backward(frames, self._goals(sample, part, shown), shown, share)
         total = self.all_gather(total).mean()
         self._protect(total, sample.drawn)
         self._step()
@@ -162,6 +166,13 @@ class Reconstructor(LightningModule):
         firsts = [int(torch.randint(a, b - 1, (), generator=drawer)) for a, b in pairwise(ends)]
         return [first + one for first in firsts for one in (0, 1)]
 
+    def _goals(self, sample: "Sample", part: slice, shown: list[int]) -> list[tuple[Tensor, float]]:
+        """Return what the pictures `shown` of `part` should be, with weights: first the truth."""
+        truth = sample.target[:, part][:, shown]
+        if sample.taught is None:
+            return [(truth, 1.0)]
+        return [(truth, 1 - self.teach), (sample.taught[:, part][:, shown], self.teach)]
+
     def _step(self) -> None:
         self.optimizers().step()
         if self.scheduler is not None:
@@ -169,31 +180,38 @@ class Reconstructor(LightningModule):
         if self.average is not None:
             follow(self.average, self.network, self.decay, self.global_step)
 
-    def _backward(self, frames: Tensor, target: Tensor, shown: list[int], share: float) -> Tensor:
+    def _backward(
+        self, frames: Tensor, goals: list[tuple[Tensor, float]], shown: list[int], share: float
+    ) -> Tensor:
         """Back-propagate `share` of the mean loss of the windows `shown`; return it.
 
         The loss sees every picture alone, so its gradient there is had a few pictures at a time,
         and its own maps (VGG's are larger than the network's) never stand in memory together.
         What holds the error steady is added to it.
         """
-        options = {}
-        if takes(self.loss, "drawer"):  # a loss that draws, draws the same again in a resumed run
-            options["drawer"] = torch.Generator().manual_seed(self.global_step)
         pictures = frames.flatten(0, 1)
         leaves, total = pictures.detach().requires_grad_(), torch.zeros((), device=self.device)
-        pairs = zip(leaves.split(PICTURES), target.flatten(0, 1).split(PICTURES), strict=True)
-        for ours, truth in pairs:
-            loss = self.loss(ours, truth, **options).sum() * (share / len(pictures))
-            loss.backward()
-            total += loss.detach()
+        for goal, weight in goals:
+            options = self._options()
+            pairs = zip(leaves.split(PICTURES), goal.flatten(0, 1).split(PICTURES), strict=True)
+            for ours, truth in pairs:
+                loss = self.loss(ours, truth, **options).sum() * (weight * share / len(pictures))
+                loss.backward()
+                total += loss.detach()
         follows = [b == a + 1 for a, b in pairwise(shown)]
         if self.steady and any(follows):
-            error = leaves.unflatten(0, frames.shape[:2]) - target
+            error = leaves.unflatten(0, frames.shape[:2]) - goals[0][0]
             change = share * self.steady * error.diff(dim=1)[:, follows].abs().mean()
             change.backward()
             total += change.detach()
         self.manual_backward(pictures, leaves.grad)
         return total
+
+    def _options(self) -> dict[str, torch.Generator]:
+        """Return what a loss that draws is given: it draws the same again in a resumed run."""
+        if not takes(self.loss, "drawer"):
+            return {}
+        return {"drawer": torch.Generator().manual_seed(self.global_step)}
 
     def _protect(self, loss: Tensor, drawn: list[dict]) -> None:
         """Stop what is not finite, scale down what leaps or is too long."""

@@ -42,13 +42,13 @@ def test_a_training_that_goes_on_sees_other_clips():
 
 
 def test_a_batch_used_again_is_augmented_anew():
-    numbered, make = Numbered(chain()), Simulator(chain(), Augment(pause=0.0), 0, "cpu")
+    numbered, make = Numbered(chain()), Simulator(chain(), Augment(pause=0.0))
     first, again, other = (
         make([numbered[clip, number]]) for clip, number in ((0, 0), (0, 1), (2, 2))
     )
     assert not torch.equal(first.voxels, again.voxels)
     assert first.drawn == again.drawn != other.drawn
-    fresh = Simulator(chain(), Augment(pause=0.0), 0, "cpu")([numbered[0, 1]])
+    fresh = Simulator(chain(), Augment(pause=0.0))([numbered[0, 1]])
     assert torch.equal(fresh.voxels, again.voxels)
 
 
