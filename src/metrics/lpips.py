@@ -140,10 +140,7 @@ class AnchoredLPIPS(LPIPS):
         drawer: torch.Generator | None = None,
     ) -> Float[Tensor, " n"]:
         """Return the loss of each pair; `drawer` draws which pictures LPIPS sees."""
-        prediction = prediction.float()
-        error = (prediction - target).abs().mean((1, 2, 3))
-        structure = 1 - ssim(prediction, target)
-        anchors = self.weights["l1"] * error + self.weights["ssim"] * structure
+        anchors = self.anchors(prediction, target)
         if self.share == 1:
             return super().forward(prediction, target) + anchors
         count = len(prediction)
@@ -151,6 +148,14 @@ class AnchoredLPIPS(LPIPS):
         seen = seen.to(prediction.device)
         distance = super().forward(prediction[seen], target[seen]) * (count / len(seen))
         return anchors.index_add(0, seen, distance)
+
+    def anchors(
+        self, prediction: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"]
+    ) -> Float[Tensor, " n"]:
+        """Return the loss of each pair without LPIPS."""
+        prediction = prediction.float()
+        error = (prediction - target).abs().mean((1, 2, 3))
+        return self.weights["l1"] * error + self.weights["ssim"] * (1 - ssim(prediction, target))
 
 
 def _unit(features: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -34,7 +35,8 @@ class Reconstructor(LightningModule):
     each equal part, drawn anew in every step (None: all windows): what is alike is not paid for.
     `steady`: weight of the mean change of a picture's error from one window to the next: a picture
     may be wrong, but not flicker.
-    `teach`: share of the loss that is against what teachers make of a clip, where there are any.
+    `teach`: weight, where there are teachers, of the loss against what they make of a clip; where
+    it has `anchors`, of these alone, so that what LPIPS sees is the truth.
     `clip`: longest gradient (Euclidean norm over all parameters; None: as long as it is).
     `average`: decay of the weights' running mean, which then is what is validated, tested and
     shipped (average.py); None: none.  `clock` counts the time of training.
@@ -58,7 +60,7 @@ class Reconstructor(LightningModule):
         loss_from: int = 0,
         loss_pairs: int | None = None,
         steady: float = 0.0,
-        teach: float = 0.5,
+        teach: float = 1.0,
         clip: float | None = None,
         average: float | None = None,
         clock: Clock | None = None,
@@ -68,8 +70,8 @@ class Reconstructor(LightningModule):
             raise ValueError(f"data.detach_every must be >= 0, got {detach_every}")
         if not 0 <= steady < math.inf:
             raise ValueError(f"steady must be >= 0, got {steady}")
-        if not 0 <= teach <= 1:
-            raise ValueError(f"teach must be in [0, 1], got {teach}")
+        if not 0 <= teach < math.inf:
+            raise ValueError(f"teach must be >= 0, got {teach}")
         if clip is not None and not clip > 0:
             raise ValueError(f"clip must be > 0 or null, got {clip}")
         if average is not None and not 0 <= average < 1:
@@ -166,12 +168,21 @@ class Reconstructor(LightningModule):
         firsts = [int(torch.randint(a, b - 1, (), generator=drawer)) for a, b in pairwise(ends)]
         return [first + one for first in firsts for one in (0, 1)]
 
-    def _goals(self, sample: "Sample", part: slice, shown: list[int]) -> list[tuple[Tensor, float]]:
-        """Return what the pictures `shown` of `part` should be, with weights: first the truth."""
-        truth = sample.target[:, part][:, shown]
-        if sample.taught is None:
-            return [(truth, 1.0)]
-        return [(truth, 1 - self.teach), (sample.taught[:, part][:, shown], self.teach)]
+    def _goals(
+        self, sample: "Sample", part: slice, shown: list[int]
+    ) -> list[tuple[Tensor, Callable[[Tensor, Tensor], Tensor]]]:
+        """Return what the pictures `shown` of `part` should be, and the loss against each: the
+        truth, then what is taught.
+        """
+        loss, teach = self.loss, self.teach
+        if takes(loss, "drawer"):  # a loss that draws, draws the same again in a resumed run
+            loss = partial(loss, drawer=torch.Generator().manual_seed(self.global_step))
+        goals = [(sample.target[:, part][:, shown], loss)]
+        if sample.taught is not None:
+            anchors = getattr(self.loss, "anchors", self.loss)
+            taught = sample.taught[:, part][:, shown]
+            goals.append((taught, lambda ours, theirs: teach * anchors(ours, theirs)))
+        return goals
 
     def _step(self) -> None:
         self.optimizers().step()
@@ -181,23 +192,26 @@ class Reconstructor(LightningModule):
             follow(self.average, self.network, self.decay, self.global_step)
 
     def _backward(
-        self, frames: Tensor, goals: list[tuple[Tensor, float]], shown: list[int], share: float
+        self,
+        frames: Tensor,
+        goals: list[tuple[Tensor, Callable[[Tensor, Tensor], Tensor]]],
+        shown: list[int],
+        share: float,
     ) -> Tensor:
         """Back-propagate `share` of the mean loss of the windows `shown`; return it.
 
         The loss sees every picture alone, so its gradient there is had a few pictures at a time,
         and its own maps (VGG's are larger than the network's) never stand in memory together.
-        What holds the error steady is added to it.
+        What holds the error steady, against the first of `goals`, is added to it.
         """
         pictures = frames.flatten(0, 1)
         leaves, total = pictures.detach().requires_grad_(), torch.zeros((), device=self.device)
-        for goal, weight in goals:
-            options = self._options()
+        for goal, loss in goals:
             pairs = zip(leaves.split(PICTURES), goal.flatten(0, 1).split(PICTURES), strict=True)
             for ours, truth in pairs:
-                loss = self.loss(ours, truth, **options).sum() * (weight * share / len(pictures))
-                loss.backward()
-                total += loss.detach()
+                part = loss(ours, truth).sum() * (share / len(pictures))
+                part.backward()
+                total += part.detach()
         follows = [b == a + 1 for a, b in pairwise(shown)]
         if self.steady and any(follows):
             error = leaves.unflatten(0, frames.shape[:2]) - goals[0][0]
@@ -206,12 +220,6 @@ class Reconstructor(LightningModule):
             total += change.detach()
         self.manual_backward(pictures, leaves.grad)
         return total
-
-    def _options(self) -> dict[str, torch.Generator]:
-        """Return what a loss that draws is given: it draws the same again in a resumed run."""
-        if not takes(self.loss, "drawer"):
-            return {}
-        return {"drawer": torch.Generator().manual_seed(self.global_step)}
 
     def _protect(self, loss: Tensor, drawn: list[dict]) -> None:
         """Stop what is not finite, scale down what leaps or is too long."""

@@ -56,11 +56,11 @@ class Teachers:
         names = "".join(sorted(self.names[name] for name in chosen))
         path = self.root / f"{hashlib.sha256((names + known).encode()).hexdigest()[:24]}.pt"
         if path.exists() and whole(path):
-            kept = torch.load(path, weights_only=True)
+            kept = torch.load(path, weights_only=True)["pictures"]
         else:
             kept = (LEVELS * self._mean(sample, chosen)).round().to("cpu", torch.uint8)
             path.parent.mkdir(parents=True, exist_ok=True)
-            WholeFiles().save_checkpoint(kept, path)
+            WholeFiles().save_checkpoint({"pictures": kept}, path)
         return kept.to(sample.voxels.device).float() / LEVELS
 
     def _for(self, rate: float) -> list[str]:

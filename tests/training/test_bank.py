@@ -16,6 +16,7 @@ from src.app import simulation as simulations
 from src.models.checkpoints import whole
 from src.sim.optics import Optics
 from src.sim.pipeline import Pipeline
+from src.sim.pipeline import simulate as simulated
 from src.sim.sensor.sensor import EventSensor
 from src.sim.turbulence.simulated import SimulatedAir
 from src.simulate import simulate
@@ -94,6 +95,13 @@ def test_numbers_differ_in_all_that_is_drawn(tmp_path):
     assert {draw.backwards for draw in draws} == {False, True}
     assert len({draw.order for draw in draws}) == len({draw.threshold for draw in draws}) == 24
     assert len({draw.sensor.seed for draw in draws}) == 24
+
+
+def test_of_few_samples_the_first_come_again(tmp_path):
+    of = bank(tmp_path)
+    few, many = banked(of, clips=2), banked(of)
+    assert torch.equal(simulated(few, [3]).voxels, simulated(many, [1]).voxels)
+    assert not torch.equal(simulated(few, [3]).voxels, simulated(many, [3]).voxels)
 
 
 def test_early_numbers_take_the_clips_that_are_filled_first(tmp_path):

@@ -46,13 +46,14 @@ def sample(windows: int = 6) -> Sample:
     return Sample(voxels, target, target, window_s, drawn=[{"name": "a"}, {"name": "b"}])
 
 
-def fit(network: nn.Module, detach_every: int, steps: int = 1, **how) -> nn.Module:
+def fit(
+    network: nn.Module, detach_every: int, steps: int = 1, lr: float = 0.05, **how
+) -> nn.Module:
     def optimizer(parameters):
-        return torch.optim.SGD(parameters, lr=0.05)
+        return torch.optim.SGD(parameters, lr=lr)
 
-    module = Reconstructor(
-        network, {}, loss=SquaredError(), optimizer=optimizer, detach_every=detach_every, **how
-    )
+    how = {"loss": SquaredError(), "optimizer": optimizer, "detach_every": detach_every} | how
+    module = Reconstructor(network, {}, **how)
     trainer = lightning.Trainer(
         max_steps=steps,
         accelerator="cpu",

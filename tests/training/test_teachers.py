@@ -1,0 +1,116 @@
+"""Teachers: the mean picture of frozen networks, once for each sample, as a second target."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import nn
+
+from src.app import build
+from src.models.setnet import SetNet
+from src.models.unroll import video
+from src.sim.pipeline import simulate
+from src.training import teachers as module
+from src.training.augment import Augment
+from src.training.teachers import Teachers
+from tests.sim.test_pipeline import STRONG, pipeline
+from tests.test_train import config
+from tests.training.test_reconstructor import Leaky, SquaredError, fit, sample
+
+pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`")
+
+
+class Constant(nn.Module):
+    """Draws one grey, whatever comes in and however long it lasts."""
+
+    views = None
+
+    def __init__(self, grey: float):
+        super().__init__()
+        self.grey, self.calls = nn.Parameter(torch.tensor(grey)), 0
+
+    def forward(self, voxels, state):
+        self.calls += 1
+        return self.grey.expand(len(voxels), 1, *voxels.shape[-2:]), state
+
+
+@pytest.fixture(scope="module")
+def clip():
+    return simulate(pipeline(STRONG, crop=16), [0])
+
+
+def test_the_picture_is_the_mean_of_the_networks_to_8_bits(clip, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "computes_bf16", lambda: False)
+    networks = {"one": SetNet(half=8, around=[8]), "two": Constant(0.3)}
+    taught = Teachers(networks, tmp_path, 120.0)(clip)
+    with torch.no_grad():
+        expected = torch.stack([video(net, clip) for net in networks.values()]).mean(0)
+    assert taught.shape == clip.target.shape
+    assert (taught - expected).abs().max() <= 0.5 / 255 + 1e-6
+
+
+def test_a_picture_is_made_once_and_again_where_anything_differs(clip, tmp_path):
+    network = Constant(0.25)
+    first = Teachers({"a": network}, tmp_path, 120.0)(clip)
+    made = network.calls
+    assert torch.equal(Teachers({"b": network}, tmp_path, 120.0)(clip), first)
+    assert network.calls == made
+    Teachers({"a": network}, tmp_path, 120.0)(replace(clip, voxels=clip.voxels + 1))
+    assert network.calls == 2 * made
+    assert not torch.equal(Teachers({"a": Constant(0.75)}, tmp_path, 120.0)(clip), first)
+    (path, *_) = tmp_path.iterdir()
+    path.write_bytes(path.read_bytes()[:100])
+    Teachers({"a": Constant(0.5)}, tmp_path, 120.0)(clip)  # others beside it do no harm
+    assert torch.equal(Teachers({"a": network}, tmp_path, 120.0)(clip), first)
+
+
+def test_who_is_not_told_the_length_of_windows_teaches_those_it_knows(clip, tmp_path):
+    networks = {"told": SetNet(half=8, around=[8]), "not": Constant(0.3)}
+    fast = replace(clip, window_s=clip.window_s / 4)
+    both, told = (Teachers(dict(n), tmp_path, 120.0) for n in (networks, [*networks.items()][:1]))
+    assert torch.equal(both(fast), told(fast))
+    assert not torch.equal(both(clip), told(clip))
+    with pytest.raises(ValueError, match="teachers must have one .* 480 windows a second, got not"):
+        Teachers({"not": networks["not"]}, tmp_path, 120.0, (120.0, 480.0))
+
+
+def test_what_is_taught_turns_and_pauses_with_the_truth(clip):
+    batch = Augment(transpose=0.5, pause=0.5)([replace(clip, taught=clip.target)] * 6, range(6))
+    assert torch.equal(batch.taught, batch.target)
+    assert not torch.equal(batch.target[0], batch.target[1])
+
+
+class HalfAnchored(SquaredError):
+    """Against the truth the whole error, against teachers half of it."""
+
+    def anchors(self, prediction, target):
+        return self(prediction, target) / 2
+
+
+@pytest.mark.parametrize(("loss", "weight"), [(SquaredError, 3.0), (HalfAnchored, 1.5)])
+def test_what_is_taught_is_added_to_the_loss(loss, weight, monkeypatch):
+    plain, other = sample(), torch.rand(2, 6, 1, 8, 8)
+    mixed = replace(plain, target=(plain.target + weight * other) / (1 + weight))
+    fitted = []
+    for batch, lr, teach in (
+        (replace(plain, taught=other), 0.05, 3.0),
+        (mixed, 0.05 * (1 + weight), 0.0),
+    ):
+        monkeypatch.setattr("tests.training.test_reconstructor.sample", lambda batch=batch: batch)
+        fitted.append(fit(Leaky(), 0, teach=teach, loss=loss(), lr=lr))
+    for ours, theirs in zip(*(net.parameters() for net in fitted), strict=True):
+        assert torch.allclose(ours, theirs, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        (["optics=single"], "teachers must take optics.views=1, lf3x3 takes 9"),
+        (["teach=-1"], "teach must be >= 0, got -1"),
+    ],
+)
+def test_wrong_values_are_one_line(asked, message, tmp_path):
+    cfg = config("train", tmp_path, "experiment=setnet_small", "teachers=[lf3x3]", *asked)
+    with pytest.raises(ValueError, match=message):
+        build.data(cfg)
+        build.reconstructor(cfg, *build.network(cfg))
