@@ -2,8 +2,10 @@
 
 Writes `weights/NAME.safetensors` (float16, spectral norm folded), its model card `NAME.md` and, of
 a run with a learning curve, that as a figure.  RUN is a folder of src.train, or of a campaign with
-the parts of one training, done or not; each FOLDER one of src.eval with these weights; where RUN is
-a name of weights/, its card alone is written, with what FOLDERs hold.
+the parts of one training, done or not; with `--mean FILE` what is shipped is the mean of its
+weights and those of FILE, which it began with (Wortsman et al. 2022).  Each FOLDER is one of
+src.eval with these weights; where RUN is a name of weights/, its card alone is written, with what
+FOLDERs hold.
 """
 
 import argparse
@@ -24,15 +26,20 @@ from src.training.handover import REACHED
 LARGEST = 16 * 2**20  # bytes of a file
 
 
-def ship(run: Path, name: str, tests: list[Path]) -> Path:
-    """Write the weights of `run` and their card; returns the path of the weights.
+def ship(run: Path, name: str, tests: list[Path], other: Path | None = None) -> Path:
+    """Write the weights of `run`, or their mean with those of `other`, and their card; returns the
+    path of the weights.
 
-    Raises ValueError for a run without a whole checkpoint and for weights above 16 MiB.
+    Raises ValueError for a run without a whole checkpoint, for weights above 16 MiB and where
+    `other` is of another network.
     """
     ckpt = files.newest(run)
     network = files.load(ckpt)
     content = torch.load(ckpt, map_location="cpu", weights_only=True)
     card = facts(ckpt.parent.parent, content, first_config(run)) | going_on(content)
+    if other is not None:
+        average(network, other)
+        card = {"mean_with": f"{other.name}, {files.card(other)['hours']} hours"} | card
     path = files.WEIGHTS / f"{name}.safetensors"
     path.parent.mkdir(parents=True, exist_ok=True)
     if rows := curve(run):
@@ -42,6 +49,20 @@ def ship(run: Path, name: str, tests: list[Path]) -> Path:
         path.unlink()
         raise ValueError(f"weights must have at most {LARGEST} bytes; {name} has more")
     return _write_card(path, name, network, card, tests)
+
+
+def average(network: torch.nn.Module, other: Path) -> None:
+    """Make the weights of `network` their mean with those of `other`; ValueError where these are
+    of another network.
+    """
+    theirs = files.load(other)
+    for each in (network, theirs):
+        files.fold(each)
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    after = theirs.state_dict()
+    if {k: v.shape for k, v in before.items()} != {k: v.shape for k, v in after.items()}:
+        raise ValueError(f"--mean must be weights of the same network, got {other}")
+    network.load_state_dict({name: (before[name] + after[name]) / 2 for name in before})
 
 
 def recard(name: str, tests: list[Path]) -> Path:
@@ -186,13 +207,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, help="or a name of weights/")
     parser.add_argument("--name", help="default: the run's experiment")
+    parser.add_argument("--mean", type=Path, help="weights that count half")
     parser.add_argument("--test", type=Path, nargs="*", default=[], help="folders of src.eval")
     arguments = parser.parse_args()
     if (files.WEIGHTS / f"{arguments.run}.safetensors").is_file():
         print(recard(str(arguments.run), arguments.test))
         return
     name = arguments.name or first_config(arguments.run).name
-    print(ship(arguments.run, name, arguments.test))
+    print(ship(arguments.run, name, arguments.test, arguments.mean))
 
 
 if __name__ == "__main__":

@@ -55,6 +55,30 @@ def test_a_trained_run_is_shipped_whole_with_its_card(tmp_path, monkeypatch):
     assert len(anew) == len(card.splitlines()) + 1 and set(anew) == set(card.splitlines())
 
 
+def test_the_mean_of_a_run_and_other_weights_is_shipped(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "WEIGHTS", tmp_path / "weights")
+    runs, shipped = [tmp_path / "one", tmp_path / "two"], []
+    for seed, run in enumerate(runs):
+        train(
+            config(
+                "train",
+                run,
+                *TINY,
+                "trainer.max_steps=1",
+                "callbacks.curve.every_h=1",
+                f"seed={seed}",
+            )
+        )
+        shipped.append(files.load(ship(run, run.name, [])).state_dict())
+    path = ship(runs[0], "mean", [], files.WEIGHTS / "two.safetensors")
+    for name, value in files.load(path).state_dict().items():
+        expected = (shipped[0][name] + shipped[1][name]) / 2
+        assert torch.allclose(value, expected, atol=2e-3), name
+    assert "| mean_with | two.safetensors, 0.0 hours |" in path.with_suffix(".md").read_text()
+    with pytest.raises(ValueError, match="--mean must be weights of the same network, got .*small"):
+        ship(runs[0], "mean", [], ROOT / "weights/setnet_small.safetensors")
+
+
 def test_scores_take_the_place_of_older_ones_on_a_card(tmp_path):
     card = tmp_path / "one.md"
     card.write_text("| tested on |\n|---|\n\nIn brackets: the interval.\n")
