@@ -64,8 +64,15 @@ def data(
 
 
 def teachers(cfg: DictConfig, views: int) -> Teachers:
-    """Return the networks that `teachers` names; ValueError where one wants other views."""
-    networks = {name: src.models.load(name, rooms(cfg)) for name in cfg.teachers}
+    """Return the networks that `teachers` names.
+
+    Raises ValueError, naming the key, where one is not there or wants other views.
+    """
+    names = [cfg.teachers] if isinstance(cfg.teachers, str) else list(cfg.teachers)
+    try:
+        networks = {name: src.models.load(name, rooms(cfg)) for name in names}
+    except ValueError as error:
+        raise ValueError(f"teachers must be networks: {error}") from error
     for name, net in networks.items():
         if net.views not in (None, views):
             raise ValueError(f"teachers must take optics.views={views}, {name} takes {net.views}")

@@ -106,11 +106,12 @@ def test_what_is_taught_is_added_to_the_loss(loss, weight, monkeypatch):
     ("asked", "message"),
     [
         (["optics=single"], "teachers must take optics.views=1, lf3x3 takes 9"),
+        (["teachers=[nobody]"], "teachers must be networks: ckpt .*nobody"),
         (["teach=-1"], "teach must be >= 0, got -1"),
     ],
 )
 def test_wrong_values_are_one_line(asked, message, tmp_path):
-    cfg = config("train", tmp_path, "experiment=setnet_small", "teachers=[lf3x3]", *asked)
+    cfg = config("train", tmp_path, "experiment=setnet_small", "teachers=lf3x3", *asked)
     with pytest.raises(ValueError, match=message):
         build.data(cfg)
         build.reconstructor(cfg, *build.network(cfg))
