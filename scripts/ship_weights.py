@@ -55,14 +55,11 @@ def average(network: torch.nn.Module, other: Path) -> None:
     """Make the weights of `network` their mean with those of `other`; ValueError where these are
     of another network.
     """
-    theirs = files.load(other)
-    for each in (network, theirs):
-        files.fold(each)
-    before = {name: value.clone() for name, value in network.state_dict().items()}
-    after = theirs.state_dict()
-    if {k: v.shape for k, v in before.items()} != {k: v.shape for k, v in after.items()}:
+    ours, theirs = (files.folded(each) for each in (network, files.load(other)))
+    if {k: v.shape for k, v in ours.items()} != {k: v.shape for k, v in theirs.items()}:
         raise ValueError(f"--mean must be weights of the same network, got {other}")
-    network.load_state_dict({name: (before[name] + after[name]) / 2 for name in before})
+    files.fold(network)
+    network.load_state_dict({name: (ours[name] + theirs[name]) / 2 for name in ours})
 
 
 def recard(name: str, tests: list[Path]) -> Path:

@@ -59,16 +59,8 @@ def test_the_mean_of_a_run_and_other_weights_is_shipped(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "WEIGHTS", tmp_path / "weights")
     runs, shipped = [tmp_path / "one", tmp_path / "two"], []
     for seed, run in enumerate(runs):
-        train(
-            config(
-                "train",
-                run,
-                *TINY,
-                "trainer.max_steps=1",
-                "callbacks.curve.every_h=1",
-                f"seed={seed}",
-            )
-        )
+        step = ["trainer.max_steps=1", "callbacks.curve.every_h=1", f"seed={seed}"]
+        train(config("train", run, *TINY, *step))
         shipped.append(files.load(ship(run, run.name, [])).state_dict())
     path = ship(runs[0], "mean", [], files.WEIGHTS / "two.safetensors")
     for name, value in files.load(path).state_dict().items():

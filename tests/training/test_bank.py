@@ -16,7 +16,6 @@ from src.app import simulation as simulations
 from src.models.checkpoints import whole
 from src.sim.optics import Optics
 from src.sim.pipeline import Pipeline
-from src.sim.pipeline import simulate as simulated
 from src.sim.sensor.sensor import EventSensor
 from src.sim.turbulence.simulated import SimulatedAir
 from src.simulate import simulate
@@ -100,8 +99,9 @@ def test_numbers_differ_in_all_that_is_drawn(tmp_path):
 def test_of_few_samples_the_first_come_again(tmp_path):
     of = bank(tmp_path)
     few, many = banked(of, clips=2), banked(of)
-    assert torch.equal(simulated(few, [3]).voxels, simulated(many, [1]).voxels)
-    assert not torch.equal(simulated(few, [3]).voxels, simulated(many, [3]).voxels)
+    again = few.simulate([few.draw(3)]).voxels
+    first, third = (many.simulate([many.draw(number)]).voxels for number in (1, 3))
+    assert torch.equal(again, first) and not torch.equal(again, third)
 
 
 def test_early_numbers_take_the_clips_that_are_filled_first(tmp_path):
