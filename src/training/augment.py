@@ -214,11 +214,15 @@ def views_kept(views: int, probability: float, key: int) -> list[int]:
 
 
 def hot_pixels(size: Sequence[int], fraction: float, std: float, key: int) -> Float[Tensor, "h w"]:
-    """Return a picture (h, w) that is zero but at up to `fraction` of the pixels."""
+    """Return a picture (h, w) that is zero but at up to `fraction` of the pixels.
+
+    A part of a pixel is one as often as it is large: a small crop would never have any else.
+    """
     pixels = size[0] * size[1]
-    count = int(float(noise.uniform(key, torch.tensor(0))) * fraction * pixels)
+    share, part = noise.uniform(noise.key(key, "count"), torch.arange(2)).tolist()
+    count = int(share * fraction * pixels + part)
     picture = torch.zeros(pixels)
-    places = (noise.uniform(key, 1 + torch.arange(count)) * pixels).long()
+    places = (noise.uniform(key, torch.arange(count)) * pixels).long()
     picture[places] = std * noise.normal(noise.key(key, "value"), torch.arange(count))
     return picture.reshape(*size)
 

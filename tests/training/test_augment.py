@@ -160,7 +160,13 @@ def test_hot_pixels_stay_through_the_sequence():
 def test_hot_pixel_count_is_uniform_up_to_the_fraction():
     counts = [int((hot_pixels((50, 50), 0.01, 1.0, key) != 0).sum()) for key in range(400)]
     assert max(counts) <= 25
-    assert abs(sum(counts) / 400 - 12.0) < 4 * 25 / math.sqrt(12 * 400)
+    assert abs(sum(counts) / 400 - 12.5) < 4 * 25 / math.sqrt(12 * 400)
+
+
+def test_small_crops_have_a_hot_pixel_as_often_as_their_part_of_one_is_large():
+    counts = [int((hot_pixels((64, 64), 1e-4, 1.0, key) != 0).sum()) for key in range(2000)]
+    assert max(counts) == 1
+    assert abs(sum(counts) / 2000 - 0.2048) < 4 * math.sqrt(0.2 * 0.8 / 2000)
 
 
 def test_firing_pixels_come_and_go_at_their_rate_each_view_s_own():
