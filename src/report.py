@@ -19,13 +19,18 @@ def report(cfg: DictConfig) -> list[tables.Table]:
     folders, out = listed(cfg.run), Path(cfg.paths.run)
     ours, plans = runs.find(folders), runs.plans(folders)
     title = cfg.title or sweep_name(ours)
-    keys, made = cells.cells(ours, plans, tuple(cfg.across))
     paper = OmegaConf.to_container(cfg.paper)
-    wanted = [
-        tables.main("Scores and cost", keys, made, paper),
-        tables.by_severity("Severities apart", keys, made),
-        tables.compared("On the same clips", keys, made),
-    ]
+    wanted, shown = [], []
+    for name, members in by_sweep(ours).items():
+        planned = [plan for plan in plans if plan.sweep == name]
+        keys, made = cells.cells(members, planned, tuple(cfg.across))
+        of = f": {name}" if len(members) < len(ours) and name else ""
+        wanted += [
+            tables.main(f"Scores and cost{of}", keys, made, paper),
+            tables.by_severity(f"Severities apart{of}", keys, made),
+            tables.compared(f"On the same clips{of}", keys, made),
+        ]
+        shown += made
     if cfg.against:
         theirs = runs.find(listed(cfg.against))
         wanted.append(margins("Clip by clip", ours, theirs, paper))
@@ -37,7 +42,7 @@ def report(cfg: DictConfig) -> list[tables.Table]:
     results.write_text(out / "report.csv", writers.comma_separated(drawn))
     results.write_text(out / "report.tex", writers.latex(drawn))
     size = int(cfg.media_mib * 2**20)
-    whole = page.html(title, drawn, made, figures, commands=commands, media_bytes=size)
+    whole = page.html(title, drawn, shown, figures, commands=commands, media_bytes=size)
     results.write_text(out / "report.html", whole)
     if cfg.into:
         writers.replace_section(Path(cfg.into), title, text)
@@ -48,6 +53,11 @@ def report(cfg: DictConfig) -> list[tables.Table]:
 def listed(given: str | ListConfig) -> list[Path]:
     """Return one folder, or a list of them, as a list."""
     return [Path(str(folder)) for folder in (given if isinstance(given, ListConfig) else [given])]
+
+
+def by_sweep(ours: list[runs.Run]) -> dict[str, list[runs.Run]]:
+    """Return the runs of each sweep: they differ in settings of its own, which head its table."""
+    return {name: [r for r in ours if r.sweep == name] for name in {run.sweep: 0 for run in ours}}
 
 
 def sweep_name(ours: list[runs.Run]) -> str:

@@ -38,6 +38,12 @@ class Run:
         return chosen | {k: str(v) for k, v in asked.items() if k not in WITHOUT_NUMBERS}
 
     @property
+    def sweep(self) -> str:
+        """Return the name of the sweep that asked for it, such as table1; "" without one."""
+        config = self.record.get("asked", {}).get("config", "")
+        return "" if config == self.record["task"] else config
+
+    @property
     def overrides(self) -> list[str]:
         """Return the overrides of the command line, such as `seed=0`."""
         return self.record.get("asked", {}).get("overrides", [])
@@ -61,8 +67,9 @@ class Run:
 
 @dataclass(frozen=True)
 class Plan:
-    """A sweep as it was started: its command, and the overrides of each of its jobs."""
+    """A sweep as it was started: its name, its command, and the overrides of each of its jobs."""
 
+    sweep: str
     command: str
     jobs: list[list[str]]
 
@@ -136,4 +143,5 @@ def _plan(hydra: dict) -> Plan:
     door, config = hydra["job"]["name"], hydra["job"]["config_name"]
     how = "-m" if door == config else f"--config-dir sweeps --config-name {config}"
     start = f"python -m src.{door} {how}"
-    return Plan(" ".join([start, *asked]), BasicSweeper.split_arguments(parsed, None)[0])
+    name = "" if door == config else config
+    return Plan(name, " ".join([start, *asked]), BasicSweeper.split_arguments(parsed, None)[0])

@@ -244,6 +244,21 @@ def test_the_door_writes_four_files_and_the_section(tmp_path):
     assert "| lf3x3 | **" not in document.read_text() and "| lf3x3 |" in document.read_text()
 
 
+def test_each_sweep_has_tables_headed_by_its_own_settings(tmp_path):
+    for lr in ("1", "2"):
+        asked = {"overrides": (f"lr={lr}",), "settings": {"lr": float(lr)}}
+        write_run(tmp_path / "runs" / f"a{lr}", config_name="rates", **asked)
+    for width in ("8", "16"):
+        asked = {"overrides": (f"width={width}",), "settings": {"width": int(width)}}
+        write_run(tmp_path / "runs" / f"b{width}", config_name="widths", **asked)
+    found = report(config("report", tmp_path / "out", f"run={tmp_path / 'runs'}"))
+    heads = {t.title: [c.name for c in t.columns[: t.labels]] for t in found}
+    assert heads["Scores and cost: rates"] == ["lr"]
+    assert heads["Scores and cost: widths"] == ["width"]
+    text = (tmp_path / "out" / "report.html").read_text()
+    assert text.index("Scores and cost: rates") < text.index("Scores and cost: widths")
+
+
 def test_an_empty_folder_is_refused_and_nothing_is_written(tmp_path):
     (tmp_path / "runs").mkdir()
     with pytest.raises(ValueError, match="run must hold results.json"):
