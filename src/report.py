@@ -21,10 +21,11 @@ def report(cfg: DictConfig) -> list[tables.Table]:
     title = cfg.title or sweep_name(ours)
     paper = OmegaConf.to_container(cfg.paper)
     wanted, shown = [], []
-    for name, members in by_sweep(ours).items():
-        planned = [plan for plan in plans if plan.sweep == name]
-        keys, made = cells.cells(members, planned, tuple(cfg.across))
-        of = f": {name}" if len(members) < len(ours) and name else ""
+    sweeps = dict.fromkeys(each.sweep for each in [*ours, *plans])
+    for name in sweeps:
+        own = [[each for each in all_of if each.sweep == name] for all_of in (ours, plans)]
+        keys, made = cells.cells(*own, tuple(cfg.across))
+        of = f": {name}" if name and len(sweeps) > 1 else ""
         wanted += [
             tables.main(f"Scores and cost{of}", keys, made, paper),
             tables.by_severity(f"Severities apart{of}", keys, made),
@@ -53,11 +54,6 @@ def report(cfg: DictConfig) -> list[tables.Table]:
 def listed(given: str | ListConfig) -> list[Path]:
     """Return one folder, or a list of them, as a list."""
     return [Path(str(folder)) for folder in (given if isinstance(given, ListConfig) else [given])]
-
-
-def by_sweep(ours: list[runs.Run]) -> dict[str, list[runs.Run]]:
-    """Return the runs of each sweep: they differ in settings of its own, which head its table."""
-    return {name: [r for r in ours if r.sweep == name] for name in {run.sweep: 0 for run in ours}}
 
 
 def sweep_name(ours: list[runs.Run]) -> str:

@@ -141,7 +141,7 @@ def _plan(hydra: dict) -> Plan:
     lines = [f"{key}={value}" for key, value in params] + asked
     parsed = OverridesParser.create().parse_overrides(lines)
     door, config = hydra["job"]["name"], hydra["job"]["config_name"]
-    how = "-m" if door == config else f"--config-dir sweeps --config-name {config}"
+    sweep = "" if door == config else config
+    how = f"--config-dir sweeps --config-name {sweep}" if sweep else "-m"
     start = f"python -m src.{door} {how}"
-    name = "" if door == config else config
-    return Plan(name, " ".join([start, *asked]), BasicSweeper.split_arguments(parsed, None)[0])
+    return Plan(sweep, " ".join([start, *asked]), BasicSweeper.split_arguments(parsed, None)[0])

@@ -214,17 +214,22 @@ def views_kept(views: int, probability: float, key: int) -> list[int]:
 
 
 def hot_pixels(size: Sequence[int], fraction: float, std: float, key: int) -> Float[Tensor, "h w"]:
-    """Return a picture (h, w) that is zero but at up to `fraction` of the pixels.
-
-    A part of a pixel is one as often as it is large: a small crop would never have any else.
-    """
+    """Return a picture (h, w) that is zero but at up to `fraction` of the pixels."""
     pixels = size[0] * size[1]
-    share, part = noise.uniform(noise.key(key, "count"), torch.arange(2)).tolist()
-    count = int(share * fraction * pixels + part)
+    drawn = noise.uniform(noise.key(key, "count"), torch.arange(2))
+    count = up_to(fraction * pixels, *drawn.tolist())
     picture = torch.zeros(pixels)
     places = (noise.uniform(key, torch.arange(count)) * pixels).long()
     picture[places] = std * noise.normal(noise.key(key, "value"), torch.arange(count))
     return picture.reshape(*size)
+
+
+def up_to(most: float, share: float, part: float) -> int:
+    """Return a number of pixels uniform in [0, most], for `share` and `part` uniform in [0, 1).
+
+    Rounded up as often as what is over is large: 0.4 pixels are one in two crops of five, not none.
+    """
+    return int(share * most + part)
 
 
 def fire(
@@ -241,7 +246,7 @@ def fire(
     windows, _, bins, height, width = voxels.shape
     drawer = np.random.Generator(np.random.SFC64(key))
     for seen in voxels.unbind(1):
-        count = int(drawer.random() * fraction * height * width)
+        count = up_to(fraction * height * width, *drawer.random(2))
         rows, columns = drawer.integers([[height], [width]], size=(2, count))
         mean = np.exp(drawer.uniform(*np.log(often), count)) / (2 * bins)
         on, off = drawer.poisson(mean, (2, windows, bins, count))

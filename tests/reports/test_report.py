@@ -259,6 +259,14 @@ def test_each_sweep_has_tables_headed_by_its_own_settings(tmp_path):
     assert text.index("Scores and cost: rates") < text.index("Scores and cost: widths")
 
 
+def test_of_several_sweeps_one_without_results_is_missing_too(tmp_path):
+    write_run(tmp_path / "runs" / "a", config_name="rates")
+    write_sweep(tmp_path / "runs" / "none", {"experiment": "lf3x3", "seed": "0,1"})
+    found = {t.title: t for t in report(config("report", tmp_path / "out", f"run={tmp_path}/runs"))}
+    missing = value(found["Scores and cost: table1"], 0, "n")
+    assert missing.words == "missing"
+
+
 def test_an_empty_folder_is_refused_and_nothing_is_written(tmp_path):
     (tmp_path / "runs").mkdir()
     with pytest.raises(ValueError, match="run must hold results.json"):

@@ -9,6 +9,7 @@ from src.sim.optics import layout
 from src.sim.pipeline import Sample
 from src.training.augment import (
     Augment,
+    fire,
     flip_axes,
     hot_pixels,
     misplace,
@@ -167,6 +168,14 @@ def test_small_crops_have_a_hot_pixel_as_often_as_their_part_of_one_is_large():
     counts = [int((hot_pixels((64, 64), 1e-4, 1.0, key) != 0).sum()) for key in range(2000)]
     assert max(counts) == 1
     assert abs(sum(counts) / 2000 - 0.2048) < 4 * math.sqrt(0.2 * 0.8 / 2000)
+
+
+def test_small_crops_have_a_firing_pixel_as_often_too():
+    voxels = torch.zeros(2, 1000, 1, 64, 64)  # each view draws its own
+    fire(voxels, 1e-4, (1000.0, 1000.0), 0)
+    counts = (voxels != 0).any(0).sum((1, 2, 3))
+    assert counts.max() == 1
+    assert abs(float(counts.float().mean()) - 0.2048) < 4 * math.sqrt(0.2 * 0.8 / 1000)
 
 
 def test_firing_pixels_come_and_go_at_their_rate_each_view_s_own():
