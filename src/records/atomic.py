@@ -1,4 +1,7 @@
-"""Files that are whole or not there: written beside under a temporary name, then renamed."""
+"""Files that are whole or not there: written beside under a temporary name, then renamed.
+
+The name has the process in it, so that of two that write the same file neither takes the other's.
+"""
 
 import os
 from collections.abc import Iterator
@@ -14,7 +17,7 @@ def written(path: Path) -> Iterator[Path]:
     fails it is removed, and what was at `path` before stays.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         yield partial
         with partial.open("rb") as file:

@@ -1,5 +1,7 @@
 """A file is whole or not there."""
 
+import os
+
 import pytest
 
 from src.records.atomic import write_text, written
@@ -20,3 +22,12 @@ def test_until_the_end_the_file_has_another_name(tmp_path):
         partial.write_text("all")
         assert not (tmp_path / "a.txt").exists() and partial.suffix == ".partial"
     assert (tmp_path / "a.txt").read_text() == "all" and not partial.exists()
+
+
+def test_of_two_processes_that_write_a_file_neither_takes_the_others(tmp_path, monkeypatch):
+    with written(tmp_path / "a.txt") as first:
+        first.write_text("first")
+        with monkeypatch.context() as other:
+            other.setattr(os, "getpid", lambda: -1)
+            write_text(tmp_path / "a.txt", "second")
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("a.txt", "first")]
