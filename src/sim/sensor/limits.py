@@ -26,9 +26,10 @@ RANGES = {
     "hot_hz": (0, 1e6),
     "cutoff_hz": (0, 1e6),
     "residual": (0, 1),
+    "drawn_share": (0, 1),
 }
 THRESHOLDS = (0.01, 5)
-FIXED = ("floor",)  # part of the response: not drawn per clip
+FIXED = ("floor", "drawn_share")  # the response, and whether at all: not drawn per clip
 
 
 def threshold_range(threshold: float | Sequence[float]) -> tuple[float, float]:

@@ -51,7 +51,7 @@ class EventSensor:
     photoreceptor's low-pass at full intensity, 0 for none.  `residual`: how far a pixel's reference
     is from its first level, uniform up to so many thresholds either way: what it saw before is not
     known.  `drawn`: ranges out of which `draw` takes a clip's numbers, log-uniform, or uniform
-    where the range begins with 0.
+    where the range begins with 0; with probability `drawn_share`, else they are the sensor's own.
     """
 
     def __init__(
@@ -74,6 +74,7 @@ class EventSensor:
         cutoff_hz: float = 0.0,
         residual: float = 0.0,
         drawn: Mapping[str, Any] | None = None,
+        drawn_share: float = 1.0,
     ):
         self.threshold = threshold if isinstance(threshold, int | float) else tuple(threshold)
         self.refractory_s, self.refractory, self.stamps = refractory_s, refractory, stamps
@@ -81,7 +82,8 @@ class EventSensor:
         self.mismatch, self.off_ratio = mismatch, off_ratio
         self.leak_hz, self.shot_hz = leak_hz, shot_hz
         self.hot_fraction, self.hot_hz, self.cutoff_hz = hot_fraction, hot_hz, cutoff_hz
-        self.residual, self.drawn, self.seed = residual, dict(drawn or {}), seed
+        self.residual, self.seed = residual, seed
+        self.drawn, self.drawn_share = dict(drawn or {}), drawn_share
         check(vars(self))
         self._table = response_table(response, input, floor)
 
@@ -100,8 +102,9 @@ class EventSensor:
         """
         sensor = copy(self)
         sensor.threshold = self.sample_threshold(noise.generator(noise.key(key, "threshold")))
-        for name, (low, high) in self.drawn.items():
-            share = float(noise.uniform(noise.key(key, "sensor", name), torch.tensor(0)))
+        some = _uniform(key, "drawn") < self.drawn_share
+        for name, (low, high) in self.drawn.items() if some else ():
+            share = _uniform(key, name)
             drawn = low * (high / low) ** share if low > 0 else high * share
             setattr(sensor, name, min(drawn, high))
         sensor.drawn, sensor.seed = {}, self.seed if seed is None else seed
@@ -247,6 +250,11 @@ class EventSensor:
         decay, lag = np.exp(-a), -np.expm1(-a) / a
         scaled = [np.rint(part * UNIT * 2**EXTRA).astype(np.int32) for part in (decay, lag)]
         return level, *(torch.from_numpy(part).to(device) for part in scaled)
+
+
+def _uniform(key: int, name: str) -> float:
+    """Return a number in [0, 1), one of each name."""
+    return float(noise.uniform(noise.key(key, "sensor", name), torch.tensor(0)))
 
 
 def _engine(job: Job) -> ModuleType:

@@ -371,6 +371,23 @@ def test_what_is_not_drawn_is_drawn_as_before():
     )
 
 
+def test_a_share_of_the_clips_keeps_the_sensors_own_numbers():
+    ranges = {"mismatch": [0.01, 0.1], "refractory_s": [0.001, 0.002]}
+    drawn = [EventSensor(drawn=ranges).draw(key) for key in range(400)]
+    some = [EventSensor(drawn=ranges, drawn_share=0.7).draw(key) for key in range(400)]
+    kept = [clip.mismatch == 0.0 for clip in some]
+    assert 0.23 < np.mean(kept) < 0.37  # 0.3 +- 0.023
+    for clip, before, own in zip(some, drawn, kept, strict=True):
+        expected = (0.0, 0.005) if own else (before.mismatch, before.refractory_s)
+        assert (clip.mismatch, clip.refractory_s) == expected
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
+def test_a_share_is_between_none_and_all(share):
+    with pytest.raises(ValueError, match=r"sensor.drawn_share must be in \[0, 1\], got"):
+        EventSensor(drawn_share=share)
+
+
 @pytest.mark.parametrize(
     ("drawn", "message"),
     [
