@@ -187,7 +187,6 @@ def main() -> None:
     parser.add_argument("--root", help="a folder of photographs that no network was trained on")
     parser.add_argument("--footage", help="a video or folder of frames: a still scene through air")
     parser.add_argument("--published", type=Path, help="a folder of published weights")
-    parser.add_argument("--clips", type=int, default=27)
     parser.add_argument("--index", type=int, default=0, help="the clip of the picture")
     given = parser.parse_args()
     if given.footage and not given.root:
@@ -196,7 +195,7 @@ def main() -> None:
     picture(HOME / "docs" / "figures" / "nine_views.png", given.index, 40)
     if not given.root:
         return
-    photos = [f"scene.root={given.root}", f"data.test_clips={given.clips}"]
+    photos = [f"scene.root={given.root}"]
     asked = {
         "data=test_photos": photos,
         "data=test_photos sensor=drawn": photos,
