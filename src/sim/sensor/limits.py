@@ -26,10 +26,9 @@ RANGES = {
     "hot_hz": (0, 1e6),
     "cutoff_hz": (0, 1e6),
     "residual": (0, 1),
-    "drawn_share": (0, 1),
 }
 THRESHOLDS = (0.01, 5)
-FIXED = ("floor", "drawn_share")  # the response, and whether at all: not drawn per clip
+FIXED = ("floor",)  # part of the response: not drawn per clip
 
 
 def threshold_range(threshold: float | Sequence[float]) -> tuple[float, float]:
@@ -52,6 +51,7 @@ def check(settings: dict) -> None:
     for name, (low, high) in RANGES.items():
         within(f"sensor.{name}", settings[name], low, high)
     threshold_range(settings["threshold"])
+    within("sensor.drawn_share", settings["drawn_share"], 0, 1)
     check_drawn(settings["drawn"])
 
 
