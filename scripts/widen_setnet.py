@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from src.app import build, door
 from src.models import files
 from src.models.setnet import SetNet
-from src.models.setnet_layers import ViewKernels
+from src.models.setnet_layers import Residual, ViewKernels
 from src.training.handover import reached
 
 SPREAD = 1.0  # a part is 1 / copies, give or take up to so much
@@ -62,6 +62,12 @@ def convolution(
         wide.bias.copy_(bias)
 
 
+def residual(wide: Residual, old: Residual, channels: Channels) -> None:
+    """Fill `wide`, which reads copies and writes copies."""
+    convolution(wide.first, old.first, channels, channels)
+    convolution(wide.second, old.second, channels, channels)
+
+
 @torch.no_grad()
 def view_kernels(wide: ViewKernels, old: ViewKernels, writes: Channels) -> None:
     """Fill `wide`, which writes copies."""
@@ -73,11 +79,13 @@ def view_kernels(wide: ViewKernels, old: ViewKernels, writes: Channels) -> None:
 
 @torch.no_grad()
 def widen(wide: SetNet, old: SetNet) -> None:
-    """Fill `wide` so that it draws what `old` does; ValueError where it is narrower anywhere."""
+    """Fill `wide` so that it draws what `old` does; ValueError where it has less anywhere."""
     half = copies(old.half, wide.half)
     widths = [net.arguments["around"] for net in (old, wide)]
     if len(widths[0]) != len(widths[1]):
         raise ValueError(f"a SetNet is widened, not deepened: {widths[0]} to {widths[1]}")
+    if old.arguments.get("refined") and not wide.arguments.get("refined"):
+        raise ValueError("a SetNet that is refined is widened to one that is refined")
     scales = [half, *(copies(a, b) for a, b in zip(*widths, strict=True))]
     view_kernels(wide.voxel_stem, old.voxel_stem, half)
     view_kernels(wide.sum_stem, old.sum_stem, half)
@@ -88,9 +96,11 @@ def widen(wide: SetNet, old: SetNet) -> None:
     for scale, (finer, here) in enumerate(pairwise(scales)):
         new, known = wide.around, old.around
         convolution(new.downs[scale], known.downs[scale], finer, here)
-        convolution(new.blocks[scale].first, known.blocks[scale].first, here, here)
-        convolution(new.blocks[scale].second, known.blocks[scale].second, here, here)
+        residual(new.blocks[scale], known.blocks[scale], here)
         convolution(new.ups[scale], known.ups[scale], here, finer)
+    if old.arguments.get("refined"):  # else these are new and silent
+        for new, known, here in zip(wide.around.joined, old.around.joined, scales[1:], strict=False):
+            residual(new, known, here)
     convolution(wide.mix2, old.mix2, half, half)
     convolution(wide.shuffle, old.shuffle, half, None)
 

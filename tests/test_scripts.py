@@ -158,9 +158,11 @@ def talkative(**sizes) -> SetNet:
 
 
 @torch.no_grad()
-def test_a_widened_network_draws_what_it_was_begun_as_and_its_copies_part():
+@pytest.mark.parametrize("before", [False, True])
+def test_a_widened_network_draws_what_it_was_begun_as_and_its_copies_part(before):
     torch.manual_seed(0)
-    old, wide = talkative(half=6, around=[8, 10]), talkative(half=15, around=[16, 10])
+    old = talkative(half=6, around=[8, 10], refined=before)
+    wide = SetNet(bins=3, half=15, around=[16, 10], refined=True)
     widen_setnet.widen(wide, old)
     voxels = torch.randn(2, 5, 4, 3, 32, 24)
     expected, drawn = (unroll(network.eval(), voxels)[0] for network in (old, wide))
@@ -171,8 +173,9 @@ def test_a_widened_network_draws_what_it_was_begun_as_and_its_copies_part():
     steps = wide.mix2.weight.grad.flatten(1)[same]  # of the copies of a channel
     assert len(steps) > 1
     assert float(torch.pdist(steps).min()) > 0.1 * float(steps.norm(dim=1).max())
-    for narrow in ({"half": 4, "around": [8, 10]}, {"half": 6, "around": [8]}):
-        with pytest.raises(ValueError, match="a SetNet .* widened, not"):
+    less = [{"half": 4, "around": [8, 10]}, {"half": 6, "around": [8]}]
+    for narrow in less + ([{"half": 6, "around": [8, 10]}] if before else []):
+        with pytest.raises(ValueError, match="a SetNet .* widened"):
             widen_setnet.widen(talkative(**narrow), old)
 
 

@@ -72,9 +72,9 @@ class AfterStem(nn.Module):
         super().__init__()
         self.views, self.stride = len(positions), CELL
         places = network.places(self.views, network.bins, positions)
-        grids, memories, bias = network.kernels(places)
+        grids, _, bias = network.kernels(places)
         self.kernel, self.bias = grids.numpy(), bias.numpy()
-        self.memories = memories.to(dtype)
+        self.mixes, self.memories = (part.to(dtype) for part in _memories(network, places))
         self.sizes = [(1, h, w, c) for c, h, w in network.hidden(*padded)]
         network.cell2 = PartedUnit(network.cell2)
         self.network = network.to(dtype)
@@ -109,7 +109,8 @@ class AfterStem(nn.Module):
 
     def stem(self, grids: Tensor, sums: Tensor) -> Tensor:
         """Return the map of the stem, before its ReLU."""
-        stem = functional.conv2d(sums.to(self.dtype), self.memories, None, 1, 1)
+        mixed = functional.conv2d(sums.to(self.dtype), self.mixes)
+        stem = functional.conv2d(mixed, self.memories, None, 1, 1)
         return channels_first(grids.to(self.dtype)) + stem
 
     def pixels(
@@ -118,6 +119,18 @@ class AfterStem(nn.Module):
         """Return the pixels of each cell and what is told of what lies around."""
         told = faded(told, about, passed)
         return channels_last(self.network.drawn(seen, channels_first(told)).sigmoid()), told
+
+
+def _memories(network: SetNet, places: Sequence[Position]) -> tuple[Tensor, Tensor]:
+    """Return a mixture of the sums of all views and their spread (maps, sums, 1, 1) and the kernels
+    of the mixed maps: together the stem's, but of as many maps as its kernels have parts.
+    """
+    code, parts = network.sum_stem.parts(torch.tensor(places).float())
+    each = torch.eye(parts.shape[2])  # of the sums of a view
+    shares = torch.einsum("vr,ij->rivj", code, each).flatten(2).flatten(0, 1)
+    mixes = torch.block_diag(shares, each)
+    kernels = [parts.transpose(0, 1).flatten(1, 2), network.spread_stem.weight]
+    return mixes[..., None, None], torch.cat(kernels, 1)
 
 
 class Between(nn.Module):

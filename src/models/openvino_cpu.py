@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from src.models.eight_bits import drawn_in_bytes
 from src.models.explicit_state import Explicit
 from src.models.fast import plain
 from src.models.setnet import SetNet
@@ -51,6 +52,7 @@ class Compiled:
         require()
         model = _converted(module, tuple(example))
         model.reshape({k: list(part.shape) for k, part in enumerate(example)})
+        _fold(model)  # bounds of bytes are then constants, without which none are computed in
         options = {
             # What computes in bf16 says so itself: nothing else is rounded.
             "INFERENCE_PRECISION_HINT": "f32",
@@ -107,6 +109,8 @@ class OpenVinoNetwork(nn.Module):
         self.views = network.views
         # SetNet adds its events up in float32 and rounds where it convolves.
         self.seen = torch.float32 if isinstance(network, SetNet) else self.dtype
+        if isinstance(network, SetNet) and self.dtype == torch.bfloat16:
+            drawn_in_bytes(self.inner)
         self.made: dict[tuple, tuple[Compiled, bool]] = {}
 
     @torch.no_grad()
@@ -170,6 +174,15 @@ def _core() -> Any:
     import openvino
 
     return openvino.Core()
+
+
+def _fold(model: Any) -> None:
+    """Compute in `model` what does not depend on what it is given."""
+    from openvino.passes import ConstantFolding, Manager
+
+    passes = Manager()
+    passes.register_pass(ConstantFolding())
+    passes.run_passes(model)
 
 
 def _converted(module: nn.Module, example: tuple[Tensor, ...]) -> Any:

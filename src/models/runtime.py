@@ -17,6 +17,7 @@ from torch import nn
 from src.models import openvino_cpu
 from src.models.behind_first_layer import AfterHead, AfterStem, Behind, OnOpenVino, OnTorch
 from src.models.e2vid import E2VID
+from src.models.eight_bits import drawn_in_bytes
 from src.models.engines import events_numba as kernels
 from src.models.fast import computes_bf16, plain
 from src.models.first_layer import HeadFront, StemFront
@@ -85,6 +86,8 @@ class Runtime:
         rest, front = (AfterStem, StemFront) if stemmed else (AfterHead, HeadFront)
         after = rest(plain(network).cpu(), positions, padded, dtype)
         self.front = front(after, padded)
+        if stemmed and form == "openvino" and dtype == torch.bfloat16:
+            drawn_in_bytes(after.network)
         engine = OnOpenVino if form == "openvino" else OnTorch
         self.behind = Behind(after, self.front.example(), engine, threads)
 

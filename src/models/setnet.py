@@ -23,9 +23,9 @@ from src.models.layers import pad_to_multiple
 from src.models.setnet_layers import Even, PacedUnit, Surroundings, ViewKernels, grown, over_time
 from src.sim.optics import layout
 
-SIZES = {  # channels; multiply-accumulates at 176 x 176 with nine views: 0.34, 1.1 and 3.0 G
+SIZES = {  # channels; multiply-accumulates at 176 x 176 with nine views: 0.34, 1.3 and 3.0 G
     "small": {"half": 16, "around": [32, 64, 96]},
-    "medium": {"half": 40, "around": [56, 96, 128]},
+    "medium": {"half": 40, "around": [56, 96, 128], "refined": True},
     "large": {"half": 64, "around": [128, 192, 256]},
 }
 MEMORIES_S = (0.05, 0.5)  # time constants of the leaky sums
@@ -45,21 +45,28 @@ State = tuple[Tensor, ...]
 class SetNet(nn.Module):
     """Voxel grids of 1 to 25 views to frames in [0, 1], window by window.
 
-    `half`: channels at half resolution; `around`: at a quarter and each coarser one.  The order of
-    the views is free but the same in all windows of a sequence.
+    `half`: channels at half resolution; `around`: at a quarter and each coarser one; `refined`:
+    see Surroundings.  The order of the views is free but the same in all windows of a sequence.
     """
 
     views = None
 
-    def __init__(self, bins: int = 5, half: int = 16, around: Sequence[int] = (32, 64, 96)):
+    def __init__(
+        self,
+        bins: int = 5,
+        half: int = 16,
+        around: Sequence[int] = (32, 64, 96),
+        refined: bool = False,
+    ):
         super().__init__()
         self.arguments = {"bins": bins, "half": half, "around": list(around)}  # that make it again
+        self.arguments |= {"refined": True} if refined else {}
         self.bins, self.half, memories = bins, half, len(MEMORIES_S)
         self.voxel_stem = ViewKernels(bins, half, 5)
         self.sum_stem = ViewKernels(memories, half, 3)
         self.spread_stem = nn.Conv2d(memories, half, 3, padding=1, bias=False)
         self.cell2 = PacedUnit(half)
-        self.around = Surroundings(half, around)
+        self.around = Surroundings(half, around, refined)
         self.mix2 = nn.Conv2d(half, half, 3)
         self.shuffle = Even(half, CELL**2, 3)
         self.relu = nn.ReLU()

@@ -31,13 +31,19 @@ class ViewKernels(nn.Module):
         self, places: Float[Tensor, "views 2"]
     ) -> Float[Tensor, "outputs viewsinputs size size"]:
         """Return the kernel for the stacked views that stand at `places` (row, col)."""
+        code, parts = self.parts(places)
+        return torch.einsum("vr,roikl->ovikl", code, parts).flatten(1, 2)
+
+    def parts(
+        self, places: Float[Tensor, "views 2"]
+    ) -> tuple[Float[Tensor, "views parts"], Float[Tensor, "parts outputs inputs size size"]]:
+        """Return how much of each part is in the kernel of each view, and the parts."""
         views = len(places)
         # Positions and the number of views, in units that keep the codes apart.
         known = torch.cat([places, torch.full_like(places[:, :1], 3 / views)], 1)
         code = self.code(known.to(self.bias.dtype))
         code = torch.cat([torch.ones_like(code[:, :1]), code], 1) / views
-        kernels = self.kernels.unflatten(0, (code.shape[1], -1))
-        return torch.einsum("vr,roikl->ovikl", code, kernels).flatten(1, 2)
+        return code, self.kernels.unflatten(0, (code.shape[1], -1))
 
 
 class PacedUnit(nn.Module):
@@ -118,14 +124,17 @@ class Surroundings(nn.Module):
     al. 2016, identity mappings), and what comes back is nothing before training: otherwise a high
     rate shuts these layers for good (docs/decisions/0021).  What is remembered of it is a running
     mean, each channel's with a time constant of its own, learned.
+    `refined`: a block of convolutions on the way back, too, where two scales have met.
     """
 
-    def __init__(self, channels: int, widths: Sequence[int]):
+    def __init__(self, channels: int, widths: Sequence[int], refined: bool = False):
         super().__init__()
         pairs = list(pairwise([channels, *widths]))
         self.downs = nn.ModuleList(nn.Conv2d(a, b, 3, 2, padding=1) for a, b in pairs)
         self.blocks = nn.ModuleList(Residual(width) for width in widths)
         self.ups = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairs)
+        met = (Residual(width) if refined else nn.Identity() for width in widths[:-1])
+        self.joined = nn.ModuleList(met)
         self.relu = nn.ReLU()
         for conv in (*self.downs, *self.ups):
             _healthy(conv)
@@ -139,9 +148,9 @@ class Surroundings(nn.Module):
             x = block(down(x))
             scales.append(x)
         scales.pop()
-        for up in reversed(self.ups[1:]):
+        for up, joined in zip(reversed(self.ups[1:]), reversed(self.joined), strict=True):
             finer = scales.pop()
-            x = finer + _stretched(up(self.relu(x)), finer)
+            x = joined(finer + _stretched(up(self.relu(x)), finer))
         return self.ups[0](self.relu(x))
 
     def mean(

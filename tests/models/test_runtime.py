@@ -8,6 +8,7 @@ import torch
 from baselines.firenet import FireNet
 from src.models import openvino_cpu
 from src.models.e2vid import E2VID
+from src.models.eight_bits import LARGEST, WORTH, EightBits, drawn_in_bytes
 from src.models.openvino_cpu import OpenVinoNetwork
 from src.models.runtime import Runtime
 from src.models.setnet import SetNet
@@ -17,6 +18,7 @@ from src.sim.voxel import voxel_grid
 EXACT, ROUNDED = 1e-5, 0.02  # in grey levels: sums in another order, and bf16
 NETWORKS = {
     "setnet": lambda: SetNet(half=4),
+    "setnet_in_bytes": lambda: SetNet(half=WORTH, around=[8, 8, 8]),
     "e2vid": lambda: E2VID(views=9, base_channels=4, spectral_norm=True),
     "e2vid_gru_3x3": lambda: E2VID(
         views=9, base_channels=4, recurrent="convgru", kernel_size=3, final_activation="none"
@@ -235,3 +237,33 @@ def test_openvino_refuses_a_state_of_another_size_and_a_batch(unchecked):
         found(torch.zeros(1, 9, 5, 24, 24), state)
     with pytest.raises(ValueError, match="form=openvino takes one clip on device=cpu, got 2"):
         found(torch.zeros(2, 9, 5, 16, 16))
+
+
+def test_bytes_round_to_half_a_step():
+    torch.manual_seed(0)
+    conv, x = torch.nn.Conv2d(6, 5, 3), LARGEST * torch.rand(1, 6, 9, 9)
+    step = conv.weight.abs().amax((1, 2, 3), keepdim=True) / 127
+    most = x.amax() * (step / 2).sum((1, 2, 3)) * 6 * 9  # what the weights can be off
+    most += LARGEST / 255 / 2 * (conv.weight.abs() + step / 2).sum((1, 2, 3))
+    with torch.no_grad():
+        off = (EightBits(conv)(x) - conv(x)).abs().amax((0, 2, 3))
+        cut = EightBits(conv)(10 * x) - EightBits(conv)((10 * x).clamp_max(LARGEST))
+    assert (off > 0).all() and (off < most).all() and not cut.any()
+
+
+def test_few_channels_are_not_drawn_in_bytes():
+    wide, narrow = network("setnet_in_bytes"), network("setnet")
+    for one in (wide, narrow):
+        drawn_in_bytes(one)
+    assert isinstance(wide.mix2, EightBits) and not isinstance(narrow.mix2, EightBits)
+
+
+def test_openvino_computes_in_bytes_what_is_to_be(unchecked):
+    form("openvino")
+    if openvino_cpu.precision() != torch.bfloat16:
+        pytest.skip("this CPU computes in float32")
+    live = runtime(network("setnet_in_bytes"), "openvino")
+    for part in (live.behind.whole, live.behind.between):
+        nodes = part.request.get_compiled_model().get_runtime_model().get_ordered_ops()
+        kinds = [node.get_rt_info()["primitiveType"].astype(str) for node in nodes]
+        assert sum(kind.endswith("I8") for kind in kinds) == 1
