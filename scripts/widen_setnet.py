@@ -99,7 +99,8 @@ def widen(wide: SetNet, old: SetNet) -> None:
         residual(new.blocks[scale], known.blocks[scale], here)
         convolution(new.ups[scale], known.ups[scale], here, finer)
     if old.arguments.get("refined"):  # else these are new and silent
-        for new, known, here in zip(wide.around.joined, old.around.joined, scales[1:], strict=False):
+        met = zip(wide.around.joined, old.around.joined, scales[1:-1], strict=True)
+        for new, known, here in met:
             residual(new, known, here)
     convolution(wide.mix2, old.mix2, half, half)
     convolution(wide.shuffle, old.shuffle, half, None)

@@ -23,10 +23,10 @@ from src.models.layers import pad_to_multiple
 from src.models.setnet_layers import Even, PacedUnit, Surroundings, ViewKernels, grown, over_time
 from src.sim.optics import layout
 
-SIZES = {  # channels; multiply-accumulates at 176 x 176 with nine views: 0.34, 1.3 and 3.0 G
+SIZES = {  # channels; multiply-accumulates at 176 x 176 with nine views: 0.34, 1.3 and 3.9 G
     "small": {"half": 16, "around": [32, 64, 96]},
     "medium": {"half": 40, "around": [56, 96, 128], "refined": True},
-    "large": {"half": 64, "around": [128, 192, 256]},
+    "large": {"half": 64, "around": [128, 192, 256], "refined": True},
 }
 MEMORIES_S = (0.05, 0.5)  # time constants of the leaky sums
 AWAKE_S = 0.005  # time constant by which a picture falls asleep after its last event
