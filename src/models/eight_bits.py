@@ -12,11 +12,12 @@ WEIGHT, MAP = 127, 255  # steps from zero to the largest
 WORTH = 32  # channels from which on it is faster
 
 
-def drawn_in_bytes(network: SetNet) -> None:
-    """Let the larger one of the convolutions that draw compute in bytes, where that is faster: a
-    pixel moves by less than bf16 moves it.
+def drawn_in_bytes(network: nn.Module) -> None:
+    """Let the larger one of the convolutions with which a SetNet in bf16 draws compute in bytes,
+    where that is faster: a pixel moves by less than bf16 moves it.
     """
-    if network.half >= WORTH:
+    wide = isinstance(network, SetNet) and network.half >= WORTH
+    if wide and network.mix2.weight.dtype == torch.bfloat16:
         network.mix2 = EightBits(network.mix2)
 
 

@@ -1,7 +1,8 @@
 """A network on OpenVINO: compiled for one size of picture, its state handed on without a copy.
 
-Weights and maps are bf16 where the CPU computes in it and float32 elsewhere; what a network keeps
-in float32 (`SetNet`: its sums and hidden maps) stays so.  Needs the extra `openvino`.
+Weights and maps are bf16 where the CPU computes in it (of a wide SetNet one convolution in bytes)
+and float32 elsewhere; what a network keeps in float32 (`SetNet`: its sums and hidden maps) stays
+so.  Needs the extra `openvino`.
 """
 
 import warnings
@@ -109,8 +110,7 @@ class OpenVinoNetwork(nn.Module):
         self.views = network.views
         # SetNet adds its events up in float32 and rounds where it convolves.
         self.seen = torch.float32 if isinstance(network, SetNet) else self.dtype
-        if isinstance(network, SetNet) and self.dtype == torch.bfloat16:
-            drawn_in_bytes(self.inner)
+        drawn_in_bytes(self.inner)
         self.made: dict[tuple, tuple[Compiled, bool]] = {}
 
     @torch.no_grad()

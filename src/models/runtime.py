@@ -86,7 +86,7 @@ class Runtime:
         rest, front = (AfterStem, StemFront) if stemmed else (AfterHead, HeadFront)
         after = rest(plain(network).cpu(), positions, padded, dtype)
         self.front = front(after, padded)
-        if stemmed and form == "openvino" and dtype == torch.bfloat16:
+        if form == "openvino":
             drawn_in_bytes(after.network)
         engine = OnOpenVino if form == "openvino" else OnTorch
         self.behind = Behind(after, self.front.example(), engine, threads)

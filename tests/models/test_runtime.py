@@ -251,11 +251,18 @@ def test_bytes_round_to_half_a_step():
     assert (off > 0).all() and (off < most).all() and not cut.any()
 
 
-def test_few_channels_are_not_drawn_in_bytes():
-    wide, narrow = network("setnet_in_bytes"), network("setnet")
-    for one in (wide, narrow):
-        drawn_in_bytes(one)
-    assert isinstance(wide.mix2, EightBits) and not isinstance(narrow.mix2, EightBits)
+@pytest.mark.parametrize(
+    ("name", "dtype", "drawn"),
+    [
+        ("setnet_in_bytes", torch.bfloat16, True),
+        ("setnet_in_bytes", torch.float32, False),
+        ("setnet", torch.bfloat16, False),
+    ],
+)
+def test_many_channels_in_bf16_are_drawn_in_bytes(name, dtype, drawn):
+    net = network(name).to(dtype)
+    drawn_in_bytes(net)
+    assert isinstance(net.mix2, EightBits) == drawn
 
 
 def test_openvino_computes_in_bytes_what_is_to_be(unchecked):
