@@ -85,7 +85,7 @@ def widen(wide: SetNet, old: SetNet) -> None:
     if len(widths[0]) != len(widths[1]):
         raise ValueError(f"a SetNet is widened, not deepened: {widths[0]} to {widths[1]}")
     if old.arguments.get("refined") and not wide.arguments.get("refined"):
-        raise ValueError("a SetNet that is refined is widened to one that is refined")
+        raise ValueError("a SetNet is widened, not cut down: refined to not refined")
     scales = [half, *(copies(a, b) for a, b in zip(*widths, strict=True))]
     view_kernels(wide.voxel_stem, old.voxel_stem, half)
     view_kernels(wide.sum_stem, old.sum_stem, half)

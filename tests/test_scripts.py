@@ -158,11 +158,13 @@ def talkative(**sizes) -> SetNet:
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("before", [False, True])
-def test_a_widened_network_draws_what_it_was_begun_as_and_its_copies_part(before):
+@pytest.mark.parametrize(("before", "after"), [(False, False), (False, True), (True, True)])
+def test_a_widened_network_draws_what_it_was_begun_as_and_its_copies_part(before, after):
     torch.manual_seed(0)
     old = talkative(half=6, around=[8, 10], refined=before)
-    wide = SetNet(bins=3, half=15, around=[16, 10], refined=True)
+    wide = talkative(half=15, around=[16, 10], refined=after)
+    if after and not before:  # blocks that are new are silent
+        wide.around.joined = SetNet(bins=3, half=15, around=[16, 10], refined=True).around.joined
     widen_setnet.widen(wide, old)
     voxels = torch.randn(2, 5, 4, 3, 32, 24)
     expected, drawn = (unroll(network.eval(), voxels)[0] for network in (old, wide))
@@ -175,7 +177,7 @@ def test_a_widened_network_draws_what_it_was_begun_as_and_its_copies_part(before
     assert float(torch.pdist(steps).min()) > 0.1 * float(steps.norm(dim=1).max())
     less = [{"half": 4, "around": [8, 10]}, {"half": 6, "around": [8]}]
     for narrow in less + ([{"half": 6, "around": [8, 10]}] if before else []):
-        with pytest.raises(ValueError, match="a SetNet .* widened"):
+        with pytest.raises(ValueError, match="a SetNet .* widened, not"):
             widen_setnet.widen(talkative(**narrow), old)
 
 
