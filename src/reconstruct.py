@@ -27,7 +27,7 @@ def reconstruct(cfg: DictConfig) -> Path:
     """
     run, net = Path(cfg.paths.run), build.chosen(cfg)
     views, span = views_for(cfg, net), overlap(cfg, net)
-    fast = event_lists.ready(net, cfg.form, cfg.device, views, cfg.bins)
+    fast = event_lists.ready(net, cfg.form, cfg.device, views, cfg.bins, cfg.align)
     results.open_run(run, door.resolved(cfg))
     with output.sink(cfg.output, run, views.model, cfg.playback) as write:
         for frame in progress.tell(frames(cfg, fast, views, span), span):

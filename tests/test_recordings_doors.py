@@ -92,6 +92,18 @@ def test_a_faster_form_gives_nearly_the_same_frames(folder, found, tmp_path):
     assert 0 < np.abs(shown[0] - shown[1]).mean() < 0.02
 
 
+def test_views_are_aligned_in_every_form(folder, found, tmp_path):
+    chosen = [f"recording={folder}/dot.raw", f"views={found}", "ckpt=setnet_small", "output=hdf5"]
+    shown = []
+    for number, more in enumerate((["align=null"], ["align=local"], ["align=local", "form=bf16"])):
+        reconstruct(config("reconstruct", tmp_path / str(number), *chosen, *more))
+        with h5py.File(tmp_path / str(number) / "video.h5") as file:
+            shown.append(file["frames"][:].astype(float) / 255)
+    as_they_are, aligned, faster = shown
+    assert 1e-4 < np.abs(aligned - as_they_are).mean() < 0.05
+    assert np.abs(aligned - faster).mean() < 0.02
+
+
 def test_what_looking_ahead_adds_is_there_from_the_first_frame_and_fades(folder, found, tmp_path):
     chosen = [f"recording={folder}/dot.raw", f"views={found}", HIGHPASS, "output=hdf5"]
     films = []
@@ -132,6 +144,7 @@ def test_without_views_the_sensor_is_one_view(folder, tmp_path):
         ("form=bf16", "form must be float32 for a network without parameters"),
         ("start=3.0 end=2.0", "start must be"),
         ("ckpt=null", "must name a network"),
+        ("align=near", "align must be one of whole, local or null, got near"),
         ("look_ahead_s=-1", "look_ahead_s must be >= 0"),
         ("noise_filter_s=0", "noise_filter_s must be > 0 seconds or null, got 0"),
         ("look_ahead_s=1 count=500", "look_ahead_s must be 0 with count=500"),

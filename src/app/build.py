@@ -20,6 +20,7 @@ from src.app.contracts import keeping
 from src.app.parts import make, part, rooms
 from src.app.simulation import pipeline
 from src.metrics.scores import Scores
+from src.models.aligned import Aligned
 from src.models.fast import computes_bf16
 from src.models.look_ahead import LookAhead
 from src.models.unroll import takes
@@ -112,8 +113,12 @@ def chosen(cfg: DictConfig) -> nn.Module:
 
 
 def frozen(cfg: DictConfig) -> nn.Module:
-    """Return the chosen network, with its look ahead and behind it the chosen post-processor."""
+    """Return the chosen network, its views aligned, with its look ahead and behind it the chosen
+    post-processor.
+    """
     net = chosen(cfg)
+    if cfg.get("align"):
+        net = Aligned(net, cfg.align)
     if cfg.get("look_ahead_s"):
         net = LookAhead(net, cfg.look_ahead_s)
     return part(cfg, "postprocess", source=net) if cfg.get("postprocess") else net

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from src.models.aligned import Aligned
 from src.models.fast import running
 from src.models.runtime import FORMS, Runtime, runs
 from src.recordings.stream import Carry, Frame, Window, carried
@@ -14,14 +15,17 @@ from src.recordings.views import Views
 
 
 def ready(
-    network: nn.Module, form: str, device: str, views: Views, bins: int
+    network: nn.Module, form: str, device: str, views: Views, bins: int, align: str | None = None
 ) -> nn.Module | Runtime:
-    """Return `network` as it is run: on a CPU a Runtime where there is one for it.
+    """Return `network` as it is run: on a CPU a Runtime where there is one for it, but not where
+    views are to be aligned, which takes grids (aligned.py).
 
     Raises ValueError for a form, a device or a number of bins that do not go together.
     """
     if device != "cpu" and form == "openvino":
         raise ValueError(f"device must be cpu for form=openvino, got {device}")
+    if align:
+        return Aligned(running(network, form), align).to(device)
     if device != "cpu" or form not in FORMS or not runs(network):
         return running(network, form).to(device)
     if bins != network.bins:

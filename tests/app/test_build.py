@@ -198,6 +198,17 @@ def test_a_clip_read_backwards_first_is_scored(tmp_path):
     assert ratio == pytest.approx(1.5)  # two of four windows are read twice
 
 
+@pytest.mark.parametrize("name", ["setnet_small", "lf3x3"])
+def test_aligned_views_are_scored(name, tmp_path):
+    chosen = [*SMALL, f"ckpt={name}", "sensor.threshold=0.1"]
+    plain, aligned, ahead = (
+        evaluate(config("eval", tmp_path / str(k), *chosen, *more))
+        for k, more in enumerate(([], ["align=local"], ["align=local", "look_ahead_s=0.02"]))
+    )
+    assert len({one["test"]["psnr"]["mean"] for one in (plain, aligned, ahead)}) == 3
+    assert aligned["model"]["params"] == plain["model"]["params"]
+
+
 KEEPING = """
 import resource, torch
 from omegaconf import OmegaConf
