@@ -27,8 +27,6 @@ WIDTH = 2.0  # blocks: standard deviation of the window of `local`
 PRIOR = {"whole": 0.01, "local": 0.1}  # squared gradients, in events a cell, that count as much
 LARGEST = 4.0  # pixels: further off the picture is not linear any more
 
-Moments = Sequence[Tensor]  # five
-
 
 class Aligned(nn.Module):
     """`network`, given views that are brought together: `way` is `whole`, each view moved as one,
@@ -101,7 +99,7 @@ def displacement(
     """
     moments = _moments(sums)
     whole = [part.mean((-2, -1), keepdim=True) for part in moments]
-    found = _solved(whole, torch.zeros_like(whole[3]), torch.zeros_like(whole[4]), PRIOR["whole"])
+    found = _solved(whole, 0.0, 0.0, PRIOR["whole"])
     if way == "local":
         near = [_windowed(part) for part in moments]
         found = _solved(near, *found, PRIOR["local"])
@@ -119,9 +117,9 @@ def brought(
     return pull(voxels.flatten(0, 1), fine.to(voxels.dtype)).unflatten(0, (n, views))
 
 
-def _moments(sums: Tensor) -> Moments:
-    """Return, summed over blocks, the products of the mean picture's gradient with itself and with
-    what each view differs by.
+def _moments(sums: Tensor) -> Sequence[Tensor]:
+    """Return, averaged over blocks, the products of the mean picture's gradient with itself and
+    with what each view differs by.
     """
     mean = sums.mean(1, keepdim=True)
     framed = functional.pad(mean.flatten(0, 1), (1, 1, 1, 1), mode="replicate")
@@ -134,7 +132,9 @@ def _moments(sums: Tensor) -> Moments:
     return [functional.avg_pool2d(part, block, ceil_mode=True) for part in products]
 
 
-def _solved(moments: Moments, x: Tensor, y: Tensor, prior: float) -> tuple[Tensor, Tensor]:
+def _solved(
+    moments: Sequence[Tensor], x: Tensor | float, y: Tensor | float, prior: float
+) -> tuple[Tensor, Tensor]:
     """Return the displacement, in cells, of least squares and of `prior` towards (x, y)."""
     xx, xy, yy, xt, yt = moments
     xx, yy, xt, yt = xx + prior, yy + prior, xt + prior * x, yt + prior * y
