@@ -26,7 +26,7 @@ def displacement(
 
     Blocks are 16 pixels wide; shifts are cut at 8 pixels.
     """
-    a, b, c = _structure(*_gradients(target))
+    a, b, c = _structure(*gradients(target))
     weaker = (a + c) / 2 - ((a - c) ** 2 / 4 + b * b).sqrt()  # eigenvalue of each block's tensor
     weight = torch.where(weaker > TEXTURE, weaker, torch.zeros_like(weaker))
     shift = torch.zeros(len(target), 2, *weight.shape[1:], dtype=target.dtype, device=target.device)
@@ -81,7 +81,7 @@ def _structure(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
 
 def _step(frames: Tensor, target: Tensor, shift: Tensor) -> Tensor:
     """Return the least-squares correction of `shift`."""
-    x, y = _gradients(target)
+    x, y = gradients(target)
     a, b, c = _structure(x, y)
     smooth = functional.interpolate(shift, frames.shape[-2:], mode="bilinear")
     difference = _matched(pull(frames, smooth), target) - target
@@ -96,7 +96,10 @@ def _smooth(pictures: Tensor, side: int) -> Tensor:
     return functional.avg_pool2d(rows, (1, side), 1, (0, half), count_include_pad=False)
 
 
-def _gradients(pictures: Tensor) -> tuple[Tensor, Tensor]:
+def gradients(
+    pictures: Float[Tensor, "n c h w"],
+) -> tuple[Float[Tensor, "n c h w"], Float[Tensor, "n c h w"]]:
+    """Return the slopes along x and y, per pixel, by central differences."""
     padded = functional.pad(pictures, (1, 1, 1, 1), mode="replicate")
     x = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) / 2
     y = (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) / 2

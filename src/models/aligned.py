@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from src.metrics.temporal import pull
+from src.metrics.temporal import gradients, pull
 from src.models.unroll import unroll
 from src.sim.optics import Position
 
@@ -122,10 +122,7 @@ def _moments(sums: Tensor) -> Sequence[Tensor]:
     with what each view differs by.
     """
     mean = sums.mean(1, keepdim=True)
-    framed = functional.pad(mean.flatten(0, 1), (1, 1, 1, 1), mode="replicate")
-    framed = framed.unflatten(0, mean.shape[:2])
-    across = (framed[..., 1:-1, 2:] - framed[..., 1:-1, :-2]) / 2
-    down = (framed[..., 2:, 1:-1] - framed[..., :-2, 1:-1]) / 2
+    across, down = gradients(mean)
     change = sums - mean
     products = (across**2, across * down, down**2, across * change, down * change)
     block = min(BLOCK, *sums.shape[-2:])
