@@ -5,7 +5,8 @@
 The wide network draws what the small one draws (Chen, Goodfellow & Shlens 2016, Net2Net): each new
 channel is a copy of an old one, and whatever reads an old channel reads its copies in parts that
 add up to what it read before.  The parts are drawn at random, for every reader anew, so that copies
-learn different things from the first step.  `export` is to go on from, with the hours of `ckpt`:
+learn different things from the first step.  A memory that is to have a rank gets it first
+(`scripts.narrow_memory`), and then draws nearly what it did.  `export` is to go on from, with the hours of `ckpt`:
 `python -m src.train ... ckpt=FILE`.  The config is that of the training.
 """
 
@@ -18,6 +19,7 @@ from jaxtyping import Float, Int
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
+from scripts.narrow_memory import narrow, told
 from src.app import build, door
 from src.models import files
 from src.models.setnet import SetNet
@@ -86,11 +88,16 @@ def widen(wide: SetNet, old: SetNet) -> None:
         raise ValueError(f"a SetNet is widened, not deepened: {widths[0]} to {widths[1]}")
     if old.arguments.get("refined") and not wide.arguments.get("refined"):
         raise ValueError("a SetNet is widened, not cut down: refined to not refined")
+    rank, wanted = (net.arguments.get("rank") for net in (old, wide))
+    if rank != wanted:
+        raise ValueError(f"a SetNet is widened, not changed otherwise: rank {rank} to {wanted}")
     scales = [half, *(copies(a, b) for a, b in zip(*widths, strict=True))]
     view_kernels(wide.voxel_stem, old.voxel_stem, half)
     view_kernels(wide.sum_stem, old.sum_stem, half)
     convolution(wide.spread_stem, old.spread_stem, None, half)
-    convolution(wide.cell2.seen, old.cell2.seen, half, half)
+    if rank:
+        convolution(wide.cell2.mixed, old.cell2.mixed, half, None)
+    convolution(wide.cell2.seen, old.cell2.seen, None if rank else half, half)
     convolution(wide.cell2.kept, old.cell2.kept, half, half)
     wide.around.pace.copy_(old.around.pace[half])
     for scale, (finer, here) in enumerate(pairwise(scales)):
@@ -118,6 +125,9 @@ def begin(cfg: DictConfig) -> None:
         kinds = f"{type(old).__name__} to {type(wide).__name__}"
         raise ValueError(f"ckpt and experiment must be SetNets, got {kinds}")
     torch.manual_seed(cfg.seed)
+    rank = wide.arguments.get("rank")
+    if rank and "rank" not in old.arguments:
+        old = narrow(old, rank, told(old, cfg))
     widen(wide, old)
     files.save(Path(cfg.export), wide, spec, reached(source))
 

@@ -23,10 +23,10 @@ from src.models.layers import pad_to_multiple
 from src.models.setnet_layers import Even, PacedUnit, Surroundings, ViewKernels, grown, over_time
 from src.sim.optics import layout
 
-SIZES = {  # channels; multiply-accumulates at 176 x 176 with nine views: 0.34, 1.3 and 3.9 G
+SIZES = {  # channels; multiply-accumulates at 176 x 176 with nine views: 0.34, 1.2 and 3.5 G
     "small": {"half": 16, "around": [32, 64, 96]},
-    "medium": {"half": 40, "around": [56, 96, 128], "refined": True},
-    "large": {"half": 64, "around": [128, 192, 256], "refined": True},
+    "medium": {"half": 40, "around": [56, 96, 128], "refined": True, "rank": 32},
+    "large": {"half": 64, "around": [128, 192, 256], "refined": True, "rank": 32},
 }
 MEMORIES_S = (0.05, 0.5)  # time constants of the leaky sums
 AWAKE_S = 0.005  # time constant by which a picture falls asleep after its last event
@@ -46,7 +46,7 @@ class SetNet(nn.Module):
     """Voxel grids of 1 to 25 views to frames in [0, 1], window by window.
 
     `half`: channels at half resolution; `around`: at a quarter and each coarser one; `refined`:
-    see Surroundings.  The order of the views is free but the same in all windows of a sequence.
+    see Surroundings; `rank`: see PacedUnit.  The order of the views is free but the same in all windows of a sequence.
     """
 
     views = None
@@ -57,15 +57,17 @@ class SetNet(nn.Module):
         half: int = 16,
         around: Sequence[int] = (32, 64, 96),
         refined: bool = False,
+        rank: int | None = None,
     ):
         super().__init__()
         self.arguments = {"bins": bins, "half": half, "around": list(around)}  # that make it again
         self.arguments |= {"refined": True} if refined else {}
+        self.arguments |= {"rank": rank} if rank else {}
         self.bins, self.half, memories = bins, half, len(MEMORIES_S)
         self.voxel_stem = ViewKernels(bins, half, 5)
         self.sum_stem = ViewKernels(memories, half, 3)
         self.spread_stem = nn.Conv2d(memories, half, 3, padding=1, bias=False)
-        self.cell2 = PacedUnit(half)
+        self.cell2 = PacedUnit(half, rank)
         self.around = Surroundings(half, around, refined)
         self.mix2 = nn.Conv2d(half, half, 3)
         self.shuffle = Even(half, CELL**2, 3)

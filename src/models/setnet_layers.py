@@ -52,11 +52,15 @@ class PacedUnit(nn.Module):
     Of the old state exp(-pace * relu(gate)) is left and the rest is the candidate's tanh: without
     pace, or with a gate below zero, nothing changes.  It stays within [-1, 1].  A place sees the
     state of its own only, so that nothing wanders.
+    `rank`: gates and candidates are mixtures of so many maps of 3 x 3 (None: of as many as there
+    are of both), which costs less.
     """
 
-    def __init__(self, channels: int):
+    def __init__(self, channels: int, rank: int | None = None):
         super().__init__()
-        self.seen = nn.Conv2d(channels, 2 * channels, 3, padding=1)
+        size = 1 if rank else 3
+        self.mixed = nn.Conv2d(channels, rank, 3, padding=1, bias=False) if rank else nn.Identity()
+        self.seen = nn.Conv2d(rank or channels, 2 * channels, size, padding=size // 2)
         self.kept = nn.Conv2d(channels, 2 * channels, 1, bias=False)
         with torch.no_grad():  # memories of one to twenty windows from the start
             self.seen.bias[:channels].copy_(torch.linspace(0.05, 0.7, channels))
@@ -77,7 +81,7 @@ class PacedUnit(nn.Module):
             gate, candidate = both.chunk(2, 1)
             return torch.lerp(candidate.tanh(), state, torch.exp(-pace * gate.relu()))
 
-        return over_time(step, state, self.seen(x), pace)
+        return over_time(step, state, self.seen(self.mixed(x)), pace)
 
 
 class PartedUnit(nn.Module):
@@ -88,6 +92,7 @@ class PartedUnit(nn.Module):
 
     def __init__(self, unit: PacedUnit):
         super().__init__()
+        self.mixed = unit.mixed
         self.seen = nn.ParameterList(unit.seen.weight.chunk(2))
         self.bias = nn.ParameterList(unit.seen.bias.chunk(2))
         self.kept = nn.ParameterList(unit.kept.weight.chunk(2))
@@ -97,8 +102,10 @@ class PartedUnit(nn.Module):
     ) -> tuple[Float[Tensor, "1 c h w"], Float[Tensor, "1 h w c"]]:
         """Return the state after the window, channels first and as it is kept."""
         before = channels_first(state.to(x.dtype))
+        mixed = self.mixed(x)
         gate, candidate = (
-            functional.conv2d(x, seen, bias, padding=1) + functional.conv2d(before, kept)
+            functional.conv2d(mixed, seen, bias, padding=len(seen[0, 0]) // 2)
+            + functional.conv2d(before, kept)
             for seen, bias, kept in zip(self.seen, self.bias, self.kept, strict=True)
         )
         keep = torch.exp(-pace * gate.relu().float())
