@@ -6,8 +6,8 @@ The wide network draws what the small one draws (Chen, Goodfellow & Shlens 2016,
 channel is a copy of an old one, and whatever reads an old channel reads its copies in parts that
 add up to what it read before.  The parts are drawn at random, for every reader anew, so that copies
 learn different things from the first step.  A memory that is to have a rank gets it first
-(`scripts.narrow_memory`), and then draws nearly what it did.  `export` is to go on from, with the hours of `ckpt`:
-`python -m src.train ... ckpt=FILE`.  The config is that of the training.
+(`scripts.narrow_memory`), and then draws nearly what it did.  `export` is to go on from, with the
+hours of `ckpt`: `python -m src.train ... ckpt=FILE`.  The config is that of the training.
 """
 
 from itertools import pairwise

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from scripts import air_map as air
-from scripts import alignment, gallery, readme, surroundings, widen_setnet
+from scripts import alignment, gallery, narrow_memory, readme, surroundings, widen_setnet
 from scripts.scales import missing
 from scripts.ship_weights import recard, ship
 from src.app import build
@@ -158,11 +158,12 @@ def talkative(**sizes) -> SetNet:
 
 
 @torch.no_grad()
+@pytest.mark.parametrize("rank", [None, 5])
 @pytest.mark.parametrize(("before", "after"), [(False, False), (False, True), (True, True)])
-def test_a_widened_network_draws_what_it_was_begun_as_and_its_copies_part(before, after):
+def test_a_widened_network_draws_what_it_was_begun_as_and_its_copies_part(before, after, rank):
     torch.manual_seed(0)
-    old = talkative(half=6, around=[8, 10], refined=before)
-    wide = talkative(half=15, around=[16, 10], refined=after)
+    old = talkative(half=6, around=[8, 10], refined=before, rank=rank)
+    wide = talkative(half=15, around=[16, 10], refined=after, rank=rank)
     if after and not before:  # blocks that are new are silent
         wide.around.joined = SetNet(bins=3, half=15, around=[16, 10], refined=True).around.joined
     widen_setnet.widen(wide, old)
@@ -176,9 +177,31 @@ def test_a_widened_network_draws_what_it_was_begun_as_and_its_copies_part(before
     assert len(steps) > 1
     assert float(torch.pdist(steps).min()) > 0.1 * float(steps.norm(dim=1).max())
     less = [{"half": 4, "around": [8, 10]}, {"half": 6, "around": [8]}]
+    less += [{"half": 6, "around": [8, 10], "refined": before, "rank": 4}]
     for narrow in less + ([{"half": 6, "around": [8, 10]}] if before else []):
         with pytest.raises(ValueError, match="a SetNet .* widened, not"):
             widen_setnet.widen(talkative(**narrow), old)
+
+
+@torch.no_grad()
+def test_a_memory_of_a_rank_draws_what_that_in_full_does_the_more_the_higher_it_is():
+    torch.manual_seed(0)
+    old, told = talkative(half=6, around=[8, 10]).eval(), []
+    hook = old.cell2.seen.register_forward_hook(lambda _, __, maps: told.append(maps))
+    voxels = 0.2 * torch.randn(2, 5, 4, 3, 32, 24)
+    expected = unroll(old, voxels)[0]
+    hook.remove()
+    told = torch.cat(told).movedim(1, -1).flatten(0, -2)
+
+    def error(rank: int) -> float:
+        narrowed = narrow_memory.narrow(old, rank, told).eval()
+        assert narrowed.arguments == old.arguments | {"rank": rank}
+        return float((unroll(narrowed, voxels)[0] - expected).abs().mean())
+
+    errors = [error(rank) for rank in (2, 8, 12)]
+    assert errors[2] < 1e-5 < errors[1] < errors[0] / 2
+    with pytest.raises(ValueError, match="rank must be <= 12 for this network, got 13"):
+        narrow_memory.narrow(old, 13, told)
 
 
 def test_a_size_begins_as_a_smaller_one_with_its_hours(tmp_path):
@@ -187,7 +210,9 @@ def test_a_size_begins_as_a_smaller_one_with_its_hours(tmp_path):
     files.save(start, small, spec, {"hours": 1.0, "curve": []})
     given = "experiment=setnet_medium", f"ckpt={start}", f"export={export}"
     widen_setnet.begin(config("train", tmp_path, *TINY, *given))
-    assert files.card(export)["hours"] == 1 and files.load(export).half == 40
+    begun = files.load(export)
+    assert files.card(export)["hours"] == 1 and begun.half == 40
+    assert begun.cell2.mixed.weight.shape == (32, 40, 3, 3)  # a memory of the rank asked for
     for wrong in ("ckpt=null", "experiment=lf3x3"):
         with pytest.raises(ValueError, match="ckpt and ex"):
             widen_setnet.begin(config("train", tmp_path, *TINY, *given, wrong))

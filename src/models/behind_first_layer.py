@@ -16,7 +16,7 @@ from src.models import openvino_cpu, stopwatch
 from src.models.e2vid import E2VID
 from src.models.explicit_state import flat, formed
 from src.models.setnet import CELL, SetNet, faded
-from src.models.setnet_layers import PartedUnit, channels_first, channels_last
+from src.models.setnet_layers import FourCells, PartedUnit, channels_first, channels_last
 from src.sim.optics import Position
 
 
@@ -77,6 +77,7 @@ class AfterStem(nn.Module):
         self.mixes, self.memories = (part.to(dtype) for part in _memories(network, places))
         self.sizes = [(1, h, w, c) for c, h, w in network.hidden(*padded)]
         network.cell2 = PartedUnit(network.cell2)
+        network.shuffle = FourCells(network.shuffle, CELL)
         self.network = network.to(dtype)
         self.dtype = dtype
 
@@ -94,8 +95,8 @@ class AfterStem(nn.Module):
         about: Float[Tensor, "1 hq wq c"],
         told: Float[Tensor, "1 hq wq c"],
     ) -> tuple[Tensor, ...]:
-        """Return the pixels of each cell (1, hc, wc, pixels), the hidden map, what lies around and
-        what is told of it, all float32.
+        """Return the pixels of each 2 x 2 cells (1, hq, wq, pixels), the hidden map, what lies
+        around and what is told of it, all float32.
         """
         seen, hidden = self.network.fine(self.stem(grids, sums), passed, hidden)
         around = self.network.around
@@ -116,7 +117,7 @@ class AfterStem(nn.Module):
     def pixels(
         self, seen: Tensor, about: Tensor, told: Tensor, passed: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return the pixels of each cell and what is told of what lies around."""
+        """Return the pixels of each 2 x 2 cells and what is told of what lies around."""
         told = faded(told, about, passed)
         return channels_last(self.network.drawn(seen, channels_first(told)).sigmoid()), told
 
@@ -144,7 +145,9 @@ class Between(nn.Module):
         self, grids: Tensor, sums: Tensor, passed: Tensor, hidden: Tensor, about: Tensor,
         told: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-        """Return the pixels of each cell, the hidden map and what is told of what lies around."""
+        """Return the pixels of each 2 x 2 cells, the hidden map and what is told of what lies
+        around.
+        """
         stem = self.after.stem(grids, sums)
         seen, hidden = self.after.network.fine(stem, passed, hidden)
         pixels, told = self.after.pixels(seen, about, told, passed)

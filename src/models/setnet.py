@@ -46,7 +46,8 @@ class SetNet(nn.Module):
     """Voxel grids of 1 to 25 views to frames in [0, 1], window by window.
 
     `half`: channels at half resolution; `around`: at a quarter and each coarser one; `refined`:
-    see Surroundings; `rank`: see PacedUnit.  The order of the views is free but the same in all windows of a sequence.
+    see Surroundings; `rank`: see PacedUnit.  The order of the views is free but the same in all
+    windows of a sequence.
     """
 
     views = None
@@ -179,10 +180,10 @@ class SetNet(nn.Module):
 
     def drawn(
         self, seen: Float[Tensor, "m c h2 w2"], told: Float[Tensor, "m c h4 w4"]
-    ) -> Float[Tensor, "m pixels h2 w2"]:
-        """Return the pixels of each cell as channels, float32, before their sigmoid; `told`: of
-        what lies around.  Maps go on beyond the border as they are there: zeros would make a
-        pattern of its pixels.
+    ) -> Float[Tensor, "m pixels _h2 _w2"]:
+        """Return the pixels of each cell (with `FourCells`, of 2 x 2 cells) as channels, float32,
+        before their sigmoid; `told`: of what lies around.  Maps go on beyond the border as they are
+        there: zeros would make a pattern of its pixels.
         """
         x = self.relu(grown(told.to(seen.dtype), 2) + seen)
         x = functional.pad(x, (BORDER,) * 4, mode="replicate")

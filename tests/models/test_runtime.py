@@ -19,6 +19,7 @@ EXACT, ROUNDED = 1e-5, 0.02  # in grey levels: sums in another order, and bf16
 NETWORKS = {
     "setnet": lambda: SetNet(half=4),
     "setnet_in_bytes": lambda: SetNet(half=WORTH, around=[8, 8, 8]),
+    "setnet_of_rank_3": lambda: SetNet(half=4, rank=3),
     "e2vid": lambda: E2VID(views=9, base_channels=4, spectral_norm=True),
     "e2vid_gru_3x3": lambda: E2VID(
         views=9, base_channels=4, recurrent="convgru", kernel_size=3, final_activation="none"
