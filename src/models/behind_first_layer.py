@@ -95,7 +95,7 @@ class AfterStem(nn.Module):
         about: Float[Tensor, "1 hq wq c"],
         told: Float[Tensor, "1 hq wq c"],
     ) -> tuple[Tensor, ...]:
-        """Return the pixels of each 2 x 2 cells (1, hq, wq, pixels), the hidden map, what lies
+        """Return the pixels of every 2 x 2 cells (1, hq, wq, pixels), the hidden map, what lies
         around and what is told of it, all float32.
         """
         seen, hidden = self.network.fine(self.stem(grids, sums), passed, hidden)
@@ -117,7 +117,7 @@ class AfterStem(nn.Module):
     def pixels(
         self, seen: Tensor, about: Tensor, told: Tensor, passed: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return the pixels of each 2 x 2 cells and what is told of what lies around."""
+        """Return the pixels of every 2 x 2 cells and what is told of what lies around."""
         told = faded(told, about, passed)
         return channels_last(self.network.drawn(seen, channels_first(told)).sigmoid()), told
 
@@ -145,7 +145,7 @@ class Between(nn.Module):
         self, grids: Tensor, sums: Tensor, passed: Tensor, hidden: Tensor, about: Tensor,
         told: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-        """Return the pixels of each 2 x 2 cells, the hidden map and what is told of what lies
+        """Return the pixels of every 2 x 2 cells, the hidden map and what is told of what lies
         around.
         """
         stem = self.after.stem(grids, sums)
