@@ -14,7 +14,7 @@ from src.models.setnet import SetNet
 from src.models.unroll import video
 from src.sim.pipeline import simulate
 
-CLIPS, PLACES = 10, 2000  # of the training; of each of their windows
+CLIPS, PLACES = 10, 2000  # of the training; drawn of every AT_ONCE windows (unroll)
 
 Told = Float[Tensor, "places outputs"]
 
