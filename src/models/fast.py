@@ -34,6 +34,12 @@ def computes_bf16() -> bool:
     return bool(has) and convolution_s(torch.bfloat16) < convolution_s(torch.float32)
 
 
+def computes_bytes() -> bool:
+    """Return whether this processor has instructions that multiply bytes and add them up."""
+    able = torch.cpu.get_capabilities()
+    return any(able.get(name, False) for name in ("avx512_vnni", "avx_vnni"))
+
+
 def convolution_s(kind: torch.dtype) -> float:
     """Return what a convolution of 85 MMAC, channels last, takes in `kind`, seconds: the shortest
     of some."""

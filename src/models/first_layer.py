@@ -1,5 +1,8 @@
 """The first layer of a network as events make it, one by one, and what else it adds up of them."""
 
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
 import numpy as np
 
 from src.models.behind_first_layer import AfterHead, AfterStem
@@ -13,7 +16,7 @@ NOTHING = [np.empty(0, kind) for kind in (np.float64, np.int64, np.int64, np.flo
 class HeadFront:
     """The map of a head that sees stacked grids: 45 channels, say, at full resolution."""
 
-    def __init__(self, after: AfterHead | AfterStem, padded: tuple[int, int]):
+    def __init__(self, after: AfterHead | AfterStem, padded: tuple[int, int], threads: int = 1):
         kernel, bias = after.kernel, after.bias
         channels, size, self.stride = len(kernel), kernel.shape[-1], after.stride
         self.table = patches(kernel, after.views, self.stride)
@@ -50,10 +53,13 @@ class HeadFront:
 
 
 class StemFront(HeadFront):
-    """The map of SetNet's stem, in cells, its leaky sums and its clock."""
+    """The map of SetNet's stem, in cells, its leaky sums and its clock; with two `threads` these
+    are made side by side.
+    """
 
-    def __init__(self, after: AfterStem, padded: tuple[int, int]):
+    def __init__(self, after: AfterStem, padded: tuple[int, int], threads: int = 1):
         super().__init__(after, padded)
+        self.beside = ThreadPoolExecutor(1) if threads > 1 else None
         rows, columns = self.shape[1:3]
         self.memories = np.array(MEMORIES_S, np.float32)
         self.sums = np.zeros(((after.views + 1) * len(MEMORIES_S), rows, columns), np.float32)
@@ -63,17 +69,22 @@ class StemFront(HeadFront):
         """Bring the sums to the end of a window; return the map, the sums and their spread, the
         time passed, how recently one looked around, and whether to look again.
         """
-        events = t, x, y, p, view, t0, t1
         often = np.float32(1 / (RATE * (t1 - t0)))  # as SetNet counts them
-        awake, passed = kernels.remember(
-            *events, self.stride, self.memories, np.float32(AWAKE_S), self.clock[0], self.sums
-        )
+        sums = np.empty_like(self.sums)
+        remember = partial(
+            kernels.remember, t, x, y, p, view, t0, t1, self.stride, self.memories,
+            np.float32(AWAKE_S), self.clock[0], self.sums, sums,
+        )  # fmt: skip
+        if self.beside:
+            remember = self.beside.submit(remember).result
+        made = super().add(t, x, y, often * p, view, t0, t1)
+        awake, passed = remember()
         recent = self.clock[1] * np.float32(np.exp(-passed / LOOK_S))
         due = recent <= DUE and passed > 0
         self.clock[:] = awake, 1 if due else recent
         times = *(np.full((1, 1, 1, 1), one, np.float32) for one in (passed, recent)), np.array(due)
-        made = super().add(t, x, y, often * p, view, t0, t1)
-        return [*made, self.sums[None].copy(), *times]
+        self.sums = sums
+        return [*made, sums[None], *times]
 
     def frame(self, drawn: np.ndarray) -> np.ndarray:
         """Return the frame (h, w), padded, of its cells."""
@@ -86,9 +97,9 @@ class StemFront(HeadFront):
         self.restore([np.zeros_like(part) for part in self.state()])
 
     def state(self) -> list[np.ndarray]:
-        """Return a copy of the sums and the clock."""
-        return [self.sums.copy(), self.clock.copy()]
+        """Return the sums, which no window changes, and a copy of the clock."""
+        return [self.sums, self.clock.copy()]
 
     def restore(self, state: list[np.ndarray]) -> None:
         """Go on from what `state` gave."""
-        self.sums[:], self.clock[:] = state
+        self.sums, self.clock[:] = state

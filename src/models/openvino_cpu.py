@@ -1,8 +1,8 @@
 """A network on OpenVINO: compiled for one size of picture, its state handed on without a copy.
 
-Weights and maps are bf16 where the CPU computes in it (of a wide SetNet one convolution in bytes)
-and float32 elsewhere; what a network keeps in float32 (`SetNet`: its sums and hidden maps) stays
-so.  Needs the extra `openvino`.
+Weights and maps are bf16 where the CPU is faster in it and float32 elsewhere (of a wide SetNet one
+convolution is in bytes where the CPU has instructions for them); what a network keeps in float32
+(`SetNet`: its sums and hidden maps) stays so.  Needs the extra `openvino`.
 """
 
 import warnings
@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from src.models.eight_bits import drawn_in_bytes
 from src.models.explicit_state import Explicit
-from src.models.fast import plain
+from src.models.fast import computes_bf16, plain
 from src.models.setnet import SetNet
 
 Position = tuple[int, int]
@@ -36,10 +36,10 @@ def require() -> None:
 
 
 def precision() -> torch.dtype:
-    """Return what to compute in here: bfloat16, or float32 on a CPU without it."""
+    """Return what to compute in here: bfloat16, or float32 on a CPU that is no faster in it."""
     require()
     able = _core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
-    return torch.bfloat16 if "BF16" in able else torch.float32
+    return torch.bfloat16 if "BF16" in able and computes_bf16() else torch.float32
 
 
 class Compiled:

@@ -52,7 +52,7 @@ class Runtime:
 
     `positions`: (row, col) of each view; `height`, `width`: of a view's picture and of the frame.
     `form`: openvino, float32 or bf16 (PyTorch); default: the `fastest`.
-    `threads`: of what comes behind the first layer, which takes one.  Raises ValueError for
+    `threads`: of what comes behind the first layer, which takes one or two.  Raises ValueError for
     another network, form or size and for a number of views that the network does not take.
     """
 
@@ -85,7 +85,7 @@ class Runtime:
         stemmed = isinstance(network, SetNet)
         rest, front = (AfterStem, StemFront) if stemmed else (AfterHead, HeadFront)
         after = rest(plain(network).cpu(), positions, padded, dtype)
-        self.front = front(after, padded)
+        self.front = front(after, padded, threads)
         if form == "openvino":
             drawn_in_bytes(after.network)
         engine = OnOpenVino if form == "openvino" else OnTorch

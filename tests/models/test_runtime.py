@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from baselines.firenet import FireNet
-from src.models import openvino_cpu
+from src.models import eight_bits, openvino_cpu
 from src.models.e2vid import E2VID
 from src.models.eight_bits import LARGEST, WORTH, EightBits, drawn_in_bytes
+from src.models.fast import computes_bytes
 from src.models.openvino_cpu import OpenVinoNetwork
 from src.models.runtime import Runtime
 from src.models.setnet import SetNet
@@ -252,24 +253,29 @@ def test_bytes_round_to_half_a_step():
     assert (off > 0).all() and (off < most).all() and not cut.any()
 
 
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])
 @pytest.mark.parametrize(
-    ("name", "dtype", "drawn"),
+    ("name", "able", "drawn"),
     [
-        ("setnet_in_bytes", torch.bfloat16, True),
-        ("setnet_in_bytes", torch.float32, False),
-        ("setnet", torch.bfloat16, False),
+        ("setnet_in_bytes", True, True),
+        ("setnet_in_bytes", False, False),
+        ("setnet", True, False),
+        ("e2vid", True, False),
     ],
 )
-def test_many_channels_in_bf16_are_drawn_in_bytes(name, dtype, drawn):
+def test_many_channels_are_drawn_in_bytes_where_these_are_fast(
+    name, able, drawn, dtype, monkeypatch
+):
+    monkeypatch.setattr(eight_bits, "computes_bytes", lambda: able)
     net = network(name).to(dtype)
     drawn_in_bytes(net)
-    assert isinstance(net.mix2, EightBits) == drawn
+    assert any(isinstance(part, EightBits) for part in net.modules()) == drawn
 
 
 def test_openvino_computes_in_bytes_what_is_to_be(unchecked):
     form("openvino")
-    if openvino_cpu.precision() != torch.bfloat16:
-        pytest.skip("this CPU computes in float32")
+    if not computes_bytes():
+        pytest.skip("this CPU has no instructions for bytes")
     live = runtime(network("setnet_in_bytes"), "openvino")
     for part in (live.behind.whole, live.behind.between):
         nodes = part.request.get_compiled_model().get_runtime_model().get_ordered_ops()

@@ -61,12 +61,12 @@ def add_patches(t, x, y, p, view, t0, t1, down, right, table, stride, out):
 
 
 @njit(nogil=True, cache=True)
-def remember(t, x, y, p, view, t0, t1, side, memories, awake_s, awake, sums):
+def remember(t, x, y, p, view, t0, t1, side, memories, awake_s, awake, before, sums):
     """Let the leaky sums of SetNet leak, and add the events with t0 <= t <= t1; return how awake
     the picture is afterwards, and the time that passed in it.
 
-    In place: `sums` (views * memories + memories, hc, wc), in cells of `side` pixels, the last of
-    them the spread of the views.  `memories` are the time constants.
+    `sums`, written, and those `before`: (views * memories + memories, hc, wc), in cells of `side`
+    pixels, the last of them the spread of the views.  `memories` are the time constants.
     """
     views = sums.shape[0] // memories.size - 1
     new = np.zeros((views, *sums.shape[1:]), f32)
@@ -79,20 +79,21 @@ def remember(t, x, y, p, view, t0, t1, side, memories, awake_s, awake, sums):
     else:
         left = f32(np.exp(-seconds / awake_s))
         passed, awake = awake * awake_s * (f32(1) - left), awake * left
-    _leak(passed, memories, new, sums)
+    _leak(passed, memories, new, before, sums)
     _spread(memories.size, sums)
     return awake, passed
 
 
 @njit(nogil=True, cache=True)
-def _leak(passed, memories, new, sums):
+def _leak(passed, memories, new, before, sums):
     for m in range(memories.size):
         keep = f32(np.exp(-passed / memories[m]))
         for v in range(new.shape[0]):
             for r in range(new.shape[1]):
-                row, more = sums[v * memories.size + m, r], new[v, r]
+                k = v * memories.size + m
+                row, old, more = sums[k, r], before[k, r], new[v, r]
                 for c in range(np.uint64(row.size)):
-                    row[c] = row[c] * keep + more[c]
+                    row[c] = old[c] * keep + more[c]
 
 
 @njit(nogil=True, cache=True)
