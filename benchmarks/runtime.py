@@ -4,8 +4,8 @@ Limits (two threads, nine views of 176x176, 600 fps, 5 million events a second o
 setnet_small 1.67 ms, setnet_medium 3.4 ms, median.  Events are those of a real recording, its
 sensor cut into nine views, its clock set so that they come at that rate.  Beside it, in turns of
 many windows, PyTorch from the same lists: grids, then the network.  All is in bf16 where the
-processor computes in it, else in float32.  On one thread the time is what the process computes,
-which other jobs disturb less, else wall time.
+processor is faster in it, else in float32 (what a wide SetNet draws: in bytes).  On one thread the
+time is what the process computes, which other jobs disturb less, else wall time.
 """
 
 import argparse

@@ -37,7 +37,7 @@ RATE, RISE = 1.5e-3, 50  # of Adam, falling by a cosine; steps over which it ris
 
 
 def rounded() -> torch.autocast:
-    """Return a context that computes in bf16 where the processor does."""
+    """Return a context that computes in bf16 where the processor is faster in it."""
     return torch.autocast("cpu", torch.bfloat16, enabled=computes_bf16())
 
 

@@ -189,7 +189,7 @@ def keep_memory(cfg: DictConfig) -> None:
 
 
 def choose_precision(cfg: DictConfig) -> None:
-    """Where `trainer.precision` is null write the fastest there: bf16, but on a CPU without it."""
+    """Where `trainer.precision` is null write the faster there: bf16, but on most CPUs float32."""
     if cfg.trainer.precision is None:
         half = cfg.trainer.accelerator != "cpu" or computes_bf16()
         cfg.trainer.precision = "bf16-mixed" if half else "32-true"

@@ -56,7 +56,7 @@ def convolution_s(kind: torch.dtype) -> float:
 
 def running(network: nn.Module, form: str) -> nn.Module:
     """Return `network` in a form to run it in: `float32`, as it is; `bf16`, a Fast one; `compiled`,
-    that one compiled; `openvino`, on OpenVINO, in bf16 where the CPU computes in it.
+    that one compiled; `openvino`, on OpenVINO, in bf16 where the CPU is faster in it.
 
     Raises ValueError, naming `form`, for another or where it cannot be made.
     """
