@@ -1,6 +1,7 @@
 """Samples from a bank of air: the clip and everything cheap about it is drawn anew for each."""
 
 import json
+import math
 from dataclasses import dataclass
 
 import torch
@@ -35,8 +36,9 @@ class Banked(Pipeline):
 
     Sample n is a function of (config, n), whether the bank is full or empty: it is of one of the
     first FIRST + n / EACH clips, the order in which a bank is filled, and a clip that is not there
-    is made.  Drawn by n as well: `windows` windows on end and which way they run, the crop, which
-    view shows which air, the sensor, its noise.  Airs go
+    is made; of fewer samples than EACH for a clip, all clips see some.  Drawn by n as well:
+    `windows` windows on end and which way they run, the crop, which view shows which air, the
+    sensor, its noise.  Airs go
     round where they are `independent` and the views all registered alike.  `clips`: how many
     different samples there are, n modulo `clips`; None: all are.
     """
@@ -71,7 +73,8 @@ class Banked(Pipeline):
         """Return which clip of the bank sample `number` is of."""
         key = noise.key(self.seed, self.split, "banked", number, "clip")
         share = float(noise.uniform(key, torch.tensor(0)))
-        return int(share * min(self.bank.clips, FIRST + number // EACH))
+        each = min(EACH, (self.clips or math.inf) / self.bank.clips)
+        return int(share * min(self.bank.clips, FIRST + int(number / each)))
 
     def draw(self, number: int) -> Taken:
         """Draw everything random about sample `number`; makes its clip if it is not there."""
