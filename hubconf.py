@@ -16,7 +16,7 @@ dependencies = ["torch", "numpy", "jaxtyping", "safetensors", "lightning"]
 
 
 def setnet_small() -> nn.Module:
-    """Any number of views at any rate; 0.5 GMAC a frame of 176 x 176 with nine views.
+    """Any number of views at any rate; 0.34 GMAC a frame of 176 x 176 with nine views.
 
     Takes `window_s`, the length of a window in seconds (1/120), and `positions`, the (row, col) of
     every view.
@@ -27,6 +27,11 @@ def setnet_small() -> nn.Module:
 def setnet_medium() -> nn.Module:
     """As `setnet_small`, 1.2 GMAC."""
     return models.load("setnet_medium")
+
+
+def setnet_large() -> nn.Module:
+    """As `setnet_small`, 3.5 GMAC."""
+    return models.load("setnet_large")
 
 
 def lf3x3() -> nn.Module:

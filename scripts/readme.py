@@ -36,10 +36,12 @@ ONE, NINE = ("setnet_small", 1), ("setnet_small", 9)  # of the picture
 AIR = ("turbulence=strong", "turbulence.atmosphere.half_length_px=[10,20]",
        "turbulence.atmosphere.near_rigid=0.0")  # fmt: skip
 PAPER = "nine views, E2VID (the paper's way)"
+LARGE, MEDIUM = "nine views, SetNet large", "nine views, SetNet medium"
 FIRENET, CISTA = "published FireNet+, one view", "published CISTA-TC, one view"
 HIGHPASS = "high-pass, one view"
 ROWS = {  # what it is: a network in weights/, how many of the nine views it is given
-    "nine views, SetNet medium": ("setnet_medium", 9),
+    LARGE: ("setnet_large", 9),
+    MEDIUM: ("setnet_medium", 9),
     "nine views, SetNet small": ("setnet_small", 9),
     PAPER: ("lf3x3", 9),
     "one view, SetNet medium": ("setnet_medium", 1),
@@ -63,9 +65,10 @@ TABLES = {  # of what is measured: the document, its section, and whether rows a
 }
 PAIRS = {  # rows whose difference is shown, clip by clip
     "nine views less one, E2VID": (PAPER, "one view, E2VID"),
-    "nine views less one, SetNet medium": ("nine views, SetNet medium", "one view, SetNet medium"),
-    "nine views, SetNet medium less E2VID": ("nine views, SetNet medium", PAPER),
+    "nine views less one, SetNet medium": (MEDIUM, "one view, SetNet medium"),
+    "nine views, SetNet medium less E2VID": (MEDIUM, PAPER),
     "nine views, SetNet small less E2VID": ("nine views, SetNet small", PAPER),
+    "nine views, SetNet large less medium": (LARGE, MEDIUM),
     "nine views, E2VID less FireNet+": (PAPER, FIRENET),
     "nine views, E2VID less CISTA-TC": (PAPER, CISTA),
     "nine views, E2VID less high-pass": (PAPER, HIGHPASS),

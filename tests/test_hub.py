@@ -18,7 +18,7 @@ for name in sys.argv[2:]:
         frames.append(net(torch.randn(1, net.views or 9, 5, 16, 16), None)[0])
 torch.save(frames, "out.pt")
 """
-NAMES = ("setnet_small", "setnet_medium", "lf3x3", "single256")
+NAMES = ("setnet_small", "setnet_medium", "setnet_large", "lf3x3", "single256")
 
 
 def test_the_shipped_networks_are_loaded_from_anywhere(tmp_path):

@@ -110,6 +110,14 @@ def test_early_numbers_take_the_clips_that_are_filled_first(tmp_path):
     assert max(chain.index(number) for number in range(1000, 1400)) > 95
 
 
+def test_few_samples_are_of_all_clips_of_a_bank(tmp_path):
+    of = bank(tmp_path, clips=100)
+    few, many = (banked(of, sensor={}, clips=clips) for clips in (100, 400))
+    assert max(few.index(number) for number in range(100)) > FIRST + 100 // EACH
+    assert all(few.index(number) < FIRST + number for number in range(100))
+    assert all(many.index(n) == banked(of, sensor={}).index(n) for n in range(0, 400, 7))
+
+
 def test_law_2_a_single_view_is_the_centre_view_of_the_same_bank(tmp_path):
     of = bank(tmp_path)
     nine, one = banked(of), banked(of, views=1)
