@@ -29,15 +29,19 @@ def computes_bf16() -> bool:
     Without instructions for it bf16 takes many times longer.  With them it takes half the time or,
     on Intel's processors whose matrix unit (AMX) a virtual machine hides, twice as long.
     """
-    able = torch.cpu.get_capabilities()
-    has = any(able.get(name) for name in ("avx512_bf16", "amx_bf16", "bf16"))
-    return bool(has) and convolution_s(torch.bfloat16) < convolution_s(torch.float32)
+    has = _says("avx512_bf16", "amx_bf16", "bf16")
+    return has and convolution_s(torch.bfloat16) < convolution_s(torch.float32)
 
 
 def computes_bytes() -> bool:
     """Return whether this processor has instructions that multiply bytes and add them up."""
+    return _says("avx512_vnni", "avx_vnni")
+
+
+def _says(*names: str) -> bool:
+    """Return whether this processor says that it can do one of `names`."""
     able = torch.cpu.get_capabilities()
-    return any(able.get(name, False) for name in ("avx512_vnni", "avx_vnni"))
+    return any(able.get(name) for name in names)
 
 
 def convolution_s(kind: torch.dtype) -> float:
