@@ -74,7 +74,8 @@ class AfterStem(nn.Module):
         places = network.places(self.views, network.bins, positions)
         grids, _, bias = network.kernels(places)
         self.kernel, self.bias = grids.numpy(), bias.numpy()
-        self.mixes, self.memories = (part.to(dtype) for part in _memories(network, places))
+        code, memories = _memories(network, places)
+        self.code, self.memories = code.numpy(), memories.to(dtype)
         self.sizes = [(1, h, w, c) for c, h, w in network.hidden(*padded)]
         network.cell2 = PartedUnit(network.cell2)
         network.shuffle = FourCells(network.shuffle, CELL)
@@ -88,7 +89,7 @@ class AfterStem(nn.Module):
     def forward(
         self,
         grids: Float[Tensor, "1 hc wc stem"],
-        sums: Float[Tensor, "1 sums hc wc"],
+        mixed: Float[Tensor, "1 hc wc mixed"],
         passed: Float[Tensor, "1 1 1 1"],
         recent: Float[Tensor, "1 1 1 1"],
         hidden: Float[Tensor, "1 hc wc c"],
@@ -98,7 +99,7 @@ class AfterStem(nn.Module):
         """Return the pixels of every 2 x 2 cells (1, hq, wq, pixels), the hidden map, what lies
         around and what is told of it, all float32.
         """
-        seen, hidden = self.network.fine(self.stem(grids, sums), passed, hidden)
+        seen, hidden = self.network.fine(self.stem(grids, mixed), passed, hidden)
         around = self.network.around
         about = around.mean(channels_first(about), around(seen).float(), recent)
         pixels, told = self.pixels(seen, channels_last(about), told, passed)
@@ -108,11 +109,12 @@ class AfterStem(nn.Module):
         """Return what a window takes in which one does not look around."""
         return Between(self)
 
-    def stem(self, grids: Tensor, sums: Tensor) -> Tensor:
+    def stem(self, grids: Tensor, mixed: Tensor) -> Tensor:
         """Return the map of the stem, before its ReLU."""
-        mixed = functional.conv2d(sums.to(self.dtype), self.mixes)
-        stem = functional.conv2d(mixed, self.memories, None, 1, 1)
-        return channels_first(grids.to(self.dtype)) + stem
+        mixed = channels_first(mixed.to(self.dtype))
+        return channels_first(grids.to(self.dtype)) + functional.conv2d(
+            mixed, self.memories, None, 1, 1
+        )
 
     def pixels(
         self, seen: Tensor, about: Tensor, told: Tensor, passed: Tensor
@@ -123,15 +125,13 @@ class AfterStem(nn.Module):
 
 
 def _memories(network: SetNet, places: Sequence[Position]) -> tuple[Tensor, Tensor]:
-    """Return a mixture of the sums of all views and their spread (maps, sums, 1, 1) and the kernels
-    of the mixed maps: together the stem's, but of as many maps as its kernels have parts.
+    """Return how much of each mixture is of each view (views, parts), and the kernels of the
+    mixtures, of each sum, and of the views' spread: together the stem's, but of as many maps as
+    its kernels have parts.
     """
     code, parts = network.sum_stem.parts(torch.tensor(places).float())
-    each = torch.eye(parts.shape[2])  # of the sums of a view
-    shares = torch.einsum("vr,ij->rivj", code, each).flatten(2).flatten(0, 1)
-    mixes = torch.block_diag(shares, each)
     kernels = [parts.transpose(0, 1).flatten(1, 2), network.spread_stem.weight]
-    return mixes[..., None, None], torch.cat(kernels, 1)
+    return code.contiguous(), torch.cat(kernels, 1)
 
 
 class Between(nn.Module):
@@ -142,13 +142,13 @@ class Between(nn.Module):
         self.after = after
 
     def forward(
-        self, grids: Tensor, sums: Tensor, passed: Tensor, hidden: Tensor, about: Tensor,
+        self, grids: Tensor, mixed: Tensor, passed: Tensor, hidden: Tensor, about: Tensor,
         told: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         """Return the pixels of every 2 x 2 cells, the hidden map and what is told of what lies
         around.
         """
-        stem = self.after.stem(grids, sums)
+        stem = self.after.stem(grids, mixed)
         seen, hidden = self.after.network.fine(stem, passed, hidden)
         pixels, told = self.after.pixels(seen, about, told, passed)
         return pixels, hidden, told

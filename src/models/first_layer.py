@@ -53,8 +53,8 @@ class HeadFront:
 
 
 class StemFront(HeadFront):
-    """The map of SetNet's stem, in cells, its leaky sums and its clock; with two `threads` these
-    are made side by side.
+    """The map of SetNet's stem, in cells, mixtures of its leaky sums and its clock; with two
+    `threads` these are made side by side.
     """
 
     def __init__(self, after: AfterStem, padded: tuple[int, int], threads: int = 1):
@@ -62,18 +62,22 @@ class StemFront(HeadFront):
         self.beside = ThreadPoolExecutor(1) if threads > 1 else None
         rows, columns = self.shape[1:3]
         self.memories = np.array(MEMORIES_S, np.float32)
-        self.sums = np.zeros(((after.views + 1) * len(MEMORIES_S), rows, columns), np.float32)
+        self.code = np.repeat(after.code, self.memories.size, 1)
+        self.sums = np.zeros((after.views * self.memories.size, rows, columns), np.float32)
+        mixtures = self.code.shape[1] + self.memories.size  # and the spread
+        self.mixed = np.zeros((1, rows, columns, mixtures), np.float32)
         self.clock = np.zeros(2, np.float32)  # how awake it is, how recently it looked around
 
     def add(self, t, x, y, p, view, t0: float, t1: float) -> list[np.ndarray]:
-        """Bring the sums to the end of a window; return the map, the sums and their spread, the
-        time passed, how recently one looked around, and whether to look again.
+        """Bring the sums to the end of a window; return the map, mixtures of the sums and their
+        spread, the time passed, how recently one looked around, and whether to look again.
         """
         often = np.float32(1 / (RATE * (t1 - t0)))  # as SetNet counts them
-        sums = np.empty_like(self.sums)
+        sums, mixed = np.empty_like(self.sums), np.empty_like(self.mixed)
         remember = partial(
             kernels.remember, t, x, y, p, view, t0, t1, self.stride, self.memories,
-            np.float32(AWAKE_S), self.clock[0], self.sums, sums,
+            np.float32(AWAKE_S), self.clock[0], self.code, self.sums, sums, self.mixed[0],
+            mixed[0],
         )  # fmt: skip
         if self.beside:
             remember = self.beside.submit(remember).result
@@ -83,8 +87,8 @@ class StemFront(HeadFront):
         due = recent <= DUE and passed > 0
         self.clock[:] = awake, 1 if due else recent
         times = *(np.full((1, 1, 1, 1), one, np.float32) for one in (passed, recent)), np.array(due)
-        self.sums = sums
-        return [*made, sums[None], *times]
+        self.sums, self.mixed = sums, mixed
+        return [*made, mixed, *times]
 
     def frame(self, drawn: np.ndarray) -> np.ndarray:
         """Return the frame (h, w), padded, of its cells."""
@@ -97,9 +101,9 @@ class StemFront(HeadFront):
         self.restore([np.zeros_like(part) for part in self.state()])
 
     def state(self) -> list[np.ndarray]:
-        """Return the sums, which no window changes, and a copy of the clock."""
-        return [self.sums, self.clock.copy()]
+        """Return the sums and mixtures, which no window changes, and a copy of the clock."""
+        return [self.sums, self.mixed, self.clock.copy()]
 
     def restore(self, state: list[np.ndarray]) -> None:
         """Go on from what `state` gave."""
-        self.sums, self.clock[:] = state
+        self.sums, self.mixed, self.clock[:] = state

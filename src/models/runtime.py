@@ -32,6 +32,7 @@ WRONG = {
     kernels.OFF_SENSOR: "have x in 0..{w} and y in 0..{h}",
     kernels.NO_VIEW: "have view in 0..{views}, an index into positions",
     kernels.NO_NUMBER: "have finite t and p",
+    kernels.NO_SIGN: "have p in -1, 1 (or weights, as floats)",
 }
 
 
@@ -153,11 +154,9 @@ class Runtime:
         if len(t) and not all(part.dtype.kind in "iu" for part in (x, y, view)):
             kinds = [str(part.dtype) for part in (x, y, view)]
             raise ValueError(f"x, y and view must be whole numbers, got {', '.join(kinds)}")
-        if p.dtype.kind != "f" and (np.abs(p.astype(np.int64)) != 1).any():
-            raise ValueError("p must be -1 or 1 (or weights, as floats), got another number")
         kinds = (np.float64, np.int64, np.int64, np.float32, np.int64)
         events = [np.ascontiguousarray(part, kind) for part, kind in zip(given, kinds, strict=True)]
-        at, wrong = kernels.check(*events, self.views, *self.size)
+        at, wrong = kernels.check(*events, self.views, *self.size, p.dtype.kind != "f")
         if at >= 0:
             reach = {"h": self.size[0] - 1, "w": self.size[1] - 1, "views": self.views - 1}
             raise ValueError(

@@ -167,7 +167,7 @@ WRONG = {
     "events must be in order of time": {"t": lambda t: t[::-1]},
     r"x in 0\.\.31 and y in 0\.\.23, got event 0 .* x=32": {"x": lambda x: x + 32},
     r"have view in 0\.\.8": {"view": lambda view: view + 9},
-    "p must be -1 or 1": {"p": lambda p: (p + 1) // 2},
+    "events must have p in -1, 1": {"p": lambda p: (p + 1) // 2},
     "finite t and p": {"p": lambda p: p * np.nan},
     "t, x, y, p, view must be of one length": {"x": lambda x: x[1:]},
     "x, y and view must be whole numbers": {"x": lambda x: x + 0.5},

@@ -9,12 +9,14 @@ from numba import njit
 
 f32 = np.float32
 
-GOOD, BACKWARDS, OFF_SENSOR, NO_VIEW, NO_NUMBER = range(5)  # what `check` finds
+GOOD, BACKWARDS, OFF_SENSOR, NO_VIEW, NO_NUMBER, NO_SIGN = range(6)  # what `check` finds
 
 
 @njit(nogil=True, cache=True)
-def check(t, x, y, p, view, views, height, width):
-    """Return (index, what) of the first event that is wrong, or (-1, GOOD)."""
+def check(t, x, y, p, view, views, height, width, signs):
+    """Return (index, what) of the first event that is wrong, or (-1, GOOD); of `signs`, p is one
+    of -1 and 1.
+    """
     for i in range(t.size):
         if not np.isfinite(t[i]) or not np.isfinite(p[i]):
             return i, NO_NUMBER
@@ -24,6 +26,8 @@ def check(t, x, y, p, view, views, height, width):
             return i, OFF_SENSOR
         if not 0 <= view[i] < views:
             return i, NO_VIEW
+        if signs and abs(p[i]) != 1:
+            return i, NO_SIGN
     return -1, GOOD
 
 
@@ -61,59 +65,94 @@ def add_patches(t, x, y, p, view, t0, t1, down, right, table, stride, out):
 
 
 @njit(nogil=True, cache=True)
-def remember(t, x, y, p, view, t0, t1, side, memories, awake_s, awake, before, sums):
+def remember(
+    t, x, y, p, view, t0, t1, side, memories, awake_s, awake, code, before, sums, blended, mixed
+):
     """Let the leaky sums of SetNet leak, and add the events with t0 <= t <= t1; return how awake
     the picture is afterwards, and the time that passed in it.
 
-    `sums`, written, and those `before`: (views * memories + memories, hc, wc), in cells of `side`
-    pixels, the last of them the spread of the views.  `memories` are the time constants.
+    `sums`, written, and those `before`: (views * memories, hc, wc), in cells of `side` pixels.
+    `memories` are the time constants.  `mixed`, written, and what it was before, `blended`: (hc,
+    wc, (parts + 1) * memories), mixtures of the sums by `code` (views, parts * memories), and the
+    spread of the views.
     """
-    views = sums.shape[0] // memories.size - 1
-    new = np.zeros((views, *sums.shape[1:]), f32)
-    for i in range(t.size):
-        if t0 <= t[i] <= t1:
-            new[view[i], y[i] // side, x[i] // side] += p[i]
+    new = np.zeros((code.shape[0], *sums.shape[1:]), f32)
+    cells = _fall(t, x, y, p, view, t0, t1, side, new)
     seconds = f32(t1 - t0)
     if new.any():
         passed, awake = seconds, f32(1)
     else:
         left = f32(np.exp(-seconds / awake_s))
         passed, awake = awake * awake_s * (f32(1) - left), awake * left
-    _leak(passed, memories, new, before, sums)
-    _spread(memories.size, sums)
+    keep = np.exp(-passed / memories)
+    _leak(keep, new, before, sums)
+    _blend(keep, p, view, cells, code, blended, mixed)
+    _spread(memories.size, sums, mixed)
     return awake, passed
 
 
 @njit(nogil=True, cache=True)
-def _leak(passed, memories, new, before, sums):
-    for m in range(memories.size):
-        keep = f32(np.exp(-passed / memories[m]))
-        for v in range(new.shape[0]):
-            for r in range(new.shape[1]):
-                k = v * memories.size + m
-                row, old, more = sums[k, r], before[k, r], new[v, r]
-                for c in range(np.uint64(row.size)):
-                    row[c] = old[c] * keep + more[c]
+def _fall(t, x, y, p, view, t0, t1, side, new):
+    """Add the events with t0 <= t <= t1 to `new` (views, hc, wc); return the cell of each, counted
+    row by row, or -1.
+    """
+    cells, flat = np.full(t.size, -1), new.reshape(-1)
+    width, count, side = np.uint64(new.shape[2]), new.shape[1] * new.shape[2], np.uint64(side)
+    for i in range(t.size):
+        if t0 <= t[i] <= t1:
+            cells[i] = np.uint64(y[i]) // side * width + np.uint64(x[i]) // side
+            flat[np.uint64(view[i] * count + cells[i])] += p[i]
+    return cells
 
 
 @njit(nogil=True, cache=True)
-def _spread(memories, sums):
-    """Write the mean distance of the views' sums from their mean behind them."""
-    views, width = sums.shape[0] // memories - 1, sums.shape[2]
-    middle, part = np.empty(width, f32), f32(1) / f32(views)
+def _leak(keep, new, before, sums):
+    for m in range(keep.size):
+        for v in range(new.shape[0]):
+            for r in range(new.shape[1]):
+                k = v * keep.size + m
+                row, old, more = sums[k, r], before[k, r], new[v, r]
+                for c in range(np.uint64(row.size)):
+                    row[c] = old[c] * keep[m] + more[c]
+
+
+@njit(nogil=True, cache=True)
+def _blend(keep, p, view, cells, code, before, mixed):
+    """Let the mixtures leak, and add the events that fell into cells, as `_leak` their sums."""
+    keeps = np.empty(mixed.shape[1] * mixed.shape[2], f32)
+    for c in range(keeps.size):
+        keeps[c] = keep[c % keep.size]
+    for r in range(mixed.shape[0]):
+        row, old = mixed[r].reshape(-1), before[r].reshape(-1)
+        for c in range(np.uint64(row.size)):
+            row[c] = old[c] * keeps[c]
+    to, shares, n = mixed.reshape(-1), code.reshape(-1), np.uint64(code.shape[1])
+    for i in range(p.size):
+        if cells[i] >= 0:
+            here, there = np.uint64(cells[i] * mixed.shape[2]), np.uint64(view[i]) * n
+            for k in range(n):
+                to[here + k] += p[i] * shares[there + k]
+
+
+@njit(nogil=True, cache=True)
+def _spread(memories, sums, mixed):
+    """Write the mean distance of the views' sums from their mean behind their mixtures."""
+    views, behind = sums.shape[0] // memories, mixed.shape[2] - memories
+    middle, part = np.empty(sums.shape[2], f32), f32(1) / f32(views)
+    far = np.empty_like(middle)
     for m in range(memories):
         for r in range(sums.shape[1]):
             middle[:] = 0
             for v in range(views):
                 row = sums[v * memories + m, r]
-                for c in range(np.uint64(width)):
+                for c in range(np.uint64(row.size)):
                     middle[c] += row[c] * part
-            far = sums[views * memories + m, r]
             far[:] = 0
             for v in range(views):
                 row = sums[v * memories + m, r]
-                for c in range(np.uint64(width)):
+                for c in range(np.uint64(row.size)):
                     far[c] += abs(row[c] - middle[c]) * part
+            mixed[r, :, behind + m] = far
 
 
 @njit(nogil=True, cache=True)
