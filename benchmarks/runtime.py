@@ -5,13 +5,16 @@ setnet_small 1.67 ms, setnet_medium 3.4 ms, median.  Events are those of a real 
 sensor cut into nine views, its clock set so that they come at that rate.  Beside it, in turns of
 many windows, PyTorch from the same lists: grids, then the network.  All is in bf16 where the
 processor is faster in it, else in float32 (what a wide SetNet draws: in bytes).  On one thread the
-time is what the process computes, which other jobs disturb less, else wall time.
+time is what the process computes, which other jobs disturb less, else wall time.  Each network is
+in a process of its own, as it would be live.
 """
 
 import argparse
 import statistics
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -101,12 +104,29 @@ def line(name: str, times: list[float], giga: float, peak: float) -> str:
     median, mean, times = statistics.median(times), statistics.mean(times), sorted(times)
     low, high = times[len(times) // 10], times[9 * len(times) // 10]
     rate = giga / mean * 1e3
-    share = f"{rate:5.0f} GMAC/s, {rate / peak:.0%} of peak"
+    share = f"{rate:5.0f} GMAC/s, {rate / peak:.0%} of a peak of {peak:.0f}"
     return f"{name:32s} {median:6.2f} ms ({low:.2f} to {high:.2f}), mean {mean:.2f}  {share}"
 
 
+def measured(name: str, count: int, recording: Path, seconds: float) -> list[str]:
+    """Return the lines of a network on `count` threads."""
+    played, network = windows(recording), load(name)
+    peak = convolution_peak(PEAKS[FORM], count=count) / 1e9
+    clock = time.process_time if count == 1 else time.perf_counter
+    size = {"positions": layout(9), "height": SIDE, "width": SIDE}
+    live = Runtime(network, **size, threads=count, form="openvino")
+    giga = arithmetic(Runtime(network, **size, form="float32"), played[:10])
+    whole = macs_per_frame(network, SIDE, SIDE, views=9) / 1e9
+    with threads(count):
+        ours, theirs = milliseconds([live.step, on_pytorch(network)], played, seconds, clock)
+    return [
+        line(f"{name}, openvino", ours, giga, peak),
+        line(f"{name}, pytorch", theirs, whole, peak),
+    ]
+
+
 def main() -> None:
-    """Print a line for each network, number of threads and form."""
+    """Print the lines of each number of threads and network, each in a process of its own."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", default=NAMES)
     parser.add_argument("--recording", type=Path, default=RECORDING)
@@ -117,23 +137,12 @@ def main() -> None:
     mean = statistics.mean(len(window[0]) for window in played)
     print(f"{len(played)} windows of 1/{FPS} s, {mean:.0f} events each over nine views of {SIDE}")
     for count in given.threads:
-        peak = convolution_peak(PEAKS[FORM], count=count) / 1e9
-        clock = time.process_time if count == 1 else time.perf_counter
         kind = "CPU" if count == 1 else "wall"
-        print(
-            f"threads: {count}, {kind} time, median (10 to 90 %); peak {peak:.0f} GMAC/s in {FORM}"
-        )
+        print(f"threads: {count}, {kind} time, median (10 to 90 %), convolutions in {FORM}")
         for name in given.names:
-            network = load(name)
-            size = {"positions": layout(9), "height": SIDE, "width": SIDE}
-            live = Runtime(network, **size, threads=count, form="openvino")
-            giga = arithmetic(Runtime(network, **size, form="float32"), played[:10])
-            whole = macs_per_frame(network, SIDE, SIDE, views=9) / 1e9
-            with threads(count):
-                steps = [live.step, on_pytorch(network)]
-                both = milliseconds(steps, played, given.seconds, clock)
-            print(line(f"{name}, openvino", both[0], giga, peak), flush=True)
-            print(line(f"{name}, pytorch", both[1], whole, peak), flush=True)
+            with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
+                told = alone.submit(measured, name, count, given.recording, given.seconds)
+                print(*told.result(), sep="\n", flush=True)
 
 
 if __name__ == "__main__":
