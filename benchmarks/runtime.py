@@ -2,11 +2,11 @@
 
 Limits (two threads, nine views of 176x176, 600 fps, 5 million events a second over all views):
 setnet_small 1.67 ms, setnet_medium 3.4 ms, median.  Events are those of a real recording, its
-sensor cut into nine views, its clock set so that they come at that rate.  Beside it, in turns of
-many windows, PyTorch from the same lists: grids, then the network.  All is in bf16 where the
-processor is faster in it, else in float32 (what a wide SetNet draws: in bytes).  On one thread the
-time is what the process computes, which other jobs disturb less, else wall time.  Each network is
-in a process of its own, as it would be live.
+sensor cut into nine views, its clock set so that they come at that rate.  After it PyTorch from
+the same lists: grids, then the network.  All is in bf16 where the processor is faster in it, else
+in float32 (what a wide SetNet draws: in bytes).  On one thread the time is what the process
+computes, which other jobs disturb less, else wall time.  Each is in a process of its own, as it
+would be live.
 """
 
 import argparse
@@ -14,6 +14,7 @@ import statistics
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -55,22 +56,19 @@ def windows(path: Path) -> list[tuple]:
 
 
 def milliseconds(
-    steps: list[Callable], played: list[tuple], seconds: float, clock: Callable[[], float]
-) -> list[list[float]]:
-    """Return the times of each of `steps`, `seconds` of each in four turns: within a turn one runs
-    alone, as it would live, its memory in the caches and no thread of the other one waiting.
-    """
-    taken: list[list[float]] = [[] for _ in steps]
-    for times, step in 4 * list(zip(taken, steps, strict=True)):
-        for window in played[:20]:
+    step: Callable, played: list[tuple], seconds: float, clock: Callable[[], float]
+) -> list[float]:
+    """Return the times of `step` over `seconds`, after a first round."""
+    times: list[float] = []
+    for window in played:
+        step(*window)
+    until = time.perf_counter() + seconds
+    while time.perf_counter() < until:
+        for window in played:
+            start = clock()
             step(*window)
-        until = time.perf_counter() + seconds / 4
-        while time.perf_counter() < until:
-            for window in played:
-                start = clock()
-                step(*window)
-                times.append(1e3 * (clock() - start))
-    return taken
+            times.append(1e3 * (clock() - start))
+    return times
 
 
 def on_pytorch(network: torch.nn.Module) -> Callable:
@@ -108,25 +106,25 @@ def line(name: str, times: list[float], giga: float, peak: float) -> str:
     return f"{name:32s} {median:6.2f} ms ({low:.2f} to {high:.2f}), mean {mean:.2f}  {share}"
 
 
-def measured(name: str, count: int, recording: Path, seconds: float) -> list[str]:
-    """Return the lines of a network on `count` threads."""
+def measured(name: str, engine: str, count: int, recording: Path, seconds: float) -> str:
+    """Return the line of a network on `engine`, openvino or pytorch, and `count` threads."""
     played, network = windows(recording), load(name)
+    size = {"positions": layout(9), "height": SIDE, "width": SIDE}
+    if engine == "openvino":
+        giga = arithmetic(Runtime(network, **size, form="float32"), played[:10])
+        step = Runtime(network, **size, threads=count, form="openvino").step
+    else:
+        giga = macs_per_frame(network, SIDE, SIDE, views=9) / 1e9
+        step = on_pytorch(network)
     peak = convolution_peak(PEAKS[FORM], count=count) / 1e9
     clock = time.process_time if count == 1 else time.perf_counter
-    size = {"positions": layout(9), "height": SIDE, "width": SIDE}
-    live = Runtime(network, **size, threads=count, form="openvino")
-    giga = arithmetic(Runtime(network, **size, form="float32"), played[:10])
-    whole = macs_per_frame(network, SIDE, SIDE, views=9) / 1e9
     with threads(count):
-        ours, theirs = milliseconds([live.step, on_pytorch(network)], played, seconds, clock)
-    return [
-        line(f"{name}, openvino", ours, giga, peak),
-        line(f"{name}, pytorch", theirs, whole, peak),
-    ]
+        times = milliseconds(step, played, seconds, clock)
+    return line(f"{name}, {engine}", times, giga, peak)
 
 
 def main() -> None:
-    """Print the lines of each number of threads and network, each in a process of its own."""
+    """Print a line for each number of threads, network and engine, each in a process of its own."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", default=NAMES)
     parser.add_argument("--recording", type=Path, default=RECORDING)
@@ -139,10 +137,10 @@ def main() -> None:
     for count in given.threads:
         kind = "CPU" if count == 1 else "wall"
         print(f"threads: {count}, {kind} time, median (10 to 90 %), convolutions in {FORM}")
-        for name in given.names:
+        for name, engine in product(given.names, ("openvino", "pytorch")):
             with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
-                told = alone.submit(measured, name, count, given.recording, given.seconds)
-                print(*told.result(), sep="\n", flush=True)
+                told = alone.submit(measured, name, engine, count, given.recording, given.seconds)
+                print(told.result(), flush=True)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ convolution is in bytes where the CPU has instructions for them); what a network
 (`SetNet`: its sums and hidden maps) stays so.  Needs the extra `openvino`.
 """
 
+import sys
 import warnings
 from collections.abc import Sequence
 from functools import cache
@@ -69,20 +70,16 @@ class Compiled:
 
     def zeros(self, first: int) -> list:
         """Return zeros for the inputs from the `first` on: the state that comes last."""
-        import openvino
-
-        made = [openvino.Tensor(kind, shape) for kind, shape in self.starts[first:]]
+        made = [_package().Tensor(kind, shape) for kind, shape in self.starts[first:]]
         for part in made:
             np.asarray(part.data).fill(0)
         return made
 
     def __call__(self, inputs: Sequence) -> list:
         """Return the outputs; the memory of `inputs` is read, not copied."""
-        import openvino
-
         for k, part in enumerate(inputs):
             self.request.set_input_tensor(k, part)
-        outputs = [openvino.Tensor(kind, shape) for kind, shape in self.outputs]
+        outputs = [_package().Tensor(kind, shape) for kind, shape in self.outputs]
         for k, part in enumerate(outputs):
             self.request.set_output_tensor(k, part)
         self.request.infer(share_outputs=True)  # else it copies them all once more
@@ -91,9 +88,7 @@ class Compiled:
 
 def shared(array: np.ndarray) -> Any:
     """Return a float32 array as OpenVINO's tensor over the same memory."""
-    import openvino
-
-    return openvino.Tensor(np.ascontiguousarray(array, np.float32), shared_memory=True)
+    return _package().Tensor(np.ascontiguousarray(array, np.float32), shared_memory=True)
 
 
 class OpenVinoNetwork(nn.Module):
@@ -169,11 +164,20 @@ class _Rounding(Explicit):
 
 
 @cache
-def _core() -> Any:
-    """Return the one core of this process."""
+def _package() -> Any:
+    """Return the package, kept from reporting over the network that it was imported: it starts a
+    process for that, which is also in the way of what is timed.
+    """
+    sys.modules.setdefault("openvino_telemetry", None)  # it goes on without it
     import openvino
 
-    return openvino.Core()
+    return openvino
+
+
+@cache
+def _core() -> Any:
+    """Return the one core of this process."""
+    return _package().Core()
 
 
 def _fold(model: Any) -> None:
@@ -186,9 +190,7 @@ def _fold(model: Any) -> None:
 
 
 def _converted(module: nn.Module, example: tuple[Tensor, ...]) -> Any:
-    """Return OpenVINO's model of `module`; its front end is used as it is, as the tool around it
-    reports its use over the network.
-    """
+    """Return OpenVINO's model of `module`."""
     from openvino.frontend import FrontEndManager
     from openvino.frontend.pytorch.ts_decoder import TorchScriptPythonDecoder
 

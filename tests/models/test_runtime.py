@@ -1,5 +1,7 @@
 """From a list of events to a frame: what the dense grid gives, without the grid."""
 
+import sys
+
 import jaxtyping
 import numpy as np
 import pytest
@@ -28,6 +30,7 @@ NETWORKS = {
     "e2vid_stem": lambda: E2VID(views=9, base_channels=4, stem_channels=6),
 }
 FORMS = ["bf16", "openvino"]
+OPENVINO = pytest.mark.skipif(not openvino_cpu.installed(), reason="needs the extra openvino")
 
 
 @pytest.fixture
@@ -44,8 +47,8 @@ def network(name: str) -> torch.nn.Module:
 
 
 def form(name: str) -> str:
-    if name == "openvino":
-        pytest.importorskip("openvino", reason="needs the extra openvino")
+    if name == "openvino" and not openvino_cpu.installed():
+        pytest.skip("needs the extra openvino")
     return name
 
 
@@ -216,9 +219,9 @@ def test_without_the_package_it_says_how_to_get_it(monkeypatch):
     assert runtime(network("setnet"), None).step(**events(0)).shape == (24, 32)
 
 
+@OPENVINO
 @pytest.mark.parametrize("name", ["setnet", "e2vid"])
 def test_openvino_gives_the_frames_of_the_network(name, unchecked):
-    pytest.importorskip("openvino", reason="needs the extra openvino")
     net, windows = network(name), [events(seed) for seed in range(4)]
     found, state, told = OpenVinoNetwork(net), None, {}
     if name == "setnet":
@@ -231,8 +234,14 @@ def test_openvino_gives_the_frames_of_the_network(name, unchecked):
     assert torch.equal(again, got)  # a state that was given back stays as it is
 
 
+@OPENVINO
+def test_openvino_reports_its_use_to_nobody(unchecked):
+    runtime(network("setnet"), "openvino")
+    assert not any(name.startswith("openvino_telemetry.") for name in sys.modules)
+
+
+@OPENVINO
 def test_openvino_refuses_a_state_of_another_size_and_a_batch(unchecked):
-    pytest.importorskip("openvino", reason="needs the extra openvino")
     found = OpenVinoNetwork(network("setnet"))
     _, state = found(torch.zeros(1, 9, 5, 16, 16))
     with pytest.raises(ValueError, match=r"state must be of voxels \(1, 9, 5, 24, 24\)"):
