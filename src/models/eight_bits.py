@@ -24,7 +24,7 @@ def drawn_in_bytes(network: nn.Module) -> None:
 
 class EightBits(nn.Module):
     """`conv` for maps from zero to LARGEST: they and the weights, output by output, are rounded to
-    bytes (Jacob et al. 2018, arXiv:1712.05877).
+    bytes (Jacob et al. 2018, arXiv:1712.05877); a map goes on beyond its border in bytes.
     """
 
     def __init__(self, conv: nn.Conv2d):
@@ -32,6 +32,7 @@ class EightBits(nn.Module):
         self.weight, self.bias = (part.detach().float() for part in (conv.weight, conv.bias))
         self.step = self.weight.abs().amax((1, 2, 3)).clamp_min(1e-12) / WEIGHT
         self.zeros = torch.zeros(len(self.step), dtype=torch.int32)
+        self.padding = conv.padding[0]
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n o _h _w"]:
         """Return the convolution, in the type of `x`."""
@@ -39,4 +40,5 @@ class EightBits(nn.Module):
             self.weight, self.step, self.zeros, 0, -WEIGHT, WEIGHT
         )
         seen = torch.fake_quantize_per_tensor_affine(x.float(), LARGEST / MAP, 0, 0, MAP)
+        seen = functional.pad(seen, (self.padding,) * 4, mode="replicate")
         return functional.conv2d(seen, weight, self.bias).to(x.dtype)

@@ -70,7 +70,7 @@ class SetNet(nn.Module):
         self.spread_stem = nn.Conv2d(memories, half, 3, padding=1, bias=False)
         self.cell2 = PacedUnit(half, rank)
         self.around = Surroundings(half, around, refined)
-        self.mix2 = nn.Conv2d(half, half, 3)
+        self.mix2 = nn.Conv2d(half, half, 3, padding=BORDER, padding_mode="replicate")
         self.shuffle = Even(half, CELL**2, 3)
         self.relu = nn.ReLU()
         self.frozen: dict[tuple, tuple[Tensor, ...]] | None = None  # kernels kept, for running
@@ -186,7 +186,6 @@ class SetNet(nn.Module):
         there: zeros would make a pattern of its pixels.
         """
         x = self.relu(grown(told.to(seen.dtype), 2) + seen)
-        x = functional.pad(x, (BORDER,) * 4, mode="replicate")
         return self.shuffle(self.relu(self.mix2(x))).float()
 
     def kernels(self, places: tuple[Position, ...]) -> tuple[Tensor, Tensor, Tensor]:
