@@ -111,10 +111,8 @@ class AfterStem(nn.Module):
 
     def stem(self, grids: Tensor, mixed: Tensor) -> Tensor:
         """Return the map of the stem, before its ReLU."""
-        mixed = channels_first(mixed.to(self.dtype))
-        return channels_first(grids.to(self.dtype)) + functional.conv2d(
-            mixed, self.memories, None, 1, 1
-        )
+        grids, mixed = (channels_first(part.to(self.dtype)) for part in (grids, mixed))
+        return grids + functional.conv2d(mixed, self.memories, None, 1, 1)
 
     def pixels(
         self, seen: Tensor, about: Tensor, told: Tensor, passed: Tensor

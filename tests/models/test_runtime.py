@@ -166,6 +166,20 @@ def test_reset_forgets_and_a_state_goes_on(name, rounded):
     np.testing.assert_array_equal(live.step(**events(0)), first)
 
 
+def test_what_leaks_is_mixed_as_it_was_before_it_leaked():
+    live = runtime(network("setnet"))
+    for seed in range(300):
+        live.step(**events(seed, count=40))
+    front = live.front
+    sums = front.sums.reshape(9, front.memories.size, *front.sums.shape[1:])
+    code = live.behind.whole.module.code
+    mixed = np.einsum("vp,vmrc->rcpm", code, sums).reshape(*front.mixed.shape[1:3], -1)
+    spread = np.abs(sums - sums.mean(0)).mean(0).transpose(1, 2, 0)
+    expected = np.concatenate([mixed, spread], 2)
+    np.testing.assert_allclose(front.mixed[0], expected, atol=EXACT)
+    assert np.abs(expected).max() > 0.1
+
+
 WRONG = {
     "events must be in order of time": {"t": lambda t: t[::-1]},
     r"x in 0\.\.31 and y in 0\.\.23, got event 0 .* x=32": {"x": lambda x: x + 32},
