@@ -106,9 +106,10 @@ def line(name: str, times: list[float], giga: float, peak: float) -> str:
     return f"{name:32s} {median:6.2f} ms ({low:.2f} to {high:.2f}), mean {mean:.2f}  {share}"
 
 
-def measured(name: str, engine: str, count: int, recording: Path, seconds: float) -> str:
+def measured(name: str, engine: str, count: int, played: list[tuple], seconds: float) -> str:
     """Return the line of a network on `engine`, openvino or pytorch, and `count` threads."""
-    played, network = windows(recording), load(name)
+    peak = convolution_peak(PEAKS[FORM], count=count) / 1e9
+    network = load(name)
     size = {"positions": layout(9), "height": SIDE, "width": SIDE}
     if engine == "openvino":
         giga = arithmetic(Runtime(network, **size, form="float32"), played[:10])
@@ -116,7 +117,6 @@ def measured(name: str, engine: str, count: int, recording: Path, seconds: float
     else:
         giga = macs_per_frame(network, SIDE, SIDE, views=9) / 1e9
         step = on_pytorch(network)
-    peak = convolution_peak(PEAKS[FORM], count=count) / 1e9
     clock = time.process_time if count == 1 else time.perf_counter
     with threads(count):
         times = milliseconds(step, played, seconds, clock)
@@ -139,7 +139,7 @@ def main() -> None:
         print(f"threads: {count}, {kind} time, median (10 to 90 %), convolutions in {FORM}")
         for name, engine in product(given.names, ("openvino", "pytorch")):
             with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
-                told = alone.submit(measured, name, engine, count, given.recording, given.seconds)
+                told = alone.submit(measured, name, engine, count, played, given.seconds)
                 print(told.result(), flush=True)
 
 

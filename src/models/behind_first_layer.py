@@ -129,7 +129,7 @@ def _memories(network: SetNet, places: Sequence[Position]) -> tuple[Tensor, Tens
     """
     code, parts = network.sum_stem.parts(torch.tensor(places).float())
     kernels = [parts.transpose(0, 1).flatten(1, 2), network.spread_stem.weight]
-    return code.contiguous(), torch.cat(kernels, 1)
+    return code, torch.cat(kernels, 1)
 
 
 class Between(nn.Module):

@@ -24,7 +24,7 @@ def drawn_in_bytes(network: nn.Module) -> None:
 
 class EightBits(nn.Module):
     """`conv` for maps from zero to LARGEST: they and the weights, output by output, are rounded to
-    bytes (Jacob et al. 2018, arXiv:1712.05877); a map goes on beyond its border in bytes.
+    bytes (Jacob et al. 2018, arXiv:1712.05877).  Padding of `conv` repeats the border, as SetNet's.
     """
 
     def __init__(self, conv: nn.Conv2d):

@@ -295,8 +295,8 @@ def test_many_channels_are_drawn_in_bytes_where_these_are_fast(
     assert any(isinstance(part, EightBits) for part in net.modules()) == drawn
 
 
+@OPENVINO
 def test_openvino_computes_in_bytes_what_is_to_be(unchecked):
-    form("openvino")
     if not computes_bytes():
         pytest.skip("this CPU has no instructions for bytes")
     live = runtime(network("setnet_in_bytes"), "openvino")
