@@ -159,6 +159,7 @@ def reconstructor(cfg: DictConfig, net: nn.Module, spec: dict) -> Reconstructor:
         loss_from=cfg.data.loss_from,
         loss_pairs=cfg.data.loss_pairs,
         steady=cfg.steady,
+        calm=cfg.calm,
         teach=cfg.teach,
         clip=cfg.clip,
         average=cfg.average,

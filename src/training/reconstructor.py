@@ -16,6 +16,7 @@ from src.models.unroll import chunks, detach, takes, unroll, video, within
 from src.training.average import copy_of, follow
 from src.training.clock import Clock
 from src.training.guard import Guard, NotFinite
+from src.training.steadiness import flicker, unrest
 
 if TYPE_CHECKING:  # a network knows nothing of the simulation; a sample is read, never made
     from src.sim.pipeline import Sample
@@ -35,6 +36,7 @@ class Reconstructor(LightningModule):
     each equal part, drawn anew in every step (None: all windows): what is alike is not paid for.
     `steady`: weight of the mean change of a picture's error from one window to the next: a picture
     may be wrong, but not flicker.
+    `calm`: weight of a picture's own change, over its contrast, where the truth stands still.
     `teach`: weight, where there are teachers, of the loss against what they make of a clip; where
     it has `anchors`, of these alone, so that what LPIPS sees is the truth.
     `clip`: longest gradient (Euclidean norm over all parameters; None: as long as it is).
@@ -60,6 +62,7 @@ class Reconstructor(LightningModule):
         loss_from: int = 0,
         loss_pairs: int | None = None,
         steady: float = 0.0,
+        calm: float = 0.0,
         teach: float = 1.0,
         clip: float | None = None,
         average: float | None = None,
@@ -68,10 +71,9 @@ class Reconstructor(LightningModule):
         super().__init__()
         if detach_every < 0:
             raise ValueError(f"data.detach_every must be >= 0, got {detach_every}")
-        if not 0 <= steady < math.inf:
-            raise ValueError(f"steady must be >= 0, got {steady}")
-        if not 0 <= teach < math.inf:
-            raise ValueError(f"teach must be >= 0, got {teach}")
+        for name, weight in (("steady", steady), ("calm", calm), ("teach", teach)):
+            if not 0 <= weight < math.inf:
+                raise ValueError(f"{name} must be >= 0, got {weight}")
         if clip is not None and not clip > 0:
             raise ValueError(f"clip must be > 0 or null, got {clip}")
         if average is not None and not 0 <= average < 1:
@@ -83,7 +85,7 @@ class Reconstructor(LightningModule):
         self.optimizer, self.scheduler = optimizer, scheduler
         self.detach_every, self.warmup, self.guard = detach_every, warmup, Guard(spike)
         self.loss_from, self.loss_pairs = loss_from, loss_pairs
-        self.steady, self.teach, self.clip = steady, teach, clip
+        self.steady, self.calm, self.teach, self.clip = steady, calm, teach, clip
         self.clock = clock or Clock()
         self.windows_seen, self.steps_before, self.rates = 0, 0, []
         # In a tuple, so that their backbones stay out of the parameters and the checkpoint.
@@ -202,7 +204,7 @@ class Reconstructor(LightningModule):
 
         The loss sees every picture alone, so its gradient there is had a few pictures at a time,
         and its own maps (VGG's are larger than the network's) never stand in memory together.
-        What holds the error steady, against the first of `goals`, is added to it.
+        What holds pictures steady, against the first of `goals`, is added to it.
         """
         pictures = frames.flatten(0, 1)
         leaves, total = pictures.detach().requires_grad_(), torch.zeros((), device=self.device)
@@ -212,10 +214,10 @@ class Reconstructor(LightningModule):
                 part = loss(ours, truth).sum() * (share / len(pictures))
                 part.backward()
                 total += part.detach()
-        follows = [b == a + 1 for a, b in pairwise(shown)]
-        if self.steady and any(follows):
-            error = leaves.unflatten(0, frames.shape[:2]) - goals[0][0]
-            change = share * self.steady * error.diff(dim=1)[:, follows].abs().mean()
+        follows = torch.tensor([b == a + 1 for a, b in pairwise(shown)])
+        if (self.steady or self.calm) and follows.any():
+            pair = leaves.unflatten(0, frames.shape[:2]), goals[0][0], follows
+            change = share * (self.steady * flicker(*pair) + self.calm * unrest(*pair))
             change.backward()
             total += change.detach()
         self.manual_backward(pictures, leaves.grad)

@@ -196,6 +196,7 @@ def test_the_mean_forgets_the_start_and_then_moves_slowly():
         (["clock=moon"], "clock must be one of wall, processor"),
         (["clip=0"], "clip must be > 0"),
         (["steady=-1"], "steady must be >= 0"),
+        (["calm=-1"], "calm must be >= 0"),
         (["average=1"], "average must be in"),
         (["data.loss_from=2"], "data.loss_from must be in 0..1"),
         (["data.loss_pairs=2", "data.loss_from=0"], "data.loss_pairs must be in 1..1 or null"),
