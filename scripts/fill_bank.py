@@ -2,7 +2,8 @@
 
     python -m scripts.fill_bank experiment=lf3x3 data.bank=1500 scene.root=... [+workers=2]
 
-Stopped anywhere and started again it goes on; several may fill one bank, trainings may use it.
+`+device=cuda` simulates on a GPU.  Stopped anywhere and started again it goes on; several may fill
+one bank, trainings may use it.
 """
 
 import multiprocessing
@@ -20,13 +21,14 @@ from src.training.bank_filler import fill
 EVERY = 10.0  # seconds between two lines
 
 
-def fill_bank(bank: Bank, workers: int) -> None:
-    """Fill with so many processes; raises OSError where clips could not be kept."""
+def fill_bank(bank: Bank, workers: int, device: str = "cpu") -> None:
+    """Fill with so many processes on `device`; raises OSError where clips could not be kept."""
     print(bank.status(), flush=True)
     start, before = time.monotonic(), len(bank.missing())
     spawn = multiprocessing.get_context("spawn")
     running = [
-        spawn.Process(target=_work, args=(bank, os.getpid()), daemon=True) for _ in range(workers)
+        spawn.Process(target=_work, args=(bank, os.getpid(), device), daemon=True)
+        for _ in range(workers)
     ]
     for process in running:
         process.start()
@@ -39,9 +41,9 @@ def fill_bank(bank: Bank, workers: int) -> None:
         raise OSError(f"{len(bank.missing())} clips are missing in {bank.folder}")
 
 
-def _work(bank: Bank, parent: int) -> None:
+def _work(bank: Bank, parent: int, device: str) -> None:
     torch.set_num_threads(1)
-    fill(bank, lambda: os.getppid() == parent)
+    fill(bank, lambda: os.getppid() == parent, device)
 
 
 @hydra.main(version_base=None, config_path="../conf", config_name="train")
@@ -50,7 +52,12 @@ def main(cfg: DictConfig) -> None:
     workers = cfg.get("workers", 1)
     if type(workers) is not int or workers < 1:
         raise ValueError(f"workers must be a whole number >= 1, got {workers}")
-    fill_bank(simulation.bank(cfg), workers)
+    device = cfg.get("device", "cpu")
+    if device not in ("cpu", "cuda"):
+        raise ValueError(f"device must be cpu or cuda, got {device}")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("device must be cpu where there is no CUDA device, got cuda")
+    fill_bank(simulation.bank(cfg), workers, device)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from scipy.special import ndtri
 from torch import Tensor
 from torch.nn import functional
 
+from src.models.unroll import chunks
 from src.sim import noise
 from src.sim.optics import Position, layout
 from src.sim.pipeline import Sample, room
@@ -98,11 +99,11 @@ class Augment:
         axes = flip_axes(self.flip, noise.key(key, "flip"))
         swap = float(noise.uniform(noise.key(key, "transpose"), torch.tensor(0))) < self.transpose
         order = turned_views(sample.positions, voxels.shape[1], axes, swap)[kept].to(voxels.device)
-        for window, step, empty in zip(out, steps.tolist(), paused.tolist(), strict=True):
-            if empty:
-                window.zero_()
-            else:  # window by window: what is turned is in the cache still
-                window.copy_(turned(voxels[step].index_select(0, order), axes, swap))
+        at_once = 1 if out.device.type == "cpu" else 0  # what is turned is in the cache still
+        for part in chunks(len(out), at_once):
+            shown = voxels[steps[part].to(voxels.device)]
+            out[part] = turned(shown.index_select(1, order), axes, swap)
+        out[paused.to(out.device)] = 0
         misplace(out, self.misplaced, self.misplaced_px, noise.key(key, "misplaced"))
         self._corrupt(out, float(sample.window_s[0]), key)
         pictures = (sample.target, sample.turbulent, sample.taught)

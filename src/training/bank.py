@@ -85,15 +85,15 @@ class Bank:
                     return self.make(index)
         return torch.load(self.path(index), mmap=True, weights_only=True)
 
-    def make(self, index: int) -> dict:
-        """Simulate clip `index` and store it; a disk that is full is a warning."""
+    def make(self, index: int, device: torch.device | str = "cpu") -> dict:
+        """Simulate clip `index` on `device` and store it; a disk that is full is a warning."""
         draw = self.source.draw(index)
         top, left, height, width = draw.crop
         clean = draw.clip.frames[:, top : top + height, left : left + width]
         facts = {"name": draw.clip.name, "fps": draw.clip.fps, "record": self.source.record(draw)}
         facts["air"] = repr(draw.air)
-        views = self.source.views(draw)[0]
-        clip = {"views": views.half().contiguous(), "clean": clean.half().contiguous()}
+        views = self.source.views(draw, device)[0].half().cpu()
+        clip = {"views": views.contiguous(), "clean": clean.half().contiguous()}
         clip["facts"] = json.dumps(facts)
         try:
             WholeFiles().save_checkpoint(clip, self.path(index))

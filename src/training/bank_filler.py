@@ -41,8 +41,12 @@ class Filler:
             self.process = None
 
 
-def fill(bank: Bank, going: Callable[[], bool] = lambda: True) -> None:
-    """Make what is missing and nobody else makes, while `going()`.
+def fill(
+    bank: Bank,
+    going: Callable[[], bool] = lambda: True,
+    device: torch.device | str = "cpu",
+) -> None:
+    """Make what is missing and nobody else makes, on `device`, while `going()`.
 
     Raises OSError where a clip could not be kept.
     """
@@ -51,7 +55,7 @@ def fill(bank: Bank, going: Callable[[], bool] = lambda: True) -> None:
             return
         with bank.claim(index, wait=False) as mine:
             if mine and not bank.path(index).exists():
-                bank.make(index)
+                bank.make(index, device)
                 if not bank.path(index).exists():
                     raise OSError(f"the bank in {bank.folder} cannot be filled")
 

@@ -122,8 +122,7 @@ def scores(trainer: Trainer, module: LightningModule) -> dict[str, float]:
     """Return the share of dead channels and the mean of every score, over the validation clips."""
     module.eval()  # the mean of the weights, if there is one, always is
     found, probed = [], []
-    for sample in trainer.datamodule.val_dataloader():
-        sample = trainer.datamodule.on_after_batch_transfer(sample, 0).to(module.device)
+    for sample in trainer.datamodule.validation_samples():
         found += module.measure(sample)
         if len(probed) < PROBED:
             probed.append(sample)

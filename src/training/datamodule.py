@@ -57,6 +57,7 @@ class LightFieldData(LightningDataModule):
         self.batch_size, self.reuse, self.epoch_clips = batch_size, reuse, epoch_clips
         self.val_clips, self.test_clips = val_clips, test_clips
         self.workers, self.simulate_on = workers, simulate_on
+        self.simulators: dict[str, Callable[[list], Sample]] = {}  # on the training device
 
     def setup(self, stage: str) -> None:
         """Start filling the bank; one process of each machine does."""
@@ -90,12 +91,19 @@ class LightFieldData(LightningDataModule):
         """Return clips 0 .. test_clips - 1 of the test split, one at a time."""
         return self._loader("test", sampler=[(clip, clip) for clip in range(self.test_clips)])
 
+    def validation_samples(self) -> Iterator[Sample]:
+        """Yield the validation clips on the training device; a training need not be interrupted."""
+        for batch in self.val_dataloader():
+            sample = batch if isinstance(batch, Sample) else self._on_device("val", batch)
+            yield sample.to(self.trainer.strategy.root_device)
+
     def on_after_batch_transfer(self, batch: Sample | list, dataloader_idx: int) -> Sample:
         """Simulate drawn clips on the training device when no worker has."""
         if isinstance(batch, Sample):
             return batch
-        split = "train" if self.trainer.training else "test" if self.trainer.testing else "val"
-        return self._simulator(split, self.trainer.strategy.root_device)(batch)
+        return self._on_device(
+            "train" if self.trainer.training else "test" if self.trainer.testing else "val", batch
+        )
 
     def transfer_batch_to_device(self, batch, device: torch.device, dataloader_idx: int):
         """Leave drawn clips where they are; move samples."""
@@ -111,6 +119,12 @@ class LightFieldData(LightningDataModule):
             persistent_workers=self.workers > 0,
             **sampling,
         )
+
+    def _on_device(self, split: str, batch: list) -> Sample:
+        if split not in self.simulators:  # kept, so that a batch can be used again
+            device = self.trainer.strategy.root_device
+            self.simulators[split] = self._simulator(split, device)
+        return self.simulators[split](batch)
 
     def _simulator(self, split: str, device) -> Callable[[Sequence], Sample]:
         training = (self.augment, self.teachers) if split == "train" else (None, None)
@@ -152,7 +166,9 @@ class Simulator:
 
     def _made(self, draw: Draw) -> Sample:
         sample = self.pipeline.sample(draw, self.device)
-        return replace(sample, taught=self.teachers(sample)) if self.teachers else sample
+        if self.teachers is None:
+            return sample
+        return replace(sample, taught=self.teachers(sample, (draw.key, draw.crop)))
 
 
 class Numbered(Dataset):

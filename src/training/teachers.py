@@ -7,7 +7,7 @@ truth than any of them, at the cost of all.  A network learns it at its own cost
 
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from pathlib import Path
 
 import torch
@@ -48,13 +48,18 @@ class Teachers:
                     f"for {other:g} windows a second, got {', '.join(networks)}"
                 )
         self.names = {name: _digest(*net.state_dict().values()) for name, net in networks.items()}
+        self.paths: dict[Hashable, Path] = {}
 
-    def __call__(self, sample: Sample) -> Float[Tensor, "1 windows 1 h w"]:
-        """Return the mean picture of a single clip, in [0, 1]."""
+    def __call__(self, sample: Sample, name: Hashable = None) -> Float[Tensor, "1 windows 1 h w"]:
+        """Return the mean picture of a single clip, in [0, 1].
+
+        `name` tells the sample from all others that are given here (None: nothing does): one that
+        comes again is not hashed again.
+        """
         chosen = self._for(1 / float(sample.window_s[0]))
-        known = _digest(sample.voxels, sample.window_s, torch.tensor(sample.positions or ()))
-        names = "".join(sorted(self.names[name] for name in chosen))
-        path = self.root / f"{hashlib.sha256((names + known).encode()).hexdigest()[:24]}.pt"
+        path = self.paths.get(name) or self._path(sample, chosen)
+        if name is not None:
+            self.paths[name] = path
         if path.exists() and whole(path):
             kept = torch.load(path, weights_only=True)["pictures"]
         else:
@@ -62,6 +67,12 @@ class Teachers:
             path.parent.mkdir(parents=True, exist_ok=True)
             WholeFiles().save_checkpoint({"pictures": kept}, path)
         return kept.to(sample.voxels.device).float() / LEVELS
+
+    def _path(self, sample: Sample, chosen: list[str]) -> Path:
+        """Return the file of what the networks `chosen` make of a sample."""
+        known = _digest(sample.voxels, sample.window_s, torch.tensor(sample.positions or ()))
+        names = "".join(sorted(self.names[name] for name in chosen))
+        return self.root / f"{hashlib.sha256((names + known).encode()).hexdigest()[:24]}.pt"
 
     def _for(self, rate: float) -> list[str]:
         """Return the names of the networks that teach at `rate` windows a second."""

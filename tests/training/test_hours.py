@@ -169,6 +169,16 @@ def test_weights_of_another_network_are_refused(tmp_path):
         files.restore(other, now)
 
 
+def test_a_training_whose_device_simulates_is_the_same(tmp_path):
+    ways = [curve_of(tmp_path / where, where) for where in ("worker", "device")]
+    assert ways[0] == ways[1]
+
+
+def curve_of(folder: Path, where: str) -> list[list[float]]:
+    run(folder, "hours=5", f"data.simulate_on={where}", "data.reuse=2")
+    return curve(folder)
+
+
 def test_weights_without_a_curve_are_none_to_go_on_from(tmp_path):
     with pytest.raises(ValueError, match="ckpt must be of the network"):
         run(tmp_path / "a", "hours=3", "ckpt=weights/lf3x3.safetensors")

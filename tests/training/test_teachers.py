@@ -64,6 +64,13 @@ def test_a_picture_is_made_once_and_again_where_anything_differs(clip, tmp_path)
     assert torch.equal(Teachers({"a": network}, tmp_path, 120.0)(clip), first)
 
 
+def test_a_sample_that_comes_again_by_name_is_not_hashed_again(clip, tmp_path, monkeypatch):
+    teachers = Teachers({"a": Constant(0.25)}, tmp_path, 120.0)
+    first = teachers(clip, "its name")
+    monkeypatch.setattr(module, "_digest", lambda *_: pytest.fail("hashed again"))
+    assert torch.equal(teachers(clip, "its name"), first)
+
+
 def test_who_is_not_told_the_length_of_windows_teaches_those_it_knows(clip, tmp_path):
     networks = {"told": SetNet(half=8, around=[8]), "not": Constant(0.3)}
     fast = replace(clip, window_s=clip.window_s / 4)
