@@ -6,18 +6,17 @@ the same in any worker.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from scipy.special import ndtri
 from torch import Tensor
 from torch.nn import functional
 
-from src.models.unroll import chunks
 from src.sim import noise
 from src.sim.optics import Position, layout
 from src.sim.pipeline import Sample, room
@@ -99,11 +98,7 @@ class Augment:
         axes = flip_axes(self.flip, noise.key(key, "flip"))
         swap = float(noise.uniform(noise.key(key, "transpose"), torch.tensor(0))) < self.transpose
         order = turned_views(sample.positions, voxels.shape[1], axes, swap)[kept].to(voxels.device)
-        at_once = 1 if out.device.type == "cpu" else 0  # what is turned is in the cache still
-        for part in chunks(len(out), at_once):
-            shown = voxels[steps[part].to(voxels.device)]
-            out[part] = turned(shown.index_select(1, order), axes, swap)
-        out[paused.to(out.device)] = 0
+        show(out, voxels, steps, paused, lambda part: turned(part[..., order, :, :, :], axes, swap))
         misplace(out, self.misplaced, self.misplaced_px, noise.key(key, "misplaced"))
         self._corrupt(out, float(sample.window_s[0]), key)
         pictures = (sample.target, sample.turbulent, sample.taught)
@@ -118,6 +113,25 @@ class Augment:
             voxels.add_(hot.to(voxels))
         rates = [rate * window_s for rate in self.firing_hz]
         fire(voxels, self.firing_fraction, rates, noise.key(key, "firing"))
+
+
+def show(
+    out: Float[Tensor, "windows kept bins h w"],
+    voxels: Float[Tensor, "windows views bins h w"],
+    steps: Int[Tensor, " windows"],
+    paused: Bool[Tensor, " windows"],
+    turn: Callable[[Tensor], Tensor],
+) -> None:
+    """Fill `out` with the windows `steps` as `turn` makes them, and with nothing where `paused`."""
+    if out.device.type != "cpu":
+        out.copy_(turn(voxels[steps.to(out.device)]))
+        out[paused.to(out.device)] = 0
+        return
+    for window, step, empty in zip(out, steps.tolist(), paused.tolist(), strict=True):
+        if empty:
+            window.zero_()
+        else:  # window by window: what is turned is in the cache still
+            window.copy_(turn(voxels[step]))
 
 
 def normals(shape: Sequence[int], key: int, device: torch.device) -> Tensor:

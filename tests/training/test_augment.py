@@ -15,6 +15,7 @@ from src.training.augment import (
     misplace,
     normals,
     pause_chain,
+    show,
     turned,
     turned_views,
     views_kept,
@@ -253,3 +254,15 @@ def test_a_view_that_stays_shows_the_picture_of_its_turned_place():
 def test_wrong_values_name_their_key(wrong):
     with pytest.raises(ValueError, match=f"augment.{next(iter(wrong))}"):
         Augment(**wrong)
+
+
+def test_windows_are_shown_one_by_one_as_all_at_once():
+    voxels, order = torch.rand(5, 3, 2, 8, 8), torch.tensor([2, 0])
+    steps, paused = torch.tensor([0, 1, 1, 2, 3]), torch.tensor([0, 0, 1, 0, 0]).bool()
+
+    def turn(part):
+        return turned(part[..., order, :, :, :], [-1], True)
+
+    out = torch.empty(5, 2, 2, 8, 8)
+    show(out, voxels, steps, paused, turn)
+    assert torch.equal(out, turn(voxels[steps]) * ~paused[:, None, None, None, None])
