@@ -12,8 +12,9 @@ from torch.utils.data import DataLoader
 
 from src.models.unroll import chunks, detach, unroll
 from src.sim.pipeline import Sample
-from src.training import reconstructor
+from src.training import reconstructor, steadiness
 from src.training.reconstructor import Reconstructor
+from src.training.steadiness import unrest
 
 pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`")
 
@@ -73,13 +74,15 @@ def by_hand(
     clip: float = 1e9,
     steady: float = 0.0,
     pairs: Sequence[int] = (),
+    calm: float = 0.0,
 ) -> nn.Module:
     network, batch = Leaky(), sample()
-    state, losses, errors = None, [], []
+    state, losses, errors, frames = None, [], [], []
     for window in range(batch.voxels.shape[1]):
         if detach_every and window % detach_every == 0:
             state = detach(state)
         frame, state = network(batch.voxels[:, window], state)
+        frames.append(frame)
         errors.append(frame - batch.target[:, window])
         losses.append(errors[-1].square().mean())
     firsts = pairs or range(loss_from, len(errors) - 1)
@@ -87,6 +90,8 @@ def by_hand(
     if pairs:
         losses = [losses[first + one] for first in pairs for one in (0, 1)]
     loss = torch.stack(losses[loss_from if not pairs else 0 :]).mean()
+    follows = torch.ones(len(frames) - 1, dtype=torch.bool)
+    loss = loss + calm * unrest(torch.stack(frames, 1), batch.target, follows)
     (loss + steady * torch.stack(changes).mean()).backward()
     torch.nn.utils.clip_grad_norm_(network.parameters(), clip)
     with torch.no_grad():
@@ -118,6 +123,14 @@ def test_what_flickers_costs(loss_from):
     for mine, other in zip(ours.parameters(), theirs.parameters(), strict=True):
         assert torch.allclose(mine, other, atol=1e-6)
     assert not torch.allclose(theirs.a, by_hand(0, loss_from).a, atol=1e-3)
+
+
+def test_what_changes_where_the_truth_stands_still_costs(monkeypatch):
+    monkeypatch.setattr(steadiness, "STILL", 2.0)  # all of it does
+    ours, theirs = fit(Leaky(), 0, calm=3.0), by_hand(0, calm=3.0)
+    for mine, other in zip(ours.parameters(), theirs.parameters(), strict=True):
+        assert torch.allclose(mine, other, atol=1e-6)
+    assert not torch.allclose(theirs.a, by_hand(0).a, atol=1e-3)
 
 
 @pytest.mark.parametrize("detach_every", [0, 2])
