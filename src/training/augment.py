@@ -8,6 +8,7 @@ the same in any worker.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -98,11 +99,12 @@ class Augment:
         axes = flip_axes(self.flip, noise.key(key, "flip"))
         swap = float(noise.uniform(noise.key(key, "transpose"), torch.tensor(0))) < self.transpose
         order = turned_views(sample.positions, voxels.shape[1], axes, swap)[kept].to(voxels.device)
-        show(out, voxels, steps, paused, lambda part: turned(part[..., order, :, :, :], axes, swap))
+        turn = partial(turned, axes=axes, swap=swap)
+        show(out, voxels, steps, paused, lambda part: turn(part.index_select(-4, order)))
         misplace(out, self.misplaced, self.misplaced_px, noise.key(key, "misplaced"))
         self._corrupt(out, float(sample.window_s[0]), key)
         pictures = (sample.target, sample.turbulent, sample.taught)
-        return [turned(part[0, steps], axes, swap) for part in pictures if part is not None]
+        return [turn(part[0, steps]) for part in pictures if part is not None]
 
     def _corrupt(self, voxels: Tensor, window_s: float, key: int) -> None:
         if self.noise_std > 0:

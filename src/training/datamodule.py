@@ -57,7 +57,7 @@ class LightFieldData(LightningDataModule):
         self.batch_size, self.reuse, self.epoch_clips = batch_size, reuse, epoch_clips
         self.val_clips, self.test_clips = val_clips, test_clips
         self.workers, self.simulate_on = workers, simulate_on
-        self.simulators: dict[str, Callable[[list], Sample]] = {}  # on the training device
+        self.simulators: dict[tuple[str, torch.device], Callable[[list], Sample]] = {}
 
     def setup(self, stage: str) -> None:
         """Start filling the bank; one process of each machine does."""
@@ -101,9 +101,8 @@ class LightFieldData(LightningDataModule):
         """Simulate drawn clips on the training device when no worker has."""
         if isinstance(batch, Sample):
             return batch
-        return self._on_device(
-            "train" if self.trainer.training else "test" if self.trainer.testing else "val", batch
-        )
+        split = "train" if self.trainer.training else "test" if self.trainer.testing else "val"
+        return self._on_device(split, batch)
 
     def transfer_batch_to_device(self, batch, device: torch.device, dataloader_idx: int):
         """Leave drawn clips where they are; move samples."""
@@ -121,10 +120,10 @@ class LightFieldData(LightningDataModule):
         )
 
     def _on_device(self, split: str, batch: list) -> Sample:
-        if split not in self.simulators:  # kept, so that a batch can be used again
-            device = self.trainer.strategy.root_device
-            self.simulators[split] = self._simulator(split, device)
-        return self.simulators[split](batch)
+        device = self.trainer.strategy.root_device
+        if (split, device) not in self.simulators:  # kept, so that a batch can be used again
+            self.simulators[split, device] = self._simulator(split, device)
+        return self.simulators[split, device](batch)
 
     def _simulator(self, split: str, device) -> Callable[[Sequence], Sample]:
         training = (self.augment, self.teachers) if split == "train" else (None, None)
@@ -155,7 +154,7 @@ class Simulator:
         draws = [draw for _, draw in numbered]
         names = [(draw.key, draw.crop) for draw in draws]
         if self.last[0] != names:
-            self.last = (names, [self._made(draw) for draw in draws])
+            self.last = (names, list(map(self._made, draws, names)))
         samples = self.last[1]
         if self.augment is None:
             sample = joined(samples)
@@ -164,11 +163,11 @@ class Simulator:
             sample = self.augment(samples, keys)
         return replace(sample, seconds=time.perf_counter() - start)
 
-    def _made(self, draw: Draw) -> Sample:
+    def _made(self, draw: Draw, name: tuple) -> Sample:
         sample = self.pipeline.sample(draw, self.device)
         if self.teachers is None:
             return sample
-        return replace(sample, taught=self.teachers(sample, (draw.key, draw.crop)))
+        return replace(sample, taught=self.teachers(sample, name))
 
 
 class Numbered(Dataset):

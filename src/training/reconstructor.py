@@ -215,9 +215,10 @@ class Reconstructor(LightningModule):
                 part.backward()
                 total += part.detach()
         follows = torch.tensor([b == a + 1 for a, b in pairwise(shown)])
-        if (self.steady or self.calm) and follows.any():
-            pair = leaves.unflatten(0, frames.shape[:2]), goals[0][0], follows
-            change = share * (self.steady * flicker(*pair) + self.calm * unrest(*pair))
+        asked = [(w, of) for w, of in ((self.steady, flicker), (self.calm, unrest)) if w]
+        if asked and follows.any():
+            seen = leaves.unflatten(0, frames.shape[:2]), goals[0][0], follows
+            change = share * sum(weight * of(*seen) for weight, of in asked)
             change.backward()
             total += change.detach()
         self.manual_backward(pictures, leaves.grad)

@@ -261,7 +261,7 @@ def test_windows_are_shown_one_by_one_as_all_at_once():
     steps, paused = torch.tensor([0, 1, 1, 2, 3]), torch.tensor([0, 0, 1, 0, 0]).bool()
 
     def turn(part):
-        return turned(part[..., order, :, :, :], [-1], True)
+        return turned(part.index_select(-4, order), [-1], True)
 
     out = torch.empty(5, 2, 2, 8, 8)
     show(out, voxels, steps, paused, turn)
