@@ -1,8 +1,10 @@
-"""Time the sensor, the voxel grids and the event files: python -m benchmarks.sensor [--eager].
+"""Time the sensor, the voxel grids and the event files: python -m benchmarks.sensor [--eager]
+[--batch N] [--device cuda].
 
 Nine views of a clip of 1/f texture and hard discs that pans by one pixel a frame and shakes by one.
 Milliseconds are per frame interval of all nine views, the smallest CPU time of the thread over the
-repeats (wall time with two threads): the machine may be shared.
+repeats (wall time with two threads): the machine may be shared.  `--batch` only times N clips of
+different sensors, at once and one by one, and counts torch's operators, each a launch on a GPU.
 """
 
 import argparse
@@ -13,14 +15,20 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch.nn import functional
+from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.timing import least
 from src.recordings.files.formats import iter_events, write_events
+from src.sim.sensor import batch
 from src.sim.sensor.engines import sensor_eager
 from src.sim.sensor.sensor import EventSensor
 from src.sim.voxel import voxel_grid
 
 SIDE, FPS = 256, 120.0
+DRAWN = {
+    "threshold": [0.1, 0.7], "off_ratio": [0.8, 1.25], "refractory_s": [0.0005, 0.005],
+    "mismatch": [0.0, 0.15], "shot_hz": [0.0, 2.0], "residual": [0.05, 1.0],
+}  # fmt: skip
 
 
 def clip(views: int, frames: int, seed: int = 0) -> torch.Tensor:
@@ -77,12 +85,44 @@ def sensors(frames: torch.Tensor, repeats: int, eager: bool) -> None:
         if eager:
             few = frames[:, :, :4].contiguous()
             job = sensor._job(few, FPS, None, 1)
-            grids = torch.empty(1, 9, 3, 5, SIDE, SIDE)
+            grids = torch.zeros(1, 3, 9, 5, SIDE, SIDE)
             slow = (
                 least(lambda j=job, g=grids: sensor_eager.voxels(j, g), repeats=2) / 3 * intervals
             )
         times = " ".join(f"{1e3 * t / intervals:9.2f}" for t in (one, two, slow))
         print(f"{name:26} {rate:8.1f} {times}")
+
+
+def batches(count: int, repeats: int, device: str, side: int = 96, frames: int = 41) -> None:
+    """Print milliseconds and operators of `count` clips of float16, each with a sensor of its own,
+    in one call and in a call for each.
+    """
+    wide, g = clip(9, frames)[0], torch.Generator().manual_seed(0)
+    corners = torch.randint(0, SIDE - side, (count, 2), generator=g).tolist()
+    views = torch.stack([wide[..., y : y + side, x : x + side] for y, x in corners])
+    views, sensor = views.half().to(device), EventSensor(drawn=DRAWN, response="linlog")
+    sensors = [sensor.draw(key, seed=key) for key in range(count)]
+
+    def work(each: int) -> None:
+        for i in range(0, count, each):
+            some = slice(i, i + each)
+            batch.voxels(
+                sensors[some], views[some], [FPS] * each, clips=range(count)[some], views=range(9),
+                origins=corners[some], full_widths=[SIDE] * each,
+            )  # fmt: skip
+        if device != "cpu":
+            torch.cuda.synchronize()
+
+    clock = time.thread_time if device == "cpu" else time.perf_counter
+    for name, each in (("in one call", count), ("one by one", 1)):
+        seconds = least(lambda each=each: work(each), clock, repeats)
+        with profile(activities=[ProfilerActivity.CPU]) as seen:
+            work(each)
+        operators = sum(event.name.startswith("aten::") for event in seen.events())
+        print(
+            f"{count} clips of 9 x {frames} x {side} x {side} {name}: {1e3 * seconds:.1f} ms, "
+            f"{operators} operators"
+        )
 
 
 def voxelising(repeats: int) -> None:
@@ -134,8 +174,13 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--frames", type=int, default=11)
     parser.add_argument("--eager", action="store_true", help="time plain torch as well")
+    parser.add_argument("--batch", type=int, help="time so many clips of different sensors only")
+    parser.add_argument("--device", default="cpu", help="where --batch runs")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    if arguments.batch:
+        batches(arguments.batch, arguments.repeats, arguments.device)
+        return
     voxelising(arguments.repeats)
     sensors(clip(9, arguments.frames), arguments.repeats, arguments.eager)
 

@@ -54,7 +54,7 @@ def drawn(
 def clip(pipeline: Pipeline, number: int, scores: Scores, warmup: int) -> tuple[Row, dict]:
     """Return the scores of every way on a clip, and what is known of its air."""
     draw = pipeline.draw(number)
-    sample = pipeline.expose(draw, pipeline.views(draw))
+    sample = pipeline.expose([draw], pipeline.views(draw))
     events = draw.threshold * sample.voxels[0].sum(2)
     keep = math.exp(-float(sample.window_s) / MEMORY_S)
     films = drawn(events, pipeline.tilt(draw)[:, 1:], keep, pipeline.optics.centre)

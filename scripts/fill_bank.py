@@ -2,8 +2,8 @@
 
     python -m scripts.fill_bank experiment=lf3x3 data.bank=1500 scene.root=... [+workers=2]
 
-`+device=cuda` simulates on a GPU.  Stopped anywhere and started again it goes on; several may fill
-one bank, trainings may use it.
+That of data.large is filled first.  `+device=cuda` simulates on a GPU.  Stopped anywhere and
+started again it goes on; several may fill one bank, trainings may use it.
 """
 
 import multiprocessing
@@ -57,6 +57,9 @@ def main(cfg: DictConfig) -> None:
         raise ValueError(f"device must be cpu or cuda, got {device}")
     if device == "cuda" and not torch.cuda.is_available():
         raise ValueError("device must be cpu where there is no CUDA device, got cuda")
+    large = simulation.large_stream(cfg)
+    if large is not None:
+        fill_bank(large.pipeline.bank, workers, device)
     fill_bank(simulation.bank(cfg), workers, device)
 
 

@@ -27,6 +27,7 @@ from src.models import files
 from src.models.fast import computes_bf16
 from src.models.setnet import CELL, SetNet
 from src.sim.pipeline import Sample
+from src.training.batch_sampler import Item
 from src.training.datamodule import LightFieldData, Simulator
 from src.training.handover import reached
 
@@ -98,10 +99,10 @@ def learn(network: SetNet, maps: Tensor, truth: Tensor, steps: int) -> list[floa
 def samples(data: LightFieldData, clips: int) -> Iterable[Sample]:
     """Return the first training clips, as a training sees them, a batch at a time."""
     pipeline = data.pipelines["train"]
-    simulated = Simulator(pipeline, data.augment, seed=data.seed)
+    simulated = Simulator([pipeline], data.augment, seed=data.seed)
     for first in range(0, clips, data.batch_size):
         numbers = range(first, min(first + data.batch_size, clips))
-        yield simulated([(number, pipeline.draw(number)) for number in numbers])
+        yield simulated([(Item(number, number), pipeline.draw(number)) for number in numbers])
 
 
 def teach(cfg: DictConfig, clips: int, steps: int) -> None:

@@ -68,7 +68,7 @@ def draw_all(index: int) -> None:
     pipeline = build.pipeline(cfg, "test")
     draw, middle = pipeline.draw(index), SIDE // 2
     views = pipeline.views(draw)[0]
-    sample = pipeline.expose(draw, views[None])
+    sample = pipeline.expose([draw], views[None])
     tilt, voxels = pipeline.tilt(draw)[:, -1], sample.voxels[0, -1]
     centre = pipeline.optics.centre
     truth, seen = sample.target[0, :, 0].numpy(), sample.turbulent[0, :, 0].numpy()

@@ -33,7 +33,7 @@ def simulate(cfg: DictConfig) -> dict:
     pipeline = build.pipeline(cfg, cfg.split)
     draw = pipeline.draw(cfg.index)
     batch = pipeline.views(draw)
-    sample, views = pipeline.expose(draw, batch), batch[0]
+    sample, views = pipeline.expose([draw], batch), batch[0]
     tilt = pipeline.tilt(draw)
     windows = slice(cfg.data.substeps, None, cfg.data.substeps)
     results.open_run(run, door.resolved(cfg))

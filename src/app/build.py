@@ -18,7 +18,7 @@ from baselines import widened
 from baselines.postprocess import Restoration
 from src.app.contracts import keeping
 from src.app.parts import make, part, rooms
-from src.app.simulation import pipeline
+from src.app.simulation import large_stream, pipeline
 from src.metrics.scores import Scores
 from src.models.aligned import Aligned
 from src.models.fast import computes_bf16
@@ -26,14 +26,18 @@ from src.models.look_ahead import LookAhead
 from src.models.unroll import takes
 from src.records.results import Row
 from src.sim.optics import Optics
+from src.sim.pipeline import Pipeline
 from src.training import evaluation
+from src.training.bank import Bank
 from src.training.bank_filler import Filler
 from src.training.bank_samples import Banked
+from src.training.batch_sampler import LargeStream
 from src.training.clock import Clock
 from src.training.datamodule import LightFieldData
 from src.training.reconstructor import Reconstructor
 from src.training.teachers import Teachers
 
+STEPS = ("auto", "eager", "graph")
 TRIM_THRESHOLD, MMAP_MAX = -1, -4  # of mallopt, in malloc.h
 
 
@@ -48,6 +52,7 @@ def data(
         raise ValueError(f"data.warmup must be in 0..{most} (windows), got {cfg.data.warmup}")
     pipelines = {split: pipeline(cfg, split, optics) for split in splits}
     train = pipelines.get("train")
+    large = large_stream(cfg, optics) if train else None
     return LightFieldData(
         pipelines,
         part(cfg, "augment") if train else None,
@@ -59,9 +64,17 @@ def data(
         workers=cfg.data.workers,
         simulate_on=cfg.data.simulate_on,
         seed=cfg.seed,
-        filler=Filler(train.bank) if isinstance(train, Banked) else None,
+        filler=_filler(train, large),
+        large=large,
         teachers=teachers(cfg, train.optics.views) if train and cfg.get("teachers") else None,
     )
+
+
+def _filler(train: Pipeline | None, large: LargeStream | None) -> Filler | None:
+    """Return what fills the banks on a disk, the one of few large clips first."""
+    streams = [*([large.pipeline] if large else []), train]
+    banks = [one.bank for one in streams if isinstance(one, Banked) and isinstance(one.bank, Bank)]
+    return Filler(*banks) if banks else None
 
 
 def teachers(cfg: DictConfig, views: int) -> Teachers:
@@ -164,7 +177,21 @@ def reconstructor(cfg: DictConfig, net: nn.Module, spec: dict) -> Reconstructor:
         clip=cfg.clip,
         average=cfg.average,
         clock=Clock(cfg.clock),
+        graphs=_graphs(cfg),
     )
+
+
+def _graphs(cfg: DictConfig) -> bool:
+    """Return whether a step runs as CUDA graphs; raises ValueError for a step that there is not."""
+    if cfg.step not in STEPS:
+        raise ValueError(f"step must be one of {', '.join(STEPS)}, got {cfg.step}")
+    able = cfg.trainer.accelerator != "cpu" and torch.cuda.is_available()
+    if cfg.step == "graph" and (not able or cfg.data.detach_every or cfg.trainer.devices != 1):
+        raise ValueError(
+            "step must be auto or eager without a GPU, on several, or with data.detach_every, "
+            "got graph"
+        )
+    return cfg.step != "eager" and able and not cfg.data.detach_every and cfg.trainer.devices == 1
 
 
 def share_cores(cfg: DictConfig) -> None:

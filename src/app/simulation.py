@@ -1,11 +1,13 @@
 """The simulation that a config asks for: scenes, air, optics and sensor of one split, or a bank."""
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from torch import nn
 
 from src.app.parts import part
@@ -15,8 +17,11 @@ from src.sim.scenes.photographs import MixedRates
 from src.sim.sensor.contract import Sensor
 from src.training.bank import Bank, listing
 from src.training.bank_samples import Banked
+from src.training.batch_sampler import LargeStream
+from src.training.device_cache import DeviceCache
 
 CLIP = ("scene", "turbulence")  # sections that make a clip, whatever sees it
+DEVICE_CACHES: dict[str, DeviceCache] = {}  # those of this process, by all that makes them
 
 
 def light_field(cfg: DictConfig, net: nn.Module) -> Optics:
@@ -45,7 +50,8 @@ def pipeline(cfg: DictConfig, split: str, optics: Optics | None = None) -> Pipel
             _sensor(cfg, _count(cfg, "seed", least=0)),
             windows=_count(cfg, "data.windows"),
             bins=_count(cfg, "bins"),
-            crop=_side(cfg, "data.crop"),
+            crop=_side(cfg, "data.crop", ranges=True),
+            together=_count(cfg, "data.batch_size"),
             independent=cfg.turbulence.get("views_correlation", "independent") == "independent",
             clips=clips,
         )
@@ -59,32 +65,66 @@ def pipeline(cfg: DictConfig, split: str, optics: Optics | None = None) -> Pipel
     )
 
 
-def bank(cfg: DictConfig) -> Bank:
-    """Return the bank of air that `data.bank` asks for, named by all that makes its clips.
+def bank(cfg: DictConfig) -> Bank | DeviceCache:
+    """Return the cache of turbulence that `data.bank` asks for, named by all that makes its clips;
+    in a device's memory it is the same one for all that ask for the same in this process.
 
-    Nine views or fewer come out of one bank: view i depends on the draws of view i only.
+    Nine views or fewer come out of one cache: view i depends on the draws of view i only.
     """
     optics, side = part(cfg, "optics"), _count(cfg, "data.bank_crop")
     if set(optics.positions) <= set(layout(9)):
         optics = replace(optics, views=9, positions=layout(9))
     windows, substeps = _count(cfg, "data.bank_windows"), _count(cfg, "data.substeps")
     source = _simulation(cfg, "train", windows=windows, optics=optics, crop=side, clips=None)
+    gib, where = cfg.data.bank_gib, cfg.data.bank_on
+    if not isinstance(gib, int | float):
+        raise ValueError(f"data.bank_gib must be a number, got {gib}")
+    size = {"clips": _count(cfg, "data.bank"), "frames": windows * substeps + 1, "gib": gib}
+    if where == "disk":
+        return Bank(source, str(cfg.data.bank_root), _made_of(cfg, optics), **size)
+    if where != "device":
+        raise ValueError(f"data.bank_on must be disk or device, got {where}")
+    if cfg.data.workers:
+        raise ValueError(f"data.workers must be 0 for data.bank_on=device, got {cfg.data.workers}")
+    device = "cpu" if cfg.trainer.accelerator == "cpu" else "cuda"
+    name = json.dumps([_made_of(cfg, optics), size, device], sort_keys=True)
+    if name not in DEVICE_CACHES:
+        DEVICE_CACHES[name] = DeviceCache(source, device=device, **size)
+    return DEVICE_CACHES[name]
+
+
+def large_stream(cfg: DictConfig, optics: Optics | None = None) -> LargeStream | None:
+    """Return the second stream of training batches that `data.large` asks for: of this config, its
+    `overrides` changed.  Raises ValueError for overrides that are none.
+    """
+    if not cfg.data.large or not cfg.data.large.share:
+        return None
+    try:
+        changes = OmegaConf.from_dotlist(list(cfg.data.large.overrides))
+        other = OmegaConf.merge(cfg, changes)
+    except (OmegaConfBaseException, TypeError, ValueError) as error:
+        raise ValueError(f"data.large.overrides must be [key=value, ...]: {error}") from error
+    if not other.data.loss_from < other.data.windows:
+        least = f"> data.loss_from, {other.data.loss_from}"
+        raise ValueError(f"data.large: data.windows must be {least}, got {other.data.windows}")
+    size = _count(other, "data.batch_size")
+    return LargeStream(pipeline(other, "train", optics), cfg.data.large.share, size)
+
+
+def _made_of(cfg: DictConfig, optics: Optics) -> dict:
+    """Return all that makes the clips of a cache, as plain data."""
     parts = {name: OmegaConf.to_container(cfg[name], resolve=True) for name in CLIP}
     measured = parts["turbulence"].get("measured")  # a file; what it holds makes the clips
-    made_of = parts | {
+    windows, substeps = cfg.data.bank_windows, cfg.data.substeps
+    return parts | {
         "optics": {"positions": optics.positions, "misalignment_px": optics.misalignment_px},
         "files": listing(parts),
         "measured": Path(measured).read_text() if measured else None,
         "sensor": _light(cfg),
         "seed": cfg.seed,
         "rates": _rates(cfg, True),
-        "frames": {"windows": windows, "substeps": substeps, "crop": side},
+        "frames": {"windows": windows, "substeps": substeps, "crop": cfg.data.bank_crop},
     }
-    gib = cfg.data.bank_gib
-    if not isinstance(gib, int | float):
-        raise ValueError(f"data.bank_gib must be a number, got {gib}")
-    clips, frames = _count(cfg, "data.bank"), windows * substeps + 1
-    return Bank(source, str(cfg.data.bank_root), made_of, clips=clips, frames=frames, gib=gib)
 
 
 def _simulation(
@@ -133,10 +173,14 @@ def _count(cfg: DictConfig, key: str, least: int = 1) -> int:
     return value
 
 
-def _side(cfg: DictConfig, key: str) -> int | float | None:
+def _side(cfg: DictConfig, key: str, ranges: bool = False) -> int | float | Sequence[int] | None:
     value = OmegaConf.select(cfg, key)
     if value is None or type(value) in (int, float):
         return value
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        if ranges:
+            return list(value)
+        raise ValueError(f"{key} may be a range of sides with data.bank only, got {value}")
     raise ValueError(f"{key} must be pixels (128), a share of the frame (0.5) or null, got {value}")
 
 

@@ -13,9 +13,10 @@ and the picture fades to that, so that areas do not change in steps (docs/decisi
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -133,9 +134,9 @@ class SetNet(nn.Module):
         spread = (every - every.mean(1, keepdim=True)).abs().mean(1)
 
         grids, memories, bias = self.kernels(places)
-        stacked = _cast(voxels, grids.dtype).reshape(windows * n, views * bins, *voxels.shape[-2:])
+        stacked = _cast(voxels.flatten(2, 3), grids.dtype)
         stem = functional.conv2d(stacked, grids, None, CELL, grids.shape[-1] // 2)
-        memory = torch.cat([every.flatten(1, 2), spread], 1).to(memories.dtype)
+        memory = _cast(torch.cat([every.flatten(1, 2), spread], 1)[None], memories.dtype)
         stem = _as_rates(stem, seconds) + functional.conv2d(memory, memories, bias, 1, 1)
         seen, hidden = self.fine(stem, passed, hidden)
         around, about = self.looked(seen, about, before, due)
@@ -166,7 +167,8 @@ class SetNet(nn.Module):
         """Return what lies around, float32, in each of m = windows * n and after the last; `about`:
         before the first, `due`: whether one looks, `recent`: how recently one had.
         """
-        if len(seen) == len(about):  # one window, as it is exported: its shapes know no `due`
+        if len(seen) == len(about) or seen.is_cuda:
+            # An export, or a GPU that would wait for it, has shapes that do not depend on `due`.
             now = self.around(seen).float()
         else:  # the windows in which nobody looks do not count
             looks = due.flatten().nonzero().flatten()
@@ -195,7 +197,7 @@ class SetNet(nn.Module):
         device = self.shuffle.bias.device
         if self.frozen is not None and (places, device) in self.frozen:
             return self.frozen[places, device]
-        stood = torch.tensor(places, device=device).float()
+        stood = _on_device(places, device).float()
         memories = torch.cat([self.sum_stem.kernel(stood), self.spread_stem.weight], 1)
         bias = self.voxel_stem.bias + self.sum_stem.bias
         kernels = self.voxel_stem.kernel(stood), memories, bias
@@ -251,13 +253,29 @@ def _leaked(sums: Tensor, keep: Tensor, new: Tensor) -> Tensor:
 
 def _windows(maps: Tensor, n: int, shown: Sequence[int]) -> Tensor:
     """Return those of `maps` (windows * n, ...) that are of the windows `shown`."""
-    return maps.unflatten(0, (-1, n))[list(shown)].flatten(0, 1)
+    chosen = _on_device(tuple(shown), maps.device)
+    return maps.unflatten(0, (-1, n)).index_select(0, chosen).flatten(0, 1)
 
 
-def _cast(x: Tensor, dtype: torch.dtype) -> Tensor:
-    """Return `x` as a convolution takes it under autocast: sooner, it is copied once only."""
+@lru_cache(maxsize=64)
+@torch.inference_mode(False)
+def _on_device(numbers: tuple, device: torch.device) -> Int[Tensor, "..."]:
+    """Return whole numbers as a tensor; kept, as a CUDA graph can copy nothing to the device."""
+    return torch.tensor(numbers, device=device)
+
+
+def _cast(x: Float[Tensor, "windows n c h w"], dtype: torch.dtype) -> Float[Tensor, "m c h w"]:
+    """Return the maps of m = windows * n as a convolution takes them under autocast, channels last:
+    in one copy.
+    """
     kind = x.device.type
-    return x.to(torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else dtype)
+    dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else dtype
+    windows, n, c, h, w = x.shape
+    maps = torch.empty(
+        windows * n, c, h, w, dtype=dtype, device=x.device, memory_format=torch.channels_last
+    )
+    maps.unflatten(0, (windows, n)).copy_(x)
+    return maps
 
 
 def _as_rates(counted: Tensor, seconds: Tensor) -> Tensor:

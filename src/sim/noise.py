@@ -40,13 +40,20 @@ def bits(key: int | Int[Tensor, "..."], counters: Int[Tensor, "..."]) -> Int[Ten
     Keys that are a tensor are broadcast with the counters.
     """
     low, high = key & MASK, (key >> 32) & MASK
-    mixed = _mix((counters & MASK) ^ low)
-    return _mix((mixed + (counters >> 32) * 0x9E3779B9 + high) & MASK)
+    mixed = _mixed((counters & MASK) ^ low)
+    return _mixed((mixed + (counters >> 32) * 0x9E3779B9 + high) & MASK)
 
 
 def uniform(key: int | Int[Tensor, "..."], counters: Int[Tensor, "..."]) -> Float[Tensor, "..."]:
     """Return float32 uniforms in the open interval (0, 1), from the upper 23 bits."""
     return ((bits(key, counters) >> 9).to(torch.float32) + 0.5) * 2.0**-23
+
+
+def uniforms(key: int, count: int) -> list[float]:
+    """Return `uniform(key, torch.arange(count))` as numbers: a hundredth of the time for a few."""
+    low, high = key & MASK, (key >> 32) & MASK
+    drawn = (_mixed(_mixed(counter ^ low) + high & MASK) for counter in range(count))
+    return [((word >> 9) + 0.5) * 2.0**-23 for word in drawn]
 
 
 def normal(key: int, counters: Int[Tensor, "..."]) -> Float[Tensor, "..."]:
@@ -55,7 +62,7 @@ def normal(key: int, counters: Int[Tensor, "..."]) -> Float[Tensor, "..."]:
     return radius * torch.cos(2.0 * math.pi * uniform(key, 2 * counters + 1))
 
 
-def _mix(x: Tensor) -> Tensor:
+def _mixed(x: Tensor | int) -> Tensor | int:
     x = x ^ (x >> 16)
     x = (x * 0x7FEB352D) & MASK
     x = x ^ (x >> 15)

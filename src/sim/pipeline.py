@@ -2,9 +2,10 @@
 
 Only this file knows them all.
 A sample is made in two steps.  `draw` fixes everything random about a clip from keys; it is cheap.
-`simulate` is deterministic and runs where it is told to, one clip at a time so that memory stays
-that of one clip.  A sample is a function of (configuration, number): not of the batch, the
-workers or the device, and view i depends on the draws of view i only.
+`simulate` is deterministic and runs where it is told to: on the CPU one clip at a time, so that
+memory stays that of one clip, on a GPU a batch in one call of the sensor.  A sample is a function
+of (configuration, number): not of the batch, the workers or the device, and view i depends on the
+draws of view i only.
 """
 
 import time
@@ -14,11 +15,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from src.sim import noise
 from src.sim.optics import Optics, Position
 from src.sim.scenes.photographs import Clip
+from src.sim.sensor import batch
+from src.sim.sensor.engines.run import zeros
 from src.sim.sensor.response import encode_srgb
 from src.sim.sensor.sensor import EventSensor, decode_srgb
 from src.sim.turbulence.model import Air, Crop, TurbulenceModel
@@ -118,50 +122,90 @@ class Pipeline:
         air = self.turbulence.draw(noise.generator(noise.key(key, "atmosphere")))
         return Draw(clip, crop, air, self.sensor.draw(key), key, number)
 
-    def simulate(self, draws: Sequence[Draw], device: torch.device | str = "cpu") -> Sample:
-        """Simulate the drawn clips on `device`."""
+    def simulate(
+        self,
+        draws: Sequence[Draw],
+        device: torch.device | str = "cpu",
+        *,
+        at_once: bool | None = None,
+    ) -> Sample:
+        """Simulate the drawn clips, of one size, on `device`.
+
+        `at_once`: all of them in one call of the sensor, else one after the other, which gives the
+        same and needs the memory of one clip's views; None: on all devices but the CPU.  Raises
+        ValueError for clips of several sizes.
+        """
         start = time.perf_counter()
-        sample = joined([self.sample(draw, device) for draw in draws])
-        return replace(sample, seconds=time.perf_counter() - start)
+        sizes = sorted({(len(draw.clip.frames), *draw.crop[2:]) for draw in draws})
+        if len(sizes) != 1:
+            raise ValueError(f"a batch must be of one size (frames, h, w), got {sizes}")
+        if at_once is None:
+            at_once = torch.device(device).type != "cpu"
+        parts = [draws] if at_once else [[draw] for draw in draws]
+        (frames, *size), views = sizes[0], self.optics.views
+        shape = (len(draws), (frames - 1) // self.substeps, views, self.bins, *size)
+        voxels = zeros(shape, torch.device(device))
+        samples = [
+            self.expose(part, self.batch_views(part, device), out)
+            for part, out in zip(parts, voxels.split(len(parts[0])), strict=True)
+        ]
+        return replace(joined(samples, voxels), seconds=time.perf_counter() - start)
 
     def sample(self, draw: Draw, device: torch.device | str = "cpu") -> Sample:
         """Simulate one drawn clip on `device`."""
-        return self.expose(draw, self.views(draw, device))
+        return self.expose([draw], self.batch_views([draw], device))
 
-    def expose(self, draw: Draw, views: Tensor) -> Sample:
-        """Return the sample of one clip whose `views` (1, views, frames, h, w) are those drawn."""
-        top, left, height, width = draw.crop
-        clean = draw.clip.frames.to(views.device)[None]
-        target = clean[:, self.substeps :: self.substeps, top : top + height, left : left + width]
-        voxels = draw.sensor.voxels(
+    def expose(
+        self,
+        draws: Sequence[Draw],
+        views: Float[Tensor, "n views frames h w"],
+        out: Float[Tensor, "n windows views bins h w"] | None = None,
+    ) -> Sample:
+        """Return the sample of the clips whose `views`, float32 or float16, are those drawn; its
+        voxel grids are in `out`, if given, which must hold zeros.
+        """
+        step, crops = self.substeps, [draw.crop for draw in draws]
+        clean = [
+            draw.clip.frames[step::step, top : top + height, left : left + width]
+            for draw, (top, left, height, width) in zip(draws, crops, strict=True)
+        ]
+        voxels = batch.voxels(
+            [draw.sensor for draw in draws],
             views,
-            draw.clip.fps,
+            [draw.clip.fps for draw in draws],
             self.bins,
-            substeps=self.substeps,
-            clips=[draw.key],
+            substeps=step,
+            clips=[draw.key for draw in draws],
             views=self.optics.view_ids,
-            origin=(top, left),
-            full_width=clean.shape[-1],
-            threshold=torch.tensor([draw.threshold]),
+            origins=[crop[:2] for crop in crops],
+            full_widths=[draw.clip.frames.shape[-1] for draw in draws],
+            thresholds=torch.tensor([draw.threshold for draw in draws]).tolist(),  # float32's
+            out=out,
         )
-        drawn = {"clip": draw.number, "name": draw.clip.name, "threshold": draw.threshold}
-        drawn |= {name: getattr(draw.sensor, name) for name in self.sensor.drawn}
-        drawn |= self.record(draw)
-        turbulent = views[:, self.optics.centre, self.substeps :: self.substeps]
+        turbulent = views[:, self.optics.centre, step::step].float()
         turbulent = encode_srgb(turbulent) if self.decode else turbulent
         return Sample(
-            voxels=voxels.transpose(1, 2),
-            target=target[:, :, None],
+            voxels=voxels,
+            target=torch.stack(clean).to(views.device)[:, :, None],
             turbulent=turbulent[:, :, None],
-            window_s=torch.tensor([self.substeps / draw.clip.fps]),
+            window_s=torch.tensor([step / draw.clip.fps for draw in draws]),
             positions=self.optics.positions,
-            drawn=[drawn],
+            drawn=[self._drawn(draw) for draw in draws],
         )
+
+    def batch_views(
+        self, draws: Sequence[Draw], device: torch.device | str = "cpu"
+    ) -> Float[Tensor, "n views frames h w"]:
+        """Return the `views` of several clips of one size."""
+        views = [self.views(draw, device) for draw in draws]
+        return views[0] if len(views) == 1 else torch.cat(views)
 
     def views(self, draw: Draw, device: torch.device | str = "cpu") -> Tensor:
         """Return what every view's optics put on the sensor, (1, views, frames, h, w), light."""
         clean = draw.clip.frames.to(device)[None]
         radiance = decode_srgb(clean) if self.decode else clean
+        if draw.clip.lamp is not None:  # it changes the light, not the ground truth
+            radiance = radiance * draw.clip.lamp.to(device)
         views = self.operator(draw).degrade(radiance, self.drawer(draw), crop=draw.crop)
         size = tuple(clean.shape[-2:])
         return self.optics.misalign(views, draw.key, origin=draw.crop[:2], full_size=size)
@@ -185,6 +229,11 @@ class Pipeline:
         """Return the generator that the turbulence of a clip draws from."""
         return noise.generator(noise.key(draw.key, "turbulence"))
 
+    def _drawn(self, draw: Draw) -> dict:
+        drawn = {"clip": draw.number, "name": draw.clip.name, "threshold": draw.threshold}
+        drawn |= {name: getattr(draw.sensor, name) for name in self.sensor.drawn}
+        return drawn | self.record(draw)
+
     def _crop(self, size: Sequence[int], key: int) -> Crop:
         height, width = size
         if self.crop is None:
@@ -198,15 +247,19 @@ class Pipeline:
             )
         if not self.random_crop:
             return (height - side) // 2, (width - side) // 2, side, side
-        top, left = noise.uniform(key, torch.arange(2)).tolist()
+        top, left = noise.uniforms(key, 2)
         return int(top * (height - side + 1)), int(left * (width - side + 1)), side, side
 
 
-def joined(samples: Sequence[Sample]) -> Sample:
-    """Return the batch of `samples`, which are of one size, in the same order."""
+def joined(samples: Sequence[Sample], voxels: Tensor | None = None) -> Sample:
+    """Return the batch of `samples`, which are of one size, in the same order; `voxels`: theirs, if
+    they lie in one tensor already.
+    """
     first = samples[0]
+    if voxels is None:
+        voxels = together([sample.voxels for sample in samples])
     return Sample(
-        voxels=together([sample.voxels for sample in samples]),
+        voxels=voxels,
         target=torch.cat([sample.target for sample in samples]),
         turbulent=torch.cat([sample.turbulent for sample in samples]),
         window_s=torch.cat([sample.window_s for sample in samples]),

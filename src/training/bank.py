@@ -25,8 +25,8 @@ import src.sim
 from src.models.checkpoints import WholeFiles, whole
 from src.records.atomic import write_text
 from src.sim.pipeline import Pipeline
+from src.training.device_cache import GIB, simulated
 
-GIB = 2**30
 FACTS = 4096  # bytes of a file beside its pictures, at most
 MADE_OF = "made_of.json"
 NOTE = 1 << 40  # the byte of the lock file that is locked while MADE_OF is written
@@ -87,14 +87,8 @@ class Bank:
 
     def make(self, index: int, device: torch.device | str = "cpu") -> dict:
         """Simulate clip `index` on `device` and store it; a disk that is full is a warning."""
-        draw = self.source.draw(index)
-        top, left, height, width = draw.crop
-        clean = draw.clip.frames[:, top : top + height, left : left + width]
-        facts = {"name": draw.clip.name, "fps": draw.clip.fps, "record": self.source.record(draw)}
-        facts["air"] = repr(draw.air)
-        views = self.source.views(draw, device)[0].half().cpu()
-        clip = {"views": views.contiguous(), "clean": clean.half().contiguous()}
-        clip["facts"] = json.dumps(facts)
+        views, clean, facts = simulated(self.source, index, device)
+        clip = {"views": views.cpu().contiguous(), "clean": clean, "facts": json.dumps(facts)}
         try:
             WholeFiles().save_checkpoint(clip, self.path(index))
         except (OSError, RuntimeError) as error:  # PyTorch's writer has an error of its own
@@ -185,20 +179,21 @@ def simulation() -> str:
 
 
 def listing(node: Any) -> str:
-    """Return a hash of the files below every `root` in a config, by name and size."""
+    """Return a hash of the files below every root in a config, by name and size."""
     digest = hashlib.sha256()
     for root in _roots(node):
-        files = sorted(path for path in Path(root).rglob("*") if path.is_file())
+        paths = [Path(root), *Path(root).rglob("*")]  # a pack of photographs is a file itself
+        files = sorted(path for path in paths if path.is_file())
         names = [f"{path.relative_to(root)}:{path.stat().st_size}" for path in files]
         digest.update(json.dumps(names).encode())
     return digest.hexdigest()[:12]
 
 
 def _roots(node: Any) -> Iterator[str]:
-    """Yield the values of every key `root` in plain dicts and lists, None left out."""
+    """Yield the values of every key `root` or `train_root` in plain dicts and lists, but None."""
     if isinstance(node, dict):
         for key, value in node.items():
-            if key == "root":
+            if key in ("root", "train_root"):
                 yield from [value] if isinstance(value, str) else value or []
             else:
                 yield from _roots(value)

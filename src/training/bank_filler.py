@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 
@@ -16,20 +16,24 @@ PATIENCE = 2.0  # seconds between two looks at whether another process still fil
 
 
 class Filler:
-    """A process of lowest priority that makes the clips a bank lacks, in their order.
+    """A process of lowest priority that makes the clips that banks lack, one bank after the other.
 
     Of all trainings that share a bank one fills it; when it ends, another goes on.  It ends with
-    the bank full, with `stop`, and with the process that started it, whatever became of that.
+    the banks full, with `stop`, and with the process that started it, whatever became of that.
     """
 
-    def __init__(self, bank: Bank):
-        self.bank, self.process = bank, None
+    def __init__(self, *banks: Bank):
+        self.banks, self.process = banks, None
+
+    def status(self) -> str:
+        """Return a line for each bank."""
+        return "\n".join(bank.status() for bank in self.banks)
 
     def start(self) -> None:
         """Start filling, where there is something to fill."""
-        if self.bank.missing():
+        if any(bank.missing() for bank in self.banks):
             spawn = multiprocessing.get_context("spawn")  # a fork would take locks of threads along
-            arguments = (self.bank, os.getpid())
+            arguments = (self.banks, os.getpid())
             self.process = spawn.Process(target=_in_background, args=arguments, daemon=True)
             self.process.start()
 
@@ -60,7 +64,7 @@ def fill(
                     raise OSError(f"the bank in {bank.folder} cannot be filled")
 
 
-def _in_background(bank: Bank, parent: int) -> None:
+def _in_background(banks: Sequence[Bank], parent: int) -> None:
     os.nice(19)
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
@@ -68,13 +72,14 @@ def _in_background(bank: Bank, parent: int) -> None:
     def going() -> bool:
         return os.getppid() == parent
 
-    with (bank.folder / "filler.lock").open("ab") as file:
-        while going() and not _locked(file):
-            time.sleep(PATIENCE)
-        try:
-            fill(bank, going)
-        except (OSError, ValueError) as error:  # the training goes on, and meets it if it must
-            print(f"filling stops: {error}", file=sys.stderr)
+    for bank in banks:
+        with (bank.folder / "filler.lock").open("ab") as file:
+            while going() and not _locked(file):
+                time.sleep(PATIENCE)
+            try:
+                fill(bank, going)
+            except (OSError, ValueError) as error:  # the training goes on, and meets it if it must
+                print(f"filling stops: {error}", file=sys.stderr)
 
 
 def _locked(file) -> bool:

@@ -2,16 +2,17 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import torch
 from lightning import LightningDataModule
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader
 
 from src.sim import noise
 from src.sim.pipeline import Draw, Pipeline, Sample, joined
 from src.training.augment import Augment
 from src.training.bank_filler import Filler
+from src.training.batch_sampler import Item, LargeStream, Numbered, StepSampler
 from src.training.teachers import Teachers
 
 
@@ -23,8 +24,9 @@ class LightFieldData(LightningDataModule):
     simulation with at most one worker.
     `workers`: processes that simulate beside the training; 0 simulates in the training process.
     `simulate_on`: `worker` (CPU) or `device` (the training device, for GPUs).
-    `filler`: fills the bank of air in the background of a training, where there is one.
+    `filler`: fills the banks of air in the background of a training, where there are some.
     `teachers`: what they make of the training clips is a part of these.
+    `large`: a second stream of training batches, of larger pictures, spread evenly among the first.
     """
 
     def __init__(
@@ -42,6 +44,7 @@ class LightFieldData(LightningDataModule):
         seed: int = 0,
         filler: Filler | None = None,
         teachers: Teachers | None = None,
+        large: LargeStream | None = None,
     ):
         super().__init__()
         if simulate_on not in ("worker", "device"):
@@ -53,7 +56,7 @@ class LightFieldData(LightningDataModule):
         if epoch_clips < batch_size:
             raise ValueError(f"data.epoch_clips must be >= data.batch_size, got {epoch_clips}")
         self.pipelines, self.augment, self.seed = pipelines, augment, seed
-        self.filler, self.teachers = filler, teachers
+        self.filler, self.teachers, self.large = filler, teachers, large
         self.batch_size, self.reuse, self.epoch_clips = batch_size, reuse, epoch_clips
         self.val_clips, self.test_clips = val_clips, test_clips
         self.workers, self.simulate_on = workers, simulate_on
@@ -62,7 +65,7 @@ class LightFieldData(LightningDataModule):
     def setup(self, stage: str) -> None:
         """Start filling the bank; one process of each machine does."""
         if stage == "fit" and self.filler is not None and self.trainer.local_rank == 0:
-            self.trainer.print(self.filler.bank.status())
+            self.trainer.print(self.filler.status())
             self.filler.start()
 
     def teardown(self, stage: str) -> None:
@@ -80,16 +83,17 @@ class LightFieldData(LightningDataModule):
             reuse=self.reuse,
             rank=trainer.global_rank,
             world=trainer.world_size,
+            large=(self.large.share, self.large.batch_size) if self.large else (0.0, 1),
         )
         return self._loader("train", batch_sampler=sampler)
 
     def val_dataloader(self) -> DataLoader:
         """Return clips 0 .. val_clips - 1 of the validation split, one at a time."""
-        return self._loader("val", sampler=[(clip, clip) for clip in range(self.val_clips)])
+        return self._loader("val", sampler=[Item(clip, clip) for clip in range(self.val_clips)])
 
     def test_dataloader(self) -> DataLoader:
         """Return clips 0 .. test_clips - 1 of the test split, one at a time."""
-        return self._loader("test", sampler=[(clip, clip) for clip in range(self.test_clips)])
+        return self._loader("test", sampler=[Item(clip, clip) for clip in range(self.test_clips)])
 
     def validation_samples(self) -> Iterator[Sample]:
         """Yield the validation clips on the training device; a training need not be interrupted."""
@@ -111,7 +115,7 @@ class LightFieldData(LightningDataModule):
     def _loader(self, split: str, **sampling) -> DataLoader:
         on_worker = self.simulate_on == "worker"
         return DataLoader(
-            Numbered(self.pipelines[split]),
+            Numbered(*self._streams(split)),
             num_workers=self.workers,
             collate_fn=self._simulator(split, "cpu") if on_worker else list,
             worker_init_fn=_one_thread,
@@ -127,88 +131,56 @@ class LightFieldData(LightningDataModule):
 
     def _simulator(self, split: str, device) -> Callable[[Sequence], Sample]:
         training = (self.augment, self.teachers) if split == "train" else (None, None)
-        return Simulator(self.pipelines[split], *training, seed=self.seed, device=device)
+        return Simulator(self._streams(split), *training, seed=self.seed, device=device)
+
+    def _streams(self, split: str) -> list[Pipeline]:
+        large = [self.large.pipeline] if self.large and split == "train" else []
+        return [self.pipelines[split], *large]
 
 
 class Simulator:
-    """Turns numbered draws into a batch; picklable, so that a worker can be given one.
+    """Turns numbered draws of a stream into a batch; picklable, so that a worker can be given one.
 
-    The last simulation is kept: the same draws again are only augmented again.
+    On a GPU all clips go through the simulation at once, on a CPU one after the other, so that
+    memory stays that of one clip.  The last simulation is kept: the same draws again are only
+    augmented again.
     """
 
     def __init__(
         self,
-        pipeline: Pipeline,
+        streams: Sequence[Pipeline],
         augment: Augment | None = None,
         teachers: Teachers | None = None,
         *,
         seed: int = 0,
         device: torch.device | str = "cpu",
     ):
-        self.pipeline, self.augment, self.teachers = pipeline, augment, teachers
-        self.seed, self.device = seed, device
+        self.streams, self.augment, self.teachers = streams, augment, teachers
+        self.seed, self.device = seed, torch.device(device)
         self.last: tuple[list, list[Sample]] = ([], [])
 
-    def __call__(self, numbered: Sequence[tuple[int, Draw]]) -> Sample:
+    def __call__(self, numbered: Sequence[tuple[Item, Draw]]) -> Sample:
         start = time.perf_counter()
-        draws = [draw for _, draw in numbered]
-        names = [(draw.key, draw.crop) for draw in draws]
+        items, draws = zip(*numbered, strict=True)
+        names = [(item.stream, draw.key, draw.crop) for item, draw in numbered]
         if self.last[0] != names:
-            self.last = (names, list(map(self._made, draws, names)))
+            self.last = (names, self._made(self.streams[items[0].stream], draws, names))
         samples = self.last[1]
         if self.augment is None:
             sample = joined(samples)
         else:
-            keys = [noise.key(self.seed, "augment", number) for number, _ in numbered]
+            keys = [noise.key(self.seed, "augment", *item.counted) for item in items]
             sample = self.augment(samples, keys)
         return replace(sample, seconds=time.perf_counter() - start)
 
-    def _made(self, draw: Draw, name: tuple) -> Sample:
-        sample = self.pipeline.sample(draw, self.device)
+    def _made(self, pipeline: Pipeline, draws: Sequence[Draw], names: list) -> list[Sample]:
+        if self.device.type != "cpu" and self.teachers is None:
+            return [pipeline.simulate(draws, self.device)]
+        samples = [pipeline.sample(draw, self.device) for draw in draws]
         if self.teachers is None:
-            return sample
-        return replace(sample, taught=self.teachers(sample, name))
-
-
-class Numbered(Dataset):
-    """The draws of a pipeline: (clip, number) to (number, draw of the clip)."""
-
-    def __init__(self, pipeline: Pipeline):
-        self.pipeline = pipeline
-
-    def __getitem__(self, item: tuple[int, int]) -> tuple[int, Draw]:
-        clip, number = item
-        return number, self.pipeline.draw(clip)
-
-
-@dataclass(eq=False)
-class StepSampler(Sampler[list[tuple[int, int]]]):
-    """The batch of step s: pairs (clip, number), numbers s * size .. (s + 1) * size - 1.
-
-    The clips are those of step s // reuse * reuse.  Starts at the step reached; an epoch ends when
-    the step is a multiple of `steps_per_epoch`.  With several processes each takes its own slice of
-    the joint batch, so that no two simulate the same clip.
-    """
-
-    batch_size: int
-    steps_per_epoch: int
-    step: Callable[[], int]
-    reuse: int = field(default=1, kw_only=True)
-    rank: int = field(default=0, kw_only=True)
-    world: int = field(default=1, kw_only=True)
-
-    def __len__(self) -> int:
-        return self.steps_per_epoch
-
-    def __iter__(self) -> Iterator[list[tuple[int, int]]]:
-        first = self.step()
-        for step in range(first, (first // self.steps_per_epoch + 1) * self.steps_per_epoch):
-            clips = self._numbers(step // self.reuse * self.reuse)
-            yield list(zip(clips, self._numbers(step), strict=True))
-
-    def _numbers(self, step: int) -> range:
-        start = (step * self.world + self.rank) * self.batch_size
-        return range(start, start + self.batch_size)
+            return samples
+        pairs = zip(samples, names, strict=True)
+        return [replace(sample, taught=self.teachers(sample, name)) for sample, name in pairs]
 
 
 def _one_thread(worker: int) -> None:

@@ -15,13 +15,16 @@ from src.metrics.scores import Scores
 from src.models.unroll import chunks, detach, takes, unroll, video, within
 from src.training.average import copy_of, follow
 from src.training.clock import Clock
+from src.training.graphed import GraphedUnroll
 from src.training.guard import Guard, NotFinite
 from src.training.steadiness import flicker, unrest
+from src.training.step_time import StageClock
 
 if TYPE_CHECKING:  # a network knows nothing of the simulation; a sample is read, never made
     from src.sim.pipeline import Sample
 
-PICTURES = 32  # whose losses are computed at a time
+PICTURES = {"cpu": 32, "cuda": 256}  # whose losses are computed at a time
+SETS = 4  # of windows that the loss sees, where each has a CUDA graph
 
 
 class Reconstructor(LightningModule):
@@ -44,6 +47,8 @@ class Reconstructor(LightningModule):
     shipped (average.py); None: none.  `clock` counts the time of training.
     `spike`: a loss so many times the median of the last hundred moves the weights no more than that
     median would (Guard); None: off.
+    `graphs`: on a GPU a sequence is unrolled as CUDA graphs (graphed.py), and `loss_pairs` are out
+    of SETS sets only, a graph for each.
     `scores` measures frames against targets; the first `warmup` windows of a clip are not scored.
     """
 
@@ -67,6 +72,7 @@ class Reconstructor(LightningModule):
         clip: float | None = None,
         average: float | None = None,
         clock: Clock | None = None,
+        graphs: bool = False,
     ):
         super().__init__()
         if detach_every < 0:
@@ -86,7 +92,8 @@ class Reconstructor(LightningModule):
         self.detach_every, self.warmup, self.guard = detach_every, warmup, Guard(spike)
         self.loss_from, self.loss_pairs = loss_from, loss_pairs
         self.steady, self.calm, self.teach, self.clip = steady, calm, teach, clip
-        self.clock = clock or Clock()
+        self.clock, self.stages = clock or Clock(), StageClock()
+        self.graphs = GraphedUnroll(network) if graphs and not detach_every else None
         self.windows_seen, self.steps_before, self.rates = 0, 0, []
         # In a tuple, so that their backbones stay out of the parameters and the checkpoint.
         self._measures = (loss, scores)
@@ -140,29 +147,41 @@ class Reconstructor(LightningModule):
         """
         windows = sample.voxels.shape[1]
         chosen = self._chosen(windows)
+        self.stages.start()
         state, total = None, torch.zeros((), device=self.device)
         self.optimizers().zero_grad()
         for part in chunks(windows, self.detach_every):
             shown = within(chosen, part)  # of the others nothing is learned but to fill the state
-            # One normalised weight per chunk: spectral norm iterates once, not once per window.
-            with parametrize.cached(), torch.set_grad_enabled(bool(shown)):
-                frames, state = self.unrolled(sample, part, detach(state), shown or [0])
+            frames, state = self._forward(sample, part, state, shown)
+            self.stages.mark("forward")
             if shown:
                 share = len(shown) / len(chosen)
                 total += self._backward(frames, self._goals(sample, part, shown), shown, share)
         total = self.all_gather(total).mean()
         self._protect(total, sample.drawn)
         self._step()
+        self.stages.mark("optimiser")
         self.windows_seen += windows * len(sample.voxels) * self.trainer.world_size
         self.log("train/loss", total, prog_bar=True, batch_size=len(sample.voxels))
         self.clock.lap()
         return total
 
+    def _forward(
+        self, sample: "Sample", part: slice, state: Any, shown: list[int]
+    ) -> tuple[Tensor, Any]:
+        """Return the frames of the windows `shown` of a `part`, and the state after it."""
+        if self.graphs is not None and sample.voxels.is_cuda:
+            return self.graphs(sample.voxels, sample.window_s, sample.positions, shown), None
+        # One normalised weight per chunk: spectral norm iterates once, not once per window.
+        with parametrize.cached(), torch.set_grad_enabled(bool(shown)):
+            return self.unrolled(sample, part, detach(state), shown or [0])
+
     def _chosen(self, windows: int) -> list[int]:
         """Return the windows that the loss sees, ascending."""
         if self.loss_pairs is None:
             return list(range(self.loss_from, windows))
-        drawer = torch.Generator().manual_seed(self.global_step)
+        drawn = self.global_step if self.graphs is None else self.global_step % SETS
+        drawer = torch.Generator().manual_seed(drawn)
         ends = [
             self.loss_from + part * (windows - self.loss_from) // self.loss_pairs
             for part in range(self.loss_pairs + 1)
@@ -208,8 +227,9 @@ class Reconstructor(LightningModule):
         """
         pictures = frames.flatten(0, 1)
         leaves, total = pictures.detach().requires_grad_(), torch.zeros((), device=self.device)
+        count = PICTURES["cuda" if pictures.is_cuda else "cpu"]
         for goal, loss in goals:
-            pairs = zip(leaves.split(PICTURES), goal.flatten(0, 1).split(PICTURES), strict=True)
+            pairs = zip(leaves.split(count), goal.flatten(0, 1).split(count), strict=True)
             for ours, truth in pairs:
                 part = loss(ours, truth).sum() * (share / len(pictures))
                 part.backward()
@@ -221,7 +241,9 @@ class Reconstructor(LightningModule):
             change = share * sum(weight * of(*seen) for weight, of in asked)
             change.backward()
             total += change.detach()
+        self.stages.mark("loss")
         self.manual_backward(pictures, leaves.grad)
+        self.stages.mark("backward")
         return total
 
     def _protect(self, loss: Tensor, drawn: list[dict]) -> None:

@@ -22,10 +22,10 @@ def poisoned(monkeypatch, clip: int, value: float) -> None:
     """Make the simulation of one training clip return `value` somewhere."""
     exposed = Pipeline.expose
 
-    def spoil(self, draw, views):
-        sample = exposed(self, draw, views)
-        if self.split == "train" and draw.number == clip:
-            sample.voxels[0, 0, 0, 0, 0, 0] = value
+    def spoil(self, draws, *args):
+        sample = exposed(self, draws, *args)
+        if self.split == "train":
+            sample.voxels[[draw.number == clip for draw in draws], 0, 0, 0, 0, 0] = value
         return sample
 
     monkeypatch.setattr(Pipeline, "expose", spoil)

@@ -94,7 +94,7 @@ READERS = {
     "cap.txt": "src.recordings.files.formats.read_events",
     "cap.h5": "src.recordings.files.formats.read_events",
     "views.yaml": "src.recordings.views.load",
-    "photo.png": "src.sim.scenes.photographs._read",
+    "photo.png": "src.sim.scenes.photo_files.read",
     "net.ckpt": "src.models.files.load",
     "net.safetensors": "src.models.files.load",
     "old.pth": "baselines.pickles.read",

@@ -46,3 +46,9 @@ def test_keys_give_independent_numbers():
     count = 100_000
     a, b = (noise.normal(noise.key("view", view), torch.arange(count)) for view in (1, 2))
     assert abs(float((a * b).mean())) < 5 / math.sqrt(count)
+
+
+def test_a_few_numbers_are_the_tensor_s():
+    for key in (noise.key("a"), noise.key("b", 3), 0):
+        assert noise.uniforms(key, 40) == noise.uniform(key, torch.arange(40)).tolist()
+    assert noise.uniforms(1, 0) == []

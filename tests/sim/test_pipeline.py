@@ -1,6 +1,7 @@
 """The laws of the whole chain (numbers as in docs/conventions.md)."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -71,6 +72,57 @@ def test_law_3_a_sample_does_not_depend_on_its_batch():
     assert together.drawn[0]["threshold"] != together.drawn[1]["threshold"]
 
 
+class MixedRates(Waves):
+    """Clips of 60 to 180 frames a second."""
+
+    def clip(self, index: int) -> Clip:
+        return replace(super().clip(index), fps=60.0 + 40 * (index % 4))
+
+
+DRAWN = {
+    "threshold": [0.1, 0.4],
+    "drawn": {
+        "off_ratio": [0.7, 1.5], "refractory_s": [0.0005, 0.02], "mismatch": [0.0, 0.2],
+        "shot_hz": [0.0, 20.0], "leak_hz": [0.0, 2.0], "hot_fraction": [0.0, 0.1],
+        "hot_hz": [1.0, 50.0], "cutoff_hz": [20.0, 200.0], "residual": [0.05, 1.0],
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("source", ["linear", "srgb"])
+def test_law_3_a_batch_at_once_is_its_clips_one_by_one(source):
+    """Rates, crops and all that is drawn of a sensor differ from clip to clip."""
+    chain = pipeline(
+        STRONG, DRAWN | {"input": source}, Optics(3), MixedRates(frames=6), crop=16,
+        random_crop=True, substeps=2,
+    )  # fmt: skip
+    draws = [chain.draw(number) for number in (4, 9, 2)]
+    whole, parts = (chain.simulate(draws, at_once=at_once) for at_once in (True, False))
+    alone = [chain.sample(draw) for draw in draws]
+    for name in ("voxels", "target", "turbulent", "window_s"):
+        theirs = torch.cat([getattr(sample, name) for sample in alone])
+        assert torch.equal(getattr(whole, name), theirs), name
+        assert torch.equal(getattr(parts, name), theirs), name
+    assert whole.drawn == parts.drawn == [sample.drawn[0] for sample in alone]
+    assert whole.voxels.is_contiguous() and whole.voxels.flatten(1).any(1).all()
+    assert len(set(whole.window_s.tolist())) == 3
+
+
+def test_views_in_float16_are_taken_as_if_they_had_been_widened():
+    chain = pipeline(STRONG, DRAWN | {"input": "srgb"})
+    draws = [chain.draw(number) for number in (4, 9)]
+    views = chain.batch_views(draws).half()
+    ours, theirs = (chain.expose(draws, seen) for seen in (views, views.float()))
+    for name in ("voxels", "target", "turbulent"):
+        assert torch.equal(getattr(ours, name), getattr(theirs, name)), name
+
+
+def test_a_batch_of_several_sizes_is_refused():
+    draws = [pipeline(crop=crop).draw(0) for crop in (16, 24)]
+    with pytest.raises(ValueError, match=r"one size .*got \[\(5, 16, 16\), \(5, 24, 24\)\]"):
+        pipeline().simulate(draws)
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_cuda_gives_the_same_sample():
@@ -87,7 +139,7 @@ def test_light_that_differs_by_rounding_moves_few_events():
     draw = chain.draw(5)
     views = chain.views(draw)
     rounding = 1e-5 * (2 * torch.rand(views.shape, generator=torch.Generator().manual_seed(0)) - 1)
-    ours, theirs = chain.expose(draw, views), chain.expose(draw, views + rounding)
+    ours, theirs = (chain.expose([draw], seen) for seen in (views, views + rounding))
     assert 0 < moved(ours.voxels, theirs.voxels) < 0.001
 
 
@@ -143,3 +195,30 @@ def test_a_crop_that_does_not_fit_names_its_key(crop):
 def test_turbulent_frames_are_code_values_as_the_target(source):
     sample = simulate(pipeline(sensor=IDEAL | {"input": source}), [0])
     torch.testing.assert_close(sample.turbulent, sample.target)
+
+
+class Lamplit(Waves):
+    """The waves under a lamp that dims by 40 % every second frame; in the left half if `half`."""
+
+    def __init__(self, half: bool, **kwargs):
+        super().__init__(**kwargs)
+        self.half = half
+
+    def clip(self, index: int) -> Clip:
+        lamp = torch.ones(self.frames, 1, self.side if self.half else 1)
+        lamp[1::2, :, : self.side // 2] = 0.6
+        return replace(super().clip(index), lamp=lamp)
+
+
+@pytest.mark.parametrize("half", [False, True])
+@pytest.mark.parametrize("crop", [None, 24])
+def test_a_lamp_flickers_in_the_light_and_not_in_the_truth(half, crop):
+    plain = simulate(pipeline(scene=Waves(contrast=0.05), crop=crop), [2])
+    lit = simulate(pipeline(scene=Lamplit(half, contrast=0.05), crop=crop), [2])
+    assert torch.equal(plain.target, lit.target)
+    dimmed = lit.turbulent / plain.turbulent
+    side = dimmed.shape[-1] // 2 if half else dimmed.shape[-1]
+    assert torch.allclose(dimmed[:, ::2, ..., :side], torch.tensor(0.6))
+    assert torch.allclose(dimmed[:, 1::2], torch.tensor(1.0))
+    assert torch.equal(lit.voxels[..., side:], plain.voxels[..., side:])
+    assert (lit.voxels[:, 0, ..., :side].sum(2) <= -1).all()  # 0.51 nat down, a threshold of 0.2

@@ -6,20 +6,17 @@ import pytest
 import torch
 
 from src.sim.optics import layout
-from src.sim.pipeline import Sample
+from src.sim.pipeline import Sample, joined
 from src.training.augment import (
     Augment,
-    fire,
     flip_axes,
-    hot_pixels,
-    misplace,
-    normals,
+    misplacements,
     pause_chain,
-    show,
-    turned,
     turned_views,
     views_kept,
 )
+from src.training.rearrange import misplace, turned
+from src.training.voxel_noise import fire, hot_pixels, normals
 
 OFF = {"noise_std": 0.0, "hot_fraction": 0.0, "pause": 0.0, "flip": 0.0}
 
@@ -172,9 +169,9 @@ def test_small_crops_have_a_hot_pixel_as_often_as_their_part_of_one_is_large():
 
 
 def test_small_crops_have_a_firing_pixel_as_often_too():
-    voxels = torch.zeros(2, 1000, 1, 64, 64)  # each view draws its own
-    fire(voxels, 1e-4, (1000.0, 1000.0), 0)
-    counts = (voxels != 0).any(0).sum((1, 2, 3))
+    voxels = torch.zeros(1, 2, 1000, 1, 64, 64)  # each view draws its own
+    fire(voxels, 1e-4, [(1000.0, 1000.0)], [0])
+    counts = (voxels[0] != 0).any(0).sum((1, 2, 3))
     assert counts.max() == 1
     assert abs(float(counts.float().mean()) - 0.2048) < 4 * math.sqrt(0.2 * 0.8 / 1000)
 
@@ -202,11 +199,11 @@ def test_a_clip_is_augmented_the_same_in_any_batch():
 def test_a_misplaced_view_moves_whole_and_leaves_nothing_behind():
     view = torch.zeros(2, 3, 1, 16, 16)
     view[..., 8, 8] = 1
-    moved = misplace(view.clone(), 1.0, 2, key=4)
+    moved = misplace(view.clone(), misplacements(3, 1.0, 2, key=4))
     places = [tuple(moved[0, i, 0].nonzero()[0].tolist()) for i in range(3)]
     assert float(moved.sum()) == float(view.sum()) and torch.equal(moved[0], moved[1])
     assert len(set(places)) > 1 and all(abs(axis - 8) <= 2 for place in places for axis in place)
-    assert torch.equal(misplace(view.clone(), 0.0, 2, key=4), view)
+    assert torch.equal(misplace(view.clone(), misplacements(3, 0.0, 2, key=4)), view)
 
 
 def test_dropped_views_take_their_positions_along_and_some_view_stays():
@@ -256,13 +253,39 @@ def test_wrong_values_name_their_key(wrong):
         Augment(**wrong)
 
 
-def test_windows_are_shown_one_by_one_as_all_at_once():
-    voxels, order = torch.rand(5, 3, 2, 8, 8), torch.tensor([2, 0])
-    steps, paused = torch.tensor([0, 1, 1, 2, 3]), torch.tensor([0, 0, 1, 0, 0]).bool()
+def drawn_batch(clips: int, seed: int = 0, taught: bool = False) -> list[Sample]:
+    """Samples of a clip each, whose numbers are all different."""
+    drawer = torch.Generator().manual_seed(seed)
+    made = []
+    for clip in range(clips):
+        voxels = torch.randn(1, 7, 9, 2, 16, 16, generator=drawer)
+        target, turbulent, other = torch.rand(3, 1, 7, 1, 16, 16, generator=drawer)
+        window_s, drawn = torch.tensor([1 / (120 * (clip + 1))]), [{"clip": clip}]
+        extra = {"taught": other} if taught else {}
+        made.append(Sample(voxels, target, turbulent, window_s, drawn=drawn, **extra))
+    return made
 
-    def turn(part):
-        return turned(part.index_select(-4, order), [-1], True)
 
-    out = torch.empty(5, 2, 2, 8, 8)
-    show(out, voxels, steps, paused, turn)
-    assert torch.equal(out, turn(voxels[steps]) * ~paused[:, None, None, None, None])
+STRONG = {"pause": 0.3, "transpose": 0.5, "hot_fraction": 0.02, "firing_fraction": 0.05}
+
+
+@pytest.mark.parametrize("changes", [{}, {"misplaced": 0.5}, {"dropped": 1.0, "misplaced": 1.0}])
+@pytest.mark.parametrize("taught", [False, True])
+def test_a_batch_at_once_is_the_clips_one_by_one(changes, taught):
+    samples, keys = drawn_batch(6, taught=taught), list(range(40, 46))
+    augment = Augment(**STRONG | changes)
+    apart, together = (augment(samples, keys, at_once=at_once) for at_once in (False, True))
+    assert torch.equal(apart.voxels, together.voxels)
+    assert torch.equal(apart.target, together.target)
+    assert torch.equal(apart.turbulent, together.turbulent)
+    assert (apart.taught is None) == (not taught)
+    assert not taught or torch.equal(apart.taught, together.taught)
+    assert apart.positions == together.positions and apart.drawn == together.drawn
+
+
+def test_one_sample_of_many_clips_is_as_many_samples_of_one():
+    samples, keys = drawn_batch(3), [7, 8, 9]
+    for at_once in (False, True):
+        apart = Augment(**STRONG)(samples, keys, at_once=at_once)
+        whole = Augment(**STRONG)([joined(samples)], keys, at_once=at_once)
+        assert torch.equal(apart.voxels, whole.voxels) and torch.equal(apart.target, whole.target)

@@ -70,7 +70,7 @@ def test_a_sample_is_the_simulation_to_the_rounding_of_float16(tmp_path):
         torch.testing.assert_close(chain.views(draw)[0], part, rtol=2**-11, atol=1e-7)
         clean = air.clip.frames[draw.first :][:5, air.crop[0] :, air.crop[1] :][:, rows, columns]
         clean = clean.flip(0) if draw.backwards else clean
-        target = chain.expose(draw, chain.views(draw)).target[0, :, 0]
+        target = chain.expose([draw], chain.views(draw)).target[0, :, 0]
         torch.testing.assert_close(target, clean[1:], rtol=2**-11, atol=1e-7)
 
 
@@ -353,7 +353,7 @@ def test_of_two_fillers_one_fills_and_the_other_takes_over_and_ends(tmp_path):
     second.start()
     first.stop()
     second.process.join(600)
-    assert second.process.exitcode == 0 and not second.bank.missing()
+    assert second.process.exitcode == 0 and not second.banks[0].missing()
     second.stop()
     second.start()
     assert second.process is None

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from src.training.augment import Augment
-from src.training.datamodule import LightFieldData, Numbered, Simulator, StepSampler
+from src.training.batch_sampler import Item, LargeStream, Numbered, StepSampler
+from src.training.datamodule import LightFieldData, Simulator
 from tests.sim.test_pipeline import STRONG, pipeline
 
 
@@ -38,22 +39,22 @@ def test_workers_change_nothing():
 def test_a_training_that_goes_on_sees_other_clips():
     data = LightFieldData({"train": chain()}, batch_size=2, epoch_clips=6)
     data.trainer = FakeTrainer(steps=4)
-    assert next(iter(data.train_dataloader().batch_sampler)) == [(8, 8), (9, 9)]
+    assert next(iter(data.train_dataloader().batch_sampler)) == [(8, 8, 0), (9, 9, 0)]
 
 
 def test_a_batch_used_again_is_augmented_anew():
-    numbered, make = Numbered(chain()), Simulator(chain(), Augment(pause=0.0))
+    numbered, make = Numbered(chain()), Simulator([chain()], Augment(pause=0.0))
     first, again, other = (
-        make([numbered[clip, number]]) for clip, number in ((0, 0), (0, 1), (2, 2))
+        make([numbered[Item(clip, number)]]) for clip, number in ((0, 0), (0, 1), (2, 2))
     )
     assert not torch.equal(first.voxels, again.voxels)
     assert first.drawn == again.drawn != other.drawn
-    fresh = Simulator(chain(), Augment(pause=0.0))([numbered[0, 1]])
+    fresh = Simulator([chain()], Augment(pause=0.0))([numbered[Item(0, 1)]])
     assert torch.equal(fresh.voxels, again.voxels)
 
 
 def numbers(sampler: StepSampler) -> list[list[int]]:
-    return [[number for _, number in batch] for batch in sampler]
+    return [[item.number for item in batch] for batch in sampler]
 
 
 def test_sampler_goes_on_where_the_training_stopped():
@@ -65,7 +66,8 @@ def test_sampler_goes_on_where_the_training_stopped():
 
 def test_reuse_repeats_clips_but_not_numbers():
     batches = list(StepSampler(2, 4, lambda: 0, reuse=2))
-    assert batches[:3] == [[(0, 0), (1, 1)], [(0, 2), (1, 3)], [(4, 4), (5, 5)]]
+    pairs = [[(item.clip, item.number) for item in batch] for batch in batches[:3]]
+    assert pairs == [[(0, 0), (1, 1)], [(0, 2), (1, 3)], [(4, 4), (5, 5)]]
 
 
 def test_processes_share_a_batch_without_overlap():
@@ -81,3 +83,38 @@ def test_processes_share_a_batch_without_overlap():
 def test_wrong_values_name_their_key(wrong):
     with pytest.raises(ValueError, match=f"data.{next(iter(wrong))}"):
         LightFieldData({}, **wrong)
+
+
+def test_large_batches_come_evenly_and_count_their_own():
+    batches = [StepSampler(4, 100, lambda: 0, large=(0.3, 2)).batch(step) for step in range(10)]
+    assert [batch[0].stream for batch in batches] == [0, 0, 0, 1, 0, 0, 1, 0, 0, 1]
+    large = [item.clip for batch in batches for item in batch if item.stream]
+    assert large == [0, 1, 2, 3, 4, 5]
+    usual = [item.clip for batch in batches for item in batch if not item.stream]
+    assert len(set(usual)) == len(usual) == 28
+
+
+def test_a_large_batch_is_used_again_as_others_are():
+    sampler = StepSampler(2, 100, lambda: 0, reuse=2, large=(0.5, 1))
+    batches = [sampler.batch(step) for step in range(4)]
+    assert [[tuple(item) for item in batch] for batch in batches[2:]] == [[(0, 0, 1)], [(0, 1, 1)]]
+    assert [[tuple(item) for item in batch] for batch in batches[:2]] == [
+        [(0, 0, 0), (1, 1, 0)], [(0, 2, 0), (1, 3, 0)],
+    ]  # fmt: skip
+
+
+def test_batches_of_two_sizes_come_out_of_a_training():
+    small, large = chain(), pipeline(STRONG, sensor={"threshold": 0.3}, crop=24, random_crop=True)
+    stream = LargeStream(large, share=0.5, batch_size=1)
+    data = LightFieldData({"train": small}, Augment(), batch_size=2, epoch_clips=8, large=stream)
+    data.trainer = FakeTrainer()
+    shapes = [tuple(batch.voxels.shape) for batch in data.train_dataloader()]
+    assert [(shape[0], shape[-1]) for shape in shapes] == [(2, 16), (1, 24), (2, 16), (1, 24)]
+    alone = Simulator([small, large], Augment())([Numbered(small, large)[Item(1, 1, 1)]])
+    again = next(b for i, b in enumerate(data.train_dataloader()) if i == 3)
+    assert torch.equal(alone.voxels, again.voxels)
+
+
+def test_a_share_of_large_batches_outside_its_range_is_refused():
+    with pytest.raises(ValueError, match="data.large.share must be in"):
+        LargeStream(chain(), share=1.0)

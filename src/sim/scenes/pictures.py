@@ -5,6 +5,7 @@ import os
 from pathlib import Path
 
 import cv2
+import numpy as np
 from numpy.typing import NDArray
 
 LARGEST_PIXELS = int(os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"])  # src/__init__.py sets 2^27
@@ -16,6 +17,14 @@ def read_picture(path: Path, flags: int = cv2.IMREAD_GRAYSCALE) -> NDArray | Non
     """
     try:
         return cv2.imread(str(path), flags)
+    except cv2.error:
+        return None
+
+
+def decode_picture(data: bytes) -> NDArray | None:
+    """Return the luminance (h, w), uint8, of an encoded picture; None as `read_picture` does."""
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
     except cv2.error:
         return None
 

@@ -6,63 +6,13 @@ shapes.py.  `truth` is the path of the point that a class names, in pixels.
 """
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
-from src.sim import noise
-from src.sim.scenes.photographs import Clip, check_frames
-from src.sim.scenes.shapes import disc, inside, polar, stripes, turned
-
-FASTEST = 20_000.0  # px/s, beyond the dart of the paper; and turns/s
-Drawing = Callable[[float], tuple[NDArray, tuple[float, float]]]
-
-
-class Target(ABC):
-    """Bright shapes on a dark ground, grey levels 0.5 (1 -+ `contrast`).
-
-    Where and when a clip starts is drawn from (seed, split, index); sizes and speeds are given.
-    """
-
-    def __init__(
-        self,
-        *,
-        height: int = 256,
-        width: int = 256,
-        frames: int = 41,
-        fps: float = 120.0,
-        split: str = "train",
-        seed: int = 0,
-        contrast: float = 0.8,
-    ):
-        check_frames(height, width, frames, fps, split)
-        _check("contrast", contrast, 0.0, 1.0)
-        self.split, self.seed, self.contrast = split, seed, contrast
-        self.height, self.width, self.side = height, width, min(height, width)
-        self.centre = (width - 1) / 2, (height - 1) / 2
-        self.fps, self.times = fps, np.arange(frames) / fps
-        self.x, self.y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
-
-    def clip(self, index: int) -> Clip:
-        """Return clip `index`; its motion is a function of time in seconds."""
-        kind = type(self).__name__
-        rng = np.random.default_rng(noise.key(self.seed, self.split, kind, index))
-        draw = self.drawing(rng)
-        shapes, path = zip(*(draw(time) for time in self.times), strict=True)
-        frames = (0.5 + self.contrast * (np.stack(shapes) - 0.5)).astype(np.float32)
-        truth = torch.tensor(path, dtype=torch.float32)
-        return Clip(torch.from_numpy(frames), self.fps, f"{kind}-{index}", truth)
-
-    @abstractmethod
-    def drawing(self, rng: np.random.Generator) -> Drawing:
-        """Return the function from a time in seconds to brightness (h, w) in [0, 1] and truth."""
-
-    def around(self, x: float, y: float) -> tuple[NDArray, NDArray]:
-        """Return every pixel's coordinates as seen from (x, y)."""
-        return self.x - x, self.y - y
+from src.sim.scenes.drawing import FASTEST, Target, check_range
+from src.sim.scenes.photographs import Clip
+from src.sim.scenes.shapes import disc, inside, polar, sectors, stripes, turned
 
 
 class Checkerboard(Target):
@@ -73,8 +23,8 @@ class Checkerboard(Target):
 
     def __init__(self, *, squares: float = 8.0, speed: float = 0.0, **frame):
         super().__init__(**frame)
-        _check("squares", squares, 1.0, self.side / 2)
-        _check("speed", speed, 0.0, FASTEST)
+        check_range("squares", squares, 1.0, self.side / 2)
+        check_range("speed", speed, 0.0, FASTEST)
         self.pitch, self.speed = self.side / squares, speed
 
     def drawing(self, rng):
@@ -86,7 +36,8 @@ class Checkerboard(Target):
             y = y0 + self.speed * math.sin(heading) * time
             across = stripes(self.x[0] - x, self.pitch)
             down = stripes(self.y[:, 0] - y, self.pitch)
-            return 0.5 + 0.5 * down[:, None] * across, (x, y)
+            board = 0.5 + 0.5 * down[:, None] * across
+            return board, np.ones_like(board), (x, y)
 
         return draw
 
@@ -96,9 +47,9 @@ class RotatingDot(Target):
 
     def __init__(self, *, radius: float = 0.3, size: float = 0.05, speed: float = 0.5, **frame):
         super().__init__(**frame)
-        _check("radius", radius, 0.0, 0.5)
-        _check("size", size, 1 / self.side, 0.5)
-        _check("speed", speed, -FASTEST, FASTEST)
+        check_range("radius", radius, 0.0, 0.5)
+        check_range("size", size, 1 / self.side, 0.5)
+        check_range("speed", speed, -FASTEST, FASTEST)
         self.radius, self.size, self.speed = radius * self.side, size * self.side, speed
 
     def drawing(self, rng):
@@ -106,7 +57,8 @@ class RotatingDot(Target):
 
         def draw(time):
             x, y = polar(self.centre, self.radius, start + 2 * math.pi * self.speed * time)
-            return disc(*self.around(x, y), self.size), (x, y)
+            dot = disc(*self.around(x, y), self.size)
+            return dot, dot, (x, y)
 
         return draw
 
@@ -119,9 +71,9 @@ class SpinningStripe(Target):
 
     def __init__(self, *, length: float = 0.8, size: float = 0.08, speed: float = 0.5, **frame):
         super().__init__(**frame)
-        _check("length", length, 1 / self.side, 2.0)
-        _check("size", size, 1 / self.side, 1.0)
-        _check("speed", speed, -FASTEST, FASTEST)
+        check_range("length", length, 1 / self.side, 2.0)
+        check_range("size", size, 1 / self.side, 1.0)
+        check_range("speed", speed, -FASTEST, FASTEST)
         self.length, self.size, self.speed = length * self.side, size * self.side, speed
 
     def drawing(self, rng):
@@ -131,7 +83,34 @@ class SpinningStripe(Target):
             angle = start + 2 * math.pi * self.speed * time
             along, across = turned(*self.around(*self.centre), angle)
             shape = inside(self.length / 2 - abs(along)) * inside(self.size / 2 - abs(across))
-            return shape, polar(self.centre, self.length / 2, angle)
+            return shape, shape, polar(self.centre, self.length / 2, angle)
+
+        return draw
+
+
+class SpinningDisc(Target):
+    """A disc of radius `size` with `sectors` bright sectors between as many dim ones, turning about
+    its middle, which stands in the frame's, `speed` times a second.
+
+    Truth: the point of its rim where a bright sector begins.
+    """
+
+    def __init__(self, *, size: float = 0.2, sectors: int = 3, speed: float = 0.5, **frame):
+        super().__init__(**frame)
+        check_range("size", size, 2 / self.side, 0.5)
+        check_range("sectors", sectors, 1, 32)
+        check_range("speed", speed, -FASTEST, FASTEST)
+        self.size, self.sectors, self.speed = size * self.side, int(sectors), speed
+
+    def drawing(self, rng):
+        start = rng.uniform(0, 2 * math.pi)
+
+        def draw(time):
+            angle = start + 2 * math.pi * self.speed * time
+            x, y = self.around(*self.centre)
+            cover = disc(x, y, self.size)
+            paint = 0.35 + 0.65 * sectors(*turned(x, y, angle), self.sectors)
+            return paint * cover, cover, polar(self.centre, self.size, angle)
 
         return draw
 
@@ -153,10 +132,10 @@ class BouncingBall(Target):
         **frame,
     ):
         super().__init__(**frame)
-        _check("size", size, 2 / self.side, 0.4)
-        _check("rise", rise, 0.0, 1.0 - 2 * size)
-        _check("bounces", bounces, 0.0, FASTEST)
-        _check("speed", speed, 0.0, FASTEST / self.width)
+        check_range("size", size, 2 / self.side, 0.4)
+        check_range("rise", rise, 0.0, 1.0 - 2 * size)
+        check_range("bounces", bounces, 0.0, FASTEST)
+        check_range("speed", speed, 0.0, FASTEST / self.width)
         self.size, self.rise = size * self.side, rise * self.side
         self.bounces, self.speed = bounces, speed * self.width
 
@@ -172,7 +151,8 @@ class BouncingBall(Target):
             y = floor - self.rise * (1 - (2 * ((phase + self.bounces * time) % 1) - 1) ** 2)
             along, _ = turned(*self.around(x, y), angle + self.speed * time / self.size)
             paint = 0.7 + 0.3 * stripes(along, self.size / 2)
-            return paint * disc(*self.around(x, y), self.size), (x, y)
+            ball = disc(*self.around(x, y), self.size)
+            return paint * ball, ball, (x, y)
 
         return draw
 
@@ -184,9 +164,9 @@ class Dart(Target):
 
     def __init__(self, *, length: float = 0.25, size: float = 0.05, speed: float = 1000.0, **frame):
         super().__init__(**frame)
-        _check("length", length, 2 / self.side, 1.0)
-        _check("size", size, 1 / self.side, length)
-        _check("speed", speed, 0.0, FASTEST)
+        check_range("length", length, 2 / self.side, 1.0)
+        check_range("size", size, 1 / self.side, length)
+        check_range("speed", speed, 0.0, FASTEST)
         self.length, self.size, self.speed = length * self.side, size * self.side, speed
 
     def drawing(self, rng):
@@ -203,7 +183,7 @@ class Dart(Target):
             beyond = np.maximum(abs(along) - (self.length - self.size) / 2, 0)
             body = inside(self.size / 2 - np.hypot(beyond, across))
             ring = inside(self.length / 20 - abs(along - self.length / 4))
-            return body * (1 - 0.6 * ring), (x, y)
+            return body * (1 - 0.6 * ring), body, (x, y)
 
         return draw
 
@@ -213,8 +193,8 @@ class DotGrid(Target):
 
     def __init__(self, *, dots: int = 3, size: float = 0.05, **frame):
         super().__init__(**frame)
-        _check("dots", dots, 1, 64)
-        _check("size", size, 1 / self.side, 0.5 / dots)
+        check_range("dots", dots, 1, 64)
+        check_range("size", size, 1 / self.side, 0.5 / dots)
         self.dots, self.size = int(dots), size * self.side
 
     def drawing(self, rng):
@@ -222,7 +202,7 @@ class DotGrid(Target):
         places = (np.arange(self.dots) - (self.dots - 1) / 2) * pitch
         x0, y0 = np.array(self.centre) + rng.uniform(-0.5, 0.5, 2)
         picture = sum(disc(*self.around(x0 + x, y0 + y), self.size) for x in places for y in places)
-        return lambda time: (picture, (x0, y0))
+        return lambda time: (picture, picture, (x0, y0))
 
 
 class Targets:
@@ -253,12 +233,8 @@ KINDS = {
     "checkerboard": Checkerboard,
     "rotating_dot": RotatingDot,
     "spinning_stripe": SpinningStripe,
+    "spinning_disc": SpinningDisc,
     "bouncing_ball": BouncingBall,
     "dart": Dart,
     "dot_grid": DotGrid,
 }
-
-
-def _check(name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise ValueError(f"scene.{name} must be in [{low:.3g}, {high:.3g}], got {value}")

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 from numpy.typing import NDArray
 
-from src.sim.scenes.photographs import SUFFIXES
+from src.sim.scenes.photo_files import SUFFIXES
 from src.sim.scenes.pictures import open_video, read_picture
 
 FILES = {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv"}

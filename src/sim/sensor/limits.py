@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from src.sim.sensor.engines.job import DEFER, DELETE, HOLD, State
+from src.sim.sensor.engines.job import DEFER, DELETE, HIGHEST, HOLD, LOWEST, State
 
 MODES = {"defer": DEFER, "delete": DELETE, "hold": HOLD}
 CHOICES = {
@@ -75,19 +75,22 @@ def within(name: str, value: float, low: float, high: float) -> None:
         raise ValueError(f"{name} must be in [{low:g}, {high:g}], got {value}")
 
 
-def check_frames(frames: Tensor, fps: float, state: State | None) -> None:
-    """Raise ValueError for frames, a rate or a state that a sensor cannot take."""
-    if frames.ndim != 5 or frames.dtype != torch.float32:
+def check_frames(frames: Tensor, state: State | None) -> None:
+    """Raise ValueError for the shape or type of frames, or a state, that sensors cannot take."""
+    if frames.ndim != 5 or frames.dtype not in (torch.float16, torch.float32):
         raise ValueError(
-            f"frames must be float32 (n, views, frames, h, w), got {frames.dtype} "
+            f"frames must be float32 or float16 (n, views, frames, h, w), got {frames.dtype} "
             f"{tuple(frames.shape)}"
         )
-    within("fps", fps, 1e-3, 1e6)
     n, v, count, h, w = frames.shape
     if min(n, v, h, w) < 1 or count < (2 if state is None else 1):
         raise ValueError(f"events need two frames of at least one pixel, got {tuple(frames.shape)}")
-    low, high = torch.aminmax(frames)
-    if not (low >= -1e-4 and high <= 1 + 1e-4):
-        raise ValueError(f"frames must be finite and in [0, 1], got {low:g} to {high:g}")
     if state is not None and state.level.shape != (n, v, h, w):
         raise ValueError(f"state is of {tuple(state.level.shape)}, frames are {(n, v, h, w)}")
+
+
+def check_intensities(frames: Tensor) -> None:
+    """Raise ValueError for frames that are not finite or outside [0, 1]."""
+    low, high = (end.float() for end in torch.aminmax(frames))
+    if not (low >= LOWEST and high <= HIGHEST):
+        raise ValueError(f"frames must be finite and in [0, 1], got {low:g} to {high:g}")

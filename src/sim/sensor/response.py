@@ -7,10 +7,12 @@ curve is below one unit; only where the lin-log curve has its kink it reaches 4e
 """
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 UNIT = 2**20  # levels per nat
@@ -20,6 +22,7 @@ FIRST = (127 - OCTAVES) << 23  # the bits of 2**-14
 LAST = (128 << 23) - 1  # the bits of the largest float below 2
 CELL = 13  # bits of a float within one cell of the table
 EXTRA = 4  # the table keeps levels to 2**-24 nat
+CPU = torch.device("cpu")
 LINLOG_KNEE = 20 / 255  # v2e: linear below code value 20 (Hu et al. 2021)
 
 
@@ -35,8 +38,11 @@ def encode_srgb(light: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     return torch.where(light <= 0.0031308, 12.92 * light, curve)
 
 
-def response_table(response: str, source: str, floor: float) -> Int[Tensor, "nodes"]:
-    """Return log intensity at the table's nodes, int32 multiples of 2**-24 nat.
+@lru_cache(maxsize=16)
+def response_table(
+    response: str, source: str, floor: float, device: torch.device = CPU
+) -> Int[Tensor, " nodes"]:
+    """Return log intensity at the table's nodes, int32 multiples of 2**-24 nat; read it only.
 
     `response` is `log`, the logarithm of max(intensity, floor), or `linlog`, v2e's: a line through
     zero below code value 20, the logarithm of the code value above.  `source` says what the
@@ -48,7 +54,23 @@ def response_table(response: str, source: str, floor: float) -> Int[Tensor, "nod
     else:
         slope = math.log(20.0) / 20.0
         y = np.where(x <= LINLOG_KNEE, 255.0 * x * slope, np.log(255.0 * x))
-    return torch.from_numpy(np.rint(y * UNIT * 2**EXTRA).astype(np.int32))
+    return torch.from_numpy(_scaled(y)).to(device)
+
+
+@lru_cache(maxsize=16)
+def low_pass_table(cutoff_hz: float, fps: float, source: str) -> NDArray[np.int32]:
+    """Return decay and lag of a photoreceptor at the table's nodes, (2, nodes) in 2**-24.
+
+    The photoreceptor is one pole whose corner frequency is proportional to intensity (v2e). For
+    a level that moves linearly by D in an interval dt and a/tau = 2 pi f dt the exact solution
+    is y1 + (filtered0 - y0) exp(-a) - D (1 - exp(-a)) / a, whatever the interval.
+    """
+    a = 2 * math.pi * cutoff_hz / fps * (255 * nodes(source) + 20) / 275
+    return _scaled(np.stack([np.exp(-a), -np.expm1(-a) / a]))
+
+
+def _scaled(curves: NDArray[np.float64]) -> NDArray[np.int32]:
+    return np.rint(curves * UNIT * 2**EXTRA).astype(np.int32)
 
 
 def nodes(source: str) -> np.ndarray:
@@ -59,11 +81,16 @@ def nodes(source: str) -> np.ndarray:
 
 
 def lookup(
-    table: Int[Tensor, "nodes"], intensity: Float[Tensor, "*shape"], shift: int = EXTRA
+    table: Int[Tensor, " entries"],
+    intensity: Float[Tensor, "*shape"],
+    begin: int | Int[Tensor, "..."] = 0,
 ) -> Int[Tensor, "*shape"]:
-    """Return the table's value at float32 intensities, int32, rounded by `shift` bits."""
+    """Return a curve's value at float32 intensities, int32, its extra bits rounded away.
+
+    `table` holds one curve or several end to end; `begin`: where that of each intensity begins.
+    """
     place = intensity.contiguous().view(torch.int32).clamp(FIRST, LAST) - FIRST
-    cell, inside = place >> CELL, place & (2**CELL - 1)
+    cell, inside = (place >> CELL) + begin, place & (2**CELL - 1)
     left = table[cell]
     value = left + (((table[cell + 1] - left) * inside) >> CELL)
-    return (value + (1 << (shift - 1))) >> shift
+    return (value + (1 << (EXTRA - 1))) >> EXTRA

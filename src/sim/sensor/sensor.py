@@ -7,30 +7,25 @@ bit.  The sensor's clock ticks in microseconds: an event of frame interval k is 
 tick in which it falls, in [edge_k, edge_k+1) with edge_k = ceil(k 10^6 / fps).
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from copy import copy
-from importlib.util import find_spec
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from numpy.typing import NDArray
 from torch import Tensor
 
 from src.sim import noise
-from src.sim.sensor.engines import sensor_cpu, sensor_eager
+from src.sim.sensor.engines import run, sensor_cpu
 from src.sim.sensor.engines.job import Job, State
-from src.sim.sensor.initial_state import blank, rested
-from src.sim.sensor.limits import MODES, THRESHOLDS, check, check_frames, threshold_range, within
-from src.sim.sensor.response import EXTRA, UNIT, decode_srgb, nodes, response_table
+from src.sim.sensor.jobs import make_job, whole_windows
+from src.sim.sensor.limits import check, threshold_range
+from src.sim.sensor.response import decode_srgb
 
 __all__ = ["EVENT", "EventSensor", "State", "decode_srgb"]
 
 EVENT = sensor_cpu.EVENT
-SHY = 2  # thresholds are lowered by so many units: a change of n C makes n events, rounded or not
 
 
 class EventSensor:
@@ -85,14 +80,12 @@ class EventSensor:
         self.residual, self.seed = residual, seed
         self.drawn, self.drawn_share = dict(drawn or {}), drawn_share
         check(vars(self))
-        self._table = response_table(response, input, floor)
 
     def having(self, **settings) -> "EventSensor":
         """Return the same sensor with other `settings`, arguments of the class."""
         sensor = copy(self)
         vars(sensor).update(settings)
         check(vars(sensor))
-        sensor._table = response_table(sensor.response, sensor.input, sensor.floor)
         return sensor
 
     def draw(self, key: int, seed: int | None = None) -> "EventSensor":
@@ -128,19 +121,18 @@ class EventSensor:
         full_width: int | None = None,
         threshold: Float[Tensor, " n"] | None = None,
     ) -> Float[Tensor, "n views windows bins h w"]:
-        """Return one grid per window of `substeps` frame intervals, float32 on the frames' device.
+        """Return one grid per window of `substeps` frame intervals, float32 on the frames' device;
+        in memory the windows come before the views.
 
         `fps` is the rate of `frames`; intensities in [0, 1].  `clips` and `views` (ids) and the
         crop's `origin` (top, left) in a frame `full_width` wide key the noise.  `threshold`: ON
         threshold per clip, instead of the sensor's.  Frames after the last whole window are not
         simulated.  Raises ValueError for frames that are not finite or outside [0, 1], or too few.
         """
-        usable = (frames.shape[2] - 1) // substeps * substeps + 1
-        if usable < 2:
-            raise ValueError(f"events need at least {substeps + 1} frames, got {frames.shape[2]}")
+        frames = whole_windows(frames, substeps)
         return self.step(
-            frames[:, :, :usable], fps, None, bins, substeps=substeps, clips=clips, views=views,
-            origin=origin, full_width=full_width, threshold=threshold,
+            frames, fps, None, bins, substeps=substeps, clips=clips, views=views, origin=origin,
+            full_width=full_width, threshold=threshold,
         )[0]  # fmt: skip
 
     def step(
@@ -156,19 +148,13 @@ class EventSensor:
         """Return the grids of a chunk and the state to go on from; `keys` as in `voxels`.
 
         With `state` None the first frame only sets the references; later chunks hold new frames
-        only, a whole number of windows of them.
+        only, a whole number of windows of them.  Raises ValueError as `voxels` does; a `state` that
+        was given with wrong intensities is then lost.
         """
         job = self._job(frames, fps, state, substeps, **keys)
-        if job.intervals % substeps:
-            raise ValueError(f"{job.intervals} intervals are not whole windows of {substeps}")
         n, views, _, h, w = frames.shape
-        shape = (n, views, job.intervals // substeps, bins, h, w)
-        if frames.device.type == "cpu":  # numpy's memory is in huge pages: 5 times cheaper
-            grids = sensor_cpu.voxels(job, torch.from_numpy(np.empty(shape, np.float32)))
-        else:
-            grids = _engine(job).voxels(job, torch.empty(shape, device=frames.device))
-        job.state.frame += job.intervals
-        return grids, job.state
+        grids = run.zeros((n, job.intervals // substeps, views, bins, h, w), frames.device)
+        return run.voxels(job, grids).transpose(1, 2), job.state
 
     def counts(
         self, frames: Float[Tensor, "n views frames h w"], fps: float, **keys
@@ -191,82 +177,21 @@ class EventSensor:
         self, frames, fps, state, substeps, *, clips=None, views=None, origin=(0, 0),
         full_width=None, threshold=None,
     ) -> Job:  # fmt: skip
-        n, v, _, h, w = frames.shape
-        check_frames(frames, fps, state)
-        for name in ("shot_hz", "hot_hz"):
-            within(f"sensor.{name}", getattr(self, name), 0, fps)
-        clips, views = range(n) if clips is None else clips, range(v) if views is None else views
-        first = 0 if state is None else state.frame
-        chip_keys = [[noise.key(self.seed, i, w) for w in ("mismatch", "hot")] for i in views]
-        shot_keys = [[noise.key(self.seed, c, i, "shot") for i in views] for c in clips]
-        job = Job(
-            frames=frames,
-            fresh=state is None,
-            tables=self._tables(fps, frames.device),
-            state=blank(n, v, h, w, frames.device) if state is None else state,
-            edges=_clock(fps, first, frames.shape[2] + (state is not None)),
+        n, v, w = len(frames), frames.shape[1], frames.shape[-1]
+        return make_job(
+            [self] * n,
+            frames,
+            [fps] * n,
+            state,
             substeps=substeps,
-            mode=MODES[self.refractory],
-            v2e=self.stamps == "v2e",
-            wait=self.refractory_s * fps,
-            chips=self._chips(n, threshold),
-            leak=round(self.leak_hz / fps * 2**24),
-            shot=round(self.shot_hz / fps * 2**32),
-            hot=round(self.hot_hz / fps * 2**32),
-            chip_keys=np.array(chip_keys, np.int64),
-            shot_keys=np.array(shot_keys, np.int64),
-            place=(*origin, w if full_width is None else full_width),
+            clips=range(n) if clips is None else clips,
+            views=range(v) if views is None else views,
+            origins=[origin] * n,
+            full_widths=[w if full_width is None else full_width] * n,
+            thresholds=None if threshold is None else threshold.double().tolist(),
         )
-        return rested(job, self.residual) if job.fresh and self.residual > 0 else job
-
-    def _chips(self, n: int, threshold: Tensor | None) -> NDArray[np.int64]:
-        """Return the integers of each clip's chip; see Job."""
-        if threshold is None:
-            low, high = threshold_range(self.threshold)
-            if low < high:
-                raise ValueError(
-                    f"sensor.threshold is the range {low} to {high}: draw one per clip, "
-                    "sample_threshold, and give it as `threshold`"
-                )
-            threshold = torch.full((n,), low, dtype=torch.float64)
-        on = threshold.double().cpu().numpy()
-        within("sensor.threshold", float(on.min()), *THRESHOLDS)
-        within("sensor.threshold", float(on.max()), *THRESHOLDS)
-        spread, hot = round(self.mismatch * UNIT), round(self.hot_fraction * 2**32)
-        parts = [np.floor(on * UNIT) - SHY, np.floor(on * self.off_ratio * UNIT) - SHY]
-        return np.stack([*parts, np.full(n, spread), np.full(n, hot)], 1).astype(np.int64)
-
-    def _tables(self, fps: float, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the tables of level, decay and lag; the last two of one node without a filter.
-
-        The photoreceptor is one pole whose corner frequency is proportional to intensity (v2e). For
-        a level that moves linearly by D in an interval dt and a/tau = 2 pi f dt the exact solution
-        is y1 + (filtered0 - y0) exp(-a) - D (1 - exp(-a)) / a, whatever the interval.
-        """
-        level = self._table.to(device)
-        if self.cutoff_hz == 0:
-            return level, level[:1], level[:1]
-        a = 2 * math.pi * self.cutoff_hz / fps * (255 * nodes(self.input) + 20) / 275
-        decay, lag = np.exp(-a), -np.expm1(-a) / a
-        scaled = [np.rint(part * UNIT * 2**EXTRA).astype(np.int32) for part in (decay, lag)]
-        return level, *(torch.from_numpy(part).to(device) for part in scaled)
 
 
 def _uniform(key: int, name: str) -> float:
     """Return a number in [0, 1), one of each name."""
-    return float(noise.uniform(noise.key(key, "sensor", name), torch.tensor(0)))
-
-
-def _engine(job: Job) -> ModuleType:
-    """Return the engine of a device: on CUDA, Triton's where it is installed, else plain torch."""
-    if job.frames.is_cuda and not job.v2e and find_spec("triton"):
-        # Here, as Triton is not there everywhere.
-        from src.sim.sensor.engines import sensor_triton
-
-        return sensor_triton
-    return sensor_eager
-
-
-def _clock(fps: float, first: int, count: int) -> NDArray[np.int64]:
-    """Return ceil(k 10^6 / fps) for `count` frames from `first` on; strictly increasing."""
-    return np.ceil(np.arange(first, first + count) * (1e6 / fps) - 1e-6).astype(np.int64)
+    return noise.uniforms(noise.key(key, "sensor", name), 1)[0]

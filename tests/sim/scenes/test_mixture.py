@@ -10,7 +10,8 @@ import torch
 from src.app import build
 from src.sim.scenes.mixture import Mixture
 from src.sim.scenes.motion import Tempo
-from src.sim.scenes.photographs import Photographs, photographs
+from src.sim.scenes.photo_files import photographs
+from src.sim.scenes.photographs import Photographs
 from src.sim.scenes.targets import Targets
 from tests.test_train import config
 
@@ -123,7 +124,7 @@ def test_a_second_folder_leaves_the_splits_of_the_first_as_they_were(tmp_path):
     for split in ("train", "val", "test"):
         both = photographs([str(root) for root in roots], split)
         assert both == photographs(str(roots[0]), split) + photographs(str(roots[1]), split)
-    with pytest.raises(ValueError, match="scene.root must be a folder, or some, got an empty"):
+    with pytest.raises(ValueError, match="scene.root must be a folder or a pack, or some, got an"):
         photographs([], "train")
-    with pytest.raises(ValueError, match="scene.root must be a folder, got /nowhere"):
+    with pytest.raises(ValueError, match="scene.root must be a folder or a pack of.* got /nowhere"):
         photographs([str(roots[0]), "/nowhere"], "train")

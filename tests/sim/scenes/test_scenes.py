@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from src.sim.scenes.photographs import EMBEDDED, MixedRates, Photographs, photographs
+from src.sim.scenes.photo_files import EMBEDDED, photographs
+from src.sim.scenes.photographs import MixedRates, Photographs
 
 
 def test_a_clip_is_a_function_of_seed_split_and_index():
@@ -95,3 +96,58 @@ def test_mixed_rates_draw_the_rate_of_a_clip_from_its_number():
     mixed = MixedRates(scenes)
     rates = [mixed.clip(index).fps for index in range(12)]
     assert set(rates) == {60.0, 600.0} and rates == [mixed.clip(i).fps for i in range(12)]
+
+
+GREYS = {  # of frame 8, every 80 pixels from (40, 40) on, of clips 0 to 2: as in version 0.2
+    "default": [
+        [0.2359, 0.7407, 0.4567, 0.1992, 0.1962, 0.1013, 0.2585, 0.0434, 0.0404],
+        [0.4250, 0.5735, 0.4563, 0.7178, 0.4322, 0.6166, 0.4276, 0.6250, 0.4595],
+        [0.2657, 0.4342, 0.6455, 0.5555, 0.6818, 0.4408, 0.3988, 0.7089, 0.4755],
+    ],
+    "still": [
+        [0.3324, 0.4711, 0.5581, 0.2947, 0.1408, 0.1683, 0.2838, 0.1268, 0.4146],
+        [0.4239, 0.4280, 0.4369, 0.4331, 0.4309, 0.4385, 0.4262, 0.4343, 0.4298],
+        [0.2570, 0.4337, 0.6530, 0.3850, 0.6315, 0.5513, 0.4526, 0.5589, 0.5396],
+    ],
+}
+
+
+@pytest.mark.parametrize("kind", GREYS)
+def test_clips_are_those_that_published_numbers_are_of(kind):
+    settings = {"still": 1.0, "rest": 1.0, "cutouts": 4} if kind == "still" else {}
+    scene = Photographs(frames=9, train_root=None, **settings)
+    for index, greys in enumerate(GREYS[kind]):
+        frame = scene.clip(index).frames[-1, 40::80, 40::80]
+        assert torch.allclose(frame.flatten(), torch.tensor(greys), atol=2e-3)
+
+
+def folder(path, count):
+    path.mkdir()
+    for number in range(count):
+        cv2.imwrite(str(path / f"{number:03}.png"), np.full((32, 32), number, np.uint8))
+    return str(path)
+
+
+def test_more_photographs_serve_training_only(tmp_path):
+    root, more, third = (folder(tmp_path / name, 12) for name in ("b", "a", "c"))
+    for split in ("train", "val", "test"):
+        plain = Photographs(root, split=split, frames=2)
+        both = Photographs(root, split=split, frames=2, train_root=[more, third])
+        extra = both.photos[len(plain.photos) :]
+        assert both.photos[: len(plain.photos)] == plain.photos
+        assert len(extra) == (24 if split == "train" else 0)
+        if split != "train":
+            assert torch.equal(plain.clip(0).frames, both.clip(0).frames)
+    assert len(Photographs(None, train_root=more).photos) == 9 + 12
+
+
+def test_photographs_that_validation_or_test_have_are_not_trained_on(tmp_path):
+    inner = folder(tmp_path / "b", 12)
+    for root, more in ((inner, inner), (str(tmp_path), inner), (inner, [str(tmp_path)])):
+        with pytest.raises(ValueError, match="scene.train_root must be apart from scene.root"):
+            Photographs(root, train_root=more)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match="scene.train_root must hold photographs, got none in"):
+        Photographs(inner, train_root=str(tmp_path / "empty"))
+    with pytest.raises(ValueError, match="scene.train_root must be a folder or a pack"):
+        Photographs(inner, train_root="/nowhere")

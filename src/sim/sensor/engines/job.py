@@ -1,15 +1,32 @@
-"""What an engine is given: a sensor's numbers as integers, keys, clock and memory."""
+"""What an engine is given: sensors' numbers as integers, keys, clock and memory."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from scipy.special import ndtri
 from torch import Tensor
 
 DEFER, DELETE, HOLD = 0, 1, 2
 VOXELS, COUNT, LIST = 0, 1, 2
+KEYS = 4  # of a view of a clip, in this order:
+MISMATCH_KEY, HOT_KEY, SHOT_KEY, RESIDUAL_KEY = range(KEYS)
 NORMAL_CELLS = 4096
+LOWEST, HIGHEST = -1e-4, 1 + 1e-4  # intensities that a sensor takes: [0, 1] and a little rounding
+
+# A clip's numbers.  on, off: thresholds, 2**-20 nat.  spread: relative mismatch, 2**-20.
+# hot_share: share of hot pixels, 2**-32.  leak: per interval, 2**-24 thresholds.  shot, hot:
+# probabilities of a noise event per interval, 2**-32.  top, left: the crop's place in a frame
+# full_width wide.  low_pass: which row of Job.low_pass.  wait: the dead time in intervals, a
+# float32's value.  residual: the largest distance of a reference from the first level, thresholds.
+WHOLE = (
+    "on", "off", "spread", "hot_share", "leak", "shot", "hot", "top", "left", "full_width",
+    "low_pass",
+)  # fmt: skip
+CLIP = np.dtype(
+    [(name, np.int64) for name in WHOLE] + [("wait", np.float64), ("residual", np.float64)]
+)
 
 
 @dataclass
@@ -28,34 +45,34 @@ class State:
     frame: int = 0
 
 
+def blank(shape: tuple[int, int, int, int], device: torch.device) -> State:
+    """Return memory (n, views, h, w) to be filled by a first frame."""
+    levels = (torch.empty(shape, dtype=torch.int32, device=device) for _ in range(3))
+    return State(*levels, torch.empty(shape, device=device))
+
+
 @dataclass(frozen=True)
 class Job:
-    """One call of a sensor.
+    """One call of the sensors of n clips.
 
-    `frames` (n, views, frames, h, w), with `fresh` the first only sets the references; `tables`:
-    level, decay and lag at the nodes of response.py (one node each if there is no low-pass);
-    `state`, overwritten; `edges`: the clock in microseconds at the frames; `chips` (n, 4): ON and
-    OFF threshold, relative mismatch in 2**-20, share of hot pixels in 2**-32; `leak`: per interval
-    in 2**-24 thresholds; `shot`, `hot`: probabilities per interval in 2**-32; `wait`: the dead time
-    in intervals; `chip_keys` (views, 2), `shot_keys` (n, views); `place`: top, left, full width.
+    `frames` (n, views, frames, h, w), float32 or float16, with `fresh` the first only sets the
+    references; `level` (nodes,), the table of response.py, and `low_pass` (rows, 2, nodes), decay
+    and lag at the same nodes, no row if there is no low-pass; `state`, overwritten; `edges`
+    (n, frames): each clip's clock in microseconds at the frames; `clips` (n,) of CLIP;
+    `keys` (n, views, 4): those of mismatch, hot pixels, shot noise and residual, 0 where not drawn.
     """
 
     frames: Tensor
     fresh: bool
-    tables: tuple[Tensor, Tensor, Tensor]
+    level: Tensor
+    low_pass: Tensor
     state: State
     edges: np.ndarray
     substeps: int
     mode: int
     v2e: bool
-    wait: float
-    chips: np.ndarray
-    leak: int
-    shot: int
-    hot: int
-    chip_keys: np.ndarray
-    shot_keys: np.ndarray
-    place: tuple[int, int, int]
+    clips: np.ndarray
+    keys: np.ndarray
 
     @property
     def intervals(self) -> int:
@@ -64,20 +81,16 @@ class Job:
 
 
 class Chip(NamedTuple):
-    """A Job's numbers as a kernel takes them; `place`: top, left, full width, width."""
+    """A Job's numbers as a kernel takes them; `width`: of the frames."""
 
-    tables: tuple
+    level: np.ndarray
+    low_pass: np.ndarray
     normals: np.ndarray
-    chips: np.ndarray
-    chip_keys: np.ndarray
-    shot_keys: np.ndarray
-    place: tuple
+    clips: np.ndarray
+    keys: np.ndarray
+    width: int
     mode: int
     v2e: bool
-    wait: np.float32
-    leak: int
-    shot: int
-    hot: int
 
 
 class Memory(NamedTuple):
@@ -90,7 +103,9 @@ class Memory(NamedTuple):
 
 
 class Sink(NamedTuple):
-    """Where events go: grids, or numbers per unit and polarity, or a list at each unit's offset."""
+    """Where events go: grids (n, windows, views, bins, pixels), or numbers per unit and polarity,
+    or a list at each unit's offset.
+    """
 
     output: int
     voxels: np.ndarray
@@ -102,17 +117,24 @@ class Sink(NamedTuple):
 class Scratch(NamedTuple):
     """Arrays over the pixels of a unit for one interval, and a batch of events (the last three).
 
-    `pixel`: the number in the whole frame; `drift`: what the reference leaks; `level`: the new
-    frame's; `active`: those pixels that are `busy`; `who`, `when`, `sign`: an event's pixel of the
-    unit, fraction of the interval and polarity.
+    `pixel`: the number in the whole frame; `drawn`: random bits; `mixed`: the part of a pixel's
+    noise that is the same in all frames; `hot`: the hot pixels, which come first; `drift`: what the
+    reference leaks; `intensity`, of float16 frames, and `level`: the new frame's; `noisy`: whether
+    there is a noise event; `active`: those pixels that are `busy`; `noise_u`, `noise_sign`: time
+    and polarity of their noise events; `who`, `when`, `sign`: an event's pixel of the unit,
+    fraction of the interval and polarity.
     """
 
     pixel: np.ndarray
+    drawn: np.ndarray
+    mixed: np.ndarray
     on: np.ndarray
     off: np.ndarray
     hot: np.ndarray
     drift: np.ndarray
+    intensity: np.ndarray
     level: np.ndarray
+    noisy: np.ndarray
     active: np.ndarray
     busy: np.ndarray
     noise_u: np.ndarray

@@ -11,13 +11,14 @@ from torch import Tensor
 
 from src.sim.sensor.engines.job import COUNT, LIST, NORMALS, VOXELS, Chip, Job, Memory, Sink
 from src.sim.sensor.engines.sensor_numba import simulate
+from src.sim.sensor.limits import check_intensities
 
 EVENT = np.dtype([("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)])
 UNIT = 8192  # pixels simulated together: their memory stays in the cache from frame to frame
 
 
 def voxels(job: Job, grids: Tensor) -> Tensor:
-    """Fill `grids` (n, views, windows, bins, h, w) and return them."""
+    """Add the events to `grids` (n, windows, views, bins, h, w) and return them."""
     _run(job, VOXELS, voxels=grids.view(*grids.shape[:4], -1).numpy())
     return grids
 
@@ -51,7 +52,10 @@ def _counts(job: Job) -> np.ndarray:
 
 
 def _run(job: Job, output: int, **targets) -> None:
-    """Run `simulate` over all units on as many threads as torch would use."""
+    """Run `simulate` over all units on as many threads as torch would use.
+
+    Raises ValueError, afterwards, for frames that are not finite or outside [0, 1].
+    """
     nowhere = {
         "voxels": np.empty((0, 0, 0, 0, 0), np.float32),
         "counts": np.empty((0, 2), np.int64),
@@ -62,21 +66,31 @@ def _run(job: Job, output: int, **targets) -> None:
     state = (job.state.level, job.state.source, job.state.reference, job.state.dead)
     memory = Memory(*(part.view(n, views, -1).numpy() for part in state))
     chip = Chip(
-        tuple(part.numpy() for part in job.tables), NORMALS, job.chips, job.chip_keys,
-        job.shot_keys, (*job.place, job.frames.shape[4]), job.mode, job.v2e, np.float32(job.wait),
-        job.leak, job.shot, job.hot,
+        job.level.numpy(), job.low_pass.numpy(), NORMALS, job.clips, job.keys, job.frames.shape[4],
+        job.mode, job.v2e,
     )  # fmt: skip
     size, units = _unit(job)
     arguments = (
-        size, job.frames.flatten(3).contiguous().numpy(), int(job.fresh), chip, memory, job.edges,
-        job.state.frame, job.substeps, Sink(output, **nowhere | targets),
+        size, _light(job.frames), int(job.fresh), chip, memory, job.edges, job.state.frame,
+        job.substeps, Sink(output, **nowhere | targets),
     )  # fmt: skip
     threads = min(torch.get_num_threads(), units)
     if threads == 1:
-        simulate(0, units, *arguments)
-        return
-    cuts = [units * i // threads for i in range(threads + 1)]
-    with ThreadPoolExecutor(threads) as pool:
-        parts = [pool.submit(simulate, a, b, *arguments) for a, b in pairwise(cuts)]
-        for part in parts:
-            part.result()
+        doubtful = simulate(0, units, *arguments)
+    else:
+        cuts = [units * i // threads for i in range(threads + 1)]
+        with ThreadPoolExecutor(threads) as pool:
+            parts = [pool.submit(simulate, a, b, *arguments) for a, b in pairwise(cuts)]
+            doubtful = any([part.result() for part in parts])
+    if doubtful:
+        check_intensities(job.frames)
+
+
+def _light(frames: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """Return the frames (n, views, frames, pixels) as the kernel takes them: float32, and the bits
+    of float16, one of them empty.
+    """
+    flat, none = frames.flatten(3).contiguous(), (0, 0, 0, 0)
+    if frames.dtype == torch.float16:
+        return np.empty(none, np.float32), flat.view(torch.int16).numpy()
+    return flat.numpy(), np.empty(none, np.int16)

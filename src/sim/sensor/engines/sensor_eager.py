@@ -3,40 +3,53 @@
 Integers and single divisions are the kernel's, so that the events are the same bit for bit.
 """
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from src.sim import noise
-from src.sim.sensor.engines.job import DELETE, HOLD, NORMALS, Job
+from src.sim.sensor.engines.job import (
+    CLIP,
+    DELETE,
+    HOLD,
+    HOT_KEY,
+    MISMATCH_KEY,
+    NORMALS,
+    RESIDUAL_KEY,
+    SHOT_KEY,
+    Job,
+)  # fmt: skip
+from src.sim.sensor.limits import check_intensities
 from src.sim.sensor.response import lookup
 
 NEVER = 2.0  # a time after the interval
 
 
 def voxels(job: Job, grids: Tensor) -> Tensor:
-    """Fill `grids` (n, views, windows, bins, h, w) and return them; `job.state` moves on."""
-    pixels = Pixels(job)
+    """Add the events to `grids` (n, windows, views, bins, h, w); `job.state` moves on.
+
+    Raises ValueError for frames that are not finite or outside [0, 1].
+    """
+    check_intensities(job.frames)
+    pixels, edges = Pixels(job), torch.from_numpy(job.edges).to(grids.device)
     frames = job.frames.unbind(2)
     if job.fresh:
-        pixels.start(frames[0])
+        pixels.start(frames[0].float())
     for i, frame in enumerate(frames[int(job.fresh) :]):
-        window, first = i // job.substeps, i % job.substeps == 0
-        grid = grids[:, :, window]
-        if first:
-            grid.zero_()
-        pixels.advance(frame, job.state.frame + i, Bins(job.edges, i, job.substeps, grid))
+        bins = Bins(edges, i, job.substeps, grids[:, i // job.substeps])
+        pixels.advance(frame.float(), job.state.frame + i, bins)
     return grids
 
 
 class Bins:
     """Adds events of one interval to its window's grid (n, views, bins, h, w)."""
 
-    def __init__(self, edges, i: int, substeps: int, grid: Tensor):
-        window = i // substeps * substeps
-        self.start = int(edges[i] - edges[window])
-        self.ticks = float(edges[i + 1] - edges[i])
-        length = torch.tensor(float(edges[window + substeps] - edges[window]))
-        self.scale = (torch.tensor(grid.shape[2] - 1.0) / length).to(grid.device)
+    def __init__(self, edges: Tensor, i: int, substeps: int, grid: Tensor):
+        edges, window = edges[..., None, None, None], i // substeps * substeps
+        self.start = edges[:, i] - edges[:, window]
+        self.ticks = (edges[:, i + 1] - edges[:, i]).float()
+        length = (edges[:, window + substeps] - edges[:, window]).float()
+        self.scale = torch.full_like(length, grid.shape[2] - 1) / length
         self.grid = grid
 
     def add(self, fired: Tensor, u: Tensor, sign: Tensor) -> None:
@@ -53,34 +66,44 @@ class Bins:
 
 
 class Pixels:
-    """All pixels of a batch; the attributes of `job.state` are replaced as time goes on."""
+    """All pixels of a batch; the attributes of `job.state` are replaced as time goes on.
+
+    `clip` holds the fields of CLIP, (n, 1, 1, 1); `pixel` and what is drawn with it are
+    (n, views or 1, h, w).
+    """
 
     def __init__(self, job: Job):
         self.job, self.state = job, job.state
         device, (n, _, _, h, w) = job.frames.device, job.frames.shape
-        top, left, full_width = job.place
-        rows = torch.arange(top, top + h, device=device)[:, None] * full_width
-        self.pixel = rows + torch.arange(left, left + w, device=device)
-        chips = torch.from_numpy(job.chips).to(device)[:, :, None, None, None]
-        normals = torch.from_numpy(NORMALS).to(device)
-        spread, hot = torch.from_numpy(job.chip_keys).to(device)[:, :, None, None].unbind(1)
+        numbers = torch.from_numpy(job.clips.view(np.int64).reshape(n, -1, 1, 1, 1)).to(device)
+        clip = dict(zip(CLIP.names, numbers.unbind(1), strict=True))
+        for name in ("wait", "residual"):
+            clip[name] = clip[name].view(torch.float64)
+        self.clip, self.wait = clip, clip["wait"].float()
+        self.keys = torch.from_numpy(job.keys).to(device)[..., None, None].unbind(2)
+        rows = clip["top"] + torch.arange(h, device=device)[:, None]
+        self.pixel = rows * clip["full_width"] + clip["left"] + torch.arange(w, device=device)
+        normals, key = torch.from_numpy(NORMALS).to(device), self.keys[MISMATCH_KEY]
         self.on, self.off = (
-            _spread(chips[:, side], chips[:, 2], normals, noise.bits(spread, 2 * self.pixel + side))
-            for side in (0, 1)
+            _spread(clip[name], clip["spread"], normals, noise.bits(key, 2 * self.pixel + side))
+            for side, name in enumerate(("on", "off"))
         )
-        self.hot = (noise.bits(hot, self.pixel) < job.chips[0, 3]).expand(n, -1, h, w)
+        self.hot = noise.bits(self.keys[HOT_KEY], self.pixel) < clip["hot_share"]
 
     def start(self, frame: Tensor) -> None:
-        """Set the memory to the first frame (n, views, h, w)."""
-        level, state = lookup(self.job.tables[0], frame), self.state
-        state.level, state.source, state.reference = level, level.clone(), level.clone()
+        """Set the memory to the first frame (n, views, h, w), off by the residual."""
+        level, state = lookup(self.job.level, frame), self.state
+        share = noise.uniform(self.keys[RESIDUAL_KEY], self.pixel)
+        away = (2 * share - 1).double() * self.clip["residual"]
+        off = (away * torch.where(away > 0, self.on, self.off)).int()
+        state.level, state.source, state.reference = level, level.clone(), level - off
         state.dead = torch.zeros_like(frame)
 
     def advance(self, frame: Tensor, number: int, bins: Bins) -> None:
         """Take all pixels through interval `number`, which ends with `frame`."""
         state, job = self.state, self.job
         source, level = self._levels(frame)
-        leak = self.on * job.leak
+        leak = self.on * self.clip["leak"]
         drift = ((leak * (number + 1)) >> 24) - ((leak * number) >> 24)
         l0, l1, ref = state.level.long(), level + drift, state.reference.long()
         u, sign = self._noise(frame, number)
@@ -92,22 +115,24 @@ class Pixels:
 
     def _levels(self, frame: Tensor) -> tuple[Tensor, Tensor]:
         """Return the frame's levels before and after the low-pass."""
-        table, decay, lag = self.job.tables
-        y, state = lookup(table, frame), self.state
-        if len(decay) == 1:
+        y, state = lookup(self.job.level, frame), self.state
+        if not len(self.job.low_pass):
             return y, y.long()
-        keep, lag = lookup(decay, frame).long(), lookup(lag, frame).long()
+        nodes = self.job.low_pass.shape[2]
+        tables, row = self.job.low_pass.flatten(), 2 * nodes * self.clip["low_pass"]
+        keep, lag = (lookup(tables, frame, row + at).long() for at in (0, nodes))
         old = (state.level - state.source).long() * keep - (y - state.source).long() * lag
         return y, y + ((old + 2**19) >> 20)
 
     def _noise(self, frame: Tensor, number: int) -> tuple[Tensor, Tensor]:
         """Return time (NEVER for none) and polarity of the noise events of interval `number`."""
         seen = (frame.clamp(0, 1) * 256).long()
-        rate = self.job.shot - (self.job.shot >> 8) * ((3 * seen) >> 2)
-        rate = torch.where(self.hot, self.job.hot, rate)
+        shot = self.clip["shot"]
+        rate = shot - (shot >> 8) * ((3 * seen) >> 2)
+        rate = torch.where(self.hot, self.clip["hot"], rate)
         counter = (number << 32) + 2 * self.pixel
-        keys = torch.from_numpy(self.job.shot_keys).to(frame.device)[:, :, None, None]
-        drawn, at = (noise.bits(keys, counter + word) for word in (0, 1))
+        key = self.keys[SHOT_KEY]
+        drawn, at = (noise.bits(key, counter + word) for word in (0, 1))
         u = ((at >> 9).float() + 0.5) * 2.0**-23
         return torch.where(drawn < rate, u, NEVER), torch.where(at & 1 == 1, 1, -1)
 
@@ -137,9 +162,8 @@ def _next(l0, delta, ref, on, off, now) -> tuple[Tensor, Tensor]:
 
 def _linear(pixels: Pixels, l0, l1, ref, dead, noise_u, noise_sign, bins) -> tuple[Tensor, Tensor]:
     """Events at their crossing times, up to the noise event and then up to the end."""
-    job, delta = pixels.job, l1 - l0
-    wait = torch.tensor(job.wait, dtype=torch.float32, device=dead.device)
-    holds = job.mode == HOLD and job.wait > 0
+    job, delta, wait = pixels.job, l1 - l0, pixels.wait
+    holds = (wait > 0) & (job.mode == HOLD)
     start, stop = torch.zeros_like(dead), noise_u.clamp(max=1)
     holding = (dead > 0) if job.mode == HOLD else torch.zeros_like(dead, dtype=torch.bool)
     for noisy in (True, False):
@@ -168,8 +192,7 @@ def _linear(pixels: Pixels, l0, l1, ref, dead, noise_u, noise_sign, bins) -> tup
 
 def _v2e(pixels: Pixels, l0, l1, ref, dead, noise_u, noise_sign, bins) -> tuple[Tensor, Tensor]:
     """Events at v2e's stamps; see v2e_events of the kernel."""
-    job, on, off = pixels.job, pixels.on, pixels.off
-    wait = torch.tensor(job.wait, dtype=torch.float32, device=dead.device)
+    job, on, off, wait = pixels.job, pixels.on, pixels.off, pixels.wait
     if job.mode == HOLD:
         over = (dead > 0) & (dead <= 1)
         ref = torch.where(over, pixels.level_at(l0, l1 - l0, dead), ref)

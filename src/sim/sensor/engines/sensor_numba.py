@@ -8,9 +8,13 @@ reference; between frames the level moves linearly, so that each crossing costs 
 import numpy as np
 from numba import njit, uint32, uint64
 
+from src.sim.sensor.engines import job
 from src.sim.sensor.engines.job import COUNT, DELETE, HOLD, VOXELS, Memory, Scratch
 
-f32 = np.float32
+f32, i32 = np.float32, np.int32
+DARKEST, BRIGHTEST, WHITE = 0x38800000, 0x3FFFFFFF, 0x3F800000  # bits of 2**-14, of below 2, of 1
+DARKEST_HALF, BRIGHTEST_HALF, WHITE_HALF = 0x0400, 0x4000, 0x3C00  # of float16
+MISMATCH, HOT, SHOT, RESIDUAL = job.MISMATCH_KEY, job.HOT_KEY, job.SHOT_KEY, job.RESIDUAL_KEY
 kernel = njit(nogil=True, error_model="numpy")  # no test for a zero divisor
 small = njit(nogil=True, error_model="numpy", inline="always")
 
@@ -144,23 +148,47 @@ def v2e_events(x, l0, l1, ref, dead, on, off, wait, mode, steps, noise_u, noise_
 @small
 def place_of(intensity_bits):
     """Return the place in the tables of an intensity, given by the bits of its float."""
-    return np.int64(min(max(intensity_bits, 0x38800000), 0x3FFFFFFF) - 0x38800000)
+    return i32(min(max(i32(intensity_bits), i32(DARKEST)), i32(BRIGHTEST)) - i32(DARKEST))
 
 
 @small
 def look(table, place):
     """Return the table's value at one place, as src.sim.sensor.response.lookup does."""
-    cell, inside = place >> 13, place & 8191
+    cell, inside = uint32(place) >> uint32(13), i32(place & i32(8191))
     left = table[cell]
-    return (left + (((table[cell + 1] - left) * inside) >> 13) + 8) >> 4
+    part = i32(i32(table[cell + uint32(1)] - left) * inside) >> i32(13)
+    return i32(i32(left + i32(part) + i32(8)) >> i32(4))
 
 
 @kernel
 def read_levels(table, intensity, levels):
-    """Fill `levels` with a frame's levels before the low-pass."""
-    places = intensity.view(np.int32)
+    """Fill `levels` with a frame's levels before the low-pass; return whether any light is negative
+    or above 1: the bits of such floats are the larger numbers.
+    """
+    places, most = intensity.view(np.uint32), uint32(0)
     for x in range(places.size):
+        most = max(most, places[x])
         levels[x] = look(table, place_of(places[x]))
+    return most > WHITE
+
+
+@kernel
+def read_halves(table, halves, intensity, levels):
+    """The same of the bits of float16, whose lights are the table's nodes; widened in `intensity`.
+
+    In a float32's place the exponent is too small by 127 - 15: exact also for light below 2**-14.
+    """
+    places, most = intensity.view(np.uint32), uint32(0)
+    for x in range(places.size):
+        half, unsigned = i32(halves[x]), uint32(halves[x]) & uint32(0xFFFF)
+        most = max(most, uint32(unsigned))
+        node = min(max(half, i32(DARKEST_HALF)), i32(BRIGHTEST_HALF)) - i32(DARKEST_HALF)
+        levels[x] = i32(i32(table[uint32(node)] + i32(8)) >> i32(4))
+        sign = uint32(unsigned & uint32(0x8000)) << uint32(16)
+        places[x] = uint32(uint32(unsigned & uint32(0x7FFF)) << uint32(13)) | uint32(sign)
+    for x in range(places.size):
+        intensity[x] *= f32(2.0**112)
+    return most > WHITE_HALF
 
 
 @kernel
@@ -175,47 +203,89 @@ def low_pass(decay, lag, intensity, memory, level):
 
 
 @kernel
-def make_chip(chip, c, v, first, scratch):
-    """Fill what the pixels of a unit are, whatever they see, from pixel `first` of the crop on."""
-    on, off, hot, pixel = scratch.on, scratch.off, scratch.hot, scratch.pixel
-    threshold_on, threshold_off, spread, hot_share = chip.chips[c]
-    mismatch_key, hot_key, normals = chip.chip_keys[v, 0], chip.chip_keys[v, 1], chip.normals
-    top, left, full_width, width = chip.place
-    for x in range(on.size):
-        y = (first + x) // width
-        at = (top + y) * full_width + left + first + x - y * width
-        pixel[x], on[x], off[x], hot[x] = at, threshold_on, threshold_off, False
-        if spread > 0:
-            on[x] = spread_threshold(threshold_on, spread, normals, bits(mismatch_key, 0, 2 * at))
-            off[x] = spread_threshold(
-                threshold_off, spread, normals, bits(mismatch_key, 0, 2 * at + 1)
-            )
-        if hot_share > 0:
-            hot[x] = bits(hot_key, 0, at) < hot_share
-
-
-@small
-def spread_threshold(threshold, spread, normals, drawn):
-    """Return threshold * (1 + spread * normal), at least a quarter of the threshold."""
-    cell, inside = np.int64(drawn >> uint32(20)), np.int64(drawn & uint32(0xFFFFF))
-    normal = normals[cell] + (((normals[cell + 1] - normals[cell]) * inside) >> 20)
-    return max(threshold + ((((threshold * spread) >> 20) * normal) >> 20), threshold >> 2)
+def number_pixels(clip, width, first, pixel):
+    """Fill the numbers that the pixels of a unit have in the whole frame."""
+    row, column = first // width, first % width
+    at = (clip.top + row) * clip.full_width + clip.left + column
+    for x in range(pixel.size):
+        pixel[x] = at
+        at, column = at + 1, column + 1
+        if column == width:
+            at, column = at + clip.full_width - width, 0
 
 
 @kernel
-def draw_noise(chip, scratch, key, frame, intensity):
-    """Fill times and polarities of the noise events of interval `frame`; time 2 for none.
+def make_chip(clip, keys, normals, scratch):
+    """Fill what the pixels of a unit are, whatever they see; return how many are hot."""
+    on, off, hot, pixel, drawn = scratch.on, scratch.off, scratch.hot, scratch.pixel, scratch.drawn
+    on[:], off[:], hots = clip.on, clip.off, 0
+    if clip.spread > 0:
+        draw_bits(keys[MISMATCH], 2, 0, pixel, drawn)
+        spread_thresholds(clip.on, clip.spread, normals, drawn, on)
+        draw_bits(keys[MISMATCH], 2, 1, pixel, drawn)
+        spread_thresholds(clip.off, clip.spread, normals, drawn, off)
+    if clip.hot_share > 0:
+        draw_bits(keys[HOT], 1, 0, pixel, drawn)
+        for x in range(pixel.size):
+            if drawn[x] < clip.hot_share:
+                hot[hots] = x
+                hots += 1
+    return hots
 
-    `chip.shot` is their probability at black in 2**-32; at white it is a quarter (v2e).
+
+@kernel
+def draw_bits(key, each, word, pixel, drawn):
+    """Fill bits(key, 0, each * pixel + word): a pixel has `each` words of random bits."""
+    for x in range(pixel.size):
+        drawn[x] = bits(key, 0, uint32(each) * uint32(pixel[x]) + uint32(word))
+
+
+@kernel
+def spread_thresholds(threshold, spread, normals, drawn, out):
+    """Fill threshold * (1 + spread * normal), at least a quarter of the threshold."""
+    deviation, least = (threshold * spread) >> 20, threshold >> 2
+    for x in range(drawn.size):
+        cell, inside = drawn[x] >> uint32(20), np.int64(drawn[x] & uint32(0xFFFFF))
+        left = normals[cell]
+        normal = left + (((normals[cell + uint32(1)] - left) * inside) >> 20)
+        out[x] = max(threshold + ((deviation * normal) >> 20), least)
+
+
+@kernel
+def mix_pixels(key, pixel, mixed):
+    """Fill the part of bits(key, frame, 2 * pixel) that is the same in all frames."""
+    low = uint32(uint64(key) & uint64(0xFFFFFFFF))
+    for x in range(pixel.size):
+        mixed[x] = mix(uint32(2) * uint32(pixel[x]) ^ low)
+
+
+@kernel
+def mark_noise(clip, hots, scratch, key, frame, intensity):
+    """Mark the pixels with a noise event in interval `frame`.
+
+    `clip.shot` is its probability at black in 2**-32; at white it is a quarter (v2e).
     """
-    pixel, hot, shot, hot_rate = scratch.pixel, scratch.hot, chip.shot, chip.hot
+    mixed, noisy = scratch.mixed, scratch.noisy
+    upper = uint32(uint64(key) >> uint64(32)) + uint32(uint32(frame) * uint32(0x9E3779B9))
+    most, slope = uint32(clip.shot - 1), uint32(clip.shot >> 8)
+    if clip.shot > 0:  # then the probability is nowhere 0, and `most` one below it
+        for x in range(intensity.size):
+            seen = uint32(i32(min(max(intensity[x], f32(0)), f32(1)) * f32(256)))
+            rate = uint32(most - uint32(slope * uint32(uint32(uint32(3) * seen) >> uint32(2))))
+            noisy[x] = mix(uint32(mixed[x] + upper)) <= rate
+    for x in scratch.hot[:hots]:
+        noisy[x] = mix(uint32(mixed[x] + upper)) < clip.hot
+
+
+@kernel
+def draw_noise(scratch, key, frame, last):
+    """Fill times and polarities of the noise events of the active pixels; time 2 for none."""
+    pixel, noisy, active = scratch.pixel, scratch.noisy, scratch.active
     noise_u, noise_sign = scratch.noise_u, scratch.noise_sign
-    for x in range(intensity.size):
-        seen = np.int64(min(max(intensity[x], f32(0)), f32(1)) * f32(256))
-        rate = hot_rate if hot[x] else shot - (shot >> 8) * ((3 * seen) >> 2)
-        at = bits(key, frame, 2 * pixel[x] + 1)
+    for x in active[:last]:
+        at = bits(key, frame, uint32(2) * uint32(pixel[x]) + uint32(1))
         u = (f32(at >> uint32(9)) + f32(0.5)) * f32(2.0**-23)
-        noise_u[x] = u if np.int64(bits(key, frame, 2 * pixel[x])) < rate else f32(2)
+        noise_u[x] = u if noisy[x] else f32(2)
         noise_sign[x] = 1 if at & uint32(1) else -1
 
 
@@ -251,13 +321,15 @@ def find_active(mode, memory, scratch):
     """
     level, reference, dead = memory.level, memory.reference, memory.dead
     new, drift, on, off = scratch.level, scratch.drift, scratch.on, scratch.off
-    active, busy, noise_u = scratch.active, scratch.busy, scratch.noise_u
-    holds, count = mode == HOLD, 0
+    active, busy, noisy = scratch.active, scratch.busy, scratch.noisy
     for x in range(level.size):
         l0, l1, ref = level[x], np.int32(new[x] + drift[x]), reference[x]
-        reached = (max(l0, l1) - ref >= on[x]) | (ref - min(l0, l1) >= off[x])
-        busy[x] = reached | (noise_u[x] <= 1) | (holds & (dead[x] > 0))
-    eights = busy.view(np.uint64)
+        up, down = np.int32(max(l0, l1) - ref), np.int32(ref - min(l0, l1))
+        busy[x] = (up >= on[x]) | (down >= off[x]) | noisy[x]
+    if mode == HOLD:
+        for x in range(level.size):
+            busy[x] |= dead[x] > 0
+    eights, count = busy.view(np.uint64), 0
     for i in range(eights.size):
         if eights[i]:
             for x in range(8 * i, 8 * i + 8):
@@ -267,7 +339,7 @@ def find_active(mode, memory, scratch):
 
 
 @kernel
-def find_events(chip, memory, scratch, steps, done, last):
+def find_events(chip, wait, memory, scratch, steps, done, last):
     """Take the active pixels `done` .. `last` - 1 through an interval, until the batch is full.
 
     Returns the number of events in the batch and of the pixels that are done.
@@ -276,7 +348,7 @@ def find_events(chip, memory, scratch, steps, done, last):
     new, drift, on_, off_ = scratch.level, scratch.drift, scratch.on, scratch.off
     active, noise_u, noise_sign = scratch.active, scratch.noise_u, scratch.noise_sign
     batch = scratch.who, scratch.when, scratch.sign
-    wait, mode, v2e, count = chip.wait, chip.mode, chip.v2e, 0
+    mode, v2e, count = chip.mode, chip.v2e, 0
     while done < last and count <= level.size:
         x = active[done]
         on, off = np.int64(on_[x]), np.int64(off_[x])
@@ -298,11 +370,11 @@ def find_events(chip, memory, scratch, steps, done, last):
 @kernel
 def deliver(sink, place, scratch, number, clock):
     """Bring the first `number` events of the batch to where they go; `place` is the unit's."""
-    unit, c, v, first, width = place
+    unit, c, v, first, _, width = place
     who, when, sign = scratch.who, scratch.when, scratch.sign
     counts, offsets, events = sink.counts, sink.offsets, sink.events
     if sink.output == VOXELS:
-        add_to_grid(sink.voxels[c, v, clock[0], :, first:], who, when, sign, number, clock)
+        add_to_grid(sink.voxels[c, clock[0], v, :, first:], who, when, sign, number, clock)
     elif sink.output == COUNT:
         for i in range(number):
             counts[unit, 0 if sign[i] > 0 else 1] += 1
@@ -334,39 +406,64 @@ def stamp(u, clock):
 
 
 @kernel
-def start(table, intensity, memory):
-    """Set the memory to the first frame."""
-    read_levels(table, intensity, memory.level)
-    memory.source[:] = memory.level
-    memory.reference[:] = memory.level
-    memory.dead[:] = f32(0)
+def start(clip, key, memory, scratch):
+    """Let the memory begin with its levels, the references off from them by the residual."""
+    level, reference, drawn = memory.level, memory.reference, scratch.drawn
+    memory.source[:], reference[:], memory.dead[:] = level, level, f32(0)
+    if clip.residual > 0:
+        draw_bits(key, 1, 0, scratch.pixel, drawn)
+        for x in range(level.size):
+            uniform = (f32(drawn[x] >> uint32(9)) + f32(0.5)) * f32(2.0**-23)
+            away = np.float64(f32(2) * uniform - f32(1)) * clip.residual
+            threshold = scratch.on[x] if away > 0 else scratch.off[x]
+            reference[x] = level[x] - i32(away * threshold)
 
 
 @kernel
-def advance(chip, memory, scratch, sink, place, clock):
-    """Take one unit through one interval, at whose end the levels are those of the scratch."""
+def advance(chip, clip, memory, scratch, sink, place, key, frame, clock):
+    """Take one unit through interval `frame`, at whose end the levels are those of the scratch."""
     level, reference, dead = memory.level, memory.reference, memory.dead
     new, drift = scratch.level, scratch.drift
     steps = busiest(chip.mode, memory, scratch) if chip.v2e else np.int64(1)
     done, last = 0, find_active(chip.mode, memory, scratch)
+    if clip.shot or clip.hot:
+        draw_noise(scratch, key, frame, last)
     while done < last:
-        number, done = find_events(chip, memory, scratch, steps, done, last)
+        number, done = find_events(chip, f32(clip.wait), memory, scratch, steps, done, last)
         deliver(sink, place, scratch, number, clock)
+    if clip.leak:
+        for x in range(level.size):
+            reference[x] -= drift[x]
+    level[:] = new
     for x in range(level.size):
-        reference[x] -= drift[x]
-        level[x], dead[x] = new[x], max(dead[x] - f32(1), f32(0))
+        dead[x] = max(dead[x] - f32(1), f32(0))
 
 
 @kernel
-def see(chip, memory, scratch, intensity, key, frame):
-    """Fill the scratch with what interval `frame` brings: levels at its end, noise and leak."""
-    read_levels(chip.tables[0], intensity, scratch.level)
-    if chip.tables[1].size > 1:
-        low_pass(chip.tables[1], chip.tables[2], intensity, memory, scratch.level)
-    if chip.shot or chip.hot:
-        draw_noise(chip, scratch, key, frame, intensity)
-    if chip.leak:
-        draw_leak(chip.leak, scratch, frame)
+def see(chip, frames, place, frame, scratch, levels):
+    """Fill levels before the low-pass and return (light, whether any of it may be wrong).
+
+    `frames` are two arrays: float32, and the bits of float16, one of them empty.
+    """
+    _, c, v, first, last, _ = place
+    wide, halves = frames
+    if halves.size:
+        seen = scratch.intensity
+        return seen, read_halves(chip.level, halves[c, v, frame, first:last], seen, levels)
+    seen = wide[c, v, frame, first:last]
+    return seen, read_levels(chip.level, seen, levels)
+
+
+@kernel
+def disturb(chip, clip, hots, memory, scratch, intensity, key, frame):
+    """Let the low-pass, noise and leak have their part in interval `frame`."""
+    if len(chip.low_pass):
+        tables = chip.low_pass[clip.low_pass]
+        low_pass(tables[0], tables[1], intensity, memory, scratch.level)
+    if clip.shot or hots:
+        mark_noise(clip, hots, scratch, key, frame, intensity)
+    if clip.leak:
+        draw_leak(clip.leak, scratch, frame)
 
 
 @kernel
@@ -382,8 +479,10 @@ def make_scratch(size, smallest):
     """Return the scratch; a pixel has no more events in an interval than thresholds in 32 nat."""
     whole, room = (size + 7) // 8 * 8, size + 32 + (1 << 25) // max(smallest >> 2, 1024)
     return Scratch(
-        np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int32),
-        np.empty(size, np.bool_), np.zeros(size, np.int32), np.empty(size, np.int32),
+        np.empty(size, np.int32), np.empty(size, np.uint32), np.empty(size, np.uint32),
+        np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.uint32),
+        np.zeros(size, np.int32),
+        np.empty(size, np.float32), np.empty(size, np.int32), np.zeros(size, np.uint8),
         np.empty(whole + 1, np.uint32), np.zeros(whole, np.uint8),
         np.full(size, f32(2)), np.ones(size, np.int8),
         np.empty(room, np.uint32), np.empty(room, np.float32), np.empty(room, np.int8),
@@ -394,9 +493,12 @@ def make_scratch(size, smallest):
 def simulate(
     first_unit, last_unit, size, frames, fresh, chip, memory, edges, first, substeps, sink
 ):
-    """Simulate units first_unit .. last_unit - 1: `size` consecutive pixels of a view each."""
-    _, views, samples, pixels = frames.shape
-    units = (pixels + size - 1) // size
+    """Simulate units first_unit .. last_unit - 1: `size` consecutive pixels of a view each.
+
+    Returns whether any light is negative or above 1.
+    """
+    views, pixels = memory.level.shape[1:]
+    units, doubtful = (pixels + size - 1) // size, False
     for unit in range(first_unit, last_unit):
         c, v, a = unit // (views * units), unit // units % views, unit % units * size
         b = min(a + size, pixels)
@@ -404,15 +506,20 @@ def simulate(
             memory.level[c, v, a:b], memory.source[c, v, a:b],
             memory.reference[c, v, a:b], memory.dead[c, v, a:b],
         )  # fmt: skip
-        scratch = make_scratch(b - a, chip.chips[:, :2].min())
-        make_chip(chip, c, v, a, scratch)
+        clip, keys, place = chip.clips[c], chip.keys[c, v], (unit, c, v, a, b, chip.width)
+        scratch = make_scratch(b - a, min(clip.on, clip.off))
+        number_pixels(clip, chip.width, a, scratch.pixel)
+        hots = make_chip(clip, keys, chip.normals, scratch)
+        mix_pixels(keys[SHOT], scratch.pixel, scratch.mixed)
         if fresh:
-            start(chip.tables[0], frames[c, v, 0, a:b], own)
-        for i in range(samples - fresh):
-            clock = clock_at(edges, i, substeps, sink.voxels.shape[3])
-            if sink.output == VOXELS and i % substeps == 0:
-                sink.voxels[c, v, clock[0], :, a:b] = f32(0)
-            see(chip, own, scratch, frames[c, v, i + fresh, a:b], chip.shot_keys[c, v], first + i)
-            advance(chip, own, scratch, sink, (unit, c, v, a, chip.place[3]), clock)
-        if chip.tables[1].size == 1:
+            doubtful |= see(chip, frames, place, 0, scratch, own.level)[1]
+            start(clip, keys[RESIDUAL], own, scratch)
+        for i in range(edges.shape[1] - 1):
+            clock = clock_at(edges[c], i, substeps, sink.voxels.shape[3])
+            light, beyond = see(chip, frames, place, i + fresh, scratch, scratch.level)
+            disturb(chip, clip, hots, own, scratch, light, keys[SHOT], first + i)
+            advance(chip, clip, own, scratch, sink, place, keys[SHOT], first + i, clock)
+            doubtful |= beyond
+        if not len(chip.low_pass):
             own.source[:] = own.level
+    return doubtful

@@ -1,10 +1,13 @@
-"""The sensor for CUDA as one kernel (Triton): a pixel's memory stays in registers over the clip.
+"""The sensor for CUDA as one kernel (Triton) for all clips and views of a batch: what a pixel is
+and what it remembers stay in registers over the clip.
 
 A program owns a run of pixels of one view, with all their bins, so that no sum depends on an order
 other than that of time.  The formulas are those of sensor_numba.py, in integers and in
 floats without fused multiply-add, so that the events are the same bit for bit.  v2e's stamps, for
 which all pixels of a view must be known at once, are left to plain torch.
 """
+
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -13,88 +16,128 @@ import triton.language as tl
 from torch import Tensor
 
 from src.sim.sensor.engines import job as jobs
-from src.sim.sensor.engines.job import Job
-from src.sim.sensor.engines.sensor_eager import Pixels
+from src.sim.sensor.engines.job import NORMALS, Job
+from src.sim.sensor.engines.triton_pixel import (
+    FIELDS,
+    FULL_WIDTH,
+    KEYS,
+    LEAK,
+    LEFT,
+    LOW_PASS,
+    NEVER,
+    SHOT_KEY,
+    TOP,
+    WAIT,
+    chip_of,
+    filtered,
+    is_outside,
+    look,
+    nearest,
+    noise_chance,
+    noise_event,
+    number64,
+    place_of,
+    residual,
+    way,
+)
+from src.sim.sensor.limits import check_intensities
 
 BLOCK = 128  # pixels of a program
 DELETE, HOLD = tl.constexpr(jobs.DELETE), tl.constexpr(jobs.HOLD)
-NEVER = tl.constexpr(2.0)  # a time after the interval
+SIZES = (
+    "clip_step", "view_step", "frame_step", "row_step", "column_step", "n", "views", "pixels",
+    "width", "intervals", "substeps", "first", "nodes",
+)  # fmt: skip
 
 
 def voxels(job: Job, grids: Tensor) -> Tensor:
-    """Fill `grids` (n, views, windows, bins, h, w) and return them; `job.state` moves on."""
-    n, views, samples, height, width = job.frames.shape
-    chip, state, bins = Pixels(job), job.state, grids.shape[3]
-    memory = (state.level, state.source, state.reference, state.dead)
-    clock, scales = _clock(job, bins)
-    numbers = np.array([job.leak, job.shot, job.hot, state.frame], np.int64)
-    on_device = (
-        torch.from_numpy(part).to(job.frames.device)
-        for part in (job.shot_keys, numbers, clock, scales)
-    )
-    pixels = height * width
+    """Fill `grids` (n, windows, views, bins, h, w) and return them; `job.state` moves on.
+
+    Raises ValueError, afterwards, for frames that are not finite or outside [0, 1].
+    """
+    n, views, _, height, width = job.frames.shape
+    state, bins, device = job.state, grids.shape[3], grids.device
+    numbers = np.concatenate([job.clips.view(np.int64), job.keys.ravel(), job.edges.ravel()])
+    wrong = torch.zeros(1, dtype=torch.int32, device=device)
+    noisy = job.clips["shot"].any() or job.clips["hot"].any()
     with torch.cuda.device_of(grids):
-        _simulate[(triton.cdiv(pixels, BLOCK), n * views)](
-            job.frames.contiguous(), *memory, chip.on, chip.off, chip.hot.contiguous(), chip.pixel,
-            *job.tables, *on_device, grids, float(np.float32(job.wait)), pixels, samples,
-            job.intervals, job.substeps, job.mode, int(job.fresh), len(job.tables[1]) > 1,
-            max(job.shot, job.hot) > 0, bins, triton.next_power_of_2(bins), BLOCK,
-            enable_fp_fusion=False,
+        _simulate[(triton.cdiv(height * width, BLOCK), n * views)](
+            job.frames, state.level, state.source, state.reference, state.dead, job.level,
+            job.low_pass, _normals(device), torch.from_numpy(numbers).to(device), grids, wrong,
+            *job.frames.stride(), n, views, height * width, width, job.intervals, job.substeps,
+            state.frame, job.low_pass.shape[2], job.mode, job.fresh, len(job.low_pass) > 0,
+            bool(noisy), bins, triton.next_power_of_2(bins), BLOCK, enable_fp_fusion=False,
         )  # fmt: skip
+    if wrong:
+        check_intensities(job.frames)
     return grids
 
 
-def _clock(job: Job, bins: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return (intervals, 2), start in the window and length in us, and windows' bins per us."""
-    starts = job.edges[:: job.substeps]
-    begins = job.edges[:-1] - np.repeat(starts[:-1], job.substeps)
-    scales = np.float32(bins - 1) / np.diff(starts).astype(np.float32)
-    return np.stack([begins, np.diff(job.edges)], 1), scales
+@lru_cache(maxsize=8)
+def _normals(device: torch.device) -> Tensor:
+    return torch.from_numpy(NORMALS).to(device)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def _simulate(
-    frames, levels, sources, references, deads, ons, offs, hots, numbering, table, decay, lag, keys,
-    numbers, clock, scales, grids, wait, pixels, samples, intervals, substeps, MODE: tl.constexpr,
-    FRESH: tl.constexpr, FILTERED: tl.constexpr, NOISY: tl.constexpr, BINS: tl.constexpr,
-    COLUMNS: tl.constexpr, BLOCK: tl.constexpr,
+    frames, levels, sources, references, deads, table, low_pass, normals, numbers, grids, wrong,
+    clip_step, view_step, frame_step, row_step, column_step, n, views, pixels, width, intervals,
+    substeps, first, nodes, MODE: tl.constexpr, FRESH: tl.constexpr, FILTERED: tl.constexpr,
+    NOISY: tl.constexpr, BINS: tl.constexpr, COLUMNS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Take BLOCK pixels of one clip and view through all intervals."""
+    """Take BLOCK pixels of one clip and view through all intervals.
+
+    `numbers`: the clips' (n, FIELDS), the keys (n, views, KEYS) and the edges (n, intervals + 1).
+    """
     unit = tl.program_id(1).to(tl.int64)
+    clip, view = unit // views, unit % views
     x = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     own, at = x < pixels, unit * pixels + x
-    on, off = tl.load(ons + at, own, 1).to(tl.int32), tl.load(offs + at, own, 1).to(tl.int32)
-    leak, first = on.to(tl.int64) * tl.load(numbers), tl.load(numbers + 3)
-    level, source = tl.load(levels + at, own, 0), tl.load(sources + at, own, 0)
-    ref, dead = tl.load(references + at, own, 0), tl.load(deads + at, own, 0.0)
-    frame = frames + unit * samples * pixels + x
+    y = x // width
+    row, col = y.to(tl.int64), (x - y * width).to(tl.int64)
+    frame = frames + clip * clip_step + view * view_step + row * row_step + col * column_step
+    chip, keys = numbers + clip * FIELDS, numbers + n * FIELDS + unit * KEYS
+    edges = numbers + n * (FIELDS + views * KEYS) + clip * (intervals + 1)
+    pixel = (tl.load(chip + TOP) + row) * tl.load(chip + FULL_WIDTH) + tl.load(chip + LEFT) + col
+    on, off, hot = chip_of(chip, keys, normals, pixel)
+    leak = on.to(tl.int64) * tl.load(chip + LEAK)
+    wait = tl.zeros([BLOCK], tl.float32) + number64(chip + WAIT).to(tl.float32)
+    key, begun = tl.load(keys + SHOT_KEY), tl.full((), 0, tl.int64) + first
+    bad = tl.zeros([BLOCK], tl.int1)
     if FRESH:
-        level = _look(table, _place(tl.load(frame, own, 0.0)))
-        source, ref, dead = level, level, tl.zeros([BLOCK], tl.float32)
-        frame += pixels
+        intensity = tl.load(frame, own, 0.0).to(tl.float32)
+        bad = is_outside(intensity)
+        level = look(table, place_of(intensity))
+        ref = level - residual(chip, keys, pixel, on, off)
+        source, dead = level, tl.zeros([BLOCK], tl.float32)
+        frame += frame_step
+    else:
+        level, source = tl.load(levels + at, own, 0), tl.load(sources + at, own, 0)
+        ref, dead = tl.load(references + at, own, 0), tl.load(deads + at, own, 0.0)
+    decay = low_pass + 2 * nodes * tl.load(chip + LOW_PASS)
     column = tl.arange(0, COLUMNS)[None, :]
     grid = tl.zeros([BLOCK, COLUMNS], tl.float32)
-    cell = grids + unit * (intervals // substeps) * BINS * pixels + column * pixels + x[:, None]
+    size = views * BINS * pixels.to(tl.int64)
+    cell = grids + (clip * (intervals // substeps)) * size + view * BINS * pixels
+    cell = cell + column * pixels + x[:, None]
     for i in range(intervals):
-        intensity = tl.load(frame, own, 0.0)
-        place = _place(intensity)
-        read = _look(table, place)
+        intensity = tl.load(frame, own, 0.0).to(tl.float32)
+        bad = bad | is_outside(intensity)
+        place = place_of(intensity)
+        read = look(table, place)
         new = read
         if FILTERED:
-            new = _low_pass(read, level, source, _look(decay, place), _look(lag, place))
-        drift = ((leak * (first + i + 1) >> 24) - (leak * (first + i) >> 24)).to(tl.int32)
+            kept, lag = look(decay, place), look(decay + nodes, place)
+            new = filtered(read, level, source, kept, lag)
+        drift = ((leak * (begun + i + 1) >> 24) - (leak * (begun + i) >> 24)).to(tl.int32)
         delta = new + drift - level
         along = tl.where(delta >= 0, 1, -1)
         ahead, behind = tl.where(delta >= 0, on, off), tl.where(delta >= 0, off, on)
         span, mark = tl.abs(delta), (ref - level) * along
-        begin, ticks = tl.load(clock + 2 * i), tl.load(clock + 2 * i + 1)
-        scale = tl.load(scales + i // substeps)
+        begin, ticks, scale = _clock(edges, i, substeps, BINS)
         start, holding = tl.zeros([BLOCK], tl.float32), (dead > 0) & (MODE == HOLD)
         if NOISY:
-            chance = _chance(numbers, tl.load(hots + at, own, 0), intensity)
-            u, sign = _noise(
-                tl.load(keys + unit), first + i, tl.load(numbering + x, own, 0), chance
-            )
+            u, sign = noise_event(key, begun + i, pixel, noise_chance(chip, hot, intensity))
             u = tl.where(own, u, NEVER)
             stop = tl.minimum(u, 1.0)
             grid, mark, dead, holding = _until(
@@ -103,7 +146,7 @@ def _simulate(
             )  # fmt: skip
             fired = (u <= 1) & (u >= dead)
             grid = _add(grid, fired, u, sign, begin, ticks, scale, column, BINS)
-            mark = tl.where(fired, _way(span, u), mark)
+            mark = tl.where(fired, way(span, u), mark)
             dead = tl.where(fired, u + wait, dead)
             holding = holding | (fired & (MODE == HOLD) & (wait > 0))
             start = stop
@@ -113,15 +156,26 @@ def _simulate(
         )  # fmt: skip
         ref, dead = level + mark * along - drift, tl.maximum(dead - 1, 0.0)
         level, source = new, read
-        frame += pixels
+        frame += frame_step
         if (i + 1) % substeps == 0:
             tl.store(cell, grid, own[:, None] & (column < BINS))
             grid = tl.zeros([BLOCK, COLUMNS], tl.float32)
-            cell += BINS * pixels
+            cell += size
     tl.store(levels + at, level, own)
     tl.store(sources + at, source, own)
     tl.store(references + at, ref, own)
     tl.store(deads + at, dead, own)
+    tl.store(wrong + tl.zeros([BLOCK], tl.int32), 1, own & bad)
+
+
+@triton.jit
+def _clock(edges, i, substeps, BINS: tl.constexpr):
+    """Return the interval's start in its window and its length, in us, and bins per us."""
+    origin = i // substeps * substeps
+    begin, window = tl.load(edges + i), tl.load(edges + origin)
+    length = (tl.load(edges + origin + substeps) - window).to(tl.float32)
+    scale = tl.math.div_rn(tl.full((), BINS - 1, tl.float32), length)
+    return begin - window, tl.load(edges + i + 1) - begin, scale
 
 
 @triton.jit
@@ -133,7 +187,7 @@ def _until(
     going = own
     while tl.max(going.to(tl.int32), 0) > 0:
         ends = holding & (dead <= stop)  # the reset ends
-        mark = tl.where(ends, _way(span, dead), mark)
+        mark = tl.where(ends, way(span, dead), mark)
         holding = holding & (dead > stop)
         now = start
         if MODE != DELETE:
@@ -153,10 +207,10 @@ def _until(
 @triton.jit
 def _next(span, mark, ahead, behind, now):
     """Return time and step of the first threshold exceeded at or after `now`; NEVER if none."""
-    way = span.to(tl.float32)
-    u = tl.math.div_rn((mark + ahead).to(tl.float32), tl.maximum(way, 1.0))
+    length = span.to(tl.float32)
+    u = tl.math.div_rn((mark + ahead).to(tl.float32), tl.maximum(length, 1.0))
     u = tl.where(mark + ahead > span, NEVER, tl.maximum(u, now))
-    before = (mark >= behind) & ((mark - behind).to(tl.float32) >= now * way)
+    before = (mark >= behind) & ((mark - behind).to(tl.float32) >= now * length)
     return tl.where(before, now, u), tl.where(before, -behind, ahead)
 
 
@@ -166,72 +220,7 @@ def _add(grid, fired, u, sign, begin, ticks, scale, column, BINS: tl.constexpr):
     tick = tl.maximum(tl.ceil(u * ticks.to(tl.float32)).to(tl.int64) - 1, 0) + begin
     tau = tick.to(tl.float32) * scale
     b = tl.minimum(tau.to(tl.int32), BINS - 1)
-    late = _whole((tau - b.to(tl.float32)) * 1048576.0) * (1 / 1048576.0)
+    late = nearest((tau - b.to(tl.float32)) * 1048576.0) * (1 / 1048576.0)
     sign = tl.where(fired, sign, 0).to(tl.float32)
     grid += tl.where(column == b[:, None], (sign * (1 - late))[:, None], 0.0)
     return grid + tl.where(column == b[:, None] + 1, (sign * late)[:, None], 0.0)
-
-
-@triton.jit
-def _chance(numbers, hot, intensity):
-    """Return the probability of a noise event in 2**-32; at white it is a quarter of black's."""
-    shot, hot_rate = tl.load(numbers + 1), tl.load(numbers + 2)
-    seen = (tl.minimum(tl.maximum(intensity, 0.0), 1.0) * 256.0).to(tl.int64)
-    return tl.where(hot != 0, hot_rate, shot - (shot >> 8) * ((3 * seen) >> 2))
-
-
-@triton.jit
-def _noise(key, frame, pixel, chance):
-    """Return time (NEVER for none) and polarity of the noise events of interval `frame`."""
-    drawn, at = _bits(key, frame, 2 * pixel), _bits(key, frame, 2 * pixel + 1)
-    u = ((at >> 9).to(tl.float32) + 0.5) * (1 / 8388608.0)
-    return tl.where(drawn.to(tl.int64) < chance, u, NEVER), tl.where(at & 1 == 1, 1, -1)
-
-
-@triton.jit
-def _bits(key, high, low):
-    """The 32 bits of src.sim.noise.bits(key, high * 2**32 + low)."""
-    mixed = _mix(low.to(tl.uint32) ^ (key & 0xFFFFFFFF).to(tl.uint32))
-    upper = high.to(tl.uint32) * 0x9E3779B9 + (key >> 32).to(tl.uint32)
-    return _mix(mixed + upper)
-
-
-@triton.jit
-def _mix(x):
-    """The 32-bit finaliser of src.sim.noise."""
-    x = (x ^ (x >> 16)) * 0x7FEB352D
-    x = (x ^ (x >> 15)) * 0x846CA68B
-    return x ^ (x >> 16)
-
-
-@triton.jit
-def _place(intensity):
-    """Return the place in the tables of an intensity, as src.sim.sensor.response.lookup has it."""
-    bits = intensity.to(tl.int32, bitcast=True)
-    return tl.minimum(tl.maximum(bits, 0x38800000), 0x3FFFFFFF) - 0x38800000
-
-
-@triton.jit
-def _low_pass(read, level, source, decay, lag):
-    """Return the new level after the low-pass from the one before it, `read`, and the memory."""
-    kept = (level - source).to(tl.int64) * decay - (read - source).to(tl.int64) * lag
-    return read + ((kept + 524288) >> 20).to(tl.int32)
-
-
-@triton.jit
-def _look(table, place):
-    """Return the table's value at a place."""
-    left, right = tl.load(table + (place >> 13)), tl.load(table + (place >> 13) + 1)
-    return (left + (((right - left) * (place & 8191)) >> 13) + 8) >> 4
-
-
-@triton.jit
-def _way(span, u):
-    """Return how far a level that moves by `span` in an interval has come at fraction `u`."""
-    return _whole(u * span.to(tl.float32)).to(tl.int32)
-
-
-@triton.jit
-def _whole(x):
-    """Return `x`, not negative, rounded to the nearest whole number, halves to even."""
-    return tl.where(x < 8388608.0, x + 8388608.0 - 8388608.0, x)

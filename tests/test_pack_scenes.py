@@ -1,0 +1,131 @@
+"""The pack of photographs: its splits, its budget, its checksums."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from scripts import pack_scenes
+from scripts.pack_scenes import MIB, WORST, pack
+from src.sim.scenes.photo_files import SPLITS, photographs, read
+from src.sim.scenes.photo_pack import check
+from src.sim.scenes.photographs import Photographs
+from tests.conftest import ROOT
+
+PHOTOS = ROOT / "../shared/data/photos"
+
+
+@pytest.fixture
+def folders(tmp_path) -> list[str]:
+    """Three folders of 12, 15 and 11 smooth photographs of 60 x 90 px; the last below another."""
+    draw, folders = np.random.default_rng(0), []
+    for name, count in (("b", 12), ("a", 15), ("c", 11)):
+        folder = tmp_path / "photos" / name
+        inner = folder / "inner" if name == "c" else folder
+        inner.mkdir(parents=True)
+        folders.append(str(folder))
+        for number in range(count):
+            rough = draw.integers(0, 256, (12, 18), np.uint8)
+            cv2.imwrite(
+                str(inner / f"{number:02}.png"),
+                cv2.resize(rough, (90, 60), interpolation=cv2.INTER_CUBIC),
+            )
+    return folders
+
+
+def names(photos: list, folder: str) -> list[str]:
+    """Names as a pack has them, of what is below the parent of `folder`."""
+    return [path.relative_to(Path(folder).parent).as_posix() for path in photos]
+
+
+def test_the_splits_are_those_of_the_folders_and_training_alone_gets_more(folders, tmp_path):
+    out = tmp_path / "new" / "photos.pack"
+    line = pack(folders[:2], out, side=32, mib=1.0, train_only=folders[2:])
+    assert line.startswith(f"{out}: 38 photographs (31 train, 3 val, 4 test), WebP at quality 100")
+    for split in SPLITS:
+        expected = names(photographs(folders[:2], split), folders[0])
+        if split == "train":
+            expected += [f"c/inner/{number:02}.png" for number in range(11)]
+        assert [photo.name for photo in photographs(str(out), split)] == expected
+    assert [path.name for path in out.parent.iterdir()] == ["photos.pack"]
+
+
+def test_pictures_are_those_of_the_folders_made_smaller_never_larger(folders, tmp_path):
+    for side, shape in ((32, (32, 48)), (200, (60, 90))):
+        out = tmp_path / f"{side}.pack"
+        pack(folders[:1], out, side=side, mib=1.0)
+        for ours, theirs in zip(
+            photographs(str(out), "train"), photographs(folders[:1], "train"), strict=True
+        ):
+            whole = cv2.resize(read(theirs), shape[::-1], interpolation=cv2.INTER_AREA)
+            assert read(ours).shape == shape
+            assert np.abs(read(ours).astype(float) - whole).mean() < 2.5
+
+
+def test_the_quality_is_the_best_that_fits(folders, tmp_path):
+    sources = pack_scenes.read(folders, [], 64)
+    sizes = [len(pack_scenes.packed(pack_scenes._encoded(sources, q))) for q in (40, 41)]
+    assert sizes[0] < sizes[1]
+    for size in sizes:
+        quality, content = pack_scenes.fitting(sources, size / MIB)
+        assert len(content) <= size and (quality == 40) == (size == sizes[0])
+    tight = pack(folders, tmp_path / "tight.pack", side=64, mib=sizes[0] / MIB)
+    assert "quality 40," in tight and (tmp_path / "tight.pack").stat().st_size == sizes[0]
+
+
+def test_a_budget_that_cannot_be_kept_is_refused_before_anything_is_written(folders, tmp_path):
+    out = tmp_path / "new" / "small.pack"
+    with pytest.raises(ValueError, match=rf"mib must be >= 0.\d\d for 27 .* quality {WORST}.*0.01"):
+        pack(folders[:2], out, side=60, mib=0.01)
+    assert not out.parent.exists()
+
+
+def test_what_stands_there_stays_where_a_pack_fails(folders, tmp_path):
+    out = tmp_path / "photos.pack"
+    out.write_bytes(b"before")
+    (Path(folders[0]) / "99.jpg").write_bytes(b"no picture")
+    with pytest.raises(ValueError, match="FOLDER must hold readable photographs .*99.jpg"):
+        pack(folders, out, side=32, mib=1.0)
+    assert out.read_bytes() == b"before"
+    assert not [path for path in tmp_path.iterdir() if "partial" in path.name]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["side=8"], "error: side must be in 16..4096 (px), got 8"),
+        (["side=many"], "error: side must be a number, got many"),
+        (["mib=0"], "error: mib must be >= 0.0"),
+        (["train_only=/nowhere"], "error: scene.train_root must be a folder or a pack of"),
+        (["train_only=photos"], "error: scene.train_root must be apart from scene.root"),
+        (["quality=5"], "Photographs in one small file"),
+    ],
+)
+def test_the_command_line_is_refused_in_one_line(words, message, folders, tmp_path):
+    line = [sys.executable, "-m", "scripts.pack_scenes", *folders, str(tmp_path / "out.pack")]
+    words = [word.replace("=photos", f"={tmp_path}/photos") for word in words]
+    done = subprocess.run([*line, *words], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode and message in done.stderr and not (tmp_path / "out.pack").exists()
+    assert "Traceback" not in done.stderr
+
+
+def test_folders_of_one_name_are_refused(folders, tmp_path):
+    with pytest.raises(ValueError, match="FOLDER must differ in name from the others, got b, b"):
+        pack_scenes.read([folders[0], f"{folders[1]}/../b"], [], 32)
+
+
+@pytest.mark.skipif(not PHOTOS.is_dir(), reason="needs ../shared/data/photos")
+def test_the_splits_of_the_real_photographs_come_out_as_they_are(tmp_path):
+    folders = [str(PHOTOS / name) for name in ("bsds500_train", "bsds500_val")]
+    out = tmp_path / "bsds.pack"
+    pack(folders, out, side=48, mib=1.0)
+    assert check(out) == 300
+    for split in SPLITS:
+        packed, files = photographs(str(out), split), photographs(folders, split)
+        assert [photo.name for photo in packed] == names(files, folders[0])
+    clip = Photographs(str(out), split="test", frames=2, height=32, width=32).clip(0)
+    plain = Photographs(folders, split="test", frames=2, height=32, width=32).clip(0)
+    assert clip.name == plain.name
