@@ -69,10 +69,12 @@ def bank(cfg: DictConfig) -> Bank | DeviceCache:
     """Return the cache of turbulence that `data.bank` asks for, named by all that makes its clips;
     in a device's memory it is the same one for all that ask for the same in this process.
 
-    Nine views or fewer come out of one cache: view i depends on the draws of view i only.
+    Nine views or fewer come out of one cache: view i depends on the draws of view i only.  Without
+    turbulence all views are alike, so that there are as many as asked for.
     """
     optics, side = part(cfg, "optics"), _count(cfg, "data.bank_crop")
-    if set(optics.positions) <= set(layout(9)):
+    clear = OmegaConf.select(cfg, "turbulence.atmosphere.severity") == "none"
+    if not clear and set(optics.positions) <= set(layout(9)):
         optics = replace(optics, views=9, positions=layout(9))
     windows, substeps = _count(cfg, "data.bank_windows"), _count(cfg, "data.substeps")
     source = _simulation(cfg, "train", windows=windows, optics=optics, crop=side, clips=None)

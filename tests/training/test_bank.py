@@ -222,6 +222,7 @@ def test_wrong_values_of_a_config_are_one_line(wrong, message, tmp_path):
         (["optics=lf1x3", "data.bank=5", "data.windows=2", "data.crop=20"], True),
         (["sensor=paper", "augment=none", "data.bank_gib=3"], True),
         (["optics=lf5x5"], False),
+        (["optics=single", "turbulence=none"], False),
         (["sensor.input=srgb"], False),
         (["seed=1"], False),
         (["turbulence=medium"], False),
@@ -236,6 +237,19 @@ def test_a_bank_is_shared_by_all_that_its_clips_do_not_depend_on(changed, same, 
         simulations.bank(config("train", tmp_path, *SMALL, *asked, *more)) for more in ([], changed)
     )
     assert (first.folder == other.folder) == same
+
+
+def test_without_turbulence_a_cache_holds_the_views_asked_for(tmp_path):
+    asked = [
+        *SMALL,
+        "turbulence=none",
+        "optics=single",
+        "data.bank=1",
+        f"data.bank_root={tmp_path}",
+    ]
+    chain = build.pipeline(config("train", tmp_path, *asked), "train")
+    assert chain.bank.clip(0)["views"].shape[0] == 1
+    assert chain.simulate([chain.draw(0)]).voxels.shape[2] == 1
 
 
 def test_batches_are_the_same_whatever_the_workers_and_the_step_begun_at(tmp_path):

@@ -108,7 +108,9 @@ def by_hand(
 
 @pytest.mark.parametrize("detach_every", [0, 1, 4, 6])
 def test_a_step_equals_the_step_written_out(detach_every, monkeypatch):
-    monkeypatch.setattr(reconstructor, "PICTURES", {"cpu": 5})  # pieces of the loss cut through clips
+    monkeypatch.setattr(
+        reconstructor, "PICTURES", {"cpu": 5}
+    )  # pieces of the loss cut through clips
     ours, theirs = fit(Leaky(), detach_every), by_hand(detach_every)
     for mine, other in zip(ours.parameters(), theirs.parameters(), strict=True):
         assert torch.allclose(mine, other, atol=1e-6)

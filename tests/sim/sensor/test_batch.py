@@ -225,3 +225,19 @@ def test_light_that_rounding_put_outside_is_taken():
     frames = clips()
     frames[1, 0, 2, :, :4] = torch.tensor([-0.0, -9e-5, 1.00009, 1.0])
     assert torch.isfinite(batch.voxels(sensors(False), frames, views=VIEWS, **KEYS)).all()
+
+
+def test_where_tritons_kernel_fails_plain_torch_goes_on_and_it_is_said(monkeypatch):
+    class Failing:
+        @staticmethod
+        def voxels(job, grids):
+            raise RuntimeError("Failed to find C compiler")
+
+    sensor, frames = EventSensor(0.2), signals(0, 5)[None]
+    frames = frames if frames.ndim == 5 else frames[None]
+    expected = sensor.voxels(frames, 120.0)
+    monkeypatch.setattr(run, "engine", lambda job: Failing)
+    monkeypatch.setattr(run, "WITHOUT_TRITON", [])
+    with pytest.warns(UserWarning, match="Triton fails, plain PyTorch .* C compiler"):
+        seen = sensor.voxels(frames, 120.0)
+    assert torch.equal(seen, expected) and len(run.WITHOUT_TRITON) == 1
