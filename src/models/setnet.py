@@ -261,7 +261,7 @@ def _windows(maps: Tensor, n: int, shown: Sequence[int]) -> Tensor:
 @torch.inference_mode(False)
 def _on_device(numbers: tuple, device: torch.device) -> Int[Tensor, "..."]:
     """Return whole numbers as a tensor; kept, as a CUDA graph can copy nothing to the device."""
-    return torch.tensor(numbers, device=device)
+    return torch.tensor(numbers, dtype=torch.long, device=device)
 
 
 def _cast(x: Float[Tensor, "windows n c h w"], dtype: torch.dtype) -> Float[Tensor, "m c h w"]:

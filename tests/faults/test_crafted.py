@@ -21,7 +21,7 @@ from src.models import files
 from src.recordings import views
 from src.recordings.calibration import alignment
 from src.recordings.files import aedat, columns, formats, safe_yaml, sources
-from src.sim.scenes import photographs, pictures, videos
+from src.sim.scenes import photo_files, pictures, videos
 from src.sim.scenes.pictures import LARGEST_PIXELS
 from src.simulate import alike
 from tests.faults.test_inputs import film, network, unpacked
@@ -182,7 +182,7 @@ def test_a_picture_does_not_unpack_without_bound(tmp_path):
     with pytest.raises(ValueError, match="readable picture of at most"):
         sources.sensor_picture(path)
     with pytest.raises(ValueError, match="readable photographs"):
-        photographs._read(path)
+        photo_files.read(path)
 
 
 GROWING = "a: &a [x, x]\nb: &b [*a, *a]\nc: &c [*b, *b]\n"

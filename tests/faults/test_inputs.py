@@ -50,10 +50,10 @@ def read_corners(path: Path) -> None:
 
 def read_picture(path: Path) -> None:
     from src.recordings.files import sources
-    from src.sim.scenes import photographs
+    from src.sim.scenes import photo_files
 
     sources.sensor_picture(path)
-    photographs._read(path)
+    photo_files.read(path)
 
 
 def read_film(path: Path) -> None:

@@ -17,7 +17,7 @@ from tests.faults.test_kills import training
 def test_no_clip_is_made_by_two_processes_and_none_is_left_out():
     def clips(size: int, rank: int, world: int) -> list[list[int]]:
         sampler = StepSampler(size, 6, lambda: 0, reuse=1, rank=rank, world=world)
-        return [[clip for clip, _ in batch] for batch in sampler]
+        return [[item.clip for item in batch] for batch in sampler]
 
     joint = clips(6, 0, 1)
     for world in (2, 3):
