@@ -1,15 +1,18 @@
-"""Turbulence for nine views: python -m benchmarks.turbulence [table | prior] [another checkout]
+"""Turbulence for nine views: python -m benchmarks.turbulence [what ...] [another checkout]
 
 `table`: ms a frame of 256x256, clips of 4 frames, two threads, where air is local: a pixel of 0.04
 to 0.4 D at the object, D/r0 0.5 to 4, D^2 / (lambda L) = 4.7, so lambda / D is 0.21 / pixel.
 Limits: 60 ms at 0.08 D and more, 1.5 GB.  `prior`: seconds of one thread for a training clip, 25
-frames of 80x80, over the air that training draws; limit 0.6 s on average.  Both by default.
+frames of 80x80, over the air that training draws; limit 0.6 s on average.  These two by default.
 Another checkout of this repository, an older one say, is timed beside this one: the two take turns.
 Times are wall time in `table`, the least of three, and CPU time of the thread in `prior`.
-With CUDA: view-frames per second.
+`launches`: what a device has to do for a clip of a cache, 41 frames of 144x144, over the same air:
+operators, gigabytes they read and write and products, and the ms that LAUNCH_S, BYTES_S and
+PRODUCTS_S make of these, an H100's; limit 8 ms.  With CUDA: those ms as they are.
 """
 
 import json
+import math
 import os
 import resource
 import statistics
@@ -18,8 +21,11 @@ import sys
 import time
 from dataclasses import asdict, fields
 from pathlib import Path
+from types import ModuleType
 
 import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from src.sim.turbulence import Turbulence
 from src.sim.turbulence.atmosphere import Atmosphere
@@ -27,6 +33,16 @@ from src.sim.turbulence.atmosphere import Atmosphere
 APERTURE_M, WAVELENGTH_M, FRESNEL = 0.1, 525e-9, 4.7
 PIXELS, STRENGTHS = (0.04, 0.08, 0.16, 0.4), (0.5, 2.0, 4.0)  # of D at the object; D/r0
 CLIPS = 20
+CACHED, CROP = (1, 41, 256, 256), (56, 56, 144, 144)  # a clip of a cache: frames, what is kept
+LAUNCH_S, BYTES_S, PRODUCTS_S = 10e-6, 2e12, 20e12  # a launch; bytes and float32 products a second
+FREE = (
+    "empty",
+    "new_empty",
+    "_unsafe_view",
+    "detach",
+    "lift_fresh",
+    "arange",
+)  # no work of a device
 
 
 def air(pixel: float, airy_px: float, d_over_r0: float) -> Turbulence:
@@ -127,25 +143,90 @@ def prior(checkouts: list[Checkout]) -> None:
         print(f"training clip: mean {statistics.mean(own):.2f} s, 90 % below {tenth:.2f} s")
 
 
+class Work(TorchDispatchMode):
+    """Counts what a device would do: operators that are no views, the bytes of their tensors, and
+    products of matrices.
+    """
+
+    def __init__(self):
+        super().__init__()
+        self.launches = self.bytes = self.products = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        """Count an operator and do it."""
+        out = func(*args, **kwargs or {})
+        name = func._schema.name.split("::")[1]
+        if not func.is_view and name not in FREE:
+            self.launches += 1
+            self.bytes += sum(part.nbytes for part in (*args, out) if isinstance(part, Tensor))
+            if name in ("mm", "bmm"):
+                self.products += out.numel() * args[0].shape[-1]
+        return out
+
+
+def kernels(work: Work) -> ModuleType:
+    """Return an engine that costs what Triton's two kernels do, and gives nothing of use."""
+    engine = ModuleType("kernels")
+
+    def warp(frames: Tensor, tilt: Tensor, *_) -> Tensor:
+        torch.aminmax(frames.flatten(1), dim=1)
+        return tilt[0] + tilt[1]
+
+    def scatter(image: Tensor, psfs: Tensor, rows, halo: Tensor, *_) -> Tensor:
+        work.bytes += psfs.nbytes
+        return image[:, : halo.shape[1], : halo.shape[2]] + 1
+
+    engine.WARP, engine.SCATTER, engine.warp, engine.scatter = 8, 0, warp, scatter
+    return engine
+
+
+def launches() -> None:
+    """Print what a device has to do for a clip of a cache, on average."""
+    from src.sim.turbulence.engines import blur_engine
+
+    frames, done, chosen = torch.rand(CACHED), [], blur_engine.on
+    for ahead in prepared():
+        with Work() as work:
+            blur_engine.on = lambda device, work=work: kernels(work)
+            ahead.degrade(frames, torch.Generator(), crop=CROP)
+        ms = [work.launches * LAUNCH_S, work.bytes / BYTES_S, work.products / PRODUCTS_S]
+        done.append((work.launches, work.bytes / 1e9, work.products / 1e9, 1e3 * math.fsum(ms)))
+    blur_engine.on = chosen
+    count, gb, products, ms = map(statistics.mean, zip(*done, strict=True))
+    print(f"a clip: {count:.0f} launches, {gb:.1f} GB, {products:.0f} G products: {ms:.1f} ms")
+    print(f"most: {max(one[0] for one in done)} launches, {max(one[-1] for one in done):.1f} ms")
+
+
+def prepared() -> list:
+    """Return random air as training sees it, ready for a device."""
+    known = {field.name for field in fields(Atmosphere)}
+    paths = [Atmosphere(**{k: v for k, v in drawn.items() if k in known}) for drawn in draws()]
+    airs = (Turbulence(path, views=9, height=256, width=256) for path in paths)
+    return [one.ahead(CACHED[1], torch.Generator().manual_seed(0), CROP) for one in airs]
+
+
 def cuda() -> None:
-    """Print view-frames per second on the first CUDA device."""
-    turbulence, frames = air(0.04, 1.0, 2.0), torch.rand(1, 32, 256, 256, device="cuda")
-    taken = []
-    for _ in range(8):
+    """Print the ms that a clip of a cache takes the first CUDA device, on average."""
+    from src.sim.turbulence.engines import blur_engine
+
+    frames, airs, taken = torch.rand(CACHED, device="cuda"), prepared(), []
+    for _ in range(4):
         start = time.perf_counter()
-        turbulence.degrade(frames, torch.Generator().manual_seed(0))
+        for ahead in airs:
+            ahead.degrade(frames, torch.Generator(), crop=CROP)
         torch.cuda.synchronize()
-        taken.append(time.perf_counter() - start)
-    print(f"CUDA: {9 * 32 / min(taken):.0f} view-frames per second at 256x256, D/r0 = 2")
+        taken.append((time.perf_counter() - start) / len(airs))
+    engine = blur_engine.on(frames.device).__name__.rpartition(".")[2]
+    print(f"CUDA: {1e3 * min(taken):.1f} ms for a clip of a cache ({engine})")
 
 
 def main(words: list[str]) -> None:
     """Run what the command line asks for."""
-    parts = [word for word in words if word in ("table", "prior")]
+    parts = [word for word in words if word in ("table", "prior", "launches")]
     roots = [Path.cwd(), *(Path(word).resolve() for word in words if word not in parts)]
     checkouts = [Checkout(root) for root in roots]
     for part in parts or ("table", "prior"):
-        {"table": table, "prior": prior}[part](checkouts)
+        launches() if part == "launches" else {"table": table, "prior": prior}[part](checkouts)
     for checkout in checkouts:
         checkout.process.communicate()  # ends it
     if torch.cuda.is_available():

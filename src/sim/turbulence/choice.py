@@ -5,6 +5,7 @@ of a view; what counts is their ratio.
 """
 
 import math
+from functools import cache
 from typing import NamedTuple
 
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from src.sim.turbulence.grids import at, between, table
 from src.sim.turbulence.p2s import FINE_PER_AIRY, Band, band_for, bands
+from src.sim.turbulence.p2s_network import Network
 from src.sim.turbulence.zernike import noll_index
 
 SHARES = {"psf": 0.57, "pitch": 0.33, "kernel": 0.1}  # of what is allowed, where PSFs are exact
@@ -120,19 +122,23 @@ def _at_pitches(
     )
 
 
-def _ns(networks: list, ranks: list[int], kernels: Tensor) -> Tensor:
+def _ns(networks: list[Network], ranks: list[int], kernels: Tensor) -> Tensor:
     """Return nanoseconds a pixel (networks, px, ranks, kernels)."""
     px = torch.arange(1, MAX_PITCH + 1).float()
-    out = []
-    for network in networks:
-        waves = sum(WAVES / noll_index(mode)[0] for mode in range(4, network.modes + 2))
-        node = NS_NODE + NS_LAYER * network.macs(torch.tensor(ranks))
-        node = node + waves * (NS_WAVE + NS_ROW * px[:, None])
-        draw = (kernels + 1.0).square() / 4 * (NS_QUAD + NS_RANK * torch.tensor(ranks)[:, None])
-        rows = node[..., None] / px[:, None, None] + draw
-        tap = torch.where(px > 1, NS_BETWEEN, NS_TAP)
-        out.append(rows / px[:, None, None] + tap[:, None, None] * kernels.square())
-    return torch.stack(out)
+    nodes = torch.stack([_node_ns(network, tuple(ranks)) for network in networks])
+    draw = (kernels + 1.0).square() / 4 * (NS_QUAD + NS_RANK * torch.tensor(ranks)[:, None])
+    rows = nodes[..., None] / px[:, None, None] + draw
+    tap = torch.where(px > 1, NS_BETWEEN, NS_TAP)
+    return rows / px[:, None, None] + tap[:, None, None] * kernels.square()
+
+
+@cache
+def _node_ns(network: Network, ranks: tuple[int, ...]) -> Float[Tensor, "px ranks"]:
+    """Return nanoseconds a node."""
+    px = torch.arange(1, MAX_PITCH + 1).float()
+    waves = sum(WAVES / noll_index(mode)[0] for mode in range(4, network.modes + 2))
+    node = NS_NODE + NS_LAYER * network.macs(torch.tensor(ranks))
+    return node + waves * (NS_WAVE + NS_ROW * px[:, None])
 
 
 def _kernel(strength: float, airy: float, reach: float) -> int:

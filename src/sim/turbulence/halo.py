@@ -5,12 +5,14 @@ hardly moves it.  The mean is therefore added once per frame, and a kernel need 
 changes from point to point; what that neglects is measured by scripts/p2s_errors.py.
 """
 
+from collections.abc import Sequence
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Complex, Float, Int
 from scipy.fft import next_fast_len
 from torch import Tensor
 
-from src.sim.turbulence.blur import reflect
+from src.sim.turbulence.engines.blur_eager import reflect
 from src.sim.turbulence.p2s import FINE_PER_AIRY
 from src.sim.turbulence.psf import resampling
 
@@ -38,14 +40,33 @@ class Halo:
         """
         if self.share == 0:
             return frames.new_zeros(len(frames), h, w)
-        sides = [
-            reflect(torch.arange(first - self.reach, first + count + self.reach), size)
-            for first, count, size in zip((top, left), (h, w), frames.shape[-2:], strict=True)
-        ]
-        rows, columns = (side.to(frames.device) for side in sides)
-        around = frames[:, rows][:, :, columns]
-        size = [next_fast_len(len(side), real=True) for side in sides]
-        spectrum = torch.fft.rfft2(self.shape.to(frames), s=size)
-        light = torch.fft.irfft2(torch.fft.rfft2(around, s=size) * spectrum, s=size)
-        far = 2 * self.reach
-        return light[:, far : far + h, far : far + w].clamp(min=0)
+        return halo_light(frames, *self.tables(frames.shape[-2:], top, left, h, w), h, w)
+
+    def tables(
+        self, size: Sequence[int], top: int, left: int, h: int, w: int
+    ) -> tuple[Int[Tensor, " rows"], Int[Tensor, " columns"], Complex[Tensor, "rows half"]]:
+        """Return the rows and columns of frames of `size` that light comes from, and the transform
+        of the shape.  A few rows and columns more make numbers of them that transform fast.
+        """
+        sides = []
+        for first, count, pixels in zip((top, left), (h, w), size, strict=True):
+            fast = next_fast_len(count + 2 * self.reach, real=True)
+            sides.append(reflect(torch.arange(fast) + first - self.reach, pixels))
+        shape = self.shape.new_zeros(*map(len, sides))
+        shape[: len(self.shape), : len(self.shape)] = self.shape
+        far = -2 * self.reach  # the first pixel gets light from the sources 0 .. 2 reach
+        return *sides, torch.fft.rfft2(shape.roll((far, far), (0, 1)))
+
+
+def halo_light(
+    frames: Float[Tensor, "frames height width"],
+    rows: Int[Tensor, " rows"],
+    columns: Int[Tensor, " columns"],
+    spectrum: Complex[Tensor, "rows half"],
+    h: int,
+    w: int,
+) -> Float[Tensor, "frames h w"]:
+    """Return the light by Halo.tables, on the device where these are."""
+    around = frames[:, rows[:, None], columns]
+    light = torch.fft.irfft2(torch.fft.rfft2(around) * spectrum, s=around.shape[1:])
+    return light[:, :h, :w].clamp(min=0)

@@ -29,12 +29,17 @@ class Lattice:
         return self.start // self.pitch - (self.order == 3 and self.pitch > 1)
 
     @property
+    def nodes(self) -> int:
+        """How many there are."""
+        if self.pitch == 1:
+            return self.count
+        last = (self.start + self.count - 1) // self.pitch + (2 if self.order == 3 else 1)
+        return last + 1 - self.first
+
+    @property
     def pixels(self) -> Int[Tensor, " nodes"]:
         """The pixels that the nodes lie on."""
-        if self.pitch == 1:
-            return torch.arange(self.start, self.start + self.count)
-        last = (self.start + self.count - 1) // self.pitch + (2 if self.order == 3 else 1)
-        return torch.arange(self.first, last + 1) * self.pitch
+        return (torch.arange(self.nodes) + self.first) * self.pitch
 
     @property
     def offset(self) -> int:

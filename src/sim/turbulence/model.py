@@ -48,6 +48,17 @@ class Air(Protocol):
 
 
 @runtime_checkable
+class PreparedAir(Air, Protocol):
+    """Air that can be prepared by another process than that which computes its pixels."""
+
+    def ahead(self, frames: int, generator: torch.Generator, crop: Crop) -> Any:
+        """Return a thing with `degrade` alone, as above, for one clip of so many frames and that
+        crop; it can be pickled.
+        """
+        ...
+
+
+@runtime_checkable
 class TurbulenceModel(Protocol):
     """Where the air of every clip comes from."""
 

@@ -10,25 +10,25 @@ from jaxtyping import Complex, Float
 from torch import Tensor
 
 from src.sim import noise
-from src.sim.optics import layout, view_id
-from src.sim.turbulence import blur
+from src.sim.optics import layout
+from src.sim.turbulence import blur, whole_clip
+from src.sim.turbulence.ahead import AirAhead
+from src.sim.turbulence.amplitudes import Motion
 from src.sim.turbulence.atmosphere import ALPHA_FPS, Atmosphere
 from src.sim.turbulence.fidelity import Fidelity, choose, mean_psf
 from src.sim.turbulence.halo import Halo
 from src.sim.turbulence.lattice import Lattice
 from src.sim.turbulence.model import Crop
 from src.sim.turbulence.p2s import Spots, band_for
-from src.sim.turbulence.phase import Waves, draw_waves, evolve, flow, look_from
-from src.sim.turbulence.psf import fraunhofer_psf
+from src.sim.turbulence.phase import Waves, draw_waves
+from src.sim.turbulence.psf import exact_spots
 from src.sim.turbulence.ranges import require
 from src.sim.turbulence.threads import in_threads
 from src.sim.turbulence.wave_field import Field
 
-TEMPORAL = ("ar1", "flow", "mixed")
-OWN_WIND = 0.5  # rms of a layer's own wind over the wind that all layers share
 WAVES = 384
 TILE = 320  # pixels; larger pictures are made tile by tile, to bound the memory
-CHUNK = 2_000_000  # numbers at the nodes of a view at a time
+CHUNK = 2_000_000  # numbers at the nodes of a view at a time, on the CPU
 
 
 class Turbulence:
@@ -68,19 +68,9 @@ class Turbulence:
         require(0 < fps < math.inf, "fps", "> 0", fps)
         require(0 < tolerance <= 1, "tolerance", "in (0, 1]", tolerance)
         require(psf in ("fitted", "exact"), "psf", "fitted or exact", psf)
-        require(temporal in TEMPORAL, "temporal", "ar1, flow or mixed", temporal)
-        valid = wind_m_s is None or 0 <= wind_m_s < math.inf
-        require(valid, "wind_m_s", ">= 0 or null", wind_m_s)
-        require(1 <= wind_layers <= 100, "wind_layers", "in [1, 100]", wind_layers)
-        shared = views_correlation == "baseline"
-        valid = shared or views_correlation == "independent"
-        require(valid, "views_correlation", "independent or baseline", views_correlation)
-        valid = baseline_m is None or 0 <= baseline_m < math.inf
-        require(valid, "baseline_m", ">= 0", baseline_m)
+        self.motion = Motion(temporal, wind_m_s, wind_layers, views_correlation, baseline_m)
         self.atmosphere, self.height, self.width, self.fps = atmosphere, height, width, fps
         self.positions = layout(views) if isinstance(views, int) else tuple(map(tuple, views))
-        self.temporal, self.wind_layers, self.wind_m_s = temporal, wind_layers, wind_m_s
-        self.shared, self.baseline_m = shared, baseline_m
         self.clear = atmosphere is None or atmosphere.d_over_r0 == 0
         self.fidelity, self.spots, self.halo = Fidelity(), None, None
         if not self.clear:
@@ -113,16 +103,23 @@ class Turbulence:
             top, left, height, width = window
             part = frames[:, None, :, top : top + height, left : left + width]
             return part.expand(-1, len(self.positions), -1, -1, -1)
-        size = (len(frames), len(self.positions), frames.shape[1], *window[2:])
-        out = frames.new_empty(size, dtype=torch.float32)
-        for index, clip in enumerate(frames.float()):
-            waves, moving = self._draw(generator, len(clip))
-            moving = moving.to(clip.device)
-            for tile in _tiles(window):
-                y, x = tile[0] - window[0], tile[1] - window[1]
-                part = out[index, ..., y : y + tile[2], x : x + tile[3]]
-                self._clip(clip, waves, moving, tile, part)
-        return out
+        seen = []
+        for clip in frames.float():
+            waves, moving = self._draw(generator, len(clip), clip.device)
+            if clip.device.type == "cpu":
+                seen.append(self._view_by_view(clip, waves, moving, window))
+            else:
+                seen.append(whole_clip.degrade(clip, self._plans(waves, moving, window)))
+        return seen[0][None] if len(seen) == 1 else torch.stack(seen)
+
+    def ahead(self, frames: int, generator: torch.Generator, crop: Crop) -> "Turbulence | AirAhead":
+        """Return the air of one clip of so many frames, drawn and prepared for `crop` on the CPU:
+        small, to be sent to where a device computes the pixels.
+        """
+        if self.clear:
+            return self
+        waves, moving = self._draw(generator, frames)
+        return AirAhead(self.facts, crop, self._plans(waves, moving, crop))
 
     @torch.no_grad()
     def tilt(
@@ -136,34 +133,61 @@ class Turbulence:
         if self.clear:
             return torch.zeros(len(self.positions), frames, 2, *window[2:])
         waves, moving = self._draw(generator, frames)
-        field = self._field(waves, slice(0, 2), window, moving.device)
+        field = self._field(waves, slice(0, 2), window)
         return self._tilt_px * torch.stack([field.at_pixels(c).transpose(0, 1) for c in moving])
 
-    def _clip(self, frames: Tensor, waves: Waves, moving: Tensor, tile: Crop, out: Tensor) -> None:
+    def _view_by_view(
+        self, frames: Tensor, waves: Waves, moving: Tensor, window: Crop
+    ) -> Float[Tensor, "views frames h w"]:
+        """Return what every view sees in `window`, on the CPU."""
+        out, shown = torch.empty(*moving.shape[:2], *window[2:]), blur.pictures(frames)
+        for tile in _tiles(window):
+            y, x = tile[0] - window[0], tile[1] - window[1]
+            part = out[..., y : y + tile[2], x : x + tile[3]]
+            self._tile(frames, shown, waves, moving, tile, part)
+        return out
+
+    def _tile(
+        self,
+        frames: Tensor,
+        shown: blur.Pictures,
+        waves: Waves,
+        moving: Tensor,
+        tile: Crop,
+        out: Tensor,
+    ) -> None:
         """Write what every view sees in `tile` to `out` (views, frames, h, w).
 
         A view's phase is computed apart, so that its numbers do not depend on its company.
         """
-        reach, device = self.fidelity.kernel // 2, frames.device
-        top, left, height, width = tile
-        halo = self.halo(frames, *tile)
-        window = (top - reach, left - reach, height + 2 * reach, width + 2 * reach)
-        tilt = self._field(waves, slice(0, 2), window, device)
-        rest = self._field(waves, slice(2, None), window, device)
+        halo, window = self.halo(frames, *tile), self._sources(tile)
+        tilt = self._field(waves, slice(0, 2), window)
+        rest = self._field(waves, slice(2, None), window)
         lattices = self._lattices(window, self.fidelity.pitch, 1)
         lines = self.fidelity.rank or self.fidelity.kernel**2
-        numbers = max(2, lines) * (height + 2 * reach) * (width + 2 * reach)
-        step = max(1, CHUNK // numbers)
+        step = max(1, CHUNK // (max(2, lines) * window[2] * window[3]))
 
         def one(view: int, first: int) -> None:
             part = slice(first, first + step)
             amplitudes = moving[view, part]
-            moved = self._tilt_px * tilt.at_pixels(amplitudes)
+            moved = tilt.at_pixels(amplitudes).mul_(self._tilt_px)
             nodes = self._nodes(rest.at_nodes(amplitudes))
             around = (self.fidelity.kernel, self.spots, *lattices, halo[part], self.halo.share)
-            out[view, part] = blur.degrade(frames[part], moved, nodes, *around)
+            out[view, part] = blur.degrade(shown, first, moved, nodes, *around)
 
-        in_threads(one, product(range(len(moving)), range(0, len(frames), step)), device)
+        in_threads(one, product(range(len(moving)), range(0, len(frames), step)))
+
+    def _plans(self, waves: Waves, moving: Tensor, window: Crop) -> list[whole_clip.Plan]:
+        """Return what a device needs of the clip in `window`, tile by tile."""
+        known = {"spots": self.spots, "halo": self.halo, "tilt_px": self._tilt_px}
+        known |= {"fidelity": self.fidelity, "frame": (self.height, self.width)}
+        plans = []
+        for tile in _tiles(window):
+            sources = self._sources(tile)
+            tilt = self._lattices(sources, self.fidelity.tilt_pitch, 3)
+            rest = self._lattices(sources, self.fidelity.pitch, 1)
+            plans.append(whole_clip.plan(tile, moving, waves, tilt=tilt, rest=rest, **known))
+        return plans
 
     def _nodes(
         self, phase: Float[Tensor, "blurmodes frames rows columns"]
@@ -171,17 +195,14 @@ class Turbulence:
         """Return what the PSFs are at the nodes: weights of the basis, or their very pixels."""
         if self.spots is not None:
             return self.spots(phase)
-        flat = torch.nn.functional.pad(phase.permute(1, 2, 3, 0), (2, 0))
-        size, airy = self.fidelity.kernel, self.fidelity.airy_px
-        psf = fraunhofer_psf(flat, airy_px=airy, size=size, whole=True)
-        return psf.flatten(3).permute(3, 0, 1, 2).contiguous()
+        return exact_spots(phase, self.fidelity.airy_px, self.fidelity.kernel)
 
-    def _field(self, waves: Waves, modes: slice, window: Crop, device: torch.device) -> Field:
+    def _field(self, waves: Waves, modes: slice, window: Crop) -> Field:
         """Prepare tilt (modes 0, 1) or the modes that blur on the lattice meant for them."""
         is_tilt = modes.start == 0
         pitch = self.fidelity.tilt_pitch if is_tilt else self.fidelity.pitch
         lattices = self._lattices(window, pitch, 3 if is_tilt else 1)
-        return Field(waves, modes, *lattices, (self.height, self.width), device)
+        return Field(waves, modes, *lattices, (self.height, self.width))
 
     @property
     def _tilt_px(self) -> float:
@@ -189,9 +210,9 @@ class Turbulence:
         return 2 / math.pi * self.fidelity.airy_px
 
     def _draw(
-        self, generator: torch.Generator, frames: int
+        self, generator: torch.Generator, frames: int, device: torch.device | str = "cpu"
     ) -> tuple[Waves, Complex[Tensor, "views frames waves"]]:
-        """Draw one clip's waves, and their amplitudes in every view and frame."""
+        """Draw one clip's waves, and on `device` their amplitudes in every view and frame."""
         key = noise.base_key(generator)
         waves = draw_waves(
             self.atmosphere,
@@ -200,47 +221,15 @@ class Turbulence:
             waves=WAVES,
             width_px=self.width,
         )
-        return waves, self._amplitudes(key, waves, frames).to(torch.complex64)
+        alpha = self.atmosphere.alpha ** (ALPHA_FPS / self.fps)
+        clip = {"positions": self.positions, "frames": frames, "fps": self.fps, "device": device}
+        return waves, self.motion.amplitudes(self.atmosphere, waves, key, alpha=alpha, **clip)
 
-    def _amplitudes(
-        self, key: int, waves: Waves, frames: int
-    ) -> Complex[Tensor, "views frames waves"]:
-        """Every view counts from its own id, or all from 0 where they share the air."""
-        ids = [0 if self.shared else view_id(position) for position in self.positions]
-        flows = self._flows(key)
-        drawn = 1 if flows else frames
-        counters = torch.arange(drawn * 2 * len(waves.place)).reshape(drawn, -1, 2)
-        counters = counters + (torch.tensor(ids) << 40)[:, None, None, None]
-        fresh = noise.normal(noise.key(key, "phase"), counters).double()
-        if flows:
-            c = flow(waves, fresh, self._winds(key), torch.arange(frames).double() / self.fps)
-        else:
-            c = evolve(fresh, self.atmosphere.alpha ** (ALPHA_FPS / self.fps))
-        if self.shared:
-            pitch = self.atmosphere.aperture_m if self.baseline_m is None else self.baseline_m
-            away = torch.tensor(self.positions, dtype=torch.float64).flip(-1) * pitch
-            c = c * look_from(waves, away)[:, None]
-        return c
-
-    def _flows(self, key: int) -> bool:
-        """Return whether the wind carries the turbulence of this clip."""
-        if self.temporal != "mixed":
-            return self.temporal == "flow"
-        return float(noise.uniform(noise.key(key, "temporal"), torch.tensor(0))) < 0.5
-
-    def _winds(self, key: int) -> Float[Tensor, "layers 2"]:
-        """Return the wind (x, y) of each layer in m/s: a common one, half as much of its own.
-
-        The mean square is that of `wind_m_s`; a single layer has that very speed.
-        """
-        speed = self.atmosphere.wind_m_s if self.wind_m_s is None else self.wind_m_s
-        turn = 2 * math.pi * float(noise.uniform(noise.key(key, "wind"), torch.tensor(0)))
-        common = torch.tensor([math.cos(turn), math.sin(turn)], dtype=torch.float64)
-        if self.wind_layers == 1:
-            return speed * common[None]
-        counters = torch.arange(2 * self.wind_layers).reshape(-1, 2)
-        own = noise.normal(noise.key(key, "winds"), counters).double() * OWN_WIND / math.sqrt(2)
-        return speed / math.sqrt(1 + OWN_WIND**2) * (common + own)
+    def _sources(self, tile: Crop) -> Crop:
+        """Return the pixels whose light reaches a tile."""
+        reach = self.fidelity.kernel // 2
+        top, left, height, width = tile
+        return top - reach, left - reach, height + 2 * reach, width + 2 * reach
 
     def _lattices(self, window: Crop, pitch: int, order: int) -> tuple[Lattice, Lattice]:
         top, left, height, width = window

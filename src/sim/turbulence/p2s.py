@@ -14,12 +14,13 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.typing import NDArray
 from safetensors.torch import load_file
 from torch import Tensor
 from torch.nn import functional
 
 from src.sim.turbulence.engines import weights as weights_engine
-from src.sim.turbulence.p2s_network import Network, shape_kinds
+from src.sim.turbulence.p2s_network import Merged, Network, shape_kinds
 from src.sim.turbulence.psf import resampling
 
 FILE = Path(__file__).with_suffix(".safetensors")
@@ -79,38 +80,45 @@ class Spots:
         self, band: Band, network: int, rank: int, airy_px: float, size: int, d_over_r0: float
     ):
         grid = resampling(size, band.mean.shape[-1], FINE_PER_AIRY / airy_px).float()
-        kind = shape_kinds(band.basis[:rank])
-        counts = torch.bincount(kind, minlength=4)
-        self.ends = counts.cumsum(0).numpy()
-        shapes = torch.cat([band.mean[None], band.basis[kind.argsort(stable=True)]])
-        self.shapes = grid @ (shapes / band.mean.sum()) @ grid.T
+        self.network, self.ends, shapes = _cut(band, network, rank)
+        self.layers = _matrices(self.network)
+        self.shapes = grid @ shapes @ grid.T
         quarter = self.shapes[:, size // 2 :, size // 2 :]
         self.quarter = quarter.permute(1, 2, 0).contiguous().numpy()
-        self.network, self.d_over_r0 = band.networks[network].cut(counts.tolist()), d_over_r0
-        self.layers = self.network.matrices()
+        self.d_over_r0 = d_over_r0
         self.own = tuple(np.array(rows, np.int64) for rows in self.network.own)
 
     def __call__(
         self, phase: Float[Tensor, "blurmodes frames rows columns"]
     ) -> Float[Tensor, "rank frames rows columns"]:
-        """Return the weights at nodes for Noll 4, 5, ... in rad.
+        """Return the weights at nodes for Noll 4, 5, ... in rad, on the CPU.
 
         Modes that are not given count as zero, those the network does not know by their mean.
         """
         known, given = self.network.modes - 2, phase.flatten(1)
-        given = functional.pad(given, (0, 0, 0, max(0, known - len(given))))[:known]
-        if given.device.type == "cpu":
-            usual = np.float32((self.d_over_r0 / self.network.edge) ** (5 / 3))
-            found = weights_engine.weights(given.numpy(), self.own, usual, self.layers)
-            weights = torch.from_numpy(found)
-        else:
-            weights = self.network.to(given.device)(given.T, self.d_over_r0).T
-        return weights.unflatten(1, phase.shape[1:])
+        if len(given) < known:
+            given = functional.pad(given, (0, 0, 0, known - len(given)))
+        usual = np.float32((self.d_over_r0 / self.network.edge) ** (5 / 3))
+        found = weights_engine.weights(given[:known].numpy(), self.own, usual, self.layers)
+        return torch.from_numpy(found).unflatten(1, phase.shape[1:])
 
-    def psfs(
-        self, weights: Float[Tensor, "rank frames rows columns"]
-    ) -> Float[Tensor, "pixels frames rows columns"]:
-        """Return the PSFs of the weights, pixel by pixel; none is negative."""
-        mean, basis = self.shapes[0].flatten(), self.shapes[1:].flatten(1)
-        flat = torch.addmm(mean[:, None].to(weights), basis.T.to(weights), weights.flatten(1))
-        return flat.clamp_(min=0).unflatten(1, weights.shape[1:])
+    def merged(self, modes: int) -> Merged:
+        """Return the network as a device takes it, for at most `modes` modes from Noll 4 on."""
+        return self.network.merged(modes, self.d_over_r0)
+
+
+@cache
+def _cut(band: Band, network: int, rank: int) -> tuple[Network, NDArray, Tensor]:
+    """Return the network of the first `rank` functions, where each of their kinds ends, and mean
+    and basis sorted by kind, over the light of the mean.
+    """
+    kind = shape_kinds(band.basis[:rank])
+    counts = torch.bincount(kind, minlength=4)
+    shapes = torch.cat([band.mean[None], band.basis[kind.argsort(stable=True)]])
+    cut = band.networks[network].cut(counts.tolist())
+    return cut, counts.cumsum(0).numpy(), shapes / band.mean.sum()
+
+
+@cache
+def _matrices(network: Network) -> tuple[NDArray, ...]:
+    return network.matrices()

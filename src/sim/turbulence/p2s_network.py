@@ -10,6 +10,7 @@ that knows none.
 """
 
 import warnings
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -108,6 +109,36 @@ class Network(nn.Module):
         own.load_state_dict(state)
         return own
 
+    def merged(self, given: int, d_over_r0: float) -> "Merged":
+        """Return the same in few large matrices, for at most `given` modes from Noll 4 on; those
+        that are not given count as zero.
+        """
+        few, width = len(self.gates[0].weight), self.width
+        forms = [*enumerate(self.forms), *enumerate(self.factors[:2])]
+        forms += [(BOTH, self.factors[BOTH]), (DOWN, self.factors[DOWN])]
+        forms += [(DOWN, self.thirds[0]), (ACROSS, self.thirds[1])]
+        first = [layer.weight.new_zeros(len(layer.weight), self.modes - 2) for _, layer in forms]
+        for rows, (kind, layer) in zip(first, forms, strict=True):
+            rows[:, self.own[kind]] = layer.weight
+        usual = self.common.weight[:, -1] * (d_over_r0 / self.edge) ** (5 / 3) + self.common.bias
+        gates = [self.pair_gates, *self.gates]
+        last = self.even.weight.new_zeros(1 + sum(self.counts), width + 1 + 6 * few)
+        last[0, width] = 1
+        even, across, down, both = last[1:].split(self.counts)
+        even[:, :width], even[:, width] = self.even.weight, self.even.bias
+        both[:, width + 1 : width + 1 + 2 * few] = self.both.weight
+        for kind, (rows, layer) in enumerate(zip((across, down), self.odd, strict=True)):
+            for part, weight in enumerate(layer.weight.split(few, 1)):
+                start = width + 1 + (2 + kind + 2 * part) * few
+                rows[:, start : start + few] = weight
+        return Merged(
+            torch.cat(first)[:, :given].contiguous(),
+            torch.cat([self.common.weight[:, :-1], usual[:, None]], 1),
+            torch.cat([torch.cat([gate.weight, gate.bias[:, None]], 1) for gate in gates]),
+            torch.cat([self.pairs.weight] * 2),
+            last,
+        )
+
     def matrices(self) -> tuple[ndarray, ...]:
         """Return all layers, each with its bias (or zeros) as a last column, for the CPU engine."""
         layers = [
@@ -115,6 +146,46 @@ class Network(nn.Module):
             self.pairs, *self.thirds, *self.gates, *self.odd,
         ]  # fmt: skip
         return tuple(_matrix(layer) for layer in layers)
+
+
+class Merged(NamedTuple):
+    """A network of one D/r0 as the matrices that nodes meet in turn, each with its bias as the
+    column of a constant 1.
+
+    `first`: the linear forms that are squared, both factors of pairs and those of products of
+    three; `common`, of squares; `gates`: of pairs and of products; `pairs`, twice; `last`: of
+    common numbers, 1, pairs, gated forms and products of three.
+    """
+
+    first: Tensor
+    common: Tensor
+    gates: Tensor
+    pairs: Tensor
+    last: Tensor
+
+    def __call__(
+        self, phase: Float[Tensor, "blurmodes nodes"]
+    ) -> Float[Tensor, "one_and_rank nodes"]:
+        """Return 1, the weight of the mean, and the weights, sorted by kind, for Noll 4 and the
+        modes after it in rad.
+        """
+        known, few = self.first.shape[1], len(self.pairs) // 2
+        width, wide = len(self.common), self.common.shape[1] - 1
+        first = self.first[:, : len(phase)] @ phase[:known]
+        forms, left, right, thirds = first.split([wide, 2 * few, 2 * few, 2 * few])
+        squares = phase.new_empty(wide + 1, phase.shape[1])
+        torch.mul(forms, forms, out=squares[:wide])
+        squares[wide] = 1
+        parts = phase.new_empty(self.last.shape[1], phase.shape[1])
+        common, twos, single, mixed = parts.split([width + 1, 2 * few, 2 * few, 2 * few])
+        torch.mm(self.common, squares, out=common[:width])
+        functional.hardswish(common[:width], inplace=True)
+        common[width] = 1
+        gates = self.gates @ common
+        torch.mul(left, right, out=twos).mul_(gates[: 2 * few])
+        torch.mul(forms[2 * few : 4 * few], gates[2 * few :], out=single)
+        torch.mul(self.pairs @ twos, thirds, out=mixed)
+        return self.last @ parts
 
 
 def _layer(inputs: int, outputs: int, bias: bool = True) -> nn.Linear:

@@ -83,12 +83,19 @@ def draw_waves(atmosphere: Atmosphere, key: int, *, modes: int, waves: int, widt
 def evolve(
     fresh: Float[Tensor, "views frames waves 2"], alpha: float
 ) -> Complex[Tensor, "views frames waves"]:
-    """Return c_t = alpha c_{t-1} + sqrt(1 - alpha^2) e_t, stationary from the first frame."""
-    state, states = fresh[:, 0], [fresh[:, 0]]
-    for step in fresh.unbind(1)[1:]:
-        state = alpha * state + math.sqrt(1 - alpha**2) * step
-        states.append(state)
-    return torch.view_as_complex(torch.stack(states, dim=1))
+    """Return c_t = alpha c_{t-1} + sqrt(1 - alpha^2) e_t, stationary from the first frame.
+
+    By doubling: 41 frames take six steps.
+    """
+    share = torch.full_like(fresh[0, :, :1, :1], math.sqrt(1 - alpha**2))
+    share[0] = 1
+    state, span = fresh * share, 1
+    while span < state.shape[1]:  # it holds the draws of the last `span` frames, then of twice that
+        state = torch.cat(
+            [state[:, :span], state[:, span:] + alpha**span * state[:, :-span]], dim=1
+        )
+        span *= 2
+    return torch.view_as_complex(state)
 
 
 def flow(
@@ -103,7 +110,7 @@ def flow(
     each: phase(x, t) = phase(x - v t, 0), exact at any time, and smooth in it.
     """
     wind = winds[(waves.share * len(winds)).long().clamp(max=len(winds) - 1)]
-    speed = (waves.layer * wind).sum(-1)
+    speed = (waves.layer * wind).sum(-1).to(fresh.device)
     return torch.view_as_complex(fresh) * torch.exp(-2j * math.pi * seconds[:, None] * speed)
 
 

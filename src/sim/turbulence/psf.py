@@ -8,6 +8,7 @@ import math
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
 from src.sim.turbulence.zernike import zernike_basis
 
@@ -45,6 +46,15 @@ def fraunhofer_psf(
     else:
         spots /= spots.sum((1, 2), keepdim=True)
     return spots.reshape(*coefficients.shape[:-1], size, size)
+
+
+def exact_spots(
+    phase: Float[Tensor, "blurmodes n rows columns"], airy_px: float, size: int
+) -> Float[Tensor, "pixels n rows columns"]:
+    """Return the PSFs of Noll 4, 5, ... at nodes, pixel by pixel; the light of the plane is 1."""
+    flat = functional.pad(phase.permute(1, 2, 3, 0), (2, 0))
+    psf = fraunhofer_psf(flat, airy_px=airy_px, size=size, whole=True)
+    return psf.flatten(3).permute(3, 0, 1, 2).contiguous()
 
 
 def resampling(size: int, fine: int, step: float) -> Float[Tensor, "size fine"]:

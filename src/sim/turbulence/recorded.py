@@ -120,17 +120,17 @@ class RecordedAir:
         rows, columns = (Lattice(window[k], window[k + 2], FAR, 1) for k in (0, 1))
         nodes = (count, len(rows.pixels), len(columns.pixels))
         psfs = kernel.flatten()[:, None, None, None].expand(-1, *nodes).contiguous()
-        halo = torch.zeros(count, height, width, device=device)
-        around = (len(kernel), None, rows, columns, halo, 0.0)
+        around = (rows, columns, torch.zeros(count, height, width, device=device), 0.0)
         out = torch.empty(len(frames), len(self.views), count, height, width, device=device)
-        for index, clip in enumerate(frames.float()):
-            tilt = self.tilt(count, generator, crop=window).transpose(1, 2).to(device)
-            pieces = zip(out[index], tilt.contiguous(), strict=True)
-            in_threads(
-                lambda seen, one, clip=clip: seen.copy_(blur.degrade(clip, one, psfs, *around)),
-                pieces,
-                device,
-            )
+        for seen, clip in zip(out, frames.float(), strict=True):
+            tilt = self.tilt(count, generator, crop=window).transpose(1, 2).to(device).contiguous()
+            if device.type == "cpu":
+                given = (psfs, len(kernel), None, *around)
+                _view_by_view(seen, blur.pictures(clip), tilt, given)
+                continue
+            lines = psfs @ columns.weights().T.to(device)
+            for view, moved in zip(seen, tilt, strict=True):  # a few launches each
+                view.copy_(blur.at_once(clip, moved, lines, *around))
         return out
 
     def tilt(
@@ -177,6 +177,15 @@ class RecordedAir:
         passed = np.arange(frames) * self.step
         start = stretch * length + late * max(length - 1 - passed[-1], 0)
         return start + (passed[::-1] if back else passed)
+
+
+def _view_by_view(out: Tensor, shown: blur.Pictures, tilt: Tensor, given: tuple) -> None:
+    """Write what the views see to `out`; `given`: the PSFs, as `blur.degrade` has them."""
+
+    def one(view: Tensor, moved: Tensor) -> None:
+        view.copy_(blur.degrade(shown, 0, moved, *given))
+
+    in_threads(one, zip(out, tilt, strict=True))
 
 
 def _gaussian(deviation: float) -> Float[Tensor, "k k"]:

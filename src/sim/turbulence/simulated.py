@@ -1,6 +1,7 @@
 """Simulated air as a turbulence model (model.py): atmospheres drawn, then computed."""
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -50,9 +51,22 @@ class SimulatedAir:
         width: int,
         fps: float,
     ) -> Turbulence:
-        """Return the operator of an atmosphere."""
-        return Turbulence(drawn, views=views, height=height, width=width, fps=fps, **self.options)
+        """Return the operator of an atmosphere; the last ones asked for are remembered."""
+        places = tuple(tuple(position) for position in views)
+        return _operator(drawn, places, height, width, fps, tuple(self.options.items()))
 
     def having(self, **options: Any) -> "SimulatedAir":
         """Return the same air with some of its options replaced."""
         return SimulatedAir({"prior": self.prior} | self.atmosphere, **self.options | options)
+
+
+@lru_cache(maxsize=64)  # a batch is simulated, then what it was is recorded
+def _operator(
+    drawn: Atmosphere | None,
+    views: tuple[Position, ...],
+    height: int,
+    width: int,
+    fps: float,
+    options: tuple[tuple[str, Any], ...],
+) -> Turbulence:
+    return Turbulence(drawn, views=views, height=height, width=width, fps=fps, **dict(options))

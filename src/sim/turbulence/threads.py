@@ -6,15 +6,15 @@ from concurrent.futures import ThreadPoolExecutor
 import torch
 
 
-def in_threads(work: Callable[..., None], pieces: Iterable[tuple], device: torch.device) -> None:
-    """Do `work` of every piece, on the CPU in as many threads as torch has.
+def in_threads(work: Callable[..., None], pieces: Iterable[tuple]) -> None:
+    """Do `work` of every piece, in as many threads as torch has.
 
     Each piece is computed by one thread, so that its numbers do not depend on how many there are,
     and nobody waits for the cores of another.
     """
     pieces = list(pieces)
     allowed = torch.get_num_threads()
-    threads = min(allowed, len(pieces)) if device.type == "cpu" else 1
+    threads = min(allowed, len(pieces))
     if threads == 1:
         for piece in pieces:
             work(*piece)

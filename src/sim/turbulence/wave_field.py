@@ -1,10 +1,10 @@
 """Zernike coefficients on a lattice: plane waves (phase.py) summed up by products of matrices.
 
-A wave on a lattice is its rows times its columns.  On the CPU the passes before and after the
-products are compiled (engines/waves.py), elsewhere they are torch expressions.
+A wave on a lattice is its rows times its columns.  This is the CPU's way, a view and some frames at
+a time, the passes before and after the products compiled (engines/waves.py); whole_clip.py has a
+device's.
 """
 
-from collections.abc import Callable
 from functools import cached_property
 from itertools import pairwise
 from math import pi
@@ -39,37 +39,33 @@ class Field:
         rows: Lattice,
         columns: Lattice,
         size: tuple[int, int],
-        device: torch.device,
     ):
         middle = (columns.pixels[0] + columns.pixels[-1]) / 2
         turned = torch.complex(*_turns(waves.frequency[:, 0], middle - (size[1] - 1) / 2))
-        response = torch.view_as_complex(waves.response[modes]).to(torch.complex64) * turned
+        response = torch.view_as_complex(waves.response[modes]).to(torch.complex64)
         down = _turns(waves.frequency[:, 1], rows.pixels - (size[0] - 1) / 2)
         half = columns.pixels[len(columns.pixels) // 2 :] - middle
         across = [pad(t, (0, -t.shape[1] % ROW)) for t in _turns(waves.frequency[:, 0], half)]
         self.orders = []
-        for own in _orders(modes.start or 0, len(response)):
-            seen = _seen(response[own], FAINT[own.start + (modes.start or 0) > 1])
-            tables = [part[seen].T.contiguous() for part in down] + [part[seen] for part in across]
-            parts = [part.to(device) for part in (response[own][:, seen], *tables)]
-            self.orders.append((own, seen, *parts))
+        for own, seen in orders(response, modes.start or 0):
+            turn = torch.view_as_real((response[own] * turned)[:, seen]).contiguous()
+            rows_of = [part[seen].T.contiguous() for part in down]
+            compiled_for = [part.numpy() for part in (turn, seen, *rows_of)]
+            self.orders.append((own, *compiled_for, *(part[seen] for part in across)))
         self.shape = (len(response), len(rows.pixels), len(columns.pixels))
-        self.rows, self.columns, self.device = rows, columns, device
+        self.rows, self.columns = rows, columns
 
     def at_nodes(
-        self, amplitudes: Complex[Tensor, "frames waves"], engine: Callable | None = None
+        self, amplitudes: Complex[Tensor, "frames waves"]
     ) -> Float[Tensor, "modes frames rows columns"]:
-        """Return the coefficients on the nodes: Re sum_m c_m w_m Q_j exp(2 pi i f_m . x).
-
-        `engine`: `sums` or `sums_cpu`; None: the one for the device.
-        """
-        engine = engine or (sums_cpu if self.device.type == "cpu" else sums)
+        """Return the coefficients on the nodes: Re sum_m c_m w_m Q_j exp(2 pi i f_m . x)."""
         modes, rows, columns = self.shape
-        out = torch.empty(modes, len(amplitudes), rows, columns, device=self.device)
-        for own, seen, response, *tables in self.orders:
-            turn = (response[:, None] * amplitudes[:, seen]).flatten(0, 1)
-            real, imag = turn.real.contiguous(), turn.imag.contiguous()
-            engine(real, imag, *tables, out[own].view(-1, columns))
+        out = torch.empty(modes, len(amplitudes), rows, columns)
+        drawn = torch.view_as_real(amplitudes).numpy()
+        for own, response, seen, *down, cos, sin in self.orders:
+            even, odd = compiled.spread(response, drawn, seen, *down)
+            even, odd = torch.from_numpy(even) @ cos, torch.from_numpy(odd) @ sin
+            compiled.join(even.numpy(), odd.numpy(), out[own].view(-1, columns).numpy())
         return out
 
     def at_pixels(
@@ -83,48 +79,26 @@ class Field:
 
     @cached_property
     def _vertical(self) -> Float[Tensor, "h rows"]:
-        return self.rows.weights().to(self.device)
+        return self.rows.weights()
 
     @cached_property
     def _horizontal(self) -> Float[Tensor, "columns w"]:
-        return self.columns.weights().T.to(self.device)
+        return self.columns.weights().T
 
 
-def sums(
-    real: Float[Tensor, "lines waves"],
-    imag: Float[Tensor, "lines waves"],
-    cos_down: Float[Tensor, "rows waves"],
-    sin_down: Float[Tensor, "rows waves"],
-    cos: Float[Tensor, "waves half"],
-    sin: Float[Tensor, "waves half"],
-    out: Float[Tensor, "lines*rows columns"],
-) -> None:
-    """Write the sums over waves of one order to `out`."""
-    columns, real, imag = out.shape[1], real[:, None], imag[:, None]
-    even = (real * cos_down).addcmul_(imag, sin_down, value=-1).flatten(0, 1) @ cos
-    odd = (real * sin_down).addcmul_(imag, cos_down).flatten(0, 1) @ sin
-    left, middle = columns // 2, columns % 2
-    torch.sub(even[:, : left + middle], odd[:, : left + middle], out=out[:, left:])
-    out[:, :left] = (even + odd)[:, middle : left + middle].flip(1)
-
-
-def sums_cpu(real, imag, cos_down, sin_down, cos, sin, out) -> None:
-    """Do the same in fewer passes."""
-    down = (real, imag, cos_down, sin_down)
-    even, odd = compiled.spread(*(part.numpy() for part in down))
-    even, odd = torch.from_numpy(even) @ cos, torch.from_numpy(odd) @ sin
-    compiled.join(even.numpy(), odd.numpy(), out.numpy())
-
-
-def _orders(first: int, count: int) -> list[slice]:
-    """Return the modes first .. first + count - 1 (0 is x-tilt) by order n, numbered from 0."""
-    order = [noll_index(mode + 2)[0] for mode in range(first, first + count)]
-    edges = [i for i in range(count + 1) if i in (0, count) or order[i] != order[i - 1]]
-    return [slice(*pair) for pair in pairwise(edges)]
+def orders(
+    response: Complex[Tensor, "modes waves"], first: int
+) -> list[tuple[slice, Int[Tensor, " some"]]]:
+    """Return the modes of every order n as a slice, mode 0 of them being `first` (0 is x-tilt), and
+    the waves which that order sees: those that make up its variance, all but FAINT of it.
+    """
+    order = [noll_index(mode + 2)[0] for mode in range(first, first + len(response))]
+    edges = [i for i in range(len(order) + 1) if i in (0, len(order)) or order[i] != order[i - 1]]
+    parts = [slice(*pair) for pair in pairwise(edges)]
+    return [(own, _seen(response[own], FAINT[own.start + first > 1])) for own in parts]
 
 
 def _seen(response: Complex[Tensor, "modes waves"], faint: float) -> Int[Tensor, " some"]:
-    """Return the waves that make up the modes' variance, all but `faint` of it."""
     share = response.abs().square().sum(0)
     strength, order = share.sort()
     kept = order[strength.cumsum(0) > faint * strength.sum()]

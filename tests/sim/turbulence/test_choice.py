@@ -1,14 +1,9 @@
-"""The cheapest way to compute PSFs, and waves on a lattice by both engines."""
+"""The cheapest way to compute PSFs."""
 
 import pytest
-import torch
 
 from src.sim.turbulence import choice
-from src.sim.turbulence.atmosphere import Atmosphere
-from src.sim.turbulence.lattice import Lattice
 from src.sim.turbulence.p2s import band_for
-from src.sim.turbulence.phase import draw_waves
-from src.sim.turbulence.wave_field import Field, sums, sums_cpu
 
 
 def fitted(strength: float, airy: float, pixel: float, allowed: float) -> choice.Choice:
@@ -38,16 +33,3 @@ def test_smaller_pixels_have_their_nodes_as_far_apart():
     assert pitches == sorted(pitches, reverse=True)
     assert pitches[0] >= 8
     assert pitches[-1] == 1
-
-
-@pytest.mark.parametrize("pitch", [1, 3])
-@pytest.mark.parametrize("columns", [30, 31])
-def test_waves_are_summed_alike_by_both_engines(pitch, columns):
-    path = Atmosphere(0.1, 0.5, 300.0, 0.4, 525e-9, 1e-14, 0.8).at(3.0)
-    waves = draw_waves(path, 1, modes=14, waves=100, width_px=64)
-    lattices = Lattice(-3, 20, pitch, 1), Lattice(2, columns, pitch, 1)
-    field = Field(waves, slice(2, None), *lattices, (64, 64), torch.device("cpu"))
-    amplitudes = torch.randn(2, 100, dtype=torch.complex64)
-    ours = field.at_nodes(amplitudes, sums_cpu)
-    torch.testing.assert_close(field.at_nodes(amplitudes, sums), ours, atol=1e-5, rtol=1e-5)
-    assert ours.std() > 0.01

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from torch.nn import functional
 
 from src.sim.turbulence.engines.weights import weights
 from src.sim.turbulence.p2s_network import Network, mode_kind, shape_kinds
@@ -57,6 +58,17 @@ def test_the_engine_equals_the_network(modes, width, nodes):
     usual = np.float32((3.0 / 4.0) ** (5 / 3))
     found = weights(phase.T.contiguous().numpy(), own, usual, net.matrices())
     torch.testing.assert_close(torch.from_numpy(found).T, net(phase, 3.0), atol=2e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("modes, width", [(5, 16), (20, 32), (77, 112)])
+@pytest.mark.parametrize("given", [0, 2, 18, 75, 90])
+def test_few_large_matrices_equal_the_network(modes, width, given):
+    net, phase = network(modes, width), phases(max(modes, given + 2))[:, :given]
+    known = functional.pad(phase, (0, max(0, modes - 2 - given)))[:, : modes - 2]
+    one, *found = net.merged(given, 3.0)(phase.T.contiguous())
+    assert torch.equal(one, torch.ones(len(phase)))
+    found = torch.stack(found, 1)
+    torch.testing.assert_close(found, net(known, 3.0), atol=2e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize("counts", [[5, 3, 2, 3], [3, 1, 1, 0], [1, 0, 0, 0]])

@@ -9,6 +9,7 @@ from src.sim.turbulence.p2s import FILE, FINE_PER_AIRY, Spots, band_for, bands
 from src.sim.turbulence.p2s_network import shape_kinds
 from src.sim.turbulence.psf import fraunhofer_psf, resampling
 from src.sim.turbulence.zernike import noll_covariance
+from tests.sim.turbulence.theory import fitted_psfs
 
 MODES = 119  # that carry what blurs
 
@@ -93,7 +94,7 @@ def test_basis_is_even_or_odd_under_both_mirrors():
 
 def test_fitted_psf_without_phase_is_diffraction():
     spots = Spots(bands()[0], -1, 24, 1.0, 17, 0.0)
-    ours = spots.psfs(spots(torch.zeros(25, 1, 1, 1))).reshape(17, 17)
+    ours = fitted_psfs(spots, torch.zeros(25, 1)).reshape(17, 17)
     exact = fraunhofer_psf(torch.zeros(2), airy_px=1.0, size=17, points=9)
     assert (ours - exact).abs().max() < 0.01 * exact.max()
 
@@ -117,8 +118,7 @@ def test_we_are_closer_than_the_public_network(shared_data):
     public = known["mu"].reshape(1, -1) + x @ known["dictionary"].reshape(len(x.T), -1)
     band = band_for(4.0)
     spots = Spots(band, -1, len(band.basis), 3.8, 65, 4.0)
-    seen = coefficients[:, 2 : spots.network.modes].T.reshape(-1, 1, 1, 300)
-    ours = spots.psfs(spots(seen)).reshape(65 * 65, 300).T
+    ours = fitted_psfs(spots, coefficients[:, 2 : spots.network.modes].T).T
 
     def error(psf):
         psf, truth = (p / p.sum(1, keepdim=True) for p in (psf, exact))

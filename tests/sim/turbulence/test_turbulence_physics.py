@@ -20,7 +20,7 @@ from src.sim.turbulence.p2s import Spots, bands
 from src.sim.turbulence.phase import Waves, draw_waves, flow
 from src.sim.turbulence.psf import fraunhofer_psf
 from src.sim.turbulence.zernike import noll_covariance
-from tests.sim.turbulence.theory import isoplanatic_angle_rad, noll_residual
+from tests.sim.turbulence.theory import fitted_psfs, isoplanatic_angle_rad, noll_residual
 
 PATH = Atmosphere(0.05, 0.5, 1000.0, 2.0, 525e-9, 3e-14, 0.9)  # D 5 cm, 1 km, 2 m wide
 
@@ -256,8 +256,7 @@ def test_16_psf_energy():
     for band in bands():
         coefficients = phases(200, band.edge, 119, False)
         spots = Spots(band, -1, len(band.basis), 1.0, 15, band.edge)
-        seen = coefficients[:, 2 : spots.network.modes].T.reshape(-1, 1, 1, 200)
-        psfs = spots.psfs(spots(seen))
+        psfs = fitted_psfs(spots, coefficients[:, 2 : spots.network.modes].T)
         assert psfs.min() >= 0
         found = psfs.sum(0).flatten()
         inside = fraunhofer_psf(coefficients, airy_px=1.0, size=15, whole=True).sum((1, 2))

@@ -3,9 +3,11 @@
 import math
 
 import numpy as np
+import torch
 from scipy import optimize, special
 
 from src.sim.turbulence.atmosphere import Atmosphere
+from src.sim.turbulence.p2s import Spots
 from src.sim.turbulence.zernike import noll_covariance
 
 
@@ -64,3 +66,9 @@ def structure_variance() -> float:
     half = (power + 3) / 2
     mean = special.beta(half, 0.5) / (power + 2) - special.beta(half, 1.5)
     return float(structure / 2 * 8 / math.pi * mean)
+
+
+def fitted_psfs(spots: Spots, phase: torch.Tensor) -> torch.Tensor:
+    """Return the PSFs (pixels, n) of Noll 4, 5, ... (blurmodes, n) in rad, none of it negative."""
+    weights, (mean, *basis) = spots(phase[:, :, None, None])[..., 0, 0], spots.shapes.flatten(1)
+    return (mean[:, None] + torch.stack(basis).T @ weights).clamp(min=0)

@@ -5,21 +5,26 @@ from numba import njit
 
 
 @njit(nogil=True, cache=True, fastmath=True)
-def spread(real, imag, cos, sin):
+def spread(response, amplitudes, seen, cos, sin):
     """Return each wave along the rows: its even part about the middle column, and its odd one.
 
-    `real`, `imag` (lines, waves) of the amplitudes, `cos`, `sin` (rows, waves) of the phase in a
-    row; the parts are (lines * rows, waves).
+    `response` (modes, some, 2) of the waves that are `seen`, `amplitudes` (frames, waves, 2) of
+    all, real and imaginary part; `cos`, `sin` (rows, some) of the phase in a row; the parts are
+    (modes * frames * rows, some).
     """
-    (lines, waves), rows = real.shape, cos.shape[0]
-    even, odd = np.empty((2, lines * rows, waves), np.float32)
-    for line in range(lines):
-        a, b = real[line], imag[line]
+    modes, frames, rows, some = len(response), len(amplitudes), len(cos), len(seen)
+    even, odd = np.empty((2, modes * frames * rows, some), np.float32)
+    a, b = np.empty((2, some), np.float32)
+    for line in range(modes * frames):
+        own, drawn = response[line // frames], amplitudes[line % frames]
+        for i in range(some):
+            c, d = drawn[seen[i], 0], drawn[seen[i], 1]
+            a[i], b[i] = own[i, 0] * c - own[i, 1] * d, own[i, 0] * d + own[i, 1] * c
         for row in range(rows):
             c, s, one, two = cos[row], sin[row], even[line * rows + row], odd[line * rows + row]
-            for i in range(waves):
+            for i in range(some):
                 one[i] = a[i] * c[i] - b[i] * s[i]
-            for i in range(waves):
+            for i in range(some):
                 two[i] = a[i] * s[i] + b[i] * c[i]
     return even, odd
 
