@@ -185,13 +185,14 @@ def _graphs(cfg: DictConfig) -> bool:
     """Return whether a step runs as CUDA graphs; raises ValueError for a step that there is not."""
     if cfg.step not in STEPS:
         raise ValueError(f"step must be one of {', '.join(STEPS)}, got {cfg.step}")
-    able = cfg.trainer.accelerator != "cpu" and torch.cuda.is_available()
-    if cfg.step == "graph" and (not able or cfg.data.detach_every or cfg.trainer.devices != 1):
+    on_gpu = cfg.trainer.accelerator != "cpu" and torch.cuda.is_available()
+    whole = not cfg.data.detach_every and cfg.trainer.devices == 1 and not cfg.get("source")
+    if cfg.step == "graph" and not (on_gpu and whole):
         raise ValueError(
-            "step must be auto or eager without a GPU, on several, or with data.detach_every, "
-            "got graph"
+            "step must be auto or eager without a GPU, on several, with data.detach_every and for "
+            "a post-processor, got graph"
         )
-    return cfg.step != "eager" and able and not cfg.data.detach_every and cfg.trainer.devices == 1
+    return cfg.step != "eager" and on_gpu and whole
 
 
 def share_cores(cfg: DictConfig) -> None:

@@ -1,7 +1,7 @@
 """Processes that draw clips for one that computes their pixels (cache_fill.py).
 
 Scenes are rendered on the CPU and so is a clip's air prepared, there.  Frames come through shared
-memory without a name, which is gone with the processes, the rest of a clip, two megabytes at most,
+memory without a name (Linux), gone with the processes, the rest of a clip, two megabytes at most,
 through a pipe.
 """
 

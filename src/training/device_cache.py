@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from src.sim.pipeline import Pipeline
+from src.training.cache_drawing import facts_of
 
 GIB = 2**30
 
@@ -102,6 +103,4 @@ def simulated(
     draw = source.draw(index)
     top, left, height, width = draw.crop
     clean = draw.clip.frames[:, top : top + height, left : left + width].half().contiguous()
-    facts = {"name": draw.clip.name, "fps": draw.clip.fps, "record": source.record(draw)}
-    facts["air"] = repr(draw.air)
-    return source.views(draw, device)[0].half(), clean, facts
+    return source.views(draw, device)[0].half(), clean, facts_of(source, draw)
