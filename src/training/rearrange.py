@@ -72,8 +72,10 @@ def rearrange_batch(
     ]  # fmt: skip
     hidden = paused[:, :, None, None, None] | ~seen[:, None, :, None]
     out.flatten(-2).copy_(grids.masked_fill_(hidden, 0))
-    still = source_pixels([change._replace(away=[]) for change in changes], height, width)[0]
-    where = clip[:, None, None], step[:, :, None], still.to(device)
+    if any(change.away for change in changes):  # pictures stay where they are
+        still = [change._replace(away=[]) for change in changes]
+        pixel = source_pixels(still, height, width)[0].to(device)
+    where = clip[:, None, None], step[:, :, None], pixel
     return [
         part.flatten(2)[where].unflatten(-1, (1, height, width)) for part in pictures_of(sample)
     ]
