@@ -23,7 +23,7 @@ demo: $(READY) $(DEMO)
 		fps=600 speed=0.2 threads=2 loop=true
 
 lint: $(READY)
-	$(PY) -m ruff check . && $(PY) -m ruff format --check .
+	$(PY) -m ruff check . && $(PY) -m ruff format --check . && $(PY) -m mypy
 
 # The environment is complete when this file is there; a changed pyproject.toml makes it anew.
 $(READY): pyproject.toml constraints.txt scripts/setup.sh
