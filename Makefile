@@ -20,7 +20,7 @@ test-all: $(READY) $(LPIPS)
 
 demo: $(READY) $(DEMO)
 	$(PY) -m src.live recording=$(DEMO)/cap.raw views=$(DEMO)/cap.views.yaml ckpt=setnet_small \
-		fps=600 speed=0.2 threads=2 loop=true
+		fps=600 playback_speed=0.2 threads=2 loop=true
 
 lint: $(READY)
 	$(PY) -m ruff check . && $(PY) -m ruff format --check . && $(PY) -m mypy

@@ -12,11 +12,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from baselines.single_view import SingleView
+from baselines.centre_view import CentreViewNetwork
 from src.models.layers import ConvLSTM
 
 
-class CISTA(SingleView):
+class CISTA(CentreViewNetwork):
     """The centre view's voxel grids to frames; 1,260,867 parameters.
 
     `channels`: of each of the two stems (published: 32); the code has four times as many.
@@ -24,7 +24,7 @@ class CISTA(SingleView):
     normalise nonzero, output sigmoid.
     """
 
-    multiple = 2
+    side_multiple = 2
 
     def __init__(
         self,
@@ -47,15 +47,15 @@ class CISTA(SingleView):
         self.up = _conv(both, both)
         self.pred = _conv(both, 1)
 
-    def reconstruct(self, seen: Tensor, state: Any) -> tuple[Tensor, Any]:
+    def predict_before_activation(self, grid: Tensor, state: Any) -> tuple[Tensor, Any]:
         """Return the frame and (code, state of the decoder, frame before cropping)."""
-        before, memory, shown = state or (None, None, torch.zeros_like(seen[:, :1]))
-        x = self.mix(torch.cat([self.events(seen), self.previous(shown)], 1))
-        z = self._unfold(x, before)
+        code, memory, previous = state or (None, None, torch.zeros_like(grid[:, :1]))
+        x = self.mix(torch.cat([self.events(grid), self.previous(previous)], 1))
+        z = self._unfold(x, code)
         hidden, memory = self.cell(self.decoder(z).relu(), memory)
-        grown = functional.interpolate(hidden, scale_factor=2, mode="bilinear")
-        frame = self.pred(self.up(grown))
-        return frame, (z, memory, self.finish(frame).detach())
+        upsampled = functional.interpolate(hidden, scale_factor=2, mode="bilinear")
+        frame = self.pred(self.up(upsampled))
+        return frame, (z, memory, self.activate_output(frame).detach())
 
     def _unfold(self, x: Tensor, before: Tensor | None) -> Tensor:
         z = self.code(x)
@@ -81,7 +81,6 @@ class Step(nn.Module):
         z: Float[Tensor, "n c h w"],
         pull: Float[Tensor, "n c h w"],
     ) -> Float[Tensor, "n c h w"]:
-        """Return the next code."""
         z = z + self.analysis(x - self.synthesis(z)) + pull
         return (z - self.threshold).relu() - (-z - self.threshold).relu()
 

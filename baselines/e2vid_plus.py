@@ -4,11 +4,11 @@ from typing import Any
 
 from torch import Tensor
 
-from baselines.single_view import SingleView
+from baselines.centre_view import CentreViewNetwork
 from src.models.e2vid import E2VID
 
 
-class E2VIDPlus(SingleView):
+class E2VIDPlus(CentreViewNetwork):
     """The centre view's voxel grids to frames; 10,710,401 parameters.
 
     As published: normalise none, output clip.  E2VID itself is normalise nonzero, output sigmoid.
@@ -24,6 +24,5 @@ class E2VIDPlus(SingleView):
         super().__init__(bins, normalise, output)
         self.net = E2VID(1, bins, base_channels, final_activation="none")
 
-    def reconstruct(self, seen: Tensor, state: Any) -> tuple[Tensor, Any]:
-        """Return the frame and the state of E2VID."""
-        return self.net(seen[:, None], state)
+    def predict_before_activation(self, grid: Tensor, state: Any) -> tuple[Tensor, Any]:
+        return self.net(grid[:, None], state)

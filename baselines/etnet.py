@@ -13,19 +13,19 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from baselines.single_view import SingleView
+from baselines.centre_view import CentreViewNetwork
 from src.models.e2vid import E2VID, SCALES
 
 HEADS, DROPOUT = 8, 0.1
 
 
-class ETNet(SingleView):
+class ETNet(CentreViewNetwork):
     """The centre view's voxel grids to frames; 22,175,361 parameters.
 
     As published: normalise none, output sigmoid.
     """
 
-    multiple = 2**SCALES
+    side_multiple = 2**SCALES
 
     def __init__(
         self,
@@ -39,9 +39,8 @@ class ETNet(SingleView):
         self.net.resblocks = nn.Sequential()
         self.pyramid = Pyramid([base_channels * 2**scale for scale in range(SCALES, 0, -1)])
 
-    def reconstruct(self, seen: Tensor, state: Any) -> tuple[Tensor, Any]:
-        """Return the frame and the state of E2VID."""
-        head, skips, after = self.net.encode(seen, state)
+    def predict_before_activation(self, grid: Tensor, state: Any) -> tuple[Tensor, Any]:
+        head, skips, after = self.net.encode(self.net.first_layer(grid), state)
         return self.net.decode(self.pyramid(skips[::-1]), head, skips), after
 
 
@@ -60,7 +59,7 @@ class Pyramid(nn.Module):
         )
         self.own = nn.ModuleList(nn.Sequential(*(Layer(width) for _ in range(3))) for _ in widths)
         self.across = nn.ModuleList(
-            nn.ModuleList(CrossLayer(width) for _ in range(2)) for _ in widths
+            nn.ModuleList(Layer(width, crossed=True) for _ in range(2)) for _ in widths
         )
         for parameter in chain(self.own.parameters(), self.across.parameters()):
             if parameter.dim() > 1:
@@ -74,43 +73,33 @@ class Pyramid(nn.Module):
         seen = [layers(x + places) for layers, x in zip(self.own, tokens, strict=True)]
         compared = []
         for layers, (memory, x) in zip(self.across, pairwise([seen[0], *seen]), strict=True):
-            for layer in layers:
+            for layer in layers:  # type: ignore[attr-defined]
                 x = layer(x, memory)
             compared.append(x)
         return torch.stack(seen + compared).mean(0).transpose(1, 2).view_as(maps[0])
 
 
 class Layer(nn.Module):
-    """Self-attention and a two-layer perceptron, each normalised before and added."""
+    """Self-attention, attention to a memory if `crossed`, and a two-layer perceptron, each
+    normalised before and added.
+    """
 
-    def __init__(self, width: int):
+    def __init__(self, width: int, crossed: bool = False):
         super().__init__()
         self.norm, self.attention = nn.LayerNorm(width), Attention(width)
-        self.mlp = MLP(width)
-
-    def forward(self, x: Float[Tensor, "n tokens c"]) -> Float[Tensor, "n tokens c"]:
-        """Return tokens of the same shape."""
-        normal = self.norm(x)
-        return self.mlp(x + self.attention(normal, normal))
-
-
-class CrossLayer(nn.Module):
-    """Self-attention, attention to a memory, a perceptron, each normalised before and added."""
-
-    def __init__(self, width: int):
-        super().__init__()
-        self.norm, self.attention = nn.LayerNorm(width), Attention(width)
-        self.asker_norm, self.memory_norm = nn.LayerNorm(width), nn.LayerNorm(width)
-        self.cross = Attention(width)
-        self.mlp = MLP(width)
+        if crossed:
+            self.asker_norm, self.memory_norm = nn.LayerNorm(width), nn.LayerNorm(width)
+            self.cross = Attention(width)
+        self.mlp = ResidualMLP(width)
 
     def forward(
-        self, x: Float[Tensor, "n tokens c"], memory: Float[Tensor, "n tokens c"]
+        self, x: Float[Tensor, "n tokens c"], memory: Float[Tensor, "n tokens c"] | None = None
     ) -> Float[Tensor, "n tokens c"]:
-        """Return tokens of the same shape."""
         normal = self.norm(x)
         x = x + self.attention(normal, normal)
-        return self.mlp(x + self.cross(self.asker_norm(x), self.memory_norm(memory)))
+        if memory is not None:
+            x = x + self.cross(self.asker_norm(x), self.memory_norm(memory))
+        return self.mlp(x)
 
 
 class Attention(nn.Module):
@@ -135,7 +124,7 @@ class Attention(nn.Module):
         return functional.dropout(attended, DROPOUT, self.training)
 
 
-class MLP(nn.Module):
+class ResidualMLP(nn.Module):
     """Normalise, four times as wide, ReLU, back, add."""
 
     def __init__(self, width: int):
@@ -144,7 +133,6 @@ class MLP(nn.Module):
         self.wide, self.back = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
 
     def forward(self, x: Float[Tensor, "n tokens c"]) -> Float[Tensor, "n tokens c"]:
-        """Return tokens of the same shape."""
         hidden = functional.dropout(self.wide(self.norm(x)).relu(), DROPOUT, self.training)
         return x + functional.dropout(self.back(hidden), DROPOUT, self.training)
 

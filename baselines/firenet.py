@@ -8,11 +8,11 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from baselines.single_view import SingleView
+from baselines.centre_view import CentreViewNetwork
 from src.models.layers import ConvGRU, ResidualBlock
 
 
-class FireNet(SingleView):
+class FireNet(CentreViewNetwork):
     """The centre view's voxel grids to frames.
 
     `normalise`: nonzero (FireNet) or none (FireNet+).  `output`: none (FireNet) or clip (FireNet+).
@@ -27,9 +27,8 @@ class FireNet(SingleView):
         self.resblocks = nn.ModuleList(ResidualBlock(channels) for _ in range(2))
         self.pred = nn.Conv2d(channels, 1, 1)
 
-    def reconstruct(self, seen: Tensor, state: Any) -> tuple[Tensor, Any]:
-        """Return the frame and the two hidden maps."""
-        x = self.head(seen).relu()
+    def predict_before_activation(self, grid: Tensor, state: Any) -> tuple[Tensor, Any]:
+        x = self.head(grid).relu()
         after = []
         for cell, block, before in zip(
             self.cells, self.resblocks, state or (None, None), strict=True

@@ -7,40 +7,42 @@ known, and errors pile up, so old events are forgotten exponentially (Scheerlinc
 from collections.abc import Sequence
 
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
-from src.sim.optics import Position, centre, layout
+from src.models.network import WINDOW_S, EventToVideoNetwork
+from src.sim.optics import Position, centre_view_index, layout
 
 
-class HighPass(nn.Module):
+class HighPass(EventToVideoNetwork):
     """Leaky sum of a view's events, drawn as grey 0.5 plus `gain` times the sum.
 
-    `keep`: what is left of a sum after one window (0.9: ten windows of memory).  `source`:
-    `centre`, the centre view, or `median`, the median over all views, pixel by pixel.
+    `decay`: what is left of a sum after one window (0.9: ten windows of memory).
+    `view_reduction`: centre, the centre view, or median, over all views, pixel by pixel.
     """
 
-    views = None
-
-    def __init__(self, keep: float = 0.9, gain: float = 0.08, source: str = "centre"):
+    def __init__(self, decay: float = 0.9, gain: float = 0.08, view_reduction: str = "centre"):
         super().__init__()
-        if not 0 <= keep <= 1:
-            raise ValueError(f"baseline.keep must be in [0, 1], got {keep}")
-        if source not in ("centre", "median"):
-            raise ValueError(f"baseline.source must be centre or median, got {source}")
-        self.keep, self.gain, self.source = keep, gain, source
+        if not 0 <= decay <= 1:
+            raise ValueError(f"baseline.decay must be in [0, 1], got {decay}")
+        if view_reduction not in ("centre", "median"):
+            raise ValueError(
+                f"baseline.view_reduction must be centre or median, got {view_reduction}"
+            )
+        self.decay, self.gain, self.view_reduction = decay, gain, view_reduction
 
     def forward(
         self,
         voxels: Float[Tensor, "n views bins h w"],
         state: Tensor | None = None,
         *,
+        window_s: float | Tensor = WINDOW_S,
         positions: Sequence[Position] | None = None,
     ) -> tuple[Float[Tensor, "n 1 h w"], Tensor]:
         """Return the frame in [0, 1] and the leaky sum (n, 1, h, w)."""
         events = voxels.sum(2)
-        if self.source == "centre":
-            change = events[:, centre(positions or layout(events.shape[1])), None]
+        if self.view_reduction == "centre":
+            change = events[:, centre_view_index(positions or layout(events.shape[1])), None]
         else:
             change = events.median(dim=1, keepdim=True).values
-        state = change if state is None else self.keep * state + change
+        state = change if state is None else self.decay * state + change
         return (0.5 + self.gain * state).clamp(0, 1), state

@@ -26,7 +26,11 @@ def hilbert_order(*sides: int) -> Int[Tensor, " cells"]:
             if i:
                 axes[i] = axes[i] ^ swapped
         level >>= 1
-    return torch.argsort(_interleave(_gray(axes, bits), bits))
+    index, axes = torch.zeros_like(axes[0]), _gray(axes, bits)
+    for bit in reversed(range(bits)):
+        for axis in axes:
+            index = (index << 1) | ((axis >> bit) & 1)
+    return torch.argsort(index)
 
 
 def _gray(axes: list[Tensor], bits: int) -> list[Tensor]:
@@ -37,11 +41,3 @@ def _gray(axes: list[Tensor], bits: int) -> list[Tensor]:
     for bit in range(bits - 1, 0, -1):
         flips = torch.where((axes[-1] >> bit) & 1 > 0, flips ^ ((1 << bit) - 1), flips)
     return [axis ^ flips for axis in axes]
-
-
-def _interleave(axes: list[Tensor], bits: int) -> Tensor:
-    index = torch.zeros_like(axes[0])
-    for bit in range(bits - 1, -1, -1):
-        for axis in axes:
-            index = (index << 1) | ((axis >> bit) & 1)
-    return index

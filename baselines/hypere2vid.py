@@ -15,19 +15,20 @@ from scipy.special import jn_zeros, jv
 from torch import Tensor, nn
 from torch.nn import functional
 
-from baselines.single_view import SingleView
+from baselines.centre_view import CentreViewNetwork
 from src.models.e2vid import E2VID, SCALES
+from src.models.layers import bias_of
 
 ATOMS, FUNCTIONS = 6, 6  # functions of each of the two reaches
 
 
-class HyperE2VID(SingleView):
+class HyperE2VID(CentreViewNetwork):
     """The centre view's voxel grids to frames; 10,149,881 parameters and 574 numbers in buffers.
 
     As published: normalise none, output clip.
     """
 
-    multiple = 2**SCALES
+    side_multiple = 2**SCALES
 
     def __init__(
         self, bins: int = 5, base_channels: int = 32, normalise: str = "none", output: str = "clip"
@@ -37,12 +38,12 @@ class HyperE2VID(SingleView):
         self.net.decoders = self.net.decoders[1:]
         self.dynamic = DynamicDecoder(8 * base_channels, 4 * base_channels, bins + 1)
 
-    def reconstruct(self, seen: Tensor, state: Any) -> tuple[Tensor, Any]:
+    def predict_before_activation(self, grid: Tensor, state: Any) -> tuple[Tensor, Any]:
         """Return the frame and (state of E2VID, frame before output handling and cropping)."""
-        before, shown = state or (None, torch.zeros_like(seen[:, :1]))
-        head, skips, after = self.net.encode(seen, before)
+        before, previous = state or (None, torch.zeros_like(grid[:, :1]))
+        head, skips, after = self.net.encode(self.net.first_layer(grid), before)
         x = self.net.resblocks(skips[-1]) + skips.pop()
-        x = self.dynamic(x, torch.cat([seen, shown], 1))
+        x = self.dynamic(x, torch.cat([grid, previous], 1))
         frame = self.net.decode(x, head, skips)
         return frame, (after, frame.detach())
 
@@ -53,6 +54,8 @@ class DynamicDecoder(nn.Module):
     The kernels are sums of fixed functions, so the functions filter first and the context weighs
     what comes out: the same numbers without ever unfolding 5x5 patches.
     """
+
+    functions: Tensor
 
     def __init__(self, inputs: int, outputs: int, context: int):
         super().__init__()
@@ -71,7 +74,7 @@ class DynamicDecoder(nn.Module):
         self.register_buffer("functions", functions.flatten(1))
         self.compose = nn.Conv2d(inputs * ATOMS, outputs, 1)
         nn.init.kaiming_normal_(self.compose.weight, mode="fan_out", nonlinearity="relu")
-        nn.init.zeros_(self.compose.bias)
+        nn.init.zeros_(bias_of(self.compose))
 
     def forward(
         self, x: Float[Tensor, "n c h w"], context: Float[Tensor, "n k h8 w8"]

@@ -5,12 +5,12 @@ spaces over all tokens of a window - rows first, time first, along a Hilbert cur
 the latent phase distortion (two of tilt, mean and log-variance of a blur latent); one more group
 guided by it; a decoder for the picture.
 
-Differs from the published code where that is at odds with its paper: backward scans are turned
-back also in guided layers, the convolution of local layers runs on the raster and not on the curve,
-frames need not be square, the few channels that weigh a fusion are GELU, which cannot die, not
-ReLU, and the last decoder draws what is added to the input, so that a short training starts there.
-With `steadied` the input is held still first, and the two latents of tilt say by how much.
+Differs from the published code: backward scans are turned back also in guided layers, the
+convolution of local layers runs on the raster, frames need not be square, fusions are weighed
+through GELU, and the last decoder draws what is added to the input.
 """
+
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float, Int
@@ -19,50 +19,53 @@ from torch.nn import functional
 
 from baselines.hilbert import hilbert_order
 from baselines.selective_scan import Mixer
-from baselines.stabilise import jitter, pull
+from baselines.stabilise import estimate_jitter, warp_video
 from src.models.layers import pad_to_multiple
+from src.models.network import FramePostprocessor, split_windows
 
 DISTORTION = 4  # channels: tilt down and right, mean and log-variance of the blur latent
 SCALES = 3
 PIXELS = 2**20  # encoded or decoded at once where no gradient is asked for: 16 frames of 256 x 256
 
 
-class MambaTM(nn.Module):
-    """`channels`: of a frame, 1 (grey) or 3.  `features`: of the encoder, 8 times as many in the
-    trunk.  `groups`: of three layers, the last one guided.  Published: 3, 16, 6 and 16 `states`.
-    `steadied`: the encoder also sees the frames without their jitter (baselines/stabilise.py), of
-    which the tilt channels take out nothing to twice as much; all of it before any training.
+class MambaTM(FramePostprocessor):
+    """`frame_channels`: 1 (grey) or 3.  `base_channels`: of the encoder, >= 8, 8 times as many in
+    the trunk.  `scan_blocks`: >= 2, of three layers, the last one guided.  Published: 3, 16, 6, 16
+    `states`.  `stabilise_input`: the encoder also sees the frames without their jitter
+    (baselines/stabilise.py), of which the tilt channels take out nothing to twice as much; all of
+    it before any training.
     """
-
-    views = None  # it sees none
-    WINDOW, OVERLAP = 16, 4  # frames that are restored at a time; of them, shared with the next
 
     def __init__(
         self,
-        channels: int = 1,
-        features: int = 8,
-        groups: int = 2,
+        frame_channels: int = 1,
+        base_channels: int = 8,
+        scan_blocks: int = 2,
         states: int = 8,
-        steadied: bool = False,
+        stabilise_input: bool = False,
     ):
         super().__init__()
-        if groups < 2:
-            raise ValueError(f"postprocess.groups must be >= 2, got {groups}")
-        if features < 8:
-            raise ValueError(f"postprocess.features must be >= 8, got {features}")
-        width = features * 2**SCALES
-        self.channels, self.steadied = channels, steadied
-        self.encoder = Encoder(2 * channels if steadied else channels, features)
-        self.distortion_encoder = Encoder(DISTORTION, features)
+        for name, value, least in (
+            ("scan_blocks", scan_blocks, 2),
+            ("base_channels", base_channels, 8),
+        ):
+            if value < least:
+                raise ValueError(f"postprocess.{name} must be >= {least}, got {value}")
+        width = base_channels * 2**SCALES
+        self.frame_channels, self.stabilise_input = frame_channels, stabilise_input
+        self.encoder = Encoder(
+            2 * frame_channels if stabilise_input else frame_channels, base_channels
+        )
+        self.distortion_encoder = Encoder(DISTORTION, base_channels)
         self.distortion_width = nn.Conv2d(width, width, 1)
-        self.distortion_decoder = Decoder(DISTORTION, features)
-        self.decoder = Decoder(channels, features)
+        self.distortion_decoder = Decoder(DISTORTION, base_channels)
+        self.decoder = Decoder(frame_channels, base_channels)
         for parameter in self.decoder.out[-1].parameters():
             nn.init.zeros_(parameter)  # what is added to the input begins with nothing
-        if steadied:
+        if stabilise_input:
             for parameter in self.distortion_decoder.out[-1].parameters():
                 nn.init.zeros_(parameter[:2])  # and takes out the jitter that was found
-        free = range(3 * (groups - 1))
+        free = range(3 * (scan_blocks - 1))
         self.free = nn.ModuleList(Layer(width, states, guided=False) for _ in free)
         self.guided = nn.ModuleList(Layer(width, states, guided=True) for _ in range(3))
 
@@ -74,22 +77,23 @@ class MambaTM(nn.Module):
         Grey frames may be given to a network of three channels too.
         """
         n, count, given, height, width = frames.shape
-        frames = frames.expand(-1, -1, self.channels, -1, -1)
-        shift = jitter(frames) if self.steadied else None
-        seen = frames if shift is None else torch.cat([frames, pull(frames, shift)], 2)
+        frames = frames.expand(-1, -1, self.frame_channels, -1, -1)
+        shift = estimate_jitter(frames) if self.stabilise_input else None
+        seen = frames if shift is None else torch.cat([frames, warp_video(frames, shift)], 2)
         flat, (top, left) = pad_to_multiple(seen.flatten(0, 1), 2**SCALES)
-        parts = parts_of(flat)
+        limit = 0 if torch.is_grad_enabled() else max(1, PIXELS // flat[0, 0].numel())
+        parts = list(split_windows(len(flat), limit))
         maps = zip(*(self.encoder(flat[part]) for part in parts), strict=True)
         *skips, deep = [torch.cat(scale) for scale in maps]
         grid = (count, *deep.shape[-2:])
         orders = [order.to(frames.device) for order in scan_orders(*grid)]
-        tokens = deep.unflatten(0, (n, count)).movedim(2, -1).flatten(1, 3)
+        tokens = _tokens(deep, count)
         for i, layer in enumerate(self.free):
             tokens = layer(tokens, grid, orders[i % 3])
         latent = self.distortion_width(_maps(tokens, grid))
         distortion = _decode(self.distortion_decoder, latent, skips, parts)
         guide = torch.cat([self.distortion_encoder(distortion[part])[-1] for part in parts])
-        guide = guide.unflatten(0, (n, count)).movedim(2, -1).flatten(1, 3)
+        guide = _tokens(guide, count)
         for i, layer in enumerate(self.guided):
             tokens = layer(tokens, grid, orders[i], guide)
         added = _decode(self.decoder, _maps(tokens, grid), skips, parts)
@@ -98,50 +102,9 @@ class MambaTM(nn.Module):
             for part in (added, distortion)
         )
         if shift is not None:
-            frames = pull(frames, 2 * distortion[:, :, :2].sigmoid() * shift)
+            frames = warp_video(frames, 2 * distortion[:, :, :2].sigmoid() * shift)
         clean = frames + added
         return (clean.mean(2, keepdim=True) if given == 1 else clean), distortion
-
-    @torch.no_grad()
-    def restore(
-        self,
-        frames: Float[Tensor, "n frames c h w"],
-        *,
-        window: int = WINDOW,
-        overlap: int = OVERLAP,
-    ) -> Float[Tensor, "n frames c h w"]:
-        """Return a video of any length without turbulence, in [0, 1], window by window.
-
-        Of two windows that overlap each gives the half that lies deeper in it.  Raises ValueError
-        unless 0 <= overlap < window.
-        """
-        if not 0 <= overlap < window:
-            raise ValueError(f"postprocess.overlap must be in [0, {window}), got {overlap}")
-        count, parts, done = frames.shape[1], [], 0
-        for start in window_starts(count, window, overlap):
-            stop = min(start + window, count)
-            until = count if stop == count else stop - overlap // 2
-            clean, _ = self(frames[:, start:stop])
-            parts.append(clean[:, done - start : until - start])
-            done = until
-        return torch.cat(parts, 1).clamp(0, 1)
-
-
-def parts_of(frames: Float[Tensor, "n c h w"]) -> list[slice]:
-    """Return the slices of the frames that are encoded and decoded at once.
-
-    All of them for training; else as many as bound the memory.
-    """
-    count = len(frames)
-    if not torch.is_grad_enabled():
-        count = max(1, PIXELS // (frames.shape[-2] * frames.shape[-1]))
-    return [slice(start, start + count) for start in range(0, len(frames), count)]
-
-
-def window_starts(frames: int, window: int, overlap: int) -> list[int]:
-    """Return where windows begin that cover `frames`; the last one ends with the video."""
-    last = max(frames - window, 0)
-    return [*range(0, last, window - overlap), last]
 
 
 def scan_orders(frames: int, height: int, width: int) -> list[Int[Tensor, " cells"]]:
@@ -188,18 +151,15 @@ class Encoder(nn.Module):
 
     def __init__(self, channels: int, features: int):
         super().__init__()
-        widths = [features * 2**scale for scale in range(SCALES + 1)]
+        widths = [channels, *(features * 2**scale for scale in range(SCALES + 1))]
         growths = [features, features * 3 // 2, 2 * features, 2 * features]
         self.down = nn.ModuleList(
             nn.Conv2d(a, b, 5, stride=2 if scale else 1, padding=2)
-            for scale, (a, b) in enumerate(zip([channels, *widths], widths, strict=False))
+            for scale, (a, b) in enumerate(pairwise(widths))
         )
-        self.dense = nn.ModuleList(
-            DenseBlock(width, growth) for width, growth in zip(widths, growths, strict=True)
-        )
+        self.dense = nn.ModuleList(map(DenseBlock, widths[1:], growths))
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> list[Tensor]:
-        """Return the maps, finest first."""
         maps = []
         for down, dense in zip(self.down, self.dense, strict=True):
             x = dense(down(x))
@@ -218,7 +178,6 @@ class DenseBlock(nn.Module):
         self.back = nn.Conv2d(width + 3 * growth, width, 1)
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
-        """Return a map of the same shape."""
         seen = x
         for conv in self.convs:
             seen = torch.cat([seen, conv(seen).relu()], 1)
@@ -261,7 +220,6 @@ class Fusion(nn.Module):
         self.weigh = nn.Conv2d(width // 16, width, 1, bias=False)
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
-        """Return a map of the same shape."""
         outcome = self.around(functional.gelu(self.inside(x)))
         mean = self.squeeze(outcome.mean((-2, -1), keepdim=True))
         weights = self.weigh(functional.gelu(mean)).sigmoid()
@@ -270,6 +228,10 @@ class Fusion(nn.Module):
 
 def _decode(decoder: "Decoder", deep: Tensor, skips: list[Tensor], parts: list[slice]) -> Tensor:
     return torch.cat([decoder(deep[part], [skip[part] for skip in skips]) for part in parts])
+
+
+def _tokens(maps: Tensor, frames: int) -> Tensor:
+    return maps.unflatten(0, (-1, frames)).movedim(2, -1).flatten(1, 3)
 
 
 def _maps(tokens: Tensor, grid: tuple[int, int, int]) -> Tensor:

@@ -1,116 +1,87 @@
-"""Frames as a method, and a post-processor behind any method: what the paper compares events with.
-
-Both make a whole video at once, `video(sample)`; see `src.models.unroll.video`.
-"""
+"""Camera frames as a method, and a post-processor behind any method."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from src.models import files
-from src.models.unroll import takes, video
-from src.training.reconstructor import Reconstructor
+from src.models.network import FramePostprocessor, VideoMethod
 
 if TYPE_CHECKING:
     from src.sim.pipeline import Sample
 
 
-class CameraFrames(nn.Module):
+class CameraFrames(VideoMethod):
     """The turbulent frames themselves, as a camera behind the centre view gives them.
 
-    `average`: consecutive frames that one exposure lasts; such a camera has one picture for so many
-    windows, shown in all of them (the paper's figure 7: 4).
+    `exposure_frames`: consecutive frames that one exposure lasts; such a camera has one picture for
+    so many windows, repeated in all of them (the paper's figure 7: 4).
     """
 
-    views = None
-
-    def __init__(self, average: int = 1):
+    def __init__(self, exposure_frames: int = 1):
         super().__init__()
-        if average < 1:
-            raise ValueError(f"baseline.average must be >= 1, got {average}")
-        self.average = average
+        if exposure_frames < 1:
+            raise ValueError(f"baseline.exposure_frames must be >= 1, got {exposure_frames}")
+        self.exposure_frames = exposure_frames
 
-    def video(self, sample: "Sample") -> Float[Tensor, "n windows 1 h w"]:
-        """Return the mean of every `average` frames in the place of each of them."""
-        pictures = [part.mean(1, keepdim=True) for part in sample.turbulent.split(self.average, 1)]
-        shown = torch.cat(pictures, 1).repeat_interleave(self.average, 1)
-        return shown[:, : sample.turbulent.shape[1]]
+    def reconstruct_clip(self, sample: "Sample") -> Float[Tensor, "n windows 1 h w"]:
+        """Return the mean of the frames of every exposure in the place of each of them."""
+        exposures = sample.turbulent.split(self.exposure_frames, 1)
+        means = torch.cat([frames.mean(1, keepdim=True) for frames in exposures], 1)
+        repeated = means.repeat_interleave(self.exposure_frames, 1)
+        return repeated[:, : sample.turbulent.shape[1]]
 
 
-class Postprocessed(nn.Module):
+class Postprocessed(VideoMethod):
     """A post-processor behind `source`: video in, video out, in windows of `window` frames that
     share `overlap`.  A source with fewer pictures than windows gives each of them once.
 
-    `restorer`: the post-processor, or a name in weights/ or a path of its weights, of one of the
-    packages `rooms` if not of ours.
+    `postprocessor`: the network, or a name in weights/ or a path of its weights, of one of the
+    packages `allowed_packages` if not of ours.
     """
 
     def __init__(
         self,
-        source: nn.Module,
-        restorer: nn.Module | str,
+        source: VideoMethod,
+        postprocessor: FramePostprocessor | str,
         window: int = 16,
         overlap: int = 4,
-        rooms: Sequence[str] = (),
+        allowed_packages: Sequence[str] = (),
     ):
         super().__init__()
-        self.source = source
-        self.restorer = load(restorer, rooms) if isinstance(restorer, str) else restorer
+        if isinstance(postprocessor, str):
+            postprocessor = load(postprocessor, allowed_packages)
+        self.source, self.postprocessor = source, postprocessor
         self.views, self.window, self.overlap = source.views, window, overlap
 
     @torch.no_grad()
-    def video(self, sample: "Sample") -> Float[Tensor, "n windows 1 h w"]:
+    def reconstruct_clip(self, sample: "Sample") -> Float[Tensor, "n windows 1 h w"]:
         """Return the restored frame of every window, in [0, 1]."""
-        frames = video(self.source, sample).float().clamp(0, 1)
-        every = getattr(self.source, "average", 1)
-        restored = self.restorer.restore(
-            frames[:, ::every], window=self.window, overlap=self.overlap
+        frames = self.source.reconstruct_clip(sample).float().clamp(0, 1)
+        step = self.source.exposure_frames if isinstance(self.source, CameraFrames) else 1
+        restored = self.postprocessor.restore(
+            frames[:, ::step], window=self.window, overlap=self.overlap
         )
-        return restored.repeat_interleave(every, 1)[:, : frames.shape[1]]
+        return restored.repeat_interleave(step, 1)[:, : frames.shape[1]]
 
 
-class Restoration(Reconstructor):
-    """Training of a post-processor on the frames that `source`, frozen, makes of each sample."""
-
-    def __init__(self, network: nn.Module, network_spec: dict, *, source: nn.Module, **how: Any):
-        super().__init__(network, network_spec, **how)
-        self._source = (source.eval().requires_grad_(False),)  # not part of the checkpoint
-
-    @property
-    def method(self) -> Postprocessed:
-        """The network behind its source."""
-        return Postprocessed(self._source[0], super().method)
-
-    def unrolled(
-        self,
-        sample: "Sample",
-        part: slice,
-        state: Any = None,
-        shown: Sequence[int] | None = None,
-    ) -> tuple[Tensor, None]:
-        """Return what the post-processor makes of a `part` of the source's frames; no state."""
-        with torch.no_grad():
-            seen = video(self._source[0].to(self.device), sample).float().clamp(0, 1)
-        restored = self.network(seen[:, part])[0]
-        return restored if shown is None else restored[:, shown], None
-
-
-def load(weights: str, rooms: Sequence[str] = ()) -> nn.Module:
+def load(weights: str, allowed_packages: Sequence[str] = ()) -> FramePostprocessor:
     """Return the frozen post-processor of a name in weights/ or a path.
 
     Raises ValueError, which says how to make it, where there is none.
     """
     try:
-        restorer = files.load(weights, rooms)
+        network = files.load(weights, allowed_packages)
     except ValueError as error:
         raise ValueError(
-            f"postprocess.restorer must be a name in weights/ or a path, got {weights} ({error}); "
-            "make one with `python -m src.train experiment=mambatm` and scripts.ship_weights"
+            "postprocess.postprocessor must be a name in weights/ or a path, got "
+            f"{weights} ({error}); make one with `python -m src.train experiment=mambatm` and "
+            "scripts.ship_weights"
         ) from error
-    if not takes(restorer, "frames"):
-        kind = type(restorer).__name__
-        raise ValueError(f"postprocess.restorer must be a post-processor, got a {kind}")
-    return restorer.requires_grad_(False)
+    if not isinstance(network, FramePostprocessor):
+        kind = type(network).__name__
+        raise ValueError(f"postprocess.postprocessor must be a post-processor, got a {kind}")
+    return network.requires_grad_(False)

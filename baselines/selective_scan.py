@@ -6,7 +6,6 @@ per channel with its own few states; step, enter and leave follow from the input
 """
 
 import math
-from importlib.util import find_spec
 
 import torch
 from jaxtyping import Float
@@ -27,11 +26,8 @@ def scan(
 ) -> Float[Tensor, "n length c"]:
     """Return what each channel reads; `rate` < 0, `step` > 0, so no decay exceeds one.
 
-    On a GPU the kernel of `mamba_ssm`, where that is installed.  Else block after block, so that
-    the memory of states is that of one block.
+    Block after block, so that the memory of states is that of one block.
     """
-    if x.is_cuda and find_spec("mamba_ssm"):
-        return _fused(x, step, rate, enter, leave)
     blocks = zip(*(part.split(BLOCK, 1) for part in (x, step, enter, leave)), strict=True)
     state, read = x.new_zeros(len(x), *rate.shape), []
     for x, step, enter, leave in blocks:
@@ -63,14 +59,6 @@ def _block(
     before = torch.cat([state[:, None], carried[:, :-1]], 1)
     states = (states + decays * before[:, :, None]).flatten(1, 2)
     return torch.einsum("nlcs,nls->nlc", states, leave)[:, :length], carried[:, -1]
-
-
-def _fused(x: Tensor, step: Tensor, rate: Tensor, enter: Tensor, leave: Tensor) -> Tensor:
-    """Return `scan` by the kernel of the authors of Mamba, which has the length last."""
-    from mamba_ssm.ops.selective_scan_interface import selective_scan_fn
-
-    x, step, enter, leave = (part.transpose(1, 2).contiguous() for part in (x, step, enter, leave))
-    return selective_scan_fn(x, step, rate, enter, leave).transpose(1, 2)
 
 
 def _run(decay: Tensor, drive: Tensor, axis: int) -> tuple[Tensor, Tensor]:
@@ -136,7 +124,6 @@ class Mixer(nn.Module):
     def forward(
         self, x: Float[Tensor, "n length c"], guide: Float[Tensor, "n length c"] | None = None
     ) -> Float[Tensor, "n length c"]:
-        """Return a sequence of the same shape; the guide, if any, has it too."""
         if guide is None:
             x, gate = self.enter(x).chunk(2, dim=-1)
         else:

@@ -1,10 +1,8 @@
 """How a video shakes, found in the video itself, and the same video held still.
 
-What stands or moves smoothly has a path without corners; what turbulence adds to it changes from
-frame to frame.  Displacements between neighbours, block by block, summed over time are a path; the
-path less its smooth part is jitter (the idea of video stabilisation, Liu et al., "Bundled camera
-paths", 2013, with blocks for cameras).  Motion that turns within a few frames is taken for jitter;
-of jitter no larger than what is measured wrong little is believed (Wiener's gain).
+Displacements between neighbouring frames, block by block, summed over time are a path; the path
+less its smooth part is jitter (as video stabilisation, Liu et al., "Bundled camera paths", 2013),
+scaled by Wiener's gain for what is measured wrong.
 """
 
 import torch
@@ -20,23 +18,23 @@ NEAR = (1.0, 4.0, 1.0)  # weights of a block and its neighbours along an axis
 
 
 @torch.no_grad()
-def jitter(frames: Float[Tensor, "n frames c h w"]) -> Float[Tensor, "n frames 2 h w"]:
+def estimate_jitter(frames: Float[Tensor, "n frames c h w"]) -> Float[Tensor, "n frames 2 h w"]:
     """Return by how much each frame is shifted, (x, y) in pixels, against where it belongs."""
     grey = frames.float().mean(2, keepdim=True)
     with torch.autocast(frames.device.type, enabled=False):
-        return torch.stack([_jitter(clip) for clip in grey])
+        return torch.stack([_clip_jitter(clip) for clip in grey])
 
 
-def _jitter(clip: Float[Tensor, "frames 1 h w"]) -> Float[Tensor, "frames 2 h w"]:
-    steps = _evened(*temporal.displacement(clip[1:], clip[:-1]))
+def _clip_jitter(clip: Float[Tensor, "frames 1 h w"]) -> Float[Tensor, "frames 2 h w"]:
+    steps = _with_neighbours(*temporal.estimate_block_displacement(clip[1:], clip[:-1]))
     path = functional.pad(steps.cumsum(0), (0, 0, 0, 0, 0, 0, 1, 0))
-    shake = path - torch.einsum("ts,s...->t...", smoother(len(path)).to(path), path)
+    shake = path - torch.einsum("ts,s...->t...", linear_smoother(len(path)).to(path), path)
     power = shake.square().mean((0, 1))
     shake = shake * power / (power + ERROR**2)
     return functional.interpolate(shake, clip.shape[-2:], mode="bilinear")
 
 
-def _evened(
+def _with_neighbours(
     steps: Float[Tensor, "steps 2 rows columns"], weight: Float[Tensor, "steps rows columns"]
 ) -> Float[Tensor, "steps 2 rows columns"]:
     """Return each block's mean with its neighbours', as far as they have texture; a block with none
@@ -51,7 +49,7 @@ def _evened(
     return whole + torch.cat(moved, 1) / (total + 1e-9)
 
 
-def smoother(frames: int) -> Float[Tensor, "frames frames"]:
+def linear_smoother(frames: int) -> Float[Tensor, "frames frames"]:
     """Return the matrix that fits a straight line around each moment, weighed by a Gaussian, and
     takes its value there: constants and straight lines come through as they are.
     """
@@ -63,9 +61,11 @@ def smoother(frames: int) -> Float[Tensor, "frames frames"]:
     return weight * (second - first * lag) / spread if frames > 1 else torch.ones(1, 1)
 
 
-def pull(
+def warp_video(
     frames: Float[Tensor, "n frames c h w"], shift: Float[Tensor, "n frames 2 h w"]
 ) -> Float[Tensor, "n frames c h w"]:
     """Return the frames with what lies `shift` (x, y), in pixels, from each pixel brought there."""
-    flat = temporal.pull(frames.float().flatten(0, 1), shift.float().flatten(0, 1), "bicubic")
+    flat = temporal.warp_by_shift(
+        frames.float().flatten(0, 1), shift.float().flatten(0, 1), "bicubic"
+    )
     return flat.unflatten(0, frames.shape[:2])

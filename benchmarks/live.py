@@ -19,12 +19,13 @@ import torch
 
 import src.models
 from benchmarks.recordings import MODEL, SENSOR, events
-from src.live_view import assembly, feeds
-from src.live_view.faults import Faults
-from src.live_view.network_step import Running
-from src.recordings import lookup
-from src.recordings.capture import kaleidoscope
+from src.live_view import assembly, event_feeds
+from src.live_view.network_runner import RunSettings
+from src.live_view.page_server import PageServer
+from src.live_view.status import FaultLog
+from src.recordings import sensor_lookup
 from src.recordings.files import formats
+from src.recordings.simulated_recording import kaleidoscope_views
 from src.sim.optics import layout
 
 RATE = 5_000_000  # events a second over all views
@@ -35,14 +36,14 @@ PORT = 8611
 
 def write(path: Path, views) -> None:
     """Write LENGTH_S of RATE events a second, all inside the views."""
-    seen = lookup.build(views).view >= 0
+    seen = sensor_lookup.build_lookup(views).view >= 0
     drawn = events(int(RATE * LENGTH_S / seen.mean() * 1.01), LENGTH_S)
     inside = drawn[seen[drawn["y"], drawn["x"]]]
     keep = np.sort(np.random.default_rng(0).permutation(len(inside))[: int(RATE * LENGTH_S)])
     formats.write_events(path, inside[keep], width=SENSOR[1], height=SENSOR[0])
 
 
-async def measure(server: assembly.Server, seconds: float) -> dict:
+async def measure(server: PageServer, seconds: float) -> dict:
     """Play and serve for `seconds` after WARM_S with a visitor; return what was counted."""
     player, stop = server.page.player, asyncio.Event()
     running_server = asyncio.create_task(server.run(player.start, stop))
@@ -51,20 +52,20 @@ async def measure(server: assembly.Server, seconds: float) -> dict:
     )
     await visitor.stdout.readline()
     await asyncio.sleep(WARM_S)
-    meters, backlog = player.meters, player.intake.backlog
+    meters, waiting = player.meters, player.reader.waiting
     meters.span_s = seconds
     meters.frames.clear()
-    busy, cpu = dict(meters.busy), time.process_time()
-    dropped = backlog.dropped
+    busy, cpu = dict(meters.busy_s), time.process_time()
+    dropped = waiting.dropped
     memory, began = _resident(), time.perf_counter()
     await asyncio.sleep(seconds)
     wall = time.perf_counter() - began
     found = meters.rates() | {
-        "dropped": backlog.dropped - dropped,
-        "share": {name: (meters.busy[name] - busy[name]) / wall for name in busy},
+        "dropped": waiting.dropped - dropped,
+        "share": {name: (meters.busy_s[name] - busy[name]) / wall for name in busy},
         "cores": (time.process_time() - cpu) / wall,
         "memory_mb": (memory, _resident()),
-        "faults": player.faults.now(),
+        "faults": player.faults.current(),
     }
     stop.set()
     await running_server
@@ -89,16 +90,16 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     asked = parser.parse_args()
     torch.set_num_threads(asked.threads)
-    views, faults = kaleidoscope(list(layout(9)), model=MODEL, sensor=SENSOR), Faults()
+    views, faults = kaleidoscope_views(list(layout(9)), model=MODEL, sensor=SENSOR), FaultLog()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "uniform.raw"
         write(path, views)
         networks = {asked.ckpt: src.models.load(asked.ckpt)}
-        how = Running(asked.fps, form=asked.form)
-        feed = feeds.open_feed(str(path), None, faults, loop=True)
+        how = RunSettings(asked.fps, form=asked.form)
+        feed = event_feeds.open_feed(str(path), None, faults, loop=True)
         server = assembly.assemble(feed, networks, views, how, faults, port=PORT)
-        assembly.first_choice(server.page.controls, asked.ckpt, "all")
-        sys.setswitchinterval(assembly.GIL_S)
+        server.page.controls.choose(asked.ckpt, "all")
+        sys.setswitchinterval(assembly.GIL_SWITCH_S)
         found = asyncio.run(measure(server, asked.seconds))
     report(asked, found)
 

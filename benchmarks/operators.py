@@ -1,6 +1,6 @@
 """How many operators a training step launches: python -m benchmarks.operators [key=value ...]
 
-A batch out of a cache in memory, simulated, augmented and trained on, clip by clip and at once, on
+A batch out of a cache in memory, simulated, augmented and trained on, clip by clip and batched, on
 a CPU at small crops: what is counted does not depend on the size.  On a GPU each operator is a
 launch or more, each of 5 to 10 us, whatever its size.  Views and allocations are not counted; on a
 GPU the sensor is one launch more for each call, which here is no operator of torch.
@@ -14,16 +14,18 @@ from torch.utils.data import DataLoader
 
 from benchmarks.training import config
 from src.app import build
+from src.app.instantiate import instantiate_node
 from src.sim import noise
 
 SMALL = [
-    "budget=hours", "data.bank=2", "data.bank_on=device", "data.bank_crop=48", "data.crop=32",
-    "data.windows=40", "data.batch_size=16", "data.loss_pairs=4", "scene.height=64",
-    "scene.width=64", "turbulence=weak", "hours=null", "augment.firing_fraction=0.001",
+    "budget=hours", "data.cache_clips=2", "data.cache_device=device", "data.cache_crop=48",
+    "data.crop=32", "data.windows=40", "data.batch_size=16", "data.loss_pairs=4", "scene.height=64",
+    "scene.width=64", "turbulence=weak", "train_hours=null",
+    "augment.max_firing_pixel_fraction=0.001",
 ]  # fmt: skip
 
 
-class Launches(TorchDispatchMode):
+class OperatorCounter(TorchDispatchMode):
     """Counts the operators that compute something."""
 
     def __init__(self):
@@ -37,12 +39,12 @@ class Launches(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-class Count(lightning.Callback):
-    """Counts what the second step launches."""
+class StepCounter(lightning.Callback):
+    """Counts the operators of the second step."""
 
     def on_train_batch_start(self, trainer, module, batch, batch_idx: int) -> None:
         """Begin with the second step."""
-        self.mode = Launches() if batch_idx == 1 else None
+        self.mode = OperatorCounter() if batch_idx == 1 else None
         if self.mode:
             self.mode.__enter__()
 
@@ -50,44 +52,44 @@ class Count(lightning.Callback):
         """End with the step."""
         if self.mode:
             self.mode.__exit__(None, None, None)
-            self.launches = self.mode.count
+            self.operators = self.mode.count
 
 
-def simulation(cfg, at_once: bool) -> tuple[int, int, object]:
-    """Return the launches of the simulation and of the augmentation of a batch, and the batch."""
-    data = build.data(cfg, ("train",))
+def count_simulation(cfg, batched: bool) -> tuple[int, int, object]:
+    """Return the operators of the simulation and of the augmentation of a batch, and the batch."""
+    data = build.build_data_module(cfg, ("train",))
     pipeline, numbers = data.pipelines["train"], range(cfg.data.batch_size)
-    for index in pipeline.bank.missing():
-        pipeline.bank.clip(index)
+    for index in pipeline.cache.missing():
+        pipeline.cache.clip(index)
     keys = [noise.key(number) for number in numbers]
-    with Launches() as simulated:
+    with OperatorCounter() as simulated:
         draws = [pipeline.draw(number) for number in numbers]
         samples = (
-            [pipeline.simulate(draws, at_once=True)]
-            if at_once
-            else [pipeline.sample(draw) for draw in draws]
+            [pipeline.simulate(draws, batched=True)]
+            if batched
+            else [pipeline.simulate([draw]) for draw in draws]
         )
-    with Launches() as augmented:
-        batch = data.augment(samples, keys, at_once=at_once)
+    with OperatorCounter() as augmented:
+        batch = data.augment(samples, keys, batched=batched)
     return simulated.count, augmented.count, batch
 
 
-def training(cfg, batch) -> int:
-    """Return the launches of a step on a batch."""
-    count, module = Count(), build.reconstructor(cfg, *build.network(cfg))
+def count_step(cfg, batch) -> int:
+    """Return the operators of a step on a batch."""
+    count, module = StepCounter(), build.build_reconstructor(cfg, *build.build_network(cfg))
     quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
-    trainer = build.make(cfg.trainer, callbacks=[count], max_steps=2, plugins=[], **quiet)
+    trainer = instantiate_node(cfg.trainer, callbacks=[count], max_steps=2, plugins=[], **quiet)
     trainer.fit(module, DataLoader([batch] * 2, collate_fn=lambda items: items[0]))
-    return count.launches
+    return count.operators
 
 
 def main() -> None:
     """Print a Markdown table."""
     cfg = config([*SMALL, *sys.argv[1:]])
-    apart, together = (simulation(cfg, at_once) for at_once in (False, True))
-    step = training(cfg, together[2])
+    apart, together = (count_simulation(cfg, batched) for batched in (False, True))
+    step = count_step(cfg, together[2])
     print(f"{cfg.name}, {cfg.data.batch_size} clips of {cfg.data.windows} windows\n")
-    print("| operators of | clip by clip | at once |\n|---|---|---|")
+    print("| operators of | clip by clip | batched |\n|---|---|---|")
     print(f"| draw, gather, sensor | {apart[0]} | {together[0]} |")
     print(f"| augmentation | {apart[1]} | {together[1]} |")
     print(f"| step | {step} | {step} |")

@@ -18,10 +18,10 @@ import torch
 from benchmarks.timing import least
 from src.models.e2vid import E2VID
 from src.models.setnet import SetNet
-from src.recordings import lookup, stream
-from src.recordings.capture import kaleidoscope
+from src.recordings import event_windows, reconstruction, sensor_lookup
 from src.recordings.files import formats
 from src.recordings.files.formats import EVENT
+from src.recordings.simulated_recording import kaleidoscope_views
 from src.sim.optics import layout
 
 SENSOR, MODEL = (720, 1280), (176, 176)
@@ -37,17 +37,19 @@ def events(count: int, seconds: float, first_us: int = 0) -> np.ndarray:
     return made
 
 
-def table() -> lookup.Lookup:
+def table() -> sensor_lookup.SensorLookup:
     """Return the lookup of a kaleidoscope whose views are 176x176."""
-    return lookup.build(kaleidoscope(list(layout(9)), model=MODEL, sensor=SENSOR))
+    return sensor_lookup.build_lookup(
+        kaleidoscope_views(list(layout(9)), model=MODEL, sensor=SENSOR)
+    )
 
 
 def splitting() -> None:
     """Events per second of one thread: one window of 2 million events into nine grids."""
     views, made = table(), events(2_000_000, 1 / 120)
-    grid = views.empty(5)
+    grid = views.empty_grid(5)
     for nearest in (False, True):
-        seconds = least(lambda near=nearest: views.add(made, grid, 0, 8333, nearest=near))
+        seconds = least(lambda near=nearest: views.add_to_grid(made, grid, 0, 8333, nearest=near))
         kind = "nearest" if nearest else "bilinear"
         print(f"split + voxelise, {kind}, one thread: {len(made) / seconds / 1e6:.1f} Mev/s")
 
@@ -62,10 +64,10 @@ def end_to_end(path: Path, seconds: float) -> None:
     }
     for (name, net), fps in product(networks.items(), (120, 600)):
         length = seconds if fps == 120 else min(seconds, 1.0)
-        rule, start = stream.Rule(fps=fps, end_s=length), time.process_time()
+        rule, start = event_windows.WindowRule(fps=fps, end_s=length), time.process_time()
         chunks = formats.iter_events(path, seconds=0.05)
-        parts, frames, events = stream.windows(chunks, views, rule), 0, 0
-        for frame in stream.frames(parts, net.eval()):
+        parts, frames, events = event_windows.cut_windows(chunks, views, rule), 0, 0
+        for frame in reconstruction.reconstruct_frames(parts, net.eval()):
             frames, events = frames + 1, events + frame.events + frame.outside
         cpu = time.process_time() - start
         print(

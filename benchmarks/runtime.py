@@ -21,19 +21,18 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from src.bench.speed import PEAKS
-from src.bench.timing import convolution_peak, threads
+from src.bench.speed import FORM_DTYPES, measure_peak_conv_macs_per_s
+from src.deploy.cost import count_macs, macs_per_frame, torch_threads
+from src.deploy.cpu_features import has_fast_bf16
+from src.deploy.forms import in_form
+from src.deploy.runtime import EventListRuntime
 from src.models import load
-from src.models.cost import macs, macs_per_frame
-from src.models.fast import computes_bf16, running
-from src.models.runtime import Runtime
-from src.models.unroll import takes
 from src.recordings.files.formats import read_events
 from src.sim.optics import layout
 from src.sim.voxel import voxel_grid
 
 SIDE, FPS, RATE = 176, 600, 5e6
-FORM = "bf16" if computes_bf16() else "float32"
+FORM = "bf16" if has_fast_bf16() else "float32"
 RECORDING = Path("../shared/data/events/gen3_640x480_evt2.raw")
 NAMES = ("setnet_small", "setnet_medium", "lf3x3")
 
@@ -73,8 +72,7 @@ def milliseconds(
 
 def on_pytorch(network: torch.nn.Module) -> Callable:
     """Return a step from a list of events through dense grids and PyTorch."""
-    fast, state = running(network, FORM), None
-    told = {"window_s": 1 / FPS} if takes(network, "window_s") else {}
+    fast, state = in_form(network, FORM), None
     size = {"bins": 5, "height": SIDE, "width": SIDE}
 
     def step(t, x, y, p, view, t0, t1):
@@ -84,17 +82,17 @@ def on_pytorch(network: torch.nn.Module) -> Callable:
             mine = view == index
             events = t[mine], x[mine], y[mine], p[mine]
             parts.append(voxel_grid(*events, t0=t0, t1=t1, **size))
-        frame, state = fast(torch.stack(parts)[None], state, **told)
+        frame, state = fast(torch.stack(parts)[None], state, window_s=1 / FPS)
         return frame
 
     return step
 
 
-def arithmetic(live: Runtime, played: list[tuple]) -> float:
+def arithmetic(live: EventListRuntime, played: list[tuple]) -> float:
     """Return the multiply-accumulates, in G, of a window behind the first layer, mean of `played`,
     as some windows take more than others.
     """
-    return macs(lambda: [live.step(*window) for window in played]) / len(played) / 1e9
+    return count_macs(lambda: [live.step(*window) for window in played]) / len(played) / 1e9
 
 
 def line(name: str, times: list[float], giga: float, peak: float) -> str:
@@ -108,17 +106,17 @@ def line(name: str, times: list[float], giga: float, peak: float) -> str:
 
 def measured(name: str, engine: str, count: int, played: list[tuple], seconds: float) -> str:
     """Return the line of a network on `engine`, openvino or pytorch, and `count` threads."""
-    peak = convolution_peak(PEAKS[FORM], count=count) / 1e9
+    peak = measure_peak_conv_macs_per_s(FORM_DTYPES[FORM], threads=count) / 1e9
     network = load(name)
     size = {"positions": layout(9), "height": SIDE, "width": SIDE}
     if engine == "openvino":
-        giga = arithmetic(Runtime(network, **size, form="float32"), played[:10])
-        step = Runtime(network, **size, threads=count, form="openvino").step
+        giga = arithmetic(EventListRuntime(network, **size, form="float32"), played[:10])
+        step = EventListRuntime(network, **size, threads=count, form="openvino").step
     else:
         giga = macs_per_frame(network, SIDE, SIDE, views=9) / 1e9
         step = on_pytorch(network)
     clock = time.process_time if count == 1 else time.perf_counter
-    with threads(count):
+    with torch_threads(count):
         times = milliseconds(step, played, seconds, clock)
     return line(f"{name}, {engine}", times, giga, peak)
 

@@ -1,5 +1,5 @@
-"""Time the sensor, the voxel grids and the event files: python -m benchmarks.sensor [--eager]
-[--batch N] [--device cuda].
+"""Time the sensor, the voxel grids and the event files: python -m benchmarks.sensor [--batch N]
+[--device cuda].
 
 Nine views of a clip of 1/f texture and hard discs that pans by one pixel a frame and shakes by one.
 Milliseconds are per frame interval of all nine views, the smallest CPU time of the thread over the
@@ -19,15 +19,15 @@ from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.timing import least
 from src.recordings.files.formats import iter_events, write_events
-from src.sim.sensor import batch
-from src.sim.sensor.engines import sensor_eager
-from src.sim.sensor.sensor import EventSensor
+from src.sim.sensor import EventSensor
+from src.sim.sensor.engine_input import SensorClip
+from src.sim.sensor.sensor import simulate_voxels
 from src.sim.voxel import voxel_grid
 
 SIDE, FPS = 256, 120.0
-DRAWN = {
+RANDOM = {
     "threshold": [0.1, 0.7], "off_ratio": [0.8, 1.25], "refractory_s": [0.0005, 0.005],
-    "mismatch": [0.0, 0.15], "shot_hz": [0.0, 2.0], "residual": [0.05, 1.0],
+    "mismatch": [0.0, 0.15], "dark_noise_hz": [0.0, 2.0], "initial_reference_error": [0.05, 1.0],
 }  # fmt: skip
 
 
@@ -57,9 +57,9 @@ def clip(views: int, frames: int, seed: int = 0) -> torch.Tensor:
     return (out * 255).round() / 255
 
 
-def sensors(frames: torch.Tensor, repeats: int, eager: bool) -> None:
+def sensors(frames: torch.Tensor, repeats: int) -> None:
     """Print milliseconds per interval of nine views for several sensors."""
-    noisy = {"mismatch": 0.25, "leak_hz": 0.1, "shot_hz": 5.0, "cutoff_hz": 30.0}
+    noisy = {"mismatch": 0.25, "leak_event_hz": 0.1, "dark_noise_hz": 5.0, "cutoff_hz": 30.0}
     cases = {
         "C 0.1, 5 ms": {"threshold": 0.1},
         "C 0.2, 5 ms": {"threshold": 0.2},
@@ -71,9 +71,7 @@ def sensors(frames: torch.Tensor, repeats: int, eager: bool) -> None:
         "C 0.2, 5 ms, noisy": {"threshold": 0.2, **noisy},
     }
     intervals = frames.shape[2] - 1
-    print(
-        f"{'sensor':26} {'ev/px/s':>8} {'1 thread':>9} {'2 threads':>9} {'eager':>8}  ms/interval"
-    )
+    print(f"{'sensor':26} {'ev/px/s':>8} {'1 thread':>9} {'2 threads':>9}  ms/interval")
     for name, settings in cases.items():
         sensor = EventSensor(**settings)
         rate = float(sensor.counts(frames, FPS).sum()) / frames[0, :, 0].numel() / intervals * FPS
@@ -81,15 +79,7 @@ def sensors(frames: torch.Tensor, repeats: int, eager: bool) -> None:
         two = least(lambda s=sensor: s.voxels(frames, FPS), time.perf_counter, repeats)
         torch.set_num_threads(1)
         one = least(lambda s=sensor: s.voxels(frames, FPS), repeats=repeats)
-        slow = float("nan")
-        if eager:
-            few = frames[:, :, :4].contiguous()
-            job = sensor._job(few, FPS, None, 1)
-            grids = torch.zeros(1, 3, 9, 5, SIDE, SIDE)
-            slow = (
-                least(lambda j=job, g=grids: sensor_eager.voxels(j, g), repeats=2) / 3 * intervals
-            )
-        times = " ".join(f"{1e3 * t / intervals:9.2f}" for t in (one, two, slow))
+        times = " ".join(f"{1e3 * t / intervals:9.2f}" for t in (one, two))
         print(f"{name:26} {rate:8.1f} {times}")
 
 
@@ -100,16 +90,14 @@ def batches(count: int, repeats: int, device: str, side: int = 96, frames: int =
     wide, g = clip(9, frames)[0], torch.Generator().manual_seed(0)
     corners = torch.randint(0, SIDE - side, (count, 2), generator=g).tolist()
     views = torch.stack([wide[..., y : y + side, x : x + side] for y, x in corners])
-    views, sensor = views.half().to(device), EventSensor(drawn=DRAWN, response="linlog")
-    sensors = [sensor.draw(key, seed=key) for key in range(count)]
+    views, sensor = views.half().to(device), EventSensor(random=RANDOM, response="linlog")
+    drawn = [sensor.draw(key, pixel_seed=key) for key in range(count)]
+    numbered = enumerate(zip(drawn, corners, strict=True))
+    given = [SensorClip(one, FPS, key, place, SIDE) for key, (one, place) in numbered]
 
     def work(each: int) -> None:
         for i in range(0, count, each):
-            some = slice(i, i + each)
-            batch.voxels(
-                sensors[some], views[some], [FPS] * each, clips=range(count)[some], views=range(9),
-                origins=corners[some], full_widths=[SIDE] * each,
-            )  # fmt: skip
+            simulate_voxels(given[i : i + each], views[i : i + each], range(9))
         if device != "cpu":
             torch.cuda.synchronize()
 
@@ -173,7 +161,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--frames", type=int, default=11)
-    parser.add_argument("--eager", action="store_true", help="time plain torch as well")
     parser.add_argument("--batch", type=int, help="time so many clips of different sensors only")
     parser.add_argument("--device", default="cpu", help="where --batch runs")
     arguments = parser.parse_args()
@@ -182,7 +169,7 @@ def main() -> None:
         batches(arguments.batch, arguments.repeats, arguments.device)
         return
     voxelising(arguments.repeats)
-    sensors(clip(9, arguments.frames), arguments.repeats, arguments.eager)
+    sensors(clip(9, arguments.frames), arguments.repeats)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """How fast a training is: python -m benchmarks.training [changes|networks] [key=value ...]
 
 Overrides are those of src.train.  Without a word before, where a step's time goes: simulation
-(shared by the `data.reuse` steps that see a batch), the network's forward and backward pass, and
-the loss with its gradient, on one batch; CPU time of the thread on one thread, wall time on two.
+(shared by the `data.batch_reuse` steps that see a batch), the network's forward and backward pass,
+and the loss with its gradient, on one batch; CPU time on one thread, wall time on two.
 `changes`: whole steps of budget=hours on made-up grids, one thing changed at a time, by CPU time of
 the one thread; `networks`: the same of several networks, before and after.  Clip-windows are
 windows of single clips.
@@ -21,27 +21,23 @@ from torch.nn.utils import parametrize
 from torch.utils.data import DataLoader
 
 from benchmarks.timing import least
-from src.app import build
-from src.models.unroll import video
+from src.app import build, hardware
+from src.app.instantiate import instantiate_node
 from src.sim.pipeline import Sample, simulate
 
 ROOT = Path(__file__).resolve().parents[1]
-BEFORE = ["channels_last=false", "optimizer.fused=false", "average=null"]
+BEFORE = ["channels_last=false", "optimizer.fused=false", "ema_decay=null"]
 CHANGES = {
     "as before": [],
     "channels-last": ["channels_last=true"],
     "fused Adam": ["optimizer.fused=true"],
-    "running mean of the weights": ["average=0.999"],
-    "LPIPS on half the windows": ["loss.share=0.5"],
-    "LPIPS on a quarter": ["loss.share=0.25"],
+    "moving average of the weights": ["ema_decay=0.999"],
     "float32": ["trainer.precision=32-true"],
     "batch 1": ["data.batch_size=1"],
     "batch 6": ["data.batch_size=6"],
     "crop 96, batch 2": ["data.crop=96", "data.batch_size=2"],
-    "channels-last, fused, mean, LPIPS on half": [
-        "channels_last=true", "optimizer.fused=true", "average=0.999", "loss.share=0.5",
-    ],
-}  # fmt: skip
+    "channels-last, fused, mean": ["channels_last=true", "optimizer.fused=true", "ema_decay=0.999"],
+}
 
 
 NETWORKS = {
@@ -49,7 +45,6 @@ NETWORKS = {
     "lf3x3, base 8, stem 32": ["experiment=lf3x3", "width=8", "stem=32"],
     "lf3x3, base 16, stem 32": ["experiment=lf3x3", "width=16", "stem=32"],
     "single256, base 16, stem 32": ["experiment=single256", "width=16", "stem=32"],
-    "lf_firenet": ["experiment=lf_firenet"],
 }
 
 
@@ -57,7 +52,7 @@ def config(overrides: list[str]) -> DictConfig:
     """Return the config of src.train."""
     with initialize_config_dir(str(ROOT / "conf"), version_base=None):
         cfg = compose("train", overrides)
-    build.choose_precision(cfg)
+    hardware.fill_in_precision(cfg)
     return cfg
 
 
@@ -66,15 +61,18 @@ def split(overrides: list[str]) -> tuple[dict[str, Callable[[], object]], int, i
     simulated batch.
     """
     cfg = config(overrides)
-    network, spec = build.network(cfg)
-    module, pipeline = build.reconstructor(cfg, network, spec), build.pipeline(cfg, "train")
+    network, spec = build.build_network(cfg)
+    module, pipeline = (
+        build.build_reconstructor(cfg, network, spec),
+        build.build_pipeline(cfg, "train"),
+    )
     clips = list(range(cfg.data.batch_size))
     sample = simulate(pipeline, clips)
     half = torch.autocast("cpu", torch.bfloat16, enabled="bf16" in str(cfg.trainer.precision))
 
     def forward() -> torch.Tensor:
         with half, parametrize.cached():
-            return video(network, sample).flatten(0, 1).float()
+            return network.reconstruct_clip(sample).flatten(0, 1).float()
 
     shown, truth = forward(), sample.target.flatten(0, 1)
     slope = torch.randn_like(shown)
@@ -89,7 +87,7 @@ def split(overrides: list[str]) -> tuple[dict[str, Callable[[], object]], int, i
         "forward and backward": lambda: forward().backward(slope),
         "loss": loss,
     }
-    return parts, len(truth), cfg.data.reuse
+    return parts, len(truth), cfg.data.batch_reuse
 
 
 class Steps(lightning.Callback):
@@ -105,16 +103,18 @@ class Steps(lightning.Callback):
 
 def step(overrides: list[str], steps: int = 3) -> tuple[float, int]:
     """Return the least seconds of a whole training step and the pixels of its clip-windows."""
-    cfg = config(["budget=hours", "data.bank=null", "hours=null", *overrides])
-    module = build.reconstructor(cfg, *build.network(cfg))
+    cfg = config(["budget=hours", "data.cache_clips=null", "train_hours=null", *overrides])
+    module = build.build_reconstructor(cfg, *build.build_network(cfg))
     shape = (cfg.data.batch_size, cfg.data.windows)
     grid = (*shape, cfg.optics.views, cfg.bins, cfg.data.crop, cfg.data.crop)
     target = torch.rand(*shape, 1, cfg.data.crop, cfg.data.crop)
     voxels = torch.randn(grid) * (torch.rand(grid) < 0.1)
-    known = {"drawn": [{}] * shape[0], "window_s": torch.full((shape[0],), 1 / cfg.fps)}
+    known = {"parameters": [{}] * shape[0], "window_s": torch.full((shape[0],), 1 / cfg.fps)}
     sample, seen = Sample(voxels, target, target, **known), Steps()
     quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
-    trainer = build.make(cfg.trainer, callbacks=[seen], max_steps=steps + 1, plugins=[], **quiet)
+    trainer = instantiate_node(
+        cfg.trainer, callbacks=[seen], max_steps=steps + 1, plugins=[], **quiet
+    )
     trainer.fit(module, DataLoader([sample] * (steps + 1), collate_fn=lambda batch: batch[0]))
     taken = [end - start for start, end in zip(seen.ends, seen.ends[1:], strict=False)]
     return min(taken), target.numel()

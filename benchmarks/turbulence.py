@@ -1,14 +1,15 @@
 """Turbulence for nine views: python -m benchmarks.turbulence [what ...] [another checkout]
 
-`table`: ms a frame of 256x256, clips of 4 frames, two threads, where air is local: a pixel of 0.04
-to 0.4 D at the object, D/r0 0.5 to 4, D^2 / (lambda L) = 4.7, so lambda / D is 0.21 / pixel.
-Limits: 60 ms at 0.08 D and more, 1.5 GB.  `prior`: seconds of one thread for a training clip, 25
-frames of 80x80, over the air that training draws; limit 0.6 s on average.  These two by default.
-Another checkout of this repository, an older one say, is timed beside this one: the two take turns.
-Times are wall time in `table`, the least of three, and CPU time of the thread in `prior`.
-`launches`: what a device has to do for a clip of a cache, 41 frames of 144x144, over the same air:
-operators, gigabytes they read and write and products, and the ms that LAUNCH_S, BYTES_S and
-PRODUCTS_S make of these, an H100's; limit 8 ms.  With CUDA: those ms as they are.
+`table`: ms a frame of 256x256, clips of 4 frames, two threads, where turbulence is local: a pixel
+of 0.04 to 0.4 D at the object, D/r0 0.5 to 4, D^2 / (lambda L) = 4.7, so lambda / D is
+0.21 / pixel.  Limits: 60 ms at 0.08 D and more, 1.5 GB.  `prior`: seconds of one thread for a
+training clip, 25 frames of 80x80, over the turbulence that training draws; limit 0.6 s on average.
+These two by default.  Another checkout of this repository, an older one say, is timed beside this
+one: the two take turns.  Times are wall time in `table`, the least of three, and CPU time of the
+thread in `prior`.  `launches`: what a device has to do for a clip of a cache, 41 frames of 144x144,
+over the same turbulence: operators, gigabytes they read and write and products, and the ms that
+LAUNCH_S, BYTES_S and PRODUCTS_S make of these, an H100's; limit 8 ms.  With CUDA: those ms as they
+are.
 """
 
 import json
@@ -19,7 +20,7 @@ import statistics
 import subprocess
 import sys
 import time
-from dataclasses import asdict, fields
+from dataclasses import astuple
 from pathlib import Path
 from types import ModuleType
 
@@ -27,37 +28,30 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from src.sim.turbulence import Turbulence
-from src.sim.turbulence.atmosphere import Atmosphere
+from src.sim.turbulence import Atmosphere, Turbulence, sample_atmosphere
 
 APERTURE_M, WAVELENGTH_M, FRESNEL = 0.1, 525e-9, 4.7
 PIXELS, STRENGTHS = (0.04, 0.08, 0.16, 0.4), (0.5, 2.0, 4.0)  # of D at the object; D/r0
 CLIPS = 20
 CACHED, CROP = (1, 41, 256, 256), (56, 56, 144, 144)  # a clip of a cache: frames, what is kept
 LAUNCH_S, BYTES_S, PRODUCTS_S = 10e-6, 2e12, 20e12  # a launch; bytes and float32 products a second
-FREE = (
-    "empty",
-    "new_empty",
-    "_unsafe_view",
-    "detach",
-    "lift_fresh",
-    "arange",
-)  # no work of a device
+FREE = ("empty", "new_empty", "_unsafe_view", "detach", "lift_fresh", "arange")  # no work
 
 
-def air(pixel: float, airy_px: float, d_over_r0: float) -> Turbulence:
-    """Return nine views of 256x256 with pixels of `pixel` D at the object."""
-    distance = airy_px * pixel * APERTURE_M**2 / WAVELENGTH_M
+def local_atmosphere(pixel: float, d_over_r0: float) -> list:
+    """Return the values of an Atmosphere with pixels of `pixel` D at the object."""
+    lambda_over_d_px = 1 / (pixel * FRESNEL)
+    distance = lambda_over_d_px * pixel * APERTURE_M**2 / WAVELENGTH_M
     width = 256 * pixel * APERTURE_M
     path = Atmosphere(APERTURE_M, 0.5, distance, width, WAVELENGTH_M, 1e-14, 0.9)
-    return Turbulence(path.at(d_over_r0), views=9, height=256, width=256)
+    return list(astuple(path.with_d_over_r0(d_over_r0)))
 
 
-def frame_ms(pixel: float, strength: float) -> float:
-    """Return wall ms for a frame of nine views."""
+def frame_ms(atmosphere: list) -> float:
+    """Return wall ms for a frame of nine views of 256x256."""
     torch.set_num_threads(2)
-    turbulence, frames = air(pixel, 1 / (pixel * FRESNEL), strength), torch.rand(1, 4, 256, 256)
-    taken = []
+    turbulence = Turbulence(Atmosphere(*atmosphere), views=9, height=256, width=256)
+    frames, taken = torch.rand(1, 4, 256, 256), []
     for _ in range(3):
         start = time.perf_counter()
         turbulence.degrade(frames, torch.Generator().manual_seed(0))
@@ -65,29 +59,19 @@ def frame_ms(pixel: float, strength: float) -> float:
     return 1e3 * min(taken) / 4
 
 
-def clip_s(drawn: dict[str, object]) -> float:
-    """Return seconds of one thread for a training clip in drawn air, from the atmosphere on.
-
-    A checkout that knows no outer scale gets the Kolmogorov air that blurs as much.
-    """
+def clip_s(atmosphere: list) -> float:
+    """Return seconds of one thread for a training clip, from the atmosphere on."""
     torch.set_num_threads(1)
-    frames = torch.rand(1, 25, 256, 256)
-    known = {field.name for field in fields(Atmosphere)}
-    path = Atmosphere(**{name: value for name, value in drawn.items() if name in known})
-    if "outer_scale_m" not in known:
-        path = path.at(drawn["blurring_d_over_r0"])
+    frames, path = torch.rand(1, 25, 256, 256), Atmosphere(*atmosphere)
     start = time.thread_time()
     turbulence = Turbulence(path, views=9, height=256, width=256)
     turbulence.degrade(frames, torch.Generator().manual_seed(0), crop=(70, 70, 80, 80))
     return time.thread_time() - start
 
 
-def draws() -> list[dict[str, object]]:
-    """Return random air as training sees it (turbulence=mixed)."""
-    from src.sim.turbulence import sample_atmosphere
-
-    paths = (sample_atmosphere("mixed", torch.Generator().manual_seed(n)) for n in range(CLIPS))
-    return [asdict(path) | {"blurring_d_over_r0": path.blurring_d_over_r0} for path in paths]
+def draw_atmospheres() -> list[Atmosphere]:
+    """Return random atmospheres as training sees them (turbulence=mixed)."""
+    return [sample_atmosphere("mixed", torch.Generator().manual_seed(n)) for n in range(CLIPS)]
 
 
 class Checkout:
@@ -127,14 +111,15 @@ def table(checkouts: list[Checkout]) -> None:
     """Print ms a frame per pixel and strength, ours first."""
     for pixel in PIXELS:
         for strength in STRENGTHS:
-            ms = [checkout("frame_ms", pixel, strength) for checkout in checkouts]
+            given = local_atmosphere(pixel, strength)
+            ms = [checkout("frame_ms", given) for checkout in checkouts]
             print(f"pixel {pixel} D, D/r0 {strength}:", *(f"{m:.0f} ms" for m in ms), flush=True)
     print("most memory:", *(f"{checkout('memory_gb'):.2f} GB" for checkout in checkouts))
 
 
 def prior(checkouts: list[Checkout]) -> None:
     """Print mean and 90 % quantile of the seconds of a training clip, ours first."""
-    known = draws()
+    known = [list(astuple(path)) for path in draw_atmospheres()]
     for checkout in checkouts:
         checkout("clip_s", known[0])  # compiles
     taken = [[checkout("clip_s", drawn) for checkout in checkouts] for drawn in known]
@@ -176,47 +161,46 @@ def kernels(work: Work) -> ModuleType:
         work.bytes += psfs.nbytes
         return image[:, : halo.shape[1], : halo.shape[2]] + 1
 
-    engine.WARP, engine.SCATTER, engine.warp, engine.scatter = 8, 0, warp, scatter
+    engine.WARP_NUMBERS, engine.SCATTER_NUMBERS, engine.warp, engine.scatter = 8, 0, warp, scatter
     return engine
 
 
 def launches() -> None:
     """Print what a device has to do for a clip of a cache, on average."""
-    from src.sim.turbulence.engines import blur_engine
+    from src.sim.turbulence import clip_rendering
+    from src.sim.turbulence.engines import device
 
-    frames, done, chosen = torch.rand(CACHED), [], blur_engine.on
-    for ahead in prepared():
+    frames, done, chosen = torch.rand(CACHED), [], device.select_engine
+    for prepared in prepare_clips():
         with Work() as work:
-            blur_engine.on = lambda device, work=work: kernels(work)
-            ahead.degrade(frames, torch.Generator(), crop=CROP)
+            device.select_engine = lambda device, work=work: kernels(work)
+            clip_rendering.render_views(frames[0], prepared.plans, compiled=False)
         ms = [work.launches * LAUNCH_S, work.bytes / BYTES_S, work.products / PRODUCTS_S]
         done.append((work.launches, work.bytes / 1e9, work.products / 1e9, 1e3 * math.fsum(ms)))
-    blur_engine.on = chosen
+    device.select_engine = chosen
     count, gb, products, ms = map(statistics.mean, zip(*done, strict=True))
     print(f"a clip: {count:.0f} launches, {gb:.1f} GB, {products:.0f} G products: {ms:.1f} ms")
     print(f"most: {max(one[0] for one in done)} launches, {max(one[-1] for one in done):.1f} ms")
 
 
-def prepared() -> list:
-    """Return random air as training sees it, ready for a device."""
-    known = {field.name for field in fields(Atmosphere)}
-    paths = [Atmosphere(**{k: v for k, v in drawn.items() if k in known}) for drawn in draws()]
-    airs = (Turbulence(path, views=9, height=256, width=256) for path in paths)
-    return [one.ahead(CACHED[1], torch.Generator().manual_seed(0), CROP) for one in airs]
+def prepare_clips() -> list:
+    """Return random turbulence as training sees it, ready for a device."""
+    operators = [Turbulence(path, views=9, height=256, width=256) for path in draw_atmospheres()]
+    return [one.prepare(CACHED[1], torch.Generator().manual_seed(0), CROP) for one in operators]
 
 
 def cuda() -> None:
     """Print the ms that a clip of a cache takes the first CUDA device, on average."""
-    from src.sim.turbulence.engines import blur_engine
+    from src.sim.turbulence.engines import device
 
-    frames, airs, taken = torch.rand(CACHED, device="cuda"), prepared(), []
+    frames, clips, taken = torch.rand(CACHED, device="cuda"), prepare_clips(), []
     for _ in range(4):
         start = time.perf_counter()
-        for ahead in airs:
-            ahead.degrade(frames, torch.Generator(), crop=CROP)
+        for prepared in clips:
+            prepared.degrade(frames, torch.Generator(), crop=CROP)
         torch.cuda.synchronize()
-        taken.append((time.perf_counter() - start) / len(airs))
-    engine = blur_engine.on(frames.device).__name__.rpartition(".")[2]
+        taken.append((time.perf_counter() - start) / len(clips))
+    engine = device.select_engine(frames.device).__name__.rpartition(".")[2]
     print(f"CUDA: {1e3 * min(taken):.1f} ms for a clip of a cache ({engine})")
 
 

@@ -19,9 +19,9 @@ import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
 
-from src.app import build, door
+from src.app import build, entry_point
 from src.models.e2vid import E2VID
-from src.recordings import lookup, output, stream
+from src.recordings import event_windows, output, reconstruction, sensor_lookup
 from src.recordings.files import formats, sources
 from src.recordings.views import Views
 from src.records import results
@@ -29,7 +29,7 @@ from src.train import fit
 
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = ["debug=fdr", "loss=l1", "metrics.lpips=null", "logger=csv", "~callbacks.progress"]
-SMALL += ["data.workers=1", "data.epoch_clips=40", "data.reuse=1", "trainer.max_steps=-1"]
+SMALL += ["data.workers=1", "data.epoch_clips=40", "data.batch_reuse=1", "trainer.max_steps=-1"]
 SIDE, EVENTS = 64, 200_000  # of the recording: pixels, events in 2 s
 
 
@@ -97,23 +97,30 @@ def train(minutes: float, run: Path) -> dict:
     with initialize_config_dir(str(ROOT / "conf"), version_base=None):
         limit = f"+trainer.max_time={{minutes: {minutes}}}"
         cfg = compose("train", [*SMALL, limit, f"paths.run={run}"])
-    network, spec = build.network(cfg)
-    results.open_run(run, door.resolved(cfg))
-    trainer = build.trainer(cfg)
+    network, spec = build.build_network(cfg)
+    results.create_run_folder(run, entry_point.resolved_yaml(cfg))
+    trainer = build.build_trainer(cfg)
     with Watch() as watch:
-        fit(trainer, build.reconstructor(cfg, network, spec), build.data(cfg), None)
+        fit(
+            trainer,
+            build.build_reconstructor(cfg, network, spec),
+            build.build_data_module(cfg),
+            None,
+        )
     return watch.slope() | {"steps": trainer.global_step}
 
 
 def reconstruct(events: int, run: Path) -> dict:
     """Reconstruct `events` events, the same recording again and again; returns the slopes."""
-    path, views = run / "cap.raw", Views.single((SIDE, SIDE), (SIDE, SIDE))
+    path, views = run / "cap.raw", Views.single_view((SIDE, SIDE), (SIDE, SIDE))
     formats.write_events(path, _recording(), width=SIDE, height=SIDE)
     network = E2VID(views=1, base_channels=4).eval()
     chunks = _over_and_over(path, events)
-    windows = stream.windows(chunks, lookup.build(views), stream.Rule(fps=120.0))
-    with Watch() as watch, output.sink("hdf5", run, views.model) as write:
-        for frame in stream.frames(windows, network):
+    windows = event_windows.cut_windows(
+        chunks, sensor_lookup.build_lookup(views), event_windows.WindowRule(fps=120.0)
+    )
+    with Watch() as watch, output.open_video_writer("hdf5", run, views.model) as write:
+        for frame in reconstruction.reconstruct_frames(windows, network):
             write(frame)
     return watch.slope() | {"events": events}
 
@@ -131,7 +138,7 @@ def _over_and_over(path: Path, events: int) -> Iterator[np.ndarray]:
     for turn in count():
         if turn * EVENTS >= events:
             return
-        for chunk in sources.events(path, (SIDE, SIDE)):
+        for chunk in sources.iter_recording(path, (SIDE, SIDE)):
             chunk["t"] += turn * 2_000_000
             yield chunk
 

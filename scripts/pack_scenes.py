@@ -4,30 +4,51 @@
 
 Grey, the shorter side at most `side` pixels, WebP at the best quality with which the file is at
 most `mib` MiB.  Each FOLDER keeps its split as `scene.root=[FOLDER,...]` has it; what is in the
-folders `train_only` serves training only.  The format: src/sim/scenes/photo_pack.py.
+folders `train_only` serves training only.  The format: src/sim/scenes/photo_files.py.
 """
 
+import json
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from hashlib import sha256
 from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from safetensors.numpy import save
 
-from src.records.atomic import written
-from src.sim.scenes.photo_files import SPLITS, only_for_training, photographs
-from src.sim.scenes.photo_pack import Picture, check, packed
-from src.sim.scenes.pictures import read_picture
+from src.records.atomic import atomic_path
+from src.sim.scenes.clip import SPLITS
+from src.sim.scenes.photo_files import (
+    CHECKSUM,
+    INDEX,
+    PackedPhotograph,
+    list_photographs,
+    list_training_photographs,
+    open_pack,
+)
+from src.sim.scenes.video_files import read_picture
 
 WORST, BEST = 10, 100  # quality of WebP; below 10 textures are gone
 SIDES = (16, 4096)  # px
 MIB = 2**20
 
 
-class Source(NamedTuple):
+class EncodedPicture(NamedTuple):
+    """A picture to be packed: its `name`, the `split` it belongs to, `data`, encoded, and `shape`
+    (height, width), pixels.
+    """
+
+    name: str
+    split: str
+    data: bytes
+    shape: tuple[int, int]
+
+
+class GreyPhotograph(NamedTuple):
     """A photograph to be packed: its name in the pack, its split and its pixels (h, w), uint8."""
 
     name: str
@@ -35,7 +56,7 @@ class Source(NamedTuple):
     pixels: NDArray
 
 
-def pack(
+def write_pack(
     folders: Sequence[str], out: Path, *, side: int, mib: float, train_only: Sequence[str] = ()
 ) -> str:
     """Write the photographs of `folders`, and those of `train_only`, to `out`; return a line.
@@ -45,17 +66,19 @@ def pack(
     """
     if not SIDES[0] <= side <= SIDES[1]:
         raise ValueError(f"side must be in {SIDES[0]}..{SIDES[1]} (px), got {side}")
-    sources = read(folders, train_only, side)
-    quality, content = fitting(sources, mib)
-    with written(out) as partial:
+    sources = read_photographs(folders, train_only, side)
+    quality, content = encode_within(sources, mib)
+    with atomic_path(out) as partial:
         partial.write_bytes(content)
     counts = [sum(source.split == split for source in sources) for split in SPLITS]
     parts = ", ".join(f"{n} {split}" for n, split in zip(counts, SPLITS, strict=True))
     size = f"{len(content) / MIB:.2f} MiB"
-    return f"{out}: {check(out)} photographs ({parts}), WebP at quality {quality}, {size}"
+    return f"{out}: {verify_pack(out)} photographs ({parts}), WebP at quality {quality}, {size}"
 
 
-def read(folders: Sequence[str], train_only: Sequence[str], side: int) -> list[Source]:
+def read_photographs(
+    folders: Sequence[str], train_only: Sequence[str], side: int
+) -> list[GreyPhotograph]:
     """Return the photographs in the order of the splits' lists, each at most `side` px high and
     wide; raises ValueError naming one that cannot be read, and for folders of the same name.
     """
@@ -63,16 +86,16 @@ def read(folders: Sequence[str], train_only: Sequence[str], side: int) -> list[S
     names = [root.name for root in roots]
     if len(set(names)) < len(names):
         raise ValueError(f"FOLDER must differ in name from the others, got {', '.join(names)}")
-    chosen = [(path, split) for split in SPLITS for path in photographs(folders, split)]
+    chosen = [(path, split) for split in SPLITS for path in list_photographs(folders, split)]
     if train_only:
-        chosen += [(path, "train") for path in only_for_training(train_only, folders)]
+        chosen += [(path, "train") for path in list_training_photographs(train_only, folders)]
     with ThreadPoolExecutor() as pool:
-        pixels = pool.map(lambda one: _shrunk(one[0], side), chosen)
+        pixels = pool.map(lambda one: _read_shrunk(one[0], side), chosen)
         pairs = zip(chosen, pixels, strict=True)
-        return [Source(_name(path, roots), split, grey) for (path, split), grey in pairs]
+        return [GreyPhotograph(_name(path, roots), split, grey) for (path, split), grey in pairs]
 
 
-def fitting(sources: Sequence[Source], mib: float) -> tuple[int, bytes]:
+def encode_within(sources: Sequence[GreyPhotograph], mib: float) -> tuple[int, bytes]:
     """Return the best quality with which the pack is at most `mib` MiB, and the pack.
 
     Raises ValueError, with what the worst quality would need, where there is none.
@@ -80,7 +103,7 @@ def fitting(sources: Sequence[Source], mib: float) -> tuple[int, bytes]:
     low, high, best = WORST, BEST, None
     while low <= high:
         quality = (low + high) // 2
-        content = packed(_encoded(sources, quality))
+        content = build_pack(_encode(sources, quality))
         if len(content) <= mib * MIB:
             low, best = quality + 1, (quality, content)
         else:
@@ -91,7 +114,26 @@ def fitting(sources: Sequence[Source], mib: float) -> tuple[int, bytes]:
     return best
 
 
-def _shrunk(path: Path, side: int) -> NDArray:
+def build_pack(pictures: Sequence[EncodedPicture]) -> bytes:
+    """Return the file that holds `pictures`, whose names all differ."""
+    index: dict[str, dict] = {}
+    for name, split, data, shape in pictures:
+        index.setdefault(split, {})[name] = [*shape, sha256(data).hexdigest()]
+    text = json.dumps(index, separators=(",", ":")).encode()
+    blobs = {picture.name: np.frombuffer(picture.data, np.uint8) for picture in pictures}
+    blobs[INDEX] = np.frombuffer(text, np.uint8)
+    return save(blobs, {CHECKSUM: sha256(text).hexdigest()})
+
+
+def verify_pack(path: Path) -> int:
+    """Return how many photographs a pack holds; raises ValueError naming the first damaged one."""
+    names = [name for names in open_pack(path)[1].values() for name in names]
+    for name in names:
+        PackedPhotograph(path, name).data()
+    return len(names)
+
+
+def _read_shrunk(path: Path, side: int) -> NDArray:
     picture = read_picture(path)
     if picture is None or min(picture.shape) < 16:
         raise ValueError(f"FOLDER must hold readable photographs of 16 px or more, got {path}")
@@ -108,11 +150,11 @@ def _name(path: Path, roots: Sequence[Path]) -> str:
     return (root.name / whole.relative_to(root)).as_posix()
 
 
-def _encoded(sources: Sequence[Source], quality: int) -> list[Picture]:
+def _encode(sources: Sequence[GreyPhotograph], quality: int) -> list[EncodedPicture]:
     with ThreadPoolExecutor() as pool:
         blobs = pool.map(lambda source: _webp(source.pixels, quality), sources)
         pairs = zip(sources, blobs, strict=True)
-        return [Picture(one.name, one.split, blob, one.pixels.shape) for one, blob in pairs]
+        return [EncodedPicture(one.name, one.split, blob, one.pixels.shape) for one, blob in pairs]
 
 
 def _webp(pixels: NDArray, quality: int) -> bytes:
@@ -133,7 +175,7 @@ def main() -> None:
     only = [value for key, value in pairs if key == "train_only"]
     try:
         side, mib = _number("side", given["side"], int), _number("mib", given["mib"], float)
-        print(pack(places[:-1], Path(places[-1]), side=side, mib=mib, train_only=only))
+        print(write_pack(places[:-1], Path(places[-1]), side=side, mib=mib, train_only=only))
     except (ValueError, OSError) as error:
         print("error: " + " ".join(str(error).split()), file=sys.stderr)
         sys.exit(2)

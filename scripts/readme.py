@@ -4,7 +4,7 @@ Made anew: docs/figures/nine_views.png, and the section between the README's mar
 scores of test clips of the photographs in PHOTOS (data=test_photos), each simulated once for all
 networks, beside the published ones whose weights are in `--published`.  Without PHOTOS only the
 picture.  The same for docs/results.md of data=test_footage, with `--footage`, a still scene through
-air, and, what differs, of sensors that have faults (sensor=drawn).  The networks' cards are given
+air, and, what differs, of sensors with random faults (sensor=randomized).  The cards are given
 the scores, too, and those of data=test_targets.
 """
 
@@ -19,11 +19,11 @@ from torch import Tensor
 
 from src import models
 from src.app import build
-from src.app.parts import part
-from src.bench.candidates import Subject
+from src.app.instantiate import build_part
+from src.bench.candidates import Candidate
 from src.figures import plots
-from src.metrics.bootstrap import interval
-from src.metrics.table import METRICS, Metric
+from src.metrics.bootstrap import bootstrap_interval
+from src.metrics.table import METRICS, MetricColumn
 from src.models import files
 from src.records import results
 from src.reports.writers import replace_section
@@ -32,19 +32,18 @@ from src.sim.pipeline import Sample, simulate
 
 HOME = Path(__file__).resolve().parents[1]
 ONE, NINE = ("setnet_small", 1), ("setnet_small", 9)  # of the picture
-# Local air, whose parts of a view wobble apart.
-AIR = ("turbulence=strong", "turbulence.atmosphere.half_length_px=[10,20]",
-       "turbulence.atmosphere.near_rigid=0.0")  # fmt: skip
-PAPER = "nine views, E2VID (the paper's way)"
+# Local air, whose parts of a view are displaced apart.
+AIR = ("turbulence=strong", "turbulence.atmosphere.tilt_correlation_half_length_px=[10,20]",
+       "turbulence.atmosphere.global_tilt_probability=0.0")  # fmt: skip
+PAPER = "nine views, E2VID (the paper's method)"
 LARGE, MEDIUM = "nine views, SetNet large", "nine views, SetNet medium"
-FIRENET, CISTA = "published FireNet+, one view", "published CISTA-TC, one view"
-HIGHPASS = "high-pass, one view"
+SMALL, SINGLE = "nine views, SetNet small", "one view, SetNet medium"
 ROWS = {  # what it is: a network in weights/, how many of the nine views it is given
     LARGE: ("setnet_large", 9),
     MEDIUM: ("setnet_medium", 9),
-    "nine views, SetNet small": ("setnet_small", 9),
+    SMALL: ("setnet_small", 9),
     PAPER: ("lf3x3", 9),
-    "one view, SetNet medium": ("setnet_medium", 1),
+    SINGLE: ("setnet_medium", 1),
     "one view, E2VID": ("single256", 1),
     "one view, E2VID+ trained without turbulence": ("clean/e2vid_plus", 1),
 }
@@ -54,102 +53,107 @@ BASELINES = {  # their files in the folder of published weights
     "highpass": [],
 }
 OTHERS = {
-    FIRENET: ("firenet_plus", 1),
-    CISTA: ("cista", 1),
-    HIGHPASS: ("highpass", 1),
+    "one view, published FireNet+": ("firenet_plus", 1),
+    "one view, published CISTA-TC": ("cista", 1),
 }
-TABLES = {  # of what is measured: the document, its section, and whether rows are in it
-    "data=test_photos": ("README.md", "results", True),
-    "data=test_footage": ("docs/results.md", "footage", False),
-    "data=test_photos sensor=drawn": ("docs/results.md", "drawn", False),
+VIEWS = {  # differences, clip by clip: of nine views and one
+    "Δ (9 − 1 views), E2VID": (PAPER, "one view, E2VID"),
+    "Δ (9 − 1 views), SetNet medium": (MEDIUM, SINGLE),
 }
-PAIRS = {  # rows whose difference is shown, clip by clip
-    "nine views less one, E2VID": (PAPER, "one view, E2VID"),
-    "nine views less one, SetNet medium": (MEDIUM, "one view, SetNet medium"),
-    "nine views, SetNet medium less E2VID": (MEDIUM, PAPER),
-    "nine views, SetNet small less E2VID": ("nine views, SetNet small", PAPER),
-    "nine views, SetNet large less medium": (LARGE, MEDIUM),
-    "nine views, E2VID less FireNet+": (PAPER, FIRENET),
-    "nine views, E2VID less CISTA-TC": (PAPER, CISTA),
-    "nine views, E2VID less high-pass": (PAPER, HIGHPASS),
+BEST = {"Δ nine views, SetNet medium − E2VID": (MEDIUM, PAPER)}
+NETWORKS = BEST | {  # of networks
+    "Δ nine views, SetNet small − E2VID": (SMALL, PAPER),
+    "Δ nine views, SetNet large − medium": (LARGE, MEDIUM),
+}
+TABLES = {  # of what is measured: document, section, whether scores are in it, differences
+    "data=test_photos": (
+        ("README.md", "results", True, VIEWS),
+        ("docs/results.md", "differences", False, NETWORKS),
+    ),
+    "data=test_footage": (("docs/results.md", "footage", False, VIEWS | BEST),),
+    "data=test_photos sensor=randomized": (("docs/results.md", "drawn", False, VIEWS | BEST),),
 }
 
 
-def config(door: str, *overrides: str) -> DictConfig:
-    """Return the config of a door."""
+def compose_config(entry_point: str, *overrides: str) -> DictConfig:
+    """Return the config of an entry point."""
     with initialize_config_dir(str(HOME / "conf"), version_base=None):
-        return compose(door, list(overrides))
+        return compose(entry_point, list(overrides))
 
 
-def baseline(name: str, published: Path | None) -> list[str]:
+def baseline_overrides(name: str, published: Path | None) -> list[str]:
     """Return the overrides that choose one of BASELINES, its weights in the folder `published`."""
     weights = [f"baseline.weights={published}/{file}" for file in BASELINES[name]]
     return [f"baseline={name}", *weights]
 
 
-def subject(name: str, views: int, published: Path | None = None) -> Subject:
+def load_shipped(name: str, views: int, published: Path | None = None) -> Candidate:
     """Return a shipped network, or one of BASELINES with its weights in the folder `published`."""
     if name not in BASELINES:
-        return Subject(name, models.load(name), views)
-    cfg = config("eval", *baseline(name, published))
-    return Subject(name, part(cfg, "baseline").eval(), views)
+        return Candidate(name, models.load(name), views)
+    cfg = compose_config("eval", *baseline_overrides(name, published))
+    return Candidate(name, build_part(cfg, "baseline").eval(), views)
 
 
-def played(network: Subject, sample: Sample) -> Tensor:
+def reconstruct_clip(network: Candidate, sample: Sample) -> Tensor:
     """Return the frames (windows, 1, h, w) that a network makes of `sample`, a single clip."""
     positions = list(sample.positions or layout(sample.voxels.shape[2]))
-    return network.play(sample.voxels[0, :, None], positions, float(sample.window_s[0]))[0]
+    return network.reconstruct(sample.voxels[0, :, None], positions, float(sample.window_s[0]))[0]
 
 
-def scores(cfg: DictConfig, rows: dict[str, Subject]) -> dict[str, list[dict[str, float]]]:
+def score_and_record_clips(
+    cfg: DictConfig, rows: dict[str, Candidate]
+) -> dict[str, list[dict[str, float]]]:
     """Return the scores of all `rows` on each of the test clips of `cfg`."""
-    pipeline, measure = build.pipeline(cfg, "test"), build.scores(cfg)
+    pipeline, measure = build.build_pipeline(cfg, "test"), build.build_metrics(cfg)
     values, clips = {row: [] for row in rows}, cfg.data.test_clips
     for clip in range(clips):
         sample = simulate(pipeline, [clip])
         for row, network in rows.items():
-            frames = played(network, sample)[cfg.data.warmup :]
-            values[row].append(measure(frames, sample.target[0, cfg.data.warmup :]))
+            frames = reconstruct_clip(network, sample)[cfg.data.unscored_windows :]
+            values[row].append(measure(frames, sample.target[0, cfg.data.unscored_windows :]))
         print(f"{clip + 1} of {clips} clips", flush=True)
     return values
 
 
-def table(values: dict[str, list[dict[str, float]]], rows: bool) -> str:
-    """Return the scores of `values` as Markdown, where `rows` says so, and differences of PAIRS."""
+def format_table(
+    values: dict[str, list[dict[str, float]]], rows: bool, pairs: dict[str, tuple[str, str]]
+) -> str:
+    """Return the scores of `values` as Markdown, where `rows` says so, and differences of pairs."""
     heads = [f"{metric.heading} {metric.arrow}" for metric in METRICS]
     lines = ["| | " + " | ".join(heads) + " |", "|---|" + "---|" * len(heads)]
     for row, clips in values.items() if rows else ():
-        lines.append(f"| {row} | " + " | ".join(means(clips)) + " |")
-    for name, (first, second) in PAIRS.items():
+        lines.append(f"| {row} | " + " | ".join(format_means(clips)) + " |")
+    for name, (first, second) in pairs.items():
         if {first, second} <= set(values):
-            cells = gains(values[first], values[second])
+            cells = format_differences(values[first], values[second])
             lines.append(f"| *{name}* | " + " | ".join(cells) + " |")
-    note = "in brackets what holds 95 % of the means, or differences, of resampled clips."
+    note = "mean (95 % bootstrap CI); Δ: paired differences."
     return "\n".join([*lines, "", f"{len(next(iter(values.values())))} clips; {note}"])
 
 
-def means(clips: list[dict[str, float]]) -> list[str]:
+def format_means(clips: list[dict[str, float]]) -> list[str]:
     """Return the scores of clips, per metric."""
-    return [written(m, [clip[m.name] for clip in clips]) for m in METRICS]
+    return [format_mean(m, [clip[m.name] for clip in clips]) for m in METRICS]
 
 
-def gains(first: list[dict[str, float]], second: list[dict[str, float]]) -> list[str]:
+def format_differences(first: list[dict[str, float]], second: list[dict[str, float]]) -> list[str]:
     """Return by how much the scores of the same clips differ, per metric."""
     pairs = list(zip(first, second, strict=True))
-    return [written(m, [a[m.name] - b[m.name] for a, b in pairs], "+") for m in METRICS]
+    return [format_mean(m, [a[m.name] - b[m.name] for a, b in pairs], "+") for m in METRICS]
 
 
-def written(metric: Metric, values: list[float], sign: str = "") -> str:
+def format_mean(metric: MetricColumn, values: list[float], sign: str = "") -> str:
     """Return the mean and its interval."""
-    form, (low, high) = f"{sign}.{metric.digits}f", interval(values)
+    form, (low, high) = f"{sign}.{metric.digits}f", bootstrap_interval(values)
     return f"{np.mean(values):{form}} ({low:{form}} to {high:{form}})"
 
 
-def on_card(card: Path, protocol: str, commit: str, clips: list[dict[str, float]]) -> None:
+def update_card(card: Path, protocol: str, commit: str, clips: list[dict[str, float]]) -> None:
     """Put the scores of `clips` on a card, in the place of what was there of their protocol."""
     start, lines = f"| `{protocol}`", card.read_text().splitlines()
     what = f"{start}, by scripts.readme, at {commit} | {len(clips)} | "
-    row = what + " | ".join(means(clips)) + " |"
+    row = what + " | ".join(format_means(clips)) + " |"
     place = next(n for n, line in enumerate(lines) if line.startswith((start, "In brackets")))
     if lines[place].startswith(start):
         lines[place] = row
@@ -158,15 +162,15 @@ def on_card(card: Path, protocol: str, commit: str, clips: list[dict[str, float]
     results.write_text(card, "\n".join(lines) + "\n")
 
 
-def picture(path: Path, index: int, windows: int) -> None:
+def draw_figure(path: Path, index: int, windows: int) -> None:
     """Draw a clip through strong local air: the last frame and the x-t slice of its middle row."""
-    cfg = config("simulate", *AIR, "scene.height=192", "scene.width=192",
+    cfg = compose_config("simulate", *AIR, "scene.height=192", "scene.width=192",
                  "sensor.threshold=0.15", f"data.test_windows={windows}")  # fmt: skip
-    sample = simulate(build.pipeline(cfg, "test"), [index])
+    sample = simulate(build.build_pipeline(cfg, "test"), [index])
     panels = {
         "what one view sees": sample.turbulent[0],
-        "one view, reconstructed": played(subject(*ONE), sample),
-        "nine views, reconstructed": played(subject(*NINE), sample),
+        "one view, reconstructed": reconstruct_clip(load_shipped(*ONE), sample),
+        "nine views, reconstructed": reconstruct_clip(load_shipped(*NINE), sample),
         "ground truth": sample.target[0],
     }
     figure = Figure(figsize=(10, 4.1), layout="constrained")
@@ -181,7 +185,7 @@ def picture(path: Path, index: int, windows: int) -> None:
         for axes in (above, below):
             axes.set(xticks=[], yticks=[])
     grid[1, 0].set_ylabel("time, down", fontsize=8)
-    plots.save(figure, path)
+    plots.save_figure(figure, path)
 
 
 def main() -> None:
@@ -194,28 +198,27 @@ def main() -> None:
     given = parser.parse_args()
     if given.footage and not given.root:
         parser.error("--footage needs --root, the photographs that it moves")
-    commit = results.commit()  # before anything is written
-    picture(HOME / "docs" / "figures" / "nine_views.png", given.index, 40)
+    commit = results.git_commit()  # before anything is written
+    draw_figure(HOME / "docs" / "figures" / "nine_views.png", given.index, 40)
     if not given.root:
         return
     photos = [f"scene.root={given.root}"]
     asked = {
         "data=test_photos": photos,
-        "data=test_photos sensor=drawn": photos,
+        "data=test_photos sensor=randomized": photos,
         "data=test_targets": [],
     }
     if given.footage:
         asked["data=test_footage"] = [f"turbulence.root={given.footage}", *photos]
     chosen = ROWS | (OTHERS if given.published else {})
-    rows = {row: subject(*what, given.published) for row, what in chosen.items()}
+    rows = {row: load_shipped(*what, given.published) for row, what in chosen.items()}
     cards = {name: row for row, (name, _) in reversed(ROWS.items())}  # the row of most views
     for protocol, overrides in asked.items():
-        values = scores(config("eval", *protocol.split(), *overrides), rows)
-        if protocol in TABLES:
-            document, section, whole = TABLES[protocol]
-            replace_section(HOME / document, section, table(values, whole))
+        values = score_and_record_clips(compose_config("eval", *protocol.split(), *overrides), rows)
+        for document, section, whole, pairs in TABLES.get(protocol, ()):
+            replace_section(HOME / document, section, format_table(values, whole, pairs))
         for name, row in cards.items():
-            on_card(files.WEIGHTS / f"{name}.md", protocol, commit, values[row])
+            update_card(files.WEIGHTS / f"{name}.md", protocol, commit, values[row])
 
 
 if __name__ == "__main__":

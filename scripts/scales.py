@@ -14,11 +14,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from scripts.readme import config
+from scripts.readme import compose_config
 from src import models
 from src.app import build
-from src.metrics.image import aligned
-from src.models.unroll import video
+from src.metrics.image import align_brightness
 from src.sim.pipeline import simulate
 
 SIDES = (2, 4, 8, 16, 44)  # of blocks, in pixels
@@ -31,7 +30,7 @@ def missing(
     """Return the power of the error relative to the truth's in details below each of SIDES, in
     pixels, and in what is left: 0 is perfect, 1 what grey has.
     """
-    error = aligned(frames, truth) - truth
+    error = align_brightness(frames, truth) - truth
     parts = zip(_scales(error), _scales(truth - truth.mean((2, 3), keepdim=True)), strict=True)
     return torch.stack([wrong.square().mean() / true.square().mean() for wrong, true in parts])
 
@@ -53,12 +52,12 @@ def main() -> None:
     parser.add_argument("--root", default="../shared/data/photos")
     given = parser.parse_args()
     overrides = "budget=hours", f"scene.root={given.root}", f"data.test_crop={SIDE}"
-    pipeline = build.pipeline(config("train", "experiment=lf3x3", *overrides), "val")
+    pipeline = build.build_pipeline(compose_config("train", "experiment=lf3x3", *overrides), "val")
     networks, rows = [models.load(name) for name in given.ckpts], [[] for _ in given.ckpts]
     for clip in range(CLIPS):
         sample = simulate(pipeline, [clip])
         for network, row in zip(networks, rows, strict=True):
-            frames = video(network, sample)[0, WARMUP:]
+            frames = network.reconstruct_clip(sample)[0, WARMUP:]
             row.append(missing(frames, sample.target[0, WARMUP:]))
     print("| pixels | " + " | ".join([f"< {side}" for side in SIDES] + [f"> {SIDES[-1]}"]) + " |")
     print("|---" * (len(SIDES) + 2) + "|")

@@ -1,49 +1,60 @@
-"""A trained run to weights/: python -m scripts.ship_weights RUN [--name NAME] [--test FOLDER ...].
+"""A trained network to weights/: python -m scripts.ship_weights RUN [--name NAME] [--test DIR ...]
 
 Writes `weights/NAME.safetensors` (float16, spectral norm folded), its model card `NAME.md` and, of
-a run with a learning curve, that as a figure.  RUN is a folder of src.train, or of a campaign with
-the parts of one training, done or not; with `--mean FILE` what is shipped is the mean of its
-weights and those of FILE, which it began with (Wortsman et al. 2022).  Each FOLDER is one of
-src.eval with these weights; where RUN is a name of weights/, its card alone is written, with what
-FOLDERs hold.
+a run with a learning curve, that as a figure.  RUN: a folder of src.train, or of a stage of a
+campaign.  Each DIR is one of src.eval with these weights; where RUN is a name of weights/, only its
+card is written, with the scores in the DIRs.  A campaign gives --recipe, the --weights of the last
+stage where they are not those of RUN, and a folder --to write to instead of weights/.
 """
 
 import argparse
 import json
+import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from scripts.learning_curves import curve
-from src.figures import learning
-from src.metrics.table import METRICS, Metric
+from scripts.learning_curves import draw_curves, read_curve
+from src.metrics.table import METRICS, MetricColumn
 from src.models import files
-from src.models.unroll import takes
+from src.models.network import FramePostprocessor
 from src.records import results
-from src.training.handover import REACHED
+from src.training.learning_curve import TRAINING_STATE
 
 LARGEST = 16 * 2**20  # bytes of a file
 
 
-def ship(run: Path, name: str, tests: list[Path], other: Path | None = None) -> Path:
-    """Write the weights of `run`, or their mean with those of `other`, and their card; returns the
-    path of the weights.
+class Given(NamedTuple):
+    """What a campaign says of a network: its recipe, other weights than those of the run, and the
+    folder to write to."""
 
-    Raises ValueError for a run without a whole checkpoint, for weights above 16 MiB and where
-    `other` is of another network.
+    recipe: str | None = None
+    weights: Path | None = None
+    folder: Path | None = None  # None: weights/
+
+
+def ship(run: Path, name: str, tests: list[Path], given: Given | None = None) -> Path:
+    """Write the weights of `run`, or those given, and their card; return the path of the weights.
+
+    Raises ValueError for a run without a whole checkpoint, of a working tree that is no commit, and
+    for weights above 16 MiB.
     """
-    ckpt = files.newest(run)
-    network = files.load(ckpt)
+    given, ckpt = given or Given(), files.newest_checkpoint(run)
     content = torch.load(ckpt, map_location="cpu", weights_only=True)
     card = facts(ckpt.parent.parent, content, first_config(run)) | going_on(content)
-    if other is not None:
-        average(network, other)
-        card = {"mean_with": f"{other.name}, {files.card(other)['hours']} hours"} | card
-    path = files.WEIGHTS / f"{name}.safetensors"
+    if card["commit"].endswith("-dirty"):
+        raise ValueError(f"weights are shipped from a commit, {run} is of {card['commit']}")
+    network = files.load(given.weights or ckpt)
+    if given.recipe:
+        card = {"recipe": given.recipe} | card
+    if given.weights and (shares := files.read_card(given.weights).get("mean_of")):
+        card = {"mean_of": shares} | card
+    path = (given.folder or files.WEIGHTS) / f"{name}.safetensors"
     path.parent.mkdir(parents=True, exist_ok=True)
-    if rows := curve(run):
-        learning.draw(path.with_suffix(".png"), {name: rows})
+    if rows := read_curve(run):
+        draw_curves(path.with_suffix(".png"), {name: rows})
     files.save(path, network, content["network"], card)
     if path.stat().st_size > LARGEST:
         path.unlink()
@@ -51,21 +62,10 @@ def ship(run: Path, name: str, tests: list[Path], other: Path | None = None) -> 
     return _write_card(path, name, network, card, tests)
 
 
-def average(network: torch.nn.Module, other: Path) -> None:
-    """Make the weights of `network` their mean with those of `other`; ValueError where these are
-    of another network.
-    """
-    ours, theirs = (files.folded(each) for each in (network, files.load(other)))
-    if {k: v.shape for k, v in ours.items()} != {k: v.shape for k, v in theirs.items()}:
-        raise ValueError(f"--mean must be weights of the same network, got {other}")
-    files.fold(network)
-    network.load_state_dict({name: (ours[name] + theirs[name]) / 2 for name in ours})
-
-
 def recard(name: str, tests: list[Path]) -> Path:
     """Write the card of shipped weights anew, with what `tests` hold; returns the weights' path."""
     path = files.WEIGHTS / f"{name}.safetensors"
-    return _write_card(path, name, files.load(path), files.card(path), tests)
+    return _write_card(path, name, files.load(path), files.read_card(path), tests)
 
 
 def _write_card(
@@ -92,9 +92,9 @@ def facts(run: Path, content: dict, first: DictConfig) -> dict:
         "steps": content.get("steps", content["global_step"]),
         "windows_seen": content["windows"],
         "hours": round(content["seconds"] / 3600, 2),
-        "clock": cfg.clock,
+        "clock": cfg.train_clock,
         "commit": _commit(run),
-        "config_sha256": results.digest(text),
+        "config_sha256": results.hash_config(text),
         "scenes": _scenes(cfg),
         "turbulence": cfg.turbulence.atmosphere.severity if cfg.turbulence.atmosphere else "none",
         "views": cfg.optics.views,
@@ -111,17 +111,17 @@ def going_on(content: dict) -> dict:
     checkpoint `content` has no learning curve.
     """
     for name, state in content.get("callbacks", {}).items():
-        if name.startswith("Curve") and state["rows"]:
+        if name.startswith("LearningCurve") and state["rows"]:
             counts = {"windows": content["windows"], "steps": content["steps"]}
             time = {"hours": content["seconds"] / 3600, "loss": state["loss"]}
-            return {REACHED: time | counts | {"curve": state["rows"]}}
+            return {TRAINING_STATE: time | counts | {"curve": state["rows"]}}
     return {}
 
 
 def _commit(run: Path) -> str:
     """Return the commit at which `run` ended; of one that has not, that of the working tree."""
     record = run / "results.json"
-    return json.loads(record.read_text())["git"] if record.is_file() else results.commit()
+    return json.loads(record.read_text())["git"] if record.is_file() else results.git_commit()
 
 
 def first_config(run: Path) -> DictConfig:
@@ -132,7 +132,7 @@ def first_config(run: Path) -> DictConfig:
     cfg = OmegaConf.load(parts[0] if parts else run / "config.yaml")
     before = Path(cfg.ckpt or "nothing")
     for folder in (before, *before.parents[:2]):  # a run, its checkpoints or one of them
-        if not files.exported(before) and (folder / "config.yaml").is_file():
+        if not files.is_exported(before) and (folder / "config.yaml").is_file():
             return first_config(folder)
     return cfg
 
@@ -141,7 +141,7 @@ def seen(network: torch.nn.Module) -> str:
     """Return what a network is given, in words."""
     if network.views is not None:
         return f"{network.views} view(s)"
-    if takes(network, "frames"):
+    if isinstance(network, FramePostprocessor):
         return "frames in, frames out"
     one = type(network).__module__.startswith("baselines.")
     return "the centre view" if one else "any number of views"
@@ -159,14 +159,14 @@ def describe(
         "",
         "| trained | |",
         "|---|---|",
-        *(f"| {key} | {value} |" for key, value in card.items() if key != REACHED),
+        *(f"| {key} | {value} |" for key, value in card.items() if key != TRAINING_STATE),
         "",
         *([f"![learning curve]({Path(name).name}.png)", ""] if drawn else []),
         "| tested on | clips | " + " | ".join(metric.heading for metric in METRICS) + " |",
         "|---|---|" + "---|" * len(METRICS),
         *(_tested(record, cfg) for record, cfg in tests),
         "",
-        "In brackets: the interval that holds 95 % of the means of resampled clips.",
+        "In brackets: 95 % bootstrap CI of the mean over clips.",
         "",
         "Limits: simulated turbulence and sensor only, grey pictures, scenes in planar motion.",
         "",
@@ -181,11 +181,11 @@ def _tested(record: dict, cfg: DictConfig) -> str:
     return f"| {what} | {scores['clips']} | " + " | ".join(cells) + " |"
 
 
-def _cell(metric: Metric, score: dict | None) -> str:
+def _cell(metric: MetricColumn, score: dict | None) -> str:
     if score is None:
-        return metric.written(None)
-    low, high = map(metric.written, score["interval"])
-    return f"{metric.written(score['mean'])} ({low} to {high})"
+        return metric.format_value(None)
+    low, high = map(metric.format_value, score["interval"])
+    return f"{metric.format_value(score['mean'])} ({low} to {high})"
 
 
 def _start(cfg: DictConfig) -> str:
@@ -204,14 +204,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, help="or a name of weights/")
     parser.add_argument("--name", help="default: the run's experiment")
-    parser.add_argument("--mean", type=Path, help="weights that count half")
+    parser.add_argument("--recipe", help="of conf/recipe, for the card")
+    parser.add_argument("--weights", type=Path, help="to ship instead of those of the run")
+    parser.add_argument("--to", type=Path, help="default: weights/")
     parser.add_argument("--test", type=Path, nargs="*", default=[], help="folders of src.eval")
     arguments = parser.parse_args()
     if (files.WEIGHTS / f"{arguments.run}.safetensors").is_file():
         print(recard(str(arguments.run), arguments.test))
         return
     name = arguments.name or first_config(arguments.run).name
-    print(ship(arguments.run, name, arguments.test, arguments.mean))
+    given = Given(arguments.recipe, arguments.weights, arguments.to)
+    try:
+        print(ship(arguments.run, name, arguments.test, given))
+    except ValueError as error:
+        sys.exit(f"error: {error}")
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
     python -m scripts.surroundings experiment=setnet_small ckpt=FILE export=FILE [+clips= +steps=]
 
 A training step sees a few clips, and of areas they tell little but noise: what follows the memory,
-`SetNet.around` above all, learns nothing from that for hours (docs/decisions/0021).  Here the
+`SetNet.context` above all, learns nothing from that for hours (docs/decisions/07).  Here the
 memory of `ckpt` rests.  What it holds in a few windows of many clips is computed once; then what
 follows, begun anew, learns from pictures of many clips a step, by their mean absolute error.
 `export` is to go on from: `python -m src.train ... ckpt=FILE`.  The config is that of the training.
@@ -22,16 +22,16 @@ from omegaconf import DictConfig
 from torch import Tensor
 from torch.nn import functional
 
-from src.app import build, door
+from src.app import build, entry_point, hardware
+from src.deploy.cpu_features import has_fast_bf16
 from src.models import files
-from src.models.fast import computes_bf16
-from src.models.setnet import CELL, SetNet
+from src.models.setnet import CELL_PX, SetNet
 from src.sim.pipeline import Sample
-from src.training.batch_sampler import Item
-from src.training.datamodule import LightFieldData, Simulator
-from src.training.handover import reached
+from src.training.batch_sampler import SampleId
+from src.training.datamodule import BatchSimulator, LightFieldData
+from src.training.learning_curve import read_training_progress
 
-REMEMBERS = ("voxel_stem", "sum_stem", "spread_stem", "cell2")  # parts that rest
+REMEMBERS = ("voxel_kernels", "sum_kernels", "spread_conv", "memory")  # parts that rest
 EVERY = 7  # windows between two that are learned from; the last one is
 PICTURES = 24  # a step
 RATE, RISE = 1.5e-3, 50  # of Adam, falling by a cosine; steps over which it rises
@@ -39,12 +39,12 @@ RATE, RISE = 1.5e-3, 50  # of Adam, falling by a cosine; steps over which it ris
 
 def rounded() -> torch.autocast:
     """Return a context that computes in bf16 where the processor is faster in it."""
-    return torch.autocast("cpu", torch.bfloat16, enabled=computes_bf16())
+    return torch.autocast("cpu", torch.bfloat16, enabled=has_fast_bf16())
 
 
 def begun_anew(network: SetNet) -> SetNet:
     """Return a fresh network that remembers as `network` does."""
-    fresh = type(network)(**network.arguments)
+    fresh = type(network)(**network.init_kwargs)
     kept = network.state_dict()
     known = {name: kept[name] for name in kept if name.split(".")[0] in REMEMBERS}
     fresh.load_state_dict(known, strict=False)
@@ -62,7 +62,7 @@ def held(
     for sample in samples:
         clips, windows = sample.voxels.shape[:2]
         seen: list[Tensor] = []
-        hook = network.cell2.register_forward_hook(lambda _, x, y, seen=seen: seen.append(y[0]))
+        hook = network.memory.register_forward_hook(lambda _, x, y, seen=seen: seen.append(y[0]))
         with rounded():
             network.sequence(sample.voxels, window_s=sample.window_s, positions=sample.positions)
         hook.remove()
@@ -84,8 +84,8 @@ def learn(network: SetNet, maps: Tensor, truth: Tensor, steps: int) -> list[floa
         some = torch.randint(len(maps), (PICTURES,))
         seen = maps[some].float()
         with rounded():
-            cells = network.drawn(seen, network.around(seen))
-        frames = functional.pixel_shuffle(cells, CELL).sigmoid()
+            cells = network.decode_logits(seen, network.context(seen))
+        frames = functional.pixel_shuffle(cells, CELL_PX).sigmoid()
         error = (frames - truth[some]).abs().mean()
         optimizer.zero_grad()
         error.backward()
@@ -99,29 +99,29 @@ def learn(network: SetNet, maps: Tensor, truth: Tensor, steps: int) -> list[floa
 def samples(data: LightFieldData, clips: int) -> Iterable[Sample]:
     """Return the first training clips, as a training sees them, a batch at a time."""
     pipeline = data.pipelines["train"]
-    simulated = Simulator([pipeline], data.augment, seed=data.seed)
+    simulated = BatchSimulator([pipeline], data.augment, seed=data.seed)
     for first in range(0, clips, data.batch_size):
         numbers = range(first, min(first + data.batch_size, clips))
-        yield simulated([(Item(number, number), pipeline.draw(number)) for number in numbers])
+        yield simulated([(SampleId(number, number), pipeline.draw(number)) for number in numbers])
 
 
 def teach(cfg: DictConfig, clips: int, steps: int) -> None:
     """Read `cfg.ckpt`, write `cfg.export`; the hours that this took are added to its own."""
-    if not (cfg.ckpt and cfg.export and files.exported(Path(cfg.export))):
+    if not (cfg.ckpt and cfg.export and files.is_exported(Path(cfg.export))):
         got = f"{cfg.ckpt} and {cfg.export}"
         raise ValueError(f"ckpt and export must be files, export a .safetensors, got {got}")
     if any(type(count) is not int or count < 1 for count in (clips, steps)):
         raise ValueError(f"clips and steps must be whole numbers >= 1, got {clips} and {steps}")
-    build.share_cores(cfg)
-    build.keep_memory(cfg)
-    _, spec = build.network(cfg)
-    source, start = files.require(cfg.ckpt, spec), time.process_time()
+    hardware.reserve_worker_cores(cfg)
+    hardware.retain_freed_memory(cfg)
+    _, spec = build.build_network(cfg)
+    source, start = files.find_checkpoint(cfg.ckpt, spec), time.process_time()
     before = files.load(source)
     if not isinstance(before, SetNet):
         raise ValueError(f"ckpt must be a SetNet, got {type(before).__name__} in {source}")
     lightning.seed_everything(cfg.seed, verbose=False)
-    network, card = begun_anew(before), reached(source)
-    maps, truth = held(network, samples(build.data(cfg), clips))
+    network, card = begun_anew(before), read_training_progress(source)
+    maps, truth = held(network, samples(build.build_data_module(cfg), clips))
     learn(network, maps, truth, steps)
     card["hours"] += (time.process_time() - start) / 3600
     files.save(Path(cfg.export), network, spec, card)
@@ -134,4 +134,4 @@ def main(cfg: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    door.run(main)
+    entry_point.run_main(main)

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import torch
 
-from scripts.readme import AIR, HOME, NINE, ONE, config, played, subject
+from scripts.readme import AIR, HOME, NINE, ONE, compose_config, load_shipped, reconstruct_clip
 from src.app import build
-from src.figures.samples import mosaic
-from src.figures.video import event_picture, row
-from src.recordings import capture
-from src.records.atomic import written
-from src.sim.pipeline import Draw, Pipeline
+from src.figures.samples import tile_views
+from src.figures.video import join_panels, render_events
+from src.recordings import simulated_recording
+from src.records.atomic import atomic_path
+from src.sim.pipeline import ClipParameters, Pipeline
 
 OUT = HOME / "docs" / "figures" / "tour"
 SIDE, WINDOWS, PITCH = 192, 40, 24  # pixels of a frame; length of the clip; pixels between stars
@@ -31,64 +31,66 @@ def save(name: str, panels: dict[str, np.ndarray], scale: int = 2) -> None:
     large = {
         title: picture[None].repeat(scale, 1).repeat(scale, 2) for title, picture in panels.items()
     }
-    eight = (np.clip(row(large)[0, ..., ::-1], 0, 1) * 255 + 0.5).astype(np.uint8)
+    eight = (np.clip(join_panels(large)[0, ..., ::-1], 0, 1) * 255 + 0.5).astype(np.uint8)
     path = OUT / f"{name}.png"
-    with written(path) as partial:
+    with atomic_path(path) as partial:
         packed = cv2.imencode(".png", eight, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]
         partial.write_bytes(packed.tobytes())
     print(f"{path}: {path.stat().st_size // 1000} kB")
 
 
-def stars(pipeline: Pipeline, draw: Draw) -> np.ndarray:
+def stars(pipeline: Pipeline, draw: ClipParameters) -> np.ndarray:
     """Return what two neighbouring views make of a grid of points: the PSF of each place, moved by
     the tilt there."""
     points = torch.zeros_like(draw.clip.frames[:1])
     points[:, PITCH // 2 :: PITCH, PITCH // 2 :: PITCH] = 1
-    air, drawer = pipeline.operator(draw), pipeline.drawer(draw)
+    air, drawer = pipeline.turbulence_operator(draw), pipeline.turbulence_generator(draw)
     seen = air.degrade(points[None], drawer)[0, :2, 0].numpy()
     return np.clip(2 * seen / seen.max(), 0, 1)
 
 
-def chip(pipeline: Pipeline, draw: Draw, views: torch.Tensor) -> np.ndarray:
+def chip(pipeline: Pipeline, draw: ClipParameters, views: torch.Tensor) -> np.ndarray:
     """Return the events of four windows of all views on one sensor, as a kaleidoscope puts them."""
-    camera = capture.kaleidoscope(
+    camera = simulated_recording.kaleidoscope_views(
         list(pipeline.optics.positions), model=(SIDE, SIDE), sensor=(400, 400), tile_px=128.0,
         key=draw.key,
     )  # fmt: skip
-    events = capture.record(views[:, -5:], draw.clip.fps, camera, draw.sensor)
+    events = simulated_recording.record_events(views[:, -5:], draw.clip.fps, camera, draw.sensor)
     counts = np.zeros(camera.sensor, np.float32)
     np.add.at(counts, (events["y"], events["x"]), events["p"])
-    return event_picture(counts[None])[0]
+    return render_events(counts[None])[0]
 
 
 def draw_all(index: int) -> None:
     """Simulate the clip and draw it stage by stage."""
-    cfg = config("simulate", *AIR, f"scene.height={SIDE}", f"scene.width={SIDE}",
+    cfg = compose_config("simulate", *AIR, f"scene.height={SIDE}", f"scene.width={SIDE}",
                  "sensor.threshold=0.15", f"data.test_windows={WINDOWS}")  # fmt: skip
-    pipeline = build.pipeline(cfg, "test")
+    pipeline = build.build_pipeline(cfg, "test")
     draw, middle = pipeline.draw(index), SIDE // 2
-    views = pipeline.views(draw)[0]
-    sample = pipeline.expose([draw], views[None])
+    views = pipeline.render_views([draw])[0]
+    sample = pipeline.simulate_sensor([draw], views[None])
     tilt, voxels = pipeline.tilt(draw)[:, -1], sample.voxels[0, -1]
     centre = pipeline.optics.centre
     truth, seen = sample.target[0, :, 0].numpy(), sample.turbulent[0, :, 0].numpy()
-    one, nine = (played(subject(*which), sample)[:, 0].numpy() for which in (ONE, NINE))
+    one, nine = (
+        reconstruct_clip(load_shipped(*which), sample)[:, 0].numpy() for which in (ONE, NINE)
+    )
     reach = float(tilt.abs().max())
 
     save("1_scene", {"first frame": colours(truth[0]), "last frame": colours(truth[-1])})
-    right, down = event_picture(tilt[centre].numpy(), full=reach)
+    right, down = render_events(tilt[centre].numpy(), full=reach)
     save("2_tilt", {f"tilt in x, to {reach:.1f} px": right, "tilt in y": down})
     first, second = map(colours, stars(pipeline, draw)[:, :96, :96])
     save("3_psfs", {"points through one view": first, "through its neighbour": second}, scale=4)
-    grid = mosaic([colours(view[-1:].numpy()) for view in views], pipeline.optics)[0]
+    grid = tile_views([colours(view[-1:].numpy()) for view in views], pipeline.optics)[0]
     save("4_views", {"what the nine views see": grid}, scale=1)
     save("5_sensor", {"events of 1/30 s on one sensor": chip(pipeline, draw, views)}, scale=1)
-    events = event_picture(voxels.sum(1).numpy())[centre : centre + 2]
+    events = render_events(voxels.sum(1).numpy())[centre : centre + 2]
     save(
         "6_events",
         dict(zip(("events of the centre view", "of its neighbour"), events, strict=True)),
     )
-    bins = event_picture(voxels[centre].numpy(), full=1.5)
+    bins = render_events(voxels[centre].numpy(), full=1.5)
     save("7_voxels", {f"bin {k}": part[32:160, 32:160] for k, part in enumerate(bins)})
     last = {"ground truth": colours(truth[-1])}
     save("8_one_view", {"one view, reconstructed": colours(one[-1])} | last)

@@ -5,8 +5,8 @@
 The wide network draws what the small one draws (Chen, Goodfellow & Shlens 2016, Net2Net): each new
 channel is a copy of an old one, and whatever reads an old channel reads its copies in parts that
 add up to what it read before.  The parts are drawn at random, for every reader anew, so that copies
-learn different things from the first step.  A memory that is to have a rank gets it first
-(`scripts.narrow_memory`), and then draws nearly what it did.  `export` is to go on from, with the
+learn different things from the first step.  A memory in full is first factored into one of as many
+ranks as it has gates and candidates, which is the same.  `export` is to go on from, with the
 hours of `ckpt`: `python -m src.train ... ckpt=FILE`.  The config is that of the training.
 """
 
@@ -19,12 +19,11 @@ from jaxtyping import Float, Int
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
-from scripts.narrow_memory import narrow, told
-from src.app import build, door
+from src.app import build, entry_point
 from src.models import files
-from src.models.setnet import SetNet
-from src.models.setnet_layers import Residual, ViewKernels
-from src.training.handover import reached
+from src.models.layers import PreActivationBlock
+from src.models.setnet import SetNet, ViewKernels
+from src.training.learning_curve import read_training_progress
 
 SPREAD = 1.0  # a part is 1 / copies, give or take up to so much
 
@@ -64,17 +63,17 @@ def convolution(
         wide.bias.copy_(bias)
 
 
-def residual(wide: Residual, old: Residual, channels: Channels) -> None:
+def residual(wide: PreActivationBlock, old: PreActivationBlock, channels: Channels) -> None:
     """Fill `wide`, which reads copies and writes copies."""
-    convolution(wide.first, old.first, channels, channels)
-    convolution(wide.second, old.second, channels, channels)
+    convolution(wide.conv1, old.conv1, channels, channels)
+    convolution(wide.conv2, old.conv2, channels, channels)
 
 
 @torch.no_grad()
 def view_kernels(wide: ViewKernels, old: ViewKernels, writes: Channels) -> None:
     """Fill `wide`, which writes copies."""
-    ranks = old.kernels.unflatten(0, (-1, len(old.bias)))
-    wide.kernels.copy_(ranks[:, writes].flatten(0, 1))
+    ranks = old.basis.unflatten(0, (-1, len(old.bias)))
+    wide.basis.copy_(ranks[:, writes].flatten(0, 1))
     wide.bias.copy_(old.bias[writes])
     wide.code.load_state_dict(old.code.state_dict())
 
@@ -82,54 +81,63 @@ def view_kernels(wide: ViewKernels, old: ViewKernels, writes: Channels) -> None:
 @torch.no_grad()
 def widen(wide: SetNet, old: SetNet) -> None:
     """Fill `wide` so that it draws what `old` does; ValueError where it has less anywhere."""
-    half = copies(old.half, wide.half)
-    widths = [net.arguments["around"] for net in (old, wide)]
+    half = copies(old.channels, wide.channels)
+    widths = [net.init_kwargs["context_channels"] for net in (old, wide)]
     if len(widths[0]) != len(widths[1]):
         raise ValueError(f"a SetNet is widened, not deepened: {widths[0]} to {widths[1]}")
-    if old.arguments.get("refined") and not wide.arguments.get("refined"):
+    if old.init_kwargs["refine_fusion"] and not wide.init_kwargs["refine_fusion"]:
         raise ValueError("a SetNet is widened, not cut down: refined to not refined")
-    rank, wanted = (net.arguments.get("rank") for net in (old, wide))
+    rank, wanted = (net.init_kwargs["gate_rank"] for net in (old, wide))
     if rank != wanted:
         raise ValueError(f"a SetNet is widened, not changed otherwise: rank {rank} to {wanted}")
     scales = [half, *(copies(a, b) for a, b in zip(*widths, strict=True))]
-    view_kernels(wide.voxel_stem, old.voxel_stem, half)
-    view_kernels(wide.sum_stem, old.sum_stem, half)
-    convolution(wide.spread_stem, old.spread_stem, None, half)
+    view_kernels(wide.voxel_kernels, old.voxel_kernels, half)
+    view_kernels(wide.sum_kernels, old.sum_kernels, half)
+    convolution(wide.spread_conv, old.spread_conv, None, half)
     if rank:
-        convolution(wide.cell2.mixed, old.cell2.mixed, half, None)
-    convolution(wide.cell2.seen, old.cell2.seen, None if rank else half, half)
-    convolution(wide.cell2.kept, old.cell2.kept, half, half)
-    wide.around.pace.copy_(old.around.pace[half])
+        convolution(wide.memory.input_features, old.memory.input_features, half, None)
+    convolution(wide.memory.input_gates, old.memory.input_gates, None if rank else half, half)
+    convolution(wide.memory.state_gates, old.memory.state_gates, half, half)
+    wide.context.log_rate.copy_(old.context.log_rate[half])
     for scale, (finer, here) in enumerate(pairwise(scales)):
-        new, known = wide.around, old.around
+        new, known = wide.context, old.context
         convolution(new.downs[scale], known.downs[scale], finer, here)
-        residual(new.blocks[scale], known.blocks[scale], here)
+        residual(new.down_blocks[scale], known.down_blocks[scale], here)
         convolution(new.ups[scale], known.ups[scale], here, finer)
-    if old.arguments.get("refined"):  # else these are new and silent
-        met = zip(wide.around.joined, old.around.joined, scales[1:-1], strict=True)
+    if old.init_kwargs["refine_fusion"]:  # else these are new and silent
+        met = zip(wide.context.fusion_blocks, old.context.fusion_blocks, scales[1:-1], strict=True)
         for new, known, here in met:
             residual(new, known, here)
-    convolution(wide.mix2, old.mix2, half, half)
-    convolution(wide.shuffle, old.shuffle, half, None)
+    convolution(wide.decoder_conv, old.decoder_conv, half, half)
+    convolution(wide.pixel_conv, old.pixel_conv, half, None)
+
+
+def factored(network: SetNet) -> SetNet:
+    """Return the same network, its memory of rank 2 * half: each gate and candidate of its own."""
+    rank, weights = 2 * network.channels, network.state_dict()
+    weights["memory.input_features.weight"] = weights["memory.input_gates.weight"]
+    weights["memory.input_gates.weight"] = torch.eye(rank)[..., None, None]
+    same = SetNet(**network.init_kwargs | {"gate_rank": rank})
+    same.load_state_dict(weights)
+    return same
 
 
 def begin(cfg: DictConfig) -> None:
     """Read `cfg.ckpt`, write `cfg.export`."""
-    if not (cfg.ckpt and cfg.export and files.exported(Path(cfg.export))):
+    if not (cfg.ckpt and cfg.export and files.is_exported(Path(cfg.export))):
         got = f"{cfg.ckpt} and {cfg.export}"
         raise ValueError(f"ckpt and export must be files, export a .safetensors, got {got}")
-    wide, spec = build.network(cfg)
+    wide, spec = build.build_network(cfg)
     source = Path(cfg.ckpt)
     old = files.load(source)
     if not (isinstance(old, SetNet) and isinstance(wide, SetNet)):
         kinds = f"{type(old).__name__} to {type(wide).__name__}"
         raise ValueError(f"ckpt and experiment must be SetNets, got {kinds}")
     torch.manual_seed(cfg.seed)
-    rank = wide.arguments.get("rank")
-    if rank and "rank" not in old.arguments:
-        old = narrow(old, rank, told(old, cfg))
+    if wide.init_kwargs["gate_rank"] and not old.init_kwargs["gate_rank"]:
+        old = factored(old)
     widen(wide, old)
-    files.save(Path(cfg.export), wide, spec, reached(source))
+    files.save(Path(cfg.export), wide, spec, read_training_progress(source))
 
 
 @hydra.main(version_base=None, config_path="../conf", config_name="train")
@@ -139,4 +147,4 @@ def main(cfg: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    door.run(main)
+    entry_point.run_main(main)

@@ -1,8 +1,6 @@
-"""The rooms and doors of the project."""
+"""Packages and entry points of the project."""
 
 import os
 
 # The largest picture that is read: OpenCV looks at this when it is imported, so before all else.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**27))
-
-import src.app.former_names  # noqa: F401

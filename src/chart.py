@@ -2,56 +2,47 @@
 
 from pathlib import Path
 
-import hydra
 import rich
 from omegaconf import DictConfig
 
-from src.app import build, door, lineup
-from src.bench import charting
-from src.bench.speed import Stopwatch
-from src.figures import changing_air, frontier
+from src.app import build, compared_networks, entry_point
+from src.bench import speed_accuracy
+from src.bench.speed import SpeedBenchmark
+from src.figures import frontier
 from src.records import results
 
 
-def chart(cfg: DictConfig) -> dict:
+def chart(cfg: DictConfig) -> dict[str, str]:
     """Time and score every network; write figures, `speed.csv`, `scores.csv` and `chart.md`.
 
-    Returns {severity: name of the knee}.  Raises ValueError for networks, sizes, forms or
-    severities that are no such thing.
+    Returns {severity: the cheapest network within one standard error of the best}.  Raises
+    ValueError for networks, sizes, forms or severities that are none.
     """
-    run = Path(cfg.paths.run)
-    charting.check(cfg.sizes, cfg.threads, cfg.forms, cfg.devices, cfg.severities, cfg.clips)
-    adaptive = lineup.adaptive(cfg) if cfg.adapt else None
-    candidates = lineup.gather(cfg)
-    results.open_run(run, door.resolved(cfg))
-    limits = {"longest_s": cfg.longest_s, "bins": cfg.bins, "onnx_side": cfg.onnx_side}
-    watch = Stopwatch(run, seconds=cfg.seconds, **limits)
-    what = (cfg.sizes, cfg.threads, cfg.forms, cfg.devices)
-    speeds = [row for candidate in candidates for row in watch.rows(candidate, *what)]
-    results.write_text(run / "speed.csv", charting.speed_csv(speeds))
-    pipelines = {severity: lineup.under(cfg, severity) for severity in cfg.severities}
-    options = {"warmup": cfg.data.warmup, "forms": cfg.forms}
-    scores = charting.scores(candidates, pipelines, cfg.clips, build.scores(cfg), **options)
-    results.write_text(run / "scores.csv", charting.scores_csv(scores))
-    knees = charting.knees(speeds, scores, cfg.sizes[0])
-    text = charting.words(speeds, scores, knees, cfg.sizes[0])
+    run, side = Path(cfg.paths.run), cfg.sizes[0] if cfg.sizes else 0
+    measured = (cfg.sizes, cfg.threads, cfg.forms, cfg.devices)
+    speed_accuracy.check_chart_options(*measured, cfg.severities, cfg.clips)
+    candidates = compared_networks.load_candidates(cfg)
+    results.create_run_folder(run, entry_point.resolved_yaml(cfg))
+    benchmark = SpeedBenchmark(run, seconds=cfg.seconds, bins=cfg.bins)
+    speeds = [row for candidate in candidates for row in benchmark.measure(candidate, *measured)]
+    results.write_text(run / "speed.csv", speed_accuracy.format_speeds_csv(speeds))
+    pipelines = {name: compared_networks.pipeline_at_severity(cfg, name) for name in cfg.severities}
+    scored = {"warmup": cfg.data.unscored_windows, "forms": cfg.forms}
+    scores = speed_accuracy.score_candidates(
+        candidates, pipelines, cfg.clips, build.build_metrics(cfg), **scored
+    )
+    results.write_text(run / "scores.csv", speed_accuracy.format_scores_csv(scores))
+    recommended = speed_accuracy.recommend_networks(speeds, scores, side)
+    text = speed_accuracy.format_chart_summary(speeds, scores, recommended, side)
+    title = "mean over " + ", ".join(cfg.severities) + " turbulence"
     for suffix in ("png", "svg"):
-        title = "mean over " + ", ".join(cfg.severities) + " turbulence"
         path = run / f"chart.{suffix}"
-        frontier.accuracy(path, speeds, scores, side=cfg.sizes[0], title=title)
-        frontier.machine(run / f"machine.{suffix}", speeds, watch.peaks)
-    if adaptive is not None:
-        text += changing_air.write(run, adaptive, cfg.adapt.course, cfg.adapt.clips)
+        frontier.draw_accuracy_against_time(path, speeds, scores, side=side, title=title)
+        frontier.draw_time_over_macs(run / f"machine.{suffix}", speeds, benchmark.peaks)
     results.write_text(run / "chart.md", text)
     rich.print(text, f"in {run}")
-    return knees
-
-
-@hydra.main(version_base=None, config_path="../conf", config_name="chart")
-def main(cfg: DictConfig) -> None:
-    """Glue between Hydra and `chart`."""
-    door.job(chart, cfg)
+    return recommended
 
 
 if __name__ == "__main__":
-    door.run(main)
+    entry_point.run_command(chart, "chart")

@@ -3,10 +3,9 @@
 import time
 from pathlib import Path
 
-import hydra
 from omegaconf import DictConfig
 
-from src.app import build, door, simulation
+from src.app import build, entry_point, hardware, simulation
 from src.figures import samples
 from src.records import results
 
@@ -17,20 +16,16 @@ def evaluate(cfg: DictConfig) -> dict:
     Everything goes below `cfg.paths.run`.  Returns the content of `results.json`.
     """
     run, start = Path(cfg.paths.run), time.perf_counter()
-    build.share_cores(cfg)
-    net = build.frozen(cfg)
-    data = build.data(cfg, splits=("test",), optics=simulation.light_field(cfg, net))
-    results.open_run(run, door.resolved(cfg))
-    row = build.test(cfg, cfg.name, net, data, build.scores(cfg))
-    samples.write(run / "samples", net, data.pipelines["test"])
-    return results.write(run, door.resolved(cfg), [row], **door.facts(cfg, start))
-
-
-@hydra.main(version_base=None, config_path="../conf", config_name="eval")
-def main(cfg: DictConfig) -> None:
-    """Glue between Hydra and `evaluate`."""
-    door.job(evaluate, cfg)
+    hardware.reserve_worker_cores(cfg)
+    net = build.build_method(cfg)
+    data = build.build_data_module(cfg, splits=("test",), optics=simulation.select_optics(cfg, net))
+    results.create_run_folder(run, entry_point.resolved_yaml(cfg))
+    row = build.test_method(cfg, cfg.name, net, data, build.build_metrics(cfg))
+    samples.write_samples(run / "samples", net, data.pipelines["test"])
+    return results.write_and_print_results(
+        run, entry_point.resolved_yaml(cfg), [row], **entry_point.run_facts(cfg, start)
+    )
 
 
 if __name__ == "__main__":
-    door.run(main)
+    entry_point.run_command(evaluate, "eval")

@@ -7,18 +7,20 @@
 
 import asyncio
 
-import hydra
 import torch
 from omegaconf import DictConfig
-from torch import nn
 
 import src.models
-from src.app import build, door
-from src.live_view import assembly, feeds
-from src.live_view.faults import Faults
-from src.live_view.network_step import Running
-from src.recordings import stream
-from src.recordings.views import Views, load
+from src.app import build, entry_point
+from src.app.instantiate import allowed_packages
+from src.live_view.assembly import assemble, play_and_serve
+from src.live_view.event_feeds import open_feed
+from src.live_view.network_runner import RunSettings
+from src.live_view.page_server import PageServer
+from src.live_view.status import FaultLog
+from src.models.network import EventToVideoNetwork
+from src.recordings.reconstruction import as_event_network, takes_all_views
+from src.recordings.views import load_views, views_or_whole_sensor
 
 
 def live(cfg: DictConfig) -> None:
@@ -27,54 +29,39 @@ def live(cfg: DictConfig) -> None:
     Raises ValueError for a recording, views, network or address that cannot be used.
     """
     torch.set_num_threads(cfg.threads)
-    server = server_for(cfg)
-    asyncio.run(assembly.serve(server))
+    asyncio.run(play_and_serve(build_server(cfg)))
 
 
-def server_for(cfg: DictConfig) -> assembly.Server:
-    """Return the server of the page, with the network and views that were asked for chosen."""
-    faults, name = Faults(), str(cfg.ckpt or "baseline")
-    sensor = cfg.sensor_size or (load(cfg.views).sensor if cfg.views else None)
-    feed = feeds.open_feed(cfg.recording, sensor, faults, loop=cfg.loop, udp_format=cfg.udp_format)
-    if cfg.noise_filter_s is not None:
-        feed = feeds.Filtered(feed, cfg.noise_filter_s)
-    views = views_for(cfg, feed.sensor)
-    how = Running(cfg.fps, cfg.bins, cfg.splat, cfg.unit, cfg.span, cfg.form)
-    server = assembly.assemble(
-        feed, networks_for(cfg, name, len(views.views)), views, how, faults,
-        speed=cfg.speed, backlog=cfg.backlog, host=cfg.host, port=cfg.port,
-    )  # fmt: skip
-    assembly.first_choice(server.page.controls, name, cfg.use)
+def build_server(cfg: DictConfig) -> PageServer:
+    """Return the server of the page, with the network and the number of views chosen."""
+    faults, name = FaultLog(), str(cfg.ckpt or "baseline")
+    sensor = cfg.sensor_size or (load_views(cfg.views).sensor if cfg.views else None)
+    feed = open_feed(cfg.recording, sensor, faults, loop=cfg.loop, udp_format=cfg.udp_format)
+    views = views_or_whole_sensor(cfg.views, feed.sensor, cfg.resolution)
+    networks = load_networks(cfg, name, len(views.views))
+    settings = RunSettings(cfg.fps, cfg.bins, cfg.splat, cfg.window_length, cfg.form)
+    keys = ("playback_speed", "max_waiting_windows", "noise_filter_s", "host", "port")
+    server = assemble(feed, networks, views, settings, faults, **{key: cfg[key] for key in keys})
+    server.page.controls.choose(name, cfg.views_used)
     return server
 
 
-def networks_for(cfg: DictConfig, name: str, views: int) -> dict[str, nn.Module]:
-    """Return the networks to choose from, from the smallest; `name`: the one that was asked for.
+def load_networks(cfg: DictConfig, name: str, views: int) -> dict[str, EventToVideoNetwork]:
+    """Return the networks to choose from; `name` is the key of the configured one.
 
-    Raises ValueError where that one wants another number of `views`.
+    Raises ValueError where that one wants another number of `views`; others that do are left out.
     """
-    chosen = build.chosen(cfg)
-    stream.wanted(chosen, views)
-    rooms = build.rooms(cfg)
-    others = {other: src.models.load(other, rooms) for other in cfg.choices if other != name}
-    fit = {other: net for other, net in others.items() if net.views in (None, 1, views)}
-    listed = {other: chosen if other == name else fit.get(other) for other in cfg.choices}
-    listed.setdefault(name, chosen)
-    return {other: net for other, net in listed.items() if net is not None}
-
-
-def views_for(cfg: DictConfig, sensor: tuple[int, int]) -> Views:
-    """Return the views of the recording, at `cfg.resolution` if there is one."""
-    size = tuple(cfg.resolution) if cfg.resolution else None
-    there = load(cfg.views, sensor) if cfg.views else Views.single(sensor, size or sensor)
-    return Views(sensor, size or there.model, there.field, there.views)
-
-
-@hydra.main(version_base=None, config_path="../conf", config_name="live")
-def main(cfg: DictConfig) -> None:
-    """Glue between Hydra and `live`."""
-    door.job(live, cfg)
+    networks: dict[str, EventToVideoNetwork] = {}
+    for other in dict.fromkeys([*cfg.offered_networks, name]):
+        if other == name:
+            networks[name] = as_event_network(build.load_network(cfg))
+            takes_all_views(networks[name], views)
+        else:
+            network = as_event_network(src.models.load(other, allowed_packages(cfg)))
+            if network.views in (None, 1, views):
+                networks[other] = network
+    return networks
 
 
 if __name__ == "__main__":
-    door.run(main)
+    entry_point.run_command(live, "live")

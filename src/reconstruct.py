@@ -3,21 +3,24 @@
 Writes the video and `frames.csv`: the time stamp and the events of each frame.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
-import hydra
 import numpy as np
 from omegaconf import DictConfig
-from torch import nn
+from rich.progress import track
 
-from src.app import build, door
-from src.models.runtime import Runtime
-from src.recordings import event_lists, lookup, output, progress, stream
+from src.app import build, entry_point
+from src.deploy.runtime import EventListRuntime
+from src.models.network import EventToVideoNetwork
+from src.recordings import output, reconstruction
+from src.recordings.event_windows import WindowRule, frames_per_window
 from src.recordings.files import sources
 from src.recordings.noise_filter import NoiseFilter
-from src.recordings.views import Views, load
+from src.recordings.views import Views, views_or_whole_sensor
 from src.records import results
+
+RULE_KEYS = ("fps", "bins", "splat", "start_s", "end_s")
 
 
 def reconstruct(cfg: DictConfig) -> Path:
@@ -25,74 +28,45 @@ def reconstruct(cfg: DictConfig) -> Path:
 
     Raises ValueError for a recording, views, network or window that do not go together.
     """
-    run, net = Path(cfg.paths.run), build.chosen(cfg)
-    views, span = views_for(cfg, net), overlap(cfg, net)
-    fast = event_lists.ready(net, cfg.form, cfg.device, views, cfg.bins, cfg.align)
-    results.open_run(run, door.resolved(cfg))
-    with output.sink(cfg.output, run, views.model, cfg.playback) as write:
-        for frame in progress.tell(frames(cfg, fast, views, span), span):
+    run = Path(cfg.paths.run)
+    network, views, span = prepare(cfg)
+    results.create_run_folder(run, entry_point.resolved_yaml(cfg))
+    with output.open_video_writer(cfg.output_format, run, views.model, cfg.playback_fps) as write:
+        for frame in track(frames(cfg, network, views, span), "frames"):
             write(frame)
     return run
 
 
-def views_for(cfg: DictConfig, net: nn.Module) -> Views:
-    """Return the views that `net` takes of the recording: all, or the centre one alone."""
+def prepare(cfg: DictConfig) -> tuple[EventToVideoNetwork | EventListRuntime, Views, int]:
+    """Return the network as it is run, the views it takes and how many frames a window spans."""
+    network = reconstruction.as_event_network(build.load_network(cfg))
     sensor = sources.sensor_size(cfg.recording, cfg.sensor_size)
-    size = tuple(cfg.resolution) if cfg.resolution else None
-    there = load(cfg.views, sensor) if cfg.views else Views.single(sensor, size or sensor)
-    there = Views(sensor, size or there.model, there.field, there.views)
-    return there if stream.wanted(net, len(there.views)) else there.only([(0, 0)])
-
-
-def overlap(cfg: DictConfig, net: nn.Module) -> int:
-    """Return how many frames a window spans; a network that is told its length needs no overlap."""
-    if cfg.count:
-        return 1
-    return stream.overlap(cfg.span or stream.default_span(net), cfg.fps)
+    views = views_or_whole_sensor(cfg.views, sensor, cfg.resolution)
+    if not reconstruction.takes_all_views(network, len(views.views)):
+        views = views.select([(0, 0)])
+    length = cfg.window_length or reconstruction.default_window_length(network)
+    span = frames_per_window(length, cfg.fps)
+    prepared = reconstruction.prepare_network(network, cfg.form, cfg.device, views, cfg.bins)
+    return prepared, views, span
 
 
 def frames(
-    cfg: DictConfig, net: nn.Module | Runtime, views: Views, span: int
-) -> Iterator[stream.Frame]:
-    """Read, cut into windows that span `span` frames, and reconstruct, chunk by chunk."""
-    rule = stream.Rule(
-        fps=None if cfg.count else cfg.fps,
-        count=cfg.count,
-        overlap=span,
-        bins=cfg.bins,
-        splat=cfg.splat,
-        unit=cfg.unit,
-        start_s=cfg.start,
-        end_s=cfg.end,
-        grids=not isinstance(net, Runtime),
-    )
+    cfg: DictConfig, network: EventToVideoNetwork | EventListRuntime, views: Views, span: int
+) -> Iterator[reconstruction.Frame]:
+    """Yield the frames of the recording."""
 
-    def chunks() -> Iterator[np.ndarray]:
-        read = sources.events(cfg.recording, views.sensor, cfg.chunk_s)
+    def read_events() -> Iterator[np.ndarray]:
+        events = sources.iter_recording(cfg.recording, views.sensor)
         if cfg.noise_filter_s is None:
-            return read
-        kept = map(NoiseFilter(views.sensor, cfg.noise_filter_s), read)
-        return (events for events in kept if events.size)
+            return events
+        return filter(len, map(NoiseFilter(views.sensor, cfg.noise_filter_s), events))
 
-    def run(windows: Iterable[stream.Window]) -> Iterator[stream.Frame]:
-        more = {"overlap": span, "carry": carry}
-        if isinstance(net, Runtime):
-            return event_lists.frames(windows, net, **more)
-        return stream.frames(windows, net, positions=views.positions, device=cfg.device, **more)
-
-    table, carry = lookup.build(views), stream.Carry()
-    if cfg.look_ahead_s:
-        for _ in run(stream.backwards(chunks(), table, rule, cfg.look_ahead_s)):
-            pass
-        carry.turn()
-    return run(stream.windows(chunks(), table, rule))
-
-
-@hydra.main(version_base=None, config_path="../conf", config_name="reconstruct")
-def main(cfg: DictConfig) -> None:
-    """Glue between Hydra and `reconstruct`."""
-    door.job(reconstruct, cfg)
+    settings = {key: cfg[key] for key in RULE_KEYS}
+    as_lists = isinstance(network, EventListRuntime)
+    rule = WindowRule(**settings, frames_per_window=span, as_lists=as_lists)
+    given = network, views, rule, cfg.backward_warmup_s
+    return reconstruction.reconstruct_recording(read_events, *given, device=cfg.device)
 
 
 if __name__ == "__main__":
-    door.run(main)
+    entry_point.run_command(reconstruct, "reconstruct")

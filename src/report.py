@@ -2,71 +2,59 @@
 
 from pathlib import Path
 
-import hydra
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig
 
-from src.app import door
+from src.app import entry_point
+from src.app.instantiate import as_dict
 from src.records import results, runs
-from src.reports import cells, page, tables, writers
-from src.reports.margins import margins
+from src.reports import page, run_groups, tables, writers
 
 
 def report(cfg: DictConfig) -> list[tables.Table]:
-    """Write `report.md`, `.csv`, `.tex` and `.html` of the runs below `cfg.run`; return the tables.
+    """Write `report.md`, `.csv` and `.html` of the runs below `cfg.run`; return the tables.
 
     With `into`, the Markdown also replaces that file's section of the same title.
     """
-    folders, out = listed(cfg.run), Path(cfg.paths.run)
-    ours, plans = runs.find(folders), runs.plans(folders)
-    title = cfg.title or sweep_name(ours)
-    paper = OmegaConf.to_container(cfg.paper)
-    wanted, shown = [], []
-    sweeps = dict.fromkeys(each.sweep for each in [*ours, *plans])
+    folders, out = _list_folders(cfg.run), Path(cfg.paths.run)
+    found, plans = runs.find_runs(folders), runs.find_sweeps(folders)
+    names = {run.record.get("asked", {}).get("config", "") for run in found}
+    title = cfg.title or (names.pop() if len(names) == 1 else "") or "runs"
+    published = as_dict(cfg.paper)
+    candidates: list[tables.Table | None] = []
+    groups = []
+    sweeps = dict.fromkeys([*(run.sweep for run in found), *(plan.sweep for plan in plans)])
     for name in sweeps:
-        own = [[each for each in all_of if each.sweep == name] for all_of in (ours, plans)]
-        keys, made = cells.cells(*own, tuple(cfg.across))
+        own = [run for run in found if run.sweep == name]
+        planned = [plan for plan in plans if plan.sweep == name]
+        keys, made = run_groups.group_runs(own, planned, tuple(cfg.across))
         of = f": {name}" if name and len(sweeps) > 1 else ""
-        wanted += [
-            tables.main(f"Scores and cost{of}", keys, made, paper),
-            tables.by_severity(f"Severities apart{of}", keys, made),
-            tables.compared(f"On the same clips{of}", keys, made),
-        ]
-        shown += made
+        candidates.append(tables.build_score_table(f"Scores and cost{of}", keys, made, published))
+        candidates.append(tables.build_severity_table(f"Scores by severity{of}", keys, made))
+        candidates.append(tables.build_same_clips_table(f"On the same clips{of}", keys, made))
+        groups += made
     if cfg.against:
-        theirs = runs.find(listed(cfg.against))
-        wanted.append(margins("Clip by clip", ours, theirs, paper))
-    drawn = [table for table in wanted if table and table.rows]
-    commands, figures = [plan.command for plan in plans], runs.figures(folders)
-    text = writers.markdown(drawn, commands)
-    results.open_run(out, door.resolved(cfg))
+        theirs = runs.find_runs(_list_folders(cfg.against))
+        title_of = "Differences on the same clips"
+        candidates.append(tables.build_difference_table(title_of, found, theirs, published))
+    shown = [table for table in candidates if table and table.rows]
+    commands, figures = [plan.command for plan in plans], runs.find_figures(folders)
+    text = writers.format_markdown(shown, commands)
+    results.create_run_folder(out, entry_point.resolved_yaml(cfg))
     results.write_text(out / "report.md", text)
-    results.write_text(out / "report.csv", writers.comma_separated(drawn))
-    results.write_text(out / "report.tex", writers.latex(drawn))
+    results.write_text(out / "report.csv", writers.format_csv_tables(shown))
     size = int(cfg.media_mib * 2**20)
-    whole = page.html(title, drawn, shown, figures, commands=commands, media_bytes=size)
-    results.write_text(out / "report.html", whole)
+    html = page.format_html(title, shown, groups, figures, commands=commands, media_bytes=size)
+    results.write_text(out / "report.html", html)
     if cfg.into:
         writers.replace_section(Path(cfg.into), title, text)
-    print(f"{text}\nin {out}: report.md, report.csv, report.tex, report.html")
-    return drawn
+    print(f"{text}\nin {out}: report.md, report.csv, report.html")
+    return shown
 
 
-def listed(given: str | ListConfig) -> list[Path]:
+def _list_folders(given: str | ListConfig) -> list[Path]:
     """Return one folder, or a list of them, as a list."""
     return [Path(str(folder)) for folder in (given if isinstance(given, ListConfig) else [given])]
 
 
-def sweep_name(ours: list[runs.Run]) -> str:
-    """Return the config that all runs were asked for, such as table1; else `runs`."""
-    names = {run.record.get("asked", {}).get("config", "") for run in ours}
-    return names.pop() if len(names) == 1 and names != {""} else "runs"
-
-
-@hydra.main(version_base=None, config_path="../conf", config_name="report")
-def main(cfg: DictConfig) -> None:
-    """Glue between Hydra and `report`."""
-    door.job(report, cfg)
-
-
 if __name__ == "__main__":
-    door.run(main)
+    entry_point.run_command(report, "report")

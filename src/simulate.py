@@ -1,21 +1,20 @@
 """Look at what the simulation makes: python -m src.simulate turbulence=strong sensor=noisy."""
 
 from pathlib import Path
+from typing import Any
 
-import hydra
 import rich
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from src.app import build, door
+from src.app import build, entry_point
 from src.figures import samples
-from src.recordings import capture
-from src.recordings.files import safe_yaml
-from src.records import results
+from src.recordings import simulated_recording
+from src.records import results, safe_yaml
 
 SECTIONS = ("scene", "optics", "turbulence", "sensor", "data")
-SAME = (*SECTIONS, "seed", "fps", "bins")  # what makes a clip
+CLIP_KEYS = (*SECTIONS, "seed", "fps", "bins")  # what makes a clip
 
 
 def simulate(cfg: DictConfig) -> dict:
@@ -23,58 +22,48 @@ def simulate(cfg: DictConfig) -> dict:
 
     With `like`, the config of another run, it is just the clip that run saw (not augmented).
     With `write` the views also go, mirrored and misaligned, onto one sensor whose events are
-    written to that file, and the truth beside it.
-
-    Returns what was drawn: D/r0, tilt and blur in pixels, threshold ...
+    written to that file, and the truth beside it.  Returns what was drawn: D/r0, threshold ...
     """
     run = Path(cfg.paths.run)
-    if cfg.like:
-        cfg = alike(cfg)
-    pipeline = build.pipeline(cfg, cfg.split)
+    cfg = copy_clip_config(cfg) if cfg.like else cfg
+    pipeline = build.build_pipeline(cfg, cfg.split)
     draw = pipeline.draw(cfg.index)
-    batch = pipeline.views(draw)
-    sample, views = pipeline.expose([draw], batch), batch[0]
+    views = pipeline.render_views([draw])[0].float()
+    sample = pipeline.simulate_sensor([draw], views[None])
     tilt = pipeline.tilt(draw)
     windows = slice(cfg.data.substeps, None, cfg.data.substeps)
-    results.open_run(run, door.resolved(cfg))
-    samples.write_views(run, sample, views[:, windows], tilt[:, windows], pipeline.optics)
+    results.create_run_folder(run, entry_point.resolved_yaml(cfg))
+    samples.write_light_field(run, sample, views[:, windows], tilt[:, windows], pipeline.optics)
     if cfg.write:
-        size = tuple(views.shape[-2:])
-        camera = capture.kaleidoscope(
-            list(pipeline.optics.positions), model=size, key=draw.key,
+        height, width = views.shape[-2:]
+        sensor: Any = draw.sensor  # one with `events`
+        camera = simulated_recording.kaleidoscope_views(
+            list(pipeline.positions), model=(height, width), key=draw.key,
             sensor=tuple(cfg.camera.sensor), tile_px=cfg.camera.tile_px,
         )  # fmt: skip
-        capture.write_recording(cfg.write, views, draw.clip.fps, camera, draw.sensor, tilt=tilt)
-    rich.print(sample.drawn[0], f"in {run}")
-    return sample.drawn[0]
+        simulated_recording.write_recording(
+            cfg.write, views, draw.clip.fps, camera, sensor, tilt=tilt
+        )
+    rich.print(sample.parameters[0], f"in {run}")
+    return sample.parameters[0]
 
 
-def alike(cfg: DictConfig) -> DictConfig:
+def copy_clip_config(cfg: DictConfig) -> DictConfig:
     """Return `cfg` with all that makes a clip taken from the run whose config is `cfg.like`.
 
     Raises ValueError for a file that is no such config.
     """
     try:
-        read = dict(safe_yaml.read(cfg.like))
-        # Before there was a seed for them, test clips followed from the training's.
-        read["data"] = {"test_seed": read["seed"]} | read["data"]
-        other = OmegaConf.create(read)
-        parts = {name: other[name] for name in SAME}
+        other = OmegaConf.create(dict(safe_yaml.read(cfg.like)))
+        parts = {name: other[name] for name in CLIP_KEYS}
         if not all(isinstance(parts[name], DictConfig) for name in SECTIONS):
             raise TypeError("a section must be a mapping")
     except (OSError, YAMLError, KeyError, TypeError, ValueError, OmegaConfBaseException):
         raise ValueError(f"like must be the config.yaml of a run, got {cfg.like}") from None
     merged = cfg.copy()
-    for name, part in parts.items():
-        merged[name] = part
+    merged.update(parts)
     return merged
 
 
-@hydra.main(version_base=None, config_path="../conf", config_name="simulate")
-def main(cfg: DictConfig) -> None:
-    """Glue between Hydra and `simulate`."""
-    door.job(simulate, cfg)
-
-
 if __name__ == "__main__":
-    door.run(main)
+    entry_point.run_command(simulate, "simulate")

@@ -1,89 +1,87 @@
-"""Where methods fail: python -m src.stress, or python -m src.stress ckpt=[lf3x3,setnet_small]."""
+"""Stress tests of networks: python -m src.stress [ckpt=[lf3x3,single256]]."""
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from functools import partial
+from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
+from typing import cast
 
-import hydra
 import rich
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from src.app import build, door, lineup
+from src.app import build, compared_networks, entry_point, hardware
+from src.app.instantiate import build_part
 from src.bench.candidates import Candidate
-from src.bench.probes import suite
-from src.bench.probes.standard import Bench
-from src.figures.heatmap import stress_map
+from src.bench.stress_tests import stress_results as stress_results
+from src.bench.stress_tests.event_clips import StressBench
+from src.figures.stress_map import draw_stress_map
 from src.records import results
 
+NetworkResults = tuple[dict[str, stress_results.Outcome], float | None]
 
-def stress(cfg: DictConfig) -> suite.Found:
-    """Put every network through every probe; write the map, `stress.csv` and `stress.md`.
 
-    Returns the findings, probe by probe and network by network.  Raises ValueError for networks,
-    probes or a number of processes that are no such thing.
+def stress(cfg: DictConfig) -> stress_results.Outcomes:
+    """Run every stress test on every network; write the map, `stress.csv` and `stress.md`.
+
+    Returns the outcomes, test by test and network by network.  Raises ValueError for networks,
+    tests or a number of processes that are none.
     """
     if cfg.processes < 1:
         raise ValueError(f"processes must be >= 1, got {cfg.processes}")
-    run = Path(cfg.paths.run)
-    candidates, examine = lineup.gather(cfg), _examiner(cfg)
-    titles = {name: str(node.title) for name, node in cfg.probes.items()}
-    results.open_run(run, door.resolved(cfg))
-
-    def keep(findings: suite.Found) -> None:
-        results.write_text(run / "stress.csv", suite.table(findings, titles))
-
-    findings, standards = suite.gather(_accounts(cfg, candidates, examine), keep)
-    text = suite.words(findings, titles, standards)
+    run, config = Path(cfg.paths.run), entry_point.resolved_yaml(cfg)
+    candidates, _ = _load(config)
+    titles = {name: str(node.title) for name, node in cfg.stress_tests.items()}
+    results.create_run_folder(run, config)
+    outcomes: stress_results.Outcomes = {name: {} for name in titles}
+    standard_psnr = {}
+    found = _run_tests(cfg, config, len(candidates))
+    for candidate, (own, psnr) in zip(candidates, found, strict=True):
+        for test, outcome in own.items():
+            outcomes[test][candidate.name] = outcome
+        if psnr is not None:
+            standard_psnr[candidate.name] = psnr
+        results.write_text(run / "stress.csv", stress_results.format_outcomes_csv(outcomes, titles))
+        print(f"{candidate.name} is done", flush=True)
+    text = stress_results.format_summary(outcomes, titles, standard_psnr)
     results.write_text(run / "stress.md", text)
     for suffix in ("png", "svg"):
-        stress_map(run / f"stress.{suffix}", findings, titles, standards)
+        draw_stress_map(run / f"stress.{suffix}", outcomes, titles, standard_psnr)
     rich.print(text, f"in {run}")
-    return findings
+    return outcomes
 
 
-def _accounts(
-    cfg: DictConfig, candidates: list[Candidate], examine: Callable[[Candidate], suite.Account]
-) -> Iterator[suite.Account]:
-    """Yield what is found of each network, in their order; several at once in `processes`, each of
-    which loads the networks itself: spectral norms do not travel.
+def _run_tests(cfg: DictConfig, config: str, networks: int) -> Iterator[NetworkResults]:
+    """Yield the results of each network, in their order; several at once in `processes`, each of
+    which loads the networks itself: spectral norms cannot be pickled.
     """
+    run = partial(_test_network, config)
     if cfg.processes == 1:
-        build.share_cores(cfg)
-        yield from map(examine, candidates)
+        hardware.reserve_worker_cores(cfg)
+        yield from map(run, range(networks))
         return
-    plain = OmegaConf.create(OmegaConf.to_container(cfg, resolve=True))
     context = get_context("spawn")  # a fork would inherit threads that are no longer there
-    with ProcessPoolExecutor(cfg.processes, context, _begin, (plain,)) as pool:
-        yield from pool.map(_examine, range(len(candidates)))
+    with ProcessPoolExecutor(cfg.processes, context, torch.set_num_threads, (1,)) as pool:
+        yield from pool.map(run, range(networks))
 
 
-def _examiner(cfg: DictConfig) -> Callable[[Candidate], suite.Account]:
-    """Return what puts a network through the probes; ValueError for probes that are none."""
-    probes = {name: build.part(cfg, f"probes.{name}.probe") for name in cfg.probes}
-    bench = Bench(build.pipeline(cfg, "test"), range(cfg.clips), cfg.data.warmup)
-    return partial(suite.examine, probes=probes, bench=bench)
+def _test_network(config: str, index: int) -> NetworkResults:
+    candidates, run_tests = _load(config)
+    return run_tests(candidates[index])
 
 
-def _begin(cfg: DictConfig) -> None:
-    """Start a process: one thread; networks, clips and probes of its own."""
-    global _here
-    torch.set_num_threads(1)
-    _here = lineup.gather(cfg), _examiner(cfg)
-
-
-def _examine(index: int) -> suite.Account:
-    candidates, examine = _here
-    return examine(candidates[index])
-
-
-@hydra.main(version_base=None, config_path="../conf", config_name="stress")
-def main(cfg: DictConfig) -> None:
-    """Glue between Hydra and `stress`."""
-    door.job(stress, cfg)
+@cache
+def _load(config: str) -> tuple[list[Candidate], Callable[[Candidate], NetworkResults]]:
+    """Return the networks and what runs the tests on one; ValueError for tests that are none."""
+    cfg = cast(DictConfig, OmegaConf.create(config))
+    keys = {name: f"stress_tests.{name}.test" for name in cfg.stress_tests}
+    tests = {name: build_part(cfg, key, _partial_=True) for name, key in keys.items()}
+    pipeline = build.build_pipeline(cfg, "test")
+    bench = StressBench(pipeline, range(cfg.clips), cfg.data.unscored_windows)
+    tester = partial(stress_results.run_stress_tests, tests=tests, bench=bench)
+    return compared_networks.load_candidates(cfg), tester
 
 
 if __name__ == "__main__":
-    door.run(main)
+    entry_point.run_command(stress, "stress")

@@ -4,18 +4,21 @@ import sys
 import time
 from pathlib import Path
 
-import hydra
 import lightning
 import torch
-from lightning.pytorch.utilities import rank_zero_only
-from omegaconf import DictConfig, OmegaConf
+from lightning.pytorch.callbacks import ModelCheckpoint
+from omegaconf import DictConfig
 
-from src.app import build, door
+from src.app import build, entry_point, hardware
+from src.app.instantiate import as_dict, build_part
 from src.figures import samples
 from src.models import files
 from src.records import results, tracking
-from src.training import handover
-from src.training.guard import NotFinite
+from src.training.datamodule import LightFieldData
+from src.training.ema import load_average
+from src.training.learning_curve import restore_training_progress
+from src.training.reconstructor import Reconstructor
+from src.training.step_guard import NonFiniteError
 
 
 def train(cfg: DictConfig) -> dict:
@@ -25,41 +28,47 @@ def train(cfg: DictConfig) -> dict:
     processes that train together all but the first train only, and return {}.
     """
     run, start = Path(cfg.paths.run), time.perf_counter()
-    build.share_cores(cfg)
-    build.keep_memory(cfg)
-    build.choose_precision(cfg)
+    hardware.reserve_worker_cores(cfg)
+    hardware.retain_freed_memory(cfg)
+    hardware.fill_in_precision(cfg)
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
-    net, spec = build.network(cfg)
-    start_from = files.require(cfg.ckpt, spec) if cfg.ckpt else None
-    module, data = build.reconstructor(cfg, net, spec), build.data(cfg)
-    trainer = build.trainer(cfg)
-    if rank_zero_only.rank:
+    net, spec = build.build_network(cfg)
+    start_from = files.find_checkpoint(cfg.ckpt, spec) if cfg.ckpt else None
+    module, data = build.build_reconstructor(cfg, net, spec), build.build_data_module(cfg)
+    trainer = build.build_trainer(cfg)
+    if trainer.global_rank:
         fit(trainer, module, data, start_from)
         return {}
-    results.open_run(run, door.resolved(cfg))
-    untrained = build.test(cfg, "untrained", module.method, data, module.scores)
-    tracking.begin(trainer.loggers, OmegaConf.to_container(cfg, resolve=True))
+    results.create_run_folder(run, entry_point.resolved_yaml(cfg))
+    untrained = build.test_method(cfg, "untrained", module.method, data, module.metrics)
+    tracking.log_config(trainer.loggers, as_dict(cfg))
     try:
         fit(trainer, module, data, start_from)
-    except NotFinite as error:
+    except NonFiniteError as error:
         same = f"python -m src.simulate like={run}/config.yaml split=train index={error.clips[0]}"
         raise ValueError(f"{error}; seed {cfg.seed}; to see the clip: {same}") from error
-    module.method.to(memory_format=torch.contiguous_format)  # as it is when it is loaded again
-    trained = build.test(cfg, cfg.name, module.method, data, module.scores)
-    least = build.part(cfg, "floor.method")
-    floor = build.test(cfg, cfg.floor.name, least, data, module.scores)
-    pictures = samples.write(run / "samples", module.method, data.pipelines["test"])
-    rows, facts = [trained, untrained, floor], door.facts(cfg, start)
-    record = results.write(run, door.resolved(cfg), rows, **facts)
-    tracking.end(trainer.loggers, record, pictures)
+    load_average(trainer, module)
+    # As it is when it is loaded again.
+    module.method.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+    trained = build.test_method(cfg, cfg.name, module.method, data, module.metrics)
+    baseline = build_part(cfg, "reference_baseline.method")
+    reference = build.test_method(cfg, cfg.reference_baseline.name, baseline, data, module.metrics)
+    pictures = samples.write_samples(run / "samples", module.method, data.pipelines["test"])
+    rows, facts = [trained, untrained, reference], entry_point.run_facts(cfg, start)
+    record = results.write_and_print_results(run, entry_point.resolved_yaml(cfg), rows, **facts)
+    tracking.log_results(trainer.loggers, record, pictures)
     return record
 
 
-def fit(trainer: lightning.Trainer, module, data, start_from: Path | None) -> None:
-    """Train; when that is cut short, whatever by, say what to go on from."""
-    last = Path(trainer.checkpoint_callback.dirpath) / "last.ckpt"
-    if start_from and files.exported(start_from):
-        handover.take(module, trainer.callbacks, start_from)
+def fit(
+    trainer: lightning.Trainer, module: Reconstructor, data: LightFieldData, start_from: Path | None
+) -> None:
+    """Train; when that is cut short, whatever by, print what to continue from."""
+    checkpoint = trainer.checkpoint_callback
+    assert isinstance(checkpoint, ModelCheckpoint) and checkpoint.dirpath
+    last = Path(checkpoint.dirpath) / "last.ckpt"
+    if start_from and files.is_exported(start_from):
+        restore_training_progress(module, trainer.callbacks, start_from)  # type: ignore[attr-defined]
         start_from = None
     try:
         trainer.fit(module, data, ckpt_path=start_from)
@@ -72,11 +81,5 @@ def fit(trainer: lightning.Trainer, module, data, start_from: Path | None) -> No
         raise
 
 
-@hydra.main(version_base=None, config_path="../conf", config_name="train")
-def main(cfg: DictConfig) -> None:
-    """Glue between Hydra and `train`."""
-    door.job(train, cfg)
-
-
 if __name__ == "__main__":
-    door.run(main)
+    entry_point.run_command(train, "train")

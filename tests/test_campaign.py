@@ -1,4 +1,4 @@
-"""Campaigns of tiny fake trainings: in turn, two at a time, through kills of anybody."""
+"""Campaigns: recipes of tiny fake trainings, two at a time, stage by stage, through kills."""
 
 import fcntl
 import os
@@ -10,9 +10,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
 
-from scripts import campaign
-from scripts.campaign_training import ROOT, Training
+from scripts.campaign import __main__ as campaign
+from scripts.campaign import driver
+from scripts.campaign.recipe import ROOT, names, read
+from scripts.campaign.training import Settings, Training, give_way
+from scripts.campaign.work import RecipeWork, average
+from src.models import files
+from src.models.e2vid import E2VID
 
 # Steps of 0.02 s, each with a checkpoint (a text file with the number of steps); as src.train, it
 # goes on from `ckpt=`, writes a curve, and at the end its results.
@@ -21,23 +27,22 @@ import pathlib, sys, time
 folder, hours, *rest = sys.argv[1:]
 run, all = pathlib.Path(folder), pathlib.Path(folder).parent
 (run / "checkpoints").mkdir(parents=True)
-(run / "config.yaml").write_text(f"hours: {hours}\\n")
+(run / "config.yaml").write_text(f"train_hours: {hours}\\n")
 steps = max([int(p.read_text()) for p in all.rglob("*.ckpt")], default=0) if rest else 0
-fault = (all.parent / "fault.py").read_text() if (all.parent / "fault.py").is_file() else ""
+top = all.parent.parent
+fault = (top / "fault.py").read_text() if (top / "fault.py").is_file() else ""
 while steps < 10 * float(hours):
     time.sleep(0.02)
     steps += 1
     (run / "checkpoints" / "last.ckpt").write_text(str(steps))
-    with (all.parent / "order.txt").open("a") as file:
-        file.write(f"{all.name} {steps}\\n")
-    rows = "".join(f"{n / 10},{n},{0.5 if n > 5 else 1 - n / 10}\\n" for n in range(steps + 1))
-    (run / "curve.csv").write_text("hours,steps,lpips\\n" + rows)
+    with (top / "order.txt").open("a") as file:
+        file.write(f"{all.parent.name} {steps}\\n")
     exec(fault)
 (run / "results.json").write_text("{}")
 """
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def fakes(monkeypatch):
     real = Training.command
 
@@ -47,22 +52,33 @@ def fakes(monkeypatch):
         rest = [word for word in words if word.startswith("ckpt=")]
         return [sys.executable, "-c", FAKE, folder, str(self.hours), *rest]
 
+    def ship(self, stage) -> None:
+        self.shipped.parent.mkdir(exist_ok=True)
+        self.shipped.write_text(stage.name)
+
     monkeypatch.setattr(Training, "command", command)
-    monkeypatch.setattr(campaign, "POLL_S", 0.05)
+    monkeypatch.setattr(RecipeWork, "_ship", ship)
+    monkeypatch.setattr(driver, "POLL_S", 0.05)
     before = signal.getsignal(signal.SIGTERM)
     yield
     signal.signal(signal.SIGTERM, before)
 
 
-def plan(folder: Path, *names: str, hours: float = 1, **more) -> Path:
-    rows = [f"  - {{name: {name}, hours: {hours}}}" for name in names]
-    values = {"out": folder, "export": folder / "now", "common": "[a=b]", "at_once": 2}
-    values |= {"threads": 1, "nice": 0, "tries": 3, "stop": "null"} | more
-    head = [f"{key}: {value}" for key, value in values.items()]
-    path = folder / "plan.yaml"
-    folder.mkdir(exist_ok=True)
-    path.write_text("\n".join([*head, "trainings:", *rows]))
-    return path
+def works(folder: Path, *given: str, hours: float = 1, parallel: int = 2) -> list[RecipeWork]:
+    """One recipe with one training for each name."""
+    settings = Settings(folder, parallel, 1, 0, 3)
+    return [RecipeWork(recipe(folder, name, hours), settings) for name in given]
+
+
+def recipe(folder: Path, name: str, hours: float = 1, stages: str | None = None):
+    path = folder / f"{name}.yaml"
+    stages = stages or f"[{{name: training, hours: {hours}}}]"
+    path.write_text(f"experiment: lf3x3\nstages: {stages}\n")
+    return read(str(path))
+
+
+def run(given: list[RecipeWork]) -> int:
+    return driver.run(given[0].settings, given)
 
 
 def order(folder: Path) -> list[tuple[str, int]]:
@@ -70,20 +86,16 @@ def order(folder: Path) -> list[tuple[str, int]]:
     return [(line.split()[0], int(line.split()[1])) for line in lines]
 
 
-def states(path: Path) -> list[str]:
-    return [one.state() for one in campaign.load(path)[1]]
-
-
-def test_two_at_a_time_and_in_turn(tmp_path):
-    path = plan(tmp_path, "a", "b", "c")
-    lines = "(all.parent / 'order.txt').read_text().split()"
+def test_two_at_a_time_and_in_turn(tmp_path, fakes):
+    lines = "(top / 'order.txt').read_text().split()"
     # The first step waits for a second training, for five seconds at most.
     (tmp_path / "fault.py").write_text(f"""
 for _ in range(500):
     if steps > 1 or len(set({lines}[::2])) > 1: break
     time.sleep(0.01)""")
-    assert campaign.run(*campaign.load(path)) == 0
-    assert states(path) == ["done"] * 3
+    given = works(tmp_path, "a", "b", "c")
+    assert run(given) == 0
+    assert [work.state() for work in given] == ["done"] * 3
     done = order(tmp_path)
     first_of = {name: [n for n, _ in done].index(name) for name in "abc"}
     last_of = {name: len(done) - 1 - [n for n, _ in done][::-1].index(name) for name in "abc"}
@@ -92,111 +104,158 @@ for _ in range(500):
     assert [steps for name, steps in done if name == "c"] == list(range(1, 11))
 
 
-def test_a_killed_training_goes_on_from_its_checkpoint(tmp_path):
-    path = plan(tmp_path, "a")
+def test_a_killed_training_goes_on_from_its_checkpoint(tmp_path, fakes):
     kill = "if steps in (3, 6, 8): __import__('os').kill(__import__('os').getpid(), 9)"
     (tmp_path / "fault.py").write_text(kill)
-    assert campaign.run(*campaign.load(path)) == 0
+    assert run(works(tmp_path, "a")) == 0
     assert [steps for _, steps in order(tmp_path)] == list(range(1, 11))
-    assert len(list((tmp_path / "a").glob("part*"))) == 4
-    kept = [file.parts[-3] for file in (tmp_path / "a").rglob("*.ckpt")]
+    folder = tmp_path / "a" / "training"
+    assert len(list(folder.glob("part*"))) == 4
+    kept = [file.parts[-3] for file in folder.rglob("*.ckpt")]
     assert sorted(kept) == ["part001", "part002", "part003"], "older checkpoints go"
 
 
-def test_more_hours_go_on_where_it_ended(tmp_path):
-    campaign.run(*campaign.load(plan(tmp_path, "a")))
-    longer = plan(tmp_path, "a", hours=2)
-    assert states(longer) == ["waiting"]
-    campaign.run(*campaign.load(longer))
-    assert [steps for _, steps in order(tmp_path)] == list(range(1, 21))
+def test_stages_run_in_order_and_go_on_from_each_other(tmp_path, fakes):
+    stages = "[{name: short, hours: 0.3}, {name: long, hours: 0.5, seed: 4, overrides: [x=1]}]"
+    work = RecipeWork(recipe(tmp_path, "a", stages=stages), Settings(tmp_path, 1, 1, 0, 3))
+    assert run([work]) == 0
+    assert [steps for _, steps in order(tmp_path)] == [1, 2, 3, 1, 2, 3, 4, 5]
+    assert work.shipped.read_text() == "long"
+    second = work.trainings["long"]
+    assert second.start_from == str((tmp_path / "a" / "short.safetensors").resolve())
+    assert second.overrides == ["experiment=lf3x3", "seed=4", "x=1"]
 
 
-def test_a_training_outlives_its_campaign_and_is_found_again(tmp_path):
-    path = plan(tmp_path, "a", hours=15)
-    training = campaign.load(path)[1][0]
+def test_a_recipe_waits_for_the_networks_that_it_names(tmp_path, fakes):
+    first, second = works(tmp_path, "a", "b")
+    stage = second.recipe.stages[0]._replace(overrides=["teachers=[{a}]"])
+    second.recipe = second.recipe._replace(after=["a"], stages=[stage])
+    assert run([second, first]) == 0
+    assert [name for name, _ in order(tmp_path)] == ["a"] * 10 + ["b"] * 10
+    taught = f"teachers=[{tmp_path / 'weights' / 'a.safetensors'}]"
+    assert taught in second.trainings["training"].overrides
+    (alone,) = works(tmp_path / "..", "c")
+    alone.recipe = alone.recipe._replace(after=["nothing"])
+    with pytest.raises(ValueError, match="c needs the networks nothing: train them too"):
+        run([alone])
+
+
+def test_a_training_outlives_its_campaign_and_is_found_again(tmp_path, fakes):
+    given = works(tmp_path, "a", hours=15)
+    training = given[0].trainings["training"]
     code = f"import sys; sys.path.insert(0, {str(ROOT)!r})\n" + (
-        "from tests.test_campaign import campaign, Training, FAKE\n"
-        "from pathlib import Path\n"
+        "from pathlib import Path\nfrom scripts.campaign import driver\n"
+        "from tests.test_campaign import FAKE, Training, works\n"
         "Training.command = lambda self: [sys.executable, '-c', FAKE, "
         "str(self.folder / 'part000'), str(self.hours)]\n"
-        f"campaign.run(*campaign.load(Path({str(path)!r})))"
+        f"given = works(Path({str(tmp_path)!r}), 'a', hours=15)\n"
+        "driver.run(given[0].settings, given)"
     )
     boss = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT)
     until(lambda: (tmp_path / "order.txt").is_file())
     boss.kill()
     boss.wait()
     assert training.state() == "running"
-    assert campaign.run(*campaign.load(path)) == 0
+    assert run(given) == 0
     assert [steps for _, steps in order(tmp_path)] == list(range(1, 151))
-    assert len(list((tmp_path / "a").glob("part*"))) == 1
+    assert len(list(training.folder.glob("part*"))) == 1
 
 
-def test_a_campaign_that_is_stopped_stops_its_trainings(tmp_path):
-    path = plan(tmp_path, "a", hours=50)
+def test_a_campaign_that_is_stopped_stops_its_trainings(tmp_path, fakes):
     until_started = "import os, pathlib; os.kill(os.getppid(), 15) if steps == 3 else None"
     (tmp_path / "fault.py").write_text(until_started)
+    given = works(tmp_path, "a", hours=50)
     with pytest.raises(SystemExit) as stopped:
-        campaign.run(*campaign.load(path))
+        run(given)
     assert stopped.value.code == 128 + signal.SIGTERM
-    assert states(path) == ["waiting"] and order(tmp_path)[-1][1] < 200
+    assert given[0].state() == "waiting" and order(tmp_path)[-1][1] < 200
 
 
-def test_what_gains_nothing_more_ends_early(tmp_path):
-    path = plan(tmp_path, "a", hours=5, stop="{hours: 0.5, gain: 0.005}")
-    assert campaign.run(*campaign.load(path)) == 0
-    assert states(path) == ["stopped"]
-    assert 10 <= order(tmp_path)[-1][1] < 50, "LPIPS falls until 0.6 h"
-
-
-def test_what_fails_thrice_is_given_up_and_the_others_go_on(tmp_path):
-    path = plan(tmp_path, "a", "b", at_once=1)
-    fail = "if all.name == 'a': (run / 'checkpoints/last.ckpt').unlink(); sys.exit('error: no')"
+def test_what_fails_thrice_is_given_up_and_the_others_go_on(tmp_path, fakes):
+    fail = "if all.parent.name == 'a': (run / 'checkpoints/last.ckpt').unlink(); sys.exit('no')"
     (tmp_path / "fault.py").write_text(fail)
-    assert campaign.run(*campaign.load(path)) == 1
-    assert states(path) == ["failed", "done"]
-    assert (tmp_path / "a" / "failed.txt").read_text() == "exit code 1: error: no\n"
-    assert len(list((tmp_path / "a").glob("part*"))) == 3
+    given = works(tmp_path, "a", "b", parallel=1)
+    assert run(given) == 1
+    assert [work.state() for work in given] == ["failed", "done"]
+    failed = tmp_path / "a" / "training" / "failed.txt"
+    assert failed.read_text() == "exit code 1: no\n"
 
 
 def test_status_says_how_far_each_is(tmp_path):
-    training = campaign.load(plan(tmp_path, "a", hours=4))[1][0]
-    assert training.line() == "a: waiting, 0.00 of 4 h, 0 steps"
-    checkpoints = training.folder / "part000" / "checkpoints"
-    checkpoints.mkdir(parents=True)
-    torch.save({"seconds": 5400.0, "global_step": 77}, checkpoints / "last.ckpt")
-    rows = "hours,steps,loss,lpips,wobble\n0,0,,0.7,1\n1.0,50,0.9,0.4321,1.2\n"
-    (training.folder / "part000" / "curve.csv").write_text(rows)
-    wanted = "a: waiting, 1.50 of 4 h, 77 steps, stored 0 min ago; at hours 1, lpips 0.4321, "
-    assert training.line() == wanted + "wobble 1.2"
+    (work,) = works(tmp_path, "a", hours=4)
+    assert work.line() == "a: waiting, training, 0.00 of 4 h, 0 steps"
+    part = tmp_path / "a" / "training" / "part000"
+    (part / "checkpoints").mkdir(parents=True)
+    torch.save({"seconds": 5400.0, "global_step": 77}, part / "checkpoints" / "last.ckpt")
+    rows = "hours,steps,loss,lpips,temporal_jitter_px\n0,0,,0.7,1\n1.0,50,0.9,0.4321,1.2\n"
+    (part / "curve.csv").write_text(rows)
+    wanted = "a: waiting, training, 1.50 of 4 h, 77 steps, stored 0 min ago; at hours 1, "
+    assert work.line() == wanted + "lpips 0.4321, temporal_jitter_px 1.2"
 
 
-def test_only_one_campaign_works_in_a_folder(tmp_path):
-    path = plan(tmp_path, "a")
+def test_only_one_campaign_works_in_a_folder(tmp_path, fakes):
     with (tmp_path / "campaign.lock").open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with pytest.raises(ValueError, match="out must be a folder that no campaign works in"):
-            campaign.run(*campaign.load(path))
+            run(works(tmp_path, "a"))
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("stages", "said"),
     [
-        ("at_once: 0", "at_once must be a whole number in 1..64"),
-        ("nice: 25", "nice must be"),
-        ("trainings: [{name: a, hours: -1}]", "hours of a must be > 0"),
-        ("trainings: [{name: a, hours: 1}, {name: a, hours: 2}]", "names of their own"),
-        ("strange: 1", "must be as conf/campaign/default.yaml"),
-        ("trainings: []", "names of their own"),
+        ("[{name: a, hours: -1}]", r"hours of stage a of recipe r must be in \(0, 10000\), got -1"),
+        ("[{name: a, hours: 1}, {name: a, hours: 2}]", "stage a of recipe r must have a name of"),
+        ("[{name: a}]", "stage a of recipe r must have one of hours, widen and mean"),
+        ("[{name: a, hours: 1}, {name: b, mean: {a: 0.4}}]", "mean of stage b of recipe r must"),
+        ("[{name: a, mean: {b: 1}}, {name: b, hours: 1}]", "among stages before it"),
+        ("[{name: a, hours: 1, speed: 2}]", "must be of the form of conf/recipe/lf3x3.yaml"),
+        ("[]", "recipe r must have stages"),
     ],
 )
-def test_a_wrong_plan_is_named(text, said, tmp_path):
-    path = plan(tmp_path, "a")
-    key = text.split(":")[0]
-    lines = [line for line in path.read_text().splitlines() if not line.startswith((key, "  -"))]
-    rows = [] if key == "trainings" else ["  - {name: a, hours: 1}"]
-    path.write_text("\n".join([text, *lines, *rows]))
+def test_a_wrong_recipe_is_named(stages, said, tmp_path):
     with pytest.raises(ValueError, match=said):
-        campaign.load(path)
+        recipe(tmp_path, "r", stages=stages)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "recipe must be one or more of clean/e2vid_plus, .*, got none"),
+        (["lf4x4"], "recipe must be one of .*, got lf4x4"),
+        (["lf3x3", "nice=25"], r"nice must be a whole number in 0\.\.19, got 25"),
+    ],
+)
+def test_a_wrong_command_line_is_named(words, said):
+    with pytest.raises(ValueError, match=said):
+        campaign.run(words)
+
+
+def test_a_mean_of_weights_is_weighted(tmp_path):
+    arguments = {"views": 1, "bins": 5, "base_channels": 2}
+    spec, shares = {"target": "src.models.e2vid.E2VID", "kwargs": arguments}, {}
+    for value, share in ((1.0, 0.25), (3.0, 0.75)):
+        network = E2VID(**arguments)
+        for parameter in network.parameters():
+            torch.nn.init.constant_(parameter, value)
+        path = tmp_path / f"{share}.safetensors"
+        files.save(path, network, spec, {"hours": value})
+        shares[path] = share
+    average(shares, tmp_path / "mean.safetensors")
+    mean = files.load(tmp_path / "mean.safetensors")
+    assert all(bool((parameter == 2.5).all()) for parameter in mean.parameters())
+    card = files.read_card(tmp_path / "mean.safetensors")
+    assert card == {"hours": 3.0, "mean_of": {"0.25": 0.25, "0.75": 0.75}}
+
+
+def test_a_training_gives_way_to_other_sessions(tmp_path):
+    sleeper = subprocess.Popen(["sleep", "60"], start_new_session=True)
+    group = Path(f"/proc/{sleeper.pid}/autogroup")
+    give_way(sleeper.pid, 19)
+    if group.is_file():
+        assert group.read_text().split()[-1] == "19"
+    sleeper.kill()
+    sleeper.wait()
+    give_way(sleeper.pid, 19)  # one that has ended is nothing to mind
 
 
 def until(seen) -> None:
@@ -206,9 +265,65 @@ def until(seen) -> None:
         time.sleep(0.02)
 
 
-def test_the_real_command_is_one_of_src_train(monkeypatch, tmp_path):
-    monkeypatch.undo()
-    training = campaign.load(ROOT / "conf" / "campaign" / "default.yaml")[1][0]
+def test_the_command_of_a_training_is_one_of_src_train(tmp_path):
+    work = RecipeWork(read("lf3x3", ["scene.root=x"]), Settings(tmp_path))
+    stage = work.recipe.stages[0]
+    training = work.trainings[stage.name]
+    training.overrides = work._overrides(stage)
     words = training.command()
     assert "campaign-child" in " ".join(words) and "experiment=lf3x3" in words
+    assert "scene.root=x" in words
     assert words[:3] == ["nice", "-n", "19"] and os.access(words[3], os.X_OK)
+
+
+@pytest.mark.parametrize("name", names())
+def test_every_stage_of_every_recipe_is_a_config(name, tmp_path):
+    work = RecipeWork(read(name), Settings(tmp_path))
+    with initialize_config_dir(str(ROOT / "conf"), version_base=None):
+        for stage in work.recipe.stages:
+            words = [word.replace("{", "").replace("}", "") for word in work._overrides(stage)]
+            cfg = compose("train", words)
+            assert cfg.seed == stage.seed and cfg.name == work.recipe.experiment
+
+
+def test_every_shipped_network_has_a_recipe():
+    shipped = {str(f.relative_to(files.WEIGHTS)) for f in files.WEIGHTS.rglob("*.safetensors")}
+    assert shipped == {f"{name}.safetensors" for name in names()}
+
+
+TINY = [
+    "scene=photos", "scene.height=64", "scene.width=64", "data.windows=8", "data.crop=32",
+    "data.loss_pairs=2", "data.loss_from=2", "data.batch_size=2", "data.clips=null",
+    "data.cache_clips=null", "data.batch_reuse=1", "data.val_clips=1", "data.test_clips=1",
+    "data.test_windows=6", "callbacks.learning_curve.every_h=0.001",
+]  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", names())
+def test_each_recipe_runs_from_nothing_to_its_card(name, tmp_path, monkeypatch):
+    commit_of(tmp_path / "repository", monkeypatch)
+    full = read(name, TINY)
+    own = [o for o in full.overrides if not o.startswith(("scene.", "sensor.", "~sensor"))]
+    stages = [
+        stage._replace(
+            hours=stage.hours and 0.0015 * (place + 1),
+            overrides=[o for o in stage.overrides if o.startswith(("teachers", "loss", "optics"))],
+        )
+        for place, stage in enumerate(full.stages)
+    ]
+    work = RecipeWork(full._replace(overrides=own, stages=stages), Settings(tmp_path / "out"))
+    monkeypatch.setattr(driver, "POLL_S", 0.5)
+    assert run([work]) == 0, (work.folder / full.stages[0].name / "log.txt").read_text()
+    assert work.state() == "done" and files.load(work.shipped).eval()
+    card = work.shipped.with_suffix(".md").read_text()
+    assert f"| recipe | {name} |" in card and "-dirty" not in card
+
+
+def commit_of(folder: Path, monkeypatch) -> None:
+    """Let the trainings see a repository without changes, whatever this one has."""
+    git = ["git", "-c", "user.name=t", "-c", "user.email=t@t", "-C", str(folder)]
+    subprocess.run(["git", "init", "-q", str(folder)], check=True)
+    subprocess.run([*git, "commit", "-q", "--allow-empty", "-m", "t"], check=True)
+    monkeypatch.setenv("GIT_DIR", str(folder / ".git"))
+    monkeypatch.setenv("GIT_WORK_TREE", str(folder))

@@ -14,12 +14,18 @@ import pytest
 from tests.conftest import ROOT
 
 SMALL = ["scene.height=64", "scene.width=64", "data.test_windows=4", "data.test_crop=32"]
-SCORED = [*SMALL, "data.test_clips=2", "data.warmup=1", "data.workers=0", "metrics.lpips=null"]
+SCORED = [
+    *SMALL,
+    "data.test_clips=2",
+    "data.unscored_windows=1",
+    "data.workers=0",
+    "metrics.lpips=null",
+]
 TINY = {  # what is added to a command, so that it is over in seconds
     "train": ["debug=fdr", "loss=l1", "metrics.lpips=null", "logger=none"],
     "eval": SCORED,
     "simulate": SMALL,
-    "reconstruct": ["fps=1000", "hydra.run.dir=out/digit", "output=hdf5"],
+    "reconstruct": ["fps=1000", "hydra.run.dir=out/digit", "output_format=hdf5"],
     "report": [],
 }
 STEP = re.compile(r"(New|In) `([^`]+)`(?:, below `([^`]+)`)?:\n\n```\w+\n(.*?)```", re.S)
@@ -81,7 +87,7 @@ def test_the_page_is_followed(copy, page):
     scored = json.loads((copy / "out" / "contrast" / "results.json").read_text())
     assert scored["test"]["contrast"]["mean"] > 0
     (report,) = (copy / "out" / "report").rglob("report.md")
-    assert "contrast ↑" in report.read_text() and report.read_text().count("baseline.keep") >= 1
+    assert "contrast ↑" in report.read_text() and report.read_text().count("baseline.decay") >= 1
     (frames,) = (copy / "out" / "digit").glob("frames.csv")
     assert len(frames.read_text().splitlines()) == 5  # four windows of a millisecond
 

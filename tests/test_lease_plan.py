@@ -1,6 +1,5 @@
 """The plan of a time-limited training: refused where it cannot be, with the numbers."""
 
-import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,13 +11,18 @@ from omegaconf import OmegaConf
 
 from scripts.lease import __main__ as lease
 from scripts.lease import plan as plans
-from scripts.lease.fit import Sized, allotted, choose, excess, fit, sized
 from scripts.lease.plan import Network
-from scripts.lease.training import HoursAnew, InTime
+from scripts.lease.selection import (
+    SizedNetwork,
+    allot_seconds,
+    find_excess,
+    select_networks,
+    size_network,
+)
+from scripts.lease.training import DeadlineSchedule
+from scripts.pack_scenes import EncodedPicture, build_pack
 from src.app import build
 from src.models import files
-from src.sim.scenes.photo_pack import Picture, packed
-from src.training.schedule import Hours
 from tests.conftest import ROOT
 
 DRY = ROOT / "conf" / "lease" / "dry.yaml"
@@ -40,24 +44,24 @@ def pack(path: Path) -> Path:
         image = cv2.GaussianBlur(rng.uniform(0, 1, (120, 160)), (0, 0), 4)
         image = cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
         data = cv2.imencode(".png", image)[1].tobytes()
-        pictures.append(Picture(f"{split}.png", split, data, image.shape))
-    path.write_bytes(packed(pictures))
+        pictures.append(EncodedPicture(f"{split}.png", split, data, image.shape))
+    path.write_bytes(build_pack(pictures))
     return path
 
 
 def begun(path: Path, hours: float) -> Path:
     """Exported weights of a training of so many hours and five steps."""
-    network = plans.load(DRY).networks[1]
+    network = plans.load_plan(DRY).networks[1]
     row = {"hours": hours, "steps": 5, "windows": 40, "loss": 0.5}
     card = row | {"curve": [row]}
-    files.save(path, *build.network(plans.load(DRY).config(network)), card)
+    files.save(path, *build.build_network(plans.load_plan(DRY).config(network)), card)
     return path
 
 
 @pytest.fixture(scope="module")
-def three() -> list[Sized]:
-    found = plans.load(DRY)
-    return [sized(found, network) for network in found.networks]
+def three() -> list[SizedNetwork]:
+    found = plans.load_plan(DRY)
+    return [size_network(found, network) for network in found.networks]
 
 
 @pytest.mark.parametrize(
@@ -69,30 +73,30 @@ def three() -> list[Sized]:
     ],
 )
 def test_what_does_not_fit_is_refused_with_the_numbers(changes, said, three, tmp_path):
-    assert not excess(plans.load(DRY), three[:2], 3)
+    assert not find_excess(plans.load_plan(DRY), three[:2], 3)
     with pytest.raises(ValueError, match=f"^{said}"):
-        choose(plans.load(plan(tmp_path, **changes)), three, 3)
+        select_networks(plans.load_plan(plan(tmp_path, **changes)), three, 3)
 
 
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"marginals": 3}, "keys must be of .*; unknown marginals"),
-        ({"fill": {"minutes": 1}}, "fill: keys must be of .*; missing clips"),
-        ({"fill": {"minutes": 1, "clips": 8, "least": 9}}, "fill: clips must be .* >= 9, got 8"),
-        ({"check_s": -1}, "check_s must be a number > 0, got -1"),
+        ({"marginals": 3}, "Key .marginals. not in .Plan."),
+        ({"fill": {"minutes": 1}}, "missing value: fill.clips|missing.*clips"),
+        ({"fill": {"minutes": 1, "clips": 8, "least": 9}}, "fill: clips must be >= 9, got 8"),
+        ({"check_s": -1}, "check_s must be > 0, got -1"),
         ({"scenes": "no.pack"}, "scenes must be a file, got no.pack, which is not in"),
         ({"networks": []}, "networks must have names of their own"),
-        ({"networks": None}, "networks are missing"),
+        ({"networks": None}, "missing.*networks"),
         ({"networks": [{"name": "a/b", "minutes": 1}]}, "name must be letters, digits"),
         ({"networks": [{"name": "lf3x3"}]}, "minutes of lf3x3 must be > 0"),
-        ({"networks": [{"name": "lf3x3", "minutes": 1, "many": 2}]}, "networks: .*unknown many"),
+        ({"networks": [{"name": "lf3x3", "minutes": 1, "many": 2}]}, "Key .many. not in .Network."),
         ({"networks": [{"name": "single256", "minutes": 0.1, "start": "x.ckpt"}]}, "exported"),
     ],
 )
 def test_a_file_that_is_no_plan_is_refused(changes, said, tmp_path):
     with pytest.raises(ValueError, match=said):
-        plans.load(plan(tmp_path, **changes))
+        plans.load_plan(plan(tmp_path, **changes))
 
 
 @pytest.mark.parametrize(
@@ -105,66 +109,50 @@ def test_a_file_that_is_no_plan_is_refused(changes, said, tmp_path):
 )
 def test_a_network_that_cannot_be_trained_is_refused(changes, said, tmp_path):
     with pytest.raises(ValueError, match=said):
-        fit(plans.load(plan(tmp_path, **changes)), 3)
+        found = plans.load_plan(plan(tmp_path, **changes))
+        [size_network(found, network) for network in found.networks]
 
 
-def test_a_damaged_pack_and_a_rate_at_its_end_are_refused(tmp_path):
+def test_a_damaged_pack_is_refused(tmp_path):
     whole = pack(tmp_path / "photos.pack").read_bytes()
     (tmp_path / "photos.pack").write_bytes(whole[:-40] + bytes(8) + whole[-32:])
     with pytest.raises(ValueError, match=r"photos.pack is damaged: the SHA-256 of \w+.png"):
-        plans.load(plan(tmp_path, scenes="photos.pack"))
-    begun(tmp_path / "begun.safetensors", 8)
-    row = {"name": "single256", "minutes": 4, "start": "begun.safetensors"}
-    with pytest.raises(ValueError, match="after 8.00 h a cosine of 4 minutes more begins at 0.02%"):
-        plans.load(plan(tmp_path, networks=[row]))
-    plans.load(plan(tmp_path, networks=[row | {"restart": True}]))
+        plans.load_plan(plan(tmp_path, scenes="photos.pack"))
 
 
 def test_what_is_optional_comes_only_where_it_fits(three, tmp_path):
-    found = plans.load(DRY)
-    two, all_of_them = choose(found, three, 3), choose(found, three, 9)
-    assert list(two.left_out) == ["single768"] and two.doubled == {"lf3x3", "single256"}
+    found = plans.load_plan(DRY)
+    two, all_of_them = select_networks(found, three, 3), select_networks(found, three, 9)
+    assert list(two.left_out) == ["single768"] and two.networks == three[:2]
     assert all_of_them.networks == three and not all_of_them.left_out
-    assert not all_of_them.doubled, "eight files are all there may be"
-    small = choose(plans.load(plan(tmp_path, budget_mib=1.3)), three, 9)
-    assert "budget_mib must be >= 1.5" in small.left_out["single768"] and not small.doubled
-    large = choose(plans.load(plan(tmp_path, budget_mib=9, file_mib=3, files=10)), three, 3)
-    assert large.doubled == two.doubled and large.checkpoints == {"lf3x3", "single256"}
+    small = select_networks(plans.load_plan(plan(tmp_path, budget_mib=1.3)), three, 9)
+    assert "budget_mib must be >= 1.5" in small.left_out["single768"]
     with pytest.raises(ValueError, match="none fits: minutes must be"):
-        choose(found, three[2:], 3)
+        select_networks(found, three[2:], 3)
     with pytest.raises(ValueError, match="only must be of lf3x3, single256, single768, got two"):
-        found.only(["two"])
+        found.select(["two"])
 
 
 def test_what_a_lease_would_do_is_told_without_one(capsys):
-    assert lease._done(["check", DRY], {"only": "single256"}, 3) == 0
+    assert lease.run_command(["check", DRY], {"only": "single256"}, 3) == 0
     first, second = capsys.readouterr().out.splitlines()
     assert first == "0.50 of 3 minutes are check, cache, validation and margin"
-    assert second.startswith(
-        "single256: 0.06 min, 168,177 parameters, 0.45 MiB in 2 files; its last"
-    )
+    assert second == "single256: 0.06 min, 168,177 parameters, 0.45 MiB in 2 files"
 
 
 def test_minutes_left_over_go_by_shares_and_missing_ones_shorten_all():
-    pair = [Network("a", minutes=1, share=1), Network("b", minutes=2, share=3)]
-    assert allotted(pair, 220) == [70, 150] and allotted(pair, 90) == [30, 60]
+    pair = [Network(name="a", minutes=1, share=1), Network(name="b", minutes=2, share=3)]
+    assert allot_seconds(pair, 220) == [70, 150] and allot_seconds(pair, 90) == [30, 60]
 
 
 def test_the_rate_ends_with_the_time_there_is():
-    hours, clock = Hours(hours=1.0), SimpleNamespace(hours=0.25)
-    module, curve = SimpleNamespace(clock=clock), SimpleNamespace(scoring_s=4.0)
-    in_time = InTime(hours, curve, time.monotonic() + 366)
-    in_time.on_train_batch_start(None, module, None, 0)
-    assert hours.hours == pytest.approx(0.35, abs=1e-3), "of 366 s 6 are kept for the scoring"
-    anew = HoursAnew(8.0, hours=8.5)
-    assert anew.share(8.0) == 1 and anew.share(8.25) == pytest.approx(0.5) and anew.share(9) == 0
-
-
-def test_missing_packages_are_named_before_anything_else(monkeypatch, capsys):
-    monkeypatch.setitem(lease.NEEDED, "nowhere_to_be_found", "some-package")
-    monkeypatch.setattr(sys, "argv", ["lease", "/nowhere.yaml", "--minutes", "1"])
-    with pytest.raises(SystemExit, match="missing packages: nowhere_to_be_found; pip install some"):
-        lease.main()
+    options = {"curve": SimpleNamespace(scoring_s=4.0), "deadline": time.monotonic() + 366}
+    schedule = DeadlineSchedule(0.0, train_hours=1.0, **options)
+    schedule.limit_train_hours(0.25)
+    assert schedule.train_hours == pytest.approx(0.35, abs=1e-3), "366 s less 6 for the scoring"
+    restarted = DeadlineSchedule(8.0, train_hours=8.5, **options)
+    ratios = [restarted.lr_ratio(hours) for hours in (8.0, 8.25, 9.0)]
+    assert ratios == pytest.approx([1, 0.5, 0])
 
 
 @pytest.mark.parametrize(
@@ -176,4 +164,4 @@ def test_missing_packages_are_named_before_anything_else(monkeypatch, capsys):
 )  # fmt: skip
 def test_a_wrong_command_line_ends_with_how_it_is_used(words):
     with pytest.raises(SystemExit, match="python -m scripts.lease PLAN --minutes N"):
-        lease._parsed(words.split())
+        lease.parse(words.split())

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from scripts import pack_scenes
-from scripts.pack_scenes import MIB, WORST, pack
-from src.sim.scenes.photo_files import SPLITS, photographs, read
-from src.sim.scenes.photo_pack import check
+from scripts.pack_scenes import MIB, WORST, verify_pack, write_pack
+from src.sim.scenes.clip import SPLITS
+from src.sim.scenes.photo_files import list_photographs, read_photograph
 from src.sim.scenes.photographs import Photographs
 from tests.conftest import ROOT
 
@@ -43,43 +43,43 @@ def names(photos: list, folder: str) -> list[str]:
 
 def test_the_splits_are_those_of_the_folders_and_training_alone_gets_more(folders, tmp_path):
     out = tmp_path / "new" / "photos.pack"
-    line = pack(folders[:2], out, side=32, mib=1.0, train_only=folders[2:])
+    line = write_pack(folders[:2], out, side=32, mib=1.0, train_only=folders[2:])
     assert line.startswith(f"{out}: 38 photographs (31 train, 3 val, 4 test), WebP at quality 100")
     for split in SPLITS:
-        expected = names(photographs(folders[:2], split), folders[0])
+        expected = names(list_photographs(folders[:2], split), folders[0])
         if split == "train":
             expected += [f"c/inner/{number:02}.png" for number in range(11)]
-        assert [photo.name for photo in photographs(str(out), split)] == expected
+        assert [photo.name for photo in list_photographs(str(out), split)] == expected
     assert [path.name for path in out.parent.iterdir()] == ["photos.pack"]
 
 
 def test_pictures_are_those_of_the_folders_made_smaller_never_larger(folders, tmp_path):
     for side, shape in ((32, (32, 48)), (200, (60, 90))):
         out = tmp_path / f"{side}.pack"
-        pack(folders[:1], out, side=side, mib=1.0)
+        write_pack(folders[:1], out, side=side, mib=1.0)
         for ours, theirs in zip(
-            photographs(str(out), "train"), photographs(folders[:1], "train"), strict=True
+            list_photographs(str(out), "train"), list_photographs(folders[:1], "train"), strict=True
         ):
-            whole = cv2.resize(read(theirs), shape[::-1], interpolation=cv2.INTER_AREA)
-            assert read(ours).shape == shape
-            assert np.abs(read(ours).astype(float) - whole).mean() < 2.5
+            whole = cv2.resize(read_photograph(theirs), shape[::-1], interpolation=cv2.INTER_AREA)
+            assert read_photograph(ours).shape == shape
+            assert np.abs(read_photograph(ours).astype(float) - whole).mean() < 2.5
 
 
 def test_the_quality_is_the_best_that_fits(folders, tmp_path):
-    sources = pack_scenes.read(folders, [], 64)
-    sizes = [len(pack_scenes.packed(pack_scenes._encoded(sources, q))) for q in (40, 41)]
+    sources = pack_scenes.read_photographs(folders, [], 64)
+    sizes = [len(pack_scenes.build_pack(pack_scenes._encode(sources, q))) for q in (40, 41)]
     assert sizes[0] < sizes[1]
     for size in sizes:
-        quality, content = pack_scenes.fitting(sources, size / MIB)
+        quality, content = pack_scenes.encode_within(sources, size / MIB)
         assert len(content) <= size and (quality == 40) == (size == sizes[0])
-    tight = pack(folders, tmp_path / "tight.pack", side=64, mib=sizes[0] / MIB)
+    tight = write_pack(folders, tmp_path / "tight.pack", side=64, mib=sizes[0] / MIB)
     assert "quality 40," in tight and (tmp_path / "tight.pack").stat().st_size == sizes[0]
 
 
 def test_a_budget_that_cannot_be_kept_is_refused_before_anything_is_written(folders, tmp_path):
     out = tmp_path / "new" / "small.pack"
     with pytest.raises(ValueError, match=rf"mib must be >= 0.\d\d for 27 .* quality {WORST}.*0.01"):
-        pack(folders[:2], out, side=60, mib=0.01)
+        write_pack(folders[:2], out, side=60, mib=0.01)
     assert not out.parent.exists()
 
 
@@ -88,7 +88,7 @@ def test_what_stands_there_stays_where_a_pack_fails(folders, tmp_path):
     out.write_bytes(b"before")
     (Path(folders[0]) / "99.jpg").write_bytes(b"no picture")
     with pytest.raises(ValueError, match="FOLDER must hold readable photographs .*99.jpg"):
-        pack(folders, out, side=32, mib=1.0)
+        write_pack(folders, out, side=32, mib=1.0)
     assert out.read_bytes() == b"before"
     assert not [path for path in tmp_path.iterdir() if "partial" in path.name]
 
@@ -114,17 +114,17 @@ def test_the_command_line_is_refused_in_one_line(words, message, folders, tmp_pa
 
 def test_folders_of_one_name_are_refused(folders, tmp_path):
     with pytest.raises(ValueError, match="FOLDER must differ in name from the others, got b, b"):
-        pack_scenes.read([folders[0], f"{folders[1]}/../b"], [], 32)
+        pack_scenes.read_photographs([folders[0], f"{folders[1]}/../b"], [], 32)
 
 
 @pytest.mark.skipif(not PHOTOS.is_dir(), reason="needs ../shared/data/photos")
 def test_the_splits_of_the_real_photographs_come_out_as_they_are(tmp_path):
     folders = [str(PHOTOS / name) for name in ("bsds500_train", "bsds500_val")]
     out = tmp_path / "bsds.pack"
-    pack(folders, out, side=48, mib=1.0)
-    assert check(out) == 300
+    write_pack(folders, out, side=48, mib=1.0)
+    assert verify_pack(out) == 300
     for split in SPLITS:
-        packed, files = photographs(str(out), split), photographs(folders, split)
+        packed, files = list_photographs(str(out), split), list_photographs(folders, split)
         assert [photo.name for photo in packed] == names(files, folders[0])
     clip = Photographs(str(out), split="test", frames=2, height=32, width=32).clip(0)
     plain = Photographs(folders, split="test", frames=2, height=32, width=32).clip(0)

@@ -2,7 +2,7 @@
 
 Composed only, as tests of their own run them: src.live, src.chart, src.stress, a sweep (its first
 job), and what wants data that are not here (REDS).  Files that a reader has (my.mp4, cap.raw,
-board.raw, site.mp4, <photographs>) are made small.  Targets of `make` exist.
+board.raw, site.mp4, /data/photographs) are made small.  Targets of `make` exist.
 """
 
 import re
@@ -22,18 +22,18 @@ from src.report import report
 from src.simulate import simulate
 from src.train import train
 from tests.conftest import ROOT
-from tests.recordings.calibration.test_air_meter import fields, film
-from tests.test_recordings_doors import folder  # noqa: F401 - a fixture
+from tests.recordings.calibration.test_turbulence_meter import fields, film
+from tests.test_recording_entry_points import folder  # noqa: F401 - a fixture
 from tests.test_sweeps import jobs
 from tests.test_train import TINY
 
 SMALL = ["scene.height=64", "scene.width=64", "data.test_windows=4"]
 RUN = {  # door: what runs it, and what makes it tiny
-    "train": (train, [*TINY, "logger=none", "data.bank=null"]),
-    "eval": (evaluate, [*SMALL, "data.test_clips=1", "data.warmup=1", "data.workers=0",
+    "train": (train, [*TINY, "logger=none", "data.cache_clips=null"]),
+    "eval": (evaluate, [*SMALL, "data.test_clips=1", "data.unscored_windows=1", "data.workers=0",
                         "metrics.lpips=null"]),
     "simulate": (simulate, [*SMALL, "camera.sensor=[360,640]", "camera.tile_px=116"]),
-    "reconstruct": (reconstruct, ["end=0.05"]),
+    "reconstruct": (reconstruct, ["end_s=0.05"]),
     "compare": (compare, []),
     "calibrate": (calibrate, []),
     "report": (report, []),
@@ -100,22 +100,21 @@ def test_every_command_of_the_readme_runs(reader):
     for number, words in enumerate(commands("README.md")):
         line = " ".join(words)
         door = words[2].removeprefix("src.") if words[0] == "python" else "make"
-        if door not in RUN or "/data/" in line or "--config-dir" in line:
+        if door not in RUN or "/data/REDS" in line or "--config-dir" in line:
             continue
         place = dict(w.split("=", 1) for w in words if "=" in w).get(
             "hydra.run.dir", f"out/{number}"
         )
         words = [word for word in words if not word.startswith("hydra.")]
         words = [re.sub(r"out/\S*(<time>|table1)", str(trained), word) for word in words]
-        words = [word.replace("<photographs>", str(reader / "photos")) for word in words]
+        words = [word.replace("/data/photographs", str(reader / "photos")) for word in words]
         work, tiny = RUN[door]
         cfg = composed(words, *tiny, f"paths.out={reader}/out")
         cfg.paths.run = str(reader / place)
-        if door == "compare":  # the other of the two videos that the page made
-            (reader / "one").symlink_to(reader / "nine")
+        if door == "compare":  # in this folder, the names of theirs would be paths
             cfg.names = ["one", "nine"]
         work(cfg)
         trained = trained or (reader / place if door == "train" else None)
         ran.append(door)
-    assert set(ran) == set(RUN) and len(ran) == 14
+    assert set(ran) == set(RUN) and len(ran) == 15
     assert list(reader.rglob("video.gif")) and (reader / "air.yaml").is_file()

@@ -1,4 +1,4 @@
-"""The door stress at a tiny size: map, table and text; what cannot run says why."""
+"""src.stress at a tiny size: map, table and text; what cannot run says why."""
 
 import csv
 
@@ -7,36 +7,46 @@ import pytest
 from src.stress import stress
 from tests.test_train import config
 
-HIGHPASS = "{baseline: {_target_: baselines.highpass.HighPass, source: median}, views: 9}"
+HIGHPASS = "{baseline: {_target_: baselines.highpass.HighPass, view_reduction: median}, views: 9}"
 ABSENT = "{ckpt: nowhere, views: 9}"
 SETNET = "{ckpt: nowhere, views: 9, model: {_target_: src.models.setnet.SetNet}}"
-PROBES = "{hold: {title: held, probe: {_target_: src.bench.probes.memory.Hold, windows: [2, 4]}}, "
-PROBES += "lost: {title: lost, probe: {_target_: src.bench.probes.light_field.Lost, "
-PROBES += "counts: [1], draws: 1}}, "
-PROBES += "fast: {title: fast, probe: {_target_: src.bench.probes.sampling.Rates, rates: [1200]}}}"
+PACKAGE = "src.bench.stress_tests"
+FUNCTIONS = {
+    "retention": "recurrence.measure_contrast_retention, windows: [2, 4], limit: 90",
+    "dropout": "conditions.measure_view_dropout_loss, counts: [1], draws: 1, limit: 0.5",
+    "fast": "conditions.measure_window_rate_loss, rates_hz: [1200], limit: 1.0",
+}
+ROWS = [
+    f"{name}: {{title: {name}, test: {{_target_: {PACKAGE}.{function}}}}}"
+    for name, function in FUNCTIONS.items()
+]
+TESTS = "{" + ", ".join(ROWS) + "}"
 TINY = ["clips=1", "scene.height=64", "scene.width=64", "data.test_crop=32", "data.test_windows=20"]
-TINY += ["data.warmup=2", "processes=1", f"+probes={PROBES}"]
+TINY += ["data.unscored_windows=2", "processes=1", f"+stress_tests={TESTS}"]
 
 
 def tiny(tmp_path, *overrides: str):
-    return config("stress", tmp_path, "~probes", "~networks", *TINY, *overrides)
+    return config("stress", tmp_path, "~stress_tests", "~networks", *TINY, *overrides)
 
 
 def test_map_table_and_text_are_written(tmp_path):
     networks = f"+networks={{median: {HIGHPASS}, absent: {ABSENT}, untrained: {SETNET}}}"
     found = stress(tiny(tmp_path, networks))
-    assert found["hold"]["median"].failed
-    assert "nowhere" in found["hold"]["absent"] and "no weights" in found["hold"]["untrained"]
+    assert found["retention"]["median"].failed
+    assert (
+        "nowhere" in found["retention"]["absent"]
+        and "no weights" in found["retention"]["untrained"]
+    )
     assert all((tmp_path / f"stress.{suffix}").is_file() for suffix in ("png", "svg", "csv", "md"))
     lines = list(csv.DictReader((tmp_path / "stress.csv").read_text().splitlines()))
     assert {line["network"] for line in lines} == {"median", "absent", "untrained"}
     text = (tmp_path / "stress.md").read_text()
-    assert "held" in text and "Not run, because" in text
+    assert "retention" in text and "Not run, because" in text
 
 
 def test_a_single_view_has_no_views_to_lose(tmp_path):
     networks = "+networks={one: {baseline: {_target_: baselines.highpass.HighPass}, views: 1}}"
-    assert "centre view only" in stress(tiny(tmp_path, networks))["lost"]["one"]
+    assert "centre view only" in stress(tiny(tmp_path, networks))["dropout"]["one"]
 
 
 def test_a_checkpoint_that_is_not_there_is_named(tmp_path):

@@ -10,7 +10,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from src.app import build, door
+from src.app import build, entry_point
 from src.eval import evaluate
 from src.models import files
 from src.reconstruct import reconstruct
@@ -18,13 +18,13 @@ from src.records import results
 from src.stress import stress
 from src.train import train
 from tests.conftest import ROOT
-from tests.test_door import command, environment
+from tests.test_entry_points import command, environment
 from tests.test_train import TINY, config
 
 SWEEPS = sorted((ROOT / "sweeps").glob("*.yaml"))
 CLEAN = ("firenet_plus", "e2vid_plus", "etnet", "hypere2vid")
 SMALL = ["scene.height=64", "scene.width=64", "data.test_crop=null", "data.test_clips=1"]
-SMALL += ["data.test_windows=5", "data.warmup=1", "data.workers=0", "metrics.lpips=null"]
+SMALL += ["data.test_windows=5", "data.unscored_windows=1", "data.workers=0", "metrics.lpips=null"]
 
 
 def content(path: Path) -> dict:
@@ -55,7 +55,8 @@ def weights(tmp_path, monkeypatch):
     for name in ("lf3x3", "single256", "setnet_medium", "mambatm", *(f"clean/{n}" for n in CLEAN)):
         path = files.WEIGHTS / f"{name}.safetensors"
         path.parent.mkdir(parents=True, exist_ok=True)
-        network, spec = build.network(config("train", tmp_path, f"experiment={name}", *narrow))
+        cfg = config("train", tmp_path, f"experiment={name}", *narrow)
+        network, spec = build.build_network(cfg)
         files.save(path, network, spec, {})
 
 
@@ -72,7 +73,7 @@ def test_every_job_composes_and_the_last_runs(path, tmp_path, weights):
     tiny, work = {
         "train": ([*TINY, "logger=none"], train),
         "eval": (SMALL, evaluate),
-        "reconstruct": (["ckpt=lf3x3", "end=0.02"], reconstruct),
+        "reconstruct": (["ckpt=lf3x3", "end_s=0.02"], reconstruct),
         "stress": (["ckpt=lf3x3", "clips=1", "processes=1", "data.test_windows=60"], stress),
     }[door]
     output = {reconstruct: "video.h5", stress: "stress.csv"}.get(work, "results.json")
@@ -105,9 +106,9 @@ def test_a_failed_job_is_named_and_the_rest_stands(tmp_path):
 
 def test_a_jobs_folder_is_one_folder():
     short = "experiment-lf3x3_scene.root-../../data/photos"
-    assert door.one_folder(short) == "experiment-lf3x3_scene.root-..-..-data-photos"
-    long = [door.one_folder("x" * 300 + tail) for tail in "ab"]
-    assert len(set(long)) == 2 and all(len(name) <= door.LONGEST for name in long)
+    assert entry_point.one_folder(short) == "experiment-lf3x3_scene.root-..-..-data-photos"
+    long = [entry_point.one_folder("x" * 300 + tail) for tail in "ab"]
+    assert len(set(long)) == 2 and all(len(name) <= entry_point.MAX_FOLDER_NAME for name in long)
 
 
 CONFIG = "task: {task}\nckpt: {ckpt}\nlr: {lr}\npaths:\n  run: {run}\nlogger:\n  dir: {run}/logs\n"
@@ -116,19 +117,19 @@ CONFIG = "task: {task}\nckpt: {ckpt}\nlr: {lr}\npaths:\n  run: {run}\nlogger:\n 
 def test_a_digest_knows_numbers_but_no_folders():
     plain = {"task": "train", "ckpt": "null", "lr": 1, "run": "/a"}
     digests = [
-        results.digest(CONFIG.format(**plain | change))
+        results.hash_config(CONFIG.format(**plain | change))
         for change in ({}, {"run": "/b c"}, {"ckpt": "x.ckpt"}, {"lr": 2})
     ]
     assert digests[0] == digests[1] == digests[2] != digests[3]
     evaluated = [CONFIG.format(**plain | {"task": "eval", "ckpt": ckpt}) for ckpt in "ab"]
-    assert results.digest(evaluated[0]) != results.digest(evaluated[1])
+    assert results.hash_config(evaluated[0]) != results.hash_config(evaluated[1])
 
 
 def test_results_of_another_configuration_are_not_overwritten(tmp_path):
     config = CONFIG.format(task="train", ckpt="null", lr=1, run=tmp_path)
-    assert not results.standing(tmp_path, config)
-    record = {"config_sha256": results.digest(config)}
+    assert not results.has_results(tmp_path, config)
+    record = {"config_sha256": results.hash_config(config)}
     (tmp_path / "results.json").write_text(json.dumps(record))
-    assert results.standing(tmp_path, config)
+    assert results.has_results(tmp_path, config)
     with pytest.raises(ValueError, match="paths.out"):
-        results.standing(tmp_path, config.replace("lr: 1", "lr: 2"))
+        results.has_results(tmp_path, config.replace("lr: 1", "lr: 2"))

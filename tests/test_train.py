@@ -44,7 +44,7 @@ def test_every_experiment_takes_a_step(experiment, tmp_path):
 
 def test_weights_and_biases_holds_config_pictures_and_metrics(tmp_path):
     train(config("train", tmp_path, *TINY, "logger=wandb"))
-    tracking.close()
+    tracking.finish_wandb()
     (run,) = (tmp_path / "wandb").glob("offline-run-*")
     words, late = (b"test/psnr_aligned", b"train/loss", b"epoch_clips"), time.monotonic() + 60
     while not all(word in next(run.glob("*.wandb")).read_bytes() for word in words):
@@ -66,7 +66,7 @@ def test_every_debug_preset_takes_a_step(debug, tmp_path):
     ]
     small += [
         "data.test_windows=3",
-        "data.warmup=1",
+        "data.unscored_windows=1",
         "data.val_clips=1",
         "width=4",
         "trainer.log_every_n_steps=1",
@@ -75,7 +75,10 @@ def test_every_debug_preset_takes_a_step(debug, tmp_path):
     assert (tmp_path / "results.json").is_file()
 
 
-@pytest.mark.parametrize("group", ["budget", "logger", "trainer", "optics", "turbulence", "sensor"])
+GROUPS = ["budget", "logger", "loss", "trainer", "optics", "turbulence", "sensor"]
+
+
+@pytest.mark.parametrize("group", GROUPS)
 def test_every_choice_composes(group, tmp_path):
     for choice in names(group):
         cfg = config("train", tmp_path, f"{group}={choice}")
@@ -110,7 +113,12 @@ def test_eval_equals_the_test_of_training(tmp_path):
     train(config("train", tmp_path / "train", *TINY))
     ckpt = tmp_path / "train" / "checkpoints" / "last.ckpt"
     same = [f"ckpt={ckpt}", "scene.height=64", "scene.width=64", "data.test_clips=1"]
-    same += ["data.test_windows=4", "data.warmup=1", "data.workers=0", "metrics.lpips=null"]
+    same += [
+        "data.test_windows=4",
+        "data.unscored_windows=1",
+        "data.workers=0",
+        "metrics.lpips=null",
+    ]
     evaluate(config("eval", tmp_path / "eval", *same))
     first, second = (
         json.loads((tmp_path / door / "results.json").read_text())["test"]
@@ -125,10 +133,10 @@ def test_eval_equals_the_test_of_training(tmp_path):
         (["scene.root=/nowhere"], "scene.root"),
         (["data.crop=100"], "data.crop"),
         (["data.batch_size=0"], "data.batch_size"),
-        (["data.warmup=9", "data.test_windows=10"], "data.warmup"),
+        (["data.unscored_windows=9", "data.test_windows=10"], "data.unscored_windows"),
         (["optics.views=7"], "optics.views"),
         (["sensor.threshold=-1"], "sensor.threshold"),
-        (["augment.pause=2"], "augment.pause"),
+        (["augment.pause_probability_when_running=2"], "augment.pause_probability_when_running"),
         (["data.simulate_on=moon"], "data.simulate_on"),
         (["paths.out=/dev/null/x"], "paths.out"),
         (["scene._target_=os.system"], "_target_"),

@@ -8,7 +8,7 @@
 One process checks the device, fills a pre-simulated turbulence cache in its memory and trains the
 networks of PLAN, a file as conf/lease/default.yaml, in turn, each by wall time with the rate
 brought to its end; it may be killed at any time, and what is in `out` is usable.  `join` makes of
-that what `ckpt=` of src.train and `start` of a plan go on from.  `folder` gathers what a lease
+that what `ckpt=` of src.train and `start` of a plan continue from.  `folder` gathers what a lease
 needs, 60 MiB at most.  Minutes count from the start of the process; exit code 0: something was
 trained, 1: nothing was, 2: the plan does not fit or is none.
 """
@@ -16,29 +16,17 @@ trained, 1: nothing was, 2: the plan does not fit or is none.
 import signal
 import sys
 import time
+from pathlib import Path
 
-BEGAN = time.monotonic()  # before the imports, which take seconds
-
-from importlib.util import find_spec  # noqa: E402
-from pathlib import Path  # noqa: E402
-
-NEEDED = {  # by the names they are imported by
-    "torch": "torch", "lightning": "lightning", "hydra": "hydra-core", "omegaconf": "omegaconf",
-    "antlr4": "antlr4-python3-runtime", "torchmetrics": "torchmetrics", "numba": "numba",
-    "cv2": "opencv-python-headless", "jaxtyping": "jaxtyping", "safetensors": "safetensors",
-    "scipy": "scipy", "skimage": "scikit-image", "rich": "rich", "numpy": "numpy", "yaml": "pyyaml",
-}  # fmt: skip
-OUT, FOLDER_MIB = Path("out/lease"), 60
+START = time.monotonic()  # before the imports below, which take seconds
+DEFAULT_OUT, MAX_FOLDER_MIB = "out/lease", 60
+OPTIONS = {"join": (2, {"to"}), "folder": (3, {"scenes", "lpips"}), "check": (2, {"only"})}
 
 
 def main() -> None:
-    """Read the command line."""
-    words, options, minutes = _parsed(sys.argv[1:])
-    if missing := [name for name in NEEDED if find_spec(name) is None]:
-        install = " ".join(NEEDED[name] for name in missing)
-        sys.exit(f"error: missing packages: {', '.join(missing)}; pip install {install}")
+    """Turn errors into exit codes."""
     try:
-        sys.exit(_done(words, options, minutes))
+        sys.exit(run_command(*parse(sys.argv[1:])))
     except ValueError as error:
         print("error: " + " ".join(str(error).split()), file=sys.stderr)
         sys.exit(2)
@@ -49,55 +37,48 @@ def main() -> None:
         sys.exit(128 + signal.SIGINT)
 
 
-def _done(words: list[str], options: dict[str, str], minutes: float) -> int:
-    """Do what the words ask for; return the exit code."""
-    from scripts.lease import export, folder  # after the look for packages
-    from scripts.lease import plan as plans
-    from scripts.lease.fit import fit
+def run_command(words: list[str], options: dict[str, str], minutes: float) -> int:
+    """Do what the command line says; return the exit code."""
+    from scripts.lease import export, folder
+    from scripts.lease.plan import load_plan
+    from scripts.lease.run import run_lease
+    from scripts.lease.selection import select_networks, size_network
 
     if words[0] == "join":
-        made, lost = export.join(Path(words[1]), Path(options.get("to", words[1])))
-        for line in [*map(folder.going_on, made), *(f"lost: {line}" for line in lost)]:
-            print(line)
+        made, lost = export.join_exports(Path(words[1]), Path(options.get("to", words[1])))
+        lines = [*map(folder.describe_export, made), *(f"lost: {line}" for line in lost)]
+        print("\n".join(lines))
         return int(bool(lost))
     if words[0] == "folder":
-        given = {key: Path(options[key]) for key in ("scenes", "lpips") if key in options}
-        print(folder.gather(Path(words[1]), Path(words[2]), given, FOLDER_MIB))
+        given = {key: Path(path) for key, path in options.items()}
+        print(folder.gather_files(Path(words[1]), Path(words[2]), given, MAX_FOLDER_MIB))
         return 0
-    plan = plans.load(Path(words[-1]))
+    plan = load_plan(Path(words[-1]))
     if "only" in options:
-        plan = plan.only(options["only"].split(","))
-    chosen = fit(plan, minutes)
+        plan = plan.select(options["only"].split(","))
+    networks = [size_network(plan, network) for network in plan.networks]
+    selection = select_networks(plan, networks, minutes)
     if words[0] == "check":
-        print(folder.described(plan, chosen, minutes))
+        print(folder.describe_selection(plan, selection, minutes))
         return 0
-    from scripts.lease.run import run
-
-    return run(plan, chosen, minutes, BEGAN, Path(options.get("out", OUT)))
+    return run_lease(plan, selection, minutes, START, Path(options.get("out", DEFAULT_OUT)))
 
 
-def _parsed(given: list[str]) -> tuple[list[str], dict[str, str], float]:
-    """Return the words, the options key=value and the minutes."""
+def parse(given: list[str]) -> tuple[list[str], dict[str, str], float]:
+    """Return the words, the options key=value and the minutes; exits where they make no command."""
     given, minutes = list(given), 0.0
     if "--minutes" in given[:-1]:
         place = given.index("--minutes")
-        minutes = _number(given[place + 1])
+        text = given[place + 1]
+        minutes = float(text) if text.replace(".", "", 1).isdecimal() else 0.0
         del given[place : place + 2]
     words = [word for word in given if "=" not in word]
     options = dict(word.split("=", 1) for word in given if "=" in word)
-    known = {"join": (2, {"to"}), "folder": (3, {"scenes", "lpips"}), "check": (2, {"only"})}
-    count, keys = known.get(words[0] if words else "", (1, {"only", "out"}))
-    timed = not words or words[0] not in ("join", "folder")
-    if len(words) != count or set(options) - keys or timed != (minutes > 0):
+    count, keys = OPTIONS.get(words[0] if words else "", (1, {"only", "out"}))
+    is_timed = not words or words[0] not in ("join", "folder")
+    if len(words) != count or set(options) - keys or is_timed != (minutes > 0):
         sys.exit(__doc__)
     return words, options, minutes
-
-
-def _number(word: str) -> float:
-    try:
-        return float(word)
-    except ValueError:
-        return 0.0
 
 
 if __name__ == "__main__":

@@ -4,73 +4,51 @@ import os
 import time
 from collections.abc import Callable, Sequence
 
-from scripts.lease.fit import Sized
 from scripts.lease.plan import Fill
-from scripts.lease.probe import EMPTY_GIB, GIB, ROOM, Device, Trial, free_memory
-from src.training.cache_fill import fill
-from src.training.device_cache import DeviceCache
+from scripts.lease.probe import GIB, MEMORY_FACTOR, UNUSED_GIB, Device, Trial, free_memory
+from scripts.parallel_fill import fill
+from src.training.clip_cache import DeviceClipCache
 
-CORES = 15  # processes that draw scenes, at most
-
-
-def check_memory(networks: Sequence[Sized], least: int, found: Device) -> None:
-    """Raise ValueError where the memory of the device does not even hold `least` clips."""
-    for one in networks:
-        size = least * sum(cache.bytes for cache in one.caches[:1])
-        if size > found.memory:
-            raise ValueError(
-                f"fill: least must be smaller: {least} clips for {one.name} take "
-                f"{size / GIB:.1f} GiB, {found.name} has {found.memory / GIB:.1f}"
-            )
+MAX_WORKERS = 15
 
 
-def fill_all(
-    caches: Sequence[DeviceCache], wanted: Fill, found: Device, trial: Trial, say: Callable
-) -> list[dict]:
-    """Fill `caches`, each with its share of `wanted.minutes` and of the memory that a training as
-    in `trial` leaves; samples are then of the clips that are there.  Returns clips and clips a
-    second of each.
+def fill_caches(
+    caches: Sequence[DeviceClipCache], plan: Fill, device: Device, trial: Trial, log: Callable
+) -> list[dict[str, float]]:
+    """Fill `caches`, each with its share of `plan.minutes` and of the memory that a training as in
+    `trial` leaves; samples are then of the clips that are there.  Returns clips and clips a second
+    of each.
 
     Raises ValueError where one stays empty.
     """
-    room = free = free_memory(found.kind)
-    room -= ROOM * trial.memory + EMPTY_GIB * GIB
-    room = room if trial.memory else free / 2
-    sizes, facts = [cache.clips * cache.bytes for cache in caches], []
+    free = free_memory(device.kind)
+    room = free - MEMORY_FACTOR * trial.memory - UNUSED_GIB * GIB if trial.memory else free / 2
+    sizes, reports = [cache.clips * cache.clip_bytes for cache in caches], []
     for cache, size in zip(caches, sizes, strict=True):
         share = size / sum(sizes)
-        most = min(cache.clips, int(share * room) // cache.bytes)
+        most = min(cache.clips, int(share * room) // cache.clip_bytes)
         if most < 1:
-            clip = f"{cache.bytes / 2**20:.1f} MiB"
+            clip = f"{cache.clip_bytes / 2**20:.1f} MiB"
             raise ValueError(f"fill: a clip of {clip} does not fit {free / GIB:.1f} GiB")
         if most < cache.clips:
-            say(f"the memory holds {most} of {cache.clips} clips")
-        cache.limit(most)
-        until = time.monotonic() + 60 * share * wanted.minutes
-        facts.append(_fill_one(cache, wanted, found.kind, until, say))
-    return facts
+            log(f"the memory holds {most} of {cache.clips} clips")
+        cache.clips = most
+        until = time.monotonic() + 60 * share * plan.minutes
+        reports.append(_fill_cache(cache, plan, device.kind, until, log))
+    return reports
 
 
-def _fill_one(
-    cache: DeviceCache, wanted: Fill, device: str, until: float, say: Callable
+def _fill_cache(
+    cache: DeviceClipCache, plan: Fill, device: str, until: float, log: Callable
 ) -> dict[str, float]:
-    workers = wanted.workers
+    workers = plan.workers
     if workers is None:
-        workers = max(1, min(CORES, (os.cpu_count() or 1) - 1))
-    clips, start = 0, time.monotonic()
-    if workers:
-        every = range(cache.clips)
-        report = fill(cache.source, every, cache.keep, device=device, workers=workers, until=until)
-        clips = report.clips
-        say(f"cache: {report}")
-    else:
-        while clips < cache.clips and time.monotonic() < until:
-            cache.clip(clips)
-            clips += 1
-    if not clips:
-        raise ValueError(f"fill: minutes must be > {wanted.minutes:g}: no clip was made")
-    cache.limit(clips)
-    speed = clips / (time.monotonic() - start)
-    few = "" if clips >= wanted.least else f", less than fill: least = {wanted.least}"
-    say(f"cache: {clips} clips, {speed:.1f} a second{few}")
-    return {"clips": clips, "clips_per_second": speed}
+        workers = max(1, min(MAX_WORKERS, (os.cpu_count() or 1) - 1))
+    clips = range(cache.clips)
+    report = fill(cache.source, clips, cache.store, device=device, workers=workers, until=until)
+    if not report.clips:
+        raise ValueError(f"fill: minutes must be > {plan.minutes:g}: no clip was made")
+    cache.clips = report.clips
+    few = "" if report.clips >= plan.least else f"; less than fill: least = {plan.least}"
+    log(f"cache: {report}{few}")
+    return {"clips": report.clips, "clips_per_second": report.clips_per_second}

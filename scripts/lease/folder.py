@@ -1,4 +1,4 @@
-"""Before and after a lease: all that it needs in one folder, and what its exports go on with."""
+"""Before and after a lease: all that it needs in one folder, and how to continue its exports."""
 
 import shutil
 from collections.abc import Mapping
@@ -6,78 +6,64 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from scripts.lease.fit import Fit, allotted, overhead
-from scripts.lease.plan import MIB, Plan, load
-from src.metrics.lpips import CACHE
+from scripts.lease.plan import MIB, Plan, load_plan
+from scripts.lease.selection import Selection, allot_seconds, overhead_s
+from src.metrics.lpips import BACKBONE_FOLDER
 from src.models import files
-from src.records.atomic import written
 
 
-def gather(folder: Path, plan: Path, given: Mapping[str, Path], most_mib: float) -> str:
-    """Copy `plan` and all files it names into `folder`, with `given` ones in their place; returns
-    a line that says what is there.
+def gather_files(folder: Path, plan: Path, given: Mapping[str, Path], max_mib: float) -> str:
+    """Copy `plan` and all files it names into `folder`, with `given` ones in their place; return a
+    line that says what is there.
 
-    Raises ValueError where a file is missing or damaged, or they are more than `most_mib` together.
+    Raises ValueError where a file is missing or damaged, or they are more than `max_mib` together.
     """
     content = OmegaConf.load(plan)
-    taken = {}
+    names: dict[Path, str] = {}
     for key in ("scenes", "lpips"):
-        named = content.get(key)
-        if named is None and key not in given:
+        if content.get(key) is None and key not in given:
             continue
-        source = given.get(key) or plan.parent / named
+        source = given.get(key) or plan.parent / content[key]
         if key == "lpips" and not source.is_file():
-            source = CACHE / "alex.safetensors"
-        taken[source] = content[key] = source.name
+            source = BACKBONE_FOLDER / "alex.safetensors"
+        names[source] = content[key] = source.name
     for network in content.networks:
         if network.get("start"):
             source = plan.parent / network.start
-            taken[source] = network.start = f"start-{network.name}.safetensors"
-    if missing := [str(source) for source in taken if not source.is_file()]:
-        raise ValueError(f"{plan} names files that are not there: {', '.join(missing)}")
-    size = sum(source.stat().st_size for source in taken)
-    if size > most_mib * MIB:
-        each = ", ".join(f"{source} {source.stat().st_size / MIB:.1f}" for source in taken)
-        raise ValueError(f"folder must have at most {most_mib:g} MiB, got {size / MIB:.1f}: {each}")
+            names[source] = network.start = f"start-{network.name}.safetensors"
+    if missing := [str(source) for source in names if not source.is_file()]:
+        raise ValueError(f"{plan} names missing files: {', '.join(missing)}")
+    size = sum(source.stat().st_size for source in names) / MIB
+    if size > max_mib:
+        each = ", ".join(f"{source} {source.stat().st_size / MIB:.1f}" for source in names)
+        raise ValueError(f"folder must have at most {max_mib:g} MiB, got {size:.1f}: {each}")
     folder.mkdir(parents=True, exist_ok=True)
-    for source, name in taken.items():
-        with written(folder / name) as partial:
-            shutil.copyfile(source, partial)
-    with written(folder / "plan.yaml") as partial:
-        partial.write_text(OmegaConf.to_yaml(content))
-    load(folder / "plan.yaml")
-    names = ", ".join(["plan.yaml", *taken.values()])
-    return f"{folder}: {names}; {size / MIB:.1f} MiB"
+    for source, name in names.items():
+        shutil.copyfile(source, folder / name)
+    OmegaConf.save(content, folder / "plan.yaml")
+    load_plan(folder / "plan.yaml")
+    return f"{folder}: {', '.join(['plan.yaml', *names.values()])}; {size:.1f} MiB"
 
 
-def described(plan: Plan, fit: Fit, minutes: float) -> str:
+def describe_selection(plan: Plan, selection: Selection, minutes: float) -> str:
     """Return what a lease of so many `minutes` does, a line for each network."""
-    fixed = overhead(plan, fit.networks)
-    seconds = allotted([one.network for one in fit.networks], 60 * minutes - fixed)
+    fixed = overhead_s(plan, selection.networks)
+    networks = [one.network for one in selection.networks]
     lines = [f"{fixed / 60:.2f} of {minutes:g} minutes are check, cache, validation and margin"]
-    for one, own in zip(fit.networks, seconds, strict=True):
-        beside = [
-            "its last export stays until the next is whole" * (one.name in fit.doubled),
-            "with its checkpoint" * (one.name in fit.checkpoints),
-        ]
-        told = ", ".join(text for text in beside if text) or "weights only, replaced at once"
+    seconds = allot_seconds(networks, 60 * minutes - fixed)
+    for one, own in zip(selection.networks, seconds, strict=True):
         lines.append(
             f"{one.name}: {own / 60:.2f} min, {one.params:,} parameters, "
-            f"{one.weights / MIB:.2f} MiB in {one.parts} files; {told}"
+            f"{one.weights_bytes / MIB:.2f} MiB in {one.parts} files"
         )
-    lines += [f"{name} is left out: {reason}" for name, reason in fit.left_out.items()]
-    return "\n".join(lines)
+    return "\n".join([*lines, *(f"{k} is left out: {v}" for k, v in selection.left_out.items())])
 
 
-def going_on(path: Path) -> str:
-    """Return a line with what a training goes on from a joined file by."""
-    if not files.exported(path):
-        return (
-            f"{path}: a checkpoint, with the optimiser's moments; ckpt={path} goes on from it too"
-        )
-    card = files.card(path)
-    words = [f"experiment={card['experiment']}", *card["overrides"]]
+def describe_export(path: Path) -> str:
+    """Return a line with the command that continues from a joined file."""
+    card = files.read_card(path)
+    overrides = " ".join([f"experiment={card['experiment']}", *card["overrides"]])
     return (
-        f"{path}: {card['steps']} steps, {card['windows']} windows, {card['hours']:.4f} h; go on: "
-        f"python -m src.train {' '.join(words)} ckpt={path} hours=<more>"
+        f"{path}: {card['steps']} steps, {card['windows']} windows, {card['hours']:.4f} h; "
+        f"continue: python -m src.train {overrides} ckpt={path} train_hours=<more>"
     )

@@ -1,72 +1,68 @@
-"""The plan of a time-limited training, and whether it fits its minutes and megabytes."""
+"""The plan of a time-limited training: a file as conf/lease/default.yaml."""
 
 import dataclasses
-import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from scripts.pack_scenes import verify_pack
 from src.models import files
-from src.sim.scenes import photo_pack
-from src.training.handover import reached
+from src.training.learning_curve import read_training_progress
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 MIB = 2**20
-LEAST_RATE = 0.02  # over the optimiser's, at which a training that goes on begins
 
 
-@dataclass(frozen=True)
+@dataclass
 class Network:
     """One training: `minutes` of it at least, and of the minutes that are left over in proportion
-    to `share`; `optional`: only where it fits.  `start`: weights to go on from, with their hours,
-    `restart` the cosine of the rate at its beginning all the same.
+    to `share`; `optional`: only where it fits.  `start`: weights to continue from, with their
+    hours; the cosine of the learning rate begins anew.
     """
 
-    name: str
+    name: str = MISSING
     experiment: str = ""
     minutes: float = 0.0
     share: float = 0.0
     optional: bool = False
-    overrides: Sequence[str] = ()
+    overrides: list[str] = field(default_factory=list)
     start: str | None = None
-    restart: bool = False
 
-    def __post_init__(self):
-        if not re.fullmatch(r"[A-Za-z0-9_-]+", str(self.name)):  # it names files
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[A-Za-z0-9_-]+", self.name):  # it names files
             raise ValueError(f"networks: name must be letters, digits, _ and -, got {self.name}")
         for key in ("minutes", "share"):
-            _check(f"networks: {key} of {self.name}", getattr(self, key), least=0)
+            _check(getattr(self, key) >= 0, f"networks: {key} of {self.name}", ">= 0", self)
         if not self.minutes and (self.optional or not self.share):
             raise ValueError(f"networks: minutes of {self.name} must be > 0, got {self.minutes}")
 
 
-@dataclass(frozen=True)
+@dataclass
 class Fill:
     """How long each pre-simulated cache is filled, the clips it is filled with at most, those with
-    which training is worth while, and the processes that draw scenes beside (None: as many as
-    there are cores but one, 15 at most).
+    which training is worth while, and the processes that draw scenes (None: as many as there are
+    cores but one, 15 at most; 0: none beside this one).
     """
 
-    minutes: float
-    clips: int
+    minutes: float = MISSING
+    clips: int = MISSING
     least: int = 16
     workers: int | None = None
 
-    def __post_init__(self):
-        _check("fill: minutes", self.minutes, above=0)
-        _check("fill: least", self.least, least=1, kind=int)
-        _check("fill: clips", self.clips, least=self.least, kind=int)
-        if self.workers is not None:
-            _check("fill: workers", self.workers, least=0, kind=int)
+    def __post_init__(self) -> None:
+        _check(self.minutes > 0, "fill: minutes", "> 0", self)
+        _check(self.least >= 1, "fill: least", ">= 1", self)
+        _check(self.clips >= self.least, "fill: clips", f">= {self.least}", self)
+        _check(self.workers is None or self.workers >= 0, "fill: workers", ">= 0", self)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Validate:
     """Validation clips, how often they are scored after the start, and the seconds of each
     network that this may take."""
@@ -75,21 +71,20 @@ class Validate:
     times: int = 4
     seconds: float = 20.0
 
-    def __post_init__(self):
-        _check("validate: clips", self.clips, least=1, kind=int)
-        _check("validate: times", self.times, least=1, kind=int)
-        _check("validate: seconds", self.seconds, above=0)
+    def __post_init__(self) -> None:
+        for key in ("clips", "times", "seconds"):
+            _check(getattr(self, key) > 0, f"validate: {key}", "> 0", self)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Plan:
     """What conf/lease/default.yaml explains; paths are relative to `folder`, that of the file."""
 
-    folder: Path
-    networks: Sequence[Network]
-    fill: Fill
+    networks: list[Network] = MISSING
+    fill: Fill = MISSING
+    folder: Path = Path()
     validate: Validate = field(default_factory=Validate)
-    common: Sequence[str] = ()
+    common: list[str] = field(default_factory=list)
     scenes: str | None = None
     lpips: str | None = None
     check_s: float = 60.0
@@ -99,10 +94,10 @@ class Plan:
     file_mib: float = 16.0
     files: int = 8
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for key in ("check_s", "export_s", "margin_s", "budget_mib", "file_mib"):
-            _check(key, getattr(self, key), above=0)
-        _check("files", self.files, least=3, kind=int)
+            _check(getattr(self, key) > 0, key, "> 0", self)
+        _check(self.files >= 3, "files", ">= 3", self)
         names = [network.name for network in self.networks]
         if len(set(names)) < len(names) or not names:
             raise ValueError(f"networks must have names of their own, got {', '.join(names)}")
@@ -111,15 +106,15 @@ class Plan:
         """Return the file of the plan's folder that is called `name`."""
         return (self.folder / name).resolve()
 
-    def only(self, names: Sequence[str]) -> "Plan":
+    def select(self, names: Sequence[str]) -> "Plan":
         """Return the plan with these networks; ValueError for a name that is none of them."""
         known = [network.name for network in self.networks]
         if unknown := [name for name in names if name not in known]:
             raise ValueError(f"only must be of {', '.join(known)}, got {', '.join(unknown)}")
-        chosen = [network for network in self.networks if network.name in names]
-        return dataclasses.replace(self, networks=chosen)
+        networks = [network for network in self.networks if network.name in names]
+        return dataclasses.replace(self, networks=networks)
 
-    def given(self, network: Network) -> list[str]:
+    def overrides(self, network: Network) -> list[str]:
         """Return the overrides of src.train that make the config of `network`."""
         experiment = network.experiment or network.name
         return [f"experiment={experiment}", *self.common, *network.overrides]
@@ -130,97 +125,51 @@ class Plan:
         Raises the exceptions of Hydra and OmegaConf where it is none.
         """
         with initialize_config_dir(str(CONF), version_base=None):
-            cfg = compose("train", self.given(network))
+            cfg = compose("train", self.overrides(network))
         cfg.data.val_clips = self.validate.clips
-        if cfg.data.bank is not None:
-            cfg.data.bank = self.fill.clips
+        if cfg.data.cache_clips is not None:
+            cfg.data.cache_clips = self.fill.clips
         if self.scenes is not None:
             cfg.scene.root = str(self.path(self.scenes))
         if self.lpips is not None:
-            for part in (cfg.loss, cfg.metrics.lpips):
-                if part is not None and "LPIPS" in part._target_:
-                    OmegaConf.update(part, "backbone", str(self.path(self.lpips)), force_add=True)
+            for node in (cfg.loss.get("lpips"), cfg.metrics.lpips):
+                if node is not None:
+                    OmegaConf.update(node, "backbone", str(self.path(self.lpips)), force_add=True)
         return cfg
 
-    def hours_before(self, network: Network) -> float:
-        """Return the hours that the weights it goes on from have had."""
-        return reached(self.path(network.start))["hours"] if network.start else 0.0
+    def earlier_hours(self, network: Network) -> float:
+        """Return the hours that the weights it continues from were trained."""
+        return read_training_progress(self.path(network.start))["hours"] if network.start else 0.0
 
 
-def load(path: Path) -> Plan:
+def load_plan(path: Path) -> Plan:
     """Return the plan of a YAML file.
 
-    Raises ValueError naming the key for what is no plan, or names a file that is not there or
+    Raises ValueError naming the key for what is no plan, or names a file that is missing or
     damaged.
     """
     try:
-        content = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
-    except (OSError, OmegaConfBaseException, ValueError) as error:
+        content = OmegaConf.merge(OmegaConf.structured(Plan), OmegaConf.load(path))
+        content.folder = path.resolve().parent
+        plan = OmegaConf.to_object(content)
+    except (OSError, OmegaConfBaseException, TypeError) as error:
         raise ValueError(f"{path} must be as conf/lease/default.yaml is: {error}") from error
-    if not isinstance(content, Mapping) or not isinstance(content.get("networks"), list):
-        raise ValueError(f"{path} must be as conf/lease/default.yaml is: networks are missing")
-    networks = [_made(Network, row, "networks: ") for row in content.pop("networks")]
-    parts = {"networks": networks, "folder": path.resolve().parent}
-    for name, kind in (("fill", Fill), ("validate", Validate)):
-        if name in content:
-            parts[name] = _made(kind, content.pop(name), f"{name}: ")
-    plan = _made(Plan, content | parts)
+    assert isinstance(plan, Plan)
     for key, name in (("scenes", plan.scenes), ("lpips", plan.lpips)):
         if name is not None and not plan.path(name).exists():
             raise ValueError(f"{key} must be a file, got {name}, which is not in {plan.folder}")
     if plan.scenes is not None and plan.path(plan.scenes).is_file():
-        photo_pack.check(plan.path(plan.scenes))
-    for network in networks:
+        verify_pack(plan.path(plan.scenes))
+    for network in plan.networks:
         if network.start is not None:
-            _check_start(plan, network)
+            start, name = plan.path(network.start), network.name
+            if not files.is_exported(start) or not start.is_file():
+                raise ValueError(f"networks: start of {name} must be exported weights, got {start}")
+            read_training_progress(start)
     return plan
 
 
-def _check_start(plan: Plan, network: Network) -> None:
-    path = plan.path(network.start)
-    if not files.exported(path) or not path.is_file():
-        raise ValueError(f"networks: start of {network.name} must be exported weights, got {path}")
-    hours = plan.hours_before(network)
-    rate = (1 + math.cos(math.pi * hours / (hours + network.minutes / 60 or 1))) / 2
-    if not network.restart and rate < LEAST_RATE:
-        raise ValueError(
-            f"networks: restart of {network.name} must be true: after {hours:.2f} h a cosine of "
-            f"{network.minutes:g} minutes more begins at {rate:.2%} of the rate"
-        )
-
-
-def _made(kind: type, content: Any, where: str = "") -> Any:
-    """Return the dataclass `kind` of plain values; ValueError naming unknown and missing keys."""
-    fields = {each.name: each for each in dataclasses.fields(kind)}
-    if not isinstance(content, Mapping):
-        raise ValueError(f"{where}must be keys and values, got {content}")
-    unknown = [str(key) for key in content if key not in fields]
-    needed = [
-        name
-        for name, each in fields.items()
-        if each.default is dataclasses.MISSING and each.default_factory is dataclasses.MISSING
-    ]
-    missing = [name for name in needed if name not in content]
-    if unknown or missing:
-        known = ", ".join(name for name in fields if name != "folder")
-        wrong = [f"unknown {', '.join(unknown)}"] * bool(unknown)
-        wrong += [f"missing {', '.join(missing)}"] * bool(missing)
-        raise ValueError(f"{where}keys must be of {known}; {'; '.join(wrong)}")
-    return kind(**content)
-
-
-def _check(
-    key: str,
-    value: Any,
-    *,
-    least: float | None = None,
-    above: float | None = None,
-    kind: Any = None,
-) -> None:
-    wanted = kind or (int, float)
-    right = isinstance(value, wanted) and not isinstance(value, bool)
-    right = right and (least is None or value >= least) and (above is None or value > above)
-    if not right:
-        what = "a whole number" if kind is int else "a number"
-        limit = f">= {least:g}" if above is None else f"> {above:g}"
-        raise ValueError(f"{key} must be {what} {limit}, got {value}")
+def _check(is_valid: bool, key: str, allowed: str, values: Any) -> None:
+    if not is_valid:
+        got = getattr(values, key.split()[1 if ":" in key else 0])
+        raise ValueError(f"{key} must be {allowed}, got {got}")

@@ -9,20 +9,27 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
-from src.figures import calibration_pictures, event_rate, measured_air
-from src.recordings import event_rates, lookup, stream
-from src.recordings.calibration import air_meter, alignment, contrast_threshold, dots, statistics
+from src.figures import calibration_figures
+from src.models.network import EventToVideoNetwork
+from src.recordings import event_windows, reconstruction, sensor_lookup
+from src.recordings.calibration import (
+    contrast_threshold,
+    dot_statistics,
+    gaussian_dots,
+    turbulence_meter,
+    view_alignment,
+)
 from src.recordings.calibration.boards import Target
 from src.recordings.files import formats, sources
-from src.recordings.files.measured import SIDE
-from src.recordings.views import Views, load
+from src.recordings.files.turbulence_file import SIDE
+from src.recordings.views import Views, load_views, views_or_whole_sensor
 from src.records import results
-from src.sim.sensor import EventSensor
+from src.sim.sensor.sensor import Sensor
 
 
-def align_views(
+def calibrate_views(
     recording: str,
     folder: Path,
     target: Target,
@@ -30,53 +37,53 @@ def align_views(
     resolution: Sequence[int],
     sensor_size: Sequence[int] | None = None,
     mirrors: bool = True,
-    margin: float = 0.04,
-    threshold_px: float = 1.5,
     corners: str | None = None,
 ) -> Views:
     """Find the views; write `views.yaml` and `views.png`.
 
     `corners`: a file of corners given by hand, instead of the target.  Of a calibration that fails,
-    with the ValueError of `alignment.align`, `found.png` remains.
+    with the ValueError of `view_alignment.fit_homographies`, `found.png` remains.
     """
-    picture = alignment.picture_of(sources.sensor_picture(recording, sensor_size))
+    picture = view_alignment.repair_picture(sources.read_sensor_picture(recording, sensor_size))
     sizes = {"sensor": picture.shape, "model": tuple(resolution)}
     if corners:
-        geometry = alignment.by_hand(alignment.read_corners(corners), **sizes)
-        calibration_pictures.views_by_hand(picture, geometry, folder / "views.png")
+        geometry = view_alignment.views_from_corners(view_alignment.read_corners(corners), **sizes)
+        calibration_figures.draw_views(picture, geometry, folder / "views.png")
     else:
-        seen = alignment.find(picture, target, mirrors)
-        calibration_pictures.views_found(picture, seen, folder / "found.png")
-        aligned = alignment.align(seen, margin=margin, threshold_px=threshold_px, **sizes)
-        calibration_pictures.views_aligned(picture, aligned, folder / "views.png")
+        seen = view_alignment.find_target(picture, target, mirrors)
+        calibration_figures.draw_found_target(picture, seen, folder / "found.png")
+        aligned = view_alignment.fit_homographies(seen, **sizes)
+        calibration_figures.draw_alignment(picture, aligned, folder / "views.png")
         geometry = aligned.views
     geometry.save(folder / "views.yaml")
     return geometry
 
 
-def find_threshold(
+def calibrate_contrast_threshold(
     recording: str,
     folder: Path,
     clips: Sequence[Float[Tensor, "views frames h w"]],
     fps: float,
-    sensor: EventSensor,
+    sensor: Sensor,
     *,
     views: str | None = None,
     sensor_size: Sequence[int] | None = None,
-) -> contrast_threshold.Estimate:
+) -> contrast_threshold.ThresholdEstimate:
     """Match the recording's event rate with that of `sensor` looking at `clips`; write
     `threshold.csv` and `threshold.png`."""
     size = sources.sensor_size(recording, sensor_size)
-    there = load(views, size) if views else Views.single(size, size)
-    events = formats.open_events(recording, size[::-1])
-    measured = event_rates.measure(events, lookup.build(there).view)
-    estimate = contrast_threshold.estimate(measured, clips, fps, sensor)
-    contrast_threshold.write_csv(estimate, measured, folder / "threshold.csv")
-    event_rate.threshold(estimate, folder / "threshold.png")
+    there = views_or_whole_sensor(views, size)
+    events = formats.open_recording(recording, size[::-1])
+    measured = contrast_threshold.measure_event_rates(
+        events, sensor_lookup.build_lookup(there).view
+    )
+    estimate = contrast_threshold.estimate_contrast_threshold(measured, clips, fps, sensor)
+    contrast_threshold.write_threshold_csv(estimate, measured, folder / "threshold.csv")
+    calibration_figures.draw_event_rates(estimate, folder / "threshold.png")
     return estimate
 
 
-def characterise(
+def measure_dot_grid(
     recording: str,
     still: str,
     folder: Path,
@@ -85,59 +92,64 @@ def characterise(
     rows: int = 3,
     cols: int = 3,
     dark: bool = True,
-    radius: int | None = None,
+    fit_radius_px: int | None = None,
     views: str | None = None,
     sensor_size: Sequence[int] | None = None,
-    network: nn.Module | None = None,
-) -> statistics.Statistics:
+    network: EventToVideoNetwork | None = None,
+) -> dot_statistics.DotStatistics:
     """Fit the dots of a recording and of one without turbulence; write `turbulence.csv`, `.png`.
 
     A recording of events is reconstructed first, each view by itself, by a `network` of one view.
     """
-    there = load(views) if views else None
+    there = load_views(views) if views else None
     positions = there.positions if there else [(0, 0)]
     calm, moving = (_films(path, there, fps, sensor_size, network) for path in (still, recording))
     centre = positions.index((0, 0))
-    places = statistics.find_dots(calm[centre].mean(0), rows, cols, dark)
-    reach = radius or statistics.radius(places)
+    places = dot_statistics.find_dots(calm[centre].mean(0), rows, cols, dark)
+    reach = fit_radius_px or dot_statistics.choose_fit_radius(places)
     if dark:  # the vignette of a bright ground would pass for a part of the dots
-        grounds = [statistics.ground(film.mean(0), places, reach) for film in calm]
+        grounds = [dot_statistics.fit_background(film.mean(0), places, reach) for film in calm]
         light = np.stack(grounds)[:, None]
         calm, moving = calm / light, moving / light
-    fits = [[dots.fit(film, places, reach) for film in films] for films in (moving, calm)]
-    fitted = statistics.measure(*fits, fps=fps, centre=centre)
-    statistics.write_csv(fitted, folder / "turbulence.csv", positions)
-    calibration_pictures.turbulence(fitted, positions, folder / "turbulence.png")
+    turbulent = [gaussian_dots.fit_gaussians(film, places, reach) for film in moving]
+    still_fits = [gaussian_dots.fit_gaussians(film, places, reach) for film in calm]
+    fitted = dot_statistics.compare_with_still(turbulent, still_fits, fps=fps, centre=centre)
+    dot_statistics.write_dot_csv(fitted, folder / "turbulence.csv", positions)
+    calibration_figures.draw_dot_statistics(fitted, positions, folder / "turbulence.png")
     return fitted
 
 
-def measure_air(
+def measure_film(
     video: str,
     folder: Path,
     *,
     fps: float | None = None,
-    frames: int = 240,
+    max_frames: int = 240,
     save: str | None = None,
-) -> air_meter.Air:
-    """Measure the air in a film of a still scene; write `air.yaml`, also at `save`, and `air.png`.
+) -> turbulence_meter.TurbulenceMeasurement:
+    """Measure the turbulence of a video of a still scene; write `air.yaml`, also at `save`, and
+    `air.png`.
 
-    At most so many `frames` are read; `fps` None: what the film states.  Raises ValueError for a
-    film that cannot be read or shows too little; then nothing is written.
+    At most `max_frames` are read; `fps` None: what the video states.  Raises ValueError for a
+    video that cannot be read or shows too little; then nothing is written.
     """
     if not Path(video).exists():
         raise ValueError(f"video must be a film or a folder of pictures, got {video}")
     if fps is not None and not (isinstance(fps, int | float) and 0 < fps < np.inf):
         raise ValueError(f"fps must be > 0 frames a second, got {fps}")
-    if frames < air_meter.LEAST_FRAMES:
-        raise ValueError(f"air.frames must be at least {air_meter.LEAST_FRAMES}, got {frames}")
-    film = [air_meter.shrunk(frame) for frame in islice(sources.film(video, "video"), frames)]
+    if max_frames < turbulence_meter.MIN_FRAMES:
+        raise ValueError(
+            f"air.max_frames must be at least {turbulence_meter.MIN_FRAMES}, got {max_frames}"
+        )
+    frames = islice(sources.read_video(video, "video"), max_frames)
+    film = list(map(turbulence_meter.shrink_frame, frames))
     if len({frame.shape for frame in film}) > 1:
         raise ValueError(f"video must hold frames of one size, got several in {video}")
-    rate = sources.frame_rate(video) if fps is None else fps
-    air = air_meter.measure(np.stack(film), rate)
+    rate = sources.stated_fps(video) if fps is None else fps
+    air = turbulence_meter.measure_turbulence(np.stack(film), rate)
     text = f"# The air of {Path(video).name}, {air.frames} frames; pixels of a frame whose smaller"
     text += f" side is {SIDE}.\n{air.found.text()}"
-    measured_air.air(air, Path(video).name, folder / "air.png")
+    calibration_figures.draw_measured_turbulence(air, Path(video).name, folder / "air.png")
     for path in (folder / "air.yaml", *([Path(save)] if save else [])):
         results.write_text(path, text)
     return air
@@ -148,16 +160,16 @@ def _films(
     there: Views | None,
     fps: float,
     sensor_size: Sequence[int] | None,
-    network: nn.Module | None,
+    network: EventToVideoNetwork | None,
 ) -> Float[np.ndarray, "views frames h w"]:
-    if not sources.holds_events(path):
-        frames = [there.register(frame) if there else frame[None] for frame in sources.film(path)]
-        return np.stack(frames, axis=1)
+    if not sources.has_events(path):
+        frames = sources.read_video(path)
+        return np.stack([there.warp_to_model(f) if there else f[None] for f in frames], axis=1)
     if network is None:
         raise ValueError(f"ckpt or baseline must reconstruct the events of {path}, got neither")
     sensor = sources.sensor_size(path, sensor_size)
-    span = stream.overlap("trained", fps)
-    table = lookup.build(there or Views.single(sensor, sensor))
-    rule = stream.Rule(fps=fps, overlap=span)
-    windows = stream.windows(sources.events(path, sensor), table, rule)
-    return np.stack(list(stream.each_view(windows, network, overlap=span)), axis=1)
+    span = event_windows.frames_per_window("trained", fps)
+    table = sensor_lookup.build_lookup(there or Views.single_view(sensor, sensor))
+    rule = event_windows.WindowRule(fps=fps, frames_per_window=span)
+    windows = event_windows.cut_windows(sources.iter_recording(path, sensor), table, rule)
+    return np.stack(list(reconstruction.reconstruct_each_view(windows, network, span)), axis=1)

@@ -1,150 +1,145 @@
-"""The simulation that a config asks for: scenes, air, optics and sensor of one split, or a bank."""
+"""The simulation that a config asks for: scene, turbulence, optics and sensor of one split."""
 
 import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from torch import nn
 
-from src.app.parts import part
+from src.app.instantiate import as_dict, build_part
+from src.models.network import VideoMethod
 from src.sim.optics import Optics, layout
 from src.sim.pipeline import Pipeline
-from src.sim.scenes.photographs import MixedRates
-from src.sim.sensor.contract import Sensor
-from src.training.bank import Bank, listing
-from src.training.bank_samples import Banked
-from src.training.batch_sampler import LargeStream
-from src.training.device_cache import DeviceCache
+from src.sim.scenes.clip import FrameRateMixture
+from src.sim.sensor.sensor import Sensor
+from src.training.batch_sampler import LargeCropStream
+from src.training.cached_pipeline import CachedPipeline
+from src.training.clip_cache import ClipCache, DeviceClipCache
+from src.training.disk_cache import DiskClipCache, hash_file_lists
 
-CLIP = ("scene", "turbulence")  # sections that make a clip, whatever sees it
-DEVICE_CACHES: dict[str, DeviceCache] = {}  # those of this process, by all that makes them
+DEVICE_CACHES: dict[str, DeviceClipCache] = {}  # those of this process, by all that makes them
 
 
-def light_field(cfg: DictConfig, net: nn.Module) -> Optics:
+def select_optics(cfg: DictConfig, net: VideoMethod) -> Optics:
     """Return the optics as `net` sees them: all views, or of them those that `net` wants.
 
     Raises ValueError where they have not got them.
     """
-    whole = part(cfg, "optics")
+    whole = build_part(cfg, "optics")
     if net.views in (None, whole.views):
         return whole
     wanted = layout(net.views)
     if not set(wanted) <= set(whole.positions):
         name = cfg.ckpt or "this baseline"
         raise ValueError(f"optics.views must be {net.views} for {name}, got {whole.views}")
-    return whole.only(wanted)
+    return whole.select_views(wanted)
 
 
-def pipeline(cfg: DictConfig, split: str, optics: Optics | None = None) -> Pipeline:
+def build_pipeline(cfg: DictConfig, split: str, optics: Optics | None = None) -> Pipeline:
     """Return the simulation of one split: train, val or test; `optics`: others than `cfg`'s."""
-    training = split == "train"
-    clips = _count(cfg, "data.clips") if training and cfg.data.clips is not None else None
-    if training and cfg.data.get("bank") is not None:
-        return Banked(
-            bank(cfg),
-            optics or part(cfg, "optics"),
-            _sensor(cfg, _count(cfg, "seed", least=0)),
-            windows=_count(cfg, "data.windows"),
-            bins=_count(cfg, "bins"),
-            crop=_side(cfg, "data.crop", ranges=True),
-            together=_count(cfg, "data.batch_size"),
-            independent=cfg.turbulence.get("views_correlation", "independent") == "independent",
-            clips=clips,
-        )
-    return _simulation(
-        cfg,
-        split,
-        windows=_count(cfg, "data.windows" if training else "data.test_windows"),
-        optics=optics or part(cfg, "optics"),
-        crop=_side(cfg, "data.crop" if training else "data.test_crop"),
+    optics, test = optics or build_part(cfg, "optics"), "" if split == "train" else "test_"
+    windows, crop = _count(cfg, f"data.{test}windows"), _side(cfg, f"data.{test}crop")
+    clips = None if test or cfg.data.clips is None else _count(cfg, "data.clips")
+    if test or cfg.data.get("cache_clips") is None:
+        return _build_uncached_pipeline(cfg, split, optics, windows, crop, clips)
+    return CachedPipeline(
+        build_clip_cache(cfg),
+        optics,
+        _build_sensor(cfg, _count(cfg, "seed", least=0)),
+        windows=windows,
+        bins=_count(cfg, "bins"),
+        crop=crop,
+        batch_size=_count(cfg, "data.batch_size"),
+        independent=cfg.turbulence.get("views_correlation", "independent") == "independent",
         clips=clips,
     )
 
 
-def bank(cfg: DictConfig) -> Bank | DeviceCache:
-    """Return the cache of turbulence that `data.bank` asks for, named by all that makes its clips;
-    in a device's memory it is the same one for all that ask for the same in this process.
+def build_clip_cache(cfg: DictConfig) -> ClipCache:
+    """Return the cache of turbulence that `data.cache_clips` asks for, named by all that makes its
+    clips; in a device's memory it is the same one for all that ask for the same in this process.
 
     Nine views or fewer come out of one cache: view i depends on the draws of view i only.  Without
     turbulence all views are alike, so that there are as many as asked for.
     """
-    optics, side = part(cfg, "optics"), _count(cfg, "data.bank_crop")
+    optics, side = build_part(cfg, "optics"), _count(cfg, "data.cache_crop")
     clear = OmegaConf.select(cfg, "turbulence.atmosphere.severity") == "none"
     if not clear and set(optics.positions) <= set(layout(9)):
         optics = replace(optics, views=9, positions=layout(9))
-    windows, substeps = _count(cfg, "data.bank_windows"), _count(cfg, "data.substeps")
-    source = _simulation(cfg, "train", windows=windows, optics=optics, crop=side, clips=None)
-    gib, where = cfg.data.bank_gib, cfg.data.bank_on
+    windows, substeps = _count(cfg, "data.cache_windows"), _count(cfg, "data.substeps")
+    source = _build_uncached_pipeline(cfg, "train", optics, windows, side)
+    gib, where = cfg.data.cache_gib, cfg.data.cache_device
     if not isinstance(gib, int | float):
-        raise ValueError(f"data.bank_gib must be a number, got {gib}")
-    size = {"clips": _count(cfg, "data.bank"), "frames": windows * substeps + 1, "gib": gib}
+        raise ValueError(f"data.cache_gib must be a number, got {gib}")
+    size = {"clips": _count(cfg, "data.cache_clips"), "frames": windows * substeps + 1, "gib": gib}
     if where == "disk":
-        return Bank(source, str(cfg.data.bank_root), _made_of(cfg, optics), **size)
+        return DiskClipCache(source, str(cfg.data.cache_root), _clip_inputs(cfg, optics), **size)
     if where != "device":
-        raise ValueError(f"data.bank_on must be disk or device, got {where}")
-    if cfg.data.workers:
-        raise ValueError(f"data.workers must be 0 for data.bank_on=device, got {cfg.data.workers}")
+        raise ValueError(f"data.cache_device must be disk or device, got {where}")
+    if workers := cfg.data.workers:
+        raise ValueError(f"data.workers must be 0 for data.cache_device=device, got {workers}")
     device = "cpu" if cfg.trainer.accelerator == "cpu" else "cuda"
-    name = json.dumps([_made_of(cfg, optics), size, device], sort_keys=True)
+    name = json.dumps([_clip_inputs(cfg, optics), size, device], sort_keys=True)
     if name not in DEVICE_CACHES:
-        DEVICE_CACHES[name] = DeviceCache(source, device=device, **size)
+        DEVICE_CACHES[name] = DeviceClipCache(source, device=device, **size)
     return DEVICE_CACHES[name]
 
 
-def large_stream(cfg: DictConfig, optics: Optics | None = None) -> LargeStream | None:
-    """Return the second stream of training batches that `data.large` asks for: of this config, its
-    `overrides` changed.  Raises ValueError for overrides that are none.
-    """
+def build_large_crop_stream(
+    cfg: DictConfig, optics: Optics | None = None
+) -> LargeCropStream | None:
+    """Return the second stream of training batches, of this config with `data.large.overrides`."""
     if not cfg.data.large or not cfg.data.large.share:
         return None
     try:
         changes = OmegaConf.from_dotlist(list(cfg.data.large.overrides))
-        other = OmegaConf.merge(cfg, changes)
+        other = cast(DictConfig, OmegaConf.merge(cfg, changes))
     except (OmegaConfBaseException, TypeError, ValueError) as error:
         raise ValueError(f"data.large.overrides must be [key=value, ...]: {error}") from error
     if not other.data.loss_from < other.data.windows:
         least = f"> data.loss_from, {other.data.loss_from}"
         raise ValueError(f"data.large: data.windows must be {least}, got {other.data.windows}")
     size = _count(other, "data.batch_size")
-    return LargeStream(pipeline(other, "train", optics), cfg.data.large.share, size)
+    return LargeCropStream(build_pipeline(other, "train", optics), cfg.data.large.share, size)
 
 
-def _made_of(cfg: DictConfig, optics: Optics) -> dict:
+def _clip_inputs(cfg: DictConfig, optics: Optics) -> dict:
     """Return all that makes the clips of a cache, as plain data."""
-    parts = {name: OmegaConf.to_container(cfg[name], resolve=True) for name in CLIP}
+    parts = {name: as_dict(cfg[name]) for name in ("scene", "turbulence")}
     measured = parts["turbulence"].get("measured")  # a file; what it holds makes the clips
-    windows, substeps = cfg.data.bank_windows, cfg.data.substeps
+    windows, substeps = cfg.data.cache_windows, cfg.data.substeps
     return parts | {
-        "optics": {"positions": optics.positions, "misalignment_px": optics.misalignment_px},
-        "files": listing(parts),
+        "optics": {
+            "positions": optics.positions,
+            "homography_error_px": optics.homography_error_px,
+        },
+        "files": hash_file_lists(parts),
         "measured": Path(measured).read_text() if measured else None,
-        "sensor": _light(cfg),
+        "decodes_srgb": _decodes_srgb(cfg),
         "seed": cfg.seed,
-        "rates": _rates(cfg, True),
-        "frames": {"windows": windows, "substeps": substeps, "crop": cfg.data.bank_crop},
+        "rates": _frame_rates(cfg, "train"),
+        "frames": {"windows": windows, "substeps": substeps, "crop": cfg.data.cache_crop},
     }
 
 
-def _simulation(
-    cfg: DictConfig, split: str, *, windows: int, optics: Optics, crop, clips
+def _build_uncached_pipeline(
+    cfg: DictConfig, split: str, optics: Optics, windows: int, crop: Any, clips: int | None = None
 ) -> Pipeline:
+    """Return the pipeline that simulates every clip, out of no cache."""
     substeps = _count(cfg, "data.substeps")
-    rates = _rates(cfg, split == "train")
     seed = _count(cfg, "seed" if split == "train" else "data.test_seed", least=0)
-    frames = windows * substeps + 1
-    scenes = [
-        part(cfg, "scene", split=split, seed=seed, frames=frames, fps=rate * substeps)
-        for rate in rates
-    ]
-    made = Pipeline(
-        MixedRates(scenes) if len(scenes) > 1 else scenes[0],
+    given = {"split": split, "seed": seed, "frames": windows * substeps + 1}
+    rates = _frame_rates(cfg, split)
+    scenes = [build_part(cfg, "scene", fps=rate * substeps, **given) for rate in rates]
+    return Pipeline(
+        FrameRateMixture(scenes) if len(scenes) > 1 else scenes[0],
         optics,
-        part(cfg, "turbulence"),
-        _light(cfg),
+        build_part(cfg, "turbulence"),
+        _build_sensor(cfg, seed),
         split=split,
         seed=seed,
         bins=_count(cfg, "bins"),
@@ -152,20 +147,18 @@ def _simulation(
         crop=crop,
         random_crop=split == "train",
         clips=clips,
+        decodes_srgb=_decodes_srgb(cfg),
     )
-    made.sensor = _sensor(cfg, seed)
-    return made
 
 
-def _light(cfg: DictConfig) -> dict:
-    """Return what decides about the light in front of the sensor: whether frames are decoded."""
-    return {"input": "srgb" if cfg.sensor.get("input") == "srgb" else "linear"}
+def _decodes_srgb(cfg: DictConfig) -> bool:
+    """Return whether frames are decoded before the turbulence, which acts on light."""
+    return cfg.sensor.get("input") == "srgb"
 
 
-def _sensor(cfg: DictConfig, seed: int) -> Sensor:
-    """Return the sensor; what is decoded before the turbulence reaches it as light."""
-    decoded = {"input": "linear"} if _light(cfg)["input"] == "srgb" else {}
-    return part(cfg, "sensor", seed=seed, **decoded)
+def _build_sensor(cfg: DictConfig, seed: int) -> Sensor:
+    light = {"input": "linear"} if _decodes_srgb(cfg) else {}
+    return build_part(cfg, "sensor", seed=seed, **light)
 
 
 def _count(cfg: DictConfig, key: str, least: int = 1) -> int:
@@ -175,19 +168,20 @@ def _count(cfg: DictConfig, key: str, least: int = 1) -> int:
     return value
 
 
-def _side(cfg: DictConfig, key: str, ranges: bool = False) -> int | float | Sequence[int] | None:
+def _side(cfg: DictConfig, key: str) -> Any:
     value = OmegaConf.select(cfg, key)
     if value is None or type(value) in (int, float):
         return value
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        if ranges:
-            return list(value)
-        raise ValueError(f"{key} may be a range of sides with data.bank only, got {value}")
-    raise ValueError(f"{key} must be pixels (128), a share of the frame (0.5) or null, got {value}")
+    if not isinstance(value, Sequence) or isinstance(value, str):
+        wanted = "pixels (128), a share of the frame (0.5) or null"
+        raise ValueError(f"{key} must be {wanted}, got {value}")
+    if key != "data.crop" or cfg.data.get("cache_clips") is None:
+        raise ValueError(f"{key} may be a range of sides with data.cache_clips only, got {value}")
+    return list(value)
 
 
-def _rates(cfg: DictConfig, training: bool) -> list[float]:
-    key = "data.rates" if training and cfg.data.rates else "fps"
+def _frame_rates(cfg: DictConfig, split: str) -> list[float]:
+    key = "data.rates" if split == "train" and cfg.data.rates else "fps"
     given = OmegaConf.select(cfg, key)
     rates = list(given) if isinstance(given, Sequence) else [given]
     if not rates or not all(isinstance(r, int | float) and 0 < r < math.inf for r in rates):

@@ -1,36 +1,38 @@
-"""The stopwatch of the chart: every network in every form, on pictures of every size."""
+"""Speed of networks: every candidate in every form, on frames of every size."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import product
 from pathlib import Path
-from typing import Any
 
 import torch
-from torch import nn
+from torch.nn import functional
 
-from src.bench import timing
 from src.bench.candidates import Candidate
-from src.models import stopwatch
-from src.models.cost import macs, macs_per_frame
-from src.models.export import OnnxNetwork, export
-from src.models.fast import computes_bf16, plain, running
+from src.deploy.cost import count_macs, macs_per_frame, time_frame, timing_clock, torch_threads
+from src.deploy.cpu_features import has_fast_bf16
+from src.deploy.forms import in_form
+from src.deploy.onnx_export import OnnxNetwork, export_onnx
+from src.models.folding import inference_copy
+from src.models.network import FramePostprocessor
 
-PEAKS = {  # what a form computes in
+FORM_DTYPES = {  # what a form computes in
     "float32": torch.float32, "bf16": torch.bfloat16, "compiled": torch.bfloat16,
-    "openvino": torch.bfloat16 if computes_bf16() else torch.float32,
+    "openvino": torch.bfloat16 if has_fast_bf16() else torch.float32,
     "onnx": torch.float32,
 }  # fmt: skip
-FORMS = tuple(PEAKS)
-ON_CPU = ("openvino", "onnx")  # and nowhere else
-SMALL = 64  # side of the picture that says what a post-processor costs on larger ones
-FILLED = 0.05  # share of a grid's entries that are not zero, as in our streams
+FORMS = tuple(FORM_DTYPES)
+LONGEST_S, ONNX_SIDE = 1.0, 176
+PREVIEW_SIDE = 64  # frames that tell what a post-processor costs on larger ones
+PEAK_SIDE, PEAK_CHANNELS = 176, 64  # of the convolution that shows what the machine can do
+ACTIVE_SHARE = 0.05  # of a grid's entries that are not zero, as in our streams
 
 
 @dataclass(frozen=True)
-class Speed:
-    """One network in one form on one size of picture; `limit_ms`, what the arithmetic alone takes.
-
-    `reason`: why there is no time.
+class SpeedMeasurement:
+    """One network in one form on frames `side` pixels square; `limit_ms`: what the arithmetic alone
+    takes at the peak of the machine.  `reason`: why there is no time.
     """
 
     network: str
@@ -46,128 +48,148 @@ class Speed:
     clock: str = ""
     gmac: float | None = None
     params: int | None = None
-    peak_mib: float | None = None
-    energy_mj: float | None = None
     limit_ms: float | None = None
     reason: str = ""
 
 
-class Stopwatch:
-    """Times networks.  `seconds` for each entry; what would take more than `longest_s` a frame by
-    arithmetic alone is left out and says so.  ONNX files, only for pictures up to `onnx_side`, go
-    to `folder`.
+class SpeedBenchmark:
+    """Times networks for `seconds` each.
+
+    What would take more than LONGEST_S a frame by arithmetic alone is left out and says so.  ONNX
+    files, only for frames up to ONNX_SIDE, go to `folder`.
     """
 
-    def __init__(
-        self, folder: Path, *, seconds: float, longest_s: float, bins: int, onnx_side: int
-    ):
-        self.folder, self.seconds, self.longest_s = folder, seconds, longest_s
-        self.bins, self.onnx_side = bins, onnx_side
-        self.peaks: dict[tuple[str, int], float] = {}
-        self._macs: dict[tuple[str, int], int] = {}
-        self._behind: dict[tuple[str, int, int], float] = {}
-        self._bytes: dict[tuple[str, str, int, str], int] = {}
+    def __init__(self, folder: Path, *, seconds: float, bins: int):
+        self.folder, self.seconds, self.bins = folder, seconds, bins
+        self.peaks: dict[tuple[str, int], float] = {}  # MAC/s of (form, threads)
+        self._macs = cache(self._count_macs)
+        self._postprocessor_ms = cache(time_postprocessor)
 
-    def peak(self, form: str, count: int) -> float:
-        """Return the machine's multiply-accumulates a second, measured once."""
-        if (form, count) not in self.peaks:
-            self.peaks[form, count] = timing.convolution_peak(PEAKS[form], count=count)
-        return self.peaks[form, count]
-
-    def rows(
-        self, candidate: Candidate, sides: Sequence[int], counts: Sequence[int],
+    def measure(
+        self, candidate: Candidate, sides: Sequence[int], thread_counts: Sequence[int],
         forms: Sequence[str], devices: Sequence[str],
-    ) -> Iterable[Speed]:  # fmt: skip
-        """Yield one entry for each combination; a GPU has no threads to choose, no OpenVINO and no
-        ONNX."""
-        for side in sides:
-            for device in devices:
-                left_out = ON_CPU if device != "cpu" else ["onnx"] if side > self.onnx_side else []
-                for form in (form for form in forms if form not in left_out):
-                    for count in counts if device == "cpu" else [1]:
-                        yield self._row(candidate, side, device, count, form)
+    ) -> Iterable[SpeedMeasurement]:  # fmt: skip
+        """Yield one measurement for each combination; a GPU has no threads to choose, no OpenVINO
+        and no ONNX."""
+        for side, device, form, threads in product(sides, devices, forms, thread_counts):
+            if device == "cpu":
+                skipped = form == "onnx" and side > ONNX_SIDE
+            else:
+                skipped = form in ("openvino", "onnx") or threads != thread_counts[0]
+            if not skipped:
+                threads = threads if device == "cpu" else 1
+                whose = candidate.name, candidate.trained, candidate.views
+                entry = SpeedMeasurement(*whose, side, device, threads, form)
+                yield self._measure_one(candidate, entry)
 
-    def _row(self, candidate: Candidate, side: int, device: str, count: int, form: str) -> Speed:
-        entry: dict[str, Any] = {
-            "network": candidate.name, "trained": candidate.trained, "views": candidate.views,
-            "side": side, "device": device, "threads": count, "form": form,
-        }  # fmt: skip
-        if candidate.network is None:
-            return Speed(**entry, reason=candidate.missing)
-        work = self._count(candidate, side)
-        entry |= {
-            "gmac": work / 1e9,
-            "params": sum(p.numel() for part in candidate.parts for p in part.parameters()),
-            "energy_mj": 1e3 * work * timing.JOULE_PER_MAC,
-        }
-        if device == "cpu":
-            entry["limit_ms"] = 1e3 * work / self.peak(form, count)
-            if entry["limit_ms"] > 1e3 * self.longest_s:
-                reason = f"more than {self.longest_s:g} s a frame by arithmetic alone"
-                return Speed(**entry, reason=reason)
+    def _measure_one(self, candidate: Candidate, entry: SpeedMeasurement) -> SpeedMeasurement:
         try:
-            return self._timed(candidate, entry)
+            macs, post = self._macs(candidate, entry.side), candidate.postprocessor
+            modules = [candidate.loaded, *([post] if post is not None else [])]
+            params = sum(p.numel() for module in modules for p in module.parameters())
+            entry = replace(entry, gmac=macs / 1e9, params=params)
+            if entry.device == "cpu":
+                key, dtype = (entry.form, entry.threads), FORM_DTYPES[entry.form]
+                if key not in self.peaks:
+                    self.peaks[key] = measure_peak_conv_macs_per_s(dtype, threads=entry.threads)
+                limit_s = macs / self.peaks[key]
+                entry = replace(entry, limit_ms=1e3 * limit_s)
+                if limit_s > LONGEST_S:
+                    raise ValueError(f"more than {LONGEST_S:g} s a frame by arithmetic alone")
+            return self._time(candidate, entry)
         except ValueError as error:
-            return Speed(**entry, reason=str(error))
+            return replace(entry, reason=str(error))
 
-    def _count(self, candidate: Candidate, side: int) -> int:
+    def _count_macs(self, candidate: Candidate, side: int) -> int:
         """Return the multiply-accumulates of a frame, by shapes alone where the network allows."""
-        which = (candidate.name, side)
-        if which not in self._macs:
-            size = {"views": candidate.views, "bins": self.bins}
-            try:
-                shapes = plain(candidate.network).to("meta")
-                self._macs[which] = macs_per_frame(shapes, side, side, **size)
-            except (NotImplementedError, RuntimeError):  # it looks at values
-                self._macs[which] = macs_per_frame(candidate.network, side, side, **size)
-            if candidate.restorer is not None:
-                restorer = candidate.restorer
-                frames = torch.zeros(1, restorer.WINDOW, 1, SMALL, SMALL)
-                behind = macs(lambda: restorer.restore(frames)) * side**2 // SMALL**2
-                self._macs[which] += behind // (restorer.WINDOW - restorer.OVERLAP)
-        return self._macs[which]
+        network, views = candidate.loaded, candidate.views
+        try:
+            shapes = inference_copy(network).to("meta")
+            macs = macs_per_frame(shapes, side, side, views=views, bins=self.bins)
+        except (NotImplementedError, RuntimeError):  # it looks at values
+            macs = macs_per_frame(network, side, side, views=views, bins=self.bins)
+        if (post := candidate.postprocessor) is not None:
+            frames = torch.zeros(1, post.WINDOW, 1, PREVIEW_SIDE, PREVIEW_SIDE)
+            sizes = {"window": post.WINDOW, "overlap": post.OVERLAP}
+            window = count_macs(lambda: post.restore(frames, **sizes)) * side**2 // PREVIEW_SIDE**2
+            macs += window // (post.WINDOW - post.OVERLAP)
+        return macs
 
-    def _timed(self, candidate: Candidate, entry: dict[str, Any]) -> Speed:
-        side, form, device = entry["side"], entry["form"], entry["device"]
-        after = 0.0
-        if candidate.restorer is not None:
-            if form != "float32" or device != "cpu":
-                raise ValueError("with a post-processor it is timed in float32 on the CPU")
-            after = self._restoration(candidate, side, entry["threads"])
-        size = (1, candidate.views, self.bins, side, side)
-        drawn = torch.Generator().manual_seed(0)
-        voxels = torch.randn(size, generator=drawn)
-        voxels = (voxels * (torch.rand(size, generator=drawn) < FILLED)).to(device)
-        network = self._running(candidate, form, side, entry["threads"]).to(device)
-        if form in ("float32", "bf16"):  # of the others nobody sees the maps
-            which = (candidate.name, form, side, device)
-            if which not in self._bytes:
-                self._bytes[which] = timing.peak_bytes(network, voxels)
-            entry["peak_mib"] = self._bytes[which] / 2**20
-        took = stopwatch.frame(network, voxels, count=entry["threads"], seconds=self.seconds)
-        ms = {"ms": took.median_ms + after, "least_ms": took.least_ms + after}
-        return Speed(**entry, **ms, frames=took.frames, clock=took.clock)
+    def _time(self, candidate: Candidate, entry: SpeedMeasurement) -> SpeedMeasurement:
+        network, after_ms = candidate.loaded, self._time_postprocessor(candidate, entry)
+        size = (1, candidate.views, self.bins, entry.side, entry.side)
+        random = torch.Generator().manual_seed(0)
+        voxels = torch.randn(size, generator=random)
+        voxels = voxels * (torch.rand(size, generator=random) < ACTIVE_SHARE)
+        if entry.form == "float32":
+            ready = inference_copy(network)
+        elif entry.form != "onnx":
+            ready = in_form(network, entry.form)
+        else:
+            path = self.folder / f"{entry.network}_{entry.side}.onnx"
+            if not path.is_file():
+                side, bins = entry.side, self.bins
+                export_onnx(network, path, views=entry.views, height=side, width=side, bins=bins)
+            ready = OnnxNetwork(path, entry.threads)
+        took = time_frame(
+            ready.to(entry.device), voxels.to(entry.device),
+            threads=entry.threads, seconds=self.seconds,
+        )  # fmt: skip
+        return replace(
+            entry, ms=took.median_ms + after_ms, least_ms=took.least_ms + after_ms,
+            frames=took.frames, clock=took.clock,
+        )  # fmt: skip
 
-    def _restoration(self, candidate: Candidate, side: int, count: int) -> float:
-        """Return the ms of a frame, measured once; ValueError where a small picture says that it
-        takes more than `longest_s`."""
-        for measured in (SMALL, side):
-            which = (candidate.name, measured, count)
-            if which not in self._behind:
-                took = timing.restoration(candidate.restorer, measured, count=count)
-                self._behind[which] = took
-            ms = self._behind[which] * side**2 / measured**2
-            if measured == SMALL and ms > 1e3 * self.longest_s:
-                raise ValueError(f"more than {self.longest_s:g} s a frame")
-        return ms
+    def _time_postprocessor(self, candidate: Candidate, entry: SpeedMeasurement) -> float:
+        """Return its ms for a frame, 0 without one; raises ValueError where a small frame shows
+        that it takes more than LONGEST_S, and where it is not timed.
+        """
+        if (post := candidate.postprocessor) is None:
+            return 0.0
+        if entry.form != "float32" or entry.device != "cpu":
+            raise ValueError("with a post-processor it is timed in float32 on the CPU")
+        preview_ms = self._postprocessor_ms(post, PREVIEW_SIDE, threads=entry.threads)
+        if preview_ms * entry.side**2 / PREVIEW_SIDE**2 > 1e3 * LONGEST_S:
+            raise ValueError(f"more than {LONGEST_S:g} s a frame")
+        return self._postprocessor_ms(post, entry.side, threads=entry.threads)
 
-    def _running(self, candidate: Candidate, form: str, side: int, count: int) -> nn.Module:
-        if form == "float32":
-            return plain(candidate.network)
-        if form != "onnx":
-            return running(candidate.network, form)
-        path = self.folder / f"{candidate.name}_{side}.onnx"
-        if not path.is_file():
-            size = {"views": candidate.views, "height": side, "width": side, "bins": self.bins}
-            export(candidate.network, path, **size)
-        return OnnxNetwork(path, count)
+
+@torch.no_grad()
+def time_postprocessor(
+    post: FramePostprocessor, side: int, *, threads: int = 1, repeats: int = 2
+) -> float:
+    """Return the ms for each frame, `side` pixels square, of a long video.
+
+    Its windows of WINDOW frames overlap by OVERLAP: what two of them share is paid for twice.
+    """
+    frames = torch.rand(1, post.WINDOW, 1, side, side)
+    sizes = {"window": post.WINDOW, "overlap": post.OVERLAP}
+    seconds = _fastest(lambda: post.restore(frames, **sizes), threads, repeats)
+    return 1e3 * seconds / (post.WINDOW - post.OVERLAP)
+
+
+@torch.no_grad()
+def measure_peak_conv_macs_per_s(
+    dtype: torch.dtype, *, threads: int = 1, repeats: int = 8
+) -> float:
+    """Return the multiply-accumulates a second of a large 3x3 convolution, channels-last, the best
+    of `repeats`: what no network of convolutions exceeds by much.
+    """
+    x, kernel = (
+        torch.randn(size).to(dtype=dtype, memory_format=torch.channels_last)
+        for size in ((1, PEAK_CHANNELS, PEAK_SIDE, PEAK_SIDE), (PEAK_CHANNELS, PEAK_CHANNELS, 3, 3))
+    )
+    functional.conv2d(x, kernel, padding=1)
+    seconds = _fastest(lambda: functional.conv2d(x, kernel, padding=1), threads, repeats)
+    return PEAK_SIDE**2 * PEAK_CHANNELS**2 * 9 / seconds
+
+
+def _fastest(work: Callable[[], object], threads: int, repeats: int) -> float:
+    """Return the least seconds of `repeats` calls of `work` on so many threads."""
+    now, seconds = timing_clock(threads), []
+    with torch_threads(threads):
+        for _ in range(repeats):
+            start = now()
+            work()
+            seconds.append(max(now() - start, 1e-9))
+    return min(seconds)

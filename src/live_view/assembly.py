@@ -1,89 +1,69 @@
-"""The parts put together: a feed, networks and views in, a server that can be run out."""
+"""The parts of the live page put together, and the loop that plays and serves it."""
 
 import asyncio
 import signal
 import sys
 from collections.abc import Mapping
 
-from torch import nn
-
-from src.live_view.backlog import Backlog
-from src.live_view.controls import ADAPTIVE, Controls, Steps
-from src.live_view.cutter import Cutter
-from src.live_view.faults import Faults
-from src.live_view.feeds import Feed
-from src.live_view.intake import Intake
-from src.live_view.meters import Meters
-from src.live_view.network_step import Running
-from src.live_view.pace import Pace
+from src.live_view.event_feeds import Feed
+from src.live_view.feed_reader import FeedReader, PlaybackClock
+from src.live_view.frame_buffer import EventCounter, FrameBuffer
+from src.live_view.live_windows import WindowCutter, WindowQueue
+from src.live_view.network_runner import Controls, RunSettings
+from src.live_view.page_server import THIS_MACHINE, LivePage, PageServer
 from src.live_view.player import Player
-from src.live_view.reconstruction import Reconstruction
-from src.live_view.screen import EventPicture, Screen
-from src.live_view.server import THIS_MACHINE, Page, Server
-from src.recordings.lookup import build
+from src.live_view.status import FaultLog, Meters
+from src.models.network import EventToVideoNetwork
+from src.recordings.noise_filter import NoiseFilter
+from src.recordings.sensor_lookup import build_lookup
 from src.recordings.views import Views
 
-GIL_S = 2e-4  # Python's own 5 ms between two threads is longer than a window
+GIL_SWITCH_S = 2e-4  # Python's own 5 ms between two threads is longer than a window
 
 
 def assemble(
     feed: Feed,
-    networks: Mapping[str, nn.Module],
+    networks: Mapping[str, EventToVideoNetwork],
     views: Views,
-    how: Running,
-    faults: Faults,
+    settings: RunSettings,
+    faults: FaultLog,
     *,
-    speed: float = 1.0,
-    backlog: int = 16,
+    playback_speed: float = 1.0,
+    max_waiting_windows: int = 16,
+    noise_filter_s: float | None = None,
     host: str = "127.0.0.1",
     port: int = 8600,
-) -> Server:
-    """Return the server of a page on which `feed` is played; `networks` from the smallest.
+) -> PageServer:
+    """Return the server of a page on which `feed` is played through one of `networks`.
 
     Raises ValueError for a value out of range.
     """
-    meters, pace, places = Meters(), Pace(speed), views.positions
-    cutter = Cutter(views.sensor, how.fps, faults)
-    waiting = Backlog(backlog, lossless=speed == float("inf"))
-    marks = EventPicture(build(views))
-    intake = Intake(feed, cutter, waiting, marks, pace, meters, faults)
-    steps = Steps(networks, views, how)
-    reconstruction = Reconstruction(waiting, Screen(views.model), meters, steps)
-    period_s = 1 / (how.fps * speed)
-    controls = Controls(reconstruction, networks, places, period_s=period_s, room=backlog)
-    player = Player(intake, reconstruction, meters, faults)
-    return Server(Page(player, controls, marks, places), host, port)
+    clock, counter = PlaybackClock(playback_speed), EventCounter(build_lookup(views))
+    cutter = WindowCutter(views.sensor, settings.fps, faults)
+    waiting = WindowQueue(max_waiting_windows, lossless=playback_speed == float("inf"))
+    noise_filter = None if noise_filter_s is None else NoiseFilter(views.sensor, noise_filter_s)
+    reader = FeedReader(feed, cutter, waiting, counter, clock, Meters(), faults, noise_filter)
+    player = Player(reader, Controls(networks, views, settings), FrameBuffer(views.model))
+    return PageServer(LivePage(player, views.positions), host, port)
 
 
-def first_choice(controls: Controls, network: str, use: int | str) -> None:
-    """Choose `network` on `use` views: a number, `all` or `adaptive`.
-
-    Raises ValueError for another `use`.
-    """
-    counts = [count for count in controls.offered()[network] if count != ADAPTIVE]
-    if use != "all" and use not in controls.offered()[network]:
-        allowed = ", ".join(map(str, ["all", *controls.offered()[network]]))
-        raise ValueError(f"use must be one of {allowed} for {network}, got {use}")
-    controls.choose(network, max(counts) if use == "all" else use)
-
-
-async def serve(server: Server) -> None:
+async def play_and_serve(server: PageServer) -> None:
     """Play and serve until SIGINT (Ctrl-C) or SIGTERM; leaves no thread and no port."""
     stop, player = asyncio.Event(), server.page.player
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
+
+    def start() -> None:
+        player.start()
+        host = f"[{server.host}]" if ":" in server.host else server.host
+        is_local = server.host in THIS_MACHINE
+        seen = "this machine only" if is_local else "other machines can see it too"
+        print(f"watch at http://{host}:{server.port} ({seen}); Ctrl-C ends it", flush=True)
+
     before = sys.getswitchinterval()
-    sys.setswitchinterval(GIL_S)
+    sys.setswitchinterval(GIL_SWITCH_S)
     try:
-        await server.run(lambda: _began(server), stop)
+        await server.run(start, stop)
     finally:
         player.stop()
         sys.setswitchinterval(before)
-
-
-def _began(server: Server) -> None:
-    """Start playing, and say where to look."""
-    server.page.player.start()
-    host = f"[{server.host}]" if ":" in server.host else server.host
-    seen = "this machine only" if server.host in THIS_MACHINE else "other machines can see it too"
-    print(f"watch at http://{host}:{server.port} ({seen}); Ctrl-C ends it", flush=True)

@@ -1,30 +1,34 @@
-"""The chain that runs, from events to the page's buffer, and what the page asks of it."""
+"""The threads from events to the page's buffer, and their state."""
 
+import math
+import queue
 import threading
+import time
 import traceback
 
-from src.live_view.faults import Faults
-from src.live_view.intake import Intake
-from src.live_view.meters import Meters
-from src.live_view.reconstruction import Reconstruction
+from src.live_view.feed_reader import FeedReader
+from src.live_view.frame_buffer import FrameBuffer
+from src.live_view.live_windows import EventWindow
+from src.live_view.network_runner import Controls, Finish, NetworkRunner
 
 JOIN_S = 2.0  # for which a thread is waited for at the end
 
 
 class Player:
-    """Four threads: decoding, cutting, events, network.  What waits between two is bounded."""
+    """Four threads: decode, cut, events, network.  What waits between two is bounded.
 
-    def __init__(
-        self, intake: Intake, reconstruction: Reconstruction, meters: Meters, faults: Faults
-    ):
-        self.intake, self.reconstruction = intake, reconstruction
-        self.meters, self.faults = meters, faults
+    The last two run what `controls` have chosen and put the pictures into `frames`.
+    """
+
+    def __init__(self, reader: FeedReader, controls: Controls, frames: FrameBuffer):
+        self.reader, self.controls, self.frames = reader, controls, frames
+        self.meters, self.faults = reader.meters, reader.faults
+        self.running: NetworkRunner | None = None  # of the newest window
+        self.begun: queue.Queue[tuple[EventWindow, Finish]] = queue.Queue(1)
         self.stopped = threading.Event()
-        laying, running = reconstruction.lay_events, reconstruction.run_network
-        works = (intake.decode, intake.cut, laying, running)
         self.threads = [
-            threading.Thread(target=self._guarded, args=(work,), name=work.__name__, daemon=True)
-            for work in works
+            threading.Thread(target=self._guard, args=(work,), name=work.__name__, daemon=True)
+            for work in (reader.decode, reader.cut, self.run_first_layer, self.run_network)
         ]
 
     def start(self) -> None:
@@ -33,45 +37,72 @@ class Player:
             thread.start()
 
     def stop(self) -> None:
-        """End the threads and let go of the feed."""
+        """End the threads and close the feed."""
         self.stopped.set()
         for thread in self.threads:
             if thread.ident is not None:
                 thread.join(JOIN_S)
-        self.intake.feed.close()
+        self.reader.feed.close()
 
-    def _guarded(self, work) -> None:
+    def _guard(self, work) -> None:
         try:
             work(self.stopped)
         except Exception as error:  # a thread that ends must not end unseen
             traceback.print_exc()
-            self.faults.tell("thread", f"{work.__name__} ended: {error}", stays=True)
-            self.intake.state = "broken"
+            self.faults.report("thread", f"{work.__name__} ended: {error}", until_cleared=True)
+            self.reader.state = "broken"
 
-    @property
-    def paused(self) -> bool:
-        """Whether the pictures stand still."""
-        return not self.intake.pace.running.is_set()
+    def run_first_layer(self, stopped: threading.Event) -> None:
+        """Add the events to the first layer, a window ahead of `run_network`, until `stopped`."""
+        while not stopped.is_set():
+            window, runner = self.reader.waiting.get(0.1), self.controls.runner
+            if window is None or runner is None:
+                continue
+            start = time.perf_counter()
+            is_new = window.starts_scene or runner is not self.running
+            self.running = runner
+            finish = runner.begin(window, restart=is_new)
+            self.meters.add_busy_time("events", time.perf_counter() - start)
+            while not stopped.is_set():
+                try:
+                    self.begun.put((window, finish), timeout=0.1)
+                    break
+                except queue.Full:
+                    continue
 
-    def pause(self, paused: bool) -> None:
-        """Hold the pictures, or go on.  What a live stream sends meanwhile is left out."""
-        running = self.intake.pace.running
+    def run_network(self, stopped: threading.Event) -> None:
+        """Run the network on what was begun, and show the pictures, until `stopped`."""
+        while not stopped.is_set():
+            try:
+                window, finish = self.begun.get(timeout=0.1)
+            except queue.Empty:
+                continue
+            start = time.perf_counter()
+            self.frames.push(finish())
+            end = time.perf_counter()
+            self.meters.add_busy_time("network", end - start)
+            self.meters.add_frame(end - window.due_s, len(window.events))
+
+    def set_paused(self, paused: bool) -> None:
+        """Pause or play.  What a live stream sends during a pause is left out."""
+        running = self.reader.clock.running
         (running.clear if paused else running.set)()
 
     def status(self) -> dict:
         """Return what `GET /status` answers, all but the page's own."""
-        intake, level = self.intake, self.reconstruction.level
-        held = self.paused and intake.state != "broken"
+        reader, runner = self.reader, self.running
+        asked_fps = reader.clock.speed * 1e6 / reader.cutter.period_us
+        paused = not reader.clock.running.is_set()
         return {
-            "state": "paused" if held else intake.state,
-            "paused": self.paused,
-            "faults": self.faults.now(),
-            "asked_fps": intake.asked_fps(),
+            "state": "paused" if paused and reader.state != "broken" else reader.state,
+            "paused": paused,
+            "faults": self.faults.current(),
+            "asked_fps": round(asked_fps, 1) if math.isfinite(asked_fps) else None,
             **self.meters.rates(),
-            "dropped": intake.backlog.dropped,
-            "waiting": len(intake.backlog),
-            "network": level.network if level else None,
-            "views": level.views if level else None,
-            "load": self.meters.load(),
-            "time_s": round(intake.cutter.last * 1e-6, 3),
+            "dropped": reader.waiting.dropped,
+            "waiting": len(reader.waiting),
+            "network": runner.name if runner else None,
+            "views": len(runner.views.views) if runner else None,
+            "load": self.meters.stage_loads(),
+            "time_s": round(reader.cutter.last_us * 1e-6, 3),
         }

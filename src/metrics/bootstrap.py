@@ -1,24 +1,24 @@
-"""Intervals of a mean by resampling (Efron & Tibshirani 1993, percentile method)."""
+"""Confidence intervals of a mean by bootstrap (Efron & Tibshirani 1993, percentile method).
+
+For one seed as scipy.stats.bootstrap; that cannot resample seeds and clips at once.
+"""
 
 from collections.abc import Sequence
 
 import numpy as np
 
-DRAWS = 4000
+RESAMPLES = 4000
 
 
-def interval(values: Sequence[float], share: float = 0.95) -> tuple[float, float]:
-    """Return the interval that holds `share` of the means of resampled `values`.
-
-    Clips are resampled.  A single value has an interval of no width.
-    """
-    return difference([values], None, share)
+def bootstrap_interval(values: Sequence[float], level: float = 0.95) -> tuple[float, float]:
+    """Return the interval of the mean of `values`, one per clip; one value has no width."""
+    return bootstrap_difference_interval([values], None, level)
 
 
-def difference(
+def bootstrap_difference_interval(
     ours: Sequence[Sequence[float]],
     theirs: Sequence[Sequence[float]] | None,
-    share: float = 0.95,
+    level: float = 0.95,
 ) -> tuple[float, float]:
     """Return the interval of mean(ours) - mean(theirs); rows are seeds, columns the same clips.
 
@@ -30,11 +30,11 @@ def difference(
     clips = len(ours[0])
     if any(len(row) != clips for row in [*ours, *(theirs or [])]):
         raise ValueError(f"every seed must have the same {clips} clips")
-    picked = rng.integers(clips, size=(DRAWS, clips))
+    picked = rng.integers(clips, size=(RESAMPLES, clips))
     means = _means(ours, picked, rng)
     if theirs is not None:
         means = means - _means(theirs, picked, rng)
-    tail = 50 * (1 - share)
+    tail = 50 * (1 - level)
     low, high = np.percentile(means, [tail, 100 - tail])
     return float(low), float(high)
 

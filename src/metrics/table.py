@@ -1,14 +1,13 @@
-"""The metrics of a clip: what each is called, to how many digits it is said, which way is better.
+"""The metrics of a clip as tables, figures and model cards show them, in this order.
 
-Tables, figures and model cards take their columns from here, in this order; how a metric is
-computed stands in scores.py.  This file imports nothing, so that a report needs no PyTorch.
+They are computed in video_metrics.py; this file imports nothing, so that a report needs no PyTorch.
 """
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Metric:
+class MetricColumn:
     """`name`: its key in results.json and clips.csv.  `better`: 1 where more is better, -1 where
     less is.
     """
@@ -20,19 +19,18 @@ class Metric:
 
     @property
     def arrow(self) -> str:
-        """The direction that is better, as the heads of tables show it."""
         return "↑" if self.better > 0 else "↓"
 
-    def written(self, value: float | None) -> str:
+    def format_value(self, value: float | None) -> str:
         """Return a value as people read it; a dash for none."""
         return "-" if value is None else f"{value:.{self.digits}f}"
 
 
 METRICS = (
-    Metric("lpips", "LPIPS", 3, -1),
-    Metric("ssim", "SSIM", 3, 1),
-    Metric("psnr", "PSNR", 2, 1),
-    Metric("psnr_aligned", "aligned PSNR", 2, 1),
-    Metric("wobble", "wobble px", 2, -1),
+    MetricColumn("lpips", "LPIPS", 3, -1),
+    MetricColumn("ssim", "SSIM", 3, 1),
+    MetricColumn("psnr", "PSNR", 2, 1),
+    MetricColumn("psnr_aligned", "aligned PSNR", 2, 1),
+    MetricColumn("temporal_jitter_px", "temporal jitter px", 2, -1),
 )
 NAMES = tuple(metric.name for metric in METRICS)

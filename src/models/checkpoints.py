@@ -1,7 +1,6 @@
 """Checkpoints that are whole or not there: written to a temporary name beside, then renamed.
 
-Lightning's own writer goes through the system's temporary folder; where that is another disk, as on
-most clusters, its last move is a copy, and a run that is killed then leaves half a checkpoint.
+Lightning's own writer moves them from the system's temporary folder, which may be another disk.
 """
 
 import warnings
@@ -12,25 +11,25 @@ from typing import Any
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from src.records.atomic import written
+from src.records.atomic import atomic_path
 
 
-class WholeFiles(TorchCheckpointIO):
+class AtomicCheckpointIO(TorchCheckpointIO):
     """Lightning's plugin that stores checkpoints; they are on the disk when it returns."""
 
     def save_checkpoint(self, checkpoint: dict, path: Any, storage_options: Any = None) -> None:
         """Write `checkpoint` to `path`; an OSError leaves what was there before."""
-        with written(Path(path)) as partial, partial.open("wb") as file:
+        with atomic_path(Path(path)) as partial, partial.open("wb") as file:
             torch.save(checkpoint, file)
 
 
-def whole(path: Path) -> bool:
+def is_intact(path: Path) -> bool:
     """Return whether every part of a checkpoint has the checksum it was written with.
 
     PyTorch's own reader does not look at them: a flipped bit would go unnoticed.
     """
     try:
-        if larger_inside(path):
+        if is_compressed(path):
             return False
         with zipfile.ZipFile(path) as archive:
             return archive.testzip() is None
@@ -38,7 +37,7 @@ def whole(path: Path) -> bool:
         return False
 
 
-def larger_inside(path: Path) -> bool:
+def is_compressed(path: Path) -> bool:
     """Return whether a zip file gives more bytes than it has, as none does that PyTorch wrote: it
     packs nothing, and a small file that is packed could fill the memory.
     """
@@ -46,13 +45,13 @@ def larger_inside(path: Path) -> bool:
         return sum(part.file_size for part in archive.infolist()) > path.stat().st_size
 
 
-def newest(run: Path) -> Path:
+def newest_checkpoint(run: Path) -> Path:
     """Return the newest whole checkpoint in the folder `run` or below; warns of damaged ones.
 
     Raises ValueError, beginning with `ckpt`, where there is none.
     """
     for path in sorted(run.rglob("*.ckpt"), key=lambda path: path.stat().st_mtime_ns)[::-1]:
-        if whole(path):
+        if is_intact(path):
             return path
         warnings.warn(f"{path} is damaged, an older checkpoint is taken", stacklevel=2)
     raise ValueError(f"ckpt must be a folder with a whole checkpoint, got none in {run}")

@@ -5,6 +5,7 @@ head -> three recurrent encoders (stride 2) -> two residual blocks -> three deco
 -> skip sum with the head -> one channel.  10,710,401 parameters with 5 input channels and base 32.
 """
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -15,27 +16,28 @@ from torch.nn import functional
 from torch.nn.utils.parametrizations import spectral_norm as normalise_spectrum
 
 from src.models.layers import ConvGRU, ConvLSTM, ResidualBlock, pad_to_multiple
-from src.sim.optics import centre, layout
+from src.models.network import WINDOW_S, EventToVideoNetwork
+from src.sim.optics import Position, centre_view_index, layout
 
 CELLS = {"convlstm": ConvLSTM, "convgru": ConvGRU}
 ACTIVATIONS = {"sigmoid": torch.sigmoid, "none": lambda x: x}
 SCALES = 3
 
 
-class E2VID(nn.Module):
+class E2VID(EventToVideoNetwork):
     """Voxel grids of `views` views and `bins` bins to frames, window by window.
 
-    `base_channels`: channels of the head, doubled at each of three scales.  `stem_channels`: of one
-    more convolution before, at full resolution, so that many views are not squeezed into a narrow
-    head at once; the head is 3x3 then (None: without, as in the paper).  `state_step`: outside
-    training the finest cell sees its hidden map, in [-1, 1], in steps of so much, so that what no
-    event supports does not creep on from window to window (None: as it is, as in the paper).
+    `base_channels`: of the head, doubled at each of three scales.  `stem_channels`: of one more
+    convolution before the head, which is 3x3 then, for many views (None: none, as in the paper).
+    `state_rounding_step`: outside training the finest cell sees its hidden map, in [-1, 1], in such
+    steps, so that nothing creeps on without events (None: as it is, as in the paper).
     `recurrent`: convlstm or convgru.  `kernel_size`: of head, encoders and decoders (published: 5).
     `final_activation`: sigmoid or none.  `spectral_norm`: keep the largest singular value of the
-    gate kernels at one (Miyato et al. 2018); wrap an unroll in
-    `torch.nn.utils.parametrize.cached()` so that it is computed once.  Raises ValueError for values
-    outside these.
+    gate kernels at one (Miyato et al. 2018), computed once within `parametrize.cached()`.  Raises
+    ValueError for values outside these.
     """
+
+    views: int
 
     def __init__(
         self,
@@ -47,30 +49,36 @@ class E2VID(nn.Module):
         final_activation: str = "sigmoid",
         spectral_norm: bool = False,
         stem_channels: int | None = None,
-        state_step: float | None = None,
+        state_rounding_step: float | None = None,
     ):
         super().__init__()
-        _choose("recurrent", recurrent, CELLS)
-        _choose("final_activation", final_activation, ACTIVATIONS)
-        if kernel_size % 2 == 0 or kernel_size < 1:
-            raise ValueError(f"model.kernel_size must be odd and >= 1, got {kernel_size}")
+        step, is_lstm = state_rounding_step, recurrent == "convlstm"
+        checks = {
+            f"recurrent must be one of {', '.join(CELLS)}, got {recurrent}": recurrent in CELLS,
+            f"final_activation must be one of {', '.join(ACTIVATIONS)}, got {final_activation}": (
+                final_activation in ACTIVATIONS
+            ),
+            f"kernel_size must be odd and >= 1, got {kernel_size}": (
+                kernel_size >= 1 and kernel_size % 2 == 1
+            ),
+            f"stem_channels must be >= 1 or null, got {stem_channels}": (
+                stem_channels is None or stem_channels >= 1
+            ),
+            "state_rounding_step must be in (0, 1], with model.recurrent=convlstm, or null, got "
+            f"{step} with {recurrent}": step is None or (0 < step <= 1 and is_lstm),
+        }
+        for message, passed in checks.items():
+            if not passed:
+                raise ValueError(f"model.{message}")
         self.views, self.bins, self.activation = views, bins, ACTIVATIONS[final_activation]
+        self.state_rounding_step = state_rounding_step
         widths = [base_channels * 2**scale for scale in range(SCALES + 1)]
         pairs = list(pairwise(widths))
-        cell = CELLS[recurrent]
-        if stem_channels is not None and stem_channels < 1:
-            raise ValueError(f"model.stem_channels must be >= 1 or null, got {stem_channels}")
-        if state_step is not None and not (0 < state_step <= 1 and recurrent == "convlstm"):
-            raise ValueError(
-                "model.state_step must be in (0, 1], with model.recurrent=convlstm, or null,"
-                f" got {state_step} with {recurrent}"
-            )
-        self.state_step = state_step
         self.stem = _conv(views * bins, stem_channels, kernel_size) if stem_channels else None
         seen, side = (stem_channels, 3) if stem_channels else (views * bins, kernel_size)
         self.head = _conv(seen, base_channels, side)
         self.encoders = nn.ModuleList(_conv(a, b, kernel_size, stride=2) for a, b in pairs)
-        self.cells = nn.ModuleList(cell(width) for width in widths[1:])
+        self.cells = nn.ModuleList(CELLS[recurrent](width) for width in widths[1:])
         self.resblocks = nn.Sequential(*(ResidualBlock(widths[-1]) for _ in range(2)))
         self.decoders = nn.ModuleList(_conv(b, a, kernel_size) for a, b in reversed(pairs))
         self.pred = nn.Conv2d(base_channels, 1, 1)
@@ -80,20 +88,33 @@ class E2VID(nn.Module):
                 normalise_spectrum(gate)
 
     def forward(
-        self, voxels: Float[Tensor, "n views bins h w"], state: Any = None
+        self,
+        voxels: Float[Tensor, "n views bins h w"],
+        state: Any = None,
+        *,
+        window_s: float | Tensor = WINDOW_S,
+        positions: Sequence[Position] | None = None,
     ) -> tuple[Float[Tensor, "n 1 h w"], Any]:
         """Return the frame at the end of the window and the state, one entry per scale.
 
-        Raises ValueError when views or bins are not the network's.
+        Views are in the order of training; `window_s` and `positions` have no part in it.  Raises
+        ValueError when views or bins are not the network's.
         """
         height, width = voxels.shape[-2:]
         x, (top, left) = self._padded(voxels)
-        frame, after = self.after_first(self.first(x), state)
+        frame, after = self.after_first_layer(self.first_layer(x), state)
         return frame[..., top : top + height, left : left + width], after
 
-    def remember(self, voxels: Float[Tensor, "n views bins h w"], state: Any = None) -> tuple:
-        """Return the state that `forward` does, without drawing the frame."""
-        return self._scales(self.first(self._padded(voxels)[0]), state)[2]
+    def warm_up(
+        self,
+        voxels: Float[Tensor, "n views bins h w"],
+        state: Any = None,
+        *,
+        window_s: float | Tensor = WINDOW_S,
+        positions: Sequence[Position] | None = None,
+    ) -> tuple:
+        """Return the state that `forward` does, without its decoder."""
+        return self.encode(self.first_layer(self._padded(voxels)[0]), state)[2]
 
     def _padded(self, voxels: Tensor) -> tuple[Tensor, tuple[int, int]]:
         if tuple(voxels.shape[1:3]) != (self.views, self.bins):
@@ -102,39 +123,37 @@ class E2VID(nn.Module):
         return pad_to_multiple(voxels.flatten(1, 2), 2**SCALES)
 
     @property
-    def first(self) -> nn.Conv2d:
+    def first_layer(self) -> nn.Conv2d:
         """The layer that sees the grids."""
         return self.head if self.stem is None else self.stem
 
-    def widened(self, weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    def widen_state_dict(self, weights: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return `weights` of the same network on one view, for this one: the first layer sees the
         centre view as before and the others not yet, so that the frames are one view's.
         """
         first = "head.weight" if self.stem is None else "stem.weight"
-        before = centre(layout(self.views)) * self.bins
+        before = centre_view_index(layout(self.views)) * self.bins
         behind = (self.views - 1) * self.bins - before
         padding = (0, 0, 0, 0, before, behind)
         return {n: functional.pad(w, padding) if n == first else w for n, w in weights.items()}
 
-    def after_first(
+    def after_first_layer(
         self, x: Float[Tensor, "n c h w"], state: Any
     ) -> tuple[Float[Tensor, "n 1 h w"], tuple]:
         """Return the frame, padding and all, and the state; `x` is the first layer's, no ReLU."""
-        head, skips, after = self._scales(x, state)
+        head, skips, after = self.encode(x, state)
         return self.activation(self.decode(self.resblocks(skips[-1]), head, skips)), after
 
     def encode(
         self, x: Float[Tensor, "n c h w"], state: Any
     ) -> tuple[Float[Tensor, "n c2 h w"], list[Tensor], tuple]:
         """Return the head, the hidden map of each scale, finest first, and the state."""
-        return self._scales(self.first(x), state)
-
-    def _scales(self, x: Tensor, state: Any) -> tuple[Tensor, list[Tensor], tuple]:
         head = x = self.relu(x if self.stem is None else self.head(self.relu(x)))
         skips, after, states = [], [], list(state or [None] * SCALES)
-        if state and self.state_step and not self.training:
+        step = self.state_rounding_step
+        if state and step and not self.training:
             hidden, memory = states[0]
-            states[0] = (hidden / self.state_step).round() * self.state_step, memory
+            states[0] = (hidden / step).round() * step, memory
         for encoder, cell, before in zip(self.encoders, self.cells, states, strict=True):
             x, new = cell(self.relu(encoder(x)), before)
             skips.append(x)
@@ -153,8 +172,3 @@ class E2VID(nn.Module):
 
 def _conv(inputs: int, outputs: int, kernel_size: int, stride: int = 1) -> nn.Conv2d:
     return nn.Conv2d(inputs, outputs, kernel_size, stride, padding=kernel_size // 2)
-
-
-def _choose(name: str, value: str, allowed: dict) -> None:
-    if value not in allowed:
-        raise ValueError(f"model.{name} must be one of {', '.join(allowed)}, got {value}")

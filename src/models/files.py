@@ -16,91 +16,93 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from src.models.checkpoints import newest, whole
-from src.records.atomic import written
+from src.models.checkpoints import is_intact, newest_checkpoint
+from src.models.e2vid import E2VID
+from src.models.folding import fold_parametrizations, inference_copy
+from src.records.atomic import atomic_path
 
 WEIGHTS = Path(__file__).resolve().parents[2] / "weights"
-ROOMS = ("src.models.", "baselines.")
-WIDENED = "src.models.e2vid.E2VID"  # goes on from its weights on one view
+PACKAGES = ("src.models.", "baselines.")
+WIDENABLE = "src.models.e2vid.E2VID"  # goes on from its weights on one view
 POWER_ITERATIONS = 50
-LARGEST = 4096  # any number in the arguments of a network that a file names
+MAX_SIZE = 4096  # any number in the arguments of a network that a file names
 
 
-def load(name_or_path: str | Path, rooms: Sequence[str] = ()) -> nn.Module:
+def load(name_or_path: str | Path, allowed_packages: Sequence[str] = ()) -> nn.Module:
     """Return the network of a file, float32, in eval mode, spectral norm folded into its weights.
 
     A word names a file of `weights/`; a path is a `.safetensors` file written by `save`, a
     checkpoint of a training run or its folder; its network is of src.models, baselines or one of
-    the packages `rooms`.  Raises ValueError, beginning with `ckpt`, for a file that is not there,
-    is no such file, or holds other weights than its network has.
+    the packages `allowed_packages`.  Raises ValueError, beginning with `ckpt`, for a file that is
+    not there, is no such file, or holds other weights than its network has.
     """
     path = Path(name_or_path)
     shipped = WEIGHTS / f"{name_or_path}.safetensors"
     if not path.is_file() and shipped.is_file():
         path = shipped
     if path.is_dir():
-        path = newest(path)
+        path = newest_checkpoint(path)
     if not path.is_file():
         names = ", ".join(sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))) or "none yet"
         raise ValueError(f"ckpt must be a file or one of weights/ ({names}), got {name_or_path}")
-    spec, weights = (_safetensors if exported(path) else _checkpoint)(path)
-    check_memory(weights, path, "ckpt")
+    spec, weights = (_exported if is_exported(path) else _checkpoint)(path)[:2]
+    check_stored_size(weights, path, "ckpt")
     with torch.device("meta"):  # without memory: a small file may name a huge network
-        empty = _build(spec, path, rooms)
-    _check_fit(type(empty), empty.state_dict(), weights, path)
-    network = _build(spec, path, rooms)
+        empty = _build(spec, path, allowed_packages)
+    check_fit(f"ckpt does not fit {type(empty).__name__} in {path}", empty.state_dict(), weights)
+    network = _build(spec, path, allowed_packages)
     network.load_state_dict(weights)
-    fold(network)
+    fold_parametrizations(network)
     return network.float().eval()
 
 
-def require(name: str | Path, spec: dict) -> Path:
+def find_checkpoint(name: str | Path, spec: dict) -> Path:
     """Return the file to go on from: `name`, or the newest whole checkpoint in the folder `name`.
 
     Raises ValueError unless it is a whole checkpoint, or a file of `save`, of the network `spec`;
     a file of `save` may also be of the same E2VID on one view.
     """
-    path = newest(Path(name)) if Path(name).is_dir() else Path(name)
+    path = newest_checkpoint(Path(name)) if Path(name).is_dir() else Path(name)
     if not path.is_file():
         raise ValueError(f"ckpt must be a checkpoint to go on from, got {path}")
-    saved, _ = (_safetensors if exported(path) else _checkpoint)(path)
-    wanted = spec | {"kwargs": spec["kwargs"] | _unnormalised(spec)} if exported(path) else spec
-    fits = saved == wanted
-    if exported(path) and spec["target"] == WIDENED:
-        fits |= saved == wanted | {"kwargs": wanted["kwargs"] | {"views": 1}}
-    if not fits:
+    saved, _ = (_exported if is_exported(path) else _checkpoint)(path)[:2]
+    wanted = [spec]
+    if is_exported(path):
+        kwargs = spec["kwargs"] | _without_spectral_norm(spec)
+        one_view = {"views": 1} if spec["target"] == WIDENABLE else {}
+        wanted = [spec | {"kwargs": kwargs | more} for more in ({}, one_view)]
+    if saved not in wanted:
         raise ValueError(f"ckpt must be of the network {spec} to go on from, got {saved} in {path}")
     return path
 
 
-def exported(path: Path) -> bool:
+def is_exported(path: Path) -> bool:
     """Return whether `path` is a file of `save`, without the state of an optimiser."""
     return path.suffix == ".safetensors"
 
 
-def card(path: Path) -> dict:
-    """Return what `save` was given beside the weights of the file `path`.
+def read_card(path: Path) -> dict:
+    """Return what `save` was given beside the weights of the file `path`; ValueError as `load`."""
+    return _exported(path)[2]
 
-    Raises ValueError, beginning with `ckpt`, for another kind of file.
-    """
-    try:
-        with safe_open(path, "pt") as file:
-            return json.loads(file.metadata()["card"])
-    except Exception as error:  # libraries raise all kinds on a broken file
-        raise ValueError(f"ckpt must be a network written by this project, got {path}") from error
+
+def network_spec(path: Path) -> dict:
+    """Return `target` and `kwargs` of the network of a file of `save`; ValueError as `load`."""
+    return _exported(path)[0]
 
 
 @torch.no_grad()
-def restore(network: nn.Module, path: Path) -> None:
+def restore_weights(network: nn.Module, path: Path) -> None:
     """Give `network` the weights of a file of `save`; spectral norms find their vectors anew.
 
-    An E2VID on many views takes those of one view too (E2VID.widened).  Raises ValueError,
+    An E2VID on many views takes those of one view too (E2VID.widen_state_dict).  Raises ValueError,
     beginning with `ckpt`, for the weights of another network.
     """
-    spec, weights = _safetensors(path)
-    if spec["target"] == WIDENED and spec["kwargs"].get("views", 1) == 1:
-        weights = network.widened(weights)
-    _check_fit(type(network), folded(network), weights, path)
+    spec, weights, _ = _exported(path)
+    if isinstance(network, E2VID) and spec["kwargs"].get("views", 1) == 1:
+        weights = network.widen_state_dict(weights)
+    own = inference_copy(network).state_dict()
+    check_fit(f"ckpt does not fit {type(network).__name__} in {path}", own, weights)
     for prefix, module in network.named_modules():
         if parametrize.is_parametrized(module, "weight"):
             module.weight = weights.pop(f"{prefix}.weight")
@@ -114,52 +116,34 @@ def save(path: Path, network: nn.Module, spec: dict, card: dict) -> None:
     """Write `network`, spectral norm folded, as float16 safetensors with `spec` and `card` (plain
     values: data, seeds, commit, metrics ...) in its header; whole or not at all.
     """
-    spec = {"target": spec["target"], "kwargs": spec["kwargs"] | _unnormalised(spec)}
+    spec = {"target": spec["target"], "kwargs": spec["kwargs"] | _without_spectral_norm(spec)}
     plain = _build(spec, path, [type(network).__module__])
-    plain.load_state_dict(folded(network))
+    plain.load_state_dict(inference_copy(network).state_dict())
     halves = {
         name: (value.half() if value.is_floating_point() else value).contiguous()
         for name, value in plain.state_dict().items()
     }
-    with written(path) as partial:
+    with atomic_path(path) as partial:
         save_file(halves, partial, {"network": json.dumps(spec), "card": json.dumps(card)})
 
 
-def fold(network: nn.Module) -> None:
-    """Replace every parametrised weight by its value, in place."""
-    for module in network.modules():
-        if parametrize.is_parametrized(module, "weight"):
-            module.eval()  # else folding would take one more power iteration
-            parametrize.remove_parametrizations(module, "weight")
-
-
-def folded(network: nn.Module) -> dict[str, Tensor]:
-    """Return the state dict of `network` as if its parametrisations were folded."""
-    values = {}
-    for prefix, module in network.named_modules():
-        if parametrize.is_parametrized(module, "weight"):
-            module.eval()
-            values[f"{prefix}.weight"] = module.weight.detach().clone()
-    kept = network.state_dict()
-    return {name: kept[name] for name in kept if "parametrizations" not in name} | values
-
-
-def _unnormalised(spec: dict) -> dict:
+def _without_spectral_norm(spec: dict) -> dict:
     return {"spectral_norm": False} if "spectral_norm" in spec["kwargs"] else {}
 
 
-def _safetensors(path: Path) -> tuple[dict, dict[str, Tensor]]:
+def _exported(path: Path) -> tuple[dict, dict[str, Tensor], dict]:
+    """Return `target` and `kwargs` of the network of a file of `save`, its weights and its card."""
     try:
         with safe_open(path, "pt") as file:
-            header = file.metadata() or {}
+            header = file.metadata()
             weights = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118
-        return json.loads(header["network"]), weights
+        return json.loads(header["network"]), weights, json.loads(header["card"])
     except Exception as error:  # libraries raise all kinds on a broken file
         raise ValueError(f"ckpt must be a network written by this project, got {path}") from error
 
 
 def _checkpoint(path: Path) -> tuple[dict, dict[str, Tensor]]:
-    if not whole(path):
+    if not is_intact(path):
         raise ValueError(f"ckpt must be a checkpoint of src.train that is whole, got {path}")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
@@ -171,18 +155,18 @@ def _checkpoint(path: Path) -> tuple[dict, dict[str, Tensor]]:
         raise ValueError(f"ckpt must be a checkpoint of src.train, got {path}") from error
 
 
-def _build(spec: dict, path: Path, rooms: Sequence[str] = ()) -> nn.Module:
+def _build(spec: dict, path: Path, allowed_packages: Sequence[str] = ()) -> nn.Module:
     try:
         target, kwargs = str(spec["target"]), dict(spec["kwargs"])
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"ckpt must name its network, got {path}") from error
-    homes = (*ROOMS, *(f"{room}." for room in rooms))
+    homes = (*PACKAGES, *(f"{package}." for package in allowed_packages))
     if not target.startswith(homes):
         raise ValueError(
             f"ckpt must hold a network of {' or '.join(homes)}, got {target} in {path}; "
-            "networks of a package of your own are let in by rooms=[<package>]"
+            "networks of a package of your own are let in by allowed_packages=[<package>]"
         )
-    _check_sizes(kwargs, path)
+    _check_numbers(kwargs, path)
     room, _, name = target.rpartition(".")
     try:
         kind = getattr(import_module(room), name)
@@ -194,16 +178,16 @@ def _build(spec: dict, path: Path, rooms: Sequence[str] = ()) -> nn.Module:
         raise ValueError(f"ckpt names a network that is not here: {wanted} in {path}") from error
 
 
-def _check_sizes(value: Any, path: Path) -> None:
-    """Raise ValueError for a number beyond LARGEST: such a network would fill the memory."""
+def _check_numbers(value: Any, path: Path) -> None:
+    """Raise ValueError for a number beyond MAX_SIZE: such a network would fill the memory."""
     if isinstance(value, dict | list | tuple):
         for part in value.values() if isinstance(value, dict) else value:
-            _check_sizes(part, path)
-    elif isinstance(value, int | float) and not abs(value) <= LARGEST:
-        raise ValueError(f"ckpt must hold sizes up to {LARGEST}, got {value} in {path}")
+            _check_numbers(part, path)
+    elif isinstance(value, int | float) and not abs(value) <= MAX_SIZE:
+        raise ValueError(f"ckpt must hold sizes up to {MAX_SIZE}, got {value} in {path}")
 
 
-def check_memory(weights: dict[str, Tensor], path: Path, key: str) -> None:
+def check_stored_size(weights: dict[str, Tensor], path: Path, key: str) -> None:
     """Raise ValueError, beginning with `key`, for weights of more numbers than the file has bytes:
     in a view of a few numbers any size fits, but the network made for it has to hold them all.
     """
@@ -214,12 +198,11 @@ def check_memory(weights: dict[str, Tensor], path: Path, key: str) -> None:
         )
 
 
-def _check_fit(kind: type, own: dict[str, Tensor], weights: dict[str, Tensor], path: Path) -> None:
-    """Raise ValueError unless `weights` are those of `own`, the state of a network of a `kind`."""
+def check_fit(error: str, own: dict[str, Tensor], weights: dict[str, Tensor]) -> None:
+    """Raise ValueError, beginning with `error`, unless `weights` have the names and shapes of
+    `own`.
+    """
     missing, extra = sorted(own.keys() - weights.keys()), sorted(weights.keys() - own.keys())
-    other = [n for n in own.keys() & weights.keys() if own[n].shape != weights[n].shape]
+    other = sorted(n for n in own.keys() & weights.keys() if own[n].shape != weights[n].shape)
     if missing or extra or other:
-        raise ValueError(
-            f"ckpt does not fit {kind.__name__} in {path}: missing {missing}, "
-            f"extra {extra}, of another shape {sorted(other)}"
-        )
+        raise ValueError(f"{error}: missing {missing}, extra {extra}, of another shape {other}")

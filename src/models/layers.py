@@ -1,5 +1,7 @@
 """Layers that recurrent reconstruction networks are made of; state in, state out."""
 
+from typing import Literal
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -28,7 +30,7 @@ class ConvLSTM(nn.Module):
     Gate order along the channels: input, forget, output, candidate.
     """
 
-    def __init__(self, channels: int, padding_mode: str = "zeros"):
+    def __init__(self, channels: int, padding_mode: Literal["zeros", "reflect"] = "zeros"):
         super().__init__()
         self.gates = nn.Conv2d(2 * channels, 4 * channels, 3, padding=1, padding_mode=padding_mode)
 
@@ -56,7 +58,7 @@ class ConvGRU(nn.Module):
         self.out_gate = nn.Conv2d(2 * channels, channels, 3, padding=1)
         for gate in (self.reset_gate, self.update_gate, self.out_gate):
             nn.init.orthogonal_(gate.weight)
-            nn.init.zeros_(gate.bias)
+            nn.init.zeros_(bias_of(gate))
 
     def forward(
         self, x: Float[Tensor, "n c h w"], state: Tensor | None
@@ -80,5 +82,57 @@ class ResidualBlock(nn.Module):
         self.relu = nn.ReLU()
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
-        """Return a map of the same shape."""
         return self.relu(x + self.conv2(self.relu(self.conv1(x))))
+
+
+class PreActivationBlock(nn.Module):
+    """Adds two 3 x 3 convolutions to a map, a ReLU before each (He et al. 2016); zero at first."""
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.conv1 = init_kaiming(nn.Conv2d(channels, channels, 3, padding=1))
+        self.conv2 = init_zero(nn.Conv2d(channels, channels, 3, padding=1))
+        self.relu = nn.ReLU()
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
+        return x + self.conv2(self.relu(self.conv1(self.relu(x))))
+
+
+class EqualDCConv(nn.Conv2d):
+    """A convolution whose outputs, the pixels of a cell, have the same response to a constant
+    input: an area without detail gets no pattern of its pixels.
+    """
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n pixels _h _w"]:
+        return functional.conv2d(x, *self.equalised())
+
+    def equalised(self) -> tuple[Tensor, Tensor]:
+        """Return the kernels and the bias that are used."""
+        response = self.weight.mean((2, 3), keepdim=True)  # to a constant input
+        weight = self.weight - response + response.mean(0, keepdim=True)
+        return weight, bias_of(self).mean().expand(len(weight))
+
+
+def upsample_nearest(x: Float[Tensor, "n c h w"], factor: int) -> Float[Tensor, "n c _h _w"]:
+    """Return `x` with every pixel repeated `factor` times along both axes."""
+    return functional.interpolate(x, scale_factor=factor, mode="nearest")
+
+
+def bias_of(layer: nn.Conv2d | nn.Linear) -> Tensor:
+    """Return the bias of a layer that has one."""
+    assert layer.bias is not None
+    return layer.bias
+
+
+def init_kaiming(conv: nn.Conv2d) -> nn.Conv2d:
+    """Return `conv` initialised to keep the scale of its input (He et al. 2015)."""
+    nn.init.kaiming_normal_(conv.weight, nonlinearity="relu")
+    nn.init.zeros_(bias_of(conv))
+    return conv
+
+
+def init_zero(conv: nn.Conv2d) -> nn.Conv2d:
+    """Return `conv` with zeros."""
+    nn.init.zeros_(conv.weight)
+    nn.init.zeros_(bias_of(conv))
+    return conv

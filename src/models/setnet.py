@@ -1,80 +1,166 @@
-"""SetNet, ours: frames from any number of views, at any rate, at a fraction of E2VID's cost.
+"""SetNet: video from the events of a set of 1 to 25 views, at any window length.
 
-Views come in as a set: a view's kernel follows from its position, so the first layer is a stack of
-views with weights made for whoever is there; the spread across views says where they agree.  Leaky
-sums of events give the network a memory from its first step.  Time passes in seconds, not in
-windows, and only while events come: one set of weights serves 120 and 12,000 windows a second, and
-a picture without events stays.
+One window of events and the state in, one frame and the new state out.  n: clips, m: windows * n in
+order of time, c: `channels` (16, 40 or 64), hk and wk: height and width, padded to a multiple of 8,
+divided by k.  Right column: fields of SetNetState.
 
-half resolution: stem, memory -> what lies around, at a quarter, an eighth, a sixteenth -> 2 x 2
-pixels.  One looks around at most 30 times a second; what was seen there goes into a running mean,
-and the picture fades to that, so that areas do not change in steps (docs/decisions/0021 to 0024).
+    voxels (n, views, bins, h, w)
+      |            |
+      |          sum over bins and 2 x 2 pixels               (n, views, h2, w2)
+      |          leaky sums, tau 0.05 s and 0.5 s             (n, views, 2, h2, w2)  view_sums
+      |            |            |
+      |            |          mean absolute deviation
+      |            |          from the mean of the views      (n, 2, h2, w2)
+      |            |            |
+    5 x 5, /2    3 x 3        3 x 3     convolutions, each to (n, c, h2, w2)
+    per 1/120 s    |            |
+      +--- sum ----+------------+
+            | ReLU                                            (n, c, h2, w2)
+    time-gated memory: input 3 x 3, state 1 x 1               (n, c, h2, w2)         hidden
+            |
+            +-----------------+
+            |          context pyramid: /4, /8, /16 and back, at most every 1/30 s
+            |          moving average                         (n, c, h4, w4)  context_average
+            |          low-pass, tau 1/60 s                   (n, c, h4, w4)  context_smoothed
+            |                 |
+            + sum <- nearest -+                               (n, c, h2, w2)
+            | ReLU, 3 x 3, ReLU, 3 x 3 with equal DC response (n, 4, h2, w2)
+            | pixel shuffle, sigmoid
+    frame (n, 1, h, w)
+
+* Set of views: the views are stacked as channels of one convolution, and the kernel of each is a
+  function of its position and of the number of views: one set of weights serves any arrangement.
+  Their spread (mean absolute deviation) separates turbulence, different in each view, from the
+  scene, common to all.
+* Leaky sums: the polarities of a pixel sum to its change of log intensity, in thresholds; the leak
+  bounds the accumulated error.
+* Any window length: all state decays exponentially in time, not per window, and voxel counts become
+  rates.  While a clip has no events in any view, its clock advances by at most 5 ms in all; then
+  state and frame are held.
+* Context: events lie at edges, so the brightness of a uniform area follows from edges that may be
+  far; the pyramid provides the receptive field.  The context is updated at most 30 times a second
+  and low-pass filtered, so that the frame does not change in steps.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor, nn
 from torch.nn import functional
 
-from src.models.layers import pad_to_multiple
-from src.models.setnet_layers import Even, PacedUnit, Surroundings, ViewKernels, grown, over_time
-from src.sim.optics import layout
+from src.models.layers import (
+    EqualDCConv,
+    PreActivationBlock,
+    bias_of,
+    init_kaiming,
+    init_zero,
+    pad_to_multiple,
+    upsample_nearest,
+)
+from src.models.network import EventToVideoNetwork
+from src.models.time_gated_update import TimeGatedUpdate, time_gated_update
+from src.sim.optics import Position, layout
 
-SIZES = {  # channels; multiply-accumulates at 176 x 176 with nine views: 0.34, 1.2 and 3.5 G
-    "small": {"half": 16, "around": [32, 64, 96]},
-    "medium": {"half": 40, "around": [56, 96, 128], "refined": True, "rank": 32},
-    "large": {"half": 64, "around": [128, 192, 256], "refined": True, "rank": 32},
-}
-MEMORIES_S = (0.05, 0.5)  # time constants of the leaky sums
-AWAKE_S = 0.005  # time constant by which a picture falls asleep after its last event
-RATE = 120.0  # windows a second at which a gate is taken as it is
-LOOK_S = 1 / 30  # what passes until one looks around again ...
-DUE = math.exp(-0.98)  # ... by how recent that is then; 2 % for rounding
-FADE_S = 1 / 60  # time constant by which a picture follows what was seen around
+SIZES: dict[str, dict[str, Any]] = {  # GMAC at 176 x 176, 9 views, context included: 0.34, 1.2, 3.5
+    "small": {"channels": 16, "context_channels": [32, 64, 96]},
+    "medium": {
+        "channels": 40, "context_channels": [56, 96, 128], "refine_fusion": True, "gate_rank": 32,
+    },
+    "large": {
+        "channels": 64, "context_channels": [128, 192, 256], "refine_fusion": True, "gate_rank": 32,
+    },
+}  # fmt: skip
 MAX_VIEWS = 25
-CELL = 2  # pixels: side of what the first layer sees as one
-BORDER = 2  # cells beyond the border that the layers which draw see
+CELL_PX = 2  # a cell: CELL_PX x CELL_PX pixels, one place of the half-resolution maps
+CELL_BORDER = 2  # padding, in cells, of the decoder's two 3 x 3 convolutions together
+REFERENCE_HZ = 120.0  # window rate in training; unit of time of rates and gates: 1 / REFERENCE_HZ
+SUM_TAUS_S = (0.05, 0.5)  # time constants of the leaky sums
+ACTIVITY_TAU_S = 0.005  # decay of the activity; at most this passes after the last event
+CONTEXT_INTERVAL_S = 1 / 30  # shortest time between two context updates
+UPDATE_RECENCY = math.exp(-0.98)  # an update is due at or below it: 0.98 intervals, for rounding
+CONTEXT_TAU_S = 1 / 60  # time constant of the low-pass on the context
+INITIAL_CONTEXT_RATE = 0.9  # initial decay rate of the moving average, per CONTEXT_INTERVAL_S
 
-Position = tuple[int, int]
-State = tuple[Tensor, ...]
+
+class SetNetState(NamedTuple):
+    """What is carried from window to window, float32; zeros before the first."""
+
+    view_sums: Float[Tensor, "n views taus h2 w2"]  # leaky polarity sums, per view and cell
+    activity: Float[Tensor, "n 1 1 1"]  # clock speed: 1 with events, decaying without
+    context_recency: Float[Tensor, "n 1 1 1"]  # exp(-age / CONTEXT_INTERVAL_S); 0: no context yet
+    hidden: Float[Tensor, "n c h2 w2"]  # memory, in [-1, 1]
+    context_average: Float[Tensor, "n c h4 w4"]  # moving average of the pyramid's output
+    context_smoothed: Float[Tensor, "n c h4 w4"]  # the same, low-pass filtered in time
 
 
-class SetNet(nn.Module):
-    """Voxel grids of 1 to 25 views to frames in [0, 1], window by window.
+class ClockTick(NamedTuple):
+    """Clock of one window, (n, 1, 1, 1), or of all, (m, 1, 1, 1): tensors, or NumPy scalars."""
 
-    `half`: channels at half resolution; `around`: at a quarter and each coarser one; `refined`:
-    see Surroundings; `rank`: see PacedUnit.  The order of the views is free but the same in all
-    windows of a sequence.
+    elapsed_s: Any  # time by which the state advances
+    context_recency: Any  # at the end of the window, before its update
+    update_due: Any  # whether the context is updated
+
+
+def advance_clock(
+    has_events: Any, window_s: Any, activity: Any, context_recency: Any, xp: Any = torch
+) -> tuple[ClockTick, Any, Any]:
+    """Return the tick of a window, and activity and context recency after it.
+
+    With events the clock advances by `window_s` and activity is 1; without, activity decays and the
+    clock advances by its integral over the window.  A context update is due if the clock advances
+    and the last is CONTEXT_INTERVAL_S old or missing.  `xp`: torch or numpy, as the arguments.
+    """
+    kept = xp.exp(-window_s / ACTIVITY_TAU_S)
+    elapsed_s = xp.where(has_events, window_s, activity * ACTIVITY_TAU_S * (1 - kept))
+    activity = xp.where(has_events, 1.0, activity * kept)
+    recency = context_recency * xp.exp(-elapsed_s / CONTEXT_INTERVAL_S)
+    update_due = (recency <= UPDATE_RECENCY) & (elapsed_s > 0)
+    tick = ClockTick(elapsed_s, recency, update_due)
+    return tick, activity, xp.where(update_due, 1.0, recency)
+
+
+class SetNet(EventToVideoNetwork):
+    """The network of the module's diagram.
+
+    `channels`: at half resolution; `context_channels`: at a quarter and each coarser scale;
+    `refine_fusion`: see ContextPyramid; `gate_rank`: see TimeGatedMemory.  Views may come in
+    any order, the same in all windows of a sequence.
     """
 
-    views = None
+    uses_window_length = True
 
     def __init__(
         self,
         bins: int = 5,
-        half: int = 16,
-        around: Sequence[int] = (32, 64, 96),
-        refined: bool = False,
-        rank: int | None = None,
+        channels: int = 16,
+        context_channels: Sequence[int] = (32, 64, 96),
+        refine_fusion: bool = False,
+        gate_rank: int | None = None,
     ):
         super().__init__()
-        self.arguments = {"bins": bins, "half": half, "around": list(around)}  # that make it again
-        self.arguments |= {"refined": True} if refined else {}
-        self.arguments |= {"rank": rank} if rank else {}
-        self.bins, self.half, memories = bins, half, len(MEMORIES_S)
-        self.voxel_stem = ViewKernels(bins, half, 5)
-        self.sum_stem = ViewKernels(memories, half, 3)
-        self.spread_stem = nn.Conv2d(memories, half, 3, padding=1, bias=False)
-        self.cell2 = PacedUnit(half, rank)
-        self.around = Surroundings(half, around, refined)
-        self.mix2 = nn.Conv2d(half, half, 3, padding=BORDER, padding_mode="replicate")
-        self.shuffle = Even(half, CELL**2, 3)
+        self.init_kwargs = {
+            "bins": bins, "channels": channels, "context_channels": list(context_channels),
+            "refine_fusion": refine_fusion, "gate_rank": gate_rank,
+        }  # fmt: skip
+        self.bins, self.channels, taus = bins, channels, len(SUM_TAUS_S)
+        self.voxel_kernels = ViewKernels(bins, channels, 5)
+        self.sum_kernels = ViewKernels(taus, channels, 3)
+        self.spread_conv = nn.Conv2d(taus, channels, 3, padding=1, bias=False)
+        self.memory: nn.Module = TimeGatedMemory(channels, gate_rank)
+        self.context = ContextPyramid(channels, context_channels, refine_fusion)
+        # Replicated: zero padding would imprint a 2 x 2 pixel pattern along the border.
+        self.decoder_conv: nn.Module = nn.Conv2d(
+            channels, channels, 3, padding=CELL_BORDER, padding_mode="replicate"
+        )
+        self.pixel_conv: nn.Module = EqualDCConv(channels, CELL_PX**2, 3)
         self.relu = nn.ReLU()
-        self.frozen: dict[tuple, tuple[Tensor, ...]] | None = None  # kernels kept, for running
+        # For inference: a cache of stem kernels by positions; None: recomputed in every call.
+        self.cached_kernels: dict[tuple, tuple[Tensor, Tensor, Tensor]] | None = None
 
     @classmethod
     def preset(cls, size: str, bins: int = 5) -> "SetNet":
@@ -86,18 +172,16 @@ class SetNet(nn.Module):
     def forward(
         self,
         voxels: Float[Tensor, "n views bins h w"],
-        state: State | None = None,
+        state: SetNetState | None = None,
         *,
-        window_s: float | Tensor = 1 / RATE,
+        window_s: float | Tensor = 1 / REFERENCE_HZ,
         positions: Sequence[Position] | None = None,
-    ) -> tuple[Float[Tensor, "n 1 h w"], State]:
-        """Return the frame at the end of the window, float32, and the state.
+    ) -> tuple[Float[Tensor, "n 1 h w"], SetNetState]:
+        """Return the frame at the end of the window, in [0, 1], float32, and the state.
 
-        `window_s`: how long the window lasts, in seconds, a number or one per clip (n,).
-        `positions`: (row, col) of each view from the centre view; default: `optics.layout`.
-        State, float32: leaky sums of each view, in cells, how awake each picture is, how recently
-        one looked around, 1 just now, 0 never, and the maps of `hidden`.  Raises ValueError for
-        bins, a number of views, a length of window or a state that do not fit.
+        `window_s`: the length of the window in seconds, a number or one per clip (n,).
+        `positions`: (row, col) of each view from the centre view; None: `optics.layout`.  Raises
+        ValueError for bins, a number of views, a window length or a state that do not fit.
         """
         frames, state = self.sequence(
             voxels[:, None], state, window_s=window_s, positions=positions
@@ -107,109 +191,113 @@ class SetNet(nn.Module):
     def sequence(
         self,
         voxels: Float[Tensor, "n windows views bins h w"],
-        state: State | None = None,
+        state: SetNetState | None = None,
         *,
-        window_s: float | Tensor = 1 / RATE,
+        window_s: float | Tensor = 1 / REFERENCE_HZ,
         positions: Sequence[Position] | None = None,
-        shown: Sequence[int] | None = None,
-    ) -> tuple[Float[Tensor, "n shown 1 h w"], State]:
-        """Return the frames of the windows `shown` (None: of all), as window by window, and the
-        state after the last one.
+        output_windows: Sequence[int] | None = None,
+    ) -> tuple[Float[Tensor, "n outputs 1 h w"], SetNetState]:
+        """Return the frames of `output_windows` (None: all) and the state after the last window.
 
-        Layer by layer: only what is remembered goes window by window, all else sees all of them at
-        once, in order of time (windows * n), and what is drawn those that are shown.
+        Only the recurrences run window by window; all other layers run once, with all windows in
+        the batch (m = windows * n, in order of time), the decoder with `output_windows` only.
         """
         n, windows, views, bins, height, width = voxels.shape
-        places = self.places(views, bins, positions)
-        seconds = _seconds(window_s, voxels)
+        where = self.checked_positions(views, bins, positions)
+        seconds = _durations(window_s, voxels)
         padded, (top, left) = pad_to_multiple(voxels.flatten(0, 2), 8)
         voxels = padded.unflatten(0, (n, windows, views)).transpose(0, 1)
-        cells = _halved(voxels.float().sum(3).flatten(0, 1))
-        sums, awake, recent, hidden, about, told = self._start(state, cells[:n])
+        cells = _sum_cells(voxels.float().sum(3).flatten(0, 1))
+        before = self._checked_state(state, cells[:n])
 
-        awake, passed = _time(cells, awake, seconds)
-        recent, before, due = _looks(passed, recent)
-        kept = torch.stack([torch.exp(-passed / memory) for memory in MEMORIES_S], 2)
-        every, sums = over_time(_leaked, sums, kept, cells[:, :, None])
-        spread = (every - every.mean(1, keepdim=True)).abs().mean(1)
-
-        grids, memories, bias = self.kernels(places)
-        stacked = _cast(voxels.flatten(2, 3), grids.dtype)
-        stem = functional.conv2d(stacked, grids, None, CELL, grids.shape[-1] // 2)
-        memory = _cast(torch.cat([every.flatten(1, 2), spread], 1)[None], memories.dtype)
-        stem = _as_rates(stem, seconds) + functional.conv2d(memory, memories, bias, 1, 1)
-        seen, hidden = self.fine(stem, passed, hidden)
-        around, about = self.looked(seen, about, before, due)
-        fading, told = over_time(faded, told, around, passed)
-        if shown is not None:
-            seen, fading = (_windows(maps, n, shown) for maps in (seen, fading))
-        frames = functional.pixel_shuffle(self.drawn(seen, fading), CELL).sigmoid()
+        tick, activity, recency = _run_clock(cells, seconds, before)
+        decay = torch.stack([torch.exp(-tick.elapsed_s / tau) for tau in SUM_TAUS_S], 2)
+        sums, view_sums = scan_windows(_leaky_sum, before.view_sums, decay, cells[:, :, None])
+        stem = self.stem(voxels, sums, seconds, where)
+        features, hidden = self.run_memory(stem, before.hidden, tick.elapsed_s)
+        contexts, context = self.average_context(features, before.context_average, tick)
+        smoothed, context_smoothed = scan_windows(
+            smooth_context, before.context_smoothed, contexts, tick.elapsed_s
+        )
+        if output_windows is not None:
+            features, smoothed = (
+                _select_windows(maps, n, output_windows) for maps in (features, smoothed)
+            )
+        frames = functional.pixel_shuffle(self.decode_logits(features, smoothed), CELL_PX).sigmoid()
         frames = frames[..., top : top + height, left : left + width]
         frames = frames.unflatten(0, (-1, n)).transpose(0, 1)
-        return frames, (sums, awake, recent, hidden, about, told)
+        after = view_sums, activity, recency, hidden, context, context_smoothed
+        return frames, SetNetState(*after)
 
-    def fine(
-        self, stem: Float[Tensor, "m c h2 w2"], passed: Float[Tensor, "m 1 1 1"], hidden: Tensor
-    ) -> tuple[Float[Tensor, "m c h2 w2"], Tensor]:
-        """Return what is known at half resolution after each of m = windows * n, and the hidden map
-        after the last; `stem`: before its ReLU, `passed`: seconds.
-        """
-        seen, hidden = self.cell2(self.relu(stem), hidden, RATE * passed)
-        return seen.to(stem.dtype), hidden
-
-    def looked(
+    def stem(
         self,
-        seen: Float[Tensor, "m c h2 w2"],
-        about: Float[Tensor, "n c h4 w4"],
-        recent: Float[Tensor, "m 1 1 1"],
-        due: Bool[Tensor, "m 1 1 1"],
+        voxels: Float[Tensor, "windows n views bins h w"],
+        view_sums: Float[Tensor, "m views taus h2 w2"],
+        seconds: Float[Tensor, "_n 1 1 1"],
+        positions: tuple[Position, ...],
+    ) -> Float[Tensor, "m c h2 w2"]:
+        """Return the sum of the three first convolutions, before the ReLU."""
+        voxel_kernel, sum_kernel, bias = self.stem_kernels(positions)
+        spread = (view_sums - view_sums.mean(1, keepdim=True)).abs().mean(1)
+        stacked = _as_conv_input(voxels.flatten(2, 3), voxel_kernel.dtype)
+        counts = functional.conv2d(
+            stacked, voxel_kernel, None, CELL_PX, voxel_kernel.shape[-1] // 2
+        )
+        sums = torch.cat([view_sums.flatten(1, 2), spread], 1)
+        sums = _as_conv_input(sums[None], sum_kernel.dtype)
+        return _as_rates(counts, seconds) + functional.conv2d(sums, sum_kernel, bias, 1, 1)
+
+    def run_memory(
+        self, stem: Float[Tensor, "m c h2 w2"], hidden: Tensor, elapsed_s: Float[Tensor, "m 1 1 1"]
+    ) -> tuple[Float[Tensor, "m c h2 w2"], Tensor]:
+        """Return the hidden map after each window, in the type of `stem`, and after the last."""
+        features, hidden = self.memory(self.relu(stem), hidden, REFERENCE_HZ * elapsed_s)
+        return features.to(stem.dtype), hidden
+
+    def average_context(
+        self, features: Float[Tensor, "m c h2 w2"], context: Tensor, tick: ClockTick
     ) -> tuple[Float[Tensor, "m c h4 w4"], Float[Tensor, "n c h4 w4"]]:
-        """Return what lies around, float32, in each of m = windows * n and after the last; `about`:
-        before the first, `due`: whether one looks, `recent`: how recently one had.
-        """
-        if len(seen) == len(about) or seen.is_cuda:
-            # An export, or a GPU that would wait for it, has shapes that do not depend on `due`.
-            now = self.around(seen).float()
-        else:  # the windows in which nobody looks do not count
-            looks = due.flatten().nonzero().flatten()
-            now = about.new_zeros(len(seen), *about.shape[1:])
-            now = now.index_copy(0, looks, self.around(seen[looks]).float())
+        """Return the moving average after each window and after the last, float32."""
+        if len(features) == len(context) or features.is_cuda:
+            # Shapes that depend on data cannot be exported and would synchronise a GPU: run on all.
+            new = self.context(features).float()
+        else:
+            due = tick.update_due.flatten().nonzero().flatten()
+            new = context.new_zeros(len(features), *context.shape[1:])
+            new = new.index_copy(0, due, self.context(features[due]).float())
 
-        def step(before: Tensor, now: Tensor, recent: Tensor, due: Tensor) -> Tensor:
-            return torch.where(due, self.around.mean(before, now, recent), before)
+        def step(before: Tensor, new: Tensor, recency: Tensor, due: Tensor) -> Tensor:
+            return torch.where(due, self.context.moving_average(before, new, recency), before)
 
-        return over_time(step, about, now, recent, due)
+        return scan_windows(step, context, new, tick.context_recency, tick.update_due)
 
-    def drawn(
-        self, seen: Float[Tensor, "m c h2 w2"], told: Float[Tensor, "m c h4 w4"]
+    def decode_logits(
+        self, features: Float[Tensor, "m c h2 w2"], context: Float[Tensor, "m c h4 w4"]
     ) -> Float[Tensor, "m pixels _h2 _w2"]:
-        """Return the pixels of each cell (with `FourCells`, of 2 x 2 cells) as channels, float32,
-        before their sigmoid; `told`: of what lies around.  Maps go on beyond the border as they are
-        there: zeros would make a pattern of its pixels.
-        """
-        x = self.relu(grown(told.to(seen.dtype), 2) + seen)
-        return self.shuffle(self.relu(self.mix2(x))).float()
+        """Return the logits of the pixels of each cell, as channels, float32."""
+        x = self.relu(upsample_nearest(context.to(features.dtype), 2) + features)
+        return self.pixel_conv(self.relu(self.decoder_conv(x))).float()
 
-    def kernels(self, places: tuple[Position, ...]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the kernels of the stem for views that stand at `places`: of the stacked grids
-        (stem, views * bins, 5, 5), of the stacked sums and their spread, and the bias.
+    def stem_kernels(self, positions: tuple[Position, ...]) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the kernels of stacked voxels (c, views * bins, 5, 5) and of stacked sums and
+        their spread (c, views * taus + taus, 3, 3), for views at `positions`, and the bias (c,).
         """
-        device = self.shuffle.bias.device
-        if self.frozen is not None and (places, device) in self.frozen:
-            return self.frozen[places, device]
-        stood = _on_device(places, device).float()
-        memories = torch.cat([self.sum_stem.kernel(stood), self.spread_stem.weight], 1)
-        bias = self.voxel_stem.bias + self.sum_stem.bias
-        kernels = self.voxel_stem.kernel(stood), memories, bias
-        if self.frozen is not None:
-            memories = memories.contiguous(memory_format=torch.channels_last)
-            self.frozen[places, device] = kernels = kernels[0], memories, bias
+        device = self.spread_conv.weight.device
+        if self.cached_kernels is not None and (positions, device) in self.cached_kernels:
+            return self.cached_kernels[positions, device]
+        place = _to_device(positions, device).float()
+        sums = torch.cat([self.sum_kernels.kernel(place), self.spread_conv.weight], 1)
+        bias = self.voxel_kernels.bias + self.sum_kernels.bias
+        kernels = self.voxel_kernels.kernel(place), sums, bias
+        if self.cached_kernels is not None:
+            sums = sums.contiguous(memory_format=torch.channels_last)
+            self.cached_kernels[positions, device] = kernels = kernels[0], sums, bias
         return kernels
 
-    def places(
+    def checked_positions(
         self, views: int, bins: int, positions: Sequence[Position] | None
     ) -> tuple[Position, ...]:
-        """Return where the views stand; ValueError for bins or views that do not fit."""
+        """Return the positions of the views; ValueError for bins or views that do not fit."""
         if bins != self.bins:
             raise ValueError(f"bins must be {self.bins} for this network, got {bins}")
         if not 1 <= views <= MAX_VIEWS:
@@ -219,57 +307,207 @@ class SetNet(nn.Module):
             raise ValueError(f"optics.positions must be {views} (row, col), got {positions}")
         return tuple((int(row), int(column)) for row, column in positions)
 
-    def hidden(self, height: int, width: int) -> list[tuple[int, int, int]]:
-        """Return the sizes (c, h, w) of the hidden maps of a picture: what is remembered at half
-        resolution, in [-1, 1], what lies around, at a quarter, and what is told of that.
-        """
-        return [(self.half, height // k, width // k) for k in (2, 4, 4)]
+    def map_sizes(self, height: int, width: int) -> list[tuple[int, int, int]]:
+        """Return the sizes (c, h, w) of hidden and of both contexts of a picture."""
+        return [(self.channels, height // k, width // k) for k in (2, 4, 4)]
 
-    def _start(self, state: State | None, cells: Tensor) -> State:
+    def _checked_state(self, state: SetNetState | None, cells: Tensor) -> SetNetState:
         """Return `state`, or zeros of the right sizes; ValueError when they are not right."""
         n, views, rows, columns = cells.shape
-        maps = self.hidden(CELL * rows, CELL * columns)
+        maps = self.map_sizes(CELL_PX * rows, CELL_PX * columns)
         sizes = [
-            (n, views, len(MEMORIES_S), rows, columns),
+            (n, views, len(SUM_TAUS_S), rows, columns),
             *[(n, 1, 1, 1)] * 2,
             *((n, *size) for size in maps),
         ]
         if state is None:
-            return tuple(cells.new_zeros(size) for size in sizes)
+            return SetNetState(*(cells.new_zeros(size) for size in sizes))
         found = [tuple(part.shape) for part in state]
         if found != sizes:
             raise ValueError(f"state must have sizes {sizes} for these voxels, got {found}")
-        return state
+        return SetNetState(*state)
 
 
-def faded(told: Tensor, about: Tensor, passed: Tensor) -> Tensor:
-    """Return what is told of what lies around, `passed` seconds after what was told before."""
-    return torch.lerp(about, told, torch.exp(-passed / FADE_S))
+class ViewKernels(nn.Module):
+    """Makes the kernel of a convolution over stacked views from the positions of the views.
+
+    kernel(position) = (basis_0 + sum_r code_r(position, views) basis_r) / views, code an MLP: with
+    as many ranks as views it can equal any convolution of the stacked views of one layout.
+    """
+
+    def __init__(self, inputs: int, outputs: int, kernel_size: int, ranks: int = 5):
+        super().__init__()
+        shape = ((ranks + 1) * outputs, inputs, kernel_size, kernel_size)
+        bound = 1 / math.sqrt(inputs * kernel_size**2)
+        self.basis = nn.Parameter(torch.empty(shape).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.zeros(outputs))
+        self.code = nn.Sequential(nn.Linear(3, 16), nn.Tanh(), nn.Linear(16, ranks))
+
+    def kernel(
+        self, positions: Float[Tensor, "views 2"]
+    ) -> Float[Tensor, "outputs viewsinputs size size"]:
+        """Return the kernel for the stacked views at `positions` (row, col)."""
+        code, basis = self.factors(positions)
+        return torch.einsum("vr,roikl->ovikl", code, basis).flatten(1, 2)
+
+    def factors(
+        self, positions: Float[Tensor, "views 2"]
+    ) -> tuple[Float[Tensor, "views basis"], Float[Tensor, "basis outputs inputs size size"]]:
+        """Return the coefficients (1, code) / views of each view and the basis kernels."""
+        views = len(positions)
+        # Inputs of the MLP, of order 1: row, column, and 3 / views.
+        known = torch.cat([positions, torch.full_like(positions[:, :1], 3 / views)], 1)
+        code = self.code(known.to(self.bias.dtype))
+        code = torch.cat([torch.ones_like(code[:, :1]), code], 1) / views
+        return code, self.basis.unflatten(0, (code.shape[1], -1))
 
 
-def _leaked(sums: Tensor, keep: Tensor, new: Tensor) -> Tensor:
-    return keep * sums + new
+class TimeGatedMemory(nn.Module):
+    """A recurrent cell with a gate and a candidate in continuous time (`time_gated_update`).
+
+    s' = k s + (1 - k) tanh(candidate), k = exp(-t relu(gate)), t in units of 1 / REFERENCE_HZ: with
+    t = 0 or gate <= 0 the state is held.  The input enters by 3 x 3, the state by 1 x 1
+    convolutions, so that nothing spreads in space over time.  `gate_rank`: the 3 x 3 convolution is
+    factored into 3 x 3 to so many channels and 1 x 1, which costs less (None: not factored).
+    """
+
+    def __init__(self, channels: int, gate_rank: int | None = None):
+        super().__init__()
+        inputs, size = (gate_rank, 1) if gate_rank else (channels, 3)
+        self.input_features = (
+            nn.Conv2d(channels, gate_rank, 3, padding=1, bias=False) if gate_rank else nn.Identity()
+        )
+        self.input_gates = nn.Conv2d(inputs, 2 * channels, size, padding=size // 2)
+        self.state_gates = nn.Conv2d(channels, 2 * channels, 1, bias=False)
+        with torch.no_grad():  # initial time constants of 1.4 to 20 windows of 1/120 s
+            bias_of(self.input_gates)[:channels].copy_(torch.linspace(0.05, 0.7, channels))
+
+    def forward(
+        self,
+        x: Float[Tensor, "m c h w"],
+        state: Float[Tensor, "n c h w"],
+        elapsed: Float[Tensor, "m 1 1 1"],
+    ) -> tuple[Float[Tensor, "m c h w"], Float[Tensor, "n c h w"]]:
+        """Return the state, float32, after each of m = windows * n steps and after the last."""
+        update = TimeGatedUpdate.apply if torch.is_grad_enabled() else time_gated_update
+
+        def step(state: Tensor, from_input: Tensor, elapsed: Tensor) -> Tensor:
+            return update(from_input + self.state_gates(state.to(x.dtype)), state, elapsed)
+
+        return scan_windows(step, state, self.input_gates(self.input_features(x)), elapsed)
 
 
-def _windows(maps: Tensor, n: int, shown: Sequence[int]) -> Tensor:
-    """Return those of `maps` (windows * n, ...) that are of the windows `shown`."""
-    chosen = _on_device(tuple(shown), maps.device)
-    return maps.unflatten(0, (-1, n)).index_select(0, chosen).flatten(0, 1)
+class ContextPyramid(nn.Module):
+    """A feature pyramid: one stride-2 convolution and residual block for each of `widths`
+    (channels), then the coarser scales are added to the finer ones, up to half the input's size.
+
+    Residual sums have no ReLU after them (He et al. 2016, identity mappings) and the output starts
+    at zero: otherwise a high learning rate leaves dead ReLUs.  `refine_fusion`: a
+    residual block also after each sum of two scales.
+    """
+
+    def __init__(self, channels: int, widths: Sequence[int], refine_fusion: bool = False):
+        super().__init__()
+        pairs = list(pairwise([channels, *widths]))
+        downs = [init_kaiming(nn.Conv2d(a, b, 3, 2, padding=1)) for a, b in pairs]
+        self.down_blocks = nn.ModuleList(PreActivationBlock(width) for width in widths)
+        ups = [init_kaiming(nn.Conv2d(b, a, 1)) for a, b in pairs]
+        init_zero(ups[0])
+        self.downs, self.ups = nn.ModuleList(downs), nn.ModuleList(ups)
+        self.fusion_blocks = nn.ModuleList(
+            PreActivationBlock(width) if refine_fusion else nn.Identity() for width in widths[:-1]
+        )
+        self.relu = nn.ReLU()
+        initial = torch.full((channels, 1, 1), math.log(INITIAL_CONTEXT_RATE))
+        self.log_rate = nn.Parameter(initial)  # log decay rate of the moving average, per channel
+
+    def forward(self, x: Float[Tensor, "n c h2 w2"]) -> Float[Tensor, "n c h4 w4"]:
+        """Return a map of half the size of `x`."""
+        scales = []
+        for down, block in zip(self.downs, self.down_blocks, strict=True):
+            x = block(down(x))
+            scales.append(x)
+        scales.pop()
+        for up, block in zip(reversed(self.ups[1:]), reversed(self.fusion_blocks), strict=True):
+            finer = scales.pop()
+            coarser = functional.interpolate(up(self.relu(x)), finer.shape[-2:], mode="bilinear")
+            x = block(finer + coarser)
+        return self.ups[0](self.relu(x))
+
+    def moving_average(
+        self,
+        before: Float[Tensor, "n c h4 w4"],
+        new: Float[Tensor, "n c h4 w4"],
+        recency: Float[Tensor, "n 1 1 1"],
+    ) -> Float[Tensor, "n c h4 w4"]:
+        """Return the moving average with `new`; `recency`: exp(-age / interval) of `before`."""
+        return torch.lerp(new, before, recency ** self.log_rate.float().exp())
 
 
-@lru_cache(maxsize=64)
-@torch.inference_mode(False)
-def _on_device(numbers: tuple, device: torch.device) -> Int[Tensor, "..."]:
-    """Return whole numbers as a tensor; kept, as a CUDA graph can copy nothing to the device."""
-    return torch.tensor(numbers, dtype=torch.long, device=device)
+def scan_windows(
+    step: Callable[..., Tensor], state: Float[Tensor, "n ..."], *maps: Shaped[Tensor, "m ..."]
+) -> tuple[Float[Tensor, "m ..."], Float[Tensor, "n ..."]]:
+    """Return the state after every window and after the last: state = step(state, *maps of the
+    window), with `maps` of m = windows * n.
+    """
+    states = []
+    for now in zip(*(part.split(len(state)) for part in maps), strict=True):
+        state = step(state, *now)
+        states.append(state)
+    return torch.cat(states), state
 
 
-def _cast(x: Float[Tensor, "windows n c h w"], dtype: torch.dtype) -> Float[Tensor, "m c h w"]:
-    """Return the maps of m = windows * n as a convolution takes them under autocast, channels last:
+def smooth_context(smoothed: Tensor, context: Tensor, elapsed_s: Tensor) -> Tensor:
+    """Return `smoothed` after a first-order low-pass step of `elapsed_s` toward `context`."""
+    return torch.lerp(context, smoothed, torch.exp(-elapsed_s / CONTEXT_TAU_S))
+
+
+def _leaky_sum(sums: Tensor, decay: Tensor, new: Tensor) -> Tensor:
+    return decay * sums + new
+
+
+def _run_clock(
+    cells: Float[Tensor, "m views h2 w2"], seconds: Tensor, state: SetNetState
+) -> tuple[ClockTick, Tensor, Tensor]:
+    """Return the ticks of all windows, and activity and context recency after the last."""
+    activity, recency, ticks = state.activity, state.context_recency, []
+    for has_events in (cells.abs().amax((1, 2, 3), keepdim=True) > 0).split(len(activity)):
+        tick, activity, recency = advance_clock(has_events, seconds, activity, recency)
+        ticks.append(tick)
+    return ClockTick(*map(torch.cat, zip(*ticks, strict=True))), activity, recency
+
+
+def _sum_cells(x: Float[Tensor, "m views h w"]) -> Float[Tensor, "m views h2 w2"]:
+    """Return the sums of 2 x 2 pixels, several times faster than avg_pool2d on a CPU."""
+    rows = x[..., ::2, :] + x[..., 1::2, :]
+    return rows[..., ::2] + rows[..., 1::2]
+
+
+def _durations(window_s: float | Tensor, voxels: Tensor) -> Float[Tensor, "_n 1 1 1"]:
+    """Return the length of the window, in seconds, one for each clip or for all."""
+    if isinstance(window_s, Tensor):
+        return window_s.to(voxels.device).float().view(-1, 1, 1, 1)
+    if not 0 < window_s < math.inf:
+        raise ValueError(f"window_s must be > 0 seconds, got {window_s}")
+    return torch.full((1, 1, 1, 1), window_s, device=voxels.device)
+
+
+def _as_rates(counts: Float[Tensor, "m c h w"], seconds: Tensor) -> Float[Tensor, "m c h w"]:
+    """Return counts per window as counts per 1 / REFERENCE_HZ seconds."""
+    scale = 1 / (REFERENCE_HZ * seconds)
+    return counts * scale.repeat(len(counts) // len(scale), 1, 1, 1).to(counts.dtype)
+
+
+def _as_conv_input(
+    x: Float[Tensor, "windows n c h w"], dtype: torch.dtype
+) -> Float[Tensor, "m c h w"]:
+    """Return the maps in the type of a convolution, that of autocast where it is on, channels last:
     in one copy.
     """
     kind = x.device.type
     dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else dtype
+    if torch.jit.is_tracing():  # OpenVINO cannot express a copy into a view
+        return x.flatten(0, 1).to(dtype)
     windows, n, c, h, w = x.shape
     maps = torch.empty(
         windows * n, c, h, w, dtype=dtype, device=x.device, memory_format=torch.channels_last
@@ -278,46 +516,14 @@ def _cast(x: Float[Tensor, "windows n c h w"], dtype: torch.dtype) -> Float[Tens
     return maps
 
 
-def _as_rates(counted: Tensor, seconds: Tensor) -> Tensor:
-    """Return maps (windows * n, ...) of what a window counts as counts in 1 / RATE s."""
-    often = 1 / (RATE * seconds)
-    return counted * often.repeat(len(counted) // len(often), 1, 1, 1).to(counted.dtype)
+def _select_windows(maps: Tensor, n: int, windows: Sequence[int]) -> Tensor:
+    """Return the entries of `maps` (m, ...) that belong to `windows`."""
+    index = _to_device(tuple(windows), maps.device)
+    return maps.unflatten(0, (-1, n)).index_select(0, index).flatten(0, 1)
 
 
-def _seconds(window_s: float | Tensor, voxels: Tensor) -> Tensor:
-    """Return the length of the window as (n or 1, 1, 1, 1)."""
-    if isinstance(window_s, Tensor):
-        return window_s.to(voxels.device).float().view(-1, 1, 1, 1)
-    if not 0 < window_s < math.inf:
-        raise ValueError(f"window_s must be > 0 seconds, got {window_s}")
-    return torch.full((1, 1, 1, 1), window_s, device=voxels.device)
-
-
-def _time(cells: Tensor, awake: Tensor, seconds: Tensor) -> tuple[Tensor, Tensor]:
-    """Return how awake each picture is after the last window and the time that passed there in
-    each, in seconds: all of it with events, without any the integral of falling asleep.
-    """
-    left, passed = torch.exp(-seconds / AWAKE_S), []
-    for stirred in (cells.abs().amax((1, 2, 3), keepdim=True) > 0).split(len(awake)):
-        passed.append(torch.where(stirred, seconds, awake * AWAKE_S * (1 - left)))
-        awake = torch.where(stirred, 1.0, awake * left)
-    return awake, torch.cat(passed)
-
-
-def _looks(passed: Tensor, recent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return how recently one looked around after the last window and, in each, before one may
-    look again, and whether one does.
-    """
-    before, due = [], []
-    for now in passed.split(len(recent)):
-        recent = recent * torch.exp(-now / LOOK_S)
-        before.append(recent)
-        due.append((recent <= DUE) & (now > 0))
-        recent = torch.where(due[-1], 1.0, recent)
-    return recent, torch.cat(before), torch.cat(due)
-
-
-def _halved(x: Tensor) -> Tensor:
-    """Return the sums of blocks of 2 x 2, cells, several times faster than avg_pool2d on a CPU."""
-    rows = x[..., ::2, :] + x[..., 1::2, :]
-    return rows[..., ::2] + rows[..., 1::2]
+@lru_cache(maxsize=64)
+@torch.inference_mode(False)
+def _to_device(numbers: tuple, device: torch.device) -> Int[Tensor, "..."]:
+    """Return integers as a tensor; cached: a CUDA graph cannot capture the copy from the host."""
+    return torch.tensor(numbers, dtype=torch.long, device=device)

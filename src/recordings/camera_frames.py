@@ -12,25 +12,25 @@ from src.recordings.files import sources
 SETTLING = 2  # first frames of a reconstruction, which are not looked at
 
 
-def agreement(video: Path, listing: Path) -> dict[str, float]:
+def compare_with_camera(video: Path, listing: Path) -> dict[str, float]:
     """Return mean `ssim`, `lpips` and `correlation` of a video of src.reconstruct with a camera's
     frames, each against the frame nearest in time.
 
-    `listing`: a line per picture, seconds and file.  Raises ValueError where `frames.csv`, which
-    says when each frame of the video is, is not beside it, or no picture falls on a frame.
+    `listing`: a line per picture, seconds and file.  Raises ValueError without the video's
+    `frames.csv`, or where no picture falls on a frame.
     """
     table = video.parent / "frames.csv"
     if not table.is_file() or not listing.is_file():
         missing = table if listing.is_file() else listing
         raise ValueError(f"camera must be the list of a camera's frames, {missing} is not there")
     clock = np.loadtxt(table, delimiter=",", skiprows=1, usecols=1, ndmin=1)
-    film, scores, lpips = list(sources.film(video)), [], LPIPS()
+    film, scores, lpips = list(sources.read_video(video)), [], LPIPS()
     reach = 0.5 * float(np.diff(clock).max(initial=0.0))
     for line in listing.read_text().splitlines():
         second, name = line.split()
         nearest = int(np.abs(clock - float(second)).argmin())
         if abs(clock[nearest] - float(second)) <= reach and nearest >= SETTLING:
-            truth = next(sources.film(listing.parent / name))
+            truth = next(sources.read_video(listing.parent / name))
             a, b = (torch.from_numpy(p.copy())[None, None] for p in (film[nearest], truth))
             together = np.corrcoef(film[nearest].ravel(), truth.ravel())[0, 1]
             scores.append([float(ssim(a, b)), float(lpips(a, b)), float(together)])

@@ -16,10 +16,10 @@ from pathlib import Path
 import cv2
 import h5py
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from PIL import GifImagePlugin, Image
 
-from src.recordings.stream import Frame
+from src.recordings.reconstruction import Frame
 
 LEAST_FREE_BYTES = 32 * 2**20
 CACHE_BYTES = 2**20  # of HDF5, for each of its datasets
@@ -28,81 +28,71 @@ Add = Callable[[Picture, Frame], None]
 
 
 @contextmanager
-def sink(kind: str, folder: Path, size: tuple[int, int], playback_fps: float = 30.0):
+def open_video_writer(
+    kind: str, folder: Path, size: tuple[int, int], playback_fps: float = 30.0
+) -> Iterator[Callable[[Frame], None]]:
     """Open `video.mp4`, `video.gif`, `frames/` or `video.h5` in `folder`; yield `write(frame)`.
 
-    `size` is (height, width); `playback_fps` how fast an MP4 or GIF is shown.  `frames.csv` gets
-    each frame's index, time in seconds, events in views and outside.  Raises ValueError for another
-    `kind`, or where the file cannot be written.
+    `size`: (height, width); `playback_fps`: of an MP4 or GIF.  `frames.csv` gets each frame's
+    index, time in s, events in views and outside.  Raises ValueError for another `kind`, or where
+    the file cannot be written.
     """
     if kind not in KINDS:
-        raise ValueError(f"output must be one of {', '.join(KINDS)}, got {kind}")
+        raise ValueError(f"output_format must be one of {', '.join(KINDS)}, got {kind}")
     if not 0.1 <= playback_fps <= 1000:
-        raise ValueError(f"playback must be in [0.1, 1000] fps, got {playback_fps}")
+        raise ValueError(f"playback_fps must be in [0.1, 1000], got {playback_fps}")
     folder.mkdir(parents=True, exist_ok=True)
     make, whole = KINDS[kind]
-    video, table_file = partial(folder / whole), partial(folder / "frames.csv")
-    with (
-        open(table_file, "w", newline="") as file,
-        make(video, size, playback_fps) as add,
-    ):
+    video, table_file = partial_path(folder / whole), partial_path(folder / "frames.csv")
+    with open(table_file, "w", newline="") as file, make(video, size, playback_fps) as add:
         table = csv.writer(file)
         table.writerow(["frame", "time_s", "events", "outside"])
         frames = 0
 
         def write(frame: Frame) -> None:
             nonlocal frames
-            _check_room(folder)
-            add(eight_bits(frame.picture), frame)
+            # HDF5's library crashes when it cannot write.
+            if shutil.disk_usage(folder).free < LEAST_FREE_BYTES:
+                raise OSError(errno.ENOSPC, f"No space left for another frame in {folder}")
+            add((np.clip(frame.picture, 0, 1) * 255 + 0.5).astype(np.uint8), frame)
             table.writerow([frames, f"{frame.time_s:.6f}", frame.events, frame.outside])
             frames += 1
 
         yield write
     if kind == "mp4":
         _check_mp4(video, frames)
-    _rename(video, folder / whole)
-    _rename(table_file, folder / "frames.csv")
+    if (folder / whole).is_dir():
+        shutil.rmtree(folder / whole)  # frames of an earlier run into the same folder
+    os.replace(video, folder / whole)
+    os.replace(table_file, folder / "frames.csv")
 
 
-def _check_room(folder: Path) -> None:
-    """Raise OSError while there is room left: HDF5's library crashes when it cannot write."""
-    if shutil.disk_usage(folder).free < LEAST_FREE_BYTES:
-        raise OSError(errno.ENOSPC, f"No space left for another frame in {folder}")
-
-
-def partial(path: Path) -> Path:
+def partial_path(path: Path) -> Path:
     """Return the name of a file while it is written: `video.partial.mp4`, `frames.partial`."""
     return path.with_name(f"{path.stem}.partial{path.suffix}")
 
 
-def _rename(made: Path, whole: Path) -> None:
-    if whole.is_dir():
-        shutil.rmtree(whole)  # frames of an earlier run into the same folder
-    os.replace(made, whole)
-
-
 def _check_mp4(path: Path, written: int) -> None:
     """Raise OSError unless `written` frames are in it: the encoder is silent on a full disk."""
-    video = cv2.VideoCapture(str(path))
-    frames = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
-    video.release()
+    frames = int(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT))
     if frames != written:
         raise OSError(f"{path} holds {frames} of {written} frames; is the disk full?")
 
 
-def eight_bits(picture: Float[np.ndarray, "h w"]) -> Picture:
-    """Return a picture in [0, 1] as uint8, rounded."""
-    return (np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)
-
-
 @contextmanager
 def _mp4(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
-    code = cv2.VideoWriter_fourcc(*"vp09")  # what both browsers and the OpenCV wheel know
+    code = cv2.VideoWriter.fourcc(*"vp09")  # what both browsers and the OpenCV wheel know
     writer = cv2.VideoWriter(str(path), code, fps, size[::-1], False)
     if not writer.isOpened():
-        raise ValueError(f"output=mp4 must be writable at {path}, got no encoder; try output=png")
+        raise ValueError(
+            f"output_format=mp4 must be writable at {path}, got no encoder; try output_format=png"
+        )
+
+    def add(picture: Picture, frame: Frame) -> None:
+        writer.write(picture)
+
     try:
-        yield lambda picture, frame: writer.write(picture)
+        yield add
     finally:
         writer.release()
 
@@ -142,14 +132,8 @@ def _png(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
 @contextmanager
 def _hdf5(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
     with h5py.File(path, "w", rdcc_nbytes=CACHE_BYTES) as file:
-        frames = file.create_dataset(
-            "frames",
-            (0, *size),
-            np.uint8,
-            maxshape=(None, *size),
-            chunks=(1, *size),
-            compression="lzf",
-        )
+        shapes = {"maxshape": (None, *size), "chunks": (1, *size)}
+        frames = file.create_dataset("frames", (0, *size), np.uint8, compression="lzf", **shapes)
         times = file.create_dataset("time_s", (0,), np.float64, maxshape=(None,), chunks=(4096,))
 
         def add(picture: Picture, frame: Frame) -> None:

@@ -1,14 +1,13 @@
 """Several views on one sensor: where each lies and how it is mirrored, as a readable file.
 
-A kaleidoscope shows the scene 3x3 times on one chip.  Each view has a homography from its own
-sensor pixels to those of the centre view; a rectangle of the centre view, the field, becomes the
-model picture.  Sizes are (height, width).  Pixel (0, 0) is the centre of the top left pixel; x runs
-right, y down.
+Each view has a homography from its sensor pixels to those of the centre view; a rectangle of that,
+the field, becomes the model picture.  Sizes are (height, width).  Pixel (0, 0) is the centre of the
+top left pixel; x runs right, y down.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -16,31 +15,20 @@ import numpy as np
 import yaml
 from jaxtyping import Float
 
-from src.recordings.files import safe_yaml
 from src.recordings.files.sources import Size
+from src.records import safe_yaml
 from src.records.atomic import write_text
 
 LARGEST_SIDE = 8192
-MOST_PIXELS = 2**24  # of a sensor, and of all views' pictures together
-SEEN = 0.75  # the share of a view that has to lie on the sensor
-
-
-def apply(
-    matrix: Float[np.ndarray, "3 3"], points: Float[np.ndarray, "k 2"]
-) -> Float[np.ndarray, "k 2"]:
-    """Return `points` (x, y) mapped by a homography; not finite on its horizon."""
-    mapped = points @ matrix[:, :2].T + matrix[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return mapped[:, :2] / mapped[:, 2:]
+MAX_PIXELS = 2**24  # of a sensor, and of all views' pictures together
+MIN_SHARE_ON_SENSOR = 0.75  # of a view
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One sub-aperture: grid position (row, col) relative to the centre view and its homography.
-
-    `homography` maps sensor pixels (x, y, 1) of this view to those of the centre view; a negative
-    determinant is a mirrored view.  `error_px` is the rms residual of the `points` it was fitted
-    to, in sensor pixels of the centre view.
+    """One sub-aperture: grid position (row, col) relative to the centre view and its homography,
+    from sensor pixels (x, y, 1) to those of the centre view (determinant < 0: mirrored).
+    `error_px`: rms residual of the `points` it was fitted to, in pixels of the centre view.
     """
 
     position: tuple[int, int]
@@ -64,44 +52,39 @@ class Views:
     views: tuple[View, ...]
 
     def __post_init__(self):
-        for name, size, count in (
-            ("sensor", self.sensor, 1),
-            ("model", self.model, len(self.views)),
-        ):
+        sizes = (("sensor", self.sensor, 1), ("model", self.model, len(self.views)))
+        for name, size, count in sizes:
             if not all(1 <= side <= LARGEST_SIDE for side in size):
                 raise ValueError(f"views.{name} must be in 1..{LARGEST_SIDE} pixels, got {size}")
-            if count * math.prod(size) > MOST_PIXELS:
+            if count * math.prod(size) > MAX_PIXELS:
                 raise ValueError(
-                    f"views.{name} must have {MOST_PIXELS} pixels at most, got {count} x {size}"
+                    f"views.{name} must have {MAX_PIXELS} pixels at most, got {count} x {size}"
                 )
         left, top, right, bottom = self.field
         if not (np.isfinite(self.field).all() and right - left >= 1 and bottom - top >= 1):
             raise ValueError(f"views.field must be left, top, right, bottom, got {self.field}")
-        positions = self.positions
-        if not positions or len(set(positions)) != len(positions):
-            raise ValueError(
-                f"views.views must be one or more different positions, got {positions}"
-            )
+        at = self.positions
+        if not at or len(set(at)) != len(at):
+            raise ValueError(f"views.views must be one or more different positions, got {at}")
         for view in self.views:
             self._check(view)
 
     def _check(self, view: View) -> None:
         matrix = view.homography
         if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-9:
-            raise ValueError(
-                f"views: homography of view {view.position} must be finite and regular"
-            )
+            at = view.position
+            raise ValueError(f"views: homography of view {at} must be finite and regular")
         height, width = self.sensor
-        x, y = self._on_sensor(view, self._field_grid(9)).T
+        x, y = self._field_on_sensor(view, 9).T
         share = np.mean((x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5))
-        if share < SEEN:
+        if share < MIN_SHARE_ON_SENSOR:
             raise ValueError(
                 f"views: view {view.position} must lie on the {width}x{height} sensor"
-                f" by {SEEN:.0%}, got {share:.0%}"
+                f" by {MIN_SHARE_ON_SENSOR:.0%}, got {share:.0%}"
             )
 
     @classmethod
-    def single(cls, sensor: Size, model: Size) -> "Views":
+    def single_view(cls, sensor: Size, model: Size) -> "Views":
         """Return the whole sensor as one view, resampled to the model picture."""
         height, width = sensor
         whole = (-0.5, -0.5, width - 0.5, height - 0.5)
@@ -109,7 +92,6 @@ class Views:
 
     @property
     def positions(self) -> list[tuple[int, int]]:
-        """The grid position (row, col) of each view."""
         return [view.position for view in self.views]
 
     def to_model(self, view: View) -> Float[np.ndarray, "3 3"]:
@@ -121,57 +103,54 @@ class Views:
 
     def outline(self, view: View) -> Float[np.ndarray, "4 2"]:
         """Return the corners of `view` on the sensor: the field's, clockwise from top left."""
-        return self._on_sensor(view, self._field_grid(2))[[0, 1, 3, 2]]
+        return self._field_on_sensor(view, 2)[[0, 1, 3, 2]]
 
-    def mirrored(self, view: View) -> tuple[bool, bool]:
+    def is_mirrored(self, view: View) -> tuple[bool, bool]:
         """Return whether `view` is mirrored in x and in y (both: it is turned by 180 degrees)."""
         corners = self.outline(view)
         return bool(corners[1, 0] < corners[0, 0]), bool(corners[3, 1] < corners[0, 1])
 
-    def only(self, positions: Sequence[tuple[int, int]]) -> "Views":
+    def select(self, positions: Sequence[tuple[int, int]]) -> "Views":
         """Return the views at `positions`, in that order.  Raises ValueError for one not there."""
         by_position = dict(zip(self.positions, self.views, strict=True))
         missing = [position for position in positions if position not in by_position]
         if missing:
             raise ValueError(f"views has no view at {missing}, only {self.positions}")
-        chosen = tuple(by_position[position] for position in positions)
-        return Views(self.sensor, self.model, self.field, chosen)
+        return replace(self, views=tuple(by_position[position] for position in positions))
 
-    def register(
+    def warp_to_model(
         self, picture: Float[np.ndarray, "sensor_h sensor_w"]
     ) -> Float[np.ndarray, "views h w"]:
         """Return every view of one sensor picture in model pixels (bilinear, float32)."""
         flat, size = picture.astype(np.float32), self.model[::-1]
-        warped = [cv2.warpPerspective(flat, self.to_model(view), size) for view in self.views]
-        return np.stack(warped)
+        return np.stack([cv2.warpPerspective(flat, self.to_model(v), size) for v in self.views])
 
-    def _field_grid(self, side: int) -> np.ndarray:
+    def _field_on_sensor(self, view: View, side: int) -> np.ndarray:
         left, top, right, bottom = self.field
         x, y = np.meshgrid(np.linspace(left, right, side), np.linspace(top, bottom, side))
-        return np.stack([x.ravel(), y.ravel()], axis=1)
-
-    @staticmethod
-    def _on_sensor(view: View, points: np.ndarray) -> np.ndarray:
-        return apply(np.linalg.inv(view.homography), points)
+        points = np.stack([x.ravel(), y.ravel()], axis=1)
+        return cv2.perspectiveTransform(points[None], np.linalg.inv(view.homography))[0]
 
     def save(self, path: Path | str) -> None:
-        """Write a YAML file that `load` reads back exactly; it appears whole or not at all."""
-        style = {"sort_keys": False, "default_flow_style": None, "width": 100}
-        write_text(Path(path), HEADER + yaml.safe_dump(self._plain(), **style))
-
-    def _plain(self) -> dict:
+        """Write a YAML file that `load_views` reads back exactly."""
         views = [
             {
                 "position": list(view.position),
-                "mirrored": list(self.mirrored(view)),
+                "mirrored": list(self.is_mirrored(view)),
                 "error_px": round(view.error_px, 4),
                 "points": view.points,
                 "homography": view.homography.tolist(),
             }
             for view in self.views
         ]
-        sizes = {"sensor": list(self.sensor), "model": list(self.model)}
-        return {**sizes, "field": [float(edge) for edge in self.field], "views": views}
+        content = {
+            "sensor": list(self.sensor),
+            "model": list(self.model),
+            "field": [float(edge) for edge in self.field],
+            "views": views,
+        }
+        style = {"sort_keys": False, "default_flow_style": None, "width": 100}
+        write_text(Path(path), HEADER + yaml.safe_dump(content, **style))
 
 
 HEADER = """\
@@ -183,45 +162,54 @@ HEADER = """\
 """
 
 
-def load(path: Path | str, sensor: Size | None = None) -> Views:
+def views_or_whole_sensor(
+    path: Path | str | None, sensor: Size, resolution: Sequence[int] | None = None
+) -> Views:
+    """Return the views of the file `path` or, without one, the whole sensor as one view.
+
+    `resolution`: (height, width) of the model picture instead of that of the file or the sensor.
+    """
+    views = load_views(path, sensor) if path else Views.single_view(sensor, sensor)
+    return replace(views, model=(resolution[0], resolution[1])) if resolution else views
+
+
+def load_views(path: Path | str, sensor: Size | None = None) -> Views:
     """Read a file of `Views.save` or one by hand (`mirrored`, `error_px`, `points` are optional).
 
-    Raises ValueError for a file that is absent or not such a file, a value out of range,
-    a `mirrored` its homography contradicts, or another sensor than `sensor` (height, width).
+    Raises ValueError for what is no such file, a value out of range, a `mirrored` its homography
+    contradicts, or another sensor than `sensor` (height, width).
     """
     try:
         content = safe_yaml.read(path)
         views = Views(
-            _numbers(content["sensor"], int, 2),
-            _numbers(content["model"], int, 2),
-            _numbers(content["field"], float, 4),
-            tuple(_view(entry) for entry in content["views"]),
+            _parse_numbers(content["sensor"], int, 2),
+            _parse_numbers(content["model"], int, 2),
+            _parse_numbers(content["field"], float, 4),
+            tuple(map(_parse_view, content["views"])),
         )
         stated = [entry.get("mirrored") for entry in content["views"]]
     except (OSError, yaml.YAMLError, KeyError, TypeError, OverflowError) as error:
-        why = f"{type(error).__name__} {error}"
-        raise ValueError(
-            f"views must be a file of calibrate task=views, got {path}: {why}"
-        ) from None
+        why = f"{path}: {type(error).__name__} {error}"
+        raise ValueError(f"views must be a file of calibrate task=views, got {why}") from None
     for view, mirrored in zip(views.views, stated, strict=True):
-        if mirrored not in (None, list(views.mirrored(view))):
+        if mirrored not in (None, list(views.is_mirrored(view))):
             raise ValueError(f"{path}: mirrored of {view.position} contradicts its homography")
     if sensor is not None and tuple(sensor) != views.sensor:
         raise ValueError(f"{path}: sensor must be the recording's {sensor}, got {views.sensor}")
     return views
 
 
-def _view(entry: dict) -> View:
+def _parse_view(entry: dict) -> View:
     rows = entry["homography"]
     if not isinstance(rows, list) or len(rows) != 3:
         raise TypeError("homography must have 3 rows")
-    matrix = np.array([_numbers(row, float, 3) for row in rows])
-    (error,) = _numbers([entry.get("error_px", 0.0)], float, 1)
-    (points,) = _numbers([entry.get("points", 0)], int, 1)
-    return View(_numbers(entry["position"], int, 2), matrix, error, points)
+    matrix = np.array([_parse_numbers(row, float, 3) for row in rows])
+    (error,) = _parse_numbers([entry.get("error_px", 0.0)], float, 1)
+    (points,) = _parse_numbers([entry.get("points", 0)], int, 1)
+    return View(_parse_numbers(entry["position"], int, 2), matrix, error, points)
 
 
-def _numbers(values: list, kind: type, count: int) -> tuple:
+def _parse_numbers(values: list, kind: type, count: int) -> tuple:
     numbers = isinstance(values, list) and len(values) == count
     if not numbers or any(type(value) not in (int, kind) for value in values):
         raise TypeError(f"expected a list of {count} x {kind.__name__}")

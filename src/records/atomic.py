@@ -1,7 +1,4 @@
-"""Files that are whole or not there: written beside under a temporary name, then renamed.
-
-The name has the process in it, so that of two that write the same file neither takes the other's.
-"""
+"""Files that appear whole or not at all: written under a temporary name, then renamed."""
 
 import os
 from collections.abc import Iterator
@@ -10,11 +7,11 @@ from pathlib import Path
 
 
 @contextmanager
-def written(path: Path) -> Iterator[Path]:
-    """Yield the name to write to, in the folder of `path`, which is made.
+def atomic_path(path: Path) -> Iterator[Path]:
+    """Yield the temporary path to write to, in the folder of `path`, which is created.
 
-    At the end of the block that file becomes `path`, on the disk when this returns; where the block
-    fails it is removed, and what was at `path` before stays.
+    After the block that file is synced and renamed to `path`; where the block fails it is removed.
+    The process id in its name keeps two writers of one file apart.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
@@ -30,5 +27,5 @@ def written(path: Path) -> Iterator[Path]:
 
 def write_text(path: Path, text: str) -> None:
     """Write `text` to `path`, whole or not at all."""
-    with written(path) as partial:
+    with atomic_path(path) as partial:
         partial.write_text(text)

@@ -1,7 +1,4 @@
-"""Runs as their folders tell of them: `results.json`, `config.yaml`, `clips.csv`, pictures.
-
-What a folder is called says nothing here; what was asked for stands in `results.json`.
-"""
+"""Finished runs and sweeps, read from their folders whatever these are called."""
 
 import csv
 import json
@@ -13,10 +10,9 @@ import yaml
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from src.recordings.files import safe_yaml
-from src.records import results
+from src.records import results, safe_yaml
 
-FIGURES = ("chart", "machine", "adapt", "stress")  # of the doors chart and stress
+FIGURES = ("chart", "machine", "stress")  # of src.chart and src.stress
 WITHOUT_NUMBERS = ("seed", "name", "task", "logger", "callbacks", "paths", "hydra")
 MACHINE = ("data.workers", "data.simulate_on", "trainer.accelerator", "trainer.devices")
 
@@ -32,25 +28,24 @@ class Run:
 
     @property
     def choices(self) -> dict[str, str]:
-        """Return group -> choice of the config groups, the experiment first."""
+        """Config group -> chosen option, the experiment first."""
         chosen = {"task": self.record["task"], "experiment": self.record["experiment"]}
         asked = self.record.get("asked", {}).get("choices", {})
         return chosen | {k: str(v) for k, v in asked.items() if k not in WITHOUT_NUMBERS}
 
     @property
     def sweep(self) -> str:
-        """Return the name of the sweep that asked for it, such as table1; "" without one."""
+        """The name of its sweep, such as table1; "" without one."""
         config = self.record.get("asked", {}).get("config", "")
         return "" if config == self.record["task"] else config
 
     @property
     def overrides(self) -> list[str]:
-        """Return the overrides of the command line, such as `seed=0`."""
         return self.record.get("asked", {}).get("overrides", [])
 
     @property
-    def identity(self) -> dict[str, Any]:
-        """Return the settings that numbers depend on; runs that agree differ in their seed only."""
+    def settings_without_seed(self) -> dict[str, Any]:
+        """The settings that numbers depend on but the seed, as {dotted key: value}."""
         # Where nothing is trained the seed is that of the test clips.
         same = (*MACHINE, *(["data.test_seed"] if self.record["task"] != "train" else []))
         return {
@@ -61,59 +56,55 @@ class Run:
 
     @property
     def test_seed(self) -> int:
-        """Return the seed that the test clips follow from."""
         return self.settings.get("data.test_seed", self.record["seed"])
 
 
 @dataclass(frozen=True)
-class Plan:
-    """A sweep as it was started: its name, its command, and the overrides of each of its jobs."""
+class SweepPlan:
+    """A sweep: its config name, its command line and the overrides of each of its jobs."""
 
     sweep: str
     command: str
     jobs: list[list[str]]
 
 
-def find(folders: list[Path]) -> list[Run]:
-    """Return the runs at or below `folders`, oldest first.
-
-    Raises ValueError for a folder that is not there or has no results, and for a file that is no
-    `results.json` of this schema.
-    """
-    unique = {}
+def find_runs(folders: list[Path]) -> list[Run]:
+    """Return the runs at or below `folders`, oldest first.  Raises ValueError for a folder without
+    results, and for a file that is no `results.json` of this schema."""
+    unique: dict[Path, Path] = {}
     for folder in folders:
         if not folder.is_dir():
             raise ValueError(f"run must be folders of runs, got {folder}: no such folder")
         files = list(folder.rglob("results.json"))
-        if not files and not figures([folder]):
+        if not files and not find_figures([folder]):
             raise ValueError(f"run must hold results.json, got {folder}: empty or not finished")
         unique |= {file.resolve(): file for file in files}
-    return sorted(map(_read, unique.values()), key=lambda run: _age(run.folder))
+    return sorted(map(_read, unique.values()), key=_age)
 
 
-def plans(folders: list[Path]) -> list[Plan]:
+def find_sweeps(folders: list[Path]) -> list[SweepPlan]:
     """Return the sweeps whose `multirun.yaml` lies at or below `folders`."""
     files = {f.resolve() for folder in folders for f in folder.rglob("multirun.yaml")}
     return [_plan(safe_yaml.read(file)["hydra"]) for file in sorted(files)]
 
 
-def figures(folders: list[Path]) -> list[Path]:
+def find_figures(folders: list[Path]) -> list[Path]:
     """Return the charts and heat maps at or below `folders`; the vector picture where both are."""
-    pictures = {}
+    pictures: dict[tuple[Path, str], Path] = {}
     for folder in folders:
         for name in (f"{stem}{suffix}" for stem in FIGURES for suffix in (".png", ".svg")):
             pictures |= {(f.resolve().parent, f.stem): f for f in sorted(folder.rglob(name))}
     return list(pictures.values())
 
 
-def flat(node: Any, prefix: str = "") -> dict[str, Any]:
+def flatten(node: Any, prefix: str = "") -> dict[str, Any]:
     """Return {dotted key: value} of nested dicts; lists are values."""
     if not isinstance(node, dict) or not node:
         return {prefix: node}
     return {
         key: value
         for name, child in node.items()
-        for key, value in flat(child, f"{prefix}.{name}" if prefix else str(name)).items()
+        for key, value in flatten(child, f"{prefix}.{name}" if prefix else str(name)).items()
     }
 
 
@@ -121,7 +112,9 @@ def _read(file: Path) -> Run:
     try:
         record = json.loads(file.read_text())
         schema = record["schema"]
-        settings = flat(results.content((file.parent / "config.yaml").read_text()))
+        settings = flatten(
+            results.settings_affecting_results((file.parent / "config.yaml").read_text())
+        )
     except (OSError, ValueError, KeyError, TypeError, RecursionError, yaml.YAMLError) as error:
         raise ValueError(f"run must hold whole results, got {file}: {error}") from error
     if schema != results.SCHEMA:
@@ -131,17 +124,19 @@ def _read(file: Path) -> Run:
     return Run(file.parent, record, settings, rows)
 
 
-def _age(folder: Path) -> tuple[float, str]:
-    return (folder / "results.json").stat().st_mtime, str(folder)
+def _age(run: Run) -> tuple[float, str]:
+    return (run.folder / "results.json").stat().st_mtime, str(run.folder)
 
 
-def _plan(hydra: dict) -> Plan:
+def _plan(hydra: dict) -> SweepPlan:
     asked = list(hydra["overrides"]["task"])
     params = (hydra["sweeper"].get("params") or {}).items()
     lines = [f"{key}={value}" for key, value in params] + asked
     parsed = OverridesParser.create().parse_overrides(lines)
-    door, config = hydra["job"]["name"], hydra["job"]["config_name"]
-    sweep = "" if door == config else config
+    entry_point, config = hydra["job"]["name"], hydra["job"]["config_name"]
+    sweep = "" if entry_point == config else config
     how = f"--config-dir sweeps --config-name {sweep}" if sweep else "-m"
-    start = f"python -m src.{door} {how}"
-    return Plan(sweep, " ".join([start, *asked]), BasicSweeper.split_arguments(parsed, None)[0])
+    start = f"python -m src.{entry_point} {how}"
+    return SweepPlan(
+        sweep, " ".join([start, *asked]), BasicSweeper.split_arguments(parsed, None)[0]
+    )

@@ -1,4 +1,4 @@
-"""What Weights & Biases is told of a run besides its curves: config, pictures, final metrics."""
+"""Config, sample pictures and final metrics of a run for Weights & Biases."""
 
 import sys
 from collections.abc import Iterable
@@ -7,24 +7,23 @@ from pathlib import Path
 from lightning.pytorch.loggers import Logger, WandbLogger
 
 
-def begin(loggers: Iterable[Logger], config: dict) -> None:
-    """Store the whole config with the run of W&B, where it is among `loggers`."""
+def log_config(loggers: Iterable[Logger], config: dict) -> None:
+    """Store `config` with the run of W&B, where it is among `loggers`."""
     for logger in _wandb(loggers):
-        logger.experiment.config.update(config)
+        logger.log_hyperparams(config)
 
 
-def end(loggers: Iterable[Logger], record: dict, pictures: Iterable[Path]) -> None:
-    """Store the means of `record`, the content of results.json, and the sample pictures."""
+def log_results(loggers: Iterable[Logger], record: dict, pictures: Iterable[Path]) -> None:
+    """Store the mean scores of `record`, the content of results.json, and sample pictures."""
     means = {name: value["mean"] for name, value in record["test"].items() if name != "clips"}
     for logger in _wandb(loggers):
-        import wandb
-
         logger.experiment.summary.update({f"test/{name}": mean for name, mean in means.items()})
-        shown = {path.stem: _picture(wandb, path) for path in pictures}
-        logger.experiment.log({f"samples/{name}": picture for name, picture in shown.items()})
+        for path in pictures:
+            log = logger.log_video if path.suffix == ".gif" else logger.log_image
+            log(f"samples/{path.stem}", [str(path)])
 
 
-def close() -> None:
+def finish_wandb() -> None:
     """End the run of W&B, if there is one: the next job of a multirun would write into it."""
     if "wandb" in sys.modules:
         sys.modules["wandb"].finish()
@@ -32,7 +31,3 @@ def close() -> None:
 
 def _wandb(loggers: Iterable[Logger]) -> list[WandbLogger]:
     return [logger for logger in loggers if isinstance(logger, WandbLogger)]
-
-
-def _picture(wandb, path: Path):
-    return wandb.Video(str(path), format="gif") if path.suffix == ".gif" else wandb.Image(str(path))

@@ -1,21 +1,26 @@
-"""Tables of cells: scores and cost, severities apart, and what was scored on the same clips."""
+"""Tables of groups of runs: scores and cost, by severity, networks on the same clips, differences
+of two sets of runs.
+"""
 
 import math
 import statistics
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
+from src.metrics.bootstrap import bootstrap_difference_interval
 from src.metrics.table import METRICS
 from src.records.runs import Run
-from src.reports.cells import Cell, matches
+from src.reports.run_groups import RunGroup, find_published
 
 SEVERITIES = ("none", "weak", "medium", "strong")
+SPLIT_METRICS = ("lpips", "psnr_aligned", "temporal_jitter_px")  # of the table by severity
 
 
 @dataclass(frozen=True)
 class Column:
     """`better` is 1 where more is better, -1 where less is, 0 where neither; `group` stands above
-    the columns that have it, such as the source of numbers that are not ours.
+    the columns that have it, such as the source of published numbers.
     """
 
     name: str
@@ -26,36 +31,36 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Value:
-    """A mean over seeds with its sample standard deviation, None for one seed; or words."""
+class TableCell:
+    """A mean over seeds with its sample standard deviation, None for one seed; or a text."""
 
     mean: float | None = None
-    spread: float | None = None
-    words: str = ""
+    std: float | None = None
+    text: str = ""
 
 
 @dataclass
 class Table:
-    """Rows of values under columns; the first `labels` columns say what a row is.
-
-    `marks` are the remarks [1], [2] ... of rows, `note` holds for all of them.
-    """
+    """Rows of cells under columns; the first `labels` columns say what a row is."""
 
     title: str
     columns: list[Column]
-    rows: list[list[Value]]
+    rows: list[list[TableCell]]
     labels: int
-    marks: list[str] = field(default_factory=list)
     note: str = ""
 
-    def best(self, column: int) -> float | None:
-        """Return the best mean of a column as it is printed; None where there is no best."""
-        head = self.columns[column]
-        means = [row[column].mean for row in self.rows if row[column].mean is not None]
-        printed = {round(mean, head.digits) for mean in means}
-        if head.better == 0 or len(printed) < 2:
-            return None
-        return max(printed) if head.better > 0 else min(printed)
+    def add_row(self, group: RunGroup, cells: Iterable[TableCell]) -> None:
+        """Add a row of the group's label and `cells`."""
+        self.rows.append([*(TableCell(text=text) for text in group.label), *cells])
+
+    def is_best(self, place: int, cell: TableCell) -> bool:
+        """Return whether `cell` is the best of column `place`, as printed."""
+        head = self.columns[place]
+        means = [row[place].mean for row in self.rows]
+        printed = {round(mean, head.digits) for mean in means if mean is not None}
+        if head.better == 0 or len(printed) < 2 or cell.mean is None:
+            return False
+        return round(cell.mean, head.digits) == (max if head.better > 0 else min)(printed)
 
 
 SCORES = tuple(Column(m.name, m.heading, m.digits, m.better) for m in METRICS)
@@ -64,141 +69,141 @@ COSTS: tuple[tuple[Column, Callable[[Run], float]], ...] = (
     (Column("gmac", "GMAC", 2), lambda run: run.record["model"]["macs_per_frame"] / 1e9),
     (Column("params", "params", 0), lambda run: run.record["model"]["params"]),
 )
-SPLIT = ("lpips", "psnr_aligned", "wobble")
 
 
-def main(title: str, keys: tuple[str, ...], cells: list[Cell], paper: dict) -> Table:
-    """Return scores, cost and number of seeds of each cell.
+def build_score_table(
+    title: str, keys: Sequence[str], groups: Sequence[RunGroup], published: Mapping[str, Any]
+) -> Table:
+    """Return scores, cost and number of seeds of each group.
 
-    `paper`: {source, rows: [{when: {key: value}, psnr ...}]}; its numbers stand in columns of their
-    own where one of `cells` matches all of `when`.
+    `published`: as for `find_published`, with its `source`; its numbers stand in columns of their
+    own.
     """
-    shown = _with_paper(cells, paper)
-    columns = [*map(_label, keys), *SCORES, *(column for column, _ in COSTS)]
-    columns += [Column("n", "n"), *(column for column, _ in shown)]
+    found = [find_published(group.runs[0], published) if group.runs else {} for group in groups]
+    theirs = [score for score in SCORES if any(score.name in row for row in found)]
+    columns = [*(Column(key, key) for key in keys), *SCORES, *(column for column, _ in COSTS)]
+    columns.append(Column("n", "n"))
+    for c in theirs:
+        digits = c.digits + (c.digits == 3)
+        columns.append(Column(f"paper_{c.name}", c.head, digits, group=published["source"]))
     table = Table(title, columns, [], len(keys))
-    for cell in cells:
-        row = _names(cell, table.marks)
-        row += [_over_seeds(cell.runs, _scored(column.name)) for column in SCORES]
-        row += [_over_seeds(cell.runs, cost, column.better != 0) for column, cost in COSTS]
-        row += [_count(cell), *(fill(cell) for _, fill in shown)]
-        table.rows.append(row)
-    table.note = _sizes(cells)
+    for group, row in zip(groups, found, strict=True):
+        cells = [_mean_over_seeds(group.runs, _score(column.name)) for column in SCORES]
+        cells += [_mean_over_seeds(group.runs, cost, column.better != 0) for column, cost in COSTS]
+        done, asked = len(group.runs), len(group.runs) + group.missing
+        count = str(done) if not group.missing else f"{done} of {asked}" if done else "missing"
+        published_cells = (TableCell(row.get(score.name)) for score in theirs)
+        table.add_row(group, [*cells, TableCell(text=count), *published_cells])
+    table.note = _describe_measurement(groups)
     return table
 
 
-def by_severity(title: str, keys: tuple[str, ...], cells: list[Cell]) -> Table | None:
-    """Return the scores of the clips of each severity; None where no cell has clips of several."""
-    drawn = {clip["severity"] for cell in cells for run in cell.runs for clip in run.clips}
-    several = any(len({c["severity"] for c in r.clips}) > 1 for cell in cells for r in cell.runs)
-    present = [severity for severity in SEVERITIES if severity in drawn]
-    if not several:
+def build_severity_table(
+    title: str, keys: Sequence[str], groups: Sequence[RunGroup]
+) -> Table | None:
+    """Return the scores of the clips of each severity; None where no run has clips of several."""
+    drawn = [{clip["severity"] for clip in run.clips} for group in groups for run in group.runs]
+    if all(len(severities) < 2 for severities in drawn):
         return None
-    split = [(score, severity) for score in SCORES if score.name in SPLIT for severity in present]
-    heads = [
-        Column(f"{score.name}_{severity}", severity, score.digits, score.better, score.head)
-        for score, severity in split
-    ]
-    table = Table(title, [*map(_label, keys), *heads], [], len(keys))
-    for cell in cells:
-        row = [_over_seeds(cell.runs, _among(score.name, severity)) for score, severity in split]
-        table.rows.append(_names(cell, table.marks) + row)
+    present = [severity for severity in SEVERITIES if severity in set().union(*drawn)]
+    split = [(s, severity) for s in SCORES if s.name in SPLIT_METRICS for severity in present]
+    heads = [Column(f"{s.name}_{name}", name, s.digits, s.better, s.head) for s, name in split]
+    table = Table(title, [*(Column(key, key) for key in keys), *heads], [], len(keys))
+    for group in groups:
+        scores = [_score(s.name, severity=severity) for s, severity in split]
+        table.add_row(group, [_mean_over_seeds(group.runs, score) for score in scores])
     return table
 
 
-def compared(title: str, keys: tuple[str, ...], cells: list[Cell]) -> Table | None:
+def build_same_clips_table(
+    title: str, keys: Sequence[str], groups: Sequence[RunGroup]
+) -> Table | None:
     """Return each network and what else its runs scored, such as the untrained one."""
-    columns = [*map(_label, keys), Column("network", "network"), *SCORES]
+    columns = [*(Column(key, key) for key in keys), Column("network", "network"), *SCORES]
     table = Table(title, columns, [], len(keys) + 1)
-    for cell in cells:
-        names = dict.fromkeys(name for run in cell.runs for name in run.record.get("compared", {}))
-        words = _names(cell, table.marks) if names else []
-        for name in (None, *names) if names else ():
-            row = [_over_seeds(cell.runs, _scored(c.name, name)) for c in SCORES]
-            table.rows.append([*words, Value(words=name or "trained"), *row])
+    for group in groups:
+        others = dict.fromkeys(n for run in group.runs for n in run.record.get("compared", {}))
+        for name in (None, *others) if others else ():
+            cells = [_mean_over_seeds(group.runs, _score(c.name, name)) for c in SCORES]
+            table.add_row(group, [TableCell(text=name or "trained"), *cells])
     return table if table.rows else None
 
 
-def _label(key: str) -> Column:
-    return Column(key, key)
+def build_difference_table(
+    title: str, ours: Sequence[Run], theirs: Sequence[Run], published: Mapping[str, Any]
+) -> Table:
+    """Return the means of `ours` and `theirs`, a run per seed, and their difference with the 95 %
+    bootstrap CI (seeds and clips resampled, clips in pairs); beside it the published difference.
+
+    Raises ValueError where the clips of all runs are not the same.
+    """
+    names = {tuple(clip["name"] for clip in run.clips) for run in [*ours, *theirs]}
+    if len(names) != 1 or () in names:
+        raise ValueError(f"run and against must hold the same clips, got {len(names)} sets of them")
+    heads = ("metric", "ours", "theirs", "ours - theirs", "95 % bootstrap CI", "published")
+    table = Table(title, [Column(head, head) for head in heads], [], 1)
+    rows = [find_published(side[0], published) for side in (ours, theirs)]
+    for metric in METRICS:
+        if not all(metric.name in clip for run in [*ours, *theirs] for clip in run.clips):
+            continue
+        sides = [[[float(clip[metric.name]) for clip in run.clips] for run in side]
+                 for side in (ours, theirs)]  # fmt: skip
+        left, right = (sum(map(sum, side)) / sum(map(len, side)) for side in sides)
+        low, high = bootstrap_difference_interval(sides[0], sides[1])
+        first, second = (row.get(metric.name) for row in rows)
+        digits = metric.digits + 1
+        texts = [metric.heading, *(f"{value:.{digits}f}" for value in (left, right))]
+        texts += [f"{left - right:+.{digits}f}", f"{low:+.{digits}f} to {high:+.{digits}f}"]
+        change = None if first is None or second is None else first - second
+        texts.append("-" if change is None else f"{change:+.{digits}f}")
+        table.rows.append([TableCell(text=text) for text in texts])
+    table.note = f"{len(ours[0].clips)} clips; {len(ours)} runs against {len(theirs)}."
+    return table
 
 
-def _names(cell: Cell, marks: list[str]) -> list[Value]:
-    """Return the words of the label; the first one carries the numbers of the cell's marks."""
-    numbers = ", ".join(str(len(marks) + k) for k in range(1, len(cell.notes) + 1))
-    marks += cell.notes
-    first, *others = cell.label
-    words = [f"{first} [{numbers}]" if numbers else first, *others]
-    return [Value(words=word) for word in words]
-
-
-def _count(cell: Cell) -> Value:
-    done = len(cell.runs)
-    if not cell.missing:
-        return Value(words=str(done))
-    return Value(words=f"{done} of {done + cell.missing}" if done else "missing")
-
-
-def _over_seeds(
-    runs: list[Run], measure: Callable[[Run], float | None], spreads: bool = True
-) -> Value:
+def _mean_over_seeds(
+    runs: Sequence[Run], measure: Callable[[Run], float | None], with_std: bool = True
+) -> TableCell:
     values = [value for run in runs if (value := measure(run)) is not None and math.isfinite(value)]
     if not values:
-        return Value()
-    spread = statistics.stdev(values) if spreads and len(values) > 1 else None
-    return Value(statistics.fmean(values), spread)
+        return TableCell()
+    std = statistics.stdev(values) if with_std and len(values) > 1 else None
+    return TableCell(statistics.fmean(values), std)
 
 
-def _scored(metric: str, compared: str | None = None) -> Callable[[Run], float | None]:
+def _score(
+    metric: str, compared: str | None = None, severity: str | None = None
+) -> Callable[[Run], float | None]:
+    """Return what reads the mean of a run: of the network `compared`, or of clips of `severity`."""
+
     def measure(run: Run) -> float | None:
-        test = run.record["compared"].get(compared, {}) if compared else run.record["test"]
-        return test.get(metric, {}).get("mean")
-
-    return measure
-
-
-def _among(metric: str, severity: str) -> Callable[[Run], float | None]:
-    def measure(run: Run) -> float | None:
+        if severity is None:
+            test = run.record["compared"].get(compared, {}) if compared else run.record["test"]
+            return test.get(metric, {}).get("mean")
         scores = [float(c[metric]) for c in run.clips if c["severity"] == severity and metric in c]
         return statistics.fmean(scores) if scores else None
 
     return measure
 
 
-def _with_paper(cells: list[Cell], paper: dict) -> list[tuple[Column, Callable]]:
-    """Return the columns of the paper's numbers for these cells, with what fills them."""
-
-    def row(cell: Cell) -> dict:
-        fitting = [r for r in paper["rows"] if cell.runs and matches(cell.runs[0], r["when"])]
-        return max(fitting, key=lambda r: len(r["when"]), default={})
-
-    def filled(metric: str) -> Callable[[Cell], Value]:
-        return lambda cell: Value(row(cell).get(metric))
-
-    if not any(map(row, cells)):
-        return []
-    return [
-        (Column(f"paper_{c.name}", c.head, c.digits + (c.digits == 3), group=paper["source"]), fill)
-        for c in SCORES
-        if any((fill := filled(c.name))(cell).mean is not None for cell in cells)
-    ]
-
-
-def _sizes(cells: list[Cell]) -> str:
-    """Say at what size the time and the operations of a frame were taken, and on what machine."""
-    records = [run.record for cell in cells for run in cell.runs]
-    if not records:
+def _describe_measurement(groups: Sequence[RunGroup]) -> str:
+    """Say how many clips there were, and at what size and on what a frame was timed."""
+    runs = [run for group in groups for run in group.runs]
+    if not runs:
         return ""
-    sizes = {size for record in records for size in record["latency_ms"]}
-    clips = {record["test"]["clips"] for record in records}
-    seeds = {frozenset(run.test_seed for run in cell.runs) for cell in cells if cell.runs}
-    unlike = " Rows differ in the seed of their test clips." if len(seeds) > 1 else ""
-    devices = {record["device"] for record in records}
-    return (
-        f"{_listed(clips)} test clips; ms and GMAC of one frame of {_listed(sizes)}; ± is the "
-        f"sample standard deviation over n seeds; {_listed(devices)}.{unlike}"
+    clips, sizes, devices = (
+        " or ".join(map(str, sorted(values)))
+        for values in (
+            {run.record["test"]["clips"] for run in runs},
+            {size for run in runs for size in run.record["latency_ms"]},
+            {run.record["device"] for run in runs},
+        )
     )
-
-
-def _listed(values: set) -> str:
-    return " or ".join(map(str, sorted(values)))
+    seeds = {frozenset(run.test_seed for run in group.runs) for group in groups if group.runs}
+    unlike = " Rows differ in the seed of their test clips." if len(seeds) > 1 else ""
+    if older := sum(group.older for group in groups):
+        unlike += f" {older} older runs of the same seeds are left out."
+    return (
+        f"{clips} test clips; ms and GMAC of one frame of {sizes}; ± is the "
+        f"sample standard deviation over n seeds; {devices}.{unlike}"
+    )

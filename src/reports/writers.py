@@ -1,58 +1,44 @@
-"""A table as Markdown, CSV and LaTeX; a section of a document replaced between its markers."""
+"""A table as Markdown and CSV; a section of a document replaced between its markers."""
 
-import re
-from itertools import groupby
+from collections.abc import Sequence
 from pathlib import Path
 
 from src.records import results
-from src.reports.tables import Column, Table, Value
+from src.reports.tables import Column, Table, TableCell
 
 ARROWS = {1: " ↑", -1: " ↓", 0: ""}
-LATEX = {"&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}"}
-LATEX |= {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"}
-LATEX |= {"±": r"$\pm$", "×": r"$\times$", "↑": r"$\uparrow$", "↓": r"$\downarrow$"}
 
 
-def markdown(tables: list[Table], commands: list[str] = ()) -> str:
-    """Return the tables with their titles, marks and commands."""
+def format_markdown(tables: Sequence[Table], commands: Sequence[str] = ()) -> str:
+    """Return the tables with their titles, remarks and commands; best values are bold."""
     parts = [f"`{command}`" for command in commands]
     for table in tables:
-        heads = [head_text(column) for column in table.columns]
-        rules = ["---" if place < table.labels else "--:" for place in range(len(heads))]
-        lines = [f"**{_escaped(table.title)}**", "", _line(heads), _line(rules)]
+        rules = ["---" if place < table.labels else "--:" for place in range(len(table.columns))]
+        heads = [f"{c.group}: " * bool(c.group) + c.head + ARROWS[c.better] for c in table.columns]
+        lines = [f"**{_escape(table.title)}**", "", _format_line(heads), _format_line(rules)]
         for row in table.rows:
             texts = []
-            for place, value in enumerate(row):
-                written = _escaped(value_text(value, table.columns[place]))
-                texts.append(f"**{written}**" if is_best(table, place, value) else written)
-            lines.append(_line(texts))
-        parts += ["\n".join(lines), *map(_escaped, remarks(table))]
+            for place, cell in enumerate(row):
+                text = _escape(format_cell(cell, table.columns[place]))
+                texts.append(f"**{text}**" if table.is_best(place, cell) else text)
+            lines.append(_format_line(texts))
+        parts += ["\n".join(lines), *([_escape(table.note)] if table.note else [])]
     return "\n\n".join(parts) + "\n"
 
 
-def comma_separated(tables: list[Table]) -> str:
-    """Return the tables one under another, full precision, mean and spread in columns."""
+def format_csv_tables(tables: Sequence[Table]) -> str:
+    """Return the tables one under another, full precision, mean and std in columns."""
     text = ""
     for table in tables:
-        names = []
-        for place, column in enumerate(table.columns):
-            spread = any(row[place].spread is not None for row in table.rows)
-            names += [column.name, f"{column.name}_std"] if spread else [column.name]
-        lines = []
-        for row in table.rows:
-            cells = [table.title]
-            for value, column in zip(row, table.columns, strict=True):
-                cells.append(value.words if value.mean is None else value.mean)
-                if f"{column.name}_std" in names:
-                    cells.append("" if value.spread is None else value.spread)
-            lines.append(cells)
-        text += results.csv_text(["table", *names], lines)
+        heads, lines = ["table"], [list[object]([table.title]) for _ in table.rows]
+        for column, *cells in zip(table.columns, *table.rows, strict=True):
+            with_std = any(cell.std is not None for cell in cells)
+            heads += [column.name, f"{column.name}_std"] if with_std else [column.name]
+            for line, cell in zip(lines, cells, strict=True):
+                line.append(cell.text if cell.mean is None else cell.mean)
+                line += ["" if cell.std is None else cell.std] if with_std else []
+        text += results.format_csv(heads, lines)
     return text
-
-
-def latex(tables: list[Table]) -> str:
-    """Return one booktabs `table` environment per table; best values are bold."""
-    return "\n".join(map(_latex, tables))
 
 
 def replace_section(document: Path, name: str, text: str) -> None:
@@ -74,73 +60,19 @@ def replace_section(document: Path, name: str, text: str) -> None:
     results.write_text(document, f"{before}{start}\n\n{text.strip()}\n\n{end}{after}")
 
 
-def value_text(value: Value, column: Column) -> str:
-    """Return a value as people read it: words, a mean, a mean ± its spread, or a dash."""
-    if value.words:
-        return value.words
-    if value.mean is None:
+def format_cell(cell: TableCell, column: Column) -> str:
+    """Return a cell as people read it: a text, a mean, a mean ± its std, or a dash."""
+    if cell.text:
+        return cell.text
+    if cell.mean is None:
         return "-"
-    number = f"{value.mean:,.{column.digits}f}"
-    return number if value.spread is None else f"{number} ± {value.spread:.{column.digits}f}"
+    number = f"{cell.mean:,.{column.digits}f}"
+    return number if cell.std is None else f"{number} ± {cell.std:.{column.digits}f}"
 
 
-def head_text(column: Column) -> str:
-    """Return the head of a column with its group before it and its arrow after it."""
-    group = f"{column.group}: " if column.group else ""
-    return group + column.head + ARROWS[column.better]
-
-
-def is_best(table: Table, place: int, value: Value) -> bool:
-    """Return whether `value` is the best of its column, as printed."""
-    best = table.best(place)
-    digits = table.columns[place].digits
-    return best is not None and value.mean is not None and round(value.mean, digits) == best
-
-
-def remarks(table: Table) -> list[str]:
-    """Return the marks of a table, numbered, and its note."""
-    numbered = [f"[{number}] {mark}" for number, mark in enumerate(table.marks, 1)]
-    return [*numbered, table.note] if table.note else numbered
-
-
-def _line(cells: list[str]) -> str:
+def _format_line(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def _escaped(text: str) -> str:
+def _escape(text: str) -> str:
     return text.replace("\n", " ").replace("|", r"\|").replace("<", "&lt;")
-
-
-def _tex(text: str) -> str:
-    return re.sub(".", lambda match: LATEX.get(match[0], match[0]), text)
-
-
-def _latex(table: Table) -> str:
-    heads = [_tex(column.head + ARROWS[column.better]) for column in table.columns]
-    lines = [*_latex_groups(table.columns), " & ".join(heads) + r" \\", r"\midrule"]
-    for row in table.rows:
-        texts = []
-        for place, value in enumerate(row):
-            written = _tex(value_text(value, table.columns[place]))
-            best = is_best(table, place, value)
-            texts.append(rf"\textbf{{{written}}}" if best else written)
-        lines.append(" & ".join(texts) + r" \\")
-    shape = "l" * table.labels + "r" * (len(table.columns) - table.labels)
-    body = "\n".join(lines)
-    caption = _tex(" ".join([f"{table.title}.", *remarks(table)]))
-    return (
-        "% needs \\usepackage{booktabs}\n\\begin{table}\n\\centering\n"
-        f"\\caption{{{caption}}}\n\\begin{{tabular}}{{{shape}}}\n\\toprule\n{body}\n"
-        "\\bottomrule\n\\end{tabular}\n\\end{table}\n"
-    )
-
-
-def _latex_groups(columns: list[Column]) -> list[str]:
-    """Return the row of groups above the heads and the rules below it; none without groups."""
-    cells, rules, first = [], [], 1
-    for group, members in groupby(columns, key=lambda column: column.group):
-        last = first + len(list(members)) - 1
-        cells.append(rf"\multicolumn{{{last - first + 1}}}{{c}}{{{_tex(group)}}}")
-        rules += [rf"\cmidrule(lr){{{first}-{last}}}"] if group else []
-        first = last + 1
-    return [" & ".join(cells) + r" \\", " ".join(rules)] if rules else []

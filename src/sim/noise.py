@@ -10,12 +10,14 @@ the low and the high half of the counter in turn, each time under half of the 64
 
 import hashlib
 import math
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 MASK = 0xFFFFFFFF
+T = TypeVar("T", int, Tensor)
 
 
 def key(*words: int | str) -> int:
@@ -62,7 +64,7 @@ def normal(key: int, counters: Int[Tensor, "..."]) -> Float[Tensor, "..."]:
     return radius * torch.cos(2.0 * math.pi * uniform(key, 2 * counters + 1))
 
 
-def _mixed(x: Tensor | int) -> Tensor | int:
+def _mixed(x: T) -> T:
     x = x ^ (x >> 16)
     x = (x * 0x7FEB352D) & MASK
     x = x ^ (x >> 15)

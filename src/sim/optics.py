@@ -7,12 +7,12 @@ sub-apertures; rows count downwards.  Axes: see docs/conventions.md.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional
 
 from src.sim import noise
 
@@ -43,7 +43,7 @@ def layout(views: int) -> tuple[Position, ...]:
     return tuple((row, col) for row in axis for col in axis)
 
 
-def centre(positions: Sequence[Position]) -> int:
+def centre_view_index(positions: Sequence[Position]) -> int:
     """Return the index of the view nearest to (0, 0): what one camera alone would see."""
     return min(range(len(positions)), key=lambda i: sum(axis**2 for axis in positions[i]))
 
@@ -60,41 +60,40 @@ def view_id(position: Position) -> int:
 class Optics:
     """Number and arrangement of the views and what registration leaves wrong.
 
-    `views`: see `layout`; `positions` overrides it with a list of (row, col).
-    `misalignment_px`: standard deviation, per corner and axis, of the residual homography of every
-    view but the centre one, in pixels; 0 is perfect registration.
+    `views`: see `layout`; `positions` overrides it with (row, col), if any.
+    `homography_error_px`: standard deviation, per corner and axis, of the residual homography of
+    every view but the centre one, in pixels; 0 is perfect registration.
     """
 
     views: int = 9
-    positions: Sequence[Sequence[int]] | None = None  # a config has lists
-    misalignment_px: float = 0.0
+    positions: Sequence[Any] = ()  # of (row, col)
+    homography_error_px: float = 0.0
 
     def __post_init__(self):
-        if self.misalignment_px < 0 or not math.isfinite(self.misalignment_px):
-            raise ValueError(f"optics.misalignment_px must be >= 0, got {self.misalignment_px}")
-        chosen = layout(self.views) if self.positions is None else self.positions
+        if self.homography_error_px < 0 or not math.isfinite(self.homography_error_px):
+            raise ValueError(
+                f"optics.homography_error_px must be >= 0, got {self.homography_error_px}"
+            )
+        chosen = self.positions or layout(self.views)
         positions = tuple((int(row), int(col)) for row, col in chosen)
         if len(positions) != self.views or len(set(positions)) != self.views:
-            raise ValueError(
-                f"optics.positions must be {self.views} different (row, col), got {positions}"
-            )
+            allowed = f"{self.views} different (row, col)"
+            raise ValueError(f"optics.positions must be {allowed}, got {positions}")
         object.__setattr__(self, "positions", positions)
 
     @property
     def view_ids(self) -> list[int]:
-        """The key of each view, in order."""
         return [view_id(position) for position in self.positions]
 
     @property
     def centre(self) -> int:
-        """The index of the centre view."""
-        return centre(self.positions)
+        return centre_view_index(self.positions)
 
-    def only(self, positions: Sequence[Position]) -> "Optics":
+    def select_views(self, positions: Sequence[Position]) -> "Optics":
         """Return these optics with the views at `positions` alone."""
         return replace(self, views=len(positions), positions=tuple(positions))
 
-    def misalign(
+    def apply_homography_error(
         self,
         frames: Float[Tensor, "n views frames h w"],
         key: int,
@@ -107,37 +106,29 @@ class Optics:
         `origin` is the (row, column) of the first pixel in the full frame of `full_size` (h, w), so
         that a crop is warped as the full frame is.  The homography is a function of (key, view).
         """
-        if self.misalignment_px == 0:
+        if self.homography_error_px == 0:
             return frames
+        from kornia.geometry.transform import warp_perspective  # here: to import it takes a second
+
         height, width = full_size or frames.shape[-2:]
+        shift = torch.eye(3, dtype=torch.float64)
+        shift[:2, 2] = torch.tensor([-origin[1], -origin[0]])
         warped = frames.clone()
         for index, position in enumerate(self.positions):
-            if position != (0, 0):
-                own = noise.key(key, view_id(position), "misalignment")
-                matrix = self._residual(own, height, width)
-                warped[:, index] = _warp(frames[:, index], matrix, origin)
+            if position == (0, 0):
+                continue
+            view_key = noise.key(key, view_id(position), "misalignment")
+            seen = self._draw_homography(view_key, height, width).inverse()  # frame to view
+            matrix = (shift @ seen @ shift.inverse()).to(frames.device).expand(len(frames), -1, -1)
+            view, size = frames[:, index].double(), (frames.shape[-2], frames.shape[-1])
+            warped[:, index] = warp_perspective(view, matrix, size, padding_mode="border")
         return warped
 
-    def _residual(self, key: int, height: int, width: int) -> Tensor:
+    def _draw_homography(self, key: int, height: int, width: int) -> Float[Tensor, "3 3"]:
+        """Return the homography, float64, that moves each corner at random."""
         right, bottom = width - 1.0, height - 1.0
         corners = torch.tensor([[0, 0], [right, 0], [right, bottom], [0, bottom]])
-        jitter = noise.normal(key, torch.arange(8)).reshape(4, 2) * self.misalignment_px
-        return homography(corners, corners + jitter)
-
-
-def homography(source: Float[Tensor, "4 2"], target: Float[Tensor, "4 2"]) -> Float[Tensor, "3 3"]:
-    """Return the homography that maps four (x, y) points onto four others, float64."""
-    points = (part.float().numpy() for part in (source, target))
-    return torch.from_numpy(cv2.getPerspectiveTransform(*points))
-
-
-def _warp(frames: Tensor, matrix: Tensor, origin: tuple[int, int]) -> Tensor:
-    """Sample (n, frames, h, w) at the homography of each pixel's full-frame (x, y)."""
-    height, width = frames.shape[-2:]
-    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    points = torch.stack([x + origin[1], y + origin[0], torch.ones_like(x)], dim=-1).double()
-    mapped = points @ matrix.T
-    mapped = mapped[..., :2] / mapped[..., 2:] - torch.tensor([origin[1], origin[0]])
-    grid = (2 * mapped + 1) / torch.tensor([width, height]) - 1
-    grid = grid.to(frames)[None].expand(len(frames), -1, -1, -1)
-    return functional.grid_sample(frames, grid, padding_mode="border", align_corners=False)
+        moved = (
+            corners + noise.normal(key, torch.arange(8)).reshape(4, 2) * self.homography_error_px
+        )
+        return torch.from_numpy(cv2.getPerspectiveTransform(corners.numpy(), moved.numpy()))

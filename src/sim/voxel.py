@@ -5,26 +5,28 @@ floor(tau) and p f to the next, f its fraction.  The edges are the window's, not
 last event, so that all views share one clock and an empty view shifts nothing.
 """
 
+from typing import no_type_check
+
 import numpy as np
 import torch
 from jaxtyping import Float
+from numba import njit
+from numpy.typing import ArrayLike
 from torch import Tensor
 
-from src.sim.engines.voxel_numba import accumulate
+f32 = np.float32
 
 
 def voxel_grid(
-    t, x, y, p, *, t0=None, t1=None, bins: int, height: int,
-    width: int, window: str = "edges",
+    t: ArrayLike, x: ArrayLike, y: ArrayLike, p: ArrayLike, *, t0: float, t1: float, bins: int,
+    height: int, width: int,
 ) -> Float[Tensor, "bins h w"]:  # fmt: skip
     """Return the grid of the events with t0 <= t <= t1; the others have no part in it.
 
     `t`, in the unit of `t0` and `t1` and in any order; `x`, `y` in pixels; `p` in {-1, 1} or
     {0, 1}: arrays or tensors of one length.  Each event's weights are multiples of 2**-20, so
-    that sums of up to 16 events a cell are exact and do not depend on their order.
-    `window="first_last"` takes t0 and t1 from the first and last event, as E2VID does; use it only
-    to compare.  Raises ValueError for coordinates outside, lengths that differ, t1 <= t0 or another
-    polarity.
+    that sums of up to 16 events a cell are exact and do not depend on their order.  Raises
+    ValueError for coordinates outside, lengths that differ, t1 <= t0 or another polarity.
     """
     t, x, y, p = (np.asarray(part) for part in (t, x, y, p))
     if not t.shape == x.shape == y.shape == p.shape or t.ndim != 1:
@@ -32,35 +34,20 @@ def voxel_grid(
         raise ValueError(f"t, x, y, p must be of one length, got shapes {shapes}")
     if bins < 1 or height < 1 or width < 1:
         raise ValueError(f"bins, height, width must be positive, got {bins}, {height}, {width}")
-    grid = torch.zeros(bins, height, width)
-    t0, t1 = _edges(t, t0, t1, window)
+    if not t1 > t0:
+        raise ValueError(f"voxel_grid needs t0 < t1, got t0={t0}, t1={t1}")
+    grid, t0, t1 = torch.zeros(bins, height, width), float(t0), float(t1)
     if t.size == 0:
         return grid
-    places = t.astype(np.int64) if t.dtype.kind in "iu" else t.astype(np.float64)
-    wrong = accumulate(
-        places, x, y, p, t0, t1, np.float32(np.float32(bins - 1) / np.float32(t1 - t0)),
-        bool(p.min() >= 0), grid.numpy(),
-    )  # fmt: skip
+    times = t.astype(np.int64) if t.dtype.kind in "iu" else t.astype(np.float64)
+    scale = np.float32(np.float32(bins - 1) / np.float32(t1 - t0))
+    wrong = accumulate(times, x, y, p, t0, t1, scale, bool(p.min() >= 0), grid.numpy())
     if wrong >= 0:
         raise ValueError(
             f"events must have x in 0..{width - 1}, y in 0..{height - 1}, p in {{-1, 1}} or "
             f"{{0, 1}}; event {wrong} is x={x[wrong]} y={y[wrong]} p={p[wrong]}"
         )
     return grid
-
-
-def _edges(t: np.ndarray, t0, t1, window: str) -> tuple[float, float]:
-    """Return the window's edges as floats that hold the event clock exactly."""
-    if window == "first_last":
-        if t.size == 0:
-            return 0.0, 1.0
-        t0, t1 = t.min(), t.max()
-        t1 = t1 if t1 > t0 else t0 + 1  # one instant: everything lands in the first bin
-    elif window != "edges":
-        raise ValueError(f"window must be `edges` or `first_last`, got {window!r}")
-    if t0 is None or t1 is None or not t1 > t0:
-        raise ValueError(f"voxel_grid needs t0 < t1, got t0={t0}, t1={t1}")
-    return float(t0), float(t1)
 
 
 def normalise_nonzero(grid: Float[Tensor, "*batch bins h w"]) -> Float[Tensor, "*batch bins h w"]:
@@ -76,3 +63,28 @@ def normalise_nonzero(grid: Float[Tensor, "*batch bins h w"]) -> Float[Tensor, "
     variance = (((grid - mean) * filled) ** 2).sum(axes, keepdim=True) / number
     spread = torch.where(variance > 1e-12, variance, 1.0).sqrt()
     return torch.where(filled, (grid - mean) / spread, 0.0)
+
+
+@njit(nogil=True, cache=True)
+@no_type_check  # a checked function would not compile
+def accumulate(t, x, y, p, t0, t1, scale, zero_is_off, grid):
+    """Add the events with t0 <= t <= t1 to `grid`; return the index of a bad event, or -1."""
+    bins, height, width = grid.shape
+    for i in range(t.size):
+        if not (0 <= x[i] < width and 0 <= y[i] < height):
+            return i
+        if p[i] == 1:
+            sign = f32(1)
+        elif p[i] == -1 or (p[i] == 0 and zero_is_off):
+            sign = f32(-1)
+        else:
+            return i
+        if not t0 <= t[i] <= t1:
+            continue
+        tau = f32(f32(t[i] - t0) * scale)
+        b = min(np.int64(tau), bins - 1)
+        late = f32(np.rint((tau - f32(b)) * f32(2**20)) * f32(2.0**-20))
+        grid[b, y[i], x[i]] += sign * (f32(1) - late)
+        if late > 0 and b + 1 < bins:
+            grid[b + 1, y[i], x[i]] += sign * late
+    return -1

@@ -1,6 +1,6 @@
 """Training augmentation of voxel sequences (Rebecq et al. 2019; Stoffregen et al. 2020; the paper).
 
-Order: dropped views, pause, turn, misplaced views, noise, hot and firing pixels.  Crops are drawn
+Order: dropped views, pauses, flips, shifted views, noise, hot and noisy pixels.  Crops are drawn
 before the simulation (sim/pipeline.py).  Every draw comes from the key of the sample, so a batch is
 the same in any worker.
 """
@@ -9,176 +9,153 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from src.sim import noise
 from src.sim.optics import Position, layout
-from src.sim.pipeline import Sample, joined, room
-from src.training.rearrange import Change, rearrange_batch, rearrange_clips
-from src.training.voxel_noise import fire, hot_pixels, normals
+from src.sim.pipeline import Sample, concatenate_samples, empty_float32
+from src.training.clip_transforms import ClipTransform, transform_batch, transform_clips
+from src.training.voxel_noise import add_noisy_pixels, draw_hot_pixels, draw_normals
 
-SHARES = (
-    "hot_fraction", "firing_fraction", "pause", "stay", "flip", "transpose", "misplaced", "dropped",
-)  # fmt: skip
+NOISY_PIXEL_RATE_HZ = (10.0, 2000.0)  # each pixel has one of its own, log-uniform
 
 
 @dataclass(frozen=True)
 class Augment:
-    """`noise_std`: standard deviation added to every voxel entry, in events.
-    `hot_fraction`: the share of hot pixels of a sequence is uniform in [0, hot_fraction];
-    `hot_std`: standard deviation of a hot pixel's value, the same in all bins, views and windows.
-    `firing_fraction`: the share of pixels of each view that fire on their own, whatever the light,
-    is uniform in [0, firing_fraction]; `firing_hz`: each at a rate log-uniform in this range, 1/s,
-    ON and OFF alike.  What E2VID calls hot does not come and go; a camera's hot pixels do.
-    `pause`: probability that a running sequence pauses at a window; `stay`: that a paused one
-    stays paused.
-    `flip`: probability of a flip, for each axis; `transpose`: that rows and columns change places.
-    The views of a grid change places with their pictures.
-    `misplaced`: probability of a view to lie up to `misplaced_px` whole pixels off, in each axis.
-    `dropped`: probability of a batch to lose views, any of them, one or more but never all.
+    """`noise_std`: standard deviation of noise on every voxel entry, in events.
+    `max_offset_pixel_fraction`: the share of pixels of a sequence with a constant offset is uniform
+    up to this; each offset is normal and the same in all bins, views and windows.
+    `max_firing_pixel_fraction`: the share of each view's pixels that fire without a change of light
+    is uniform up to this; ON and OFF alike, as a camera's hot pixels do.
+    `pause_probability_when_running`, `.._when_paused`: that the next window has no events.
+    `flip_probability`: for each axis.  The views of a grid change places with their images.
+    `view_shift_probability`: of a view to be shifted by up to `max_view_shift_px` whole pixels in
+    each axis.  `view_dropout_probability`: of a batch to lose views, any of them but never all.
     """
 
     noise_std: float = 0.4
-    hot_fraction: float = 1e-4
-    hot_std: float = 0.1
-    firing_fraction: float = 0.0
-    firing_hz: Sequence[float] = (10.0, 2000.0)
-    pause: float = 0.05
-    stay: float = 0.9
-    flip: float = 0.5
-    transpose: float = 0.0
-    misplaced: float = 0.0
-    misplaced_px: int = 2
-    dropped: float = 0.0
+    max_offset_pixel_fraction: float = 1e-4
+    max_firing_pixel_fraction: float = 0.0
+    pause_probability_when_running: float = 0.05
+    pause_probability_when_paused: float = 0.9
+    flip_probability: float = 0.5
+    view_shift_probability: float = 0.0
+    max_view_shift_px: int = 2
+    view_dropout_probability: float = 0.0
 
-    def __post_init__(self):
-        for name in SHARES:
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"augment.{name} must be in [0, 1], got {getattr(self, name)}")
-        for name in ("noise_std", "hot_std"):
-            if not 0 <= getattr(self, name) < float("inf"):
-                raise ValueError(f"augment.{name} must be >= 0, got {getattr(self, name)}")
-        ends = list(self.firing_hz)
-        if len(ends) != 2 or not 0 < ends[0] <= ends[1] < float("inf"):
-            raise ValueError(f"augment.firing_hz must be [low, high] above 0, got {ends}")
-        if self.misplaced_px < 0:
-            raise ValueError(f"augment.misplaced_px must be >= 0, got {self.misplaced_px}")
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if name in ("noise_std", "max_view_shift_px"):
+                if not 0 <= value < float("inf"):
+                    raise ValueError(f"augment.{name} must be >= 0, got {value}")
+            elif not 0 <= value <= 1:
+                raise ValueError(f"augment.{name} must be in [0, 1], got {value}")
 
     def __call__(
-        self, samples: Sequence[Sample], keys: Sequence[int], at_once: bool | None = None
+        self, samples: Sequence[Sample], keys: Sequence[int], batched: bool | None = None
     ) -> Sample:
         """Return the augmented batch of the clips of `samples`; `keys` has one key per clip.
 
-        `at_once`: all clips in a few operators, as a GPU wants it, or clip by clip, as a CPU's
-        cache does (None: by the device).  Both give the same, but for how a device draws `noise`.
+        `batched`: all clips in a few operators, else clip by clip (None: batched on all devices but
+        the CPU).  Both give the same, but for the noise that a device draws.
         """
         first = samples[0]
         windows, views, *grid = first.voxels.shape[1:]
-        kept = views_kept(views, self.dropped, noise.key(keys[0], "dropped"))
-        changes = [self._draw(key, windows, views, first.positions, kept) for key in keys]
-        voxels = room((len(keys), windows, len(kept), *grid), first.voxels.device)
-        if at_once is None:
-            at_once = voxels.device.type != "cpu"
-        if at_once:
-            whole = first if len(samples) == 1 else joined(samples)
-            pictures = rearrange_batch(whole, changes, voxels)
+        positions = first.positions or layout(views)
+        kept = draw_kept_views(views, self.view_dropout_probability, noise.key(keys[0], "dropped"))
+        transforms = [self._draw_transform(key, windows, positions, kept) for key in keys]
+        voxels = empty_float32((len(keys), windows, len(kept), *grid), first.voxels.device)
+        if voxels.device.type != "cpu" if batched is None else batched:
+            whole = first if len(samples) == 1 else concatenate_samples(samples)
+            frames = transform_batch(whole, transforms, voxels)
         else:
-            pictures = rearrange_clips(samples, changes, voxels)
+            frames = transform_clips(samples, transforms, voxels)
         window_s = torch.cat([sample.window_s for sample in samples])
-        self._corrupt(voxels, window_s.tolist(), keys)
-        places = first.positions or layout(views)
-        target, turbulent, *taught = pictures
+        self._add_noise(voxels, window_s.tolist(), keys)
         return Sample(
             voxels=voxels,
-            target=target,
-            turbulent=turbulent,
             window_s=window_s,
-            positions=tuple(places[view] for view in kept),
-            drawn=[drawn for sample in samples for drawn in sample.drawn],
-            taught=taught[0] if taught else None,
+            positions=tuple(positions[view] for view in kept),
+            parameters=[clip for sample in samples for clip in sample.parameters],
+            **frames,
         )
 
-    def _draw(self, key: int, windows: int, views: int, positions, kept: list[int]) -> Change:
-        steps, paused = pause_chain(windows, self.pause, self.stay, noise.key(key, "pause"))
-        axes = flip_axes(self.flip, noise.key(key, "flip"))
-        swap = noise.uniforms(noise.key(key, "transpose"), 1)[0] < self.transpose
-        order = turned_views(positions, views, axes, swap)[kept]
-        away = misplacements(
-            len(kept), self.misplaced, self.misplaced_px, noise.key(key, "misplaced")
-        )
-        return Change(steps, paused, axes, swap, order, away)
+    def _draw_transform(
+        self, key: int, windows: int, positions: Sequence[Position], kept: list[int]
+    ) -> ClipTransform:
+        pauses = self.pause_probability_when_running, self.pause_probability_when_paused
+        source, paused = draw_pauses(windows, *pauses, noise.key(key, "pause"))
+        axes = draw_flip_axes(self.flip_probability, noise.key(key, "flip"))
+        order = flipped_view_order(positions, axes)[kept]
+        shift = self.view_shift_probability, self.max_view_shift_px
+        shifts = draw_view_shifts(len(kept), *shift, noise.key(key, "misplaced"))
+        return ClipTransform(source, paused, axes, order, shifts)
 
-    def _corrupt(self, voxels: Tensor, window_s: Sequence[float], keys: Sequence[int]) -> None:
-        """Add noise, hot and firing pixels to the clips of a batch."""
+    def _add_noise(self, voxels: Tensor, window_s: Sequence[float], keys: Sequence[int]) -> None:
         hot = torch.zeros(len(voxels), *voxels.shape[-2:])
         for number, (clip, key) in enumerate(zip(voxels, keys, strict=True)):
             if self.noise_std > 0:
-                spread = normals(clip.shape, noise.key(key, "noise"), clip.device)
-                clip.add_(spread, alpha=self.noise_std)
-            drawn = noise.key(key, "hot")
-            hot[number] = hot_pixels(hot.shape[1:], self.hot_fraction, self.hot_std, drawn)
+                normals = draw_normals(clip.shape, noise.key(key, "noise"), clip.device)
+                clip.add_(normals, alpha=self.noise_std)
+            fraction = self.max_offset_pixel_fraction
+            hot[number] = draw_hot_pixels(hot.shape[1:], fraction, noise.key(key, "hot"))
         if hot.any():
             voxels.add_(hot[:, None, None, None].to(voxels))
-        rates = [[rate * window for rate in self.firing_hz] for window in window_s]
-        drawn = [noise.key(key, "firing") for key in keys]
-        fire(voxels, self.firing_fraction, rates, drawn)
+        if self.max_firing_pixel_fraction:
+            counts = [[rate * window for rate in NOISY_PIXEL_RATE_HZ] for window in window_s]
+            noise_keys = [noise.key(key, "firing") for key in keys]
+            add_noisy_pixels(voxels, self.max_firing_pixel_fraction, counts, noise_keys)
 
 
-def pause_chain(
-    windows: int, pause: float, stay: float, key: int
-) -> tuple[Int[Tensor, " windows"], Tensor]:
-    """Return which window each step shows (windows,) and whether it is paused (windows,) bool.
+def draw_pauses(
+    windows: int, probability_when_running: float, probability_when_paused: float, key: int
+) -> tuple[Int[Tensor, " windows"], Bool[Tensor, " windows"]]:
+    """Return which window of the clip each window is, and whether it is paused.
 
-    A two-state chain.  The first step runs.  A paused step repeats the target of the window shown
-    last, without events, and the clip goes on after the pause (event_cnn_minimal's semantics).
+    A two-state chain.  The first window runs.  A paused one repeats the target of the window before
+    it, without events, and the clip goes on after the pause (event_cnn_minimal's semantics).
     """
-    draws = noise.uniforms(key, windows)
-    steps, paused = [0], [False]
-    for draw in draws[1:]:
-        paused.append(draw < (stay if paused[-1] else pause))
-        steps.append(steps[-1] + (not paused[-1]))
-    return torch.tensor(steps), torch.tensor(paused)
+    source, paused = [0], [False]
+    for draw in noise.uniforms(key, windows)[1:]:
+        paused.append(draw < (probability_when_paused if paused[-1] else probability_when_running))
+        source.append(source[-1] + (not paused[-1]))
+    return torch.tensor(source), torch.tensor(paused)
 
 
-def flip_axes(probability: float, key: int) -> list[int]:
-    """Return the axes to flip, out of -2 (upside down) and -1 (mirrored)."""
+def draw_flip_axes(probability: float, key: int) -> list[int]:
+    """Return the axes to flip, out of -2 (vertical) and -1 (horizontal)."""
     draws = noise.uniforms(key, 2)
     return [axis for axis, draw in zip((-2, -1), draws, strict=True) if draw < probability]
 
 
-def turned_views(
-    positions: Sequence[Position] | None, views: int, axes: list[int], swap: bool
-) -> Int[Tensor, " views"]:
-    """Return for each view which one's picture, turned, is seen there: that which stands there when
-    the grid is turned with the pictures.  All stay where a turned grid is another one.
+def flipped_view_order(positions: Sequence[Position], axes: list[int]) -> Int[Tensor, " views"]:
+    """Return for each view which one takes its place when the grid is flipped along `axes` like the
+    images.  All stay where that gives another grid.
     """
-    here = [tuple(place) for place in positions or layout(views)]
+    here = [tuple(place) for place in positions]
     ends = [min(column) + max(column) for column in zip(*here, strict=True)]
-    flipped = [[ends[a] - p[a] if a - 2 in axes else p[a] for a in (0, 1)] for p in here]
-    there = [tuple(place[::-1] if swap else place) for place in flipped]
-    same = set(there) == set(here)
-    return torch.tensor([there.index(place) for place in here] if same else range(len(here)))
+    there = [tuple(ends[a] - p[a] if a - 2 in axes else p[a] for a in (0, 1)) for p in here]
+    is_same_grid = set(there) == set(here)
+    return torch.tensor([there.index(p) for p in here] if is_same_grid else range(len(here)))
 
 
-def misplacements(
-    views: int, probability: float, reach: int, key: int
+def draw_view_shifts(
+    views: int, probability: float, max_shift_px: int, key: int
 ) -> list[tuple[int, int, int]]:
-    """Return (view, rows, columns) of the views that move, each at `probability`, by so many pixels
-    up and to the left, up to `reach` either way.
+    """Return (view, rows, columns) of the views that are shifted, each with `probability`, in whole
+    pixels up to `max_shift_px` either way.
     """
     if probability == 0:
         return []
     draws = noise.uniforms(key, 3 * views)
-    moved = [view for view in range(views) if draws[3 * view] < probability]
-    return [
-        (view, *(int(share * (2 * reach + 1)) - reach for share in draws[3 * view + 1 :][:2]))
-        for view in moved
-    ]
+    px = [int(share * (2 * max_shift_px + 1)) - max_shift_px for share in draws]
+    triples = zip(range(views), draws[::3], px[1::3], px[2::3], strict=True)
+    return [(view, up, left) for view, draw, up, left in triples if draw < probability]
 
 
-def views_kept(views: int, probability: float, key: int) -> list[int]:
-    """Return which views a batch has: at `probability` some are lost; how many is uniform."""
+def draw_kept_views(views: int, probability: float, key: int) -> list[int]:
+    """Return which views a batch has: with `probability` some are lost; how many is uniform."""
     chance, share, *order = noise.uniforms(key, 2 + views)
     if chance >= probability or views == 1:
         return list(range(views))

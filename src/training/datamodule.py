@@ -1,33 +1,35 @@
 """Batches for training, validation and test, simulated on the fly: number -> draw -> sample."""
 
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import replace
+from typing import Any, cast
 
 import torch
-from lightning import LightningDataModule
+from lightning import LightningDataModule, Trainer
 from torch.utils.data import DataLoader
 
 from src.sim import noise
-from src.sim.pipeline import Draw, Pipeline, Sample, joined
+from src.sim.pipeline import ClipParameters, Pipeline, Sample, concatenate_samples
 from src.training.augment import Augment
-from src.training.bank_filler import Filler
-from src.training.batch_sampler import Item, LargeStream, Numbered, StepSampler
-from src.training.teachers import Teachers
+from src.training.batch_sampler import DrawDataset, LargeCropStream, SampleId, StepSampler
+from src.training.disk_cache import BackgroundFiller
+from src.training.teachers import TeacherEnsemble
 
 
 class LightFieldData(LightningDataModule):
     """`pipelines` has one Pipeline for each of train, val and test.
 
-    `epoch_clips`: training clips between two validations; `val_clips`, `test_clips`: their numbers.
-    `reuse`: steps in a row that train on one simulated batch, each augmented anew; saves
-    simulation with at most one worker.
+    `batch_reuse`: steps in a row that train on one simulated batch, each augmented anew; saves
+    simulation with at most one worker.  `epoch_clips`: training clips between two validations.
+    Validation and test are of clips 0, 1, ..., one at a time.
     `workers`: processes that simulate beside the training; 0 simulates in the training process.
     `simulate_on`: `worker` (CPU) or `device` (the training device, for GPUs).
-    `filler`: fills the banks of air in the background of a training, where there are some.
-    `teachers`: what they make of the training clips is a part of these.
-    `large`: a second stream of training batches, of larger pictures, spread evenly among the first.
+    `filler`: fills caches on a disk in the background of a training.
+    `teachers`: their frames of the training clips are a part of these.
+    `large`: a second stream of training batches, of larger crops, spread evenly among the first.
     """
+
+    trainer: Trainer  # set by Lightning before anything here is called
 
     def __init__(
         self,
@@ -35,70 +37,66 @@ class LightFieldData(LightningDataModule):
         augment: Augment | None = None,
         *,
         batch_size: int = 8,
-        reuse: int = 1,
+        batch_reuse: int = 1,
         epoch_clips: int = 216,
         val_clips: int = 27,
         test_clips: int = 27,
         workers: int = 0,
         simulate_on: str = "worker",
         seed: int = 0,
-        filler: Filler | None = None,
-        teachers: Teachers | None = None,
-        large: LargeStream | None = None,
+        filler: BackgroundFiller | None = None,
+        teachers: TeacherEnsemble | None = None,
+        large: LargeCropStream | None = None,
     ):
         super().__init__()
         if simulate_on not in ("worker", "device"):
             raise ValueError(f"data.simulate_on must be worker or device, got {simulate_on}")
-        counts = {"batch_size": batch_size, "reuse": reuse, "epoch_clips": epoch_clips}
-        for name, value in counts.items():
-            if value < 1:
-                raise ValueError(f"data.{name} must be >= 1, got {value}")
-        if epoch_clips < batch_size:
-            raise ValueError(f"data.epoch_clips must be >= data.batch_size, got {epoch_clips}")
+        least = {"batch_size": 1, "batch_reuse": 1, "epoch_clips": batch_size}
+        for name, value in zip(least, (batch_size, batch_reuse, epoch_clips), strict=True):
+            if value < least[name]:
+                raise ValueError(f"data.{name} must be >= {least[name]}, got {value}")
         self.pipelines, self.augment, self.seed = pipelines, augment, seed
         self.filler, self.teachers, self.large = filler, teachers, large
-        self.batch_size, self.reuse, self.epoch_clips = batch_size, reuse, epoch_clips
+        self.batch_size, self.batch_reuse, self.epoch_clips = batch_size, batch_reuse, epoch_clips
         self.val_clips, self.test_clips = val_clips, test_clips
         self.workers, self.simulate_on = workers, simulate_on
-        self.simulators: dict[tuple[str, torch.device], Callable[[list], Sample]] = {}
+        self.simulators: dict[str, BatchSimulator] = {}  # on the training device
 
     def setup(self, stage: str) -> None:
-        """Start filling the bank; one process of each machine does."""
+        """Start filling the caches, in one process of each machine."""
         if stage == "fit" and self.filler is not None and self.trainer.local_rank == 0:
-            self.trainer.print(self.filler.status())
+            self.trainer.print("\n".join(cache.status() for cache in self.filler.caches))
             self.filler.start()
 
     def teardown(self, stage: str) -> None:
-        """Stop filling the bank."""
         if stage == "fit" and self.filler is not None:
             self.filler.stop()
 
     def train_dataloader(self) -> DataLoader:
-        """Return endless clips, from the training's step on: what goes on sees others."""
-        trainer = self.trainer
+        """Return endless clips, from the training's step on: a resumed training sees others."""
+        trainer, module = self.trainer, self.trainer.lightning_module
         sampler = StepSampler(
-            self.batch_size,
-            max(1, self.epoch_clips // (self.batch_size * trainer.world_size)),
-            lambda: trainer.lightning_module.steps,
-            reuse=self.reuse,
+            batch_size=self.batch_size,
+            steps_per_epoch=max(1, self.epoch_clips // (self.batch_size * trainer.world_size)),
+            step=lambda: cast(int, module.total_steps),
+            batch_reuse=self.batch_reuse,
             rank=trainer.global_rank,
             world=trainer.world_size,
-            large=(self.large.share, self.large.batch_size) if self.large else (0.0, 1),
+            large_share=self.large.share if self.large else 0.0,
+            large_batch_size=self.large.batch_size if self.large else 1,
         )
         return self._loader("train", batch_sampler=sampler)
 
     def val_dataloader(self) -> DataLoader:
-        """Return clips 0 .. val_clips - 1 of the validation split, one at a time."""
-        return self._loader("val", sampler=[Item(clip, clip) for clip in range(self.val_clips)])
+        return self._loader("val", sampler=[SampleId(k, k) for k in range(self.val_clips)])
 
     def test_dataloader(self) -> DataLoader:
-        """Return clips 0 .. test_clips - 1 of the test split, one at a time."""
-        return self._loader("test", sampler=[Item(clip, clip) for clip in range(self.test_clips)])
+        return self._loader("test", sampler=[SampleId(k, k) for k in range(self.test_clips)])
 
     def validation_samples(self) -> Iterator[Sample]:
-        """Yield the validation clips on the training device; a training need not be interrupted."""
+        """Yield the validation clips on the training device, within a training too."""
         for batch in self.val_dataloader():
-            sample = batch if isinstance(batch, Sample) else self._on_device("val", batch)
+            sample = batch if isinstance(batch, Sample) else self._simulate_on_device("val", batch)
             yield sample.to(self.trainer.strategy.root_device)
 
     def on_after_batch_transfer(self, batch: Sample | list, dataloader_idx: int) -> Sample:
@@ -106,51 +104,51 @@ class LightFieldData(LightningDataModule):
         if isinstance(batch, Sample):
             return batch
         split = "train" if self.trainer.training else "test" if self.trainer.testing else "val"
-        return self._on_device(split, batch)
+        return self._simulate_on_device(split, batch)
 
-    def transfer_batch_to_device(self, batch, device: torch.device, dataloader_idx: int):
-        """Leave drawn clips where they are; move samples."""
+    def transfer_batch_to_device(
+        self, batch: Sample | list, device: torch.device, dataloader_idx: int
+    ) -> Sample | list:
         return batch.to(device) if isinstance(batch, Sample) else batch
 
-    def _loader(self, split: str, **sampling) -> DataLoader:
+    def _loader(self, split: str, **sampling: Any) -> DataLoader:
         on_worker = self.simulate_on == "worker"
         return DataLoader(
-            Numbered(*self._streams(split)),
+            DrawDataset(*self._streams(split)),
             num_workers=self.workers,
             collate_fn=self._simulator(split, "cpu") if on_worker else list,
-            worker_init_fn=_one_thread,
+            worker_init_fn=_use_one_thread,
             persistent_workers=self.workers > 0,
             **sampling,
         )
 
-    def _on_device(self, split: str, batch: list) -> Sample:
-        device = self.trainer.strategy.root_device
-        if (split, device) not in self.simulators:  # kept, so that a batch can be used again
-            self.simulators[split, device] = self._simulator(split, device)
-        return self.simulators[split, device](batch)
+    def _simulate_on_device(self, split: str, batch: list) -> Sample:
+        if split not in self.simulators:  # stays, so that a batch can be used again
+            self.simulators[split] = self._simulator(split, self.trainer.strategy.root_device)
+        return self.simulators[split](batch)
 
-    def _simulator(self, split: str, device) -> Callable[[Sequence], Sample]:
+    def _simulator(self, split: str, device: torch.device | str) -> "BatchSimulator":
         training = (self.augment, self.teachers) if split == "train" else (None, None)
-        return Simulator(self._streams(split), *training, seed=self.seed, device=device)
+        return BatchSimulator(self._streams(split), *training, seed=self.seed, device=device)
 
     def _streams(self, split: str) -> list[Pipeline]:
         large = [self.large.pipeline] if self.large and split == "train" else []
         return [self.pipelines[split], *large]
 
 
-class Simulator:
+class BatchSimulator:
     """Turns numbered draws of a stream into a batch; picklable, so that a worker can be given one.
 
-    On a GPU all clips go through the simulation at once, on a CPU one after the other, so that
-    memory stays that of one clip.  The last simulation is kept: the same draws again are only
-    augmented again.
+    On a GPU all clips go through the simulation at once, on a CPU and for teachers one after the
+    other, so that memory stays that of one clip.  The last simulation is kept: the same draws again
+    are only augmented again.
     """
 
     def __init__(
         self,
         streams: Sequence[Pipeline],
         augment: Augment | None = None,
-        teachers: Teachers | None = None,
+        teachers: TeacherEnsemble | None = None,
         *,
         seed: int = 0,
         device: torch.device | str = "cpu",
@@ -159,29 +157,28 @@ class Simulator:
         self.seed, self.device = seed, torch.device(device)
         self.last: tuple[list, list[Sample]] = ([], [])
 
-    def __call__(self, numbered: Sequence[tuple[Item, Draw]]) -> Sample:
-        start = time.perf_counter()
-        items, draws = zip(*numbered, strict=True)
-        names = [(item.stream, draw.key, draw.crop) for item, draw in numbered]
+    def __call__(self, numbered: Sequence[tuple[SampleId, ClipParameters]]) -> Sample:
+        ids, draws = zip(*numbered, strict=True)
+        names = [(sample.stream, draw.key, draw.crop) for sample, draw in numbered]
         if self.last[0] != names:
-            self.last = (names, self._made(self.streams[items[0].stream], draws, names))
+            self.last = (names, self._simulate(self.streams[ids[0].stream], draws, names))
         samples = self.last[1]
         if self.augment is None:
-            sample = joined(samples)
-        else:
-            keys = [noise.key(self.seed, "augment", *item.counted) for item in items]
-            sample = self.augment(samples, keys)
-        return replace(sample, seconds=time.perf_counter() - start)
+            return concatenate_samples(samples)
+        keys = [noise.key(self.seed, "augment", *sample.augmentation_key) for sample in ids]
+        return self.augment(samples, keys)
 
-    def _made(self, pipeline: Pipeline, draws: Sequence[Draw], names: list) -> list[Sample]:
-        if self.device.type != "cpu" and self.teachers is None:
+    def _simulate(
+        self, pipeline: Pipeline, draws: Sequence[ClipParameters], names: Sequence[Hashable]
+    ) -> list[Sample]:
+        if self.teachers is None and self.device.type != "cpu":
             return [pipeline.simulate(draws, self.device)]
-        samples = [pipeline.sample(draw, self.device) for draw in draws]
+        samples = [pipeline.simulate([draw], self.device) for draw in draws]
         if self.teachers is None:
             return samples
         pairs = zip(samples, names, strict=True)
-        return [replace(sample, taught=self.teachers(sample, name)) for sample, name in pairs]
+        return [replace(one, teacher_frames=self.teachers(one, name)) for one, name in pairs]
 
 
-def _one_thread(worker: int) -> None:
+def _use_one_thread(worker: int) -> None:
     torch.set_num_threads(1)

@@ -1,54 +1,76 @@
-"""A training by time: how long it lasts and how its rate falls follow from the hours it has had."""
+"""Training by time: a clock that checkpoints hold, and a learning rate that follows it."""
 
 import math
+import time
+from typing import Any
 
-from lightning import Callback, LightningModule, Trainer
+from lightning import Callback, Trainer
+
+CLOCKS = {"wall": time.perf_counter, "processor": time.thread_time}
 
 
-class Hours(Callback):
-    """Train for `hours` of the module's clock; the rate falls by half a cosine of that time, from
-    the optimiser's own to `floor` of it (Loshchilov & Hutter 2017).  None: steps decide.
+class TrainingClock:
+    """Adds up `seconds` of training; the time between `lap` and the next `start` is left out.
 
-    Only the time counts, which checkpoints hold: a training that is cut goes on where it was, and
-    one that goes on with more hours goes on along the longer cosine.  `rise`: first
-    steps of an optimiser, over which the rate rises from zero: Adam knows no second moments yet.
+    `kind`: wall, or processor, the processor time of the training thread: with one thread on a CPU
+    neither other work nor a pause of the process counts.  Raises ValueError for another kind.
     """
 
-    def __init__(self, hours: float | None = None, floor: float = 0.0, rise: int = 0):
-        if hours is not None and not 0 < hours < math.inf:
-            raise ValueError(f"hours must be > 0 or null, got {hours}")
-        if not 0 <= floor <= 1:
-            raise ValueError(f"callbacks.hours.floor must be in [0, 1], got {floor}")
-        if type(rise) is not int or rise < 0:
-            raise ValueError(f"callbacks.hours.rise must be a whole number >= 0, got {rise}")
-        self.hours, self.floor, self.rise = hours, floor, rise
+    def __init__(self, kind: str = "wall"):
+        if kind not in CLOCKS:
+            raise ValueError(f"train_clock must be one of {', '.join(CLOCKS)}, got {kind}")
+        self.now, self.seconds = CLOCKS[kind], 0.0
+        self.last = self.now()
 
-    def share(self, hours: float) -> float:
-        """Return the rate after `hours` over that of the beginning."""
-        way = min(hours / self.hours, 1.0)
-        return self.floor + (1 - self.floor) * (1 + math.cos(math.pi * way)) / 2
+    @property
+    def hours(self) -> float:
+        return self.seconds / 3600
 
-    def on_fit_start(self, trainer: Trainer, module: LightningModule) -> None:
-        """Do nothing more when the time is over already."""
-        self._stop(trainer, module)
+    def start(self) -> None:
+        """Count from now on."""
+        self.last = self.now()
 
-    def on_train_batch_start(
-        self, trainer: Trainer, module: LightningModule, batch, batch_idx: int
-    ) -> None:
-        """Set the rate of the step."""
-        if self.hours is None:
-            return
-        share = self.share(module.clock.hours)
-        share *= min(1.0, (trainer.global_step + 1) / (self.rise + 1))
-        for group, rate in zip(trainer.optimizers[0].param_groups, module.rates, strict=True):
-            group["lr"] = rate * share
+    def lap(self) -> None:
+        """Count the time since the last lap or start."""
+        now = self.now()
+        self.seconds, self.last = self.seconds + now - self.last, now
 
-    def on_train_batch_end(
-        self, trainer: Trainer, module: LightningModule, outputs, batch, batch_idx: int
-    ) -> None:
-        """Stop when the time is over."""
-        self._stop(trainer, module)
 
-    def _stop(self, trainer: Trainer, module: LightningModule) -> None:
-        if self.hours is not None and module.clock.hours >= self.hours:
+class CosineSchedule(Callback):
+    """Train for `train_hours` of the module's clock; the learning rate falls by half a cosine of
+    that time, from the optimiser's own to 0 (Loshchilov & Hutter 2017).  None: steps decide.
+
+    The time so far is part of checkpoints: a training that is cut continues where it was, and with
+    more hours along the longer cosine.  `warmup_steps`: first steps of an optimiser, over which the
+    rate rises from zero, as Adam knows no second moments yet.  Raises ValueError for values out of
+    range.
+    """
+
+    def __init__(self, train_hours: float | None = None, warmup_steps: int = 0):
+        if train_hours is not None and not 0 < train_hours < math.inf:
+            raise ValueError(f"train_hours must be > 0 or null, got {train_hours}")
+        if type(warmup_steps) is not int or warmup_steps < 0:
+            key = "callbacks.schedule.warmup_steps"
+            raise ValueError(f"{key} must be a whole number >= 0, got {warmup_steps}")
+        self.train_hours, self.warmup_steps = train_hours, warmup_steps
+
+    def lr_ratio(self, hours: float) -> float:
+        """Return the learning rate after `hours` over that of the beginning."""
+        assert self.train_hours is not None
+        return (1 + math.cos(math.pi * min(hours / self.train_hours, 1.0))) / 2
+
+    def on_fit_start(self, trainer: Trainer, pl_module: Any) -> None:
+        if self.train_hours is not None and pl_module.clock.hours >= self.train_hours:
             trainer.should_stop = True
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
+        if self.train_hours is None:
+            return
+        ratio = self.lr_ratio(pl_module.clock.hours)
+        ratio *= min(1.0, (trainer.global_step + 1) / (self.warmup_steps + 1))
+        groups = trainer.optimizers[0].param_groups
+        for group, rate in zip(groups, pl_module.initial_rates, strict=True):
+            group["lr"] = rate * ratio
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
+        self.on_fit_start(trainer, pl_module)

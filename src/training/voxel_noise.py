@@ -1,7 +1,11 @@
-"""What is added to voxel grids: Gaussian noise, hot pixels (Rebecq et al. 2019), firing pixels."""
+"""Noise on voxel grids: Gaussian, hot pixels (Rebecq et al. 2019) and pixels that fire alone.
+
+Own code, not kornia's: every draw comes from a key, and on the CPU the normals of a table cost half
+of torch's.
+"""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -12,86 +16,77 @@ from torch import Tensor
 
 from src.sim import noise
 
+HOT_PIXEL_STD = 0.1  # of a hot pixel's value, in events
+QUANTILES = ndtri((np.arange(2**16) + 0.5) / 2**16)  # of a standard normal, at equal steps
+QUANTILES = (QUANTILES / QUANTILES.std()).astype(np.float32)
 
-def normals(shape: Sequence[int], key: int, device: torch.device) -> Tensor:
-    """Return standard normals; on the CPU of 2^16 levels up to 4.2 away from 0, at half the cost.
+
+def draw_normals(shape: Sequence[int], key: int, device: torch.device) -> Tensor:
+    """Return standard normals; on the CPU of 2^16 levels up to 4.2 away from 0.
 
     The devices draw other numbers from the same distribution.
     """
     if device.type != "cpu":
-        drawer = torch.Generator(device).manual_seed(key)
-        return torch.empty(shape, device=device).normal_(generator=drawer)
+        generator = torch.Generator(device).manual_seed(key)
+        return torch.empty(*shape, device=device).normal_(generator=generator)
     count = math.prod(shape)
-    words = np.random.SFC64(key).random_raw(-(-count // 4)).view(np.uint16)
-    return torch.from_numpy(QUANTILES[words[:count]]).reshape(shape)
+    levels = np.random.SFC64(key).random_raw(-(-count // 4)).view(np.uint16)
+    return torch.from_numpy(QUANTILES[levels[:count]]).reshape(*shape)
 
 
-def quantiles(levels: int) -> NDArray[np.float32]:
-    """Return the standard normal's quantiles at equal steps, of deviation 1 in all."""
-    values = ndtri((np.arange(levels) + 0.5) / levels)
-    return (values / values.std()).astype(np.float32)
+def draw_hot_pixels(size: Sequence[int], max_fraction: float, key: int) -> Float[Tensor, "h w"]:
+    """Return an image (h, w) that is zero but at up to `max_fraction` of the pixels.
 
-
-QUANTILES = quantiles(2**16)
-
-
-def hot_pixels(size: Sequence[int], fraction: float, std: float, key: int) -> Float[Tensor, "h w"]:
-    """Return a picture (h, w) that is zero but at up to `fraction` of the pixels."""
-    pixels = size[0] * size[1]
-    count = up_to(fraction * pixels, *noise.uniforms(noise.key(key, "count"), 2))
-    picture = torch.zeros(pixels)
-    if count == 0:
-        return picture.reshape(*size)
-    places = (noise.uniform(key, torch.arange(count)) * pixels).long()
-    picture[places] = std * noise.normal(noise.key(key, "value"), torch.arange(count))
-    return picture.reshape(*size)
-
-
-def up_to(most: float, share: float, part: float) -> int:
-    """Return a number of pixels uniform in [0, most], for `share` and `part` uniform in [0, 1).
-
-    Rounded up as often as what is over is large: 0.4 pixels are one in two crops of five, not none.
+    Their number is rounded up as often as its rest is large: 0.4 are one in two crops of five.
     """
-    return int(share * most + part)
+    pixels = size[0] * size[1]
+    share, rest = noise.uniforms(noise.key(key, "count"), 2)
+    count = int(share * (max_fraction * pixels) + rest)
+    image = torch.zeros(pixels)
+    if count:
+        places = (noise.uniform(key, torch.arange(count)) * pixels).long()
+        image[places] = HOT_PIXEL_STD * noise.normal(noise.key(key, "value"), torch.arange(count))
+    return image.reshape(*size)
 
 
-def fire(
+def add_noisy_pixels(
     voxels: Float[Tensor, "n windows views bins h w"],
-    fraction: float,
-    often: Sequence[Sequence[float]],
+    max_fraction: float,
+    window_counts: Sequence[Sequence[float]],
     keys: Sequence[int],
 ) -> None:
-    """Let up to `fraction` of the pixels of each clip's views fire on their own: in a window each
-    has as many events as a Poisson process of a mean log-uniform in the clip's `often` = (low,
-    high), each ON or OFF.
+    """Let up to `max_fraction` of the pixels of each clip's views fire without a change of light:
+    each has as many events a window as a Poisson process with a mean log-uniform in the clip's
+    `window_counts` = (low, high), each ON or OFF.
     """
-    if fraction == 0:
-        return
-    places, counts = [], []
-    for clip, (rates, key) in enumerate(zip(often, keys, strict=True)):
-        for view, (pixels, events) in enumerate(_firing(voxels.shape, fraction, rates, key)):
-            places.append(
-                np.stack([np.full_like(pixels[0], clip), np.full_like(pixels[0], view), *pixels])
-            )
-            counts.append(events)
+    places, events = [], []
+    for clip, (counts, key) in enumerate(zip(window_counts, keys, strict=True)):
+        generator = np.random.Generator(np.random.SFC64(key))
+        for view in range(voxels.shape[2]):
+            pixels, own = _draw_noisy_pixels(voxels.shape, max_fraction, counts, generator)
+            places.append(np.stack([np.full_like(pixels[0], k) for k in (clip, view)] + [*pixels]))
+            events.append(own)
     clip, view, row, column = torch.from_numpy(np.concatenate(places, 1)).to(voxels.device)
-    events = torch.from_numpy(np.concatenate(counts)).to(voxels)
-    voxels[clip, :, view, :, row, column] += events  # no pixel is there twice
+    added = torch.from_numpy(np.concatenate(events)).to(voxels)
+    voxels[clip, :, view, :, row, column] += added  # no pixel is there twice
 
 
-def _firing(
-    shape: Sequence[int], fraction: float, often: Sequence[float], key: int
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Yield rows and columns (2, pixels) of each view's firing pixels, and ON minus OFF events
+def _draw_noisy_pixels(
+    shape: Sequence[int],
+    max_fraction: float,
+    counts: Sequence[float],
+    generator: np.random.Generator,
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return rows and columns (2, pixels) of a view's noisy pixels, and their ON minus OFF events
     (pixels, windows, bins).
     """
-    _, windows, views, bins, height, width = shape
-    drawer = np.random.Generator(np.random.SFC64(key))
-    for _ in range(views):
-        count = up_to(fraction * height * width, *drawer.random(2))
-        pixels = drawer.integers([[height], [width]], size=(2, count))
-        mean = np.exp(drawer.uniform(*np.log(often), count)) / (2 * bins)
-        on, off = drawer.poisson(mean, (2, windows, bins, count))
-        # A pixel that is drawn twice fires as it was drawn last.
-        last = count - 1 - np.unique((pixels[0] * width + pixels[1])[::-1], return_index=True)[1]
-        yield pixels[:, last], (on - off)[..., last].transpose(2, 0, 1)
+    _, windows, _, bins, height, width = shape
+    share, rest = generator.random(2)
+    count = int(share * (max_fraction * height * width) + rest)
+    pixels = generator.integers([[height], [width]], size=(2, count))
+    low, high = np.log(counts)
+    mean = np.exp(generator.uniform(low, high, count)) / (2 * bins)
+    on, off = generator.poisson(mean, (2, windows, bins, count))
+    # A pixel that is drawn twice fires as it was drawn last.
+    last = count - 1 - np.unique((pixels[0] * width + pixels[1])[::-1], return_index=True)[1]
+    return pixels[:, last], (on - off)[..., last].transpose(2, 0, 1)

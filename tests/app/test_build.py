@@ -10,7 +10,8 @@ from lightning.pytorch.callbacks import ProgressBar
 from omegaconf import OmegaConf
 
 from baselines import postprocess
-from src.app import build, lineup
+from src.app import build, compared_networks, hardware
+from src.app.instantiate import allowed_packages
 from src.eval import evaluate
 from src.models import files
 from src.recordings.files import formats, sources
@@ -26,31 +27,30 @@ from torch import nn, optim
 
 from baselines.highpass import HighPass
 from baselines.mambatm import MambaTM
-from src.metrics.image import L1
+from src.losses.terms import L1Term
+from src.models.network import EventToVideoNetwork
 from src.sim.optics import Optics
 from src.sim.scenes.photographs import Photographs
 from src.sim.sensor.sensor import EventSensor
-from src.sim.turbulence.simulated import SimulatedAir
+from src.sim.turbulence.simulated import SimulatedTurbulence
 from src.training.augment import Augment
 
 
-class Net(nn.Module):
-    views = None
-
+class Net(EventToVideoNetwork):
     def __init__(self, gain: float):
         super().__init__()
         self.gain = nn.Parameter(torch.tensor(gain))
 
-    def forward(self, voxels, state=None):
+    def forward(self, voxels, state=None, *, window_s=1 / 120, positions=None):
         change = voxels.mean((1, 2))[:, None]
         state = change if state is None else 0.9 * state + change
         return (0.5 + self.gain * state).clamp(0, 1), state
 """
 PARTS = {
-    "scene": "Photographs", "optics": "Optics", "turbulence": "SimulatedAir",
-    "sensor": "EventSensor", "augment": "Augment", "loss": "L1", "optimizer": "Adam",
-    "floor.method": "HighPass", "logger.csv": "CSVLogger",
-    "callbacks.checkpoint": "ModelCheckpoint", "restorer": "MambaTM",
+    "scene": "Photographs", "optics": "Optics", "turbulence": "SimulatedTurbulence",
+    "sensor": "EventSensor", "augment": "Augment", "loss.l1": "L1Term", "optimizer": "Adam",
+    "reference_baseline.method": "HighPass", "logger.csv": "CSVLogger",
+    "callbacks.checkpoint": "ModelCheckpoint", "postprocessor": "MambaTM",
 }  # fmt: skip
 
 
@@ -65,7 +65,7 @@ def own(tmp_path, monkeypatch):
     (tmp_path / "mypackage" / "__init__.py").write_text("")
     (tmp_path / "mypackage" / "parts.py").write_text("\n\n".join([OWN, *classes]))
     monkeypatch.syspath_prepend(str(tmp_path))
-    yield ["rooms=[mypackage]"]
+    yield ["allowed_packages=[mypackage]"]
     for name in [name for name in sys.modules if name.split(".")[0] == "mypackage"]:
         del sys.modules[name]
 
@@ -78,56 +78,61 @@ NET = ["~model", "+model={_target_: mypackage.parts.Net, gain: 0.05}"]
 
 
 def test_every_part_of_a_training_may_be_a_class_of_ones_own(own, tmp_path):
-    chosen = [*NET, *(mine(key) for key in PARTS if key != "restorer")]
+    chosen = [*NET, *(mine(key) for key in PARTS if key != "postprocessor")]
     train(config("train", tmp_path / "a", *TINY, *chosen, *own))
     ckpt = tmp_path / "a" / "checkpoints" / "last.ckpt"
     more = ["trainer.max_steps=2", f"ckpt={ckpt}"]
     train(config("train", tmp_path / "b", *TINY, *chosen, *own, *more))
     tested = ["debug=fdr", "metrics.lpips=null", f"ckpt={ckpt}"]
     evaluate(config("eval", tmp_path / "c", *tested, *own))
-    (candidate,) = lineup.gather(config("chart", tmp_path, f"ckpt={ckpt}", *own))
+    (candidate,) = compared_networks.load_candidates(
+        config("chart", tmp_path, f"ckpt={ckpt}", *own)
+    )
     assert type(candidate.network).__name__ == "Net"
-    with pytest.raises(ValueError, match=r"rooms=\[<package>\]"):
+    with pytest.raises(ValueError, match=r"allowed_packages=\[<package>\]"):
         evaluate(config("eval", tmp_path / "d", *tested))
 
 
 @pytest.mark.parametrize("key", [*PARTS, "model"])
 def test_a_class_of_ones_own_is_refused_unless_its_package_is_named(own, key, tmp_path):
-    if key == "restorer":
+    if key == "postprocessor":
         pytest.skip("no part of a training")
     chosen = NET if key == "model" else [mine(key)]
-    with pytest.raises(ValueError, match=r"_target_ must.*rooms=\[<package>\]"):
-        train(config("train", tmp_path, *TINY, *chosen, "rooms=[other]"))
+    with pytest.raises(ValueError, match=r"_target_ must.*allowed_packages=\[<package>\]"):
+        train(config("train", tmp_path, *TINY, *chosen, "allowed_packages=[other]"))
 
 
 def test_a_post_processor_of_ones_own_is_loaded(own, tmp_path):
     from mypackage import parts
 
-    spec = {"target": "mypackage.parts.MyMambaTM", "kwargs": {"channels": 1, "features": 8}}
+    spec = {
+        "target": "mypackage.parts.MyMambaTM",
+        "kwargs": {"frame_channels": 1, "base_channels": 8},
+    }
     files.save(tmp_path / "mine.safetensors", parts.MyMambaTM(1, 8), spec, {})
-    named = f"postprocess.restorer={tmp_path}/mine.safetensors"
+    named = f"postprocess.postprocessor={tmp_path}/mine.safetensors"
     cfg = config("eval", tmp_path, "postprocess=mambatm", named, "baseline=frames", *own)
-    assert type(build.frozen(cfg).restorer).__name__ == "MyMambaTM"
-    with pytest.raises(ValueError, match="rooms="):
+    assert type(build.build_method(cfg).postprocessor).__name__ == "MyMambaTM"
+    with pytest.raises(ValueError, match="allowed_packages="):
         postprocess.load(f"{tmp_path}/mine.safetensors")
 
 
 @pytest.mark.parametrize("given", ["mypackage", "[1a]", "[..]", "['']"])
-def test_rooms_are_a_list_of_packages(given, tmp_path):
-    with pytest.raises(ValueError, match="rooms must be a list of packages"):
-        build.rooms(config("eval", tmp_path, f"rooms={given}"))
+def test_allowed_packages_are_a_list_of_names(given, tmp_path):
+    with pytest.raises(ValueError, match="allowed_packages must be a list of packages"):
+        allowed_packages(config("eval", tmp_path, f"allowed_packages={given}"))
 
 
-DOORS = ("train", "eval", "simulate", "reconstruct", "calibrate", "chart", "stress", "live")
+ENTRY_POINTS = ("train", "eval", "simulate", "reconstruct", "calibrate", "chart", "stress", "live")
 
 
-@pytest.mark.parametrize("door", DOORS)
-def test_every_door_that_builds_has_rooms_and_they_are_empty(door):
-    assert OmegaConf.load(ROOT / "conf" / f"{door}.yaml").rooms == []
+@pytest.mark.parametrize("entry_point", ENTRY_POINTS)
+def test_every_entry_point_that_builds_allows_no_package_of_ones_own(entry_point):
+    assert OmegaConf.load(ROOT / "conf" / f"{entry_point}.yaml").allowed_packages == []
 
 
 SMALL = ["scene.height=64", "scene.width=64", "data.test_clips=1", "data.test_windows=4"]
-SMALL += ["data.warmup=1", "data.workers=0", "metrics.lpips=null"]
+SMALL += ["data.unscored_windows=1", "data.workers=0", "metrics.lpips=null"]
 
 
 def test_a_network_of_one_view_is_given_the_centre_of_nine(tmp_path):
@@ -147,7 +152,7 @@ def test_without_a_progress_bar_training_goes_on_without_it(tmp_path):
     bars = []
     for shown in ("true", "false"):
         cfg = config("train", tmp_path, f"trainer.enable_progress_bar={shown}")
-        trainer = build.trainer(cfg)
+        trainer = build.build_trainer(cfg)
         bars.append(any(isinstance(found, ProgressBar) for found in trainer.callbacks))
     assert bars == [True, False]
 
@@ -164,9 +169,9 @@ def test_without_a_progress_bar_training_goes_on_without_it(tmp_path):
 def test_precision_is_what_the_device_is_fast_in(
     budget, device, able, precision, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(build, "computes_bf16", lambda: able)
+    monkeypatch.setattr(hardware, "has_fast_bf16", lambda: able)
     cfg = config("train", tmp_path, f"budget={budget}", f"trainer.accelerator={device}")
-    build.choose_precision(cfg)
+    hardware.fill_in_precision(cfg)
     assert cfg.trainer.precision == precision
 
 
@@ -190,7 +195,7 @@ def test_views_that_stand_anywhere_are_scored_and_timed(tmp_path):
 def test_a_clip_read_backwards_first_is_scored(tmp_path):
     chosen = [*SMALL, "ckpt=lf3x3", "sensor.threshold=0.1"]  # the same work in every window
     once, ahead = (
-        evaluate(config("eval", tmp_path / seconds, *chosen, f"look_ahead_s={seconds}"))
+        evaluate(config("eval", tmp_path / seconds, *chosen, f"backward_warmup_s={seconds}"))
         for seconds in ("0", "0.02")
     )
     assert ahead["test"]["psnr"]["mean"] != once["test"]["psnr"]["mean"]
@@ -198,21 +203,10 @@ def test_a_clip_read_backwards_first_is_scored(tmp_path):
     assert ratio == pytest.approx(1.5)  # two of four windows are read twice
 
 
-@pytest.mark.parametrize("name", ["setnet_small", "lf3x3"])
-def test_aligned_views_are_scored(name, tmp_path):
-    chosen = [*SMALL, f"ckpt={name}", "sensor.threshold=0.1"]
-    plain, aligned, ahead = (
-        evaluate(config("eval", tmp_path / str(k), *chosen, *more))
-        for k, more in enumerate(([], ["align=local"], ["align=local", "look_ahead_s=0.02"]))
-    )
-    assert len({one["test"]["psnr"]["mean"] for one in (plain, aligned, ahead)}) == 3
-    assert aligned["model"]["params"] == plain["model"]["params"]
-
-
 KEEPING = """
 import resource, torch
 from omegaconf import OmegaConf
-from src.app import build
+from src.app import hardware
 
 def faults():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
@@ -221,7 +215,7 @@ def faults():
 
 torch.set_num_threads(1)
 given_back = [faults() for _ in range(3)][-1]
-build.keep_memory(OmegaConf.create({"trainer": {"accelerator": "cpu"}}))
+hardware.retain_freed_memory(OmegaConf.create({"trainer": {"accelerator": "cpu"}}))
 kept = [faults() for _ in range(3)][-1]
 print(given_back, kept)
 """

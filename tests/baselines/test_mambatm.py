@@ -5,15 +5,16 @@ import torch
 from omegaconf import OmegaConf
 
 from baselines import mambatm
-from baselines.mambatm import MambaTM, scan_orders, window_starts
-from baselines.stabilise import jitter, pull
-from src.app.parts import make
+from baselines.mambatm import MambaTM, scan_orders
+from baselines.stabilise import estimate_jitter, warp_video
+from src.app.instantiate import instantiate_node
+from src.models.network import FramePostprocessor
 from tests.conftest import ROOT
 
 
-def small(steadied: bool = False) -> MambaTM:
+def small(stabilise_input: bool = False) -> MambaTM:
     torch.manual_seed(0)
-    network = MambaTM(states=2, steadied=steadied).eval()
+    network = MambaTM(states=2, stabilise_input=stabilise_input).eval()
     torch.nn.init.normal_(network.decoder.out[-1].weight, std=0.1)
     return network
 
@@ -25,17 +26,17 @@ def test_it_begins_as_the_identity():
 
 
 @torch.no_grad()
-def test_steadied_it_begins_as_the_frames_held_still():
+def test_stabilise_input_it_begins_as_the_frames_held_still():
     frames = torch.rand(1, 4, 1, 32, 32)
-    still = pull(frames, jitter(frames))
-    torch.testing.assert_close(MambaTM(states=2, steadied=True)(frames)[0], still)
+    still = warp_video(frames, estimate_jitter(frames))
+    torch.testing.assert_close(MambaTM(states=2, stabilise_input=True)(frames)[0], still)
 
 
 @pytest.mark.parametrize(
     ("name", "parameters"), [("mambatm", 998_229), ("mambatm_published", 7_239_319)]
 )
 def test_parameter_counts(name, parameters):
-    network = make(OmegaConf.load(ROOT / "conf" / "model" / f"{name}.yaml"))
+    network = instantiate_node(OmegaConf.load(ROOT / "conf" / "model" / f"{name}.yaml"))
     assert sum(p.numel() for p in network.parameters()) == parameters
 
 
@@ -59,7 +60,15 @@ def test_clips_of_a_batch_do_not_meet():
     [(1, [0]), (16, [0]), (17, [0, 1]), (40, [0, 12, 24]), (41, [0, 12, 24, 25])],
 )
 def test_windows_cover_the_video(frames, starts):
-    assert window_starts(frames, 16, 4) == starts
+    seen = []
+
+    class Listed(FramePostprocessor):
+        def forward(self, part):
+            seen.append(round(100 * float(part[0, 0, 0, 0, 0])))
+            return part, None
+
+    video = torch.arange(frames).view(1, -1, 1, 1, 1) / 100
+    assert torch.equal(Listed().restore(video), video) and seen == starts
 
 
 @torch.no_grad()
@@ -97,9 +106,9 @@ def test_orders_are_permutations_of_the_box():
     assert in_time[:4].tolist() == [0, 20, 40, 5]  # all times of a place, then the place below
 
 
-@pytest.mark.parametrize("steadied", [False, True])
-def test_gradients_reach_every_parameter(steadied):
-    network = small(steadied).train()
+@pytest.mark.parametrize("stabilise_input", [False, True])
+def test_gradients_reach_every_parameter(stabilise_input):
+    network = small(stabilise_input).train()
     clean, distortion = network(torch.rand(1, 5, 1, 32, 32))
     ((clean * torch.randn_like(clean)).sum() + distortion.sum()).backward()
     idle = [name for name, p in network.named_parameters() if float(p.grad.abs().sum()) == 0]
@@ -121,9 +130,9 @@ def test_it_can_learn_one_clip_by_heart():
 
 
 def test_bad_arguments_name_their_key():
-    with pytest.raises(ValueError, match=r"postprocess\.groups"):
-        MambaTM(groups=1)
-    with pytest.raises(ValueError, match=r"postprocess\.features"):
-        MambaTM(features=4)
+    with pytest.raises(ValueError, match=r"postprocess\.scan_blocks"):
+        MambaTM(scan_blocks=1)
+    with pytest.raises(ValueError, match=r"postprocess\.base_channels"):
+        MambaTM(base_channels=4)
     with pytest.raises(ValueError, match=r"postprocess\.overlap"):
         small().restore(torch.rand(1, 1, 1, 16, 16), window=4, overlap=4)

@@ -11,7 +11,7 @@ from baselines.etnet import ETNet
 from baselines.firenet import FireNet
 from baselines.highpass import HighPass
 from baselines.hypere2vid import DynamicDecoder, HyperE2VID, fourier_bessel
-from src.models.unroll import unroll
+from src.models.network import unroll
 from src.sim.optics import Optics
 
 PUBLISHED = {

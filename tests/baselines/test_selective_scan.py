@@ -1,8 +1,5 @@
 """The scan against its definition, its direction, and the curve."""
 
-import sys
-from types import SimpleNamespace
-
 import pytest
 import torch
 
@@ -89,15 +86,3 @@ def test_curve_meets_every_cell_once_and_stays_near(sides):
     assert torch.equal(order.sort().values, torch.arange(len(order)))
     jumps = torch.stack(torch.unravel_index(order, sides), 1).diff(dim=0).abs().sum(1).float()
     assert len(jumps) == 0 or float(jumps.mean()) < 2
-
-
-def test_the_fused_kernel_gets_the_length_last(monkeypatch):
-    def kernel(x, step, rate, enter, leave):  # mamba_ssm's axes: (n, c, length), (n, s, length)
-        x, step, enter, leave = (part.transpose(1, 2) for part in (x, step, enter, leave))
-        return loop(x, step, rate, enter, leave).transpose(1, 2)
-
-    interface = SimpleNamespace(selective_scan_fn=kernel)
-    monkeypatch.setitem(sys.modules, "mamba_ssm", SimpleNamespace())
-    monkeypatch.setitem(sys.modules, "mamba_ssm.ops", SimpleNamespace())
-    monkeypatch.setitem(sys.modules, "mamba_ssm.ops.selective_scan_interface", interface)
-    torch.testing.assert_close(selective_scan._fused(*inputs(20)), scan(*inputs(20)))

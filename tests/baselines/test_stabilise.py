@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from baselines.stabilise import ERROR, jitter, pull, smoother
+from baselines.stabilise import ERROR, estimate_jitter, linear_smoother, warp_video
 
 
 def scene(paths: torch.Tensor, side: int = 96) -> torch.Tensor:
@@ -27,7 +27,7 @@ def shake(frames: int, px: float) -> torch.Tensor:
 
 def rest(path: torch.Tensor) -> torch.Tensor:
     """Return what of a path (frames, 2) is no smooth motion."""
-    return path - smoother(len(path)) @ path
+    return path - linear_smoother(len(path)) @ path
 
 
 def inner(field: torch.Tensor) -> torch.Tensor:
@@ -39,19 +39,19 @@ def test_a_shake_is_found():
     path = shake(12, 0.8)
     expected = rest(path)
     expected = expected / (1 + ERROR**2 / expected.square().mean())  # Wiener's gain
-    found = inner(jitter(scene(path)))
+    found = inner(estimate_jitter(scene(path)))
     assert float((found - expected).square().mean().sqrt()) < 0.08
 
 
 def test_steady_flight_is_no_jitter():
     flight = torch.arange(12.0)[:, None] * torch.tensor([0.7, -0.4])
-    assert float(inner(jitter(scene(flight))).abs().max()) < 0.08
+    assert float(inner(estimate_jitter(scene(flight))).abs().max()) < 0.08
 
 
 def test_pulling_takes_the_shake_out():
     path, still = shake(12, 0.5), scene(torch.zeros(12, 2))
     shaken = scene(rest(path))
-    steady = pull(shaken, jitter(shaken))
+    steady = warp_video(shaken, estimate_jitter(shaken))
     middle = (..., slice(24, -24), slice(24, -24))
     before, after = ((video - still)[middle].square().mean() for video in (shaken, steady))
     assert float(after) < 0.1 * float(before)
@@ -59,12 +59,12 @@ def test_pulling_takes_the_shake_out():
 
 def test_straight_paths_come_through_the_smoother():
     line = torch.stack([torch.ones(9), torch.arange(9.0)], 1)
-    torch.testing.assert_close(smoother(9) @ line, line, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(linear_smoother(9) @ line, line, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3])
 def test_short_videos(frames):
-    shift = jitter(torch.rand(2, frames, 1, 32, 24))
+    shift = estimate_jitter(torch.rand(2, frames, 1, 32, 24))
     assert shift.shape == (2, frames, 2, 32, 24) and torch.isfinite(shift).all()
     if frames <= 2:  # two points lie on a line
         assert float(shift.abs().max()) < 1e-4

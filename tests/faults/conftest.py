@@ -15,6 +15,6 @@ def alone(tmp_path_factory) -> tuple[dict, float]:
     folder = tmp_path_factory.mktemp("alone")
     Run(folder / "nothing", int).wait()  # so that the server is up
     start = time.monotonic()
-    run = Run(folder / "log", harness.train, training(folder / "run"))
+    run = Run(folder / "log", harness.run_entry_point, "train", training(folder / "run"))
     assert run.wait() == 0, run.text()
     return harness.outcome(folder / "run"), time.monotonic() - start

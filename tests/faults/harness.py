@@ -1,7 +1,7 @@
-"""Runs of the doors in processes of their own that can be killed, and the count of what came of it.
+"""Runs of entry points in processes of their own that can be killed, and the count of what came.
 
-A fork server imports the doors once; each run is forked from it, so that a run starts at once and
-its signal handlers, limits and open files are its own.
+A fork server imports the entry points once; each run is forked from it, so that a run starts at
+once and its signal handlers, limits and open files are its own.
 """
 
 import json
@@ -13,45 +13,38 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 import torch
 from omegaconf import OmegaConf
 
 FORKS = multiprocessing.get_context("forkserver")
-FORKS.set_forkserver_preload(
-    ["src.train", "src.eval", "src.reconstruct", "baselines.highpass", "tests.faults.test_inputs"]
-)
-SLOWEST = 600.0  # seconds; a run that takes longer hangs, also on a machine at work
+PRELOADED = ("src.train", "src.eval", "src.reconstruct", "baselines.highpass")
+FORKS.set_forkserver_preload([*PRELOADED, "tests.faults.test_damaged_files"])
+MAX_RUN_S = 600.0  # a run that takes longer hangs, also on a machine at work
 
 
 @dataclass
 class Tally:
-    """What was done and what came of it; printed when the test ends, whichever way."""
+    """Counts the faults injected into runs, and prints them when a test ends."""
 
     name: str
     injected: int = 0
-    recovered: int = 0
-    lost: int = 0
 
     @contextmanager
     def run(self) -> Iterator[None]:
-        """One run that is disturbed in the block: recovered at its end, lost if that raises."""
+        """A run that is disturbed in the block: recovered at its end, lost if that raises."""
+        end = "0 runs recovered, 1 results lost"
         try:
             yield
-            self.recovered += 1
-        except BaseException:
-            self.lost += 1
-            raise
+            end = "1 runs recovered, 0 results lost"
         finally:
-            print(
-                f"{self.name}: {self.injected} faults injected, {self.recovered} runs recovered, "
-                f"{self.lost} results lost"
-            )
+            print(f"{self.name}: {self.injected} faults injected, {end}")
 
 
 class Run:
-    """`work(*arguments)` in a process of its own, as a door runs it; output in `log`."""
+    """`work(*arguments)` in a process of its own, as an entry point runs it; output in `log`."""
 
     def __init__(self, log: Path, work: Callable, *arguments):
         self.log = log
@@ -60,7 +53,7 @@ class Run:
         self.process = FORKS.Process(target=_work, args=(str(log), work, arguments))
         self.process.start()
 
-    def wait(self, seconds: float = SLOWEST) -> int:
+    def wait(self, seconds: float = MAX_RUN_S) -> int:
         """Return the exit code, negative for the signal that ended the run."""
         self.process.join(seconds)
         if self.process.exitcode is None:
@@ -68,15 +61,15 @@ class Run:
             raise TimeoutError(f"the run hangs:\n{self.text()}")
         return self.process.exitcode
 
-    def until(self, seen: Callable[[], bool]) -> bool:
-        """Return True when `seen()`, False when the run ended before."""
-        end = time.monotonic() + SLOWEST
+    def wait_until(self, condition: Callable[[], bool]) -> bool:
+        """Return True when `condition()`, False when the run ended before."""
+        end = time.monotonic() + MAX_RUN_S
         while self.process.exitcode is None:
-            if seen():
+            if condition():
                 return True
             assert time.monotonic() < end, f"nothing happened:\n{self.text()}"
             time.sleep(0.005)
-        return seen()
+        return condition()
 
     def stop(self, number: int) -> int:
         """Send a signal, if the run is still there, and return the exit code."""
@@ -91,37 +84,21 @@ class Run:
 
 def _work(log: str, work: Callable, arguments: tuple) -> None:
     file = os.open(log, os.O_WRONLY | os.O_APPEND)
-    os.dup2(file, 1)
-    os.dup2(file, 2)
-    sys.stdout = os.fdopen(1, "w", buffering=1)
-    sys.stderr = os.fdopen(2, "w", buffering=1)
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        os.dup2(file, number)
+        setattr(sys, name, os.fdopen(number, "w", buffering=1))
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    multiprocessing.set_start_method("fork", force=True)  # for loaders' workers, as of a door
+    multiprocessing.set_start_method("fork", force=True)  # for loaders' workers, as of a run
     torch.set_num_threads(1)
-    from src.app import door
+    from src.app import entry_point
 
-    door.run(lambda: work(*arguments))
-
-
-def train(config: str) -> None:
-    """Run the door train on a resolved config (YAML)."""
-    from src.train import train as work
-
-    work(OmegaConf.create(config))
+    entry_point.run_main(lambda: work(*arguments))
 
 
-def evaluate(config: str) -> None:
-    """Run the door eval."""
-    from src.eval import evaluate as work
-
-    work(OmegaConf.create(config))
-
-
-def reconstruct(config: str) -> None:
-    """Run the door reconstruct."""
-    from src.reconstruct import reconstruct as work
-
-    work(OmegaConf.create(config))
+def run_entry_point(name: str, config: str) -> None:
+    """Run src.train, src.eval or src.reconstruct on a resolved config (YAML)."""
+    function = "evaluate" if name == "eval" else name
+    getattr(import_module(f"src.{name}"), function)(OmegaConf.create(config))
 
 
 def outcome(run: Path) -> dict:

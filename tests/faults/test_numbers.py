@@ -11,16 +11,16 @@ from src.app import build
 from src.sim.pipeline import Pipeline
 from src.simulate import simulate
 from src.train import train
-from src.training import reconstructor
+from src.training.step_guard import StepGuard
 from tests.test_train import TINY, config
 
 QUICK = [*TINY, "logger=none", "optics=single", "data.epoch_clips=4", "trainer.max_steps=4"]
-QUICK += ["data.reuse=1"]
+QUICK += ["data.batch_reuse=1"]
 
 
 def poisoned(monkeypatch, clip: int, value: float) -> None:
     """Make the simulation of one training clip return `value` somewhere."""
-    exposed = Pipeline.expose
+    exposed = Pipeline.simulate_sensor
 
     def spoil(self, draws, *args):
         sample = exposed(self, draws, *args)
@@ -28,7 +28,7 @@ def poisoned(monkeypatch, clip: int, value: float) -> None:
             sample.voxels[[draw.number == clip for draw in draws], 0, 0, 0, 0, 0] = value
         return sample
 
-    monkeypatch.setattr(Pipeline, "expose", spoil)
+    monkeypatch.setattr(Pipeline, "simulate_sensor", spoil)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
@@ -50,8 +50,8 @@ def see_the_clip(message: str, tmp_path, run) -> None:
     words = shlex.split(re.search(r"python -m src\.simulate (.*)", message).group(1))
     found = simulate(config("simulate", tmp_path / "seen", *words))
     trained = OmegaConf.load(run / "config.yaml")
-    pipeline = build.pipeline(trained, "train")
-    assert found == pipeline.simulate([pipeline.draw(2)]).drawn[0] and found["clip"] == 2
+    pipeline = build.build_pipeline(trained, "train")
+    assert found == pipeline.simulate([pipeline.draw(2)]).parameters[0] and found["clip"] == 2
     assert (tmp_path / "seen" / "views.png").is_file()
 
 
@@ -72,7 +72,7 @@ def test_deterministic_mode_gives_the_same_bits(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_leap_of_the_loss_hardly_moves_the_weights(monkeypatch, tmp_path):
+def test_a_spike_of_the_loss_hardly_moves_the_weights(monkeypatch, tmp_path):
     def norms(**given) -> list[float]:
         seen = []
         step = torch.optim.Adam.step
@@ -84,18 +84,8 @@ def test_a_leap_of_the_loss_hardly_moves_the_weights(monkeypatch, tmp_path):
 
         with monkeypatch.context() as patch:
             patch.setattr(torch.optim.Adam, "step", watch)
-            patch.setattr(reconstructor, "Guard", lambda spike: given["guard"])
+            patch.setattr(StepGuard, "gradient_scale", lambda *_: given["factor"])
             train(config("train", tmp_path / str(id(given)), *QUICK))
         return seen
 
-    class Half:
-        losses = ()
-
-        def share(self, loss: float) -> float:
-            return 0.5
-
-    class Whole(Half):
-        def share(self, loss: float) -> float:
-            return 1.0
-
-    assert norms(guard=Half())[0] == pytest.approx(0.5 * norms(guard=Whole())[0], rel=1e-5)
+    assert norms(factor=0.5)[0] == pytest.approx(0.5 * norms(factor=1.0)[0], rel=1e-5)

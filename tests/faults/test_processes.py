@@ -16,7 +16,14 @@ from tests.faults.test_kills import training
 
 def test_no_clip_is_made_by_two_processes_and_none_is_left_out():
     def clips(size: int, rank: int, world: int) -> list[list[int]]:
-        sampler = StepSampler(size, 6, lambda: 0, reuse=1, rank=rank, world=world)
+        sampler = StepSampler(
+            batch_size=size,
+            steps_per_epoch=6,
+            step=lambda: 0,
+            batch_reuse=1,
+            rank=rank,
+            world=world,
+        )
         return [[item.clip for item in batch] for batch in sampler]
 
     joint = clips(6, 0, 1)
@@ -33,7 +40,7 @@ def as_rank(rank: int, port: int, config: str) -> None:
     rank_zero_only.rank = rank
     os.environ |= {"LOCAL_RANK": str(rank), "NODE_RANK": "0", "WORLD_SIZE": "2"}
     os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "GLOO_SOCKET_IFNAME": "lo"}
-    harness.train(config)
+    harness.run_entry_point("train", config)
 
 
 def free_port() -> int:
@@ -53,14 +60,14 @@ def losses(run: Path) -> list[float]:
 
 
 def test_two_processes_train_as_one_with_the_joint_batch(tmp_path):
-    few = ["trainer.max_steps=3", "data.epoch_clips=8", "data.reuse=1", "logger=csv"]
+    few = ["trainer.max_steps=3", "data.epoch_clips=8", "data.batch_reuse=1", "logger=csv"]
     # Adam's first steps have the size of the rate whatever the gradient: rounding would show.
     few += ["optimizer._target_=torch.optim.SGD", "optimizer.lr=0.1", "trainer.precision=32-true"]
     two = training(tmp_path / "two", *few, "trainer=ddp", "data.batch_size=1")
     one = training(tmp_path / "one", *few, "data.batch_size=2")
     port = free_port()
     runs = [Run(tmp_path / f"log{rank}", as_rank, rank, port, two) for rank in (0, 1)]
-    runs.append(Run(tmp_path / "log", harness.train, one))
+    runs.append(Run(tmp_path / "log", harness.run_entry_point, "train", one))
     for run in runs:
         assert run.wait() == 0, run.text()
     assert losses(tmp_path / "two") == pytest.approx(losses(tmp_path / "one"), rel=1e-5)

@@ -15,10 +15,10 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from src.models.checkpoints import WholeFiles, newest, whole
+from src.models.checkpoints import AtomicCheckpointIO, is_intact, newest_checkpoint
 from src.recordings import output
-from src.recordings.output import partial, sink
-from src.recordings.stream import Frame
+from src.recordings.output import open_video_writer, partial_path
+from src.recordings.reconstruction import Frame
 from tests.faults import harness
 from tests.faults.harness import Run, Tally
 from tests.faults.test_kills import STEPS, training
@@ -27,7 +27,7 @@ NOBODY = 65534
 
 
 def written(path: Path, number: float) -> None:
-    WholeFiles().save_checkpoint({"state_dict": {"a": torch.full((50_000,), number)}}, path)
+    AtomicCheckpointIO().save_checkpoint({"state_dict": {"a": torch.full((50_000,), number)}}, path)
 
 
 @contextmanager
@@ -46,7 +46,7 @@ def test_a_full_disk_leaves_the_checkpoint_that_was_there(tmp_path):
     written(path, 1.0)
     with small_files(100_000), pytest.raises((OSError, RuntimeError)):
         written(path, 2.0)
-    assert whole(path) and torch.load(path)["state_dict"]["a"][0] == 1
+    assert is_intact(path) and torch.load(path)["state_dict"]["a"][0] == 1
     assert [file.name for file in tmp_path.iterdir()] == ["last.ckpt"]
 
 
@@ -59,10 +59,10 @@ def test_a_damaged_checkpoint_is_passed_over(tmp_path):
     (tmp_path / "new.ckpt").write_bytes(data)
     os.utime(tmp_path / "new.ckpt", (1, 1))
     with pytest.warns(UserWarning, match="new.ckpt is damaged"):
-        assert newest(tmp_path).name == "old.ckpt"
+        assert newest_checkpoint(tmp_path).name == "old.ckpt"
     (tmp_path / "old.ckpt").unlink()
     with pytest.warns(UserWarning), pytest.raises(ValueError, match="ckpt must be a folder"):
-        newest(tmp_path)
+        newest_checkpoint(tmp_path)
 
 
 @pytest.mark.parametrize("kind", ["mp4", "png", "gif"])
@@ -71,19 +71,22 @@ def test_a_file_that_cannot_grow_is_no_whole_video(kind, tmp_path):
     with (
         small_files(4_000),
         pytest.raises((OSError, RuntimeError)),
-        sink(kind, tmp_path, (96, 96)) as write,
+        open_video_writer(kind, tmp_path, (96, 96)) as write,
     ):
         for number, picture in enumerate(pictures):
             write(Frame(0.01 * number, picture, 1, 0))
     assert not [file for file in tmp_path.iterdir() if "partial" not in file.name]
-    assert partial(tmp_path / "frames.csv").is_file()
+    assert partial_path(tmp_path / "frames.csv").is_file()
 
 
 @pytest.mark.parametrize("kind", ["mp4", "png", "gif", "hdf5"])
 def test_a_full_disk_is_no_whole_video(kind, tmp_path, monkeypatch):
     usage = output.shutil.disk_usage(tmp_path)
     picture = np.zeros((96, 96), np.float32)
-    with pytest.raises(OSError, match="No space left"), sink(kind, tmp_path, (96, 96)) as write:
+    with (
+        pytest.raises(OSError, match="No space left"),
+        open_video_writer(kind, tmp_path, (96, 96)) as write,
+    ):
         write(Frame(0.0, picture, 1, 0))
         monkeypatch.setattr(output.shutil, "disk_usage", lambda path: usage._replace(free=1 << 20))
         write(Frame(0.1, picture, 1, 0))
@@ -93,11 +96,11 @@ def test_a_full_disk_is_no_whole_video(kind, tmp_path, monkeypatch):
 READERS = {
     "cap.txt": "src.recordings.files.formats.read_events",
     "cap.h5": "src.recordings.files.formats.read_events",
-    "views.yaml": "src.recordings.views.load",
-    "photo.png": "src.sim.scenes.photo_files.read",
+    "views.yaml": "src.recordings.views.load_views",
+    "photo.png": "src.sim.scenes.photo_files.read_photograph",
     "net.ckpt": "src.models.files.load",
     "net.safetensors": "src.models.files.load",
-    "old.pth": "baselines.pickles.read",
+    "old.pth": "baselines.pickled_weights.read_tensors",
 }
 
 
@@ -139,7 +142,7 @@ def train_and_lose_a_worker(config: str) -> None:
         return draw(self, number)
 
     Pipeline.draw = die
-    harness.train(config)
+    harness.run_entry_point("train", config)
 
 
 def test_a_worker_that_dies_ends_the_run_and_it_goes_on(tmp_path, alone):
@@ -152,7 +155,7 @@ def test_a_worker_that_dies_ends_the_run_and_it_goes_on(tmp_path, alone):
         assert run.wait() == 1 and "DataLoader worker" in run.text(), run.text()
         assert f"go on with ckpt={tmp_path / 'first' / 'checkpoints'}" in run.text()
         rest = training(tmp_path / "rest", "data.workers=1", f"ckpt={tmp_path / 'first'}")
-        run = Run(tmp_path / "rest.log", harness.train, rest)
+        run = Run(tmp_path / "rest.log", harness.run_entry_point, "train", rest)
         assert run.wait() == 0, run.text()
         assert harness.outcome(tmp_path / "rest") == numbers
 
@@ -164,7 +167,7 @@ def on_slurm(config: str, folder: str) -> None:
         "SLURM_JOB_NAME": "train", "SLURM_PROCID": "0", "SLURM_LOCALID": "0", "SLURM_NODEID": "0",
         "SLURM_JOB_NUM_NODES": "1", "PATH": f"{folder}:{os.environ['PATH']}",
     }  # fmt: skip
-    harness.train(config)
+    harness.run_entry_point("train", config)
 
 
 def test_a_preempted_job_is_requeued_and_goes_on(tmp_path, alone):
@@ -176,14 +179,14 @@ def test_a_preempted_job_is_requeued_and_goes_on(tmp_path, alone):
     with tally.run():
         config = training(tmp_path / "run", "trainer=slurm")
         run = Run(tmp_path / "log", on_slurm, config, str(tmp_path))
-        assert run.until(lambda: bool(list((tmp_path / "run").rglob("every*.ckpt"))))
+        assert run.wait_until(lambda: bool(list((tmp_path / "run").rglob("every*.ckpt"))))
         os.kill(run.process.pid, signal.SIGUSR1)
-        assert run.until(lambda: (tmp_path / "orders").is_file()), run.text()
+        assert run.wait_until(lambda: (tmp_path / "orders").is_file()), run.text()
         assert run.stop(signal.SIGTERM) in (0, 143, -15), run.text()
         tally.injected += 1
         assert (tmp_path / "orders").read_text() == "requeue 77\n"
         (kept,) = (tmp_path / "run").glob("hpc_ckpt_*.ckpt")
-        assert 0 < torch.load(kept, weights_only=True)["global_step"] <= STEPS and whole(kept)
+        assert 0 < torch.load(kept, weights_only=True)["global_step"] <= STEPS and is_intact(kept)
         again = Run(tmp_path / "log2", on_slurm, config, str(tmp_path))
         assert again.wait() == 0, again.text()
         assert harness.outcome(tmp_path / "run") == numbers
@@ -203,8 +206,8 @@ def test_a_disk_that_is_full_in_earnest(tmp_path, alone):
     tally = Tally("disk full (tmpfs)")
     try:
         with tally.run():
-            run = Run(tmp_path / "log", harness.train, training(disk / "first"))
-            assert run.until(lambda: bool(list(disk.rglob("every*.ckpt"))))
+            run = Run(tmp_path / "log", harness.run_entry_point, "train", training(disk / "first"))
+            assert run.wait_until(lambda: bool(list(disk.rglob("every*.ckpt"))))
             with pytest.raises(OSError, match="No space"), (disk / "ballast").open("wb") as ballast:
                 while True:
                     ballast.write(bytes(1 << 20))
@@ -215,7 +218,7 @@ def test_a_disk_that_is_full_in_earnest(tmp_path, alone):
             (disk / "ballast").unlink()
             assert not list(disk.rglob("*.partial"))
             rest = training(disk / "rest", f"ckpt={disk / 'first'}")
-            assert Run(tmp_path / "log2", harness.train, rest).wait() == 0
+            assert Run(tmp_path / "log2", harness.run_entry_point, "train", rest).wait() == 0
             assert harness.outcome(disk / "rest") == numbers
     finally:
         subprocess.run(["umount", str(disk)], check=True)
@@ -227,5 +230,5 @@ def test_too_little_room_is_said_before_anything_is_done(tmp_path, monkeypatch):
     usage = results.shutil.disk_usage(tmp_path)
     monkeypatch.setattr(results.shutil, "disk_usage", lambda path: usage._replace(free=1 << 20))
     with pytest.raises(ValueError, match="paths.out must have 200 MiB free, got 1 MiB"):
-        results.open_run(tmp_path / "run", OmegaConf.to_yaml({"a": 1}))
+        results.create_run_folder(tmp_path / "run", OmegaConf.to_yaml({"a": 1}))
     assert not (tmp_path / "run" / "config.yaml").exists()

@@ -5,8 +5,7 @@ import os
 import pytest
 from PIL import Image
 
-from scripts.learning_curves import curve
-from src.figures import learning
+from scripts.learning_curves import draw_curves, read_curve
 
 
 def test_the_newest_curve_is_drawn(tmp_path):
@@ -15,13 +14,13 @@ def test_the_newest_curve_is_drawn(tmp_path):
         folder.mkdir(parents=True)
         (folder / "curve.csv").write_text("hours,lpips,psnr_aligned\n" + lines)
         os.utime(folder / "curve.csv", (part, part))
-    rows = curve(tmp_path / "lf")
+    rows = read_curve(tmp_path / "lf")
     assert [row["hours"] for row in rows] == [0, 1] and rows[1]["psnr_aligned"] == 17
-    path = learning.draw(tmp_path / "a.png", {"lf": rows, "none yet": curve(tmp_path / "no")})
+    path = draw_curves(tmp_path / "a.png", {"lf": rows, "none yet": read_curve(tmp_path / "no")})
     with Image.open(path) as picture:
         assert picture.size[0] > picture.size[1]
 
 
 def test_without_a_line_nothing_is_drawn(tmp_path):
     with pytest.raises(ValueError, match="curves must have a line"):
-        learning.draw(tmp_path / "a.png", {"none": []})
+        draw_curves(tmp_path / "a.png", {"none": []})

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from src.figures.slices import along, around, sample, straight
+from src.figures.slices import circle_points, line_points, rotating_ray_points, sample_points
 
 Y, X = np.mgrid[:40, :60].astype(float)
 
@@ -14,20 +14,24 @@ def test_a_plane_is_sampled_exactly_between_pixels():
     video = np.stack([X + 2 * Y, 100 + X])
     points = np.array([[3.25, 7.5], [10.0, 20.0], [0.0, 38.5]])
     expected = np.stack([points @ (1, 2), 100 + points[:, 0]])
-    assert np.allclose(sample(video, points), expected, atol=0.05)
+    assert np.allclose(sample_points(video, points), expected, atol=0.05)
 
 
 def test_row_and_column_are_the_video_itself():
     video = np.random.default_rng(0).random((5, 40, 60)).astype(np.float32)
-    assert np.allclose(sample(video, straight((0, 12), (59, 12))), video[:, 12], atol=1e-6)
-    assert np.allclose(sample(video, straight((7, 0), (7, 39))), video[:, :, 7], atol=1e-6)
+    assert np.allclose(
+        sample_points(video, line_points((0, 12), (59, 12))), video[:, 12], atol=1e-6
+    )
+    assert np.allclose(
+        sample_points(video, line_points((7, 0), (7, 39))), video[:, :, 7], atol=1e-6
+    )
 
 
 def test_a_turning_sector_draws_a_straight_line_of_its_own_speed():
     turn = 2 * math.pi * np.arange(12) / 24
     angle = np.arctan2(Y - 20, X - 30)
     video = np.stack([np.cos(angle - phase) for phase in turn])
-    slices = sample(video, around((30, 20), 15, 240))
+    slices = sample_points(video, circle_points((30, 20), 15, 240))
     assert np.array_equal(slices.argmax(1) // 10, np.arange(12))
     assert np.abs(slices.argmax(1) - 10 * np.arange(12)).max() <= 2
 
@@ -37,16 +41,16 @@ def test_a_circling_dot_stays_at_its_radius():
     spots = 12 * np.stack([np.cos(angles), np.sin(angles)], 1) + (30, 20)
     video = np.stack([np.exp(-((X - x) ** 2 + (Y - y) ** 2) / 8) for x, y in spots])
     radii = np.linspace(0, 18, 73)
-    slices = along(video, (30, 20), angles, radii)
+    slices = sample_points(video, rotating_ray_points((30, 20), angles, radii))
     middle = (slices * radii).sum(1) / slices.sum(1)
     assert np.abs(middle - 12).max() < 0.1
 
 
 def test_points_are_at_most_a_pixel_apart():
-    for points in (straight((2, 3), (30.5, 17.2)), around((20, 20), 9.3)):
+    for points in (line_points((2, 3), (30.5, 17.2)), circle_points((20, 20), 9.3)):
         assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() <= 1
 
 
 def test_outside_is_refused():
     with pytest.raises(ValueError, match=r"60x40 px, got \(70.0, 3.0\)"):
-        sample(np.zeros((2, 40, 60)), np.array([[5.0, 3.0], [70.0, 3.0]]))
+        sample_points(np.zeros((2, 40, 60)), np.array([[5.0, 3.0], [70.0, 3.0]]))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from src.figures.video import GAP_PX, TITLE_PX, event_picture, row, write_video
+from src.figures.video import GAP_PX, TITLE_PX, join_panels, render_events, write_video
 
 
 def ramp(frames: int, height: int, width: int) -> np.ndarray:
@@ -13,20 +13,20 @@ def ramp(frames: int, height: int, width: int) -> np.ndarray:
 
 
 def test_events_are_blue_on_and_red_off_on_white():
-    off, none, on = event_picture(np.array([[[-3.0, 0.0, 3.0]]]))[0, 0]
+    off, none, on = render_events(np.array([[[-3.0, 0.0, 3.0]]]))[0, 0]
     assert none.tolist() == [1, 1, 1]
     assert on.argmax() == 2 and off.argmax() == 0
-    assert np.allclose(event_picture(np.array([[[9.0]]]))[0, 0], on)
+    assert np.allclose(render_events(np.array([[[9.0]]]))[0, 0], on)
 
 
 def test_fainter_events_are_paler():
-    one, two, three = event_picture(np.array([[[1.0, 2.0, 3.0]]]))[0, 0, :, 0]
+    one, two, three = render_events(np.array([[[1.0, 2.0, 3.0]]]))[0, 0, :, 0]
     assert 1 > one > two > three
 
 
 def test_panels_stand_side_by_side_under_their_names():
     left, right = ramp(2, 200, 200), ramp(2, 100, 60)
-    frames = row({"left": left, "right": right})
+    frames = join_panels({"left": left, "right": right})
     assert frames.shape == (2, TITLE_PX + 200, 200 + GAP_PX + 120, 3)
     assert np.array_equal(frames[:, TITLE_PX:, :200], left)
     assert np.array_equal(frames[:, TITLE_PX::2, 200 + GAP_PX :: 2], right)
@@ -34,7 +34,7 @@ def test_panels_stand_side_by_side_under_their_names():
 
 
 def test_small_panels_are_enlarged():
-    assert row({"small": ramp(1, 32, 32)}).shape[1] == TITLE_PX + 160
+    assert join_panels({"small": ramp(1, 32, 32)}).shape[1] == TITLE_PX + 160
 
 
 def test_a_gif_keeps_frames_grey_levels_and_time(tmp_path):

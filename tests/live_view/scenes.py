@@ -8,7 +8,7 @@ import faery
 import numpy as np
 import torch
 
-from src.recordings import capture
+from src.recordings import simulated_recording
 from src.recordings.views import Views
 from src.sim.optics import layout
 from src.sim.sensor.sensor import EventSensor
@@ -20,8 +20,8 @@ FPS = 300.0
 
 def views() -> Views:
     """Return nine views on one sensor."""
-    return capture.kaleidoscope(
-        list(layout(9)), model=(SIDE, SIDE), sensor=SENSOR, tile_px=116.0, misalignment_px=1.0
+    return simulated_recording.kaleidoscope_views(
+        list(layout(9)), model=(SIDE, SIDE), sensor=SENSOR, tile_px=116.0, homography_error_px=1.0
     )
 
 
@@ -32,7 +32,9 @@ def events(seconds: float = 0.5) -> np.ndarray:
     size, light = np.full((len(path), 1), 5.0), np.full((len(path), 1), 0.9)
     film = pictures.dot_grid(path[:, None], size, light, SIDE) - 0.7
     frames = torch.from_numpy(film).float().clamp(0, 1)[None].expand(9, -1, -1, -1)
-    return capture.record(frames, FPS, views(), EventSensor(0.4, refractory_s=1e-3, shot_hz=0.5))
+    return simulated_recording.record_events(
+        frames, FPS, views(), EventSensor(0.4, refractory_s=1e-3, dark_noise_hz=0.5)
+    )
 
 
 class Sender:

@@ -13,19 +13,17 @@ import torch
 from aiohttp import ClientSession, WSMsgType
 
 from baselines.highpass import HighPass
-from src.live_view import assembly, feeds
-from src.live_view.backlog import Backlog
-from src.live_view.cutter import Cutter
-from src.live_view.faults import Faults
-from src.live_view.intake import STALL_S, Intake
-from src.live_view.meters import Meters
-from src.live_view.network_step import Running
-from src.live_view.pace import Pace
-from src.live_view.screen import EventPicture
+from src.live_view import assembly, event_feeds
+from src.live_view.feed_reader import STALL_S, FeedReader, PlaybackClock
+from src.live_view.frame_buffer import EventCounter
+from src.live_view.live_windows import WindowCutter, WindowQueue
+from src.live_view.network_runner import RunSettings
+from src.live_view.page_server import PageServer
+from src.live_view.status import FaultLog, Meters
 from src.models.setnet import SetNet
-from src.recordings import stream
+from src.recordings import event_windows, reconstruction
 from src.recordings.files.formats import EVENT, read_events, write_events
-from src.recordings.lookup import build
+from src.recordings.sensor_lookup import build_lookup
 from tests.live_view import scenes
 from tests.live_view.browser import free_port
 
@@ -50,14 +48,14 @@ def received(feed, done) -> np.ndarray:
 
 @pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")  # faery leaves its socket open
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.parametrize("kind", list(feeds.PACKETS))
+@pytest.mark.parametrize("kind", list(event_feeds.PACKETS))
 def test_packets_of_faery_are_read_as_they_were_sent(kind):
-    faults, port = Faults(), free_port(socket.SOCK_DGRAM)
+    faults, port = FaultLog(), free_port(socket.SOCK_DGRAM)
     sent = np.zeros(3000, faery.EVENTS_DTYPE)
     rng = np.random.default_rng(0)
     sent["t"], sent["on"] = np.sort(rng.integers(0, 2**32, 3000)), rng.random(3000) < 0.5
     sent["x"], sent["y"] = rng.integers(0, 640, 3000), rng.integers(0, 480, 3000)
-    feed = feeds.open_feed(f"udp://127.0.0.1:{port}", (480, 640), faults, udp_format=kind)
+    feed = event_feeds.open_feed(f"udp://127.0.0.1:{port}", (480, 640), faults, udp_format=kind)
     stream_of = faery.events_stream_from_array(sent, (640, 480))
     sender = threading.Timer(0.2, lambda: stream_of.to_udp(("127.0.0.1", port), format=kind))
     sender.start()
@@ -67,16 +65,16 @@ def test_packets_of_faery_are_read_as_they_were_sent(kind):
     for name in "txy":
         assert np.array_equal(found[name], sent[name]), name
     assert np.array_equal(found["p"] == 1, sent["on"]) and (abs(found["p"]) == 1).all()
-    assert faults.now() == []
+    assert faults.current() == []
 
 
 def test_the_turn_of_a_32_bit_clock_is_no_jump():
-    feed = feeds.Udp(
-        f"udp://127.0.0.1:{free_port(socket.SOCK_DGRAM)}", (4, 4), "t32_x16_y15_on1", Faults()
+    feed = event_feeds.UdpFeed(
+        f"udp://127.0.0.1:{free_port(socket.SOCK_DGRAM)}", (4, 4), "t32_x16_y15_on1", FaultLog()
     )
-    packed = np.zeros(4, feeds.PACKETS["t32_x16_y15_on1"])
+    packed = np.zeros(4, event_feeds.PACKETS["t32_x16_y15_on1"])
     packed["t"] = [2**32 - 2, 2**32 - 1, 0, 5]
-    found = np.concatenate([feed._events(packed[:3]), feed._events(packed[3:])])
+    found = np.concatenate([feed.unpack(packed[:3]), feed.unpack(packed[3:])])
     feed.close()
     assert np.diff(found["t"]).tolist() == [1, 1, 5]
 
@@ -94,14 +92,14 @@ def test_the_turn_of_a_32_bit_clock_is_no_jump():
 )
 def test_a_feed_that_cannot_be_is_refused(address, sensor, kind, named):
     with pytest.raises(ValueError, match=named):
-        feeds.open_feed(address, sensor, Faults(), udp_format=kind)
+        event_feeds.open_feed(address, sensor, FaultLog(), udp_format=kind)
 
 
 def test_a_port_in_use_is_refused():
-    first = feeds.Udp("udp://127.0.0.1:0", (4, 4), "t64_x16_y16_on8", Faults())
+    first = event_feeds.UdpFeed("udp://127.0.0.1:0", (4, 4), "t64_x16_y16_on8", FaultLog())
     port = first.socket.getsockname()[1]
     with pytest.raises(ValueError, match="recording must be udp"):
-        feeds.Udp(f"udp://127.0.0.1:{port}", (4, 4), "t64_x16_y16_on8", Faults())
+        event_feeds.UdpFeed(f"udp://127.0.0.1:{port}", (4, 4), "t64_x16_y16_on8", FaultLog())
     first.close()
 
 
@@ -119,22 +117,22 @@ class FaeryCamera:
 
 def test_a_camera_is_read_and_looked_for_again_when_it_is_lost(monkeypatch):
     monkeypatch.setattr(faery, "events_stream_from_camera", FaeryCamera)
-    monkeypatch.setattr(feeds, "RETRY_S", 0.01)
-    faults = Faults()
-    feed = feeds.open_feed("camera://", None, faults)
-    assert feed.sensor == (480, 640) and feed.live
+    monkeypatch.setattr(event_feeds, "RETRY_S", 0.01)
+    faults = FaultLog()
+    feed = event_feeds.open_feed("camera://", None, faults)
+    assert feed.sensor == (480, 640) and feed.is_live
     found = received(feed, 12)
     assert found["p"][:5].tolist() == [1, -1, 1, 1, -1] and len(found) == 15
-    assert faults.now() == []
+    assert faults.current() == []
 
 
 def test_no_camera_says_what_to_install():
     with pytest.raises(ValueError, match="pip install event-camera-drivers neuromorphic-drivers"):
-        feeds.open_feed("camera://", None, Faults())
+        event_feeds.open_feed("camera://", None, FaultLog())
 
 
 def test_a_file_that_loops_goes_on_in_time(recording):
-    feed, once = feeds.File(recording, scenes.SENSOR, True), read_events(recording)
+    feed, once = event_feeds.FileFeed(recording, scenes.SENSOR, True), read_events(recording)
     found = received(feed, 2 * len(once))
     again = found[len(once) : 2 * len(once)]
     for name in "xyp":
@@ -142,16 +140,13 @@ def test_a_file_that_loops_goes_on_in_time(recording):
     assert np.ptp(again["t"] - once["t"]) == 0 and (np.diff(found["t"]) >= 0).all()
 
 
-class Script:
+class Script(event_feeds.Feed):
     """A live feed that sends what it is told to, when: (seconds from the start, times in us)."""
 
-    live, sensor = True, scenes.SENSOR
+    sensor = scenes.SENSOR
 
     def __init__(self, *steps):
         self.steps = steps
-
-    def close(self):
-        pass
 
     def chunks(self, stopped):
         began = time.perf_counter()
@@ -163,11 +158,15 @@ class Script:
         stopped.wait(60)
 
 
-def live_windows(feed, seconds: float, faults: Faults):
+def live_windows(feed, seconds: float, faults: FaultLog):
     """Return the windows at 100 fps of `seconds` of a live feed, and the intake."""
-    marks, meters, waiting = EventPicture(build(scenes.views())), Meters(), Backlog(10_000)
-    cutter = Cutter(scenes.SENSOR, 100.0, faults)
-    intake = Intake(feed, cutter, waiting, marks, Pace(1.0), meters, faults)
+    marks, meters, waiting = (
+        EventCounter(build_lookup(scenes.views())),
+        Meters(),
+        WindowQueue(10_000),
+    )
+    cutter = WindowCutter(scenes.SENSOR, 100.0, faults)
+    intake = FeedReader(feed, cutter, waiting, marks, PlaybackClock(1.0), meters, faults)
     stopped = threading.Event()
     threads = [threading.Thread(target=w, args=(stopped,)) for w in (intake.decode, intake.cut)]
     for thread in threads:
@@ -181,61 +180,65 @@ def live_windows(feed, seconds: float, faults: Faults):
 
 
 def test_windows_of_a_quiet_camera_come_by_the_clock_until_it_has_stalled():
-    faults = Faults()
+    faults = FaultLog()
     windows, state = live_windows(Script((0, [0])), STALL_S + 0.5, faults)
     assert 30 < len(windows) <= 101 * STALL_S and state == "stalled"
-    assert "no events for 1 s" in faults.now()[0]
-    dues = [one.due for one in windows]
+    assert "no events for 1 s" in faults.current()[0]
+    dues = [one.due_s for one in windows]
     assert np.diff(dues) == pytest.approx(0.01, abs=1e-6)
 
 
 def test_a_stream_that_comes_back_goes_on_from_there():
     later = 0.2 + STALL_S + 0.3
     feed = Script((0, [0, 200_000]), (later, [9_000_000]), (later + 0.05, [9_050_000]))
-    windows, state = live_windows(feed, later + 0.8, Faults())
+    windows, state = live_windows(feed, later + 0.8, FaultLog())
     assert state == "playing"
     starts = np.array([one.start_us for one in windows])
     assert (starts >= 9_000_000).sum() >= 3 and not ((starts > 1.5e6) & (starts < 9e6)).any()
-    assert [one.fresh for one in windows].count(True) == 1  # the picture is not thrown away
+    assert [one.starts_scene for one in windows].count(True) == 1  # the picture is not thrown away
 
 
 def test_a_camera_s_clock_that_leaps_does_not_make_windows_without_end():
     feed = Script((0, [0]), (0.1, [10**12]), (0.15, [10**12 + 50_000]))
-    windows, _ = live_windows(feed, 0.4, Faults())
+    windows, _ = live_windows(feed, 0.4, FaultLog())
     assert len(windows) < 60
     assert sum(one.start_us >= 10**12 for one in windows) >= 4
 
 
 def test_what_comes_live_is_not_slowed_down():
-    parts = (Backlog(1), EventPicture(build(scenes.views())), Pace(0.5), Meters(), Faults())
-    with pytest.raises(ValueError, match="speed must be 1 for what comes live"):
-        Intake(Script(), Cutter(scenes.SENSOR, 100.0, Faults()), *parts)
+    parts = (WindowQueue(1), EventCounter(build_lookup(scenes.views())), PlaybackClock(0.5))
+    with pytest.raises(ValueError, match="playback_speed must be 1 for what comes live"):
+        FeedReader(
+            Script(), WindowCutter(scenes.SENSOR, 100.0, FaultLog()), *parts, Meters(), FaultLog()
+        )
 
 
-def served(recording: str, networks, **how) -> assembly.Server:
+def served(recording: str, networks, **how) -> PageServer:
     """Return the server of a recording, its port open to be chosen."""
-    views, faults = scenes.views(), Faults()
-    running = Running(how.pop("fps", 100.0), form="float32")
-    feed = feeds.open_feed(recording, None, faults)
+    views, faults = scenes.views(), FaultLog()
+    running = RunSettings(how.pop("fps", 100.0), form="float32")
+    feed = event_feeds.open_feed(recording, None, faults)
     made = assembly.assemble(feed, networks, views, running, faults, port=free_port(), **how)
-    assembly.first_choice(made.page.controls, next(iter(networks)), "all")
+    made.page.controls.choose(next(iter(networks)), "all")
     return made
 
 
 def test_as_fast_as_it_goes_every_picture_is_that_of_reconstruct(recording):
     torch.manual_seed(0)
     network = SetNet.preset("small").eval()
-    made = served(recording, {"net": network}, speed=float("inf"))
-    player, screen = made.page.player, made.page.screen
+    made = served(recording, {"net": network}, playback_speed=float("inf"))
+    player, screen = made.page.player, made.page.frames
     player.start()
-    _until(lambda: player.intake.state == "ended" and not len(player.intake.backlog))
+    _until(lambda: player.reader.state == "ended" and not len(player.reader.waiting))
     _until(lambda: screen.count >= 29)
     player.stop()
-    rule = stream.Rule(fps=100.0, splat="nearest")
-    windows = stream.windows([read_events(recording)], build(scenes.views()), rule)
-    frames = stream.frames(windows, network, positions=scenes.views().positions)
+    rule = event_windows.WindowRule(fps=100.0, splat="nearest")
+    windows = event_windows.cut_windows(
+        [read_events(recording)], build_lookup(scenes.views()), rule
+    )
+    frames = reconstruction.reconstruct_frames(windows, network, scenes.views().positions)
     wanted = np.array([np.rint(frame.picture * 255) for frame in frames])
-    assert player.intake.backlog.dropped == 0
+    assert player.reader.waiting.dropped == 0
     shown = screen.ring[: screen.count].astype(float)
     assert np.abs(shown - wanted[: screen.count]).max() <= 1 and shown.std() > 1
     assert len(wanted) - screen.count in (0, 1)
@@ -247,10 +250,10 @@ def test_what_cannot_keep_up_drops_windows_and_keeps_its_latency(recording):
             time.sleep(0.05)
             return super().forward(*args, **kwargs)
 
-    made = served(recording, {"slow": Slow()}, fps=400.0, backlog=4)
+    made = served(recording, {"slow": Slow()}, fps=400.0, max_waiting_windows=4)
     player = made.page.player
     player.start()
-    _until(lambda: player.intake.state == "ended")
+    _until(lambda: player.reader.state == "ended")
     status = player.status()
     player.stop()
     assert status["dropped"] > 50 and status["waiting"] <= 4
@@ -262,7 +265,7 @@ def test_a_file_that_breaks_off_is_told(recording, tmp_path, monkeypatch):
         yield read_events(recording)[:1000]
         raise ValueError(f"{recording}: cannot be decoded: broken")
 
-    monkeypatch.setattr(feeds.sources, "events", broken)
+    monkeypatch.setattr(event_feeds.sources, "iter_recording", broken)
     made = served(recording, {"net": HighPass()})
     made.page.player.start()
     _until(lambda: made.page.player.status()["state"] == "broken")
@@ -310,7 +313,7 @@ def test_the_server_answers_and_takes_only_what_makes_sense(recording):
     headers = asyncio.run(visit())
     made.page.player.stop()
     assert headers[-1]["line"] == [0, 0, 87, 87] and headers[-1]["chosen"]["network"] == "net"
-    assert any("views_used must be in" in fault for one in headers for fault in one["faults"])
+    assert any("views_used must be one of" in fault for one in headers for fault in one["faults"])
 
 
 def test_a_page_s_port_in_use_is_refused(recording):
@@ -319,14 +322,14 @@ def test_a_page_s_port_in_use_is_refused(recording):
         taken.bind(("127.0.0.1", made.port))
         taken.listen()
         with pytest.raises(ValueError, match=f"port={made.port} cannot be used"):
-            asyncio.run(assembly.serve(made))
+            asyncio.run(assembly.play_and_serve(made))
 
 
 @pytest.mark.parametrize("use", [2, "many", 0])
 def test_views_that_are_not_there_are_refused(recording, use):
     made = served(recording, {"net": SetNet.preset("small").eval()})
-    with pytest.raises(ValueError, match="use must be one of all, 1, 3, 5, 9"):
-        assembly.first_choice(made.page.controls, "net", use)
+    with pytest.raises(ValueError, match="views_used must be one of all, 1, 3, 5, 9"):
+        made.page.controls.choose("net", use)
 
 
 def _until(seen, seconds: float = 60.0) -> None:

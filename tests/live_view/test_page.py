@@ -35,7 +35,7 @@ class Server:
             f"port={self.port}",
             f"hydra.run.dir={folder}/run",
             "ckpt=setnet_small",
-            "choices=[setnet_small,setnet_medium]",
+            "offered_networks=[setnet_small,setnet_medium]",
             "fps=30",
             "threads=1",
         ]

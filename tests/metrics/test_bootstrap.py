@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from src.metrics.bootstrap import difference, interval
+from src.metrics.bootstrap import RESAMPLES, bootstrap_difference_interval, bootstrap_interval
 
 
 def test_the_interval_of_many_values_is_the_normal_one():
     values = np.random.default_rng(1).normal(3.0, 2.0, 400)
-    low, high = interval(values.tolist())
+    low, high = bootstrap_interval(values.tolist())
     half = 1.96 * values.std() / 20
     assert low == pytest.approx(values.mean() - half, abs=0.12 * half)
     assert high == pytest.approx(values.mean() + half, abs=0.12 * half)
@@ -19,21 +20,31 @@ def test_clips_are_paired():
     hard = rng.normal(0, 10.0, 27)  # what the clip does to every network
     ours = [(hard + 0.5 + rng.normal(0, 0.1, 27)).tolist() for _ in range(3)]
     theirs = [(hard + rng.normal(0, 0.1, 27)).tolist() for _ in range(3)]
-    low, high = difference(ours, theirs)
+    low, high = bootstrap_difference_interval(ours, theirs)
     assert 0.4 < low < 0.5 < high < 0.6
-    assert np.diff(interval(hard.tolist()))[0] > 5
+    assert np.diff(bootstrap_interval(hard.tolist()))[0] > 5
 
 
 def test_seeds_count():
     apart = [[0.0] * 9, [1.0] * 9, [2.0] * 9]
-    low, high = difference(apart, None)
+    low, high = bootstrap_difference_interval(apart, None)
     assert low == pytest.approx(0.0, abs=0.4) and high == pytest.approx(2.0, abs=0.4)
 
 
+def test_it_is_scipy_s_where_there_is_one_seed():
+    values = np.random.default_rng(3).normal(0.5, 0.1, 12)
+    theirs = stats.bootstrap(
+        (values,), np.mean, n_resamples=RESAMPLES, method="percentile", rng=np.random.default_rng(0)
+    ).confidence_interval
+    assert bootstrap_interval(values.tolist()) == pytest.approx(
+        (theirs.low, theirs.high), abs=1e-12
+    )
+
+
 def test_a_single_value_has_no_width():
-    assert interval([0.25]) == (0.25, 0.25)
+    assert bootstrap_interval([0.25]) == (0.25, 0.25)
 
 
 def test_rows_must_be_of_the_same_clips():
     with pytest.raises(ValueError, match="same 2 clips"):
-        difference([[1.0, 2.0]], [[1.0]])
+        bootstrap_difference_interval([[1.0, 2.0]], [[1.0]])

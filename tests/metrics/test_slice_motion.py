@@ -17,12 +17,12 @@ def test_wander_is_the_rms_shift_whatever_the_brightness(size):
     rng = np.random.default_rng(0)
     shift = size * rng.normal(size=200)
     rows = edges(shift) * rng.uniform(0.7, 1.3, (200, 1)) + 0.1 * rng.normal(size=(200, 1))
-    assert slice_motion.wander(rows) == pytest.approx(shift.std(), rel=0.05)
+    assert slice_motion.residual_displacement_px(rows) == pytest.approx(shift.std(), rel=0.05)
 
 
 def test_a_still_slice_does_not_wander_and_a_blank_one_has_no_answer():
-    assert slice_motion.wander(edges(np.zeros(10))) < 1e-9
-    assert np.isnan(slice_motion.wander(np.full((10, 50), 0.5)))
+    assert slice_motion.residual_displacement_px(edges(np.zeros(10))) < 1e-9
+    assert np.isnan(slice_motion.residual_displacement_px(np.full((10, 50), 0.5)))
 
 
 @pytest.mark.parametrize("size", [0.0, 0.3, 1.0])
@@ -31,7 +31,7 @@ def test_straightness_is_the_distance_from_the_line_of_uniform_motion(size):
     centre = 15 + 1.1 * time + size * rng.normal(size=60)
     rows = 0.2 + 0.7 * np.exp(-((np.arange(100) - centre[:, None]) ** 2) / 18)
     true = centre - np.polyval(np.polyfit(time, centre, 1), time)
-    assert slice_motion.straightness(rows) == pytest.approx(true.std(), abs=0.05)
+    assert slice_motion.line_deviation_px(rows) == pytest.approx(true.std(), abs=0.05)
 
 
 @pytest.mark.parametrize("ends", [1, 2])
@@ -43,21 +43,21 @@ def test_turning_is_the_distance_from_uniform_turning_over_many_rounds(ends):
     apart = (apart + period / 2) % period - period / 2
     rows = 0.2 + 0.7 * np.exp(-(apart**2) / 18)
     true = centre - np.polyval(np.polyfit(time, centre, 1), time)
-    assert slice_motion.turning(rows) == pytest.approx(true.std(), abs=0.05)
-    assert slice_motion.straightness(rows) > 10
+    assert slice_motion.rotation_deviation_px(rows) == pytest.approx(true.std(), abs=0.05)
+    assert slice_motion.line_deviation_px(rows) > 10
 
 
 def test_a_slice_in_which_nothing_moves_has_no_straightness():
-    assert np.isnan(slice_motion.straightness(np.full((10, 50), 0.5)))
-    assert np.isnan(slice_motion.turning(np.full((10, 50), 0.5)))
+    assert np.isnan(slice_motion.line_deviation_px(np.full((10, 50), 0.5)))
+    assert np.isnan(slice_motion.rotation_deviation_px(np.full((10, 50), 0.5)))
 
 
 def test_flicker_is_change_over_contrast():
     scene = np.tile(np.sin(np.arange(40) / 3), (40, 1)).astype(np.float32)
-    still = slice_motion.of_still(np.stack([scene] * 6), 8)
-    assert still["flicker"] == 0 and still["wander"] < 1e-3
+    still = slice_motion.measure_static_scene(np.stack([scene] * 6), 8)
+    assert still["flicker"] == 0 and still["residual_displacement_px"] < 1e-3
     assert still["contrast"] == pytest.approx(float(scene.std()), rel=1e-5)
     restless = np.stack([scene + 0.1 * (k % 2) for k in range(6)])
-    assert slice_motion.of_still(restless, 8)["flicker"] == pytest.approx(
+    assert slice_motion.measure_static_scene(restless, 8)["flicker"] == pytest.approx(
         0.1 / scene.std(), rel=1e-4
     )

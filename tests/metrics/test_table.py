@@ -3,22 +3,26 @@
 import subprocess
 import sys
 
-from src.metrics.scores import MEASURES
 from src.metrics.table import METRICS, NAMES
+from src.metrics.video_metrics import SCORES
 from tests.conftest import ROOT
 
 
 def test_every_metric_that_is_computed_has_a_line():
-    assert {*MEASURES, "lpips"} == set(NAMES) and len(NAMES) == len(set(NAMES))
+    assert {*SCORES, "lpips"} == set(NAMES) and len(NAMES) == len(set(NAMES))
 
 
 def test_the_line_says_how_a_value_is_written():
-    wobble = METRICS[-1]
-    assert wobble.written(1.236) == "1.24" and wobble.arrow == "↓" and wobble.written(None) == "-"
+    temporal_jitter_px = METRICS[-1]
+    assert (
+        temporal_jitter_px.format_value(1.236) == "1.24"
+        and temporal_jitter_px.arrow == "↓"
+        and temporal_jitter_px.format_value(None) == "-"
+    )
 
 
 def test_a_report_loads_no_training_stack():
-    code = "import sys, src.reports.margins; print(*sys.modules)"
+    code = "import sys, src.reports.tables; print(*sys.modules)"
     run = [sys.executable, "-c", code]
     loaded = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     assert not {"torch", "lightning"} & set(loaded.split())

@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch.nn.utils import parametrize
 
-from src.models.cost import macs_per_frame
+from src.deploy.cost import macs_per_frame
 from src.models.e2vid import E2VID
-from src.models.unroll import unroll
+from src.models.network import unroll
 
 
 @pytest.mark.parametrize(
@@ -63,15 +63,15 @@ def test_law_6_two_chunks_equal_one(recurrent):
     assert torch.equal(whole, torch.cat([first, second], 1))
 
 
-@pytest.mark.parametrize("state_step", [None, 0.25])
+@pytest.mark.parametrize("state_rounding_step", [None, 0.25])
 @torch.no_grad()
-def test_windows_that_are_not_shown_are_remembered(state_step):
-    network, drawn = small(state_step=state_step).eval(), []
+def test_windows_without_output_warm_up_the_state(state_rounding_step):
+    network, drawn = small(state_rounding_step=state_rounding_step).eval(), []
     network.pred.register_forward_hook(lambda *_: drawn.append(1))
     windows = voxels().repeat(1, 3, 1, 1, 1, 1)
     whole, state = unroll(network, windows)
     drawn.clear()
-    some, same = unroll(network, windows, shown=[1, 4])
+    some, same = unroll(network, windows, output_windows=[1, 4])
     assert torch.equal(some, whole[:, [1, 4]]) and len(drawn) == 2
     for ours, theirs in zip(same, state, strict=True):
         assert all(map(torch.equal, ours, theirs))
@@ -87,7 +87,7 @@ def test_clips_of_a_batch_do_not_meet():
 
 @torch.no_grad()
 def test_less_than_half_a_step_is_not_handed_on():
-    network, window = small(state_step=0.25).eval(), voxels()[:, 0]
+    network, window = small(state_rounding_step=0.25).eval(), voxels()[:, 0]
     _, state = network(window, None)
     (hidden, memory), *rest = state
     steps = 0.25 * (hidden / 0.25).round()
@@ -99,7 +99,7 @@ def test_less_than_half_a_step_is_not_handed_on():
 
 @torch.no_grad()
 def test_training_sees_the_hidden_map_as_it_is():
-    network, window = small(state_step=0.25), voxels()[:, 0]
+    network, window = small(state_rounding_step=0.25), voxels()[:, 0]
     _, state = network(window, None)
     assert torch.equal(network(window, state)[0], small()(window, state)[0])
 

@@ -6,7 +6,7 @@ from safetensors.torch import save_file
 
 from src.models import files, load, save
 from src.models.e2vid import E2VID
-from src.models.unroll import unroll
+from src.models.network import unroll
 
 KWARGS = {"views": 2, "bins": 3, "base_channels": 4, "spectral_norm": True}
 SPEC = {"target": "src.models.e2vid.E2VID", "kwargs": KWARGS}
@@ -58,17 +58,17 @@ def test_one_view_is_where_many_begin(stem, tmp_path):
     path, narrow = tmp_path / "one.safetensors", E2VID(**one).eval()
     save(path, narrow, {"target": SPEC["target"], "kwargs": one}, {})
     nine = one | {"views": 9}
-    assert files.require(path, {"target": SPEC["target"], "kwargs": nine}) == path
+    assert files.find_checkpoint(path, {"target": SPEC["target"], "kwargs": nine}) == path
     wide = E2VID(**nine).eval()
-    files.restore(wide, path)
+    files.restore_weights(wide, path)
     seen = torch.randn(1, 3, 9, 3, 16, 16)
     ours, theirs = unroll(wide, seen)[0], unroll(load(path), seen[:, :, 4:5])[0]
     assert torch.allclose(ours, theirs, atol=1e-6)
     with pytest.raises(ValueError, match="ckpt must be of the network"):
-        files.require(path, {"target": SPEC["target"], "kwargs": nine | {"bins": 4}})
+        files.find_checkpoint(path, {"target": SPEC["target"], "kwargs": nine | {"bins": 4}})
     for other in ({"base_channels": 8}, {"bins": 4}, {"stem_channels": 7}, {"kernel_size": 3}):
         with pytest.raises(ValueError, match="ckpt does not fit E2VID"):
-            files.restore(E2VID(**nine | other), path)
+            files.restore_weights(E2VID(**nine | other), path)
 
 
 def test_other_weights_are_listed(tmp_path):
@@ -84,7 +84,7 @@ def test_other_weights_are_listed(tmp_path):
     "target",
     [
         "os.system",
-        "src.app.build.network",
+        "src.app.build.build_network",
         "src.models.files.save",
         "src.models.absent.X",
         "baselines.",

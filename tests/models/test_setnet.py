@@ -2,26 +2,35 @@
 
 from itertools import pairwise
 
+import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
 
 from src.app import build
-from src.app.parts import make
+from src.app.instantiate import instantiate_node
+from src.deploy.cost import macs_per_frame
 from src.models import load, save
-from src.models.cost import macs_per_frame
-from src.models.setnet import FADE_S, SIZES, SetNet, faded
-from src.models.setnet_layers import PacedUnit
-from src.models.unroll import AT_ONCE, unroll
+from src.models.network import MAX_WINDOWS, unroll
+from src.models.setnet import (
+    CONTEXT_TAU_S,
+    SIZES,
+    SetNet,
+    TimeGatedMemory,
+    advance_clock,
+    smooth_context,
+)
 from src.sim.optics import layout
 from tests.conftest import ROOT
 from tests.test_train import config
 
+FULL = {"bins": 5, "refine_fusion": False, "gate_rank": None}  # with what SIZES says
+
 
 def small() -> SetNet:
     torch.manual_seed(0)
-    network = SetNet(bins=3, half=4, around=(8, 8, 8))
-    for part in (network.around.ups[0], *(block.second for block in network.around.blocks)):
+    network = SetNet(bins=3, channels=4, context_channels=(8, 8, 8))
+    for part in (network.context.ups[0], *(block.conv2 for block in network.context.down_blocks)):
         torch.nn.init.normal_(part.weight, std=0.1)  # as after training
     return network
 
@@ -36,14 +45,14 @@ def test_cost_and_config_of_each_size(size, giga):
     network = SetNet.preset(size)
     assert abs(macs_per_frame(network, 176, 176, views=9) / 1e9 - giga) < 0.02
     node = OmegaConf.load(ROOT / "conf" / "model" / f"setnet_{size}.yaml")
-    made = make(OmegaConf.merge(node, {"bins": 5}))
-    assert isinstance(made, SetNet) and made.arguments == {"bins": 5} | SIZES[size]
+    made = instantiate_node(OmegaConf.merge(node, {"bins": 5}))
+    assert isinstance(made, SetNet) and made.init_kwargs == FULL | SIZES[size]
 
 
 @pytest.mark.parametrize("size", SIZES)
 def test_a_preset_is_stored_as_what_it_stands_for(size, tmp_path):
-    _, spec = build.network(config("train", tmp_path, f"experiment=setnet_{size}"))
-    assert spec == {"target": "src.models.setnet.SetNet", "kwargs": {"bins": 5} | SIZES[size]}
+    _, spec = build.build_network(config("train", tmp_path, f"experiment=setnet_{size}"))
+    assert spec == {"target": "src.models.setnet.SetNet", "kwargs": FULL | SIZES[size]}
 
 
 @pytest.mark.parametrize("views", [1, 2, 3, 4, 5, 9, 16, 25])
@@ -51,7 +60,7 @@ def test_a_preset_is_stored_as_what_it_stands_for(size, tmp_path):
 def test_any_number_of_views_and_any_size(views):
     frame, state = small()(voxels(2, 1, views, 19)[:, 0], None)
     assert frame.shape == (2, 1, 19, 19) and 0 <= float(frame.min()) <= float(frame.max()) <= 1
-    assert [tuple(part.shape[1:]) for part in state[3:]] == small().hidden(24, 24)
+    assert [tuple(part.shape[1:]) for part in state[3:]] == small().map_sizes(24, 24)
 
 
 @torch.no_grad()
@@ -101,11 +110,12 @@ def test_state_stays_bounded_over_500_windows_of_noise():
     for step in range(500):
         noise = torch.randn(1, 2, 3, 16, 16, generator=torch.Generator().manual_seed(step))
         frame, state = network(30 * noise + 10, state)
-    sums, awake, recent, hidden, about, told = state
-    assert max(float(part.abs().max()) for part in (awake, recent, hidden)) <= 1
-    assert all(torch.isfinite(part).all() for part in (frame, about, told))
+    bounded = state.activity, state.context_recency, state.hidden
+    assert max(float(part.abs().max()) for part in bounded) <= 1
+    finite = frame, state.context, state.context_smoothed
+    assert all(torch.isfinite(part).all() for part in finite)
     # A leaky sum is at most what comes in a window divided by what leaks out of it.
-    assert float(sums.abs().max()) < 4 * 3 * (10 + 30 * 6) / (1 - 0.984)
+    assert float(state.view_sums.abs().max()) < 4 * 3 * (10 + 30 * 6) / (1 - 0.984)
 
 
 @torch.no_grad()
@@ -127,13 +137,13 @@ def test_nothing_happens_before_the_first_event():
     assert all(bool((part == 0).all()) for part in state)
 
 
-@pytest.mark.parametrize("rank", [None, 3])
+@pytest.mark.parametrize("gate_rank", [None, 3])
 @torch.no_grad()
-def test_a_window_cut_in_ten_passes_the_same_time(rank):
-    cell = PacedUnit(4, rank).eval()
+def test_a_window_cut_in_ten_passes_the_same_time(gate_rank):
+    cell = TimeGatedMemory(4, gate_rank).eval()
     x, state = torch.zeros(1, 4, 8, 8), torch.rand(1, 4, 8, 8)
-    cell.seen.weight.zero_()
-    cell.kept.weight.zero_()  # gates do not see the state
+    cell.input_gates.weight.zero_()
+    cell.state_gates.weight.zero_()  # gates do not see the state
     _, whole = cell(x, state, torch.ones(1, 1, 1, 1))
     every, last = cell(x.expand(10, -1, -1, -1), state, torch.full((10, 1, 1, 1), 0.1))
     torch.testing.assert_close(last, whole)
@@ -143,7 +153,7 @@ def test_a_window_cut_in_ten_passes_the_same_time(rank):
 @pytest.mark.parametrize("side", [16, 20])
 @torch.no_grad()
 def test_a_sequence_at_once_is_what_its_windows_are_one_by_one(side):
-    network, clips = small(), voxels(2, windows=AT_ONCE + 3, side=side)
+    network, clips = small(), voxels(2, windows=MAX_WINDOWS + 3, side=side)
     clips[1, 4:9] = 0
     lengths = {"window_s": torch.tensor([1 / 120, 1 / 600])}
     frames, state = unroll(network, clips, **lengths)
@@ -155,15 +165,17 @@ def test_a_sequence_at_once_is_what_its_windows_are_one_by_one(side):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("shown", [[2, 3, 17, AT_ONCE + 1], [0], list(range(AT_ONCE + 3))])
+@pytest.mark.parametrize(
+    "output_windows", [[2, 3, 17, MAX_WINDOWS + 1], [0], list(range(MAX_WINDOWS + 3))]
+)
 @torch.no_grad()
-def test_windows_that_are_not_shown_change_nothing(shown):
-    network, clips = small(), voxels(2, windows=AT_ONCE + 3)
+def test_windows_without_output_change_nothing(output_windows):
+    network, clips = small(), voxels(2, windows=MAX_WINDOWS + 3)
     clips[0, 4:9] = 0
     lengths = {"window_s": torch.tensor([1 / 120, 1 / 600])}
     frames, state = unroll(network, clips, **lengths)
-    some, same = unroll(network, clips, **lengths, shown=shown)
-    torch.testing.assert_close(some, frames[:, shown], rtol=1e-4, atol=1e-5)
+    some, same = unroll(network, clips, **lengths, output_windows=output_windows)
+    torch.testing.assert_close(some, frames[:, output_windows], rtol=1e-4, atol=1e-5)
     for one, other in zip(state, same, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
 
@@ -171,9 +183,9 @@ def test_windows_that_are_not_shown_change_nothing(shown):
 @torch.no_grad()
 def test_events_count_per_time_not_per_window():
     network, seen = small(), []
-    for part in (network.sum_stem.kernels, network.spread_stem.weight):
+    for part in (network.sum_kernels.basis, network.spread_conv.weight):
         part.zero_()  # sums leak, the longer a window the more
-    network.cell2.register_forward_pre_hook(lambda _, x: seen.append(x[0]))
+    network.memory.register_forward_pre_hook(lambda _, x: seen.append(x[0]))
     network(voxels()[:, 0], None, window_s=1 / 600)
     network(7 * voxels()[:, 0], None, window_s=7 / 600)
     torch.testing.assert_close(seen[0], seen[1])
@@ -188,16 +200,31 @@ def test_an_empty_window_cut_in_pieces_passes_the_same_time():
     _, whole = network(nothing, whole, window_s=0.1)
     for _ in range(100):
         _, pieces = network(nothing, pieces, window_s=1e-3)
-    for one, other in zip(whole[:3], pieces[:3], strict=True):  # sums and wakefulness
+    for one, other in zip(whole[:3], pieces[:3], strict=True):  # sums and clock
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
 
 
+def test_the_clock_of_numpy_is_that_of_torch():
+    states = {torch: torch.tensor([0.0, 0.0]), np: np.zeros(2, np.float32)}
+    for has_events in (True, True, False, False, True, False, True):
+        ticks = {}
+        for xp, clock in states.items():
+            window_s = np.float32(1 / 200) if xp is np else torch.tensor(1 / 200)
+            events = np.bool_(has_events) if xp is np else torch.tensor(has_events)
+            ticks[xp], *after = advance_clock(events, window_s, *clock, xp=xp)
+            states[xp] = np.array(after) if xp is np else torch.stack(after)
+        np.testing.assert_allclose(
+            [float(part) for part in (*ticks[torch], *states[torch])],
+            [float(part) for part in (*ticks[np], *states[np])], rtol=1e-6,
+        )  # fmt: skip
+
+
 @torch.no_grad()
-def test_one_looks_around_30_times_a_second():
+def test_the_context_is_updated_30_times_a_second():
     network, state, kept = small().eval(), None, []
     for window in voxels(windows=10).unbind(1):
         _, state = network(window, state, window_s=1 / 120)
-        kept.append(state[3:])
+        kept.append((state.hidden, state.context))
     changed = [
         [not torch.equal(one, other) for one, other in zip(before, after, strict=True)]
         for before, after in pairwise(kept)
@@ -208,43 +235,43 @@ def test_one_looks_around_30_times_a_second():
 
 
 @torch.no_grad()
-def test_what_lies_around_is_a_running_mean_of_what_was_seen():
+def test_the_context_is_a_running_mean_of_the_pyramid():
     network, windows = small().eval(), voxels(windows=9)
-    looks = []
-    network.around.register_forward_hook(lambda _, x, seen: looks.append(seen))
+    outputs = []
+    network.context.register_forward_hook(lambda _, x, output: outputs.append(output))
     _, state = network.sequence(windows)
-    keep = torch.exp(-4 / 120 * 30 * network.around.pace.exp())
-    first, second, third = looks[0].unbind()
+    keep = torch.exp(-4 / 120 * 30 * network.context.log_rate.exp())
+    first, second, third = outputs[0].unbind()
     expected = keep * (keep * first + (1 - keep) * second) + (1 - keep) * third
-    torch.testing.assert_close(state[4][0], expected)
+    torch.testing.assert_close(state.context[0], expected)
 
 
 @torch.no_grad()
-def test_the_picture_fades_to_what_was_seen_around_and_does_not_step():
-    network, state, told = small().eval(), None, []
+def test_the_frame_follows_the_context_smoothly():
+    network, state, smoothed = small().eval(), None, []
     for window in voxels(windows=9).unbind(1):
         _, state = network(window, state)
-        told.append(state[5])
-    # One looks in the first, fifth and ninth window; between, what is told goes on.
-    moved = [float((after - before).norm()) for before, after in pairwise(told)]
-    expected = float(torch.exp(torch.tensor(-1 / 120 / FADE_S)))
+        smoothed.append(state.context_smoothed)
+    # It is updated in the first, fifth and ninth window; between, smoothing goes on.
+    moved = [float((after - before).norm()) for before, after in pairwise(smoothed)]
+    expected = float(torch.exp(torch.tensor(-1 / 120 / CONTEXT_TAU_S)))
     assert [b / a for a, b in pairwise(moved[3:7])] == pytest.approx([expected] * 3, rel=1e-3)
     seconds = torch.full((1, 1, 1, 1), 0.01)
     nothing, all_of_it = torch.zeros(1, 1, 1, 1), torch.ones(1, 1, 1, 1)
-    halfway = faded(nothing, all_of_it, seconds)
+    halfway = smooth_context(nothing, all_of_it, seconds)
     assert torch.allclose(
-        faded(halfway, all_of_it, seconds), faded(nothing, all_of_it, 2 * seconds)
+        smooth_context(halfway, all_of_it, seconds), smooth_context(nothing, all_of_it, 2 * seconds)
     )
-    assert torch.allclose(1 - halfway, torch.exp(-seconds / FADE_S))
+    assert torch.allclose(1 - halfway, torch.exp(-seconds / CONTEXT_TAU_S))
 
 
 @torch.no_grad()
 def test_a_flat_map_is_drawn_flat_up_to_the_border_without_a_pattern_of_pixels():
     network = small()
-    torch.nn.init.normal_(network.shuffle.bias)
-    flat = network.drawn(torch.ones(1, 4, 8, 8), torch.ones(1, 4, 4, 4))
+    torch.nn.init.normal_(network.pixel_conv.bias)
+    flat = network.decode_logits(torch.ones(1, 4, 8, 8), torch.ones(1, 4, 4, 4))
     torch.testing.assert_close(flat, flat[:, :1, :1, :1].expand_as(flat))
-    edge = network.drawn(torch.ones(1, 4, 8, 8).tril(), torch.ones(1, 4, 4, 4))
+    edge = network.decode_logits(torch.ones(1, 4, 8, 8).tril(), torch.ones(1, 4, 4, 4))
     assert float((edge - edge[:, :1]).abs().max()) > 1e-3
 
 
@@ -289,7 +316,7 @@ def test_bf16_and_channels_last_keep_the_state_in_float32():
 
 
 def test_the_file_gives_the_network_back(tmp_path):
-    spec = {"target": "src.models.setnet.SetNet", "kwargs": small().arguments}
+    spec = {"target": "src.models.setnet.SetNet", "kwargs": small().init_kwargs}
     save(tmp_path / "net.safetensors", small(), spec, {})
     again = load(tmp_path / "net.safetensors")
     assert again.views is None

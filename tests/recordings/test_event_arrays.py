@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from src.recordings.files.event_arrays import joined, until
+from src.recordings.files.event_arrays import concatenate_events, count_before
 from src.recordings.files.formats import EVENT
 
 
@@ -17,7 +17,7 @@ def events(count: int) -> np.ndarray:
 @pytest.mark.parametrize("counts", [(5,), (0,), (3, 0, 7), (0, 0), (100, 50)])
 def test_joined_as_numpy_does(counts):
     parts = [events(count)[count // 3 :] for count in counts]
-    whole = joined(parts)
+    whole = concatenate_events(parts)
     assert whole.dtype == EVENT and np.array_equal(whole, np.concatenate(parts))
 
 
@@ -25,4 +25,4 @@ def test_joined_as_numpy_does(counts):
 def test_until_counts_what_comes_before(count):
     some = events(count)
     for time in (-1.0, 0, 7, 7.5, 39, 1e9):
-        assert until(some, time) == np.searchsorted(some["t"], time)
+        assert count_before(some, time) == np.searchsorted(some["t"], time)

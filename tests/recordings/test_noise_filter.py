@@ -5,9 +5,15 @@ import threading
 import numpy as np
 import pytest
 
-from src.live_view.feeds import File, Filtered
-from src.recordings.files.formats import EVENT, write_events
+from baselines.highpass import HighPass
+from src.live_view.assembly import assemble
+from src.live_view.event_feeds import FileFeed
+from src.live_view.network_runner import RunSettings
+from src.live_view.status import FaultLog
+from src.recordings.files.formats import EVENT
 from src.recordings.noise_filter import NoiseFilter
+from src.recordings.views import Views
+from tests.recordings.files.tables import write_events
 
 
 def events(*rows: tuple[int, int, int]) -> np.ndarray:
@@ -55,9 +61,14 @@ def test_a_wrong_time_names_its_key(seconds):
 
 
 def test_a_live_feed_is_filtered(tmp_path):
-    path = tmp_path / "few.csv"
+    path, views = tmp_path / "few.csv", Views.single_view((8, 8), (8, 8))
     write_events(path, events((0, 3, 3), (1000, 4, 4), (20_000, 0, 0)), width=8, height=8)
-    feed = Filtered(File(str(path), (8, 8), loop=False), 0.005)
-    assert (feed.live, feed.sensor) == (False, (8, 8))
-    (kept,) = (chunk for chunk, _ in feed.chunks(threading.Event()))
-    assert kept["t"].tolist() == [1000]
+    settings = RunSettings(100.0, form="float32")
+    server = assemble(
+        FileFeed(str(path), (8, 8), loop=False), {"net": HighPass()}, views, settings, FaultLog(),
+        noise_filter_s=0.005,
+    )  # fmt: skip
+    reader = server.page.player.reader
+    reader.decode(threading.Event())
+    kept, _ = reader.chunks.get_nowait()
+    assert kept["t"].tolist() == [1000] and reader.chunks.get_nowait() == "ended"

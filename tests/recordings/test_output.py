@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from src.recordings.output import partial, sink
-from src.recordings.stream import Frame
+from src.recordings.output import open_video_writer, partial_path
+from src.recordings.reconstruction import Frame
 
 SIZE = (48, 64)
 
@@ -56,7 +56,7 @@ READERS = {
 
 @pytest.mark.parametrize("kind", READERS)
 def test_frames_come_back(kind, tmp_path):
-    with sink(kind, tmp_path, SIZE) as write:
+    with open_video_writer(kind, tmp_path, SIZE) as write:
         for frame in frames():
             write(frame)
     read, name, loss = READERS[kind]
@@ -66,14 +66,17 @@ def test_frames_come_back(kind, tmp_path):
 
 @pytest.mark.parametrize("kind", READERS)
 def test_what_was_done_is_kept_when_the_run_fails(kind, tmp_path):
-    with pytest.raises(ValueError, match="halfway"), sink(kind, tmp_path, SIZE) as write:
+    with (
+        pytest.raises(ValueError, match="halfway"),
+        open_video_writer(kind, tmp_path, SIZE) as write,
+    ):
         for frame in frames(3):
             write(frame)
         raise ValueError("halfway")
     read, name, _ = READERS[kind]
     assert not (tmp_path / name).exists() and not (tmp_path / "frames.csv").exists()
-    assert len(read(partial(tmp_path / name))) == 3
-    with open(partial(tmp_path / "frames.csv")) as file:
+    assert len(read(partial_path(tmp_path / name))) == 3
+    with open(partial_path(tmp_path / "frames.csv")) as file:
         rows = list(csv.DictReader(file))
     assert [float(row["time_s"]) for row in rows] == [0, 0.25, 0.5]
     assert rows[2]["events"] == "20" and rows[2]["outside"] == "2"
@@ -81,5 +84,8 @@ def test_what_was_done_is_kept_when_the_run_fails(kind, tmp_path):
 
 @pytest.mark.parametrize("kind, playback, message", [("avi", 30, "output"), ("mp4", 0, "playback")])
 def test_a_wrong_choice_is_refused(kind, playback, message, tmp_path):
-    with pytest.raises(ValueError, match=message), sink(kind, tmp_path, SIZE, playback):
+    with (
+        pytest.raises(ValueError, match=message),
+        open_video_writer(kind, tmp_path, SIZE, playback),
+    ):
         pass

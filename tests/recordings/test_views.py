@@ -2,12 +2,13 @@
 
 import re
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
-from src.recordings import capture, lookup, views
-from src.recordings.calibration import alignment
+from src.recordings import sensor_lookup, simulated_recording, views
+from src.recordings.calibration import view_alignment
 from src.recordings.calibration.boards import Charuco, Checkerboard, Circles
 from src.sim.optics import layout
 from src.sim.voxel import voxel_grid
@@ -25,7 +26,9 @@ EVENT = np.dtype([("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.
 
 @pytest.fixture(scope="module")
 def truth() -> views.Views:
-    return capture.kaleidoscope(list(layout(9)), model=(SIDE, SIDE), sensor=SENSOR, key=3)
+    return simulated_recording.kaleidoscope_views(
+        list(layout(9)), model=(SIDE, SIDE), sensor=SENSOR, key=3
+    )
 
 
 def shown(
@@ -34,8 +37,10 @@ def shown(
     """Return what the sensor sees (uint8) when the views `keep` show `picture`."""
     frames = torch.zeros(9, 1, *picture.shape)
     frames[list(keep)] = torch.from_numpy(picture)
-    table = lookup.build(truth)
-    seen = capture.sensor_frames(frames, table, capture.vignette(table), slice(None))[0].numpy()
+    table = sensor_lookup.build_lookup(truth)
+    seen = simulated_recording.render_sensor_frames(
+        frames, table, simulated_recording.vignette_gain(table), slice(None)
+    )[0].numpy()
     seen = seen + np.random.default_rng(0).normal(0, noise, seen.shape)
     return np.clip(seen * 255, 0, 255).astype(np.uint8)
 
@@ -48,15 +53,15 @@ def distance_px(found: views.Views, truth: views.Views) -> dict:
     field = field.reshape(-1, 2)
     far = {}
     for view in found.views:
-        on_sensor = views.apply(np.linalg.inv(true[view.position]), field)
-        offset = views.apply(view.homography, on_sensor) - field
+        on_sensor = cv2.perspectiveTransform(field[None], np.linalg.inv(true[view.position]))
+        offset = cv2.perspectiveTransform(on_sensor, view.homography)[0] - field
         far[view.position] = np.linalg.norm(offset, axis=1).mean()
     return far
 
 
 def calibrate(picture, target, **options):
-    found = alignment.find(picture, target, **options)
-    return alignment.align(found, sensor=SENSOR, model=(176, 176)).views
+    found = view_alignment.find_target(picture, target, **options)
+    return view_alignment.fit_homographies(found, sensor=SENSOR, model=(176, 176)).views
 
 
 @pytest.mark.parametrize("name", TARGETS)
@@ -66,7 +71,7 @@ def test_homographies_within_a_third_of_a_pixel_and_flips_right(truth, name):
     assert found.positions == list(layout(9))
     assert max(distance_px(found, truth).values()) < 0.3
     for mine, true in zip(found.views, truth.views, strict=True):
-        assert found.mirrored(mine) == truth.mirrored(true)
+        assert found.is_mirrored(mine) == truth.is_mirrored(true)
         odd = sum(mine.position) % 2
         assert np.sign(np.linalg.det(mine.homography)) == (-1 if odd else 1)
 
@@ -96,26 +101,26 @@ def test_a_view_that_does_not_show_the_target_is_left_out(truth):
 
 def test_fewer_than_four_views_are_refused_but_reported(truth):
     target, picture = TARGETS["circles"]
-    found = alignment.find(shown(truth, picture, keep=[3, 4, 5]), target)
-    assert sorted(found.points) == [(0, -1), (0, 0), (0, 1)]
+    found = view_alignment.find_target(shown(truth, picture, keep=[3, 4, 5]), target)
+    assert sorted(found) == [(0, -1), (0, 0), (0, 1)]
     with pytest.raises(ValueError, match="in 4 or more views .* got 3"):
-        alignment.align(found, sensor=SENSOR, model=(176, 176))
+        view_alignment.fit_homographies(found, sensor=SENSOR, model=(176, 176))
 
 
 def test_a_picture_without_targets_shows_none():
     noise = np.random.default_rng(0).integers(0, 255, SENSOR).astype(np.uint8)
-    assert not alignment.find(noise, Circles(5, 7)).points
+    assert not view_alignment.find_target(noise, Circles(5, 7))
 
 
 def test_corners_by_hand_give_the_true_homographies(truth):
     corners = {view.position: truth.outline(view) for view in truth.views}
-    by_hand = alignment.by_hand(corners, sensor=SENSOR, model=(176, 176))
+    by_hand = view_alignment.views_from_corners(corners, sensor=SENSOR, model=(176, 176))
     assert max(distance_px(by_hand, truth).values()) < 0.01
 
 
 def test_file_comes_back_exactly(truth, tmp_path):
     truth.save(tmp_path / "views.yaml")
-    back = views.load(tmp_path / "views.yaml", SENSOR)
+    back = views.load_views(tmp_path / "views.yaml", SENSOR)
     assert (back.sensor, back.model, back.field) == (truth.sensor, truth.model, truth.field)
     for mine, true in zip(back.views, truth.views, strict=True):
         assert np.array_equal(mine.homography, true.homography)
@@ -143,18 +148,18 @@ def test_a_spoilt_file_is_refused_in_one_line(truth, tmp_path, change, message):
     assert count == 1
     path.write_text(text)
     with pytest.raises(ValueError, match=message):
-        views.load(path)
+        views.load_views(path)
 
 
 def test_views_of_another_sensor_are_refused(truth, tmp_path):
     truth.save(tmp_path / "views.yaml")
     with pytest.raises(ValueError, match="must be the recording's"):
-        views.load(tmp_path / "views.yaml", (480, 640))
+        views.load_views(tmp_path / "views.yaml", (480, 640))
 
 
 def test_an_absent_file_is_refused(tmp_path):
     with pytest.raises(ValueError, match="FileNotFoundError"):
-        views.load(tmp_path / "none.yaml")
+        views.load_views(tmp_path / "none.yaml")
 
 
 def stream(count: int, sensor=SENSOR, seed: int = 0) -> np.ndarray:
@@ -168,9 +173,9 @@ def stream(count: int, sensor=SENSOR, seed: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize("nearest", [False, True])
 def test_splitting_keeps_the_mass_of_each_view_and_counts_the_rest(truth, nearest):
-    table, events = lookup.build(truth), stream(50_000)
-    grid = table.empty(5)
-    outside = table.add(events, grid, 0, 10_000, nearest=nearest)
+    table, events = sensor_lookup.build_lookup(truth), stream(50_000)
+    grid = table.empty_grid(5)
+    outside = table.add_to_grid(events, grid, 0, 10_000, nearest=nearest)
     view = table.view[events["y"], events["x"]]
     assert outside == (view < 0).sum() > 0
     for index in range(9):
@@ -180,30 +185,30 @@ def test_splitting_keeps_the_mass_of_each_view_and_counts_the_rest(truth, neares
 @pytest.mark.parametrize("kind", ["bilinear", "nearest"])
 def test_an_event_of_every_pixel_is_flat_per_sensor_pixel(truth, kind):
     there = views.Views(truth.sensor, (176, 176), truth.field, truth.views)
-    table = lookup.build(there)
+    table = sensor_lookup.build_lookup(there)
     events = np.zeros(SENSOR[0] * SENSOR[1], EVENT)
     events["y"], events["x"] = np.indices(SENSOR).reshape(2, -1)
     events["p"] = 1
-    grid = table.empty(1)
-    table.add(events, grid, 0, 1, nearest=kind == "nearest")
+    grid = table.empty_grid(1)
+    table.add_to_grid(events, grid, 0, 1, nearest=kind == "nearest")
     inner = (slice(None), 0, slice(4, -4), slice(4, -4))
     assert grid[inner].mean() == pytest.approx((230 / 176) ** 2, rel=0.03)
     assert grid[inner].std() > 0.1  # it ripples
-    assert np.abs((grid / table.densities[kind])[inner] - 1).max() < 1e-5
+    assert np.abs((grid / table.density[kind])[inner] - 1).max() < 1e-5
 
 
-def split(table: lookup.Lookup, events: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def split(table: sensor_lookup.SensorLookup, events: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the events inside views, at their nearest model pixel, and the view of each."""
-    pixel = table.nearest[events["y"], events["x"]]
+    pixel = table.nearest_pixel[events["y"], events["x"]]
     kept = events[pixel >= 0].copy()
     view, kept["y"], kept["x"] = np.unravel_index(pixel[pixel >= 0], (table.views, *table.model))
     return kept, view
 
 
 def test_nearest_splat_is_the_voxel_grid_of_each_views_events(truth):
-    table, events = lookup.build(truth), stream(50_000)
-    grid = table.empty(5)
-    table.add(events, grid, 0, 10_000, nearest=True)
+    table, events = sensor_lookup.build_lookup(truth), stream(50_000)
+    grid = table.empty_grid(5)
+    table.add_to_grid(events, grid, 0, 10_000, nearest=True)
     kept, view = split(table, events)
     for index in range(9):
         mine = kept[view == index]
@@ -213,11 +218,11 @@ def test_nearest_splat_is_the_voxel_grid_of_each_views_events(truth):
 
 
 def test_bilinear_splat_is_a_hat_around_each_place(truth):
-    table, event = lookup.build(truth), stream(1)
+    table, event = sensor_lookup.build_lookup(truth), stream(1)
     event["x"], event["y"], event["t"], event["p"] = 700, 380, 2500, -1
-    grid = table.empty(5)
-    table.add(event, grid, 0, 10_000)
-    u, v = table.place[380, 700]
+    grid = table.empty_grid(5)
+    table.add_to_grid(event, grid, 0, 10_000)
+    u, v = table.model_xy[380, 700]
     x, y = np.arange(SIDE), np.arange(SIDE)[:, None]
     hat = np.clip(1 - abs(x - u), 0, None) * np.clip(1 - abs(y - v), 0, None)
     assert np.abs(grid[4, 1] + hat).max() < 1e-5  # 2500 us is the place of bin 1 of 5
@@ -226,23 +231,23 @@ def test_bilinear_splat_is_a_hat_around_each_place(truth):
 
 def test_one_view_at_sensor_size_is_the_plain_voxel_grid():
     events = stream(5000, (60, 80))
-    table = lookup.build(views.Views.single((60, 80), (60, 80)))
-    grid = table.empty(3)
-    assert table.add(events, grid, 0, 10_000) == 0
+    table = sensor_lookup.build_lookup(views.Views.single_view((60, 80), (60, 80)))
+    grid = table.empty_grid(3)
+    assert table.add_to_grid(events, grid, 0, 10_000) == 0
     fields = (events[name] for name in "txyp")
     expected = voxel_grid(*fields, t0=0, t1=10_000, bins=3, height=60, width=80)
     assert np.abs(grid[0] - expected.numpy()).max() < 1e-5
 
 
 def test_an_event_off_the_sensor_is_refused(truth):
-    table, events = lookup.build(truth), stream(10)
+    table, events = sensor_lookup.build_lookup(truth), stream(10)
     events["x"][3] = 1280
     with pytest.raises(ValueError, match="1280x720 sensor"):
-        table.add(events, table.empty(5), 0, 10_000)
+        table.add_to_grid(events, table.empty_grid(5), 0, 10_000)
 
 
 def test_registered_views_agree_with_the_scene(truth):
     picture = pictures.circles(5, 7)
-    registered = truth.register(shown(truth, picture, noise=0.0) / 255.0)
+    registered = truth.warp_to_model(shown(truth, picture, noise=0.0) / 255.0)
     inner = (slice(None), slice(60, -60), slice(60, -60))
     assert np.corrcoef(registered[inner].mean(0).ravel(), picture[inner[1:]].ravel())[0, 1] > 0.98

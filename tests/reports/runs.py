@@ -8,7 +8,7 @@ from PIL import Image
 
 from src.records import results
 
-SCORES = {"lpips": 0.4, "ssim": 0.6, "psnr": 17.0, "psnr_aligned": 20.0, "wobble": 1.0}
+SCORES = {"lpips": 0.4, "ssim": 0.6, "psnr": 17.0, "psnr_aligned": 20.0, "temporal_jitter_px": 1.0}
 UNTRAINED = {"untrained": {"clips": 9, "ssim": {"mean": 0.1, "std": 0.0}}}
 
 
@@ -47,7 +47,7 @@ def write_run(
         "wall_s": 1.0,
         "device": "cpu, 1 threads",
         "git": "abc",
-        "config_sha256": results.digest(text),
+        "config_sha256": results.hash_config(text),
         "model": {"name": experiment, "params": 1234567, "macs_per_frame": 608_000_000},
         "test": {"clips": 9}
         | {key: found | {"mean": value} for key, value in (SCORES | (scores or {})).items()},
@@ -56,7 +56,9 @@ def write_run(
     }
     (folder / "results.json").write_text(json.dumps(record))
     if clips:
-        (folder / "clips.csv").write_text(results.clips_csv(clips))
+        (folder / "clips.csv").write_text(
+            results.format_csv(clips[0], [clip.values() for clip in clips])
+        )
     return folder
 
 

@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 
 from src.records import runs
 from src.report import report
-from src.reports import cells, page, tables, writers
+from src.reports import page, run_groups, tables, writers
 from tests.conftest import ROOT
 from tests.reports.runs import clips_of, write_run, write_samples, write_sweep
 from tests.test_train import config
@@ -20,8 +20,8 @@ PAPER = {"source": "paper: other data", "rows": [{"when": {"experiment": "lf3x3"
 
 
 def built(folder, paper=NO_PAPER):
-    keys, made = cells.cells(runs.find([folder]), runs.plans([folder]))
-    return tables.main("main", keys, made, paper), keys, made
+    keys, made = run_groups.group_runs(runs.find_runs([folder]), runs.find_sweeps([folder]))
+    return tables.build_score_table("main", keys, made, paper), keys, made
 
 
 def value(table, row, name):
@@ -34,23 +34,23 @@ def test_mean_and_sample_deviation_over_seeds(tmp_path):
         write_run(tmp_path / str(seed), seed=seed, scores={"ssim": ssim})
     table, _, _ = built(tmp_path)
     found = value(table, 0, "ssim")
-    assert math.isclose(found.mean, 0.6) and math.isclose(found.spread, 0.1)
-    assert value(table, 0, "gmac") == tables.Value(0.608) and value(table, 0, "n").words == "3"
-    assert writers.value_text(found, tables.SCORES[1]) == "0.600 ± 0.100"
+    assert math.isclose(found.mean, 0.6) and math.isclose(found.std, 0.1)
+    assert value(table, 0, "gmac") == tables.TableCell(0.608) and value(table, 0, "n").text == "3"
+    assert writers.format_cell(found, tables.SCORES[1]) == "0.600 ± 0.100"
 
 
 def test_one_seed_has_no_spread_and_a_metric_not_taken_is_a_dash(tmp_path):
     write_run(tmp_path / "a", scores={"lpips": math.nan})
     table, _, _ = built(tmp_path)
-    assert value(table, 0, "ssim").spread is None
-    assert writers.value_text(value(table, 0, "lpips"), tables.SCORES[0]) == "-"
+    assert value(table, 0, "ssim").std is None
+    assert writers.format_cell(value(table, 0, "lpips"), tables.SCORES[0]) == "-"
 
 
 def test_missing_cells_are_shown(tmp_path):
     write_sweep(tmp_path, {"experiment": "lf3x3,single256", "seed": "range(2)"})
     write_run(tmp_path / "a", "lf3x3", 0)
     table, _, _ = built(tmp_path)
-    assert [value(table, row, "n").words for row in (0, 1)] == ["1 of 2", "missing"]
+    assert [value(table, row, "n").text for row in (0, 1)] == ["1 of 2", "missing"]
     assert value(table, 1, "psnr").mean is None
     assert "differ in the seed" not in table.note
 
@@ -70,7 +70,7 @@ def test_trainings_of_other_seeds_saw_the_same_clips(tmp_path):
 def test_severities_are_means_over_their_clips(tmp_path):
     write_run(tmp_path / "a", seed=0, clips=clips_of("strong weak weak", lpips=0.3))
     _, keys, made = built(tmp_path)
-    table = tables.by_severity("split", keys, made)
+    table = tables.build_severity_table("split", keys, made)
     assert math.isclose(value(table, 0, "lpips_weak").mean, 0.45)
     assert math.isclose(value(table, 0, "lpips_strong").mean, 0.3)
     assert "lpips_medium" not in [column.name for column in table.columns]
@@ -79,7 +79,7 @@ def test_severities_are_means_over_their_clips(tmp_path):
 def test_one_severity_needs_no_split(tmp_path):
     write_run(tmp_path / "a", clips=clips_of("weak weak"))
     _, keys, made = built(tmp_path)
-    assert tables.by_severity("split", keys, made) is None
+    assert tables.build_severity_table("split", keys, made) is None
 
 
 def test_the_papers_numbers_stand_in_columns_of_their_own(tmp_path):
@@ -88,7 +88,7 @@ def test_the_papers_numbers_stand_in_columns_of_their_own(tmp_path):
     table, _, _ = built(tmp_path, PAPER)
     assert value(table, 0, "paper_psnr").mean == 15.4 and value(table, 0, "psnr").mean == 17.0
     assert value(table, 1, "paper_psnr").mean is None
-    assert "paper: other data: PSNR" in writers.markdown([table])
+    assert "paper: other data: PSNR" in writers.format_markdown([table])
     assert "paper_ssim" not in [column.name for column in table.columns]
 
 
@@ -96,8 +96,8 @@ def test_what_else_was_scored_stands_below_its_network(tmp_path):
     write_run(tmp_path / "a", scores={"ssim": 0.7})
     write_run(tmp_path / "b", "eval", task="eval", scores={"ssim": 0.3}, compared={})
     _, keys, made = built(tmp_path)
-    table = tables.compared("compared", keys, made)
-    assert [row[1].words for row in table.rows] == ["trained", "untrained"]
+    table = tables.build_same_clips_table("compared", keys, made)
+    assert [row[1].text for row in table.rows] == ["trained", "untrained"]
     assert [row[3].mean for row in table.rows] == [0.7, 0.1]
 
 
@@ -106,24 +106,16 @@ def test_the_best_of_a_column_is_what_is_printed_best(tmp_path):
         write_run(tmp_path / name, name, scores={"psnr": psnr})
     table, _, _ = built(tmp_path)
     place = [column.name for column in table.columns].index("psnr")
-    marked = [writers.is_best(table, place, row[place]) for row in table.rows]
+    marked = [table.is_best(place, row[place]) for row in table.rows]
     assert marked == [True, True, False]
 
 
 def test_csv_has_full_precision_and_mean_and_spread_apart(tmp_path):
     for seed, ssim in enumerate((0.123456789, 0.2)):
         write_run(tmp_path / str(seed), seed=seed, scores={"ssim": ssim})
-    (row,) = csv.DictReader(io.StringIO(writers.comma_separated([built(tmp_path)[0]])))
+    (row,) = csv.DictReader(io.StringIO(writers.format_csv_tables([built(tmp_path)[0]])))
     assert float(row["ssim"]) == (0.123456789 + 0.2) / 2 and float(row["ssim_std"]) > 0
     assert row["experiment"] == "lf3x3"
-
-
-def test_latex_is_booktabs_and_escapes(tmp_path):
-    write_run(tmp_path / "a", "a_b&c")
-    text = writers.latex([built(tmp_path)[0]])
-    for part in (r"\toprule", r"\midrule", r"\bottomrule", r"a\_b\&c", r"PSNR $\uparrow$"):
-        assert part in text
-    assert text.count("{") == text.count("}")
 
 
 def test_a_section_is_replaced_and_the_text_around_it_stays(tmp_path):
@@ -206,7 +198,9 @@ def test_the_page_needs_nothing_from_elsewhere_and_keeps_names_harmless(tmp_path
     write_samples(run)
     (tmp_path / "chart.svg").write_text("<svg xmlns='http://www.w3.org/2000/svg'/>")
     table, _, made = built(tmp_path)
-    text = page.html("t", [table], made, runs.figures([tmp_path]), commands=[], media_bytes=1 << 20)
+    text = page.format_html(
+        "t", [table], made, runs.find_figures([tmp_path]), commands=[], media_bytes=1 << 20
+    )
     seen = Seen(text)
     assert seen.open == [] and seen.tags.count("script") == 1 and seen.tags.count("img") == 3
     assert all(address.startswith("data:image/") for address in seen.addresses)
@@ -225,22 +219,22 @@ def test_pictures_beyond_the_bound_are_named(tmp_path):
     run = write_run(tmp_path / "a")
     write_samples(run, size=64)
     table, _, made = built(tmp_path)
-    text = page.html("t", [table], made, [], commands=[], media_bytes=100)
+    text = page.format_html("t", [table], made, [], commands=[], media_bytes=100)
     assert "<img" not in text and "Left out" in text and "clip0.gif" in text
 
 
-def test_the_door_writes_four_files_and_the_section(tmp_path):
+def test_the_entry_point_writes_three_files_and_the_section(tmp_path):
     write_run(tmp_path / "runs" / "a", clips=clips_of())
     document = tmp_path / "results.md"
     document.write_text("<!-- report:table1 -->\n<!-- end:table1 -->\n")
     cfg = config("report", tmp_path / "out", f"run={tmp_path / 'runs'}", f"into={document}")
     assert [table.title for table in report(cfg)] == [
         "Scores and cost",
-        "Severities apart",
+        "Scores by severity",
         "On the same clips",
     ]
     written = {file.name for file in (tmp_path / "out").iterdir()}
-    assert {"report.md", "report.csv", "report.tex", "report.html"} <= written
+    assert {"report.md", "report.csv", "report.html"} <= written
     assert "| lf3x3 | **" not in document.read_text() and "| lf3x3 |" in document.read_text()
 
 
@@ -264,7 +258,7 @@ def test_of_several_sweeps_one_without_results_is_missing_too(tmp_path):
     write_sweep(tmp_path / "runs" / "none", {"experiment": "lf3x3", "seed": "0,1"})
     found = {t.title: t for t in report(config("report", tmp_path / "out", f"run={tmp_path}/runs"))}
     missing = value(found["Scores and cost: table1"], 0, "n")
-    assert missing.words == "missing"
+    assert missing.text == "missing"
 
 
 def test_an_empty_folder_is_refused_and_nothing_is_written(tmp_path):

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from src.sim.optics import Optics, homography, layout, view_id
+from src.sim.optics import Optics, layout, view_id
 
 
 def test_layouts():
@@ -38,30 +38,25 @@ def test_wrong_positions(positions, key):
 
 
 def test_negative_misalignment_is_refused():
-    with pytest.raises(ValueError, match="optics.misalignment_px"):
-        Optics(9, misalignment_px=-1)
-
-
-def test_homography_maps_four_points():
-    generator = torch.Generator().manual_seed(0)
-    source = torch.tensor([[0.0, 0], [9, 0], [9, 9], [0, 9]])
-    target = source + torch.rand(4, 2, generator=generator)
-    mapped = torch.cat([source, torch.ones(4, 1)], 1).double() @ homography(source, target).T
-    assert torch.allclose(mapped[:, :2] / mapped[:, 2:], target.double(), atol=1e-9)
+    with pytest.raises(ValueError, match="optics.homography_error_px"):
+        Optics(9, homography_error_px=-1)
 
 
 def test_perfect_registration_changes_nothing():
     frames = torch.rand(1, 9, 2, 8, 8)
-    assert Optics(9).misalign(frames, 1) is frames
+    assert Optics(9).apply_homography_error(frames, 1) is frames
 
 
 def test_misalignment_moves_all_views_but_the_centre_by_its_size():
     side = 65
     ramp = torch.arange(side).float().expand(side, side) / side
     frames = ramp.expand(1, 25, 1, side, side)
-    optics = Optics(25, misalignment_px=1.0)
+    optics = Optics(25, homography_error_px=1.0)
     shifts = torch.cat(
-        [(optics.misalign(frames, key) - frames)[0, :, 0, 32, 32] * side for key in range(20)]
+        [
+            (optics.apply_homography_error(frames, key) - frames)[0, :, 0, 32, 32] * side
+            for key in range(20)
+        ]
     ).reshape(20, 25)
     assert torch.all(shifts[:, optics.centre] == 0)
     others = torch.cat([shifts[:, :12], shifts[:, 13:]], dim=1)
@@ -73,7 +68,9 @@ def test_misalignment_moves_all_views_but_the_centre_by_its_size():
 
 def test_a_crop_is_misaligned_as_the_whole_frame():
     frames = torch.rand(1, 9, 1, 48, 48, generator=torch.Generator().manual_seed(0))
-    optics = Optics(9, misalignment_px=0.7)
-    whole = optics.misalign(frames, 3)[..., 16:32, 8:32]
-    crop = optics.misalign(frames[..., 16:32, 8:32], 3, origin=(16, 8), full_size=(48, 48))
+    optics = Optics(9, homography_error_px=0.7)
+    whole = optics.apply_homography_error(frames, 3)[..., 16:32, 8:32]
+    crop = optics.apply_homography_error(
+        frames[..., 16:32, 8:32], 3, origin=(16, 8), full_size=(48, 48)
+    )
     assert torch.allclose(whole[..., 3:-3, 3:-3], crop[..., 3:-3, 3:-3], atol=1e-5)

@@ -8,12 +8,13 @@ import torch
 
 from src.sim.optics import Optics
 from src.sim.pipeline import Pipeline, simulate
-from src.sim.scenes.photographs import Clip
-from src.sim.turbulence.simulated import SimulatedAir
+from src.sim.scenes.clip import Clip
+from src.sim.sensor import EventSensor
+from src.sim.turbulence.simulated import SimulatedTurbulence
 
 IDEAL = {"threshold": 0.2, "refractory_s": 0.0}
-STRONG = SimulatedAir({"severity": "strong"})
-CALM = SimulatedAir({"severity": "none"})
+STRONG = SimulatedTurbulence({"severity": "strong"})
+CALM = SimulatedTurbulence({"severity": "none"})
 
 
 class Waves:
@@ -32,9 +33,10 @@ class Waves:
 
 
 def pipeline(turbulence=CALM, sensor=IDEAL, optics=None, scene=None, **kwargs) -> Pipeline:
-    return Pipeline(
-        scene or Waves(), optics or Optics(9), turbulence, sensor, split="test", **kwargs
-    )
+    srgb = sensor.get("input") == "srgb"
+    pixels = EventSensor(**sensor | {"input": "linear"})
+    optics, scene = optics or Optics(9), scene or Waves()
+    return Pipeline(scene, optics, turbulence, pixels, split="test", decodes_srgb=srgb, **kwargs)
 
 
 def test_law_1_without_turbulence_events_follow_the_log_intensity_within_a_threshold():
@@ -48,10 +50,12 @@ def test_law_1_without_turbulence_events_follow_the_log_intensity_within_a_thres
     assert torch.equal(sample.target[0, :, 0], frames[1:])
 
 
-@pytest.mark.parametrize("misalignment_px", [0.0, 0.5])
-def test_law_2_single_is_the_centre_view_of_3x3(misalignment_px):
-    nine = simulate(pipeline(STRONG, optics=Optics(9, misalignment_px=misalignment_px)), [5])
-    one = simulate(pipeline(STRONG, optics=Optics(1, misalignment_px=misalignment_px)), [5])
+@pytest.mark.parametrize("homography_error_px", [0.0, 0.5])
+def test_law_2_single_is_the_centre_view_of_3x3(homography_error_px):
+    nine = simulate(
+        pipeline(STRONG, optics=Optics(9, homography_error_px=homography_error_px)), [5]
+    )
+    one = simulate(pipeline(STRONG, optics=Optics(1, homography_error_px=homography_error_px)), [5])
     assert torch.equal(nine.voxels[:, :, 4:5], one.voxels)
     assert torch.equal(nine.turbulent, one.turbulent)
     assert int((nine.voxels[:, :, 0] != nine.voxels[:, :, 4]).sum()) > 100
@@ -65,11 +69,11 @@ def test_law_3_a_view_depends_on_its_own_draws_only():
 
 
 def test_law_3_a_sample_does_not_depend_on_its_batch():
-    chain = pipeline(STRONG, sensor={"threshold": [0.1, 0.7], "shot_hz": 5.0})
+    chain = pipeline(STRONG, sensor={"threshold": [0.1, 0.7], "dark_noise_hz": 5.0})
     together, alone = simulate(chain, [4, 9]), simulate(chain, [9])
     assert torch.equal(together.voxels[1:], alone.voxels)
-    assert together.drawn[1] == alone.drawn[0]
-    assert together.drawn[0]["threshold"] != together.drawn[1]["threshold"]
+    assert together.parameters[1] == alone.parameters[0]
+    assert together.parameters[0]["threshold"] != together.parameters[1]["threshold"]
 
 
 class MixedRates(Waves):
@@ -81,10 +85,11 @@ class MixedRates(Waves):
 
 DRAWN = {
     "threshold": [0.1, 0.4],
-    "drawn": {
+    "random": {
         "off_ratio": [0.7, 1.5], "refractory_s": [0.0005, 0.02], "mismatch": [0.0, 0.2],
-        "shot_hz": [0.0, 20.0], "leak_hz": [0.0, 2.0], "hot_fraction": [0.0, 0.1],
-        "hot_hz": [1.0, 50.0], "cutoff_hz": [20.0, 200.0], "residual": [0.05, 1.0],
+        "dark_noise_hz": [0.0, 20.0], "leak_event_hz": [0.0, 2.0], "hot_pixel_fraction": [0.0, 0.1],
+        "hot_pixel_hz": [1.0, 50.0], "cutoff_hz": [20.0, 200.0],
+        "initial_reference_error": [0.05, 1.0],
     },
 }  # fmt: skip
 
@@ -97,13 +102,13 @@ def test_law_3_a_batch_at_once_is_its_clips_one_by_one(source):
         random_crop=True, substeps=2,
     )  # fmt: skip
     draws = [chain.draw(number) for number in (4, 9, 2)]
-    whole, parts = (chain.simulate(draws, at_once=at_once) for at_once in (True, False))
-    alone = [chain.sample(draw) for draw in draws]
+    whole, parts = (chain.simulate(draws, batched=batched) for batched in (True, False))
+    alone = [chain.simulate([draw]) for draw in draws]
     for name in ("voxels", "target", "turbulent", "window_s"):
         theirs = torch.cat([getattr(sample, name) for sample in alone])
         assert torch.equal(getattr(whole, name), theirs), name
         assert torch.equal(getattr(parts, name), theirs), name
-    assert whole.drawn == parts.drawn == [sample.drawn[0] for sample in alone]
+    assert whole.parameters == parts.parameters == [sample.parameters[0] for sample in alone]
     assert whole.voxels.is_contiguous() and whole.voxels.flatten(1).any(1).all()
     assert len(set(whole.window_s.tolist())) == 3
 
@@ -111,8 +116,8 @@ def test_law_3_a_batch_at_once_is_its_clips_one_by_one(source):
 def test_views_in_float16_are_taken_as_if_they_had_been_widened():
     chain = pipeline(STRONG, DRAWN | {"input": "srgb"})
     draws = [chain.draw(number) for number in (4, 9)]
-    views = chain.batch_views(draws).half()
-    ours, theirs = (chain.expose(draws, seen) for seen in (views, views.float()))
+    views = chain.render_views(draws).half()
+    ours, theirs = (chain.simulate_sensor(draws, seen) for seen in (views, views.float()))
     for name in ("voxels", "target", "turbulent"):
         assert torch.equal(getattr(ours, name), getattr(theirs, name)), name
 
@@ -137,9 +142,9 @@ def test_light_that_differs_by_rounding_moves_few_events():
     """What two devices may differ by: a hundred times what their light does."""
     chain = pipeline(STRONG)
     draw = chain.draw(5)
-    views = chain.views(draw)
+    views = chain.render_views([draw])
     rounding = 1e-5 * (2 * torch.rand(views.shape, generator=torch.Generator().manual_seed(0)) - 1)
-    ours, theirs = (chain.expose([draw], seen) for seen in (views, views + rounding))
+    ours, theirs = (chain.simulate_sensor([draw], seen) for seen in (views, views + rounding))
     assert 0 < moved(ours.voxels, theirs.voxels) < 0.001
 
 
@@ -149,7 +154,7 @@ def moved(ours: torch.Tensor, theirs: torch.Tensor) -> float:
 
 
 def test_law_5_a_crop_is_the_crop_of_the_whole_away_from_the_border():
-    sensor = {"threshold": 0.3, "shot_hz": 20.0, "mismatch": 0.1}
+    sensor = {"threshold": 0.3, "dark_noise_hz": 20.0, "mismatch": 0.1}
     whole = simulate(pipeline(STRONG, sensor, scene=Waves(side=96)), [2])
     crop = simulate(pipeline(STRONG, sensor, scene=Waves(side=96), crop=48), [2])
     assert crop.voxels.shape[-2:] == (48, 48)
@@ -174,7 +179,7 @@ def test_sub_frame_samples_refine_the_same_windows():
 
 
 def test_what_was_drawn_is_recorded():
-    drawn = simulate(pipeline(STRONG, sensor={"threshold": [0.1, 0.7]}), [0]).drawn[0]
+    drawn = simulate(pipeline(STRONG, sensor={"threshold": [0.1, 0.7]}), [0]).parameters[0]
     assert 4 <= drawn["d_over_r0"] < 10 and 0.1 <= drawn["threshold"] <= 0.7
     assert drawn["tilt_px"] > 0 and math.isfinite(drawn["tilt_px"])
 
@@ -207,7 +212,7 @@ class Lamplit(Waves):
     def clip(self, index: int) -> Clip:
         lamp = torch.ones(self.frames, 1, self.side if self.half else 1)
         lamp[1::2, :, : self.side // 2] = 0.6
-        return replace(super().clip(index), lamp=lamp)
+        return replace(super().clip(index), illumination=lamp)
 
 
 @pytest.mark.parametrize("half", [False, True])

@@ -49,14 +49,6 @@ def test_the_edges_of_the_window_are_the_first_and_the_last_bin():
     assert grid.abs().sum() == 3
 
 
-def test_first_last_is_the_window_of_the_events():
-    t, x, y, p = random_events(100)
-    ours = voxel_grid(t, x, y, p, window="first_last", **SIZE)
-    assert torch.equal(ours, voxel_grid(t, x, y, p, t0=t.min(), t1=t.max(), **SIZE))
-    one = voxel_grid(t[:1], x[:1], y[:1], p[:1], window="first_last", **SIZE)
-    assert one[0].abs().sum() == one.abs().sum() == 1
-
-
 def test_seconds_and_microseconds_give_one_grid():
     t, x, y, p = random_events(300)
     a = voxel_grid(t, x, y, p, t0=0, t1=10000, **SIZE)
@@ -82,7 +74,7 @@ def test_mass_is_conserved_in_any_order(n, seed, bins, zero):
 
 @pytest.mark.parametrize(
     "settings_",
-    [{}, {"refractory_s": 0.0}, {"stamps": "v2e"}, {"mismatch": 0.1, "shot_hz": 50.0}],
+    [{}, {"refractory_s": 0.0}, {"stamps": "v2e"}, {"mismatch": 0.1, "dark_noise_hz": 50.0}],
 )
 @pytest.mark.parametrize("fps", [120.0, 12000.0])
 def test_the_list_and_the_direct_grid_are_equal(settings_, fps):
@@ -135,7 +127,6 @@ def test_normalising_one_event_is_finite():
         ({"t1": 0}, "t0 < t1"),
         ({"t1": math.nan}, "t0 < t1"),
         ({"x": [1, 2]}, "one length"),
-        ({"window": "frame"}, "window must be"),
         ({"bins": 0}, "must be positive"),
     ],
 )

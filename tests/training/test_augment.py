@@ -6,19 +6,24 @@ import pytest
 import torch
 
 from src.sim.optics import layout
-from src.sim.pipeline import Sample, joined
+from src.sim.pipeline import Sample, concatenate_samples
 from src.training.augment import (
     Augment,
-    flip_axes,
-    misplacements,
-    pause_chain,
-    turned_views,
-    views_kept,
+    draw_flip_axes,
+    draw_kept_views,
+    draw_pauses,
+    draw_view_shifts,
+    flipped_view_order,
 )
-from src.training.rearrange import misplace, turned
-from src.training.voxel_noise import fire, hot_pixels, normals
+from src.training.clip_transforms import flip_frames, shift_views
+from src.training.voxel_noise import add_noisy_pixels, draw_hot_pixels, draw_normals
 
-OFF = {"noise_std": 0.0, "hot_fraction": 0.0, "pause": 0.0, "flip": 0.0}
+OFF = {
+    "noise_std": 0.0,
+    "max_offset_pixel_fraction": 0.0,
+    "pause_probability_when_running": 0.0,
+    "flip_probability": 0.0,
+}
 
 
 def numbered(windows: int = 6, size: int = 4) -> Sample:
@@ -37,8 +42,10 @@ def test_nothing_on_changes_nothing():
 
 
 def test_a_pause_repeats_the_target_without_events_and_the_clip_goes_on():
-    out = Augment(**OFF | {"pause": 0.5, "stay": 0.5})([numbered(40)], [3])
-    steps, paused = pause_chain(40, 0.5, 0.5, key_of(3))
+    out = Augment(
+        **OFF | {"pause_probability_when_running": 0.5, "pause_probability_when_paused": 0.5}
+    )([numbered(40)], [3])
+    steps, paused = draw_pauses(40, 0.5, 0.5, key_of(3))
     assert 5 < int(paused.sum()) < 35 and not paused[0]
     for step in range(40):
         shown = float(steps[step]) + 1
@@ -56,8 +63,8 @@ def key_of(key: int) -> int:
     return noise.key(key, "pause")
 
 
-def test_pause_chain_has_the_paper_s_rates():
-    chains = [pause_chain(200, 0.05, 0.9, key)[1] for key in range(100)]
+def test_draw_pauses_has_the_paper_s_rates():
+    chains = [draw_pauses(200, 0.05, 0.9, key)[1] for key in range(100)]
     paused = torch.stack(chains)[:, 60:].double()  # the chain forgets its start
     # Stationary share 0.05 / (0.05 + 0.1); neighbours are correlated by 0.85 per step.
     spread = math.sqrt(1 / 3 * 2 / 3 / paused.numel() * (1 + 0.85) / (1 - 0.85))
@@ -68,30 +75,13 @@ def test_flips_turn_voxels_and_targets_alike():
     sample = numbered()
     seen = set()
     for key in range(40):
-        out = Augment(**OFF | {"flip": 0.5})([sample], [key])
+        out = Augment(**OFF | {"flip_probability": 0.5})([sample], [key])
         axes = [a for a in ([], [-1], [-2], [-2, -1]) if torch.equal(out.voxels, turn(sample, a))]
         assert len(axes) == 1
         expected = sample.target.flip(axes[0]) if axes[0] else sample.target
         assert torch.equal(out.target, expected) and torch.equal(out.turbulent, expected)
         seen.add(tuple(axes[0]))
     assert len(seen) == 4
-
-
-def test_transposition_turns_voxels_and_targets_alike():
-    sample, seen = numbered(), 0
-    for key in range(20):
-        out = Augment(**OFF | {"transpose": 0.5})([sample], [key])
-        swapped = torch.equal(out.voxels, sample.voxels.mT)
-        assert swapped or torch.equal(out.voxels, sample.voxels)
-        assert torch.equal(out.target, sample.target.mT if swapped else sample.target)
-        seen += swapped
-    assert 4 < seen < 16
-    with pytest.raises(ValueError, match="augment.transpose must be 0 for crops that are no"):
-        Augment(**OFF | {"transpose": 1.0})([Sample(*wide(), torch.tensor([1.0]))], [0])
-
-
-def wide() -> list[torch.Tensor]:
-    return [torch.zeros(1, 3, 1, 2, 4, 6), torch.zeros(1, 3, 1, 4, 6), torch.zeros(1, 3, 1, 4, 6)]
 
 
 @pytest.mark.parametrize("views", [1, 2, 3, 4, 5, 9, 25])
@@ -102,18 +92,13 @@ def test_views_of_a_grid_turn_with_their_pictures(views):
     down, across = (place[:, None, None] - place.mean() for place in (rows, columns))
     field = down * (y - 2.5) + across * (x - 2.5)
     for axes in ([], [-1], [-2], [-2, -1]):
-        for swap in (False, True):
-            if swap and views in (2, 3):  # a row of views becomes a column: they stay
-                assert turned_views(None, views, axes, swap).tolist() == list(range(views))
-                continue
-            order = turned_views(None, views, axes, swap)
-            assert torch.allclose(turned(field[order], axes, swap), field)
+        order = flipped_view_order(layout(views), axes)
+        assert torch.allclose(flip_frames(field[order], axes), field)
 
 
 def test_the_centre_view_stays_the_centre_view():
     for axes in ([], [-1], [-2], [-2, -1]):
-        for swap in (False, True):
-            assert turned_views(layout(9), 9, axes, swap)[4] == 4
+        assert flipped_view_order(layout(9), axes)[4] == 4
 
 
 def turn(sample: Sample, axes: list[int]) -> torch.Tensor:
@@ -121,7 +106,7 @@ def turn(sample: Sample, axes: list[int]) -> torch.Tensor:
 
 
 def test_flip_probabilities():
-    assert flip_axes(1.0, 5) == [-2, -1] and flip_axes(0.0, 5) == []
+    assert draw_flip_axes(1.0, 5) == [-2, -1] and draw_flip_axes(0.0, 5) == []
 
 
 def test_noise_has_the_stated_spread_also_in_pauses():
@@ -131,55 +116,57 @@ def test_noise_has_the_stated_spread_also_in_pauses():
         torch.zeros(1, 20, 1, 32, 32),
         window_s=torch.tensor([1 / 120]),
     )
-    out = Augment(**OFF | {"noise_std": 0.4, "pause": 1.0})([sample], [1]).voxels
+    out = Augment(**OFF | {"noise_std": 0.4, "pause_probability_when_running": 1.0})(
+        [sample], [1]
+    ).voxels
     assert abs(float(out.std()) - 0.4) < 5 * 0.4 / math.sqrt(2 * out.numel())
     assert float(out[0, 5].std()) > 0.3
 
 
 def test_normals_are_normal_and_each_its_own():
-    seen = normals((100_000, 7), 5, torch.device("cpu")).double()
+    seen = draw_normals((100_000, 7), 5, torch.device("cpu")).double()
     for power, moment in ((1, 0), (2, 1), (3, 0), (4, 3), (6, 15)):
         spread = math.sqrt(math.prod(range(2 * power - 1, 0, -2)) / seen.numel())
         assert abs(float((seen**power).mean()) - moment) < 5 * spread
     for shift in (1, 4, 7):  # neighbours, those of one word, and of one row
         flat = seen.flatten()
         assert abs(float((flat[shift:] * flat[:-shift]).mean())) < 5 / math.sqrt(seen.numel())
-    assert not torch.equal(seen, normals((100_000, 7), 6, torch.device("cpu")).double())
-    assert torch.equal(seen, normals((100_000, 7), 5, torch.device("cpu")).double())
+    assert not torch.equal(seen, draw_normals((100_000, 7), 6, torch.device("cpu")).double())
+    assert torch.equal(seen, draw_normals((100_000, 7), 5, torch.device("cpu")).double())
 
 
 def test_hot_pixels_stay_through_the_sequence():
     sample = numbered(windows=5, size=64)
-    out = Augment(**OFF | {"hot_fraction": 0.02, "hot_std": 5.0})([sample], [2]).voxels
+    out = Augment(**OFF | {"max_offset_pixel_fraction": 0.02})([sample], [2]).voxels
     added = out - sample.voxels
     assert torch.allclose(added, added[:, :1, :1, :1].expand_as(added), atol=1e-5)
     assert 0 < int((added[0, 0, 0, 0].abs() > 1e-4).sum()) <= 0.02 * 64 * 64
 
 
 def test_hot_pixel_count_is_uniform_up_to_the_fraction():
-    counts = [int((hot_pixels((50, 50), 0.01, 1.0, key) != 0).sum()) for key in range(400)]
+    counts = [int((draw_hot_pixels((50, 50), 0.01, key) != 0).sum()) for key in range(400)]
     assert max(counts) <= 25
     assert abs(sum(counts) / 400 - 12.5) < 4 * 25 / math.sqrt(12 * 400)
 
 
 def test_small_crops_have_a_hot_pixel_as_often_as_their_part_of_one_is_large():
-    counts = [int((hot_pixels((64, 64), 1e-4, 1.0, key) != 0).sum()) for key in range(2000)]
+    counts = [int((draw_hot_pixels((64, 64), 1e-4, key) != 0).sum()) for key in range(2000)]
     assert max(counts) == 1
     assert abs(sum(counts) / 2000 - 0.2048) < 4 * math.sqrt(0.2 * 0.8 / 2000)
 
 
 def test_small_crops_have_a_firing_pixel_as_often_too():
     voxels = torch.zeros(1, 2, 1000, 1, 64, 64)  # each view draws its own
-    fire(voxels, 1e-4, [(1000.0, 1000.0)], [0])
+    add_noisy_pixels(voxels, 1e-4, [(1000.0, 1000.0)], [0])
     counts = (voxels[0] != 0).any(0).sum((1, 2, 3))
     assert counts.max() == 1
     assert abs(float(counts.float().mean()) - 0.2048) < 4 * math.sqrt(0.2 * 0.8 / 1000)
 
 
-def test_firing_pixels_come_and_go_at_their_rate_each_view_s_own():
+def test_firing_pixels_come_and_go_at_their_rate_each_view_s_own(monkeypatch):
+    monkeypatch.setattr("src.training.augment.NOISY_PIXEL_RATE_HZ", (600.0, 600.0))
     sample = numbered(windows=40, size=64)
-    firing = {"firing_fraction": 0.1, "firing_hz": [600.0, 600.0]}
-    out = Augment(**OFF | firing)([sample], [2]).voxels
+    out = Augment(**OFF | {"max_firing_pixel_fraction": 0.1})([sample], [2]).voxels
     added = (out - sample.voxels)[0].round()  # (windows, views, bins, h, w)
     fires = (added != 0).any(2).any(0)  # (views, h, w)
     shares = fires.float().mean((1, 2))
@@ -199,11 +186,11 @@ def test_a_clip_is_augmented_the_same_in_any_batch():
 def test_a_misplaced_view_moves_whole_and_leaves_nothing_behind():
     view = torch.zeros(2, 3, 1, 16, 16)
     view[..., 8, 8] = 1
-    moved = misplace(view.clone(), misplacements(3, 1.0, 2, key=4))
+    moved = shift_views(view.clone(), draw_view_shifts(3, 1.0, 2, key=4))
     places = [tuple(moved[0, i, 0].nonzero()[0].tolist()) for i in range(3)]
     assert float(moved.sum()) == float(view.sum()) and torch.equal(moved[0], moved[1])
     assert len(set(places)) > 1 and all(abs(axis - 8) <= 2 for place in places for axis in place)
-    assert torch.equal(misplace(view.clone(), misplacements(3, 0.0, 2, key=4)), view)
+    assert torch.equal(shift_views(view.clone(), draw_view_shifts(3, 0.0, 2, key=4)), view)
 
 
 def test_dropped_views_take_their_positions_along_and_some_view_stays():
@@ -211,21 +198,21 @@ def test_dropped_views_take_their_positions_along_and_some_view_stays():
     voxels = torch.arange(4.0).reshape(1, 1, 4, 1, 1, 1)
     picture = torch.zeros(1, 1, 1, 1, 1)
     sample = Sample(voxels, picture, picture, torch.tensor([1 / 120]), places)
-    lossy = Augment(**OFF, dropped=1.0)
+    lossy = Augment(**OFF, view_dropout_probability=1.0)
     counts = set()
     for key in range(60):
         left = lossy([sample], [key])
         kept = left.voxels.flatten().tolist()
         assert [places[int(view)] for view in kept] == list(left.positions)
         counts.add(len(kept))
-    assert counts == {1, 2, 3} and views_kept(4, 0.0, 1) == [0, 1, 2, 3]
+    assert counts == {1, 2, 3} and draw_kept_views(4, 0.0, 1) == [0, 1, 2, 3]
 
 
 def test_a_view_that_stays_shows_the_picture_of_its_turned_place():
     voxels = torch.arange(9.0).reshape(1, 1, 9, 1, 1, 1)
     picture = torch.zeros(1, 1, 1, 1, 1)
     sample = Sample(voxels, picture, picture, torch.tensor([1 / 120]), layout(9))
-    mirror = Augment(**OFF | {"flip": 1.0}, dropped=1.0)
+    mirror = Augment(**OFF | {"flip_probability": 1.0}, view_dropout_probability=1.0)
     for key in range(10):
         left = mirror([sample], [key])
         shown = [layout(9)[int(view)] for view in left.voxels.flatten()]
@@ -235,17 +222,14 @@ def test_a_view_that_stays_shows_the_picture_of_its_turned_place():
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"flip": 1.5},
-        {"pause": -0.1},
+        {"flip_probability": 1.5},
+        {"pause_probability_when_running": -0.1},
         {"noise_std": -1},
-        {"hot_fraction": 2},
-        {"hot_std": math.inf},
-        {"misplaced": 2},
-        {"misplaced_px": -1},
-        {"dropped": 1.5},
-        {"firing_fraction": -1},
-        {"firing_hz": [0, 10]},
-        {"firing_hz": [10]},
+        {"max_offset_pixel_fraction": 2},
+        {"view_shift_probability": 2},
+        {"max_view_shift_px": -1},
+        {"view_dropout_probability": 1.5},
+        {"max_firing_pixel_fraction": -1},
     ],
 )
 def test_wrong_values_name_their_key(wrong):
@@ -253,7 +237,7 @@ def test_wrong_values_name_their_key(wrong):
         Augment(**wrong)
 
 
-def drawn_batch(clips: int, seed: int = 0, taught: bool = False) -> list[Sample]:
+def drawn_batch(clips: int, seed: int = 0, teacher_frames: bool = False) -> list[Sample]:
     """Samples of a clip each, whose numbers are all different."""
     drawer = torch.Generator().manual_seed(seed)
     made = []
@@ -261,31 +245,42 @@ def drawn_batch(clips: int, seed: int = 0, taught: bool = False) -> list[Sample]
         voxels = torch.randn(1, 7, 9, 2, 16, 16, generator=drawer)
         target, turbulent, other = torch.rand(3, 1, 7, 1, 16, 16, generator=drawer)
         window_s, drawn = torch.tensor([1 / (120 * (clip + 1))]), [{"clip": clip}]
-        extra = {"taught": other} if taught else {}
-        made.append(Sample(voxels, target, turbulent, window_s, drawn=drawn, **extra))
+        extra = {"teacher_frames": other} if teacher_frames else {}
+        made.append(Sample(voxels, target, turbulent, window_s, parameters=drawn, **extra))
     return made
 
 
-STRONG = {"pause": 0.3, "transpose": 0.5, "hot_fraction": 0.02, "firing_fraction": 0.05}
+STRONG = {
+    "pause_probability_when_running": 0.3,
+    "max_offset_pixel_fraction": 0.02,
+    "max_firing_pixel_fraction": 0.05,
+}
 
 
-@pytest.mark.parametrize("changes", [{}, {"misplaced": 0.5}, {"dropped": 1.0, "misplaced": 1.0}])
-@pytest.mark.parametrize("taught", [False, True])
-def test_a_batch_at_once_is_the_clips_one_by_one(changes, taught):
-    samples, keys = drawn_batch(6, taught=taught), list(range(40, 46))
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"view_shift_probability": 0.5},
+        {"view_dropout_probability": 1.0, "view_shift_probability": 1.0},
+    ],
+)
+@pytest.mark.parametrize("teacher_frames", [False, True])
+def test_a_batch_at_once_is_the_clips_one_by_one(changes, teacher_frames):
+    samples, keys = drawn_batch(6, teacher_frames=teacher_frames), list(range(40, 46))
     augment = Augment(**STRONG | changes)
-    apart, together = (augment(samples, keys, at_once=at_once) for at_once in (False, True))
+    apart, together = (augment(samples, keys, batched=batched) for batched in (False, True))
     assert torch.equal(apart.voxels, together.voxels)
     assert torch.equal(apart.target, together.target)
     assert torch.equal(apart.turbulent, together.turbulent)
-    assert (apart.taught is None) == (not taught)
-    assert not taught or torch.equal(apart.taught, together.taught)
-    assert apart.positions == together.positions and apart.drawn == together.drawn
+    assert (apart.teacher_frames is None) == (not teacher_frames)
+    assert not teacher_frames or torch.equal(apart.teacher_frames, together.teacher_frames)
+    assert apart.positions == together.positions and apart.parameters == together.parameters
 
 
 def test_one_sample_of_many_clips_is_as_many_samples_of_one():
     samples, keys = drawn_batch(3), [7, 8, 9]
-    for at_once in (False, True):
-        apart = Augment(**STRONG)(samples, keys, at_once=at_once)
-        whole = Augment(**STRONG)([joined(samples)], keys, at_once=at_once)
+    for batched in (False, True):
+        apart = Augment(**STRONG)(samples, keys, batched=batched)
+        whole = Augment(**STRONG)([concatenate_samples(samples)], keys, batched=batched)
         assert torch.equal(apart.voxels, whole.voxels) and torch.equal(apart.target, whole.target)

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from src.training.augment import Augment
-from src.training.batch_sampler import Item, LargeStream, Numbered, StepSampler
-from src.training.datamodule import LightFieldData, Simulator
+from src.training.batch_sampler import DrawDataset, LargeCropStream, SampleId, StepSampler
+from src.training.datamodule import BatchSimulator, LightFieldData
 from tests.sim.test_pipeline import STRONG, pipeline
 
 
@@ -17,7 +17,7 @@ class FakeTrainer:
     global_rank, world_size = 0, 1
 
     def __init__(self, steps: int = 0):
-        self.lightning_module = SimpleNamespace(steps=steps)
+        self.lightning_module = SimpleNamespace(total_steps=steps)
 
 
 def chain():
@@ -27,7 +27,12 @@ def chain():
 def test_workers_change_nothing():
     def batches(workers: int) -> list[torch.Tensor]:
         data = LightFieldData(
-            {"train": chain()}, Augment(), batch_size=2, reuse=2, epoch_clips=6, workers=workers
+            {"train": chain()},
+            Augment(),
+            batch_size=2,
+            batch_reuse=2,
+            epoch_clips=6,
+            workers=workers,
         )
         data.trainer = FakeTrainer()
         return [batch.voxels for batch in data.train_dataloader()]
@@ -43,42 +48,56 @@ def test_a_training_that_goes_on_sees_other_clips():
 
 
 def test_a_batch_used_again_is_augmented_anew():
-    numbered, make = Numbered(chain()), Simulator([chain()], Augment(pause=0.0))
+    numbered, make = (
+        DrawDataset(chain()),
+        BatchSimulator([chain()], Augment(pause_probability_when_running=0.0)),
+    )
     first, again, other = (
-        make([numbered[Item(clip, number)]]) for clip, number in ((0, 0), (0, 1), (2, 2))
+        make([numbered[SampleId(clip, number)]]) for clip, number in ((0, 0), (0, 1), (2, 2))
     )
     assert not torch.equal(first.voxels, again.voxels)
-    assert first.drawn == again.drawn != other.drawn
-    fresh = Simulator([chain()], Augment(pause=0.0))([numbered[Item(0, 1)]])
+    assert first.parameters == again.parameters != other.parameters
+    fresh = BatchSimulator([chain()], Augment(pause_probability_when_running=0.0))(
+        [numbered[SampleId(0, 1)]]
+    )
     assert torch.equal(fresh.voxels, again.voxels)
 
 
-def numbers(sampler: StepSampler) -> list[list[int]]:
-    return [[item.number for item in batch] for batch in sampler]
+def sampler(batch_size: int, steps: int, step, **options) -> StepSampler:
+    return StepSampler(batch_size=batch_size, steps_per_epoch=steps, step=step, **options)
+
+
+def numbers(batches: StepSampler) -> list[list[int]]:
+    return [[item.number for item in batch] for batch in batches]
 
 
 def test_sampler_goes_on_where_the_training_stopped():
-    whole = numbers(StepSampler(2, 4, lambda: 0))
+    whole = numbers(sampler(2, 4, lambda: 0))
     assert whole == [[0, 1], [2, 3], [4, 5], [6, 7]]
-    assert numbers(StepSampler(2, 4, lambda: 3)) == whole[3:]
-    assert numbers(StepSampler(2, 4, lambda: 4))[0] == [8, 9]
+    assert numbers(sampler(2, 4, lambda: 3)) == whole[3:]
+    assert numbers(sampler(2, 4, lambda: 4))[0] == [8, 9]
 
 
 def test_reuse_repeats_clips_but_not_numbers():
-    batches = list(StepSampler(2, 4, lambda: 0, reuse=2))
+    batches = list(sampler(2, 4, lambda: 0, batch_reuse=2))
     pairs = [[(item.clip, item.number) for item in batch] for batch in batches[:3]]
     assert pairs == [[(0, 0), (1, 1)], [(0, 2), (1, 3)], [(4, 4), (5, 5)]]
 
 
 def test_processes_share_a_batch_without_overlap():
-    shards = [numbers(StepSampler(2, 3, lambda: 0, rank=rank, world=2)) for rank in (0, 1)]
-    joint = numbers(StepSampler(4, 3, lambda: 0))
+    shards = [numbers(sampler(2, 3, lambda: 0, rank=rank, world=2)) for rank in (0, 1)]
+    joint = numbers(sampler(4, 3, lambda: 0))
     assert [a + b for a, b in zip(*shards, strict=True)] == joint
 
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"batch_size": 0}, {"reuse": 0}, {"epoch_clips": 3, "batch_size": 4}, {"simulate_on": "moon"}],
+    [
+        {"batch_size": 0},
+        {"batch_reuse": 0},
+        {"epoch_clips": 3, "batch_size": 4},
+        {"simulate_on": "moon"},
+    ],
 )
 def test_wrong_values_name_their_key(wrong):
     with pytest.raises(ValueError, match=f"data.{next(iter(wrong))}"):
@@ -86,7 +105,10 @@ def test_wrong_values_name_their_key(wrong):
 
 
 def test_large_batches_come_evenly_and_count_their_own():
-    batches = [StepSampler(4, 100, lambda: 0, large=(0.3, 2)).batch(step) for step in range(10)]
+    batches = [
+        sampler(4, 100, lambda: 0, large_share=0.3, large_batch_size=2).batch(step)
+        for step in range(10)
+    ]
     assert [batch[0].stream for batch in batches] == [0, 0, 0, 1, 0, 0, 1, 0, 0, 1]
     large = [item.clip for batch in batches for item in batch if item.stream]
     assert large == [0, 1, 2, 3, 4, 5]
@@ -95,8 +117,8 @@ def test_large_batches_come_evenly_and_count_their_own():
 
 
 def test_a_large_batch_is_used_again_as_others_are():
-    sampler = StepSampler(2, 100, lambda: 0, reuse=2, large=(0.5, 1))
-    batches = [sampler.batch(step) for step in range(4)]
+    steps = sampler(2, 100, lambda: 0, batch_reuse=2, large_share=0.5)
+    batches = [steps.batch(step) for step in range(4)]
     assert [[tuple(item) for item in batch] for batch in batches[2:]] == [[(0, 0, 1)], [(0, 1, 1)]]
     assert [[tuple(item) for item in batch] for batch in batches[:2]] == [
         [(0, 0, 0), (1, 1, 0)], [(0, 2, 0), (1, 3, 0)],
@@ -105,16 +127,18 @@ def test_a_large_batch_is_used_again_as_others_are():
 
 def test_batches_of_two_sizes_come_out_of_a_training():
     small, large = chain(), pipeline(STRONG, sensor={"threshold": 0.3}, crop=24, random_crop=True)
-    stream = LargeStream(large, share=0.5, batch_size=1)
+    stream = LargeCropStream(large, share=0.5, batch_size=1)
     data = LightFieldData({"train": small}, Augment(), batch_size=2, epoch_clips=8, large=stream)
     data.trainer = FakeTrainer()
     shapes = [tuple(batch.voxels.shape) for batch in data.train_dataloader()]
     assert [(shape[0], shape[-1]) for shape in shapes] == [(2, 16), (1, 24), (2, 16), (1, 24)]
-    alone = Simulator([small, large], Augment())([Numbered(small, large)[Item(1, 1, 1)]])
+    alone = BatchSimulator([small, large], Augment())(
+        [DrawDataset(small, large)[SampleId(1, 1, 1)]]
+    )
     again = next(b for i, b in enumerate(data.train_dataloader()) if i == 3)
     assert torch.equal(alone.voxels, again.voxels)
 
 
 def test_a_share_of_large_batches_outside_its_range_is_refused():
     with pytest.raises(ValueError, match="data.large.share must be in"):
-        LargeStream(chain(), share=1.0)
+        LargeCropStream(chain(), share=1.0)

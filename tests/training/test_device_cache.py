@@ -6,50 +6,51 @@ import torch
 from src.app import build
 from src.app import simulation as simulations
 from src.training.augment import Augment
-from src.training.bank_filler import fill
-from src.training.batch_sampler import Item, Numbered
-from src.training.datamodule import Simulator
-from src.training.device_cache import DeviceCache, simulated
+from src.training.batch_sampler import DrawDataset, SampleId
+from src.training.clip_cache import DeviceClipCache, simulate_clip
+from src.training.datamodule import BatchSimulator
 from tests.test_train import TINY, config
-from tests.training.test_bank import bank, banked, source
+from tests.training.test_disk_cache import cached, disk_cache, source
 
 
-def cache(clips: int = 3, gib: float = 1.0, **kwargs) -> DeviceCache:
-    return DeviceCache(source(**kwargs), clips=clips, frames=7, gib=gib, device="cpu")
+def cache(clips: int = 3, gib: float = 1.0, **kwargs) -> DeviceClipCache:
+    return DeviceClipCache(source(**kwargs), clips=clips, frames=7, gib=gib, device="cpu")
 
 
 @pytest.mark.parametrize("views", [9, 1])
 def test_its_samples_are_those_of_a_disk_bit_for_bit(views, tmp_path):
-    fill(on_disk := bank(tmp_path))
-    chains = [banked(of, views=views) for of in (on_disk, cache())]
+    (on_disk := disk_cache(tmp_path)).fill()
+    chains = [cached(of, views=views) for of in (on_disk, cache())]
     for number in (0, 5, 200):
         disk, memory = (chain.simulate([chain.draw(number)]) for chain in chains)
         assert torch.equal(disk.voxels, memory.voxels)
         assert torch.equal(disk.target, memory.target)
         assert torch.equal(disk.turbulent, memory.turbulent)
-        assert disk.drawn == memory.drawn
+        assert disk.parameters == memory.parameters
 
 
 def test_a_batch_is_gathered_as_its_clips_are_one_by_one():
-    chain = banked(cache())
+    chain = cached(cache())
     draws = [chain.draw(number) for number in range(12)]
-    assert {draw.backwards for draw in draws} == {False, True}
-    together = chain.batch_views(draws)
+    assert {draw.frames.step for draw in draws} == {-1, 1}
+    together = chain.render_views(draws)
     assert together.dtype == torch.float16 and together.shape == (12, 9, 5, 16, 16)
     for views, draw in zip(together, draws, strict=True):
-        assert torch.equal(views, chain.batch_views([draw])[0])
-        assert torch.equal(views, chain._read(draw))
+        assert torch.equal(views, chain.render_views([draw])[0])
+        frames = chain.cache.clip(draw.index).views[list(draw.view_order)][:, list(draw.frames)]
+        top, left, height, width = draw.crop
+        assert torch.equal(views, frames[..., top : top + height, left : left + width])
 
 
 @pytest.mark.parametrize("sides", [16, [8, 24]])
 def test_a_batch_at_once_is_the_batch_clip_by_clip(sides):
-    chain = banked(cache(), crop=sides, together=4)
-    items = [Item(number, number) for number in range(4, 8)]
-    draws = [Numbered(chain)[item] for item in items]
-    one_by_one = Simulator([chain], Augment(pause=0.3))(draws)
-    at_once = chain.simulate([draw for _, draw in draws], at_once=True)
+    chain = cached(cache(), crop=sides, batch_size=4)
+    items = [SampleId(number, number) for number in range(4, 8)]
+    draws = [DrawDataset(chain)[item] for item in items]
+    one_by_one = BatchSimulator([chain], Augment(pause_probability_when_running=0.3))(draws)
+    batched = chain.simulate([draw for _, draw in draws], batched=True)
     keys = [key_of(number) for number in range(4, 8)]
-    augmented = Augment(pause=0.3)([at_once], keys, at_once=True)
+    augmented = Augment(pause_probability_when_running=0.3)([batched], keys, batched=True)
     assert torch.equal(one_by_one.voxels, augmented.voxels)
     assert torch.equal(one_by_one.target, augmented.target)
 
@@ -61,7 +62,7 @@ def key_of(number: int) -> int:
 
 
 def test_the_sides_of_a_range_are_a_batch_s_and_all_come():
-    chain = banked(cache(), crop=[8, 24], together=3)
+    chain = cached(cache(), crop=[8, 24], batch_size=3)
     crops = [chain.draw(number).crop for number in range(60)]
     assert all(top + side <= 24 and left + side <= 24 for top, left, side, _ in crops)
     sides = [crop[2] for crop in crops]
@@ -72,66 +73,66 @@ def test_the_sides_of_a_range_are_a_batch_s_and_all_come():
 @pytest.mark.parametrize("wrong", [[24, 8], [4, 16], [16, 32], [16], [8.0, 16.0]])
 def test_a_range_that_the_clips_do_not_hold_is_refused(wrong):
     with pytest.raises(ValueError, match=r"data.crop must be \[low, high\] in 8..24 .*, got \["):
-        banked(cache(), crop=wrong)
+        cached(cache(), crop=wrong)
 
 
 def test_samples_that_come_again_keep_their_batches():
     with pytest.raises(ValueError, match="data.clips must be a multiple of data.batch_size=3"):
-        banked(cache(), crop=[8, 24], together=3, clips=10)
-    chain = banked(cache(), crop=[8, 24], together=3, clips=9)
+        cached(cache(), crop=[8, 24], batch_size=3, clips=10)
+    chain = cached(cache(), crop=[8, 24], batch_size=3, clips=9)
     assert [chain.draw(n).crop for n in range(9)] == [chain.draw(n).crop for n in range(9, 18)]
 
 
 def test_samples_are_of_the_first_clips_only_where_fewer_came():
     of = cache(clips=50)
     for index in range(4):
-        of.keep(index, *simulated(of.source, index, "cpu"))
-    of.limit(4)
+        of.store(index, simulate_clip(of.source, index, "cpu"))
+    of.clips = 4
     assert of.missing() == []
-    assert {banked(of).draw(number).index for number in range(200)} == {0, 1, 2, 3}
-    with pytest.raises(ValueError, match="data.bank must be in 1..4 here, got 5"):
-        of.limit(5)
+    assert {cached(of).draw(number).index for number in range(200)} == {0, 1, 2, 3}
 
 
 def test_memory_that_is_given_back_is_filled_again():
     of = cache()
-    before = banked(of).batch_views([banked(of).draw(1)])
-    of.release()
+    before = cached(of).render_views([cached(of).draw(1)])
+    of.clear()
     assert of.missing() == [0, 1, 2]
-    assert torch.equal(banked(of).batch_views([banked(of).draw(1)]), before)
+    assert torch.equal(cached(of).render_views([cached(of).draw(1)]), before)
 
 
 def test_more_than_the_bound_is_refused():
-    with pytest.raises(ValueError, match=r"data.bank_gib must be >= 0.08 for data.bank=1000"):
+    with pytest.raises(
+        ValueError, match=r"data.cache_gib must be >= 0.08 for data.cache_clips=1000"
+    ):
         cache(clips=1000, gib=0.01)
 
 
-SMALL = ["scene.height=64", "scene.width=64", "data.bank_windows=4", "data.bank_crop=40"]
+SMALL = ["scene.height=64", "scene.width=64", "data.cache_windows=4", "data.cache_crop=40"]
 SMALL += [
     "data.loss_from=0",
     "data.windows=3",
     "data.crop=[16,32]",
     "turbulence=weak",
-    "sensor=drawn",
-    "data.bank=2",
+    "sensor=randomized",
+    "data.cache_clips=2",
 ]
 
 
 def test_all_that_ask_for_the_same_share_one_of_a_process(tmp_path):
-    asked = [*SMALL, "data.bank_on=device", "data.workers=0"]
+    asked = [*SMALL, "data.cache_device=device", "data.workers=0"]
     nine, one, other = (
-        simulations.bank(config("train", tmp_path, *asked, *more))
+        simulations.build_clip_cache(config("train", tmp_path, *asked, *more))
         for more in ([], ["optics=single", "data.crop=24"], ["seed=5"])
     )
-    assert isinstance(nine, DeviceCache) and nine is one and nine is not other
+    assert isinstance(nine, DeviceClipCache) and nine is one and nine is not other
 
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ("data.bank_on=moon", "data.bank_on must be disk or device, got moon"),
-        ("data.workers=1", "data.workers must be 0 for data.bank_on=device, got 1"),
-        ("data.bank=null", "data.crop may be a range of sides with data.bank only"),
+        ("data.cache_device=moon", "data.cache_device must be disk or device, got moon"),
+        ("data.workers=1", "data.workers must be 0 for data.cache_device=device, got 1"),
+        ("data.cache_clips=null", "data.crop may be a range of sides with data.cache_clips only"),
         (
             'data.large={share:2,overrides:["data.crop=16"]}',
             r"data.large.share must be in \[0, 1\)",
@@ -141,22 +142,22 @@ def test_all_that_ask_for_the_same_share_one_of_a_process(tmp_path):
             "data.large: data.windows must be >",
         ),
         ("data.large={share:0.5,overrides:data.crop}", "data.large.overrides must be"),
-        ("step=fast", "step must be one of auto, eager, graph, got fast"),
-        ("step=graph", "step must be auto or eager without a GPU"),
+        ("cuda_graphs=fast", "cuda_graphs must be one of auto, true, false, got fast"),
+        ("cuda_graphs=true", "cuda_graphs must be auto or false without a GPU"),
     ],
 )
 def test_wrong_values_are_one_line(wrong, message, tmp_path):
-    cfg = config("train", tmp_path, *SMALL, "data.bank_on=device", "data.workers=0", wrong)
+    cfg = config("train", tmp_path, *SMALL, "data.cache_device=device", "data.workers=0", wrong)
     with pytest.raises(ValueError, match=message):
-        build.data(cfg)
-        build.reconstructor(cfg, *build.network(cfg))
+        build.build_data_module(cfg)
+        build.build_reconstructor(cfg, *build.build_network(cfg))
 
 
 def test_a_training_of_two_sizes_takes_steps(tmp_path):
     from src.train import train
 
     large = '{share:0.5,overrides:["data.crop=40","data.batch_size=1","data.windows=2"]}'
-    asked = [*TINY, *SMALL, "data.bank_on=device", "data.workers=0", "optics=lf2"]
+    asked = [*TINY, *SMALL, "data.cache_device=device", "data.workers=0", "optics=lf2"]
     asked += [f"data.large={large}", "trainer.max_steps=4", "data.batch_size=2"]
     record = train(config("train", tmp_path, *asked, "data.epoch_clips=4"))
     assert record["test"]["clips"] > 0

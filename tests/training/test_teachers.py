@@ -7,12 +7,13 @@ import torch
 from torch import nn
 
 from src.app import build
+from src.losses.terms import Distillation, TrainingLoss
+from src.models.network import EventToVideoNetwork
 from src.models.setnet import SetNet
-from src.models.unroll import video
 from src.sim.pipeline import simulate
 from src.training import teachers as module
 from src.training.augment import Augment
-from src.training.teachers import Teachers
+from src.training.teachers import TeacherEnsemble
 from tests.sim.test_pipeline import STRONG, pipeline
 from tests.test_train import config
 from tests.training.test_reconstructor import Leaky, SquaredError, fit, sample
@@ -20,7 +21,7 @@ from tests.training.test_reconstructor import Leaky, SquaredError, fit, sample
 pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`")
 
 
-class Constant(nn.Module):
+class Constant(EventToVideoNetwork):
     """Draws one grey, whatever comes in and however long it lasts."""
 
     views = None
@@ -29,7 +30,7 @@ class Constant(nn.Module):
         super().__init__()
         self.grey, self.calls = nn.Parameter(torch.tensor(grey)), 0
 
-    def forward(self, voxels, state):
+    def forward(self, voxels, state=None, *, window_s=1 / 120, positions=None):
         self.calls += 1
         return self.grey.expand(len(voxels), 1, *voxels.shape[-2:]), state
 
@@ -40,71 +41,66 @@ def clip():
 
 
 def test_the_picture_is_the_mean_of_the_networks_to_8_bits(clip, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "computes_bf16", lambda: False)
-    networks = {"one": SetNet(half=8, around=[8]), "two": Constant(0.3)}
-    taught = Teachers(networks, tmp_path, 120.0)(clip)
+    monkeypatch.setattr(module, "has_fast_bf16", lambda: False)
+    networks = {"one": SetNet(channels=8, context_channels=[8]), "two": Constant(0.3)}
+    teacher_frames = TeacherEnsemble(networks, tmp_path, 120.0)(clip)
     with torch.no_grad():
-        expected = torch.stack([video(net, clip) for net in networks.values()]).mean(0)
-    assert taught.shape == clip.target.shape
-    assert (taught - expected).abs().max() <= 0.5 / 255 + 1e-6
+        expected = torch.stack([net.reconstruct_clip(clip) for net in networks.values()]).mean(0)
+    assert teacher_frames.shape == clip.target.shape
+    assert (teacher_frames - expected).abs().max() <= 0.5 / 255 + 1e-6
 
 
 def test_a_picture_is_made_once_and_again_where_anything_differs(clip, tmp_path):
     network = Constant(0.25)
-    first = Teachers({"a": network}, tmp_path, 120.0)(clip)
+    first = TeacherEnsemble({"a": network}, tmp_path, 120.0)(clip)
     made = network.calls
-    assert torch.equal(Teachers({"b": network}, tmp_path, 120.0)(clip), first)
+    assert torch.equal(TeacherEnsemble({"b": network}, tmp_path, 120.0)(clip), first)
     assert network.calls == made
-    Teachers({"a": network}, tmp_path, 120.0)(replace(clip, voxels=clip.voxels + 1))
+    TeacherEnsemble({"a": network}, tmp_path, 120.0)(replace(clip, voxels=clip.voxels + 1))
     assert network.calls == 2 * made
-    assert not torch.equal(Teachers({"a": Constant(0.75)}, tmp_path, 120.0)(clip), first)
+    assert not torch.equal(TeacherEnsemble({"a": Constant(0.75)}, tmp_path, 120.0)(clip), first)
     (path, *_) = tmp_path.iterdir()
     path.write_bytes(path.read_bytes()[:100])
-    Teachers({"a": Constant(0.5)}, tmp_path, 120.0)(clip)  # others beside it do no harm
-    assert torch.equal(Teachers({"a": network}, tmp_path, 120.0)(clip), first)
+    TeacherEnsemble({"a": Constant(0.5)}, tmp_path, 120.0)(clip)  # others beside it do no harm
+    assert torch.equal(TeacherEnsemble({"a": network}, tmp_path, 120.0)(clip), first)
 
 
 def test_a_sample_that_comes_again_by_name_is_not_hashed_again(clip, tmp_path, monkeypatch):
-    teachers = Teachers({"a": Constant(0.25)}, tmp_path, 120.0)
+    teachers = TeacherEnsemble({"a": Constant(0.25)}, tmp_path, 120.0)
     first = teachers(clip, "its name")
-    monkeypatch.setattr(module, "_digest", lambda *_: pytest.fail("hashed again"))
+    monkeypatch.setattr(module, "_hash", lambda *_: pytest.fail("hashed again"))
     assert torch.equal(teachers(clip, "its name"), first)
 
 
 def test_who_is_not_told_the_length_of_windows_teaches_those_it_knows(clip, tmp_path):
-    networks = {"told": SetNet(half=8, around=[8]), "not": Constant(0.3)}
+    networks = {"told": SetNet(channels=8, context_channels=[8]), "not": Constant(0.3)}
     fast = replace(clip, window_s=clip.window_s / 4)
-    both, told = (Teachers(dict(n), tmp_path, 120.0) for n in (networks, [*networks.items()][:1]))
+    both = TeacherEnsemble(networks, tmp_path, 120.0)
+    told = TeacherEnsemble({"told": networks["told"]}, tmp_path, 120.0)
     assert torch.equal(both(fast), told(fast))
     assert not torch.equal(both(clip), told(clip))
     with pytest.raises(ValueError, match="teachers must have one .* 480 windows a second, got not"):
-        Teachers({"not": networks["not"]}, tmp_path, 120.0, (120.0, 480.0))
+        TeacherEnsemble({"not": networks["not"]}, tmp_path, 120.0, (120.0, 480.0))
 
 
 def test_what_is_taught_turns_and_pauses_with_the_truth(clip):
-    batch = Augment(transpose=0.5, pause=0.5)([replace(clip, taught=clip.target)] * 6, range(6))
-    assert torch.equal(batch.taught, batch.target)
+    taught = replace(clip, teacher_frames=clip.target)
+    batch = Augment(pause_probability_when_running=0.5)([taught] * 6, range(6))
+    assert torch.equal(batch.teacher_frames, batch.target)
     assert not torch.equal(batch.target[0], batch.target[1])
 
 
-class HalfAnchored(SquaredError):
-    """Against the truth the whole error, against teachers half of it."""
-
-    def anchors(self, prediction, target):
-        return self(prediction, target) / 2
-
-
-@pytest.mark.parametrize(("loss", "weight"), [(SquaredError, 3.0), (HalfAnchored, 1.5)])
-def test_what_is_taught_is_added_to_the_loss(loss, weight, monkeypatch):
+def test_what_is_taught_is_added_to_the_loss(monkeypatch, weight=3.0):
     plain, other = sample(), torch.rand(2, 6, 1, 8, 8)
     mixed = replace(plain, target=(plain.target + weight * other) / (1 + weight))
     fitted = []
-    for batch, lr, teach in (
-        (replace(plain, taught=other), 0.05, 3.0),
+    for batch, lr, distillation in (
+        (replace(plain, teacher_frames=other), 0.05, 3.0),
         (mixed, 0.05 * (1 + weight), 0.0),
     ):
         monkeypatch.setattr("tests.training.test_reconstructor.sample", lambda batch=batch: batch)
-        fitted.append(fit(Leaky(), 0, teach=teach, loss=loss(), lr=lr))
+        terms = {"error": SquaredError(), "distillation": Distillation(distillation)}
+        fitted.append(fit(Leaky(), lr=lr, loss=TrainingLoss(terms)))
     for ours, theirs in zip(*(net.parameters() for net in fitted), strict=True):
         assert torch.allclose(ours, theirs, atol=1e-6)
 
@@ -114,11 +110,11 @@ def test_what_is_taught_is_added_to_the_loss(loss, weight, monkeypatch):
     [
         (["optics=single"], "teachers must take optics.views=1, lf3x3 takes 9"),
         (["teachers=[nobody]"], "teachers must be networks: ckpt .*nobody"),
-        (["teach=-1"], "teach must be >= 0, got -1"),
+        (["loss.distillation.weight=-1"], "loss.distillation.weight must be >= 0, got -1"),
     ],
 )
 def test_wrong_values_are_one_line(asked, message, tmp_path):
     cfg = config("train", tmp_path, "experiment=setnet_small", "teachers=lf3x3", *asked)
     with pytest.raises(ValueError, match=message):
-        build.data(cfg)
-        build.reconstructor(cfg, *build.network(cfg))
+        build.build_data_module(cfg)
+        build.build_reconstructor(cfg, *build.build_network(cfg))

@@ -1,10 +1,9 @@
 """Calibration targets: the points of a checkerboard, circle grid or ChArUco board in a picture.
 
-A target has two jobs.  `features` finds points of its kind anywhere in a picture that shows it many
-times, mirrored or not; `find` returns the points of the one target in a crop row by row, NaN where
-one is not seen, or None.  `shape` is (rows, columns) of these points, `count` the number of
-features of a whole target; one that is `ordered` knows which point is which and is not found in a
-mirrored picture.
+`detect_features` finds points of a kind of target anywhere in a picture that shows it many times,
+mirrored or not; `find_points` those of the one target in a crop row by row, NaN where one is not
+seen, or None.  `shape`: (rows, columns) of these; `count`: features of a whole target; one that is
+`ordered` knows which point is which and is not found in a mirrored picture.
 Pictures are (h, w) uint8; points are (x, y) pixels, (0, 0) the centre of the top left pixel.
 """
 
@@ -29,7 +28,9 @@ class _Grid:
     ordered = False
 
     def __post_init__(self):
-        _check_shape(self.rows, self.cols)
+        if not (3 <= self.rows <= 100 and 3 <= self.cols <= 100):
+            got = f"{self.rows} and {self.cols}"
+            raise ValueError(f"target.rows and target.cols must be in 3..100, got {got}")
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -43,7 +44,7 @@ class _Grid:
 class Checkerboard(_Grid):
     """`rows` x `cols` inner corners, each at least 3."""
 
-    def features(self, picture: Picture) -> Points:
+    def detect_features(self, picture: Picture) -> Points:
         """Saddle points: where the Hessian's determinant is most negative for the contrast there.
 
         The threshold is half of what the corners of four whole boards have in the median.
@@ -60,7 +61,7 @@ class Checkerboard(_Grid):
         y, x = np.nonzero(peaks & (saddle > 0.5 * np.median(strongest)))
         return np.stack([x, y], axis=1).astype(np.float64)
 
-    def find(self, picture: Picture) -> Points | None:
+    def find_points(self, picture: Picture) -> Points | None:
         flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
         complete, points = cv2.findChessboardCornersSB(picture, (self.cols, self.rows), flags=flags)
         return points.reshape(-1, 2).astype(np.float64) if complete else None
@@ -72,11 +73,11 @@ class Circles(_Grid):
 
     dark: bool = True
 
-    def features(self, picture: Picture) -> Points:
+    def detect_features(self, picture: Picture) -> Points:
         spots = self._detector().detect(self._dark(picture))
         return np.array([spot.pt for spot in spots], dtype=np.float64).reshape(-1, 2)
 
-    def find(self, picture: Picture) -> Points | None:
+    def find_points(self, picture: Picture) -> Points | None:
         flags = cv2.CALIB_CB_SYMMETRIC_GRID | cv2.CALIB_CB_CLUSTERING
         complete, points = cv2.findCirclesGrid(
             self._dark(picture), (self.cols, self.rows), flags=flags, blobDetector=self._detector()
@@ -88,15 +89,15 @@ class Circles(_Grid):
 
     @staticmethod
     def _detector() -> cv2.SimpleBlobDetector:
-        settings = cv2.SimpleBlobDetector_Params()
+        settings = cv2.SimpleBlobDetector.Params()
         settings.minArea, settings.maxArea = 12.0, 5000.0
         settings.minDistBetweenBlobs = 4.0
         settings.minCircularity, settings.filterByCircularity = 0.6, True
-        return cv2.SimpleBlobDetector_create(settings)
+        return cv2.SimpleBlobDetector.create(settings)
 
 
 @dataclass(frozen=True)
-class Charuco:
+class Charuco(_Grid):
     """A ChArUco board of `rows` x `cols` squares; a marker's side is `marker` of a square's."""
 
     rows: int = 6
@@ -106,7 +107,7 @@ class Charuco:
     ordered = True
 
     def __post_init__(self):
-        _check_shape(self.rows, self.cols)
+        super().__post_init__()
         if not 0 < self.marker < 1:
             raise ValueError(f"target.marker must be in (0, 1), got {self.marker}")
         if not self.dictionary.startswith("DICT_") or not hasattr(cv2.aruco, self.dictionary):
@@ -120,7 +121,7 @@ class Charuco:
     def count(self) -> int:
         return self.rows * self.cols // 2
 
-    def features(self, picture: Picture) -> Points:
+    def detect_features(self, picture: Picture) -> Points:
         """Markers of both hands: those of the picture and of the picture mirrored in x."""
         detector = cv2.aruco.ArucoDetector(self._board().getDictionary())
         plain = _middles(detector.detectMarkers(picture)[0])
@@ -128,7 +129,7 @@ class Charuco:
         mirrored[:, 0] = picture.shape[1] - 1 - mirrored[:, 0]
         return np.concatenate([plain, mirrored])
 
-    def find(self, picture: Picture) -> Points | None:
+    def find_points(self, picture: Picture) -> Points | None:
         corners, names, *_ = cv2.aruco.CharucoDetector(self._board()).detectBoard(picture)
         if names is None or len(names) < 6:
             return None
@@ -154,12 +155,9 @@ class Charuco:
 Target = Checkerboard | Circles | Charuco
 
 
-def groups(points: Points, expected: int) -> list[Points]:
-    """Return the clusters of `points` that have half to twice `expected` members.
-
-    Two points are linked when they are closer than 1.3 times the median distance of nearest
-    neighbours, so that targets have to stand at least that far apart.
-    """
+def cluster_points(points: Points, expected: int) -> list[Points]:
+    """Return the clusters of `points` that have half to twice `expected` members: linked are those
+    closer than 1.3 times the median distance of nearest neighbours."""
     if len(points) < expected:
         return []
     tree = cKDTree(points)
@@ -172,8 +170,3 @@ def groups(points: Points, expected: int) -> list[Points]:
 
 def _middles(markers: Sequence[np.ndarray]) -> Points:
     return np.array([marker.reshape(4, 2).mean(0) for marker in markers]).reshape(-1, 2)
-
-
-def _check_shape(rows: int, cols: int) -> None:
-    if not (3 <= rows <= 100 and 3 <= cols <= 100):
-        raise ValueError(f"target.rows and target.cols must be in 3..100, got {rows} and {cols}")

@@ -2,28 +2,106 @@
 
 The simulator's rate over a grid of thresholds is inverted at the recording's rate.  This supposes
 that simulated and real scene agree in texture, speed and turbulence: a rate that is wrong by 10 %
-moves C by 4 to 10 %, and light taken for code values moves it nearly threefold.
+moves C by 4 to 10 %, and light taken for code values moves it nearly threefold.  Rates are events
+per pixel of the sensor, not of the warped view, per second, ON and OFF apart.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy.ndimage import median_filter
 from torch import Tensor
 
-from src.recordings.event_rates import Rates
-from src.records.results import csv_text, write_text
-from src.sim.sensor.sensor import EventSensor
+from src.records.results import format_csv, write_text
+from src.sim.sensor.sensor import EventSensor, Sensor
 
+HOT_FACTOR = 5.0  # times its neighbours' median plus its view's mean: more than texture makes
+HOT_EVENTS = 10  # beyond that, so that a pixel is not hot by chance
 ROUNDS = 4  # of simulating with the ratio of OFF to ON threshold found so far
 GRID = tuple(np.geomspace(0.05, 2.0, 24).round(4).tolist())
 
 
 @dataclass(frozen=True)
-class Curve:
+class EventRates:
+    """`events` (slices, views, 2) ON and OFF in slices of `slice_s`; `pixels` of each view that
+    count, `hot` ones left out."""
+
+    events: Int[np.ndarray, "slices views 2"]
+    pixels: Int[np.ndarray, " views"]
+    hot: Int[np.ndarray, " views"]
+    slice_s: float
+
+    @property
+    def per_view(self) -> Float[np.ndarray, "views 2"]:
+        """In events / pixel / s, ON and OFF."""
+        return self.events.sum(0) / (self.pixels[:, None] * len(self.events) * self.slice_s)
+
+    @property
+    def pooled(self) -> Float[np.ndarray, " 2"]:
+        return self.events.sum((0, 1)) / (self.pixels.sum() * len(self.events) * self.slice_s)
+
+    def bootstrap(self, draws: int = 1000) -> Float[np.ndarray, "draws 2"]:
+        """Return pooled rates of recordings put together from this one's blocks of n ** (1/3)
+        successive slices, wrapping around (circular block bootstrap, Politis and Romano 1992)."""
+        n = len(self.events)
+        length = max(1, round(n ** (1 / 3)))
+        first = np.random.default_rng(0).integers(n, size=(draws, -(-n // length), 1))
+        slices = ((first + np.arange(length)) % n).reshape(draws, -1)[:, :n]
+        events = self.events.sum(1)[slices].sum(1)
+        return events / (self.pixels.sum() * n * self.slice_s)
+
+
+def measure_event_rates(
+    recording: Iterable[np.ndarray], view: Int[np.ndarray, "h w"], *, slices: int = 100
+) -> EventRates:
+    """Return the rates of a recording; it is gone through twice.
+
+    `recording` yields structured arrays t (us), x, y, p in order of time each time it is iterated;
+    `view`: that of each sensor pixel, -1 for none; `slices` of the time from the first to the last
+    event.  Raises ValueError without two instants or without views.
+    """
+    totals, times = np.zeros(view.shape, np.int64), []
+    for piece in recording:
+        x, y = piece["x"].max(), piece["y"].max()
+        height, width = view.shape
+        if x >= width or y >= height:
+            raise ValueError(
+                f"events lie outside the {width}x{height} sensor of the views: up to {x}, {y}"
+            )
+        times += [int(piece["t"][0]), int(piece["t"][-1])]
+        pixels = np.ravel_multi_index((piece["y"], piece["x"]), view.shape)
+        totals += np.bincount(pixels, minlength=totals.size).reshape(view.shape)
+    if not times or times[-1] <= times[0]:
+        raise ValueError("event rates need a recording of more than one instant")
+    if view.max() < 0:
+        raise ValueError("event rates need at least one view on the sensor")
+    hot = find_hot_pixels(totals, view)
+    used = np.where(hot, -1, view)
+    views, start, span = int(view.max()) + 1, times[0], times[-1] - times[0] + 1
+    events = np.zeros((slices, views, 2), np.int64)
+    for piece in recording:
+        owner = used[piece["y"], piece["x"]].astype(np.int64)
+        part = (piece["t"] - start) * slices // span
+        place = ((part * views + owner) * 2 + (piece["p"] < 0))[owner >= 0]
+        events += np.bincount(place, minlength=events.size).reshape(events.shape)
+    pixels, lost = (np.bincount(view[mask & (view >= 0)], minlength=views) for mask in (~hot, hot))
+    return EventRates(events, pixels, lost, span * 1e-6 / slices)
+
+
+def find_hot_pixels(totals: Int[np.ndarray, "h w"], view: Int[np.ndarray, "h w"]) -> np.ndarray:
+    """Return where a pixel fires over 5 times as often as its neighbours and its view together."""
+    mean = np.zeros(totals.shape)
+    for index in np.unique(view[view >= 0]):
+        mean[view == index] = totals[view == index].mean()
+    return (view >= 0) & (totals > HOT_FACTOR * (median_filter(totals, 3) + mean) + HOT_EVENTS)
+
+
+@dataclass(frozen=True)
+class RateCurve:
     """Simulated rates (thresholds, 2), ON and OFF in events / pixel / s, over the ON threshold."""
 
     thresholds: Float[np.ndarray, " k"]
@@ -32,106 +110,103 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """`on` and `off` thresholds: (value, low, high), the last two an interval of 95 %."""
+class ThresholdEstimate:
+    """`on` and `off` thresholds: (value, low, high), the last two a 95 % bootstrap CI; the measured
+    `rates` (ON, OFF) with their `interval` (low and high, ON and OFF)."""
 
     on: tuple[float, float, float]
     off: tuple[float, float, float]
-    curve: Curve
+    curve: RateCurve
     rates: Float[np.ndarray, " 2"]
     interval: Float[np.ndarray, "2 2"]
 
 
-def simulate(
+def simulate_event_rates(
     clips: Iterable[Float[Tensor, "views frames h w"]],
     fps: float,
-    sensor: EventSensor,
+    sensor: Sensor,
     thresholds: Sequence[float] = GRID,
     *,
     off_ratio: float = 1.0,
-) -> Curve:
-    """Return the rates of a sensor looking at `clips`, at all thresholds with the same noise.
+) -> RateCurve:
+    """Return the rates of a sensor that sees `clips`, at all thresholds with the same noise.
 
-    Its own `threshold` and `off_ratio` are not used.
+    Its own `threshold` and `off_ratio` are not used.  Raises ValueError for another sensor.
     """
-    sensor = sensor.having(threshold=thresholds[0], off_ratio=off_ratio)
+    if not isinstance(sensor, EventSensor):
+        raise ValueError(f"sensor must be an EventSensor, got {type(sensor).__name__}")
     grid = torch.tensor(thresholds, dtype=torch.float32)
+    sensors = [replace(sensor, threshold=c, off_ratio=off_ratio) for c in thresholds]
     events, exposure = torch.zeros(len(grid), 2, dtype=torch.float64), 0.0
     for index, frames in enumerate(clips):
         views, count, h, w = frames.shape
-        batch = frames.expand(len(grid), -1, -1, -1, -1)
-        counts = sensor.counts(batch, fps, clips=[index] * len(grid), threshold=grid)
-        events += counts.sum(1)
+        counts = [one.counts(frames[None], fps, clips=[index])[0] for one in sensors]
+        events += torch.stack(counts).sum(1)
         exposure += views * h * w * (count - 1) / fps
-    return Curve(grid.double().numpy(), (events / exposure).numpy(), off_ratio)
+    return RateCurve(grid.double().numpy(), (events / exposure).numpy(), off_ratio)
 
 
-def estimate(
-    rates: Rates,
+def estimate_contrast_threshold(
+    rates: EventRates,
     clips: Sequence[Float[Tensor, "views frames h w"]],
     fps: float,
-    sensor: EventSensor,
+    sensor: Sensor,
     thresholds: Sequence[float] = GRID,
-) -> Estimate:
+) -> ThresholdEstimate:
     """Return the thresholds at which the sensor makes the recording's rates.
 
-    The geometric mean of ON and OFF rate gives the size of the thresholds; their quotient gives
-    the ratio of OFF to ON, because what rises has to fall: the simulation is repeated with the
-    ratio found.  Raises ValueError if a rate is none that the grid makes.
+    The geometric mean of ON and OFF rate gives their size; the quotient gives the ratio of OFF to
+    ON, as what rises has to fall.  Raises ValueError for a rate that the grid does not make.
     """
-    wanted, drawn = rates.pooled, rates.bootstrap()
-    if not (wanted > 0).all():
-        raise ValueError(f"the recording's rates above the background are not positive: {wanted}")
+    measured, drawn = rates.pooled, np.maximum(rates.bootstrap(), 1e-12)
+    if not (measured > 0).all():
+        raise ValueError(f"the recording's rates above the background are not positive: {measured}")
     ratio = 1.0
     for _ in range(ROUNDS):
-        curve = simulate(clips, fps, sensor, thresholds, off_ratio=ratio)
-        on = invert(curve, wanted)
+        curve = simulate_event_rates(clips, fps, sensor, thresholds, off_ratio=ratio)
+        on = float(find_threshold(curve, measured))
         if not np.isfinite(on):
             low, high = np.sqrt(np.prod(curve.rates[[-1, 0]], axis=1))
             raise ValueError(
-                f"the recording's rate {np.sqrt(np.prod(wanted)):.3g} is outside what the grid of "
-                f"thresholds {thresholds[0]} to {thresholds[-1]} makes, {low:.3g} to {high:.3g}"
+                f"the recording's rate {np.sqrt(np.prod(measured)):.3g} is outside what the grid of"
+                f" thresholds {thresholds[0]} to {thresholds[-1]} makes, {low:.3g} to {high:.3g}"
             )
-        ratio = float(np.clip(ratio * _excess(curve, on, wanted), 0.1, 10))
-    pairs = np.maximum(drawn, 1e-12)
-    spread_on = np.array([invert(curve, pair) for pair in pairs])
-    excess = np.array([_excess(curve, c, p) for c, p in zip(spread_on, pairs, strict=True)])
-    spread_off = spread_on * curve.off_ratio * excess
-    bounds = [np.nanpercentile(spread, (2.5, 97.5)) for spread in (spread_on, spread_off)]
-    return Estimate(
-        (on, *map(float, bounds[0])),
-        (on * ratio, *map(float, bounds[1])),
-        curve,
-        wanted,
-        np.percentile(drawn, (2.5, 97.5), axis=0),
-    )
+        ratio = float(np.clip(ratio * _excess_quotient(curve, on, measured), 0.1, 10))
+    on_drawn = find_threshold(curve, drawn)
+    off_drawn = on_drawn * curve.off_ratio * _excess_quotient(curve, on_drawn, drawn)
+    bounds = np.nanpercentile([on_drawn, off_drawn], (2.5, 97.5), axis=1).T.tolist()
+    (on_low, on_high), (off_low, off_high) = bounds
+    on_off = (on, on_low, on_high), (on * ratio, off_low, off_high)
+    return ThresholdEstimate(*on_off, curve, measured, np.percentile(drawn, (2.5, 97.5), axis=0))
 
 
-def invert(curve: Curve, rates: Float[np.ndarray, " 2"]) -> float:
+def find_threshold(
+    curve: RateCurve, rates: Float[np.ndarray, "*draws 2"]
+) -> Float[np.ndarray, "*draws"]:
     """Return the ON threshold with the geometric mean of `rates`, nan where the grid ends.
 
     Linear in log rate over log threshold, the simulated rates made monotone first.
     """
     mean = np.sqrt(np.maximum(np.prod(curve.rates, axis=1), 1e-30))
     falling = np.minimum.accumulate(np.log(mean))
-    target = 0.5 * np.log(np.prod(rates))
+    target = 0.5 * np.log(np.prod(rates, axis=-1))
     thresholds = np.log(curve.thresholds)[::-1]
-    return float(np.exp(np.interp(target, falling[::-1], thresholds, np.nan, np.nan)))
+    return np.asarray(np.exp(np.interp(target, falling[::-1], thresholds, np.nan, np.nan)))
 
 
-def _excess(curve: Curve, on: float, rates: Float[np.ndarray, " 2"]) -> float:
+def _excess_quotient(curve: RateCurve, on: np.ndarray | float, rates: np.ndarray) -> np.ndarray:
     """Return how much larger the quotient of ON to OFF rate is than the curve's at `on`."""
-    quotient = np.log(np.maximum(curve.rates[:, 0], 1e-15) / np.maximum(curve.rates[:, 1], 1e-15))
+    quotient = np.subtract(*np.log(np.maximum(curve.rates, 1e-15)).T)
     expected = np.interp(np.log(on), np.log(curve.thresholds), quotient)
-    return float(np.exp(np.log(rates[0] / rates[1]) - expected))
+    return np.asarray(np.exp(np.log(rates[..., 0] / rates[..., 1]) - expected))
 
 
-def write_csv(thresholds: Estimate, rates: Rates, path: Path) -> None:
+def write_threshold_csv(estimate: ThresholdEstimate, rates: EventRates, path: Path) -> None:
     """Write the curve, the rates of each view and the estimate as one table."""
-    curve = zip(thresholds.curve.thresholds, thresholds.curve.rates, strict=True)
+    curve = zip(estimate.curve.thresholds, estimate.curve.rates, strict=True)
     rows = [("simulated_hz", f"{threshold:.4g}", *pair) for threshold, pair in curve]
     rows += [("measured_hz", index, *pair) for index, pair in enumerate(rates.per_view)]
-    estimate = zip(("estimate", "low", "high"), thresholds.on, thresholds.off, strict=True)
-    rows += [(name, "", on, off) for name, on, off in estimate]
+    bounds = zip(("estimate", "low", "high"), estimate.on, estimate.off, strict=True)
+    rows += [(name, "", on, off) for name, on, off in bounds]
     texts = [(what, which, *(f"{value:.5g}" for value in pair)) for what, which, *pair in rows]
-    write_text(path, csv_text(("what", "threshold_or_view", "on", "off"), texts))
+    write_text(path, format_csv(("what", "threshold_or_view", "on", "off"), texts))

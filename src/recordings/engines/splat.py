@@ -1,17 +1,16 @@
-"""One pass over a list of events: look the view up, add to its voxel grid or say what to add."""
+"""One pass over a list of events: look up the view, add to its voxel grid or list what to add."""
 
 import numpy as np
 from numba import njit
 
-AHEAD = 256  # events that are looked up before any is laid
+BATCH = 256  # events that are looked up before any is used
 
 
 @njit(nogil=True, cache=True)
-def splat(t, x, y, p, view, place, grid, t0, t1, nearest):
+def splat_events(t, x, y, p, view, model_xy, grid, t0, t1, nearest):
     """Add events to `grid` (views, bins, h, w) in their order; return how many were in no view.
 
-    `t` in microseconds as `t0` and `t1`, the edges of the window; `view` (sensor h, sensor w)
-    holds the index of the view or -1 and `place` (sensor h, sensor w, 2) the (u, v) in that view.
+    `t`, and `t0` and `t1`, the edges of the window, in us; `view` and `model_xy` of `SensorLookup`.
     In time the weight is E2VID's hat on bins - 1 intervals (Rebecq et al. 2019, eq. 1); in space
     bilinear, or 1 at the nearest pixel.  Places are clamped to the grid, so that no mass is lost.
     """
@@ -26,8 +25,8 @@ def splat(t, x, y, p, view, place, grid, t0, t1, nearest):
         tau = min(max((t[i] - t0) * rate, 0.0), bins - 1.0)
         b = min(int(tau), max(bins - 2, 0))
         late = tau - b
-        u = min(max(place[y[i], x[i], 0], 0.0), width - 1.0)
-        v = min(max(place[y[i], x[i], 1], 0.0), height - 1.0)
+        u = min(max(model_xy[y[i], x[i], 0], 0.0), width - 1.0)
+        v = min(max(model_xy[y[i], x[i], 1], 0.0), height - 1.0)
         if nearest:
             u, v = float(int(u + 0.5)), float(int(v + 0.5))
         c, r = int(u), int(v)
@@ -48,11 +47,10 @@ def splat(t, x, y, p, view, place, grid, t0, t1, nearest):
 
 
 @njit(nogil=True, cache=True)
-def lay(x, y, p, view, place, density, index, u, v, which, weight):
-    """Write what `splat` adds in space, bilinearly: for each part the index of its event, its pixel
-    (u, v), its view and its weight over `density` (views, h, w).
-
-    Return how many parts there are and how many events in no view.
+def list_bilinear_parts(x, y, p, view, model_xy, density, index, u, v, which, weight):
+    """Write what `splat_events` adds in space, bilinearly: for each part the index of its event,
+    its pixel (u, v), its view and its weight over `density` (views, h, w); return the number of
+    parts and of events in no view.
     """
     _, height, width = density.shape
     outside = parts = 0
@@ -61,8 +59,8 @@ def lay(x, y, p, view, place, density, index, u, v, which, weight):
         if k < 0:
             outside += 1
             continue
-        right = min(max(place[y[i], x[i], 0], 0.0), width - 1.0)
-        down = min(max(place[y[i], x[i], 1], 0.0), height - 1.0)
+        right = min(max(model_xy[y[i], x[i], 0], 0.0), width - 1.0)
+        down = min(max(model_xy[y[i], x[i], 1], 0.0), height - 1.0)
         c, r = int(right), int(down)
         right, down = right - c, down - r
         for a in range(2):
@@ -76,17 +74,15 @@ def lay(x, y, p, view, place, density, index, u, v, which, weight):
 
 
 @njit(nogil=True, cache=True)
-def lay_nearest(x, y, p, nearest, density, index, u, v, which, weight):
-    """As `lay`, at the nearest pixel: `nearest` (sensor h, sensor w) counts pixels through all
-    views, -1 for none.
-    """
+def list_nearest_pixels(x, y, p, nearest, density, index, u, v, which, weight):
+    """As `list_bilinear_parts`, at the nearest pixel; `nearest`: `SensorLookup.nearest_pixel`."""
     _, height, width = density.shape
     flat = density.reshape(-1)
-    pixels, densities = np.empty(AHEAD, np.int64), np.empty(AHEAD, np.float32)
+    pixels, densities = np.empty(BATCH, np.int64), np.empty(BATCH, np.float32)
     outside = parts = 0
-    for begin in range(0, x.size, AHEAD):
-        count = min(AHEAD, x.size - begin)
-        _fetch(x, y, begin, count, nearest, pixels)
+    for begin in range(0, x.size, BATCH):
+        count = min(BATCH, x.size - begin)
+        _look_up(x, y, begin, count, nearest, pixels)
         for i in range(count):
             densities[i] = flat[max(pixels[i], 0)]
         for i in range(count):
@@ -102,19 +98,19 @@ def lay_nearest(x, y, p, nearest, density, index, u, v, which, weight):
 
 
 @njit(nogil=True, cache=True)
-def mark(x, y, p, nearest, counts):
-    """Add the polarity of every event to `counts` (views, h, w); `nearest` as of `lay_nearest`."""
-    flat, pixels = counts.reshape(-1), np.empty(AHEAD, np.int64)
-    for begin in range(0, x.size, AHEAD):
-        count = min(AHEAD, x.size - begin)
-        _fetch(x, y, begin, count, nearest, pixels)
+def count_polarity(x, y, p, nearest, counts):
+    """Add the polarity of every event to `counts` (views, h, w); `nearest` as above."""
+    flat, pixels = counts.reshape(-1), np.empty(BATCH, np.int64)
+    for begin in range(0, x.size, BATCH):
+        count = min(BATCH, x.size - begin)
+        _look_up(x, y, begin, count, nearest, pixels)
         for i in range(count):
             if pixels[i] >= 0:
                 flat[pixels[i]] += p[begin + i]
 
 
 @njit(nogil=True, cache=True)
-def _fetch(x, y, begin, count, nearest, pixels):
-    """Look up where `count` events fall: nothing else, so that many a wait for memory is one."""
+def _look_up(x, y, begin, count, nearest, pixels):
+    """Look up the pixels of `count` events and nothing else: their waits for memory overlap."""
     for i in range(count):
         pixels[i] = nearest[y[begin + i], x[begin + i]]

@@ -7,11 +7,11 @@ packets, description) and the packets, each with its stream and its length, up t
 end (iniVation's AEDAT4).  A packet is one LZ4 or Zstandard frame (LZ4 frame format 1.6, RFC 8878).
 """
 
+import io
 import struct
 from collections.abc import Generator, Iterator
 from pathlib import Path
-from typing import NamedTuple
-from xml.parsers import expat
+from xml.etree import ElementTree
 
 MAGIC = b"#!AER-DAT4.0\r\n"
 LARGEST_PACKET = 2**28  # bytes, packed or not; ten thousand events have 160,000
@@ -20,29 +20,23 @@ LZ4, ZSTD, SKIPPED = b"\x04\x22\x4d\x18", b"\x28\xb5\x2f\xfd", b"\x2a\x4d\x18"
 LZ4_RATIO, ZSTD_BLOCK = 255, 2**17  # at most: bytes out of one, bytes out of a block
 
 
-class Header(NamedTuple):
-    """`packets` begin at that byte and end at `table`, or with the file where it is -1."""
-
-    packets: int
-    table: int
-    description: str
-
-
 def check_header(path: Path) -> None:
     """Raise ValueError, which names the file, for a header that cannot be read or is too deep, and
     for a table of more than LARGEST_PACKET bytes: the decoder reads both when it opens the file.
     """
-    header = _header(path)
-    if 0 <= header.table < path.stat().st_size:
+    _, table, description = _header(path)
+    if 0 <= table < path.stat().st_size:
         with path.open("rb") as file:
-            file.seek(header.table)
+            file.seek(table)
             _check_size(path, file.read(LARGEST_PACKET + 1))
+    depth = 0
     try:
-        _check_depth(header.description)
-    except expat.ExpatError as error:
+        for event, _ in ElementTree.iterparse(io.StringIO(description), ("start", "end")):
+            depth += 1 if event == "start" else -1
+            if depth > DEEPEST:
+                raise ValueError(f"{path}: its description is nested beyond {DEEPEST} levels")
+    except ElementTree.ParseError as error:
         raise ValueError(f"{path}: its description cannot be read: {error}") from error
-    except RecursionError:
-        raise ValueError(f"{path}: its description is nested beyond {DEEPEST} levels") from None
 
 
 def check_packets(path: Path) -> None:
@@ -64,7 +58,8 @@ def _check_size(path: Path, packet: bytes) -> None:
         raise ValueError(f"{path}: a packet has more than {LARGEST_PACKET} bytes")
 
 
-def _header(path: Path) -> Header:
+def _header(path: Path) -> tuple[int, int, str]:
+    """Return where the packets begin and end (-1: with the file), and the description."""
     with path.open("rb") as file:
         start = file.read(len(MAGIC) + 4)
         length = int.from_bytes(start[len(MAGIC) :], "little")
@@ -72,7 +67,7 @@ def _header(path: Path) -> Header:
             raise ValueError(f"{path}: a header of {length} bytes is longer than the file")
         header = file.read(length)
     try:
-        return Header(len(start) + length, *_fields(header))
+        return len(start) + length, *_fields(header)
     except (struct.error, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: its header cannot be read: {error}") from error
 
@@ -89,25 +84,6 @@ def _fields(header: bytes) -> tuple[int, str]:
     (size,) = struct.unpack_from("<I", header, text)
     (words,) = struct.unpack_from(f"{size}s", header, text + 4)
     return struct.unpack_from("<q", header, root + table)[0] if table else -1, words.decode()
-
-
-def _check_depth(description: str) -> None:
-    """Raise RecursionError beyond DEEPEST, ExpatError for what is no XML."""
-    depth = 0
-
-    def begin(*_: object) -> None:
-        nonlocal depth
-        depth += 1
-        if depth > DEEPEST:
-            raise RecursionError
-
-    def end(_: str) -> None:
-        nonlocal depth
-        depth -= 1
-
-    parser = expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = begin, end
-    parser.Parse(description, True)
 
 
 def _unpacked(packet: bytes) -> int:

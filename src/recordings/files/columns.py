@@ -7,7 +7,7 @@ seconds.  HDF5 holds `x y t p` at the top or in the group `events`; the group ma
 
 import math
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
 
@@ -16,16 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 SUFFIXES = (".txt", ".csv", ".npz", ".h5", ".hdf5")
-PIECE = 2**18  # events in a piece
-LARGEST_CHUNK = 2**28  # bytes of HDF5 that are unpacked at a time
-PACKED = 200  # most that the columns of a recording shrink when they are packed
+PIECE_EVENTS = 2**18  # events in a piece
+MAX_CHUNK_BYTES = 2**28  # bytes of HDF5 that are unpacked at a time
+MAX_PACKING = 200  # most that the columns of a recording shrink when they are packed
 NAMES = {
     "t": ("t", "ts", "time", "timestamp"), "x": ("x", "xs"), "y": ("y", "ys"),
     "p": ("p", "ps", "on", "polarity", "pol"),
 }  # fmt: skip
 
 
-def pieces(path: Path) -> Iterator[tuple]:
+def iter_event_pieces(path: Path) -> Iterator[tuple]:
     """Yield (t int64 us, x, y, p) piece by piece; raises ValueError that names the file."""
     try:
         with np.errstate(invalid="raise"):
@@ -37,30 +37,9 @@ def pieces(path: Path) -> Iterator[tuple]:
         raise ValueError(f"{path}: cannot be read as a table of events: {error}") from error
 
 
-def write(path: Path, events: np.ndarray, size: tuple[int, int]) -> None:
-    """Write the events with the sensor's (width, height); times in microseconds."""
-    columns = {name: events[name] for name in "txyp"}
-    if path.suffix == ".npz":
-        np.savez_compressed(path, **columns, size=np.array(size))
-    elif path.suffix in (".h5", ".hdf5"):
-        with h5py.File(path, "w") as file:
-            file.attrs["size"] = size
-            for name, column in columns.items():
-                file.create_dataset(f"events/{name}", data=column, chunks=True, compression="gzip")
-            t = events["t"]
-            if len(t):
-                marks = np.searchsorted(t, np.arange(0, t[-1] // 1000 + 2) * 1000)
-                file["ms_to_idx"] = marks.astype(np.uint64)
-    else:
-        comma = "," if path.suffix == ".csv" else " "
-        header = comma.join(["t", f"x@{size[0]}", f"y@{size[1]}", "p"])
-        table = np.stack([column.astype(np.int64) for column in columns.values()], 1)
-        np.savetxt(path, table, fmt="%d", delimiter=comma, header=header, comments="")
-
-
-def size(path: Path) -> tuple[int, int] | None:
+def read_sensor_size(path: Path) -> tuple[int, int] | None:
     """Return (width, height) where the file states it."""
-    stated = None
+    stated: Sequence | None = None
     try:
         if path.suffix in (".txt", ".csv"):
             with path.open(encoding="latin-1") as file:
@@ -89,7 +68,7 @@ def _text(path: Path) -> Iterator[tuple]:
         first = file.readline()
         order, data = _layout(first)
         lines = chain([first] if data else [], file)
-        while block := list(islice(lines, PIECE)):
+        while block := list(islice(lines, PIECE_EVENTS)):
             seconds = "." in block[0].replace(",", " ").split()[order[0]]
             delimiter = "," if "," in block[0] else None
             table = np.loadtxt(block, np.float64, delimiter=delimiter, ndmin=2, usecols=order)
@@ -122,7 +101,7 @@ def _columns(path: Path) -> Iterator[tuple]:
             yield from _sliced(file, 0)
         return
     with h5py.File(path) as file:
-        check_inside(file)
+        check_no_external_data(file)
         if "CD" in file:
             raise ValueError(
                 "Prophesee HDF5 (CD/events) is packed with the vendor's own codec; export the "
@@ -131,21 +110,15 @@ def _columns(path: Path) -> Iterator[tuple]:
         columns = file.get("events", file)
         parts = [part for part in columns.values() if isinstance(part, h5py.Dataset)]
         _check_claim(path, sum(part.nbytes for part in parts))
-        yield from _sliced(columns, _offset(file))
+        stated = file.get("t_offset")
+        if stated is not None and stated.size != 1:
+            raise ValueError(f"t_offset must be one number, got {stated.shape}")
+        yield from _sliced(columns, 0 if stated is None else int(np.asarray(stated).item()))
 
 
-def _offset(file: h5py.File) -> int:
-    stated = file.get("t_offset")
-    if stated is None:
-        return 0
-    if stated.size != 1:
-        raise ValueError(f"t_offset must be one number, got {stated.shape}")
-    return int(np.asarray(stated).item())
-
-
-def check_inside(file: h5py.File) -> None:
+def check_no_external_data(file: h5py.File) -> None:
     """Raise ValueError where a part of the file is another file, as a path leads anywhere, or comes
-    in chunks beyond LARGEST_CHUNK, which are unpacked whole.
+    in chunks beyond MAX_CHUNK_BYTES, which are unpacked whole.
     """
 
     def visit(name: str, link) -> str | None:  # an error raised in here would be lost in HDF5
@@ -156,8 +129,8 @@ def check_inside(file: h5py.File) -> None:
             return None
         if part.external or part.is_virtual:
             return f"{name} lies in another file"
-        if part.dtype.itemsize * math.prod(part.chunks or ()) > LARGEST_CHUNK:
-            return f"{name} is packed in chunks of more than {LARGEST_CHUNK} bytes"
+        if part.dtype.itemsize * math.prod(part.chunks or ()) > MAX_CHUNK_BYTES:
+            return f"{name} is packed in chunks of more than {MAX_CHUNK_BYTES} bytes"
         return None
 
     if fault := file.visititems_links(visit):
@@ -170,8 +143,8 @@ def _check_packing(path: Path) -> None:
 
 
 def _check_claim(path: Path, size: int) -> None:
-    """Raise ValueError for a file that unpacks to more than PACKED times its size."""
-    most = PACKED * path.stat().st_size + 2**24
+    """Raise ValueError for a file that unpacks to more than MAX_PACKING times its size."""
+    most = MAX_PACKING * path.stat().st_size + 2**24
     if size > most:
         raise ValueError(f"it unpacks to {size} bytes, more than the {most} believed")
 
@@ -187,8 +160,8 @@ def _sliced(group, offset: int) -> Iterator[tuple]:
         raise ValueError("columns must have one dimension")
     if not len(t) == len(x) == len(y) == len(p):
         raise ValueError(f"columns differ in length: {len(t)}, {len(x)}, {len(y)}, {len(p)}")
-    for i in range(0, len(t), PIECE):
-        part = slice(i, i + PIECE)
+    for i in range(0, len(t), PIECE_EVENTS):
+        part = slice(i, i + PIECE_EVENTS)
         time = np.asarray(t[part])
         yield _us(time, time.dtype.kind == "f") + offset, *_pixels(x[part], y[part], p[part])
 

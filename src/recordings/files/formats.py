@@ -1,38 +1,40 @@
 """Event files, whatever their format, as one structured array: t int64 us, x, y uint16, p int8.
 
-Prophesee EVT2, EVT3 and DAT, AEDAT4 and ES, read and written by faery; CSV and text, npz and HDF5
-here.  A file is read in pieces of bounded memory.  What is wrong with a file is an error that names
-it, or a warning with the number of events concerned at the end of the reading.
+Prophesee EVT2, EVT3 and DAT, AEDAT4 and ES, read and written by faery; CSV, text, npz and HDF5,
+read here.  What is wrong with a file is an error that names it, or a warning with the number of
+events concerned at the end of the reading.
 """
 
 import re
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import faery
 import numpy as np
 from faery.file_encoder import events_to_file
 
+from src.recordings.engines.event_passes import convert_events
 from src.recordings.files import aedat, columns
-from src.recordings.files.engines.decode import adopt
-from src.recordings.files.event_arrays import joined, until
+from src.recordings.files.event_arrays import concatenate_events, count_before
 
 EVENT = np.dtype([("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)])
-# Endings read here, by modules with `pieces(path)` and `size(path)` as columns.py has them.
+# Endings read by modules with `iter_event_pieces` and `read_sensor_size`, as columns.py.
 READERS = dict.fromkeys(columns.SUFFIXES, columns)
 BINARY = {".raw": "evt", ".dat": "dat", ".aedat4": "aedat", ".es": "es"}
 SENSORS = {"gen3": (640, 480), "gen4": (1280, 720), "imx636": (1280, 720), "genx320": (320, 320)}
-SIDE_MAX = 2**16  # pixels: coordinates have 16 bits
-HIGHEST = 2**62  # microseconds; a time beyond is a broken file
-SILENCE_US = 2**24  # EVT3 counts time in 24 bits: the writer cannot bridge a longer silence
+MAX_SIDE = 2**16  # pixels: coordinates have 16 bits
+MAX_TIME_US = 2**62  # microseconds; a time beyond is a broken file
+EVT3_MAX_GAP_US = 2**24  # EVT3 counts time in 24 bits: the writer cannot bridge a longer silence
 DAT_SPAN_US = 2**32
-PIECE = 2**18  # events in a written piece
+PIECE_EVENTS = 2**18  # events in a written piece
 
 
 @dataclass(frozen=True)
-class Recording:
+class EventRecording:
     """An event file: `size` is its (width, height) in pixels, None where the file does not say."""
 
     path: Path
@@ -40,13 +42,13 @@ class Recording:
 
     def __iter__(self) -> Iterator[np.ndarray]:
         """Yield the events in pieces, not empty, in order of time; warn of what was wrong."""
-        last, back, outside = -HIGHEST, 0, 0
+        last, back, outside = -MAX_TIME_US, 0, 0
         width, height = self.size or (0, 0)
         for t, x, y, p in _pieces(self.path):
-            if len(t) and not -HIGHEST < int(t[0]) < HIGHEST:
+            if len(t) and not -MAX_TIME_US < int(t[0]) < MAX_TIME_US:
                 raise ValueError(f"{self.path}: event times are broken, the first is {t[0]} us")
             events = np.empty(len(t), EVENT)
-            kept, last, went, out = adopt(t, x, y, p, width, height, last, events)
+            kept, last, went, out = convert_events(t, x, y, p, width, height, last, events)
             back, outside = back + went, outside + out
             if kept:
                 yield events[:kept]
@@ -58,7 +60,7 @@ class Recording:
             )
 
 
-def open_events(path: str | Path, size: tuple[int, int] | None = None) -> Recording:
+def open_recording(path: str | Path, size: tuple[int, int] | None = None) -> EventRecording:
     """Return the recording at `path`; `size` (width, height) for a file that does not say.
 
     Raises ValueError for a file that is missing, empty or of an unknown kind.
@@ -70,45 +72,42 @@ def open_events(path: str | Path, size: tuple[int, int] | None = None) -> Record
         kinds = ", ".join((*BINARY, *READERS))
         raise ValueError(f"{path}: unknown kind of event file, known are {kinds}")
     size = _size(path) or size
-    if size is not None and not all(1 <= side <= SIDE_MAX for side in size):
-        raise ValueError(f"{path}: a sensor's sides must be in 1..{SIDE_MAX}, got {size}")
-    return Recording(path, size)
+    if size is not None and not all(1 <= side <= MAX_SIDE for side in size):
+        raise ValueError(f"{path}: a sensor's sides must be in 1..{MAX_SIDE}, got {size}")
+    return EventRecording(path, size)
 
 
 def read_events(path: str | Path, size: tuple[int, int] | None = None) -> np.ndarray:
     """Return all events of a file: t int64 us, x, y uint16, p int8 in {-1, 1}, in order of time.
 
-    Raises ValueError for a file that cannot be read; warns of events that go back in time (they
-    are given the latest time so far) and of events outside the sensor (they are dropped).
+    Raises ValueError for a file that cannot be read; warns of events that go back in time (held at
+    the latest time so far) and of events outside the sensor (dropped).
     """
-    pieces = list(open_events(path, size))
-    return joined(pieces) if pieces else np.empty(0, EVENT)
+    pieces = list(open_recording(path, size))
+    return concatenate_events(pieces) if pieces else np.empty(0, EVENT)
 
 
 def iter_events(
     path: str | Path, *, seconds: float = 0.1, size: tuple[int, int] | None = None
 ) -> Iterator[np.ndarray]:
-    """Yield the events of a file in chunks of `seconds`, counted from the first event.
-
-    A span without events yields nothing, however long it is.  Memory is that of one chunk and one
-    piece of the decoder.  Raises as `read_events` does.
-    """
+    """Yield the events of a file in chunks of `seconds` from the first event, those without events
+    left out, in the memory of one chunk.  Raises as `read_events` does."""
     if not 1e-6 <= seconds <= 1e6:
         raise ValueError(f"seconds must be in [1e-6, 1e6], got {seconds}")
     span, start, held = round(seconds * 1e6), None, []
-    for events in open_events(path, size):
+    for events in open_recording(path, size):
         start = int(events["t"][0]) if start is None else start
         while len(events):
-            cut = until(events, start + span)
+            cut = count_before(events, start + span)
             held.append(events[:cut])
             events = events[cut:]
             if len(events):
-                chunk = joined(held)
+                chunk = concatenate_events(held)
                 if len(chunk):
                     yield chunk
                 held, start = [], start + (int(events["t"][0]) - start) // span * span
     if held:
-        yield joined(held)
+        yield concatenate_events(held)
 
 
 def write_events(
@@ -123,22 +122,16 @@ def write_events(
     t, x, y, p = (events[name] for name in "txyp")
     _check_writable(path, t, x, y, p, width, height, version)
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix in columns.SUFFIXES:
-        columns.write(path, events, (width, height))
-        return
     listed = np.empty(len(events), faery.EVENTS_DTYPE)
     listed["t"], listed["x"], listed["y"], listed["on"] = t, x, y, p > 0
-    pieces = (listed[i : i + PIECE] for i in range(0, max(len(listed), 1), PIECE))
-    numbers = {".raw": version, ".dat": "dat2"}
-    kind = BINARY[path.suffix]
-    events_to_file(
-        pieces, path, (width, height), version=numbers.get(path.suffix), file_type=kind,
-        zero_t0=path.suffix != ".es",
-    )  # fmt: skip
+    pieces = (listed[i : i + PIECE_EVENTS] for i in range(0, max(len(listed), 1), PIECE_EVENTS))
+    number = {".raw": version, ".dat": "dat2"}.get(path.suffix)
+    how = {"file_type": BINARY[path.suffix], "zero_t0": path.suffix != ".es"}
+    events_to_file(pieces, path, (width, height), version=number, **how)
 
 
 def _check_writable(path, t, x, y, p, width, height, version) -> None:
-    if path.suffix not in (*BINARY, *columns.SUFFIXES) or version not in ("evt2", "evt3"):
+    if path.suffix not in BINARY or version not in ("evt2", "evt3"):
         raise ValueError(f"{path}: cannot write {path.suffix or 'no ending'} of version {version}")
     if len(t) == 0:
         return
@@ -149,7 +142,7 @@ def _check_writable(path, t, x, y, p, width, height, version) -> None:
         raise ValueError(f"{path}: events must lie on {width}x{height}, got {x.max()}, {y.max()}")
     if not np.isin(p, (-1, 1)).all():
         raise ValueError(f"{path}: polarity must be -1 or 1, got {np.unique(p)[:4].tolist()}")
-    if path.suffix == ".raw" and version == "evt3" and (gaps >= SILENCE_US).any():
+    if path.suffix == ".raw" and version == "evt3" and (gaps >= EVT3_MAX_GAP_US).any():
         raise ValueError(f"{path}: EVT3 cannot hold a silence of {gaps.max()} us, use evt2")
     if path.suffix == ".dat" and t[-1] - t[0] >= DAT_SPAN_US:
         raise ValueError(f"{path}: DAT cannot hold {t[-1] - t[0]} us, use evt2")
@@ -158,17 +151,22 @@ def _check_writable(path, t, x, y, p, width, height, version) -> None:
 def _pieces(path: Path) -> Iterator[tuple]:
     """Yield (t, x, y, p) of a file piece by piece; p is ON where positive."""
     if path.suffix in READERS:
-        yield from READERS[path.suffix].pieces(path)
+        yield from READERS[path.suffix].iter_event_pieces(path)
         return
     if path.suffix in (".raw", ".dat") and len(_header(path)) == path.stat().st_size:
         return  # a recording without events
     if path.suffix == ".aedat4":
         aedat.check_packets(path)
-    for events in _decoded(path, _decoder(path)):
+    pieces = iter(_decoder(path))
+    while True:
+        with _guarded(path):
+            events = next(pieces, None)
+        if events is None:
+            return
         yield events["t"].view(np.int64), events["x"], events["y"], events["on"]
 
 
-def _decoder(path: Path) -> Iterable[np.ndarray]:
+def _decoder(path: Path) -> Any:
     kind = BINARY[path.suffix]
     fallback = None
     if kind == "evt":
@@ -178,30 +176,19 @@ def _decoder(path: Path) -> Iterable[np.ndarray]:
             warnings.warn(f"{path}: the file ends within a word, it is truncated", stacklevel=2)
     if kind == "aedat":
         aedat.check_header(path)
-    return _guarded(
-        path,
-        lambda: faery.events_stream_from_file(
-            path, file_type=kind, version_fallback=fallback, dimensions_fallback=(65535, 65535)
-        ),
-    )
+    fallbacks = {"version_fallback": fallback, "dimensions_fallback": (65535, 65535)}
+    with _guarded(path):
+        return faery.events_stream_from_file(path, file_type=kind, **fallbacks)
 
 
-def _decoded(path: Path, stream: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-    """Yield what the decoder yields; its errors, panics of compiled code too, name the file."""
-    pieces = iter(stream)
-    while True:
-        piece = _guarded(path, lambda: next(pieces, None))
-        if piece is None:
-            return
-        yield piece
-
-
-def _guarded(path: Path, call):
+@contextmanager
+def _guarded(path: Path) -> Iterator[None]:
+    """Errors of the decoder, panics of compiled code too, which are no Exception, name the file."""
     try:
-        return call()
+        yield
     except (KeyboardInterrupt, SystemExit, MemoryError):
         raise
-    except BaseException as error:  # a panic of the decoder is no Exception
+    except BaseException as error:
         raise ValueError(f"{path}: cannot be decoded: {error}") from error
 
 
@@ -230,7 +217,7 @@ def _evt_version(path: Path) -> str:
 def _size(path: Path) -> tuple[int, int] | None:
     """Return (width, height) as the file states it, or None."""
     if path.suffix in READERS:
-        return READERS[path.suffix].size(path)
+        return READERS[path.suffix].read_sensor_size(path)
     if path.suffix in (".es", ".aedat4"):
         return _decoder(path).dimensions()
     header = _header(path).decode("latin-1").lower()

@@ -1,78 +1,102 @@
-"""Several kinds of scenes in one: what a network should see of everything."""
+"""Several kinds of scenes in one, and light that flickers with the mains.
 
+An event camera sees the flicker, the ground truth does not show it.  A lamp on alternating current
+is brightest twice a period: at 100 Hz where the mains have 50 Hz, at 120 Hz where they have 60
+(IEEE 1789-2015, which also defines percent flicker, here `depth`).
+"""
+
+import math
 from bisect import bisect
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
 
 from src.sim import noise
-from src.sim.scenes.lamps import LEAST_RATE, flicker
-from src.sim.scenes.photo_files import SPLITS, Root
-from src.sim.scenes.photographs import Clip, check_share
+from src.sim.scenes.clip import SPLITS, Clip, SceneBase
+from src.sim.scenes.photo_files import Root
+
+MAINS_HZ = (50.0, 60.0)
+LEAST_FPS = 480.0  # at fewer than four frames a period a flicker of 120 Hz aliases
+LAMP_WIDTHS = (0.15, 0.6)  # frame widths, how far a lamp that lights a part of the scene reaches
 
 
-class Mixture:
+@dataclass(kw_only=True, eq=False)
+class Mixture(SceneBase):
     """Clip `index` is that of one of `parts`, drawn by their shares.
 
     A part holds `scene`, a class of scenes with its own arguments filled in; `share`, any number
-    from 0 on, 0 leaves it out; and `splits`, those that it serves (None: all).  `flicker`: share of
-    the clips whose light flickers with the mains, by a percent flicker out of `flicker_depth`; none
-    does below 480 frames (windows times substeps) a second, where it would alias.  `frame`: what
-    all scenes are given.  `root`, `train_root` and `video` are there for the parts' configs to
-    refer to.
+    from 0 on, 0 leaves it out; and `splits`, those that it serves (None: all).  `flicker_share`: of
+    the clips whose light flickers with the mains, by a share out of `percent_flicker`; none does
+    below 480 frames (windows times substeps) a second, where it would alias.  `root`,
+    `train_root` and `video_root` are there for the parts' configs to refer to.
     """
 
-    def __init__(
-        self,
-        parts: Mapping[str, Mapping[str, Any]],
-        *,
-        split: str = "train",
-        seed: int = 0,
-        root: Root = None,
-        train_root: Root = None,
-        video: str | None = None,
-        flicker: float = 0.0,
-        flicker_depth: Sequence[float] = (0.05, 0.4),
-        **frame: Any,
-    ):
-        check_share("flicker", flicker)
-        if not 0 <= flicker_depth[0] <= flicker_depth[1] < 1:
-            allowed = "a range 0 <= low <= high < 1"
-            raise ValueError(f"scene.flicker_depth must be {allowed}, got {list(flicker_depth)}")
-        chosen = {}
-        for name, part in parts.items():
+    parts: Mapping[str, Mapping[str, Any]]
+    root: Root = None
+    train_root: Root = None
+    video_root: str | None = None
+    flicker_share: float = 0.0
+    percent_flicker: Sequence[float] = (0.05, 0.4)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.percent_flicker[0] <= self.percent_flicker[1] < 1:
+            got = list(self.percent_flicker)
+            raise ValueError(
+                f"scene.percent_flicker must be a range 0 <= low <= high < 1, got {got}"
+            )
+        served = []
+        for name, part in self.parts.items():
             share, splits = part["share"], part.get("splits") or SPLITS
-            if not (isinstance(share, int | float) and 0 <= share < float("inf")):
+            if not (isinstance(share, int | float) and 0 <= share < math.inf):
                 raise ValueError(f"scene.parts.{name}.share must be >= 0, got {share}")
             if not set(splits) <= set(SPLITS):
                 allowed = ", ".join(SPLITS)
                 raise ValueError(
                     f"scene.parts.{name}.splits must be some of {allowed}, got {splits}"
                 )
-            if share > 0 and split in splits:
-                chosen[name] = (share, part["scene"])
-        if not chosen:
-            raise ValueError(f"scene.parts must have a share > 0 for split={split}, got none")
-        self.scenes = [scene(split=split, seed=seed, **frame) for _, scene in chosen.values()]
-        self.ends = list(accumulate(share for share, _ in chosen.values()))
-        self.key = noise.key(seed, split, "mixture")
-        self.flicker, self.flicker_depth = flicker, tuple(flicker_depth)
+            served += [part] if share > 0 and self.split in splits else []
+        if not served:
+            raise ValueError(f"scene.parts must have a share > 0 for split={self.split}, got none")
+        self.scenes = [part["scene"](**self.shared_arguments()) for part in served]
+        self.cumulative_shares = list(accumulate(part["share"] for part in served))
+        self.key = noise.key(self.seed, self.split, "mixture")
 
     def clip(self, index: int) -> Clip:
-        """Return clip `index` of the part drawn for it."""
-        place = float(noise.uniform(self.key, torch.tensor(index))) * self.ends[-1]
-        clip = self.scenes[bisect(self.ends, place)].clip(index)
-        return self._lit(clip, index) if clip.fps >= LEAST_RATE else clip
-
-    def _lit(self, clip: Clip, index: int) -> Clip:
-        """Return the clip under a lamp that flickers, if one is drawn for it."""
+        draw = float(noise.uniform(self.key, torch.tensor(index)))
+        place = bisect(self.cumulative_shares, draw * self.cumulative_shares[-1])
+        clip = self.scenes[place].clip(index)
         rng = np.random.default_rng(noise.key(self.key, "flicker", index))
-        if rng.uniform() >= self.flicker:
+        if clip.fps < LEAST_FPS or rng.uniform() >= self.flicker_share:
             return clip
-        frames, *size = clip.frames.shape
-        times = np.arange(frames) / clip.fps
-        return replace(clip, lamp=flicker(rng, times, tuple(size), self.flicker_depth))
+        times_s = np.arange(len(clip.frames)) / clip.fps
+        size, depth = tuple(clip.frames.shape[1:]), self.percent_flicker
+        return replace(clip, illumination=draw_flicker(rng, times_s, size, depth))
+
+
+def draw_flicker(
+    rng: np.random.Generator, times_s: NDArray, size: tuple[int, int], depths: Sequence[float]
+) -> Float[Tensor, " frames #h #w"]:
+    """Return the factor in (0, 1] that a lamp puts on the light at `times_s`.
+
+    It goes as |sin| at the mains' frequency, of random phase, its percent flicker drawn from
+    `depths`; every second lamp lights the whole frame of `size` (h, w), the others a smooth pool.
+    """
+    low, high = depths
+    mains, depth = MAINS_HZ[rng.integers(2)], rng.uniform(low, high)
+    wave = abs(np.sin(2 * math.pi * mains * times_s + rng.uniform(0, math.pi)))
+    swing = 2 * depth / (1 + depth)  # from the highest, which is 1
+    whole, centre, reach = rng.uniform() < 0.5, rng.uniform(0, 1, 2), rng.uniform(*LAMP_WIDTHS)
+    height, width = size
+    across = np.arange(width) / width - centre[0]
+    down = (np.arange(height) - centre[1] * height) / width
+    pool = np.exp(-(across**2 + down[:, None] ** 2) / (2 * reach**2))
+    lit = np.ones((1, 1)) if whole else pool
+    return torch.from_numpy((1 - swing * lit * (1 - wave)[:, None, None]).astype(np.float32))

@@ -1,20 +1,30 @@
-"""Which photographs there are, which split each belongs to, and how one is read."""
+"""Which photographs there are, which split each belongs to, and how one is read.
 
+Many may lie in one file, a pack, which `python -m scripts.pack_scenes` writes: safetensors, under
+each name an encoded picture (WebP or any other that OpenCV decodes) as uint8, under `index.json`
+the index, {split: {name: [height, width, SHA-256 of the picture]}} in the order of the splits'
+lists, and in the file's metadata `index_sha256`.  It is mapped, not read.
+"""
+
+import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
+from hashlib import sha256
 from importlib.util import find_spec
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import Any
 
 import cv2
 from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
 
-from src.sim.scenes.photo_pack import Packed, listed
-from src.sim.scenes.pictures import decode_picture, read_picture
+from src.sim.scenes.clip import check_split
+from src.sim.scenes.video_files import PICTURE_SUFFIXES, read_picture
 
-SPLITS = ("train", "val", "test")
 SHARES = {"train": (0, 1, 2, 3, 5, 6, 8), "val": (4,), "test": (7, 9)}  # of ten photographs
-SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff"}
 LARGEST_SIDE = 1024  # of a photograph in memory
+INDEX, CHECKSUM = "index.json", "index_sha256"  # of a pack
 
 # The photographs inside the scikit-image wheel; no split shares one with another, each has scenes
 # and textures.
@@ -24,17 +34,33 @@ EMBEDDED = {
     "test": "chelsea gravel rocket",
 }
 
-Photo = Path | Packed
+
+@dataclass(frozen=True)
+class PackedPhotograph:
+    """The photograph `name` of the file `pack`."""
+
+    pack: Path
+    name: str
+
+    def __str__(self) -> str:
+        return f"{self.pack}: {self.name}"
+
+    @property
+    def stem(self) -> str:
+        return PurePosixPath(self.name).stem
+
+    def data(self) -> bytes:
+        """Return the encoded picture; raises ValueError where its checksum is not the index's."""
+        file, index = open_pack(self.pack)
+        _, _, checksum = next(names[self.name] for names in index.values() if self.name in names)
+        return _read_checked(file, self.pack, self.name, checksum)
+
+
+Photograph = Path | PackedPhotograph
 Root = str | Sequence[str] | None
 
 
-def check_split(split: str) -> None:
-    """Raise ValueError for a split that is none."""
-    if split not in SPLITS:
-        raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split}")
-
-
-def photographs(root: Root, split: str) -> list[Photo]:
+def list_photographs(root: Root, split: str) -> list[Photograph]:
     """Return the photographs of a split: of several folders or packs, each one's own share of it.
 
     `root` None: those inside scikit-image.  Raises ValueError where there are none, and for a split
@@ -42,13 +68,15 @@ def photographs(root: Root, split: str) -> list[Photo]:
     """
     check_split(split)
     if root is None:
-        folder = Path(find_spec("skimage").origin).parent / "data"
-        embedded = {path.stem: path for path in folder.iterdir() if path.suffix in SUFFIXES}
+        spec = find_spec("skimage")
+        assert spec is not None and spec.origin is not None
+        folder = Path(spec.origin).parent / "data"
+        embedded = {path.stem: path for path in folder.iterdir() if path.suffix in PICTURE_SUFFIXES}
         return [embedded[name] for name in EMBEDDED[split].split()]
     return [photo for one in _roots("root", root) for photo in _share(one, split)]
 
 
-def only_for_training(train_root: Root, root: Root) -> list[Photo]:
+def list_training_photographs(train_root: Root, root: Root) -> list[Photograph]:
     """Return the photographs that serve training only: all of a folder, of a pack its share.
 
     Raises ValueError where there are none, and where one of the two is within the other, as what
@@ -57,16 +85,47 @@ def only_for_training(train_root: Root, root: Root) -> list[Photo]:
     if train_root is None:
         return []
     places = [] if root is None else [one.resolve() for one in _roots("root", root)]
-    found: list[Photo] = []
+    found: list[Photograph] = []
     for one in _roots("train_root", train_root):
         here = one.resolve()
         if any(here.is_relative_to(place) or place.is_relative_to(here) for place in places):
             raise ValueError(f"scene.train_root must be apart from scene.root, got {one}")
-        photos = listed(one, "train") if one.is_file() else _pictures(one)
+        photos = _packed(one, "train") if one.is_file() else _pictures(one)
         if not photos:
             raise ValueError(f"scene.train_root must hold photographs, got none in {one}")
         found += photos
     return found
+
+
+@lru_cache(maxsize=8)
+def open_pack(path: Path) -> tuple[Any, dict[str, dict[str, list]]]:
+    """Return the mapped file and its index.
+
+    Raises ValueError for a file that is no pack or whose index is damaged.
+    """
+    try:
+        file = safe_open(path, "numpy")
+        checksum = (file.metadata() or {})[CHECKSUM]
+        file.get_tensor(INDEX)
+    except (SafetensorError, KeyError) as error:
+        reason = f"scene.root must be a folder or a pack of photographs, whole, got {path}"
+        raise ValueError(reason) from error
+    return file, json.loads(_read_checked(file, path, INDEX, checksum))
+
+
+@lru_cache(maxsize=512)
+def read_photograph(photo: Photograph) -> NDArray:
+    """Return a photograph's luminance as uint8, at most LARGEST_SIDE long.
+
+    Raises ValueError for one that cannot be read or is damaged, and for a side below 16 px.
+    """
+    picture = read_picture(photo.data() if isinstance(photo, PackedPhotograph) else photo)
+    shrink = 1 if picture is None else min(1, LARGEST_SIDE / max(picture.shape))
+    if picture is None or shrink * min(picture.shape) < 16:
+        raise ValueError(f"scene.root must hold readable photographs of 16 px or more, got {photo}")
+    if shrink < 1:
+        picture = cv2.resize(picture, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    return picture
 
 
 def _roots(key: str, root: str | Sequence[str]) -> list[Path]:
@@ -79,35 +138,33 @@ def _roots(key: str, root: str | Sequence[str]) -> list[Path]:
     return roots
 
 
-def _share(root: Path, split: str) -> list[Photo]:
+def _share(root: Path, split: str) -> list[Photograph]:
     if root.is_file():
-        photos = listed(root, split)
+        photos = _packed(root, split)
         if not photos:
             raise ValueError(f"scene.root must hold photographs of split={split}, got {root}")
         return photos
     paths = _pictures(root)
     if len(paths) < 10:
-        raise ValueError(
-            f"scene.root must hold at least 10 photographs, got {len(paths)} in {root}"
-        )
+        found = f"{len(paths)} in {root}"
+        raise ValueError(f"scene.root must hold at least 10 photographs, got {found}")
     return [path for place, path in enumerate(paths) if place % 10 in SHARES[split]]
 
 
-def _pictures(folder: Path) -> list[Photo]:
-    return sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
+def _packed(pack: Path, split: str) -> list[Photograph]:
+    return [PackedPhotograph(pack, name) for name in open_pack(pack)[1].get(split, ())]
 
 
-@lru_cache(maxsize=512)
-def read(photo: Photo) -> NDArray:
-    """Return a photograph's luminance as uint8, at most LARGEST_SIDE long.
+def _pictures(folder: Path) -> list[Photograph]:
+    return [*sorted(p for p in folder.rglob("*") if p.suffix.lower() in PICTURE_SUFFIXES)]
 
-    Raises ValueError for one that cannot be read or is damaged, and for a side below 16 px.
-    """
-    whole = isinstance(photo, Packed)
-    picture = decode_picture(photo.data()) if whole else read_picture(photo)
-    shrink = 1 if picture is None else min(1, LARGEST_SIDE / max(picture.shape))
-    if picture is None or shrink * min(picture.shape) < 16:
-        raise ValueError(f"scene.root must hold readable photographs of 16 px or more, got {photo}")
-    if shrink < 1:
-        picture = cv2.resize(picture, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-    return picture
+
+def _read_checked(file: Any, path: Path, name: str, checksum: str) -> bytes:
+    try:
+        data = file.get_tensor(name).tobytes()
+    except SafetensorError:
+        data = b""
+    if sha256(data).hexdigest() != checksum:
+        reason = f"is damaged: the SHA-256 of {name} is not as packed"
+        raise ValueError(f"scene.root: {path} {reason}")
+    return data

@@ -2,8 +2,8 @@
 
 A level is an int32 multiple of 2**-20 nat.  The table is read at the upper 18 bits of the float32
 intensity (1024 nodes per octave, as floats are laid out) and interpolated linearly with integers,
-so that every processor makes the same level of the same intensity.  The error against the exact
-curve is below one unit; only where the lin-log curve has its kink it reaches 4e-4 nat.
+so that every processor makes the same level of the same intensity.  The error is below one unit,
+4e-4 nat at the kink of the lin-log curve.
 """
 
 import math
@@ -19,7 +19,6 @@ UNIT = 2**20  # levels per nat
 OCTAVES = 14  # intensities below 2**-14 count as 2**-14
 NODES = 1024  # per octave
 FIRST = (127 - OCTAVES) << 23  # the bits of 2**-14
-LAST = (128 << 23) - 1  # the bits of the largest float below 2
 CELL = 13  # bits of a float within one cell of the table
 EXTRA = 4  # the table keeps levels to 2**-24 nat
 CPU = torch.device("cpu")
@@ -48,24 +47,21 @@ def response_table(
     zero below code value 20, the logarithm of the code value above.  `source` says what the
     intensities are: `linear`, taken as they are, or `srgb`, decoded to linear light first.
     """
-    x = nodes(source)
-    if response == "log":
-        y = np.log(np.maximum(x, floor))
-    else:
-        slope = math.log(20.0) / 20.0
-        y = np.where(x <= LINLOG_KNEE, 255.0 * x * slope, np.log(255.0 * x))
+    x, slope = nodes(source), math.log(20.0) / 20.0
+    linlog = np.where(x <= LINLOG_KNEE, 255.0 * x * slope, np.log(255.0 * x))
+    y = linlog if response == "linlog" else np.log(np.maximum(x, floor))
     return torch.from_numpy(_scaled(y)).to(device)
 
 
 @lru_cache(maxsize=16)
-def low_pass_table(cutoff_hz: float, fps: float, source: str) -> NDArray[np.int32]:
+def low_pass_table(cutoff_hz: float, fps: float, encoding: str) -> NDArray[np.int32]:
     """Return decay and lag of a photoreceptor at the table's nodes, (2, nodes) in 2**-24.
 
     The photoreceptor is one pole whose corner frequency is proportional to intensity (v2e). For
     a level that moves linearly by D in an interval dt and a/tau = 2 pi f dt the exact solution
     is y1 + (filtered0 - y0) exp(-a) - D (1 - exp(-a)) / a, whatever the interval.
     """
-    a = 2 * math.pi * cutoff_hz / fps * (255 * nodes(source) + 20) / 275
+    a = 2 * math.pi * cutoff_hz / fps * (255 * nodes(encoding) + 20) / 275
     return _scaled(np.stack([np.exp(-a), -np.expm1(-a) / a]))
 
 
@@ -78,19 +74,3 @@ def nodes(source: str) -> np.ndarray:
     bits = FIRST + (np.arange((OCTAVES + 1) * NODES + 1, dtype=np.int64) << CELL)
     x = bits.astype(np.int32).view(np.float32).astype(np.float64)
     return decode_srgb(torch.from_numpy(x)).numpy() if source == "srgb" else x
-
-
-def lookup(
-    table: Int[Tensor, " entries"],
-    intensity: Float[Tensor, "*shape"],
-    begin: int | Int[Tensor, "..."] = 0,
-) -> Int[Tensor, "*shape"]:
-    """Return a curve's value at float32 intensities, int32, its extra bits rounded away.
-
-    `table` holds one curve or several end to end; `begin`: where that of each intensity begins.
-    """
-    place = intensity.contiguous().view(torch.int32).clamp(FIRST, LAST) - FIRST
-    cell, inside = (place >> CELL) + begin, place & (2**CELL - 1)
-    left = table[cell]
-    value = left + (((table[cell + 1] - left) * inside) >> CELL)
-    return (value + (1 << (EXTRA - 1))) >> EXTRA

@@ -3,13 +3,13 @@
 Between two frames the log intensity of a pixel is linear in time; an event is the moment at which
 it is a threshold away from the pixel's reference.  Levels and thresholds are integers and noise is
 a function of (seed, clip, view, pixel, frame), so all engines, crops and batches agree bit for
-bit.  The sensor's clock ticks in microseconds: an event of frame interval k is stamped with the
-tick in which it falls, in [edge_k, edge_k+1) with edge_k = ceil(k 10^6 / fps).
+bit.  Events are stamped in microseconds, those of frame interval k in [edge_k, edge_k+1) with
+edge_k = ceil(k 10^6 / fps).
 """
 
 from collections.abc import Mapping, Sequence
-from copy import copy
-from typing import Any
+from dataclasses import KW_ONLY, dataclass, field, replace
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -17,96 +17,43 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from src.sim import noise
+from src.sim.sensor.engine_input import (
+    COMMON,
+    SensorClip,
+    build_engine_input,
+    check_frames,
+    check_settings,
+    threshold_range,
+)
 from src.sim.sensor.engines import run, sensor_cpu
-from src.sim.sensor.engines.job import Job, State
-from src.sim.sensor.jobs import make_job, whole_windows
-from src.sim.sensor.limits import check, threshold_range
-from src.sim.sensor.response import decode_srgb
+from src.sim.sensor.engines.records import EngineInput
 
-__all__ = ["EVENT", "EventSensor", "State", "decode_srgb"]
+# What the random numbers of a setting are keyed by, where it is not the setting's name.
+RANDOM_STREAMS = {
+    "leak_event_hz": "leak_hz",
+    "dark_noise_hz": "shot_hz",
+    "hot_pixel_fraction": "hot_fraction",
+    "hot_pixel_hz": "hot_hz",
+    "initial_reference_error": "residual",
+}
 
-EVENT = sensor_cpu.EVENT
 
+@runtime_checkable
+class Sensor(Protocol):
+    """The pixels behind all views: the contract of `sensor._target_`.
 
-class EventSensor:
-    """An event camera's pixels.
-
-    `threshold` C, in nat of intensity as `input` has it, one number or a range (low, high) out of
-    which `sample_threshold` draws a clip's; `off_ratio`, the OFF threshold over the ON threshold.
-    `refractory_s` the dead time after an event; `refractory` what becomes of a crossing within it:
-    `defer` (the reference waits, the event comes when the dead time ends; v2e), `delete` (the
-    reference moves on, the event is lost; ESIM), `hold` (the pixel is in reset and starts from the
-    level at the end; hardware).  `stamps`: `linear`, the crossing's own time, or `v2e`, spread
-    evenly by the busiest pixel of the view.  `input`: `linear`, the frames are taken for intensity
-    as they are, or `srgb`, the frames are decoded here; whoever decodes them before passes
-    `linear`.  `response`: `log` of max(intensity, floor), or `linlog`, v2e's.
-    `mismatch`: relative deviation of a pixel's thresholds, fixed per (seed, view, pixel).
-    `leak_hz`: ON events of a pixel in the dark.  `shot_hz`: noise events of a black pixel (a white
-    one has a quarter).  `hot_fraction` of the pixels make `hot_hz` noise events.  `cutoff_hz`: the
-    photoreceptor's low-pass at full intensity, 0 for none.  `residual`: how far a pixel's reference
-    is from its first level, uniform up to so many thresholds either way: what it saw before is not
-    known.  `drawn`: ranges out of which `draw` takes a clip's numbers, log-uniform, or uniform
-    where the range begins with 0; with probability `drawn_share`, else they are the sensor's own.
+    The class is given the values of the config and `seed`; `input`, where the config has it, is
+    `linear` for frames that were decoded before the turbulence.  `write=` of src.simulate and
+    src.stress also want `events` of it, `calibrate task=threshold` `counts`, as in `EventSensor`.
     """
 
-    def __init__(
-        self,
-        threshold: float | Sequence[float] = 0.2,
-        *,
-        refractory_s: float = 0.005,
-        refractory: str = "defer",
-        stamps: str = "linear",
-        input: str = "linear",
-        mismatch: float = 0.0,
-        leak_hz: float = 0.0,
-        shot_hz: float = 0.0,
-        seed: int = 0,
-        response: str = "log",
-        floor: float = 1 / 255,
-        off_ratio: float = 1.0,
-        hot_fraction: float = 0.0,
-        hot_hz: float = 0.0,
-        cutoff_hz: float = 0.0,
-        residual: float = 0.0,
-        drawn: Mapping[str, Any] | None = None,
-        drawn_share: float = 1.0,
-    ):
-        self.threshold = threshold if isinstance(threshold, int | float) else tuple(threshold)
-        self.refractory_s, self.refractory, self.stamps = refractory_s, refractory, stamps
-        self.input, self.response, self.floor = input, response, floor
-        self.mismatch, self.off_ratio = mismatch, off_ratio
-        self.leak_hz, self.shot_hz = leak_hz, shot_hz
-        self.hot_fraction, self.hot_hz, self.cutoff_hz = hot_fraction, hot_hz, cutoff_hz
-        self.residual, self.seed = residual, seed
-        self.drawn, self.drawn_share = dict(drawn or {}), drawn_share
-        check(vars(self))
+    threshold: Any  # of the sensor that `draw` returns, a number: recorded
+    random: Mapping[str, Any]  # names of the attributes that differ from clip to clip: recorded
 
-    def having(self, **settings) -> "EventSensor":
-        """Return the same sensor with other `settings`, arguments of the class."""
-        sensor = copy(self)
-        vars(sensor).update(settings)
-        check(vars(sensor))
-        return sensor
-
-    def draw(self, key: int, seed: int | None = None) -> "EventSensor":
-        """Return the sensor of one clip, its numbers drawn from `key`; of another `seed`, if any.
-
-        The threshold's own range is uniform, from the stream that `sample_threshold` draws from.
-        """
-        sensor = copy(self)
-        sensor.threshold = self.sample_threshold(noise.generator(noise.key(key, "threshold")))
-        some = _uniform(key, "drawn") < self.drawn_share
-        for name, (low, high) in self.drawn.items() if some else ():
-            share = _uniform(key, name)
-            drawn = low * (high / low) ** share if low > 0 else high * share
-            setattr(sensor, name, min(drawn, high))
-        sensor.drawn, sensor.seed = {}, self.seed if seed is None else seed
-        return sensor
-
-    def sample_threshold(self, generator: torch.Generator) -> float:
-        """Return one clip's threshold: uniform in the range, or the number itself."""
-        low, high = threshold_range(self.threshold)
-        return low + (high - low) * float(torch.rand((), generator=generator))
+    def draw(self, key: int, pixel_seed: int | None = None) -> "Sensor":
+        """Return the sensor of one clip, all that is random about it drawn from `key`, its pixels
+        those of `pixel_seed` (None: of its own seed)."""
+        ...
 
     def voxels(
         self,
@@ -119,48 +66,98 @@ class EventSensor:
         views: Sequence[int] | None = None,
         origin: tuple[int, int] = (0, 0),
         full_width: int | None = None,
-        threshold: Float[Tensor, " n"] | None = None,
+    ) -> Float[Tensor, "n views windows bins h w"]:
+        """Return one grid per window of `substeps` frame intervals; see `EventSensor.voxels`."""
+        ...
+
+
+@dataclass(eq=False)
+class EventSensor:
+    """An event camera's pixels.
+
+    `threshold` C, in nat of intensity as `input` has it, one number or a range (low, high) out of
+    which `draw` takes a clip's, uniform; `off_ratio`, the OFF threshold over the ON threshold.
+    `refractory_s` the dead time after an event; `refractory` what becomes of a crossing within it:
+    `defer` (the event comes when the dead time ends; v2e), `delete` (the event is lost, the
+    reference moves on; ESIM), `hold` (the pixel starts from the level at the end; hardware).
+    `stamps`: `linear`, the crossing's own time, or `v2e`, spread evenly by the pixel of the view
+    with most crossings.  `input`: the frames are taken for intensity (`linear`) or decoded here
+    (`srgb`).  `response`: `log` of max(intensity, floor), or `linlog`, v2e's.
+    `mismatch`: relative deviation of a pixel's thresholds, fixed per (seed, view, pixel).
+    `leak_event_hz`: ON events of a pixel whose light does not change.  `dark_noise_hz`: noise
+    events of a black pixel (a white one has a quarter).  `hot_pixel_fraction` of the pixels make
+    `hot_pixel_hz` noise events.  `cutoff_hz`: the photoreceptor's low-pass at full intensity, 0 for
+    none.  `initial_reference_error`: how far a pixel's reference is from its first level, uniform
+    up to so many thresholds either way: what it saw before is not known.  `random`: ranges out of
+    which `draw` takes a clip's numbers, log-uniform, or uniform where the range begins with 0; with
+    probability `random_share`, else they are the sensor's own.
+    """
+
+    threshold: float | Sequence[float] = 0.2
+    _: KW_ONLY
+    refractory_s: float = 0.005
+    refractory: str = "defer"
+    stamps: str = "linear"
+    input: str = "linear"
+    mismatch: float = 0.0
+    leak_event_hz: float = 0.0
+    dark_noise_hz: float = 0.0
+    seed: int = 0
+    response: str = "log"
+    floor: float = 1 / 255
+    off_ratio: float = 1.0
+    hot_pixel_fraction: float = 0.0
+    hot_pixel_hz: float = 0.0
+    cutoff_hz: float = 0.0
+    initial_reference_error: float = 0.0
+    random: Mapping[str, Any] = field(default_factory=dict)
+    random_share: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_settings(vars(self))
+
+    def draw(self, key: int, pixel_seed: int | None = None) -> "EventSensor":
+        low, high = threshold_range(self.threshold)
+        generator = noise.generator(noise.key(key, "threshold"))
+        drawn: dict[str, Any] = {"random": {}}
+        drawn["threshold"] = low + (high - low) * float(torch.rand((), generator=generator))
+        if _uniform(key, "drawn") < self.random_share:
+            for name, (low, high) in self.random.items():
+                share = _uniform(key, RANDOM_STREAMS.get(name, name))
+                drawn[name] = min(low * (high / low) ** share if low > 0 else high * share, high)
+        return replace(self, **drawn, seed=self.seed if pixel_seed is None else pixel_seed)
+
+    def voxels(
+        self,
+        frames: Float[Tensor, "n views frames h w"],
+        fps: float,
+        bins: int = 5,
+        *,
+        substeps: int = 1,
+        clips: Sequence[int] | None = None,
+        views: Sequence[int] | None = None,
+        origin: tuple[int, int] = (0, 0),
+        full_width: int | None = None,
     ) -> Float[Tensor, "n views windows bins h w"]:
         """Return one grid per window of `substeps` frame intervals, float32 on the frames' device;
         in memory the windows come before the views.
 
         `fps` is the rate of `frames`; intensities in [0, 1].  `clips` and `views` (ids) and the
-        crop's `origin` (top, left) in a frame `full_width` wide key the noise.  `threshold`: ON
-        threshold per clip, instead of the sensor's.  Frames after the last whole window are not
-        simulated.  Raises ValueError for frames that are not finite or outside [0, 1], or too few.
+        crop's `origin` (top, left) in a frame `full_width` wide key the noise.  Frames after the
+        last whole window are not simulated.  Raises ValueError for frames that are not finite or
+        outside [0, 1], or too few.
         """
-        frames = whole_windows(frames, substeps)
-        return self.step(
-            frames, fps, None, bins, substeps=substeps, clips=clips, views=views, origin=origin,
-            full_width=full_width, threshold=threshold,
-        )[0]  # fmt: skip
-
-    def step(
-        self,
-        frames: Float[Tensor, "n views frames h w"],
-        fps: float,
-        state: State | None = None,
-        bins: int = 5,
-        *,
-        substeps: int = 1,
-        **keys,
-    ) -> tuple[Float[Tensor, "n views windows bins h w"], State]:
-        """Return the grids of a chunk and the state to go on from; `keys` as in `voxels`.
-
-        With `state` None the first frame only sets the references; later chunks hold new frames
-        only, a whole number of windows of them.  Raises ValueError as `voxels` does; a `state` that
-        was given with wrong intensities is then lost.
-        """
-        job = self._job(frames, fps, state, substeps, **keys)
-        n, views, _, h, w = frames.shape
-        grids = run.zeros((n, job.intervals // substeps, views, bins, h, w), frames.device)
-        return run.voxels(job, grids).transpose(1, 2), job.state
+        given = self._engine_input(frames, fps, clips, views, origin, full_width, substeps)
+        n, v, count, h, w = given.frames.shape
+        grids = run.zeros((n, (count - 1) // substeps, v, bins, h, w), frames.device)
+        return run.voxels(given, grids).transpose(1, 2)
 
     def counts(
-        self, frames: Float[Tensor, "n views frames h w"], fps: float, **keys
-    ) -> Int[Tensor, "n views 2"]:
-        """Return the numbers of ON and OFF events of each clip and view; `keys` as in `voxels`."""
-        return sensor_cpu.counts(self._job(frames.cpu(), fps, None, 1, **keys))
+        self, frames: Float[Tensor, "n views frames h w"], fps: float,
+        clips: Sequence[int] | None = None,
+    ) -> Int[Tensor, "n views 2"]:  # fmt: skip
+        """Return the numbers of ON and OFF events of each clip and view; `clips` as in `voxels`."""
+        return sensor_cpu.counts(self._engine_input(frames.cpu(), fps, clips))
 
     def events(
         self, frames: Float[Tensor, "frames h w"], fps: float, *, clip: int = 0, view: int = 0,
@@ -170,28 +167,67 @@ class EventSensor:
 
         Time starts at the first frame.  Raises ValueError as `voxels` does.
         """
-        keys = {"clips": [clip], "views": [view], "origin": origin, "full_width": full_width}
-        return sensor_cpu.events(self._job(frames[None, None].cpu(), fps, None, 1, **keys))
+        one = frames[None, None].cpu()
+        return sensor_cpu.events(self._engine_input(one, fps, [clip], [view], origin, full_width))
 
-    def _job(
-        self, frames, fps, state, substeps, *, clips=None, views=None, origin=(0, 0),
-        full_width=None, threshold=None,
-    ) -> Job:  # fmt: skip
-        n, v, w = len(frames), frames.shape[1], frames.shape[-1]
-        return make_job(
-            [self] * n,
-            frames,
-            [fps] * n,
-            state,
-            substeps=substeps,
-            clips=range(n) if clips is None else clips,
-            views=range(v) if views is None else views,
-            origins=[origin] * n,
-            full_widths=[w if full_width is None else full_width] * n,
-            thresholds=None if threshold is None else threshold.double().tolist(),
-        )
+    def _engine_input(
+        self, frames: Tensor, fps: float, clips: Sequence[int] | None = None,
+        views: Sequence[int] | None = None, origin: tuple[int, int] = (0, 0),
+        full_width: int | None = None, substeps: int = 1,
+    ) -> EngineInput:  # fmt: skip
+        width = frames.shape[-1] if full_width is None else full_width
+        keys = range(len(frames)) if clips is None else clips
+        views = range(frames.shape[1]) if views is None else views
+        sensor_clips = [SensorClip(self, fps, key, origin, width) for key in keys]
+        return build_engine_input(sensor_clips, frames, views, substeps=substeps)
+
+
+def simulate_voxels(
+    clips: Sequence[SensorClip],
+    frames: Float[Tensor, "n views frames h w"],
+    views: Sequence[int],
+    *,
+    bins: int = 5,
+    substeps: int = 1,
+    out: Float[Tensor, "n windows views bins h w"] | None = None,
+) -> Float[Tensor, "n windows views bins h w"]:
+    """Return the grids of n clips, contiguous and on the frames' device: in `out`, if given, which
+    must be so too and hold zeros.
+
+    Equal bit for bit to `voxels` of each clip's sensor; `frames` (float32, or float16 which is
+    widened as it is read) may lie in memory in any order; `views`: ids.  `EventSensor`s of the same
+    settings go through their engine together, a sensor of another class by itself.  Raises
+    ValueError as `EventSensor.voxels` does.
+    """
+    check_frames(frames, len(clips), len(views), substeps)
+    n, v, count, h, w = frames.shape
+    shape = (n, (count - 1) // substeps, v, bins, h, w)
+    out = run.zeros(shape, frames.device) if out is None else out
+    if tuple(out.shape) != shape or not out.is_contiguous():
+        raise ValueError(f"out must be contiguous {shape}, got {tuple(out.shape)}")
+    groups: dict[object, list[int]] = {}
+    for i, (sensor, *_) in enumerate(clips):
+        together: object = i  # what is derived from EventSensor may do everything else
+        if type(sensor) is EventSensor:
+            together = *(getattr(sensor, name) for name in COMMON), sensor.cutoff_hz > 0
+        groups.setdefault(together, []).append(i)
+    for group in groups.values():
+        whole, own = len(group) == n, [clips[i] for i in group]
+        seen = frames if whole else frames[group]
+        grids = out if whole else run.zeros((len(group), *shape[1:]), frames.device)
+        sensor, fps, key, origin, full_width = own[0]
+        if type(sensor) is EventSensor:
+            run.voxels(build_engine_input(own, seen, views, substeps=substeps), grids)
+        else:
+            found = sensor.voxels(
+                seen.float(), fps, bins, substeps=substeps, clips=[key], views=views,
+                origin=origin, full_width=full_width,
+            )  # fmt: skip
+            grids.copy_(found.transpose(1, 2))
+        if not whole:
+            out[group] = grids
+    return out
 
 
 def _uniform(key: int, name: str) -> float:
-    """Return a number in [0, 1), one of each name."""
     return noise.uniforms(noise.key(key, "sensor", name), 1)[0]

@@ -1,4 +1,4 @@
-"""Air: one atmosphere as numbers, how it is drawn, its phase, and what it does to a picture."""
+"""Turbulence: an atmosphere as numbers, how it is drawn, and what it does to an image."""
 
 from src.sim.turbulence.atmosphere import Atmosphere
 from src.sim.turbulence.operator import Turbulence

@@ -1,4 +1,4 @@
-"""Von Karman air: what an outer scale L0 takes from the phase, and how far its tilt reaches.
+"""Statistics of von Karman turbulence in closed form: tilt with an outer scale L0, and blur.
 
 The phase of a layer has the power SPECTRUM r0^(-5/3) (f^2 + 1/L0^2)^(-11/6) (von Karman); L0 = inf
 is Kolmogorov's.  A layer at z = u L is seen through a disc of D (1 - u), so with kappa = D (1 - u) f
@@ -19,50 +19,61 @@ from jaxtyping import Float
 from scipy import special
 from scipy.interpolate import RegularGridInterpolator
 
-Profile = tuple[float, ...]  # Cn2 at equally spaced points from the camera to the object
+Cn2Profile = tuple[float, ...]  # Cn2 at equally spaced points from the camera to the object
 Lags = Float[np.ndarray, " lags"]
 
 SLICES = 120  # of the path
 KAPPA = np.exp(np.linspace(math.log(1e-14), math.log(30.0), 1600))
 STEP = math.log(KAPPA[1] / KAPPA[0])
+KAPPA0 = np.concatenate([[0.0], np.geomspace(1e-4, 100, 61)])
 TILT = (2 * special.jv(2, math.pi * KAPPA) / (math.pi * KAPPA)) ** 2
 PISTON = (2 * special.jv(1, math.pi * KAPPA) / (math.pi * KAPPA)) ** 2
 HIGHER = np.where(KAPPA > 1e-3, 1 - PISTON - 4 * TILT, 0)  # of the modes beyond tilt; kappa^4 at 0
 NEAREST, FARTHEST = 1e-3, 1e4  # D; the ends of what is tabulated as a length
 LAGS = np.geomspace(NEAREST, FARTHEST, 141)
+BLUR_D_OVER_R0 = np.concatenate([[0.0], np.geomspace(0.05, 40, 60)])
+BLUR_RADII = np.geomspace(0.4, 60, 200)  # lambda / D
+GAUSSIAN_HALF_LIGHT = math.sqrt(2 * math.log(2))  # half-light radius over standard deviation
 
 
-def left(ratio: float, profile: Profile, modes: str) -> float:
-    """Return the share of the variance that an outer scale L0 = D / `ratio` leaves.
-
-    `modes`: `tilt`, or `higher`, all modes beyond tilt.
-    """
+def variance_ratio(aperture_over_outer_scale: float, profile: Cn2Profile, modes: str) -> float:
+    """Return the share of the variance of `modes`, `tilt` or `higher` (all modes beyond tilt), that
+    an outer scale L0 = D / `aperture_over_outer_scale` leaves."""
     place, weight = _path(profile)
-    powers = np.interp(_log(ratio * (1 - place)), _log(_kappa0()), _powers()[modes])
-    return float(weight @ powers / _powers()[modes][0])
+    powers = np.interp(
+        _log(aperture_over_outer_scale * (1 - place)), _log(KAPPA0), _variances()[modes]
+    )
+    return float(weight @ powers / _variances()[modes][0])
 
 
-def tilt_correlation(ratio: float, profile: Profile, lags: Lags, *, wind: bool = False) -> Lags:
+def tilt_correlation(
+    aperture_over_outer_scale: float, profile: Cn2Profile, lags: Lags, *, wind: bool = False
+) -> Lags:
     """Return the correlation of the tilt of two points `lags` D apart at the object.
 
     With `wind`: of one point with itself after a wind common to the path moved the air `lags` D.
     """
     place, weight = _path(profile)
     apart = np.multiply.outer(lags, (1 if wind else place) / (1 - place))
-    kappa0 = np.broadcast_to(ratio * (1 - place), apart.shape)
+    kappa0 = np.broadcast_to(aperture_over_outer_scale * (1 - place), apart.shape)
     covariance = _covariance()((_log(kappa0), np.log(apart.clip(1e-6, 1e7)))) @ weight
-    power = np.interp(_log(ratio * (1 - place)), _log(_kappa0()), _powers()["tilt"]) @ weight
+    power = (
+        np.interp(_log(aperture_over_outer_scale * (1 - place)), _log(KAPPA0), _variances()["tilt"])
+        @ weight
+    )
     return covariance / power
 
 
 @lru_cache(maxsize=4096)
-def tilt_reach(ratio: float, profile: Profile, *, wind: bool = False) -> float:
+def tilt_correlation_distance(
+    aperture_over_outer_scale: float, profile: Cn2Profile, *, wind: bool = False
+) -> float:
     """Return the distance in D at which the tilt's correlation falls to 1/2, with `wind` to 1 / e.
 
     NEAREST to FARTHEST, which stands for any longer one.
     """
     level = math.exp(-1) if wind else 0.5
-    correlation = _curve(ratio, profile, wind)
+    correlation = _correlation_over_lags(aperture_over_outer_scale, profile, wind)
     first = int((correlation < level).argmax())
     if first == 0:
         return FARTHEST if correlation[0] >= level else NEAREST
@@ -70,42 +81,35 @@ def tilt_reach(ratio: float, profile: Profile, *, wind: bool = False) -> float:
     return float(np.exp(np.interp(-level, -correlation[ends], np.log(LAGS[ends]))))
 
 
-def whole_share(ratio: float, profile: Profile, view: float) -> float:
+def global_tilt_share(aperture_over_outer_scale: float, profile: Cn2Profile, view: float) -> float:
     """Return the share of the tilt's variance that moves all of a square view, `view` D a side.
 
     The mean correlation of two of its points; the density of their distance: Philip (2007).
     """
     apart = math.sqrt(2) * (np.arange(200) + 0.5) / 200
     far = np.sqrt(np.maximum(apart**2 - 1, 0))
-    density = np.where(
-        apart < 1,
-        apart**2 - 4 * apart + math.pi,
-        4 * far - apart**2 - 2 + math.pi - 4 * np.arctan(far),
-    )
-    weight = apart * density
-    correlation = np.interp(np.log(apart * view), np.log(LAGS), _curve(ratio, profile, False))
+    beyond = 4 * far - apart**2 - 2 + math.pi - 4 * np.arctan(far)
+    weight = apart * np.where(apart < 1, apart**2 - 4 * apart + math.pi, beyond)
+    known = _correlation_over_lags(aperture_over_outer_scale, profile, False)
+    correlation = np.interp(np.log(apart * view), np.log(LAGS), known)
     return float(weight @ correlation / weight.sum())
 
 
 @lru_cache(maxsize=4096)
-def _curve(ratio: float, profile: Profile, wind: bool) -> Lags:
-    """Return `tilt_correlation` over LAGS."""
-    return tilt_correlation(ratio, profile, LAGS, wind=wind)
-
-
-@cache
-def _kappa0() -> Float[np.ndarray, " scales"]:
-    return np.concatenate([[0.0], np.geomspace(1e-4, 100, 61)])
+def _correlation_over_lags(
+    aperture_over_outer_scale: float, profile: Cn2Profile, wind: bool
+) -> Lags:
+    return tilt_correlation(aperture_over_outer_scale, profile, LAGS, wind=wind)
 
 
 @cache
 def _spectra() -> Float[np.ndarray, "scales kappa"]:
     """Return kappa (kappa^2 + kappa0^2)^(-11/6) d kappa."""
-    return KAPPA**2 * (KAPPA**2 + _kappa0()[:, None] ** 2) ** (-11 / 6) * STEP
+    return KAPPA**2 * (KAPPA**2 + KAPPA0[:, None] ** 2) ** (-11 / 6) * STEP
 
 
 @cache
-def _powers() -> dict[str, Float[np.ndarray, " scales"]]:
+def _variances() -> dict[str, Float[np.ndarray, " scales"]]:
     return {"tilt": _spectra() @ TILT, "higher": _spectra() @ HIGHER}
 
 
@@ -114,16 +118,46 @@ def _covariance() -> RegularGridInterpolator:
     """Return the tilt's covariance over log kappa0 and log of the distance in footprints."""
     apart = np.geomspace(1e-6, 1e7, 400)
     values = (_spectra() * TILT) @ special.j0(2 * math.pi * np.multiply.outer(KAPPA, apart))
-    return RegularGridInterpolator((_log(_kappa0()), np.log(apart)), values)
+    return RegularGridInterpolator((_log(KAPPA0), np.log(apart)), values)
 
 
 def _log(kappa0: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     return np.log(np.clip(kappa0, 1e-6, 100))
 
 
-def _path(profile: Profile) -> tuple[np.ndarray, np.ndarray]:
+def _path(profile: Cn2Profile) -> tuple[np.ndarray, np.ndarray]:
     """Return z / L of slices and their weight in the tilt, Cn2 (1 - z/L)^(5/3), summing to 1."""
     place = (np.arange(SLICES) + 0.5) / SLICES
     knots = np.linspace(0, 1, len(profile)) if len(profile) > 1 else [0.5]
     weight = np.interp(place, knots, profile) * (1 - place) ** (5 / 3)
     return place, weight / weight.sum()
+
+
+def half_light_radius(d_over_r0: float) -> float:
+    """Return the radius that holds half of a point's light, tilt removed, in lambda / D.
+
+    From the mean transfer function T(nu) exp(-3.44 (nu D/r0)^(5/3) (1 - nu^(1/3))), nu in units of
+    D / lambda and T that of the aperture (Fried 1966, near field).
+    """
+    return float(np.interp(d_over_r0, BLUR_D_OVER_R0, _half_light_radii()))
+
+
+def turbulence_blur(d_over_r0: float) -> float:
+    """Return by how much turbulence blurs beyond diffraction, tilt removed, in lambda / D.
+
+    The standard deviation along one axis of the Gaussian whose half-light radius, added in squares
+    to that of diffraction, gives `half_light_radius`.
+    """
+    squares = half_light_radius(d_over_r0) ** 2 - half_light_radius(0.0) ** 2
+    return math.sqrt(squares) / GAUSSIAN_HALF_LIGHT
+
+
+@cache
+def _half_light_radii() -> np.ndarray:
+    nu = (np.arange(1500) + 0.5) / 1500
+    aperture = 2 / math.pi * (np.arccos(nu) - nu * np.sqrt(1 - nu**2))
+    turns = 2 * math.pi * BLUR_RADII[:, None]
+    rings = turns * special.j1(turns * nu) / len(nu)
+    decay = -3.44 * nu ** (5 / 3) * (1 - nu ** (1 / 3))
+    light = [rings @ (aperture * np.exp(decay * s ** (5 / 3))) for s in BLUR_D_OVER_R0]
+    return np.array([np.interp(0.5, held, BLUR_RADII) for held in light])

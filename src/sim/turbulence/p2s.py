@@ -2,123 +2,101 @@
 
 The idea is Mao, Chimitt & Chan 2021 (ICCV), "Accelerating atmospheric turbulence simulation via
 learned phase-to-space transform".  Basis, networks (p2s_network.py) and error tables are our own,
-fitted to exact Fraunhofer PSFs by `python -m scripts.fit_p2s` and kept in p2s.safetensors.  A
-network sees the first modes only but is fitted to PSFs of all of them: what it gives is their mean
-under the modes it knows, so the modes it does without blur as they do on average.
+fitted to exact Fraunhofer PSFs by `python -m scripts.fit_p2s`.  A network sees the first modes only
+but is fitted to PSFs of all of them: the modes it does without blur as they do on average.
 """
 
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.typing import NDArray
 from safetensors.torch import load_file
 from torch import Tensor
-from torch.nn import functional
 
-from src.sim.turbulence.engines import weights as weights_engine
-from src.sim.turbulence.p2s_network import Merged, Network, shape_kinds
-from src.sim.turbulence.psf import resampling
+from src.sim.turbulence.p2s_network import PhaseToSpaceNetwork, basis_parities
+from src.sim.turbulence.psf import SAMPLES_PER_LAMBDA_OVER_D, pixel_integration_matrix
 
 FILE = Path(__file__).with_suffix(".safetensors")
-BEYOND = 1.06  # the networks are fitted a little beyond the edge of their band
-FINE_PER_AIRY = 2.0  # samples of the basis per lambda / D: an intensity is band-limited to this
+EDGE_MARGIN = 1.06  # the networks are fitted a little beyond the edge of their band
 
 
 @dataclass(frozen=True)
-class Band:
-    """The basis and the networks for D/r0 up to `edge`.
+class PSFBand:
+    """The PSF basis and the networks for D/r0 up to `edge`.
 
-    `mean` (fine, fine) and `basis` (rank, fine, fine) are PSFs sampled at FINE_PER_AIRY; the basis
-    is ordered by its share in a natural picture, each function of one kind.  `networks`: from few
-    modes to many.
+    `mean` (fine, fine) and `basis` (rank, fine, fine) are PSFs sampled at
+    SAMPLES_PER_LAMBDA_OVER_D; the basis is ordered by its share in a natural image, each function
+    of one parity.  `networks`: from few modes to many.
     """
 
     edge: float
     mean: Float[Tensor, "fine fine"]
     basis: Float[Tensor, "rank fine fine"]
-    networks: tuple[Network, ...]
+    networks: tuple[PhaseToSpaceNetwork, ...]
 
 
 @cache
-def bands() -> tuple[Band, ...]:
+def load_psf_bands() -> tuple[PSFBand, ...]:
     """Return the fitted bands, weakest first."""
-    stored = load_file(FILE)
-    return tuple(_band(stored, index) for index in range(len(stored["edges"])))
+    stored, bands = load_file(FILE), []
+    for index, edge in enumerate(stored["edges"].tolist()):
+        networks = []
+        for number, (modes, _) in enumerate(stored["sizes"][index].tolist()):
+            prefix = f"{index}.{number}."
+            names = [name.removeprefix(prefix) for name in stored if name.startswith(prefix)]
+            layers = {name: stored[prefix + name].float() for name in names}
+            networks.append(PhaseToSpaceNetwork(modes, edge, layers))
+        mean, basis = stored[f"{index}.mean"], stored[f"{index}.basis"].float()
+        bands.append(PSFBand(edge, mean, basis, tuple(networks)))
+    return tuple(bands)
 
 
-def _band(stored: dict[str, Tensor], index: int) -> Band:
-    edge, basis = float(stored["edges"][index]), stored[f"{index}.basis"].float()
-    counts = torch.bincount(shape_kinds(basis), minlength=4).tolist()
-    networks = []
-    for modes, width in stored["sizes"][index].tolist():
-        network = Network(modes, width, counts, edge).requires_grad_(False)
-        own = f"{index}.{len(networks)}."
-        state = {name: stored[own + name].float() for name in network.state_dict()}
-        network.load_state_dict(state)
-        networks.append(network)
-    return Band(edge, stored[f"{index}.mean"], basis, tuple(networks))
+def find_psf_band(d_over_r0: float) -> PSFBand:
+    """Return the weakest band that covers `d_over_r0`; raises ValueError beyond the last."""
+    bands = load_psf_bands()
+    if d_over_r0 > EDGE_MARGIN * bands[-1].edge:
+        limit = EDGE_MARGIN * bands[-1].edge
+        raise ValueError(f"turbulence: D/r0 of the blur must be <= {limit:g}, got {d_over_r0:g}")
+    return next(band for band in bands if d_over_r0 <= EDGE_MARGIN * band.edge)
 
 
-def band_for(strength: float) -> Band | None:
-    """Return the weakest band that covers D/r0 = `strength`; None beyond the last."""
-    return next((band for band in bands() if strength <= BEYOND * band.edge), None)
-
-
-class Spots:
+class FittedPSFs:
     """The PSFs of one atmosphere on the pixels of one camera, from the basis and a network.
 
-    `rank` basis functions of `band`, integrated over pixels of lambda / D / `airy_px`, `size` of
-    them across; the light that falls outside them is not in them.
-    Weights are sorted by the symmetry of their functions, their kind; `ends` is where each ends.
+    `rank` basis functions of `band`, integrated over `size` x `size` pixels of
+    lambda / D / `lambda_over_d_px`; the light that falls outside them is not in them.
+    `basis` (1 + rank, size, size): the mean, then the functions sorted by parity;
+    `parity_ends`: where each of the four parities ends.
     """
 
     def __init__(
-        self, band: Band, network: int, rank: int, airy_px: float, size: int, d_over_r0: float
+        self,
+        band: PSFBand,
+        network: int,
+        rank: int,
+        lambda_over_d_px: float,
+        size: int,
+        d_over_r0: float,
     ):
-        grid = resampling(size, band.mean.shape[-1], FINE_PER_AIRY / airy_px).float()
-        self.network, self.ends, shapes = _cut(band, network, rank)
-        self.layers = _matrices(self.network)
-        self.shapes = grid @ shapes @ grid.T
-        quarter = self.shapes[:, size // 2 :, size // 2 :]
+        step = SAMPLES_PER_LAMBDA_OVER_D / lambda_over_d_px
+        grid = pixel_integration_matrix(size, band.mean.shape[-1], step).float()
+        self.network, self.parity_ends, basis = _truncate(band, network, rank)
+        self.basis, self.d_over_r0 = grid @ basis @ grid.T, d_over_r0
+        quarter = self.basis[:, size // 2 :, size // 2 :]
         self.quarter = quarter.permute(1, 2, 0).contiguous().numpy()
-        self.d_over_r0 = d_over_r0
-        self.own = tuple(np.array(rows, np.int64) for rows in self.network.own)
-
-    def __call__(
-        self, phase: Float[Tensor, "blurmodes frames rows columns"]
-    ) -> Float[Tensor, "rank frames rows columns"]:
-        """Return the weights at nodes for Noll 4, 5, ... in rad, on the CPU.
-
-        Modes that are not given count as zero, those the network does not know by their mean.
-        """
-        known, given = self.network.modes - 2, phase.flatten(1)
-        if len(given) < known:
-            given = functional.pad(given, (0, 0, 0, known - len(given)))
-        usual = np.float32((self.d_over_r0 / self.network.edge) ** (5 / 3))
-        found = weights_engine.weights(given[:known].numpy(), self.own, usual, self.layers)
-        return torch.from_numpy(found).unflatten(1, phase.shape[1:])
-
-    def merged(self, modes: int) -> Merged:
-        """Return the network as a device takes it, for at most `modes` modes from Noll 4 on."""
-        return self.network.merged(modes, self.d_over_r0)
 
 
 @cache
-def _cut(band: Band, network: int, rank: int) -> tuple[Network, NDArray, Tensor]:
-    """Return the network of the first `rank` functions, where each of their kinds ends, and mean
-    and basis sorted by kind, over the light of the mean.
+def _truncate(
+    band: PSFBand, network: int, rank: int
+) -> tuple[PhaseToSpaceNetwork, tuple[int, ...], Tensor]:
+    """Return the network of the first `rank` functions, where each of their parities ends, and mean
+    and basis sorted by parity, over the light of the mean.
     """
-    kind = shape_kinds(band.basis[:rank])
-    counts = torch.bincount(kind, minlength=4)
-    shapes = torch.cat([band.mean[None], band.basis[kind.argsort(stable=True)]])
-    cut = band.networks[network].cut(counts.tolist())
-    return cut, counts.cumsum(0).numpy(), shapes / band.mean.sum()
-
-
-@cache
-def _matrices(network: Network) -> tuple[NDArray, ...]:
-    return network.matrices()
+    parity = basis_parities(band.basis[:rank])
+    counts = torch.bincount(parity, minlength=4)
+    basis = torch.cat([band.mean[None], band.basis[parity.argsort(stable=True)]])
+    truncated = band.networks[network].truncate(counts.tolist())
+    return truncated, tuple(counts.cumsum(0).tolist()), basis / band.mean.sum()

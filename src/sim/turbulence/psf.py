@@ -1,63 +1,66 @@
-"""From phase to point spread function: the exact Fraunhofer integral, and its resampling.
+"""Point spread functions: the exact Fraunhofer integral, its resampling, and the halo.
 
-Lengths in the focal plane are in pixels; lambda / D is `airy_px` pixels (lambda f / (D p)).
+Lengths in the focal plane are in pixels; lambda / D is lambda f / (D p) of them.
 """
 
 import math
+from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Complex, Float, Int
+from scipy.fft import next_fast_len
 from torch import Tensor
-from torch.nn import functional
 
 from src.sim.turbulence.zernike import zernike_basis
 
 CHUNK = 512  # PSFs at a time, so that the fields stay in the cache
+SAMPLES_PER_LAMBDA_OVER_D = 2.0  # of stored PSFs: an intensity is band-limited to this
 
 
 def fraunhofer_psf(
     coefficients: Float[Tensor, "*n modes"],
     *,
-    airy_px: float,
+    lambda_over_d_px: float,
     size: int,
     pupil: int = 0,
     points: int = 0,
-    whole: bool = False,
+    normalise_plane: bool = False,
 ) -> Float[Tensor, "*n size size"]:
     """Return |Fourier transform of P exp(i phi)|^2 integrated over pixels; each sums to 1.
 
     `coefficients` are Noll 2..modes + 1 in rad, `size` is odd, the axis of the camera falls on the
     middle pixel and a positive a2 moves the light to larger columns.  `pupil`: samples across the
     pupil (0: enough for `size`); `points`: samples per pixel and axis (0: enough for its integral;
-    1: the value at its centre).  With `whole` it is the light of the endless plane that sums to 1,
+    1: the value at its centre).  With `normalise_plane` the light of the endless plane sums to 1,
     of which the pixels hold a part.  Goodman, Introduction to Fourier Optics, 5.2.
     """
-    if size % 2 == 0 or size < 1 or not airy_px > 0:
-        raise ValueError(f"psf needs an odd size and airy_px > 0, got {size}, {airy_px}")
-    pupil = pupil or max(24, math.ceil(1.5 * size / airy_px) + 8)
-    points = points or max(1, math.ceil(5 / airy_px))
+    if size % 2 == 0 or size < 1 or not lambda_over_d_px > 0:
+        raise ValueError(
+            f"psf needs an odd size and lambda_over_d_px > 0, got {size}, {lambda_over_d_px}"
+        )
+    pupil = pupil or max(24, math.ceil(1.5 * size / lambda_over_d_px) + 8)
+    points = points or max(1, math.ceil(5 / lambda_over_d_px))
     flat = coefficients.reshape(-1, coefficients.shape[-1])
-    inside, basis = _pupil(flat.shape[-1], pupil)
-    inside, basis = inside.to(flat), basis.to(flat)
-    turn = _transform(pupil, size * points, airy_px * points).to(flat)
-    spots = torch.cat([_spot(part @ basis, inside, turn, size) for part in flat.split(CHUNK)])
-    if whole:  # Parseval
-        spots /= inside.sum() * (pupil * airy_px * points) ** 2
+    values, places = zernike_basis(flat.shape[-1], pupil)
+    column, row = ((places + 1) * pupil / 2).long().unbind(-1)
+    xi = (torch.arange(pupil, dtype=torch.float64) + 0.5) / pupil - 0.5
+    x = (torch.arange(size * points, dtype=torch.float64) + 0.5) / points - size / 2
+    turn = torch.exp(-2j * math.pi * xi[:, None] * x / lambda_over_d_px)
+    turn, psfs = turn.to(flat.device, flat.dtype.to_complex()), []
+    for part in flat.split(CHUNK):
+        wave = turn.new_zeros(len(part), pupil, pupil)
+        wave[:, row, column] = torch.exp(1j * (part @ values.to(part)))
+        light = (turn.T @ wave @ turn).abs().square()
+        psfs.append(light.reshape(-1, size, points, size, points).sum((2, 4)))
+    psf = torch.cat(psfs)
+    if normalise_plane:  # Parseval
+        psf /= len(places) * (pupil * lambda_over_d_px * points) ** 2
     else:
-        spots /= spots.sum((1, 2), keepdim=True)
-    return spots.reshape(*coefficients.shape[:-1], size, size)
+        psf /= psf.sum((1, 2), keepdim=True)
+    return psf.reshape(*coefficients.shape[:-1], size, size)
 
 
-def exact_spots(
-    phase: Float[Tensor, "blurmodes n rows columns"], airy_px: float, size: int
-) -> Float[Tensor, "pixels n rows columns"]:
-    """Return the PSFs of Noll 4, 5, ... at nodes, pixel by pixel; the light of the plane is 1."""
-    flat = functional.pad(phase.permute(1, 2, 3, 0), (2, 0))
-    psf = fraunhofer_psf(flat, airy_px=airy_px, size=size, whole=True)
-    return psf.flatten(3).permute(3, 0, 1, 2).contiguous()
-
-
-def resampling(size: int, fine: int, step: float) -> Float[Tensor, "size fine"]:
+def pixel_integration_matrix(size: int, fine: int, step: float) -> Float[Tensor, "size fine"]:
     """Return the integrals over `size` pixels of a function known at `fine` samples, per axis.
 
     Both odd and centred; a pixel is `step` samples wide.  The function is taken for band-limited,
@@ -72,39 +75,53 @@ def resampling(size: int, fine: int, step: float) -> Float[Tensor, "size fine"]:
     return torch.cos(2 * math.pi * distance[..., None] * frequency) @ weight
 
 
-def _spot(phase: Tensor, inside: Tensor, turn: Tensor, size: int) -> Tensor:
-    """Return the intensity (n, size, size) of pupil phases (n, samples^2)."""
-    samples, fine = turn.shape[0] // 2, turn.shape[1] // 2
-    wave = torch.stack([phase.cos() * inside, phase.sin() * inside], dim=1)
-    rows = wave.reshape(-1, 2, samples, samples).transpose(1, 2)
-    across = rows.reshape(-1, 2 * samples) @ turn
-    columns = across.reshape(-1, samples, 2, fine).permute(0, 3, 2, 1)
-    field = columns.reshape(-1, 2 * samples) @ turn
-    light = field.square().reshape(-1, fine, 2, fine).sum(2).transpose(1, 2)
-    points = fine // size
-    if points > 1:
-        light = light.reshape(-1, size, points, size, points).sum((2, 4))
-    return light
+class PSFHalo:
+    """The light that a point sends beyond its kernel, the same for all points and views.
 
-
-def _pupil(modes: int, samples: int) -> tuple[Tensor, Tensor]:
-    """Return the aperture (samples^2,) and the modes on it (modes, samples^2), zero outside."""
-    values, points = zernike_basis(modes, samples)
-    column, row = ((points + 1) * samples / 2).long().unbind(-1)
-    inside = torch.zeros(samples * samples, dtype=torch.float64)
-    inside[row * samples + column] = 1
-    basis = torch.zeros(modes, samples * samples, dtype=torch.float64)
-    basis[:, row * samples + column] = values
-    return inside, basis
-
-
-def _transform(samples: int, count: int, airy: float) -> Tensor:
-    """Return exp(-2 pi i x xi) for `count` points of the focal plane as a real matrix.
-
-    (2 samples, 2 count): real and imaginary part in, real and imaginary part out.
+    The mean PSF (fine, fine) without its `kernel` x `kernel` pixels of
+    lambda / D / `lambda_over_d_px` is therefore added once per frame; what that neglects is
+    measured by scripts/p2s_errors.py.  `share` of the light of a white scene comes from it.
     """
-    xi = (torch.arange(samples, dtype=torch.float64) + 0.5) / samples - 0.5
-    x = (torch.arange(count, dtype=torch.float64) + 0.5 - count / 2) / airy
-    angle = 2 * math.pi * xi[:, None] * x
-    cos, sin = angle.cos(), angle.sin()
-    return torch.cat([torch.cat([cos, -sin], 1), torch.cat([sin, cos], 1)])
+
+    def __init__(self, mean: Float[Tensor, "fine fine"], lambda_over_d_px: float, kernel: int):
+        widest = int(mean.shape[-1] / SAMPLES_PER_LAMBDA_OVER_D / 2 * lambda_over_d_px)
+        reach, step = max(widest, kernel // 2), SAMPLES_PER_LAMBDA_OVER_D / lambda_over_d_px
+        grid = pixel_integration_matrix(2 * reach + 1, mean.shape[-1], step).float()
+        self.psf = (grid @ (mean / mean.sum()) @ grid.T).clamp(min=0)
+        core = slice(reach - kernel // 2, reach + kernel // 2 + 1)
+        self.psf[core, core] = 0
+        self.reach, self.share = reach, float(self.psf.sum())
+
+    def transform(
+        self, frame_size: Sequence[int], window: tuple[int, int, int, int]
+    ) -> tuple[Int[Tensor, " rows"], Int[Tensor, " columns"], Complex[Tensor, "rows half"]]:
+        """Return the rows and columns of a frame that send light to `window` (top, left, h, w), and
+        the transform of the halo there.  A few more rows and columns make a fast size.
+        """
+        sides = []
+        for first, count, pixels in zip(window[:2], window[2:], frame_size, strict=True):
+            fast = next_fast_len(count + 2 * self.reach, real=True)
+            sides.append(reflect_index(torch.arange(fast) + first - self.reach, pixels))
+        psf = self.psf.new_zeros(len(sides[0]), len(sides[1]))
+        psf[: len(self.psf), : len(self.psf)] = self.psf
+        far = -2 * self.reach  # the first pixel gets light from the sources 0 .. 2 reach
+        return sides[0], sides[1], torch.fft.rfft2(psf.roll((far, far), (0, 1)))
+
+
+def convolve_halo(
+    frames: Float[Tensor, "frames height width"],
+    rows: Int[Tensor, " rows"],
+    columns: Int[Tensor, " columns"],
+    spectrum: Complex[Tensor, "rows half"],
+    size: Sequence[int],
+) -> Float[Tensor, "frames h w"]:
+    """Return the halo's light on a window of `size` (h, w), given PSFHalo.transform."""
+    sources = frames[:, rows[:, None], columns]
+    light = torch.fft.irfft2(torch.fft.rfft2(sources) * spectrum, s=sources.shape[1:])
+    return light[:, : size[0], : size[1]].clamp(min=0)
+
+
+def reflect_index(index: Int[Tensor, "..."], size: int) -> Int[Tensor, "..."]:
+    """Return the pixel of the frame whose mirror image lies at `index` (the border is doubled)."""
+    folded = torch.remainder(index, 2 * size)
+    return torch.minimum(folded, 2 * size - 1 - folded)

@@ -1,7 +1,7 @@
-"""Turbulence that was seen: the tilt of real footage instead of simulated air's.
+"""Recorded turbulence: the tilt of real footage instead of a simulated one.
 
-Pieces of the footage's displacement fields (fields.py), other in place and time for every view,
-move the frames, and a constant blur goes with them.  Nothing of the simulated air is used.
+Pieces of the footage's displacement fields (footage_displacement.py), other in place and time for
+every view, move the frames, and a constant Gaussian blur goes with them.
 """
 
 import math
@@ -12,38 +12,36 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.typing import NDArray
+from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
 from src.sim import noise
 from src.sim.optics import Position, view_id
-from src.sim.turbulence import blur
-from src.sim.turbulence.fields import Fields, fields
-from src.sim.turbulence.lattice import Lattice
-from src.sim.turbulence.model import Crop
-from src.sim.turbulence.ranges import require
-from src.sim.turbulence.threads import in_threads
+from src.sim.turbulence.clip_rendering import run_in_threads
+from src.sim.turbulence.contract import Crop, check_option
+from src.sim.turbulence.engines.device import select_engine
+from src.sim.turbulence.engines.warp_numba import pad_frames, warp_frames
+from src.sim.turbulence.footage_displacement import NormalisedDisplacement, load_displacement_fields
 
-PLACES, STRETCHES = 2, 3  # pieces of the footage: PLACES x PLACES in the picture, STRETCHES in time
-FAR = 4096  # pixels between the nodes of a blur that is the same everywhere
-MOST_PX = 8.0  # of rms tilt
+PLACES, TIMES = 2, 3  # pieces of the footage: PLACES x PLACES in the picture, TIMES in time
+LARGEST_TILT_PX = 8.0  # rms
 
 
 @dataclass(frozen=True)
-class Strength:
+class DrawnTilt:
     """What is drawn for a clip: the name of a strength and the tilt's rms along an axis, pixels."""
 
     severity: str
-    rms_px: float
+    tilt_rms_px: float
 
 
-class RecordedTilt:
-    """A turbulence model (model.py) that moves frames as the air in real footage did.
+class RecordedTurbulence:
+    """A turbulence model (contract.py) that moves frames as the air in real footage did.
 
-    `root`: a video or a folder of frames of a still scene through air, its smaller side taken for
-    256 pixels.  `rms_px`: names of strengths with the tilt's rms along an axis in pixels;
-    `severity`: one of the names, or `mixed`: each as often.  `rate`: frames per second that the
-    footage is taken for.  `blur`: standard deviation of a Gaussian, in units of the rms tilt.
+    `root`: a video or a folder of frames of a still scene through turbulence, its smaller side
+    taken for 256 pixels.  `tilt_rms_px`: names of strengths with the tilt's rms along an axis;
+    `severity`: one of the names, or `mixed`: each as often.  `footage_fps`: what the footage is
+    taken for.  `blur_over_tilt`: standard deviation of a Gaussian, in units of the rms tilt.
     Raises ValueError for footage that is missing, too short, or moves, and for values outside
     their range.
     """
@@ -52,55 +50,58 @@ class RecordedTilt:
         self,
         root: str | None,
         *,
-        rms_px: Mapping[str, float],
+        tilt_rms_px: Mapping[str, float],
         severity: str = "mixed",
-        rate: float = 30.0,
-        blur: float = 0.4,
+        footage_fps: float = 30.0,
+        blur_over_tilt: float = 0.4,
     ):
-        for name, rms in rms_px.items():
-            require(0 <= rms <= MOST_PX, f"rms_px.{name}", f"in [0, {MOST_PX:g}] pixels", rms)
-        valid = severity in ("mixed", *rms_px)
-        require(valid, "severity", ", ".join(["mixed", *rms_px]), severity)
-        require(0 < rate < math.inf, "rate", "> 0 frames per second", rate)
-        require(0 <= blur <= 2, "blur", "in [0, 2] times the tilt", blur)
-        there = root is not None and Path(root).exists()
-        require(there, "root", "a video or folder of frames of a still scene through air", root)
-        self.names = list(rms_px) if severity == "mixed" else [severity]
-        self.rms_px, self.rate, self.blur = dict(rms_px), rate, blur
-        self.fields = fields(Path(root).resolve())
+        for name, rms in tilt_rms_px.items():
+            allowed = f"in [0, {LARGEST_TILT_PX:g}] pixels"
+            check_option(0 <= rms <= LARGEST_TILT_PX, f"tilt_rms_px.{name}", allowed, rms)
+        names = ["mixed", *tilt_rms_px]
+        check_option(severity in names, "severity", ", ".join(names), severity)
+        check_option(0 < footage_fps < math.inf, "footage_fps", "> 0", footage_fps)
+        valid = 0 <= blur_over_tilt <= 2
+        check_option(valid, "blur_over_tilt", "in [0, 2] times the tilt", blur_over_tilt)
+        footage = Path(root or "/").resolve()
+        expected = "a video or folder of frames of a still scene through turbulence"
+        check_option(bool(root) and footage.exists(), "root", expected, root)
+        self.names = list(tilt_rms_px) if severity == "mixed" else [severity]
+        self.tilt_rms_px, self.footage_fps = dict(tilt_rms_px), footage_fps
+        self.blur_over_tilt = blur_over_tilt
+        self.fields = load_displacement_fields(footage)
 
-    def draw(self, generator: torch.Generator) -> Strength:
+    def draw(self, generator: torch.Generator) -> DrawnTilt:
         """Draw the strength of a clip."""
         name = self.names[int(torch.randint(len(self.names), (), generator=generator))]
-        return Strength(name, self.rms_px[name])
+        return DrawnTilt(name, self.tilt_rms_px[name])
 
     def operator(
-        self, drawn: Strength, *, views: Sequence[Position], height: int, width: int, fps: float
-    ) -> "RecordedAir":
-        """Return the air of a clip."""
-        step, blur_px = self.rate / fps, self.blur * drawn.rms_px
-        return RecordedAir(self.fields, drawn, views, (height, width), step, blur_px)
+        self, drawn: DrawnTilt, *, views: Sequence[Position], height: int, width: int, fps: float
+    ) -> "RecordedTurbulenceOperator":
+        """Return the operator of a clip."""
+        step, blur_px = self.footage_fps / fps, self.blur_over_tilt * drawn.tilt_rms_px
+        size = height, width
+        return RecordedTurbulenceOperator(self.fields, drawn, views, size, step, blur_px)
 
 
 @dataclass(frozen=True)
-class RecordedAir:
-    """One clip's air (model.py): every view looks through a piece of the footage of its own.
+class RecordedTurbulenceOperator:
+    """The operator of a clip (contract.py): every view has a piece of the footage of its own.
 
-    `size` (h, w) of the frames; `step`: frames of the footage from one frame to the next;
-    `blur_px`: standard deviation of the blur.
+    `size` (h, w) of frames; `step`: footage frames per frame; `blur_px`: standard deviation.
     """
 
-    fields: Fields
-    drawn: Strength
+    fields: NormalisedDisplacement
+    drawn: DrawnTilt
     views: Sequence[Position]
     size: tuple[int, int]
     step: float
     blur_px: float
 
     @property
-    def facts(self) -> dict[str, float | str]:
-        """What is recorded about the clip."""
-        tilt = self.drawn.rms_px
+    def metadata(self) -> dict[str, float | str]:
+        tilt = self.drawn.tilt_rms_px
         return {"severity": self.drawn.severity, "tilt_px": tilt, "blur_px": self.blur_px}
 
     @torch.no_grad()
@@ -112,39 +113,26 @@ class RecordedAir:
         crop: Crop | None = None,
     ) -> Float[Tensor, "n views frames hc wc"]:
         """Return what every view sees, linear light: moved, then blurred."""
-        count, device = frames.shape[1], frames.device
-        kernel = _gaussian(self.blur_px).to(device)
-        reach = len(kernel) // 2
-        top, left, height, width = crop or (0, 0, *self.size)
+        reach, (top, left, height, width) = math.ceil(3 * self.blur_px), crop or (0, 0, *self.size)
         window = (top - reach, left - reach, height + 2 * reach, width + 2 * reach)
-        rows, columns = (Lattice(window[k], window[k + 2], FAR, 1) for k in (0, 1))
-        nodes = (count, len(rows.pixels), len(columns.pixels))
-        psfs = kernel.flatten()[:, None, None, None].expand(-1, *nodes).contiguous()
-        around = (rows, columns, torch.zeros(count, height, width, device=device), 0.0)
-        out = torch.empty(len(frames), len(self.views), count, height, width, device=device)
-        for seen, clip in zip(out, frames.float(), strict=True):
-            tilt = self.tilt(count, generator, crop=window).transpose(1, 2).to(device).contiguous()
-            if device.type == "cpu":
-                given = (psfs, len(kernel), None, *around)
-                _view_by_view(seen, blur.pictures(clip), tilt, given)
-                continue
-            lines = psfs @ columns.weights().T.to(device)
-            for view, moved in zip(seen, tilt, strict=True):  # a few launches each
-                view.copy_(blur.at_once(clip, moved, lines, *around))
-        return out
+        seen = []
+        for clip in frames.float():
+            tilt = self.tilt(len(clip), generator, crop=window).transpose(1, 2).contiguous()
+            views = _warp_views(clip, tilt.to(clip.device), *window[:2])
+            if reach:
+                size, sigma = (2 * reach + 1,) * 2, (self.blur_px,) * 2
+                views = gaussian_blur2d(views, size, sigma, "constant")
+            seen.append(views[..., reach : reach + height, reach : reach + width])
+        return torch.stack(seen)
 
     def tilt(
         self, frames: int, generator: torch.Generator, *, crop: Crop | None = None
     ) -> Float[Tensor, "views frames 2 h w"]:
-        """Return the displacement (x, y) in pixels that `degrade` gives its first clip.
-
-        `crop` may reach beyond the frame.
-        """
+        """Return the displacement (x, y) in px of `degrade`; `crop` may reach beyond the frame."""
         key = noise.base_key(generator)
-        pieces = noise.uniform(noise.key(key, "pieces"), torch.arange(PLACES**2 * STRETCHES))
+        pieces = noise.uniform(noise.key(key, "pieces"), torch.arange(PLACES**2 * TIMES))
         order, window = pieces.argsort().tolist(), crop or (0, 0, *self.size)
-        views = [self._view(position, frames, order, key, window) for position in self.views]
-        return torch.stack(views)
+        return torch.stack([self._view(one, frames, order, key, window) for one in self.views])
 
     def _view(
         self, position: Position, frames: int, order: list[int], key: int, window: Crop
@@ -164,33 +152,30 @@ class RecordedAir:
         y = sign[1] * (np.arange(height) + top - (self.size[0] - 1) / 2)
         right = (place % PLACES + 0.5) / PLACES * self.fields.width_px
         below = (place // PLACES + 0.5) / PLACES * self.fields.height_px
-        time = self._times(frames, stretch, drawn[4], back)
+        length, passed = len(self.fields.nodes) / TIMES, np.arange(frames) * self.step
+        start = stretch * length + drawn[4] * max(length - 1 - passed[-1], 0)
+        time = start + (passed[::-1] if back else passed)  # within the stretch, if it fits
         if turned:
-            moved = self.fields.at(time, below + x, right + y).transpose(-1, -2).flip(1)
+            moved = self.fields.sample(time, below + x, right + y).transpose(-1, -2).flip(1)
         else:
-            moved = self.fields.at(time, below + y, right + x)
-        return self.drawn.rms_px * torch.tensor(sign)[:, None, None] * moved
-
-    def _times(self, frames: int, stretch: int, late: float, back: bool) -> NDArray:
-        """Return when the frames are, in frames of the footage: within the stretch, if they fit."""
-        length = len(self.fields.nodes) / STRETCHES
-        passed = np.arange(frames) * self.step
-        start = stretch * length + late * max(length - 1 - passed[-1], 0)
-        return start + (passed[::-1] if back else passed)
+            moved = self.fields.sample(time, below + y, right + x)
+        return self.drawn.tilt_rms_px * torch.tensor(sign)[:, None, None] * moved
 
 
-def _view_by_view(out: Tensor, shown: blur.Pictures, tilt: Tensor, given: tuple) -> None:
-    """Write what the views see to `out`; `given`: the PSFs, as `blur.degrade` has them."""
+def _warp_views(
+    frames: Float[Tensor, "frames height width"],
+    tilt: Float[Tensor, "views 2 frames h w"],
+    top: int,
+    left: int,
+) -> Float[Tensor, "views frames h w"]:
+    """Return the frames from (top, left) on, perhaps outside, displaced as in every view."""
+    if frames.device.type != "cpu":
+        warp = select_engine(frames.device).warp
+        return torch.stack([warp(frames, view, top, left) for view in tilt])
+    padded, out = pad_frames(frames), torch.empty(len(tilt), *tilt.shape[2:])
 
-    def one(view: Tensor, moved: Tensor) -> None:
-        view.copy_(blur.degrade(shown, 0, moved, *given))
+    def warp_view(view: int) -> None:
+        out[view] = warp_frames(padded, 0, tilt[view], top, left)
 
-    in_threads(one, zip(out, tilt, strict=True))
-
-
-def _gaussian(deviation: float) -> Float[Tensor, "k k"]:
-    """Return a Gaussian out to three standard deviations, its sum 1."""
-    reach = math.ceil(3 * deviation)
-    away = torch.arange(-reach, reach + 1) / max(deviation, 1e-6)
-    line = torch.exp(-0.5 * away**2)
-    return line[:, None] * line / line.sum() ** 2
+    run_in_threads(warp_view, [(view,) for view in range(len(tilt))])
+    return out

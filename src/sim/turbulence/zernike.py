@@ -27,13 +27,16 @@ def noll_index(mode: int) -> tuple[int, int]:
 
 
 def noll_covariance(modes: int) -> Float[Tensor, "modes modes"]:
-    """Return the covariance of Noll coefficients 2..modes + 1 at D/r0 = 1, in rad^2, float64.
-
-    Noll 1976, eq. 25; it scales with (D/r0)^(5/3).
-    """
-    indices = [noll_index(mode) for mode in range(2, modes + 2)]
-    rows = [[_covariance(a, b) for b in indices] for a in indices]
-    return torch.tensor(rows, dtype=torch.float64)
+    """Return the covariance of Noll coefficients 2..modes + 1 at D/r0 = 1, in rad^2, float64
+    (Noll 1976, eq. 25); it scales with (D/r0)^(5/3)."""
+    n, m = _indices(modes)
+    total, apart, third = n[:, None] + n, n[:, None] - n, 17 / 3
+    signs = (-1.0) ** (total // 2 - abs(m))
+    signs *= special.gammasgn((apart + third) / 2) * special.gammasgn((third - apart) / 2)
+    logs = special.gammaln((total - 5 / 3) / 2) - special.gammaln((total + 23 / 3) / 2)
+    logs -= special.gammaln((apart + third) / 2) + special.gammaln((third - apart) / 2)
+    scale = COVARIANCE * np.sqrt(np.multiply.outer(n + 1, n + 1))
+    return torch.from_numpy(np.where(m[:, None] == m, signs * scale * np.exp(logs), 0))
 
 
 def zernike_basis(modes: int, size: int) -> tuple[Float[Tensor, "modes p"], Float[Tensor, "p 2"]]:
@@ -60,7 +63,9 @@ def pupil_filter(
     """
     n, m = _indices(modes)
     x, turn = math.pi * kappa.double().numpy(), angle.double().numpy()
-    radial = 2 * np.sqrt(n + 1)[:, None] * _bessel_over_x(x, int(n[-1]) + 1)[n + 1]
+    inside = np.where(x > 0, x, 1)
+    bessel = special.jv(np.arange(n[-1] + 2)[:, None], inside) / inside
+    radial = 2 * np.sqrt(n + 1)[:, None] * np.where(x > 0, bessel[n + 1], 0)
     azimuth = np.cos(abs(m)[:, None] * turn - np.where(m < 0, math.pi / 2, 0)[:, None])
     scale = np.where(m == 0, 1, math.sqrt(2)) * np.where(np.isin(n % 4, (2, 3)), -1, 1)
     out = np.zeros((modes, len(x), 2))
@@ -70,43 +75,8 @@ def pupil_filter(
 
 @cache
 def _indices(modes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return n and m of Noll modes 2..modes + 1."""
     n, m = np.array([noll_index(mode) for mode in range(2, modes + 2)]).T
     return n, m
-
-
-def _bessel_over_x(x: np.ndarray, last: int) -> np.ndarray:
-    """Return J_k(x) / x for k = 0..last (last + 1, points), from k = 2 on right at x = 0 too.
-
-    J_(k-1) = (2 k / x) J_k - J_(k+1), which is stable towards smaller k.
-    """
-    inside = np.where(x > 0, x, 1)
-    out = np.empty((last + 1, len(x)))
-    above, out[last] = special.jv(last + 1, x), special.jv(last, x)
-    for k in range(last, 0, -1):
-        out[k - 1] = 2 * k / inside * out[k] - (out[k + 1] if k < last else above)
-    return np.where(x > 0, out / inside, 0)
-
-
-def _covariance(a: tuple[int, int], b: tuple[int, int]) -> float:
-    (n, m), (n2, m2) = a, b
-    if m != m2:
-        return 0.0
-    sign = -1 if ((n + n2 - 2 * abs(m)) // 2) % 2 else 1
-    gammas = (
-        special.gammaln((n + n2 - 5 / 3) / 2)
-        - special.gammaln((n - n2 + 17 / 3) / 2)
-        - special.gammaln((n2 - n + 17 / 3) / 2)
-        - special.gammaln((n + n2 + 23 / 3) / 2)
-    )
-    lows = special.gammasgn((n - n2 + 17 / 3) / 2) * special.gammasgn((n2 - n + 17 / 3) / 2)
-    return sign * lows * COVARIANCE * math.sqrt((n + 1) * (n2 + 1)) * math.exp(gammas)
-
-
-def _azimuth(m: int, angle: Tensor) -> Tensor:
-    if m == 0:
-        return torch.ones_like(angle)
-    return math.sqrt(2) * (torch.cos(m * angle) if m > 0 else torch.sin(-m * angle))
 
 
 def _mode(index: tuple[int, int], radius: Tensor, angle: Tensor) -> Tensor:
@@ -115,4 +85,5 @@ def _mode(index: tuple[int, int], radius: Tensor, angle: Tensor) -> Tensor:
     for s in range((n - m) // 2 + 1):
         weight = (-1) ** s * math.comb(n - s, s) * math.comb(n - 2 * s, (n - m) // 2 - s)
         total = total + weight * radius ** (n - 2 * s)
-    return math.sqrt(n + 1) * total * _azimuth(index[1], angle)
+    azimuth = torch.sin(m * angle) if index[1] < 0 else torch.cos(m * angle)
+    return math.sqrt((n + 1) * (2 if m else 1)) * total * azimuth

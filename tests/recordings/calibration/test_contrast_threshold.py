@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from src.figures import event_rate
-from src.recordings import event_rates
+from src.figures import calibration_figures
 from src.recordings.calibration import contrast_threshold
-from src.recordings.files.formats import EVENT, open_events, write_events
+from src.recordings.files.formats import EVENT, open_recording, write_events
 from src.sim.sensor.sensor import EventSensor
 
 FPS = 120.0
@@ -42,9 +41,13 @@ def test_a_known_threshold_is_found(on, off_ratio, refractory_s):
     settings = {"refractory_s": refractory_s}
     camera = EventSensor(on, off_ratio=off_ratio, **settings)
     recording = recorded(camera, [scene(seed) for seed in range(8)])
-    measured = event_rates.measure(recording, np.zeros((48, 48), np.int64), slices=40)
+    measured = contrast_threshold.measure_event_rates(
+        recording, np.zeros((48, 48), np.int64), slices=40
+    )
     others = [scene(seed) for seed in range(100, 106)]
-    found = contrast_threshold.estimate(measured, others, FPS, EventSensor(**settings), GRID)
+    found = contrast_threshold.estimate_contrast_threshold(
+        measured, others, FPS, EventSensor(**settings), GRID
+    )
     assert abs(np.log(found.on[0] / on)) < 0.12
     assert abs(np.log(found.off[0] / (on * off_ratio))) < 0.12
     assert found.on[1] < found.on[0] < found.on[2]
@@ -54,8 +57,12 @@ def test_a_known_threshold_is_found(on, off_ratio, refractory_s):
 def test_the_same_scene_gives_the_threshold_exactly():
     clips = [scene(seed) for seed in range(3)]
     recording = recorded(EventSensor(0.2), clips)
-    measured = event_rates.measure(recording, np.zeros((48, 48), np.int64), slices=40)
-    found = contrast_threshold.estimate(measured, clips, FPS, EventSensor(), GRID)
+    measured = contrast_threshold.measure_event_rates(
+        recording, np.zeros((48, 48), np.int64), slices=40
+    )
+    found = contrast_threshold.estimate_contrast_threshold(
+        measured, clips, FPS, EventSensor(), GRID
+    )
     assert abs(found.on[0] / 0.2 - 1) < 0.02 and abs(found.off[0] / 0.2 - 1) < 0.02
 
 
@@ -67,7 +74,7 @@ def test_rates_of_views_are_events_per_pixel_and_second():
     events["t"] = np.linspace(0, 2e6 - 1, 600).astype(np.int64)
     events["x"], events["y"] = g.integers(0, 10, 600), g.integers(0, 6, 600)
     events["p"] = g.choice([-1, 1], 600)
-    measured = event_rates.measure([events[:250], events[250:]], view, slices=7)
+    measured = contrast_threshold.measure_event_rates([events[:250], events[250:]], view, slices=7)
     for index, pixels in enumerate((24, 12)):
         mine = events["p"][view[events["y"], events["x"]] == index]
         assert measured.pixels[index] == pixels
@@ -82,8 +89,10 @@ def test_hot_pixels_do_not_count():
     camera = {"threshold": 0.2, "refractory_s": 0.0, "seed": 1}
     view = np.zeros((48, 48), np.int64)
     plain, broken = (
-        event_rates.measure(recorded(EventSensor(**camera, **hot), [calm]), view, slices=10)
-        for hot in ({}, {"hot_fraction": 0.004, "hot_hz": 119.0})
+        contrast_threshold.measure_event_rates(
+            recorded(EventSensor(**camera, **hot), [calm]), view, slices=10
+        )
+        for hot in ({}, {"hot_pixel_fraction": 0.004, "hot_pixel_hz": 119.0})
     )
     assert plain.hot.sum() == 0
     assert 2 <= broken.hot.sum() <= 20
@@ -93,30 +102,38 @@ def test_hot_pixels_do_not_count():
 def test_the_bootstrap_has_the_spread_of_a_poisson_process():
     """The deviation of a deviation from n / n^(1/3) blocks is a tenth here: three of them."""
     events = np.random.default_rng(0).poisson(50.0, (4000, 1, 2))
-    made = event_rates.Rates(events, np.array([100]), np.array([0]), 0.01)
+    made = contrast_threshold.EventRates(events, np.array([100]), np.array([0]), 0.01)
     spread = made.bootstrap(1000).std(0) / made.pooled
     assert np.abs(spread * np.sqrt(4000 * 50) - 1).max() < 0.3
 
 
 def test_a_rate_that_no_threshold_makes_is_named():
     recording = recorded(EventSensor(0.2), [scene(0)])
-    measured = event_rates.measure(recording, np.zeros((48, 48), np.int64), slices=10)
+    measured = contrast_threshold.measure_event_rates(
+        recording, np.zeros((48, 48), np.int64), slices=10
+    )
     with pytest.raises(ValueError, match="outside what the grid"):
-        contrast_threshold.estimate(measured, [scene(1)], FPS, EventSensor(), [0.8, 1.0, 1.4])
+        contrast_threshold.estimate_contrast_threshold(
+            measured, [scene(1)], FPS, EventSensor(), [0.8, 1.0, 1.4]
+        )
 
 
 def test_a_recording_off_the_sensor_is_named():
     recording = recorded(EventSensor(0.2), [scene(0)])
     with pytest.raises(ValueError, match="outside the 40x48 sensor"):
-        event_rates.measure(recording, np.zeros((48, 40), np.int64))
+        contrast_threshold.measure_event_rates(recording, np.zeros((48, 40), np.int64))
 
 
 def test_figure_and_table_are_written_from_a_file(tmp_path):
     clips = [scene(0)]
     write_events(tmp_path / "a.raw", recorded(EventSensor(0.2), clips)[0], width=48, height=48)
-    measured = event_rates.measure(open_events(tmp_path / "a.raw"), np.zeros((48, 48), np.int64))
-    found = contrast_threshold.estimate(measured, clips, FPS, EventSensor(), GRID)
-    event_rate.threshold(found, tmp_path / "threshold.png")
-    contrast_threshold.write_csv(found, measured, tmp_path / "threshold.csv")
+    measured = contrast_threshold.measure_event_rates(
+        open_recording(tmp_path / "a.raw"), np.zeros((48, 48), np.int64)
+    )
+    found = contrast_threshold.estimate_contrast_threshold(
+        measured, clips, FPS, EventSensor(), GRID
+    )
+    calibration_figures.draw_event_rates(found, tmp_path / "threshold.png")
+    contrast_threshold.write_threshold_csv(found, measured, tmp_path / "threshold.csv")
     assert (tmp_path / "threshold.png").stat().st_size > 5000
     assert "estimate,,0." in (tmp_path / "threshold.csv").read_text()

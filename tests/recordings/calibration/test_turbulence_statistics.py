@@ -12,14 +12,14 @@ import pytest
 import torch
 
 from src.app import calibrations
-from src.recordings import capture, lookup
-from src.recordings.calibration import dots, statistics
+from src.recordings import sensor_lookup, simulated_recording
+from src.recordings.calibration import dot_statistics, gaussian_dots
 from src.sim import noise
 from src.sim.optics import layout
-from src.sim.turbulence.atmosphere import Atmosphere
-from src.sim.turbulence.operator import ALPHA_FPS, Turbulence
+from src.sim.turbulence.atmosphere import AR1_FPS, Atmosphere
+from src.sim.turbulence.operator import Turbulence
 from tests.recordings import pictures
-from tests.recordings.calibration.test_statistics import sampling_error
+from tests.recordings.calibration.test_dot_statistics import sampling_error
 
 pytestmark = pytest.mark.slow  # 6480 pictures through turbulence
 
@@ -44,12 +44,14 @@ def calm_dots() -> torch.Tensor:
 
 def write(path: Path, views: torch.Tensor, camera) -> None:
     """Write what the sensor sees of `views` (9, frames, h, w) as a film of eight bits."""
-    table, rng = lookup.build(camera), np.random.default_rng(3)
-    light = capture.vignette(table, 0.3)
+    table, rng = sensor_lookup.build_lookup(camera), np.random.default_rng(3)
+    light = simulated_recording.vignette_gain(table, 0.3)
     with h5py.File(path, "w") as file:
         film = file.create_dataset("frames", (views.shape[1], *SENSOR), np.uint8)
         for k in range(0, len(film), 40):
-            seen = capture.sensor_frames(views[:, k : k + 40], table, light, slice(None)).numpy()
+            seen = simulated_recording.render_sensor_frames(
+                views[:, k : k + 40], table, light, slice(None)
+            ).numpy()
             seen += rng.normal(0, 0.005, seen.shape)
             film[k : k + 40] = np.clip(255 * seen + 0.5, 0, 255).astype(np.uint8)
 
@@ -86,7 +88,7 @@ class Case:
     alike: int
     turbulence: Turbulence
     views: torch.Tensor
-    found: statistics.Statistics
+    found: dot_statistics.DotStatistics
 
 
 @pytest.fixture(
@@ -97,7 +99,9 @@ class Case:
 def case(request, tmp_path_factory) -> Case:
     alpha, alike, shared = request.param
     folder, positions = tmp_path_factory.mktemp("dots"), list(layout(9))
-    camera = capture.kaleidoscope(positions, model=(SIDE, SIDE), sensor=SENSOR, tile_px=TILE, key=5)
+    camera = simulated_recording.kaleidoscope_views(
+        positions, model=(SIDE, SIDE), sensor=SENSOR, tile_px=TILE, key=5
+    )
     turbulence, calm = air(alpha, **shared), calm_dots()
     views = turbulence.degrade(calm.expand(FRAMES, -1, -1)[None], noise.generator(4))[0]
     gain = np.exp(FLICKER * np.random.default_rng(1).normal(size=(9, FRAMES)))
@@ -106,15 +110,17 @@ def case(request, tmp_path_factory) -> Case:
     write(folder / "dots.h5", views, camera)
     write(folder / "still.h5", calm.expand(9, 12, -1, -1), camera)
     moving, still, there = (str(folder / name) for name in ("dots.h5", "still.h5", "views.yaml"))
-    found = calibrations.characterise(moving, still, folder, fps=FPS, views=there)
+    found = calibrations.measure_dot_grid(moving, still, folder, fps=FPS, views=there)
     assert found.failed.sum() < 0.01 * found.blur.size
     return Case(alpha, alike, turbulence, views, found)
 
 
 def test_tilt_decays_as_the_simulators(case):
     tilts, lags = case.found.tilt[:, :, MIDDLE], len(case.found.lags_s)
-    found = [statistics.decay_s(statistics.autocorrelation(tilt, lags), FPS) for tilt in tilts]
-    a = case.alpha ** (ALPHA_FPS / FPS)
+    found = [
+        dot_statistics.decay_time_s(dot_statistics.autocorrelate(tilt, lags), FPS) for tilt in tilts
+    ]
+    a = case.alpha ** (AR1_FPS / FPS)
     error = decay_error(a, FRAMES) / np.sqrt(case.alike)
     check("1/e of tilt, s", np.mean(found), -1 / np.log(a) / FPS, error / FPS)
 
@@ -123,7 +129,7 @@ def test_tilt_across_views_is_that_of_the_same_air_looked_at_for_longer(case):
     x, y = map(int, GRID[MIDDLE])
     long = case.turbulence.tilt(LONG, noise.generator(4), crop=(y, x, 1, 1))[..., 0, 0].numpy()
     pairs = np.triu_indices(9, 1)
-    true = statistics.correlation(long.swapaxes(0, 1))[pairs]
+    true = dot_statistics.tilt_correlation(long.swapaxes(0, 1))[pairs]
     assert abs(true.mean()) < 0.02 if case.alike == 9 else true.min() > 0.4
     error = sampling_error(long[CENTRE, :FRAMES]) * (1 - true**2)
     found = case.found.across_views[pairs]
@@ -133,8 +139,11 @@ def test_tilt_across_views_is_that_of_the_same_air_looked_at_for_longer(case):
 
 
 def test_blur_ratio_is_that_before_the_camera(case):
-    before = [dots.fit(view.numpy(), GRID[[MIDDLE]], 10).blur[:, 0] for view in case.views]
-    still = dots.fit(calm_dots().numpy(), GRID[[MIDDLE]], 10).blur[0, 0]
+    before = [
+        gaussian_dots.fit_gaussians(view.numpy(), GRID[[MIDDLE]], 10).blur[:, 0]
+        for view in case.views
+    ]
+    still = gaussian_dots.fit_gaussians(calm_dots().numpy(), GRID[[MIDDLE]], 10).blur[0, 0]
     true = np.mean(before, axis=1) / still
     error = np.mean([mean_error(series) for series in before]) / still
     assert true.min() - 1 > 5 * error

@@ -9,13 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from src.recordings.files.formats import (
-    EVENT,
-    iter_events,
-    open_events,
-    read_events,
-    write_events,
-)
+from src.recordings.files.formats import EVENT, iter_events, open_recording, read_events
+from tests.recordings.files.tables import write_events
 
 REAL = {
     "evk3_1280x720_evt3.raw": (219_596, (1280, 720)),
@@ -46,7 +41,7 @@ def test_every_real_recording_is_read_whole(shared_data, name):
         warnings.simplefilter("error")
         events = read_events(path)
     assert len(events) == count and events.dtype == EVENT
-    assert open_events(path).size == size
+    assert open_recording(path).size == size
     assert (np.diff(events["t"]) >= 0).all() and set(np.unique(events["p"])) == {-1, 1}
     pieces = list(iter_events(path, seconds=0.005))
     assert np.array_equal(np.concatenate(pieces), events)
@@ -68,7 +63,7 @@ def test_what_is_written_is_read(tmp_path, ending):
     events = made_up()
     path = tmp_path / f"a{ending}"
     write_events(path, events, width=640, height=480)
-    assert open_events(path).size == (640, 480)
+    assert open_recording(path).size == (640, 480)
     assert np.array_equal(read_events(path), events)
 
 
@@ -120,7 +115,7 @@ def test_hdf5_in_the_groups_of_others(tmp_path):
         file["events/ts"] = events["t"] * 1e-6
         file.attrs["sensor_resolution"] = (480, 640)
     assert np.array_equal(read_events(tmp_path / "seconds.h5"), events)
-    assert open_events(tmp_path / "seconds.h5").size == (640, 480)
+    assert open_recording(tmp_path / "seconds.h5").size == (640, 480)
     with h5py.File(tmp_path / "vendor.h5", "w") as file:
         file["CD/events"] = events
     with pytest.raises(ValueError, match="export the recording as RAW"):
@@ -131,7 +126,7 @@ def test_text_of_others(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("240 180\n0.5 1 2 0\n0.6 3 4 1\n")
     assert read_events(path).tolist() == [(500000, 1, 2, -1), (600000, 3, 4, 1)]
-    assert open_events(path).size == (240, 180)
+    assert open_recording(path).size == (240, 180)
     path = tmp_path / "a.csv"
     path.write_text("x,y,polarity,timestamp\n1,2,-1,50\n3,4,1,60\n")
     assert read_events(path).tolist() == [(50, 1, 2, -1), (60, 3, 4, 1)]
@@ -271,7 +266,7 @@ def survives(folder, ending: str, seed: int) -> None:
         warnings.simplefilter("ignore")
         try:
             events = read_events(path)
-            size = open_events(path).size
+            size = open_recording(path).size
         except ValueError as error:
             assert path.name in str(error)
             return

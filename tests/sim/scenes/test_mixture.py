@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 import torch
 
-from src.app import build
+from src.app.instantiate import instantiate_node
 from src.sim.scenes.mixture import Mixture
-from src.sim.scenes.motion import Tempo
-from src.sim.scenes.photo_files import photographs
+from src.sim.scenes.moving_layers import RestSchedule
+from src.sim.scenes.photo_files import list_photographs
 from src.sim.scenes.photographs import Photographs
 from src.sim.scenes.targets import Targets
 from tests.test_train import config
 
 FRAME = {"height": 32, "width": 32, "frames": 3, "fps": 120.0}
-PHOTOS = partial(Photographs, cutouts=0)
+PHOTOS = partial(Photographs, max_cutouts=0)
 DOTS = partial(Targets, kinds=["dot_grid"])
 
 
@@ -25,7 +25,7 @@ def mixture(photos: float, dots: float, split: str = "train", **more) -> Mixture
         "photos": {"share": photos, "scene": PHOTOS},
         "dots": {"share": dots, "splits": ["train"], "scene": DOTS},
     }
-    return Mixture(parts, split=split, **FRAME | more)
+    return Mixture(parts=parts, split=split, **FRAME | more)
 
 
 def kinds(scene: Mixture, clips: int = 200) -> int:
@@ -59,13 +59,13 @@ def test_a_clip_of_a_mixture_is_that_of_its_part_whatever_the_length():
 )
 def test_wrong_parts_name_their_key(parts, message):
     with pytest.raises(ValueError, match=message):
-        Mixture(parts, **FRAME)
+        Mixture(parts=parts, **FRAME)
 
 
 def test_the_scenes_to_train_on_need_no_data(tmp_path):
     cfg = config("train", tmp_path, "scene=training", "scene.height=64", "scene.width=64")
     for split in ("train", "val", "test"):
-        scene = build.make(cfg.scene, split=split, seed=0, frames=2, fps=120.0)
+        scene = instantiate_node(cfg.scene, split=split, seed=0, frames=2, fps=120.0)
         assert scene.clip(0).frames.shape == (2, 64, 64)
 
 
@@ -76,39 +76,42 @@ def changes(scene: Photographs, index: int) -> torch.Tensor:
 
 
 def test_a_still_camera_shows_moving_things_before_a_scene_that_stands():
-    moving = [changes(Photographs(frames=9, still=1.0, cutouts=2), index) for index in range(8)]
+    static = Photographs(frames=9, static_camera_share=1.0, max_cutouts=2)
+    moving = [changes(static, index) for index in range(8)]
     shares = [float(where.float().mean()) for where in moving]
     assert max(shares) < 0.6 and sum(share > 0 for share in shares) > 4
-    some = [
-        changes(Photographs(frames=3, still=0.5, cutouts=0), index).any() for index in range(40)
-    ]
+    half = Photographs(frames=3, static_camera_share=0.5, max_cutouts=0)
+    some = [changes(half, index).any() for index in range(40)]
     assert 10 < sum(map(bool, some)) < 30
 
 
 def test_what_rests_is_the_same_clip_at_another_pace():
     times, seen = np.arange(240) / 240, set()
     for seed in range(40):
-        tempo = Tempo(np.random.default_rng(seed))
-        moved = np.array([tempo(time) for time in times])
+        schedule = RestSchedule(np.random.default_rng(seed))
+        moved = np.array([schedule.motion_time_s(time) for time in times])
         steps = np.diff(moved)
         assert moved[0] == 0 and steps.min() > -1e-9 and steps.max() < 1 / 240 + 1e-9
-        pace = {"never": 0, "stops": moved[-1] < 0.31, "pauses": 0 < moved[-1] < 1}[tempo.kind]
-        assert pace or (tempo.kind == "never" and moved[-1] == 0)
-        seen.add(tempo.kind)
+        pace = {"never": 0, "stops": moved[-1] < 0.31, "pauses": 0 < moved[-1] < 1}[schedule.kind]
+        assert pace or (schedule.kind == "never" and moved[-1] == 0)
+        seen.add(schedule.kind)
     assert seen == {"pauses", "stops", "never"}
     for index in range(6):
-        always, rests = (Photographs(**FRAME, rest=rest).clip(index).frames for rest in (0.0, 1.0))
-        assert torch.equal(always[0], rests[0])
+        moving, resting = (
+            Photographs(**FRAME, rest_share=s).clip(index).frames for s in (0.0, 1.0)
+        )
+        assert torch.equal(moving[0], resting[0])
 
 
 def test_a_finer_clip_that_rests_holds_the_coarse_one():
+    shares = {"rest_share": 1.0, "static_camera_share": 0.5}
     for index in range(6):
-        coarse = Photographs(frames=4, fps=60.0, rest=1.0, still=0.5).clip(index).frames
-        fine = Photographs(frames=10, fps=180.0, rest=1.0, still=0.5).clip(index).frames
+        coarse = Photographs(frames=4, fps=60.0, **shares).clip(index).frames
+        fine = Photographs(frames=10, fps=180.0, **shares).clip(index).frames
         torch.testing.assert_close(coarse, fine[::3], atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("name", ["still", "rest"])
+@pytest.mark.parametrize("name", ["static_camera_share", "rest_share"])
 @pytest.mark.parametrize("value", [-0.1, 1.1, float("nan")])
 def test_probabilities_name_their_key(name, value):
     with pytest.raises(ValueError, match=rf"scene.{name} must be in \[0, 1\]"):
@@ -122,9 +125,11 @@ def test_a_second_folder_leaves_the_splits_of_the_first_as_they_were(tmp_path):
         root.mkdir(exist_ok=True)
         cv2.imwrite(str(root / f"{number:03}.png"), np.full((32, 32), number, np.uint8))
     for split in ("train", "val", "test"):
-        both = photographs([str(root) for root in roots], split)
-        assert both == photographs(str(roots[0]), split) + photographs(str(roots[1]), split)
+        both = list_photographs([str(root) for root in roots], split)
+        assert both == list_photographs(str(roots[0]), split) + list_photographs(
+            str(roots[1]), split
+        )
     with pytest.raises(ValueError, match="scene.root must be a folder or a pack, or some, got an"):
-        photographs([], "train")
+        list_photographs([], "train")
     with pytest.raises(ValueError, match="scene.root must be a folder or a pack of.* got /nowhere"):
-        photographs([str(roots[0]), "/nowhere"], "train")
+        list_photographs([str(roots[0]), "/nowhere"], "train")

@@ -10,10 +10,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import save
 
-from src.sim.scenes import photo_pack
-from src.sim.scenes.photo_files import SPLITS, photographs, read
-from src.sim.scenes.photo_pack import Packed, Picture, check, packed
+from scripts.pack_scenes import EncodedPicture, build_pack, verify_pack
+from src.sim.scenes import photo_files
+from src.sim.scenes.clip import SPLITS
+from src.sim.scenes.photo_files import PackedPhotograph, list_photographs, read_photograph
 from src.sim.scenes.photographs import Photographs
 from tests.conftest import ROOT
 
@@ -22,29 +24,29 @@ def picture(number: int) -> np.ndarray:
     return np.random.default_rng(number).integers(0, 256, (40, 48), np.uint8)
 
 
-def pictures() -> list[Picture]:
+def pictures() -> list[EncodedPicture]:
     """Twelve photographs without loss: seven to train on, two to validate, three to test."""
     splits = ["train"] * 7 + ["val"] * 2 + ["test"] * 3
     blobs = [cv2.imencode(".png", picture(number))[1].tobytes() for number in range(12)]
     names = [f"folder/sub/{11 - number:02}.jpg" for number in range(12)]
-    return [Picture(*one, (40, 48)) for one in zip(names, splits, blobs, strict=True)]
+    return [EncodedPicture(*one, (40, 48)) for one in zip(names, splits, blobs, strict=True)]
 
 
 @pytest.fixture
 def pack(tmp_path) -> Path:
     path = tmp_path / "photos.pack"
-    path.write_bytes(packed(pictures()))
+    path.write_bytes(build_pack(pictures()))
     return path
 
 
 def test_a_pack_gives_back_its_pictures_in_order_by_split(pack):
-    assert check(pack) == 12 and packed(pictures()) == pack.read_bytes()
-    photos = {split: photographs(str(pack), split) for split in SPLITS}
+    assert verify_pack(pack) == 12 and build_pack(pictures()) == pack.read_bytes()
+    photos = {split: list_photographs(str(pack), split) for split in SPLITS}
     names = [photo.name for split in SPLITS for photo in photos[split]]
     assert [len(photos[split]) for split in SPLITS] == [7, 2, 3]
     assert names == [one.name for one in pictures()] and photos["train"][0].stem == "11"
     for number, photo in enumerate(photo for split in SPLITS for photo in photos[split]):
-        assert np.array_equal(read(photo), picture(number))
+        assert np.array_equal(read_photograph(photo), picture(number))
 
 
 def test_clips_of_a_pack_are_those_of_the_files_in_it(pack, tmp_path):
@@ -75,9 +77,9 @@ def test_a_scene_with_a_pack_travels_to_another_process(pack):
 
 def test_only_what_is_asked_for_is_read(pack, monkeypatch):
     hashed = []
-    plain = photo_pack._sha256
-    monkeypatch.setattr(photo_pack, "_sha256", lambda data: hashed.append(data) or plain(data))
-    photos = photographs(str(pack), "val")
+    plain = photo_files.sha256
+    monkeypatch.setattr(photo_files, "sha256", lambda data: hashed.append(data) or plain(data))
+    photos = list_photographs(str(pack), "val")
     photos[1].data()
     photos[1].data()
     assert len(hashed) == 3 and hashed[1] == hashed[2] == pictures()[8].data
@@ -96,22 +98,22 @@ def test_a_damaged_picture_is_named_with_its_file(pack):
     bad = damaged(pack, pictures()[4].data, 50)
     message = f"scene.root: {re.escape(str(bad))} is damaged: the SHA-256 of folder/sub/07.jpg"
     with pytest.raises(ValueError, match=message):
-        check(bad)
-    photos = photographs(str(bad), "train")
+        verify_pack(bad)
+    photos = list_photographs(str(bad), "train")
     with pytest.raises(ValueError, match=message):
-        read(photos[4])
-    assert np.array_equal(read(photos[5]), picture(5))
+        read_photograph(photos[4])
+    assert np.array_equal(read_photograph(photos[5]), picture(5))
 
 
 def test_a_damaged_index_is_named(pack):
     bad = damaged(pack, b'{"train"', 3)
     with pytest.raises(ValueError, match="damaged.pack is damaged: the SHA-256 of index.json"):
-        photographs(str(bad), "train")
+        list_photographs(str(bad), "train")
 
 
 @pytest.mark.parametrize("kind", ["text", "cut", "other"])
 def test_what_is_no_whole_pack_is_refused(kind, pack):
-    other = photo_pack.save({"a": np.zeros(3, np.uint8)}, {"format": "pt"})
+    other = save({"a": np.zeros(3, np.uint8)}, {"format": "pt"})
     content = {"text": b"no pack", "cut": pack.read_bytes()[:-9], "other": other}[kind]
     path = pack.with_name(f"{kind}.pack")
     path.write_bytes(content)
@@ -121,13 +123,13 @@ def test_what_is_no_whole_pack_is_refused(kind, pack):
 
 def test_a_split_that_a_pack_lacks_is_named(tmp_path):
     path = tmp_path / "train.pack"
-    path.write_bytes(packed([one for one in pictures() if one.split == "train"]))
+    path.write_bytes(build_pack([one for one in pictures() if one.split == "train"]))
     with pytest.raises(ValueError, match="scene.root must hold photographs of split=val, got"):
-        photographs(str(path), "val")
+        list_photographs(str(path), "val")
 
 
 def test_a_picture_that_opencv_cannot_read_is_named(tmp_path):
     path = tmp_path / "odd.pack"
-    path.write_bytes(packed([Picture("a.jpg", "train", b"not a picture", (40, 48))]))
+    path.write_bytes(build_pack([EncodedPicture("a.jpg", "train", b"not a picture", (40, 48))]))
     with pytest.raises(ValueError, match=r"scene.root must hold readable .*odd.pack: a.jpg"):
-        read(Packed(path, "a.jpg"))
+        read_photograph(PackedPhotograph(path, "a.jpg"))

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from src.sim.scenes.photo_files import EMBEDDED, photographs
-from src.sim.scenes.photographs import MixedRates, Photographs
+from src.sim.scenes.clip import FrameRateMixture
+from src.sim.scenes.photo_files import EMBEDDED, list_photographs
+from src.sim.scenes.photographs import Photographs
 
 
 def test_a_clip_is_a_function_of_seed_split_and_index():
@@ -35,8 +36,8 @@ def test_a_finer_clip_holds_the_coarse_one():
 
 def test_motion_is_smooth_and_of_the_stated_speed():
     """Halving the frame interval halves the change from frame to frame: nothing jumps."""
-    slow = Photographs(frames=9, fps=120.0, speed=(0.5, 0.5), cutouts=0)
-    fast = Photographs(frames=9, fps=240.0, speed=(0.5, 0.5), cutouts=0)
+    given = {"frames": 9, "speed_widths_per_s": (0.5, 0.5), "max_cutouts": 0}
+    slow, fast = Photographs(fps=120.0, **given), Photographs(fps=240.0, **given)
     for index in range(4):
         steps = [
             float((clip.frames[1:] - clip.frames[:-1]).abs().mean())
@@ -46,8 +47,8 @@ def test_motion_is_smooth_and_of_the_stated_speed():
 
 
 def test_resolution_shows_the_same_scene():
-    low = Photographs(frames=2, height=64, width=64, cutouts=0).clip(1).frames[0]
-    high = Photographs(frames=2, height=192, width=192, cutouts=0).clip(1).frames[0]
+    low = Photographs(frames=2, height=64, width=64, max_cutouts=0).clip(1).frames[0]
+    high = Photographs(frames=2, height=192, width=192, max_cutouts=0).clip(1).frames[0]
     shrunk = cv2.resize(high.numpy(), (64, 64), interpolation=cv2.INTER_AREA)
     assert np.corrcoef(low.numpy().ravel(), shrunk.ravel())[0, 1] > 0.97
 
@@ -56,7 +57,7 @@ def test_splits_are_disjoint_embedded_and_in_a_folder(tmp_path):
     for number in range(23):
         cv2.imwrite(str(tmp_path / f"{number:03}.png"), np.full((32, 32), number, np.uint8))
     for root in (None, str(tmp_path)):
-        parts = [set(photographs(root, split)) for split in ("train", "val", "test")]
+        parts = [set(list_photographs(root, split)) for split in ("train", "val", "test")]
         assert all(parts) and sum(map(len, parts)) == len(set.union(*parts))
         assert len(parts[0]) > len(parts[2]) >= len(parts[1])
     assert len(set(" ".join(EMBEDDED.values()).split())) == sum(
@@ -71,9 +72,9 @@ def test_splits_are_disjoint_embedded_and_in_a_folder(tmp_path):
         ({"height": 4}, "scene.height"),
         ({"frames": 1}, "scene.frames"),
         ({"fps": 0.0}, "fps"),
-        ({"speed": (2.0, 1.0)}, "scene.speed"),
-        ({"zoom": (0.0, 1.0)}, "scene.zoom"),
-        ({"cutouts": -1}, "scene.cutouts"),
+        ({"speed_widths_per_s": (2.0, 1.0)}, "scene.speed_widths_per_s"),
+        ({"photo_px_per_px": (0.0, 1.0)}, "scene.photo_px_per_px"),
+        ({"max_cutouts": -1}, "scene.max_cutouts"),
         ({"split": "exam"}, "split"),
     ],
 )
@@ -93,7 +94,7 @@ def test_empty_folder_and_unreadable_photographs(tmp_path):
 
 def test_mixed_rates_draw_the_rate_of_a_clip_from_its_number():
     scenes = [Photographs(height=32, width=32, frames=2, fps=fps) for fps in (60.0, 600.0)]
-    mixed = MixedRates(scenes)
+    mixed = FrameRateMixture(scenes)
     rates = [mixed.clip(index).fps for index in range(12)]
     assert set(rates) == {60.0, 600.0} and rates == [mixed.clip(i).fps for i in range(12)]
 
@@ -114,7 +115,9 @@ GREYS = {  # of frame 8, every 80 pixels from (40, 40) on, of clips 0 to 2: as i
 
 @pytest.mark.parametrize("kind", GREYS)
 def test_clips_are_those_that_published_numbers_are_of(kind):
-    settings = {"still": 1.0, "rest": 1.0, "cutouts": 4} if kind == "still" else {}
+    settings = (
+        {"static_camera_share": 1.0, "rest_share": 1.0, "max_cutouts": 4} if kind == "still" else {}
+    )
     scene = Photographs(frames=9, train_root=None, **settings)
     for index, greys in enumerate(GREYS[kind]):
         frame = scene.clip(index).frames[-1, 40::80, 40::80]

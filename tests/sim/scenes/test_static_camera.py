@@ -4,24 +4,29 @@ import numpy as np
 import pytest
 import torch
 
-from src.app import build
-from src.sim.scenes.motion import Motion
-from src.sim.scenes.photo_layers import ReturningLayer, render
+from src.app.instantiate import build_part, instantiate_node
+from src.sim.scenes.moving_layers import MovingLayer, SimilarityMotion, render_frame
 from src.sim.scenes.photographs import Photographs
-from src.sim.scenes.shapes import sectors
-from src.sim.scenes.targets import KINDS, SpinningDisc
+from src.sim.scenes.targets import TARGETS, Targets, sector_coverage
 from src.sim.scenes.targets_on_photographs import TargetsOnPhotographs
 from tests.test_train import config
 
 FRAME = {"height": 64, "width": 80, "frames": 5, "fps": 120.0}
-SMALL = {"still": 1.0, "cutouts": 6, "cutout_sizes": (0.05, 0.2), "cutouts_return": True}
+SMALL = {
+    "static_camera_share": 1.0, "max_cutouts": 6, "cutout_widths": (0.05, 0.2),
+    "cutouts_reenter": True,
+}  # fmt: skip
 ALL = {
-    "bouncing_ball": {"size": [0.05, 0.12], "rise": [0.2, 0.6], "speed": [0.1, 2]},
-    "dart": {"length": [0.2, 0.35], "size": [0.03, 0.1], "speed": [300, 6000]},
-    "rotating_dot": {"radius": 0.3, "size": 0.06, "speed": [-4, 4]},
-    "spinning_stripe": {"length": [0.3, 0.7], "size": 0.1, "speed": [0.3, 4]},
-    "spinning_disc": {"size": [0.1, 0.25], "sectors": [1, 6], "speed": [0.3, 4]},
-    "dot_grid": {"dots": [1, 3], "size": 0.05},
+    "bouncing_ball": {
+        "ball_radius": [0.05, 0.12],
+        "bounce_height": [0.2, 0.6],
+        "speed_widths_per_s": [0.1, 2],
+    },
+    "dart": {"dart_length": [0.2, 0.35], "dart_width": [0.03, 0.1], "speed_px_per_s": [300, 6000]},
+    "rotating_dot": {"orbit_radius": 0.3, "dot_radius": 0.06, "turns_per_s": [-4, 4]},
+    "spinning_stripe": {"stripe_length": [0.3, 0.7], "stripe_width": 0.1, "turns_per_s": [0.3, 4]},
+    "spinning_disc": {"disc_radius": [0.1, 0.25], "sectors": [1, 6], "turns_per_s": [0.3, 4]},
+    "dot_grid": {"dots": [1, 3], "dot_radius": 0.05},
 }
 
 
@@ -31,7 +36,7 @@ def moved(frames: torch.Tensor) -> float:
 
 
 @pytest.mark.parametrize(
-    "scene", [Photographs(**FRAME, **SMALL), TargetsOnPhotographs(ALL, **FRAME)]
+    "scene", [Photographs(**FRAME, **SMALL), TargetsOnPhotographs(kinds=ALL, **FRAME)]
 )
 def test_only_small_things_move(scene):
     shares = [moved(scene.clip(index).frames) for index in range(12)]
@@ -40,11 +45,12 @@ def test_only_small_things_move(scene):
 
 def test_small_cut_outs_take_the_room_that_their_sizes_say():
     """What turns about its own middle changes its own room only: a disc of 0.92 of its side."""
-    frame = {"height": 120, "width": 120, "frames": 9, "fps": 30.0, "speed": (1e-9, 1e-9)}
+    frame = {"height": 120, "width": 120, "frames": 9, "fps": 30.0}
+    slow = {"speed_widths_per_s": (1e-9, 1e-9), "static_camera_share": 1.0}
     spans = []
     for index in range(12):
-        sizes = {"cutouts": 1, "cutout_sizes": (0.1, 0.1), "cutouts_return": True}
-        frames = Photographs(**frame, **sizes, still=1.0).clip(index).frames
+        sizes = {"max_cutouts": 1, "cutout_widths": (0.1, 0.1), "cutouts_reenter": True}
+        frames = Photographs(**frame, **sizes, **slow).clip(index).frames
         places = torch.nonzero((frames != frames[0]).any(0))
         spans += [int(np.ptp(axis)) + 1 for axis in places.T.numpy() if len(axis)]
     assert len(spans) == 24 and max(spans) <= 0.92 * 12 * 1.2 + 2 and np.median(spans) > 6
@@ -55,8 +61,8 @@ def test_clips_are_functions_of_the_index_and_of_time(kind):
     def scene(**more):
         frame = FRAME | more
         if kind == "small":
-            return Photographs(**frame, **SMALL, rest=0.5)
-        return TargetsOnPhotographs(ALL, **frame, rest=0.5, targets=3)
+            return Photographs(**frame, **SMALL, rest_share=0.5)
+        return TargetsOnPhotographs(kinds=ALL, **frame, rest_share=0.5, max_targets=3)
 
     for index in range(5):
         clip = scene().clip(index)
@@ -71,21 +77,23 @@ def test_clips_are_functions_of_the_index_and_of_time(kind):
     assert not any(torch.equal(first, other.frames) for other in others)
 
 
-def speck(speed: float) -> ReturningLayer:
+def speck(speed: float) -> MovingLayer:
     """Return a white disc in a square of 16 px that starts in the middle and drifts."""
-    motion = Motion(np.random.default_rng(3), (speed, speed))
-    motion.drift, motion.size, motion.angle = np.array([0.6, 0.2]) * speed, 0 * motion.size, 0.3
+    motion = SimilarityMotion(np.random.default_rng(3), (speed, speed))
+    motion.stop()
+    motion.drift, motion.angle = np.array([0.6, 0.2]) * speed, 0.3
     white = np.ones((16, 16), np.float32)
     mask = np.hypot(*np.mgrid[-7.5:8, -7.5:8]) < 0.92 * 8
-    return ReturningLayer(white, mask.astype(np.float32), np.array([8.0, 8.0]), 1.0, motion)
+    return MovingLayer(white, mask.astype(np.float32), np.array([8.0, 8.0]), 1.0, motion, True)
 
 
 def test_a_cut_out_that_left_comes_in_again_on_the_other_side():
     layer, size = speck(1.0), (64, 96)
-    ground = ReturningLayer(
-        np.zeros((64, 96), np.float32), None, np.array([48.0, 32.0]), 1.0, speck(1e-9).motion
+    black, middle = np.zeros((64, 96), np.float32), np.array([48.0, 32.0])
+    ground = MovingLayer(black, None, middle, 1.0, speck(1e-9).motion, True)
+    frames = np.stack(
+        [render_frame([ground, layer], time, size) for time in np.arange(0, 12, 0.01)]
     )
-    frames = np.stack([render([ground, layer], time, size) for time in np.arange(0, 12, 0.01)])
     seen = frames.sum((1, 2))
     y, x = np.mgrid[:64, :96]
     first = frames[0]
@@ -99,9 +107,10 @@ def test_a_cut_out_that_left_comes_in_again_on_the_other_side():
 
 
 def test_targets_are_drawn_before_the_photograph_and_only_there():
-    kinds = {"rotating_dot": {"radius": 0.0, "size": 0.1, "speed": 0.0}}
-    scene = TargetsOnPhotographs(kinds, **FRAME, targets=1)
-    other = TargetsOnPhotographs({"rotating_dot": {"size": 1 / 64}}, **FRAME, targets=1)
+    kinds = {"rotating_dot": {"orbit_radius": 0.0, "dot_radius": 0.1, "turns_per_s": 0.0}}
+    scene = TargetsOnPhotographs(kinds=kinds, **FRAME, max_targets=1)
+    small = {"rotating_dot": {"dot_radius": 1 / 64}}
+    other = TargetsOnPhotographs(kinds=small, **FRAME, max_targets=1)
     for index in range(4):
         frame, bare = scene.clip(index).frames[0], other.clip(index).frames[0]
         differ = (frame - bare).abs() > 1e-6
@@ -115,12 +124,15 @@ def test_targets_are_drawn_before_the_photograph_and_only_there():
     [
         ({"kinds": {}}, "scene.kinds must be some of rotating_dot"),
         ({"kinds": {"checkerboard": {}}}, "scene.kinds must be some of rotating_dot.*checkerboard"),
-        ({"kinds": {"dart": {"speed": [5, 1]}}}, "scene.kinds.dart.speed must be a number or"),
-        ({"kinds": {"dart": {"speed": "fast"}}}, "scene.kinds.dart.speed must be .*got fast"),
-        ({"kinds": {"dart": {"speed": [1, 1e6]}}}, r"scene.speed must be in \[0, 2e"),
-        ({"targets": 0}, "scene.targets must be >= 1, got 0"),
-        ({"rest": 1.5}, r"scene.rest must be in \[0, 1\], got 1.5"),
-        ({"zoom": [0, 1]}, "scene.zoom must be a range"),
+        ({"kinds": {"dart": {"dart_width": [5, 1]}}}, "kinds.dart.dart_width must be a number or"),
+        ({"kinds": {"dart": {"dart_width": "a"}}}, "kinds.dart.dart_width must be .*got a"),
+        (
+            {"kinds": {"dart": {"speed_px_per_s": [1, 1e6]}}},
+            r"scene.speed_px_per_s must be in \[0, 2",
+        ),
+        ({"max_targets": 0}, "scene.max_targets must be >= 1, got 0"),
+        ({"rest_share": 1.5}, r"scene.rest_share must be in \[0, 1\], got 1.5"),
+        ({"photo_px_per_px": [0, 1]}, "scene.photo_px_per_px must be a range"),
         ({"root": "/nowhere"}, "scene.root must be a folder or a pack"),
     ],
 )
@@ -131,8 +143,8 @@ def test_wrong_values_name_their_key(wrong, message):
 
 @pytest.mark.parametrize("sizes", [(0.0, 0.1), (0.3, 0.1), (0.1, float("nan"))])
 def test_sizes_of_cut_outs_that_are_no_range_are_refused(sizes):
-    with pytest.raises(ValueError, match="scene.cutout_sizes must be a range 0 < low <= high"):
-        Photographs(cutout_sizes=sizes)
+    with pytest.raises(ValueError, match="scene.cutout_widths must be a range 0 < low <= high"):
+        Photographs(cutout_widths=sizes)
 
 
 def test_sectors_cover_what_a_fine_grid_says():
@@ -144,42 +156,44 @@ def test_sectors_cover_what_a_fine_grid_says():
     for number in (1, 2, 3, 6):
         exact = np.arctan2(y, x) % (2 * np.pi / number) < np.pi / number
         exact = exact.reshape(32, 16, 32, 16).mean((1, 3))
-        off = abs(sectors(pixel_x, pixel_y, number) - exact)
+        off = abs(sector_coverage(pixel_x, pixel_y, number) - exact)
         assert off[np.hypot(pixel_x, pixel_y) > max(1, number)].max() < 0.08
 
 
 def test_a_disc_turns_about_its_middle_by_its_speed():
-    clip = SpinningDisc(height=65, width=65, frames=9, sectors=2, size=0.3, speed=5.0).clip(0)
+    options = {"spinning_disc": {"sectors": 2, "disc_radius": 0.3, "turns_per_s": 5.0}}
+    disc = Targets(kinds=list(options), options=options, height=65, width=65, frames=9)
+    clip = disc.clip(0)
     turned = np.degrees(2 * np.pi * 5.0 / 120)
     assert turned == pytest.approx(15)
     torch.testing.assert_close(clip.frames[0], clip.frames[6].rot90(1), atol=0.02, rtol=0)
-    away = clip.truth - 32
+    away = clip.path_px - 32
     assert torch.allclose(away.norm(dim=1), torch.tensor(0.3 * 65), atol=1e-4)
-    assert "spinning_disc" in KINDS
+    assert "spinning_disc" in TARGETS
 
 
 def test_the_scenes_of_a_static_camera_need_no_data(tmp_path):
     sizes = ("scene.height=128", "scene.width=160", "sensor=any_camera")
     cfg = config("train", tmp_path, "scene=static_camera", *sizes)
     for split, parts in (("train", 6), ("val", 5), ("test", 5)):
-        scene = build.make(cfg.scene, split=split, seed=0, frames=2, fps=480.0)
+        scene = instantiate_node(cfg.scene, split=split, seed=0, frames=2, fps=480.0)
         assert len(scene.scenes) == parts
         assert all(part.clip(0).frames.shape == (2, 128, 160) for part in scene.scenes)
-        lit = [scene.clip(index).lamp is not None for index in range(60)]
+        lit = [scene.clip(index).illumination is not None for index in range(60)]
         assert 1 < sum(lit) < 22
-    assert cfg.scene.parts.photographs.scene.cutouts == 4  # as in scene=training
+    assert cfg.scene.parts.photographs.scene.max_cutouts == 4  # as in scene=training
 
 
 def test_any_camera_draws_wide_ranges_and_keeps_the_sensor_of_the_paper(tmp_path):
-    sensor = build.part(config("train", tmp_path, "sensor=any_camera"), "sensor", seed=0)
+    sensor = build_part(config("train", tmp_path, "sensor=any_camera"), "sensor", seed=0)
     chips = [sensor.draw(key) for key in range(400)]
-    drawn = [chip for chip in chips if chip.residual > 0]
-    papers = [chip for chip in chips if chip.residual == 0]
+    drawn = [chip for chip in chips if chip.initial_reference_error > 0]
+    papers = [chip for chip in chips if chip.initial_reference_error == 0]
     assert 270 < len(drawn) < 330  # 300 +- 8.7
     thresholds = np.array([chip.threshold for chip in drawn])
     assert 0.05 <= thresholds.min() < 0.07 and 1.2 < thresholds.max() <= 1.5
     assert 0.22 < np.median(thresholds) < 0.34  # log-uniform: sqrt(0.05 1.5) = 0.27
     assert min(chip.off_ratio for chip in drawn) < 0.7 < 1.4 < max(c.off_ratio for c in drawn)
-    assert all(0.1 <= chip.threshold <= 0.7 and chip.shot_hz == 0 for chip in papers)
+    assert all(0.1 <= chip.threshold <= 0.7 and chip.dark_noise_hz == 0 for chip in papers)
     frames = torch.full((1, 1, 3, 8, 8), 0.5)
     assert all(chip.voxels(frames, 60.0).shape == (1, 1, 2, 5, 8, 8) for chip in chips[:40])

@@ -6,20 +6,22 @@ import numpy as np
 import pytest
 import torch
 
-from src.figures.slices import around, sample
-from src.sim.scenes.shapes import disc, inside, stripes, turned
+from src.figures.slices import circle_points, sample_points
 from src.sim.scenes.targets import (
-    KINDS,
-    BouncingBall,
-    Checkerboard,
-    Dart,
-    DotGrid,
-    RotatingDot,
-    SpinningStripe,
+    TARGETS,
     Targets,
+    disc_coverage,
+    edge_coverage,
+    mean_stripes,
+    rotate_coordinates,
 )
 
 SMALL = {"height": 64, "width": 80, "frames": 13, "split": "test"}
+
+
+def target(kind: str, options: dict | None = None, **arguments) -> Targets:
+    """Return the scene of one kind."""
+    return Targets(kinds=[kind], options={kind: options or {}}, **arguments)
 
 
 def centroid(frames: torch.Tensor) -> np.ndarray:
@@ -31,97 +33,97 @@ def centroid(frames: torch.Tensor) -> np.ndarray:
     )
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", TARGETS)
 def test_a_clip_is_a_function_of_seed_split_and_index(kind):
-    first, again = KINDS[kind](**SMALL).clip(3), KINDS[kind](**SMALL).clip(3)
-    assert torch.equal(first.frames, again.frames) and torch.equal(first.truth, again.truth)
+    first, again = target(kind, **SMALL).clip(3), target(kind, **SMALL).clip(3)
+    assert torch.equal(first.frames, again.frames) and torch.equal(first.path_px, again.path_px)
     for other in ({"seed": 1}, {"split": "val"}):
-        assert not torch.equal(first.truth, KINDS[kind](**SMALL | other).clip(3).truth)
-    assert not torch.equal(first.truth, KINDS[kind](**SMALL).clip(4).truth)
+        assert not torch.equal(first.path_px, target(kind, **SMALL | other).clip(3).path_px)
+    assert not torch.equal(first.path_px, target(kind, **SMALL).clip(4).path_px)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", TARGETS)
 def test_a_finer_clip_holds_the_coarse_one(kind):
-    coarse = KINDS[kind](**SMALL).clip(0)
-    fine = KINDS[kind](**SMALL | {"frames": 37, "fps": 360.0}).clip(0)
+    coarse = target(kind, **SMALL).clip(0)
+    fine = target(kind, **SMALL | {"frames": 37, "fps": 360.0}).clip(0)
     assert torch.allclose(coarse.frames, fine.frames[::3], atol=1e-6)
-    assert torch.allclose(coarse.truth, fine.truth[::3], atol=1e-4)
+    assert torch.allclose(coarse.path_px, fine.path_px[::3], atol=1e-4)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", TARGETS)
 def test_grey_levels_follow_the_contrast(kind):
-    clip = KINDS[kind](**SMALL, contrast=0.4).clip(0)
+    clip = target(kind, **SMALL, contrast=0.4).clip(0)
     assert clip.frames.shape == (13, 64, 80) and clip.frames.dtype == torch.float32
     assert math.isclose(float(clip.frames.min()), 0.3, abs_tol=1e-6)
     assert 0.6 < float(clip.frames.max()) <= 0.7 + 1e-6
 
 
 def test_a_dot_is_where_its_truth_says_and_circles():
-    clip = RotatingDot(**SMALL, speed=3.0).clip(0)
-    assert np.abs(centroid(clip.frames) - clip.truth.numpy()).max() < 0.03
-    away = clip.truth.numpy() - (39.5, 31.5)
+    clip = target("rotating_dot", {"turns_per_s": 3.0}, **SMALL).clip(0)
+    assert np.abs(centroid(clip.frames) - clip.path_px.numpy()).max() < 0.03
+    away = clip.path_px.numpy() - (39.5, 31.5)
     assert np.allclose(np.linalg.norm(away, axis=1), 0.3 * 64, atol=1e-4)
     angle = np.unwrap(np.arctan2(away[:, 1], away[:, 0]))
     assert np.allclose(np.diff(angle), 2 * math.pi * 3.0 / 120, atol=1e-5)
 
 
 def test_a_stripe_draws_straight_lines_in_theta_and_time():
-    clip = SpinningStripe(height=96, width=96, frames=25, speed=2.0).clip(1)
-    slices = sample(clip.frames.numpy(), around((47.5, 47.5), 30, 720))
+    clip = target("spinning_stripe", {"turns_per_s": 2.0}, height=96, width=96, frames=25).clip(1)
+    slices = sample_points(clip.frames.numpy(), circle_points((47.5, 47.5), 30, 720))
     # The stripe crosses the circle at two opposite angles: the second harmonic turns twice as far.
     phase = np.unwrap(np.angle(np.fft.rfft(slices)[:, 2])) / -2
     assert np.allclose(np.diff(phase), 2 * math.pi * 2.0 / 120, atol=0.003)
-    end = clip.truth.numpy() - 47.5
+    end = clip.path_px.numpy() - 47.5
     assert np.allclose(
         np.unwrap(np.arctan2(end[:, 1], end[:, 0]) - phase, period=math.pi).std(), 0, atol=0.003
     )
 
 
 def test_a_checkerboard_has_its_corner_on_the_truth():
-    scene = Checkerboard(**SMALL, squares=4, speed=300.0)
+    scene = target("checkerboard", {"squares": 4, "speed_px_per_s": 300.0}, **SMALL)
     for index in range(3):
         clip = scene.clip(index)
-        for frame, (x, y) in zip(clip.frames.numpy(), clip.truth.tolist(), strict=True):
+        for frame, (x, y) in zip(clip.frames.numpy(), clip.path_px.tolist(), strict=True):
             if not (4 < x < 75 and 4 < y < 59):
                 continue
             points = np.array([[x - 3, y - 3], [x + 3, y - 3], [x - 3, y + 3], [x + 3, y + 3]])
-            values = sample(frame[None], points)[0]
+            values = sample_points(frame[None], points)[0]
             assert np.allclose(values, [0.9, 0.1, 0.1, 0.9], atol=0.01)
-    steps = np.linalg.norm(np.diff(clip.truth.numpy(), axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(clip.path_px.numpy(), axis=0), axis=1)
     assert np.allclose(steps, 300 / 120, atol=1e-4)
 
 
 def test_a_still_checkerboard_stands_still():
-    frames = Checkerboard(**SMALL).clip(0).frames
+    frames = target("checkerboard", **SMALL).clip(0).frames
     assert torch.equal(frames[1:], frames[:-1])
 
 
 def test_a_dart_flies_straight_at_the_speed_of_the_paper():
-    scene = Dart(height=256, width=256, frames=101, fps=12_000.0, speed=16_000.0)
-    clip = scene.clip(2)
-    steps = np.diff(clip.truth.numpy(), axis=0)
+    paper = {"speed_px_per_s": 16_000.0}
+    clip = target("dart", paper, height=256, width=256, frames=101, fps=12_000.0).clip(2)
+    steps = np.diff(clip.path_px.numpy(), axis=0)
     assert np.allclose(np.linalg.norm(steps, axis=1), 16_000 / 12_000, atol=1e-3)
     assert np.allclose(steps, steps[0], atol=1e-3)
     seen = clip.frames.amax((1, 2)) > 0.5
-    whole = ((clip.truth > 40) & (clip.truth < 215)).all(1)
+    whole = ((clip.path_px > 40) & (clip.path_px < 215)).all(1)
     assert seen[whole].all() and whole.sum() > 20
-    off = centroid(clip.frames[whole]) - clip.truth[whole].numpy()
+    off = centroid(clip.frames[whole]) - clip.path_px[whole].numpy()
     across = off @ np.array([-steps[0, 1], steps[0, 0]]) / np.linalg.norm(steps[0])
     assert np.abs(across).max() < 0.02
 
 
 @pytest.mark.parametrize("index", range(4))
 def test_a_dart_turns_up_and_leaves_out_of_sight(index):
-    clip = Dart(**SMALL | {"frames": 400}, speed=700.0).clip(index)
-    jumps = (clip.truth[1:] - clip.truth[:-1]).norm(dim=1) > 700 / 120 + 1
+    clip = target("dart", {"speed_px_per_s": 700.0}, **SMALL | {"frames": 400}).clip(index)
+    jumps = (clip.path_px[1:] - clip.path_px[:-1]).norm(dim=1) > 700 / 120 + 1
     assert jumps.any()
     dark = (clip.frames == clip.frames.min()).all(2).all(1)
     assert (dark[1:] & dark[:-1])[jumps].all()
 
 
 def test_a_ball_stays_inside_falls_and_keeps_its_texture():
-    clip = BouncingBall(height=100, width=140, frames=241).clip(0)
-    x, y = clip.truth.T.numpy()
+    clip = target("bouncing_ball", height=100, width=140, frames=241).clip(0)
+    x, y = clip.path_px.T.numpy()
     radius = 12
     assert x.min() >= radius and x.max() <= 139 - radius
     assert y.max() <= 99 - radius + 1e-3 and np.ptp(y) > 55
@@ -129,7 +131,7 @@ def test_a_ball_stays_inside_falls_and_keeps_its_texture():
     assert np.isclose(np.median(bend), 8 * 60, rtol=0.02)  # 8 rise bounces^2, downwards
     ball = np.stack(
         [
-            disc(np.arange(140) - a, np.arange(100)[:, None] - b, 9)
+            disc_coverage(np.arange(140) - a, np.arange(100)[:, None] - b, 9)
             for a, b in zip(x, y, strict=True)
         ]
     )
@@ -137,36 +139,39 @@ def test_a_ball_stays_inside_falls_and_keeps_its_texture():
 
 
 def test_dots_stand_in_their_grid():
-    clip = DotGrid(height=90, width=90, frames=2, dots=3, size=0.1).clip(0)
-    assert np.allclose(centroid(clip.frames), clip.truth.numpy(), atol=0.01)
-    x, y = clip.truth[0].tolist()
+    clip = target("dot_grid", {"dots": 3, "dot_radius": 0.1}, height=90, width=90, frames=2).clip(0)
+    assert np.allclose(centroid(clip.frames), clip.path_px.numpy(), atol=0.01)
+    x, y = clip.path_px[0].tolist()
     points = np.array([[x + dx, y + dy] for dx in (-30, -15, 0, 15, 30) for dy in (-30, 0, 30)])
     expected = np.repeat([0.9, 0.1, 0.9, 0.1, 0.9], 3)
-    assert np.allclose(sample(clip.frames.numpy(), points)[0], expected, atol=1e-4)
+    assert np.allclose(sample_points(clip.frames.numpy(), points)[0], expected, atol=1e-4)
 
 
 def test_targets_cycle_over_kinds_and_pass_options():
-    scene = Targets(["dart", "dot_grid"], options={"dot_grid": {"dots": 1}}, **SMALL)
+    scene = Targets(kinds=["dart", "dot_grid"], options={"dot_grid": {"dots": 1}}, **SMALL)
     assert [scene.clip(index).name for index in range(3)] == ["Dart-0", "DotGrid-0", "Dart-1"]
-    assert torch.equal(scene.clip(3).frames, DotGrid(dots=1, **SMALL).clip(1).frames)
+    assert torch.equal(
+        scene.clip(3).frames, target("dot_grid", {"dots": 1}, **SMALL).clip(1).frames
+    )
 
 
 @pytest.mark.parametrize("kinds, options", [([], {}), (["darts"], {}), (["dart"], {"dot": {}})])
 def test_unknown_kinds_are_refused(kinds, options):
     with pytest.raises(ValueError, match="scene.kinds must be some of checkerboard"):
-        Targets(kinds, options=options)
+        Targets(kinds=kinds, options=options)
 
 
 @pytest.mark.parametrize(
     "make, message",
     [
-        (lambda: Dart(speed=1e6), "scene.speed must be in"),
-        (lambda: Dart(speed=math.nan), "scene.speed must be in"),
-        (lambda: RotatingDot(size=0.0), "scene.size must be in"),
-        (lambda: Checkerboard(squares=0), "scene.squares must be in"),
-        (lambda: BouncingBall(rise=0.9), "scene.rise must be in"),
-        (lambda: DotGrid(contrast=1.5), "scene.contrast must be in"),
-        (lambda: DotGrid(split="all"), "split must be one of"),
+        (lambda: target("dart", {"speed_px_per_s": 1e6}), "scene.speed_px_per_s must be in"),
+        (lambda: target("dart", {"speed_px_per_s": math.nan}), "scene.speed_px_per_s must be in"),
+        (lambda: target("rotating_dot", {"dot_radius": 0.0}), "scene.dot_radius must be in"),
+        (lambda: target("checkerboard", {"squares": 0}), "scene.squares must be in"),
+        (lambda: target("bouncing_ball", {"bounce_height": 0.9}), "scene.bounce_height must be in"),
+        (lambda: target("dot_grid", contrast=1.5), "scene.contrast must be in"),
+        (lambda: target("dart", {"dots": 1}), "dart takes dart_length, dart_width, speed"),
+        (lambda: target("dot_grid", split="all"), "split must be one of"),
     ],
 )
 def test_impossible_targets_are_refused(make, message):
@@ -185,11 +190,11 @@ def test_shapes_cover_what_a_fine_grid_says():
         return samples.reshape(24, 32, 24, 32).mean((1, 3))
 
     exact = mean(np.hypot(x - 11.3, y - 12.1) < 5.4)
-    assert np.abs(disc(pixel_x - 11.3, pixel_y - 12.1, 5.4) - exact).max() < 0.06
-    assert abs(exact.sum() / disc(pixel_x - 11.3, pixel_y - 12.1, 5.4).sum() - 1) < 0.004
+    assert np.abs(disc_coverage(pixel_x - 11.3, pixel_y - 12.1, 5.4) - exact).max() < 0.06
+    assert abs(exact.sum() / disc_coverage(pixel_x - 11.3, pixel_y - 12.1, 5.4).sum() - 1) < 0.004
     exact = mean(np.where((x - 3.3) % 10 < 5, 1.0, -1.0))
-    assert np.abs(stripes(pixel_x - 3.3, 5.0) - exact).max() < 0.07  # the fine grid's own step
-    along, _ = turned(x - 9.2, y - 9.7, 0.6)
+    assert np.abs(mean_stripes(pixel_x - 3.3, 5.0) - exact).max() < 0.07  # the fine grid's own step
+    along, _ = rotate_coordinates(x - 9.2, y - 9.7, 0.6)
     exact = mean(along < 4.0)
-    along, _ = turned(pixel_x - 9.2, pixel_y - 9.7, 0.6)
-    assert np.abs(inside(4.0 - along) - exact).max() < 0.06
+    along, _ = rotate_coordinates(pixel_x - 9.2, pixel_y - 9.7, 0.6)
+    assert np.abs(edge_coverage(4.0 - along) - exact).max() < 0.06

@@ -9,15 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from src.sim.sensor import response
-from src.sim.sensor.engines import sensor_cpu, sensor_eager
+from src.sim.sensor.engines import sensor_cpu, sensor_numba
+from src.sim.sensor.engines.records import NORMALS
 from src.sim.sensor.sensor import EventSensor
 from tests.sim.sensor import sensor_oracle
 
 FPS = 120.0
 EDGES = [math.ceil(k * 1e6 / FPS - 1e-6) for k in range(64)]
 NOISY = dict(
-    mismatch=0.1, leak_hz=5.0, shot_hz=60.0, hot_fraction=0.1, hot_hz=100.0, cutoff_hz=50.0,
-    response="linlog", off_ratio=1.3, seed=3,
+    mismatch=0.1, leak_event_hz=5.0, dark_noise_hz=60.0, hot_pixel_fraction=0.1,
+    hot_pixel_hz=100.0, cutoff_hz=50.0, response="linlog", off_ratio=1.3, seed=3,
 )  # fmt: skip
 
 
@@ -39,17 +40,21 @@ def signals(seed: int = 0, frames: int = 9) -> torch.Tensor:
 
 def levels_of(sensor: EventSensor, frames: torch.Tensor) -> list[list[int]]:
     """The level sequence of every pixel, row by row."""
-    return response.lookup(table_of(sensor), frames).flatten(1).T.tolist()
+    table = response.response_table(sensor.response, sensor.input, sensor.floor)
+    return read_levels(table, frames).flatten(1).T.tolist()
 
 
-def table_of(sensor: EventSensor) -> torch.Tensor:
-    """The levels at the table's nodes."""
-    return response.response_table(sensor.response, sensor.input, sensor.floor)
+def read_levels(table: torch.Tensor, intensity: torch.Tensor) -> torch.Tensor:
+    """The levels of intensities, int32, as the CPU kernel reads them."""
+    flat = np.ascontiguousarray(intensity.numpy()).ravel()
+    levels = np.empty(flat.size, np.int32)
+    sensor_numba.read_levels(table.numpy(), flat, levels)
+    return torch.from_numpy(levels).view(intensity.shape)
 
 
 def expected(sensor: EventSensor, frames: torch.Tensor) -> list[list[tuple[int, int]]]:
-    chip = sensor._job(frames[None, None], FPS, None, 1).clips[0]
-    on, off = int(chip["on"]), int(chip["off"])
+    clip = sensor._engine_input(frames[None, None], FPS).clips[0]
+    on, off = int(clip["on"]), int(clip["off"])
     wait = sensor_oracle.Fraction(float(np.float32(sensor.refractory_s * FPS)))
     pixels = levels_of(sensor, frames)
     if sensor.stamps == "v2e":
@@ -112,25 +117,6 @@ def test_any_8_bit_signal_gives_the_definitions_events(codes, threshold, refract
     assert same(listed(sensor.events(frames, FPS), 1, 1), expected(sensor, frames))
 
 
-@pytest.mark.parametrize("settings_", [{}, NOISY], ids=["clean", "noisy"])
-@pytest.mark.parametrize("stamps", ["linear", "v2e"])
-@pytest.mark.parametrize("refractory", ["defer", "delete", "hold"])
-@pytest.mark.parametrize("refractory_s", [0.0, 0.005, 0.02])
-def test_engines_agree_bit_for_bit(settings_, stamps, refractory, refractory_s):
-    sensor = EventSensor(
-        0.2, stamps=stamps, refractory=refractory, refractory_s=refractory_s, **settings_
-    )
-    frames = torch.stack([signals(s, 7) for s in range(6)]).view(2, 3, 7, 6, 8)
-    first, second = (
-        sensor._job(frames, FPS, None, 2, origin=(5, 7), full_width=99) for _ in range(2)
-    )
-    kernel = sensor_cpu.voxels(first, torch.zeros(2, 3, 3, 5, 6, 8))
-    eager = sensor_eager.voxels(second, torch.zeros(2, 3, 3, 5, 6, 8))
-    assert torch.equal(kernel, eager)
-    for name in ("level", "source", "reference", "dead"):
-        assert torch.equal(getattr(first.state, name), getattr(second.state, name)), name
-
-
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 @pytest.mark.parametrize("settings_", [{}, NOISY], ids=["clean", "noisy"])
@@ -139,26 +125,9 @@ def test_engines_agree_bit_for_bit(settings_, stamps, refractory, refractory_s):
 def test_the_gpu_agrees_bit_for_bit(settings_, stamps, refractory):
     frames = torch.rand(2, 3, 8, 63, 65, generator=torch.Generator().manual_seed(4))
     sensor = EventSensor(0.2, stamps=stamps, refractory=refractory, **settings_)
-    on_cpu, on_gpu = [], []
-    for found, device in ((on_cpu, "cpu"), (on_gpu, "cuda")):
-        state = None
-        for part in frames.to(device).split([5, 3], 2):
-            grids, state = sensor.step(part, FPS, state, origin=(5, 7), full_width=99)
-            found.append(grids.cpu())
-        memory = (state.level, state.source, state.reference, state.dead)
-        found.extend(part.cpu() for part in memory)
-    assert all(torch.equal(a, b) for a, b in zip(on_cpu, on_gpu, strict=True))
-
-
-@pytest.mark.parametrize("settings_", [{}, NOISY, {"stamps": "v2e"}, {"refractory": "hold"}])
-def test_in_chunks_is_in_one(settings_):
-    sensor = EventSensor(0.15, **settings_)
-    frames = signals(frames=9)[None, None]
-    whole = sensor.voxels(frames, FPS)
-    head, state = sensor.step(frames[:, :, :4], FPS)
-    middle, state = sensor.step(frames[:, :, 4:5], FPS, state)
-    tail, _ = sensor.step(frames[:, :, 5:], FPS, state)
-    assert torch.equal(torch.cat([head, middle, tail], 2), whole)
+    place = {"origin": (5, 7), "full_width": 99}
+    on_cpu = sensor.voxels(frames, FPS, **place)
+    assert torch.equal(sensor.voxels(frames.cuda(), FPS, **place).cpu(), on_cpu)
 
 
 @pytest.mark.parametrize("response_", ["log", "linlog"])
@@ -202,20 +171,17 @@ def test_how_many_pixels_are_simulated_together_changes_nothing(settings_, monke
     frames = signals()[None, None]
     sensor = EventSensor(0.02, refractory_s=0.0, **settings_)
     place = {"origin": (3, 5), "full_width": 24}
-    grids, state = sensor.step(frames, FPS, **place)
+    grids = sensor.voxels(frames, FPS, **place)
     counts, events = sensor.counts(frames, FPS), sensor.events(frames[0, 0], FPS, **place)
     monkeypatch.setattr(sensor_cpu, "UNIT", 5)
-    small_grids, small_state = sensor.step(frames, FPS, **place)
-    assert torch.equal(small_grids, grids)
-    for name in ("level", "source", "reference", "dead"):
-        assert torch.equal(getattr(small_state, name), getattr(state, name)), name
+    assert torch.equal(sensor.voxels(frames, FPS, **place), grids)
     assert torch.equal(sensor.counts(frames, FPS), counts)
     assert np.array_equal(sensor.events(frames[0, 0], FPS, **place), events)
 
 
-def test_the_chip_is_one_over_clips_and_the_noise_is_not():
+def test_the_pixels_are_the_same_over_clips_and_the_noise_is_not():
     frames = torch.full((2, 1, 30, 24, 24), 0.2)
-    noise = EventSensor(0.3, shot_hz=30.0).voxels(frames, FPS)
+    noise = EventSensor(0.3, dark_noise_hz=30.0).voxels(frames, FPS)
     assert not torch.equal(noise[0], noise[1])
     flicker = frames.clone()
     flicker[:, :, 1::2] = 0.3
@@ -246,48 +212,61 @@ def test_a_ramp_cut_into_substeps_keeps_its_events():
 
 def test_the_low_pass_is_exact_at_any_frame_interval():
     """One pole whose input is linear in time: more samples of the same line, the same output."""
-    sensor = EventSensor(0.1, cutoff_hz=20.0)
-    ends = torch.full((1, 1, 2, 1, 1), 0.5)
-    ends[:, :, 1] = 0.5001
-    ends[:, :, 0] = 0.499
-    fine = torch.lerp(ends[:, :, :1], ends[:, :, 1:], torch.linspace(0, 1, 9).view(1, 1, 9, 1, 1))
-    _, once = sensor.step(ends, FPS)
-    _, often = sensor.step(fine, FPS * 8)
-    moved = int(once.source) - int(response.lookup(table_of(sensor), ends[0, 0, 0]))
-    assert abs(int(once.level) - int(often.level)) <= 16
-    assert 0.2 < (int(once.level) - int(once.source) + moved) / moved < 0.8
+    table = response.response_table("log", "linear", 1 / 255)
+
+    def filtered(samples: int) -> tuple[int, int]:
+        """The last level after and before a low-pass of 20 Hz, seen `samples` times a frame."""
+        decay, lag = response.low_pass_table(20.0, FPS * samples, "linear")
+        line = torch.linspace(0.499, 0.5001, samples + 1)
+        first, *levels = read_levels(table, line).numpy()
+        old_level, old_source = (np.array([first], np.int32) for _ in range(2))
+        for level, light in zip(levels, line.numpy()[1:], strict=True):
+            new = np.array([level], np.int32)
+            light = np.array([light])
+            sensor_numba.apply_low_pass(decay, lag, light, old_level, old_source, new)
+            old_level[:] = new
+        return int(new[0]), int(new[0] - first)
+
+    (once, moved), (often, _) = filtered(1), filtered(8)
+    assert abs(once - often) <= 16
+    whole = int(np.diff(read_levels(table, torch.tensor([0.499, 0.5001])).numpy())[0])
+    assert 0.2 < moved / whole < 0.8
 
 
 def test_the_noise_has_the_rates_it_is_given():
     frames = torch.zeros(1, 1, 121, 64, 64)
-    counts = EventSensor(0.3, shot_hz=5.0, refractory_s=0.0).counts(frames, FPS).sum()
+    counts = EventSensor(0.3, dark_noise_hz=5.0, refractory_s=0.0).counts(frames, FPS).sum()
     expected_events = 5.0 * 64 * 64
     assert abs(counts - expected_events) < 4 * math.sqrt(expected_events)
-    white = EventSensor(0.3, shot_hz=5.0, refractory_s=0.0).counts(frames + 1, FPS).sum()
+    white = EventSensor(0.3, dark_noise_hz=5.0, refractory_s=0.0).counts(frames + 1, FPS).sum()
     assert abs(white - expected_events / 4) < 4 * math.sqrt(expected_events / 4)
-    leak = EventSensor(0.3, leak_hz=3.5, refractory_s=0.0).counts(frames, FPS)[0, 0]
+    leak = EventSensor(0.3, leak_event_hz=3.5, refractory_s=0.0).counts(frames, FPS)[0, 0]
     assert leak.tolist() == [3 * 64 * 64, 0]
-    hot = EventSensor(0.3, hot_fraction=0.01, hot_hz=60.0, refractory_s=0.0)
+    hot = EventSensor(0.3, hot_pixel_fraction=0.01, hot_pixel_hz=60.0, refractory_s=0.0)
     share = hot.counts(frames, FPS).sum() / (60 * 64 * 64)
     assert abs(share - 0.01) < 4 * math.sqrt(0.01 / 64**2)
 
 
 def test_noise_comes_at_any_time_of_the_interval():
-    events = EventSensor(0.3, shot_hz=100.0, refractory_s=0.0).events(torch.zeros(2, 64, 64), FPS)
+    sensor = EventSensor(0.3, dark_noise_hz=100.0, refractory_s=0.0)
+    events = sensor.events(torch.zeros(2, 64, 64), FPS)
     share = np.histogram(events["t"], 5, (0, EDGES[1]))[0] / len(events)
     assert np.abs(share - 0.2).max() < 4 * math.sqrt(0.16 / len(events))
 
 
 def test_mismatch_has_its_deviation_and_its_floor():
-    sensor = EventSensor(0.2, mismatch=0.15, refractory_s=0.0)
-    job = sensor._job(torch.zeros(1, 1, 2, 200, 200), FPS, None, 1)
-    on = sensor_eager.Pixels(job).on.double() / 2**20
+    drawn = np.random.default_rng(0).integers(0, 2**32, 40_000, np.uint32)
+
+    def thresholds(mismatch: float) -> np.ndarray:
+        out = np.empty(drawn.size, np.int32)
+        whole = round(0.2 * response.UNIT), round(mismatch * response.UNIT)
+        sensor_numba.spread_thresholds(*whole, NORMALS, drawn, out)
+        return out / response.UNIT
+
+    on = thresholds(0.15)
     assert abs(on.mean() - 0.2) < 4 * 0.03 / 200
     assert abs(on.std() / 0.03 - 1) < 4 / math.sqrt(2 * 200**2)
-    wild = sensor_eager.Pixels(
-        EventSensor(0.2, mismatch=0.9)._job(torch.zeros(1, 1, 2, 99, 99), FPS, None, 1)
-    )
-    assert wild.on.min() >= 0.049 * 2**20
+    assert thresholds(0.9).min() >= 0.049
 
 
 @pytest.mark.parametrize("refractory_s", [0.0005, 0.005])
@@ -302,7 +281,7 @@ def test_v2es_single_pixel_step(refractory_s):
     assert sum(per_frame) == 20
 
 
-def test_v2es_stamps_are_set_by_the_busiest_pixel():
+def test_v2es_stamps_are_set_by_the_pixel_of_most_events():
     frames = torch.tensor([[0.1, 0.5], [0.9, 0.5 * math.exp(0.25)]])[:, None]
     events = EventSensor(0.2, stamps="v2e", refractory_s=0.0).events(frames, FPS)
     quiet = events[events["x"] == 1]
@@ -313,7 +292,7 @@ def test_levels_are_the_logarithm_to_one_unit():
     x = torch.rand(20000, dtype=torch.float32) * 0.99 + 0.01
     for source, light in (("linear", x.double()), ("srgb", ((x.double() + 0.055) / 1.055) ** 2.4)):
         seen = x >= 0.05
-        level = response.lookup(response.response_table("log", source, 1e-3), x)[seen]
+        level = read_levels(response.response_table("log", source, 1e-3), x)[seen]
         exact = light[seen].clamp(min=1e-3).log() * 2**20
         assert (level - exact).abs().max() < 1.1
 
@@ -359,28 +338,28 @@ def test_black_pixels_are_at_the_floor():
 
 def test_a_clips_sensor_is_drawn_within_the_ranges():
     ranges = {"threshold": [0.1, 0.6], "off_ratio": [0.8, 1.25], "mismatch": [0.0, 0.1]}
-    sensor = EventSensor(0.2, shot_hz=1.0, drawn=ranges)
+    sensor = EventSensor(0.2, dark_noise_hz=1.0, random=ranges)
     clips = [sensor.draw(key) for key in range(400)]
     for name, (low, high) in ranges.items():
         values = np.array([getattr(clip, name) for clip in clips])
         assert low <= values.min() and values.max() <= high and len(set(values)) > 390
         middle = np.sqrt(low * high) if low > 0 else high / 2  # log-uniform, or uniform
         assert 0.4 < (values < middle).mean() < 0.6  # 0.5 +- 0.025
-    assert clips[0].drawn == {} and clips[0].shot_hz == 1.0 and clips[0].seed == sensor.seed
+    assert clips[0].random == {} and clips[0].dark_noise_hz == 1.0 and clips[0].seed == sensor.seed
     assert sensor.draw(3).threshold == clips[3].threshold and sensor.draw(3, 7).seed == 7
 
 
 def test_what_is_not_drawn_is_drawn_as_before():
     plain = EventSensor([0.1, 0.7]).draw(5)
     assert (
-        plain.threshold == EventSensor([0.1, 0.7], drawn={"mismatch": [0, 0.1]}).draw(5).threshold
+        plain.threshold == EventSensor([0.1, 0.7], random={"mismatch": [0, 0.1]}).draw(5).threshold
     )
 
 
 def test_a_share_of_the_clips_keeps_the_sensors_own_numbers():
     ranges = {"mismatch": [0.01, 0.1], "refractory_s": [0.001, 0.002]}
-    drawn = [EventSensor(drawn=ranges).draw(key) for key in range(400)]
-    some = [EventSensor(drawn=ranges, drawn_share=0.7).draw(key) for key in range(400)]
+    drawn = [EventSensor(random=ranges).draw(key) for key in range(400)]
+    some = [EventSensor(random=ranges, random_share=0.7).draw(key) for key in range(400)]
     kept = [clip.mismatch == 0.0 for clip in some]
     assert 0.23 < np.mean(kept) < 0.37  # 0.3 +- 0.023
     for clip, before, own in zip(some, drawn, kept, strict=True):
@@ -390,28 +369,28 @@ def test_a_share_of_the_clips_keeps_the_sensors_own_numbers():
 
 @pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
 def test_a_share_is_between_none_and_all(share):
-    with pytest.raises(ValueError, match=r"sensor.drawn_share must be in \[0, 1\], got"):
-        EventSensor(drawn_share=share)
+    with pytest.raises(ValueError, match=r"sensor.random_share must be in \[0, 1\], got"):
+        EventSensor(random_share=share)
 
 
 @pytest.mark.parametrize(
-    ("drawn", "message"),
+    ("ranges", "message"),
     [
-        ({"color": [0, 1]}, "sensor.drawn must hold ranges of threshold, .*, got color"),
-        ({"floor": [0.01, 0.1]}, "sensor.drawn must hold ranges of .*, got floor"),
-        ({"threshold": 0.2}, r"sensor.drawn.threshold must be \[low, high\], got 0.2"),
-        ({"threshold": [0.5, 0.1]}, r"sensor.drawn.threshold must be \[low, high\]"),
-        ({"threshold": ["a", "b"]}, r"sensor.drawn.threshold must be \[low, high\]"),
-        ({"threshold": [0.1, 9]}, r"sensor.drawn.threshold must be in \[0.01, 5\], got 9"),
-        ({"mismatch": [-1, 0.5]}, r"sensor.drawn.mismatch must be in \[0, 1\], got -1"),
+        ({"color": [0, 1]}, "sensor.random must hold ranges of threshold, .*, got color"),
+        ({"floor": [0.01, 0.1]}, "sensor.random must hold ranges of .*, got floor"),
+        ({"threshold": 0.2}, r"sensor.random.threshold must be \[low, high\], got 0.2"),
+        ({"threshold": [0.5, 0.1]}, r"sensor.random.threshold must be \[low, high\]"),
+        ({"threshold": ["a", "b"]}, r"sensor.random.threshold must be \[low, high\]"),
+        ({"threshold": [0.1, 9]}, r"sensor.random.threshold must be in \[0.01, 5\], got 9"),
+        ({"mismatch": [-1, 0.5]}, r"sensor.random.mismatch must be in \[0, 1\], got -1"),
     ],
 )
-def test_wrong_ranges_name_their_key(drawn, message):
+def test_wrong_ranges_name_their_key(ranges, message):
     with pytest.raises(ValueError, match=message):
-        EventSensor(drawn=drawn)
+        EventSensor(random=ranges)
 
 
-def test_with_a_residual_the_first_event_comes_anywhere_within_two_thresholds():
+def test_with_a_reference_error_the_first_event_comes_anywhere_within_two_thresholds():
     """A ramp of log intensity: without, all pixels fire at the same moment, one threshold on."""
     ramp = (
         torch.exp(torch.linspace(-2.0, -1.0, 101))
@@ -420,8 +399,9 @@ def test_with_a_residual_the_first_event_comes_anywhere_within_two_thresholds():
     )
     ramp = ramp.contiguous()
     firsts = []
-    for residual in (0.0, 1.0):
-        counts = EventSensor(0.2, refractory_s=0.0, residual=residual).voxels(ramp, 100.0).sum(3)
+    for error in (0.0, 1.0):
+        sensor = EventSensor(0.2, refractory_s=0.0, initial_reference_error=error)
+        counts = sensor.voxels(ramp, 100.0).sum(3)
         firsts.append((counts[0, 0] > 0).float().argmax(0).flatten())  # hundredths of a nat
     assert firsts[0].unique().numel() == 1
     waited = (firsts[1] + 0.5) / 100
@@ -429,9 +409,9 @@ def test_with_a_residual_the_first_event_comes_anywhere_within_two_thresholds():
     assert float(waited.mean()) == pytest.approx(0.2, abs=0.01)
 
 
-def test_a_residual_makes_no_event_by_itself_and_is_the_same_in_a_crop_and_in_a_list():
+def test_a_reference_error_makes_no_event_by_itself_and_is_the_same_in_a_crop_and_in_a_list():
     still = torch.full((1, 2, 4, 32, 32), 0.4)
-    sensor = EventSensor(0.2, residual=1.0, mismatch=0.3, refractory_s=0.0)
+    sensor = EventSensor(0.2, initial_reference_error=1.0, mismatch=0.3, refractory_s=0.0)
     assert float(sensor.voxels(still, 100.0).abs().sum()) == 0
     moving = still * torch.linspace(1, 2, 4)[:, None, None]
     whole = sensor.voxels(moving, 100.0, clips=[3])

@@ -6,18 +6,17 @@ Each in a process of its own, because Triton reads TRITON_INTERPRET when it is i
 import os
 import subprocess
 import sys
-from dataclasses import replace
 from importlib.util import find_spec
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
 
-from src.sim.sensor.engines import sensor_cpu, sensor_eager
-from src.sim.sensor.engines.run import engine
-from src.sim.sensor.limits import MODES
+from src.sim.sensor.engine_input import MODES, build_engine_input
+from src.sim.sensor.engines import sensor_cpu
+from src.sim.sensor.engines.run import uses_triton
 from src.sim.sensor.sensor import EventSensor
-from tests.sim.sensor.test_batch import clips, in_two_chunks, sensors
+from tests.sim.sensor.test_batch import VIEWS, clips, sensor_clips, sensors
 from tests.sim.sensor.test_sensor import FPS
 
 pytestmark = pytest.mark.skipif(not find_spec("triton"), reason="triton is not installed")
@@ -32,6 +31,14 @@ def in_a_process(check: str, **environment: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
+def simulated(engine: ModuleType, many: list[EventSensor], frames: torch.Tensor) -> torch.Tensor:
+    """Grids of two intervals each."""
+    given = build_engine_input(sensor_clips(many), frames, VIEWS, substeps=2)
+    return engine.voxels(
+        given, torch.zeros(4, (frames.shape[2] - 1) // 2, 2, 5, *frames.shape[-2:])
+    )
+
+
 def agree() -> None:
     """Compare the kernel with the CPU's; 16 programs of 32 pixels, some beyond the picture.
 
@@ -44,8 +51,8 @@ def agree() -> None:
     turned = clips(5).permute(2, 4, 0, 3, 1).contiguous().permute(2, 4, 0, 3, 1)
     cases = [(sensors(True, refractory=mode), turned.half()) for mode in MODES]
     for many, frames in (*cases, (sensors(False)[:2] * 2, turned)):
-        ours, theirs = (in_two_chunks(e, many, frames) for e in (sensor_triton, sensor_cpu))
-        assert all(torch.equal(a, b) for a, b in zip(ours, theirs, strict=True)), vars(many[0])
+        ours, theirs = (simulated(e, many, frames) for e in (sensor_triton, sensor_cpu))
+        assert torch.equal(ours, theirs) and ours.any(), vars(many[0])
 
 
 def refuses() -> None:
@@ -54,10 +61,10 @@ def refuses() -> None:
 
     for frame in (0, 4):
         frames = clips(5)
-        in_two_chunks(sensor_triton, sensors(False), frames)
+        simulated(sensor_triton, sensors(False), frames)
         frames[3, 1, frame, 5, 7] = float("nan")
         with pytest.raises(ValueError, match="frames must be finite"):
-            in_two_chunks(sensor_triton, sensors(False), frames)
+            simulated(sensor_triton, sensors(False), frames)
 
 
 def compiles() -> None:
@@ -71,12 +78,11 @@ def compiles() -> None:
     names = _simulate.arg_names
     fixed = {"MODE": 2, "FILTERED": True, "NOISY": True, "BINS": 5, "COLUMNS": 8, "BLOCK": 128}
     types = dict.fromkeys(names, "*i32") | dict.fromkeys(SIZES, "i32")
-    types |= dict.fromkeys(("deads", "grids"), "*fp32")
-    types |= dict.fromkeys(("normals", "numbers"), "*i64")
-    types |= dict.fromkeys((*fixed, "FRESH"), "constexpr")
+    types |= {"grids": "*fp32", "normals": "*i64", "numbers": "*i64"}
+    types |= dict.fromkeys(fixed, "constexpr")
     options = {"enable_fp_fusion": False}
-    for fresh, frames in ((True, "*fp16"), (False, "*fp32")):
-        values = {(names.index(name),): value for name, value in (fixed | {"FRESH": fresh}).items()}
+    values = {(names.index(name),): value for name, value in fixed.items()}
+    for frames in ("*fp16", "*fp32"):
         source = ASTSource(_simulate, types | {"frames": frames}, values)
         ptx = triton.compile(source, target=GPUTarget("cuda", 80, 32), options=options).asm["ptx"]
         assert "div.rn.f32" in ptx
@@ -91,14 +97,11 @@ def test_the_kernel_says_what_is_no_intensity():
     in_a_process("refuses()", TRITON_INTERPRET="1")
 
 
-def test_cuda_is_given_to_the_kernel_and_v2es_stamps_to_plain_torch():
-    frames = SimpleNamespace(is_cuda=True, device=torch.device("cuda"))
-    jobs = {
-        stamps: EventSensor(stamps=stamps)._job(torch.zeros(1, 1, 2, 4, 4), FPS, None, 1)
-        for stamps in ("linear", "v2e")
-    }
-    assert engine(replace(jobs["linear"], frames=frames)).__name__.endswith("sensor_triton")
-    assert engine(replace(jobs["v2e"], frames=frames)) is sensor_eager
+def test_cuda_is_given_to_the_kernel_and_v2es_stamps_to_the_cpu():
+    for stamps, wanted in (("linear", True), ("v2e", False)):
+        given = EventSensor(stamps=stamps)._engine_input(torch.zeros(1, 1, 2, 4, 4), FPS)
+        assert not uses_triton(given)
+        assert uses_triton(given._replace(frames=SimpleNamespace(is_cuda=True))) == wanted
 
 
 def test_the_kernel_compiles_for_a_gpu():

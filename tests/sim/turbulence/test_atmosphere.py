@@ -12,12 +12,12 @@ PATH = Atmosphere(0.05, 0.5, 1000.0, 2.0, 525e-9, 3e-14, 0.9)
 
 def test_pixels_follow_from_focal_length_distance_and_scene_width():
     assert PATH.pixel_pitch_m(256) == pytest.approx(0.5 * 2.0 / (1000.0 * 256))
-    assert PATH.airy_px(256) == pytest.approx(525e-9 / 0.05 * 1000 * 256 / 2.0)
+    assert PATH.lambda_over_d_px(256) == pytest.approx(525e-9 / 0.05 * 1000 * 256 / 2.0)
     assert PATH.tilt_std_px(512) == pytest.approx(2 * PATH.tilt_std_px(256))
 
 
 def test_severity_is_what_is_seen():
-    weak, medium, strong = (PATH.at(d_over_r0) for d_over_r0 in (0.5, 1.4, 4.0))
+    weak, medium, strong = (PATH.with_d_over_r0(d_over_r0) for d_over_r0 in (0.5, 1.4, 4.0))
     assert [path.severity for path in (weak, medium, strong)] == ["weak", "medium", "strong"]
     assert strong.d_over_r0 == pytest.approx(4.0)
     enlarged = replace(medium, scene_width_m=1.0)  # the same air through a longer lens
@@ -26,7 +26,12 @@ def test_severity_is_what_is_seen():
 
 def test_no_turbulence_on_the_path():
     path = replace(PATH, cn2=0.0)
-    assert (path.r0_m, path.d_over_r0, path.tilt_std_px(256), path.rytov) == (math.inf, 0, 0, 0)
+    assert (path.r0_m, path.d_over_r0, path.tilt_std_px(256), path.rytov_variance) == (
+        math.inf,
+        0,
+        0,
+        0,
+    )
 
 
 @pytest.mark.parametrize(
@@ -42,8 +47,8 @@ def test_no_turbulence_on_the_path():
         ("focal_length_m", -1.0),
         ("scene_width_m", math.inf),
         ("wavelength_m", 0.0),
-        ("alpha", 1.1),
-        ("alpha", -0.1),
+        ("ar1_coefficient", 1.1),
+        ("ar1_coefficient", -0.1),
         ("outer_scale_m", 0.0),
         ("outer_scale_m", -1.0),
         ("outer_scale_m", math.nan),

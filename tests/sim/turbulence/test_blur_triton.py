@@ -12,8 +12,8 @@ from itertools import product
 import pytest
 import torch
 
-from src.sim.turbulence.engines import blur_eager, blur_engine
-from src.sim.turbulence.lattice import Lattice
+from src.sim.turbulence.coefficient_grid import GridAxis
+from src.sim.turbulence.engines import blur_torch, device
 
 triton = pytest.mark.skipif(not find_spec("triton"), reason="triton is not installed")
 CUDA = torch.device("cuda", 0)
@@ -34,16 +34,16 @@ def agree() -> None:
 
     blur_triton.BLOCK = 32
     for size, pitch in product((1, 3, 6), (1, 3)):
-        rows = Lattice(-3, 13, pitch, 1)
+        rows = GridAxis(-3, 13, pitch, 1)
         frames, tilt = torch.rand(2, 6, 11), 3 * torch.randn(2, 3, 13, 12)
         psfs, halo = (
             torch.rand(size**2, 3, rows.nodes, 12) - 0.3,
             torch.rand(2, 14 - size, 13 - size),
         )
-        one, other = (e.warp(frames, tilt, -3, 2, 1) for e in (blur_triton, blur_eager))
+        one, other = (e.warp(frames, tilt, -3, 2, 1) for e in (blur_triton, blur_torch))
         torch.testing.assert_close(one, other, atol=2e-6, rtol=0)
         given = (psfs, rows, halo, 0.1, 1)
-        one, other = (e.scatter(other, *given) for e in (blur_triton, blur_eager))
+        one, other = (e.scatter(other, *given) for e in (blur_triton, blur_torch))
         torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
 
 
@@ -84,22 +84,22 @@ def test_the_kernels_compile_for_gpus():
 
 
 def test_a_gpu_without_triton_gets_plain_torch(monkeypatch):
-    monkeypatch.setattr(blur_engine, "find_spec", lambda name: None)
-    assert blur_engine.on.__wrapped__(CUDA) is blur_eager
-    assert blur_engine.on(torch.device("cpu")) is blur_eager
+    monkeypatch.setattr(device, "find_spec", lambda name: None)
+    assert device.select_engine.__wrapped__(CUDA) is blur_torch
+    assert device.select_engine(torch.device("cpu")) is blur_torch
 
 
 @pytest.mark.parametrize("apart", [0.5, float("nan")])
 def test_kernels_that_fail_or_differ_are_not_used_and_that_is_said(apart, monkeypatch):
-    monkeypatch.setattr(blur_engine, "find_spec", lambda name: True)
+    monkeypatch.setattr(device, "find_spec", lambda name: True)
     with pytest.warns(UserWarning, match="turbulence without Triton's kernels, slower: .*Error: "):
-        assert blur_engine.on.__wrapped__(CUDA) is blur_eager  # there is no such device
-    monkeypatch.setitem(sys.modules, "src.sim.turbulence.engines.blur_triton", blur_eager)
-    monkeypatch.setattr(blur_engine, "difference", lambda *_: apart)
+        assert device.select_engine.__wrapped__(CUDA) is blur_torch  # there is no such device
+    monkeypatch.setitem(sys.modules, "src.sim.turbulence.engines.blur_triton", blur_torch)
+    monkeypatch.setattr(device, "max_abs_difference", lambda *_: apart)
     with pytest.warns(UserWarning, match="slower: they differ by"):
-        assert blur_engine.on.__wrapped__(CUDA) is blur_eager
+        assert device.select_engine.__wrapped__(CUDA) is blur_torch
 
 
 def test_an_engine_does_not_differ_from_itself():
     cpu = torch.device("cpu")
-    assert blur_engine.difference(blur_eager, 3, cpu) == 0.0
+    assert device.max_abs_difference(blur_torch, 3, cpu) == 0.0

@@ -10,8 +10,8 @@ from scipy import special
 
 from src.sim import noise
 from src.sim.turbulence import Atmosphere, Turbulence, outer_scale
-from src.sim.turbulence.phase import draw_waves
-from src.sim.turbulence.prior import profile
+from src.sim.turbulence.plane_waves import draw_plane_waves
+from src.sim.turbulence.prior import cn2_profile
 from tests.sim.turbulence.theory import isoplanatic_angle_rad
 
 RATIOS = (0.0, 1 / 100, 1 / 30, 1 / 10, 1 / 3, 1.0)  # D / L0
@@ -26,49 +26,51 @@ PATH = Atmosphere(0.1, 1.0, 1000.0, 1.28, 525e-9, 1e-15, 0.0)
 
 
 def drawn(path: Atmosphere, modes: int = 2):
-    return draw_waves(path, 5, modes=modes, waves=40_000, width_px=256)
+    return draw_plane_waves(path, 5, modes=modes, waves=40_000, width_px=256)
 
 
 @pytest.mark.parametrize("place", HALF_LENGTHS)
 def test_half_lengths_of_theory_are_those_of_the_table(place):
-    found = [outer_scale.tilt_reach(ratio, profile(place)) for ratio in RATIOS]
+    found = [outer_scale.tilt_correlation_distance(ratio, cn2_profile(place)) for ratio in RATIOS]
     np.testing.assert_allclose(found, HALF_LENGTHS[place], rtol=0.15)  # two digits, few slices
 
 
 @pytest.mark.parametrize("place", HALF_LENGTHS)
 @pytest.mark.parametrize("ratio", RATIOS)
 def test_the_waves_that_are_drawn_have_this_variance_and_half_length(place, ratio):
-    shape = profile(place)
-    path = replace(PATH, cn2=shape).at(1.0)
+    shape = cn2_profile(place)
+    path = replace(PATH, cn2=shape).with_d_over_r0(1.0)
     path = replace(path, outer_scale_m=PATH.aperture_m / ratio if ratio else math.inf)
     waves = drawn(path)
     power = waves.response[:2].square().sum((0, 2)).numpy() / 2
-    expected = outer_scale.left(ratio, shape, "tilt") * 0.448879
+    expected = outer_scale.variance_ratio(ratio, shape, "tilt") * 0.448879
     assert power.sum() == pytest.approx(expected, rel=0.04)
-    apart = path.half_length_px(256)
+    apart = path.tilt_correlation_half_length_px(256)
     turn = 2 * math.pi * waves.frequency.norm(dim=-1).numpy() * apart
     assert (power * special.j0(turn)).sum() / power.sum() == pytest.approx(0.5, abs=0.03)
 
 
 def test_the_variance_of_uniform_air_is_the_tables():
-    found = [outer_scale.left(ratio, (1.0,), "tilt") for ratio in RATIOS]
+    found = [outer_scale.variance_ratio(ratio, (1.0,), "tilt") for ratio in RATIOS]
     np.testing.assert_allclose(found, VARIANCES, rtol=0.03)
 
 
 @pytest.mark.parametrize("ratio", [1 / 3, 1.0])
 def test_what_is_left_of_the_modes_that_blur(ratio):
-    kolmogorov = drawn(PATH.at(1.0), 120).response[2:].square().sum()
-    path = replace(PATH.at(1.0), outer_scale_m=PATH.aperture_m / ratio)
+    kolmogorov = drawn(PATH.with_d_over_r0(1.0), 120).response[2:].square().sum()
+    path = replace(PATH.with_d_over_r0(1.0), outer_scale_m=PATH.aperture_m / ratio)
     left = drawn(path, 120).response[2:].square().sum() / kolmogorov
-    assert outer_scale.left(ratio, path.shape, "higher") == pytest.approx(float(left), rel=0.05)
+    assert outer_scale.variance_ratio(ratio, path.normalised_profile, "higher") == pytest.approx(
+        float(left), rel=0.05
+    )
 
 
 def test_the_fields_of_clips_have_the_half_length():
-    path = replace(PATH.at(2.0), outer_scale_m=0.1)
+    path = replace(PATH.with_d_over_r0(2.0), outer_scale_m=0.1)
     air = Turbulence(path, views=1, height=128, width=128)
-    apart = round(path.half_length_px(128))
-    lag = np.array([apart * path.object_pixel_m(128) / path.aperture_m])
-    expected = outer_scale.tilt_correlation(1.0, path.shape, lag)[0]
+    apart = round(path.tilt_correlation_half_length_px(128))
+    lag = np.array([apart * path.pixel_size_at_object_m(128) / path.aperture_m])
+    expected = outer_scale.tilt_correlation(1.0, path.normalised_profile, lag)[0]
     tilt = torch.stack([air.tilt(8, noise.generator(seed))[0] for seed in range(24)])
     power = tilt.square().mean()
     along = [
@@ -81,11 +83,13 @@ def test_the_fields_of_clips_have_the_half_length():
 
 
 def test_time_of_decay_in_the_wind():
-    path = replace(PATH, outer_scale_m=0.2).at(1.0)
-    reach = outer_scale.tilt_reach(path.inverse_outer_scale, path.shape, wind=True)
+    path = replace(PATH, outer_scale_m=0.2).with_d_over_r0(1.0)
+    reach = outer_scale.tilt_correlation_distance(
+        path.aperture_over_outer_scale, path.normalised_profile, wind=True
+    )
     waves = drawn(path)
     power = waves.response[:2].square().sum((0, 2)).numpy()
-    turn = 2 * math.pi * waves.layer.norm(dim=-1).numpy() * reach * path.aperture_m
+    turn = 2 * math.pi * waves.layer_frequency.norm(dim=-1).numpy() * reach * path.aperture_m
     left = (power * special.j0(turn)).sum() / power.sum()
     assert left == pytest.approx(math.exp(-1), abs=0.03)
 

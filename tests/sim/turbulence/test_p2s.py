@@ -1,12 +1,12 @@
-"""The networks from phase to PSF weights: their symmetries, and the CPU engine against torch."""
+"""The networks from phase to PSF weights: their symmetries, and their merged layers."""
 
 import numpy as np
 import pytest
 import torch
 from torch.nn import functional
 
-from src.sim.turbulence.engines.weights import weights
-from src.sim.turbulence.p2s_network import Network, mode_kind, shape_kinds
+from scripts.p2s_training import TrainableNetwork
+from src.sim.turbulence.p2s_network import PhaseToSpaceNetwork, basis_parities, mode_parity
 from src.sim.turbulence.psf import fraunhofer_psf
 from src.sim.turbulence.zernike import noll_index
 
@@ -18,14 +18,18 @@ def phases(modes: int, count: int = 300) -> torch.Tensor:
     return torch.randn(count, modes - 2, generator=torch.Generator().manual_seed(1))
 
 
-def network(modes: int, width: int = 16) -> Network:
+def network(modes: int, width: int = 16) -> TrainableNetwork:
     torch.manual_seed(0)
-    return Network(modes, width, COUNTS, edge=4.0).requires_grad_(False)
+    return TrainableNetwork(modes, width, COUNTS, edge=4.0).requires_grad_(False)
+
+
+def stored(net: TrainableNetwork) -> PhaseToSpaceNetwork:
+    return PhaseToSpaceNetwork(net.modes, net.edge, net.state_dict())
 
 
 def turned(phase: torch.Tensor, down: bool, across: bool) -> torch.Tensor:
     """Mirror the rows and the columns of a phase."""
-    kinds = torch.tensor([mode_kind(mode) for mode in range(4, 4 + phase.shape[1])])
+    kinds = torch.tensor([mode_parity(mode) for mode in range(4, 4 + phase.shape[1])])
     odd = (down & (kinds // 2 == 1)) ^ (across & (kinds % 2 == 1))
     return torch.where(odd, -phase, phase)
 
@@ -46,18 +50,8 @@ def test_half_a_turn_and_another_sign_change_nothing():
     other = torch.where(even, -phase, phase)
     torch.testing.assert_close(net(other, 3.0), net(phase, 3.0))
     full = (torch.nn.functional.pad(some[:2], (2, 0)) for some in (phase, other))
-    one, two = (fraunhofer_psf(some, airy_px=2.0, size=21) for some in full)
+    one, two = (fraunhofer_psf(some, lambda_over_d_px=2.0, size=21) for some in full)
     torch.testing.assert_close(one, two, atol=1e-6, rtol=0)
-
-
-@pytest.mark.parametrize("modes, width", [(5, 16), (9, 16), (20, 32), (77, 112)])
-@pytest.mark.parametrize("nodes", [1, 128, 300])
-def test_the_engine_equals_the_network(modes, width, nodes):
-    net, phase = network(modes, width), phases(modes, nodes)
-    own = tuple(np.array(rows, np.int64) for rows in net.own)
-    usual = np.float32((3.0 / 4.0) ** (5 / 3))
-    found = weights(phase.T.contiguous().numpy(), own, usual, net.matrices())
-    torch.testing.assert_close(torch.from_numpy(found).T, net(phase, 3.0), atol=2e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize("modes, width", [(5, 16), (20, 32), (77, 112)])
@@ -65,7 +59,7 @@ def test_the_engine_equals_the_network(modes, width, nodes):
 def test_few_large_matrices_equal_the_network(modes, width, given):
     net, phase = network(modes, width), phases(max(modes, given + 2))[:, :given]
     known = functional.pad(phase, (0, max(0, modes - 2 - given)))[:, : modes - 2]
-    one, *found = net.merged(given, 3.0)(phase.T.contiguous())
+    one, *found = stored(net).merge_layers(given, 3.0)(phase.T.contiguous())
     assert torch.equal(one, torch.ones(len(phase)))
     found = torch.stack(found, 1)
     torch.testing.assert_close(found, net(known, 3.0), atol=2e-5, rtol=1e-4)
@@ -76,12 +70,13 @@ def test_a_cut_network_gives_the_first_functions_of_each_kind(counts):
     net, phase = network(20), phases(20)
     kept = [np.arange(k) + start for k, start in zip(counts, (0, 5, 8, 10), strict=True)]
     whole = net(phase, 2.0)[:, np.concatenate(kept)]
-    torch.testing.assert_close(net.cut(counts)(phase, 2.0), whole)
-    assert net.cut(counts).macs(sum(counts)) <= net.macs(13)
+    cut = stored(net).truncate(counts)
+    torch.testing.assert_close(cut.merge_layers(18, 2.0)(phase.T)[1:].T, whole)
+    assert cut.count_macs(sum(counts)) <= stored(net).count_macs(13)
 
 
 def test_kinds_of_shapes():
     x = torch.linspace(-1, 1, 9)
     even, odd = torch.exp(-(x**2)), x * torch.exp(-(x**2))
     shapes = [even[:, None] * even, even[:, None] * odd, odd[:, None] * even, odd[:, None] * odd]
-    assert shape_kinds(torch.stack(shapes)).tolist() == [0, 1, 2, 3]
+    assert basis_parities(torch.stack(shapes)).tolist() == [0, 1, 2, 3]

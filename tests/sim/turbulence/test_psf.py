@@ -5,11 +5,17 @@ import math
 import pytest
 import torch
 
-from src.sim.turbulence.p2s import FILE, FINE_PER_AIRY, Spots, band_for, bands
-from src.sim.turbulence.p2s_network import shape_kinds
-from src.sim.turbulence.psf import fraunhofer_psf, resampling
+from src.sim.turbulence.p2s import (
+    FILE,
+    SAMPLES_PER_LAMBDA_OVER_D,
+    FittedPSFs,
+    find_psf_band,
+    load_psf_bands,
+)
+from src.sim.turbulence.p2s_network import basis_parities
+from src.sim.turbulence.psf import fraunhofer_psf, pixel_integration_matrix
 from src.sim.turbulence.zernike import noll_covariance
-from tests.sim.turbulence.theory import fitted_psfs
+from tests.sim.turbulence.theory import compute_fitted_psfs
 
 MODES = 119  # that carry what blurs
 
@@ -22,7 +28,7 @@ def phases(count: int, d_over_r0: float, modes: int) -> torch.Tensor:
 
 
 def test_clear_pupil_is_airys_pattern():
-    psf = fraunhofer_psf(torch.zeros(2), airy_px=4.0, size=61, points=1, pupil=256)
+    psf = fraunhofer_psf(torch.zeros(2), lambda_over_d_px=4.0, size=61, points=1, pupil=256)
     profile = psf[30, 30:] / psf[30, 30]
     x = math.pi * torch.arange(31.0) / 4
     airy = (2 * torch.special.bessel_j1(x) / x.clamp(min=1e-9)) ** 2
@@ -32,8 +38,8 @@ def test_clear_pupil_is_airys_pattern():
 
 def test_tilt_moves_the_light_the_way_it_says():
     tilt = torch.tensor([1.5, -0.8])
-    psf = fraunhofer_psf(tilt, airy_px=2.0, size=63, points=1)
-    straight = fraunhofer_psf(torch.zeros(2), airy_px=2.0, size=63, points=1)
+    psf = fraunhofer_psf(tilt, lambda_over_d_px=2.0, size=63, points=1)
+    straight = fraunhofer_psf(torch.zeros(2), lambda_over_d_px=2.0, size=63, points=1)
     moved = psf.flatten().argmax()
     assert (moved % 63 - 31, moved // 63 - 31) == (
         round(1.5 * 4 / math.pi),
@@ -46,23 +52,29 @@ def test_tilt_moves_the_light_the_way_it_says():
 def test_resampling_equals_integration_over_pixels(airy):
     size = 2 * int(4 * airy) + 1
     coefficients = phases(8, 2.0, 35)
-    fine = fraunhofer_psf(coefficients, airy_px=2.0, size=65, pupil=64, points=1)
-    grid = resampling(size, 65, 2.0 / airy).float()
+    fine = fraunhofer_psf(coefficients, lambda_over_d_px=2.0, size=65, pupil=64, points=1)
+    grid = pixel_integration_matrix(size, 65, 2.0 / airy).float()
     ours = grid @ fine @ grid.T
-    exact = fraunhofer_psf(coefficients, airy_px=airy, size=size, pupil=64, points=9)
+    exact = fraunhofer_psf(coefficients, lambda_over_d_px=airy, size=size, pupil=64, points=9)
     ours = ours / ours.sum((1, 2), keepdim=True)
     assert (ours - exact).norm() < 0.01 * exact.norm()
 
 
 def exact_and_fitted(strength: float, number: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Return PSFs (300, fine^2) of all modes, and what network `number` makes of its own."""
-    band = band_for(strength)
+    band = find_psf_band(strength)
     coefficients = phases(300, strength, MODES)
     size = band.mean.shape[-1]
-    exact = fraunhofer_psf(coefficients, airy_px=FINE_PER_AIRY, size=size, pupil=size - 3, points=1)
+    exact = fraunhofer_psf(
+        coefficients,
+        lambda_over_d_px=SAMPLES_PER_LAMBDA_OVER_D,
+        size=size,
+        pupil=size - 3,
+        points=1,
+    )
     network = band.networks[number]
-    weights = network(coefficients[:, 2 : network.modes], strength)
-    basis = band.basis[shape_kinds(band.basis).argsort(stable=True)]
+    weights = network.merge_layers(network.modes - 2, strength)(coefficients[:, 2:].T)[1:].T
+    basis = band.basis[basis_parities(band.basis).argsort(stable=True)]
     return exact.flatten(1), band.mean.flatten() + weights @ basis.flatten(1)
 
 
@@ -85,7 +97,7 @@ def test_modes_left_out_blur_as_they_do_on_average(strength, number):
 
 
 def test_basis_is_even_or_odd_under_both_mirrors():
-    for band in bands():
+    for band in load_psf_bands():
         for axis in (1, 2):
             turned = band.basis.flip(axis)
             sign = (turned * band.basis).sum((1, 2), keepdim=True).sign()
@@ -93,9 +105,9 @@ def test_basis_is_even_or_odd_under_both_mirrors():
 
 
 def test_fitted_psf_without_phase_is_diffraction():
-    spots = Spots(bands()[0], -1, 24, 1.0, 17, 0.0)
-    ours = fitted_psfs(spots, torch.zeros(25, 1)).reshape(17, 17)
-    exact = fraunhofer_psf(torch.zeros(2), airy_px=1.0, size=17, points=9)
+    psfs = FittedPSFs(load_psf_bands()[0], -1, 24, 1.0, 17, 0.0)
+    ours = compute_fitted_psfs(psfs, torch.zeros(25, 1)).reshape(17, 17)
+    exact = fraunhofer_psf(torch.zeros(2), lambda_over_d_px=1.0, size=17, points=9)
     assert (ours - exact).abs().max() < 0.01 * exact.max()
 
 
@@ -109,16 +121,18 @@ def test_we_are_closer_than_the_public_network(shared_data):
     state = torch.load(shared_data / "p2s_reference/P2S_state.pt", map_location="cpu")
     known = torch.load(shared_data / "p2s_reference/kernel_PCA.pt", map_location="cpu")
     coefficients = phases(300, 4.0, MODES)
-    exact = fraunhofer_psf(coefficients, airy_px=3.8, size=65, pupil=64, points=1).flatten(1)
+    exact = fraunhofer_psf(coefficients, lambda_over_d_px=3.8, size=65, pupil=64, points=1).flatten(
+        1
+    )
     layers = list(state.values())
     x = coefficients[:, 2:35]
     for index in (0, 2, 4):
         x = torch.nn.functional.linear(x, layers[index], layers[index + 1])
         x = torch.nn.functional.leaky_relu(x, 0.01) if index < 4 else x
     public = known["mu"].reshape(1, -1) + x @ known["dictionary"].reshape(len(x.T), -1)
-    band = band_for(4.0)
-    spots = Spots(band, -1, len(band.basis), 3.8, 65, 4.0)
-    ours = fitted_psfs(spots, coefficients[:, 2 : spots.network.modes].T).T
+    band = find_psf_band(4.0)
+    psfs = FittedPSFs(band, -1, len(band.basis), 3.8, 65, 4.0)
+    ours = compute_fitted_psfs(psfs, coefficients[:, 2 : psfs.network.modes].T).T
 
     def error(psf):
         psf, truth = (p / p.sum(1, keepdim=True) for p in (psf, exact))

@@ -7,9 +7,13 @@ import torch
 
 from src.sim.noise import generator
 from src.sim.optics import layout
-from src.sim.turbulence.fields import Fields, fields, join
-from src.sim.turbulence.model import Air, TurbulenceModel
-from src.sim.turbulence.recorded import RecordedAir, RecordedTilt, Strength
+from src.sim.turbulence.contract import TurbulenceModel, TurbulenceOperator
+from src.sim.turbulence.footage_displacement import (
+    NormalisedDisplacement,
+    interpolate_tracks,
+    load_displacement_fields,
+)
+from src.sim.turbulence.recorded import DrawnTilt, RecordedTurbulence, RecordedTurbulenceOperator
 
 RMS = {"weak": 0.5, "medium": 1.0, "strong": 2.0}
 SIDE, FRAMES = 256, 12
@@ -43,24 +47,24 @@ def footage(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def model(footage):
-    return RecordedTilt(str(footage), rms_px=RMS)
+    return RecordedTurbulence(str(footage), tilt_rms_px=RMS)
 
 
 def test_the_fields_are_the_warps_that_the_footage_was_made_with(footage):
-    found = fields(footage)
+    found = load_displacement_fields(footage)
     left, top = (round((SIDE - size) / 2) for size in (found.width_px, found.height_px))
     assert max(left, top) < 16  # corners fill the frame but for a margin
     place = np.arange(40.0, 216.0, 4.0)
-    seen = found.at(np.arange(FRAMES) * 1.0, place - top, place - left).numpy()
+    seen = found.sample(np.arange(FRAMES) * 1.0, place - top, place - left).numpy()
     true = warps()[:, :, 40:216:4, 40:216:4]
     scale = (seen * true).sum() / (seen**2).sum()
     assert np.sqrt(((scale * seen - true) ** 2).mean()) < 0.2 * np.sqrt((true**2).mean())
     assert scale == pytest.approx(np.sqrt((warps() ** 2).mean()), rel=0.15)
 
 
-def at(found: Fields, time: float, *places: float) -> torch.Tensor:
+def at(found: NormalisedDisplacement, time: float, *places: float) -> torch.Tensor:
     """Return the field at one time on a square lattice."""
-    return found.at(np.array([time]), np.array(places), np.array(places))
+    return found.sample(np.array([time]), np.array(places), np.array(places))
 
 
 def test_between_corners_and_frames_the_fields_are_smooth_and_pass_through_them():
@@ -68,7 +72,7 @@ def test_between_corners_and_frames_the_fields_are_smooth_and_pass_through_them(
     corners = rng.uniform(0, 100, (60, 2))
     corners[:4] = [[0, 0], [100, 0], [0, 100], [100, 100]]
     slope = np.stack([0.02 * corners[:, 0] - 1, 0.01 * corners[:, 1]], -1)
-    found = join(slope * np.sin(np.arange(9))[:, None, None], corners)
+    found = interpolate_tracks(slope * np.sin(np.arange(9))[:, None, None], corners)
     whole = at(found, 3.0, *np.arange(0, 101, 10.0))[0]
     assert torch.allclose(whole[0, :, 10] / whole[0, :, 0], torch.tensor(-1.0), atol=1e-2)
     assert found.nodes.square().mean().sqrt() == pytest.approx(1.0, abs=1e-5)
@@ -80,9 +84,9 @@ def test_between_corners_and_frames_the_fields_are_smooth_and_pass_through_them(
 
 
 def test_beyond_its_ends_the_footage_is_mirrored_in_place_and_time():
-    found = Fields(torch.randn(5, 2, 6, 7, generator=generator(0)), 10.0, 12.0)
-    inside = found.at(np.array([1.3]), np.array([2.0]), np.array([3.0]))
-    beyond = found.at(np.array([8 - 1.3]), np.array([-2.0]), np.array([24 - 3.0]))
+    found = NormalisedDisplacement(torch.randn(5, 2, 6, 7, generator=generator(0)), 10.0, 12.0)
+    inside = found.sample(np.array([1.3]), np.array([2.0]), np.array([3.0]))
+    beyond = found.sample(np.array([8 - 1.3]), np.array([-2.0]), np.array([24 - 3.0]))
     torch.testing.assert_close(inside, beyond, atol=1e-5, rtol=0)
     turn = [at(found, time, 4.0, 5.0) for time in (3.9, 4.0, 4.1)]  # level there: no jerk
     assert float((turn[1] - turn[0]).abs().max()) < 0.15
@@ -91,15 +95,17 @@ def test_beyond_its_ends_the_footage_is_mirrored_in_place_and_time():
 
 def test_both_sides_of_the_contract_are_kept(model):
     air = model.operator(model.draw(generator(0)), views=layout(9), **RUN)
-    assert isinstance(model, TurbulenceModel) and isinstance(air, Air)
-    strength = air.facts["severity"]
-    assert air.facts["tilt_px"] == RMS[strength] and air.facts["blur_px"] == 0.4 * RMS[strength]
+    assert isinstance(model, TurbulenceModel) and isinstance(air, TurbulenceOperator)
+    strength = air.metadata["severity"]
+    assert (
+        air.metadata["tilt_px"] == RMS[strength] and air.metadata["blur_px"] == 0.4 * RMS[strength]
+    )
     drawn = {model.draw(generator(k)).severity for k in range(30)}
     assert drawn == set(RMS)
 
 
 def test_a_view_depends_on_its_own_position_and_a_crop_is_that_part_of_the_whole(model):
-    frames, strong = torch.rand(1, 3, 64, 64), Strength("strong", 2.0)
+    frames, strong = torch.rand(1, 3, 64, 64), DrawnTilt("strong", 2.0)
     nine = model.operator(strong, views=layout(9), **RUN)
     one = model.operator(strong, views=layout(1), **RUN)
     whole = nine.degrade(frames, generator(3))
@@ -112,7 +118,7 @@ def test_a_view_depends_on_its_own_position_and_a_crop_is_that_part_of_the_whole
 def test_the_picture_moves_as_tilt_says_and_a_flat_one_stays_flat(model):
     y, x = torch.meshgrid(torch.arange(64.0), torch.arange(64.0), indexing="ij")
     frames = (x + 2 * y).expand(1, 4, 64, 64) / 200
-    air = model.operator(Strength("medium", 1.0), views=layout(4), **RUN)
+    air = model.operator(DrawnTilt("medium", 1.0), views=layout(4), **RUN)
     seen, tilt = air.degrade(frames, generator(5)), air.tilt(4, generator(5))
     inner = (..., slice(8, 56), slice(8, 56))
     expected = frames[:, None] - (tilt[:, :, 0] + 2 * tilt[:, :, 1]) / 200
@@ -122,15 +128,19 @@ def test_the_picture_moves_as_tilt_says_and_a_flat_one_stays_flat(model):
 
 
 def test_a_point_is_blurred_as_stated():
-    still = Fields(torch.zeros(3, 2, 4, 4), 10.0, 10.0)
-    air = RecordedAir(still, Strength("strong", 2.0), layout(1), (33, 33), 0.25, 1.2)
+    still = NormalisedDisplacement(torch.zeros(3, 2, 4, 4), 10.0, 10.0)
+    air = RecordedTurbulenceOperator(
+        still, DrawnTilt("strong", 2.0), layout(1), (33, 33), 0.25, 1.2
+    )
     frames = torch.zeros(1, 1, 33, 33)
     frames[..., 16, 16] = 1
     spot = air.degrade(frames, generator(0))[0, 0, 0]
     away = torch.arange(33) - 16.0
     assert float(spot.sum()) == pytest.approx(1, abs=1e-4)
     assert float((spot.sum(0) * away**2).sum()) == pytest.approx(1.2**2, rel=0.05)
-    sharp = RecordedAir(still, Strength("weak", 0.0), layout(1), (33, 33), 0.25, 0.0)
+    sharp = RecordedTurbulenceOperator(
+        still, DrawnTilt("weak", 0.0), layout(1), (33, 33), 0.25, 0.0
+    )
     assert torch.equal(sharp.degrade(frames, generator(0))[0], frames)
 
 
@@ -141,8 +151,13 @@ def test_nine_views_look_through_nine_pieces():
     nodes = torch.zeros(frames, 2, side, side)
     nodes[:, 0] = torch.arange(frames)[:, None, None].float()
     nodes[:, 1] = (place // 32)[:, None] * 2 + place // 32
-    air = RecordedAir(
-        Fields(nodes, 63.0, 63.0), Strength("weak", 1.0), layout(9), (256, 256), 0.25, 0.0
+    air = RecordedTurbulenceOperator(
+        NormalisedDisplacement(nodes, 63.0, 63.0),
+        DrawnTilt("weak", 1.0),
+        layout(9),
+        (256, 256),
+        0.25,
+        0.0,
     )
     for seed in range(4):
         tilt = air.tilt(40, generator(seed), crop=(120, 120, 16, 16)).abs()
@@ -156,8 +171,8 @@ def test_nine_views_look_through_nine_pieces():
 
 def test_about_half_of_the_views_play_their_piece_backwards():
     clock = torch.arange(40.0)[:, None, None, None].expand(40, 2, 8, 8)
-    seen = Fields(clock, 63.0, 63.0)
-    air = RecordedAir(seen, Strength("weak", 1.0), layout(9), (16, 16), 0.25, 0.0)
+    seen = NormalisedDisplacement(clock, 63.0, 63.0)
+    air = RecordedTurbulenceOperator(seen, DrawnTilt("weak", 1.0), layout(9), (16, 16), 0.25, 0.0)
     backwards = 0
     for seed in range(10):
         time = air.tilt(40, generator(seed)).abs().mean((2, 3, 4))
@@ -172,8 +187,8 @@ def test_mirrored_and_turned_pieces_stay_gradients():
     y, x = torch.meshgrid(torch.arange(65.0), torch.arange(65.0), indexing="ij")
     hill = torch.stack([torch.cos(x / 9) * torch.sin(y / 7) / 9,
                         torch.sin(x / 9) * torch.cos(y / 7) / 7])  # fmt: skip
-    seen = Fields(hill.expand(4, 2, 65, 65), 64.0, 64.0)
-    air = RecordedAir(seen, Strength("weak", 1.0), layout(9), (16, 16), 0.1, 0.0)
+    seen = NormalisedDisplacement(hill.expand(4, 2, 65, 65), 64.0, 64.0)
+    air = RecordedTurbulenceOperator(seen, DrawnTilt("weak", 1.0), layout(9), (16, 16), 0.1, 0.0)
     tilt = air.tilt(2, generator(1))
     down = tilt[:, :, 0, 2:, 1:-1] - tilt[:, :, 0, :-2, 1:-1]
     across = tilt[:, :, 1, 1:-1, 2:] - tilt[:, :, 1, 1:-1, :-2]
@@ -198,36 +213,41 @@ def moving(folder, count=10):
         ({"root": None}, "turbulence.root must be a video or folder of frames .*got None"),
         ({"root": "/nowhere"}, "turbulence.root must be .*got /nowhere"),
         ({"severity": "wild"}, "turbulence.severity must be mixed, weak, medium, strong, got wild"),
-        ({"rms_px": {"weak": -1.0}}, r"turbulence.rms_px.weak must be in \[0, 8\] pixels, got -1"),
-        ({"rate": 0.0}, "turbulence.rate must be > 0"),
-        ({"blur": float("nan")}, "turbulence.blur must be in"),
+        (
+            {"tilt_rms_px": {"weak": -1.0}},
+            r"turbulence.tilt_rms_px.weak must be in \[0, 8\] pixels, got -1",
+        ),
+        ({"footage_fps": 0.0}, "turbulence.footage_fps must be > 0"),
+        ({"blur_over_tilt": float("nan")}, "turbulence.blur_over_tilt must be in"),
     ],
 )
 def test_a_wrong_value_names_its_key(footage, options, said):
     with pytest.raises(ValueError, match=said):
-        RecordedTilt(**{"root": str(footage), "rms_px": RMS} | options)
+        RecordedTurbulence(**{"root": str(footage), "tilt_rms_px": RMS} | options)
 
 
 def test_footage_that_will_not_do_is_refused(tmp_path, footage):
     with pytest.raises(ValueError, match="turbulence.root must hold videos or folders"):
-        fields(tmp_path)
-    with pytest.raises(ValueError, match="turbulence.root must show a still scene of which 20 cor"):
-        fields(moving(tmp_path / "pan"))
+        load_displacement_fields(tmp_path)
+    with pytest.raises(ValueError, match="turbulence.root must be a still scene of which 20 cor"):
+        load_displacement_fields(moving(tmp_path / "pan"))
     moving(tmp_path / "short", count=7)
-    with pytest.raises(ValueError, match="turbulence.root must show 8 frames or more, got 7"):
-        fields(tmp_path / "short")
+    with pytest.raises(
+        ValueError, match="turbulence.root must be footage of 8 frames or more, got 7"
+    ):
+        load_displacement_fields(tmp_path / "short")
     with pytest.raises(ValueError, match="one video or one folder of frames, got 2"):
-        fields(tmp_path)
+        load_displacement_fields(tmp_path)
     flat = tmp_path / "flat"
     flat.mkdir()
     for k in range(9):
         cv2.imwrite(str(flat / f"{k}.png"), np.full((64, 64), 90, np.uint8))
     with pytest.raises(ValueError, match="got 0 of 0 in"):
-        fields(flat)
+        load_displacement_fields(flat)
 
 
 def test_the_real_footage_moves_locally(shared_data):
-    found = fields(shared_data / "turbulence" / "building")
+    found = load_displacement_fields(shared_data / "turbulence" / "building")
     assert found.nodes.shape[0] == 40 and min(found.width_px, found.height_px) > 190
     power = found.nodes.square().mean((0, 1))
     assert float(power.max().sqrt()) < 2 and float(power.min().sqrt()) > 0.5

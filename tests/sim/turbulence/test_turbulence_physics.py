@@ -14,25 +14,26 @@ import torch
 from src.sim import noise
 from src.sim.turbulence.atmosphere import Atmosphere
 from src.sim.turbulence.fidelity import mean_psf
-from src.sim.turbulence.halo import Halo
 from src.sim.turbulence.operator import WAVES, Turbulence
-from src.sim.turbulence.p2s import Spots, bands
-from src.sim.turbulence.phase import Waves, draw_waves, flow
-from src.sim.turbulence.psf import fraunhofer_psf
+from src.sim.turbulence.p2s import FittedPSFs, load_psf_bands
+from src.sim.turbulence.plane_waves import PlaneWaves, advect_waves, draw_plane_waves
+from src.sim.turbulence.psf import PSFHalo, fraunhofer_psf
 from src.sim.turbulence.zernike import noll_covariance
-from tests.sim.turbulence.theory import fitted_psfs, isoplanatic_angle_rad, noll_residual
+from tests.sim.turbulence.theory import compute_fitted_psfs, isoplanatic_angle_rad, noll_residual
 
 PATH = Atmosphere(0.05, 0.5, 1000.0, 2.0, 525e-9, 3e-14, 0.9)  # D 5 cm, 1 km, 2 m wide
 
 
-def waves_of(atmosphere: Atmosphere, modes: int, clips: int, width_px: int = 256) -> list[Waves]:
+def waves_of(
+    atmosphere: Atmosphere, modes: int, clips: int, width_px: int = 256
+) -> list[PlaneWaves]:
     return [
-        draw_waves(atmosphere, noise.key(i), modes=modes, waves=WAVES, width_px=width_px)
+        draw_plane_waves(atmosphere, noise.key(i), modes=modes, waves=WAVES, width_px=width_px)
         for i in range(clips)
     ]
 
 
-def covariance(waves: Waves, shift_px: tuple[float, float] = (0.0, 0.0)) -> torch.Tensor:
+def covariance(waves: PlaneWaves, shift_px: tuple[float, float] = (0.0, 0.0)) -> torch.Tensor:
     """Return E[a_i(x) a_j(x + shift)] over the amplitudes of one clip."""
     turn = 2 * math.pi * waves.frequency @ torch.tensor(shift_px, dtype=torch.float64)
     left = torch.view_as_complex(waves.response)
@@ -40,7 +41,7 @@ def covariance(waves: Waves, shift_px: tuple[float, float] = (0.0, 0.0)) -> torc
     return (left.conj() @ right.T).real
 
 
-def mean_covariance(clips: list[Waves], shift_px=(0.0, 0.0)) -> torch.Tensor:
+def mean_covariance(clips: list[PlaneWaves], shift_px=(0.0, 0.0)) -> torch.Tensor:
     return torch.stack([covariance(waves, shift_px) for waves in clips]).mean(0)
 
 
@@ -53,7 +54,7 @@ def phases(count: int, d_over_r0: float, modes: int, tilt: bool) -> torch.Tensor
 
 def still(d_over_r0: float, views=9, **options) -> Turbulence:
     """Return turbulence whose frames are independent draws."""
-    path = replace(PATH.at(d_over_r0), alpha=0.0)
+    path = replace(PATH.with_d_over_r0(d_over_r0), ar1_coefficient=0.0)
     return Turbulence(path, views=views, height=64, width=64, **options)
 
 
@@ -66,7 +67,7 @@ def test_01_fried_parameter():
 
 
 def test_02_03_04_noll_covariances_of_the_waves():
-    clips = waves_of(PATH.at(1.0), 35, 64)
+    clips = waves_of(PATH.with_d_over_r0(1.0), 35, 64)
     expected = noll_covariance(35)
     scale = expected.diagonal().sqrt()
     error = (mean_covariance(clips) - expected) / (scale[:, None] * scale)
@@ -79,7 +80,7 @@ def test_02_03_04_noll_covariances_of_the_waves():
 
 
 def test_02_every_clip_has_the_right_tilt_variance():
-    variances = [covariance(waves)[0, 0] for waves in waves_of(PATH.at(1.0), 35, 32)]
+    variances = [covariance(waves)[0, 0] for waves in waves_of(PATH.with_d_over_r0(1.0), 35, 32)]
     assert torch.stack(variances).std() < 0.02 * 0.4489
 
 
@@ -92,7 +93,7 @@ def test_05_residuals():
 
 
 def test_06_tilt_in_pixels():
-    path = replace(PATH.at(0.05 / 0.0203), alpha=0.0)
+    path = replace(PATH.with_d_over_r0(0.05 / 0.0203), ar1_coefficient=0.0)
     assert path.tilt_std_px(256) == pytest.approx(1.21, rel=0.01)
     samples = []
     for seed in range(12):
@@ -107,7 +108,10 @@ def test_06_tilt_in_pixels():
 
 def test_07_centroid_of_a_rendered_point():
     turbulence = Turbulence(
-        replace(PATH.at(1.0), alpha=0.0, scene_width_m=0.5), views=9, height=65, width=65
+        replace(PATH.with_d_over_r0(1.0), ar1_coefficient=0.0, scene_width_m=0.5),
+        views=9,
+        height=65,
+        width=65,
     )
     bell = torch.exp(-((torch.arange(65.0) - 32) ** 2) / 8)  # smooth, so that the warp is exact
     point = (bell[:, None] * bell).expand(1, 16, -1, -1)
@@ -115,7 +119,7 @@ def test_07_centroid_of_a_rendered_point():
     seen = seen / seen.sum((1, 2), keepdim=True)
     place = torch.arange(65.0) - 32
     x, y = (seen.sum(1) * place).sum(1), (seen.sum(2) * place).sum(1)
-    share = 0.5 * (x.var() + y.var()) / turbulence.fidelity.airy_px**2
+    share = 0.5 * (x.var() + y.var()) / turbulence.fidelity.lambda_over_d_px**2
     slack = 4 * share * math.sqrt(2 / (2 * len(x)))
     assert 0.1698 - slack < share < 0.1819 + slack  # between G-tilt and Z-tilt
     drawn = turbulence.tilt(16, torch.Generator().manual_seed(0), crop=(32, 32, 1, 1))
@@ -132,8 +136,8 @@ def test_07_centroid_of_a_rendered_point():
     ],
 )
 def test_08_correlation_along_the_object(mode, expected):
-    clips = waves_of(PATH.at(1.0), 14, 200)
-    pixel = PATH.object_pixel_m(256) / PATH.aperture_m
+    clips = waves_of(PATH.with_d_over_r0(1.0), 14, 200)
+    pixel = PATH.pixel_size_at_object_m(256) / PATH.aperture_m
     zero = mean_covariance(clips)
     for separation, value in zip((0.1, 0.2, 0.5, 1.0, 2.0), expected, strict=True):
         along = mean_covariance(clips, (separation / pixel, 0.0))
@@ -143,7 +147,7 @@ def test_08_correlation_along_the_object(mode, expected):
 
 
 def test_09_tilt_along_and_across_the_separation():
-    clips = waves_of(PATH.at(1.0), 2, 200)
+    clips = waves_of(PATH.with_d_over_r0(1.0), 2, 200)
     along = mean_covariance(clips, (128.0, 0.0))  # 20 D apart
     across = mean_covariance(clips, (0.0, 128.0))
     # Sarazin & Roddier 1990: 0.0968 against 0.145 (d/D)^(-1/3) beyond a few D, in any layer
@@ -155,14 +159,16 @@ def test_09_tilt_along_and_across_the_separation():
 def test_exposure_transfer_function(tilt):
     size, airy, strength = 63, 2.0, 2.0
     flat = torch.zeros(1, 2)
-    spots = fraunhofer_psf(phases(1500, strength, 90, tilt), airy_px=airy, size=size, points=1)
-    limit = fraunhofer_psf(flat, airy_px=airy, size=size, points=1)
+    psfs_of_band = fraunhofer_psf(
+        phases(1500, strength, 90, tilt), lambda_over_d_px=airy, size=size, points=1
+    )
+    limit = fraunhofer_psf(flat, lambda_over_d_px=airy, size=size, points=1)
 
     def transfer(psf):
         total = torch.fft.fft2(psf.mean(0)).abs()
         return (total[0] + total[:, 0]) / 2
 
-    found = transfer(spots) / transfer(limit)
+    found = transfer(psfs_of_band) / transfer(limit)
     # Fried's short exposure takes tilt and the rest for independent; a lower bound as nu grows
     for index in (6, 12, 18) if tilt else (3, 6):
         nu = index / size * airy  # in D / lambda
@@ -172,9 +178,11 @@ def test_exposure_transfer_function(tilt):
 
 @pytest.mark.parametrize("strength, strehl", [(1.0, 0.88), (2.0, 0.68), (4.0, 0.39), (6.0, 0.24)])
 def test_12_mean_peak(strength, strehl):
-    spots = fraunhofer_psf(phases(1200, strength, 35, False), airy_px=4.0, size=61, points=1)
-    limit = fraunhofer_psf(torch.zeros(1, 35), airy_px=4.0, size=61, points=1)
-    peak = spots.amax((1, 2)).mean() / limit.max()
+    psfs_of_band = fraunhofer_psf(
+        phases(1200, strength, 35, False), lambda_over_d_px=4.0, size=61, points=1
+    )
+    limit = fraunhofer_psf(torch.zeros(1, 35), lambda_over_d_px=4.0, size=61, points=1)
+    peak = psfs_of_band.amax((1, 2)).mean() / limit.max()
     assert peak == pytest.approx(strehl, rel=0.06)
 
 
@@ -184,7 +192,7 @@ def test_13_isoplanatic_angle():
 
 
 def test_14_ar1():
-    path = replace(PATH.at(2.0), alpha=0.8)
+    path = replace(PATH.with_d_over_r0(2.0), ar1_coefficient=0.8)
     turbulence = Turbulence(path, views=9, height=32, width=32)
     runs = [
         turbulence.tilt(60, torch.Generator().manual_seed(seed), crop=(16, 16, 1, 1))
@@ -202,7 +210,7 @@ def test_14_ar1():
 
 
 def test_14_ar1_at_another_frame_rate_has_the_same_time_scale():
-    path = replace(PATH.at(2.0), alpha=0.8)
+    path = replace(PATH.with_d_over_r0(2.0), ar1_coefficient=0.8)
     slow = Turbulence(path, views=9, height=32, width=32, fps=120.0)
     fast = Turbulence(path, views=9, height=32, width=32, fps=480.0)
     change = []
@@ -214,13 +222,13 @@ def test_14_ar1_at_another_frame_rate_has_the_same_time_scale():
 
 
 def test_15_frozen_flow_shifts_the_field():
-    [waves] = waves_of(PATH.at(2.0), 9, 1)
-    middle = torch.full_like(waves.place, 0.5)
-    pixel = PATH.object_pixel_m(256)
-    thin = replace(waves, place=middle, frequency=waves.layer * 0.5 * pixel)
+    [waves] = waves_of(PATH.with_d_over_r0(2.0), 9, 1)
+    middle = torch.full_like(waves.z_over_l, 0.5)
+    pixel = PATH.pixel_size_at_object_m(256)
+    thin = replace(waves, z_over_l=middle, frequency=waves.layer_frequency * 0.5 * pixel)
     fresh = torch.randn(1, 1, WAVES, 2, dtype=torch.float64)
     speed, seconds = torch.tensor([[2.0, -1.0]], dtype=torch.float64), 0.01
-    later = flow(thin, fresh, speed, torch.tensor([seconds], dtype=torch.float64))[0, 0]
+    later = advect_waves(thin, fresh, speed, torch.tensor([seconds], dtype=torch.float64))[0, 0]
     # a layer half-way moves v t; the object point behind the same air moves 2 v t the same way
     shift = speed[0] * seconds / 0.5 / pixel
     response = torch.view_as_complex(thin.response)
@@ -233,9 +241,9 @@ def test_15_frozen_flow_shifts_the_field():
 
 
 def test_15_tilt_spectrum_of_frozen_flow():
-    waves = draw_waves(PATH.at(1.0), 5, modes=2, waves=200_000, width_px=256)
-    near = replace(waves, place=torch.zeros_like(waves.place))
-    kappa_x = (near.layer[:, 0].abs() * PATH.aperture_m * (1 - waves.place)).log10()
+    waves = draw_plane_waves(PATH.with_d_over_r0(1.0), 5, modes=2, waves=200_000, width_px=256)
+    near = replace(waves, z_over_l=torch.zeros_like(waves.z_over_l))
+    kappa_x = (near.layer_frequency[:, 0].abs() * PATH.aperture_m * (1 - waves.z_over_l)).log10()
     power = near.response[0].square().sum(-1)
 
     def density(low: float, high: float) -> float:
@@ -250,19 +258,21 @@ def test_15_tilt_spectrum_of_frozen_flow():
 
 def test_16_psf_energy():
     coefficients = phases(200, 4.0, 44, False)
-    exact = fraunhofer_psf(coefficients, airy_px=1.0, size=17)
+    exact = fraunhofer_psf(coefficients, lambda_over_d_px=1.0, size=17)
     torch.testing.assert_close(exact.sum((1, 2)), torch.ones(200), atol=1e-5, rtol=0)
     assert exact.min() >= 0
-    for band in bands():
+    for band in load_psf_bands():
         coefficients = phases(200, band.edge, 119, False)
-        spots = Spots(band, -1, len(band.basis), 1.0, 15, band.edge)
-        psfs = fitted_psfs(spots, coefficients[:, 2 : spots.network.modes].T)
+        psfs_of_band = FittedPSFs(band, -1, len(band.basis), 1.0, 15, band.edge)
+        psfs = compute_fitted_psfs(psfs_of_band, coefficients[:, 2 : psfs_of_band.network.modes].T)
         assert psfs.min() >= 0
         found = psfs.sum(0).flatten()
-        inside = fraunhofer_psf(coefficients, airy_px=1.0, size=15, whole=True).sum((1, 2))
+        inside = fraunhofer_psf(
+            coefficients, lambda_over_d_px=1.0, size=15, normalise_plane=True
+        ).sum((1, 2))
         assert inside.max() < 1.001
         torch.testing.assert_close(found, inside, atol=0.15, rtol=0)
-        halo = Halo(mean_psf(band.edge), 1.0, 15).share
+        halo = PSFHalo(mean_psf(band.edge), 1.0, 15).share
         assert found.mean() + halo == pytest.approx(1.0, abs=0.02)  # the cut of negative light
 
 
@@ -273,13 +283,15 @@ def test_16_flat_stays_flat():
 
 def test_17_zero_turbulence_is_diffraction_and_moves_nothing():
     image = torch.rand(1, 1, 64, 64, generator=torch.Generator().manual_seed(0))
-    tiny = replace(PATH, scene_width_m=40.0).at(1e-6)  # a pixel far wider than lambda / D
+    tiny = replace(PATH, scene_width_m=40.0).with_d_over_r0(
+        1e-6
+    )  # a pixel far wider than lambda / D
     turbulence = Turbulence(tiny, views=1, height=64, width=64)
-    assert turbulence.fidelity.kernel == 1
+    assert turbulence.fidelity.psf_size_px == 1
     assert (turbulence.degrade(image, torch.Generator()) - image[:, None]).abs().max() < 1e-4
     point = torch.zeros(1, 1, 65, 65)
     point[..., 32, 32] = 1
-    sharp = Turbulence(PATH.at(1e-6), views=1, height=65, width=65)
+    sharp = Turbulence(PATH.with_d_over_r0(1e-6), views=1, height=65, width=65)
     airy = sharp.degrade(point, torch.Generator())[0, 0, 0]
     torch.testing.assert_close(airy, airy.flip(0), atol=2e-3, rtol=0)
     torch.testing.assert_close(airy, airy.flip(1), atol=2e-3, rtol=0)
@@ -293,7 +305,7 @@ def test_18_views_are_independent():
 
 
 def test_18_views_on_a_baseline_are_partly_correlated():
-    path = replace(PATH.at(2.0), alpha=0.0)
+    path = replace(PATH.with_d_over_r0(2.0), ar1_coefficient=0.0)
     near, far = (
         Turbulence(
             path, views=9, height=32, width=32, views_correlation="baseline", baseline_m=baseline
@@ -308,14 +320,14 @@ def test_18_views_on_a_baseline_are_partly_correlated():
 
 
 def test_19_opposite_borders_are_not_locked_together():
-    path = replace(PATH.at(2.0), alpha=0.0)  # 40 D wide
+    path = replace(PATH.with_d_over_r0(2.0), ar1_coefficient=0.0)  # 40 D wide
     turbulence = Turbulence(path, views=9, height=256, width=256)
     pairs = []
     for seed in range(8):
         tilt = turbulence.tilt(50, torch.Generator().manual_seed(seed), crop=(128, 0, 1, 256))
         pairs.append(tilt[:, :, 1, 0].flatten(0, 1)[:, [0, 128, 255]])
     correlation = torch.corrcoef(torch.cat(pairs).T)
-    clips = waves_of(PATH.at(2.0), 2, 100)
+    clips = waves_of(PATH.with_d_over_r0(2.0), 2, 100)
     zero = mean_covariance(clips)[1, 1]
     half, full = (mean_covariance(clips, (shift, 0.0))[1, 1] / zero for shift in (128.0, 255.0))
     assert correlation[0, 1] == pytest.approx(float(half), abs=0.08)
@@ -326,13 +338,15 @@ def test_19_opposite_borders_are_not_locked_together():
 def test_20_rytov_variance():
     strong = replace(PATH, cn2=1e-13)
     k = 2 * math.pi / 525e-9
-    assert strong.rytov == pytest.approx(0.5 * 1e-13 * k ** (7 / 6) * 1000 ** (11 / 6), rel=0.01)
-    assert strong.rytov > 2.5
+    assert strong.rytov_variance == pytest.approx(
+        0.5 * 1e-13 * k ** (7 / 6) * 1000 ** (11 / 6), rel=0.01
+    )
+    assert strong.rytov_variance > 2.5
 
 
 def test_21_scaling():
     twice = replace(PATH, wavelength_m=1050e-9)
     assert twice.r0_m == pytest.approx(PATH.r0_m * 2 ** (6 / 5), rel=1e-9)
     assert twice.tilt_std_px(256) == pytest.approx(PATH.tilt_std_px(256), rel=1e-9)
-    weak, strong = (waves_of(PATH.at(d), 9, 1)[0] for d in (1.0, 8.0))
+    weak, strong = (waves_of(PATH.with_d_over_r0(d), 9, 1)[0] for d in (1.0, 8.0))
     torch.testing.assert_close(strong.response, weak.response * 8 ** (5 / 6))

@@ -1,13 +1,22 @@
-"""Closed forms and integrals that the simulated air is held against, for the tests beside."""
+"""Closed forms and integrals that simulated turbulence is compared with."""
 
+import copy
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
 from scipy import optimize, special
+from torch.nn import functional
 
+from src.sim.turbulence import clip_rendering
 from src.sim.turbulence.atmosphere import Atmosphere
-from src.sim.turbulence.p2s import Spots
+from src.sim.turbulence.coefficient_grid import WaveSum
+from src.sim.turbulence.contract import Crop
+from src.sim.turbulence.engines import blur_torch
+from src.sim.turbulence.operator import Turbulence
+from src.sim.turbulence.p2s import FittedPSFs
+from src.sim.turbulence.psf import fraunhofer_psf
 from src.sim.turbulence.zernike import noll_covariance
 
 
@@ -16,7 +25,7 @@ def isoplanatic_angle_rad(path: Atmosphere) -> float:
 
     Without an outer scale theta0 = [2.914 k^2 Int Cn2 z^(5/3) dz]^(-3/5) (Fried 1982).
     """
-    place, strength = (part.numpy() for part in path.path)
+    place, strength = (part.numpy() for part in path.path_slices)
     z, k = place * path.distance_m, 2 * math.pi / path.wavelength_m
     integral = 2.914 * k**2 * float((strength * z ** (5 / 3)).sum())
     if integral == 0:
@@ -68,7 +77,32 @@ def structure_variance() -> float:
     return float(structure / 2 * 8 / math.pi * mean)
 
 
-def fitted_psfs(spots: Spots, phase: torch.Tensor) -> torch.Tensor:
+def compute_fitted_psfs(psfs: FittedPSFs, phase: torch.Tensor) -> torch.Tensor:
     """Return the PSFs (pixels, n) of Noll 4, 5, ... (blurmodes, n) in rad, none of it negative."""
-    weights, (mean, *basis) = spots(phase[:, :, None, None])[..., 0, 0], spots.shapes.flatten(1)
-    return (mean[:, None] + torch.stack(basis).T @ weights).clamp(min=0)
+    weights = psfs.network.merge_layers(len(phase), psfs.d_over_r0)(phase)
+    return (psfs.basis.flatten(1).T @ weights).clamp(min=0)
+
+
+def degrade_with_exact_psfs(
+    turbulence: Turbulence, frame: torch.Tensor, generator: torch.Generator, crop: Crop, size: int
+) -> torch.Tensor:
+    """Return `crop` of a frame (h, w) seen by one view, with exact PSFs at every pixel.
+
+    The turbulence that is drawn is the same; PSFs are `size` pixels across and have no halo.
+    """
+    exact = copy.copy(turbulence)
+    exact.fidelity = replace(turbulence.fidelity, psf_grid_pitch_px=1, psf_size_px=size)
+    [plan] = exact.prepare(1, generator, crop).plans
+    tables, unit = plan.tables.to(torch.device("cpu")), turbulence.fidelity.lambda_over_d_px
+    names = "response", "rows", "columns"
+    tilt, phase = (
+        WaveSum(*(tables[f"{grid}_{name}"] for name in names), first)(plan.amplitudes)
+        for grid, first in (("tilt", 0), ("psf", 2))
+    )
+    rows, columns = plan.psf_grid
+    tilt = clip_rendering._tilt(plan, tables, tilt)
+    warped = blur_torch.warp(frame[None], tilt, rows.start, columns.start)
+    coefficients = functional.pad(phase.permute(1, 2, 3, 0), (2, 0))
+    psfs = fraunhofer_psf(coefficients, lambda_over_d_px=unit, size=size, normalise_plane=True)
+    psfs = psfs.flatten(3).permute(3, 0, 1, 2)
+    return blur_torch.scatter(warped, psfs, rows, torch.zeros(1, *crop[2:]), 0.0)[0]

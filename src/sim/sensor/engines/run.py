@@ -1,56 +1,51 @@
-"""Runs a job on the engine of its device."""
+"""Runs the sensor on the engine of the frames' device: numba's on the CPU, Triton's on CUDA."""
 
 import warnings
 from collections.abc import Sequence
 from importlib.util import find_spec
-from types import ModuleType
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from src.sim.sensor.engines import sensor_cpu, sensor_eager
-from src.sim.sensor.engines.job import Job
+from src.sim.sensor.engines import sensor_cpu
+from src.sim.sensor.engines.records import EngineInput
 
-WITHOUT_TRITON: list[str] = []  # why Triton's kernel does not run here, once it has failed
+TRITON_FAILURES: list[str] = []  # why Triton's kernel does not run in this process
 
 
 def voxels(
-    job: Job, grids: Float[Tensor, "n windows views bins h w"]
+    given: EngineInput, grids: Float[Tensor, "n windows views bins h w"]
 ) -> Float[Tensor, "n windows views bins h w"]:
-    """Fill `grids`, contiguous zeros, and return them; `job.state` moves on.
+    """Fill `grids`, contiguous zeros on the device of the frames, and return them.
 
-    Raises ValueError for frames that are not finite or outside [0, 1]; the state is then lost.
+    Raises ValueError for frames that are not finite or outside [0, 1].
     """
-    chosen = engine(job)
-    try:
-        chosen.voxels(job, grids)
-    except (ValueError, torch.OutOfMemoryError):
-        raise
-    except Exception as error:  # no compiler, another driver: Triton's errors are of many kinds
-        if chosen in (sensor_cpu, sensor_eager):
-            raise
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        warnings.warn(f"sensor: Triton fails, plain PyTorch from now on: {reason}", stacklevel=2)
-        WITHOUT_TRITON.append(reason)
-        sensor_eager.voxels(job, grids.zero_())
-    job.state.frame += job.intervals
-    return grids
-
-
-def engine(job: Job) -> ModuleType:
-    """Return the engine: numba's on the CPU, on CUDA Triton's where it is installed, has not failed
-    in this process and knows the stamps, else plain torch.
-    """
-    if job.frames.device.type == "cpu":
-        return sensor_cpu
-    if job.frames.is_cuda and not job.v2e and not WITHOUT_TRITON and find_spec("triton"):
+    if uses_triton(given):
         # Here, as Triton is not there everywhere.
         from src.sim.sensor.engines import sensor_triton
 
-        return sensor_triton
-    return sensor_eager
+        try:
+            return sensor_triton.voxels(given, grids)
+        except (ValueError, torch.OutOfMemoryError):
+            raise
+        except Exception as error:  # no compiler, another driver: its errors are of many kinds
+            TRITON_FAILURES.append(" ".join(f"{type(error).__name__}: {error}".split()))
+            text = f"sensor: Triton fails, the CPU simulates from now on: {TRITON_FAILURES[-1]}"
+            warnings.warn(text, stacklevel=2)
+    if grids.device.type == "cpu":
+        return sensor_cpu.voxels(given, grids)
+    here = zeros(grids.shape, torch.device("cpu"))
+    return grids.copy_(sensor_cpu.voxels(given, here))
+
+
+def uses_triton(given: EngineInput) -> bool:
+    """Return whether Triton's kernel runs: on CUDA, where it is installed, has not failed in this
+    process and knows the time stamps.
+    """
+    possible = given.frames.is_cuda and not given.v2e_stamps and not TRITON_FAILURES
+    return possible and find_spec("triton") is not None
 
 
 def zeros(shape: Sequence[int], device: torch.device) -> Tensor:
@@ -58,5 +53,5 @@ def zeros(shape: Sequence[int], device: torch.device) -> Tensor:
     until something else is written.
     """
     if device.type != "cpu":
-        return torch.zeros(shape, device=device)
-    return torch.from_numpy(np.zeros(shape, np.float32))
+        return torch.zeros(*shape, device=device)
+    return torch.from_numpy(np.zeros(tuple(shape), np.float32))

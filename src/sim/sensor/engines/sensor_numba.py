@@ -5,22 +5,39 @@ at the first moment at which the pixel is not dead and the level is a threshold 
 reference; between frames the level moves linearly, so that each crossing costs one division.
 """
 
+from collections import namedtuple
+
 import numpy as np
 from numba import njit, uint32, uint64
 
-from src.sim.sensor.engines import job
-from src.sim.sensor.engines.job import COUNT, DELETE, HOLD, VOXELS, Memory, Scratch
+from src.sim.sensor.engines import records
+from src.sim.sensor.engines.records import DELETE, HOLD
 
 f32, i32 = np.float32, np.int32
 DARKEST, BRIGHTEST, WHITE = 0x38800000, 0x3FFFFFFF, 0x3F800000  # bits of 2**-14, of below 2, of 1
 DARKEST_HALF, BRIGHTEST_HALF, WHITE_HALF = 0x0400, 0x4000, 0x3C00  # of float16
-MISMATCH, HOT, SHOT, RESIDUAL = job.MISMATCH_KEY, job.HOT_KEY, job.SHOT_KEY, job.RESIDUAL_KEY
+MISMATCH_KEY, HOT_PIXEL_KEY, NOISE_KEY, REFERENCE_KEY = range(records.KEYS)
 kernel = njit(nogil=True, error_model="numpy")  # no test for a zero divisor
-small = njit(nogil=True, error_model="numpy", inline="always")
+inline_kernel = njit(nogil=True, error_model="numpy", inline="always")
+
+# Arrays over the pixels of a unit, and a batch of events (the last three).  Pixels remember between
+# frames: `level` and `source`, the last frame's level after and before the low-pass, 2**-20 nat;
+# `reference`, the memorised level; `dead`, the end of the dead time, in frame intervals after the
+# last frame.  `pixel`: the number in the whole frame; `drawn`: random bits; `mixed`: the part of a
+# pixel's noise that is the same in all frames; `hot`: the hot pixels, which come first; `drift`:
+# what the reference leaks; `intensity`, of float16 frames, and `new_level`: the new frame's;
+# `noisy`: whether there is a noise event; `active`: those pixels that are `busy`; `noise_u`,
+# `noise_sign`: time and polarity of their noise events; `event_pixel`, `event_u`, `event_sign`: an
+# event's pixel of the unit, fraction of the interval and polarity.
+Workspace = namedtuple(
+    "Workspace",
+    "level source reference dead pixel drawn mixed on off hot drift intensity new_level noisy "
+    "active busy noise_u noise_sign event_pixel event_u event_sign",
+)
 
 
-@small
-def mix(x):
+@inline_kernel
+def mix_bits(x):
     """The 32-bit finaliser of src.sim.noise."""
     x = uint32(x)
     x ^= x >> uint32(16)
@@ -30,27 +47,26 @@ def mix(x):
     return uint32(x ^ (x >> uint32(16)))
 
 
-@small
-def bits(key, high, low):
-    """src.sim.noise.bits(key, high * 2**32 + low), the same 32 bits."""
-    mixed = mix(uint32(low) ^ uint32(uint64(key) & uint64(0xFFFFFFFF)))
+@inline_kernel
+def random_uint32(key, high, low):
+    """The 32 bits of src.sim.noise.bits(key, high * 2**32 + low)."""
+    mixed = mix_bits(uint32(low) ^ uint32(uint64(key) & uint64(0xFFFFFFFF)))
     upper = uint32(uint64(key) >> uint64(32))
-    return mix(uint32(mixed + uint32(uint32(high) * uint32(0x9E3779B9)) + upper))
+    return mix_bits(uint32(mixed + uint32(uint32(high) * uint32(0x9E3779B9)) + upper))
 
 
-@small
-def way(delta, u):
+@inline_kernel
+def level_change(delta, u):
     """Return how far a level that moves by `delta` in an interval has come at fraction `u`."""
     return np.int64(np.rint(f32(u) * f32(delta)))
 
 
-@small
+@inline_kernel
 def linear_events(x, l0, l1, ref, dead, on, off, wait, mode, noise_u, noise_sign, batch, count):
     """Append the events of pixel `x` to `batch`, which holds `count`; return (count, ref, dead).
 
     `noise_u` is the time of a noise event, above 1 for none.  All is seen along the level's way:
-    `span` is its length, `at` the reference's place on it.  The function is drawn into its loop:
-    the arrays of `batch` would cost more to hand over than the pixel.
+    `span` is its length, `at` the reference's place on it.
     """
     who, when, sign = batch
     along = 1 if l1 >= l0 else -1
@@ -61,7 +77,7 @@ def linear_events(x, l0, l1, ref, dead, on, off, wait, mode, noise_u, noise_sign
     holding = mode == HOLD and dead > start
     while True:
         if holding and dead <= stop:  # the reset ends
-            at = way(span, dead)
+            at = level_change(span, dead)
             holding = False
         moved = False
         if not holding:
@@ -83,13 +99,13 @@ def linear_events(x, l0, l1, ref, dead, on, off, wait, mode, noise_u, noise_sign
         if noise_u >= dead:
             who[count], when[count], sign[count] = x, noise_u, noise_sign
             count += 1
-            at = way(span, noise_u)
+            at = level_change(span, noise_u)
             dead = noise_u + wait
             holding = mode == HOLD and wait > 0
         start, stop, noise_u = noise_u, f32(1), f32(2)
 
 
-@small
+@inline_kernel
 def next_crossing(span, at, ahead, behind, now):
     """Return time and step of the first threshold exceeded at or after `now`; time 2 if none."""
     if at >= behind and f32(at - behind) >= now * f32(span):  # exceeded before, and still so
@@ -100,23 +116,23 @@ def next_crossing(span, at, ahead, behind, now):
     return (u if u > now else now), ahead  # now, if it was exceeded before: also at 0 / 0
 
 
-@small
+@inline_kernel
 def v2e_crossings(l0, l1, ref, dead, on, off, mode):
     """Return (thresholds between the reference and the frame's level, reference)."""
     if mode == HOLD and dead > 1:
         return 0, ref
     if mode == HOLD and dead > 0:
-        ref = l0 + way(l1 - l0, dead)
+        ref = l0 + level_change(l1 - l0, dead)
     return (l1 - ref) // on if l1 >= ref else (ref - l1) // off, ref
 
 
-@small
+@inline_kernel
 def v2e_events(x, l0, l1, ref, dead, on, off, wait, mode, steps, noise_u, noise_sign, batch, count):
-    """The same with v2e's time stamps: `steps` for the whole view, set by its busiest pixel.
+    """The same with v2e's time stamps, `steps` in the whole view: the most crossings of a pixel.
 
     The pixel's first crossings take the first stamps; a stamp within the dead time is refused
     (compute_events of v2e's emulator).  Where a stamp interval is longer than the refractory
-    period, v2e neither tests nor records it.  Noise is stamped at the end of the interval.
+    period, v2e neither tests nor records it.  Noise is stamped at the interval's end.
     """
     who, when, sign = batch
     tested = wait * f32(steps) > 1
@@ -137,7 +153,7 @@ def v2e_events(x, l0, l1, ref, dead, on, off, wait, mode, steps, noise_u, noise_
         if kept and tested and mode == HOLD:
             if dead > 1:
                 break
-            ref = l0 + way(l1 - l0, dead)
+            ref = l0 + level_change(l1 - l0, dead)
     if noise_u <= 1:
         who[count], when[count], sign[count] = x, f32(1), noise_sign
         count += 1
@@ -145,15 +161,14 @@ def v2e_events(x, l0, l1, ref, dead, on, off, wait, mode, steps, noise_u, noise_
     return count, ref, dead
 
 
-@small
-def place_of(intensity_bits):
+@inline_kernel
+def table_position(intensity_bits):
     """Return the place in the tables of an intensity, given by the bits of its float."""
     return i32(min(max(i32(intensity_bits), i32(DARKEST)), i32(BRIGHTEST)) - i32(DARKEST))
 
 
-@small
-def look(table, place):
-    """Return the table's value at one place, as src.sim.sensor.response.lookup does."""
+@inline_kernel
+def read_table(table, place):
     cell, inside = uint32(place) >> uint32(13), i32(place & i32(8191))
     left = table[cell]
     part = i32(i32(table[cell + uint32(1)] - left) * inside) >> i32(13)
@@ -162,21 +177,21 @@ def look(table, place):
 
 @kernel
 def read_levels(table, intensity, levels):
-    """Fill `levels` with a frame's levels before the low-pass; return whether any light is negative
-    or above 1: the bits of such floats are the larger numbers.
+    """Fill `levels` with a frame's levels before the low-pass; return whether any intensity is
+    negative or above 1: the bits of such floats are the larger numbers.
     """
     places, most = intensity.view(np.uint32), uint32(0)
     for x in range(places.size):
         most = max(most, places[x])
-        levels[x] = look(table, place_of(places[x]))
+        levels[x] = read_table(table, table_position(places[x]))
     return most > WHITE
 
 
 @kernel
-def read_halves(table, halves, intensity, levels):
+def read_half_levels(table, halves, intensity, levels):
     """The same of the bits of float16, whose lights are the table's nodes; widened in `intensity`.
 
-    In a float32's place the exponent is too small by 127 - 15: exact also for light below 2**-14.
+    In a float32's place the exponent is too small by 127 - 15: exact also below 2**-14.
     """
     places, most = intensity.view(np.uint32), uint32(0)
     for x in range(places.size):
@@ -192,58 +207,53 @@ def read_halves(table, halves, intensity, levels):
 
 
 @kernel
-def low_pass(decay, lag, intensity, memory, level):
-    """Filter the new frame's levels in place; the memory's are those of the frame before."""
-    places, old_source, old_level = intensity.view(np.int32), memory.source, memory.level
+def apply_low_pass(decay, lag, intensity, old_level, old_source, level):
+    """Filter the new frame's levels in place; the old ones are those of the frame before."""
+    places = intensity.view(np.int32)
     for x in range(places.size):
-        place, source = place_of(places[x]), level[x]
-        old = np.int64(old_level[x] - old_source[x]) * look(decay, place)
-        old -= np.int64(source - old_source[x]) * look(lag, place)
+        place, source = table_position(places[x]), level[x]
+        old = np.int64(old_level[x] - old_source[x]) * read_table(decay, place)
+        old -= np.int64(source - old_source[x]) * read_table(lag, place)
         level[x], old_source[x] = source + ((old + 524288) >> 20), source
 
 
 @kernel
 def number_pixels(clip, width, first, pixel):
-    """Fill the numbers that the pixels of a unit have in the whole frame."""
-    row, column = first // width, first % width
-    at = (clip.top + row) * clip.full_width + clip.left + column
     for x in range(pixel.size):
-        pixel[x] = at
-        at, column = at + 1, column + 1
-        if column == width:
-            at, column = at + clip.full_width - width, 0
+        row, column = (first + x) // width, (first + x) % width
+        pixel[x] = (clip.top + row) * clip.full_width + clip.left + column
 
 
 @kernel
-def make_chip(clip, keys, normals, scratch):
-    """Fill what the pixels of a unit are, whatever they see; return how many are hot."""
-    on, off, hot, pixel, drawn = scratch.on, scratch.off, scratch.hot, scratch.pixel, scratch.drawn
-    on[:], off[:], hots = clip.on, clip.off, 0
-    if clip.spread > 0:
-        draw_bits(keys[MISMATCH], 2, 0, pixel, drawn)
-        spread_thresholds(clip.on, clip.spread, normals, drawn, on)
-        draw_bits(keys[MISMATCH], 2, 1, pixel, drawn)
-        spread_thresholds(clip.off, clip.spread, normals, drawn, off)
-    if clip.hot_share > 0:
-        draw_bits(keys[HOT], 1, 0, pixel, drawn)
+def draw_pixel_properties(clip, keys, normals, work):
+    """Fill thresholds and hot pixels of a unit, the same in all clips; return how many are hot."""
+    on, off, hot, pixel, drawn = work.on, work.off, work.hot, work.pixel, work.drawn
+    on[:], off[:], hot_count = clip.on, clip.off, 0
+    if clip.mismatch > 0:
+        draw_bits(keys[MISMATCH_KEY], 2, 0, pixel, drawn)
+        spread_thresholds(clip.on, clip.mismatch, normals, drawn, on)
+        draw_bits(keys[MISMATCH_KEY], 2, 1, pixel, drawn)
+        spread_thresholds(clip.off, clip.mismatch, normals, drawn, off)
+    if clip.hot_fraction > 0:
+        draw_bits(keys[HOT_PIXEL_KEY], 1, 0, pixel, drawn)
         for x in range(pixel.size):
-            if drawn[x] < clip.hot_share:
-                hot[hots] = x
-                hots += 1
-    return hots
+            if drawn[x] < clip.hot_fraction:
+                hot[hot_count] = x
+                hot_count += 1
+    return hot_count
 
 
 @kernel
-def draw_bits(key, each, word, pixel, drawn):
-    """Fill bits(key, 0, each * pixel + word): a pixel has `each` words of random bits."""
+def draw_bits(key, words, word, pixel, drawn):
+    """Fill random_uint32(key, 0, words * pixel + word); a pixel has so many words."""
     for x in range(pixel.size):
-        drawn[x] = bits(key, 0, uint32(each) * uint32(pixel[x]) + uint32(word))
+        drawn[x] = random_uint32(key, 0, uint32(words) * uint32(pixel[x]) + uint32(word))
 
 
 @kernel
-def spread_thresholds(threshold, spread, normals, drawn, out):
-    """Fill threshold * (1 + spread * normal), at least a quarter of the threshold."""
-    deviation, least = (threshold * spread) >> 20, threshold >> 2
+def spread_thresholds(threshold, mismatch, normals, drawn, out):
+    """Fill threshold * (1 + mismatch * normal), at least a quarter of the threshold."""
+    deviation, least = (threshold * mismatch) >> 20, threshold >> 2
     for x in range(drawn.size):
         cell, inside = drawn[x] >> uint32(20), np.int64(drawn[x] & uint32(0xFFFFF))
         left = normals[cell]
@@ -252,57 +262,54 @@ def spread_thresholds(threshold, spread, normals, drawn, out):
 
 
 @kernel
-def mix_pixels(key, pixel, mixed):
-    """Fill the part of bits(key, frame, 2 * pixel) that is the same in all frames."""
+def prehash_pixels(key, pixel, mixed):
+    """Fill the part of random_uint32(key, frame, 2 * pixel) that is the same in all frames."""
     low = uint32(uint64(key) & uint64(0xFFFFFFFF))
     for x in range(pixel.size):
-        mixed[x] = mix(uint32(2) * uint32(pixel[x]) ^ low)
+        mixed[x] = mix_bits(uint32(2) * uint32(pixel[x]) ^ low)
 
 
 @kernel
-def mark_noise(clip, hots, scratch, key, frame, intensity):
-    """Mark the pixels with a noise event in interval `frame`.
-
-    `clip.shot` is its probability at black in 2**-32; at white it is a quarter (v2e).
-    """
-    mixed, noisy = scratch.mixed, scratch.noisy
+def mark_noise(clip, hot_count, work, key, frame, intensity):
+    """Mark the pixels with a noise event in interval `frame`; white has a quarter (v2e)."""
+    mixed, noisy = work.mixed, work.noisy
     upper = uint32(uint64(key) >> uint64(32)) + uint32(uint32(frame) * uint32(0x9E3779B9))
-    most, slope = uint32(clip.shot - 1), uint32(clip.shot >> 8)
-    if clip.shot > 0:  # then the probability is nowhere 0, and `most` one below it
+    most, slope = uint32(clip.dark_noise - 1), uint32(clip.dark_noise >> 8)
+    if clip.dark_noise > 0:  # then the probability is nowhere 0, and `most` one below it
         for x in range(intensity.size):
             seen = uint32(i32(min(max(intensity[x], f32(0)), f32(1)) * f32(256)))
             rate = uint32(most - uint32(slope * uint32(uint32(uint32(3) * seen) >> uint32(2))))
-            noisy[x] = mix(uint32(mixed[x] + upper)) <= rate
-    for x in scratch.hot[:hots]:
-        noisy[x] = mix(uint32(mixed[x] + upper)) < clip.hot
+            noisy[x] = mix_bits(uint32(mixed[x] + upper)) <= rate
+    for x in work.hot[:hot_count]:
+        noisy[x] = mix_bits(uint32(mixed[x] + upper)) < clip.hot_noise
 
 
 @kernel
-def draw_noise(scratch, key, frame, last):
+def draw_noise_times(work, key, frame, last):
     """Fill times and polarities of the noise events of the active pixels; time 2 for none."""
-    pixel, noisy, active = scratch.pixel, scratch.noisy, scratch.active
-    noise_u, noise_sign = scratch.noise_u, scratch.noise_sign
+    pixel, noisy, active = work.pixel, work.noisy, work.active
+    noise_u, noise_sign = work.noise_u, work.noise_sign
     for x in active[:last]:
-        at = bits(key, frame, uint32(2) * uint32(pixel[x]) + uint32(1))
+        at = random_uint32(key, frame, uint32(2) * uint32(pixel[x]) + uint32(1))
         u = (f32(at >> uint32(9)) + f32(0.5)) * f32(2.0**-23)
         noise_u[x] = u if noisy[x] else f32(2)
         noise_sign[x] = 1 if at & uint32(1) else -1
 
 
 @kernel
-def draw_leak(leak, scratch, frame):
+def compute_leak(leak, work, frame):
     """Fill how far the references leak in interval `frame`, by the whole units leaked so far."""
-    on, drift = scratch.on, scratch.drift
+    on, drift = work.on, work.drift
     for x in range(on.size):
         rate = np.int64(on[x]) * leak
         drift[x] = ((rate * (frame + 1)) >> 24) - ((rate * frame) >> 24)
 
 
 @kernel
-def busiest(mode, memory, scratch):
+def count_v2e_steps(mode, work):
     """Return the largest number of crossings of any pixel of a unit, at least 1."""
-    level, reference, dead = memory.level, memory.reference, memory.dead
-    new, drift, on, off = scratch.level, scratch.drift, scratch.on, scratch.off
+    level, reference, dead = work.level, work.reference, work.dead
+    new, drift, on, off = work.new_level, work.drift, work.on, work.off
     steps = np.int64(1)
     for x in range(level.size):
         l1, ref, up, down = np.int64(new[x]) + drift[x], np.int64(reference[x]), on[x], off[x]
@@ -314,14 +321,12 @@ def busiest(mode, memory, scratch):
 
 
 @kernel
-def find_active(mode, memory, scratch):
-    """List the pixels that have something to do in `scratch.active`; return how many.
-
-    Without a branch per pixel: which are quiet is not predictable.  But eight in a row often are.
-    """
-    level, reference, dead = memory.level, memory.reference, memory.dead
-    new, drift, on, off = scratch.level, scratch.drift, scratch.on, scratch.off
-    active, busy, noisy = scratch.active, scratch.busy, scratch.noisy
+def find_active(mode, work):
+    """List the pixels that have something to do in `work.active`; return how many."""
+    # Without a branch per pixel: which are quiet is not predictable.  But eight in a row often are.
+    level, reference, dead = work.level, work.reference, work.dead
+    new, drift, on, off = work.new_level, work.drift, work.on, work.off
+    active, busy, noisy = work.active, work.busy, work.noisy
     for x in range(level.size):
         l0, l1, ref = level[x], np.int32(new[x] + drift[x]), reference[x]
         up, down = np.int32(max(l0, l1) - ref), np.int32(ref - min(l0, l1))
@@ -339,16 +344,15 @@ def find_active(mode, memory, scratch):
 
 
 @kernel
-def find_events(chip, wait, memory, scratch, steps, done, last):
-    """Take the active pixels `done` .. `last` - 1 through an interval, until the batch is full.
-
-    Returns the number of events in the batch and of the pixels that are done.
+def find_events(given, wait, work, steps, done, last):
+    """Take the active pixels `done` .. `last` - 1 through an interval, until the batch is full;
+    return the number of events in it and of the pixels that are done.
     """
-    level, reference, dead = memory.level, memory.reference, memory.dead
-    new, drift, on_, off_ = scratch.level, scratch.drift, scratch.on, scratch.off
-    active, noise_u, noise_sign = scratch.active, scratch.noise_u, scratch.noise_sign
-    batch = scratch.who, scratch.when, scratch.sign
-    mode, v2e, count = chip.mode, chip.v2e, 0
+    level, reference, dead = work.level, work.reference, work.dead
+    new, drift, on_, off_ = work.new_level, work.drift, work.on, work.off
+    active, noise_u, noise_sign = work.active, work.noise_u, work.noise_sign
+    batch = work.event_pixel, work.event_u, work.event_sign
+    mode, v2e, count = given.refractory_mode, given.v2e_stamps, 0
     while done < last and count <= level.size:
         x = active[done]
         on, off = np.int64(on_[x]), np.int64(off_[x])
@@ -368,22 +372,21 @@ def find_events(chip, wait, memory, scratch, steps, done, last):
 
 
 @kernel
-def deliver(sink, place, scratch, number, clock):
-    """Bring the first `number` events of the batch to where they go; `place` is the unit's."""
-    unit, c, v, first, _, width = place
-    who, when, sign = scratch.who, scratch.when, scratch.sign
-    counts, offsets, events = sink.counts, sink.offsets, sink.events
-    if sink.output == VOXELS:
-        add_to_grid(sink.voxels[c, clock[0], v, :, first:], who, when, sign, number, clock)
-    elif sink.output == COUNT:
+def write_events(output, place, width, work, number, clock):
+    unit, c, v, first, _ = place
+    who, when, sign = work.event_pixel, work.event_u, work.event_sign
+    grids, tally, events = output
+    if grids.size:
+        add_to_grid(grids[c, clock[0], v, :, first:], who, when, sign, number, clock)
+    elif events.size:
         for i in range(number):
-            counts[unit, 0 if sign[i] > 0 else 1] += 1
+            at, pixel = tally[unit, 0] + i, first + who[i]
+            events[at].t, events[at].p = timestamp_us(when[i], clock), sign[i]
+            events[at].x, events[at].y = pixel % width, pixel // width
+        tally[unit, 0] += number
     else:
         for i in range(number):
-            at, pixel = offsets[unit] + i, first + who[i]
-            events[at].t, events[at].p = stamp(when[i], clock), sign[i]
-            events[at].x, events[at].y = pixel % width, pixel // width
-        offsets[unit] += number
+            tally[unit, 0 if sign[i] > 0 else 1] += 1
 
 
 @kernel
@@ -391,7 +394,7 @@ def add_to_grid(grid, who, when, sign, number, clock):
     """Add events to a unit's grid (bins, pixels), bilinear in time."""
     origin, scale, bins = clock[1], clock[2], grid.shape[0]
     for i in range(number):
-        tau = f32(f32(stamp(when[i], clock) - origin) * scale)
+        tau = f32(f32(timestamp_us(when[i], clock) - origin) * scale)
         b = min(np.int64(tau), bins - 1)
         late = f32(np.rint((tau - f32(b)) * f32(2**20)) * f32(2.0**-20))
         grid[b, who[i]] += f32(sign[i]) * (f32(1) - late)
@@ -399,38 +402,56 @@ def add_to_grid(grid, who, when, sign, number, clock):
             grid[b + 1, who[i]] += f32(sign[i]) * late
 
 
-@small
-def stamp(u, clock):
+@inline_kernel
+def timestamp_us(u, clock):
     """Return the tick of the sensor's clock in which fraction `u` of the interval falls."""
     return clock[3] + max(np.int64(np.ceil(u * f32(clock[4] - clock[3]))) - 1, 0)
 
 
 @kernel
-def start(clip, key, memory, scratch):
-    """Let the memory begin with its levels, the references off from them by the residual."""
-    level, reference, drawn = memory.level, memory.reference, scratch.drawn
-    memory.source[:], reference[:], memory.dead[:] = level, level, f32(0)
-    if clip.residual > 0:
-        draw_bits(key, 1, 0, scratch.pixel, drawn)
+def initialise_memory(clip, key, work):
+    """Let the memory begin with its levels, the references off from them by a drawn error."""
+    level, reference, drawn = work.level, work.reference, work.drawn
+    work.source[:], reference[:], work.dead[:] = level, level, f32(0)
+    if clip.reference_error > 0:
+        draw_bits(key, 1, 0, work.pixel, drawn)
         for x in range(level.size):
             uniform = (f32(drawn[x] >> uint32(9)) + f32(0.5)) * f32(2.0**-23)
-            away = np.float64(f32(2) * uniform - f32(1)) * clip.residual
-            threshold = scratch.on[x] if away > 0 else scratch.off[x]
+            away = np.float64(f32(2) * uniform - f32(1)) * clip.reference_error
+            threshold = work.on[x] if away > 0 else work.off[x]
             reference[x] = level[x] - i32(away * threshold)
 
 
 @kernel
-def advance(chip, clip, memory, scratch, sink, place, key, frame, clock):
-    """Take one unit through interval `frame`, at whose end the levels are those of the scratch."""
-    level, reference, dead = memory.level, memory.reference, memory.dead
-    new, drift = scratch.level, scratch.drift
-    steps = busiest(chip.mode, memory, scratch) if chip.v2e else np.int64(1)
-    done, last = 0, find_active(chip.mode, memory, scratch)
-    if clip.shot or clip.hot:
-        draw_noise(scratch, key, frame, last)
+def read_frame(given, half_frames, place, frame, work, levels):
+    """Fill levels before the low-pass; return the intensities and whether any may be wrong."""
+    _, c, v, first, last = place
+    if half_frames.size:
+        seen, halves = work.intensity, half_frames[c, v, frame, first:last]
+        return seen, read_half_levels(given.level_table, halves, seen, levels)
+    seen = given.frames[c, v, frame, first:last]
+    return seen, read_levels(given.level_table, seen, levels)
+
+
+@kernel
+def advance_interval(given, clip, hot_count, work, output, place, intensity, key, frame, clock):
+    """Take one unit through interval `frame`, at whose end the levels are the new ones."""
+    level, reference, dead = work.level, work.reference, work.dead
+    new, drift, mode = work.new_level, work.drift, given.refractory_mode
+    if len(given.low_pass_tables):
+        tables = given.low_pass_tables[clip.low_pass_row]
+        apply_low_pass(tables[0], tables[1], intensity, level, work.source, new)
+    if clip.dark_noise or hot_count:
+        mark_noise(clip, hot_count, work, key, frame, intensity)
+    if clip.leak:
+        compute_leak(clip.leak, work, frame)
+    steps = count_v2e_steps(mode, work) if given.v2e_stamps else np.int64(1)
+    done, last = 0, find_active(mode, work)
+    if clip.dark_noise or clip.hot_noise:
+        draw_noise_times(work, key, frame, last)
     while done < last:
-        number, done = find_events(chip, f32(clip.wait), memory, scratch, steps, done, last)
-        deliver(sink, place, scratch, number, clock)
+        number, done = find_events(given, f32(clip.refractory), work, steps, done, last)
+        write_events(output, place, given.width, work, number, clock)
     if clip.leak:
         for x in range(level.size):
             reference[x] -= drift[x]
@@ -440,86 +461,54 @@ def advance(chip, clip, memory, scratch, sink, place, key, frame, clock):
 
 
 @kernel
-def see(chip, frames, place, frame, scratch, levels):
-    """Fill levels before the low-pass and return (light, whether any of it may be wrong).
-
-    `frames` are two arrays: float32, and the bits of float16, one of them empty.
-    """
-    _, c, v, first, last, _ = place
-    wide, halves = frames
-    if halves.size:
-        seen = scratch.intensity
-        return seen, read_halves(chip.level, halves[c, v, frame, first:last], seen, levels)
-    seen = wide[c, v, frame, first:last]
-    return seen, read_levels(chip.level, seen, levels)
-
-
-@kernel
-def disturb(chip, clip, hots, memory, scratch, intensity, key, frame):
-    """Let the low-pass, noise and leak have their part in interval `frame`."""
-    if len(chip.low_pass):
-        tables = chip.low_pass[clip.low_pass]
-        low_pass(tables[0], tables[1], intensity, memory, scratch.level)
-    if clip.shot or hots:
-        mark_noise(clip, hots, scratch, key, frame, intensity)
-    if clip.leak:
-        draw_leak(clip.leak, scratch, frame)
-
-
-@kernel
-def clock_at(edges, i, substeps, bins):
-    """Return interval `i`'s window, the window's start and bins per microsecond, both edges."""
-    window = i // substeps
-    origin, end = edges[window * substeps], edges[(window + 1) * substeps]
-    return window, origin, f32(f32(bins - 1) / f32(end - origin)), edges[i], edges[i + 1]
-
-
-@kernel
-def make_scratch(size, smallest):
-    """Return the scratch; a pixel has no more events in an interval than thresholds in 32 nat."""
-    whole, room = (size + 7) // 8 * 8, size + 32 + (1 << 25) // max(smallest >> 2, 1024)
-    return Scratch(
+def make_workspace(size, smallest):
+    """Return the arrays; a pixel has no more events in an interval than thresholds in 32 nat."""
+    whole, most = (size + 7) // 8 * 8, size + 32 + (1 << 25) // max(smallest >> 2, 1024)
+    return Workspace(
+        np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int32),
+        np.empty(size, np.float32),
         np.empty(size, np.int32), np.empty(size, np.uint32), np.empty(size, np.uint32),
         np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.uint32),
         np.zeros(size, np.int32),
         np.empty(size, np.float32), np.empty(size, np.int32), np.zeros(size, np.uint8),
         np.empty(whole + 1, np.uint32), np.zeros(whole, np.uint8),
         np.full(size, f32(2)), np.ones(size, np.int8),
-        np.empty(room, np.uint32), np.empty(room, np.float32), np.empty(room, np.int8),
+        np.empty(most, np.uint32), np.empty(most, np.float32), np.empty(most, np.int8),
     )  # fmt: skip
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def simulate(
-    first_unit, last_unit, size, frames, fresh, chip, memory, edges, first, substeps, sink
+def simulate_pixel_blocks(
+    first_unit, last_unit, given, half_frames, normals, pixels, size, grids, tally, events
 ):
-    """Simulate units first_unit .. last_unit - 1: `size` consecutive pixels of a view each.
+    """Simulate units first_unit .. last_unit - 1, `size` consecutive pixels of a view each.
 
-    Returns whether any light is negative or above 1.
+    `given.frames` and `half_frames` (the bits of float16) are (n, views, frames, pixels), one of
+    them is empty.  Events are added to `grids` (n, windows, views, bins, pixels), if there are any,
+    or listed in `events` from `tally[unit, 0]` on, or else counted in `tally` (units, 2), ON and
+    OFF.  Returns whether any intensity is negative or above 1.
     """
-    views, pixels = memory.level.shape[1:]
+    views, bins = given.keys.shape[1], grids.shape[3]
     units, doubtful = (pixels + size - 1) // size, False
     for unit in range(first_unit, last_unit):
         c, v, a = unit // (views * units), unit // units % views, unit % units * size
         b = min(a + size, pixels)
-        own = Memory(
-            memory.level[c, v, a:b], memory.source[c, v, a:b],
-            memory.reference[c, v, a:b], memory.dead[c, v, a:b],
-        )  # fmt: skip
-        clip, keys, place = chip.clips[c], chip.keys[c, v], (unit, c, v, a, b, chip.width)
-        scratch = make_scratch(b - a, min(clip.on, clip.off))
-        number_pixels(clip, chip.width, a, scratch.pixel)
-        hots = make_chip(clip, keys, chip.normals, scratch)
-        mix_pixels(keys[SHOT], scratch.pixel, scratch.mixed)
-        if fresh:
-            doubtful |= see(chip, frames, place, 0, scratch, own.level)[1]
-            start(clip, keys[RESIDUAL], own, scratch)
-        for i in range(edges.shape[1] - 1):
-            clock = clock_at(edges[c], i, substeps, sink.voxels.shape[3])
-            light, beyond = see(chip, frames, place, i + fresh, scratch, scratch.level)
-            disturb(chip, clip, hots, own, scratch, light, keys[SHOT], first + i)
-            advance(chip, clip, own, scratch, sink, place, keys[SHOT], first + i, clock)
+        clip, keys, place = given.clips[c], given.keys[c, v], (unit, c, v, a, b)
+        key, edges_us = keys[NOISE_KEY], given.edges_us[c]
+        work = make_workspace(b - a, min(clip.on, clip.off))
+        number_pixels(clip, given.width, a, work.pixel)
+        hot_count = draw_pixel_properties(clip, keys, normals, work)
+        prehash_pixels(key, work.pixel, work.mixed)
+        doubtful |= read_frame(given, half_frames, place, 0, work, work.level)[1]
+        initialise_memory(clip, keys[REFERENCE_KEY], work)
+        for i in range(edges_us.size - 1):
+            # The interval's window, where that begins, bins per microsecond, and both edges.
+            window, step = i // given.substeps, given.substeps
+            origin, end = edges_us[window * step], edges_us[(window + 1) * step]
+            scale = f32(f32(bins - 1) / f32(end - origin))
+            clock = window, origin, scale, edges_us[i], edges_us[i + 1]
+            seen, beyond = read_frame(given, half_frames, place, i + 1, work, work.new_level)
+            output = grids, tally, events
+            advance_interval(given, clip, hot_count, work, output, place, seen, key, i, clock)
             doubtful |= beyond
-        if not len(chip.low_pass):
-            own.source[:] = own.level
     return doubtful

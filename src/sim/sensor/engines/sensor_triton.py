@@ -4,7 +4,8 @@ and what it remembers stay in registers over the clip.
 A program owns a run of pixels of one view, with all their bins, so that no sum depends on an order
 other than that of time.  The formulas are those of sensor_numba.py, in integers and in
 floats without fused multiply-add, so that the events are the same bit for bit.  v2e's stamps, for
-which all pixels of a view must be known at once, are left to plain torch.
+which all pixels of a view must be known at once, are left to the CPU.  `clip` points to the numbers
+of a clip, in the order of records.FIELDS; `keys` to the keys of one of its views.
 """
 
 from functools import lru_cache
@@ -13,63 +14,50 @@ import numpy as np
 import torch
 import triton
 import triton.language as tl
+from jaxtyping import Float
 from torch import Tensor
 
-from src.sim.sensor.engines import job as jobs
-from src.sim.sensor.engines.job import NORMALS, Job
-from src.sim.sensor.engines.triton_pixel import (
-    FIELDS,
-    FULL_WIDTH,
-    KEYS,
-    LEAK,
-    LEFT,
-    LOW_PASS,
-    NEVER,
-    SHOT_KEY,
-    TOP,
-    WAIT,
-    chip_of,
-    filtered,
-    is_outside,
-    look,
-    nearest,
-    noise_chance,
-    noise_event,
-    number64,
-    place_of,
-    residual,
-    way,
-)
-from src.sim.sensor.limits import check_intensities
+from src.sim.sensor.engines import records
+from src.sim.sensor.engines.records import NORMALS, EngineInput, check_intensities
 
+LOWEST, HIGHEST = tl.constexpr(records.LOWEST), tl.constexpr(records.HIGHEST)
+NEVER = tl.constexpr(2.0)  # a time after the interval
+FIELDS, KEYS = tl.constexpr(len(records.FIELDS)), tl.constexpr(records.KEYS)
+(
+    ON, OFF, MISMATCH, HOT_FRACTION, LEAK, DARK_NOISE, HOT_NOISE, TOP, LEFT, FULL_WIDTH,
+    LOW_PASS_ROW, REFRACTORY, REFERENCE_ERROR,
+) = map(tl.constexpr, range(len(records.FIELDS)))  # fmt: skip
+MISMATCH_KEY, HOT_PIXEL_KEY, NOISE_KEY, REFERENCE_KEY = map(tl.constexpr, range(records.KEYS))
 BLOCK = 128  # pixels of a program
-DELETE, HOLD = tl.constexpr(jobs.DELETE), tl.constexpr(jobs.HOLD)
+DELETE, HOLD = tl.constexpr(records.DELETE), tl.constexpr(records.HOLD)
 SIZES = (
     "clip_step", "view_step", "frame_step", "row_step", "column_step", "n", "views", "pixels",
-    "width", "intervals", "substeps", "first", "nodes",
+    "width", "intervals", "substeps", "nodes",
 )  # fmt: skip
 
 
-def voxels(job: Job, grids: Tensor) -> Tensor:
-    """Fill `grids` (n, windows, views, bins, h, w) and return them; `job.state` moves on.
+def voxels(
+    given: EngineInput, grids: Float[Tensor, "n windows views bins h w"]
+) -> Float[Tensor, "n windows views bins h w"]:
+    """Fill `grids` and return them.
 
     Raises ValueError, afterwards, for frames that are not finite or outside [0, 1].
     """
-    n, views, _, height, width = job.frames.shape
-    state, bins, device = job.state, grids.shape[3], grids.device
-    numbers = np.concatenate([job.clips.view(np.int64), job.keys.ravel(), job.edges.ravel()])
+    n, views, frames, height, width = given.frames.shape
+    bins, device, clips = grids.shape[3], grids.device, given.clips
+    numbers = np.concatenate([clips.view(np.int64), given.keys.ravel(), given.edges_us.ravel()])
     wrong = torch.zeros(1, dtype=torch.int32, device=device)
-    noisy = job.clips["shot"].any() or job.clips["hot"].any()
+    noisy = clips["dark_noise"].any() or clips["hot_noise"].any()
     with torch.cuda.device_of(grids):
         _simulate[(triton.cdiv(height * width, BLOCK), n * views)](
-            job.frames, state.level, state.source, state.reference, state.dead, job.level,
-            job.low_pass, _normals(device), torch.from_numpy(numbers).to(device), grids, wrong,
-            *job.frames.stride(), n, views, height * width, width, job.intervals, job.substeps,
-            state.frame, job.low_pass.shape[2], job.mode, job.fresh, len(job.low_pass) > 0,
-            bool(noisy), bins, triton.next_power_of_2(bins), BLOCK, enable_fp_fusion=False,
+            given.frames, given.level_table, given.low_pass_tables, _normals(device),
+            torch.from_numpy(numbers).to(device), grids, wrong, *given.frames.stride(), n, views,
+            height * width, width, frames - 1, given.substeps, given.low_pass_tables.shape[2],
+            given.refractory_mode, len(given.low_pass_tables) > 0, bool(noisy), bins,
+            triton.next_power_of_2(bins), BLOCK, enable_fp_fusion=False,
         )  # fmt: skip
     if wrong:
-        check_intensities(job.frames)
+        check_intensities(given.frames)
     return grids
 
 
@@ -80,77 +68,73 @@ def _normals(device: torch.device) -> Tensor:
 
 @triton.jit(do_not_specialize=SIZES)
 def _simulate(
-    frames, levels, sources, references, deads, table, low_pass, normals, numbers, grids, wrong,
-    clip_step, view_step, frame_step, row_step, column_step, n, views, pixels, width, intervals,
-    substeps, first, nodes, MODE: tl.constexpr, FRESH: tl.constexpr, FILTERED: tl.constexpr,
-    NOISY: tl.constexpr, BINS: tl.constexpr, COLUMNS: tl.constexpr, BLOCK: tl.constexpr,
+    frames, level_table, low_pass_tables, normals, numbers, grids, wrong, clip_step, view_step,
+    frame_step, row_step, column_step, n, views, pixels, width, intervals, substeps, nodes,
+    MODE: tl.constexpr, FILTERED: tl.constexpr, NOISY: tl.constexpr, BINS: tl.constexpr,
+    COLUMNS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Take BLOCK pixels of one clip and view through all intervals.
 
     `numbers`: the clips' (n, FIELDS), the keys (n, views, KEYS) and the edges (n, intervals + 1).
     """
     unit = tl.program_id(1).to(tl.int64)
-    clip, view = unit // views, unit % views
+    index, view = unit // views, unit % views
     x = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    own, at = x < pixels, unit * pixels + x
-    y = x // width
+    own, y = x < pixels, x // width
     row, col = y.to(tl.int64), (x - y * width).to(tl.int64)
-    frame = frames + clip * clip_step + view * view_step + row * row_step + col * column_step
-    chip, keys = numbers + clip * FIELDS, numbers + n * FIELDS + unit * KEYS
-    edges = numbers + n * (FIELDS + views * KEYS) + clip * (intervals + 1)
-    pixel = (tl.load(chip + TOP) + row) * tl.load(chip + FULL_WIDTH) + tl.load(chip + LEFT) + col
-    on, off, hot = chip_of(chip, keys, normals, pixel)
-    leak = on.to(tl.int64) * tl.load(chip + LEAK)
-    wait = tl.zeros([BLOCK], tl.float32) + number64(chip + WAIT).to(tl.float32)
-    key, begun = tl.load(keys + SHOT_KEY), tl.full((), 0, tl.int64) + first
-    bad = tl.zeros([BLOCK], tl.int1)
-    if FRESH:
-        intensity = tl.load(frame, own, 0.0).to(tl.float32)
-        bad = is_outside(intensity)
-        level = look(table, place_of(intensity))
-        ref = level - residual(chip, keys, pixel, on, off)
-        source, dead = level, tl.zeros([BLOCK], tl.float32)
-        frame += frame_step
-    else:
-        level, source = tl.load(levels + at, own, 0), tl.load(sources + at, own, 0)
-        ref, dead = tl.load(references + at, own, 0), tl.load(deads + at, own, 0.0)
-    decay = low_pass + 2 * nodes * tl.load(chip + LOW_PASS)
+    frame = frames + index * clip_step + view * view_step + row * row_step + col * column_step
+    clip, keys = numbers + index * FIELDS, numbers + n * FIELDS + unit * KEYS
+    edges = numbers + n * (FIELDS + views * KEYS) + index * (intervals + 1)
+    pixel = (tl.load(clip + TOP) + row) * tl.load(clip + FULL_WIDTH) + tl.load(clip + LEFT) + col
+    on, off, hot = draw_pixel_properties(clip, keys, normals, pixel)
+    leak = on.to(tl.int64) * tl.load(clip + LEAK)
+    wait = tl.zeros([BLOCK], tl.float32) + load_int64_as_float64(clip + REFRACTORY).to(tl.float32)
+    key, zero = tl.load(keys + NOISE_KEY), tl.full((), 0, tl.int64)
+    intensity = tl.load(frame, own, 0.0).to(tl.float32)
+    bad = is_outside(intensity)
+    level = read_table(level_table, table_position(intensity))
+    ref = level - draw_reference_error(clip, keys, pixel, on, off)
+    source, dead = level, tl.zeros([BLOCK], tl.float32)
+    frame += frame_step
+    decay = low_pass_tables + 2 * nodes * tl.load(clip + LOW_PASS_ROW)
     column = tl.arange(0, COLUMNS)[None, :]
     grid = tl.zeros([BLOCK, COLUMNS], tl.float32)
     size = views * BINS * pixels.to(tl.int64)
-    cell = grids + (clip * (intervals // substeps)) * size + view * BINS * pixels
+    cell = grids + (index * (intervals // substeps)) * size + view * BINS * pixels
     cell = cell + column * pixels + x[:, None]
     for i in range(intervals):
         intensity = tl.load(frame, own, 0.0).to(tl.float32)
         bad = bad | is_outside(intensity)
-        place = place_of(intensity)
-        read = look(table, place)
+        place = table_position(intensity)
+        read = read_table(level_table, place)
         new = read
         if FILTERED:
-            kept, lag = look(decay, place), look(decay + nodes, place)
-            new = filtered(read, level, source, kept, lag)
-        drift = ((leak * (begun + i + 1) >> 24) - (leak * (begun + i) >> 24)).to(tl.int32)
+            kept, lag = read_table(decay, place), read_table(decay + nodes, place)
+            new = apply_low_pass(read, level, source, kept, lag)
+        drift = ((leak * (zero + i + 1) >> 24) - (leak * (zero + i) >> 24)).to(tl.int32)
         delta = new + drift - level
         along = tl.where(delta >= 0, 1, -1)
         ahead, behind = tl.where(delta >= 0, on, off), tl.where(delta >= 0, off, on)
         span, mark = tl.abs(delta), (ref - level) * along
-        begin, ticks, scale = _clock(edges, i, substeps, BINS)
+        begin, ticks, scale = _interval_clock(edges, i, substeps, BINS)
         start, holding = tl.zeros([BLOCK], tl.float32), (dead > 0) & (MODE == HOLD)
         if NOISY:
-            u, sign = noise_event(key, begun + i, pixel, noise_chance(chip, hot, intensity))
+            u, sign = draw_noise_event(
+                key, zero + i, pixel, noise_probability(clip, hot, intensity)
+            )
             u = tl.where(own, u, NEVER)
             stop = tl.minimum(u, 1.0)
-            grid, mark, dead, holding = _until(
+            grid, mark, dead, holding = _add_events(
                 grid, mark, dead, holding, start, stop, span, ahead, behind, along, own, wait,
                 begin, ticks, scale, column, BINS, MODE,
             )  # fmt: skip
             fired = (u <= 1) & (u >= dead)
-            grid = _add(grid, fired, u, sign, begin, ticks, scale, column, BINS)
-            mark = tl.where(fired, way(span, u), mark)
+            grid = _add_to_grid(grid, fired, u, sign, begin, ticks, scale, column, BINS)
+            mark = tl.where(fired, level_change(span, u), mark)
             dead = tl.where(fired, u + wait, dead)
             holding = holding | (fired & (MODE == HOLD) & (wait > 0))
             start = stop
-        grid, mark, dead, holding = _until(
+        grid, mark, dead, holding = _add_events(
             grid, mark, dead, holding, start, tl.full([BLOCK], 1, tl.float32), span, ahead, behind,
             along, own, wait, begin, ticks, scale, column, BINS, MODE,
         )  # fmt: skip
@@ -161,15 +145,11 @@ def _simulate(
             tl.store(cell, grid, own[:, None] & (column < BINS))
             grid = tl.zeros([BLOCK, COLUMNS], tl.float32)
             cell += size
-    tl.store(levels + at, level, own)
-    tl.store(sources + at, source, own)
-    tl.store(references + at, ref, own)
-    tl.store(deads + at, dead, own)
     tl.store(wrong + tl.zeros([BLOCK], tl.int32), 1, own & bad)
 
 
 @triton.jit
-def _clock(edges, i, substeps, BINS: tl.constexpr):
+def _interval_clock(edges, i, substeps, BINS: tl.constexpr):
     """Return the interval's start in its window and its length, in us, and bins per us."""
     origin = i // substeps * substeps
     begin, window = tl.load(edges + i), tl.load(edges + origin)
@@ -179,33 +159,32 @@ def _clock(edges, i, substeps, BINS: tl.constexpr):
 
 
 @triton.jit
-def _until(
+def _add_events(
     grid, mark, dead, holding, start, stop, span, ahead, behind, along, own, wait, begin, ticks,
     scale, column, BINS: tl.constexpr, MODE: tl.constexpr,
 ):  # fmt: skip
-    """Add the events from `start` to `stop`; `mark` is the reference's place on the level's way."""
     going = own
     while tl.max(going.to(tl.int32), 0) > 0:
         ends = holding & (dead <= stop)  # the reset ends
-        mark = tl.where(ends, way(span, dead), mark)
+        mark = tl.where(ends, level_change(span, dead), mark)
         holding = holding & (dead > stop)
         now = start
         if MODE != DELETE:
             now = tl.maximum(start, dead)
-        u, step = _next(span, mark, ahead, behind, now)
+        u, step = _next_crossing(span, mark, ahead, behind, now)
         going = going & (u <= stop) & (holding == 0)
         mark = tl.where(going, mark + step, mark)
         start = tl.where(going, u, start)
         fired = going & (u >= dead)
         sign = tl.where(step > 0, along, -along)
-        grid = _add(grid, fired, u, sign, begin, ticks, scale, column, BINS)
+        grid = _add_to_grid(grid, fired, u, sign, begin, ticks, scale, column, BINS)
         dead = tl.where(fired, u + wait, dead)
         holding = holding | (fired & (MODE == HOLD) & (wait > 0))
     return grid, mark, dead, holding
 
 
 @triton.jit
-def _next(span, mark, ahead, behind, now):
+def _next_crossing(span, mark, ahead, behind, now):
     """Return time and step of the first threshold exceeded at or after `now`; NEVER if none."""
     length = span.to(tl.float32)
     u = tl.math.div_rn((mark + ahead).to(tl.float32), tl.maximum(length, 1.0))
@@ -215,12 +194,119 @@ def _next(span, mark, ahead, behind, now):
 
 
 @triton.jit
-def _add(grid, fired, u, sign, begin, ticks, scale, column, BINS: tl.constexpr):
-    """Add the events of the pixels where `fired` to `grid` (pixels, columns), bilinear in time."""
+def _add_to_grid(grid, fired, u, sign, begin, ticks, scale, column, BINS: tl.constexpr):
     tick = tl.maximum(tl.ceil(u * ticks.to(tl.float32)).to(tl.int64) - 1, 0) + begin
     tau = tick.to(tl.float32) * scale
     b = tl.minimum(tau.to(tl.int32), BINS - 1)
-    late = nearest((tau - b.to(tl.float32)) * 1048576.0) * (1 / 1048576.0)
+    late = round_half_even((tau - b.to(tl.float32)) * 1048576.0) * (1 / 1048576.0)
     sign = tl.where(fired, sign, 0).to(tl.float32)
     grid += tl.where(column == b[:, None], (sign * (1 - late))[:, None], 0.0)
     return grid + tl.where(column == b[:, None] + 1, (sign * late)[:, None], 0.0)
+
+
+@triton.jit
+def draw_pixel_properties(clip, keys, normals, pixel):
+    mismatch, key = tl.load(clip + MISMATCH), tl.load(keys + MISMATCH_KEY)
+    none = tl.full((), 0, tl.int64)
+    drawn_on, drawn_off = (
+        random_uint32(key, none, 2 * pixel),
+        random_uint32(key, none, 2 * pixel + 1),
+    )
+    on = spread_threshold(tl.load(clip + ON), mismatch, normals, drawn_on)
+    off = spread_threshold(tl.load(clip + OFF), mismatch, normals, drawn_off)
+    drawn_hot = random_uint32(tl.load(keys + HOT_PIXEL_KEY), none, pixel)
+    return on, off, drawn_hot.to(tl.int64) < tl.load(clip + HOT_FRACTION)
+
+
+@triton.jit
+def spread_threshold(threshold, mismatch, normals, drawn):
+    """Return threshold * (1 + mismatch * normal), at least a quarter of the threshold."""
+    cell, inside = (drawn >> 20).to(tl.int32), (drawn & 0xFFFFF).to(tl.int64)
+    left, right = tl.load(normals + cell), tl.load(normals + cell + 1)
+    normal = left + (((right - left) * inside) >> 20)
+    spread_out = threshold + ((((threshold * mismatch) >> 20) * normal) >> 20)
+    return tl.maximum(spread_out, threshold >> 2).to(tl.int32)
+
+
+@triton.jit
+def draw_reference_error(clip, keys, pixel, on, off):
+    """Return how far a reference is below the first level."""
+    drawn = random_uint32(tl.load(keys + REFERENCE_KEY), tl.full((), 0, tl.int64), pixel)
+    share = ((drawn >> 9).to(tl.float32) + 0.5) * (1 / 8388608.0)
+    away = (2 * share - 1).to(tl.float64) * load_int64_as_float64(clip + REFERENCE_ERROR)
+    return (away * tl.where(away > 0, on, off).to(tl.float64)).to(tl.int32)
+
+
+@triton.jit
+def is_outside(intensity):
+    """Return where an intensity is not one: nan as well."""
+    return ((intensity >= LOWEST) & (intensity <= HIGHEST)) == 0
+
+
+@triton.jit
+def table_position(intensity):
+    """Return the place in the tables of an intensity, as src.sim.sensor.response.lookup has it."""
+    bits = intensity.to(tl.int32, bitcast=True)
+    return tl.minimum(tl.maximum(bits, 0x38800000), 0x3FFFFFFF) - 0x38800000
+
+
+@triton.jit
+def read_table(table, place):
+    left, right = tl.load(table + (place >> 13)), tl.load(table + (place >> 13) + 1)
+    return (left + (((right - left) * (place & 8191)) >> 13) + 8) >> 4
+
+
+@triton.jit
+def apply_low_pass(read, level, source, decay, lag):
+    kept = (level - source).to(tl.int64) * decay - (read - source).to(tl.int64) * lag
+    return read + ((kept + 524288) >> 20).to(tl.int32)
+
+
+@triton.jit
+def level_change(span, u):
+    """Return how far a level that moves by `span` in an interval has come at fraction `u`."""
+    return round_half_even(u * span.to(tl.float32)).to(tl.int32)
+
+
+@triton.jit
+def round_half_even(x):
+    """Return `x`, not negative, rounded to the nearest whole number, halves to even."""
+    return tl.where(x < 8388608.0, x + 8388608.0 - 8388608.0, x)
+
+
+@triton.jit
+def noise_probability(clip, hot, intensity):
+    """Return the probability of a noise event in 2**-32; at white it is a quarter of black's."""
+    dark = tl.load(clip + DARK_NOISE)
+    seen = (tl.minimum(tl.maximum(intensity, 0.0), 1.0) * 256.0).to(tl.int64)
+    return tl.where(hot, tl.load(clip + HOT_NOISE), dark - (dark >> 8) * ((3 * seen) >> 2))
+
+
+@triton.jit
+def draw_noise_event(key, frame, pixel, probability):
+    """Return time (NEVER for none) and polarity of the noise events of interval `frame`."""
+    drawn, at = random_uint32(key, frame, 2 * pixel), random_uint32(key, frame, 2 * pixel + 1)
+    u = ((at >> 9).to(tl.float32) + 0.5) * (1 / 8388608.0)
+    return tl.where(drawn.to(tl.int64) < probability, u, NEVER), tl.where(at & 1 == 1, 1, -1)
+
+
+@triton.jit
+def random_uint32(key, high, low):
+    """The 32 bits of src.sim.noise.bits(key, high * 2**32 + low)."""
+    mixed = mix_bits(low.to(tl.uint32) ^ (key & 0xFFFFFFFF).to(tl.uint32))
+    upper = high.to(tl.uint32) * 0x9E3779B9 + (key >> 32).to(tl.uint32)
+    return mix_bits(mixed + upper)
+
+
+@triton.jit
+def mix_bits(x):
+    """The 32-bit finaliser of src.sim.noise."""
+    x = (x ^ (x >> 16)) * 0x7FEB352D
+    x = (x ^ (x >> 15)) * 0x846CA68B
+    return x ^ (x >> 16)
+
+
+@triton.jit
+def load_int64_as_float64(at):
+    """Return the float64 whose bits are kept as int64."""
+    return tl.load(at).to(tl.float64, bitcast=True)

@@ -1,6 +1,6 @@
 """Warp and normalised scatter of many pictures at once as two kernels (Triton) for CUDA.
 
-They take what blur_eager.py takes, and give the same but for float32 rounding.
+They take what blur_torch.py takes, and give the same but for float32 rounding.
 """
 
 import math
@@ -10,14 +10,13 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from src.sim.turbulence.lattice import Lattice
+from src.sim.turbulence.coefficient_grid import GridAxis
 
-WARP, SCATTER = 8, 0  # numbers held at a time: for a pixel, and for a pixel of its PSF
+WARP_NUMBERS, SCATTER_NUMBERS = 8, 0  # held at a time, for a pixel and for one of its PSF
 BLOCK = 256  # pixels of a program
 
 
 def warp(frames: Tensor, tilt: Tensor, top: int, left: int, first: int = 0) -> Tensor:
-    """Do as blur_eager.warp."""
     _, n, height, width = tilt.shape
     out = tilt.new_empty(n, height, width)
     low, high = torch.aminmax(frames.flatten(1), dim=1)
@@ -30,9 +29,8 @@ def warp(frames: Tensor, tilt: Tensor, top: int, left: int, first: int = 0) -> T
 
 
 def scatter(
-    image: Tensor, psfs: Tensor, rows: Lattice, halo: Tensor, share: float, first: int = 0
+    image: Tensor, psfs: Tensor, rows: GridAxis, halo: Tensor, share: float, first: int = 0
 ) -> Tensor:
-    """Do as blur_eager.scatter."""
     (frames, height, width), n = halo.shape, len(image)
     out = image.new_empty(n, height, width)
     with torch.cuda.device_of(out):
@@ -45,11 +43,11 @@ def scatter(
 
 
 # No whole number is worth another compilation.
-_WARP_NUMBERS = ["frames", "rows", "columns", "n", "height", "width", "top", "left", "first"]
-_SCATTER_NUMBERS = ["frames", "n", "height", "width", "rows", "pitch", "offset", "first", "size"]
+_WARP_INTEGERS = ["frames", "rows", "columns", "n", "height", "width", "top", "left", "first"]
+_SCATTER_INTEGERS = ["frames", "n", "height", "width", "rows", "pitch", "offset", "first", "size"]
 
 
-@triton.jit(do_not_specialize=_WARP_NUMBERS)
+@triton.jit(do_not_specialize=_WARP_INTEGERS)
 def _warp(
     light, tilt, lows, highs, out, frames, rows, columns, n, height, width, top, left, first,
     BLOCK: tl.constexpr,
@@ -101,7 +99,7 @@ def _reflect(index, size):
     return tl.minimum(folded, 2 * size - 1 - folded)
 
 
-@triton.jit(do_not_specialize=_SCATTER_NUMBERS)
+@triton.jit(do_not_specialize=_SCATTER_INTEGERS)
 def _scatter(
     image, psfs, halo, out, share, frames, n, height, width, rows, pitch, offset, first, size,
     BETWEEN: tl.constexpr, BLOCK: tl.constexpr,

@@ -1,12 +1,20 @@
-"""How numbers reach a device and how exactly they are multiplied there."""
+"""How a device computes turbulence: which engine, how exactly, and how numbers get there."""
 
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
+from importlib.util import find_spec
+from types import ModuleType
 
 import torch
 from torch import Tensor
 
-ALIGNED = 16  # bytes
+from src.sim.turbulence.coefficient_grid import GridAxis
+from src.sim.turbulence.engines import blur_torch
+
+TESTED_PITCHES = 1, 3  # a kernel each
+LARGEST_DIFFERENCE = 1e-3  # of white
 
 
 @contextmanager
@@ -21,30 +29,41 @@ def full_float32() -> Iterator[None]:
         products.allow_tf32 = before
 
 
-def moved(here: Tensor, device: torch.device) -> Tensor:
+def copy_to_device(tensor: Tensor, device: torch.device) -> Tensor:
     """Return a tensor on a device; the CPU goes on while it is copied there."""
-    if device.type == "cuda" and here.device.type == "cpu":
-        here = here.pin_memory()
-    return here.to(device, non_blocking=True)
+    if device.type == "cuda" and tensor.device.type == "cpu":
+        tensor = tensor.pin_memory()
+    return tensor.to(device, non_blocking=True)
 
 
-class Packed:
-    """Tensors of the CPU by name, in one piece of memory: a single copy takes them to a device."""
+@cache
+def select_engine(device: torch.device) -> ModuleType:
+    """Return Triton's kernels on CUDA where they do what plain torch does, else plain torch."""
+    if device.type != "cuda" or not find_spec("triton"):
+        return blur_torch
+    try:
+        from src.sim.turbulence.engines import blur_triton  # here, as Triton is not everywhere
 
-    def __init__(self, tables: Mapping[str, Tensor]):
-        self.places, end = {}, 0
-        for name, part in tables.items():
-            self.places[name] = slice(end, end + part.nbytes), part.dtype, part.shape
-            end += -(-part.nbytes // ALIGNED) * ALIGNED
-        self.memory = torch.zeros(end, dtype=torch.uint8)
-        for name, part in tables.items():
-            place = self.memory[self.places[name][0]]
-            place.copy_(part.contiguous().flatten().view(torch.uint8))
+        apart = [max_abs_difference(blur_triton, pitch, device) for pitch in TESTED_PITCHES]
+        if all(part < LARGEST_DIFFERENCE for part in apart):  # a NaN is no agreement
+            return blur_triton
+        reason = f"they differ by {max(apart):.2g}"
+    except Exception as error:  # whatever a compiler or a driver raises
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+    warnings.warn(f"turbulence without Triton's kernels, slower: {reason}", stacklevel=2)
+    return blur_torch
 
-    def on(self, device: torch.device) -> dict[str, Tensor]:
-        """Return the tensors on `device`."""
-        there = moved(self.memory, device)
-        return {
-            name: there[place].view(dtype).view(shape)
-            for name, (place, dtype, shape) in self.places.items()
-        }
+
+def max_abs_difference(engine: ModuleType, pitch: int, device: torch.device) -> float:
+    """Return how much pictures of another engine differ from those of plain torch, at most."""
+    generator, rows = torch.Generator().manual_seed(pitch), GridAxis(-3, 40, pitch, 1)
+    frames, halo = (torch.rand(2, *size, generator=generator) for size in ((30, 90), (34, 71)))
+    tilt = 3 * torch.randn(2, 5, 40, 77, generator=generator)
+    psfs = torch.rand(49, 5, rows.nodes, 77, generator=generator) - 0.3
+    frames, halo, tilt, psfs = (part.to(device) for part in (frames, halo, tilt, psfs))
+    warped, made = [], []
+    for one in (engine, blur_torch):
+        with full_float32():
+            warped.append(one.warp(frames, tilt, -3, 2, 1))
+            made.append(one.scatter(warped[-1], psfs, rows, halo, 0.1, 1))
+    return max(float((a - b).abs().max()) for a, b in (warped, made))

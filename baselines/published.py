@@ -1,0 +1,179 @@
+"""Published checkpoints as networks of ours: only names differ, by the rules below."""
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import nn
+
+from baselines.cista import CISTA
+from baselines.e2vid_plus import E2VIDPlus
+from baselines.etnet import ETNet
+from baselines.firenet import FireNet
+from baselines.hypere2vid import HyperE2VID
+from baselines.pickled_weights import read_tensors
+from src.models import files
+
+# Ours -> published, one rule after the other.
+UNET = (
+    (r"^net\.encoders\.(\d)\.", r"unetrecurrent.encoders.\1.conv.conv2d."),
+    (r"^net\.cells\.(\d)\.gates\.", r"unetrecurrent.encoders.\1.recurrent_block.Gates."),
+    (r"^net\.resblocks\.", "unetrecurrent.resblocks."),
+    (r"^net\.(head|decoders\.\d|pred)\.", r"unetrecurrent.\1.conv2d."),
+)
+FIRENET = (
+    (r"^head\.", "net.head.conv.conv2d."),
+    (r"^cells\.0\.", "net.head.recurrent_block."),
+    (r"^resblocks\.0\.", "net.resblocks.0.conv."),
+    (r"^cells\.1\.", "net.resblocks.0.recurrent_block."),
+    (r"^resblocks\.1\.", "net.resblocks.1."),
+    (r"^pred\.", "net.pred.conv2d."),
+)
+FIRENET_PLUS = (
+    (r"^(head|pred)\.", r"\1.conv2d."),
+    (r"^cells\.0\.", "G1."),
+    (r"^resblocks\.0\.", "R1."),
+    (r"^cells\.1\.", "G2."),
+    (r"^resblocks\.1\.", "R2."),
+)
+ETNET = (
+    (r"^net\.(head|pred)\.", r"\1.conv2d."),
+    (r"^net\.encoders\.(\d)\.", r"DownsampleConv.\1.conv.conv2d."),
+    (r"^net\.cells\.(\d)\.gates\.", r"DownsampleConv.\1.recurrent_block.Gates."),
+    (r"^net\.decoders\.(\d)\.", r"UpsampleConv.\1.conv2d."),
+    (r"^pyramid\.split\.0\.", "split1."),
+    (r"^pyramid\.split\.1\.", "split2."),
+    (r"\.attention\.project\.", ".self_attn.in_proj_"),
+    (r"\.attention\.out\.", ".self_attn.out_proj."),
+    (r"\.cross\.project\.", ".cross_attn.in_proj_"),
+    (r"\.cross\.out\.", ".cross_attn.out_proj."),
+    (r"\.asker_norm\.", ".norm21."),
+    (r"\.memory_norm\.", ".norm22."),
+    (r"\.mlp\.wide\.", ".linear1."),
+    (r"\.mlp\.back\.", ".linear2."),
+    (r"^(pyramid\.own\..*)\.mlp\.norm\.", r"\1.norm2."),
+    (r"^(pyramid\.across\..*)\.mlp\.norm\.", r"\1.norm3."),
+    (r"\.norm\.", ".norm1."),
+    (r"^pyramid\.own\.(\d)\.(\d)\.", r"trans_encoder\1.encoder.layers.\2."),
+    (r"^pyramid\.across\.(\d)\.(\d)\.", r"trans_decoder\1.decoder.layers.\2."),
+)
+HYPER = (
+    (r"^net\.decoders\.0\.", "unetrecurrent.decoders.1.conv2d."),
+    (r"^net\.decoders\.1\.", "unetrecurrent.decoders.2.conv2d."),
+    (r"^dynamic\.fuse\.", "unetrecurrent.decoders.0.context_fusion.conv."),
+    (r"^dynamic\.weigh\.", "unetrecurrent.decoders.0.dynamic_atom_generation.bases_net."),
+    (r"^dynamic\.functions", "unetrecurrent.decoders.0.dynamic_atom_generation.bases"),
+    (
+        r"^dynamic\.compose\.weight",
+        "unetrecurrent.decoders.0.dynamic_conv.compositional_coefficients",
+    ),
+    (r"^dynamic\.compose\.", "unetrecurrent.decoders.0.dynamic_conv."),
+    *UNET,
+)
+CISTA_TC = (
+    (r"^events\.", "We.conv2d."),
+    (r"^previous\.", "Wi.conv2d."),
+    (r"^mix\.", "W0.conv2d."),
+    (r"^code\.", "P0.conv2d."),
+    (r"^steps\.(\d)\.threshold", r"lista_blocks.\1.Lambda"),
+    (r"^steps\.(\d)\.synthesis\.", r"lista_blocks.\1.D.conv2d."),
+    (r"^steps\.(\d)\.analysis\.", r"lista_blocks.\1.P.conv2d."),
+    (r"^agree_before\.", "one_conv_for_prev.conv2d."),
+    (r"^agree_now\.", "one_conv_for_cur.conv2d."),
+    (r"^pulls\.", "alpha."),
+    (r"^decoder\.", "Dg.conv.conv2d."),
+    (r"^cell\.gates\.", "Dg.recurrent_block.Gates."),
+    (r"^up\.", "upsamp_conv.conv2d."),
+    (r"^pred\.", "final_conv.conv2d."),
+)
+
+
+OURS = (".safetensors", ".ckpt")  # what src.models.files reads
+
+
+class Published(NamedTuple):
+    """A published network; its width, `width_argument`, is the outputs of `first_layer`."""
+
+    network_class: type[nn.Module]
+    options: dict
+    rename_rules: tuple
+    first_layer: str
+    width_argument: str
+
+
+NORMALISED, RAW = {"normalise": "nonzero"}, {"normalise": "none", "output": "clip"}
+NETWORKS = {
+    "e2vid": Published(
+        E2VIDPlus, NORMALISED | {"output": "sigmoid"}, UNET, "net.head", "base_channels"
+    ),
+    "e2vid_plus": Published(E2VIDPlus, RAW, UNET, "net.head", "base_channels"),
+    "firenet": Published(FireNet, NORMALISED | {"output": "none"}, FIRENET, "head", "channels"),
+    "firenet_plus": Published(FireNet, RAW, FIRENET_PLUS, "head", "channels"),
+    "etnet": Published(ETNet, RAW | {"output": "sigmoid"}, ETNET, "net.head", "base_channels"),
+    "hypere2vid": Published(HyperE2VID, RAW, HYPER, "net.head", "base_channels"),
+    "cista": Published(CISTA, NORMALISED | {"output": "sigmoid"}, CISTA_TC, "events", "channels"),
+}
+
+
+def load_pretrained(architecture: str, weights: str | None) -> nn.Module:
+    """Return the network `architecture` with the weights that `baseline.weights` gives, frozen.
+
+    `weights`: a name in weights/ or a path of ours (.safetensors, .ckpt), trained on clean events;
+    or the path of the published checkpoint.  Raises ValueError, which says where to get them, when
+    there are none, and when they are another network's.
+    """
+    network_class, path = _find_architecture(architecture).network_class, Path(weights or "")
+    shipped = (files.WEIGHTS / f"{weights}.safetensors").is_file()
+    if shipped or (path.is_file() and path.suffix in OURS):
+        network = files.load(path if path.is_file() else str(weights)).requires_grad_(False)
+        if not isinstance(network, network_class):
+            got = f"a {type(network).__name__} is in {weights}"
+            raise ValueError(f"baseline.weights are not those of {architecture}: {got}")
+        return network
+    if path.is_file():
+        return load_published(architecture, path)
+    make = (
+        f"make ours with `python -m src.train experiment=clean/{architecture}` and ship_weights, "
+    )
+    raise ValueError(
+        f"baseline.weights must be a file with the weights of {architecture}, got {weights}; "
+        f"{make if path.parent.name == 'clean' else ''}"
+        "or give the path of its authors' checkpoint"
+    )
+
+
+def load_published(architecture: str, path: Path) -> nn.Module:
+    """Return the published network `architecture`, a key of NETWORKS, frozen and in eval mode.
+
+    Width and bins follow from the checkpoint at `path`.  Raises ValueError with the missing and
+    extra names when the weights are another network's.
+    """
+    network_class, options, rules, first_layer, width = _find_architecture(architecture)
+    weights = read_tensors(path)
+    head, sizes = weights.get(rename(f"{first_layer}.weight", rules)), {}
+    if head is not None and head.dim() == 4 and head.numel() > 0:
+        sizes = {"bins": head.shape[1], width: head.shape[0]}
+    with torch.device("meta"):  # without memory: a small file may ask for a huge network
+        own = network_class(**sizes, **options).state_dict()
+    names = {ours: rename(ours, rules) for ours in own}
+    wanted = {names[ours]: value for ours, value in own.items()}
+    files.check_fit(f"baseline.weights are not those of {architecture}", wanted, weights)
+    network = network_class(**sizes, **options)
+    network.load_state_dict({ours: weights[theirs] for ours, theirs in names.items()})
+    return network.eval().requires_grad_(False)
+
+
+def rename(ours: str, rules: tuple[tuple[str, str], ...]) -> str:
+    """Return the published name of a weight of ours."""
+    for pattern, published in rules:
+        ours = re.sub(pattern, published, ours)
+    return ours
+
+
+def _find_architecture(architecture: str) -> Published:
+    if architecture not in NETWORKS:
+        raise ValueError(
+            f"baseline.architecture must be one of {', '.join(NETWORKS)}, got {architecture}"
+        )
+    return NETWORKS[architecture]

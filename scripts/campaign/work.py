@@ -1,0 +1,177 @@
+"""A recipe at work: which stage is next, what it starts from, what it leaves behind."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import torch
+
+from scripts.campaign.recipe import ROOT, Recipe, Stage
+from scripts.campaign.training import Settings, Training
+from src.models import files
+
+
+class RecipeWork:
+    """The stages of `recipe` in the folder `settings.out/recipe`; each leaves a weights file there.
+
+    `ship`: where the network, its card and its learning curve go once all stages are done.
+    """
+
+    def __init__(self, recipe: Recipe, settings: Settings):
+        self.recipe, self.settings = recipe, settings
+        self.name, self.folder = recipe.name, settings.out / recipe.name
+        self.trainings = {
+            stage.name: self._training(stage) for stage in recipe.stages if stage.hours is not None
+        }
+
+    @property
+    def shipped(self) -> Path:
+        """The weights of the last stage, with a card beside them, where all is done."""
+        return self.settings.out / "weights" / f"{self.name}.safetensors"
+
+    def state(self) -> str:
+        """Return running, done, failed or waiting (for a turn, or for recipes of `after`)."""
+        if self.shipped.is_file():
+            return "done"
+        training = self.trainings.get(self._stage().name)
+        return training.state() if training and training.state() != "done" else "waiting"
+
+    def ready(self) -> bool:
+        """Return whether the networks that the stages name are there."""
+        return all(self._network(name) for name in self.recipe.after)
+
+    def advance(self) -> bool:
+        """Do what takes no training, up to the next one; return whether there is one to start."""
+        while not self.shipped.is_file():
+            stage = self._stage()
+            if stage.name in self.trainings:
+                if self.trainings[stage.name].state() != "done":
+                    return True
+                self._ship(stage)  # the last one: all others are done
+            elif stage.widen is not None:
+                self._widen(stage)
+            else:
+                self._average(stage)
+        return False
+
+    def start(self) -> None:
+        """Start the training of the next stage."""
+        training = self.trainings[self._stage().name]
+        training.overrides = self._overrides(self._stage())
+        training.start_from = self._start(self._stage())
+        training.start()
+
+    def line(self) -> str:
+        """Return the line of `status`."""
+        state, stage = self.state(), self._stage()
+        training = self.trainings.get(stage.name)
+        return f"{self.name}: {state}, {stage.name}" + (
+            f", {training.progress()}" if training else ""
+        )
+
+    def _stage(self) -> Stage:
+        """Return the first stage that is not done, or the last."""
+        for stage in self.recipe.stages:
+            if not self._done(stage):
+                return stage
+        return self.recipe.stages[-1]
+
+    def _done(self, stage: Stage) -> bool:
+        if stage.name in self.trainings:
+            return self.trainings[stage.name].state() == "done"
+        return self._weights(stage.name).is_file()
+
+    def _weights(self, stage: str) -> Path:
+        return self.folder / f"{stage}.safetensors"
+
+    def _training(self, stage: Stage) -> Training:
+        return Training(self.settings, self.folder / stage.name, stage.hours or 0.0, [], None)
+
+    def _network(self, name: str) -> str | None:
+        """Return the weights of a stage, of a recipe of this campaign, or the shipped ones."""
+        own = self._weights(name)
+        of_campaign = self.settings.out / "weights" / f"{name}.safetensors"
+        for path in (own, of_campaign):
+            if path.is_file():
+                return str(path.resolve())
+        shipped = files.WEIGHTS / f"{name}.safetensors"
+        return str(shipped) if shipped.is_file() else None
+
+    def _overrides(self, stage: Stage) -> list[str]:
+        """Return the overrides of a training, names in braces replaced by weights."""
+        known = {*self.recipe.after, *(one.name for one in self.recipe.stages)}
+        paths = {name: path for name in known if (path := self._network(name))}
+        common = [f"experiment={self.recipe.experiment}", *self.recipe.overrides]
+        given = [*common, f"seed={stage.seed}", *stage.overrides]
+        for name, path in paths.items():
+            given = [word.replace(f"{{{name}}}", path) for word in given]
+        return given
+
+    def _start(self, stage: Stage) -> str | None:
+        """Return the weights that a stage goes on from; None for the first."""
+        if stage.start is not None:
+            found = self._network(stage.start)
+            if found is None:
+                raise ValueError(
+                    f"start of stage {stage.name} must be a network, got {stage.start}"
+                )
+            return found
+        before = self.recipe.stages[: self.recipe.stages.index(stage)]
+        return str(self._weights(before[-1].name).resolve()) if before else None
+
+    def _widen(self, stage: Stage) -> None:
+        """Fill the network of this recipe from the smaller one that the stage names."""
+        source = self._network(stage.widen or "")
+        if source is None:
+            raise ValueError(f"widen of stage {stage.name} must be a network, got {stage.widen}")
+        self.folder.mkdir(parents=True, exist_ok=True)
+        words = [f"experiment={self.recipe.experiment}", f"seed={stage.seed}", *stage.overrides]
+        run("scripts.widen_setnet", *words, f"ckpt={source}", f"export={self._weights(stage.name)}")
+        self._go_on(stage)
+
+    def _average(self, stage: Stage) -> None:
+        shares = {self._weights(name): share for name, share in (stage.mean or {}).items()}
+        average(shares, self._weights(stage.name))
+        self._go_on(stage)
+
+    def _go_on(self, stage: Stage) -> None:
+        if stage == self.recipe.stages[-1]:
+            self._ship(stage)
+
+    def _ship(self, stage: Stage) -> None:
+        """Write the last stage's weights with card and learning curve to `shipped`."""
+        last = [name for name in self.trainings if self._weights(name).is_file()][-1]
+        run(
+            "scripts.ship_weights", str(self.folder / last), "--name", self.name, "--recipe",
+            self.name, "--weights", str(self._weights(stage.name)), "--to",
+            str(self.shipped.parent),
+        )  # fmt: skip
+
+
+def run(module: str, *words: str) -> None:
+    """Run a script of this repository; raises ValueError with its last line where it fails."""
+    command = [sys.executable, "-m", module, *words]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    if done.returncode:
+        last = (done.stderr.strip() or "no message").splitlines()[-1]
+        raise ValueError(f"{module} failed: {last}")
+
+
+@torch.no_grad()
+def average(shares: dict[Path, float], export: Path) -> None:
+    """Write the weighted mean of weights of one network (Wortsman et al. 2022), and the card of the
+    last of them with `mean_of`.
+
+    Raises ValueError where the files hold different networks.
+    """
+    networks = [files.load(path) for path in shares]
+    states = [network.state_dict() for network in networks]
+    shapes = [{name: value.shape for name, value in state.items()} for state in states]
+    if any(other != shapes[0] for other in shapes):
+        raise ValueError(f"mean must be of one network, got {', '.join(map(str, shares))}")
+    parts = list(zip(states, shares.values(), strict=True))
+    mean = {name: sum(share * state[name] for state, share in parts) for name in states[0]}
+    networks[-1].load_state_dict(mean)
+    last = list(shares)[-1]
+    card = files.read_card(last) | {"mean_of": {path.stem: share for path, share in shares.items()}}
+    files.save(export, networks[-1], files.network_spec(last), card)

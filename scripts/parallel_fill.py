@@ -1,0 +1,177 @@
+"""Filling a pre-simulated turbulence cache fast: one device, and processes that keep it busy.
+
+The processes draw clips and, for a GPU, prepare their turbulence; this one computes the pixels of
+all views.  The processes are those of a DataLoader, which keeps the order and notices their death.
+"""
+
+import os
+import pickle
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from src.sim.pipeline import ClipParameters, Pipeline, crop_frames
+from src.sim.turbulence.contract import PreparableTurbulence
+from src.sim.turbulence.engines.device import copy_to_device
+from src.training.clip_cache import CachedClip, clip_metadata
+from src.training.disk_cache import init_worker
+
+MAX_QUEUED_CLIPS = 2  # on the device
+
+
+@dataclass(frozen=True)
+class FillReport:
+    """`clips`: how many were made, the first ones without a gap; `seconds` it took, of which
+    `waiting_s` for clips to be drawn.
+    """
+
+    clips: int
+    seconds: float
+    waiting_s: float
+
+    @property
+    def clips_per_second(self) -> float:
+        """Clips a second, the start of the processes included."""
+        return self.clips / max(self.seconds, 1e-9)
+
+    def __str__(self) -> str:
+        return (
+            f"{self.clips} clips in {self.seconds:.1f} s, {self.clips_per_second:.1f} a second; "
+            f"{self.waiting_s:.1f} s of it waiting for clips to be drawn"
+        )
+
+
+def fill(
+    source: Pipeline,
+    indices: Iterable[int],
+    store: Callable[[int, CachedClip], None],
+    *,
+    device: torch.device | str,
+    workers: int,
+    until: float | None = None,
+) -> FillReport:
+    """Simulate the clips `indices` on `device` and `store` them in order, until the time `until` of
+    time.monotonic; a clip that is drawn later is dropped.
+
+    `workers`: the processes that draw; 0: this one.  Raises ValueError for a clip that is refused,
+    RuntimeError for one that fails, both naming the clip, RuntimeError where a process died, and
+    what `store` raises.
+    """
+    indices, device = list(indices), torch.device(device)
+    if type(workers) is not int or workers < 0:
+        raise ValueError(f"workers must be a whole number >= 0, got {workers}")
+    count, waiting_s, queued = 0, 0.0, deque[torch.cuda.Event]()
+    start = lap = time.monotonic()
+    drawn = _draw_clips(source, indices, min(workers, len(indices)), device)
+    for index, draw, metadata in drawn:
+        waiting_s += time.monotonic() - lap
+        if until is not None and time.monotonic() >= until:
+            break
+        store(index, CachedClip(*_simulate_drawn(source, index, draw, device), metadata))
+        count += 1
+        if device.type == "cuda":
+            queued.append(torch.cuda.Event())
+            queued[-1].record()
+            if len(queued) > MAX_QUEUED_CLIPS:
+                queued.popleft().synchronize()
+        lap = time.monotonic()
+    drawn.close()  # ends the processes
+    if queued:
+        queued[-1].synchronize()
+    return FillReport(count, time.monotonic() - start, waiting_s)
+
+
+@dataclass
+class _PickledDraws(Dataset):
+    """Draws of clips with their metadata and, if `prepare`, their turbulence prepared; an exception
+    for one that cannot be drawn.  Pickled, as PyTorch would send tensors from a process through
+    /dev/shm, which is small in containers.
+    """
+
+    source: Pipeline
+    prepare: bool
+
+    def __getitem__(self, index: int) -> bytes:
+        content: tuple[ClipParameters, dict] | Exception
+        try:
+            content = self._draw(index)
+        except Exception as error:  # raised by the process that asks
+            kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+            content = (RuntimeError if kind else ValueError)(f"clip {index}: {kind}{error}")
+        return pickle.dumps(content, pickle.HIGHEST_PROTOCOL)
+
+    def _draw(self, index: int) -> tuple[ClipParameters, dict[str, Any]]:
+        draw = self.source.draw(index)
+        metadata = clip_metadata(self.source, draw)
+        turbulence = self.source.turbulence_operator(draw) if self.prepare else None
+        if isinstance(turbulence, PreparableTurbulence):
+            frames, generator = len(draw.clip.frames), self.source.turbulence_generator(draw)
+            draw = replace(draw, turbulence=turbulence.prepare(frames, generator, draw.crop))
+        return draw, metadata
+
+
+def prepares_turbulence(device: torch.device) -> bool:
+    """Return whether turbulence is prepared for a device; a CPU computes view by view."""
+    return device.type != "cpu"
+
+
+def _draw_clips(
+    source: Pipeline, indices: list[int], workers: int, device: torch.device
+) -> Generator[tuple[int, ClipParameters, dict[str, Any]]]:
+    """Yield clips in order with draw and metadata; the `workers` processes that draw them end with
+    the generator.
+    """
+    if not indices:
+        return
+    loader = DataLoader(
+        _PickledDraws(source, prepares_turbulence(device)),
+        batch_size=None,
+        sampler=indices,
+        num_workers=workers,
+        collate_fn=_unchanged,
+        worker_init_fn=_init_worker,
+        multiprocessing_context="spawn" if workers else None,  # a fork would take CUDA along
+        generator=torch.Generator(),  # or the loader would draw from that of the training
+    )
+    clips = iter(loader)
+    for index in indices:
+        try:
+            clip = pickle.loads(next(clips))
+        except RuntimeError as error:
+            raise RuntimeError(f"waiting for clip {index}: {error}") from error
+        if isinstance(clip, Exception):
+            raise clip
+        yield index, *clip
+
+
+def _unchanged(clip: Any) -> Any:
+    return clip
+
+
+def _init_worker(worker: int) -> None:
+    init_worker()
+    os.environ["CUDA_VISIBLE_DEVICES"] = ""  # the device is for the process that asks
+    cv2.setNumThreads(1)
+
+
+def _simulate_drawn(
+    source: Pipeline, index: int, draw: ClipParameters, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Return views and clean frames of a drawn clip, float16; CUDA may not be done with them.
+
+    Raises RuntimeError, naming the clip, for whatever goes wrong.
+    """
+    try:
+        frames = copy_to_device(draw.clip.frames, device)
+        draw = replace(draw, clip=replace(draw.clip, frames=frames))
+        views = source.render_views([draw], device)[0].half().contiguous()
+        return views, crop_frames(frames, draw.crop).half().contiguous()
+    except Exception as error:
+        raise RuntimeError(f"clip {index}: {type(error).__name__}: {error}") from error

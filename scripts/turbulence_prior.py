@@ -1,0 +1,108 @@
+"""What atmospheres the prior draws: python -m scripts.turbulence_prior [air.yaml ...].
+
+Prints quantiles of the draws of each severity and of the clips of data=test_photos, and draws
+docs/figures/air.png: rms tilt against its half length.  `air.yaml` files are those of
+`python -m src.calibrate task=air`, shown with their intervals.
+"""
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from hydra import compose, initialize_config_dir
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from src.app import build
+from src.figures.plots import save_figure
+from src.records import safe_yaml
+from src.sim.turbulence import Atmosphere, sample_atmosphere
+
+CONF = Path(__file__).resolve().parents[1] / "conf"
+COUNT, WIDTH = 400, 256
+COLOURS = {"weak": "tab:green", "medium": "tab:orange", "strong": "tab:red"}
+FARTHEST = 2000.0  # px; what is longer is drawn there
+COLUMNS = {
+    "tilt, px": lambda path: path.tilt_std_px(WIDTH),
+    "half length, px": lambda path: path.tilt_correlation_half_length_px(WIDTH),
+    "spread, px": lambda path: path.tilt_and_blur_px(WIDTH),
+    "D/r0": lambda path: path.d_over_r0,
+    "lambda/D, px": lambda path: path.lambda_over_d_px(WIDTH),
+    "D, px at the object": lambda path: path.aperture_m / path.pixel_size_at_object_m(WIDTH),
+    "D / L0": lambda path: path.aperture_over_outer_scale,
+    "Rytov": lambda path: path.rytov_variance,
+}
+
+
+def draw_atmospheres() -> dict[str, list[Atmosphere]]:
+    """Return atmospheres of each severity and of their mix."""
+    return {
+        name: [sample_atmosphere(name, torch.Generator().manual_seed(k)) for k in range(COUNT)]
+        for name in ("weak", "medium", "strong", "mixed")
+    }
+
+
+def draw_test_atmospheres() -> dict[str, list[Atmosphere]]:
+    """Return the atmospheres of the clips of data=test_photos, by severity."""
+    with initialize_config_dir(str(CONF), version_base=None):
+        cfg = compose("eval", overrides=["data=test_photos", "paths.run=."])
+    pipeline = build.build_pipeline(cfg, "test")
+    paths = [pipeline.draw(number).turbulence for number in range(cfg.data.test_clips)]
+    names = sorted({path.severity for path in paths}, key=("weak", "medium", "strong").index)
+    return {f"test, {n}": [path for path in paths if path.severity == n] for n in names}
+
+
+def format_table(found: Mapping[str, Sequence[Atmosphere]]) -> str:
+    """Return the 10, 50 and 90 % quantiles of every column as Markdown."""
+    lines = ["| 10 / 50 / 90 % | " + " | ".join(COLUMNS) + " |"]
+    lines.append("|---" * (len(COLUMNS) + 1) + "|")
+    for name, paths in found.items():
+        cells = []
+        for column in COLUMNS.values():
+            values = np.percentile([column(path) for path in paths], [10, 50, 90])
+            cells.append(
+                " / ".join(f"{value:.2g}" if value < 100 else f"{value:.0f}" for value in values)
+            )
+        lines.append(f"| {name} ({len(paths)}) | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def plot_prior(
+    found: Mapping[str, Sequence[Atmosphere]], measured: Sequence[Path], path: Path
+) -> None:
+    """Draw rms tilt against half length: draws as dots, footage as crosses with intervals."""
+    figure = Figure(figsize=(7, 5), layout="constrained")
+    axes = figure.subplots()
+    for name in ("weak", "medium", "strong"):
+        x = [min(each.tilt_correlation_half_length_px(WIDTH), FARTHEST) for each in found[name]]
+        y = [each.tilt_std_px(WIDTH) for each in found[name]]
+        axes.plot(x, y, ".", ms=4, alpha=0.6, color=COLOURS[name], label=name)
+    x = np.percentile(
+        [each.tilt_correlation_half_length_px(WIDTH) for each in found["mixed"]], [10, 90]
+    )
+    y = np.percentile([each.tilt_std_px(WIDTH) for each in found["mixed"]], [10, 90])
+    box = Rectangle((x[0], y[0]), *np.diff(x), *np.diff(y), fill=False, ls="--", lw=1.2)
+    box.set_label("central 80 % of mixed")
+    axes.add_patch(box)
+    for file, marker in zip(measured, "X*PDv^s", strict=False):
+        air = safe_yaml.read(file)
+        at = [air[key]["value"] for key in ("half_length_px", "rms_px")]
+        ends = [air[key]["interval"] for key in ("half_length_px", "rms_px")]
+        error = [
+            np.abs(np.array(end) - value)[:, None] for value, end in zip(at, ends, strict=True)
+        ]
+        axes.errorbar(*at, xerr=error[0], yerr=error[1], fmt=marker, color="black", ms=9, capsize=3,
+                      label=f"footage: {file.parent.name}")  # fmt: skip
+    axes.set(xscale="log", yscale="log", xlabel="half length of the tilt, px of a frame 256 wide",
+             ylabel="rms tilt per axis, px")  # fmt: skip
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8, loc="lower right")
+    save_figure(figure, path)
+
+
+if __name__ == "__main__":
+    atmospheres = draw_atmospheres()
+    print(format_table(atmospheres | draw_test_atmospheres()))
+    plot_prior(atmospheres, [Path(name) for name in sys.argv[1:]], Path("docs/figures/air.png"))

@@ -1,0 +1,174 @@
+"""What all entry points share: the folder of a run, errors, exit codes."""
+
+import functools
+import hashlib
+import logging
+import os
+import signal
+import sys
+import time
+import traceback
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import hydra
+import rich
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from lightning.pytorch.utilities.exceptions import SIGTERMException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from rich.syntax import Syntax
+
+from src.app.renamed_keys import check_keys, check_overrides, explain_refused_key
+from src.records import results, tracking
+
+FAILURE_FILE = "failed.txt"  # in the folder of a sweep's job: why it failed
+MAX_FOLDER_NAME = 200  # characters
+
+
+def one_folder(overrides: str) -> str:
+    """Return `overrides` as the name of one folder, without slashes, of at most MAX_FOLDER_NAME."""
+    name = overrides.replace("/", "-")
+    if len(name) <= MAX_FOLDER_NAME:
+        return name
+    return f"{name[: MAX_FOLDER_NAME - 9]}_{hashlib.sha256(overrides.encode()).hexdigest()[:8]}"
+
+
+OmegaConf.register_new_resolver("one_folder", one_folder, replace=True)
+
+
+class JobFailed(Exception):
+    """A job of the sweep in this folder failed; the others ran."""
+
+
+def run_command(work: Callable[[DictConfig], object], config: str) -> None:
+    """Run `work` on `conf/<config>.yaml` and the overrides of the command line, as `run_main`."""
+
+    @hydra.main(version_base=None, config_path="../conf", config_name=config)
+    @functools.wraps(work)
+    def main(cfg: DictConfig) -> None:
+        run_job(work, cfg)
+
+    run_main(main)
+
+
+def run_main(main: Callable[[], None]) -> None:
+    """Call the Hydra entry point `main`; a wrong value ends in one line on stderr and exit code 2.
+
+    A sweep with failed jobs ends with their names and exit code 1.  `HYDRA_FULL_ERROR=1` makes
+    Hydra hand the errors of the job to us instead of printing them.
+    """
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    start = time.time()
+    try:
+        check_overrides(sys.argv[1:])
+        main()
+    except JobFailed as error:
+        _print_failed_jobs(Path(str(error)), start)
+        sys.exit(1)
+    except (ValueError, HydraException, OmegaConfBaseException, OSError) as error:
+        message = explain_refused_key(str(error)) or str(error)
+        print("error: " + " ".join(message.split()), file=sys.stderr)
+        is_io = isinstance(error, OSError) and not isinstance(error, HydraException)
+        sys.exit(1 if is_io else 2)  # 1: a full disk, a file that may not be read
+    except (KeyboardInterrupt, SIGTERMException) as error:  # Lightning's would end with exit code 0
+        interrupted = isinstance(error, KeyboardInterrupt)
+        sys.exit(128 + (signal.SIGINT if interrupted else signal.SIGTERM))
+    except SystemExit as error:  # Lightning makes an exit code 1 of Ctrl-C
+        interrupted = isinstance(error.__context__, KeyboardInterrupt)
+        sys.exit(128 + signal.SIGINT if interrupted else error.code)
+
+
+def run_job(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:
+    """Run `work` in the folder Hydra made for this job; print the config once; end W&B's run.
+
+    A job of a sweep is skipped where its results stand; its error is stored.
+    """
+    check_keys(cfg)
+    job = HydraConfig.get()
+    cfg.paths.run = job.runtime.output_dir
+    _silence_expected_warnings()
+    if job.mode != RunMode.MULTIRUN:
+        _run_work(work, cfg)
+        return
+    folder, name = Path(cfg.paths.run), " ".join(job.overrides.task)
+    (folder / FAILURE_FILE).unlink(missing_ok=True)
+    try:
+        if results.has_results(folder, resolved_yaml(cfg)):
+            print(f"skipped, its results stand: {name}, in {folder}")
+        else:
+            _run_work(work, cfg)
+    except SIGTERMException:  # ends the sweep, as Ctrl-C does
+        raise KeyboardInterrupt from None
+    except Exception as error:
+        print(f"failed: {name}: {' '.join(str(error).split())}", file=sys.stderr)
+        results.write_text(folder / FAILURE_FILE, f"{name}\n{traceback.format_exc()}")
+        raise JobFailed(job.sweep.dir) from error
+
+
+def _run_work(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:
+    rich.print(Syntax(resolved_yaml(cfg), "yaml", background_color="default"))
+    try:
+        work(cfg)
+    finally:
+        tracking.finish_wandb()
+
+
+def _print_failed_jobs(sweep: Path, start: float) -> None:
+    """Print the jobs of `sweep` that failed after `start` (seconds since the epoch)."""
+    files = sorted(file for file in sweep.rglob(FAILURE_FILE) if file.stat().st_mtime >= start - 1)
+    print(f"error: {len(files)} failed; the others are done.  Failed:", file=sys.stderr)
+    for file in files:
+        print(f"  {file.read_text().splitlines()[0]}: see {file}", file=sys.stderr)
+
+
+def resolved_yaml(cfg: DictConfig) -> str:
+    """Return the whole config as YAML, interpolations filled in."""
+    return OmegaConf.to_yaml(cfg, resolve=True)
+
+
+def run_facts(cfg: DictConfig, start: float) -> dict:
+    """Return what `results.json` says of a run besides its numbers; `start` by perf_counter."""
+    gpu = cfg.trainer.accelerator == "gpu" and torch.cuda.is_available()
+    cpu = f"cpu, {torch.get_num_threads()} threads"
+    return {
+        "task": cfg.task,
+        "experiment": cfg.name,
+        "seed": cfg.seed,
+        "asked": command_line(),
+        "resumed_from": cfg.ckpt if cfg.task == "train" else None,
+        "wall_s": round(time.perf_counter() - start, 1),
+        "device": torch.cuda.get_device_name() if gpu else cpu,
+    }
+
+
+def command_line() -> dict:
+    """Return the config, group choices and overrides of the command line; {} without one."""
+    if not HydraConfig.initialized():
+        return {}
+    job = HydraConfig.get()
+    groups = {group: choice for group, choice in job.runtime.choices.items() if choice}
+    return {
+        "config": job.job.config_name,
+        "choices": {group: choice for group, choice in groups.items() if "hydra/" not in group},
+        "overrides": list(job.overrides.task),
+    }
+
+
+def _silence_expected_warnings() -> None:
+    """Drop what Lightning warns of in every run and is expected here."""
+    for expected in (
+        "The dirpath has changed",  # a resumed run has a folder of its own
+        "You're resuming from a checkpoint that ended",  # our sampler starts at the step reached
+        "Experiment logs directory",  # a job of a sweep that starts again
+        "Checkpoint directory",
+        "Using ModelCheckpoint with manual optimization",  # saved after the step, as wanted
+        ".*LeafSpec",  # inside Lightning 2.6 with torch 2.13
+    ):
+        warnings.filterwarnings("ignore", expected)
+    for chatty in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):
+        logging.getLogger(chatty).setLevel(logging.WARNING)

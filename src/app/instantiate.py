@@ -1,0 +1,128 @@
+"""Objects from config nodes: which classes a config may name, and what is required of them.
+
+`hydra.utils.instantiate` is called nowhere else.
+"""
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any, Protocol, cast
+
+from hydra.errors import InstantiationException
+from hydra.utils import get_object, instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from baselines.published import load_pretrained
+from src.models.network import EventToVideoNetwork, FramePostprocessor, VideoMethod
+from src.models.setnet import SetNet
+from src.sim.scenes.clip import Scene
+from src.sim.sensor.sensor import Sensor
+from src.sim.turbulence.contract import TurbulenceModel
+
+FACTORIES = (load_pretrained, SetNet.preset)  # no classes, allowed all the same
+FUNCTIONS = "src.bench.stress_tests."  # whose functions are allowed too
+PACKAGE_NAME = r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*"
+ALLOWED_PACKAGES = (
+    "src.", "baselines.", "torch.optim.", "lightning.pytorch.trainer.",
+    *(f"lightning.pytorch.{name}." for name in ("callbacks", "loggers", "plugins", "profilers")),
+)  # fmt: skip
+
+
+CONTRACTS: dict[str, tuple[type, ...]] = {  # key of the config: what its object must be one of
+    "scene": (Scene,),
+    "turbulence": (TurbulenceModel,),
+    "sensor": (Sensor,),
+    "model": (EventToVideoNetwork, FramePostprocessor),
+    "baseline": (VideoMethod,),
+}
+
+
+def allowed_packages(cfg: DictConfig) -> tuple[str, ...]:
+    """Return the user's packages whose classes this config may name too.
+
+    Raises ValueError for an `allowed_packages` that is no list of package names.
+    """
+    names = cfg.get("allowed_packages") or []
+    if isinstance(names, str) or not all(re.fullmatch(PACKAGE_NAME, str(name)) for name in names):
+        example = "a list of packages such as [mypackage]"
+        raise ValueError(f"allowed_packages must be {example}, got {names}")
+    return tuple(names)
+
+
+def build_part(cfg: DictConfig, key: str, **kwargs) -> Any:
+    """Build the object of the config node `key`; `kwargs` are added to the node's values.
+
+    Raises ValueError as `instantiate_node` does, and for a class that lacks what `key` needs.
+    """
+    node = OmegaConf.select(cfg, key)
+    return check_contract(key, instantiate_node(node, allowed_packages(cfg), **kwargs))
+
+
+def as_dict(node: Any) -> dict[str, Any]:
+    """Return a mapping of the config as nested dicts, interpolations resolved."""
+    return cast(dict[str, Any], OmegaConf.to_container(node, resolve=True))
+
+
+def check_contract(key: str, built: Any) -> Any:
+    """Return `built`, the object of the config node `key`; raises ValueError, with the members that
+    are missing, unless it is what CONTRACTS asks for.
+    """
+    contracts = CONTRACTS.get(key, (object,))
+    if not isinstance(built, contracts):
+        names = " or ".join(f"{c.__module__}.{c.__name__}" for c in contracts)
+        members = {*vars(contracts[0]), *getattr(contracts[0], "__annotations__", ())}
+        public = sorted(n for n in members - set(vars(Protocol)) if n[0] != "_")
+        missing = ", ".join(name for name in public if not hasattr(built, name))
+        kind = f"{type(built).__module__}.{type(built).__name__}"
+        lacks = f" (it has no {missing})" if missing else ""
+        raise ValueError(f"{key}._target_ must be a {names}, got {kind}{lacks}")
+    return built
+
+
+def instantiate_node(node: Any, extra_packages: Sequence[str] = (), **kwargs) -> Any:
+    """Instantiate a config node.
+
+    Raises ValueError for a `_target_`, however deep, that is no class of ALLOWED_PACKAGES or of
+    the user's `extra_packages`; a ValueError of the object itself is not wrapped by Hydra.
+    """
+    plain = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
+    if not isinstance(plain, dict) or "_target_" not in plain:
+        raise ValueError(f"a part of the config must name its class (_target_), got {plain}")
+    for target in _find_targets(plain):
+        _check_target(target, extra_packages)
+    try:
+        return instantiate(node, _convert_="all", **kwargs)
+    except InstantiationException as error:
+        if isinstance(error.__cause__, ValueError):
+            raise error.__cause__ from None
+        raise ValueError(f"{plain['_target_']} takes no such values: {error.__cause__}") from error
+
+
+def _find_targets(node: Any) -> Iterator[str]:
+    """Yield every `_target_` in nested dicts and lists."""
+    if isinstance(node, dict):
+        yield from (str(value) for key, value in node.items() if key == "_target_")
+    if isinstance(node, dict | list):
+        for value in node.values() if isinstance(node, dict) else node:
+            yield from _find_targets(value)
+
+
+def _check_target(target: str, packages: Sequence[str]) -> None:
+    """Raise ValueError unless `target` is a class that an allowed package defines.
+
+    A name alone says little: `torch.optim.adam.torch.load` begins like an optimiser.
+    """
+    own = tuple(f"{package}." for package in packages)
+    refusal = (
+        f"_target_ must be a class of {', '.join(ALLOWED_PACKAGES + own)}, got {target}; "
+        "classes of a package of your own are allowed by allowed_packages=[<package>]"
+    )
+    if not target.startswith(("src.", "baselines.", "torch.optim.", "lightning.", *own)):
+        raise ValueError(refusal)
+    try:
+        named = get_object(target)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"_target_ must name a class, got {target}") from error
+    module = f"{getattr(named, '__module__', '')}."
+    defined_here = isinstance(named, type) and module.startswith(ALLOWED_PACKAGES + own)
+    if named not in FACTORIES and not defined_here and not module.startswith(FUNCTIONS):
+        raise ValueError(refusal)

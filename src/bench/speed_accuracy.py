@@ -1,0 +1,162 @@
+"""Scores of networks on the same clips, their Pareto front, and the tables of the chart."""
+
+import math
+import statistics
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import astuple, dataclass, fields, replace
+from typing import TypeVar
+
+import torch
+
+from src.bench.candidates import Candidate
+from src.bench.speed import FORMS, SpeedMeasurement
+from src.deploy.forms import in_form
+from src.metrics.table import METRICS
+from src.metrics.video_metrics import VideoMetrics
+from src.records.results import format_csv
+from src.sim.pipeline import Pipeline, simulate
+
+Name = TypeVar("Name", bound=Hashable)
+SEVERITIES = ("weak", "medium", "strong", "mixed")
+
+
+def check_chart_options(sizes, threads, forms, devices, severities, clips: int) -> None:
+    """Raise ValueError, naming the key, for what cannot be measured."""
+    rules = {
+        "sizes must be multiples of 8 from 16 on": (sizes, lambda s: s >= 16 and s % 8 == 0),
+        "threads must be numbers >= 1": (threads, lambda count: count >= 1),
+        f"forms must be of {', '.join(FORMS)}": (forms, FORMS.__contains__),
+        "devices must be of cpu, cuda": (devices, ("cpu", "cuda").__contains__),
+        f"severities must be of {', '.join(SEVERITIES)}": (severities, SEVERITIES.__contains__),
+        "clips must be >= 1": ([clips], lambda count: count >= 1),
+    }
+    for rule, (values, is_allowed) in rules.items():
+        if not len(values) or not all(map(is_allowed, values)):
+            raise ValueError(f"{rule}, got {', '.join(map(str, values)) or 'none'}")
+
+
+@dataclass(frozen=True)
+class ClipScore:
+    """The scores of one network in one form on one clip."""
+
+    network: str
+    form: str
+    severity: str
+    clip: int
+    values: Mapping[str, float]
+
+
+@torch.no_grad()
+def score_candidates(
+    candidates: Sequence[Candidate], pipelines: Mapping[str, Pipeline], clips: int,
+    measure: VideoMetrics, *, warmup: int, forms: Sequence[str],
+) -> list[ClipScore]:  # fmt: skip
+    """Return the scores of all trained networks on the same `clips` clips of every severity; bf16
+    only of those with parameters and without a post-processor.
+    """
+    variants = []
+    for candidate in candidates:
+        if candidate.network is None or not candidate.trained:
+            continue
+        variants.append(("float32", candidate))
+        learned = any(True for _ in candidate.network.parameters())
+        if "bf16" in forms and learned and candidate.postprocessor is None:
+            half = replace(candidate, network=in_form(candidate.network, "bf16"))
+            variants.append(("bf16", half))
+    scores = []
+    for severity, pipeline in pipelines.items():
+        for clip in range(clips):
+            sample = simulate(pipeline, [clip])
+            windows, window_s = sample.voxels[0, :, None], float(sample.window_s[0])
+            truth = sample.target[0, warmup:]
+            for form, candidate in variants:
+                frames, _ = candidate.reconstruct(windows, list(sample.positions or ()), window_s)
+                if (post := candidate.postprocessor) is not None:
+                    sizes = {"window": post.WINDOW, "overlap": post.OVERLAP}
+                    frames = post.restore(frames[None], **sizes)[0]
+                values = measure(frames[warmup:], truth)
+                scores.append(ClipScore(candidate.name, form, severity, clip, values))
+        print(f"scored on {severity} turbulence")
+    return scores
+
+
+def find_pareto_front(points: Mapping[Name, tuple[float, float]]) -> list[Name]:
+    """Return the names, cheapest first, of the (cost, error) that none beats in both."""
+    names, least = [], math.inf
+    for name, (_, error) in sorted(points.items(), key=lambda item: item[1]):
+        if error < least:
+            names.append(name)
+            least = error
+    return names
+
+
+def select_by_one_standard_error(
+    costs: Mapping[str, float], errors: Mapping[str, Sequence[float]]
+) -> str:
+    """Return the cheapest network whose mean error over clips is within one standard error, that of
+    the best network, of the best (the rule of Breiman et al. 1984).
+    """
+    means = {name: statistics.fmean(values) for name, values in errors.items()}
+    best = min(means, key=means.__getitem__)
+    values = errors[best]
+    spread = statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else 0.0
+    within = [name for name in means if means[name] <= means[best] + spread]
+    return min(within, key=costs.__getitem__)
+
+
+def recommend_networks(
+    speeds: Sequence[SpeedMeasurement], scores: Sequence[ClipScore], side: int
+) -> dict[str, str]:
+    """Return {severity: the cheapest network within one standard error of the best}.
+
+    By LPIPS, else by 1 - SSIM; the cost is thread time in ms on frames of `side`, float32.
+    """
+    which = (side, "float32", 1, "cpu")
+    timed = [s for s in speeds if (s.side, s.form, s.threads, s.device) == which]
+    costs = {s.network: s.ms for s in timed if s.ms}
+    errors: dict[str, dict[str, list[float]]] = {}
+    for score in scores:
+        row = errors.setdefault(score.severity, {})
+        if score.form == "float32" and score.network in costs:
+            error = score.values.get("lpips", 1 - score.values["ssim"])
+            row.setdefault(score.network, []).append(error)
+    return {name: select_by_one_standard_error(costs, row) for name, row in errors.items() if row}
+
+
+def format_chart_summary(
+    speeds: Sequence[SpeedMeasurement], scores: Sequence[ClipScore],
+    recommended: Mapping[str, str], side: int,
+) -> str:  # fmt: skip
+    """Return the recommended networks and a table of means over all clips, as Markdown."""
+    metrics = [metric for metric in METRICS if scores and metric.name in scores[0].values]
+    heads = [metric.heading for metric in metrics]
+    lines = ["# Speed against accuracy\n"]
+    lines += [f"- {severity} turbulence: take {name}." for severity, name in recommended.items()]
+    lines += [
+        f"\nMean over all clips; ms a frame of {side}x{side}, computed by one CPU thread.  "
+        "Without scores: no weights, timed only.\n",
+        "| " + " | ".join(["network", "form", "ms", "GMAC", "parameters", *heads]) + " |",
+        "|---|---|" + "---:|" * (3 + len(metrics)),
+    ]
+    for s in speeds:
+        if s.threads == 1 and s.side == side and s.device == "cpu":
+            rows = [r.values for r in scores if (r.network, r.form) == (s.network, s.form)]
+            means = [m.format_value(sum(r[m.name] for r in rows) / len(rows)) if rows else ""
+                     for m in metrics]  # fmt: skip
+            time = s.reason if s.ms is None else f"{s.ms:.2f}"
+            size = [f"{s.gmac:.2f}" if s.gmac is not None else "", str(s.params or 0)]
+            name = s.network + ("" if s.trained else " (no weights)")
+            lines.append("| " + " | ".join([name, s.form, time, *size, *means]) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def format_speeds_csv(rows: Sequence[SpeedMeasurement]) -> str:
+    """Return one line per measurement."""
+    return format_csv([field.name for field in fields(SpeedMeasurement)], map(astuple, rows))
+
+
+def format_scores_csv(rows: Sequence[ClipScore]) -> str:
+    """Return one line per network, form and clip."""
+    heads = ["network", "form", "severity", "clip", *(rows[0].values if rows else [])]
+    lines = [[r.network, r.form, r.severity, r.clip, *r.values.values()] for r in rows]
+    return format_csv(heads, lines)

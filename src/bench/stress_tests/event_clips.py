@@ -1,0 +1,223 @@
+"""Simulated clips as events of every view, to be cut into windows at any rate.
+
+A clip is simulated once under its `ClipConditions`: turbulence, sensor, motion, gain of a view.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, field, replace
+from itertools import accumulate
+from statistics import fmean
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from src.bench.candidates import Candidate
+from src.metrics.image import aligned_psnr
+from src.models.backward_warmup import reverse_voxels
+from src.sim import noise
+from src.sim.pipeline import Pipeline
+from src.sim.sensor import EventSensor
+from src.sim.turbulence.simulated import SimulatedTurbulence
+from src.sim.voxel import voxel_grid
+
+Part = TypeVar("Part")
+BINS = 5
+US_PER_S = 1e6
+GAIN_AR1_COEFFICIENT = 0.9  # of a view's log gain, frame by frame
+
+
+Curve = list[tuple[Any, float]]  # (setting, value), from easy to hard
+
+
+@dataclass(frozen=True)
+class ClipConditions:
+    """How a clip differs from the standard one.
+
+    `d_over_r0`: turbulence strength, 0 for none (None: as drawn).  `moving_share`: the share of the
+    clip after which the scene stands still.  `view_gain_std`: standard deviation of each view's log
+    gain, an AR(1) process over frames.  `turbulence`, `sensor`: arguments of SimulatedTurbulence
+    and EventSensor that are replaced.
+    """
+
+    d_over_r0: float | None = None
+    moving_share: float = 1.0
+    view_gain_std: float = 0.0
+    turbulence: Mapping[str, Any] = field(default_factory=dict)
+    sensor: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def from_settings(cls, settings: Mapping[str, Any]) -> "ClipConditions":
+        """Return the conditions of {"d_over_r0" or "sensor.<argument>" ...: value}."""
+        fields: dict[str, Any] = {"turbulence": {}, "sensor": {}}
+        for key, value in settings.items():
+            group, _, name = key.partition(".")
+            target = fields[group] if name else fields
+            target[name or group] = value
+        return cls(**fields)
+
+
+@dataclass(frozen=True)
+class EventClip:
+    """Events of every view (t in microseconds from the first frame) and the truth at `fps`.
+
+    `turbulent`: the light of the centre view.
+    """
+
+    events: list[np.ndarray]
+    target: Float[Tensor, "frames h w"]
+    turbulent: Float[Tensor, "frames h w"]
+    fps: float
+    positions: tuple[tuple[int, int], ...]
+
+    @property
+    def duration_s(self) -> float:
+        return (len(self.target) - 1) / self.fps
+
+    @property
+    def truth(self) -> Float[Tensor, "windows 1 h w"]:
+        """The true frame at the end of every window."""
+        return self.target[1:, None]
+
+    def windows(
+        self, rate_hz: float | None = None, duration_s: float | None = None
+    ) -> Iterator[Float[Tensor, "1 views bins h w"]]:
+        """Yield the grids of `rate_hz` windows a second (None: `fps`), for at most `duration_s`."""
+        rate = rate_hz or self.fps
+        height, width = self.target.shape[-2:]
+        size = {"bins": BINS, "height": height, "width": width}
+        for k in range(round(min(duration_s or self.duration_s, self.duration_s) * rate)):
+            start_us, end_us = k * US_PER_S / rate, (k + 1) * US_PER_S / rate
+            grids = []
+            for events in self.events:
+                # Ticks belong to the window in which they fall, as the sensor has it.
+                ends = np.searchsorted(events["t"], np.ceil([start_us - 1e-6, end_us - 1e-6]))
+                t, x, y, p = (events[slice(*ends)][name] for name in "txyp")
+                grids.append(voxel_grid(t, x, y, p, t0=start_us, t1=end_us + 1e-3, **size))
+            yield torch.stack(grids)[None]
+
+    def back_and_forth(self) -> tuple[list[Tensor], Float[Tensor, "frames h w"]]:
+        """Return the windows of the clip followed by those of its reverse, and the truth."""
+        forth = list(self.windows())
+        back = [reverse_voxels(window) for window in reversed(forth)]
+        return forth + back, torch.cat([self.target[1:], self.target[:-1].flip(0)])
+
+    def reconstruct(
+        self, network: Candidate, windows: Iterable[Tensor] | None = None, state: Any = None
+    ) -> tuple[Float[Tensor, "windows 1 h w"], Any]:
+        """Return the frames that `network` makes of `windows` (None: those of the clip), each
+        1 / `fps` long, and its state.
+        """
+        windows = self.windows() if windows is None else windows
+        return network.reconstruct(windows, self.positions, 1 / self.fps, state)
+
+
+def simulate_event_clip(pipeline: Pipeline, index: int, conditions: ClipConditions) -> EventClip:
+    """Simulate clip `index` of `pipeline` under `conditions`, the centre of its frame.
+
+    All randomness is that of the standard clip, so that conditions are compared on the same draws.
+    Raises ValueError for a strength where no turbulence is drawn, and for other turbulence where it
+    is not simulated.
+    """
+    variant, draw = copy(pipeline), pipeline.draw(index)
+    if conditions.turbulence or conditions.d_over_r0 is not None:
+        simulated = require_type("turbulence", pipeline.turbulence, SimulatedTurbulence)
+        variant.turbulence = simulated.with_options(**conditions.turbulence)
+    if conditions.moving_share < 1:
+        last = int(conditions.moving_share * (len(draw.clip.frames) - 1))
+        kept = torch.arange(len(draw.clip.frames)).clamp(max=last)
+        draw = replace(draw, clip=replace(draw.clip, frames=draw.clip.frames[kept]))
+    if conditions.d_over_r0 == 0:
+        draw = replace(draw, turbulence=None)
+    elif conditions.d_over_r0 is not None:
+        if draw.turbulence is None:
+            raise ValueError("turbulence must be on for a stress test of its strength, got none")
+        draw = replace(draw, turbulence=draw.turbulence.with_d_over_r0(conditions.d_over_r0))
+    views = variant.render_views([draw])[0]
+    if conditions.view_gain_std:
+        views = _apply_gain(views, conditions.view_gain_std, noise.key(draw.key, "gain"))
+    changes = {"threshold": draw.sensor.threshold} | dict(conditions.sensor)
+    sensor = replace(require_type("sensor", pipeline.sensor, EventSensor), **changes)
+    ids = pipeline.optics.view_ids
+    top, left, height, width = draw.crop
+    return EventClip(
+        [
+            sensor.events(view.contiguous(), draw.clip.fps, clip=index, view=i)
+            for i, view in zip(ids, views, strict=True)
+        ],
+        draw.clip.frames[:, top : top + height, left : left + width],
+        views[pipeline.optics.centre],
+        draw.clip.fps,
+        tuple((row, col) for row, col in pipeline.optics.positions or ()),
+    )
+
+
+def require_type(key: str, part: object, kind: type[Part]) -> Part:
+    """Return `part`; raises ValueError unless it is a `kind`."""
+    if not isinstance(part, kind):
+        got = type(part).__name__
+        raise ValueError(f"{key} must be a {kind.__name__} for this stress test, got {got}")
+    return part
+
+
+def _apply_gain(views: Tensor, std: float, key: int) -> Tensor:
+    """Multiply every view by a log-normal gain that is AR(1) over frames."""
+    count, frames = views.shape[:2]
+    drawn = noise.normal(key, torch.arange(count * frames)).view(count, frames)
+    innovation = (1 - GAIN_AR1_COEFFICIENT**2) ** 0.5
+    gains = accumulate(
+        drawn.unbind(1), lambda gain, new: GAIN_AR1_COEFFICIENT * gain + innovation * new
+    )
+    gain = (std * torch.stack(list(gains), 1)).exp()
+    return (views * gain[:, :, None, None]).clamp(0, 1)
+
+
+class StressBench:
+    """Clips `indices` of `pipeline`; frames of the first `warmup` windows are not scored."""
+
+    def __init__(self, pipeline: Pipeline, indices: Sequence[int], warmup: int):
+        self.pipeline, self.indices, self.warmup = pipeline, indices, warmup
+        self._clips: dict[str, list[EventClip]] = {}
+        self._psnr: dict[tuple[str, str], float] = {}
+
+    def clips(self, conditions: ClipConditions = ClipConditions()) -> list[EventClip]:
+        """Return the clips under `conditions`; each is simulated once."""
+        name = repr(conditions)
+        if name not in self._clips:
+            clips = [simulate_event_clip(self.pipeline, n, conditions) for n in self.indices]
+            self._clips[name] = clips
+        return self._clips[name]
+
+    def psnr(
+        self, network: Candidate, conditions: ClipConditions = ClipConditions(),
+        change: Callable[[Tensor], Tensor] | None = None,
+    ) -> float:  # fmt: skip
+        """Return the aligned PSNR in dB at the clips' own rate, mean over clips.
+
+        `change` is applied to every window (1, views, bins, h, w).  Without it the result is stored
+        under the name of the network.
+        """
+        key = network.name, repr(conditions)
+        if change is None and key in self._psnr:
+            return self._psnr[key]
+        scores = []
+        for clip in self.clips(conditions):
+            windows = map(change, clip.windows()) if change else clip.windows()
+            scores.append(self.score(clip.reconstruct(network, windows)[0], clip))
+        if change is None:
+            self._psnr[key] = fmean(scores)
+        return fmean(scores)
+
+    def psnr_losses(
+        self, network: Candidate, changes: Mapping[Any, Callable[[Tensor], Tensor]]
+    ) -> Curve:
+        """Return (setting, dB lost) for each change of the windows of the standard clips."""
+        base = self.psnr(network)
+        return [(name, base - self.psnr(network, change=c)) for name, c in changes.items()]
+
+    def score(self, frames: Float[Tensor, "windows 1 h w"], clip: EventClip) -> float:
+        """Return the mean aligned PSNR of the frames after the warm-up."""
+        return float(aligned_psnr(frames[self.warmup :], clip.truth[self.warmup :]).mean())

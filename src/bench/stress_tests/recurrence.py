@@ -1,0 +1,216 @@
+"""Stress tests of the recurrent state: retention, drift, start-up, recovery, stability, bf16."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import chain, cycle, islice
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from src.bench.candidates import Candidate
+from src.bench.stress_tests.event_clips import ClipConditions, StressBench
+from src.bench.stress_tests.stress_results import StressResult, mean_result
+from src.deploy.forms import in_form
+from src.metrics.image import aligned_psnr
+from src.metrics.temporal import temporal_jitter_px
+from src.sim import noise
+
+SCORED_EVERY = 4  # windows of a long run
+
+
+def measure_contrast_retention(
+    network: Candidate, bench: StressBench, *, limit: float, windows: Sequence[int]
+) -> StressResult:
+    """Return the contrast kept, in %, after the last number of `windows` without an event."""
+    per_clip = []
+    for clip in bench.clips():
+        given = list(clip.windows())
+        frames, state = clip.reconstruct(network, given)
+        before, kept = float(frames[-1].std()), []
+        for done, count in zip((0, *windows), windows, strict=False):
+            empty = [torch.zeros_like(given[0])] * (count - done)
+            frames, state = clip.reconstruct(network, empty, state)
+            kept.append(100 * float(frames[-1].std()) / max(before, 1e-9))
+        per_clip.append(kept)
+    kept = torch.tensor(per_clip).mean(0).tolist()
+    curve = list(zip(windows, kept, strict=True))
+    return StressResult(kept[-1], "%", limit, curve, "empty windows", True)
+
+
+def measure_long_sequence_drift(
+    network: Candidate, bench: StressBench, *, limit: float, windows: int
+) -> StressResult:
+    """Return the aligned PSNR in dB lost between the second and the last loop of a clip played back
+    and forth; the curve has one entry a tenth of the run.
+    """
+    clip = bench.clips()[0]
+    loop, truth = clip.back_and_forth()
+    length = len(loop)
+    if windows < 3 * length:
+        key = "stress_tests.long_sequence_drift.test.windows"
+        raise ValueError(f"{key} must be >= {3 * length}, got {windows}")
+    scores, state = torch.full((windows,), torch.nan), None
+    for k, window in enumerate(islice(cycle(loop), windows)):
+        frames, state = clip.reconstruct(network, [window], state)
+        if k % SCORED_EVERY == 0:
+            scores[k] = aligned_psnr(frames, truth[k % length][None, None])[0]
+    per_loop = scores[: windows // length * length].view(-1, length).nanmean(1)
+    losses = (per_loop[1] - per_loop[1:]).tolist()
+    curve = [(length * (k + 2), loss) for k, loss in enumerate(losses)]
+    thinned = [*curve[: -1 : max(1, len(curve) // 10)], curve[-1]]
+    return StressResult(losses[-1], "dB", limit, thinned, "windows")
+
+
+def measure_convergence_time(
+    network: Candidate, bench: StressBench, *, limit: float, within_db: float = 1.0
+) -> StressResult:
+    """Return the windows until the frame is within `within_db` of the clip's second half, for good;
+    a clip that never gets there counts its length.
+    """
+    scores = [aligned_psnr(clip.reconstruct(network)[0], clip.truth) for clip in bench.clips()]
+    return mean_result([measure_settling_time(s, within_db) for s in scores], "windows", limit)
+
+
+def measure_flicker_recovery(
+    network: Candidate, bench: StressBench, *, limit: float, length: int = 10,
+    events: float = 3.0, within_db: float = 1.0,
+) -> StressResult:  # fmt: skip
+    """Return the windows until the frame is back within `within_db` after `length` windows in which
+    every pixel makes `events` ON events, in the next as many OFF events.
+    """
+    times = []
+    for clip in bench.clips():
+        windows, truth = list(clip.windows()), clip.truth
+        half = len(windows) // 2
+        flash = torch.full_like(windows[0], events / windows[0].shape[2])
+        flashes = [(-1) ** k * flash for k in range(length)]
+        plain, _ = clip.reconstruct(network, windows)
+        disturbed, _ = clip.reconstruct(network, chain(windows[:half], flashes, windows[half:]))
+        after = aligned_psnr(disturbed[half + length :], truth[half:])
+        losses = aligned_psnr(plain[half:], truth[half:]) - after
+        times.append(find_last_exceedance(losses, within_db))
+    return mean_result(times, "windows", limit)
+
+
+def measure_static_scene_jitter(
+    network: Candidate, bench: StressBench, *, limit: float, moving_share: float = 0.0
+) -> StressResult:
+    """Return the temporal jitter of a static scene's video, in % of what turbulence does to one
+    view.
+
+    `moving_share`: the share of the clip in which the scene moves before it stops; at 0 all events
+    come from turbulence.  At 100 % the light of one view would be as steady.
+    """
+    shares = []
+    for clip in bench.clips(ClipConditions(moving_share=moving_share)):
+        truth = clip.truth
+        start = int(moving_share * len(truth)) + bench.warmup
+        if start > len(truth) - 2:
+            raise ValueError(f"data.test_windows must be > {start + 1}, got {len(truth)}")
+        one_view, ours = (
+            temporal_jitter_px(video, truth)[start:].mean()
+            for video in (clip.turbulent[1:, None].clone(), clip.reconstruct(network)[0])
+        )
+        shares.append(100 * float(ours / one_view.clamp(min=1e-9)))
+    return mean_result(shares, "%", limit)
+
+
+def measure_perturbation_growth(
+    network: Candidate, bench: StressBench, *, limit: float, size: float = 1e-3,
+    skip: int = 3,
+) -> StressResult:  # fmt: skip
+    """Return the growth exponent, per window, of a perturbation of rms `size` in one window.
+
+    Fitted to the logarithm of the rms difference of the frames (a Lyapunov exponent); above 0 the
+    perturbation grows.  The first `skip` windows after it do not count.
+    """
+    exponents = []
+    for clip in bench.clips():
+        windows = list(clip.windows())
+        start = len(windows) // 3
+        drawn = _draw_normal(windows[0], "growth")
+        # Where there were events anyway, so that the same pixels are active.
+        perturbed = windows[start] + size * drawn * (windows[start] != 0)
+        plain, _ = clip.reconstruct(network, windows)
+        changed = [*windows[:start], perturbed, *windows[start + 1 :]]
+        other, _ = clip.reconstruct(network, changed)
+        difference = (plain - other)[start + skip :].double().square().mean((1, 2, 3)).sqrt()
+        logs = difference.clamp(min=1e-12).log()
+        exponents.append(float(np.polyfit(np.arange(len(logs)), logs.numpy(), 1)[0]))
+    return mean_result(exponents, "per window", limit)
+
+
+def measure_adversarial_gain(
+    network: Candidate, bench: StressBench, *, limit: float, windows: int = 12,
+    steps: int = 8, size: float = 0.02,
+) -> StressResult:  # fmt: skip
+    """Return the largest gain from input to output: rms change of the last frame over rms of a
+    perturbation.
+
+    The perturbation, of rms `size`, is added to the first of `windows` windows and found by `steps`
+    of gradient ascent (Tanay et al., arXiv 2010.05099).
+    """
+    network.require_parameters("its response is linear")
+    clip = bench.clips()[0]
+    given = list(islice(clip.windows(), bench.warmup + windows))
+    _, start_state = clip.reconstruct(network, given[: bench.warmup])
+    selected = [network.select_views(window, clip.positions) for window in given[bench.warmup :]]
+
+    def last_frame(extra: Tensor) -> Tensor:
+        state = start_state
+        for k, (window, positions) in enumerate(selected):
+            voxels, options = window + extra if k == 0 else window, {"positions": positions}
+            frame, state = network.loaded(voxels, state, window_s=1 / clip.fps, **options)
+        return frame
+
+    plain, extra = last_frame(torch.zeros(())), _draw_normal(selected[0][0], "worst")
+    curve = []
+    for step in range(steps):
+        extra = (extra * size / extra.square().mean().sqrt()).detach().requires_grad_()
+        change = (last_frame(extra) - plain).square().mean()
+        (gradient,) = torch.autograd.grad(change, extra)
+        curve.append((step, math.sqrt(float(change.detach())) / size))
+        extra = gradient + 1e-12
+    return StressResult(max(gain for _, gain in curve), "x", limit, curve, "steps of ascent")
+
+
+def measure_bf16_error(
+    network: Candidate, bench: StressBench, *, limit: float, windows: int
+) -> StressResult:
+    """Return the mean difference of aligned PSNR, in dB, between bf16 and float32 in the last
+    quarter of a long run.
+    """
+    network.require_parameters("there is nothing to round")
+    clip, quarter = bench.clips()[0], windows // 4
+    loop, truth = clip.back_and_forth()
+    half = replace(network, network=in_form(network.loaded, "bf16"))
+    scores = []
+    for form in (network, half):
+        frames, _ = clip.reconstruct(form, islice(cycle(loop), quarter * 4))
+        at = torch.arange(len(frames)) % len(truth)
+        scores.append(aligned_psnr(frames, truth[at, None]))
+    gaps = (scores[0] - scores[1]).view(4, -1).mean(1).abs().tolist()
+    curve = [(quarter * (k + 1), gap) for k, gap in enumerate(gaps)]
+    return StressResult(gaps[-1], "dB", limit, curve, "windows")
+
+
+def measure_settling_time(scores: Float[Tensor, " windows"], within_db: float) -> float:
+    """Return the first window from which on the scores, averaged over five windows, stay within
+    `within_db` of the mean of their second half.
+    """
+    plateau = scores[len(scores) // 2 :].mean()
+    smooth = scores.unfold(0, 5, 1).mean(1) if len(scores) >= 5 else scores
+    return find_last_exceedance(plateau - smooth[: len(scores) // 2], within_db)
+
+
+def find_last_exceedance(losses: Float[Tensor, " windows"], limit: float) -> float:
+    """Return how many windows pass until `losses` is above `limit` for the last time."""
+    beyond = (losses > limit).nonzero()
+    return float(beyond[-1] + 1) if len(beyond) else 0.0
+
+
+def _draw_normal(like: Tensor, name: str) -> Tensor:
+    return noise.normal(noise.key("probes", name), torch.arange(like.numel())).view_as(like)

@@ -1,0 +1,146 @@
+"""What a stress test returns: a value with its limit; results of all tests, table and summary."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from statistics import fmean
+from typing import Any
+
+from src.bench.candidates import Candidate
+from src.bench.stress_tests.event_clips import Curve, StressBench
+from src.records.results import format_csv
+
+
+@dataclass(frozen=True)
+class StressResult:
+    """A `value` in `unit` that must not exceed `limit` (`higher_is_better`: not fall below it).
+
+    `curve`: how it went with the `varied` setting.
+    """
+
+    value: float
+    unit: str
+    limit: float
+    curve: Curve = field(default_factory=list)
+    varied: str = ""
+    higher_is_better: bool = False
+
+    def violates_limit(self, value: float) -> bool:
+        """Return whether `value` is beyond the limit; NaN is."""
+        return not (value >= self.limit if self.higher_is_better else value <= self.limit)
+
+    @property
+    def failed(self) -> bool:
+        return self.violates_limit(self.value)
+
+    @property
+    def first_failure(self) -> Any:
+        """The first setting of the curve whose value is beyond the limit; None: there is none."""
+        return next((name for name, value in self.curve if self.violates_limit(value)), None)
+
+
+StressTest = Callable[[Candidate, StressBench], StressResult]
+
+
+def worst_loss(curve: Curve, *, limit: float, varied: str) -> StressResult:
+    """Return the result whose value is the largest of the curve, in dB."""
+    return StressResult(max(value for _, value in curve), "dB", limit, curve, varied)
+
+
+def mean_result(values: Sequence[float], unit: str, limit: float) -> StressResult:
+    """Return the result whose value is the mean over clips."""
+    return StressResult(fmean(values), unit, limit)
+
+
+Outcome = StressResult | str  # or why there is none
+Outcomes = dict[str, dict[str, Outcome]]  # test -> network -> outcome
+CSV_COLUMNS = (
+    "network", "test", "title", "varied", "setting", "value", "unit", "limit", "failed", "reason",
+)  # fmt: skip
+
+
+def run_stress_tests(
+    candidate: Candidate, tests: Mapping[str, StressTest], bench: StressBench
+) -> tuple[dict[str, Outcome], float | None]:
+    """Return the outcome of every test, the reason where one cannot run, and the aligned PSNR in dB
+    on the standard clips (None: the network does not run).
+    """
+    if candidate.network is None or not candidate.trained:
+        reason = candidate.missing
+        reason = reason if candidate.network is None else f"it has no weights: {reason}"
+        return dict.fromkeys(tests, reason), None
+    outcomes: dict[str, Outcome] = {}
+    for name, test in tests.items():
+        try:
+            if candidate.postprocessor is not None:
+                raise ValueError("a post-processor needs the whole video")
+            outcomes[name] = test(candidate, bench)
+        except ValueError as error:
+            outcomes[name] = str(error)
+    return outcomes, bench.psnr(candidate)
+
+
+def format_outcomes_csv(outcomes: Outcomes, titles: Mapping[str, str]) -> str:
+    """Return CSV: one line for the value of each outcome and for each point of its curve."""
+    lines: list[list[object]] = []
+    for test, row in outcomes.items():
+        for network, outcome in row.items():
+            head: list[object] = [network, test, titles[test]]
+            if isinstance(outcome, str):
+                lines.append([*head, "", "", "", "", "", "", outcome])
+                continue
+            points = [("", "", outcome.value)]
+            points += [(outcome.varied, setting, value) for setting, value in outcome.curve]
+            for varied, setting, value in points:
+                failed = outcome.violates_limit(value)
+                tail = [f"{value:.6g}", outcome.unit, outcome.limit, failed, ""]
+                lines.append([*head, varied, setting, *tail])
+    return format_csv(CSV_COLUMNS, lines)
+
+
+def format_summary(
+    outcomes: Outcomes, titles: Mapping[str, str], standard_psnr: Mapping[str, float]
+) -> str:
+    """Return Markdown: for each network the tests it fails and passes."""
+    parts = ["# Stress tests\n"]
+    for network in next(iter(outcomes.values()), {}):
+        own = {titles[test]: row[network] for test, row in outcomes.items()}
+        psnr = standard_psnr.get(network)
+        standard = "" if psnr is None else f"On the standard clips: aligned PSNR {psnr:.2f} dB. "
+        parts.append(f"## {network}\n\n{standard}{_summarize_network(own)}\n")
+    return "\n".join(parts)
+
+
+def _summarize_network(outcomes: Mapping[str, Outcome]) -> str:
+    failed, passed, reasons = [], [], dict[str, list[str]]()
+    for title, outcome in outcomes.items():
+        if isinstance(outcome, str):
+            reasons.setdefault(outcome, []).append(title)
+        elif outcome.failed:
+            failed.append(f"- {title}: {_describe_failure(outcome)}")
+        else:
+            passed.append(f"{title} ({format_value(outcome.value)} {outcome.unit})")
+    ran = len(failed) + len(passed)
+    lines = [f"Fails {len(failed)} of the {ran} tests that ran.", *failed] if ran else []
+    lines += ["", "Passes: " + "; ".join(passed) + "."] if passed else []
+    lines += [f"\nNot run, because {why}: {'; '.join(t)}." for why, t in reasons.items()]
+    return "\n".join(lines)
+
+
+def _describe_failure(result: StressResult) -> str:
+    side = "at least" if result.higher_is_better else "at most"
+    text = f"{format_value(result.value)} {result.unit}, limit {side} {result.limit:g}"
+    where = result.first_failure
+    return text if where is None else f"{text}; fails from {result.varied} = {where} on"
+
+
+def format_value(value: float) -> str:
+    """Return `value` to two digits or so."""
+    if not math.isfinite(value):
+        return "∞" if value > 0 else "–"
+    if value == 0:
+        return "0"
+    if abs(value) < 0.0095:
+        return f"{value:.0e}".replace("e-0", "e-")
+    digits = 0 if abs(value) >= 20 else 1 if abs(value) >= 1 else 2
+    return f"{value:.{digits}f}"

@@ -1,0 +1,106 @@
+"""What a network costs: multiply-accumulates and time of one frame, state carried."""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode
+
+from src.models.network import EventToVideoNetwork
+from src.sim.optics import Position
+
+MAX_FRAMES = 200  # timed at most
+
+
+@torch.no_grad()
+def macs_per_frame(
+    network: EventToVideoNetwork,
+    height: int,
+    width: int,
+    *,
+    views: int = 1,
+    bins: int = 5,
+    positions: Sequence[Position] | None = None,
+) -> int:
+    """Return the multiply-accumulates of one window, batch 1.
+
+    `positions`: (row, col) of each view, None: `optics.layout`.  Counted are convolutions and
+    matrix products (torch's FLOP counter, two FLOPs a MAC), not elementwise work and interpolation.
+    """
+    device = next((parameter.device for parameter in network.parameters()), torch.device("cpu"))
+    voxels = torch.zeros(1, views, bins, height, width, device=device)
+    _, state = network(voxels, None, positions=positions)
+    return count_macs(lambda: network(voxels, state, positions=positions))
+
+
+def count_macs(work: Callable[[], object]) -> int:
+    """Return the multiply-accumulates of convolutions and matrix products in a call of `work`."""
+    with FlopCounterMode(display=False) as counter:
+        work()
+    return counter.get_total_flops() // 2
+
+
+class Timing(NamedTuple):
+    """Milliseconds of a frame, median and least of `frames`; `clock`: thread or wall."""
+
+    median_ms: float
+    least_ms: float
+    frames: int
+    clock: str
+
+
+def timing_clock(threads: int, device: torch.device | str = "cpu") -> Callable[[], float]:
+    """Return the clock, in seconds, of every timing of a network: on one thread of a CPU what that
+    thread computes, which other jobs on the machine hardly disturb, else wall time.
+    """
+    alone = threads == 1 and torch.device(device).type == "cpu"
+    return time.thread_time if alone else time.perf_counter
+
+
+@contextlib.contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Let torch compute on `count` threads for as long as this lasts."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@torch.no_grad()
+def time_frame(
+    network: EventToVideoNetwork,
+    voxels: Tensor,
+    *,
+    positions: Sequence[Position] | None = None,
+    threads: int = 1,
+    seconds: float = 1.0,
+    min_frames: int = 3,
+) -> Timing:
+    """Return the time of one window (n, views, bins, h, w) on `threads` threads.
+
+    `positions`: (row, col) of each view, None: `optics.layout`.  As many frames as fit into
+    `seconds`, at least `min_frames`, after two that warm up.
+    """
+    now, times = timing_clock(threads, voxels.device), list[float]()
+
+    def advance(state: Any) -> Any:
+        _, state = network(voxels, state, positions=positions)
+        if voxels.device.type == "cuda":
+            torch.cuda.synchronize(voxels.device)
+        return state
+
+    with torch_threads(threads):
+        state = advance(advance(None))
+        until = time.perf_counter() + seconds
+        while len(times) < min_frames or (time.perf_counter() < until and len(times) < MAX_FRAMES):
+            start = now()
+            state = advance(state)
+            times.append(1e3 * (now() - start))
+    times.sort()
+    clock = "thread" if now is time.thread_time else "wall"
+    return Timing(times[len(times) // 2], times[0], len(times), clock)

@@ -1,0 +1,130 @@
+"""A network as an ONNX file with its state as explicit inputs and outputs, and back to run it.
+
+A file is for one number of views, one size of picture and one clip at a time; the length of a
+window is an input.  Needs the extra `onnx`: pip install onnx onnxruntime onnxscript.
+"""
+
+import contextlib
+import io
+import logging
+import warnings
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from src.deploy.explicit_state import ExplicitStateNetwork
+from src.models.folding import inference_copy
+from src.models.network import WINDOW_S, EventToVideoNetwork
+from src.sim.optics import Position
+
+PACKAGES = ("onnx", "onnxscript", "onnxruntime")
+TOLERANCE = 1e-4  # largest difference from PyTorch, in grey levels, that an export may show
+CHECKED_WINDOWS = 4  # windows over which it is compared
+
+
+def export_onnx(
+    network: EventToVideoNetwork,
+    path: Path,
+    *,
+    views: int,
+    height: int,
+    width: int,
+    bins: int = 5,
+    positions: Sequence[Position] | None = None,
+) -> "OnnxNetwork":
+    """Write `network` to `path`, spectral norm folded; return what runs it, checked against it.
+
+    Raises ValueError without the packages, for a network that ONNX cannot express, and where the
+    two differ by more than TOLERANCE over a few windows of noise.
+    """
+    require_onnx()
+    folded = inference_copy(network).cpu()
+    voxels = torch.randn(1, views, bins, height, width, generator=torch.Generator().manual_seed(0))
+    explicit = ExplicitStateNetwork(folded, positions)
+    with torch.no_grad():
+        started = explicit.initial_state(voxels)
+        _write(explicit, (voxels, torch.full((1,), WINDOW_S), *started), path)
+    exported = OnnxNetwork(path)
+    gap = _largest_difference(exported, folded, voxels, positions)
+    if not gap <= TOLERANCE:
+        raise ValueError(f"export must give PyTorch's frames within {TOLERANCE}, got {gap:.2g}")
+    return exported
+
+
+def require_onnx() -> None:
+    """Raise ValueError, saying how to get them, unless the packages are there."""
+    missing = [name for name in PACKAGES if find_spec(name) is None]
+    if missing:
+        raise ValueError(f"ONNX needs pip install {' '.join(missing)}")
+
+
+class OnnxNetwork(EventToVideoNetwork):
+    """The network of a file written by `export`, on ONNX Runtime with `threads` threads."""
+
+    uses_window_length = True
+
+    def __init__(self, path: Path, threads: int = 1):
+        require_onnx()
+        import onnxruntime
+
+        super().__init__()
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+        providers = ["CPUExecutionProvider"]
+        self.session = onnxruntime.InferenceSession(str(path), options, providers)
+        self.inputs = {node.name: node.shape for node in self.session.get_inputs()}
+
+    def forward(
+        self,
+        voxels: Float[Tensor, "1 views bins h w"],
+        state: list | None = None,
+        *,
+        window_s: float | Tensor = WINDOW_S,
+        positions: Sequence[Position] | None = None,
+    ) -> tuple[Float[Tensor, "1 1 h w"], list]:
+        """Return the frame and the state, arrays; `positions` are those of the export."""
+        names = [name for name in self.inputs if name.startswith("state")]
+        if state is None:
+            state = [torch.zeros(self.inputs[name]).numpy() for name in names]
+        fed = {"voxels": voxels.numpy(), **dict(zip(names, state, strict=True))}
+        if "window_s" in self.inputs:
+            fed["window_s"] = torch.as_tensor(window_s, dtype=torch.float32).reshape(1).numpy()
+        frame, *after = self.session.run(None, fed)
+        return torch.from_numpy(frame), after
+
+
+def _write(explicit: ExplicitStateNetwork, example: tuple, path: Path) -> None:
+    states = range(len(example) - 2)
+    names = ["voxels", "window_s", *(f"state{k}" for k in states)]
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")  # of the exporter's own parts about each other
+            torch.onnx.export(
+                explicit, example, str(path), dynamo=True, input_names=names, verbose=False,
+                output_names=["frame", *(f"after{k}" for k in states)], external_data=False,
+            )  # fmt: skip
+    except torch.onnx.OnnxExporterError as error:
+        kind = type(explicit.network).__name__
+        raise ValueError(f"{kind} has a part that ONNX cannot express") from error
+    finally:
+        logger.setLevel(level)
+
+
+@torch.no_grad()
+def _largest_difference(
+    exported: OnnxNetwork, folded: EventToVideoNetwork, voxels: Tensor, positions
+) -> float:
+    ours, theirs, gap = None, None, 0.0
+    for k in range(CHECKED_WINDOWS):
+        window = voxels.roll(3 * k, -1)
+        frame, ours = folded(window, ours, positions=positions)
+        other, theirs = exported(window, theirs)
+        gap = max(gap, float((frame - other).abs().max()))
+    return gap

@@ -1,0 +1,182 @@
+"""A network on OpenVINO: compiled for one size of picture, its state handed on without a copy.
+
+Weights and maps are bf16 where the CPU is faster in it and float32 elsewhere (of a wide SetNet one
+convolution is in bytes where the CPU has instructions for them); what a network keeps in float32
+(`SetNet`: its sums and hidden maps) stays so.  Needs the extra `openvino`.
+"""
+
+import sys
+import warnings
+from collections.abc import Sequence
+from functools import cache
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from src.deploy.cpu_features import has_fast_bf16
+from src.deploy.explicit_state import ExplicitStateNetwork
+from src.deploy.int8 import quantise_decoder
+from src.models.folding import inference_copy
+from src.models.network import WINDOW_S, EventToVideoNetwork
+from src.models.setnet import SetNet
+from src.sim.optics import Position
+
+
+def is_installed() -> bool:
+    """Return whether the package is there."""
+    return find_spec("openvino") is not None
+
+
+def best_dtype() -> torch.dtype:
+    """Return what to compute in here: bfloat16, or float32 on a CPU that is no faster in it.
+
+    Raises ValueError, saying how to get it, without the package.
+    """
+    if not is_installed():
+        raise ValueError("form=openvino needs pip install openvino")
+    able = _core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+    return torch.bfloat16 if "BF16" in able and has_fast_bf16() else torch.float32
+
+
+class CompiledModule:
+    """`module`, compiled for inputs of the sizes and types of `example`, on `threads` threads.
+
+    The state, OpenVINO's tensors, is the last inputs and outputs; it is new each time, so that one
+    that was given back stays as it is.  Raises ValueError for what OpenVINO cannot express.
+    """
+
+    def __init__(self, module: nn.Module, example: Sequence[Tensor], threads: int):
+        model = _convert(module, tuple(example))
+        options = {
+            # What computes in bf16 says so itself: nothing else is rounded.
+            "INFERENCE_PRECISION_HINT": "f32",
+            "INFERENCE_NUM_THREADS": threads,
+            "PERFORMANCE_HINT": "LATENCY",
+            "ENABLE_CPU_PINNING": False,
+        }
+        compiled = _core().compile_model(model, "CPU", options)
+        self.request = compiled.create_infer_request()
+        self.module = module  # whose weights it may read where they lie
+        self.outputs = [(part.element_type, list(part.shape)) for part in compiled.outputs]
+        self.starts = [(part.element_type, list(part.shape)) for part in compiled.inputs]
+
+    def zeros(self, first: int) -> list:
+        """Return zeros for the inputs from the `first` on: the state that comes last."""
+        made = [_package().Tensor(kind, shape) for kind, shape in self.starts[first:]]
+        for part in made:
+            np.asarray(part.data).fill(0)
+        return made
+
+    def __call__(self, inputs: Sequence[np.ndarray], state: Sequence) -> list:
+        """Return the first output, valid until the next call, and the state; nothing is copied."""
+        arrays = [np.ascontiguousarray(part, np.float32) for part in inputs]
+        shared = [_package().Tensor(part, shared_memory=True) for part in arrays]
+        for k, part in enumerate([*shared, *state]):
+            self.request.set_input_tensor(k, part)
+        outputs = [_package().Tensor(kind, shape) for kind, shape in self.outputs]
+        for k, part in enumerate(outputs):
+            self.request.set_output_tensor(k, part)
+        self.request.infer(share_outputs=True)  # else it copies them all once more
+        self.output, *state = outputs  # an array does not keep its tensor alive
+        return [self.output.data, *state]
+
+
+class OpenVinoNetwork(EventToVideoNetwork):
+    """`network`, compiled at its first window of each size with as many threads as torch has then.
+
+    One clip at a time.
+    """
+
+    def __init__(self, network: EventToVideoNetwork):
+        super().__init__()
+        dtype = best_dtype()
+        # Weights are read in the order in which they lie.
+        self.inner = inference_copy(network).to(dtype)
+        self.inner.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+        self.views, self.uses_window_length = network.views, network.uses_window_length
+        # SetNet adds its events up in float32 and rounds where it convolves.
+        self.input_dtype = torch.float32 if isinstance(network, SetNet) else dtype
+        quantise_decoder(self.inner)
+        self.compiled: dict[tuple, CompiledModule] = {}
+
+    @torch.no_grad()
+    def forward(
+        self,
+        voxels: Float[Tensor, "1 views bins h w"],
+        state: Any = None,
+        *,
+        window_s: float | Tensor = WINDOW_S,
+        positions: Sequence[Position] | None = None,
+    ) -> tuple[Float[Tensor, "1 1 h w"], Any]:
+        """Return the frame, float32, and the state: the size it is for and OpenVINO's tensors.
+
+        Raises ValueError for more than one clip, another device than the CPU, or the state of
+        another size.
+        """
+        if voxels.device.type != "cpu" or len(voxels) != 1:
+            raise ValueError(
+                f"form=openvino takes one clip on device=cpu, got {len(voxels)} on {voxels.device}"
+            )
+        size = tuple(voxels.shape)
+        if state is not None and state[0] != size:
+            raise ValueError(f"state must be of voxels {size} for form=openvino, got {state[0]}")
+        compiled = self._compiled(voxels, positions)
+        given = voxels.numpy(), np.float32(window_s).reshape(1)
+        frame, *own = compiled(given, compiled.zeros(len(given)) if state is None else state[1])
+        return torch.from_numpy(frame.copy()), (size, own)
+
+    def _compiled(self, voxels: Tensor, positions: Sequence[Position] | None) -> CompiledModule:
+        places = None if positions is None else tuple((row, column) for row, column in positions)
+        which = (tuple(voxels.shape), places)
+        if which not in self.compiled:
+            explicit = ExplicitStateNetwork(self.inner, places, self.input_dtype)
+            state = explicit.initial_state(voxels)
+            example = [voxels.float(), torch.full((1,), WINDOW_S), *state]
+            self.compiled[which] = CompiledModule(explicit, example, torch.get_num_threads())
+        return self.compiled[which]
+
+
+@cache
+def _package() -> Any:
+    """Return the package, kept from reporting over the network that it was imported: it starts a
+    process for that, which is also in the way of what is timed.
+    """
+    # It goes on without it.
+    sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
+    import openvino
+
+    return openvino
+
+
+@cache
+def _core() -> Any:
+    return _package().Core()
+
+
+def _convert(module: nn.Module, example: tuple[Tensor, ...]) -> Any:
+    """Return OpenVINO's model of `module`, what does not depend on its inputs computed.
+
+    A model of `openvino.convert_model` takes 15 to 30 % longer.
+    """
+    from openvino.frontend import FrontEndManager
+    from openvino.frontend.pytorch.ts_decoder import TorchScriptPythonDecoder
+    from openvino.passes import ConstantFolding, Manager
+
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")  # of tracing, about itself
+        try:
+            frontend = FrontEndManager().load_by_framework("pytorch")
+            decoder = TorchScriptPythonDecoder(module.eval(), example_input=example)
+            model = frontend.convert(frontend.load(decoder))
+        except Exception as error:  # of tracing and of OpenVINO
+            kind = type(getattr(module, "network", module)).__name__
+            raise ValueError(f"{kind} has a part that OpenVINO cannot express") from error
+    model.reshape({k: list(part.shape) for k, part in enumerate(example)})
+    passes = Manager()  # bounds of bytes are then constants, without which none are computed in
+    passes.register_pass(ConstantFolding())
+    passes.run_passes(model)
+    return model

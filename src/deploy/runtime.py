@@ -1,0 +1,188 @@
+"""Live: from the events of a window to a frame, numpy in and out, the state kept inside.
+
+The dense grid is never made: an event adds its patch of the first layer's kernel to that layer's
+map (`first_layer.py`), and what comes behind runs on OpenVINO or PyTorch.  Equal to the network's
+`forward` on `voxel_grid`s up to the order of sums in float32 (1e-5 in a frame, `form="float32"`)
+or to bf16's rounding (0.02).
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import nn
+
+from src.deploy import openvino_network
+from src.deploy.backends import EagerBackend, StatefulRunner
+from src.deploy.cpu_features import has_fast_bf16
+from src.deploy.engines import events_numba as kernels
+from src.deploy.first_layer import DTYPES, EventFirstLayer, SetNetEventFirstLayer
+from src.deploy.int8 import quantise_decoder
+from src.deploy.remaining_layers import E2VIDRemainder, SetNetRemainder
+from src.models.e2vid import E2VID
+from src.models.folding import inference_copy
+from src.models.setnet import SetNet
+from src.sim.optics import Position
+
+FORMS = ("float32", "bf16", "openvino")
+SIDE_MULTIPLE = 8  # sides are padded to it by reflection, as the networks do
+MIN_SIDE = 8  # side that can be padded so
+EVENT_ERRORS = {
+    kernels.BACKWARDS: "be in order of time",
+    kernels.OFF_SENSOR: "have x in 0..{w} and y in 0..{h}",
+    kernels.NO_VIEW: "have view in 0..{views}, an index into positions",
+    kernels.NO_NUMBER: "have finite t and p",
+    kernels.NO_SIGN: "have p in -1, 1 (or weights, as floats)",
+}
+
+
+def fastest_form() -> str:
+    """Return the form that runs fastest with this processor and what is installed."""
+    if openvino_network.is_installed():
+        return "openvino"
+    return "bf16" if has_fast_bf16() else "float32"
+
+
+def takes_event_lists(network: nn.Module) -> bool:
+    """Return whether `network` has a first layer that events can be added to one by one."""
+    return isinstance(network, SetNet | E2VID)
+
+
+class EventListRuntime:
+    """A `SetNet` or `E2VID` over lists of events, window by window.
+
+    `positions`: (row, col) of each view; `height`, `width`: of a view's picture and of the frame.
+    `form`: openvino, float32 or bf16 (PyTorch); default: the `fastest_form`.
+    `threads`: of what comes behind the first layer, which takes one or two.  Raises ValueError for
+    another network, form or size and for a number of views that the network does not take.
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        *,
+        positions: Sequence[Position],
+        height: int,
+        width: int,
+        threads: int = 2,
+        form: str | None = None,
+    ):
+        form = form or fastest_form()
+        if form not in FORMS:
+            raise ValueError(f"form must be one of {', '.join(FORMS)}, got {form}")
+        if not takes_event_lists(network):
+            kind = type(network).__name__
+            raise ValueError(f"a list of events needs a SetNet or an E2VID, got {kind}")
+        if min(height, width) < MIN_SIDE or threads < 1:
+            raise ValueError(
+                f"height and width must be >= {MIN_SIDE} and threads >= 1, got {height}, {width}"
+                f" and {threads}"
+            )
+        self.views, self.size = len(positions), (height, width)
+        missing = [-side % SIDE_MULTIPLE for side in self.size]  # shared out as `pad_to_multiple`
+        self.padding = [(more // 2, more - more // 2) for more in missing]
+        padded = height + sum(self.padding[0]), width + sum(self.padding[1])
+        dtype = {"float32": torch.float32, "bf16": torch.bfloat16}.get(form)
+        dtype = openvino_network.best_dtype() if dtype is None else dtype
+        copied = inference_copy(network).cpu()
+        remainder: E2VIDRemainder | SetNetRemainder
+        self.first_layer: EventFirstLayer
+        if isinstance(copied, SetNet):
+            remainder = SetNetRemainder(copied, positions, padded, dtype)
+            self.first_layer = SetNetEventFirstLayer(remainder, padded, threads)
+        else:
+            assert isinstance(copied, E2VID)
+            remainder = E2VIDRemainder(copied, positions, padded, dtype)
+            self.first_layer = EventFirstLayer(remainder, padded, threads)
+        if form == "openvino":
+            quantise_decoder(remainder.network)
+        backend = openvino_network.CompiledModule if form == "openvino" else EagerBackend
+        self.runner = StatefulRunner(remainder, self.first_layer.example(), backend, threads)
+
+    def step(
+        self,
+        t: np.ndarray,
+        x: np.ndarray,
+        y: np.ndarray,
+        p: np.ndarray,
+        view: np.ndarray,
+        t0: float,
+        t1: float,
+    ) -> Float[np.ndarray, "h w"]:
+        """Return the frame at `t1`, float32, as the network's `forward` gives it.
+
+        Events of one window in order of time, arrays of one length: `t`, `t0`, `t1` in seconds,
+        `x`, `y` in pixels, `view` an index into positions, `p` in {-1, 1} or, as floats, weights.
+        Those outside t0 <= t <= t1 have no part in it.  Raises ValueError, and leaves the state,
+        for events that are out of order, off the sensor or in no view.
+        """
+        return self.finish(self.begin(t, x, y, p, view, t0, t1))
+
+    def begin(self, t, x, y, p, view, t0: float, t1: float) -> list[np.ndarray]:
+        """Do the first half of `step`, the events; another thread may `finish` it while this one
+        begins the next window.
+        """
+        events = self._checked(t, x, y, p, view, t0, t1)
+        t, x, y, p, view = self._reflected(*events)
+        return self.first_layer.add(t, x, y, p, view, float(t0), float(t1))
+
+    def finish(self, begun: list[np.ndarray]) -> Float[np.ndarray, "h w"]:
+        """Return the frame of a window that was begun; in the order in which they were."""
+        (top, _), (left, _) = self.padding
+        height, width = self.size
+        frame = self.first_layer.to_frame(self.runner(begun))
+        return frame[top : top + height, left : left + width]
+
+    def reset(self) -> None:
+        """Forget everything: the next window is the first."""
+        self.first_layer.reset()
+        self.runner.reset()
+
+    @property
+    def state(self) -> Any:
+        """What lives from window to window; kept by whoever takes it, for `state = ...`."""
+        return self.first_layer.state, self.runner.state
+
+    @state.setter
+    def state(self, state: Any) -> None:
+        if state is None:
+            self.reset()
+        else:
+            self.first_layer.state, self.runner.state = state
+
+    def _checked(self, t, x, y, p, view, t0, t1) -> list[np.ndarray]:
+        given = [np.asarray(part) for part in (t, x, y, p, view)]
+        if len({part.shape for part in given}) != 1 or given[0].ndim != 1:
+            shapes = [part.shape for part in given]
+            raise ValueError(f"t, x, y, p, view must be of one length, got shapes {shapes}")
+        if not (np.isfinite(t0) and np.isfinite(t1) and t0 < t1):
+            raise ValueError(f"a window must have t0 < t1 in seconds, got {t0} and {t1}")
+        t, x, y, p, view = given
+        if len(t) and not all(part.dtype.kind in "iu" for part in (x, y, view)):
+            kinds = [str(part.dtype) for part in (x, y, view)]
+            raise ValueError(f"x, y and view must be whole numbers, got {', '.join(kinds)}")
+        is_sign, typed = p.dtype.kind != "f", zip(given, DTYPES, strict=True)
+        t, x, y, p, view = (np.ascontiguousarray(part, dtype) for part, dtype in typed)
+        at, wrong = kernels.check(t, x, y, p, view, self.views, *self.size, is_sign)
+        if at >= 0:
+            reach = {"h": self.size[0] - 1, "w": self.size[1] - 1, "views": self.views - 1}
+            raise ValueError(
+                f"events must {EVENT_ERRORS[wrong].format(**reach)}, got event {at} with t={t[at]} "
+                f"x={x[at]} y={y[at]} p={p[at]} view={view[at]}"
+            )
+        return [t, x, y, p, view]
+
+    def _reflected(self, t, x, y, p, view) -> list[np.ndarray]:
+        """Return the events in padded pixels, those near a padded edge once more behind it."""
+        events = [t, x, y, p, view]
+        for axis, side, (before, behind) in zip((2, 1), self.size, self.padding, strict=True):
+            if before + behind:
+                place = events[axis]
+                low = (place >= 1) & (place <= before)
+                high = (place <= side - 2) & (place >= side - 1 - behind)
+                mirrored = [place, -place[low], 2 * (side - 1) - place[high]]
+                events = [np.concatenate([part, part[low], part[high]]) for part in events]
+                events[axis] = np.concatenate(mirrored) + before
+        return events

@@ -1,0 +1,229 @@
+"""Where live events come from: a file, played; packets over UDP; a camera."""
+
+import select
+import socket
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from urllib.parse import urlsplit
+
+import numpy as np
+
+from src.live_view.status import FaultLog
+from src.recordings.files import sources
+from src.recordings.files.formats import EVENT
+from src.recordings.views import LARGEST_SIDE, Size
+
+Chunks = Iterator[tuple[np.ndarray, float]]  # events (t x y p), wall time of their arrival in s
+FILE_CHUNK_S = 0.005  # of a file, read at a time: a long one would hold the other threads up
+GATHER_S = 0.002  # for which packets are gathered into one chunk
+GATHER_BYTES = 1 << 20
+MAX_PACKET_BYTES = 65536
+KERNEL_BUFFER_BYTES = 1 << 23  # asked of the kernel for packets that wait
+MAX_TIME_US = 2**53  # a time beyond is a broken packet
+RETRY_S = 1.0  # after which a lost camera is looked for again
+PACKETS = {  # of faery
+    "t64_x16_y16_on8": np.dtype([("t", "<u8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")]),
+    "t32_x16_y15_on1": np.dtype([("t", "<u4"), ("x", "<u2"), ("y", "<u2")]),
+}
+
+
+class Feed(ABC):
+    """`is_live`: whether events come while they happen.  `sensor`: (height, width) in pixels."""
+
+    is_live = True
+    sensor: Size
+
+    @abstractmethod
+    def chunks(self, stopped: threading.Event) -> Chunks:
+        """Yield chunks of events, not empty, until `stopped`."""
+
+    def close(self) -> None:  # noqa: B027 - most have nothing open
+        """Release what is open."""
+
+
+def open_feed(
+    recording: str,
+    sensor: Sequence[int] | None,
+    faults: FaultLog,
+    *,
+    loop: bool = False,
+    udp_format: str = "t64_x16_y16_on8",
+) -> Feed:
+    """Return the feed of `recording`: a path, `udp://address:port` or `camera://`; `sensor`:
+    (height, width) where it states none.  Raises ValueError for what cannot be read."""
+    if recording.startswith("camera://"):
+        return CameraFeed(faults)
+    if not recording.startswith("udp://"):
+        return FileFeed(recording, sources.sensor_size(recording, sensor), loop)
+    if sensor is None or not all(1 <= side <= LARGEST_SIDE for side in sensor):
+        raise ValueError(
+            f"sensor_size must be [height,width] for recording=udp://, got {sensor}; "
+            "or give views=, which says it"
+        )
+    return UdpFeed(recording, (sensor[0], sensor[1]), udp_format, faults)
+
+
+class FileFeed(Feed):
+    """Events of a file; `loop`: again and again, the clock going on."""
+
+    is_live = False
+
+    def __init__(self, path: str, sensor: Size, loop: bool):
+        self.path, self.sensor, self.loop = path, sensor, loop
+
+    def chunks(self, stopped: threading.Event) -> Chunks:
+        """Yield the file's events; raises ValueError where it cannot be decoded."""
+        shift_us, last_us = 0, 0
+        while not stopped.is_set():
+            first_us = None
+            for events in sources.iter_recording(self.path, self.sensor, FILE_CHUNK_S):
+                first_us = int(events["t"][0]) if first_us is None else first_us
+                last_us = int(events["t"][-1])
+                if shift_us:
+                    events["t"] += shift_us
+                yield events, time.perf_counter()
+            if not self.loop or first_us is None:
+                return
+            shift_us += last_us + 1 - first_us
+
+
+class UdpFeed(Feed):
+    """Events in packets of one of PACKETS that arrive at `udp://address:port`.
+
+    Raises ValueError for an address that cannot be listened at.
+    """
+
+    def __init__(self, url: str, sensor: Size, packet_format: str, faults: FaultLog):
+        if packet_format not in PACKETS:
+            allowed = ", ".join(PACKETS)
+            raise ValueError(f"udp_format must be one of {allowed}, got {packet_format}")
+        self.sensor, self.packet_format, self.faults = sensor, packet_format, faults
+        self.dtype = PACKETS[packet_format]
+        self.buffer = memoryview(bytearray(GATHER_BYTES + MAX_PACKET_BYTES))
+        self.turns, self.last_us = 0, 0  # of a clock of 32 bits
+        try:
+            self.socket = _bind_udp_socket(url)
+        except (OSError, ValueError) as error:
+            raise ValueError(f"recording must be udp://address:port, got {url}: {error}") from None
+
+    def chunks(self, stopped: threading.Event) -> Chunks:
+        """Yield what came, as soon as it came."""
+        while not stopped.is_set():
+            if select.select([self.socket], [], [], 0.1)[0]:
+                size = self._gather_packets()
+                events = self.unpack(np.frombuffer(self.buffer[:size], self.dtype))
+                if events.size:
+                    yield events, time.perf_counter()
+
+    def _gather_packets(self) -> int:
+        """Put the packets that wait one behind the other; return their bytes."""
+        size, end = 0, time.perf_counter() + GATHER_S
+        while size < GATHER_BYTES and time.perf_counter() < end:
+            try:
+                received = self.socket.recv_into(self.buffer[size:], MAX_PACKET_BYTES)
+            except BlockingIOError:
+                break
+            if received % self.dtype.itemsize:
+                self._report_bad_packets()
+            else:
+                size += received
+        return size
+
+    def unpack(self, packed: np.ndarray) -> np.ndarray:
+        """Return packed events as (t x y p); those with impossible times are left out.
+
+        32 bits of microseconds turn every 71.6 minutes: the turns are added.
+        """
+        t = packed["t"].astype(np.int64)
+        if self.packet_format == "t64_x16_y16_on8":
+            on, y = packed["p"] != 0, packed["y"]
+        else:
+            on, y = packed["y"] & 1, packed["y"] >> 1
+            if t.size:
+                turns = self.turns + np.cumsum(np.diff(t, prepend=self.last_us) < -(2**31))
+                self.turns, self.last_us = int(turns[-1]), int(t[-1])
+                t = t + (turns << 32)
+        is_valid = (t >= 0) & (t < MAX_TIME_US)
+        if not is_valid.all():
+            self._report_bad_packets()
+        return _as_events(t, packed["x"], y, on)[is_valid]
+
+    def _report_bad_packets(self) -> None:
+        self.faults.report("packet", f"packets that are not {self.packet_format}: left out")
+
+    def close(self) -> None:
+        self.socket.close()
+
+
+def _bind_udp_socket(url: str) -> socket.socket:
+    """Return a socket that packets to `url` arrive at; raises OSError or ValueError."""
+    parts = urlsplit(url)
+    if parts.port is None:
+        raise ValueError("no port")
+    family = socket.AF_INET6 if ":" in (parts.hostname or "") else socket.AF_INET
+    bound = socket.socket(family, socket.SOCK_DGRAM)
+    try:
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, KERNEL_BUFFER_BYTES)
+        bound.setblocking(False)
+        bound.bind((parts.hostname or "", parts.port))
+    except OSError:
+        bound.close()
+        raise
+    return bound
+
+
+class CameraFeed(Feed):
+    """A camera that faery's drivers read; lost, it is looked for again.
+
+    Raises ValueError where there is none, or no driver.
+    """
+
+    def __init__(self, faults: FaultLog):
+        self.faults = faults
+        self.stream = _open_camera()
+        width, height = self.stream.dimensions()
+        self.sensor = (int(height), int(width))
+
+    def chunks(self, stopped: threading.Event) -> Chunks:
+        """Yield what the camera sends."""
+        while not stopped.is_set():
+            try:
+                stream = _open_camera() if self.stream is None else self.stream
+                self.faults.clear("camera")
+                for packet in stream:
+                    events = _as_events(packet["t"], packet["x"], packet["y"], packet["on"])
+                    yield events, time.perf_counter()
+                    if stopped.is_set():
+                        return
+                reason = "it sends no more"
+            except Exception as error:  # drivers raise all kinds
+                reason = str(error)
+            self.stream = None
+            text = f"the camera is lost, looking for it: {reason}"
+            self.faults.report("camera", text, until_cleared=True)
+            stopped.wait(RETRY_S)
+
+    def close(self) -> None:
+        self.stream = None
+
+
+def _open_camera():
+    import faery  # here, as tests put another in its place
+
+    try:
+        return faery.events_stream_from_camera()
+    except Exception as error:  # drivers raise all kinds
+        reasons = " ".join(str(part) for part in error.args)
+        raise ValueError(
+            "recording=camera:// found no camera, or no driver for it; drivers come with "
+            f"pip install event-camera-drivers neuromorphic-drivers: {reasons}"
+        ) from None
+
+
+def _as_events(t: np.ndarray, x: np.ndarray, y: np.ndarray, on: np.ndarray) -> np.ndarray:
+    events = np.empty(len(t), EVENT)
+    events["t"], events["x"], events["y"] = t, x, y
+    events["p"] = 2 * on.astype(np.int8) - 1
+    return events

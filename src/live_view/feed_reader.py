@@ -1,0 +1,228 @@
+"""From a feed to windows that are over: one thread decodes, another cuts.
+
+A file is read a little ahead and played by its own clock.  What comes live is taken as it comes: a
+window is over when an event after it has come, or by the clock when nothing does.  Wall times are
+seconds of `time.perf_counter`, recorded ones microseconds.
+"""
+
+import math
+import queue
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from src.live_view.event_feeds import Feed
+from src.live_view.frame_buffer import EventCounter
+from src.live_view.live_windows import EventWindow, WindowCutter, WindowQueue
+from src.live_view.status import FaultLog, Meters
+from src.recordings.event_windows import COVERED
+
+NAP_S = 0.02  # how long a wait goes on before it looks whether it is still wanted
+MAX_DRIFT = 1e-4  # by which a camera's clock may run slow against ours: 100 ppm
+MAX_AHEAD_US = 1_000_000  # of a camera's clock ahead of ours is a jump, not a silence
+MAX_CHUNKS = 16  # that wait to be cut
+POLL_S = 0.002  # between two looks at the clock while nothing comes
+PATIENCE_S = 0.003  # for which events of a window may be on their way when it is over
+STALL_S = 1.0  # without events, a live stream is said to have stalled
+
+
+class PlaybackClock:
+    """Plays a recording: `speed` recorded seconds in a second of the wall, inf: nothing waits.
+
+    `running` is cleared for a pause.  Raises ValueError for a `speed` that is not above 0.
+    """
+
+    def __init__(self, speed: float = 1.0):
+        if not speed > 0:
+            raise ValueError(f"playback_speed must be > 0 (.inf: as fast as it goes), got {speed}")
+        self.speed = speed
+        self.anchor: tuple[float, float] | None = None  # recorded us, wall s
+        self.running = threading.Event()
+        self.running.set()
+
+    def start(self, recorded_us: float) -> None:
+        """Make `recorded_us` due now."""
+        self.anchor = (recorded_us, time.perf_counter())
+
+    def wait_until_due(self, recorded_us: float, stopped: threading.Event) -> float | None:
+        """Sleep until `recorded_us` is due, through pauses, and return when that was; None when
+        `stopped` is set before."""
+        while not stopped.is_set():
+            if not self.running.is_set():
+                self._sleep_through_pause(stopped)
+                continue
+            due_s = time.perf_counter()
+            if self.anchor is not None and not math.isinf(self.speed):
+                at_us, wall_s = self.anchor
+                due_s = wall_s + (recorded_us - at_us) * 1e-6 / self.speed
+            left_s = due_s - time.perf_counter()
+            if left_s <= 0:
+                return due_s
+            time.sleep(min(left_s, NAP_S))
+        return None
+
+    def _sleep_through_pause(self, stopped: threading.Event) -> None:
+        """Wait for the end of a pause; what comes after it is later by its length."""
+        start_s = time.perf_counter()
+        while not (self.running.wait(NAP_S) or stopped.is_set()):
+            pass
+        if self.anchor is not None:
+            at_us, wall_s = self.anchor
+            self.anchor = (at_us, wall_s + time.perf_counter() - start_s)
+
+
+class CameraClock:
+    """The wall time of a camera's clock, after the events that came soonest.
+
+    What travels and is buffered comes late by changing spans; the least of them is taken for none.
+    """
+
+    def __init__(self):
+        self.offset_s = math.nan  # wall minus recorded
+        self.observed_s = 0.0
+
+    def observe(self, recorded_us: float, wall_s: float) -> None:
+        """An event of `recorded_us` came at `wall_s`."""
+        offset_s = wall_s - recorded_us * 1e-6
+        if not math.isnan(self.offset_s):
+            offset_s = min(offset_s, self.offset_s + MAX_DRIFT * (wall_s - self.observed_s))
+        self.offset_s, self.observed_s = offset_s, wall_s
+
+    def wall_s(self, recorded_us: float) -> float:
+        """Return the wall time of `recorded_us`; nan before the first event."""
+        return recorded_us * 1e-6 + self.offset_s
+
+    def recorded_us(self, wall_s: float) -> float:
+        """Return the time of the camera's clock at `wall_s`; nan before the first event."""
+        return (wall_s - self.offset_s) * 1e6
+
+
+class FeedReader:
+    """Fills `waiting` with windows of `feed`, and `counter` with their events, until stopped.
+
+    `state`: waiting | playing | stalled | ended | broken.  `noise_filter`: returns the events of a
+    chunk that are kept.  Raises ValueError for a live feed at another playback speed than 1.
+    """
+
+    def __init__(
+        self,
+        feed: Feed,
+        cutter: WindowCutter,
+        waiting: WindowQueue,
+        counter: EventCounter,
+        clock: PlaybackClock,
+        meters: Meters,
+        faults: FaultLog,
+        noise_filter: Callable[[np.ndarray], np.ndarray] | None = None,
+    ):
+        if feed.is_live and clock.speed != 1:
+            raise ValueError(f"playback_speed must be 1 for what comes live, got {clock.speed}")
+        self.feed, self.cutter, self.waiting, self.counter = feed, cutter, waiting, counter
+        self.clock, self.meters, self.faults = clock, meters, faults
+        self.noise_filter = noise_filter
+        self.chunks: queue.Queue = queue.Queue(MAX_CHUNKS)
+        self.camera_clock = CameraClock()
+        self.arrival_s: float | None = None  # wall time of the newest live chunk
+        self.state = "waiting"
+
+    def decode(self, stopped: threading.Event) -> None:
+        """Read the feed to its end."""
+        start, end = time.thread_time(), "ended"
+        try:
+            for events, arrival_s in self.feed.chunks(stopped):
+                kept = self.noise_filter(events) if self.noise_filter else events
+                self.meters.add_busy_time("decode", time.thread_time() - start)
+                if kept.size:
+                    self._offer((kept, arrival_s), stopped)
+                start = time.thread_time()
+        except ValueError as error:
+            self.faults.report("file", str(error), until_cleared=True)
+            end = "broken"
+        self._offer(end, stopped)
+
+    def _offer(self, chunk: tuple[np.ndarray, float] | str, stopped: threading.Event) -> None:
+        """Queue a chunk or the last state; a live stream loses its oldest chunk, a file waits."""
+        while not stopped.is_set():
+            try:
+                return self.chunks.put(chunk, timeout=0.0 if self.feed.is_live else 0.1)
+            except queue.Full:
+                if self.feed.is_live:
+                    lost, _ = self.chunks.get_nowait()
+                    self.faults.report("lost", "events came faster than they are cut", len(lost))
+
+    def cut(self, stopped: threading.Event) -> None:
+        """Cut what was decoded, and hand each window on when it is over."""
+        start = time.thread_time()
+        while not stopped.is_set() and self.state not in ("ended", "broken"):
+            try:
+                chunk = self.chunks.get(timeout=POLL_S if self.feed.is_live else 0.1)
+            except queue.Empty:
+                chunk = None
+            if self.feed.is_live:
+                self._cut_live(chunk, stopped)
+            elif chunk is not None:
+                self._cut_file(chunk, stopped)
+            now = time.thread_time()
+            self.meters.add_busy_time("cut", now - start)
+            start = now
+
+    def _cut_file(self, chunk: tuple[np.ndarray, float] | str, stopped: threading.Event) -> None:
+        until_us = self.cutter.last_us + (1 - COVERED) * self.cutter.period_us + 1
+        if not isinstance(chunk, str):
+            self.cutter.add(chunk[0])
+            until_us = self.cutter.last_us
+            if self.clock.anchor is None and self.cutter.origin_us is not None:
+                self.clock.start(self.cutter.origin_us)
+                self.state = "playing"
+        for window in self.cutter.pop_windows(until_us):
+            due_s = self.clock.wait_until_due(window.end_us, stopped)
+            if due_s is None:
+                break
+            self._hand_on(window, due_s, stopped)
+        if isinstance(chunk, str):
+            self.state = chunk
+
+    def _cut_live(
+        self, chunk: tuple[np.ndarray, float] | str | None, stopped: threading.Event
+    ) -> None:
+        now = time.perf_counter()
+        if not self.clock.running.is_set():  # a pause: what comes is not kept
+            self._restart()
+            return
+        if chunk is not None and not isinstance(chunk, str):
+            self._add_live(*chunk)
+        if self.arrival_s is None:
+            return
+        if now - self.arrival_s > STALL_S:
+            self.state = "stalled"
+            silent = math.floor(now - self.arrival_s)
+            self.faults.report("stall", f"no events for {silent} s, waiting")
+        elif self.cutter.origin_us is not None:
+            self.state = "playing"
+            until_us = max(self.cutter.last_us, self.camera_clock.recorded_us(now - PATIENCE_S))
+            for window in self.cutter.pop_windows(until_us):
+                self._hand_on(window, self.camera_clock.wall_s(window.end_us), stopped)
+
+    def _add_live(self, events: np.ndarray, arrival_s: float) -> None:
+        """Take a live chunk; after a silence or a jump of the camera's clock, time restarts."""
+        if self.arrival_s is not None:
+            ahead_us = float(events["t"][0]) - self.camera_clock.recorded_us(arrival_s)
+            if arrival_s - self.arrival_s > STALL_S or ahead_us > MAX_AHEAD_US:
+                self._restart()
+        self.faults.clear("stall")
+        self.arrival_s = arrival_s
+        if self.cutter.add(events):
+            self.camera_clock = CameraClock()
+        if self.cutter.origin_us is not None:
+            self.camera_clock.observe(self.cutter.last_us, arrival_s)
+
+    def _restart(self) -> None:
+        self.cutter.restart(new_scene=False)
+        self.camera_clock = CameraClock()
+
+    def _hand_on(self, window: EventWindow, due_s: float, stopped: threading.Event) -> None:
+        self.counter.add(window.events)
+        self.waiting.put(replace(window, due_s=due_s), stopped)

@@ -1,0 +1,146 @@
+"""The page's pictures: the newest frames, the x-t slice through them, the events of each view.
+
+Written by the threads that cut and reconstruct, read by the page's.  Colours are blue, green, red.
+"""
+
+import threading
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from src.recordings.engines.splat import count_polarity
+from src.recordings.sensor_lookup import SensorLookup
+from src.recordings.views import Size
+from src.sim.optics import Position
+
+MAX_BYTES = 1 << 26  # of frames kept
+MAX_FRAMES = 600  # columns of a slice: a second at 600 fps
+GREY_QUALITY, COLOUR_QUALITY = 88, 80  # of JPEG; coloured dots need less and cost most
+MAX_SIDE = 264  # longer side in pixels of all views side by side, which take turns with the rest
+BACKGROUND, OFF, ON = (24, 21, 19), (255, 150, 70), (90, 190, 255)
+FULL_COLOUR = 2  # events at a pixel that are drawn at full colour
+_SHARE = np.abs(np.linspace(-1, 1, 2 * FULL_COLOUR + 1))[:, None] ** 0.6
+_ENDS = np.array([OFF] * FULL_COLOUR + [BACKGROUND] + [ON] * FULL_COLOUR)
+COLOURS = np.zeros((256, 1, 3), np.uint8)  # of -FULL_COLOUR ... FULL_COLOUR events, then black
+COLOURS[: len(_ENDS), 0] = _SHARE * _ENDS + (1 - _SHARE) * np.array(BACKGROUND)
+Line = tuple[float, float, float, float]  # x0, y0, x1, y1 in pixels of the picture
+
+
+class FrameBuffer:
+    """Keeps MAX_FRAMES frames of `size` (height, width), fewer where they are large.
+
+    `ring` holds them, the newest at (`count` - 1) modulo its length.
+    """
+
+    def __init__(self, size: Size):
+        self.size = size
+        kept = max(2, min(MAX_FRAMES, MAX_BYTES // (size[0] * size[1])))
+        self.ring = np.zeros((kept, *size), np.uint8)
+        self.count = 0  # frames since the start
+
+    def push(self, picture: Float[np.ndarray, "h w"]) -> None:
+        """Add a frame in [0, 1]."""
+        cv2.convertScaleAbs(picture, dst=self.ring[self.count % len(self.ring)], alpha=255)
+        self.count += 1
+
+    def newest(self) -> UInt8[np.ndarray, "h w"] | None:
+        """Return a copy of the newest frame; None before the first."""
+        count = self.count
+        return self.ring[(count - 1) % len(self.ring)].copy() if count else None
+
+
+class TimeSlice:
+    """The x-t slice: the pixels along `line`, one column per frame, the newest on the right.
+
+    Only frames that are new since the last call are read, unless the line has moved.
+    """
+
+    def __init__(self, frames: FrameBuffer):
+        self.frames = frames
+        height, width = frames.size
+        self.line: Line = (0.0, height / 2, width - 1.0, height / 2)
+        self.drawn: tuple[Line, int] | None = None  # line and frame count of `picture`
+        self.picture = np.zeros((1, len(frames.ring)), np.uint8)
+
+    def draw(self, *, always: bool = False) -> UInt8[np.ndarray, "samples frames"] | None:
+        """Return the slice; None where it is still that of the last call, unless `always`."""
+        line, count = self.line, self.frames.count
+        if self.drawn == (line, count):
+            return self.picture if always else None
+        kept = len(self.frames.ring)
+        before = self.drawn[1] if self.drawn is not None and self.drawn[0] == line else None
+        new = min(count if before is None else count - before, kept)
+        x, y = self._sample_pixels(line)
+        columns = self.frames.ring[np.arange(count - new, count) % kept][:, y, x].T
+        if before is None:
+            self.picture = np.zeros((len(x), kept), np.uint8)
+        self.picture = np.concatenate([self.picture[:, new:], columns], axis=1)
+        self.drawn = (line, count)
+        return self.picture
+
+    def _sample_pixels(self, line: Line) -> Int[np.ndarray, "2 k"]:
+        """Return x and y of the pixels along the line, about one for each it passes."""
+        x0, y0, x1, y1 = line
+        height, width = self.frames.size
+        k = max(2, round(max(abs(x1 - x0), abs(y1 - y0))) + 1)
+        points = np.linspace((x0, y0), (x1, y1), k).clip(0, (width - 1, height - 1))
+        return np.rint(points).astype(int).T
+
+
+class EventCounter:
+    """Sums of polarity per pixel of every view since the last `take`; idle unless `is_watched`."""
+
+    def __init__(self, lookup: SensorLookup):
+        self.lookup = lookup
+        self.lock = threading.Lock()
+        self.is_watched = False
+        self.windows = 0  # added since the last `take`
+        size = (lookup.views, *lookup.model)
+        self.counts, self.taken = np.zeros(size, np.int32), np.zeros(size, np.int32)
+
+    def add(self, events: np.ndarray) -> None:
+        """Add a window's events (t x y p) of the sensor."""
+        if self.is_watched:
+            x, y, p = (events[name] for name in "xyp")
+            with self.lock:
+                count_polarity(x, y, p, self.lookup.nearest_pixel, self.counts)
+                self.windows += 1
+
+    def take(self) -> Int[np.ndarray, "views h w"]:
+        """Return the sums and start anew; the array is valid until the next call."""
+        self.taken.fill(0)
+        with self.lock:
+            self.counts, self.taken, self.windows = self.taken, self.counts, 0
+        return self.taken
+
+
+def draw_events(counts: Int[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Return polarities added up at each pixel in colour: ON warm, OFF cool."""
+    steps = (np.clip(counts, -FULL_COLOUR, FULL_COLOUR) + FULL_COLOUR).astype(np.uint8)
+    return cv2.applyColorMap(steps, COLOURS)
+
+
+def tile_views(
+    counts: Int[np.ndarray, "views h w"], positions: Sequence[Position]
+) -> UInt8[np.ndarray, "rows columns 3"]:
+    """Return the events of all views where they stand in the light field, made small."""
+    rows, columns = (sorted({place[axis] for place in positions}) for axis in (0, 1))
+    _, height, width = counts.shape
+    whole = np.zeros((len(rows) * height, len(columns) * width), counts.dtype)
+    for view, (row, column) in zip(counts, positions, strict=True):
+        top, left = rows.index(row) * height, columns.index(column) * width
+        whole[top : top + height, left : left + width] = view
+    shrink = max(1, -(-max(whole.shape) // MAX_SIDE))
+    rows_kept, columns_kept = (side // shrink for side in whole.shape)
+    kept = whole[: rows_kept * shrink, : columns_kept * shrink]
+    return draw_events(kept.reshape(rows_kept, shrink, columns_kept, shrink).sum((1, 3)))
+
+
+def encode_jpeg(picture: UInt8[np.ndarray, "..."]) -> bytes:
+    """Return a grey or colour picture as JPEG, colours at full resolution."""
+    full = cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444
+    quality = GREY_QUALITY if picture.ndim == 2 else COLOUR_QUALITY
+    how = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, full]
+    return cv2.imencode(".jpg", picture, how)[1].tobytes()

@@ -1,0 +1,173 @@
+"""One window of events to a picture: a network, its views and its state; and which of them runs.
+
+A network with a first layer that events can be added to one by one runs on lists of events, the
+others on voxel grids.
+"""
+
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float
+
+from src.deploy.runtime import EventListRuntime, fastest_form, takes_event_lists
+from src.live_view.live_windows import EventWindow
+from src.models.network import EventToVideoNetwork
+from src.recordings.event_windows import Window, WindowRule, fill_window, frames_per_window
+from src.recordings.files.event_arrays import concatenate_events, count_before
+from src.recordings.files.formats import EVENT
+from src.recordings.reconstruction import (
+    ReconstructionState,
+    default_window_length,
+    prepare_network,
+    reconstruct_frames,
+)
+from src.recordings.sensor_lookup import build_lookup
+from src.recordings.views import Views
+from src.sim.optics import Position, layout
+
+VIEW_COUNTS = (1, 3, 5, 9)  # to choose from, where the light field has them
+Finish = Callable[[], Float[np.ndarray, "h w"]]
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """As the keys of conf/live.yaml; `form` None: the fastest that is there."""
+
+    fps: float
+    bins: int = 5
+    splat: str = "nearest"
+    window_length: str | None = None
+    form: str | None = None
+
+
+class NetworkRunner:
+    """`network` on `views`, window after window, as `src.reconstruct` runs it; warm when made.
+
+    Raises ValueError for what it cannot run with.
+    """
+
+    def __init__(
+        self, name: str, network: EventToVideoNetwork, views: Views, settings: RunSettings
+    ):
+        self.name, self.views, fps = name, views, settings.fps
+        length = settings.window_length or default_window_length(network)
+        self.frames_per_window = frames_per_window(length, fps)
+        form = settings.form or (fastest_form() if takes_event_lists(network) else "float32")
+        self.network = prepare_network(network, form, "cpu", views, settings.bins)
+        is_runtime = isinstance(self.network, EventListRuntime)
+        self.rule = WindowRule(
+            fps=fps, bins=settings.bins, splat=settings.splat, as_lists=is_runtime
+        )
+        self.lookup = build_lookup(views)
+        # One without overlapping windows can begin a window while another is finished.
+        self.is_pipelined = is_runtime and self.frames_per_window == 1
+        self.recent: deque[np.ndarray] = deque(maxlen=self.frames_per_window)
+        events = np.zeros(1000, EVENT)  # to run on, so that nothing is compiled while windows wait
+        events["x"] = np.linspace(0, views.sensor[1] - 1, len(events))
+        events["y"], events["p"] = views.sensor[0] // 2, 1
+        for _ in range(3):
+            self.begin(EventWindow(0.0, 1e6 / fps, events), restart=True)()
+
+    def begin(self, window: EventWindow, *, restart: bool = False) -> Finish:
+        """Do what the events of `window` ask for; return what gives the picture, in [0, 1], which
+        may run in another thread, in order.  The first window has to `restart`: forget all before.
+        """
+        if restart:
+            self.recent.clear()
+        self.recent.append(window.events)
+        start_us = window.end_us - self.frames_per_window * (window.end_us - window.start_us)
+        events = window.events
+        if self.frames_per_window > 1:  # of the windows in between some may be dropped
+            events = concatenate_events(self.recent)
+            events = events[count_before(events, start_us) :]
+        filled = fill_window(events, self.lookup, self.rule, start_us, window.end_us)
+        if not self.is_pipelined or not isinstance(self.network, EventListRuntime):
+            return partial(self._run, filled, restart)
+        if restart:
+            self.network.first_layer.reset()
+        begun = None
+        if filled.events and filled.event_list is not None:
+            begun = self.network.begin(*filled.event_list, 0.0, filled.length_s)
+        return partial(self._finish, self.network, begun, restart)
+
+    def _run(self, window: Window, restart: bool) -> Float[np.ndarray, "h w"]:
+        if restart:
+            self.state = ReconstructionState(self.frames_per_window)
+        frames = reconstruct_frames([window], self.network, self.views.positions, self.state)
+        return next(frames).picture
+
+    def _finish(
+        self, runtime: EventListRuntime, begun: list[np.ndarray] | None, restart: bool
+    ) -> Float[np.ndarray, "h w"]:
+        """Run the rest of the network on a window that was begun; one without events holds."""
+        if restart:
+            runtime.runner.reset()
+            self.picture = np.full(self.views.model, 0.5, np.float32)
+        if begun is not None:
+            self.picture = runtime.finish(begun).clip(0, 1)
+        return self.picture
+
+
+class Controls:
+    """What a visitor can choose: one of `networks`, on how many of `views`; `offered`: the numbers
+    of views for each; `chosen`: what runs now, on `runner`."""
+
+    def __init__(
+        self, networks: Mapping[str, EventToVideoNetwork], views: Views, settings: RunSettings
+    ):
+        self.networks, self.views, self.settings = networks, views, settings
+        self.offered = {
+            name: offered_view_counts(network.views, views.positions)
+            for name, network in networks.items()
+        }
+        self.chosen: dict[str, int | str] = {}
+        self.runner: NetworkRunner | None = None
+        self.lock = threading.Lock()
+        self.runners: dict[tuple[str, int], NetworkRunner] = {}
+
+    def choose(self, network: str, views: int | str) -> None:
+        """Run `network` on `views`, a number or `all`, from the next window on.
+
+        Raises ValueError for what is not offered.
+        """
+        if network not in self.offered:
+            raise ValueError(f"network must be one of {', '.join(self.offered)}, got {network}")
+        counts = self.offered[network]
+        if views != "all" and views not in counts:
+            allowed = ", ".join(map(str, ["all", *counts]))
+            raise ValueError(f"views_used must be one of {allowed} for {network}, got {views}")
+        count = max(counts) if views == "all" else int(views)
+        with self.lock:
+            if (network, count) not in self.runners:
+                used = self.views.select(positions_used(count, self.views.positions))
+                self.runners[network, count] = NetworkRunner(
+                    network, self.networks[network], used, self.settings
+                )
+            self.runner = self.runners[network, count]
+        self.chosen = {"network": network, "views": count}
+
+
+def offered_view_counts(network_views: int | None, positions: Sequence[Position]) -> list[int]:
+    """Return how many of the views at `positions` a network can be given; `network_views`: the
+    number it was made for, None: any."""
+    if network_views is not None:
+        return [network_views]
+    counts = {count for count in VIEW_COUNTS if set(layout(count)) <= set(positions)}
+    return sorted(counts | {len(positions)})
+
+
+def positions_used(count: int, positions: Sequence[Position]) -> list[Position]:
+    """Return which of `positions` are used: all, or those of the layout of `count` views.
+
+    Raises ValueError where the light field has not got them.
+    """
+    if count == len(positions):
+        return list(positions)
+    used = list(layout(count))
+    if not set(used) <= set(positions):
+        raise ValueError(f"ckpt wants the views {used}, the recording has {list(positions)}")
+    return used

@@ -1,0 +1,224 @@
+"""The web server: the page, its stream of messages, `/status` and `/frame.png`.
+
+A message of the stream is the length of a JSON header (uint32, little endian), the header, and the
+JPEGs it lists.  The browser sends JSON: pause, line, network and views, all_views.
+"""
+
+import asyncio
+import json
+import math
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import cv2
+from aiohttp import WSMsgType, web
+
+from src.live_view.frame_buffer import Line, TimeSlice, draw_events, encode_jpeg, tile_views
+from src.live_view.player import Player
+from src.sim.optics import Position
+
+HTML = Path(__file__).with_name("live.html")
+PICTURES_HZ = 30.0
+STATUS_S = 0.25  # between two readings of the meters on the page
+MAX_REQUEST_BYTES = 4096
+NO_CACHE = {"Cache-Control": "no-store"}
+THIS_MACHINE = ("127.0.0.1", "localhost", "::1")
+
+
+class LivePage:
+    """The messages that all visitors get, and what they ask for."""
+
+    def __init__(self, player: Player, positions: list[Position]):
+        self.player, self.positions = player, positions
+        self.controls, self.counter = player.controls, player.reader.counter
+        self.frames = player.frames
+        self.slice = TimeSlice(self.frames)
+        self.all_views = False
+        self.frames_sent = -1  # count of frames at the last picture
+        self.status_sent = 0.0  # wall time
+
+    def message(self, *, whole: bool = False) -> bytes | None:
+        """Return what is new since the last call, or everything; None where nothing is."""
+        pictures = self._pictures(whole)
+        header: dict = {"pictures": [[name, len(data)] for name, data in pictures]}
+        now = time.perf_counter()
+        if whole or now - self.status_sent >= STATUS_S:
+            self.status_sent, header["status"] = now, self.status()
+        elif not pictures:
+            return None
+        text = json.dumps(header).encode()
+        return len(text).to_bytes(4, "little") + text + b"".join(data for _, data in pictures)
+
+    def status(self) -> dict:
+        """Return the meters, and what is chosen and offered."""
+        status = self.player.status()
+        asked_fps = status["asked_fps"]
+        return status | {
+            "line": self.slice.line,
+            "slice_s": round(len(self.frames.ring) / asked_fps, 2) if asked_fps else None,
+            "all_views": self.all_views,
+            "offered": self.controls.offered,
+            "chosen": self.controls.chosen,
+        }
+
+    def _pictures(self, whole: bool) -> list[tuple[str, bytes]]:
+        count, newest = self.frames.count, self.frames.newest()
+        if newest is None:
+            return []
+        pictures = []
+        if whole or count != self.frames_sent:
+            self.frames_sent = count
+            pictures.append(("frame", encode_jpeg(newest)))
+        if whole or self.counter.windows:
+            counts = self.counter.take()
+            centre = self.positions.index((0, 0)) if (0, 0) in self.positions else 0
+            pictures.append(("events", encode_jpeg(draw_events(counts[centre]))))
+            if self.all_views:
+                pictures.append(("views", encode_jpeg(tile_views(counts, self.positions))))
+        drawn = self.slice.draw(always=whole)
+        return pictures if drawn is None else [*pictures, ("slice", encode_jpeg(drawn))]
+
+    def handle_request(self, request: dict) -> None:
+        """Do what a visitor asks; raises ValueError for what makes no sense."""
+        if "pause" in request:
+            self.player.set_paused(bool(request["pause"]))
+        if "all_views" in request:
+            self.all_views = bool(request["all_views"])
+        if "line" in request:
+            self.slice.line = _parse_line(request["line"])
+        if "network" in request:
+            self.controls.choose(str(request["network"]), request.get("views", "all"))
+
+
+def _parse_line(numbers: object) -> Line:
+    if (
+        not isinstance(numbers, list)
+        or len(numbers) != 4
+        or not all(isinstance(n, int | float) and math.isfinite(n) for n in numbers)
+    ):
+        raise ValueError(f"line must be x0, y0, x1, y1 in pixels, got {numbers}")
+    x0, y0, x1, y1 = (min(max(float(n), -1e4), 1e4) for n in numbers)
+    return x0, y0, x1, y1
+
+
+class PageServer:
+    """Serves `page` at `host`:`port` until told to stop."""
+
+    def __init__(self, page: LivePage, host: str, port: int):
+        self.page, self.host, self.port = page, host, port
+        self.visitors: set[asyncio.Queue] = set()
+        self.app = web.Application(
+            middlewares=[self._own_pages_only], client_max_size=MAX_REQUEST_BYTES
+        )
+        self.app.router.add_get("/", self._page)
+        self.app.router.add_get("/status", self._status)
+        self.app.router.add_get("/frame.png", self._frame)
+        self.app.router.add_get("/stream", self._stream)
+
+    async def run(self, on_ready: Callable[[], None], stop: asyncio.Event) -> None:
+        """Serve until `stop`; `on_ready` is called once the port is open.
+
+        Raises ValueError where the address cannot be used.
+        """
+        runner = web.AppRunner(self.app, access_log=None, shutdown_timeout=0.5)
+        await runner.setup()
+        try:
+            await web.TCPSite(runner, self.host, self.port).start()
+        except (OSError, OverflowError) as error:
+            await runner.cleanup()
+            raise ValueError(f"host={self.host} port={self.port} cannot be used: {error}") from None
+        try:
+            on_ready()
+            await self._tick(stop)
+        finally:
+            for queue in self.visitors:
+                _replace(queue, None)
+            await runner.cleanup()
+
+    async def _tick(self, stop: asyncio.Event) -> None:
+        """Draw and hand out, PICTURES_HZ times a second."""
+        meters, before = self.page.player.meters, time.thread_time()
+        while not stop.is_set():
+            started = time.perf_counter()
+            self.page.counter.is_watched = bool(self.visitors)
+            if self.visitors and (message := self.page.message()) is not None:
+                for queue in self.visitors:
+                    _replace(queue, message)
+            now = time.thread_time()
+            meters.add_busy_time("page", now - before)
+            before = now
+            left = 1 / PICTURES_HZ - (time.perf_counter() - started)
+            with suppress(TimeoutError):
+                await asyncio.wait_for(stop.wait(), max(left, 0.001))
+
+    @web.middleware
+    async def _own_pages_only(self, request: web.Request, handler) -> web.StreamResponse:
+        """Refuse requests that another site's page makes in a visitor's browser."""
+        host = request.host.rsplit(":", 1)[0].strip("[]")
+        local = self.host in THIS_MACHINE
+        origin = request.headers.get("Origin")
+        foreign = origin is not None and origin != f"http://{request.host}"
+        if foreign or (local and host not in THIS_MACHINE):
+            raise web.HTTPForbidden(text="this page serves its own address only")
+        return await handler(request)
+
+    async def _page(self, request: web.Request) -> web.Response:
+        policy = (
+            "default-src 'none'; img-src 'self' blob: data:; style-src 'unsafe-inline'; "
+            f"script-src 'unsafe-inline'; connect-src 'self' ws://{request.host}"
+        )
+        headers = NO_CACHE | {"Content-Security-Policy": policy}
+        return web.Response(text=HTML.read_text(), content_type="text/html", headers=headers)
+
+    async def _status(self, request: web.Request) -> web.Response:
+        return web.json_response(self.page.status(), headers=NO_CACHE)
+
+    async def _frame(self, request: web.Request) -> web.Response:
+        newest = self.page.frames.newest()
+        if newest is None:
+            raise web.HTTPServiceUnavailable(text="no frame yet")
+        content = cv2.imencode(".png", newest)[1].tobytes()
+        return web.Response(body=content, content_type="image/png", headers=NO_CACHE)
+
+    async def _stream(self, request: web.Request) -> web.WebSocketResponse:
+        socket = web.WebSocketResponse(compress=False, max_msg_size=MAX_REQUEST_BYTES, heartbeat=20)
+        await socket.prepare(request)
+        queue: asyncio.Queue = asyncio.Queue(1)
+        queue.put_nowait(self.page.message(whole=True))
+        self.visitors.add(queue)
+        sending = asyncio.create_task(_send(socket, queue))
+        try:
+            async for message in socket:
+                if message.type == WSMsgType.TEXT:
+                    await self._handle(message.data)
+        finally:
+            self.visitors.discard(queue)
+            sending.cancel()
+        return socket
+
+    async def _handle(self, text: str) -> None:
+        """Do what a visitor asks, in a thread: a network may have to be made ready."""
+        try:
+            request = json.loads(text)
+            if not isinstance(request, dict):
+                raise ValueError(f"a request must be a mapping, got {request}")
+            await asyncio.to_thread(self.page.handle_request, request)
+        except ValueError as error:
+            self.page.player.faults.report("request", str(error))
+
+
+def _replace(queue: asyncio.Queue, message: bytes | None) -> None:
+    """Put a message into `queue`, in place of one that a slow visitor has not taken."""
+    if queue.full():
+        queue.get_nowait()
+    queue.put_nowait(message)
+
+
+async def _send(socket: web.WebSocketResponse, queue: asyncio.Queue) -> None:
+    """Send what is put into `queue`; None closes the socket."""
+    with suppress(ConnectionError, RuntimeError):  # the visitor has gone
+        while (message := await queue.get()) is not None:
+            await socket.send_bytes(message)
+        await socket.close()

@@ -1,0 +1,159 @@
+"""The contract of every network here, and how one is run over a sequence of windows."""
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from src.sim.optics import Position
+
+if TYPE_CHECKING:  # a network knows nothing of the simulation; a sample is read, never made
+    from src.sim.pipeline import Sample
+
+WINDOW_S = 1 / 120  # default length of a window, that of training
+MAX_WINDOWS = 40  # that a network is given at once; more take more memory and no less time
+
+
+class VideoMethod(nn.Module):
+    """Anything that turns a clip into frames; `views`: how many it takes, None: any number."""
+
+    views: int | None = None
+
+    def reconstruct_clip(self, sample: "Sample") -> Float[Tensor, "n windows 1 h w"]:
+        """Return the frame at the end of every window of `sample`."""
+        raise NotImplementedError
+
+
+class EventToVideoNetwork(VideoMethod):
+    """A recurrent network from event voxel grids to frames in [0, 1], window by window.
+
+    A subclass implements `forward`; `warm_up` and `sequence` may be replaced by faster ones that
+    give the same.  The state, a tensor or nested tuples, lists and dicts of tensors, is never kept
+    inside.  `uses_window_length`: whether windows may last longer or shorter than in training.
+    """
+
+    uses_window_length = False
+
+    def forward(
+        self,
+        voxels: Float[Tensor, "n views bins h w"],
+        state: Any = None,
+        *,
+        window_s: float | Tensor = WINDOW_S,
+        positions: Sequence[Position] | None = None,
+    ) -> tuple[Float[Tensor, "n 1 h w"], Any]:
+        """Return the frame at the end of the window and the state to go on from.
+
+        `state`: None starts a sequence.  `window_s`: length of the window in seconds, a number or
+        one per clip (n,).  `positions`: (row, col) of each view, None: `optics.layout`.
+        """
+        raise NotImplementedError
+
+    def warm_up(
+        self,
+        voxels: Float[Tensor, "n views bins h w"],
+        state: Any = None,
+        *,
+        window_s: float | Tensor = WINDOW_S,
+        positions: Sequence[Position] | None = None,
+    ) -> Any:
+        """Return the state that `forward` returns, for windows whose frame is not wanted."""
+        return self(voxels, state, window_s=window_s, positions=positions)[1]
+
+    def sequence(
+        self,
+        voxels: Float[Tensor, "n windows views bins h w"],
+        state: Any = None,
+        *,
+        window_s: float | Tensor = WINDOW_S,
+        positions: Sequence[Position] | None = None,
+        output_windows: Sequence[int] | None = None,
+    ) -> tuple[Float[Tensor, "n outputs 1 h w"], Any]:
+        """Return the frames of `output_windows`, ascending (None: all), and the state after the
+        last window.
+        """
+        frames = []
+        for number, window in enumerate(voxels.unbind(1)):
+            if output_windows is None or number in output_windows:
+                frame, state = self(window, state, window_s=window_s, positions=positions)
+                frames.append(frame)
+            else:
+                state = self.warm_up(window, state, window_s=window_s, positions=positions)
+        if not frames:
+            return voxels.new_empty(len(voxels), 0, 1, *voxels.shape[-2:]), state
+        return torch.stack(frames, dim=1), state
+
+    def reconstruct_clip(self, sample: "Sample") -> Float[Tensor, "n windows 1 h w"]:
+        voxels, window_s, positions = sample.voxels, sample.window_s, sample.positions
+        return unroll(self, voxels, window_s=window_s, positions=positions)[0]
+
+
+class FramePostprocessor(nn.Module):
+    """A network from distorted frames to restored ones; a subclass implements `forward`."""
+
+    WINDOW, OVERLAP = 16, 4
+
+    def forward(
+        self, frames: Float[Tensor, "n frames c h w"]
+    ) -> tuple[Float[Tensor, "n frames c h w"], Any]:
+        """Return the restored frames, not clipped, and what else training may use."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def restore(
+        self,
+        frames: Float[Tensor, "n frames c h w"],
+        *,
+        window: int = WINDOW,
+        overlap: int = OVERLAP,
+    ) -> Float[Tensor, "n frames c h w"]:
+        """Return a video of any length, restored, in [0, 1], in windows that share `overlap`.
+
+        Of two windows that overlap each gives the half that lies deeper in it.  Raises ValueError
+        unless 0 <= overlap < window.
+        """
+        if not 0 <= overlap < window:
+            raise ValueError(f"postprocess.overlap must be in [0, {window}), got {overlap}")
+        count, parts, done = frames.shape[1], [], 0
+        last = max(count - window, 0)  # ends with the video
+        for start in [*range(0, last, window - overlap), last]:
+            stop = min(start + window, count)
+            until = count if stop == count else stop - overlap // 2
+            restored, _ = self(frames[:, start:stop])
+            parts.append(restored[:, done - start : until - start])
+            done = until
+        return torch.cat(parts, 1).clamp(0, 1)
+
+
+def unroll(
+    network: EventToVideoNetwork,
+    voxels: Float[Tensor, "n windows views bins h w"],
+    state: Any = None,
+    *,
+    window_s: float | Tensor = WINDOW_S,
+    positions: Sequence[Position] | None = None,
+    output_windows: Sequence[int] | None = None,
+) -> tuple[Float[Tensor, "n outputs 1 h w"], Any]:
+    """Return what `network.sequence` does, of a sequence of any length: MAX_WINDOWS at a time."""
+    frames = []
+    for part in split_windows(voxels.shape[1], MAX_WINDOWS):
+        wanted = None if output_windows is None else windows_within(output_windows, part)
+        some, state = network.sequence(
+            voxels[:, part], state, window_s=window_s, positions=positions, output_windows=wanted
+        )
+        frames.append(some)
+    return torch.cat(frames, dim=1), state
+
+
+def windows_within(windows: Sequence[int], part: slice) -> list[int]:
+    """Return those of `windows` that lie in `part`, counted from its first."""
+    return [window - part.start for window in windows if part.start <= window < part.stop]
+
+
+def split_windows(windows: int, length: int) -> Iterator[slice]:
+    """Yield slices of at most `length` windows (0: all at once) that cover `windows`."""
+    length = length or windows
+    for start in range(0, windows, length):
+        yield slice(start, min(start + length, windows))

@@ -1,0 +1,198 @@
+"""Points of a still scene, tracked through frames that turbulence moved (Lucas & Kanade 1981).
+
+The template is the mean frame, shifted; frames are never interpolated.  A window of a frame, a
+shift and a change of contrast and brightness of the template are fitted to each other by
+Gauss-Newton steps from OpenCV's optical flow.  The last step is taken twice, from the two colours
+of a chessboard of pixels: their noise is independent, so that the product of the two displacements
+estimates the power of the motion without that of the noise.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+SPREAD, REACH = 2.0, 5  # pixels: deviation and half width of the Gaussian window
+STEPS = 4
+MAX_STEP = 2.0  # pixels
+MIN_EXPLAINED = 0.8  # of a window's variance, or the point is lost in that frame
+MAX_RELATIVE = 4.0  # times the typical displacement: further off is another part of the scene
+MAX_CORNERS, QUALITY, MIN_DISTANCE = 800, 0.003, 4  # corners: number, weakest over best, px apart
+MIN_ROUNDNESS = 0.2  # of a corner: power along the weaker over that along the stronger direction
+MARGIN = 12  # pixels at the frame's edge without corners
+COARSEST = 64  # pixels of the shorter side at the coarsest level
+
+
+@dataclass(frozen=True)
+class PointTracks:
+    """Points that were tracked, in pixels of the frames given.
+
+    `place`: x and y in the mean frame; `moved`: the displacement from there, estimated twice;
+    `sharp`, twice: how much of the mean frame's gradient a window shows (1: all, more: sharper);
+    `texture`: the power of that gradient; `seen`: in which frames a point was found, others hold 0;
+    `window_px2`: the variance along one axis of what a displacement is the mean over.
+    """
+
+    place: Float[np.ndarray, "points 2"]
+    moved: Float[np.ndarray, "2 frames points 2"]
+    sharp: Float[np.ndarray, "2 frames points"]
+    texture: Float[np.ndarray, " points"]
+    seen: Bool[np.ndarray, "frames points"]
+    window_px2: float
+
+    def select(self, chosen: Bool[np.ndarray, " points"]) -> "PointTracks":
+        """Return the tracks of some of the points."""
+        moved, sharp = self.moved[:, :, chosen], self.sharp[:, :, chosen]
+        place, texture, seen = self.place[chosen], self.texture[chosen], self.seen[:, chosen]
+        return PointTracks(place, moved, sharp, texture, seen, self.window_px2)
+
+
+def find_corners(picture: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "points 2"]:
+    """Return whole-pixel corners of a picture in [0, 1], not near its edge; perhaps none.
+
+    Points on straight edges are left out: along an edge any displacement fits.
+    """
+    inside = np.zeros(picture.shape, np.uint8)
+    inside[MARGIN:-MARGIN, MARGIN:-MARGIN] = 255
+    eight_bits = np.clip(picture * 255, 0, 255).astype(np.uint8)
+    peaks = cv2.goodFeaturesToTrack(
+        eight_bits, 4 * MAX_CORNERS, QUALITY, MIN_DISTANCE, mask=inside, blockSize=5
+    )
+    if peaks is None:
+        return np.zeros((0, 2), np.float32)
+    x, y = np.round(peaks[:, 0]).astype(int).T
+    gx, gy = _gradient(picture)
+    xx, xy, yy = (cv2.GaussianBlur(g, (0, 0), SPREAD)[y, x] for g in (gx * gx, gx * gy, gy * gy))
+    half, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    is_corner = half - spread > MIN_ROUNDNESS * (half + spread)
+    return np.stack([x, y], axis=1)[is_corner][:MAX_CORNERS].astype(np.float32)
+
+
+def track_points(
+    frames: Float[np.ndarray, "frames h w"], place: Float[np.ndarray, "points 2"]
+) -> PointTracks:
+    """Track the points `place`, whole pixels of the mean frame, into every frame: with windows of
+    the mean frame, then with the mean of the windows that were found, which is sharper."""
+    picture = frames.mean(0)
+    rough = np.stack([_optical_flow(picture, frame, place) for frame in frames])
+    fine = _registered(frames, place, rough)
+    refined = [_refine(fine, frame, start) for frame, start in zip(frames, rough, strict=True)]
+    moved, sharp, explained = map(np.stack, zip(*refined, strict=True))
+    seen = explained > MIN_EXPLAINED
+    far = np.hypot(*moved.mean(1).transpose(2, 0, 1))
+    typical = np.median(far[seen]) / 1.18 if seen.any() else 0.0  # of a Rayleigh distribution
+    seen &= far < MAX_RELATIVE * typical + 0.5
+    return PointTracks(
+        place=place,
+        moved=np.where(seen[..., None], moved.swapaxes(0, 1), 0),
+        sharp=np.where(seen, sharp.swapaxes(0, 1), 0),
+        texture=fine.texture,
+        seen=seen,
+        window_px2=fine.window_px2,
+    )
+
+
+def _optical_flow(picture: np.ndarray, frame: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Return displacements (points, 2) from `picture` to `frame`, to be refined; 0 where lost."""
+    levels = int(np.log2(max(min(frame.shape) / COARSEST, 1)))
+    before, after = (np.clip(p * 255, 0, 255).astype(np.uint8) for p in (picture, frame))
+    found, is_found, _ = cv2.calcOpticalFlowPyrLK(
+        before, after, place, place.copy(), winSize=(2 * REACH + 1,) * 2, maxLevel=levels
+    )
+    return np.where(is_found, found - place, 0).astype(np.float32)
+
+
+def _registered(frames: np.ndarray, place: np.ndarray, moved: np.ndarray) -> "_Windows":
+    """Return the windows' means over the frames, each where it was found, as one tall picture."""
+    half, side = REACH + 3, 2 * (REACH + 3) + 1
+    v, u = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1)
+    total = np.zeros((len(place), side * side), np.float32)
+    for frame, away in zip(frames, moved, strict=True):
+        total = total + _sample(frame, place + away, u, v)
+    tall = (total / len(frames)).reshape(len(place) * side, side)
+    home = np.stack([np.full(len(place), half), np.arange(len(place)) * side + half], axis=1)
+    return _Windows(tall, home, place)
+
+
+def _refine(
+    windows: "_Windows", frame: np.ndarray, moved: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return displacement (2, points, 2), sharpness (2, points), explained variance (points,)."""
+    for _ in range(STEPS):
+        moved = moved + windows.step(frame, moved)[0]
+    halves = [moved + windows.step(frame, moved, colour)[0] for colour in (0, 1)]
+    sharp = [windows.sharpness(frame, moved, colour) for colour in (0, 1)]
+    return np.stack(halves), np.stack(sharp), windows.step(frame, moved)[1]
+
+
+class _Windows:
+    """Windows of a picture around `home`, to be found in frames near `place`, both whole pixels."""
+
+    def __init__(self, picture: np.ndarray, home: np.ndarray, place: np.ndarray):
+        self.home, self.place = home.astype(np.float32), place.astype(np.float32)
+        self.fields = (picture, *_gradient(picture))
+        self.v, self.u = v, u = np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1].reshape(2, -1)
+        self.weight = np.exp(-(u**2 + v**2) / (2 * SPREAD**2)).astype(np.float32)
+        self.colour = (u + v) % 2
+        power = np.sum([_sample(field, self.home, u, v) ** 2 for field in self.fields[1:]], axis=0)
+        self.texture = power.sum(1)
+        share = power * self.weight
+        share /= np.maximum(share.sum(1, keepdims=True), 1e-12)
+        spread = share @ (u**2 + v**2) - (share @ u) ** 2 - (share @ v) ** 2
+        self.window_px2 = float(spread.mean() / 2)
+
+    def step(
+        self, frame: np.ndarray, moved: np.ndarray, colour: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return a Gauss-Newton step from `moved`, and the share of variance explained there:
+        frame = gain (template - step . gradient) + constant, in the pixels of one `colour`."""
+        seen, weight, (picture, gx, gy) = self._pair(frame, moved, self.fields)
+        if colour is not None:
+            weight = weight * (self.colour == colour)
+        total = np.maximum(weight.sum(1, keepdims=True), 1e-6)
+        terms = np.stack([seen, gx, gy, picture], axis=1)
+        terms -= (terms * weight[:, None]).sum(2, keepdims=True) / total[:, None]
+        products = (terms * weight[:, None]) @ terms.swapaxes(1, 2)
+        matrix, vector = products[:, 1:, 1:], products[:, 1:, :1]
+        floor = 1e-6 * np.trace(matrix, axis1=1, axis2=2)[:, None, None] + 1e-12
+        slope = np.linalg.solve(matrix + floor * np.eye(3), vector)
+        gain = slope[:, 2]
+        steps = -slope[:, :2, 0] / np.where(np.abs(gain) > 0.1, gain, np.inf)
+        explained = (slope * vector).sum((1, 2)) / np.maximum(products[:, 0, 0], 1e-12)
+        return np.clip(steps, -MAX_STEP, MAX_STEP), np.where(gain[:, 0] > 0, explained, 0)
+
+    def sharpness(self, frame: np.ndarray, moved: np.ndarray, colour: int) -> np.ndarray:
+        """Return the slope of the frame's gradient over the template's, in the pixels of a colour
+        (a central difference at one colour reads pixels of the other only)."""
+        total = np.zeros((2, len(self.place)), np.float32)
+        for ours, field in zip(_gradient(frame), self.fields[1:], strict=True):
+            seen, weight, (wanted,) = self._pair(ours, moved, (field,))
+            mine = (weight > 0) & (self.colour == colour)
+            total = total + np.stack([(seen * wanted * mine).sum(1), (wanted**2 * mine).sum(1)])
+        return total[0] / np.maximum(total[1], 1e-12)
+
+    def _pair(
+        self, frame: np.ndarray, moved: np.ndarray, fields: tuple[np.ndarray, ...]
+    ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+        """Return the frame's windows, their weights, and the fields' windows that fall there."""
+        whole = np.round(moved)
+        at = (self.place + whole).astype(int)
+        x, y = at[:, :1] + self.u, at[:, 1:] + self.v
+        height, width = frame.shape
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        seen = frame[y.clip(0, height - 1), x.clip(0, width - 1)]
+        here = self.home + (whole - moved)
+        return seen, self.weight * inside, [_sample(f, here, self.u, self.v) for f in fields]
+
+
+def _sample(picture: np.ndarray, at: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Return the picture (points, pixels) at `at` + (u, v), cubic; beyond the edge it is held."""
+    x, y = (at[:, 0, None] + u).astype(np.float32), (at[:, 1, None] + v).astype(np.float32)
+    return cv2.remap(picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _gradient(picture: Float[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return central differences along x and y."""
+    across = np.array([[-0.5, 0, 0.5]], np.float32)
+    return cv2.filter2D(picture, -1, across), cv2.filter2D(picture, -1, across.T)

@@ -1,0 +1,246 @@
+"""Turbulence in front of a still scene: what a video shows of tilt and blur, with intervals.
+
+Lengths are in pixels of a frame whose smaller side is 256.  Intervals of 95 % come from resampling
+blocks of frames and squares of the frame (bootstrap), which knows of chance only, and, for the
+numbers in METHOD_ERROR, from what the method itself errs by.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from src.recordings.calibration import tilt_covariance
+from src.recordings.calibration.point_tracking import PointTracks, find_corners, track_points
+from src.recordings.calibration.tilt_covariance import CELLS, CovarianceModel, TiltStatistics
+from src.recordings.files.turbulence_file import ALLOWED, SIDE, IntervalEstimate, TurbulenceFile
+
+SIZES = (512, 362, SIDE)  # pixels of the shorter side that is worked on: larger frames are shrunk
+MIN_TRACKED = 0.75  # of the corners, or the next smaller size is tried
+MIN_FRAMES, MIN_POINTS = 16, 40
+MIN_FOUND = 0.6  # of the frames, or a point is left out
+MIN_SHARE = 0.2  # of the corners must be tracked: where the camera moves, fewer are
+MAX_RELATIVE_POWER = 9.0  # times the median power: such a point moves by itself
+MAX_DRIFT_PX = 4.0  # between the quarters of a video: more is a camera that moves
+MIN_RMS_PX = 0.01  # less is the error of tracking
+DRAWS = 200
+SHARPEST = 0.1  # the sharpest tenth
+# Errors of the method at 95 %, of the logarithm, added to the intervals, from clips of known
+# turbulence (scripts/check_turbulence_meter.py): windows average, random blur shifts corners.
+METHOD_ERROR = {"rms_px": 0.15, "half_length_px": 0.3}
+
+
+@dataclass(frozen=True)
+class TurbulenceMeasurement:
+    """What was `found`, and the curves behind it, lengths in pixels of a frame of SIDE.
+
+    `tilt` holds curves over `distance_px`, over `fitted_px` and over lags in frames; `rms_px` of
+    every point at `place` (x, y), in pixels of `picture`; `corners`, how many it was tried with;
+    `fps` None: not known.
+    """
+
+    found: TurbulenceFile
+    tilt: TiltStatistics
+    distance_px: Float[np.ndarray, " distances"]
+    fitted_px: Float[np.ndarray, " k"]
+    picture: Float[np.ndarray, "h w"]
+    place: Float[np.ndarray, "points 2"]
+    rms_px: Float[np.ndarray, " points"]
+    frames: int
+    corners: int
+    fps: float | None
+
+
+def measure_turbulence(
+    frames: Float[np.ndarray, "frames h w"], fps: float | None = None
+) -> TurbulenceMeasurement:
+    """Measure the turbulence in a video of a still scene, grey in [0, 1]; `fps` None: not known.
+
+    Raises ValueError for a video that is too short, has no texture or moves.
+    """
+    if len(frames) < MIN_FRAMES:
+        raise ValueError(f"video must have at least {MIN_FRAMES} frames, got {len(frames)}")
+    level = frames.mean((1, 2), keepdims=True)
+    # To one mean brightness: flicker is not turbulence.
+    frames = (frames * (level.mean() / np.maximum(level, 1e-6))).astype(np.float32)
+    frames, tracks = _track_corners(frames)
+    size, corners = frames.shape[1:], len(tracks.place)
+    tracks = _select_still(tracks, size)
+    unit = SIDE / min(size)
+    pairs = tilt_covariance.sum_over_distance(tracks, size)
+    lags = tilt_covariance.sum_over_lags(tracks, size)
+    model = CovarianceModel(pairs.at, tracks.window_px2, size)
+    every = np.ones(len(frames)), np.ones(CELLS**2)
+    tilt = model.describe_tilt(
+        *pairs.weighted_mean(*every), lags.weighted_mean(*every)[0], len(frames)
+    )
+    rms_px = tilt.power**0.5 * unit
+    if rms_px < MIN_RMS_PX:
+        raise ValueError(
+            f"video must show a scene through turbulent air, got a tilt of {rms_px:.3f} px rms"
+            f" of {SIDE} at {len(tracks.place)} points, which is none"
+        )
+    drawn = [
+        model.describe_tilt(
+            *pairs.weighted_mean(*chosen), lags.weighted_mean(*chosen)[0], len(frames)
+        )
+        for chosen in _resampled(len(frames), 2 * tilt.decay_frames)
+    ]
+    numbers = _summarize_tilt(tilt, drawn, unit, fps, len(lags.at))
+    numbers["blur_ratio"] = estimate_blur_ratio(*_track_at_side(frames, tracks))
+    return TurbulenceMeasurement(
+        found=TurbulenceFile(**numbers),
+        tilt=tilt,
+        distance_px=pairs.at * unit,
+        fitted_px=model.fitted_px * unit,
+        picture=frames.mean(0),
+        place=tracks.place,
+        rms_px=np.sqrt(np.maximum(tilt_covariance.tilt_variance_per_axis(tracks), 0)) * unit,
+        frames=len(frames),
+        corners=corners,
+        fps=fps,
+    )
+
+
+def estimate_blur_ratio(tracks: PointTracks, size: tuple[int, int]) -> IntervalEstimate:
+    """Return how much wider an edge is at a typical moment than in its sharpest tenth of moments,
+    which up to a D/r0 of about 5 is nearly free of turbulence (Fried 1978, JOSA 68, 1651).
+
+    A moment's sharpness is the slope of its gradient over that of the registered mean.  Between
+    edges blurred by Gaussians of widths s and S that is sqrt(2 S^2 / (s^2 + S^2)), whence s / S.
+    The tenth is chosen by one estimate and measured by the other, so that noise does not choose.
+    """
+    rows = []
+    for chosen_by, value in (tracks.sharp, tracks.sharp[::-1]):
+        ranked = np.sort(np.where(tracks.seen, chosen_by, -np.inf), axis=0)[::-1]
+        most = np.maximum(np.round(SHARPEST * tracks.seen.sum(0)).astype(int), 1)
+        sharpest = tracks.seen & (chosen_by >= ranked[most - 1, np.arange(len(most))])
+        rows.append([(value * of).sum(0) / of.sum(0) for of in (tracks.seen, sharpest)])
+    slopes = np.mean(rows, axis=0) * tracks.texture
+    where = tilt_covariance.frame_squares(tracks, size)
+    sums = np.stack([np.bincount(where, row, CELLS**2) for row in (*slopes, tracks.texture)])
+    drawn = [_width_ratio(sums @ squares) for _, squares in _resampled(1, 1.0)]
+    return _estimate("blur_ratio", _width_ratio(sums @ np.ones(CELLS**2)), drawn)
+
+
+def _width_ratio(sums: Float[np.ndarray, "3"]) -> float:
+    """Return the ratio of widths for sums of slopes (all moments, the sharpest) and weights."""
+    usual, sharpest = (max(2 / (total / sums[2]) ** 2 - 1, 1e-3) for total in sums[:2])
+    return max(math.sqrt(usual / sharpest), 1.0)
+
+
+def shrink_frame(
+    frame: Float[np.ndarray, "h w"], largest: int = SIZES[0]
+) -> Float[np.ndarray, "_h _w"]:
+    """Return a frame whose smaller side has `largest` pixels at most: so large it is worked on."""
+    least = min(frame.shape)
+    if least <= largest:
+        return frame
+    height, width = (round(side * largest / least) for side in frame.shape)
+    return cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _track_at_side(frames: np.ndarray, tracks: PointTracks) -> tuple[PointTracks, tuple[int, int]]:
+    """Return the points tracked in frames of SIDE pixels, which blur ratios are stated for, and
+    the size of these."""
+    size = frames.shape[1:]
+    if min(size) <= SIDE:
+        return tracks, size
+    small = np.stack([shrink_frame(frame, SIDE) for frame in frames])
+    place = np.round(tracks.place * SIDE / min(size)).astype(np.float32)
+    again = track_points(small, place)
+    return again.select(again.seen.mean(0) >= MIN_FOUND), small.shape[1:]
+
+
+def _track_corners(frames: np.ndarray) -> tuple[np.ndarray, PointTracks]:
+    """Return the frames at the largest of SIZES at which most corners are tracked, and these: tilt
+    may move fine frames by more pixels than a corner can be tracked over."""
+    least, found = min(frames.shape[1:]), None
+    for side in (min(least, SIZES[0]), *(side for side in SIZES[1:] if side < least)):
+        small = np.stack([shrink_frame(frame, side) for frame in frames])
+        place = find_corners(small.mean(0))
+        if len(place) < MIN_POINTS:
+            break
+        found = small, track_points(small, place)
+        if (found[1].seen.mean(0) >= MIN_FOUND).mean() >= MIN_TRACKED:
+            break
+    if found is None:
+        raise ValueError(f"video must show texture, {MIN_POINTS} corners or more, got {len(place)}")
+    return found
+
+
+def _select_still(tracks: PointTracks, size: tuple[int, int]) -> PointTracks:
+    """Return the points that only turbulence moves; raises ValueError where few do."""
+    tracked = tracks.seen.mean(0) >= MIN_FOUND
+    share = f"{tracked.mean():.0%} of {len(tracked)} corners could be tracked"
+    if tracked.mean() < MIN_SHARE or tracked.sum() < MIN_POINTS:
+        raise ValueError(
+            f"video must show a scene that stands still: {share}, at least {MIN_SHARE:.0%} and"
+            f" {MIN_POINTS} are wanted"
+        )
+    tracks = tracks.select(tracked)
+    # How far apart the whole scene lies in the most different quarters of the video.
+    moved = np.where(tracks.seen[..., None], tracks.moved.mean(0), np.nan)
+    quarters = [np.nanmedian(part, axis=(0, 1)) for part in np.array_split(moved, 4)]
+    apart = max(np.hypot(*(one - other)) for one in quarters for other in quarters)
+    drift = float(apart) * SIDE / min(size)
+    if drift > MAX_DRIFT_PX:
+        raise ValueError(
+            f"video must show a scene that stands still, got one that moves by {drift:.0f} px of"
+            f" {SIDE}; {share}"
+        )
+    power = tilt_covariance.tilt_variance_per_axis(tracks)
+    return tracks.select(power < MAX_RELATIVE_POWER * np.median(power))
+
+
+def _resampled(frames: int, block: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield how often each frame, in blocks, and each square of the frame is drawn; DRAWS times."""
+    random, most = np.random.default_rng(0), frames // 4
+    length = int(np.clip(np.ceil(block), 1, max(most, 1))) if np.isfinite(block) else most
+    for _ in range(DRAWS):
+        starts = random.integers(frames, size=math.ceil(frames / length))
+        drawn = (starts[:, None] + np.arange(length)).ravel()[:frames] % frames
+        squares = random.integers(CELLS**2, size=CELLS**2)
+        times = np.bincount(drawn, minlength=frames), np.bincount(squares, minlength=CELLS**2)
+        yield times[0].astype(float), times[1].astype(float)
+
+
+def _summarize_tilt(
+    tilt: TiltStatistics, drawn: list[TiltStatistics], unit: float, fps: float | None, lags: int
+) -> dict[str, IntervalEstimate]:
+    """Return the numbers of the tilt; where a time or a length is beyond reach, what bounds it."""
+    lengths = [one.half_px * unit for one in drawn]
+    half = _estimate("half_length_px", tilt.half_px * unit, lengths, most=float(SIDE))
+    if half.value is not None and half.value < 1.3 * tilt_covariance.MIN_LENGTH_PX * unit:
+        half = half._replace(low=ALLOWED["half_length_px"][0])  # shorter ones look alike
+    spreads = [one.power**0.5 * unit for one in drawn]
+    shares = [one.uniform_share for one in drawn]
+    if fps is None:
+        decay = IntervalEstimate(None, None, None)
+    elif tilt.decay_frames < 1:  # within the first frame it has no value but a bound
+        decay = IntervalEstimate(None, None, 1 / fps)
+    else:
+        times = [max(one.decay_frames, 0.5) / fps for one in drawn]
+        decay = _estimate("decay_s", tilt.decay_frames / fps, times, most=(lags - 1) / fps)
+    return {
+        "rms_px": _estimate("rms_px", tilt.power**0.5 * unit, spreads),
+        "half_length_px": half,
+        "whole_share": _estimate("whole_share", tilt.uniform_share, shares),
+        "decay_s": decay,
+    }
+
+
+def _estimate(
+    name: str, value: float, drawn: list[float], most: float = np.inf
+) -> IntervalEstimate:
+    """Return a value with the middle 95 % of what was drawn; beyond `most` only that is known."""
+    low, high = np.percentile(np.nan_to_num(drawn, posinf=1e9), (2.5, 97.5))
+    low, high = min(low, value, most), max(high, value)
+    if value <= most and name in METHOD_ERROR:
+        low = value * math.exp(-math.hypot(math.log(value / max(low, 1e-9)), METHOD_ERROR[name]))
+        high = value * math.exp(math.hypot(math.log(high / value), METHOD_ERROR[name]))
+    low, middle, top = (float(number) for number in np.clip((low, value, high), *ALLOWED[name]))
+    return IntervalEstimate(middle if value <= most else None, low, top if high <= most else None)

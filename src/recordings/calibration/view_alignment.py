@@ -1,0 +1,212 @@
+"""From a picture that shows one target in every view to the homography of each view.
+
+The targets are found anywhere on the sensor, sorted into a grid, un-mirrored and matched to that of
+the centre view.  Points are (x, y) in sensor pixels, float64.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+from jaxtyping import Float, UInt8
+
+from src.recordings.calibration.boards import Points, Target, cluster_points
+from src.recordings.views import Size, View, Views
+from src.records import safe_yaml
+from src.sim.optics import Position
+
+MIN_VIEWS = 4
+MARGIN = 0.04  # of a tile's side, cut off at each seam
+MAX_ERROR_PX = 1.5  # a point further off is an outlier of the homography
+FLIPS = ((False, False), (True, False), (False, True), (True, True))
+
+
+def repair_picture(counts: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+    """Return counts of events, or any picture, as uint8; a pixel that stands out of its neighbours
+    by half the range gets their median (a median everywhere would move a target's corners).
+    """
+    counts = counts.astype(np.float32)
+    median = cv2.medianBlur(counts, 3)
+    low, high = np.percentile(median, [1, 99.5])
+    repaired = np.where(np.abs(counts - median) > (high - low) / 2, median, counts)
+    return np.clip((repaired - low) / max(high - low, 1e-9) * 255, 0, 255).astype(np.uint8)
+
+
+def find_target(
+    picture: UInt8[np.ndarray, "h w"], target: Target, mirrors: bool = True
+) -> dict[Position, Points]:
+    """Return the points of `target` in each view of a sensor picture in which it is found, row by
+    row, NaN where one is not seen.  `mirrors`: the view at (row, col) is mirrored in x for odd col
+    and in y for odd row; a target that knows its hand (ChArUco) decides itself.
+    """
+    clusters = cluster_points(target.detect_features(picture), target.count)
+    places = _sort_into_grid(np.array([cluster.mean(0) for cluster in clusters]), picture.shape)
+    points, mirrored = {}, {}
+    for position, cluster in zip(places, clusters, strict=True):
+        row, col = position
+        physical = (bool(mirrors and col % 2), bool(mirrors and row % 2))
+        for flip in FLIPS if target.ordered else (physical,):
+            seen = _find_flipped(picture, cluster, target, flip)
+            if seen is not None:
+                points[position], mirrored[position] = seen, flip
+                break
+    if (0, 0) in points and not target.ordered:
+        model = points[0, 0].reshape(*target.shape, 2)
+        points = {at: _reorder_like(model, seen, mirrored[at]) for at, seen in points.items()}
+    return points
+
+
+def _find_flipped(picture: np.ndarray, cluster: Points, target: Target, flip) -> Points | None:
+    """Find the target around `cluster`, the picture mirrored by `flip`; return sensor pixels."""
+    pitch = np.ptp(cluster, axis=0).max() / max(target.shape)
+    height, width = picture.shape
+    left, top = np.maximum(np.floor(cluster.min(0) - 1.7 * pitch), 0).astype(int)
+    right, bottom = np.ceil(cluster.max(0) + 1.7 * pitch).astype(int) + 1
+    crop = picture[top : min(bottom, height), left : min(right, width)]
+    crop = crop[:: -1 if flip[1] else 1, :: -1 if flip[0] else 1]
+    points = target.find_points(np.ascontiguousarray(crop))
+    if points is None:
+        return None
+    last = np.array(crop.shape[::-1]) - 1
+    return np.where(flip, last - points, points) + np.array([left, top])
+
+
+def _sort_into_grid(centres: np.ndarray, sensor: Size) -> list[Position]:
+    """Sort centres (k, 2) into (row, col) about the middle of a full 3x3, else of the sensor."""
+    if len(centres) < 2:
+        return [(0, 0)] * len(centres)
+    apart = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+    np.fill_diagonal(apart, np.inf)
+    pitch = np.median(apart.min(0))
+    middle = (centres.max(0) + centres.min(0)) / 2
+    whole = np.abs(np.ptp(centres, axis=0) - 2 * pitch) < 0.5 * pitch
+    middle = np.where(whole, middle, (np.array(sensor[::-1]) - 1) / 2)
+    return [(int(row), int(col)) for col, row in np.round((centres - middle) / pitch)]
+
+
+def _reorder_like(model: np.ndarray, seen: Points, mirrored: tuple[bool, bool]) -> Points:
+    """Order the lattice `seen` as `model` (rows, cols, 2) is: the nearest of its symmetries."""
+    upright = np.where(mirrored, -seen, seen).reshape(model.shape)
+    upright, model = upright - upright.mean((0, 1)), model - model.mean((0, 1))
+    best, fitting = np.inf, seen
+    for turned in (False, True) if model.shape[0] == model.shape[1] else (False,):
+        for rows, cols in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+            order = np.arange(len(seen)).reshape(model.shape[:2])[::rows, ::cols]
+            order = (order.T if turned else order).ravel()
+            error = np.abs(upright.reshape(-1, 2)[order] - model.reshape(-1, 2)).sum()
+            if error < best:
+                best, fitting = error, seen[order]
+    return fitting
+
+
+@dataclass(frozen=True)
+class AlignedViews:
+    """`views`, and per position the points used and what is left of them in the centre view."""
+
+    views: Views
+    points: Mapping[Position, Points]
+    residuals: Mapping[Position, Points]
+
+
+def fit_homographies(
+    found: Mapping[Position, Points], *, sensor: Size, model: Size
+) -> AlignedViews:
+    """Fit the homography of every view to the centre view, by RANSAC.
+
+    The field is the centre view's tile, cut to the model's aspect and by MARGIN of its side.
+    Raises ValueError for fewer than four views, or without the centre one.
+    """
+    if len(found) < MIN_VIEWS or (0, 0) not in found:
+        seen = sorted(found)
+        raise ValueError(
+            f"calibrate: the target must be seen in {MIN_VIEWS} or more views and in the centre"
+            f" one, got {len(seen)}: {seen}; give corners= by hand or another target="
+        )
+    centre = found[0, 0]
+    views, used, residuals = [], {}, {}
+    for at in sorted(found):
+        both = np.isfinite(found[at]).all(1) & np.isfinite(centre).all(1)
+        points, onto = found[at][both], centre[both]
+        if len(points) < 6:
+            raise ValueError(
+                f"calibrate: view {at} must share 6 or more points with the centre,"
+                f" got {len(points)}"
+            )
+        matrix, good = cv2.findHomography(points, onto, cv2.RANSAC, MAX_ERROR_PX, maxIters=5000)
+        if matrix is None:
+            raise ValueError(f"calibrate: no homography fits view {at} within {MAX_ERROR_PX} px")
+        good = good.ravel().astype(bool)
+        used[at] = points[good]
+        residuals[at] = cv2.perspectiveTransform(points[None, good], matrix)[0] - onto[good]
+        error = float(np.sqrt((residuals[at] ** 2).sum(1).mean()))
+        views.append(View(at, matrix, error, len(used[at])))
+    return AlignedViews(Views(sensor, model, _field(found, model), tuple(views)), used, residuals)
+
+
+def _field(found: Mapping[Position, Points], model: Size) -> tuple[float, float, float, float]:
+    """Return the largest rectangle of the model's aspect in the centre tile, less MARGIN.
+
+    The tile is bounded half way between a point and its image in each neighbour.
+    """
+    centre = found[0, 0]
+    middle = np.nanmean(centre, axis=0)
+    sides = {}
+    for at in ((0, -1), (-1, 0), (0, 1), (1, 0)):
+        axis = 0 if at[0] == 0 else 1
+        if at in found:
+            between = np.nanmean((centre + found[at]) / 2, axis=0)[axis]
+            sides[at] = abs(between - middle[axis]), between
+    if not sides:
+        raise ValueError("calibrate: the target must be seen beside the centre view, got none")
+    reach = np.median([distance for distance, _ in sides.values()])
+    left, top, right, bottom = (
+        sides[at][1] if at in sides else middle[axis] + sign * reach
+        for at, axis, sign in (((0, -1), 0, -1), ((-1, 0), 1, -1), ((0, 1), 0, 1), ((1, 0), 1, 1))
+    )
+    scale = min((right - left) / model[1], (bottom - top) / model[0]) * (1 - 2 * MARGIN) / 2
+    x, y = (left + right) / 2, (top + bottom) / 2
+    across, along = scale * model[1], scale * model[0]
+    return float(x - across), float(y - along), float(x + across), float(y + along)
+
+
+def views_from_corners(corners: Mapping[Position, Points], *, sensor: Size, model: Size) -> Views:
+    """Return the views whose four corners, those of one rectangle of the scene, are given.
+
+    The field is the bounding rectangle of the centre view's.  Raises ValueError without the centre
+    view, or for other than four finite corners.
+    """
+    for at, quad in corners.items():
+        if np.shape(quad) != (4, 2) or not np.isfinite(quad).all():
+            raise ValueError(f"calibrate.corners of view {at} must be four (x, y), got {quad}")
+    if (0, 0) not in corners:
+        raise ValueError(
+            f"calibrate.corners must have the centre view (0, 0), got {sorted(corners)}"
+        )
+    centre = corners[0, 0].astype(np.float32)
+    views = [
+        View(at, cv2.getPerspectiveTransform(corners[at].astype(np.float32), centre), 0.0, 4)
+        for at in sorted(corners)
+    ]
+    field = (*centre.min(0).tolist(), *centre.max(0).tolist())
+    return Views(sensor, model, field, tuple(views))
+
+
+def read_corners(path: Path | str) -> dict[Position, Points]:
+    """Read corners given by hand: a YAML list of {position: [row, col], corners: four [x, y]}.
+
+    Raises ValueError for anything else.
+    """
+    found = {}
+    try:
+        for entry in safe_yaml.read(path):
+            row, column = map(int, entry["position"])
+            corners = [(float(x), float(y)) for x, y in entry["corners"]]
+            found[row, column] = np.array(corners).reshape(-1, 2)
+    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, OverflowError) as error:
+        why = f"{type(error).__name__} {error}"
+        message = f"corners must be a list of position and corners, got {path}: {why}"
+        raise ValueError(message) from None
+    return found

@@ -1,0 +1,195 @@
+"""Events of any length to windows of voxel grids, in memory that does not grow.
+
+A network trained on windows of 1/120 s that is fed shorter ones gets fewer events and runs its
+recurrence more often: it fades.  So windows may overlap: each spans `frames_per_window` frames and
+continues the recurrent state of the window that ended where it starts.  Each of these interleaved
+phases is the reconstruction at the trained rate, and every event counts once per phase.  Times are
+microseconds of the recording's clock in float64.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from src.models.backward_warmup import check_backward_warmup_s
+from src.recordings.files.event_arrays import concatenate_events, count_before
+from src.recordings.sensor_lookup import SensorLookup
+
+COVERED = 0.99  # of the last window, or the recording ends before it
+TRAINED_WINDOW_S = 1 / 120
+
+
+class EventList(NamedTuple):
+    """What each event adds to a voxel grid: seconds since the window's start, pixel, weight, view;
+    one entry for every pixel that an event contributes to."""
+
+    t_s: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    weight: np.ndarray
+    view: np.ndarray
+
+
+@dataclass(frozen=True)
+class Window:
+    """The events in [start_us, end_us): the number of `events` in views and `outside` of all.
+
+    They lie in `voxels` or, for an EventListRuntime, in `event_list`.
+    """
+
+    start_us: float
+    end_us: float
+    events: int
+    outside: int
+    voxels: Float[np.ndarray, "views bins h w"] | None = None
+    event_list: EventList | None = None
+
+    @property
+    def length_s(self) -> float:
+        return (self.end_us - self.start_us) * 1e-6
+
+    def reversed(self) -> "Window":
+        """Return the window with time reversed: last event first, polarity inverted."""
+        if self.voxels is not None:
+            return replace(self, voxels=-self.voxels[:, ::-1])
+        assert self.event_list is not None
+        t, x, y, weight, view = (part[::-1] for part in self.event_list)
+        return replace(self, event_list=EventList(self.length_s - t, x, y, -weight, view))
+
+
+@dataclass(frozen=True)
+class WindowRule:
+    """How windows are cut and filled: each is frames_per_window / fps long and ends 1 / fps after
+    the one before.  `start_s` and `end_s` count from the first event.  `as_lists`: windows hold an
+    event list instead of a grid.  Raises ValueError for a value out of range.
+    """
+
+    fps: float = 120.0
+    frames_per_window: int = 1
+    bins: int = 5
+    splat: str = "bilinear"
+    start_s: float = 0.0
+    end_s: float = float("inf")
+    as_lists: bool = False
+
+    def __post_init__(self):
+        if not 0 < self.fps <= 1e6:
+            raise ValueError(f"fps must be in (0, 1e6], got {self.fps}")
+        if self.splat not in ("bilinear", "nearest"):
+            raise ValueError(f"splat must be bilinear or nearest, got {self.splat}")
+        if self.bins < 1:
+            raise ValueError(f"bins must be >= 1, got {self.bins}")
+        if not 0 <= self.start_s < self.end_s:
+            raise ValueError(
+                f"start_s must be >= 0 and before end_s, got {self.start_s}, {self.end_s}"
+            )
+
+
+def frames_per_window(window_length: str, fps: float) -> int:
+    """Return how many frames a window spans: `frame` one; `trained` TRAINED_WINDOW_S, if longer.
+
+    Raises ValueError for another `window_length`.
+    """
+    if window_length not in ("frame", "trained"):
+        raise ValueError(f"window_length must be frame or trained, got {window_length}")
+    return max(1, round(TRAINED_WINDOW_S * fps)) if window_length == "trained" else 1
+
+
+Cut = tuple[np.ndarray, float, float]  # events of a window, its start and end in us
+
+
+def cut_windows(
+    chunks: Iterable[np.ndarray], lookup: SensorLookup, rule: WindowRule
+) -> Iterator[Window]:
+    """Cut chunks of events (t x y p, in order of time) into windows.  Raises ValueError for time
+    running backwards, an event off the sensor, or less than one window."""
+    is_empty = True
+    for events, start_us, end_us in _cut(chunks, lookup, rule):
+        yield fill_window(events, lookup, rule, start_us, end_us)
+        is_empty = False
+    if is_empty:
+        raise ValueError(f"recording must be longer than one window of 1/{rule.fps} s, got less")
+
+
+def cut_windows_backward(
+    chunks: Iterable[np.ndarray], lookup: SensorLookup, rule: WindowRule, seconds: float
+) -> Iterator[Window]:
+    """Yield the windows of the first `seconds`, the last first, each `reversed`; as many as are a
+    multiple of the rule's `frames_per_window`, so that `ReconstructionState.reverse` gives every
+    phase its state.  Raises ValueError as `cut_windows` and for an impossible length of time.
+    """
+    end_s = min(rule.end_s, rule.start_s + check_backward_warmup_s(seconds))
+    cuts = list(_cut(chunks, lookup, replace(rule, end_s=end_s)))
+    whole = len(cuts) // rule.frames_per_window * rule.frames_per_window
+    for events, start_us, end_us in reversed(cuts[:whole]):
+        yield fill_window(events, lookup, rule, start_us, end_us).reversed()
+
+
+def _cut(chunks: Iterable[np.ndarray], lookup: SensorLookup, rule: WindowRule) -> Iterator[Cut]:
+    def cut(k: int) -> Cut:
+        to = start + k * 1e6 / rule.fps
+        since = start + (k - rule.frames_per_window) * 1e6 / rule.fps
+        return events[count_before(events, since) : count_before(events, to)], since, to
+
+    period, k, last, end = 1e6 / rule.fps, 1, -np.inf, np.inf
+    pending: list[np.ndarray] = []
+    for chunk in _check_chunks(chunks, lookup):
+        if not np.isfinite(last):
+            start, end = chunk["t"][0] + 1e6 * np.array([rule.start_s, rule.end_s])
+            last = start
+        chunk = chunk[count_before(chunk, start) :]
+        if not len(chunk):
+            continue
+        events = concatenate_events([*pending, chunk])
+        last = min(float(chunk["t"][-1]) + 1, end)
+        while start + k * period < last:
+            yield cut(k)
+            k += 1
+        oldest = start + (k - rule.frames_per_window) * period
+        pending = [events[count_before(events, oldest) :]]
+        if last == end:
+            break
+    while pending and start + (k - 1 + COVERED) * period <= last:
+        yield cut(k)
+        k += 1
+
+
+def _check_chunks(chunks: Iterable[np.ndarray], lookup: SensorLookup) -> Iterator[np.ndarray]:
+    last = None
+    for chunk in filter(len, chunks):
+        t = chunk["t"]
+        if (np.diff(t) < 0).any() or (last is not None and t[0] < last):
+            raise ValueError(
+                "recording must not run backwards in time, an event is before the last"
+            )
+        last = t[-1]
+        lookup.check_on_sensor(chunk)
+        yield chunk
+
+
+def fill_window(
+    events: np.ndarray, lookup: SensorLookup, rule: WindowRule, start_us: float, end_us: float
+) -> Window:
+    """Return the window [start_us, end_us) of `events`, which lie in it, as a grid or a list.
+
+    Both are in events per sensor pixel, as in training, however views are resampled.
+    """
+    nearest, density = rule.splat == "nearest", lookup.density[rule.splat]
+    if rule.as_lists:
+        (index, x, y, weight, view), outside = lookup.list_contributions(
+            events, density, nearest=nearest
+        )
+        length_s = (end_us - start_us) * 1e-6
+        t = np.clip((events["t"] - start_us) * 1e-6, 0, length_s)[index]
+        listed = EventList(t, x, y, weight, view)
+        return Window(start_us, end_us, len(events) - outside, outside, event_list=listed)
+    if not events.size:
+        empty = np.broadcast_to(np.float32(0), (lookup.views, rule.bins, *lookup.model))
+        return Window(start_us, end_us, 0, 0, empty)
+    grid = lookup.empty_grid(rule.bins)
+    outside = lookup.add_to_grid(events, grid, start_us, end_us, nearest=nearest)
+    grid /= density
+    return Window(start_us, end_us, len(events) - outside, outside, grid)

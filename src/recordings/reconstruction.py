@@ -1,0 +1,181 @@
+"""Windows of a recording to frames: on voxel grids or, where the network can, on event lists."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import cycle
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import nn
+
+from src.deploy.forms import in_form
+from src.deploy.runtime import FORMS, EventListRuntime, takes_event_lists
+from src.models.network import EventToVideoNetwork
+from src.recordings.event_windows import Window, WindowRule, cut_windows, cut_windows_backward
+from src.recordings.sensor_lookup import build_lookup
+from src.recordings.views import Views
+from src.sim.optics import Position
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A picture (h, w) float32 in [0, 1] at `time_s`, the end of its window; its window's number
+    of `events` in views and `outside` of all."""
+
+    time_s: float
+    picture: Float[np.ndarray, "h w"]
+    events: int
+    outside: int
+
+
+class ReconstructionState:
+    """What lives from frame to frame: the recurrent state of each phase of overlapping windows,
+    the last picture and the number of frames so far."""
+
+    def __init__(self, frames_per_window: int = 1):
+        self.states: list[Any] = [None] * frames_per_window
+        self.picture: Float[np.ndarray, "h w"] | None = None
+        self.frames = 0
+
+    def reverse(self) -> None:
+        """After windows backward in time, continue with the same windows forward."""
+        self.states.reverse()
+        self.frames = 0
+
+
+def as_event_network(method: nn.Module) -> EventToVideoNetwork:
+    """Return `method`; raises ValueError unless it is a network that events can be fed to."""
+    if not isinstance(method, EventToVideoNetwork):
+        name = type(method).__name__
+        raise ValueError(f"ckpt or baseline must name a network of events, got {name}")
+    return method
+
+
+def takes_all_views(network: EventToVideoNetwork, views: int) -> bool:
+    """Return whether `network` takes all `views`; False: it takes the centre view alone.
+
+    Raises ValueError where it wants another number of views.
+    """
+    wants = network.views
+    if wants not in (None, 1, views):
+        raise ValueError(
+            f"ckpt wants {wants} views, the recording has {views}; give views=views.yaml"
+        )
+    return wants != 1 or views == 1
+
+
+def default_window_length(network: EventToVideoNetwork) -> str:
+    """Return `frame` for a network that uses its window's length, else `trained`: most fade when
+    fed shorter windows than in training."""
+    return "frame" if network.uses_window_length else "trained"
+
+
+def prepare_network(
+    network: EventToVideoNetwork, form: str, device: str, views: Views, bins: int
+) -> EventToVideoNetwork | EventListRuntime:
+    """Return `network` as it is run: on a CPU an EventListRuntime where there is one for it.
+
+    Raises ValueError for a form, a device or a number of bins that do not go together.
+    """
+    if device != "cpu" and form == "openvino":
+        raise ValueError(f"device must be cpu for form=openvino, got {device}")
+    if device != "cpu" or form not in FORMS or not takes_event_lists(network):
+        return in_form(network, form).to(device)
+    if bins != network.bins:
+        raise ValueError(f"bins must be {network.bins} for this network, got {bins}")
+    sides = dict(zip(("height", "width"), views.model, strict=True))
+    threads = torch.get_num_threads()
+    return EventListRuntime(network, positions=views.positions, threads=threads, form=form, **sides)
+
+
+def reconstruct_recording(
+    read_events: Callable[[], Iterable[np.ndarray]],
+    network: EventToVideoNetwork | EventListRuntime,
+    views: Views,
+    rule: WindowRule,
+    backward_warmup_s: float = 0.0,
+    *,
+    device: torch.device | str = "cpu",
+) -> Iterator[Frame]:
+    """Yield the frames of the recording whose chunks `read_events` returns, each time it is called.
+
+    The network first reads `backward_warmup_s` backward, so that the first frame shows the scene.
+    """
+    lookup, state = build_lookup(views), ReconstructionState(rule.frames_per_window)
+    run = partial(reconstruct_frames, network=network, positions=views.positions, state=state)
+    if backward_warmup_s:
+        windows = cut_windows_backward(read_events(), lookup, rule, backward_warmup_s)
+        for _ in run(windows, device=device):
+            pass
+        state.reverse()
+    yield from run(cut_windows(read_events(), lookup, rule), device=device)
+
+
+def reconstruct_frames(
+    windows: Iterable[Window],
+    network: EventToVideoNetwork | EventListRuntime,
+    positions: Sequence[Position] | None = None,
+    state: ReconstructionState | None = None,
+    *,
+    device: torch.device | str = "cpu",
+) -> Iterator[Frame]:
+    """Reconstruct one frame per window; a window without events holds the picture at no cost.
+
+    `windows` hold lists of events for an EventListRuntime, else grids.  `state`, kept up to date,
+    with the rule's `frames_per_window`, makes this call the continuation of an earlier one.
+    """
+    state = ReconstructionState() if state is None else state
+    for window in windows:
+        phase = state.frames % len(state.states)
+        if window.events:
+            before = state.states[phase]
+            picture, after = _run(network, window, before, positions, device)
+            state.states[phase], state.picture = after, picture.clip(0, 1)
+        elif state.picture is None:
+            size = (
+                network.size
+                if isinstance(network, EventListRuntime)
+                else _voxels(window).shape[-2:]
+            )
+            state.picture = np.full(size, 0.5, np.float32)
+        state.frames += 1
+        yield Frame(window.end_us * 1e-6, state.picture, window.events, window.outside)
+
+
+def _run(
+    network: EventToVideoNetwork | EventListRuntime,
+    window: Window,
+    state: Any,
+    positions: Sequence[Position] | None,
+    device: torch.device | str,
+) -> tuple[np.ndarray, Any]:
+    if isinstance(network, EventListRuntime):
+        assert window.event_list is not None
+        network.state = state
+        return network.step(*window.event_list, 0.0, window.length_s), network.state
+    voxels = torch.from_numpy(_voxels(window))[None].to(device)
+    with torch.inference_mode():
+        picture, state = network(voxels, state, window_s=window.length_s, positions=positions)
+    return picture[0, 0].float().cpu().numpy(), state
+
+
+def _voxels(window: Window) -> Float[np.ndarray, "views bins h w"]:
+    assert window.voxels is not None, "windows of event lists are for an EventListRuntime"
+    return window.voxels
+
+
+def reconstruct_each_view(
+    windows: Iterable[Window], network: EventToVideoNetwork, frames_per_window: int = 1
+) -> Iterator[Float[np.ndarray, "views h w"]]:
+    """Reconstruct every view by itself, with a network of one view; empty windows hold."""
+    states, pictures = [None] * frames_per_window, None
+    for window, phase in zip(windows, cycle(range(frames_per_window)), strict=False):
+        if window.events or pictures is None:
+            voxels = torch.from_numpy(_voxels(window).copy())[:, None]
+            options = {"window_s": window.length_s, "positions": [(0, 0)]}
+            with torch.inference_mode():
+                pictures, states[phase] = network(voxels, states[phase], **options)
+        yield pictures[:, 0].clamp(0, 1).numpy()

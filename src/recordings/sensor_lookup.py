@@ -1,0 +1,119 @@
+"""The sensor lookup: one pass over a stream splits it into registered views."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+
+from src.recordings.engines.splat import list_bilinear_parts, list_nearest_pixels, splat_events
+from src.recordings.views import Size, Views
+
+MIN_DENSITY = 0.1  # where fewer sensor pixels than this map to a model pixel, no scaling up
+
+
+@dataclass(frozen=True)
+class SensorLookup:
+    """For each sensor pixel the index of its `view`, -1 for none, and its place `model_xy` in
+    model pixels; `views`: how many there are, `model`: (height, width) of each."""
+
+    view: Int[np.ndarray, "h w"]
+    model_xy: Float[np.ndarray, "h w 2"]
+    views: int
+    model: Size
+
+    def empty_grid(self, bins: int) -> Float[np.ndarray, "views bins h w"]:
+        """Return a voxel grid of zeros, float32."""
+        return np.zeros((self.views, bins, *self.model), np.float32)
+
+    def add_to_grid(
+        self,
+        events: np.ndarray,
+        grid: Float[np.ndarray, "views bins h w"],
+        start_us: float,
+        end_us: float,
+        *,
+        nearest: bool = False,
+    ) -> int:
+        """Add `events` (fields t x y p) to `grid` and return how many lie in no view.
+
+        An event weighs by E2VID's hat in the time from `start_us` to `end_us`, and bilinearly or at
+        the nearest pixel in space.  Raises ValueError for an event off the sensor.
+        """
+        self.check_on_sensor(events)
+        t, x, y, p = (events[name] for name in "txyp")
+        edges = float(start_us), float(end_us)
+        return splat_events(t, x, y, p, self.view, self.model_xy, grid, *edges, nearest)
+
+    def list_contributions(
+        self, events: np.ndarray, density: Float[np.ndarray, "views 1 h w"], *, nearest: bool
+    ) -> tuple[tuple[np.ndarray, ...], int]:
+        """Return what `add_to_grid` would add over `density`, one entry for every pixel that an
+        event contributes to: (index of the event, x, y, weight, view), and how many events lie in
+        no view.
+        """
+        self.check_on_sensor(events)
+        count = (1 if nearest else 4) * len(events)
+        dtypes = (np.int64, np.int64, np.int64, np.int64, np.float32)
+        index, u, v, which, weight = made = [np.empty(count, dtype) for dtype in dtypes]
+        x, y, p = (events[name] for name in "xyp")
+        if nearest:
+            entries, outside = list_nearest_pixels(
+                x, y, p, self.nearest_pixel, density[:, 0], *made
+            )
+        else:
+            geometry = self.view, self.model_xy, density[:, 0]
+            entries, outside = list_bilinear_parts(x, y, p, *geometry, *made)
+        return tuple(part[:entries] for part in (index, u, v, weight, which)), outside
+
+    @cached_property
+    def nearest_pixel(self) -> Int[np.ndarray, "h w"]:
+        """For each sensor pixel its nearest model pixel, counted through all views; -1: none."""
+        limit = np.array(self.model[::-1]) - 1
+        column, row = np.clip((self.model_xy + 0.5).astype(np.int32), 0, limit).transpose(2, 0, 1)
+        pixel = (self.view.astype(np.int32) * self.model[0] + row) * self.model[1] + column
+        return np.where(self.view >= 0, pixel, -1).astype(np.int32)
+
+    @cached_property
+    def density(self) -> dict[str, Float[np.ndarray, "views 1 h w"]]:
+        """Sensor pixels per model pixel, as events are laid, `bilinear` and `nearest`; a grid over
+        it is in events per sensor pixel."""
+        y, x = np.nonzero(self.view >= 0)
+        time, one = np.zeros(len(x), np.int64), np.ones(len(x), np.int8)
+        grids = {"bilinear": self.empty_grid(1), "nearest": self.empty_grid(1)}
+        for kind, grid in grids.items():
+            geometry = self.view, self.model_xy, grid
+            splat_events(time, x, y, one, *geometry, 0.0, 1.0, kind == "nearest")
+        return {kind: np.maximum(grid, MIN_DENSITY) for kind, grid in grids.items()}
+
+    def check_on_sensor(self, events: np.ndarray) -> None:
+        """Raise ValueError where an event lies off the sensor."""
+        height, width = self.view.shape
+        if events.size and (events["x"].max() >= width or events["y"].max() >= height):
+            reach = int(events["x"].max()), int(events["y"].max())
+            raise ValueError(
+                f"events must lie on the {width}x{height} sensor of views, got (x, y) up to {reach}"
+            )
+
+
+def build_lookup(views: Views) -> SensorLookup:
+    """Return the lookup of `views`; where two overlap, the one whose centre is nearer wins."""
+    height, width = views.sensor
+    y, x = np.mgrid[:height, :width].astype(np.float64)
+    sensor = np.stack([x, y], axis=-1)
+    best = np.full((height, width), np.inf)
+    owner = np.full((height, width), -1, np.int16)
+    model_xy = np.zeros((height, width, 2), np.float32)
+    middle = (np.array(views.model[::-1]) - 1) / 2
+    half = np.array(views.model[::-1]) / 2
+    for index, view in enumerate(views.views):
+        matrix = views.to_model(view)
+        uv = cv2.perspectiveTransform(sensor, matrix)
+        # Beyond the homography's horizon the plane comes again.
+        depth = sensor @ matrix[2, :2] + matrix[2, 2]
+        front = depth * (views.outline(view).mean(0) @ matrix[2, :2] + matrix[2, 2]) > 0
+        distance = np.abs((uv - middle) / half).max(-1)
+        mine = front & (distance <= 1) & (distance < best)
+        best[mine], owner[mine], model_xy[mine] = distance[mine], index, uv[mine]
+    return SensorLookup(owner, model_xy, len(views.views), views.model)

@@ -1,0 +1,124 @@
+"""Runs that differ in their seed only form a group, labelled by the settings that tell it apart."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from src.records.runs import Run, SweepPlan
+
+FIRST_KEYS = ("task", "method", "experiment", "resolution", "postprocess", "baseline", "optics")
+LAST_KEYS = ("budget", "debug")
+
+
+@dataclass
+class RunGroup:
+    """Runs of one setting, one per seed.
+
+    `missing`: seeds of the sweep that have no results; `older`: runs of a seed that has
+    a newer one.
+    """
+
+    label: tuple[str, ...]
+    runs: list[Run]
+    missing: int = 0
+    older: int = 0
+
+
+def group_runs(
+    runs: Sequence[Run], plans: Sequence[SweepPlan] = (), across: Sequence[str] = ()
+) -> tuple[tuple[str, ...], list[RunGroup]]:
+    """Return the keys of the labels, and a group per setting, in the order of the sweeps.
+
+    The keys are the fewest that tell the groups apart: first choices and what a command line has
+    set, then any other setting.  Like the seed, the settings `across` do not part groups, such as
+    ckpt for networks of several seeds tested on the same clips.  Of two runs with one setting and
+    seed the newer counts.
+    """
+    overridden = sorted({_override_key(override) for run in runs for override in run.overrides})
+    rows = [_label_values(run, overridden, across) for run in runs]
+    keys = _distinguishing_keys(rows)
+    groups: dict[tuple[str, ...], RunGroup] = {}
+    newest: dict[tuple[str, ...], dict[tuple, Run]] = defaultdict(dict)
+    for run, row in zip(runs, rows, strict=True):  # oldest first: the last one stays
+        label = tuple(row.get(key, "-") for key in keys)
+        draw = run.record["seed"], *(str(run.settings.get(key)) for key in across)
+        groups.setdefault(label, RunGroup(label, [])).older += draw in newest[label]
+        newest[label][draw] = run
+    for label, group in groups.items():
+        group.runs = [run for _, run in sorted(newest[label].items())]
+    return keys, _count_missing(list(groups.values()), keys, plans)
+
+
+def format_setting(value: Any) -> str:
+    """Return a setting as a person writes it."""
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    if isinstance(value, list):
+        return "[" + ", ".join(map(format_setting, value)) + "]"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def find_published(run: Run, published: Mapping[str, Any]) -> dict[str, float]:
+    """Return {metric: value} of the row of `published` that fits the run best; {} without one.
+
+    `published`: {rows: [{when: {key: value}, metric: value ...}]}; a row fits a run with each
+    choice or setting of its `when`.
+    """
+    settings = {key: format_setting(value) for key, value in run.settings.items()} | run.choices
+    fitting = [
+        row
+        for row in published["rows"]
+        if all(settings.get(key) == format_setting(value) for key, value in row["when"].items())
+    ]
+    best: dict = max(fitting, key=lambda row: len(row["when"]), default={})
+    return {metric: value for metric, value in best.items() if metric != "when"}
+
+
+def _override_key(override: str) -> str:
+    return override.split("=")[0].lstrip("+~").split("@")[0]
+
+
+def _label_values(run: Run, overridden: Sequence[str], across: Sequence[str]) -> dict[str, str]:
+    """Return the choices, the settings of the `overridden` keys, and all other settings."""
+    first = {k: v for k, v in run.choices.items() if k not in LAST_KEYS}
+    settings = {
+        k: format_setting(v) for k, v in run.settings_without_seed.items() if k not in across
+    }
+    for key in (key for key in overridden if key not in (*run.choices, *across)):
+        inside = [v for k, v in settings.items() if k == key or k.startswith(key + ".")]
+        first |= {key: ", ".join(inside)} if inside else {}
+    order = {key: place for place, key in enumerate(FIRST_KEYS)}
+    first = dict(sorted(first.items(), key=lambda item: order.get(item[0], len(order))))
+    return first | {k: v for k, v in run.choices.items() if k in LAST_KEYS} | settings
+
+
+def _distinguishing_keys(rows: Sequence[dict[str, str]]) -> tuple[str, ...]:
+    """Return the fewest keys, taken in order, that tell apart all rows that differ."""
+    chosen: list[str] = []
+    groups = 1
+    for key in dict.fromkeys(key for row in rows for key in row):
+        split = len({tuple(row.get(k) for k in [*chosen, key]) for row in rows})
+        if split > groups:
+            chosen, groups = [*chosen, key], split
+    return tuple(chosen) or ("experiment",)
+
+
+def _count_missing(
+    groups: list[RunGroup], keys: tuple[str, ...], plans: Sequence[SweepPlan]
+) -> list[RunGroup]:
+    """Add to each group, or as a new one, the jobs without results; return them as the jobs go."""
+    done = {frozenset(run.overrides) for group in groups for run in group.runs}
+    by_setting = {_without_seed(run.overrides): group for group in groups for run in group.runs}
+    ordered: dict[int, RunGroup] = {}
+    for job in (job for plan in plans for job in plan.jobs):
+        values = {_override_key(override): override.split("=", 1)[-1] for override in job}
+        new = RunGroup(tuple(values.get(key, "-") for key in keys), [])
+        group = by_setting.setdefault(_without_seed(job), new)
+        group.missing += frozenset(job) not in done
+        ordered[id(group)] = group
+    return list((ordered | {id(group): group for group in groups}).values())
+
+
+def _without_seed(overrides: Sequence[str]) -> frozenset[str]:
+    return frozenset(override for override in overrides if _override_key(override) != "seed")

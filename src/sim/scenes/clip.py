@@ -1,0 +1,103 @@
+"""Clean clips: what a scene makes, and the arguments that all scenes share."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from src.sim import noise
+from src.sim.checks import check_in_range, is_range
+
+SPLITS = ("train", "val", "test")
+RANGES = {  # of what scenes take; a share is one of the clips
+    "height": (8, math.inf),
+    "width": (8, math.inf),
+    "frames": (2, math.inf),
+    "contrast": (0, 1),
+    "rest_share": (0, 1),
+    "static_camera_share": (0, 1),
+    "flicker_share": (0, 1),
+    "max_cutouts": (0, math.inf),
+    "max_targets": (1, math.inf),
+}
+INTERVALS = ("photo_px_per_px", "speed_widths_per_s", "cutout_widths")  # of positive numbers
+
+
+@dataclass(frozen=True)
+class Clip:
+    """`frames` (frames, h, w) float32 in [0, 1], code values; `path_px`: the path (frames, 2) of a
+    known target's centre (x, y), where there is one; `illumination`: the factor in (0, 1] that a
+    flickering lamp puts on the light of each frame, which `frames`, the ground truth, are without.
+    """
+
+    frames: Float[Tensor, "frames h w"]
+    fps: float
+    name: str
+    path_px: Float[Tensor, "frames 2"] | None = None
+    illumination: Float[Tensor, " frames #h #w"] | None = None
+
+
+@runtime_checkable
+class Scene(Protocol):
+    """Where clean clips come from; the class is given `split`, `seed`, `frames` and `fps` beside
+    the values of the config."""
+
+    def clip(self, index: int) -> Clip:
+        """Return clip `index`, a function of `index` and the arguments of the class alone."""
+        ...
+
+
+@dataclass(kw_only=True, eq=False)
+class SceneBase:
+    """The arguments of every scene: size in pixels, number and rate of frames, split and seed.
+
+    Raises ValueError for an argument that is outside its range, also for those of other scenes
+    that RANGES and INTERVALS hold.
+    """
+
+    height: int = 256
+    width: int = 256
+    frames: int = 41
+    fps: float = 120.0
+    split: str = "train"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_split(self.split)
+        if not 0 < self.fps < math.inf:
+            raise ValueError(f"fps must be > 0, got {self.fps}")
+        given = vars(self)
+        for name in RANGES.keys() & given:
+            check_in_range(f"scene.{name}", given[name], *RANGES[name])
+        for name in given.keys() & INTERVALS:
+            ends = list(given[name])
+            if not is_range(ends) or not 0 < ends[0] <= ends[1] < math.inf:
+                raise ValueError(f"scene.{name} must be a range 0 < low <= high, got {ends}")
+        self.size = self.height, self.width
+        self.times_s = np.arange(self.frames) / self.fps
+
+    def shared_arguments(self) -> dict[str, Any]:
+        """Return the arguments of SceneBase, for a scene within this one."""
+        return {one.name: getattr(self, one.name) for one in fields(SceneBase)}
+
+
+class FrameRateMixture:
+    """Scenes that differ in frame rate: clip k is that of one of them, drawn by its number."""
+
+    def __init__(self, scenes: Sequence[Scene]):
+        self.scenes = list(scenes)
+
+    def clip(self, index: int) -> Clip:
+        draw = float(noise.uniform(noise.key("rate"), torch.tensor(index)))
+        return self.scenes[int(draw * len(self.scenes))].clip(index)
+
+
+def check_split(split: str) -> None:
+    """Raise ValueError for a split that is none."""
+    if split not in SPLITS:
+        raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split}")

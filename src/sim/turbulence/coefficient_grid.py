@@ -1,0 +1,156 @@
+"""Regular grids over an endless image, interpolation between their nodes, and sums of waves there.
+
+A grid holds every `pitch`-th pixel, pixel 0 being the first of the frame, so that a crop uses the
+same nodes as the frame.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from jaxtyping import Complex, Float, Int
+from torch import Tensor
+from torch.nn.functional import pad
+
+from src.sim.turbulence.engines.waves_numba import join_parities, split_even_odd
+from src.sim.turbulence.zernike import noll_index
+
+# Of the variance of the modes of a radial order, tilt and the rest, that is left out with the
+# weakest waves.
+OMITTED_VARIANCE = 1e-4, 3e-3
+PADDED_COLUMNS = 8  # products of matrices with a multiple of it are faster
+
+
+@dataclass(frozen=True)
+class GridAxis:
+    """The nodes along one axis that pixels start .. start + count - 1 need.
+
+    `order` 1 interpolates linearly between two nodes, 3 by Lagrange's cubic through four.
+    """
+
+    start: int
+    count: int
+    pitch: int
+    order: int
+
+    @property
+    def first(self) -> int:
+        """The number of the first node; it lies on pixel first * pitch."""
+        return self.start // self.pitch - (self.order == 3 and self.pitch > 1)
+
+    @property
+    def nodes(self) -> int:
+        if self.pitch == 1:
+            return self.count
+        last = (self.start + self.count - 1) // self.pitch + (2 if self.order == 3 else 1)
+        return last + 1 - self.first
+
+    @property
+    def pixels(self) -> Int[Tensor, " nodes"]:
+        return (torch.arange(self.nodes) + self.first) * self.pitch
+
+    @property
+    def offset(self) -> int:
+        """How many pixels the first pixel lies after the first node."""
+        return self.start - self.first * self.pitch
+
+    def interpolation_matrix(self) -> Float[Tensor, "count nodes"]:
+        """Return the weight of every node in every pixel; rows sum to 1."""
+        if self.pitch == 1:
+            return torch.eye(self.count)
+        pixel = torch.arange(self.count) + self.offset
+        cell = torch.div(pixel, self.pitch, rounding_mode="floor")
+        t = (pixel - cell * self.pitch).double() / self.pitch
+        near, taps = torch.arange(2), [1 - t, t]
+        if self.order == 3:  # Lagrange's weights of the nodes -1, 0, 1, 2
+            near, below, above = torch.arange(-1, 3), t + 1, t - 2
+            taps = [-t * (t - 1) * above / 6, below * (t - 1) * above / 2]
+            taps += [-below * t * above / 2, below * t * (t - 1) / 6]
+        weights = torch.zeros(self.count, self.nodes, dtype=torch.float64)
+        return weights.scatter_(1, cell[:, None] + near, torch.stack(taps, dim=-1)).float()
+
+
+Grid = tuple[GridAxis, GridAxis]  # rows and columns
+
+
+def omit_weak_waves(
+    response: Complex[Tensor, "modes waves"], first: int
+) -> Complex[Tensor, "modes waves"]:
+    """Return `response` with 0 for waves that hardly count for a radial order (OMITTED_VARIANCE).
+
+    Row 0 is mode `first`, 0 being x-tilt.
+    """
+    strongest = torch.zeros_like(response)
+    for rows in radial_orders(first, len(response)):
+        power, rank = response[rows].abs().square().sum(0).sort()
+        waves = rank[power.cumsum(0) > OMITTED_VARIANCE[first > 1] * power.sum()]
+        strongest[rows, waves] = response[rows, waves]
+    return strongest
+
+
+def radial_orders(first: int, modes: int) -> list[slice]:
+    """Return the modes of each radial order n, as slices; mode 0 of them is `first`."""
+    order = [noll_index(mode + 2)[0] for mode in range(first, first + modes)]
+    edges = [i for i in range(modes + 1) if i in (0, modes) or order[i] != order[i - 1]]
+    return [slice(*pair) for pair in pairwise(edges)]
+
+
+class WaveSum:
+    """Sums of plane waves at the nodes of a grid on the CPU, by products of matrices.
+
+    A wave on a grid is its rows times its columns.  There is a product for all modes of a radial
+    order, over the waves that it sees, for what is even about the middle column and for what is
+    odd.  `response`: that of `omit_weak_waves`, row 0 being mode `first`; `rows`, `columns`:
+    exp(-2 pi i f x) from the middle of the grid on.
+    """
+
+    def __init__(
+        self,
+        response: Complex[Tensor, "modes waves"],
+        rows: Complex[Tensor, "waves rows"],
+        columns: Complex[Tensor, "waves columns"],
+        first: int,
+    ):
+        half = columns[:, columns.shape[1] // 2 :]
+        half = pad(half, (0, -half.shape[1] % PADDED_COLUMNS))
+        self.orders: list[tuple[slice, list[np.ndarray], Tensor, Tensor]] = []
+        for modes in radial_orders(first, len(response)):
+            waves = (response[modes] != 0).any(0).nonzero()[:, 0]
+            weights = torch.view_as_real(response[modes, waves].contiguous()).numpy()
+            down = [part[waves].T.contiguous().numpy() for part in (rows.real, -rows.imag)]
+            across = half.real[waves], -half.imag[waves]
+            self.orders.append((modes, [weights, waves.numpy(), *down], *across))
+        self.shape = len(response), rows.shape[1], columns.shape[1]
+
+    def __call__(
+        self, amplitudes: Complex[Tensor, "frames waves"]
+    ) -> Float[Tensor, "modes frames rows columns"]:
+        """Return Re sum_m amplitude_m response_m exp(2 pi i f_m . x) at the nodes."""
+        modes, rows, columns = self.shape
+        out = torch.empty(modes, len(amplitudes), rows, columns)
+        drawn = torch.view_as_real(amplitudes.contiguous()).numpy()
+        for order, (weights, waves, cos_y, sin_y), cos_x, sin_x in self.orders:
+            even, odd = split_even_odd(weights, drawn, waves, cos_y, sin_y)
+            even, odd = torch.from_numpy(even) @ cos_x, torch.from_numpy(odd) @ sin_x
+            join_parities(even.numpy(), odd.numpy(), out[order].view(-1, columns).numpy())
+        return out
+
+
+def waves_on_grid(
+    rows: Complex[Tensor, "waves rows"], columns: Complex[Tensor, "waves columns"]
+) -> Float[Tensor, "twice_the_waves rows columns"]:
+    """Return the real and the negative imaginary part of waves at all nodes; see WaveSum."""
+    waves = torch.view_as_real(rows[:, :, None] * columns[:, None])
+    return waves.permute(0, 3, 1, 2).flatten(0, 1)
+
+
+def sum_waves(
+    response: Complex[Tensor, "modes waves"],
+    amplitudes: Complex[Tensor, "n waves"],
+    waves: Float[Tensor, "twice_the_waves rows columns"],
+) -> Float[Tensor, "modes n rows columns"]:
+    """Return the same as WaveSum in one product of matrices, for a device."""
+    parts = torch.view_as_real(response[:, None] * amplitudes).flatten(2).flatten(0, 1)
+    found = parts @ waves.flatten(1)
+    return found.view(len(response), len(amplitudes), *waves.shape[1:])

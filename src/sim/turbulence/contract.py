@@ -1,0 +1,69 @@
+"""What the pipeline asks of turbulence: the contract of `turbulence._target_`.
+
+A model draws the parameters of a clip and makes the operator of that clip.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from src.sim.optics import Position
+
+Crop = tuple[int, int, int, int]  # top, left, height, width
+
+
+@runtime_checkable
+class TurbulenceOperator(Protocol):
+    """The turbulence of one clip, between its clean frames and the views of a light field.
+
+    All randomness comes from the generator: the same state gives the same result, on any device.  A
+    view depends on its own position only, and a crop is that part of the whole.
+    """
+
+    @property
+    def metadata(self) -> Mapping[str, float | int | str]:
+        """What is recorded about the clip; `severity` (weak, medium, strong or none) is there."""
+
+    def degrade(
+        self,
+        frames: Float[Tensor, "n frames h w"],
+        generator: torch.Generator,
+        *,
+        crop: Crop | None = None,
+    ) -> Float[Tensor, "n views frames hc wc"]:
+        """Return every view of `crop` (None: the whole frame); linear light, float32."""
+
+    def tilt(
+        self, frames: int, generator: torch.Generator, *, crop: Crop | None = None
+    ) -> Float[Tensor, "views frames 2 hc wc"]:
+        """Return the displacement (x, y) in pixels that `degrade` gives its first clip."""
+
+
+@runtime_checkable
+class PreparableTurbulence(TurbulenceOperator, Protocol):
+    """Turbulence that another process prepares than the one that computes the pixels."""
+
+    def prepare(self, frames: int, generator: torch.Generator, crop: Crop) -> Any:
+        """Return a picklable operator for one clip of so many frames, in `crop` only."""
+
+
+@runtime_checkable
+class TurbulenceModel(Protocol):
+    """Where the turbulence of every clip comes from."""
+
+    def draw(self, generator: torch.Generator) -> Any:
+        """Draw the parameters of a clip: a small object that can be pickled."""
+
+    def operator(
+        self, drawn: Any, *, views: Sequence[Position], height: int, width: int, fps: float
+    ) -> TurbulenceOperator:
+        """Return the operator of these parameters, for frames of `height` x `width` at `fps`."""
+
+
+def check_option(valid: bool, name: str, allowed: str, value: object) -> None:
+    """Raise ValueError, naming `turbulence.name`, unless `valid`."""
+    if not valid:
+        raise ValueError(f"turbulence.{name} must be {allowed}, got {value}")

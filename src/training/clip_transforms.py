@@ -1,0 +1,119 @@
+"""Windows, views and pixels of clips rearranged: pauses, flips, dropped and shifted views.
+
+Own code, not kornia's: draws come from keys, voxel grids and frames go along, and a batch takes one
+gather (python -m benchmarks.operators counts 40 times fewer operators than clip by clip).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int, Shaped
+from torch import Tensor
+from torch.nn import functional
+
+from src.sim.pipeline import Sample
+
+FRAMES = {"target", "turbulent", "teacher_frames"}  # of a sample, transformed like its grids
+
+
+class ClipTransform(NamedTuple):
+    """What a clip becomes: its `source_windows` (windows,), without events where `paused`
+    (windows,), flipped along `flip_axes`; the views are those of `view_order` (kept,), of which
+    some (view, rows, columns) in `view_shifts` lie so many pixels further up and left.
+    """
+
+    source_windows: Int[Tensor, " windows"]
+    paused: Bool[Tensor, " windows"]
+    flip_axes: list[int]
+    view_order: Int[Tensor, " kept"]
+    view_shifts: list[tuple[int, int, int]]
+
+
+def transform_clips(
+    samples: Sequence[Sample],
+    transforms: Sequence[ClipTransform],
+    out: Float[Tensor, "n windows kept bins h w"],
+) -> dict[str, Float[Tensor, "n windows 1 h w"]]:
+    """Write the transformed grids to `out`, window by window, which stays in the CPU's cache;
+    return the transformed FRAMES.
+    """
+    clips = [(sample, clip) for sample in samples for clip in range(len(sample.voxels))]
+    frames: dict[str, list[Tensor]] = {}
+    for (sample, clip), transform, grids in zip(clips, transforms, out, strict=True):
+        source, axes = transform.source_windows, transform.flip_axes
+        paused = transform.paused.tolist()
+        for grid, window, is_paused in zip(grids, source.tolist(), paused, strict=True):
+            if is_paused:
+                grid.zero_()
+            else:
+                views = sample.voxels[clip, window].index_select(0, transform.view_order)
+                grid.copy_(flip_frames(views, axes))
+        shift_views(grids, transform.view_shifts)
+        for name in FRAMES & sample.tensors().keys():
+            part = getattr(sample, name)[clip, source]
+            frames.setdefault(name, []).append(flip_frames(part, axes))
+    return {name: torch.stack(parts) for name, parts in frames.items()}
+
+
+def transform_batch(
+    sample: Sample,
+    transforms: Sequence[ClipTransform],
+    out: Float[Tensor, "n windows kept bins h w"],
+) -> dict[str, Float[Tensor, "n windows 1 h w"]]:
+    """Do as `transform_clips` in one gather for the grids and one for each of FRAMES."""
+    device, (height, width) = out.device, out.shape[-2:]
+    clip, bins = (torch.arange(count, device=device) for count in (len(transforms), out.shape[3]))
+    window = torch.stack([transform.source_windows for transform in transforms]).to(device)
+    paused = torch.stack([transform.paused for transform in transforms]).to(device)
+    view = torch.stack([transform.view_order for transform in transforms]).to(device)
+    pixel, is_inside = (part.to(device) for part in source_pixels(transforms, height, width))
+    grids = sample.voxels.flatten(-2)[
+        clip[:, None, None, None, None], window[:, :, None, None, None],
+        view[:, None, :, None, None], bins[:, None], pixel[:, None, :, None],
+    ]  # fmt: skip
+    is_empty = paused[:, :, None, None, None] | ~is_inside[:, None, :, None]
+    out.flatten(-2).copy_(grids.masked_fill_(is_empty, 0))
+    if any(transform.view_shifts for transform in transforms):  # frames are not shifted
+        unshifted = [transform._replace(view_shifts=[]) for transform in transforms]
+        pixel = source_pixels(unshifted, height, width)[0].to(device)
+    place = clip[:, None, None], window[:, :, None], pixel
+    return {
+        name: getattr(sample, name).flatten(2)[place].unflatten(-1, (1, height, width))
+        for name in FRAMES & sample.tensors().keys()
+    }
+
+
+def source_pixels(
+    transforms: Sequence[ClipTransform], height: int, width: int
+) -> tuple[Int[Tensor, "n views pixels"], Bool[Tensor, "n views pixels"]]:
+    """Return which pixel each pixel of each view comes from (one view for all, where none is
+    shifted), and whether there is one.
+    """
+    numbers = torch.arange(1, height * width + 1).view(1, 1, 1, height, width)
+    has_shifts = any(transform.view_shifts for transform in transforms)
+    sources = []
+    for transform in transforms:
+        pixels = flip_frames(numbers, transform.flip_axes)
+        views = pixels.repeat(1, len(transform.view_order) if has_shifts else 1, 1, 1, 1)
+        sources.append(shift_views(views, transform.view_shifts).flatten(3)[0, :, 0] - 1)
+    source = torch.stack(sources)
+    return source.clamp(min=0), source >= 0
+
+
+def flip_frames(frames: Tensor, axes: list[int]) -> Tensor:
+    """Return frames (..., h, w) flipped along `axes`; not a copy where there are none."""
+    return frames.flip(axes) if axes else frames
+
+
+def shift_views(
+    voxels: Shaped[Tensor, "windows views bins h w"], shifts: Sequence[tuple[int, int, int]]
+) -> Shaped[Tensor, "windows views bins h w"]:
+    """Shift (view, rows, columns) up and left, in place; zeros come in at the border."""
+    height, width = voxels.shape[-2:]
+    for view, up, left in shifts:
+        reach = max(abs(up), abs(left))
+        padded = functional.pad(voxels[:, view], (reach,) * 4)
+        rows, columns = slice(reach + up, reach + up + height), slice(reach + left, None)
+        voxels[:, view] = padded[..., rows, columns][..., :width]
+    return voxels

@@ -1,0 +1,147 @@
+"""The learning curve of a training, which is exported with its weights and continued from there."""
+
+from collections.abc import Iterable
+from copy import deepcopy
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import torch
+from lightning import Callback, Trainer
+
+from src.metrics.table import NAMES
+from src.models import files
+from src.records.atomic import write_text
+from src.records.results import format_csv
+from src.training.ema import averaged_weights
+from src.training.reconstructor import Reconstructor
+
+COLLAPSE_FACTOR = 1.5  # of the mean loss over the least of all rows so far
+TRAINING_STATE = "reached"  # key of what a training continues from, in the card of shipped weights
+
+
+class LearningCurve(Callback):
+    """Score the validation clips at the start, every `every_h` hours of the module's clock and at
+    the end (None: never); write all rows so far to the CSV file `path`.
+
+    A row: hours, steps, windows trained on, mean training loss since the row before, scores.  The
+    rows are part of checkpoints.  `export`: also write the weights to this file (.safetensors,
+    float16), at each row and when the training is cut short.  Raises ValueError for
+    values out of range and, keeping the export of the row before, where the loss has risen to
+    COLLAPSE_FACTOR times its least, as when no gradient reaches the network any more.
+    """
+
+    def __init__(self, path: str, every_h: float | None = None, export: str | None = None):
+        if every_h is not None and not every_h > 0:
+            raise ValueError(f"callbacks.learning_curve.every_h must be > 0 or null, got {every_h}")
+        if export is not None and Path(export).suffix != ".safetensors":
+            raise ValueError(f"export must be a .safetensors file or null, got {export}")
+        self.path, self.every_h = Path(path), every_h
+        self.export = Path(export) if export else None
+        self.rows: list[dict] = []
+        self.loss, self.steps = 0.0, 0  # since the last row
+        self.first_row = 0  # whose loss is that of this training
+
+    def state_dict(self) -> dict:
+        return {key: getattr(self, key) for key in ("rows", "loss", "steps", "first_row")}
+
+    def load_state_dict(self, state_dict: dict) -> None:
+        vars(self).update(state_dict)
+
+    def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
+        if self.every_h is None or not trainer.is_global_zero:
+            return
+        if self.rows:
+            self._write()
+        else:
+            self.add_row(trainer, pl_module)
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
+        if self.every_h is None or not trainer.is_global_zero:
+            return
+        self.loss += float(trainer.callback_metrics["train/loss"])
+        self.steps += 1
+        is_due = pl_module.clock.hours // self.every_h > self.rows[-1]["hours"] // self.every_h
+        if is_due or trainer.should_stop or trainer.global_step == trainer.max_steps:
+            self.add_row(trainer, pl_module)
+
+    def on_exception(self, trainer: Trainer, pl_module: Any, exception: BaseException) -> None:
+        if self.rows and trainer.is_global_zero:
+            self.export_weights(pl_module)
+
+    def add_row(self, trainer: Trainer, module: Reconstructor) -> None:
+        """Score the validation clips, write the row, export the weights."""
+        row = {
+            "hours": module.clock.hours,
+            "steps": module.total_steps,
+            "windows": module.windows_seen,
+            "loss": self.loss / self.steps if self.steps else "",
+        }
+        losses = [r["loss"] for r in [*self.rows[self.first_row :], row] if r["loss"] != ""]
+        if losses and losses[-1] > COLLAPSE_FACTOR * min(losses):
+            text = f"its mean loss is {losses[-1]:.3g} after {min(losses):.3g}"
+            if self.export:
+                text += f"; {self.export} holds the weights of {self.rows[-1]['hours']:.2f} hours"
+            self.export = None  # so that these are kept
+            raise ValueError(f"the training has collapsed: {text}")
+        self.rows.append(row | mean_scores(trainer, module))
+        self.loss, self.steps = 0.0, 0
+        self._write()
+        self.export_weights(module)
+        module.clock.start()
+
+    def export_weights(self, module: Reconstructor) -> None:
+        """Write the (averaged) weights with all that a training needs to continue from them."""
+        if self.export is None:
+            return
+        reached = {"hours": module.clock.hours, "windows": module.windows_seen}
+        card = reached | {"steps": module.total_steps, "loss": self.loss, "curve": self.rows}
+        with averaged_weights(module):
+            # A copy: spectral norm is folded in eval mode, and the training continues in its own.
+            files.save(self.export, deepcopy(module.network), module.network_spec, card)
+
+    def _write(self) -> None:
+        heads = list(self.rows[-1])
+        rows = [[row.get(name, "") for name in heads] for row in self.rows]
+        write_text(self.path, format_csv(heads, rows))
+
+
+@torch.no_grad()
+def mean_scores(trainer: Trainer, module: Reconstructor) -> dict[str, float]:
+    """Return the mean of every score over the validation clips, of the averaged weights."""
+    module.eval()
+    with averaged_weights(module):
+        samples = trainer.datamodule.validation_samples()  # type: ignore[attr-defined]
+        clips = [scores for sample in samples for scores in module.score_and_record_clips(sample)]
+    module.metrics.reset()
+    module.train()
+    return {name: fmean(clip[name] for clip in clips) for name in NAMES if name in module.metrics}
+
+
+def read_training_progress(path: Path) -> dict:
+    """Return hours, windows, steps, the loss since the last row of the curve, and the curve so far
+    of the weights `path`: a LearningCurve's export, or shipped weights of a training with one.
+
+    Raises ValueError for weights that were written otherwise.
+    """
+    card = files.read_card(path)
+    card = card.get(TRAINING_STATE, card)
+    if "curve" not in card:
+        raise ValueError(f"ckpt must be a checkpoint or weights with a learning curve, got {path}")
+    return card
+
+
+def restore_training_progress(
+    module: Reconstructor, callbacks: Iterable[Callback], path: Path
+) -> None:
+    """Give `module` the weights, time, steps and windows, and the curve among `callbacks` the rows
+    of `path`; the optimiser starts anew.  Raises ValueError as `read_training_progress` does.
+    """
+    before = read_training_progress(path)
+    files.restore_weights(module.network, path)
+    module.clock.seconds, module.windows_seen = 3600 * before["hours"], before["windows"]
+    module.earlier_steps = before["steps"]
+    for curve in (found for found in callbacks if isinstance(found, LearningCurve)):
+        curve.rows, curve.loss = list(before["curve"]), before["loss"]
+        curve.first_row = len(curve.rows)  # the loss may have been another one before
+        curve.steps = before["steps"] - curve.rows[-1]["steps"]

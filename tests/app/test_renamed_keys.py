@@ -1,0 +1,58 @@
+"""A key of an earlier version ends in one line that names the new key, wherever it was given."""
+
+import subprocess
+import sys
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from src.app import renamed_keys
+from tests.conftest import ROOT
+
+ENTRY_POINTS = sorted(file.stem for file in (ROOT / "conf").glob("*.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("key", "explanation"),
+    [
+        ("calm", "calm is now loss.static_flicker.weight"),
+        ("calm.inner", "calm.inner is now loss.static_flicker.weight.inner"),
+        ("calmer", None),
+        ("seed", None),
+    ],
+)
+def test_a_key_below_a_former_one_is_renamed_with_it(key, explanation):
+    assert renamed_keys.describe_renaming(key) == explanation
+
+
+def test_the_longest_former_key_wins_and_a_removed_one_says_so(monkeypatch):
+    monkeypatch.setattr(renamed_keys, "RENAMED_KEYS", {"a": "b", "a.c": "d", "e": None})
+    keys = ("a.c.x", "a.x", "e.x")
+    expected = ["a.c.x is now d.x", "a.x is now b.x", "e.x was removed"]
+    assert [renamed_keys.describe_renaming(key) for key in keys] == expected
+
+
+def test_a_former_key_in_a_config_file_is_refused():
+    with pytest.raises(ValueError, match="^calm is now loss.static_flicker.weight$"):
+        renamed_keys.check_keys(OmegaConf.create({"seed": 0, "calm": 1}))
+
+
+@pytest.mark.parametrize("entry_point", ENTRY_POINTS)
+def test_no_entry_point_has_a_former_key(entry_point):
+    with initialize_config_dir(str(ROOT / "conf"), version_base=None):
+        cfg = compose(entry_point)
+    renamed_keys.check_keys(cfg)
+
+
+@pytest.mark.parametrize(
+    ("entry_point", "override"),
+    [("train", "calm=1"), ("eval", "+calm=1"), ("report", "++calm=1"), ("chart", "~calm")],
+)
+def test_the_command_line_gets_one_line_and_exit_code_2(entry_point, override, tmp_path):
+    command = [sys.executable, "-m", f"src.{entry_point}", override, f"paths.out={tmp_path}"]
+    if entry_point == "report":
+        command.append("run=nowhere")
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == ["error: calm is now loss.static_flicker.weight"]

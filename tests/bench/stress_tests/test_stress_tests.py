@@ -1,0 +1,181 @@
+"""Event clips against the pipeline; results; networks whose result of a stress test is known."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from baselines.highpass import HighPass
+from src.bench.candidates import Candidate
+from src.bench.stress_tests import conditions, recurrence
+from src.bench.stress_tests.event_clips import ClipConditions, StressBench, simulate_event_clip
+from src.bench.stress_tests.stress_results import StressResult
+from src.models.network import EventToVideoNetwork
+from src.models.setnet import SetNet
+from src.sim.optics import Optics
+from src.sim.pipeline import Pipeline, simulate
+from src.sim.scenes.photographs import Photographs
+from src.sim.sensor import EventSensor
+from src.sim.turbulence.simulated import SimulatedTurbulence
+
+FPS = 120.0
+
+
+def pipeline(windows: int = 16, views: int = 9) -> Pipeline:
+    scene = Photographs(split="test", height=64, width=64, frames=windows + 1)
+    air = SimulatedTurbulence({"severity": "medium", "width_px": 64})
+    options = {"split": "test", "crop": 32}
+    return Pipeline(scene, Optics(views), air, EventSensor(0.15), **options)
+
+
+@pytest.fixture(scope="module")
+def bench() -> StressBench:
+    return StressBench(pipeline(), [0], warmup=4)
+
+
+one_view_shifted = partial(conditions.measure_view_shift_loss, judged_px=2, limit=0.3)
+
+
+class Running(EventToVideoNetwork):
+    """The sum of all events of the centre view: never forgets, whatever the windows."""
+
+    views = None
+
+    def __init__(self):
+        super().__init__()
+        self.gain = nn.Parameter(torch.tensor(0.03))
+
+    def forward(self, voxels, state=None, **_):
+        change = voxels.float()[:, voxels.shape[1] // 2].sum(1, keepdim=True)
+        state = change if state is None else state + change
+        return 0.5 + self.gain * state, state
+
+
+def running(views: int = 9) -> Candidate:
+    return Candidate("running", Running(), views)
+
+
+def test_a_clip_cut_at_its_own_rate_is_what_the_pipeline_makes(bench):
+    sample = simulate(pipeline(), [0])
+    clip = bench.clips()[0]
+    assert torch.equal(clip.target[1:], sample.target[0, :, 0])
+    torch.testing.assert_close(torch.cat(list(clip.windows())), sample.voxels[0], atol=2e-3, rtol=0)
+
+
+def test_every_rate_shows_the_same_events(bench):
+    clip = bench.clips()[0]
+    sums = [sum(w.sum() for w in clip.windows(rate)) for rate in (30, 120, 1200)]
+    torch.testing.assert_close(sums[0], sums[1], atol=1e-2, rtol=0)
+    torch.testing.assert_close(sums[2], sums[1], atol=1e-2, rtol=0)
+
+
+def test_a_still_scene_without_turbulence_makes_no_event(bench):
+    found = simulate_event_clip(bench.pipeline, 0, ClipConditions(moving_share=0.0, d_over_r0=0.0))
+    assert sum(map(len, found.events)) == 0
+
+
+def test_a_scene_that_stops_makes_no_event_afterwards(bench):
+    found = simulate_event_clip(bench.pipeline, 0, ClipConditions(moving_share=0.5, d_over_r0=0.0))
+    half = int(0.5 * (len(found.target) - 1))
+    assert all(torch.equal(frame, found.target[half]) for frame in found.target[half:])
+    times = np.concatenate([events["t"] for events in found.events])
+    assert 0 < times.max() <= 1e6 * (half / found.fps + 0.005)  # what dead time held back
+
+
+@pytest.mark.parametrize(("value", "high", "failed"), [(2, False, True), (2, True, False)])
+def test_a_result_fails_on_its_side(value, high, failed):
+    assert StressResult(value, "dB", 1.0, higher_is_better=high).failed == failed
+
+
+def test_nothing_known_is_a_failure_and_the_first_break_is_found():
+    found = StressResult(float("nan"), "dB", 1.0, [(1, 0.5), (2, 1.5), (3, 0.2)])
+    assert found.failed and found.first_failure == 2
+
+
+def test_a_sum_holds_and_a_leaky_sum_does_not(bench):
+    retention = partial(recurrence.measure_contrast_retention, windows=[5, 50], limit=90.0)
+    assert retention(running(), bench).value == pytest.approx(100)
+    kept = retention(Candidate("leaky", HighPass(), 1), bench)
+    assert kept.curve[0][1] == pytest.approx(100 * 0.9**5, rel=0.02) and kept.failed
+
+
+def test_a_sum_comes_back_at_any_rate_and_after_any_loop(bench):
+    rates = {"rates_hz": [60, 1200], "duration_s": 0.2, "limit": 1.0}
+    assert abs(conditions.measure_window_rate_loss(running(), bench, **rates).value) < 1e-3
+    drift = recurrence.measure_long_sequence_drift(running(), bench, windows=96, limit=1.0)
+    assert abs(drift.value) < 1e-3
+
+
+def test_a_difference_in_a_sum_neither_grows_nor_fades(bench):
+    growth = partial(recurrence.measure_perturbation_growth, limit=0.0)
+    assert abs(growth(running(), bench).value) < 1e-3
+    assert growth(Candidate("leaky", HighPass(), 1), bench).value < -0.05
+
+
+def test_the_worst_input_of_a_sum_is_found(bench):
+    sizes = {"windows": 3, "steps": 4, "limit": 1.0}
+    found = recurrence.measure_adversarial_gain(running(), bench, **sizes)
+    # Five bins pull the same way; all that nine views may have goes into the one that is seen.
+    assert found.value == pytest.approx(0.03 * 5 * 3, rel=1e-3)
+
+
+def test_what_looks_at_the_centre_alone_minds_no_other_view(bench):
+    assert one_view_shifted(running(), bench).value == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize("views", [2, 4])
+def test_without_a_middle_the_centre_view_is_that_of_the_optics(views):
+    bench, subject = (
+        StressBench(pipeline(views=views), [0], 4),
+        Candidate("centre", HighPass(), views),
+    )
+    lost = {"counts": [1], "draws": 1, "limit": 0.5}
+    assert conditions.measure_view_dropout_loss(subject, bench, **lost).value != 0
+    assert one_view_shifted(subject, bench).value == 0
+
+
+def test_the_view_beside_the_centre_is_one_the_network_sees(bench):
+    subject = Candidate("four of nine", HighPass(view_reduction="median"), 4)
+    assert one_view_shifted(subject, bench).value != 0
+
+
+def test_every_stress_test_runs_on_a_set_network(bench):
+    torch.manual_seed(0)
+    subject = Candidate("setnet", SetNet(channels=4).eval(), 9)
+    tests = {
+        recurrence.measure_contrast_retention: {"windows": [3]},
+        recurrence.measure_long_sequence_drift: {"windows": 96},
+        recurrence.measure_convergence_time: {},
+        recurrence.measure_flicker_recovery: {},
+        recurrence.measure_static_scene_jitter: {},
+        recurrence.measure_perturbation_growth: {},
+        recurrence.measure_adversarial_gain: {"windows": 2, "steps": 2},
+        recurrence.measure_bf16_error: {"windows": 8},
+        conditions.measure_window_rate_loss: {"rates_hz": [1200], "duration_s": 0.1},
+        conditions.measure_event_dropout_loss: {"kept_shares": [0.1]},
+        conditions.measure_view_dropout_loss: {"counts": [4], "draws": 1},
+        conditions.measure_view_shift_loss: {"judged_px": 1, "parallax": True},
+        conditions.measure_correlated_views_loss: {"spacings": [0.0]},
+        conditions.measure_condition_loss: {"parameter": "sensor.threshold", "values": [0.3]},
+    }
+    for measure, settings in tests.items():
+        found = measure(subject, bench, limit=1.0, **settings)
+        assert found.value == found.value and found.limit is not None, measure
+    varied = {"parameter": "view_gain_std", "values": [0.05], "limit": 1.0}
+    found = conditions.measure_condition_loss(subject, bench, **varied)
+    assert found.value == found.value
+
+
+def test_shifting_brings_nothing_in():
+    voxels = torch.ones(1, 9, 5, 8, 8)
+    moved = conditions.shift_views(voxels, {2: (1, -2)})
+    assert moved[:, 2].sum() == 5 * 7 * 6 and torch.equal(moved[:, 3], voxels[:, 3])
+    assert not moved[0, 2, 0, 0].any() and not moved[0, 2, 0, :, -2:].any()
+
+
+def test_settling_is_the_last_time_beyond():
+    scores = torch.cat([torch.linspace(0, 20, 21), torch.full((39,), 20.0)])
+    assert recurrence.measure_settling_time(scores, 1.0) == 18  # averaged over five windows
+    assert recurrence.find_last_exceedance(torch.tensor([3.0, 0.5, 2.0, 0.5]), 1.0) == 3

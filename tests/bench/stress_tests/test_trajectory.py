@@ -1,0 +1,64 @@
+"""The front of a dart: a path that strays by a known amount, a trail, a clip too short to tell."""
+
+import math
+
+import pytest
+import torch
+
+from src.bench.candidates import Candidate
+from src.bench.stress_tests.event_clips import StressBench
+from src.bench.stress_tests.trajectory import measure_deviation, measure_trajectory_deviation
+from src.sim.optics import Optics
+from src.sim.pipeline import Pipeline
+from src.sim.scenes.targets import Targets
+from src.sim.sensor import EventSensor
+from src.sim.turbulence.simulated import SimulatedTurbulence
+from tests.bench.stress_tests.test_stress_tests import Running
+
+SIDE, FRAMES = 128, 100
+
+
+def film(stray: float = 0.0, trail: float = 0.0) -> torch.Tensor:
+    """A blob that flies level, above and below its line by `stray` in turns of 12 frames."""
+    y, x = torch.meshgrid(torch.arange(SIDE), torch.arange(SIDE), indexing="ij")
+    shown, frames = torch.zeros(SIDE, SIDE), []
+    for k in range(FRAMES):
+        row = 64 + stray * math.copysign(1, math.sin(math.pi * (k + 0.5) / 12))
+        blob = torch.exp(-((x - 5 - 1.2 * k) ** 2 + (y - row) ** 2) / 18)
+        shown = torch.maximum(trail * shown, blob)
+        frames.append(shown)
+    return torch.stack(frames)
+
+
+def test_a_straight_flight_does_not_stray():
+    assert measure_deviation(film(), film()) < 0.01
+
+
+def test_a_front_that_strays_is_measured():
+    assert measure_deviation(film(stray=1.0), film()) == pytest.approx(1.0, rel=0.25)
+    assert measure_deviation(film(stray=2.0), film()) > 1.7 * measure_deviation(
+        film(stray=1.0), film()
+    )
+
+
+def test_a_trail_that_stays_does_not_count():
+    assert measure_deviation(film(trail=0.98), film()) < 0.05
+
+
+def test_a_clip_that_shows_too_little_of_a_flight_is_named():
+    with pytest.raises(ValueError, match=r"data\.test_windows must show more of a flight"):
+        measure_deviation(film()[:40], film()[:40])
+
+
+def test_a_network_is_compared_with_no_turbulence_and_with_the_light():
+    scene = Targets(
+        kinds=["dart"], height=SIDE, width=SIDE, frames=61, fps=12_000.0, split="test",
+        options={"dart": {"speed_px_per_s": 16_000.0, "dart_length": 0.25}},
+    )  # fmt: skip
+    air = SimulatedTurbulence({"severity": "strong", "width_px": SIDE})
+    pipeline = Pipeline(scene, Optics(1), air, EventSensor(0.2), split="test")
+    subject, bench = Candidate("running", Running(), 1), StressBench(pipeline, [0], 0)
+    found = measure_trajectory_deviation(subject, bench, limit=0.3)
+    (still, calm), (light, seen), (clip, stray) = found.curve
+    assert (still, light, clip) == ("no turbulence", "light of one view", "clip 0")
+    assert found.value == stray and calm < 0.2 and seen > calm

@@ -1,0 +1,104 @@
+"""ONNX with explicit state, and the running form: the same frames as the network itself."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from baselines.firenet import FireNet
+from baselines.highpass import HighPass
+from src.deploy.forms import ReducedPrecisionNetwork, in_form
+from src.deploy.onnx_export import OnnxNetwork, export_onnx
+from src.models.e2vid import E2VID
+from src.models.setnet import SetNet
+
+ROOT = Path(__file__).resolve().parents[2]
+NETWORKS = {
+    "e2vid": lambda: E2VID(views=9, base_channels=4, spectral_norm=True),
+    "setnet": lambda: SetNet(channels=4),
+    "firenet": FireNet,
+}
+
+
+def frames(network, windows, **told):
+    state, shown = None, []
+    with torch.no_grad():
+        for window in windows:
+            frame, state = network(window, state, **told)
+            shown.append(frame)
+    return torch.cat(shown)
+
+
+def noise(windows: int = 3) -> torch.Tensor:
+    torch.manual_seed(1)
+    return torch.randn(windows, 1, 9, 5, 32, 32)
+
+
+@pytest.mark.parametrize("name", ["e2vid", "setnet"])
+def test_onnx_gives_the_frames_of_the_network_window_by_window(name, tmp_path):
+    pytest.importorskip("onnxruntime", reason="needs the extra onnx")
+    pytest.importorskip("onnxscript", reason="needs the extra onnx")
+    torch.manual_seed(0)
+    network = NETWORKS[name]().eval()
+    found = export_onnx(network, tmp_path / "net.onnx", views=9, height=32, width=32)
+    torch.testing.assert_close(
+        frames(found, noise()), frames(network, noise()), atol=1e-4, rtol=1e-3
+    )
+    assert isinstance(found, OnnxNetwork)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_the_running_form_is_as_accurate_as_its_type(name):
+    torch.manual_seed(0)
+    network = NETWORKS[name]().eval()
+    plain = frames(network, noise())
+    rounded = frames(ReducedPrecisionNetwork(network), noise())
+    assert rounded.dtype == torch.float32 and (rounded - plain).abs().mean() < 0.02
+
+
+def compiled_gap(name: str) -> float:
+    network = NETWORKS[name]().eval()
+    forms = [frames(in_form(network, form), noise()) for form in ("bf16", "compiled")]
+    return float((forms[0] - forms[1]).abs().max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NETWORKS)
+def test_the_compiled_form_gives_the_frames_of_bf16(name):
+    """In a process of its own, where annotations are not checked: the checks do not compile."""
+    code = f"from tests.deploy.test_onnx_export import compiled_gap; print(compiled_gap({name!r}))"
+    line = [sys.executable, "-c", code]
+    found = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert float(found.stdout) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("form", "network", "words"),
+    [
+        ("float16", E2VID(views=9, base_channels=4), "form must be one of float32, bf16, compiled"),
+        (
+            "bf16",
+            HighPass(view_reduction="median"),
+            "form must be float32 for a network without parameters",
+        ),
+    ],
+)
+def test_a_form_that_is_none_is_named(form, network, words):
+    with pytest.raises(ValueError, match=words):
+        in_form(network, form)
+
+
+def test_without_a_compiler_nothing_is_compiled(monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    with pytest.raises(ValueError, match="form=compiled needs a C.. compiler"):
+        in_form(E2VID(views=9, base_channels=4), "compiled")
+
+
+def test_what_onnx_cannot_express_is_said(tmp_path):
+    pytest.importorskip("onnxscript")
+    with pytest.raises(ValueError, match="HighPass has a part that ONNX cannot express"):
+        export_onnx(
+            HighPass(view_reduction="median"), tmp_path / "a.onnx", views=9, height=16, width=16
+        )

@@ -1,0 +1,314 @@
+"""From a list of events to a frame: what the dense grid gives, without the grid."""
+
+import sys
+
+import jaxtyping
+import numpy as np
+import pytest
+import torch
+
+from baselines.firenet import FireNet
+from src.deploy import int8, openvino_network
+from src.deploy.cpu_features import has_int8_dot_product
+from src.deploy.int8 import MAX_ACTIVATION, MIN_CHANNELS, Int8Conv, quantise_decoder
+from src.deploy.openvino_network import OpenVinoNetwork
+from src.deploy.runtime import EventListRuntime
+from src.models.e2vid import E2VID
+from src.models.setnet import SetNet
+from src.sim.optics import layout
+from src.sim.voxel import voxel_grid
+
+EXACT, ROUNDED = 1e-5, 0.02  # in grey levels: sums in another order, and bf16
+NETWORKS = {
+    "setnet": lambda: SetNet(channels=4),
+    "setnet_in_bytes": lambda: SetNet(channels=MIN_CHANNELS, context_channels=[8, 8, 8]),
+    "setnet_of_rank_3": lambda: SetNet(channels=4, gate_rank=3),
+    "e2vid": lambda: E2VID(views=9, base_channels=4, spectral_norm=True),
+    "e2vid_gru_3x3": lambda: E2VID(
+        views=9, base_channels=4, recurrent="convgru", kernel_size=3, final_activation="none"
+    ),
+    "e2vid_stem": lambda: E2VID(views=9, base_channels=4, stem_channels=6),
+}
+FORMS = ["bf16", "openvino"]
+OPENVINO = pytest.mark.skipif(
+    not openvino_network.is_installed(), reason="needs the extra openvino"
+)
+
+
+@pytest.fixture
+def unchecked():
+    """Without the checks of annotations: to a network that is traced its sizes are tensors."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+def network(name: str) -> torch.nn.Module:
+    torch.manual_seed(0)
+    return NETWORKS[name]().eval()
+
+
+def form(name: str) -> str:
+    if name == "openvino" and not openvino_network.is_installed():
+        pytest.skip("needs the extra openvino")
+    return name
+
+
+def events(seed: int, count: int = 400, height: int = 24, width: int = 32, views: int = 9) -> dict:
+    """Events of a window of 1/600 s, also on its edges and on those of the picture."""
+    rng = np.random.default_rng(seed)
+    t0, t1 = seed / 600, (seed + 1) / 600
+    t = np.sort(rng.uniform(t0, t1, count))
+    if count:
+        t[0], t[-1] = t0, t1
+    return {
+        "t": t, "x": rng.integers(0, width, count).astype(np.uint16),
+        "y": rng.integers(0, height, count).astype(np.uint16),
+        "p": (2 * rng.integers(0, 2, count) - 1).astype(np.int8),
+        "view": rng.integers(0, views, count), "t0": t0, "t1": t1,
+    }  # fmt: skip
+
+
+def grids(window: dict, height: int = 24, width: int = 32, views: int = 9) -> torch.Tensor:
+    size = {"bins": 5, "height": height, "width": width}
+    edges = {"t0": window["t0"], "t1": window["t1"]}
+    parts = []
+    for view in range(views):
+        mine = window["view"] == view
+        parts.append(voxel_grid(*(window[name][mine] for name in "txyp"), **edges, **size))
+    return torch.stack(parts)[None]
+
+
+def dense(net: torch.nn.Module, windows: list[dict], **size) -> list[np.ndarray]:
+    told = {"window_s": 1 / 600} if isinstance(net, SetNet) else {}
+    state, shown = None, []
+    with torch.no_grad():
+        for window in windows:
+            frame, state = net(grids(window, **size), state, **told)
+            shown.append(frame[0, 0].numpy())
+    return shown
+
+
+def runtime(
+    net: torch.nn.Module, form: str = "float32", views: int = 9, **size
+) -> EventListRuntime:
+    size = {"height": 24, "width": 32} | size
+    return EventListRuntime(net, positions=layout(views), threads=1, form=form, **size)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize(("height", "width"), [(24, 32), (19, 29)])
+def test_events_one_by_one_are_the_dense_grid(name, height, width):
+    net, size = network(name), {"height": height, "width": width}
+    windows = [events(seed, 0 if seed == 2 else 400, **size) for seed in range(12)]
+    found, live = dense(net, windows, **size), runtime(net, **size)
+    for window, frame in zip(windows, found, strict=True):
+        np.testing.assert_allclose(live.step(**window), frame, atol=EXACT)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("rounded", FORMS)
+def test_rounded_forms_stay_near_the_dense_grid(name, rounded):
+    net, windows = network(name), [events(seed) for seed in range(12)]
+    live = runtime(net, form(rounded))
+    for window, frame in zip(windows, dense(net, windows), strict=True):
+        got = live.step(**window)
+        assert got.dtype == np.float32 and got.shape == (24, 32)
+        np.testing.assert_allclose(got, frame, atol=ROUNDED)
+
+
+@pytest.mark.parametrize("views", [1, 4, 25])
+def test_any_number_of_views(views):
+    net, window = network("setnet"), events(0, views=views)
+    with torch.no_grad():
+        frame, _ = net(grids(window, views=views), None, window_s=1 / 600)
+    got = runtime(net, views=views).step(**window)
+    np.testing.assert_allclose(got, frame[0, 0], atol=EXACT)
+
+
+def test_events_that_cancel_in_a_block_wake_nothing():
+    net = network("setnet")
+    pair = events(0, 2) | {
+        "t": np.array([0.0005, 0.0005]), "x": np.array([4, 5]), "y": np.array([6, 6]),
+        "p": np.array([1, -1]), "view": np.array([3, 3]),
+    }  # fmt: skip
+    live = runtime(net)
+    np.testing.assert_allclose(live.step(**pair), dense(net, [pair])[0], atol=EXACT)
+    assert float(live.first_layer.state[2].max()) == 0
+
+
+def test_a_pixel_may_weigh_a_part():
+    """As events laid bilinearly into the picture do."""
+    net, window = network("setnet"), events(0)
+    halves = {name: np.repeat(window[name], 2) for name in ("t", "x", "y", "view")}
+    halves |= {"p": np.repeat(window["p"], 2) * np.tile([0.25, 0.75], 400)}
+    one, two = runtime(net).step(**window), runtime(net).step(**window | halves)
+    np.testing.assert_allclose(one, two, atol=EXACT)
+
+
+def test_events_outside_the_window_have_no_part():
+    net, window = network("setnet"), events(1)
+    early = {name: window[name] for name in ("x", "y", "p", "view")}
+    more = {name: np.concatenate([part, part]) for name, part in early.items()}
+    more["t"] = np.concatenate([window["t"] - 1 / 300, window["t"]])
+    np.testing.assert_array_equal(runtime(net).step(**window), runtime(net).step(**window | more))
+
+
+@pytest.mark.parametrize("rounded", ["float32", *FORMS])
+@pytest.mark.parametrize("name", ["setnet", "e2vid"])
+def test_reset_forgets_and_a_state_goes_on(name, rounded):
+    live = runtime(network(name), form(rounded))
+    first = live.step(**events(0))
+    kept = live.state
+    second = live.step(**events(1))
+    live.reset()
+    np.testing.assert_array_equal(live.step(**events(0)), first)
+    live.step(**events(2))
+    live.state = kept
+    np.testing.assert_array_equal(live.step(**events(1)), second)
+    live.state = None
+    np.testing.assert_array_equal(live.step(**events(0)), first)
+
+
+def test_what_leaks_is_mixed_as_it_was_before_it_leaked():
+    live = runtime(network("setnet"))
+    for seed in range(300):
+        live.step(**events(seed, count=40))
+    sums, found, _ = live.first_layer.state
+    sums = sums.reshape(9, -1, *sums.shape[1:])
+    code = live.runner.whole.module.code
+    mixed = np.einsum("vp,vmrc->rcpm", code, sums).reshape(*found.shape[1:3], -1)
+    spread = np.abs(sums - sums.mean(0)).mean(0).transpose(1, 2, 0)
+    expected = np.concatenate([mixed, spread], 2)
+    np.testing.assert_allclose(found[0], expected, atol=EXACT)
+    assert np.abs(expected).max() > 0.1
+
+
+WRONG = {
+    "events must be in order of time": {"t": lambda t: t[::-1]},
+    r"x in 0\.\.31 and y in 0\.\.23, got event 0 .* x=32": {"x": lambda x: x + 32},
+    r"have view in 0\.\.8": {"view": lambda view: view + 9},
+    "events must have p in -1, 1": {"p": lambda p: (p + 1) // 2},
+    "finite t and p": {"p": lambda p: p * np.nan},
+    "t, x, y, p, view must be of one length": {"x": lambda x: x[1:]},
+    "x, y and view must be whole numbers": {"x": lambda x: x + 0.5},
+    "a window must have t0 < t1": {"t1": lambda t1: -1.0},
+}
+
+
+@pytest.mark.parametrize("words", WRONG)
+def test_wrong_events_are_named_and_change_nothing(words):
+    live, window = runtime(network("setnet")), events(0, height=1, width=1)
+    live.step(**window)
+    before = [part.copy() for part in live.first_layer.state]
+    with pytest.raises(ValueError, match=words):
+        live.step(**window | {name: spoil(window[name]) for name, spoil in WRONG[words].items()})
+    assert all(np.array_equal(a, b) for a, b in zip(before, live.first_layer.state, strict=True))
+
+
+CROWD = {"positions": [(0, k) for k in range(26)]}
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "words"),
+    [
+        ("setnet", CROWD, r"optics.views must be in 1\.\.25, got 26"),
+        ("e2vid", {"positions": layout(4)}, "optics.views must be 9 for this network, got 4"),
+        ("setnet", {"height": 7}, "height and width must be >= 8"),
+        ("setnet", {"threads": 0}, "threads >= 1"),
+        ("setnet", {"form": "float16"}, "form must be one of float32, bf16, openvino"),
+    ],
+)
+def test_what_does_not_fit_is_named(name, options, words):
+    size = {"positions": layout(9), "height": 24, "width": 32}
+    with pytest.raises(ValueError, match=words):
+        EventListRuntime(network(name), **size | options)
+
+
+def test_another_network_is_refused():
+    with pytest.raises(ValueError, match="a list of events needs a SetNet or an E2VID, got FireN"):
+        EventListRuntime(FireNet(), positions=layout(1), height=24, width=32)
+
+
+def test_without_the_package_it_says_how_to_get_it(monkeypatch):
+    monkeypatch.setattr(openvino_network, "find_spec", lambda name: None)
+    with pytest.raises(ValueError, match="form=openvino needs pip install openvino"):
+        runtime(network("setnet"), "openvino")
+    assert runtime(network("setnet"), None).step(**events(0)).shape == (24, 32)
+
+
+@OPENVINO
+@pytest.mark.parametrize("name", ["setnet", "e2vid"])
+def test_openvino_gives_the_frames_of_the_network(name, unchecked):
+    net, windows = network(name), [events(seed) for seed in range(4)]
+    found, state, told = OpenVinoNetwork(net), None, {}
+    if name == "setnet":
+        told = {"window_s": 1 / 600, "positions": layout(9)}
+    for window, frame in zip(windows, dense(net, windows), strict=True):
+        given = state
+        got, state = found(grids(window), state, **told)
+        np.testing.assert_allclose(got[0, 0], frame, atol=ROUNDED)
+    again, _ = found(grids(windows[-1]), given, **told)
+    assert torch.equal(again, got)  # a state that was given back stays as it is
+
+
+@OPENVINO
+def test_openvino_reports_its_use_to_nobody(unchecked):
+    runtime(network("setnet"), "openvino")
+    assert not any(name.startswith("openvino_telemetry.") for name in sys.modules)
+
+
+@OPENVINO
+def test_openvino_refuses_a_state_of_another_size_and_a_batch(unchecked):
+    found = OpenVinoNetwork(network("setnet"))
+    _, state = found(torch.zeros(1, 9, 5, 16, 16))
+    with pytest.raises(ValueError, match=r"state must be of voxels \(1, 9, 5, 24, 24\)"):
+        found(torch.zeros(1, 9, 5, 24, 24), state)
+    with pytest.raises(ValueError, match="form=openvino takes one clip on device=cpu, got 2"):
+        found(torch.zeros(2, 9, 5, 16, 16))
+
+
+def test_bytes_round_to_half_a_step():
+    torch.manual_seed(0)
+    conv, x = torch.nn.Conv2d(6, 5, 3), MAX_ACTIVATION * torch.rand(1, 6, 9, 9)
+    step = conv.weight.abs().amax((1, 2, 3), keepdim=True) / 127
+    most = x.amax() * (step / 2).sum((1, 2, 3)) * 6 * 9  # what the weights can be off
+    most += MAX_ACTIVATION / 255 / 2 * (conv.weight.abs() + step / 2).sum((1, 2, 3))
+    with torch.no_grad():
+        off = (Int8Conv(conv)(x) - conv(x)).abs().amax((0, 2, 3))
+        cut = Int8Conv(conv)(10 * x) - Int8Conv(conv)((10 * x).clamp_max(MAX_ACTIVATION))
+    assert (off > 0).all() and (off < most).all() and not cut.any()
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])
+@pytest.mark.parametrize(
+    ("name", "able", "drawn"),
+    [
+        ("setnet_in_bytes", True, True),
+        ("setnet_in_bytes", False, False),
+        ("setnet", True, False),
+        ("e2vid", True, False),
+    ],
+)
+def test_many_channels_are_drawn_in_bytes_where_these_are_fast(
+    name, able, drawn, dtype, monkeypatch
+):
+    monkeypatch.setattr(int8, "has_int8_dot_product", lambda: able)
+    net = network(name).to(dtype)
+    quantise_decoder(net)
+    assert any(isinstance(part, Int8Conv) for part in net.modules()) == drawn
+
+
+@OPENVINO
+def test_openvino_computes_in_bytes_what_is_to_be(unchecked):
+    if not has_int8_dot_product():
+        pytest.skip("this CPU has no instructions for bytes")
+    live = runtime(network("setnet_in_bytes"), "openvino")
+    for part in (live.runner.whole, live.runner.without_context_update):
+        nodes = part.request.get_compiled_model().get_runtime_model().get_ordered_ops()
+        told = [
+            {key: node.get_rt_info()[key].astype(str) for key in ("layerType", "primitiveType")}
+            for node in nodes
+        ]
+        in_bytes = [one["layerType"] for one in told if one["primitiveType"].endswith("I8")]
+        assert in_bytes.count("Convolution") == 1

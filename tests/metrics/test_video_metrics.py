@@ -1,0 +1,49 @@
+"""Scores of clips, their means, and another resolution than that of the frames."""
+
+import pytest
+import torch
+
+from src.metrics.video_metrics import VideoMetrics
+
+
+def clip(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    target = torch.rand(3, 1, 48, 48, generator=generator)
+    return (target + 0.1 * torch.randn(target.shape, generator=generator)).clamp(0, 1), target
+
+
+def test_means_are_over_clips_whatever_their_length():
+    metrics = VideoMetrics()
+    long, short = clip(0), tuple(part[:2] for part in clip(1))
+    values = [metrics(*long), metrics(*short)]
+    for name, mean in metrics.compute().items():
+        assert float(mean) == pytest.approx(sum(v[name] for v in values) / 2, rel=1e-5)
+    assert values[0] == VideoMetrics()(*long), "a clip's scores do not depend on those before"
+    metrics.reset()
+    assert metrics(*short) == values[1]
+
+
+def test_scores_that_are_equal_on_a_clip_stay_apart():
+    target = clip()[1]
+    metrics = VideoMetrics()
+    assert metrics(target, target)["psnr"] == metrics(target, target)["psnr_aligned"] == 100
+    other = metrics(0.5 * target, target)
+    assert other["psnr"] < 20 < other["psnr_aligned"]
+    assert float(metrics.compute()["psnr"]) < float(metrics.compute()["psnr_aligned"])
+
+
+def test_repeated_pixels_change_ssim_and_not_psnr():
+    own, larger = VideoMetrics()(*clip()), VideoMetrics(scale=3)(*clip())
+    assert larger["psnr"] == pytest.approx(own["psnr"], abs=1e-4)
+    assert larger["psnr_aligned"] == pytest.approx(own["psnr_aligned"], abs=1e-4)
+    assert larger["ssim"] != pytest.approx(own["ssim"], abs=0.01)
+
+
+def test_averaged_areas_lose_noise():
+    assert VideoMetrics(scale=1 / 3)(*clip())["psnr"] > VideoMetrics()(*clip())["psnr"] + 3
+
+
+@pytest.mark.parametrize("scale", [0, -1, 1.5, 9])
+def test_other_scales_are_refused(scale):
+    with pytest.raises(ValueError, match=r"metrics\.scale"):
+        VideoMetrics(scale=scale)

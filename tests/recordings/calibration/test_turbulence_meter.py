@@ -1,0 +1,221 @@
+"""Air in footage: known warps are found back with their times and shares; what is refused."""
+
+import cv2
+import numpy as np
+import pytest
+
+from src.app import calibrations
+from src.calibrate import calibrate
+from src.recordings.calibration import point_tracking, turbulence_meter
+from src.recordings.files import sources
+from src.recordings.files.turbulence_file import IntervalEstimate, read_turbulence_file
+from tests.test_recording_entry_points import config
+
+SIDE, UNIT = 128, 256 / 128
+
+
+def scene(side: int = SIDE) -> np.ndarray:
+    """Return dark and bright shapes on grey, with edges a pixel wide, in [0, 1]."""
+    rng = np.random.default_rng(3)
+    picture = np.full((4 * side, 4 * side), 0.5, np.float32)
+    for _ in range(160):
+        corners = rng.uniform(0, 4 * side, 2) + rng.uniform(-60, 60, (4, 2))
+        cv2.fillConvexPoly(
+            picture, cv2.convexHull(corners.astype(np.int32)), float(rng.uniform(0.1, 0.9))
+        )
+    return cv2.resize(picture, (side, side), interpolation=cv2.INTER_AREA)
+
+
+def fields(half_px: float, rms_px: float, memory: float, frames: int) -> np.ndarray:
+    """Return (frames, 2, h, w): Gaussian fields, half length and rms in pixels of SIDE, AR(1)."""
+    rng, sigma = np.random.default_rng(1), half_px / 1.665
+    pad = int(4 * sigma)
+    wide = SIDE + 2 * pad
+
+    def fresh() -> np.ndarray:
+        drawn = rng.standard_normal((2, wide, wide)).astype(np.float32)
+        soft = np.stack([cv2.GaussianBlur(one, (0, 0), sigma) for one in drawn])
+        return soft[:, pad : pad + SIDE, pad : pad + SIDE] * (2 * np.sqrt(np.pi) * sigma * rms_px)
+
+    now, found = fresh(), []
+    for _ in range(frames):
+        found.append(now)
+        now = memory * now + np.sqrt(1 - memory**2) * fresh()
+    return np.stack(found)
+
+
+def film(push: np.ndarray, noise: float = 0.01) -> np.ndarray:
+    """Return the scene warped by `push` (frames, 2, h, w), with noise, in steps of 1/255."""
+    y, x = np.mgrid[:SIDE, :SIDE].astype(np.float32)
+    picture, rng = scene(), np.random.default_rng(2)
+    frames = np.stack([
+        cv2.remap(picture, x + dx, y + dy, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        for dx, dy in push.astype(np.float32)
+    ])  # fmt: skip
+    frames += noise * rng.standard_normal(frames.shape).astype(np.float32)
+    return np.round(frames.clip(0, 1) * 255).astype(np.float32) / 255
+
+
+@pytest.mark.parametrize("half_px, rms_px, noise", [(10, 0.7, 0.01), (24, 1.5, 0.02)])
+def test_rms_and_half_length_of_known_warps_are_found(half_px, rms_px, noise):
+    push = fields(half_px / UNIT, rms_px / UNIT, 0.0, 20)
+    found = turbulence_meter.measure_turbulence(film(push, noise), 50.0).found
+    rms = push.std(0).mean() * UNIT * np.sqrt(20 / 19)
+    assert found.rms_px.value == pytest.approx(rms, rel=0.1)
+    assert found.half_length_px.value == pytest.approx(half_px, rel=0.2)
+    assert found.rms_px.low < 0.87 * found.rms_px.value  # what the method errs by counts too
+    assert found.rms_px.high > 1.15 * found.rms_px.value
+    assert found.half_length_px.low < half_px < found.half_length_px.high
+    assert found.decay_s.value is None and found.decay_s.high == 1 / 50  # new in every frame
+
+
+def test_tilt_of_many_pixels_of_a_large_frame_is_followed_in_a_smaller_one():
+    push = fields(8 / UNIT, 2.2 / UNIT, 0.0, 16)
+    small = film(push)
+    large = np.stack([
+        cv2.resize(frame, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC) for frame in small
+    ])  # fmt: skip
+    found = turbulence_meter.measure_turbulence(large)
+    assert found.picture.shape == (256, 256)
+    assert found.found.rms_px.value == pytest.approx(push.std(0).mean() * UNIT * 1.033, rel=0.1)
+    assert found.found.half_length_px.value == pytest.approx(8, rel=0.2)
+
+
+def test_decay_and_the_share_of_the_whole_view_are_found():
+    local = fields(8, 0.4, 0.8, 48)
+    rng, whole = np.random.default_rng(5), [np.zeros(2)]
+    for _ in range(47):
+        whole.append(0.8 * whole[-1] + 0.6 * rng.standard_normal(2))
+    whole = 0.4 * np.array(whole) / np.std(whole)
+    push = local + whole[:, :, None, None]
+    found = turbulence_meter.measure_turbulence(film(push), 100.0).found
+    centred = push - push.mean(0)
+    truth = (centred.mean((2, 3)) ** 2).mean() / (centred**2).mean()
+    assert found.whole_share.value == pytest.approx(truth, abs=0.06)
+    assert found.decay_s.value == pytest.approx(-0.01 / np.log(0.8), rel=0.3)
+    assert found.decay_s.low < found.decay_s.value < found.decay_s.high
+
+
+def test_half_length_beyond_the_frame_is_a_bound():
+    rng = np.random.default_rng(0)
+    push = np.broadcast_to(rng.normal(0, 0.6, (16, 2, 1, 1)), (16, 2, SIDE, SIDE))
+    found = turbulence_meter.measure_turbulence(film(push), 30.0).found
+    assert found.half_length_px.value is None and found.half_length_px.high is None
+    assert found.half_length_px.low > 100 and found.whole_share.value > 0.95
+
+
+def blurred(ratio: float) -> np.ndarray:
+    """Return 30 frames, a tenth of them blurred by 1.2 px, the rest `ratio` times as much."""
+    widths = np.full(30, 1.2 * ratio)
+    widths[::10] = 1.2
+    push = fields(10, 0.2, 0.0, 30)
+    return np.stack([
+        cv2.GaussianBlur(frame, (0, 0), width)
+        for frame, width in zip(film(push, 0.0), widths, strict=True)
+    ])  # fmt: skip
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1.4])
+def test_blur_is_that_of_a_typical_moment_over_the_sharpest_tenth(ratio):
+    frames = blurred(ratio)
+    frames += 0.01 * np.random.default_rng(0).standard_normal(frames.shape).astype(np.float32)
+    found = turbulence_meter.measure_turbulence(frames).found.blur_ratio
+    typical = (27 * ratio + 3) / 30
+    assert found.value == pytest.approx(typical, rel=0.2)
+
+
+def test_blur_is_that_of_a_frame_of_256_px():
+    large = np.stack([
+        cv2.resize(frame, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
+        for frame in blurred(1.4)
+    ])  # fmt: skip
+    small = np.stack([turbulence_meter.shrink_frame(frame, 256) for frame in large])
+    found, wanted = (
+        turbulence_meter.measure_turbulence(frames).found.blur_ratio for frames in (large, small)
+    )
+    assert found.value == pytest.approx(wanted.value, rel=0.08)  # seen at 512 px it is 0.8 of it
+
+
+def test_points_lie_on_corners_not_on_edges():
+    picture = np.full((128, 128), 0.2, np.float32)
+    picture[40:90, 30:] = 0.8
+    found = point_tracking.find_corners(picture)
+    assert len(found) > 0
+    apart = np.hypot(found[:, 0] - 30, np.minimum(abs(found[:, 1] - 40), abs(found[:, 1] - 90)))
+    assert apart.max() < 5
+
+
+def pan(px: float) -> np.ndarray:
+    push = np.zeros((16, 2, SIDE, SIDE), np.float32)
+    push[:, 0] = np.linspace(0, px, 16)[:, None, None]
+    return film(push)
+
+
+@pytest.mark.parametrize(
+    "frames, message",
+    [
+        (lambda: film(np.zeros((10, 2, SIDE, SIDE))), "at least 16 frames, got 10"),
+        (lambda: film(np.zeros((16, 2, SIDE, SIDE))), "through turbulent air, got a tilt of 0.00"),
+        (lambda: np.full((20, 64, 64), 0.5, np.float32), "must show texture, .* got 0"),
+        (lambda: pan(9.0), "stands still, got one that moves by .* px of 256; .*% of"),
+        (lambda: pan(90.0), r"stands still.*% .*could be tracked"),
+    ],
+)
+def test_footage_that_shows_too_little_is_refused(frames, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        turbulence_meter.measure_turbulence(frames(), 25.0)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Return a folder of pictures of a scene through air."""
+    folder = tmp_path_factory.mktemp("site") / "pictures"
+    folder.mkdir()
+    for number, frame in enumerate(film(fields(8, 0.5, 0.5, 16))):
+        cv2.imwrite(str(folder / f"{number:03}.png"), np.round(frame * 255))
+    return folder
+
+
+def test_the_door_writes_a_file_and_a_figure(folder, tmp_path):
+    run, save = tmp_path / "run", tmp_path / "air.yaml"
+    calibrate(config("calibrate", run, "task=air", f"video={folder}", f"save={save}"))
+    found = read_turbulence_file(save)
+    assert found.decay_s == IntervalEstimate(None, None, None)  # pictures have no frame rate
+    assert save.read_text() == (run / "air.yaml").read_text()
+    assert cv2.imread(str(run / "air.png")).std() > 10
+    timed = calibrations.measure_film(str(folder), tmp_path, fps=50.0)
+    assert timed.found.decay_s.value == pytest.approx(timed.tilt.decay_frames / 50)
+    assert timed.found.rms_px.value == pytest.approx(found.rms_px.value, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        ("video=nowhere", "video must be a film or a folder of pictures, got nowhere"),
+        ("fps=0", "fps must be > 0"),
+        ("air.max_frames=5", "air.max_frames must be at least 16"),
+        ("air.max_frames=16 fps=inf", "fps must be > 0"),
+    ],
+)
+def test_the_door_refuses_and_writes_nothing(folder, wrong, message, tmp_path):
+    chosen = ["task=air", f"video={folder}", f"save={tmp_path}/air.yaml", *wrong.split()]
+    with pytest.raises(ValueError, match=message):
+        calibrate(config("calibrate", tmp_path / "run", *chosen))
+    assert not (tmp_path / "air.yaml").exists() and not (tmp_path / "run" / "air.yaml").exists()
+
+
+def test_footage_of_a_building_and_of_a_panning_camera(shared_data):
+    found = turbulence_meter.measure_turbulence(
+        _frames(shared_data / "turbulence/building")[:20]
+    ).found
+    assert 0.6 < found.rms_px.value < 0.95 and 5 < found.half_length_px.value < 20
+    assert 0.1 < found.whole_share.value < 0.45
+    with pytest.raises(ValueError, match="stands still"):
+        turbulence_meter.measure_turbulence(
+            _frames(shared_data / "turbulence/TSR_phys_0212.mp4")[::5]
+        )
+
+
+def _frames(path) -> np.ndarray:
+    return np.stack([turbulence_meter.shrink_frame(frame) for frame in sources.read_video(path)])

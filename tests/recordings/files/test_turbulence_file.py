@@ -1,0 +1,154 @@
+"""Air that was measured: what its file may hold, and clips that show what it says."""
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from src.app import build, simulation
+from src.recordings.files.turbulence_file import (
+    IntervalEstimate,
+    MeasuredTurbulence,
+    TurbulenceFile,
+    read_turbulence_file,
+)
+from src.sim.pipeline import simulate
+from src.sim.turbulence import outer_scale
+from src.sim.turbulence.prior import cn2_profile
+from src.sim.turbulence.simulated import SimulatedTurbulence
+from tests.test_train import config
+
+SITE = {
+    "rms_px": [0.5, 0.4, 0.6],
+    "half_length_px": [15.0, 12.0, 18.0],
+    "whole_share": [0.1, 0.05, 0.15],
+    "decay_s": [0.05, 0.04, 0.06],
+    "blur_ratio": [1.2, 1.15, 1.25],
+}
+RANGES = {"tilt_correlation_time_s": (0.1, 0.2)}
+
+
+def site(path, **changes) -> str:
+    """Write an air.yaml of SITE, with changes; None leaves a key out."""
+    rows = {key: value for key, value in (SITE | changes).items() if value is not None}
+    content = {
+        key: {"value": row[0], "interval": row[1:]} if isinstance(row, list) else row
+        for key, row in rows.items()
+    }
+    path.write_text(yaml.safe_dump(content))
+    return str(path)
+
+
+def test_a_file_is_read_as_it_was_written(tmp_path):
+    written = TurbulenceFile(**{key: IntervalEstimate(*row) for key, row in SITE.items()})
+    (tmp_path / "air.yaml").write_text(written.text())
+    assert read_turbulence_file(tmp_path / "air.yaml") == written
+    bound = TurbulenceFile(**vars(written) | {"decay_s": IntervalEstimate(None, None, 0.04)})
+    (tmp_path / "air.yaml").write_text(bound.text())
+    assert read_turbulence_file(tmp_path / "air.yaml") == bound
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"rms_px": [-1.0, 0.1, 0.2]}, "rms_px must be in 0.001..30, got -1.0"),
+        ({"rms_px": [None, None, None]}, "rms_px must be in .* got None"),
+        ({"rms_px": [0.5, 0.6, 0.7]}, "rms_px must lie in its interval"),
+        ({"half_length_px": [15.0, 0.1, 20.0]}, "half_length_px must be in 1..2000, got 0.1"),
+        ({"whole_share": [0.5, 0.2, 1.5]}, "whole_share must be in 0..1, got 1.5"),
+        ({"decay_s": [float("nan"), 0.0, 1.0]}, "decay_s must be in"),
+        ({"decay_s": ["fast", 0.1, 1.0]}, "decay_s must hold numbers, got fast"),
+        ({"blur_ratio": [1.2, 0.5, 1.3]}, "blur_ratio must be in 1..10, got 0.5"),
+        ({"blur_ratio": [True, 1.0, 1.3]}, "blur_ratio must hold numbers, got True"),
+        ({"decay_s": None}, "its keys must be rms_px, half_length_px"),
+        ({"more": [1, 1, 1]}, "its keys must be"),
+        ({"rms_px": 0.5}, "rms_px must hold value and interval"),
+        ({"rms_px": [0.5, 0.4]}, "rms_px must hold value and interval"),
+    ],
+)
+def test_a_file_with_wrong_values_is_refused(changes, message, tmp_path):
+    path = site(tmp_path / "air.yaml", **changes)
+    with pytest.raises(ValueError, match="turbulence.measured must be a file of .*: .*" + message):
+        read_turbulence_file(path)
+
+
+@pytest.mark.parametrize("text", ["[1, 2]", "a: &a [1]\nb: *a", "{", "\0"])
+def test_what_is_no_such_file_is_refused(text, tmp_path):
+    (tmp_path / "air.yaml").write_text(text)
+    with pytest.raises(ValueError, match="turbulence.measured must be a file of"):
+        read_turbulence_file(tmp_path / "air.yaml")
+    with pytest.raises(ValueError, match="turbulence.measured must be a file of"):
+        read_turbulence_file(tmp_path / "nowhere.yaml")
+    with pytest.raises(ValueError, match="turbulence.measured must be a file of .* got None"):
+        read_turbulence_file(None)
+
+
+def draws(air: MeasuredTurbulence, count: int = 30) -> list:
+    return [air.draw(torch.Generator().manual_seed(seed)) for seed in range(count)]
+
+
+def test_clips_show_what_the_file_says(tmp_path):
+    paths = draws(MeasuredTurbulence(site(tmp_path / "air.yaml"), RANGES))
+    tilts = np.array([path.tilt_std_px(256) for path in paths])
+    assert tilts.min() > 0.4 * 0.97 and tilts.max() < 0.6 * 1.03 and np.ptp(tilts) > 0.1
+    lengths = np.array([path.tilt_correlation_half_length_px(256) for path in paths])
+    assert lengths.min() > 12 * 0.9 and lengths.max() < 18 * 1.1 and np.ptp(lengths) > 3
+    decays = np.array([-1 / (120 * np.log(path.ar1_coefficient)) for path in paths])
+    assert decays.min() > 0.039 and decays.max() < 0.061
+    shares = [
+        outer_scale.global_tilt_share(
+            path.aperture_m / path.outer_scale_m,
+            tuple(np.array(path.cn2_profile) / max(path.cn2_profile)),
+            256 * path.pixel_size_at_object_m(256) / path.aperture_m,
+        )
+        for path in paths
+    ]
+    assert np.median(np.abs(np.array(shares) - 0.1)) < 0.06
+
+
+def test_what_the_file_does_not_know_is_drawn_from_the_ranges(tmp_path):
+    unknown = site(tmp_path / "air.yaml", decay_s=[None, None, None])
+    decays = [
+        -1 / (120 * np.log(path.ar1_coefficient))
+        for path in draws(MeasuredTurbulence(unknown, RANGES))
+    ]
+    assert min(decays) > 0.099 and max(decays) < 0.201
+    bound = site(tmp_path / "air.yaml", half_length_px=[None, 120.0, None])
+    lengths = [
+        path.tilt_correlation_half_length_px(256)
+        for path in draws(MeasuredTurbulence(bound, RANGES), 10)
+    ]
+    assert min(lengths) > 108
+
+
+def test_the_whole_share_is_the_mean_correlation_of_two_points():
+    rng = np.random.default_rng(0)
+    apart = np.hypot(*(rng.uniform(0, 20, (2, 4000)) - rng.uniform(0, 20, (2, 4000))))
+    for shape in ("uniform", "object"):
+        expected = outer_scale.tilt_correlation(0.1, cn2_profile(shape), apart).mean()
+        assert outer_scale.global_tilt_share(0.1, cn2_profile(shape), 20.0) == pytest.approx(
+            expected, abs=0.01
+        )
+
+
+SMALL = ["scene.height=64", "scene.width=64", "data.test_windows=2", "data.test_crop=16"]
+
+
+def test_turbulence_measured_simulates(tmp_path):
+    path = site(tmp_path / "air.yaml")
+    chosen = ["turbulence=measured", f"turbulence.measured={path}", *SMALL]
+    pipeline = build.build_pipeline(config("simulate", tmp_path, *chosen), "test")
+    assert isinstance(pipeline.turbulence, SimulatedTurbulence)
+    (drawn,) = simulate(pipeline, [0]).parameters
+    assert drawn["severity"] in ("weak", "medium")
+    calm = pipeline.turbulence.with_options(temporal_model="frozen_flow")
+    assert isinstance(calm, MeasuredTurbulence) and calm.options["temporal_model"] == "frozen_flow"
+
+
+def test_another_measurement_makes_another_cache(tmp_path):
+    path = site(tmp_path / "air.yaml")
+    chosen = ["turbulence=measured", f"turbulence.measured={path}", "data.cache_clips=2"]
+    cfg = config("train", tmp_path, *chosen, f"data.cache_root={tmp_path}/cache")
+    first = simulation.build_clip_cache(cfg).folder
+    site(tmp_path / "air.yaml", rms_px=[0.7, 0.6, 0.8])
+    assert simulation.build_clip_cache(cfg).folder != first

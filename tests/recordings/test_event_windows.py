@@ -1,0 +1,276 @@
+"""Windows do not depend on how the file is read; states are carried; pictures are held."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+from src.models.network import EventToVideoNetwork
+from src.recordings import event_windows, reconstruction, sensor_lookup, views
+from src.recordings.event_windows import WindowRule
+from src.recordings.reconstruction import ReconstructionState, reconstruct_frames
+
+EVENT = np.dtype([("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)])
+SIZE = (12, 16)
+TABLE = sensor_lookup.build_lookup(views.Views.single_view(SIZE, SIZE))
+
+
+def events(count: int, length_us: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    made = np.zeros(count, EVENT)
+    made["t"] = 5_000_000 + np.sort(rng.integers(0, length_us, count))
+    made["t"][0], made["t"][-1] = 5_000_000, 5_000_000 + length_us - 1
+    made["x"], made["y"] = rng.integers(0, SIZE[1], count), rng.integers(0, SIZE[0], count)
+    made["p"] = rng.choice([-1, 1], count)
+    return made
+
+
+def chunks(all_events: np.ndarray, sizes: int):
+    return (all_events[k : k + sizes] for k in range(0, len(all_events), sizes))
+
+
+class Leaky(EventToVideoNetwork):
+    """A recurrent stand-in: the state forgets a share of itself per step and adds the events."""
+
+    views = None
+
+    def __init__(self, keep: float = 0.9):
+        super().__init__()
+        self.keep, self.calls = keep, 0
+
+    def forward(self, voxels, state=None, *, window_s=1 / 120, positions=None):
+        self.window_s, self.positions = window_s, positions
+        self.calls += 1
+        fresh = voxels.sum((1, 2))[:, None] * 0.05
+        state = fresh if state is None else self.keep * state + fresh
+        return 0.5 + state, state
+
+
+RULES = {
+    "time": WindowRule(fps=200),
+    "overlap": WindowRule(fps=1000, frames_per_window=8),
+    "cut": WindowRule(fps=200, start_s=0.021, end_s=0.072),
+}
+
+
+@pytest.mark.parametrize("name", RULES)
+@pytest.mark.parametrize("size", [1, 37, 1000])
+def test_windows_do_not_depend_on_the_chunks(name, size):
+    made, rule = events(4000, 100_000), RULES[name]
+    whole = list(event_windows.cut_windows([made], TABLE, rule))
+    parts = list(event_windows.cut_windows(chunks(made, size), TABLE, rule))
+    assert len(whole) == len(parts) > 3
+    for one, other in zip(whole, parts, strict=True):
+        assert (one.start_us, one.end_us, one.events) == (
+            other.start_us,
+            other.end_us,
+            other.events,
+        )
+        assert np.array_equal(one.voxels, other.voxels)
+
+
+def test_windows_by_time_share_out_every_event():
+    made = events(4000, 100_000)
+    found = list(event_windows.cut_windows([made], TABLE, WindowRule(fps=200)))
+    assert len(found) == 20
+    assert sum(window.events for window in found) == 4000
+    assert [window.end_us for window in found] == [5_000_000 + 5000 * k for k in range(1, 21)]
+
+
+def test_start_and_end_cut_the_recording():
+    made = events(4000, 100_000)
+    found = list(
+        event_windows.cut_windows([made], TABLE, WindowRule(fps=1000, start_s=0.02, end_s=0.03))
+    )
+    inside = (made["t"] >= 5_020_000) & (made["t"] < 5_030_000)
+    assert sum(window.events for window in found) == inside.sum()
+
+
+def test_each_phase_of_overlapping_windows_counts_an_event_once():
+    made = events(4000, 100_000)
+    found = list(
+        event_windows.cut_windows([made], TABLE, WindowRule(fps=1000, frames_per_window=8))
+    )
+    for phase in range(8):
+        mine = found[phase::8]
+        assert all(a.end_us == b.start_us for a, b in itertools.pairwise(mine))
+        last = (made["t"] < mine[-1].end_us).sum()
+        assert sum(window.events for window in mine) == last
+
+
+def test_an_empty_window_takes_no_memory_of_its_own():
+    made = np.concatenate([events(10, 1000), events(10, 1000)])
+    made["t"][10:] += 1_000_000
+    found = list(event_windows.cut_windows([made], TABLE, WindowRule(fps=1000)))
+    assert len(found) == 1001
+    assert found[500].events == 0 and found[500].voxels.strides == (0, 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    "made, rule, message",
+    [
+        (events(100, 1000)[::-1], WindowRule(fps=5000), "backwards"),
+        (events(100, 1000), WindowRule(fps=120), "longer than one window of 1/120 s"),
+        (np.zeros(0, EVENT), WindowRule(fps=120), "longer than one window"),
+    ],
+)
+def test_a_recording_that_cannot_be_cut_is_refused(made, rule, message):
+    with pytest.raises(ValueError, match=message):
+        list(event_windows.cut_windows([made], TABLE, rule))
+
+
+def test_time_running_backwards_between_chunks_is_refused():
+    made = events(100, 10_000)
+    with pytest.raises(ValueError, match="backwards"):
+        list(event_windows.cut_windows([made[50:], made[:50]], TABLE, WindowRule(fps=5000)))
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        ({"fps": 0}, "fps must be"),
+        ({"bins": 0}, "bins must be"),
+        ({"fps": 120, "start_s": 2.0, "end_s": 1.0}, "start_s must be"),
+    ],
+)
+def test_a_wrong_rule_is_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        WindowRule(**wrong)
+
+
+def pictures(made, rule, network=None, state=None):
+    found = event_windows.cut_windows([made], TABLE, rule)
+    state = state or ReconstructionState(rule.frames_per_window)
+    frames = reconstruct_frames(found, network or Leaky(), state=state)
+    return np.stack([frame.picture for frame in frames])
+
+
+@pytest.mark.parametrize("overlap", [1, 4])
+def test_two_halves_with_the_state_carried_are_the_whole(overlap):
+    found = list(
+        event_windows.cut_windows(
+            [events(4000, 100_000)], TABLE, WindowRule(fps=1000, frames_per_window=overlap)
+        )
+    )
+    network, state = Leaky(), ReconstructionState(overlap)
+    alone = reconstruct_frames(found, network, state=ReconstructionState(overlap))
+    whole = [frame.picture for frame in alone]
+    halves = []
+    for part in (found[:37], found[37:]):
+        frames = reconstruct_frames(part, network, state=state)
+        halves += [frame.picture for frame in frames]
+    assert np.array_equal(np.stack(whole), np.stack(halves))
+
+
+def test_empty_windows_hold_the_picture_and_skip_the_network():
+    made = np.concatenate([events(500, 20_000), events(500, 20_000)])
+    made["t"][500:] += 1_000_000
+    network = Leaky()
+    found = pictures(made, WindowRule(fps=1000), network)
+    assert network.calls == 40
+    assert np.array_equal(found[20:1000], np.repeat(found[19:20], 980, axis=0))
+
+
+def still_after_motion(noise_hz: float) -> np.ndarray:
+    """Return 0.1 s of motion, then 0.5 s of a still scene with `noise_hz` events of the sensor."""
+    moving = events(3000, 100_000)
+    noise = events(max(2, int(noise_hz * 0.5)), 500_000, seed=1)
+    noise["t"] += 100_000
+    return np.concatenate([moving, noise])
+
+
+@pytest.mark.parametrize("noise_hz", [0.0, 2000.0])
+def test_a_still_scene_at_12000_fps_fades_no_more_than_at_the_trained_rate(noise_hz):
+    made = still_after_motion(noise_hz)
+    slow = pictures(made, WindowRule(fps=120))
+    overlap = event_windows.frames_per_window("trained", 12_000)
+    fast = pictures(made, WindowRule(fps=12_000, frames_per_window=overlap))
+    contrast = [found[-1].std() / found[len(found) // 5].std() for found in (slow, fast)]
+    assert contrast[1] == pytest.approx(contrast[0], rel=0.15)
+    naive = pictures(made, WindowRule(fps=12_000))
+    if noise_hz:  # what the rule is for: a window per frame fades to nothing
+        assert naive[-1].std() < 0.5 * fast[-1].std()
+
+
+def test_a_still_scene_at_12000_fps_does_not_flicker():
+    overlap = event_windows.frames_per_window("trained", 12_000)
+    rule = WindowRule(fps=12_000, frames_per_window=overlap)
+    fast = pictures(still_after_motion(0.0), rule)
+    assert np.abs(np.diff(fast[2400:-1], axis=0)).max() == 0  # an event ends the recording
+
+
+@pytest.mark.parametrize("fps, frames", [(60, 1), (120, 1), (600, 5), (1000, 8), (12_000, 100)])
+def test_a_window_spans_the_trained_length(fps, frames):
+    assert event_windows.frames_per_window("trained", fps) == frames
+    assert event_windows.frames_per_window("frame", fps) == 1
+
+
+def test_another_span_is_refused():
+    with pytest.raises(ValueError, match="window_length must be"):
+        event_windows.frames_per_window("long", 120)
+
+
+def test_a_network_is_given_the_window_and_the_positions():
+    network = Leaky()
+    found = event_windows.cut_windows([events(400, 10_000)], TABLE, WindowRule(fps=600))
+    list(reconstruct_frames(found, network, positions=[(0, 0)]))
+    assert network.window_s == pytest.approx(1 / 600) and network.positions == [(0, 0)]
+
+
+def test_view_by_view_a_network_is_given_the_window_too():
+    network = Leaky()
+    found = event_windows.cut_windows([events(400, 100_000)], TABLE, WindowRule(fps=60))
+    list(reconstruction.reconstruct_each_view(found, network))
+    assert network.window_s == pytest.approx(1 / 60) and network.positions == [(0, 0)]
+
+
+@pytest.mark.parametrize(
+    "wants, there, all_views", [(None, 9, True), (9, 9, True), (1, 9, False), (1, 1, True)]
+)
+def test_a_network_gets_the_views_it_wants(wants, there, all_views):
+    network = Leaky()
+    network.views = wants
+    assert reconstruction.takes_all_views(network, there) == all_views
+
+
+def test_nine_view_weights_with_one_view_are_refused():
+    network = Leaky()
+    network.views = 9
+    with pytest.raises(ValueError, match="wants 9 views, the recording has 1"):
+        reconstruction.takes_all_views(network, 1)
+
+
+def test_pictures_are_in_range_for_any_events():
+    found = pictures(events(4000, 50_000), WindowRule(fps=100), Leaky(keep=1.0))
+    assert found.min() >= 0 and found.max() <= 1 and torch.from_numpy(found).isfinite().all()
+
+
+class Sums(EventToVideoNetwork):
+    """The sum of all events so far, in grey: 0.5 is none."""
+
+    def forward(self, voxels, state=None, **_):
+        change = voxels.sum((1, 2))[:, None]
+        state = change if state is None else state + change
+        return 0.5 + 1e-3 * state, state
+
+
+@pytest.mark.parametrize("overlap, size", [(1, 4000), (4, 4000), (4, 100)])
+def test_what_looked_ahead_begins_with_what_is_missing_to_there(overlap, size):
+    made, rule = (
+        events(4000, 100_000),
+        WindowRule(fps=1000, frames_per_window=overlap, start_s=0.01),
+    )
+    once, state = pictures(made, rule, Sums()), ReconstructionState(overlap)
+    back = list(event_windows.cut_windows_backward(chunks(made, size), TABLE, rule, 0.0335))
+    assert [window.end_us - made["t"][0] for window in back] == [
+        1e3 * (10 + k) for k in range(33 // overlap * overlap, 0, -1)
+    ]
+    for _ in reconstruct_frames(back, Sums(), state=state):
+        pass
+    state.reverse()
+    ahead = pictures(made, rule, Sums(), state)
+    there = 33 // overlap * overlap  # the last window of each phase that was looked at
+    for k in range(overlap):
+        base = once[there - overlap + k] - 0.5
+        np.testing.assert_allclose(ahead[k::overlap], once[k::overlap] - base, atol=1e-5)

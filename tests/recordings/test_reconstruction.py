@@ -1,0 +1,101 @@
+"""Frames from lists of events are those from grids, resampled views, empty windows and all."""
+
+import numpy as np
+import pytest
+import torch
+
+from baselines.firenet import FireNet
+from src.deploy.forms import ReducedPrecisionNetwork
+from src.deploy.runtime import EventListRuntime
+from src.models.e2vid import E2VID
+from src.models.setnet import SetNet
+from src.recordings import event_windows, reconstruction, sensor_lookup
+from src.recordings.files.formats import EVENT
+from src.recordings.reconstruction import ReconstructionState, reconstruct_frames
+from src.recordings.simulated_recording import kaleidoscope_views
+from src.sim.optics import layout
+
+SENSOR = {"sensor": (96, 120), "tile_px": 36.0, "homography_error_px": 0.5}
+VIEWS = kaleidoscope_views(list(layout(9)), model=(24, 32), **SENSOR)
+NETWORKS = {
+    "setnet": lambda: SetNet(channels=4),
+    "e2vid": lambda: E2VID(views=9, base_channels=4),
+}
+
+
+def recording() -> np.ndarray:
+    """Events of 50 ms with a pause of 20 in the middle."""
+    rng = np.random.default_rng(0)
+    made = np.empty(4000, EVENT)
+    made["t"] = np.sort(rng.choice(np.r_[0:15_000, 35_000:50_000], 4000))
+    made["x"], made["y"] = rng.integers(0, 120, 4000), rng.integers(0, 96, 4000)
+    made["p"] = rng.integers(0, 2, 4000) * 2 - 1
+    return made
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize(
+    "cut",
+    [
+        {"fps": 240.0},
+        {"fps": 240.0, "splat": "nearest"},
+        {"fps": 600.0, "frames_per_window": 5},
+    ],
+)
+def test_the_frames_are_those_from_grids(name, cut):
+    torch.manual_seed(0)
+    network, table = NETWORKS[name]().eval(), sensor_lookup.build_lookup(VIEWS)
+    span = cut.get("frames_per_window", 1)
+    grids = event_windows.cut_windows([recording()], table, event_windows.WindowRule(**cut))
+    dense = list(reconstruct_frames(grids, network, VIEWS.positions, ReconstructionState(span)))
+    lists = event_windows.cut_windows(
+        [recording()], table, event_windows.WindowRule(**cut, as_lists=True)
+    )
+    runtime, state = (
+        reconstruction.prepare_network(network, "float32", "cpu", VIEWS, 5),
+        ReconstructionState(span),
+    )
+    found = []
+    for window in lists:  # law 6: each window a call of its own
+        found += reconstruct_frames([window], runtime, state=state)
+    assert len(found) == len(dense) > 5
+    for one, other in zip(dense, found, strict=True):
+        assert (one.time_s, one.events, one.outside) == (other.time_s, other.events, other.outside)
+        np.testing.assert_allclose(one.picture, other.picture, atol=1e-5)
+
+
+def test_what_is_run_follows_from_network_and_device():
+    network = SetNet(channels=4)
+    assert isinstance(
+        reconstruction.prepare_network(network, "bf16", "cpu", VIEWS, 5), EventListRuntime
+    )
+    assert isinstance(
+        reconstruction.prepare_network(FireNet(), "bf16", "cpu", VIEWS, 5), ReducedPrecisionNetwork
+    )
+    with pytest.raises(ValueError, match="bins must be 5 for this network, got 3"):
+        reconstruction.prepare_network(network, "bf16", "cpu", VIEWS, 3)
+    with pytest.raises(ValueError, match="device must be cpu for form=openvino, got cuda"):
+        reconstruction.prepare_network(network, "openvino", "cuda", VIEWS, 5)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("cut", [{"fps": 240.0}, {"fps": 600.0, "frames_per_window": 5}])
+def test_lists_of_events_backwards_are_the_grids_backwards(name, cut):
+    torch.manual_seed(0)
+    network, table = NETWORKS[name]().eval(), sensor_lookup.build_lookup(VIEWS)
+    span = cut.get("frames_per_window", 1)
+    runtime = reconstruction.prepare_network(network, "float32", "cpu", VIEWS, 5)
+    shown = []
+    for grids in (True, False):
+        state = ReconstructionState(span)
+        rule = event_windows.WindowRule(**cut, as_lists=not grids)
+        for windows in (event_windows.cut_windows_backward, event_windows.cut_windows):
+            ahead = [0.03] if windows is event_windows.cut_windows_backward else []
+            made = windows([recording()], table, rule, *ahead)
+            run = network if grids else runtime
+            found = list(reconstruct_frames(made, run, VIEWS.positions, state))
+            if ahead:
+                assert len(found) == {240.0: 7, 600.0: 15}[cut["fps"]]
+                state.reverse()
+        shown.append(np.stack([frame.picture for frame in found]))
+    np.testing.assert_allclose(*shown, atol=1e-5)

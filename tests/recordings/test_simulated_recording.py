@@ -1,0 +1,191 @@
+"""A simulated recording read back: its geometry, its motion and its turbulence are found again."""
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from src.recordings import sensor_lookup, simulated_recording, views
+from src.recordings.calibration import dot_statistics, gaussian_dots, view_alignment
+from src.recordings.calibration.boards import Charuco, Checkerboard, Circles
+from src.recordings.files import formats, sources
+from src.sim.optics import layout
+from src.sim.sensor.sensor import EventSensor
+from tests.recordings import pictures
+from tests.recordings.calibration.test_dot_statistics import sampling_error, series
+from tests.recordings.test_views import distance_px, split
+
+SENSOR, SIDE, TILE = (360, 640), 120, 116.0
+
+
+def noisy_sensor(**changes) -> EventSensor:
+    settings = {
+        "mismatch": 0.03,
+        "dark_noise_hz": 1.0,
+        "leak_event_hz": 0.1,
+        "hot_pixel_fraction": 1e-4,
+    }
+    return EventSensor(0.4, refractory_s=5e-4, hot_pixel_hz=60.0, **{**settings, **changes})
+
+
+@pytest.fixture(scope="module")
+def truth() -> views.Views:
+    positions = list(layout(9))
+    return simulated_recording.kaleidoscope_views(
+        positions, model=(SIDE, SIDE), sensor=SENSOR, tile_px=TILE, key=5
+    )
+
+
+def half(picture: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(picture).reshape(SIDE, 2, SIDE, 2).mean((1, 3))
+
+
+def blinking(picture: torch.Tensor, frames: int = 5) -> torch.Tensor:
+    """Return (9, frames, h, w): a screen that shows the picture in every second frame."""
+    film = torch.full((frames, *picture.shape), 0.05)
+    film[1::2] = picture
+    return film[None].expand(9, -1, -1, -1)
+
+
+@pytest.mark.parametrize(
+    "target, picture",
+    [
+        (Checkerboard(5, 7), pictures.checkerboard(5, 7, pitch=25)),
+        (Circles(5, 7), pictures.circles(5, 7)),
+    ],
+    ids=["checkerboard", "circles"],
+)
+def test_a_blinking_screen_calibrates_the_views(truth, target, picture, tmp_path):
+    path = tmp_path / "board.raw"
+    simulated_recording.write_recording(path, blinking(half(picture)), 60.0, truth, noisy_sensor())
+    seen = view_alignment.repair_picture(sources.read_sensor_picture(path))
+    aligned = view_alignment.fit_homographies(
+        view_alignment.find_target(seen, target), sensor=SENSOR, model=(88, 88)
+    )
+    assert aligned.views.positions == list(layout(9))
+    assert max(distance_px(aligned.views, truth).values()) < 0.3
+    saved = views.load_views(tmp_path / "board.views.yaml", sources.sensor_size(path))
+    assert [saved.is_mirrored(view) for view in saved.views] == [
+        aligned.views.is_mirrored(view) for view in aligned.views.views
+    ]
+
+
+@pytest.mark.slow  # markers need the full sensor: 30 million events
+def test_a_blinking_charuco_board_calibrates_the_views_of_an_evk4(tmp_path):
+    truth = simulated_recording.kaleidoscope_views(list(layout(9)), model=(240, 240), key=5)
+    film = blinking(torch.from_numpy(pictures.charuco()))
+    events = simulated_recording.record_events(film, 60.0, truth, noisy_sensor())
+    counts = np.zeros(truth.sensor)
+    np.add.at(counts, (events["y"], events["x"]), 1)
+    found = view_alignment.find_target(view_alignment.repair_picture(counts), Charuco(6, 6))
+    aligned = view_alignment.fit_homographies(found, sensor=truth.sensor, model=(176, 176))
+    assert max(distance_px(aligned.views, truth).values()) < 0.3
+
+
+def moving_dot(frames: int = 41) -> tuple[torch.Tensor, np.ndarray]:
+    """Return frames (frames, h, w) of a bright dot and its path (frames, 2)."""
+    time = np.linspace(0, 1, frames)
+    path = np.stack([25 + 70 * time, 80 - 40 * time], axis=1)
+    film = pictures.dot_grid(
+        path[:, None], np.full((frames, 1), 4.0), np.full((frames, 1), 0.8), SIDE
+    )
+    return torch.from_numpy(film).float() - 0.75, path
+
+
+def test_every_view_shows_the_motion_upright_in_its_place(truth):
+    film, path = moving_dot()
+    clear = noisy_sensor(mismatch=0.0, dark_noise_hz=0.0, leak_event_hz=0.0, hot_pixel_fraction=0.0)
+    events = simulated_recording.record_events(
+        film[None].expand(9, -1, -1, -1).clamp(0, 1), 600.0, truth, clear
+    )
+    kept, view = split(sensor_lookup.build_lookup(truth), events)
+    late = kept["t"] > 30_000
+    for index in range(9):
+        mine = kept[(view == index) & late & (kept["p"] > 0)]
+        moment = mine["t"] * 600e-6
+        there = [np.interp(moment, np.arange(len(path)), axis) for axis in path.T]
+        lead = mine["x"] - there[0], mine["y"] - there[1]
+        # ON events surround the leading edge, ahead of the dot by about its sigma of 4 px.
+        assert 1 < np.mean(lead[0]) < 6 and -6 < np.mean(lead[1]) < -0.5
+
+
+def test_bands_of_the_sensor_make_the_same_events(truth, monkeypatch):
+    frames, sensor = blinking(half(pictures.circles(5, 7)), 3), noisy_sensor()
+    whole = simulated_recording.record_events(frames, 60.0, truth, sensor)
+    monkeypatch.setattr(simulated_recording, "BAND_BYTES", 4 * SENSOR[1] * 3 * 50)
+    bands = simulated_recording.record_events(frames, 60.0, truth, sensor)
+    one, other = (part[np.lexsort([part[name] for name in "pxyt"])] for part in (whole, bands))
+    assert np.array_equal(one, other)
+    assert (np.diff(bands["t"]) >= 0).all()
+
+
+def test_a_still_scene_makes_no_event(truth):
+    still = torch.full((9, 3, SIDE, SIDE), 0.6)
+    ideal = EventSensor(0.2, refractory_s=0.0)
+    assert len(simulated_recording.record_events(still, 60.0, truth, ideal)) == 0
+
+
+def test_the_truth_lies_beside_the_recording(truth, tmp_path):
+    frames, tilt = blinking(half(pictures.circles(5, 7)), 3), torch.zeros(9, 3, 2, SIDE, SIDE)
+    path = tmp_path / "cap.raw"
+    count = simulated_recording.write_recording(
+        path, frames, 60.0, truth, noisy_sensor(), tilt=tilt
+    )
+    assert len(formats.read_events(path)) == count
+    with h5py.File(tmp_path / "cap.truth.h5") as file:
+        assert file.attrs["fps"] == 60 and file["tilt"].shape == tilt.shape
+        assert np.array_equal(file["centre"][:], frames[4].numpy())
+
+
+def test_views_turn_about_the_centre_one(truth):
+    assert [truth.is_mirrored(view) for view in truth.views] == [
+        (bool(col % 2), bool(row % 2)) for row, col in layout(9)
+    ]
+    assert np.allclose(truth.views[4].homography, np.eye(3))
+
+
+def dot_films(frames: int = 120) -> tuple[torch.Tensor, np.ndarray, np.ndarray]:
+    """Return dots (9, frames, h, w) with tilts (frames, 9 views x 9 dots, 2) and spreads."""
+    grid = np.array([[x, y] for y in (30.0, 60.0, 90.0) for x in (30.0, 60.0, 90.0)])
+    tilt = 0.8 * series(frames, 81, 0.7, seed=7).reshape(frames, 9, 9, 2)
+    tilt[:, :, 1:] = 0.6 * tilt[:, :, :1] + 0.8 * tilt[:, :, 1:]  # within a view dots share a part
+    sigma = 3.0 + 0.4 * np.random.default_rng(8).normal(size=(frames, 9, 9))
+    dark = np.full((frames, 9), -0.6)
+    films = [pictures.dot_grid(grid + tilt[:, v], sigma[:, v], dark, SIDE) for v in range(9)]
+    return torch.from_numpy(np.stack(films)).float(), tilt, sigma
+
+
+def fits_of(films: torch.Tensor, truth: views.Views, places=None) -> tuple[list, np.ndarray]:
+    """Film the views on the sensor, register them again and fit every dot."""
+    table = sensor_lookup.build_lookup(truth)
+    seen = simulated_recording.render_sensor_frames(
+        films, table, simulated_recording.vignette_gain(table, 0.3), slice(None)
+    )
+    seen = seen + 0.005 * torch.randn(seen.shape, generator=torch.Generator().manual_seed(0))
+    registered = np.stack([truth.warp_to_model(frame) for frame in seen.numpy()], axis=1)
+    if places is None:
+        places = dot_statistics.find_dots(registered[4].mean(0), 3, 3)
+    return [gaussian_dots.fit_gaussians(film, places, 12) for film in registered], places
+
+
+def test_statistics_are_those_of_the_simulated_turbulence(truth):
+    films, tilt, sigma = dot_films()
+    calm = pictures.dot_grid(
+        np.array([[[x, y] for y in (30.0, 60.0, 90.0) for x in (30.0, 60.0, 90.0)]] * 12),
+        np.full((12, 9), 2.4), np.full((12, 9), -0.6), SIDE,
+    )  # fmt: skip
+    still, places = fits_of(torch.from_numpy(calm).float()[None].expand(9, -1, -1, -1), truth)
+    turbulent, _ = fits_of(films, truth, places)
+    found = dot_statistics.compare_with_still(turbulent, still, fps=60.0, centre=4)
+    assert found.failed.sum() == 0
+    error = sampling_error(tilt[:, 4, 4])  # 0.09: of these 120 frames
+    true = dot_statistics.autocorrelate(tilt[:, 4, 4], 20)
+    assert np.abs(found.autocorrelation[:20] - true).max() < error
+    assert np.abs(found.within_view - dot_statistics.tilt_correlation(tilt[:, 4])).max() < error
+    assert np.abs(found.across_views - dot_statistics.tilt_correlation(tilt[:, :, 4])).max() < error
+    assert found.blur_ratio[4] == pytest.approx(sigma[:, 4].mean(0) / 2.4, rel=0.03)
+    # The dots' flux goes as sigma squared here, which is what scintillation has to find.
+    flux = sigma[:, 4, 4] ** 2
+    index = flux.var() / flux.mean() ** 2
+    assert found.scintillation[4, 4] == pytest.approx(index, rel=0.15)
+    assert found.still_scintillation[4].max() < 0.1 * index

@@ -1,0 +1,130 @@
+"""Which runs are one group, what its label says, and what is missing or contradicts itself."""
+
+import pytest
+
+from src.records import runs
+from src.reports.run_groups import group_runs
+from tests.reports.runs import write_run, write_sweep
+
+
+def grouped(*folders):
+    return group_runs(runs.find_runs(list(folders)), runs.find_sweeps(list(folders)))
+
+
+def test_seeds_of_one_setting_are_one_group_whatever_the_folders_are_called(tmp_path):
+    for name, experiment, seed in [("z", "lf3x3", 0), ("lf3x3", "single256", 0), ("0", "lf3x3", 1)]:
+        write_run(tmp_path / name, experiment, seed)
+    keys, found = grouped(tmp_path)
+    assert keys == ("experiment",)
+    seeds = {group.label: [run.record["seed"] for run in group.runs] for group in found}
+    assert seeds == {("lf3x3",): [0, 1], ("single256",): [0]}
+
+
+def test_the_label_takes_as_few_choices_and_overrides_as_tell_the_groups_apart(tmp_path):
+    place = 0
+    for optics in ("single", "lf3x3"):
+        for lr in ("0.1", "0.2"):
+            write_run(
+                tmp_path / str(place),
+                choices={"optics": optics, "turbulence": "mixed"},
+                overrides=(f"optics={optics}", f"lr={lr}"),
+                settings={"lr": float(lr), "optics": {"views": optics}},
+            )
+            place += 1
+    keys, found = grouped(tmp_path)
+    assert keys == ("optics", "lr")
+    assert [group.label for group in found] == [
+        ("single", "0.1"),
+        ("single", "0.2"),
+        ("lf3x3", "0.1"),
+        ("lf3x3", "0.2"),
+    ]
+
+
+def test_a_default_asked_for_by_name_is_the_same_group(tmp_path):
+    write_run(tmp_path / "a", seed=0, overrides=("lr=0.001",))
+    write_run(tmp_path / "b", seed=1)
+    assert [len(group.runs) for group in grouped(tmp_path)[1]] == [2]
+
+
+def test_settings_that_no_command_line_names_part_groups_too(tmp_path):
+    write_run(tmp_path / "a", settings={"lr": 0.1})
+    write_run(tmp_path / "b", settings={"lr": 0.2})
+    keys, found = grouped(tmp_path)
+    assert keys == ("lr",) and [group.label for group in found] == [("0.1",), ("0.2",)]
+
+
+def test_where_and_on_what_machine_it_ran_makes_no_other_cell(tmp_path):
+    write_run(tmp_path / "a", seed=0, settings={"data": {"workers": 0}})
+    write_run(tmp_path / "b", seed=1, settings={"data": {"workers": 2}, "ckpt": "x.ckpt"})
+    assert len(grouped(tmp_path)[1]) == 1
+
+
+@pytest.mark.parametrize(("task", "cells"), [("eval", 1), ("train", 2)])
+def test_other_test_clips_are_another_cell_of_trainings_only(task, cells, tmp_path):
+    for seed in (0, 1):
+        settings = {"data": {"test_seed": seed}}
+        write_run(tmp_path / str(seed), seed=seed, settings=settings, task=task)
+    assert len(grouped(tmp_path)[1]) == cells
+
+
+def test_networks_of_several_seeds_on_the_same_clips_are_one_group_across_ckpt(tmp_path):
+    for path in ("a.ckpt", "b.ckpt"):
+        settings = {"ckpt": path}
+        write_run(tmp_path / path, overrides=(f"ckpt={path}",), settings=settings, task="eval")
+    assert [group.label for group in grouped(tmp_path)[1]] == [("a.ckpt",), ("b.ckpt",)]
+    keys, (group,) = group_runs(runs.find_runs([tmp_path]), across=("ckpt",))
+    assert keys == ("experiment",) and len(group.runs) == 2
+
+
+def test_of_two_runs_of_one_seed_the_newer_counts_and_it_is_said(tmp_path):
+    write_run(tmp_path / "b", scores={"ssim": 0.1})
+    write_run(tmp_path / "a", scores={"ssim": 0.2})
+    (group,) = grouped(tmp_path)[1]
+    assert [run.folder.name for run in group.runs] == ["a"]
+    assert group.older == 1
+
+
+def test_jobs_of_the_sweep_without_results_are_missing_in_its_order(tmp_path):
+    write_sweep(tmp_path, {"experiment": "single768,single256,lf3x3", "seed": "range(2)"})
+    write_run(tmp_path / "0", "lf3x3", 0)
+    write_run(tmp_path / "1", "lf3x3", 1)
+    write_run(tmp_path / "2", "single256", 1)
+    _, found = grouped(tmp_path)
+    assert [(group.label[0], len(group.runs), group.missing) for group in found] == [
+        ("single768", 0, 2),
+        ("single256", 1, 1),
+        ("lf3x3", 2, 0),
+    ]
+
+
+def test_a_plan_is_the_command_and_its_jobs(tmp_path):
+    write_sweep(tmp_path, {"experiment": "a,b", "seed": "range(2)"}, ("budget=hour", "seed=7"))
+    (plan,) = runs.find_sweeps([tmp_path])
+    assert plan.command == (
+        "python -m src.train --config-dir sweeps --config-name table1 budget=hour seed=7"
+    )
+    assert [set(job) for job in plan.jobs] == [
+        {"experiment=a", "seed=7", "budget=hour"},
+        {"experiment=b", "seed=7", "budget=hour"},
+    ]
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [(None, "empty or not finished"), ("{", "whole results"), ('{"schema": 9}', "schema must be")],
+)
+def test_an_empty_or_broken_run_folder_is_named(content, said, tmp_path):
+    folder = write_run(tmp_path / "run")
+    if content is None:
+        (folder / "results.json").unlink()
+    else:
+        (folder / "results.json").write_text(content)
+    with pytest.raises(ValueError, match=said) as error:
+        runs.find_runs([tmp_path / "run"])
+    assert str(folder) in str(error.value) and "run" in str(error.value)
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(ValueError, match="no such folder"):
+        runs.find_runs([tmp_path / "nowhere"])

@@ -1,0 +1,133 @@
+"""Filling a cache with processes that draw: what is made, how it ends, and what is reported."""
+
+import gc
+import json
+import multiprocessing
+import os
+import pickle
+import signal
+import subprocess
+import sys
+from collections.abc import Iterable
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from scripts import parallel_fill
+from scripts.parallel_fill import FillReport, fill
+from src.sim.pipeline import Pipeline
+from src.training.clip_cache import CachedClip
+from src.training.disk_cache import DiskClipCache
+from tests.training.cache_sources import Broken, Growing, Other, Telling, source
+from tests.training.test_disk_cache import runs, until
+
+
+def made(of: Pipeline, indices: Iterable[int], **kw) -> tuple[dict[int, CachedClip], FillReport]:
+    """Return what is stored, in order, and the report."""
+    stored: dict[int, CachedClip] = {}
+    report = fill(of, indices, stored.__setitem__, **{"device": "cpu", "workers": 1} | kw)
+    return stored, report
+
+
+def nobody_draws() -> bool:
+    gc.collect()  # an error that is still somewhere holds the loader
+    return not multiprocessing.active_children()
+
+
+def test_clips_are_those_of_a_disk_cache_and_drawn_without_the_device(tmp_path):
+    of = source(Telling(tmp_path / "told"))
+    stored, report = made(of, range(7), workers=2)
+    assert (tmp_path / "told").read_text() == "False ''"
+    cache = DiskClipCache(source(), tmp_path, {}, clips=7, frames=7, gib=1.0)
+    assert list(stored) == list(range(7)) and report.clips == 7
+    for index, (views, clean, metadata) in stored.items():
+        clip = cache.clip(index)
+        assert torch.equal(views, clip.views) and torch.equal(clean, clip.clean)
+        assert views.dtype == clean.dtype == torch.float16
+        assert json.loads(json.dumps(metadata)) == clip.metadata
+
+
+def test_turbulence_that_is_prepared_elsewhere_gives_the_same_clips(monkeypatch):
+    """As for a GPU: turbulence comes from those who draw, and all views are computed at once."""
+    of = source(Growing(frames=7))
+    monkeypatch.setattr(parallel_fill, "prepares_turbulence", lambda device: True)
+    for index, (views, *_) in made(of, range(6))[0].items():
+        expected = of.render_views([of.draw(index)])[0].half()
+        assert views.dtype == torch.float16 and views.shape == expected.shape
+        torch.testing.assert_close(views.float(), expected.float(), atol=1e-3, rtol=0)
+        assert (views != expected).float().mean() < 0.02  # rounded the other way
+
+
+def test_turbulence_that_cannot_be_prepared_is_computed_here_and_a_failure_named(monkeypatch):
+    of, stored = source(turbulence=Other({"severity": "weak"})), {}
+    monkeypatch.setattr(parallel_fill, "prepares_turbulence", lambda device: True)
+    with pytest.raises(RuntimeError, match="clip 2: MemoryError: no room"):
+        fill(of, range(6), stored.__setitem__, device="cpu", workers=1)
+    assert list(stored) == [0, 1]
+    expected = [of.render_views([of.draw(k)])[0].half() for k in stored]
+    assert all(torch.equal(stored[k].views, expected[k]) for k in stored)
+
+
+@pytest.mark.parametrize(
+    ("killed", "error", "message"),
+    [
+        (False, ValueError, "clip 2: scene.root must hold readable photographs, got two.png"),
+        (True, RuntimeError, r"DataLoader worker .* (exited unexpectedly|killed by signal)"),
+    ],
+)
+def test_a_clip_that_cannot_be_drawn_is_an_error_and_nothing_hangs(killed, error, message):
+    stored: dict[int, CachedClip] = {}
+    with pytest.raises(error, match=message):
+        fill(source(Broken(killed)), range(6), stored.__setitem__, device="cpu", workers=2)
+    assert list(stored) == [0, 1] or (killed and len(stored) < 2)
+    until(nobody_draws)
+
+
+def test_an_error_that_is_no_refusal_says_its_kind():
+    draws = parallel_fill._PickledDraws(source(), False)
+    draws.source.scene = None
+    error = pickle.loads(draws[0])
+    assert isinstance(error, RuntimeError) and str(error).startswith("clip 0: AttributeError: ")
+
+
+def test_what_store_raises_ends_all_and_is_raised():
+    def store(*_) -> None:
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        fill(source(), range(9), store, device="cpu", workers=1)
+    until(nobody_draws)
+
+
+def test_it_stops_in_time_without_a_gap(monkeypatch):
+    stored: dict[int, CachedClip] = {}
+    clock = SimpleNamespace(monotonic=lambda: len(stored))
+    monkeypatch.setattr(parallel_fill, "time", clock)
+    report = fill(source(), range(5, 10_000), stored.__setitem__, device="cpu", workers=2, until=3)
+    assert list(stored) == [5, 6, 7] and report.clips == 3
+    assert str(report).startswith("3 clips in ") and f"{report.clips_per_second:.1f}" in str(report)
+
+
+def test_nothing_to_do_and_no_one_to_do_it():
+    assert made(source(), [])[1].clips == 0
+    with pytest.raises(ValueError, match="workers must be a whole number >= 0, got -1"):
+        made(source(), range(3), workers=-1)
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_from_outside_all_end(how, tmp_path):
+    told = tmp_path / "pids"
+    call = f"from tests.training import cache_sources; cache_sources.fill_for_ever({str(told)!r})"
+    asking = subprocess.Popen(
+        [sys.executable, "-c", call], start_new_session=True, stderr=subprocess.DEVNULL
+    )
+    until(lambda: told.exists() and told.read_text().endswith("."))
+    drawing = [int(pid) for pid in told.read_text()[:-1].split()]
+    assert len(drawing) == 2 and all(map(runs, drawing))
+    if how == signal.SIGINT:
+        os.killpg(asking.pid, how)  # Ctrl-C reaches all of them
+    else:
+        asking.terminate()
+    assert asking.wait(600) != 0
+    until(lambda: not any(map(runs, drawing)))

@@ -1,0 +1,318 @@
+"""From a simulated recording to views.yaml to video to statistics, through the doors."""
+
+import csv
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+
+from src.calibrate import calibrate
+from src.compare import compare
+from src.reconstruct import reconstruct
+from src.recordings import sensor_lookup, simulated_recording, views
+from src.sim.optics import layout
+from src.sim.sensor.sensor import EventSensor
+from tests.conftest import ROOT
+from tests.recordings import pictures
+
+SENSOR, SIDE = (360, 640), 120
+HIGHPASS = "+baseline._target_=baselines.highpass.HighPass"
+
+
+def config(name: str, run: Path, *overrides: str):
+    with initialize_config_dir(str(ROOT / "conf"), version_base=None):
+        cfg = compose(name, list(overrides))
+    run.mkdir(exist_ok=True)
+    cfg.paths.run = str(run)
+    return cfg
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Return a folder with board.raw, a blinking board, and dot.raw, a moving dot."""
+    folder = tmp_path_factory.mktemp("camera")
+    truth = simulated_recording.kaleidoscope_views(
+        list(layout(9)), model=(SIDE, SIDE), sensor=SENSOR, tile_px=116.0
+    )
+    sensor = EventSensor(0.5, refractory_s=5e-4, dark_noise_hz=0.5)
+    board = torch.from_numpy(pictures.checkerboard(5, 7, 25)).reshape(SIDE, 2, SIDE, 2).mean((1, 3))
+    blink = torch.stack([board if k % 2 else torch.full_like(board, 0.05) for k in range(5)])
+    path = np.stack([np.linspace(30, 90, 31), np.linspace(80, 50, 31)], axis=1)
+    dot = pictures.dot_grid(path[:, None], np.full((31, 1), 4.0), np.full((31, 1), 0.9), SIDE) - 0.7
+    for name, film in (("board", blink), ("dot", torch.from_numpy(dot).float().clamp(0, 1))):
+        frames = film[None].expand(9, -1, -1, -1)
+        simulated_recording.write_recording(folder / f"{name}.raw", frames, 300.0, truth, sensor)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def found(folder) -> Path:
+    """Return the views.yaml that the door made of board.raw."""
+    path = folder / "views.yaml"
+    recording = f"recording={folder}/board.raw"
+    calibrate(
+        config(
+            "calibrate", folder / "a", "task=views", recording, f"save={path}", "resolution=[88,88]"
+        )
+    )
+    return path
+
+
+def test_calibrating_the_views_leaves_a_file_and_pictures(folder, found):
+    there = views.load_views(found, SENSOR)
+    assert there.positions == list(layout(9)) and there.model == (88, 88)
+    assert max(view.error_px for view in there.views) < 0.5
+    for name in ("views.yaml", "views.png", "found.png"):
+        assert (folder / "a" / name).stat().st_size > 0
+
+
+@pytest.mark.parametrize("extra", ["fps=120", "fps=1200", "fps=300 start_s=0.02 end_s=0.06"])
+def test_reconstructing_gives_a_picture_and_a_time_per_window(folder, found, extra, tmp_path):
+    chosen = [f"recording={folder}/dot.raw", f"views={found}", HIGHPASS, "output_format=hdf5"]
+    run = reconstruct(config("reconstruct", tmp_path / "run", *chosen, *extra.split()))
+    with h5py.File(run / "video.h5") as file:
+        frames, times = file["frames"][:], file["time_s"][:]
+    assert frames.shape[1:] == (88, 88) and len(frames) == len(times) > 5
+    assert (np.diff(times) > 0).all() and frames.std() > 1
+    with open(run / "frames.csv") as file:
+        assert len(list(csv.DictReader(file))) == len(frames)
+
+
+def test_a_faster_form_gives_nearly_the_same_frames(folder, found, tmp_path):
+    chosen = [
+        f"recording={folder}/dot.raw",
+        f"views={found}",
+        "ckpt=setnet_small",
+        "output_format=hdf5",
+    ]
+    shown = []
+    for form in ("float32", "bf16"):
+        reconstruct(config("reconstruct", tmp_path / form, *chosen, f"form={form}"))
+        with h5py.File(tmp_path / form / "video.h5") as file:
+            shown.append(file["frames"][:].astype(float) / 255)
+    assert 0 < np.abs(shown[0] - shown[1]).mean() < 0.02
+
+
+def test_what_a_backward_warmup_adds_is_there_from_the_first_frame_and_fades(
+    folder, found, tmp_path
+):
+    chosen = [f"recording={folder}/dot.raw", f"views={found}", HIGHPASS, "output_format=hdf5"]
+    films = []
+    for ahead in (0.0, 0.1):
+        run = tmp_path / str(ahead)
+        reconstruct(config("reconstruct", run, *chosen, f"backward_warmup_s={ahead}"))
+        with h5py.File(run / "video.h5") as file:
+            films.append(file["frames"][:].astype(float))
+    added = np.abs(films[1] - films[0]).mean((1, 2))
+    assert added[0] > 0.1 and added[-1] < 0.5 * added[0]
+
+
+def test_the_reconstructed_dot_moves_as_the_true_one(folder, found, tmp_path):
+    chosen = [
+        f"recording={folder}/dot.raw",
+        f"views={found}",
+        HIGHPASS,
+        "output_format=hdf5",
+        "fps=300",
+    ]
+    run = reconstruct(config("reconstruct", tmp_path / "run", *chosen))
+    with h5py.File(run / "video.h5") as file:
+        bright = np.clip(file["frames"][:].astype(float) - 140, 0, None)
+    x = (bright.sum(1) @ np.arange(88)) / bright.sum((1, 2))
+    assert np.corrcoef(x[5:], np.arange(len(x) - 5))[0, 1] > 0.99
+
+
+def test_without_views_the_sensor_is_one_view(folder, tmp_path):
+    chosen = [f"recording={folder}/dot.raw", HIGHPASS, "output_format=png", "resolution=[90,160]"]
+    run = reconstruct(config("reconstruct", tmp_path / "run", *chosen))
+    assert cv2.imread(str(run / "frames/0000000.png"), 0).shape == (90, 160)
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        ("recording=nowhere.raw", "nowhere.raw"),
+        ("sensor_size=[480,640]", "sensor_size must be"),
+        ("fps=1", "longer than one window"),
+        ("fps=-1", "fps must be"),
+        ("output_format=avi", "output_format must be one of"),
+        ("splat=hat", "splat must be"),
+        ("form=half", "form must be one of"),
+        ("form=bf16", "form must be float32 for a network without parameters"),
+        ("start_s=3.0 end_s=2.0", "start_s must be"),
+        ("ckpt=null", "must name a network"),
+        ("backward_warmup_s=-1", "must be >= 0 seconds"),
+        ("noise_filter_s=0", "noise_filter_s must be > 0 seconds or null, got 0"),
+    ],
+)
+def test_wrong_values_are_refused(folder, wrong, message, tmp_path):
+    chosen = [f"recording={folder}/dot.raw", *([HIGHPASS] if wrong != "ckpt=null" else [])]
+    with pytest.raises(ValueError, match=message):
+        reconstruct(config("reconstruct", tmp_path / "run", *chosen, *wrong.split()))
+
+
+def test_a_calibration_that_fails_leaves_what_was_found(folder, tmp_path):
+    chosen = ["task=views", f"recording={folder}/dot.raw"]
+    with pytest.raises(ValueError, match="seen in 4 or more views"):
+        calibrate(config("calibrate", tmp_path / "run", *chosen))
+    assert (tmp_path / "run" / "found.png").is_file()
+
+
+def test_corners_by_hand_replace_the_target(folder, found, tmp_path):
+    there = views.load_views(found)
+    lines = [
+        f"- {{position: {list(view.position)}, corners: {there.outline(view).tolist()}}}"
+        for view in there.views
+    ]
+    (tmp_path / "corners.yaml").write_text("\n".join(lines))
+    chosen = ["task=views", f"recording={folder}/board.raw", f"corners={tmp_path}/corners.yaml"]
+    calibrate(config("calibrate", tmp_path / "run", *chosen))
+    by_hand = views.load_views(tmp_path / "run" / "views.yaml")
+    for mine, auto in zip(by_hand.views, there.views, strict=True):
+        assert by_hand.is_mirrored(mine) == there.is_mirrored(auto)
+
+
+def test_turbulence_of_a_film_of_dots(folder, found, tmp_path):
+    there = views.load_views(found)
+    at_full = views.Views(there.sensor, (SIDE, SIDE), there.field, there.views)
+    grid = np.array([[x, y] for y in (30.0, 60.0, 90.0) for x in (30.0, 60.0, 90.0)])
+    rng = np.random.default_rng(0)
+    for name, spread, frames in (("still", 0.0, 8), ("dots", 0.7, 24)):
+        centres = grid + spread * rng.normal(size=(frames, 9, 2))
+        film = pictures.dot_grid(
+            centres, np.full((frames, 9), 3.0), np.full((frames, 9), -0.6), SIDE
+        )
+        table = sensor_lookup.build_lookup(at_full)
+        light = simulated_recording.vignette_gain(table, 0.2)
+        films = torch.from_numpy(film).float()[None].expand(9, -1, -1, -1)
+        (tmp_path / name).mkdir()
+        for k, seen in enumerate(
+            simulated_recording.render_sensor_frames(films, table, light, slice(None)).numpy()
+        ):
+            cv2.imwrite(
+                str(tmp_path / name / f"{k:03d}.png"), np.clip(seen * 255, 0, 255).astype(np.uint8)
+            )
+    chosen = [f"recording={tmp_path}/dots", f"still={tmp_path}/still", f"views={found}"]
+    calibrate(config("calibrate", tmp_path / "run", "task=turbulence", *chosen))
+    with open(tmp_path / "run" / "turbulence.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 81 and sum(int(row["failed"]) for row in rows) == 0
+    scale = 88 / (there.field[2] - there.field[0]) * (at_full.field[2] - at_full.field[0]) / SIDE
+    rms = np.mean([float(row["tilt_x_rms_px"]) for row in rows])
+    assert rms == pytest.approx(0.7 * scale, rel=0.15)
+    assert (tmp_path / "run" / "turbulence.png").is_file()
+
+
+def test_another_task_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="task must be one of"):
+        calibrate(config("calibrate", tmp_path / "run", "task=guess", "recording=a.raw"))
+
+
+def test_threshold_of_a_recording_is_found_by_the_door(folder, found, tmp_path):
+    small = [
+        "scene.height=64",
+        "scene.width=64",
+        "data.test_windows=8",
+        "turbulence=none",
+        "clips=2",
+    ]
+    chosen = [f"recording={folder}/dot.raw", f"views={found}", *small]
+    calibrate(config("calibrate", tmp_path / "run", "task=threshold", *chosen))
+    assert (tmp_path / "run" / "threshold.csv").is_file()
+    assert (tmp_path / "run" / "threshold.png").is_file()
+
+
+def test_comparing_videos_draws_them_and_measures_their_slices(folder, found, tmp_path):
+    chosen = [
+        f"recording={folder}/dot.raw",
+        f"views={found}",
+        HIGHPASS,
+        "output_format=hdf5",
+        "fps=300",
+    ]
+    videos = []
+    for source in ("centre", "median"):
+        wanted = [*chosen, f"+baseline.view_reduction={source}"]
+        videos.append(reconstruct(config("reconstruct", tmp_path / source, *wanted)) / "video.h5")
+    line = ["line=[[0,70],[87,20]]", "fps=300", f"videos=[{videos[0]},{videos[1]}]"]
+    numbers = compare(config("compare", tmp_path / "run", *line))
+    assert set(numbers) == {"centre", "median"}
+    assert (tmp_path / "run" / "comparison.png").is_file()
+
+
+def test_what_turns_uniformly_is_straight_in_theta_and_still_in_r(tmp_path):
+    (tmp_path / "film").mkdir()
+    y, x = np.mgrid[:61, :61]
+    for k in range(24):
+        angle = np.radians(20 + 24 * k)
+        dot = np.hypot(x - 30 - 18 * np.cos(angle), y - 30 - 18 * np.sin(angle))
+        picture = (255 * np.clip(4.5 - dot, 0, 1)).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / f"film/{k:02d}.png"), picture)
+    film = [f"videos=[{tmp_path}/film]", "names=[film]", "fps=120"]
+    along = [*film, "spin=[30,30,28,8,20]"]
+    still = compare(config("compare", tmp_path / "r", *along))["film"]
+    round_ = compare(config("compare", tmp_path / "theta", *film, "circle=[30,30,18]"))["film"]
+    assert still["residual_displacement_px"] < 0.1 and round_["line_deviation_px"] < 0.2
+
+
+def test_the_tail_behind_a_bright_dot_is_not_followed(tmp_path):
+    (tmp_path / "film").mkdir()
+    y, x = np.mgrid[:20, :80]
+    for k in range(24):
+        dot = np.clip(4.5 - np.hypot(x - 10 - 2 * k, y - 10), 0, 1)
+        tail = (x < 4 + 2 * k) & (x > 2 * k - 8 - 8 * np.sin(k / 2))
+        picture = (100 + 150 * dot - 90 * tail).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / f"film/{k:02d}.png"), picture)
+    given = [f"videos=[{tmp_path}/film]", "names=[film]", "line=[[0,10],[79,10]]"]
+    found = {
+        follow: compare(config("compare", tmp_path / follow, *given, f"follow={follow}"))["film"]
+        for follow in ("any", "bright")
+    }
+    assert found["bright"]["line_deviation_px"] < 0.1 < 1 < found["any"]["line_deviation_px"]
+
+
+def test_videos_of_two_sizes_are_not_compared(tmp_path):
+    for side in (20, 30):
+        (tmp_path / str(side)).mkdir()
+        cv2.imwrite(str(tmp_path / f"{side}/0.png"), np.zeros((side, side), np.uint8))
+    films = f"videos=[{tmp_path}/20,{tmp_path}/30]"
+    with pytest.raises(ValueError, match="videos must be of one size"):
+        compare(config("compare", tmp_path / "run", films, "line=[[0,0],[19,0]]"))
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        ("line=null", "one of line, circle, spin and still"),
+        ("line=[[0,0],[500,0]]", "must stay"),
+        ("line=[[0,0],[9,0]] follow=all", "follow must be one of"),
+    ],
+)
+def test_a_slice_that_cannot_be_taken_is_refused(wrong, message, tmp_path):
+    (tmp_path / "film").mkdir()
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / "film" / f"{k}.png"), np.zeros((20, 30), np.uint8))
+    with pytest.raises(ValueError, match=message):
+        compare(config("compare", tmp_path / "run", f"videos=[{tmp_path}/film]", *wrong.split()))
+
+
+def test_a_scene_that_stands_wanders_by_its_shifts_whatever_the_size(tmp_path):
+    y, x = np.mgrid[:96, :96]
+    for name, side in (("large", 96), ("small", 48)):
+        (tmp_path / name).mkdir()
+        for k in range(16):
+            shift = 1.5 * np.sin(1.7 * k)
+            picture = 128 + 60 * np.sin((x - shift) / 5) + 60 * np.sin((y - shift) / 7)
+            picture = cv2.resize(picture, (side, side), interpolation=cv2.INTER_AREA)
+            cv2.imwrite(str(tmp_path / name / f"{k:02d}.png"), picture.astype(np.uint8))
+    given = [f"videos=[{tmp_path}/large,{tmp_path}/small]", "names=[large,small]", "still=8"]
+    found = compare(config("compare", tmp_path / "run", *given))
+    for values in found.values():  # both are looked at with 48 pixels
+        assert values["residual_displacement_px"] == pytest.approx(0.75 / 2**0.5, rel=0.1)
+    assert (tmp_path / "run" / "comparison.png").is_file()
+    with pytest.raises(ValueError, match="give one of line, circle, spin and still"):
+        compare(config("compare", tmp_path / "none", *given, "line=[[0,0],[9,9]]"))

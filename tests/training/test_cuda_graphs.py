@@ -1,0 +1,86 @@
+"""A training sequence as one CUDA graph."""
+
+import pytest
+import torch
+from torch import nn
+
+from src.models.network import unroll
+from src.models.setnet import SetNet
+from src.training import cuda_graphs
+from src.training.cuda_graphs import GraphedUnroll, UnrolledNetwork
+from tests.training.test_reconstructor import Leaky
+
+
+def unrolled(network: nn.Module, monkeypatch, capture) -> GraphedUnroll:
+    """A GraphedUnroll on a CPU, whose graphs are made by `capture`."""
+    ours = GraphedUnroll(network)
+    monkeypatch.setattr(ours, "_capture", capture)
+    return ours
+
+
+def batch(n: int = 2) -> tuple[torch.Tensor, torch.Tensor]:
+    voxels = torch.randn(n, 3, 1, 5, 8, 8, generator=torch.Generator().manual_seed(0))
+    return voxels, torch.full((n,), 1 / 120)
+
+
+def test_a_graph_is_made_the_second_time_and_then_used(monkeypatch):
+    made = []
+
+    def capture(plain: UnrolledNetwork, *example):
+        made.append(plain.output_windows)
+        return lambda voxels, window_s: plain(voxels, window_s) + 1
+
+    network = Leaky()
+    ours = unrolled(network, monkeypatch, capture)
+    plain = unroll(network, batch()[0], output_windows=[1, 2])[0]
+    frames = [ours(*batch(), None, [1, 2]) for _ in range(3)]
+    assert torch.equal(frames[0], plain) and made == [[1, 2]]
+    assert all(torch.equal(frame, plain + 1) for frame in frames[1:])
+    assert torch.equal(
+        ours(*batch(), None, [0, 1]), unroll(network, batch()[0], output_windows=[0, 1])[0]
+    )
+    ours(*batch(3), None, [1, 2])
+    assert len(ours.graphs) == 1  # another size and other windows have been seen once
+
+
+def test_where_no_graph_can_be_made_the_training_goes_on_and_says_so(monkeypatch, capsys):
+    def capture(*_):
+        raise RuntimeError("CUDA error:\n operation not permitted")
+
+    network = Leaky()
+    ours = unrolled(network, monkeypatch, capture)
+    plain = unroll(network, batch()[0], output_windows=[2])[0]
+    assert all(torch.equal(ours(*batch(), None, [2]), plain) for _ in range(4))
+    line = "cuda_graphs: none, operators one by one: CUDA error: operation not permitted\n"
+    assert capsys.readouterr().out == line
+
+
+def test_there_are_no_more_graphs_than_asked_for(monkeypatch):
+    monkeypatch.setattr(cuda_graphs, "MAX_GRAPHS", 1)
+    ours = unrolled(Leaky(), monkeypatch, lambda plain, *_: plain)
+    for shown in ([0], [1], [0], [1]):
+        ours(*batch(), None, shown)
+    assert len(ours.graphs) == 1
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("half", [True, False])
+def test_a_graph_gives_the_frames_and_gradients_of_its_operators(half):
+    torch.manual_seed(0)
+    network = SetNet.preset("small").cuda()
+    voxels = (torch.rand(2, 12, 9, 5, 64, 64, device="cuda") < 0.1).float()
+    window_s = torch.full((2,), 1 / 120, device="cuda")
+
+    def gradients(forward) -> list[torch.Tensor]:
+        network.zero_grad()
+        with torch.autocast("cuda", torch.bfloat16, enabled=half):
+            forward(voxels, window_s, None, [3, 4, 9]).square().sum().backward()
+        return [p.grad.clone() for p in network.parameters() if p.grad is not None]
+
+    ours = GraphedUnroll(network)
+    first, second, third = (gradients(ours) for _ in range(3))
+    assert len(ours.graphs) == 1
+    for plain, made, again in zip(first, second, third, strict=True):
+        torch.testing.assert_close(made, again)
+        torch.testing.assert_close(made, plain, rtol=0.05, atol=float(plain.abs().max()) * 0.05)
+    assert cuda_graphs.TOLERANCE < 0.1
