@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
 
 from src.models.checkpoints import is_compressed
-from src.models.files import check_stored_size
+from src.models.files import check_weights_stored_whole
 
 PICKLES = 5  # at the beginning of a checkpoint of PyTorch before 1.6, the weights' storages behind
 
@@ -47,7 +47,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     weights = {name: value for name, value in items if isinstance(value, Tensor)}
     if not weights:
         raise ValueError(f"baseline.weights must hold a state dict, got no tensors in {path}")
-    check_stored_size(weights, path, "baseline.weights")
+    check_weights_stored_whole(weights, path, "baseline.weights")
     return weights
 
 

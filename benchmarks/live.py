@@ -60,7 +60,7 @@ async def measure(server: PageServer, seconds: float) -> dict:
     memory, began = _resident(), time.perf_counter()
     await asyncio.sleep(seconds)
     wall = time.perf_counter() - began
-    found = meters.rates() | {
+    found = meters.measure_rates_and_latency() | {
         "dropped": waiting.dropped - dropped,
         "share": {name: (meters.busy_s[name] - busy[name]) / wall for name in busy},
         "cores": (time.process_time() - cpu) / wall,

@@ -76,7 +76,10 @@ def count_simulation(cfg, batched: bool) -> tuple[int, int, object]:
 
 def count_step(cfg, batch) -> int:
     """Return the operators of a step on a batch."""
-    count, module = StepCounter(), build.build_reconstructor(cfg, *build.build_network(cfg))
+    count, module = (
+        StepCounter(),
+        build.build_reconstructor(cfg, *build.build_network_and_spec(cfg)),
+    )
     quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
     trainer = instantiate_node(cfg.trainer, callbacks=[count], max_steps=2, plugins=[], **quiet)
     trainer.fit(module, DataLoader([batch] * 2, collate_fn=lambda items: items[0]))

@@ -61,7 +61,7 @@ def split(overrides: list[str]) -> tuple[dict[str, Callable[[], object]], int, i
     simulated batch.
     """
     cfg = config(overrides)
-    network, spec = build.build_network(cfg)
+    network, spec = build.build_network_and_spec(cfg)
     module, pipeline = (
         build.build_reconstructor(cfg, network, spec),
         build.build_pipeline(cfg, "train"),
@@ -104,7 +104,7 @@ class Steps(lightning.Callback):
 def step(overrides: list[str], steps: int = 3) -> tuple[float, int]:
     """Return the least seconds of a whole training step and the pixels of its clip-windows."""
     cfg = config(["budget=hours", "data.cache_clips=null", "train_hours=null", *overrides])
-    module = build.build_reconstructor(cfg, *build.build_network(cfg))
+    module = build.build_reconstructor(cfg, *build.build_network_and_spec(cfg))
     shape = (cfg.data.batch_size, cfg.data.windows)
     grid = (*shape, cfg.optics.views, cfg.bins, cfg.data.crop, cfg.data.crop)
     target = torch.rand(*shape, 1, cfg.data.crop, cfg.data.crop)

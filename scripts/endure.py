@@ -97,7 +97,7 @@ def train(minutes: float, run: Path) -> dict:
     with initialize_config_dir(str(ROOT / "conf"), version_base=None):
         limit = f"+trainer.max_time={{minutes: {minutes}}}"
         cfg = compose("train", [*SMALL, limit, f"paths.run={run}"])
-    network, spec = build.build_network(cfg)
+    network, spec = build.build_network_and_spec(cfg)
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     trainer = build.build_trainer(cfg)
     with Watch() as watch:

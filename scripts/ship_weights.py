@@ -132,17 +132,17 @@ def first_config(run: Path) -> DictConfig:
     cfg = OmegaConf.load(parts[0] if parts else run / "config.yaml")
     before = Path(cfg.ckpt or "nothing")
     for folder in (before, *before.parents[:2]):  # a run, its checkpoints or one of them
-        if not files.is_exported(before) and (folder / "config.yaml").is_file():
+        if not files.is_weights_file(before) and (folder / "config.yaml").is_file():
             return first_config(folder)
     return cfg
 
 
 def seen(network: torch.nn.Module) -> str:
     """Return what a network is given, in words."""
-    if network.views is not None:
-        return f"{network.views} view(s)"
     if isinstance(network, FramePostprocessor):
         return "frames in, frames out"
+    if network.views is not None:
+        return f"{network.views} view(s)"
     one = type(network).__module__.startswith("baselines.")
     return "the centre view" if one else "any number of views"
 
@@ -209,7 +209,8 @@ def main() -> None:
     parser.add_argument("--to", type=Path, help="default: weights/")
     parser.add_argument("--test", type=Path, nargs="*", default=[], help="folders of src.eval")
     arguments = parser.parse_args()
-    if (files.WEIGHTS / f"{arguments.run}.safetensors").is_file():
+    shipped = files.WEIGHTS / f"{arguments.run}.safetensors"
+    if shipped.is_file() and not arguments.run.is_dir():
         print(recard(str(arguments.run), arguments.test))
         return
     name = arguments.name or first_config(arguments.run).name

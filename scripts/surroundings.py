@@ -107,14 +107,14 @@ def samples(data: LightFieldData, clips: int) -> Iterable[Sample]:
 
 def teach(cfg: DictConfig, clips: int, steps: int) -> None:
     """Read `cfg.ckpt`, write `cfg.export`; the hours that this took are added to its own."""
-    if not (cfg.ckpt and cfg.export and files.is_exported(Path(cfg.export))):
+    if not (cfg.ckpt and cfg.export and files.is_weights_file(Path(cfg.export))):
         got = f"{cfg.ckpt} and {cfg.export}"
         raise ValueError(f"ckpt and export must be files, export a .safetensors, got {got}")
     if any(type(count) is not int or count < 1 for count in (clips, steps)):
         raise ValueError(f"clips and steps must be whole numbers >= 1, got {clips} and {steps}")
     hardware.reserve_worker_cores(cfg)
     hardware.retain_freed_memory(cfg)
-    _, spec = build.build_network(cfg)
+    _, spec = build.build_network_and_spec(cfg)
     source, start = files.find_checkpoint(cfg.ckpt, spec), time.process_time()
     before = files.load(source)
     if not isinstance(before, SetNet):

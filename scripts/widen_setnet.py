@@ -124,10 +124,10 @@ def factored(network: SetNet) -> SetNet:
 
 def begin(cfg: DictConfig) -> None:
     """Read `cfg.ckpt`, write `cfg.export`."""
-    if not (cfg.ckpt and cfg.export and files.is_exported(Path(cfg.export))):
+    if not (cfg.ckpt and cfg.export and files.is_weights_file(Path(cfg.export))):
         got = f"{cfg.ckpt} and {cfg.export}"
         raise ValueError(f"ckpt and export must be files, export a .safetensors, got {got}")
-    wide, spec = build.build_network(cfg)
+    wide, spec = build.build_network_and_spec(cfg)
     source = Path(cfg.ckpt)
     old = files.load(source)
     if not (isinstance(old, SetNet) and isinstance(wide, SetNet)):

@@ -32,7 +32,7 @@ def chart(cfg: DictConfig) -> dict[str, str]:
         candidates, pipelines, cfg.clips, build.build_metrics(cfg), **scored
     )
     results.write_text(run / "scores.csv", speed_accuracy.format_scores_csv(scores))
-    recommended = speed_accuracy.recommend_networks(speeds, scores, side)
+    recommended = speed_accuracy.recommend_network_per_severity(speeds, scores, side)
     text = speed_accuracy.format_chart_summary(speeds, scores, recommended, side)
     title = "mean over " + ", ".join(cfg.severities) + " turbulence"
     for suffix in ("png", "svg"):

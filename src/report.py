@@ -30,7 +30,9 @@ def report(cfg: DictConfig) -> list[tables.Table]:
         of = f": {name}" if name and len(sweeps) > 1 else ""
         candidates.append(tables.build_score_table(f"Scores and cost{of}", keys, made, published))
         candidates.append(tables.build_severity_table(f"Scores by severity{of}", keys, made))
-        candidates.append(tables.build_same_clips_table(f"On the same clips{of}", keys, made))
+        candidates.append(
+            tables.build_reference_methods_table(f"On the same clips{of}", keys, made)
+        )
         groups += made
     if cfg.against:
         theirs = runs.find_runs(_list_folders(cfg.against))

@@ -25,7 +25,7 @@ def simulate(cfg: DictConfig) -> dict:
     written to that file, and the truth beside it.  Returns what was drawn: D/r0, threshold ...
     """
     run = Path(cfg.paths.run)
-    cfg = copy_clip_config(cfg) if cfg.like else cfg
+    cfg = take_clip_config_from_run(cfg) if cfg.like else cfg
     pipeline = build.build_pipeline(cfg, cfg.split)
     draw = pipeline.draw(cfg.index)
     views = pipeline.render_views([draw])[0].float()
@@ -48,7 +48,7 @@ def simulate(cfg: DictConfig) -> dict:
     return sample.parameters[0]
 
 
-def copy_clip_config(cfg: DictConfig) -> DictConfig:
+def take_clip_config_from_run(cfg: DictConfig) -> DictConfig:
     """Return `cfg` with all that makes a clip taken from the run whose config is `cfg.like`.
 
     Raises ValueError for a file that is no such config.

@@ -32,7 +32,7 @@ def train(cfg: DictConfig) -> dict:
     hardware.retain_freed_memory(cfg)
     hardware.fill_in_precision(cfg)
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
-    net, spec = build.build_network(cfg)
+    net, spec = build.build_network_and_spec(cfg)
     start_from = files.find_checkpoint(cfg.ckpt, spec) if cfg.ckpt else None
     module, data = build.build_reconstructor(cfg, net, spec), build.build_data_module(cfg)
     trainer = build.build_trainer(cfg)
@@ -67,7 +67,7 @@ def fit(
     checkpoint = trainer.checkpoint_callback
     assert isinstance(checkpoint, ModelCheckpoint) and checkpoint.dirpath
     last = Path(checkpoint.dirpath) / "last.ckpt"
-    if start_from and files.is_exported(start_from):
+    if start_from and files.is_weights_file(start_from):
         restore_training_progress(module, trainer.callbacks, start_from)  # type: ignore[attr-defined]
         start_from = None
     try:

@@ -56,7 +56,7 @@ def weights(tmp_path, monkeypatch):
         path = files.WEIGHTS / f"{name}.safetensors"
         path.parent.mkdir(parents=True, exist_ok=True)
         cfg = config("train", tmp_path, f"experiment={name}", *narrow)
-        network, spec = build.build_network(cfg)
+        network, spec = build.build_network_and_spec(cfg)
         files.save(path, network, spec, {})
 
 

@@ -146,6 +146,7 @@ class RecipeWork:
             self.name, "--weights", str(self._weights(stage.name)), "--to",
             str(self.shipped.parent),
         )  # fmt: skip
+        assert self.shipped.is_file(), "the loop of `advance` ends with it"
 
 
 def run(module: str, *words: str) -> None:

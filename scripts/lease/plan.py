@@ -163,7 +163,7 @@ def load_plan(path: Path) -> Plan:
     for network in plan.networks:
         if network.start is not None:
             start, name = plan.path(network.start), network.name
-            if not files.is_exported(start) or not start.is_file():
+            if not files.is_weights_file(start) or not start.is_file():
                 raise ValueError(f"networks: start of {name} must be exported weights, got {start}")
             read_training_progress(start)
     return plan

@@ -127,7 +127,7 @@ class StepTimer(Callback):
 
 def _time_steps(cfg: DictConfig, kind: str, until: float) -> Trial:
     hardware.fill_in_precision(cfg)
-    module = build.build_reconstructor(cfg, *build.build_network(cfg))
+    module = build.build_reconstructor(cfg, *build.build_network_and_spec(cfg))
     n, windows = cfg.data.batch_size, cfg.data.windows
     side = cfg.data.crop if isinstance(cfg.data.crop, int) else max(cfg.data.crop)
     target = torch.rand(n, windows, 1, side, side, device=kind)

@@ -54,7 +54,7 @@ def size_network(plan: Plan, network: Network) -> SizedNetwork:
     try:
         cfg = plan.config(network)
         with torch.device("meta"):
-            net, spec = build.build_network(cfg)
+            net, spec = build.build_network_and_spec(cfg)
         build.build_reconstructor(cfg, net, spec)
         caches = _device_caches(build.build_data_module(cfg, ("train", "val")))
     except (HydraException, OmegaConfBaseException, ValueError) as error:

@@ -104,7 +104,7 @@ def train_network(
     hardware.retain_freed_memory(cfg)
     hardware.fill_in_precision(cfg)
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
-    net, spec = build.build_network(cfg)
+    net, spec = build.build_network_and_spec(cfg)
     module = build.build_reconstructor(cfg, net, spec)
     data = build.build_data_module(cfg, ("train", "val"))
     simulate = data.validation_samples

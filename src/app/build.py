@@ -85,7 +85,9 @@ def build_teachers(cfg: DictConfig, views: int) -> TeacherEnsemble:
     return TeacherEnsemble(networks, cfg.distillation_cache, cfg.fps, rates)
 
 
-def build_network(cfg: DictConfig) -> tuple[EventToVideoNetwork | FramePostprocessor, dict]:
+def build_network_and_spec(
+    cfg: DictConfig,
+) -> tuple[EventToVideoNetwork | FramePostprocessor, dict]:
     """Return a fresh network and the plain dict (target, kwargs) that builds it again."""
     node = as_dict(cfg.model)
     net = check_contract("model", instantiate_node(node, allowed_packages(cfg)))

@@ -104,7 +104,7 @@ def select_by_one_standard_error(
     return min(within, key=costs.__getitem__)
 
 
-def recommend_networks(
+def recommend_network_per_severity(
     speeds: Sequence[SpeedMeasurement], scores: Sequence[ClipScore], side: int
 ) -> dict[str, str]:
     """Return {severity: the cheapest network within one standard error of the best}.

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from src.live_view.event_feeds import Feed
 from src.live_view.feed_reader import FeedReader, PlaybackClock
-from src.live_view.frame_buffer import EventCounter, FrameBuffer
+from src.live_view.frame_buffer import EventCounter, FrameRing
 from src.live_view.live_windows import WindowCutter, WindowQueue
 from src.live_view.network_runner import Controls, RunSettings
 from src.live_view.page_server import THIS_MACHINE, LivePage, PageServer
@@ -43,7 +43,7 @@ def assemble(
     waiting = WindowQueue(max_waiting_windows, lossless=playback_speed == float("inf"))
     noise_filter = None if noise_filter_s is None else NoiseFilter(views.sensor, noise_filter_s)
     reader = FeedReader(feed, cutter, waiting, counter, clock, Meters(), faults, noise_filter)
-    player = Player(reader, Controls(networks, views, settings), FrameBuffer(views.model))
+    player = Player(reader, Controls(networks, views, settings), FrameRing(views.model))
     return PageServer(LivePage(player, views.positions), host, port)
 
 

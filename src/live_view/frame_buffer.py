@@ -28,7 +28,7 @@ COLOURS[: len(_ENDS), 0] = _SHARE * _ENDS + (1 - _SHARE) * np.array(BACKGROUND)
 Line = tuple[float, float, float, float]  # x0, y0, x1, y1 in pixels of the picture
 
 
-class FrameBuffer:
+class FrameRing:
     """Keeps MAX_FRAMES frames of `size` (height, width), fewer where they are large.
 
     `ring` holds them, the newest at (`count` - 1) modulo its length.
@@ -57,7 +57,7 @@ class TimeSlice:
     Only frames that are new since the last call are read, unless the line has moved.
     """
 
-    def __init__(self, frames: FrameBuffer):
+    def __init__(self, frames: FrameRing):
         self.frames = frames
         height, width = frames.size
         self.line: Line = (0.0, height / 2, width - 1.0, height / 2)

@@ -7,7 +7,7 @@ import time
 import traceback
 
 from src.live_view.feed_reader import FeedReader
-from src.live_view.frame_buffer import FrameBuffer
+from src.live_view.frame_buffer import FrameRing
 from src.live_view.live_windows import EventWindow
 from src.live_view.network_runner import Controls, Finish, NetworkRunner
 
@@ -20,7 +20,7 @@ class Player:
     The last two run what `controls` have chosen and put the pictures into `frames`.
     """
 
-    def __init__(self, reader: FeedReader, controls: Controls, frames: FrameBuffer):
+    def __init__(self, reader: FeedReader, controls: Controls, frames: FrameRing):
         self.reader, self.controls, self.frames = reader, controls, frames
         self.meters, self.faults = reader.meters, reader.faults
         self.running: NetworkRunner | None = None  # of the newest window
@@ -98,7 +98,7 @@ class Player:
             "paused": paused,
             "faults": self.faults.current(),
             "asked_fps": round(asked_fps, 1) if math.isfinite(asked_fps) else None,
-            **self.meters.rates(),
+            **self.meters.measure_rates_and_latency(),
             "dropped": reader.waiting.dropped,
             "waiting": len(reader.waiting),
             "network": runner.name if runner else None,

@@ -64,7 +64,7 @@ class Meters:
         while self.frames and self.frames[0][0] < now - self.span_s:
             self.frames.popleft()
 
-    def rates(self) -> dict:
+    def measure_rates_and_latency(self) -> dict:
         """Return `fps`, `events_per_s` and `latency_ms` (median, p99; None without frames)."""
         now = time.perf_counter()
         with self.lock:

@@ -45,8 +45,8 @@ def load(name_or_path: str | Path, allowed_packages: Sequence[str] = ()) -> nn.M
     if not path.is_file():
         names = ", ".join(sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))) or "none yet"
         raise ValueError(f"ckpt must be a file or one of weights/ ({names}), got {name_or_path}")
-    spec, weights = (_exported if is_exported(path) else _checkpoint)(path)[:2]
-    check_stored_size(weights, path, "ckpt")
+    spec, weights = (_exported if is_weights_file(path) else _checkpoint)(path)[:2]
+    check_weights_stored_whole(weights, path, "ckpt")
     with torch.device("meta"):  # without memory: a small file may name a huge network
         empty = _build(spec, path, allowed_packages)
     check_fit(f"ckpt does not fit {type(empty).__name__} in {path}", empty.state_dict(), weights)
@@ -65,9 +65,9 @@ def find_checkpoint(name: str | Path, spec: dict) -> Path:
     path = newest_checkpoint(Path(name)) if Path(name).is_dir() else Path(name)
     if not path.is_file():
         raise ValueError(f"ckpt must be a checkpoint to go on from, got {path}")
-    saved, _ = (_exported if is_exported(path) else _checkpoint)(path)[:2]
+    saved, _ = (_exported if is_weights_file(path) else _checkpoint)(path)[:2]
     wanted = [spec]
-    if is_exported(path):
+    if is_weights_file(path):
         kwargs = spec["kwargs"] | _without_spectral_norm(spec)
         one_view = {"views": 1} if spec["target"] == WIDENABLE else {}
         wanted = [spec | {"kwargs": kwargs | more} for more in ({}, one_view)]
@@ -76,7 +76,7 @@ def find_checkpoint(name: str | Path, spec: dict) -> Path:
     return path
 
 
-def is_exported(path: Path) -> bool:
+def is_weights_file(path: Path) -> bool:
     """Return whether `path` is a file of `save`, without the state of an optimiser."""
     return path.suffix == ".safetensors"
 
@@ -187,7 +187,7 @@ def _check_numbers(value: Any, path: Path) -> None:
         raise ValueError(f"ckpt must hold sizes up to {MAX_SIZE}, got {value} in {path}")
 
 
-def check_stored_size(weights: dict[str, Tensor], path: Path, key: str) -> None:
+def check_weights_stored_whole(weights: dict[str, Tensor], path: Path, key: str) -> None:
     """Raise ValueError, beginning with `key`, for weights of more numbers than the file has bytes:
     in a view of a few numbers any size fits, but the network made for it has to hold them all.
     """

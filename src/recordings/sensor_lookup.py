@@ -7,7 +7,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from src.recordings.engines.splat import list_bilinear_parts, list_nearest_pixels, splat_events
+from src.recordings.engines.splat import (
+    list_bilinear_parts,
+    list_nearest_pixels,
+    splat_and_count_outside,
+)
 from src.recordings.views import Size, Views
 
 MIN_DENSITY = 0.1  # where fewer sensor pixels than this map to a model pixel, no scaling up
@@ -44,7 +48,7 @@ class SensorLookup:
         self.check_on_sensor(events)
         t, x, y, p = (events[name] for name in "txyp")
         edges = float(start_us), float(end_us)
-        return splat_events(t, x, y, p, self.view, self.model_xy, grid, *edges, nearest)
+        return splat_and_count_outside(t, x, y, p, self.view, self.model_xy, grid, *edges, nearest)
 
     def list_contributions(
         self, events: np.ndarray, density: Float[np.ndarray, "views 1 h w"], *, nearest: bool
@@ -84,7 +88,7 @@ class SensorLookup:
         grids = {"bilinear": self.empty_grid(1), "nearest": self.empty_grid(1)}
         for kind, grid in grids.items():
             geometry = self.view, self.model_xy, grid
-            splat_events(time, x, y, one, *geometry, 0.0, 1.0, kind == "nearest")
+            splat_and_count_outside(time, x, y, one, *geometry, 0.0, 1.0, kind == "nearest")
         return {kind: np.maximum(grid, MIN_DENSITY) for kind, grid in grids.items()}
 
     def check_on_sensor(self, events: np.ndarray) -> None:

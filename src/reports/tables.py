@@ -115,7 +115,7 @@ def build_severity_table(
     return table
 
 
-def build_same_clips_table(
+def build_reference_methods_table(
     title: str, keys: Sequence[str], groups: Sequence[RunGroup]
 ) -> Table | None:
     """Return each network and what else its runs scored, such as the untrained one."""

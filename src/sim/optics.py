@@ -82,7 +82,7 @@ class Optics:
         object.__setattr__(self, "positions", positions)
 
     @property
-    def view_ids(self) -> list[int]:
+    def random_key_ids(self) -> list[int]:
         return [view_id(position) for position in self.positions]
 
     @property

@@ -159,7 +159,7 @@ class Pipeline:
         """Return the sample of the clips whose `views`, float32 or float16, are those drawn; its
         voxel grids are in `out`, if given, which must hold zeros.
         """
-        step, ids = self.substeps, self.optics.view_ids
+        step, ids = self.substeps, self.optics.random_key_ids
         clips = [
             SensorClip(d.sensor, d.clip.fps, d.key, d.crop[:2], d.clip.frames.shape[-1])
             for d in draws

@@ -23,7 +23,7 @@ from src.recordings.files import aedat, columns, formats, sources
 from src.records import safe_yaml
 from src.sim.scenes import photo_files, video_files
 from src.sim.scenes.video_files import LARGEST_PIXELS
-from src.simulate import copy_clip_config
+from src.simulate import take_clip_config_from_run
 from tests.faults import test_damaged_files as whole
 
 DESCRIPTION = (
@@ -212,7 +212,7 @@ def test_a_config_does_not_grow_without_bound(tmp_path, text, words):
         with pytest.raises(ValueError, match=r"a\.yaml"):
             read(path)
     with pytest.raises(ValueError, match=r"a\.yaml"):
-        copy_clip_config(OmegaConf.create({"like": str(path)}))
+        take_clip_config_from_run(OmegaConf.create({"like": str(path)}))
 
 
 @pytest.mark.parametrize(

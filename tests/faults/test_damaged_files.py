@@ -75,7 +75,9 @@ def read_published(path: Path) -> None:
 def read_config(path: Path) -> None:
     cfg = OmegaConf.create({"like": str(path)})
     try:
-        found = simulate.copy_clip_config(OmegaConf.merge(cfg, dict.fromkeys(simulate.CLIP_KEYS)))
+        found = simulate.take_clip_config_from_run(
+            OmegaConf.merge(cfg, dict.fromkeys(simulate.CLIP_KEYS))
+        )
         build.build_pipeline(found, "train")
     except OmegaConfBaseException as error:  # an entry point prints it in one line
         raise ValueError(str(error)) from error

@@ -8,7 +8,7 @@ import pytest
 
 from src.live_view import frame_buffer
 from src.live_view.feed_reader import CameraClock, PlaybackClock
-from src.live_view.frame_buffer import MAX_BYTES, MAX_FRAMES, EventCounter, FrameBuffer, TimeSlice
+from src.live_view.frame_buffer import MAX_BYTES, MAX_FRAMES, EventCounter, FrameRing, TimeSlice
 from src.live_view.live_windows import MAX_LATE_US, EventWindow, WindowCutter, WindowQueue
 from src.live_view.network_runner import offered_view_counts, positions_used
 from src.live_view.status import FaultLog, Meters
@@ -173,7 +173,7 @@ def test_views_to_choose_from():
 
 
 def test_the_slice_has_a_column_for_every_frame_and_follows_the_line():
-    screen = FrameBuffer((8, 10))
+    screen = FrameRing((8, 10))
     pictures = np.random.default_rng(0).random((MAX_FRAMES + 50, 8, 10), np.float32)
     cut = TimeSlice(screen)
     cut.line = (0.0, 3.0, 9.0, 3.0)
@@ -192,7 +192,7 @@ def test_the_slice_has_a_column_for_every_frame_and_follows_the_line():
 
 
 def test_the_buffer_is_bounded():
-    assert FrameBuffer((2160, 3840)).ring.nbytes <= MAX_BYTES
+    assert FrameRing((2160, 3840)).ring.nbytes <= MAX_BYTES
 
 
 def test_event_pictures_count_where_a_view_looks_and_only_while_watched():
@@ -225,17 +225,20 @@ def test_events_are_drawn_in_two_colours_and_views_where_they_stand():
 
 def test_meters_say_rates_and_latency_of_the_last_seconds():
     meters = Meters(span_s=5.0)
-    assert meters.rates()["fps"] == 0 and meters.rates()["latency_ms"]["median"] is None
+    assert (
+        meters.measure_rates_and_latency()["fps"] == 0
+        and meters.measure_rates_and_latency()["latency_ms"]["median"] is None
+    )
     for k in range(100):
         meters.add_frame(0.001 if k else 0.05, 10)
         time.sleep(0.001)
-    rates = meters.rates()
+    rates = meters.measure_rates_and_latency()
     assert rates["latency_ms"]["median"] == 1 and rates["latency_ms"]["p99"] > 1
     assert 0 < rates["fps"] <= 1000
     assert rates["events_per_s"] == pytest.approx(10 * rates["fps"], rel=0.01)
     meters.span_s = 0.001
     time.sleep(0.01)
-    assert meters.rates()["fps"] == 0
+    assert meters.measure_rates_and_latency()["fps"] == 0
 
 
 def test_a_fault_goes_when_it_is_over(faults, monkeypatch):

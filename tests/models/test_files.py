@@ -84,7 +84,7 @@ def test_other_weights_are_listed(tmp_path):
     "target",
     [
         "os.system",
-        "src.app.build.build_network",
+        "src.app.build.build_network_and_spec",
         "src.models.files.save",
         "src.models.absent.X",
         "baselines.",

@@ -51,7 +51,7 @@ def test_cost_and_config_of_each_size(size, giga):
 
 @pytest.mark.parametrize("size", SIZES)
 def test_a_preset_is_stored_as_what_it_stands_for(size, tmp_path):
-    _, spec = build.build_network(config("train", tmp_path, f"experiment=setnet_{size}"))
+    _, spec = build.build_network_and_spec(config("train", tmp_path, f"experiment=setnet_{size}"))
     assert spec == {"target": "src.models.setnet.SetNet", "kwargs": FULL | SIZES[size]}
 
 

@@ -96,7 +96,7 @@ def test_what_else_was_scored_stands_below_its_network(tmp_path):
     write_run(tmp_path / "a", scores={"ssim": 0.7})
     write_run(tmp_path / "b", "eval", task="eval", scores={"ssim": 0.3}, compared={})
     _, keys, made = built(tmp_path)
-    table = tables.build_same_clips_table("compared", keys, made)
+    table = tables.build_reference_methods_table("compared", keys, made)
     assert [row[1].text for row in table.rows] == ["trained", "untrained"]
     assert [row[3].mean for row in table.rows] == [0.7, 0.1]
 

@@ -20,7 +20,7 @@ def test_centre_and_ids():
     for views in (1, 2, 3, 4, 5, 9, 25):
         optics = Optics(views)
         assert optics.positions[optics.centre] == (0, 0)
-        assert len(set(optics.view_ids)) == views
+        assert len(set(optics.random_key_ids)) == views
 
 
 @pytest.mark.parametrize("views", [0, -1, 6, 7, 10, 400])
@@ -34,7 +34,7 @@ def test_unknown_layout_names_the_key(views):
 )
 def test_wrong_positions(positions, key):
     with pytest.raises(ValueError, match=f"optics.{key}"):
-        _ = Optics(2, positions).view_ids
+        _ = Optics(2, positions).random_key_ids
 
 
 def test_negative_misalignment_is_refused():

@@ -150,7 +150,7 @@ def test_wrong_values_are_one_line(wrong, message, tmp_path):
     cfg = config("train", tmp_path, *SMALL, "data.cache_device=device", "data.workers=0", wrong)
     with pytest.raises(ValueError, match=message):
         build.build_data_module(cfg)
-        build.build_reconstructor(cfg, *build.build_network(cfg))
+        build.build_reconstructor(cfg, *build.build_network_and_spec(cfg))
 
 
 def test_a_training_of_two_sizes_takes_steps(tmp_path):

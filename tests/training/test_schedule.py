@@ -145,7 +145,7 @@ def test_a_training_that_has_collapsed_ends_and_keeps_what_it_had(tmp_path, monk
 def test_what_goes_on_with_another_loss_has_not_collapsed(tmp_path):
     now = tmp_path / "now.safetensors"
     run(tmp_path / "first", "train_hours=3", f"export={now}")
-    _, spec = build.build_network(config("train", tmp_path, *TINY))
+    _, spec = build.build_network_and_spec(config("train", tmp_path, *TINY))
     card = files.read_card(now)
     card["curve"][-1]["loss"] = 1e-6
     files.save(now, files.load(now), spec, card)
@@ -157,7 +157,7 @@ def test_restored_weights_are_those_that_were_exported(tmp_path):
     now = tmp_path / "now.safetensors"
     run(tmp_path / "first", "train_hours=3", f"export={now}")
     cfg = config("train", tmp_path / "second", *TINY, *RECIPE)
-    network, _ = build.build_network(cfg)
+    network, _ = build.build_network_and_spec(cfg)
     files.restore_weights(network, now)
     ours, theirs = inference_copy(network).state_dict(), files.load(now).state_dict()
     assert ours.keys() == theirs.keys()
@@ -170,8 +170,8 @@ def test_restored_weights_are_those_that_were_exported(tmp_path):
 
 def test_weights_of_another_network_are_refused(tmp_path):
     now = tmp_path / "now.safetensors"
-    network, spec = build.build_network(config("train", tmp_path, *TINY, *RECIPE))
-    other, _ = build.build_network(config("train", tmp_path, *TINY, *RECIPE, "width=8"))
+    network, spec = build.build_network_and_spec(config("train", tmp_path, *TINY, *RECIPE))
+    other, _ = build.build_network_and_spec(config("train", tmp_path, *TINY, *RECIPE, "width=8"))
     files.save(now, network, spec, {})
     with pytest.raises(ValueError, match="ckpt does not fit E2VID"):
         files.restore_weights(other, now)

@@ -19,7 +19,7 @@ from src.sim.optics import centre_view_index, layout
 from src.sim.turbulence.simulated import SimulatedTurbulence
 
 
-def measure_condition_loss(
+def measure_worst_psnr_loss(
     network: Candidate, bench: StressBench, *, limit: float, parameter: str,
     values: Sequence[Any], fixed: Mapping[str, Any] | None = None,
     reference: Mapping[str, Any] | None = None,
@@ -48,7 +48,7 @@ def measure_correlated_views_loss(
     """
     require_type("turbulence", bench.pipeline.turbulence, SimulatedTurbulence)
     aperture_m = bench.pipeline.draw(bench.indices[0]).turbulence.aperture_m
-    found = measure_condition_loss(
+    found = measure_worst_psnr_loss(
         network, bench, limit=limit, parameter="turbulence.baseline_m",
         values=[spacing * aperture_m for spacing in spacings],
         fixed={"turbulence.views_correlation": "baseline"},

@@ -141,7 +141,7 @@ def simulate_event_clip(pipeline: Pipeline, index: int, conditions: ClipConditio
         views = _apply_gain(views, conditions.view_gain_std, noise.key(draw.key, "gain"))
     changes = {"threshold": draw.sensor.threshold} | dict(conditions.sensor)
     sensor = replace(require_type("sensor", pipeline.sensor, EventSensor), **changes)
-    ids = pipeline.optics.view_ids
+    ids = pipeline.optics.random_key_ids
     top, left, height, width = draw.crop
     return EventClip(
         [

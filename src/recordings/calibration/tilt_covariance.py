@@ -31,7 +31,7 @@ class CovarianceSums:
     total: Float[np.ndarray, "frames squares classes"]
     count: Float[np.ndarray, "frames squares classes"]
 
-    def weighted_mean(
+    def mean_and_count(
         self,
         frame_weights: Float[np.ndarray, " frames"],
         square_weights: Float[np.ndarray, " squares"],
@@ -103,7 +103,7 @@ def sum_over_distance(tracks: PointTracks, size: tuple[int, int]) -> CovarianceS
     return CovarianceSums(mean, np.stack(total), np.stack(count))
 
 
-def sum_over_lags(tracks: PointTracks, size: tuple[int, int]) -> CovarianceSums:
+def sum_over_time_lags(tracks: PointTracks, size: tuple[int, int]) -> CovarianceSums:
     """Sum the products of displacement of every point with its own at lags of 0, 1, ... frames."""
     a, b = centre_displacements(tracks)
     frames = len(tracks.seen)

@@ -71,11 +71,11 @@ def measure_turbulence(
     tracks = _select_still(tracks, size)
     unit = SIDE / min(size)
     pairs = tilt_covariance.sum_over_distance(tracks, size)
-    lags = tilt_covariance.sum_over_lags(tracks, size)
+    lags = tilt_covariance.sum_over_time_lags(tracks, size)
     model = CovarianceModel(pairs.at, tracks.window_px2, size)
     every = np.ones(len(frames)), np.ones(CELLS**2)
     tilt = model.describe_tilt(
-        *pairs.weighted_mean(*every), lags.weighted_mean(*every)[0], len(frames)
+        *pairs.mean_and_count(*every), lags.mean_and_count(*every)[0], len(frames)
     )
     rms_px = tilt.power**0.5 * unit
     if rms_px < MIN_RMS_PX:
@@ -85,7 +85,7 @@ def measure_turbulence(
         )
     drawn = [
         model.describe_tilt(
-            *pairs.weighted_mean(*chosen), lags.weighted_mean(*chosen)[0], len(frames)
+            *pairs.mean_and_count(*chosen), lags.mean_and_count(*chosen)[0], len(frames)
         )
         for chosen in _resampled(len(frames), 2 * tilt.decay_frames)
     ]

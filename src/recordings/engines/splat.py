@@ -7,7 +7,7 @@ BATCH = 256  # events that are looked up before any is used
 
 
 @njit(nogil=True, cache=True)
-def splat_events(t, x, y, p, view, model_xy, grid, t0, t1, nearest):
+def splat_and_count_outside(t, x, y, p, view, model_xy, grid, t0, t1, nearest):
     """Add events to `grid` (views, bins, h, w) in their order; return how many were in no view.
 
     `t`, and `t0` and `t1`, the edges of the window, in us; `view` and `model_xy` of `SensorLookup`.
@@ -48,7 +48,7 @@ def splat_events(t, x, y, p, view, model_xy, grid, t0, t1, nearest):
 
 @njit(nogil=True, cache=True)
 def list_bilinear_parts(x, y, p, view, model_xy, density, index, u, v, which, weight):
-    """Write what `splat_events` adds in space, bilinearly: for each part the index of its event,
+    """List what `splat_and_count_outside` adds, bilinearly: for each part the index of its event,
     its pixel (u, v), its view and its weight over `density` (views, h, w); return the number of
     parts and of events in no view.
     """

@@ -34,7 +34,7 @@ LARGEST_MOTION_RATIO = 3.0  # times the median motion; what moves more is a car 
 
 
 @dataclass(frozen=True)
-class NormalisedDisplacement:
+class UnitRmsDisplacement:
     """Displacement (x, y), of 1 px rms along an axis, on nodes over `height_px` x `width_px`.
 
     Between nodes and between frames lies a cubic spline, beyond the ends their mirror image: in
@@ -57,7 +57,7 @@ class NormalisedDisplacement:
 
 
 @lru_cache(maxsize=4)
-def load_displacement_fields(root: Path) -> NormalisedDisplacement:
+def load_displacement_fields(root: Path) -> UnitRmsDisplacement:
     """Return the displacement fields of the footage at `root`, a video or a folder of frames.
 
     Raises ValueError where there is not one video, it is too short, or too few of its corners stay.
@@ -77,7 +77,7 @@ def load_displacement_fields(root: Path) -> NormalisedDisplacement:
 
 def interpolate_tracks(
     displacement: Float[NDArray, "frames corners 2"], at: Float[NDArray, "corners 2"]
-) -> NormalisedDisplacement:
+) -> UnitRmsDisplacement:
     """Return fields over the rectangle that the corners at places `at` (x, y) fill."""
     low, high = at.min(0), at.max(0)
     width, height = (high - low).tolist()
@@ -88,7 +88,7 @@ def interpolate_tracks(
     joined = RBFInterpolator(at - low, values, smoothing=SMOOTHING)(places)
     joined = joined.reshape(len(y), len(x), len(displacement), 2).transpose(2, 3, 0, 1)
     nodes = torch.from_numpy(joined / np.sqrt(np.square(joined).mean()))
-    return NormalisedDisplacement(nodes.float().contiguous(), height, width)
+    return UnitRmsDisplacement(nodes.float().contiguous(), height, width)
 
 
 def _spline_weights(knots: int, at: Float[NDArray, " at"]) -> Float[Tensor, "at knots"]:

@@ -23,7 +23,7 @@ EVEN, ODD_X, ODD_Y, ODD_XY = range(4)
 OUTPUT_LAYERS = "even", "odd.0", "odd.1", "both"  # of the parities in turn
 
 
-def mode_parity(mode: int) -> int:
+def mirror_symmetry_class(mode: int) -> int:
     """Return the parity of Noll mode `mode`."""
     m = noll_index(mode)[1]
     if m % 2 == 0:
@@ -33,7 +33,7 @@ def mode_parity(mode: int) -> int:
 
 def modes_by_parity(modes: int) -> list[list[int]]:
     """Return which of Noll 4..modes + 1, counted from 0, are of each parity."""
-    parities = [mode_parity(mode) for mode in range(4, modes + 2)]
+    parities = [mirror_symmetry_class(mode) for mode in range(4, modes + 2)]
     return [[i for i, parity in enumerate(parities) if parity == one] for one in range(4)]
 
 

@@ -21,7 +21,7 @@ from src.sim.turbulence.clip_rendering import run_in_threads
 from src.sim.turbulence.contract import Crop, check_option
 from src.sim.turbulence.engines.device import select_engine
 from src.sim.turbulence.engines.warp_numba import pad_frames, warp_frames
-from src.sim.turbulence.footage_displacement import NormalisedDisplacement, load_displacement_fields
+from src.sim.turbulence.footage_displacement import UnitRmsDisplacement, load_displacement_fields
 
 PLACES, TIMES = 2, 3  # pieces of the footage: PLACES x PLACES in the picture, TIMES in time
 LARGEST_TILT_PX = 8.0  # rms
@@ -92,7 +92,7 @@ class RecordedTurbulenceOperator:
     `size` (h, w) of frames; `step`: footage frames per frame; `blur_px`: standard deviation.
     """
 
-    fields: NormalisedDisplacement
+    fields: UnitRmsDisplacement
     drawn: DrawnTilt
     views: Sequence[Position]
     size: tuple[int, int]

@@ -158,13 +158,13 @@ def test_every_stress_test_runs_on_a_set_network(bench):
         conditions.measure_view_dropout_loss: {"counts": [4], "draws": 1},
         conditions.measure_view_shift_loss: {"judged_px": 1, "parallax": True},
         conditions.measure_correlated_views_loss: {"spacings": [0.0]},
-        conditions.measure_condition_loss: {"parameter": "sensor.threshold", "values": [0.3]},
+        conditions.measure_worst_psnr_loss: {"parameter": "sensor.threshold", "values": [0.3]},
     }
     for measure, settings in tests.items():
         found = measure(subject, bench, limit=1.0, **settings)
         assert found.value == found.value and found.limit is not None, measure
     varied = {"parameter": "view_gain_std", "values": [0.05], "limit": 1.0}
-    found = conditions.measure_condition_loss(subject, bench, **varied)
+    found = conditions.measure_worst_psnr_loss(subject, bench, **varied)
     assert found.value == found.value
 
 

@@ -6,7 +6,11 @@ import torch
 from torch.nn import functional
 
 from scripts.p2s_training import TrainableNetwork
-from src.sim.turbulence.p2s_network import PhaseToSpaceNetwork, basis_parities, mode_parity
+from src.sim.turbulence.p2s_network import (
+    PhaseToSpaceNetwork,
+    basis_parities,
+    mirror_symmetry_class,
+)
 from src.sim.turbulence.psf import fraunhofer_psf
 from src.sim.turbulence.zernike import noll_index
 
@@ -29,7 +33,7 @@ def stored(net: TrainableNetwork) -> PhaseToSpaceNetwork:
 
 def turned(phase: torch.Tensor, down: bool, across: bool) -> torch.Tensor:
     """Mirror the rows and the columns of a phase."""
-    kinds = torch.tensor([mode_parity(mode) for mode in range(4, 4 + phase.shape[1])])
+    kinds = torch.tensor([mirror_symmetry_class(mode) for mode in range(4, 4 + phase.shape[1])])
     odd = (down & (kinds // 2 == 1)) ^ (across & (kinds % 2 == 1))
     return torch.where(odd, -phase, phase)
 

@@ -9,7 +9,7 @@ from src.sim.noise import generator
 from src.sim.optics import layout
 from src.sim.turbulence.contract import TurbulenceModel, TurbulenceOperator
 from src.sim.turbulence.footage_displacement import (
-    NormalisedDisplacement,
+    UnitRmsDisplacement,
     interpolate_tracks,
     load_displacement_fields,
 )
@@ -62,7 +62,7 @@ def test_the_fields_are_the_warps_that_the_footage_was_made_with(footage):
     assert scale == pytest.approx(np.sqrt((warps() ** 2).mean()), rel=0.15)
 
 
-def at(found: NormalisedDisplacement, time: float, *places: float) -> torch.Tensor:
+def at(found: UnitRmsDisplacement, time: float, *places: float) -> torch.Tensor:
     """Return the field at one time on a square lattice."""
     return found.sample(np.array([time]), np.array(places), np.array(places))
 
@@ -84,7 +84,7 @@ def test_between_corners_and_frames_the_fields_are_smooth_and_pass_through_them(
 
 
 def test_beyond_its_ends_the_footage_is_mirrored_in_place_and_time():
-    found = NormalisedDisplacement(torch.randn(5, 2, 6, 7, generator=generator(0)), 10.0, 12.0)
+    found = UnitRmsDisplacement(torch.randn(5, 2, 6, 7, generator=generator(0)), 10.0, 12.0)
     inside = found.sample(np.array([1.3]), np.array([2.0]), np.array([3.0]))
     beyond = found.sample(np.array([8 - 1.3]), np.array([-2.0]), np.array([24 - 3.0]))
     torch.testing.assert_close(inside, beyond, atol=1e-5, rtol=0)
@@ -128,7 +128,7 @@ def test_the_picture_moves_as_tilt_says_and_a_flat_one_stays_flat(model):
 
 
 def test_a_point_is_blurred_as_stated():
-    still = NormalisedDisplacement(torch.zeros(3, 2, 4, 4), 10.0, 10.0)
+    still = UnitRmsDisplacement(torch.zeros(3, 2, 4, 4), 10.0, 10.0)
     air = RecordedTurbulenceOperator(
         still, DrawnTilt("strong", 2.0), layout(1), (33, 33), 0.25, 1.2
     )
@@ -152,7 +152,7 @@ def test_nine_views_look_through_nine_pieces():
     nodes[:, 0] = torch.arange(frames)[:, None, None].float()
     nodes[:, 1] = (place // 32)[:, None] * 2 + place // 32
     air = RecordedTurbulenceOperator(
-        NormalisedDisplacement(nodes, 63.0, 63.0),
+        UnitRmsDisplacement(nodes, 63.0, 63.0),
         DrawnTilt("weak", 1.0),
         layout(9),
         (256, 256),
@@ -171,7 +171,7 @@ def test_nine_views_look_through_nine_pieces():
 
 def test_about_half_of_the_views_play_their_piece_backwards():
     clock = torch.arange(40.0)[:, None, None, None].expand(40, 2, 8, 8)
-    seen = NormalisedDisplacement(clock, 63.0, 63.0)
+    seen = UnitRmsDisplacement(clock, 63.0, 63.0)
     air = RecordedTurbulenceOperator(seen, DrawnTilt("weak", 1.0), layout(9), (16, 16), 0.25, 0.0)
     backwards = 0
     for seed in range(10):
@@ -187,7 +187,7 @@ def test_mirrored_and_turned_pieces_stay_gradients():
     y, x = torch.meshgrid(torch.arange(65.0), torch.arange(65.0), indexing="ij")
     hill = torch.stack([torch.cos(x / 9) * torch.sin(y / 7) / 9,
                         torch.sin(x / 9) * torch.cos(y / 7) / 7])  # fmt: skip
-    seen = NormalisedDisplacement(hill.expand(4, 2, 65, 65), 64.0, 64.0)
+    seen = UnitRmsDisplacement(hill.expand(4, 2, 65, 65), 64.0, 64.0)
     air = RecordedTurbulenceOperator(seen, DrawnTilt("weak", 1.0), layout(9), (16, 16), 0.1, 0.0)
     tilt = air.tilt(2, generator(1))
     down = tilt[:, :, 0, 2:, 1:-1] - tilt[:, :, 0, :-2, 1:-1]
