@@ -306,7 +306,7 @@ def test_each_recipe_runs_from_nothing_to_its_card(name, tmp_path, monkeypatch):
     full = read(name, TINY)
     own = [o for o in full.overrides if not o.startswith(("scene.", "sensor.", "~sensor"))]
     widened = full.stages[0].widen
-    begun = files.card(files.WEIGHTS / f"{widened}.safetensors")["hours"] if widened else 0
+    begun = files.read_card(files.WEIGHTS / f"{widened}.safetensors")["hours"] if widened else 0
     stages = [
         stage._replace(
             hours=stage.hours and begun + 0.0015 * (place + 1),

@@ -127,7 +127,7 @@ def test_the_pace_is_that_of_the_recording():
     pace = PlaybackClock(0.5)
     pace.start(10**6)
     _, began = pace.anchor
-    assert pace.wait(10**6 + 20_000, RUNNING) == pytest.approx(began + 0.04, abs=1e-6)
+    assert pace.wait_until_due(10**6 + 20_000, RUNNING) == pytest.approx(began + 0.04, abs=1e-6)
     assert time.perf_counter() - began >= 0.04
 
 
@@ -137,7 +137,7 @@ def test_a_pause_puts_off_what_comes_after_it():
     pace.running.clear()
     threading.Timer(0.15, pace.running.set).start()
     began = time.perf_counter()
-    due = pace.wait(10_000, RUNNING)
+    due = pace.wait_until_due(10_000, RUNNING)
     assert began + 0.14 < due <= time.perf_counter()
 
 
@@ -145,7 +145,7 @@ def test_a_stop_ends_the_wait():
     pace, stopped = PlaybackClock(1.0), threading.Event()
     pace.start(0)
     stopped.set()
-    assert pace.wait(10**9, stopped) is None
+    assert pace.wait_until_due(10**9, stopped) is None
 
 
 @pytest.mark.parametrize("speed", [0, -1, float("nan")])

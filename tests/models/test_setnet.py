@@ -112,7 +112,7 @@ def test_state_stays_bounded_over_500_windows_of_noise():
         frame, state = network(30 * noise + 10, state)
     bounded = state.activity, state.context_recency, state.hidden
     assert max(float(part.abs().max()) for part in bounded) <= 1
-    finite = frame, state.context, state.context_smoothed
+    finite = frame, state.context_average, state.context_smoothed
     assert all(torch.isfinite(part).all() for part in finite)
     # A leaky sum is at most what comes in a window divided by what leaks out of it.
     assert float(state.view_sums.abs().max()) < 4 * 3 * (10 + 30 * 6) / (1 - 0.984)
@@ -224,7 +224,7 @@ def test_the_context_is_updated_30_times_a_second():
     network, state, kept = small().eval(), None, []
     for window in voxels(windows=10).unbind(1):
         _, state = network(window, state, window_s=1 / 120)
-        kept.append((state.hidden, state.context))
+        kept.append((state.hidden, state.context_average))
     changed = [
         [not torch.equal(one, other) for one, other in zip(before, after, strict=True)]
         for before, after in pairwise(kept)
@@ -243,7 +243,7 @@ def test_the_context_is_a_running_mean_of_the_pyramid():
     keep = torch.exp(-4 / 120 * 30 * network.context.log_rate.exp())
     first, second, third = outputs[0].unbind()
     expected = keep * (keep * first + (1 - keep) * second) + (1 - keep) * third
-    torch.testing.assert_close(state.context[0], expected)
+    torch.testing.assert_close(state.context_average[0], expected)
 
 
 @torch.no_grad()
