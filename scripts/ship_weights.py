@@ -87,7 +87,7 @@ def facts(run: Path, content: dict, first: DictConfig) -> dict:
     cfg = OmegaConf.create(text)
     return {
         "experiment": cfg.name,
-        "started_from": _start(first),
+        "started_from": Path(first.ckpt or "nothing").name,
         "seed": cfg.seed,
         "steps": content.get("steps", content["global_step"]),
         "windows_seen": content["windows"],
@@ -186,11 +186,6 @@ def _cell(metric: MetricColumn, score: dict | None) -> str:
         return metric.format_value(None)
     low, high = map(metric.format_value, score["interval"])
     return f"{metric.format_value(score['mean'])} ({low} to {high})"
-
-
-def _start(cfg: DictConfig) -> str:
-    """Return the name of the weights that a training began with."""
-    return Path(cfg.model.get("weights") or cfg.ckpt or "nothing").name
 
 
 def _scenes(cfg: DictConfig) -> str:

@@ -1,7 +1,7 @@
 """What atmospheres the prior draws: python -m scripts.turbulence_prior [air.yaml ...].
 
 Prints quantiles of the draws of each severity and of the clips of data=test_photos, and draws
-docs/figures/air.png: rms tilt against its half length.  `air.yaml` files are those of
+docs/figures/turbulence_prior.png: rms tilt against its half length.  `air.yaml` files are those of
 `python -m src.calibrate task=air`, shown with their intervals.
 """
 
@@ -105,4 +105,5 @@ def plot_prior(
 if __name__ == "__main__":
     atmospheres = draw_atmospheres()
     print(format_table(atmospheres | draw_test_atmospheres()))
-    plot_prior(atmospheres, [Path(name) for name in sys.argv[1:]], Path("docs/figures/air.png"))
+    measured = [Path(name) for name in sys.argv[1:]]
+    plot_prior(atmospheres, measured, Path("docs/figures/turbulence_prior.png"))

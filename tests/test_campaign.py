@@ -134,6 +134,11 @@ def test_a_recipe_waits_for_the_networks_that_it_names(tmp_path, fakes):
     assert [name for name, _ in order(tmp_path)] == ["a"] * 10 + ["b"] * 10
     taught = f"teachers=[{tmp_path / 'weights' / 'a.safetensors'}]"
     assert taught in second.trainings["training"].overrides
+    whole, shipped = tmp_path / "whole", recipe(tmp_path, "d")._replace(after=["lf3x3"])
+    whole.mkdir()
+    given = [RecipeWork(shipped, Settings(whole, 2, 1, 0, 3)), *works(whole, "lf3x3")]
+    assert run(given) == 0, "one of this campaign comes before the shipped one of its name"
+    assert [name for name, _ in order(whole)] == ["lf3x3"] * 10 + ["d"] * 10
     (alone,) = works(tmp_path / "..", "c")
     alone.recipe = alone.recipe._replace(after=["nothing"])
     with pytest.raises(ValueError, match="c needs the networks nothing: train them too"):
@@ -228,6 +233,13 @@ def test_a_wrong_recipe_is_named(stages, said, tmp_path):
 def test_a_wrong_command_line_is_named(words, said):
     with pytest.raises(ValueError, match=said):
         campaign.run(words)
+
+
+def test_a_campaign_runs_at_a_commit(monkeypatch, tmp_path):
+    monkeypatch.setattr(campaign, "git_commit", lambda: "abc-dirty")
+    with pytest.raises(ValueError, match="a campaign runs at a commit, got abc-dirty"):
+        campaign.run(["lf3x3", f"out={tmp_path}"])
+    assert campaign.run(["lf3x3", f"out={tmp_path}", "status"]) == 0
 
 
 def test_a_mean_of_weights_is_weighted(tmp_path):

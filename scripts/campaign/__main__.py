@@ -26,6 +26,7 @@ from scripts.campaign import driver
 from scripts.campaign.recipe import ROOT, names, read
 from scripts.campaign.training import Settings
 from scripts.campaign.work import RecipeWork
+from src.records.results import git_commit
 
 OWN = ("out", "clone", *Settings._fields[1:])
 LIMITS = {"parallel": (1, 64), "threads": (1, 256), "nice": (0, 19), "max_failures": (1, 100)}
@@ -70,6 +71,8 @@ def run(words: list[str]) -> int:
     if "status" in words:
         print("\n".join(work.line() for work in works))
         return 0
+    if (commit := git_commit()).endswith("-dirty"):  # such weights are not shipped
+        raise ValueError(f"a campaign runs at a commit, got {commit}: commit, or clone=FOLDER")
     return driver.run(given, works)
 
 

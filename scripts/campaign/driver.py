@@ -40,16 +40,22 @@ def _turn(settings: Settings, recipes: list[RecipeWork]) -> bool:
         for training in work.trainings.values():
             training.settle()
     states = [work.state() for work in recipes]
+
+    def is_ready(work: RecipeWork) -> bool:
+        named = zip(recipes, states, strict=True)
+        return work.ready({other.name for other, state in named if state != "done"})
+
     for place, work in enumerate(recipes):
         turn = states[place] == "waiting" and states.count("running") < settings.parallel
-        if turn and work.ready():
+        if turn and is_ready(work):
             states[place] = "done"
             if work.advance():
                 work.start()
                 states[place] = "running"
                 print(f"{time.strftime('%F %T')} {work.line().split(',')[0]}", flush=True)
-    stuck = [w for w, s in zip(recipes, states, strict=True) if s == "waiting" and not w.ready()]
-    if stuck and "running" not in states and states.count("waiting") == len(stuck):
+    waiting = [work for work, state in zip(recipes, states, strict=True) if state == "waiting"]
+    stuck = [work for work in waiting if not is_ready(work)]
+    if stuck and "running" not in states and len(waiting) == len(stuck):
         needs = ", ".join(sorted({name for work in stuck for name in work.recipe.after}))
         raise ValueError(f"{stuck[0].name} needs the networks {needs}: train them too")
     return "running" in states or "waiting" in states

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from collections.abc import Collection
 from pathlib import Path
 
 import torch
@@ -14,7 +15,7 @@ from src.models import files
 class RecipeWork:
     """The stages of `recipe` in the folder `settings.out/recipe`; each leaves a weights file there.
 
-    `ship`: where the network, its card and its learning curve go once all stages are done.
+    `shipped`: where the network goes, its card and learning curve beside it, once all are done.
     """
 
     def __init__(self, recipe: Recipe, settings: Settings):
@@ -36,22 +37,21 @@ class RecipeWork:
         training = self.trainings.get(self._stage().name)
         return training.state() if training and training.state() != "done" else "waiting"
 
-    def ready(self) -> bool:
-        """Return whether the networks that the stages name are there."""
-        return all(self._network(name) for name in self.recipe.after)
+    def ready(self, unfinished: Collection[str] = ()) -> bool:
+        """Return whether the networks that the stages name are there, and none of them is among the
+        `unfinished` recipes of this campaign.
+        """
+        return all(self._network(name) and name not in unfinished for name in self.recipe.after)
 
     def advance(self) -> bool:
         """Do what takes no training, up to the next one; return whether there is one to start."""
-        while not self.shipped.is_file():
-            stage = self._stage()
+        for stage in self.recipe.stages:
+            if self._done(stage):
+                continue
             if stage.name in self.trainings:
-                if self.trainings[stage.name].state() != "done":
-                    return True
-                self._ship(stage)  # the last one: all others are done
-            elif stage.widen is not None:
-                self._widen(stage)
-            else:
-                self._average(stage)
+                return True
+            (self._average if stage.widen is None else self._widen)(stage)
+        self._ship(self.recipe.stages[-1])
         return False
 
     def start(self) -> None:
@@ -127,16 +127,10 @@ class RecipeWork:
         self.folder.mkdir(parents=True, exist_ok=True)
         words = [f"experiment={self.recipe.experiment}", f"seed={stage.seed}", *stage.overrides]
         run("scripts.widen_setnet", *words, f"ckpt={source}", f"export={self._weights(stage.name)}")
-        self._go_on(stage)
 
     def _average(self, stage: Stage) -> None:
         shares = {self._weights(name): share for name, share in (stage.mean or {}).items()}
         average(shares, self._weights(stage.name))
-        self._go_on(stage)
-
-    def _go_on(self, stage: Stage) -> None:
-        if stage == self.recipe.stages[-1]:
-            self._ship(stage)
 
     def _ship(self, stage: Stage) -> None:
         """Write the last stage's weights with card and learning curve to `shipped`."""
@@ -146,7 +140,6 @@ class RecipeWork:
             self.name, "--weights", str(self._weights(stage.name)), "--to",
             str(self.shipped.parent),
         )  # fmt: skip
-        assert self.shipped.is_file(), "the loop of `advance` ends with it"
 
 
 def run(module: str, *words: str) -> None:
