@@ -93,6 +93,12 @@ class StaticFlicker(SequenceTerm):
         return (change * is_static / contrast[:, 1:][:, is_consecutive]).mean()
 
 
+class FlatnessTerm(LossTerm):
+    """A term of where nothing is revealed: `forward` maps frames (n, 1, h, w) and whether each
+    pixel is revealed to values (n,).  With it the other terms have no gradient there.
+    """
+
+
 class Distillation(LossTerm):
     """The frame terms against the frames of teachers (Hinton et al. 2015): those with
     `in_distillation`, or all where none has it.
@@ -121,7 +127,7 @@ class TrainingLoss(nn.Module):
     def __init__(self, terms: Mapping[str, LossTerm]):
         super().__init__()
         for name, term in terms.items():
-            if not isinstance(term, FrameTerm | SequenceTerm | Distillation):
+            if not isinstance(term, FrameTerm | SequenceTerm | Distillation | FlatnessTerm):
                 raise ValueError(
                     f"loss.{name}._target_ must be a FrameTerm or a SequenceTerm "
                     f"(src.losses.terms), got {type(term).__name__}"
@@ -130,6 +136,7 @@ class TrainingLoss(nn.Module):
         self.frame_terms = [term for term in terms.values() if isinstance(term, FrameTerm)]
         self.sequence_terms = [term for term in terms.values() if isinstance(term, SequenceTerm)]
         self.distillation = next((t for t in terms.values() if isinstance(t, Distillation)), None)
+        self.flatness = next((t for t in terms.values() if isinstance(t, FlatnessTerm)), None)
         if not self.frame_terms:
             raise ValueError("loss must have a frame term of weight > 0, such as loss.l1.weight=1")
 
@@ -143,14 +150,23 @@ class TrainingLoss(nn.Module):
         target: Sequences,
         windows: list[int],
         teacher_frames: Sequences | None = None,
+        is_revealed: Bool[Tensor, "n windows 1 h w"] | None = None,
     ) -> tuple[Float[Tensor, ""], Sequences]:
         """Return the mean loss of frames and its gradient with respect to them.
 
-        `windows`: the number of each window in its sequence.  A few frames are computed at a time,
+        `windows`: the number of each window in its sequence.  `is_revealed`: for `flatness`.  A few frames are computed at a time,
         so that feature maps (VGG's are larger than the network's) are never in memory together.
         """
         leaf = frames.detach().flatten(0, 1).float().requires_grad_()
-        value = _backward_frames(self, leaf, target.flatten(0, 1))
+        truth = target.flatten(0, 1)
+        if is_revealed is not None and self.flatness is not None:
+            revealed = is_revealed.flatten(0, 1)
+            truth = torch.where(revealed, truth, leaf.detach())
+            if teacher_frames is not None:
+                teacher_frames = torch.where(is_revealed, teacher_frames, frames.detach())
+        value = _backward_frames(self, leaf, truth)
+        if is_revealed is not None and self.flatness is not None:
+            value += _backward_frames(self.flatness, leaf, revealed, self.flatness.weight)
         if teacher_frames is not None and (taught := self.distillation) is not None:
             compare = partial(taught, terms=self.frame_terms)
             value += _backward_frames(compare, leaf, teacher_frames.flatten(0, 1), taught.weight)

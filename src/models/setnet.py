@@ -80,7 +80,11 @@ CELL_PX = 2  # a cell: CELL_PX x CELL_PX pixels, one place of the half-resolutio
 CELL_BORDER = 2  # padding, in cells, of the decoder's two 3 x 3 convolutions together
 REFERENCE_HZ = 120.0  # window rate in training; unit of time of rates and gates: 1 / REFERENCE_HZ
 SUM_TAUS_S = (0.05, 0.5)  # time constants of the leaky sums
-ACTIVITY_TAU_S = 0.005  # decay of the activity; at most this passes after the last event
+ACTIVITY_TAU_S = 0.005  # decay of the event trace, and of the activity after the last event
+MIN_ACTIVITY = 0.25  # below which a cell stands still
+MIN_SUPPORT = 1.25  # events of a view in 3 x 3 cells within ACTIVITY_TAU_S, for one to count
+REACH_CELLS = 3  # from a supported event, to which cells are active
+SETTLING = math.exp(-2)  # context recency above which the context of a cell is still smoothed
 CONTEXT_INTERVAL_S = 1 / 30  # shortest time between two context updates
 UPDATE_RECENCY = math.exp(-0.98)  # an update is due at or below it: 0.98 intervals, for rounding
 CONTEXT_TAU_S = 1 / 60  # time constant of the low-pass on the context
@@ -91,37 +95,48 @@ class SetNetState(NamedTuple):
     """What is carried from window to window, float32; zeros before the first."""
 
     view_sums: Float[Tensor, "n views taus h2 w2"]  # leaky polarity sums, per view and cell
-    activity: Float[Tensor, "n 1 1 1"]  # clock speed: 1 with events, decaying without
-    context_recency: Float[Tensor, "n 1 1 1"]  # exp(-age / CONTEXT_INTERVAL_S); 0: no context yet
+    event_trace: Float[Tensor, "n views h2 w2"]  # events of a cell, decaying by ACTIVITY_TAU_S
+    activity: Float[Tensor, "n 1 h2 w2"]  # clock speed: 1 near supported events, decaying without
+    is_pending: Float[Tensor, "n 1 h2 w2"]  # 1: was active since the last context update
+    update_recency: Float[Tensor, "n 1 1 1"]  # exp(-age / CONTEXT_INTERVAL_S) of the last update
+    context_recency: Float[Tensor, "n 1 h4 w4"]  # the same of each cell's own; 0: no context yet
     hidden: Float[Tensor, "n c h2 w2"]  # memory, in [-1, 1]
+    scales: tuple[Tensor, ...]  # maps of the pyramid, those of ContextPyramid.map_sizes
     context_average: Float[Tensor, "n c h4 w4"]  # moving average of the pyramid's output
     context_smoothed: Float[Tensor, "n c h4 w4"]  # the same, low-pass filtered in time
 
 
 class ClockTick(NamedTuple):
-    """Clock of one window, (n, 1, 1, 1), or of all, (m, 1, 1, 1): tensors, or NumPy scalars."""
+    """Clock of all windows (m = windows * n)."""
 
-    elapsed_s: Any  # time by which the state advances
-    context_recency: Any  # at the end of the window, before its update
-    update_due: Any  # whether the context is updated
+    elapsed_s: Float[Tensor, "m 1 h2 w2"]  # time by which the state of a cell advances
+    is_updated: Tensor  # (m, 1, h2, w2) bool: the context of the cell is updated
+    context_recency: Float[Tensor, "m 1 h4 w4"]  # at the end of the window, before its update
+    smoothing_s: Float[Tensor, "m 1 h4 w4"]  # time by which the smoothed context advances
 
 
-def advance_clock(
-    has_events: Any, window_s: Any, activity: Any, context_recency: Any, xp: Any = torch
-) -> tuple[ClockTick, Any, Any]:
-    """Return the tick of a window, and activity and context recency after it.
+def advance_activity(
+    is_near_events: Tensor, window_s: Tensor, activity: Float[Tensor, "n 1 h2 w2"]
+) -> tuple[Float[Tensor, "n 1 h2 w2"], Float[Tensor, "n 1 h2 w2"]]:
+    """Return by how many seconds the clock of each cell advances in a window, and its activity.
 
-    With events the clock advances by `window_s` and activity is 1; without, activity decays and the
-    clock advances by its integral over the window.  A context update is due if the clock advances
-    and the last is CONTEXT_INTERVAL_S old or missing.  `xp`: torch or numpy, as the arguments.
+    Near events it advances by `window_s` and activity is 1; elsewhere activity decays, to 0 below
+    MIN_ACTIVITY, and the clock advances by its integral over the window.
     """
-    kept = xp.exp(-window_s / ACTIVITY_TAU_S)
-    elapsed_s = xp.where(has_events, window_s, activity * ACTIVITY_TAU_S * (1 - kept))
-    activity = xp.where(has_events, 1.0, activity * kept)
-    recency = context_recency * xp.exp(-elapsed_s / CONTEXT_INTERVAL_S)
-    update_due = (recency <= UPDATE_RECENCY) & (elapsed_s > 0)
-    tick = ClockTick(elapsed_s, recency, update_due)
-    return tick, activity, xp.where(update_due, 1.0, recency)
+    kept = torch.exp(-window_s / ACTIVITY_TAU_S)
+    elapsed_s = torch.where(is_near_events, window_s, activity * ACTIVITY_TAU_S * (1 - kept))
+    activity = torch.where(is_near_events, 1.0, activity * kept)
+    return elapsed_s, torch.where(activity < MIN_ACTIVITY, 0.0, activity)
+
+
+def find_active_cells(
+    counts: Float[Tensor, "m views h2 w2"], trace: Float[Tensor, "m views h2 w2"]
+) -> Tensor:
+    """Return (m, 1, h2, w2) bool: cells within REACH_CELLS of a supported event of any view."""
+    support = 9 * functional.avg_pool2d(trace, 3, 1, 1)
+    is_supported = ((counts > 0) & (support > MIN_SUPPORT)).any(1, keepdim=True)
+    size = 2 * REACH_CELLS + 1
+    return functional.max_pool2d(is_supported.float(), size, 1, REACH_CELLS) > 0
 
 
 class SetNet(EventToVideoNetwork):
@@ -206,18 +221,23 @@ class SetNet(EventToVideoNetwork):
         where = self.checked_positions(views, bins, positions)
         seconds = _durations(window_s, voxels)
         padded, (top, left) = pad_to_multiple(voxels.flatten(0, 2), 8)
-        voxels = padded.unflatten(0, (n, windows, views)).transpose(0, 1)
-        cells = _sum_cells(voxels.float().sum(3).flatten(0, 1))
-        before = self._checked_state(state, cells[:n])
+        voxels = padded.unflatten(0, (n, windows, views)).transpose(0, 1).float()
+        counts = _sum_cells(torch.linalg.vector_norm(voxels, 1, 3).flatten(0, 1))
+        before = self._checked_state(state, counts[:n])
 
-        tick, activity, recency = _run_clock(cells, seconds, before)
+        tick, clock = self.run_clock(counts, seconds, before)
+        is_active = tick.elapsed_s > 0
+        is_active_px = upsample_nearest(is_active.float(), CELL_PX).unflatten(0, (windows, n))
+        voxels = voxels * is_active_px[:, :, None]
+        cells = _sum_cells(voxels.sum(3).flatten(0, 1))
         decay = torch.stack([torch.exp(-tick.elapsed_s / tau) for tau in SUM_TAUS_S], 2)
         sums, view_sums = scan_windows(_leaky_sum, before.view_sums, decay, cells[:, :, None])
         stem = self.stem(voxels, sums, seconds, where)
-        features, hidden = self.run_memory(stem, before.hidden, tick.elapsed_s)
-        contexts, context = self.average_context(features, before.context_average, tick)
+        features, hidden = self.run_memory(stem, is_active, before.hidden, tick.elapsed_s)
+        new, scales = self.context(features, before.scales, tick.is_updated)
+        contexts, context = self.average_context(new, before.context_average, tick)
         smoothed, context_smoothed = scan_windows(
-            smooth_context, before.context_smoothed, contexts, tick.elapsed_s
+            smooth_context, before.context_smoothed, contexts, tick.smoothing_s
         )
         if output_windows is not None:
             features, smoothed = (
@@ -226,8 +246,38 @@ class SetNet(EventToVideoNetwork):
         frames = functional.pixel_shuffle(self.decode_logits(features, smoothed), CELL_PX).sigmoid()
         frames = frames[..., top : top + height, left : left + width]
         frames = frames.unflatten(0, (-1, n)).transpose(0, 1)
-        after = view_sums, activity, recency, hidden, context, context_smoothed
-        return frames, SetNetState(*after)
+        return frames, SetNetState(view_sums, *clock, hidden, scales, context, context_smoothed)
+
+    @torch.no_grad()
+    def run_clock(
+        self, counts: Float[Tensor, "m views h2 w2"], seconds: Tensor, state: SetNetState
+    ) -> tuple[ClockTick, tuple[Tensor, ...]]:
+        """Return the ticks of all windows, and the fields event_trace to context_recency of the
+        state after the last.
+
+        A context update is due if the clock advances anywhere and the last is CONTEXT_INTERVAL_S
+        old or missing; it reaches the cells that were active since the one before.
+        """
+        kept = torch.exp(-seconds / ACTIVITY_TAU_S)
+        traces, trace = scan_windows(lambda old, new: kept * old + new, state.event_trace, counts)
+        near = find_active_cells(counts, traces)
+        activity, pending = state.activity, state.is_pending
+        recency, cell_recency, ticks = state.update_recency, state.context_recency, []
+        for is_near in near.split(len(activity)):
+            elapsed_s, activity = advance_activity(is_near, seconds, activity)
+            longest_s = elapsed_s.amax((2, 3), keepdim=True)
+            kept_recency = torch.exp(-longest_s / CONTEXT_INTERVAL_S)
+            recency, cell_recency = recency * kept_recency, cell_recency * kept_recency
+            pending = torch.maximum(pending, (elapsed_s > 0).float())
+            due = (recency <= UPDATE_RECENCY) & (longest_s > 0)
+            is_updated = due & (pending > 0)
+            coarse = _any_of_cells(pending)
+            smoothing_s = longest_s * ((coarse > 0) | (cell_recency > SETTLING))
+            ticks.append(ClockTick(elapsed_s, is_updated, cell_recency, smoothing_s))
+            cell_recency = torch.where(due & (coarse > 0), 1.0, cell_recency)
+            recency, pending = torch.where(due, 1.0, recency), torch.where(due, 0.0, pending)
+        tick = ClockTick(*map(torch.cat, zip(*ticks, strict=True)))
+        return tick, (trace, activity, pending, recency, cell_recency)
 
     def stem(
         self,
@@ -248,28 +298,28 @@ class SetNet(EventToVideoNetwork):
         return _as_rates(counts, seconds) + functional.conv2d(sums, sum_kernel, bias, 1, 1)
 
     def run_memory(
-        self, stem: Float[Tensor, "m c h2 w2"], hidden: Tensor, elapsed_s: Float[Tensor, "m 1 1 1"]
+        self,
+        stem: Float[Tensor, "m c h2 w2"],
+        is_active: Tensor,
+        hidden: Tensor,
+        elapsed_s: Float[Tensor, "m 1 h2 w2"],
     ) -> tuple[Float[Tensor, "m c h2 w2"], Tensor]:
         """Return the hidden map after each window, in the type of `stem`, and after the last."""
-        features, hidden = self.memory(self.relu(stem), hidden, REFERENCE_HZ * elapsed_s)
+        inputs = self.relu(stem) * is_active
+        features, hidden = self.memory(inputs, hidden, REFERENCE_HZ * elapsed_s)
         return features.to(stem.dtype), hidden
 
     def average_context(
-        self, features: Float[Tensor, "m c h2 w2"], context: Tensor, tick: ClockTick
+        self, new: Float[Tensor, "m c h4 w4"], context: Tensor, tick: ClockTick
     ) -> tuple[Float[Tensor, "m c h4 w4"], Float[Tensor, "n c h4 w4"]]:
         """Return the moving average after each window and after the last, float32."""
-        if len(features) == len(context) or features.is_cuda:
-            # Shapes that depend on data cannot be exported and would synchronise a GPU: run on all.
-            new = self.context(features).float()
-        else:
-            due = tick.update_due.flatten().nonzero().flatten()
-            new = context.new_zeros(len(features), *context.shape[1:])
-            new = new.index_copy(0, due, self.context(features[due]).float())
 
-        def step(before: Tensor, new: Tensor, recency: Tensor, due: Tensor) -> Tensor:
-            return torch.where(due, self.context.moving_average(before, new, recency), before)
+        def step(before: Tensor, new: Tensor, recency: Tensor, updated: Tensor) -> Tensor:
+            average = self.context.moving_average(before, new, recency)
+            return torch.where(updated, average, before)
 
-        return scan_windows(step, context, new, tick.context_recency, tick.update_due)
+        updated = _any_of_cells(tick.is_updated.float()) > 0
+        return scan_windows(step, context, new.float(), tick.context_recency, updated)
 
     def decode_logits(
         self, features: Float[Tensor, "m c h2 w2"], context: Float[Tensor, "m c h4 w4"]
@@ -315,14 +365,20 @@ class SetNet(EventToVideoNetwork):
         """Return `state`, or zeros of the right sizes; ValueError when they are not right."""
         n, views, rows, columns = cells.shape
         maps = self.map_sizes(CELL_PX * rows, CELL_PX * columns)
-        sizes = [
-            (n, views, len(SUM_TAUS_S), rows, columns),
-            *[(n, 1, 1, 1)] * 2,
-            *((n, *size) for size in maps),
-        ]
+        half, quarter = (rows, columns), maps[1][1:]
+        zeros = SetNetState(
+            cells.new_zeros(n, views, len(SUM_TAUS_S), *half),
+            cells.new_zeros(n, views, *half),
+            *(cells.new_zeros(n, 1, *half) for _ in range(2)),
+            cells.new_zeros(n, 1, 1, 1),
+            cells.new_zeros(n, 1, *quarter),
+            cells.new_zeros(n, *maps[0]),
+            tuple(cells.new_zeros(n, *size) for size in self.context.map_sizes(*half)),
+            *(cells.new_zeros(n, *size) for size in maps[1:]),
+        )
         if state is None:
-            return SetNetState(*(cells.new_zeros(size) for size in sizes))
-        found = [tuple(part.shape) for part in state]
+            return zeros
+        found, sizes = _sizes(state), _sizes(zeros)
         if found != sizes:
             raise ValueError(f"state must have sizes {sizes} for these voxels, got {found}")
         return SetNetState(*state)
@@ -386,7 +442,7 @@ class TimeGatedMemory(nn.Module):
         self,
         x: Float[Tensor, "m c h w"],
         state: Float[Tensor, "n c h w"],
-        elapsed: Float[Tensor, "m 1 1 1"],
+        elapsed: Float[Tensor, "m 1 _h _w"],
     ) -> tuple[Float[Tensor, "m c h w"], Float[Tensor, "n c h w"]]:
         """Return the state, float32, after each of m = windows * n steps and after the last."""
         update = TimeGatedUpdate.apply if torch.is_grad_enabled() else time_gated_update
@@ -421,24 +477,55 @@ class ContextPyramid(nn.Module):
         initial = torch.full((channels, 1, 1), math.log(INITIAL_CONTEXT_RATE))
         self.log_rate = nn.Parameter(initial)  # log decay rate of the moving average, per channel
 
-    def forward(self, x: Float[Tensor, "n c h2 w2"]) -> Float[Tensor, "n c h4 w4"]:
-        """Return a map of half the size of `x`."""
-        scales = []
-        for down, block in zip(self.downs, self.down_blocks, strict=True):
-            x = block(down(x))
+    def map_sizes(self, rows: int, columns: int) -> list[tuple[int, int, int]]:
+        """Return the sizes (c, h, w) of the maps that are held: those of the scales, finest first,
+        then the sums with the coarser ones but the finest, coarsest first."""
+        sizes = []
+        for down in self.downs:
+            rows, columns = -(-rows // 2), -(-columns // 2)
+            sizes.append((down.out_channels, rows, columns))
+        return [*sizes, *reversed(sizes[1:-1])]
+
+    def forward(
+        self, x: Float[Tensor, "m c h2 w2"], held: tuple[Tensor, ...], is_updated: Tensor
+    ) -> tuple[Float[Tensor, "m c h4 w4"], tuple[Tensor, ...]]:
+        """Return a map of half the size of `x` (m = windows * n), and the held maps after the last
+        window.  Each map changes only in cells over one that `is_updated` (m, 1, h2, w2).
+        """
+        due = None
+        if not x.is_cuda:  # shapes that depend on data would synchronise a GPU
+            due = is_updated.flatten(1).any(1).nonzero().flatten()
+        masks, mask = [], is_updated.float()
+        for _ in self.downs:
+            mask = functional.max_pool2d(mask, 2, ceil_mode=True)
+            masks.append(mask > 0)
+        remaining, after, scales = list(held), [], []
+        for down, block, mask in zip(self.downs, self.down_blocks, masks, strict=True):
+            new = _run_on(due, lambda x, d=down, b=block: b(d(x)), x)
+            x, last = scan_windows(_hold, remaining.pop(0), new, mask)
+            x = x.to(new.dtype)
             scales.append(x)
+            after.append(last)
         scales.pop()
-        for up, block in zip(reversed(self.ups[1:]), reversed(self.fusion_blocks), strict=True):
-            finer = scales.pop()
-            coarser = functional.interpolate(up(self.relu(x)), finer.shape[-2:], mode="bilinear")
-            x = block(finer + coarser)
-        return self.ups[0](self.relu(x))
+        ups = zip(reversed(self.ups[1:]), reversed(self.fusion_blocks), strict=True)
+        for (up, block), mask in zip(ups, reversed(masks[:-1]), strict=True):
+            new = _run_on(due, lambda x, f, u=up, b=block: self._fuse(x, f, u, b), x, scales.pop())
+            x = new
+            if scales:
+                x, last = scan_windows(_hold, remaining.pop(0), new, mask)
+                x = x.to(new.dtype)
+                after.append(last)
+        return _run_on(due, lambda x: self.ups[0](self.relu(x)), x), tuple(after)
+
+    def _fuse(self, x: Tensor, finer: Tensor, up: nn.Module, block: nn.Module) -> Tensor:
+        coarser = functional.interpolate(up(self.relu(x)), finer.shape[-2:], mode="bilinear")
+        return block(finer + coarser)
 
     def moving_average(
         self,
         before: Float[Tensor, "n c h4 w4"],
         new: Float[Tensor, "n c h4 w4"],
-        recency: Float[Tensor, "n 1 1 1"],
+        recency: Float[Tensor, "n 1 h4 w4"],
     ) -> Float[Tensor, "n c h4 w4"]:
         """Return the moving average with `new`; `recency`: exp(-age / interval) of `before`."""
         return torch.lerp(new, before, recency ** self.log_rate.float().exp())
@@ -466,15 +553,24 @@ def _leaky_sum(sums: Tensor, decay: Tensor, new: Tensor) -> Tensor:
     return decay * sums + new
 
 
-def _run_clock(
-    cells: Float[Tensor, "m views h2 w2"], seconds: Tensor, state: SetNetState
-) -> tuple[ClockTick, Tensor, Tensor]:
-    """Return the ticks of all windows, and activity and context recency after the last."""
-    activity, recency, ticks = state.activity, state.context_recency, []
-    for has_events in (cells.abs().amax((1, 2, 3), keepdim=True) > 0).split(len(activity)):
-        tick, activity, recency = advance_clock(has_events, seconds, activity, recency)
-        ticks.append(tick)
-    return ClockTick(*map(torch.cat, zip(*ticks, strict=True))), activity, recency
+def _hold(before: Tensor, new: Tensor, is_updated: Tensor) -> Tensor:
+    return torch.where(is_updated, new.float(), before)
+
+
+def _run_on(due: Tensor | None, work: Callable[..., Tensor], *maps: Tensor) -> Tensor:
+    """Return work(*maps) for the entries `due` (None: all) and zeros for the others."""
+    if due is None:
+        return work(*maps)
+    some = work(*(part[due] for part in maps))
+    return some.new_zeros(len(maps[0]), *some.shape[1:]).index_copy(0, due, some)
+
+
+def _any_of_cells(mask: Float[Tensor, "n 1 h2 w2"]) -> Float[Tensor, "n 1 h4 w4"]:
+    return functional.max_pool2d(mask, 2)
+
+
+def _sizes(state: SetNetState) -> list:
+    return [tuple(p.shape) if isinstance(p, Tensor) else [tuple(q.shape) for q in p] for p in state]
 
 
 def _sum_cells(x: Float[Tensor, "m views h w"]) -> Float[Tensor, "m views h2 w2"]:

@@ -90,7 +90,11 @@ class DiskClipCache(ClipCache):
                         warnings.warn(str(error), stacklevel=2)
                     return clip._replace(metadata=json.loads(json.dumps(clip.metadata)))
         content = torch.load(self.path(index), mmap=True, weights_only=True)
-        return CachedClip(content["views"], content["clean"], json.loads(content["metadata"]))
+        return CachedClip(
+            content["views"],
+            content["clean"],
+            json.loads(content.get("metadata") or content["facts"]),
+        )
 
     def read_views(
         self, draws: Sequence[CachedDraw], device: torch.device | str

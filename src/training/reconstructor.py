@@ -10,6 +10,7 @@ from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 from torch.nn.utils import parametrize
 
+from src.losses.revealed import find_revealed
 from src.losses.terms import TrainingLoss
 from src.metrics.video_metrics import VideoMetrics
 from src.models.network import EventToVideoNetwork, FramePostprocessor, VideoMethod, unroll
@@ -117,6 +118,7 @@ class Reconstructor(LightningModule):
             sample.target[:, outputs],
             outputs,
             None if teachers is None else teachers[:, outputs],
+            self._find_revealed(sample, outputs),
         )
         self.manual_backward(frames, gradient)
         total = self.all_gather(loss).mean()  # type: ignore[union-attr]
@@ -129,6 +131,14 @@ class Reconstructor(LightningModule):
         self.log("train/loss", total, prog_bar=True, batch_size=len(sample.voxels))
         self.clock.lap()
         return total
+
+    def _find_revealed(self, sample: "Sample", outputs: Sequence[int]) -> Tensor | None:
+        if self.loss.flatness is None:
+            return None
+        noise_hz = torch.tensor([_noise_hz(drawn) for drawn in sample.parameters])
+        noise = noise_hz * sample.window_s.cpu()
+        threshold = torch.tensor([drawn.get("threshold", 0.0) for drawn in sample.parameters])
+        return find_revealed(sample.target, sample.voxels, threshold, noise)[:, outputs]
 
     def reconstruct_windows(self, sample: "Sample", outputs: Sequence[int]) -> Tensor:
         """Return the frames of the windows `outputs` of the network in training."""
@@ -195,6 +205,12 @@ class PostprocessorTraining(Reconstructor):
         with torch.no_grad():
             frames = source.reconstruct_clip(sample).float().clamp(0, 1)
         return self.network(frames)[0][:, outputs]
+
+
+def _noise_hz(drawn: dict) -> float:
+    """Return the noise events per second and pixel of a sensor that was drawn."""
+    hot_hz = drawn.get("hot_pixel_fraction", 0.0) * drawn.get("hot_pixel_hz", 0.0)
+    return drawn.get("dark_noise_hz", 0.0) + drawn.get("leak_event_hz", 0.0) + hot_hz
 
 
 def select_loss_windows(windows: int, first: int, pairs: int | None, seed: int) -> list[int]:
