@@ -1,55 +1,39 @@
-"""What runs the remaining layers, with the state kept inside; PyTorch as one of its backends."""
+"""What runs the layers behind the events; PyTorch as one of its backends."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from src.deploy.cost import torch_threads
-from src.deploy.remaining_layers import (
-    E2VIDRemainder,
-    SetNetRemainder,
-    SetNetRemainderWithoutContext,
-)
+from src.deploy.remaining_layers import E2VIDRemainder
 
 
 class StatefulRunner:
-    """Runs the remaining layers window by window and keeps their state.
+    """Runs the remaining layers of an E2VID window by window and keeps their state.
 
     `inputs`: an example; `backend`: EagerBackend or CompiledModule of OpenVINO.
     """
 
     def __init__(
         self,
-        remainder: E2VIDRemainder | SetNetRemainder,
+        remainder: E2VIDRemainder,
         inputs: list[np.ndarray],
         backend: Callable[[nn.Module, list[Tensor], int], Any],
         threads: int,
     ):
         given, state = [*map(torch.from_numpy, inputs)], remainder.initial_state
-        self.without_context_update = None
-        if isinstance(remainder, SetNetRemainder):
-            given.pop()  # whether an update is due
-            reduced = SetNetRemainderWithoutContext(remainder)
-            self.without_context_update = backend(reduced, [*given[:-1], *state], threads)
         self.whole = backend(remainder, [*given, *state], threads)
         self.inputs, self.state = len(given), list[Any]()
         self.reset()
 
-    def __call__(self, inputs: list[np.ndarray]) -> np.ndarray:
-        if self.without_context_update is None:
-            output, *self.state = self.whole(inputs, self.state)
-            return output
-        *given, recency, update_due = inputs
-        if update_due.any():
-            output, *self.state = self.whole([*given, recency], self.state)
-        else:
-            _, context, _ = self.state
-            output, hidden, smoothed = self.without_context_update(given, self.state)
-            self.state = [hidden, context, smoothed]
-        return output
+    def __call__(self, inputs: list[np.ndarray]) -> Float[np.ndarray, "h w"]:
+        """Return the frame, padded, valid until the next call."""
+        output, *self.state = self.whole(inputs, self.state)
+        return output[0, 0]
 
     def reset(self) -> None:
         self.state = self.whole.zeros(self.inputs)
@@ -67,6 +51,12 @@ class EagerBackend:
         with torch_threads(self.threads):
             output, *state = self.module(*map(torch.from_numpy, inputs), *state)
         return [output.numpy(), *state]
+
+    @torch.inference_mode()
+    def run(self, inputs: Sequence[np.ndarray], output: np.ndarray) -> None:
+        """Write the only output of a module without state into `output`."""
+        with torch_threads(self.threads):
+            output[...] = self.module(*map(torch.from_numpy, inputs)).numpy()
 
     def zeros(self, first: int) -> list[Tensor]:
         """Return zeros for the inputs from the `first` on."""

@@ -74,15 +74,21 @@ class CompiledModule:
     def __call__(self, inputs: Sequence[np.ndarray], state: Sequence) -> list:
         """Return the first output, valid until the next call, and the state; nothing is copied."""
         arrays = [np.ascontiguousarray(part, np.float32) for part in inputs]
-        shared = [_package().Tensor(part, shared_memory=True) for part in arrays]
-        for k, part in enumerate([*shared, *state]):
-            self.request.set_input_tensor(k, part)
         outputs = [_package().Tensor(kind, shape) for kind, shape in self.outputs]
+        self._infer([*map(_share, arrays), *state], outputs)
+        self.output, *state = outputs  # an array does not keep its tensor alive
+        return [self.output.data, *state]
+
+    def run(self, inputs: Sequence[np.ndarray], output: np.ndarray) -> None:
+        """Write the only output of a module without state into `output`: contiguous, float32."""
+        self._infer([*map(_share, inputs)], [_share(output)])
+
+    def _infer(self, inputs: Sequence, outputs: Sequence) -> None:
+        for k, part in enumerate(inputs):
+            self.request.set_input_tensor(k, part)
         for k, part in enumerate(outputs):
             self.request.set_output_tensor(k, part)
         self.request.infer(share_outputs=True)  # else it copies them all once more
-        self.output, *state = outputs  # an array does not keep its tensor alive
-        return [self.output.data, *state]
 
 
 class OpenVinoNetwork(EventToVideoNetwork):
@@ -155,6 +161,10 @@ def _package() -> Any:
 @cache
 def _core() -> Any:
     return _package().Core()
+
+
+def _share(array: np.ndarray) -> Any:
+    return _package().Tensor(array, shared_memory=True)
 
 
 def _convert(module: nn.Module, example: tuple[Tensor, ...]) -> Any:

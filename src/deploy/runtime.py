@@ -18,9 +18,12 @@ from src.deploy import openvino_network
 from src.deploy.backends import EagerBackend, StatefulRunner
 from src.deploy.cpu_features import has_fast_bf16
 from src.deploy.engines import events_numba as kernels
-from src.deploy.first_layer import DTYPES, EventFirstLayer, SetNetEventFirstLayer
+from src.deploy.first_layer import DTYPES, EventFirstLayer
 from src.deploy.int8 import quantise_decoder
-from src.deploy.remaining_layers import E2VIDRemainder, SetNetRemainder
+from src.deploy.remaining_layers import E2VIDRemainder
+from src.deploy.setnet_clock import SetNetClock
+from src.deploy.setnet_layers import MemoryLayers
+from src.deploy.setnet_tiles import SetNetTiles
 from src.models.e2vid import E2VID
 from src.models.folding import inference_copy
 from src.models.setnet import SetNet
@@ -87,19 +90,21 @@ class EventListRuntime:
         dtype = {"float32": torch.float32, "bf16": torch.bfloat16}.get(form)
         dtype = openvino_network.best_dtype() if dtype is None else dtype
         copied = inference_copy(network).cpu()
-        remainder: E2VIDRemainder | SetNetRemainder
-        self.first_layer: EventFirstLayer
+        backend = openvino_network.CompiledModule if form == "openvino" else EagerBackend
+        self.first_layer: EventFirstLayer | SetNetClock
+        self.runner: StatefulRunner | SetNetTiles
         if isinstance(copied, SetNet):
-            remainder = SetNetRemainder(copied, positions, padded, dtype)
-            self.first_layer = SetNetEventFirstLayer(remainder, padded, threads)
+            where = copied.checked_positions(self.views, copied.bins, positions)
+            if form == "openvino":
+                quantise_decoder(copied)
+            memory = MemoryLayers(copied, where, dtype)
+            self.first_layer = SetNetClock(copied, where, memory.mixture_code, padded, threads)
+            self.runner = SetNetTiles(copied, memory, padded, dtype, backend, threads)
         else:
             assert isinstance(copied, E2VID)
             remainder = E2VIDRemainder(copied, positions, padded, dtype)
-            self.first_layer = EventFirstLayer(remainder, padded, threads)
-        if form == "openvino":
-            quantise_decoder(remainder.network)
-        backend = openvino_network.CompiledModule if form == "openvino" else EagerBackend
-        self.runner = StatefulRunner(remainder, self.first_layer.example(), backend, threads)
+            self.first_layer = EventFirstLayer(remainder, padded)
+            self.runner = StatefulRunner(remainder, self.first_layer.example(), backend, threads)
 
     def step(
         self,
@@ -120,7 +125,7 @@ class EventListRuntime:
         """
         return self.finish(self.begin(t, x, y, p, view, t0, t1))
 
-    def begin(self, t, x, y, p, view, t0: float, t1: float) -> list[np.ndarray]:
+    def begin(self, t, x, y, p, view, t0: float, t1: float) -> Any:
         """Do the first half of `step`, the events; another thread may `finish` it while this one
         begins the next window.
         """
@@ -128,12 +133,11 @@ class EventListRuntime:
         t, x, y, p, view = self._reflected(*events)
         return self.first_layer.add(t, x, y, p, view, float(t0), float(t1))
 
-    def finish(self, begun: list[np.ndarray]) -> Float[np.ndarray, "h w"]:
+    def finish(self, begun: Any) -> Float[np.ndarray, "h w"]:
         """Return the frame of a window that was begun; in the order in which they were."""
         (top, _), (left, _) = self.padding
         height, width = self.size
-        frame = self.first_layer.to_frame(self.runner(begun))
-        return frame[top : top + height, left : left + width]
+        return self.runner(begun)[top : top + height, left : left + width].copy()
 
     def reset(self) -> None:
         """Forget everything: the next window is the first."""
@@ -142,7 +146,9 @@ class EventListRuntime:
 
     @property
     def state(self) -> Any:
-        """What lives from window to window; kept by whoever takes it, for `state = ...`."""
+        """What lives from window to window, for `state = ...`; later windows advance it in place, so
+        that whoever goes back to it keeps a `copy.deepcopy`.
+        """
         return self.first_layer.state, self.runner.state
 
     @state.setter

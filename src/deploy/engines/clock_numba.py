@@ -1,0 +1,237 @@
+"""SetNet's clock from the pixels that had events (numba): what `SetNet.run_clock` gives, bit for bit.
+
+Maps are (rows, columns) of cells.  Whatever is dense in here is a pass or two over one map of
+bytes or floats; all else follows the events and the tiles, of TILE x TILE cells, that they reach.
+"""
+
+import numpy as np
+from numba import njit
+
+from src.models.setnet import ACTIVITY_TAU_S, CELL_PX, MIN_ACTIVITY, MIN_SUPPORT, REACH_CELLS
+from src.models.setnet import SETTLING as _SETTLING
+
+f32, u8 = np.float32, np.uint8
+
+TILE = 16  # side of a tile, in cells
+QUARTER = TILE // 2  # the same in cells of the context
+TAU_S, FLOOR, SUPPORT, SETTLING = map(f32, (ACTIVITY_TAU_S, MIN_ACTIVITY, MIN_SUPPORT, _SETTLING))
+TINY = f32(2.0**-126)  # what is smaller takes a processor a hundred times longer
+SIDE, REACH = CELL_PX, REACH_CELLS
+
+
+@njit(nogil=True, cache=True)
+def collect_pixels(t, x, y, p, view, t0, t1, slot_of, places, grid):
+    """Lay the events with t0 <= t <= t1 into `grid` (n, bins), a row for each pixel that has any;
+    return their number.  `places` (n, 3): view, row, column; `slot_of` (views, h, w): zeros.
+    """
+    bins, count = grid.shape[1], 0
+    scale = f32(f32(bins - 1) / f32(t1 - t0))
+    for i in range(t.size):
+        if not t0 <= t[i] <= t1:
+            continue
+        tau = f32(f32(t[i] - t0) * scale)
+        b = min(np.int64(tau), bins - 1)
+        late = f32(np.rint((tau - f32(b)) * f32(2**20)) * f32(2.0**-20))
+        slot = slot_of[view[i], y[i], x[i]]
+        if slot == 0:
+            places[count, 0], places[count, 1], places[count, 2] = view[i], y[i], x[i]
+            for k in range(bins):
+                grid[count, k] = 0
+            count += 1
+            slot_of[view[i], y[i], x[i]] = slot = count
+        grid[slot - 1, b] += p[i] * (f32(1) - late)
+        if b + 1 < bins:
+            grid[slot - 1, b + 1] += p[i] * late
+    for k in range(count):
+        slot_of[places[k, 0], places[k, 1], places[k, 2]] = 0
+    return count
+
+
+@njit(nogil=True, cache=True)
+def fade(kept, values):
+    """Multiply `values` (n,) by `kept`."""
+    for i in range(np.uint64(values.size)):
+        value = values[i] * kept
+        values[i] = value if value >= TINY else f32(0)
+
+
+@njit(nogil=True, cache=True)
+def mark_supported(places, grid, kept, counts, trace, is_supported, near_tiles):
+    """Bring `trace` (views, rows, columns) to the end of the window, set `is_supported` (rows,
+    columns) where a view has an event with support, and `near_tiles` where these reach.
+
+    `counts`: zeros, of the size of `trace`.
+    """
+    fade(kept, trace.reshape(-1))
+    cells, found = np.empty((len(places), 3), np.int32), 0
+    for k in range(len(places)):
+        weight = f32(0)
+        for b in range(grid.shape[1]):
+            weight += abs(grid[k, b])
+        if weight > 0:
+            v, r, c = places[k, 0], places[k, 1] // SIDE, places[k, 2] // SIDE
+            if counts[v, r, c] == 0:
+                cells[found, 0], cells[found, 1], cells[found, 2] = v, r, c
+                found += 1
+            counts[v, r, c] += weight
+    for k in range(found):
+        v, r, c = cells[k]
+        trace[v, r, c] += counts[v, r, c]
+        counts[v, r, c] = 0
+    for k in range(found):
+        v, r, c = cells[k]
+        if not is_supported[r, c] and f32(9) * (_sum_3x3(trace[v], r, c) / f32(9)) > SUPPORT:
+            is_supported[r, c] = 1
+            top, left = max(r - REACH, 0) // TILE, max(c - REACH, 0) // TILE
+            for i in range(top, min((r + REACH) // TILE + 1, len(near_tiles))):
+                for j in range(left, min((c + REACH) // TILE + 1, near_tiles.shape[1])):
+                    near_tiles[i, j] = 1
+
+
+@njit(nogil=True, cache=True)
+def _sum_3x3(values, r, c):
+    total = f32(0)
+    for i in range(max(r - 1, 0), min(r + 2, len(values))):
+        for j in range(max(c - 1, 0), min(c + 2, values.shape[1])):
+            total += values[i, j]
+    return total
+
+
+@njit(nogil=True, cache=True)
+def widen(is_supported, is_near):
+    """Set `is_near` within REACH of `is_supported` in each direction, and clear the latter."""
+    rows, columns = is_near.shape
+    has = np.zeros(rows + 2 * REACH, u8)
+    for r in range(rows):
+        any_set = u8(0)
+        for c in range(np.uint64(columns)):
+            any_set |= is_supported[r, c]
+        has[r + REACH] = any_set
+    line = np.zeros(columns + 2 * REACH, u8)
+    for r in range(rows):
+        line[:] = 0
+        is_empty = True
+        for k in range(-REACH, REACH + 1):
+            if has[r + REACH + k]:
+                is_empty = False
+                for c in range(np.uint64(columns)):
+                    line[c + np.uint64(REACH)] |= is_supported[r + k, c]
+        near = is_near[r]
+        near[:] = 0
+        if not is_empty:
+            for k in range(np.uint64(2 * REACH + 1)):
+                for c in range(np.uint64(columns)):
+                    near[c] |= line[c + k]
+    for r in range(rows):
+        if has[r + REACH]:
+            is_supported[r] = 0
+
+
+@njit(nogil=True, cache=True)
+def advance(window_s, kept, is_near, near_tiles, active_tiles, activity, elapsed_s, is_pending,
+            pending_tiles, changed):  # fmt: skip
+    """Advance the clock of every cell; return by how much at most, in seconds.
+
+    `active_tiles`: before and after, which tiles have a cell whose clock advances; `changed`: the
+    tiles within the decoder's reach of one.
+    """
+    longest, rest = f32(0), f32(1) - kept
+    columns_used = np.empty(TILE, f32)
+    for i, j in np.ndindex(active_tiles.shape):
+        if not (near_tiles[i, j] or active_tiles[i, j]):
+            continue
+        near_tiles[i, j] = active_tiles[i, j] = 0
+        columns_used[:] = 0
+        first, last = TILE, -1
+        r0, c0 = i * TILE, j * TILE
+        width = np.uint64(min(TILE, activity.shape[1] - c0))
+        for r in range(r0, min(r0 + TILE, len(activity))):
+            near, active = is_near[r, c0 : c0 + width], activity[r, c0 : c0 + width]
+            elapsed, pending = elapsed_s[r, c0 : c0 + width], is_pending[r, c0 : c0 + width]
+            most = f32(0)
+            for c in range(width):
+                before = active[c]
+                fading = before * kept
+                fading = fading if fading >= FLOOR else f32(0)
+                passed = window_s if near[c] else before * TAU_S * rest
+                active[c] = f32(1) if near[c] else fading
+                elapsed[c] = passed
+                pending[c] = u8(1) if passed > 0 else pending[c]
+                columns_used[c] = max(columns_used[c], passed)
+                most = max(most, passed)
+            if most > 0:
+                first, last = min(first, r - r0), r - r0
+                longest = max(longest, most)
+        if last >= 0:
+            active_tiles[i, j] = pending_tiles[i, j] = 1
+            used = np.flatnonzero(columns_used)
+            mark_reached(r0 + first, r0 + last, c0 + used[0], c0 + used[-1], changed)
+    return longest
+
+
+@njit(nogil=True, cache=True)
+def mark_reached(top, bottom, left, right, changed):
+    """Set the tiles of `changed` within two cells of a rectangle."""
+    for i in range(max(top - 2, 0) // TILE, min((bottom + 2) // TILE + 1, len(changed))):
+        for j in range(max(left - 2, 0) // TILE, min((right + 2) // TILE + 1, changed.shape[1])):
+            changed[i, j] = 1
+
+
+@njit(nogil=True, cache=True)
+def find_smoothed(recency, is_pending, pending_tiles, settling_tiles, changed):
+    """Return the tiles (n, 2), and in each the cells (n, QUARTER, QUARTER), in which the smoothed
+    context advances; mark what they change.  `settling_tiles`: where any did without an update.
+    """
+    most = np.count_nonzero(pending_tiles | settling_tiles)
+    tiles = np.empty((most, 2), np.int32)
+    cells, count = np.zeros((most, QUARTER, QUARTER), u8), 0
+    for i, j in np.ndindex(settling_tiles.shape):
+        if not (pending_tiles[i, j] or settling_tiles[i, j]):
+            continue
+        settling_tiles[i, j] = 0
+        top, bottom, left, right = QUARTER, -1, QUARTER, -1
+        for r in range(min(QUARTER, len(recency) - i * QUARTER)):
+            for c in range(min(QUARTER, recency.shape[1] - j * QUARTER)):
+                row, column = i * QUARTER + r, j * QUARTER + c
+                is_settling = recency[row, column] > SETTLING
+                if is_settling:
+                    settling_tiles[i, j] = 1
+                if is_settling or _has_pending(is_pending, row, column):
+                    cells[count, r, c] = 1
+                    top, bottom = min(top, r), max(bottom, r)
+                    left, right = min(left, c), max(right, c)
+        if bottom >= 0:
+            tiles[count, 0], tiles[count, 1] = i, j
+            count += 1
+            r0, c0 = i * TILE, j * TILE
+            mark_reached(
+                r0 + 2 * top, r0 + 2 * bottom + 1, c0 + 2 * left, c0 + 2 * right + 1, changed
+            )
+    return tiles[:count], cells[:count]
+
+
+@njit(nogil=True, cache=True)
+def _has_pending(is_pending, row, column):
+    r, c = 2 * row, 2 * column
+    return is_pending[r, c] or is_pending[r, c + 1] or is_pending[r + 1, c] or is_pending[r + 1, c + 1]
+
+
+@njit(nogil=True, cache=True)
+def halve(mask):
+    """Return where a mask is set in 2 x 2 cells; at an odd end in what there is."""
+    rows, columns = mask.shape
+    half = np.zeros(((rows + 1) // 2, (columns + 1) // 2), u8)
+    for r in range(rows):
+        for c in range(columns):
+            half[r // 2, c // 2] |= mask[r, c]
+    return half
+
+
+@njit(nogil=True, cache=True)
+def note_update(coarse, recency, settling_tiles):
+    """Set the recency of the cells `coarse`, whose context is updated, to 1."""
+    for r in range(len(coarse)):
+        for c in range(coarse.shape[1]):
+            if coarse[r, c]:
+                recency[r, c] = 1
+                settling_tiles[r // QUARTER, c // QUARTER] = 1

@@ -1,0 +1,166 @@
+"""Tiles cut from maps and written back (numba).  Maps are (rows, columns, channels), tiles (n, side,
+side, channels); `corners` (n, 2): the first row and column of each tile in the map, its halo
+included, which may lie outside.
+"""
+
+import numpy as np
+from numba import njit
+
+f32 = np.float32
+
+
+@njit(nogil=True, cache=True)
+def gather(source, corners, out):
+    """Write the tiles of `source` at `corners` into `out`; zeros outside the map."""
+    rows, columns, channels = source.shape
+    side, flat, to = out.shape[1], source.reshape(-1), out.reshape(-1)
+    for i in range(len(corners)):
+        first = corners[i, 1]
+        begin = np.uint64(min(max(-first, 0), side) * channels)
+        end = np.uint64(max(min(side, columns - first), 0) * channels)
+        for k in range(side):
+            row, at = corners[i, 0] + k, np.uint64((i * side + k) * side * channels)
+            if not 0 <= row < rows:
+                for q in range(np.uint64(side * channels)):
+                    to[at + q] = 0
+                continue
+            shift = (row * columns + first) * channels
+            for q in range(begin):
+                to[at + q] = 0
+            origin = np.uint64(shift + np.int64(begin))
+            for q in range(end - begin):
+                to[at + begin + q] = flat[origin + q]
+            for q in range(end, np.uint64(side * channels)):
+                to[at + q] = 0
+
+
+@njit(nogil=True, cache=True)
+def gather_sum(near, far, corners, out):
+    """Write the tiles of relu(near + far) into `out`, `far` of half the size; the border goes on."""
+    rows, columns, channels = near.shape
+    side, a, b, to = out.shape[1], near.reshape(-1), far.reshape(-1), out.reshape(-1)
+    at, n = np.uint64(0), np.uint64(channels)
+    for i in range(len(corners)):
+        for k in range(side):
+            row = min(max(corners[i, 0] + k, 0), rows - 1)
+            for q in range(side):
+                column = min(max(corners[i, 1] + q, 0), columns - 1)
+                one = np.uint64((row * columns + column) * channels)
+                two = np.uint64(((row // 2) * (columns // 2) + column // 2) * channels)
+                for c in range(n):
+                    to[at + c] = max(a[one + c] + b[two + c], f32(0))
+                at += n
+
+
+@njit(nogil=True, cache=True)
+def gather_interpolated(source, row_spans, column_spans, corners, out):
+    """Write the tiles of relu(source), interpolated bilinearly to a finer map, into `out`; zeros
+    outside.  Spans (side, 3): for each place of the finer map two of `source` and the weight of the
+    second.
+    """
+    side, channels = out.shape[1], np.uint64(source.shape[2])
+    zero = f32(0)
+    for i in range(len(corners)):
+        for k in range(side):
+            row = corners[i, 0] + k
+            for q in range(side):
+                column, to = corners[i, 1] + q, out[i, k, q]
+                if not (0 <= row < len(row_spans) and 0 <= column < len(column_spans)):
+                    to[:] = 0
+                    continue
+                r0, r1 = np.int64(row_spans[row, 0]), np.int64(row_spans[row, 1])
+                c0, c1 = np.int64(column_spans[column, 0]), np.int64(column_spans[column, 1])
+                down, right = row_spans[row, 2], column_spans[column, 2]
+                a, b, c, d = source[r0, c0], source[r0, c1], source[r1, c0], source[r1, c1]
+                for m in range(channels):
+                    above = (f32(1) - right) * max(a[m], zero) + right * max(b[m], zero)
+                    below = (f32(1) - right) * max(c[m], zero) + right * max(d[m], zero)
+                    to[m] = (f32(1) - down) * above + down * below
+
+
+@njit(nogil=True, cache=True)
+def mark_inside(rows, columns, corners, out):
+    """Write 1 into the cells of the tiles that lie in a map of that size, 0 into the others."""
+    for i in range(len(corners)):
+        for k in range(out.shape[1]):
+            for q in range(out.shape[2]):
+                row, column = corners[i, 0] + k, corners[i, 1] + q
+                out[i, k, q, 0] = 0 <= row < rows and 0 <= column < columns
+
+
+@njit(nogil=True, cache=True)
+def scatter(tiles, corners, mask, target):
+    """Write the cells of `tiles`, which have no halo, into `target` where `mask` (rows, columns) of
+    the map is set."""
+    rows, columns, channels = target.shape
+    n = np.uint64(channels)
+    for i in range(len(corners)):
+        r0, c0 = corners[i]
+        for k in range(min(tiles.shape[1], rows - r0)):
+            for q in range(min(tiles.shape[2], columns - c0)):
+                if mask[r0 + k, c0 + q]:
+                    to, of = target[r0 + k, c0 + q], tiles[i, k, q]
+                    for c in range(n):
+                        to[c] = of[c]
+
+
+@njit(nogil=True, cache=True)
+def scatter_active(tiles, corners, elapsed_s, target):
+    """`scatter` where `elapsed_s`, tiles with a halo of one cell, is not 0."""
+    rows, columns, channels = target.shape
+    n = np.uint64(channels)
+    for i in range(len(corners)):
+        r0, c0 = corners[i]
+        for k in range(min(tiles.shape[1], rows - r0)):
+            for q in range(min(tiles.shape[2], columns - c0)):
+                if elapsed_s[i, k + 1, q + 1, 0] > 0:
+                    to, of = target[r0 + k, c0 + q], tiles[i, k, q]
+                    for c in range(n):
+                        to[c] = of[c]
+
+
+@njit(nogil=True, cache=True)
+def smooth(context, corners, cells, kept, smoothed):
+    """Move `smoothed` toward `context` in the `cells` (n, side, side) of tiles."""
+    n = np.uint64(context.shape[2])
+    for i in range(len(corners)):
+        r0, c0 = corners[i]
+        for k in range(min(cells.shape[1], len(context) - r0)):
+            for q in range(min(cells.shape[2], context.shape[1] - c0)):
+                if cells[i, k, q]:
+                    to, of = smoothed[r0 + k, c0 + q], context[r0 + k, c0 + q]
+                    for c in range(n):
+                        to[c] = of[c] + kept * (to[c] - of[c])
+
+
+@njit(nogil=True, cache=True)
+def write_pixels(tiles, corners, side, frame):
+    """Write tiles (n, t, t, side * side) of the pixels of squares, row by row, into `frame`;
+    `corners`: in squares."""
+    squares_down, squares_across = len(frame) // side, frame.shape[1] // side
+    for i in range(len(corners)):
+        r0, c0 = corners[i]
+        for k in range(min(tiles.shape[1], squares_down - r0)):
+            width = np.uint64(min(tiles.shape[2], squares_across - c0))
+            for a in range(side):
+                row = frame[side * (r0 + k) + a]
+                for q in range(width):
+                    for b in range(side):
+                        row[side * (c0 + q) + b] = tiles[i, k, q, side * a + b]
+
+
+@njit(nogil=True, cache=True)
+def find_tiles(mask, side):
+    """Return (n, 2): first row and column of the tiles of `side` that have a cell of `mask`."""
+    down, across = (len(mask) + side - 1) // side, (mask.shape[1] + side - 1) // side
+    has = np.zeros((down, across), np.uint8)
+    for r in range(len(mask)):
+        for c in range(mask.shape[1]):
+            if mask[r, c]:
+                has[r // side, c // side] = 1
+    corners, count = np.empty((down * across, 2), np.int32), 0
+    for i, j in np.ndindex(has.shape):
+        if has[i, j]:
+            corners[count, 0], corners[count, 1] = side * i, side * j
+            count += 1
+    return corners[:count]
