@@ -53,10 +53,12 @@ class EagerBackend:
         return [output.numpy(), *state]
 
     @torch.inference_mode()
-    def run(self, inputs: Sequence[np.ndarray], output: np.ndarray) -> None:
-        """Write the only output of a module without state into `output`."""
+    def run(self, inputs: list[np.ndarray], outputs: list[np.ndarray]) -> None:
+        """Write the outputs of a module that takes no state: arrays, contiguous and float32."""
         with torch_threads(self.threads):
-            output[...] = self.module(*map(torch.from_numpy, inputs)).numpy()
+            made = self.module(*map(torch.from_numpy, inputs))
+        for part, output in zip(made if isinstance(made, tuple) else (made,), outputs, strict=True):
+            output[...] = part.numpy()
 
     def zeros(self, first: int) -> list[Tensor]:
         """Return zeros for the inputs from the `first` on."""

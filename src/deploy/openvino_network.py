@@ -7,7 +7,7 @@ convolution is in bytes where the CPU has instructions for them); what a network
 
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from importlib.util import find_spec
 from typing import Any
@@ -59,7 +59,7 @@ class CompiledModule:
             "ENABLE_CPU_PINNING": False,
         }
         compiled = _core().compile_model(model, "CPU", options)
-        self.request = compiled.create_infer_request()
+        self.request, self.bound = compiled.create_infer_request(), None
         self.module = module  # whose weights it may read where they lie
         self.outputs = [(part.element_type, list(part.shape)) for part in compiled.outputs]
         self.starts = [(part.element_type, list(part.shape)) for part in compiled.inputs]
@@ -75,20 +75,23 @@ class CompiledModule:
         """Return the first output, valid until the next call, and the state; nothing is copied."""
         arrays = [np.ascontiguousarray(part, np.float32) for part in inputs]
         outputs = [_package().Tensor(kind, shape) for kind, shape in self.outputs]
-        self._infer([*map(_share, arrays), *state], outputs)
+        self._bind([*map(_share, arrays), *state], outputs)
+        self.request.infer(share_outputs=True)  # else it copies them all once more
         self.output, *state = outputs  # an array does not keep its tensor alive
         return [self.output.data, *state]
 
-    def run(self, inputs: Sequence[np.ndarray], output: np.ndarray) -> None:
-        """Write the only output of a module without state into `output`: contiguous, float32."""
-        self._infer([*map(_share, inputs)], [_share(output)])
+    def run(self, inputs: list[np.ndarray], outputs: list[np.ndarray]) -> None:
+        """Write the outputs of a module that takes no state: arrays, contiguous and float32."""
+        if self.bound is not inputs or self.bound_outputs is not outputs:
+            self._bind(map(_share, inputs), map(_share, outputs))
+            self.bound, self.bound_outputs = inputs, outputs
+        self.request.infer(share_outputs=True)
 
-    def _infer(self, inputs: Sequence, outputs: Sequence) -> None:
+    def _bind(self, inputs: Iterable, outputs: Iterable) -> None:
         for k, part in enumerate(inputs):
             self.request.set_input_tensor(k, part)
         for k, part in enumerate(outputs):
             self.request.set_output_tensor(k, part)
-        self.request.infer(share_outputs=True)  # else it copies them all once more
 
 
 class OpenVinoNetwork(EventToVideoNetwork):

@@ -21,8 +21,7 @@ from src.deploy.engines import events_numba as kernels
 from src.deploy.first_layer import DTYPES, EventFirstLayer
 from src.deploy.int8 import quantise_decoder
 from src.deploy.remaining_layers import E2VIDRemainder
-from src.deploy.setnet_clock import SetNetClock
-from src.deploy.setnet_layers import MemoryLayers
+from src.deploy.setnet_clock import SetNetEvents
 from src.deploy.setnet_tiles import SetNetTiles
 from src.models.e2vid import E2VID
 from src.models.folding import inference_copy
@@ -91,15 +90,14 @@ class EventListRuntime:
         dtype = openvino_network.best_dtype() if dtype is None else dtype
         copied = inference_copy(network).cpu()
         backend = openvino_network.CompiledModule if form == "openvino" else EagerBackend
-        self.first_layer: EventFirstLayer | SetNetClock
+        self.first_layer: EventFirstLayer | SetNetEvents
         self.runner: StatefulRunner | SetNetTiles
         if isinstance(copied, SetNet):
             where = copied.checked_positions(self.views, copied.bins, positions)
             if form == "openvino":
                 quantise_decoder(copied)
-            memory = MemoryLayers(copied, where, dtype)
-            self.first_layer = SetNetClock(copied, where, memory.mixture_code, padded, threads)
-            self.runner = SetNetTiles(copied, memory, padded, dtype, backend, threads)
+            self.first_layer = SetNetEvents(self.views, padded, copied.bins)
+            self.runner = SetNetTiles(copied, where, padded, dtype, backend, threads)
         else:
             assert isinstance(copied, E2VID)
             remainder = E2VIDRemainder(copied, positions, padded, dtype)

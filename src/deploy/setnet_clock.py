@@ -1,10 +1,6 @@
-"""The first half of a SetNet's window: from events to tiles of its event map and leaky sums.
-
-Everything in here lives in maps of cells, which change only where the clock of a cell advances.
-"""
+"""SetNet's clock, event map and leaky sums, which advance where events fall: maps of cells."""
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -13,11 +9,9 @@ import torch
 from jaxtyping import Float, Int, UInt8
 
 from src.deploy.engines import clock_numba as clock
-from src.deploy.engines import sums_numba, tiles_numba
+from src.deploy.engines import sums_numba
 from src.deploy.engines.clock_numba import QUARTER, TILE
 from src.deploy.first_layer import event_patches, patch_spans
-from src.deploy.setnet_layers import MemoryLayers
-from src.deploy.tile_batches import padded_count
 from src.models.setnet import (
     ACTIVITY_TAU_S,
     CELL_PX,
@@ -31,6 +25,32 @@ from src.models.setnet import (
 from src.sim.optics import Position
 
 
+class EventPixels(NamedTuple):
+    """The pixels that had events in a window of `window_s`: view, row and column, and voxels."""
+
+    places: Int[np.ndarray, "n 3"]
+    voxels: Float[np.ndarray, "n bins"]
+    window_s: np.float32
+
+
+class SetNetEvents:
+    """From events to the pixels that had any; nothing lives from window to window."""
+
+    state = None
+
+    def __init__(self, views: int, padded: tuple[int, int], bins: int):
+        self.bins, self.slot_of = bins, np.zeros((views, *padded), np.int32)
+
+    def add(self, t, x, y, p, view, t0: float, t1: float) -> EventPixels:
+        """Return the pixels of a window's events."""
+        places, voxels = np.empty((len(t), 3), np.int32), np.empty((len(t), self.bins), np.float32)
+        count = clock.collect_pixels(t, x, y, p, view, t0, t1, self.slot_of, places, voxels)
+        return EventPixels(places[:count], voxels[:count], np.float32(t1 - t0))
+
+    def reset(self) -> None:
+        """Do nothing: there is nothing to forget."""
+
+
 class ContextUpdate(NamedTuple):
     """Which cells of each scale of the context a window updates, and the age of their context."""
 
@@ -38,13 +58,10 @@ class ContextUpdate(NamedTuple):
     recency: Float[np.ndarray, "h4 w4"]
 
 
-class BegunWindow(NamedTuple):
-    """What the layers behind the events need of a window; tiles by (row, column) in the frame."""
+class Tick(NamedTuple):
+    """What a window changes; tiles by (row, column) in the frame."""
 
-    tiles: Int[np.ndarray, "n 2"]  # with cells whose clock advances, and of them, padded batches:
-    voxel_map: Float[np.ndarray, "b h1 w1 c"]
-    mixtures: Float[np.ndarray, "b h2 w2 m"]
-    elapsed_s: Float[np.ndarray, "b h1 w1 1"]
+    active_tiles: Int[np.ndarray, "n 2"]  # with cells whose clock advances
     update: ContextUpdate | None
     smoothed_tiles: Int[np.ndarray, "k 2"]  # in which the smoothed context advances
     smoothed_cells: UInt8[np.ndarray, "k q q"]
@@ -56,13 +73,11 @@ class ClockState:
     """What lives from window to window, advanced in place: fields of SetNetState as (views, rows,
     columns) or (rows, columns), float32 or bytes, and which tiles have what."""
 
-    def __init__(self, views: int, rows: int, columns: int, mixtures: int):
+    def __init__(self, views: int, rows: int, columns: int):
         tiles = -(-rows // TILE), -(-columns // TILE)
-        self.sums = np.zeros((views, len(SUM_TAUS_S), rows, columns), np.float32)
-        self.mixtures = np.zeros((rows, columns, mixtures), np.float32)
         self.trace = np.zeros((views, rows, columns), np.float32)
         self.activity = np.zeros((rows, columns), np.float32)
-        self.elapsed_s = np.zeros((rows, columns), np.float32)
+        self.elapsed_s = np.zeros((rows, columns), np.float32)  # in the last window
         self.is_pending = np.zeros((rows, columns), np.uint8)
         self.recency = np.zeros((rows // 2, columns // 2), np.float32)
         self.update_recency = np.float32(0)
@@ -72,82 +87,39 @@ class ClockState:
 
 
 class SetNetClock:
-    """Brings a ClockState forward, window by window; with two `threads` the event map and the sums
-    are made side by side.  `padded`: (h, w) of a picture, multiples of 8."""
+    """Advances a ClockState; `scales`: of the context."""
 
-    def __init__(
-        self, network: SetNet, positions: Sequence[Position], mixture_code: np.ndarray,
-        padded: tuple[int, int], threads: int,
-    ):  # fmt: skip
-        kernel, _, bias = network.stem_kernels(tuple(positions))
-        self.bias, kernels, views = bias.numpy(), kernel.numpy(), len(positions)
-        self.patches = event_patches(kernels, views, CELL_PX)
-        self.spans = [patch_spans(side, CELL_PX, kernels.shape[-1]) for side in padded]
-        self.code = np.repeat(mixture_code, len(SUM_TAUS_S), 1)
-        self.scales = len(network.context.downs)
-        self.taus_s = np.array(SUM_TAUS_S, np.float32)
-        rows, columns = (side // CELL_PX for side in padded)
-        self.size = views, rows, columns, self.code.shape[1] + len(SUM_TAUS_S)
-        self.pool = ThreadPoolExecutor(1) if threads > 1 else None
-        # Between two windows all zero, but for the event map, which is filled where it is used.
-        self.slot_of = np.zeros((views, *padded), np.int32)
-        self.counts, self.new = (np.zeros((views, rows, columns), np.float32) for _ in range(2))
+    def __init__(self, views: int, rows: int, columns: int, scales: int):
+        self.scales = scales
+        # Between two windows all zero.
+        self.counts = np.zeros((views, rows, columns), np.float32)
         self.is_supported, self.is_near = (np.zeros((rows, columns), np.uint8) for _ in range(2))
-        self.voxel_map = np.zeros((rows, columns, len(self.bias)), np.float32)
-        self.reset()
-        self.near_tiles = np.zeros_like(self.state.active_tiles)
-        self.grid = np.empty((0, network.bins), np.float32)
+        self.near_tiles = np.zeros((-(-rows // TILE), -(-columns // TILE)), np.uint8)
 
-    def reset(self) -> None:
-        self.state = ClockState(*self.size)
-
-    def add(self, t, x, y, p, view, t0: float, t1: float) -> BegunWindow:
-        """Bring the state to the end of a window; return what the layers behind need of it."""
-        places, grid = self._collect(t, x, y, p, view, t0, t1)
+    def tick(self, pixels: EventPixels, now: ClockState) -> Tick:
+        """Bring `now` to the end of a window."""
         changed = np.zeros_like(self.near_tiles)
-        longest_s = self._advance(places, grid, np.float32(t1 - t0), changed)
-        smoothed, update = self._advance_context(longest_s, changed)
+        longest_s = self._advance(pixels, now, changed)
+        smoothed, update = self._advance_context(longest_s, now, changed)
         kept = exp_float32(-longest_s / np.float32(CONTEXT_TAU_S))
-        tiles = np.argwhere(self.state.active_tiles).astype(np.int32)
-        weight = np.float32(1 / (REFERENCE_HZ * (t1 - t0)))  # as SetNet counts them
-        if self.pool:
-            made = self.pool.submit(self._make_mixtures, places, grid, tiles)
-            voxel_map = self._make_voxel_map(places, grid, weight, tiles)
-            mixtures = made.result()
-        else:
-            mixtures = self._make_mixtures(places, grid, tiles)
-            voxel_map = self._make_voxel_map(places, grid, weight, tiles)
-        elapsed_s = self._cut(self.state.elapsed_s[..., None], tiles, MemoryLayers.VOXEL_HALO)
-        changed_tiles = np.argwhere(changed).astype(np.int32)
-        inputs = tiles, voxel_map, mixtures, elapsed_s
-        return BegunWindow(*inputs, update, *smoothed, kept, changed_tiles)
+        tiles = (np.argwhere(part).astype(np.int32) for part in (now.active_tiles, changed))
+        active, changed = tiles
+        return Tick(active, update, *smoothed, kept, changed)
 
-    def _collect(self, t, x, y, p, view, t0, t1) -> tuple[np.ndarray, np.ndarray]:
-        if len(self.grid) < len(t):
-            self.grid = np.empty((2 * len(t), self.grid.shape[1]), np.float32)
-            self.places = np.empty((2 * len(t), 3), np.int32)
-        if not len(t):
-            return np.empty((0, 3), np.int32), self.grid[:0]
-        count = clock.collect_pixels(
-            t, x, y, p, view, t0, t1, self.slot_of, self.places, self.grid
-        )
-        return self.places[:count], self.grid[:count]
-
-    def _advance(self, places, grid, window_s: np.float32, changed: np.ndarray) -> np.float32:
-        now, kept = self.state, exp_float32(-window_s / np.float32(ACTIVITY_TAU_S))
+    def _advance(self, pixels: EventPixels, now: ClockState, changed: np.ndarray) -> np.float32:
+        places, voxels, window_s = pixels
+        kept = exp_float32(-window_s / np.float32(ACTIVITY_TAU_S))
         seen = self.counts, now.trace, self.is_supported, self.near_tiles
-        clock.mark_supported(places, grid, kept, *seen)
+        clock.mark_supported(places, voxels, kept, *seen)
         clock.widen(self.is_supported, self.is_near)
         tiles = self.is_near, self.near_tiles, now.active_tiles
         cells = now.activity, now.elapsed_s, now.is_pending
-        return np.float32(
-            clock.advance(window_s, kept, *tiles, *cells, now.pending_tiles, changed)
-        )
+        longest_s = clock.advance(window_s, kept, *tiles, *cells, now.pending_tiles, changed)
+        return np.float32(longest_s)
 
     def _advance_context(
-        self, longest_s: np.float32, changed: np.ndarray
+        self, longest_s: np.float32, now: ClockState, changed: np.ndarray
     ) -> tuple[tuple[np.ndarray, np.ndarray], ContextUpdate | None]:
-        now = self.state
         if longest_s == 0:
             none = np.zeros((0, QUARTER, QUARTER), np.uint8)
             return (np.zeros((0, 2), np.int32), none), None
@@ -156,37 +128,60 @@ class SetNetClock:
         clock.fade(kept, now.recency.reshape(-1))
         tiles = now.pending_tiles, now.settling_tiles
         smoothed = clock.find_smoothed(now.recency, now.is_pending, *tiles, changed)
-        update = None
-        if now.update_recency <= np.float32(UPDATE_RECENCY):
-            cells = [clock.halve(now.is_pending)]
-            for _ in range(self.scales - 1):
-                cells.append(clock.halve(cells[-1]))
-            update = ContextUpdate(cells, now.recency.copy())
-            clock.note_update(cells[0], now.recency, now.settling_tiles)
-            now.is_pending[:], now.pending_tiles[:] = 0, 0
-            now.update_recency = np.float32(1)
-        return smoothed, update
+        is_due = now.update_recency <= np.float32(UPDATE_RECENCY)
+        return smoothed, self._start_update(now) if is_due else None
 
-    def _make_voxel_map(self, places, grid, weight, tiles) -> np.ndarray:
-        sums_numba.fill_tiles(self.state.active_tiles, self.bias, self.voxel_map)
-        patch = self.state.elapsed_s, *self.spans, self.patches, self.voxel_map
-        sums_numba.add_patches(places, grid, weight, *patch)
-        return self._cut(self.voxel_map, tiles, MemoryLayers.VOXEL_HALO)
+    def _start_update(self, now: ClockState) -> ContextUpdate:
+        cells = [clock.halve(now.is_pending)]
+        for _ in range(self.scales - 1):
+            cells.append(clock.halve(cells[-1]))
+        update = ContextUpdate(cells, now.recency.copy())
+        clock.note_update(cells[0], now.recency, now.settling_tiles)
+        now.is_pending[:], now.pending_tiles[:] = 0, 0
+        now.update_recency = np.float32(1)
+        return update
 
-    def _make_mixtures(self, places, grid, tiles) -> np.ndarray:
-        now, totals = self.state, np.empty(len(places), np.float32)
-        sums_numba.add_to_cells(places, grid, now.elapsed_s, self.new, totals)
-        passed = now.active_tiles, now.elapsed_s, self.taus_s
-        sums_numba.leak(*passed, self.new, now.sums, now.mixtures)
-        sums_numba.add_to_mixtures(places, totals, self.code, now.mixtures)
-        return self._cut(now.mixtures, tiles, MemoryLayers.MIXTURE_HALO)
 
-    def _cut(self, source: np.ndarray, tiles: np.ndarray, halo: int) -> np.ndarray:
-        side = TILE + 2 * halo
-        out = np.empty((padded_count(len(tiles)), side, side, source.shape[2]), np.float32)
-        out[len(tiles) :] = 0
-        tiles_numba.gather(source, TILE * tiles - np.int32(halo), out)
-        return out
+class SumState:
+    """What lives from window to window, advanced in place: the leaky sums and their mixtures."""
+
+    def __init__(self, views: int, rows: int, columns: int, mixtures: int):
+        self.sums = np.zeros((views, len(SUM_TAUS_S), rows, columns), np.float32)
+        self.mixtures = np.zeros((rows, columns, mixtures), np.float32)
+
+
+class EventMaps:
+    """Makes the map of SetNet's voxel kernels and advances a SumState, in active tiles.  `padded`:
+    (h, w) of a picture, multiples of 8."""
+
+    def __init__(
+        self, network: SetNet, positions: Sequence[Position], mixture_code: np.ndarray,
+        padded: tuple[int, int],
+    ):  # fmt: skip
+        kernel, _, bias = network.stem_kernels(tuple(positions))
+        self.bias, kernels, views = bias.numpy(), kernel.numpy(), len(positions)
+        self.patches = event_patches(kernels, views, CELL_PX)
+        self.spans = [patch_spans(side, CELL_PX, kernels.shape[-1]) for side in padded]
+        self.code = np.repeat(mixture_code, len(SUM_TAUS_S), 1)
+        self.taus_s = np.array(SUM_TAUS_S, np.float32)
+        rows, columns = (side // CELL_PX for side in padded)
+        self.size = views, rows, columns, self.code.shape[1] + len(SUM_TAUS_S)
+        # What lies outside of active tiles is used nowhere.
+        self.voxel_map = np.zeros((rows, columns, len(self.bias)), np.float32)
+        self.new = np.zeros((views, rows, columns), np.float32)  # zero between two windows
+
+    def add(self, pixels: EventPixels, clocks: ClockState, state: SumState) -> None:
+        """Bring `state` to the end of a window, and make its `voxel_map`."""
+        places, voxels, window_s = pixels
+        weight = np.float32(1 / (REFERENCE_HZ * float(window_s)))  # as SetNet counts them
+        sums_numba.fill_tiles(clocks.active_tiles, self.bias, self.voxel_map)
+        patch = clocks.elapsed_s, *self.spans, self.patches, self.voxel_map
+        sums_numba.add_patches(places, voxels, weight, *patch)
+        totals = np.empty(len(places), np.float32)
+        sums_numba.add_to_cells(places, voxels, clocks.elapsed_s, self.new, totals)
+        passed = clocks.active_tiles, clocks.elapsed_s, self.taus_s
+        sums_numba.leak(*passed, self.new, state.sums, state.mixtures)
+        sums_numba.add_to_mixtures(places, totals, self.code, state.mixtures)
 
 
 @lru_cache(4096)

@@ -115,16 +115,17 @@ class WholeContext(nn.Module):
         hidden: Float[Tensor, "1 h2 w2 c"],
         context: Float[Tensor, "1 h4 w4 c"],
         recency: Float[Tensor, "1 h4 w4 1"],
-        is_updated: Float[Tensor, "1 h2 w2 1"],
+        is_updated: Float[Tensor, "1 h4 w4 1"],
         *held: Float[Tensor, "1 _h _w _c"],
     ) -> tuple[Tensor, ...]:
         """Return the context and the held maps after the update."""
         features = channels_first(hidden.to(self.dtype))
         mask = channels_first(is_updated)
-        new, scales = self.pyramid(features, tuple(map(channels_first, held)), mask > 0)
+        cells = functional.interpolate(mask, scale_factor=2, mode="nearest")
+        new, scales = self.pyramid(features, tuple(map(channels_first, held)), cells > 0)
         before = channels_first(context)
         average = self.pyramid.moving_average(before, new.float(), channels_first(recency))
-        context = torch.where(functional.max_pool2d(mask, 2) > 0, average, before)
+        context = torch.where(mask > 0, average, before)
         return channels_last(context), *map(channels_last, scales)
 
 
@@ -219,7 +220,7 @@ class DecoderLayers(nn.Module):
 
     HALO = CELL_BORDER
 
-    def __init__(self, network: SetNet, dtype: torch.dtype, is_whole: bool):
+    def __init__(self, network: SetNet, dtype: torch.dtype, is_whole: bool = False):
         super().__init__()
         assert isinstance(network.pixel_conv, EqualDCConv)
         self.pixel_conv = TwoByTwoCellConv(network.pixel_conv, CELL_PX).to(dtype)

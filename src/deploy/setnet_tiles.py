@@ -1,17 +1,24 @@
-"""The second half of a SetNet's window: the layers behind its events, on tiles that change."""
+"""A SetNet over windows of events, computed on the tiles that change."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import nn
 
 from src.deploy.engines import tiles_numba
 from src.deploy.engines.clock_numba import QUARTER, TILE
-from src.deploy.setnet_clock import BegunWindow, ContextUpdate
+from src.deploy.setnet_clock import (
+    ClockState,
+    ContextUpdate,
+    EventMaps,
+    EventPixels,
+    SetNetClock,
+    SumState,
+)
 from src.deploy.setnet_layers import (
     BLOCK_HALO,
     ContextLayers,
@@ -19,12 +26,16 @@ from src.deploy.setnet_layers import (
     FusionLayers,
     MemoryLayers,
     ScaleLayers,
+    WholeContext,
+    WholeDecoder,
 )
-from src.deploy.tile_batches import TileModule
+from src.deploy.tile_batches import Backend, TileModule
 from src.models.setnet import CELL_PX, SetNet
+from src.sim.optics import Position
 
 CONTEXT_TILE = 8  # side of a tile of any scale of the context, in its cells
-Backend = Callable[[nn.Module, list[Tensor], int], Any]
+# Share of the frame from which on all of it is computed at once, which takes no longer.
+WHOLE_SHARE, WHOLE_CONTEXT_SHARE = 0.8, 0.5
 
 
 class TileState:
@@ -35,7 +46,8 @@ class TileState:
         rows, columns = height // CELL_PX, width // CELL_PX
         hidden, context, _ = network.map_sizes(height, width)
         scales = network.context.map_sizes(rows, columns)
-        self.hidden, self.context, self.smoothed = map(_zeros, (hidden, context, context))
+        self.hidden, self.spare_hidden = _zeros(hidden), _zeros(hidden)
+        self.context, self.smoothed = _zeros(context), _zeros(context)
         levels = len(network.context.downs)
         self.scales = [_zeros(size) for size in scales[:levels]]
         # The sums with coarser scales, by scale; the coarsest has none, the finest is not held.
@@ -43,64 +55,154 @@ class TileState:
         self.frame = np.full((height, width), start, np.float32)
 
 
+class SetNetState(NamedTuple):
+    """All that lives from window to window, advanced in place."""
+
+    clock: ClockState
+    sums: SumState
+    maps: TileState
+
+
 class SetNetTiles:
-    """Brings a TileState forward, window by window.  `padded`: (h, w) of a picture; `memory`: see
-    MemoryLayers."""
+    """Brings a SetNetState forward, window by window; `padded`: (h, w) of a picture."""
 
     def __init__(
-        self, network: SetNet, memory: MemoryLayers, padded: tuple[int, int], dtype: torch.dtype,
-        backend: Backend, threads: int,
+        self, network: SetNet, positions: Sequence[Position], padded: tuple[int, int],
+        dtype: torch.dtype, backend: Backend, threads: int,
     ):  # fmt: skip
-        self.network, self.padded = network, padded
+        self.network, self.padded, how = network, padded, (backend, threads)
+        memory, decoder = MemoryLayers(network, positions, dtype), DecoderLayers(network, dtype)
+        self.events = EventMaps(network, positions, memory.mixture_code, padded)
+        views, rows, columns, mixtures = self.events.size
+        self.clock = SetNetClock(views, rows, columns, len(network.context.downs))
         c, near, far = network.channels, TILE + 2, TILE + 4
-        mixtures = memory.kernel.shape[1]
         shapes = [(near, near, c), (far, far, mixtures), (near, near, 1), (TILE, TILE, c)]
-        self.memory = TileModule(memory, shapes, backend, threads)
-        decoder = DecoderLayers(network, dtype, False)
-        self.decoder = TileModule(decoder, [(far, far, c)], backend, threads)
-        self.context = ContextTiles(network, dtype, backend, threads)
+        self.memory = TileModule(memory, shapes, *how)
+        self.decoder = TileModule(decoder, [(far, far, c)], *how)
+        self.context = ContextTiles(network, dtype, *how)
+        self.whole = WholeFrame(network, positions, padded, dtype, *how)
         # Where no event was ever seen every pixel is that of maps of zeros.
-        self.start = float(self.decoder.run(4, [np.zeros((4, far, far, c), np.float32)])[0, 0, 0, 0])
+        found = list[float]()
+        self.decoder.run(1, lambda part, x: None, lambda part, made: found.append(made[0, 0, 0, 0]))
+        self.start = float(found[0])
         self.reset()
 
     def reset(self) -> None:
-        self.state = TileState(self.network, *self.padded, self.start)
+        sums = SumState(*self.events.size)
+        maps = TileState(self.network, *self.padded, self.start)
+        self.state = SetNetState(ClockState(*self.events.size[:3]), sums, maps)
 
-    def __call__(self, begun: BegunWindow) -> Float[np.ndarray, "h w"]:
+    def __call__(self, pixels: EventPixels) -> Float[np.ndarray, "h w"]:
         """Return the frame, padded, valid until the next window."""
-        state = self.state
-        self._remember(begun)
-        if begun.update:
-            self.context.update(state, begun.update)
-        corners = QUARTER * begun.smoothed_tiles
-        cells = begun.smoothed_cells, begun.smoothing_kept
-        tiles_numba.smooth(state.context, corners, *cells, state.smoothed)
-        self._draw(begun.changed_tiles)
-        return state.frame
+        clock, sums, maps = self.state
+        tick = self.clock.tick(pixels, clock)
+        if len(tick.active_tiles):
+            self.events.add(pixels, clock, sums)
+            if self._is_most(TILE, len(tick.active_tiles), WHOLE_SHARE):
+                self.whole.remember(self.events.voxel_map, sums.mixtures, clock.elapsed_s, maps)
+            else:
+                self._remember(tick.active_tiles)
+        if tick.update:
+            self._update_context(tick.update)
+        corners = QUARTER * tick.smoothed_tiles
+        cells = tick.smoothed_cells, tick.smoothing_kept
+        tiles_numba.smooth(maps.context, corners, *cells, maps.smoothed)
+        if self._is_most(TILE, len(tick.changed_tiles), WHOLE_SHARE):
+            self.whole.draw(maps)
+        else:
+            self._draw(tick.changed_tiles)
+        return maps.frame
 
-    def _remember(self, begun: BegunWindow) -> None:
-        corners, hidden = TILE * begun.tiles, self.state.hidden
-        for part, size, (*_, before) in self.memory.batches(len(corners)):
-            tiles_numba.gather(hidden, corners[part], before)
-            padded = slice(part.start, part.start + size)
-            given = [x[padded] for x in (begun.voxel_map, begun.mixtures, begun.elapsed_s)]
-            after = self.memory.run(size, [*given, before])
-            tiles_numba.scatter_active(after, corners[part], begun.elapsed_s[part], hidden)
+    def _is_most(self, side_cells: int, tiles: int, share: float) -> bool:
+        """Return whether `tiles` are more than a `share` of the frame."""
+        _, rows, columns, _ = self.events.size
+        return tiles * side_cells**2 > share * rows * columns
+
+    def _update_context(self, update: ContextUpdate) -> None:
+        tiles = len(tiles_numba.find_tiles(update.cells[0], CONTEXT_TILE))
+        if self._is_most(2 * CONTEXT_TILE, tiles, WHOLE_CONTEXT_SHARE):
+            self.whole.update_context(update, self.state.maps)
+        else:
+            self.context.update(self.state.maps, update)
+
+    def _remember(self, tiles: np.ndarray) -> None:
+        clock, sums, maps = self.state
+        corners, elapsed_s, events = TILE * tiles, clock.elapsed_s[..., None], self.events
+        near, far = np.int32(MemoryLayers.VOXEL_HALO), np.int32(MemoryLayers.MIXTURE_HALO)
+
+        def read(part: slice, inputs: list[np.ndarray]) -> None:
+            tiles_numba.gather(events.voxel_map, corners[part] - near, inputs[0])
+            tiles_numba.gather(sums.mixtures, corners[part] - far, inputs[1])
+            tiles_numba.gather(elapsed_s, corners[part] - near, inputs[2])
+            tiles_numba.gather(maps.hidden, corners[part], inputs[3])
+
+        def write(part: slice, after: np.ndarray) -> None:
+            tiles_numba.scatter(after, corners[part], clock.elapsed_s, maps.hidden)
+
+        self.memory.run(len(corners), read, write)
 
     def _draw(self, tiles: np.ndarray) -> None:
-        state, halo = self.state, np.int32(DecoderLayers.HALO)
-        for part, size, (seen,) in self.decoder.batches(len(tiles)):
-            corners = TILE * tiles[part]
-            tiles_numba.gather_sum(state.hidden, state.smoothed, corners - halo, seen)
-            pixels = self.decoder.run(size, [seen])
-            squares = QUARTER * tiles[part], 2 * CELL_PX
-            tiles_numba.write_pixels(pixels, *squares, state.frame)
+        state, halo = self.state.maps, np.int32(DecoderLayers.HALO)
+
+        def read(part: slice, inputs: list[np.ndarray]) -> None:
+            corners = TILE * tiles[part] - halo
+            tiles_numba.gather_sum(state.hidden, state.smoothed, corners, inputs[0])
+
+        def write(part: slice, pixels: np.ndarray) -> None:
+            tiles_numba.write_pixels(pixels, QUARTER * tiles[part], 2 * CELL_PX, state.frame)
+
+        self.decoder.run(len(tiles), read, write)
+
+
+class WholeFrame:
+    """What SetNetTiles do, on whole maps."""
+
+    def __init__(
+        self, network: SetNet, positions: Sequence[Position], padded: tuple[int, int],
+        dtype: torch.dtype, backend: Backend, threads: int,
+    ):  # fmt: skip
+        c, (rows, columns) = network.channels, (side // CELL_PX for side in padded)
+        near, far = (rows, columns), (rows // 2, columns // 2)
+        held = [size[1:] + size[:1] for size in network.context.map_sizes(*near)]
+
+        def compile_module(module: nn.Module, *shapes: tuple[int, ...]) -> Any:
+            return backend(module, [torch.zeros(1, *shape) for shape in shapes], threads)
+
+        memory = MemoryLayers(network, positions, dtype, True)
+        mixtures = memory.kernel.shape[1]
+        shapes = (*near, c), (*near, mixtures), (*near, 1), (*near, c)
+        self.memory = compile_module(memory, *shapes)
+        shapes = (*near, c), (*far, c), (*far, 1), (*far, 1), *held
+        self.context = compile_module(WholeContext(network, dtype), *shapes)
+        self.decoder = compile_module(WholeDecoder(network, dtype), (*near, c), (*far, c))
+        self.updated = [np.empty((1, *shape), np.float32) for shape in [(*far, c), *held]]
+        self.pixels = np.empty((1, *far, (2 * CELL_PX) ** 2), np.float32)
+
+    def remember(self, voxel_map, mixtures, elapsed_s, maps: TileState) -> None:
+        """Advance the hidden map."""
+        given = voxel_map, mixtures, elapsed_s[..., None], maps.hidden
+        self.memory.run([part[None] for part in given], [maps.spare_hidden[None]])
+        maps.hidden, maps.spare_hidden = maps.spare_hidden, maps.hidden
+
+    def update_context(self, update: ContextUpdate, maps: TileState) -> None:
+        """Bring the maps of the context up to date in the cells of `update`."""
+        held = maps.scales + maps.fused[-2:0:-1]  # in the order of ContextPyramid.map_sizes
+        is_updated = update.cells[0].astype(np.float32)[..., None]
+        given = maps.hidden, maps.context, update.recency[..., None], is_updated, *held
+        self.context.run([part[None] for part in given], self.updated)
+        for part, new in zip([maps.context, *held], self.updated, strict=True):
+            part[...] = new[0]
+
+    def draw(self, maps: TileState) -> None:
+        """Draw the frame."""
+        self.decoder.run([maps.hidden[None], maps.smoothed[None]], [self.pixels])
+        tiles_numba.write_pixels(self.pixels, np.zeros((1, 2), np.int32), 2 * CELL_PX, maps.frame)
 
 
 class ContextTiles:
     """Updates the context of a TileState, scale by scale.  Raises ValueError for a single scale."""
 
-    def __init__(self, network: SetNet, dtype: torch.dtype, backend: Backend, threads: int):
+    def __init__(self, network: SetNet, dtype: torch.dtype, *how: Any):
         pyramid = network.context
         widths = [down.out_channels for down in pyramid.downs]
         inner, outer = CONTEXT_TILE + 2 * BLOCK_HALO, 2 * (CONTEXT_TILE + 2 * BLOCK_HALO) + 1
@@ -108,7 +210,7 @@ class ContextTiles:
         for scale, channels in enumerate([network.channels, *widths[:-1]]):
             layers = ScaleLayers(pyramid, scale, dtype)
             shapes = [(outer, outer, channels), (inner, inner, 1)]
-            self.down.append(TileModule(layers, shapes, backend, threads))
+            self.down.append(TileModule(layers, shapes, *how))
         for scale, (finer, coarser) in enumerate(zip(widths[:-1], widths[1:], strict=True)):
             layers = FusionLayers(pyramid, scale, dtype) if scale else ContextLayers(pyramid, dtype)
             self.halo = np.int32(layers.halo)
@@ -116,7 +218,7 @@ class ContextTiles:
             shapes = [(side, side, n) for n in (finer, coarser, 1)]
             if not scale:
                 shapes += [(CONTEXT_TILE, CONTEXT_TILE, n) for n in (network.channels, 1)]
-            self.fuse.append(TileModule(layers, shapes, backend, threads))
+            self.fuse.append(TileModule(layers, shapes, *how))
 
     def update(self, state: Any, update: ContextUpdate) -> None:
         """Bring scales, their sums and the context of `state` up to date in the cells of `update`."""
@@ -128,26 +230,34 @@ class ContextTiles:
             self._fuse(scale, state, corners[scale], update)
 
     def _make_scale(self, module, source, corners, cells, target) -> None:
-        for part, size, given in module.batches(len(corners)):
-            x, inside = given
+        def read(part: slice, inputs: list[np.ndarray]) -> None:
+            x, inside = inputs
             tiles_numba.gather(source, 2 * corners[part] - np.int32(2 * BLOCK_HALO + 1), x)
             tiles_numba.mark_inside(*target.shape[:2], corners[part] - np.int32(BLOCK_HALO), inside)
-            tiles_numba.scatter(module.run(size, given), corners[part], cells, target)
+
+        def write(part: slice, made: np.ndarray) -> None:
+            tiles_numba.scatter(made, corners[part], cells, target)
+
+        module.run(len(corners), read, write)
 
     def _fuse(self, scale, state, corners, update) -> None:
-        module, finer, coarser = self.fuse[scale], state.scales[scale], state.fused[scale + 1]
-        spans = [interpolation_spans(n, m) for n, m in zip(coarser.shape[:2], finer.shape[:2], strict=True)]
-        for part, size, given in module.batches(len(corners)):
+        finer, coarser = state.scales[scale], state.fused[scale + 1]
+        target = state.fused[scale] if scale else state.context
+        rows, columns = map(interpolation_spans, coarser.shape[:2], finer.shape[:2])
+
+        def read(part: slice, inputs: list[np.ndarray]) -> None:
             first = corners[part] - self.halo
-            tiles_numba.gather(finer, first, given[0])
-            tiles_numba.gather_interpolated(coarser, *spans, first, given[1])
-            tiles_numba.mark_inside(*finer.shape[:2], first, given[2])
+            tiles_numba.gather(finer, first, inputs[0])
+            tiles_numba.gather_interpolated(coarser, rows, columns, first, inputs[1])
+            tiles_numba.mark_inside(*finer.shape[:2], first, inputs[2])
             if not scale:
-                tiles_numba.gather(state.context, corners[part], given[3])
-                tiles_numba.gather(update.recency[..., None], corners[part], given[4])
-            target = state.fused[scale] if scale else state.context
-            made = module.run(size, given)
+                tiles_numba.gather(state.context, corners[part], inputs[3])
+                tiles_numba.gather(update.recency[..., None], corners[part], inputs[4])
+
+        def write(part: slice, made: np.ndarray) -> None:
             tiles_numba.scatter(made, corners[part], update.cells[scale], target)
+
+        self.fuse[scale].run(len(corners), read, write)
 
 
 @lru_cache(64)

@@ -1,6 +1,6 @@
 """A module on any number of tiles: in batches of a few fixed sizes, the last one filled up."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -9,52 +9,51 @@ import torch
 from torch import Tensor, nn
 
 SIZES = (4, 16)  # of a batch, in tiles
-CALL_COST = 2  # what a call costs more than its tiles, in tiles
+CALL_COST = 3  # what a call costs beside its tiles, in tiles
+Backend = Callable[[nn.Module, list[Tensor], int], Any]  # EagerBackend or CompiledModule
 
 
 @lru_cache(4096)
 def split_into_batches(tiles: int) -> tuple[int, ...]:
-    """Return the sizes of the batches, of SIZES, that `tiles` take least time in."""
-    largest = SIZES[-1]
-    if tiles > 2 * largest:
-        return largest, *split_into_batches(tiles - largest)
+    """Return the sizes of the batches, of SIZES, in which `tiles` take least time."""
     if tiles <= 0:
         return ()
+    if tiles > 2 * SIZES[-1]:
+        return SIZES[-1], *split_into_batches(tiles - SIZES[-1])
     ways = [(size, *split_into_batches(tiles - size)) for size in SIZES]
     return min(ways, key=lambda way: sum(way) + CALL_COST * len(way))
 
 
-def padded_count(tiles: int) -> int:
-    """Return how many tiles the batches of `tiles` have."""
-    return sum(split_into_batches(tiles))
-
-
 class TileModule:
-    """`module` on batches of tiles, on a `backend`; `shapes`: of an input for one tile."""
+    """`module`, which has one output, on batches of tiles; `shapes`: of an input for one tile."""
 
     def __init__(
         self,
         module: nn.Module,
         shapes: Sequence[tuple[int, ...]],
-        backend: Callable[[nn.Module, list[Tensor], int], Any],
+        backend: Backend,
         threads: int,
     ):
         self.compiled, self.inputs, self.outputs = {}, {}, {}
         for size in SIZES:
             example = [torch.zeros(size, *shape) for shape in shapes]
             with torch.inference_mode():
-                self.outputs[size] = module(*example).numpy().copy()
+                self.outputs[size] = [module(*example).numpy().copy()]
             self.inputs[size] = [part.numpy() for part in example]
             self.compiled[size] = backend(module, example, threads)
 
-    def batches(self, tiles: int) -> Iterator[tuple[slice, int, list[np.ndarray]]]:
-        """Yield for each batch which of `tiles` are in it, its size, and arrays for its inputs."""
+    def run(
+        self,
+        tiles: int,
+        read: Callable[[slice, list[np.ndarray]], None],
+        write: Callable[[slice, np.ndarray], None],
+    ) -> None:
+        """Run on all `tiles`: read(which, inputs) fills the inputs of a batch, write(which, output)
+        takes its output."""
         start = 0
         for size in split_into_batches(tiles):
-            yield slice(start, min(start + size, tiles)), size, self.inputs[size]
+            part = slice(start, min(start + size, tiles))
+            read(part, self.inputs[size])
+            self.compiled[size].run(self.inputs[size], self.outputs[size])
+            write(part, self.outputs[size][0])
             start += size
-
-    def run(self, size: int, inputs: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the output, valid until the next run."""
-        self.compiled[size].run(inputs, self.outputs[size])
-        return self.outputs[size]

@@ -493,7 +493,8 @@ class ContextPyramid(nn.Module):
         window.  Each map changes only in cells over one that `is_updated` (m, 1, h2, w2).
         """
         due = None
-        if not x.is_cuda:  # shapes that depend on data would synchronise a GPU
+        # Shapes that depend on data would synchronise a GPU, and no exported model has them.
+        if not x.is_cuda and not torch.jit.is_tracing() and not torch.compiler.is_compiling():
             due = is_updated.flatten(1).any(1).nonzero().flatten()
         masks, mask = [], is_updated.float()
         for _ in self.downs:

@@ -17,6 +17,15 @@ def check(t, x, y, p, view, views, height, width, signs):
     """Return (index, what) of the first event that is wrong, or (-1, GOOD); of `signs`, p is one
     of -1 and 1.
     """
+    wrong = False
+    for i in range(np.uint64(t.size)):  # without a way out, which would keep it from vectors
+        wrong |= not abs(t[i]) < np.inf or not abs(p[i]) < f32(np.inf)
+        wrong |= x[i] < 0 or x[i] >= width or y[i] < 0 or y[i] >= height
+        wrong |= view[i] < 0 or view[i] >= views or (signs and abs(p[i]) != f32(1))
+    for i in range(np.uint64(1), np.uint64(t.size)):
+        wrong |= t[i] < t[i - np.uint64(1)]
+    if not wrong:
+        return -1, GOOD
     for i in range(t.size):
         if not np.isfinite(t[i]) or not np.isfinite(p[i]):
             return i, NO_NUMBER

@@ -136,11 +136,14 @@ def _leak_row(r, first, last, decay, new, sums, mixed, middle, far):
             mixed[r, first + c, behind + m] = far[c]
     for v in range(views):
         new[v, r, first:last] = 0
-    mixtures, to = np.uint64(behind), mixed[r].reshape(-1)
+    mixtures, to, each = np.uint64(behind), mixed[r].reshape(-1), np.empty(behind, f32)
     for c in range(n):
+        if c == 0 or decay[0, c] != decay[0, c - np.uint64(1)]:
+            for k in range(mixtures):
+                each[k] = decay[k % np.uint64(taus), c]
         at = (np.uint64(first) + c) * np.uint64(mixed.shape[2])
         for k in range(mixtures):
-            to[at + k] *= decay[k % np.uint64(taus), c]
+            to[at + k] *= each[k]
 
 
 @njit(nogil=True, cache=True)

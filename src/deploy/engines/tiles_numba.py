@@ -91,7 +91,7 @@ def mark_inside(rows, columns, corners, out):
 @njit(nogil=True, cache=True)
 def scatter(tiles, corners, mask, target):
     """Write the cells of `tiles`, which have no halo, into `target` where `mask` (rows, columns) of
-    the map is set."""
+    the map is not 0."""
     rows, columns, channels = target.shape
     n = np.uint64(channels)
     for i in range(len(corners)):
@@ -99,21 +99,6 @@ def scatter(tiles, corners, mask, target):
         for k in range(min(tiles.shape[1], rows - r0)):
             for q in range(min(tiles.shape[2], columns - c0)):
                 if mask[r0 + k, c0 + q]:
-                    to, of = target[r0 + k, c0 + q], tiles[i, k, q]
-                    for c in range(n):
-                        to[c] = of[c]
-
-
-@njit(nogil=True, cache=True)
-def scatter_active(tiles, corners, elapsed_s, target):
-    """`scatter` where `elapsed_s`, tiles with a halo of one cell, is not 0."""
-    rows, columns, channels = target.shape
-    n = np.uint64(channels)
-    for i in range(len(corners)):
-        r0, c0 = corners[i]
-        for k in range(min(tiles.shape[1], rows - r0)):
-            for q in range(min(tiles.shape[2], columns - c0)):
-                if elapsed_s[i, k + 1, q + 1, 0] > 0:
                     to, of = target[r0 + k, c0 + q], tiles[i, k, q]
                     for c in range(n):
                         to[c] = of[c]
