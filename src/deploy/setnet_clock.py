@@ -146,7 +146,7 @@ class SumState:
     """What lives from window to window, advanced in place: the leaky sums and their mixtures."""
 
     def __init__(self, views: int, rows: int, columns: int, mixtures: int):
-        self.sums = np.zeros((views, len(SUM_TAUS_S), rows, columns), np.float32)
+        self.sums = np.zeros((rows, views, len(SUM_TAUS_S), columns), np.float32)
         self.mixtures = np.zeros((rows, columns, mixtures), np.float32)
 
 
@@ -168,7 +168,7 @@ class EventMaps:
         self.size = views, rows, columns, self.code.shape[1] + len(SUM_TAUS_S)
         # What lies outside of active tiles is used nowhere.
         self.voxel_map = np.zeros((rows, columns, len(self.bias)), np.float32)
-        self.new = np.zeros((views, rows, columns), np.float32)  # zero between two windows
+        self.new = np.zeros((rows, views, columns), np.float32)  # zero between two windows
 
     def add(self, pixels: EventPixels, clocks: ClockState, state: SumState) -> None:
         """Bring `state` to the end of a window, and make its `voxel_map`."""

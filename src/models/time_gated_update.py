@@ -9,7 +9,7 @@ from torch.autograd.function import FunctionCtx
 def time_gated_update(
     gates_and_candidate: Float[Tensor, "n c2 h w"],
     state: Float[Tensor, "n c h w"],
-    elapsed: Float[Tensor, "n 1 1 1"],
+    elapsed: Float[Tensor, "n 1 _h _w"],
 ) -> Float[Tensor, "n c h w"]:
     """Return s' = tanh(a) + k (s - tanh(a)) with k = exp(-elapsed relu(g)), float32.
 

@@ -24,24 +24,26 @@ def collect_pixels(t, x, y, p, view, t0, t1, slot_of, places, grid):
     """Lay the events with t0 <= t <= t1 into `grid` (n, bins), a row for each pixel that has any;
     return their number.  `places` (n, 3): view, row, column; `slot_of` (views, h, w): zeros.
     """
-    bins, count = grid.shape[1], 0
-    scale = f32(f32(bins - 1) / f32(t1 - t0))
-    for i in range(t.size):
+    bins, count, slots, voxels = grid.shape[1], 0, slot_of.reshape(-1), grid.reshape(-1)
+    scale, height, width = f32(f32(bins - 1) / f32(t1 - t0)), slot_of.shape[1], slot_of.shape[2]
+    for i in range(np.uint64(t.size)):
         if not t0 <= t[i] <= t1:
             continue
         tau = f32(f32(t[i] - t0) * scale)
         b = min(np.int64(tau), bins - 1)
         late = f32(np.rint((tau - f32(b)) * f32(2**20)) * f32(2.0**-20))
-        slot = slot_of[view[i], y[i], x[i]]
+        pixel = np.uint64((view[i] * height + y[i]) * width + x[i])
+        slot = slots[pixel]
         if slot == 0:
             places[count, 0], places[count, 1], places[count, 2] = view[i], y[i], x[i]
             for k in range(bins):
                 grid[count, k] = 0
             count += 1
-            slot_of[view[i], y[i], x[i]] = slot = count
-        grid[slot - 1, b] += p[i] * (f32(1) - late)
+            slots[pixel] = slot = count
+        at = np.uint64((slot - 1) * bins + b)
+        voxels[at] += p[i] * (f32(1) - late)
         if b + 1 < bins:
-            grid[slot - 1, b + 1] += p[i] * late
+            voxels[at + np.uint64(1)] += p[i] * late
     for k in range(count):
         slot_of[places[k, 0], places[k, 1], places[k, 2]] = 0
     return count

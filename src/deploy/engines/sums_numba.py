@@ -68,7 +68,7 @@ def add_patches(places, grid, weight, elapsed_s, row_spans, column_spans, patche
 
 @njit(nogil=True, cache=True)
 def add_to_cells(places, grid, elapsed_s, new, totals):
-    """Add what the pixels sum to, to `new` (views, rows, columns) and write it into `totals` (n,),
+    """Add what the pixels sum to, to `new` (rows, views, columns) and write it into `totals` (n,),
     0 where the cell stands still."""
     for i in range(len(places)):
         v, r, c = places[i, 0], places[i, 1] // SIDE, places[i, 2] // SIDE
@@ -76,14 +76,14 @@ def add_to_cells(places, grid, elapsed_s, new, totals):
         if elapsed_s[r, c] > 0:
             for b in range(grid.shape[1]):
                 total += grid[i, b]
-            new[v, r, c] += total
+            new[r, v, c] += total
         totals[i] = total
 
 
 @njit(nogil=True, cache=True)
 def leak(active_tiles, elapsed_s, taus_s, new, sums, mixed):
-    """Advance `sums` (views, taus, rows, columns) by `elapsed_s` in active tiles and add `new`
-    (views, rows, columns), which is cleared; let `mixed` (rows, columns, mixtures) leak, and write
+    """Advance `sums` (rows, views, taus, columns) by `elapsed_s` in active tiles and add `new`
+    (rows, views, columns), which is cleared; let `mixed` (rows, columns, mixtures) leak, and write
     the spread of the views behind its mixtures.
     """
     columns = elapsed_s.shape[1]
@@ -100,7 +100,7 @@ def leak(active_tiles, elapsed_s, taus_s, new, sums, mixed):
             last = min(j * TILE, columns)
             for r in range(i * TILE, min((i + 1) * TILE, len(elapsed_s))):
                 _write_decays(elapsed_s[r, first:last], taus_s, decay)
-                _leak_row(r, first, last, decay, new, sums, mixed, middle, far)
+                _leak_row(first, last, decay, new[r], sums[r], mixed[r], middle, far)
 
 
 @njit(nogil=True, cache=True)
@@ -116,32 +116,32 @@ def _write_decays(elapsed_s, taus_s, decay):
 
 
 @njit(nogil=True, cache=True)
-def _leak_row(r, first, last, decay, new, sums, mixed, middle, far):
+def _leak_row(first, last, decay, new, sums, mixed, middle, far):
     views, taus, n = sums.shape[0], sums.shape[1], np.uint64(last - first)
-    part, behind = f32(1) / f32(views), mixed.shape[2] - taus
+    part, behind = f32(1) / f32(views), mixed.shape[1] - taus
     for m in range(taus):
         factor = decay[m]
         for c in range(n):
             middle[c] = far[c] = 0
         for v in range(views):
-            row, more = sums[v, m, r, first:last], new[v, r, first:last]
+            row, more = sums[v, m, first:last], new[v, first:last]
             for c in range(n):
                 row[c] = row[c] * factor[c] + more[c]
                 middle[c] += row[c] * part
-        for v in range(views):
-            row = sums[v, m, r, first:last]
+        for v in range(views if views > 1 else 0):
+            row = sums[v, m, first:last]
             for c in range(n):
                 far[c] += abs(row[c] - middle[c]) * part
         for c in range(n):
-            mixed[r, first + c, behind + m] = far[c]
+            mixed[first + c, behind + m] = far[c]
     for v in range(views):
-        new[v, r, first:last] = 0
-    mixtures, to, each = np.uint64(behind), mixed[r].reshape(-1), np.empty(behind, f32)
+        new[v, first:last] = 0
+    mixtures, to, each = np.uint64(behind), mixed.reshape(-1), np.empty(behind, f32)
     for c in range(n):
         if c == 0 or decay[0, c] != decay[0, c - np.uint64(1)]:
             for k in range(mixtures):
                 each[k] = decay[k % np.uint64(taus), c]
-        at = (np.uint64(first) + c) * np.uint64(mixed.shape[2])
+        at = (np.uint64(first) + c) * np.uint64(mixed.shape[1])
         for k in range(mixtures):
             to[at + k] *= each[k]
 

@@ -39,16 +39,17 @@ def gather_sum(near, far, corners, out):
     """Write the tiles of relu(near + far) into `out`, `far` of half the size; the border goes on."""
     rows, columns, channels = near.shape
     side, a, b, to = out.shape[1], near.reshape(-1), far.reshape(-1), out.reshape(-1)
-    at, n = np.uint64(0), np.uint64(channels)
+    at, n, zero = np.uint64(0), np.uint64(channels), f32(0)
     for i in range(len(corners)):
         for k in range(side):
             row = min(max(corners[i, 0] + k, 0), rows - 1)
+            near_row, far_row = row * columns, row // 2 * (columns // 2)
             for q in range(side):
                 column = min(max(corners[i, 1] + q, 0), columns - 1)
-                one = np.uint64((row * columns + column) * channels)
-                two = np.uint64(((row // 2) * (columns // 2) + column // 2) * channels)
+                one = np.uint64((near_row + column) * channels)
+                two = np.uint64((far_row + column // 2) * channels)
                 for c in range(n):
-                    to[at + c] = max(a[one + c] + b[two + c], f32(0))
+                    to[at + c] = max(a[one + c] + b[two + c], zero)
                 at += n
 
 
@@ -93,29 +94,34 @@ def scatter(tiles, corners, mask, target):
     """Write the cells of `tiles`, which have no halo, into `target` where `mask` (rows, columns) of
     the map is not 0."""
     rows, columns, channels = target.shape
-    n = np.uint64(channels)
+    side, n, of, to = tiles.shape[1], np.uint64(channels), tiles.reshape(-1), target.reshape(-1)
     for i in range(len(corners)):
         r0, c0 = corners[i]
-        for k in range(min(tiles.shape[1], rows - r0)):
-            for q in range(min(tiles.shape[2], columns - c0)):
+        for k in range(min(side, rows - r0)):
+            here = np.uint64((i * side + k) * side * channels)
+            there = np.uint64(((r0 + k) * columns + c0) * channels)
+            for q in range(min(side, columns - c0)):
                 if mask[r0 + k, c0 + q]:
-                    to, of = target[r0 + k, c0 + q], tiles[i, k, q]
                     for c in range(n):
-                        to[c] = of[c]
+                        to[there + c] = of[here + c]
+                here += n
+                there += n
 
 
 @njit(nogil=True, cache=True)
 def smooth(context, corners, cells, kept, smoothed):
     """Move `smoothed` toward `context` in the `cells` (n, side, side) of tiles."""
-    n = np.uint64(context.shape[2])
+    rows, columns, channels = context.shape
+    side, n, of, to = cells.shape[1], np.uint64(channels), context.reshape(-1), smoothed.reshape(-1)
     for i in range(len(corners)):
         r0, c0 = corners[i]
-        for k in range(min(cells.shape[1], len(context) - r0)):
-            for q in range(min(cells.shape[2], context.shape[1] - c0)):
+        for k in range(min(side, rows - r0)):
+            at = np.uint64(((r0 + k) * columns + c0) * channels)
+            for q in range(min(side, columns - c0)):
                 if cells[i, k, q]:
-                    to, of = smoothed[r0 + k, c0 + q], context[r0 + k, c0 + q]
-                    for c in range(n):
+                    for c in range(at, at + n):
                         to[c] = of[c] + kept * (to[c] - of[c])
+                at += n
 
 
 @njit(nogil=True, cache=True)
@@ -123,15 +129,18 @@ def write_pixels(tiles, corners, side, frame):
     """Write tiles (n, t, t, side * side) of the pixels of squares, row by row, into `frame`;
     `corners`: in squares."""
     squares_down, squares_across = len(frame) // side, frame.shape[1] // side
+    across, of, n = tiles.shape[2], tiles.reshape(-1), np.uint64(side)
     for i in range(len(corners)):
         r0, c0 = corners[i]
         for k in range(min(tiles.shape[1], squares_down - r0)):
-            width = np.uint64(min(tiles.shape[2], squares_across - c0))
             for a in range(side):
-                row = frame[side * (r0 + k) + a]
-                for q in range(width):
-                    for b in range(side):
-                        row[side * (c0 + q) + b] = tiles[i, k, q, side * a + b]
+                row, to = frame[side * (r0 + k) + a], np.uint64(side * c0)
+                at = np.uint64(((i * tiles.shape[1] + k) * across * side + a) * side)
+                for _ in range(min(across, squares_across - c0)):
+                    for b in range(n):
+                        row[to + b] = of[at + b]
+                    to += n
+                    at += n * n
 
 
 @njit(nogil=True, cache=True)
