@@ -1,6 +1,6 @@
 """What runs the layers behind the events; PyTorch as one of its backends."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np

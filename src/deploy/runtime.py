@@ -144,8 +144,8 @@ class EventListRuntime:
 
     @property
     def state(self) -> Any:
-        """What lives from window to window, for `state = ...`; later windows advance it in place, so
-        that whoever goes back to it keeps a `copy.deepcopy`.
+        """What lives from window to window, for `state = ...`; later windows advance it in place,
+        so that going back to it takes a `copy.deepcopy`.
         """
         return self.first_layer.state, self.runner.state
 

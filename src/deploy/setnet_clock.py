@@ -1,6 +1,7 @@
 """SetNet's clock, event map and leaky sums, which advance where events fall: maps of cells."""
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -151,13 +152,14 @@ class SumState:
 
 
 class EventMaps:
-    """Makes the map of SetNet's voxel kernels and advances a SumState, in active tiles.  `padded`:
-    (h, w) of a picture, multiples of 8."""
+    """Makes the map of SetNet's voxel kernels and advances a SumState, in active tiles; with two
+    `threads` side by side.  `padded`: (h, w) of a picture, multiples of 8."""
 
     def __init__(
         self, network: SetNet, positions: Sequence[Position], mixture_code: np.ndarray,
-        padded: tuple[int, int],
+        padded: tuple[int, int], threads: int,
     ):  # fmt: skip
+        self.pool = ThreadPoolExecutor(1) if threads > 1 else None
         kernel, _, bias = network.stem_kernels(tuple(positions))
         self.bias, kernels, views = bias.numpy(), kernel.numpy(), len(positions)
         self.patches = event_patches(kernels, views, CELL_PX)
@@ -172,11 +174,20 @@ class EventMaps:
 
     def add(self, pixels: EventPixels, clocks: ClockState, state: SumState) -> None:
         """Bring `state` to the end of a window, and make its `voxel_map`."""
+        work = pixels, clocks, state
+        sums = self.pool.submit(self._advance_sums, *work) if self.pool else None
+        self._make_voxel_map(pixels, clocks)
+        sums.result() if sums else self._advance_sums(*work)
+
+    def _make_voxel_map(self, pixels: EventPixels, clocks: ClockState) -> None:
         places, voxels, window_s = pixels
         weight = np.float32(1 / (REFERENCE_HZ * float(window_s)))  # as SetNet counts them
         sums_numba.fill_tiles(clocks.active_tiles, self.bias, self.voxel_map)
         patch = clocks.elapsed_s, *self.spans, self.patches, self.voxel_map
         sums_numba.add_patches(places, voxels, weight, *patch)
+
+    def _advance_sums(self, pixels: EventPixels, clocks: ClockState, state: SumState) -> None:
+        places, voxels, _ = pixels
         totals = np.empty(len(places), np.float32)
         sums_numba.add_to_cells(places, voxels, clocks.elapsed_s, self.new, totals)
         passed = clocks.active_tiles, clocks.elapsed_s, self.taus_s

@@ -15,18 +15,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from src.deploy.int8 import Int8Conv
-from src.models.layers import EqualDCConv, PreActivationBlock, bias_of
-from src.models.setnet import (
-    CELL_BORDER,
-    CELL_PX,
-    REFERENCE_HZ,
-    ContextPyramid,
-    SetNet,
-    TimeGatedMemory,
-)
+from src.models.layers import EqualDCConv, bias_of
+from src.models.setnet import CELL_BORDER, CELL_PX, REFERENCE_HZ, SetNet, TimeGatedMemory
 from src.sim.optics import Position
-
-BLOCK_HALO = 2  # cells that the two convolutions of a PreActivationBlock take in on each side
 
 
 class MemoryLayers(nn.Module):
@@ -101,117 +92,6 @@ class SplitTimeGatedMemory(nn.Module):
         keep = torch.exp(-elapsed * gate.relu().float())
         new = keep * channels_first(state) + (1 - keep) * candidate.tanh().float()
         return channels_last(new)
-
-
-class WholeContext(nn.Module):
-    """An update of the context on whole maps: ContextPyramid and its moving average."""
-
-    def __init__(self, network: SetNet, dtype: torch.dtype):
-        super().__init__()
-        self.pyramid, self.dtype = deepcopy(network.context).to(dtype), dtype
-
-    def forward(
-        self,
-        hidden: Float[Tensor, "1 h2 w2 c"],
-        context: Float[Tensor, "1 h4 w4 c"],
-        recency: Float[Tensor, "1 h4 w4 1"],
-        is_updated: Float[Tensor, "1 h4 w4 1"],
-        *held: Float[Tensor, "1 _h _w _c"],
-    ) -> tuple[Tensor, ...]:
-        """Return the context and the held maps after the update."""
-        features = channels_first(hidden.to(self.dtype))
-        mask = channels_first(is_updated)
-        cells = functional.interpolate(mask, scale_factor=2, mode="nearest")
-        new, scales = self.pyramid(features, tuple(map(channels_first, held)), cells > 0)
-        before = channels_first(context)
-        average = self.pyramid.moving_average(before, new.float(), channels_first(recency))
-        context = torch.where(mask > 0, average, before)
-        return channels_last(context), *map(channels_last, scales)
-
-
-class ScaleLayers(nn.Module):
-    """One scale of a ContextPyramid on tiles: from the finer map, with a halo of 5 of its cells
-    behind and 4 before."""
-
-    def __init__(self, pyramid: ContextPyramid, scale: int, dtype: torch.dtype):
-        super().__init__()
-        self.down = deepcopy(pyramid.downs[scale]).to(dtype)
-        self.down.padding = (0, 0)
-        self.block, self.dtype = TileBlock(pyramid.down_blocks[scale]).to(dtype), dtype
-
-    def forward(
-        self, x: Float[Tensor, "b s s c"], is_inside: Float[Tensor, "b t t 1"]
-    ) -> Float[Tensor, "b u u d"]:
-        """Return the map of the scale; `is_inside`: 1 in cells of the frame, with a halo of 2."""
-        inside = channels_first(is_inside.to(self.dtype))
-        new = self.block(self.down(channels_first(x.to(self.dtype))), inside)
-        return channels_last(new).float()
-
-
-class FusionLayers(nn.Module):
-    """A scale of a ContextPyramid and the next coarser one, added on tiles with a halo of `halo`;
-    behind the finest the update of the context."""
-
-    def __init__(self, pyramid: ContextPyramid, scale: int, dtype: torch.dtype):
-        super().__init__()
-        block = pyramid.fusion_blocks[scale]
-        is_block = isinstance(block, PreActivationBlock)
-        self.halo = BLOCK_HALO if is_block else 0
-        self.block = TileBlock(block).to(dtype) if is_block else None
-        self.up, self.dtype = deepcopy(pyramid.ups[scale + 1]).to(dtype), dtype
-
-    def forward(
-        self,
-        finer: Float[Tensor, "b t t c"],
-        coarser: Float[Tensor, "b t t d"],
-        is_inside: Float[Tensor, "b t t 1"],
-    ) -> Float[Tensor, "b u u c"]:
-        """Return the sum; `coarser`: after its ReLU, interpolated to the cells of `finer`."""
-        return channels_last(self.fuse(finer, coarser, is_inside)).float()
-
-    def fuse(self, finer: Tensor, coarser: Tensor, is_inside: Tensor) -> Tensor:
-        finer, coarser, inside = (
-            channels_first(part.to(self.dtype)) for part in (finer, coarser, is_inside)
-        )
-        new = finer + self.up(coarser)
-        return new if self.block is None else self.block(new, inside)
-
-
-class ContextLayers(FusionLayers):
-    """The FusionLayers of the finest scale, and the update of the context from their sum."""
-
-    def __init__(self, pyramid: ContextPyramid, dtype: torch.dtype):
-        super().__init__(pyramid, 0, dtype)
-        self.last, self.rate = deepcopy(pyramid.ups[0]).to(dtype), pyramid.log_rate.float().exp()
-
-    def forward(  # type: ignore[override]
-        self,
-        finer: Float[Tensor, "b t t c"],
-        coarser: Float[Tensor, "b t t d"],
-        is_inside: Float[Tensor, "b t t 1"],
-        context: Float[Tensor, "b u u o"],
-        recency: Float[Tensor, "b u u 1"],
-    ) -> Float[Tensor, "b u u o"]:
-        """Return the context after the update."""
-        new = self.last(self.fuse(finer, coarser, is_inside).relu()).float()
-        keep = channels_first(recency) ** self.rate
-        return channels_last(torch.lerp(new, channels_first(context), keep))
-
-
-class TileBlock(nn.Module):
-    """A PreActivationBlock on tiles: what is outside the frame is zero before each convolution."""
-
-    def __init__(self, block: PreActivationBlock):
-        super().__init__()
-        self.conv1, self.conv2 = deepcopy(block.conv1), deepcopy(block.conv2)
-        self.conv1.padding = self.conv2.padding = (0, 0)
-
-    def forward(
-        self, x: Float[Tensor, "b c t t"], inside: Float[Tensor, "b 1 t t"]
-    ) -> Float[Tensor, "b c u u"]:
-        y = self.conv1(x.relu() * inside)
-        y = self.conv2(y.relu() * inside[..., 1:-1, 1:-1])
-        return x[..., BLOCK_HALO:-BLOCK_HALO, BLOCK_HALO:-BLOCK_HALO] + y
 
 
 class DecoderLayers(nn.Module):

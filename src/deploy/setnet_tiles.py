@@ -1,7 +1,6 @@
 """A SetNet over windows of events, computed on the tiles that change."""
 
-from collections.abc import Callable, Sequence
-from functools import lru_cache
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,23 +18,15 @@ from src.deploy.setnet_clock import (
     SetNetClock,
     SumState,
 )
-from src.deploy.setnet_layers import (
-    BLOCK_HALO,
-    ContextLayers,
-    DecoderLayers,
-    FusionLayers,
-    MemoryLayers,
-    ScaleLayers,
-    WholeContext,
-    WholeDecoder,
-)
+from src.deploy.setnet_context import CONTEXT_TILE, ContextTiles, WholeContext
+from src.deploy.setnet_layers import DecoderLayers, MemoryLayers, WholeDecoder
 from src.deploy.tile_batches import Backend, TileModule
 from src.models.setnet import CELL_PX, SetNet
 from src.sim.optics import Position
 
-CONTEXT_TILE = 8  # side of a tile of any scale of the context, in its cells
-# Share of the frame from which on all of it is computed at once, which takes no longer.
-WHOLE_SHARE, WHOLE_CONTEXT_SHARE = 0.8, 0.5
+BATCHES = 8, 32  # sizes of batches, in tiles
+# Share of the frame in tiles from which on all of it is computed at once, which takes no longer.
+WHOLE_MEMORY, WHOLE_CONTEXT, WHOLE_DECODER = 0.45, 0.35, 0.5
 
 
 class TileState:
@@ -72,13 +63,13 @@ class SetNetTiles:
     ):  # fmt: skip
         self.network, self.padded, how = network, padded, (backend, threads)
         memory, decoder = MemoryLayers(network, positions, dtype), DecoderLayers(network, dtype)
-        self.events = EventMaps(network, positions, memory.mixture_code, padded)
+        self.events = EventMaps(network, positions, memory.mixture_code, padded, threads)
         views, rows, columns, mixtures = self.events.size
         self.clock = SetNetClock(views, rows, columns, len(network.context.downs))
         c, near, far = network.channels, TILE + 2, TILE + 4
         shapes = [(near, near, c), (far, far, mixtures), (near, near, 1), (TILE, TILE, c)]
-        self.memory = TileModule(memory, shapes, *how)
-        self.decoder = TileModule(decoder, [(far, far, c)], *how)
+        self.memory = TileModule(memory, shapes, *how, BATCHES)
+        self.decoder = TileModule(decoder, [(far, far, c)], *how, BATCHES)
         self.context = ContextTiles(network, dtype, *how)
         self.whole = WholeFrame(network, positions, padded, dtype, *how)
         # Where no event was ever seen every pixel is that of maps of zeros.
@@ -98,7 +89,7 @@ class SetNetTiles:
         tick = self.clock.tick(pixels, clock)
         if len(tick.active_tiles):
             self.events.add(pixels, clock, sums)
-            if self._is_most(TILE, len(tick.active_tiles), WHOLE_SHARE):
+            if self._is_most(TILE, len(tick.active_tiles), WHOLE_MEMORY):
                 self.whole.remember(self.events.voxel_map, sums.mixtures, clock.elapsed_s, maps)
             else:
                 self._remember(tick.active_tiles)
@@ -107,7 +98,7 @@ class SetNetTiles:
         corners = QUARTER * tick.smoothed_tiles
         cells = tick.smoothed_cells, tick.smoothing_kept
         tiles_numba.smooth(maps.context, corners, *cells, maps.smoothed)
-        if self._is_most(TILE, len(tick.changed_tiles), WHOLE_SHARE):
+        if self._is_most(TILE, len(tick.changed_tiles), WHOLE_DECODER):
             self.whole.draw(maps)
         else:
             self._draw(tick.changed_tiles)
@@ -120,7 +111,7 @@ class SetNetTiles:
 
     def _update_context(self, update: ContextUpdate) -> None:
         tiles = len(tiles_numba.find_tiles(update.cells[0], CONTEXT_TILE))
-        if self._is_most(2 * CONTEXT_TILE, tiles, WHOLE_CONTEXT_SHARE):
+        if self._is_most(2 * CONTEXT_TILE, tiles, WHOLE_CONTEXT):
             self.whole.update_context(update, self.state.maps)
         else:
             self.context.update(self.state.maps, update)
@@ -197,77 +188,6 @@ class WholeFrame:
         """Draw the frame."""
         self.decoder.run([maps.hidden[None], maps.smoothed[None]], [self.pixels])
         tiles_numba.write_pixels(self.pixels, np.zeros((1, 2), np.int32), 2 * CELL_PX, maps.frame)
-
-
-class ContextTiles:
-    """Updates the context of a TileState, scale by scale.  Raises ValueError for a single scale."""
-
-    def __init__(self, network: SetNet, dtype: torch.dtype, *how: Any):
-        pyramid = network.context
-        widths = [down.out_channels for down in pyramid.downs]
-        inner, outer = CONTEXT_TILE + 2 * BLOCK_HALO, 2 * (CONTEXT_TILE + 2 * BLOCK_HALO) + 1
-        self.down, self.fuse = [], []
-        for scale, channels in enumerate([network.channels, *widths[:-1]]):
-            layers = ScaleLayers(pyramid, scale, dtype)
-            shapes = [(outer, outer, channels), (inner, inner, 1)]
-            self.down.append(TileModule(layers, shapes, *how))
-        for scale, (finer, coarser) in enumerate(zip(widths[:-1], widths[1:], strict=True)):
-            layers = FusionLayers(pyramid, scale, dtype) if scale else ContextLayers(pyramid, dtype)
-            self.halo = np.int32(layers.halo)
-            side = CONTEXT_TILE + 2 * layers.halo
-            shapes = [(side, side, n) for n in (finer, coarser, 1)]
-            if not scale:
-                shapes += [(CONTEXT_TILE, CONTEXT_TILE, n) for n in (network.channels, 1)]
-            self.fuse.append(TileModule(layers, shapes, *how))
-
-    def update(self, state: Any, update: ContextUpdate) -> None:
-        """Bring scales, their sums and the context of `state` up to date in the cells of `update`."""
-        corners = [tiles_numba.find_tiles(cells, CONTEXT_TILE) for cells in update.cells]
-        finer = [state.hidden, *state.scales]
-        for scale, module in enumerate(self.down):
-            self._make_scale(module, finer[scale], corners[scale], update.cells[scale], state.scales[scale])
-        for scale in reversed(range(len(self.fuse))):
-            self._fuse(scale, state, corners[scale], update)
-
-    def _make_scale(self, module, source, corners, cells, target) -> None:
-        def read(part: slice, inputs: list[np.ndarray]) -> None:
-            x, inside = inputs
-            tiles_numba.gather(source, 2 * corners[part] - np.int32(2 * BLOCK_HALO + 1), x)
-            tiles_numba.mark_inside(*target.shape[:2], corners[part] - np.int32(BLOCK_HALO), inside)
-
-        def write(part: slice, made: np.ndarray) -> None:
-            tiles_numba.scatter(made, corners[part], cells, target)
-
-        module.run(len(corners), read, write)
-
-    def _fuse(self, scale, state, corners, update) -> None:
-        finer, coarser = state.scales[scale], state.fused[scale + 1]
-        target = state.fused[scale] if scale else state.context
-        rows, columns = map(interpolation_spans, coarser.shape[:2], finer.shape[:2])
-
-        def read(part: slice, inputs: list[np.ndarray]) -> None:
-            first = corners[part] - self.halo
-            tiles_numba.gather(finer, first, inputs[0])
-            tiles_numba.gather_interpolated(coarser, rows, columns, first, inputs[1])
-            tiles_numba.mark_inside(*finer.shape[:2], first, inputs[2])
-            if not scale:
-                tiles_numba.gather(state.context, corners[part], inputs[3])
-                tiles_numba.gather(update.recency[..., None], corners[part], inputs[4])
-
-        def write(part: slice, made: np.ndarray) -> None:
-            tiles_numba.scatter(made, corners[part], update.cells[scale], target)
-
-        self.fuse[scale].run(len(corners), read, write)
-
-
-@lru_cache(64)
-def interpolation_spans(coarse: int, fine: int) -> Float[np.ndarray, "fine 3"]:
-    """Return, for each place of a bilinear interpolation, two places to take and the weight of the
-    second, as torch does without align_corners."""
-    place = np.maximum((np.arange(fine) + 0.5) * np.float32(coarse / fine) - 0.5, 0)
-    first = place.astype(int)
-    second = np.minimum(first + 1, coarse - 1)
-    return np.stack([first, second, place - first], 1).astype(np.float32)
 
 
 def _zeros(size: tuple[int, int, int]) -> Float[np.ndarray, "h w c"]:

@@ -8,24 +8,24 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-SIZES = (4, 16)  # of a batch, in tiles
 CALL_COST = 3  # what a call costs beside its tiles, in tiles
 Backend = Callable[[nn.Module, list[Tensor], int], Any]  # EagerBackend or CompiledModule
 
 
 @lru_cache(4096)
-def split_into_batches(tiles: int) -> tuple[int, ...]:
-    """Return the sizes of the batches, of SIZES, in which `tiles` take least time."""
+def split_into_batches(tiles: int, sizes: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the sizes of the batches, of `sizes`, in which `tiles` take least time."""
     if tiles <= 0:
         return ()
-    if tiles > 2 * SIZES[-1]:
-        return SIZES[-1], *split_into_batches(tiles - SIZES[-1])
-    ways = [(size, *split_into_batches(tiles - size)) for size in SIZES]
+    if tiles > 2 * sizes[-1]:
+        return sizes[-1], *split_into_batches(tiles - sizes[-1], sizes)
+    ways = [(size, *split_into_batches(tiles - size, sizes)) for size in sizes]
     return min(ways, key=lambda way: sum(way) + CALL_COST * len(way))
 
 
 class TileModule:
-    """`module`, which has one output, on batches of tiles; `shapes`: of an input for one tile."""
+    """`module`, which has one output, on batches of tiles; `shapes`: of an input for one tile;
+    `sizes`: of the batches, in tiles, ascending."""
 
     def __init__(
         self,
@@ -33,9 +33,11 @@ class TileModule:
         shapes: Sequence[tuple[int, ...]],
         backend: Backend,
         threads: int,
+        sizes: tuple[int, ...],
     ):
+        self.sizes = sizes
         self.compiled, self.inputs, self.outputs = {}, {}, {}
-        for size in SIZES:
+        for size in sizes:
             example = [torch.zeros(size, *shape) for shape in shapes]
             with torch.inference_mode():
                 self.outputs[size] = [module(*example).numpy().copy()]
@@ -51,7 +53,7 @@ class TileModule:
         """Run on all `tiles`: read(which, inputs) fills the inputs of a batch, write(which, output)
         takes its output."""
         start = 0
-        for size in split_into_batches(tiles):
+        for size in split_into_batches(tiles, self.sizes):
             part = slice(start, min(start + size, tiles))
             read(part, self.inputs[size])
             self.compiled[size].run(self.inputs[size], self.outputs[size])

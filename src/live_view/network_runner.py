@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -101,9 +102,9 @@ class NetworkRunner:
         return next(frames).picture
 
     def _finish(
-        self, runtime: EventListRuntime, begun: list[np.ndarray] | None, restart: bool
+        self, runtime: EventListRuntime, begun: Any, restart: bool
     ) -> Float[np.ndarray, "h w"]:
-        """Run the rest of the network on a window that was begun; one without events holds."""
+        """Run the rest of the network on a window that was begun; None, without events, holds."""
         if restart:
             runtime.runner.reset()
             self.picture = np.full(self.views.model, 0.5, np.float32)

@@ -70,11 +70,13 @@ def grids(window: tuple, views: int, height: int, width: int) -> torch.Tensor:
 
 
 def largest_gap(net: SetNet, live: EventListRuntime, windows: list, views: int) -> float:
-    """Return the largest difference of a frame, a hidden map or, over its largest value, a context."""
+    """Return the largest difference of frames, hidden maps and contexts, over their largest value
+    where that is above 1."""
     state, gap, places = None, 0.0, positions(views)
     for window in windows:
         seconds = window[6] - window[5]
-        frame, state = net(grids(window, views, *live.size), state, window_s=seconds, positions=places)
+        grid = grids(window, views, *live.size)
+        frame, state = net(grid, state, window_s=seconds, positions=places)
         got = live.step(*window)
         maps = live.runner.state.maps
         pairs = [
@@ -83,8 +85,8 @@ def largest_gap(net: SetNet, live: EventListRuntime, windows: list, views: int) 
             (state.context_average[0].permute(1, 2, 0), maps.context),
             (state.context_smoothed[0].permute(1, 2, 0), maps.smoothed),
         ]
-        gaps = (abs(a - b).max() / max(1, abs(a).max()) for a, b in ((a.numpy(), b) for a, b in pairs))
-        gap = max(gap, *map(float, gaps))
+        for a, b in ((a.numpy(), b) for a, b in pairs):
+            gap = max(gap, float(abs(a - b).max() / max(1, abs(a).max())))
     return gap
 
 
@@ -165,8 +167,8 @@ def test_from_tiles_to_the_whole_frame_and_back(backend, in_float32):
 @pytest.mark.parametrize("share", [0.0, 9.0])
 def test_either_way_all_the_time(share, monkeypatch):
     """Whole maps although little changes, tiles although all does."""
-    monkeypatch.setattr(setnet_tiles, "WHOLE_SHARE", share)
-    monkeypatch.setattr(setnet_tiles, "WHOLE_CONTEXT_SHARE", share)
+    for name in ("WHOLE_MEMORY", "WHOLE_CONTEXT", "WHOLE_DECODER"):
+        monkeypatch.setattr(setnet_tiles, name, share)
     windows = scene([EVERYWHERE, BLOB, BLOB, QUIET] * 5, 5, 2, 72, 100, 120.0)
     live = EventListRuntime(
         NETWORKS["medium"], positions=positions(2), height=72, width=100, form="float32"
@@ -193,8 +195,14 @@ def test_two_states_take_turns():
     """As overlapping windows do: each state goes on where it was, whatever ran in between."""
     net = NETWORKS["small"]
     one, other = (scene([BLOB, QUIET, EVERYWHERE, BLOB], seed, 1, 64, 64, 600.0) for seed in (1, 2))
-    make = lambda: EventListRuntime(net, positions=positions(1), height=64, width=64, form="float32")
-    alone = [[live.step(*window) for window in part] for live, part in ((make(), one), (make(), other))]
+
+    def make() -> EventListRuntime:
+        return EventListRuntime(net, positions=positions(1), height=64, width=64, form="float32")
+
+    alone = []
+    for windows in (one, other):
+        live = make()
+        alone.append([live.step(*window) for window in windows])
     live, states = make(), [None, None]
     for k in range(4):
         for turn, windows in enumerate((one, other)):

@@ -1,4 +1,4 @@
-"""SetNet's clock from the pixels that had events (numba): what `SetNet.run_clock` gives, bit for bit.
+"""SetNet's clock from the pixels that had events (numba): bit for bit that of `SetNet.run_clock`.
 
 Maps are (rows, columns) of cells.  Whatever is dense in here is a pass or two over one map of
 bytes or floats; all else follows the events and the tiles, of TILE x TILE cells, that they reach.
@@ -82,7 +82,7 @@ def mark_supported(places, grid, kept, counts, trace, is_supported, near_tiles):
         counts[v, r, c] = 0
     for k in range(found):
         v, r, c = cells[k]
-        if not is_supported[r, c] and f32(9) * (_sum_3x3(trace[v], r, c) / f32(9)) > SUPPORT:
+        if not is_supported[r, c] and _has_support(trace[v], r, c):
             is_supported[r, c] = 1
             top, left = max(r - REACH, 0) // TILE, max(c - REACH, 0) // TILE
             for i in range(top, min((r + REACH) // TILE + 1, len(near_tiles))):
@@ -91,12 +91,14 @@ def mark_supported(places, grid, kept, counts, trace, is_supported, near_tiles):
 
 
 @njit(nogil=True, cache=True)
-def _sum_3x3(values, r, c):
+def _has_support(trace, r, c):
+    if trace[r, c] > f32(2) * SUPPORT:  # as its neighbours only add to it
+        return True
     total = f32(0)
-    for i in range(max(r - 1, 0), min(r + 2, len(values))):
-        for j in range(max(c - 1, 0), min(c + 2, values.shape[1])):
-            total += values[i, j]
-    return total
+    for i in range(max(r - 1, 0), min(r + 2, len(trace))):
+        for j in range(max(c - 1, 0), min(c + 2, trace.shape[1])):
+            total += trace[i, j]
+    return f32(9) * (total / f32(9)) > SUPPORT  # rounded as an average pooling is
 
 
 @njit(nogil=True, cache=True)
@@ -215,7 +217,9 @@ def find_smoothed(recency, is_pending, pending_tiles, settling_tiles, changed):
 @njit(nogil=True, cache=True)
 def _has_pending(is_pending, row, column):
     r, c = 2 * row, 2 * column
-    return is_pending[r, c] or is_pending[r, c + 1] or is_pending[r + 1, c] or is_pending[r + 1, c + 1]
+    return (
+        is_pending[r, c] or is_pending[r, c + 1] or is_pending[r + 1, c] or is_pending[r + 1, c + 1]
+    )
 
 
 @njit(nogil=True, cache=True)

@@ -87,7 +87,8 @@ def leak(active_tiles, elapsed_s, taus_s, new, sums, mixed):
     the spread of the views behind its mixtures.
     """
     columns = elapsed_s.shape[1]
-    decay, middle, far = np.empty((taus_s.size, columns), f32), np.empty(columns, f32), np.empty(columns, f32)
+    decay = np.empty((taus_s.size, columns), f32)
+    middle, far = np.empty(columns, f32), np.empty(columns, f32)
     for i in range(len(active_tiles)):
         j = 0
         while j < active_tiles.shape[1]:

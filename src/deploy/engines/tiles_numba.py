@@ -1,6 +1,7 @@
-"""Tiles cut from maps and written back (numba).  Maps are (rows, columns, channels), tiles (n, side,
-side, channels); `corners` (n, 2): the first row and column of each tile in the map, its halo
-included, which may lie outside.
+"""Tiles cut from maps and written back (numba).
+
+Maps are (rows, columns, channels), tiles (n, side, side, channels); `corners` (n, 2): the first row
+and column of each tile in the map, its halo included, which may lie outside.
 """
 
 import numpy as np
@@ -36,7 +37,7 @@ def gather(source, corners, out):
 
 @njit(nogil=True, cache=True)
 def gather_sum(near, far, corners, out):
-    """Write the tiles of relu(near + far) into `out`, `far` of half the size; the border goes on."""
+    """Write the tiles of relu(near + far) into `out`, `far` of half the size; borders go on."""
     rows, columns, channels = near.shape
     side, a, b, to = out.shape[1], near.reshape(-1), far.reshape(-1), out.reshape(-1)
     at, n, zero = np.uint64(0), np.uint64(channels), f32(0)

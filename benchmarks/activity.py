@@ -1,0 +1,83 @@
+"""Time of a window against where events fall: python -m benchmarks.activity
+
+One line for each network and size: milliseconds, the median of some windows, with events in 0, 5,
+10, 25, 50, 75 and 100 % of the tiles of 32 x 32 pixels, a block around the middle, 300 events a
+window in each.
+"""
+
+import argparse
+import math
+import statistics
+import time
+
+import numpy as np
+
+from src.deploy.runtime import EventListRuntime, fastest_form
+from src.models import load
+from src.sim.optics import layout
+
+TILE_PX, EVENTS = 32, 300  # side of a tile, events in each
+SIZES = ((9, 176, 176, 600.0), (1, 480, 640, 120.0), (1, 720, 1280, 120.0))  # views, h, w, rate
+SHARES = (0.0, 0.05, 0.1, 0.25, 0.5, 0.75, 1.0)
+
+
+def block(share: float, height: int, width: int) -> list[tuple[int, int]]:
+    """Return the corners, in pixels, of the tiles nearest to the middle that are `share` of all."""
+    corners = [(y, x) for y in range(0, height, TILE_PX) for x in range(0, width, TILE_PX)]
+    middle = (height - TILE_PX) / 2, (width - TILE_PX) / 2
+    corners.sort(key=lambda at: max(abs(at[0] - middle[0]), abs(at[1] - middle[1])))
+    return corners[: math.ceil(share * len(corners))]
+
+
+def windows(share: float, views: int, height: int, width: int, fps: float, count: int) -> list:
+    """Return (t, x, y, p, view, t0, t1) of `count` windows."""
+    rng, corners, made = np.random.default_rng(0), block(share, height, width), []
+    for k in range(count):
+        places = np.repeat(np.array(corners, int).reshape(-1, 2), EVENTS, 0)
+        places = (places + rng.integers(0, TILE_PX, places.shape)).clip(0, (height - 1, width - 1))
+        n, edges = len(places), (k / fps, (k + 1) / fps)
+        y, x = places[rng.permutation(n)].T
+        p, view = 2 * rng.integers(0, 2, n) - 1, rng.integers(0, views, n)
+        made.append((np.sort(rng.uniform(*edges, n)), x, y, p, view, *edges))
+    return made
+
+
+def milliseconds(live: EventListRuntime, played: list, seconds: float) -> float:
+    """Return the median time of a window over `seconds`, after a first round."""
+    times, until = list[float](), 0.0
+    while time.perf_counter() < until or not times:
+        for window in played:
+            start = time.perf_counter()
+            live.step(*window)
+            times.append(1e3 * (time.perf_counter() - start))
+        if not until:
+            until = time.perf_counter() + seconds
+            times = times[-1:]
+    return statistics.median(times)
+
+
+def main() -> None:
+    """Print the lines."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", default=("setnet_small", "setnet_medium"))
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--seconds", type=float, default=1.0)
+    parser.add_argument("--windows", type=int, default=24)
+    given = parser.parse_args()
+    form = fastest_form()
+    print(f"{form}, {given.threads} threads; ms at", *(f"{share:.0%}" for share in SHARES))
+    for name in given.names:
+        network = load(name)
+        for views, height, width, fps in SIZES:
+            size = {"positions": layout(views), "height": height, "width": width}
+            live = EventListRuntime(network, **size, threads=given.threads, form=form)
+            found = []
+            for share in SHARES:
+                live.reset()
+                played = windows(share, views, height, width, fps, given.windows)
+                found.append(f"{milliseconds(live, played, given.seconds):7.2f}")
+            print(f"{name}, {views} x {height}x{width} at {fps:.0f}/s:", *found, flush=True)
+
+
+if __name__ == "__main__":
+    main()
