@@ -59,7 +59,8 @@ class CompiledModule:
             "ENABLE_CPU_PINNING": False,
         }
         compiled = _core().compile_model(model, "CPU", options)
-        self.request, self.bound = compiled.create_infer_request(), None
+        self.request = compiled.create_infer_request()
+        self.bound: list[list[np.ndarray]] = []
         self.module = module  # whose weights it may read where they lie
         self.outputs = [(part.element_type, list(part.shape)) for part in compiled.outputs]
         self.starts = [(part.element_type, list(part.shape)) for part in compiled.inputs]
@@ -82,9 +83,9 @@ class CompiledModule:
 
     def run(self, inputs: list[np.ndarray], outputs: list[np.ndarray]) -> None:
         """Write the outputs of a module that takes no state: arrays, contiguous and float32."""
-        if self.bound is not inputs or self.bound_outputs is not outputs:
+        if not (self.bound and self.bound[0] is inputs and self.bound[1] is outputs):
             self._bind(map(_share, inputs), map(_share, outputs))
-            self.bound, self.bound_outputs = inputs, outputs
+            self.bound = [inputs, outputs]
         self.request.infer(share_outputs=True)
 
     def _bind(self, inputs: Iterable, outputs: Iterable) -> None:

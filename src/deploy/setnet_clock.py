@@ -104,8 +104,8 @@ class SetNetClock:
         smoothed, update = self._advance_context(longest_s, now, changed)
         kept = exp_float32(-longest_s / np.float32(CONTEXT_TAU_S))
         tiles = (np.argwhere(part).astype(np.int32) for part in (now.active_tiles, changed))
-        active, changed = tiles
-        return Tick(active, update, *smoothed, kept, changed)
+        active_tiles, changed_tiles = tiles
+        return Tick(active_tiles, update, *smoothed, kept, changed_tiles)
 
     def _advance(self, pixels: EventPixels, now: ClockState, changed: np.ndarray) -> np.float32:
         places, voxels, window_s = pixels

@@ -59,8 +59,7 @@ class ScaleLayers(nn.Module):
 
     def __init__(self, pyramid: ContextPyramid, scale: int, dtype: torch.dtype):
         super().__init__()
-        self.down = deepcopy(pyramid.downs[scale]).to(dtype)
-        self.down.padding = (0, 0)
+        self.down = unpadded(pyramid.downs[scale]).to(dtype)
         self.block, self.dtype = TileBlock(pyramid.down_blocks[scale]).to(dtype), dtype
 
     def forward(
@@ -122,13 +121,21 @@ class ContextLayers(FusionLayers):
         return channels_last(torch.lerp(new, channels_first(context), keep))
 
 
+def unpadded(conv: nn.Module) -> nn.Conv2d:
+    """Return a copy of a convolution that pads nothing."""
+    assert isinstance(conv, nn.Conv2d)
+    copied = deepcopy(conv)
+    copied.padding, copied.padding_mode = (0, 0), "zeros"
+    return copied
+
+
 class TileBlock(nn.Module):
     """A PreActivationBlock on tiles: what is outside the frame is zero before each convolution."""
 
-    def __init__(self, block: PreActivationBlock):
+    def __init__(self, block: nn.Module):
         super().__init__()
-        self.conv1, self.conv2 = deepcopy(block.conv1), deepcopy(block.conv2)
-        self.conv1.padding = self.conv2.padding = (0, 0)
+        assert isinstance(block, PreActivationBlock)
+        self.conv1, self.conv2 = unpadded(block.conv1), unpadded(block.conv2)
 
     def forward(
         self, x: Float[Tensor, "b c t t"], inside: Float[Tensor, "b 1 t t"]
@@ -143,19 +150,18 @@ class ContextTiles:
 
     def __init__(self, network: SetNet, dtype: torch.dtype, *how: Any):
         pyramid = network.context
-        widths = [down.out_channels for down in pyramid.downs]
+        widths = [c for c, *_ in pyramid.map_sizes(2, 2)[: len(pyramid.downs)]]
         if len(widths) < 2:
             raise ValueError(f"context_channels must be at least 2 for event lists, got {widths}")
         how = *how, CONTEXT_BATCHES
         inner, outer = CONTEXT_TILE + 2 * BLOCK_HALO, 2 * (CONTEXT_TILE + 2 * BLOCK_HALO) + 1
-        self.down, self.fuse = [], []
+        self.down, self.fuse = list[TileModule](), list[TileModule]()
         for scale, channels in enumerate([network.channels, *widths[:-1]]):
-            layers = ScaleLayers(pyramid, scale, dtype)
             shapes = [(outer, outer, channels), (inner, inner, 1)]
-            self.down.append(TileModule(layers, shapes, *how))
+            self.down.append(TileModule(ScaleLayers(pyramid, scale, dtype), shapes, *how))
         for scale, (finer, coarser) in enumerate(pairwise(widths)):
             layers = FusionLayers(pyramid, scale, dtype) if scale else ContextLayers(pyramid, dtype)
-            self.halo = np.int32(layers.halo)
+            self.halo = layers.halo
             side = CONTEXT_TILE + 2 * layers.halo
             shapes = [(side, side, n) for n in (finer, coarser, 1)]
             if not scale:
@@ -173,11 +179,13 @@ class ContextTiles:
         for scale in reversed(range(len(self.fuse))):
             self._fuse(scale, state, corners[scale], update)
 
-    def _make_scale(self, module, source, corners, cells, target) -> None:
+    def _make_scale(self, module: TileModule, source, corners, cells, target) -> None:
+        size = target.shape[:2]
+
         def read(part: slice, inputs: list[np.ndarray]) -> None:
             x, inside = inputs
             tiles_numba.gather(source, 2 * corners[part] - np.int32(2 * BLOCK_HALO + 1), x)
-            tiles_numba.mark_inside(*target.shape[:2], corners[part] - np.int32(BLOCK_HALO), inside)
+            tiles_numba.mark_inside(size, corners[part] - np.int32(BLOCK_HALO), inside)
 
         def write(part: slice, made: np.ndarray) -> None:
             tiles_numba.scatter(made, corners[part], cells, target)
@@ -187,13 +195,14 @@ class ContextTiles:
     def _fuse(self, scale, state, corners, update) -> None:
         finer, coarser = state.scales[scale], state.fused[scale + 1]
         target = state.fused[scale] if scale else state.context
-        rows, columns = map(interpolation_spans, coarser.shape[:2], finer.shape[:2])
+        size = finer.shape[:2]
+        rows, columns = map(interpolation_spans, coarser.shape[:2], size)
 
         def read(part: slice, inputs: list[np.ndarray]) -> None:
-            first = corners[part] - self.halo
+            first = corners[part] - np.int32(self.halo)
             tiles_numba.gather(finer, first, inputs[0])
             tiles_numba.gather_interpolated(coarser, rows, columns, first, inputs[1])
-            tiles_numba.mark_inside(*finer.shape[:2], first, inputs[2])
+            tiles_numba.mark_inside(size, first, inputs[2])
             if not scale:
                 tiles_numba.gather(state.context, corners[part], inputs[3])
                 tiles_numba.gather(update.recency[..., None], corners[part], inputs[4])

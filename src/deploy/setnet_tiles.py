@@ -42,7 +42,7 @@ class TileState:
         levels = len(network.context.downs)
         self.scales = [_zeros(size) for size in scales[:levels]]
         # The sums with coarser scales, by scale; the coarsest has none, the finest is not held.
-        self.fused = [None, *map(_zeros, reversed(scales[levels:])), self.scales[-1]]
+        self.fused: list[Any] = [None, *map(_zeros, reversed(scales[levels:])), self.scales[-1]]
         self.frame = np.full((height, width), start, np.float32)
 
 
@@ -160,11 +160,10 @@ class WholeFrame:
             return backend(module, [torch.zeros(1, *shape) for shape in shapes], threads)
 
         memory = MemoryLayers(network, positions, dtype, True)
-        mixtures = memory.kernel.shape[1]
-        shapes = (*near, c), (*near, mixtures), (*near, 1), (*near, c)
-        self.memory = compile_module(memory, *shapes)
-        shapes = (*near, c), (*far, c), (*far, 1), (*far, 1), *held
-        self.context = compile_module(WholeContext(network, dtype), *shapes)
+        given = [(*near, channels) for channels in (c, memory.kernel.shape[1], 1, c)]
+        self.memory = compile_module(memory, *given)
+        given = [(*near, c), (*far, c), (*far, 1), (*far, 1), *held]
+        self.context = compile_module(WholeContext(network, dtype), *given)
         self.decoder = compile_module(WholeDecoder(network, dtype), (*near, c), (*far, c))
         self.updated = [np.empty((1, *shape), np.float32) for shape in [(*far, c), *held]]
         self.pixels = np.empty((1, *far, (2 * CELL_PX) ** 2), np.float32)

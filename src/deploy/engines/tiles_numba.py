@@ -81,8 +81,9 @@ def gather_interpolated(source, row_spans, column_spans, corners, out):
 
 
 @njit(nogil=True, cache=True)
-def mark_inside(rows, columns, corners, out):
-    """Write 1 into the cells of the tiles that lie in a map of that size, 0 into the others."""
+def mark_inside(size, corners, out):
+    """Write 1 into the cells of the tiles that lie in a map of `size`, 0 into the others."""
+    rows, columns = size
     for i in range(len(corners)):
         for k in range(out.shape[1]):
             for q in range(out.shape[2]):
