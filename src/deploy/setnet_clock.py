@@ -110,9 +110,9 @@ class SetNetClock:
     def _advance(self, pixels: EventPixels, now: ClockState, changed: np.ndarray) -> np.float32:
         places, voxels, window_s = pixels
         kept = exp_float32(-window_s / np.float32(ACTIVITY_TAU_S))
-        seen = self.counts, now.trace, self.is_supported, self.near_tiles
+        seen = self.counts, now.trace, self.is_supported
         clock.mark_supported(places, voxels, kept, *seen)
-        clock.widen(self.is_supported, self.is_near)
+        clock.widen(self.is_supported, self.is_near, self.near_tiles)
         tiles = self.is_near, self.near_tiles, now.active_tiles
         cells = now.activity, now.elapsed_s, now.is_pending
         longest_s = clock.advance(window_s, kept, *tiles, *cells, now.pending_tiles, changed)

@@ -58,52 +58,53 @@ def fade(kept, values):
 
 
 @njit(nogil=True, cache=True)
-def mark_supported(places, grid, kept, counts, trace, is_supported, near_tiles):
-    """Bring `trace` (views, rows, columns) to the end of the window, set `is_supported` (rows,
-    columns) where a view has an event with support, and `near_tiles` where these reach.
-
-    `counts`: zeros, of the size of `trace`.
+def mark_supported(places, grid, kept, counts, trace, is_supported):
+    """Bring `trace` (views, rows, columns) to the end of the window, and set `is_supported` (rows,
+    columns), zeros, where a view has an event with support.  `counts`: zeros, as `trace`.
     """
+    views, rows, columns = trace.shape
     fade(kept, trace.reshape(-1))
-    cells, found = np.empty((len(places), 3), np.int32), 0
+    has, flat = np.zeros((views, rows + 2), u8), counts.reshape(-1)
     for k in range(len(places)):
         weight = f32(0)
         for b in range(grid.shape[1]):
             weight += abs(grid[k, b])
-        if weight > 0:
-            v, r, c = places[k, 0], places[k, 1] // SIDE, places[k, 2] // SIDE
-            if counts[v, r, c] == 0:
-                cells[found, 0], cells[found, 1], cells[found, 2] = v, r, c
-                found += 1
-            counts[v, r, c] += weight
-    for k in range(found):
-        v, r, c = cells[k]
-        trace[v, r, c] += counts[v, r, c]
-        counts[v, r, c] = 0
-    for k in range(found):
-        v, r, c = cells[k]
-        if not is_supported[r, c] and _has_support(trace[v], r, c):
-            is_supported[r, c] = 1
-            top, left = max(r - REACH, 0) // TILE, max(c - REACH, 0) // TILE
-            for i in range(top, min((r + REACH) // TILE + 1, len(near_tiles))):
-                for j in range(left, min((c + REACH) // TILE + 1, near_tiles.shape[1])):
-                    near_tiles[i, j] = 1
+        v, r = places[k, 0], places[k, 1] // SIDE
+        flat[np.uint64((v * rows + r) * columns + places[k, 2] // SIDE)] += weight
+        has[v, r + 1] = 1
+    line, nothing = np.zeros(columns + 2, f32), np.zeros(columns, f32)
+    for v in range(views):
+        for r in range(rows):
+            if has[v, r + 1]:
+                now, more = trace[v, r], counts[v, r]
+                for c in range(np.uint64(columns)):
+                    now[c] += more[c]
+        for r in range(rows):
+            if has[v, r + 1]:
+                above = trace[v, r - 1] if r else nothing
+                below = trace[v, r + 1] if r + 1 < rows else nothing
+                _mark_row(above, trace[v, r], below, counts[v, r], line, is_supported[r])
 
 
 @njit(nogil=True, cache=True)
-def _has_support(trace, r, c):
-    if trace[r, c] > f32(2) * SUPPORT:  # as its neighbours only add to it
-        return True
-    total = f32(0)
-    for i in range(max(r - 1, 0), min(r + 2, len(trace))):
-        for j in range(max(c - 1, 0), min(c + 2, trace.shape[1])):
-            total += trace[i, j]
-    return f32(9) * (total / f32(9)) > SUPPORT  # rounded as an average pooling is
+def _mark_row(above, here, below, count, total, is_supported):
+    # In the order, and rounded, as an average pooling of 3 x 3 adds them up.
+    n = np.uint64(here.size)
+    total[:] = 0
+    for row in (above, here, below):
+        for k in range(np.uint64(3)):
+            for c in range(n):
+                total[c + np.uint64(2) - k] += row[c]
+    for c in range(n):
+        has = count[c] > 0 and f32(9) * (total[c + np.uint64(1)] / f32(9)) > SUPPORT
+        is_supported[c] |= u8(1) if has else u8(0)
+        count[c] = 0
 
 
 @njit(nogil=True, cache=True)
-def widen(is_supported, is_near):
-    """Set `is_near` within REACH of `is_supported` in each direction, and clear the latter."""
+def widen(is_supported, is_near, near_tiles):
+    """Set `is_near` within REACH of `is_supported` in each direction, and `near_tiles` that have
+    any; clear `is_supported`."""
     rows, columns = is_near.shape
     has = np.zeros(rows + 2 * REACH, u8)
     for r in range(rows):
@@ -113,19 +114,21 @@ def widen(is_supported, is_near):
         has[r + REACH] = any_set
     line = np.zeros(columns + 2 * REACH, u8)
     for r in range(rows):
+        is_near[r] = 0
+        if not has[r : r + 2 * REACH + 1].any():
+            continue
         line[:] = 0
-        is_empty = True
         for k in range(-REACH, REACH + 1):
             if has[r + REACH + k]:
-                is_empty = False
                 for c in range(np.uint64(columns)):
                     line[c + np.uint64(REACH)] |= is_supported[r + k, c]
         near = is_near[r]
-        near[:] = 0
-        if not is_empty:
-            for k in range(np.uint64(2 * REACH + 1)):
-                for c in range(np.uint64(columns)):
-                    near[c] |= line[c + k]
+        for k in range(np.uint64(2 * REACH + 1)):
+            for c in range(np.uint64(columns)):
+                near[c] |= line[c + k]
+        for j in range(near_tiles.shape[1]):
+            for c in range(j * TILE, min((j + 1) * TILE, columns)):
+                near_tiles[r // TILE, j] |= near[c]
     for r in range(rows):
         if has[r + REACH]:
             is_supported[r] = 0
