@@ -84,6 +84,8 @@ ACTIVITY_TAU_S = 0.005  # decay of the event trace, and of the activity after th
 MIN_ACTIVITY = 0.25  # below which a cell stands still
 MIN_SUPPORT = 1.25  # events of a view in 3 x 3 cells within ACTIVITY_TAU_S, for one to count
 REACH_CELLS = 3  # from a supported event, to which cells are active
+STATIC_SHARE = 0.3  # of active cells, up to which the others stand still: a static camera
+MOVING_SHARE = 0.4  # from which on the clock of all cells advances: a moving camera
 SETTLING = math.exp(-2)  # context recency above which the context of a cell is still smoothed
 CONTEXT_INTERVAL_S = 1 / 30  # shortest time between two context updates
 UPDATE_RECENCY = math.exp(-0.98)  # an update is due at or below it: 0.98 intervals, for rounding
@@ -127,6 +129,13 @@ def advance_activity(
     elapsed_s = torch.where(is_near_events, window_s, activity * ACTIVITY_TAU_S * (1 - kept))
     activity = torch.where(is_near_events, 1.0, activity * kept)
     return elapsed_s, torch.where(activity < MIN_ACTIVITY, 0.0, activity)
+
+
+def pace_of_inactive_cells(activity: Float[Tensor, "n 1 h2 w2"]) -> Float[Tensor, "n 1 1 1"]:
+    """Return by what share of a window the clock of cells without activity advances: 0 up to
+    STATIC_SHARE of active cells, 1 from MOVING_SHARE on."""
+    share = (activity > 0).sum((2, 3), keepdim=True).float() / activity[0].numel()
+    return ((share - STATIC_SHARE) / (MOVING_SHARE - STATIC_SHARE)).clamp(0, 1)
 
 
 def find_active_cells(
@@ -265,6 +274,7 @@ class SetNet(EventToVideoNetwork):
         recency, cell_recency, ticks = state.update_recency, state.context_recency, []
         for is_near in near.split(len(activity)):
             elapsed_s, activity = advance_activity(is_near, seconds, activity)
+            elapsed_s = torch.maximum(elapsed_s, pace_of_inactive_cells(activity) * seconds)
             longest_s = elapsed_s.amax((2, 3), keepdim=True)
             kept_recency = torch.exp(-longest_s / CONTEXT_INTERVAL_S)
             recency, cell_recency = recency * kept_recency, cell_recency * kept_recency
