@@ -80,12 +80,16 @@ CELL_PX = 2  # a cell: CELL_PX x CELL_PX pixels, one place of the half-resolutio
 CELL_BORDER = 2  # padding, in cells, of the decoder's two 3 x 3 convolutions together
 REFERENCE_HZ = 120.0  # window rate in training; unit of time of rates and gates: 1 / REFERENCE_HZ
 SUM_TAUS_S = (0.05, 0.5)  # time constants of the leaky sums
-ACTIVITY_TAU_S = 0.005  # decay of the event trace, and of the activity after the last event
+ACTIVITY_TAU_S = 0.005  # decay of the activity after the last event
+TRACE_TAU_S = 0.01  # decay of the event trace
 MIN_ACTIVITY = 0.25  # below which a cell stands still
-MIN_SUPPORT = 1.25  # events of a view in 3 x 3 cells within ACTIVITY_TAU_S, for one to count
+MIN_SUPPORT = 1.5  # trace of a view in the 8 cells around an event, above which it is supported
 REACH_CELLS = 3  # from a supported event, to which cells are active
-STATIC_SHARE = 0.3  # of active cells, up to which the others stand still: a static camera
-MOVING_SHARE = 0.4  # from which on the clock of all cells advances: a moving camera
+STATIC_SHARE = 0.35  # of active cells, up to which the others stand still: a static camera
+MOVING_SHARE = 0.5  # from which on the clock of all cells advances: a moving camera
+REVEALING_EVENTS = 0.03  # supported events per cell so far, at which a frame is half the background
+REVEALING_S = 0.02  # the same in seconds of a moving camera
+BACKGROUND = 0.45  # brightness of what no event has revealed
 SETTLING = math.exp(-2)  # context recency above which the context of a cell is still smoothed
 CONTEXT_INTERVAL_S = 1 / 30  # shortest time between two context updates
 UPDATE_RECENCY = math.exp(-0.98)  # an update is due at or below it: 0.98 intervals, for rounding
@@ -97,8 +101,9 @@ class SetNetState(NamedTuple):
     """What is carried from window to window, float32; zeros before the first."""
 
     view_sums: Float[Tensor, "n views taus h2 w2"]  # leaky polarity sums, per view and cell
-    event_trace: Float[Tensor, "n views h2 w2"]  # events of a cell, decaying by ACTIVITY_TAU_S
+    event_trace: Float[Tensor, "n views h2 w2"]  # events of a cell, decaying by TRACE_TAU_S
     activity: Float[Tensor, "n 1 h2 w2"]  # clock speed: 1 near supported events, decaying without
+    evidence: Float[Tensor, "n 1 h2 w2"]  # supported events nearby so far, per cell and view
     is_pending: Float[Tensor, "n 1 h2 w2"]  # 1: was active since the last context update
     update_recency: Float[Tensor, "n 1 1 1"]  # exp(-age / CONTEXT_INTERVAL_S) of the last update
     context_recency: Float[Tensor, "n 1 h4 w4"]  # the same of each cell's own; 0: no context yet
@@ -111,6 +116,7 @@ class SetNetState(NamedTuple):
 class ClockTick(NamedTuple):
     """Clock of all windows (m = windows * n)."""
 
+    evidence: Float[Tensor, "m 1 h2 w2"]  # see SetNetState
     elapsed_s: Float[Tensor, "m 1 h2 w2"]  # time by which the state of a cell advances
     is_updated: Tensor  # (m, 1, h2, w2) bool: the context of the cell is updated
     context_recency: Float[Tensor, "m 1 h4 w4"]  # at the end of the window, before its update
@@ -138,14 +144,25 @@ def pace_of_inactive_cells(activity: Float[Tensor, "n 1 h2 w2"]) -> Float[Tensor
     return ((share - STATIC_SHARE) / (MOVING_SHARE - STATIC_SHARE)).clamp(0, 1)
 
 
-def find_active_cells(
+def find_supported_events(
     counts: Float[Tensor, "m views h2 w2"], trace: Float[Tensor, "m views h2 w2"]
-) -> Tensor:
+) -> Float[Tensor, "m 1 h2 w2"]:
+    """Return the number of events of each cell that others support, in the view that has most."""
+    support = 9 * functional.avg_pool2d(trace, 3, 1, 1) - trace
+    return (counts * (support > MIN_SUPPORT)).amax(1, keepdim=True)
+
+
+def find_active_cells(supported: Float[Tensor, "m 1 h2 w2"]) -> Tensor:
     """Return (m, 1, h2, w2) bool: cells within REACH_CELLS of a supported event of any view."""
-    support = 9 * functional.avg_pool2d(trace, 3, 1, 1)
-    is_supported = ((counts > 0) & (support > MIN_SUPPORT)).any(1, keepdim=True)
     size = 2 * REACH_CELLS + 1
-    return functional.max_pool2d(is_supported.float(), size, 1, REACH_CELLS) > 0
+    return functional.max_pool2d((supported > 0).float(), size, 1, REACH_CELLS) > 0
+
+
+def spread_evidence(supported: Float[Tensor, "m 1 h2 w2"]) -> Float[Tensor, "m 1 h2 w2"]:
+    """Return supported events smoothed over REACH_CELLS on each side."""
+    for _ in range(REACH_CELLS):
+        supported = functional.avg_pool2d(supported, 3, 1, 1)
+    return supported
 
 
 class SetNet(EventToVideoNetwork):
@@ -248,11 +265,14 @@ class SetNet(EventToVideoNetwork):
         smoothed, context_smoothed = scan_windows(
             smooth_context, before.context_smoothed, contexts, tick.smoothing_s
         )
+        evidence = tick.evidence
         if output_windows is not None:
-            features, smoothed = (
-                _select_windows(maps, n, output_windows) for maps in (features, smoothed)
+            features, smoothed, evidence = (
+                _select_windows(maps, n, output_windows) for maps in (features, smoothed, evidence)
             )
-        frames = functional.pixel_shuffle(self.decode_logits(features, smoothed), CELL_PX).sigmoid()
+        revealed = evidence / (evidence + REVEALING_EVENTS)
+        drawn = self.decode_logits(features, smoothed).sigmoid()
+        frames = functional.pixel_shuffle(BACKGROUND + revealed * (drawn - BACKGROUND), CELL_PX)
         frames = frames[..., top : top + height, left : left + width]
         frames = frames.unflatten(0, (-1, n)).transpose(0, 1)
         return frames, SetNetState(view_sums, *clock, hidden, scales, context, context_smoothed)
@@ -267,14 +287,18 @@ class SetNet(EventToVideoNetwork):
         A context update is due if the clock advances anywhere and the last is CONTEXT_INTERVAL_S
         old or missing; it reaches the cells that were active since the one before.
         """
-        kept = torch.exp(-seconds / ACTIVITY_TAU_S)
+        kept = torch.exp(-seconds / TRACE_TAU_S)
         traces, trace = scan_windows(lambda old, new: kept * old + new, state.event_trace, counts)
-        near = find_active_cells(counts, traces)
-        activity, pending = state.activity, state.is_pending
+        supported = find_supported_events(counts, traces)
+        near, gain = find_active_cells(supported), spread_evidence(supported)
+        activity, evidence, pending = state.activity, state.evidence, state.is_pending
         recency, cell_recency, ticks = state.update_recency, state.context_recency, []
-        for is_near in near.split(len(activity)):
+        n = len(activity)
+        for is_near, more in zip(near.split(n), gain.split(n), strict=True):
             elapsed_s, activity = advance_activity(is_near, seconds, activity)
-            elapsed_s = torch.maximum(elapsed_s, pace_of_inactive_cells(activity) * seconds)
+            moving_s = pace_of_inactive_cells(activity) * seconds
+            elapsed_s = torch.maximum(elapsed_s, moving_s)
+            evidence = evidence + more + REVEALING_EVENTS / REVEALING_S * moving_s
             longest_s = elapsed_s.amax((2, 3), keepdim=True)
             kept_recency = torch.exp(-longest_s / CONTEXT_INTERVAL_S)
             recency, cell_recency = recency * kept_recency, cell_recency * kept_recency
@@ -283,11 +307,11 @@ class SetNet(EventToVideoNetwork):
             is_updated = due & (pending > 0)
             coarse = _any_of_cells(pending)
             smoothing_s = longest_s * ((coarse > 0) | (cell_recency > SETTLING))
-            ticks.append(ClockTick(elapsed_s, is_updated, cell_recency, smoothing_s))
+            ticks.append(ClockTick(evidence, elapsed_s, is_updated, cell_recency, smoothing_s))
             cell_recency = torch.where(due & (coarse > 0), 1.0, cell_recency)
             recency, pending = torch.where(due, 1.0, recency), torch.where(due, 0.0, pending)
         tick = ClockTick(*map(torch.cat, zip(*ticks, strict=True)))
-        return tick, (trace, activity, pending, recency, cell_recency)
+        return tick, (trace, activity, evidence, pending, recency, cell_recency)
 
     def stem(
         self,
@@ -379,7 +403,7 @@ class SetNet(EventToVideoNetwork):
         zeros = SetNetState(
             cells.new_zeros(n, views, len(SUM_TAUS_S), *half),
             cells.new_zeros(n, views, *half),
-            *(cells.new_zeros(n, 1, *half) for _ in range(2)),
+            *(cells.new_zeros(n, 1, *half) for _ in range(3)),
             cells.new_zeros(n, 1, 1, 1),
             cells.new_zeros(n, 1, *quarter),
             cells.new_zeros(n, *maps[0]),
