@@ -13,7 +13,7 @@ from src.app import entry_point
 from src.figures import comparison, slices
 from src.metrics import slice_motion
 from src.recordings import camera_frames
-from src.recordings.files import sources
+from src.recordings.files import videos
 from src.records import results
 
 NOTES = {
@@ -41,7 +41,8 @@ def compare(cfg: DictConfig) -> dict:
     names = list(cfg.names or [Path(path).parent.name for path in cfg.videos])
     if len(names) != len(cfg.videos):
         raise ValueError(f"names must be one per video, got {len(names)} for {len(cfg.videos)}")
-    films = [np.stack(list(sources.read_video(path)))[cfg.first : cfg.last] for path in cfg.videos]
+    read = (np.stack(list(videos.read_video(path, "videos"))) for path in cfg.videos)
+    films = [film[cfg.first : cfg.last] for film in read]
     given = {name: cfg[name] for name in slices.KINDS if cfg[name]}
     if len(given) != 1:
         raise ValueError(f"give one of line, circle, spin and still, got {given or 'none'}")
@@ -56,9 +57,13 @@ def compare(cfg: DictConfig) -> dict:
         if cfg.still:
             scores[name] = slice_motion.measure_static_scene(film, cfg.still)
         else:
-            scores[name] = slice_motion.measure_slice_motion(across, next(iter(given)), cfg.follow)
-        if cfg.camera:
-            scores[name] |= camera_frames.compare_with_camera(Path(path), Path(cfg.camera))
+            scores[name] = slice_motion.measure_slice_motion(
+                across, next(iter(given)), cfg.moving_thing
+            )
+        if cfg.reference_images:
+            scores[name] |= camera_frames.score_against_camera(
+                Path(path), Path(cfg.reference_images)
+            )
         notes = [NOTES[measure].format(value) for measure, value in scores[name].items()]
         rows.append(comparison.VideoRow(name, film, across, "\n".join(notes)))
     comparison.draw_comparison(

@@ -26,7 +26,7 @@ from src.models.setnet import SetNet
 from src.records.results import ScoreRow
 from src.sim.optics import Optics
 from src.training import evaluation
-from src.training.cached_pipeline import CachedPipeline
+from src.training.clip_cache import CachedPipeline
 from src.training.datamodule import LightFieldData
 from src.training.disk_cache import BackgroundFiller, DiskClipCache
 from src.training.ema import WeightEMA
@@ -110,7 +110,7 @@ def load_network(cfg: DictConfig) -> VideoMethod:
     raise ValueError("ckpt or baseline must name a network, got neither")
 
 
-def build_method(cfg: DictConfig) -> VideoMethod:
+def build_video_method(cfg: DictConfig) -> VideoMethod:
     """Return the network of `load_network`, with the backward warm-up and the frame post-processor
     that the config asks for.
     """

@@ -1,8 +1,4 @@
-"""The first layer of a network as events make it, one by one, and what else it adds up of them.
-
-A convolution is linear: an event adds the part of the kernel that reaches from where it fell, its
-patch, to the map.
-"""
+"""The first layer of a network as events make it (engines/events_numba.py), and other sums."""
 
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -98,7 +94,7 @@ class SetNetEventFirstLayer(EventFirstLayer):
         sums, mixed = np.empty_like(sums_before), np.empty_like(mixed_before)
         kernels.leak(*leak, new, sums_before, sums)
         kernels.leak_mixtures(*leak, p, view, cells, self.code, mixed_before[0], mixed[0])
-        kernels.write_spread(self.taus_s.size, sums, mixed[0])
+        kernels.write_view_deviation(self.taus_s.size, sums, mixed[0])
         self.state = sums, mixed, np.array(clock, np.float32)
         times = (np.full((1, 1, 1, 1), one, np.float32) for one in tick[:2])
         return [mixed, *times, np.array(tick.update_due)]

@@ -4,7 +4,8 @@ Maps come channels last, as events are added to them; `kernel`, `bias`, `stride`
 what the first layer is.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,8 +14,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils import _pytree as pytree
 
+from src.deploy.cost import torch_threads
 from src.models.e2vid import E2VID
-from src.models.layers import EqualDCConv, bias_of
+from src.models.layers import EqualDCConv, require_bias
 from src.models.setnet import CELL_PX, SetNet, TimeGatedMemory, smooth_context
 from src.sim.optics import Position
 
@@ -30,18 +32,15 @@ class E2VIDRemainder(nn.Module):
         dtype: torch.dtype,
     ):
         super().__init__()
-        if len(positions) != network.views:
-            raise ValueError(
-                f"optics.views must be {network.views} for this network, got {len(positions)}"
-            )
-        self.views, self.stride = network.views, 1
+        if (given := len(positions)) != (views := network.views):
+            raise ValueError(f"optics.views must be {views} for this network, got {given}")
+        self.views, self.stride = views, 1
         self.kernel, self.bias = (part.float().numpy() for part in network.first_layer.parameters())
         self.network, self.dtype = network.to(dtype), dtype
         with torch.no_grad():
             head = self._to_first(torch.zeros(1, *padded, len(self.kernel)))
-            leaves, self.structure = pytree.tree_flatten(
-                self.network.after_first_layer(head, None)[1]
-            )
+            _, state = self.network.after_first_layer(head, None)
+        leaves, self.structure = pytree.tree_flatten(state)
         self.initial_state = [torch.zeros_like(leaf) for leaf in leaves]
 
     def forward(self, head: Float[Tensor, "1 h w c"], *state: Tensor) -> tuple[Tensor, ...]:
@@ -67,7 +66,7 @@ class SetNetRemainder(nn.Module):
         super().__init__()
         self.views, self.stride = len(positions), CELL_PX
         places = network.checked_positions(self.views, network.bins, positions)
-        kernel, _, bias = network.stem_kernels(places)
+        kernel, _, bias = network.stem_kernels_and_bias(places)
         self.kernel, self.bias = kernel.numpy(), bias.numpy()
         # Of the sums only as many mixtures are convolved as their kernels have basis kernels.
         code, basis = network.sum_kernels.factors(torch.tensor(places).float())
@@ -97,18 +96,15 @@ class SetNetRemainder(nn.Module):
         features, hidden = self.network.run_memory(stem, hidden, elapsed_s)
         pyramid = self.network.context
         new = pyramid(features).float()
-        context = channels_last(
-            pyramid.moving_average(channels_first(context), new, context_recency)
-        )
+        average = pyramid.moving_average(channels_first(context), new, context_recency)
+        context = channels_last(average)
         pixels, smoothed = self.pixels(features, context, context_smoothed, elapsed_s)
         return pixels, hidden, context, smoothed
 
     def stem(self, voxel_map: Tensor, mixtures: Tensor) -> Tensor:
         """Return SetNet's stem, before its ReLU."""
-        voxel_map, mixtures = (
-            channels_first(part.to(self.dtype)) for part in (voxel_map, mixtures)
-        )
-        return voxel_map + functional.conv2d(mixtures, self.mixture_kernel, None, 1, 1)
+        own, mixed = (channels_first(part.to(self.dtype)) for part in (voxel_map, mixtures))
+        return own + functional.conv2d(mixed, self.mixture_kernel, None, 1, 1)
 
     def pixels(
         self, features: Tensor, context: Tensor, smoothed: Tensor, elapsed_s: Tensor
@@ -138,15 +134,14 @@ class SetNetRemainderWithoutContext(nn.Module):
 
 class SplitTimeGatedMemory(nn.Module):
     """A TimeGatedMemory for one window: gate and candidate come from convolutions of their own, as
-    splitting a map in two costs as much as a convolution, and the state stays channels last, as
-    convolutions take maps.
+    splitting a map costs as much, and the state stays channels last.
     """
 
     def __init__(self, memory: TimeGatedMemory):
         super().__init__()
         self.input_features = memory.input_features
         self.input_gates = nn.ParameterList(memory.input_gates.weight.chunk(2))
-        self.bias = nn.ParameterList(bias_of(memory.input_gates).chunk(2))
+        self.bias = nn.ParameterList(require_bias(memory.input_gates).chunk(2))
         self.state_gates = nn.ParameterList(memory.state_gates.weight.chunk(2))
 
     def forward(
@@ -186,15 +181,69 @@ class TwoByTwoCellConv(nn.Module):
         self.bias = nn.Parameter(bias[0].repeat(width**2))
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n pixels _h _w"]:
-        """Return the maps of all pixels of 2 x 2 cells."""
         return functional.conv2d(x, self.weight, self.bias, 2)
 
 
+class StatefulRunner:
+    """Runs the remaining layers window by window and keeps their state.
+
+    `inputs`: an example; `backend`: EagerBackend or CompiledModule of OpenVINO.
+    """
+
+    def __init__(
+        self,
+        remainder: E2VIDRemainder | SetNetRemainder,
+        inputs: list[np.ndarray],
+        backend: Callable[[nn.Module, list[Tensor], int], Any],
+        threads: int,
+    ):
+        given, state = [*map(torch.from_numpy, inputs)], remainder.initial_state
+        self.without_context_update = None
+        if isinstance(remainder, SetNetRemainder):
+            given.pop()  # whether an update is due
+            reduced = SetNetRemainderWithoutContext(remainder)
+            self.without_context_update = backend(reduced, [*given[:-1], *state], threads)
+        self.whole = backend(remainder, [*given, *state], threads)
+        self.inputs, self.state = len(given), list[Any]()
+        self.reset()
+
+    def __call__(self, inputs: list[np.ndarray]) -> np.ndarray:
+        if self.without_context_update is None:
+            output, *self.state = self.whole(inputs, self.state)
+            return output
+        *given, recency, update_due = inputs
+        if update_due.any():
+            output, *self.state = self.whole([*given, recency], self.state)
+        else:
+            _, context, _ = self.state
+            output, hidden, smoothed = self.without_context_update(given, self.state)
+            self.state = [hidden, context, smoothed]
+        return output
+
+    def reset(self) -> None:
+        self.state = self.whole.zeros(self.inputs)
+
+
+class EagerBackend:
+    """A module on PyTorch: arrays and a state in, an array and a state out."""
+
+    def __init__(self, module: nn.Module, example: list[Tensor], threads: int):
+        self.module = module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.example, self.threads = example, threads
+
+    @torch.inference_mode()
+    def __call__(self, inputs: list[np.ndarray], state: list[Tensor]) -> list:
+        with torch_threads(self.threads):
+            output, *state = self.module(*map(torch.from_numpy, inputs), *state)
+        return [output.numpy(), *state]
+
+    def zeros(self, first: int) -> list[Tensor]:
+        return [torch.zeros_like(part) for part in self.example[first:]]
+
+
 def channels_first(x: Float[Tensor, "n h w c"]) -> Float[Tensor, "n c h w"]:
-    """Return a view of `x`."""
     return x.permute(0, 3, 1, 2)
 
 
 def channels_last(x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n h w c"]:
-    """Return a view of `x`."""
     return x.permute(0, 2, 3, 1)

@@ -12,6 +12,8 @@ from src.metrics.image import Frames, FrameValues, ssim
 from src.metrics.lpips import LPIPS
 
 Sequences = Float[Tensor, "n windows 1 h w"]
+Mask = Bool[Tensor, " windows-1"]
+Value = Float[Tensor, ""]
 
 STATIC_CHANGE = 1 / 512  # half a grey level: a target that changes by less is static
 FRAMES_AT_A_TIME = {"cpu": 32, "cuda": 256}  # that losses are computed of
@@ -71,22 +73,16 @@ class LPIPSTerm(FrameTerm):
 class TemporalConsistency(SequenceTerm):
     """Mean absolute change of the error from one window to the next."""
 
-    def forward(
-        self, frames: Sequences, target: Sequences, is_consecutive: Bool[Tensor, " windows-1"]
-    ) -> Float[Tensor, ""]:
+    def forward(self, frames: Sequences, target: Sequences, is_consecutive: Mask) -> Value:
         return (frames - target).diff(dim=1)[:, is_consecutive].abs().mean()
 
 
 class StaticFlicker(SequenceTerm):
-    """Mean absolute change of a frame where the target is static, relative to its contrast.
-
-    Without the contrast a fainter frame would cost less: an edge that is half as dark and changes
-    half as much moves as far.
+    """Mean absolute change of a frame where the target is static, relative to its contrast (else a
+    fainter frame would cost less).
     """
 
-    def forward(
-        self, frames: Sequences, target: Sequences, is_consecutive: Bool[Tensor, " windows-1"]
-    ) -> Float[Tensor, ""]:
+    def forward(self, frames: Sequences, target: Sequences, is_consecutive: Mask) -> Value:
         change = frames.diff(dim=1)[:, is_consecutive].abs()
         is_static = target.diff(dim=1)[:, is_consecutive].abs() < STATIC_CHANGE
         contrast = (frames.var((-2, -1), keepdim=True) + CONTRAST_FLOOR**2).sqrt()
@@ -143,7 +139,7 @@ class TrainingLoss(nn.Module):
         target: Sequences,
         windows: list[int],
         teacher_frames: Sequences | None = None,
-    ) -> tuple[Float[Tensor, ""], Sequences]:
+    ) -> tuple[Value, Sequences]:
         """Return the mean loss of frames and its gradient with respect to them.
 
         `windows`: the number of each window in its sequence.  A few frames are computed at a time,

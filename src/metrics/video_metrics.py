@@ -4,14 +4,13 @@ import math
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 from torchmetrics import MeanMetric, Metric, MetricCollection
 
 from src.metrics.image import aligned_psnr, psnr, ssim
 from src.metrics.lpips import LPIPS
-from src.metrics.temporal import temporal_jitter_px
+from src.metrics.temporal import Video, temporal_jitter_px
 
 SCORES = {  # name in table.py: a value per frame, or per step from a frame to the next
     "psnr": psnr,
@@ -31,9 +30,7 @@ class ClipMean(MeanMetric):
         # In a tuple: the parameters of a network that scores are no part of a checkpoint.
         self._score = (score,)
 
-    def update(  # type: ignore[override]
-        self, frames: Float[Tensor, "frames 1 h w"], target: Float[Tensor, "frames 1 h w"]
-    ) -> None:
+    def update(self, frames: Video, target: Video) -> None:  # type: ignore[override]
         (score,) = self._score
         if isinstance(score, LPIPS):
             score.to(frames.device)
@@ -59,9 +56,7 @@ class VideoMetrics(MetricCollection):
         self.scale = scale
 
     @torch.no_grad()
-    def forward(
-        self, frames: Float[Tensor, "frames 1 h w"], target: Float[Tensor, "frames 1 h w"]
-    ) -> dict[str, float]:
+    def forward(self, frames: Video, target: Video) -> dict[str, float]:
         """Add a clip; return its scores by name."""
         frames = self._resample(frames.float().clamp(0, 1))
         values = super().forward(frames, self._resample(target))

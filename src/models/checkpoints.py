@@ -29,7 +29,7 @@ def is_intact(path: Path) -> bool:
     PyTorch's own reader does not look at them: a flipped bit would go unnoticed.
     """
     try:
-        if is_compressed(path):
+        if is_compressed_zip(path):
             return False
         with zipfile.ZipFile(path) as archive:
             return archive.testzip() is None
@@ -37,7 +37,7 @@ def is_intact(path: Path) -> bool:
         return False
 
 
-def is_compressed(path: Path) -> bool:
+def is_compressed_zip(path: Path) -> bool:
     """Return whether a zip file gives more bytes than it has, as none does that PyTorch wrote: it
     packs nothing, and a small file that is packed could fill the memory.
     """

@@ -56,11 +56,10 @@ from torch.nn import functional
 from src.models.layers import (
     EqualDCConv,
     PreActivationBlock,
-    bias_of,
     init_kaiming,
     init_zero,
-    pad_to_multiple,
-    upsample_nearest,
+    pad_centred_to_multiple,
+    require_bias,
 )
 from src.models.network import EventToVideoNetwork
 from src.models.time_gated_update import TimeGatedUpdate, time_gated_update
@@ -87,6 +86,10 @@ CONTEXT_TAU_S = 1 / 60  # time constant of the low-pass on the context
 INITIAL_CONTEXT_RATE = 0.9  # initial decay rate of the moving average, per CONTEXT_INTERVAL_S
 
 
+Context = Float[Tensor, "n c h4 w4"]
+Maps = Float[Tensor, "m c h2 w2"]
+
+
 class SetNetState(NamedTuple):
     """What is carried from window to window, float32; zeros before the first."""
 
@@ -94,8 +97,8 @@ class SetNetState(NamedTuple):
     activity: Float[Tensor, "n 1 1 1"]  # clock speed: 1 with events, decaying without
     context_recency: Float[Tensor, "n 1 1 1"]  # exp(-age / CONTEXT_INTERVAL_S); 0: no context yet
     hidden: Float[Tensor, "n c h2 w2"]  # memory, in [-1, 1]
-    context_average: Float[Tensor, "n c h4 w4"]  # moving average of the pyramid's output
-    context_smoothed: Float[Tensor, "n c h4 w4"]  # the same, low-pass filtered in time
+    context_average: Context  # moving average of the pyramid's output
+    context_smoothed: Context  # the same, low-pass filtered in time
 
 
 class ClockTick(NamedTuple):
@@ -179,13 +182,10 @@ class SetNet(EventToVideoNetwork):
     ) -> tuple[Float[Tensor, "n 1 h w"], SetNetState]:
         """Return the frame at the end of the window, in [0, 1], float32, and the state.
 
-        `window_s`: the length of the window in seconds, a number or one per clip (n,).
-        `positions`: (row, col) of each view from the centre view; None: `optics.layout`.  Raises
-        ValueError for bins, a number of views, a window length or a state that do not fit.
+        Raises ValueError for bins, a number of views, a window length or a state that do not fit.
         """
-        frames, state = self.sequence(
-            voxels[:, None], state, window_s=window_s, positions=positions
-        )
+        window = voxels[:, None]
+        frames, state = self.sequence(window, state, window_s=window_s, positions=positions)
         return frames[:, 0], state
 
     def sequence(
@@ -205,14 +205,18 @@ class SetNet(EventToVideoNetwork):
         n, windows, views, bins, height, width = voxels.shape
         where = self.checked_positions(views, bins, positions)
         seconds = _durations(window_s, voxels)
-        padded, (top, left) = pad_to_multiple(voxels.flatten(0, 2), 8)
+        padded, (top, left) = pad_centred_to_multiple(voxels.flatten(0, 2), 8)
         voxels = padded.unflatten(0, (n, windows, views)).transpose(0, 1)
-        cells = _sum_cells(voxels.float().sum(3).flatten(0, 1))
+        pixels = voxels.float().sum(3).flatten(0, 1)
+        rows = pixels[..., ::2, :] + pixels[..., 1::2, :]  # avg_pool2d is slower on a CPU
+        cells = rows[..., ::2] + rows[..., 1::2]
         before = self._checked_state(state, cells[:n])
 
         tick, activity, recency = _run_clock(cells, seconds, before)
         decay = torch.stack([torch.exp(-tick.elapsed_s / tau) for tau in SUM_TAUS_S], 2)
-        sums, view_sums = scan_windows(_leaky_sum, before.view_sums, decay, cells[:, :, None])
+        sums, view_sums = scan_windows(
+            lambda sums, decay, new: decay * sums + new, before.view_sums, decay, cells[:, :, None]
+        )
         stem = self.stem(voxels, sums, seconds, where)
         features, hidden = self.run_memory(stem, before.hidden, tick.elapsed_s)
         contexts, context = self.average_context(features, before.context_average, tick)
@@ -220,14 +224,15 @@ class SetNet(EventToVideoNetwork):
             smooth_context, before.context_smoothed, contexts, tick.elapsed_s
         )
         if output_windows is not None:
+            index = _to_device(tuple(output_windows), features.device)
             features, smoothed = (
-                _select_windows(maps, n, output_windows) for maps in (features, smoothed)
+                maps.unflatten(0, (-1, n)).index_select(0, index).flatten(0, 1)
+                for maps in (features, smoothed)
             )
         frames = functional.pixel_shuffle(self.decode_logits(features, smoothed), CELL_PX).sigmoid()
         frames = frames[..., top : top + height, left : left + width]
-        frames = frames.unflatten(0, (-1, n)).transpose(0, 1)
         after = view_sums, activity, recency, hidden, context, context_smoothed
-        return frames, SetNetState(*after)
+        return frames.unflatten(0, (-1, n)).transpose(0, 1), SetNetState(*after)
 
     def stem(
         self,
@@ -235,9 +240,9 @@ class SetNet(EventToVideoNetwork):
         view_sums: Float[Tensor, "m views taus h2 w2"],
         seconds: Float[Tensor, "_n 1 1 1"],
         positions: tuple[Position, ...],
-    ) -> Float[Tensor, "m c h2 w2"]:
+    ) -> Maps:
         """Return the sum of the three first convolutions, before the ReLU."""
-        voxel_kernel, sum_kernel, bias = self.stem_kernels(positions)
+        voxel_kernel, sum_kernel, bias = self.stem_kernels_and_bias(positions)
         spread = (view_sums - view_sums.mean(1, keepdim=True)).abs().mean(1)
         stacked = _as_conv_input(voxels.flatten(2, 3), voxel_kernel.dtype)
         counts = functional.conv2d(
@@ -245,18 +250,20 @@ class SetNet(EventToVideoNetwork):
         )
         sums = torch.cat([view_sums.flatten(1, 2), spread], 1)
         sums = _as_conv_input(sums[None], sum_kernel.dtype)
-        return _as_rates(counts, seconds) + functional.conv2d(sums, sum_kernel, bias, 1, 1)
+        scale = 1 / (REFERENCE_HZ * seconds)  # to counts per 1 / REFERENCE_HZ
+        rates = counts * scale.repeat(len(counts) // len(scale), 1, 1, 1).to(counts.dtype)
+        return rates + functional.conv2d(sums, sum_kernel, bias, 1, 1)
 
     def run_memory(
-        self, stem: Float[Tensor, "m c h2 w2"], hidden: Tensor, elapsed_s: Float[Tensor, "m 1 1 1"]
-    ) -> tuple[Float[Tensor, "m c h2 w2"], Tensor]:
+        self, stem: Maps, hidden: Tensor, elapsed_s: Float[Tensor, "m 1 1 1"]
+    ) -> tuple[Maps, Tensor]:
         """Return the hidden map after each window, in the type of `stem`, and after the last."""
         features, hidden = self.memory(self.relu(stem), hidden, REFERENCE_HZ * elapsed_s)
         return features.to(stem.dtype), hidden
 
     def average_context(
-        self, features: Float[Tensor, "m c h2 w2"], context: Tensor, tick: ClockTick
-    ) -> tuple[Float[Tensor, "m c h4 w4"], Float[Tensor, "n c h4 w4"]]:
+        self, features: Maps, context: Tensor, tick: ClockTick
+    ) -> tuple[Float[Tensor, "m c h4 w4"], Context]:
         """Return the moving average after each window and after the last, float32."""
         if len(features) == len(context) or features.is_cuda:
             # Shapes that depend on data cannot be exported and would synchronise a GPU: run on all.
@@ -272,13 +279,16 @@ class SetNet(EventToVideoNetwork):
         return scan_windows(step, context, new, tick.context_recency, tick.update_due)
 
     def decode_logits(
-        self, features: Float[Tensor, "m c h2 w2"], context: Float[Tensor, "m c h4 w4"]
+        self, features: Maps, context: Float[Tensor, "m c h4 w4"]
     ) -> Float[Tensor, "m pixels _h2 _w2"]:
         """Return the logits of the pixels of each cell, as channels, float32."""
-        x = self.relu(upsample_nearest(context.to(features.dtype), 2) + features)
+        coarse = functional.interpolate(context.to(features.dtype), scale_factor=2, mode="nearest")
+        x = self.relu(coarse + features)
         return self.pixel_conv(self.relu(self.decoder_conv(x))).float()
 
-    def stem_kernels(self, positions: tuple[Position, ...]) -> tuple[Tensor, Tensor, Tensor]:
+    def stem_kernels_and_bias(
+        self, positions: tuple[Position, ...]
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Return the kernels of stacked voxels (c, views * bins, 5, 5) and of stacked sums and
         their spread (c, views * taus + taus, 3, 3), for views at `positions`, and the bias (c,).
         """
@@ -380,14 +390,11 @@ class TimeGatedMemory(nn.Module):
         self.input_gates = nn.Conv2d(inputs, 2 * channels, size, padding=size // 2)
         self.state_gates = nn.Conv2d(channels, 2 * channels, 1, bias=False)
         with torch.no_grad():  # initial time constants of 1.4 to 20 windows of 1/120 s
-            bias_of(self.input_gates)[:channels].copy_(torch.linspace(0.05, 0.7, channels))
+            require_bias(self.input_gates)[:channels].copy_(torch.linspace(0.05, 0.7, channels))
 
     def forward(
-        self,
-        x: Float[Tensor, "m c h w"],
-        state: Float[Tensor, "n c h w"],
-        elapsed: Float[Tensor, "m 1 1 1"],
-    ) -> tuple[Float[Tensor, "m c h w"], Float[Tensor, "n c h w"]]:
+        self, x: Maps, state: Float[Tensor, "n c h2 w2"], elapsed: Float[Tensor, "m 1 1 1"]
+    ) -> tuple[Maps, Float[Tensor, "n c h2 w2"]]:
         """Return the state, float32, after each of m = windows * n steps and after the last."""
         update = TimeGatedUpdate.apply if torch.is_grad_enabled() else time_gated_update
 
@@ -421,7 +428,7 @@ class ContextPyramid(nn.Module):
         initial = torch.full((channels, 1, 1), math.log(INITIAL_CONTEXT_RATE))
         self.log_rate = nn.Parameter(initial)  # log decay rate of the moving average, per channel
 
-    def forward(self, x: Float[Tensor, "n c h2 w2"]) -> Float[Tensor, "n c h4 w4"]:
+    def forward(self, x: Float[Tensor, "n c h2 w2"]) -> Context:
         """Return a map of half the size of `x`."""
         scales = []
         for down, block in zip(self.downs, self.down_blocks, strict=True):
@@ -434,13 +441,8 @@ class ContextPyramid(nn.Module):
             x = block(finer + coarser)
         return self.ups[0](self.relu(x))
 
-    def moving_average(
-        self,
-        before: Float[Tensor, "n c h4 w4"],
-        new: Float[Tensor, "n c h4 w4"],
-        recency: Float[Tensor, "n 1 1 1"],
-    ) -> Float[Tensor, "n c h4 w4"]:
-        """Return the moving average with `new`; `recency`: exp(-age / interval) of `before`."""
+    def moving_average(self, before: Context, new: Context, recency: Tensor) -> Context:
+        """Return the moving average with `new`; `recency` (n, 1, 1, 1): exp(-age / interval)."""
         return torch.lerp(new, before, recency ** self.log_rate.float().exp())
 
 
@@ -462,10 +464,6 @@ def smooth_context(smoothed: Tensor, context: Tensor, elapsed_s: Tensor) -> Tens
     return torch.lerp(context, smoothed, torch.exp(-elapsed_s / CONTEXT_TAU_S))
 
 
-def _leaky_sum(sums: Tensor, decay: Tensor, new: Tensor) -> Tensor:
-    return decay * sums + new
-
-
 def _run_clock(
     cells: Float[Tensor, "m views h2 w2"], seconds: Tensor, state: SetNetState
 ) -> tuple[ClockTick, Tensor, Tensor]:
@@ -477,12 +475,6 @@ def _run_clock(
     return ClockTick(*map(torch.cat, zip(*ticks, strict=True))), activity, recency
 
 
-def _sum_cells(x: Float[Tensor, "m views h w"]) -> Float[Tensor, "m views h2 w2"]:
-    """Return the sums of 2 x 2 pixels, several times faster than avg_pool2d on a CPU."""
-    rows = x[..., ::2, :] + x[..., 1::2, :]
-    return rows[..., ::2] + rows[..., 1::2]
-
-
 def _durations(window_s: float | Tensor, voxels: Tensor) -> Float[Tensor, "_n 1 1 1"]:
     """Return the length of the window, in seconds, one for each clip or for all."""
     if isinstance(window_s, Tensor):
@@ -490,12 +482,6 @@ def _durations(window_s: float | Tensor, voxels: Tensor) -> Float[Tensor, "_n 1 
     if not 0 < window_s < math.inf:
         raise ValueError(f"window_s must be > 0 seconds, got {window_s}")
     return torch.full((1, 1, 1, 1), window_s, device=voxels.device)
-
-
-def _as_rates(counts: Float[Tensor, "m c h w"], seconds: Tensor) -> Float[Tensor, "m c h w"]:
-    """Return counts per window as counts per 1 / REFERENCE_HZ seconds."""
-    scale = 1 / (REFERENCE_HZ * seconds)
-    return counts * scale.repeat(len(counts) // len(scale), 1, 1, 1).to(counts.dtype)
 
 
 def _as_conv_input(
@@ -514,12 +500,6 @@ def _as_conv_input(
     )
     maps.unflatten(0, (windows, n)).copy_(x)
     return maps
-
-
-def _select_windows(maps: Tensor, n: int, windows: Sequence[int]) -> Tensor:
-    """Return the entries of `maps` (m, ...) that belong to `windows`."""
-    index = _to_device(tuple(windows), maps.device)
-    return maps.unflatten(0, (-1, n)).index_select(0, index).flatten(0, 1)
 
 
 @lru_cache(maxsize=64)

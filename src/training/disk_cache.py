@@ -1,8 +1,7 @@
 """The pre-simulated turbulence cache on a disk, shared by all trainings whose clips are the same.
 
 A clip is one file in float16, renamed into place when it is complete, with PyTorch's checksums.
-While a process simulates it, its byte of a lock file is locked; the system unlocks it when the
-process ends, however it ends.
+While a process simulates it, its byte of a lock file is locked by the system.
 """
 
 import ast
@@ -23,15 +22,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 import src.sim
 from src.models.checkpoints import AtomicCheckpointIO, is_intact
 from src.records.atomic import write_text
-from src.sim.pipeline import Pipeline, crop_frames
-from src.training import clip_cache
-from src.training.clip_cache import GIB, CachedClip, CachedDraw, ClipCache, simulate_clip
+from src.sim.pipeline import Pipeline
+from src.training.clip_cache import GIB, CachedClip, ClipCache, simulate_clip
 
 INPUTS_FILE = "inputs.json"
 DOWNSTREAM = ("sensor", "voxel.py")  # parts of src/sim that come after the cache
@@ -91,17 +87,6 @@ class DiskClipCache(ClipCache):
                     return clip._replace(metadata=json.loads(json.dumps(clip.metadata)))
         content = torch.load(self.path(index), mmap=True, weights_only=True)
         return CachedClip(content["views"], content["clean"], json.loads(content["metadata"]))
-
-    def read_views(
-        self, draws: Sequence[CachedDraw], device: torch.device | str
-    ) -> Float[Tensor, "n views frames h w"]:
-        parts = []
-        for draw in draws:
-            views = self.clip(draw.index).views
-            crops = (crop_frames(views[view], draw.crop) for view in draw.view_order)
-            frames = [clip_cache.select_frames(crop, draw.frames) for crop in crops]
-            parts.append(torch.stack(frames))
-        return torch.stack(parts).to(device)
 
     def fill(self) -> None:
         """Simulate what is missing and no other process simulates, on the CPU.

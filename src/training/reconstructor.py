@@ -13,6 +13,7 @@ from torch.nn.utils import parametrize
 from src.losses.terms import TrainingLoss
 from src.metrics.video_metrics import VideoMetrics
 from src.models.network import EventToVideoNetwork, FramePostprocessor, VideoMethod, unroll
+from src.training import going_on
 from src.training.cuda_graphs import GraphedUnroll
 from src.training.schedule import TrainingClock
 from src.training.step_guard import StepGuard
@@ -60,6 +61,7 @@ class Reconstructor(LightningModule):
         self.unscored_windows = unscored_windows
         self.graphs = GraphedUnroll(network) if cuda_graphs else None  # type: ignore[arg-type]
         self.windows_seen, self.earlier_steps = 0, 0
+        self.optimizer_start = 0  # step at which the optimiser's state began
         self.initial_rates: list[float] = []
         # In tuples, so that what is not trained stays out of the parameters and the checkpoint.
         self._loss, self._method = (loss,), (method or network,)
@@ -139,7 +141,7 @@ class Reconstructor(LightningModule):
         )[0]  # fmt: skip
 
     def validation_step(self, sample: "Sample", batch_idx: int) -> None:
-        self.score_and_record_clips(sample)
+        self.score_clips_into_metrics(sample)
         self._log_means("val")
 
     def on_test_start(self) -> None:
@@ -150,14 +152,14 @@ class Reconstructor(LightningModule):
 
     def test_step(self, sample: "Sample", batch_idx: int) -> None:
         self.sample = sample
-        self.clips += self.score_and_record_clips(sample)
+        self.clips += self.score_clips_into_metrics(sample)
         self._log_means("test")
 
     def _log_means(self, split: str) -> None:
         means = {f"{split}/{name}": metric for name, metric in self.metrics.items()}
         self.log_dict(means, on_step=False, on_epoch=True, batch_size=1)
 
-    def score_and_record_clips(self, sample: "Sample") -> list[dict]:
+    def score_clips_into_metrics(self, sample: "Sample") -> list[dict]:
         """Add every clip to `metrics`; return the scores of each with what was drawn for it."""
         with parametrize.cached():
             frames = self.method.reconstruct_clip(sample)
@@ -179,8 +181,15 @@ class Reconstructor(LightningModule):
         checkpoint["losses"] = list(self.guard.losses)
         checkpoint["seconds"], checkpoint["windows"] = self.clock.seconds, self.windows_seen
         checkpoint["steps"] = self.total_steps
+        checkpoint["optimizer_start"] = self.optimizer_start
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
+        if self.make_optimizer is not None:  # else nothing is trained
+            kept = going_on.follow_config(
+                checkpoint, self.network.parameters, self.make_optimizer, self.make_scheduler
+            )
+            start = checkpoint.get("optimizer_start", 0)
+            self.optimizer_start = start if kept else checkpoint["global_step"]
         self.guard.losses.extend(checkpoint["losses"])
         self.clock.seconds, self.windows_seen = checkpoint["seconds"], checkpoint["windows"]
         self.earlier_steps = checkpoint["steps"] - checkpoint["global_step"]

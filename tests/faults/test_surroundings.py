@@ -94,8 +94,8 @@ def test_a_full_disk_is_no_whole_video(kind, tmp_path, monkeypatch):
 
 
 READERS = {
-    "cap.txt": "src.recordings.files.formats.read_events",
-    "cap.h5": "src.recordings.files.formats.read_events",
+    "cap.txt": "src.recordings.files.recording.read_events",
+    "cap.h5": "src.recordings.files.recording.read_events",
     "views.yaml": "src.recordings.views.load_views",
     "photo.png": "src.sim.scenes.photo_files.read_photograph",
     "net.ckpt": "src.models.files.load",

@@ -13,7 +13,7 @@ from torch import Tensor
 from src.bench.candidates import Candidate
 from src.bench.stress_tests.event_clips import ClipConditions, StressBench
 from src.bench.stress_tests.stress_results import StressResult, mean_result
-from src.deploy.forms import in_form
+from src.deploy.forms import convert_to_form
 from src.metrics.image import aligned_psnr
 from src.metrics.temporal import temporal_jitter_px
 from src.sim import noise
@@ -21,7 +21,7 @@ from src.sim import noise
 SCORED_EVERY = 4  # windows of a long run
 
 
-def measure_contrast_retention(
+def measure_contrast_retention_percent(
     network: Candidate, bench: StressBench, *, limit: float, windows: Sequence[int]
 ) -> StressResult:
     """Return the contrast kept, in %, after the last number of `windows` without an event."""
@@ -64,7 +64,7 @@ def measure_long_sequence_drift(
     return StressResult(losses[-1], "dB", limit, thinned, "windows")
 
 
-def measure_convergence_time(
+def measure_convergence_windows(
     network: Candidate, bench: StressBench, *, limit: float, within_db: float = 1.0
 ) -> StressResult:
     """Return the windows until the frame is within `within_db` of the clip's second half, for good;
@@ -91,7 +91,7 @@ def measure_flicker_recovery(
         disturbed, _ = clip.reconstruct(network, chain(windows[:half], flashes, windows[half:]))
         after = aligned_psnr(disturbed[half + length :], truth[half:])
         losses = aligned_psnr(plain[half:], truth[half:]) - after
-        times.append(find_last_exceedance(losses, within_db))
+        times.append(windows_to_last_exceedance(losses, within_db))
     return mean_result(times, "windows", limit)
 
 
@@ -186,7 +186,7 @@ def measure_bf16_error(
     network.require_parameters("there is nothing to round")
     clip, quarter = bench.clips()[0], windows // 4
     loop, truth = clip.back_and_forth()
-    half = replace(network, network=in_form(network.loaded, "bf16"))
+    half = replace(network, network=convert_to_form(network.loaded, "bf16"))
     scores = []
     for form in (network, half):
         frames, _ = clip.reconstruct(form, islice(cycle(loop), quarter * 4))
@@ -203,10 +203,10 @@ def measure_settling_time(scores: Float[Tensor, " windows"], within_db: float) -
     """
     plateau = scores[len(scores) // 2 :].mean()
     smooth = scores.unfold(0, 5, 1).mean(1) if len(scores) >= 5 else scores
-    return find_last_exceedance(plateau - smooth[: len(scores) // 2], within_db)
+    return windows_to_last_exceedance(plateau - smooth[: len(scores) // 2], within_db)
 
 
-def find_last_exceedance(losses: Float[Tensor, " windows"], limit: float) -> float:
+def windows_to_last_exceedance(losses: Float[Tensor, " windows"], limit: float) -> float:
     """Return how many windows pass until `losses` is above `limit` for the last time."""
     beyond = (losses > limit).nonzero()
     return float(beyond[-1] + 1) if len(beyond) else 0.0

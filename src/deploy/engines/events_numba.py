@@ -13,7 +13,7 @@ GOOD, BACKWARDS, OFF_SENSOR, NO_VIEW, NO_NUMBER, NO_SIGN = range(6)  # what `che
 
 
 @njit(nogil=True, cache=True)
-def check(t, x, y, p, view, views, height, width, signs):
+def find_bad_event(t, x, y, p, view, views, height, width, signs):
     """Return (index, what) of the first event that is wrong, or (-1, GOOD); of `signs`, p is one
     of -1 and 1.
     """
@@ -112,7 +112,7 @@ def leak_mixtures(elapsed_s, taus_s, p, view, cells, code, before, mixed):
 
 
 @njit(nogil=True, cache=True)
-def write_spread(taus, sums, mixed):
+def write_view_deviation(taus, sums, mixed):
     """Write the mean distance of the views' sums from their mean behind their mixtures."""
     views, behind = sums.shape[0] // taus, mixed.shape[2] - taus
     middle, part = np.empty(sums.shape[2], f32), f32(1) / f32(views)

@@ -147,10 +147,6 @@ class MeasuredTurbulence(SimulatedTurbulence):
                 reason = error
         raise ValueError(f"turbulence.measured={self.measured}: {reason}")
 
-    def with_options(self, **options: Any) -> "MeasuredTurbulence":
-        """Return the same turbulence with some of its options replaced."""
-        return MeasuredTurbulence(self.measured, self.atmosphere, **self.options | options)
-
 
 def _drawing_range(estimate: IntervalEstimate, unknown: Range) -> Range:
     """Return the interval; a bound that is not known is WIDENING times away from the other."""

@@ -1,7 +1,5 @@
-"""How an atmosphere is drawn: by what an image shows of it.
-
-Statistics of the image are drawn - tilt and blur, correlation length and time of the tilt - and
-then a camera, a path and an outer scale that give them.
+"""How an atmosphere is drawn: first what an image shows of it - tilt and blur, correlation length
+and time of the tilt - then a camera, a path and an outer scale that show it.
 """
 
 import math
@@ -151,7 +149,7 @@ def sample_matching_atmosphere(
         length = float(log_uniform(u[i, 3], distance_m, "distance_m"))
         diameter = math.sqrt(wavelength_m * length * aperture[i] / unit[i])
         # Of the wind, in D, after which the tilt's correlation is 1 / e.
-        way = outer_scale.tilt_correlation_distance(1 / scale[i], shapes[i], wind=True)
+        way = outer_scale.tilt_decay_distance(1 / scale[i], shapes[i], wind=True)
         time_s = wanted.tilt_correlation_time_s
         return Atmosphere(
             aperture_m=diameter,
@@ -243,7 +241,11 @@ def _mismatch(
     """Return how far each candidate is off: 0.1 is 10 % of blur, or of the tilt's variance."""
     total = np.zeros(len(blur))
     if wanted.blur_ratio is not None:
-        sharp = unit * outer_scale.half_light_radius(0.0) / outer_scale.GAUSSIAN_HALF_LIGHT
+        sharp = (
+            unit
+            * outer_scale.short_exposure_half_light_radius(0.0)
+            / outer_scale.GAUSSIAN_HALF_LIGHT
+        )
         total += np.abs(np.log(np.hypot(1, blur / sharp) / wanted.blur_ratio))
     if wanted.global_tilt_share is not None:
         given = zip(ratio, shapes, REFERENCE_WIDTH_PX / aperture, strict=True)
@@ -267,7 +269,7 @@ def _path_statistics(profile: tuple[float, ...], ratio: float) -> tuple[float, f
     strength = np.interp(place, np.linspace(0, 1, len(profile)), profile)
     scatter = (strength * (place * (1 - place)) ** (5 / 6)).sum()
     return (
-        outer_scale.tilt_correlation_distance(ratio, profile),
+        outer_scale.tilt_decay_distance(ratio, profile),
         outer_scale.variance_ratio(ratio, profile, "tilt"),
         outer_scale.variance_ratio(ratio, profile, "higher"),
         float(scatter / (strength * (1 - place) ** (5 / 3)).sum()),

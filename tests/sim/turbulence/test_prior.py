@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from src.sim.turbulence import sample_atmosphere
-from src.sim.turbulence.outer_scale import half_light_radius
+from src.sim.turbulence.outer_scale import short_exposure_half_light_radius
 from src.sim.turbulence.prior import (
     TILT_AND_BLUR_PX,
     ImageStatistics,
@@ -75,7 +75,9 @@ def test_the_blur_that_is_wanted_is_the_nearest_there_is():
     def blur_ratio(wanted: float) -> float:
         statistics = ImageStatistics(20.0, 0.05, tilt_px=0.5, blur_ratio=wanted)
         path = sample_matching_atmosphere(statistics, generator(3))
-        sharp, blurred = (half_light_radius(d) for d in (0.0, path.blur_equivalent_d_over_r0))
+        sharp, blurred = (
+            short_exposure_half_light_radius(d) for d in (0.0, path.blur_equivalent_d_over_r0)
+        )
         return blurred / sharp
 
     assert blur_ratio(1.3) == pytest.approx(1.3, rel=0.15)

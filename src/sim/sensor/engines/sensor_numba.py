@@ -62,7 +62,9 @@ def level_change(delta, u):
 
 
 @inline_kernel
-def linear_events(x, l0, l1, ref, dead, on, off, wait, mode, noise_u, noise_sign, batch, count):
+def append_linear_events(
+    x, l0, l1, ref, dead, on, off, wait, mode, noise_u, noise_sign, batch, count
+):
     """Append the events of pixel `x` to `batch`, which holds `count`; return (count, ref, dead).
 
     `noise_u` is the time of a noise event, above 1 for none.  All is seen along the level's way:
@@ -363,7 +365,7 @@ def find_events(given, wait, work, steps, done, last):
                 x, l0, l1, ref, dead[x], on, off, wait, mode, steps, u, s, batch, count
             )
         else:
-            count, ref, dead[x] = linear_events(
+            count, ref, dead[x] = append_linear_events(
                 x, l0, l1, ref, dead[x], on, off, wait, mode, u, s, batch, count
             )
         reference[x] = ref

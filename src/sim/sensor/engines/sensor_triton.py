@@ -14,11 +14,10 @@ import numpy as np
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float
 from torch import Tensor
 
 from src.sim.sensor.engines import records
-from src.sim.sensor.engines.records import NORMALS, EngineInput, check_intensities
+from src.sim.sensor.engines.records import NORMALS, EngineInput, Grids, check_intensities
 
 LOWEST, HIGHEST = tl.constexpr(records.LOWEST), tl.constexpr(records.HIGHEST)
 NEVER = tl.constexpr(2.0)  # a time after the interval
@@ -36,9 +35,7 @@ SIZES = (
 )  # fmt: skip
 
 
-def voxels(
-    given: EngineInput, grids: Float[Tensor, "n windows views bins h w"]
-) -> Float[Tensor, "n windows views bins h w"]:
+def voxels(given: EngineInput, grids: Grids) -> Grids:
     """Fill `grids` and return them.
 
     Raises ValueError, afterwards, for frames that are not finite or outside [0, 1].
@@ -119,9 +116,8 @@ def _simulate(
         begin, ticks, scale = _interval_clock(edges, i, substeps, BINS)
         start, holding = tl.zeros([BLOCK], tl.float32), (dead > 0) & (MODE == HOLD)
         if NOISY:
-            u, sign = draw_noise_event(
-                key, zero + i, pixel, noise_probability(clip, hot, intensity)
-            )
+            likely = noise_probability(clip, hot, intensity)
+            u, sign = draw_timed_noise_event(key, zero + i, pixel, likely)
             u = tl.where(own, u, NEVER)
             stop = tl.minimum(u, 1.0)
             grid, mark, dead, holding = _add_events(
@@ -208,18 +204,16 @@ def _add_to_grid(grid, fired, u, sign, begin, ticks, scale, column, BINS: tl.con
 def draw_pixel_properties(clip, keys, normals, pixel):
     mismatch, key = tl.load(clip + MISMATCH), tl.load(keys + MISMATCH_KEY)
     none = tl.full((), 0, tl.int64)
-    drawn_on, drawn_off = (
-        random_uint32(key, none, 2 * pixel),
-        random_uint32(key, none, 2 * pixel + 1),
-    )
-    on = spread_threshold(tl.load(clip + ON), mismatch, normals, drawn_on)
-    off = spread_threshold(tl.load(clip + OFF), mismatch, normals, drawn_off)
+    drawn_on = random_uint32(key, none, 2 * pixel)
+    drawn_off = random_uint32(key, none, 2 * pixel + 1)
+    on = draw_pixel_threshold(tl.load(clip + ON), mismatch, normals, drawn_on)
+    off = draw_pixel_threshold(tl.load(clip + OFF), mismatch, normals, drawn_off)
     drawn_hot = random_uint32(tl.load(keys + HOT_PIXEL_KEY), none, pixel)
     return on, off, drawn_hot.to(tl.int64) < tl.load(clip + HOT_FRACTION)
 
 
 @triton.jit
-def spread_threshold(threshold, mismatch, normals, drawn):
+def draw_pixel_threshold(threshold, mismatch, normals, drawn):
     """Return threshold * (1 + mismatch * normal), at least a quarter of the threshold."""
     cell, inside = (drawn >> 20).to(tl.int32), (drawn & 0xFFFFF).to(tl.int64)
     left, right = tl.load(normals + cell), tl.load(normals + cell + 1)
@@ -283,7 +277,7 @@ def noise_probability(clip, hot, intensity):
 
 
 @triton.jit
-def draw_noise_event(key, frame, pixel, probability):
+def draw_timed_noise_event(key, frame, pixel, probability):
     """Return time (NEVER for none) and polarity of the noise events of interval `frame`."""
     drawn, at = random_uint32(key, frame, 2 * pixel), random_uint32(key, frame, 2 * pixel + 1)
     u = ((at >> 9).to(tl.float32) + 0.5) * (1 / 8388608.0)

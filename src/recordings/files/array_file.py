@@ -1,0 +1,132 @@
+"""Events in NumPy files: .npy and .npz, nothing of which is executed."""
+
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from src.recordings.files.columns import (
+    as_integers,
+    as_times,
+    check_claim,
+    find_columns,
+    match_columns,
+    pick_columns,
+)
+from src.recordings.files.event_file import PIECE_EVENTS, EventFile, RawEvents, ReadOptions
+
+
+class ArrayFile(EventFile):
+    """A structured array, an array (n, 4), or an .npz with these or with columns of their own.
+
+    An .npz may state `size` (width, height), or `width` and `height`.
+    """
+
+    def __init__(self, path: Path, options: ReadOptions):
+        self.path = path
+        try:
+            if path.suffix.lower() == ".npy":
+                self._columns = split_table(np.load(path, mmap_mode="r"), options.columns)
+            else:
+                with zipfile.ZipFile(path) as archive:
+                    check_claim(path, sum(part.file_size for part in archive.infolist()))
+                with np.load(path) as file:
+                    self.size = _stated_size(file)
+                    self._columns = _columns_of(file, options.columns)
+            lengths = [len(self._columns[name]) for name in "txyp"]
+            if len(set(lengths)) != 1:
+                raise ValueError(f"columns t, x, y, p differ in length: {lengths}")
+        except Exception as error:  # libraries raise all kinds on a broken file
+            raise ValueError(f"{path}: cannot be read as arrays of events: {error}") from error
+
+    def pieces(self) -> Iterator[RawEvents]:
+        yield from slice_columns(self.path, self._columns)
+
+    def times(self) -> Iterator[np.ndarray]:
+        t = self._columns["t"]
+        for first in range(0, len(t), PIECE_EVENTS):
+            try:
+                yield as_times(t[first : first + PIECE_EVENTS])
+            except ValueError as error:
+                raise ValueError(f"{self.path}: {error}") from None
+
+
+def split_table(table: Any, order: str | None) -> dict[str, Any]:
+    """Return the columns t, x, y, p of a structured array or of one (n, columns), in any of which
+    slices can be taken; `order`: columns=.  Raises ValueError for another array."""
+    names = table.dtype.names
+    if names is not None:
+        keys = pick_columns(dict.fromkeys(names))
+        if keys is None or table.ndim != 1:
+            raise ValueError(f"fields must be t, x, y, p of one dimension, got {', '.join(names)}")
+        return {name: _Field(table, key) for name, key in keys.items()}
+    if table.ndim != 2 or table.shape[1] < 4:
+        raise ValueError(f"an array must be (n, 4) or have fields t, x, y, p, got {table.shape}")
+    sample = np.asarray(table[:PIECE_EVENTS])
+    if sample.dtype.kind not in "iufb":
+        raise ValueError(f"an array must hold numbers, got {sample.dtype}")
+    if not len(sample):
+        return {name: _Column(table, 0) for name in "txyp"}
+    places = find_columns(sample.astype(np.float64), order)
+    return {name: _Column(table, place) for name, place in places.items()}
+
+
+def slice_columns(
+    path: Path, columns: dict[str, Any], times: list[np.ndarray] | None = None
+) -> Iterator[RawEvents]:
+    """Yield pieces of columns; `times`: those of the pieces, if they were read before."""
+    for number, first in enumerate(range(0, len(columns["t"]), PIECE_EVENTS)):
+        part = slice(first, first + PIECE_EVENTS)
+        try:
+            t = times[number] if times is not None else as_times(np.asarray(columns["t"][part]))
+            x, y, p = (as_integers(name, np.asarray(columns[name][part])) for name in "xyp")
+        except Exception as error:  # a broken chunk, or values that are no events
+            raise ValueError(f"{path}: events from {first} on cannot be read: {error}") from error
+        yield RawEvents(t, x, y, p)
+
+
+class _Column:
+    """Column `place` of an array (n, columns) of which slices are taken."""
+
+    def __init__(self, table: Any, place: int | str):
+        self.table, self.place = table, place
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def __getitem__(self, part: slice) -> np.ndarray:
+        return self.table[part, self.place]
+
+
+class _Field(_Column):
+    """Field `place` of a structured array."""
+
+    def __getitem__(self, part: slice) -> np.ndarray:
+        return self.table[part][self.place]
+
+
+def _columns_of(file: Any, order: str | None) -> dict[str, Any]:
+    keys = pick_columns(dict.fromkeys(file.files))
+    if keys is not None:
+        columns = {name: file[key] for name, key in keys.items()}
+        if any(column.ndim != 1 for column in columns.values()):
+            raise ValueError("columns must have one dimension")
+        return columns
+    for name in sorted(file.files, key=lambda name: "event" not in name.lower()):
+        table = file[name]
+        fields = table.dtype.names
+        if (fields and match_columns(fields)) or (table.ndim == 2 and table.shape[1] == 4):
+            return split_table(table, order)
+    raise ValueError(f"no columns t, x, y, p and no array of events among {', '.join(file.files)}")
+
+
+def _stated_size(file: Any) -> tuple[int, int] | None:
+    if "size" in file:
+        width, height = file["size"].ravel().tolist()
+    elif "width" in file and "height" in file:
+        width, height = file["width"].item(), file["height"].item()
+    else:
+        return None
+    return int(width), int(height)
