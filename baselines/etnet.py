@@ -42,7 +42,7 @@ class ETNet(CentreViewNetwork):
 
     def predict_before_activation(self, grid: Tensor, state: Any) -> tuple[Tensor, Any]:
         head, skips, after = self.net.encode(self.net.first_layer(grid), state)
-        return self.net.decode(self.pyramid(skips[::-1]), head, skips), after
+        return self.net.decode_logits(self.pyramid(skips[::-1]), head, skips), after
 
 
 class Pyramid(nn.Module):

@@ -44,7 +44,7 @@ class HyperE2VID(CentreViewNetwork):
         head, skips, after = self.net.encode(self.net.first_layer(grid), before)
         x = self.net.resblocks(skips[-1]) + skips.pop()
         x = self.dynamic(x, torch.cat([grid, previous], 1))
-        frame = self.net.decode(x, head, skips)
+        frame = self.net.decode_logits(x, head, skips)
         return frame, (after, frame.detach())
 
 

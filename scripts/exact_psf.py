@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy import special
 from torch import Tensor
 
-from src.sim.turbulence.zernike import noll_index, noll_indices
+from src.sim.turbulence.zernike import noll_index, noll_indices_without_piston
 
 CHUNK = 512  # PSFs at a time, so that the fields stay in the cache
 COVARIANCE = 2.246061  # Noll's 2.2424 without the rounding of his 0.023
@@ -63,7 +63,7 @@ def fraunhofer_psf(
 def noll_covariance(modes: int) -> Float[Tensor, "modes modes"]:
     """Return the covariance of Noll coefficients 2..modes + 1 at D/r0 = 1, in rad^2, float64
     (Noll 1976, eq. 25); it scales with (D/r0)^(5/3)."""
-    n, m = noll_indices(modes)
+    n, m = noll_indices_without_piston(modes)
     total, apart, third = n[:, None] + n, n[:, None] - n, 17 / 3
     signs = (-1.0) ** (total // 2 - abs(m))
     signs *= special.gammasgn((apart + third) / 2) * special.gammasgn((third - apart) / 2)

@@ -3,11 +3,12 @@
 The layout of the paper's figures 6 to 10: samples, an x-t, r-t or theta-t slice, its deviations.
 """
 
+import math
 from pathlib import Path
 
 import numpy as np
 import rich
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from src.app import entry_point
 from src.figures import comparison, slices
@@ -16,6 +17,9 @@ from src.recordings import camera_frames
 from src.recordings.files import videos
 from src.records import results
 
+FORMS: dict[str, list] = {
+    "line": [[0, 88], [175, 88]], "circle": [88, 88, 40], "spin": [88, 88, 40, 2.5, 90],
+}  # fmt: skip
 NOTES = {
     "residual_displacement_px": "residual displacement, static: {:.2f} px",
     "line_deviation_px": "deviation from a line, moving: {:.2f} px",
@@ -38,6 +42,7 @@ def compare(cfg: DictConfig) -> dict:
     run = Path(cfg.paths.run)
     if not cfg.videos:
         raise ValueError("videos must name one file or more, got []")
+    check_slice(cfg)
     names = list(cfg.names or [Path(path).parent.name for path in cfg.videos])
     if len(names) != len(cfg.videos):
         raise ValueError(f"names must be one per video, got {len(names)} for {len(cfg.videos)}")
@@ -72,6 +77,19 @@ def compare(cfg: DictConfig) -> dict:
     )  # fmt: skip
     rich.print(scores, f"in {run}")
     return scores
+
+
+def check_slice(cfg: DictConfig) -> None:
+    """Raise ValueError for an `fps` or a slice of another form than cut_slice takes."""
+    if not 0 < cfg.fps < math.inf:
+        raise ValueError(f"fps must be > 0 frames a second, got {cfg.fps}")
+    for key, form in FORMS.items():
+        try:
+            given = np.array(OmegaConf.to_object(cfg[key]) if cfg[key] else form)
+        except ValueError:  # rows of several lengths
+            given = np.empty(0, str)
+        if given.dtype.kind not in "if" or given.shape != np.shape(form):
+            raise ValueError(f"{key} must be numbers as in {form}, got {cfg[key]}")
 
 
 if __name__ == "__main__":

@@ -37,13 +37,17 @@ def cut(pieces: Iterable[np.ndarray], start_s: float, end_s: float) -> Iterator[
     """Yield the events from `start_s` to `end_s`, seconds after the first of `pieces`."""
     if not 0 <= start_s < end_s:
         raise ValueError(f"start_s must be >= 0 and before end_s, got {start_s}, {end_s}")
-    first = None
+    first, count = None, 0
     for events in filter(len, pieces):
         first = int(events["t"][0]) if first is None else first
         end = count_before(events, first + end_s * 1e6)
-        yield events[count_before(events, first + start_s * 1e6) : end]
+        part = events[count_before(events, first + start_s * 1e6) : end]
+        count += len(part)
+        yield part
         if end < len(events):
-            return
+            break
+    if not count:
+        raise ValueError(f"recording must have events from {start_s} s to {end_s} s, got none")
 
 
 if __name__ == "__main__":

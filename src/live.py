@@ -29,6 +29,8 @@ def live(cfg: DictConfig) -> None:
 
     Raises ValueError for a recording, views, network or address that cannot be used.
     """
+    if cfg.threads < 1:
+        raise ValueError(f"threads must be >= 1, got {cfg.threads}")
     torch.set_num_threads(cfg.threads)
     asyncio.run(play_and_serve(build_server(cfg)))
 

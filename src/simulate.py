@@ -11,6 +11,7 @@ from yaml import YAMLError
 from src.app import build, entry_point
 from src.figures import samples
 from src.recordings import simulated_recording
+from src.recordings.files import event_writers
 from src.records import results, safe_yaml
 
 SECTIONS = ("scene", "optics", "turbulence", "sensor", "data")
@@ -27,6 +28,9 @@ def simulate(cfg: DictConfig) -> dict:
     run = Path(cfg.paths.run)
     if cfg.index < 0:
         raise ValueError(f"index must be >= 0, the number of a clip, got {cfg.index}")
+    if cfg.write:  # refused before minutes of work
+        height, width = cfg.camera.sensor
+        event_writers.find_kind(Path(cfg.write), None, width, height, "evt3")
     cfg = take_clip_config_from_run(cfg) if cfg.like else cfg
     pipeline = build.build_pipeline(cfg, cfg.split)
     draw = pipeline.draw(cfg.index)

@@ -111,3 +111,10 @@ def test_the_command_ends_with_one_line(tmp_path):
     assert re.fullmatch(
         r"30 events, 0\.0\d+ s, 640x480, \d+ bytes: .*a\.npz", said.splitlines()[-1]
     )
+
+
+def test_a_part_without_events_is_refused_and_leaves_no_file(tmp_path, convert):
+    tables.write_events(tmp_path / "in.raw", made_up(3000), width=640, height=480)
+    with pytest.raises(ValueError, match="recording must have events from 99"):
+        convert(f"recording={tmp_path}/in.raw", f"out={tmp_path}/out.npz", "start_s=99")
+    assert [file.name for file in tmp_path.glob("out*")] == []

@@ -60,6 +60,7 @@ KINDS: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 # Parts whose own classes check whether a number, a range of numbers or null does.
 RANGES = ("augment.", "optics.", "scene.", "sensor.", "target.", "turbulence.")
+SIZES = ("sensor_size", "resolution", "camera.sensor")  # [height, width]
 OPEN = ("callbacks", "logger", "loss", "networks", "scene.parts", "stress_tests")  # more entries do
 
 
@@ -121,7 +122,8 @@ def _check_mapping(given: dict, shipped: DictConfig, entry_point: str, cfg: _Con
             default = defaults.value(key)
         except ValueError:
             default = None
-        _check_value(key, value, default, entry_point)
+        is_required = _at(cast(dict, plain), key) == "???"
+        _check_value(key, value, default, entry_point, is_required)
 
 
 def _at(node: Any, key: str) -> Any:
@@ -154,14 +156,19 @@ def _is_known(key: str, value: Any, given: dict, shipped: dict) -> bool:
     return name in shipped or is_part or ".".join(parents) in OPEN
 
 
-def _check_value(key: str, value: Any, default: Any, entry_point: str) -> None:
+def _check_value(key: str, value: Any, default: Any, entry_point: str, is_required: bool) -> None:
     kinds = KINDS.get(key) or KINDS.get(f"{entry_point}:{key}")
     if kinds is None and is_path_key(key, entry_point):
-        kinds = (WORD, *([NULL] if default is None else []), *([LIST] * key.startswith(RANGES)))
+        may_be_null = default is None and not is_required
+        kinds = (WORD, *([NULL] * may_be_null), *([LIST] * key.startswith(RANGES)))
     kinds = kinds or _kinds_like(key, default)
     if kinds and value != "???" and not _is_of(value, kinds):
         got = NULL if value is None else value
         raise ValueError(f"{key} must be {' or '.join(kinds)}, got {got}")
+    if is_required and value == "":
+        raise ValueError(f"{key} must be a word, got none")
+    if key in SIZES and value is not None and not _is_size(value):
+        raise ValueError(f"{key} must be [height,width], whole numbers >= 1, got {value}")
 
 
 def _kinds_like(key: str, default: Any) -> tuple[str, ...]:
@@ -174,6 +181,10 @@ def _kinds_like(key: str, default: Any) -> tuple[str, ...]:
     if kind == MAPPING or key.startswith(RANGES):
         return (kind, NULL)
     return (kind,)
+
+
+def _is_size(value: list) -> bool:
+    return len(value) == 2 and all(type(side) is int and side >= 1 for side in value)
 
 
 def _is_of(value: Any, kinds: tuple[str, ...]) -> bool:

@@ -15,7 +15,7 @@ PATH_KEYS = frozenset({
     "against", "allowed_origins", "backbone", "cache_root", "ckpt", "corners", "distillation_cache",
     "export", "into", "like", "measured", "name", "names", "offered_networks", "out",
     "postprocessor", "published", "recording", "reference_images", "root", "run", "save",
-    "save_dir", "teachers", "title", "train_root", "video", "video_root", "videos", "weights",
+    "save_dir", "teachers", "title", "extra_train_root", "video", "video_root", "videos", "weights",
     "write",
 })  # fmt: skip
 WHOLE_KEYS = frozenset({"hydra.run.dir", "hydra.sweep.dir", "views", "calibrate:still"})

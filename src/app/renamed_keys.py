@@ -14,13 +14,16 @@ RENAMED_KEYS: dict[str, str | None] = {
 }
 REFUSED_KEY = r"Could not (?:override|delete from config\.) '([\w./]+)'"  # Hydra's messages
 LISTED = "--cfg job lists the keys"
+MISSING_VALUE = r"Missing mandatory value: ([\w.]+)"
 REFUSED_CHOICE = r"Could not find '([\w/]+)/(\w+)'"
 
 
 def explain_refused_key(message: str) -> str | None:
-    """Return what became of the key or choice that Hydra refuses in `message`, or that there is no
-    such key; None for any other error.
+    """Return what became of the key or choice that Hydra refuses in `message`, that there is no
+    such key, or that it must be given; None for any other error.
     """
+    if found := re.search(MISSING_VALUE, message):
+        return f"{found[1]} must be given: {found[1]}=..."
     if found := re.search(REFUSED_CHOICE, message):
         return describe_renaming(f"{found[1]}={found[2]}")
     if found := re.search(REFUSED_KEY, message):

@@ -49,7 +49,7 @@ def fastest_form() -> str:
     return "bf16" if is_bf16_faster() else "float32"
 
 
-def takes_event_lists(network: nn.Module) -> bool:
+def supports_event_lists(network: nn.Module) -> bool:
     """Return whether `network` has a first layer that events can be added to one by one."""
     return isinstance(network, SetNet | E2VID)
 
@@ -76,7 +76,7 @@ class EventListRuntime:
         form = form or fastest_form()
         if form not in FORMS:
             raise ValueError(f"form must be one of {', '.join(FORMS)}, got {form}")
-        if not takes_event_lists(network):
+        if not supports_event_lists(network):
             kind = type(network).__name__
             raise ValueError(f"a list of events needs a SetNet or an E2VID, got {kind}")
         if min(height, width) < MIN_SIDE or threads < 1:

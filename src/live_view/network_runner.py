@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float
 
-from src.deploy.runtime import EventListRuntime, fastest_form, takes_event_lists
+from src.deploy.runtime import EventListRuntime, fastest_form, supports_event_lists
 from src.live_view.live_windows import EventWindow
 from src.models.network import EventToVideoNetwork
 from src.recordings.event_windows import Window, WindowRule, fill_window, frames_per_window
@@ -56,7 +56,7 @@ class NetworkRunner:
         self.name, self.views, fps = name, views, settings.fps
         length = settings.window_length or default_window_length(network)
         self.frames_per_window = frames_per_window(length, fps)
-        form = settings.form or (fastest_form() if takes_event_lists(network) else "float32")
+        form = settings.form or (fastest_form() if supports_event_lists(network) else "float32")
         self.network = build_runnable_network(network, form, "cpu", views, settings.bins)
         is_runtime = isinstance(self.network, EventListRuntime)
         self.rule = WindowRule(

@@ -129,7 +129,7 @@ class E2VID(EventToVideoNetwork):
     ) -> tuple[Float[Tensor, "n 1 h w"], tuple]:
         """Return the frame, padding and all, and the state; `x` is the first layer's, no ReLU."""
         head, skips, after = self.encode(x, state)
-        return self.activation(self.decode(self.resblocks(skips[-1]), head, skips)), after
+        return self.activation(self.decode_logits(self.resblocks(skips[-1]), head, skips)), after
 
     def encode(
         self, x: Float[Tensor, "n c h w"], state: Any
@@ -147,7 +147,7 @@ class E2VID(EventToVideoNetwork):
             after.append(new)
         return head, skips, tuple(after)
 
-    def decode(
+    def decode_logits(
         self, x: Float[Tensor, "n c h w"], head: Float[Tensor, "n c2 h2 w2"], skips: list[Tensor]
     ) -> Float[Tensor, "n 1 h2 w2"]:
         """Return the frame before its activation, from the coarsest map up."""

@@ -219,7 +219,7 @@ class SetNet(EventToVideoNetwork):
         )
         stem = self.stem(voxels, sums, seconds, where)
         features, hidden = self.run_memory(stem, before.hidden, tick.elapsed_s)
-        contexts, context = self.average_context(features, before.context_average, tick)
+        contexts, context = self.update_context(features, before.context_average, tick)
         smoothed, context_smoothed = scan_windows(
             smooth_context, before.context_smoothed, contexts, tick.elapsed_s
         )
@@ -261,7 +261,7 @@ class SetNet(EventToVideoNetwork):
         features, hidden = self.memory(self.relu(stem), hidden, REFERENCE_HZ * elapsed_s)
         return features.to(stem.dtype), hidden
 
-    def average_context(
+    def update_context(
         self, features: Maps, context: Tensor, tick: ClockTick
     ) -> tuple[Float[Tensor, "m c h4 w4"], Context]:
         """Return the moving average after each window and after the last, float32."""

@@ -22,7 +22,8 @@ def score_against_camera(video: Path, listing: Path) -> dict[str, float]:
     table = video.parent / "frames.csv"
     if not table.is_file() or not listing.is_file():
         missing = table if listing.is_file() else listing
-        raise ValueError(f"camera must be the list of a camera's frames, {missing} is not there")
+        wanted = "reference_images must be the list of a camera's frames"
+        raise ValueError(f"{wanted}, {missing} is not there")
     clock = np.loadtxt(table, delimiter=",", skiprows=1, usecols=1, ndmin=1)
     film, scores, lpips = list(videos.read_video(video)), [], LPIPS()
     reach = 0.5 * float(np.diff(clock).max(initial=0.0))
@@ -35,5 +36,6 @@ def score_against_camera(video: Path, listing: Path) -> dict[str, float]:
             together = np.corrcoef(film[nearest].ravel(), truth.ravel())[0, 1]
             scores.append([float(ssim(a, b)), float(lpips(a, b)), float(together)])
     if not scores:
-        raise ValueError(f"camera must have frames within the video's time, {listing} has none")
+        wanted = "reference_images must have frames within the video's time"
+        raise ValueError(f"{wanted}, {listing} has none")
     return dict(zip(("ssim", "lpips", "correlation"), np.mean(scores, 0).tolist(), strict=True))

@@ -110,6 +110,8 @@ def write_recording(
     """
     path = Path(path)
     events = record_events(frames, fps, views, sensor)
+    if not len(events):
+        raise ValueError(f"write: the clip gives no events, nothing is written to {path}")
     height, width = views.sensor
     write_events(path, events, width=width, height=height)
     views.save(path.with_suffix(".views.yaml"))

@@ -22,7 +22,7 @@ from src.sim.sensor.engines.records import Grids
 from src.sim.sensor.engines.run import zeros
 from src.sim.sensor.response import decode_srgb, encode_srgb
 from src.sim.sensor.sensor import Sensor, ViewFrames, simulate_voxels
-from src.sim.turbulence.contract import Crop, TurbulenceModel, TurbulenceOperator
+from src.sim.turbulence.contract import ClipTurbulence, Crop, TurbulenceModel
 
 
 @dataclass(frozen=True)
@@ -175,10 +175,10 @@ class Pipeline:
         frames, generator = len(draw.clip.frames), self.turbulence_generator(draw)
         return self.turbulence_operator(draw).tilt(frames, generator, crop=draw.crop)
 
-    def turbulence_operator(self, draw: ClipParameters) -> TurbulenceOperator:
+    def turbulence_operator(self, draw: ClipParameters) -> ClipTurbulence:
         """Return the turbulence of a clip; `draw.turbulence` may be that already, prepared."""
         drawn, (height, width) = draw.turbulence, draw.clip.frames.shape[-2:]
-        if isinstance(drawn, TurbulenceOperator):
+        if isinstance(drawn, ClipTurbulence):
             return drawn
         options: Any = {"views": self.positions, "fps": draw.clip.fps}
         return self.turbulence.operator(drawn, height=height, width=width, **options)

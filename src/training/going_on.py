@@ -41,6 +41,12 @@ def follow_config(
     return kept
 
 
+def check_steps(max_steps: int, done: int) -> None:
+    """Raise ValueError where a training has taken more steps than it shall (-1: no limit)."""
+    if 0 <= max_steps < done:
+        raise ValueError(f"trainer.max_steps must be >= {done}, the steps of ckpt, got {max_steps}")
+
+
 def _fits(saved: dict, fresh: dict, make_optimizer: Callable[..., Optimizer]) -> bool:
     """Return whether the state of every parameter has the names that the optimiser works with."""
     numbers = [group["params"] for group in saved["param_groups"]]

@@ -185,6 +185,7 @@ class Reconstructor(LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
         if self.make_optimizer is not None:  # else nothing is trained
+            going_on.check_steps(self.trainer.max_steps, checkpoint["global_step"])
             kept = going_on.follow_config(
                 checkpoint, self.network.parameters, self.make_optimizer, self.make_scheduler
             )

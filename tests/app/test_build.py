@@ -117,6 +117,12 @@ def test_a_post_processor_of_ones_own_is_loaded(own, tmp_path):
         postprocess.load(f"{tmp_path}/mine.safetensors")
 
 
+def test_a_network_and_a_baseline_are_not_both_taken(tmp_path):
+    cfg = config("reconstruct", tmp_path, "recording=a.raw", "ckpt=any", "baseline=highpass")
+    with pytest.raises(ValueError, match="^ckpt must be null with baseline=..., got any"):
+        build.load_network(cfg)
+
+
 @pytest.mark.parametrize("given", ["mypackage", "[1a]", "[..]", "['']"])
 def test_allowed_packages_are_a_list_of_names(given, tmp_path):
     with pytest.raises(ValueError, match="allowed_packages must be a list of packages"):
@@ -178,7 +184,7 @@ def test_precision_is_what_the_device_is_fast_in(
 def test_a_missing_size_is_asked_for_by_its_key(tmp_path):
     events = np.array([(0, 1, 1, 1), (5, 2, 2, -1)], event_file.EVENT)
     event_writers.write_events(tmp_path / "a.raw", events, width=8, height=8)
-    (tmp_path / "a.txt").write_text("0 1 1 1\n5 2 2 0\n")
+    (tmp_path / "a.txt").write_text("0 1 1 1\n5e-6 2 2 0\n")
     with pytest.raises(ValueError, match=r"give sensor_size=\[height,width\]"):
         sources.sensor_size(tmp_path / "a.txt")
     with pytest.raises(ValueError, match=r"sensor_size must be \(8, 8\)"):

@@ -4,7 +4,9 @@ import sys
 from importlib import import_module
 
 import pytest
+from omegaconf import OmegaConf
 
+from src import simulate
 from src.app import entry_point
 from src.app.config_values import LIST, NULL, NUMBER, WORD, _kinds_like
 
@@ -12,6 +14,12 @@ WRONG = [
     ("reconstruct", ["recording=x", "fps=abc"], "fps must be a number, got abc"),
     ("reconstruct", ["recording=x", "fps=1/60"], "fps must be a number, got 1/60"),
     ("reconstruct", ["recording=x", "sensor_size=720"], "sensor_size must be a list or null"),
+    ("reconstruct", ["recording=x", "sensor_size=[720]"], "sensor_size must be [height,width], wh"),
+    ("reconstruct", ["recording=x", "resolution=[a,b]"], "resolution must be [height,width], wh"),
+    ("reconstruct", ["ckpt=setnet_small"], "recording must be given: recording=..."),
+    ("calibrate", [], "task must be given: task=..."),
+    ("reconstruct", ["recording=null"], "recording must be a word, got null"),
+    ("reconstruct", ["recording="], "recording must be a word, got none"),
     ("reconstruct", ["recording=x", "ckpt=[a,b]"], "ckpt must be a word or null, got"),
     ("reconstruct", ["recording=x", "ckpt=setnet_small", "device=cuda:99"], "device must be cpu"),
     ("reconstruct", ["recording=x", "+unknown=1"], "unknown is no key of the configuration"),
@@ -23,6 +31,12 @@ WRONG = [
     ("train", ["trainer.max_steps=abc"], "trainer.max_steps must be a number, got abc"),
     ("train", ["ckpt=setnet_medium"], "ckpt=setnet_medium must be of the network that is trained"),
     ("compare", ["videos=a.h5"], "videos must be a list, got a.h5"),
+    ("compare", ["videos=[a.h5]", "fps=0"], "fps must be > 0 frames a second, got 0"),
+    ("compare", ["videos=[a.h5]", "line=[[a,b],[c,d]]"], "line must be numbers as in [[0, 88], ["),
+    ("compare", ["videos=[a.h5]", "line=[1,2]"], "line must be numbers as in [[0, 88], [175, 88]]"),
+    ("compare", ["videos=[a.h5]", "circle=[1]"], "circle must be numbers as in [88, 88, 40], got"),
+    ("compare", ["videos=[a.h5]", "spin=[[1,2],3]"], "spin must be numbers as in [88, 88, 40, 2.5"),
+    ("live", ["recording=x", "threads=0"], "threads must be >= 1, got 0"),
     ("live", ["recording=x", "host=1.5"], "host must be a word, got 1.5"),
 ]  # fmt: skip
 
@@ -38,6 +52,16 @@ def test_one_line_and_exit_code_2(name, overrides, said, tmp_path, monkeypatch, 
     (line,) = printed.err.splitlines()
     assert ended.value.code == 2 and printed.out == ""
     assert line.startswith("error: ") and said in line
+
+
+def test_a_recording_that_cannot_be_written_is_refused_before_it_is_made(tmp_path, monkeypatch):
+    monkeypatch.setattr(simulate.build, "build_pipeline", None)
+    cfg = OmegaConf.create({
+        "paths": {"run": str(tmp_path)}, "index": 0, "write": "a.xyz", "like": None,
+        "camera": {"sensor": [360, 640]},
+    })  # fmt: skip
+    with pytest.raises(ValueError, match="a.xyz: cannot write .xyz"):
+        simulate.simulate(cfg)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from lz4.frame import LZ4FrameCompressor
 
 from src.recordings.files import read_events, unpacking
 from src.recordings.files.aedat2_file import Aedat2File
-from src.recordings.files.aedat_file import AedatFile
+from src.recordings.files.aedat_file import Aedat4File
 from src.recordings.files.event_file import ReadOptions
 from src.recordings.files.rosbag_file import RosbagFile
 from tests.recordings.files.bags import Bag
@@ -83,7 +83,7 @@ def refuse(read, path, content: bytes, said: str) -> None:
 
 @pytest.mark.parametrize(("content", "said"), AEDAT4)
 def test_aedat4(tmp_path, content, said):
-    refuse(AedatFile, tmp_path / "a.aedat4", content, said)
+    refuse(Aedat4File, tmp_path / "a.aedat4", content, said)
 
 
 def test_a_description_that_grows_is_refused(tmp_path):
@@ -92,7 +92,7 @@ def test_a_description_that_grows_is_refused(tmp_path):
     fields = struct.pack("<iiqI", 10, 0, -1, 4) + struct.pack("<I", len(BOMB)) + BOMB
     header = struct.pack("<I", 16) + b"\0\0" + places + fields + b"\0"
     content = text + struct.pack("<I", len(header)) + header
-    refuse(AedatFile, tmp_path / "a.aedat4", content, "description cannot be read|no stream")
+    refuse(Aedat4File, tmp_path / "a.aedat4", content, "description cannot be read|no stream")
 
 
 @pytest.mark.parametrize(("size", "count"), [(8, 2**30), (-8, 5), (0, 2**31 - 1), (2**30, 2**30)])

@@ -42,8 +42,8 @@ def test_a_video_agrees_with_itself_and_not_with_the_next_frames(recording):
 
 def test_what_is_not_there_or_not_at_the_same_time_is_named(recording):
     video, listing = recording
-    with pytest.raises(ValueError, match="camera must be the list of a camera's frames"):
+    with pytest.raises(ValueError, match="reference_images must be the list of a camera's frames"):
         camera_frames.score_against_camera(video, listing.with_name("none.txt"))
     listing.write_text("99.0 0000000.png")
-    with pytest.raises(ValueError, match="camera must have frames within the video's time"):
+    with pytest.raises(ValueError, match="reference_images must have frames within the video"):
         camera_frames.score_against_camera(video, listing)

@@ -125,6 +125,13 @@ def test_a_still_scene_makes_no_event(truth):
     assert len(simulated_recording.record_events(still, 60.0, truth, ideal)) == 0
 
 
+def test_no_file_is_written_without_an_event(truth, tmp_path):
+    still, ideal = torch.full((9, 3, SIDE, SIDE), 0.6), EventSensor(0.2, refractory_s=0.0)
+    with pytest.raises(ValueError, match="write: the clip gives no events"):
+        simulated_recording.write_recording(tmp_path / "a.raw", still, 60.0, truth, ideal)
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_truth_lies_beside_the_recording(truth, tmp_path):
     frames, tilt = blinking(half(pictures.circles(5, 7)), 3), torch.zeros(9, 3, 2, SIDE, SIDE)
     path = tmp_path / "cap.raw"

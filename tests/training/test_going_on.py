@@ -10,7 +10,7 @@ from torch.optim import SGD, Adam, AdamW
 from torch.optim.lr_scheduler import CosineAnnealingLR
 
 from src.train import train
-from src.training.going_on import follow_config
+from src.training.going_on import check_steps, follow_config
 from tests.test_train import TINY, config
 
 STEPS = 4
@@ -103,3 +103,12 @@ def test_a_run_that_goes_on_obeys_its_config(before, after, rate, schedules, tmp
     train(config("train", tmp_path / "b", *TINY, *after, "trainer.max_steps=3", ckpt))
     found = rates(tmp_path / "b")
     assert found[0] == pytest.approx(rate, rel=1e-4) and found[1] == schedules
+
+
+def test_fewer_steps_than_were_taken_are_refused():
+    for allowed in (-1, STEPS, STEPS + 1):
+        check_steps(allowed, STEPS)
+    with pytest.raises(
+        ValueError, match="trainer.max_steps must be >= 4, the steps of ckpt, got 2"
+    ):
+        check_steps(2, STEPS)

@@ -42,7 +42,7 @@ def find_target(
     row, NaN where one is not seen.  `mirrors`: the view at (row, col) is mirrored in x for odd col
     and in y for odd row; a target that knows its hand (ChArUco) decides itself.
     """
-    clusters = cluster_points(target.detect_landmarks(picture), target.count)
+    clusters = cluster_points(target.detect_candidate_points(picture), target.count)
     places = _sort_into_grid(np.array([cluster.mean(0) for cluster in clusters]), picture.shape)
     points, mirrored = {}, {}
     for position, cluster in zip(places, clusters, strict=True):

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from src.recordings.files.aedat3_packets import iter_polarity
-from src.recordings.files.clocks import Clock, join_pieces
+from src.recordings.files.clocks import Clock, merge_small_pieces
 from src.recordings.files.event_file import PIECE_EVENTS, EventFile, RawEvents, ReadOptions
 from src.recordings.files.streams import Stream, choose_stream
 
@@ -65,7 +65,7 @@ class Aedat2File(EventFile):
         """Yield the events; warns of a file that ends within one; raises ValueError for a file of
         nothing but frames, motion or triggers, and for packets that cannot be."""
         if self._version == "3.1":
-            yield from join_pieces(iter_polarity(self.path, self._start, self._source))
+            yield from merge_small_pieces(iter_polarity(self.path, self._start, self._source))
             return
         found, words, clock = 0, 0, Clock()
         for address, t in self._words():

@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from src.recordings.files.clocks import join_pieces
+from src.recordings.files.clocks import merge_small_pieces
 from src.recordings.files.event_file import EventFile, RawEvents, ReadOptions
 from src.recordings.files.streams import Stream, choose_stream
 from src.recordings.files.unpacking import LARGEST_PACKET, unpack
@@ -41,7 +41,7 @@ class Header(NamedTuple):
     description: str
 
 
-class AedatFile(EventFile):
+class Aedat4File(EventFile):
     """An `.aedat4` file; times are microseconds.
 
     `options.stream` is the place or the camera's name of one of several event streams, the first by
@@ -68,7 +68,7 @@ class AedatFile(EventFile):
         file hold anything.
         """
         found = 0
-        for piece in join_pieces(self._events()):
+        for piece in merge_small_pieces(self._events()):
             found += len(piece.t)
             yield piece
         if not found and (others := sum(stream != self._id for stream, _ in self._packets())):

@@ -16,6 +16,7 @@ from src.recordings.files.columns import (
     pick_columns,
 )
 from src.recordings.files.event_file import PIECE_EVENTS, EventFile, RawEvents, ReadOptions
+from src.recordings.files.streams import Stream, choose_stream
 
 
 class ArrayFile(EventFile):
@@ -34,12 +35,13 @@ class ArrayFile(EventFile):
                     check_claim(path, sum(part.file_size for part in archive.infolist()))
                 with np.load(path) as file:
                     self.size = _stated_size(file)
-                    self._columns = _columns_of(file, options.columns)
+                    self._columns, self.notes = _columns_of(path, file, options)
             lengths = [len(self._columns[name]) for name in "txyp"]
             if len(set(lengths)) != 1:
                 raise ValueError(f"columns t, x, y, p differ in length: {lengths}")
         except Exception as error:  # libraries raise all kinds on a broken file
-            raise ValueError(f"{path}: cannot be read as arrays of events: {error}") from error
+            text = str(error).split("\n")[0].removeprefix(f"{path}: ")  # of choose_stream
+            raise ValueError(f"{path}: cannot be read as arrays of events: {text}") from error
 
     def pieces(self) -> Iterator[RawEvents]:
         yield from slice_columns(self.path, self._columns)
@@ -107,19 +109,34 @@ class _Field(_Column):
         return self.table[part][self.place]
 
 
-def _columns_of(file: Any, order: str | None) -> dict[str, Any]:
+def _columns_of(
+    path: Path, file: Any, options: ReadOptions
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return the columns t, x, y, p of an .npz, and a note of other arrays of events in it."""
     keys = pick_columns(dict.fromkeys(file.files))
     if keys is not None:
-        columns = {name: file[key] for name, key in keys.items()}
+        columns = {name: _flat(file[key]) for name, key in keys.items()}
         if any(column.ndim != 1 for column in columns.values()):
             raise ValueError("columns must have one dimension")
-        return columns
-    for name in sorted(file.files, key=lambda name: "event" not in name.lower()):
-        table = file[name]
-        fields = table.dtype.names
-        if (fields and match_columns(fields)) or (table.ndim == 2 and table.shape[1] == 4):
-            return split_table(table, order)
+        return columns, ()
+    for is_called_events in (True, False):
+        names = [name for name in file.files if ("event" in name.lower()) == is_called_events]
+        tables = {name: table for name in names if _is_table(table := file[name])}
+        if tables:
+            streams = [Stream(place, name, None) for place, name in enumerate(tables)]
+            chosen, notes = choose_stream(path, streams, options.stream)
+            return split_table(tables[chosen.name], options.columns), notes
     raise ValueError(f"no columns t, x, y, p and no array of events among {', '.join(file.files)}")
+
+
+def _is_table(table: np.ndarray) -> bool:
+    fields = table.dtype.names
+    return bool(fields and match_columns(fields)) or (table.ndim == 2 and table.shape[1] == 4)
+
+
+def _flat(column: np.ndarray) -> np.ndarray:
+    """Return (n, 1) or (1, n), as MATLAB has columns, as (n,); others as they are."""
+    return column.ravel() if column.ndim == 2 and 1 in column.shape else column
 
 
 def _stated_size(file: Any) -> tuple[int, int] | None:

@@ -25,7 +25,7 @@ class Clock:
         return times
 
 
-def join_pieces(pieces: Iterator[RawEvents]) -> Iterator[RawEvents]:
+def merge_small_pieces(pieces: Iterator[RawEvents]) -> Iterator[RawEvents]:
     """Yield the events in pieces of PIECE_EVENTS or more, the last one apart; none is empty."""
     held: list[RawEvents] = []
     for piece in pieces:

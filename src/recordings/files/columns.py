@@ -14,7 +14,8 @@ NAMES = {
     "t": ("t", "ts", "time", "times", "timestamp", "timestamps"), "x": ("x", "xs", "col", "column"),
     "y": ("y", "ys", "row"), "p": ("p", "ps", "on", "polarity", "polarities", "pol"),
 }  # fmt: skip
-UNIT = re.compile(r"[ _]?[\[(]?(us|µs|ns|ms|s|sec|seconds|px|pixel|pixels)[\])]?$")
+UNIT = re.compile(r"[ _]?[\[(]?(us|µs|μs|ns|ms|s|sec|seconds|px|pixel|pixels)[\])]?$")
+TIME_UNIT = re.compile(r"[ _\[(](us|µs|μs|ns|ms|s|sec|seconds)[\])]?$")
 
 
 def match_columns(names: Sequence[str]) -> dict[str, int] | None:
@@ -37,6 +38,12 @@ def pick_columns(table: Mapping[str, Any]) -> dict[str, str] | None:
     keys = list(table)
     places = match_columns(keys)
     return None if places is None else {letter: keys[place] for letter, place in places.items()}
+
+
+def stated_unit(name: str) -> str | None:
+    """Return the unit that the name of a column of times ends in (`t_ns`, `time [ms]`), or None."""
+    found = TIME_UNIT.search(name.strip().strip("\"'").lower())
+    return None if found is None else {"n": "ns", "m": "ms", "s": "s"}.get(found[1][0], "us")
 
 
 def stated_columns(order: str, width: int) -> dict[str, int]:
@@ -65,6 +72,12 @@ def guess_columns(sample: np.ndarray) -> dict[str, int]:
         x, y = (k for k in range(4) if k not in (*times, *signs))
         if {x, y} <= set(whole):
             return {"t": times[0], "x": x, "y": y, "p": signs[0]}
+    fitting = len({*whole, *signs})
+    if width > 3 > fitting:
+        raise ValueError(
+            "x and y must be whole numbers from 0 on, polarity -1, 0 or 1: only "
+            f"{fitting} of {width} columns can be one of these (rectified places are not read)"
+        )
     raise ValueError(
         f"columns must say the order of the {width} columns, such as columns=txyp or "
         f"columns=xypt: {len(times)} can be time and {len(signs)} polarity"
@@ -96,7 +109,7 @@ def as_integers(name: str, values: np.ndarray) -> np.ndarray:
     wrong = ~(np.rint(values) == values)
     if wrong.any():
         raise ValueError(f"{name} must be whole numbers, got {values[wrong][0]}")
-    if values.size and np.abs(values).max() > 2**31:
+    if values.size and float(np.abs(values).max()) > 2**31:  # float16 cannot hold the bound
         raise ValueError(f"{name} must be in 0..{MAX_COORDINATE}, got {np.abs(values).max():.0f}")
     return values.astype(np.int64)
 

@@ -93,6 +93,8 @@ def find_kind(path: Path, layout: str | None, width: int, height: int, version: 
         raise ValueError(f"{path}: layout=dsec must have the ending .h5 or .hdf5")
     if path.is_dir() and not (kind == "evreal" and (path / table_writers.EVREAL_TIMES).is_file()):
         raise ValueError(f"{path}: is a folder already, of something else")
+    if kind == "evreal" and path.is_file():
+        raise ValueError(f"{path}: layout=evreal writes a folder, this is a file already")
     if max(width, height) > (most := MOST_PIXELS.get(kind, 2**16)):
         raise ValueError(f"{path}: {kind} holds sides up to {most}, got {width}x{height}")
     return kind

@@ -6,6 +6,7 @@ Known layouts: DSEC (events/{x, y, t, p} in us after `t_offset`; Gehrig et al. 2
 """
 
 import math
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -62,7 +63,9 @@ class Hdf5File(EventFile):
         )
         self._offset = 0
         if "t_offset" in self._file:
-            self.time_unit, self._offset = "us", _single_number(self._file["t_offset"])
+            self._offset = _single_number(self._file["t_offset"])
+        if "t_offset" in self._file or "ms_to_idx" in self._file:  # DSEC's layout
+            self.time_unit = "us"
 
     def _read_times(self) -> Iterator[np.ndarray]:
         t = self._columns["t"]
@@ -180,16 +183,24 @@ def _stated_size(node: Any) -> tuple[int, int] | None:
     held = node if isinstance(node, h5py.Group) else {}
     known = {**{k: held[k] for k in held if _is_small(held[k])}, **node.attrs}
     for name in (*SIZE_NAMES, *SHAPE_NAMES):
-        if name in known:
-            value = known[name]
-            if isinstance(value, str):
-                value = value.lower().replace("x", " ").replace(",", " ").split()
-            sides = [int(side) for side in np.asarray(value).ravel()[:2]]
-            if len(sides) == 2:
-                return tuple(sides if name in SIZE_NAMES else sides[::-1])  # type: ignore[return-value]
-    if "width" in known and "height" in known:
-        return int(np.asarray(known["width"])), int(np.asarray(known["height"]))
-    return None
+        sides = _whole_numbers(known[name]) if name in known else []
+        if len(sides) == 2:
+            has_width_first = name in SIZE_NAMES or "x" in str(known[name]).lower()  # 640x480
+            return (sides[0], sides[1]) if has_width_first else (sides[1], sides[0])
+    width, height = (_whole_numbers(known.get(name)) for name in ("width", "height"))
+    return (width[0], height[0]) if len(width) == len(height) == 1 else None
+
+
+def _whole_numbers(value: Any) -> list[int]:
+    """Return the numbers of a value such as `640x480`, (640, 480) or 640; none for another."""
+    if isinstance(value, str | bytes):
+        text = value.decode("latin-1") if isinstance(value, bytes) else value
+        value = re.split(r"[\sx,;]+", text.strip().lower())
+    try:
+        numbers = np.asarray(value).ravel()[:2].astype(np.float64).tolist()
+    except (TypeError, ValueError):  # words, or nothing
+        return []
+    return [int(n) for n in numbers if n >= 1 and n == int(n)]
 
 
 def _is_small(node: Any) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 
 from src.recordings.engines.event_passes import convert_events
 from src.recordings.files.aedat2_file import Aedat2File
-from src.recordings.files.aedat_file import AedatFile
+from src.recordings.files.aedat_file import Aedat4File
 from src.recordings.files.array_file import ArrayFile
 from src.recordings.files.es_file import EsFile
 from src.recordings.files.event_arrays import concatenate_events, count_before
@@ -30,11 +30,12 @@ from src.recordings.files.time_unit import check_times, to_us
 
 Reader = Callable[[Path, ReadOptions], EventFile]
 READERS: dict[str, Reader] = {  # by the ending, in small letters
-    ".raw": PropheseeFile, ".dat": PropheseeFile, ".aedat4": AedatFile, ".aedat": Aedat2File,
+    ".raw": PropheseeFile, ".dat": PropheseeFile, ".aedat4": Aedat4File, ".aedat": Aedat2File,
     ".es": EsFile, ".bag": RosbagFile, ".db3": RosbagFile, ".mcap": RosbagFile, ".npy": ArrayFile,
     ".npz": ArrayFile, **dict.fromkeys(HDF5_ENDINGS, Hdf5File),
     **dict.fromkeys((*TEXT_ENDINGS, ".gz", ".zip"), TextFile),
 }  # fmt: skip
+OF_ONE_CAMERA = (PropheseeFile, EsFile, TextFile)
 MAX_SIDE = 2**16  # pixels: coordinates have 16 bits
 
 
@@ -49,13 +50,13 @@ class EventRecording:
     survey: Survey
 
     @property
-    def lines(self) -> tuple[str, ...]:
+    def messages(self) -> tuple[str, ...]:
         """Return what the user is told before the file is read."""
-        return *self.file.notes, *self.survey.lines
+        return *self.file.notes, *self.survey.messages
 
     def __iter__(self) -> Iterator[np.ndarray]:
         """Yield the events in pieces, not empty, in order of time; warn of what was wrong."""
-        if self.survey.is_on_then_off:
+        if self.survey.parts_are_on_and_off:
             both = (iter(_Reading(self, part)) for part in (0, 1))
             yield from merge_in_time(*both)
         else:
@@ -72,7 +73,8 @@ def open_recording(
     """
     path = Path(path)
     if not is_bag_folder(path) and (not path.is_file() or path.stat().st_size == 0):
-        raise ValueError(f"{path}: {'the file is empty' if path.is_file() else 'no such file'}")
+        found = "is a folder, not an event file" if path.is_dir() else "no such file"
+        raise ValueError(f"{path}: {'the file is empty' if path.is_file() else found}")
     state = path.stat()
     kept, survey = _open_and_survey(path, state.st_mtime_ns, state.st_size, options)
     file = _open_file(path, options) if kept is None else kept
@@ -81,7 +83,7 @@ def open_recording(
     if size is not None and not all(1 <= side <= MAX_SIDE for side in size):
         raise ValueError(f"{path}: a sensor's sides must be in 1..{MAX_SIDE}, got {size}")
     recording = EventRecording(path, size, options, file, survey)
-    _tell(recording.lines)
+    _tell(recording.messages)
     return recording
 
 
@@ -131,7 +133,7 @@ class _Reading:
 
     def __init__(self, recording: EventRecording, part: int):
         self._recording, self._path, self._part = recording, recording.path, part
-        self._order = EventOrder(recording.survey.buffer_us, recording.survey.few, part)
+        self._order = EventOrder(recording.survey.buffer_us, recording.survey.min_part_events, part)
         self._count, self._outside, self._most = 0, 0, np.zeros(2, np.int64)
 
     def __iter__(self) -> Iterator[np.ndarray]:
@@ -211,6 +213,8 @@ def _open_file(path: Path, options: ReadOptions) -> EventFile:
     reader = RosbagFile if path.is_dir() else reader
     if reader is None:
         raise ValueError(f"{path}: unknown kind of event file, known are {', '.join(READERS)}")
+    if reader in OF_ONE_CAMERA and options.stream not in (None, 0, "0"):
+        raise ValueError(f"stream must be null, as {path} has one camera, got {options.stream}")
     file = reader(path, options)
     if file.time_unit is not None and options.time_unit not in ("auto", file.time_unit):
         raise ValueError(

@@ -3,20 +3,24 @@
 dvs_msgs/EventArray, prophesee_event_msgs/EventArray: header, uint32 height, width, a list of
 uint16 x, y, time ts, bool polarity.  event_camera_msgs/EventPacket (event_array_msgs/EventArray was
 its name): header, uint32 height, width, uint64 seq, time_base, string encoding, bool is_bigendian,
-uint8[] events.  Of its encodings evt3 (Prophesee's words) and mono (64 bits; from the lowest: 32 of
-nanoseconds after time_base, 16 of x, 15 of y, 1 of polarity) are read.  ROS 1 puts one field behind
-the other, ROS 2 (CDR) each at a multiple of its size.
+uint8[] events.  Of its encodings evt3 (Prophesee's words), mono (64 bits; from the lowest: 32 of
+nanoseconds after time_base, 16 of x, 15 of y, 1 of polarity) and those of iniVation's cameras
+(caer_packets) are read.  ROS 1 puts one field behind the other, ROS 2 (CDR) each at a multiple of
+its size.
 """
 
 import struct
 
 import numpy as np
 
+from src.recordings.files.caer_packets import split_libcaer, split_libcaer_cmp
 from src.recordings.files.event_file import RawEvents
 from src.recordings.files.evt_decoder import EvtDecoder
 
 ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
+WORDS = {"evt3": "u2", "mono": "u8", "libcaer": "u4", "libcaer_cmp": "u2"}  # by the encoding
 PACKETS = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
+LAST_START_NS = 2**62  # the year 2116
 # Places of x, y, seconds, nanoseconds, polarity, and bytes of an event.
 ROS1 = (0, 2, 4, 8, 12), 13
 FIRST_CDR = (0, 2, 4, 8, 12), 14
@@ -50,12 +54,18 @@ class Message:
         """
         if not self.encoding:
             return self._read_array()
-        if self.encoding not in ("evt3", "mono"):
-            raise ValueError(f"encoding {self.encoding!r} is not read, but evt3 and mono")
-        kind = "u2" if self.encoding == "evt3" else "u8"
-        packed = np.frombuffer(self._read_bytes(), (">" if self._big else "<") + kind)
+        if self.encoding not in WORDS:
+            raise ValueError(f"encoding {self.encoding!r} is not read, but {', '.join(WORDS)}")
+        big = self._big and self.encoding != "libcaer"  # libcaer's words are little endian
+        packed = np.frombuffer(self._read_bytes(), (">" if big else "<") + WORDS[self.encoding])
         if self.encoding == "evt3":
             return decoder.decode(packed.astype("<u2").tobytes())
+        if self._start_ns > LAST_START_NS:
+            raise ValueError(f"time_base must be in 0..{LAST_START_NS} ns, got {self._start_ns}")
+        if self.encoding == "libcaer":
+            return split_libcaer(packed, self._start_ns)
+        if self.encoding == "libcaer_cmp":
+            return split_libcaer_cmp(packed, self._start_ns)
         packed = packed.astype(np.uint64)
         t = (packed & 0xFFFFFFFF).astype(np.int64) + self._start_ns
         x, y = (packed >> 32).astype(np.uint16), (packed >> 48).astype(np.uint16)

@@ -17,7 +17,7 @@ from rosbags.rosbag2 import storage_mcap as mcap
 from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
-from src.recordings.files.clocks import join_pieces
+from src.recordings.files.clocks import merge_small_pieces
 from src.recordings.files.event_file import EventFile, RawEvents, ReadOptions
 from src.recordings.files.evt_decoder import EvtDecoder
 from src.recordings.files.ros_messages import ARRAYS, PACKETS, Message
@@ -67,7 +67,7 @@ class RosbagFile(EventFile):
         """Yield the events; warns of events before the first time; raises ValueError for a message
         that cannot be read."""
         decoder = EvtDecoder("evt3")
-        yield from join_pieces(self._events(decoder))
+        yield from merge_small_pieces(self._events(decoder))
         if decoder.lost:
             warnings.warn(
                 f"{self.path}: {decoder.lost} events before the first time, dropped", stacklevel=2

@@ -34,9 +34,9 @@ class Survey(NamedTuple):
 
     unit: str
     buffer_us: int = BUFFER_US
-    few: int = FEW_EVENTS
-    is_on_then_off: bool = False
-    lines: tuple[str, ...] = ()
+    min_part_events: int = FEW_EVENTS
+    parts_are_on_and_off: bool = False
+    messages: tuple[str, ...] = ()
     is_whole: bool = True
     is_ordered: bool = False
     times: list[np.ndarray] | None = None

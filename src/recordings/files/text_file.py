@@ -17,7 +17,6 @@ from src.recordings.files.columns import MAX_COORDINATE, as_integers, check_clai
 from src.recordings.files.event_file import PIECE_EVENTS, EventFile, RawEvents, ReadOptions
 from src.recordings.files.text_layout import (
     COMMENTS,
-    MAX_LINE,
     WORDS,
     Layout,
     is_number,
@@ -26,7 +25,7 @@ from src.recordings.files.text_layout import (
     split_line,
 )
 
-CHUNK = MAX_LINE  # characters read at a time
+CHUNK = 2**22  # characters read at a time
 SPOOL = {"names": ["t", "x", "y", "p"], "offsets": [0, 8, 10, 12], "itemsize": 16}
 
 
@@ -43,6 +42,8 @@ class TextFile(EventFile):
             with open_text(path) as file:
                 self._layout = read_layout(file)
             self.size = self._layout.size
+            names_hold = options.time_unit == "auto" and options.columns is None
+            self.time_unit = self._layout.time_unit if names_hold else None
             self._events = self._read(options)
 
     def pieces(self) -> Iterator[RawEvents]:
@@ -56,7 +57,7 @@ class TextFile(EventFile):
 
     def _read(self, options: ReadOptions) -> np.ndarray:
         """Return all events, (n,) of t in the file's unit, x, y, p, as they stand in the file."""
-        places = self._layout.places
+        places = self._layout.places if options.columns is None else None
         with _Spool() as spool:
             for block, number, is_last in self._blocks():
                 table = self._parse(block, number, is_last)
@@ -67,8 +68,8 @@ class TextFile(EventFile):
                 spool.add(*(table[f"f{places[name]}"] for name in "txyp"))
             return spool.mapped()
 
-    def _blocks(self) -> Iterator[tuple[list[str], int, bool]]:
-        """Yield lines of events, the number of the first one, and whether they end the file."""
+    def _blocks(self) -> Iterator[tuple[str, int, bool]]:
+        """Yield lines of events, how many come before them, and whether they end the file."""
         number, rest, size = self._layout.lines, "", 0
         with open_text(self.path) as file:
             for _ in range(number):
@@ -81,24 +82,23 @@ class TextFile(EventFile):
                 body, newline, rest = (rest + chunk).rpartition("\n")
                 if not newline:
                     raise ValueError(f"line {number + 1} has more than {CHUNK} characters")
-                lines = body.split("\n")
-                yield lines, number, False
-                number += len(lines)
+                yield body, number, False
+                number += body.count("\n") + 1
         if rest or chunk:
-            yield (rest + chunk).rstrip("\n").split("\n"), number, True
+            yield (rest + chunk).rstrip("\n"), number, True
 
-    def _parse(self, lines: list[str], number: int, is_last: bool) -> np.ndarray:
+    def _parse(self, text: str, number: int, is_last: bool) -> np.ndarray:
         """Return the values of the lines as a structured array of columns f0, f1, ..."""
-        tidy = self._tidy(lines)
+        tidy = self._tidy(text)
         for kind in (np.int64, np.float64):
             try:
                 return _load(tidy, self._layout, kind)
             except ValueError:
                 continue
         wrong = self._find_broken(tidy)
-        if is_last and wrong == len(tidy) - 1 and wrong:
+        if is_last and wrong == len(tidy) - 1 and number + wrong > self._layout.lines:
             self.notes = (f"{self.path}: its last line is cut, left out",)
-            return self._parse(lines[:-1], number, False)
+            return self._parse("\n".join(tidy[:-1]), number, False)
         raise ValueError(f"line {number + wrong + 1} is no event: {tidy[wrong][:40]!r}")
 
     def _find_broken(self, lines: list[str]) -> int:
@@ -109,16 +109,15 @@ class TextFile(EventFile):
                 return place
         raise ValueError("a number is out of range")
 
-    def _tidy(self, lines: list[str]) -> list[str]:
+    def _tidy(self, text: str) -> list[str]:
         """Return the lines with points, numbers for words, and blank for comments."""
-        text = "\n".join(lines)
         if self._layout.has_decimal_comma:
             text = text.replace(",", ".")
         if self._layout.has_words:
             text = re.sub(
                 r"\b(true|false|on|off)\b", lambda m: WORDS[m[0].lower()], text, flags=re.I
             )
-        tidy = text.replace("\r", "").split("\n")
+        tidy = text.split("\n")
         if any(mark in text for mark in ("#", "%", "/")):
             tidy = ["" if line.lstrip().startswith(COMMENTS) else line for line in tidy]
         return tidy
@@ -163,7 +162,7 @@ class _Spool:
                 raise ValueError(f"{name} must be in 0..{MAX_COORDINATE}, got {low} to {high}")
             events[name] = values
         sign = as_integers("polarity", p)
-        if not np.isin(sign, (-1, 0, 1)).all():
+        if sign.min() < -1 or sign.max() > 1:
             raise ValueError(f"polarity must be -1, 0 or 1, got {np.unique(sign)[:4].tolist()}")
         events["p"] = sign
         self.file.write(events.tobytes())

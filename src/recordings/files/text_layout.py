@@ -9,26 +9,33 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from src.recordings.files.columns import match_columns
+from src.recordings.files.columns import match_columns, stated_unit
 
 TEXT_ENDINGS = (".txt", ".csv", ".tsv")
 MAX_LINE = 2**23  # characters; a longer line is none of events
 MAX_HEADER_LINES = 1000
 COMMENTS = ("#", "%", "//", ";")
 WORDS = {"true": "1", "false": "0", "on": "1", "off": "0"}  # of polarity
-GEOMETRY = re.compile(r"(?:geometry|resolution|size)\D*(\d+)\D+(\d+)", re.IGNORECASE)
+CUT = b" cut"  # what a packed text ends in where its file is cut: its last line is no event
+GEOMETRY = re.compile(
+    r"(?:geometry|resolution|size)\D*(?<![\d.])(\d+)"
+    r"(?:\s*(?:(?:[x,;*]|by|height)[\s=:]*)+|\s+)(\d+)(?!\d|\.\d)",
+    re.IGNORECASE,
+)
 
 
 class Layout(NamedTuple):
     """How the lines of a file are read: the `width` of the table, `separator` (None: any blanks),
     whether a comma is the decimal point, whether polarity is a word, the `places` of t, x, y, p
-    where names tell them, and (width, height).  `lines` come before the events."""
+    where names tell them, the unit of time in these, and (width, height).  `lines` come before
+    the events."""
 
     width: int
     separator: str | None
     has_decimal_comma: bool
     has_words: bool
     places: dict[str, int] | None
+    time_unit: str | None
     size: tuple[int, int] | None
     lines: int
 
@@ -50,17 +57,38 @@ def _open_bytes(path: Path) -> Iterator[Any]:
     ending = path.suffix.lower()
     if ending == ".gz":
         with gzip.open(path) as file:
-            yield io.BufferedReader(file)  # type: ignore[arg-type]
+            yield io.BufferedReader(_UpToCut(file))
     elif ending == ".zip":
         with zipfile.ZipFile(path) as archive:
             names = [n for n in archive.namelist() if n.lower().endswith(TEXT_ENDINGS)]
+            names = [n for n in names if not Path(n).name.startswith("._")]  # of macOS
+            named = [n for n in names if Path(n).stem.lower() == "events"]  # beside images.txt
+            names = names if len(names) == 1 else named
             if len(names) != 1:
-                raise ValueError(f"a .zip must hold one text file, got {len(names)}")
+                raise ValueError("a .zip must hold one text file, or one that is called events.txt")
             with archive.open(names[0]) as file:
                 yield io.BufferedReader(file)  # type: ignore[arg-type]
     else:
         with path.open("rb") as file:
             yield file
+
+
+class _UpToCut(io.RawIOBase):
+    """What a .gz holds; of one that is cut, what is whole and CUT."""
+
+    def __init__(self, file: gzip.GzipFile):
+        self._file, self._is_cut = file, False
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        try:
+            part = b"" if self._is_cut else self._file.read1(len(buffer))
+        except EOFError:
+            part, self._is_cut = CUT, True
+        buffer[: len(part)] = part
+        return len(part)
 
 
 def read_layout(file: io.TextIOBase) -> Layout:
@@ -73,7 +101,7 @@ def read_layout(file: io.TextIOBase) -> Layout:
         if not line:
             if strange is not None:
                 raise ValueError(f"no line of numbers t x y p in it, got {strange[:40]!r}")
-            return Layout(0, None, False, False, None, size, number)
+            return Layout(0, None, False, False, None, None, size, number)
         bare = line.strip()
         separator, has_decimal_comma = _find_separator(bare)
         words = split_line(bare.replace(",", ".") if has_decimal_comma else bare, separator)
@@ -82,11 +110,12 @@ def read_layout(file: io.TextIOBase) -> Layout:
             if names is not None and len(names) != len(words):
                 names = None
             places = None if names is None else match_columns(names)
+            unit = stated_unit(names[places["t"]]) if names and places else None
             how = separator, has_decimal_comma, has_words
-            return Layout(len(words), *how, places, size, number)
+            return Layout(len(words), *how, places, unit, size, number)
         here = _stated_size(bare)
         size = here or size
-        title = bare.lstrip("#%/; ")
+        title = bare.lstrip("#%/; ").encode("latin-1").decode(errors="replace")  # it may have µs
         found = split_line(title, _find_separator(title)[0])
         names = found if match_columns(found) else names
         if bare and not (bare.startswith(COMMENTS) or here or match_columns(found)):

@@ -35,12 +35,12 @@ class Mixture(SceneBase):
     from 0 on, 0 leaves it out; and `splits`, those that it serves (None: all).  `flicker_share`: of
     the clips whose light flickers with the mains, by a share out of `percent_flicker`; none does
     below 480 frames (windows times substeps) a second, where it would alias.  `root`,
-    `train_root` and `video_root` are there for the parts' configs to refer to.
+    `extra_train_root` and `video_root` are there for the parts' configs to refer to.
     """
 
     parts: Mapping[str, Mapping[str, Any]]
     root: Root = None
-    train_root: Root = None
+    extra_train_root: Root = None
     video_root: str | None = None
     flicker_share: float = 0.0
     percent_flicker: Sequence[float] = (0.05, 0.4)

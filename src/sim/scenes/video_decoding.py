@@ -37,7 +37,8 @@ def opened_video(path: Path, key: str) -> Iterator[tuple[Any, Any]]:
     with container:
         stream: Any = container.streams.best("video")
         decoder = stream.codec_context if stream else None  # none for an unknown codec
-        if decoder is None or not 0 < decoder.width * decoder.height <= LARGEST_PIXELS:
+        is_text = container.format.name == "tty"  # FFmpeg draws the letters
+        if is_text or decoder is None or not 0 < decoder.width * decoder.height <= LARGEST_PIXELS:
             raise ValueError(refusal)
         yield container, stream
 

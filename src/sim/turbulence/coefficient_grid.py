@@ -78,15 +78,15 @@ class GridAxis:
 Grid = tuple[GridAxis, GridAxis]  # rows and columns
 
 
-def omit_weak_waves(response: Response, first: int) -> Response:
+def omit_weak_waves(response: Response, first_mode: int) -> Response:
     """Return `response` with 0 for waves that hardly count for a radial order (OMITTED_VARIANCE).
 
-    Row 0 is mode `first`, 0 being x-tilt.
+    Row 0 is mode `first_mode`, 0 being x-tilt.
     """
     strongest = torch.zeros_like(response)
-    for rows in radial_orders(first, len(response)):
+    for rows in radial_orders(first_mode, len(response)):
         power, rank = response[rows].abs().square().sum(0).sort()
-        waves = rank[power.cumsum(0) > OMITTED_VARIANCE[first > 1] * power.sum()]
+        waves = rank[power.cumsum(0) > OMITTED_VARIANCE[first_mode > 1] * power.sum()]
         strongest[rows, waves] = response[rows, waves]
     return strongest
 

@@ -18,7 +18,7 @@ Tilt = Float[Tensor, "views frames 2 hc wc"]  # (x, y) in pixels
 
 
 @runtime_checkable
-class TurbulenceOperator(Protocol):
+class ClipTurbulence(Protocol):
     """The turbulence of one clip, between its clean frames and the views of a light field.
 
     All randomness comes from the generator: the same state gives the same result, on any device.  A
@@ -45,7 +45,7 @@ class TurbulenceModel(Protocol):
 
     def operator(
         self, drawn: Any, *, views: Sequence[Position], height: int, width: int, fps: float
-    ) -> TurbulenceOperator:
+    ) -> ClipTurbulence:
         """Return the operator of these parameters, for frames of `height` x `width` at `fps`."""
 
 

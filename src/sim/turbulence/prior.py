@@ -42,7 +42,7 @@ class NoCameraError(ValueError):
 
 
 @dataclass(frozen=True)
-class ImageStatistics:
+class TargetImageStatistics:
     """What an image shall show, in pixels of a frame 256 wide: the half length of the tilt's
     correlation, its time to 1 / e, and either `tilt_and_blur_px` (see Atmosphere) or `tilt_px`, rms
     along one axis.
@@ -94,7 +94,7 @@ def sample_atmosphere(
         lengths = (tilt_correlation_half_length_px, "tilt_correlation_half_length_px")
         if u[0] < share:
             lengths = (global_tilt_half_length_px, "global_tilt_half_length_px")
-        wanted = ImageStatistics(
+        wanted = TargetImageStatistics(
             float(log_uniform(u[1], *lengths)),
             float(log_uniform(u[2], tilt_correlation_time_s, "tilt_correlation_time_s")),
             tilt_and_blur_px=float(log_uniform(u[3], spreads, "tilt_and_blur_px")),
@@ -107,7 +107,7 @@ def sample_atmosphere(
 
 
 def sample_matching_atmosphere(
-    wanted: ImageStatistics,
+    wanted: TargetImageStatistics,
     generator: torch.Generator,
     *,
     lambda_over_d_px: Range = (0.4, 2.0),
@@ -210,7 +210,7 @@ def _draw_outer_scales(u: Candidates, limits: Range, kolmogorov: float) -> Candi
 
 
 def _solve_d_over_r0(
-    wanted: ImageStatistics, unit: Candidates, tilt: Candidates, higher: Candidates
+    wanted: TargetImageStatistics, unit: Candidates, tilt: Candidates, higher: Candidates
 ) -> tuple[Candidates, Candidates]:
     """Return the D/r0 that shows what is wanted, nan beyond D_OVER_R0, and its blur in pixels.
 
@@ -231,7 +231,7 @@ def _solve_d_over_r0(
 
 
 def _mismatch(
-    wanted: ImageStatistics,
+    wanted: TargetImageStatistics,
     blur: Candidates,
     unit: Candidates,
     shapes: Sequence[tuple[float, ...]],

@@ -34,7 +34,7 @@ def pupil_filter(
     i^n sqrt(n + 1) 2 J_{n+1}(pi kappa) / (pi kappa) {1, sqrt2 cos(m angle), sqrt2 sin(m angle)}
     (Noll 1976, eq. 8, for the phase at the pupil's centre).
     """
-    n, m = noll_indices(modes)
+    n, m = noll_indices_without_piston(modes)
     x, turn = math.pi * kappa.double().numpy(), angle.double().numpy()
     inside = np.where(x > 0, x, 1)
     bessel = special.jv(np.arange(n[-1] + 2)[:, None], inside) / inside
@@ -47,7 +47,7 @@ def pupil_filter(
 
 
 @cache
-def noll_indices(modes: int) -> tuple[np.ndarray, np.ndarray]:
+def noll_indices_without_piston(modes: int) -> tuple[np.ndarray, np.ndarray]:
     """Return n and m of Noll modes 2..modes + 1."""
     n, m = np.array([noll_index(mode) for mode in range(2, modes + 2)]).T
     return n, m

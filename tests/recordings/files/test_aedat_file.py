@@ -8,7 +8,7 @@ import pytest
 from faery.file_encoder import events_to_file
 
 from src.recordings.files import aedat_file
-from src.recordings.files.aedat_file import AedatFile
+from src.recordings.files.aedat_file import Aedat4File
 from src.recordings.files.event_file import RawEvents, ReadOptions
 from tests.recordings.files.test_recording import made_up
 from tests.recordings.files.test_rosbag_file import equal
@@ -21,10 +21,10 @@ STREAM = (
 )
 
 
-def read(path, content: bytes | None = None, **options) -> tuple[AedatFile, RawEvents]:
+def read(path, content: bytes | None = None, **options) -> tuple[Aedat4File, RawEvents]:
     if content is not None:
         path.write_bytes(content)
-    file = AedatFile(path, ReadOptions(**options))
+    file = Aedat4File(path, ReadOptions(**options))
     return file, RawEvents(*map(np.concatenate, zip(*file.pieces(), strict=True)))
 
 
@@ -134,4 +134,4 @@ def test_no_events_are_no_error(tmp_path):
         ("b.aedat4", made(LEFT, packets=[(0, packet(made_up(0)))])),
     ):
         (tmp_path / name).write_bytes(content)
-        assert list(AedatFile(tmp_path / name, ReadOptions()).pieces()) == []
+        assert list(Aedat4File(tmp_path / name, ReadOptions()).pieces()) == []

@@ -103,13 +103,16 @@ def test_what_fails_leaves_what_was_there(tmp_path, ending):
         ("a.raw", {"layout": "dsec"}, "must have the ending .h5"),
         ("a.raw", {"width": 2049}, "sides up to 2048, got 2049x480"),
         ("taken", {"layout": "evreal"}, "is a folder already"),
+        ("file.h5", {"layout": "evreal"}, "writes a folder, this is a file already"),
     ],
 )
 def test_what_cannot_be_written_is_named_before(tmp_path, name, how, words):
     (tmp_path / "taken").mkdir()
+    (tmp_path / "file.h5").write_bytes(b"kept")
     with pytest.raises(ValueError, match=words):
         event_writers.write_pieces(tmp_path / name, [made_up(9)], **{**SIZE, **how})
-    assert [file.name for file in tmp_path.iterdir()] == ["taken"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["file.h5", "taken"]
+    assert (tmp_path / "file.h5").read_bytes() == b"kept"
 
 
 @pytest.mark.parametrize(

@@ -73,6 +73,53 @@ def test_packets_of_a_word_an_event(tmp_path, big):
     assert file.time_unit == "ns" and equal(found, events)
 
 
+def test_packets_of_libcaer_whose_clock_goes_round(tmp_path):
+    # bit 0 valid, 1 ON, from 2 y, from 17 x; microseconds of 31 bits
+    events = [(5, 7, 1, 2**31 - 2), (639, 0, 0, 2**31 - 1), (1, 479, 1, 3)]
+    words = [word for x, y, on, t in events for word in (x << 17 | y << 2 | on << 1 | 1, t)]
+    with Bag(tmp_path / "cap", "mcap") as bag:
+        bag.add_packet("/events", np.array(words, "<u4").tobytes(), "libcaer", 1000, big=True)
+        bag.add_packet("/events", np.array(words[4:], "<u4").tobytes(), "libcaer", 2**31 * 1000)
+    file, found = read(tmp_path / "cap")
+    assert (file.size, file.time_unit) == ((640, 480), "ns")
+    assert [int(t) // 1000 - 2**31 for t in found.t] == [-1, 0, 4, 3]
+    assert found.x.tolist() == [5, 639, 1, 1] and found.y.tolist() == [7, 0, 479, 479]
+    assert found.p.tolist() == [1, 0, 1, 1]
+
+
+@pytest.mark.parametrize("big", [False, True])
+def test_packed_packets_of_libcaer(tmp_path, big):
+    high, low, column, row, first, rows = (kind << 12 for kind in range(6))
+    on = 1 << 11
+    words = [
+        high | 1, low | 5, column | 300, row | on | 250, low | 6, row | 4, column | 2,
+        first | on | 8, rows | 0b10000001, rows | 0b10, first, rows | 1, row | 9,
+    ]  # fmt: skip
+    content = np.array(words, ">u2" if big else "<u2").tobytes()
+    with Bag(tmp_path / "cap", "mcap") as bag:
+        bag.add_packet("/events", content, "libcaer_cmp", 10**18, big)
+    file, found = read(tmp_path / "cap")
+    assert file.time_unit == "ns"
+    assert ((found.t - 10**18) // 1000).tolist() == [4101, *[4102] * 6]
+    assert found.x.tolist() == [300, 300, 2, 2, 2, 2, 2]
+    assert found.y.tolist() == [250, 4, 8, 15, 17, 0, 9]
+    assert found.p.tolist() == [1, 0, 1, 1, 1, 0, 0]
+
+
+@pytest.mark.parametrize(("encoding", "size", "base", "fault"), [
+    ("libcaer", 12, 0, "cannot reshape"), ("libcaer_cmp", 3, 0, "buffer size"),
+    ("libcaer_cmp", 2, 0, "a word of kind 6"), ("libcaer_cmp", 4, 0, "before the word of"),
+    ("libcaer", 8, 2**63, "time_base must be in"),
+    ("mono", 8, 2**64 - 1, "time_base must be in"),
+])  # fmt: skip
+def test_packets_that_cannot_be_are_named(tmp_path, encoding, size, base, fault):
+    content = b"\0\x30\0\x10" if size == 4 else b"\0\x60" * 6  # a row without a column
+    with Bag(tmp_path / "cap", "mcap") as bag:
+        bag.add_packet("/events", content[:size], encoding, base)
+    with pytest.raises(ValueError, match=f"cap: topic /events: .*{fault}"):
+        read(tmp_path / "cap")
+
+
 @pytest.mark.parametrize(("plugin", "packing"), [
     (None, "lz4"), (None, "bz2"), ("sqlite3", "file"), ("sqlite3", "message"), ("mcap", "storage"),
 ])  # fmt: skip
@@ -117,8 +164,8 @@ def test_what_is_not_read_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"a\.bag: holds no messages of events, only std_msgs"):
         read(tmp_path / "a.bag")
     with Bag(tmp_path / "b", "mcap") as bag:
-        bag.add_packet("/events", bytes(8), "libcaer_cmp")
-    with pytest.raises(ValueError, match="b: topic /events: encoding 'libcaer_cmp' is not read"):
+        bag.add_packet("/events", bytes(8), "evt4")
+    with pytest.raises(ValueError, match="b: topic /events: encoding 'evt4' is not read, but evt3"):
         read(tmp_path / "b")
 
 

@@ -97,6 +97,28 @@ def test_packed_text(tmp_path, events):
     assert_read(tmp_path / "a.zip", events)
 
 
+def test_events_of_a_zip_with_other_texts(tmp_path, events):
+    """As a data set has them, packed by macOS."""
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        for name in ("images.txt", "shapes/events.txt", "__MACOSX/shapes/._events.txt"):
+            archive.writestr(name, lines(events) if name[0] == "s" else "0.1 a.png")
+    assert_read(tmp_path / "a.zip", events)
+
+
+@pytest.mark.parametrize(
+    ("comment", "size"),
+    [
+        ("# resolution: width=320, height=240", (WIDTH, HEIGHT)),
+        ("# sensor size (width, height): 320 240", (WIDTH, HEIGHT)),
+        ("# size of the file: 1234 bytes, 1500 lines", None),
+        ("# time resolution: 1e-06 s", None),
+    ],
+)
+def test_only_two_sides_in_a_comment_are_a_sensor_size(tmp_path, events, comment, size):
+    (tmp_path / "a.txt").write_text(f"{comment}\n{lines(events)}")
+    assert_read(tmp_path / "a.txt", events, size)
+
+
 def test_integers_are_exact_beyond_what_a_float_holds(tmp_path, events):
     epoch_ns = 1_700_000_000_123_456_789
     path = tmp_path / "a.txt"
@@ -128,6 +150,10 @@ BAD_TEXTS = {
     "polarity 2": ("t x y p\n1 2 3 2\n2 3 4 1\n", "polarity must be -1, 0 or 1"),
     "a place below 0": ("t x y p\n1 -2 3 1\n2 3 4 1\n", r"x must be in 0..65535, got -2"),
     "half a place": ("t x y p\n1 2.5 3 1\n2 3 4 1\n", "x must be whole numbers, got 2.5"),
+    "rectified places": (
+        "0.1 2.5 3.2 1\n0.2 2.7 4.5 0\n",
+        "only 1 of 4 columns can be one of these",
+    ),
     "order unknown": ("0 1 1 0\n1 1 1 0\n0 1 1 1\n", "columns must say the order"),
     "no numbers": ("a b c d\n" * 1200, "no line of numbers"),
 }
@@ -223,11 +249,18 @@ def fill_structured(file, events):
     file.attrs["geometry"] = "320x240"
 
 
-@pytest.mark.parametrize("fill", [fill_v2e, fill_mvsec, fill_any_group, fill_structured])
+def fill_words(file, events):
+    file["CD/events"] = structured(events)
+    file.attrs["sensor_resolution"] = "320x240"
+
+
+@pytest.mark.parametrize(
+    "fill", [fill_words, fill_v2e, fill_mvsec, fill_any_group, fill_structured]
+)
 def test_hdf5_layouts(tmp_path, events, fill):
     with h5py.File(tmp_path / "a.hdf5", "w") as file:
         fill(file, events)
-    stated = (WIDTH, HEIGHT) if fill in (fill_any_group, fill_structured) else None
+    stated = None if fill in (fill_v2e, fill_mvsec) else (WIDTH, HEIGHT)
     found = read_events(tmp_path / "a.hdf5")
     assert np.abs(found["t"] - found["t"][0] - events["t"] + events["t"][0]).max() <= 1
     assert all(np.array_equal(found[name], events[name]) for name in "xyp")
@@ -249,3 +282,25 @@ def test_one_of_two_cameras_is_read_and_the_other_is_told_of(tmp_path, events):
         assert np.array_equal(found["y"], other["y"])
     with pytest.raises(ValueError, match="stream must be one of"):
         read_events(tmp_path / "a.h5", options=ReadOptions(stream="up"))
+
+
+def test_one_of_two_cameras_in_an_npz(tmp_path, events):
+    right = events[:100]
+    np.savez(tmp_path / "a.npz", left=table(events, "txyp"), right=table(right, "txyp"))
+    with pytest.warns(UserWarning, match=r"holds 2 event streams, 0 \(left\), 1 \(right\)"):
+        assert len(read_events(tmp_path / "a.npz")) == len(events)
+    with pytest.warns(UserWarning, match="read is 1"):
+        found = read_events(tmp_path / "a.npz", options=ReadOptions(stream="right"))
+    assert np.array_equal(found["x"], right["x"])
+
+
+def test_a_stream_of_a_file_of_one_camera_is_refused(tmp_path, events):
+    (tmp_path / "a.txt").write_text(lines(events))
+    with pytest.raises(ValueError, match="stream must be null, as .* has one camera, got left"):
+        read_events(tmp_path / "a.txt", options=ReadOptions(stream="left"))
+    assert len(read_events(tmp_path / "a.txt", options=ReadOptions(stream=0))) == len(events)
+
+
+def test_a_folder_is_named_as_one(tmp_path):
+    with pytest.raises(ValueError, match="is a folder, not an event file"):
+        read_events(tmp_path)

@@ -144,6 +144,14 @@ def test_a_file_without_a_picture_is_refused(tmp_path):
         index_video(tmp_path / "none.mp4", "video")
 
 
+def test_text_is_no_film(tmp_path):
+    """FFmpeg would draw the letters of a list of events."""
+    path = tmp_path / "events.txt"
+    path.write_text("0.000450 60 134 1\n" * 2000)
+    with pytest.raises(ValueError, match="^video must be a video that FFmpeg can read"):
+        index_video(path, "video")
+
+
 def test_names_that_ffmpeg_takes_for_addresses_are_files(tmp_path):
     path = write_video(tmp_path / "http: größe %03d.mp4")
     assert len(index_video(path, "video").shown) == COUNT

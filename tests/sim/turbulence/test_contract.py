@@ -12,7 +12,7 @@ from src.sim.optics import Optics, layout
 from src.sim.pipeline import Pipeline, simulate
 from src.sim.scenes.clip import Clip
 from src.sim.sensor import EventSensor
-from src.sim.turbulence.contract import TurbulenceModel, TurbulenceOperator
+from src.sim.turbulence.contract import ClipTurbulence, TurbulenceModel
 from src.sim.turbulence.simulated import SimulatedTurbulence
 from tests.conftest import ROOT
 
@@ -53,7 +53,7 @@ class Ramp:
 def test_both_sides_of_the_contract_are_kept_by_simulated_turbulence():
     model = SimulatedTurbulence({"severity": "weak"})
     air = model.operator(model.draw(generator(0)), views=layout(4), height=16, width=16, fps=120.0)
-    assert isinstance(model, TurbulenceModel) and isinstance(air, TurbulenceOperator)
+    assert isinstance(model, TurbulenceModel) and isinstance(air, ClipTurbulence)
     assert air.metadata["severity"] == "weak" and air.metadata["tilt_px"] > 0
 
 

@@ -83,13 +83,13 @@ def _simulate(
     clip, keys = numbers + index * FIELDS, numbers + n * FIELDS + unit * KEYS
     edges = numbers + n * (FIELDS + views * KEYS) + index * (intervals + 1)
     pixel = (tl.load(clip + TOP) + row) * tl.load(clip + FULL_WIDTH) + tl.load(clip + LEFT) + col
-    on, off, hot = draw_pixel_properties(clip, keys, normals, pixel)
+    on, off, hot = draw_thresholds_and_hot_pixels(clip, keys, normals, pixel)
     leak = on.to(tl.int64) * tl.load(clip + LEAK)
     wait = tl.zeros([BLOCK], tl.float32) + load_int64_as_float64(clip + REFRACTORY).to(tl.float32)
     key, zero = tl.load(keys + NOISE_KEY), tl.full((), 0, tl.int64)
     intensity = tl.load(frame, own, 0.0).to(tl.float32)
     bad = is_outside(intensity)
-    level = read_table(level_table, table_position(intensity))
+    level = read_table(level_table, fixed_point_table_position(intensity))
     ref = level - draw_reference_error(clip, keys, pixel, on, off)
     source, dead = level, tl.zeros([BLOCK], tl.float32)
     frame += frame_step
@@ -102,7 +102,7 @@ def _simulate(
     for i in range(intervals):
         intensity = tl.load(frame, own, 0.0).to(tl.float32)
         bad = bad | is_outside(intensity)
-        place = table_position(intensity)
+        place = fixed_point_table_position(intensity)
         read = read_table(level_table, place)
         new = read
         if FILTERED:
@@ -201,7 +201,7 @@ def _add_to_grid(grid, fired, u, sign, begin, ticks, scale, column, BINS: tl.con
 
 
 @triton.jit
-def draw_pixel_properties(clip, keys, normals, pixel):
+def draw_thresholds_and_hot_pixels(clip, keys, normals, pixel):
     mismatch, key = tl.load(clip + MISMATCH), tl.load(keys + MISMATCH_KEY)
     none = tl.full((), 0, tl.int64)
     drawn_on = random_uint32(key, none, 2 * pixel)
@@ -238,7 +238,7 @@ def is_outside(intensity):
 
 
 @triton.jit
-def table_position(intensity):
+def fixed_point_table_position(intensity):
     """Return the place in the tables of an intensity, as src.sim.sensor.response.lookup has it."""
     bits = intensity.to(tl.int32, bitcast=True)
     return tl.minimum(tl.maximum(bits, 0x38800000), 0x3FFFFFFF) - 0x38800000
