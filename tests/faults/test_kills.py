@@ -79,6 +79,7 @@ def disturb_training(
     return harness.outcome(folder / "last")
 
 
+@pytest.mark.filterwarnings("ignore:.* runs, the newest is taken")
 @pytest.mark.parametrize("seed", SEEDS)
 def test_training_goes_on_to_the_same_numbers(tmp_path, alone, seed):
     numbers, seconds = alone
