@@ -64,8 +64,8 @@ def run_main(main: Callable[[], None]) -> None:
     """Call the Hydra entry point `main`; a wrong value ends in one line on stderr and exit code 2.
 
     A sweep with failed jobs ends with their names and exit code 1.  Paths on the command line are
-    quoted for Hydra's grammar.  `HYDRA_FULL_ERROR=1` makes
-    Hydra hand the errors of the job to us instead of printing them.
+    quoted for Hydra's grammar.  `HYDRA_FULL_ERROR=1` makes Hydra hand the errors of the job to us
+    instead of printing them.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"
     start = time.time()

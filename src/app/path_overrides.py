@@ -79,12 +79,8 @@ def _quote(value: str) -> str:
     return f"'{escaped}'"
 
 
-def _split(values: str) -> list[str]:
-    """Return the values between the commas that stand in no quotes and no brackets."""
-    return list(_parts(values))
-
-
-def _parts(values: str) -> Iterator[str]:
+def _split(values: str) -> Iterator[str]:
+    """Yield the values between the commas that stand in no quotes and no brackets."""
     start = place = depth = 0
     while place < len(values):
         letter = values[place]

@@ -12,6 +12,7 @@ import numpy as np
 
 from src.live_view.status import FaultLog
 from src.recordings.files import sources
+from src.recordings.files.clocks import TimestampUnwrapper
 from src.recordings.files.event_file import EVENT, ReadOptions
 from src.recordings.files.recording import open_recording
 from src.recordings.views import LARGEST_SIDE, Size
@@ -110,7 +111,7 @@ class UdpFeed(Feed):
         self.sensor, self.packet_format, self.faults = sensor, packet_format, faults
         self.dtype = PACKETS[packet_format]
         self.buffer = memoryview(bytearray(GATHER_BYTES + MAX_PACKET_BYTES))
-        self.turns, self.last_us = 0, 0  # of a clock of 32 bits
+        self.clock = TimestampUnwrapper()
         try:
             self.socket = _bind_udp_socket(url)
         except (OSError, ValueError) as error:
@@ -144,15 +145,10 @@ class UdpFeed(Feed):
 
         32 bits of microseconds turn every 71.6 minutes: the turns are added.
         """
-        t = packed["t"].astype(np.int64)
         if self.packet_format == "t64_x16_y16_on8":
-            on, y = packed["p"] != 0, packed["y"]
+            t, on, y = packed["t"].astype(np.int64), packed["p"] != 0, packed["y"]
         else:
-            on, y = packed["y"] & 1, packed["y"] >> 1
-            if t.size:
-                turns = self.turns + np.cumsum(np.diff(t, prepend=self.last_us) < -(2**31))
-                self.turns, self.last_us = int(turns[-1]), int(t[-1])
-                t = t + (turns << 32)
+            t, on, y = self.clock.unwrap(packed["t"]), packed["y"] & 1, packed["y"] >> 1
         is_valid = (t >= 0) & (t < MAX_TIME_US)
         if not is_valid.all():
             self._report_bad_packets()

@@ -13,7 +13,7 @@ from lz4.frame import LZ4FrameCompressor
 
 from src.recordings.files import read_events, unpacking
 from src.recordings.files.aedat2_file import Aedat2File
-from src.recordings.files.aedat_file import Aedat4File
+from src.recordings.files.aedat4_file import Aedat4File
 from src.recordings.files.event_file import ReadOptions
 from src.recordings.files.rosbag_file import RosbagFile
 from tests.recordings.files.bags import Bag

@@ -20,28 +20,10 @@ def new_state() -> np.ndarray:
 
 
 @njit(nogil=True, cache=True)
-def decode_evt2(words, state, t, x, y, p):
-    """Write the events of `words` (n,) uint32 to t, x, y, p (n,); return how many."""
-    found, base, high = 0, state[BASE], state[HIGH]
-    for word in words:
-        kind = word >> 28
-        if kind < 2:
-            t[found] = base + (high << 6) + np.int64(word >> 22 & 63)
-            x[found], y[found], p[found] = word >> 11 & 2047, word & 2047, kind
-            found += high >= 0
-            state[LOST] += high < 0
-        elif kind == TIME:
-            base, high = _set_high(base, high, np.int64(word & 0xFFFFFFF), 28, 6)
-        elif kind == TRIGGER:
-            state[TRIGGERS] += 1
-    state[BASE], state[HIGH] = base, high
-    return found
-
-
-@njit(nogil=True, cache=True)
-def decode_evt21(heads, masks, state, t, x, y, p):
-    """Write the events of words of 64 bits, their upper and lower halves (n,) uint32, to t, x, y, p
-    (32 n,); return how many."""
+def decode_evt2(heads, masks, state, t, x, y, p):
+    """Write the events of EVT2.1's words, their upper and lower 32 bits (n,), to t, x, y, p
+    (32 n,); return how many.  A word of EVT2 is an upper half with a mask of 1: one event.
+    """
     found, base, high = 0, state[BASE], state[HIGH]
     for i in range(heads.size):
         word, mask = heads[i], masks[i]

@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from src.recordings.files.aedat3_packets import iter_polarity
-from src.recordings.files.clocks import Clock, merge_small_pieces
+from src.recordings.files.clocks import TimestampUnwrapper, merge_small_pieces
 from src.recordings.files.event_file import PIECE_EVENTS, EventFile, RawEvents, ReadOptions
-from src.recordings.files.streams import Stream, choose_stream
+from src.recordings.files.streams import EventStream, choose_stream
 
 LARGEST_HEADER = 2**24  # bytes; jAER's settings are in it
 LINE = re.compile(rb"#[^\n\x00-\x08\x0e-\x1f]*\n")
@@ -51,7 +51,7 @@ class Aedat2File(EventFile):
             raise ValueError(f"{path}: must be AEDAT 1.0, 2.0 or 3.1, is {found}")
         if self._version == "3.1":
             sources = re.findall(r"#source (\d{1,4}): *([\w-]*)", lines) or [("0", "camera")]
-            streams = [Stream(int(number), name, _find_size(name)) for number, name in sources]
+            streams = [EventStream(int(number), name, _find_size(name)) for number, name in sources]
             chosen, self.notes = choose_stream(path, streams, options.stream)
             self._source, self.size = chosen.id, chosen.size
             return
@@ -67,11 +67,11 @@ class Aedat2File(EventFile):
         if self._version == "3.1":
             yield from merge_small_pieces(iter_polarity(self.path, self._start, self._source))
             return
-        found, words, clock = 0, 0, Clock()
+        found, words, clock = 0, 0, TimestampUnwrapper()
         for address, t in self._words():
             on, x, y, pixel = self._split(address)
             found, words = found + int(pixel.sum()), words + len(pixel)
-            yield RawEvents(*(part[pixel] for part in (clock.go_on(t), x, y, on)))
+            yield RawEvents(*(part[pixel] for part in (clock.unwrap(t), x, y, on)))
         if words and not found:
             raise ValueError(f"{self.path}: holds no events, only {words} words of other kinds")
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from src.recordings.files.event_file import RawEvents
+from src.recordings.files.unpacking import LARGEST_PACKET
 
-LARGEST_PACKET = 2**28  # bytes; ten thousand events have 80,000
 HEADER = np.dtype(
     [("kind", "<i2"), ("source", "<i2"), ("bytes", "<i4"), ("time_at", "<i4"), ("rounds", "<i4"),
      ("room", "<i4"), ("count", "<i4"), ("valid", "<i4")]

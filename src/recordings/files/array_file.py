@@ -11,12 +11,13 @@ from src.recordings.files.columns import (
     as_integers,
     as_times,
     check_claim,
+    check_lengths,
     find_columns,
     match_columns,
     pick_columns,
 )
 from src.recordings.files.event_file import PIECE_EVENTS, EventFile, RawEvents, ReadOptions
-from src.recordings.files.streams import Stream, choose_stream
+from src.recordings.files.streams import EventStream, choose_stream
 
 
 class ArrayFile(EventFile):
@@ -36,9 +37,7 @@ class ArrayFile(EventFile):
                 with np.load(path) as file:
                     self.size = _stated_size(file)
                     self._columns, self.notes = _columns_of(path, file, options)
-            lengths = [len(self._columns[name]) for name in "txyp"]
-            if len(set(lengths)) != 1:
-                raise ValueError(f"columns t, x, y, p differ in length: {lengths}")
+            check_lengths(self._columns)
         except Exception as error:  # libraries raise all kinds on a broken file
             text = str(error).split("\n")[0].removeprefix(f"{path}: ")  # of choose_stream
             raise ValueError(f"{path}: cannot be read as arrays of events: {text}") from error
@@ -47,12 +46,7 @@ class ArrayFile(EventFile):
         yield from slice_columns(self.path, self._columns)
 
     def times(self) -> Iterator[np.ndarray]:
-        t = self._columns["t"]
-        for first in range(0, len(t), PIECE_EVENTS):
-            try:
-                yield as_times(t[first : first + PIECE_EVENTS])
-            except ValueError as error:
-                raise ValueError(f"{self.path}: {error}") from None
+        yield from slice_times(self.path, self._columns["t"])
 
 
 def split_table(table: Any, order: str | None) -> dict[str, Any]:
@@ -70,9 +64,18 @@ def split_table(table: Any, order: str | None) -> dict[str, Any]:
     if sample.dtype.kind not in "iufb":
         raise ValueError(f"an array must hold numbers, got {sample.dtype}")
     if not len(sample):
-        return {name: _Column(table, 0) for name in "txyp"}
+        return {name: SlicedColumn(table, 0) for name in "txyp"}
     places = find_columns(sample.astype(np.float64), order)
-    return {name: _Column(table, place) for name, place in places.items()}
+    return {name: SlicedColumn(table, place) for name, place in places.items()}
+
+
+def slice_times(path: Path, t: Any) -> Iterator[np.ndarray]:
+    """Yield the times of the pieces of `slice_columns`."""
+    for first in range(0, len(t), PIECE_EVENTS):
+        try:
+            yield as_times(np.asarray(t[first : first + PIECE_EVENTS]))
+        except Exception as error:  # a broken chunk, or values that are no times
+            raise ValueError(f"{path}: times cannot be read: {error}") from error
 
 
 def slice_columns(
@@ -89,7 +92,7 @@ def slice_columns(
         yield RawEvents(t, x, y, p)
 
 
-class _Column:
+class SlicedColumn:
     """Column `place` of an array (n, columns) of which slices are taken."""
 
     def __init__(self, table: Any, place: int | str):
@@ -102,7 +105,7 @@ class _Column:
         return self.table[part, self.place]
 
 
-class _Field(_Column):
+class _Field(SlicedColumn):
     """Field `place` of a structured array."""
 
     def __getitem__(self, part: slice) -> np.ndarray:
@@ -123,7 +126,7 @@ def _columns_of(
         names = [name for name in file.files if ("event" in name.lower()) == is_called_events]
         tables = {name: table for name in names if _is_table(table := file[name])}
         if tables:
-            streams = [Stream(place, name, None) for place, name in enumerate(tables)]
+            streams = [EventStream(place, name, None) for place, name in enumerate(tables)]
             chosen, notes = choose_stream(path, streams, options.stream)
             return split_table(tables[chosen.name], options.columns), notes
     raise ValueError(f"no columns t, x, y, p and no array of events among {', '.join(file.files)}")

@@ -9,18 +9,18 @@ the first y and ON of a column's rows, and which of its next eight rows have an 
 
 import numpy as np
 
+from src.recordings.files.clocks import TimestampUnwrapper
 from src.recordings.files.event_file import RawEvents
 
 TIME_HIGH, TIME_LOW, COLUMN, ROW, FIRST_ROW, ROWS = range(6)  # kinds of words of libcaer_cmp
-CLOCK = 2**31  # microseconds, after which libcaer's clock begins anew
+CLOCK_BITS = 31  # of libcaer's microseconds
 
 
 def split_libcaer(words: np.ndarray, start_ns: int) -> RawEvents:
     """Return the events of a packet (2 n,) uint32, times in nanoseconds; raises ValueError for a
     packet that ends within an event."""
     pixel, t = words.reshape(-1, 2).T
-    times = t.astype(np.int64)
-    times += np.cumsum(np.diff(times, prepend=times[:1]) < -CLOCK // 2) * CLOCK
+    times = TimestampUnwrapper(CLOCK_BITS).unwrap(t)
     x, y = (pixel >> 17).astype(np.uint16), (pixel >> 2 & 0x7FFF).astype(np.uint16)
     return RawEvents(times * 1000 + start_ns, x, y, pixel >> 1 & 1)
 

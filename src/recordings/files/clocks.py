@@ -1,4 +1,4 @@
-"""Pieces of events: clocks of 32 bits that begin anew, and small pieces joined to larger ones."""
+"""Pieces of events: counters of time that begin anew, and small pieces joined to larger ones."""
 
 from collections.abc import Iterator
 
@@ -6,22 +6,21 @@ import numpy as np
 
 from src.recordings.files.event_file import PIECE_EVENTS, RawEvents
 
-CLOCK = 2**32  # microseconds, after which a clock of 32 bits begins anew
 
+class TimestampUnwrapper:
+    """A counter of `bits`, read in pieces: it went round where it falls by more than half."""
 
-class Clock:
-    """A clock of 32 bits that is read in pieces: it went round where it falls by more than half."""
+    def __init__(self, bits: int = 32):
+        self._bits, self._last, self._rounds = bits, 0, 0
 
-    def __init__(self):
-        self._last, self._rounds = 0, 0
-
-    def go_on(self, t: np.ndarray) -> np.ndarray:
-        """Return the times (n,) uint32 as int64 with the rounds since the first piece."""
+    def unwrap(self, t: np.ndarray) -> np.ndarray:
+        """Return the times (n,) as int64 with the rounds since the first piece."""
         times = t.astype(np.int64)
         if len(times):
-            rounds = np.cumsum(np.diff(times, prepend=self._last) < -CLOCK // 2) + self._rounds
+            has_wrapped = np.diff(times, prepend=self._last) < -(1 << self._bits - 1)
+            rounds = np.cumsum(has_wrapped) + self._rounds
             self._last, self._rounds = int(times[-1]), int(rounds[-1])
-            times += rounds * CLOCK
+            times += rounds << self._bits
         return times
 
 

@@ -114,6 +114,13 @@ def as_integers(name: str, values: np.ndarray) -> np.ndarray:
     return values.astype(np.int64)
 
 
+def check_lengths(columns: Mapping[str, Any]) -> None:
+    """Raise ValueError unless the columns t, x, y, p are equally long."""
+    lengths = [len(columns[name]) for name in "txyp"]
+    if len(set(lengths)) != 1:
+        raise ValueError(f"columns t, x, y, p differ in length: {lengths}")
+
+
 def check_claim(path: Path, size: int) -> None:
     """Raise ValueError for a file that unpacks to more than MAX_PACKING times its size."""
     most = MAX_PACKING * path.stat().st_size + 2**24

@@ -8,7 +8,6 @@ MAX_PARTS times.
 """
 
 import math
-from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +20,12 @@ from src.recordings.engines.event_passes import (
     label_events,
     measure_lateness,
 )
-from src.recordings.files.event_arrays import concatenate_events, count_before, sort_events
+from src.recordings.files.event_arrays import (
+    concatenate_events,
+    count_before,
+    sort_events,
+    times_of,
+)
 
 BUFFER_US = 50_000  # by which events may be late
 BUFFER_EVENTS = 2**24  # that are buffered at most; of more the oldest go
@@ -32,7 +36,7 @@ TOLD_US = 1000  # events later than that are told of
 
 
 @dataclass
-class Part:
+class ClockPart:
     """Events of one clock: how many, and the first and the last time in us."""
 
     count: int = 0
@@ -50,7 +54,7 @@ class EventOrder:
 
     def __init__(self, buffer_us: int = BUFFER_US, few: int = FEW_EVENTS, part: int | None = 0):
         self.buffer_us, self.few, self._part = buffer_us, few, part
-        self.parts, self.count = [Part()], 0
+        self.parts, self.count = [ClockPart()], 0
         self.dropped = self.late = self.most_late_us = 0
         self._undecided: np.ndarray | None = None
         self._held: list[np.ndarray] = []  # in order, one after the other
@@ -82,15 +86,15 @@ class EventOrder:
     def settle(self, until_us: float) -> None:
         """Take later events for a silence's end, without waiting for more, if before `until_us`."""
         waiting = self._undecided
-        if waiting is not None and self.last_us < _times(waiting).min() <= until_us:
+        if waiting is not None and self.last_us < times_of(waiting).min() <= until_us:
             self._decide(waiting, self.few, at_end=True)
 
     def release(self, until_us: float) -> list[np.ndarray]:
         """Return the events before `until_us`; what comes later and is earlier is dropped."""
         ready: list[np.ndarray] = []
-        while self._held and _times(self._held[0])[-1] < until_us:
+        while self._held and times_of(self._held[0])[-1] < until_us:
             ready.append(self._held.pop(0))
-        if self._held and (cut := _count_before(self._held[0], until_us)):
+        if self._held and (cut := count_before(self._held[0], until_us)):
             ready.append(self._held[0][:cut])
             self._held[0] = self._held[0][cut:]
         self._released_us = max(self._released_us, math.ceil(min(until_us, 2**62)))
@@ -104,7 +108,7 @@ class EventOrder:
                 events = events[:0]
                 break
             part, labels = self.parts[-1], np.empty(len(events), np.int8)
-            t = np.ascontiguousarray(_times(events))
+            t = np.ascontiguousarray(times_of(events))
             state = part.first_us, part.last_us, part.count
             done, _, _, restarted = label_events(t, *state, self.buffer_us, few, at_end, labels)
             kept = labels[:done] == KEPT
@@ -119,7 +123,7 @@ class EventOrder:
 
     def _goes_on(self, events: np.ndarray, few: int) -> bool:
         """Return whether all events are in order and none of the last ones could be an outlier."""
-        t, part = _times(events), self.parts[-1]
+        t, part = times_of(events), self.parts[-1]
         if part.count < few or len(t) <= few or t[0] < part.last_us:
             return False
         return (
@@ -128,13 +132,13 @@ class EventOrder:
         )
 
     def _keep_some(self, events: np.ndarray) -> list[np.ndarray]:
-        late = measure_lateness(_times(events), self.parts[-1].last_us)
+        late = measure_lateness(times_of(events), self.parts[-1].last_us)
         return self._keep(events, *late) if len(events) else []
 
     def _keep(self, events: np.ndarray, late: int, most: int) -> list[np.ndarray]:
         """Hold events of the part's clock, `late` of them by `most` us at most; return those that
         are in order for good."""
-        part, t = self.parts[-1], _times(events)
+        part, t = self.parts[-1], times_of(events)
         if late:
             self.late, self.most_late_us = self.late + late, max(self.most_late_us, most)
             events = self._drop_released(events)
@@ -149,14 +153,14 @@ class EventOrder:
         return self.release(self._bound_us(part.last_us - self.buffer_us))
 
     def _drop_released(self, events: np.ndarray) -> np.ndarray:
-        gone = _times(events) < self._released_us
+        gone = times_of(events) < self._released_us
         self.dropped += (count := int(gone.sum()))
         return events[~gone] if count else events
 
     def _hold(self, events: np.ndarray, unsorted: bool) -> None:
         if unsorted:
-            first = _times(events).min()
-            after = [part for part in self._held if _times(part)[-1] > first]
+            first = times_of(events).min()
+            after = [part for part in self._held if times_of(part)[-1] > first]
             self._held = self._held[: len(self._held) - len(after)]
             events = sort_events(concatenate_events([*after, events]))
         if len(events):
@@ -168,7 +172,7 @@ class EventOrder:
         for part in self._held:
             if excess < 0:
                 break
-            until_us = max(until_us, int(_times(part)[min(excess, len(part) - 1)]))
+            until_us = max(until_us, int(times_of(part)[min(excess, len(part) - 1)]))
             excess -= len(part)
         return until_us
 
@@ -181,7 +185,7 @@ class EventOrder:
             ready = self.release(2**63 - 1)
             self._released_us = LONG_AGO_US
         self._held = []
-        self.parts.append(Part())
+        self.parts.append(ClockPart())
         return ready
 
     def is_whole(self) -> bool:
@@ -232,11 +236,3 @@ def merge_in_time(ones: Iterator[np.ndarray], others: Iterator[np.ndarray]) -> I
         if rest is not None:
             yield rest
             yield from left
-
-
-def _times(events: np.ndarray) -> np.ndarray:
-    return events["t"] if events.dtype.names else events
-
-
-def _count_before(events: np.ndarray, time_us: float) -> int:
-    return bisect_left(_times(events), time_us)

@@ -36,16 +36,17 @@ class EvtDecoder:
         """Return the events of whole little-endian words, times in microseconds."""
         room = len(block) // WORD_BYTES[self.kind] * MOST_EVENTS[self.kind]
         events = [np.empty(room, kind) for kind in ("i8", "u2", "u2", "i1")]
-        if self.kind == "evt21":
-            count = evt_words.decode_evt21(*self._halves(block), self._state, *events)
-        elif self.kind == "evt2":
-            count = evt_words.decode_evt2(np.frombuffer(block, "<u4"), self._state, *events)
-        else:
+        if self.kind == "evt3":
             count = evt_words.decode_evt3(np.frombuffer(block, "<u2"), self._state, *events)
+        else:
+            count = evt_words.decode_evt2(*self._halves(block), self._state, *events)
         return RawEvents(*(part[:count] for part in events))
 
     def _halves(self, block: bytes) -> tuple[np.ndarray, np.ndarray]:
-        """Return the upper and lower 32 bits of each word."""
+        """Return the upper and lower 32 bits of each word, of EVT2 the word and a mask of one."""
+        if self.kind == "evt2":
+            words = np.frombuffer(block, "<u4")
+            return words, np.broadcast_to(np.uint32(1), words.shape)
         pairs = np.frombuffer(block, "<u4").reshape(-1, 2)
         legacy, little, big = pairs[:, 0], pairs[:, 1], pairs[:, 0].byteswap()
         if self._order is None:

@@ -15,10 +15,21 @@ import h5py
 import hdf5plugin  # noqa: F401 - its codecs are registered by the import
 import numpy as np
 
-from src.recordings.files.array_file import slice_columns, split_table
-from src.recordings.files.columns import as_times, check_claim, match_columns, pick_columns
-from src.recordings.files.event_file import PIECE_EVENTS, EventFile, RawEvents, ReadOptions
-from src.recordings.files.streams import Stream, choose_stream
+from src.recordings.files.array_file import (
+    SlicedColumn,
+    slice_columns,
+    slice_times,
+    split_table,
+)
+from src.recordings.files.columns import (
+    as_times,
+    check_claim,
+    check_lengths,
+    match_columns,
+    pick_columns,
+)
+from src.recordings.files.event_file import EventFile, RawEvents, ReadOptions
+from src.recordings.files.streams import EventStream, choose_stream
 
 HDF5_ENDINGS = (".h5", ".hdf5", ".hdf")
 MAX_CHUNK_BYTES = 2**28  # bytes of HDF5 that are unpacked at a time
@@ -38,19 +49,19 @@ class Hdf5File(EventFile):
             streams = find_streams(self._file)
             if not streams:
                 raise ValueError("no columns t, x, y, p and no array of events (n, 4) in it")
-            listed = [Stream(k, name, None) for k, name in enumerate(streams)]
+            listed = [EventStream(k, name, None) for k, name in enumerate(streams)]
             chosen, self.notes = choose_stream(path, listed, options.stream)
             self._open(streams[chosen.name], options)
         except Exception as error:  # HDF5 raises all kinds on a broken file
-            text = str(error)
-            text = text if text.startswith(str(path)) else f"cannot be read as events: {text}"
-            raise ValueError(f"{path}: {text}" if text[:6] == "cannot" else text) from error
+            is_named = str(error).startswith(str(path))
+            text = "" if is_named else f"{path}: cannot be read as events: "
+            raise ValueError(f"{text}{error}") from error
 
     def pieces(self) -> Iterator[RawEvents]:
-        yield from slice_columns(self.path, self._columns, self._shifted(self.kept_times))
+        yield from slice_columns(self.path, self._columns, self.kept_times)
 
     def times(self) -> Iterator[np.ndarray] | None:
-        return self._read_times() if self._has_own_times else None
+        return slice_times(self.path, self._columns["t"]) if self._has_own_times else None
 
     def _open(self, node: Any, options: ReadOptions) -> None:
         check_claim(self.path, _claimed_bytes(node))
@@ -61,35 +72,18 @@ class Hdf5File(EventFile):
         self._columns: dict[str, Any] = (
             _columns_of(node) if self._has_own_times else split_table(node, options.columns)
         )
-        self._offset = 0
         if "t_offset" in self._file:
-            self._offset = _single_number(self._file["t_offset"])
+            offset = _single_number(self._file["t_offset"])
+            self._columns["t"] = _ShiftedTimes(self._columns["t"], offset)
         if "t_offset" in self._file or "ms_to_idx" in self._file:  # DSEC's layout
             self.time_unit = "us"
 
-    def _read_times(self) -> Iterator[np.ndarray]:
-        t = self._columns["t"]
-        for first in range(0, len(t), PIECE_EVENTS):
-            try:
-                yield as_times(t[first : first + PIECE_EVENTS]) + self._offset
-            except Exception as error:  # a broken chunk
-                raise ValueError(f"{self.path}: times cannot be read: {error}") from error
 
-    def _shifted(self, times: list[np.ndarray] | None) -> list[np.ndarray] | Any:
-        if times is not None:
-            return times
-        return _ShiftedTimes(self._columns["t"], self._offset) if self._offset else None
+class _ShiftedTimes(SlicedColumn):
+    """Times after an offset, `place`, in their unit."""
 
-
-class _ShiftedTimes:
-    """The times of a piece by its number, read when they are asked for."""
-
-    def __init__(self, t: Any, offset: int):
-        self.t, self.offset = t, offset
-
-    def __getitem__(self, number: int) -> np.ndarray:
-        first = number * PIECE_EVENTS
-        return as_times(self.t[first : first + PIECE_EVENTS]) + self.offset
+    def __getitem__(self, part: slice) -> np.ndarray:
+        return as_times(np.asarray(self.table[part])) + self.place
 
 
 def find_streams(file: h5py.File) -> dict[str, Any]:
@@ -161,9 +155,7 @@ def _is_table(name: str, node: Any) -> bool:
 
 def _columns_of(group: Any) -> dict[str, Any]:
     columns = {name: group[key] for name, key in (pick_columns(group) or {}).items()}
-    lengths = [len(columns[name]) for name in "txyp"]
-    if len(set(lengths)) != 1:
-        raise ValueError(f"columns t, x, y, p differ in length: {lengths}")
+    check_lengths(columns)
     return columns
 
 

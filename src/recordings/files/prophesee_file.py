@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from src.recordings.files.clocks import Clock
+from src.recordings.files.clocks import TimestampUnwrapper
 from src.recordings.files.event_file import (
     PIECE_EVENTS,
     RAW_FORMATS,
@@ -124,9 +124,9 @@ class PropheseeFile(EventFile):
         if head[0] not in DAT_PIXELS or head[1:] != b"\10":
             raise ValueError(f"{self.path}: DAT of type {head.hex(' ')} is not read, but 0 and 12")
         x_bits, y_bits = (9, 8) if self._lines.get("version") in ("0", "1") else (14, 14)
-        clock = Clock()
+        clock = TimestampUnwrapper()
         for block in self._blocks(8, self._start + 2):
             t, word = np.frombuffer(block, "<u4").reshape(-1, 2).T
             x, y = word & (1 << x_bits) - 1, word >> x_bits & (1 << y_bits) - 1
             on = word >> (x_bits + y_bits) & 15
-            yield RawEvents(clock.go_on(t), x.astype(np.uint16), y.astype(np.uint16), on > 0)
+            yield RawEvents(clock.unwrap(t), x.astype(np.uint16), y.astype(np.uint16), on > 0)

@@ -14,7 +14,7 @@ import numpy as np
 
 from src.recordings.engines.event_passes import convert_events
 from src.recordings.files.aedat2_file import Aedat2File
-from src.recordings.files.aedat_file import Aedat4File
+from src.recordings.files.aedat4_file import Aedat4File
 from src.recordings.files.array_file import ArrayFile
 from src.recordings.files.es_file import EsFile
 from src.recordings.files.event_arrays import concatenate_events, count_before
@@ -23,7 +23,7 @@ from src.recordings.files.event_order import EventOrder, merge_in_time
 from src.recordings.files.hdf5_file import HDF5_ENDINGS, Hdf5File
 from src.recordings.files.prophesee_file import PropheseeFile
 from src.recordings.files.rosbag_file import RosbagFile, is_bag_folder
-from src.recordings.files.survey import Survey, survey_times
+from src.recordings.files.survey import TimeSurvey, survey_times
 from src.recordings.files.text_file import TextFile
 from src.recordings.files.text_layout import TEXT_ENDINGS
 from src.recordings.files.time_unit import check_times, to_us
@@ -47,7 +47,7 @@ class EventRecording:
     size: tuple[int, int] | None
     options: ReadOptions
     file: EventFile
-    survey: Survey
+    survey: TimeSurvey
 
     @property
     def messages(self) -> tuple[str, ...]:
@@ -227,7 +227,7 @@ def _open_file(path: Path, options: ReadOptions) -> EventFile:
 @lru_cache(maxsize=1)
 def _open_and_survey(
     path: Path, changed_ns: int, length: int, options: ReadOptions
-) -> tuple[EventFile | None, Survey]:
+) -> tuple[EventFile | None, TimeSurvey]:
     """Return what is opened, once for a file that does not change, and what its times tell; None
     for HDF5, of which an open file cannot be written."""
     file = _open_file(path, options)

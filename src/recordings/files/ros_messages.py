@@ -27,7 +27,7 @@ FIRST_CDR = (0, 2, 4, 8, 12), 14
 NEXT_CDR = (0, 2, 6, 10, 14), 16  # two bytes behind a multiple of four, where the time begins
 
 
-class Message:
+class EventMessage:
     """A message of type `kind` with events of a camera; `cdr`: of ROS 2.
 
     `size`: (width, height); `encoding`: of a packet, "" of an array.  Raises struct.error or

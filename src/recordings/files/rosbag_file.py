@@ -20,11 +20,12 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from src.recordings.files.clocks import merge_small_pieces
 from src.recordings.files.event_file import EventFile, RawEvents, ReadOptions
 from src.recordings.files.evt_decoder import EvtDecoder
-from src.recordings.files.ros_messages import ARRAYS, PACKETS, Message
-from src.recordings.files.streams import Stream, choose_stream
+from src.recordings.files.ros_messages import ARRAYS, PACKETS, EventMessage
+from src.recordings.files.streams import EventStream, choose_stream
 from src.recordings.files.unpacking import unpack
 
 READERS: dict[str, Any] = {".bag": Ros1Reader, ".db3": Sqlite3Reader, ".mcap": mcap.McapReader}
+Messages = Generator[tuple[str, EventMessage], None, None]  # of a topic, its name first
 ZSTD = b"\x28\xb5\x2f\xfd"  # how a message begins that is packed alone
 
 # rosbags itself unpacks without bound.
@@ -52,7 +53,7 @@ class RosbagFile(EventFile):
         topics = self._find_topics()
         sizes = self._count_bytes() if len(topics) > 1 and options.stream is None else {}
         most = max(range(len(topics)), key=lambda place: sizes.get(topics[place], 0))
-        streams = [Stream(place, topic, None) for place, topic in enumerate(topics)]
+        streams = [EventStream(place, topic, None) for place, topic in enumerate(topics)]
         chosen, self.notes = choose_stream(path, streams, options.stream, most)
         self._topic = chosen.name
         with closing(self._messages(self._topic)) as messages:
@@ -99,7 +100,7 @@ class RosbagFile(EventFile):
             sizes[topic] += message.size_bytes
         return sizes
 
-    def _messages(self, topic: str | None = None) -> Generator[tuple[str, Message], None, None]:
+    def _messages(self, topic: str | None = None) -> Messages:
         """Yield the messages of a topic, or of all topics of events, with its name."""
         with self._opened() as reader:
             for part in getattr(reader, "storages", [reader]):  # the files of a folder
@@ -108,7 +109,7 @@ class RosbagFile(EventFile):
                 for link, _, content in part.messages(wanted) if wanted else ():
                     packed = content[:4] == ZSTD
                     content = unpack(content, "zstd") if packed else content
-                    yield link.topic, Message(link.msgtype, content, self._ros2)
+                    yield link.topic, EventMessage(link.msgtype, content, self._ros2)
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:

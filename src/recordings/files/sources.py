@@ -11,7 +11,8 @@ from jaxtyping import Float
 from src.recordings.files import recording
 from src.recordings.files.event_file import ReadOptions
 from src.recordings.files.rosbag_file import is_bag_folder
-from src.recordings.files.videos import PICTURES, VIDEOS, read_gray_picture, read_video
+from src.recordings.files.videos import read_gray_picture, read_video
+from src.sim.scenes.video_files import PICTURE_SUFFIXES, VIDEO_SUFFIXES
 
 Size = tuple[int, int]  # height, width
 
@@ -57,7 +58,7 @@ def read_sensor_picture(
     """Return a picture in [0, 1], the mean of a film, or the number of events of each pixel, which
     shows a target that blinks on a dark screen.  Raises ValueError for what cannot be read."""
     path = Path(path)
-    if path.suffix.lower() in PICTURES:
+    if path.suffix.lower() in PICTURE_SUFFIXES:
         return read_gray_picture(path)
     if not has_events(path):
         frames = read_video(path)
@@ -75,7 +76,7 @@ def read_sensor_picture(
 def has_events(path: Path | str) -> bool:
     """Return whether `path` is none of: folder of pictures, picture, film, our `video.h5`."""
     path = Path(path)
-    if path.is_dir() or path.suffix.lower() in PICTURES + VIDEOS:
+    if path.is_dir() or path.suffix.lower() in PICTURE_SUFFIXES | VIDEO_SUFFIXES:
         return is_bag_folder(path)
     try:
         with h5py.File(path) if path.suffix.lower() == ".h5" else nullcontext({}) as file:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 
-class Stream(NamedTuple):
+class EventStream(NamedTuple):
     """Events of one camera: its number in the file, its name, and (width, height) or None."""
 
     id: int
@@ -14,8 +14,8 @@ class Stream(NamedTuple):
 
 
 def choose_stream(
-    path: Path, streams: Sequence[Stream], wanted: str | int | None, default: int = 0
-) -> tuple[Stream, tuple[str, ...]]:
+    path: Path, streams: Sequence[EventStream], wanted: str | int | None, default: int = 0
+) -> tuple[EventStream, tuple[str, ...]]:
     """Return the stream `wanted`, its place in `streams` or its name, and a note of the others.
 
     Without `wanted` it is `streams[default]`.  Raises ValueError where there is no such stream.

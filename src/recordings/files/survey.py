@@ -23,7 +23,7 @@ KEPT_BYTES = 2**28  # of what was read for its times and need not be read again
 Part = TypeVar("Part", np.ndarray, RawEvents)
 
 
-class Survey(NamedTuple):
+class TimeSurvey(NamedTuple):
     """The unit of the times, the buffer and the least events of a part (EventOrder), whether the
     two parts are ON and OFF, and lines for the user.
 
@@ -43,36 +43,29 @@ class Survey(NamedTuple):
     pieces: list[RawEvents] | None = None
 
 
-def survey_times(file: EventFile, options: ReadOptions) -> Survey:
+def survey_times(file: EventFile, options: ReadOptions) -> TimeSurvey:
     """Return what the times of a file tell where its format does not define their unit, or where
     they can be read alone.
 
     Raises ValueError, which names the file, for one that is refused (find_order).
     """
-    if file.time_unit is not None and file.times() is None:
-        return Survey(file.time_unit, is_whole=False)
-    pieces = None
+    times = pieces = None
     if file.times() is not None:
-        file.kept_times = _keep(lambda: file.times() or ())
-        read_times = _times_reader(file)
-    else:
+        times = file.kept_times = _keep(lambda: file.times() or ())
+    elif file.time_unit is None:
         pieces = _keep(file.pieces)
-        kept = pieces
+    else:
+        return TimeSurvey(file.time_unit, is_whole=False)
 
-        def read_times() -> Iterable[np.ndarray]:
-            return (piece.t for piece in (file.pieces() if kept is None else kept))
+    def read_times() -> Iterable[np.ndarray]:
+        return times or file.times() or (piece.t for piece in pieces or file.pieces())
 
-    return _judge(file, options, read_times)._replace(times=file.kept_times, pieces=pieces)
-
-
-def _times_reader(file: EventFile) -> Callable[[], Iterable[np.ndarray]]:
-    kept = file.kept_times
-    return lambda: (file.times() or ()) if kept is None else kept
+    return _judge(file, options, read_times)._replace(times=times, pieces=pieces)
 
 
 def _judge(
     file: EventFile, options: ReadOptions, read_times: Callable[[], Iterable[np.ndarray]]
-) -> Survey:
+) -> TimeSurvey:
     path, sample = file.path, TimeSample()
     for t in read_times():
         sample.add(t)
@@ -98,7 +91,7 @@ def _judge(
         merged = False
         lines += order.lines(path, part=options.part)
     shape = order.buffer_us, order.few, merged
-    return Survey(unit, *shape, tuple(lines), is_ordered=order.is_whole())
+    return TimeSurvey(unit, *shape, tuple(lines), is_ordered=order.is_whole())
 
 
 def find_order(

@@ -17,8 +17,9 @@ from src.recordings.files.columns import MAX_COORDINATE, as_integers, check_clai
 from src.recordings.files.event_file import PIECE_EVENTS, EventFile, RawEvents, ReadOptions
 from src.recordings.files.text_layout import (
     COMMENTS,
+    MAX_LINE,
     WORDS,
-    Layout,
+    TextLayout,
     is_number,
     open_text,
     read_layout,
@@ -73,7 +74,7 @@ class TextFile(EventFile):
         number, rest, size = self._layout.lines, "", 0
         with open_text(self.path) as file:
             for _ in range(number):
-                file.readline(CHUNK)
+                file.readline(MAX_LINE)
             while chunk := file.read(CHUNK):
                 size += len(chunk)
                 check_claim(self.path, size)
@@ -123,7 +124,7 @@ class TextFile(EventFile):
         return tidy
 
 
-def _load(lines: list[str], layout: Layout, kind: type) -> np.ndarray:
+def _load(lines: list[str], layout: TextLayout, kind: type) -> np.ndarray:
     """Return the columns of lines, all of them as `kind`; raises ValueError for other lines."""
     dtype = [(f"f{k}", kind) for k in range(layout.width)]
     if not any(lines):

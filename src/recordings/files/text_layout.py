@@ -24,7 +24,7 @@ GEOMETRY = re.compile(
 )
 
 
-class Layout(NamedTuple):
+class TextLayout(NamedTuple):
     """How the lines of a file are read: the `width` of the table, `separator` (None: any blanks),
     whether a comma is the decimal point, whether polarity is a word, the `places` of t, x, y, p
     where names tell them, the unit of time in these, and (width, height).  `lines` come before
@@ -91,7 +91,7 @@ class _UpToCut(io.RawIOBase):
         return len(part)
 
 
-def read_layout(file: io.TextIOBase) -> Layout:
+def read_layout(file: io.TextIOBase) -> TextLayout:
     """Return how the lines are read, from those up to the first event."""
     size: tuple[int, int] | None = None
     names: list[str] | None = None
@@ -101,7 +101,7 @@ def read_layout(file: io.TextIOBase) -> Layout:
         if not line:
             if strange is not None:
                 raise ValueError(f"no line of numbers t x y p in it, got {strange[:40]!r}")
-            return Layout(0, None, False, False, None, None, size, number)
+            return TextLayout(0, None, False, False, None, None, size, number)
         bare = line.strip()
         separator, has_decimal_comma = _find_separator(bare)
         words = split_line(bare.replace(",", ".") if has_decimal_comma else bare, separator)
@@ -112,7 +112,7 @@ def read_layout(file: io.TextIOBase) -> Layout:
             places = None if names is None else match_columns(names)
             unit = stated_unit(names[places["t"]]) if names and places else None
             how = separator, has_decimal_comma, has_words
-            return Layout(len(words), *how, places, unit, size, number)
+            return TextLayout(len(words), *how, places, unit, size, number)
         here = _stated_size(bare)
         size = here or size
         title = bare.lstrip("#%/; ").encode("latin-1").decode(errors="replace")  # it may have µs

@@ -13,10 +13,8 @@ from jaxtyping import Float
 
 from src.recordings.files.hdf5_file import check_no_external_data
 from src.sim.scenes.video_decoding import LARGEST_PIXELS
-from src.sim.scenes.video_files import PICTURE_SUFFIXES, VIDEO_SUFFIXES, read_picture
+from src.sim.scenes.video_files import PICTURE_SUFFIXES, read_picture
 from src.sim.scenes.video_index import index_video
-
-PICTURES, VIDEOS = tuple(sorted(PICTURE_SUFFIXES)), tuple(sorted(VIDEO_SUFFIXES))
 
 
 def read_video(
@@ -53,7 +51,7 @@ def read_fps(path: Path | str, key: str = "video", most: int | None = None) -> f
 
 def _frames(path: Path, key: str, most: int | None) -> Iterator[np.ndarray]:
     if path.is_dir():
-        names = sorted(name for name in path.iterdir() if name.suffix.lower() in PICTURES)
+        names = sorted(name for name in path.iterdir() if name.suffix.lower() in PICTURE_SUFFIXES)
         yield from (read_gray_picture(name) for name in names if name.name[0] != ".")
     elif path.suffix == ".h5":
         with _opened_h5(path) as file:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from faery.file_encoder import events_to_file
 
-from src.recordings.files import aedat_file
-from src.recordings.files.aedat_file import Aedat4File
+from src.recordings.files import aedat4_file as aedat_file
+from src.recordings.files.aedat4_file import Aedat4File
 from src.recordings.files.event_file import RawEvents, ReadOptions
 from tests.recordings.files.test_recording import made_up
 from tests.recordings.files.test_rosbag_file import equal

@@ -19,7 +19,7 @@ import numpy as np
 
 from src.recordings.files.clocks import merge_small_pieces
 from src.recordings.files.event_file import EventFile, RawEvents, ReadOptions
-from src.recordings.files.streams import Stream, choose_stream
+from src.recordings.files.streams import EventStream, choose_stream
 from src.recordings.files.unpacking import LARGEST_PACKET, unpack
 
 MAGIC = b"#!AER-DAT4.0\r\n"
@@ -32,7 +32,7 @@ STORED = np.dtype(
 KINDS = {"EVTS": "events", "FRME": "frames", "IMUS": "inertial data", "TRIG": "triggers"}
 
 
-class Header(NamedTuple):
+class Aedat4Header(NamedTuple):
     """What an AEDAT4 file says of itself; its packets lie from `start` to `end` (-1: its end)."""
 
     compression: int
@@ -130,7 +130,7 @@ def _table(content: bytes, root: int) -> list[int]:
     return [root + field if field else 0 for field in fields]
 
 
-def _read_header(path: Path) -> Header:
+def _read_header(path: Path) -> Aedat4Header:
     with path.open("rb") as file:
         start = file.read(len(MAGIC) + 4)
         length = int.from_bytes(start[len(MAGIC) :], "little")
@@ -145,7 +145,7 @@ def _read_header(path: Path) -> Header:
         raise ValueError(f"{path}: its header cannot be read: {error}") from error
 
 
-def _parse_header(header: bytes, start: int) -> Header:
+def _parse_header(header: bytes, start: int) -> Aedat4Header:
     """Return what a header says, behind which the packets begin at byte `start`."""
 
     def read(kind: str, at: int) -> int:
@@ -154,7 +154,7 @@ def _parse_header(header: bytes, start: int) -> Header:
     compression, end, text = _table(header, read("<I", 0))[:3]
     text += read("<I", text)
     (words,) = struct.unpack_from(f"{read('<I', text)}s", header, text + 4)
-    return Header(
+    return Aedat4Header(
         read("<i", compression) if compression else 0,
         start,
         read("<q", end) if end else -1,
@@ -162,7 +162,7 @@ def _parse_header(header: bytes, start: int) -> Header:
     )
 
 
-def _read_streams(path: Path, description: str) -> list[tuple[str, Stream]]:
+def _read_streams(path: Path, description: str) -> list[tuple[str, EventStream]]:
     """Return the kind of each stream (EVTS, FRME, ...) and the stream."""
     depth, found = 0, []
     try:
@@ -178,10 +178,10 @@ def _read_streams(path: Path, description: str) -> list[tuple[str, Stream]]:
     return found
 
 
-def _read_stream(node: ElementTree.Element) -> Stream:
+def _read_stream(node: ElementTree.Element) -> EventStream:
     info = {part.get("key"): part.text or "" for part in node.iterfind("node[@name='info']/attr")}
     sides = [info.get(key, "") for key in ("sizeX", "sizeY")]
     known = all(side.isdecimal() and len(side) < 10 for side in sides)
     number = node.get("name", "")[:9]
     size = (int(sides[0]), int(sides[1])) if known else None
-    return Stream(int(number), info.get("source") or f"stream {number}", size)
+    return EventStream(int(number), info.get("source") or f"stream {number}", size)
