@@ -6,7 +6,7 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
-from src.models.layers import pad_to_multiple
+from src.models.layers import pad_centred_to_multiple
 from src.models.network import WINDOW_S, EventToVideoNetwork
 from src.sim.optics import Position, centre_view_index, layout
 from src.sim.voxel import normalise_nonzero
@@ -44,7 +44,7 @@ class CentreViewNetwork(EventToVideoNetwork):
         height, width = voxels.shape[-2:]
         view = voxels[:, centre_view_index(positions or layout(voxels.shape[1]))]
         view = normalise_nonzero(view) if self.normalise == "nonzero" else view
-        grid, (top, left) = pad_to_multiple(view, self.side_multiple)
+        grid, (top, left) = pad_centred_to_multiple(view, self.side_multiple)
         frame, state = self.predict_before_activation(grid, state)
         return self.activate_output(frame[..., top : top + height, left : left + width]), state
 

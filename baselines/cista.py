@@ -15,6 +15,8 @@ from torch.nn import functional
 from baselines.centre_view import CentreViewNetwork
 from src.models.layers import ConvLSTM
 
+Code = Float[Tensor, "n c h w"]
+
 
 class CISTA(CentreViewNetwork):
     """The centre view's voxel grids to frames; 1,260,867 parameters.
@@ -75,12 +77,7 @@ class Step(nn.Module):
         self.synthesis, self.analysis = _conv(code, features), _conv(features, code)
         self.threshold = nn.Parameter(1e-3 * torch.rand(1, code, 1, 1))
 
-    def forward(
-        self,
-        x: Float[Tensor, "n f h w"],
-        z: Float[Tensor, "n c h w"],
-        pull: Float[Tensor, "n c h w"],
-    ) -> Float[Tensor, "n c h w"]:
+    def forward(self, x: Float[Tensor, "n f h w"], z: Code, pull: Code) -> Code:
         z = z + self.analysis(x - self.synthesis(z)) + pull
         return (z - self.threshold).relu() - (-z - self.threshold).relu()
 

@@ -15,11 +15,7 @@ class E2VIDPlus(CentreViewNetwork):
     """
 
     def __init__(
-        self,
-        bins: int = 5,
-        base_channels: int = 32,
-        normalise: str = "none",
-        output: str = "clip",
+        self, bins: int = 5, base_channels: int = 32, normalise: str = "none", output: str = "clip"
     ):
         super().__init__(bins, normalise, output)
         self.net = E2VID(1, bins, base_channels, final_activation="none")

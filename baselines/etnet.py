@@ -17,6 +17,7 @@ from baselines.centre_view import CentreViewNetwork
 from src.models.e2vid import E2VID, SCALES
 
 HEADS, DROPOUT = 8, 0.1
+Tokens = Float[Tensor, "n tokens c"]
 
 
 class ETNet(CentreViewNetwork):
@@ -41,7 +42,7 @@ class ETNet(CentreViewNetwork):
 
     def predict_before_activation(self, grid: Tensor, state: Any) -> tuple[Tensor, Any]:
         head, skips, after = self.net.encode(self.net.first_layer(grid), state)
-        return self.net.decode(self.pyramid(skips[::-1]), head, skips), after
+        return self.net.decode_logits(self.pyramid(skips[::-1]), head, skips), after
 
 
 class Pyramid(nn.Module):
@@ -92,9 +93,7 @@ class Layer(nn.Module):
             self.cross = Attention(width)
         self.mlp = ResidualMLP(width)
 
-    def forward(
-        self, x: Float[Tensor, "n tokens c"], memory: Float[Tensor, "n tokens c"] | None = None
-    ) -> Float[Tensor, "n tokens c"]:
+    def forward(self, x: Tokens, memory: Tokens | None = None) -> Tokens:
         normal = self.norm(x)
         x = x + self.attention(normal, normal)
         if memory is not None:
@@ -109,9 +108,7 @@ class Attention(nn.Module):
         super().__init__()
         self.project, self.out = nn.Linear(width, 3 * width), nn.Linear(width, width)
 
-    def forward(
-        self, x: Float[Tensor, "n tokens c"], memory: Float[Tensor, "n tokens c"]
-    ) -> Float[Tensor, "n tokens c"]:
+    def forward(self, x: Tokens, memory: Tokens) -> Tokens:
         """Return what the tokens `x` find in `memory`; dropped out in training."""
         weights, biases = self.project.weight.chunk(3), self.project.bias.chunk(3)
         q, k, v = (
@@ -132,7 +129,7 @@ class ResidualMLP(nn.Module):
         self.norm = nn.LayerNorm(width)
         self.wide, self.back = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
 
-    def forward(self, x: Float[Tensor, "n tokens c"]) -> Float[Tensor, "n tokens c"]:
+    def forward(self, x: Tokens) -> Tokens:
         hidden = functional.dropout(self.wide(self.norm(x)).relu(), DROPOUT, self.training)
         return x + functional.dropout(self.back(hidden), DROPOUT, self.training)
 

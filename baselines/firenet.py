@@ -28,11 +28,8 @@ class FireNet(CentreViewNetwork):
         self.pred = nn.Conv2d(channels, 1, 1)
 
     def predict_before_activation(self, grid: Tensor, state: Any) -> tuple[Tensor, Any]:
-        x = self.head(grid).relu()
-        after = []
-        for cell, block, before in zip(
-            self.cells, self.resblocks, state or (None, None), strict=True
-        ):
+        x, after, states = self.head(grid).relu(), [], state or (None, None)
+        for cell, block, before in zip(self.cells, self.resblocks, states, strict=True):
             x, new = cell(x, before)
             x = block(x)
             after.append(new)

@@ -1,7 +1,5 @@
-"""No learning: the exponential high-pass of the events, the least that a method must beat.
-
-Log intensity is the sum of polarity times threshold; without the first frame only its changes are
-known, and errors pile up, so old events are forgotten exponentially (Scheerlinck et al. 2018).
+"""No learning: the exponential high-pass of the events (Scheerlinck et al. 2018), the least that a
+method must beat.
 """
 
 from collections.abc import Sequence
@@ -24,10 +22,8 @@ class HighPass(EventToVideoNetwork):
         super().__init__()
         if not 0 <= decay <= 1:
             raise ValueError(f"baseline.decay must be in [0, 1], got {decay}")
-        if view_reduction not in ("centre", "median"):
-            raise ValueError(
-                f"baseline.view_reduction must be centre or median, got {view_reduction}"
-            )
+        if (got := view_reduction) not in ("centre", "median"):
+            raise ValueError(f"baseline.view_reduction must be centre or median, got {got}")
         self.decay, self.gain, self.view_reduction = decay, gain, view_reduction
 
     def forward(

@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from baselines.centre_view import CentreViewNetwork
 from src.models.e2vid import E2VID, SCALES
-from src.models.layers import bias_of
+from src.models.layers import require_bias
 
 ATOMS, FUNCTIONS = 6, 6  # functions of each of the two reaches
 
@@ -44,7 +44,7 @@ class HyperE2VID(CentreViewNetwork):
         head, skips, after = self.net.encode(self.net.first_layer(grid), before)
         x = self.net.resblocks(skips[-1]) + skips.pop()
         x = self.dynamic(x, torch.cat([grid, previous], 1))
-        frame = self.net.decode(x, head, skips)
+        frame = self.net.decode_logits(x, head, skips)
         return frame, (after, frame.detach())
 
 
@@ -74,7 +74,7 @@ class DynamicDecoder(nn.Module):
         self.register_buffer("functions", functions.flatten(1))
         self.compose = nn.Conv2d(inputs * ATOMS, outputs, 1)
         nn.init.kaiming_normal_(self.compose.weight, mode="fan_out", nonlinearity="relu")
-        nn.init.zeros_(bias_of(self.compose))
+        nn.init.zeros_(require_bias(self.compose))
 
     def forward(
         self, x: Float[Tensor, "n c h w"], context: Float[Tensor, "n k h8 w8"]

@@ -20,11 +20,13 @@ from torch.nn import functional
 from baselines.hilbert import hilbert_order
 from baselines.selective_scan import Mixer
 from baselines.stabilise import estimate_jitter, warp_video
-from src.models.layers import pad_to_multiple
+from src.models.layers import pad_centred_to_multiple
 from src.models.network import FramePostprocessor, split_windows
 
 DISTORTION = 4  # channels: tilt down and right, mean and log-variance of the blur latent
 SCALES = 3
+Tokens = Float[Tensor, "n cells c"]
+Grid = tuple[int, int, int]  # frames, height, width
 PIXELS = 2**20  # encoded or decoded at once where no gradient is asked for: 16 frames of 256 x 256
 
 
@@ -53,9 +55,7 @@ class MambaTM(FramePostprocessor):
                 raise ValueError(f"postprocess.{name} must be >= {least}, got {value}")
         width = base_channels * 2**SCALES
         self.frame_channels, self.stabilise_input = frame_channels, stabilise_input
-        self.encoder = Encoder(
-            2 * frame_channels if stabilise_input else frame_channels, base_channels
-        )
+        self.encoder = Encoder((1 + stabilise_input) * frame_channels, base_channels)
         self.distortion_encoder = Encoder(DISTORTION, base_channels)
         self.distortion_width = nn.Conv2d(width, width, 1)
         self.distortion_decoder = Decoder(DISTORTION, base_channels)
@@ -80,7 +80,7 @@ class MambaTM(FramePostprocessor):
         frames = frames.expand(-1, -1, self.frame_channels, -1, -1)
         shift = estimate_jitter(frames) if self.stabilise_input else None
         seen = frames if shift is None else torch.cat([frames, warp_video(frames, shift)], 2)
-        flat, (top, left) = pad_to_multiple(seen.flatten(0, 1), 2**SCALES)
+        flat, (top, left) = pad_centred_to_multiple(seen.flatten(0, 1), 2**SCALES)
         limit = 0 if torch.is_grad_enabled() else max(1, PIXELS // flat[0, 0].numel())
         parts = list(split_windows(len(flat), limit))
         maps = zip(*(self.encoder(flat[part]) for part in parts), strict=True)
@@ -131,12 +131,8 @@ class Layer(nn.Module):
         self.near = nn.Conv3d(4 * width, 4 * width, 3, padding=1, groups=4 * width)
 
     def forward(
-        self,
-        tokens: Float[Tensor, "n cells c"],
-        grid: tuple[int, int, int],
-        order: Int[Tensor, " cells"],
-        guide: Float[Tensor, "n cells c"] | None = None,
-    ) -> Float[Tensor, "n cells c"]:
+        self, tokens: Tokens, grid: Grid, order: Int[Tensor, " cells"], guide: Tokens | None = None
+    ) -> Tokens:
         """Return tokens of the same shape; `grid` is (frames, h, w), row-major as the tokens."""
         guide = None if guide is None else self.guide_norm(guide)[:, order]
         mixed = self.mixer(self.norm(tokens)[:, order], guide)
@@ -234,5 +230,5 @@ def _tokens(maps: Tensor, frames: int) -> Tensor:
     return maps.unflatten(0, (-1, frames)).movedim(2, -1).flatten(1, 3)
 
 
-def _maps(tokens: Tensor, grid: tuple[int, int, int]) -> Tensor:
+def _maps(tokens: Tensor, grid: Grid) -> Tensor:
     return tokens.unflatten(1, grid).movedim(-1, 2).flatten(0, 1)

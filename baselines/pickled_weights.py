@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
 
-from src.models.checkpoints import is_compressed
+from src.models.checkpoints import is_compressed_zip
 from src.models.files import check_weights_stored_whole
 
 PICKLES = 5  # at the beginning of a checkpoint of PyTorch before 1.6, the weights' storages behind
@@ -34,14 +34,13 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise ValueError(f"baseline.weights must be a file, got {path}")
     try:
-        if zipfile.is_zipfile(path) and is_compressed(path):
+        if zipfile.is_zipfile(path) and is_compressed_zip(path):
             raise ValueError("packed, it could fill the memory")
         with safe_globals([(Inert, name) for name in _unknown_globals(path)]):
             content = torch.load(path, "cpu", weights_only=True)
     except Exception as error:  # libraries raise all kinds on a broken file
-        raise ValueError(
-            f"baseline.weights must be an unpacked torch checkpoint, got {path}"
-        ) from error
+        allowed = "an unpacked torch checkpoint"
+        raise ValueError(f"baseline.weights must be {allowed}, got {path}") from error
     content = content.get("state_dict", content) if isinstance(content, dict) else {}
     items = content.items() if isinstance(content, dict) else ()
     weights = {name: value for name, value in items if isinstance(value, Tensor)}

@@ -36,8 +36,8 @@ class CameraFrames(VideoMethod):
 
 
 class Postprocessed(VideoMethod):
-    """A post-processor behind `source`: video in, video out, in windows of `window` frames that
-    share `overlap`.  A source with fewer pictures than windows gives each of them once.
+    """A post-processor behind `source`: video in, video out.  A source with fewer pictures than
+    windows gives each of them once.
 
     `postprocessor`: the network, or a name in weights/ or a path of its weights, of one of the
     packages `allowed_packages` if not of ours.
@@ -47,24 +47,20 @@ class Postprocessed(VideoMethod):
         self,
         source: VideoMethod,
         postprocessor: FramePostprocessor | str,
-        window: int = 16,
-        overlap: int = 4,
         allowed_packages: Sequence[str] = (),
     ):
         super().__init__()
         if isinstance(postprocessor, str):
             postprocessor = load(postprocessor, allowed_packages)
         self.source, self.postprocessor = source, postprocessor
-        self.views, self.window, self.overlap = source.views, window, overlap
+        self.views = source.views
 
     @torch.no_grad()
     def reconstruct_clip(self, sample: "Sample") -> Float[Tensor, "n windows 1 h w"]:
         """Return the restored frame of every window, in [0, 1]."""
         frames = self.source.reconstruct_clip(sample).float().clamp(0, 1)
         step = self.source.exposure_frames if isinstance(self.source, CameraFrames) else 1
-        restored = self.postprocessor.restore(
-            frames[:, ::step], window=self.window, overlap=self.overlap
-        )
+        restored = self.postprocessor.restore(frames[:, ::step])
         return restored.repeat_interleave(step, 1)[:, : frames.shape[1]]
 
 

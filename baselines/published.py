@@ -64,11 +64,8 @@ HYPER = (
     (r"^dynamic\.fuse\.", "unetrecurrent.decoders.0.context_fusion.conv."),
     (r"^dynamic\.weigh\.", "unetrecurrent.decoders.0.dynamic_atom_generation.bases_net."),
     (r"^dynamic\.functions", "unetrecurrent.decoders.0.dynamic_atom_generation.bases"),
-    (
-        r"^dynamic\.compose\.weight",
-        "unetrecurrent.decoders.0.dynamic_conv.compositional_coefficients",
-    ),
     (r"^dynamic\.compose\.", "unetrecurrent.decoders.0.dynamic_conv."),
+    (r"dynamic_conv\.weight", "dynamic_conv.compositional_coefficients"),
     *UNET,
 )
 CISTA_TC = (
@@ -133,12 +130,10 @@ def load_pretrained(architecture: str, weights: str | None) -> nn.Module:
         return network
     if path.is_file():
         return load_published(architecture, path)
-    make = (
-        f"make ours with `python -m src.train experiment=clean/{architecture}` and ship_weights, "
-    )
+    command = f"`python -m src.train experiment=clean/{architecture}`"
+    make = f"make ours with {command} and ship_weights, " if path.parent.name == "clean" else ""
     raise ValueError(
-        f"baseline.weights must be a file with the weights of {architecture}, got {weights}; "
-        f"{make if path.parent.name == 'clean' else ''}"
+        f"baseline.weights must be a file with the weights of {architecture}, got {weights}; {make}"
         "or give the path of its authors' checkpoint"
     )
 
@@ -173,7 +168,6 @@ def rename(ours: str, rules: tuple[tuple[str, str], ...]) -> str:
 
 def _find_architecture(architecture: str) -> Published:
     if architecture not in NETWORKS:
-        raise ValueError(
-            f"baseline.architecture must be one of {', '.join(NETWORKS)}, got {architecture}"
-        )
+        names = ", ".join(NETWORKS)
+        raise ValueError(f"baseline.architecture must be one of {names}, got {architecture}")
     return NETWORKS[architecture]

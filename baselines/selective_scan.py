@@ -14,16 +14,14 @@ from torch.nn import functional
 
 TAPS = 4  # of the causal convolution before the scan
 EXPAND = 2
+Tokens = Float[Tensor, "n length c"]
+States = Float[Tensor, "n length s"]
 BLOCK = 16384  # positions whose states are kept at once: 64 MiB at 128 channels of 8 states
 
 
 def scan(
-    x: Float[Tensor, "n length c"],
-    step: Float[Tensor, "n length c"],
-    rate: Float[Tensor, "c s"],
-    enter: Float[Tensor, "n length s"],
-    leave: Float[Tensor, "n length s"],
-) -> Float[Tensor, "n length c"]:
+    x: Tokens, step: Tokens, rate: Float[Tensor, "c s"], enter: States, leave: States
+) -> Tokens:
     """Return what each channel reads; `rate` < 0, `step` > 0, so no decay exceeds one.
 
     Block after block, so that the memory of states is that of one block.
@@ -95,9 +93,7 @@ class Direction(nn.Module):
             self.step.bias.copy_(steps + torch.log(-torch.expm1(-steps)))
         nn.init.uniform_(self.step.weight, -(rank**-0.5), rank**-0.5)
 
-    def forward(
-        self, x: Float[Tensor, "n length c"], guide: Float[Tensor, "n length c"] | None
-    ) -> Float[Tensor, "n length c"]:
+    def forward(self, x: Tokens, guide: Tokens | None) -> Tokens:
         """Return what position i makes of positions 0 .. i."""
         x = _causal(self.conv, x)
         chooser = x if guide is None else _causal(self.guide_conv, guide)
@@ -121,9 +117,7 @@ class Mixer(nn.Module):
         self.back = Direction(inner, states, rank, guided)
         self.leave = nn.Linear(inner, width, bias=False)
 
-    def forward(
-        self, x: Float[Tensor, "n length c"], guide: Float[Tensor, "n length c"] | None = None
-    ) -> Float[Tensor, "n length c"]:
+    def forward(self, x: Tokens, guide: Tokens | None = None) -> Tokens:
         if guide is None:
             x, gate = self.enter(x).chunk(2, dim=-1)
         else:

@@ -14,11 +14,12 @@ from src.metrics import temporal
 
 SPAN = 2.0  # frames, standard deviation of the window over which a path is taken for straight
 ERROR = 0.2  # pixels per axis, rms, to which a block's jitter is known
+Video = Float[Tensor, "n frames c h w"]
 NEAR = (1.0, 4.0, 1.0)  # weights of a block and its neighbours along an axis
 
 
 @torch.no_grad()
-def estimate_jitter(frames: Float[Tensor, "n frames c h w"]) -> Float[Tensor, "n frames 2 h w"]:
+def estimate_jitter(frames: Video) -> Float[Tensor, "n frames 2 h w"]:
     """Return by how much each frame is shifted, (x, y) in pixels, against where it belongs."""
     grey = frames.float().mean(2, keepdim=True)
     with torch.autocast(frames.device.type, enabled=False):
@@ -61,11 +62,7 @@ def linear_smoother(frames: int) -> Float[Tensor, "frames frames"]:
     return weight * (second - first * lag) / spread if frames > 1 else torch.ones(1, 1)
 
 
-def warp_video(
-    frames: Float[Tensor, "n frames c h w"], shift: Float[Tensor, "n frames 2 h w"]
-) -> Float[Tensor, "n frames c h w"]:
+def warp_video(frames: Video, shift: Float[Tensor, "n frames 2 h w"]) -> Video:
     """Return the frames with what lies `shift` (x, y), in pixels, from each pixel brought there."""
-    flat = temporal.warp_by_shift(
-        frames.float().flatten(0, 1), shift.float().flatten(0, 1), "bicubic"
-    )
-    return flat.unflatten(0, frames.shape[:2])
+    every, away = (part.float().flatten(0, 1) for part in (frames, shift))
+    return temporal.warp_by_shift(every, away, "bicubic").unflatten(0, frames.shape[:2])

@@ -24,7 +24,7 @@ from src.live_view.network_runner import RunSettings
 from src.live_view.page_server import PageServer
 from src.live_view.status import FaultLog
 from src.recordings import sensor_lookup
-from src.recordings.files import formats
+from src.recordings.files import event_writers
 from src.recordings.simulated_recording import kaleidoscope_views
 from src.sim.optics import layout
 
@@ -40,7 +40,7 @@ def write(path: Path, views) -> None:
     drawn = events(int(RATE * LENGTH_S / seen.mean() * 1.01), LENGTH_S)
     inside = drawn[seen[drawn["y"], drawn["x"]]]
     keep = np.sort(np.random.default_rng(0).permutation(len(inside))[: int(RATE * LENGTH_S)])
-    formats.write_events(path, inside[keep], width=SENSOR[1], height=SENSOR[0])
+    event_writers.write_events(path, inside[keep], width=SENSOR[1], height=SENSOR[0])
 
 
 async def measure(server: PageServer, seconds: float) -> dict:

@@ -19,8 +19,8 @@ from benchmarks.timing import least
 from src.models.e2vid import E2VID
 from src.models.setnet import SetNet
 from src.recordings import event_windows, reconstruction, sensor_lookup
-from src.recordings.files import formats
-from src.recordings.files.formats import EVENT
+from src.recordings.files import event_writers, recording
+from src.recordings.files.event_file import EVENT
 from src.recordings.simulated_recording import kaleidoscope_views
 from src.sim.optics import layout
 
@@ -65,7 +65,7 @@ def end_to_end(path: Path, seconds: float) -> None:
     for (name, net), fps in product(networks.items(), (120, 600)):
         length = seconds if fps == 120 else min(seconds, 1.0)
         rule, start = event_windows.WindowRule(fps=fps, end_s=length), time.process_time()
-        chunks = formats.iter_events(path, seconds=0.05)
+        chunks = recording.iter_events(path, seconds=0.05)
         parts, frames, events = event_windows.cut_windows(chunks, views, rule), 0, 0
         for frame in reconstruction.reconstruct_frames(parts, net.eval()):
             frames, events = frames + 1, events + frame.events + frame.outside
@@ -81,7 +81,7 @@ def main() -> None:
     splitting()
     with tempfile.TemporaryDirectory() as folder:
         path, count, seconds = Path(folder) / "long.raw", 20_000_000, 4.0
-        formats.write_events(path, events(count, seconds), width=SENSOR[1], height=SENSOR[0])
+        event_writers.write_events(path, events(count, seconds), width=SENSOR[1], height=SENSOR[0])
         reader = multiprocessing.get_context("spawn").Process(
             target=end_to_end, args=(path, seconds)
         )

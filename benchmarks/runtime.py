@@ -23,16 +23,16 @@ import torch
 
 from src.bench.speed import FORM_DTYPES, measure_peak_conv_macs_per_s
 from src.deploy.cost import count_macs, macs_per_frame, torch_threads
-from src.deploy.cpu_features import has_fast_bf16
-from src.deploy.forms import in_form
+from src.deploy.cpu_features import is_bf16_faster
+from src.deploy.forms import convert_to_form
 from src.deploy.runtime import EventListRuntime
 from src.models import load
-from src.recordings.files.formats import read_events
+from src.recordings.files.recording import read_events
 from src.sim.optics import layout
 from src.sim.voxel import voxel_grid
 
 SIDE, FPS, RATE = 176, 600, 5e6
-FORM = "bf16" if has_fast_bf16() else "float32"
+FORM = "bf16" if is_bf16_faster() else "float32"
 RECORDING = Path("../shared/data/events/gen3_640x480_evt2.raw")
 NAMES = ("setnet_small", "setnet_medium", "lf3x3")
 
@@ -72,7 +72,7 @@ def milliseconds(
 
 def on_pytorch(network: torch.nn.Module) -> Callable:
     """Return a step from a list of events through dense grids and PyTorch."""
-    fast, state = in_form(network, FORM), None
+    fast, state = convert_to_form(network, FORM), None
     size = {"bins": 5, "height": SIDE, "width": SIDE}
 
     def step(t, x, y, p, view, t0, t1):

@@ -18,7 +18,8 @@ from torch.nn import functional
 from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.timing import least
-from src.recordings.files.formats import iter_events, write_events
+from src.recordings.files.event_writers import write_events
+from src.recordings.files.recording import iter_events
 from src.sim.sensor import EventSensor
 from src.sim.sensor.engine_input import SensorClip
 from src.sim.sensor.sensor import simulate_voxels

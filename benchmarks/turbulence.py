@@ -28,6 +28,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from scripts.parallel_fill import prepare_turbulence
 from src.sim.turbulence import Atmosphere, Turbulence, sample_atmosphere
 
 APERTURE_M, WAVELENGTH_M, FRESNEL = 0.1, 525e-9, 4.7
@@ -186,7 +187,10 @@ def launches() -> None:
 def prepare_clips() -> list:
     """Return random turbulence as training sees it, ready for a device."""
     operators = [Turbulence(path, views=9, height=256, width=256) for path in draw_atmospheres()]
-    return [one.prepare(CACHED[1], torch.Generator().manual_seed(0), CROP) for one in operators]
+    return [
+        prepare_turbulence(one, CACHED[1], torch.Generator().manual_seed(0), CROP)
+        for one in operators
+    ]
 
 
 def cuda() -> None:

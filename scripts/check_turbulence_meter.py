@@ -35,7 +35,7 @@ from src.recordings.files.turbulence_file import (
 )
 from src.sim.turbulence.atmosphere import AR1_FPS, Atmosphere
 from src.sim.turbulence.operator import Turbulence
-from src.sim.turbulence.prior import ImageStatistics, log_uniform, sample_matching_atmosphere
+from src.sim.turbulence.prior import TargetImageStatistics, log_uniform, sample_matching_atmosphere
 
 PHOTOGRAPHS = Path("../shared/data/photos/bsds500_val")
 CONF = Path(__file__).resolve().parents[1] / "conf/turbulence/measured.yaml"
@@ -61,7 +61,7 @@ def draw_atmosphere(k: int) -> Atmosphere:
     generator = torch.Generator().manual_seed(k)
     while True:
         u = torch.rand(3, generator=generator).tolist()
-        seen = ImageStatistics(
+        seen = TargetImageStatistics(
             tilt_px=float(log_uniform(u[0], RMS, "rms")),
             tilt_correlation_half_length_px=float(log_uniform(u[1], HALF, "half length")),
             tilt_correlation_time_s=float(log_uniform(u[2], DECAY, "decay")),

@@ -22,7 +22,7 @@ from hydra import compose, initialize_config_dir
 from src.app import build, entry_point
 from src.models.e2vid import E2VID
 from src.recordings import event_windows, output, reconstruction, sensor_lookup
-from src.recordings.files import formats, sources
+from src.recordings.files import contract, event_writers, sources
 from src.recordings.views import Views
 from src.records import results
 from src.train import fit
@@ -113,7 +113,7 @@ def train(minutes: float, run: Path) -> dict:
 def reconstruct(events: int, run: Path) -> dict:
     """Reconstruct `events` events, the same recording again and again; returns the slopes."""
     path, views = run / "cap.raw", Views.single_view((SIDE, SIDE), (SIDE, SIDE))
-    formats.write_events(path, _recording(), width=SIDE, height=SIDE)
+    event_writers.write_events(path, _recording(), width=SIDE, height=SIDE)
     network = E2VID(views=1, base_channels=4).eval()
     chunks = _over_and_over(path, events)
     windows = event_windows.cut_windows(
@@ -127,7 +127,7 @@ def reconstruct(events: int, run: Path) -> dict:
 
 def _recording() -> np.ndarray:
     draw = np.random.default_rng(0)
-    made = np.zeros(EVENTS, formats.EVENT)
+    made = np.zeros(EVENTS, contract.EVENT)
     made["t"] = np.sort(draw.integers(0, 2_000_000, EVENTS))
     made["x"], made["y"] = draw.integers(0, SIDE, (2, EVENTS))
     made["p"] = draw.choice([-1, 1], EVENTS)

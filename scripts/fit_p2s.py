@@ -14,12 +14,11 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from scripts.exact_psf import fraunhofer_psf, noll_covariance
 from scripts.p2s_errors import ALL_MODES, measure_error_tables, picture_metric, symmetrise_psf
 from scripts.p2s_training import TrainableNetwork
-from src.sim.turbulence.p2s import EDGE_MARGIN, FILE
-from src.sim.turbulence.p2s_network import basis_parities
-from src.sim.turbulence.psf import SAMPLES_PER_LAMBDA_OVER_D, fraunhofer_psf
-from src.sim.turbulence.zernike import noll_covariance
+from src.sim.turbulence.p2s import EDGE_MARGIN, FILE, basis_parities
+from src.sim.turbulence.psf import SAMPLES_PER_LAMBDA_OVER_D
 
 
 @dataclass(frozen=True)

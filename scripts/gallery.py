@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from scripts.readme import BASELINES, baseline_overrides, compose_config
 from src.figures import plots
 from src.reconstruct import frames, prepare
-from src.recordings.files import sources
+from src.recordings.files import videos
 from src.recordings.reconstruction import Frame
 
 FPS = 120
@@ -43,7 +43,7 @@ def camera(recording: str, time_s: float) -> Float[np.ndarray, "h w"] | None:
         return None
     lines = (line.split() for line in listing.read_text().splitlines())
     _, name = min(lines, key=lambda line: abs(float(line[0]) - time_s))
-    return next(sources.read_video(listing.parent / name))
+    return next(videos.read_video(listing.parent / name))
 
 
 def gallery(recordings: list[str], networks: list[str], published: Path | None) -> Figure:

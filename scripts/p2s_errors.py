@@ -8,12 +8,11 @@ import math
 import torch
 from torch import Tensor
 
+from scripts.exact_psf import fraunhofer_psf, noll_covariance
 from src.sim.turbulence.atmosphere import TILT_VARIANCE, Atmosphere
-from src.sim.turbulence.p2s import PSFBand, load_psf_bands
-from src.sim.turbulence.p2s_network import basis_parities
+from src.sim.turbulence.p2s import PSFBand, basis_parities, load_bands_by_d_over_r0
 from src.sim.turbulence.plane_waves import draw_plane_waves
-from src.sim.turbulence.psf import SAMPLES_PER_LAMBDA_OVER_D, fraunhofer_psf
-from src.sim.turbulence.zernike import noll_covariance
+from src.sim.turbulence.psf import SAMPLES_PER_LAMBDA_OVER_D
 
 STRENGTHS = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.0, 10.0)
 AIRY = (0.25, 0.5, 1.0, 2.0)
@@ -128,8 +127,8 @@ def _places(strength: float) -> tuple[Tensor, Tensor, Tensor]:
         t = torch.rand(CELLS // CLIPS, 1, 2, dtype=torch.float64)
         corners = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]], dtype=torch.float64) - t
         nodes = place[:, None] + torch.tensor(PITCHES).view(-1, 1, 1, 1) * corners
-        at.append(_phase(response, waves.frequency, place))
-        around.append(_phase(response, waves.frequency, nodes))
+        at.append(_phase(response, waves.frequency_per_px, place))
+        around.append(_phase(response, waves.frequency_per_px, nodes))
         shares.append((1 - corners.abs()).prod(-1))
     return torch.cat(at), torch.cat(around, 1), torch.cat(shares).float()
 
@@ -161,7 +160,7 @@ def _networks() -> dict[str, Tensor]:
     Bands, strengths from where each band begins to its edge, networks, pitches (the first is 0),
     ranks, AIRY.
     """
-    edges = [band.edge for band in load_psf_bands()]
+    edges = [band.max_d_over_r0 for band in load_bands_by_d_over_r0()]
     starts = [STRENGTHS[0], *edges[:-1]]
     axes = [
         [start * (edge / start) ** (step / (PLACES - 1)) for step in range(PLACES)]
@@ -169,7 +168,7 @@ def _networks() -> dict[str, Tensor]:
     ]
     rows = [
         torch.stack([_psf_errors(band, strength) for strength in axis])
-        for band, axis in zip(load_psf_bands(), axes, strict=True)
+        for band, axis in zip(load_bands_by_d_over_r0(), axes, strict=True)
     ]
     return {"psf": torch.stack(rows), "psf_strength": torch.tensor(axes)}
 

@@ -1,4 +1,4 @@
-"""The network of src/sim/turbulence/p2s_network.py layer by layer, to be trained by fit_p2s.py."""
+"""The network of src/sim/turbulence/p2s.py layer by layer, to be trained by fit_p2s.py."""
 
 import warnings
 
@@ -7,20 +7,21 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from src.sim.turbulence.p2s_network import EVEN, ODD_X, ODD_XY, ODD_Y, modes_by_parity
+from src.sim.turbulence.p2s import EVEN, ODD_X, ODD_XY, ODD_Y, modes_by_parity
 
 
 class TrainableNetwork(nn.Module):
     """Weights of the basis functions, by parity, from Noll 4..modes + 1.
 
-    `width`: hidden numbers, a multiple of 16; `counts`: basis functions of each parity; `edge`: the
-    D/r0 at which (D/r0 / edge)^(5/3), the phase variance that is usual, is 1.
+    `width`: hidden numbers, a multiple of 16; `counts`: basis functions of each parity;
+    `max_d_over_r0`: where (D/r0 / max_d_over_r0)^(5/3), the phase variance that is usual, is 1.
     """
 
-    def __init__(self, modes: int, width: int, counts: list[int], edge: float):
+    def __init__(self, modes: int, width: int, counts: list[int], max_d_over_r0: float):
         super().__init__()
         self.own = modes_by_parity(modes)
-        self.modes, self.width, self.counts, self.edge = modes, width, list(counts), edge
+        self.modes, self.width, self.counts = modes, width, list(counts)
+        self.max_d_over_r0 = max_d_over_r0
         few = 3 * width // 16
         wide = {EVEN: 2 * few, ODD_X: few, ODD_Y: few, ODD_XY: width // 4}
         self.forms = nn.ModuleList(self._form(parity, wide[parity]) for parity in range(4))
@@ -44,7 +45,7 @@ class TrainableNetwork(nn.Module):
         """Return the weights, sorted by parity, for Noll 4..modes + 1 in rad."""
         own = [phase[:, rows] for rows in self.own]
         forms = [form(part) for form, part in zip(self.forms, own, strict=True)]
-        usual = phase.new_ones(len(phase), 1) * (d_over_r0 / self.edge) ** (5 / 3)
+        usual = phase.new_ones(len(phase), 1) * (d_over_r0 / self.max_d_over_r0) ** (5 / 3)
         squares = torch.cat([*(form.square() for form in forms), usual], 1)
         known = functional.hardswish(self.common(squares))
         a, b, c, d = (form(part) for form, part in zip(self.factors, own, strict=True))

@@ -27,8 +27,8 @@ from src.sim.scenes.photo_files import (
     INDEX,
     PackedPhotograph,
     list_photographs,
-    list_training_photographs,
-    open_pack,
+    list_train_only_photographs,
+    open_photo_pack,
 )
 from src.sim.scenes.video_files import read_picture
 
@@ -88,7 +88,7 @@ def read_photographs(
         raise ValueError(f"FOLDER must differ in name from the others, got {', '.join(names)}")
     chosen = [(path, split) for split in SPLITS for path in list_photographs(folders, split)]
     if train_only:
-        chosen += [(path, "train") for path in list_training_photographs(train_only, folders)]
+        chosen += [(path, "train") for path in list_train_only_photographs(train_only, folders)]
     with ThreadPoolExecutor() as pool:
         pixels = pool.map(lambda one: _read_shrunk(one[0], side), chosen)
         pairs = zip(chosen, pixels, strict=True)
@@ -127,7 +127,7 @@ def build_pack(pictures: Sequence[EncodedPicture]) -> bytes:
 
 def verify_pack(path: Path) -> int:
     """Return how many photographs a pack holds; raises ValueError naming the first damaged one."""
-    names = [name for names in open_pack(path)[1].values() for name in names]
+    names = [name for names in open_photo_pack(path)[1].values() for name in names]
     for name in names:
         PackedPhotograph(path, name).data()
     return len(names)

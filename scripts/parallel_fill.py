@@ -8,17 +8,21 @@ import os
 import pickle
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from src.sim.pipeline import ClipParameters, Pipeline, crop_frames
-from src.sim.turbulence.contract import PreparableTurbulence
+from src.sim.turbulence import Turbulence
+from src.sim.turbulence.clip_plan import TilePlan
+from src.sim.turbulence.clip_rendering import render_tilt, render_views
+from src.sim.turbulence.contract import Crop
 from src.sim.turbulence.engines.device import copy_to_device
 from src.training.clip_cache import CachedClip, clip_metadata
 from src.training.disk_cache import init_worker
@@ -111,10 +115,51 @@ class _PickledDraws(Dataset):
         draw = self.source.draw(index)
         metadata = clip_metadata(self.source, draw)
         turbulence = self.source.turbulence_operator(draw) if self.prepare else None
-        if isinstance(turbulence, PreparableTurbulence):
+        if isinstance(turbulence, Turbulence) and not turbulence.is_identity:
             frames, generator = len(draw.clip.frames), self.source.turbulence_generator(draw)
-            draw = replace(draw, turbulence=turbulence.prepare(frames, generator, draw.crop))
+            prepared = prepare_turbulence(turbulence, frames, generator, draw.crop)
+            draw = replace(draw, turbulence=prepared)
         return draw, metadata
+
+
+@dataclass(frozen=True)
+class PreparedTurbulence:
+    """The turbulence of one clip in `crop`, drawn and ready for a device: an operator (contract.py)
+    that can be pickled.
+    """
+
+    metadata: Mapping[str, float | int | str]
+    crop: Crop
+    plans: Sequence[TilePlan]
+
+    @torch.no_grad()
+    def degrade(
+        self,
+        frames: Float[Tensor, "one frames h w"],
+        generator: torch.Generator,
+        *,
+        crop: Crop | None = None,
+    ) -> Float[Tensor, "one views frames hc wc"]:
+        """Return every view; raises ValueError for another crop or more clips than prepared."""
+        if (len(frames), crop) != (1, self.crop):
+            raise ValueError(
+                f"prepared turbulence is of 1 clip in {self.crop}, got {len(frames)} in {crop}"
+            )
+        return render_views(frames[0].float(), self.plans)[None]
+
+    @torch.no_grad()
+    def tilt(
+        self, frames: int, generator: torch.Generator, *, crop: Crop | None = None
+    ) -> Float[Tensor, "views frames 2 hc wc"]:
+        """Return the displacement (x, y) in pixels, in the crop that was prepared."""
+        return render_tilt(self.plans, frames)
+
+
+def prepare_turbulence(
+    turbulence: Turbulence, frames: int, generator: torch.Generator, crop: Crop
+) -> PreparedTurbulence:
+    """Return the turbulence of one clip of so many `frames`, drawn for `crop` on the CPU."""
+    return PreparedTurbulence(turbulence.metadata, crop, turbulence.plan(frames, generator, crop))
 
 
 def prepares_turbulence(device: torch.device) -> bool:

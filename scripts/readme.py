@@ -23,7 +23,7 @@ from src.app.instantiate import build_part
 from src.bench.candidates import Candidate
 from src.figures import plots
 from src.metrics.bootstrap import bootstrap_interval
-from src.metrics.table import METRICS, MetricColumn
+from src.metrics.table import METRICS, Column
 from src.models import files
 from src.records import results
 from src.reports.writers import replace_section
@@ -101,7 +101,7 @@ def reconstruct_clip(network: Candidate, sample: Sample) -> Tensor:
     return network.reconstruct(sample.voxels[0, :, None], positions, float(sample.window_s[0]))[0]
 
 
-def score_and_record_clips(
+def score_clips_into_metrics(
     cfg: DictConfig, rows: dict[str, Candidate]
 ) -> dict[str, list[dict[str, float]]]:
     """Return the scores of all `rows` on each of the test clips of `cfg`."""
@@ -120,7 +120,7 @@ def format_table(
     values: dict[str, list[dict[str, float]]], rows: bool, pairs: dict[str, tuple[str, str]]
 ) -> str:
     """Return the scores of `values` as Markdown, where `rows` says so, and differences of pairs."""
-    heads = [f"{metric.heading} {metric.arrow}" for metric in METRICS]
+    heads = [metric.title for metric in METRICS]
     lines = ["| | " + " | ".join(heads) + " |", "|---|" + "---|" * len(heads)]
     for row, clips in values.items() if rows else ():
         lines.append(f"| {row} | " + " | ".join(format_means(clips)) + " |")
@@ -143,7 +143,7 @@ def format_differences(first: list[dict[str, float]], second: list[dict[str, flo
     return [format_mean(m, [a[m.name] - b[m.name] for a, b in pairs], "+") for m in METRICS]
 
 
-def format_mean(metric: MetricColumn, values: list[float], sign: str = "") -> str:
+def format_mean(metric: Column, values: list[float], sign: str = "") -> str:
     """Return the mean and its interval."""
     form, (low, high) = f"{sign}.{metric.digits}f", bootstrap_interval(values)
     return f"{np.mean(values):{form}} ({low:{form}} to {high:{form}})"
@@ -214,7 +214,9 @@ def main() -> None:
     rows = {row: load_shipped(*what, given.published) for row, what in chosen.items()}
     cards = {name: row for row, (name, _) in reversed(ROWS.items())}  # the row of most views
     for protocol, overrides in asked.items():
-        values = score_and_record_clips(compose_config("eval", *protocol.split(), *overrides), rows)
+        values = score_clips_into_metrics(
+            compose_config("eval", *protocol.split(), *overrides), rows
+        )
         for document, section, whole, pairs in TABLES.get(protocol, ()):
             replace_section(HOME / document, section, format_table(values, whole, pairs))
         for name, row in cards.items():

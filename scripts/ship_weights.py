@@ -17,7 +17,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from scripts.learning_curves import draw_curves, read_curve
-from src.metrics.table import METRICS, MetricColumn
+from src.metrics.table import METRICS, Column
 from src.models import files
 from src.models.network import FramePostprocessor
 from src.records import results
@@ -181,7 +181,7 @@ def _tested(record: dict, cfg: DictConfig) -> str:
     return f"| {what} | {scores['clips']} | " + " | ".join(cells) + " |"
 
 
-def _cell(metric: MetricColumn, score: dict | None) -> str:
+def _cell(metric: Column, score: dict | None) -> str:
     if score is None:
         return metric.format_value(None)
     low, high = map(metric.format_value, score["interval"])

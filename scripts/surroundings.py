@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from src.app import build, entry_point, hardware
-from src.deploy.cpu_features import has_fast_bf16
+from src.deploy.cpu_features import is_bf16_faster
 from src.models import files
 from src.models.setnet import CELL_PX, SetNet
 from src.sim.pipeline import Sample
@@ -39,7 +39,7 @@ RATE, RISE = 1.5e-3, 50  # of Adam, falling by a cosine; steps over which it ris
 
 def rounded() -> torch.autocast:
     """Return a context that computes in bf16 where the processor is faster in it."""
-    return torch.autocast("cpu", torch.bfloat16, enabled=has_fast_bf16())
+    return torch.autocast("cpu", torch.bfloat16, enabled=is_bf16_faster())
 
 
 def begun_anew(network: SetNet) -> SetNet:

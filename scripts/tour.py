@@ -11,8 +11,7 @@ import torch
 
 from scripts.readme import AIR, HOME, NINE, ONE, compose_config, load_shipped, reconstruct_clip
 from src.app import build
-from src.figures.samples import tile_views
-from src.figures.video import join_panels, render_events
+from src.figures.samples import join_panels, render_events, tile_views
 from src.recordings import simulated_recording
 from src.records.atomic import atomic_path
 from src.sim.pipeline import ClipParameters, Pipeline

@@ -7,6 +7,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from src.app import build, calibrations, entry_point
 from src.app.instantiate import build_part
+from src.recordings.files.event_file import ReadOptions
 from src.recordings.reconstruction import as_event_network
 from src.records import results
 
@@ -14,8 +15,8 @@ from src.records import results
 def find_views(cfg: DictConfig, run: Path) -> dict:
     """Find the views and their homographies: `views.yaml`, also at `cfg.save`."""
     keys = ("resolution", "sensor_size", "mirrors", "corners")
-    options = {key: cfg[key] for key in keys}
-    aligned = calibrations.calibrate_views(cfg.recording, run, build_part(cfg, "target"), **options)
+    given = {key: cfg[key] for key in keys} | {"options": ReadOptions.from_keys(cfg)}
+    aligned = calibrations.calibrate_views(cfg.recording, run, build_part(cfg, "target"), **given)
     if cfg.save:
         aligned.save(cfg.save)
     return {f"error_px of {view.position}": round(view.error_px, 3) for view in aligned.views}
@@ -27,7 +28,7 @@ def find_threshold(cfg: DictConfig, run: Path) -> dict:
     clips = [pipeline.render_views([pipeline.draw(index)])[0] for index in range(cfg.clips)]
     estimate = calibrations.calibrate_contrast_threshold(
         cfg.recording, run, clips, cfg.fps * cfg.data.substeps, pipeline.sensor,
-        views=cfg.views, sensor_size=cfg.sensor_size,
+        views=cfg.views, sensor_size=cfg.sensor_size, options=ReadOptions.from_keys(cfg),
     )  # fmt: skip
     return {"ON (value, low, high)": estimate.on, "OFF": estimate.off}
 
@@ -38,7 +39,7 @@ def measure_dots(cfg: DictConfig, run: Path) -> dict:
     network = as_event_network(build.load_network(cfg)) if given else None
     statistics = calibrations.measure_dot_grid(
         cfg.recording, cfg.still, run, fps=cfg.fps, network=network, views=cfg.views,
-        sensor_size=cfg.sensor_size, **cfg.dots,
+        sensor_size=cfg.sensor_size, options=ReadOptions.from_keys(cfg), **cfg.dots,
     )  # fmt: skip
     return statistics.summary()
 

@@ -3,19 +3,23 @@
 The layout of the paper's figures 6 to 10: samples, an x-t, r-t or theta-t slice, its deviations.
 """
 
+import math
 from pathlib import Path
 
 import numpy as np
 import rich
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from src.app import entry_point
 from src.figures import comparison, slices
 from src.metrics import slice_motion
 from src.recordings import camera_frames
-from src.recordings.files import sources
+from src.recordings.files import videos
 from src.records import results
 
+FORMS: dict[str, list] = {
+    "line": [[0, 88], [175, 88]], "circle": [88, 88, 40], "spin": [88, 88, 40, 2.5, 90],
+}  # fmt: skip
 NOTES = {
     "residual_displacement_px": "residual displacement, static: {:.2f} px",
     "line_deviation_px": "deviation from a line, moving: {:.2f} px",
@@ -38,10 +42,12 @@ def compare(cfg: DictConfig) -> dict:
     run = Path(cfg.paths.run)
     if not cfg.videos:
         raise ValueError("videos must name one file or more, got []")
+    check_slice(cfg)
     names = list(cfg.names or [Path(path).parent.name for path in cfg.videos])
     if len(names) != len(cfg.videos):
         raise ValueError(f"names must be one per video, got {len(names)} for {len(cfg.videos)}")
-    films = [np.stack(list(sources.read_video(path)))[cfg.first : cfg.last] for path in cfg.videos]
+    read = (np.stack(list(videos.read_video(path, "videos"))) for path in cfg.videos)
+    films = [film[cfg.first : cfg.last] for film in read]
     given = {name: cfg[name] for name in slices.KINDS if cfg[name]}
     if len(given) != 1:
         raise ValueError(f"give one of line, circle, spin and still, got {given or 'none'}")
@@ -56,9 +62,13 @@ def compare(cfg: DictConfig) -> dict:
         if cfg.still:
             scores[name] = slice_motion.measure_static_scene(film, cfg.still)
         else:
-            scores[name] = slice_motion.measure_slice_motion(across, next(iter(given)), cfg.follow)
-        if cfg.camera:
-            scores[name] |= camera_frames.compare_with_camera(Path(path), Path(cfg.camera))
+            scores[name] = slice_motion.measure_slice_motion(
+                across, next(iter(given)), cfg.moving_thing
+            )
+        if cfg.reference_images:
+            scores[name] |= camera_frames.score_against_camera(
+                Path(path), Path(cfg.reference_images)
+            )
         notes = [NOTES[measure].format(value) for measure, value in scores[name].items()]
         rows.append(comparison.VideoRow(name, film, across, "\n".join(notes)))
     comparison.draw_comparison(
@@ -67,6 +77,19 @@ def compare(cfg: DictConfig) -> dict:
     )  # fmt: skip
     rich.print(scores, f"in {run}")
     return scores
+
+
+def check_slice(cfg: DictConfig) -> None:
+    """Raise ValueError for an `fps` or a slice of another form than cut_slice takes."""
+    if not 0 < cfg.fps < math.inf:
+        raise ValueError(f"fps must be > 0 frames a second, got {cfg.fps}")
+    for key, form in FORMS.items():
+        try:
+            given = np.array(OmegaConf.to_object(cfg[key]) if cfg[key] else form)
+        except ValueError:  # rows of several lengths
+            given = np.empty(0, str)
+        if given.dtype.kind not in "if" or given.shape != np.shape(form):
+            raise ValueError(f"{key} must be numbers as in {form}, got {cfg[key]}")
 
 
 if __name__ == "__main__":

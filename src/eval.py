@@ -17,13 +17,13 @@ def evaluate(cfg: DictConfig) -> dict:
     """
     run, start = Path(cfg.paths.run), time.perf_counter()
     hardware.reserve_worker_cores(cfg)
-    net = build.build_method(cfg)
+    net = build.build_video_method(cfg)
     data = build.build_data_module(cfg, splits=("test",), optics=simulation.select_optics(cfg, net))
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     row = build.test_method(cfg, cfg.name, net, data, build.build_metrics(cfg))
     samples.write_samples(run / "samples", net, data.pipelines["test"])
     return results.write_and_print_results(
-        run, entry_point.resolved_yaml(cfg), [row], **entry_point.run_facts(cfg, start)
+        run, entry_point.resolved_yaml(cfg), [row], **entry_point.run_metadata(cfg, start)
     )
 
 

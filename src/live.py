@@ -19,6 +19,7 @@ from src.live_view.network_runner import RunSettings
 from src.live_view.page_server import PageServer
 from src.live_view.status import FaultLog
 from src.models.network import EventToVideoNetwork
+from src.recordings.files.event_file import ReadOptions
 from src.recordings.reconstruction import as_event_network, takes_all_views
 from src.recordings.views import load_views, views_or_whole_sensor
 
@@ -28,6 +29,8 @@ def live(cfg: DictConfig) -> None:
 
     Raises ValueError for a recording, views, network or address that cannot be used.
     """
+    if cfg.threads < 1:
+        raise ValueError(f"threads must be >= 1, got {cfg.threads}")
     torch.set_num_threads(cfg.threads)
     asyncio.run(play_and_serve(build_server(cfg)))
 
@@ -36,17 +39,21 @@ def build_server(cfg: DictConfig) -> PageServer:
     """Return the server of the page, with the network and the number of views chosen."""
     faults, name = FaultLog(), str(cfg.ckpt or "baseline")
     sensor = cfg.sensor_size or (load_views(cfg.views).sensor if cfg.views else None)
-    feed = open_feed(cfg.recording, sensor, faults, loop=cfg.loop, udp_format=cfg.udp_format)
+    how = {"loop": cfg.loop, "udp_format": cfg.udp_format, "options": ReadOptions.from_keys(cfg)}
+    feed = open_feed(cfg.recording, sensor, faults, **how)
     views = views_or_whole_sensor(cfg.views, feed.sensor, cfg.resolution)
-    networks = load_networks(cfg, name, len(views.views))
+    networks = load_offered_networks(cfg, name, len(views.views))
     settings = RunSettings(cfg.fps, cfg.bins, cfg.splat, cfg.window_length, cfg.form)
-    keys = ("playback_speed", "max_waiting_windows", "noise_filter_s", "host", "port")
+    keys = (
+        "playback_speed", "max_waiting_windows", "noise_filter_s", "host", "port",
+        "allowed_origins",
+    )  # fmt: skip
     server = assemble(feed, networks, views, settings, faults, **{key: cfg[key] for key in keys})
     server.page.controls.choose(name, cfg.views_used)
     return server
 
 
-def load_networks(cfg: DictConfig, name: str, views: int) -> dict[str, EventToVideoNetwork]:
+def load_offered_networks(cfg: DictConfig, name: str, views: int) -> dict[str, EventToVideoNetwork]:
     """Return the networks to choose from; `name` is the key of the configured one.
 
     Raises ValueError where that one wants another number of `views`; others that do are left out.

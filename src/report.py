@@ -28,11 +28,11 @@ def report(cfg: DictConfig) -> list[tables.Table]:
         planned = [plan for plan in plans if plan.sweep == name]
         keys, made = run_groups.group_runs(own, planned, tuple(cfg.across))
         of = f": {name}" if name and len(sweeps) > 1 else ""
-        candidates.append(tables.build_score_table(f"Scores and cost{of}", keys, made, published))
-        candidates.append(tables.build_severity_table(f"Scores by severity{of}", keys, made))
-        candidates.append(
-            tables.build_reference_methods_table(f"On the same clips{of}", keys, made)
-        )
+        candidates += [
+            tables.build_score_table(f"Scores and cost{of}", keys, made, published),
+            tables.build_severity_table(f"Scores by severity{of}", keys, made),
+            tables.build_reference_methods_table(f"On the same clips{of}", keys, made),
+        ]
         groups += made
     if cfg.against:
         theirs = runs.find_runs(_list_folders(cfg.against))
@@ -54,7 +54,6 @@ def report(cfg: DictConfig) -> list[tables.Table]:
 
 
 def _list_folders(given: str | ListConfig) -> list[Path]:
-    """Return one folder, or a list of them, as a list."""
     return [Path(str(folder)) for folder in (given if isinstance(given, ListConfig) else [given])]
 
 

@@ -11,6 +11,7 @@ from yaml import YAMLError
 from src.app import build, entry_point
 from src.figures import samples
 from src.recordings import simulated_recording
+from src.recordings.files import event_writers
 from src.records import results, safe_yaml
 
 SECTIONS = ("scene", "optics", "turbulence", "sensor", "data")
@@ -25,6 +26,11 @@ def simulate(cfg: DictConfig) -> dict:
     written to that file, and the truth beside it.  Returns what was drawn: D/r0, threshold ...
     """
     run = Path(cfg.paths.run)
+    if cfg.index < 0:
+        raise ValueError(f"index must be >= 0, the number of a clip, got {cfg.index}")
+    if cfg.write:  # refused before minutes of work
+        height, width = cfg.camera.sensor
+        event_writers.find_kind(Path(cfg.write), None, width, height, "evt3")
     cfg = take_clip_config_from_run(cfg) if cfg.like else cfg
     pipeline = build.build_pipeline(cfg, cfg.split)
     draw = pipeline.draw(cfg.index)
@@ -33,7 +39,8 @@ def simulate(cfg: DictConfig) -> dict:
     tilt = pipeline.tilt(draw)
     windows = slice(cfg.data.substeps, None, cfg.data.substeps)
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
-    samples.write_light_field(run, sample, views[:, windows], tilt[:, windows], pipeline.optics)
+    seen = views[:, windows], tilt[:, windows], pipeline.optics
+    written = samples.write_light_field(run, sample, *seen)
     if cfg.write:
         height, width = views.shape[-2:]
         sensor: Any = draw.sensor  # one with `events`
@@ -44,7 +51,10 @@ def simulate(cfg: DictConfig) -> dict:
         simulated_recording.write_recording(
             cfg.write, views, draw.clip.fps, camera, sensor, tilt=tilt
         )
-    rich.print(sample.parameters[0], f"in {run}")
+        written += [Path(cfg.write)]
+        written += [Path(cfg.write).with_suffix(end) for end in (".views.yaml", ".truth.h5")]
+    rich.print(sample.parameters[0])
+    print(f"clip {cfg.index} of {cfg.split}: {', '.join(map(str, written))}")
     return sample.parameters[0]
 
 

@@ -44,7 +44,7 @@ def stress(cfg: DictConfig) -> stress_results.Outcomes:
             standard_psnr[candidate.name] = psnr
         results.write_text(run / "stress.csv", stress_results.format_outcomes_csv(outcomes, titles))
         print(f"{candidate.name} is done", flush=True)
-    text = stress_results.format_summary(outcomes, titles, standard_psnr)
+    text = stress_results.format_markdown_summary(outcomes, titles, standard_psnr)
     results.write_text(run / "stress.md", text)
     for suffix in ("png", "svg"):
         draw_stress_map(run / f"stress.{suffix}", outcomes, titles, standard_psnr)

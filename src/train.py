@@ -15,7 +15,7 @@ from src.figures import samples
 from src.models import files
 from src.records import results, tracking
 from src.training.datamodule import LightFieldData
-from src.training.ema import load_average
+from src.training.ema import load_ema_weights
 from src.training.learning_curve import restore_training_progress
 from src.training.reconstructor import Reconstructor
 from src.training.step_guard import NonFiniteError
@@ -47,14 +47,14 @@ def train(cfg: DictConfig) -> dict:
     except NonFiniteError as error:
         same = f"python -m src.simulate like={run}/config.yaml split=train index={error.clips[0]}"
         raise ValueError(f"{error}; seed {cfg.seed}; to see the clip: {same}") from error
-    load_average(trainer, module)
+    load_ema_weights(trainer, module)
     # As it is when it is loaded again.
     module.method.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
     trained = build.test_method(cfg, cfg.name, module.method, data, module.metrics)
     baseline = build_part(cfg, "reference_baseline.method")
     reference = build.test_method(cfg, cfg.reference_baseline.name, baseline, data, module.metrics)
     pictures = samples.write_samples(run / "samples", module.method, data.pipelines["test"])
-    rows, facts = [trained, untrained, reference], entry_point.run_facts(cfg, start)
+    rows, facts = [trained, untrained, reference], entry_point.run_metadata(cfg, start)
     record = results.write_and_print_results(run, entry_point.resolved_yaml(cfg), rows, **facts)
     tracking.log_results(trainer.loggers, record, pictures)
     return record

@@ -99,8 +99,8 @@ def test_what_stands_there_stays_where_a_pack_fails(folders, tmp_path):
         (["side=8"], "error: side must be in 16..4096 (px), got 8"),
         (["side=many"], "error: side must be a number, got many"),
         (["mib=0"], "error: mib must be >= 0.0"),
-        (["train_only=/nowhere"], "error: scene.train_root must be a folder or a pack of"),
-        (["train_only=photos"], "error: scene.train_root must be apart from scene.root"),
+        (["train_only=/nowhere"], "error: scene.extra_train_root must be a folder or a pack of"),
+        (["train_only=photos"], "error: scene.extra_train_root must be apart from scene.root"),
         (["quality=5"], "Photographs in one small file"),
     ],
 )

@@ -173,7 +173,7 @@ def test_corners_by_hand_replace_the_target(folder, found, tmp_path):
     calibrate(config("calibrate", tmp_path / "run", *chosen))
     by_hand = views.load_views(tmp_path / "run" / "views.yaml")
     for mine, auto in zip(by_hand.views, there.views, strict=True):
-        assert by_hand.is_mirrored(mine) == there.is_mirrored(auto)
+        assert by_hand.mirrored_xy(mine) == there.mirrored_xy(auto)
 
 
 def test_turbulence_of_a_film_of_dots(folder, found, tmp_path):
@@ -269,7 +269,9 @@ def test_the_tail_behind_a_bright_dot_is_not_followed(tmp_path):
         cv2.imwrite(str(tmp_path / f"film/{k:02d}.png"), picture)
     given = [f"videos=[{tmp_path}/film]", "names=[film]", "line=[[0,10],[79,10]]"]
     found = {
-        follow: compare(config("compare", tmp_path / follow, *given, f"follow={follow}"))["film"]
+        follow: compare(config("compare", tmp_path / follow, *given, f"moving_thing={follow}"))[
+            "film"
+        ]
         for follow in ("any", "bright")
     }
     assert found["bright"]["line_deviation_px"] < 0.1 < 1 < found["any"]["line_deviation_px"]
@@ -289,7 +291,7 @@ def test_videos_of_two_sizes_are_not_compared(tmp_path):
     [
         ("line=null", "one of line, circle, spin and still"),
         ("line=[[0,0],[500,0]]", "must stay"),
-        ("line=[[0,0],[9,0]] follow=all", "follow must be one of"),
+        ("line=[[0,0],[9,0]] moving_thing=all", "moving_thing must be one of"),
     ],
 )
 def test_a_slice_that_cannot_be_taken_is_refused(wrong, message, tmp_path):

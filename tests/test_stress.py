@@ -12,7 +12,7 @@ ABSENT = "{ckpt: nowhere, views: 9}"
 SETNET = "{ckpt: nowhere, views: 9, model: {_target_: src.models.setnet.SetNet}}"
 PACKAGE = "src.bench.stress_tests"
 FUNCTIONS = {
-    "retention": "recurrence.measure_contrast_retention, windows: [2, 4], limit: 90",
+    "retention": "recurrence.measure_contrast_retention_percent, windows: [2, 4], limit: 90",
     "dropout": "conditions.measure_view_dropout_loss, counts: [1], draws: 1, limit: 0.5",
     "fast": "conditions.measure_window_rate_loss, rates_hz: [1200], limit: 1.0",
 }

@@ -10,7 +10,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from src.app import build, entry_point
+from src.app import build
 from src.eval import evaluate
 from src.models import files
 from src.reconstruct import reconstruct
@@ -102,13 +102,6 @@ def test_a_failed_job_is_named_and_the_rest_stands(tmp_path):
     assert second.returncode == 0, second.stderr
     assert second.stdout.count("skipped, its results stand") == 1
     assert [file.stat().st_mtime_ns for file in done] == times
-
-
-def test_a_jobs_folder_is_one_folder():
-    short = "experiment-lf3x3_scene.root-../../data/photos"
-    assert entry_point.one_folder(short) == "experiment-lf3x3_scene.root-..-..-data-photos"
-    long = [entry_point.one_folder("x" * 300 + tail) for tail in "ab"]
-    assert len(set(long)) == 2 and all(len(name) <= entry_point.MAX_FOLDER_NAME for name in long)
 
 
 CONFIG = "task: {task}\nckpt: {ckpt}\nlr: {lr}\npaths:\n  run: {run}\nlogger:\n  dir: {run}/logs\n"

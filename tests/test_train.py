@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from src.eval import evaluate
-from src.recordings.files.formats import read_events
+from src.recordings.files.recording import read_events
 from src.records import tracking
 from src.simulate import simulate
 from src.train import train

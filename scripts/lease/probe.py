@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader
 
 from src.app import build, hardware
 from src.app.instantiate import build_part
-from src.deploy.cpu_features import has_fast_bf16
+from src.deploy.cpu_features import is_bf16_faster
 from src.sim.pipeline import Sample
 
 TRIAL_STEPS = 14  # the first ones make the CUDA graphs of those that follow
@@ -66,7 +66,7 @@ def probe_device(cfg: DictConfig) -> Device:
     if cfg.trainer.accelerator == "cpu":
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
         name = f"CPU, {torch.get_num_threads()} threads"
-        return Device("cpu", name, memory, has_fast_bf16(), False)
+        return Device("cpu", name, memory, is_bf16_faster(), False)
     if not torch.cuda.is_available():
         raise ValueError(
             f"trainer must be cpu where there is no CUDA device (torch {torch.__version__}), "

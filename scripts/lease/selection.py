@@ -13,8 +13,7 @@ from scripts.lease.export import HEADER_BYTES, TABLES, TABLES_BYTES, split_into_
 from scripts.lease.plan import MIB, Network, Plan
 from src.app import build
 from src.models.folding import inference_copy
-from src.training.cached_pipeline import CachedPipeline
-from src.training.clip_cache import DeviceClipCache
+from src.training.clip_cache import CachedPipeline, DeviceClipCache
 from src.training.datamodule import LightFieldData
 
 

@@ -26,7 +26,7 @@ from src.models.setnet import SetNet
 from src.records.results import ScoreRow
 from src.sim.optics import Optics
 from src.training import evaluation
-from src.training.cached_pipeline import CachedPipeline
+from src.training.clip_cache import CachedPipeline
 from src.training.datamodule import LightFieldData
 from src.training.disk_cache import BackgroundFiller, DiskClipCache
 from src.training.ema import WeightEMA
@@ -98,7 +98,9 @@ def build_network_and_spec(
 
 
 def load_network(cfg: DictConfig) -> VideoMethod:
-    """Return the network that `ckpt` or else `baseline` names, in eval mode."""
+    """Return the network that `ckpt` or `baseline` names, in eval mode; ValueError for both."""
+    if cfg.ckpt and cfg.get("baseline"):
+        raise ValueError(f"ckpt must be null with baseline=..., got {cfg.ckpt}")
     if cfg.ckpt:
         net = src.models.load(cfg.ckpt, allowed_packages(cfg))
         if not isinstance(net, VideoMethod):
@@ -110,7 +112,7 @@ def load_network(cfg: DictConfig) -> VideoMethod:
     raise ValueError("ckpt or baseline must name a network, got neither")
 
 
-def build_method(cfg: DictConfig) -> VideoMethod:
+def build_video_method(cfg: DictConfig) -> VideoMethod:
     """Return the network of `load_network`, with the backward warm-up and the frame post-processor
     that the config asks for.
     """
@@ -123,7 +125,7 @@ def build_method(cfg: DictConfig) -> VideoMethod:
 def build_metrics(cfg: DictConfig) -> VideoMetrics:
     """Return the metrics of validation and test: without `metrics.lpips`, all but LPIPS."""
     lpips = build_part(cfg, "metrics.lpips") if cfg.metrics.lpips else None
-    return VideoMetrics(lpips, cfg.metrics.scale)
+    return VideoMetrics(lpips, cfg.metrics.resolution_scale)
 
 
 def build_loss(cfg: DictConfig) -> TrainingLoss:

@@ -4,7 +4,6 @@ Each reads a recording and writes its file, its table and its picture into a fol
 """
 
 from collections.abc import Sequence
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,9 @@ from src.recordings.calibration import (
     view_alignment,
 )
 from src.recordings.calibration.boards import Target
-from src.recordings.files import formats, sources
+from src.recordings.files import sources, videos
+from src.recordings.files.event_file import ReadOptions
+from src.recordings.files.recording import open_recording
 from src.recordings.files.turbulence_file import SIDE
 from src.recordings.views import Views, load_views, views_or_whole_sensor
 from src.records import results
@@ -38,13 +39,16 @@ def calibrate_views(
     sensor_size: Sequence[int] | None = None,
     mirrors: bool = True,
     corners: str | None = None,
+    options: ReadOptions = ReadOptions(),
 ) -> Views:
     """Find the views; write `views.yaml` and `views.png`.
 
     `corners`: a file of corners given by hand, instead of the target.  Of a calibration that fails,
     with the ValueError of `view_alignment.fit_homographies`, `found.png` remains.
     """
-    picture = view_alignment.repair_picture(sources.read_sensor_picture(recording, sensor_size))
+    picture = view_alignment.repair_picture(
+        sources.read_sensor_picture(recording, sensor_size, options)
+    )
     sizes = {"sensor": picture.shape, "model": tuple(resolution)}
     if corners:
         geometry = view_alignment.views_from_corners(view_alignment.read_corners(corners), **sizes)
@@ -53,7 +57,7 @@ def calibrate_views(
         seen = view_alignment.find_target(picture, target, mirrors)
         calibration_figures.draw_found_target(picture, seen, folder / "found.png")
         aligned = view_alignment.fit_homographies(seen, **sizes)
-        calibration_figures.draw_alignment(picture, aligned, folder / "views.png")
+        calibration_figures.draw_view_residuals(picture, aligned, folder / "views.png")
         geometry = aligned.views
     geometry.save(folder / "views.yaml")
     return geometry
@@ -68,12 +72,13 @@ def calibrate_contrast_threshold(
     *,
     views: str | None = None,
     sensor_size: Sequence[int] | None = None,
+    options: ReadOptions = ReadOptions(),
 ) -> contrast_threshold.ThresholdEstimate:
     """Match the recording's event rate with that of `sensor` looking at `clips`; write
     `threshold.csv` and `threshold.png`."""
-    size = sources.sensor_size(recording, sensor_size)
+    size = sources.sensor_size(recording, sensor_size, options)
     there = views_or_whole_sensor(views, size)
-    events = formats.open_recording(recording, size[::-1])
+    events = open_recording(recording, size[::-1], options)
     measured = contrast_threshold.measure_event_rates(
         events, sensor_lookup.build_lookup(there).view
     )
@@ -96,6 +101,7 @@ def measure_dot_grid(
     views: str | None = None,
     sensor_size: Sequence[int] | None = None,
     network: EventToVideoNetwork | None = None,
+    options: ReadOptions = ReadOptions(),
 ) -> dot_statistics.DotStatistics:
     """Fit the dots of a recording and of one without turbulence; write `turbulence.csv`, `.png`.
 
@@ -103,7 +109,8 @@ def measure_dot_grid(
     """
     there = load_views(views) if views else None
     positions = there.positions if there else [(0, 0)]
-    calm, moving = (_films(path, there, fps, sensor_size, network) for path in (still, recording))
+    given = there, fps, sensor_size, network, options
+    calm, moving = (_films(path, *given) for path in (still, recording))
     centre = positions.index((0, 0))
     places = dot_statistics.find_dots(calm[centre].mean(0), rows, cols, dark)
     reach = fit_radius_px or dot_statistics.choose_fit_radius(places)
@@ -114,7 +121,7 @@ def measure_dot_grid(
     turbulent = [gaussian_dots.fit_gaussians(film, places, reach) for film in moving]
     still_fits = [gaussian_dots.fit_gaussians(film, places, reach) for film in calm]
     fitted = dot_statistics.compare_with_still(turbulent, still_fits, fps=fps, centre=centre)
-    dot_statistics.write_dot_csv(fitted, folder / "turbulence.csv", positions)
+    dot_statistics.write_view_dot_csv(fitted, folder / "turbulence.csv", positions)
     calibration_figures.draw_dot_statistics(fitted, positions, folder / "turbulence.png")
     return fitted
 
@@ -130,7 +137,7 @@ def measure_film(
     """Measure the turbulence of a video of a still scene; write `air.yaml`, also at `save`, and
     `air.png`.
 
-    At most `max_frames` are read; `fps` None: what the video states.  Raises ValueError for a
+    At most `max_frames` are read; `fps` None: that of the video.  Raises ValueError for a
     video that cannot be read or shows too little; then nothing is written.
     """
     if not Path(video).exists():
@@ -141,11 +148,11 @@ def measure_film(
         raise ValueError(
             f"air.max_frames must be at least {turbulence_meter.MIN_FRAMES}, got {max_frames}"
         )
-    frames = islice(sources.read_video(video, "video"), max_frames)
+    frames = videos.read_video(video, "video", max_frames)
     film = list(map(turbulence_meter.shrink_frame, frames))
     if len({frame.shape for frame in film}) > 1:
         raise ValueError(f"video must hold frames of one size, got several in {video}")
-    rate = sources.stated_fps(video) if fps is None else fps
+    rate = videos.read_fps(video, "video", max_frames) if fps is None else fps
     air = turbulence_meter.measure_turbulence(np.stack(film), rate)
     text = f"# The air of {Path(video).name}, {air.frames} frames; pixels of a frame whose smaller"
     text += f" side is {SIDE}.\n{air.found.text()}"
@@ -161,15 +168,17 @@ def _films(
     fps: float,
     sensor_size: Sequence[int] | None,
     network: EventToVideoNetwork | None,
+    options: ReadOptions,
 ) -> Float[np.ndarray, "views frames h w"]:
     if not sources.has_events(path):
-        frames = sources.read_video(path)
+        frames = videos.read_video(path)
         return np.stack([there.warp_to_model(f) if there else f[None] for f in frames], axis=1)
     if network is None:
         raise ValueError(f"ckpt or baseline must reconstruct the events of {path}, got neither")
-    sensor = sources.sensor_size(path, sensor_size)
+    sensor = sources.sensor_size(path, sensor_size, options)
     span = event_windows.frames_per_window("trained", fps)
     table = sensor_lookup.build_lookup(there or Views.single_view(sensor, sensor))
     rule = event_windows.WindowRule(fps=fps, frames_per_window=span)
-    windows = event_windows.cut_windows(sources.iter_recording(path, sensor), table, rule)
+    events = sources.iter_recording(path, sensor, options=options)
+    windows = event_windows.cut_windows(events, table, rule)
     return np.stack(list(reconstruction.reconstruct_each_view(windows, network, span)), axis=1)

@@ -1,7 +1,6 @@
 """What all entry points share: the folder of a run, errors, exit codes."""
 
 import functools
-import hashlib
 import logging
 import os
 import signal
@@ -23,22 +22,16 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.syntax import Syntax
 
+from src.app import console
+from src.app.config_values import check_values
+from src.app.path_overrides import name_job_folder, quote_paths, unquote_override
 from src.app.renamed_keys import check_keys, check_overrides, explain_refused_key
 from src.records import results, tracking
 
+CONF = str(Path(__file__).resolve().parents[2] / "conf")
 FAILURE_FILE = "failed.txt"  # in the folder of a sweep's job: why it failed
-MAX_FOLDER_NAME = 200  # characters
 
-
-def one_folder(overrides: str) -> str:
-    """Return `overrides` as the name of one folder, without slashes, of at most MAX_FOLDER_NAME."""
-    name = overrides.replace("/", "-")
-    if len(name) <= MAX_FOLDER_NAME:
-        return name
-    return f"{name[: MAX_FOLDER_NAME - 9]}_{hashlib.sha256(overrides.encode()).hexdigest()[:8]}"
-
-
-OmegaConf.register_new_resolver("one_folder", one_folder, replace=True)
+OmegaConf.register_new_resolver("one_folder", name_job_folder, replace=True)
 
 
 class JobFailed(Exception):
@@ -47,23 +40,37 @@ class JobFailed(Exception):
 
 def run_command(work: Callable[[DictConfig], object], config: str) -> None:
     """Run `work` on `conf/<config>.yaml` and the overrides of the command line, as `run_main`."""
+    failures: list[Exception] = []
 
-    @hydra.main(version_base=None, config_path="../conf", config_name=config)
+    @hydra.main(version_base=None, config_path=CONF, config_name=config)
     @functools.wraps(work)
     def main(cfg: DictConfig) -> None:
-        run_job(work, cfg)
+        try:
+            run_job(work, cfg)
+        except Exception as error:
+            if HydraConfig.get().runtime.choices.get("hydra/launcher") != "basic":
+                raise  # a process of its own
+            failures.append(error)  # Hydra would print it, and go on to raise it
 
-    run_main(main)
+    def run() -> None:
+        main()
+        if failures:
+            raise failures[0]
+
+    run_main(run)
 
 
 def run_main(main: Callable[[], None]) -> None:
     """Call the Hydra entry point `main`; a wrong value ends in one line on stderr and exit code 2.
 
-    A sweep with failed jobs ends with their names and exit code 1.  `HYDRA_FULL_ERROR=1` makes
-    Hydra hand the errors of the job to us instead of printing them.
+    A sweep with failed jobs ends with their names and exit code 1.  Paths on the command line are
+    quoted for Hydra's grammar.  `HYDRA_FULL_ERROR=1` makes Hydra hand the errors of the job to us
+    instead of printing them.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"
     start = time.time()
+    console.prepare_streams()
+    sys.argv[1:] = quote_paths(sys.argv[1:], Path(sys.argv[0]).stem)
     try:
         check_overrides(sys.argv[1:])
         main()
@@ -84,18 +91,20 @@ def run_main(main: Callable[[], None]) -> None:
 
 
 def run_job(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:
-    """Run `work` in the folder Hydra made for this job; print the config once; end W&B's run.
+    """Run `work` in the folder Hydra made for this job, with `verbose` after the config is printed;
+    end W&B's run.
 
     A job of a sweep is skipped where its results stand; its error is stored.
     """
     check_keys(cfg)
     job = HydraConfig.get()
     cfg.paths.run = job.runtime.output_dir
+    check_values(cfg)
     _silence_expected_warnings()
     if job.mode != RunMode.MULTIRUN:
         _run_work(work, cfg)
         return
-    folder, name = Path(cfg.paths.run), " ".join(job.overrides.task)
+    folder, name = Path(cfg.paths.run), " ".join(map(unquote_override, job.overrides.task))
     (folder / FAILURE_FILE).unlink(missing_ok=True)
     try:
         if results.has_results(folder, resolved_yaml(cfg)):
@@ -111,7 +120,8 @@ def run_job(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:
 
 
 def _run_work(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:
-    rich.print(Syntax(resolved_yaml(cfg), "yaml", background_color="default"))
+    if cfg.get("verbose"):
+        rich.print(Syntax(resolved_yaml(cfg), "yaml", background_color="default"))
     try:
         work(cfg)
     finally:
@@ -131,7 +141,7 @@ def resolved_yaml(cfg: DictConfig) -> str:
     return OmegaConf.to_yaml(cfg, resolve=True)
 
 
-def run_facts(cfg: DictConfig, start: float) -> dict:
+def run_metadata(cfg: DictConfig, start: float) -> dict:
     """Return what `results.json` says of a run besides its numbers; `start` by perf_counter."""
     gpu = cfg.trainer.accelerator == "gpu" and torch.cuda.is_available()
     cpu = f"cpu, {torch.get_num_threads()} threads"
@@ -155,7 +165,7 @@ def command_line() -> dict:
     return {
         "config": job.job.config_name,
         "choices": {group: choice for group, choice in groups.items() if "hydra/" not in group},
-        "overrides": list(job.overrides.task),
+        "overrides": list(map(unquote_override, job.overrides.task)),
     }
 
 

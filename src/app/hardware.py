@@ -2,11 +2,12 @@
 
 import ctypes
 import os
+import re
 
 import torch
 from omegaconf import DictConfig
 
-from src.deploy.cpu_features import has_fast_bf16
+from src.deploy.cpu_features import is_bf16_faster
 
 TRIM_THRESHOLD, MMAP_MAX = -1, -4  # of mallopt, in malloc.h
 
@@ -31,5 +32,14 @@ def retain_freed_memory(cfg: DictConfig) -> None:
 def fill_in_precision(cfg: DictConfig) -> None:
     """Set a `trainer.precision` of null to bf16-mixed, on a CPU without fast bf16 to 32-true."""
     if cfg.trainer.precision is None:
-        fast_bf16 = cfg.trainer.accelerator != "cpu" or has_fast_bf16()
+        fast_bf16 = cfg.trainer.accelerator != "cpu" or is_bf16_faster()
         cfg.trainer.precision = "bf16-mixed" if fast_bf16 else "32-true"
+
+
+def check_device(device: str) -> None:
+    """Raise ValueError for a `device` other than cpu, cuda or cuda:0, cuda:1, ... of a GPU here."""
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
+        raise ValueError(f"device must be cpu or cuda, got {device}")
+    gpus = torch.cuda.device_count()
+    if device != "cpu" and int(device.partition(":")[2] or 0) >= gpus:
+        raise ValueError(f"device must be cpu, as torch finds {gpus} GPUs here, got {device}")

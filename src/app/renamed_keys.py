@@ -1,4 +1,4 @@
-"""Config keys of earlier versions: an error that names the new key instead of an unknown one."""
+"""Config keys and choices of earlier versions: an error that names the new one."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -7,24 +7,39 @@ from pathlib import Path
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-# Former key: its new name, or None where nothing took its place.
-TABLE = Path(__file__).with_suffix(".yaml")
-RENAMED_KEYS: dict[str, str | None] = yaml.safe_load(TABLE.read_text())
-REFUSED_KEY = r"Could not (?:override|delete from config\.) '([\w./]+)'"  # Hydra's message
+# Former key, or group=choice: its new name, or None where nothing took its place.
+TABLES = [Path(__file__).with_name(name) for name in ("renamed_keys.yaml", "renamed_choices.yaml")]
+RENAMED_KEYS: dict[str, str | None] = {
+    old: new for table in TABLES for old, new in yaml.safe_load(table.read_text()).items()
+}
+REFUSED_KEY = r"Could not (?:override|delete from config\.) '([\w./]+)'"  # Hydra's messages
+LISTED = "--cfg job lists the keys"
+MISSING_VALUE = r"Missing mandatory value: ([\w.]+)"
+REFUSED_CHOICE = r"Could not find '([\w/]+)/(\w+)'"
 
 
 def explain_refused_key(message: str) -> str | None:
-    """Return what became of the key that Hydra refuses in `message`; None for any other error."""
-    found = re.search(REFUSED_KEY, message)
-    return describe_renaming(found[1].replace("/", ".")) if found else None
+    """Return what became of the key or choice that Hydra refuses in `message`, that there is no
+    such key, or that it must be given; None for any other error.
+    """
+    if found := re.search(MISSING_VALUE, message):
+        return f"{found[1]} must be given: {found[1]}=..."
+    if found := re.search(REFUSED_CHOICE, message):
+        return describe_renaming(f"{found[1]}={found[2]}")
+    if found := re.search(REFUSED_KEY, message):
+        key = found[1].replace("/", ".")
+        return describe_renaming(key) or f"{key} is no key of the configuration; {LISTED}"
+    return None
 
 
 def check_overrides(arguments: Iterable[str]) -> None:
-    """Raise ValueError for a former key among the overrides of a command line."""
+    """Raise ValueError for a former key or choice among the overrides of a command line."""
     for argument in arguments:
-        key = re.split("[=@]", argument.lstrip("+~"))[0].replace("/", ".")
-        if explanation := describe_renaming(key):
-            raise ValueError(explanation)
+        name, _, value = argument.lstrip("+~").partition("=")
+        key = name.split("@")[0].replace("/", ".")
+        for former in (key, *(f"{key}={choice.strip()}" for choice in value.split(","))):
+            if explanation := describe_renaming(former):
+                raise ValueError(explanation)
 
 
 def check_keys(cfg: DictConfig) -> None:

@@ -17,8 +17,7 @@ from src.sim.pipeline import Pipeline
 from src.sim.scenes.clip import FrameRateMixture
 from src.sim.sensor.sensor import Sensor
 from src.training.batch_sampler import LargeCropStream
-from src.training.cached_pipeline import CachedPipeline
-from src.training.clip_cache import ClipCache, DeviceClipCache
+from src.training.clip_cache import CachedPipeline, ClipCache, DeviceClipCache
 from src.training.disk_cache import DiskClipCache, hash_file_lists
 
 DEVICE_CACHES: dict[str, DeviceClipCache] = {}  # those of this process, by all that makes them
@@ -113,10 +112,7 @@ def _clip_inputs(cfg: DictConfig, optics: Optics) -> dict:
     measured = parts["turbulence"].get("measured")  # a file; what it holds makes the clips
     windows, substeps = cfg.data.cache_windows, cfg.data.substeps
     return parts | {
-        "optics": {
-            "positions": optics.positions,
-            "homography_error_px": optics.homography_error_px,
-        },
+        "optics": optics.positions,
         "files": hash_file_lists(parts),
         "measured": Path(measured).read_text() if measured else None,
         "decodes_srgb": _decodes_srgb(cfg),

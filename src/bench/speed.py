@@ -10,16 +10,22 @@ import torch
 from torch.nn import functional
 
 from src.bench.candidates import Candidate
-from src.deploy.cost import count_macs, macs_per_frame, time_frame, timing_clock, torch_threads
-from src.deploy.cpu_features import has_fast_bf16
-from src.deploy.forms import in_form
+from src.deploy.cost import (
+    count_macs,
+    macs_per_frame,
+    select_timing_clock,
+    time_frame,
+    torch_threads,
+)
+from src.deploy.cpu_features import is_bf16_faster
+from src.deploy.forms import convert_to_form
 from src.deploy.onnx_export import OnnxNetwork, export_onnx
 from src.models.folding import inference_copy
 from src.models.network import FramePostprocessor
 
 FORM_DTYPES = {  # what a form computes in
     "float32": torch.float32, "bf16": torch.bfloat16, "compiled": torch.bfloat16,
-    "openvino": torch.bfloat16 if has_fast_bf16() else torch.float32,
+    "openvino": torch.bfloat16 if is_bf16_faster() else torch.float32,
     "onnx": torch.float32,
 }  # fmt: skip
 FORMS = tuple(FORM_DTYPES)
@@ -31,8 +37,8 @@ ACTIVE_SHARE = 0.05  # of a grid's entries that are not zero, as in our streams
 
 @dataclass(frozen=True)
 class SpeedMeasurement:
-    """One network in one form on frames `side` pixels square; `limit_ms`: what the arithmetic alone
-    takes at the peak of the machine.  `reason`: why there is no time.
+    """One network in one form on frames `side` pixels square; `roofline_ms`: what the arithmetic
+    alone takes at the peak of the machine.  `reason`: why there is no time.
     """
 
     network: str
@@ -48,7 +54,7 @@ class SpeedMeasurement:
     clock: str = ""
     gmac: float | None = None
     params: int | None = None
-    limit_ms: float | None = None
+    roofline_ms: float | None = None
     reason: str = ""
 
 
@@ -93,7 +99,7 @@ class SpeedBenchmark:
                 if key not in self.peaks:
                     self.peaks[key] = measure_peak_conv_macs_per_s(dtype, threads=entry.threads)
                 limit_s = macs / self.peaks[key]
-                entry = replace(entry, limit_ms=1e3 * limit_s)
+                entry = replace(entry, roofline_ms=1e3 * limit_s)
                 if limit_s > LONGEST_S:
                     raise ValueError(f"more than {LONGEST_S:g} s a frame by arithmetic alone")
             return self._time(candidate, entry)
@@ -110,8 +116,7 @@ class SpeedBenchmark:
             macs = macs_per_frame(network, side, side, views=views, bins=self.bins)
         if (post := candidate.postprocessor) is not None:
             frames = torch.zeros(1, post.WINDOW, 1, PREVIEW_SIDE, PREVIEW_SIDE)
-            sizes = {"window": post.WINDOW, "overlap": post.OVERLAP}
-            window = count_macs(lambda: post.restore(frames, **sizes)) * side**2 // PREVIEW_SIDE**2
+            window = count_macs(lambda: post.restore(frames)) * side**2 // PREVIEW_SIDE**2
             macs += window // (post.WINDOW - post.OVERLAP)
         return macs
 
@@ -124,7 +129,7 @@ class SpeedBenchmark:
         if entry.form == "float32":
             ready = inference_copy(network)
         elif entry.form != "onnx":
-            ready = in_form(network, entry.form)
+            ready = convert_to_form(network, entry.form)
         else:
             path = self.folder / f"{entry.network}_{entry.side}.onnx"
             if not path.is_file():
@@ -155,38 +160,33 @@ class SpeedBenchmark:
 
 
 @torch.no_grad()
-def time_postprocessor(
-    post: FramePostprocessor, side: int, *, threads: int = 1, repeats: int = 2
-) -> float:
+def time_postprocessor(post: FramePostprocessor, side: int, *, threads: int = 1) -> float:
     """Return the ms for each frame, `side` pixels square, of a long video.
 
     Its windows of WINDOW frames overlap by OVERLAP: what two of them share is paid for twice.
     """
     frames = torch.rand(1, post.WINDOW, 1, side, side)
-    sizes = {"window": post.WINDOW, "overlap": post.OVERLAP}
-    seconds = _fastest(lambda: post.restore(frames, **sizes), threads, repeats)
+    seconds = _fastest(lambda: post.restore(frames), threads, repeats=2)
     return 1e3 * seconds / (post.WINDOW - post.OVERLAP)
 
 
 @torch.no_grad()
-def measure_peak_conv_macs_per_s(
-    dtype: torch.dtype, *, threads: int = 1, repeats: int = 8
-) -> float:
+def measure_peak_conv_macs_per_s(dtype: torch.dtype, *, threads: int = 1) -> float:
     """Return the multiply-accumulates a second of a large 3x3 convolution, channels-last, the best
-    of `repeats`: what no network of convolutions exceeds by much.
+    of eight: what no network of convolutions exceeds by much.
     """
     x, kernel = (
         torch.randn(size).to(dtype=dtype, memory_format=torch.channels_last)
         for size in ((1, PEAK_CHANNELS, PEAK_SIDE, PEAK_SIDE), (PEAK_CHANNELS, PEAK_CHANNELS, 3, 3))
     )
     functional.conv2d(x, kernel, padding=1)
-    seconds = _fastest(lambda: functional.conv2d(x, kernel, padding=1), threads, repeats)
+    seconds = _fastest(lambda: functional.conv2d(x, kernel, padding=1), threads, repeats=8)
     return PEAK_SIDE**2 * PEAK_CHANNELS**2 * 9 / seconds
 
 
 def _fastest(work: Callable[[], object], threads: int, repeats: int) -> float:
     """Return the least seconds of `repeats` calls of `work` on so many threads."""
-    now, seconds = timing_clock(threads), []
+    now, seconds = select_timing_clock(threads), []
     with torch_threads(threads):
         for _ in range(repeats):
             start = now()

@@ -10,7 +10,7 @@ import torch
 
 from src.bench.candidates import Candidate
 from src.bench.speed import FORMS, SpeedMeasurement
-from src.deploy.forms import in_form
+from src.deploy.forms import convert_to_form
 from src.metrics.table import METRICS
 from src.metrics.video_metrics import VideoMetrics
 from src.records.results import format_csv
@@ -61,7 +61,7 @@ def score_candidates(
         variants.append(("float32", candidate))
         learned = any(True for _ in candidate.network.parameters())
         if "bf16" in forms and learned and candidate.postprocessor is None:
-            half = replace(candidate, network=in_form(candidate.network, "bf16"))
+            half = replace(candidate, network=convert_to_form(candidate.network, "bf16"))
             variants.append(("bf16", half))
     scores = []
     for severity, pipeline in pipelines.items():
@@ -72,8 +72,7 @@ def score_candidates(
             for form, candidate in variants:
                 frames, _ = candidate.reconstruct(windows, list(sample.positions or ()), window_s)
                 if (post := candidate.postprocessor) is not None:
-                    sizes = {"window": post.WINDOW, "overlap": post.OVERLAP}
-                    frames = post.restore(frames[None], **sizes)[0]
+                    frames = post.restore(frames[None])[0]
                 values = measure(frames[warmup:], truth)
                 scores.append(ClipScore(candidate.name, form, severity, clip, values))
         print(f"scored on {severity} turbulence")

@@ -17,18 +17,12 @@ MAX_FRAMES = 200  # timed at most
 
 @torch.no_grad()
 def macs_per_frame(
-    network: EventToVideoNetwork,
-    height: int,
-    width: int,
-    *,
-    views: int = 1,
-    bins: int = 5,
+    network: EventToVideoNetwork, height: int, width: int, *, views: int = 1, bins: int = 5,
     positions: Sequence[Position] | None = None,
-) -> int:
-    """Return the multiply-accumulates of one window, batch 1.
+) -> int:  # fmt: skip
+    """Return the multiply-accumulates of one window, batch 1, by `count_macs`.
 
-    `positions`: (row, col) of each view, None: `optics.layout`.  Counted are convolutions and
-    matrix products (torch's FLOP counter, two FLOPs a MAC), not elementwise work and interpolation.
+    `positions`: (row, col) of each view, None: `optics.layout`.
     """
     device = next((parameter.device for parameter in network.parameters()), torch.device("cpu"))
     voxels = torch.zeros(1, views, bins, height, width, device=device)
@@ -37,7 +31,9 @@ def macs_per_frame(
 
 
 def count_macs(work: Callable[[], object]) -> int:
-    """Return the multiply-accumulates of convolutions and matrix products in a call of `work`."""
+    """Return the multiply-accumulates of convolutions and matrix products in a call of `work`
+    (torch's FLOP counter, two FLOPs a MAC), without elementwise work and interpolation.
+    """
     with FlopCounterMode(display=False) as counter:
         work()
     return counter.get_total_flops() // 2
@@ -52,7 +48,7 @@ class Timing(NamedTuple):
     clock: str
 
 
-def timing_clock(threads: int, device: torch.device | str = "cpu") -> Callable[[], float]:
+def select_timing_clock(threads: int, device: torch.device | str = "cpu") -> Callable[[], float]:
     """Return the clock, in seconds, of every timing of a network: on one thread of a CPU what that
     thread computes, which other jobs on the machine hardly disturb, else wall time.
     """
@@ -86,7 +82,7 @@ def time_frame(
     `positions`: (row, col) of each view, None: `optics.layout`.  As many frames as fit into
     `seconds`, at least `min_frames`, after two that warm up.
     """
-    now, times = timing_clock(threads, voxels.device), list[float]()
+    now, times = select_timing_clock(threads, voxels.device), list[float]()
 
     def advance(state: Any) -> Any:
         _, state = network(voxels, state, positions=positions)

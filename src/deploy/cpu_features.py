@@ -10,7 +10,7 @@ TIMED_CONVOLUTIONS = 20  # of each type, the first of which are slow
 
 
 @cache
-def has_fast_bf16() -> bool:
+def is_bf16_faster() -> bool:
     """Return whether this processor is faster in bf16 than in float32, by a convolution in each.
 
     Without instructions for it bf16 takes many times longer.  With them it takes half the time or,

@@ -18,7 +18,7 @@ from src.sim.optics import Position
 FORMS = ("float32", "bf16", "compiled", "openvino")
 
 
-def in_form(network: EventToVideoNetwork, form: str) -> EventToVideoNetwork:
+def convert_to_form(network: EventToVideoNetwork, form: str) -> EventToVideoNetwork:
     """Return `network` in a form to run it in: `float32`, as it is; `bf16`; `compiled`, bf16
     through torch.compile; `openvino`, on OpenVINO, in bf16 where the CPU is faster in it.
 
@@ -32,16 +32,14 @@ def in_form(network: EventToVideoNetwork, form: str) -> EventToVideoNetwork:
         raise ValueError(f"form must be float32 for a network without parameters, got {form}")
     if form == "openvino":
         return OpenVinoNetwork(network)
-    return ReducedPrecisionNetwork(network, compiled=form == "compiled")
+    return Bf16Network(network, compiled=form == "compiled")
 
 
-class ReducedPrecisionNetwork(EventToVideoNetwork):
-    """A copy of `network` with weights and maps in bf16, laid out channels last; frames are
-    float32.
+class Bf16Network(EventToVideoNetwork):
+    """A copy of `network` with weights and maps in bf16, channels last; frames are float32.
 
-    `compiled`: torch.compile makes one pass of what lies between two convolutions, which takes a
-    C++ compiler, half a minute at the first windows of every size, and as many threads as torch has
-    then.
+    `compiled`: by torch.compile, which takes a C++ compiler, half a minute at the first windows of
+    every size, and as many threads as torch has then.
     """
 
     def __init__(self, network: EventToVideoNetwork, *, compiled: bool = False):
@@ -67,7 +65,6 @@ class ReducedPrecisionNetwork(EventToVideoNetwork):
         window_s: float | Tensor = WINDOW_S,
         positions: Sequence[Position] | None = None,
     ) -> tuple[Float[Tensor, "n 1 h w"], Any]:
-        """Return the frame and the network's own state."""
         if self.compiled:  # a number would be compiled into the code
             window_s = torch.as_tensor(window_s, dtype=torch.float32)
         seen = voxels.to(self.input_dtype)

@@ -13,7 +13,7 @@ WEIGHT_LEVELS, ACTIVATION_LEVELS = 127, 255  # from zero to the largest
 MIN_CHANNELS = 16  # from which on it is faster, or no slower
 
 
-def quantise_decoder(network: nn.Module) -> None:
+def quantise_decoder_conv(network: nn.Module) -> None:
     """Let the larger convolution of a SetNet's decoder compute in 8 bits, in place, where that is
     faster: a pixel changes by less than by rounding to bf16.
     """

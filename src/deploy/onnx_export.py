@@ -27,15 +27,9 @@ CHECKED_WINDOWS = 4  # windows over which it is compared
 
 
 def export_onnx(
-    network: EventToVideoNetwork,
-    path: Path,
-    *,
-    views: int,
-    height: int,
-    width: int,
-    bins: int = 5,
+    network: EventToVideoNetwork, path: Path, *, views: int, height: int, width: int, bins: int = 5,
     positions: Sequence[Position] | None = None,
-) -> "OnnxNetwork":
+) -> "OnnxNetwork":  # fmt: skip
     """Write `network` to `path`, spectral norm folded; return what runs it, checked against it.
 
     Raises ValueError without the packages, for a network that ONNX cannot express, and where the

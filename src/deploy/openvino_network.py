@@ -17,9 +17,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from src.deploy.cpu_features import has_fast_bf16
+from src.deploy.cpu_features import is_bf16_faster
 from src.deploy.explicit_state import ExplicitStateNetwork
-from src.deploy.int8 import quantise_decoder
+from src.deploy.int8 import quantise_decoder_conv
 from src.models.folding import inference_copy
 from src.models.network import WINDOW_S, EventToVideoNetwork
 from src.models.setnet import SetNet
@@ -39,7 +39,7 @@ def best_dtype() -> torch.dtype:
     if not is_installed():
         raise ValueError("form=openvino needs pip install openvino")
     able = _core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
-    return torch.bfloat16 if "BF16" in able and has_fast_bf16() else torch.float32
+    return torch.bfloat16 if "BF16" in able and is_bf16_faster() else torch.float32
 
 
 class CompiledModule:
@@ -110,7 +110,7 @@ class OpenVinoNetwork(EventToVideoNetwork):
         self.views, self.uses_window_length = network.views, network.uses_window_length
         # SetNet adds its events up in float32 and rounds where it convolves.
         self.input_dtype = torch.float32 if isinstance(network, SetNet) else dtype
-        quantise_decoder(self.inner)
+        quantise_decoder_conv(self.inner)
         self.compiled: dict[tuple, CompiledModule] = {}
 
     @torch.no_grad()
@@ -128,9 +128,8 @@ class OpenVinoNetwork(EventToVideoNetwork):
         another size.
         """
         if voxels.device.type != "cpu" or len(voxels) != 1:
-            raise ValueError(
-                f"form=openvino takes one clip on device=cpu, got {len(voxels)} on {voxels.device}"
-            )
+            got = f"{len(voxels)} on {voxels.device}"
+            raise ValueError(f"form=openvino takes one clip on device=cpu, got {got}")
         size = tuple(voxels.shape)
         if state is not None and state[0] != size:
             raise ValueError(f"state must be of voxels {size} for form=openvino, got {state[0]}")

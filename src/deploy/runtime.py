@@ -15,12 +15,11 @@ from jaxtyping import Float
 from torch import nn
 
 from src.deploy import openvino_network
-from src.deploy.backends import EagerBackend, StatefulRunner
-from src.deploy.cpu_features import has_fast_bf16
+from src.deploy.cpu_features import is_bf16_faster
 from src.deploy.engines import events_numba as kernels
 from src.deploy.first_layer import DTYPES, EventFirstLayer
-from src.deploy.int8 import quantise_decoder
-from src.deploy.remaining_layers import E2VIDRemainder
+from src.deploy.int8 import quantise_decoder_conv
+from src.deploy.remaining_layers import E2VIDRemainder, EagerBackend, StatefulRunner
 from src.deploy.setnet_clock import SetNetEvents
 from src.deploy.setnet_tiles import SetNetTiles
 from src.models.e2vid import E2VID
@@ -44,10 +43,10 @@ def fastest_form() -> str:
     """Return the form that runs fastest with this processor and what is installed."""
     if openvino_network.is_installed():
         return "openvino"
-    return "bf16" if has_fast_bf16() else "float32"
+    return "bf16" if is_bf16_faster() else "float32"
 
 
-def takes_event_lists(network: nn.Module) -> bool:
+def supports_event_lists(network: nn.Module) -> bool:
     """Return whether `network` has a first layer that events can be added to one by one."""
     return isinstance(network, SetNet | E2VID)
 
@@ -74,7 +73,7 @@ class EventListRuntime:
         form = form or fastest_form()
         if form not in FORMS:
             raise ValueError(f"form must be one of {', '.join(FORMS)}, got {form}")
-        if not takes_event_lists(network):
+        if not supports_event_lists(network):
             kind = type(network).__name__
             raise ValueError(f"a list of events needs a SetNet or an E2VID, got {kind}")
         if min(height, width) < MIN_SIDE or threads < 1:
@@ -83,7 +82,7 @@ class EventListRuntime:
                 f" and {threads}"
             )
         self.views, self.size = len(positions), (height, width)
-        missing = [-side % SIDE_MULTIPLE for side in self.size]  # shared out as `pad_to_multiple`
+        missing = [-side % SIDE_MULTIPLE for side in self.size]  # as pad_centred_to_multiple
         self.padding = [(more // 2, more - more // 2) for more in missing]
         padded = height + sum(self.padding[0]), width + sum(self.padding[1])
         dtype = {"float32": torch.float32, "bf16": torch.bfloat16}.get(form)
@@ -95,7 +94,7 @@ class EventListRuntime:
         if isinstance(copied, SetNet):
             where = copied.checked_positions(self.views, copied.bins, positions)
             if form == "openvino":
-                quantise_decoder(copied)
+                quantise_decoder_conv(copied)
             self.first_layer = SetNetEvents(self.views, padded, copied.bins)
             self.runner = SetNetTiles(copied, where, padded, dtype, backend, threads)
         else:
@@ -104,16 +103,7 @@ class EventListRuntime:
             self.first_layer = EventFirstLayer(remainder, padded)
             self.runner = StatefulRunner(remainder, self.first_layer.example(), backend, threads)
 
-    def step(
-        self,
-        t: np.ndarray,
-        x: np.ndarray,
-        y: np.ndarray,
-        p: np.ndarray,
-        view: np.ndarray,
-        t0: float,
-        t1: float,
-    ) -> Float[np.ndarray, "h w"]:
+    def step(self, t, x, y, p, view, t0: float, t1: float) -> Float[np.ndarray, "h w"]:
         """Return the frame at `t1`, float32, as the network's `forward` gives it.
 
         Events of one window in order of time, arrays of one length: `t`, `t0`, `t1` in seconds,
@@ -169,7 +159,7 @@ class EventListRuntime:
             raise ValueError(f"x, y and view must be whole numbers, got {', '.join(kinds)}")
         is_sign, typed = p.dtype.kind != "f", zip(given, DTYPES, strict=True)
         t, x, y, p, view = (np.ascontiguousarray(part, dtype) for part, dtype in typed)
-        at, wrong = kernels.check(t, x, y, p, view, self.views, *self.size, is_sign)
+        at, wrong = kernels.find_bad_event(t, x, y, p, view, self.views, *self.size, is_sign)
         if at >= 0:
             reach = {"h": self.size[0] - 1, "w": self.size[1] - 1, "views": self.views - 1}
             raise ValueError(

@@ -18,8 +18,13 @@ from src.models.setnet import (
     CELL_PX,
     CONTEXT_INTERVAL_S,
     CONTEXT_TAU_S,
+    MOVING_SHARE,
     REFERENCE_HZ,
+    REVEALING_EVENTS,
+    REVEALING_S,
+    STATIC_SHARE,
     SUM_TAUS_S,
+    TRACE_TAU_S,
     UPDATE_RECENCY,
     SetNet,
 )
@@ -78,6 +83,7 @@ class ClockState:
         tiles = -(-rows // TILE), -(-columns // TILE)
         self.trace = np.zeros((views, rows, columns), np.float32)
         self.activity = np.zeros((rows, columns), np.float32)
+        self.evidence = np.zeros((rows, columns), np.float32)
         self.elapsed_s = np.zeros((rows, columns), np.float32)  # in the last window
         self.is_pending = np.zeros((rows, columns), np.uint8)
         self.recency = np.zeros((rows // 2, columns // 2), np.float32)
@@ -94,7 +100,8 @@ class SetNetClock:
         self.scales = scales
         # Between two windows all zero.
         self.counts = np.zeros((views, rows, columns), np.float32)
-        self.is_supported, self.is_near = (np.zeros((rows, columns), np.uint8) for _ in range(2))
+        self.supported = np.zeros((rows, columns), np.float32)
+        self.is_near = np.zeros((rows, columns), np.uint8)
         self.near_tiles = np.zeros((-(-rows // TILE), -(-columns // TILE)), np.uint8)
 
     def tick(self, pixels: EventPixels, now: ClockState) -> Tick:
@@ -109,14 +116,25 @@ class SetNetClock:
 
     def _advance(self, pixels: EventPixels, now: ClockState, changed: np.ndarray) -> np.float32:
         places, voxels, window_s = pixels
-        kept = exp_float32(-window_s / np.float32(ACTIVITY_TAU_S))
-        seen = self.counts, now.trace, self.is_supported
-        clock.mark_supported(places, voxels, kept, *seen)
-        clock.widen(self.is_supported, self.is_near, self.near_tiles)
+        kept, trace_kept = (
+            exp_float32(-window_s / np.float32(tau)) for tau in (ACTIVITY_TAU_S, TRACE_TAU_S)
+        )
+        clock.find_supported(places, voxels, trace_kept, self.counts, now.trace, self.supported)
+        clock.add_evidence(self.supported, now.evidence)
+        clock.widen(self.supported, self.is_near, self.near_tiles)
         tiles = self.is_near, self.near_tiles, now.active_tiles
         cells = now.activity, now.elapsed_s, now.is_pending
         longest_s = clock.advance(window_s, kept, *tiles, *cells, now.pending_tiles, changed)
-        return np.float32(longest_s)
+        share = np.float32(np.count_nonzero(now.activity)) / np.float32(now.activity.size)
+        pace = (share - np.float32(STATIC_SHARE)) / np.float32(MOVING_SHARE - STATIC_SHARE)
+        if pace <= 0:
+            return np.float32(longest_s)
+        moving_s = min(pace, np.float32(1)) * window_s
+        gained = np.float32(REVEALING_EVENTS / REVEALING_S)
+        clock.advance_all(moving_s, gained, now.elapsed_s, now.evidence, now.is_pending)
+        for part in (now.active_tiles, now.pending_tiles, changed):
+            part[:] = 1
+        return max(np.float32(longest_s), moving_s)
 
     def _advance_context(
         self, longest_s: np.float32, now: ClockState, changed: np.ndarray
@@ -160,7 +178,7 @@ class EventMaps:
         padded: tuple[int, int], threads: int,
     ):  # fmt: skip
         self.pool = ThreadPoolExecutor(1) if threads > 1 else None
-        kernel, _, bias = network.stem_kernels(tuple(positions))
+        kernel, _, bias = network.stem_kernels_and_bias(tuple(positions))
         self.bias, kernels, views = bias.numpy(), kernel.numpy(), len(positions)
         self.patches = event_patches(kernels, views, CELL_PX)
         self.spans = [patch_spans(side, CELL_PX, kernels.shape[-1]) for side in padded]

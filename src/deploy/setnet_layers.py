@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from src.deploy.int8 import Int8Conv
-from src.models.layers import EqualDCConv, bias_of
+from src.models.layers import EqualDCConv, require_bias
 from src.models.setnet import CELL_BORDER, CELL_PX, REFERENCE_HZ, SetNet, TimeGatedMemory
 from src.sim.optics import Position
 
@@ -72,7 +72,7 @@ class SplitTimeGatedMemory(nn.Module):
         if isinstance(self.input_features, nn.Conv2d):
             self.input_features.padding = (padding, padding)
         self.input_gates = nn.ParameterList(memory.input_gates.weight.chunk(2))
-        self.bias = nn.ParameterList(bias_of(memory.input_gates).chunk(2))
+        self.bias = nn.ParameterList(require_bias(memory.input_gates).chunk(2))
         self.state_gates = nn.ParameterList(memory.state_gates.weight.chunk(2))
         self.padding = padding if len(memory.input_gates.weight[0, 0]) > 1 else 0
 

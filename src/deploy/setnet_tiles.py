@@ -21,7 +21,7 @@ from src.deploy.setnet_clock import (
 from src.deploy.setnet_context import CONTEXT_TILE, ContextTiles, WholeContext
 from src.deploy.setnet_layers import DecoderLayers, MemoryLayers, WholeDecoder
 from src.deploy.tile_batches import Backend, TileModule
-from src.models.setnet import CELL_PX, SetNet
+from src.models.setnet import BACKGROUND, CELL_PX, SetNet
 from src.sim.optics import Position
 
 BATCHES = 8, 32  # sizes of batches, in tiles
@@ -33,7 +33,7 @@ class TileState:
     """What lives from window to window, advanced in place: maps (rows, columns, channels) and the
     frame (h, w)."""
 
-    def __init__(self, network: SetNet, height: int, width: int, start: float):
+    def __init__(self, network: SetNet, height: int, width: int):
         rows, columns = height // CELL_PX, width // CELL_PX
         hidden, context, _ = network.map_sizes(height, width)
         scales = network.context.map_sizes(rows, columns)
@@ -43,7 +43,7 @@ class TileState:
         self.scales = [_zeros(size) for size in scales[:levels]]
         # The sums with coarser scales, by scale; the coarsest has none, the finest is not held.
         self.fused: list[Any] = [None, *map(_zeros, reversed(scales[levels:])), self.scales[-1]]
-        self.frame = np.full((height, width), start, np.float32)
+        self.frame = np.full((height, width), BACKGROUND, np.float32)
 
 
 class SetNetState(NamedTuple):
@@ -72,15 +72,11 @@ class SetNetTiles:
         self.decoder = TileModule(decoder, [(far, far, c)], *how, BATCHES)
         self.context = ContextTiles(network, dtype, *how)
         self.whole = WholeFrame(network, positions, padded, dtype, *how)
-        # Where no event was ever seen every pixel is that of maps of zeros.
-        found = list[float]()
-        self.decoder.run(1, lambda part, x: None, lambda part, made: found.append(made[0, 0, 0, 0]))
-        self.start = float(found[0])
         self.reset()
 
     def reset(self) -> None:
         sums = SumState(*self.events.size)
-        maps = TileState(self.network, *self.padded, self.start)
+        maps = TileState(self.network, *self.padded)
         self.state = SetNetState(ClockState(*self.events.size[:3]), sums, maps)
 
     def __call__(self, pixels: EventPixels) -> Float[np.ndarray, "h w"]:
@@ -99,7 +95,7 @@ class SetNetTiles:
         cells = tick.smoothed_cells, tick.smoothing_kept
         tiles_numba.smooth(maps.context, corners, *cells, maps.smoothed)
         if self._is_most(TILE, len(tick.changed_tiles), WHOLE_DECODER):
-            self.whole.draw(maps)
+            self.whole.draw(maps, clock.evidence)
         else:
             self._draw(tick.changed_tiles)
         return maps.frame
@@ -134,13 +130,14 @@ class SetNetTiles:
 
     def _draw(self, tiles: np.ndarray) -> None:
         state, halo = self.state.maps, np.int32(DecoderLayers.HALO)
+        evidence = self.state.clock.evidence
 
         def read(part: slice, inputs: list[np.ndarray]) -> None:
             corners = TILE * tiles[part] - halo
             tiles_numba.gather_sum(state.hidden, state.smoothed, corners, inputs[0])
 
         def write(part: slice, pixels: np.ndarray) -> None:
-            tiles_numba.write_pixels(pixels, QUARTER * tiles[part], 2 * CELL_PX, state.frame)
+            tiles_numba.write_pixels(pixels, QUARTER * tiles[part], evidence, state.frame)
 
         self.decoder.run(len(tiles), read, write)
 
@@ -183,10 +180,10 @@ class WholeFrame:
         for part, new in zip([maps.context, *held], self.updated, strict=True):
             part[...] = new[0]
 
-    def draw(self, maps: TileState) -> None:
+    def draw(self, maps: TileState, evidence: np.ndarray) -> None:
         """Draw the frame."""
         self.decoder.run([maps.hidden[None], maps.smoothed[None]], [self.pixels])
-        tiles_numba.write_pixels(self.pixels, np.zeros((1, 2), np.int32), 2 * CELL_PX, maps.frame)
+        tiles_numba.write_pixels(self.pixels, np.zeros((1, 2), np.int32), evidence, maps.frame)
 
 
 def _zeros(size: tuple[int, int, int]) -> Float[np.ndarray, "h w c"]:

@@ -40,7 +40,9 @@ def draw_found_target(
     save_figure(figure, path)
 
 
-def draw_alignment(picture: UInt8[np.ndarray, "h w"], alignment: AlignedViews, path: Path) -> None:
+def draw_view_residuals(
+    picture: UInt8[np.ndarray, "h w"], alignment: AlignedViews, path: Path
+) -> None:
     """Draw the outline of every view, its error, and its residuals as lines from each point."""
     figure, axes = _show_sensor(picture)
     _draw_outlines(axes, alignment.views)
@@ -101,9 +103,11 @@ def draw_dot_statistics(
         title=f"(a) tilt in time, 1/e at {decay_s:.3f} s",
     )  # fmt: skip
     dots, names = range(statistics.tilt.shape[2]), [f"{row},{col}" for row, col in positions]
-    _show_correlations(within, statistics.within_view, "(b) tilt between dots, centre view", dots)
+    _show_correlations(
+        within, statistics.centre_view_correlation, "(b) tilt between dots, centre view", dots
+    )
     title = "(c) tilt between views, middle dot"
-    _show_correlations(across, statistics.across_views, title, names)
+    _show_correlations(across, statistics.tilt_correlation_across_views, title, names)
     for axes, series, label in (
         (blur, statistics.blur, "turbulence"),
         (intensity, statistics.intensity, "turbulence"),

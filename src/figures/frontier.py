@@ -12,7 +12,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from src.bench.speed import SpeedMeasurement
 from src.bench.speed_accuracy import ClipScore, find_pareto_front
 from src.figures.plots import MARKERS, save_figure
-from src.metrics.table import METRICS, MetricColumn
+from src.metrics.table import METRICS, Column
 
 PAPER_MS, LIVE_MS = 3.4, 1000 / 600
 MIN_GMAC = 1e-3
@@ -85,7 +85,7 @@ def draw_time_over_macs(
 
 
 def _draw_metric(
-    axes, names: list[str], times: Mapping, scores: Sequence[ClipScore], metric: MetricColumn
+    axes, names: list[str], times: Mapping, scores: Sequence[ClipScore], metric: Column
 ) -> None:
     points: dict[tuple[str, str], tuple[float, float]] = {}
     for index, name in enumerate(names):

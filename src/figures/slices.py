@@ -1,4 +1,4 @@
-"""Space-time slices of a video: what stands still draws a straight line, what wobbles a wavy one.
+"""Space-time slices of a video: what stands still draws a straight line, what jitters a wavy one.
 
 A slice is the video sampled, between pixels by bilinear interpolation, at the same places of every
 frame: time down, place across (the paper's x-t, y-t, r-t and theta-t plots, figures 6 to 10).
@@ -29,7 +29,7 @@ def cut_slice(
     if spin:
         x, y, radius, turns, degrees = spin
         angles = math.radians(degrees) + 2 * math.pi * turns * np.arange(len(video)) / fps
-        points = rotating_ray_points((x, y), angles, np.arange(0, radius + 1e-9))
+        points = rotating_ray_xy((x, y), angles, np.arange(0, radius + 1e-9))
     elif circle:
         points = circle_points(circle[:2], circle[2])
     else:
@@ -72,10 +72,10 @@ def circle_points(centre: Sequence[float], radius: float, places: int | None = N
     """
     places = places or math.ceil(2 * math.pi * radius)
     angles = 2 * math.pi * np.arange(places) / places
-    return rotating_ray_points(centre, angles, np.array([float(radius)]))[:, 0]
+    return rotating_ray_xy(centre, angles, np.array([float(radius)]))[:, 0]
 
 
-def rotating_ray_points(
+def rotating_ray_xy(
     centre: Sequence[float], angles: Float[np.ndarray, " frames"],
     radii: Float[np.ndarray, " places"],
 ) -> Float[np.ndarray, "frames places 2"]:  # fmt: skip

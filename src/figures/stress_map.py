@@ -54,7 +54,7 @@ def draw_stress_map(
     return save_figure(figure, path)
 
 
-def limit_colour_value(result: StressResult) -> float:
+def map_limit_ratio_to_colour(result: StressResult) -> float:
     """Return 0..1, 0.5 at the limit: the logarithm of the ratio to the limit, cut at 10 times.
 
     Where the limit is 0, of the value in units of 0.01; where higher is better, of what is missing
@@ -79,7 +79,7 @@ def _draw_cell(axes, row: int, column: int, outcome: StressResult | str) -> None
     if isinstance(outcome, str):
         axes.add_patch(Rectangle((column, row), 1, 1, **box, **NOT_RUN))
         return
-    shade = limit_colour_value(outcome)
+    shade = map_limit_ratio_to_colour(outcome)
     axes.add_patch(Rectangle((column, row), 1, 1, **box, facecolor=COLOURS(shade)))
     style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 9}
     style["color"] = "white" if shade > 0.85 or shade < 0.15 else "black"

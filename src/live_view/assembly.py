@@ -3,11 +3,11 @@
 import asyncio
 import signal
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from src.live_view.event_feeds import Feed
 from src.live_view.feed_reader import FeedReader, PlaybackClock
-from src.live_view.frame_buffer import EventCounter, FrameRing
+from src.live_view.frame_buffer import FrameRing, PolarityAccumulator
 from src.live_view.live_windows import WindowCutter, WindowQueue
 from src.live_view.network_runner import Controls, RunSettings
 from src.live_view.page_server import THIS_MACHINE, LivePage, PageServer
@@ -33,18 +33,19 @@ def assemble(
     noise_filter_s: float | None = None,
     host: str = "127.0.0.1",
     port: int = 8600,
+    allowed_origins: Sequence[str] = (),
 ) -> PageServer:
     """Return the server of a page on which `feed` is played through one of `networks`.
 
     Raises ValueError for a value out of range.
     """
-    clock, counter = PlaybackClock(playback_speed), EventCounter(build_lookup(views))
-    cutter = WindowCutter(views.sensor, settings.fps, faults)
+    clock, counter = PlaybackClock(playback_speed), PolarityAccumulator(build_lookup(views))
+    cutter = WindowCutter(views.sensor, settings.fps, faults, is_live=feed.is_live)
     waiting = WindowQueue(max_waiting_windows, lossless=playback_speed == float("inf"))
     noise_filter = None if noise_filter_s is None else NoiseFilter(views.sensor, noise_filter_s)
     reader = FeedReader(feed, cutter, waiting, counter, clock, Meters(), faults, noise_filter)
     player = Player(reader, Controls(networks, views, settings), FrameRing(views.model))
-    return PageServer(LivePage(player, views.positions), host, port)
+    return PageServer(LivePage(player, views.positions), host, port, allowed_origins)
 
 
 async def play_and_serve(server: PageServer) -> None:

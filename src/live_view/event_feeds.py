@@ -12,7 +12,9 @@ import numpy as np
 
 from src.live_view.status import FaultLog
 from src.recordings.files import sources
-from src.recordings.files.formats import EVENT
+from src.recordings.files.clocks import TimestampUnwrapper
+from src.recordings.files.event_file import EVENT, ReadOptions
+from src.recordings.files.recording import open_recording
 from src.recordings.views import LARGEST_SIDE, Size
 
 Chunks = Iterator[tuple[np.ndarray, float]]  # events (t x y p), wall time of their arrival in s
@@ -50,13 +52,17 @@ def open_feed(
     *,
     loop: bool = False,
     udp_format: str = "t64_x16_y16_on8",
+    options: ReadOptions = ReadOptions(),
 ) -> Feed:
     """Return the feed of `recording`: a path, `udp://address:port` or `camera://`; `sensor`:
     (height, width) where it states none.  Raises ValueError for what cannot be read."""
     if recording.startswith("camera://"):
         return CameraFeed(faults)
     if not recording.startswith("udp://"):
-        return FileFeed(recording, sources.sensor_size(recording, sensor), loop)
+        size = sources.sensor_size(recording, sensor, options)
+        if lines := open_recording(recording, options=options).messages:
+            faults.report("reading", "; ".join(lines), until_cleared=True)
+        return FileFeed(recording, size, loop, options)
     if sensor is None or not all(1 <= side <= LARGEST_SIDE for side in sensor):
         raise ValueError(
             f"sensor_size must be [height,width] for recording=udp://, got {sensor}; "
@@ -70,15 +76,15 @@ class FileFeed(Feed):
 
     is_live = False
 
-    def __init__(self, path: str, sensor: Size, loop: bool):
-        self.path, self.sensor, self.loop = path, sensor, loop
+    def __init__(self, path: str, sensor: Size, loop: bool, options: ReadOptions = ReadOptions()):
+        self.path, self.sensor, self.loop, self.options = path, sensor, loop, options
 
     def chunks(self, stopped: threading.Event) -> Chunks:
         """Yield the file's events; raises ValueError where it cannot be decoded."""
         shift_us, last_us = 0, 0
         while not stopped.is_set():
             first_us = None
-            for events in sources.iter_recording(self.path, self.sensor, FILE_CHUNK_S):
+            for events in self._read():
                 first_us = int(events["t"][0]) if first_us is None else first_us
                 last_us = int(events["t"][-1])
                 if shift_us:
@@ -87,6 +93,9 @@ class FileFeed(Feed):
             if not self.loop or first_us is None:
                 return
             shift_us += last_us + 1 - first_us
+
+    def _read(self) -> Iterator[np.ndarray]:
+        return sources.iter_recording(self.path, self.sensor, FILE_CHUNK_S, self.options)
 
 
 class UdpFeed(Feed):
@@ -102,7 +111,7 @@ class UdpFeed(Feed):
         self.sensor, self.packet_format, self.faults = sensor, packet_format, faults
         self.dtype = PACKETS[packet_format]
         self.buffer = memoryview(bytearray(GATHER_BYTES + MAX_PACKET_BYTES))
-        self.turns, self.last_us = 0, 0  # of a clock of 32 bits
+        self.clock = TimestampUnwrapper()
         try:
             self.socket = _bind_udp_socket(url)
         except (OSError, ValueError) as error:
@@ -136,15 +145,10 @@ class UdpFeed(Feed):
 
         32 bits of microseconds turn every 71.6 minutes: the turns are added.
         """
-        t = packed["t"].astype(np.int64)
         if self.packet_format == "t64_x16_y16_on8":
-            on, y = packed["p"] != 0, packed["y"]
+            t, on, y = packed["t"].astype(np.int64), packed["p"] != 0, packed["y"]
         else:
-            on, y = packed["y"] & 1, packed["y"] >> 1
-            if t.size:
-                turns = self.turns + np.cumsum(np.diff(t, prepend=self.last_us) < -(2**31))
-                self.turns, self.last_us = int(turns[-1]), int(t[-1])
-                t = t + (turns << 32)
+            t, on, y = self.clock.unwrap(packed["t"]), packed["y"] & 1, packed["y"] >> 1
         is_valid = (t >= 0) & (t < MAX_TIME_US)
         if not is_valid.all():
             self._report_bad_packets()

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from src.live_view.event_feeds import Feed
-from src.live_view.frame_buffer import EventCounter
+from src.live_view.frame_buffer import PolarityAccumulator
 from src.live_view.live_windows import EventWindow, WindowCutter, WindowQueue
 from src.live_view.status import FaultLog, Meters
 from src.recordings.event_windows import COVERED
@@ -112,7 +112,7 @@ class FeedReader:
         feed: Feed,
         cutter: WindowCutter,
         waiting: WindowQueue,
-        counter: EventCounter,
+        counter: PolarityAccumulator,
         clock: PlaybackClock,
         meters: Meters,
         faults: FaultLog,
@@ -209,7 +209,9 @@ class FeedReader:
     def _add_live(self, events: np.ndarray, arrival_s: float) -> None:
         """Take a live chunk; after a silence or a jump of the camera's clock, time restarts."""
         if self.arrival_s is not None:
-            ahead_us = float(events["t"][0]) - self.camera_clock.recorded_us(arrival_s)
+            ahead_us = float(events["t"][len(events) // 2]) - self.camera_clock.recorded_us(
+                arrival_s
+            )
             if arrival_s - self.arrival_s > STALL_S or ahead_us > MAX_AHEAD_US:
                 self._restart()
         self.faults.clear("stall")

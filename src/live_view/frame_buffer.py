@@ -89,7 +89,7 @@ class TimeSlice:
         return np.rint(points).astype(int).T
 
 
-class EventCounter:
+class PolarityAccumulator:
     """Sums of polarity per pixel of every view since the last `take`; idle unless `is_watched`."""
 
     def __init__(self, lookup: SensorLookup):

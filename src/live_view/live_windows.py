@@ -9,9 +9,12 @@ import numpy as np
 
 from src.live_view.status import FaultLog
 from src.recordings.files.event_arrays import concatenate_events, count_before
+from src.recordings.files.event_file import EVENT
+from src.recordings.files.event_order import BUFFER_US, EventOrder
 from src.recordings.views import Size
 
-MAX_LATE_US = 50_000  # events may arrive out of order by less; more is another recording
+FEW_LIVE_EVENTS = 16  # with times far from the others; more of them are a clock that restarts
+ANY_GAP_US = 2**61
 
 
 @dataclass(frozen=True)
@@ -31,42 +34,57 @@ class EventWindow:
 class WindowCutter:
     """Keeps events until a window of 1 / `fps` is whole; reports to `faults` what is wrong.
 
-    Raises ValueError for an `fps` out of range.
+    What `is_live` is put in order by the rule of files (EventOrder), but nothing waits for it: an
+    event whose window is over is dropped.  The events of a file are in order.  Raises ValueError
+    for an `fps` out of range.
     """
 
-    def __init__(self, sensor: Size, fps: float, faults: FaultLog):
+    def __init__(self, sensor: Size, fps: float, faults: FaultLog, *, is_live: bool = True):
         if not 0 < fps <= 1e5:
             raise ValueError(f"fps must be in (0, 1e5], got {fps}")
         self.sensor, self.period_us, self.faults = sensor, 1e6 / fps, faults
-        self.pending: list[np.ndarray] = []
+        self.buffer_us = BUFFER_US if is_live else ANY_GAP_US
+        self.order = EventOrder(self.buffer_us, FEW_LIVE_EVENTS, None)
         self.origin_us: float | None = None  # start of the first window
         self.windows_cut = 0  # since the origin
-        self.last_us = 0.0  # time of the newest event
         self.starts_scene = True
+
+    @property
+    def last_us(self) -> float:
+        """Return the time of the newest event that is no outlier."""
+        return float(self.order.last_us)
 
     def restart(self, *, new_scene: bool = True) -> None:
         """Forget the clock: the next event starts a window, of a new scene or not."""
-        self.pending, self.origin_us, self.windows_cut = [], None, 0
+        self.order = EventOrder(self.buffer_us, FEW_LIVE_EVENTS, None)
+        self._forget_windows(new_scene)
+
+    def _forget_windows(self, new_scene: bool) -> None:
+        self.origin_us, self.windows_cut = None, 0
         self.starts_scene = self.starts_scene or new_scene
 
     def add(self, events: np.ndarray) -> bool:
         """Take a chunk, less events off the sensor; return whether the clock restarted, as after a
         jump back in time."""
-        events, restarted = self._on_sensor(events), False
-        if not events.size:
-            return False
-        first_us = float(events["t"][0])
-        if self.origin_us is not None and first_us < self.last_us - MAX_LATE_US:
-            back_s = (self.last_us - first_us) * 1e-6
+        events = self._on_sensor(events)
+        order = self.order
+        part, last_us, before = order.parts[-1], order.last_us, (order.late, order.dropped)
+        order.add(events)
+        self._report(order.late - before[0], order.dropped - before[1])
+        if order.parts[-1] is not part:
+            back_s = (last_us - order.parts[-1].first_us) * 1e-6
             self.faults.report("time", f"time jumped back by {back_s:.3g} s: started anew")
-            self.restart()
-        if self.origin_us is None:
-            self.origin_us = self.last_us = first_us
-            restarted = True
-        events = self._in_order(events)
-        self.last_us = float(events["t"][-1])
-        self.pending.append(events)
-        return restarted
+            self._forget_windows(True)
+        if self.origin_us is not None or not order.parts[-1].count:
+            return False
+        self.origin_us = float(order.parts[-1].first_us)
+        return True
+
+    def _report(self, late: int, dropped: int) -> None:
+        if late:
+            self.faults.report("order", "events came out of order: sorted", late)
+        if dropped:
+            self.faults.report("late", "events came too late or far out of order: dropped", dropped)
 
     def pop_windows(self, until_us: float) -> Iterator[EventWindow]:
         """Yield the windows that are over at `until_us`, each without its `due_s`."""
@@ -75,11 +93,13 @@ class WindowCutter:
         end_us = self.origin_us + (self.windows_cut + 1) * self.period_us
         if end_us > until_us:
             return
-        events = concatenate_events(self.pending)
         over = int((until_us - self.origin_us) / self.period_us) - self.windows_cut
         ends = (end_us + self.period_us * np.arange(max(over, 1))).tolist()
+        self.order.settle(until_us)
+        ready = self.order.release(ends[-1])
+        events = concatenate_events(ready) if ready else np.empty(0, EVENT)
         stops = [count_before(events, end) for end in ends]
-        self.pending, self.windows_cut = [events[stops[-1] :]], self.windows_cut + len(ends)
+        self.windows_cut += len(ends)
         starts_scene, self.starts_scene, start = self.starts_scene, False, 0
         for end, stop in zip(ends, stops, strict=True):
             part = events[start:stop]
@@ -95,17 +115,6 @@ class WindowCutter:
         text = f"events up to {reach} are off the {width}x{height} sensor"
         self.faults.report("size", text, len(events) - int(inside.sum()))
         return events[inside]
-
-    def _in_order(self, events: np.ndarray) -> np.ndarray:
-        """Return events whose time does not decrease: a late one gets the latest time so far."""
-        t = events["t"]
-        if t[0] >= self.last_us and not (np.diff(t) < 0).any():
-            return events
-        events = events.copy()
-        held = np.maximum.accumulate(np.maximum(t, int(self.last_us)))
-        self.faults.report("order", "events came out of order: held", int((held > t).sum()))
-        events["t"] = held
-        return events
 
 
 class WindowQueue:

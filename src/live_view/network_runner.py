@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from src.deploy.runtime import EventListRuntime, fastest_form, takes_event_lists
+from src.deploy.runtime import EventListRuntime, fastest_form, supports_event_lists
 from src.live_view.live_windows import EventWindow
 from src.models.network import EventToVideoNetwork
 from src.recordings.event_windows import Window, WindowRule, fill_window, frames_per_window
 from src.recordings.files.event_arrays import concatenate_events, count_before
-from src.recordings.files.formats import EVENT
+from src.recordings.files.event_file import EVENT
 from src.recordings.reconstruction import (
     ReconstructionState,
+    build_runnable_network,
     default_window_length,
-    prepare_network,
     reconstruct_frames,
 )
 from src.recordings.sensor_lookup import build_lookup
@@ -57,8 +57,8 @@ class NetworkRunner:
         self.name, self.views, fps = name, views, settings.fps
         length = settings.window_length or default_window_length(network)
         self.frames_per_window = frames_per_window(length, fps)
-        form = settings.form or (fastest_form() if takes_event_lists(network) else "float32")
-        self.network = prepare_network(network, form, "cpu", views, settings.bins)
+        form = settings.form or (fastest_form() if supports_event_lists(network) else "float32")
+        self.network = build_runnable_network(network, form, "cpu", views, settings.bins)
         is_runtime = isinstance(self.network, EventListRuntime)
         self.rule = WindowRule(
             fps=fps, bins=settings.bins, splat=settings.splat, as_lists=is_runtime

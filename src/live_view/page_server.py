@@ -7,8 +7,9 @@ JPEGs it lists.  The browser sends JSON: pause, line, network and views, all_vie
 import asyncio
 import json
 import math
+import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -24,6 +25,7 @@ PICTURES_HZ = 30.0
 STATUS_S = 0.25  # between two readings of the meters on the page
 MAX_REQUEST_BYTES = 4096
 NO_CACHE = {"Cache-Control": "no-store"}
+ORIGIN = re.compile(r"(https?://[a-z0-9.-]+(:\d+)?)/?")
 THIS_MACHINE = ("127.0.0.1", "localhost", "::1")
 
 
@@ -104,10 +106,15 @@ def _parse_line(numbers: object) -> Line:
 
 
 class PageServer:
-    """Serves `page` at `host`:`port` until told to stop."""
+    """Serves `page` at `host`:`port` until told to stop.
 
-    def __init__(self, page: LivePage, host: str, port: int):
+    `allowed_origins`: addresses of a proxy before it, such as https://cam.example.org, whose page
+    may use the stream.  Raises ValueError for one that is no address of a site.
+    """
+
+    def __init__(self, page: LivePage, host: str, port: int, allowed_origins: Sequence[str] = ()):
         self.page, self.host, self.port = page, host, port
+        self.origins = {_parse_origin(origin) for origin in allowed_origins}
         self.visitors: set[asyncio.Queue] = set()
         self.app = web.Application(
             middlewares=[self._own_pages_only], client_max_size=MAX_REQUEST_BYTES
@@ -157,17 +164,21 @@ class PageServer:
     async def _own_pages_only(self, request: web.Request, handler) -> web.StreamResponse:
         """Refuse requests that another site's page makes in a visitor's browser."""
         host = request.host.rsplit(":", 1)[0].strip("[]")
-        local = self.host in THIS_MACHINE
+        local = self.host in THIS_MACHINE and request.host not in self._proxies()
         origin = request.headers.get("Origin")
-        foreign = origin is not None and origin != f"http://{request.host}"
-        if foreign or (local and host not in THIS_MACHINE):
+        known = origin in (None, f"http://{request.host}") or origin in self.origins
+        if not known or (local and host not in THIS_MACHINE):
             raise web.HTTPForbidden(text="this page serves its own address only")
         return await handler(request)
 
+    def _proxies(self) -> set[str]:
+        return {origin.partition("://")[2] for origin in self.origins}
+
     async def _page(self, request: web.Request) -> web.Response:
+        streams = " ".join(f"ws://{host} wss://{host}" for host in sorted(self._proxies()))
         policy = (
             "default-src 'none'; img-src 'self' blob: data:; style-src 'unsafe-inline'; "
-            f"script-src 'unsafe-inline'; connect-src 'self' ws://{request.host}"
+            f"script-src 'unsafe-inline'; connect-src 'self' ws://{request.host} {streams}"
         )
         headers = NO_CACHE | {"Content-Security-Policy": policy}
         return web.Response(text=HTML.read_text(), content_type="text/html", headers=headers)
@@ -207,6 +218,14 @@ class PageServer:
             await asyncio.to_thread(self.page.handle_request, request)
         except ValueError as error:
             self.page.player.faults.report("request", str(error))
+
+
+def _parse_origin(origin: str) -> str:
+    found = ORIGIN.fullmatch(str(origin).lower())
+    if found is None:
+        wanted = "addresses such as https://cam.example.org"
+        raise ValueError(f"allowed_origins must be {wanted}, got {origin}")
+    return found[1]
 
 
 def _replace(queue: asyncio.Queue, message: bytes | None) -> None:

@@ -103,6 +103,6 @@ class Player:
             "waiting": len(reader.waiting),
             "network": runner.name if runner else None,
             "views": len(runner.views.views) if runner else None,
-            "load": self.meters.stage_loads(),
+            "load": self.meters.stage_cpu_shares(),
             "time_s": round(reader.cutter.last_us * 1e-6, 3),
         }

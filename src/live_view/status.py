@@ -80,7 +80,7 @@ class Meters:
             "latency_ms": {"median": round(median, 2), "p99": round(high, 2)},
         }
 
-    def stage_loads(self) -> dict[str, float]:
+    def stage_cpu_shares(self) -> dict[str, float]:
         """Return the share of a core that each stage took since about a second before."""
         now, busy = time.perf_counter(), dict(self.busy_s)
         at, before = self.before

@@ -12,6 +12,8 @@ from src.metrics.image import Frames, FrameValues, ssim
 from src.metrics.lpips import LPIPS
 
 Sequences = Float[Tensor, "n windows 1 h w"]
+Mask = Bool[Tensor, " windows-1"]
+Value = Float[Tensor, ""]
 
 STATIC_CHANGE = 1 / 512  # half a grey level: a target that changes by less is static
 FRAMES_AT_A_TIME = {"cpu": 32, "cuda": 256}  # that losses are computed of
@@ -71,32 +73,20 @@ class LPIPSTerm(FrameTerm):
 class TemporalConsistency(SequenceTerm):
     """Mean absolute change of the error from one window to the next."""
 
-    def forward(
-        self, frames: Sequences, target: Sequences, is_consecutive: Bool[Tensor, " windows-1"]
-    ) -> Float[Tensor, ""]:
+    def forward(self, frames: Sequences, target: Sequences, is_consecutive: Mask) -> Value:
         return (frames - target).diff(dim=1)[:, is_consecutive].abs().mean()
 
 
 class StaticFlicker(SequenceTerm):
-    """Mean absolute change of a frame where the target is static, relative to its contrast.
-
-    Without the contrast a fainter frame would cost less: an edge that is half as dark and changes
-    half as much moves as far.
+    """Mean absolute change of a frame where the target is static, relative to its contrast (else a
+    fainter frame would cost less).
     """
 
-    def forward(
-        self, frames: Sequences, target: Sequences, is_consecutive: Bool[Tensor, " windows-1"]
-    ) -> Float[Tensor, ""]:
+    def forward(self, frames: Sequences, target: Sequences, is_consecutive: Mask) -> Value:
         change = frames.diff(dim=1)[:, is_consecutive].abs()
         is_static = target.diff(dim=1)[:, is_consecutive].abs() < STATIC_CHANGE
         contrast = (frames.var((-2, -1), keepdim=True) + CONTRAST_FLOOR**2).sqrt()
         return (change * is_static / contrast[:, 1:][:, is_consecutive]).mean()
-
-
-class FlatnessTerm(LossTerm):
-    """A term of where nothing is revealed: `forward` maps frames (n, 1, h, w) and whether each
-    pixel is revealed to values (n,).  With it the other terms have no gradient there.
-    """
 
 
 class Distillation(LossTerm):
@@ -127,7 +117,7 @@ class TrainingLoss(nn.Module):
     def __init__(self, terms: Mapping[str, LossTerm]):
         super().__init__()
         for name, term in terms.items():
-            if not isinstance(term, FrameTerm | SequenceTerm | Distillation | FlatnessTerm):
+            if not isinstance(term, FrameTerm | SequenceTerm | Distillation):
                 raise ValueError(
                     f"loss.{name}._target_ must be a FrameTerm or a SequenceTerm "
                     f"(src.losses.terms), got {type(term).__name__}"
@@ -136,7 +126,6 @@ class TrainingLoss(nn.Module):
         self.frame_terms = [term for term in terms.values() if isinstance(term, FrameTerm)]
         self.sequence_terms = [term for term in terms.values() if isinstance(term, SequenceTerm)]
         self.distillation = next((t for t in terms.values() if isinstance(t, Distillation)), None)
-        self.flatness = next((t for t in terms.values() if isinstance(t, FlatnessTerm)), None)
         if not self.frame_terms:
             raise ValueError("loss must have a frame term of weight > 0, such as loss.l1.weight=1")
 
@@ -150,23 +139,14 @@ class TrainingLoss(nn.Module):
         target: Sequences,
         windows: list[int],
         teacher_frames: Sequences | None = None,
-        is_revealed: Bool[Tensor, "n windows 1 h w"] | None = None,
-    ) -> tuple[Float[Tensor, ""], Sequences]:
+    ) -> tuple[Value, Sequences]:
         """Return the mean loss of frames and its gradient with respect to them.
 
-        `windows`: the number of each window in its sequence.  `is_revealed`: for `flatness`.  A few frames are computed at a time,
+        `windows`: the number of each window in its sequence.  A few frames are computed at a time,
         so that feature maps (VGG's are larger than the network's) are never in memory together.
         """
         leaf = frames.detach().flatten(0, 1).float().requires_grad_()
-        truth = target.flatten(0, 1)
-        if is_revealed is not None and self.flatness is not None:
-            revealed = is_revealed.flatten(0, 1)
-            truth = torch.where(revealed, truth, leaf.detach())
-            if teacher_frames is not None:
-                teacher_frames = torch.where(is_revealed, teacher_frames, frames.detach())
-        value = _backward_frames(self, leaf, truth)
-        if is_revealed is not None and self.flatness is not None:
-            value += _backward_frames(self.flatness, leaf, revealed, self.flatness.weight)
+        value = _backward_frames(self, leaf, target.flatten(0, 1))
         if teacher_frames is not None and (taught := self.distillation) is not None:
             compare = partial(taught, terms=self.frame_terms)
             value += _backward_frames(compare, leaf, teacher_frames.flatten(0, 1), taught.weight)

@@ -7,24 +7,21 @@ from collections.abc import Sequence
 
 import numpy as np
 
-RESAMPLES = 4000
+RESAMPLES, LEVEL = 4000, 0.95
 
 
-def bootstrap_interval(values: Sequence[float], level: float = 0.95) -> tuple[float, float]:
-    """Return the interval of the mean of `values`, one per clip; one value has no width."""
-    return bootstrap_difference_interval([values], None, level)
+def bootstrap_interval(values: Sequence[float]) -> tuple[float, float]:
+    """Return the 95 % interval of the mean of `values`, one per clip; one value has no width."""
+    return bootstrap_difference_interval([values], None)
 
 
 def bootstrap_difference_interval(
-    ours: Sequence[Sequence[float]],
-    theirs: Sequence[Sequence[float]] | None,
-    level: float = 0.95,
+    ours: Sequence[Sequence[float]], theirs: Sequence[Sequence[float]] | None
 ) -> tuple[float, float]:
     """Return the interval of mean(ours) - mean(theirs); rows are seeds, columns the same clips.
 
-    Seeds and clips are resampled, a clip in both at once, seeds of each apart (a network of seed k
-    has nothing to do with another network of seed k).  None stands for zero.  Always the same
-    draws.  Raises ValueError for rows of different lengths.
+    Seeds and clips are resampled, a clip in both at once, seeds of each apart.  None stands for
+    zero.  Always the same draws.  Raises ValueError for rows of different lengths.
     """
     rng = np.random.default_rng(0)
     clips = len(ours[0])
@@ -34,7 +31,7 @@ def bootstrap_difference_interval(
     means = _means(ours, picked, rng)
     if theirs is not None:
         means = means - _means(theirs, picked, rng)
-    tail = 50 * (1 - level)
+    tail = 50 * (1 - LEVEL)
     low, high = np.percentile(means, [tail, 100 - tail])
     return float(low), float(high)
 

@@ -1,8 +1,5 @@
 """LPIPS (Zhang et al., CVPR 2018), version 0.1, on real ImageNet features and without torchvision,
-which the LPIPS of torchmetrics needs and this project does not install.
-
-The learned heads are those of torchmetrics; the backbone's convolutions have to be found and are
-never replaced by random ones.
+which the LPIPS of torchmetrics needs and this project does not install; its heads are used.
 """
 
 from itertools import chain
@@ -54,7 +51,10 @@ class LPIPS(nn.Module):
             raise ValueError(f"lpips.net must be alex or vgg, got {net}")
         self.net = net
         stages = _build_stages(net)
-        self.stages, self.heads = nn.ModuleList(stages), nn.ParameterList(_load_heads(net))
+        path = Path(torchmetrics.__file__).parent / "functional/image/lpips_models" / f"{net}.pth"
+        heads = torch.load(path, map_location="cpu", weights_only=True)  # (1, channels, 1, 1) each
+        self.stages = nn.ModuleList(stages)
+        self.heads = nn.ParameterList(heads[name] for name in sorted(heads))
         _copy_backbone(stages, _backbone(net, backbone), net)
         self.register_buffer("shift", torch.tensor(SHIFT).reshape(1, 3, 1, 1))
         self.register_buffer("scale", torch.tensor(SCALE).reshape(1, 3, 1, 1))
@@ -124,13 +124,6 @@ def _build_stages(net: str) -> list[nn.Sequential]:
                 channels = step[0]
         stages.append(nn.Sequential(*layers))
     return stages
-
-
-def _load_heads(net: str) -> list[Tensor]:
-    """Return the learned weight of every channel of every stage, each (1, channels, 1, 1)."""
-    path = Path(torchmetrics.__file__).parent / "functional/image/lpips_models" / f"{net}.pth"
-    learned = torch.load(path, map_location="cpu", weights_only=True)
-    return [learned[name] for name in sorted(learned)]
 
 
 def _copy_backbone(stages: list[nn.Sequential], weights: dict[str, Tensor], net: str) -> None:

@@ -1,7 +1,5 @@
-"""Motion in a space-time slice, without ground truth: rows (frames, places) against each other.
-
-What is static should keep its mean place, what moves uniformly should draw a straight line.  One
-place is one pixel where the slice is sampled pixel by pixel.
+"""Motion in a space-time slice (frames, places) without ground truth.  What is static should keep
+its mean place, what moves uniformly should draw a straight line.
 """
 
 import numpy as np
@@ -55,29 +53,29 @@ def measure_static_scene(film: Float[np.ndarray, "frames h w"], step: int) -> di
 
 
 def measure_slice_motion(
-    rows: Float[np.ndarray, "frames places"], kind: str, follow: str = "any"
+    rows: Float[np.ndarray, "frames places"], kind: str, moving_thing: str = "any"
 ) -> dict[str, float]:
     """Return `residual_displacement_px` and `line_deviation_px` of a slice along a `line`, a
     `circle` or a ray that turns with the scene (`spin`), in places.
 
-    Nothing is static on a circle, and nothing moves along such a ray.  `follow`: whether what moves
-    is `bright` or `dark` against the median in time, or `any`; ValueError for another.
+    Nothing is static on a circle, and nothing moves along such a ray.  `moving_thing`: whether what
+    moves is `bright` or `dark` against the median in time, or `any`; ValueError for another.
     """
     values = {}
     if kind != "circle":
         values["residual_displacement_px"] = residual_displacement_px(rows)
     if kind != "spin":
-        measure = rotation_deviation_px if kind == "circle" else line_deviation_px
-        values["line_deviation_px"] = measure(_isolate_moving(rows, follow))
+        measure = uniform_rotation_deviation_px if kind == "circle" else line_deviation_px
+        values["line_deviation_px"] = measure(_isolate_moving(rows, moving_thing))
     return values
 
 
-def _isolate_moving(rows: np.ndarray, follow: str) -> np.ndarray:
+def _isolate_moving(rows: np.ndarray, moving_thing: str) -> np.ndarray:
     middle = np.median(rows, axis=0)
     kinds = {"any": rows, "bright": np.maximum(rows, middle), "dark": np.minimum(rows, middle)}
-    if follow not in kinds:
-        raise ValueError(f"follow must be one of {', '.join(kinds)}, got {follow}")
-    return kinds[follow]
+    if moving_thing not in kinds:
+        raise ValueError(f"moving_thing must be one of {', '.join(kinds)}, got {moving_thing}")
+    return kinds[moving_thing]
 
 
 def line_deviation_px(rows: Float[np.ndarray, "frames places"]) -> float:
@@ -90,7 +88,7 @@ def line_deviation_px(rows: Float[np.ndarray, "frames places"]) -> float:
     return _from_line(time, (weight @ np.arange(rows.shape[1])) / weight.sum(1))
 
 
-def rotation_deviation_px(rows: Float[np.ndarray, "frames places"]) -> float:
+def uniform_rotation_deviation_px(rows: Float[np.ndarray, "frames places"]) -> float:
     """Return the rms distance, in places, from uniform rotation of what moves along a circle.
 
     As `line_deviation_px`, but places are periodic: their angle is that of the centroid on the

@@ -7,19 +7,22 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class MetricColumn:
+class Column:
     """`name`: its key in results.json and clips.csv.  `better`: 1 where more is better, -1 where
-    less is.
+    less is, 0 where neither; `group` stands above the columns that have it, such as the source of
+    published numbers.
     """
 
     name: str
     heading: str
-    digits: int
-    better: int
+    digits: int = 0
+    better: int = 0
+    group: str = ""
 
     @property
-    def arrow(self) -> str:
-        return "↑" if self.better > 0 else "↓"
+    def title(self) -> str:
+        """The heading with an arrow towards better values."""
+        return self.heading + {1: " ↑", -1: " ↓", 0: ""}[self.better]
 
     def format_value(self, value: float | None) -> str:
         """Return a value as people read it; a dash for none."""
@@ -27,10 +30,10 @@ class MetricColumn:
 
 
 METRICS = (
-    MetricColumn("lpips", "LPIPS", 3, -1),
-    MetricColumn("ssim", "SSIM", 3, 1),
-    MetricColumn("psnr", "PSNR", 2, 1),
-    MetricColumn("psnr_aligned", "aligned PSNR", 2, 1),
-    MetricColumn("temporal_jitter_px", "temporal jitter px", 2, -1),
+    Column("lpips", "LPIPS", 3, -1),
+    Column("ssim", "SSIM", 3, 1),
+    Column("psnr", "PSNR", 2, 1),
+    Column("psnr_aligned", "aligned PSNR", 2, 1),
+    Column("temporal_jitter_px", "temporal jitter px", 2, -1),
 )
 NAMES = tuple(metric.name for metric in METRICS)

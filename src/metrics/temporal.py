@@ -16,9 +16,11 @@ MAX_SHIFT_PX = 8.0  # largest displacement in pixels: over 2.5 sigma of strong t
 SMOOTHING = (15, 15, 7, 1, 1)  # side of the box blur of each iteration: coarse to fine
 MIN_TEXTURE = 1e-4  # least mean square gradient of a block that counts, (grey levels / pixel)^2
 
+Video = Float[Tensor, "frames 1 h w"]
+
 
 def estimate_block_displacement(
-    frames: Float[Tensor, "frames 1 h w"], target: Float[Tensor, "frames 1 h w"]
+    frames: Video, target: Video
 ) -> tuple[Float[Tensor, "frames 2 rows columns"], Float[Tensor, "frames rows columns"]]:
     """Return by how much each block of `frames` is shifted against `target`, (x, y) in pixels, and
     its weight: the target's mean square gradient along its weaker direction, 0 without texture.
@@ -48,9 +50,7 @@ def warp_by_shift(
     return functional.grid_sample(frames, grid, mode, padding_mode="border", align_corners=False)
 
 
-def temporal_jitter_px(
-    frames: Float[Tensor, "frames 1 h w"], target: Float[Tensor, "frames 1 h w"]
-) -> Float[Tensor, " frames-1"]:
+def temporal_jitter_px(frames: Video, target: Video) -> Float[Tensor, " frames-1"]:
     """Return the rms change of the displacement from each frame to the next, in pixels per axis.
 
     A block counts as much as its weaker weight in the two frames.

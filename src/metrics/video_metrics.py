@@ -4,14 +4,13 @@ import math
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 from torchmetrics import MeanMetric, Metric, MetricCollection
 
 from src.metrics.image import aligned_psnr, psnr, ssim
 from src.metrics.lpips import LPIPS
-from src.metrics.temporal import temporal_jitter_px
+from src.metrics.temporal import Video, temporal_jitter_px
 
 SCORES = {  # name in table.py: a value per frame, or per step from a frame to the next
     "psnr": psnr,
@@ -31,9 +30,7 @@ class ClipMean(MeanMetric):
         # In a tuple: the parameters of a network that scores are no part of a checkpoint.
         self._score = (score,)
 
-    def update(  # type: ignore[override]
-        self, frames: Float[Tensor, "frames 1 h w"], target: Float[Tensor, "frames 1 h w"]
-    ) -> None:
+    def update(self, frames: Video, target: Video) -> None:  # type: ignore[override]
         (score,) = self._score
         if isinstance(score, LPIPS):
             score.to(frames.device)
@@ -43,33 +40,35 @@ class ClipMean(MeanMetric):
 class VideoMetrics(MetricCollection):
     """PSNR, aligned PSNR, SSIM, temporal jitter and, if a network is given, LPIPS of clips.
 
-    Frames are clipped to [0, 1]; the data range is 1.  `scale`: frames and targets are scored at so
-    many times their own resolution, temporal jitter in pixels of the scored frame.  Whole numbers
-    repeat pixels, so that PSNR stays; below 1 areas are averaged.  Raises ValueError for another.
+    Frames are clipped to [0, 1]; the data range is 1.  `resolution_scale`: frames and targets are
+    scored at so many times their own resolution, temporal jitter in pixels of the scored frame.
+    Whole numbers repeat pixels, so that PSNR stays; below 1 areas are averaged.  Raises ValueError
+    for another.
     """
 
-    def __init__(self, lpips: LPIPS | None = None, scale: float = 1.0):
+    def __init__(self, lpips: LPIPS | None = None, resolution_scale: float = 1.0):
+        scale = resolution_scale
         if not 0 < scale <= 8 or (scale > 1 and scale != int(scale)):
-            raise ValueError(f"metrics.scale must be in (0, 1] or one of 2..8, got {scale}")
+            raise ValueError(
+                f"metrics.resolution_scale must be in (0, 1] or one of 2..8, got {scale}"
+            )
         scores = SCORES if lpips is None else SCORES | {"lpips": lpips}
         metrics: dict[str, Metric | MetricCollection]
         metrics = {name: ClipMean(score) for name, score in scores.items()}
         # Groups would merge scores that are equal on the first clip.
         super().__init__(metrics, compute_groups=False)
-        self.scale = scale
+        self.resolution_scale = scale
 
     @torch.no_grad()
-    def forward(
-        self, frames: Float[Tensor, "frames 1 h w"], target: Float[Tensor, "frames 1 h w"]
-    ) -> dict[str, float]:
+    def forward(self, frames: Video, target: Video) -> dict[str, float]:
         """Add a clip; return its scores by name."""
         frames = self._resample(frames.float().clamp(0, 1))
         values = super().forward(frames, self._resample(target))
         return {name: float(value) for name, value in values.items()}
 
     def _resample(self, frames: Tensor) -> Tensor:
-        if self.scale == 1:
+        if self.resolution_scale == 1:
             return frames
-        size = [math.floor(side * self.scale + 0.5) for side in frames.shape[-2:]]
-        mode = "nearest" if self.scale > 1 else "area"
+        size = [math.floor(side * self.resolution_scale + 0.5) for side in frames.shape[-2:]]
+        mode = "nearest" if self.resolution_scale > 1 else "area"
         return functional.interpolate(frames, size, mode=mode)

@@ -29,7 +29,7 @@ def is_intact(path: Path) -> bool:
     PyTorch's own reader does not look at them: a flipped bit would go unnoticed.
     """
     try:
-        if is_compressed(path):
+        if is_compressed_zip(path):
             return False
         with zipfile.ZipFile(path) as archive:
             return archive.testzip() is None
@@ -37,7 +37,7 @@ def is_intact(path: Path) -> bool:
         return False
 
 
-def is_compressed(path: Path) -> bool:
+def is_compressed_zip(path: Path) -> bool:
     """Return whether a zip file gives more bytes than it has, as none does that PyTorch wrote: it
     packs nothing, and a small file that is packed could fill the memory.
     """
@@ -46,12 +46,17 @@ def is_compressed(path: Path) -> bool:
 
 
 def newest_checkpoint(run: Path) -> Path:
-    """Return the newest whole checkpoint in the folder `run` or below; warns of damaged ones.
+    """Return the newest whole checkpoint in the folder `run` or below; warns of damaged ones, and
+    where folders of several runs are there.
 
     Raises ValueError, beginning with `ckpt`, where there is none.
     """
-    for path in sorted(run.rglob("*.ckpt"), key=lambda path: path.stat().st_mtime_ns)[::-1]:
+    paths = sorted(run.rglob("*.ckpt"), key=lambda path: path.stat().st_mtime_ns)[::-1]
+    runs = len({path.parent for path in paths})
+    for path in paths:
         if is_intact(path):
+            if runs > 1:
+                warnings.warn(f"{run} holds {runs} runs, the newest is taken: {path}", stacklevel=2)
             return path
         warnings.warn(f"{path} is damaged, an older checkpoint is taken", stacklevel=2)
     raise ValueError(f"ckpt must be a folder with a whole checkpoint, got none in {run}")

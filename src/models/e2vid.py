@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.parametrizations import spectral_norm as normalise_spectrum
 
-from src.models.layers import ConvGRU, ConvLSTM, ResidualBlock, pad_to_multiple
+from src.models.layers import ConvGRU, ConvLSTM, ResidualBlock, pad_centred_to_multiple
 from src.models.network import WINDOW_S, EventToVideoNetwork
 from src.sim.optics import Position, centre_view_index, layout
 
@@ -52,24 +52,18 @@ class E2VID(EventToVideoNetwork):
         state_rounding_step: float | None = None,
     ):
         super().__init__()
-        step, is_lstm = state_rounding_step, recurrent == "convlstm"
-        checks = {
-            f"recurrent must be one of {', '.join(CELLS)}, got {recurrent}": recurrent in CELLS,
-            f"final_activation must be one of {', '.join(ACTIVATIONS)}, got {final_activation}": (
-                final_activation in ACTIVATIONS
-            ),
-            f"kernel_size must be odd and >= 1, got {kernel_size}": (
-                kernel_size >= 1 and kernel_size % 2 == 1
-            ),
-            f"stem_channels must be >= 1 or null, got {stem_channels}": (
-                stem_channels is None or stem_channels >= 1
-            ),
-            "state_rounding_step must be in (0, 1], with model.recurrent=convlstm, or null, got "
-            f"{step} with {recurrent}": step is None or (0 < step <= 1 and is_lstm),
-        }
-        for message, passed in checks.items():
-            if not passed:
-                raise ValueError(f"model.{message}")
+        step, stem, side, end = state_rounding_step, stem_channels, kernel_size, final_activation
+        is_rounding = step is None or (0 < step <= 1 and recurrent == "convlstm")
+        rounding = "in (0, 1], with model.recurrent=convlstm, or null"
+        for name, value, is_valid, allowed in (
+            ("recurrent", recurrent, recurrent in CELLS, f"one of {', '.join(CELLS)}"),
+            ("final_activation", end, end in ACTIVATIONS, f"one of {', '.join(ACTIVATIONS)}"),
+            ("kernel_size", side, side >= 1 and side % 2 == 1, "odd and >= 1"),
+            ("stem_channels", stem, stem is None or stem >= 1, ">= 1 or null"),
+            ("state_rounding_step", f"{step} with {recurrent}", is_rounding, rounding),
+        ):
+            if not is_valid:
+                raise ValueError(f"model.{name} must be {allowed}, got {value}")
         self.views, self.bins, self.activation = views, bins, ACTIVATIONS[final_activation]
         self.state_rounding_step = state_rounding_step
         widths = [base_channels * 2**scale for scale in range(SCALES + 1)]
@@ -105,14 +99,7 @@ class E2VID(EventToVideoNetwork):
         frame, after = self.after_first_layer(self.first_layer(x), state)
         return frame[..., top : top + height, left : left + width], after
 
-    def warm_up(
-        self,
-        voxels: Float[Tensor, "n views bins h w"],
-        state: Any = None,
-        *,
-        window_s: float | Tensor = WINDOW_S,
-        positions: Sequence[Position] | None = None,
-    ) -> tuple:
+    def warm_up(self, voxels: Tensor, state: Any = None, **options: Any) -> tuple:
         """Return the state that `forward` does, without its decoder."""
         return self.encode(self.first_layer(self._padded(voxels)[0]), state)[2]
 
@@ -120,7 +107,7 @@ class E2VID(EventToVideoNetwork):
         if tuple(voxels.shape[1:3]) != (self.views, self.bins):
             wanted, got = (self.views, self.bins), tuple(voxels.shape[1:3])
             raise ValueError(f"optics.views, bins must be {wanted} for this network, got {got}")
-        return pad_to_multiple(voxels.flatten(1, 2), 2**SCALES)
+        return pad_centred_to_multiple(voxels.flatten(1, 2), 2**SCALES)
 
     @property
     def first_layer(self) -> nn.Conv2d:
@@ -142,7 +129,7 @@ class E2VID(EventToVideoNetwork):
     ) -> tuple[Float[Tensor, "n 1 h w"], tuple]:
         """Return the frame, padding and all, and the state; `x` is the first layer's, no ReLU."""
         head, skips, after = self.encode(x, state)
-        return self.activation(self.decode(self.resblocks(skips[-1]), head, skips)), after
+        return self.activation(self.decode_logits(self.resblocks(skips[-1]), head, skips)), after
 
     def encode(
         self, x: Float[Tensor, "n c h w"], state: Any
@@ -160,7 +147,7 @@ class E2VID(EventToVideoNetwork):
             after.append(new)
         return head, skips, tuple(after)
 
-    def decode(
+    def decode_logits(
         self, x: Float[Tensor, "n c h w"], head: Float[Tensor, "n c2 h2 w2"], skips: list[Tensor]
     ) -> Float[Tensor, "n 1 h2 w2"]:
         """Return the frame before its activation, from the coarsest map up."""

@@ -57,12 +57,16 @@ def load(name_or_path: str | Path, allowed_packages: Sequence[str] = ()) -> nn.M
 
 
 def find_checkpoint(name: str | Path, spec: dict) -> Path:
-    """Return the file to go on from: `name`, or the newest whole checkpoint in the folder `name`.
+    """Return the file to go on from: `name`, the newest whole checkpoint in the folder `name`, or
+    the file of `weights/` of that name.
 
     Raises ValueError unless it is a whole checkpoint, or a file of `save`, of the network `spec`;
     a file of `save` may also be of the same E2VID on one view.
     """
-    path = newest_checkpoint(Path(name)) if Path(name).is_dir() else Path(name)
+    path, shipped = Path(name), WEIGHTS / f"{name}.safetensors"
+    if not path.exists() and shipped.is_file():
+        path = shipped
+    path = newest_checkpoint(path) if path.is_dir() else path
     if not path.is_file():
         raise ValueError(f"ckpt must be a checkpoint to go on from, got {path}")
     saved, _ = (_exported if is_weights_file(path) else _checkpoint)(path)[:2]
@@ -72,6 +76,11 @@ def find_checkpoint(name: str | Path, spec: dict) -> Path:
         one_view = {"views": 1} if spec["target"] == WIDENABLE else {}
         wanted = [spec | {"kwargs": kwargs | more} for more in ({}, one_view)]
     if saved not in wanted:
+        if path == shipped:
+            how = f"experiment={name} and the overrides of conf/recipe/{name}.yaml"
+            raise ValueError(
+                f"ckpt={name} must be of the network that is trained; go on with {how}"
+            )
         raise ValueError(f"ckpt must be of the network {spec} to go on from, got {saved} in {path}")
     return path
 
@@ -193,15 +202,12 @@ def check_weights_stored_whole(weights: dict[str, Tensor], path: Path, key: str)
     """
     numbers, size = sum(value.numel() for value in weights.values()), path.stat().st_size
     if numbers > size:
-        raise ValueError(
-            f"{key} must hold its weights whole, got {numbers} numbers in {size} bytes of {path}"
-        )
+        got = f"{numbers} numbers in {size} bytes of {path}"
+        raise ValueError(f"{key} must hold its weights whole, got {got}")
 
 
 def check_fit(error: str, own: dict[str, Tensor], weights: dict[str, Tensor]) -> None:
-    """Raise ValueError, beginning with `error`, unless `weights` have the names and shapes of
-    `own`.
-    """
+    """Raise ValueError, beginning with `error`, unless names and shapes are those of `own`."""
     missing, extra = sorted(own.keys() - weights.keys()), sorted(weights.keys() - own.keys())
     other = sorted(n for n in own.keys() & weights.keys() if own[n].shape != weights[n].shape)
     if missing or extra or other:

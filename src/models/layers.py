@@ -8,12 +8,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 
-def pad_to_multiple(
+def pad_centred_to_multiple(
     x: Float[Tensor, "n c h w"], multiple: int
 ) -> tuple[Float[Tensor, "n c hp wp"], tuple[int, int]]:
-    """Pad by reflection, centred, to the next multiple in each axis.
-
-    Returns the padded tensor and how many rows and columns were added above and to the left.
+    """Return `x` padded by reflection, centred, to the next multiple in each axis, and how many
+    rows and columns were added above and to the left.
     """
     height, width = x.shape[-2:]
     rows, columns = -height % multiple, -width % multiple
@@ -58,7 +57,7 @@ class ConvGRU(nn.Module):
         self.out_gate = nn.Conv2d(2 * channels, channels, 3, padding=1)
         for gate in (self.reset_gate, self.update_gate, self.out_gate):
             nn.init.orthogonal_(gate.weight)
-            nn.init.zeros_(bias_of(gate))
+            nn.init.zeros_(require_bias(gate))
 
     def forward(
         self, x: Float[Tensor, "n c h w"], state: Tensor | None
@@ -110,15 +109,10 @@ class EqualDCConv(nn.Conv2d):
         """Return the kernels and the bias that are used."""
         response = self.weight.mean((2, 3), keepdim=True)  # to a constant input
         weight = self.weight - response + response.mean(0, keepdim=True)
-        return weight, bias_of(self).mean().expand(len(weight))
+        return weight, require_bias(self).mean().expand(len(weight))
 
 
-def upsample_nearest(x: Float[Tensor, "n c h w"], factor: int) -> Float[Tensor, "n c _h _w"]:
-    """Return `x` with every pixel repeated `factor` times along both axes."""
-    return functional.interpolate(x, scale_factor=factor, mode="nearest")
-
-
-def bias_of(layer: nn.Conv2d | nn.Linear) -> Tensor:
+def require_bias(layer: nn.Conv2d | nn.Linear) -> Tensor:
     """Return the bias of a layer that has one."""
     assert layer.bias is not None
     return layer.bias
@@ -127,12 +121,12 @@ def bias_of(layer: nn.Conv2d | nn.Linear) -> Tensor:
 def init_kaiming(conv: nn.Conv2d) -> nn.Conv2d:
     """Return `conv` initialised to keep the scale of its input (He et al. 2015)."""
     nn.init.kaiming_normal_(conv.weight, nonlinearity="relu")
-    nn.init.zeros_(bias_of(conv))
+    nn.init.zeros_(require_bias(conv))
     return conv
 
 
 def init_zero(conv: nn.Conv2d) -> nn.Conv2d:
     """Return `conv` with zeros."""
     nn.init.zeros_(conv.weight)
-    nn.init.zeros_(bias_of(conv))
+    nn.init.zeros_(require_bias(conv))
     return conv

@@ -52,15 +52,10 @@ class EventToVideoNetwork(VideoMethod):
         raise NotImplementedError
 
     def warm_up(
-        self,
-        voxels: Float[Tensor, "n views bins h w"],
-        state: Any = None,
-        *,
-        window_s: float | Tensor = WINDOW_S,
-        positions: Sequence[Position] | None = None,
+        self, voxels: Float[Tensor, "n views bins h w"], state: Any = None, **options: Any
     ) -> Any:
         """Return the state that `forward` returns, for windows whose frame is not wanted."""
-        return self(voxels, state, window_s=window_s, positions=positions)[1]
+        return self(voxels, state, **options)[1]
 
     def sequence(
         self,
@@ -74,13 +69,13 @@ class EventToVideoNetwork(VideoMethod):
         """Return the frames of `output_windows`, ascending (None: all), and the state after the
         last window.
         """
-        frames = []
+        frames, options = [], {"window_s": window_s, "positions": positions}
         for number, window in enumerate(voxels.unbind(1)):
             if output_windows is None or number in output_windows:
-                frame, state = self(window, state, window_s=window_s, positions=positions)
+                frame, state = self(window, state, **options)
                 frames.append(frame)
             else:
-                state = self.warm_up(window, state, window_s=window_s, positions=positions)
+                state = self.warm_up(window, state, **options)
         if not frames:
             return voxels.new_empty(len(voxels), 0, 1, *voxels.shape[-2:]), state
         return torch.stack(frames, dim=1), state
@@ -102,25 +97,15 @@ class FramePostprocessor(nn.Module):
         raise NotImplementedError
 
     @torch.no_grad()
-    def restore(
-        self,
-        frames: Float[Tensor, "n frames c h w"],
-        *,
-        window: int = WINDOW,
-        overlap: int = OVERLAP,
-    ) -> Float[Tensor, "n frames c h w"]:
-        """Return a video of any length, restored, in [0, 1], in windows that share `overlap`.
-
-        Of two windows that overlap each gives the half that lies deeper in it.  Raises ValueError
-        unless 0 <= overlap < window.
+    def restore(self, frames: Float[Tensor, "n frames c h w"]) -> Float[Tensor, "n frames c h w"]:
+        """Return a video of any length, restored, in [0, 1], in windows of WINDOW frames that share
+        OVERLAP: of two, each gives the half that lies deeper in it.
         """
-        if not 0 <= overlap < window:
-            raise ValueError(f"postprocess.overlap must be in [0, {window}), got {overlap}")
         count, parts, done = frames.shape[1], [], 0
-        last = max(count - window, 0)  # ends with the video
-        for start in [*range(0, last, window - overlap), last]:
-            stop = min(start + window, count)
-            until = count if stop == count else stop - overlap // 2
+        last = max(count - self.WINDOW, 0)  # ends with the video
+        for start in [*range(0, last, self.WINDOW - self.OVERLAP), last]:
+            stop = min(start + self.WINDOW, count)
+            until = count if stop == count else stop - self.OVERLAP // 2
             restored, _ = self(frames[:, start:stop])
             parts.append(restored[:, done - start : until - start])
             done = until
@@ -139,17 +124,14 @@ def unroll(
     """Return what `network.sequence` does, of a sequence of any length: MAX_WINDOWS at a time."""
     frames = []
     for part in split_windows(voxels.shape[1], MAX_WINDOWS):
-        wanted = None if output_windows is None else windows_within(output_windows, part)
+        wanted = output_windows
+        if wanted is not None:  # counted from the first of the part
+            wanted = [k - part.start for k in wanted if part.start <= k < part.stop]
         some, state = network.sequence(
             voxels[:, part], state, window_s=window_s, positions=positions, output_windows=wanted
         )
         frames.append(some)
     return torch.cat(frames, dim=1), state
-
-
-def windows_within(windows: Sequence[int], part: slice) -> list[int]:
-    """Return those of `windows` that lie in `part`, counted from its first."""
-    return [window - part.start for window in windows if part.start <= window < part.stop]
 
 
 def split_windows(windows: int, length: int) -> Iterator[slice]:

@@ -56,11 +56,10 @@ from torch.nn import functional
 from src.models.layers import (
     EqualDCConv,
     PreActivationBlock,
-    bias_of,
     init_kaiming,
     init_zero,
-    pad_to_multiple,
-    upsample_nearest,
+    pad_centred_to_multiple,
+    require_bias,
 )
 from src.models.network import EventToVideoNetwork
 from src.models.time_gated_update import TimeGatedUpdate, time_gated_update
@@ -87,7 +86,7 @@ MIN_SUPPORT = 1.5  # trace of a view in the 8 cells around an event, above which
 REACH_CELLS = 3  # from a supported event, to which cells are active
 STATIC_SHARE = 0.35  # of active cells, up to which the others stand still: a static camera
 MOVING_SHARE = 0.5  # from which on the clock of all cells advances: a moving camera
-REVEALING_EVENTS = 0.03  # supported events per cell so far, at which a frame is half the background
+REVEALING_EVENTS = 0.05  # supported events per cell so far, at which a frame is half the background
 REVEALING_S = 0.02  # the same in seconds of a moving camera
 BACKGROUND = 0.45  # brightness of what no event has revealed
 SETTLING = math.exp(-2)  # context recency above which the context of a cell is still smoothed
@@ -95,6 +94,10 @@ CONTEXT_INTERVAL_S = 1 / 30  # shortest time between two context updates
 UPDATE_RECENCY = math.exp(-0.98)  # an update is due at or below it: 0.98 intervals, for rounding
 CONTEXT_TAU_S = 1 / 60  # time constant of the low-pass on the context
 INITIAL_CONTEXT_RATE = 0.9  # initial decay rate of the moving average, per CONTEXT_INTERVAL_S
+
+
+Context = Float[Tensor, "n c h4 w4"]
+Maps = Float[Tensor, "m c h2 w2"]
 
 
 class SetNetState(NamedTuple):
@@ -109,8 +112,8 @@ class SetNetState(NamedTuple):
     context_recency: Float[Tensor, "n 1 h4 w4"]  # the same of each cell's own; 0: no context yet
     hidden: Float[Tensor, "n c h2 w2"]  # memory, in [-1, 1]
     scales: tuple[Tensor, ...]  # maps of the pyramid, those of ContextPyramid.map_sizes
-    context_average: Float[Tensor, "n c h4 w4"]  # moving average of the pyramid's output
-    context_smoothed: Float[Tensor, "n c h4 w4"]  # the same, low-pass filtered in time
+    context_average: Context  # moving average of the pyramid's output
+    context_smoothed: Context  # the same, low-pass filtered in time
 
 
 class ClockTick(NamedTuple):
@@ -160,9 +163,10 @@ def find_active_cells(supported: Float[Tensor, "m 1 h2 w2"]) -> Tensor:
 
 def spread_evidence(supported: Float[Tensor, "m 1 h2 w2"]) -> Float[Tensor, "m 1 h2 w2"]:
     """Return supported events smoothed over REACH_CELLS on each side."""
+    spread = functional.pad(supported, [REACH_CELLS] * 4)
     for _ in range(REACH_CELLS):
-        supported = functional.avg_pool2d(supported, 3, 1, 1)
-    return supported
+        spread = functional.avg_pool2d(spread, 3, 1)
+    return spread
 
 
 class SetNet(EventToVideoNetwork):
@@ -220,13 +224,10 @@ class SetNet(EventToVideoNetwork):
     ) -> tuple[Float[Tensor, "n 1 h w"], SetNetState]:
         """Return the frame at the end of the window, in [0, 1], float32, and the state.
 
-        `window_s`: the length of the window in seconds, a number or one per clip (n,).
-        `positions`: (row, col) of each view from the centre view; None: `optics.layout`.  Raises
-        ValueError for bins, a number of views, a window length or a state that do not fit.
+        Raises ValueError for bins, a number of views, a window length or a state that do not fit.
         """
-        frames, state = self.sequence(
-            voxels[:, None], state, window_s=window_s, positions=positions
-        )
+        window = voxels[:, None]
+        frames, state = self.sequence(window, state, window_s=window_s, positions=positions)
         return frames[:, 0], state
 
     def sequence(
@@ -246,18 +247,20 @@ class SetNet(EventToVideoNetwork):
         n, windows, views, bins, height, width = voxels.shape
         where = self.checked_positions(views, bins, positions)
         seconds = _durations(window_s, voxels)
-        padded, (top, left) = pad_to_multiple(voxels.flatten(0, 2), 8)
+        padded, (top, left) = pad_centred_to_multiple(voxels.flatten(0, 2), 8)
         voxels = padded.unflatten(0, (n, windows, views)).transpose(0, 1).float()
         counts = _sum_cells(torch.linalg.vector_norm(voxels, 1, 3).flatten(0, 1))
         before = self._checked_state(state, counts[:n])
 
-        tick, clock = self.run_clock(counts, seconds, before)
+        tick, after = self.run_clock(counts, seconds, before)
         is_active = tick.elapsed_s > 0
-        is_active_px = upsample_nearest(is_active.float(), CELL_PX).unflatten(0, (windows, n))
-        voxels = voxels * is_active_px[:, :, None]
+        active_px = functional.interpolate(is_active.float(), scale_factor=CELL_PX, mode="nearest")
+        voxels = voxels * active_px.unflatten(0, (windows, n))[:, :, None]
         cells = _sum_cells(voxels.sum(3).flatten(0, 1))
         decay = torch.stack([torch.exp(-tick.elapsed_s / tau) for tau in SUM_TAUS_S], 2)
-        sums, view_sums = scan_windows(_leaky_sum, before.view_sums, decay, cells[:, :, None])
+        sums, view_sums = scan_windows(
+            lambda sums, decay, new: decay * sums + new, before.view_sums, decay, cells[:, :, None]
+        )
         stem = self.stem(voxels, sums, seconds, where)
         features, hidden = self.run_memory(stem, is_active, before.hidden, tick.elapsed_s)
         new, scales = self.context(features, before.scales, tick.is_updated)
@@ -267,22 +270,26 @@ class SetNet(EventToVideoNetwork):
         )
         evidence = tick.evidence
         if output_windows is not None:
+            index = _to_device(tuple(output_windows), features.device)
             features, smoothed, evidence = (
-                _select_windows(maps, n, output_windows) for maps in (features, smoothed, evidence)
+                maps.unflatten(0, (-1, n)).index_select(0, index).flatten(0, 1)
+                for maps in (features, smoothed, evidence)
             )
         revealed = evidence / (evidence + REVEALING_EVENTS)
         drawn = self.decode_logits(features, smoothed).sigmoid()
         frames = functional.pixel_shuffle(BACKGROUND + revealed * (drawn - BACKGROUND), CELL_PX)
         frames = frames[..., top : top + height, left : left + width]
         frames = frames.unflatten(0, (-1, n)).transpose(0, 1)
-        return frames, SetNetState(view_sums, *clock, hidden, scales, context, context_smoothed)
+        return frames, after._replace(
+            view_sums=view_sums, hidden=hidden, scales=scales, context_average=context,
+            context_smoothed=context_smoothed,
+        )  # fmt: skip
 
     @torch.no_grad()
     def run_clock(
         self, counts: Float[Tensor, "m views h2 w2"], seconds: Tensor, state: SetNetState
-    ) -> tuple[ClockTick, tuple[Tensor, ...]]:
-        """Return the ticks of all windows, and the fields event_trace to context_recency of the
-        state after the last.
+    ) -> tuple[ClockTick, SetNetState]:
+        """Return the ticks of all windows, and the state with the clock's fields after the last.
 
         A context update is due if the clock advances anywhere and the last is CONTEXT_INTERVAL_S
         old or missing; it reaches the cells that were active since the one before.
@@ -311,7 +318,10 @@ class SetNet(EventToVideoNetwork):
             cell_recency = torch.where(due & (coarse > 0), 1.0, cell_recency)
             recency, pending = torch.where(due, 1.0, recency), torch.where(due, 0.0, pending)
         tick = ClockTick(*map(torch.cat, zip(*ticks, strict=True)))
-        return tick, (trace, activity, evidence, pending, recency, cell_recency)
+        return tick, state._replace(
+            event_trace=trace, activity=activity, evidence=evidence, is_pending=pending,
+            update_recency=recency, context_recency=cell_recency,
+        )  # fmt: skip
 
     def stem(
         self,
@@ -319,9 +329,9 @@ class SetNet(EventToVideoNetwork):
         view_sums: Float[Tensor, "m views taus h2 w2"],
         seconds: Float[Tensor, "_n 1 1 1"],
         positions: tuple[Position, ...],
-    ) -> Float[Tensor, "m c h2 w2"]:
+    ) -> Maps:
         """Return the sum of the three first convolutions, before the ReLU."""
-        voxel_kernel, sum_kernel, bias = self.stem_kernels(positions)
+        voxel_kernel, sum_kernel, bias = self.stem_kernels_and_bias(positions)
         spread = (view_sums - view_sums.mean(1, keepdim=True)).abs().mean(1)
         stacked = _as_conv_input(voxels.flatten(2, 3), voxel_kernel.dtype)
         counts = functional.conv2d(
@@ -329,15 +339,13 @@ class SetNet(EventToVideoNetwork):
         )
         sums = torch.cat([view_sums.flatten(1, 2), spread], 1)
         sums = _as_conv_input(sums[None], sum_kernel.dtype)
-        return _as_rates(counts, seconds) + functional.conv2d(sums, sum_kernel, bias, 1, 1)
+        scale = 1 / (REFERENCE_HZ * seconds)  # to counts per 1 / REFERENCE_HZ
+        rates = counts * scale.repeat(len(counts) // len(scale), 1, 1, 1).to(counts.dtype)
+        return rates + functional.conv2d(sums, sum_kernel, bias, 1, 1)
 
     def run_memory(
-        self,
-        stem: Float[Tensor, "m c h2 w2"],
-        is_active: Tensor,
-        hidden: Tensor,
-        elapsed_s: Float[Tensor, "m 1 h2 w2"],
-    ) -> tuple[Float[Tensor, "m c h2 w2"], Tensor]:
+        self, stem: Maps, is_active: Tensor, hidden: Tensor, elapsed_s: Float[Tensor, "m 1 h2 w2"]
+    ) -> tuple[Maps, Tensor]:
         """Return the hidden map after each window, in the type of `stem`, and after the last."""
         inputs = self.relu(stem) * is_active
         features, hidden = self.memory(inputs, hidden, REFERENCE_HZ * elapsed_s)
@@ -345,7 +353,7 @@ class SetNet(EventToVideoNetwork):
 
     def average_context(
         self, new: Float[Tensor, "m c h4 w4"], context: Tensor, tick: ClockTick
-    ) -> tuple[Float[Tensor, "m c h4 w4"], Float[Tensor, "n c h4 w4"]]:
+    ) -> tuple[Float[Tensor, "m c h4 w4"], Context]:
         """Return the moving average after each window and after the last, float32."""
 
         def step(before: Tensor, new: Tensor, recency: Tensor, updated: Tensor) -> Tensor:
@@ -356,13 +364,16 @@ class SetNet(EventToVideoNetwork):
         return scan_windows(step, context, new.float(), tick.context_recency, updated)
 
     def decode_logits(
-        self, features: Float[Tensor, "m c h2 w2"], context: Float[Tensor, "m c h4 w4"]
+        self, features: Maps, context: Float[Tensor, "m c h4 w4"]
     ) -> Float[Tensor, "m pixels _h2 _w2"]:
         """Return the logits of the pixels of each cell, as channels, float32."""
-        x = self.relu(upsample_nearest(context.to(features.dtype), 2) + features)
+        coarse = functional.interpolate(context.to(features.dtype), scale_factor=2, mode="nearest")
+        x = self.relu(coarse + features)
         return self.pixel_conv(self.relu(self.decoder_conv(x))).float()
 
-    def stem_kernels(self, positions: tuple[Position, ...]) -> tuple[Tensor, Tensor, Tensor]:
+    def stem_kernels_and_bias(
+        self, positions: tuple[Position, ...]
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Return the kernels of stacked voxels (c, views * bins, 5, 5) and of stacked sums and
         their spread (c, views * taus + taus, 3, 3), for views at `positions`, and the bias (c,).
         """
@@ -401,14 +412,17 @@ class SetNet(EventToVideoNetwork):
         maps = self.map_sizes(CELL_PX * rows, CELL_PX * columns)
         half, quarter = (rows, columns), maps[1][1:]
         zeros = SetNetState(
-            cells.new_zeros(n, views, len(SUM_TAUS_S), *half),
-            cells.new_zeros(n, views, *half),
-            *(cells.new_zeros(n, 1, *half) for _ in range(3)),
-            cells.new_zeros(n, 1, 1, 1),
-            cells.new_zeros(n, 1, *quarter),
-            cells.new_zeros(n, *maps[0]),
-            tuple(cells.new_zeros(n, *size) for size in self.context.map_sizes(*half)),
-            *(cells.new_zeros(n, *size) for size in maps[1:]),
+            view_sums=cells.new_zeros(n, views, len(SUM_TAUS_S), *half),
+            event_trace=cells.new_zeros(n, views, *half),
+            activity=cells.new_zeros(n, 1, *half),
+            evidence=cells.new_zeros(n, 1, *half),
+            is_pending=cells.new_zeros(n, 1, *half),
+            update_recency=cells.new_zeros(n, 1, 1, 1),
+            context_recency=cells.new_zeros(n, 1, *quarter),
+            hidden=cells.new_zeros(n, *maps[0]),
+            scales=tuple(cells.new_zeros(n, *size) for size in self.context.map_sizes(*half)),
+            context_average=cells.new_zeros(n, *maps[1]),
+            context_smoothed=cells.new_zeros(n, *maps[2]),
         )
         if state is None:
             return zeros
@@ -470,14 +484,11 @@ class TimeGatedMemory(nn.Module):
         self.input_gates = nn.Conv2d(inputs, 2 * channels, size, padding=size // 2)
         self.state_gates = nn.Conv2d(channels, 2 * channels, 1, bias=False)
         with torch.no_grad():  # initial time constants of 1.4 to 20 windows of 1/120 s
-            bias_of(self.input_gates)[:channels].copy_(torch.linspace(0.05, 0.7, channels))
+            require_bias(self.input_gates)[:channels].copy_(torch.linspace(0.05, 0.7, channels))
 
     def forward(
-        self,
-        x: Float[Tensor, "m c h w"],
-        state: Float[Tensor, "n c h w"],
-        elapsed: Float[Tensor, "m 1 _h _w"],
-    ) -> tuple[Float[Tensor, "m c h w"], Float[Tensor, "n c h w"]]:
+        self, x: Maps, state: Float[Tensor, "n c h2 w2"], elapsed: Float[Tensor, "m 1 _h _w"]
+    ) -> tuple[Maps, Float[Tensor, "n c h2 w2"]]:
         """Return the state, float32, after each of m = windows * n steps and after the last."""
         update = TimeGatedUpdate.apply if torch.is_grad_enabled() else time_gated_update
 
@@ -517,6 +528,7 @@ class ContextPyramid(nn.Module):
         sizes = []
         for down in self.downs:
             rows, columns = -(-rows // 2), -(-columns // 2)
+            assert isinstance(down, nn.Conv2d)
             sizes.append((down.out_channels, rows, columns))
         return [*sizes, *reversed(sizes[1:-1])]
 
@@ -556,13 +568,8 @@ class ContextPyramid(nn.Module):
         coarser = functional.interpolate(up(self.relu(x)), finer.shape[-2:], mode="bilinear")
         return block(finer + coarser)
 
-    def moving_average(
-        self,
-        before: Float[Tensor, "n c h4 w4"],
-        new: Float[Tensor, "n c h4 w4"],
-        recency: Float[Tensor, "n 1 h4 w4"],
-    ) -> Float[Tensor, "n c h4 w4"]:
-        """Return the moving average with `new`; `recency`: exp(-age / interval) of `before`."""
+    def moving_average(self, before: Context, new: Context, recency: Tensor) -> Context:
+        """Return the moving average with `new`; `recency` (n, 1, h4, w4): exp(-age / interval)."""
         return torch.lerp(new, before, recency ** self.log_rate.float().exp())
 
 
@@ -600,18 +607,18 @@ def _run_on(due: Tensor | None, work: Callable[..., Tensor], *maps: Tensor) -> T
     return some.new_zeros(len(maps[0]), *some.shape[1:]).index_copy(0, due, some)
 
 
+def _sum_cells(x: Float[Tensor, "m views h w"]) -> Float[Tensor, "m views h2 w2"]:
+    """Return the sums of 2 x 2 pixels; avg_pool2d is slower on a CPU."""
+    rows = x[..., ::2, :] + x[..., 1::2, :]
+    return rows[..., ::2] + rows[..., 1::2]
+
+
 def _any_of_cells(mask: Float[Tensor, "n 1 h2 w2"]) -> Float[Tensor, "n 1 h4 w4"]:
     return functional.max_pool2d(mask, 2)
 
 
 def _sizes(state: SetNetState) -> list:
     return [tuple(p.shape) if isinstance(p, Tensor) else [tuple(q.shape) for q in p] for p in state]
-
-
-def _sum_cells(x: Float[Tensor, "m views h w"]) -> Float[Tensor, "m views h2 w2"]:
-    """Return the sums of 2 x 2 pixels, several times faster than avg_pool2d on a CPU."""
-    rows = x[..., ::2, :] + x[..., 1::2, :]
-    return rows[..., ::2] + rows[..., 1::2]
 
 
 def _durations(window_s: float | Tensor, voxels: Tensor) -> Float[Tensor, "_n 1 1 1"]:
@@ -621,12 +628,6 @@ def _durations(window_s: float | Tensor, voxels: Tensor) -> Float[Tensor, "_n 1 
     if not 0 < window_s < math.inf:
         raise ValueError(f"window_s must be > 0 seconds, got {window_s}")
     return torch.full((1, 1, 1, 1), window_s, device=voxels.device)
-
-
-def _as_rates(counts: Float[Tensor, "m c h w"], seconds: Tensor) -> Float[Tensor, "m c h w"]:
-    """Return counts per window as counts per 1 / REFERENCE_HZ seconds."""
-    scale = 1 / (REFERENCE_HZ * seconds)
-    return counts * scale.repeat(len(counts) // len(scale), 1, 1, 1).to(counts.dtype)
 
 
 def _as_conv_input(
@@ -645,12 +646,6 @@ def _as_conv_input(
     )
     maps.unflatten(0, (windows, n)).copy_(x)
     return maps
-
-
-def _select_windows(maps: Tensor, n: int, windows: Sequence[int]) -> Tensor:
-    """Return the entries of `maps` (m, ...) that belong to `windows`."""
-    index = _to_device(tuple(windows), maps.device)
-    return maps.unflatten(0, (-1, n)).index_select(0, index).flatten(0, 1)
 
 
 @lru_cache(maxsize=64)

@@ -7,12 +7,12 @@ import torch
 
 from src.metrics.image import ssim
 from src.metrics.lpips import LPIPS
-from src.recordings.files import sources
+from src.recordings.files import videos
 
 SETTLING = 2  # first frames of a reconstruction, which are not looked at
 
 
-def compare_with_camera(video: Path, listing: Path) -> dict[str, float]:
+def score_against_camera(video: Path, listing: Path) -> dict[str, float]:
     """Return mean `ssim`, `lpips` and `correlation` of a video of src.reconstruct with a camera's
     frames, each against the frame nearest in time.
 
@@ -22,18 +22,20 @@ def compare_with_camera(video: Path, listing: Path) -> dict[str, float]:
     table = video.parent / "frames.csv"
     if not table.is_file() or not listing.is_file():
         missing = table if listing.is_file() else listing
-        raise ValueError(f"camera must be the list of a camera's frames, {missing} is not there")
+        wanted = "reference_images must be the list of a camera's frames"
+        raise ValueError(f"{wanted}, {missing} is not there")
     clock = np.loadtxt(table, delimiter=",", skiprows=1, usecols=1, ndmin=1)
-    film, scores, lpips = list(sources.read_video(video)), [], LPIPS()
+    film, scores, lpips = list(videos.read_video(video)), [], LPIPS()
     reach = 0.5 * float(np.diff(clock).max(initial=0.0))
     for line in listing.read_text().splitlines():
         second, name = line.split()
         nearest = int(np.abs(clock - float(second)).argmin())
         if abs(clock[nearest] - float(second)) <= reach and nearest >= SETTLING:
-            truth = next(sources.read_video(listing.parent / name))
+            truth = next(videos.read_video(listing.parent / name))
             a, b = (torch.from_numpy(p.copy())[None, None] for p in (film[nearest], truth))
             together = np.corrcoef(film[nearest].ravel(), truth.ravel())[0, 1]
             scores.append([float(ssim(a, b)), float(lpips(a, b)), float(together)])
     if not scores:
-        raise ValueError(f"camera must have frames within the video's time, {listing} has none")
+        wanted = "reference_images must have frames within the video's time"
+        raise ValueError(f"{wanted}, {listing} has none")
     return dict(zip(("ssim", "lpips", "correlation"), np.mean(scores, 0).tolist(), strict=True))

@@ -22,7 +22,7 @@ COVERED = 0.99  # of the last window, or the recording ends before it
 TRAINED_WINDOW_S = 1 / 120
 
 
-class EventList(NamedTuple):
+class VoxelContributions(NamedTuple):
     """What each event adds to a voxel grid: seconds since the window's start, pixel, weight, view;
     one entry for every pixel that an event contributes to."""
 
@@ -45,7 +45,7 @@ class Window:
     events: int
     outside: int
     voxels: Float[np.ndarray, "views bins h w"] | None = None
-    event_list: EventList | None = None
+    event_list: VoxelContributions | None = None
 
     @property
     def length_s(self) -> float:
@@ -57,7 +57,7 @@ class Window:
             return replace(self, voxels=-self.voxels[:, ::-1])
         assert self.event_list is not None
         t, x, y, weight, view = (part[::-1] for part in self.event_list)
-        return replace(self, event_list=EventList(self.length_s - t, x, y, -weight, view))
+        return replace(self, event_list=VoxelContributions(self.length_s - t, x, y, -weight, view))
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ def fill_window(
         )
         length_s = (end_us - start_us) * 1e-6
         t = np.clip((events["t"] - start_us) * 1e-6, 0, length_s)[index]
-        listed = EventList(t, x, y, weight, view)
+        listed = VoxelContributions(t, x, y, weight, view)
         return Window(start_us, end_us, len(events) - outside, outside, event_list=listed)
     if not events.size:
         empty = np.broadcast_to(np.float32(0), (lookup.views, rule.bins, *lookup.model))

@@ -10,9 +10,11 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from fractions import Fraction
 from itertools import count
 from pathlib import Path
 
+import av
 import cv2
 import h5py
 import numpy as np
@@ -22,6 +24,8 @@ from PIL import GifImagePlugin, Image
 from src.recordings.reconstruction import Frame
 
 LEAST_FREE_BYTES = 32 * 2**20
+VP9 = {"crf": "12", "b": "0", "deadline": "realtime", "cpu-used": "6"}  # error of 1 level, rms
+KEY_FRAME_EVERY = 12
 CACHE_BYTES = 2**20  # of HDF5, for each of its datasets
 Picture = UInt8[np.ndarray, "h w"]
 Add = Callable[[Picture, Frame], None]
@@ -73,28 +77,33 @@ def partial_path(path: Path) -> Path:
 
 
 def _check_mp4(path: Path, written: int) -> None:
-    """Raise OSError unless `written` frames are in it: the encoder is silent on a full disk."""
-    frames = int(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT))
+    """Raise OSError unless `written` frames are in it: an encoder may be silent on a full disk."""
+    with av.open(str(path)) as file:
+        frames = file.streams.video[0].frames if file.streams.video else 0
     if frames != written:
         raise OSError(f"{path} holds {frames} of {written} frames; is the disk full?")
 
 
 @contextmanager
 def _mp4(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
-    code = cv2.VideoWriter.fourcc(*"vp09")  # what both browsers and the OpenCV wheel know
-    writer = cv2.VideoWriter(str(path), code, fps, size[::-1], False)
-    if not writer.isOpened():
-        raise ValueError(
-            f"output_format=mp4 must be writable at {path}, got no encoder; try output_format=png"
-        )
+    rate = Fraction(fps).limit_denominator(1001)
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream("libvpx-vp9", rate=rate, options=VP9)  # browsers and OpenCV know
+        stream.height, stream.width = size  # odd ones too
+        stream.pix_fmt = "yuv420p"
+        stream.codec_context.gop_size = KEY_FRAME_EVERY
+        file.start_encoding()
+        numbers = count()
 
-    def add(picture: Picture, frame: Frame) -> None:
-        writer.write(picture)
+        def add(picture: Picture, frame: Frame) -> None:
+            image = av.VideoFrame.from_ndarray(picture, format="gray")
+            image.pts = next(numbers)
+            file.mux(stream.encode(image))
 
-    try:
-        yield add
-    finally:
-        writer.release()
+        try:
+            yield add
+        finally:
+            file.mux(stream.encode())
 
 
 @contextmanager

@@ -11,13 +11,15 @@ import torch
 from jaxtyping import Float
 from torch import nn
 
-from src.deploy.forms import in_form
-from src.deploy.runtime import FORMS, EventListRuntime, takes_event_lists
+from src.deploy.forms import convert_to_form
+from src.deploy.runtime import FORMS, EventListRuntime, supports_event_lists
 from src.models.network import EventToVideoNetwork
 from src.recordings.event_windows import Window, WindowRule, cut_windows, cut_windows_backward
 from src.recordings.sensor_lookup import build_lookup
 from src.recordings.views import Views
 from src.sim.optics import Position
+
+RunnableNetwork = EventToVideoNetwork | EventListRuntime
 
 
 @dataclass(frozen=True)
@@ -61,9 +63,8 @@ def takes_all_views(network: EventToVideoNetwork, views: int) -> bool:
     """
     wants = network.views
     if wants not in (None, 1, views):
-        raise ValueError(
-            f"ckpt wants {wants} views, the recording has {views}; give views=views.yaml"
-        )
+        has = f"the recording has {views}; give views=views.yaml"
+        raise ValueError(f"ckpt wants {wants} views, {has}")
     return wants != 1 or views == 1
 
 
@@ -73,17 +74,17 @@ def default_window_length(network: EventToVideoNetwork) -> str:
     return "frame" if network.uses_window_length else "trained"
 
 
-def prepare_network(
+def build_runnable_network(
     network: EventToVideoNetwork, form: str, device: str, views: Views, bins: int
-) -> EventToVideoNetwork | EventListRuntime:
+) -> RunnableNetwork:
     """Return `network` as it is run: on a CPU an EventListRuntime where there is one for it.
 
     Raises ValueError for a form, a device or a number of bins that do not go together.
     """
     if device != "cpu" and form == "openvino":
         raise ValueError(f"device must be cpu for form=openvino, got {device}")
-    if device != "cpu" or form not in FORMS or not takes_event_lists(network):
-        return in_form(network, form).to(device)
+    if device != "cpu" or form not in FORMS or not supports_event_lists(network):
+        return convert_to_form(network, form).to(device)
     if bins != network.bins:
         raise ValueError(f"bins must be {network.bins} for this network, got {bins}")
     sides = dict(zip(("height", "width"), views.model, strict=True))
@@ -92,14 +93,9 @@ def prepare_network(
 
 
 def reconstruct_recording(
-    read_events: Callable[[], Iterable[np.ndarray]],
-    network: EventToVideoNetwork | EventListRuntime,
-    views: Views,
-    rule: WindowRule,
-    backward_warmup_s: float = 0.0,
-    *,
-    device: torch.device | str = "cpu",
-) -> Iterator[Frame]:
+    read_events: Callable[[], Iterable[np.ndarray]], network: RunnableNetwork, views: Views,
+    rule: WindowRule, backward_warmup_s: float = 0.0, *, device: torch.device | str = "cpu",
+) -> Iterator[Frame]:  # fmt: skip
     """Yield the frames of the recording whose chunks `read_events` returns, each time it is called.
 
     The network first reads `backward_warmup_s` backward, so that the first frame shows the scene.
@@ -115,13 +111,10 @@ def reconstruct_recording(
 
 
 def reconstruct_frames(
-    windows: Iterable[Window],
-    network: EventToVideoNetwork | EventListRuntime,
-    positions: Sequence[Position] | None = None,
-    state: ReconstructionState | None = None,
-    *,
+    windows: Iterable[Window], network: RunnableNetwork,
+    positions: Sequence[Position] | None = None, state: ReconstructionState | None = None, *,
     device: torch.device | str = "cpu",
-) -> Iterator[Frame]:
+) -> Iterator[Frame]:  # fmt: skip
     """Reconstruct one frame per window; a window without events holds the picture at no cost.
 
     `windows` hold lists of events for an EventListRuntime, else grids.  `state`, kept up to date,
@@ -135,22 +128,17 @@ def reconstruct_frames(
             picture, after = _run(network, window, before, positions, device)
             state.states[phase], state.picture = after, picture.clip(0, 1)
         elif state.picture is None:
-            size = (
-                network.size
-                if isinstance(network, EventListRuntime)
-                else _voxels(window).shape[-2:]
-            )
+            if isinstance(network, EventListRuntime):
+                size: tuple[int, ...] = network.size
+            else:
+                size = _voxels(window).shape[-2:]
             state.picture = np.full(size, 0.5, np.float32)
         state.frames += 1
         yield Frame(window.end_us * 1e-6, state.picture, window.events, window.outside)
 
 
 def _run(
-    network: EventToVideoNetwork | EventListRuntime,
-    window: Window,
-    state: Any,
-    positions: Sequence[Position] | None,
-    device: torch.device | str,
+    network: RunnableNetwork, window: Window, state: Any, positions: Any, device: Any
 ) -> tuple[np.ndarray, Any]:
     if isinstance(network, EventListRuntime):
         assert window.event_list is not None

@@ -28,18 +28,12 @@ class SensorLookup:
     model: Size
 
     def empty_grid(self, bins: int) -> Float[np.ndarray, "views bins h w"]:
-        """Return a voxel grid of zeros, float32."""
         return np.zeros((self.views, bins, *self.model), np.float32)
 
     def add_to_grid(
-        self,
-        events: np.ndarray,
-        grid: Float[np.ndarray, "views bins h w"],
-        start_us: float,
-        end_us: float,
-        *,
-        nearest: bool = False,
-    ) -> int:
+        self, events: np.ndarray, grid: Float[np.ndarray, "views bins h w"], start_us: float,
+        end_us: float, *, nearest: bool = False,
+    ) -> int:  # fmt: skip
         """Add `events` (fields t x y p) to `grid` and return how many lie in no view.
 
         An event weighs by E2VID's hat in the time from `start_us` to `end_us`, and bilinearly or at
@@ -63,12 +57,11 @@ class SensorLookup:
         index, u, v, which, weight = made = [np.empty(count, dtype) for dtype in dtypes]
         x, y, p = (events[name] for name in "xyp")
         if nearest:
-            entries, outside = list_nearest_pixels(
-                x, y, p, self.nearest_pixel, density[:, 0], *made
-            )
+            geometry = self.nearest_pixel, density[:, 0]
+            entries, outside = list_nearest_pixels(x, y, p, *geometry, *made)
         else:
-            geometry = self.view, self.model_xy, density[:, 0]
-            entries, outside = list_bilinear_parts(x, y, p, *geometry, *made)
+            parts = self.view, self.model_xy, density[:, 0]
+            entries, outside = list_bilinear_parts(x, y, p, *parts, *made)
         return tuple(part[:entries] for part in (index, u, v, weight, which)), outside
 
     @cached_property
@@ -95,10 +88,8 @@ class SensorLookup:
         """Raise ValueError where an event lies off the sensor."""
         height, width = self.view.shape
         if events.size and (events["x"].max() >= width or events["y"].max() >= height):
-            reach = int(events["x"].max()), int(events["y"].max())
-            raise ValueError(
-                f"events must lie on the {width}x{height} sensor of views, got (x, y) up to {reach}"
-            )
+            got = f"(x, y) up to {int(events['x'].max()), int(events['y'].max())}"
+            raise ValueError(f"events must lie on the {width}x{height} sensor of views, got {got}")
 
 
 def build_lookup(views: Views) -> SensorLookup:

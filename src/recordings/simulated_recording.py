@@ -1,8 +1,4 @@
-"""A simulated recording: nine mirrored, misaligned, vignetted views on one event sensor.
-
-The true geometry is a `Views`, so that a calibration can be compared with it; a sensor pixel sees
-what `SensorLookup` says it does, the same table that splits the events again.
-"""
+"""A simulated recording: nine mirrored, misaligned, vignetted views on one event sensor."""
 
 from pathlib import Path
 
@@ -15,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from src.recordings.files.event_arrays import concatenate_events
-from src.recordings.files.formats import write_events
+from src.recordings.files.event_writers import write_events
 from src.recordings.sensor_lookup import SensorLookup, build_lookup
 from src.recordings.views import Size, View, Views
 from src.sim import noise
@@ -28,14 +24,9 @@ DARK = 0.02  # share of light that a sensor pixel gets without any
 
 
 def kaleidoscope_views(
-    positions: list[tuple[int, int]],
-    *,
-    model: Size,
-    sensor: Size = (720, 1280),
-    tile_px: float = 230.0,
-    homography_error_px: float = 3.0,
-    key: int = 0,
-) -> Views:
+    positions: list[tuple[int, int]], *, model: Size, sensor: Size = (720, 1280),
+    tile_px: float = 230.0, homography_error_px: float = 3.0, key: int = 0,
+) -> Views:  # fmt: skip
     """Return the views of a kaleidoscope whose tiles are `tile_px` wide, about the sensor's middle.
 
     The view at (row, col) is mirrored in x for odd col and in y for odd row.  Each corner of every
@@ -109,14 +100,9 @@ def record_events(
 
 
 def write_recording(
-    path: Path | str,
-    frames: Float[Tensor, "views frames h w"],
-    fps: float,
-    views: Views,
-    sensor: EventSensor,
-    *,
-    tilt: Float[Tensor, "views frames 2 h w"] | None = None,
-) -> int:
+    path: Path | str, frames: Float[Tensor, "views frames h w"], fps: float, views: Views,
+    sensor: EventSensor, *, tilt: Float[Tensor, "views frames 2 h w"] | None = None,
+) -> int:  # fmt: skip
     """Record `frames`, write them as an event file and return the number of events.
 
     Beside `cap.raw` come `cap.views.yaml`, the true geometry, and `cap.truth.h5`: the frames of the
@@ -124,6 +110,8 @@ def write_recording(
     """
     path = Path(path)
     events = record_events(frames, fps, views, sensor)
+    if not len(events):
+        raise ValueError(f"write: the clip gives no events, nothing is written to {path}")
     height, width = views.sensor
     write_events(path, events, width=width, height=height)
     views.save(path.with_suffix(".views.yaml"))

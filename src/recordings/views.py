@@ -57,9 +57,8 @@ class Views:
             if not all(1 <= side <= LARGEST_SIDE for side in size):
                 raise ValueError(f"views.{name} must be in 1..{LARGEST_SIDE} pixels, got {size}")
             if count * math.prod(size) > MAX_PIXELS:
-                raise ValueError(
-                    f"views.{name} must have {MAX_PIXELS} pixels at most, got {count} x {size}"
-                )
+                allowed = f"{MAX_PIXELS} pixels at most"
+                raise ValueError(f"views.{name} must have {allowed}, got {count} x {size}")
         left, top, right, bottom = self.field
         if not (np.isfinite(self.field).all() and right - left >= 1 and bottom - top >= 1):
             raise ValueError(f"views.field must be left, top, right, bottom, got {self.field}")
@@ -105,7 +104,7 @@ class Views:
         """Return the corners of `view` on the sensor: the field's, clockwise from top left."""
         return self._field_on_sensor(view, 2)[[0, 1, 3, 2]]
 
-    def is_mirrored(self, view: View) -> tuple[bool, bool]:
+    def mirrored_xy(self, view: View) -> tuple[bool, bool]:
         """Return whether `view` is mirrored in x and in y (both: it is turned by 180 degrees)."""
         corners = self.outline(view)
         return bool(corners[1, 0] < corners[0, 0]), bool(corners[3, 1] < corners[0, 1])
@@ -136,7 +135,7 @@ class Views:
         views = [
             {
                 "position": list(view.position),
-                "mirrored": list(self.is_mirrored(view)),
+                "mirrored": list(self.mirrored_xy(view)),
                 "error_px": round(view.error_px, 4),
                 "points": view.points,
                 "homography": view.homography.tolist(),
@@ -192,7 +191,7 @@ def load_views(path: Path | str, sensor: Size | None = None) -> Views:
         why = f"{path}: {type(error).__name__} {error}"
         raise ValueError(f"views must be a file of calibrate task=views, got {why}") from None
     for view, mirrored in zip(views.views, stated, strict=True):
-        if mirrored not in (None, list(views.is_mirrored(view))):
+        if mirrored not in (None, list(views.mirrored_xy(view))):
             raise ValueError(f"{path}: mirrored of {view.position} contradicts its homography")
     if sensor is not None and tuple(sensor) != views.sensor:
         raise ValueError(f"{path}: sensor must be the recording's {sensor}, got {views.sensor}")

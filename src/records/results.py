@@ -52,8 +52,9 @@ def create_run_folder(run: Path, config: str) -> None:
 
 def settings_affecting_results(config: str) -> dict:
     """Return the settings of a resolved `config` (YAML) that the numbers depend on: all but
-    `paths` and, for training, the `ckpt` it resumed from."""
+    `paths`, `verbose` and, for training, the `ckpt` it resumed from."""
     settings = safe_yaml.parse(config)
+    settings.pop("verbose", None)
     run = settings.pop("paths", {}).get("run")
     if settings.get("task") == "train":
         settings.pop("ckpt", None)
@@ -76,10 +77,8 @@ def has_results(run: Path, config: str) -> bool:
     if not file.is_file():
         return False
     if json.loads(file.read_text()).get("config_sha256") != hash_config(config):
-        raise ValueError(
-            f"paths.out must be another folder, or {run} moved away: it holds results of another "
-            "configuration"
-        )
+        why = "it holds results of another configuration"
+        raise ValueError(f"paths.out must be another folder, or {run} moved away: {why}")
     return True
 
 
@@ -115,7 +114,7 @@ def write_and_print_results(run: Path, config: str, rows: list[ScoreRow], **fact
     values = [[clip[name] for name in columns] for clip in first.clips]
     write_text(run / "clips.csv", format_csv(columns, values))
     write_text(run / "results.json", json.dumps(record, indent=2) + "\n")
-    rich.print(format_score_table(rows))
+    rich.print(build_rich_score_table(rows))
     files = sorted(str(file.relative_to(run)) for file in run.rglob("*.*") if file.is_file())
     rich.print(f"in {run}: " + ", ".join(file for file in files if not file.startswith(".")))
     return record
@@ -128,12 +127,12 @@ def format_csv(heads: Iterable, rows: Iterable[Iterable]) -> str:
     return text.getvalue()
 
 
-def format_score_table(rows: list[ScoreRow]) -> Table:
+def build_rich_score_table(rows: list[ScoreRow]) -> Table:
     """Return mean scores over clips, one line per network; arrows point to better values."""
     picture = Table(title=f"{len(rows[0].clips)} test clips, mean of per-frame values")
     picture.add_column("network")
     for metric in METRICS:
-        picture.add_column(f"{metric.heading} {metric.arrow}", justify="right")
+        picture.add_column(metric.title, justify="right")
     picture.add_column("ms/frame", justify="right")
     for row in rows:
         means = summarize_scores(row.clips)

@@ -79,7 +79,8 @@ def find_runs(folders: list[Path]) -> list[Run]:
         if not files and not find_figures([folder]):
             raise ValueError(f"run must hold results.json, got {folder}: empty or not finished")
         unique |= {file.resolve(): file for file in files}
-    return sorted(map(_read, unique.values()), key=_age)
+    runs = map(_read, unique.values())
+    return sorted(runs, key=lambda r: ((r.folder / "results.json").stat().st_mtime, str(r.folder)))
 
 
 def find_sweeps(folders: list[Path]) -> list[SweepPlan]:
@@ -111,10 +112,8 @@ def flatten(node: Any, prefix: str = "") -> dict[str, Any]:
 def _read(file: Path) -> Run:
     try:
         record = json.loads(file.read_text())
-        schema = record["schema"]
-        settings = flatten(
-            results.settings_affecting_results((file.parent / "config.yaml").read_text())
-        )
+        schema, config = record["schema"], (file.parent / "config.yaml").read_text()
+        settings = flatten(results.settings_affecting_results(config))
     except (OSError, ValueError, KeyError, TypeError, RecursionError, yaml.YAMLError) as error:
         raise ValueError(f"run must hold whole results, got {file}: {error}") from error
     if schema != results.SCHEMA:
@@ -122,10 +121,6 @@ def _read(file: Path) -> Run:
     clips = file.parent / "clips.csv"
     rows = list(csv.DictReader(clips.read_text().splitlines())) if clips.is_file() else []
     return Run(file.parent, record, settings, rows)
-
-
-def _age(run: Run) -> tuple[float, str]:
-    return (run.folder / "results.json").stat().st_mtime, str(run.folder)
 
 
 def _plan(hydra: dict) -> SweepPlan:
@@ -137,6 +132,5 @@ def _plan(hydra: dict) -> SweepPlan:
     sweep = "" if entry_point == config else config
     how = f"--config-dir sweeps --config-name {sweep}" if sweep else "-m"
     start = f"python -m src.{entry_point} {how}"
-    return SweepPlan(
-        sweep, " ".join([start, *asked]), BasicSweeper.split_arguments(parsed, None)[0]
-    )
+    jobs = BasicSweeper.split_arguments(parsed, None)[0]
+    return SweepPlan(sweep, " ".join([start, *asked]), jobs)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from src.reports.run_groups import RunGroup
 from src.reports.tables import Table, TableCell
-from src.reports.writers import ARROWS, format_cell
+from src.reports.writers import format_cell
 
 TEMPLATE = Path(__file__).with_name("page.html")
 MEDIA_TYPES = {".gif": "image/gif", ".png": "image/png", ".svg": "image/svg+xml"}
@@ -61,8 +61,7 @@ def _format_table(table: Table) -> str:
     )
     grouped = f"<tr>{groups}</tr>\n" if any(column.group for column in table.columns) else ""
     heads = "".join(
-        f'<th class="{_column_kind(table, place)}"><button>'
-        f"{escape(column.head + ARROWS[column.better])}</button></th>"
+        f'<th class="{_column_kind(table, place)}"><button>{escape(column.title)}</button></th>'
         for place, column in enumerate(table.columns)
     )
     rows = "\n".join(

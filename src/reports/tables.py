@@ -9,25 +9,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from src.metrics.bootstrap import bootstrap_difference_interval
-from src.metrics.table import METRICS
+from src.metrics.table import METRICS, Column
 from src.records.runs import Run
 from src.reports.run_groups import RunGroup, find_published
 
 SEVERITIES = ("none", "weak", "medium", "strong")
 SPLIT_METRICS = ("lpips", "psnr_aligned", "temporal_jitter_px")  # of the table by severity
-
-
-@dataclass(frozen=True)
-class Column:
-    """`better` is 1 where more is better, -1 where less is, 0 where neither; `group` stands above
-    the columns that have it, such as the source of published numbers.
-    """
-
-    name: str
-    head: str
-    digits: int = 0
-    better: int = 0
-    group: str = ""
 
 
 @dataclass(frozen=True)
@@ -63,7 +50,6 @@ class Table:
         return round(cell.mean, head.digits) == (max if head.better > 0 else min)(printed)
 
 
-SCORES = tuple(Column(m.name, m.heading, m.digits, m.better) for m in METRICS)
 COSTS: tuple[tuple[Column, Callable[[Run], float]], ...] = (
     (Column("ms", "ms/frame", 1, -1), lambda run: next(iter(run.record["latency_ms"].values()))),
     (Column("gmac", "GMAC", 2), lambda run: run.record["model"]["macs_per_frame"] / 1e9),
@@ -80,15 +66,15 @@ def build_score_table(
     own.
     """
     found = [find_published(group.runs[0], published) if group.runs else {} for group in groups]
-    theirs = [score for score in SCORES if any(score.name in row for row in found)]
-    columns = [*(Column(key, key) for key in keys), *SCORES, *(column for column, _ in COSTS)]
+    theirs = [score for score in METRICS if any(score.name in row for row in found)]
+    columns = [*(Column(key, key) for key in keys), *METRICS, *(column for column, _ in COSTS)]
     columns.append(Column("n", "n"))
     for c in theirs:
         digits = c.digits + (c.digits == 3)
-        columns.append(Column(f"paper_{c.name}", c.head, digits, group=published["source"]))
+        columns.append(Column(f"paper_{c.name}", c.heading, digits, group=published["source"]))
     table = Table(title, columns, [], len(keys))
     for group, row in zip(groups, found, strict=True):
-        cells = [_mean_over_seeds(group.runs, _score(column.name)) for column in SCORES]
+        cells = [_mean_over_seeds(group.runs, _score(column.name)) for column in METRICS]
         cells += [_mean_over_seeds(group.runs, cost, column.better != 0) for column, cost in COSTS]
         done, asked = len(group.runs), len(group.runs) + group.missing
         count = str(done) if not group.missing else f"{done} of {asked}" if done else "missing"
@@ -106,8 +92,8 @@ def build_severity_table(
     if all(len(severities) < 2 for severities in drawn):
         return None
     present = [severity for severity in SEVERITIES if severity in set().union(*drawn)]
-    split = [(s, severity) for s in SCORES if s.name in SPLIT_METRICS for severity in present]
-    heads = [Column(f"{s.name}_{name}", name, s.digits, s.better, s.head) for s, name in split]
+    split = [(s, severity) for s in METRICS if s.name in SPLIT_METRICS for severity in present]
+    heads = [Column(f"{s.name}_{name}", name, s.digits, s.better, s.heading) for s, name in split]
     table = Table(title, [*(Column(key, key) for key in keys), *heads], [], len(keys))
     for group in groups:
         scores = [_score(s.name, severity=severity) for s, severity in split]
@@ -119,12 +105,12 @@ def build_reference_methods_table(
     title: str, keys: Sequence[str], groups: Sequence[RunGroup]
 ) -> Table | None:
     """Return each network and what else its runs scored, such as the untrained one."""
-    columns = [*(Column(key, key) for key in keys), Column("network", "network"), *SCORES]
+    columns = [*(Column(key, key) for key in keys), Column("network", "network"), *METRICS]
     table = Table(title, columns, [], len(keys) + 1)
     for group in groups:
         others = dict.fromkeys(n for run in group.runs for n in run.record.get("compared", {}))
         for name in (None, *others) if others else ():
-            cells = [_mean_over_seeds(group.runs, _score(c.name, name)) for c in SCORES]
+            cells = [_mean_over_seeds(group.runs, _score(c.name, name)) for c in METRICS]
             table.add_row(group, [TableCell(text=name or "trained"), *cells])
     return table if table.rows else None
 

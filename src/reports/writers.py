@@ -3,10 +3,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from src.metrics.table import Column
 from src.records import results
-from src.reports.tables import Column, Table, TableCell
-
-ARROWS = {1: " ↑", -1: " ↓", 0: ""}
+from src.reports.tables import Table, TableCell
 
 
 def format_markdown(tables: Sequence[Table], commands: Sequence[str] = ()) -> str:
@@ -14,7 +13,7 @@ def format_markdown(tables: Sequence[Table], commands: Sequence[str] = ()) -> st
     parts = [f"`{command}`" for command in commands]
     for table in tables:
         rules = ["---" if place < table.labels else "--:" for place in range(len(table.columns))]
-        heads = [f"{c.group}: " * bool(c.group) + c.head + ARROWS[c.better] for c in table.columns]
+        heads = [f"{c.group}: " * bool(c.group) + c.title for c in table.columns]
         lines = [f"**{_escape(table.title)}**", "", _format_line(heads), _format_line(rules)]
         for row in table.rows:
             texts = []

@@ -1,4 +1,4 @@
-"""The light field: how many views, where they stand, how each is mirrored, how well registered.
+"""The light field: how many views and where they stand.
 
 A view is its grid position (row, col) relative to the centre view, in units of the pitch of the
 sub-apertures; rows count downwards.  Axes: see docs/conventions.md.
@@ -8,13 +8,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
-
-import cv2
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
-from src.sim import noise
 
 Position = tuple[int, int]
 REACH = 8  # a grid position lies in -REACH..REACH
@@ -58,22 +51,12 @@ def view_id(position: Position) -> int:
 
 @dataclass(frozen=True)
 class Optics:
-    """Number and arrangement of the views and what registration leaves wrong.
-
-    `views`: see `layout`; `positions` overrides it with (row, col), if any.
-    `homography_error_px`: standard deviation, per corner and axis, of the residual homography of
-    every view but the centre one, in pixels; 0 is perfect registration.
-    """
+    """Number and arrangement of the views: `views`, see `layout`, or `positions` (row, col)."""
 
     views: int = 9
     positions: Sequence[Any] = ()  # of (row, col)
-    homography_error_px: float = 0.0
 
     def __post_init__(self):
-        if self.homography_error_px < 0 or not math.isfinite(self.homography_error_px):
-            raise ValueError(
-                f"optics.homography_error_px must be >= 0, got {self.homography_error_px}"
-            )
         chosen = self.positions or layout(self.views)
         positions = tuple((int(row), int(col)) for row, col in chosen)
         if len(positions) != self.views or len(set(positions)) != self.views:
@@ -92,43 +75,3 @@ class Optics:
     def select_views(self, positions: Sequence[Position]) -> "Optics":
         """Return these optics with the views at `positions` alone."""
         return replace(self, views=len(positions), positions=tuple(positions))
-
-    def apply_homography_error(
-        self,
-        frames: Float[Tensor, "n views frames h w"],
-        key: int,
-        *,
-        origin: tuple[int, int] = (0, 0),
-        full_size: tuple[int, int] | None = None,
-    ) -> Float[Tensor, "n views frames h w"]:
-        """Warp every view but the centre one by its residual homography (bilinear).
-
-        `origin` is the (row, column) of the first pixel in the full frame of `full_size` (h, w), so
-        that a crop is warped as the full frame is.  The homography is a function of (key, view).
-        """
-        if self.homography_error_px == 0:
-            return frames
-        from kornia.geometry.transform import warp_perspective  # here: to import it takes a second
-
-        height, width = full_size or frames.shape[-2:]
-        shift = torch.eye(3, dtype=torch.float64)
-        shift[:2, 2] = torch.tensor([-origin[1], -origin[0]])
-        warped = frames.clone()
-        for index, position in enumerate(self.positions):
-            if position == (0, 0):
-                continue
-            view_key = noise.key(key, view_id(position), "misalignment")
-            seen = self._draw_homography(view_key, height, width).inverse()  # frame to view
-            matrix = (shift @ seen @ shift.inverse()).to(frames.device).expand(len(frames), -1, -1)
-            view, size = frames[:, index].double(), (frames.shape[-2], frames.shape[-1])
-            warped[:, index] = warp_perspective(view, matrix, size, padding_mode="border")
-        return warped
-
-    def _draw_homography(self, key: int, height: int, width: int) -> Float[Tensor, "3 3"]:
-        """Return the homography, float64, that moves each corner at random."""
-        right, bottom = width - 1.0, height - 1.0
-        corners = torch.tensor([[0, 0], [right, 0], [right, bottom], [0, bottom]])
-        moved = (
-            corners + noise.normal(key, torch.arange(8)).reshape(4, 2) * self.homography_error_px
-        )
-        return torch.from_numpy(cv2.getPerspectiveTransform(corners.numpy(), moved.numpy()))

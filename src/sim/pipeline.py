@@ -18,10 +18,11 @@ from src.sim import noise
 from src.sim.optics import Optics, Position
 from src.sim.scenes.clip import Clip, Scene
 from src.sim.sensor.engine_input import SensorClip
+from src.sim.sensor.engines.records import Grids
 from src.sim.sensor.engines.run import zeros
 from src.sim.sensor.response import decode_srgb, encode_srgb
-from src.sim.sensor.sensor import Sensor, simulate_voxels
-from src.sim.turbulence.contract import Crop, TurbulenceModel, TurbulenceOperator
+from src.sim.sensor.sensor import Sensor, ViewFrames, simulate_voxels
+from src.sim.turbulence.contract import ClipTurbulence, Crop, TurbulenceModel
 
 
 @dataclass(frozen=True)
@@ -132,8 +133,8 @@ class Pipeline:
 
     def render_views(
         self, draws: Sequence[ClipParameters], device: torch.device | str = "cpu"
-    ) -> Float[Tensor, "n views frames h w"]:
-        """Return the light that the turbulence and every view's optics put on the sensor."""
+    ) -> ViewFrames:
+        """Return the light of every view on the sensor."""
         views = [self._render_clip(draw, device) for draw in draws]
         return views[0] if len(views) == 1 else torch.cat(views)
 
@@ -143,18 +144,10 @@ class Pipeline:
         if draw.clip.illumination is not None:  # it changes the light, not the ground truth
             radiance = radiance * draw.clip.illumination.to(device)
         operator, generator = self.turbulence_operator(draw), self.turbulence_generator(draw)
-        views = operator.degrade(radiance, generator, crop=draw.crop)
-        height, width = clean.shape[-2:]
-        size = height, width
-        return self.optics.apply_homography_error(
-            views, draw.key, origin=draw.crop[:2], full_size=size
-        )
+        return operator.degrade(radiance, generator, crop=draw.crop)
 
     def simulate_sensor(
-        self,
-        draws: Sequence[ClipParameters],
-        views: Float[Tensor, "n views frames h w"],
-        out: Float[Tensor, "n windows views bins h w"] | None = None,
+        self, draws: Sequence[ClipParameters], views: ViewFrames, out: Grids | None = None
     ) -> Sample:
         """Return the sample of the clips whose `views`, float32 or float16, are those drawn; its
         voxel grids are in `out`, if given, which must hold zeros.
@@ -182,13 +175,13 @@ class Pipeline:
         frames, generator = len(draw.clip.frames), self.turbulence_generator(draw)
         return self.turbulence_operator(draw).tilt(frames, generator, crop=draw.crop)
 
-    def turbulence_operator(self, draw: ClipParameters) -> TurbulenceOperator:
+    def turbulence_operator(self, draw: ClipParameters) -> ClipTurbulence:
         """Return the turbulence of a clip; `draw.turbulence` may be that already, prepared."""
         drawn, (height, width) = draw.turbulence, draw.clip.frames.shape[-2:]
-        if isinstance(drawn, TurbulenceOperator):
+        if isinstance(drawn, ClipTurbulence):
             return drawn
-        size: Any = {"height": height, "width": width, "fps": draw.clip.fps}
-        return self.turbulence.operator(drawn, views=self.positions, **size)
+        options: Any = {"views": self.positions, "fps": draw.clip.fps}
+        return self.turbulence.operator(drawn, height=height, width=width, **options)
 
     def turbulence_generator(self, draw: ClipParameters) -> torch.Generator:
         return noise.generator(noise.key(draw.key, "turbulence"))
@@ -228,18 +221,18 @@ def concatenate_samples(samples: Sequence[Sample], voxels: Tensor | None = None)
     for name in samples[0].tensors().keys() - whole:
         parts = [getattr(sample, name) for sample in samples]
         shape = (sum(map(len, parts)), *parts[0].shape[1:])
-        whole[name] = torch.cat(parts, out=empty_float32(shape, parts[0].device))
+        whole[name] = torch.cat(parts, out=allocate_float32(shape, parts[0].device))
     parameters = [drawn for sample in samples for drawn in sample.parameters]
     return replace(samples[0], **whole, parameters=parameters)
 
 
-def empty_float32(shape: Sequence[int], device: torch.device) -> Tensor:
+def allocate_float32(shape: Sequence[int], device: torch.device) -> Tensor:
     """Return float32 to be filled, on the CPU in numpy's huge pages, a third of the cost."""
     if device.type != "cpu":
         return torch.empty(*shape, device=device)
     return torch.from_numpy(np.empty(tuple(shape), np.float32))
 
 
-def crop_frames(frames: Float[Tensor, "frames h w"], crop: Crop) -> Tensor:
+def crop_frames(frames: Float[Tensor, "*any h w"], crop: Crop) -> Tensor:
     top, left, height, width = crop
-    return frames[:, top : top + height, left : left + width]
+    return frames[..., top : top + height, left : left + width]

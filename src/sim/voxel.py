@@ -41,7 +41,9 @@ def voxel_grid(
         return grid
     times = t.astype(np.int64) if t.dtype.kind in "iu" else t.astype(np.float64)
     scale = np.float32(np.float32(bins - 1) / np.float32(t1 - t0))
-    wrong = accumulate(times, x, y, p, t0, t1, scale, bool(p.min() >= 0), grid.numpy())
+    wrong = accumulate_until_bad_event(
+        times, x, y, p, t0, t1, scale, bool(p.min() >= 0), grid.numpy()
+    )
     if wrong >= 0:
         raise ValueError(
             f"events must have x in 0..{width - 1}, y in 0..{height - 1}, p in {{-1, 1}} or "
@@ -67,7 +69,7 @@ def normalise_nonzero(grid: Float[Tensor, "*batch bins h w"]) -> Float[Tensor, "
 
 @njit(nogil=True, cache=True)
 @no_type_check  # a checked function would not compile
-def accumulate(t, x, y, p, t0, t1, scale, zero_is_off, grid):
+def accumulate_until_bad_event(t, x, y, p, t0, t1, scale, zero_is_off, grid):
     """Add the events with t0 <= t <= t1 to `grid`; return the index of a bad event, or -1."""
     bins, height, width = grid.shape
     for i in range(t.size):

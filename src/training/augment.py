@@ -1,8 +1,7 @@
 """Training augmentation of voxel sequences (Rebecq et al. 2019; Stoffregen et al. 2020; the paper).
 
-Order: dropped views, pauses, flips, shifted views, noise, hot and noisy pixels.  Crops are drawn
-before the simulation (sim/pipeline.py).  Every draw comes from the key of the sample, so a batch is
-the same in any worker.
+Order: dropped views, pauses, flips, shifted views, noise, hot and noisy pixels.  Every draw comes
+from the key of the sample, so a batch is the same in any worker.
 """
 
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from src.sim import noise
 from src.sim.optics import Position, layout
-from src.sim.pipeline import Sample, concatenate_samples, empty_float32
+from src.sim.pipeline import Sample, allocate_float32, concatenate_samples
 from src.training.clip_transforms import ClipTransform, transform_batch, transform_clips
 from src.training.voxel_noise import add_noisy_pixels, draw_hot_pixels, draw_normals
 
@@ -57,15 +56,14 @@ class Augment:
     ) -> Sample:
         """Return the augmented batch of the clips of `samples`; `keys` has one key per clip.
 
-        `batched`: all clips in a few operators, else clip by clip (None: batched on all devices but
-        the CPU).  Both give the same, but for the noise that a device draws.
+        `batched`: in a few operators, else clip by clip, with the same result (None: not on a CPU).
         """
         first = samples[0]
         windows, views, *grid = first.voxels.shape[1:]
         positions = first.positions or layout(views)
         kept = draw_kept_views(views, self.view_dropout_probability, noise.key(keys[0], "dropped"))
         transforms = [self._draw_transform(key, windows, positions, kept) for key in keys]
-        voxels = empty_float32((len(keys), windows, len(kept), *grid), first.voxels.device)
+        voxels = allocate_float32((len(keys), windows, len(kept), *grid), first.voxels.device)
         if voxels.device.type != "cpu" if batched is None else batched:
             whole = first if len(samples) == 1 else concatenate_samples(samples)
             frames = transform_batch(whole, transforms, voxels)

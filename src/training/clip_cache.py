@@ -1,22 +1,29 @@
 """Pre-simulated turbulence cache: what every view sees of a fixed set of clips, simulated once.
 
-What turbulence does to a clip is slow to compute and stays the same; sensor, crop and augmentation
-are fast and drawn anew for every sample (cached_pipeline.py).  Clip i is a function of the config
-and of i, so it does not matter which process simulates it.
+Sensor, crop and augmentation are drawn anew for every sample (CachedPipeline).  Clip i is a
+function of the config and of i, so it does not matter which process simulates it.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from src.sim import noise
+from src.sim.optics import Optics
 from src.sim.pipeline import ClipParameters, Pipeline, crop_frames
+from src.sim.scenes.clip import Clip
+from src.sim.sensor.sensor import Sensor
+from src.sim.turbulence.contract import Crop
 
 GIB = 2**30
+FIRST_CLIPS, SAMPLES_PER_CLIP = 8, 4  # sample n is of one of the first 8 + n / 4 clips
+CROP_STEP = 16  # pixels between two sides of a range of crops
 
 
 class CachedClip(NamedTuple):
@@ -67,18 +74,19 @@ class ClipCache(ABC):
         """Return whether clip `index` is in the cache."""
 
     @abstractmethod
-    def store(self, index: int, clip: CachedClip) -> None:
-        """Store clip `index`; raises OSError where there is no room for it."""
-
-    @abstractmethod
     def clip(self, index: int) -> CachedClip:
         """Return clip `index`, simulated and stored first if it is missing."""
 
-    @abstractmethod
     def read_views(
         self, draws: Sequence[CachedDraw], device: torch.device | str
     ) -> Float[Tensor, "n views frames h w"]:
         """Return what the views of `draws`, of one crop size, see: light, float16."""
+        parts = []
+        for draw in draws:
+            crop = crop_frames(self.clip(draw.index).views, draw.crop).transpose(0, 1)
+            frames = select_frames(crop, draw.frames)
+            parts.append(frames[:, list(draw.view_order)].transpose(0, 1))
+        return torch.stack(parts).to(device)
 
 
 class DeviceClipCache(ClipCache):
@@ -112,20 +120,6 @@ class DeviceClipCache(ClipCache):
             self.store(index, simulate_clip(self.source, index, self.device))
         return CachedClip(self.views[index], self.clean[index], self.metadata[index])
 
-    def read_views(
-        self, draws: Sequence[CachedDraw], device: torch.device | str
-    ) -> Float[Tensor, "n views frames h w"]:
-        corners = torch.tensor([draw.crop[:2] for draw in draws]).T[..., None]
-        rows, columns = corners + torch.arange(draws[0].crop[2])
-        places = (
-            torch.tensor([draw.index for draw in draws])[:, None, None, None, None],
-            torch.tensor([draw.view_order for draw in draws])[:, :, None, None, None],
-            torch.tensor([list(draw.frames) for draw in draws])[:, None, :, None, None],
-            rows[:, None, None, :, None],
-            columns[:, None, None, None, :],
-        )  # one gather for the batch
-        return self.views[tuple(place.to(self.device) for place in places)].to(device)
-
 
 def simulate_clip(source: Pipeline, index: int, device: torch.device | str) -> CachedClip:
     """Return clip `index` of `source`, simulated on `device`."""
@@ -146,3 +140,107 @@ def select_frames(video: Tensor, frames: range) -> Tensor:
     """Return `frames`, neighbours forwards or backwards, of the first axis of a video."""
     part = video[min(frames) :][: len(frames)]
     return part.flip(0) if frames.step < 0 else part
+
+
+class CachedPipeline(Pipeline):
+    """From a number to a sample whose turbulence comes from `cache`.
+
+    Sample n is a function of (config, n), whatever the cache holds already: it is of one of the
+    first FIRST_CLIPS + n / SAMPLES_PER_CLIP clips, the order in which a cache is filled; of fewer
+    samples than SAMPLES_PER_CLIP for a clip, all clips see some.  Drawn by n as well: `windows`
+    neighbouring windows, forwards or backwards, the crop, the order of the views (where their
+    turbulence is `independent`), the sensor and its noise.  `clips`: how many different samples
+    there are (None: all are).  `crop` = [low, high]: the side in pixels, a multiple of CROP_STEP
+    above low, is the same for `batch_size` neighbouring numbers.  Raises ValueError for a range the
+    clips do not hold and for `clips` that are no whole batches.
+    """
+
+    def __init__(
+        self, cache: ClipCache, optics: Optics, sensor: Sensor, *, windows: int, bins: int = 5,
+        crop: int | float | Sequence[float] | None = None, batch_size: int = 1,
+        independent: bool = True, clips: int | None = None,
+    ):  # fmt: skip
+        source = cache.source
+        super().__init__(
+            source.scene, optics, source.turbulence, sensor, split=source.split, seed=source.seed,
+            bins=bins, substeps=source.substeps, crop=None if isinstance(crop, Sequence) else crop,
+            random_crop=True, clips=clips, decodes_srgb=source.decodes_srgb,
+        )  # fmt: skip
+        self.shuffles_views = independent
+        self.cache, self.frames = cache, windows * source.substeps + 1
+        self.sides, self.batch_size = self._crop_sides(crop), batch_size
+        if self.sides and clips is not None and clips % batch_size:
+            allowed = f"a multiple of data.batch_size={batch_size} where data.crop is a range"
+            raise ValueError(f"data.clips must be {allowed}, got {clips}")
+        if self.frames > cache.frames:
+            most = (cache.frames - 1) // source.substeps
+            raise ValueError(f"data.windows must be <= data.cache_windows, {most}, got {windows}")
+        positions = [tuple(place) for place in source.optics.positions or ()]
+        self.cache_views = [positions.index(tuple(place)) for place in optics.positions or ()]
+
+    def clip_index(self, number: int) -> int:
+        """Return which clip of the cache sample `number` is of."""
+        key = noise.key(self.seed, self.split, "banked", number, "clip")
+        share = noise.uniforms(key, 1)[0]
+        each = min(SAMPLES_PER_CLIP, (self.clips or math.inf) / self.cache.clips)
+        return int(share * min(self.cache.clips, FIRST_CLIPS + int(number / each)))
+
+    def draw(self, number: int) -> CachedDraw:
+        """Draw everything random about sample `number`; simulates its clip if it is missing."""
+        number = number if self.clips is None else number % self.clips
+        key = noise.key(self.seed, self.split, "banked", number)
+        start, direction = noise.uniforms(key, 2)
+        first, index = int(start * (self.cache.frames - self.frames + 1)), self.clip_index(number)
+        frames = range(first, first + self.frames)[:: -1 if direction < 0.5 else 1]
+        clip = self.cache.clip(index)
+        clean = select_frames(clip.clean, frames).float()
+        return CachedDraw(
+            clip=Clip(clean, clip.metadata["fps"], clip.metadata["name"]),
+            crop=self._draw_crop(number, clean.shape[-2:], noise.key(key, "crop")),
+            turbulence=None,
+            sensor=self.sensor.draw(key, pixel_seed=noise.key(key, "chip")),
+            key=key,
+            number=number,
+            index=index,
+            frames=frames,
+            view_order=self._draw_view_order(noise.key(key, "order")),
+            record={"cached_clip": index} | clip.metadata["record"],
+        )
+
+    def render_views(
+        self, draws: Sequence[ClipParameters], device: torch.device | str = "cpu"
+    ) -> Float[Tensor, "n views frames h w"]:
+        return self.cache.read_views(cast(Sequence[CachedDraw], draws), device)
+
+    def tilt(self, draw: ClipParameters) -> Tensor:
+        draw, source = cast(CachedDraw, draw), self.cache.source
+        tilt = source.tilt(source.draw(draw.index))[list(draw.view_order)]
+        crop = crop_frames(tilt, draw.crop).transpose(0, 1)
+        return select_frames(crop, draw.frames).transpose(0, 1)
+
+    def turbulence_record(self, draw: ClipParameters) -> dict:
+        return cast(CachedDraw, draw).record
+
+    def _crop_sides(self, crop: Any) -> list[int]:
+        if not isinstance(crop, Sequence):
+            return []
+        most = self.cache.source.crop
+        is_pair = len(crop) == 2 and all(type(side) is int for side in crop)
+        if not is_pair or not 8 <= crop[0] <= crop[1] <= most:
+            allowed = f"[low, high] in 8..{most} (data.cache_crop)"
+            raise ValueError(f"data.crop must be {allowed}, got {list(crop)}")
+        return list(range(crop[0], crop[1] + 1, CROP_STEP))
+
+    def _draw_crop(self, number: int, size: Sequence[int], key: int) -> Crop:
+        if not self.sides:
+            return self._crop_box(size, key)
+        batch = noise.key(self.seed, self.split, "side", number // self.batch_size)
+        side = self.sides[int(noise.uniforms(batch, 1)[0] * len(self.sides))]
+        (height, width), (top, left) = size, noise.uniforms(key, 2)
+        return int(top * (height - side + 1)), int(left * (width - side + 1)), side, side
+
+    def _draw_view_order(self, key: int) -> tuple[int, ...]:
+        order: Sequence[int] = range(self.cache.source.optics.views)
+        if self.shuffles_views:
+            order = sorted(order, key=noise.uniforms(key, len(order)).__getitem__)
+        return tuple(order[view] for view in self.cache_views)

@@ -1,7 +1,6 @@
 """Windows, views and pixels of clips rearranged: pauses, flips, dropped and shifted views.
 
-Own code, not kornia's: draws come from keys, voxel grids and frames go along, and a batch takes one
-gather (python -m benchmarks.operators counts 40 times fewer operators than clip by clip).
+Own code, not kornia's: draws come from keys, grids and frames go along, a batch takes one gather.
 """
 
 from collections.abc import Sequence
@@ -14,6 +13,9 @@ from torch.nn import functional
 
 from src.sim.pipeline import Sample
 
+KeptGrids = Float[Tensor, "n windows kept bins h w"]
+ClipGrids = Shaped[Tensor, "windows views bins h w"]
+Frames = Float[Tensor, "n windows 1 h w"]
 FRAMES = {"target", "turbulent", "teacher_frames"}  # of a sample, transformed like its grids
 
 
@@ -31,10 +33,8 @@ class ClipTransform(NamedTuple):
 
 
 def transform_clips(
-    samples: Sequence[Sample],
-    transforms: Sequence[ClipTransform],
-    out: Float[Tensor, "n windows kept bins h w"],
-) -> dict[str, Float[Tensor, "n windows 1 h w"]]:
+    samples: Sequence[Sample], transforms: Sequence[ClipTransform], out: KeptGrids
+) -> dict[str, Frames]:
     """Write the transformed grids to `out`, window by window, which stays in the CPU's cache;
     return the transformed FRAMES.
     """
@@ -57,10 +57,8 @@ def transform_clips(
 
 
 def transform_batch(
-    sample: Sample,
-    transforms: Sequence[ClipTransform],
-    out: Float[Tensor, "n windows kept bins h w"],
-) -> dict[str, Float[Tensor, "n windows 1 h w"]]:
+    sample: Sample, transforms: Sequence[ClipTransform], out: KeptGrids
+) -> dict[str, Frames]:
     """Do as `transform_clips` in one gather for the grids and one for each of FRAMES."""
     device, (height, width) = out.device, out.shape[-2:]
     clip, bins = (torch.arange(count, device=device) for count in (len(transforms), out.shape[3]))
@@ -106,9 +104,7 @@ def flip_frames(frames: Tensor, axes: list[int]) -> Tensor:
     return frames.flip(axes) if axes else frames
 
 
-def shift_views(
-    voxels: Shaped[Tensor, "windows views bins h w"], shifts: Sequence[tuple[int, int, int]]
-) -> Shaped[Tensor, "windows views bins h w"]:
+def shift_views(voxels: ClipGrids, shifts: Sequence[tuple[int, int, int]]) -> ClipGrids:
     """Shift (view, rows, columns) up and left, in place; zeros come in at the border."""
     height, width = voxels.shape[-2:]
     for view, up, left in shifts:

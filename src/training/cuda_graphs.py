@@ -34,9 +34,8 @@ class GraphedUnroll:
     """Unrolls `network` over batches on a GPU: the first batch of each size and each selection of
     output windows operator by operator, those that follow as a CUDA graph.
 
-    A graph replays one fixed series of launches, so sizes and selections should be few; at most
-    MAX_GRAPHS are made, all of one pool of memory.  The first time that a graph cannot be made,
-    runs out of memory or gives other frames, graphs are disabled for good, and one line is printed.
+    At most MAX_GRAPHS are made, all of one pool of memory.  The first time that a graph cannot be
+    made, runs out of memory or gives other frames, graphs are disabled, and one line is printed.
     """
 
     def __init__(self, network: EventToVideoNetwork):
@@ -47,18 +46,14 @@ class GraphedUnroll:
         self.disabled = False
 
     def __call__(
-        self,
-        voxels: Float[Tensor, "n windows views bins h w"],
-        window_s: Float[Tensor, " n"],
-        positions: Sequence[tuple[int, int]] | None,
-        output_windows: Sequence[int],
+        self, voxels: Tensor, window_s: Tensor, positions: Sequence | None, outputs: Sequence[int]
     ) -> Float[Tensor, "n outputs 1 h w"]:
-        """Return the frames of the windows `output_windows`."""
+        """Return the frames of the windows `outputs`; arguments as those of UnrolledNetwork."""
         places = None if positions is None else tuple(map(tuple, positions))
-        name = (tuple(voxels.shape), voxels.dtype, places, tuple(output_windows))
+        name = (tuple(voxels.shape), voxels.dtype, places, tuple(outputs))
         if name in self.graphs:
             return self.graphs[name](voxels, window_s)
-        plain = UnrolledNetwork(self.network, positions, output_windows)
+        plain = UnrolledNetwork(self.network, positions, outputs)
         if self.disabled or name not in self.seen or len(self.graphs) >= MAX_GRAPHS:
             self.seen.add(name)
             return plain(voxels, window_s)

@@ -139,9 +139,8 @@ class LightFieldData(LightningDataModule):
 class BatchSimulator:
     """Turns numbered draws of a stream into a batch; picklable, so that a worker can be given one.
 
-    On a GPU all clips go through the simulation at once, on a CPU and for teachers one after the
-    other, so that memory stays that of one clip.  The last simulation is kept: the same draws again
-    are only augmented again.
+    Clips are simulated all at once on a GPU, else one after the other.  The last simulation is
+    kept: the same draws again are only augmented again.
     """
 
     def __init__(

@@ -1,8 +1,7 @@
 """The pre-simulated turbulence cache on a disk, shared by all trainings whose clips are the same.
 
 A clip is one file in float16, renamed into place when it is complete, with PyTorch's checksums.
-While a process simulates it, its byte of a lock file is locked; the system unlocks it when the
-process ends, however it ends.
+While a process simulates it, its byte of a lock file is locked by the system.
 """
 
 import ast
@@ -23,15 +22,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 import src.sim
 from src.models.checkpoints import AtomicCheckpointIO, is_intact
 from src.records.atomic import write_text
-from src.sim.pipeline import Pipeline, crop_frames
-from src.training import clip_cache
-from src.training.clip_cache import GIB, CachedClip, CachedDraw, ClipCache, simulate_clip
+from src.sim.pipeline import Pipeline
+from src.training.clip_cache import GIB, CachedClip, ClipCache, simulate_clip
 
 INPUTS_FILE = "inputs.json"
 DOWNSTREAM = ("sensor", "voxel.py")  # parts of src/sim that come after the cache
@@ -95,17 +91,6 @@ class DiskClipCache(ClipCache):
             content["clean"],
             json.loads(content.get("metadata") or content["facts"]),
         )
-
-    def read_views(
-        self, draws: Sequence[CachedDraw], device: torch.device | str
-    ) -> Float[Tensor, "n views frames h w"]:
-        parts = []
-        for draw in draws:
-            views = self.clip(draw.index).views
-            crops = (crop_frames(views[view], draw.crop) for view in draw.view_order)
-            frames = [clip_cache.select_frames(crop, draw.frames) for crop in crops]
-            parts.append(torch.stack(frames))
-        return torch.stack(parts).to(device)
 
     def fill(self) -> None:
         """Simulate what is missing and no other process simulates, on the CPU.
@@ -213,8 +198,8 @@ def hash_simulation_code() -> str:
 
 
 def hash_file_lists(config: Any) -> str:
-    """Return a hash of names and sizes of the files below every `root` or `train_root` in a plain
-    config: a folder, a file (a pack of photographs) or a list of these.
+    """Return a hash of names and sizes of the files below every `root` or `extra_train_root` in a
+    plain config: a folder, a file (a pack of photographs) or a list of these.
     """
     digest = hashlib.sha256()
     for root in _roots(config):
@@ -225,7 +210,7 @@ def hash_file_lists(config: Any) -> str:
 
 
 def _roots(node: Any, key: str = "") -> Iterator[str]:
-    if isinstance(node, str) and key in ("root", "train_root"):
+    if isinstance(node, str) and key in ("root", "extra_train_root"):
         yield node
     items = [(key, value) for value in node] if isinstance(node, list) else []
     for name, value in node.items() if isinstance(node, dict) else items:

@@ -13,9 +13,8 @@ class WeightEMA(WeightAveraging):
     """Lightning's weight averaging with a moving average; buffers are copied.
 
     `decay`, in [0, 1): 0.999 remembers a thousand steps; the first steps count more, 9 / (10 +
-    step), so that the start is forgotten, as in TensorFlow's ExponentialMovingAverage.  Checkpoints
-    hold the average as `state_dict` and the weights in training as `current_model_state`.  Raises
-    ValueError for another decay.
+    step).  Checkpoints hold the average as `state_dict` and the weights in training as
+    `current_model_state`.  Raises ValueError for another decay.
     """
 
     def __init__(self, decay: float):
@@ -49,7 +48,7 @@ def averaged_weights(module: LightningModule) -> Iterator[None]:
             ema._swap_models(module)
 
 
-def load_average(trainer: Trainer, module: LightningModule) -> None:
+def load_ema_weights(trainer: Trainer, module: LightningModule) -> None:
     """Give `module` the averaged weights for good, where its trainer has a WeightEMA."""
     for ema in _find_averages(trainer):
         ema._copy_average_to_current(module)

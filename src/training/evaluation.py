@@ -4,7 +4,7 @@ import lightning
 import torch
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
-from src.deploy.cost import count_macs, macs_per_frame, time_frame, timing_clock
+from src.deploy.cost import count_macs, macs_per_frame, select_timing_clock, time_frame
 from src.metrics.video_metrics import VideoMetrics
 from src.models.network import EventToVideoNetwork, VideoMethod
 from src.records.results import ScoreRow
@@ -14,14 +14,9 @@ from src.training.reconstructor import Reconstructor
 
 
 def test_network(
-    name: str,
-    network: VideoMethod,
-    data: LightFieldData,
-    metrics: VideoMetrics,
-    *,
-    trainer: lightning.Trainer,
-    unscored_windows: int = 0,
-) -> ScoreRow:
+    name: str, network: VideoMethod, data: LightFieldData, metrics: VideoMetrics, *,
+    trainer: lightning.Trainer, unscored_windows: int = 0,
+) -> ScoreRow:  # fmt: skip
     """Return the row of `network` on the test clips of `data`.
 
     Raises SIGTERMException when SIGTERM came, which Lightning forgets during the last clip.
@@ -58,7 +53,7 @@ def measure_cost(network: VideoMethod, sample: Sample) -> tuple[int, float]:
             network, window, positions=positions, threads=threads, seconds=0.0, min_frames=5
         )
         return macs, timing.median_ms
-    now = timing_clock(threads, sample.voxels.device)
+    now = select_timing_clock(threads, sample.voxels.device)
     frames, start = sample.target.shape[:2].numel(), now()
     network.reconstruct_clip(sample)
     seconds = now() - start

@@ -14,11 +14,9 @@ DEFERRED = (signal.SIGINT, signal.SIGUSR1)  # Lightning itself defers SIGTERM
 
 
 class DeferredSignals(Callback):
-    """Ctrl-C and SLURM's SIGUSR1 act before the next step; a second one acts at once.
-
-    What they do stays Lightning's: stop with a checkpoint, or store one and requeue the job.  In
-    the middle of a step that checkpoint would hold weights of which some have moved already; an
-    error that comes there, such as a worker's death, leaves none: the one before stays the newest.
+    """Ctrl-C and SLURM's SIGUSR1 act before the next step, a second one at once, as Lightning has
+    it: stop with a checkpoint, or store one and requeue the job.  An error in the middle of a step,
+    such as a worker's death, leaves no checkpoint: the one before stays the newest.
     """
 
     def __init__(self) -> None:

@@ -112,7 +112,7 @@ def mean_scores(trainer: Trainer, module: Reconstructor) -> dict[str, float]:
     module.eval()
     with averaged_weights(module):
         samples = trainer.datamodule.validation_samples()  # type: ignore[attr-defined]
-        clips = [scores for sample in samples for scores in module.score_and_record_clips(sample)]
+        clips = [scores for sample in samples for scores in module.score_clips_into_metrics(sample)]
     module.metrics.reset()
     module.train()
     return {name: fmean(clip[name] for clip in clips) for name in NAMES if name in module.metrics}

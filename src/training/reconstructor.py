@@ -10,10 +10,10 @@ from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 from torch.nn.utils import parametrize
 
-from src.losses.revealed import find_revealed
 from src.losses.terms import TrainingLoss
 from src.metrics.video_metrics import VideoMetrics
 from src.models.network import EventToVideoNetwork, FramePostprocessor, VideoMethod, unroll
+from src.training import going_on
 from src.training.cuda_graphs import GraphedUnroll
 from src.training.schedule import TrainingClock
 from src.training.step_guard import StepGuard
@@ -61,6 +61,7 @@ class Reconstructor(LightningModule):
         self.unscored_windows = unscored_windows
         self.graphs = GraphedUnroll(network) if cuda_graphs else None  # type: ignore[arg-type]
         self.windows_seen, self.earlier_steps = 0, 0
+        self.optimizer_start = 0  # step at which the optimiser's state began
         self.initial_rates: list[float] = []
         # In tuples, so that what is not trained stays out of the parameters and the checkpoint.
         self._loss, self._method = (loss,), (method or network,)
@@ -118,7 +119,6 @@ class Reconstructor(LightningModule):
             sample.target[:, outputs],
             outputs,
             None if teachers is None else teachers[:, outputs],
-            self._find_revealed(sample, outputs),
         )
         self.manual_backward(frames, gradient)
         total = self.all_gather(loss).mean()  # type: ignore[union-attr]
@@ -132,14 +132,6 @@ class Reconstructor(LightningModule):
         self.clock.lap()
         return total
 
-    def _find_revealed(self, sample: "Sample", outputs: Sequence[int]) -> Tensor | None:
-        if self.loss.flatness is None:
-            return None
-        noise_hz = torch.tensor([_noise_hz(drawn) for drawn in sample.parameters])
-        noise = noise_hz * sample.window_s.cpu()
-        threshold = torch.tensor([drawn.get("threshold", 0.0) for drawn in sample.parameters])
-        return find_revealed(sample.target, sample.voxels, threshold, noise)[:, outputs]
-
     def reconstruct_windows(self, sample: "Sample", outputs: Sequence[int]) -> Tensor:
         """Return the frames of the windows `outputs` of the network in training."""
         assert isinstance(self.network, EventToVideoNetwork)
@@ -149,7 +141,7 @@ class Reconstructor(LightningModule):
         )[0]  # fmt: skip
 
     def validation_step(self, sample: "Sample", batch_idx: int) -> None:
-        self.score_and_record_clips(sample)
+        self.score_clips_into_metrics(sample)
         self._log_means("val")
 
     def on_test_start(self) -> None:
@@ -160,14 +152,14 @@ class Reconstructor(LightningModule):
 
     def test_step(self, sample: "Sample", batch_idx: int) -> None:
         self.sample = sample
-        self.clips += self.score_and_record_clips(sample)
+        self.clips += self.score_clips_into_metrics(sample)
         self._log_means("test")
 
     def _log_means(self, split: str) -> None:
         means = {f"{split}/{name}": metric for name, metric in self.metrics.items()}
         self.log_dict(means, on_step=False, on_epoch=True, batch_size=1)
 
-    def score_and_record_clips(self, sample: "Sample") -> list[dict]:
+    def score_clips_into_metrics(self, sample: "Sample") -> list[dict]:
         """Add every clip to `metrics`; return the scores of each with what was drawn for it."""
         with parametrize.cached():
             frames = self.method.reconstruct_clip(sample)
@@ -189,8 +181,16 @@ class Reconstructor(LightningModule):
         checkpoint["losses"] = list(self.guard.losses)
         checkpoint["seconds"], checkpoint["windows"] = self.clock.seconds, self.windows_seen
         checkpoint["steps"] = self.total_steps
+        checkpoint["optimizer_start"] = self.optimizer_start
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
+        if self.make_optimizer is not None:  # else nothing is trained
+            going_on.check_steps(self.trainer.max_steps, checkpoint["global_step"])
+            kept = going_on.follow_config(
+                checkpoint, self.network.parameters, self.make_optimizer, self.make_scheduler
+            )
+            start = checkpoint.get("optimizer_start", 0)
+            self.optimizer_start = start if kept else checkpoint["global_step"]
         self.guard.losses.extend(checkpoint["losses"])
         self.clock.seconds, self.windows_seen = checkpoint["seconds"], checkpoint["windows"]
         self.earlier_steps = checkpoint["steps"] - checkpoint["global_step"]
@@ -205,12 +205,6 @@ class PostprocessorTraining(Reconstructor):
         with torch.no_grad():
             frames = source.reconstruct_clip(sample).float().clamp(0, 1)
         return self.network(frames)[0][:, outputs]
-
-
-def _noise_hz(drawn: dict) -> float:
-    """Return the noise events per second and pixel of a sensor that was drawn."""
-    hot_hz = drawn.get("hot_pixel_fraction", 0.0) * drawn.get("hot_pixel_hz", 0.0)
-    return drawn.get("dark_noise_hz", 0.0) + drawn.get("leak_event_hz", 0.0) + hot_hz
 
 
 def select_loss_windows(windows: int, first: int, pairs: int | None, seed: int) -> list[int]:

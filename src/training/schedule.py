@@ -40,10 +40,8 @@ class CosineSchedule(Callback):
     """Train for `train_hours` of the module's clock; the learning rate falls by half a cosine of
     that time, from the optimiser's own to 0 (Loshchilov & Hutter 2017).  None: steps decide.
 
-    The time so far is part of checkpoints: a training that is cut continues where it was, and with
-    more hours along the longer cosine.  `warmup_steps`: first steps of an optimiser, over which the
-    rate rises from zero, as Adam knows no second moments yet.  Raises ValueError for values out of
-    range.
+    The time so far is part of checkpoints.  `warmup_steps`: first steps of an optimiser, over which
+    the rate rises from zero.  Raises ValueError for values out of range.
     """
 
     def __init__(self, train_hours: float | None = None, warmup_steps: int = 0):
@@ -67,7 +65,8 @@ class CosineSchedule(Callback):
         if self.train_hours is None:
             return
         ratio = self.lr_ratio(pl_module.clock.hours)
-        ratio *= min(1.0, (trainer.global_step + 1) / (self.warmup_steps + 1))
+        steps = trainer.global_step - pl_module.optimizer_start
+        ratio *= min(1.0, (steps + 1) / (self.warmup_steps + 1))
         groups = trainer.optimizers[0].param_groups
         for group, rate in zip(groups, pl_module.initial_rates, strict=True):
             group["lr"] = rate * ratio

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from src.deploy.cpu_features import has_fast_bf16
+from src.deploy.cpu_features import is_bf16_faster
 from src.models.checkpoints import AtomicCheckpointIO, is_intact
 from src.models.network import EventToVideoNetwork
 from src.sim.pipeline import Sample
@@ -47,13 +47,15 @@ class TeacherEnsemble:
         self.paths: dict[Hashable, Path] = {}
 
     def __call__(self, sample: Sample, key: Hashable = None) -> Float[Tensor, "1 windows 1 h w"]:
-        """Return the mean frames of a single clip, in [0, 1].
-
-        `key` identifies the sample among all others (None: nothing does): one that comes again is
+        """Return the mean frames of a single clip, in [0, 1]; a sample whose `key` comes again is
         not hashed again.
         """
         names = self._names_at(1 / float(sample.window_s[0]))
-        path = self.paths.get(key) or self._path(sample, names)
+        path = self.paths.get(key)
+        if path is None:
+            inputs = _hash(sample.voxels, sample.window_s, torch.tensor(sample.positions or ()))
+            text = "".join(sorted(self.hashes[name] for name in names)) + inputs
+            path = self.cache / f"{hashlib.sha256(text.encode()).hexdigest()[:24]}.pt"
         if key is not None:
             self.paths[key] = path
         if path.exists() and is_intact(path):
@@ -64,11 +66,6 @@ class TeacherEnsemble:
             AtomicCheckpointIO().save_checkpoint({"pictures": frames}, path)
         return frames.to(sample.voxels.device).float() / LEVELS
 
-    def _path(self, sample: Sample, names: list[str]) -> Path:
-        inputs = _hash(sample.voxels, sample.window_s, torch.tensor(sample.positions or ()))
-        weights = "".join(sorted(self.hashes[name] for name in names))
-        return self.cache / f"{hashlib.sha256((weights + inputs).encode()).hexdigest()[:24]}.pt"
-
     def _names_at(self, rate: float) -> list[str]:
         """Return the names of the networks that teach at `rate` windows a second."""
         is_usual = math.isclose(rate, self.rate, rel_tol=1e-3)
@@ -77,7 +74,7 @@ class TeacherEnsemble:
     @torch.no_grad()
     def _mean_frames(self, sample: Sample, names: list[str]) -> Tensor:
         device = sample.voxels.device
-        half = device.type != "cpu" or has_fast_bf16()
+        half = device.type != "cpu" or is_bf16_faster()
         with torch.autocast(device.type, torch.bfloat16, enabled=half):
             networks = (self.networks[name].to(device) for name in names)
             videos = [network.reconstruct_clip(sample).float() for network in networks]

@@ -1,7 +1,6 @@
 """Noise on voxel grids: Gaussian, hot pixels (Rebecq et al. 2019) and pixels that fire alone.
 
-Own code, not kornia's: every draw comes from a key, and on the CPU the normals of a table cost half
-of torch's.
+Every draw comes from a key; on the CPU the normals of a table cost half of torch's.
 """
 
 import math
@@ -50,14 +49,12 @@ def draw_hot_pixels(size: Sequence[int], max_fraction: float, key: int) -> Float
 
 
 def add_noisy_pixels(
-    voxels: Float[Tensor, "n windows views bins h w"],
-    max_fraction: float,
-    window_counts: Sequence[Sequence[float]],
-    keys: Sequence[int],
+    voxels: Tensor, max_fraction: float, window_counts: Sequence[Sequence[float]], keys: list[int]
 ) -> None:
-    """Let up to `max_fraction` of the pixels of each clip's views fire without a change of light:
-    each has as many events a window as a Poisson process with a mean log-uniform in the clip's
-    `window_counts` = (low, high), each ON or OFF.
+    """Let up to `max_fraction` of the pixels of each clip's views fire without a change of light.
+
+    `voxels`: (n, windows, views, bins, h, w).  Each has as many events a window as a Poisson
+    process with a mean log-uniform in the clip's `window_counts` = (low, high), each ON or OFF.
     """
     places, events = [], []
     for clip, (counts, key) in enumerate(zip(window_counts, keys, strict=True)):

@@ -14,7 +14,7 @@ from src.app import build, compared_networks, hardware
 from src.app.instantiate import allowed_packages
 from src.eval import evaluate
 from src.models import files
-from src.recordings.files import formats, sources
+from src.recordings.files import event_file, event_writers, sources
 from src.train import train
 from tests.conftest import ROOT
 from tests.test_train import TINY, config
@@ -112,9 +112,15 @@ def test_a_post_processor_of_ones_own_is_loaded(own, tmp_path):
     files.save(tmp_path / "mine.safetensors", parts.MyMambaTM(1, 8), spec, {})
     named = f"postprocess.postprocessor={tmp_path}/mine.safetensors"
     cfg = config("eval", tmp_path, "postprocess=mambatm", named, "baseline=frames", *own)
-    assert type(build.build_method(cfg).postprocessor).__name__ == "MyMambaTM"
+    assert type(build.build_video_method(cfg).postprocessor).__name__ == "MyMambaTM"
     with pytest.raises(ValueError, match="allowed_packages="):
         postprocess.load(f"{tmp_path}/mine.safetensors")
+
+
+def test_a_network_and_a_baseline_are_not_both_taken(tmp_path):
+    cfg = config("reconstruct", tmp_path, "recording=a.raw", "ckpt=any", "baseline=highpass")
+    with pytest.raises(ValueError, match="^ckpt must be null with baseline=..., got any"):
+        build.load_network(cfg)
 
 
 @pytest.mark.parametrize("given", ["mypackage", "[1a]", "[..]", "['']"])
@@ -169,16 +175,16 @@ def test_without_a_progress_bar_training_goes_on_without_it(tmp_path):
 def test_precision_is_what_the_device_is_fast_in(
     budget, device, able, precision, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(hardware, "has_fast_bf16", lambda: able)
+    monkeypatch.setattr(hardware, "is_bf16_faster", lambda: able)
     cfg = config("train", tmp_path, f"budget={budget}", f"trainer.accelerator={device}")
     hardware.fill_in_precision(cfg)
     assert cfg.trainer.precision == precision
 
 
 def test_a_missing_size_is_asked_for_by_its_key(tmp_path):
-    events = np.array([(0, 1, 1, 1), (5, 2, 2, -1)], formats.EVENT)
-    formats.write_events(tmp_path / "a.raw", events, width=8, height=8)
-    (tmp_path / "a.txt").write_text("0 1 1 1\n5 2 2 0\n")
+    events = np.array([(0, 1, 1, 1), (5, 2, 2, -1)], event_file.EVENT)
+    event_writers.write_events(tmp_path / "a.raw", events, width=8, height=8)
+    (tmp_path / "a.txt").write_text("0 1 1 1\n5e-6 2 2 0\n")
     with pytest.raises(ValueError, match=r"give sensor_size=\[height,width\]"):
         sources.sensor_size(tmp_path / "a.txt")
     with pytest.raises(ValueError, match=r"sensor_size must be \(8, 8\)"):

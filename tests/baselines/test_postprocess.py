@@ -30,7 +30,7 @@ def sample(windows: int = 10) -> Sample:
 class Doubled(FramePostprocessor):
     """Stands for a post-processor: doubles, and counts what it is given."""
 
-    def restore(self, frames, *, window, overlap):
+    def restore(self, frames):
         self.given = frames.shape[1]
         return (2 * frames).clamp(0, 1)
 

@@ -19,7 +19,7 @@ def test_bf16_has_to_be_there_and_faster(able, bf16_s, faster, monkeypatch):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: able)
     seconds = {torch.bfloat16: bf16_s, torch.float32: 1.0}
     monkeypatch.setattr(cpu_features, "time_convolution_s", seconds.get)
-    assert cpu_features.has_fast_bf16.__wrapped__() == faster
+    assert cpu_features.is_bf16_faster.__wrapped__() == faster
 
 
 def test_a_convolution_is_timed_in_either():

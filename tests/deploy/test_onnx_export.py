@@ -9,7 +9,7 @@ import torch
 
 from baselines.firenet import FireNet
 from baselines.highpass import HighPass
-from src.deploy.forms import ReducedPrecisionNetwork, in_form
+from src.deploy.forms import Bf16Network, convert_to_form
 from src.deploy.onnx_export import OnnxNetwork, export_onnx
 from src.models.e2vid import E2VID
 from src.models.setnet import SetNet
@@ -54,13 +54,13 @@ def test_the_running_form_is_as_accurate_as_its_type(name):
     torch.manual_seed(0)
     network = NETWORKS[name]().eval()
     plain = frames(network, noise())
-    rounded = frames(ReducedPrecisionNetwork(network), noise())
+    rounded = frames(Bf16Network(network), noise())
     assert rounded.dtype == torch.float32 and (rounded - plain).abs().mean() < 0.02
 
 
 def compiled_gap(name: str) -> float:
     network = NETWORKS[name]().eval()
-    forms = [frames(in_form(network, form), noise()) for form in ("bf16", "compiled")]
+    forms = [frames(convert_to_form(network, form), noise()) for form in ("bf16", "compiled")]
     return float((forms[0] - forms[1]).abs().max())
 
 
@@ -87,13 +87,13 @@ def test_the_compiled_form_gives_the_frames_of_bf16(name):
 )
 def test_a_form_that_is_none_is_named(form, network, words):
     with pytest.raises(ValueError, match=words):
-        in_form(network, form)
+        convert_to_form(network, form)
 
 
 def test_without_a_compiler_nothing_is_compiled(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
     with pytest.raises(ValueError, match="form=compiled needs a C.. compiler"):
-        in_form(E2VID(views=9, base_channels=4), "compiled")
+        convert_to_form(E2VID(views=9, base_channels=4), "compiled")
 
 
 def test_what_onnx_cannot_express_is_said(tmp_path):

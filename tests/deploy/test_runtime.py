@@ -11,7 +11,7 @@ import torch
 from baselines.firenet import FireNet
 from src.deploy import int8, openvino_network
 from src.deploy.cpu_features import has_int8_dot_product
-from src.deploy.int8 import MAX_ACTIVATION, MIN_CHANNELS, Int8Conv, quantise_decoder
+from src.deploy.int8 import MAX_ACTIVATION, MIN_CHANNELS, Int8Conv, quantise_decoder_conv
 from src.deploy.openvino_network import OpenVinoNetwork
 from src.deploy.runtime import EventListRuntime
 from src.models.e2vid import E2VID
@@ -298,7 +298,7 @@ def test_many_channels_are_drawn_in_bytes_where_these_are_fast(
 ):
     monkeypatch.setattr(int8, "has_int8_dot_product", lambda: able)
     net = network(name).to(dtype)
-    quantise_decoder(net)
+    quantise_decoder_conv(net)
     assert any(isinstance(part, Int8Conv) for part in net.modules()) == drawn
 
 

@@ -35,12 +35,12 @@ from src.models import files
 from src.models.e2vid import E2VID
 from src.recordings import sensor_lookup, views
 from src.recordings.calibration import view_alignment
-from src.recordings.files import formats, sources
+from src.recordings.files import recording, sources, videos
 from src.sim.scenes import photo_files, video_files
 from tests.baselines.published_names import published_state_dict
 from tests.faults.harness import Run
 from tests.recordings.files import tables
-from tests.recordings.files.test_formats import made_up
+from tests.recordings.files.test_recording import made_up
 from tests.test_train import TINY, config
 
 SPEC = {"target": "src.models.e2vid.E2VID", "kwargs": {"views": 1, "base_channels": 2}}
@@ -63,7 +63,7 @@ def read_picture(path: Path) -> None:
 
 
 def read_video(path: Path) -> None:
-    deque(sources.read_video(path), 0)
+    deque(videos.read_video(path), 0)
     for source in video_files.find_videos(path) if path.suffix != ".h5" else ():
         deque(source.read(0, min(source.count, 50)), 0)
 
@@ -126,10 +126,10 @@ def write_config(path: Path) -> None:
 
 PICTURES, TABLES = (".png", ".jpg", ".tif", ".bmp"), (".csv", ".txt", ".npz", ".h5")
 FORMATS: dict[str, tuple[str, Callable, Callable]] = {
-    "EVT3": (".raw", write_events, formats.read_events),
-    "EVT2": (".raw", partial(write_events, version="evt2"), formats.read_events),
-    "AEDAT4 unpacked": (".aedat4", write_aedat, formats.read_events),
-    **{name: (name, write_events, formats.read_events)
+    "EVT3": (".raw", write_events, recording.read_events),
+    "EVT2": (".raw", partial(write_events, version="evt2"), recording.read_events),
+    "AEDAT4 unpacked": (".aedat4", write_aedat, recording.read_events),
+    **{name: (name, write_events, recording.read_events)
        for name in (".dat", ".aedat4", ".es", *TABLES)},
     **{name: (name, lambda path: cv2.imwrite(str(path), RAMP), read_picture) for name in PICTURES},
     **{f"video{name}": (name, write_video, read_video) for name in (".mp4", ".avi", ".h5")},
@@ -163,7 +163,8 @@ SEEN: list[str] = []  # of what a reader must not do
 
 def watch(event: str, args: tuple, folder: str) -> None:
     if event == "open" and isinstance(args[0], str) and isinstance(args[2], int):
-        writes = args[2] & (os.O_WRONLY | os.O_RDWR)
+        is_temporary = os.path.isdir(args[0])  # a file without a name, gone when it is closed
+        writes = args[2] & (os.O_WRONLY | os.O_RDWR) and not is_temporary
         if writes and "__pycache__" not in args[0] and not args[0].startswith(folder):
             SEEN.append(f"wrote to {args[0]}")
     elif event.startswith(FORBIDDEN):

@@ -13,7 +13,8 @@ from omegaconf import OmegaConf
 from src.models import files
 from src.models.checkpoints import is_intact, newest_checkpoint
 from src.models.e2vid import E2VID
-from src.recordings.files.formats import EVENT, write_events
+from src.recordings.files.event_file import EVENT
+from src.recordings.files.event_writers import write_events
 from src.records import results
 from src.records.results import ScoreRow
 from tests.faults import harness
@@ -78,6 +79,7 @@ def disturb_training(
     return harness.outcome(folder / "last")
 
 
+@pytest.mark.filterwarnings("ignore:.* runs, the newest is taken")
 @pytest.mark.parametrize("seed", SEEDS)
 def test_training_goes_on_to_the_same_numbers(tmp_path, alone, seed):
     numbers, seconds = alone

@@ -65,6 +65,15 @@ def test_a_damaged_checkpoint_is_passed_over(tmp_path):
         newest_checkpoint(tmp_path)
 
 
+def test_a_folder_of_several_runs_says_which_one_is_taken(tmp_path):
+    for number, name in enumerate(("new", "old")):
+        (tmp_path / name).mkdir()
+        written(tmp_path / name / "last.ckpt", 1.0)
+        os.utime(tmp_path / name / "last.ckpt", (9 - number, 9 - number))
+    with pytest.warns(UserWarning, match="holds 2 runs, the newest is taken: .*new/last.ckpt"):
+        assert newest_checkpoint(tmp_path) == tmp_path / "new/last.ckpt"
+
+
 @pytest.mark.parametrize("kind", ["mp4", "png", "gif"])
 def test_a_file_that_cannot_grow_is_no_whole_video(kind, tmp_path):
     pictures = np.random.default_rng(0).random((20, 96, 96), np.float32)
@@ -94,8 +103,8 @@ def test_a_full_disk_is_no_whole_video(kind, tmp_path, monkeypatch):
 
 
 READERS = {
-    "cap.txt": "src.recordings.files.formats.read_events",
-    "cap.h5": "src.recordings.files.formats.read_events",
+    "cap.txt": "src.recordings.files.recording.read_events",
+    "cap.h5": "src.recordings.files.recording.read_events",
     "views.yaml": "src.recordings.views.load_views",
     "photo.png": "src.sim.scenes.photo_files.read_photograph",
     "net.ckpt": "src.models.files.load",

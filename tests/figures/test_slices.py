@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from src.figures.slices import circle_points, line_points, rotating_ray_points, sample_points
+from src.figures.slices import circle_points, line_points, rotating_ray_xy, sample_points
 
 Y, X = np.mgrid[:40, :60].astype(float)
 
@@ -41,7 +41,7 @@ def test_a_circling_dot_stays_at_its_radius():
     spots = 12 * np.stack([np.cos(angles), np.sin(angles)], 1) + (30, 20)
     video = np.stack([np.exp(-((X - x) ** 2 + (Y - y) ** 2) / 8) for x, y in spots])
     radii = np.linspace(0, 18, 73)
-    slices = sample_points(video, rotating_ray_points((30, 20), angles, radii))
+    slices = sample_points(video, rotating_ray_xy((30, 20), angles, radii))
     middle = (slices * radii).sum(1) / slices.sum(1)
     assert np.abs(middle - 12).max() < 0.1
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from src.figures.video import GAP_PX, TITLE_PX, join_panels, render_events, write_video
+from src.figures.samples import GAP_PX, TITLE_PX, join_panels, render_events, write_video
 
 
 def ramp(frames: int, height: int, width: int) -> np.ndarray:

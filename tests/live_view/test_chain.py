@@ -15,14 +15,16 @@ from aiohttp import ClientSession, WSMsgType
 from baselines.highpass import HighPass
 from src.live_view import assembly, event_feeds
 from src.live_view.feed_reader import STALL_S, FeedReader, PlaybackClock
-from src.live_view.frame_buffer import EventCounter
+from src.live_view.frame_buffer import PolarityAccumulator
 from src.live_view.live_windows import WindowCutter, WindowQueue
 from src.live_view.network_runner import RunSettings
 from src.live_view.page_server import PageServer
 from src.live_view.status import FaultLog, Meters
 from src.models.setnet import SetNet
 from src.recordings import event_windows, reconstruction
-from src.recordings.files.formats import EVENT, read_events, write_events
+from src.recordings.files.event_file import EVENT
+from src.recordings.files.event_writers import write_events
+from src.recordings.files.recording import read_events
 from src.recordings.sensor_lookup import build_lookup
 from tests.live_view import scenes
 from tests.live_view.browser import free_port
@@ -161,7 +163,7 @@ class Script(event_feeds.Feed):
 def live_windows(feed, seconds: float, faults: FaultLog):
     """Return the windows at 100 fps of `seconds` of a live feed, and the intake."""
     marks, meters, waiting = (
-        EventCounter(build_lookup(scenes.views())),
+        PolarityAccumulator(build_lookup(scenes.views())),
         Meters(),
         WindowQueue(10_000),
     )
@@ -206,7 +208,7 @@ def test_a_camera_s_clock_that_leaps_does_not_make_windows_without_end():
 
 
 def test_what_comes_live_is_not_slowed_down():
-    parts = (WindowQueue(1), EventCounter(build_lookup(scenes.views())), PlaybackClock(0.5))
+    parts = (WindowQueue(1), PolarityAccumulator(build_lookup(scenes.views())), PlaybackClock(0.5))
     with pytest.raises(ValueError, match="playback_speed must be 1 for what comes live"):
         FeedReader(
             Script(), WindowCutter(scenes.SENSOR, 100.0, FaultLog()), *parts, Meters(), FaultLog()

@@ -8,11 +8,23 @@ import pytest
 
 from src.live_view import frame_buffer
 from src.live_view.feed_reader import CameraClock, PlaybackClock
-from src.live_view.frame_buffer import MAX_BYTES, MAX_FRAMES, EventCounter, FrameRing, TimeSlice
-from src.live_view.live_windows import MAX_LATE_US, EventWindow, WindowCutter, WindowQueue
+from src.live_view.frame_buffer import (
+    MAX_BYTES,
+    MAX_FRAMES,
+    FrameRing,
+    PolarityAccumulator,
+    TimeSlice,
+)
+from src.live_view.live_windows import (
+    FEW_LIVE_EVENTS,
+    EventWindow,
+    WindowCutter,
+    WindowQueue,
+)
 from src.live_view.network_runner import offered_view_counts, positions_used
 from src.live_view.status import FaultLog, Meters
-from src.recordings.files.formats import EVENT
+from src.recordings.files.event_file import EVENT
+from src.recordings.files.event_order import BUFFER_US
 from src.recordings.sensor_lookup import build_lookup
 from src.sim.optics import layout
 from tests.live_view import scenes
@@ -63,18 +75,47 @@ def test_a_window_without_events_is_cut_too(cutter):
 def test_time_that_jumps_back_starts_anew_and_says_so(cutter, faults):
     cutter.add(some([10**6, 10**6 + 2000]))
     list(cutter.pop_windows(cutter.last_us))
-    assert cutter.add(some([0, 1500]))
-    assert "jumped back by 1 s" in faults.current()[0]
+    assert not cutter.add(some(range(FEW_LIVE_EVENTS - 1)))
+    assert cutter.add(some([1500]))
+    assert any("jumped back by 1 s" in line for line in faults.current())
     (found,) = cutter.pop_windows(cutter.last_us)
-    assert found.starts_scene and found.start_us == 0 and found.events["t"].tolist() == [0]
+    assert found.starts_scene and found.start_us == 0
+    assert found.events["t"].tolist() == list(range(FEW_LIVE_EVENTS - 1))
 
 
-def test_events_a_little_late_are_held_and_counted(cutter, faults):
-    cutter.add(some([0, 100_000]))
-    assert not cutter.add(some([100_000 - MAX_LATE_US, 100_500, 100_200, 101_500]))
+def test_events_a_little_late_are_sorted_and_counted(cutter, faults):
+    cutter.add(some([60_000, 100_000]))
+    late = 100_000 - BUFFER_US + 15_000
+    assert not cutter.add(some([late, 100_500, 100_200, 101_500]))
     found = np.concatenate([one.events["t"] for one in cutter.pop_windows(cutter.last_us)])
-    assert (np.diff(found) >= 0).all()
-    assert faults.current() == ["events came out of order: held (2 events)"]
+    assert found.tolist() == [60_000, late, 100_000, 100_200, 100_500]
+    assert faults.current() == ["events came out of order: sorted (2 events)"]
+
+
+def test_an_event_whose_window_is_over_is_dropped_and_counted(cutter, faults):
+    cutter.add(some([0, 5000]))
+    assert len(list(cutter.pop_windows(cutter.last_us))) == 5
+    cutter.add(some([4999, 6000]))
+    (found,) = cutter.pop_windows(cutter.last_us)
+    assert found.events["t"].tolist() == [5000]
+    assert "events came too late or far out of order: dropped (1 events)" in faults.current()
+
+
+def test_a_wild_time_moves_no_window(cutter, faults):
+    cutter.add(some([0, 500, 3_600_000_000, 700, 1500]))
+    (found,) = cutter.pop_windows(cutter.last_us)
+    assert found.events["t"].tolist() == [0, 500, 700]
+    assert faults.current() == ["events came too late or far out of order: dropped (1 events)"]
+
+
+def test_events_few_and_far_between_are_not_held_up(cutter):
+    cutter.add(some([0]))
+    for k in range(1, 5):
+        cutter.add(some([k * 100_000]))
+        found = [one for one in cutter.pop_windows(k * 100_000 + 1000) if len(one.events)]
+        assert [one.events["t"].tolist() for one in found] == [[(k - 1) * 100_000]] * (k == 1) + [
+            [k * 100_000]
+        ]
 
 
 def test_events_off_the_sensor_are_left_out_and_counted(cutter, faults):
@@ -197,7 +238,7 @@ def test_the_buffer_is_bounded():
 
 def test_event_pictures_count_where_a_view_looks_and_only_while_watched():
     lookup = build_lookup(scenes.views())
-    marks = EventCounter(lookup)
+    marks = PolarityAccumulator(lookup)
     y, x = (int(n) for n in np.argwhere(lookup.view == 4)[5000])
     events = some([0, 1], x=x, y=y)
     marks.add(events)

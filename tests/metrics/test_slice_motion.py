@@ -43,13 +43,13 @@ def test_turning_is_the_distance_from_uniform_turning_over_many_rounds(ends):
     apart = (apart + period / 2) % period - period / 2
     rows = 0.2 + 0.7 * np.exp(-(apart**2) / 18)
     true = centre - np.polyval(np.polyfit(time, centre, 1), time)
-    assert slice_motion.rotation_deviation_px(rows) == pytest.approx(true.std(), abs=0.05)
+    assert slice_motion.uniform_rotation_deviation_px(rows) == pytest.approx(true.std(), abs=0.05)
     assert slice_motion.line_deviation_px(rows) > 10
 
 
 def test_a_slice_in_which_nothing_moves_has_no_straightness():
     assert np.isnan(slice_motion.line_deviation_px(np.full((10, 50), 0.5)))
-    assert np.isnan(slice_motion.rotation_deviation_px(np.full((10, 50), 0.5)))
+    assert np.isnan(slice_motion.uniform_rotation_deviation_px(np.full((10, 50), 0.5)))
 
 
 def test_flicker_is_change_over_contrast():

@@ -16,7 +16,7 @@ def test_the_line_says_how_a_value_is_written():
     temporal_jitter_px = METRICS[-1]
     assert (
         temporal_jitter_px.format_value(1.236) == "1.24"
-        and temporal_jitter_px.arrow == "↓"
+        and temporal_jitter_px.title == "temporal jitter px ↓"
         and temporal_jitter_px.format_value(None) == "-"
     )
 

@@ -33,17 +33,19 @@ def test_scores_that_are_equal_on_a_clip_stay_apart():
 
 
 def test_repeated_pixels_change_ssim_and_not_psnr():
-    own, larger = VideoMetrics()(*clip()), VideoMetrics(scale=3)(*clip())
+    own, larger = VideoMetrics()(*clip()), VideoMetrics(resolution_scale=3)(*clip())
     assert larger["psnr"] == pytest.approx(own["psnr"], abs=1e-4)
     assert larger["psnr_aligned"] == pytest.approx(own["psnr_aligned"], abs=1e-4)
     assert larger["ssim"] != pytest.approx(own["ssim"], abs=0.01)
 
 
 def test_averaged_areas_lose_noise():
-    assert VideoMetrics(scale=1 / 3)(*clip())["psnr"] > VideoMetrics()(*clip())["psnr"] + 3
+    assert (
+        VideoMetrics(resolution_scale=1 / 3)(*clip())["psnr"] > VideoMetrics()(*clip())["psnr"] + 3
+    )
 
 
 @pytest.mark.parametrize("scale", [0, -1, 1.5, 9])
 def test_other_scales_are_refused(scale):
-    with pytest.raises(ValueError, match=r"metrics\.scale"):
-        VideoMetrics(scale=scale)
+    with pytest.raises(ValueError, match=r"metrics\.resolution_scale"):
+        VideoMetrics(resolution_scale=scale)

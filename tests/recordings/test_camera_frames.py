@@ -31,19 +31,19 @@ def recording(tmp_path) -> tuple[Path, Path]:
 
 def test_a_video_agrees_with_itself_and_not_with_the_next_frames(recording):
     video, listing = recording
-    same = camera_frames.compare_with_camera(video, listing)
+    same = camera_frames.score_against_camera(video, listing)
     assert same["ssim"] > 0.999 and same["correlation"] > 0.999 and same["lpips"] < 1e-4
     names = [line.split()[1] for line in listing.read_text().splitlines()]
     late = [f"{k / FPS} {name}" for k, name in enumerate(names[1:])]
     listing.write_text("\n".join(late))
-    other = camera_frames.compare_with_camera(video, listing)
+    other = camera_frames.score_against_camera(video, listing)
     assert other["ssim"] < 0.8 and abs(other["correlation"]) < 0.5 and other["lpips"] > 0.05
 
 
 def test_what_is_not_there_or_not_at_the_same_time_is_named(recording):
     video, listing = recording
-    with pytest.raises(ValueError, match="camera must be the list of a camera's frames"):
-        camera_frames.compare_with_camera(video, listing.with_name("none.txt"))
+    with pytest.raises(ValueError, match="reference_images must be the list of a camera's frames"):
+        camera_frames.score_against_camera(video, listing.with_name("none.txt"))
     listing.write_text("99.0 0000000.png")
-    with pytest.raises(ValueError, match="camera must have frames within the video's time"):
-        camera_frames.compare_with_camera(video, listing)
+    with pytest.raises(ValueError, match="reference_images must have frames within the video"):
+        camera_frames.score_against_camera(video, listing)

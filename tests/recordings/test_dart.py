@@ -7,7 +7,7 @@ import pytest
 
 from src.models.network import EventToVideoNetwork
 from src.recordings import event_windows, reconstruction, sensor_lookup, simulated_recording
-from src.recordings.files import formats
+from src.recordings.files import recording
 from src.sim import noise
 from src.sim.optics import layout
 from src.sim.scenes.targets import Targets
@@ -59,7 +59,7 @@ def wander_of(air_seed: int, folder: Path) -> dict[int | None, float]:
     table = sensor_lookup.build_lookup(camera)
     deviations = {}
     for views in (1, None):
-        chunks = formats.iter_events(folder / "dart.raw", seconds=0.001)
+        chunks = recording.iter_events(folder / "dart.raw", seconds=0.001)
         windows = event_windows.cut_windows(chunks, table, event_windows.WindowRule(fps=FPS))
         time, found = path(
             list(reconstruction.reconstruct_frames(windows, Integrator(views)))[LENGTH + 5 :]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from src.recordings.files.event_arrays import concatenate_events, count_before
-from src.recordings.files.formats import EVENT
+from src.recordings.files.event_file import EVENT
 
 
 def events(count: int) -> np.ndarray:

@@ -10,7 +10,7 @@ from src.live_view.assembly import assemble
 from src.live_view.event_feeds import FileFeed
 from src.live_view.network_runner import RunSettings
 from src.live_view.status import FaultLog
-from src.recordings.files.formats import EVENT
+from src.recordings.files.event_file import EVENT
 from src.recordings.noise_filter import NoiseFilter
 from src.recordings.views import Views
 from tests.recordings.files.tables import write_events

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from src.recordings.files import videos
 from src.recordings.output import open_video_writer, partial_path
 from src.recordings.reconstruction import Frame
 
@@ -89,3 +90,13 @@ def test_a_wrong_choice_is_refused(kind, playback, message, tmp_path):
         open_video_writer(kind, tmp_path, SIZE, playback),
     ):
         pass
+
+
+def test_an_mp4_keeps_an_odd_size(tmp_path):
+    ramp = np.linspace(0, 0.9, 61, dtype=np.float32) * np.ones((47, 1), np.float32)
+    with open_video_writer("mp4", tmp_path, ramp.shape) as write:
+        for number in range(3):
+            write(Frame(number / 30, ramp, 1, 0))
+    found = np.stack(list(videos.read_video(tmp_path / "video.mp4")))
+    assert found.shape == (3, 47, 61) and np.abs(found - ramp).max() < 7 / 255
+    assert video(tmp_path / "video.mp4").shape == (3, 47, 61)

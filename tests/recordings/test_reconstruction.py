@@ -5,12 +5,12 @@ import pytest
 import torch
 
 from baselines.firenet import FireNet
-from src.deploy.forms import ReducedPrecisionNetwork
+from src.deploy.forms import Bf16Network
 from src.deploy.runtime import EventListRuntime
 from src.models.e2vid import E2VID
 from src.models.setnet import SetNet
 from src.recordings import event_windows, reconstruction, sensor_lookup
-from src.recordings.files.formats import EVENT
+from src.recordings.files.event_file import EVENT
 from src.recordings.reconstruction import ReconstructionState, reconstruct_frames
 from src.recordings.simulated_recording import kaleidoscope_views
 from src.sim.optics import layout
@@ -52,7 +52,7 @@ def test_the_frames_are_those_from_grids(name, cut):
         [recording()], table, event_windows.WindowRule(**cut, as_lists=True)
     )
     runtime, state = (
-        reconstruction.prepare_network(network, "float32", "cpu", VIEWS, 5),
+        reconstruction.build_runnable_network(network, "float32", "cpu", VIEWS, 5),
         ReconstructionState(span),
     )
     found = []
@@ -67,15 +67,15 @@ def test_the_frames_are_those_from_grids(name, cut):
 def test_what_is_run_follows_from_network_and_device():
     network = SetNet(channels=4)
     assert isinstance(
-        reconstruction.prepare_network(network, "bf16", "cpu", VIEWS, 5), EventListRuntime
+        reconstruction.build_runnable_network(network, "bf16", "cpu", VIEWS, 5), EventListRuntime
     )
     assert isinstance(
-        reconstruction.prepare_network(FireNet(), "bf16", "cpu", VIEWS, 5), ReducedPrecisionNetwork
+        reconstruction.build_runnable_network(FireNet(), "bf16", "cpu", VIEWS, 5), Bf16Network
     )
     with pytest.raises(ValueError, match="bins must be 5 for this network, got 3"):
-        reconstruction.prepare_network(network, "bf16", "cpu", VIEWS, 3)
+        reconstruction.build_runnable_network(network, "bf16", "cpu", VIEWS, 3)
     with pytest.raises(ValueError, match="device must be cpu for form=openvino, got cuda"):
-        reconstruction.prepare_network(network, "openvino", "cuda", VIEWS, 5)
+        reconstruction.build_runnable_network(network, "openvino", "cuda", VIEWS, 5)
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -84,7 +84,7 @@ def test_lists_of_events_backwards_are_the_grids_backwards(name, cut):
     torch.manual_seed(0)
     network, table = NETWORKS[name]().eval(), sensor_lookup.build_lookup(VIEWS)
     span = cut.get("frames_per_window", 1)
-    runtime = reconstruction.prepare_network(network, "float32", "cpu", VIEWS, 5)
+    runtime = reconstruction.build_runnable_network(network, "float32", "cpu", VIEWS, 5)
     shown = []
     for grids in (True, False):
         state = ReconstructionState(span)

@@ -8,7 +8,7 @@ import torch
 from src.recordings import sensor_lookup, simulated_recording, views
 from src.recordings.calibration import dot_statistics, gaussian_dots, view_alignment
 from src.recordings.calibration.boards import Charuco, Checkerboard, Circles
-from src.recordings.files import formats, sources
+from src.recordings.files import recording, sources
 from src.sim.optics import layout
 from src.sim.sensor.sensor import EventSensor
 from tests.recordings import pictures
@@ -65,8 +65,8 @@ def test_a_blinking_screen_calibrates_the_views(truth, target, picture, tmp_path
     assert aligned.views.positions == list(layout(9))
     assert max(distance_px(aligned.views, truth).values()) < 0.3
     saved = views.load_views(tmp_path / "board.views.yaml", sources.sensor_size(path))
-    assert [saved.is_mirrored(view) for view in saved.views] == [
-        aligned.views.is_mirrored(view) for view in aligned.views.views
+    assert [saved.mirrored_xy(view) for view in saved.views] == [
+        aligned.views.mirrored_xy(view) for view in aligned.views.views
     ]
 
 
@@ -125,20 +125,27 @@ def test_a_still_scene_makes_no_event(truth):
     assert len(simulated_recording.record_events(still, 60.0, truth, ideal)) == 0
 
 
+def test_no_file_is_written_without_an_event(truth, tmp_path):
+    still, ideal = torch.full((9, 3, SIDE, SIDE), 0.6), EventSensor(0.2, refractory_s=0.0)
+    with pytest.raises(ValueError, match="write: the clip gives no events"):
+        simulated_recording.write_recording(tmp_path / "a.raw", still, 60.0, truth, ideal)
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_truth_lies_beside_the_recording(truth, tmp_path):
     frames, tilt = blinking(half(pictures.circles(5, 7)), 3), torch.zeros(9, 3, 2, SIDE, SIDE)
     path = tmp_path / "cap.raw"
     count = simulated_recording.write_recording(
         path, frames, 60.0, truth, noisy_sensor(), tilt=tilt
     )
-    assert len(formats.read_events(path)) == count
+    assert len(recording.read_events(path)) == count
     with h5py.File(tmp_path / "cap.truth.h5") as file:
         assert file.attrs["fps"] == 60 and file["tilt"].shape == tilt.shape
         assert np.array_equal(file["centre"][:], frames[4].numpy())
 
 
 def test_views_turn_about_the_centre_one(truth):
-    assert [truth.is_mirrored(view) for view in truth.views] == [
+    assert [truth.mirrored_xy(view) for view in truth.views] == [
         (bool(col % 2), bool(row % 2)) for row, col in layout(9)
     ]
     assert np.allclose(truth.views[4].homography, np.eye(3))
@@ -181,9 +188,17 @@ def test_statistics_are_those_of_the_simulated_turbulence(truth):
     error = sampling_error(tilt[:, 4, 4])  # 0.09: of these 120 frames
     true = dot_statistics.autocorrelate(tilt[:, 4, 4], 20)
     assert np.abs(found.autocorrelation[:20] - true).max() < error
-    assert np.abs(found.within_view - dot_statistics.tilt_correlation(tilt[:, 4])).max() < error
-    assert np.abs(found.across_views - dot_statistics.tilt_correlation(tilt[:, :, 4])).max() < error
-    assert found.blur_ratio[4] == pytest.approx(sigma[:, 4].mean(0) / 2.4, rel=0.03)
+    assert (
+        np.abs(found.centre_view_correlation - dot_statistics.tilt_correlation(tilt[:, 4])).max()
+        < error
+    )
+    assert (
+        np.abs(
+            found.tilt_correlation_across_views - dot_statistics.tilt_correlation(tilt[:, :, 4])
+        ).max()
+        < error
+    )
+    assert found.blur_over_still[4] == pytest.approx(sigma[:, 4].mean(0) / 2.4, rel=0.03)
     # The dots' flux goes as sigma squared here, which is what scintillation has to find.
     flux = sigma[:, 4, 4] ** 2
     index = flux.var() / flux.mean() ** 2

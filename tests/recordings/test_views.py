@@ -71,7 +71,7 @@ def test_homographies_within_a_third_of_a_pixel_and_flips_right(truth, name):
     assert found.positions == list(layout(9))
     assert max(distance_px(found, truth).values()) < 0.3
     for mine, true in zip(found.views, truth.views, strict=True):
-        assert found.is_mirrored(mine) == truth.is_mirrored(true)
+        assert found.mirrored_xy(mine) == truth.mirrored_xy(true)
         odd = sum(mine.position) % 2
         assert np.sign(np.linalg.det(mine.homography)) == (-1 if odd else 1)
 

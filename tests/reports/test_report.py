@@ -36,14 +36,14 @@ def test_mean_and_sample_deviation_over_seeds(tmp_path):
     found = value(table, 0, "ssim")
     assert math.isclose(found.mean, 0.6) and math.isclose(found.std, 0.1)
     assert value(table, 0, "gmac") == tables.TableCell(0.608) and value(table, 0, "n").text == "3"
-    assert writers.format_cell(found, tables.SCORES[1]) == "0.600 ± 0.100"
+    assert writers.format_cell(found, tables.METRICS[1]) == "0.600 ± 0.100"
 
 
 def test_one_seed_has_no_spread_and_a_metric_not_taken_is_a_dash(tmp_path):
     write_run(tmp_path / "a", scores={"lpips": math.nan})
     table, _, _ = built(tmp_path)
     assert value(table, 0, "ssim").std is None
-    assert writers.format_cell(value(table, 0, "lpips"), tables.SCORES[0]) == "-"
+    assert writers.format_cell(value(table, 0, "lpips"), tables.METRICS[0]) == "-"
 
 
 def test_missing_cells_are_shown(tmp_path):

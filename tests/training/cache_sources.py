@@ -18,9 +18,8 @@ MIXED = SimulatedTurbulence({"severity": "mixed"}, temporal_model="mixed")
 
 
 def source(scene=None, turbulence=MIXED) -> Pipeline:
-    optics = Optics(9, homography_error_px=0.5)
     return Pipeline(
-        scene or Waves(frames=7, side=40), optics, turbulence, EventSensor(), split="train",
+        scene or Waves(frames=7, side=40), Optics(9), turbulence, EventSensor(), split="train",
         crop=24, random_crop=True,
     )  # fmt: skip
 

@@ -41,7 +41,7 @@ def clip():
 
 
 def test_the_picture_is_the_mean_of_the_networks_to_8_bits(clip, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "has_fast_bf16", lambda: False)
+    monkeypatch.setattr(module, "is_bf16_faster", lambda: False)
     networks = {"one": SetNet(channels=8, context_channels=[8]), "two": Constant(0.3)}
     teacher_frames = TeacherEnsemble(networks, tmp_path, 120.0)(clip)
     with torch.no_grad():

@@ -18,6 +18,8 @@ from src.sim import noise
 from src.sim.optics import centre_view_index, layout
 from src.sim.turbulence.simulated import SimulatedTurbulence
 
+Voxels = Float[Tensor, "n views bins h w"]
+
 
 def measure_worst_psnr_loss(
     network: Candidate, bench: StressBench, *, limit: float, parameter: str,
@@ -167,9 +169,7 @@ def measure_view_shift_loss(
     return StressResult(dict(curve)[judged_px], "dB", limit, curve, "px of shift")
 
 
-def shift_views(
-    voxels: Float[Tensor, "n views bins h w"], shifts_px: dict[int, tuple[int, int]]
-) -> Float[Tensor, "n views bins h w"]:
+def shift_views(voxels: Voxels, shifts_px: dict[int, tuple[int, int]]) -> Voxels:
     """Return the grids with view i moved by shifts_px[i] (down, right), zeros at the edges."""
     moved = voxels.clone()
     for view, shift in shifts_px.items():

@@ -19,7 +19,7 @@ from src.bench.candidates import Candidate
 from src.metrics.image import aligned_psnr
 from src.models.backward_warmup import reverse_voxels
 from src.sim import noise
-from src.sim.pipeline import Pipeline
+from src.sim.pipeline import Pipeline, crop_frames
 from src.sim.sensor import EventSensor
 from src.sim.turbulence.simulated import SimulatedTurbulence
 from src.sim.voxel import voxel_grid
@@ -31,6 +31,8 @@ GAIN_AR1_COEFFICIENT = 0.9  # of a view's log gain, frame by frame
 
 
 Curve = list[tuple[Any, float]]  # (setting, value), from easy to hard
+Film = Float[Tensor, "frames h w"]
+Video = Float[Tensor, "windows 1 h w"]
 
 
 @dataclass(frozen=True)
@@ -68,8 +70,8 @@ class EventClip:
     """
 
     events: list[np.ndarray]
-    target: Float[Tensor, "frames h w"]
-    turbulent: Float[Tensor, "frames h w"]
+    target: Film
+    turbulent: Film
     fps: float
     positions: tuple[tuple[int, int], ...]
 
@@ -78,7 +80,7 @@ class EventClip:
         return (len(self.target) - 1) / self.fps
 
     @property
-    def truth(self) -> Float[Tensor, "windows 1 h w"]:
+    def truth(self) -> Video:
         """The true frame at the end of every window."""
         return self.target[1:, None]
 
@@ -99,7 +101,7 @@ class EventClip:
                 grids.append(voxel_grid(t, x, y, p, t0=start_us, t1=end_us + 1e-3, **size))
             yield torch.stack(grids)[None]
 
-    def back_and_forth(self) -> tuple[list[Tensor], Float[Tensor, "frames h w"]]:
+    def back_and_forth(self) -> tuple[list[Tensor], Film]:
         """Return the windows of the clip followed by those of its reverse, and the truth."""
         forth = list(self.windows())
         back = [reverse_voxels(window) for window in reversed(forth)]
@@ -107,7 +109,7 @@ class EventClip:
 
     def reconstruct(
         self, network: Candidate, windows: Iterable[Tensor] | None = None, state: Any = None
-    ) -> tuple[Float[Tensor, "windows 1 h w"], Any]:
+    ) -> tuple[Video, Any]:
         """Return the frames that `network` makes of `windows` (None: those of the clip), each
         1 / `fps` long, and its state.
         """
@@ -125,7 +127,8 @@ def simulate_event_clip(pipeline: Pipeline, index: int, conditions: ClipConditio
     variant, draw = copy(pipeline), pipeline.draw(index)
     if conditions.turbulence or conditions.d_over_r0 is not None:
         simulated = require_type("turbulence", pipeline.turbulence, SimulatedTurbulence)
-        variant.turbulence = simulated.with_options(**conditions.turbulence)
+        options = simulated.options | dict(conditions.turbulence)
+        variant.turbulence = SimulatedTurbulence(simulated.atmosphere, **options)
     if conditions.moving_share < 1:
         last = int(conditions.moving_share * (len(draw.clip.frames) - 1))
         kept = torch.arange(len(draw.clip.frames)).clamp(max=last)
@@ -141,18 +144,13 @@ def simulate_event_clip(pipeline: Pipeline, index: int, conditions: ClipConditio
         views = _apply_gain(views, conditions.view_gain_std, noise.key(draw.key, "gain"))
     changes = {"threshold": draw.sensor.threshold} | dict(conditions.sensor)
     sensor = replace(require_type("sensor", pipeline.sensor, EventSensor), **changes)
-    ids = pipeline.optics.random_key_ids
-    top, left, height, width = draw.crop
-    return EventClip(
-        [
-            sensor.events(view.contiguous(), draw.clip.fps, clip=index, view=i)
-            for i, view in zip(ids, views, strict=True)
-        ],
-        draw.clip.frames[:, top : top + height, left : left + width],
-        views[pipeline.optics.centre],
-        draw.clip.fps,
-        tuple((row, col) for row, col in pipeline.optics.positions or ()),
-    )
+    fps, ids = draw.clip.fps, pipeline.optics.random_key_ids
+    events = [
+        sensor.events(view.contiguous(), fps, clip=index, view=i)
+        for i, view in zip(ids, views, strict=True)
+    ]
+    target, turbulent = crop_frames(draw.clip.frames, draw.crop), views[pipeline.optics.centre]
+    return EventClip(events, target, turbulent, fps, pipeline.positions)
 
 
 def require_type(key: str, part: object, kind: type[Part]) -> Part:
@@ -167,10 +165,8 @@ def _apply_gain(views: Tensor, std: float, key: int) -> Tensor:
     """Multiply every view by a log-normal gain that is AR(1) over frames."""
     count, frames = views.shape[:2]
     drawn = noise.normal(key, torch.arange(count * frames)).view(count, frames)
-    innovation = (1 - GAIN_AR1_COEFFICIENT**2) ** 0.5
-    gains = accumulate(
-        drawn.unbind(1), lambda gain, new: GAIN_AR1_COEFFICIENT * gain + innovation * new
-    )
+    old, innovation = GAIN_AR1_COEFFICIENT, (1 - GAIN_AR1_COEFFICIENT**2) ** 0.5
+    gains = accumulate(drawn.unbind(1), lambda gain, new: old * gain + innovation * new)
     gain = (std * torch.stack(list(gains), 1)).exp()
     return (views * gain[:, :, None, None]).clamp(0, 1)
 
@@ -218,6 +214,6 @@ class StressBench:
         base = self.psnr(network)
         return [(name, base - self.psnr(network, change=c)) for name, c in changes.items()]
 
-    def score(self, frames: Float[Tensor, "windows 1 h w"], clip: EventClip) -> float:
+    def score(self, frames: Video, clip: EventClip) -> float:
         """Return the mean aligned PSNR of the frames after the warm-up."""
         return float(aligned_psnr(frames[self.warmup :], clip.truth[self.warmup :]).mean())

@@ -13,7 +13,7 @@ from torch import Tensor
 from src.bench.candidates import Candidate
 from src.bench.stress_tests.event_clips import ClipConditions, StressBench
 from src.bench.stress_tests.stress_results import StressResult, mean_result
-from src.deploy.forms import in_form
+from src.deploy.forms import convert_to_form
 from src.metrics.image import aligned_psnr
 from src.metrics.temporal import temporal_jitter_px
 from src.sim import noise
@@ -21,7 +21,7 @@ from src.sim import noise
 SCORED_EVERY = 4  # windows of a long run
 
 
-def measure_contrast_retention(
+def measure_contrast_retention_percent(
     network: Candidate, bench: StressBench, *, limit: float, windows: Sequence[int]
 ) -> StressResult:
     """Return the contrast kept, in %, after the last number of `windows` without an event."""
@@ -64,7 +64,7 @@ def measure_long_sequence_drift(
     return StressResult(losses[-1], "dB", limit, thinned, "windows")
 
 
-def measure_convergence_time(
+def measure_convergence_windows(
     network: Candidate, bench: StressBench, *, limit: float, within_db: float = 1.0
 ) -> StressResult:
     """Return the windows until the frame is within `within_db` of the clip's second half, for good;
@@ -91,11 +91,11 @@ def measure_flicker_recovery(
         disturbed, _ = clip.reconstruct(network, chain(windows[:half], flashes, windows[half:]))
         after = aligned_psnr(disturbed[half + length :], truth[half:])
         losses = aligned_psnr(plain[half:], truth[half:]) - after
-        times.append(find_last_exceedance(losses, within_db))
+        times.append(windows_to_last_exceedance(losses, within_db))
     return mean_result(times, "windows", limit)
 
 
-def measure_static_scene_jitter(
+def measure_static_scene_jitter_percent(
     network: Candidate, bench: StressBench, *, limit: float, moving_share: float = 0.0
 ) -> StressResult:
     """Return the temporal jitter of a static scene's video, in % of what turbulence does to one
@@ -119,10 +119,10 @@ def measure_static_scene_jitter(
 
 
 def measure_perturbation_growth(
-    network: Candidate, bench: StressBench, *, limit: float, size: float = 1e-3,
+    network: Candidate, bench: StressBench, *, limit: float, perturbation_rms: float = 1e-3,
     skip: int = 3,
 ) -> StressResult:  # fmt: skip
-    """Return the growth exponent, per window, of a perturbation of rms `size` in one window.
+    """Return the growth exponent, per window, of a perturbation of `perturbation_rms` in one.
 
     Fitted to the logarithm of the rms difference of the frames (a Lyapunov exponent); above 0 the
     perturbation grows.  The first `skip` windows after it do not count.
@@ -133,7 +133,7 @@ def measure_perturbation_growth(
         start = len(windows) // 3
         drawn = _draw_normal(windows[0], "growth")
         # Where there were events anyway, so that the same pixels are active.
-        perturbed = windows[start] + size * drawn * (windows[start] != 0)
+        perturbed = windows[start] + perturbation_rms * drawn * (windows[start] != 0)
         plain, _ = clip.reconstruct(network, windows)
         changed = [*windows[:start], perturbed, *windows[start + 1 :]]
         other, _ = clip.reconstruct(network, changed)
@@ -145,13 +145,13 @@ def measure_perturbation_growth(
 
 def measure_adversarial_gain(
     network: Candidate, bench: StressBench, *, limit: float, windows: int = 12,
-    steps: int = 8, size: float = 0.02,
+    steps: int = 8, perturbation_rms: float = 0.02,
 ) -> StressResult:  # fmt: skip
     """Return the largest gain from input to output: rms change of the last frame over rms of a
     perturbation.
 
-    The perturbation, of rms `size`, is added to the first of `windows` windows and found by `steps`
-    of gradient ascent (Tanay et al., arXiv 2010.05099).
+    The perturbation, of `perturbation_rms`, is added to the first of `windows` windows and found by
+    `steps` of gradient ascent (Tanay et al., arXiv 2010.05099).
     """
     network.require_parameters("its response is linear")
     clip = bench.clips()[0]
@@ -169,15 +169,15 @@ def measure_adversarial_gain(
     plain, extra = last_frame(torch.zeros(())), _draw_normal(selected[0][0], "worst")
     curve = []
     for step in range(steps):
-        extra = (extra * size / extra.square().mean().sqrt()).detach().requires_grad_()
+        extra = (extra * perturbation_rms / extra.square().mean().sqrt()).detach().requires_grad_()
         change = (last_frame(extra) - plain).square().mean()
         (gradient,) = torch.autograd.grad(change, extra)
-        curve.append((step, math.sqrt(float(change.detach())) / size))
+        curve.append((step, math.sqrt(float(change.detach())) / perturbation_rms))
         extra = gradient + 1e-12
     return StressResult(max(gain for _, gain in curve), "x", limit, curve, "steps of ascent")
 
 
-def measure_bf16_error(
+def measure_bf16_psnr_difference(
     network: Candidate, bench: StressBench, *, limit: float, windows: int
 ) -> StressResult:
     """Return the mean difference of aligned PSNR, in dB, between bf16 and float32 in the last
@@ -186,7 +186,7 @@ def measure_bf16_error(
     network.require_parameters("there is nothing to round")
     clip, quarter = bench.clips()[0], windows // 4
     loop, truth = clip.back_and_forth()
-    half = replace(network, network=in_form(network.loaded, "bf16"))
+    half = replace(network, network=convert_to_form(network.loaded, "bf16"))
     scores = []
     for form in (network, half):
         frames, _ = clip.reconstruct(form, islice(cycle(loop), quarter * 4))
@@ -203,10 +203,10 @@ def measure_settling_time(scores: Float[Tensor, " windows"], within_db: float) -
     """
     plateau = scores[len(scores) // 2 :].mean()
     smooth = scores.unfold(0, 5, 1).mean(1) if len(scores) >= 5 else scores
-    return find_last_exceedance(plateau - smooth[: len(scores) // 2], within_db)
+    return windows_to_last_exceedance(plateau - smooth[: len(scores) // 2], within_db)
 
 
-def find_last_exceedance(losses: Float[Tensor, " windows"], limit: float) -> float:
+def windows_to_last_exceedance(losses: Float[Tensor, " windows"], limit: float) -> float:
     """Return how many windows pass until `losses` is above `limit` for the last time."""
     beyond = (losses > limit).nonzero()
     return float(beyond[-1] + 1) if len(beyond) else 0.0

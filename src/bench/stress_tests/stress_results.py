@@ -98,7 +98,7 @@ def format_outcomes_csv(outcomes: Outcomes, titles: Mapping[str, str]) -> str:
     return format_csv(CSV_COLUMNS, lines)
 
 
-def format_summary(
+def format_markdown_summary(
     outcomes: Outcomes, titles: Mapping[str, str], standard_psnr: Mapping[str, float]
 ) -> str:
     """Return Markdown: for each network the tests it fails and passes."""

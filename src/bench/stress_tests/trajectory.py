@@ -3,7 +3,7 @@
 from statistics import fmean
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from src.bench.candidates import Candidate
@@ -15,6 +15,8 @@ GATE_PX = 24.0  # around the true front
 MARGIN_PX = 12.0  # from the frame's border, within which the true front does not count
 WARMUP_FRAMES = 32  # until the target has left its first place, which no event tells
 
+Film = Float[Tensor, "frames h w"]
+
 
 def measure_trajectory_deviation(
     network: Candidate, bench: StressBench, *, limit: float
@@ -22,9 +24,8 @@ def measure_trajectory_deviation(
     """Return the rms distance, in pixels, of the front of a flying target from its line, across it;
     the mean over clips of one target.
 
-    The front is the centroid of what has become brighter in the last frames near where it truly is,
-    so that neither a trail that stays nor a constant offset counts.  The curve begins with two
-    means to compare with, the network's without turbulence and that of the light of one view.
+    The front is the centroid of what has become brighter in the last frames near where it truly is.
+    The curve begins with the network's mean without turbulence and that of the light of one view.
     """
 
     def deviation(clip: EventClip) -> float:
@@ -39,9 +40,7 @@ def measure_trajectory_deviation(
     return StressResult(fmean(deviations), "px", limit, curve, "video")
 
 
-def measure_deviation(
-    frames: Float[Tensor, "frames h w"], truth: Float[Tensor, "frames h w"]
-) -> float:
+def measure_deviation(frames: Film, truth: Film) -> float:
     """Return the rms distance, in pixels, of the front in `frames` from its line in `truth`.
 
     Raises ValueError for fewer than four frames that count.
@@ -50,7 +49,8 @@ def measure_deviation(
         (film[LAG_FRAMES:] - film[:-LAG_FRAMES]).clamp(min=0) for film in (frames, truth)
     )
     known = _centroids(true)
-    counts = _is_inside(known, truth.shape[1:])
+    most = torch.tensor(truth.shape[:0:-1]) - 1.0 - MARGIN_PX
+    counts = ((known > MARGIN_PX) & (known < most)).all(1)
     counts[:WARMUP_FRAMES] = False
     if counts.sum() < 4:
         raise ValueError(f"data.test_windows must show more of a flight, got {counts.sum()} frames")
@@ -65,14 +65,8 @@ def measure_deviation(
     return float((error - error.mean()).square().mean().sqrt())
 
 
-def _centroids(weight: Float[Tensor, "frames h w"]) -> Float[Tensor, "frames 2"]:
+def _centroids(weight: Film) -> Float[Tensor, "frames 2"]:
     """Return the centres (x, y); NaN of a frame of zeros."""
     rows, columns = (torch.arange(side).to(weight) for side in weight.shape[1:])
     sums = torch.stack([weight.sum(1) @ columns, weight.sum(2) @ rows], 1)
     return sums / weight.sum((1, 2))[:, None]
-
-
-def _is_inside(place: Float[Tensor, "frames 2"], size: torch.Size) -> Bool[Tensor, " frames"]:
-    """Return where a place (x, y) lies well within a frame of `size` (h, w)."""
-    most = torch.tensor([size[1] - 1.0, size[0] - 1.0]) - MARGIN_PX
-    return ((place > MARGIN_PX) & (place < most)).all(1)

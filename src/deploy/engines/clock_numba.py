@@ -17,6 +17,9 @@ QUARTER = TILE // 2  # the same in cells of the context
 TAU_S, FLOOR, SUPPORT, SETTLING = map(f32, (ACTIVITY_TAU_S, MIN_ACTIVITY, MIN_SUPPORT, _SETTLING))
 TINY = f32(2.0**-126)  # what is smaller takes a processor a hundred times longer
 SIDE, REACH = CELL_PX, REACH_CELLS
+SMOOTHING = np.ones(1, np.float32)  # weights of REACH averages of three cells, one after the other
+for _ in range(REACH):
+    SMOOTHING = np.convolve(SMOOTHING, np.full(3, 1 / 3, np.float32)).astype(np.float32)
 
 
 @njit(nogil=True, cache=True)
@@ -58,9 +61,10 @@ def fade(kept, values):
 
 
 @njit(nogil=True, cache=True)
-def mark_supported(places, grid, kept, counts, trace, is_supported):
-    """Bring `trace` (views, rows, columns) to the end of the window, and set `is_supported` (rows,
-    columns), zeros, where a view has an event with support.  `counts`: zeros, as `trace`.
+def find_supported(places, grid, kept, counts, trace, supported):
+    """Bring `trace` (views, rows, columns) to the end of the window, and write into `supported`
+    (rows, columns), zeros, how many events of a cell have support, in the view that has most.
+    `counts`: zeros, as `trace`.
     """
     views, rows, columns = trace.shape
     fade(kept, trace.reshape(-1))
@@ -83,11 +87,11 @@ def mark_supported(places, grid, kept, counts, trace, is_supported):
             if has[v, r + 1]:
                 above = trace[v, r - 1] if r else nothing
                 below = trace[v, r + 1] if r + 1 < rows else nothing
-                _mark_row(above, trace[v, r], below, counts[v, r], line, is_supported[r])
+                _find_supported_in_row(above, trace[v, r], below, counts[v, r], line, supported[r])
 
 
 @njit(nogil=True, cache=True)
-def _mark_row(above, here, below, count, total, is_supported):
+def _find_supported_in_row(above, here, below, count, total, supported):
     # In the order, and rounded, as an average pooling of 3 x 3 adds them up.
     n = np.uint64(here.size)
     total[:] = 0
@@ -96,22 +100,49 @@ def _mark_row(above, here, below, count, total, is_supported):
             for c in range(n):
                 total[c + np.uint64(2) - k] += row[c]
     for c in range(n):
-        has = count[c] > 0 and f32(9) * (total[c + np.uint64(1)] / f32(9)) > SUPPORT
-        is_supported[c] |= u8(1) if has else u8(0)
+        others = f32(9) * (total[c + np.uint64(1)] / f32(9)) - here[c]
+        found = count[c] if others > SUPPORT else f32(0)
+        supported[c] = max(supported[c], found)
         count[c] = 0
 
 
 @njit(nogil=True, cache=True)
-def widen(is_supported, is_near, near_tiles):
-    """Set `is_near` within REACH of `is_supported` in each direction, and `near_tiles` that have
-    any; clear `is_supported`."""
+def add_evidence(supported, evidence):
+    """Add `supported` (rows, columns), smoothed over REACH on each side, to `evidence`."""
+    rows, columns = supported.shape
+    line, n = np.zeros(columns + 2 * REACH, f32), np.uint64(columns)
+    smoothed = np.zeros(columns, f32)
+    for r in range(rows):
+        first, last = columns, -1
+        for c in range(columns):
+            if supported[r, c] > 0:
+                first, last = min(first, c), c
+        if last < 0:
+            continue
+        line[REACH : REACH + columns] = supported[r]
+        smoothed[:] = 0
+        for k in range(np.uint64(2 * REACH + 1)):
+            for c in range(n):
+                smoothed[c] += SMOOTHING[k] * line[c + k]
+        begin, end = np.uint64(max(first - REACH, 0)), np.uint64(min(last + REACH + 1, columns))
+        for k in range(-REACH, REACH + 1):
+            if 0 <= r + k < rows:
+                row, weight = evidence[r + k], SMOOTHING[k + REACH]
+                for c in range(end - begin):
+                    row[begin + c] += weight * smoothed[begin + c]
+
+
+@njit(nogil=True, cache=True)
+def widen(supported, is_near, near_tiles):
+    """Set `is_near` within REACH of what is `supported` in each direction, and `near_tiles` that
+    have any; clear `supported`."""
     rows, columns = is_near.shape
     has = np.zeros(rows + 2 * REACH, u8)
     for r in range(rows):
-        any_set = u8(0)
+        most = f32(0)
         for c in range(np.uint64(columns)):
-            any_set |= is_supported[r, c]
-        has[r + REACH] = any_set
+            most = max(most, supported[r, c])
+        has[r + REACH] = most > 0
     line = np.zeros(columns + 2 * REACH, u8)
     for r in range(rows):
         is_near[r] = 0
@@ -121,7 +152,7 @@ def widen(is_supported, is_near, near_tiles):
         for k in range(-REACH, REACH + 1):
             if has[r + REACH + k]:
                 for c in range(np.uint64(columns)):
-                    line[c + np.uint64(REACH)] |= is_supported[r + k, c]
+                    line[c + np.uint64(REACH)] |= u8(supported[r + k, c] > 0)
         near = is_near[r]
         for k in range(np.uint64(2 * REACH + 1)):
             for c in range(np.uint64(columns)):
@@ -131,7 +162,7 @@ def widen(is_supported, is_near, near_tiles):
                 near_tiles[r // TILE, j] |= near[c]
     for r in range(rows):
         if has[r + REACH]:
-            is_supported[r] = 0
+            supported[r] = 0
 
 
 @njit(nogil=True, cache=True)
@@ -174,6 +205,17 @@ def advance(window_s, kept, is_near, near_tiles, active_tiles, activity, elapsed
             used = np.flatnonzero(columns_used)
             mark_reached(r0 + first, r0 + last, c0 + used[0], c0 + used[-1], changed)
     return longest
+
+
+@njit(nogil=True, cache=True)
+def advance_all(moving_s, evidence_per_s, elapsed_s, evidence, is_pending):
+    """Advance the clock of every cell by at least `moving_s`, and add to its evidence."""
+    elapsed, known, pending = elapsed_s.reshape(-1), evidence.reshape(-1), is_pending.reshape(-1)
+    more = f32(evidence_per_s * moving_s)
+    for i in range(np.uint64(elapsed.size)):
+        elapsed[i] = max(elapsed[i], moving_s)
+        known[i] += more
+        pending[i] = u8(1)
 
 
 @njit(nogil=True, cache=True)

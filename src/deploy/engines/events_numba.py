@@ -13,7 +13,7 @@ GOOD, BACKWARDS, OFF_SENSOR, NO_VIEW, NO_NUMBER, NO_SIGN = range(6)  # what `che
 
 
 @njit(nogil=True, cache=True)
-def check(t, x, y, p, view, views, height, width, signs):
+def find_bad_event(t, x, y, p, view, views, height, width, signs):
     """Return (index, what) of the first event that is wrong, or (-1, GOOD); of `signs`, p is one
     of -1 and 1.
     """

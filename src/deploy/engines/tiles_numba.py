@@ -7,7 +7,12 @@ and column of each tile in the map, its halo included, which may lie outside.
 import numpy as np
 from numba import njit
 
+from src.models.setnet import BACKGROUND as _BACKGROUND
+from src.models.setnet import CELL_PX, REVEALING_EVENTS
+
 f32 = np.float32
+
+CELL, BACKGROUND, HALF = CELL_PX, f32(_BACKGROUND), f32(REVEALING_EVENTS)
 
 
 @njit(nogil=True, cache=True)
@@ -127,22 +132,28 @@ def smooth(context, corners, cells, kept, smoothed):
 
 
 @njit(nogil=True, cache=True)
-def write_pixels(tiles, corners, side, frame):
-    """Write tiles (n, t, t, side * side) of the pixels of squares, row by row, into `frame`;
-    `corners`: in squares."""
+def write_pixels(tiles, corners, evidence, frame):
+    """Write tiles (n, t, t, pixels) of the pixels of 2 x 2 cells, row by row, into `frame`, more of
+    them and less of the background the more `evidence` a cell has; `corners`: in 2 x 2 cells."""
+    side = 2 * CELL
     squares_down, squares_across = len(frame) // side, frame.shape[1] // side
-    across, of, n = tiles.shape[2], tiles.reshape(-1), np.uint64(side)
+    across, of, n = tiles.shape[2], tiles.reshape(-1), np.uint64(CELL)
     for i in range(len(corners)):
         r0, c0 = corners[i]
         for k in range(min(tiles.shape[1], squares_down - r0)):
             for a in range(side):
-                row, to = frame[side * (r0 + k) + a], np.uint64(side * c0)
+                row, known = frame[side * (r0 + k) + a], evidence[2 * (r0 + k) + a // CELL]
+                to, cell = np.uint64(side * c0), np.uint64(2 * c0)
                 at = np.uint64(((i * tiles.shape[1] + k) * across * side + a) * side)
                 for _ in range(min(across, squares_across - c0)):
-                    for b in range(n):
-                        row[to + b] = of[at + b]
-                    to += n
-                    at += n * n
+                    for _ in range(2):
+                        revealed = known[cell] / (known[cell] + HALF)
+                        for b in range(n):
+                            row[to + b] = BACKGROUND + revealed * (of[at + b] - BACKGROUND)
+                        cell += np.uint64(1)
+                        to += n
+                        at += n
+                    at += np.uint64(side * side - side)
 
 
 @njit(nogil=True, cache=True)

@@ -1,9 +1,9 @@
 """Calibration targets: the points of a checkerboard, circle grid or ChArUco board in a picture.
 
-`detect_candidates` finds points of a kind of target anywhere in a picture that shows it many times,
-mirrored or not; `find_points` those of the one target in a crop row by row, NaN where one is not
-seen, or None.  `shape`: (rows, columns) of these; `count`: features of a whole target; one that is
-`ordered` knows which point is which and is not found in a mirrored picture.
+`detect_candidate_points` finds points of a kind of target anywhere in a picture that shows it many
+times, mirrored or not; `find_points` those of the one target in a crop row by row, NaN where one is
+not seen, or None.  `shape`: (rows, columns) of these; `count`: features of a whole target; one that
+is `ordered` knows which point is which and is not found in a mirrored picture.
 Pictures are (h, w) uint8; points are (x, y) pixels, (0, 0) the centre of the top left pixel.
 """
 
@@ -44,7 +44,7 @@ class _Grid:
 class Checkerboard(_Grid):
     """`rows` x `cols` inner corners, each at least 3."""
 
-    def detect_candidates(self, picture: Picture) -> Points:
+    def detect_candidate_points(self, picture: Picture) -> Points:
         """Saddle points: where the Hessian's determinant is most negative for the contrast there.
 
         The threshold is half of what the corners of four whole boards have in the median.
@@ -73,7 +73,7 @@ class Circles(_Grid):
 
     dark: bool = True
 
-    def detect_candidates(self, picture: Picture) -> Points:
+    def detect_candidate_points(self, picture: Picture) -> Points:
         spots = self._detector().detect(self._dark(picture))
         return np.array([spot.pt for spot in spots], dtype=np.float64).reshape(-1, 2)
 
@@ -121,7 +121,7 @@ class Charuco(_Grid):
     def count(self) -> int:
         return self.rows * self.cols // 2
 
-    def detect_candidates(self, picture: Picture) -> Points:
+    def detect_candidate_points(self, picture: Picture) -> Points:
         """Markers of both hands: those of the picture and of the picture mirrored in x."""
         detector = cv2.aruco.ArucoDetector(self._board().getDictionary())
         plain = _middles(detector.detectMarkers(picture)[0])

@@ -22,6 +22,7 @@ from src.sim.sensor.sensor import EventSensor, Sensor
 HOT_FACTOR = 5.0  # times its neighbours' median plus its view's mean: more than texture makes
 HOT_EVENTS = 10  # beyond that, so that a pixel is not hot by chance
 ROUNDS = 4  # of simulating with the ratio of OFF to ON threshold found so far
+Clip = Float[Tensor, "views frames h w"]
 GRID = tuple(np.geomspace(0.05, 2.0, 24).round(4).tolist())
 
 
@@ -69,9 +70,8 @@ def measure_event_rates(
         x, y = piece["x"].max(), piece["y"].max()
         height, width = view.shape
         if x >= width or y >= height:
-            raise ValueError(
-                f"events lie outside the {width}x{height} sensor of the views: up to {x}, {y}"
-            )
+            sensor = f"the {width}x{height} sensor of the views"
+            raise ValueError(f"events lie outside {sensor}: up to {x}, {y}")
         times += [int(piece["t"][0]), int(piece["t"][-1])]
         pixels = np.ravel_multi_index((piece["y"], piece["x"]), view.shape)
         totals += np.bincount(pixels, minlength=totals.size).reshape(view.shape)
@@ -122,13 +122,9 @@ class ThresholdEstimate:
 
 
 def simulate_event_rates(
-    clips: Iterable[Float[Tensor, "views frames h w"]],
-    fps: float,
-    sensor: Sensor,
-    thresholds: Sequence[float] = GRID,
-    *,
+    clips: Iterable[Clip], fps: float, sensor: Sensor, thresholds: Sequence[float] = GRID, *,
     off_ratio: float = 1.0,
-) -> RateCurve:
+) -> RateCurve:  # fmt: skip
     """Return the rates of a sensor that sees `clips`, at all thresholds with the same noise.
 
     Its own `threshold` and `off_ratio` are not used.  Raises ValueError for another sensor.
@@ -147,12 +143,9 @@ def simulate_event_rates(
 
 
 def estimate_contrast_threshold(
-    rates: EventRates,
-    clips: Sequence[Float[Tensor, "views frames h w"]],
-    fps: float,
-    sensor: Sensor,
+    rates: EventRates, clips: Sequence[Clip], fps: float, sensor: Sensor,
     thresholds: Sequence[float] = GRID,
-) -> ThresholdEstimate:
+) -> ThresholdEstimate:  # fmt: skip
     """Return the thresholds at which the sensor makes the recording's rates.
 
     The geometric mean of ON and OFF rate gives their size; the quotient gives the ratio of OFF to

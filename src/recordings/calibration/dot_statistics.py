@@ -38,7 +38,7 @@ class DotStatistics:
         return np.isnan(self.blur).sum(1)
 
     @property
-    def blur_ratio(self) -> Float[np.ndarray, "views dots"]:
+    def blur_over_still(self) -> Float[np.ndarray, "views dots"]:
         return _mean(self.blur, 1) / self.still_blur
 
     @property
@@ -60,12 +60,12 @@ class DotStatistics:
         return autocorrelate(self.tilt[self.centre, :, self.middle], len(self.lags_s))
 
     @property
-    def within_view(self) -> Float[np.ndarray, "dots dots"]:
+    def centre_view_correlation(self) -> Float[np.ndarray, "dots dots"]:
         """Correlation of tilt between the dots of the centre view."""
         return tilt_correlation(self.tilt[self.centre])
 
     @property
-    def across_views(self) -> Float[np.ndarray, "views views"]:
+    def tilt_correlation_across_views(self) -> Float[np.ndarray, "views views"]:
         """Correlation of tilt between the views, of the middle dot."""
         return tilt_correlation(self.tilt[:, :, self.middle].swapaxes(0, 1))
 
@@ -82,8 +82,10 @@ class DotStatistics:
             "failed": int(self.failed.sum()),
             "tilt_rms_px": float(np.sqrt(_mean(self.tilt[view, :, dot] ** 2, None))),
             "tilt_decay_s": float(decay_time_s(self.autocorrelation, self.fps)),
-            "across_views": float(self.across_views[off].mean()) if off.any() else float("nan"),
-            "blur_ratio": float(self.blur_ratio[view, dot]),
+            "across_views": float(self.tilt_correlation_across_views[off].mean())
+            if off.any()
+            else float("nan"),
+            "blur_over_still": float(self.blur_over_still[view, dot]),
             "scintillation": float(self.scintillation[view, dot]),
             "still_scintillation": float(self.still_scintillation[view, dot]),
         }
@@ -163,10 +165,8 @@ def tilt_correlation(tilt: Float[np.ndarray, "frames k 2"]) -> Float[np.ndarray,
     return products / np.sqrt(power * power.T)
 
 
-def scintillation_index(
-    intensity: Float[np.ndarray, "views frames dots"],
-) -> Float[np.ndarray, "views dots"]:
-    """Return <I^2> / <I>^2 - 1 over the frames."""
+def scintillation_index(intensity: np.ndarray) -> Float[np.ndarray, "views dots"]:
+    """Return <I^2> / <I>^2 - 1 over the frames of an intensity (views, frames, dots)."""
     return _mean(intensity**2, 1) / _mean(intensity, 1) ** 2 - 1
 
 
@@ -175,13 +175,13 @@ def decay_time_s(correlations: Float[np.ndarray, " lags"], fps: float) -> float:
     return find_first_fall(np.arange(len(correlations)), correlations, np.exp(-1)) / fps
 
 
-def write_dot_csv(
+def write_view_dot_csv(
     statistics: DotStatistics, path: Path | str, positions: Sequence[tuple[int, int]]
 ) -> None:
-    """Write one row per view and dot: failures, tilt, blur, their ratio, scintillation."""
+    """Write one row per view and dot: failures, tilt, blur, blur over still, scintillation."""
     heads = ["row", "col", "dot", "frames", "failed", "tilt_x_rms_px", "tilt_y_rms_px"]
     heads += ["tilt_decay_s", "blur_px"]
-    by_dot = ("blur_ratio", "scintillation", "still_scintillation")
+    by_dot = ("blur_over_still", "scintillation", "still_scintillation")
     numbers, rows = [getattr(statistics, name) for name in by_dot], []
     for view, dot in np.ndindex(statistics.still_blur.shape):
         tilt = statistics.tilt[view, :, dot]

@@ -20,6 +20,7 @@ MIN_LENGTH_PX = 2.5  # the shortest Gaussian that is taken for tilt
 DISTANCE_CLASSES = 22  # of distances
 MIN_PAIRS = 30  # pairs that make a class
 MAX_LAG = 120  # frames
+Distances = Float[np.ndarray, " distances"]
 
 
 @dataclass(frozen=True)
@@ -31,16 +32,12 @@ class CovarianceSums:
     total: Float[np.ndarray, "frames squares classes"]
     count: Float[np.ndarray, "frames squares classes"]
 
-    def mean_and_count(
-        self,
-        frame_weights: Float[np.ndarray, " frames"],
-        square_weights: Float[np.ndarray, " squares"],
+    def weighted_mean_and_count(
+        self, frames: Float[np.ndarray, " frames"], squares: Float[np.ndarray, " squares"]
     ) -> tuple[Float[np.ndarray, " classes"], Float[np.ndarray, " classes"]]:
-        """Return the mean product of every class and the count, both weighted."""
+        """Return the mean product of every class and the count, for these weights."""
         both = (self.total, self.count)
-        total, count = (
-            np.einsum("t,tsk,s->k", frame_weights, sums, square_weights) for sums in both
-        )
+        total, count = (np.einsum("t,tsk,s->k", frames, sums, squares) for sums in both)
         return total / np.maximum(count, 1), count
 
 
@@ -56,7 +53,7 @@ class TiltStatistics:
     half_px: float
     uniform_share: float
     decay_frames: float
-    correlation: Float[np.ndarray, " distances"]
+    correlation: Distances
     lag_correlation: Float[np.ndarray, " lags"]
     fitted: Float[np.ndarray, " k"]
 
@@ -103,7 +100,7 @@ def sum_over_distance(tracks: PointTracks, size: tuple[int, int]) -> CovarianceS
     return CovarianceSums(mean, np.stack(total), np.stack(count))
 
 
-def sum_over_time_lags(tracks: PointTracks, size: tuple[int, int]) -> CovarianceSums:
+def sum_autocovariance(tracks: PointTracks, size: tuple[int, int]) -> CovarianceSums:
     """Sum the products of displacement of every point with its own at lags of 0, 1, ... frames."""
     a, b = centre_displacements(tracks)
     frames = len(tracks.seen)
@@ -129,11 +126,7 @@ class CovarianceModel:
         self.pairs = np.hypot(*(points[0] - points[1]).T)  # of a square view
 
     def describe_tilt(
-        self,
-        product: Float[np.ndarray, " distances"],
-        count: Float[np.ndarray, " distances"],
-        lags: Float[np.ndarray, " lags"],
-        frames: int,
+        self, product: Distances, count: Distances, lags: Float[np.ndarray, " lags"], frames: int
     ) -> TiltStatistics:
         """Describe the tilt by its mean product and its count over distance, and its mean product
         over lags, in a film of so many `frames`."""
@@ -176,10 +169,9 @@ class CovarianceModel:
 def _correlation_over_lags(
     product: np.ndarray, power: float, frames: int
 ) -> tuple[np.ndarray, float]:
-    """Return the correlation over lags, and the share of power left after taking off the mean.
-
-    Taking off the mean of T frames takes off m, the mean correlation of all their pairs:
-    measured = (true - m) / (1 - m).  Solved for true; what lies beyond its first zero counts as 0.
+    """Return the correlation over lags, and the share of power left after taking off the mean of
+    the frames: measured = (true - m) / (1 - m), m the mean correlation of all their pairs.  What
+    lies beyond the first zero of `true` counts as 0.
     """
     measured = np.minimum(product / max(power, 1e-12), 1.0)
     measured[0] = 1.0  # what is more is the error of tracking

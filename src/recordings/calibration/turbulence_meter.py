@@ -1,8 +1,7 @@
 """Turbulence in front of a still scene: what a video shows of tilt and blur, with intervals.
 
 Lengths are in pixels of a frame whose smaller side is 256.  Intervals of 95 % come from resampling
-blocks of frames and squares of the frame (bootstrap), which knows of chance only, and, for the
-numbers in METHOD_ERROR, from what the method itself errs by.
+blocks of frames and squares of the frame (bootstrap) and, for some, from METHOD_ERROR.
 """
 
 import math
@@ -38,8 +37,7 @@ class TurbulenceMeasurement:
     """What was `found`, and the curves behind it, lengths in pixels of a frame of SIDE.
 
     `tilt` holds curves over `distance_px`, over `fitted_px` and over lags in frames; `rms_px` of
-    every point at `place` (x, y), in pixels of `picture`; `corners`, how many it was tried with;
-    `fps` None: not known.
+    every point at `place` (x, y), in pixels of `picture`; `corners`: how many were tried.
     """
 
     found: TurbulenceFile
@@ -71,24 +69,21 @@ def measure_turbulence(
     tracks = _select_still(tracks, size)
     unit = SIDE / min(size)
     pairs = tilt_covariance.sum_over_distance(tracks, size)
-    lags = tilt_covariance.sum_over_time_lags(tracks, size)
+    lags = tilt_covariance.sum_autocovariance(tracks, size)
     model = CovarianceModel(pairs.at, tracks.window_px2, size)
-    every = np.ones(len(frames)), np.ones(CELLS**2)
-    tilt = model.describe_tilt(
-        *pairs.mean_and_count(*every), lags.mean_and_count(*every)[0], len(frames)
-    )
+
+    def describe(*weights: np.ndarray) -> TiltStatistics:
+        over_lags, _ = lags.weighted_mean_and_count(*weights)
+        return model.describe_tilt(*pairs.weighted_mean_and_count(*weights), over_lags, len(frames))
+
+    tilt = describe(np.ones(len(frames)), np.ones(CELLS**2))
     rms_px = tilt.power**0.5 * unit
     if rms_px < MIN_RMS_PX:
         raise ValueError(
             f"video must show a scene through turbulent air, got a tilt of {rms_px:.3f} px rms"
             f" of {SIDE} at {len(tracks.place)} points, which is none"
         )
-    drawn = [
-        model.describe_tilt(
-            *pairs.mean_and_count(*chosen), lags.mean_and_count(*chosen)[0], len(frames)
-        )
-        for chosen in _resampled(len(frames), 2 * tilt.decay_frames)
-    ]
+    drawn = [describe(*chosen) for chosen in _resampled(len(frames), 2 * tilt.decay_frames)]
     numbers = _summarize_tilt(tilt, drawn, unit, fps, len(lags.at))
     numbers["blur_ratio"] = estimate_blur_ratio(*_track_at_side(frames, tracks))
     return TurbulenceMeasurement(
@@ -132,9 +127,7 @@ def _width_ratio(sums: Float[np.ndarray, "3"]) -> float:
     return max(math.sqrt(usual / sharpest), 1.0)
 
 
-def shrink_frame(
-    frame: Float[np.ndarray, "h w"], largest: int = SIZES[0]
-) -> Float[np.ndarray, "_h _w"]:
+def shrink_frame(frame: np.ndarray, largest: int = SIZES[0]) -> Float[np.ndarray, "_h _w"]:
     """Return a frame whose smaller side has `largest` pixels at most: so large it is worked on."""
     least = min(frame.shape)
     if least <= largest:

@@ -42,7 +42,7 @@ def find_target(
     row, NaN where one is not seen.  `mirrors`: the view at (row, col) is mirrored in x for odd col
     and in y for odd row; a target that knows its hand (ChArUco) decides itself.
     """
-    clusters = cluster_points(target.detect_candidates(picture), target.count)
+    clusters = cluster_points(target.detect_candidate_points(picture), target.count)
     places = _sort_into_grid(np.array([cluster.mean(0) for cluster in clusters]), picture.shape)
     points, mirrored = {}, {}
     for position, cluster in zip(places, clusters, strict=True):
@@ -130,11 +130,9 @@ def fit_homographies(
     for at in sorted(found):
         both = np.isfinite(found[at]).all(1) & np.isfinite(centre).all(1)
         points, onto = found[at][both], centre[both]
-        if len(points) < 6:
-            raise ValueError(
-                f"calibrate: view {at} must share 6 or more points with the centre,"
-                f" got {len(points)}"
-            )
+        if (shared := len(points)) < 6:
+            needed = "6 or more points with the centre"
+            raise ValueError(f"calibrate: view {at} must share {needed}, got {shared}")
         matrix, good = cv2.findHomography(points, onto, cv2.RANSAC, MAX_ERROR_PX, maxIters=5000)
         if matrix is None:
             raise ValueError(f"calibrate: no homography fits view {at} within {MAX_ERROR_PX} px")
@@ -182,9 +180,8 @@ def views_from_corners(corners: Mapping[Position, Points], *, sensor: Size, mode
         if np.shape(quad) != (4, 2) or not np.isfinite(quad).all():
             raise ValueError(f"calibrate.corners of view {at} must be four (x, y), got {quad}")
     if (0, 0) not in corners:
-        raise ValueError(
-            f"calibrate.corners must have the centre view (0, 0), got {sorted(corners)}"
-        )
+        got = sorted(corners)
+        raise ValueError(f"calibrate.corners must have the centre view (0, 0), got {got}")
     centre = corners[0, 0].astype(np.float32)
     views = [
         View(at, cv2.getPerspectiveTransform(corners[at].astype(np.float32), centre), 0.0, 4)
@@ -206,7 +203,6 @@ def read_corners(path: Path | str) -> dict[Position, Points]:
             corners = [(float(x), float(y)) for x, y in entry["corners"]]
             found[row, column] = np.array(corners).reshape(-1, 2)
     except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, OverflowError) as error:
-        why = f"{type(error).__name__} {error}"
-        message = f"corners must be a list of position and corners, got {path}: {why}"
-        raise ValueError(message) from None
+        got = f"{path}: {type(error).__name__} {error}"
+        raise ValueError(f"corners must be a list of position and corners, got {got}") from None
     return found

@@ -4,29 +4,123 @@ import numpy as np
 from numba import njit
 
 LONG_AGO_US = -(2**62)
+KEPT, DROPPED, RIVAL, RETURNED, NEITHER = range(5)  # labels; the last three are not final
+ALONE_US = 3_600_000_000  # a few first events that long before all others are outliers
+LAST_GAP_US = 1_000_000  # a few last events later by more, and by LAST_GAP times the file, too
+LAST_GAP = 10
 
 
 @njit(nogil=True, cache=True)
-def convert_events(t, x, y, p, width, height, last, out):
-    """Fill `out` with the events on the sensor; return (kept, last time, back, outside).
+def convert_events(t, x, y, p, width, height, found, out):
+    """Fill `out` with the events on the sensor; return (kept, outside, wrong).
 
-    `p` is ON where positive.  An event earlier than one before it is given that one's time and
-    counted as gone back; one outside `width` x `height` (0: not known) is dropped and counted.
+    `t` int64 us; `p` is ON where positive, else OFF.  One outside `width` x `height` (0: not known)
+    is left out and counted.  `wrong`: the place of the first event whose time is beyond 2^62 us,
+    whose polarity is none of -1, 0, 1 or, where the size is not known, whose x or y is not in
+    0..65535; -1 for none.  `found`: largest x and y so far, (2,) int64.
     """
-    kept = back = outside = 0
+    kept = outside = 0
+    most_x, most_y = found[0], found[1]
     for i in range(t.size):
-        if width > 0 and not (0 <= x[i] < width and 0 <= y[i] < height):
-            outside += 1
-            continue
-        now = np.int64(t[i])
-        if now < last:
-            back += 1
-            now = last
-        last = now
-        out[kept].t, out[kept].x, out[kept].y = now, x[i], y[i]
-        out[kept].p = 1 if p[i] > 0 else -1
+        now, column, row, sign = t[i], np.int64(x[i]), np.int64(y[i]), p[i]
+        if sign < -1 or sign > 1 or now <= LONG_AGO_US or now >= -LONG_AGO_US:
+            return kept, outside, i
+        most_x, most_y = max(most_x, column), max(most_y, row)
+        if width > 0:
+            if not (0 <= column < width and 0 <= row < height):
+                outside += 1
+                continue
+        elif not (0 <= column < 65536 and 0 <= row < 65536):
+            return kept, outside, i
+        out[kept].t, out[kept].x, out[kept].y = now, column, row
+        out[kept].p = 1 if sign > 0 else -1
         kept += 1
-    return kept, last, back, outside
+    found[0], found[1] = most_x, most_y
+    return kept, outside, -1
+
+
+@njit(nogil=True, cache=True)
+def measure_lateness(t, latest):
+    """Return how many of `t` are before one before them or before `latest`, and by how much at
+    most."""
+    late = most = 0
+    for now in t:
+        if now < latest:
+            late, most = late + 1, max(most, latest - now)
+        else:
+            latest = now
+    return late, most
+
+
+@njit(nogil=True, cache=True)
+def label_events(t, first, latest, count, buffer_us, few, at_end, labels):
+    """Write KEPT or DROPPED to `labels` of events in their order; return (decided, latest, count,
+    restarted): those from `decided` on wait for what follows or, `restarted`, for another clock.
+
+    `first`, `latest`, `count` are of the events kept so far.  An event within `buffer_us` of the
+    latest is kept.  One further away opens a challenge: it and those that go on from it are rivals,
+    those that go on from the latest return.  `few` rivals win: later ones are kept as after a
+    silence, earlier ones are a clock that restarts.  Returned events win when they are as many.
+    The others are outliers.  `at_end` nothing follows: later rivals win, unless they are few and
+    far (LAST_GAP), earlier ones are outliers.
+    """
+    i, begin, aside = 0, -1, -1  # the challenge, and the first event in it that is neither
+    later, rival, ours, rivals, returned = False, latest, latest, 0, 0
+    while True:
+        while i < t.size:
+            now = t[i]
+            if begin < 0:
+                if count == 0 or -buffer_us <= now - latest <= buffer_us:
+                    latest, first = (now, now) if count == 0 else (max(latest, now), first)
+                    labels[i], count = KEPT, count + 1
+                else:
+                    begin, aside, later, rival, ours = i, -1, now > latest, now, latest
+                    labels[i], rivals, returned = RIVAL, 1, 0
+            elif now >= rival - buffer_us if later else now < ours - buffer_us:
+                labels[i], rivals, rival = RIVAL, rivals + 1, max(rival, now)
+            else:
+                returned += 1
+                if ours - buffer_us <= now <= ours + buffer_us:
+                    labels[i], ours = RETURNED, max(ours, now)
+                else:
+                    labels[i], aside = NEITHER, i if aside < 0 else aside
+            i += 1
+            if begin >= 0 and (rivals >= few or returned >= rivals):
+                break
+        if begin < 0:
+            return t.size, latest, count, False
+        if i == t.size and rivals < few and returned < rivals and not at_end:
+            return begin, latest, count, False
+        gap = t[begin] - latest
+        wins = rivals >= few or (at_end and returned < rivals and later)
+        if rivals >= few and (not later or (count < few and gap > ALONE_US)):
+            return begin, latest, count, True
+        if rivals < few and gap > max(LAST_GAP_US, LAST_GAP * (latest - first)):
+            wins = wins and rivals * 100 > count
+        winner, end = (RIVAL, i) if wins else (RETURNED, i if aside < 0 else aside)
+        for k in range(begin, end):
+            near = later and not wins and labels[k] == RIVAL and t[k] <= ours + buffer_us
+            labels[k] = KEPT if labels[k] == winner or near else DROPPED
+            if labels[k] == KEPT:
+                latest, count = max(latest, t[k]), count + 1
+        i, begin = end, -1
+
+
+@njit(nogil=True, cache=True)
+def sort_slightly_late(t, order, most_moves):
+    """Sort `t` (n,) and `order`, its places, by insertion, those that are equal as they are; return
+    whether `most_moves` were enough."""
+    moves = 0
+    for i in range(1, t.size):
+        now, place, k = t[i], order[i], i
+        while k > 0 and t[k - 1] > now:
+            t[k], order[k] = t[k - 1], order[k - 1]
+            k -= 1
+        t[k], order[k] = now, place
+        moves += i - k
+        if moves > most_moves:
+            return False
+    return True
 
 
 @njit(nogil=True, cache=True)

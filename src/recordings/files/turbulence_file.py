@@ -15,7 +15,7 @@ import yaml
 from src.records import safe_yaml
 from src.sim.turbulence import prior
 from src.sim.turbulence.atmosphere import Atmosphere
-from src.sim.turbulence.prior import ImageStatistics, Range, log_uniform
+from src.sim.turbulence.prior import Range, TargetImageStatistics, log_uniform
 from src.sim.turbulence.simulated import SimulatedTurbulence
 
 SIDE = 256  # pixels of the smaller side of the frame that lengths are stated for
@@ -132,7 +132,7 @@ class MeasuredTurbulence(SimulatedTurbulence):
             u = torch.rand(5, generator=generator, dtype=torch.float64).tolist()
             rms, blur, share = self.file.rms_px, self.file.blur_ratio, self.file.whole_share
             length = log_uniform(u[0], self.lengths, "half_length_px")
-            seen = ImageStatistics(
+            seen = TargetImageStatistics(
                 tilt_correlation_half_length_px=float(length),
                 tilt_correlation_time_s=float(log_uniform(u[1], self.decays, "decay_s")),
                 tilt_px=float(log_uniform(u[2], _bounds(rms), "rms_px")),
@@ -146,10 +146,6 @@ class MeasuredTurbulence(SimulatedTurbulence):
             except ValueError as error:
                 reason = error
         raise ValueError(f"turbulence.measured={self.measured}: {reason}")
-
-    def with_options(self, **options: Any) -> "MeasuredTurbulence":
-        """Return the same turbulence with some of its options replaced."""
-        return MeasuredTurbulence(self.measured, self.atmosphere, **self.options | options)
 
 
 def _drawing_range(estimate: IntervalEstimate, unknown: Range) -> Range:

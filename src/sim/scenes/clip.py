@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any, Protocol, runtime_checkable
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -49,7 +49,6 @@ class Scene(Protocol):
 
     def clip(self, index: int) -> Clip:
         """Return clip `index`, a function of `index` and the arguments of the class alone."""
-        ...
 
 
 @dataclass(kw_only=True, eq=False)
@@ -80,10 +79,6 @@ class SceneBase:
                 raise ValueError(f"scene.{name} must be a range 0 < low <= high, got {ends}")
         self.size = self.height, self.width
         self.times_s = np.arange(self.frames) / self.fps
-
-    def shared_arguments(self) -> dict[str, Any]:
-        """Return the arguments of SceneBase, for a scene within this one."""
-        return {one.name: getattr(self, one.name) for one in fields(SceneBase)}
 
 
 class FrameRateMixture:

@@ -1,8 +1,7 @@
 """Clips from footage: REDS as it is distributed, any video file, any folder of frames.
 
-The middle of the picture is cut out in the frame's proportions and shrunk with an area filter.  A
-clip is a function of time: its frame at time t is the footage at t, and between two frames of the
-footage their linear blend, which adds no motion.  Grey values are luminance code values.
+The middle of the picture is cut out in the frame's proportions and shrunk with an area filter;
+between two frames of the footage lies their linear blend.  Grey values are luminance code values.
 """
 
 import math

@@ -8,7 +8,7 @@ is brightest twice a period: at 100 Hz where the mains have 50 Hz, at 120 Hz whe
 import math
 from bisect import bisect
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import accumulate
 from typing import Any
 
@@ -35,12 +35,12 @@ class Mixture(SceneBase):
     from 0 on, 0 leaves it out; and `splits`, those that it serves (None: all).  `flicker_share`: of
     the clips whose light flickers with the mains, by a share out of `percent_flicker`; none does
     below 480 frames (windows times substeps) a second, where it would alias.  `root`,
-    `train_root` and `video_root` are there for the parts' configs to refer to.
+    `extra_train_root` and `video_root` are there for the parts' configs to refer to.
     """
 
     parts: Mapping[str, Mapping[str, Any]]
     root: Root = None
-    train_root: Root = None
+    extra_train_root: Root = None
     video_root: str | None = None
     flicker_share: float = 0.0
     percent_flicker: Sequence[float] = (0.05, 0.4)
@@ -48,24 +48,21 @@ class Mixture(SceneBase):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0 <= self.percent_flicker[0] <= self.percent_flicker[1] < 1:
-            got = list(self.percent_flicker)
-            raise ValueError(
-                f"scene.percent_flicker must be a range 0 <= low <= high < 1, got {got}"
-            )
+            allowed, got = "a range 0 <= low <= high < 1", list(self.percent_flicker)
+            raise ValueError(f"scene.percent_flicker must be {allowed}, got {got}")
         served = []
         for name, part in self.parts.items():
             share, splits = part["share"], part.get("splits") or SPLITS
             if not (isinstance(share, int | float) and 0 <= share < math.inf):
                 raise ValueError(f"scene.parts.{name}.share must be >= 0, got {share}")
             if not set(splits) <= set(SPLITS):
-                allowed = ", ".join(SPLITS)
-                raise ValueError(
-                    f"scene.parts.{name}.splits must be some of {allowed}, got {splits}"
-                )
+                key, allowed = f"scene.parts.{name}.splits", ", ".join(SPLITS)
+                raise ValueError(f"{key} must be some of {allowed}, got {splits}")
             served += [part] if share > 0 and self.split in splits else []
         if not served:
             raise ValueError(f"scene.parts must have a share > 0 for split={self.split}, got none")
-        self.scenes = [part["scene"](**self.shared_arguments()) for part in served]
+        shared = {one.name: getattr(self, one.name) for one in fields(SceneBase)}
+        self.scenes = [part["scene"](**shared) for part in served]
         self.cumulative_shares = list(accumulate(part["share"] for part in served))
         self.key = noise.key(self.seed, self.split, "mixture")
 

@@ -30,7 +30,7 @@ class SimilarityMotion:
         """Stay as it is at t = 0."""
         self.drift, self.amplitude = 0 * self.drift, 0 * self.amplitude
 
-    def at(self, time_s: float) -> tuple[NDArray, float, float]:
+    def pose_at(self, time_s: float) -> tuple[NDArray, float, float]:
         """Return the shift (x, y) in frame widths, the angle in rad and the logarithm of zoom."""
         wave = self.amplitude * (np.sin(self.pace * time_s + self.phase) - np.sin(self.phase))
         return self.drift * time_s + wave[:2], self.angle + wave[2], wave[3]
@@ -74,7 +74,7 @@ class MovingLayer:
 
     def matrix(self, time_s: float, size: tuple[int, int]) -> Float[np.ndarray, "2 3"]:
         """Return the map from frame pixels (x, y) to picture pixels."""
-        (height, width), (shift, angle, log_zoom) = size, self.motion.at(time_s)
+        (height, width), (shift, angle, log_zoom) = size, self.motion.pose_at(time_s)
         cos, sin = math.cos(angle), math.sin(angle)
         turn = self.zoom * math.exp(log_zoom) * np.array([[cos, -sin], [sin, cos]])
         middle = np.array([(width - 1) / 2, (height - 1) / 2])
@@ -125,9 +125,7 @@ def random_outline_mask(shape: tuple[int, ...], rng: np.random.Generator) -> NDA
     return np.clip(mask, 0, 1)
 
 
-def _visible_box(
-    shape: tuple[int, ...], matrix: NDArray, size: tuple[int, int]
-) -> tuple[slice, slice]:
+def _visible_box(shape: tuple, matrix: NDArray, size: tuple[int, int]) -> tuple[slice, slice]:
     height, width = shape
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - matrix[:, 2]
     x, y = np.linalg.solve(matrix[:, :2], corners.T)

@@ -51,7 +51,7 @@ class PackedPhotograph:
 
     def data(self) -> bytes:
         """Return the encoded picture; raises ValueError where its checksum is not the index's."""
-        file, index = open_pack(self.pack)
+        file, index = open_photo_pack(self.pack)
         _, _, checksum = next(names[self.name] for names in index.values() if self.name in names)
         return _read_checked(file, self.pack, self.name, checksum)
 
@@ -76,29 +76,29 @@ def list_photographs(root: Root, split: str) -> list[Photograph]:
     return [photo for one in _roots("root", root) for photo in _share(one, split)]
 
 
-def list_training_photographs(train_root: Root, root: Root) -> list[Photograph]:
+def list_train_only_photographs(extra_train_root: Root, root: Root) -> list[Photograph]:
     """Return the photographs that serve training only: all of a folder, of a pack its share.
 
     Raises ValueError where there are none, and where one of the two is within the other, as what
     `root` keeps for validation and test would be trained on.
     """
-    if train_root is None:
+    if extra_train_root is None:
         return []
     places = [] if root is None else [one.resolve() for one in _roots("root", root)]
     found: list[Photograph] = []
-    for one in _roots("train_root", train_root):
+    for one in _roots("extra_train_root", extra_train_root):
         here = one.resolve()
         if any(here.is_relative_to(place) or place.is_relative_to(here) for place in places):
-            raise ValueError(f"scene.train_root must be apart from scene.root, got {one}")
+            raise ValueError(f"scene.extra_train_root must be apart from scene.root, got {one}")
         photos = _packed(one, "train") if one.is_file() else _pictures(one)
         if not photos:
-            raise ValueError(f"scene.train_root must hold photographs, got none in {one}")
+            raise ValueError(f"scene.extra_train_root must hold photographs, got none in {one}")
         found += photos
     return found
 
 
 @lru_cache(maxsize=8)
-def open_pack(path: Path) -> tuple[Any, dict[str, dict[str, list]]]:
+def open_photo_pack(path: Path) -> tuple[Any, dict[str, dict[str, list]]]:
     """Return the mapped file and its index.
 
     Raises ValueError for a file that is no pack or whose index is damaged.
@@ -152,7 +152,7 @@ def _share(root: Path, split: str) -> list[Photograph]:
 
 
 def _packed(pack: Path, split: str) -> list[Photograph]:
-    return [PackedPhotograph(pack, name) for name in open_pack(pack)[1].get(split, ())]
+    return [PackedPhotograph(pack, name) for name in open_photo_pack(pack)[1].get(split, ())]
 
 
 def _pictures(folder: Path) -> list[Photograph]:

@@ -1,7 +1,5 @@
-"""Clean clips: photographs in smooth planar motion behind moving cut-outs of other photographs.
-
-The recipe E2VID was trained with (Rebecq et al. 2019; ESIM's multi-object renderer, Rebecq et al.
-2018), as a function of time in seconds.
+"""Clean clips: photographs in smooth planar motion behind moving cut-outs of other photographs, as
+E2VID was trained with (Rebecq et al. 2019; ESIM's multi-object renderer, Rebecq et al. 2018).
 """
 
 from collections.abc import Sequence
@@ -24,7 +22,7 @@ from src.sim.scenes.moving_layers import (
 from src.sim.scenes.photo_files import (
     Root,
     list_photographs,
-    list_training_photographs,
+    list_train_only_photographs,
     read_photograph,
 )
 
@@ -38,14 +36,14 @@ class PhotographScene(SceneBase):
 
     `root`: a folder of photographs, searched recursively, a pack of them (scripts/pack_scenes.py),
     or several of either (None: those inside scikit-image); 10 % of each serve `val` and 20 %
-    `test`.  `train_root`: as `root`, more photographs, which serve training only.
+    `test`.  `extra_train_root`: as `root`, more photographs, which serve training only.
     `photo_px_per_px`: range of photograph pixels per pixel of a frame 256 wide.  `rest_share`: of
     the clips in which all pauses, stops or never moves.  Raises ValueError where there are no
     photographs, or for a value outside its range.
     """
 
     root: Root = field(default=None, kw_only=False)
-    train_root: Root = None
+    extra_train_root: Root = None
     photo_px_per_px: Sequence[float] = (0.9, 1.6)
     rest_share: float = 0.0
 
@@ -53,7 +51,7 @@ class PhotographScene(SceneBase):
         super().__post_init__()
         self.photos = list_photographs(self.root, self.split)
         if self.split == "train":
-            self.photos += list_training_photographs(self.train_root, self.root)
+            self.photos += list_train_only_photographs(self.extra_train_root, self.root)
 
     def background_layer(
         self, photo: NDArray, rng: np.random.Generator, speed_widths_per_s: Sequence[float]

@@ -52,8 +52,8 @@ def checkerboard(canvas: Canvas, rng: Rng, *, squares=8.0, speed_px_per_s=0.0) -
     def draw(time):
         x = x0 + speed_px_per_s * math.cos(heading) * time
         y = y0 + speed_px_per_s * math.sin(heading) * time
-        across = mean_stripes(canvas.x[0] - x, pitch)
-        down = mean_stripes(canvas.y[:, 0] - y, pitch)
+        across = antialiased_stripes(canvas.x[0] - x, pitch)
+        down = antialiased_stripes(canvas.y[:, 0] - y, pitch)
         board = 0.5 + 0.5 * down[:, None] * across
         return board, np.ones_like(board), (x, y)
 
@@ -64,11 +64,8 @@ def rotating_dot(
     canvas: Canvas, rng: Rng, *, orbit_radius=0.3, dot_radius=0.05, turns_per_s=0.5
 ) -> DrawFunction:
     """A dot that circles the middle.  Path: its centre."""
-    orbit, radius, start = (
-        orbit_radius * canvas.side,
-        dot_radius * canvas.side,
-        rng.uniform(0, TURN),
-    )
+    orbit, radius = orbit_radius * canvas.side, dot_radius * canvas.side
+    start = rng.uniform(0, TURN)
 
     def draw(time):
         x, y = point_at(canvas.centre, orbit, start + TURN * turns_per_s * time)
@@ -87,7 +84,7 @@ def spinning_stripe(
 
     def draw(time):
         angle = start + TURN * turns_per_s * time
-        along, across = rotate_coordinates(*canvas.relative_to(*canvas.centre), angle)
+        along, across = to_body_coordinates(*canvas.relative_to(*canvas.centre), angle)
         ends, sides = length / 2 - abs(along), width / 2 - abs(across)
         shape = edge_coverage(ends) * edge_coverage(sides)
         return shape, shape, point_at(canvas.centre, length / 2, angle)
@@ -105,21 +102,16 @@ def spinning_disc(
         angle = start + TURN * turns_per_s * time
         x, y = canvas.relative_to(*canvas.centre)
         cover = disc_coverage(x, y, radius)
-        bright = sector_coverage(*rotate_coordinates(x, y, angle), int(sectors))
+        bright = sector_coverage(*to_body_coordinates(x, y, angle), int(sectors))
         return (0.35 + 0.65 * bright) * cover, cover, point_at(canvas.centre, radius, angle)
 
     return draw
 
 
 def bouncing_ball(
-    canvas: Canvas,
-    rng: Rng,
-    *,
-    ball_radius=0.12,
-    bounce_height=0.6,
-    bounces_per_s=1.0,
+    canvas: Canvas, rng: Rng, *, ball_radius=0.12, bounce_height=0.6, bounces_per_s=1.0,
     speed_widths_per_s=0.25,
-) -> DrawFunction:
+) -> DrawFunction:  # fmt: skip
     """A striped ball that falls, bounces to a height and comes back, drifts (in frame widths) from
     wall to wall and rolls.  Path: its centre.
     """
@@ -133,9 +125,9 @@ def bouncing_ball(
         way = (place + speed * time / free) % 2
         x = radius + free * min(way, 2 - way)
         y = floor - height * (1 - (2 * ((phase + bounces_per_s * time) % 1) - 1) ** 2)
-        along, _ = rotate_coordinates(*canvas.relative_to(x, y), angle + speed * time / radius)
+        along, _ = to_body_coordinates(*canvas.relative_to(x, y), angle + speed * time / radius)
         ball = disc_coverage(*canvas.relative_to(x, y), radius)
-        return (0.7 + 0.3 * mean_stripes(along, radius / 2)) * ball, ball, (x, y)
+        return (0.7 + 0.3 * antialiased_stripes(along, radius / 2)) * ball, ball, (x, y)
 
     return draw
 
@@ -156,7 +148,7 @@ def dart(
     def draw(time):
         place = (start + speed_px_per_s * time) % (2 * reach) - reach
         x, y = point_at(middle, place, heading)
-        along, across = rotate_coordinates(*canvas.relative_to(x, y), heading)
+        along, across = to_body_coordinates(*canvas.relative_to(x, y), heading)
         beyond = np.maximum(abs(along) - (length - width) / 2, 0)
         body = edge_coverage(width / 2 - np.hypot(beyond, across))
         ring = edge_coverage(length / 20 - abs(along - length / 4))
@@ -254,7 +246,7 @@ def disc_coverage(x: Map, y: Map, radius: float) -> Map:
     return edge_coverage(radius - np.hypot(x, y))
 
 
-def mean_stripes(place: Map, width: float) -> Map:
+def antialiased_stripes(place: Map, width: float) -> Map:
     """Return the mean over a pixel of stripes of +1 (from 0 on) and -1, each `width` wide; exact
     where the stripes run along rows or columns.
     """
@@ -275,14 +267,12 @@ def sector_coverage(x: Map, y: Map, number: int) -> Map:
     return edge_coverage(np.hypot(x, y) * np.sin(wide / 2 - from_middle))
 
 
-def rotate_coordinates(x: Map, y: Map, angle: float) -> tuple[Map, Map]:
+def to_body_coordinates(x: Map, y: Map, angle: float) -> tuple[Map, Map]:
     """Return the coordinates (x, y) along and across a body that lies at `angle`."""
     cos, sin = math.cos(angle), math.sin(angle)
     return cos * x + sin * y, cos * y - sin * x
 
 
-def point_at(
-    centre: Sequence[float] | Float[np.ndarray, "2"], radius: float, angle: float
-) -> tuple[float, float]:
-    """Return the point (x, y) at `radius` and `angle` from `centre`."""
+def point_at(centre: Any, radius: float, angle: float) -> tuple[float, float]:
+    """Return the point (x, y) at `radius` and `angle` from `centre` (x, y)."""
     return centre[0] + radius * math.cos(angle), centre[1] + radius * math.sin(angle)

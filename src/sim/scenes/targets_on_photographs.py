@@ -44,8 +44,7 @@ class TargetsOnPhotographs(PhotographScene):
         self.canvas = Canvas(self.size)
         self.ranges: dict[str, dict[str, Any]] = {}
         for kind, given in self.kinds.items():
-            ranges: dict[str, Any] = {}
-            self.ranges[kind] = ranges
+            ranges = self.ranges.setdefault(kind, {})
             for name, value in (given or {}).items():
                 ranges[name] = [value, value] if isinstance(value, int | float) else value
                 if not is_range(ranges[name]):

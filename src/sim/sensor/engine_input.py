@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -53,14 +52,10 @@ class SensorClip(NamedTuple):
 
 
 def build_engine_input(
-    clips: Sequence[SensorClip],
-    frames: Float[Tensor, "n views frames h w"],
-    views: Sequence[int],
-    *,
-    substeps: int = 1,
+    clips: Sequence[SensorClip], frames: Tensor, views: Sequence[int], *, substeps: int = 1
 ) -> EngineInput:
     """Return the input of `clips`, whose sensors agree in COMMON and all have a low-pass or none;
-    `views`: ids.
+    `frames`: (n, views, frames, h, w), `views`: ids.
 
     Frames after the last whole window of `substeps` intervals are left out.  Raises ValueError for
     frames of another shape or type, too few of them, and numbers outside their range.

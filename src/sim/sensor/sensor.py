@@ -26,7 +26,7 @@ from src.sim.sensor.engine_input import (
     threshold_range,
 )
 from src.sim.sensor.engines import run, sensor_cpu
-from src.sim.sensor.engines.records import EngineInput
+from src.sim.sensor.engines.records import EngineInput, Grids
 
 # What the random numbers of a setting are keyed by, where it is not the setting's name.
 RANDOM_STREAMS = {
@@ -36,6 +36,9 @@ RANDOM_STREAMS = {
     "hot_pixel_hz": "hot_hz",
     "initial_reference_error": "residual",
 }
+
+
+ViewFrames = Float[Tensor, "n views frames h w"]  # intensities in [0, 1]
 
 
 @runtime_checkable
@@ -53,22 +56,13 @@ class Sensor(Protocol):
     def draw(self, key: int, pixel_seed: int | None = None) -> "Sensor":
         """Return the sensor of one clip, all that is random about it drawn from `key`, its pixels
         those of `pixel_seed` (None: of its own seed)."""
-        ...
 
     def voxels(
-        self,
-        frames: Float[Tensor, "n views frames h w"],
-        fps: float,
-        bins: int = 5,
-        *,
-        substeps: int = 1,
-        clips: Sequence[int] | None = None,
-        views: Sequence[int] | None = None,
-        origin: tuple[int, int] = (0, 0),
-        full_width: int | None = None,
-    ) -> Float[Tensor, "n views windows bins h w"]:
+        self, frames: ViewFrames, fps: float, bins: int = 5, *, substeps: int = 1,
+        clips: Sequence[int] | None = None, views: Sequence[int] | None = None,
+        origin: tuple[int, int] = (0, 0), full_width: int | None = None,
+    ) -> Float[Tensor, "n views windows bins h w"]:  # fmt: skip
         """Return one grid per window of `substeps` frame intervals; see `EventSensor.voxels`."""
-        ...
 
 
 @dataclass(eq=False)
@@ -128,17 +122,10 @@ class EventSensor:
         return replace(self, **drawn, seed=self.seed if pixel_seed is None else pixel_seed)
 
     def voxels(
-        self,
-        frames: Float[Tensor, "n views frames h w"],
-        fps: float,
-        bins: int = 5,
-        *,
-        substeps: int = 1,
-        clips: Sequence[int] | None = None,
-        views: Sequence[int] | None = None,
-        origin: tuple[int, int] = (0, 0),
-        full_width: int | None = None,
-    ) -> Float[Tensor, "n views windows bins h w"]:
+        self, frames: ViewFrames, fps: float, bins: int = 5, *, substeps: int = 1,
+        clips: Sequence[int] | None = None, views: Sequence[int] | None = None,
+        origin: tuple[int, int] = (0, 0), full_width: int | None = None,
+    ) -> Float[Tensor, "n views windows bins h w"]:  # fmt: skip
         """Return one grid per window of `substeps` frame intervals, float32 on the frames' device;
         in memory the windows come before the views.
 
@@ -153,9 +140,8 @@ class EventSensor:
         return run.voxels(given, grids).transpose(1, 2)
 
     def counts(
-        self, frames: Float[Tensor, "n views frames h w"], fps: float,
-        clips: Sequence[int] | None = None,
-    ) -> Int[Tensor, "n views 2"]:  # fmt: skip
+        self, frames: ViewFrames, fps: float, clips: Sequence[int] | None = None
+    ) -> Int[Tensor, "n views 2"]:
         """Return the numbers of ON and OFF events of each clip and view; `clips` as in `voxels`."""
         return sensor_cpu.counts(self._engine_input(frames.cpu(), fps, clips))
 
@@ -183,14 +169,9 @@ class EventSensor:
 
 
 def simulate_voxels(
-    clips: Sequence[SensorClip],
-    frames: Float[Tensor, "n views frames h w"],
-    views: Sequence[int],
-    *,
-    bins: int = 5,
-    substeps: int = 1,
-    out: Float[Tensor, "n windows views bins h w"] | None = None,
-) -> Float[Tensor, "n windows views bins h w"]:
+    clips: Sequence[SensorClip], frames: ViewFrames, views: Sequence[int], *, bins: int = 5,
+    substeps: int = 1, out: Grids | None = None,
+) -> Grids:  # fmt: skip
     """Return the grids of n clips, contiguous and on the frames' device: in `out`, if given, which
     must be so too and hold zeros.
 

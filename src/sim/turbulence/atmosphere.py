@@ -61,7 +61,7 @@ class Atmosphere:
         return (self.cn2,) if isinstance(self.cn2, int | float) else tuple(self.cn2)
 
     @cached_property
-    def path_slices(self) -> tuple[Tensor, Tensor]:
+    def cn2_dz_slices(self) -> tuple[Tensor, Tensor]:
         """Where the turbulence is: z / L of 2048 slices and each slice's Int Cn2 dz, in float64."""
         place = (torch.arange(2048, dtype=torch.float64) + 0.5) / 2048
         knots = np.linspace(0, 1, len(self.cn2_profile))
@@ -74,7 +74,7 @@ class Atmosphere:
 
         r0 = [0.423 k^2 Int Cn2(z) (1 - z/L)^(5/3) dz]^(-3/5) (Fried 1966).
         """
-        place, strength = self.path_slices
+        place, strength = self.cn2_dz_slices
         integral = 0.423 * self._k**2 * float((strength * (1 - place) ** (5 / 3)).sum())
         return integral**-0.6 if integral > 0 else math.inf
 
@@ -112,20 +112,16 @@ class Atmosphere:
         2.25 k^(7/6) Int Cn2 [z (1 - z/L)]^(5/6) dz, 0.5 Cn2 k^(7/6) L^(11/6) for a constant Cn2
         (Andrews & Phillips, 2nd ed., ch. 8).
         """
-        place, strength = self.path_slices
+        place, strength = self.cn2_dz_slices
         weighted = strength * (place * (1 - place) * self.distance_m) ** (5 / 6)
         return 2.25 * self._k ** (7 / 6) * float(weighted.sum())
-
-    def pixel_pitch_m(self, width_px: int) -> float:
-        """Pitch of a pixel on the sensor: p = f * scene width / (L * width)."""
-        return self.focal_length_m * self.scene_width_m / (self.distance_m * width_px)
 
     def pixel_size_at_object_m(self, width_px: int) -> float:
         return self.scene_width_m / width_px
 
     def lambda_over_d_px(self, width_px: int) -> float:
-        """The diffraction angle lambda / D in pixels: lambda f / (D p)."""
-        pitch = self.pixel_pitch_m(width_px)
+        """The diffraction angle lambda / D in pixels: lambda f / (D p), p the pitch of a pixel."""
+        pitch = self.focal_length_m * self.scene_width_m / (self.distance_m * width_px)
         return self.wavelength_m * self.focal_length_m / (self.aperture_m * pitch)
 
     def tilt_std_px(self, width_px: int) -> float:
@@ -150,7 +146,7 @@ class Atmosphere:
     def tilt_correlation_half_length_px(self, width_px: int) -> float:
         """The distance at which the correlation of the tilt falls to 1/2, in pixels."""
         path = self.aperture_over_outer_scale, self.normalised_profile
-        reach_m = outer_scale.tilt_correlation_distance(*path) * self.aperture_m
+        reach_m = outer_scale.tilt_decay_distance(*path) * self.aperture_m
         return reach_m / self.pixel_size_at_object_m(width_px)
 
     def with_d_over_r0(self, d_over_r0: float) -> "Atmosphere":

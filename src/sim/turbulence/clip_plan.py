@@ -93,7 +93,7 @@ def _wave_tables(
     """
     (rows, columns), (height, width) = (axis.pixels for axis in grid), frame_size
     middle = (columns[0] + columns[-1]) / 2
-    along_x, along_y = waves.frequency[:, :1].double(), waves.frequency[:, 1:].double()
+    along_x, along_y = waves.frequency_per_px.double().split(1, 1)
     return {
         f"{name}_response": _phasor(along_x[:, 0] * (middle - (width - 1) / 2).double()),
         f"{name}_rows": _phasor(-along_y * (rows - (height - 1) / 2)),

@@ -5,15 +5,13 @@ the tilt of every pixel and the weights of its PSF, then tilt first and blur sec
 arXiv 2207.06377).  Every point spreads its light by the PSF it sees (Chimitt et al. 2023, arXiv
 2303.05687); the sum is divided by what a white scene would give: flat stays flat.
 
-On the CPU a thread renders some frames of one view at a time, so that the numbers of a view do not
-depend on its company.  A device does many pictures at a time, as every launch costs.  The two
-differ by float32 rounding only.
+On the CPU a thread renders some frames of one view at a time, a device many pictures at a time;
+they differ by float32 rounding only.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from types import ModuleType
 
 import numpy as np
@@ -22,48 +20,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from src.sim.turbulence.clip_plan import TilePlan
-from src.sim.turbulence.coefficient_grid import WaveSum, sum_waves, waves_on_grid
-from src.sim.turbulence.contract import Crop
+from src.sim.turbulence.coefficient_grid import WaveSum, evaluate_waves, sum_waves
 from src.sim.turbulence.engines import device as devices
 from src.sim.turbulence.engines.scatter_numba import scatter_psfs
 from src.sim.turbulence.engines.warp_numba import PaddedFrames, pad_frames, warp_frames
-from src.sim.turbulence.p2s_network import FoldedNetwork
+from src.sim.turbulence.p2s import FoldedNetwork
 from src.sim.turbulence.psf import convolve_halo
 
 DEVICE_BYTES = 2 * 2**30  # held at a time on a device, about
 CPU_NUMBERS = 2_000_000  # at the nodes of a view at a time, on the CPU
 CPU_NODES = 4096  # that go through a network at a time, so that they stay in the cache
-
-
-@dataclass(frozen=True)
-class PreparedTurbulence:
-    """The turbulence of one clip in `crop`, drawn and ready for a device: of Turbulence.prepare."""
-
-    metadata: Mapping[str, float | int | str]
-    crop: Crop
-    plans: Sequence[TilePlan]
-
-    @torch.no_grad()
-    def degrade(
-        self,
-        frames: Float[Tensor, "one frames h w"],
-        generator: torch.Generator,
-        *,
-        crop: Crop | None = None,
-    ) -> Float[Tensor, "one views frames hc wc"]:
-        """Return every view; raises ValueError for another crop or more clips than prepared."""
-        if (len(frames), crop) != (1, self.crop):
-            raise ValueError(
-                f"prepared turbulence is of 1 clip in {self.crop}, got {len(frames)} in {crop}"
-            )
-        return render_views(frames[0].float(), self.plans)[None]
-
-    @torch.no_grad()
-    def tilt(
-        self, frames: int, generator: torch.Generator, *, crop: Crop | None = None
-    ) -> Float[Tensor, "views frames 2 hc wc"]:
-        """Return the displacement (x, y) in pixels, in the crop that was prepared."""
-        return render_tilt(self.plans, frames)
 
 
 def render_views(
@@ -142,7 +108,7 @@ def _make_wave_sum(
     response, rows, columns = (tables[f"{name}_{part}"] for part in ("response", "rows", "columns"))
     if on_cpu:
         return WaveSum(response, rows, columns, first)
-    waves = waves_on_grid(rows, columns)
+    waves = evaluate_waves(rows, columns)
     return lambda amplitudes: sum_waves(response, amplitudes, waves)
 
 

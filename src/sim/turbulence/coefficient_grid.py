@@ -13,13 +13,17 @@ from jaxtyping import Complex, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from src.sim.turbulence.engines.waves_numba import join_parities, split_even_odd
+from src.sim.turbulence.engines.waves_numba import join_even_odd, split_even_odd
 from src.sim.turbulence.zernike import noll_index
 
 # Of the variance of the modes of a radial order, tilt and the rest, that is left out with the
 # weakest waves.
 OMITTED_VARIANCE = 1e-4, 3e-3
 PADDED_COLUMNS = 8  # products of matrices with a multiple of it are faster
+Response = Complex[Tensor, "modes waves"]
+WaveRows = Complex[Tensor, "waves rows"]
+WaveColumns = Complex[Tensor, "waves columns"]
+GridWaves = Float[Tensor, "twice_the_waves rows columns"]
 
 
 @dataclass(frozen=True)
@@ -74,17 +78,15 @@ class GridAxis:
 Grid = tuple[GridAxis, GridAxis]  # rows and columns
 
 
-def omit_weak_waves(
-    response: Complex[Tensor, "modes waves"], first: int
-) -> Complex[Tensor, "modes waves"]:
+def omit_weak_waves(response: Response, first_mode: int) -> Response:
     """Return `response` with 0 for waves that hardly count for a radial order (OMITTED_VARIANCE).
 
-    Row 0 is mode `first`, 0 being x-tilt.
+    Row 0 is mode `first_mode`, 0 being x-tilt.
     """
     strongest = torch.zeros_like(response)
-    for rows in radial_orders(first, len(response)):
+    for rows in radial_orders(first_mode, len(response)):
         power, rank = response[rows].abs().square().sum(0).sort()
-        waves = rank[power.cumsum(0) > OMITTED_VARIANCE[first > 1] * power.sum()]
+        waves = rank[power.cumsum(0) > OMITTED_VARIANCE[first_mode > 1] * power.sum()]
         strongest[rows, waves] = response[rows, waves]
     return strongest
 
@@ -105,13 +107,7 @@ class WaveSum:
     exp(-2 pi i f x) from the middle of the grid on.
     """
 
-    def __init__(
-        self,
-        response: Complex[Tensor, "modes waves"],
-        rows: Complex[Tensor, "waves rows"],
-        columns: Complex[Tensor, "waves columns"],
-        first: int,
-    ):
+    def __init__(self, response: Response, rows: WaveRows, columns: WaveColumns, first: int):
         half = columns[:, columns.shape[1] // 2 :]
         half = pad(half, (0, -half.shape[1] % PADDED_COLUMNS))
         self.orders: list[tuple[slice, list[np.ndarray], Tensor, Tensor]] = []
@@ -133,22 +129,18 @@ class WaveSum:
         for order, (weights, waves, cos_y, sin_y), cos_x, sin_x in self.orders:
             even, odd = split_even_odd(weights, drawn, waves, cos_y, sin_y)
             even, odd = torch.from_numpy(even) @ cos_x, torch.from_numpy(odd) @ sin_x
-            join_parities(even.numpy(), odd.numpy(), out[order].view(-1, columns).numpy())
+            join_even_odd(even.numpy(), odd.numpy(), out[order].view(-1, columns).numpy())
         return out
 
 
-def waves_on_grid(
-    rows: Complex[Tensor, "waves rows"], columns: Complex[Tensor, "waves columns"]
-) -> Float[Tensor, "twice_the_waves rows columns"]:
+def evaluate_waves(rows: WaveRows, columns: WaveColumns) -> GridWaves:
     """Return the real and the negative imaginary part of waves at all nodes; see WaveSum."""
     waves = torch.view_as_real(rows[:, :, None] * columns[:, None])
     return waves.permute(0, 3, 1, 2).flatten(0, 1)
 
 
 def sum_waves(
-    response: Complex[Tensor, "modes waves"],
-    amplitudes: Complex[Tensor, "n waves"],
-    waves: Float[Tensor, "twice_the_waves rows columns"],
+    response: Response, amplitudes: Complex[Tensor, "n waves"], waves: GridWaves
 ) -> Float[Tensor, "modes n rows columns"]:
     """Return the same as WaveSum in one product of matrices, for a device."""
     parts = torch.view_as_real(response[:, None] * amplitudes).flatten(2).flatten(0, 1)

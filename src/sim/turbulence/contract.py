@@ -6,17 +6,19 @@ A model draws the parameters of a clip and makes the operator of that clip.
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
-import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Generator, Tensor
 
 from src.sim.optics import Position
 
 Crop = tuple[int, int, int, int]  # top, left, height, width
+Frames = Float[Tensor, "n frames h w"]  # linear light
+Views = Float[Tensor, "n views frames hc wc"]
+Tilt = Float[Tensor, "views frames 2 hc wc"]  # (x, y) in pixels
 
 
 @runtime_checkable
-class TurbulenceOperator(Protocol):
+class ClipTurbulence(Protocol):
     """The turbulence of one clip, between its clean frames and the views of a light field.
 
     All randomness comes from the generator: the same state gives the same result, on any device.  A
@@ -27,39 +29,23 @@ class TurbulenceOperator(Protocol):
     def metadata(self) -> Mapping[str, float | int | str]:
         """What is recorded about the clip; `severity` (weak, medium, strong or none) is there."""
 
-    def degrade(
-        self,
-        frames: Float[Tensor, "n frames h w"],
-        generator: torch.Generator,
-        *,
-        crop: Crop | None = None,
-    ) -> Float[Tensor, "n views frames hc wc"]:
+    def degrade(self, frames: Frames, generator: Generator, *, crop: Crop | None = None) -> Views:
         """Return every view of `crop` (None: the whole frame); linear light, float32."""
 
-    def tilt(
-        self, frames: int, generator: torch.Generator, *, crop: Crop | None = None
-    ) -> Float[Tensor, "views frames 2 hc wc"]:
-        """Return the displacement (x, y) in pixels that `degrade` gives its first clip."""
-
-
-@runtime_checkable
-class PreparableTurbulence(TurbulenceOperator, Protocol):
-    """Turbulence that another process prepares than the one that computes the pixels."""
-
-    def prepare(self, frames: int, generator: torch.Generator, crop: Crop) -> Any:
-        """Return a picklable operator for one clip of so many frames, in `crop` only."""
+    def tilt(self, frames: int, generator: Generator, *, crop: Crop | None = None) -> Tilt:
+        """Return the displacement that `degrade` gives its first clip."""
 
 
 @runtime_checkable
 class TurbulenceModel(Protocol):
     """Where the turbulence of every clip comes from."""
 
-    def draw(self, generator: torch.Generator) -> Any:
+    def draw(self, generator: Generator) -> Any:
         """Draw the parameters of a clip: a small object that can be pickled."""
 
     def operator(
         self, drawn: Any, *, views: Sequence[Position], height: int, width: int, fps: float
-    ) -> TurbulenceOperator:
+    ) -> ClipTurbulence:
         """Return the operator of these parameters, for frames of `height` x `width` at `fps`."""
 
 

@@ -2,30 +2,40 @@
 
 Errors are powers, as shares of the power by which turbulence at random changes a picture (its blur
 against the mean blur, tilt apart) with the spectrum 1 / f^2 of natural ones.  The tables behind
-them are measured on exact PSFs by scripts/p2s_errors.py and kept beside the networks.
+them are measured on exact PSFs, over D/r0 and lambda / D in pixels, by scripts/p2s_errors.py and
+kept beside the networks.  Times are those of one core (AVX2) per pixel of a view; what counts is
+their ratio.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
+import torch
 from jaxtyping import Float
+from safetensors import safe_open
 from torch import Tensor
 
+from src.sim.turbulence import p2s
 from src.sim.turbulence.atmosphere import AR1_FPS, TILT_VARIANCE, Atmosphere
-from src.sim.turbulence.outer_scale import half_light_radius
-from src.sim.turbulence.p2s import find_psf_band
-from src.sim.turbulence.psf_settings import (
-    MAX_PITCH,
-    choose_psf_settings,
-    error_table,
-    interpolate_log,
-    interpolate_table,
-)
+from src.sim.turbulence.outer_scale import short_exposure_half_light_radius
+from src.sim.turbulence.psf import SAMPLES_PER_LAMBDA_OVER_D
+from src.sim.turbulence.zernike import noll_index
 
 CONTRAST = 0.2  # rms contrast of a natural picture
 UNSEEN = 0.5 / 255  # rms error that nobody needs to go below
 TILT_ERROR = 0.35  # of the tilt's spread, per D between nodes
 TILT_SHARE = 0.06  # of the spread, that interpolating the tilt may err by
+MAX_PITCH = 64
+BLURRED = 0.88  # measured at 0.16 D, D/r0 4, two and three pixels between nodes
+UNRELATED = 2.0  # the error of a PSF taken from a place that has nothing to do with it
+WAVES = 540  # that a mode of order n sees, times n
+NS_WAVE, NS_ROW = 0.023, 0.012  # a wave of a mode at a node, and for each pixel between nodes
+NS_LAYER, NS_NODE = 0.040, 33.0  # a weight of a network at a node, and a node itself
+NS_QUAD, NS_RANK = 1.1, 0.065  # four pixels of a PSF, and each basis function in them
+NS_TAP, NS_BETWEEN = 0.15, 0.2  # a pixel of a PSF at work, on a row of nodes and between two
 
 
 @dataclass(frozen=True)
@@ -77,7 +87,7 @@ def choose_fidelity(atmosphere: Atmosphere, width_px: int, tolerance: float) -> 
     allowed = max(tolerance, (UNSEEN / CONTRAST) ** 2 / power)
     pixel = atmosphere.pixel_size_at_object_m(width_px) / atmosphere.aperture_m
     patch = pixel / _isoplanatic_patch_ratio(atmosphere)
-    psf = choose_psf_settings(find_psf_band(strength), strength, unit, patch, allowed)
+    psf = choose_psf_settings(p2s.find_psf_band(strength), strength, unit, patch, allowed)
     tilt_px, ar1 = atmosphere.tilt_std_px(width_px), atmosphere.ar1_coefficient
     tilt_pitch, error_tilt = _tilt_pitch(patch, tilt_px, unit, atmosphere.d_over_r0)
     return Fidelity(
@@ -93,11 +103,11 @@ def choose_fidelity(atmosphere: Atmosphere, width_px: int, tolerance: float) -> 
         aperture_over_outer_scale=atmosphere.aperture_over_outer_scale,
         tilt_px=tilt_px,
         lambda_over_d_px=unit,
-        blur_px=unit * half_light_radius(strength),
+        blur_px=unit * short_exposure_half_light_radius(strength),
         tilt_grid_pitch_px=tilt_pitch,
         error_tilt_px=error_tilt,
-        error=math.sqrt(power * (psf.error_psf + psf.error_grid + psf.error_kernel)),
-        **psf._asdict(),
+        error=math.sqrt(power * (psf["error_psf"] + psf["error_grid"] + psf["error_kernel"])),
+        **psf,
     )
 
 
@@ -111,7 +121,7 @@ def _isoplanatic_patch_ratio(atmosphere: Atmosphere) -> float:
 
     The ratio of theta0 L / r0, Kolmogorov's: an outer scale does not change small distances.
     """
-    place, strength = atmosphere.path_slices
+    place, strength = atmosphere.cn2_dz_slices
     near = float((strength * (1 - place) ** (5 / 3)).sum())
     return (near / float((strength * place ** (5 / 3)).sum())) ** 0.6
 
@@ -121,9 +131,8 @@ def _tilt_pitch(
 ) -> tuple[int, float]:
     """Return the widest pitch within 0.03 px or TILT_SHARE of the spread, and its error.
 
-    Cubic interpolation between nodes S D apart leaves an rms error of 0.35 S of the spread that
-    Kolmogorov's tilt has, measured on 30,000 waves for a constant Cn2; an outer scale takes away
-    long waves only, so the error stays.
+    Cubic interpolation between nodes S D apart leaves an rms error of TILT_ERROR S of the spread of
+    Kolmogorov's tilt, measured for a constant Cn2; an outer scale does not change that error.
     """
     allowed = max(0.03, TILT_SHARE * tilt_px)
     kolmogorov = 2 / math.pi * lambda_over_d_px * math.sqrt(TILT_VARIANCE) * d_over_r0 ** (5 / 6)
@@ -136,3 +145,107 @@ def _random_power(d_over_r0: float, lambda_over_d_px: float) -> float:
     """Return the power of the random change of a picture of unit contrast; grows as d^(5/3)."""
     weak = min(d_over_r0 / float(error_table("strength")[0]), 1.0) ** (5 / 3)
     return max(float(interpolate_table("power", d_over_r0, lambda_over_d_px)) * weak, 1e-30)
+
+
+def choose_psf_settings(
+    band: p2s.PSFBand, d_over_r0: float, lambda_over_d_px: float, pixel_d: float, allowed: float
+) -> dict[str, Any]:
+    """Return the cheapest settings, fields of Fidelity, whose error is `allowed`, or those of the
+    least error.
+
+    `pixel_d`: a pixel at the object in units of D, for a constant Cn2.
+    """
+    optics, number = (d_over_r0, lambda_over_d_px), p2s.load_bands_by_d_over_r0().index(band)
+    table, strengths = (error_table(name)[number] for name in ("psf", "psf_strength"))
+    psf = _errors_at_pitches(_interpolate(table, strengths, *optics), pixel_d)
+    ranks = [min(int(rank), len(band.basis)) for rank in error_table("rank_axis")]
+    widest = band.mean.shape[-1] / SAMPLES_PER_LAMBDA_OVER_D / 2
+    sizes = [  # odd numbers of pixels
+        2 * math.floor(min(reach + 0.5 / lambda_over_d_px, widest) * lambda_over_d_px) + 1
+        for reach in error_table("kernel_axis").tolist()
+    ]
+    kernel = interpolate_table("kernel", *optics)
+    total = psf[..., None] + kernel  # networks, pitches, ranks, kernels
+    cost = _nanoseconds(band.networks, ranks, torch.tensor(sizes))
+    within = total <= allowed
+    best = torch.where(within, cost, math.inf) if within.any() else total
+    n, p, r, k = (int(i) for i in torch.unravel_index(best.argmin(), best.shape))
+    at_nodes, between = float(psf[n, 0, r]), float(psf[n, p, r])
+    return {
+        "zernike_modes": band.networks[n].modes, "psf_network": n, "psf_rank": ranks[r],
+        "psf_grid_pitch_px": p + 1, "psf_size_px": sizes[k], "error_psf": at_nodes,
+        "error_grid": between - at_nodes, "error_kernel": float(kernel[k]),
+    }  # fmt: skip
+
+
+def _errors_at_pitches(
+    errors: Float[Tensor, "networks pitches ranks"], pixel_d: float
+) -> Float[Tensor, "networks px ranks"]:
+    """Return the errors at nodes 1, 2, ... MAX_PITCH pixels apart, the table's first pitch being 0.
+
+    The table's are of places anywhere between nodes; one pixel in pitch^2 lies on one.  And they
+    change sign within a kernel, so that a picture sees BLURRED of their power.
+    """
+    axis = error_table("pitch_axis").double()
+    px = torch.arange(2, MAX_PITCH + 1, dtype=torch.float64)
+    step = pixel_d * px
+    more = (errors[:, 1:] - errors[:, :1]).clamp(min=0).cummax(1).values
+    high = torch.searchsorted(axis, step).clamp(1, len(axis) - 1)
+    share = (step / axis[high - 1]).log() / (axis[high] / axis[high - 1]).log()
+    low, up = more[:, high - 1], more[:, high]
+    more = low + share.clamp(0, 1).float()[:, None] * (up - low)
+    more[:, step > axis[-1]] = UNRELATED
+    between = BLURRED * more * (1 - px**-2).float()[:, None]
+    return errors[:, :1] + torch.cat([torch.zeros_like(errors[:, :1]), between], 1)
+
+
+def _nanoseconds(
+    networks: Sequence[p2s.PhaseToSpaceNetwork], ranks: list[int], kernels: Tensor
+) -> Tensor:
+    """Return nanoseconds a pixel (networks, px, ranks, kernels)."""
+    px = torch.arange(1, MAX_PITCH + 1).float()
+    nodes = torch.stack([_node_nanoseconds(network, tuple(ranks)) for network in networks])
+    draw = (kernels + 1.0).square() / 4 * (NS_QUAD + NS_RANK * torch.tensor(ranks)[:, None])
+    rows = nodes[..., None] / px[:, None, None] + draw
+    tap = torch.where(px > 1, NS_BETWEEN, NS_TAP)
+    return rows / px[:, None, None] + tap[:, None, None] * kernels.square()
+
+
+@cache
+def _node_nanoseconds(
+    network: p2s.PhaseToSpaceNetwork, ranks: tuple[int, ...]
+) -> Float[Tensor, "px ranks"]:
+    px = torch.arange(1, MAX_PITCH + 1).float()
+    waves = sum(WAVES / noll_index(mode)[0] for mode in range(4, network.modes + 2))
+    node = NS_NODE + NS_LAYER * network.count_macs(torch.tensor(ranks))
+    return node + waves * (NS_WAVE + NS_ROW * px[:, None])
+
+
+def interpolate_table(
+    name: str, d_over_r0: float, lambda_over_d_px: float
+) -> Float[Tensor, "*axis"]:
+    """Interpolate a table (D/r0, ..., lambda / D) in the logarithm of both."""
+    return _interpolate(error_table(name), error_table("strength"), d_over_r0, lambda_over_d_px)
+
+
+def _interpolate(
+    table: Tensor, strengths: Tensor, d_over_r0: float, lambda_over_d_px: float
+) -> Tensor:
+    rows = interpolate_log(table, strengths, d_over_r0)
+    return interpolate_log(rows.movedim(-1, 0), error_table("airy"), lambda_over_d_px)
+
+
+def interpolate_log(rows: Tensor, axis: Tensor, value: float) -> Tensor:
+    """Interpolate the `rows` at the values `axis` in the logarithm; held beyond its ends."""
+    place = max(value, float(axis[0]))
+    high = int((axis < place).sum().clamp(1, len(axis) - 1))
+    low = high - 1
+    share = math.log(place / float(axis[low])) / math.log(float(axis[high] / axis[low]))
+    return rows[low] + (rows[high] - rows[low]) * min(share, 1.0)
+
+
+@cache
+def error_table(name: str) -> Tensor:
+    """Return the table or axis of that name."""
+    with safe_open(p2s.FILE, "pt") as file:
+        return file.get_tensor(f"errors.{name}")

@@ -106,9 +106,7 @@ def _track_corners(
     were tried, in pixels of a frame whose smaller side is SIDE_PX.
 
     Corners of the mean frame (Shi & Tomasi 1994) are tracked into every frame and back (pyramidal
-    Lucas-Kanade, Bouguet 2001).  Left out is what does not return, is missing in more than one
-    frame of ten or moves three times as much as the rest; gaps are filled linearly in time.
-    `footage`: grey frames, uint8 (h, w).  May find no corner at all: footage of a moving camera.
+    Lucas-Kanade, Bouguet 2001); gaps are filled linearly in time.  May find no corner at all.
     """
     scale = min(LONGEST_SIDE / min(footage[0].shape), 2.0)
     kind = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA

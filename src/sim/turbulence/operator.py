@@ -6,15 +6,14 @@ from dataclasses import asdict
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
+from torch import Generator
 
 from src.sim import noise
 from src.sim.optics import layout
 from src.sim.turbulence.atmosphere import Atmosphere
 from src.sim.turbulence.clip_plan import TilePlan, plan_tile
-from src.sim.turbulence.clip_rendering import PreparedTurbulence, render_tilt, render_views
-from src.sim.turbulence.contract import Crop, check_option
+from src.sim.turbulence.clip_rendering import render_tilt, render_views
+from src.sim.turbulence.contract import Crop, Frames, Tilt, Views, check_option
 from src.sim.turbulence.fidelity import Fidelity, choose_fidelity, mean_psf
 from src.sim.turbulence.p2s import FittedPSFs, find_psf_band
 from src.sim.turbulence.plane_waves import WaveDynamics, draw_plane_waves
@@ -65,17 +64,8 @@ class Turbulence:
         return asdict(self.fidelity)
 
     @torch.no_grad()
-    def degrade(
-        self,
-        frames: Float[Tensor, "n frames h w"],
-        generator: torch.Generator,
-        *,
-        crop: Crop | None = None,
-    ) -> Float[Tensor, "n views frames hc wc"]:
-        """Return every view, linear light in and out.
-
-        Only `crop` (top, left, height, width) is simulated; it equals that part of the whole.
-        """
+    def degrade(self, frames: Frames, generator: Generator, *, crop: Crop | None = None) -> Views:
+        """Return every view of `crop`: only this is simulated; it equals that part of the whole."""
         size, given = (self.height, self.width), tuple(frames.shape[-2:])
         check_option(given == size, "frame", f"{size}", given)
         top, left, height, width = crop or (0, 0, *size)
@@ -86,36 +76,21 @@ class Turbulence:
             return part.expand(-1, len(self.positions), -1, -1, -1)
         seen = []
         for clip in frames.float():
-            plans = self._plan(len(clip), generator, (top, left, height, width), clip.device)
+            plans = self.plan(len(clip), generator, (top, left, height, width), clip.device)
             seen.append(render_views(clip, plans))
         return seen[0][None] if len(seen) == 1 else torch.stack(seen)
 
-    def prepare(
-        self, frames: int, generator: torch.Generator, crop: Crop
-    ) -> "Turbulence | PreparedTurbulence":
-        """Return the turbulence of one clip, drawn for `crop` on the CPU: small, to be sent."""
-        if self.is_identity:
-            return self
-        return PreparedTurbulence(self.metadata, crop, self._plan(frames, generator, crop))
-
     @torch.no_grad()
-    def tilt(
-        self, frames: int, generator: torch.Generator, *, crop: Crop | None = None
-    ) -> Float[Tensor, "views frames 2 h w"]:
-        """Return the displacement (x, y) in pixels that `degrade` gives its first clip."""
+    def tilt(self, frames: int, generator: Generator, *, crop: Crop | None = None) -> Tilt:
         window = crop or (0, 0, self.height, self.width)
         if self.is_identity:
             return torch.zeros(len(self.positions), frames, 2, *window[2:])
-        return render_tilt(self._plan(frames, generator, window), frames)
+        return render_tilt(self.plan(frames, generator, window), frames)
 
-    def _plan(
-        self,
-        frames: int,
-        generator: torch.Generator,
-        window: Crop,
-        device: torch.device | str = "cpu",
+    def plan(
+        self, frames: int, generator: Generator, window: Crop, device: torch.device | str = "cpu"
     ) -> list[TilePlan]:
-        """Draw a clip, its amplitudes on `device`, and return the plans of its tiles."""
+        """Return the plans of the tiles of one clip, drawn on `device`; not of the identity."""
         atmosphere, key = self.atmosphere, noise.base_key(generator)
         assert atmosphere is not None  # else it is the identity
         modes, wave_key = self.fidelity.zernike_modes, noise.key(key, "waves")

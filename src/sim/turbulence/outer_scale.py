@@ -65,7 +65,7 @@ def tilt_correlation(
 
 
 @lru_cache(maxsize=4096)
-def tilt_correlation_distance(
+def tilt_decay_distance(
     aperture_over_outer_scale: float, profile: Cn2Profile, *, wind: bool = False
 ) -> float:
     """Return the distance in D at which the tilt's correlation falls to 1/2, with `wind` to 1 / e.
@@ -133,7 +133,7 @@ def _path(profile: Cn2Profile) -> tuple[np.ndarray, np.ndarray]:
     return place, weight / weight.sum()
 
 
-def half_light_radius(d_over_r0: float) -> float:
+def short_exposure_half_light_radius(d_over_r0: float) -> float:
     """Return the radius that holds half of a point's light, tilt removed, in lambda / D.
 
     From the mean transfer function T(nu) exp(-3.44 (nu D/r0)^(5/3) (1 - nu^(1/3))), nu in units of
@@ -146,9 +146,12 @@ def turbulence_blur(d_over_r0: float) -> float:
     """Return by how much turbulence blurs beyond diffraction, tilt removed, in lambda / D.
 
     The standard deviation along one axis of the Gaussian whose half-light radius, added in squares
-    to that of diffraction, gives `half_light_radius`.
+    to that of diffraction, gives `short_exposure_half_light_radius`.
     """
-    squares = half_light_radius(d_over_r0) ** 2 - half_light_radius(0.0) ** 2
+    squares = (
+        short_exposure_half_light_radius(d_over_r0) ** 2
+        - short_exposure_half_light_radius(0.0) ** 2
+    )
     return math.sqrt(squares) / GAUSSIAN_HALF_LIGHT
 
 

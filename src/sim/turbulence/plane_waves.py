@@ -29,6 +29,7 @@ LOW, HIGH = 0.08, 0.32  # limits of the three power laws that kappa is drawn fro
 DEPTH = 1.0  # waves are drawn with the density Cn2 (1 - z/L)^DEPTH
 SHARES = (0.25, 0.65, 0.10)  # of the waves below LOW, between, above HIGH
 TEMPORAL_MODELS, VIEWS_CORRELATIONS = ("ar1", "frozen_flow", "mixed"), ("independent", "baseline")
+WIND_LAYERS = 4  # of equal strength
 LAYER_WIND_RATIO = 0.5  # rms of a layer's own wind over the wind that all layers share
 
 
@@ -36,16 +37,16 @@ LAYER_WIND_RATIO = 0.5  # rms of a layer's own wind over the wind that all layer
 class PlaneWaves:
     """The plane waves of one clip; the same for its views, only their amplitudes differ.
 
-    `frequency` (waves, 2): f z / L in cycles per pixel at the object along (x, y).
-    `layer_frequency` (waves, 2): f in cycles per metre in the layer; `z_over_l` (waves,);
-    `path_quantile` (waves,): the share of the turbulence that lies nearer to the camera.
+    `frequency_per_px` (waves, 2): f z / L in cycles per pixel at the object along (x, y).
+    `frequency_per_m` (waves, 2): f in cycles per metre in the layer; `z_over_l` (waves,);
+    `cumulative_cn2` (waves,): the share of the turbulence that lies nearer to the camera.
     `response` (modes, waves, 2): w_m Q_j, real and imaginary part, in rad.
     """
 
-    frequency: Float[Tensor, "waves 2"]
-    layer_frequency: Float[Tensor, "waves 2"]
+    frequency_per_px: Float[Tensor, "waves 2"]
+    frequency_per_m: Float[Tensor, "waves 2"]
     z_over_l: Float[Tensor, " waves"]
-    path_quantile: Float[Tensor, " waves"]
+    cumulative_cn2: Float[Tensor, " waves"]
     response: Float[Tensor, "modes waves 2"]
 
 
@@ -54,10 +55,9 @@ def draw_plane_waves(
 ) -> PlaneWaves:
     """Draw `waves` plane waves that carry Noll modes 2..modes + 1.
 
-    kappa = D_l |f|, its angle and z are drawn by a shifted Kronecker sequence; z with the density
-    Cn2 (1 - z/L): a strong one of the fine waves near the object would be seen as a stripe; kappa
-    from a broken power law over all of (0, inf).  The weights w_m divide by these densities, so the
-    expected covariance is exact.
+    kappa = D_l |f|, its angle and z are drawn by a shifted Kronecker sequence, z with the density
+    Cn2 (1 - z/L), kappa from a broken power law over all of (0, inf).  The weights w_m divide by
+    these densities, so the expected covariance is exact.
     """
     u = _kronecker_sequence(key, waves)
     order = (math.isqrt(8 * (modes + 1) - 7) - 1) // 2
@@ -66,7 +66,7 @@ def draw_plane_waves(
     low = min(max(LOW, 0.3 * atmosphere.aperture_over_outer_scale), 0.5 * high)
     kappa, density = _draw_kappa(u[:, 0], low, high)
     angle = 2 * math.pi * u[:, 1]
-    place, strength = atmosphere.path_slices
+    place, strength = atmosphere.cn2_dz_slices
     near = 1 - place
     steps = torch.cumsum(strength * near**DEPTH, 0)
     slot = torch.searchsorted(steps, u[:, 2] * steps[-1]).clamp(max=len(place) - 1)
@@ -78,10 +78,10 @@ def draw_plane_waves(
     amplitude = variance.sqrt() * atmosphere.d_over_r0 ** (5 / 6)
     layer = torch.stack([angle.cos(), angle.sin()], dim=-1) * (kappa / diameter)[:, None]
     return PlaneWaves(
-        frequency=layer * place[slot, None] * atmosphere.pixel_size_at_object_m(width_px),
-        layer_frequency=layer,
+        frequency_per_px=layer * place[slot, None] * atmosphere.pixel_size_at_object_m(width_px),
+        frequency_per_m=layer,
         z_over_l=place[slot],
-        path_quantile=u[:, 2],
+        cumulative_cn2=u[:, 2],
         response=pupil_filter(kappa, angle, modes) * amplitude[:, None],
     )
 
@@ -91,15 +91,14 @@ class WaveDynamics:
     """How turbulence evolves and what the views share of it.
 
     `temporal_model`: `ar1` (the paper: its coefficient per frame at 120 fps), `frozen_flow`, frozen
-    turbulence in `wind_layers` layers each carried by a wind of its own, about `wind_m_s` (None:
-    the atmosphere's), or `mixed`, one of the two drawn per clip.  `views_correlation`:
+    turbulence in WIND_LAYERS layers each carried by a wind of its own, about `wind_m_s` (None: the
+    atmosphere's), or `mixed`, one of the two drawn per clip.  `views_correlation`:
     `independent` (the paper) or `baseline`, sub-apertures `baseline_m` apart (None: touching)
     looking through the same turbulence.  Raises ValueError for values outside their range.
     """
 
     temporal_model: str = "ar1"
     wind_m_s: float | None = None
-    wind_layers: int = 4
     views_correlation: str = "independent"
     baseline_m: float | None = None
 
@@ -108,7 +107,6 @@ class WaveDynamics:
         checks = {
             "temporal_model": (time in TEMPORAL_MODELS, "ar1, frozen_flow or mixed"),
             "wind_m_s": (0 <= (self.wind_m_s or 0) < math.inf, ">= 0 or null"),
-            "wind_layers": (1 <= self.wind_layers <= 100, "in [1, 100]"),
             "views_correlation": (shared in VIEWS_CORRELATIONS, "independent or baseline"),
             "baseline_m": (0 <= (self.baseline_m or 0) < math.inf, ">= 0 or null"),
         }
@@ -146,21 +144,18 @@ class WaveDynamics:
         if shared:  # the line of sight of a sub-aperture crosses a layer baseline (1 - z/L) away
             pitch = atmosphere.aperture_m if self.baseline_m is None else self.baseline_m
             baselines = torch.tensor(positions, dtype=torch.float64).flip(-1) * pitch
-            cycles = (baselines @ waves.layer_frequency.T) * (1 - waves.z_over_l)
+            cycles = (baselines @ waves.frequency_per_m.T) * (1 - waves.z_over_l)
             c = c * torch.exp(2j * math.pi * cycles).to(device)[:, None]
         return c.to(torch.complex64)
 
     def _draw_winds(self, key: int, atmosphere: Atmosphere) -> Float[Tensor, "layers 2"]:
-        """Return the wind (x, y) of each layer in m/s: a common one, half as much of its own.
-
-        The mean square is that of `wind_m_s`; a single layer has that very speed.
+        """Return the wind (x, y) of each layer in m/s: a common one, half as much of its own; the
+        mean square is that of `wind_m_s`.
         """
         speed = atmosphere.wind_m_s if self.wind_m_s is None else self.wind_m_s
         turn = 2 * math.pi * float(noise.uniform(noise.key(key, "wind"), torch.tensor(0)))
         common = torch.tensor([math.cos(turn), math.sin(turn)], dtype=torch.float64)
-        if self.wind_layers == 1:
-            return speed * common[None]
-        counters = torch.arange(2 * self.wind_layers).reshape(-1, 2)
+        counters = torch.arange(2 * WIND_LAYERS).reshape(-1, 2)
         own = noise.normal(noise.key(key, "winds"), counters).double()
         own = own * LAYER_WIND_RATIO / math.sqrt(2)
         return speed / math.sqrt(1 + LAYER_WIND_RATIO**2) * (common + own)
@@ -195,8 +190,8 @@ def advect_waves(
     The layers, from the camera on, have equal shares of the turbulence.  Taylor's hypothesis within
     each: phase(x, t) = phase(x - v t, 0), exact at any time, and smooth in it.
     """
-    layer = (waves.path_quantile * len(winds)).long().clamp(max=len(winds) - 1)
-    cycles_per_s = (waves.layer_frequency * winds[layer]).sum(-1).to(white.device)
+    layer = (waves.cumulative_cn2 * len(winds)).long().clamp(max=len(winds) - 1)
+    cycles_per_s = (waves.frequency_per_m * winds[layer]).sum(-1).to(white.device)
     shift = torch.exp(-2j * math.pi * times_s[:, None] * cycles_per_s)
     return torch.view_as_complex(white) * shift
 
@@ -204,8 +199,8 @@ def advect_waves(
 def _kronecker_sequence(key: int, count: int) -> Float[Tensor, "count 3"]:
     """Return a Kronecker sequence in the unit cube, shifted at random: strata, angle, path.
 
-    sqrt 3 for the angle because none of its small multiples, the m of the modes, is near a whole
-    number; that would tie the angle to the radius and spoil the mode's variance in every clip.
+    No small multiple of sqrt 3, the m of the modes, is near a whole number: angle and radius are
+    independent.
     """
     shift = noise.uniform(key, torch.arange(3)).double()
     step = torch.tensor([1 / count, math.sqrt(3) - 1, (math.sqrt(5) - 1) / 2], dtype=torch.float64)

@@ -1,7 +1,5 @@
-"""How an atmosphere is drawn: by what an image shows of it.
-
-Statistics of the image are drawn - tilt and blur, correlation length and time of the tilt - and
-then a camera, a path and an outer scale that give them.
+"""How an atmosphere is drawn: first what an image shows of it - tilt and blur, correlation length
+and time of the tilt - then a camera, a path and an outer scale that show it.
 """
 
 import math
@@ -44,7 +42,7 @@ class NoCameraError(ValueError):
 
 
 @dataclass(frozen=True)
-class ImageStatistics:
+class TargetImageStatistics:
     """What an image shall show, in pixels of a frame 256 wide: the half length of the tilt's
     correlation, its time to 1 / e, and either `tilt_and_blur_px` (see Atmosphere) or `tilt_px`, rms
     along one axis.
@@ -96,7 +94,7 @@ def sample_atmosphere(
         lengths = (tilt_correlation_half_length_px, "tilt_correlation_half_length_px")
         if u[0] < share:
             lengths = (global_tilt_half_length_px, "global_tilt_half_length_px")
-        wanted = ImageStatistics(
+        wanted = TargetImageStatistics(
             float(log_uniform(u[1], *lengths)),
             float(log_uniform(u[2], tilt_correlation_time_s, "tilt_correlation_time_s")),
             tilt_and_blur_px=float(log_uniform(u[3], spreads, "tilt_and_blur_px")),
@@ -109,7 +107,7 @@ def sample_atmosphere(
 
 
 def sample_matching_atmosphere(
-    wanted: ImageStatistics,
+    wanted: TargetImageStatistics,
     generator: torch.Generator,
     *,
     lambda_over_d_px: Range = (0.4, 2.0),
@@ -151,7 +149,7 @@ def sample_matching_atmosphere(
         length = float(log_uniform(u[i, 3], distance_m, "distance_m"))
         diameter = math.sqrt(wavelength_m * length * aperture[i] / unit[i])
         # Of the wind, in D, after which the tilt's correlation is 1 / e.
-        way = outer_scale.tilt_correlation_distance(1 / scale[i], shapes[i], wind=True)
+        way = outer_scale.tilt_decay_distance(1 / scale[i], shapes[i], wind=True)
         time_s = wanted.tilt_correlation_time_s
         return Atmosphere(
             aperture_m=diameter,
@@ -212,7 +210,7 @@ def _draw_outer_scales(u: Candidates, limits: Range, kolmogorov: float) -> Candi
 
 
 def _solve_d_over_r0(
-    wanted: ImageStatistics, unit: Candidates, tilt: Candidates, higher: Candidates
+    wanted: TargetImageStatistics, unit: Candidates, tilt: Candidates, higher: Candidates
 ) -> tuple[Candidates, Candidates]:
     """Return the D/r0 that shows what is wanted, nan beyond D_OVER_R0, and its blur in pixels.
 
@@ -233,7 +231,7 @@ def _solve_d_over_r0(
 
 
 def _mismatch(
-    wanted: ImageStatistics,
+    wanted: TargetImageStatistics,
     blur: Candidates,
     unit: Candidates,
     shapes: Sequence[tuple[float, ...]],
@@ -243,7 +241,11 @@ def _mismatch(
     """Return how far each candidate is off: 0.1 is 10 % of blur, or of the tilt's variance."""
     total = np.zeros(len(blur))
     if wanted.blur_ratio is not None:
-        sharp = unit * outer_scale.half_light_radius(0.0) / outer_scale.GAUSSIAN_HALF_LIGHT
+        sharp = (
+            unit
+            * outer_scale.short_exposure_half_light_radius(0.0)
+            / outer_scale.GAUSSIAN_HALF_LIGHT
+        )
         total += np.abs(np.log(np.hypot(1, blur / sharp) / wanted.blur_ratio))
     if wanted.global_tilt_share is not None:
         given = zip(ratio, shapes, REFERENCE_WIDTH_PX / aperture, strict=True)
@@ -267,7 +269,7 @@ def _path_statistics(profile: tuple[float, ...], ratio: float) -> tuple[float, f
     strength = np.interp(place, np.linspace(0, 1, len(profile)), profile)
     scatter = (strength * (place * (1 - place)) ** (5 / 6)).sum()
     return (
-        outer_scale.tilt_correlation_distance(ratio, profile),
+        outer_scale.tilt_decay_distance(ratio, profile),
         outer_scale.variance_ratio(ratio, profile, "tilt"),
         outer_scale.variance_ratio(ratio, profile, "higher"),
         float(scatter / (strength * (1 - place) ** (5 / 3)).sum()),

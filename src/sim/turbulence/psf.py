@@ -1,4 +1,4 @@
-"""Point spread functions: the exact Fraunhofer integral, its resampling, and the halo.
+"""Point spread functions: their resampling to pixels, and the halo.
 
 Lengths in the focal plane are in pixels; lambda / D is lambda f / (D p) of them.
 """
@@ -11,53 +11,7 @@ from jaxtyping import Complex, Float, Int
 from scipy.fft import next_fast_len
 from torch import Tensor
 
-from src.sim.turbulence.zernike import zernike_basis
-
-CHUNK = 512  # PSFs at a time, so that the fields stay in the cache
 SAMPLES_PER_LAMBDA_OVER_D = 2.0  # of stored PSFs: an intensity is band-limited to this
-
-
-def fraunhofer_psf(
-    coefficients: Float[Tensor, "*n modes"],
-    *,
-    lambda_over_d_px: float,
-    size: int,
-    pupil: int = 0,
-    points: int = 0,
-    normalise_plane: bool = False,
-) -> Float[Tensor, "*n size size"]:
-    """Return |Fourier transform of P exp(i phi)|^2 integrated over pixels; each sums to 1.
-
-    `coefficients` are Noll 2..modes + 1 in rad, `size` is odd, the axis of the camera falls on the
-    middle pixel and a positive a2 moves the light to larger columns.  `pupil`: samples across the
-    pupil (0: enough for `size`); `points`: samples per pixel and axis (0: enough for its integral;
-    1: the value at its centre).  With `normalise_plane` the light of the endless plane sums to 1,
-    of which the pixels hold a part.  Goodman, Introduction to Fourier Optics, 5.2.
-    """
-    if size % 2 == 0 or size < 1 or not lambda_over_d_px > 0:
-        raise ValueError(
-            f"psf needs an odd size and lambda_over_d_px > 0, got {size}, {lambda_over_d_px}"
-        )
-    pupil = pupil or max(24, math.ceil(1.5 * size / lambda_over_d_px) + 8)
-    points = points or max(1, math.ceil(5 / lambda_over_d_px))
-    flat = coefficients.reshape(-1, coefficients.shape[-1])
-    values, places = zernike_basis(flat.shape[-1], pupil)
-    column, row = ((places + 1) * pupil / 2).long().unbind(-1)
-    xi = (torch.arange(pupil, dtype=torch.float64) + 0.5) / pupil - 0.5
-    x = (torch.arange(size * points, dtype=torch.float64) + 0.5) / points - size / 2
-    turn = torch.exp(-2j * math.pi * xi[:, None] * x / lambda_over_d_px)
-    turn, psfs = turn.to(flat.device, flat.dtype.to_complex()), []
-    for part in flat.split(CHUNK):
-        wave = turn.new_zeros(len(part), pupil, pupil)
-        wave[:, row, column] = torch.exp(1j * (part @ values.to(part)))
-        light = (turn.T @ wave @ turn).abs().square()
-        psfs.append(light.reshape(-1, size, points, size, points).sum((2, 4)))
-    psf = torch.cat(psfs)
-    if normalise_plane:  # Parseval
-        psf /= len(places) * (pupil * lambda_over_d_px * points) ** 2
-    else:
-        psf /= psf.sum((1, 2), keepdim=True)
-    return psf.reshape(*coefficients.shape[:-1], size, size)
 
 
 def pixel_integration_matrix(size: int, fine: int, step: float) -> Float[Tensor, "size fine"]:
@@ -79,8 +33,7 @@ class PSFHalo:
     """The light that a point sends beyond its kernel, the same for all points and views.
 
     The mean PSF (fine, fine) without its `kernel` x `kernel` pixels of
-    lambda / D / `lambda_over_d_px` is therefore added once per frame; what that neglects is
-    measured by scripts/p2s_errors.py.  `share` of the light of a white scene comes from it.
+    lambda / D / `lambda_over_d_px`; `share` of the light of a white scene comes from it.
     """
 
     def __init__(self, mean: Float[Tensor, "fine fine"], lambda_over_d_px: float, kernel: int):
@@ -101,7 +54,7 @@ class PSFHalo:
         sides = []
         for first, count, pixels in zip(window[:2], window[2:], frame_size, strict=True):
             fast = next_fast_len(count + 2 * self.reach, real=True)
-            sides.append(reflect_index(torch.arange(fast) + first - self.reach, pixels))
+            sides.append(symmetric_index(torch.arange(fast) + first - self.reach, pixels))
         psf = self.psf.new_zeros(len(sides[0]), len(sides[1]))
         psf[: len(self.psf), : len(self.psf)] = self.psf
         far = -2 * self.reach  # the first pixel gets light from the sources 0 .. 2 reach
@@ -121,7 +74,7 @@ def convolve_halo(
     return light[:, : size[0], : size[1]].clamp(min=0)
 
 
-def reflect_index(index: Int[Tensor, "..."], size: int) -> Int[Tensor, "..."]:
+def symmetric_index(index: Int[Tensor, "..."], size: int) -> Int[Tensor, "..."]:
     """Return the pixel of the frame whose mirror image lies at `index` (the border is doubled)."""
     folded = torch.remainder(index, 2 * size)
     return torch.minimum(folded, 2 * size - 1 - folded)

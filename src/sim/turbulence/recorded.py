@@ -1,7 +1,5 @@
-"""Recorded turbulence: the tilt of real footage instead of a simulated one.
-
-Pieces of the footage's displacement fields (footage_displacement.py), other in place and time for
-every view, move the frames, and a constant Gaussian blur goes with them.
+"""Recorded turbulence: pieces of the displacement fields of real footage, other in place and time
+for every view, move the frames, and a constant Gaussian blur goes with them.
 """
 
 import math
@@ -13,12 +11,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from kornia.filters import gaussian_blur2d
-from torch import Tensor
+from torch import Generator, Tensor
 
 from src.sim import noise
 from src.sim.optics import Position, view_id
 from src.sim.turbulence.clip_rendering import run_in_threads
-from src.sim.turbulence.contract import Crop, check_option
+from src.sim.turbulence.contract import Crop, Frames, Tilt, Views, check_option
 from src.sim.turbulence.engines.device import select_engine
 from src.sim.turbulence.engines.warp_numba import pad_frames, warp_frames
 from src.sim.turbulence.footage_displacement import UnitRmsDisplacement, load_displacement_fields
@@ -36,7 +34,7 @@ class DrawnTilt:
 
 
 class RecordedTurbulence:
-    """A turbulence model (contract.py) that moves frames as the air in real footage did.
+    """A turbulence model (contract.py) that moves frames as turbulence in real footage did.
 
     `root`: a video or a folder of frames of a still scene through turbulence, its smaller side
     taken for 256 pixels.  `tilt_rms_px`: names of strengths with the tilt's rms along an axis;
@@ -71,15 +69,13 @@ class RecordedTurbulence:
         self.blur_over_tilt = blur_over_tilt
         self.fields = load_displacement_fields(footage)
 
-    def draw(self, generator: torch.Generator) -> DrawnTilt:
-        """Draw the strength of a clip."""
+    def draw(self, generator: Generator) -> DrawnTilt:
         name = self.names[int(torch.randint(len(self.names), (), generator=generator))]
         return DrawnTilt(name, self.tilt_rms_px[name])
 
     def operator(
         self, drawn: DrawnTilt, *, views: Sequence[Position], height: int, width: int, fps: float
     ) -> "RecordedTurbulenceOperator":
-        """Return the operator of a clip."""
         step, blur_px = self.footage_fps / fps, self.blur_over_tilt * drawn.tilt_rms_px
         size = height, width
         return RecordedTurbulenceOperator(self.fields, drawn, views, size, step, blur_px)
@@ -105,14 +101,8 @@ class RecordedTurbulenceOperator:
         return {"severity": self.drawn.severity, "tilt_px": tilt, "blur_px": self.blur_px}
 
     @torch.no_grad()
-    def degrade(
-        self,
-        frames: Float[Tensor, "n frames h w"],
-        generator: torch.Generator,
-        *,
-        crop: Crop | None = None,
-    ) -> Float[Tensor, "n views frames hc wc"]:
-        """Return what every view sees, linear light: moved, then blurred."""
+    def degrade(self, frames: Frames, generator: Generator, *, crop: Crop | None = None) -> Views:
+        """Return what every view sees: moved, then blurred."""
         reach, (top, left, height, width) = math.ceil(3 * self.blur_px), crop or (0, 0, *self.size)
         window = (top - reach, left - reach, height + 2 * reach, width + 2 * reach)
         seen = []
@@ -125,10 +115,8 @@ class RecordedTurbulenceOperator:
             seen.append(views[..., reach : reach + height, reach : reach + width])
         return torch.stack(seen)
 
-    def tilt(
-        self, frames: int, generator: torch.Generator, *, crop: Crop | None = None
-    ) -> Float[Tensor, "views frames 2 h w"]:
-        """Return the displacement (x, y) in px of `degrade`; `crop` may reach beyond the frame."""
+    def tilt(self, frames: int, generator: Generator, *, crop: Crop | None = None) -> Tilt:
+        """Return the displacement of `degrade`; `crop` may reach beyond the frame."""
         key = noise.base_key(generator)
         pieces = noise.uniform(noise.key(key, "pieces"), torch.arange(PLACES**2 * TIMES))
         order, window = pieces.argsort().tolist(), crop or (0, 0, *self.size)
@@ -137,10 +125,8 @@ class RecordedTurbulenceOperator:
     def _view(
         self, position: Position, frames: int, order: list[int], key: int, window: Crop
     ) -> Float[Tensor, "frames 2 h w"]:
-        """Return what one view's piece does: mirrored, turned and played in a direction that are
-        drawn for this view alone.
-
-        Views of a 3x3 block have different pieces, which are shuffled into `order` for each clip.
+        """Return what one view's piece does, mirrored, turned and played as drawn for this view;
+        views of a 3x3 block have different pieces, which are shuffled into `order`.
         """
         row, col = position
         stretch, place = divmod(order[3 * (row % 3) + col % 3], PLACES**2)

@@ -35,19 +35,8 @@ class SimulatedTurbulence:
             raise ValueError(f"turbulence.atmosphere takes no such values: {error}") from error
 
     def operator(
-        self,
-        drawn: Atmosphere | None,
-        *,
-        views: Sequence[Position],
-        height: int,
-        width: int,
-        fps: float,
+        self, drawn: Atmosphere | None, *, views: Sequence[Position], **frames: Any
     ) -> Turbulence:
         """Return the operator of an atmosphere; the last ones are cached."""
         places = tuple(tuple(position) for position in views)
-        size = {"height": height, "width": width}
-        return _cached_turbulence(drawn, views=places, **size, fps=fps, **self.options)
-
-    def with_options(self, **options: Any) -> "SimulatedTurbulence":
-        """Return the same model with some of its options replaced."""
-        return SimulatedTurbulence(self.atmosphere, **self.options | options)
+        return _cached_turbulence(drawn, views=places, **frames, **self.options)

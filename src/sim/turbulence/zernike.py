@@ -15,7 +15,6 @@ from scipy import special
 from torch import Tensor
 
 SPECTRUM = 0.022896  # of phase: SPECTRUM r0^(-5/3) f^(-11/3) rad^2 m^2, f in cycles / m
-COVARIANCE = 2.246061  # Noll's 2.2424 without the rounding of his 0.023
 
 
 def noll_index(mode: int) -> tuple[int, int]:
@@ -24,32 +23,6 @@ def noll_index(mode: int) -> tuple[int, int]:
     place = mode - n * (n + 1) // 2 - 1
     m = 2 * ((place + 1) // 2) if n % 2 == 0 else 2 * (place // 2) + 1
     return n, m if mode % 2 == 0 else -m
-
-
-def noll_covariance(modes: int) -> Float[Tensor, "modes modes"]:
-    """Return the covariance of Noll coefficients 2..modes + 1 at D/r0 = 1, in rad^2, float64
-    (Noll 1976, eq. 25); it scales with (D/r0)^(5/3)."""
-    n, m = _indices(modes)
-    total, apart, third = n[:, None] + n, n[:, None] - n, 17 / 3
-    signs = (-1.0) ** (total // 2 - abs(m))
-    signs *= special.gammasgn((apart + third) / 2) * special.gammasgn((third - apart) / 2)
-    logs = special.gammaln((total - 5 / 3) / 2) - special.gammaln((total + 23 / 3) / 2)
-    logs -= special.gammaln((apart + third) / 2) + special.gammaln((third - apart) / 2)
-    scale = COVARIANCE * np.sqrt(np.multiply.outer(n + 1, n + 1))
-    return torch.from_numpy(np.where(m[:, None] == m, signs * scale * np.exp(logs), 0))
-
-
-def zernike_basis(modes: int, size: int) -> tuple[Float[Tensor, "modes p"], Float[Tensor, "p 2"]]:
-    """Return Noll modes 2..modes + 1 at the points of a `size` x `size` grid inside the unit disc.
-
-    Also the (x, y) of the points, in pupil radii.
-    """
-    axis = (torch.arange(size, dtype=torch.float64) + 0.5) * 2 / size - 1
-    y, x = torch.meshgrid(axis, axis, indexing="ij")
-    inside = x**2 + y**2 <= 1
-    points = torch.stack([x[inside], y[inside]], dim=-1)
-    radius, angle = points.norm(dim=-1), torch.atan2(points[:, 1], points[:, 0])
-    return torch.stack([_mode(noll_index(j), radius, angle) for j in range(2, modes + 2)]), points
 
 
 def pupil_filter(
@@ -61,7 +34,7 @@ def pupil_filter(
     i^n sqrt(n + 1) 2 J_{n+1}(pi kappa) / (pi kappa) {1, sqrt2 cos(m angle), sqrt2 sin(m angle)}
     (Noll 1976, eq. 8, for the phase at the pupil's centre).
     """
-    n, m = _indices(modes)
+    n, m = noll_indices_without_piston(modes)
     x, turn = math.pi * kappa.double().numpy(), angle.double().numpy()
     inside = np.where(x > 0, x, 1)
     bessel = special.jv(np.arange(n[-1] + 2)[:, None], inside) / inside
@@ -74,16 +47,7 @@ def pupil_filter(
 
 
 @cache
-def _indices(modes: int) -> tuple[np.ndarray, np.ndarray]:
+def noll_indices_without_piston(modes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return n and m of Noll modes 2..modes + 1."""
     n, m = np.array([noll_index(mode) for mode in range(2, modes + 2)]).T
     return n, m
-
-
-def _mode(index: tuple[int, int], radius: Tensor, angle: Tensor) -> Tensor:
-    n, m = index[0], abs(index[1])
-    total = torch.zeros_like(radius)
-    for s in range((n - m) // 2 + 1):
-        weight = (-1) ** s * math.comb(n - s, s) * math.comb(n - 2 * s, (n - m) // 2 - s)
-        total = total + weight * radius ** (n - 2 * s)
-    azimuth = torch.sin(m * angle) if index[1] < 0 else torch.cos(m * angle)
-    return math.sqrt((n + 1) * (2 if m else 1)) * total * azimuth

@@ -95,7 +95,7 @@ def test_nothing_known_is_a_failure_and_the_first_break_is_found():
 
 
 def test_a_sum_holds_and_a_leaky_sum_does_not(bench):
-    retention = partial(recurrence.measure_contrast_retention, windows=[5, 50], limit=90.0)
+    retention = partial(recurrence.measure_contrast_retention_percent, windows=[5, 50], limit=90.0)
     assert retention(running(), bench).value == pytest.approx(100)
     kept = retention(Candidate("leaky", HighPass(), 1), bench)
     assert kept.curve[0][1] == pytest.approx(100 * 0.9**5, rel=0.02) and kept.failed
@@ -145,14 +145,14 @@ def test_every_stress_test_runs_on_a_set_network(bench):
     torch.manual_seed(0)
     subject = Candidate("setnet", SetNet(channels=4).eval(), 9)
     tests = {
-        recurrence.measure_contrast_retention: {"windows": [3]},
+        recurrence.measure_contrast_retention_percent: {"windows": [3]},
         recurrence.measure_long_sequence_drift: {"windows": 96},
-        recurrence.measure_convergence_time: {},
+        recurrence.measure_convergence_windows: {},
         recurrence.measure_flicker_recovery: {},
-        recurrence.measure_static_scene_jitter: {},
+        recurrence.measure_static_scene_jitter_percent: {},
         recurrence.measure_perturbation_growth: {},
         recurrence.measure_adversarial_gain: {"windows": 2, "steps": 2},
-        recurrence.measure_bf16_error: {"windows": 8},
+        recurrence.measure_bf16_psnr_difference: {"windows": 8},
         conditions.measure_window_rate_loss: {"rates_hz": [1200], "duration_s": 0.1},
         conditions.measure_event_dropout_loss: {"kept_shares": [0.1]},
         conditions.measure_view_dropout_loss: {"counts": [4], "draws": 1},
@@ -178,4 +178,4 @@ def test_shifting_brings_nothing_in():
 def test_settling_is_the_last_time_beyond():
     scores = torch.cat([torch.linspace(0, 20, 21), torch.full((39,), 20.0)])
     assert recurrence.measure_settling_time(scores, 1.0) == 18  # averaged over five windows
-    assert recurrence.find_last_exceedance(torch.tensor([3.0, 0.5, 2.0, 0.5]), 1.0) == 3
+    assert recurrence.windows_to_last_exceedance(torch.tensor([3.0, 0.5, 2.0, 0.5]), 1.0) == 3

@@ -6,7 +6,9 @@ import torch
 
 from src.figures import calibration_figures
 from src.recordings.calibration import contrast_threshold
-from src.recordings.files.formats import EVENT, open_recording, write_events
+from src.recordings.files.event_file import EVENT
+from src.recordings.files.event_writers import write_events
+from src.recordings.files.recording import open_recording
 from src.sim.sensor.sensor import EventSensor
 
 FPS = 120.0

@@ -129,10 +129,13 @@ def measured(frames: int = 40):
 def test_measure_compares_with_the_still_recording():
     found = measured()
     assert found.tilt.std() == pytest.approx(1.2, rel=0.1)
-    assert found.blur_ratio == pytest.approx(np.full((2, 9), 2.5 / 2.0), rel=0.05)
+    assert found.blur_over_still == pytest.approx(np.full((2, 9), 2.5 / 2.0), rel=0.05)
     assert (found.scintillation > 3 * found.still_scintillation).all()
     assert found.failed.sum() == 0
-    assert found.within_view.shape == (9, 9) and found.across_views.shape == (2, 2)
+    assert found.centre_view_correlation.shape == (
+        9,
+        9,
+    ) and found.tilt_correlation_across_views.shape == (2, 2)
 
 
 def test_measure_rejects_a_dot_without_a_reference():
@@ -144,11 +147,11 @@ def test_measure_rejects_a_dot_without_a_reference():
 
 
 def test_csv_has_a_row_per_view_and_dot(tmp_path):
-    dot_statistics.write_dot_csv(measured(), tmp_path / "dots.csv", [(0, 0), (0, 1)])
+    dot_statistics.write_view_dot_csv(measured(), tmp_path / "dots.csv", [(0, 0), (0, 1)])
     with open(tmp_path / "dots.csv") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 18
-    assert float(rows[0]["blur_ratio"]) == pytest.approx(1.25, rel=0.05)
+    assert float(rows[0]["blur_over_still"]) == pytest.approx(1.25, rel=0.05)
 
 
 def test_find_dots_orders_row_by_row():

@@ -7,7 +7,7 @@ import pytest
 from src.app import calibrations
 from src.calibrate import calibrate
 from src.recordings.calibration import point_tracking, turbulence_meter
-from src.recordings.files import sources
+from src.recordings.files import videos
 from src.recordings.files.turbulence_file import IntervalEstimate, read_turbulence_file
 from tests.test_recording_entry_points import config
 
@@ -218,4 +218,4 @@ def test_footage_of_a_building_and_of_a_panning_camera(shared_data):
 
 
 def _frames(path) -> np.ndarray:
-    return np.stack([turbulence_meter.shrink_frame(frame) for frame in sources.read_video(path)])
+    return np.stack([turbulence_meter.shrink_frame(frame) for frame in videos.read_video(path)])

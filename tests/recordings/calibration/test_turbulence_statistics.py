@@ -132,7 +132,7 @@ def test_tilt_across_views_is_that_of_the_same_air_looked_at_for_longer(case):
     true = dot_statistics.tilt_correlation(long.swapaxes(0, 1))[pairs]
     assert abs(true.mean()) < 0.02 if case.alike == 9 else true.min() > 0.4
     error = sampling_error(long[CENTRE, :FRAMES]) * (1 - true**2)
-    found = case.found.across_views[pairs]
+    found = case.found.tilt_correlation_across_views[pairs]
     assert abs((found - true) / error).max() < 4
     apart = 36 if case.alike == 9 else 4  # pairs of views in shared air are not independent
     check("across views", found.mean(), true.mean(), error.mean() / np.sqrt(apart))
@@ -147,7 +147,7 @@ def test_blur_ratio_is_that_before_the_camera(case):
     true = np.mean(before, axis=1) / still
     error = np.mean([mean_error(series) for series in before]) / still
     assert true.min() - 1 > 5 * error
-    for found, of_view in zip(case.found.blur_ratio[:, MIDDLE], true, strict=True):
+    for found, of_view in zip(case.found.blur_over_still[:, MIDDLE], true, strict=True):
         check("blur ratio", found, of_view, error)
 
 

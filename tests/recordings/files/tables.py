@@ -5,17 +5,19 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from src.recordings.files import columns, formats
+from src.recordings.files import event_writers
+
+TABLES = (".txt", ".csv", ".npz", ".h5", ".hdf5")
 
 
 def write_events(
     path: Path, events: np.ndarray, *, width: int, height: int, version: str = "evt3"
 ) -> None:
     """Write events (t x y p) in the format of the path's ending."""
-    if path.suffix in columns.SUFFIXES:
+    if path.suffix in TABLES:
         write_table(path, events, (width, height))
     else:
-        formats.write_events(path, events, width=width, height=height, version=version)
+        event_writers.write_events(path, events, width=width, height=height, version=version)
 
 
 def write_table(path: Path, events: np.ndarray, size: tuple[int, int]) -> None:

@@ -151,7 +151,7 @@ def broken(tmp_path, kind):
     [
         ("missing", "footage that exists"),
         ("empty", "videos or folders of frames, got none"),
-        ("unreadable", "a video that OpenCV can read"),
+        ("unreadable", "a video that FFmpeg can read"),
         ("damaged", "frames that can be read"),
         ("short", "4 frames on end"),
         ("small", "16x16 px or more"),

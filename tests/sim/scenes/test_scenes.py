@@ -118,7 +118,7 @@ def test_clips_are_those_that_published_numbers_are_of(kind):
     settings = (
         {"static_camera_share": 1.0, "rest_share": 1.0, "max_cutouts": 4} if kind == "still" else {}
     )
-    scene = Photographs(frames=9, train_root=None, **settings)
+    scene = Photographs(frames=9, extra_train_root=None, **settings)
     for index, greys in enumerate(GREYS[kind]):
         frame = scene.clip(index).frames[-1, 40::80, 40::80]
         assert torch.allclose(frame.flatten(), torch.tensor(greys), atol=2e-3)
@@ -135,22 +135,22 @@ def test_more_photographs_serve_training_only(tmp_path):
     root, more, third = (folder(tmp_path / name, 12) for name in ("b", "a", "c"))
     for split in ("train", "val", "test"):
         plain = Photographs(root, split=split, frames=2)
-        both = Photographs(root, split=split, frames=2, train_root=[more, third])
+        both = Photographs(root, split=split, frames=2, extra_train_root=[more, third])
         extra = both.photos[len(plain.photos) :]
         assert both.photos[: len(plain.photos)] == plain.photos
         assert len(extra) == (24 if split == "train" else 0)
         if split != "train":
             assert torch.equal(plain.clip(0).frames, both.clip(0).frames)
-    assert len(Photographs(None, train_root=more).photos) == 9 + 12
+    assert len(Photographs(None, extra_train_root=more).photos) == 9 + 12
 
 
 def test_photographs_that_validation_or_test_have_are_not_trained_on(tmp_path):
     inner = folder(tmp_path / "b", 12)
     for root, more in ((inner, inner), (str(tmp_path), inner), (inner, [str(tmp_path)])):
-        with pytest.raises(ValueError, match="scene.train_root must be apart from scene.root"):
-            Photographs(root, train_root=more)
+        with pytest.raises(ValueError, match="extra_train_root must be apart from scene.root"):
+            Photographs(root, extra_train_root=more)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match="scene.train_root must hold photographs, got none in"):
-        Photographs(inner, train_root=str(tmp_path / "empty"))
-    with pytest.raises(ValueError, match="scene.train_root must be a folder or a pack"):
-        Photographs(inner, train_root="/nowhere")
+    with pytest.raises(ValueError, match="extra_train_root must hold photographs, got none in"):
+        Photographs(inner, extra_train_root=str(tmp_path / "empty"))
+    with pytest.raises(ValueError, match="scene.extra_train_root must be a folder or a pack"):
+        Photographs(inner, extra_train_root="/nowhere")

@@ -10,10 +10,10 @@ from src.figures.slices import circle_points, sample_points
 from src.sim.scenes.targets import (
     TARGETS,
     Targets,
+    antialiased_stripes,
     disc_coverage,
     edge_coverage,
-    mean_stripes,
-    rotate_coordinates,
+    to_body_coordinates,
 )
 
 SMALL = {"height": 64, "width": 80, "frames": 13, "split": "test"}
@@ -193,8 +193,10 @@ def test_shapes_cover_what_a_fine_grid_says():
     assert np.abs(disc_coverage(pixel_x - 11.3, pixel_y - 12.1, 5.4) - exact).max() < 0.06
     assert abs(exact.sum() / disc_coverage(pixel_x - 11.3, pixel_y - 12.1, 5.4).sum() - 1) < 0.004
     exact = mean(np.where((x - 3.3) % 10 < 5, 1.0, -1.0))
-    assert np.abs(mean_stripes(pixel_x - 3.3, 5.0) - exact).max() < 0.07  # the fine grid's own step
-    along, _ = rotate_coordinates(x - 9.2, y - 9.7, 0.6)
+    assert (
+        np.abs(antialiased_stripes(pixel_x - 3.3, 5.0) - exact).max() < 0.07
+    )  # the fine grid's own step
+    along, _ = to_body_coordinates(x - 9.2, y - 9.7, 0.6)
     exact = mean(along < 4.0)
-    along, _ = rotate_coordinates(pixel_x - 9.2, pixel_y - 9.7, 0.6)
+    along, _ = to_body_coordinates(pixel_x - 9.2, pixel_y - 9.7, 0.6)
     assert np.abs(edge_coverage(4.0 - along) - exact).max() < 0.06

@@ -11,7 +11,6 @@ PATH = Atmosphere(0.05, 0.5, 1000.0, 2.0, 525e-9, 3e-14, 0.9)
 
 
 def test_pixels_follow_from_focal_length_distance_and_scene_width():
-    assert PATH.pixel_pitch_m(256) == pytest.approx(0.5 * 2.0 / (1000.0 * 256))
     assert PATH.lambda_over_d_px(256) == pytest.approx(525e-9 / 0.05 * 1000 * 256 / 2.0)
     assert PATH.tilt_std_px(512) == pytest.approx(2 * PATH.tilt_std_px(256))
 

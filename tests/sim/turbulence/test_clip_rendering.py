@@ -11,22 +11,22 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from scripts.parallel_fill import PreparedTurbulence, prepare_turbulence
 from src.sim.turbulence import clip_rendering, sample_atmosphere
 from src.sim.turbulence.clip_plan import ALIGNMENT, PackedTensors, _wave_tables
-from src.sim.turbulence.clip_rendering import PreparedTurbulence
 from src.sim.turbulence.coefficient_grid import (
     GridAxis,
     WaveSum,
+    evaluate_waves,
     omit_weak_waves,
     sum_waves,
-    waves_on_grid,
 )
 from src.sim.turbulence.engines import blur_torch, device
 from src.sim.turbulence.engines.device import full_float32
 from src.sim.turbulence.engines.scatter_numba import scatter_psfs
 from src.sim.turbulence.engines.warp_numba import pad_frames, warp_frames
 from src.sim.turbulence.operator import Turbulence
-from src.sim.turbulence.p2s import FittedPSFs, load_psf_bands
+from src.sim.turbulence.p2s import FittedPSFs, load_bands_by_d_over_r0
 from src.sim.turbulence.plane_waves import draw_plane_waves
 from src.sim.turbulence.simulated import SimulatedTurbulence
 from tests.sim.turbulence.test_turbulence import PATH, operator, seed
@@ -41,7 +41,7 @@ def render_on_device(frames: torch.Tensor, plans) -> torch.Tensor:
 
 def both(turbulence: Turbulence, frames: torch.Tensor, crop=CROP) -> tuple[torch.Tensor, ...]:
     """Return the views as the CPU renders them, and as a device does."""
-    plans = turbulence.prepare(frames.shape[1], seed(), crop).plans
+    plans = turbulence.plan(frames.shape[1], seed(), crop)
     return turbulence.degrade(frames, seed(), crop=crop), render_on_device(frames, plans)
 
 
@@ -74,7 +74,7 @@ def test_parts_and_tiles_change_nothing(monkeypatch):
     _, other = both(turbulence, frames)
     monkeypatch.setattr(clip_rendering, "DEVICE_BYTES", 2_000_000)
     monkeypatch.setattr("src.sim.turbulence.operator.TILE", 16)
-    plans = turbulence.prepare(5, seed(), CROP).plans
+    plans = turbulence.plan(5, seed(), CROP)
     assert len(plans) == 6
     assert clip_rendering._numbers_per_picture(plans[0], blur_torch) * 4 * 20 > 2_000_000
     torch.testing.assert_close(render_on_device(frames, plans), other, atol=5e-6, rtol=0)
@@ -85,7 +85,8 @@ def test_parts_and_tiles_change_nothing(monkeypatch):
 
 def test_prepared_turbulence_is_small_can_be_sent_and_is_for_one_crop():
     turbulence = Turbulence(PATH.with_d_over_r0(2.0), views=9, height=256, width=256)
-    ahead, frames = turbulence.prepare(4, seed(), CROP), torch.rand(1, 4, 256, 256)
+    ahead = prepare_turbulence(turbulence, 4, seed(), CROP)
+    frames = torch.rand(1, 4, 256, 256)
     sent = pickle.dumps(ahead)
     assert len(sent) < 1_000_000
     again = pickle.loads(sent)
@@ -99,8 +100,6 @@ def test_prepared_turbulence_is_small_can_be_sent_and_is_for_one_crop():
         ahead.degrade(frames.expand(2, -1, -1, -1), seed(), crop=CROP)
     with pytest.raises(ValueError, match="got 1 in None"):
         ahead.degrade(frames, seed())
-    clear = Turbulence(None, views=9, height=256, width=256)
-    assert clear.prepare(4, seed(), CROP) is clear
 
 
 class Launches(TorchDispatchMode):
@@ -138,7 +137,7 @@ def kernels() -> ModuleType:
 @pytest.mark.parametrize("strength", [0.5, 2.0, 6.0])
 def test_a_clip_is_few_launches_none_of_which_is_waited_for(strength, monkeypatch):
     turbulence, frames = operator(strength, views=9), torch.rand(1, 5, 64, 64)
-    plans = turbulence.prepare(5, seed(), CROP).plans
+    plans = turbulence.plan(5, seed(), CROP)
     for engine, most in ((kernels(), 55), (blur_torch, 95)):
         monkeypatch.setattr(device, "select_engine", lambda device, engine=engine: engine)
         with Launches() as launches:
@@ -150,7 +149,7 @@ def test_a_clip_is_few_launches_none_of_which_is_waited_for(strength, monkeypatc
 def test_torch_expressions_equal_the_compiled_ones(pitch):
     rows, columns = GridAxis(-3, 40, pitch, 1), GridAxis(2, 37, pitch, 1)
     frames, tilt = torch.rand(2, 30, 41), 3 * torch.randn(2, 6, 40, 37)
-    psfs = FittedPSFs(load_psf_bands()[2], 0, 20, 1.3, 7, 3.0)
+    psfs = FittedPSFs(load_bands_by_d_over_r0()[2], 0, 20, 1.3, 7, 3.0)
     weights = 0.5 * torch.randn(20, 6, rows.nodes, columns.nodes)
     one = torch.ones_like(weights[:1])
     pixels = torch.einsum("rij,rnyx->ijnyx", psfs.basis, torch.cat([one, weights])).flatten(0, 1)
@@ -185,9 +184,12 @@ def test_both_sums_of_waves_equal_the_definition(pitch, columns):
     response = omit_weak_waves(torch.view_as_complex(waves.response).to(torch.complex64)[2:], 2)
     turned = response * tables["psf_response"]
     along = tables["psf_rows"], tables["psf_columns"]
-    found = sum_waves(turned, amplitudes, waves_on_grid(*along))
+    found = sum_waves(turned, amplitudes, evaluate_waves(*along))
     y, x = (axis.pixels.double() - 31.5 for axis in grid)
-    turns = waves.frequency[:, 1, None, None] * y[:, None] + waves.frequency[:, 0, None, None] * x
+    turns = (
+        waves.frequency_per_px[:, 1, None, None] * y[:, None]
+        + waves.frequency_per_px[:, 0, None, None] * x
+    )
     wave = torch.exp(2j * torch.pi * turns).to(torch.complex64)
     expected = torch.einsum("mw,nw,wyx->mnyx", response, amplitudes, wave).real
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
@@ -223,7 +225,8 @@ def test_the_operator_of_the_same_atmosphere_is_cached():
     one = air.operator(path, views=[(0, 0)], **size)
     assert air.operator(copy.copy(path), views=((0, 0),), **size) is one
     assert air.operator(replace(path, ar1_coefficient=0.5), views=[(0, 0)], **size) is not one
-    assert air.with_options(tolerance=0.9).operator(path, views=[(0, 0)], **size) is not one
+    rough = SimulatedTurbulence({"severity": "weak"}, tolerance=0.9)
+    assert rough.operator(path, views=[(0, 0)], **size) is not one
 
 
 @pytest.mark.gpu

@@ -12,7 +12,7 @@ from src.sim.optics import Optics, layout
 from src.sim.pipeline import Pipeline, simulate
 from src.sim.scenes.clip import Clip
 from src.sim.sensor import EventSensor
-from src.sim.turbulence.contract import TurbulenceModel, TurbulenceOperator
+from src.sim.turbulence.contract import ClipTurbulence, TurbulenceModel
 from src.sim.turbulence.simulated import SimulatedTurbulence
 from tests.conftest import ROOT
 
@@ -53,7 +53,7 @@ class Ramp:
 def test_both_sides_of_the_contract_are_kept_by_simulated_turbulence():
     model = SimulatedTurbulence({"severity": "weak"})
     air = model.operator(model.draw(generator(0)), views=layout(4), height=16, width=16, fps=120.0)
-    assert isinstance(model, TurbulenceModel) and isinstance(air, TurbulenceOperator)
+    assert isinstance(model, TurbulenceModel) and isinstance(air, ClipTurbulence)
     assert air.metadata["severity"] == "weak" and air.metadata["tilt_px"] > 0
 
 
@@ -67,14 +67,9 @@ def test_a_class_of_ones_own_is_all_the_pipeline_needs():
     assert torch.equal(sample.turbulent[0, :, 0], shown)
 
 
-def test_options_are_replaced_and_wrong_ones_refused_at_once():
-    model = SimulatedTurbulence({"severity": "strong"}, temporal_model="ar1", tolerance=0.5)
-    assert model.with_options(temporal_model="frozen_flow").options == {
-        "temporal_model": "frozen_flow",
-        "tolerance": 0.5,
-    }
+def test_wrong_options_are_refused_at_once():
     with pytest.raises(ValueError, match=r"turbulence\.tolerance must be in \(0, 1\], got 7"):
-        model.with_options(tolerance=7)
+        SimulatedTurbulence({"severity": "strong"}, tolerance=7)
     with pytest.raises(ValueError, match="turbulence takes no such values.*strenght"):
         SimulatedTurbulence({"severity": "strong"}, strenght=2)
     with pytest.raises(ValueError, match=r"turbulence\.atmosphere takes no such values.*cn"):

@@ -31,7 +31,7 @@ def drawn(path: Atmosphere, modes: int = 2):
 
 @pytest.mark.parametrize("place", HALF_LENGTHS)
 def test_half_lengths_of_theory_are_those_of_the_table(place):
-    found = [outer_scale.tilt_correlation_distance(ratio, cn2_profile(place)) for ratio in RATIOS]
+    found = [outer_scale.tilt_decay_distance(ratio, cn2_profile(place)) for ratio in RATIOS]
     np.testing.assert_allclose(found, HALF_LENGTHS[place], rtol=0.15)  # two digits, few slices
 
 
@@ -46,7 +46,7 @@ def test_the_waves_that_are_drawn_have_this_variance_and_half_length(place, rati
     expected = outer_scale.variance_ratio(ratio, shape, "tilt") * 0.448879
     assert power.sum() == pytest.approx(expected, rel=0.04)
     apart = path.tilt_correlation_half_length_px(256)
-    turn = 2 * math.pi * waves.frequency.norm(dim=-1).numpy() * apart
+    turn = 2 * math.pi * waves.frequency_per_px.norm(dim=-1).numpy() * apart
     assert (power * special.j0(turn)).sum() / power.sum() == pytest.approx(0.5, abs=0.03)
 
 
@@ -84,12 +84,12 @@ def test_the_fields_of_clips_have_the_half_length():
 
 def test_time_of_decay_in_the_wind():
     path = replace(PATH, outer_scale_m=0.2).with_d_over_r0(1.0)
-    reach = outer_scale.tilt_correlation_distance(
+    reach = outer_scale.tilt_decay_distance(
         path.aperture_over_outer_scale, path.normalised_profile, wind=True
     )
     waves = drawn(path)
     power = waves.response[:2].square().sum((0, 2)).numpy()
-    turn = 2 * math.pi * waves.layer_frequency.norm(dim=-1).numpy() * reach * path.aperture_m
+    turn = 2 * math.pi * waves.frequency_per_m.norm(dim=-1).numpy() * reach * path.aperture_m
     left = (power * special.j0(turn)).sum() / power.sum()
     assert left == pytest.approx(math.exp(-1), abs=0.03)
 

@@ -5,13 +5,13 @@ import pytest
 import torch
 from torch.nn import functional
 
+from scripts.exact_psf import fraunhofer_psf
 from scripts.p2s_training import TrainableNetwork
-from src.sim.turbulence.p2s_network import (
+from src.sim.turbulence.p2s import (
     PhaseToSpaceNetwork,
     basis_parities,
     mirror_symmetry_class,
 )
-from src.sim.turbulence.psf import fraunhofer_psf
 from src.sim.turbulence.zernike import noll_index
 
 COUNTS = [5, 3, 2, 3]
@@ -24,11 +24,11 @@ def phases(modes: int, count: int = 300) -> torch.Tensor:
 
 def network(modes: int, width: int = 16) -> TrainableNetwork:
     torch.manual_seed(0)
-    return TrainableNetwork(modes, width, COUNTS, edge=4.0).requires_grad_(False)
+    return TrainableNetwork(modes, width, COUNTS, max_d_over_r0=4.0).requires_grad_(False)
 
 
 def stored(net: TrainableNetwork) -> PhaseToSpaceNetwork:
-    return PhaseToSpaceNetwork(net.modes, net.edge, net.state_dict())
+    return PhaseToSpaceNetwork(net.modes, net.max_d_over_r0, net.state_dict())
 
 
 def turned(phase: torch.Tensor, down: bool, across: bool) -> torch.Tensor:

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from src.sim.turbulence import sample_atmosphere
-from src.sim.turbulence.outer_scale import half_light_radius
+from src.sim.turbulence.outer_scale import short_exposure_half_light_radius
 from src.sim.turbulence.prior import (
     TILT_AND_BLUR_PX,
-    ImageStatistics,
+    TargetImageStatistics,
     cn2_profile,
     sample_matching_atmosphere,
 )
@@ -63,7 +63,7 @@ def test_a_draw_is_a_function_of_the_generator():
 
 @pytest.mark.parametrize("tilt_px, length_px", [(0.3, 8.0), (0.64, 15.0), (1.2, 60.0)])
 def test_a_camera_that_shows_measured_turbulence(tilt_px, length_px):
-    seen = ImageStatistics(length_px, tilt_correlation_time_s=0.05, tilt_px=tilt_px)
+    seen = TargetImageStatistics(length_px, tilt_correlation_time_s=0.05, tilt_px=tilt_px)
     for seed in range(8):
         path = sample_matching_atmosphere(seen, generator(seed))
         assert path.tilt_std_px(256) == pytest.approx(tilt_px, rel=0.03)
@@ -73,9 +73,11 @@ def test_a_camera_that_shows_measured_turbulence(tilt_px, length_px):
 
 def test_the_blur_that_is_wanted_is_the_nearest_there_is():
     def blur_ratio(wanted: float) -> float:
-        statistics = ImageStatistics(20.0, 0.05, tilt_px=0.5, blur_ratio=wanted)
+        statistics = TargetImageStatistics(20.0, 0.05, tilt_px=0.5, blur_ratio=wanted)
         path = sample_matching_atmosphere(statistics, generator(3))
-        sharp, blurred = (half_light_radius(d) for d in (0.0, path.blur_equivalent_d_over_r0))
+        sharp, blurred = (
+            short_exposure_half_light_radius(d) for d in (0.0, path.blur_equivalent_d_over_r0)
+        )
         return blurred / sharp
 
     assert blur_ratio(1.3) == pytest.approx(1.3, rel=0.15)

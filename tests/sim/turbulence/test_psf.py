@@ -5,16 +5,16 @@ import math
 import pytest
 import torch
 
+from scripts.exact_psf import fraunhofer_psf, noll_covariance
 from src.sim.turbulence.p2s import (
     FILE,
     SAMPLES_PER_LAMBDA_OVER_D,
     FittedPSFs,
+    basis_parities,
     find_psf_band,
-    load_psf_bands,
+    load_bands_by_d_over_r0,
 )
-from src.sim.turbulence.p2s_network import basis_parities
-from src.sim.turbulence.psf import fraunhofer_psf, pixel_integration_matrix
-from src.sim.turbulence.zernike import noll_covariance
+from src.sim.turbulence.psf import pixel_integration_matrix
 from tests.sim.turbulence.theory import compute_fitted_psfs
 
 MODES = 119  # that carry what blurs
@@ -97,7 +97,7 @@ def test_modes_left_out_blur_as_they_do_on_average(strength, number):
 
 
 def test_basis_is_even_or_odd_under_both_mirrors():
-    for band in load_psf_bands():
+    for band in load_bands_by_d_over_r0():
         for axis in (1, 2):
             turned = band.basis.flip(axis)
             sign = (turned * band.basis).sum((1, 2), keepdim=True).sign()
@@ -105,7 +105,7 @@ def test_basis_is_even_or_odd_under_both_mirrors():
 
 
 def test_fitted_psf_without_phase_is_diffraction():
-    psfs = FittedPSFs(load_psf_bands()[0], -1, 24, 1.0, 17, 0.0)
+    psfs = FittedPSFs(load_bands_by_d_over_r0()[0], -1, 24, 1.0, 17, 0.0)
     ours = compute_fitted_psfs(psfs, torch.zeros(25, 1)).reshape(17, 17)
     exact = fraunhofer_psf(torch.zeros(2), lambda_over_d_px=1.0, size=17, points=9)
     assert (ours - exact).abs().max() < 0.01 * exact.max()

@@ -1,13 +1,16 @@
 """The cheapest settings of PSFs."""
 
+from types import SimpleNamespace
+
 import pytest
 
+from src.sim.turbulence.fidelity import choose_psf_settings
 from src.sim.turbulence.p2s import find_psf_band
-from src.sim.turbulence.psf_settings import PSFSettings, choose_psf_settings
 
 
-def fitted(strength: float, airy: float, pixel: float, allowed: float) -> PSFSettings:
-    return choose_psf_settings(find_psf_band(strength), strength, airy, pixel, allowed)
+def fitted(strength: float, airy: float, pixel: float, allowed: float) -> SimpleNamespace:
+    found = choose_psf_settings(find_psf_band(strength), strength, airy, pixel, allowed)
+    return SimpleNamespace(**found)
 
 
 @pytest.mark.parametrize("strength", [0.3, 1.0, 2.5, 4.0, 5.0])

@@ -7,7 +7,7 @@ import torch
 
 from src.sim.noise import generator
 from src.sim.optics import layout
-from src.sim.turbulence.contract import TurbulenceModel, TurbulenceOperator
+from src.sim.turbulence.contract import ClipTurbulence, TurbulenceModel
 from src.sim.turbulence.footage_displacement import (
     UnitRmsDisplacement,
     interpolate_tracks,
@@ -95,7 +95,7 @@ def test_beyond_its_ends_the_footage_is_mirrored_in_place_and_time():
 
 def test_both_sides_of_the_contract_are_kept(model):
     air = model.operator(model.draw(generator(0)), views=layout(9), **RUN)
-    assert isinstance(model, TurbulenceModel) and isinstance(air, TurbulenceOperator)
+    assert isinstance(model, TurbulenceModel) and isinstance(air, ClipTurbulence)
     strength = air.metadata["severity"]
     assert (
         air.metadata["tilt_px"] == RMS[strength] and air.metadata["blur_px"] == 0.4 * RMS[strength]

@@ -268,7 +268,6 @@ def test_extremes_of_the_ar1_coefficient_over_a_thousand_frames(ar1_coefficient)
             {"temporal_model": "magic"},
             r"turbulence\.temporal_model must be ar1, frozen_flow or mixed",
         ),
-        ({"wind_layers": 0}, r"turbulence\.wind_layers must be in \[1, 100\], got 0"),
         ({"views_correlation": "maybe"}, r"turbulence\.views_correlation"),
         ({"wind_m_s": -1.0}, r"turbulence\.wind_m_s"),
         ({"baseline_m": -1.0}, r"turbulence\.baseline_m"),

@@ -11,14 +11,14 @@ from dataclasses import replace
 import pytest
 import torch
 
+from scripts.exact_psf import fraunhofer_psf, noll_covariance
 from src.sim import noise
 from src.sim.turbulence.atmosphere import Atmosphere
 from src.sim.turbulence.fidelity import mean_psf
 from src.sim.turbulence.operator import WAVES, Turbulence
-from src.sim.turbulence.p2s import FittedPSFs, load_psf_bands
+from src.sim.turbulence.p2s import FittedPSFs, load_bands_by_d_over_r0
 from src.sim.turbulence.plane_waves import PlaneWaves, advect_waves, draw_plane_waves
-from src.sim.turbulence.psf import PSFHalo, fraunhofer_psf
-from src.sim.turbulence.zernike import noll_covariance
+from src.sim.turbulence.psf import PSFHalo
 from tests.sim.turbulence.theory import compute_fitted_psfs, isoplanatic_angle_rad, noll_residual
 
 PATH = Atmosphere(0.05, 0.5, 1000.0, 2.0, 525e-9, 3e-14, 0.9)  # D 5 cm, 1 km, 2 m wide
@@ -35,7 +35,7 @@ def waves_of(
 
 def covariance(waves: PlaneWaves, shift_px: tuple[float, float] = (0.0, 0.0)) -> torch.Tensor:
     """Return E[a_i(x) a_j(x + shift)] over the amplitudes of one clip."""
-    turn = 2 * math.pi * waves.frequency @ torch.tensor(shift_px, dtype=torch.float64)
+    turn = 2 * math.pi * waves.frequency_per_px @ torch.tensor(shift_px, dtype=torch.float64)
     left = torch.view_as_complex(waves.response)
     right = left * torch.exp(1j * turn)
     return (left.conj() @ right.T).real
@@ -225,7 +225,7 @@ def test_15_frozen_flow_shifts_the_field():
     [waves] = waves_of(PATH.with_d_over_r0(2.0), 9, 1)
     middle = torch.full_like(waves.z_over_l, 0.5)
     pixel = PATH.pixel_size_at_object_m(256)
-    thin = replace(waves, z_over_l=middle, frequency=waves.layer_frequency * 0.5 * pixel)
+    thin = replace(waves, z_over_l=middle, frequency_per_px=waves.frequency_per_m * 0.5 * pixel)
     fresh = torch.randn(1, 1, WAVES, 2, dtype=torch.float64)
     speed, seconds = torch.tensor([[2.0, -1.0]], dtype=torch.float64), 0.01
     later = advect_waves(thin, fresh, speed, torch.tensor([seconds], dtype=torch.float64))[0, 0]
@@ -233,9 +233,9 @@ def test_15_frozen_flow_shifts_the_field():
     shift = speed[0] * seconds / 0.5 / pixel
     response = torch.view_as_complex(thin.response)
     at = torch.tensor([7.0, 3.0], dtype=torch.float64)
-    now = (response * later * torch.exp(2j * math.pi * (thin.frequency @ at))).real.sum(1)
+    now = (response * later * torch.exp(2j * math.pi * (thin.frequency_per_px @ at))).real.sum(1)
     before = torch.view_as_complex(fresh)[0, 0] * torch.exp(
-        2j * math.pi * (thin.frequency @ (at - shift))
+        2j * math.pi * (thin.frequency_per_px @ (at - shift))
     )
     torch.testing.assert_close(now, (response * before).real.sum(1))
 
@@ -243,7 +243,7 @@ def test_15_frozen_flow_shifts_the_field():
 def test_15_tilt_spectrum_of_frozen_flow():
     waves = draw_plane_waves(PATH.with_d_over_r0(1.0), 5, modes=2, waves=200_000, width_px=256)
     near = replace(waves, z_over_l=torch.zeros_like(waves.z_over_l))
-    kappa_x = (near.layer_frequency[:, 0].abs() * PATH.aperture_m * (1 - waves.z_over_l)).log10()
+    kappa_x = (near.frequency_per_m[:, 0].abs() * PATH.aperture_m * (1 - waves.z_over_l)).log10()
     power = near.response[0].square().sum(-1)
 
     def density(low: float, high: float) -> float:
@@ -261,9 +261,9 @@ def test_16_psf_energy():
     exact = fraunhofer_psf(coefficients, lambda_over_d_px=1.0, size=17)
     torch.testing.assert_close(exact.sum((1, 2)), torch.ones(200), atol=1e-5, rtol=0)
     assert exact.min() >= 0
-    for band in load_psf_bands():
-        coefficients = phases(200, band.edge, 119, False)
-        psfs_of_band = FittedPSFs(band, -1, len(band.basis), 1.0, 15, band.edge)
+    for band in load_bands_by_d_over_r0():
+        coefficients = phases(200, band.max_d_over_r0, 119, False)
+        psfs_of_band = FittedPSFs(band, -1, len(band.basis), 1.0, 15, band.max_d_over_r0)
         psfs = compute_fitted_psfs(psfs_of_band, coefficients[:, 2 : psfs_of_band.network.modes].T)
         assert psfs.min() >= 0
         found = psfs.sum(0).flatten()
@@ -272,7 +272,7 @@ def test_16_psf_energy():
         ).sum((1, 2))
         assert inside.max() < 1.001
         torch.testing.assert_close(found, inside, atol=0.15, rtol=0)
-        halo = PSFHalo(mean_psf(band.edge), 1.0, 15).share
+        halo = PSFHalo(mean_psf(band.max_d_over_r0), 1.0, 15).share
         assert found.mean() + halo == pytest.approx(1.0, abs=0.02)  # the cut of negative light
 
 

@@ -4,7 +4,8 @@ import math
 
 import torch
 
-from src.sim.turbulence.zernike import noll_covariance, noll_index, pupil_filter, zernike_basis
+from scripts.exact_psf import noll_covariance, zernike_basis
+from src.sim.turbulence.zernike import noll_index, pupil_filter
 
 
 def test_order_of_the_modes():

@@ -9,6 +9,7 @@ import torch
 from scipy import optimize, special
 from torch.nn import functional
 
+from scripts.exact_psf import fraunhofer_psf, noll_covariance
 from src.sim.turbulence import clip_rendering
 from src.sim.turbulence.atmosphere import Atmosphere
 from src.sim.turbulence.coefficient_grid import WaveSum
@@ -16,8 +17,6 @@ from src.sim.turbulence.contract import Crop
 from src.sim.turbulence.engines import blur_torch
 from src.sim.turbulence.operator import Turbulence
 from src.sim.turbulence.p2s import FittedPSFs
-from src.sim.turbulence.psf import fraunhofer_psf
-from src.sim.turbulence.zernike import noll_covariance
 
 
 def isoplanatic_angle_rad(path: Atmosphere) -> float:
@@ -25,7 +24,7 @@ def isoplanatic_angle_rad(path: Atmosphere) -> float:
 
     Without an outer scale theta0 = [2.914 k^2 Int Cn2 z^(5/3) dz]^(-3/5) (Fried 1982).
     """
-    place, strength = (part.numpy() for part in path.path_slices)
+    place, strength = (part.numpy() for part in path.cn2_dz_slices)
     z, k = place * path.distance_m, 2 * math.pi / path.wavelength_m
     integral = 2.914 * k**2 * float((strength * z ** (5 / 3)).sum())
     if integral == 0:
@@ -92,7 +91,7 @@ def degrade_with_exact_psfs(
     """
     exact = copy.copy(turbulence)
     exact.fidelity = replace(turbulence.fidelity, psf_grid_pitch_px=1, psf_size_px=size)
-    [plan] = exact.prepare(1, generator, crop).plans
+    [plan] = exact.plan(1, generator, crop)
     tables, unit = plan.tables.to(torch.device("cpu")), turbulence.fidelity.lambda_over_d_px
     names = "response", "rows", "columns"
     tilt, phase = (

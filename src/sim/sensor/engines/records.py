@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from numpy.typing import NDArray
 from scipy.special import ndtri
 from torch import Tensor
@@ -26,6 +27,7 @@ WHOLE = (
 )  # fmt: skip
 FIELDS = (*WHOLE, "refractory", "reference_error")
 CLIP = np.dtype([(name, np.int64 if name in WHOLE else np.float64) for name in FIELDS])
+Grids = Float[Tensor, "n windows views bins h w"]
 EVENT = np.dtype([("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)])
 
 

@@ -6,18 +6,15 @@ from importlib.util import find_spec
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from src.sim.sensor.engines import sensor_cpu
-from src.sim.sensor.engines.records import EngineInput
+from src.sim.sensor.engines.records import EngineInput, Grids
 
 TRITON_FAILURES: list[str] = []  # why Triton's kernel does not run in this process
 
 
-def voxels(
-    given: EngineInput, grids: Float[Tensor, "n windows views bins h w"]
-) -> Float[Tensor, "n windows views bins h w"]:
+def voxels(given: EngineInput, grids: Grids) -> Grids:
     """Fill `grids`, contiguous zeros on the device of the frames, and return them.
 
     Raises ValueError for frames that are not finite or outside [0, 1].

@@ -5,19 +5,17 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
-from src.sim.sensor.engines.records import EVENT, NORMALS, EngineInput, check_intensities
+from src.sim.sensor.engines.records import EVENT, NORMALS, EngineInput, Grids, check_intensities
 from src.sim.sensor.engines.sensor_numba import simulate_pixel_blocks
 
 UNIT = 8192  # pixels simulated together: their memory stays in the cache from frame to frame
 NO_GRIDS, NO_EVENTS = np.empty((0, 0, 0, 0, 0), np.float32), np.empty(0, EVENT)
 
 
-def voxels(
-    given: EngineInput, grids: Float[Tensor, "n windows views bins h w"]
-) -> Float[Tensor, "n windows views bins h w"]:
+def voxels(given: EngineInput, grids: Grids) -> Grids:
     """Add the events to `grids` and return them."""
     _run(given, grids.view(*grids.shape[:4], -1).numpy(), np.empty((0, 2), np.int64), NO_EVENTS)
     return grids

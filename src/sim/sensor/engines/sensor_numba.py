@@ -62,7 +62,9 @@ def level_change(delta, u):
 
 
 @inline_kernel
-def linear_events(x, l0, l1, ref, dead, on, off, wait, mode, noise_u, noise_sign, batch, count):
+def append_linear_events(
+    x, l0, l1, ref, dead, on, off, wait, mode, noise_u, noise_sign, batch, count
+):
     """Append the events of pixel `x` to `batch`, which holds `count`; return (count, ref, dead).
 
     `noise_u` is the time of a noise event, above 1 for none.  All is seen along the level's way:
@@ -162,7 +164,7 @@ def v2e_events(x, l0, l1, ref, dead, on, off, wait, mode, steps, noise_u, noise_
 
 
 @inline_kernel
-def table_position(intensity_bits):
+def fixed_point_table_position(intensity_bits):
     """Return the place in the tables of an intensity, given by the bits of its float."""
     return i32(min(max(i32(intensity_bits), i32(DARKEST)), i32(BRIGHTEST)) - i32(DARKEST))
 
@@ -183,7 +185,7 @@ def read_levels(table, intensity, levels):
     places, most = intensity.view(np.uint32), uint32(0)
     for x in range(places.size):
         most = max(most, places[x])
-        levels[x] = read_table(table, table_position(places[x]))
+        levels[x] = read_table(table, fixed_point_table_position(places[x]))
     return most > WHITE
 
 
@@ -211,7 +213,7 @@ def apply_low_pass(decay, lag, intensity, old_level, old_source, level):
     """Filter the new frame's levels in place; the old ones are those of the frame before."""
     places = intensity.view(np.int32)
     for x in range(places.size):
-        place, source = table_position(places[x]), level[x]
+        place, source = fixed_point_table_position(places[x]), level[x]
         old = np.int64(old_level[x] - old_source[x]) * read_table(decay, place)
         old -= np.int64(source - old_source[x]) * read_table(lag, place)
         level[x], old_source[x] = source + ((old + 524288) >> 20), source
@@ -225,7 +227,7 @@ def number_pixels(clip, width, first, pixel):
 
 
 @kernel
-def draw_pixel_properties(clip, keys, normals, work):
+def draw_thresholds_and_hot_pixels(clip, keys, normals, work):
     """Fill thresholds and hot pixels of a unit, the same in all clips; return how many are hot."""
     on, off, hot, pixel, drawn = work.on, work.off, work.hot, work.pixel, work.drawn
     on[:], off[:], hot_count = clip.on, clip.off, 0
@@ -363,7 +365,7 @@ def find_events(given, wait, work, steps, done, last):
                 x, l0, l1, ref, dead[x], on, off, wait, mode, steps, u, s, batch, count
             )
         else:
-            count, ref, dead[x] = linear_events(
+            count, ref, dead[x] = append_linear_events(
                 x, l0, l1, ref, dead[x], on, off, wait, mode, u, s, batch, count
             )
         reference[x] = ref
@@ -479,9 +481,9 @@ def make_workspace(size, smallest):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def simulate_pixel_blocks(
-    first_unit, last_unit, given, half_frames, normals, pixels, size, grids, tally, events
+    first_block, stop_block, given, half_frames, normals, pixels, size, grids, tally, events
 ):
-    """Simulate units first_unit .. last_unit - 1, `size` consecutive pixels of a view each.
+    """Simulate blocks first_block .. stop_block - 1, `size` consecutive pixels of a view each.
 
     `given.frames` and `half_frames` (the bits of float16) are (n, views, frames, pixels), one of
     them is empty.  Events are added to `grids` (n, windows, views, bins, pixels), if there are any,
@@ -490,14 +492,14 @@ def simulate_pixel_blocks(
     """
     views, bins = given.keys.shape[1], grids.shape[3]
     units, doubtful = (pixels + size - 1) // size, False
-    for unit in range(first_unit, last_unit):
+    for unit in range(first_block, stop_block):
         c, v, a = unit // (views * units), unit // units % views, unit % units * size
         b = min(a + size, pixels)
         clip, keys, place = given.clips[c], given.keys[c, v], (unit, c, v, a, b)
         key, edges_us = keys[NOISE_KEY], given.edges_us[c]
         work = make_workspace(b - a, min(clip.on, clip.off))
         number_pixels(clip, given.width, a, work.pixel)
-        hot_count = draw_pixel_properties(clip, keys, normals, work)
+        hot_count = draw_thresholds_and_hot_pixels(clip, keys, normals, work)
         prehash_pixels(key, work.pixel, work.mixed)
         doubtful |= read_frame(given, half_frames, place, 0, work, work.level)[1]
         initialise_memory(clip, keys[REFERENCE_KEY], work)

@@ -14,11 +14,10 @@ import numpy as np
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float
 from torch import Tensor
 
 from src.sim.sensor.engines import records
-from src.sim.sensor.engines.records import NORMALS, EngineInput, check_intensities
+from src.sim.sensor.engines.records import NORMALS, EngineInput, Grids, check_intensities
 
 LOWEST, HIGHEST = tl.constexpr(records.LOWEST), tl.constexpr(records.HIGHEST)
 NEVER = tl.constexpr(2.0)  # a time after the interval
@@ -36,9 +35,7 @@ SIZES = (
 )  # fmt: skip
 
 
-def voxels(
-    given: EngineInput, grids: Float[Tensor, "n windows views bins h w"]
-) -> Float[Tensor, "n windows views bins h w"]:
+def voxels(given: EngineInput, grids: Grids) -> Grids:
     """Fill `grids` and return them.
 
     Raises ValueError, afterwards, for frames that are not finite or outside [0, 1].
@@ -86,13 +83,13 @@ def _simulate(
     clip, keys = numbers + index * FIELDS, numbers + n * FIELDS + unit * KEYS
     edges = numbers + n * (FIELDS + views * KEYS) + index * (intervals + 1)
     pixel = (tl.load(clip + TOP) + row) * tl.load(clip + FULL_WIDTH) + tl.load(clip + LEFT) + col
-    on, off, hot = draw_pixel_properties(clip, keys, normals, pixel)
+    on, off, hot = draw_thresholds_and_hot_pixels(clip, keys, normals, pixel)
     leak = on.to(tl.int64) * tl.load(clip + LEAK)
     wait = tl.zeros([BLOCK], tl.float32) + load_int64_as_float64(clip + REFRACTORY).to(tl.float32)
     key, zero = tl.load(keys + NOISE_KEY), tl.full((), 0, tl.int64)
     intensity = tl.load(frame, own, 0.0).to(tl.float32)
     bad = is_outside(intensity)
-    level = read_table(level_table, table_position(intensity))
+    level = read_table(level_table, fixed_point_table_position(intensity))
     ref = level - draw_reference_error(clip, keys, pixel, on, off)
     source, dead = level, tl.zeros([BLOCK], tl.float32)
     frame += frame_step
@@ -105,7 +102,7 @@ def _simulate(
     for i in range(intervals):
         intensity = tl.load(frame, own, 0.0).to(tl.float32)
         bad = bad | is_outside(intensity)
-        place = table_position(intensity)
+        place = fixed_point_table_position(intensity)
         read = read_table(level_table, place)
         new = read
         if FILTERED:
@@ -119,9 +116,8 @@ def _simulate(
         begin, ticks, scale = _interval_clock(edges, i, substeps, BINS)
         start, holding = tl.zeros([BLOCK], tl.float32), (dead > 0) & (MODE == HOLD)
         if NOISY:
-            u, sign = draw_noise_event(
-                key, zero + i, pixel, noise_probability(clip, hot, intensity)
-            )
+            likely = noise_probability(clip, hot, intensity)
+            u, sign = draw_timed_noise_event(key, zero + i, pixel, likely)
             u = tl.where(own, u, NEVER)
             stop = tl.minimum(u, 1.0)
             grid, mark, dead, holding = _add_events(
@@ -205,21 +201,19 @@ def _add_to_grid(grid, fired, u, sign, begin, ticks, scale, column, BINS: tl.con
 
 
 @triton.jit
-def draw_pixel_properties(clip, keys, normals, pixel):
+def draw_thresholds_and_hot_pixels(clip, keys, normals, pixel):
     mismatch, key = tl.load(clip + MISMATCH), tl.load(keys + MISMATCH_KEY)
     none = tl.full((), 0, tl.int64)
-    drawn_on, drawn_off = (
-        random_uint32(key, none, 2 * pixel),
-        random_uint32(key, none, 2 * pixel + 1),
-    )
-    on = spread_threshold(tl.load(clip + ON), mismatch, normals, drawn_on)
-    off = spread_threshold(tl.load(clip + OFF), mismatch, normals, drawn_off)
+    drawn_on = random_uint32(key, none, 2 * pixel)
+    drawn_off = random_uint32(key, none, 2 * pixel + 1)
+    on = draw_pixel_threshold(tl.load(clip + ON), mismatch, normals, drawn_on)
+    off = draw_pixel_threshold(tl.load(clip + OFF), mismatch, normals, drawn_off)
     drawn_hot = random_uint32(tl.load(keys + HOT_PIXEL_KEY), none, pixel)
     return on, off, drawn_hot.to(tl.int64) < tl.load(clip + HOT_FRACTION)
 
 
 @triton.jit
-def spread_threshold(threshold, mismatch, normals, drawn):
+def draw_pixel_threshold(threshold, mismatch, normals, drawn):
     """Return threshold * (1 + mismatch * normal), at least a quarter of the threshold."""
     cell, inside = (drawn >> 20).to(tl.int32), (drawn & 0xFFFFF).to(tl.int64)
     left, right = tl.load(normals + cell), tl.load(normals + cell + 1)
@@ -244,7 +238,7 @@ def is_outside(intensity):
 
 
 @triton.jit
-def table_position(intensity):
+def fixed_point_table_position(intensity):
     """Return the place in the tables of an intensity, as src.sim.sensor.response.lookup has it."""
     bits = intensity.to(tl.int32, bitcast=True)
     return tl.minimum(tl.maximum(bits, 0x38800000), 0x3FFFFFFF) - 0x38800000
@@ -283,7 +277,7 @@ def noise_probability(clip, hot, intensity):
 
 
 @triton.jit
-def draw_noise_event(key, frame, pixel, probability):
+def draw_timed_noise_event(key, frame, pixel, probability):
     """Return time (NEVER for none) and polarity of the noise events of interval `frame`."""
     drawn, at = random_uint32(key, frame, 2 * pixel), random_uint32(key, frame, 2 * pixel + 1)
     u = ((at >> 9).to(tl.float32) + 0.5) * (1 / 8388608.0)

@@ -30,7 +30,7 @@ def split_even_odd(response, amplitudes, seen, cos, sin):
 
 
 @njit(nogil=True, cache=True, fastmath=True)
-def join_parities(even, odd, out):
+def join_even_odd(even, odd, out):
     """Write even less odd part right of the middle of `out` (lines, columns), their sum left."""
     columns = out.shape[1]
     left, middle = columns // 2, columns % 2

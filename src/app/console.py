@@ -1,0 +1,44 @@
+"""What is printed, on any terminal: missing signs are replaced, a warning takes one line."""
+
+import codecs
+import sys
+import warnings
+from pathlib import Path
+from typing import TextIO
+
+NEAREST = {
+    "•": "*",
+    "…": "...",
+    "—": "-",
+    "–": "-",
+    "━": "-",
+    "╸": "-",
+    "╺": "-",
+    "↑": "^",
+    "↓": "v",
+}
+
+
+def prepare_streams() -> None:
+    """Make stdout and stderr print every text, and warnings of ours one line each."""
+    codecs.register_error("nearest_sign", _replace)
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="nearest_sign")
+    warnings.showwarning = _show_warning
+
+
+def _replace(error: UnicodeError) -> tuple[str, int]:
+    assert isinstance(error, UnicodeEncodeError)
+    letters = error.object[error.start : error.end]
+    return "".join(NEAREST.get(letter, "?") for letter in letters), error.end
+
+
+def _show_warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int,
+    file: TextIO | None = None, line: str | None = None,
+) -> None:  # fmt: skip
+    text = warnings.formatwarning(message, category, filename, lineno, line)
+    if category is UserWarning and "site-packages" not in Path(filename).parts:
+        text = f"warning: {' '.join(str(message).split())}\n"
+    print(text, end="", file=file or sys.stderr)

@@ -1,0 +1,54 @@
+"""A recording to another format: python -m src.convert recording=cap.raw out=cap.h5."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+from omegaconf import DictConfig
+
+from src.app import entry_point
+from src.recordings.files import event_writers, recording, sources
+from src.recordings.files.event_arrays import count_before
+from src.recordings.files.event_file import ReadOptions
+
+
+def convert(cfg: DictConfig) -> Path:
+    """Write the events of `cfg.recording` from `start_s` to `end_s` to `cfg.out`; return it.
+
+    Raises ValueError for a recording that cannot be read, a format that cannot be written or cannot
+    hold it, and where the one would be written over the other.
+    """
+    source, out = Path(cfg.recording), Path(cfg.out)
+    for written in (out, event_writers.partial_path(out)):
+        if written.exists() and source.exists() and written.samefile(source):
+            raise ValueError(f"out must be another file than recording, got {out}")
+    options = ReadOptions.from_keys(cfg)
+    height, width = sources.sensor_size(source, cfg.sensor_size, options)
+    how = {"width": width, "height": height, "version": cfg.version, "layout": cfg.layout}
+    event_writers.find_kind(out, **how)
+    events = cut(recording.open_recording(source, (width, height), options), cfg.start_s, cfg.end_s)
+    count, seconds = event_writers.write_pieces(out, events, **how)
+    size = sum(file.stat().st_size for file in (out, *out.rglob("*")) if file.is_file())
+    print(f"{count} events, {seconds:.6f} s, {width}x{height}, {size} bytes: {out}")
+    return out
+
+
+def cut(pieces: Iterable[np.ndarray], start_s: float, end_s: float) -> Iterator[np.ndarray]:
+    """Yield the events from `start_s` to `end_s`, seconds after the first of `pieces`."""
+    if not 0 <= start_s < end_s:
+        raise ValueError(f"start_s must be >= 0 and before end_s, got {start_s}, {end_s}")
+    first, count = None, 0
+    for events in filter(len, pieces):
+        first = int(events["t"][0]) if first is None else first
+        end = count_before(events, first + end_s * 1e6)
+        part = events[count_before(events, first + start_s * 1e6) : end]
+        count += len(part)
+        yield part
+        if end < len(events):
+            break
+    if not count:
+        raise ValueError(f"recording must have events from {start_s} s to {end_s} s, got none")
+
+
+if __name__ == "__main__":
+    entry_point.run_command(convert, "convert")

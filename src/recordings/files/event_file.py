@@ -1,0 +1,91 @@
+"""What a format's reader gives to the recording that is read from it."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+EVENT = np.dtype([("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)])
+TIME_UNITS = ("auto", "s", "ms", "us", "ns")
+RAW_FORMATS = ("evt2", "evt21", "evt3")
+PIECE_EVENTS = 2**18  # events in a piece
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """What the user states of a file that does not say it, or of which it has several.
+
+    `time_unit`: auto, s, ms, us or ns.  `columns`: the order of the columns of a table without
+    names, the letters x y p t (other letters are skipped).  `format`: of a RAW file without a
+    line that says it: evt2, evt21 or evt3.  `stream`: number or name of one of several cameras in
+    a file.  `part`: 0, 1, ... of a file whose clock restarts.  Raises ValueError for a value out
+    of range.
+    """
+
+    time_unit: str = "auto"
+    columns: str | None = None
+    format: str | None = None
+    stream: str | int | None = None
+    part: int | None = None
+
+    def __post_init__(self):
+        if self.time_unit not in TIME_UNITS:
+            raise ValueError(f"time_unit must be auto, s, ms, us or ns, got {self.time_unit}")
+        order = self.columns
+        if order is not None and any(order.count(name) != 1 for name in "txyp"):
+            raise ValueError(f"columns must have t, x, y and p once each, got {order}")
+        if self.format not in (None, *RAW_FORMATS):
+            raise ValueError(f"format must be null, {', '.join(RAW_FORMATS)}, got {self.format}")
+        if self.part is not None and self.part < 0:
+            raise ValueError(f"part must be null or a whole number from 0 on, got {self.part}")
+
+    @classmethod
+    def from_keys(cls, cfg: Mapping) -> "ReadOptions":
+        """Return the options from the keys of a config that have their names; raises ValueError
+        for one of another kind."""
+        given = {field.name: cfg[field.name] for field in fields(cls)}
+        for name, value in given.items():
+            kinds = {"part": (int,), "stream": (int, str)}.get(name, (str,))
+            if value is not None and type(value) not in kinds:
+                expected = {"part": "a whole number", "stream": "a number or a name"}
+                raise ValueError(f"{name} must be {expected.get(name, 'a word')}, got {value}")
+        return cls(**given)
+
+
+class RawEvents(NamedTuple):
+    """Events as a file has them, in its order: `t` int64 or float64 in the file's unit; `x`, `y`
+    integers; `p` is ON where positive.  Each is (n,)."""
+
+    t: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    p: np.ndarray
+
+
+class EventFile(ABC):
+    """An event file of one format, opened with a `path` and ReadOptions.
+
+    `size`: (width, height) in pixels, None where the file does not state it.  `time_unit`: s, ms,
+    us or ns where the format defines it, None where its values must tell.  `notes`: lines for the
+    user, such as which other streams the file holds.  `kept_times`: what `times` yields, where it
+    was read and kept: `pieces` may take its times from there.  Opening and reading raise
+    ValueError, which names the file, for what cannot be read.
+    """
+
+    path: Path
+    size: tuple[int, int] | None = None
+    time_unit: str | None = None
+    notes: tuple[str, ...] = ()
+    kept_times: list[np.ndarray] | None = None
+
+    @abstractmethod
+    def pieces(self) -> Iterator[RawEvents]:
+        """Yield the events in pieces of about PIECE_EVENTS, each time from the beginning."""
+
+    def times(self) -> Iterator[np.ndarray] | None:
+        """Yield the times alone, in pieces, as `pieces` has them; None where this would cost as
+        much as `pieces`: then order is judged while events are read."""
+        return None

@@ -1,0 +1,238 @@
+"""One rule for events that come out of order, in files and live.
+
+Events up to `buffer_us` late are sorted, in their order where times are equal.  Fewer than `few`
+events with times further from those around them are outliers: dropped and counted.  More of them
+earlier are a clock that restarts and begin another part; later ones are a silence.  A file is
+refused where more than MAX_DROPPED of its events are outliers, or its clock restarts more than
+MAX_PARTS times.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from src.recordings.engines.event_passes import (
+    KEPT,
+    LONG_AGO_US,
+    label_events,
+    measure_lateness,
+)
+from src.recordings.files.event_arrays import (
+    concatenate_events,
+    count_before,
+    sort_events,
+    times_of,
+)
+
+BUFFER_US = 50_000  # by which events may be late
+BUFFER_EVENTS = 2**24  # that are buffered at most; of more the oldest go
+FEW_EVENTS, LEAST_FEW, FEW_SHARE = 256, 4, 100  # a hundredth of a file, within these bounds
+MAX_DROPPED = 0.01
+MAX_PARTS = 100
+TOLD_US = 1000  # events later than that are told of
+
+
+@dataclass
+class ClockPart:
+    """Events of one clock: how many, and the first and the last time in us."""
+
+    count: int = 0
+    first_us: int = 0
+    last_us: int = LONG_AGO_US
+
+
+class EventOrder:
+    """Takes events (n,) EVENT, or times (n,) int64 us alone, as they come; gives them in order.
+
+    `part`: the one that is given, 0 the first; None: always the newest, of which no event goes
+    before `release` is called (live).  `parts`, `dropped`, `late` (events that were sorted) and
+    `most_late_us` tell what was found.
+    """
+
+    def __init__(self, buffer_us: int = BUFFER_US, few: int = FEW_EVENTS, part: int | None = 0):
+        self.buffer_us, self.few, self._part = buffer_us, few, part
+        self.parts, self.count = [ClockPart()], 0
+        self.dropped = self.late = self.most_late_us = 0
+        self._undecided: np.ndarray | None = None
+        self._held: list[np.ndarray] = []  # in order, one after the other
+        self._released_us = LONG_AGO_US
+
+    @property
+    def last_us(self) -> int:
+        """Return the latest time that is no outlier."""
+        return self.parts[-1].last_us
+
+    def add(self, events: np.ndarray) -> list[np.ndarray]:
+        """Take events; return those that are in order for good."""
+        start = 2 * self.few
+        if self.parts[-1].count < self.few and len(events) > 2 * start:
+            return [*self.add(events[:start]), *self.add(events[start:])]
+        self.count += len(events)
+        if self._undecided is not None:
+            events = concatenate_events([self._undecided, events])
+        return self._decide(events, self.few, at_end=False)
+
+    def finish(self) -> list[np.ndarray]:
+        """Return the events that are left, after the last."""
+        few = min(self.few, max(LEAST_FEW, self.count // FEW_SHARE))
+        undecided, ready = self._undecided, []
+        if undecided is not None:
+            ready = self._decide(undecided, few, at_end=True)
+        return [*ready, *self.release(2**63 - 1)]
+
+    def settle(self, until_us: float) -> None:
+        """Take later events for a silence's end, without waiting for more, if before `until_us`."""
+        waiting = self._undecided
+        if waiting is not None and self.last_us < times_of(waiting).min() <= until_us:
+            self._decide(waiting, self.few, at_end=True)
+
+    def release(self, until_us: float) -> list[np.ndarray]:
+        """Return the events before `until_us`; what comes later and is earlier is dropped."""
+        ready: list[np.ndarray] = []
+        while self._held and times_of(self._held[0])[-1] < until_us:
+            ready.append(self._held.pop(0))
+        if self._held and (cut := count_before(self._held[0], until_us)):
+            ready.append(self._held[0][:cut])
+            self._held[0] = self._held[0][cut:]
+        self._released_us = max(self._released_us, math.ceil(min(until_us, 2**62)))
+        return ready
+
+    def _decide(self, events: np.ndarray, few: int, *, at_end: bool) -> list[np.ndarray]:
+        ready: list[np.ndarray] = []
+        while len(events):
+            if self._goes_on(events, few):
+                ready += self._keep(events, 0, 0)
+                events = events[:0]
+                break
+            part, labels = self.parts[-1], np.empty(len(events), np.int8)
+            t = np.ascontiguousarray(times_of(events))
+            state = part.first_us, part.last_us, part.count
+            done, _, _, restarted = label_events(t, *state, self.buffer_us, few, at_end, labels)
+            kept = labels[:done] == KEPT
+            self.dropped += int(done - kept.sum())
+            ready += self._keep_some(events[:done] if kept.all() else events[:done][kept])
+            events = events[done:]
+            if not restarted:
+                break
+            ready += self._restart(few)
+        self._undecided = events if len(events) else None
+        return ready
+
+    def _goes_on(self, events: np.ndarray, few: int) -> bool:
+        """Return whether all events are in order and none of the last ones could be an outlier."""
+        t, part = times_of(events), self.parts[-1]
+        if part.count < few or len(t) <= few or t[0] < part.last_us:
+            return False
+        return (
+            bool(np.diff(t[-few - 1 :]).max() <= self.buffer_us)
+            and not measure_lateness(t, part.last_us)[0]
+        )
+
+    def _keep_some(self, events: np.ndarray) -> list[np.ndarray]:
+        late = measure_lateness(times_of(events), self.parts[-1].last_us)
+        return self._keep(events, *late) if len(events) else []
+
+    def _keep(self, events: np.ndarray, late: int, most: int) -> list[np.ndarray]:
+        """Hold events of the part's clock, `late` of them by `most` us at most; return those that
+        are in order for good."""
+        part, t = self.parts[-1], times_of(events)
+        if late:
+            self.late, self.most_late_us = self.late + late, max(self.most_late_us, most)
+            events = self._drop_released(events)
+        part.first_us = part.first_us if part.count else int(t[0])
+        part.last_us = max(part.last_us, int(t.max() if late else t[-1]))
+        part.count += len(t)
+        if self._part is not None and self._part != len(self.parts) - 1:
+            return []
+        self._hold(events, late > 0)
+        if self._part is None or part.count < self.few:
+            return []
+        return self.release(self._bound_us(part.last_us - self.buffer_us))
+
+    def _drop_released(self, events: np.ndarray) -> np.ndarray:
+        gone = times_of(events) < self._released_us
+        self.dropped += (count := int(gone.sum()))
+        return events[~gone] if count else events
+
+    def _hold(self, events: np.ndarray, unsorted: bool) -> None:
+        if unsorted:
+            first = times_of(events).min()
+            after = [part for part in self._held if times_of(part)[-1] > first]
+            self._held = self._held[: len(self._held) - len(after)]
+            events = sort_events(concatenate_events([*after, events]))
+        if len(events):
+            self._held.append(events)
+
+    def _bound_us(self, until_us: int) -> int:
+        """Return `until_us`, or a later time where more than BUFFER_EVENTS would be held."""
+        excess = sum(map(len, self._held)) - BUFFER_EVENTS
+        for part in self._held:
+            if excess < 0:
+                break
+            until_us = max(until_us, int(times_of(part)[min(excess, len(part) - 1)]))
+            excess -= len(part)
+        return until_us
+
+    def _restart(self, few: int) -> list[np.ndarray]:
+        """Begin another part; too few events of one before it are outliers."""
+        ready, self._released_us = [], LONG_AGO_US
+        if self.parts[-1].count < few:
+            self.dropped += self.parts.pop().count
+        elif self._part is not None:
+            ready = self.release(2**63 - 1)
+            self._released_us = LONG_AGO_US
+        self._held = []
+        self.parts.append(ClockPart())
+        return ready
+
+    def is_whole(self) -> bool:
+        """Return whether all events came in order and of one clock."""
+        return not (self.late or self.dropped) and len(self.parts) == 1
+
+    def fault(self) -> str | None:
+        """Return why a file like this cannot be read as it is; None where it can."""
+        if self.dropped > max(1, MAX_DROPPED * self.count):
+            share = f"{100 * self.dropped / self.count:.3g} % of {self.count} events"
+            return f"{share} are more than {self.buffer_us * 1e-6:g} s out of order of time"
+        if len(self.parts) > MAX_PARTS:
+            return f"its clock restarts more than {MAX_PARTS} times"
+        return None
+
+    def check_part(self, part: int, path: Path) -> None:
+        """Raise ValueError where there is no such part."""
+        most = len(self.parts) - 1
+        if part > most:
+            raise ValueError(f"part must be in 0..{most}, the parts of {path}, got {part}")
+
+    def lines(self, path: Path, *, part: int | None) -> Iterator[str]:
+        """Yield what the user is told; `part`: the one that was asked for."""
+        if self.dropped:
+            yield f"{path}: {self.dropped} of {self.count} events far out of order of time, dropped"
+        if self.most_late_us > TOLD_US:
+            reach = f"up to {self.most_late_us * 1e-6:.3g} s"
+            yield f"{path}: {self.late} of {self.count} events {reach} out of order, sorted"
+        if len(self.parts) > 1 and part is None:
+            lengths = ", ".join(
+                f"{k}: {one.count} events, {(one.last_us - one.first_us) * 1e-6:.3g} s"
+                for k, one in enumerate(self.parts[:10])
+            )
+            yield f"{path}: its clock restarts, read is part=0 of {len(self.parts)} ({lengths})"
+
+
+def merge_in_time(ones: Iterator[np.ndarray], others: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
+    """Yield the events of two recordings, each in order of time, in order."""
+    one, other = next(ones, None), next(others, None)
+    while one is not None and other is not None:
+        until = int(min(one["t"][-1], other["t"][-1])) + 1
+        cut, cut_other = count_before(one, until), count_before(other, until)
+        both = concatenate_events([one[:cut], other[:cut_other]])
+        yield sort_events(both)
+        one = one[cut:] if cut < len(one) else next(ones, None)
+        other = other[cut_other:] if cut_other < len(other) else next(others, None)
+    for rest, left in ((one, ones), (other, others)):
+        if rest is not None:
+            yield rest
+            yield from left

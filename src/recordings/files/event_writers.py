@@ -1,0 +1,176 @@
+"""Events to files of other tools, piece by piece, so that a recording of any length fits.
+
+RAW (EVT2, EVT3), DAT, AEDAT4 and ES are written by faery; CSV, npz, HDF5 and EVREAL's folder of
+.npy in table_writers.py.  Until it is whole a file has `partial` in its name.
+"""
+
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+import faery
+import numpy as np
+from faery.file_encoder import events_to_file
+
+from src.recordings.files import table_writers
+from src.recordings.files.event_file import PIECE_EVENTS
+
+BINARY = {".raw": "evt", ".dat": "dat", ".aedat4": "aedat", ".es": "es"}
+TABLES: dict[str, Callable] = {
+    ".csv": table_writers.write_csv, ".npz": table_writers.write_npz,
+    ".h5": table_writers.write_dsec, ".hdf5": table_writers.write_dsec,
+    "evreal": table_writers.write_evreal,
+}  # fmt: skip
+VERSIONS = ("evt2", "evt3")
+LAYOUTS = (None, "dsec", "evreal")
+MOST_PIXELS = {".raw": 2**11, ".dat": 2**14, "evreal": 2**15}  # of a side, by its bits
+MOST_US = {".dat": 2**32, ".h5": 2**32, ".hdf5": 2**32}  # between the first and the last event
+MOST_ES_US = 2**32  # ES writes all time since 0, a byte for each 127 us without events
+# RAW counts time in 24 and 34 bits; that it went round shows where it falls by more than half.
+MOST_SILENCE_US = {"evt3": 2**23, "evt2": 2**33}
+
+
+def write_events(
+    path: str | Path, events: np.ndarray, *, width: int, height: int, version: str = "evt3"
+) -> None:
+    """Write events (n,) of t, x, y, p, in order of time, in the format of the path's ending.
+
+    `width`, `height`: of the sensor in pixels; `version`: evt2 or evt3, of a `.raw`.  Raises
+    ValueError for events that are out of order or off the sensor, a polarity that is not -1 or 1,
+    and what the format cannot hold.
+    """
+    starts = range(0, len(events), PIECE_EVENTS)
+    pieces = (events[start : start + PIECE_EVENTS] for start in starts)
+    write_pieces(path, pieces, width=width, height=height, version=version)
+
+
+def write_pieces(
+    path: str | Path,
+    pieces: Iterable[np.ndarray],
+    *,
+    width: int,
+    height: int,
+    version: str = "evt3",
+    layout: str | None = None,
+) -> tuple[int, float]:
+    """Write events that come in pieces, as `write_events`; return how many, and their seconds.
+
+    `layout` evreal writes a folder, as EVREAL reads it.
+    """
+    path = Path(path)
+    kind = find_kind(path, layout, width, height, version)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = partial_path(path)
+    _remove(partial)
+    checked = _Checked(path, kind, pieces, (width, height), version)
+    try:
+        if kind in BINARY:
+            _write_binary(partial, kind, iter(checked), (width, height), version)
+        else:
+            TABLES[kind](partial, iter(checked), (width, height))
+        if kind == "evreal":
+            _remove(path)
+        os.replace(partial, path)
+    finally:
+        _remove(partial)
+    return checked.count, checked.span_us * 1e-6
+
+
+def find_kind(path: Path, layout: str | None, width: int, height: int, version: str) -> str:
+    """Return the ending that says how `path` is written, or evreal; raises ValueError for what
+    cannot be, before anything is written."""
+    suffix = path.suffix.lower()
+    if layout not in LAYOUTS:
+        raise ValueError(f"layout must be null, dsec or evreal, got {layout}")
+    if version not in VERSIONS:
+        raise ValueError(f"{path}: cannot write {suffix} of version {version}, but evt2 and evt3")
+    kind = "evreal" if layout == "evreal" else suffix
+    if kind not in (*BINARY, *TABLES):
+        known = ", ".join((*BINARY, *TABLES))
+        raise ValueError(f"{path}: cannot write {suffix or 'no ending'}, but {known}")
+    if layout == "dsec" and kind not in (".h5", ".hdf5"):
+        raise ValueError(f"{path}: layout=dsec must have the ending .h5 or .hdf5")
+    if path.is_dir() and not (kind == "evreal" and (path / table_writers.EVREAL_TIMES).is_file()):
+        raise ValueError(f"{path}: is a folder already, of something else")
+    if kind == "evreal" and path.is_file():
+        raise ValueError(f"{path}: layout=evreal writes a folder, this is a file already")
+    if max(width, height) > (most := MOST_PIXELS.get(kind, 2**16)):
+        raise ValueError(f"{path}: {kind} holds sides up to {most}, got {width}x{height}")
+    return kind
+
+
+def partial_path(path: Path) -> Path:
+    """Return the name of a file while it is written: `cap.partial.raw`."""
+    return path.with_name(f"{path.stem}.partial{path.suffix}")
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    path.unlink(missing_ok=True)
+
+
+class _Checked:
+    """Pieces that can be written; `count` and `span_us` are of those that came so far."""
+
+    def __init__(
+        self, path: Path, kind: str, pieces: Iterable, size: tuple[int, int], version: str
+    ):
+        self.count, self.span_us = 0, 0
+        self._path, self._kind, self._pieces, self._size = path, kind, pieces, size
+        self._silence_us = MOST_SILENCE_US[version] if kind == ".raw" else 2**62
+        self._version = version.upper()
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        first, last = 0, 0
+        for events in self._pieces:
+            if len(events):
+                first = first if self.count else int(events["t"][0])
+                self._check_times(events["t"], last if self.count else first, first)
+                self._check_pixels(events)
+                last = int(events["t"][-1])
+                self.count, self.span_us = self.count + len(events), last - first
+                yield events
+
+    def _check_times(self, t: np.ndarray, last: int, first: int) -> None:
+        gaps = np.diff(t, prepend=last)
+        if t[0] < 0 or (gaps < 0).any():
+            raise ValueError(f"{self._path}: times must start at 0 or later and not decrease")
+        if (gaps >= self._silence_us).any():
+            raise ValueError(
+                f"{self._path}: {self._version} cannot hold a silence of {gaps.max()} us, use "
+                f"{'evt2' if self._version == 'EVT3' else '.npz'}"
+            )
+        if self._kind == ".es" and t[-1] >= MOST_ES_US:
+            raise ValueError(f"{self._path}: .es cannot hold a time of {t[-1]} us, use .raw")
+        if (span := int(t[-1]) - first) >= MOST_US.get(self._kind, 2**62):
+            other = "evt2" if self._kind == ".dat" else ".npz"
+            raise ValueError(f"{self._path}: {self._kind} cannot hold {span} us, use {other}")
+
+    def _check_pixels(self, events: np.ndarray) -> None:
+        (width, height), x, y, p = self._size, events["x"], events["y"], events["p"]
+        if x.max() >= width or y.max() >= height:
+            raise ValueError(
+                f"{self._path}: events must lie on {width}x{height}, got {x.max()}, {y.max()}"
+            )
+        if not np.isin(p, (-1, 1)).all():
+            raise ValueError(
+                f"{self._path}: polarity must be -1 or 1, got {np.unique(p)[:4].tolist()}"
+            )
+
+
+def _write_binary(
+    path: Path, kind: str, pieces: Iterator[np.ndarray], size: tuple[int, int], version: str
+) -> None:
+    number = {".raw": version, ".dat": "dat2"}.get(kind)
+    how = {"file_type": BINARY[kind], "zero_t0": kind != ".es", "use_write_suffix": False}
+    events_to_file((_as_faery(events) for events in pieces), path, size, version=number, **how)
+
+
+def _as_faery(events: np.ndarray) -> np.ndarray:
+    listed = np.empty(len(events), faery.EVENTS_DTYPE)
+    for name in "txy":
+        listed[name] = events[name]
+    listed["on"] = events["p"] > 0
+    return listed

@@ -1,0 +1,63 @@
+"""Blocks of Prophesee's EVT2, EVT2.1 and EVT3 to events, block by block of one recording."""
+
+import numpy as np
+
+from src.recordings.engines import evt_words
+from src.recordings.files.event_file import RawEvents
+
+WORD_BYTES = {"evt2": 4, "evt21": 8, "evt3": 2}
+MOST_EVENTS = {"evt2": 1, "evt21": 32, "evt3": 12}  # of a word
+WORD_ORDERS = ("little", "legacy", "big")  # of EVT2.1; legacy: the halves exchanged
+EVT21_KINDS = (0, 1, 8, 10, 14, 15)  # of words
+
+
+class EvtDecoder:
+    """A decoder of `kind` evt2, evt21 or evt3 that goes on where the last block ended.
+
+    `order` is that of EVT2.1's words, little, legacy or big; None: the one that shows in the first
+    block.
+    """
+
+    def __init__(self, kind: str, order: str | None = None):
+        self.kind, self._order = kind, order
+        self._state = evt_words.new_state()
+
+    @property
+    def triggers(self) -> int:
+        """Return how many words of triggers came so far."""
+        return int(self._state[evt_words.TRIGGERS])
+
+    @property
+    def lost(self) -> int:
+        """Return how many events came before the first time, which were left out."""
+        return int(self._state[evt_words.LOST])
+
+    def decode(self, block: bytes) -> RawEvents:
+        """Return the events of whole little-endian words, times in microseconds."""
+        room = len(block) // WORD_BYTES[self.kind] * MOST_EVENTS[self.kind]
+        events = [np.empty(room, kind) for kind in ("i8", "u2", "u2", "i1")]
+        if self.kind == "evt3":
+            count = evt_words.decode_evt3(np.frombuffer(block, "<u2"), self._state, *events)
+        else:
+            count = evt_words.decode_evt2(*self._halves(block), self._state, *events)
+        return RawEvents(*(part[:count] for part in events))
+
+    def _halves(self, block: bytes) -> tuple[np.ndarray, np.ndarray]:
+        """Return the upper and lower 32 bits of each word, of EVT2 the word and a mask of one."""
+        if self.kind == "evt2":
+            words = np.frombuffer(block, "<u4")
+            return words, np.broadcast_to(np.uint32(1), words.shape)
+        pairs = np.frombuffer(block, "<u4").reshape(-1, 2)
+        legacy, little, big = pairs[:, 0], pairs[:, 1], pairs[:, 0].byteswap()
+        if self._order is None:
+            known = {"little": little, "legacy": legacy, "big": big}
+            self._order = max(known, key=lambda name: _count_known(known[name]))
+        if self._order == "big":
+            return big, pairs[:, 1].byteswap()
+        return (little, legacy) if self._order == "little" else (legacy, little)
+
+
+def _count_known(heads: np.ndarray) -> tuple[int, int]:
+    """Return how many words have a kind that there is, and how many are times."""
+    kinds = heads >> 28
+    return int(np.isin(kinds, EVT21_KINDS).sum()), int((kinds == evt_words.TIME).sum())

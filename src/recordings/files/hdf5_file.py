@@ -1,0 +1,199 @@
+"""Events in HDF5: columns in any group, arrays (n, 4) and structured ones, packed by Blosc, LZ4,
+Zstd, bitshuffle or gzip.
+
+Known layouts: DSEC (events/{x, y, t, p} in us after `t_offset`; Gehrig et al. 2021), v2e and MVSEC
+(`events`, n x 4), event_cnn_minimal (xs, ys, ts, ps) and any other group with such columns.
+"""
+
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import hdf5plugin  # noqa: F401 - its codecs are registered by the import
+import numpy as np
+
+from src.recordings.files.array_file import (
+    SlicedColumn,
+    slice_columns,
+    slice_times,
+    split_table,
+)
+from src.recordings.files.columns import (
+    as_times,
+    check_claim,
+    check_lengths,
+    match_columns,
+    pick_columns,
+)
+from src.recordings.files.event_file import EventFile, RawEvents, ReadOptions
+from src.recordings.files.streams import EventStream, choose_stream
+
+HDF5_ENDINGS = (".h5", ".hdf5", ".hdf")
+MAX_CHUNK_BYTES = 2**28  # bytes of HDF5 that are unpacked at a time
+ECF_CODEC = 36559  # the number of Prophesee's codec
+SIZE_NAMES = ("size", "geometry", "sensor_size")  # width, height
+SHAPE_NAMES = ("sensor_resolution", "resolution")  # height, width
+
+
+class Hdf5File(EventFile):
+    """An HDF5 file with one stream of events or several, one of which is read."""
+
+    def __init__(self, path: Path, options: ReadOptions):
+        self.path = path
+        try:
+            self._file = h5py.File(path)
+            check_no_external_data(self._file)
+            streams = find_streams(self._file)
+            if not streams:
+                raise ValueError("no columns t, x, y, p and no array of events (n, 4) in it")
+            listed = [EventStream(k, name, None) for k, name in enumerate(streams)]
+            chosen, self.notes = choose_stream(path, listed, options.stream)
+            self._open(streams[chosen.name], options)
+        except Exception as error:  # HDF5 raises all kinds on a broken file
+            is_named = str(error).startswith(str(path))
+            text = "" if is_named else f"{path}: cannot be read as events: "
+            raise ValueError(f"{text}{error}") from error
+
+    def pieces(self) -> Iterator[RawEvents]:
+        yield from slice_columns(self.path, self._columns, self.kept_times)
+
+    def times(self) -> Iterator[np.ndarray] | None:
+        return slice_times(self.path, self._columns["t"]) if self._has_own_times else None
+
+    def _open(self, node: Any, options: ReadOptions) -> None:
+        check_claim(self.path, _claimed_bytes(node))
+        check_codec(node)
+        group = node if isinstance(node, h5py.Group) else node.parent
+        self.size = _stated_size(node) or _stated_size(group) or _stated_size(self._file)
+        self._has_own_times = isinstance(node, h5py.Group)
+        self._columns: dict[str, Any] = (
+            _columns_of(node) if self._has_own_times else split_table(node, options.columns)
+        )
+        if "t_offset" in self._file:
+            offset = _single_number(self._file["t_offset"])
+            self._columns["t"] = _ShiftedTimes(self._columns["t"], offset)
+        if "t_offset" in self._file or "ms_to_idx" in self._file:  # DSEC's layout
+            self.time_unit = "us"
+
+
+class _ShiftedTimes(SlicedColumn):
+    """Times after an offset, `place`, in their unit."""
+
+    def __getitem__(self, part: slice) -> np.ndarray:
+        return as_times(np.asarray(self.table[part])) + self.place
+
+
+def find_streams(file: h5py.File) -> dict[str, Any]:
+    """Return the groups with columns of events and the arrays of events of a file by their paths,
+    in alphabetical order, those that are called events first."""
+    found: dict[str, Any] = {"": file} if _has_columns(file) else {}
+
+    def visit(name: str, node: Any) -> None:
+        if (isinstance(node, h5py.Group) and _has_columns(node)) or (
+            isinstance(node, h5py.Dataset) and _is_table(name, node)
+        ):
+            found[name] = node
+
+    file.visititems(visit)
+    inside = [name for name in found if any(name.startswith(f"{other}/") for other in found)]
+    names = sorted(set(found) - set(inside), key=lambda name: ("event" not in name.lower(), name))
+    return {name or "/": found[name] for name in names}
+
+
+def check_no_external_data(file: h5py.File) -> None:
+    """Raise ValueError where a part of the file is another file, as a path leads anywhere, or comes
+    in chunks beyond MAX_CHUNK_BYTES, which are unpacked whole.
+    """
+
+    def visit(name: str, link: Any) -> str | None:  # an error raised in here would be lost in HDF5
+        if isinstance(link, h5py.ExternalLink):
+            return f"{name} leads to another file, {link.filename}"
+        part = file.get(name) if isinstance(link, h5py.HardLink) else None
+        if not isinstance(part, h5py.Dataset):
+            return None
+        if part.external or part.is_virtual:
+            return f"{name} lies in another file"
+        if part.dtype.itemsize * math.prod(part.chunks or ()) > MAX_CHUNK_BYTES:
+            return f"{name} is packed in chunks of more than {MAX_CHUNK_BYTES} bytes"
+        return None
+
+    if fault := file.visititems_links(visit):
+        raise ValueError(fault)
+
+
+def check_codec(node: Any) -> None:
+    """Raise ValueError for events packed with Prophesee's own codec."""
+    parts = node.values() if isinstance(node, h5py.Group) else [node]
+    for part in parts:
+        plan = part.id.get_create_plist() if isinstance(part, h5py.Dataset) else None
+        codecs = [plan.get_filter(k)[0] for k in range(plan.get_nfilters())] if plan else []
+        if ECF_CODEC in codecs:
+            raise ValueError(
+                "Prophesee HDF5 is packed with the vendor's own codec (ECF); export the recording "
+                "as RAW (EVT3) or as events/{x,y,t,p}"
+            )
+
+
+def _has_columns(group: Any) -> bool:
+    """Return whether the group holds t, x, y, p of one dimension."""
+    keys = pick_columns(group)
+    if keys is None:
+        return False
+    return all(
+        isinstance(group.get(key), h5py.Dataset) and group[key].ndim == 1 for key in keys.values()
+    )
+
+
+def _is_table(name: str, node: Any) -> bool:
+    if node.dtype.names is not None:
+        return node.ndim == 1 and match_columns(node.dtype.names) is not None
+    return node.ndim == 2 and node.shape[1] == 4 and "event" in name.lower()
+
+
+def _columns_of(group: Any) -> dict[str, Any]:
+    columns = {name: group[key] for name, key in (pick_columns(group) or {}).items()}
+    check_lengths(columns)
+    return columns
+
+
+def _claimed_bytes(node: Any) -> int:
+    parts = node.values() if isinstance(node, h5py.Group) else [node]
+    return sum(part.nbytes for part in parts if isinstance(part, h5py.Dataset))
+
+
+def _single_number(node: Any) -> int:
+    if node.size != 1:
+        raise ValueError(f"t_offset must be one number, got {node.shape}")
+    return int(np.asarray(node).item())
+
+
+def _stated_size(node: Any) -> tuple[int, int] | None:
+    """Return (width, height) as attributes or small arrays state it."""
+    held = node if isinstance(node, h5py.Group) else {}
+    known = {**{k: held[k] for k in held if _is_small(held[k])}, **node.attrs}
+    for name in (*SIZE_NAMES, *SHAPE_NAMES):
+        sides = _whole_numbers(known[name]) if name in known else []
+        if len(sides) == 2:
+            has_width_first = name in SIZE_NAMES or "x" in str(known[name]).lower()  # 640x480
+            return (sides[0], sides[1]) if has_width_first else (sides[1], sides[0])
+    width, height = (_whole_numbers(known.get(name)) for name in ("width", "height"))
+    return (width[0], height[0]) if len(width) == len(height) == 1 else None
+
+
+def _whole_numbers(value: Any) -> list[int]:
+    """Return the numbers of a value such as `640x480`, (640, 480) or 640; none for another."""
+    if isinstance(value, str | bytes):
+        text = value.decode("latin-1") if isinstance(value, bytes) else value
+        value = re.split(r"[\sx,;]+", text.strip().lower())
+    try:
+        numbers = np.asarray(value).ravel()[:2].astype(np.float64).tolist()
+    except (TypeError, ValueError):  # words, or nothing
+        return []
+    return [int(n) for n in numbers if n >= 1 and n == int(n)]
+
+
+def _is_small(node: Any) -> bool:
+    return isinstance(node, h5py.Dataset) and node.size <= 4

@@ -1,0 +1,132 @@
+"""Prophesee's RAW (EVT2, EVT2.1, EVT3) and DAT files.
+
+Both begin with lines of text, `% key value` (Metavision's pages "RAW file format" and "DAT file
+format"), which come in any order.
+"""
+
+import re
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from src.recordings.files.clocks import TimestampUnwrapper
+from src.recordings.files.event_file import (
+    PIECE_EVENTS,
+    RAW_FORMATS,
+    EventFile,
+    RawEvents,
+    ReadOptions,
+)
+from src.recordings.files.evt_decoder import MOST_EVENTS, WORD_BYTES, WORD_ORDERS, EvtDecoder
+
+SENSORS = {
+    "gen3": (640, 480), "gen4": (1280, 720), "imx636": (1280, 720), "imx646": (1280, 720),
+    "genx320": (320, 320),
+}  # fmt: skip
+HEADER = re.compile(rb"(?:% (?!end\s)[\t\r\x20-\x7e\x80-\xff]*\n)*(?:% end[\t\r ]*\n)?")
+DAT_PIXELS = (0, 12)  # types of DAT whose events lie in pixels
+DAT_TRIGGER = 14
+
+
+class PropheseeFile(EventFile):
+    """A `.raw` or `.dat` file; times are microseconds.
+
+    `options.format` is what a RAW file holds that does not say it.  Raises ValueError for one that
+    says nothing without it or says another, and for other formats.
+    """
+
+    time_unit = "us"
+
+    def __init__(self, path: Path, options: ReadOptions):
+        self.path = path
+        with path.open("rb") as file:
+            found = HEADER.match(file.read(1 << 16))
+        text = found.group().decode("latin-1").lower() if found else ""
+        self._start = len(text)
+        self._lines = dict(re.findall(r"^% (\w+)[ :=]*([^\r\n]*?)\s*$", text, re.MULTILINE))
+        start_us = self._lines.get("t0", "")  # what faery takes off all times
+        self._start_us = int(start_us) if re.fullmatch(r"\d{1,18}", start_us) else 0
+        self.size = self._read_size(text)
+        self._format = None if path.suffix.lower() == ".dat" else self._read_format(options.format)
+
+    def pieces(self) -> Iterator[RawEvents]:
+        """Yield the events; warns of a file that ends within a word and of events before the first
+        time; raises ValueError for a file of nothing but triggers."""
+        for events in self._dat_pieces() if self._format is None else self._raw_pieces():
+            if len(events.t):
+                yield events._replace(t=events.t + self._start_us) if self._start_us else events
+
+    def _read_size(self, text: str) -> tuple[int, int] | None:
+        geometry = re.match(r"(\d{1,9}) *x *(\d{1,9})", self._lines.get("geometry", ""))
+        if geometry:
+            return int(geometry[1]), int(geometry[2])
+        stated = dict(re.findall(r"(width|height)=(\d+)", self._lines.get("format", "")))
+        stated = self._lines | stated
+        width, height = (re.match(r"\d{1,9}", stated.get(side, "")) for side in ("width", "height"))
+        if width and height:
+            return int(width.group()), int(height.group())
+        name = re.search("|".join(SENSORS), text)
+        return SENSORS[name.group()] if name else None
+
+    def _read_format(self, stated: str | None) -> str:
+        line = self._lines.get("format", "").split(";")[0].strip()
+        line = f"evt{self._lines['evt']}" if "evt" in self._lines else line
+        said = line.replace(".0", "").replace(".", "")
+        if not said and not stated:
+            raise ValueError(
+                f"{self.path}: no `% evt` or `% format` line in its header; format must be evt2, "
+                "evt21 or evt3, got null"
+            )
+        if said and said not in RAW_FORMATS:
+            raise ValueError(f"{self.path}: {line.upper()} is not read, but EVT2, EVT2.1 and EVT3")
+        if said and stated and stated != said:
+            raise ValueError(f"{self.path}: format must be {said} as its header, got {stated}")
+        return said or str(stated)
+
+    def _blocks(self, word: int, start: int, most: int = 1) -> Iterator[bytes]:
+        """Yield whole words in blocks of about PIECE_EVENTS events; warns of a cut word."""
+        with self.path.open("rb") as file:
+            file.seek(start)
+            while block := file.read(word * (PIECE_EVENTS // max(1, most // 2))):
+                if cut := len(block) % word:
+                    warnings.warn(
+                        f"{self.path}: the file ends within a word, it is truncated", stacklevel=4
+                    )
+                yield block[: len(block) - cut]
+
+    def _raw_pieces(self) -> Iterator[RawEvents]:
+        kind, found = str(self._format), 0
+        order = re.search(r"endianness=(\w+)", self._lines.get("format", ""))
+        decoder = EvtDecoder(kind, order[1] if order and order[1] in WORD_ORDERS else None)
+        for block in self._blocks(WORD_BYTES[kind], self._start, MOST_EVENTS[kind]):
+            events = decoder.decode(block)
+            found += len(events.t)
+            yield events
+        if not found and decoder.triggers:
+            raise ValueError(f"{self.path}: holds no events, only {decoder.triggers} triggers")
+        if decoder.lost:
+            warnings.warn(
+                f"{self.path}: {decoder.lost} events before the first time, dropped", stacklevel=3
+            )
+
+    def _dat_pieces(self) -> Iterator[RawEvents]:
+        with self.path.open("rb") as file:
+            file.seek(self._start)
+            head = file.read(2)
+        if not head and self._start:
+            return  # a recording without events
+        if not self._start:
+            raise ValueError(f"{self.path}: does not begin with `% ` as a DAT file does")
+        if head[0] == DAT_TRIGGER:
+            raise ValueError(f"{self.path}: holds no events, only triggers (DAT of type 14)")
+        if head[0] not in DAT_PIXELS or head[1:] != b"\10":
+            raise ValueError(f"{self.path}: DAT of type {head.hex(' ')} is not read, but 0 and 12")
+        x_bits, y_bits = (9, 8) if self._lines.get("version") in ("0", "1") else (14, 14)
+        clock = TimestampUnwrapper()
+        for block in self._blocks(8, self._start + 2):
+            t, word = np.frombuffer(block, "<u4").reshape(-1, 2).T
+            x, y = word & (1 << x_bits) - 1, word >> x_bits & (1 << y_bits) - 1
+            on = word >> (x_bits + y_bits) & 15
+            yield RawEvents(clock.unwrap(t), x.astype(np.uint16), y.astype(np.uint16), on > 0)

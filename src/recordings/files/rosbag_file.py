@@ -1,0 +1,126 @@
+"""Bags of ROS 1 (.bag) and ROS 2 (a folder with metadata.yaml, .db3, .mcap), by rosbags.
+
+Each topic of events is a stream.  Times are those of the events, not of the messages.
+"""
+
+import warnings
+from collections import Counter
+from collections.abc import Generator, Iterator
+from contextlib import closing, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rosbags.rosbag1 import Reader as Ros1Reader
+from rosbags.rosbag1 import reader as ros1
+from rosbags.rosbag2 import storage_mcap as mcap
+from rosbags.rosbag2.reader import DirectoryReader
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+
+from src.recordings.files.clocks import merge_small_pieces
+from src.recordings.files.event_file import EventFile, RawEvents, ReadOptions
+from src.recordings.files.evt_decoder import EvtDecoder
+from src.recordings.files.ros_messages import ARRAYS, PACKETS, EventMessage
+from src.recordings.files.streams import EventStream, choose_stream
+from src.recordings.files.unpacking import unpack
+
+READERS: dict[str, Any] = {".bag": Ros1Reader, ".db3": Sqlite3Reader, ".mcap": mcap.McapReader}
+Messages = Generator[tuple[str, EventMessage], None, None]  # of a topic, its name first
+ZSTD = b"\x28\xb5\x2f\xfd"  # how a message begins that is packed alone
+
+# rosbags itself unpacks without bound.
+ros1.decompressors.update({kind: partial(unpack, kind=kind) for kind in ("lz4", "bz2")})
+mcap.DECOMPRESSORS.update(
+    lz4=lambda packed, _: unpack(packed, "lz4"), zstd=lambda packed, _: unpack(packed, "zstd")
+)
+
+
+def is_bag_folder(path: Path) -> bool:
+    """Return whether `path` is a bag of ROS 2, a folder."""
+    return (path / "metadata.yaml").is_file()
+
+
+class RosbagFile(EventFile):
+    """A bag; times are nanoseconds, of Prophesee's words microseconds.
+
+    `options.stream` is the place or the name of one of several topics of events, by default the one
+    with most bytes.  Raises ValueError for a bag that cannot be read or holds no events.
+    """
+
+    def __init__(self, path: Path, options: ReadOptions):
+        self.path = path
+        self._ros2 = path.is_dir() or path.suffix.lower() != ".bag"
+        topics = self._find_topics()
+        sizes = self._count_bytes() if len(topics) > 1 and options.stream is None else {}
+        most = max(range(len(topics)), key=lambda place: sizes.get(topics[place], 0))
+        streams = [EventStream(place, topic, None) for place, topic in enumerate(topics)]
+        chosen, self.notes = choose_stream(path, streams, options.stream, most)
+        self._topic = chosen.name
+        with closing(self._messages(self._topic)) as messages:
+            _, first = next(messages, ("", None))
+        if first is None:
+            raise ValueError(f"{path}: topic {self._topic} holds no messages")
+        self.size = first.size if all(first.size) else None
+        self._encoding = first.encoding
+        self.time_unit = "us" if first.encoding == "evt3" else "ns"
+
+    def pieces(self) -> Iterator[RawEvents]:
+        """Yield the events; warns of events before the first time; raises ValueError for a message
+        that cannot be read."""
+        decoder = EvtDecoder("evt3")
+        yield from merge_small_pieces(self._events(decoder))
+        if decoder.lost:
+            warnings.warn(
+                f"{self.path}: {decoder.lost} events before the first time, dropped", stacklevel=2
+            )
+
+    def _events(self, decoder: EvtDecoder) -> Iterator[RawEvents]:
+        for _, message in self._messages(self._topic):
+            try:
+                if message.encoding != self._encoding:
+                    raise ValueError(f"encoding changes to {message.encoding}")
+                yield message.read_events(decoder)
+            except ValueError as error:
+                raise ValueError(f"{self.path}: topic {self._topic}: {error}") from error
+
+    def _find_topics(self) -> list[str]:
+        """Return the names of the topics with messages of events."""
+        with self._opened() as reader:
+            topics = {link.topic: link.msgtype for link in reader.connections if link.msgcount}
+        found = sorted(topic for topic, kind in topics.items() if kind in (*ARRAYS, *PACKETS))
+        if not found:
+            others = ", ".join(sorted(set(topics.values()))[:5]) or "nothing"
+            raise ValueError(f"{self.path}: holds no messages of events, only {others}")
+        return found
+
+    def _count_bytes(self) -> Counter:
+        """Return how many bytes of events each topic has."""
+        sizes: Counter = Counter()
+        for topic, message in self._messages():
+            sizes[topic] += message.size_bytes
+        return sizes
+
+    def _messages(self, topic: str | None = None) -> Messages:
+        """Yield the messages of a topic, or of all topics of events, with its name."""
+        with self._opened() as reader:
+            for part in getattr(reader, "storages", [reader]):  # the files of a folder
+                links = [link for link in part.connections if link.msgtype in (*ARRAYS, *PACKETS)]
+                wanted = [link for link in links if topic in (None, link.topic)]
+                for link, _, content in part.messages(wanted) if wanted else ():
+                    packed = content[:4] == ZSTD
+                    content = unpack(content, "zstd") if packed else content
+                    yield link.topic, EventMessage(link.msgtype, content, self._ros2)
+
+    @contextmanager
+    def _opened(self) -> Iterator[Any]:
+        """Open the bag; what rosbags raises of a broken one, of all kinds, names the file."""
+        kind = DirectoryReader if self.path.is_dir() else READERS[self.path.suffix.lower()]
+        try:
+            reader = kind(self.path)
+            reader.open()
+            try:
+                yield reader
+            finally:
+                reader.close()
+        except Exception as error:
+            raise ValueError(f"{self.path}: cannot be read as a bag: {error}") from error

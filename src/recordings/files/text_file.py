@@ -1,0 +1,200 @@
+"""Events as text, a line each: CSV and its relatives, also packed as .gz or .zip.
+
+Before the events there may be comments (# % // ;), a line `width height`, `%geometry:640,480`, and
+the names of the columns.  Values are separated by spaces, tabs, commas or semicolons (then a comma
+may be the decimal point); polarity is 0 / 1, -1 / 1, True / False or ON / OFF.
+"""
+
+import re
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from src.recordings.files.columns import MAX_COORDINATE, as_integers, check_claim, find_columns
+from src.recordings.files.event_file import PIECE_EVENTS, EventFile, RawEvents, ReadOptions
+from src.recordings.files.text_layout import (
+    COMMENTS,
+    MAX_LINE,
+    WORDS,
+    TextLayout,
+    is_number,
+    open_text,
+    read_layout,
+    split_line,
+)
+
+CHUNK = 2**22  # characters read at a time
+SPOOL = {"names": ["t", "x", "y", "p"], "offsets": [0, 8, 10, 12], "itemsize": 16}
+
+
+class TextFile(EventFile):
+    """A text file, read once into a temporary file of binary columns.
+
+    Raises ValueError for a line that cannot be read, with its number; a last line that is cut is
+    left out, with a note.
+    """
+
+    def __init__(self, path: Path, options: ReadOptions):
+        self.path, self.notes = path, ()
+        with _named(path):
+            with open_text(path) as file:
+                self._layout = read_layout(file)
+            self.size = self._layout.size
+            names_hold = options.time_unit == "auto" and options.columns is None
+            self.time_unit = self._layout.time_unit if names_hold else None
+            self._events = self._read(options)
+
+    def pieces(self) -> Iterator[RawEvents]:
+        for first in range(0, len(self._events), PIECE_EVENTS):
+            piece = np.array(self._events[first : first + PIECE_EVENTS])
+            yield RawEvents(*(piece[name] for name in "txyp"))
+
+    def times(self) -> Iterator[np.ndarray]:
+        for first in range(0, len(self._events), PIECE_EVENTS):
+            yield np.array(self._events["t"][first : first + PIECE_EVENTS])
+
+    def _read(self, options: ReadOptions) -> np.ndarray:
+        """Return all events, (n,) of t in the file's unit, x, y, p, as they stand in the file."""
+        places = self._layout.places if options.columns is None else None
+        with _Spool() as spool:
+            for block, number, is_last in self._blocks():
+                table = self._parse(block, number, is_last)
+                if not len(table):
+                    continue
+                if places is None:
+                    places = find_columns(_as_floats(table), options.columns)
+                spool.add(*(table[f"f{places[name]}"] for name in "txyp"))
+            return spool.mapped()
+
+    def _blocks(self) -> Iterator[tuple[str, int, bool]]:
+        """Yield lines of events, how many come before them, and whether they end the file."""
+        number, rest, size = self._layout.lines, "", 0
+        with open_text(self.path) as file:
+            for _ in range(number):
+                file.readline(MAX_LINE)
+            while chunk := file.read(CHUNK):
+                size += len(chunk)
+                check_claim(self.path, size)
+                if len(chunk) < CHUNK:  # the end: these are the last lines
+                    break
+                body, newline, rest = (rest + chunk).rpartition("\n")
+                if not newline:
+                    raise ValueError(f"line {number + 1} has more than {CHUNK} characters")
+                yield body, number, False
+                number += body.count("\n") + 1
+        if rest or chunk:
+            yield (rest + chunk).rstrip("\n"), number, True
+
+    def _parse(self, text: str, number: int, is_last: bool) -> np.ndarray:
+        """Return the values of the lines as a structured array of columns f0, f1, ..."""
+        tidy = self._tidy(text)
+        for kind in (np.int64, np.float64):
+            try:
+                return _load(tidy, self._layout, kind)
+            except ValueError:
+                continue
+        wrong = self._find_broken(tidy)
+        if is_last and wrong == len(tidy) - 1 and number + wrong > self._layout.lines:
+            self.notes = (f"{self.path}: its last line is cut, left out",)
+            return self._parse("\n".join(tidy[:-1]), number, False)
+        raise ValueError(f"line {number + wrong + 1} is no event: {tidy[wrong][:40]!r}")
+
+    def _find_broken(self, lines: list[str]) -> int:
+        """Return the place of the first line that is no event."""
+        for place, line in enumerate(lines):
+            words = split_line(line, self._layout.separator)
+            if line and not (len(words) == self._layout.width and all(map(is_number, words))):
+                return place
+        raise ValueError("a number is out of range")
+
+    def _tidy(self, text: str) -> list[str]:
+        """Return the lines with points, numbers for words, and blank for comments."""
+        if self._layout.has_decimal_comma:
+            text = text.replace(",", ".")
+        if self._layout.has_words:
+            text = re.sub(
+                r"\b(true|false|on|off)\b", lambda m: WORDS[m[0].lower()], text, flags=re.I
+            )
+        tidy = text.split("\n")
+        if any(mark in text for mark in ("#", "%", "/")):
+            tidy = ["" if line.lstrip().startswith(COMMENTS) else line for line in tidy]
+        return tidy
+
+
+def _load(lines: list[str], layout: TextLayout, kind: type) -> np.ndarray:
+    """Return the columns of lines, all of them as `kind`; raises ValueError for other lines."""
+    dtype = [(f"f{k}", kind) for k in range(layout.width)]
+    if not any(lines):
+        return np.empty(0, dtype)
+    return np.loadtxt(lines, dtype, comments=None, delimiter=layout.separator, ndmin=1)
+
+
+def _as_floats(table: np.ndarray) -> np.ndarray:
+    return np.stack([table[name].astype(np.float64) for name in table.dtype.names or ()], 1)
+
+
+class _Spool:
+    """Events in a temporary file; times are integers as long as all of them are."""
+
+    def __init__(self) -> None:
+        self.file = tempfile.TemporaryFile()  # noqa: SIM115 - closed by __exit__
+        self.kind: np.dtype = np.dtype(np.int64)
+        self.count = 0
+
+    def __enter__(self) -> "_Spool":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.file.close()  # what is mapped stays
+
+    def add(self, t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> None:
+        """Add columns; raises ValueError for a place or polarity that is none."""
+        if self.kind.kind == "i" and t.dtype.kind == "f":
+            self._use_float_times()
+        events = np.zeros(len(t), self._dtype())
+        events["t"] = t
+        for name, column in (("x", x), ("y", y)):
+            values = as_integers(name, column)
+            low, high = values.min(), values.max()
+            if low < 0 or high > MAX_COORDINATE:
+                raise ValueError(f"{name} must be in 0..{MAX_COORDINATE}, got {low} to {high}")
+            events[name] = values
+        sign = as_integers("polarity", p)
+        if sign.min() < -1 or sign.max() > 1:
+            raise ValueError(f"polarity must be -1, 0 or 1, got {np.unique(sign)[:4].tolist()}")
+        events["p"] = sign
+        self.file.write(events.tobytes())
+        self.count += len(events)
+
+    def mapped(self) -> np.ndarray:
+        """Return the events, (n,)."""
+        self.file.flush()
+        if not self.count:
+            return np.empty(0, self._dtype())
+        return np.memmap(self.file, self._dtype(), "r", shape=(self.count,))  # type: ignore[call-overload]
+
+    def _dtype(self) -> np.dtype:
+        formats = [self.kind, np.uint16, np.uint16, np.int8]
+        return np.dtype({**SPOOL, "formats": formats})  # type: ignore[call-overload]
+
+    def _use_float_times(self) -> None:
+        before, self.kind = self.mapped(), np.dtype(np.float64)
+        self.file.close()
+        self.file, self.count = tempfile.TemporaryFile(), 0  # noqa: SIM115
+        for first in range(0, len(before), PIECE_EVENTS):
+            piece = before[first : first + PIECE_EVENTS]
+            self.add(piece["t"].astype(np.float64), piece["x"], piece["y"], piece["p"])
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Errors name the file."""
+    try:
+        yield
+    except (KeyboardInterrupt, MemoryError):
+        raise
+    except Exception as error:  # libraries raise all kinds on a broken file
+        raise ValueError(f"{path}: cannot be read as text of events: {error}") from error

@@ -1,0 +1,160 @@
+"""The layout of a text file of events, from its first lines: separator, columns, sensor size."""
+
+import gzip
+import io
+import re
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from src.recordings.files.columns import match_columns, stated_unit
+
+TEXT_ENDINGS = (".txt", ".csv", ".tsv")
+MAX_LINE = 2**23  # characters; a longer line is none of events
+MAX_HEADER_LINES = 1000
+COMMENTS = ("#", "%", "//", ";")
+WORDS = {"true": "1", "false": "0", "on": "1", "off": "0"}  # of polarity
+CUT = b" cut"  # what a packed text ends in where its file is cut: its last line is no event
+GEOMETRY = re.compile(
+    r"(?:geometry|resolution|size)\D*(?<![\d.])(\d+)"
+    r"(?:\s*(?:(?:[x,;*]|by|height)[\s=:]*)+|\s+)(\d+)(?!\d|\.\d)",
+    re.IGNORECASE,
+)
+
+
+class TextLayout(NamedTuple):
+    """How the lines of a file are read: the `width` of the table, `separator` (None: any blanks),
+    whether a comma is the decimal point, whether polarity is a word, the `places` of t, x, y, p
+    where names tell them, the unit of time in these, and (width, height).  `lines` come before
+    the events."""
+
+    width: int
+    separator: str | None
+    has_decimal_comma: bool
+    has_words: bool
+    places: dict[str, int] | None
+    time_unit: str | None
+    size: tuple[int, int] | None
+    lines: int
+
+
+@contextmanager
+def open_text(path: Path) -> Iterator[io.TextIOBase]:
+    """Open a text file, or the one in a .gz or .zip, without its byte-order mark."""
+    with _open_bytes(path) as file:
+        start = file.peek(4)[:4]
+        if start[:2] in (b"\xff\xfe", b"\xfe\xff"):
+            raise ValueError("it is UTF-16; save it as UTF-8")
+        if start[:3] == b"\xef\xbb\xbf":
+            file.read(3)
+        yield io.TextIOWrapper(file, encoding="latin-1")
+
+
+@contextmanager
+def _open_bytes(path: Path) -> Iterator[Any]:
+    ending = path.suffix.lower()
+    if ending == ".gz":
+        with gzip.open(path) as file:
+            yield io.BufferedReader(_UpToCut(file))
+    elif ending == ".zip":
+        with zipfile.ZipFile(path) as archive:
+            names = [n for n in archive.namelist() if n.lower().endswith(TEXT_ENDINGS)]
+            names = [n for n in names if not Path(n).name.startswith("._")]  # of macOS
+            named = [n for n in names if Path(n).stem.lower() == "events"]  # beside images.txt
+            names = names if len(names) == 1 else named
+            if len(names) != 1:
+                raise ValueError("a .zip must hold one text file, or one that is called events.txt")
+            with archive.open(names[0]) as file:
+                yield io.BufferedReader(file)  # type: ignore[arg-type]
+    else:
+        with path.open("rb") as file:
+            yield file
+
+
+class _UpToCut(io.RawIOBase):
+    """What a .gz holds; of one that is cut, what is whole and CUT."""
+
+    def __init__(self, file: gzip.GzipFile):
+        self._file, self._is_cut = file, False
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        try:
+            part = b"" if self._is_cut else self._file.read1(len(buffer))
+        except EOFError:
+            part, self._is_cut = CUT, True
+        buffer[: len(part)] = part
+        return len(part)
+
+
+def read_layout(file: io.TextIOBase) -> TextLayout:
+    """Return how the lines are read, from those up to the first event."""
+    size: tuple[int, int] | None = None
+    names: list[str] | None = None
+    strange: str | None = None
+    for number in range(MAX_HEADER_LINES):
+        line = file.readline(MAX_LINE)
+        if not line:
+            if strange is not None:
+                raise ValueError(f"no line of numbers t x y p in it, got {strange[:40]!r}")
+            return TextLayout(0, None, False, False, None, None, size, number)
+        bare = line.strip()
+        separator, has_decimal_comma = _find_separator(bare)
+        words = split_line(bare.replace(",", ".") if has_decimal_comma else bare, separator)
+        if len(words) >= 4 and all(map(_is_value, words)):
+            has_words = not all(map(is_number, words))
+            if names is not None and len(names) != len(words):
+                names = None
+            places = None if names is None else match_columns(names)
+            unit = stated_unit(names[places["t"]]) if names and places else None
+            how = separator, has_decimal_comma, has_words
+            return TextLayout(len(words), *how, places, unit, size, number)
+        here = _stated_size(bare)
+        size = here or size
+        title = bare.lstrip("#%/; ").encode("latin-1").decode(errors="replace")  # it may have µs
+        found = split_line(title, _find_separator(title)[0])
+        names = found if match_columns(found) else names
+        if bare and not (bare.startswith(COMMENTS) or here or match_columns(found)):
+            strange = strange or bare
+    raise ValueError(f"no line of numbers t x y p among the first {MAX_HEADER_LINES}")
+
+
+def _stated_size(line: str) -> tuple[int, int] | None:
+    """Return (width, height) of `640 480`, `%geometry:640,480` or `t x@640 y@480 p`."""
+    sides = dict(re.findall(r"\b([xy])@(\d+)", line))
+    if len(sides) == 2:
+        return int(sides["x"]), int(sides["y"])
+    match = re.fullmatch(r"(\d+)[\s,;x]+(\d+)", line.lstrip("#% ")) or GEOMETRY.search(line)
+    return (int(match[1]), int(match[2])) if match else None
+
+
+def _find_separator(line: str) -> tuple[str | None, bool]:
+    """Return what separates values (None: blanks), and whether a comma is the decimal point."""
+    if ";" in line.lstrip("; "):
+        return ";", "," in line
+    return ("," if "," in line else None), False
+
+
+def split_line(line: str, separator: str | None) -> list[str]:
+    """Return the values of a line; `separator` None: any blanks."""
+    words = line.strip().split(separator)
+    while separator and words and not words[-1].strip():  # a separator at the end of the line
+        words.pop()
+    return words
+
+
+def is_number(word: str) -> bool:
+    """Return whether a word is a number as text files have them."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return "_" not in word
+
+
+def _is_value(word: str) -> bool:
+    return word.strip().lower() in WORDS or is_number(word)

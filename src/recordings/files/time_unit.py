@@ -1,0 +1,137 @@
+"""The unit of a table's times, told once by all of them, and times in it to int64 microseconds.
+
+A unit is judged by the file's duration and event rate in it.  It loses a point for each factor of
+ten by which the duration is outside 0.02 s..600 s or the rate outside 1e4..3e7 events/s, and those
+of PRIOR, for whole numbers and others.  It gains EPOCH where the times are then dates of 2001 to
+2039.  Where half of the times have more than three digits behind the point, other units than s
+lose FINE: they would be finer than a camera's.  Duration and rate are those between the 1st and
+the 99th of a hundred times, so that single wild ones do not matter.
+
+The best unit is taken.  The user is told where it is not that of PRIOR 0 or a date, where a second
+one is less than NEAR behind, and where duration or rate are absurd.  Fewer than FEW_TIMES values
+tell too little: they are seconds with a fraction, microseconds without.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+UNITS_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
+PRIOR = {
+    True: {"us": 0.0, "ns": 1.0, "ms": 2.0, "s": 3.0},  # whole numbers
+    False: {"s": 0.0, "ms": 1.0, "us": 1.0, "ns": 2.0},
+}
+FINE = 3.0
+DURATION_S, RATE_HZ, EPOCH_S, EPOCH = (0.02, 600.0), (1e4, 3e7), (1e9, 2.2e9), 3.0
+NEAR = 1.0  # points: a second unit as near is told of
+ABSURD_S, ABSURD_HZ = (1e-3, 86_400.0), (10.0, 1e9)  # outside, duration and rate are told of
+FEW_TIMES = 100
+SAMPLES = 1024  # of a piece
+MAX_TIME_US = 2**62
+Range = tuple[float, float]
+
+
+class TimeSample:
+    """Some of a file's times in its unit, from all its pieces, and whether all are whole."""
+
+    def __init__(self) -> None:
+        self.count, self.is_whole = 0, True
+        self._values: list[np.ndarray] = []
+
+    def add(self, t: np.ndarray) -> None:
+        """Take the times (n,) of a piece."""
+        self.count += len(t)
+        self._values.append(np.array(t[:: max(1, len(t) // SAMPLES)]))
+        if t.dtype.kind == "f" and self.is_whole:
+            self.is_whole = bool((t == np.rint(t)).all())
+
+    def is_fine(self) -> bool:
+        """Return whether half of the times or more have above three digits behind the point."""
+        if self.is_whole or not self._values:
+            return False
+        thousands = np.concatenate(self._values) * 1e3
+        return bool(np.mean(np.abs(thousands - np.rint(thousands)) > 1e-3) >= 0.5)
+
+    def span(self) -> float:
+        """Return the span of the times in the file's unit, less the first and last hundredth."""
+        return self._low_span()[1]
+
+    def date(self) -> float:
+        """Return an early time in the file's unit."""
+        return self._low_span()[0]
+
+    def _low_span(self) -> tuple[float, float]:
+        values = np.concatenate(self._values) if self._values else np.zeros(0)
+        values = values[np.isfinite(values)]
+        if not len(values):
+            return 0.0, 0.0
+        if self.count < FEW_TIMES:
+            return float(values.min()), float(values.max() - values.min())
+        order = np.sort(values)
+        low, high = order[len(order) // 100], order[-1 - len(order) // 100]
+        return float(low), float(high - low) / 0.98
+
+
+def find_unit(sample: TimeSample, stated: str) -> tuple[str, str]:
+    """Return the unit (`stated`, where it is not auto), and what the user is told of it, or ""."""
+    if sample.count < FEW_TIMES:
+        return (("us" if sample.is_whole else "s") if stated == "auto" else stated), ""
+    span, losses = sample.span(), PRIOR[sample.is_whole]
+    fine = FINE * sample.is_fine()
+    points = {unit: _judge(sample, unit) - losses[unit] - fine * (unit != "s") for unit in UNITS_US}
+    best, second = sorted(points, key=lambda unit: -points[unit])[:2]
+    unit = best if stated == "auto" else stated
+    near = stated == "auto" and points[best] - points[second] < NEAR
+    duration_s = span * UNITS_US[unit] * 1e-6
+    rate_hz = sample.count / duration_s if duration_s else np.inf
+    unusual = stated == "auto" and losses[unit] > 0 and not _is_date(sample, unit)
+    absurd = _decades(duration_s, ABSURD_S) + _decades(rate_hz, ABSURD_HZ) > 0
+    if not (near or unusual or absurd):
+        return unit, ""
+    other = second if unit == best else best
+    seen = f"times in {unit} give {_describe(sample, unit)}, in {other} {_describe(sample, other)}"
+    return unit, f"{seen}: read as {unit}; if it is another, give time_unit=s, ms, us or ns"
+
+
+def check_times(t: np.ndarray, unit: str, path: Path) -> None:
+    """Raise ValueError for times (n,) that are not finite or beyond 2^62 us."""
+    least, most = (t.min(), t.max()) if len(t) else (0, 0)
+    bound = MAX_TIME_US / UNITS_US[unit]
+    if not (-bound < float(least) and float(most) < bound):
+        wrong = most if -bound < float(least) else least
+        raise ValueError(f"{path}: times must be finite and within 2^62 us, got {wrong} {unit}")
+
+
+def to_us(t: np.ndarray, unit: str) -> np.ndarray:
+    """Return times (n,) of `unit` as int64 us, rounded; whole numbers exactly."""
+    if t.dtype.kind == "f":
+        return np.rint(t / 1e3 if unit == "ns" else t * UNITS_US[unit]).astype(np.int64)
+    t = t.astype(np.int64, copy=False)
+    if unit == "ns":
+        return (t + 500) // 1000
+    return t if unit == "us" else t * int(UNITS_US[unit])
+
+
+def _judge(sample: TimeSample, unit: str) -> float:
+    duration_s = sample.span() * UNITS_US[unit] * 1e-6
+    if not duration_s:
+        return 0.0
+    points = -_decades(duration_s, DURATION_S) - _decades(sample.count / duration_s, RATE_HZ)
+    return points + EPOCH * _is_date(sample, unit)
+
+
+def _is_date(sample: TimeSample, unit: str) -> bool:
+    return EPOCH_S[0] < sample.date() * UNITS_US[unit] * 1e-6 < EPOCH_S[1]
+
+
+def _decades(value: float, allowed: Range) -> float:
+    """Return by how many factors of ten a value is outside."""
+    if not 0 < value < np.inf:
+        return np.inf
+    return float(max(0.0, np.log10(allowed[0] / value), np.log10(value / allowed[1])))
+
+
+def _describe(sample: TimeSample, unit: str) -> str:
+    duration_s = sample.span() * UNITS_US[unit] * 1e-6
+    rate = sample.count / duration_s if duration_s else np.inf
+    return f"{duration_s:.3g} s and {rate:.3g} events/s"

@@ -1,0 +1,88 @@
+"""Frames of a film, a folder of pictures or our `video.h5`: grey, in [0, 1]."""
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import islice
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+from jaxtyping import Float
+
+from src.recordings.files.hdf5_file import check_no_external_data
+from src.sim.scenes.video_decoding import LARGEST_PIXELS
+from src.sim.scenes.video_files import PICTURE_SUFFIXES, read_picture
+from src.sim.scenes.video_index import index_video
+
+
+def read_video(
+    path: Path | str, key: str = "recording", most: int | None = None
+) -> Iterator[Float[np.ndarray, "h w"]]:
+    """Yield the grey frames in [0, 1], float32, of a film, a folder of pictures or our `video.h5`;
+    of a film that is long at most its first `most` frames.
+
+    Raises ValueError, which names `key`, for a file that cannot be read or has no frame.
+    """
+    frame = None
+    for frame in islice(_frames(Path(path), key, most), most):
+        yield frame
+    if frame is None:
+        raise ValueError(f"{key} must be a film or a folder of pictures, got {path}")
+
+
+def read_fps(path: Path | str, key: str = "video", most: int | None = None) -> float | None:
+    """Return the frames a second of a film, of its first `most` frames: what it states, or what its
+    time stamps say where that differs; None for pictures and for a film without time stamps.
+
+    Raises ValueError, which names `key`, for a film that cannot be read.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return None
+    if path.suffix == ".h5":
+        with _opened_h5(path) as file:
+            times = file["time_s"][:2] if "time_s" in file else []
+        known = len(times) == 2 and times[1] > times[0]
+        return float(1 / (times[1] - times[0])) if known else None
+    return index_video(path, key, most).fps
+
+
+def _frames(path: Path, key: str, most: int | None) -> Iterator[np.ndarray]:
+    if path.is_dir():
+        names = sorted(name for name in path.iterdir() if name.suffix.lower() in PICTURE_SUFFIXES)
+        yield from (read_gray_picture(name) for name in names if name.name[0] != ".")
+    elif path.suffix == ".h5":
+        with _opened_h5(path) as file:
+            frames = file["frames"]
+            if frames.ndim != 3 or frames.dtype != np.uint8:
+                raise ValueError("frames must be uint8 (n, h, w)")
+            if math.prod(frames.shape[1:]) > LARGEST_PIXELS:
+                raise ValueError(f"frames must have {LARGEST_PIXELS} pixels at most")
+            yield from (frame.astype(np.float32) / 255 for frame in frames)
+    else:
+        index = index_video(path, key, most)
+        for frame in index.read(0, len(index.shown), key):
+            yield frame.astype(np.float32) / 255
+
+
+@contextmanager
+def _opened_h5(path: Path) -> Iterator[h5py.File]:
+    """Open our `video.h5`; errors in the block are ValueErrors that name it."""
+    try:
+        with h5py.File(path) as file:
+            check_no_external_data(file)
+            yield file
+    except Exception as error:  # HDF5 raises all kinds on a broken file
+        raise ValueError(f"{path}: cannot be read as a video: {error}") from error
+
+
+def read_gray_picture(path: Path) -> Float[np.ndarray, "h w"]:
+    """Return a picture in [0, 1], of 8 or 16 bits; raises ValueError for what cannot be read."""
+    picture = read_picture(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    if picture is None or picture.dtype.kind != "u":
+        raise ValueError(
+            f"recording must be a readable picture of at most {LARGEST_PIXELS} pixels, got {path}"
+        )
+    return picture.astype(np.float32) / np.iinfo(picture.dtype).max

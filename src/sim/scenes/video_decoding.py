@@ -1,0 +1,90 @@
+"""Frames of a video file, decoded with FFmpeg (PyAV) up to its first fault; grey as OpenCV's."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+from av.video.reformatter import Interpolation, VideoReformatter
+from jaxtyping import UInt8
+
+LARGEST_PIXELS = int(os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"])  # src/__init__.py sets 2^27
+TURNS = {
+    90: cv2.ROTATE_90_COUNTERCLOCKWISE, -90: cv2.ROTATE_90_CLOCKWISE,
+    180: cv2.ROTATE_180, -180: cv2.ROTATE_180,
+}  # fmt: skip
+Gray = UInt8[np.ndarray, "h w"]
+
+
+class DamagedVideo(Exception):
+    """The frames after this place of a file cannot be read."""
+
+
+@contextmanager
+def opened_video(path: Path, key: str) -> Iterator[tuple[Any, Any]]:
+    """Open the first video stream of a file; raises ValueError, which names `key`."""
+    wanted = f"{key} must be a video that FFmpeg can read, with frames of at most {LARGEST_PIXELS}"
+    refusal = f"{wanted} pixels, got {path}"
+    options = {"protocol_whitelist": "file"}  # a playlist may not fetch from elsewhere
+    try:
+        container = av.open(f"file:{path}", options=options, metadata_errors="replace")
+    except (av.FFmpegError, ValueError, OSError) as error:
+        raise ValueError(refusal) from error
+    with container:
+        stream: Any = container.streams.best("video")
+        decoder = stream.codec_context if stream else None  # none for an unknown codec
+        is_text = container.format.name == "tty"  # FFmpeg draws the letters
+        if is_text or decoder is None or not 0 < decoder.width * decoder.height <= LARGEST_PIXELS:
+            raise ValueError(refusal)
+        yield container, stream
+
+
+def decode_frames(container: Any, stream: Any) -> Iterator[Any]:
+    """Yield the frames in the order in which they are shown; what cannot be decoded before the
+    first is left out.  Raises DamagedVideo at the first fault after it.
+    """
+    some = False
+    for packet in _packets(container, stream):
+        frames, fault = _decode_packet(packet)
+        for frame in frames:
+            if frame.is_corrupt and some:
+                raise DamagedVideo("a frame has errors")
+            if not frame.is_corrupt:
+                some = True
+                yield frame
+        if fault and some:
+            raise DamagedVideo(fault)
+
+
+def _packets(container: Any, stream: Any) -> Iterator[Any]:
+    try:
+        yield from container.demux(stream)
+    except av.FFmpegError as error:
+        raise DamagedVideo(error.strerror) from error
+
+
+def _decode_packet(packet: Any) -> tuple[list, str]:
+    """Return the frames that come out, and why none do."""
+    if packet.is_corrupt:
+        return [], "a part is incomplete"
+    try:
+        return packet.decode(), ""
+    except av.FFmpegError as error:
+        return [], str(error.strerror)
+
+
+class GrayConverter:
+    """Turns frames into grey pictures, uint8 (h, w), upright, as OpenCV does: by way of BGR."""
+
+    def __init__(self) -> None:
+        self.reformatter = VideoReformatter()
+
+    def __call__(self, frame: Any) -> Gray:
+        bgr = self.reformatter.reformat(frame, format="bgr24", interpolation=Interpolation.BICUBIC)
+        gray = cv2.cvtColor(bgr.to_ndarray(), cv2.COLOR_BGR2GRAY)
+        turn = TURNS.get(round(frame.rotation))
+        return gray if turn is None else cv2.rotate(gray, turn)

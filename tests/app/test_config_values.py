@@ -1,0 +1,77 @@
+"""A value of a wrong kind and a key that is none end in one line, before anything runs."""
+
+import sys
+from importlib import import_module
+
+import pytest
+from omegaconf import OmegaConf
+
+from src import simulate
+from src.app import entry_point
+from src.app.config_values import LIST, NULL, NUMBER, WORD, _kinds_like
+
+WRONG = [
+    ("reconstruct", ["recording=x", "fps=abc"], "fps must be a number, got abc"),
+    ("reconstruct", ["recording=x", "fps=1/60"], "fps must be a number, got 1/60"),
+    ("reconstruct", ["recording=x", "sensor_size=720"], "sensor_size must be a list or null"),
+    ("reconstruct", ["recording=x", "sensor_size=[720]"], "sensor_size must be [height,width], wh"),
+    ("reconstruct", ["recording=x", "resolution=[a,b]"], "resolution must be [height,width], wh"),
+    ("reconstruct", ["ckpt=setnet_small"], "recording must be given: recording=..."),
+    ("calibrate", [], "task must be given: task=..."),
+    ("reconstruct", ["recording=null"], "recording must be a word, got null"),
+    ("reconstruct", ["recording="], "recording must be a word, got none"),
+    ("reconstruct", ["recording=x", "ckpt=[a,b]"], "ckpt must be a word or null, got"),
+    ("reconstruct", ["recording=x", "ckpt=setnet_small", "device=cuda:99"], "device must be cpu"),
+    ("reconstruct", ["recording=x", "+unknown=1"], "unknown is no key of the configuration"),
+    ("simulate", ["camera.tile_px=abc"], "camera.tile_px must be a number, got abc"),
+    ("simulate", ["index=-1"], "index must be >= 0, the number of a clip, got -1"),
+    ("simulate", ["data.unknown=1"], "data.unknown is no key of the configuration"),
+    ("simulate", ["turbulence=rigid"], "turbulence=rigid is now turbulence=mixed turbulence.atm"),
+    ("train", ["experiment=lf_firenet"], "experiment=lf_firenet was removed"),
+    ("train", ["trainer.max_steps=abc"], "trainer.max_steps must be a number, got abc"),
+    ("train", ["ckpt=setnet_medium"], "ckpt=setnet_medium must be of the network that is trained"),
+    ("compare", ["videos=a.h5"], "videos must be a list, got a.h5"),
+    ("compare", ["videos=[a.h5]", "fps=0"], "fps must be > 0 frames a second, got 0"),
+    ("compare", ["videos=[a.h5]", "line=[[a,b],[c,d]]"], "line must be numbers as in [[0, 88], ["),
+    ("compare", ["videos=[a.h5]", "line=[1,2]"], "line must be numbers as in [[0, 88], [175, 88]]"),
+    ("compare", ["videos=[a.h5]", "circle=[1]"], "circle must be numbers as in [88, 88, 40], got"),
+    ("compare", ["videos=[a.h5]", "spin=[[1,2],3]"], "spin must be numbers as in [88, 88, 40, 2.5"),
+    ("live", ["recording=x", "threads=0"], "threads must be >= 1, got 0"),
+    ("live", ["recording=x", "host=1.5"], "host must be a word, got 1.5"),
+]  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # Hydra's log
+@pytest.mark.parametrize(("name", "overrides", "said"), WRONG)
+def test_one_line_and_exit_code_2(name, overrides, said, tmp_path, monkeypatch, capsys):
+    work = getattr(import_module(f"src.{name}"), name)
+    monkeypatch.setattr(sys, "argv", [name, *overrides, f"paths.out={tmp_path}"])
+    with pytest.raises(SystemExit) as ended:
+        entry_point.run_command(work, name)
+    printed = capsys.readouterr()
+    (line,) = printed.err.splitlines()
+    assert ended.value.code == 2 and printed.out == ""
+    assert line.startswith("error: ") and said in line
+
+
+def test_a_recording_that_cannot_be_written_is_refused_before_it_is_made(tmp_path, monkeypatch):
+    monkeypatch.setattr(simulate.build, "build_pipeline", None)
+    cfg = OmegaConf.create({
+        "paths": {"run": str(tmp_path)}, "index": 0, "write": "a.xyz", "like": None,
+        "camera": {"sensor": [360, 640]},
+    })  # fmt: skip
+    with pytest.raises(ValueError, match="a.xyz: cannot write .xyz"):
+        simulate.simulate(cfg)
+
+
+@pytest.mark.parametrize(
+    ("key", "default", "kinds"),
+    [
+        ("fps", 120.0, (NUMBER,)),
+        ("sensor.threshold", [0.1, 0.7], (NUMBER, LIST, NULL)),
+        ("split", "test", (WORD,)),
+        ("last", None, ()),
+    ],
+)
+def test_the_shipped_value_says_what_a_key_takes(key, default, kinds):
+    assert _kinds_like(key, default) == kinds

@@ -1,0 +1,94 @@
+"""Paths reach the entry point as they were typed; two jobs of a sweep never share a folder."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
+from src.app.path_overrides import MAX_FOLDER_BYTES, name_job_folder, quote_paths, unquote_override
+from tests.conftest import ROOT
+
+NAMES = [
+    "größe.txt", "cap (1).txt", "run=3.txt", "cap#1.txt", "a,b.txt", "it's.txt", 'a"b.txt',
+    "日本 語.raw", "2026_11_26", "20261126", "1", "true", "1e3", "[x].raw", "{a: b}", "a\\b", "a\\",
+    "it\\'s", " x ",
+]  # fmt: skip
+
+
+def parsed(override: str):
+    return OverridesParser.create().parse_override(override)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_path_is_what_was_typed(name):
+    (override,) = quote_paths([f"scene.root={name}"], "simulate")
+    assert parsed(override).value() == name
+    assert unquote_override(override) == f"scene.root={name}"
+
+
+@pytest.mark.parametrize(
+    ("typed", "value"),
+    [
+        (
+            "videos=[a b.mp4,it's.h5,20261126,'x,y.h5']",
+            ["a b.mp4", "it's.h5", "20261126", "x,y.h5"],
+        ),
+        ("recording='a b'", "a b"),
+        ("views=null", None),
+        ("ckpt=", ""),
+        ("recording=~/cap.raw", str(Path.home() / "cap.raw")),
+        ("still=1", "1"),
+        ("optics.views=9", 9),
+        ("fps=120", 120),
+    ],
+)
+def test_lists_null_home_and_other_keys(typed, value):
+    (override,) = quote_paths([typed], "calibrate")
+    assert parsed(override).value() == value
+
+
+@pytest.mark.parametrize(
+    ("typed", "values"),
+    [
+        ("recording=x/a b.txt,x-a.txt,'a,b.txt'", ["x/a b.txt", "x-a.txt", "a,b.txt"]),
+        ("ckpt=[a,b],[c,1]", [["a", "b"], ["c", "1"]]),
+    ],
+)
+def test_in_a_sweep_a_comma_separates(typed, values):
+    _, override = quote_paths(["-m", typed], "chart")
+    key = typed.split("=")[0]
+    lines = parsed(override).sweep_string_iterator()
+    assert [parsed(f"{key}={line}").value() for line in lines] == values
+
+
+def test_a_sweep_that_its_config_asks_for_is_one():
+    sweep = ["--config-dir", str(ROOT / "sweeps"), "--config-name", "views", "ckpt=a,b"]
+    assert quote_paths(sweep, "eval")[-1] == "ckpt='a','b'"
+    assert quote_paths(["ckpt=a,b"], "eval") == ["ckpt='a,b'"]
+
+
+def test_names_of_jobs_differ_as_their_overrides_do():
+    jobs = [
+        ["recording='x/a.txt'"],
+        ["recording='x-a.txt'"],
+        ["a=b_c=d", "c=e"],
+        ["a=b", "c=d_c=e"],
+    ]
+    jobs += [["ckpt=['a','b']"], ["ckpt=['a,b']"], [f"a={'ü' * 300}x"], [f"a={'ü' * 300}y"]]
+    names = [name_job_folder(job) for job in jobs]
+    assert len(set(names)) == len(jobs) and not any("/" in name or "=" in name for name in names)
+    assert all(len(name.encode()) <= MAX_FOLDER_BYTES for name in names)
+    plain = ["seed=0", "experiment=lf3x3", "paths.out='o'"]
+    assert name_job_folder(plain) == "experiment-lf3x3_seed-0"
+
+
+@pytest.mark.parametrize("locale", [{"PYTHONIOENCODING": "latin-1"}, {"PYTHONIOENCODING": "ascii"}])
+def test_a_console_of_few_signs_ends_no_job(locale, tmp_path):
+    text = "from src.app import console; console.prepare_streams(); print('größe • ━ ↑ 日')"
+    done = subprocess.run(
+        [sys.executable, "-c", text], cwd=ROOT, env=os.environ | locale, capture_output=True
+    )
+    assert done.returncode == 0 and done.stdout.endswith(b" * - ^ ?\n")

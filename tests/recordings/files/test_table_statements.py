@@ -1,0 +1,99 @@
+"""What tables state of themselves - size, unit, columns - and packed or cut ones, as found."""
+
+import gzip
+
+import h5py
+import numpy as np
+import pytest
+
+from src.recordings.files import ReadOptions, read_events, text_file
+from tests.recordings.files.test_tables import assert_read, events, lines
+
+__all__ = ["events"]  # a fixture
+SLOW = 1500  # times the 0.2 s of the scene: the values alone would tell another unit
+
+
+def write_columns(path, made, **attrs):
+    with h5py.File(path, "w") as file:
+        for name in "txyp":
+            file[f"events/{name}"] = made[name]
+        file["events"].attrs.update(attrs)
+
+
+def slowed(events):
+    slow = events.copy()
+    slow["t"] *= SLOW
+    return slow
+
+
+@pytest.mark.parametrize(
+    ("name", "form"),
+    [
+        ("t_ns", lambda t: int(t) * 1000),
+        ("Timestamp [us]", int),
+        ("t (µs)", int),
+        ("time_s", lambda t: f"{t * 1e-6:.6f}"),
+    ],
+)
+def test_a_name_states_the_unit(tmp_path, events, name, form):
+    slow = slowed(events)
+    text = f"{name},x,y,p\n" + lines(slow, between=",", t=form)
+    (tmp_path / "a.csv").write_text(text, encoding="utf-8")
+    assert np.array_equal(read_events(tmp_path / "a.csv"), slow)
+
+
+def test_a_stated_unit_goes_before_the_name(tmp_path, events):
+    (tmp_path / "a.csv").write_text("t_ns,x,y,p\n" + lines(events, between=","))
+    found = read_events(tmp_path / "a.csv", options=ReadOptions(time_unit="us"))
+    assert np.array_equal(found, events)
+
+
+def test_an_index_by_milliseconds_means_microseconds(tmp_path, events):
+    """DSEC's."""
+    slow = slowed(events)
+    write_columns(tmp_path / "a.h5", slow)
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["ms_to_idx"] = np.searchsorted(slow["t"], np.arange(0, 300_000) * 1000)
+    assert np.array_equal(read_events(tmp_path / "a.h5"), slow)
+
+
+@pytest.mark.parametrize(
+    ("attrs", "size"),
+    [
+        ({"geometry": np.bytes_("320x240")}, (320, 240)),
+        ({"width": [320], "height": [240]}, (320, 240)),
+        ({"sensor_resolution": (240, 320)}, (320, 240)),
+        ({"sensor_resolution": np.bytes_("320x240")}, (320, 240)),
+        ({"size": "1500 events"}, None),
+    ],
+)
+def test_hdf5_states_its_size_in_many_ways(tmp_path, events, attrs, size):
+    write_columns(tmp_path / "a.h5", events, **attrs)
+    assert_read(tmp_path / "a.h5", events, size)
+
+
+def test_stated_columns_go_before_names(tmp_path, events):
+    (tmp_path / "a.txt").write_text("x y t p\n" + lines(events))
+    assert_read(tmp_path / "a.txt", events, columns="txyp")
+
+
+def test_columns_of_matlab(tmp_path, events):
+    np.savez(tmp_path / "a.npz", **{name: events[name][:, None] for name in "txyp"})
+    assert_read(tmp_path / "a.npz", events)
+
+
+def test_a_cut_gz_is_read_up_to_its_last_whole_line(tmp_path, events):
+    content = gzip.compress(lines(events, "xypt").encode())
+    (tmp_path / "a.txt.gz").write_bytes(content[: len(content) * 7 // 10])
+    with pytest.warns(UserWarning, match="last line is cut, left out"):
+        found = read_events(tmp_path / "a.txt.gz")
+    assert 900 < len(found) < 1200
+    assert np.array_equal(found, events[: len(found)])
+
+
+def test_a_cut_line_may_be_the_only_one_of_the_last_block(tmp_path, events, monkeypatch):
+    text = lines(events)
+    monkeypatch.setattr(text_file, "CHUNK", len(text))
+    (tmp_path / "a.txt").write_text(text + "200999 1")
+    with pytest.warns(UserWarning, match="last line is cut"):
+        assert np.array_equal(read_events(tmp_path / "a.txt"), events)

@@ -1,0 +1,101 @@
+"""The unit of times: told by all of a file's values, stated, or told of; whole numbers exactly."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from src.recordings.files.time_unit import TimeSample, check_times, find_unit, to_us
+
+DATE_S = 1_600_000_000
+PER_S = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
+
+
+def sampled(t: np.ndarray, pieces: int = 3) -> TimeSample:
+    sample = TimeSample()
+    for part in np.array_split(t, pieces):
+        sample.add(part)
+    return sample
+
+
+def made_up(duration_s: float, rate_hz: float) -> np.ndarray:
+    """Return times in ns, int64."""
+    g = np.random.default_rng(0)
+    return np.sort(g.integers(0, int(duration_s * 1e9), int(duration_s * rate_hz)))
+
+
+def in_unit(ns: np.ndarray, unit: str, date_s: int, kind: type) -> np.ndarray:
+    if kind is float:
+        return ns / (10**9 / PER_S[unit]) + date_s * PER_S[unit]
+    return ns // (10**9 // PER_S[unit]) + date_s * PER_S[unit]
+
+
+@pytest.mark.parametrize("first", [[], [0.0], [1e-06], [3600.0]])
+@pytest.mark.parametrize(("duration", "rate"), [(0.2, 7500), (1.0, 1e4), (10.0, 2e4), (0.1, 1e6)])
+def test_fractions_are_seconds_whatever_the_first_value(first, duration, rate):
+    t = np.concatenate([first, in_unit(made_up(duration, rate), "s", 0, float)])
+    assert find_unit(sampled(t), "auto") == ("s", "")
+
+
+@pytest.mark.parametrize("kind", [int, np.round])
+@pytest.mark.parametrize(("duration", "rate"), [(0.2, 7500), (1.0, 1e5), (10.0, 1e5), (0.1, 1e7)])
+def test_whole_numbers_are_microseconds_with_a_point_or_without(kind, duration, rate):
+    t = in_unit(made_up(duration, rate), "us", 0, int)
+    t = t if kind is int else t.astype(float)
+    assert find_unit(sampled(t), "auto") == ("us", "")
+
+
+@pytest.mark.parametrize("kind", [int, float])
+@pytest.mark.parametrize("unit", PER_S)
+def test_dates_tell_their_unit(unit, kind):
+    t = in_unit(made_up(2.0, 1e5), unit, DATE_S, kind)
+    if unit != "s" or kind is float:  # whole seconds are not told from each other
+        assert find_unit(sampled(t), "auto")[0] == unit
+
+
+def test_nanoseconds_are_not_taken_for_a_slow_recording():
+    unit, line = find_unit(sampled(made_up(0.2, 7500)), "auto")
+    assert unit == "ns" and "read as ns; if it is another, give time_unit=" in line
+    unit, line = find_unit(sampled(made_up(2.0, 1e6)), "auto")
+    assert unit == "ns" and "times in ns give 2 s and 1e+06 events/s" in line
+    assert "in us 2e+03 s" in line and "time_unit=" in line
+
+
+def test_what_is_stated_is_obeyed_and_told_of_where_absurd():
+    t = made_up(0.2, 7500)
+    unit, line = find_unit(sampled(t), "us")
+    assert unit == "us" and "times in us give 200 s and 7.49 events/s" in line
+    assert find_unit(sampled(t), "ns") == ("ns", "")
+
+
+def test_seconds_of_a_slow_recording_have_six_digits_and_milliseconds_three():
+    t = in_unit(made_up(100.0, 15), "us", 0, int)
+    assert find_unit(sampled(t / 1e6), "auto") == ("s", "")
+    t = in_unit(made_up(2.0, 1e5), "us", 0, int)
+    unit, line = find_unit(sampled(t / 1e3), "auto")
+    assert unit == "ms" and "times in ms give 2 s" in line
+
+
+@pytest.mark.parametrize(
+    ("t", "unit"), [([50, 60], "us"), ([0.5, 0.6], "s"), ([5.0, 6.0], "us"), ([], "us")]
+)
+def test_too_few_times_go_by_their_kind(t, unit):
+    assert find_unit(sampled(np.array(t), 1), "auto") == (unit, "")
+
+
+def test_whole_numbers_never_go_through_floats():
+    t = np.array([2**61 + 1, 2**61 + 3])
+    assert to_us(t, "us").tolist() == t.tolist()
+    ns = np.array([1_600_000_000_123_456_789, -1_500, 499])
+    assert to_us(ns, "ns").tolist() == [1_600_000_000_123_457, -1, 0]
+    assert to_us(np.array([1_600_000_000_123]), "ms").tolist() == [1_600_000_000_123_000]
+    assert to_us(np.array([0.000450, 1.6e9 + 0.25]), "s").tolist() == [450, 1_600_000_000_250_000]
+
+
+@pytest.mark.parametrize(
+    ("t", "unit"), [([0, np.nan], "s"), ([np.inf], "us"), ([1e15], "s"), ([2**62], "us")]
+)
+def test_times_that_cannot_be_are_refused(t, unit):
+    with pytest.raises(ValueError, match=r"a.txt: times must be finite and within 2\^62 us"):
+        check_times(np.array(t), unit, Path("a.txt"))
+    check_times(np.array([]), unit, Path("a.txt"))

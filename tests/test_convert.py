@@ -1,0 +1,120 @@
+"""src.convert: the same events in another format, in pieces, whole or not at all."""
+
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from src import convert as entry
+from src.recordings.files.recording import open_recording, read_events
+from tests.conftest import ROOT
+from tests.recordings.files import tables
+from tests.recordings.files.test_prophesee_file import evt2
+from tests.recordings.files.test_recording import made_up
+from tests.test_recording_entry_points import config
+
+ENDINGS = [".raw", ".dat", ".aedat4", ".es", ".csv", ".npz", ".h5"]
+
+
+@pytest.fixture
+def convert(tmp_path):
+    """Return a call of the entry point's function with the overrides of a command line."""
+    return lambda *overrides: entry.convert(config("convert", tmp_path / "run", *overrides))
+
+
+@pytest.mark.parametrize("source", ENDINGS)
+def test_any_format_becomes_any_other(tmp_path, convert, capsys, source):
+    events = made_up(3000)
+    tables.write_events(tmp_path / f"in{source}", events, width=640, height=480)
+    for ending in ENDINGS:
+        out = tmp_path / f"out{ending}"
+        assert convert(f"recording={tmp_path}/in{source}", f"out={out}") == out
+        assert np.array_equal(read_events(out), events), ending
+        assert open_recording(out).size == (640, 480)
+        seconds = (events["t"][-1] - events["t"][0]) * 1e-6
+        assert (
+            capsys.readouterr().out
+            == f"3000 events, {seconds:.6f} s, 640x480, {out.stat().st_size} bytes: {out}\n"
+        )
+
+
+def test_a_part_of_a_recording(tmp_path, convert):
+    events = made_up(3000)
+    tables.write_events(tmp_path / "in.npz", events, width=640, height=480)
+    convert(f"recording={tmp_path}/in.npz", f"out={tmp_path}/a.h5", "start_s=0.1", "end_s=0.3")
+    since = events["t"] - events["t"][0]
+    expected = events[(since >= 100_000) & (since < 300_000)]
+    assert 500 < len(expected) < 2000
+    assert np.array_equal(read_events(tmp_path / "a.h5"), expected)
+
+
+def test_what_the_file_does_not_say_is_stated(tmp_path, convert):
+    events = made_up(3000)
+    content = b"% plugin_name gen3\n" + evt2(events).tobytes()
+    (tmp_path / "IN.RAW").write_bytes(content)
+    given = f"recording={tmp_path}/IN.RAW", f"out={tmp_path}/a.npz"
+    with pytest.raises(ValueError, match="format must be evt2, evt21 or evt3, got null"):
+        convert(*given)
+    convert(*given, "format=evt2")
+    assert np.array_equal(read_events(tmp_path / "a.npz"), events)
+
+
+def test_a_folder_for_evreal_and_a_version_of_evt(tmp_path, convert):
+    events = made_up(300)
+    events["t"][200:] += 20_000_000
+    given = f"recording={tmp_path}/in.dat"
+    tables.write_events(tmp_path / "in.dat", events, width=640, height=480)
+    convert(given, f"out={tmp_path}/scene", "layout=evreal")
+    assert np.array_equal(np.load(tmp_path / "scene/events_xy.npy")[:, 1], events["y"])
+    with pytest.raises(ValueError, match="EVT3 cannot hold a silence of .*use evt2"):
+        convert(given, f"out={tmp_path}/a.raw")
+    assert not list(tmp_path.glob("a*"))
+    convert(given, f"out={tmp_path}/a.raw", "version=evt2")
+    assert np.array_equal(read_events(tmp_path / "a.raw"), events)
+
+
+def test_the_input_is_never_written_over(tmp_path, convert):
+    for name in ("a.csv", "b.partial.csv"):
+        tables.write_events(tmp_path / name, made_up(30), width=640, height=480)
+    (tmp_path / "link.csv").symlink_to(tmp_path / "a.csv")
+    before = (tmp_path / "a.csv").read_bytes()
+    for source, out in (("a.csv", "a.csv"), ("a.csv", "link.csv"), ("b.partial.csv", "b.csv")):
+        with pytest.raises(ValueError, match="out must be another file than recording"):
+            convert(f"recording={tmp_path}/{source}", f"out={tmp_path}/{out}")
+    assert (tmp_path / "a.csv").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["out=a.mp4"], "cannot write .mp4"),
+        (["out=a.h5", "start_s=2", "end_s=1"], "start_s must be >= 0 and before end_s, got 2, 1"),
+        (["out=a.h5", "layout=x"], "layout must be null, dsec or evreal, got x"),
+        (["out=a.h5", "sensor_size=[9,9]"], "sensor_size must be"),
+    ],
+)
+def test_what_cannot_be_is_named(tmp_path, convert, monkeypatch, overrides, words):
+    monkeypatch.chdir(tmp_path)
+    tables.write_events(tmp_path / "in.csv", made_up(30), width=640, height=480)
+    with pytest.raises(ValueError, match=words):
+        convert("recording=in.csv", *overrides)
+    assert not (tmp_path / "a.h5").exists()
+
+
+def test_the_command_ends_with_one_line(tmp_path):
+    tables.write_events(tmp_path / "in.csv", made_up(30), width=640, height=480)
+    command = [sys.executable, "-m", "src.convert", f"recording={tmp_path}/in.csv"]
+    command += [f"out={tmp_path}/a.npz", f"paths.out={tmp_path}/out"]
+    said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert re.fullmatch(
+        r"30 events, 0\.0\d+ s, 640x480, \d+ bytes: .*a\.npz", said.splitlines()[-1]
+    )
+
+
+def test_a_part_without_events_is_refused_and_leaves_no_file(tmp_path, convert):
+    tables.write_events(tmp_path / "in.raw", made_up(3000), width=640, height=480)
+    with pytest.raises(ValueError, match="recording must have events from 99"):
+        convert(f"recording={tmp_path}/in.raw", f"out={tmp_path}/out.npz", "start_s=99")
+    assert [file.name for file in tmp_path.glob("out*")] == []

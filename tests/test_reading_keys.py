@@ -1,0 +1,77 @@
+"""The keys of how a file is read reach the reader from every entry point that reads events."""
+
+import numpy as np
+import pytest
+
+from src.app import calibrations
+from src.calibrate import calibrate
+from src.convert import convert
+from src.live import build_server
+from src.reconstruct import reconstruct
+from src.recordings.files import ReadOptions, open_recording, read_events
+from tests.recordings.files.test_reported_times import quiet_read, scene, text
+from tests.test_recording_entry_points import config
+
+DOORS = {
+    "reconstruct": (reconstruct, ["baseline=highpass", "resolution=[24,32]"]),
+    "live": (build_server, ["baseline=highpass", "offered_networks=[]"]),
+    "calibrate": (calibrate, ["task=views"]),
+    "convert": (convert, ["out=/nowhere/a.npz"]),
+}
+
+
+@pytest.fixture
+def joined(tmp_path):
+    """A file of two recordings, of 0.2 s and of 0.1 s."""
+    whole = scene()
+    return text(tmp_path / "a.txt", np.concatenate([whole, whole[whole["t"] < 100_000]]))
+
+
+@pytest.mark.parametrize("door", DOORS)
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("time_unit=min", "time_unit must be auto, s, ms, us or ns, got min"),
+        ("columns=xyp", "columns must have t, x, y and p once each, got xyp"),
+        ("format=evt9", "format must be null, evt2, evt21, evt3, got evt9"),
+        ("stream=[0]", "stream must be a number or a name"),
+        ("part=2", r"part must be in 0\.\.1, the parts of .*a.txt, got 2"),
+        ("part=x", "part must be a whole number, got x"),
+    ],
+)
+def test_a_wrong_value_is_refused(joined, tmp_path, door, given, words):
+    work, more = DOORS[door]
+    with pytest.raises(ValueError, match=words):
+        work(config(door, tmp_path / "run", f"recording={joined}", *more, given))
+
+
+@pytest.mark.parametrize(("part", "frames"), [(0, 23), (1, 11)])
+def test_the_part_that_is_chosen_is_reconstructed(joined, tmp_path, part, frames):
+    given = [f"recording={joined}", "baseline=highpass", "output_format=hdf5", f"part={part}"]
+    run = reconstruct(config("reconstruct", tmp_path / "run", *given))
+    assert len((run / "frames.csv").read_text().splitlines()) == 1 + frames
+
+
+def test_a_picture_of_the_sensor_and_a_conversion_are_of_the_part_that_is_chosen(joined, tmp_path):
+    options = ReadOptions(part=1)
+    assert calibrations.sources.read_sensor_picture(joined, None, options).sum() == len(
+        part := quiet_read(joined, part=1)
+    )
+    out = tmp_path / "b.npz"
+    convert(config("convert", tmp_path / "run", f"recording={joined}", f"out={out}", "part=1"))
+    assert np.array_equal(read_events(out), part)
+
+
+def test_what_is_odd_is_on_the_live_page(joined, tmp_path):
+    given = [f"recording={joined}", *DOORS["live"][1]]
+    with pytest.warns(UserWarning, match="clock restarts"):
+        server = build_server(config("live", tmp_path / "run", *given))
+    (line,) = server.page.player.reader.faults.current()
+    assert "its clock restarts, read is part=0 of 2 (0: 1500 events" in line
+
+
+def test_a_recording_of_nothing_says_so(tmp_path):
+    path = text(tmp_path / "a.txt", scene()[:0])
+    assert list(open_recording(path)) == []
+    with pytest.raises(ValueError, match=r"a.txt: holds no events"):
+        reconstruct(config("reconstruct", tmp_path, f"recording={path}", "baseline=highpass"))

@@ -1,0 +1,114 @@
+"""A training that goes on: rate, schedule and optimiser are the config's; fitting state is kept."""
+
+import math
+from functools import partial
+
+import pytest
+import torch
+from torch import nn
+from torch.optim import SGD, Adam, AdamW
+from torch.optim.lr_scheduler import CosineAnnealingLR
+
+from src.train import train
+from src.training.going_on import check_steps, follow_config
+from tests.test_train import TINY, config
+
+STEPS = 4
+
+
+def network() -> nn.Linear:
+    return nn.Linear(2, 1)
+
+
+def checkpoint(make_optimizer, t_max: int = 4) -> dict:
+    """The part of a checkpoint that an optimiser and its schedule leave after STEPS steps."""
+    net = network()
+    optimizer = make_optimizer(net.parameters())
+    scheduler = CosineAnnealingLR(optimizer, t_max)
+    for _ in range(STEPS):
+        net(torch.ones(1, 2)).sum().backward()
+        optimizer.step()
+        scheduler.step()
+    states = {"optimizer_states": [optimizer.state_dict()]}
+    return states | {"lr_schedulers": [scheduler.state_dict()], "global_step": STEPS}
+
+
+def cosine(rate: float, step: int, t_max: int) -> float:
+    return rate * (1 + math.cos(math.pi * step / t_max)) / 2
+
+
+@pytest.mark.parametrize("change", [{}, {"weight_decay": 0.01}, {"betas": (0.8, 0.9)}])
+def test_numbers_and_schedule_are_the_configs_and_moments_stay(change):
+    saved = checkpoint(partial(Adam, lr=1e-3))
+    moments = saved["optimizer_states"][0]["state"][0]["exp_avg"].clone()
+    kept = follow_config(
+        saved,
+        network().parameters,
+        partial(Adam, lr=0.1, **change),
+        partial(CosineAnnealingLR, T_max=8),
+    )
+    (group,) = saved["optimizer_states"][0]["param_groups"]
+    assert (
+        kept and group["lr"] == pytest.approx(cosine(0.1, STEPS, 8)) and group["initial_lr"] == 0.1
+    )
+    assert {name: group[name] for name in change} == change
+    assert torch.equal(saved["optimizer_states"][0]["state"][0]["exp_avg"], moments)
+    (schedule,) = saved["lr_schedulers"]
+    assert (schedule["T_max"], schedule["last_epoch"]) == (8, STEPS)
+
+
+@pytest.mark.parametrize(
+    ("other", "kept"),
+    [
+        (partial(SGD, lr=0.1), False),
+        (partial(SGD, lr=0.1, momentum=0.9), False),
+        (partial(Adam, lr=0.1, amsgrad=True), False),
+        (partial(AdamW, lr=0.1), True),
+    ],
+)
+def test_the_state_of_another_optimiser_is_dropped_and_said(other, kept):
+    saved = checkpoint(partial(Adam, lr=1e-3))
+    net = network()
+    if kept:
+        assert follow_config(saved, net.parameters, other, None)
+    else:
+        with pytest.warns(UserWarning, match="ckpt holds the state of another optimiser"):
+            assert not follow_config(saved, net.parameters, other, None)
+    optimizer = other(net.parameters())
+    optimizer.load_state_dict(saved["optimizer_states"][0])
+    assert bool(optimizer.state) == kept and saved["lr_schedulers"] == []
+    net(torch.ones(1, 2)).sum().backward()
+    optimizer.step()
+    assert optimizer.param_groups[0]["lr"] == 0.1
+
+
+def rates(folder) -> tuple[float, list[int]]:
+    found = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    schedules = [schedule["T_max"] for schedule in found["lr_schedulers"]]
+    return found["optimizer_states"][0]["param_groups"][0]["lr"], schedules
+
+
+HOURS = ["scheduler=null", "train_hours=1000"]
+GOING_ON = [
+    ([], ["scheduler.T_max=8", "optimizer.lr=0.1"], cosine(0.1, 3, 8), [8]),
+    (HOURS, [*HOURS, "optimizer.lr=0.1"], 0.1, []),
+    ([], [*HOURS, "optimizer.lr=0.1"], 0.1, []),
+]
+
+
+@pytest.mark.parametrize(("before", "after", "rate", "schedules"), GOING_ON)
+def test_a_run_that_goes_on_obeys_its_config(before, after, rate, schedules, tmp_path):
+    train(config("train", tmp_path / "a", *TINY, *before, "trainer.max_steps=2"))
+    ckpt = f"ckpt={tmp_path / 'a'}"
+    train(config("train", tmp_path / "b", *TINY, *after, "trainer.max_steps=3", ckpt))
+    found = rates(tmp_path / "b")
+    assert found[0] == pytest.approx(rate, rel=1e-4) and found[1] == schedules
+
+
+def test_fewer_steps_than_were_taken_are_refused():
+    for allowed in (-1, STEPS, STEPS + 1):
+        check_steps(allowed, STEPS)
+    with pytest.raises(
+        ValueError, match="trainer.max_steps must be >= 4, the steps of ckpt, got 2"
+    ):
+        check_steps(2, STEPS)
