@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -18,10 +18,14 @@ from src.models.setnet import (
     CELL_PX,
     CONTEXT_INTERVAL_S,
     CONTEXT_TAU_S,
+    MIN_ACTIVITY,
+    MIN_SUPPORT,
     MOVING_SHARE,
+    REACH_CELLS,
     REFERENCE_HZ,
     REVEALING_EVENTS,
     REVEALING_S,
+    SETTLING,
     STATIC_SHARE,
     SUM_TAUS_S,
     TRACE_TAU_S,
@@ -29,6 +33,10 @@ from src.models.setnet import (
     SetNet,
 )
 from src.sim.optics import Position
+
+
+# Weights of REACH_CELLS averages of three cells, one after the other.
+SMOOTHING = np.float32(reduce(np.convolve, [np.full(3, 1 / 3)] * REACH_CELLS))
 
 
 class EventPixels(NamedTuple):
@@ -119,22 +127,24 @@ class SetNetClock:
         kept, trace_kept = (
             exp_float32(-window_s / np.float32(tau)) for tau in (ACTIVITY_TAU_S, TRACE_TAU_S)
         )
-        clock.find_supported(places, voxels, trace_kept, self.counts, now.trace, self.supported)
-        clock.add_evidence(self.supported, now.evidence)
-        clock.widen(self.supported, self.is_near, self.near_tiles)
+        events = places, voxels, trace_kept, np.float32(MIN_SUPPORT)
+        clock.find_supported(*events, self.counts, now.trace, self.supported)
+        clock.add_evidence(self.supported, SMOOTHING, now.evidence)
+        clock.widen(self.supported, REACH_CELLS, self.is_near, self.near_tiles)
+        fading = kept, np.float32(ACTIVITY_TAU_S), np.float32(MIN_ACTIVITY)
         tiles = self.is_near, self.near_tiles, now.active_tiles
         cells = now.activity, now.elapsed_s, now.is_pending
-        longest_s = clock.advance(window_s, kept, *tiles, *cells, now.pending_tiles, changed)
+        longest_s = clock.advance(window_s, *fading, *tiles, *cells, now.pending_tiles, changed)
         share = np.float32(np.count_nonzero(now.activity)) / np.float32(now.activity.size)
         pace = (share - np.float32(STATIC_SHARE)) / np.float32(MOVING_SHARE - STATIC_SHARE)
         if pace <= 0:
             return np.float32(longest_s)
-        moving_s = min(pace, np.float32(1)) * window_s
+        moving_s = min(pace, np.float32(1)) * np.float32(longest_s)
         gained = np.float32(REVEALING_EVENTS / REVEALING_S)
         clock.advance_all(moving_s, gained, now.elapsed_s, now.evidence, now.is_pending)
         for part in (now.active_tiles, now.pending_tiles, changed):
             part[:] = 1
-        return max(np.float32(longest_s), moving_s)
+        return np.float32(longest_s)
 
     def _advance_context(
         self, longest_s: np.float32, now: ClockState, changed: np.ndarray
@@ -146,7 +156,8 @@ class SetNetClock:
         now.update_recency *= kept
         clock.fade(kept, now.recency.reshape(-1))
         tiles = now.pending_tiles, now.settling_tiles
-        smoothed = clock.find_smoothed(now.recency, now.is_pending, *tiles, changed)
+        given = now.recency, np.float32(SETTLING), now.is_pending
+        smoothed = clock.find_smoothed(*given, *tiles, changed)
         is_due = now.update_recency <= np.float32(UPDATE_RECENCY)
         return smoothed, self._start_update(now) if is_due else None
 

@@ -21,12 +21,13 @@ from src.deploy.setnet_clock import (
 from src.deploy.setnet_context import CONTEXT_TILE, ContextTiles, WholeContext
 from src.deploy.setnet_layers import DecoderLayers, MemoryLayers, WholeDecoder
 from src.deploy.tile_batches import Backend, TileModule
-from src.models.setnet import BACKGROUND, CELL_PX, SetNet
+from src.models.setnet import BACKGROUND, CELL_PX, REVEALING_EVENTS, SetNet
 from src.sim.optics import Position
 
 BATCHES = 8, 32  # sizes of batches, in tiles
 # Share of the frame in tiles from which on all of it is computed at once, which takes no longer.
 WHOLE_MEMORY, WHOLE_CONTEXT, WHOLE_DECODER = 0.45, 0.35, 0.5
+BLEND = np.float32(REVEALING_EVENTS), np.float32(BACKGROUND)  # of pixels, as SetNet does
 
 
 class TileState:
@@ -137,7 +138,8 @@ class SetNetTiles:
             tiles_numba.gather_sum(state.hidden, state.smoothed, corners, inputs[0])
 
         def write(part: slice, pixels: np.ndarray) -> None:
-            tiles_numba.write_pixels(pixels, QUARTER * tiles[part], evidence, state.frame)
+            corners = QUARTER * tiles[part]
+            tiles_numba.write_pixels(pixels, corners, evidence, *BLEND, state.frame)
 
         self.decoder.run(len(tiles), read, write)
 
@@ -183,7 +185,8 @@ class WholeFrame:
     def draw(self, maps: TileState, evidence: np.ndarray) -> None:
         """Draw the frame."""
         self.decoder.run([maps.hidden[None], maps.smoothed[None]], [self.pixels])
-        tiles_numba.write_pixels(self.pixels, np.zeros((1, 2), np.int32), evidence, maps.frame)
+        corner = np.zeros((1, 2), np.int32)
+        tiles_numba.write_pixels(self.pixels, corner, evidence, *BLEND, maps.frame)
 
 
 def _zeros(size: tuple[int, int, int]) -> Float[np.ndarray, "h w c"]:

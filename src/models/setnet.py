@@ -35,8 +35,10 @@ divided by k.  Right column: fields of SetNetState.
 * Leaky sums: the polarities of a pixel sum to its change of log intensity, in thresholds; the leak
   bounds the accumulated error.
 * Any window length: all state decays exponentially in time, not per window, and voxel counts become
-  rates.  While a clip has no events in any view, its clock advances by at most 5 ms in all; then
-  state and frame are held.
+  rates.
+* A clock for each cell: it runs near events that others support, and by at most 4 ms in all after
+  the last; then the cell's state is held.  Where much of the picture is active the camera moves,
+  and all clocks run.  What no event has revealed yet is BACKGROUND.
 * Context: events lie at edges, so the brightness of a uniform area follows from edges that may be
   far; the pyramid provides the receptive field.  The context is updated at most 30 times a second
   and low-pass filtered, so that the frame does not change in steps.
@@ -131,18 +133,19 @@ def advance_activity(
 ) -> tuple[Float[Tensor, "n 1 h2 w2"], Float[Tensor, "n 1 h2 w2"]]:
     """Return by how many seconds the clock of each cell advances in a window, and its activity.
 
-    Near events it advances by `window_s` and activity is 1; elsewhere activity decays, to 0 below
-    MIN_ACTIVITY, and the clock advances by its integral over the window.
+    Near events it advances by `window_s` and activity is 1; elsewhere activity decays until it is
+    MIN_ACTIVITY, then is 0, and the clock advances by its integral, however windows are cut.
     """
-    kept = torch.exp(-window_s / ACTIVITY_TAU_S)
-    elapsed_s = torch.where(is_near_events, window_s, activity * ACTIVITY_TAU_S * (1 - kept))
-    activity = torch.where(is_near_events, 1.0, activity * kept)
-    return elapsed_s, torch.where(activity < MIN_ACTIVITY, 0.0, activity)
+    remaining = activity * torch.exp(-window_s / ACTIVITY_TAU_S)
+    fading_s = ACTIVITY_TAU_S * (activity - remaining.clamp(min=MIN_ACTIVITY)).clamp(min=0)
+    remaining = torch.where(remaining < MIN_ACTIVITY, 0.0, remaining)
+    elapsed_s = torch.where(is_near_events, window_s, fading_s)
+    return elapsed_s, torch.where(is_near_events, 1.0, remaining)
 
 
-def pace_of_inactive_cells(activity: Float[Tensor, "n 1 h2 w2"]) -> Float[Tensor, "n 1 1 1"]:
-    """Return by what share of a window the clock of cells without activity advances: 0 up to
-    STATIC_SHARE of active cells, 1 from MOVING_SHARE on."""
+def pace_of_all_cells(activity: Float[Tensor, "n 1 h2 w2"]) -> Float[Tensor, "n 1 1 1"]:
+    """Return the speed of all clocks relative to that of the most active cell: 0 up to STATIC_SHARE
+    of active cells, 1 from MOVING_SHARE on."""
     share = (activity > 0).sum((2, 3), keepdim=True).float() / activity[0].numel()
     return ((share - STATIC_SHARE) / (MOVING_SHARE - STATIC_SHARE)).clamp(0, 1)
 
@@ -303,10 +306,10 @@ class SetNet(EventToVideoNetwork):
         n = len(activity)
         for is_near, more in zip(near.split(n), gain.split(n), strict=True):
             elapsed_s, activity = advance_activity(is_near, seconds, activity)
-            moving_s = pace_of_inactive_cells(activity) * seconds
+            longest_s = elapsed_s.amax((2, 3), keepdim=True)
+            moving_s = pace_of_all_cells(activity) * longest_s
             elapsed_s = torch.maximum(elapsed_s, moving_s)
             evidence = evidence + more + REVEALING_EVENTS / REVEALING_S * moving_s
-            longest_s = elapsed_s.amax((2, 3), keepdim=True)
             kept_recency = torch.exp(-longest_s / CONTEXT_INTERVAL_S)
             recency, cell_recency = recency * kept_recency, cell_recency * kept_recency
             pending = torch.maximum(pending, (elapsed_s > 0).float())
@@ -589,10 +592,6 @@ def scan_windows(
 def smooth_context(smoothed: Tensor, context: Tensor, elapsed_s: Tensor) -> Tensor:
     """Return `smoothed` after a first-order low-pass step of `elapsed_s` toward `context`."""
     return torch.lerp(context, smoothed, torch.exp(-elapsed_s / CONTEXT_TAU_S))
-
-
-def _leaky_sum(sums: Tensor, decay: Tensor, new: Tensor) -> Tensor:
-    return decay * sums + new
 
 
 def _hold(before: Tensor, new: Tensor, is_updated: Tensor) -> Tensor:

@@ -3,7 +3,9 @@
 import pytest
 import torch
 from torch import nn
+from torch._subclasses.fake_tensor import FakeTensorMode
 
+from src.models import setnet
 from src.models.network import unroll
 from src.models.setnet import SetNet
 from src.training import cuda_graphs
@@ -61,6 +63,18 @@ def test_there_are_no_more_graphs_than_asked_for(monkeypatch):
     for shown in ([0], [1], [0], [1]):
         ours(*batch(), None, shown)
     assert len(ours.graphs) == 1
+
+
+def test_no_shape_and_no_branch_of_a_setnet_depends_on_events(monkeypatch):
+    """Else no graph can be made: what is traced has no values."""
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)  # as on a GPU
+    with FakeTensorMode():
+        network = SetNet.preset("medium")
+        voxels, window_s = torch.zeros(2, 6, 9, 5, 64, 64), torch.full((2,), 1 / 120)
+        frames, _ = unroll(network, voxels, window_s=window_s, output_windows=[1, 4])
+        frames.sum().backward()
+        assert frames.shape == (2, 2, 1, 64, 64)
+    setnet._to_device.cache_clear()  # of tensors without values
 
 
 @pytest.mark.gpu

@@ -2,24 +2,19 @@
 
 Maps are (rows, columns) of cells.  Whatever is dense in here is a pass or two over one map of
 bytes or floats; all else follows the events and the tiles, of TILE x TILE cells, that they reach.
+Thresholds and times are arguments: a compiled function that is kept on disk keeps its constants.
 """
 
 import numpy as np
 from numba import njit
 
-from src.models.setnet import ACTIVITY_TAU_S, CELL_PX, MIN_ACTIVITY, MIN_SUPPORT, REACH_CELLS
-from src.models.setnet import SETTLING as _SETTLING
+from src.models.setnet import CELL_PX as SIDE
 
 f32, u8 = np.float32, np.uint8
 
 TILE = 16  # side of a tile, in cells
 QUARTER = TILE // 2  # the same in cells of the context
-TAU_S, FLOOR, SUPPORT, SETTLING = map(f32, (ACTIVITY_TAU_S, MIN_ACTIVITY, MIN_SUPPORT, _SETTLING))
 TINY = f32(2.0**-126)  # what is smaller takes a processor a hundred times longer
-SIDE, REACH = CELL_PX, REACH_CELLS
-SMOOTHING = np.ones(1, np.float32)  # weights of REACH averages of three cells, one after the other
-for _ in range(REACH):
-    SMOOTHING = np.convolve(SMOOTHING, np.full(3, 1 / 3, np.float32)).astype(np.float32)
 
 
 @njit(nogil=True, cache=True)
@@ -61,10 +56,10 @@ def fade(kept, values):
 
 
 @njit(nogil=True, cache=True)
-def find_supported(places, grid, kept, counts, trace, supported):
+def find_supported(places, grid, kept, least, counts, trace, supported):
     """Bring `trace` (views, rows, columns) to the end of the window, and write into `supported`
-    (rows, columns), zeros, how many events of a cell have support, in the view that has most.
-    `counts`: zeros, as `trace`.
+    (rows, columns), zeros, how many events of a cell have support, more than `least`, in the view
+    that has most.  `counts`: zeros, as `trace`.
     """
     views, rows, columns = trace.shape
     fade(kept, trace.reshape(-1))
@@ -87,30 +82,32 @@ def find_supported(places, grid, kept, counts, trace, supported):
             if has[v, r + 1]:
                 above = trace[v, r - 1] if r else nothing
                 below = trace[v, r + 1] if r + 1 < rows else nothing
-                _find_supported_in_row(above, trace[v, r], below, counts[v, r], line, supported[r])
+                rows_used = above, trace[v, r], below
+                _find_supported_in_row(rows_used, least, counts[v, r], line, supported[r])
 
 
 @njit(nogil=True, cache=True)
-def _find_supported_in_row(above, here, below, count, total, supported):
+def _find_supported_in_row(rows, least, count, total, supported):
     # In the order, and rounded, as an average pooling of 3 x 3 adds them up.
+    here = rows[1]
     n = np.uint64(here.size)
     total[:] = 0
-    for row in (above, here, below):
+    for row in rows:
         for k in range(np.uint64(3)):
             for c in range(n):
                 total[c + np.uint64(2) - k] += row[c]
     for c in range(n):
         others = f32(9) * (total[c + np.uint64(1)] / f32(9)) - here[c]
-        found = count[c] if others > SUPPORT else f32(0)
+        found = count[c] if others > least else f32(0)
         supported[c] = max(supported[c], found)
         count[c] = 0
 
 
 @njit(nogil=True, cache=True)
-def add_evidence(supported, evidence):
-    """Add `supported` (rows, columns), smoothed over REACH on each side, to `evidence`."""
-    rows, columns = supported.shape
-    line, n = np.zeros(columns + 2 * REACH, f32), np.uint64(columns)
+def add_evidence(supported, weights, evidence):
+    """Add `supported` (rows, columns), smoothed by `weights` along both sides, to `evidence`."""
+    (rows, columns), reach = supported.shape, weights.size // 2
+    line, n = np.zeros(columns + 2 * reach, f32), np.uint64(columns)
     smoothed = np.zeros(columns, f32)
     for r in range(rows):
         first, last = columns, -1
@@ -119,61 +116,61 @@ def add_evidence(supported, evidence):
                 first, last = min(first, c), c
         if last < 0:
             continue
-        line[REACH : REACH + columns] = supported[r]
+        line[reach : reach + columns] = supported[r]
         smoothed[:] = 0
-        for k in range(np.uint64(2 * REACH + 1)):
+        for k in range(np.uint64(2 * reach + 1)):
             for c in range(n):
-                smoothed[c] += SMOOTHING[k] * line[c + k]
-        begin, end = np.uint64(max(first - REACH, 0)), np.uint64(min(last + REACH + 1, columns))
-        for k in range(-REACH, REACH + 1):
+                smoothed[c] += weights[k] * line[c + k]
+        begin, end = np.uint64(max(first - reach, 0)), np.uint64(min(last + reach + 1, columns))
+        for k in range(-reach, reach + 1):
             if 0 <= r + k < rows:
-                row, weight = evidence[r + k], SMOOTHING[k + REACH]
+                row, weight = evidence[r + k], weights[k + reach]
                 for c in range(end - begin):
                     row[begin + c] += weight * smoothed[begin + c]
 
 
 @njit(nogil=True, cache=True)
-def widen(supported, is_near, near_tiles):
-    """Set `is_near` within REACH of what is `supported` in each direction, and `near_tiles` that
+def widen(supported, reach, is_near, near_tiles):
+    """Set `is_near` within `reach` of what is `supported` in each direction, and `near_tiles` that
     have any; clear `supported`."""
     rows, columns = is_near.shape
-    has = np.zeros(rows + 2 * REACH, u8)
+    has = np.zeros(rows + 2 * reach, u8)
     for r in range(rows):
         most = f32(0)
         for c in range(np.uint64(columns)):
             most = max(most, supported[r, c])
-        has[r + REACH] = most > 0
-    line = np.zeros(columns + 2 * REACH, u8)
+        has[r + reach] = most > 0
+    line = np.zeros(columns + 2 * reach, u8)
     for r in range(rows):
         is_near[r] = 0
-        if not has[r : r + 2 * REACH + 1].any():
+        if not has[r : r + 2 * reach + 1].any():
             continue
         line[:] = 0
-        for k in range(-REACH, REACH + 1):
-            if has[r + REACH + k]:
+        for k in range(-reach, reach + 1):
+            if has[r + reach + k]:
                 for c in range(np.uint64(columns)):
-                    line[c + np.uint64(REACH)] |= u8(supported[r + k, c] > 0)
+                    line[c + np.uint64(reach)] |= u8(supported[r + k, c] > 0)
         near = is_near[r]
-        for k in range(np.uint64(2 * REACH + 1)):
+        for k in range(np.uint64(2 * reach + 1)):
             for c in range(np.uint64(columns)):
                 near[c] |= line[c + k]
         for j in range(near_tiles.shape[1]):
             for c in range(j * TILE, min((j + 1) * TILE, columns)):
                 near_tiles[r // TILE, j] |= near[c]
     for r in range(rows):
-        if has[r + REACH]:
+        if has[r + reach]:
             supported[r] = 0
 
 
 @njit(nogil=True, cache=True)
-def advance(window_s, kept, is_near, near_tiles, active_tiles, activity, elapsed_s, is_pending,
-            pending_tiles, changed):  # fmt: skip
+def advance(window_s, kept, tau_s, floor, is_near, near_tiles, active_tiles, activity, elapsed_s,
+            is_pending, pending_tiles, changed):  # fmt: skip
     """Advance the clock of every cell; return by how much at most, in seconds.
 
     `active_tiles`: before and after, which tiles have a cell whose clock advances; `changed`: the
     tiles within the decoder's reach of one.
     """
-    longest, rest = f32(0), f32(1) - kept
+    longest = f32(0)
     columns_used = np.empty(TILE, f32)
     for i, j in np.ndindex(active_tiles.shape):
         if not (near_tiles[i, j] or active_tiles[i, j]):
@@ -189,10 +186,11 @@ def advance(window_s, kept, is_near, near_tiles, active_tiles, activity, elapsed
             most = f32(0)
             for c in range(width):
                 before = active[c]
-                fading = before * kept
-                fading = fading if fading >= FLOOR else f32(0)
-                passed = window_s if near[c] else before * TAU_S * rest
-                active[c] = f32(1) if near[c] else fading
+                remaining = before * kept
+                faded = tau_s * max(before - max(remaining, floor), f32(0))
+                passed = window_s if near[c] else faded
+                remaining = remaining if remaining >= floor else f32(0)
+                active[c] = f32(1) if near[c] else remaining
                 elapsed[c] = passed
                 pending[c] = u8(1) if passed > 0 else pending[c]
                 columns_used[c] = max(columns_used[c], passed)
@@ -227,9 +225,10 @@ def mark_reached(top, bottom, left, right, changed):
 
 
 @njit(nogil=True, cache=True)
-def find_smoothed(recency, is_pending, pending_tiles, settling_tiles, changed):
+def find_smoothed(recency, settling, is_pending, pending_tiles, settling_tiles, changed):
     """Return the tiles (n, 2), and in each the cells (n, QUARTER, QUARTER), in which the smoothed
-    context advances; mark what they change.  `settling_tiles`: where any did without an update.
+    context advances: pending ones, and those with a `recency` above `settling`; mark what they
+    change.  `settling_tiles`: where any did without an update.
     """
     most = np.count_nonzero(pending_tiles | settling_tiles)
     tiles = np.empty((most, 2), np.int32)
@@ -242,7 +241,7 @@ def find_smoothed(recency, is_pending, pending_tiles, settling_tiles, changed):
         for r in range(min(QUARTER, len(recency) - i * QUARTER)):
             for c in range(min(QUARTER, recency.shape[1] - j * QUARTER)):
                 row, column = i * QUARTER + r, j * QUARTER + c
-                is_settling = recency[row, column] > SETTLING
+                is_settling = recency[row, column] > settling
                 if is_settling:
                     settling_tiles[i, j] = 1
                 if is_settling or _has_pending(is_pending, row, column):

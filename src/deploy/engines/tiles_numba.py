@@ -7,12 +7,9 @@ and column of each tile in the map, its halo included, which may lie outside.
 import numpy as np
 from numba import njit
 
-from src.models.setnet import BACKGROUND as _BACKGROUND
-from src.models.setnet import CELL_PX, REVEALING_EVENTS
+from src.models.setnet import CELL_PX as CELL
 
 f32 = np.float32
-
-CELL, BACKGROUND, HALF = CELL_PX, f32(_BACKGROUND), f32(REVEALING_EVENTS)
 
 
 @njit(nogil=True, cache=True)
@@ -132,9 +129,10 @@ def smooth(context, corners, cells, kept, smoothed):
 
 
 @njit(nogil=True, cache=True)
-def write_pixels(tiles, corners, evidence, frame):
+def write_pixels(tiles, corners, evidence, half, background, frame):
     """Write tiles (n, t, t, pixels) of the pixels of 2 x 2 cells, row by row, into `frame`, more of
-    them and less of the background the more `evidence` a cell has; `corners`: in 2 x 2 cells."""
+    them and less of the `background` the more `evidence` a cell has, `half` for half of each;
+    `corners`: in 2 x 2 cells."""
     side = 2 * CELL
     squares_down, squares_across = len(frame) // side, frame.shape[1] // side
     across, of, n = tiles.shape[2], tiles.reshape(-1), np.uint64(CELL)
@@ -147,9 +145,9 @@ def write_pixels(tiles, corners, evidence, frame):
                 at = np.uint64(((i * tiles.shape[1] + k) * across * side + a) * side)
                 for _ in range(min(across, squares_across - c0)):
                     for _ in range(2):
-                        revealed = known[cell] / (known[cell] + HALF)
+                        revealed = known[cell] / (known[cell] + half)
                         for b in range(n):
-                            row[to + b] = BACKGROUND + revealed * (of[at + b] - BACKGROUND)
+                            row[to + b] = background + revealed * (of[at + b] - background)
                         cell += np.uint64(1)
                         to += n
                         at += n
