@@ -73,6 +73,15 @@ def held(
     return torch.cat(maps), torch.cat(truth)
 
 
+def new_context(
+    network: SetNet, maps: Float[Tensor, "m c h2 w2"]
+) -> Float[Tensor, "m c h4 w4"]:
+    """Return the context of the maps, each a clip of its own, updated everywhere."""
+    sizes = network.context.map_sizes(*maps.shape[2:])
+    nothing = tuple(maps.new_zeros(len(maps), *size) for size in sizes)
+    return network.context(maps, nothing, torch.ones_like(maps[:, :1]) > 0)[0]
+
+
 def learn(network: SetNet, maps: Tensor, truth: Tensor, steps: int) -> list[float]:
     """Train what follows the memory on what `held` returns; return the error of every step."""
     follows = [part for name, part in network.named_children() if name not in (*REMEMBERS, "relu")]
@@ -84,7 +93,7 @@ def learn(network: SetNet, maps: Tensor, truth: Tensor, steps: int) -> list[floa
         some = torch.randint(len(maps), (PICTURES,))
         seen = maps[some].float()
         with rounded():
-            cells = network.decode_logits(seen, network.context(seen))
+            cells = network.decode_logits(seen, new_context(network, seen))
         frames = functional.pixel_shuffle(cells, CELL_PX).sigmoid()
         error = (frames - truth[some]).abs().mean()
         optimizer.zero_grad()

@@ -68,6 +68,7 @@ def test_there_are_no_more_graphs_than_asked_for(monkeypatch):
 def test_no_shape_and_no_branch_of_a_setnet_depends_on_events(monkeypatch):
     """Else no graph can be made: what is traced has no values."""
     monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)  # as on a GPU
+    setnet._to_device.cache_clear()  # of tensors with values
     with FakeTensorMode():
         network = SetNet.preset("medium")
         voxels, window_s = torch.zeros(2, 6, 9, 5, 64, 64), torch.full((2,), 1 / 120)
