@@ -190,7 +190,8 @@ class EventMaps:
     ):  # fmt: skip
         self.pool = ThreadPoolExecutor(1) if threads > 1 else None
         kernel, _, bias = network.stem_kernels_and_bias(tuple(positions))
-        self.bias, kernels, views = bias.numpy(), kernel.numpy(), len(positions)
+        kernels, views = kernel.numpy(), len(positions)
+        self.bias_row = np.tile(bias.numpy(), TILE)
         self.patches = event_patches(kernels, views, CELL_PX)
         self.spans = [patch_spans(side, CELL_PX, kernels.shape[-1]) for side in padded]
         self.code = np.repeat(mixture_code, len(SUM_TAUS_S), 1)
@@ -198,7 +199,7 @@ class EventMaps:
         rows, columns = (side // CELL_PX for side in padded)
         self.size = views, rows, columns, self.code.shape[1] + len(SUM_TAUS_S)
         # What lies outside of active tiles is used nowhere.
-        self.voxel_map = np.zeros((rows, columns, len(self.bias)), np.float32)
+        self.voxel_map = np.zeros((rows, columns, len(bias)), np.float32)
         self.new = np.zeros((rows, views, columns), np.float32)  # zero between two windows
 
     def add(self, pixels: EventPixels, clocks: ClockState, state: SumState) -> None:
@@ -211,7 +212,7 @@ class EventMaps:
     def _make_voxel_map(self, pixels: EventPixels, clocks: ClockState) -> None:
         places, voxels, window_s = pixels
         weight = np.float32(1 / (REFERENCE_HZ * float(window_s)))  # as SetNet counts them
-        sums_numba.fill_tiles(clocks.active_tiles, self.bias, self.voxel_map)
+        sums_numba.fill_tiles(clocks.active_tiles, self.bias_row, self.voxel_map)
         patch = clocks.elapsed_s, *self.spans, self.patches, self.voxel_map
         sums_numba.add_patches(places, voxels, weight, *patch)
 

@@ -43,14 +43,28 @@ class WholeContext(nn.Module):
         *held: Float[Tensor, "1 _h _w _c"],
     ) -> tuple[Tensor, ...]:
         """Return the context and the held maps after the update."""
-        features = channels_first(hidden.to(self.dtype))
-        mask = channels_first(is_updated)
-        cells = functional.interpolate(mask, scale_factor=2, mode="nearest")
-        new, scales = self.pyramid(features, tuple(map(channels_first, held)), cells > 0)
-        before = channels_first(context)
-        average = self.pyramid.moving_average(before, new.float(), channels_first(recency))
-        context = torch.where(mask > 0, average, before)
-        return channels_last(context), *map(channels_last, scales)
+        pyramid, remaining, after = self.pyramid, list(held), list[Tensor]()
+        masks, x, finer = [channels_first(is_updated)], channels_first(hidden.to(self.dtype)), []
+        for _ in pyramid.downs[1:]:
+            masks.append(functional.max_pool2d(masks[-1], 2, ceil_mode=True))
+
+        def hold(new: Tensor, mask: Tensor) -> Tensor:
+            # Channels last: OpenVINO would transpose all that are selected from.
+            now = torch.where(channels_last(mask) > 0, channels_last(new.float()), remaining.pop(0))
+            after.append(now)
+            return channels_first(now.to(self.dtype))
+
+        for down, block, mask in zip(pyramid.downs, pyramid.down_blocks, masks, strict=True):
+            x = hold(block(down(x)), mask)
+            finer.append(x)
+        finer.pop()
+        for scale in reversed(range(len(finer))):
+            x = pyramid.fuse(x, finer[scale], scale)
+            x = hold(x, masks[scale]) if scale else x
+        new = channels_last(pyramid.ups[0](x.relu()).float())
+        keep = torch.exp(pyramid.log_rate.float().exp().flatten() * recency.log())
+        context = torch.where(is_updated > 0, torch.lerp(new, context, keep), context)
+        return context, *after
 
 
 class ScaleLayers(nn.Module):

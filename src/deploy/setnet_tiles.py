@@ -37,14 +37,20 @@ class TileState:
     def __init__(self, network: SetNet, height: int, width: int):
         rows, columns = height // CELL_PX, width // CELL_PX
         hidden, context, _ = network.map_sizes(height, width)
-        scales = network.context.map_sizes(rows, columns)
         self.hidden, self.spare_hidden = _zeros(hidden), _zeros(hidden)
-        self.context, self.smoothed = _zeros(context), _zeros(context)
-        levels = len(network.context.downs)
-        self.scales = [_zeros(size) for size in scales[:levels]]
-        # The sums with coarser scales, by scale; the coarsest has none, the finest is not held.
-        self.fused: list[Any] = [None, *map(_zeros, reversed(scales[levels:])), self.scales[-1]]
+        self.smoothed, self.levels = _zeros(context), len(network.context.downs)
+        self.hold(_zeros(context), *map(_zeros, network.context.map_sizes(rows, columns)))
         self.frame = np.full((height, width), BACKGROUND, np.float32)
+
+    def hold(self, context: np.ndarray, *held: np.ndarray) -> None:
+        """Hold a context and maps in the order of ContextPyramid.map_sizes."""
+        self.context, self.scales = context, list(held[: self.levels])
+        # The sums with coarser scales, by scale; the coarsest has none, the finest is not held.
+        self.fused: list[Any] = [None, *reversed(held[self.levels :]), held[self.levels - 1]]
+
+    def held(self) -> list[np.ndarray]:
+        """Return the maps in that order."""
+        return self.scales + self.fused[-2:0:-1]
 
 
 class SetNetState(NamedTuple):
@@ -164,7 +170,7 @@ class WholeFrame:
         given = [(*near, c), (*far, c), (*far, 1), (*far, 1), *held]
         self.context = compile_module(WholeContext(network, dtype), *given)
         self.decoder = compile_module(WholeDecoder(network, dtype), (*near, c), (*far, c))
-        self.updated = [np.empty((1, *shape), np.float32) for shape in [(*far, c), *held]]
+        self.spare = [np.zeros(shape, np.float32) for shape in [(*far, c), *held]]
         self.pixels = np.empty((1, *far, (2 * CELL_PX) ** 2), np.float32)
 
     def remember(self, voxel_map, mixtures, elapsed_s, maps: TileState) -> None:
@@ -175,12 +181,12 @@ class WholeFrame:
 
     def update_context(self, update: ContextUpdate, maps: TileState) -> None:
         """Bring the maps of the context up to date in the cells of `update`."""
-        held = maps.scales + maps.fused[-2:0:-1]  # in the order of ContextPyramid.map_sizes
+        held = maps.held()
         is_updated = update.cells[0].astype(np.float32)[..., None]
         given = maps.hidden, maps.context, update.recency[..., None], is_updated, *held
-        self.context.run([part[None] for part in given], self.updated)
-        for part, new in zip([maps.context, *held], self.updated, strict=True):
-            part[...] = new[0]
+        self.context.run([part[None] for part in given], [part[None] for part in self.spare])
+        made, self.spare = self.spare, [maps.context, *held]
+        maps.hold(*made)
 
     def draw(self, maps: TileState, evidence: np.ndarray) -> None:
         """Draw the frame."""

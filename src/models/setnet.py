@@ -557,19 +557,20 @@ class ContextPyramid(nn.Module):
             scales.append(x)
             after.append(last)
         scales.pop()
-        ups = zip(reversed(self.ups[1:]), reversed(self.fusion_blocks), strict=True)
-        for (up, block), mask in zip(ups, reversed(masks[:-1]), strict=True):
-            new = _run_on(due, lambda x, f, u=up, b=block: self._fuse(x, f, u, b), x, scales.pop())
+        for scale in reversed(range(len(scales))):
+            new = _run_on(due, lambda x, f, k=scale: self.fuse(x, f, k), x, scales[scale])
             x = new
-            if scales:
-                x, last = scan_windows(_hold, remaining.pop(0), new, mask)
+            if scale:
+                x, last = scan_windows(_hold, remaining.pop(0), new, masks[scale])
                 x = x.to(new.dtype)
                 after.append(last)
         return _run_on(due, lambda x: self.ups[0](self.relu(x)), x), tuple(after)
 
-    def _fuse(self, x: Tensor, finer: Tensor, up: nn.Module, block: nn.Module) -> Tensor:
-        coarser = functional.interpolate(up(self.relu(x)), finer.shape[-2:], mode="bilinear")
-        return block(finer + coarser)
+    def fuse(self, x: Tensor, finer: Tensor, scale: int) -> Tensor:
+        """Return the sum of a scale, `finer`, and `x` of the next coarser one, refined."""
+        x = self.ups[scale + 1](self.relu(x))
+        coarser = functional.interpolate(x, finer.shape[-2:], mode="bilinear")
+        return self.fusion_blocks[scale](finer + coarser)
 
     def moving_average(self, before: Context, new: Context, recency: Tensor) -> Context:
         """Return the moving average with `new`; `recency` (n, 1, h4, w4): exp(-age / interval)."""
@@ -582,6 +583,9 @@ def scan_windows(
     """Return the state after every window and after the last: state = step(state, *maps of the
     window), with `maps` of m = windows * n.
     """
+    if len(maps[0]) == len(state):  # OpenVINO would copy what is split into one
+        state = step(state, *maps)
+        return state, state
     states = []
     for now in zip(*(part.split(len(state)) for part in maps), strict=True):
         state = step(state, *now)

@@ -14,19 +14,16 @@ f32 = np.float32
 
 @njit(nogil=True, cache=True)
 def fill_tiles(active_tiles, values, out):
-    """Write `values` (channels,) into every cell of active tiles of `out` (rows, columns,
-    channels)."""
-    channels, flat = np.uint64(out.shape[2]), out.reshape(-1)
+    """Write `values` (TILE * channels,), those of a row, into active tiles of `out` (rows,
+    columns, channels)."""
+    flat = out.reshape(-1)
     for i, j in np.ndindex(active_tiles.shape):
         if active_tiles[i, j]:
-            c0 = j * TILE
-            width = min(TILE, out.shape[1] - c0)
+            n = np.uint64(min(TILE, out.shape[1] - j * TILE) * out.shape[2])
             for r in range(i * TILE, min((i + 1) * TILE, len(out))):
-                at = np.uint64((r * out.shape[1] + c0) * out.shape[2])
-                for _ in range(width):
-                    for k in range(channels):
-                        flat[at + k] = values[k]
-                    at += channels
+                at = np.uint64((r * out.shape[1] + j * TILE) * out.shape[2])
+                for k in range(n):
+                    flat[at + k] = values[k]
 
 
 @njit(nogil=True, cache=True)
