@@ -53,6 +53,11 @@ class MemoryLayers(nn.Module):
     ) -> Float[Tensor, "b h w c"]:
         """Return the hidden map after the window.  `elapsed_s`: 0 in cells that stand still and
         outside the frame."""
+        return channels_last(self.advance(voxel_map, mixtures, elapsed_s, hidden))
+
+    def advance(
+        self, voxel_map: Tensor, mixtures: Tensor, elapsed_s: Tensor, hidden: Tensor
+    ) -> Float[Tensor, "b c h w"]:
         voxel_map, mixtures = (channels_first(x.to(self.dtype)) for x in (voxel_map, mixtures))
         stem = voxel_map + functional.conv2d(mixtures, self.kernel, None, 1, self.padding)
         is_active = channels_first((elapsed_s > 0).to(self.dtype))
@@ -78,7 +83,7 @@ class SplitTimeGatedMemory(nn.Module):
 
     def forward(
         self, x: Float[Tensor, "b c h1 w1"], state: Float[Tensor, "b h w c"], elapsed: Tensor
-    ) -> Float[Tensor, "b h w c"]:
+    ) -> Float[Tensor, "b c h w"]:
         """Return the state after the window; exactly `state` where `elapsed` is 0."""
         before = channels_first(state.to(x.dtype))
         features = self.input_features(x)
@@ -90,8 +95,7 @@ class SplitTimeGatedMemory(nn.Module):
             )
         )
         keep = torch.exp(-elapsed * gate.relu().float())
-        new = keep * channels_first(state) + (1 - keep) * candidate.tanh().float()
-        return channels_last(new)
+        return keep * channels_first(state) + (1 - keep) * candidate.tanh().float()
 
 
 class DecoderLayers(nn.Module):
@@ -128,9 +132,28 @@ class WholeDecoder(DecoderLayers):
         self, hidden: Float[Tensor, "1 h w c"], context: Float[Tensor, "1 hq wq c"]
     ) -> Float[Tensor, "1 hq wq pixels"]:
         """Return the pixels."""
-        far, near = (channels_first(part.to(self.dtype)) for part in (context, hidden))
+        return self.draw(channels_first(hidden), context)
+
+    def draw(self, hidden: Tensor, context: Tensor) -> Tensor:
+        far, near = channels_first(context.to(self.dtype)), hidden.to(self.dtype)
         x = functional.interpolate(far, scale_factor=2, mode="nearest") + near
         return super().forward(channels_last(x.relu()))
+
+
+class WholeWindow(nn.Module):
+    """MemoryLayers and WholeDecoder on whole maps."""
+
+    def __init__(self, network: SetNet, positions: Sequence[Position], dtype: torch.dtype):
+        super().__init__()
+        self.memory = MemoryLayers(network, positions, dtype, True)
+        self.decoder = WholeDecoder(network, dtype)
+
+    def forward(
+        self, voxel_map: Tensor, mixtures: Tensor, elapsed_s: Tensor, hidden: Tensor, context: Tensor
+    ) -> tuple[Float[Tensor, "1 h w c"], Float[Tensor, "1 hq wq pixels"]]:
+        """Return the hidden map after the window and the pixels."""
+        new = self.memory.advance(voxel_map, mixtures, elapsed_s, hidden)
+        return channels_last(new), self.decoder.draw(new, context)
 
 
 class TwoByTwoCellConv(nn.Module):

@@ -17,9 +17,10 @@ from src.deploy.setnet_clock import (
     EventPixels,
     SetNetClock,
     SumState,
+    Tick,
 )
 from src.deploy.setnet_context import CONTEXT_TILE, ContextTiles, WholeContext
-from src.deploy.setnet_layers import DecoderLayers, MemoryLayers, WholeDecoder
+from src.deploy.setnet_layers import DecoderLayers, MemoryLayers, WholeDecoder, WholeWindow
 from src.deploy.tile_batches import Backend, TileModule
 from src.models.setnet import BACKGROUND, CELL_PX, REVEALING_EVENTS, SetNet
 from src.sim.optics import Position
@@ -90,22 +91,30 @@ class SetNetTiles:
         """Return the frame, padded, valid until the next window."""
         clock, sums, maps = self.state
         tick = self.clock.tick(pixels, clock)
+        is_most = self._is_most(TILE, len(tick.active_tiles), WHOLE_MEMORY)
+        if not tick.update:
+            self._smooth(tick)
         if len(tick.active_tiles):
             self.events.add(pixels, clock, sums)
-            if self._is_most(TILE, len(tick.active_tiles), WHOLE_MEMORY):
-                self.whole.remember(self.events.voxel_map, sums.mixtures, clock.elapsed_s, maps)
-            else:
-                self._remember(tick.active_tiles)
+        if is_most:
+            self.whole.remember(self.events.voxel_map, sums.mixtures, clock.elapsed_s, maps)
+        else:
+            self._remember(tick.active_tiles)
         if tick.update:
             self._update_context(tick.update)
-        corners = QUARTER * tick.smoothed_tiles
-        cells = tick.smoothed_cells, tick.smoothing_kept
-        tiles_numba.smooth(maps.context, corners, *cells, maps.smoothed)
-        if self._is_most(TILE, len(tick.changed_tiles), WHOLE_DECODER):
+            self._smooth(tick)
+        if is_most and not tick.update:
+            self.whole.show(maps, clock.evidence)
+        elif self._is_most(TILE, len(tick.changed_tiles), WHOLE_DECODER):
             self.whole.draw(maps, clock.evidence)
         else:
             self._draw(tick.changed_tiles)
         return maps.frame
+
+    def _smooth(self, tick: Tick) -> None:
+        maps, corners = self.state.maps, QUARTER * tick.smoothed_tiles
+        cells = tick.smoothed_cells, tick.smoothing_kept
+        tiles_numba.smooth(maps.context, corners, *cells, maps.smoothed)
 
     def _is_most(self, side_cells: int, tiles: int, share: float) -> bool:
         """Return whether `tiles` are more than a `share` of the frame."""
@@ -164,9 +173,9 @@ class WholeFrame:
         def compile_module(module: nn.Module, *shapes: tuple[int, ...]) -> Any:
             return backend(module, [torch.zeros(1, *shape) for shape in shapes], threads)
 
-        memory = MemoryLayers(network, positions, dtype, True)
-        given = [(*near, channels) for channels in (c, memory.kernel.shape[1], 1, c)]
-        self.memory = compile_module(memory, *given)
+        window = WholeWindow(network, positions, dtype)
+        given = [(*near, channels) for channels in (c, window.memory.kernel.shape[1], 1, c)]
+        self.window = compile_module(window, *given, (*far, c))
         given = [(*near, c), (*far, c), (*far, 1), (*far, 1), *held]
         self.context = compile_module(WholeContext(network, dtype), *given)
         self.decoder = compile_module(WholeDecoder(network, dtype), (*near, c), (*far, c))
@@ -174,9 +183,9 @@ class WholeFrame:
         self.pixels = np.empty((1, *far, (2 * CELL_PX) ** 2), np.float32)
 
     def remember(self, voxel_map, mixtures, elapsed_s, maps: TileState) -> None:
-        """Advance the hidden map."""
-        given = voxel_map, mixtures, elapsed_s[..., None], maps.hidden
-        self.memory.run([part[None] for part in given], [maps.spare_hidden[None]])
+        """Advance the hidden map, and draw what `show` writes: with the context as it is."""
+        given = voxel_map, mixtures, elapsed_s[..., None], maps.hidden, maps.smoothed
+        self.window.run([part[None] for part in given], [maps.spare_hidden[None], self.pixels])
         maps.hidden, maps.spare_hidden = maps.spare_hidden, maps.hidden
 
     def update_context(self, update: ContextUpdate, maps: TileState) -> None:
@@ -191,6 +200,10 @@ class WholeFrame:
     def draw(self, maps: TileState, evidence: np.ndarray) -> None:
         """Draw the frame."""
         self.decoder.run([maps.hidden[None], maps.smoothed[None]], [self.pixels])
+        self.show(maps, evidence)
+
+    def show(self, maps: TileState, evidence: np.ndarray) -> None:
+        """Write the frame that was drawn last."""
         corner = np.zeros((1, 2), np.int32)
         tiles_numba.write_pixels(self.pixels, corner, evidence, *BLEND, maps.frame)
 
