@@ -35,6 +35,7 @@ from src.models.setnet import (
 from src.sim.optics import Position
 
 
+SIDE_BY_SIDE = 2000  # pixels with events from which on two threads take less time
 # Weights of REACH_CELLS averages of three cells, one after the other.
 SMOOTHING = np.float32(reduce(np.convolve, [np.full(3, 1 / 3)] * REACH_CELLS))
 
@@ -89,7 +90,7 @@ class ClockState:
 
     def __init__(self, views: int, rows: int, columns: int):
         tiles = -(-rows // TILE), -(-columns // TILE)
-        self.trace = np.zeros((views, rows, columns), np.float32)
+        self.trace = np.zeros((views, rows + 2, columns + 2), np.float32)  # a border of zeros
         self.activity = np.zeros((rows, columns), np.float32)
         self.evidence = np.zeros((rows, columns), np.float32)
         self.elapsed_s = np.zeros((rows, columns), np.float32)  # in the last window
@@ -128,14 +129,14 @@ class SetNetClock:
             exp_float32(-window_s / np.float32(tau)) for tau in (ACTIVITY_TAU_S, TRACE_TAU_S)
         )
         events = places, voxels, trace_kept, np.float32(MIN_SUPPORT)
-        clock.find_supported(*events, self.counts, now.trace, self.supported)
-        clock.add_evidence(self.supported, SMOOTHING, now.evidence)
-        clock.widen(self.supported, REACH_CELLS, self.is_near, self.near_tiles)
+        spans = clock.find_supported(*events, self.counts, now.trace, self.supported)
+        near = self.is_near, self.near_tiles
+        clock.spread(self.supported, spans, SMOOTHING, now.evidence, *near)
         fading = kept, np.float32(ACTIVITY_TAU_S), np.float32(MIN_ACTIVITY)
         tiles = self.is_near, self.near_tiles, now.active_tiles
         cells = now.activity, now.elapsed_s, now.is_pending
-        longest_s = clock.advance(window_s, *fading, *tiles, *cells, now.pending_tiles, changed)
-        share = np.float32(np.count_nonzero(now.activity)) / np.float32(now.activity.size)
+        longest_s, active = clock.advance(window_s, *fading, *tiles, *cells, now.pending_tiles, changed)
+        share = np.float32(active) / np.float32(now.activity.size)
         pace = (share - np.float32(STATIC_SHARE)) / np.float32(MOVING_SHARE - STATIC_SHARE)
         if pace <= 0:
             return np.float32(longest_s)
@@ -204,8 +205,8 @@ class EventMaps:
 
     def add(self, pixels: EventPixels, clocks: ClockState, state: SumState) -> None:
         """Bring `state` to the end of a window, and make its `voxel_map`."""
-        work = pixels, clocks, state
-        sums = self.pool.submit(self._advance_sums, *work) if self.pool else None
+        work, is_much = (pixels, clocks, state), len(pixels.places) > SIDE_BY_SIDE
+        sums = self.pool.submit(self._advance_sums, *work) if self.pool and is_much else None
         self._make_voxel_map(pixels, clocks)
         sums.result() if sums else self._advance_sums(*work)
 

@@ -25,7 +25,7 @@ from src.deploy.tile_batches import Backend, TileModule
 from src.models.setnet import BACKGROUND, CELL_PX, REVEALING_EVENTS, SetNet
 from src.sim.optics import Position
 
-BATCHES = 8, 32  # sizes of batches, in tiles
+BATCHES = 32, 128  # sizes of batches, in tiles
 # Share of the frame in tiles from which on all of it is computed at once, which takes no longer.
 WHOLE_MEMORY, WHOLE_CONTEXT, WHOLE_DECODER = 0.45, 0.35, 0.5
 BLEND = np.float32(REVEALING_EVENTS), np.float32(BACKGROUND)  # of pixels, as SetNet does

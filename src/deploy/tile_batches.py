@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-CALL_COST = 3  # what a call costs beside its tiles, in tiles
+CALL_COST = 8  # what a call costs beside its tiles, in tiles
 Backend = Callable[[nn.Module, list[Tensor], int], Any]  # EagerBackend or CompiledModule
 
 

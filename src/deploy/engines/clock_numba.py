@@ -12,7 +12,7 @@ from src.models.setnet import CELL_PX as SIDE
 
 f32, u8 = np.float32, np.uint8
 
-TILE = 16  # side of a tile, in cells
+TILE = 8  # side of a tile, in cells
 QUARTER = TILE // 2  # the same in cells of the context
 TINY = f32(2.0**-126)  # what is smaller takes a processor a hundred times longer
 
@@ -57,120 +57,96 @@ def fade(kept, values):
 
 @njit(nogil=True, cache=True)
 def find_supported(places, grid, kept, least, counts, trace, supported):
-    """Bring `trace` (views, rows, columns) to the end of the window, and write into `supported`
-    (rows, columns), zeros, how many events of a cell have support, more than `least`, in the view
-    that has most.  `counts`: zeros, as `trace`.
+    """Bring `trace` (views, rows + 2, columns + 2), zero at its border, to the end of the window,
+    and write into `supported` (rows, columns), zeros, how many events of a cell have support, more
+    than `least`, in the view that has most.  Return (rows, 2), from where to where in each row.
+    `counts` (views, rows, columns): zeros.
     """
-    views, rows, columns = trace.shape
+    views, rows, columns = counts.shape
     fade(kept, trace.reshape(-1))
-    has, flat = np.zeros((views, rows + 2), u8), counts.reshape(-1)
+    first, stop = np.full((views, rows), columns, np.int32), np.zeros((views, rows), np.int32)
+    flat = counts.reshape(-1)
     for k in range(len(places)):
         weight = f32(0)
         for b in range(grid.shape[1]):
             weight += abs(grid[k, b])
-        v, r = places[k, 0], places[k, 1] // SIDE
-        flat[np.uint64((v * rows + r) * columns + places[k, 2] // SIDE)] += weight
-        has[v, r + 1] = 1
-    line, nothing = np.zeros(columns + 2, f32), np.zeros(columns, f32)
-    for v in range(views):
-        for r in range(rows):
-            if has[v, r + 1]:
-                now, more = trace[v, r], counts[v, r]
-                for c in range(np.uint64(columns)):
-                    now[c] += more[c]
-        for r in range(rows):
-            if has[v, r + 1]:
-                above = trace[v, r - 1] if r else nothing
-                below = trace[v, r + 1] if r + 1 < rows else nothing
-                rows_used = above, trace[v, r], below
-                _find_supported_in_row(rows_used, least, counts[v, r], line, supported[r])
+        v, r, c = places[k, 0], places[k, 1] // SIDE, places[k, 2] // SIDE
+        flat[np.uint64((v * rows + r) * columns + c)] += weight
+        first[v, r], stop[v, r] = min(first[v, r], c), max(stop[v, r], c + 1)
+    for v, r in np.ndindex(first.shape):
+        now, more = trace[v, r + 1, first[v, r] + 1 :], counts[v, r, first[v, r] :]
+        for c in range(np.uint64(max(stop[v, r] - first[v, r], 0))):
+            now[c] += more[c]
+    spans = np.zeros((rows, 2), np.int32)
+    for r in range(rows):
+        begin, end = columns, 0
+        for v in range(views):
+            if first[v, r] < stop[v, r]:
+                part = slice(first[v, r], stop[v, r])
+                near = trace[v, r : r + 3, part.start : part.stop + 2]
+                _find_supported_in_row(near, least, counts[v, r, part], supported[r, part])
+                begin, end = min(begin, part.start), max(end, part.stop)
+        while begin < end and supported[r, begin] == 0:
+            begin += 1
+        while begin < end and supported[r, end - 1] == 0:
+            end -= 1
+        spans[r, 0], spans[r, 1] = begin, max(begin, end)
+    return spans
 
 
 @njit(nogil=True, cache=True)
-def _find_supported_in_row(rows, least, count, total, supported):
-    # In the order, and rounded, as an average pooling of 3 x 3 adds them up.
-    here = rows[1]
-    n = np.uint64(here.size)
-    total[:] = 0
-    for row in rows:
-        for k in range(np.uint64(3)):
-            for c in range(n):
-                total[c + np.uint64(2) - k] += row[c]
-    for c in range(n):
-        others = f32(9) * (total[c + np.uint64(1)] / f32(9)) - here[c]
-        found = count[c] if others > least else f32(0)
-        supported[c] = max(supported[c], found)
+def _find_supported_in_row(near, least, count, supported):
+    # Added up in the order of, and rounded as, an average pooling of 3 x 3.
+    above, here, below = near[0], near[1], near[2]
+    for c in range(np.uint64(count.size)):
+        d, e = c + np.uint64(1), c + np.uint64(2)
+        total = above[c] + above[d] + above[e] + here[c] + here[d] + here[e]
+        total = total + below[c] + below[d] + below[e]
+        others = f32(9) * (total / f32(9)) - here[d]
+        supported[c] = max(supported[c], count[c] if others > least else f32(0))
         count[c] = 0
 
 
 @njit(nogil=True, cache=True)
-def add_evidence(supported, weights, evidence):
-    """Add `supported` (rows, columns), smoothed by `weights` along both sides, to `evidence`."""
+def spread(supported, spans, weights, evidence, is_near, near_tiles):
+    """Add `supported` (rows, columns), smoothed by `weights` along both sides, to `evidence`; set
+    `is_near` where that is anything, and `near_tiles` that have any; clear `supported`."""
     (rows, columns), reach = supported.shape, weights.size // 2
-    line, n = np.zeros(columns + 2 * reach, f32), np.uint64(columns)
-    smoothed = np.zeros(columns, f32)
+    line, smoothed = np.zeros(columns + 4 * reach, f32), np.zeros(columns, f32)
     for r in range(rows):
-        first, last = columns, -1
-        for c in range(columns):
-            if supported[r, c] > 0:
-                first, last = min(first, c), c
-        if last < 0:
+        first, stop = spans[r, 0], spans[r, 1]
+        if first == stop:
             continue
-        line[reach : reach + columns] = supported[r]
-        smoothed[:] = 0
-        for k in range(np.uint64(2 * reach + 1)):
+        line[first : stop + 4 * reach] = 0
+        line[first + 2 * reach : stop + 2 * reach] = supported[r, first:stop]
+        supported[r, first:stop] = 0
+        begin, end = max(first - reach, 0), min(stop + reach, columns)
+        n, smooth, given = np.uint64(end - begin), smoothed[begin:end], line[begin + reach :]
+        smooth[:] = 0
+        for k in range(np.uint64(weights.size)):
             for c in range(n):
-                smoothed[c] += weights[k] * line[c + k]
-        begin, end = np.uint64(max(first - reach, 0)), np.uint64(min(last + reach + 1, columns))
-        for k in range(-reach, reach + 1):
-            if 0 <= r + k < rows:
-                row, weight = evidence[r + k], weights[k + reach]
-                for c in range(end - begin):
-                    row[begin + c] += weight * smoothed[begin + c]
-
-
-@njit(nogil=True, cache=True)
-def widen(supported, reach, is_near, near_tiles):
-    """Set `is_near` within `reach` of what is `supported` in each direction, and `near_tiles` that
-    have any; clear `supported`."""
-    rows, columns = is_near.shape
-    has = np.zeros(rows + 2 * reach, u8)
-    for r in range(rows):
-        most = f32(0)
-        for c in range(np.uint64(columns)):
-            most = max(most, supported[r, c])
-        has[r + reach] = most > 0
-    line = np.zeros(columns + 2 * reach, u8)
-    for r in range(rows):
-        is_near[r] = 0
-        if not has[r : r + 2 * reach + 1].any():
-            continue
-        line[:] = 0
-        for k in range(-reach, reach + 1):
-            if has[r + reach + k]:
-                for c in range(np.uint64(columns)):
-                    line[c + np.uint64(reach)] |= u8(supported[r + k, c] > 0)
-        near = is_near[r]
-        for k in range(np.uint64(2 * reach + 1)):
-            for c in range(np.uint64(columns)):
-                near[c] |= line[c + k]
-        for j in range(near_tiles.shape[1]):
-            for c in range(j * TILE, min((j + 1) * TILE, columns)):
-                near_tiles[r // TILE, j] |= near[c]
-    for r in range(rows):
-        if has[r + reach]:
-            supported[r] = 0
+                smooth[c] += weights[k] * given[c + k]
+        top, bottom = max(r - reach, 0), min(r + reach, rows - 1)
+        for q in range(top, bottom + 1):
+            weight, known, near = weights[q - r + reach], evidence[q, begin:], is_near[q, begin:]
+            for c in range(n):
+                known[c] += weight * smooth[c]
+                near[c] |= u8(smooth[c] > 0)
+        for j in range(begin // TILE, (end - 1) // TILE + 1):
+            if smoothed[max(j * TILE, begin) : min((j + 1) * TILE, end)].any():
+                near_tiles[top // TILE : bottom // TILE + 1, j] = 1
 
 
 @njit(nogil=True, cache=True)
 def advance(window_s, kept, tau_s, floor, is_near, near_tiles, active_tiles, activity, elapsed_s,
             is_pending, pending_tiles, changed):  # fmt: skip
-    """Advance the clock of every cell; return by how much at most, in seconds.
+    """Advance the clock of every cell; return by how much at most, in seconds, and how many cells
+    are active then.  `is_near` is cleared, and `near_tiles`.
 
     `active_tiles`: before and after, which tiles have a cell whose clock advances; `changed`: the
     tiles within the decoder's reach of one.
     """
-    longest = f32(0)
+    longest, total = f32(0), 0
     columns_used = np.empty(TILE, f32)
     for i, j in np.ndindex(active_tiles.shape):
         if not (near_tiles[i, j] or active_tiles[i, j]):
@@ -193,6 +169,8 @@ def advance(window_s, kept, tau_s, floor, is_near, near_tiles, active_tiles, act
                 active[c] = f32(1) if near[c] else remaining
                 elapsed[c] = passed
                 pending[c] = u8(1) if passed > 0 else pending[c]
+                near[c] = 0
+                total += active[c] > 0
                 columns_used[c] = max(columns_used[c], passed)
                 most = max(most, passed)
             if most > 0:
@@ -202,7 +180,7 @@ def advance(window_s, kept, tau_s, floor, is_near, near_tiles, active_tiles, act
             active_tiles[i, j] = pending_tiles[i, j] = 1
             used = np.flatnonzero(columns_used)
             mark_reached(r0 + first, r0 + last, c0 + used[0], c0 + used[-1], changed)
-    return longest
+    return longest, total
 
 
 @njit(nogil=True, cache=True)
