@@ -73,9 +73,7 @@ def held(
     return torch.cat(maps), torch.cat(truth)
 
 
-def new_context(
-    network: SetNet, maps: Float[Tensor, "m c h2 w2"]
-) -> Float[Tensor, "m c h4 w4"]:
+def new_context(network: SetNet, maps: Float[Tensor, "m c h2 w2"]) -> Float[Tensor, "m c h4 w4"]:
     """Return the context of the maps, each a clip of its own, updated everywhere."""
     sizes = network.context.map_sizes(*maps.shape[2:])
     nothing = tuple(maps.new_zeros(len(maps), *size) for size in sizes)

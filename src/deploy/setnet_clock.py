@@ -34,7 +34,6 @@ from src.models.setnet import (
 )
 from src.sim.optics import Position
 
-
 SIDE_BY_SIDE = 2000  # pixels with events from which on two threads take less time
 # Weights of REACH_CELLS averages of three cells, one after the other.
 SMOOTHING = np.float32(reduce(np.convolve, [np.full(3, 1 / 3)] * REACH_CELLS))
@@ -135,7 +134,9 @@ class SetNetClock:
         fading = kept, np.float32(ACTIVITY_TAU_S), np.float32(MIN_ACTIVITY)
         tiles = self.is_near, self.near_tiles, now.active_tiles
         cells = now.activity, now.elapsed_s, now.is_pending
-        longest_s, active = clock.advance(window_s, *fading, *tiles, *cells, now.pending_tiles, changed)
+        longest_s, active = clock.advance(
+            window_s, *fading, *tiles, *cells, now.pending_tiles, changed
+        )
         share = np.float32(active) / np.float32(now.activity.size)
         pace = (share - np.float32(STATIC_SHARE)) / np.float32(MOVING_SHARE - STATIC_SHARE)
         if pace <= 0:

@@ -149,7 +149,12 @@ class WholeWindow(nn.Module):
         self.decoder = WholeDecoder(network, dtype)
 
     def forward(
-        self, voxel_map: Tensor, mixtures: Tensor, elapsed_s: Tensor, hidden: Tensor, context: Tensor
+        self,
+        voxel_map: Tensor,
+        mixtures: Tensor,
+        elapsed_s: Tensor,
+        hidden: Tensor,
+        context: Tensor,
     ) -> tuple[Float[Tensor, "1 h w c"], Float[Tensor, "1 hq wq pixels"]]:
         """Return the hidden map after the window and the pixels."""
         new = self.memory.advance(voxel_map, mixtures, elapsed_s, hidden)

@@ -27,7 +27,7 @@ from src.sim.optics import Position
 
 BATCHES = 32, 128  # sizes of batches, in tiles
 # Share of the frame in tiles from which on all of it is computed at once, which takes no longer.
-WHOLE_MEMORY, WHOLE_CONTEXT, WHOLE_DECODER = 0.45, 0.35, 0.5
+WHOLE_MEMORY, WHOLE_CONTEXT, WHOLE_DECODER = 0.3, 0.25, 0.6
 BLEND = np.float32(REVEALING_EVENTS), np.float32(BACKGROUND)  # of pixels, as SetNet does
 
 

@@ -71,7 +71,7 @@ def grids(window: tuple, views: int, height: int, width: int) -> torch.Tensor:
 
 def largest_gap(net: SetNet, live: EventListRuntime, windows: list, views: int) -> float:
     """Return the largest difference of frames, hidden maps and contexts, over their largest value
-    where that is above 1."""
+    where that is above 1.  The clock must be equal to the last bit."""
     state, gap, places = None, 0.0, positions(views)
     for window in windows:
         seconds = window[6] - window[5]
@@ -85,6 +85,11 @@ def largest_gap(net: SetNet, live: EventListRuntime, windows: list, views: int) 
             (state.context_average[0].permute(1, 2, 0), maps.context),
             (state.context_smoothed[0].permute(1, 2, 0), maps.smoothed),
         ]
+        clock = live.runner.state.clock
+        np.testing.assert_array_equal(state.event_trace[0], clock.trace[:, 1:-1, 1:-1])
+        np.testing.assert_array_equal(state.activity[0, 0], clock.activity)
+        np.testing.assert_array_equal(state.is_pending[0, 0], clock.is_pending)
+        np.testing.assert_allclose(state.evidence[0, 0], clock.evidence, rtol=1e-5, atol=EXACT)
         for a, b in ((a.numpy(), b) for a, b in pairs):
             gap = max(gap, float(abs(a - b).max() / max(1, abs(a).max())))
     return gap

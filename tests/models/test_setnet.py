@@ -51,10 +51,8 @@ def events_within(
     rows: slice, columns: slice, windows: int = 1, views: int = 2, side: int = 64
 ) -> torch.Tensor:
     """Voxels with events in every pixel of a block of cells and nowhere else."""
-    some, (rows, columns) = voxels(1, windows, views, side), (
-        slice(2 * part.start, 2 * part.stop) for part in (rows, columns)
-    )
-    block = torch.zeros(side, side)
+    some, block = voxels(1, windows, views, side), torch.zeros(side, side)
+    rows, columns = (slice(2 * part.start, 2 * part.stop) for part in (rows, columns))
     block[rows, columns] = 1
     return (some + some.sign()) * block
 
@@ -196,7 +194,7 @@ def test_a_cell_without_supported_events_near_it_keeps_its_bits():
 
 @torch.no_grad()
 def test_what_a_still_camera_has_not_seen_is_exactly_the_background():
-    frames, state = unroll(small().eval(), events_within(*BLOCK, 6))
+    frames, _ = unroll(small().eval(), events_within(*BLOCK, 6))
     # Evidence reaches as far as activity.
     known = far_from(*BLOCK, REACH_CELLS).repeat_interleave(2, 0).repeat_interleave(2, 1)
     unseen = frames[..., known]
