@@ -166,10 +166,10 @@ def find_active_cells(supported: Float[Tensor, "m 1 h2 w2"]) -> Tensor:
 
 def spread_evidence(supported: Float[Tensor, "m 1 h2 w2"]) -> Float[Tensor, "m 1 h2 w2"]:
     """Return supported events smoothed over REACH_CELLS on each side."""
-    spread = functional.pad(supported, [REACH_CELLS] * 4)
-    for _ in range(REACH_CELLS):
-        spread = functional.avg_pool2d(spread, 3, 1)
-    return spread
+    spread = supported
+    for _ in range(REACH_CELLS):  # each with its own padding: ONNX Runtime takes no larger one
+        spread = functional.avg_pool2d(functional.pad(spread, [2] * 4), 3, 1)
+    return spread[..., REACH_CELLS:-REACH_CELLS, REACH_CELLS:-REACH_CELLS]
 
 
 class SetNet(EventToVideoNetwork):
