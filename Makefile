@@ -1,14 +1,16 @@
 # make train: set up what is missing, train the light-field network for minutes, show what it learned.
 # make test:  set up what is missing, run the fast tests.     make test-all: the slow ones too.
 # make demo:  set up what is missing, simulate a recording once, play it live in the browser.
+# make docs:  the site of docs/ in out/site; REPO_URL=https://... where its links to code lead.
 
 PYTHON ?= python3
 PY := .venv/bin/python
 READY := .venv/ready
 LPIPS := .cache/lpips/alex.safetensors
 DEMO := out/demo
+SITE := .cache/docs
 
-.PHONY: train test test-all demo lint clean
+.PHONY: train test test-all demo docs lint clean
 train: $(READY) $(LPIPS)
 	$(PY) -m src.train experiment=lf3x3
 
@@ -22,12 +24,25 @@ demo: $(READY) $(DEMO)
 	$(PY) -m src.live recording=$(DEMO)/cap.raw views=$(DEMO)/cap.views.yaml ckpt=setnet_small \
 		fps=600 playback_speed=0.2 threads=2 loop=true
 
+docs: $(SITE)/ready
+	NO_MKDOCS_2_WARNING=1 $(SITE)/bin/python -m mkdocs build --strict  # --quiet would hide warnings from it
+	@echo "the site is in out/site"
+
 lint: $(READY)
 	$(PY) -m ruff check . && $(PY) -m ruff format --check . && $(PY) -m mypy
 
 # The environment is complete when this file is there; a changed pyproject.toml makes it anew.
 $(READY): pyproject.toml constraints.txt scripts/setup.sh
 	PYTHON=$(PYTHON) bash scripts/setup.sh
+	touch $@
+
+# The site needs nothing of the project's own dependencies: the code is read, not imported.
+$(SITE)/ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(SITE)
+	$(SITE)/bin/python -c 'import tomllib; project = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
+		print(*project["optional-dependencies"]["docs"], sep="\n")' > $(SITE)/requirements.txt
+	$(SITE)/bin/python -m pip install --quiet --disable-pip-version-check \
+		--constraint constraints.txt --requirement $(SITE)/requirements.txt
 	touch $@
 
 # The folder is there only when the recording in it is whole.

@@ -12,7 +12,7 @@ from torch import nn
 
 from src import models
 
-dependencies = ["torch", "numpy", "jaxtyping", "safetensors", "lightning"]
+dependencies = ["torch", "numpy", "jaxtyping", "safetensors"]
 
 
 def setnet_small() -> nn.Module:

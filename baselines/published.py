@@ -13,6 +13,7 @@ from baselines.etnet import ETNet
 from baselines.firenet import FireNet
 from baselines.hypere2vid import HyperE2VID
 from baselines.pickled_weights import read_tensors
+from baselines.pienet import PIENet
 from src.models import files
 
 # Ours -> published, one rule after the other.
@@ -84,22 +85,47 @@ CISTA_TC = (
     (r"^up\.", "upsamp_conv.conv2d."),
     (r"^pred\.", "final_conv.conv2d."),
 )
+PIENET = (
+    (r"^(events|previous)\.", r"stem.\1_branch.mbconv."),
+    (r"^stem\.previous", "stem.frame"),
+    (r"^stem\.events", "stem.event"),
+    (r"^encoders\.(\d)\.widen\.", r"downs.\1.mbd.Gates.mbconv.0."),
+    (r"^encoders\.(\d)\.weigh\.squeeze\.", r"downs.\1.mbd.Gates.mbconv.1.fc1."),
+    (r"^encoders\.(\d)\.weigh\.excite\.", r"downs.\1.mbd.Gates.mbconv.1.fc2."),
+    (r"^encoders\.(\d)\.gates\.", r"downs.\1.mbd.Gates.mbconv.2.convna."),
+    (r"^encoders\.(\d)\.hidden_norm\.", r"downs.\1.mbd.norm_h."),
+    (r"^encoders\.(\d)\.cell_norm\.", r"downs.\1.mbd.norm_c."),
+    (r"^encoders\.(\d)\.refine\.", r"downs.\1.out.mbconv_0.mbconv."),
+    (r"^encoders\.(\d)\.modulate\.", r"downs.\1.film.film."),
+    (r"^decoders\.(\d)\.gate\.", r"ups.\1.ugate.gate_conv."),
+    (r"^decoders\.(\d)\.fuse\.", r"ups.\1.fuse.0.mbconv."),
+    (r"^pred\.", "outc."),
+    (r"^(stem|downs|ups|outc)\.", r"model.\1."),
+    (r"^offset\.", "cal_k.mbconv."),
+    (r"mbconv\.(\d\.)?conv\.", r"mbconv.\1convna.0."),
+    (r"mbconv\.(\d\.)?norm\.", r"mbconv.\1convna.1."),
+)
 
 
 OURS = (".safetensors", ".ckpt")  # what src.models.files reads
 
 
 class Published(NamedTuple):
-    """A published network; its width, `width_argument`, is the outputs of `first_layer`."""
+    """A published network; its width, `width_argument`, is the outputs of `first_layer`.
+
+    `left_out`: names, a regular expression, of weights in the checkpoint that it does not have.
+    """
 
     network_class: type[nn.Module]
     options: dict
     rename_rules: tuple
     first_layer: str
     width_argument: str
+    left_out: str | None = None
 
 
 NORMALISED, RAW = {"normalise": "nonzero"}, {"normalise": "none", "output": "clip"}
+PIE_NET = PIENET, "events.conv", "base_channels"
 NETWORKS = {
     "e2vid": Published(
         E2VIDPlus, NORMALISED | {"output": "sigmoid"}, UNET, "net.head", "base_channels"
@@ -110,6 +136,10 @@ NETWORKS = {
     "etnet": Published(ETNet, RAW | {"output": "sigmoid"}, ETNET, "net.head", "base_channels"),
     "hypere2vid": Published(HyperE2VID, RAW, HYPER, "net.head", "base_channels"),
     "cista": Published(CISTA, NORMALISED | {"output": "sigmoid"}, CISTA_TC, "events", "channels"),
+    "pienet": Published(PIENet, RAW, *PIE_NET),
+    "pienet_lite": Published(PIENet, RAW | {"channels": (16, 24), "pools": (2, 2)}, *PIE_NET),
+    # What event-pienet 1.1.3 runs of the checkpoint of PIE-Net.
+    "pienet_package": Published(PIENet, RAW | {"refine": False}, *PIE_NET, r"\.out\.mbconv_0\."),
 }
 
 
@@ -144,8 +174,9 @@ def load_published(architecture: str, path: Path) -> nn.Module:
     Width and bins follow from the checkpoint at `path`.  Raises ValueError with the missing and
     extra names when the weights are another network's.
     """
-    network_class, options, rules, first_layer, width = _find_architecture(architecture)
+    network_class, options, rules, first_layer, width, unused = _find_architecture(architecture)
     weights = read_tensors(path)
+    weights = {k: v for k, v in weights.items() if not (unused and re.search(unused, k))}
     head, sizes = weights.get(rename(f"{first_layer}.weight", rules)), {}
     if head is not None and head.dim() == 4 and head.numel() > 0:
         sizes = {"bins": head.shape[1], width: head.shape[0]}

@@ -3,27 +3,32 @@
     python -m scripts.gallery RECORDING ... --out FILE.png [--networks NAME ...] [--published DIR]
 
 A row for each recording, its last frame by each network: one of weights/ or, with the folder of
-published weights, of scripts.readme's baselines.  A recording that does not state the size of its
-sensor is written FILE@HEIGHTxWIDTH.  Where the list of a camera's frames, images.txt, lies beside
-a recording, the frame nearest in time stands last.
+published weights, of scripts.readme's baselines.  Below it its invented contrast, which says
+something where the camera stood still.  A recording that does not state the size of its sensor is
+written FILE@HEIGHTxWIDTH.  Where images.txt, the list of a camera's frames, lies beside a
+recording, the frame nearest in time stands last.
 """
 
 import argparse
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
 from scripts.readme import BASELINES, baseline_overrides, compose_config
+from src.app import build
 from src.figures import plots
-from src.reconstruct import frames, prepare
-from src.recordings.files import videos
-from src.recordings.reconstruction import Frame
+from src.metrics.invented_contrast import find_unseen, invented_contrast
+from src.reconstruct import choose_views, video_frames
+from src.recordings.files import sources, videos
+from src.recordings.noise_filter import NoiseFilter
+from src.recordings.reconstruction import Frame, as_event_network
 
 FPS = 120
 WIDE = 2.4  # inches: width of a panel
 CAMERA = "images.txt"
+SUPPORT_S = 0.005  # of NoiseFilter: what is noise reveals nothing
 
 
 def last(recording: str, network: str, published: Path | None) -> Frame:
@@ -32,7 +37,9 @@ def last(recording: str, network: str, published: Path | None) -> Frame:
     chosen = baseline_overrides(network, published) if network in BASELINES else [f"ckpt={network}"]
     sensor = [f"sensor_size=[{size.replace('x', ',')}]"] if size else []
     cfg = compose_config("reconstruct", f"recording={path}", f"fps={FPS}", *chosen, *sensor)
-    *_, frame = frames(cfg, *prepare(cfg))
+    loaded = as_event_network(build.load_network(cfg))
+    frames, _ = video_frames(cfg, loaded, choose_views(cfg, loaded))
+    *_, frame = frames
     return frame
 
 
@@ -44,6 +51,15 @@ def camera(recording: str, time_s: float) -> Float[np.ndarray, "h w"] | None:
     lines = (line.split() for line in listing.read_text().splitlines())
     _, name = min(lines, key=lambda line: abs(float(line[0]) - time_s))
     return next(videos.read_video(listing.parent / name))
+
+
+def unseen(recording: str, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """Return where no event that is not noise was ever near."""
+    has_events, keep = np.zeros(size, bool), NoiseFilter(size, SUPPORT_S)
+    for events in sources.iter_recording(recording.partition("@")[0], size, 0.05):
+        kept = keep(events)
+        has_events[kept["y"], kept["x"]] = True
+    return find_unseen(has_events)
 
 
 def gallery(recordings: list[str], networks: list[str], published: Path | None) -> Figure:
@@ -59,8 +75,12 @@ def gallery(recordings: list[str], networks: list[str], published: Path | None) 
     grid = figure.subplots(len(rows), columns, squeeze=False, height_ratios=heights)
     for recording, row, picture, axes in zip(recordings, rows, seen, grid, strict=True):
         pictures = [*(frame.picture for frame in row), picture]
+        unseen_px = unseen(recording, row[0].picture.shape)
         for panel, shown in zip(axes, pictures, strict=False):
             panel.set(xticks=[], yticks=[])
+            if shown is not None and shown is not picture:
+                value = invented_contrast(shown, unseen_px)
+                panel.set_xlabel("" if np.isnan(value) else f"{value:.3f}", fontsize=7)
             if shown is not None:
                 panel.imshow(shown, cmap="gray", vmin=0, vmax=1)
             else:

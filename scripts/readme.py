@@ -50,11 +50,15 @@ ROWS = {  # what it is: a network in weights/, how many of the nine views it is 
 BASELINES = {  # their files in the folder of published weights
     "firenet_plus": ["FireNet+/firenet_plus_state_dict.pth"],
     "cista": ["CISTA-TC/cista-tc.pth.tar"],
+    "pienet": ["PIE-Net/model.pth"],
+    "pienet_lite": ["PIE-Net/model_lite.pth"],
     "highpass": [],
 }
 OTHERS = {
     "one view, published FireNet+": ("firenet_plus", 1),
     "one view, published CISTA-TC": ("cista", 1),
+    "one view, published PIE-Net": ("pienet", 1),
+    "one view, published PIE-Net-Lite": ("pienet_lite", 1),
 }
 VIEWS = {  # differences, clip by clip: of nine views and one
     "Δ (9 − 1 views), E2VID": (PAPER, "one view, E2VID"),

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Make .venv with the dependencies of pyproject.toml (those of the tests included).
+# Make .venv with the dependencies of pyproject.toml, those of training, live view and tests
+# included, and OpenVINO, on which networks are fastest, where this machine has a wheel of it.
 # The repository itself is run from its root and not installed.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -25,6 +26,11 @@ fi
 import tomllib
 
 project = tomllib.load(open("pyproject.toml", "rb"))["project"]
-print(*project["dependencies"], *project["optional-dependencies"]["test"], sep="\n")
+extras = project["optional-dependencies"]
+print(*project["dependencies"], *extras["train"], *extras["live"], *extras["test"], sep="\n")
 PY
 "${pip[@]}" --requirement .venv/requirements.txt
+
+openvino=$(sed -n 's/^openvino = \["\(.*\)"\].*/\1/p' pyproject.toml)
+"${pip[@]}" --only-binary=:all: "$openvino" ||
+  echo "OpenVINO is not there (no wheel for this machine?): networks run in PyTorch, slower" >&2

@@ -1,12 +1,14 @@
 """Calibrate: python -m src.calibrate task=views|threshold|turbulence|air recording=...|video=..."""
 
 from pathlib import Path
+from typing import Any
 
 import rich
 from omegaconf import DictConfig, OmegaConf
 
 from src.app import build, calibrations, entry_point
 from src.app.instantiate import build_part
+from src.recordings.calibration.scene_alignment import Scene
 from src.recordings.files.event_file import ReadOptions
 from src.recordings.reconstruction import as_event_network
 from src.records import results
@@ -14,12 +16,21 @@ from src.records import results
 
 def find_views(cfg: DictConfig, run: Path) -> dict:
     """Find the views and their homographies: `views.yaml`, also at `cfg.save`."""
-    keys = ("resolution", "sensor_size", "mirrors", "corners")
-    given = {key: cfg[key] for key in keys} | {"options": ReadOptions.from_keys(cfg)}
-    aligned = calibrations.calibrate_views(cfg.recording, run, build_part(cfg, "target"), **given)
+    given: dict[str, Any] = {key: cfg[key] for key in ("resolution", "sensor_size")}
+    given["options"] = ReadOptions.from_keys(cfg)
+    target = build_part(cfg, "target")
+    if isinstance(target, Scene) and not cfg.corners:
+        if not cfg.mirrors:
+            raise ValueError("mirrors must be true for target=scene, got false")
+        found = calibrations.calibrate_views_on_scene(cfg.recording, run, target, **given)
+        views, summary = found.aligned.views, found.summary()
+    else:
+        given |= {key: cfg[key] for key in ("mirrors", "corners")}
+        views = calibrations.calibrate_views(cfg.recording, run, target, **given)
+        summary = {f"error_px of {v.position}": f"{v.error_px:.3f}" for v in views.views}
     if cfg.save:
-        aligned.save(cfg.save)
-    return {f"error_px of {view.position}": round(view.error_px, 3) for view in aligned.views}
+        views.save(cfg.save)
+    return summary
 
 
 def find_threshold(cfg: DictConfig, run: Path) -> dict:

@@ -63,7 +63,7 @@ def compare(cfg: DictConfig) -> dict:
             scores[name] = slice_motion.measure_static_scene(film, cfg.still)
         else:
             scores[name] = slice_motion.measure_slice_motion(
-                across, next(iter(given)), cfg.moving_thing
+                across, next(iter(given)), cfg.moving_object_brightness
             )
         if cfg.reference_images:
             scores[name] |= camera_frames.score_against_camera(

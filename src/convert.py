@@ -1,5 +1,6 @@
 """A recording to another format: python -m src.convert recording=cap.raw out=cap.h5."""
 
+import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from src.app import entry_point
 from src.recordings.files import event_writers, recording, sources
 from src.recordings.files.event_arrays import count_before
 from src.recordings.files.event_file import ReadOptions
+from src.recordings.files.recorded_frames import RecordedFrames, find_frames
 
 
 def convert(cfg: DictConfig) -> Path:
@@ -26,11 +28,32 @@ def convert(cfg: DictConfig) -> Path:
     height, width = sources.sensor_size(source, cfg.sensor_size, options)
     how = {"width": width, "height": height, "version": cfg.version, "layout": cfg.layout}
     event_writers.find_kind(out, **how)
-    events = cut(recording.open_recording(source, (width, height), options), cfg.start_s, cfg.end_s)
-    count, seconds = event_writers.write_pieces(out, events, **how)
+    opened = recording.open_recording(source, (width, height), options)
+    frames = frames_to_write(opened, (height, width), cfg) if cfg.layout == "evreal" else None
+    events = cut(opened, cfg.start_s, cfg.end_s)
+    count, seconds = event_writers.write_pieces(out, events, **how, frames=frames)
     size = sum(file.stat().st_size for file in (out, *out.rglob("*")) if file.is_file())
     print(f"{count} events, {seconds:.6f} s, {width}x{height}, {size} bytes: {out}")
     return out
+
+
+def frames_to_write(
+    opened: recording.EventRecording, size: sources.Size, cfg: DictConfig
+) -> RecordedFrames | None:
+    """Return the frames of a recording from `start_s` on; None, with a warning, for frames of
+    another size than the sensor's."""
+    frames = find_frames(opened)
+    if frames is None:
+        return None
+    if frames.size != size:
+        (height, width), (wanted_height, wanted_width) = frames.size, size
+        found = f"{opened.path}: frames of {width}x{height} are left out"
+        warnings.warn(f"{found}, the sensor is {wanted_width}x{wanted_height}", stacklevel=2)
+        return None
+    if cfg.start_s:
+        first = next((int(events["t"][0]) for events in opened), 0)
+        frames = frames.select(frames.times_us >= first + cfg.start_s * 1e6)
+    return frames if len(frames.times_us) else None
 
 
 def cut(pieces: Iterable[np.ndarray], start_s: float, end_s: float) -> Iterator[np.ndarray]:

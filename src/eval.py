@@ -5,7 +5,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from src.app import build, entry_point, hardware, simulation
+from src.app import benchmark, build, entry_point, hardware, simulation
 from src.figures import samples
 from src.records import results
 
@@ -15,12 +15,14 @@ def evaluate(cfg: DictConfig) -> dict:
 
     Everything goes below `cfg.paths.run`.  Returns the content of `results.json`.
     """
+    if cfg.data.get("benchmark") == "evreal":
+        return benchmark.evaluate_recordings(cfg)
     run, start = Path(cfg.paths.run), time.perf_counter()
     hardware.reserve_worker_cores(cfg)
     net = build.build_video_method(cfg)
     data = build.build_data_module(cfg, splits=("test",), optics=simulation.select_optics(cfg, net))
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
-    row = build.test_method(cfg, cfg.name, net, data, build.build_metrics(cfg))
+    row = build.test_method(cfg, build.method_name(cfg), net, data, build.build_metrics(cfg))
     samples.write_samples(run / "samples", net, data.pipelines["test"])
     return results.write_and_print_results(
         run, entry_point.resolved_yaml(cfg), [row], **entry_point.run_metadata(cfg, start)

@@ -46,7 +46,7 @@ def build_server(cfg: DictConfig) -> PageServer:
     settings = RunSettings(cfg.fps, cfg.bins, cfg.splat, cfg.window_length, cfg.form)
     keys = (
         "playback_speed", "max_waiting_windows", "noise_filter_s", "host", "port",
-        "allowed_origins",
+        "allowed_origins", "tone", "tone_time_constant_s",
     )  # fmt: skip
     server = assemble(feed, networks, views, settings, faults, **{key: cfg[key] for key in keys})
     server.page.controls.choose(name, cfg.views_used)

@@ -1,23 +1,31 @@
 """From a recording to video: python -m src.reconstruct recording=cap.raw views=views.yaml ckpt=...
 
-Writes the video and `frames.csv`: the time stamp and the events of each frame.
+Writes the video and `frames.csv`: the time stamp and the events of each frame.  With
+`output_format=film` the video shows events, one view, all views and, of a simulated recording, the
+clean clip, side by side.
 """
 
+import time
 from collections.abc import Iterator
+from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 from omegaconf import DictConfig
-from rich.progress import track
 
-from src.app import build, entry_point, hardware
+from src.app import build, console, entry_point, hardware
 from src.deploy.runtime import EventListRuntime
-from src.recordings import output, reconstruction
-from src.recordings.event_windows import WindowRule, frames_per_window
+from src.figures import samples
+from src.models.network import EventToVideoNetwork
+from src.recordings import output, reconstruction, tone, truth_file
+from src.recordings.event_windows import Window, WindowRule, cut_windows, frames_per_window
 from src.recordings.files import sources
 from src.recordings.files.event_file import ReadOptions
 from src.recordings.noise_filter import NoiseFilter
-from src.recordings.reconstruction import RunnableNetwork
+from src.recordings.reconstruction import Frame
+from src.recordings.sensor_lookup import build_lookup
+from src.recordings.truth_file import CleanClip
 from src.recordings.views import Views, views_or_whole_sensor
 from src.records import results
 
@@ -29,49 +37,115 @@ def reconstruct(cfg: DictConfig) -> Path:
 
     Raises ValueError for a recording, views, network or window that do not go together.
     """
-    run, count = Path(cfg.paths.run), 0
+    run, ready_s = Path(cfg.paths.run), []
     hardware.check_device(cfg.device)
-    network, views, span = prepare(cfg)
+    curve = tone.curve_for_output(cfg.tone, cfg.tone_time_constant_s, cfg.output_format)
+    network = reconstruction.as_event_network(build.load_network(cfg))
+    views = choose_views(cfg, network)
+    make = film_frames if cfg.output_format == "film" else video_frames
+    start = time.perf_counter()
+    frames, size = make(cfg, network, views)
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
-    with output.open_video_writer(cfg.output_format, run, views.model, cfg.playback_fps) as write:
-        for frame in track(frames(cfg, network, views, span), "frames"):
+    with output.open_video_writer(cfg.output_format, run, size, cfg.playback_fps) as write:
+        for frame in tone.apply_to_frames(console.show_frames(frames), curve):
             write(frame)
-            count += 1
-    print(f"{count} frames in {run}: {output.KINDS[cfg.output_format][1]}, frames.csv")
+            ready_s.append(time.perf_counter() - start)
+    print(describe_run(run / output.KINDS[cfg.output_format][1], views, ready_s))
     return run
 
 
-def prepare(cfg: DictConfig) -> tuple[RunnableNetwork, Views, int]:
-    """Return the network as it is run, the views it takes and how many frames a window spans."""
-    network = reconstruction.as_event_network(build.load_network(cfg))
+def describe_run(video: Path, views: Views, ready_s: list[float]) -> str:
+    """Return where the video is and how fast its frames came, the last after `ready_s[-1]`; the
+    first, for which code is compiled, does not count as speed.
+    """
+    (height, width), number, count = views.model, len(views.views), len(ready_s)
+    later_s = ready_s[-1] - ready_s[0]
+    speed = f", {(count - 1) / later_s:.1f} frames/s after the first" if later_s else ""
+    return (
+        f"{video}: {count} frames, {width}x{height} px, {number} view{'s' * (number > 1)}; "
+        f"{ready_s[-1]:.1f} s{speed}; times in {video.parent / 'frames.csv'}"
+    )
+
+
+def choose_views(cfg: DictConfig, network: EventToVideoNetwork) -> Views:
+    """Return the views of the recording that the network takes."""
     sensor = sources.sensor_size(cfg.recording, cfg.sensor_size, ReadOptions.from_keys(cfg))
     views = views_or_whole_sensor(cfg.views, sensor, cfg.resolution)
-    if not reconstruction.takes_all_views(network, len(views.views)):
-        views = views.select([(0, 0)])
+    all_of_them = reconstruction.takes_all_views(network, len(views.views))
+    return views if all_of_them else views.select([(0, 0)])
+
+
+def video_frames(
+    cfg: DictConfig, network: EventToVideoNetwork, views: Views
+) -> tuple[Iterator[Frame], tuple[int, int]]:
+    """Return the frames of the recording and their size."""
+    given = cfg.form, cfg.device, views, cfg.bins
+    runnable = reconstruction.build_runnable_network(network, *given)
+    rule = build_rule(cfg, network)
+    rule = replace(rule, as_lists=isinstance(runnable, EventListRuntime))
+
+    def read() -> Iterator[np.ndarray]:
+        return read_events(cfg, views)
+
+    options = views, rule, cfg.backward_warmup_s
+    frames = reconstruction.reconstruct_recording(read, runnable, *options, device=cfg.device)
+    return frames, views.model
+
+
+def build_rule(cfg: DictConfig, network: EventToVideoNetwork) -> WindowRule:
+    """Return how the recording is cut into windows for `network`."""
     length = cfg.window_length or reconstruction.default_window_length(network)
-    span = frames_per_window(length, cfg.fps)
-    prepared = reconstruction.build_runnable_network(network, cfg.form, cfg.device, views, cfg.bins)
-    return prepared, views, span
-
-
-def frames(
-    cfg: DictConfig, network: RunnableNetwork, views: Views, span: int
-) -> Iterator[reconstruction.Frame]:
-    """Yield the frames of the recording."""
-
-    options = ReadOptions.from_keys(cfg)
-
-    def read_events() -> Iterator[np.ndarray]:
-        events = sources.iter_recording(cfg.recording, views.sensor, options=options)
-        if cfg.noise_filter_s is None:
-            return events
-        return filter(len, map(NoiseFilter(views.sensor, cfg.noise_filter_s), events))
-
     settings = {key: cfg[key] for key in RULE_KEYS}
-    as_lists = isinstance(network, EventListRuntime)
-    rule = WindowRule(**settings, frames_per_window=span, as_lists=as_lists)
-    given = network, views, rule, cfg.backward_warmup_s
-    return reconstruction.reconstruct_recording(read_events, *given, device=cfg.device)
+    return WindowRule(**settings, frames_per_window=frames_per_window(length, cfg.fps))
+
+
+def read_events(cfg: DictConfig, views: Views) -> Iterator[np.ndarray]:
+    """Yield the events of the recording, without noise where the config says so."""
+    options = ReadOptions.from_keys(cfg)
+    events = sources.iter_recording(cfg.recording, views.sensor, options=options)
+    if cfg.noise_filter_s is None:
+        return events
+    return filter(len, map(NoiseFilter(views.sensor, cfg.noise_filter_s), events))
+
+
+def film_frames(
+    cfg: DictConfig, network: EventToVideoNetwork, views: Views
+) -> tuple[Iterator[Frame], tuple[int, int]]:
+    """Return the frames of the film, panels beside each other, and their size.
+
+    The panel of one view shows what the same network makes of the centre view; there is none of a
+    network for another number of views.
+    """
+    number, centre = len(views.views), views
+    methods = {f"{number} views": video_frames(cfg, network, views)[0]}
+    if number == 1:
+        methods = {"one view": methods["1 views"]}
+    else:
+        centre = views.select([(0, 0)])
+        if network.views is None:
+            methods = {"one view": video_frames(cfg, network, centre)[0]} | methods
+    rule = replace(build_rule(cfg, network), bins=1)
+    windows = cut_windows(read_events(cfg, views), build_lookup(centre), rule)
+    clean = truth_file.read_clean(Path(cfg.recording))
+    frames = join_frames(windows, methods, clean)
+    first = next(frames)
+    height, width = first.picture.shape[:2]
+    return chain([first], frames), (height, width)
+
+
+def join_frames(
+    windows: Iterator[Window], methods: dict[str, Iterator[Frame]], clean: CleanClip | None
+) -> Iterator[Frame]:
+    """Yield frames of panels: the events of each window, the frames of the methods and, where it is
+    known, the clean clip at that moment.
+    """
+    for window, *shown in zip(windows, *methods.values(), strict=False):
+        assert window.voxels is not None
+        panels = {"events": samples.render_events(window.voxels[0], full=1.0)}
+        panels |= {name: one.picture[None] for name, one in zip(methods, shown, strict=True)}
+        if clean is not None:
+            panels["clean"] = clean.at(window.end_us * 1e-6, shown[-1].picture.shape)[None]
+        yield replace(shown[-1], picture=samples.join_panels(panels)[0])
 
 
 if __name__ == "__main__":

@@ -1,61 +1,148 @@
-"""Look at what the simulation makes: python -m src.simulate turbulence=strong sensor=noisy."""
+"""Your video through turbulence: python -m src.simulate video=my.mp4 turbulence=strong.
 
+Or a clip of a training, a validation or a test: python -m src.simulate index=3 turbulence=strong.
+"""
+
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import rich
+import numpy as np
+import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from rich.progress import track
+from torch import Tensor
 from yaml import YAMLError
 
-from src.app import build, entry_point
+from src.app import build, entry_point, own_simulation
+from src.app.own_simulation import OwnSimulation, Part
 from src.figures import samples
-from src.recordings import simulated_recording
 from src.recordings.files import event_writers
+from src.recordings.simulated_recording import kaleidoscope_views, write_recording
+from src.recordings.truth_file import open_truth
+from src.recordings.views import Views
 from src.records import results, safe_yaml
+from src.sim.optics import Position
+from src.sim.pipeline import crop_frames
+from src.sim.sensor.response import encode_srgb
 
 SECTIONS = ("scene", "optics", "turbulence", "sensor", "data")
 CLIP_KEYS = (*SECTIONS, "seed", "fps", "bins")  # what makes a clip
+DRAWN_FRAMES = 24  # of your own clip in views.gif
 
 
 def simulate(cfg: DictConfig) -> dict:
-    """Simulate clip `index` of `split`; write clean, views, tilt and events as `views.gif`, `.png`.
+    """Simulate `video` or `photo`, or clip `index` of `split` of a scene; draw clean, views, tilt
+    and events as `views.gif`, `.png`.
 
     With `like`, the config of another run, it is just the clip that run saw (not augmented).
-    With `write` the views also go, mirrored and misaligned, onto one sensor whose events are
-    written to that file, and the truth beside it.  Returns what was drawn: D/r0, threshold ...
+    A video or photograph, or a clip with `write`, also goes, its views mirrored and misaligned,
+    onto one sensor whose events are written to a file, geometry and truth beside it.  Returns what
+    was drawn: D/r0, threshold ...
     """
-    run = Path(cfg.paths.run)
     if cfg.index < 0:
         raise ValueError(f"index must be >= 0, the number of a clip, got {cfg.index}")
+    own = cfg.video or cfg.photo
+    if cfg.like and own:
+        raise ValueError(f"like must be null with video or photo, got {cfg.like}")
     if cfg.write:  # refused before minutes of work
         height, width = cfg.camera.sensor
         event_writers.find_kind(Path(cfg.write), None, width, height, "evt3")
-    cfg = take_clip_config_from_run(cfg) if cfg.like else cfg
-    pipeline = build.build_pipeline(cfg, cfg.split)
+    return simulate_own_clip(cfg) if own else simulate_scene(cfg)
+
+
+def simulate_own_clip(cfg: DictConfig) -> dict:
+    """Simulate all of `video` or `photo` and record it, to `write` or into the run's folder."""
+    run, clip = Path(cfg.paths.run), own_simulation.read_own_clip(cfg)
+    work = OwnSimulation(cfg, clip)
+    if not hasattr(work.sensor, "events"):
+        kind = type(work.sensor).__name__
+        raise ValueError(f"sensor must be one of events for video and photo, got {kind}")
+    camera, drawn = place_views(cfg, work.optics.positions, clip.size, work.key), work.record()
+    results.create_run_folder(run, entry_point.resolved_yaml(cfg))
+    print(work.describe())
+    if cfg.photo and not cfg.speed_widths_per_s:
+        print("at rest, so that only turbulence makes events; speed_widths_per_s=0.3 moves it")
+    path, shown = Path(cfg.write or run / f"{clip.name}.raw"), []
+    path.parent.mkdir(parents=True, exist_ok=True)
+    views, count = work.allocate_views(path.parent), 0
+    with open_truth(path, camera, len(clip.frames), clip.fps, drawn) as truth:
+        for part in work.parts(views, track):
+            truth.add(part.clean, part.views, part.tilt)
+            shown += [part] if count <= DRAWN_FRAMES else []
+            count += len(part.clean)
+        written = draw_own_clip(run, work, views, shown)
+        events = write_recording(path, views, work.fps, camera, work.sensor, track)
+    print_files(path, events, written)
+    return drawn
+
+
+def draw_own_clip(run: Path, work: OwnSimulation, views: Tensor, parts: list[Part]) -> list[Path]:
+    """Draw the first frames as `views.gif` and `views.png`."""
+    shown = slice(1, DRAWN_FRAMES + 1)
+    clean = torch.cat([part.clean for part in parts])[shown].numpy()
+    seen = torch.cat([part.views for part in parts], 1)[:, shown].numpy()
+    tilt = torch.cat([part.tilt for part in parts], 1)[:, shown].numpy()
+    light = views[None, :, : len(clean) * work.substeps + 1].float()
+    counts = work.sensor.voxels(light, work.fps, 1, substeps=work.substeps)[0, :, :, 0].numpy()
+    return samples.write_light_field(run, clean, seen, tilt, counts, work.optics)
+
+
+def simulate_scene(cfg: DictConfig) -> dict:
+    """Simulate clip `index` of `split` and, with `write`, record it."""
+    run, cfg = Path(cfg.paths.run), take_clip_config_from_run(cfg) if cfg.like else cfg
+    pipeline, step = build.build_pipeline(cfg, cfg.split), cfg.data.substeps
     draw = pipeline.draw(cfg.index)
     views = pipeline.render_views([draw])[0].float()
     sample = pipeline.simulate_sensor([draw], views[None])
-    tilt = pipeline.tilt(draw)
-    windows = slice(cfg.data.substeps, None, cfg.data.substeps)
+    tilt, drawn = pipeline.tilt(draw), sample.parameters[0]
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
-    seen = views[:, windows], tilt[:, windows], pipeline.optics
-    written = samples.write_light_field(run, sample, *seen)
-    if cfg.write:
-        height, width = views.shape[-2:]
-        sensor: Any = draw.sensor  # one with `events`
-        camera = simulated_recording.kaleidoscope_views(
-            list(pipeline.positions), model=(height, width), key=draw.key,
-            sensor=tuple(cfg.camera.sensor), tile_px=cfg.camera.tile_px,
-        )  # fmt: skip
-        simulated_recording.write_recording(
-            cfg.write, views, draw.clip.fps, camera, sensor, tilt=tilt
-        )
-        written += [Path(cfg.write)]
-        written += [Path(cfg.write).with_suffix(end) for end in (".views.yaml", ".truth.h5")]
-    rich.print(sample.parameters[0])
-    print(f"clip {cfg.index} of {cfg.split}: {', '.join(map(str, written))}")
-    return sample.parameters[0]
+    counts = sample.voxels[0].sum(2).transpose(0, 1).numpy()
+    seen = views[:, step::step].numpy(), tilt[:, step::step].numpy(), counts
+    clean = crop_frames(draw.clip.frames, draw.crop)[::step]
+    print(describe_clip(cfg, drawn, clean.shape, draw.clip.fps / step))
+    written = samples.write_light_field(run, clean[1:].numpy(), *seen, pipeline.optics)
+    if not cfg.write:
+        print(f"written: {', '.join(map(str, written))}")
+        return drawn
+    path, size = Path(cfg.write), (views.shape[-2], views.shape[-1])
+    camera, fps = place_views(cfg, pipeline.positions, size, draw.key), draw.clip.fps
+    sensor: Any = draw.sensor  # one with `events`
+    with open_truth(path, camera, len(clean), fps / step, drawn) as truth:
+        codes = encode_srgb(views) if pipeline.decodes_srgb else views
+        truth.add(clean, codes[:, ::step], tilt[:, ::step])
+        events = write_recording(path, views, fps, camera, sensor, track)
+    print_files(path, events, written)
+    return drawn
+
+
+def place_views(
+    cfg: DictConfig, positions: Sequence[Position], model: tuple[int, int], key: int
+) -> Views:
+    """Return where the camera of the config has the views, each of `model` (h, w) pixels."""
+    camera = {"sensor": tuple(cfg.camera.sensor), "tile_px": cfg.camera.tile_px}
+    return kaleidoscope_views(list(positions), model=model, key=key, **camera)
+
+
+def describe_clip(cfg: DictConfig, drawn: dict, shape: Sequence[int], fps: float) -> str:
+    """Return what a clip of a scene is, in one line."""
+    frames, height, width = shape
+    return (
+        f"clip {cfg.index} of {cfg.split}, {drawn['name']}: {frames} frames of {width}x{height} px "
+        f"at {fps:.6g} frames/s; turbulence {drawn['severity']}, contrast threshold "
+        f"{drawn['threshold']:.3f}"
+    )
+
+
+def print_files(path: Path, events: np.ndarray, pictures: list[Path]) -> None:
+    """Print what was written and how to go on."""
+    views, truth = (path.with_suffix(end) for end in (".views.yaml", ".truth.h5"))
+    size = truth.stat().st_size / 1e6
+    print(f"{len(events)} events in {path}, geometry in {views}")
+    print(f"clean frames, views and tilt in {truth} ({size:.1f} MB)")
+    print(f"pictures: {', '.join(map(str, pictures))}")
+    print(f"next: python -m src.reconstruct recording={path} views={views} ckpt=setnet_small")
 
 
 def take_clip_config_from_run(cfg: DictConfig) -> DictConfig:

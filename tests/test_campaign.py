@@ -259,6 +259,19 @@ def test_a_mean_of_weights_is_weighted(tmp_path):
     assert card == {"hours": 3.0, "mean_of": {"0.25": 0.25, "0.75": 0.75}}
 
 
+@pytest.mark.parametrize("name", ["lf3x3", "clean/etnet"])
+def test_weights_are_shipped_to_where_the_recipe_looks_for_them(name, tmp_path, monkeypatch):
+    work, words = RecipeWork(read(name), Settings(tmp_path)), []
+    monkeypatch.setattr("scripts.campaign.work.run", lambda module, *given: words.extend(given))
+    for stage in work.recipe.stages:
+        path = work.folder / f"{stage.name}.safetensors"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    work._ship(work.recipe.stages[-1])
+    options = dict(zip(words[1::2], words[2::2], strict=True))
+    assert Path(options["--to"]) / f"{options['--name']}.safetensors" == work.shipped
+
+
 def test_a_training_gives_way_to_other_sessions(tmp_path):
     sleeper = subprocess.Popen(["sleep", "60"], start_new_session=True)
     group = Path(f"/proc/{sleeper.pid}/autogroup")
@@ -307,7 +320,7 @@ TINY = [
     "scene=photos", "scene.height=64", "scene.width=64", "data.windows=8", "data.crop=32",
     "data.loss_pairs=2", "data.loss_from=2", "data.batch_size=2", "data.clips=null",
     "data.cache_clips=null", "data.batch_reuse=1", "data.val_clips=1", "data.test_clips=1",
-    "data.test_windows=8", "data.unscored_windows=1", "callbacks.learning_curve.every_h=0.001",
+    "data.test_windows=8", "data.unscored_windows=1", "callbacks.learning_curve.interval_h=0.001",
 ]  # fmt: skip
 
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from baselines.mambatm import MambaTM
+from src.app.compared_networks import load_candidates
 from src.chart import chart
 from src.models import save
 from tests.test_train import config
@@ -71,3 +72,16 @@ def test_a_post_processor_is_scored_and_paid_for(tmp_path):
 def test_what_cannot_be_measured_is_named(tmp_path, override, message):
     with pytest.raises(ValueError, match=message):
         chart(tiny(tmp_path, "+networks={}", override))
+
+
+@pytest.mark.parametrize("found", [True, False])
+def test_published_networks_without_their_weights_are_timed_only(tmp_path, request, found):
+    names = ["firenet", "firenet_plus", "pienet", "pienet_lite", "cista"]
+    folder = request.getfixturevalue("shared_data") / "weights" if found else tmp_path
+    cfg = config("chart", tmp_path, f"paths.published={folder}")
+    cfg.networks = {name: cfg.networks[name] for name in names}
+    made = load_candidates(cfg)
+    assert [one.name for one in made] == names
+    assert all(one.trained == found and one.network is not None for one in made)
+    sizes = {one.name: sum(p.numel() for p in one.loaded.parameters()) for one in made}
+    assert (sizes["pienet"], sizes["pienet_lite"]) == (171_121, 78_537)

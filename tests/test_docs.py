@@ -14,6 +14,7 @@ LIMITS = {  # words, as `wc -w` counts them
     "docs/training.md": 1200,
     "docs/simulation.md": 3500,
     "docs/reliability.md": 500,
+    "docs/benchmarks.md": 1100,
 }
 DECISIONS = sorted((ROOT / "docs" / "decisions").iterdir())
 DECISION_WORDS = 350
@@ -71,7 +72,7 @@ def test_links_of_a_page_lead_somewhere(page):
 
 
 def test_pages_name_modules_that_are_there():
-    module = re.compile(r"python -m (src\.\w+)|\b((?:scripts|benchmarks)\.[a-z]\w*)")
+    module = re.compile(r"python -m (src\.\w+)|\b((?:scripts|benchmarks)\.(?!md\b)[a-z]\w*)")
     for page in set(PAGES) - {ROOT / "CHANGELOG.md"}:  # which also names what is gone
         for names in module.findall(page.read_text()):
             path = ROOT / "".join(names).replace(".", "/")

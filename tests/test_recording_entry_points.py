@@ -13,7 +13,7 @@ from hydra import compose, initialize_config_dir
 from src.calibrate import calibrate
 from src.compare import compare
 from src.reconstruct import reconstruct
-from src.recordings import sensor_lookup, simulated_recording, views
+from src.recordings import sensor_lookup, simulated_recording, truth_file, views
 from src.sim.optics import layout
 from src.sim.sensor.sensor import EventSensor
 from tests.conftest import ROOT
@@ -124,6 +124,36 @@ def test_the_reconstructed_dot_moves_as_the_true_one(folder, found, tmp_path):
         bright = np.clip(file["frames"][:].astype(float) - 140, 0, None)
     x = (bright.sum(1) @ np.arange(88)) / bright.sum((1, 2))
     assert np.corrcoef(x[5:], np.arange(len(x) - 5))[0, 1] > 0.99
+
+
+def test_a_film_shows_events_one_view_all_views_and_the_clean_clip(folder, found, tmp_path, capsys):
+    (tmp_path / "dot.raw").symlink_to(folder / "dot.raw")
+    truth = views.load_views(found)
+    with truth_file.open_truth(tmp_path / "dot.raw", truth, 31, 300.0, {}) as file:
+        clean = torch.linspace(0, 1, 31)[:, None, None].expand(31, 88, 88)
+        file.add(clean, clean.expand(9, -1, -1, -1), torch.zeros(9, 31, 2, 88, 88))
+    chosen = [f"recording={tmp_path}/dot.raw", f"views={found}", "ckpt=setnet_small", "fps=300"]
+    run = reconstruct(
+        config("reconstruct", tmp_path / "run", *chosen, "output_format=film", "end_s=0.05")
+    )
+    file, frames = cv2.VideoCapture(str(run / "film.mp4")), []
+    while (read := file.read())[0]:
+        frames.append(read[1])
+    assert len(frames) == 15 and frames[0].shape == (106, 4 * 88 + 3 * 4, 3)
+    panels = [np.stack(frames)[:, 20:, 92 * k : 92 * k + 88].astype(float) for k in range(4)]
+    shown = panels[3].mean((1, 2, 3)) / 255
+    assert np.allclose(shown, (np.arange(15) + 1) / 30, atol=0.04)  # the frame at the window's end
+    assert panels[0].mean() > 200 and np.ptp(panels[0][..., 0] - panels[0][..., 2]) > 50  # colours
+    assert np.abs(panels[1] - panels[2]).mean() > 0.5  # one view is not nine
+    (line,) = [one for one in capsys.readouterr().out.splitlines() if "film.mp4" in one]
+    assert line.startswith(f"{run}/film.mp4: 15 frames, 88x88 px, 9 views; ")
+    assert "frames/s after the first" in line
+
+
+def test_without_other_numbers_of_views_the_panel_is_left_out(folder, found, tmp_path):
+    chosen = [f"recording={folder}/dot.raw", f"views={found}", "ckpt=lf3x3", "end_s=0.02"]
+    run = reconstruct(config("reconstruct", tmp_path / "run", *chosen, "output_format=film"))
+    assert cv2.VideoCapture(str(run / "film.mp4")).read()[1].shape[1] == 2 * 88 + 4
 
 
 def test_without_views_the_sensor_is_one_view(folder, tmp_path):
@@ -269,9 +299,9 @@ def test_the_tail_behind_a_bright_dot_is_not_followed(tmp_path):
         cv2.imwrite(str(tmp_path / f"film/{k:02d}.png"), picture)
     given = [f"videos=[{tmp_path}/film]", "names=[film]", "line=[[0,10],[79,10]]"]
     found = {
-        follow: compare(config("compare", tmp_path / follow, *given, f"moving_thing={follow}"))[
-            "film"
-        ]
+        follow: compare(
+            config("compare", tmp_path / follow, *given, f"moving_object_brightness={follow}")
+        )["film"]
         for follow in ("any", "bright")
     }
     assert found["bright"]["line_deviation_px"] < 0.1 < 1 < found["any"]["line_deviation_px"]
@@ -291,7 +321,10 @@ def test_videos_of_two_sizes_are_not_compared(tmp_path):
     [
         ("line=null", "one of line, circle, spin and still"),
         ("line=[[0,0],[500,0]]", "must stay"),
-        ("line=[[0,0],[9,0]] moving_thing=all", "moving_thing must be one of"),
+        (
+            "line=[[0,0],[9,0]] moving_object_brightness=all",
+            "moving_object_brightness must be one of",
+        ),
     ],
 )
 def test_a_slice_that_cannot_be_taken_is_refused(wrong, message, tmp_path):

@@ -29,7 +29,9 @@ def clean(monkeypatch):
 
 def test_a_trained_run_is_shipped_whole_with_its_card(tmp_path, monkeypatch, clean):
     run, weights = tmp_path / "run", tmp_path / "weights"
-    train(config("train", run, *TINY, "trainer.max_steps=2", "callbacks.learning_curve.every_h=1"))
+    train(
+        config("train", run, *TINY, "trainer.max_steps=2", "callbacks.learning_curve.interval_h=1")
+    )
     monkeypatch.setattr(files, "WEIGHTS", weights)
     path = ship(run, "tiny/one", [run])
     shipped, trained = files.load("tiny/one"), files.load(files.newest_checkpoint(run))

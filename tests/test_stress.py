@@ -12,9 +12,11 @@ ABSENT = "{ckpt: nowhere, views: 9}"
 SETNET = "{ckpt: nowhere, views: 9, model: {_target_: src.models.setnet.SetNet}}"
 PACKAGE = "src.bench.stress_tests"
 FUNCTIONS = {
-    "retention": "recurrence.measure_contrast_retention_percent, windows: [2, 4], limit: 90",
-    "dropout": "conditions.measure_view_dropout_loss, counts: [1], draws: 1, limit: 0.5",
-    "fast": "conditions.measure_window_rate_loss, rates_hz: [1200], limit: 1.0",
+    "retention": (
+        "recurrence.measure_contrast_retention_percent, windows: [2, 4], limit_percent: 90"
+    ),
+    "dropout": "conditions.measure_view_dropout_loss, counts: [1], draws: 1, limit_db: 0.5",
+    "fast": "conditions.measure_window_rate_loss, rates_hz: [1200], limit_db: 1.0",
 }
 ROWS = [
     f"{name}: {{title: {name}, test: {{_target_: {PACKAGE}.{function}}}}}"

@@ -138,7 +138,7 @@ class RecipeWork:
         run(
             "scripts.ship_weights", str(self.folder / last), "--name", self.name, "--recipe",
             self.name, "--weights", str(self._weights(stage.name)), "--to",
-            str(self.shipped.parent),
+            str(self.settings.out / "weights"),
         )  # fmt: skip
 
 

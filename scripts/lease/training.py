@@ -25,13 +25,15 @@ MIN_HOURS = 1e-6
 
 
 class ExportingCurve(LearningCurve):
-    """A learning curve that also exports every `every_s` seconds; after each export `publish` is
+    """A learning curve that also exports every `export_interval_s`; after each export `publish` is
     given this and the module.
     """
 
-    def __init__(self, export: Path, every_h: float, every_s: float, publish: Callable):
-        super().__init__(str(export.with_suffix(".csv")), every_h, str(export))
-        self.every_s, self.publish = every_s, publish
+    def __init__(
+        self, export: Path, interval_h: float, export_interval_s: float, publish: Callable
+    ):
+        super().__init__(str(export.with_suffix(".csv")), interval_h, str(export))
+        self.export_interval_s, self.publish = export_interval_s, publish
         self.scoring_s, self.exported_at = 0.0, time.monotonic()
 
     @property
@@ -44,7 +46,7 @@ class ExportingCurve(LearningCurve):
     ) -> None:
         """Score when a row is due; export when it is time."""
         super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
-        if time.monotonic() - self.exported_at >= self.every_s:
+        if time.monotonic() - self.exported_at >= self.export_interval_s:
             self.export_weights(pl_module)
 
     def add_row(self, trainer: Trainer, module: LightningModule) -> None:

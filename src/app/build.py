@@ -1,9 +1,11 @@
 """Data, networks, metrics and trainers from a configuration; simulations: simulation.py."""
 
 import math
+from pathlib import Path
 
 import lightning
 import torch
+from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.callbacks import ProgressBar
 from omegaconf import DictConfig
 from torch import nn
@@ -30,6 +32,7 @@ from src.training.clip_cache import CachedPipeline
 from src.training.datamodule import LightFieldData
 from src.training.disk_cache import BackgroundFiller, DiskClipCache
 from src.training.ema import WeightEMA
+from src.training.progress import TrainingProgress
 from src.training.reconstructor import PostprocessorTraining, Reconstructor
 from src.training.schedule import TrainingClock
 from src.training.step_guard import StepGuard
@@ -110,6 +113,21 @@ def load_network(cfg: DictConfig) -> VideoMethod:
     if cfg.get("baseline"):
         return build_part(cfg, "baseline").eval()
     raise ValueError("ckpt or baseline must name a network, got neither")
+
+
+def method_name(cfg: DictConfig) -> str:
+    """Return what a table calls the method of a test: the `name` that was given, else the network
+    or the baseline.
+    """
+    if cfg.name != cfg.task:
+        return cfg.name
+    if cfg.ckpt:
+        path = Path(cfg.ckpt)
+        return path.stem if path.suffix else str(cfg.ckpt).rstrip("/")
+    chosen = (
+        HydraConfig.get().runtime.choices.get("baseline") if HydraConfig.initialized() else None
+    )
+    return chosen or str(cfg.baseline._target_).rpartition(".")[2]
 
 
 def build_video_method(cfg: DictConfig) -> VideoMethod:
@@ -212,6 +230,7 @@ def test_method(
     # On SLURM a trainer takes up what a preempted training left in its folder: this one has none.
     options: dict = {"precision": "32-true", "logger": False, "enable_checkpointing": False}
     options |= {"devices": 1, "num_nodes": 1, "strategy": "auto", "default_root_dir": None}
-    trainer = build_part(cfg, "trainer", callbacks=[], **options)
+    shown = [TrainingProgress(tested=name)] if cfg.trainer.enable_progress_bar else []
+    trainer = build_part(cfg, "trainer", callbacks=shown, **options)
     options = {"trainer": trainer, "unscored_windows": cfg.data.unscored_windows}
     return evaluation.test_network(name, net, data, metrics, **options)

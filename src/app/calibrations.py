@@ -14,9 +14,11 @@ from src.figures import calibration_figures
 from src.models.network import EventToVideoNetwork
 from src.recordings import event_windows, reconstruction, sensor_lookup
 from src.recordings.calibration import (
+    activity_pictures,
     contrast_threshold,
     dot_statistics,
     gaussian_dots,
+    scene_alignment,
     turbulence_meter,
     view_alignment,
 )
@@ -61,6 +63,28 @@ def calibrate_views(
         geometry = aligned.views
     geometry.save(folder / "views.yaml")
     return geometry
+
+
+def calibrate_views_on_scene(
+    recording: str,
+    folder: Path,
+    scene: scene_alignment.Scene,
+    *,
+    resolution: Sequence[int],
+    sensor_size: Sequence[int] | None = None,
+    options: ReadOptions = ReadOptions(),
+) -> scene_alignment.SceneAlignment:
+    """Find the views of a kaleidoscope in whatever it shows; write `views.yaml`, `views.png` and
+    `overlay.png`.  Raises ValueError as `scene_alignment.align_scene` does."""
+    pictures = activity_pictures.read_activity_pictures(recording, sensor_size, options)
+    found = scene_alignment.align_scene(pictures, scene, (resolution[0], resolution[1]))
+    total = pictures.sum((0, 1))
+    shown = view_alignment.repair_picture(np.log1p(total))
+    calibration_figures.draw_view_residuals(shown, found.aligned, folder / "views.png")
+    views, overlay = found.aligned.views, folder / "overlay.png"
+    calibration_figures.draw_view_overlays(total, views, found.matched, overlay)
+    views.save(folder / "views.yaml")
+    return found
 
 
 def calibrate_contrast_threshold(

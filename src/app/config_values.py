@@ -23,11 +23,12 @@ KINDS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(
         ("noise_filter_s", "train_hours", "grad_clip_norm", "ema_decay", "state_rounding_step",
          "loss_spike_factor", "turbulence.wind_m_s", "turbulence.baseline_m",
-         "callbacks.learning_curve.every_h"),
+         "callbacks.learning_curve.interval_h", "data.part_s", "data.start_s", "data.end_s"),
         (NUMBER, NULL),
     ),
     **dict.fromkeys(
-        ("data.clips", "data.cache_clips", "data.loss_pairs", "dots.fit_radius_px", "last", "stem"),
+        ("data.clips", "data.cache_clips", "data.loss_pairs", "dots.fit_radius_px", "last", "stem",
+         "longest_side_px"),
         (WHOLE, NULL),
     ),
     **dict.fromkeys(
@@ -35,7 +36,8 @@ KINDS: dict[str, tuple[str, ...]] = {
          "first", "air.max_frames", "dots.rows", "dots.cols", "data.batch_size", "data.test_seed",
          "data.batch_reuse", "data.epoch_clips", "data.windows", "data.substeps", "data.workers",
          "data.test_windows", "data.test_clips", "data.val_clips", "data.unscored_windows",
-         "data.loss_from", "optics.views", "width", "scene.height", "scene.width"),
+         "data.loss_from", "data.events_per_window", "optics.views", "width", "scene.height",
+         "scene.width"),
         (WHOLE,),
     ),
     **dict.fromkeys(("sensor_size", "resolution", "line", "circle", "spin"), (LIST, NULL)),
@@ -44,12 +46,14 @@ KINDS: dict[str, tuple[str, ...]] = {
     "run": (WORD, LIST),
     "names": (LIST, NULL),
     "live:threads": (WHOLE,),
-    "calibrate:fps": (NUMBER, NULL),
+    **dict.fromkeys(("calibrate:fps", "simulate:fps", "camera.tile_px"), (NUMBER, NULL)),
     "compare:still": (NUMBER, NULL),
     "data.rates": (LIST, NULL),
     "data.crop": (NUMBER, LIST, NULL),
     "data.test_crop": (NUMBER, NULL),
-    "data.test_set": (WORD, NULL),
+    **dict.fromkeys(
+        ("data.test_set", "data.grid_edges", "data.output_normalisation"), (WORD, NULL)
+    ),
     "window_length": (WORD, NULL),
     "form": (WORD, NULL),
     "cuda_graphs": (WORD, FLAG),

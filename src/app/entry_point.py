@@ -23,12 +23,13 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.syntax import Syntax
 
 from src.app import console
+from src.app.compose import CONF
 from src.app.config_values import check_values
+from src.app.help import help_text
 from src.app.path_overrides import name_job_folder, quote_paths, unquote_override
 from src.app.renamed_keys import check_keys, check_overrides, explain_refused_key
 from src.records import results, tracking
 
-CONF = str(Path(__file__).resolve().parents[2] / "conf")
 FAILURE_FILE = "failed.txt"  # in the folder of a sweep's job: why it failed
 
 OmegaConf.register_new_resolver("one_folder", name_job_folder, replace=True)
@@ -53,6 +54,9 @@ def run_command(work: Callable[[DictConfig], object], config: str) -> None:
             failures.append(error)  # Hydra would print it, and go on to raise it
 
     def run() -> None:
+        if {"--help", "-h"} & set(sys.argv[1:]) and "--config-name" not in sys.argv:
+            print(help_text(config, sys.modules[work.__module__].__doc__ or ""))
+            return
         main()
         if failures:
             raise failures[0]

@@ -12,6 +12,7 @@ from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from baselines.published import load_pretrained
+from src import HOME
 from src.models.network import EventToVideoNetwork, FramePostprocessor, VideoMethod
 from src.models.setnet import SetNet
 from src.sim.scenes.clip import Scene
@@ -90,7 +91,7 @@ def instantiate_node(node: Any, extra_packages: Sequence[str] = (), **kwargs) ->
     for target in _find_targets(plain):
         _check_target(target, extra_packages)
     try:
-        return instantiate(node, _convert_="all", **kwargs)
+        return instantiate(_rename_targets(plain) if HOME else node, _convert_="all", **kwargs)
     except InstantiationException as error:
         if isinstance(error.__cause__, ValueError):
             raise error.__cause__ from None
@@ -106,6 +107,21 @@ def _find_targets(node: Any) -> Iterator[str]:
             yield from _find_targets(value)
 
 
+def _importable(target: str) -> str:
+    """Return the name by which a class is imported that a config calls src.* or baselines.*."""
+    return HOME + target if target.startswith(("src.", "baselines.")) else target
+
+
+def _rename_targets(node: Any) -> Any:
+    """Return nested dicts and lists with every `_target_` as it is imported."""
+    if isinstance(node, dict):
+        renamed = {name: _rename_targets(value) for name, value in node.items()}
+        return (
+            renamed | {"_target_": _importable(node["_target_"])} if "_target_" in node else renamed
+        )
+    return [_rename_targets(value) for value in node] if isinstance(node, list) else node
+
+
 def _check_target(target: str, packages: Sequence[str]) -> None:
     """Raise ValueError unless `target` is a class that an allowed package defines.
 
@@ -119,10 +135,10 @@ def _check_target(target: str, packages: Sequence[str]) -> None:
     if not target.startswith(("src.", "baselines.", "torch.optim.", "lightning.", *own)):
         raise ValueError(refusal)
     try:
-        named = get_object(target)
+        named = get_object(_importable(target))
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f"_target_ must name a class, got {target}") from error
-    module = f"{getattr(named, '__module__', '')}."
+    module = f"{getattr(named, '__module__', '')}.".removeprefix(HOME)
     defined_here = isinstance(named, type) and module.startswith(ALLOWED_PACKAGES + own)
     if named not in FACTORIES and not defined_here and not module.startswith(FUNCTIONS):
         raise ValueError(refusal)

@@ -14,7 +14,7 @@ from pathlib import Path
 PATH_KEYS = frozenset({
     "against", "allowed_origins", "backbone", "cache_root", "ckpt", "corners", "distillation_cache",
     "export", "into", "like", "measured", "name", "names", "offered_networks", "out",
-    "postprocessor", "published", "recording", "reference_images", "root", "run", "save",
+    "photo", "postprocessor", "published", "recording", "reference_images", "root", "run", "save",
     "save_dir", "teachers", "title", "extra_train_root", "video", "video_root", "videos", "weights",
     "write",
 })  # fmt: skip

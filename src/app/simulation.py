@@ -20,6 +20,7 @@ from src.training.batch_sampler import LargeCropStream
 from src.training.clip_cache import CachedPipeline, ClipCache, DeviceClipCache
 from src.training.disk_cache import DiskClipCache, hash_file_lists
 
+FPS = 120.0
 DEVICE_CACHES: dict[str, DeviceClipCache] = {}  # those of this process, by all that makes them
 
 
@@ -48,7 +49,7 @@ def build_pipeline(cfg: DictConfig, split: str, optics: Optics | None = None) ->
     return CachedPipeline(
         build_clip_cache(cfg),
         optics,
-        _build_sensor(cfg, _count(cfg, "seed", least=0)),
+        build_sensor(cfg, _count(cfg, "seed", least=0)),
         windows=windows,
         bins=_count(cfg, "bins"),
         crop=crop,
@@ -115,7 +116,7 @@ def _clip_inputs(cfg: DictConfig, optics: Optics) -> dict:
         "optics": optics.positions,
         "files": hash_file_lists(parts),
         "measured": Path(measured).read_text() if measured else None,
-        "decodes_srgb": _decodes_srgb(cfg),
+        "decodes_srgb": decodes_srgb(cfg),
         "seed": cfg.seed,
         "rates": _frame_rates(cfg, "train"),
         "frames": {"windows": windows, "substeps": substeps, "crop": cfg.data.cache_crop},
@@ -135,7 +136,7 @@ def _build_uncached_pipeline(
         FrameRateMixture(scenes) if len(scenes) > 1 else scenes[0],
         optics,
         build_part(cfg, "turbulence"),
-        _build_sensor(cfg, seed),
+        build_sensor(cfg, seed),
         split=split,
         seed=seed,
         bins=_count(cfg, "bins"),
@@ -143,17 +144,17 @@ def _build_uncached_pipeline(
         crop=crop,
         random_crop=split == "train",
         clips=clips,
-        decodes_srgb=_decodes_srgb(cfg),
+        decodes_srgb=decodes_srgb(cfg),
     )
 
 
-def _decodes_srgb(cfg: DictConfig) -> bool:
+def decodes_srgb(cfg: DictConfig) -> bool:
     """Return whether frames are decoded before the turbulence, which acts on light."""
     return cfg.sensor.get("input") == "srgb"
 
 
-def _build_sensor(cfg: DictConfig, seed: int) -> Sensor:
-    light = {"input": "linear"} if _decodes_srgb(cfg) else {}
+def build_sensor(cfg: DictConfig, seed: int) -> Sensor:
+    light = {"input": "linear"} if decodes_srgb(cfg) else {}
     return build_part(cfg, "sensor", seed=seed, **light)
 
 
@@ -179,6 +180,10 @@ def _side(cfg: DictConfig, key: str) -> Any:
 def _frame_rates(cfg: DictConfig, split: str) -> list[float]:
     key = "data.rates" if split == "train" and cfg.data.rates else "fps"
     given = OmegaConf.select(cfg, key)
+    if (
+        given is None and cfg.get("task") == "simulate"
+    ):  # there null is the rate of a video of one's own
+        given = FPS
     rates = list(given) if isinstance(given, Sequence) else [given]
     if not rates or not all(isinstance(r, int | float) and 0 < r < math.inf for r in rates):
         raise ValueError(f"{key} must be > 0 windows a second, got {given}")

@@ -62,6 +62,22 @@ def draw_views(picture: UInt8[np.ndarray, "h w"], views: Views, path: Path) -> N
     save_figure(figure, path)
 
 
+def draw_view_overlays(
+    picture: Float[np.ndarray, "h w"], views: Views, matched: Mapping[Position, float], path: Path
+) -> None:
+    """Draw each view of a sensor picture over the centre one: what coincides is white, what only
+    the view shows magenta, only the centre view green."""
+    rows, cols = ([at[axis] for at in views.positions] for axis in (0, 1))
+    shape = max(rows) - min(rows) + 1, max(cols) - min(cols) + 1
+    seen = dict(zip(views.positions, views.warp_to_model(np.log1p(picture)), strict=True))
+    figure = Figure(figsize=(4 * shape[1], 4 * shape[0] * views.model[0] / views.model[1] + 1))
+    for at, axes in zip(views.positions, figure.subplots(*shape, squeeze=False).flat, strict=True):
+        layers = [seen[key] / np.percentile(seen[key], 99.5) for key in (at, (0, 0), at)]
+        axes.imshow(np.clip(np.stack(layers, axis=-1), 0, 1))
+        axes.set(xticks=[], yticks=[], title=f"{at}: {matched[at]:.0%} matched")
+    save_figure(figure, path)
+
+
 def draw_event_rates(estimate: ThresholdEstimate, path: Path) -> None:
     """Draw event rate against contrast threshold (the paper's supplement): the simulated rates, the
     recording's with their intervals, and where they meet.

@@ -7,17 +7,17 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from PIL import Image
-from torch import Tensor
 
 from src.figures.comparison import VideoRow, draw_comparison
 from src.models.network import VideoMethod
 from src.records.atomic import atomic_path
 from src.sim.optics import Optics
-from src.sim.pipeline import Pipeline, Sample, simulate
+from src.sim.pipeline import Pipeline, simulate
 
 PLAYBACK_FPS = 15.0
 TITLE_PX = 18  # height of the strip with a panel's name
 GAP_PX = 4
+MAX_VIEW_PX = 160  # longest side of a view in views.gif
 MIN_HEIGHT_PX = 160  # lower panels are enlarged by a whole factor
 
 Video = Float[np.ndarray, "_frames _h _w *_rgb"]
@@ -52,21 +52,24 @@ def write_samples(
 
 
 def write_light_field(
-    folder: Path, sample: Sample, views: Float[Tensor, "views windows h w"],
-    tilt: Float[Tensor, "views windows 2 h w"], optics: Optics,
+    folder: Path, clean: Video, views: Float[np.ndarray, "views windows h w"],
+    tilt: Float[np.ndarray, "views windows 2 h w"],
+    counts: Float[np.ndarray, "views windows h w"], optics: Optics,
 ) -> list[Path]:  # fmt: skip
     """Write `views.gif` and its last frame `views.png`: the clean clip, and of every view its
-    light, in [0, 1], its tilt and its events, in the arrangement of the views.
+    light, in [0, 1], its tilt and its sums of polarity, in the arrangement of the views; pictures
+    longer than MAX_VIEW_PX shrunk to that.
 
     `tilt`, in pixels, is drawn as the mean of both axes: blue where the picture is pushed right or
     down, red where left or up.
     """
-    events = [render_events(part.sum(1).numpy()) for part in sample.voxels[0].unbind(1)]
-    reach = float(tilt.abs().max().clamp(min=1e-6))
-    pushed = [render_events(part.mean(1).numpy(), full=reach) for part in tilt]
+    clean, (views, tilt, counts) = _shrink(clean), map(_shrink, (views, tilt, counts))
+    events = [render_events(part) for part in counts]
+    reach = max(float(np.abs(tilt).max()), 1e-6)
+    pushed = [render_events(part.mean(1), full=reach) for part in tilt]
     panels = {
-        "clean": sample.target[0, :, 0].numpy(),
-        "views": tile_views([view.numpy() for view in views], optics),
+        "clean": clean,
+        "views": tile_views(list(views), optics),
         f"tilt, +-{reach:.1f} px": tile_views(pushed, optics),
         "events": tile_views(events, optics),
     }
@@ -75,6 +78,18 @@ def write_light_field(
     write_video(paths[0], frames, PLAYBACK_FPS)
     write_video(paths[1], frames[-1:], PLAYBACK_FPS)
     return paths
+
+
+def _shrink(pictures: Float[np.ndarray, "*n h w"]) -> Float[np.ndarray, "*n h2 w2"]:
+    """Return pictures at most MAX_VIEW_PX long, by means over areas."""
+    *shape, height, width = pictures.shape
+    shrink = MAX_VIEW_PX / max(height, width)
+    if shrink >= 1:
+        return pictures
+    size = max(1, round(width * shrink)), max(1, round(height * shrink))
+    flat = pictures.reshape(-1, height, width)
+    small = [cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in flat]
+    return np.stack(small).reshape(*shape, *size[::-1])
 
 
 def tile_views(videos: list[Video], optics: Optics) -> Video:

@@ -31,6 +31,8 @@ def assemble(
     playback_speed: float = 1.0,
     max_waiting_windows: int = 16,
     noise_filter_s: float | None = None,
+    tone: str = "none",
+    tone_time_constant_s: float = 0.5,
     host: str = "127.0.0.1",
     port: int = 8600,
     allowed_origins: Sequence[str] = (),
@@ -45,6 +47,7 @@ def assemble(
     noise_filter = None if noise_filter_s is None else NoiseFilter(views.sensor, noise_filter_s)
     reader = FeedReader(feed, cutter, waiting, counter, clock, Meters(), faults, noise_filter)
     player = Player(reader, Controls(networks, views, settings), FrameRing(views.model))
+    player.set_tone(tone, tone_time_constant_s)
     return PageServer(LivePage(player, views.positions), host, port, allowed_origins)
 
 

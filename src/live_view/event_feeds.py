@@ -38,8 +38,8 @@ class Feed(ABC):
     sensor: Size
 
     @abstractmethod
-    def chunks(self, stopped: threading.Event) -> Chunks:
-        """Yield chunks of events, not empty, until `stopped`."""
+    def iter_event_chunks(self, stopped: threading.Event) -> Chunks:
+        """Yield chunks of events until `stopped`; an empty one: a recording starts again."""
 
     def close(self) -> None:  # noqa: B027 - most have nothing open
         """Release what is open."""
@@ -72,27 +72,23 @@ def open_feed(
 
 
 class FileFeed(Feed):
-    """Events of a file; `loop`: again and again, the clock going on."""
+    """Events of a file; `loop`: again and again, each time from its first time stamp."""
 
     is_live = False
 
     def __init__(self, path: str, sensor: Size, loop: bool, options: ReadOptions = ReadOptions()):
         self.path, self.sensor, self.loop, self.options = path, sensor, loop, options
 
-    def chunks(self, stopped: threading.Event) -> Chunks:
+    def iter_event_chunks(self, stopped: threading.Event) -> Chunks:
         """Yield the file's events; raises ValueError where it cannot be decoded."""
-        shift_us, last_us = 0, 0
         while not stopped.is_set():
-            first_us = None
+            is_empty = True
             for events in self._read():
-                first_us = int(events["t"][0]) if first_us is None else first_us
-                last_us = int(events["t"][-1])
-                if shift_us:
-                    events["t"] += shift_us
+                is_empty = False
                 yield events, time.perf_counter()
-            if not self.loop or first_us is None:
+            if not self.loop or is_empty:
                 return
-            shift_us += last_us + 1 - first_us
+            yield np.empty(0, EVENT), time.perf_counter()
 
     def _read(self) -> Iterator[np.ndarray]:
         return sources.iter_recording(self.path, self.sensor, FILE_CHUNK_S, self.options)
@@ -117,7 +113,7 @@ class UdpFeed(Feed):
         except (OSError, ValueError) as error:
             raise ValueError(f"recording must be udp://address:port, got {url}: {error}") from None
 
-    def chunks(self, stopped: threading.Event) -> Chunks:
+    def iter_event_chunks(self, stopped: threading.Event) -> Chunks:
         """Yield what came, as soon as it came."""
         while not stopped.is_set():
             if select.select([self.socket], [], [], 0.1)[0]:
@@ -190,7 +186,7 @@ class CameraFeed(Feed):
         width, height = self.stream.dimensions()
         self.sensor = (int(height), int(width))
 
-    def chunks(self, stopped: threading.Event) -> Chunks:
+    def iter_event_chunks(self, stopped: threading.Event) -> Chunks:
         """Yield what the camera sends."""
         while not stopped.is_set():
             try:

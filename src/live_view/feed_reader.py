@@ -9,7 +9,6 @@ import math
 import queue
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +18,7 @@ from src.live_view.frame_buffer import PolarityAccumulator
 from src.live_view.live_windows import EventWindow, WindowCutter, WindowQueue
 from src.live_view.status import FaultLog, Meters
 from src.recordings.event_windows import COVERED
+from src.recordings.noise_filter import NoiseFilter
 
 NAP_S = 0.02  # how long a wait goes on before it looks whether it is still wanted
 MAX_DRIFT = 1e-4  # by which a camera's clock may run slow against ours: 100 ppm
@@ -26,6 +26,7 @@ MAX_AHEAD_US = 1_000_000  # of a camera's clock ahead of ours is a jump, not a s
 MAX_CHUNKS = 16  # that wait to be cut
 POLL_S = 0.002  # between two looks at the clock while nothing comes
 PATIENCE_S = 0.003  # for which events of a window may be on their way when it is over
+AGAIN = "again"  # in place of a chunk: the recording starts again
 STALL_S = 1.0  # without events, a live stream is said to have stalled
 
 
@@ -116,7 +117,7 @@ class FeedReader:
         clock: PlaybackClock,
         meters: Meters,
         faults: FaultLog,
-        noise_filter: Callable[[np.ndarray], np.ndarray] | None = None,
+        noise_filter: NoiseFilter | None = None,
     ):
         if feed.is_live and clock.speed != 1:
             raise ValueError(f"playback_speed must be 1 for what comes live, got {clock.speed}")
@@ -132,7 +133,12 @@ class FeedReader:
         """Read the feed to its end."""
         start, end = time.thread_time(), "ended"
         try:
-            for events, arrival_s in self.feed.chunks(stopped):
+            for events, arrival_s in self.feed.iter_event_chunks(stopped):
+                if not events.size:
+                    self._offer(AGAIN, stopped)
+                    if self.noise_filter:
+                        self.noise_filter.reset()
+                    continue
                 kept = self.noise_filter(events) if self.noise_filter else events
                 self.meters.add_busy_time("decode", time.thread_time() - start)
                 if kept.size:
@@ -182,7 +188,10 @@ class FeedReader:
             if due_s is None:
                 break
             self._hand_on(window, due_s, stopped)
-        if isinstance(chunk, str):
+        if chunk == AGAIN:  # nothing of the end is left when the recording starts again
+            self.cutter.restart()
+            self.clock.anchor = None
+        elif isinstance(chunk, str):
             self.state = chunk
 
     def _cut_live(
@@ -227,4 +236,4 @@ class FeedReader:
 
     def _hand_on(self, window: EventWindow, due_s: float, stopped: threading.Event) -> None:
         self.counter.add(window.events)
-        self.waiting.put(replace(window, due_s=due_s), stopped)
+        self.waiting.put_within_capacity(replace(window, due_s=due_s), stopped)

@@ -131,7 +131,7 @@ class WindowQueue:
         self.changed = threading.Condition()
         self.dropped = 0
 
-    def put(self, window: EventWindow, stopped: threading.Event) -> None:
+    def put_within_capacity(self, window: EventWindow, stopped: threading.Event) -> None:
         """Add a window; where one that starts a scene is dropped, the next one starts it."""
         with self.changed:
             while self.lossless and len(self.windows) >= self.capacity and not stopped.is_set():

@@ -127,6 +127,8 @@ class Controls:
         }
         self.chosen: dict[str, int | str] = {}
         self.runner: NetworkRunner | None = None
+        self.one_view_runner: NetworkRunner | None = None  # beside `runner`, to compare
+        self.compares_one_view = False
         self.lock = threading.Lock()
         self.runners: dict[tuple[str, int], NetworkRunner] = {}
 
@@ -142,14 +144,25 @@ class Controls:
             allowed = ", ".join(map(str, ["all", *counts]))
             raise ValueError(f"views_used must be one of {allowed} for {network}, got {views}")
         count = max(counts) if views == "all" else int(views)
+        self.runner = self._make_runner(network, count)
+        self.chosen = {"network": network, "views": count}
+        self.compare_one_view(self.compares_one_view)
+
+    def compare_one_view(self, wanted: bool) -> None:
+        """Also run the network on the centre view, where it takes any number and has several."""
+        network, views = str(self.chosen["network"]), self.chosen["views"]
+        several = 1 in self.offered[network] and views != 1
+        self.one_view_runner = self._make_runner(network, 1) if wanted and several else None
+        self.compares_one_view = wanted
+
+    def _make_runner(self, network: str, count: int) -> NetworkRunner:
         with self.lock:
             if (network, count) not in self.runners:
                 used = self.views.select(positions_used(count, self.views.positions))
                 self.runners[network, count] = NetworkRunner(
                     network, self.networks[network], used, self.settings
                 )
-            self.runner = self.runners[network, count]
-        self.chosen = {"network": network, "views": count}
+            return self.runners[network, count]
 
 
 def offered_view_counts(network_views: int | None, positions: Sequence[Position]) -> list[int]:

@@ -1,7 +1,7 @@
 """The web server: the page, its stream of messages, `/status` and `/frame.png`.
 
 A message of the stream is the length of a JSON header (uint32, little endian), the header, and the
-JPEGs it lists.  The browser sends JSON: pause, line, network and views, all_views.
+JPEGs it lists.  The browser sends JSON: pause, line, network and views, all_views, tone, one_view.
 """
 
 import asyncio
@@ -61,6 +61,7 @@ class LivePage:
             "line": self.slice.line,
             "slice_s": round(len(self.frames.ring) / asked_fps, 2) if asked_fps else None,
             "all_views": self.all_views,
+            "one_view": self.controls.one_view_runner is not None,
             "offered": self.controls.offered,
             "chosen": self.controls.chosen,
         }
@@ -73,6 +74,8 @@ class LivePage:
         if whole or count != self.frames_sent:
             self.frames_sent = count
             pictures.append(("frame", encode_jpeg(newest)))
+            if (one_view := self.player.one_view) is not None:
+                pictures.append(("one-view", encode_jpeg(cv2.convertScaleAbs(one_view, alpha=255))))
         if whole or self.counter.windows:
             counts = self.counter.take()
             centre = self.positions.index((0, 0)) if (0, 0) in self.positions else 0
@@ -86,6 +89,10 @@ class LivePage:
         """Do what a visitor asks; raises ValueError for what makes no sense."""
         if "pause" in request:
             self.player.set_paused(bool(request["pause"]))
+        if "tone" in request:
+            self.player.set_tone(str(request["tone"]))
+        if "one_view" in request:
+            self.controls.compare_one_view(bool(request["one_view"]))
         if "all_views" in request:
             self.all_views = bool(request["all_views"])
         if "line" in request:

@@ -6,11 +6,15 @@ import threading
 import time
 import traceback
 
+import numpy as np
+
 from src.live_view.feed_reader import FeedReader
 from src.live_view.frame_buffer import FrameRing
 from src.live_view.live_windows import EventWindow
 from src.live_view.network_runner import Controls, Finish, NetworkRunner
+from src.recordings.tone import ToneCurve
 
+SPARED = 0.95  # of the frames a second that were reached, to have time to spare
 JOIN_S = 2.0  # for which a thread is waited for at the end
 
 
@@ -23,8 +27,11 @@ class Player:
     def __init__(self, reader: FeedReader, controls: Controls, frames: FrameRing):
         self.reader, self.controls, self.frames = reader, controls, frames
         self.meters, self.faults = reader.meters, reader.faults
+        self.tone, self.one_view_tone = ToneCurve(), ToneCurve()
         self.running: NetworkRunner | None = None  # of the newest window
-        self.begun: queue.Queue[tuple[EventWindow, Finish]] = queue.Queue(1)
+        self.running_one_view: NetworkRunner | None = None
+        self.one_view: np.ndarray | None = None  # newest frame of the network on one view
+        self.begun: queue.Queue[tuple[EventWindow, Finish, Finish | None]] = queue.Queue(1)
         self.stopped = threading.Event()
         self.threads = [
             threading.Thread(target=self._guard, args=(work,), name=work.__name__, daemon=True)
@@ -62,23 +69,40 @@ class Player:
             is_new = window.starts_scene or runner is not self.running
             self.running = runner
             finish = runner.begin(window, restart=is_new)
+            beside = self._begin_one_view(window)
             self.meters.add_busy_time("events", time.perf_counter() - start)
             while not stopped.is_set():
                 try:
-                    self.begun.put((window, finish), timeout=0.1)
+                    self.begun.put((window, finish, beside), timeout=0.1)
                     break
                 except queue.Full:
                     continue
+
+    def _begin_one_view(self, window: EventWindow) -> Finish | None:
+        runner = self.controls.one_view_runner
+        is_new = window.starts_scene or runner is not self.running_one_view
+        self.running_one_view = runner
+        return runner.begin(window, restart=is_new) if runner else None
+
+    def set_tone(self, tone: str, time_constant_s: float | None = None) -> None:
+        """Show pictures with another tone; raises ValueError for one that there is not."""
+        seconds = self.tone.time_constant_s if time_constant_s is None else time_constant_s
+        self.tone, self.one_view_tone = ToneCurve(tone, seconds), ToneCurve(tone, seconds)
 
     def run_network(self, stopped: threading.Event) -> None:
         """Run the network on what was begun, and show the pictures, until `stopped`."""
         while not stopped.is_set():
             try:
-                window, finish = self.begun.get(timeout=0.1)
+                window, finish, beside = self.begun.get(timeout=0.1)
             except queue.Empty:
                 continue
             start = time.perf_counter()
-            self.frames.push(finish())
+            self.frames.push(self.tone.apply(finish(), window.end_us * 1e-6))
+            picture = None if beside is None else beside()
+            if picture is None:
+                self.one_view = None
+            else:
+                self.one_view = self.one_view_tone.apply(picture, window.end_us * 1e-6)
             end = time.perf_counter()
             self.meters.add_busy_time("network", end - start)
             self.meters.add_frame(end - window.due_s, len(window.events))
@@ -88,18 +112,29 @@ class Player:
         running = self.reader.clock.running
         (running.clear if paused else running.set)()
 
+    def _suggest_fps(self, reached: float, asked: float) -> str | None:
+        """Return what to set where windows are dropped now; None where they are not."""
+        suggested = math.floor(SPARED * reached / self.reader.clock.speed)
+        is_short = self.reader.state == "playing" and math.isfinite(asked)
+        if not (is_short and self.reader.waiting.dropped and reached < SPARED * asked):
+            return None
+        return f"fps={suggested} would drop nothing on this machine" if suggested else None
+
     def status(self) -> dict:
         """Return what `GET /status` answers, all but the page's own."""
         reader, runner = self.reader, self.running
         asked_fps = reader.clock.speed * 1e6 / reader.cutter.period_us
+        rates = self.meters.measure_rates_and_latency()
         paused = not reader.clock.running.is_set()
         return {
             "state": "paused" if paused and reader.state != "broken" else reader.state,
             "paused": paused,
             "faults": self.faults.current(),
+            "tone": self.tone.tone,
             "asked_fps": round(asked_fps, 1) if math.isfinite(asked_fps) else None,
-            **self.meters.measure_rates_and_latency(),
+            **rates,
             "dropped": reader.waiting.dropped,
+            "hint": self._suggest_fps(rates["fps"], asked_fps),
             "waiting": len(reader.waiting),
             "network": runner.name if runner else None,
             "views": len(runner.views.views) if runner else None,

@@ -53,29 +53,32 @@ def measure_static_scene(film: Float[np.ndarray, "frames h w"], step: int) -> di
 
 
 def measure_slice_motion(
-    rows: Float[np.ndarray, "frames places"], kind: str, moving_thing: str = "any"
+    rows: Float[np.ndarray, "frames places"], kind: str, object_brightness: str = "any"
 ) -> dict[str, float]:
     """Return `residual_displacement_px` and `line_deviation_px` of a slice along a `line`, a
     `circle` or a ray that turns with the scene (`spin`), in places.
 
-    Nothing is static on a circle, and nothing moves along such a ray.  `moving_thing`: whether what
-    moves is `bright` or `dark` against the median in time, or `any`; ValueError for another.
+    Nothing is static on a circle, and nothing moves along such a ray.  `object_brightness`: whether
+    what moves is `bright` or `dark` against the median in time, or `any`; ValueError for another.
     """
     values = {}
     if kind != "circle":
         values["residual_displacement_px"] = residual_displacement_px(rows)
     if kind != "spin":
         measure = uniform_rotation_deviation_px if kind == "circle" else line_deviation_px
-        values["line_deviation_px"] = measure(_isolate_moving(rows, moving_thing))
+        values["line_deviation_px"] = measure(_isolate_moving(rows, object_brightness))
     return values
 
 
-def _isolate_moving(rows: np.ndarray, moving_thing: str) -> np.ndarray:
+def _isolate_moving(rows: np.ndarray, object_brightness: str) -> np.ndarray:
     middle = np.median(rows, axis=0)
     kinds = {"any": rows, "bright": np.maximum(rows, middle), "dark": np.minimum(rows, middle)}
-    if moving_thing not in kinds:
-        raise ValueError(f"moving_thing must be one of {', '.join(kinds)}, got {moving_thing}")
-    return kinds[moving_thing]
+    if object_brightness not in kinds:
+        allowed = ", ".join(kinds)
+        raise ValueError(
+            f"moving_object_brightness must be one of {allowed}, got {object_brightness}"
+        )
+    return kinds[object_brightness]
 
 
 def line_deviation_px(rows: Float[np.ndarray, "frames places"]) -> float:

@@ -1,7 +1,4 @@
-"""Checkpoints that are whole or not there: written to a temporary name beside, then renamed.
-
-Lightning's own writer moves them from the system's temporary folder, which may be another disk.
-"""
+"""Files of PyTorch that are whole or not there: how they are written, and the newest checkpoint."""
 
 import warnings
 import zipfile
@@ -9,18 +6,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from src.records.atomic import atomic_path
 
 
-class AtomicCheckpointIO(TorchCheckpointIO):
-    """Lightning's plugin that stores checkpoints; they are on the disk when it returns."""
-
-    def save_checkpoint(self, checkpoint: dict, path: Any, storage_options: Any = None) -> None:
-        """Write `checkpoint` to `path`; an OSError leaves what was there before."""
-        with atomic_path(Path(path)) as partial, partial.open("wb") as file:
-            torch.save(checkpoint, file)
+def save_whole(content: Any, path: Path) -> None:
+    """Write `content` as torch.save does; it is on the disk, whole, when this returns, and an
+    OSError leaves what was there before.
+    """
+    with atomic_path(path) as partial, partial.open("wb") as file:
+        torch.save(content, file)
 
 
 def is_intact(path: Path) -> bool:

@@ -22,6 +22,10 @@ class NoiseFilter:
         self.latest_us = np.full((height + 2, width + 2), LONG_AGO_US)  # with a border
         self.support_us = round(1e6 * support_s)
 
+    def reset(self) -> None:
+        """Forget earlier events: time starts anew."""
+        self.latest_us.fill(LONG_AGO_US)
+
     def __call__(self, events: np.ndarray) -> np.ndarray:
         """Return those of `events` (t x y p), in order of time, that are kept."""
         kept = np.empty(len(events), bool)

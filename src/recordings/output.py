@@ -1,4 +1,5 @@
-"""Frames to a file as they come: MP4, GIF, PNG or HDF5, with a table of their time stamps.
+"""Frames to a file as they come: MP4, GIF, PNG or HDF5, with a table of their time stamps; films of
+panels; and a video of one's own frames (`write_video`).
 
 Every format keeps what was written when the run is stopped, and holds one frame at a time.  Until
 the end files have `partial` in their names, so that none that is cut short is taken for whole.
@@ -8,10 +9,10 @@ import csv
 import errno
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 
 import av
@@ -27,19 +28,20 @@ LEAST_FREE_BYTES = 32 * 2**20
 VP9 = {"crf": "12", "b": "0", "deadline": "realtime", "cpu-used": "6"}  # error of 1 level, rms
 KEY_FRAME_EVERY = 12
 CACHE_BYTES = 2**20  # of HDF5, for each of its datasets
-Picture = UInt8[np.ndarray, "h w"]
-Add = Callable[[Picture, Frame], None]
+Picture = UInt8[np.ndarray, "h w *rgb"]  # grey, or of three colours
+Add = Callable[[Picture, Frame | None], None]
 
 
 @contextmanager
 def open_video_writer(
     kind: str, folder: Path, size: tuple[int, int], playback_fps: float = 30.0
 ) -> Iterator[Callable[[Frame], None]]:
-    """Open `video.mp4`, `video.gif`, `frames/` or `video.h5` in `folder`; yield `write(frame)`.
+    """Open `video.mp4`, `video.gif`, `frames/`, `video.h5` or `film.mp4` in `folder`; yield
+    `write(frame)`.
 
-    `size`: (height, width); `playback_fps`: of an MP4 or GIF.  `frames.csv` gets each frame's
-    index, time in s, events in views and outside.  Raises ValueError for another `kind`, or where
-    the file cannot be written.
+    `size`: (height, width); `film`: frames with colours; `playback_fps`: of an MP4 or GIF.
+    `frames.csv` gets each frame's index, time in s, events in views and outside.  Raises ValueError
+    for another `kind`, or where the file cannot be written.
     """
     if kind not in KINDS:
         raise ValueError(f"output_format must be one of {', '.join(KINDS)}, got {kind}")
@@ -58,17 +60,55 @@ def open_video_writer(
             # HDF5's library crashes when it cannot write.
             if shutil.disk_usage(folder).free < LEAST_FREE_BYTES:
                 raise OSError(errno.ENOSPC, f"No space left for another frame in {folder}")
-            add((np.clip(frame.picture, 0, 1) * 255 + 0.5).astype(np.uint8), frame)
+            add(_round_codes(frame.picture), frame)
             table.writerow([frames, f"{frame.time_s:.6f}", frame.events, frame.outside])
             frames += 1
 
         yield write
-    if kind == "mp4":
+    if whole.endswith(".mp4"):
         _check_mp4(video, frames)
     if (folder / whole).is_dir():
         shutil.rmtree(folder / whole)  # frames of an earlier run into the same folder
     os.replace(video, folder / whole)
     os.replace(table_file, folder / "frames.csv")
+
+
+def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> int:
+    """Write frames (h, w), grey, or (h, w, 3), RGB, floats in [0, 1] or uint8, as an MP4 (VP9);
+    return how many.
+
+    The file is there when it is whole.  Raises ValueError for another ending of `path`, no frames,
+    frames of several sizes and an `fps` outside [0.1, 1000].
+    """
+    path, given = Path(path), map(np.asarray, frames)
+    first = next(given, None)
+    if path.suffix != ".mp4":
+        raise ValueError(f"path must end in .mp4, got {path}")
+    if not 0.1 <= fps <= 1000:
+        raise ValueError(f"fps must be in [0.1, 1000], got {fps}")
+    if first is None or first.ndim not in (2, 3) or first.shape[2:] not in ((), (3,)):
+        shape = "none" if first is None else first.shape
+        raise ValueError(f"frames must be of shape (h, w) or (h, w, 3), got {shape}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial, count = partial_path(path), 0
+    try:
+        with _mp4(partial, first.shape[:2], fps) as add:
+            for frame in chain([first], given):
+                if frame.shape != first.shape:
+                    raise ValueError(f"frames must be of one size {first.shape}, got {frame.shape}")
+                add(_round_codes(frame), None)
+                count += 1
+        _check_mp4(partial, count)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return count
+
+
+def _round_codes(picture: np.ndarray) -> Picture:
+    if picture.dtype == np.uint8:
+        return picture
+    return (np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def partial_path(path: Path) -> Path:
@@ -95,8 +135,9 @@ def _mp4(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
         file.start_encoding()
         numbers = count()
 
-        def add(picture: Picture, frame: Frame) -> None:
-            image = av.VideoFrame.from_ndarray(picture, format="gray")
+        def add(picture: Picture, frame: Frame | None) -> None:
+            form = "gray" if picture.ndim == 2 else "rgb24"
+            image = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format=form)
             image.pts = next(numbers)
             file.mux(stream.encode(image))
 
@@ -113,7 +154,7 @@ def _gif(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
         blank = Image.new("L", size[::-1])
         file.write(b"".join(GifImagePlugin.getheader(blank, info={"loop": 0})[0]))
 
-        def add(picture: Picture, frame: Frame) -> None:
+        def add(picture: Picture, frame: Frame | None) -> None:
             image = Image.fromarray(picture)
             file.write(b"".join(GifImagePlugin.getdata(image, duration=10 * hundredths)))
 
@@ -130,7 +171,7 @@ def _png(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
     path.mkdir()
     names = (path / f"{number:07d}.png" for number in count())
 
-    def add(picture: Picture, frame: Frame) -> None:
+    def add(picture: Picture, frame: Frame | None) -> None:
         name = next(names)
         if not cv2.imwrite(str(name), picture):
             raise OSError(f"{name} cannot be written; is the disk full?")
@@ -145,7 +186,8 @@ def _hdf5(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
         frames = file.create_dataset("frames", (0, *size), np.uint8, compression="lzf", **shapes)
         times = file.create_dataset("time_s", (0,), np.float64, maxshape=(None,), chunks=(4096,))
 
-        def add(picture: Picture, frame: Frame) -> None:
+        def add(picture: Picture, frame: Frame | None) -> None:
+            assert frame is not None
             for data, value in ((frames, picture), (times, frame.time_s)):
                 data.resize(len(data) + 1, axis=0)
                 data[-1] = value
@@ -158,4 +200,5 @@ KINDS = {
     "gif": (_gif, "video.gif"),
     "png": (_png, "frames"),
     "hdf5": (_hdf5, "video.h5"),
+    "film": (_mp4, "film.mp4"),
 }

@@ -24,11 +24,11 @@ RunnableNetwork = EventToVideoNetwork | EventListRuntime
 
 @dataclass(frozen=True)
 class Frame:
-    """A picture (h, w) float32 in [0, 1] at `time_s`, the end of its window; its window's number
-    of `events` in views and `outside` of all."""
+    """A picture (h, w), or (h, w, 3) of a film, float32 in [0, 1] at `time_s`, the end of its
+    window; its window's number of `events` in views and `outside` of all."""
 
     time_s: float
-    picture: Float[np.ndarray, "h w"]
+    picture: Float[np.ndarray, "h w *rgb"]
     events: int
     outside: int
 
@@ -37,8 +37,8 @@ class ReconstructionState:
     """What lives from frame to frame: the recurrent state of each phase of overlapping windows,
     the last picture and the number of frames so far."""
 
-    def __init__(self, frames_per_window: int = 1):
-        self.states: list[Any] = [None] * frames_per_window
+    def __init__(self, overlapping_windows: int = 1):
+        self.states: list[Any] = [None] * overlapping_windows
         self.picture: Float[np.ndarray, "h w"] | None = None
         self.frames = 0
 

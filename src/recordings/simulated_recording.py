@@ -1,14 +1,13 @@
 """A simulated recording: nine mirrored, misaligned, vignetted views on one event sensor."""
 
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import cv2
-import h5py
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional
 
 from src.recordings.files.event_arrays import concatenate_events
 from src.recordings.files.event_writers import write_events
@@ -18,22 +17,29 @@ from src.sim import noise
 from src.sim.optics import view_id
 from src.sim.sensor.sensor import EventSensor
 
+Progress = Callable[[range, str], Iterable[int]]
 BAND_BYTES = 1 << 28  # of sensor frames at a time
 FALLOFF = 0.5  # of light, from the middle of a view to that of an edge
+FILLED = 23 / 24  # of the sensor, by the tiles; the rest is for their displacements
 DARK = 0.02  # share of light that a sensor pixel gets without any
 
 
 def kaleidoscope_views(
     positions: list[tuple[int, int]], *, model: Size, sensor: Size = (720, 1280),
-    tile_px: float = 230.0, homography_error_px: float = 3.0, key: int = 0,
+    tile_px: float | None = None, homography_error_px: float = 3.0, key: int = 0,
 ) -> Views:  # fmt: skip
-    """Return the views of a kaleidoscope whose tiles are `tile_px` wide, about the sensor's middle.
+    """Return the views of a kaleidoscope whose tiles are `tile_px` wide (None: as wide as all fit
+    on the sensor), about the sensor's middle.
 
     The view at (row, col) is mirrored in x for odd col and in y for odd row.  Each corner of every
     tile but the centre one is displaced by a normal of `homography_error_px` along x and y, a
     function of (key, view).  `model`: (height, width) of the pictures shown.
     """
     middle = (np.array(sensor[::-1]) - 1) / 2
+    if tile_px is None:
+        rows, columns = (2 * max(map(abs, axis)) + 1 for axis in zip(*positions, strict=True))
+        widest = min(sensor[1] / columns, sensor[0] / rows * model[1] / model[0])
+        tile_px = FILLED * widest
     half = np.array([tile_px, tile_px * model[0] / model[1]]) / 2
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
     views = []
@@ -69,28 +75,53 @@ def render_sensor_frames(
 ) -> Float[Tensor, "frames rows sensor_w"]:
     """Return what the sensor's `rows` see: each view's frames at each pixel's place, bilinear."""
     view, place, gain = lookup.view[rows], lookup.model_xy[rows], torch.from_numpy(light[rows])
-    height, width = lookup.model
     seen = torch.full((frames.shape[1], *view.shape), DARK)
     for index in range(lookup.views):
         y, x = np.nonzero(view == index)
-        spot = torch.from_numpy((2 * place[y, x] + 1) / np.array([width, height], np.float32) - 1)
-        sampled = functional.grid_sample(
-            frames[index, None], spot[None, None], padding_mode="border", align_corners=False
-        )
-        seen[:, y, x] = DARK + (1 - DARK) * gain[y, x] * sampled[0, :, 0]
+        if len(y):
+            sampled = _sample(frames[index], place[y, x])
+            seen[:, y, x] = DARK + (1 - DARK) * gain[y, x] * sampled
     return seen
 
 
+def _sample(
+    frames: Float[Tensor, "frames h w"], places: Float[np.ndarray, "n 2"]
+) -> Float[Tensor, "frames n"]:
+    """Return all frames at `places` (x, y), bilinear, float32; at the border its pixel's value.
+
+    Only the rows that are wanted are read, and the result at a place does not depend on the others.
+    """
+    last = np.array(frames.shape[:0:-1]) - 1
+    places = np.clip(places, 0, last)
+    low = np.floor(places).astype(np.int64)
+    high = np.minimum(low + 1, last)
+    (x0, y0), (x1, y1) = low.T, high.T
+    top, width = y0.min(), frames.shape[-1]
+    rows = frames[:, top : y1.max() + 1].float().flatten(1)
+    corners = [torch.from_numpy((y - top) * width + x) for y in (y0, y1) for x in (x0, x1)]
+    x_share, y_share = torch.from_numpy((places - low).astype(np.float32)).T
+    upper, lower = (
+        torch.lerp(rows.index_select(1, left), rows.index_select(1, right), x_share)
+        for left, right in (corners[:2], corners[2:])
+    )
+    return torch.lerp(upper, lower, y_share)
+
+
 def record_events(
-    frames: Float[Tensor, "views frames h w"], fps: float, views: Views, sensor: EventSensor
-) -> np.ndarray:
-    """Return the sensor's events (t x y p) in order of time; `frames` are intensities in [0, 1]."""
+    frames: Float[Tensor, "views frames h w"], fps: float, views: Views, sensor: EventSensor,
+    progress: Progress = lambda parts, _: parts,
+) -> np.ndarray:  # fmt: skip
+    """Return the sensor's events (t x y p) in order of time; `frames` are intensities in [0, 1], of
+    16 or 32 bits, also on a disk (np.memmap).
+
+    `progress(parts, name)` yields the parts of the work, as rich.progress.track does.
+    """
     lookup = build_lookup(views)
     light = vignette_gain(lookup)
     height, width = views.sensor
     band = max(1, BAND_BYTES // (4 * width * frames.shape[1]))
     parts = []
-    for top in range(0, height, band):
+    for top in progress(range(0, height, band), "events"):
         seen = render_sensor_frames(frames, lookup, light, slice(top, min(top + band, height)))
         part = sensor.events(seen, fps, origin=(top, 0), full_width=width)
         part["y"] += top
@@ -101,23 +132,18 @@ def record_events(
 
 def write_recording(
     path: Path | str, frames: Float[Tensor, "views frames h w"], fps: float, views: Views,
-    sensor: EventSensor, *, tilt: Float[Tensor, "views frames 2 h w"] | None = None,
-) -> int:  # fmt: skip
-    """Record `frames`, write them as an event file and return the number of events.
+    sensor: EventSensor, progress: Progress = lambda parts, _: parts,
+) -> np.ndarray:  # fmt: skip
+    """Record `frames` as `record_events`, write the events as an event file and return them.
 
-    Beside `cap.raw` come `cap.views.yaml`, the true geometry, and `cap.truth.h5`: the frames of the
-    centre view, fps and, where given, the tilt in view pixels.
+    Beside `cap.raw` comes `cap.views.yaml`, the true geometry.  Raises ValueError for a clip
+    without events.
     """
     path = Path(path)
-    events = record_events(frames, fps, views, sensor)
+    events = record_events(frames, fps, views, sensor, progress)
     if not len(events):
         raise ValueError(f"write: the clip gives no events, nothing is written to {path}")
     height, width = views.sensor
     write_events(path, events, width=width, height=height)
     views.save(path.with_suffix(".views.yaml"))
-    with h5py.File(path.with_suffix(".truth.h5"), "w") as file:
-        file.attrs["fps"], file.attrs["first_event_us"] = fps, events["t"][0]
-        file["centre"] = frames[views.positions.index((0, 0))].numpy()
-        if tilt is not None:
-            file["tilt"] = tilt.numpy()
-    return len(events)
+    return events

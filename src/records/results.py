@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import rich
+from rich.console import RenderableType
 from rich.table import Table
 
 from src.metrics.bootstrap import bootstrap_interval
@@ -92,8 +93,11 @@ def summarize_scores(clips: list[dict]) -> dict:
     return summary
 
 
-def write_and_print_results(run: Path, config: str, rows: list[ScoreRow], **facts) -> dict:
-    """Write `results.json` and `clips.csv` of the first row into `run` and print all rows.
+def write_and_print_results(
+    run: Path, config: str, rows: list[ScoreRow], table: RenderableType | None = None, **facts
+) -> dict:
+    """Write `results.json` and `clips.csv` of the first row into `run` and print all rows, or
+    `table` for them.
 
     `facts`: further entries of `results.json` (task, experiment, seed, wall_s, device ...), whose
     content is returned.
@@ -114,8 +118,9 @@ def write_and_print_results(run: Path, config: str, rows: list[ScoreRow], **fact
     values = [[clip[name] for name in columns] for clip in first.clips]
     write_text(run / "clips.csv", format_csv(columns, values))
     write_text(run / "results.json", json.dumps(record, indent=2) + "\n")
-    rich.print(build_rich_score_table(rows))
-    files = sorted(str(file.relative_to(run)) for file in run.rglob("*.*") if file.is_file())
+    rich.print(table or build_rich_score_table(rows))
+    found = [*run.glob("*.*"), *run.glob("*/*.*")]  # not the thousands of saved frames below
+    files = sorted(str(file.relative_to(run)) for file in found if file.is_file())
     rich.print(f"in {run}: " + ", ".join(file for file in files if not file.startswith(".")))
     return record
 
@@ -130,10 +135,10 @@ def format_csv(heads: Iterable, rows: Iterable[Iterable]) -> str:
 def build_rich_score_table(rows: list[ScoreRow]) -> Table:
     """Return mean scores over clips, one line per network; arrows point to better values."""
     picture = Table(title=f"{len(rows[0].clips)} test clips, mean of per-frame values")
-    picture.add_column("network")
+    picture.add_column("network", overflow="fold")
     for metric in METRICS:
-        picture.add_column(metric.title, justify="right")
-    picture.add_column("ms/frame", justify="right")
+        picture.add_column(metric.title, justify="right", overflow="fold")
+    picture.add_column("ms/frame", justify="right", overflow="fold")
     for row in rows:
         means = summarize_scores(row.clips)
         cells = [m.format_value(means.get(m.name, {}).get("mean")) for m in METRICS]

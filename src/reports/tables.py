@@ -88,7 +88,7 @@ def build_severity_table(
     title: str, keys: Sequence[str], groups: Sequence[RunGroup]
 ) -> Table | None:
     """Return the scores of the clips of each severity; None where no run has clips of several."""
-    drawn = [{clip["severity"] for clip in run.clips} for group in groups for run in group.runs]
+    drawn = [{clip.get("severity") for clip in run.clips} for group in groups for run in group.runs]
     if all(len(severities) < 2 for severities in drawn):
         return None
     present = [severity for severity in SEVERITIES if severity in set().union(*drawn)]
@@ -166,7 +166,9 @@ def _score(
         if severity is None:
             test = run.record["compared"].get(compared, {}) if compared else run.record["test"]
             return test.get(metric, {}).get("mean")
-        scores = [float(c[metric]) for c in run.clips if c["severity"] == severity and metric in c]
+        scores = [
+            float(c[metric]) for c in run.clips if c.get("severity") == severity and metric in c
+        ]
         return statistics.fmean(scores) if scores else None
 
     return measure

@@ -15,7 +15,7 @@ from src.sim import noise
 from src.sim.optics import Position, layout
 from src.sim.pipeline import Sample, allocate_float32, concatenate_samples
 from src.training.clip_transforms import ClipTransform, transform_batch, transform_clips
-from src.training.voxel_noise import add_noisy_pixels, draw_hot_pixels, draw_normals
+from src.training.voxel_noise import add_noisy_pixels, draw_normals, draw_pixel_offsets
 
 NOISY_PIXEL_RATE_HZ = (10.0, 2000.0)  # each pixel has one of its own, log-uniform
 
@@ -97,7 +97,7 @@ class Augment:
                 normals = draw_normals(clip.shape, noise.key(key, "noise"), clip.device)
                 clip.add_(normals, alpha=self.noise_std)
             fraction = self.max_offset_pixel_fraction
-            hot[number] = draw_hot_pixels(hot.shape[1:], fraction, noise.key(key, "hot"))
+            hot[number] = draw_pixel_offsets(hot.shape[1:], fraction, noise.key(key, "hot"))
         if hot.any():
             voxels.add_(hot[:, None, None, None].to(voxels))
         if self.max_firing_pixel_fraction:

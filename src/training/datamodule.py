@@ -1,5 +1,6 @@
 """Batches for training, validation and test, simulated on the fly: number -> draw -> sample."""
 
+import signal
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, cast
@@ -117,7 +118,7 @@ class LightFieldData(LightningDataModule):
             DrawDataset(*self._streams(split)),
             num_workers=self.workers,
             collate_fn=self._simulator(split, "cpu") if on_worker else list,
-            worker_init_fn=_use_one_thread,
+            worker_init_fn=_prepare_worker,
             persistent_workers=self.workers > 0,
             **sampling,
         )
@@ -179,5 +180,7 @@ class BatchSimulator:
         return [replace(one, teacher_frames=self.teachers(one, name)) for one, name in pairs]
 
 
-def _use_one_thread(worker: int) -> None:
+def _prepare_worker(worker: int) -> None:
+    """Compute in one thread, and leave Ctrl-C, which a terminal sends to all, to the training."""
     torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -24,7 +24,7 @@ from typing import Any
 import torch
 
 import src.sim
-from src.models.checkpoints import AtomicCheckpointIO, is_intact
+from src.models.checkpoints import is_intact, save_whole
 from src.records.atomic import write_text
 from src.sim.pipeline import Pipeline
 from src.training.clip_cache import GIB, CachedClip, ClipCache, simulate_clip
@@ -68,7 +68,7 @@ class DiskClipCache(ClipCache):
         metadata = json.dumps(clip.metadata)
         content = {"views": clip.views.cpu(), "clean": clip.clean.cpu(), "metadata": metadata}
         try:
-            AtomicCheckpointIO().save_checkpoint(content, self.path(index))
+            save_whole(content, self.path(index))
         except (OSError, RuntimeError) as error:  # PyTorch's writer has an error of its own
             raise OSError(f"{self.folder}: clip {index} cannot be stored: {error}") from error
 

@@ -21,8 +21,8 @@ TRAINING_STATE = "reached"  # key of what a training continues from, in the card
 
 
 class LearningCurve(Callback):
-    """Score the validation clips at the start, every `every_h` hours of the module's clock and at
-    the end (None: never); write all rows so far to the CSV file `path`.
+    """Score the validation clips at the start, every `interval_h` hours of the module's clock and
+    at the end (None: never); write all rows so far to the CSV file `path`.
 
     A row: hours, steps, windows trained on, mean training loss since the row before, scores.  The
     rows are part of checkpoints.  `export`: also write the weights to this file (.safetensors,
@@ -31,12 +31,14 @@ class LearningCurve(Callback):
     COLLAPSE_FACTOR times its least, as when no gradient reaches the network any more.
     """
 
-    def __init__(self, path: str, every_h: float | None = None, export: str | None = None):
-        if every_h is not None and not every_h > 0:
-            raise ValueError(f"callbacks.learning_curve.every_h must be > 0 or null, got {every_h}")
+    def __init__(self, path: str, interval_h: float | None = None, export: str | None = None):
+        if interval_h is not None and not interval_h > 0:
+            raise ValueError(
+                f"callbacks.learning_curve.interval_h must be > 0 or null, got {interval_h}"
+            )
         if export is not None and Path(export).suffix != ".safetensors":
             raise ValueError(f"export must be a .safetensors file or null, got {export}")
-        self.path, self.every_h = Path(path), every_h
+        self.path, self.interval_h = Path(path), interval_h
         self.export = Path(export) if export else None
         self.rows: list[dict] = []
         self.loss, self.steps = 0.0, 0  # since the last row
@@ -49,7 +51,7 @@ class LearningCurve(Callback):
         vars(self).update(state_dict)
 
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
-        if self.every_h is None or not trainer.is_global_zero:
+        if self.interval_h is None or not trainer.is_global_zero:
             return
         if self.rows:
             self._write()
@@ -57,11 +59,13 @@ class LearningCurve(Callback):
             self.add_row(trainer, pl_module)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
-        if self.every_h is None or not trainer.is_global_zero:
+        if self.interval_h is None or not trainer.is_global_zero:
             return
         self.loss += float(trainer.callback_metrics["train/loss"])
         self.steps += 1
-        is_due = pl_module.clock.hours // self.every_h > self.rows[-1]["hours"] // self.every_h
+        is_due = (
+            pl_module.clock.hours // self.interval_h > self.rows[-1]["hours"] // self.interval_h
+        )
         if is_due or trainer.should_stop or trainer.global_step == trainer.max_steps:
             self.add_row(trainer, pl_module)
 

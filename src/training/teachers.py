@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from src.deploy.cpu_features import is_bf16_faster
-from src.models.checkpoints import AtomicCheckpointIO, is_intact
+from src.models.checkpoints import is_intact, save_whole
 from src.models.network import EventToVideoNetwork
 from src.sim.pipeline import Sample
 
@@ -63,7 +63,7 @@ class TeacherEnsemble:
         else:
             frames = (LEVELS * self._mean_frames(sample, names)).round().to("cpu", torch.uint8)
             path.parent.mkdir(parents=True, exist_ok=True)
-            AtomicCheckpointIO().save_checkpoint({"pictures": frames}, path)
+            save_whole({"pictures": frames}, path)
         return frames.to(sample.voxels.device).float() / LEVELS
 
     def _names_at(self, rate: float) -> list[str]:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from src.sim import noise
 
-HOT_PIXEL_STD = 0.1  # of a hot pixel's value, in events
+PIXEL_OFFSET_STD = 0.1  # of an offset, in events
 QUANTILES = ndtri((np.arange(2**16) + 0.5) / 2**16)  # of a standard normal, at equal steps
 QUANTILES = (QUANTILES / QUANTILES.std()).astype(np.float32)
 
@@ -33,7 +33,7 @@ def draw_normals(shape: Sequence[int], key: int, device: torch.device) -> Tensor
     return torch.from_numpy(QUANTILES[levels[:count]]).reshape(*shape)
 
 
-def draw_hot_pixels(size: Sequence[int], max_fraction: float, key: int) -> Float[Tensor, "h w"]:
+def draw_pixel_offsets(size: Sequence[int], max_fraction: float, key: int) -> Float[Tensor, "h w"]:
     """Return an image (h, w) that is zero but at up to `max_fraction` of the pixels.
 
     Their number is rounded up as often as its rest is large: 0.4 are one in two crops of five.
@@ -44,7 +44,8 @@ def draw_hot_pixels(size: Sequence[int], max_fraction: float, key: int) -> Float
     image = torch.zeros(pixels)
     if count:
         places = (noise.uniform(key, torch.arange(count)) * pixels).long()
-        image[places] = HOT_PIXEL_STD * noise.normal(noise.key(key, "value"), torch.arange(count))
+        normals = noise.normal(noise.key(key, "value"), torch.arange(count))
+        image[places] = PIXEL_OFFSET_STD * normals
     return image.reshape(*size)
 
 

@@ -23,7 +23,7 @@ WRONG = [
     ("reconstruct", ["recording=x", "ckpt=[a,b]"], "ckpt must be a word or null, got"),
     ("reconstruct", ["recording=x", "ckpt=setnet_small", "device=cuda:99"], "device must be cpu"),
     ("reconstruct", ["recording=x", "+unknown=1"], "unknown is no key of the configuration"),
-    ("simulate", ["camera.tile_px=abc"], "camera.tile_px must be a number, got abc"),
+    ("simulate", ["camera.tile_px=abc"], "camera.tile_px must be a number or null, got abc"),
     ("simulate", ["index=-1"], "index must be >= 0, the number of a clip, got -1"),
     ("simulate", ["data.unknown=1"], "data.unknown is no key of the configuration"),
     ("simulate", ["turbulence=rigid"], "turbulence=rigid is now turbulence=mixed turbulence.atm"),
@@ -58,6 +58,7 @@ def test_a_recording_that_cannot_be_written_is_refused_before_it_is_made(tmp_pat
     monkeypatch.setattr(simulate.build, "build_pipeline", None)
     cfg = OmegaConf.create({
         "paths": {"run": str(tmp_path)}, "index": 0, "write": "a.xyz", "like": None,
+        "video": None, "photo": None,
         "camera": {"sensor": [360, 640]},
     })  # fmt: skip
     with pytest.raises(ValueError, match="a.xyz: cannot write .xyz"):

@@ -11,6 +11,7 @@ from baselines.etnet import ETNet
 from baselines.firenet import FireNet
 from baselines.highpass import HighPass
 from baselines.hypere2vid import DynamicDecoder, HyperE2VID, fourier_bessel
+from baselines.pienet import PIENet
 from src.models.network import unroll
 from src.sim.optics import Optics
 
@@ -20,6 +21,7 @@ PUBLISHED = {
     ETNet: 22_175_361,
     HyperE2VID: 10_149_881,
     CISTA: 1_260_867,
+    PIENet: 171_121,
 }
 
 
@@ -165,3 +167,27 @@ def test_cista_shrinks_its_code():
         step.threshold.fill_(1e6)
     _, (code, _, _) = network(voxels()[:, 0], None)
     assert float(code.abs().max()) == 0
+
+
+def test_pie_net_lite_and_the_layers_that_its_package_leaves_out_are_counted():
+    lite = PIENet(base_channels=12, channels=(16, 24), pools=(2, 2))
+    assert sum(p.numel() for p in lite.parameters()) == 78_537
+    assert sum(p.numel() for p in PIENet(refine=False).parameters()) == 154_201
+
+
+@torch.no_grad()
+def test_pie_net_gates_its_skips_from_the_second_window_on():
+    network, window = small(PIENet), voxels()[:, 0]
+    first, state = network(window)
+    for decoder in network.decoders:
+        decoder.gate.bias.fill_(-9)  # nothing passes
+    again, _ = network(window)
+    gated, _ = network(window, state)
+    opened, _ = network(window, state._replace(begun=torch.zeros(1, 1, 1, 1)))
+    assert torch.equal(first, again) and not torch.equal(gated, opened)
+
+
+@torch.no_grad()
+def test_pie_net_takes_maps_that_are_smaller_than_what_it_pools():
+    frame, _ = small(PIENet)(torch.randn(1, 1, 3, 9, 30))  # 2 x 7 before five are pooled
+    assert frame.shape == (1, 1, 9, 30) and frame.isfinite().all()

@@ -24,6 +24,25 @@ FILES = {
     "firenet": "FireNet/firenet_state_dict.pth",
     "firenet_plus": "FireNet+/firenet_plus_state_dict.pth",
     "cista": "CISTA-TC/cista-tc.pth.tar",
+    "pienet": "PIE-Net/model.pth",
+    "pienet_package": "PIE-Net/model.pth",
+    "pienet_lite": "PIE-Net/model_lite.pth",
+}
+# Of event-pienet 1.1.3 ("pienet": with n_rep_dn = [1, 1, 1], as its checkpoint has it): every sixth
+# pixel of row 11 after the first and the fourth window of `few_events`.
+PIE_NET_FRAMES = {
+    "pienet": (
+        [0.153001, 0.115957, 0.226795, 0.281091, 0.160237, 0.062087, 0.145532],
+        [0.039624, 0.082345, 0.184097, 0.001708, 0.046368, 0.225082, 0.123234],
+    ),
+    "pienet_package": (
+        [0.408599, 0.319073, 0.358896, 0.548899, 0.614033, 0.269857, 0.255031],
+        [0.133544, 0.244154, 0.476306, 0.207072, 0.473983, 0.590085, 0.249149],
+    ),
+    "pienet_lite": (
+        [0.106339, 0.138736, 0.505866, 0.426105, 0.23936, 0.173607, 0.13688],
+        [0.07319, 0.231795, 0.449761, 0.109486, 0.17621, 0.350037, 0.109337],
+    ),
 }
 
 
@@ -75,6 +94,23 @@ def test_published_weights_reach_the_published_correlation(
     assert np.corrcoef(*steep)[0, 1] == pytest.approx(gradients, abs=0.01)
 
 
+def few_events() -> torch.Tensor:
+    """Return four windows of five bins, 23x37, of -1, 0 and 1."""
+    k = torch.arange(4 * 5 * 23 * 37, dtype=torch.float64)
+    return (1.2 * torch.sin(k * k / 7)).trunc().float().view(4, 1, 1, 5, 23, 37)
+
+
+@pytest.mark.parametrize("name", PIE_NET_FRAMES)
+def test_pie_net_gives_the_frames_of_its_package(shared_data, name):
+    network = published.load_published(name, shared_data / "weights" / FILES[name])
+    state, rows = None, []
+    for window in few_events():
+        frame, state = network(window, state)
+        rows.append(frame[0, 0, 11, ::6])
+    expected = torch.tensor(PIE_NET_FRAMES[name])
+    torch.testing.assert_close(torch.stack([rows[0], rows[3]]), expected, atol=1e-5, rtol=0)
+
+
 def small(name: str) -> torch.nn.Module:
     known = published.NETWORKS[name]
     return known.network_class(**known.options, **{known.width_argument: 8})
@@ -121,6 +157,14 @@ def test_hypere2vid_has_the_published_names():
     }  # fmt: skip
     assert "dynamic_atom_generation.bases_net.4.running_var" in first
     assert names["unetrecurrent.decoders.2.conv2d.weight"].shape == (8, 16, 5, 5)
+
+
+def test_pie_net_as_its_package_runs_it_leaves_three_layers_of_the_checkpoint_out():
+    whole = published_state_dict("pienet", small("pienet"))
+    ran = published_state_dict("pienet_package", small("pienet_package"))
+    assert set(ran) < set(whole) and len(whole) == 92
+    left_out = {name.split("mbconv.")[0] for name in set(whole) - set(ran)}
+    assert left_out == {f"model.downs.{scale}.out.mbconv_0." for scale in range(3)}
 
 
 def test_missing_and_extra_weights_are_listed(tmp_path):

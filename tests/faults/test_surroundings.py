@@ -15,7 +15,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from src.models.checkpoints import AtomicCheckpointIO, is_intact, newest_checkpoint
+from src.models.checkpoints import is_intact, newest_checkpoint, save_whole
 from src.recordings import output
 from src.recordings.output import open_video_writer, partial_path
 from src.recordings.reconstruction import Frame
@@ -27,7 +27,7 @@ NOBODY = 65534
 
 
 def written(path: Path, number: float) -> None:
-    AtomicCheckpointIO().save_checkpoint({"state_dict": {"a": torch.full((50_000,), number)}}, path)
+    save_whole({"state_dict": {"a": torch.full((50_000,), number)}}, path)
 
 
 @contextmanager

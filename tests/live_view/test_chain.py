@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import re
 import socket
 import threading
 import time
@@ -41,7 +42,7 @@ def recording(tmp_path_factory):
 def received(feed, done) -> np.ndarray:
     """Return what a feed gives until `done` events are there."""
     stopped, found, end = threading.Event(), [], time.monotonic() + 20
-    for chunk, _ in feed.chunks(stopped):
+    for chunk, _ in feed.iter_event_chunks(stopped):
         found.append(chunk)
         if sum(map(len, found)) >= done or time.monotonic() > end:
             stopped.set()
@@ -133,13 +134,21 @@ def test_no_camera_says_what_to_install():
         event_feeds.open_feed("camera://", None, FaultLog())
 
 
-def test_a_file_that_loops_goes_on_in_time(recording):
-    feed, once = event_feeds.FileFeed(recording, scenes.SENSOR, True), read_events(recording)
-    found = received(feed, 2 * len(once))
-    again = found[len(once) : 2 * len(once)]
-    for name in "xyp":
-        assert np.array_equal(again[name], once[name])
-    assert np.ptp(again["t"] - once["t"]) == 0 and (np.diff(found["t"]) >= 0).all()
+def test_a_file_that_loops_starts_each_time_as_the_first(recording):
+    torch.manual_seed(0)
+    made = served(recording, {"net": SetNet.preset("small").eval()}, playback_speed=float("inf"))
+    player, screen, shown = made.page.player, made.page.frames, []
+    player.reader.feed.loop = True
+    screen.push = lambda picture: shown.append(picture.copy())
+    player.start()
+    _until(lambda: len(shown) > 110)
+    dropped = player.reader.waiting.dropped
+    player.stop()
+    moving = [k for k in range(20, 40) if np.array_equal(shown[k], shown[0])]
+    length = moving[0]
+    for k in range(length):
+        assert np.array_equal(shown[k], shown[2 * length + k])
+    assert player.status()["time_s"] < 0.6 and dropped == 0
 
 
 class Script(event_feeds.Feed):
@@ -150,7 +159,7 @@ class Script(event_feeds.Feed):
     def __init__(self, *steps):
         self.steps = steps
 
-    def chunks(self, stopped):
+    def iter_event_chunks(self, stopped):
         began = time.perf_counter()
         for at, times in self.steps:
             stopped.wait(max(0.0, began + at - time.perf_counter()))
@@ -258,6 +267,11 @@ def test_what_cannot_keep_up_drops_windows_and_keeps_its_latency(recording):
     _until(lambda: player.reader.state == "ended")
     status = player.status()
     player.stop()
+    player.reader.state = "playing"
+    fps = int(
+        re.fullmatch(r"fps=(\d+) would drop nothing on this machine", player.status()["hint"])[1]
+    )
+    assert 0 < fps < 30
     assert status["dropped"] > 50 and status["waiting"] <= 4
     assert status["latency_ms"]["median"] < 2000  # four windows and the network, on a busy machine
 
@@ -339,3 +353,17 @@ def _until(seen, seconds: float = 60.0) -> None:
     while not seen():
         assert time.monotonic() < end
         time.sleep(0.02)
+
+
+def test_one_view_runs_beside_all_of_them(recording):
+    made = served(recording, {"net": SetNet.preset("small").eval()}, playback_speed=float("inf"))
+    made.page.handle_request({"one_view": True, "tone": "auto"})
+    player = made.page.player
+    player.start()
+    _until(lambda: player.one_view is not None and made.page.frames.count > 5)
+    assert b'"one-view"' in made.page.message(whole=True)
+    status = made.page.status()
+    player.stop()
+    assert status["one_view"] and status["tone"] == "auto"
+    made.page.handle_request({"network": "net", "views": 1})
+    assert not made.page.status()["one_view"]

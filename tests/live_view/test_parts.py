@@ -136,7 +136,7 @@ def test_an_impossible_rate_is_refused(fps, faults):
 def test_a_full_backlog_drops_whole_windows_oldest_first():
     backlog = WindowQueue(3)
     for k in range(10):
-        backlog.put(window(k, starts_scene=k == 2), RUNNING)
+        backlog.put_within_capacity(window(k, starts_scene=k == 2), RUNNING)
     assert backlog.dropped == 7 and len(backlog) == 3
     found = [backlog.get(0.01) for _ in range(3)]
     assert [one.start_us for one in found] == [7, 8, 9]
@@ -150,7 +150,9 @@ def test_a_full_backlog_drops_whole_windows_oldest_first():
 
 def test_a_lossless_backlog_waits_instead():
     backlog, stopped = WindowQueue(2, lossless=True), threading.Event()
-    work = threading.Thread(target=lambda: [backlog.put(window(k), stopped) for k in range(9)])
+    work = threading.Thread(
+        target=lambda: [backlog.put_within_capacity(window(k), stopped) for k in range(9)]
+    )
     work.start()
     time.sleep(0.05)
     assert len(backlog) == 2

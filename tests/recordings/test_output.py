@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from src.recordings.files import videos
-from src.recordings.output import open_video_writer, partial_path
+from src.recordings.output import open_video_writer, partial_path, write_video
 from src.recordings.reconstruction import Frame
 
 SIZE = (48, 64)
@@ -100,3 +100,32 @@ def test_an_mp4_keeps_an_odd_size(tmp_path):
     found = np.stack(list(videos.read_video(tmp_path / "video.mp4")))
     assert found.shape == (3, 47, 61) and np.abs(found - ramp).max() < 7 / 255
     assert video(tmp_path / "video.mp4").shape == (3, 47, 61)
+
+
+@pytest.mark.parametrize("colours", [False, True])
+def test_frames_of_your_own_are_a_video(colours, tmp_path):
+    shown = [frame.picture for frame in frames()]
+    if colours:
+        shown = [np.stack([picture, 0 * picture + 0.5, 1 - picture], -1) for picture in shown]
+    assert write_video(tmp_path / "a.mp4", iter(shown), fps=25) == 5
+    file = cv2.VideoCapture(str(tmp_path / "a.mp4"))
+    read = np.stack([file.read()[1][..., ::-1] for _ in range(5)]) / 255  # RGB
+    wanted = np.stack(shown) if colours else np.stack(shown)[..., None].repeat(3, -1)
+    assert file.get(cv2.CAP_PROP_FPS) == 25 and np.abs(read - wanted).mean() < 0.02
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.mp4"]
+
+
+@pytest.mark.parametrize(
+    "name, shapes, fps, message",
+    [
+        ("a.avi", [(16, 16)], 30, "path must end in .mp4, got"),
+        ("a.mp4", [], 30, "frames must be of shape .* got none"),
+        ("a.mp4", [(16, 16, 2)], 30, "frames must be of shape"),
+        ("a.mp4", [(16, 16), (16, 18)], 30, "frames must be of one size"),
+        ("a.mp4", [(16, 16)], 0, r"fps must be in \[0.1, 1000\], got 0"),
+    ],
+)
+def test_no_video_of_wrong_frames(name, shapes, fps, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        write_video(tmp_path / name, [np.zeros(shape) for shape in shapes], fps)
+    assert list(tmp_path.iterdir()) == []

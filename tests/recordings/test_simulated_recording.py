@@ -9,6 +9,7 @@ from src.recordings import sensor_lookup, simulated_recording, views
 from src.recordings.calibration import dot_statistics, gaussian_dots, view_alignment
 from src.recordings.calibration.boards import Charuco, Checkerboard, Circles
 from src.recordings.files import recording, sources
+from src.recordings.truth_file import open_truth
 from src.sim.optics import layout
 from src.sim.sensor.sensor import EventSensor
 from tests.recordings import pictures
@@ -132,16 +133,28 @@ def test_no_file_is_written_without_an_event(truth, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_the_truth_lies_beside_the_recording(truth, tmp_path):
-    frames, tilt = blinking(half(pictures.circles(5, 7)), 3), torch.zeros(9, 3, 2, SIDE, SIDE)
-    path = tmp_path / "cap.raw"
-    count = simulated_recording.write_recording(
-        path, frames, 60.0, truth, noisy_sensor(), tilt=tilt
-    )
-    assert len(recording.read_events(path)) == count
+def test_the_geometry_lies_beside_the_recording_and_the_truth_packs_what_is_seen(truth, tmp_path):
+    frames, path = blinking(half(pictures.circles(5, 7)), 3), tmp_path / "cap.raw"
+    events = simulated_recording.write_recording(path, frames, 60.0, truth, noisy_sensor())
+    assert len(recording.read_events(path)) == len(events) > 0
+    saved = views.load_views(tmp_path / "cap.views.yaml")
+    assert saved.positions == truth.positions
+    tilt = torch.linspace(-3, 3, 9 * 3 * 2 * SIDE * SIDE).reshape(9, 3, 2, SIDE, SIDE)
+    with open_truth(path, truth, 3, 60.0, {"threshold": 0.4}) as file:
+        for part in (slice(0, 2), slice(2, 3)):
+            file.add(frames[0, part], frames[:, part], tilt[:, part])
     with h5py.File(tmp_path / "cap.truth.h5") as file:
-        assert file.attrs["fps"] == 60 and file["tilt"].shape == tilt.shape
-        assert np.array_equal(file["centre"][:], frames[4].numpy())
+        assert np.abs(file["clean"] - frames[0].numpy() * 255).max() <= 0.5001
+        assert np.abs(file["views"] - frames.numpy() * 255).max() <= 0.5001
+        assert np.abs(file["tilt"][:] - tilt.numpy()).max() <= 1 / 64
+        assert file["positions"][:].tolist() == [list(p) for p in truth.positions]
+        assert file.attrs["fps"] == 60 and np.allclose(file["time_s"], [0, 1 / 60, 2 / 60])
+
+
+@pytest.mark.parametrize("shape, wide", [((180, 320), 23 / 24 * 240 * 16 / 9), ((256, 256), 230)])
+def test_the_views_fill_the_sensor(shape, wide):
+    found = simulated_recording.kaleidoscope_views(list(layout(9)), model=shape)
+    assert found.field[2] - found.field[0] == pytest.approx(wide)
 
 
 def test_views_turn_about_the_centre_one(truth):

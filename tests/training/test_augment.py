@@ -16,7 +16,7 @@ from src.training.augment import (
     flipped_view_order,
 )
 from src.training.clip_transforms import flip_frames, shift_views
-from src.training.voxel_noise import add_noisy_pixels, draw_hot_pixels, draw_normals
+from src.training.voxel_noise import add_noisy_pixels, draw_normals, draw_pixel_offsets
 
 OFF = {
     "noise_std": 0.0,
@@ -144,13 +144,13 @@ def test_hot_pixels_stay_through_the_sequence():
 
 
 def test_hot_pixel_count_is_uniform_up_to_the_fraction():
-    counts = [int((draw_hot_pixels((50, 50), 0.01, key) != 0).sum()) for key in range(400)]
+    counts = [int((draw_pixel_offsets((50, 50), 0.01, key) != 0).sum()) for key in range(400)]
     assert max(counts) <= 25
     assert abs(sum(counts) / 400 - 12.5) < 4 * 25 / math.sqrt(12 * 400)
 
 
 def test_small_crops_have_a_hot_pixel_as_often_as_their_part_of_one_is_large():
-    counts = [int((draw_hot_pixels((64, 64), 1e-4, key) != 0).sum()) for key in range(2000)]
+    counts = [int((draw_pixel_offsets((64, 64), 1e-4, key) != 0).sum()) for key in range(2000)]
     assert max(counts) == 1
     assert abs(sum(counts) / 2000 - 0.2048) < 4 * math.sqrt(0.2 * 0.8 / 2000)
 

@@ -40,7 +40,7 @@ RECIPE = [
     "ema_decay=0.9",
     "optimizer.lr=1e-3",
 ]
-RECIPE += ["callbacks.learning_curve.every_h=3", "trainer.max_steps=-1", "scheduler=null"]
+RECIPE += ["callbacks.learning_curve.interval_h=3", "trainer.max_steps=-1", "scheduler=null"]
 RECIPE += ["trainer.limit_val_batches=0", "augment.noise_std=0.1", "channels_last=true"]
 
 
@@ -224,7 +224,7 @@ def test_the_average_forgets_the_start_and_then_moves_slowly():
         (["ema_decay=1"], "ema_decay must be in"),
         (["data.loss_from=2"], "data.loss_from must be in 0..1"),
         (["data.loss_pairs=2", "data.loss_from=0"], "data.loss_pairs must be in 1..1 or null"),
-        (["callbacks.learning_curve.every_h=0"], "callbacks.learning_curve.every_h"),
+        (["callbacks.learning_curve.interval_h=0"], "callbacks.learning_curve.interval_h"),
         (["callbacks.schedule.warmup_steps=-1"], "callbacks.schedule.warmup_steps must be"),
         (["export=weights.pt"], "export must be a .safetensors"),
         (["stem=0"], "model.stem_channels must be >= 1"),

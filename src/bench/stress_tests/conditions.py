@@ -22,7 +22,7 @@ Voxels = Float[Tensor, "n views bins h w"]
 
 
 def measure_worst_psnr_loss(
-    network: Candidate, bench: StressBench, *, limit: float, parameter: str,
+    network: Candidate, bench: StressBench, *, limit_db: float, parameter: str,
     values: Sequence[Any], fixed: Mapping[str, Any] | None = None,
     reference: Mapping[str, Any] | None = None,
 ) -> StressResult:  # fmt: skip
@@ -36,11 +36,11 @@ def measure_worst_psnr_loss(
     for value in values:
         conditions = ClipConditions.from_settings({parameter: value, **(fixed or {})})
         curve.append((value, base - bench.psnr(network, conditions)))
-    return worst_loss(curve, limit=limit, varied=parameter)
+    return worst_loss(curve, limit_db=limit_db, varied=parameter)
 
 
 def measure_correlated_views_loss(
-    network: Candidate, bench: StressBench, *, limit: float, spacings: Sequence[float]
+    network: Candidate, bench: StressBench, *, limit_db: float, spacings: Sequence[float]
 ) -> StressResult:
     """Return the aligned PSNR lost as the views look through more and more of the same turbulence,
     against views of independent turbulence.
@@ -51,16 +51,16 @@ def measure_correlated_views_loss(
     require_type("turbulence", bench.pipeline.turbulence, SimulatedTurbulence)
     aperture_m = bench.pipeline.draw(bench.indices[0]).turbulence.aperture_m
     found = measure_worst_psnr_loss(
-        network, bench, limit=limit, parameter="turbulence.baseline_m",
+        network, bench, limit_db=limit_db, parameter="turbulence.baseline_m",
         values=[spacing * aperture_m for spacing in spacings],
         fixed={"turbulence.views_correlation": "baseline"},
     )  # fmt: skip
     curve = [(spacing, loss) for spacing, (_, loss) in zip(spacings, found.curve, strict=True)]
-    return worst_loss(curve, limit=limit, varied="sub-aperture spacing in diameters")
+    return worst_loss(curve, limit_db=limit_db, varied="sub-aperture spacing in diameters")
 
 
 def measure_window_rate_loss(
-    network: Candidate, bench: StressBench, *, limit: float, rates_hz: Sequence[float],
+    network: Candidate, bench: StressBench, *, limit_db: float, rates_hz: Sequence[float],
     duration_s: float = 0.3,
 ) -> StressResult:  # fmt: skip
     """Return the aligned PSNR lost, at the same instants, when the events are cut at another rate.
@@ -86,11 +86,11 @@ def measure_window_rate_loss(
         own = score(clip, clip.fps)
         totals += torch.tensor([own - score(clip, rate_hz) for rate_hz in rates_hz])
     curve = list(zip(rates_hz, (totals / len(bench.clips())).tolist(), strict=True))
-    return worst_loss(curve, limit=limit, varied="windows a second")
+    return worst_loss(curve, limit_db=limit_db, varied="windows a second")
 
 
 def measure_event_dropout_loss(
-    network: Candidate, bench: StressBench, *, limit: float, kept_shares: Sequence[float]
+    network: Candidate, bench: StressBench, *, limit_db: float, kept_shares: Sequence[float]
 ) -> StressResult:
     """Return the aligned PSNR lost when only a share of the entries of the grids is kept, at
     random: that of the last of `kept_shares`.
@@ -101,7 +101,7 @@ def measure_event_dropout_loss(
         return lambda voxels: voxels * (torch.rand(voxels.shape, generator=generator) < share)
 
     curve = bench.psnr_losses(network, {share: thin(share) for share in kept_shares})
-    return StressResult(curve[-1][1], "dB", limit, curve, "share of events kept")
+    return StressResult(curve[-1][1], "dB", limit_db, curve, "share of events kept")
 
 
 def require_views(network: Candidate, least: int) -> None:
@@ -111,7 +111,7 @@ def require_views(network: Candidate, least: int) -> None:
 
 
 def measure_view_dropout_loss(
-    network: Candidate, bench: StressBench, *, limit: float, counts: Sequence[int],
+    network: Candidate, bench: StressBench, *, limit_db: float, counts: Sequence[int],
     draws: int = 4,
 ) -> StressResult:  # fmt: skip
     """Return the aligned PSNR lost when `counts` of the views are dark from the start, the worst of
@@ -127,7 +127,7 @@ def measure_view_dropout_loss(
         lost[0] = [middle, *(v for v in lost[0] if v != middle)][:count]  # the centre view, too
         losses = [base - _psnr_without_views(network, bench, views) for views in lost]
         curve.append((count, max(losses)))
-    return worst_loss(curve, limit=limit, varied="views lost")
+    return worst_loss(curve, limit_db=limit_db, varied="views lost")
 
 
 def _psnr_without_views(network: Candidate, bench: StressBench, lost: list[int]) -> float:
@@ -149,7 +149,7 @@ def _psnr_without_views(network: Candidate, bench: StressBench, lost: list[int])
 
 
 def measure_view_shift_loss(
-    network: Candidate, bench: StressBench, *, limit: float, parallax: bool = False,
+    network: Candidate, bench: StressBench, *, limit_db: float, parallax: bool = False,
     shifts_px: Sequence[int] = (1, 2, 4), judged_px: int,
 ) -> StressResult:  # fmt: skip
     """Return the aligned PSNR lost when views are displaced by `judged_px`.
@@ -166,7 +166,7 @@ def measure_view_shift_loss(
         shifts = everywhere if parallax else {moved: (0, px)}
         changes[px] = partial(shift_views, shifts_px=shifts)
     curve = bench.psnr_losses(network, changes)
-    return StressResult(dict(curve)[judged_px], "dB", limit, curve, "px of shift")
+    return StressResult(dict(curve)[judged_px], "dB", limit_db, curve, "px of shift")
 
 
 def shift_views(voxels: Voxels, shifts_px: dict[int, tuple[int, int]]) -> Voxels:

@@ -22,7 +22,7 @@ SCORED_EVERY = 4  # windows of a long run
 
 
 def measure_contrast_retention_percent(
-    network: Candidate, bench: StressBench, *, limit: float, windows: Sequence[int]
+    network: Candidate, bench: StressBench, *, limit_percent: float, windows: Sequence[int]
 ) -> StressResult:
     """Return the contrast kept, in %, after the last number of `windows` without an event."""
     per_clip = []
@@ -37,11 +37,11 @@ def measure_contrast_retention_percent(
         per_clip.append(kept)
     kept = torch.tensor(per_clip).mean(0).tolist()
     curve = list(zip(windows, kept, strict=True))
-    return StressResult(kept[-1], "%", limit, curve, "empty windows", True)
+    return StressResult(kept[-1], "%", limit_percent, curve, "empty windows", True)
 
 
 def measure_long_sequence_drift(
-    network: Candidate, bench: StressBench, *, limit: float, windows: int
+    network: Candidate, bench: StressBench, *, limit_db: float, windows: int
 ) -> StressResult:
     """Return the aligned PSNR in dB lost between the second and the last loop of a clip played back
     and forth; the curve has one entry a tenth of the run.
@@ -61,21 +61,23 @@ def measure_long_sequence_drift(
     losses = (per_loop[1] - per_loop[1:]).tolist()
     curve = [(length * (k + 2), loss) for k, loss in enumerate(losses)]
     thinned = [*curve[: -1 : max(1, len(curve) // 10)], curve[-1]]
-    return StressResult(losses[-1], "dB", limit, thinned, "windows")
+    return StressResult(losses[-1], "dB", limit_db, thinned, "windows")
 
 
 def measure_convergence_windows(
-    network: Candidate, bench: StressBench, *, limit: float, within_db: float = 1.0
+    network: Candidate, bench: StressBench, *, limit_windows: float, within_db: float = 1.0
 ) -> StressResult:
     """Return the windows until the frame is within `within_db` of the clip's second half, for good;
     a clip that never gets there counts its length.
     """
     scores = [aligned_psnr(clip.reconstruct(network)[0], clip.truth) for clip in bench.clips()]
-    return mean_result([measure_settling_time(s, within_db) for s in scores], "windows", limit)
+    return mean_result(
+        [measure_settling_time(s, within_db) for s in scores], "windows", limit_windows
+    )
 
 
 def measure_flicker_recovery(
-    network: Candidate, bench: StressBench, *, limit: float, length: int = 10,
+    network: Candidate, bench: StressBench, *, limit_windows: float, length: int = 10,
     events: float = 3.0, within_db: float = 1.0,
 ) -> StressResult:  # fmt: skip
     """Return the windows until the frame is back within `within_db` after `length` windows in which
@@ -92,11 +94,11 @@ def measure_flicker_recovery(
         after = aligned_psnr(disturbed[half + length :], truth[half:])
         losses = aligned_psnr(plain[half:], truth[half:]) - after
         times.append(windows_to_last_exceedance(losses, within_db))
-    return mean_result(times, "windows", limit)
+    return mean_result(times, "windows", limit_windows)
 
 
 def measure_static_scene_jitter_percent(
-    network: Candidate, bench: StressBench, *, limit: float, moving_share: float = 0.0
+    network: Candidate, bench: StressBench, *, limit_percent: float, moving_share: float = 0.0
 ) -> StressResult:
     """Return the temporal jitter of a static scene's video, in % of what turbulence does to one
     view.
@@ -115,12 +117,12 @@ def measure_static_scene_jitter_percent(
             for video in (clip.turbulent[1:, None].clone(), clip.reconstruct(network)[0])
         )
         shares.append(100 * float(ours / one_view.clamp(min=1e-9)))
-    return mean_result(shares, "%", limit)
+    return mean_result(shares, "%", limit_percent)
 
 
 def measure_perturbation_growth(
-    network: Candidate, bench: StressBench, *, limit: float, perturbation_rms: float = 1e-3,
-    skip: int = 3,
+    network: Candidate, bench: StressBench, *, limit_growth_per_window: float,
+    perturbation_rms: float = 1e-3, skip: int = 3,
 ) -> StressResult:  # fmt: skip
     """Return the growth exponent, per window, of a perturbation of `perturbation_rms` in one.
 
@@ -140,11 +142,11 @@ def measure_perturbation_growth(
         difference = (plain - other)[start + skip :].double().square().mean((1, 2, 3)).sqrt()
         logs = difference.clamp(min=1e-12).log()
         exponents.append(float(np.polyfit(np.arange(len(logs)), logs.numpy(), 1)[0]))
-    return mean_result(exponents, "per window", limit)
+    return mean_result(exponents, "per window", limit_growth_per_window)
 
 
 def measure_adversarial_gain(
-    network: Candidate, bench: StressBench, *, limit: float, windows: int = 12,
+    network: Candidate, bench: StressBench, *, limit_gain: float, windows: int = 12,
     steps: int = 8, perturbation_rms: float = 0.02,
 ) -> StressResult:  # fmt: skip
     """Return the largest gain from input to output: rms change of the last frame over rms of a
@@ -174,11 +176,11 @@ def measure_adversarial_gain(
         (gradient,) = torch.autograd.grad(change, extra)
         curve.append((step, math.sqrt(float(change.detach())) / perturbation_rms))
         extra = gradient + 1e-12
-    return StressResult(max(gain for _, gain in curve), "x", limit, curve, "steps of ascent")
+    return StressResult(max(gain for _, gain in curve), "x", limit_gain, curve, "steps of ascent")
 
 
 def measure_bf16_psnr_difference(
-    network: Candidate, bench: StressBench, *, limit: float, windows: int
+    network: Candidate, bench: StressBench, *, limit_db: float, windows: int
 ) -> StressResult:
     """Return the mean difference of aligned PSNR, in dB, between bf16 and float32 in the last
     quarter of a long run.
@@ -194,7 +196,7 @@ def measure_bf16_psnr_difference(
         scores.append(aligned_psnr(frames, truth[at, None]))
     gaps = (scores[0] - scores[1]).view(4, -1).mean(1).abs().tolist()
     curve = [(quarter * (k + 1), gap) for k, gap in enumerate(gaps)]
-    return StressResult(gaps[-1], "dB", limit, curve, "windows")
+    return StressResult(gaps[-1], "dB", limit_db, curve, "windows")
 
 
 def measure_settling_time(scores: Float[Tensor, " windows"], within_db: float) -> float:

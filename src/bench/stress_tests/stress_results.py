@@ -42,9 +42,9 @@ class StressResult:
 StressTest = Callable[[Candidate, StressBench], StressResult]
 
 
-def worst_loss(curve: Curve, *, limit: float, varied: str) -> StressResult:
+def worst_loss(curve: Curve, *, limit_db: float, varied: str) -> StressResult:
     """Return the result whose value is the largest of the curve, in dB."""
-    return StressResult(max(value for _, value in curve), "dB", limit, curve, varied)
+    return StressResult(max(value for _, value in curve), "dB", limit_db, curve, varied)
 
 
 def mean_result(values: Sequence[float], unit: str, limit: float) -> StressResult:

@@ -19,7 +19,7 @@ Film = Float[Tensor, "frames h w"]
 
 
 def measure_trajectory_deviation(
-    network: Candidate, bench: StressBench, *, limit: float
+    network: Candidate, bench: StressBench, *, limit_px: float
 ) -> StressResult:
     """Return the rms distance, in pixels, of the front of a flying target from its line, across it;
     the mean over clips of one target.
@@ -37,7 +37,7 @@ def measure_trajectory_deviation(
     deviations = list(map(deviation, clips))
     named = [(f"clip {n}", d) for n, d in zip(bench.indices, deviations, strict=True)]
     curve = [("no turbulence", without), ("light of one view", light), *named]
-    return StressResult(fmean(deviations), "px", limit, curve, "video")
+    return StressResult(fmean(deviations), "px", limit_px, curve, "video")
 
 
 def measure_deviation(frames: Film, truth: Film) -> float:

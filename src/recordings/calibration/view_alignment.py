@@ -21,6 +21,7 @@ from src.sim.optics import Position
 MIN_VIEWS = 4
 MARGIN = 0.04  # of a tile's side, cut off at each seam
 MAX_ERROR_PX = 1.5  # a point further off is an outlier of the homography
+Rectangle = tuple[float, float, float, float]  # left, top, right, bottom
 FLIPS = ((False, False), (True, False), (False, True), (True, True))
 
 
@@ -141,14 +142,12 @@ def fit_homographies(
         residuals[at] = cv2.perspectiveTransform(points[None, good], matrix)[0] - onto[good]
         error = float(np.sqrt((residuals[at] ** 2).sum(1).mean()))
         views.append(View(at, matrix, error, len(used[at])))
-    return AlignedViews(Views(sensor, model, _field(found, model), tuple(views)), used, residuals)
+    field = cut_field(_between_boards(found), model)
+    return AlignedViews(Views(sensor, model, field, tuple(views)), used, residuals)
 
 
-def _field(found: Mapping[Position, Points], model: Size) -> tuple[float, float, float, float]:
-    """Return the largest rectangle of the model's aspect in the centre tile, less MARGIN.
-
-    The tile is bounded half way between a point and its image in each neighbour.
-    """
+def _between_boards(found: Mapping[Position, Points]) -> Rectangle:
+    """Return the centre tile: bounded half way between a point and its image in each neighbour."""
     centre = found[0, 0]
     middle = np.nanmean(centre, axis=0)
     sides = {}
@@ -164,10 +163,16 @@ def _field(found: Mapping[Position, Points], model: Size) -> tuple[float, float,
         sides[at][1] if at in sides else middle[axis] + sign * reach
         for at, axis, sign in (((0, -1), 0, -1), ((-1, 0), 1, -1), ((0, 1), 0, 1), ((1, 0), 1, 1))
     )
+    return float(left), float(top), float(right), float(bottom)
+
+
+def cut_field(tile: Rectangle, model: Size) -> Rectangle:
+    """Return the largest rectangle of the model's aspect in the middle of `tile`, less MARGIN."""
+    left, top, right, bottom = tile
     scale = min((right - left) / model[1], (bottom - top) / model[0]) * (1 - 2 * MARGIN) / 2
     x, y = (left + right) / 2, (top + bottom) / 2
     across, along = scale * model[1], scale * model[0]
-    return float(x - across), float(y - along), float(x + across), float(y + along)
+    return x - across, y - along, x + across, y + along
 
 
 def views_from_corners(corners: Mapping[Position, Points], *, sensor: Size, model: Size) -> Views:

@@ -1,7 +1,7 @@
 """What a format's reader gives to the recording that is read from it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import NamedTuple
@@ -65,6 +65,16 @@ class RawEvents(NamedTuple):
     p: np.ndarray
 
 
+class RawFrames(NamedTuple):
+    """Frames of a camera beside the event pixels, as a file has them: times `t` (n,) in `unit`,
+    None: that of the events; `size`: (height, width); `pictures()` yields them, uint8 (h, w)."""
+
+    t: np.ndarray
+    size: tuple[int, int]
+    pictures: Callable[[], Iterator[np.ndarray]]
+    unit: str | None = None
+
+
 class EventFile(ABC):
     """An event file of one format, opened with a `path` and ReadOptions.
 
@@ -88,4 +98,8 @@ class EventFile(ABC):
     def times(self) -> Iterator[np.ndarray] | None:
         """Yield the times alone, in pieces, as `pieces` has them; None where this would cost as
         much as `pieces`: then order is judged while events are read."""
+        return None
+
+    def frames(self) -> RawFrames | None:
+        """Return the frames of a camera that the recording has beside its events, None for none."""
         return None

@@ -15,6 +15,7 @@ from faery.file_encoder import events_to_file
 
 from src.recordings.files import table_writers
 from src.recordings.files.event_file import PIECE_EVENTS
+from src.recordings.files.recorded_frames import RecordedFrames
 
 BINARY = {".raw": "evt", ".dat": "dat", ".aedat4": "aedat", ".es": "es"}
 TABLES: dict[str, Callable] = {
@@ -53,10 +54,11 @@ def write_pieces(
     height: int,
     version: str = "evt3",
     layout: str | None = None,
+    frames: RecordedFrames | None = None,
 ) -> tuple[int, float]:
     """Write events that come in pieces, as `write_events`; return how many, and their seconds.
 
-    `layout` evreal writes a folder, as EVREAL reads it.
+    `layout` evreal writes a folder, as EVREAL reads it, with `frames` of the sensor's size.
     """
     path = Path(path)
     kind = find_kind(path, layout, width, height, version)
@@ -68,7 +70,8 @@ def write_pieces(
         if kind in BINARY:
             _write_binary(partial, kind, iter(checked), (width, height), version)
         else:
-            TABLES[kind](partial, iter(checked), (width, height))
+            given = {"frames": frames} if kind == "evreal" else {}
+            TABLES[kind](partial, iter(checked), (width, height), **given)
         if kind == "evreal":
             _remove(path)
         os.replace(partial, path)

@@ -8,6 +8,7 @@ Known layouts: DSEC (events/{x, y, t, p} in us after `t_offset`; Gehrig et al. 2
 import math
 import re
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,8 @@ from src.recordings.files.columns import (
     match_columns,
     pick_columns,
 )
-from src.recordings.files.event_file import EventFile, RawEvents, ReadOptions
+from src.recordings.files.event_file import EventFile, RawEvents, RawFrames, ReadOptions
+from src.recordings.files.frame_files import stored_frames, to_gray
 from src.recordings.files.streams import EventStream, choose_stream
 
 HDF5_ENDINGS = (".h5", ".hdf5", ".hdf")
@@ -63,10 +65,26 @@ class Hdf5File(EventFile):
     def times(self) -> Iterator[np.ndarray] | None:
         return slice_times(self.path, self._columns["t"]) if self._has_own_times else None
 
+    def frames(self) -> RawFrames | None:
+        """Return image_raw and image_raw_ts beside the events (MVSEC), or the pictures of the group
+        `images`, with the attribute timestamp each (event_cnn_minimal)."""
+        for name in ("image_raw", "images"):
+            held = self._beside.get(name)
+            if isinstance(held, h5py.Dataset) and f"{name}_ts" in self._beside:
+                return stored_frames(held, self._beside[f"{name}_ts"][:])
+            if isinstance(held, h5py.Group) and len(held):
+                pictures = [held[key] for key in sorted(held)]
+                times = np.array([picture.attrs["timestamp"] for picture in pictures])
+                height, width = pictures[0].shape[:2]
+                read = partial(map, lambda picture: to_gray(picture[:]), pictures)
+                return RawFrames(times, (height, width), read)
+        return None
+
     def _open(self, node: Any, options: ReadOptions) -> None:
         check_claim(self.path, _claimed_bytes(node))
         check_codec(node)
         group = node if isinstance(node, h5py.Group) else node.parent
+        self._beside = node.parent
         self.size = _stated_size(node) or _stated_size(group) or _stated_size(self._file)
         self._has_own_times = isinstance(node, h5py.Group)
         self._columns: dict[str, Any] = (

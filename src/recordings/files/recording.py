@@ -20,7 +20,9 @@ from src.recordings.files.es_file import EsFile
 from src.recordings.files.event_arrays import concatenate_events, count_before
 from src.recordings.files.event_file import EVENT, EventFile, RawEvents, ReadOptions
 from src.recordings.files.event_order import EventOrder, merge_in_time
+from src.recordings.files.evreal_folder import EvrealFolder, is_evreal_folder
 from src.recordings.files.hdf5_file import HDF5_ENDINGS, Hdf5File
+from src.recordings.files.npz_folder import NpzFolder, find_npz_folder
 from src.recordings.files.prophesee_file import PropheseeFile
 from src.recordings.files.rosbag_file import RosbagFile, is_bag_folder
 from src.recordings.files.survey import TimeSurvey, survey_times
@@ -72,7 +74,7 @@ def open_recording(
     Raises ValueError for a file that is missing, empty, of an unknown kind or cannot be read.
     """
     path = Path(path)
-    if not is_bag_folder(path) and (not path.is_file() or path.stat().st_size == 0):
+    if find_folder_reader(path) is None and (not path.is_file() or path.stat().st_size == 0):
         found = "is a folder, not an event file" if path.is_dir() else "no such file"
         raise ValueError(f"{path}: {'the file is empty' if path.is_file() else found}")
     state = path.stat()
@@ -207,10 +209,18 @@ def _plain(raw: RawEvents) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return x, y, np.ascontiguousarray(p)
 
 
+def find_folder_reader(path: Path) -> Reader | None:
+    """Return the reader of a folder that is a recording; None for a file and any other folder."""
+    if not path.is_dir():
+        return None
+    kinds = {RosbagFile: is_bag_folder, EvrealFolder: is_evreal_folder, NpzFolder: find_npz_folder}
+    return next((reader for reader, is_one in kinds.items() if is_one(path)), None)
+
+
 def _open_file(path: Path, options: ReadOptions) -> EventFile:
     ending = "".join(path.suffixes[-2:]).lower()
     reader = READERS.get(ending) or READERS.get(path.suffix.lower())
-    reader = RosbagFile if path.is_dir() else reader
+    reader = find_folder_reader(path) or reader
     if reader is None:
         raise ValueError(f"{path}: unknown kind of event file, known are {', '.join(READERS)}")
     if reader in OF_ONE_CAMERA and options.stream not in (None, 0, "0"):

@@ -10,14 +10,21 @@ its size.
 """
 
 import struct
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
 from src.recordings.files.caer_packets import split_libcaer, split_libcaer_cmp
 from src.recordings.files.event_file import RawEvents
 from src.recordings.files.evt_decoder import EvtDecoder
+from src.recordings.files.frame_files import to_gray
 
 ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
+IMAGE = "sensor_msgs/msg/Image"
+GRAY, COLOUR = ("mono8", "8UC1"), ("bgr8", "rgb8")  # encodings of images that are read
 WORDS = {"evt3": "u2", "mono": "u8", "libcaer": "u4", "libcaer_cmp": "u2"}  # by the encoding
 PACKETS = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
 LAST_START_NS = 2**62  # the year 2116
@@ -110,6 +117,28 @@ class EventMessage:
         table = np.frombuffer(self._content, kind, count, self._at)
         self._at += size * count
         return table
+
+
+def read_image(content: bytes, cdr: bool) -> tuple[int, np.ndarray]:
+    """Return the time in nanoseconds and the grey picture (h, w) of a sensor_msgs/Image.
+
+    Raises ValueError for an encoding of other than 8 bits.
+    """
+    store = _typestore(cdr)
+    image: Any = (store.deserialize_cdr if cdr else store.deserialize_ros1)(content, IMAGE)
+    if image.encoding not in (*GRAY, *COLOUR):
+        known = ", ".join((*GRAY, *COLOUR))
+        raise ValueError(f"images of encoding {image.encoding} are not read, but {known}")
+    depth = 3 if image.encoding in COLOUR else 1
+    rows = image.data.reshape(image.height, image.step)[:, : image.width * depth]
+    picture = to_gray(rows.reshape(image.height, image.width, depth), image.encoding == "rgb8")
+    stamp = image.header.stamp
+    return stamp.sec * 1_000_000_000 + stamp.nanosec, picture
+
+
+@lru_cache
+def _typestore(cdr: bool) -> Typestore:
+    return get_typestore(Stores.ROS2_HUMBLE if cdr else Stores.ROS1_NOETIC)
 
 
 def _events(table: np.ndarray) -> RawEvents:

@@ -8,9 +8,11 @@ from collections import Counter
 from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager
 from functools import partial
+from os.path import commonpath
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag1 import reader as ros1
 from rosbags.rosbag2 import storage_mcap as mcap
@@ -18,9 +20,9 @@ from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from src.recordings.files.clocks import merge_small_pieces
-from src.recordings.files.event_file import EventFile, RawEvents, ReadOptions
+from src.recordings.files.event_file import EventFile, RawEvents, RawFrames, ReadOptions
 from src.recordings.files.evt_decoder import EvtDecoder
-from src.recordings.files.ros_messages import ARRAYS, PACKETS, EventMessage
+from src.recordings.files.ros_messages import ARRAYS, IMAGE, PACKETS, EventMessage, read_image
 from src.recordings.files.streams import EventStream, choose_stream
 from src.recordings.files.unpacking import unpack
 
@@ -74,6 +76,26 @@ class RosbagFile(EventFile):
                 f"{self.path}: {decoder.lost} events before the first time, dropped", stacklevel=2
             )
 
+    def frames(self) -> RawFrames | None:
+        """Return the images of the topic whose name is most like that of the events, such as
+        /dvs/image_raw beside /dvs/events; None for events without the bag's clock."""
+        with self._opened() as reader:
+            links = [link for link in reader.connections if link.msgtype == IMAGE]
+        topics = {link.topic for link in links if link.msgcount}
+        if not topics or self._encoding == "evt3":
+            return None
+        topic = max(
+            sorted(topics), key=lambda name: len(commonpath([f"/{name}", f"/{self._topic}"]))
+        )
+
+        def images() -> Iterator[tuple[int, np.ndarray]]:
+            for _, content in self._contents((IMAGE,), topic):
+                yield read_image(content, self._ros2)
+
+        _, first = next(images())
+        times = np.array([time for time, _ in images()])
+        return RawFrames(times, first.shape, lambda: (picture for _, picture in images()), "ns")
+
     def _events(self, decoder: EvtDecoder) -> Iterator[RawEvents]:
         for _, message in self._messages(self._topic):
             try:
@@ -102,14 +124,21 @@ class RosbagFile(EventFile):
 
     def _messages(self, topic: str | None = None) -> Messages:
         """Yield the messages of a topic, or of all topics of events, with its name."""
+        with closing(self._contents((*ARRAYS, *PACKETS), topic)) as contents:
+            for link, content in contents:
+                yield link.topic, EventMessage(link.msgtype, content, self._ros2)
+
+    def _contents(
+        self, kinds: tuple[str, ...], topic: str | None
+    ) -> Generator[tuple[Any, bytes], None, None]:
+        """Yield the bytes of the messages of some types, of one topic or of all."""
         with self._opened() as reader:
             for part in getattr(reader, "storages", [reader]):  # the files of a folder
-                links = [link for link in part.connections if link.msgtype in (*ARRAYS, *PACKETS)]
+                links = [link for link in part.connections if link.msgtype in kinds]
                 wanted = [link for link in links if topic in (None, link.topic)]
                 for link, _, content in part.messages(wanted) if wanted else ():
                     packed = content[:4] == ZSTD
-                    content = unpack(content, "zstd") if packed else content
-                    yield link.topic, EventMessage(link.msgtype, content, self._ros2)
+                    yield link, unpack(content, "zstd") if packed else content
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:

@@ -1,5 +1,6 @@
 """Inputs of known size: events of a recording, a picture of the sensor."""
 
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -10,7 +11,7 @@ from jaxtyping import Float
 
 from src.recordings.files import recording
 from src.recordings.files.event_file import ReadOptions
-from src.recordings.files.rosbag_file import is_bag_folder
+from src.recordings.files.recorded_frames import find_frames
 from src.recordings.files.videos import read_gray_picture, read_video
 from src.sim.scenes.video_files import PICTURE_SUFFIXES, VIDEO_SUFFIXES
 
@@ -22,13 +23,17 @@ def sensor_size(
     sensor: Sequence[int] | None = None,
     options: ReadOptions = ReadOptions(),
 ) -> Size:
-    """Return (height, width) of the recording's sensor; `sensor` for a file that does not say.
+    """Return (height, width) of the recording's sensor; `sensor` for a file that does not say,
+    which is else that of the frames beside its events, with a warning.
 
     Raises ValueError where neither says, or both do and differ.
     """
-    size = recording.open_recording(path, options=options).size
-    stated = size and size[::-1]
+    opened = recording.open_recording(path, options=options)
+    stated = opened.size and opened.size[::-1]
     given = (sensor[0], sensor[1]) if sensor is not None else stated
+    if given is None and (frames := find_frames(opened)) is not None:
+        given = frames.size
+        warnings.warn(f"{path}: a sensor of {given[1]}x{given[0]}, as its frames", stacklevel=2)
     if given is None:
         raise ValueError(f"{path} does not state its sensor; give sensor_size=[height,width]")
     if stated not in (None, given):
@@ -77,7 +82,7 @@ def has_events(path: Path | str) -> bool:
     """Return whether `path` is none of: folder of pictures, picture, film, our `video.h5`."""
     path = Path(path)
     if path.is_dir() or path.suffix.lower() in PICTURE_SUFFIXES | VIDEO_SUFFIXES:
-        return is_bag_folder(path)
+        return recording.find_folder_reader(path) is not None
     try:
         with h5py.File(path) if path.suffix.lower() == ".h5" else nullcontext({}) as file:
             return "frames" not in file

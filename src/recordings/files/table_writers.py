@@ -5,14 +5,19 @@ Polarity is written as 0 and 1, time in microseconds but where a layout has anot
 
 import json
 import tempfile
+import warnings
 import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
+from numpy.lib.format import open_memmap
+
+from src.recordings.files.recorded_frames import RecordedFrames
 
 EVREAL_TIMES = "events_ts.npy"
 CHUNK_EVENTS = 2**16  # in HDF5
@@ -44,18 +49,46 @@ def write_npz(path: Path, pieces: Pieces, size: tuple[int, int]) -> None:
                 archive.write(column, column.name)
 
 
-def write_evreal(path: Path, pieces: Pieces, size: tuple[int, int]) -> None:
-    """Write a folder as EVREAL (Ercan et al. 2023) reads one: events_ts.npy in seconds,
-    events_xy.npy (n, 2), events_p.npy, and the sensor's (height, width) in metadata.json."""
+def write_evreal(
+    path: Path, pieces: Pieces, size: tuple[int, int], frames: RecordedFrames | None = None
+) -> None:
+    """Write a folder as EVREAL reads one (evreal_folder.py), with the frames up to the first at or
+    after the last event; the clock starts at 0 with the first event or frame."""
     path.mkdir()
     files = [
         (path / EVREAL_TIMES, np.float64, ()),
         (path / "events_xy.npy", np.int16, (2,)),
         (path / "events_p.npy", np.uint8, ()),
     ]
-    columns = ((e["t"] * 1e-6, np.stack([e["x"], e["y"]], 1), e["p"] > 0) for e in pieces)
+    first = list(islice(pieces, 1))
+    starts = [part["t"][0] for part in first] + ([] if frames is None else [frames.times_us[0]])
+    zero_us = float(min(starts, default=0))
+    columns = (
+        ((part["t"] - zero_us) * 1e-6, np.stack([part["x"], part["y"]], 1), part["p"] > 0)
+        for part in chain(first, pieces)
+    )
     _write_columns(files, columns)
     (path / "metadata.json").write_text(json.dumps({"sensor_resolution": [size[1], size[0]]}))
+    if frames is not None and first:
+        _write_evreal_frames(path, frames, zero_us)
+
+
+def _write_evreal_frames(path: Path, frames: RecordedFrames, zero_us: float) -> None:
+    t = np.load(path / EVREAL_TIMES, mmap_mode="r")
+    times = (frames.times_us - zero_us) * 1e-6
+    kept = np.arange(len(times)) <= np.searchsorted(times, t[-1])
+    if (dropped := int((~kept).sum())) > 0:
+        warnings.warn(
+            f"{dropped} of {len(times)} frames come after the last event, left out", stacklevel=2
+        )
+    times = times[kept][:, None]
+    stored = open_memmap(path / "images.npy", "w+", np.uint8, (len(times), *frames.size, 1))
+    for place, picture in enumerate(frames.select(kept).pictures()):
+        stored[place, ..., 0] = picture
+    stored.flush()
+    np.save(path / "images_ts.npy", times)
+    index = np.searchsorted(t, times, "right") - 1  # of the last event at or before a frame
+    np.save(path / "image_event_indices.npy", index.clip(0, len(t) - 1))
 
 
 def write_dsec(path: Path, pieces: Pieces, size: tuple[int, int]) -> None:

@@ -14,7 +14,14 @@ from pathlib import Path
 import numpy as np
 
 from src.recordings.files.columns import MAX_COORDINATE, as_integers, check_claim, find_columns
-from src.recordings.files.event_file import PIECE_EVENTS, EventFile, RawEvents, ReadOptions
+from src.recordings.files.event_file import (
+    PIECE_EVENTS,
+    EventFile,
+    RawEvents,
+    RawFrames,
+    ReadOptions,
+)
+from src.recordings.files.frame_files import listed_frames
 from src.recordings.files.text_layout import (
     COMMENTS,
     MAX_LINE,
@@ -55,6 +62,9 @@ class TextFile(EventFile):
     def times(self) -> Iterator[np.ndarray]:
         for first in range(0, len(self._events), PIECE_EVENTS):
             yield np.array(self._events["t"][first : first + PIECE_EVENTS])
+
+    def frames(self) -> RawFrames | None:
+        return listed_frames(self.path.parent / "images.txt")
 
     def _read(self, options: ReadOptions) -> np.ndarray:
         """Return all events, (n,) of t in the file's unit, x, y, p, as they stand in the file."""

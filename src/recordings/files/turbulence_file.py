@@ -136,7 +136,7 @@ class MeasuredTurbulence(SimulatedTurbulence):
                 tilt_correlation_half_length_px=float(length),
                 tilt_correlation_time_s=float(log_uniform(u[1], self.decays, "decay_s")),
                 tilt_px=float(log_uniform(u[2], _bounds(rms), "rms_px")),
-                blur_ratio=1 + LUCKY * (float(np.interp(u[3], (0, 1), _bounds(blur))) - 1),
+                psf_width_ratio=1 + LUCKY * (float(np.interp(u[3], (0, 1), _bounds(blur))) - 1),
                 global_tilt_share=float(np.interp(u[4], (0, 1), _bounds(share))),
             )
             try:

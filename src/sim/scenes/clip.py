@@ -19,7 +19,7 @@ RANGES = {  # of what scenes take; a share is one of the clips
     "width": (8, math.inf),
     "frames": (2, math.inf),
     "contrast": (0, 1),
-    "rest_share": (0, 1),
+    "paused_clip_share": (0, 1),
     "static_camera_share": (0, 1),
     "flicker_share": (0, 1),
     "max_cutouts": (0, math.inf),

@@ -72,7 +72,9 @@ class MovingLayer:
     motion: SimilarityMotion
     reenters: bool = False
 
-    def matrix(self, time_s: float, size: tuple[int, int]) -> Float[np.ndarray, "2 3"]:
+    def frame_to_picture_matrix(
+        self, time_s: float, size: tuple[int, int]
+    ) -> Float[np.ndarray, "2 3"]:
         """Return the map from frame pixels (x, y) to picture pixels."""
         (height, width), (shift, angle, log_zoom) = size, self.motion.pose_at(time_s)
         cos, sin = math.cos(angle), math.sin(angle)
@@ -92,9 +94,9 @@ def render_frame(
 ) -> Float[np.ndarray, "h w"]:
     """Return the frame at `time_s`: the first layer with the others before it."""
     background, *cutouts = layers
-    frame = _warp(background.picture, background.matrix(time_s, size), size)
+    frame = _warp(background.picture, background.frame_to_picture_matrix(time_s, size), size)
     for layer in cutouts:
-        matrix = layer.matrix(time_s, size)
+        matrix = layer.frame_to_picture_matrix(time_s, size)
         rows, columns = _visible_box(layer.picture.shape, matrix, size)
         behind = frame[rows, columns]
         if behind.size and layer.mask is not None:

@@ -37,15 +37,15 @@ class PhotographScene(SceneBase):
     `root`: a folder of photographs, searched recursively, a pack of them (scripts/pack_scenes.py),
     or several of either (None: those inside scikit-image); 10 % of each serve `val` and 20 %
     `test`.  `extra_train_root`: as `root`, more photographs, which serve training only.
-    `photo_px_per_px`: range of photograph pixels per pixel of a frame 256 wide.  `rest_share`: of
-    the clips in which all pauses, stops or never moves.  Raises ValueError where there are no
-    photographs, or for a value outside its range.
+    `photo_px_per_px`: range of photograph pixels per pixel of a frame 256 wide.
+    `paused_clip_share`: of the clips in which all pauses, stops or never moves.  Raises ValueError
+    where there are no photographs, or for a value outside its range.
     """
 
     root: Root = field(default=None, kw_only=False)
     extra_train_root: Root = None
     photo_px_per_px: Sequence[float] = (0.9, 1.6)
-    rest_share: float = 0.0
+    paused_clip_share: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -89,7 +89,7 @@ class Photographs(PhotographScene):
         key = noise.key(self.seed, self.split, "photographs", index)
         rng = np.random.default_rng(key)
         rng_rests = np.random.default_rng(noise.key(key, "tempo"))  # `rng` draws as without rests
-        shares = self.static_camera_share, self.rest_share
+        shares = self.static_camera_share, self.paused_clip_share
         static, rests = (rng_rests.uniform(size=2) < shares).tolist()
         name, picture = self._read_random_photo(rng)
         layers = [self.background_layer(picture, rng, self.speed_widths_per_s)]

@@ -60,7 +60,7 @@ class TargetsOnPhotographs(PhotographScene):
         background = render_frame([layer], 0.0, self.size)
         targets = [self._draw_target(rng) for _ in range(rng.integers(1, self.max_targets + 1))]
         frames = []
-        for time in self.motion_times_s(rng.uniform() < self.rest_share, rng):
+        for time in self.motion_times_s(rng.uniform() < self.paused_clip_share, rng):
             frame = background.copy()
             for draw, dim, bright in targets:
                 shape, cover, _ = draw(time)

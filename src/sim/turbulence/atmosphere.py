@@ -61,7 +61,7 @@ class Atmosphere:
         return (self.cn2,) if isinstance(self.cn2, int | float) else tuple(self.cn2)
 
     @cached_property
-    def cn2_dz_slices(self) -> tuple[Tensor, Tensor]:
+    def integrated_cn2_by_slice(self) -> tuple[Tensor, Tensor]:
         """Where the turbulence is: z / L of 2048 slices and each slice's Int Cn2 dz, in float64."""
         place = (torch.arange(2048, dtype=torch.float64) + 0.5) / 2048
         knots = np.linspace(0, 1, len(self.cn2_profile))
@@ -74,7 +74,7 @@ class Atmosphere:
 
         r0 = [0.423 k^2 Int Cn2(z) (1 - z/L)^(5/3) dz]^(-3/5) (Fried 1966).
         """
-        place, strength = self.cn2_dz_slices
+        place, strength = self.integrated_cn2_by_slice
         integral = 0.423 * self._k**2 * float((strength * (1 - place) ** (5 / 3)).sum())
         return integral**-0.6 if integral > 0 else math.inf
 
@@ -112,7 +112,7 @@ class Atmosphere:
         2.25 k^(7/6) Int Cn2 [z (1 - z/L)]^(5/6) dz, 0.5 Cn2 k^(7/6) L^(11/6) for a constant Cn2
         (Andrews & Phillips, 2nd ed., ch. 8).
         """
-        place, strength = self.cn2_dz_slices
+        place, strength = self.integrated_cn2_by_slice
         weighted = strength * (place * (1 - place) * self.distance_m) ** (5 / 6)
         return 2.25 * self._k ** (7 / 6) * float(weighted.sum())
 

@@ -1,7 +1,8 @@
 """What the pixels of a clip need: small tables made on the CPU, by another process if need be."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Complex, Float
@@ -16,28 +17,46 @@ from src.sim.turbulence.plane_waves import PlaneWaves
 from src.sim.turbulence.psf import PSFHalo
 
 ALIGNMENT = 16  # bytes
+Places = Mapping[str, tuple[slice, torch.dtype, torch.Size]]
 
 
 class PackedTensors:
-    """Tensors of the CPU by name, in one piece of memory: a single copy takes them to a device."""
+    """Tensors of the CPU by name; one copy takes all to a device or, pickled, to a process."""
 
     def __init__(self, tensors: Mapping[str, Tensor]):
-        self.places, end = {}, 0
-        for name, part in tensors.items():
-            self.places[name] = slice(end, end + part.nbytes), part.dtype, part.shape
-            end += -(-part.nbytes // ALIGNMENT) * ALIGNMENT
-        self.memory = torch.zeros(end, dtype=torch.uint8)
-        for name, part in tensors.items():
-            place = self.memory[self.places[name][0]]
-            place.copy_(part.contiguous().flatten().view(torch.uint8))
+        self.tensors = dict(tensors)
 
     def to(self, device: torch.device) -> dict[str, Tensor]:
         """Return the tensors on `device`."""
-        there = copy_to_device(self.memory, device)
-        return {
-            name: there[place].view(dtype).view(shape)
-            for name, (place, dtype, shape) in self.places.items()
-        }
+        if device.type == "cpu":
+            return dict(self.tensors)
+        memory, places = self.packed
+        return _unpack(copy_to_device(memory, device), places)
+
+    @cached_property
+    def packed(self) -> tuple[Tensor, Places]:
+        """The tensors in one piece of memory, and their places there."""
+        places, end = {}, 0
+        for name, part in self.tensors.items():
+            places[name] = slice(end, end + part.nbytes), part.dtype, part.shape
+            end += -(-part.nbytes // ALIGNMENT) * ALIGNMENT
+        memory = torch.zeros(end, dtype=torch.uint8)
+        for name, part in self.tensors.items():
+            memory[places[name][0]].copy_(part.contiguous().flatten().view(torch.uint8))
+        return memory, places
+
+    def __getstate__(self) -> tuple[Tensor, Places]:
+        return self.packed
+
+    def __setstate__(self, state: tuple[Tensor, Places]) -> None:
+        self.tensors, self.packed = _unpack(*state), state
+
+
+def _unpack(memory: Tensor, places: Places) -> dict[str, Tensor]:
+    return {
+        name: memory[place].view(dtype).view(shape)
+        for name, (place, dtype, shape) in places.items()
+    }
 
 
 @dataclass(frozen=True)
@@ -51,6 +70,11 @@ class TilePlan:
     fidelity: Fidelity
     psfs: FittedPSFs
     halo_share: float
+
+    def of_frames(self, first: int, stop: int, frames: int) -> "TilePlan":
+        """Return the plan of frames first .. stop - 1 of the clip's `frames`."""
+        by_view = self.amplitudes.unflatten(0, (-1, frames))
+        return replace(self, amplitudes=by_view[:, first:stop].flatten(0, 1))
 
 
 def plan_tile(

@@ -22,6 +22,7 @@ from torch import Tensor
 from src.sim.turbulence.clip_plan import TilePlan
 from src.sim.turbulence.coefficient_grid import WaveSum, evaluate_waves, sum_waves
 from src.sim.turbulence.engines import device as devices
+from src.sim.turbulence.engines.network_numba import evaluate_network
 from src.sim.turbulence.engines.scatter_numba import scatter_psfs
 from src.sim.turbulence.engines.warp_numba import PaddedFrames, pad_frames, warp_frames
 from src.sim.turbulence.p2s import FoldedNetwork
@@ -29,7 +30,6 @@ from src.sim.turbulence.psf import convolve_halo
 
 DEVICE_BYTES = 2 * 2**30  # held at a time on a device, about
 CPU_NUMBERS = 2_000_000  # at the nodes of a view at a time, on the CPU
-CPU_NODES = 4096  # that go through a network at a time, so that they stay in the cache
 
 
 def render_views(
@@ -80,16 +80,17 @@ def _render_tile(
     amplitudes = devices.copy_to_device(plan.amplitudes, frames.device)
     sum_tilt = _make_wave_sum(tables, "tilt", 0, on_cpu=padded is not None)
     sum_psf = _make_wave_sum(tables, "psf", 2, on_cpu=padded is not None)
+    weigh = _make_network(tables, on_cpu=padded is not None)
     rows, columns, spectrum = (tables[f"halo_{name}"] for name in ("rows", "columns", "spectrum"))
     tables["halo"] = convolve_halo(frames, rows, columns, spectrum, plan.tile[2:])
 
     def render(first: int, stop: int) -> None:
         drawn = amplitudes[first:stop]
-        tilt, phase = _tilt(plan, tables, sum_tilt(drawn)), sum_psf(drawn)
+        tilt, weights = _tilt(plan, tables, sum_tilt(drawn)), weigh(sum_psf(drawn))
         if padded is not None:
-            _blur_on_cpu(padded, first % len(frames), tilt, phase, plan, tables, out[first:stop])
+            _blur_on_cpu(padded, first % len(frames), tilt, weights, plan, tables, out[first:stop])
         else:
-            out[first:stop] = _blur_on_device(frames, first, tilt, phase, plan, tables)
+            out[first:stop] = _blur_on_device(frames, first, tilt, weights, plan, tables)
 
     with devices.full_float32():
         if padded is not None:
@@ -112,6 +113,20 @@ def _make_wave_sum(
     return lambda amplitudes: sum_waves(response, amplitudes, waves)
 
 
+def _make_network(tables: dict[str, Tensor], *, on_cpu: bool) -> Callable[[Tensor], Tensor]:
+    """Return the function from phase at nodes to weights there, with the mean's 1 on a device."""
+    network = FoldedNetwork(*(tables[name] for name in FoldedNetwork._fields))
+    if not on_cpu:
+        return lambda phase: network(phase.flatten(1)).unflatten(1, phase.shape[1:])
+    matrices = [matrix.numpy() for matrix in network._replace(last=network.last[1:])]
+
+    def weigh(phase: Tensor) -> Tensor:
+        weights = evaluate_network(phase.flatten(1).numpy(), *matrices)
+        return torch.from_numpy(weights).unflatten(1, phase.shape[1:])
+
+    return weigh
+
+
 def _tilt(
     plan: TilePlan, tables: dict[str, Tensor], nodes: Float[Tensor, "2 n rows columns"]
 ) -> Float[Tensor, "2 n h w"]:
@@ -125,44 +140,36 @@ def _blur_on_cpu(
     padded: PaddedFrames,
     first: int,
     tilt: Float[Tensor, "2 n h w"],
-    phase: Float[Tensor, "blurmodes n rows columns"],
+    weights: Float[Tensor, "rank n rows columns"],
     plan: TilePlan,
     tables: dict[str, Tensor],
     out: Float[Tensor, "n hout wout"],
 ) -> None:
     """Write the frames from `first` on, warped by `tilt` and spread by their PSFs, to `out`."""
-    network, (rows, columns) = _network(tables), plan.psf_grid
-    parts = [network(nodes)[1:] for nodes in phase.flatten(1).split(CPU_NODES, 1)]
-    weights = torch.cat(parts, 1).unflatten(1, phase.shape[1:]).numpy()
+    (rows, columns), nodes = plan.psf_grid, weights.numpy()
     basis = plan.psfs.quarter, np.array(plan.psfs.parity_ends)
     lattice = rows.offset, columns.offset, rows.pitch
-    warped = warp_frames(padded, first, tilt, rows.start, columns.start).numpy()
-    for index, image in enumerate(warped):
+    for index, image in enumerate(warp_frames(padded, first, tilt, rows.start, columns.start)):
         halo = tables["halo"][first + index].numpy(), plan.halo_share
-        out[index] = torch.from_numpy(scatter_psfs(image, weights, index, *basis, *lattice, *halo))
+        out[index] = torch.from_numpy(scatter_psfs(image, nodes, index, *basis, *lattice, *halo))
 
 
 def _blur_on_device(
     frames: Float[Tensor, "frames height width"],
     first: int,
     tilt: Float[Tensor, "2 n h w"],
-    phase: Float[Tensor, "blurmodes n rows columns"],
+    weights: Float[Tensor, "one_and_rank n rows columns"],
     plan: TilePlan,
     tables: dict[str, Tensor],
 ) -> Float[Tensor, "n hout wout"]:
     """Return the pictures from number `first` on; picture i is of frame i modulo their number."""
-    psfs = _network(tables)(phase.flatten(1)).unflatten(1, phase.shape[1:])
     if "psf_across" in tables:
-        psfs = psfs @ tables["psf_across"]
-    psfs = (tables["basis"] @ psfs.flatten(1)).unflatten(1, psfs.shape[1:])
+        weights = weights @ tables["psf_across"]
+    psfs = (tables["basis"] @ weights.flatten(1)).unflatten(1, weights.shape[1:])
     rows, columns = plan.psf_grid
     engine = devices.select_engine(frames.device)
     seen = engine.warp(frames, tilt, rows.start, columns.start, first)
     return engine.scatter(seen, psfs, rows, tables["halo"], plan.halo_share, first)
-
-
-def _network(tables: dict[str, Tensor]) -> FoldedNetwork:
-    return FoldedNetwork(*(tables[name] for name in FoldedNetwork._fields))
 
 
 def _view_parts(plan: TilePlan, pictures: int, frames: int) -> Iterator[tuple[int, int]]:
@@ -179,7 +186,7 @@ def _numbers_per_picture(plan: TilePlan, engine: ModuleType) -> int:
     (rows, columns), fidelity = plan.psf_grid, plan.fidelity
     nodes, pixels = rows.nodes * columns.nodes, rows.count * columns.count
     psf = fidelity.psf_size_px**2
-    sizes = [plan.tables.places[name][2] for name in ("first", "common", "gates", "last")]
+    sizes = [plan.tables.tensors[name].shape for name in ("first", "common", "gates", "last")]
     network = sum(map(sum, sizes)) - sizes[0][1]
     return (
         (fidelity.zernike_modes - 2 + network) * nodes

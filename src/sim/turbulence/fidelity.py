@@ -121,7 +121,7 @@ def _isoplanatic_patch_ratio(atmosphere: Atmosphere) -> float:
 
     The ratio of theta0 L / r0, Kolmogorov's: an outer scale does not change small distances.
     """
-    place, strength = atmosphere.cn2_dz_slices
+    place, strength = atmosphere.integrated_cn2_by_slice
     near = float((strength * (1 - place) ** (5 / 3)).sum())
     return (near / float((strength * place ** (5 / 3)).sum())) ** 0.6
 

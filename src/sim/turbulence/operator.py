@@ -1,12 +1,13 @@
 """Turbulence as an operator: clean frames in, what every view sees out; tilt first, then blur."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from typing import Any
 
 import torch
-from torch import Generator
+from jaxtyping import Float
+from torch import Generator, Tensor
 
 from src.sim import noise
 from src.sim.optics import layout
@@ -86,6 +87,25 @@ class Turbulence:
         if self.is_identity:
             return torch.zeros(len(self.positions), frames, 2, *window[2:])
         return render_tilt(self.plan(frames, generator, window), frames)
+
+    @torch.no_grad()
+    def degrade_parts(
+        self, parts: Iterable[Float[Tensor, "part h w"]], frames: int, generator: Generator
+    ) -> Iterator[tuple[Float[Tensor, "views part h w"], Tilt]]:
+        """Yield every view and the tilt of successive parts of one clip of `frames`, as `degrade`
+        and `tilt` return them for all of it, in the memory of one part.
+        """
+        window, first = (0, 0, self.height, self.width), 0
+        plans = [] if self.is_identity else self.plan(frames, generator, window)
+        for part in parts:
+            stop = first + len(part)
+            own = [plan.of_frames(first, stop, frames) for plan in plans]
+            if own:
+                yield render_views(part.float(), own), render_tilt(own, len(part))
+            else:
+                views = part.expand(len(self.positions), *part.shape)
+                yield views, torch.zeros(*views.shape[:2], 2, *window[2:])
+            first = stop
 
     def plan(
         self, frames: int, generator: Generator, window: Crop, device: torch.device | str = "cpu"

@@ -66,7 +66,7 @@ def draw_plane_waves(
     low = min(max(LOW, 0.3 * atmosphere.aperture_over_outer_scale), 0.5 * high)
     kappa, density = _draw_kappa(u[:, 0], low, high)
     angle = 2 * math.pi * u[:, 1]
-    place, strength = atmosphere.cn2_dz_slices
+    place, strength = atmosphere.integrated_cn2_by_slice
     near = 1 - place
     steps = torch.cumsum(strength * near**DEPTH, 0)
     slot = torch.searchsorted(steps, u[:, 2] * steps[-1]).clamp(max=len(place) - 1)

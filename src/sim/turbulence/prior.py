@@ -47,16 +47,16 @@ class TargetImageStatistics:
     correlation, its time to 1 / e, and either `tilt_and_blur_px` (see Atmosphere) or `tilt_px`, rms
     along one axis.
 
-    Of all that shows this, wanted most are `blur_ratio`, the width of the blurred point over the
-    sharp one, and `global_tilt_share`, the share of the tilt's variance that moves the whole view;
-    None: any.
+    Of all that shows this, wanted most are `psf_width_ratio`, the width of the blurred point over
+    the sharp one, and `global_tilt_share`, the share of the tilt's variance that moves the whole
+    view; None: any.
     """
 
     tilt_correlation_half_length_px: float
     tilt_correlation_time_s: float
     tilt_and_blur_px: float | None = None
     tilt_px: float | None = None
-    blur_ratio: float | None = None
+    psf_width_ratio: float | None = None
     global_tilt_share: float | None = None
 
 
@@ -240,13 +240,13 @@ def _mismatch(
 ) -> Candidates:
     """Return how far each candidate is off: 0.1 is 10 % of blur, or of the tilt's variance."""
     total = np.zeros(len(blur))
-    if wanted.blur_ratio is not None:
+    if wanted.psf_width_ratio is not None:
         sharp = (
             unit
             * outer_scale.short_exposure_half_light_radius(0.0)
             / outer_scale.GAUSSIAN_HALF_LIGHT
         )
-        total += np.abs(np.log(np.hypot(1, blur / sharp) / wanted.blur_ratio))
+        total += np.abs(np.log(np.hypot(1, blur / sharp) / wanted.psf_width_ratio))
     if wanted.global_tilt_share is not None:
         given = zip(ratio, shapes, REFERENCE_WIDTH_PX / aperture, strict=True)
         shares = np.array([outer_scale.global_tilt_share(*one) for one in given])

@@ -161,7 +161,8 @@ def _warp_views(
     padded, out = pad_frames(frames), torch.empty(len(tilt), *tilt.shape[2:])
 
     def warp_view(view: int) -> None:
-        out[view] = warp_frames(padded, 0, tilt[view], top, left)
+        for frame, warped in enumerate(warp_frames(padded, 0, tilt[view], top, left)):
+            out[view, frame] = torch.from_numpy(warped)
 
     run_in_threads(warp_view, [(view,) for view in range(len(tilt))])
     return out

@@ -9,7 +9,7 @@ from torch import nn
 
 from baselines.highpass import HighPass
 from src.bench.candidates import Candidate
-from src.bench.stress_tests import conditions, recurrence
+from src.bench.stress_tests import conditions, recurrence, static_camera
 from src.bench.stress_tests.event_clips import ClipConditions, StressBench, simulate_event_clip
 from src.bench.stress_tests.stress_results import StressResult
 from src.models.network import EventToVideoNetwork
@@ -35,7 +35,7 @@ def bench() -> StressBench:
     return StressBench(pipeline(), [0], warmup=4)
 
 
-one_view_shifted = partial(conditions.measure_view_shift_loss, judged_px=2, limit=0.3)
+one_view_shifted = partial(conditions.measure_view_shift_loss, judged_px=2, limit_db=0.3)
 
 
 class Running(EventToVideoNetwork):
@@ -95,27 +95,29 @@ def test_nothing_known_is_a_failure_and_the_first_break_is_found():
 
 
 def test_a_sum_holds_and_a_leaky_sum_does_not(bench):
-    retention = partial(recurrence.measure_contrast_retention_percent, windows=[5, 50], limit=90.0)
+    retention = partial(
+        recurrence.measure_contrast_retention_percent, windows=[5, 50], limit_percent=90.0
+    )
     assert retention(running(), bench).value == pytest.approx(100)
     kept = retention(Candidate("leaky", HighPass(), 1), bench)
     assert kept.curve[0][1] == pytest.approx(100 * 0.9**5, rel=0.02) and kept.failed
 
 
 def test_a_sum_comes_back_at_any_rate_and_after_any_loop(bench):
-    rates = {"rates_hz": [60, 1200], "duration_s": 0.2, "limit": 1.0}
+    rates = {"rates_hz": [60, 1200], "duration_s": 0.2, "limit_db": 1.0}
     assert abs(conditions.measure_window_rate_loss(running(), bench, **rates).value) < 1e-3
-    drift = recurrence.measure_long_sequence_drift(running(), bench, windows=96, limit=1.0)
+    drift = recurrence.measure_long_sequence_drift(running(), bench, windows=96, limit_db=1.0)
     assert abs(drift.value) < 1e-3
 
 
 def test_a_difference_in_a_sum_neither_grows_nor_fades(bench):
-    growth = partial(recurrence.measure_perturbation_growth, limit=0.0)
+    growth = partial(recurrence.measure_perturbation_growth, limit_growth_per_window=0.0)
     assert abs(growth(running(), bench).value) < 1e-3
     assert growth(Candidate("leaky", HighPass(), 1), bench).value < -0.05
 
 
 def test_the_worst_input_of_a_sum_is_found(bench):
-    sizes = {"windows": 3, "steps": 4, "limit": 1.0}
+    sizes = {"windows": 3, "steps": 4, "limit_gain": 1.0}
     found = recurrence.measure_adversarial_gain(running(), bench, **sizes)
     # Five bins pull the same way; all that nine views may have goes into the one that is seen.
     assert found.value == pytest.approx(0.03 * 5 * 3, rel=1e-3)
@@ -131,7 +133,7 @@ def test_without_a_middle_the_centre_view_is_that_of_the_optics(views):
         StressBench(pipeline(views=views), [0], 4),
         Candidate("centre", HighPass(), views),
     )
-    lost = {"counts": [1], "draws": 1, "limit": 0.5}
+    lost = {"counts": [1], "draws": 1, "limit_db": 0.5}
     assert conditions.measure_view_dropout_loss(subject, bench, **lost).value != 0
     assert one_view_shifted(subject, bench).value == 0
 
@@ -145,25 +147,33 @@ def test_every_stress_test_runs_on_a_set_network(bench):
     torch.manual_seed(0)
     subject = Candidate("setnet", SetNet(channels=4).eval(), 9)
     tests = {
-        recurrence.measure_contrast_retention_percent: {"windows": [3]},
-        recurrence.measure_long_sequence_drift: {"windows": 96},
-        recurrence.measure_convergence_windows: {},
-        recurrence.measure_flicker_recovery: {},
-        recurrence.measure_static_scene_jitter_percent: {},
-        recurrence.measure_perturbation_growth: {},
-        recurrence.measure_adversarial_gain: {"windows": 2, "steps": 2},
-        recurrence.measure_bf16_psnr_difference: {"windows": 8},
-        conditions.measure_window_rate_loss: {"rates_hz": [1200], "duration_s": 0.1},
-        conditions.measure_event_dropout_loss: {"kept_shares": [0.1]},
-        conditions.measure_view_dropout_loss: {"counts": [4], "draws": 1},
-        conditions.measure_view_shift_loss: {"judged_px": 1, "parallax": True},
-        conditions.measure_correlated_views_loss: {"spacings": [0.0]},
-        conditions.measure_worst_psnr_loss: {"parameter": "sensor.threshold", "values": [0.3]},
+        recurrence.measure_contrast_retention_percent: {"windows": [3], "limit_percent": 1.0},
+        recurrence.measure_long_sequence_drift: {"windows": 96, "limit_db": 1.0},
+        recurrence.measure_convergence_windows: {"limit_windows": 1.0},
+        recurrence.measure_flicker_recovery: {"limit_windows": 1.0},
+        recurrence.measure_static_scene_jitter_percent: {"limit_percent": 1.0},
+        recurrence.measure_perturbation_growth: {"limit_growth_per_window": 1.0},
+        recurrence.measure_adversarial_gain: {"windows": 2, "steps": 2, "limit_gain": 1.0},
+        recurrence.measure_bf16_psnr_difference: {"windows": 8, "limit_db": 1.0},
+        conditions.measure_window_rate_loss: {
+            "rates_hz": [1200],
+            "duration_s": 0.1,
+            "limit_db": 1.0,
+        },
+        conditions.measure_event_dropout_loss: {"kept_shares": [0.1], "limit_db": 1.0},
+        conditions.measure_view_dropout_loss: {"counts": [4], "draws": 1, "limit_db": 1.0},
+        conditions.measure_view_shift_loss: {"judged_px": 1, "parallax": True, "limit_db": 1.0},
+        conditions.measure_correlated_views_loss: {"spacings": [0.0], "limit_db": 1.0},
+        conditions.measure_worst_psnr_loss: {
+            "parameter": "sensor.threshold",
+            "values": [0.3],
+            "limit_db": 1.0,
+        },
     }
     for measure, settings in tests.items():
-        found = measure(subject, bench, limit=1.0, **settings)
+        found = measure(subject, bench, **settings)
         assert found.value == found.value and found.limit is not None, measure
-    varied = {"parameter": "view_gain_std", "values": [0.05], "limit": 1.0}
+    varied = {"parameter": "view_gain_std", "values": [0.05], "limit_db": 1.0}
     found = conditions.measure_worst_psnr_loss(subject, bench, **varied)
     assert found.value == found.value
 
@@ -179,3 +189,21 @@ def test_settling_is_the_last_time_beyond():
     scores = torch.cat([torch.linspace(0, 20, 21), torch.full((39,), 20.0)])
     assert recurrence.measure_settling_time(scores, 1.0) == 18  # averaged over five windows
     assert recurrence.windows_to_last_exceedance(torch.tensor([3.0, 0.5, 2.0, 0.5]), 1.0) == 3
+
+
+class Cloudy(Running):
+    """As Running, on a background that is darker on the left by a quarter."""
+
+    def forward(self, voxels, state=None, **_):
+        frame, state = super().forward(voxels, state)
+        clouds = torch.where(torch.arange(frame.shape[-1]) < frame.shape[-1] // 2, -0.125, 0.125)
+        return frame + clouds, state
+
+
+def test_a_background_of_one_value_invents_nothing(bench):
+    options = {"limit_share": 0.02, "sizes": [[96, 128]], "windows": 6}
+    plain = static_camera.measure_invented_contrast(running(), bench, **options)
+    cloudy = Candidate("cloudy", Cloudy(), 9)
+    found = static_camera.measure_invented_contrast(cloudy, bench, **options)
+    assert plain.value < 1e-6 and not plain.failed
+    assert found.value > 0.05 and found.failed

@@ -58,7 +58,7 @@ def test_a_network_is_compared_with_no_turbulence_and_with_the_light():
     air = SimulatedTurbulence({"severity": "strong", "width_px": SIDE})
     pipeline = Pipeline(scene, Optics(1), air, EventSensor(0.2), split="test")
     subject, bench = Candidate("running", Running(), 1), StressBench(pipeline, [0], 0)
-    found = measure_trajectory_deviation(subject, bench, limit=0.3)
+    found = measure_trajectory_deviation(subject, bench, limit_px=0.3)
     (still, calm), (light, seen), (clip, stray) = found.curve
     assert (still, light, clip) == ("no turbulence", "light of one view", "clip 0")
     assert found.value == stray and calm < 0.2 and seen > calm

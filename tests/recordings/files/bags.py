@@ -61,8 +61,24 @@ class Bag:
         extra = {} if self.ros2 else {"seq": 3}
         return types["std_msgs/msg/Header"](stamp=time, frame_id=frame, **extra)
 
-    def add_array(self, topic: str, events: np.ndarray, name: str = "dvs_msgs", frame="camera"):
-        """Add events, times in nanoseconds, as one message of `name`/EventArray on 640x480."""
+    def add_image(self, topic: str, picture: np.ndarray, time_ns: int, encoding: str) -> None:
+        """Add a grey picture (h, w) as sensor_msgs/Image, its rows two bytes longer than needed."""
+        header, kind = self.header(), "sensor_msgs/msg/Image"
+        header.stamp.sec, header.stamp.nanosec = divmod(time_ns, 10**9)
+        depth = 3 if encoding == "bgr8" else 1
+        rows = np.pad(picture.repeat(depth, axis=1), [(0, 0), (0, 2)])
+        (height, width), step = picture.shape, rows.shape[1]
+        message = self.store.types[kind](
+            header=header, height=height, width=width, encoding=encoding, is_bigendian=0,
+            step=step, data=rows.ravel(),
+        )  # fmt: skip
+        self.add(topic, kind, message, time_ns)
+
+    def add_array(
+        self, topic: str, events: np.ndarray, name: str = "dvs_msgs", frame="camera",
+        size=(480, 640),
+    ):  # fmt: skip
+        """Add events, times in nanoseconds, as one message of `name`/EventArray."""
         types = self.store.types
         Event, Time = types[f"{name}/msg/Event"], types["builtin_interfaces/msg/Time"]
         listed = [
@@ -70,7 +86,8 @@ class Bag:
             for t, x, y, p in events.tolist()
         ]
         kind = f"{name}/msg/EventArray"
-        message = types[kind](header=self.header(frame), height=480, width=640, events=listed)
+        height, width = size
+        message = types[kind](header=self.header(frame), height=height, width=width, events=listed)
         self.add(topic, kind, message, int(events["t"][0]) if len(events) else 1)
 
     def add_packet(

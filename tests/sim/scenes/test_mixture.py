@@ -98,20 +98,20 @@ def test_what_rests_is_the_same_clip_at_another_pace():
     assert seen == {"pauses", "stops", "never"}
     for index in range(6):
         moving, resting = (
-            Photographs(**FRAME, rest_share=s).clip(index).frames for s in (0.0, 1.0)
+            Photographs(**FRAME, paused_clip_share=s).clip(index).frames for s in (0.0, 1.0)
         )
         assert torch.equal(moving[0], resting[0])
 
 
 def test_a_finer_clip_that_rests_holds_the_coarse_one():
-    shares = {"rest_share": 1.0, "static_camera_share": 0.5}
+    shares = {"paused_clip_share": 1.0, "static_camera_share": 0.5}
     for index in range(6):
         coarse = Photographs(frames=4, fps=60.0, **shares).clip(index).frames
         fine = Photographs(frames=10, fps=180.0, **shares).clip(index).frames
         torch.testing.assert_close(coarse, fine[::3], atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("name", ["static_camera_share", "rest_share"])
+@pytest.mark.parametrize("name", ["static_camera_share", "paused_clip_share"])
 @pytest.mark.parametrize("value", [-0.1, 1.1, float("nan")])
 def test_probabilities_name_their_key(name, value):
     with pytest.raises(ValueError, match=rf"scene.{name} must be in \[0, 1\]"):

@@ -116,7 +116,9 @@ GREYS = {  # of frame 8, every 80 pixels from (40, 40) on, of clips 0 to 2: as i
 @pytest.mark.parametrize("kind", GREYS)
 def test_clips_are_those_that_published_numbers_are_of(kind):
     settings = (
-        {"static_camera_share": 1.0, "rest_share": 1.0, "max_cutouts": 4} if kind == "still" else {}
+        {"static_camera_share": 1.0, "paused_clip_share": 1.0, "max_cutouts": 4}
+        if kind == "still"
+        else {}
     )
     scene = Photographs(frames=9, extra_train_root=None, **settings)
     for index, greys in enumerate(GREYS[kind]):

@@ -61,8 +61,8 @@ def test_clips_are_functions_of_the_index_and_of_time(kind):
     def scene(**more):
         frame = FRAME | more
         if kind == "small":
-            return Photographs(**frame, **SMALL, rest_share=0.5)
-        return TargetsOnPhotographs(kinds=ALL, **frame, rest_share=0.5, max_targets=3)
+            return Photographs(**frame, **SMALL, paused_clip_share=0.5)
+        return TargetsOnPhotographs(kinds=ALL, **frame, paused_clip_share=0.5, max_targets=3)
 
     for index in range(5):
         clip = scene().clip(index)
@@ -131,7 +131,7 @@ def test_targets_are_drawn_before_the_photograph_and_only_there():
             r"scene.speed_px_per_s must be in \[0, 2",
         ),
         ({"max_targets": 0}, "scene.max_targets must be >= 1, got 0"),
-        ({"rest_share": 1.5}, r"scene.rest_share must be in \[0, 1\], got 1.5"),
+        ({"paused_clip_share": 1.5}, r"scene.paused_clip_share must be in \[0, 1\], got 1.5"),
         ({"photo_px_per_px": [0, 1]}, "scene.photo_px_per_px must be a range"),
         ({"root": "/nowhere"}, "scene.root must be a folder or a pack"),
     ],

@@ -79,7 +79,7 @@ def test_wrong_options_are_refused_at_once():
 @pytest.fixture
 def config():
     with initialize_config_dir(str(ROOT / "conf"), version_base=None):
-        yield lambda *overrides: compose("simulate", ["data.test_windows=2", *overrides])
+        yield lambda *overrides: compose("simulate", ["fps=120", "data.test_windows=2", *overrides])
 
 
 def test_turbulence_must_name_a_class_of_an_allowed_package(config):

@@ -7,6 +7,7 @@ from torch.nn import functional
 
 from scripts.exact_psf import fraunhofer_psf
 from scripts.p2s_training import TrainableNetwork
+from src.sim.turbulence.engines.network_numba import BLOCK, evaluate_network
 from src.sim.turbulence.p2s import (
     PhaseToSpaceNetwork,
     basis_parities,
@@ -77,6 +78,18 @@ def test_a_cut_network_gives_the_first_functions_of_each_kind(counts):
     cut = stored(net).truncate(counts)
     torch.testing.assert_close(cut.merge_layers(18, 2.0)(phase.T)[1:].T, whole)
     assert cut.count_macs(sum(counts)) <= stored(net).count_macs(13)
+
+
+@pytest.mark.parametrize("modes, width, given", [(5, 16, 3), (20, 32, 2), (77, 112, 90)])
+@pytest.mark.parametrize("counts", [[5, 3, 2, 3], [1, 0, 0, 0]])
+def test_the_compiled_network_equals_the_matrices(modes, width, given, counts):
+    torch.manual_seed(0)
+    folded = stored(network(modes, width)).truncate(counts).merge_layers(given, 3.0)
+    phase = torch.randn(given, 2 * BLOCK + 7)
+    matrices = folded._replace(last=folded.last[1:])
+    found = evaluate_network(phase.numpy(), *(matrix.numpy() for matrix in matrices))
+    expected = folded(phase)[1:]
+    torch.testing.assert_close(torch.from_numpy(found), expected, atol=2e-5, rtol=1e-4)
 
 
 def test_kinds_of_shapes():

@@ -72,16 +72,16 @@ def test_a_camera_that_shows_measured_turbulence(tilt_px, length_px):
 
 
 def test_the_blur_that_is_wanted_is_the_nearest_there_is():
-    def blur_ratio(wanted: float) -> float:
-        statistics = TargetImageStatistics(20.0, 0.05, tilt_px=0.5, blur_ratio=wanted)
+    def psf_width_ratio(wanted: float) -> float:
+        statistics = TargetImageStatistics(20.0, 0.05, tilt_px=0.5, psf_width_ratio=wanted)
         path = sample_matching_atmosphere(statistics, generator(3))
         sharp, blurred = (
             short_exposure_half_light_radius(d) for d in (0.0, path.blur_equivalent_d_over_r0)
         )
         return blurred / sharp
 
-    assert blur_ratio(1.3) == pytest.approx(1.3, rel=0.15)
-    assert blur_ratio(1.8) == pytest.approx(1.8, rel=0.15)
+    assert psf_width_ratio(1.3) == pytest.approx(1.3, rel=0.15)
+    assert psf_width_ratio(1.8) == pytest.approx(1.8, rel=0.15)
 
 
 def test_none_and_unknown_severities():

@@ -24,7 +24,7 @@ def isoplanatic_angle_rad(path: Atmosphere) -> float:
 
     Without an outer scale theta0 = [2.914 k^2 Int Cn2 z^(5/3) dz]^(-3/5) (Fried 1982).
     """
-    place, strength = (part.numpy() for part in path.cn2_dz_slices)
+    place, strength = (part.numpy() for part in path.integrated_cn2_by_slice)
     z, k = place * path.distance_m, 2 * math.pi / path.wavelength_m
     integral = 2.914 * k**2 * float((strength * z ** (5 / 3)).sum())
     if integral == 0:

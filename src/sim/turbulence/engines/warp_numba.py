@@ -3,10 +3,10 @@
 Own code: cubic maps of OpenCV have a = -3/4 and places rounded to 1/32 pixel.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from numba import njit
 from torch import Tensor
@@ -32,13 +32,11 @@ def pad_frames(frames: Float[Tensor, "frames height width"]) -> PaddedFrames:
 
 def warp_frames(
     padded: PaddedFrames, first: int, tilt: Float[Tensor, "2 n h w"], top: int, left: int
-) -> Float[Tensor, "n h w"]:
-    """Return the frames from `first` on, displaced by `tilt` (x, y) in pixels: see warp_frame."""
-    warped = np.empty(tilt.shape[1:], np.float32)
-    for index in range(len(warped)):
+) -> Iterator[Float[np.ndarray, "h w"]]:
+    """Yield the frames from `first` on, displaced by `tilt` (x, y) in pixels: see warp_frame."""
+    for index in range(tilt.shape[1]):
         frame, low, high = (part[first + index] for part in padded)
-        warped[index] = warp_frame(frame, tilt.numpy(), index, top, left, low, high)
-    return torch.from_numpy(warped)
+        yield warp_frame(frame, tilt.numpy(), index, top, left, low, high)
 
 
 @njit(nogil=True, cache=True, fastmath=True)

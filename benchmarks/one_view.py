@@ -1,0 +1,149 @@
+"""One view of a whole sensor, from a list of events to a frame: python -m benchmarks.one_view
+
+Ours run from lists of events, the networks of conf/networks/published.yaml from a grid, each in the
+fastest of its forms: float32 and bf16 on PyTorch and, with the extra, OpenVINO.  Weights of the
+latter are random: time does not depend on them.  Events are those of a real recording, its sensor
+scaled to the size, its clock set so that a window of 1/120 s has one event for ten pixels.  Wall
+time, the least of several windows: other jobs on the machine disturb it less than a median.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import torch
+from omegaconf import OmegaConf
+
+from src.app.instantiate import instantiate_node
+from src.deploy import openvino_network
+from src.deploy.cost import torch_threads
+from src.deploy.cpu_features import is_bf16_faster
+from src.deploy.forms import convert_to_form
+from src.deploy.runtime import EventListRuntime, fastest_form
+from src.models import load
+from src.recordings.files.recording import read_events
+from src.sim.voxel import voxel_grid
+
+FPS, EVENTS_PER_PIXEL, BINS, WINDOWS, WARMUP = 120, 0.1, 5, 3, 2
+SLOW_MS = 8e3  # a frame: no further windows and forms are timed
+RECORDING = Path("../shared/data/events/gen3_640x480_evt2.raw")
+NETWORKS = Path(__file__).resolve().parents[1] / "conf" / "networks" / "published.yaml"
+OURS = ("setnet_small", "setnet_medium", "single256")
+SIZES = ("240x180", "346x260", "1280x720")
+Window = tuple  # t in s, x, y, p, t0, t1
+
+
+def cut_windows(path: Path, width: int, height: int) -> list[Window]:
+    """Return the windows of the recording at `path`, its sensor scaled to `width` x `height`."""
+    events = read_events(path)
+    x, y = (
+        (events[axis] * (side / (float(events[axis].max()) + 1))).astype(np.uint16)
+        for axis, side in (("x", width), ("y", height))
+    )
+    number = int(EVENTS_PER_PIXEL * width * height)
+    made = []
+    for first in range(0, max(len(events) - number, 1), number):
+        part, k = slice(first, first + number), len(made)
+        own = (events["t"][part] - events["t"][first]).astype(float)
+        t = (k + own / (own[-1] + 1)) / FPS
+        made.append((t, x[part], y[part], events["p"][part], k / FPS, (k + 1) / FPS))
+    return made
+
+
+def from_grids(network: torch.nn.Module, form: str, width: int, height: int) -> Callable:
+    """Return a step from a window's events through a grid and `network` in `form`."""
+    fast, state = convert_to_form(network, form), None
+    size = {"bins": BINS, "height": height, "width": width}
+
+    @torch.no_grad()
+    def step(t, x, y, p, t0, t1):
+        nonlocal state
+        grid = voxel_grid(t, x, y, p, t0=t0, t1=t1, **size)
+        frame, state = fast(grid[None, None], state, window_s=1 / FPS)
+        return frame.numpy()
+
+    return step
+
+
+def from_lists(name: str, width: int, height: int, threads: int) -> Callable:
+    """Return a step from a window's events through a network of ours."""
+    live = EventListRuntime(
+        load(name), positions=[(0, 0)], height=height, width=width, threads=threads
+    )
+    views = np.zeros(int(EVENTS_PER_PIXEL * width * height), np.uint8)
+    return lambda t, x, y, p, t0, t1: live.step(t, x, y, p, views[: len(t)], t0, t1)
+
+
+def least_ms(step: Callable, windows: Sequence[Window], seconds: float) -> float:
+    """Return the least time of `step` over `seconds`, at least WINDOWS after a warm-up, or that
+    of the second window where it is SLOW_MS: the first compiles.
+    """
+    times: list[float] = []
+    until = float("inf")
+    while len(times) < WARMUP + WINDOWS or time.perf_counter() < until:
+        window = windows[len(times) % len(windows)]
+        start = time.perf_counter()
+        step(*window)
+        times.append(1e3 * (time.perf_counter() - start))
+        if len(times) == WARMUP:
+            if times[-1] > SLOW_MS:
+                return times[-1]
+            until = time.perf_counter() + seconds
+    return min(times[WARMUP:])
+
+
+def list_forms() -> list[str]:
+    """Return the forms that may be the fastest on this machine."""
+    with torch_threads(1):  # other jobs disturb that less
+        half = ["bf16"] if is_bf16_faster() else []
+    return ["float32", *half, *(["openvino"] if openvino_network.is_installed() else [])]
+
+
+def measure(name: str, size: str, path: Path, threads: int, seconds: float) -> str:
+    """Return the milliseconds of a frame of the network `name` and its fastest form."""
+    width, height = map(int, size.split("x"))
+    windows, found = cut_windows(path, width, height), {}
+    forms = list_forms()
+    with torch_threads(threads):
+        if name in OURS:
+            step = from_lists(name, width, height, threads)
+            return f"{least_ms(step, windows, seconds):.1f} {fastest_form()}"
+        network = instantiate_node(OmegaConf.load(NETWORKS)[name].model).eval()
+        for form in forms:
+            try:
+                step = from_grids(network, form, width, height)
+                found[form] = least_ms(step, windows, seconds)
+            except ValueError as error:  # OpenVINO cannot express it
+                print(f"{name}, {form}: {error}", file=sys.stderr)
+            if max(found.values(), default=0.0) > SLOW_MS:
+                break
+    form = min(found, key=found.__getitem__)
+    return f"{found[form]:.1f} {form}"
+
+
+def main() -> None:
+    """Print a row for each network, a column for each size."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    published = [str(name) for name in OmegaConf.load(NETWORKS)]
+    parser.add_argument("names", nargs="*", default=[*OURS, *published])
+    parser.add_argument("--sizes", nargs="+", default=SIZES, help="width x height in pixels")
+    parser.add_argument("--recording", type=Path, default=RECORDING)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--seconds", type=float, default=2.0, help="of each size and form")
+    given = parser.parse_args()
+    print("| ms a frame | " + " | ".join(given.sizes) + " |")
+    print("|---|" + "---:|" * len(given.sizes))
+    options = given.recording, given.threads, given.seconds
+    for name in given.names:
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
+            cells = [alone.submit(measure, name, size, *options).result() for size in given.sizes]
+        print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,31 @@
+"""The commands of the installed package: lightfield-events reconstruct recording=cap.raw ..."""
+
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+from runpy import run_module
+
+COMMANDS = (
+    "train", "eval", "simulate", "reconstruct", "convert", "calibrate", "compare", "chart",
+    "stress", "report", "live",
+)  # fmt: skip
+
+
+def main() -> None:
+    """Run `src.<command>` with the rest of the command line."""
+    import src
+
+    name = sys.argv[1] if len(sys.argv) > 1 else "--help"
+    if name not in COMMANDS:
+        print(f"usage: lightfield-events {{{','.join(COMMANDS)}}} [key=value ...]")
+        sys.exit(0 if name in ("-h", "--help") else 2)
+    if find_spec("lightning") is None:
+        print('error: commands need pip install "lightfield-events[train]"', file=sys.stderr)
+        sys.exit(1)
+    file = str(Path(src.__path__[0]) / f"{name}.py")
+    sys.argv[:2] = [file]
+    run_module(f"{src.__name__}.{name}", run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    main()

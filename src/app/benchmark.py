@@ -1,0 +1,207 @@
+"""Recordings with frames, scored by the protocol of EVREAL: `src.eval data=evreal`."""
+
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from omegaconf import DictConfig
+from rich.console import Group
+from rich.table import Table
+
+from baselines.centre_view import CentreViewNetwork
+from src.app import build, entry_point
+from src.app.instantiate import as_dict, build_part
+from src.deploy.cost import macs_per_frame, time_frame
+from src.models.network import EventToVideoNetwork
+from src.recordings.evreal_protocol import (
+    EvrealRule,
+    ScoredFrame,
+    check_scored_range,
+    score_sequence,
+)
+from src.recordings.evreal_sequences import find_sequences, name_of, open_as_evreal
+from src.recordings.files.evreal_folder import EvrealSequence, is_evreal_folder, open_sequence
+from src.recordings.reconstruction import as_event_network
+from src.records import results
+from src.records.atomic import write_text
+
+SCORES = {"mse": "MSE ↓", "ssim": "SSIM ↑", "lpips": "LPIPS ↓"}
+RULE_KEYS = (
+    "window", "events_per_window", "window_s", "part_s", "histogram", "tolerance_ms", "warm_up_s",
+)  # fmt: skip
+
+
+def evaluate_recordings(cfg: DictConfig) -> dict:
+    """Score the network of `ckpt` or `baseline` on the sequences below `cfg.scene.root`.
+
+    Writes `results.json`, `clips.csv` (a line per sequence) and `frames.csv` below
+    `cfg.paths.run`.  Returns the content of `results.json`.
+    """
+    run, start = Path(cfg.paths.run), time.perf_counter()
+    benchmark = Benchmark(cfg)
+    sources = find_sequences(cfg.scene.root)
+    for folder in filter(is_evreal_folder, sources):  # what is wrong is said before hours of work
+        benchmark.check(folder, open_sequence(folder))
+    results.create_run_folder(run, entry_point.resolved_yaml(cfg))
+    clips, lines = [], []
+    for source in sources:
+        clip, scored = benchmark.score(source, run)
+        clips.append(clip)
+        lines += scored
+        print(f"{clip['name']}: {clip['frames']} frames, {_said(clip)}")
+    write_text(run / "frames.csv", results.format_csv(lines[0], [line.values() for line in lines]))
+    means, row = average_over_frames(clips), benchmark.row(clips)
+    return results.write_and_print_results(
+        run, entry_point.resolved_yaml(cfg), [row], _tables(row.name, means, cfg.data),
+        benchmarks=means, **entry_point.run_metadata(cfg, start),
+    )  # fmt: skip
+
+
+class Benchmark:
+    """The network of a config and how it is scored on a sequence."""
+
+    def __init__(self, cfg: DictConfig):
+        self.cfg, self.rule = cfg, _build_rule(cfg)
+        self.device = "cuda" if cfg.trainer.accelerator == "gpu" else "cpu"
+        self.network = _load_network(cfg).to(self.device)
+        if self.rule.output_normalisation != "none" and isinstance(self.network, CentreViewNetwork):
+            self.network.output = self.network.output.replace("clip", "none")  # clipped after it
+        lpips = build_part(cfg, "metrics.lpips") if cfg.metrics.lpips else None
+        self.lpips, self.size = lpips and lpips.to(self.device), (0, 0)
+
+    def check(self, source: Path, sequence: EvrealSequence) -> None:
+        """Raise ValueError for a sequence of which no frame can be scored."""
+        _, first_s, last_s = find_scored_range(self.cfg.data, source)
+        check_scored_range(sequence, self.rule.window, first_s, last_s)
+
+    def score(self, source: Path, run: Path) -> tuple[dict, list[dict]]:
+        """Return the mean scores of a sequence, and a line of each frame's."""
+        data_set, first_s, last_s = find_scored_range(self.cfg.data, source)
+        facts: dict[str, Any] = {"name": f"{data_set}/{name_of(source)}", "data_set": data_set}
+        lines = []
+        with open_as_evreal(source, run) as sequence:
+            self.check(source, sequence)
+            self.size = sequence.size
+            for frame in score_sequence(
+                sequence, self.network, self.rule, bins=self.cfg.bins, start_s=first_s,
+                end_s=last_s, lpips=self.lpips, device=self.device,
+            ):  # fmt: skip
+                lines.append({"sequence": facts["name"], **_line(frame)})
+                if self.cfg.data.save_frames:
+                    _save(run / "frames" / facts["name"], frame)
+        if not lines:
+            raise ValueError(f"{source}: no window ends within data.tolerance_ms of a frame")
+        times = [line["time_s"] for line in lines]
+        facts |= {"frames": len(lines), "first_s": min(times), "last_s": max(times)}
+        names = [name for name in SCORES if name in lines[0]]
+        return facts | {name: _mean(line[name] for line in lines) for name in names}, lines
+
+    def row(self, clips: list[dict]) -> results.ScoreRow:
+        """Return the scores with the network's cost for frames of the last sequence's size."""
+        (height, width), bins = self.size, self.cfg.bins
+        zeros = torch.zeros(1, 1, bins, height, width, device=self.device)
+        threads = torch.get_num_threads()
+        timing = time_frame(self.network, zeros, threads=threads, seconds=0.0, min_frames=5)
+        given = self.cfg.get("baseline") or {}
+        return results.ScoreRow(
+            str(self.cfg.ckpt or given.get("architecture") or given.get("_target_")),
+            clips,
+            params=sum(part.numel() for part in self.network.parameters()),
+            macs_per_frame=macs_per_frame(self.network, height, width, bins=bins),
+            latency_ms={f"{height}x{width}": timing.median_ms},
+        )
+
+
+def _load_network(cfg: DictConfig) -> EventToVideoNetwork:
+    if cfg.get("postprocess") or cfg.get("backward_warmup_s"):
+        raise ValueError("data=evreal needs postprocess=none and backward_warmup_s=0.0")
+    network = as_event_network(build.load_network(cfg))
+    if network.views not in (None, 1):
+        raise ValueError(f"ckpt must take one view for data=evreal, got one of {network.views}")
+    return network.eval()
+
+
+def _build_rule(cfg: DictConfig) -> EvrealRule:
+    """Return the protocol; what is null there follows from the method, as in EVREAL."""
+    data = cfg.data
+    edges = data.grid_edges or ("events" if cfg.get("baseline") else "window")
+    kind = cfg.baseline.get("architecture") if cfg.get("baseline") else None
+    output = data.output_normalisation or ("robust" if kind == "e2vid" else "none")
+    given = {key: data[key] for key in RULE_KEYS}
+    return EvrealRule(**given, grid_edges=edges, output_normalisation=output)
+
+
+def find_scored_range(data: DictConfig, source: Path) -> tuple[str, float, float]:
+    """Return the data set of a sequence and the first and last second to be scored.
+
+    Raises ValueError for a range that is none.
+    """
+    name, folder = name_of(source), source.resolve().parent.name
+    known = [(group, spans[name]) for group, spans in data.sequences.items() if name in spans]
+    data_set, span = known[0] if known else ("other" if folder in data.sequences else folder, None)
+    first, last = span or (0.0, math.inf)
+    first = first if data.start_s is None else data.start_s
+    last = last if data.end_s is None else data.end_s
+    if not 0 <= first < last:
+        raise ValueError(f"data.start_s must be >= 0 and before data.end_s, got {first}, {last}")
+    return data_set, float(first), float(last)
+
+
+def _line(frame: ScoredFrame) -> dict:
+    given = frame.given
+    facts = {"window": frame.window, "frame": given.frame, "time_s": round(given.time_s, 6)}
+    return facts | {"events": given.last - given.first} | frame.scores
+
+
+def _mean(values: Iterator[float]) -> float:
+    """Return the mean of the finite values; EVREAL leaves others out."""
+    finite = [value for value in values if math.isfinite(value)]
+    return float(np.mean(finite)) if finite else math.nan
+
+
+def average_over_frames(clips: Sequence[Mapping[str, Any]]) -> dict[str, dict]:
+    """Return {data set: {sequences, frames, mse, ssim, lpips}}; a sequence counts by its frames."""
+    means = {}
+    for data_set in dict.fromkeys(clip["data_set"] for clip in clips):
+        group = [clip for clip in clips if clip["data_set"] == data_set]
+        weights = [clip["frames"] for clip in group]
+        means[data_set] = {"sequences": len(group), "frames": sum(weights)} | {
+            name: float(np.average([clip[name] for clip in group], weights=weights))
+            for name in SCORES if name in group[0]
+        }  # fmt: skip
+    return means
+
+
+def _said(scores: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name.upper()} {scores[name]:.4f}" for name in SCORES if name in scores)
+
+
+def _save(folder: Path, frame: ScoredFrame) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    levels = np.rint(frame.picture * 255).astype(np.uint8)
+    name = folder / f"frame_{frame.window:010d}.png"
+    if not cv2.imwrite(str(name), levels):
+        raise OSError(f"{name} cannot be written; is the disk full?")
+
+
+def _tables(name: str, means: Mapping[str, Mapping], data: DictConfig) -> Group:
+    """Return a table for each data set: the scores of this run and what others published."""
+    tables = []
+    for data_set, found in means.items():
+        of = f" of {len(data.sequences[data_set])}" if data_set in data.sequences else ""
+        counts = f"{found['sequences']}{of} sequences, {found['frames']} frames"
+        table = Table(title=f"{data_set}: {counts}", title_justify="left")
+        for head in ("network", *SCORES.values(), "source"):
+            table.add_column(head, justify="left" if head in ("network", "source") else "right")
+        table.add_row(name, *(f"{found[k]:.3f}" if k in found else "-" for k in SCORES), "this run")
+        for entry in map(as_dict, data.published_scores):
+            if data_set in entry:
+                theirs = [f"{value:.3f}" for value in entry[data_set]]
+                table.add_row(entry["method"], *theirs, entry["source"])
+        tables.append(table)
+    return Group(*tables)

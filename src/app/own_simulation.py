@@ -1,0 +1,166 @@
+"""Your own clip through turbulence, optics and sensor, some frames at a time."""
+
+import math
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from omegaconf import DictConfig
+from torch import Tensor
+
+from src.app.instantiate import build_part
+from src.app.simulation import build_sensor, decodes_srgb
+from src.sim import noise
+from src.sim.optics import Optics
+from src.sim.scenes import own_material
+from src.sim.scenes.own_material import OwnClip
+from src.sim.sensor.response import decode_srgb, encode_srgb
+from src.sim.turbulence.contract import ClipTurbulence
+from src.sim.turbulence.operator import Turbulence
+
+PART_BYTES = 1 << 27  # of all views at a time
+FREE_BYTES = 1 << 28  # that are left on the disk
+
+Progress = Callable[[range, str], Iterable[int]]
+
+
+def without_progress(parts: range, name: str) -> Iterable[int]:
+    """Return `parts`: nothing is printed."""
+    return parts
+
+
+@dataclass(frozen=True)
+class Part:
+    """Those of the clip's own frames that a part of the simulated ones holds: `clean` (n, h, w) and
+    `views` (views, n, h, w) in [0, 1], code values; `tilt` (views, n, 2, h, w), pixels.
+    """
+
+    clean: Tensor
+    views: Tensor
+    tilt: Tensor
+
+
+@dataclass(eq=False)
+class OwnSimulation:
+    """What the config `cfg` makes of `clip`: turbulence and sensor are drawn from its seed.
+
+    `substeps`: simulated frames per frame of the clip.  Raises ValueError for values outside their
+    range.
+    """
+
+    cfg: DictConfig
+    clip: OwnClip
+    substeps: int = field(init=False)
+    optics: Optics = field(init=False)
+
+    def __post_init__(self) -> None:
+        cfg, least = self.cfg, self.cfg.least_simulated_fps
+        if not 0 < least <= 1e5:
+            raise ValueError(f"least_simulated_fps must be in (0, 1e5], got {least}")
+        self.substeps = max(1, math.ceil(round(least / self.clip.fps, 6)))
+        self.optics = build_part(cfg, "optics")
+        self.key = noise.key(cfg.seed, "own material", cfg.index)
+        self.sensor: Any = build_sensor(cfg, cfg.seed).draw(self.key)
+
+    @property
+    def fps(self) -> float:
+        """Rate of the simulated frames."""
+        return self.clip.fps * self.substeps
+
+    @property
+    def frames(self) -> int:
+        """Number of simulated frames."""
+        return (len(self.clip.frames) - 1) * self.substeps + 1
+
+    @cached_property
+    def turbulence(self) -> ClipTurbulence:
+        model = build_part(self.cfg, "turbulence")
+        drawn = model.draw(noise.generator(noise.key(self.key, "atmosphere")))
+        height, width = self.clip.size
+        size = {"height": height, "width": width}
+        return model.operator(drawn, views=self.optics.positions, fps=self.fps, **size)
+
+    def record(self) -> dict[str, Any]:
+        """Return what was drawn."""
+        own = {"name": self.clip.name, "threshold": self.sensor.threshold}
+        return own | {"simulated_fps": self.fps} | dict(self.turbulence.metadata)
+
+    def describe(self) -> str:
+        """Return size, rate, frames, turbulence and threshold in one line."""
+        (height, width), drawn = self.clip.size, self.record()
+        strength = drawn.get("tilt_and_blur_px")
+        strong = f" ({strength:.2f} px tilt and blur)" if strength else ""
+        return (
+            f"{self.clip.name}: {self.clip.source}; simulated as {self.optics.views} views of "
+            f"{width}x{height} px at {self.fps:.6g} frames/s; turbulence {drawn['severity']}"
+            f"{strong}, contrast threshold {self.sensor.threshold:.3f}"
+        )
+
+    def parts(
+        self, views: Float[Tensor, "views frames h w"], progress: Progress = without_progress
+    ) -> Iterator[Part]:
+        """Yield the clip part by part, and write what all views see, light, to `views`."""
+        starts = range(0, self.frames, self._frames_per_part())
+        spans = [(first, min(first + starts.step, self.frames)) for first in starts]
+        blended = (self.clip.blend(*span, self.substeps) for span in spans)
+        seen = self._see(self._to_light(part) for part in blended)
+        for number in progress(range(len(spans)), "turbulence"):
+            (first, stop), (lights, tilt) = spans[number], next(seen)
+            views[:, first:stop] = lights
+            own = slice(-first % self.substeps, None, self.substeps)
+            codes = encode_srgb(lights[:, own]) if decodes_srgb(self.cfg) else lights[:, own]
+            yield Part(self.clip.blend(first, stop, self.substeps)[own], codes, tilt[:, own])
+
+    def _frames_per_part(self) -> int:
+        numbers = self.optics.views * math.prod(self.clip.size)
+        return max(1, PART_BYTES // (4 * numbers))
+
+    def _to_light(self, clean: Tensor) -> Tensor:
+        return decode_srgb(clean) if decodes_srgb(self.cfg) else clean
+
+    def _see(self, parts: Iterable[Tensor]) -> Iterator[tuple[Tensor, Tensor]]:
+        """Yield what all views see of each part, and its tilt; classes that know the contract only
+        are asked for all frames at once.
+        """
+        operator, key = self.turbulence, noise.key(self.key, "turbulence")
+        if isinstance(operator, Turbulence):
+            yield from operator.degrade_parts(parts, self.frames, noise.generator(key))
+            return
+        clean = list(parts)
+        views = operator.degrade(torch.cat(clean)[None], noise.generator(key))[0]
+        tilt = operator.tilt(self.frames, noise.generator(key))
+        sizes = [len(part) for part in clean]
+        yield from zip(views.split(sizes, 1), tilt.split(sizes, 1), strict=True)
+
+    def allocate_views(self, folder: Path) -> Float[Tensor, "views frames h w"]:
+        """Return float16 memory for all views, in a file of `folder` that vanishes when it is no
+        longer used.  Raises ValueError where the disk has no room for it and for what comes.
+        """
+        shape = (self.optics.views, self.frames, *self.clip.size)
+        needed = 2 * math.prod(shape) + FREE_BYTES
+        needed += 2 * math.prod(shape) // self.substeps  # of the truth, at most about
+        free = shutil.disk_usage(folder).free
+        if free < needed:
+            much = f"{needed >> 20} MiB free in {folder}, got {free >> 20} MiB"
+            less = "a shorter part (end_s) or a smaller picture (longest_side_px) needs less"
+            raise ValueError(f"write must have {much}; {less}")
+        with tempfile.TemporaryFile(dir=folder) as file:
+            return torch.from_numpy(np.memmap(file, np.float16, "w+", shape=shape))
+
+
+def read_own_clip(cfg: DictConfig) -> OwnClip:
+    """Return the clip that `video` or `photo` names; ValueError for both and for wrong values."""
+    if cfg.video and cfg.photo:
+        raise ValueError(f"video must be null with photo={cfg.photo}, got {cfg.video}")
+    options = {"fps": cfg.fps, "longest_side_px": cfg.longest_side_px}
+    if cfg.video:
+        return own_material.read_video(cfg.video, start_s=cfg.start_s, end_s=cfg.end_s, **options)
+    motion = {"speed_widths_per_s": cfg.speed_widths_per_s, "seed": cfg.seed}
+    return own_material.read_photograph(cfg.photo, seconds=cfg.seconds, **motion, **options)

@@ -1,0 +1,107 @@
+"""The simulation for code of your own: `simulate("my.mp4", turbulence="strong", views=9)`."""
+
+import math
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from src.app.compose import compose_config, config_choices
+from src.app.own_simulation import OwnSimulation
+from src.sim.optics import Position, view_id
+from src.sim.scenes import own_material
+from src.sim.scenes.own_material import OwnClip
+from src.sim.scenes.video_files import PICTURE_SUFFIXES
+
+VIEW_EVENT = np.dtype(
+    [("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8), ("view", np.uint16)]
+)
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedClip:
+    """A clip seen through turbulence; it unpacks into clean, views, tilt and events.
+
+    `clean` (frames, h, w) and `views` (views, frames, h, w): float32 in [0, 1], grey code values.
+    `tilt` (views, frames, 2, h, w): float32, displacement (x, y) in pixels.  `events` (n,), in
+    order of time: t in us from the first frame on (int64), x, y in pixels of the view (uint16),
+    p -1 or 1 (int8), view, an index into `positions` (uint16).  `fps`: frames a second;
+    `positions`: (row, col) of each view from the centre view; `drawn`: contrast threshold,
+    severity, D/r0 ...
+    """
+
+    clean: Float[np.ndarray, "frames h w"]
+    views: Float[np.ndarray, "views frames h w"]
+    tilt: Float[np.ndarray, "views frames 2 h w"]
+    events: np.ndarray
+    fps: float
+    positions: Sequence[Position]
+    drawn: dict[str, Any]
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        return iter((self.clean, self.views, self.tilt, self.events))
+
+
+def simulate(
+    photo_or_video: Any, turbulence: str = "strong", views: int = 9, *, sensor: str = "paper",
+    fps: float | None = None, seconds: float = 1.0, start_s: float = 0.0, end_s: float = math.inf,
+    longest_side_px: int | None = None, seed: int = 0, overrides: Sequence[str] = (),
+) -> SimulatedClip:  # fmt: skip
+    """Return what a light field of `views` views and an event sensor see of your material.
+
+    `photo_or_video`: a path, of a picture, a video or a folder of frames, or an array, (h, w) or
+    (frames, h, w), uint8 or floats in [0, 1].  `turbulence`: none, weak, medium, strong or mixed.
+    `sensor`: paper, ideal, noisy, evk4 ...; `fps`: None for that of the file, 120 for a photograph,
+    which lasts `seconds`.  `overrides`: keys of conf/simulate.yaml as on the command line.  The
+    result is a function of the arguments.  Raises ValueError for values outside their range.
+    """
+    for group, choice in (("turbulence", turbulence), ("sensor", sensor)):
+        if choice not in (names := config_choices(group)):
+            raise ValueError(f"{group} must be one of {', '.join(names)}, got {choice}")
+    chosen = [f"turbulence={turbulence}", f"optics.views={views}", f"sensor={sensor}"]
+    cfg = compose_config("simulate", [*chosen, f"seed={seed}", *overrides])
+    options: dict[str, Any] = {"fps": fps, "longest_side_px": longest_side_px}
+    if not isinstance(photo_or_video, str | Path):
+        clip = own_material.clip_from_array(photo_or_video, seconds=seconds, **options)
+    elif Path(photo_or_video).suffix.lower() in PICTURE_SUFFIXES:
+        motion = {"speed_widths_per_s": cfg.speed_widths_per_s, "seed": seed}
+        clip = own_material.read_photograph(photo_or_video, seconds=seconds, **motion, **options)
+    else:
+        clip = own_material.read_video(photo_or_video, start_s=start_s, end_s=end_s, **options)
+    return simulate_clip(OwnSimulation(cfg, clip))
+
+
+def simulate_clip(work: OwnSimulation) -> SimulatedClip:
+    """Return all that `work` makes."""
+    clip: OwnClip = work.clip
+    shape, count = clip.size, len(clip.frames)
+    clean = np.empty((count, *shape), np.float32)
+    views = np.empty((work.optics.views, count, *shape), np.float32)
+    tilt = np.empty((work.optics.views, count, 2, *shape), np.float32)
+    seen, first = work.allocate_views(Path(tempfile.gettempdir())), 0
+    for part in work.parts(seen):
+        at = slice(first, first + len(part.clean))
+        clean[at], views[:, at], tilt[:, at] = part.clean, part.views, part.tilt
+        first = at.stop
+    events, positions = detect_events(work, seen), work.optics.positions
+    return SimulatedClip(clean, views, tilt, events, clip.fps, positions, work.record())
+
+
+def detect_events(work: OwnSimulation, views: Float[Tensor, "views frames h w"]) -> np.ndarray:
+    """Return the events of all views in order of time."""
+    parts = []
+    for index, position in enumerate(work.optics.positions):
+        light, place = views[index].float(), {"clip": work.key, "view": view_id(position)}
+        own = work.sensor.events(light, work.fps, **place)
+        part = np.empty(len(own), VIEW_EVENT)
+        for name in "txyp":
+            part[name] = own[name]
+        part["view"] = index
+        parts.append(part)
+    events = np.concatenate(parts)
+    return events[np.argsort(events["t"], kind="stable")]

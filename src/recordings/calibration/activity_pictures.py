@@ -1,0 +1,99 @@
+"""Pictures of what changed, or was seen, in windows that share a recording of any length.
+
+The windows double in length, and are joined in pairs, whenever there are more than WINDOWS: memory
+does not grow.  All views see the same in a window, so it may be long.
+"""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from src.recordings.files import sources, videos
+from src.recordings.files.event_file import ReadOptions
+from src.recordings.views import Size
+from src.sim.scenes.video_files import PICTURE_SUFFIXES
+
+WINDOWS = 16
+FIRST_WINDOW_US = 5000
+Pictures = Float[np.ndarray, "windows kinds h w"]
+
+
+class WindowSums:
+    """Sums of pictures (kinds, h, w) over windows of one length, of which `windows` is the list."""
+
+    def __init__(self, shape: tuple[int, ...], length: int):
+        self.shape, self.length = shape, length
+        self.windows: list[np.ndarray] = []
+
+    def window(self, time: int) -> np.ndarray:
+        """Return the sum of the window of `time`, to be added to; `time` is 0 or more, in the unit
+        of `length`."""
+        while time // self.length >= WINDOWS:
+            pairs = range(0, len(self.windows), 2)
+            self.windows = [np.sum(self.windows[first : first + 2], axis=0) for first in pairs]
+            self.length *= 2
+        while len(self.windows) <= time // self.length:
+            self.windows.append(np.zeros(self.shape, np.float32))
+        return self.windows[time // self.length]
+
+
+def read_activity_pictures(
+    path: Path | str, sensor: Sequence[int] | None = None, options: ReadOptions = ReadOptions()
+) -> Pictures:
+    """Return the events of each pixel, ON and OFF apart, or the mean of a film's code values (0 to
+    255), in up to WINDOWS windows of a recording.  Raises ValueError for what cannot be read."""
+    if (path := Path(path)).suffix.lower() in PICTURE_SUFFIXES:
+        return 255 * videos.read_gray_picture(path)[None, None].astype(np.float32)
+    if not sources.has_events(path):
+        return _average_film(videos.read_video(path))
+    size = sources.sensor_size(path, sensor, options)
+    return _count_events(sources.iter_recording(path, size, FIRST_WINDOW_US * 1e-6, options), size)
+
+
+def shrink_pictures(
+    pictures: Float[np.ndarray, "*windows h w"], factor: int
+) -> Float[np.ndarray, "n small_h small_w"]:
+    """Return means over squares of `factor` pixels; what is left right and below is cut."""
+    flat = pictures.reshape(-1, *pictures.shape[-2:])
+    height, width = (side // factor for side in flat.shape[1:])
+    cut = flat[:, : height * factor, : width * factor]
+    return cut.reshape(-1, height, factor, width, factor).mean((2, 4))
+
+
+def describe_structure(
+    pictures: Float[np.ndarray, "n h w"], fine_px: float, coarse_px: float
+) -> Float[np.ndarray, "n h w"]:
+    """Return the logarithm of pictures between two scales, sigmas in pixels; a pixel far above its
+    neighbours, a hot one, counts as three times their median."""
+
+    def describe(picture: np.ndarray) -> np.ndarray:
+        calm = np.log1p(np.minimum(picture, 3 + 3 * cv2.medianBlur(picture, 5)))
+        fine, coarse = (cv2.GaussianBlur(calm, (0, 0), sigma) for sigma in (fine_px, coarse_px))
+        return fine - coarse
+
+    return np.stack([describe(picture) for picture in pictures])
+
+
+def _average_film(frames: Iterator[np.ndarray]) -> Pictures:
+    sums = None
+    for index, frame in enumerate(frames):
+        sums = sums or WindowSums((2, *frame.shape), 1)  # of code values, and of frames
+        if frame.shape != sums.shape[1:]:
+            got = f"{frame.shape} after {sums.shape[1:]}"
+            raise ValueError(f"recording must hold frames of one size, got {got}")
+        sums.window(index)[:] += np.stack([255 * frame, np.ones_like(frame)])
+    assert sums is not None, "read_video yields a frame or raises"
+    return np.stack([window[:1] / window[1:] for window in sums.windows])
+
+
+def _count_events(chunks: Iterator[np.ndarray], size: Size) -> Pictures:
+    sums, start = WindowSums((2, *size), FIRST_WINDOW_US), None
+    for events in chunks:
+        start = int(events["t"][0]) if start is None else start
+        place = np.ravel_multi_index((events["p"] > 0, events["y"], events["x"]), sums.shape)
+        added = np.bincount(place, minlength=int(np.prod(sums.shape)))
+        sums.window(int(events["t"][0]) - start)[:] += added.reshape(sums.shape)
+    return np.stack([window for window in sums.windows if window.any()])

@@ -1,0 +1,174 @@
+"""Where the mirrored views of a kaleidoscope lie on the sensor, found in pictures of any scene.
+
+Two neighbours are mirror images of each other about the seam between them.  The products of all
+pairs of columns (then of rows) of the sensor, summed over pictures, are folded at every seam and
+pitch: the right ones bring equal columns together.
+"""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+
+from src.recordings.calibration.activity_pictures import describe_structure, shrink_pictures
+from src.sim.optics import Position
+
+LINES = 160  # at least so many along the longer side of the pictures that are folded
+MIN_SCORE = 0.2  # of the energy that neighbours share; other scenes have 0.1 at most
+MIN_LIKENESS = 0.2  # of a view and its neighbour, 1 for equal ones
+MIN_PITCH, MAX_VIEWS = 24, 10  # px, and along an axis
+WHOLE = 0.9  # share of a view that must lie on the sensor, or it is left out
+Gram = Float[np.ndarray, "n n"]
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Views along x or y, in pixels: the first begins at `start`, each is `pitch` long, `count` are
+    whole.
+
+    `score`: the products of mirrored neighbours over those of each line with itself.
+    """
+
+    start: float
+    pitch: float
+    count: int
+    score: float
+
+    @property
+    def centre(self) -> int:
+        """Index of the centre view; of an even number the one before the middle."""
+        return (self.count - 1) // 2
+
+    @property
+    def tile(self) -> tuple[float, float]:
+        """Where the centre view begins and ends."""
+        begin = self.start + self.centre * self.pitch
+        return begin, begin + self.pitch
+
+    def mirror(self, offset: int) -> tuple[float, float]:
+        """Return (a, b): pixel x of the view `offset` from the centre one shows what pixel
+        a x + b of the centre one does."""
+        begin, end = self.tile
+        if offset % 2:
+            return -1.0, begin + end + offset * self.pitch
+        return 1.0, -offset * self.pitch
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The whole views of a sensor: `x` and `y` are the axes of columns and of rows."""
+
+    x: Axis
+    y: Axis
+
+    @property
+    def positions(self) -> list[Position]:
+        """(row, col) from the centre view, row by row."""
+        rows, cols = (range(-a.centre, a.count - a.centre) for a in (self.y, self.x))
+        return [(row, col) for row in rows for col in cols]
+
+    @property
+    def tile(self) -> tuple[float, float, float, float]:
+        """The centre view's left, top, right and bottom edge."""
+        (left, right), (top, bottom) = self.x.tile, self.y.tile
+        return left, top, right, bottom
+
+    def homography(self, position: Position) -> Float[np.ndarray, "3 3"]:
+        """Return the map of a view's pixels to the centre one's, were all mirrors perfect."""
+        (a, b), (c, d) = self.x.mirror(position[1]), self.y.mirror(position[0])
+        return np.array([[a, 0, b], [0, c, d], [0, 0, 1]])
+
+
+def find_grid(pictures: Float[np.ndarray, "*windows h w"]) -> Grid:
+    """Find the views of a sensor in pictures of what it saw.
+
+    Raises ValueError where neither columns nor rows of views repeat.
+    """
+    step = max(1, max(pictures.shape[-2:]) // LINES)
+    small = _level(describe_structure(shrink_pictures(pictures, step), 1.2, 2.5))
+    x = find_axis(np.einsum("kyx,kyz->xz", small, small, optimize=True))
+    y = find_axis(np.einsum("kyx,kzx->yz", small, small, optimize=True))
+    if x.count == 1 and y.count == 1:
+        best = f"{max(x.score, y.score):.2f}"
+        raise ValueError(
+            f"recording must show mirrored views side by side: neighbours share {best} of what"
+            f" they show, {MIN_SCORE} is needed; record more motion, or use a board (target=)"
+        )
+    if y.count == 1:
+        y = _one_view(small, x, y.score)
+    elif x.count == 1:
+        x = _one_view(small.transpose(0, 2, 1), y, x.score)
+    in_pixels = (replace(a, start=a.start * step - 0.5, pitch=a.pitch * step) for a in (x, y))
+    return Grid(*in_pixels)
+
+
+def _level(pictures: Float[np.ndarray, "n h w"]) -> Float[np.ndarray, "n h w"]:
+    """Return the pictures over their local contrast, so that strong edges do not decide alone."""
+    contrast = [np.sqrt(cv2.GaussianBlur(picture**2, (0, 0), 5.0)) for picture in pictures]
+    return pictures / (np.stack(contrast) + pictures.std((1, 2), keepdims=True) + 1e-9)
+
+
+def find_axis(gram: Gram) -> Axis:
+    """Find the views along an axis from the products of its lines; one view where none repeats."""
+    n, total = len(gram), max(float(np.trace(gram)), 1e-9)
+    pitches = np.arange(max(n / MAX_VIEWS, 8), n / 2 / WHOLE, 0.5)
+    tried = [(seam, pitch) for pitch in pitches for seam in np.arange(0.0, pitch)]
+    shared = np.array([_shared(gram, *fold).sum() for fold in tried])
+    size = np.sqrt(np.maximum(np.diag(gram), 0))
+    possible = np.array([_shared(np.outer(size, size), *fold).sum() for fold in tried])
+    best = int(np.argmax(shared * np.abs(shared) / np.maximum(possible, 1e-9)))  # many and alike
+    axis = _whole_views(gram, *tried[best], score=float(shared[best]) / total)
+    return axis if axis.score >= MIN_SCORE and axis.count > 1 else Axis(0.0, n, 1, axis.score)
+
+
+def _fold_lines(n: int, seam: float, pitch: float) -> Int[np.ndarray, "views lines"]:
+    """Return the lines of each view, mirrored in every second; -1 off the sensor."""
+    views = np.arange(-int(np.ceil(seam / pitch)), int(np.ceil((n - seam) / pitch)))[:, None]
+    along = np.arange(int(pitch)) + 0.5
+    lines = np.floor(seam + views * pitch + np.where(views % 2, pitch - along, along)).astype(int)
+    return np.where((lines >= 0) & (lines < n), lines, -1)
+
+
+def _shared(gram: Gram, seam: float, pitch: float) -> Float[np.ndarray, "pairs lines"]:
+    """Return the products of each line and its mirror image in the next view."""
+    lines = _fold_lines(len(gram), seam, pitch)
+    one, other = lines[:-1], lines[1:]
+    return gram[one, other] * ((one >= 0) & (other >= 0))
+
+
+def _whole_views(gram: Gram, seam: float, pitch: float, score: float) -> Axis:
+    """Return the axis of the views that are like a neighbour and lie on the sensor."""
+    lines, shared = _fold_lines(len(gram), seam, pitch), _shared(gram, seam, pitch)
+    energy = np.where(lines >= 0, np.diag(gram)[lines], 0)
+    both = np.where((lines[:-1] >= 0) & (lines[1:] >= 0), energy[:-1] * energy[1:], 0)
+    pairs = shared.sum(1) > MIN_LIKENESS * np.maximum(np.sqrt(both).sum(1), 1e-9)
+    start = seam - int(np.ceil(seam / pitch)) * pitch
+    if pairs.sum() == 1:  # two views fit any pitch beyond what they show
+        only = int(pairs.argmax())
+        middle = start + (only + 1) * pitch
+        reach = _reach(np.abs(lines[only] + 0.5 - middle), shared[only])
+        reach = min(reach, middle, len(gram) - middle)
+        return Axis(float(middle - reach), float(reach), 2, score)
+    like = np.append(pairs, False) | np.insert(pairs, 0, False)
+    kept = np.flatnonzero(like & ((lines >= 0).mean(1) >= WHOLE))
+    first, last = (kept[0], kept[-1]) if len(kept) else (0, 0)
+    return Axis(float(start + first * pitch), float(pitch), int(last - first) + 1, score)
+
+
+def _reach(distance: Float[np.ndarray, " n"], shared: Float[np.ndarray, " n"]) -> float:
+    """Return the distance within which 99 % of what is shared lies, and a twentieth more."""
+    order = np.argsort(distance)
+    total = np.maximum(shared[order], 0).cumsum()
+    return 1.05 * float(distance[order][np.searchsorted(total, 0.99 * total[-1])])
+
+
+def _one_view(pictures: Float[np.ndarray, "n h w"], across: Axis, score: float) -> Axis:
+    """Return the axis of one row of views, as long as what neighbours in it share."""
+    lines = _fold_lines(pictures.shape[2], across.start, across.pitch)
+    folded = pictures[:, :, lines] * (lines >= 0)
+    total = (folded[:, :, 1:] * folded[:, :, :-1]).sum((0, 2, 3)).cumsum()
+    first, last = (int(np.argmax(total >= share * total[-1])) for share in (0.01, 0.99))
+    more = (last + 1 - first) / 20
+    begin, end = max(0.0, first - more), min(float(len(total)), last + 1 + more)
+    return Axis(begin, end - begin, 1, score)

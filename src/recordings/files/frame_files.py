@@ -1,0 +1,95 @@
+"""Frames of a camera beside the event pixels, as files hold them."""
+
+import re
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from src.recordings.files.event_file import RawFrames
+from src.sim.scenes.video_files import PICTURE_SUFFIXES, read_picture
+
+PICTURE_FOLDERS = ("images_corrected", "images")  # of TimeLens's recordings, beside the events
+TIME_FILES = ("timestamp.txt", "timestamps.txt")
+
+
+def listed_frames(listing: Path) -> RawFrames | None:
+    """Return the pictures of a text file with a line for each, seconds and file; None where there
+    is no such file (images.txt of the Event Camera Dataset)."""
+    if not listing.is_file():
+        return None
+    rows = [line.split(maxsplit=1) for line in listing.read_text().splitlines() if line.strip()]
+    try:
+        times = np.array([float(second) for second, _ in rows])
+    except ValueError:
+        raise ValueError(f"{listing} must have seconds and a file in each line") from None
+    return _pictures([listing.parent / name.strip() for _, name in rows], times, "s")
+
+
+def numbered_frames(folder: Path) -> RawFrames | None:
+    """Return the pictures of TimeLens's layout, in a folder beside that of the events: in order of
+    name, with a line of timestamp.txt for each, in the events' unit of time."""
+    found = [p for name in PICTURE_FOLDERS if (p := folder.parent / name).is_dir()]
+    if not found:
+        return None
+    names = sort_by_name(p for p in found[0].iterdir() if p.suffix.lower() in PICTURE_SUFFIXES)
+    places = [place / name for place in (found[0], folder.parent) for name in TIME_FILES]
+    listing = next((place for place in places if place.is_file()), None)
+    if listing is None:
+        warnings.warn(
+            f"{found[0]}: {len(names)} frames without timestamp.txt, left out", stacklevel=2
+        )
+        return None
+    try:
+        times = np.loadtxt(listing, ndmin=1)
+    except ValueError as error:
+        raise ValueError(f"{listing} must have a time in each line: {error}") from error
+    if times.shape != (len(names),):
+        raise ValueError(f"{listing} has {times.size} times for {len(names)} pictures")
+    return _pictures(names, times, None)
+
+
+def stored_frames(pictures: Any, times: np.ndarray, unit: str | None = None) -> RawFrames:
+    """Return the frames of an array (n, h, w) or (n, h, w, 1), which are read one by one."""
+    if pictures.ndim not in (3, 4) or len(pictures) != len(times):
+        raise ValueError(f"{len(times)} times for frames of shape {pictures.shape}")
+    height, width = pictures.shape[1:3]
+
+    def one_by_one() -> Iterator[np.ndarray]:
+        yield from (to_gray(np.asarray(pictures[k])) for k in range(len(times)))
+
+    return RawFrames(np.asarray(times), (height, width), one_by_one, unit)
+
+
+def sort_by_name(paths: Iterable[Path]) -> list[Path]:
+    """Return paths in order of name, the numbers in names by their value: 2.png before 10.png."""
+    return sorted(
+        paths,
+        key=lambda path: [
+            int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)
+        ],
+    )
+
+
+def to_gray(picture: np.ndarray, rgb: bool = False) -> np.ndarray:
+    """Return a picture (h, w), (h, w, 1) or in colour (h, w, 3), BGR unless `rgb`, as (h, w)."""
+    if picture.ndim == 3 and picture.shape[2] == 3:
+        return cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY if rgb else cv2.COLOR_BGR2GRAY)
+    return picture[..., 0] if picture.ndim == 3 else picture
+
+
+def _pictures(names: Sequence[Path], times: np.ndarray, unit: str | None) -> RawFrames | None:
+    if not names:
+        return None
+    height, width = _read(names[0]).shape
+    return RawFrames(times, (height, width), lambda: map(_read, names), unit)
+
+
+def _read(path: Path) -> np.ndarray:
+    picture = read_picture(path, cv2.IMREAD_GRAYSCALE)
+    if picture is None:
+        raise ValueError(f"{path} must be a picture that can be read")
+    return picture

@@ -1,0 +1,192 @@
+"""Your own video or photograph as a clean clip: all of it, uncropped, at its own rate.
+
+Grey values are luminance code values.  Pictures are only shrunk, with an area filter.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from src.sim import noise
+from src.sim.scenes.moving_layers import MovingLayer, SimilarityMotion, render_frame
+from src.sim.scenes.video_files import VideoSource, find_videos, read_picture
+
+LARGEST_SIDE_PX = 512  # of the frames, where nothing else is asked for
+LEAST_SIDE_PX = 16
+
+
+@dataclass(frozen=True, eq=False)
+class OwnClip:
+    """`frames` (frames, h, w), 16 or 32 bit floats in [0, 1], code values, at `fps`; `source`: what
+    the material is, in words.
+    """
+
+    name: str
+    frames: Float[np.ndarray, "frames h w"]
+    fps: float
+    source: str
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width, pixels."""
+        return self.frames.shape[1], self.frames.shape[2]
+
+    def blend(self, first: int, stop: int, substeps: int) -> Float[Tensor, "count h w"]:
+        """Return frames first .. stop - 1 of the clip at `substeps` times its rate, float32: linear
+        blends between two frames.
+        """
+        before, rest = np.divmod(np.arange(first, stop), substeps)
+        share = (rest / substeps).astype(np.float32)[:, None, None]
+        one, next_one = (
+            self.frames[np.minimum(at, len(self.frames) - 1)].astype(np.float32)
+            for at in (before, before + 1)
+        )
+        return torch.from_numpy(one + share * (next_one - one))
+
+
+def read_video(
+    path: Path | str, *, fps: float | None = None, start_s: float = 0.0, end_s: float = math.inf,
+    longest_side_px: int | None = None,
+) -> OwnClip:  # fmt: skip
+    """Return a video file, or a folder of frames, from `start_s` to `end_s`.
+
+    `fps`: that it is taken for (None: as the file says); `longest_side_px` of its frames (None:
+    their own, at most LARGEST_SIDE_PX).  Raises ValueError for what is no video, says no rate, or
+    has less than two frames there.
+    """
+    source = _find_one_video(Path(path))
+    rate = fps or (source.index.fps if source.index else None)
+    if rate is None:
+        raise ValueError(f"fps must be given, frames a second, for {path}, which states none")
+    _check_rate(rate)
+    if not 0 <= start_s < end_s:
+        raise ValueError(f"start_s must be >= 0 and below end_s, got {start_s} and {end_s}")
+    first = math.ceil(round(start_s * rate, 6))
+    stop = source.count if end_s == math.inf else math.ceil(round(end_s * rate, 6))
+    stop = min(stop, source.count)
+    if stop - first < 2:
+        lasts = f"{source.count / rate:.3f} s"
+        raise ValueError(f"start_s and end_s must leave two frames or more of {path}, {lasts} long")
+    frames, shape = [], (0, 0)
+    for picture in source.read(first, stop):
+        shape = picture.shape
+        frames.append(_shrink(picture, longest_side_px).astype(np.float16))
+    part = "all" if stop - first == source.count else f"frames {first} to {stop - 1}"
+    facts = f"{shape[1]}x{shape[0]} px, {rate:.6g} frames/s, {part} of {source.count} frames"
+    return OwnClip(source.name, np.stack(frames), rate, facts)
+
+
+def read_photograph(
+    path: Path | str, *, fps: float | None = None, seconds: float = 1.0,
+    longest_side_px: int | None = None, speed_widths_per_s: float = 0.0, seed: int = 0,
+) -> OwnClip:  # fmt: skip
+    """Return a photograph for `seconds` at `fps` (None: 120): at rest, or in a smooth motion, drawn
+    from `seed`, of `speed_widths_per_s` frame widths a second.
+
+    Raises ValueError for what is no picture and for values outside their range.
+    """
+    picture = read_picture(Path(path)) if Path(path).is_file() else None
+    if picture is None:
+        raise ValueError(f"photo must be a picture that can be read (a film: video=), got {path}")
+    facts = f"photograph of {picture.shape[1]}x{picture.shape[0]} px"
+    clip = hold_photograph(_shrink(picture, longest_side_px), fps or 120.0, seconds, facts)
+    if not 0 <= speed_widths_per_s < math.inf:
+        raise ValueError(f"speed_widths_per_s must be >= 0, got {speed_widths_per_s}")
+    frames = clip.frames
+    if speed_widths_per_s:
+        frames = _move(frames[0], len(frames), clip.fps, speed_widths_per_s, seed)
+    return OwnClip(Path(path).stem, frames, clip.fps, facts)
+
+
+def hold_photograph(
+    picture: Float[np.ndarray, "h w"], fps: float, seconds: float, source: str
+) -> OwnClip:
+    """Return a picture that stands still for `seconds` at `fps`."""
+    _check_rate(fps)
+    if not (isinstance(seconds, int | float) and 2 / fps <= seconds < 1e6):
+        raise ValueError(f"seconds must be {2 / fps:.4g} (two frames) or more, got {seconds}")
+    count = round(seconds * fps) + 1
+    return OwnClip("photograph", np.broadcast_to(picture, (count, *picture.shape)), fps, source)
+
+
+def clip_from_array(
+    values: Any, *, fps: float | None = None, seconds: float = 1.0,
+    longest_side_px: int | None = None,
+) -> OwnClip:  # fmt: skip
+    """Return an array as a clip: (h, w), a photograph, or (frames, h, w), a video at `fps`, of
+    uint8 or of floats in [0, 1].
+
+    Raises ValueError for another shape, for values outside and for a video without `fps`.
+    """
+    array = np.asarray(values)
+    if array.ndim not in (2, 3) or (array.ndim == 3 and len(array) < 2):
+        wanted = "(h, w), a photograph, or (frames, h, w), grey"
+        raise ValueError(f"photo_or_video must be of shape {wanted}, got {array.shape}")
+    if array.dtype != np.uint8 and not (
+        array.dtype.kind == "f" and array.size and 0 <= array.min() <= array.max() <= 1
+    ):
+        raise ValueError("photo_or_video must be uint8 or floats in [0, 1]")
+    facts = "x".join(map(str, array.shape[:-3:-1])) + " px"
+    if array.ndim == 2:
+        return hold_photograph(_shrink(array, longest_side_px), fps or 120.0, seconds, facts)
+    if fps is None:
+        raise ValueError("fps must be given for an array of frames, frames a second")
+    _check_rate(fps)
+    frames = np.stack([_shrink(frame, longest_side_px) for frame in array])
+    return OwnClip("video", frames, fps, f"{facts}, {fps:.6g} frames/s, {len(array)} frames")
+
+
+def _find_one_video(path: Path) -> VideoSource:
+    if not path.exists():
+        raise ValueError(f"video must be a file or a folder of frames that exists, got {path}")
+    try:
+        videos = find_videos(path, "video")
+    except ValueError as error:
+        hint = (
+            "; a photograph is photo=" if path.is_file() and read_picture(path) is not None else ""
+        )
+        raise ValueError(f"{error}{hint}") from None
+    if len(videos) != 1:
+        raise ValueError(f"video must be one video or one folder of frames, got {path}")
+    return videos[0]
+
+
+def _check_rate(fps: float) -> None:
+    if not 0.1 <= fps <= 1e6:
+        raise ValueError(f"fps must be in [0.1, 1e6] frames a second, got {fps}")
+
+
+def _shrink(picture: NDArray, longest_side_px: int | None) -> Float[np.ndarray, "h w"]:
+    """Return float32 in [0, 1], at most `longest_side_px` long."""
+    wanted = LARGEST_SIDE_PX if longest_side_px is None else longest_side_px
+    if not (isinstance(wanted, int) and wanted >= LEAST_SIDE_PX):
+        raise ValueError(f"longest_side_px must be >= {LEAST_SIDE_PX} or null, got {wanted}")
+    shrink = min(1.0, wanted / max(picture.shape))
+    size = [round(side * shrink) for side in picture.shape]
+    if min(size) < LEAST_SIDE_PX:
+        got = f"{size[1]}x{size[0]}"
+        raise ValueError(f"frames must be {LEAST_SIDE_PX} px or more on either side, got {got}")
+    values: NDArray = picture.astype(np.float32) / (255 if picture.dtype == np.uint8 else 1)
+    if shrink < 1:
+        values = cv2.resize(values, size[::-1], interpolation=cv2.INTER_AREA)
+    return np.clip(values, 0, 1)
+
+
+def _move(
+    picture: NDArray, count: int, fps: float, speed: float, seed: int
+) -> Float[np.ndarray, "count h w"]:
+    rng = np.random.default_rng(noise.key(seed, "motion of a photograph"))
+    motion = SimilarityMotion(rng, (speed, speed))
+    motion.angle = 0.0  # upright at the start
+    centre = np.array([(side - 1) / 2 for side in picture.shape[::-1]])
+    layer = MovingLayer(picture, None, centre, 1.0, motion)
+    size = picture.shape[0], picture.shape[1]
+    return np.stack([render_frame([layer], k / fps, size) for k in range(count)])

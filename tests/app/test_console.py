@@ -1,0 +1,115 @@
+"""What a user sees: help with comments, progress, names of methods, one line at Ctrl-C."""
+
+import io
+import os
+import pty
+import re
+import select
+import subprocess
+import sys
+import time
+from unittest.mock import Mock
+
+import pytest
+from lightning import Trainer
+from rich.console import Console
+
+from src.app import build
+from src.app.help import help_text
+from src.records.results import ScoreRow, build_rich_score_table
+from src.training.progress import TrainingProgress
+from tests.conftest import ROOT
+from tests.test_train import config
+
+SMALL = [
+    "experiment=lf3x3", "data.crop=32", "data.test_crop=32", "data.windows=3", "data.loss_from=0",
+    "data.test_windows=4", "data.test_clips=1", "data.val_clips=1", "data.epoch_clips=8", "width=8",
+    "data.batch_size=2", "data.cache_clips=null", "trainer.max_steps=5000", "loss=l1",
+    "metrics.lpips=null", "data.unscored_windows=0", "data.workers=1", "turbulence=none",
+]  # fmt: skip
+
+
+def test_help_shows_keys_with_their_comments_and_the_choices_of_groups():
+    text = help_text("reconstruct", "What it does.\n")
+    assert text.startswith("What it does.\n")
+    assert re.search(r"^recording: required +# an event file", text, re.M)
+    assert re.search(r"^playback_fps: 30.0 +# frames per second at which", text, re.M)
+    assert "defaults:" not in text and "paths" not in text.splitlines()[3]
+    groups = help_text("simulate", "")
+    assert re.search(
+        r"^  turbulence=mixed +or measured, medium, none, recorded, strong", groups, re.M
+    )
+
+
+@pytest.mark.parametrize("command", ["simulate", "train"])
+def test_every_command_has_help(command):
+    run = [sys.executable, "-m", f"src.{command}", "--help"]
+    done = subprocess.run(run, cwd=ROOT, check=True, capture_output=True, text=True, timeout=300)
+    assert "seed: 0  " in done.stdout and f"python -m src.{command}" in done.stdout
+
+
+@pytest.mark.parametrize(
+    "given, name",
+    [
+        (["ckpt=setnet_small"], "setnet_small"),
+        (["ckpt=out/a/step5.ckpt"], "step5"),
+        (["ckpt=clean/etnet", "name=mine"], "mine"),
+        (["baseline=highpass"], "HighPass"),
+    ],
+)
+def test_a_table_names_the_method_asked_for(given, name, tmp_path):
+    assert build.method_name(config("eval", tmp_path, *given)) == name
+
+
+def test_a_table_cuts_no_name_and_no_number():
+    scores = {"ssim": 0.512, "psnr": 16.25}
+    row = ScoreRow("published/a_long_name_of_a_network", [scores], 1, 1, {"a": 103.2})
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(build_rich_score_table([row]))
+    text = console.export_text()
+    first = "".join(line.split("│")[1].strip() for line in text.splitlines() if "│" in line)
+    assert first == row.name and "0.512" in text and "16.25" in text and "103.2" in text
+
+
+def test_progress_counts_the_steps_asked_for(capsys):
+    shown = TrainingProgress(tested="untrained")
+    trainer = Mock(spec=Trainer, max_steps=30, num_test_batches=[2])
+    shown.on_train_start(trainer, None)
+    for step in range(1, 31):
+        trainer.global_step, trainer.progress_bar_metrics = step, {"train/loss": 0.5}
+        shown.on_train_batch_end(trainer, None, None)
+    shown.on_train_end(trainer, None)
+    shown.on_test_start(trainer, None)
+    for _ in range(2):
+        shown.on_test_batch_end(trainer, None)
+    shown.on_test_end(trainer, None)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines == ["training: step 30 of 30 loss 0.500", "testing untrained: 2 of 2"]
+
+
+def read_until(terminal: int, word: bytes, seconds: float) -> bytes:
+    """Return what a terminal shows until `word` is there or it closes."""
+    seen, end = b"", time.monotonic() + seconds
+    while word not in seen and time.monotonic() < end:
+        if select.select([terminal], [], [], 1)[0]:
+            try:
+                seen += os.read(terminal, 65536)
+            except OSError:
+                break
+    return seen
+
+
+@pytest.mark.slow
+def test_ctrl_c_at_a_terminal_ends_in_one_line(tmp_path):
+    words = [*SMALL, f"hydra.run.dir={tmp_path}"]
+    child, terminal = pty.fork()
+    if child == 0:
+        os.chdir(ROOT)
+        os.execv(sys.executable, [sys.executable, "-W", "ignore", "-m", "src.train", *words])
+    before = read_until(terminal, b"step 6 of 5000", 400)
+    os.write(terminal, b"\x03")
+    after = read_until(terminal, b"never", 100).decode()
+    _, status = os.waitpid(child, 0)
+    assert b"testing untrained" in before and os.waitstatus_to_exitcode(status) == 130
+    assert "Traceback" not in after and "DataLoader" not in after
+    assert len(re.findall(r"stopped at step \d+; go on with ckpt=", after)) == 1

@@ -1,0 +1,100 @@
+"""A user's own video and photograph: every frame, uncropped, at the rate of the file."""
+
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from src.sim.scenes import own_material
+
+LEVELS = np.arange(10, 250, 20)  # of twelve frames
+
+
+def write_film(path: Path, levels=LEVELS, size=(36, 64), fps=30) -> Path:
+    """Write a lossless video of flat frames, a white stripe at the left edge."""
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream("ffv1", rate=fps)
+        stream.height, stream.width, stream.pix_fmt = *size, "gray"
+        for level in levels:
+            picture = np.full(size, level, np.uint8)
+            picture[:, :4] = 255
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="gray")))
+        file.mux(stream.encode())
+    return path
+
+
+def test_all_frames_of_a_video_are_there_uncropped_at_its_rate(tmp_path):
+    clip = own_material.read_video(write_film(tmp_path / "a.mkv"))
+    assert clip.frames.shape == (12, 36, 64) and clip.fps == 30
+    codes = np.round(clip.frames.astype(float) * 255)
+    assert (codes[:, :, 4:] == LEVELS[:, None, None]).all() and (codes[:, :, :4] == 255).all()
+    assert clip.source == "64x36 px, 30 frames/s, all of 12 frames"
+
+
+def test_a_part_and_another_rate(tmp_path):
+    path = write_film(tmp_path / "a.mkv")
+    clip = own_material.read_video(path, fps=120, start_s=2 / 120, end_s=5 / 120)
+    assert clip.fps == 120 and np.round(clip.frames[:, 0, 9] * 255).tolist() == [50, 70, 90]
+    assert clip.source.endswith("frames 2 to 4 of 12 frames")
+
+
+def test_between_two_frames_lies_their_blend(tmp_path):
+    clip = own_material.read_video(write_film(tmp_path / "a.mkv"))
+    seen = clip.blend(3, 9, 4)[:, 0, 9].numpy() * 255
+    assert np.allclose(seen, [25, 30, 35, 40, 45, 50], atol=0.05)
+    assert len(clip.blend(40, 45, 4)) == 5  # up to the last frame
+
+
+def test_a_large_picture_is_shrunk_and_keeps_its_proportions(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((600, 1200), 100, np.uint8))
+    clip = own_material.read_photograph(tmp_path / "a.png", seconds=0.1)
+    assert clip.frames.shape == (13, 256, 512) and clip.fps == 120
+    assert np.allclose(clip.frames, 100 / 255)
+
+
+def test_a_photograph_moves_when_asked_to_and_starts_as_it_is(tmp_path):
+    rng = np.random.default_rng(0)
+    picture = cv2.GaussianBlur(rng.uniform(0, 255, (64, 96)).astype(np.float32), (0, 0), 3)
+    cv2.imwrite(str(tmp_path / "a.png"), picture)
+    still, moving = (
+        own_material.read_photograph(tmp_path / "a.png", seconds=0.2, speed_widths_per_s=speed)
+        for speed in (0.0, 0.5)
+    )
+    assert (still.frames == still.frames[0]).all()
+    assert np.abs(moving.frames[0] - still.frames[0]).max() < 0.01
+    assert np.abs(moving.frames[-1] - still.frames[0]).mean() > 0.01
+
+
+def test_arrays_are_clips(tmp_path):
+    frames = np.random.default_rng(0).integers(0, 256, (3, 20, 30), dtype=np.uint8)
+    clip = own_material.clip_from_array(frames, fps=50)
+    assert (np.round(clip.frames * 255) == frames).all() and clip.fps == 50
+    assert own_material.clip_from_array(frames[0] / 255.0).frames.shape == (121, 20, 30)
+
+
+@pytest.mark.parametrize(
+    "call, message",
+    [
+        (lambda p: own_material.read_video(p / "none.mp4"), "video must be a file or a folder"),
+        (lambda p: own_material.read_video(p / "a.png"), "a photograph is photo="),
+        (lambda p: own_material.read_video(p), "fps must be given, frames a second"),
+        (lambda p: own_material.read_video(p / "a.mkv", fps=-1), r"fps must be in \[0.1, 1e6\]"),
+        (lambda p: own_material.read_video(p / "a.mkv", end_s=0.03), "start_s and end_s must"),
+        (lambda p: own_material.read_video(p / "a.mkv", start_s=2, end_s=1), "start_s must be"),
+        (lambda p: own_material.read_video(p / "a.mkv", longest_side_px=8), "longest_side_px must"),
+        (lambda p: own_material.read_photograph(p / "a.mkv"), r"a film: video=\)"),
+        (lambda p: own_material.read_photograph(p / "a.png", seconds=0), "seconds must be 0.0166"),
+        (lambda p: own_material.clip_from_array(np.zeros((3, 20, 30))), "fps must be given"),
+        (lambda p: own_material.clip_from_array(np.full((20, 30), 7.0)), r"floats in \[0, 1\]"),
+        (lambda p: own_material.clip_from_array(np.zeros((1, 1, 2, 3))), "must be of shape"),
+    ],
+)
+def test_wrong_material_is_one_line(call, message, tmp_path):
+    write_film(tmp_path / "a.mkv")
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(tmp_path / name), np.zeros((20, 30), np.uint8))
+    with pytest.raises(ValueError, match=message) as error:
+        call(tmp_path)
+    assert "\n" not in str(error.value)

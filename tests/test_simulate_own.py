@@ -1,0 +1,141 @@
+"""Your own video and photograph through src.simulate, and the same from Python."""
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from hydra.core.global_hydra import GlobalHydra
+
+from src.app import own_simulation
+from src.app.compose import compose_config
+from src.app.own_simulation import OwnSimulation
+from src.app.python_interface import simulate as simulate_arrays
+from src.recordings.files import read_events
+from src.recordings.views import load_views
+from src.sim import noise
+from src.sim.scenes.own_material import clip_from_array
+from src.sim.turbulence.operator import Turbulence
+from src.simulate import simulate
+from tests.sim.scenes.test_own_material import LEVELS, write_film
+from tests.test_recording_entry_points import config
+
+SMALL = ["camera.sensor=[120,160]", "turbulence=strong"]
+
+
+def textured(frames: int = 5, size=(40, 56)) -> np.ndarray:
+    rng = np.random.default_rng(1)
+    wide = rng.uniform(0.1, 0.9, (size[0] // 8, size[1] // 8 + frames)).repeat(8, 0).repeat(8, 1)
+    return np.stack([wide[:, 4 * k : 4 * k + size[1]] for k in range(frames)]).astype(np.float32)
+
+
+def test_a_video_gives_events_geometry_and_truth_of_all_its_frames(tmp_path, capsys):
+    film = write_film(tmp_path / "my.mkv")
+    drawn = simulate(config("simulate", tmp_path / "run", f"video={film}", *SMALL))
+    line = capsys.readouterr().out.splitlines()[0]
+    assert line.startswith(
+        "my: 64x36 px, 30 frames/s, all of 12 frames; simulated as 9 views of 64x"
+    )
+    assert f"turbulence strong ({drawn['tilt_and_blur_px']:.2f} px" in line
+    assert line.endswith(f"at 120 frames/s; {line[line.index('turbulence') :]}")
+    assert f"contrast threshold {drawn['threshold']:.3f}" in line
+    events = read_events(tmp_path / "run" / "my.raw")
+    views = load_views(tmp_path / "run" / "my.views.yaml")
+    assert len(events) > 500 and events["t"].max() < 11 / 30 * 1e6 and views.model == (36, 64)
+    with h5py.File(tmp_path / "run" / "my.truth.h5") as file:
+        assert (file["clean"][:, 9, 30] == LEVELS).all()
+        assert file["views"].shape == (9, 12, 36, 64) and file["views"].compression == "gzip"
+        assert file["tilt"].shape == (9, 12, 2, 36, 64) and 0.1 < np.abs(file["tilt"][:]).max() < 20
+        assert np.allclose(file["time_s"], np.arange(12) / 30) and file.attrs["fps"] == 30
+        assert file.attrs["threshold"] == drawn["threshold"]
+    assert (tmp_path / "run" / "views.gif").stat().st_size > 1000
+    assert not list(tmp_path.rglob("*partial*"))
+
+
+def test_parts_are_those_of_the_whole_clip(tmp_path, monkeypatch):
+    clip = clip_from_array(textured(), fps=60)
+    cfg = compose_config("simulate", ["turbulence=strong", "optics.views=3"])
+    work = OwnSimulation(cfg, clip)
+    assert work.substeps == 2 and work.frames == 9 and isinstance(work.turbulence, Turbulence)
+    monkeypatch.setattr(own_simulation, "PART_BYTES", 4 * 3 * 40 * 56 * 2)  # two frames
+    seen = work.allocate_views(tmp_path)
+    parts = list(work.parts(seen))
+    key = noise.key(work.key, "turbulence")
+    clean = clip.blend(0, 9, 2)[None]
+    whole = work.turbulence.degrade(clean, noise.generator(key))[0]
+    tilt = work.turbulence.tilt(9, noise.generator(key))
+    assert len(parts) == 5 and (seen.float() - whole).abs().max() < 1e-3
+    assert torch.allclose(torch.cat([p.views for p in parts], 1), whole[:, ::2], atol=1e-5)
+    assert torch.allclose(torch.cat([p.tilt for p in parts], 1), tilt[:, ::2], atol=1e-5)
+    assert torch.allclose(torch.cat([p.clean for p in parts]), torch.from_numpy(clip.frames))
+
+
+def test_from_python_the_result_is_that_of_the_command(tmp_path):
+    film = write_film(tmp_path / "my.mkv")
+    simulate(config("simulate", tmp_path / "run", f"video={film}", *SMALL))
+    clip = simulate_arrays(film, turbulence="strong", views=9)
+    with h5py.File(tmp_path / "run" / "my.truth.h5") as file:
+        assert (np.round(clip.clean * 255) == file["clean"]).all()
+        assert np.abs(clip.views * 255 - file["views"][:].astype(float)).max() < 0.501
+        assert np.abs(clip.tilt - file["tilt"][:]).max() < 0.501 / 32
+    clean, views, tilt, events = clip
+    assert clean is clip.clean and views is clip.views and tilt is clip.tilt
+    assert (np.diff(events["t"]) >= 0).all() and set(np.unique(events["view"])) == set(range(9))
+    assert (np.abs(events["p"]) == 1).all() and events["x"].max() < 64 > events["y"].max()
+
+
+def test_without_turbulence_events_are_the_threshold_crossings_of_the_clip():
+    ramp = np.exp(np.linspace(np.log(0.1), np.log(0.8), 25))[:, None, None]
+    frames = np.broadcast_to(ramp, (25, 20, 24)).astype(np.float32)
+    sensor = ["sensor.threshold=0.25"]
+    clip = simulate_arrays(frames, "none", 1, fps=240, sensor="ideal", overrides=sensor)
+    assert (clip.views[0] == clip.clean).all() and not clip.tilt.any()
+    assert len(clip.events) == 20 * 24 * int(np.log(8) / 0.25) and (clip.events["p"] == 1).all()
+    first = clip.events["t"][0] * 1e-6 * 240  # frames until the light has grown by exp(0.25)
+    assert first == pytest.approx(24 * 0.25 / np.log(8), abs=0.02)
+
+
+def test_a_seed_draws_anew_and_the_same_seed_the_same():
+    same, again, other = (
+        simulate_arrays(textured(3), "strong", 2, fps=120, seed=seed) for seed in (1, 1, 2)
+    )
+    assert (same.views == again.views).all() and (same.events == again.events).all()
+    assert np.abs(same.views - other.views).max() > 0.01
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"turbulence": "heavy"}, "turbulence must be one of .*, strong, weak, got heavy"),
+        ({"sensor": "nosy"}, "sensor must be one of .*, noisy, .*, got nosy"),
+        ({"views": 7}, "optics.views must be"),
+        ({"overrides": ["foo=1"]}, "foo"),
+        ({"overrides": ["least_simulated_fps=0"]}, "least_simulated_fps must be in"),
+    ],
+)
+def test_a_wrong_argument_is_one_line_and_leaves_hydra_as_it_was(options, message):
+    before = GlobalHydra.instance().hydra
+    with pytest.raises(ValueError, match=message) as error:
+        simulate_arrays(textured(2), fps=30, **options)
+    assert "\n" not in str(error.value) and GlobalHydra.instance().hydra is before
+
+
+@pytest.mark.parametrize(
+    "given, message",
+    [
+        (["video=my.mkv", "photo=a.png"], "video must be null with photo=a.png"),
+        (["video=my.mkv", "like=config.yaml"], "like must be null with video or photo"),
+        (["video=my.mkv", "write=a.txt"], "write"),
+    ],
+)
+def test_keys_that_do_not_go_together(given, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        simulate(config("simulate", tmp_path / "run", *given))
+
+
+def test_a_full_disk_is_told_before_the_work(tmp_path, monkeypatch):
+    film = write_film(tmp_path / "my.mkv")
+    cfg = config("simulate", tmp_path / "run", f"video={film}", *SMALL)
+    monkeypatch.setattr(own_simulation, "FREE_BYTES", 1 << 60)
+    with pytest.raises(ValueError, match=r"write must have .* MiB free"):
+        simulate(cfg)
+    assert not list(tmp_path.rglob("my.raw*")) and not list(tmp_path.rglob("*.h5*"))
