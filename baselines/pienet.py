@@ -19,7 +19,7 @@ Map = Float[Tensor, "n _c _h _w"]  # each of its own channels and size
 Memory = tuple[Tensor, Tensor]  # hidden and cell map
 
 
-class State(NamedTuple):
+class PIENetState(NamedTuple):
     """What goes from window to window; zeros start a sequence."""
 
     memories: tuple[Memory | None, ...]
@@ -61,10 +61,10 @@ class PIENet(CentreViewNetwork):
         self.pred = nn.Conv2d(base_channels, 3, 1)
         self.offset = ConvNorm(3, 1)
 
-    def predict_before_activation(self, grid: Tensor, state: Any) -> tuple[Tensor, State]:
+    def predict_before_activation(self, grid: Tensor, state: Any) -> tuple[Tensor, PIENetState]:
         if state is None:
             blank = torch.zeros_like(grid[:, :1])
-            state = State((None,) * len(self.encoders), blank, blank, blank[..., :1, :1])
+            state = PIENetState((None,) * len(self.encoders), blank, blank, blank[..., :1, :1])
         events, before = self.events(grid), self.previous(state.frame)
         summary = torch.cat([events, before], 1).mean((2, 3), keepdim=True)
         x, skips, memories = events + before, [], []
@@ -76,7 +76,7 @@ class PIENet(CentreViewNetwork):
             x = decoder(x, skips.pop(), state.variance, state.begun)
         frame, variance = self._map_to_intensity(self.pred(x))
         carried = frame.detach().clamp(0, 1), variance.detach(), torch.ones_like(state.begun)
-        return frame, State(tuple(memories), *carried)
+        return frame, PIENetState(tuple(memories), *carried)
 
     def _map_to_intensity(self, maps: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, Tensor]:
         """Return frame and variance of mean and variance of the change and the refined frame."""
@@ -93,9 +93,11 @@ class Encoder(nn.Module):
         super().__init__()
         self.width, self.pool = width, pool
         both = inputs + width
-        self.widen, self.weigh = ConvNorm(both, 2 * both), ChannelWeights(2 * both)
-        self.gates = nn.Sequential(nn.Conv2d(2 * both, 4 * width, 1), Norm(1, 4 * width))
-        self.hidden_norm, self.cell_norm = Norm(4, width), Norm(4, width)
+        self.widen, self.weigh = ConvNorm(both, 2 * both), SqueezeExcitation(2 * both)
+        self.gates = nn.Sequential(
+            nn.Conv2d(2 * both, 4 * width, 1), Float32GroupNorm(1, 4 * width)
+        )
+        self.hidden_norm, self.cell_norm = Float32GroupNorm(4, width), Float32GroupNorm(4, width)
         self.refine = ConvNorm(width, width) if refine else None
         self.modulate = nn.Conv2d(summary, 2 * width, 1)
 
@@ -136,7 +138,7 @@ class Decoder(nn.Module):
         return self.fuse(torch.cat([skip, functional.pad(x, edges)], 1))
 
 
-class ChannelWeights(nn.Module):
+class SqueezeExcitation(nn.Module):
     """Weighs channels by what their means say (Hu et al. 2018)."""
 
     def __init__(self, channels: int):
@@ -153,13 +155,16 @@ class ConvNorm(nn.Module):
 
     def __init__(self, inputs: int, outputs: int):
         super().__init__()
-        self.conv, self.norm = nn.Conv2d(inputs, outputs, 3, padding=1), Norm(1, outputs)
+        self.conv, self.norm = (
+            nn.Conv2d(inputs, outputs, 3, padding=1),
+            Float32GroupNorm(1, outputs),
+        )
 
     def forward(self, x: Map) -> Map:
         return functional.silu(self.norm(self.conv(x)))
 
 
-class Norm(nn.GroupNorm):
+class Float32GroupNorm(nn.GroupNorm):
     """A norm over groups of channels and all pixels, in float32 also where the rest is bf16."""
 
     def forward(self, input: Map) -> Map:

@@ -5,6 +5,7 @@
 What a name needs is imported when it is first used.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -17,6 +18,19 @@ if TYPE_CHECKING:
     from src.sim.optics import layout
     from src.sim.voxel import voxel_grid
 
+_HOMES = {  # of each name: its module, and there its name
+    "ReadOptions": "src.recordings.files.ReadOptions",
+    "Runtime": "src.deploy.runtime.EventListRuntime",
+    "SimulatedClip": "src.app.python_interface.SimulatedClip",
+    "Views": "src.recordings.views.Views",
+    "layout": "src.sim.optics.layout",
+    "load": "src.models.load",
+    "load_views": "src.recordings.views.load_views",
+    "read_events": "src.recordings.files.read_events",
+    "simulate": "src.app.python_interface.simulate",
+    "voxel_grid": "src.sim.voxel.voxel_grid",
+    "write_video": "src.recordings.output.write_video",
+}
 __all__ = [
     "ReadOptions", "Runtime", "SimulatedClip", "Views", "layout", "load", "load_views",
     "read_events", "simulate", "voxel_grid", "write_video",
@@ -24,28 +38,12 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    home: Any
-    if name in ("SimulatedClip", "simulate"):
-        from src.app import python_interface as home
-    elif name == "Runtime":
-        from src.deploy import runtime
-
-        return runtime.EventListRuntime
-    elif name == "load":
-        from src import models as home
-    elif name in ("ReadOptions", "read_events"):
-        from src.recordings import files as home
-    elif name == "write_video":
-        from src.recordings import output as home
-    elif name in ("Views", "load_views"):
-        from src.recordings import views as home
-    elif name == "layout":
-        from src.sim import optics as home
-    elif name == "voxel_grid":
-        from src.sim import voxel as home
-    else:
+    if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(home, name)
+    from src import importable_name
+
+    module, _, there = _HOMES[name].rpartition(".")
+    return getattr(import_module(importable_name(module)), there)
 
 
 def __dir__() -> list[str]:

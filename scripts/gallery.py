@@ -16,19 +16,19 @@ import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
-from scripts.readme import BASELINES, baseline_overrides, compose_config
+from scripts.readme import BASELINES, baseline_overrides
 from src.app import build
+from src.app.compose import compose_config
 from src.figures import plots
 from src.metrics.invented_contrast import find_unseen, invented_contrast
 from src.reconstruct import choose_views, video_frames
 from src.recordings.files import sources, videos
-from src.recordings.noise_filter import NoiseFilter
+from src.recordings.noise_filter import find_supported_pixels
 from src.recordings.reconstruction import Frame, as_event_network
 
 FPS = 120
 WIDE = 2.4  # inches: width of a panel
 CAMERA = "images.txt"
-SUPPORT_S = 0.005  # of NoiseFilter: what is noise reveals nothing
 
 
 def last(recording: str, network: str, published: Path | None) -> Frame:
@@ -55,11 +55,8 @@ def camera(recording: str, time_s: float) -> Float[np.ndarray, "h w"] | None:
 
 def unseen(recording: str, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
     """Return where no event that is not noise was ever near."""
-    has_events, keep = np.zeros(size, bool), NoiseFilter(size, SUPPORT_S)
-    for events in sources.iter_recording(recording.partition("@")[0], size, 0.05):
-        kept = keep(events)
-        has_events[kept["y"], kept["x"]] = True
-    return find_unseen(has_events)
+    events = sources.iter_recording(recording.partition("@")[0], size, 0.05)
+    return find_unseen(find_supported_pixels(events, size))
 
 
 def gallery(recordings: list[str], networks: list[str], published: Path | None) -> Figure:

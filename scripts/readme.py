@@ -12,13 +12,13 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from hydra import compose, initialize_config_dir
 from matplotlib.figure import Figure
 from omegaconf import DictConfig
 from torch import Tensor
 
 from src import models
 from src.app import build
+from src.app.compose import compose_config
 from src.app.instantiate import build_part
 from src.bench.candidates import Candidate
 from src.figures import plots
@@ -77,12 +77,6 @@ TABLES = {  # of what is measured: document, section, whether scores are in it, 
     "data=test_footage": (("docs/results.md", "footage", False, VIEWS | BEST),),
     "data=test_photos sensor=randomized": (("docs/results.md", "drawn", False, VIEWS | BEST),),
 }
-
-
-def compose_config(entry_point: str, *overrides: str) -> DictConfig:
-    """Return the config of an entry point."""
-    with initialize_config_dir(str(HOME / "conf"), version_base=None):
-        return compose(entry_point, list(overrides))
 
 
 def baseline_overrides(name: str, published: Path | None) -> list[str]:
@@ -168,7 +162,7 @@ def update_card(card: Path, protocol: str, commit: str, clips: list[dict[str, fl
 
 def draw_figure(path: Path, index: int, windows: int) -> None:
     """Draw a clip through strong local air: the last frame and the x-t slice of its middle row."""
-    cfg = compose_config("simulate", *AIR, "scene.height=192", "scene.width=192",
+    cfg = compose_config("simulate", *AIR, "fps=120", "scene.height=192", "scene.width=192",
                  "sensor.threshold=0.15", f"data.test_windows={windows}")  # fmt: skip
     sample = simulate(build.build_pipeline(cfg, "test"), [index])
     panels = {

@@ -14,9 +14,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from scripts.readme import compose_config
 from src import models
 from src.app import build
+from src.app.compose import compose_config
 from src.metrics.image import align_brightness
 from src.sim.pipeline import simulate
 

@@ -9,10 +9,12 @@ import cv2
 import numpy as np
 import torch
 
-from scripts.readme import AIR, HOME, NINE, ONE, compose_config, load_shipped, reconstruct_clip
+from scripts.readme import AIR, HOME, NINE, ONE, load_shipped, reconstruct_clip
 from src.app import build
+from src.app.compose import compose_config
 from src.figures.samples import join_panels, render_events, tile_views
 from src.recordings import simulated_recording
+from src.recordings.output import round_codes
 from src.records.atomic import atomic_path
 from src.sim.pipeline import ClipParameters, Pipeline
 
@@ -30,7 +32,7 @@ def save(name: str, panels: dict[str, np.ndarray], scale: int = 2) -> None:
     large = {
         title: picture[None].repeat(scale, 1).repeat(scale, 2) for title, picture in panels.items()
     }
-    eight = (np.clip(join_panels(large)[0, ..., ::-1], 0, 1) * 255 + 0.5).astype(np.uint8)
+    eight = round_codes(join_panels(large)[0, ..., ::-1])
     path = OUT / f"{name}.png"
     with atomic_path(path) as partial:
         packed = cv2.imencode(".png", eight, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]
@@ -62,7 +64,7 @@ def chip(pipeline: Pipeline, draw: ClipParameters, views: torch.Tensor) -> np.nd
 
 def draw_all(index: int) -> None:
     """Simulate the clip and draw it stage by stage."""
-    cfg = compose_config("simulate", *AIR, f"scene.height={SIDE}", f"scene.width={SIDE}",
+    cfg = compose_config("simulate", *AIR, "fps=120", f"scene.height={SIDE}", f"scene.width={SIDE}",
                  "sensor.threshold=0.15", f"data.test_windows={WINDOWS}")  # fmt: skip
     pipeline = build.build_pipeline(cfg, "test")
     draw, middle = pipeline.draw(index), SIDE // 2

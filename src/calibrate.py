@@ -8,7 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from src.app import build, calibrations, entry_point
 from src.app.instantiate import build_part
-from src.recordings.calibration.scene_alignment import Scene
+from src.recordings.calibration.scene_alignment import SceneTarget
 from src.recordings.files.event_file import ReadOptions
 from src.recordings.reconstruction import as_event_network
 from src.records import results
@@ -19,7 +19,7 @@ def find_views(cfg: DictConfig, run: Path) -> dict:
     given: dict[str, Any] = {key: cfg[key] for key in ("resolution", "sensor_size")}
     given["options"] = ReadOptions.from_keys(cfg)
     target = build_part(cfg, "target")
-    if isinstance(target, Scene) and not cfg.corners:
+    if isinstance(target, SceneTarget) and not cfg.corners:
         if not cfg.mirrors:
             raise ValueError("mirrors must be true for target=scene, got false")
         found = calibrations.calibrate_views_on_scene(cfg.recording, run, target, **given)

@@ -6,15 +6,16 @@ clean clip, side by side.
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
 from omegaconf import DictConfig
+from rich.progress import BarColumn, Progress, TimeElapsedColumn
 
-from src.app import build, console, entry_point, hardware
+from src.app import build, entry_point, hardware
 from src.deploy.runtime import EventListRuntime
 from src.figures import samples
 from src.models.network import EventToVideoNetwork
@@ -47,7 +48,7 @@ def reconstruct(cfg: DictConfig) -> Path:
     frames, size = make(cfg, network, views)
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     with output.open_video_writer(cfg.output_format, run, size, cfg.playback_fps) as write:
-        for frame in tone.apply_to_frames(console.show_frames(frames), curve):
+        for frame in tone.apply_to_frames(show_frames(frames), curve):
             write(frame)
             ready_s.append(time.perf_counter() - start)
     print(describe_run(run / output.KINDS[cfg.output_format][1], views, ready_s))
@@ -65,6 +66,17 @@ def describe_run(video: Path, views: Views, ready_s: list[float]) -> str:
         f"{video}: {count} frames, {width}x{height} px, {number} view{'s' * (number > 1)}; "
         f"{ready_s[-1]:.1f} s{speed}; times in {video.parent / 'frames.csv'}"
     )
+
+
+def show_frames(frames: Iterable[Frame]) -> Iterator[Frame]:
+    """Yield `frames`, and show how many there were and how far in the recording they are."""
+    columns = "{task.description}", BarColumn(), "{task.completed:.0f} frames,", "{task.fields[at]}"
+    with Progress(*columns, TimeElapsedColumn()) as progress:
+        task = progress.add_task("reconstruction", total=None, at="0.00 s")
+        for frame in frames:
+            yield frame
+            progress.update(task, advance=1, at=f"{frame.time_s:.2f} s")
+        progress.update(task, total=progress.tasks[0].completed)
 
 
 def choose_views(cfg: DictConfig, network: EventToVideoNetwork) -> Views:
@@ -144,7 +156,7 @@ def join_frames(
         panels = {"events": samples.render_events(window.voxels[0], full=1.0)}
         panels |= {name: one.picture[None] for name, one in zip(methods, shown, strict=True)}
         if clean is not None:
-            panels["clean"] = clean.at(window.end_us * 1e-6, shown[-1].picture.shape)[None]
+            panels["clean"] = clean.frame_at(window.end_us * 1e-6, shown[-1].picture.shape)[None]
         yield replace(shown[-1], picture=samples.join_panels(panels)[0])
 
 

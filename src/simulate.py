@@ -16,7 +16,7 @@ from torch import Tensor
 from yaml import YAMLError
 
 from src.app import build, entry_point, own_simulation
-from src.app.own_simulation import OwnSimulation, Part
+from src.app.own_simulation import OwnSimulation, SimulatedPart
 from src.figures import samples
 from src.recordings.files import event_writers
 from src.recordings.simulated_recording import kaleidoscope_views, write_recording
@@ -29,6 +29,7 @@ from src.sim.sensor.response import encode_srgb
 
 SECTIONS = ("scene", "optics", "turbulence", "sensor", "data")
 CLIP_KEYS = (*SECTIONS, "seed", "fps", "bins")  # what makes a clip
+SCENE_FPS = 120.0  # of a clip of a scene, unless fps says another
 DRAWN_FRAMES = 24  # of your own clip in views.gif
 
 
@@ -78,7 +79,9 @@ def simulate_own_clip(cfg: DictConfig) -> dict:
     return drawn
 
 
-def draw_own_clip(run: Path, work: OwnSimulation, views: Tensor, parts: list[Part]) -> list[Path]:
+def draw_own_clip(
+    run: Path, work: OwnSimulation, views: Tensor, parts: list[SimulatedPart]
+) -> list[Path]:
     """Draw the first frames as `views.gif` and `views.png`."""
     shown = slice(1, DRAWN_FRAMES + 1)
     clean = torch.cat([part.clean for part in parts])[shown].numpy()
@@ -92,6 +95,8 @@ def draw_own_clip(run: Path, work: OwnSimulation, views: Tensor, parts: list[Par
 def simulate_scene(cfg: DictConfig) -> dict:
     """Simulate clip `index` of `split` and, with `write`, record it."""
     run, cfg = Path(cfg.paths.run), take_clip_config_from_run(cfg) if cfg.like else cfg
+    if cfg.fps is None:
+        cfg.fps = SCENE_FPS
     pipeline, step = build.build_pipeline(cfg, cfg.split), cfg.data.substeps
     draw = pipeline.draw(cfg.index)
     views = pipeline.render_views([draw])[0].float()

@@ -53,7 +53,7 @@ def test_a_video_gives_events_geometry_and_truth_of_all_its_frames(tmp_path, cap
 
 def test_parts_are_those_of_the_whole_clip(tmp_path, monkeypatch):
     clip = clip_from_array(textured(), fps=60)
-    cfg = compose_config("simulate", ["turbulence=strong", "optics.views=3"])
+    cfg = compose_config("simulate", "turbulence=strong", "optics.views=3")
     work = OwnSimulation(cfg, clip)
     assert work.substeps == 2 and work.frames == 9 and isinstance(work.turbulence, Turbulence)
     monkeypatch.setattr(own_simulation, "PART_BYTES", 4 * 3 * 40 * 56 * 2)  # two frames

@@ -16,7 +16,6 @@ from rich.table import Table
 from baselines.centre_view import CentreViewNetwork
 from src.app import build, entry_point
 from src.app.instantiate import as_dict, build_part
-from src.deploy.cost import macs_per_frame, time_frame
 from src.models.network import EventToVideoNetwork
 from src.recordings.evreal_protocol import (
     EvrealRule,
@@ -24,11 +23,12 @@ from src.recordings.evreal_protocol import (
     check_scored_range,
     score_sequence,
 )
-from src.recordings.evreal_sequences import find_sequences, name_of, open_as_evreal
+from src.recordings.evreal_sequences import find_sequences, open_as_evreal, sequence_name
 from src.recordings.files.evreal_folder import EvrealSequence, is_evreal_folder, open_sequence
 from src.recordings.reconstruction import as_event_network
 from src.records import results
 from src.records.atomic import write_text
+from src.training import evaluation
 
 SCORES = {"mse": "MSE ↓", "ssim": "SSIM ↑", "lpips": "LPIPS ↓"}
 RULE_KEYS = (
@@ -43,7 +43,7 @@ def evaluate_recordings(cfg: DictConfig) -> dict:
     `cfg.paths.run`.  Returns the content of `results.json`.
     """
     run, start = Path(cfg.paths.run), time.perf_counter()
-    benchmark = Benchmark(cfg)
+    benchmark = EvrealBenchmark(cfg)
     sources = find_sequences(cfg.scene.root)
     for folder in filter(is_evreal_folder, sources):  # what is wrong is said before hours of work
         benchmark.check(folder, open_sequence(folder))
@@ -53,7 +53,7 @@ def evaluate_recordings(cfg: DictConfig) -> dict:
         clip, scored = benchmark.score(source, run)
         clips.append(clip)
         lines += scored
-        print(f"{clip['name']}: {clip['frames']} frames, {_said(clip)}")
+        print(f"{clip['name']}: {clip['frames']} frames, {_format_scores(clip)}")
     write_text(run / "frames.csv", results.format_csv(lines[0], [line.values() for line in lines]))
     means, row = average_over_frames(clips), benchmark.row(clips)
     return results.write_and_print_results(
@@ -62,7 +62,7 @@ def evaluate_recordings(cfg: DictConfig) -> dict:
     )  # fmt: skip
 
 
-class Benchmark:
+class EvrealBenchmark:
     """The network of a config and how it is scored on a sequence."""
 
     def __init__(self, cfg: DictConfig):
@@ -82,7 +82,10 @@ class Benchmark:
     def score(self, source: Path, run: Path) -> tuple[dict, list[dict]]:
         """Return the mean scores of a sequence, and a line of each frame's."""
         data_set, first_s, last_s = find_scored_range(self.cfg.data, source)
-        facts: dict[str, Any] = {"name": f"{data_set}/{name_of(source)}", "data_set": data_set}
+        facts: dict[str, Any] = {
+            "name": f"{data_set}/{sequence_name(source)}",
+            "data_set": data_set,
+        }
         lines = []
         with open_as_evreal(source, run) as sequence:
             self.check(source, sequence)
@@ -104,16 +107,14 @@ class Benchmark:
     def row(self, clips: list[dict]) -> results.ScoreRow:
         """Return the scores with the network's cost for frames of the last sequence's size."""
         (height, width), bins = self.size, self.cfg.bins
-        zeros = torch.zeros(1, 1, bins, height, width, device=self.device)
-        threads = torch.get_num_threads()
-        timing = time_frame(self.network, zeros, threads=threads, seconds=0.0, min_frames=5)
-        given = self.cfg.get("baseline") or {}
+        window = torch.zeros(1, 1, bins, height, width, device=self.device)
+        macs, milliseconds = evaluation.measure_frame_cost(self.network, window)
         return results.ScoreRow(
-            str(self.cfg.ckpt or given.get("architecture") or given.get("_target_")),
+            build.method_name(self.cfg),
             clips,
             params=sum(part.numel() for part in self.network.parameters()),
-            macs_per_frame=macs_per_frame(self.network, height, width, bins=bins),
-            latency_ms={f"{height}x{width}": timing.median_ms},
+            macs_per_frame=macs,
+            latency_ms={f"{height}x{width}": milliseconds},
         )
 
 
@@ -141,7 +142,7 @@ def find_scored_range(data: DictConfig, source: Path) -> tuple[str, float, float
 
     Raises ValueError for a range that is none.
     """
-    name, folder = name_of(source), source.resolve().parent.name
+    name, folder = sequence_name(source), source.resolve().parent.name
     known = [(group, spans[name]) for group, spans in data.sequences.items() if name in spans]
     data_set, span = known[0] if known else ("other" if folder in data.sequences else folder, None)
     first, last = span or (0.0, math.inf)
@@ -177,7 +178,7 @@ def average_over_frames(clips: Sequence[Mapping[str, Any]]) -> dict[str, dict]:
     return means
 
 
-def _said(scores: Mapping[str, Any]) -> str:
+def _format_scores(scores: Mapping[str, Any]) -> str:
     return ", ".join(f"{name.upper()} {scores[name]:.4f}" for name in SCORES if name in scores)
 
 

@@ -124,10 +124,8 @@ def method_name(cfg: DictConfig) -> str:
     if cfg.ckpt:
         path = Path(cfg.ckpt)
         return path.stem if path.suffix else str(cfg.ckpt).rstrip("/")
-    chosen = (
-        HydraConfig.get().runtime.choices.get("baseline") if HydraConfig.initialized() else None
-    )
-    return chosen or str(cfg.baseline._target_).rpartition(".")[2]
+    choices = HydraConfig.get().runtime.choices if HydraConfig.initialized() else {}
+    return choices.get("baseline") or str(cfg.baseline._target_).rpartition(".")[2]
 
 
 def build_video_method(cfg: DictConfig) -> VideoMethod:
@@ -230,7 +228,7 @@ def test_method(
     # On SLURM a trainer takes up what a preempted training left in its folder: this one has none.
     options: dict = {"precision": "32-true", "logger": False, "enable_checkpointing": False}
     options |= {"devices": 1, "num_nodes": 1, "strategy": "auto", "default_root_dir": None}
-    shown = [TrainingProgress(tested=name)] if cfg.trainer.enable_progress_bar else []
-    trainer = build_part(cfg, "trainer", callbacks=shown, **options)
+    callbacks = [TrainingProgress(tested=name)] if cfg.trainer.enable_progress_bar else []
+    trainer = build_part(cfg, "trainer", callbacks=callbacks, **options)
     options = {"trainer": trainer, "unscored_windows": cfg.data.unscored_windows}
     return evaluation.test_network(name, net, data, metrics, **options)

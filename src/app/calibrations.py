@@ -68,7 +68,7 @@ def calibrate_views(
 def calibrate_views_on_scene(
     recording: str,
     folder: Path,
-    scene: scene_alignment.Scene,
+    scene: scene_alignment.SceneTarget,
     *,
     resolution: Sequence[int],
     sensor_size: Sequence[int] | None = None,

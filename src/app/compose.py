@@ -1,6 +1,5 @@
 """The folder of the configs, and configs made without a command line."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
@@ -17,7 +16,7 @@ def config_choices(group: str) -> list[str]:
     return sorted(file.stem for file in (Path(CONF) / group).glob("*.yaml"))
 
 
-def compose_config(name: str, overrides: Sequence[str]) -> DictConfig:
+def compose_config(name: str, *overrides: str) -> DictConfig:
     """Return conf/<name>.yaml with overrides, also inside an application of Hydra.
 
     Raises ValueError for a key or a choice that is none.

@@ -3,13 +3,8 @@
 import codecs
 import sys
 import warnings
-from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TextIO
-
-from rich.progress import BarColumn, Progress, TimeElapsedColumn
-
-from src.recordings.reconstruction import Frame
 
 NEAREST = {
     "•": "*",
@@ -47,14 +42,3 @@ def _show_warning(
     if category is UserWarning and "site-packages" not in Path(filename).parts:
         text = f"warning: {' '.join(str(message).split())}\n"
     print(text, end="", file=file or sys.stderr)
-
-
-def show_frames(frames: Iterable[Frame]) -> Iterator[Frame]:
-    """Yield `frames`, and show how many there were and how far in the recording they are."""
-    columns = "{task.description}", BarColumn(), "{task.completed:.0f} frames,", "{task.fields[at]}"
-    with Progress(*columns, TimeElapsedColumn()) as progress:
-        task = progress.add_task("reconstruction", total=None, at="0.00 s")
-        for frame in frames:
-            yield frame
-            progress.update(task, advance=1, at=f"{frame.time_s:.2f} s")
-        progress.update(task, total=progress.tasks[0].completed)

@@ -12,7 +12,7 @@ from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from baselines.published import load_pretrained
-from src import HOME
+from src import HOME, importable_name
 from src.models.network import EventToVideoNetwork, FramePostprocessor, VideoMethod
 from src.models.setnet import SetNet
 from src.sim.scenes.clip import Scene
@@ -107,17 +107,14 @@ def _find_targets(node: Any) -> Iterator[str]:
             yield from _find_targets(value)
 
 
-def _importable(target: str) -> str:
-    """Return the name by which a class is imported that a config calls src.* or baselines.*."""
-    return HOME + target if target.startswith(("src.", "baselines.")) else target
-
-
 def _rename_targets(node: Any) -> Any:
     """Return nested dicts and lists with every `_target_` as it is imported."""
     if isinstance(node, dict):
         renamed = {name: _rename_targets(value) for name, value in node.items()}
         return (
-            renamed | {"_target_": _importable(node["_target_"])} if "_target_" in node else renamed
+            renamed | {"_target_": importable_name(node["_target_"])}
+            if "_target_" in node
+            else renamed
         )
     return [_rename_targets(value) for value in node] if isinstance(node, list) else node
 
@@ -135,7 +132,7 @@ def _check_target(target: str, packages: Sequence[str]) -> None:
     if not target.startswith(("src.", "baselines.", "torch.optim.", "lightning.", *own)):
         raise ValueError(refusal)
     try:
-        named = get_object(_importable(target))
+        named = get_object(importable_name(target))
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f"_target_ must name a class, got {target}") from error
     module = f"{getattr(named, '__module__', '')}.".removeprefix(HOME)

@@ -37,7 +37,7 @@ def without_progress(parts: range, name: str) -> Iterable[int]:
 
 
 @dataclass(frozen=True)
-class Part:
+class SimulatedPart:
     """Those of the clip's own frames that a part of the simulated ones holds: `clean` (n, h, w) and
     `views` (views, n, h, w) in [0, 1], code values; `tilt` (views, n, 2, h, w), pixels.
     """
@@ -105,7 +105,7 @@ class OwnSimulation:
 
     def parts(
         self, views: Float[Tensor, "views frames h w"], progress: Progress = without_progress
-    ) -> Iterator[Part]:
+    ) -> Iterator[SimulatedPart]:
         """Yield the clip part by part, and write what all views see, light, to `views`."""
         starts = range(0, self.frames, self._frames_per_part())
         spans = [(first, min(first + starts.step, self.frames)) for first in starts]
@@ -116,7 +116,9 @@ class OwnSimulation:
             views[:, first:stop] = lights
             own = slice(-first % self.substeps, None, self.substeps)
             codes = encode_srgb(lights[:, own]) if decodes_srgb(self.cfg) else lights[:, own]
-            yield Part(self.clip.blend(first, stop, self.substeps)[own], codes, tilt[:, own])
+            yield SimulatedPart(
+                self.clip.blend(first, stop, self.substeps)[own], codes, tilt[:, own]
+            )
 
     def _frames_per_part(self) -> int:
         numbers = self.optics.views * math.prod(self.clip.size)

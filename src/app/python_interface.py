@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from src.app.compose import compose_config, config_choices
-from src.app.own_simulation import OwnSimulation
+from src.app.own_simulation import OwnSimulation, read_own_clip
 from src.sim.optics import Position, view_id
 from src.sim.scenes import own_material
 from src.sim.scenes.own_material import OwnClip
@@ -64,15 +64,15 @@ def simulate(
         if choice not in (names := config_choices(group)):
             raise ValueError(f"{group} must be one of {', '.join(names)}, got {choice}")
     chosen = [f"turbulence={turbulence}", f"optics.views={views}", f"sensor={sensor}"]
-    cfg = compose_config("simulate", [*chosen, f"seed={seed}", *overrides])
-    options: dict[str, Any] = {"fps": fps, "longest_side_px": longest_side_px}
-    if not isinstance(photo_or_video, str | Path):
-        clip = own_material.clip_from_array(photo_or_video, seconds=seconds, **options)
-    elif Path(photo_or_video).suffix.lower() in PICTURE_SUFFIXES:
-        motion = {"speed_widths_per_s": cfg.speed_widths_per_s, "seed": seed}
-        clip = own_material.read_photograph(photo_or_video, seconds=seconds, **motion, **options)
+    cfg = compose_config("simulate", *chosen, f"seed={seed}", *overrides)
+    options: dict[str, Any] = {"fps": fps, "seconds": seconds, "longest_side_px": longest_side_px}
+    if isinstance(photo_or_video, str | Path):
+        path = Path(photo_or_video)
+        key = "photo" if path.suffix.lower() in PICTURE_SUFFIXES else "video"
+        cfg.update(options | {"start_s": start_s, "end_s": end_s, key: str(path)})
+        clip = read_own_clip(cfg)
     else:
-        clip = own_material.read_video(photo_or_video, start_s=start_s, end_s=end_s, **options)
+        clip = own_material.clip_from_array(photo_or_video, **options)
     return simulate_clip(OwnSimulation(cfg, clip))
 
 

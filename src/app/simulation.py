@@ -20,7 +20,6 @@ from src.training.batch_sampler import LargeCropStream
 from src.training.clip_cache import CachedPipeline, ClipCache, DeviceClipCache
 from src.training.disk_cache import DiskClipCache, hash_file_lists
 
-FPS = 120.0
 DEVICE_CACHES: dict[str, DeviceClipCache] = {}  # those of this process, by all that makes them
 
 
@@ -180,10 +179,6 @@ def _side(cfg: DictConfig, key: str) -> Any:
 def _frame_rates(cfg: DictConfig, split: str) -> list[float]:
     key = "data.rates" if split == "train" and cfg.data.rates else "fps"
     given = OmegaConf.select(cfg, key)
-    if (
-        given is None and cfg.get("task") == "simulate"
-    ):  # there null is the rate of a video of one's own
-        given = FPS
     rates = list(given) if isinstance(given, Sequence) else [given]
     if not rates or not all(isinstance(r, int | float) and 0 < r < math.inf for r in rates):
         raise ValueError(f"{key} must be > 0 windows a second, got {given}")

@@ -10,6 +10,7 @@ from PIL import Image
 
 from src.figures.comparison import VideoRow, draw_comparison
 from src.models.network import VideoMethod
+from src.recordings.output import round_codes
 from src.records.atomic import atomic_path
 from src.sim.optics import Optics
 from src.sim.pipeline import Pipeline, simulate
@@ -142,8 +143,7 @@ def write_video(path: Path, frames: Video, fps: float) -> None:
 
     Values are clipped to [0, 1]; GIFs keep time to hundredths of a second.
     """
-    eight = (np.clip(frames, 0, 1) * 255 + 0.5).astype(np.uint8)
-    pictures = [Image.fromarray(frame) for frame in eight]
+    pictures = [Image.fromarray(frame) for frame in round_codes(frames)]
     with atomic_path(path) as partial:
         if path.suffix == ".gif":
             first, *rest = (p.quantize(128, dither=Image.Dither.NONE) for p in pictures)

@@ -194,7 +194,8 @@ class CameraFeed(Feed):
                 self.faults.clear("camera")
                 for packet in stream:
                     events = _as_events(packet["t"], packet["x"], packet["y"], packet["on"])
-                    yield events, time.perf_counter()
+                    if events.size:
+                        yield events, time.perf_counter()
                     if stopped.is_set():
                         return
                 reason = "it sends no more"

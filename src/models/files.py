@@ -16,7 +16,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from src import HOME
+from src import importable_name
 from src.models.checkpoints import is_intact, newest_checkpoint
 from src.models.e2vid import E2VID
 from src.models.folding import fold_parametrizations, inference_copy
@@ -179,18 +179,13 @@ def _build(spec: dict, path: Path, allowed_packages: Sequence[str] = ()) -> nn.M
     _check_numbers(kwargs, path)
     room, _, name = target.rpartition(".")
     try:
-        kind = getattr(import_module(_importable(room)), name)
+        kind = getattr(import_module(importable_name(room)), name)
         if not issubclass(kind, nn.Module):
             raise TypeError(f"{target} is no network")
         return kind(**kwargs)
     except Exception as error:  # networks raise all kinds for arguments that are not theirs
         wanted = f"{target} of {kwargs}"
         raise ValueError(f"ckpt names a network that is not here: {wanted} in {path}") from error
-
-
-def _importable(module: str) -> str:
-    """Return the name by which a module is imported that a file calls src.* or baselines.*."""
-    return HOME + module if module.startswith(("src.", "baselines")) else module
 
 
 def _check_numbers(value: Any, path: Path) -> None:

@@ -65,7 +65,7 @@ class EvrealRule:
                 raise ValueError(f"data.{name} must be >= 0, got {getattr(self, name)}")
 
 
-class EventWindow(NamedTuple):
+class EvrealWindow(NamedTuple):
     """Events first .. last - 1 of a sequence, between `start_s` and `end_s`; the frame of the
     camera that is nearest to `time_s`, at which the network's frame counts."""
 
@@ -81,12 +81,12 @@ class ScoredFrame(NamedTuple):
     """A reconstruction (h, w) in [0, 1] and its scores; `window`: its number in the sequence."""
 
     window: int
-    given: EventWindow
+    given: EvrealWindow
     picture: Picture
     scores: dict[str, float]
 
 
-def cut_evreal_windows(sequence: EvrealSequence, rule: EvrealRule) -> Iterator[EventWindow]:
+def cut_evreal_windows(sequence: EvrealSequence, rule: EvrealRule) -> Iterator[EvrealWindow]:
     """Yield the windows of a sequence with frames."""
     t, frame_t = sequence.t, sequence.frame_t
     assert frame_t is not None and sequence.event_index is not None
@@ -95,12 +95,12 @@ def cut_evreal_windows(sequence: EvrealSequence, rule: EvrealRule) -> Iterator[E
         for k in range(len(frame_t) - 1):
             before = max(k - 1, 0)
             times = float(frame_t[before]), float(frame_t[k])
-            yield EventWindow(int(ends[before]), int(ends[k]), *times, times[1], k)
+            yield EvrealWindow(int(ends[before]), int(ends[k]), *times, times[1], k)
     elif rule.window == "events":
         for first in range(0, len(t) - rule.events_per_window + 1, rule.events_per_window):
             last = first + rule.events_per_window
             times = float(t[first]), float(t[last - 1])
-            yield EventWindow(first, last, *times, times[1], _nearest(frame_t, times[1]))
+            yield EvrealWindow(first, last, *times, times[1], _nearest(frame_t, times[1]))
     else:
         yield from _windows_of_one_length(t, frame_t, rule.window_s)
 
@@ -114,7 +114,7 @@ def _windows_of_one_length(t: np.ndarray, frame_t: np.ndarray, length: float) ->
             time = float(t[last - 1])
         else:
             time = float(t[first - 1]) + length if first else 0.0
-        yield EventWindow(first, last, begin, begin + length, time, _nearest(frame_t, time))
+        yield EvrealWindow(first, last, begin, begin + length, time, _nearest(frame_t, time))
         first = last
 
 
@@ -169,7 +169,7 @@ def score_sequence(
 
 
 def _reconstruct(
-    sequence: EvrealSequence, window: EventWindow, network: EventToVideoNetwork, state: Any,
+    sequence: EvrealSequence, window: EvrealWindow, network: EventToVideoNetwork, state: Any,
     rule: EvrealRule, bins: int, device: torch.device | str,
 ) -> tuple[Picture, Any]:  # fmt: skip
     """Return the frame at the end of a window, which is given in parts where they are wanted."""

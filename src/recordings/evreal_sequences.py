@@ -44,7 +44,7 @@ def _is_sequence(path: Path) -> bool:
     return path.suffix.lower() in FILES and not path.stem.endswith("_gt")  # MVSEC's depth
 
 
-def name_of(source: Path) -> str:
+def sequence_name(source: Path) -> str:
     """Return the name of a sequence: that of its folder, or of its file without the ending."""
     return source.resolve().name if source.is_dir() else source.stem
 
@@ -68,7 +68,7 @@ def open_as_evreal(source: Path, run: Path) -> Iterator[EvrealSequence]:
         raise ValueError(f"{path}: frames are {(height, width)}, the sensor {opened.size[::-1]}")
     opened = recording.open_recording(path, (width, height))
     with tempfile.TemporaryDirectory(dir=run, prefix=".sequence") as folder:
-        out = Path(folder) / name_of(source)
+        out = Path(folder) / sequence_name(source)
         event_writers.write_pieces(
             out, opened, width=width, height=height, layout="evreal", frames=frames
         )

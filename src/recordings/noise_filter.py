@@ -1,11 +1,15 @@
 """Events that no neighbour supports: background activity (Delbruck 2008) and hot pixels."""
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
+from jaxtyping import Bool
 
 from src.recordings.engines.event_passes import LONG_AGO_US, find_supported
 from src.recordings.views import Size
+
+SUPPORT_S = 0.005  # of `find_supported_pixels`
 
 
 class NoiseFilter:
@@ -31,3 +35,11 @@ class NoiseFilter:
         kept = np.empty(len(events), bool)
         find_supported(events["t"], events["x"], events["y"], self.latest_us, self.support_us, kept)
         return events[kept]
+
+
+def find_supported_pixels(pieces: Iterable[np.ndarray], sensor: Size) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels that had an event a NoiseFilter of SUPPORT_S keeps."""
+    has_events, keep = np.zeros(sensor, bool), NoiseFilter(sensor, SUPPORT_S)
+    for kept in map(keep, pieces):
+        has_events[kept["y"], kept["x"]] = True
+    return has_events

@@ -60,7 +60,7 @@ def open_video_writer(
             # HDF5's library crashes when it cannot write.
             if shutil.disk_usage(folder).free < LEAST_FREE_BYTES:
                 raise OSError(errno.ENOSPC, f"No space left for another frame in {folder}")
-            add(_round_codes(frame.picture), frame)
+            add(round_codes(frame.picture), frame)
             table.writerow([frames, f"{frame.time_s:.6f}", frame.events, frame.outside])
             frames += 1
 
@@ -96,7 +96,7 @@ def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> i
             for frame in chain([first], given):
                 if frame.shape != first.shape:
                     raise ValueError(f"frames must be of one size {first.shape}, got {frame.shape}")
-                add(_round_codes(frame), None)
+                add(round_codes(frame), None)
                 count += 1
         _check_mp4(partial, count)
         os.replace(partial, path)
@@ -105,7 +105,8 @@ def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> i
     return count
 
 
-def _round_codes(picture: np.ndarray) -> Picture:
+def round_codes(picture: np.ndarray) -> UInt8[np.ndarray, "*shape"]:
+    """Return code values, floats in [0, 1] or uint8, as uint8."""
     if picture.dtype == np.uint8:
         return picture
     return (np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)

@@ -18,10 +18,10 @@ from typing import Any
 import cv2
 import h5py
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from src.recordings.output import round_codes
 from src.recordings.views import Views
 from src.records.atomic import atomic_path
 
@@ -47,8 +47,8 @@ class TruthWriter:
     ) -> None:  # fmt: skip
         """Write the next frames: code values in [0, 1] and pixels."""
         at = slice(self.written, self.written + len(clean))
-        self.file["clean"][at] = round_codes(clean)
-        self.file["views"][:, at] = round_codes(views)
+        self.file["clean"][at] = round_codes(clean.numpy())
+        self.file["views"][:, at] = round_codes(views.numpy())
         self.file["tilt"][:, at] = round_tilt(tilt)
         self.written = at.stop
 
@@ -69,11 +69,6 @@ def open_truth(
         yield TruthWriter(file, len(views.positions), frames, views.model)
 
 
-def round_codes(values: Float[Tensor, "*shape"]) -> np.ndarray:
-    """Return code values in [0, 1] as uint8."""
-    return (values.clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
-
-
 def round_tilt(tilt: Float[Tensor, "*shape"]) -> np.ndarray:
     """Return pixels as float16, rounded to 1/32, so that they pack well."""
     return ((tilt * TILT_STEPS_PER_PX).round() / TILT_STEPS_PER_PX).half().numpy()
@@ -86,7 +81,7 @@ class CleanClip:
     frames: UInt8[np.ndarray, "frames h w"]
     times_s: Float[np.ndarray, " frames"]
 
-    def at(self, time_s: float, size: tuple[int, ...]) -> Float[np.ndarray, "h w"]:
+    def frame_at(self, time_s: float, size: tuple[int, ...]) -> Float[np.ndarray, "h w"]:
         """Return the frame nearest to `time_s`, in [0, 1], brought to `size` (h, w)."""
         frame = self.frames[int(np.abs(self.times_s - time_s).argmin())].astype(np.float32) / 255
         if frame.shape == size[:2]:

@@ -1,13 +1,18 @@
 """One network on the test clips: scores per clip, cost and latency."""
 
+from collections.abc import Sequence
+
 import lightning
 import torch
+from jaxtyping import Float
 from lightning.pytorch.utilities.exceptions import SIGTERMException
+from torch import Tensor
 
 from src.deploy.cost import count_macs, macs_per_frame, select_timing_clock, time_frame
 from src.metrics.video_metrics import VideoMetrics
 from src.models.network import EventToVideoNetwork, VideoMethod
 from src.records.results import ScoreRow
+from src.sim.optics import Position
 from src.sim.pipeline import Sample
 from src.training.datamodule import LightFieldData
 from src.training.reconstructor import Reconstructor
@@ -45,16 +50,25 @@ def measure_cost(network: VideoMethod, sample: Sample) -> tuple[int, float]:
     network.eval()
     positions, threads = sample.positions, torch.get_num_threads()
     if isinstance(network, EventToVideoNetwork):
-        views, bins, height, width = sample.voxels.shape[2:]
-        macs = macs_per_frame(network, height, width, views=views, bins=bins, positions=positions)
         device = next((parameter.device for parameter in network.parameters()), torch.device("cpu"))
-        window = sample.voxels[:1, 0].to(device)
-        timing = time_frame(
-            network, window, positions=positions, threads=threads, seconds=0.0, min_frames=5
-        )
-        return macs, timing.median_ms
+        return measure_frame_cost(network, sample.voxels[:1, 0].to(device), positions)
     now = select_timing_clock(threads, sample.voxels.device)
     frames, start = sample.target.shape[:2].numel(), now()
     network.reconstruct_clip(sample)
     seconds = now() - start
     return count_macs(lambda: network.reconstruct_clip(sample)) // frames, 1e3 * seconds / frames
+
+
+@torch.no_grad()
+def measure_frame_cost(
+    network: EventToVideoNetwork, window: Float[Tensor, "1 views bins h w"],
+    positions: Sequence[Position] | None = None,
+) -> tuple[int, float]:  # fmt: skip
+    """Return multiply-accumulates and milliseconds of the frame of a `window`, on its device."""
+    views, bins, height, width = window.shape[1:]
+    macs = macs_per_frame(network, height, width, views=views, bins=bins, positions=positions)
+    timing = time_frame(
+        network, window, positions=positions, threads=torch.get_num_threads(), seconds=0.0,
+        min_frames=5,
+    )  # fmt: skip
+    return macs, timing.median_ms

@@ -15,7 +15,7 @@ SMALL = ["scene.height=64", "scene.width=64", "data.test_windows=2", "data.test_
 @pytest.mark.parametrize("choice", ["none", "weak", "medium", "strong", "mixed"])
 def test_every_setting_of_turbulence_can_be_set_whatever_its_strength(choice, tmp_path):
     settings = ["turbulence.tolerance=0.5", "turbulence.temporal_model=frozen_flow"]
-    cfg = config("simulate", tmp_path, f"turbulence={choice}", *settings, *SMALL)
+    cfg = config("simulate", tmp_path, f"turbulence={choice}", "fps=120", *settings, *SMALL)
     assert len(simulate(build.build_pipeline(cfg, "test"), [0]).parameters) == 1
 
 
@@ -66,6 +66,7 @@ def test_trainings_of_several_seeds_are_tested_on_the_same_clips(tmp_path):
 
 @pytest.mark.parametrize("entry_point", ["eval", "chart", "stress", "simulate", "calibrate"])
 def test_without_a_training_the_seed_is_that_of_the_test_clips(entry_point, tmp_path):
-    task = ["task=threshold", "fps=120"] if entry_point == "calibrate" else []
-    one, other = (drawn(entry_point, tmp_path, "test", f"seed={seed}", *task) for seed in (0, 1))
+    needed = {"calibrate": ["task=threshold", "fps=120"], "simulate": ["fps=120"]}
+    given = needed.get(entry_point, [])
+    one, other = (drawn(entry_point, tmp_path, "test", f"seed={seed}", *given) for seed in (0, 1))
     assert not same(one, other)

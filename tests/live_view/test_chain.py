@@ -129,6 +129,18 @@ def test_a_camera_is_read_and_looked_for_again_when_it_is_lost(monkeypatch):
     assert faults.current() == []
 
 
+def test_an_empty_packet_of_a_camera_does_not_start_a_recording_anew(monkeypatch):
+    class Quiet(FaeryCamera):
+        def __iter__(self):
+            yield np.zeros(0, faery.EVENTS_DTYPE)
+            yield from super().__iter__()
+
+    monkeypatch.setattr(faery, "events_stream_from_camera", Quiet)
+    feed = event_feeds.open_feed("camera://", None, FaultLog())
+    events, _ = next(feed.iter_event_chunks(threading.Event()))
+    assert len(events) == 5
+
+
 def test_no_camera_says_what_to_install():
     with pytest.raises(ValueError, match="pip install event-camera-drivers neuromorphic-drivers"):
         event_feeds.open_feed("camera://", None, FaultLog())

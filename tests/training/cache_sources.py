@@ -85,6 +85,8 @@ def fill_for_ever(told: str) -> None:
 
     def store(*_) -> None:
         pids = [str(process.pid) for process in multiprocessing.active_children()]
-        Path(told).write_text(" ".join(pids) + ".")
+        part = Path(told + ".part")  # renamed, so that nobody reads half of it
+        part.write_text(" ".join(pids))
+        part.rename(told)
 
     fill(source(), range(10**6), store, device="cpu", workers=2)

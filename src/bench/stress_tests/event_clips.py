@@ -6,6 +6,7 @@ A clip is simulated once under its `ClipConditions`: turbulence, sensor, motion,
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import accumulate
 from statistics import fmean
 from typing import Any, TypeVar
@@ -181,10 +182,13 @@ class StressBench:
 
     def clips(self, conditions: ClipConditions = ClipConditions()) -> list[EventClip]:
         """Return the clips under `conditions`; each is simulated once."""
-        name = repr(conditions)
+        simulate = partial(simulate_event_clip, self.pipeline, conditions=conditions)
+        return self.simulate_once(repr(conditions), simulate)
+
+    def simulate_once(self, name: str, simulate: Callable[[int], EventClip]) -> list[EventClip]:
+        """Return the clips that `simulate` makes of the indices; made once for a `name`."""
         if name not in self._clips:
-            clips = [simulate_event_clip(self.pipeline, n, conditions) for n in self.indices]
-            self._clips[name] = clips
+            self._clips[name] = [simulate(index) for index in self.indices]
         return self._clips[name]
 
     def psnr(

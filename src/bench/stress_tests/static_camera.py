@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,10 @@ from src.bench.candidates import Candidate
 from src.bench.stress_tests.event_clips import EventClip, StressBench, require_type
 from src.bench.stress_tests.stress_results import StressResult
 from src.metrics.invented_contrast import find_unseen, invented_contrast
-from src.recordings.noise_filter import NoiseFilter
+from src.recordings.noise_filter import find_supported_pixels
 from src.sim.optics import layout
 from src.sim.scenes.photographs import Photographs
 from src.sim.sensor import EventSensor
-
-SUPPORT_S = 0.005  # of NoiseFilter: what is noise reveals nothing
 
 
 def measure_invented_contrast(
@@ -27,23 +26,22 @@ def measure_invented_contrast(
     `sizes`: (height, width) of the sensor, easy to hard; `windows`: of the clip; `sensor`: replaced
     arguments of EventSensor, such as its noise.  A network of any number of views is given one.
     """
-    curve = []
+    curve, views = [], network.loaded.views or 1
     for height, width in sizes:
-        shares = [
-            _invented_contrast(
-                network, _clip(network, bench, index, (height, width), windows, sensor)
-            )
-            for index in bench.indices
-        ]
+        conditions = (height, width), windows, views, tuple((sensor or {}).items())
+        simulate = partial(_simulate_clip, bench, *conditions)
+        clips = bench.simulate_once(f"static camera {conditions}", simulate)
+        shares = [_invented_contrast(network, clip) for clip in clips]
         curve.append((f"{width}x{height}", float(np.nanmean(shares))))
     worst = max(value for _, value in curve)
     return StressResult(worst, "", limit_share, curve, "sensor")
 
 
-def _clip(
-    network: Candidate, bench: StressBench, index: int, size: tuple[int, int], windows: int,
-    changes: Mapping[str, Any] | None,
+def _simulate_clip(
+    bench: StressBench, size: tuple[int, int], windows: int, views: int,
+    changes: tuple[tuple[str, Any], ...], index: int,
 ) -> EventClip:  # fmt: skip
+    """Return clip `index` of the bench's photographs behind small things that move."""
     own = require_type("scene", bench.pipeline.scene, Photographs)
     height, width = size
     scene = replace(
@@ -53,17 +51,13 @@ def _clip(
     clip = scene.clip(index)
     plain = require_type("sensor", bench.pipeline.sensor, EventSensor)
     threshold = bench.pipeline.draw(index).sensor.threshold
-    sensor = replace(plain, **{"threshold": threshold, **(changes or {})})
-    places = layout(network.loaded.views or 1)
-    events = [sensor.events(clip.frames, clip.fps, clip=index, view=k) for k in range(len(places))]
-    return EventClip(events, clip.frames, clip.frames, clip.fps, places)
+    sensor = replace(plain, **({"threshold": threshold} | dict(changes)))
+    events = [sensor.events(clip.frames, clip.fps, clip=index, view=k) for k in range(views)]
+    return EventClip(events, clip.frames, clip.frames, clip.fps, layout(views))
 
 
 def _invented_contrast(network: Candidate, clip: EventClip) -> float:
     height, width = clip.target.shape[-2:]
-    has_events = np.zeros((height, width), bool)
-    for events in clip.events:
-        kept = NoiseFilter((height, width), SUPPORT_S)(events)
-        has_events[kept["y"], kept["x"]] = True
+    seen = [find_supported_pixels([events], (height, width)) for events in clip.events]
     frames, _ = clip.reconstruct(replace(network, views=len(clip.positions)))
-    return invented_contrast(frames[-1, 0].numpy(), find_unseen(has_events))
+    return invented_contrast(frames[-1, 0].numpy(), find_unseen(np.any(seen, axis=0)))

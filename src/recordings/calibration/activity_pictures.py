@@ -70,8 +70,8 @@ def describe_structure(
     neighbours, a hot one, counts as three times their median."""
 
     def describe(picture: np.ndarray) -> np.ndarray:
-        calm = np.log1p(np.minimum(picture, 3 + 3 * cv2.medianBlur(picture, 5)))
-        fine, coarse = (cv2.GaussianBlur(calm, (0, 0), sigma) for sigma in (fine_px, coarse_px))
+        capped = np.log1p(np.minimum(picture, 3 + 3 * cv2.medianBlur(picture, 5)))
+        fine, coarse = (cv2.GaussianBlur(capped, (0, 0), sigma) for sigma in (fine_px, coarse_px))
         return fine - coarse
 
     return np.stack([describe(picture) for picture in pictures])

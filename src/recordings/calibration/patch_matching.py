@@ -5,15 +5,16 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
+from src.recordings.calibration.view_alignment import Rectangle
+
 MIN_LIKENESS = 0.4  # normalised correlation of a patch and its counterpart
 MIN_STRENGTH = 0.1  # of the structure that the strongest tenth of the places have
 MIN_ROUNDNESS = 0.08  # of the weaker to the stronger direction: along a straight edge all is alike
 Stack = Float[np.ndarray, "n h w"]
 Pixels = Int[np.ndarray, "places 2"]
-Tile = tuple[float, float, float, float]  # left, top, right, bottom
 
 
-def choose_places(pictures: Stack, tile: Tile, half: int) -> Pixels:
+def choose_places(pictures: Stack, tile: Rectangle, half: int) -> Pixels:
     """Return the (x, y) of patches of 2 `half` + 1 pixels in `tile`, half overlapping, that have
     structure in two directions."""
     low = np.maximum(tile[:2], 0) + half

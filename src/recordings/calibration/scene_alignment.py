@@ -12,11 +12,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
 
-from src.recordings.calibration.activity_pictures import Pictures, describe_structure
+from src.recordings.calibration.activity_pictures import (
+    Pictures,
+    describe_structure,
+    shrink_pictures,
+)
 from src.recordings.calibration.boards import Points
-from src.recordings.calibration.patch_matching import Tile, choose_places, find_patches
-from src.recordings.calibration.view_alignment import AlignedViews, cut_field
-from src.recordings.calibration.view_grid import find_grid, shrink_pictures
+from src.recordings.calibration.patch_matching import choose_places, find_patches
+from src.recordings.calibration.view_alignment import AlignedViews, Rectangle, cut_field
+from src.recordings.calibration.view_grid import find_grid
 from src.recordings.views import Size, View, Views
 from src.sim.optics import Position
 
@@ -32,7 +36,7 @@ Homographies = Mapping[Position, Matrix]
 
 
 @dataclass(frozen=True)
-class Scene:
+class SceneTarget:
     """Any scene that all views show, instead of a board.
 
     A place counts as matched where it is found within `error_px` of where the homography puts it;
@@ -50,7 +54,7 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Match:
+class ViewMatches:
     """Places of the centre view `at` which another view shows them, in its own pixels, and the
     `offset` from where its homography says, in pixels of the centre view; NaN where not found."""
 
@@ -69,9 +73,9 @@ class Match:
 
 @dataclass(frozen=True)
 class SceneAlignment:
-    """`aligned`: the views, and their points within Scene's `error_px`.  `matched`: these points'
-    share of the places with structure.  `held_out_px`: the median distance at places of every
-    second window from a fit to the others; empty for a recording of one window."""
+    """`aligned`: the views, and their points within SceneTarget's `error_px`.  `matched`: these
+    points' share of the places with structure.  `held_out_px`: the median distance at places of
+    every second window from a fit to the others; empty for a recording of one window."""
 
     aligned: AlignedViews
     matched: Mapping[Position, float]
@@ -93,7 +97,7 @@ class ScaledPictures:
     the centre view's `tile`.  Raises ValueError for fewer than MIN_PLACES.
     """
 
-    def __init__(self, pictures: Pictures, tile: Tile, scale: int = 1):
+    def __init__(self, pictures: Pictures, tile: Rectangle, scale: int = 1):
         groups = np.array_split(pictures, min(GROUPS, len(pictures)))
         joined = np.stack([group.sum(0) for group in groups])
         self.structure = describe_structure(shrink_pictures(joined, scale), 1.2, 8.0)
@@ -106,7 +110,7 @@ class ScaledPictures:
         middle = (scale - 1) / 2
         self.to_full = np.array([[scale, 0, middle], [0, scale, middle], [0, 0, 1.0]])
 
-    def match(self, matrix: Matrix, reach: int) -> Match:
+    def match(self, matrix: Matrix, reach: int) -> ViewMatches:
         """Look for the places in the view that `matrix` maps to the centre one, up to `reach` off
         along x and y, in pixels of these pictures."""
         small = np.linalg.inv(self.to_full) @ matrix @ self.to_full
@@ -115,10 +119,10 @@ class ScaledPictures:
         offset = find_patches(self.structure, view, self.places, self.half, reach)
         placed = self.places.astype(np.float64)
         places, moved = (_apply(self.to_full, each) for each in (placed, placed + offset))
-        return Match(places, _apply(np.linalg.inv(matrix), moved), moved - places)
+        return ViewMatches(places, _apply(np.linalg.inv(matrix), moved), moved - places)
 
 
-def align_scene(pictures: Pictures, scene: Scene, model: Size) -> SceneAlignment:
+def align_scene(pictures: Pictures, scene: SceneTarget, model: Size) -> SceneAlignment:
     """Find the views in pictures of a recording's windows and fit their homographies.
 
     Raises ValueError where no views repeat, the centre one shows too little or another does not
@@ -141,7 +145,7 @@ def align_scene(pictures: Pictures, scene: Scene, model: Size) -> SceneAlignment
     return SceneAlignment(AlignedViews(views, points, residuals), matched, held_out)
 
 
-def fit_homography(position: Position, match: Match, tile: Tile) -> Matrix:
+def fit_homography(position: Position, match: ViewMatches, tile: Rectangle) -> Matrix:
     """Fit the homography of a view to the places found, robustly: an affine map by RANSAC, then the
     four corners of `tile` by least squares.  Raises ValueError for fewer than MIN_FOUND places."""
     at, places = match.at[match.found], match.places[match.found]
@@ -166,7 +170,7 @@ def fit_homography(position: Position, match: Match, tile: Tile) -> Matrix:
 
 
 def _fit_views(
-    pictures: ScaledPictures, start: Homographies, tile: Tile, reach: int
+    pictures: ScaledPictures, start: Homographies, tile: Rectangle, reach: int
 ) -> dict[Position, Matrix]:
     """Return the homographies of one round of search; the centre view keeps its own."""
     return {
@@ -176,26 +180,26 @@ def _fit_views(
 
 
 def _refine(
-    pictures: ScaledPictures, start: Homographies, tile: Tile
-) -> tuple[dict[Position, Matrix], dict[Position, Match]]:
+    pictures: ScaledPictures, start: Homographies, tile: Rectangle
+) -> tuple[dict[Position, Matrix], dict[Position, ViewMatches]]:
     """Return the homographies after two more rounds, and what the places say of them."""
     once = _fit_views(pictures, start, tile, REACH_PX)
     matrices = _fit_views(pictures, once, tile, REACH_PX)
     return matrices, _match_views(pictures, matrices)
 
 
-def _match_views(pictures: ScaledPictures, matrices: Homographies) -> dict[Position, Match]:
+def _match_views(pictures: ScaledPictures, matrices: Homographies) -> dict[Position, ViewMatches]:
     return {at: pictures.match(matrix, REACH_PX) for at, matrix in matrices.items()}
 
 
-def _hold_out(pictures: Pictures, start: Homographies, tile: Tile) -> dict[Position, float]:
+def _hold_out(pictures: Pictures, start: Homographies, tile: Rectangle) -> dict[Position, float]:
     """Fit to every second window, and return the median distance found in the others."""
     matrices, _ = _refine(ScaledPictures(pictures[::2], tile), start, tile)
     matches = _match_views(ScaledPictures(pictures[1::2], tile), matrices)
     return {at: float(np.median(m.distance_px[m.found])) for at, m in matches.items()}
 
 
-def _check_matched(matched: Mapping[Position, float], scene: Scene) -> None:
+def _check_matched(matched: Mapping[Position, float], scene: SceneTarget) -> None:
     worst = min(matched, key=lambda at: matched[at])
     if matched[worst] < scene.min_matched:
         raise ValueError(
@@ -206,7 +210,7 @@ def _check_matched(matched: Mapping[Position, float], scene: Scene) -> None:
 
 
 def _build_views(
-    matrices: Homographies, residuals: Mapping[Position, Points], tile: Tile, sensor: Size,
+    matrices: Homographies, residuals: Mapping[Position, Points], tile: Rectangle, sensor: Size,
     model: Size,
 ) -> Views:  # fmt: skip
     views = []
@@ -216,7 +220,7 @@ def _build_views(
     return Views(sensor, model, cut_field(_between_seams(matrices, tile), model), tuple(views))
 
 
-def _between_seams(matrices: Homographies, tile: Tile) -> Tile:
+def _between_seams(matrices: Homographies, tile: Rectangle) -> Rectangle:
     """Return where the centre view begins and ends: a seam lies half way between a pixel and its
     mirror image; a side without a neighbour is as far from the other as in the grid."""
     edges, known = list(tile), []
@@ -235,7 +239,7 @@ def _between_seams(matrices: Homographies, tile: Tile) -> Tile:
     return left, top, right, bottom
 
 
-def _normalise(tile: Tile) -> Matrix:
+def _normalise(tile: Rectangle) -> Matrix:
     """Return the map of `tile` to -1..1."""
     left, top, right, bottom = tile
     a, b = 2 / (right - left), 2 / (bottom - top)

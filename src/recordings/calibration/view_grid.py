@@ -23,7 +23,7 @@ Gram = Float[np.ndarray, "n n"]
 
 
 @dataclass(frozen=True)
-class Axis:
+class ViewAxis:
     """Views along x or y, in pixels: the first begins at `start`, each is `pitch` long, `count` are
     whole.
 
@@ -36,14 +36,14 @@ class Axis:
     score: float
 
     @property
-    def centre(self) -> int:
+    def centre_index(self) -> int:
         """Index of the centre view; of an even number the one before the middle."""
         return (self.count - 1) // 2
 
     @property
     def tile(self) -> tuple[float, float]:
         """Where the centre view begins and ends."""
-        begin = self.start + self.centre * self.pitch
+        begin = self.start + self.centre_index * self.pitch
         return begin, begin + self.pitch
 
     def mirror(self, offset: int) -> tuple[float, float]:
@@ -56,16 +56,16 @@ class Axis:
 
 
 @dataclass(frozen=True)
-class Grid:
+class ViewGrid:
     """The whole views of a sensor: `x` and `y` are the axes of columns and of rows."""
 
-    x: Axis
-    y: Axis
+    x: ViewAxis
+    y: ViewAxis
 
     @property
     def positions(self) -> list[Position]:
         """(row, col) from the centre view, row by row."""
-        rows, cols = (range(-a.centre, a.count - a.centre) for a in (self.y, self.x))
+        rows, cols = (range(-a.centre_index, a.count - a.centre_index) for a in (self.y, self.x))
         return [(row, col) for row in rows for col in cols]
 
     @property
@@ -80,7 +80,7 @@ class Grid:
         return np.array([[a, 0, b], [0, c, d], [0, 0, 1]])
 
 
-def find_grid(pictures: Float[np.ndarray, "*windows h w"]) -> Grid:
+def find_grid(pictures: Float[np.ndarray, "*windows h w"]) -> ViewGrid:
     """Find the views of a sensor in pictures of what it saw.
 
     Raises ValueError where neither columns nor rows of views repeat.
@@ -100,7 +100,7 @@ def find_grid(pictures: Float[np.ndarray, "*windows h w"]) -> Grid:
     elif x.count == 1:
         x = _one_view(small.transpose(0, 2, 1), y, x.score)
     in_pixels = (replace(a, start=a.start * step - 0.5, pitch=a.pitch * step) for a in (x, y))
-    return Grid(*in_pixels)
+    return ViewGrid(*in_pixels)
 
 
 def _level(pictures: Float[np.ndarray, "n h w"]) -> Float[np.ndarray, "n h w"]:
@@ -109,7 +109,7 @@ def _level(pictures: Float[np.ndarray, "n h w"]) -> Float[np.ndarray, "n h w"]:
     return pictures / (np.stack(contrast) + pictures.std((1, 2), keepdims=True) + 1e-9)
 
 
-def find_axis(gram: Gram) -> Axis:
+def find_axis(gram: Gram) -> ViewAxis:
     """Find the views along an axis from the products of its lines; one view where none repeats."""
     n, total = len(gram), max(float(np.trace(gram)), 1e-9)
     pitches = np.arange(max(n / MAX_VIEWS, 8), n / 2 / WHOLE, 0.5)
@@ -119,7 +119,7 @@ def find_axis(gram: Gram) -> Axis:
     possible = np.array([_shared(np.outer(size, size), *fold).sum() for fold in tried])
     best = int(np.argmax(shared * np.abs(shared) / np.maximum(possible, 1e-9)))  # many and alike
     axis = _whole_views(gram, *tried[best], score=float(shared[best]) / total)
-    return axis if axis.score >= MIN_SCORE and axis.count > 1 else Axis(0.0, n, 1, axis.score)
+    return axis if axis.score >= MIN_SCORE and axis.count > 1 else ViewAxis(0.0, n, 1, axis.score)
 
 
 def _fold_lines(n: int, seam: float, pitch: float) -> Int[np.ndarray, "views lines"]:
@@ -137,7 +137,7 @@ def _shared(gram: Gram, seam: float, pitch: float) -> Float[np.ndarray, "pairs l
     return gram[one, other] * ((one >= 0) & (other >= 0))
 
 
-def _whole_views(gram: Gram, seam: float, pitch: float, score: float) -> Axis:
+def _whole_views(gram: Gram, seam: float, pitch: float, score: float) -> ViewAxis:
     """Return the axis of the views that are like a neighbour and lie on the sensor."""
     lines, shared = _fold_lines(len(gram), seam, pitch), _shared(gram, seam, pitch)
     energy = np.where(lines >= 0, np.diag(gram)[lines], 0)
@@ -149,11 +149,11 @@ def _whole_views(gram: Gram, seam: float, pitch: float, score: float) -> Axis:
         middle = start + (only + 1) * pitch
         reach = _reach(np.abs(lines[only] + 0.5 - middle), shared[only])
         reach = min(reach, middle, len(gram) - middle)
-        return Axis(float(middle - reach), float(reach), 2, score)
+        return ViewAxis(float(middle - reach), float(reach), 2, score)
     like = np.append(pairs, False) | np.insert(pairs, 0, False)
     kept = np.flatnonzero(like & ((lines >= 0).mean(1) >= WHOLE))
     first, last = (kept[0], kept[-1]) if len(kept) else (0, 0)
-    return Axis(float(start + first * pitch), float(pitch), int(last - first) + 1, score)
+    return ViewAxis(float(start + first * pitch), float(pitch), int(last - first) + 1, score)
 
 
 def _reach(distance: Float[np.ndarray, " n"], shared: Float[np.ndarray, " n"]) -> float:
@@ -163,7 +163,7 @@ def _reach(distance: Float[np.ndarray, " n"], shared: Float[np.ndarray, " n"]) -
     return 1.05 * float(distance[order][np.searchsorted(total, 0.99 * total[-1])])
 
 
-def _one_view(pictures: Float[np.ndarray, "n h w"], across: Axis, score: float) -> Axis:
+def _one_view(pictures: Float[np.ndarray, "n h w"], across: ViewAxis, score: float) -> ViewAxis:
     """Return the axis of one row of views, as long as what neighbours in it share."""
     lines = _fold_lines(pictures.shape[2], across.start, across.pitch)
     folded = pictures[:, :, lines] * (lines >= 0)
@@ -171,4 +171,4 @@ def _one_view(pictures: Float[np.ndarray, "n h w"], across: Axis, score: float) 
     first, last = (int(np.argmax(total >= share * total[-1])) for share in (0.01, 0.99))
     more = (last + 1 - first) / 20
     begin, end = max(0.0, first - more), min(float(len(total)), last + 1 + more)
-    return Axis(begin, end - begin, 1, score)
+    return ViewAxis(begin, end - begin, 1, score)

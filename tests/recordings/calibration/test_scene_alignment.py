@@ -7,7 +7,7 @@ import torch
 
 from src.recordings import simulated_recording
 from src.recordings.calibration import activity_pictures, view_grid
-from src.recordings.calibration.scene_alignment import Scene, align_scene
+from src.recordings.calibration.scene_alignment import SceneTarget, align_scene
 from src.recordings.files.event_writers import write_events
 from src.sim.optics import layout
 from src.sim.sensor.sensor import EventSensor
@@ -57,7 +57,7 @@ def test_any_scene_finds_the_views_of_a_kaleidoscope(views, tmp_path):
     path = tmp_path / "scene.raw"
     truth = record(path, layout(views), [moving_scene()], key=views)
     pictures = activity_pictures.read_activity_pictures(path)
-    found = align_scene(pictures, Scene(), (88, 88))
+    found = align_scene(pictures, SceneTarget(), (88, 88))
     there = found.aligned.views
     assert there.positions == list(layout(views))
     assert max(distance_px(there, truth).values()) < 0.3
@@ -83,7 +83,7 @@ def test_a_folder_of_frames_finds_them_too(tmp_path):
     assert (
         pictures.shape == (3, 1, 352, 364) and abs(pictures[1, 0] - 255 * seen[1].numpy()).max() < 1
     )
-    there = align_scene(pictures, Scene(), (88, 88)).aligned.views
+    there = align_scene(pictures, SceneTarget(), (88, 88)).aligned.views
     assert there.positions == list(layout(9))
     assert max(distance_px(there, truth).values()) < 0.5  # dark gaps at the seams disturb
 
@@ -95,15 +95,15 @@ def test_views_of_another_place_or_with_parallax_are_refused(tmp_path):
     record(path, layout(9), films)
     pictures = activity_pictures.read_activity_pictures(path)
     with pytest.raises(ValueError, match=r"view \(1, 1\) (matches at|shows)"):
-        align_scene(pictures, Scene(), (88, 88))
+        align_scene(pictures, SceneTarget(), (88, 88))
 
 
 def test_a_scene_without_repetition_or_events_is_refused():
     once = np.stack([texture(k, 256) for k in range(2)])[:, None] * 50
     with pytest.raises(ValueError, match="must show mirrored views side by side"):
-        align_scene(once, Scene(), (88, 88))
+        align_scene(once, SceneTarget(), (88, 88))
     with pytest.raises(ValueError, match=r"share 0\.00 of what they show"):
-        align_scene(np.zeros((1, 2, 90, 120), np.float32), Scene(), (88, 88))
+        align_scene(np.zeros((1, 2, 90, 120), np.float32), SceneTarget(), (88, 88))
 
 
 def test_the_views_at_the_borders_are_left_out():
@@ -128,4 +128,4 @@ def test_windows_share_a_recording_of_any_length():
 def test_a_setting_out_of_range_is_refused(wrong):
     (name,) = wrong
     with pytest.raises(ValueError, match=rf"target\.{name} must be in"):
-        Scene(**wrong)
+        SceneTarget(**wrong)

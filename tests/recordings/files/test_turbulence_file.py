@@ -136,7 +136,7 @@ SMALL = ["scene.height=64", "scene.width=64", "data.test_windows=2", "data.test_
 
 def test_turbulence_measured_simulates(tmp_path):
     path = site(tmp_path / "air.yaml")
-    chosen = ["turbulence=measured", f"turbulence.measured={path}", *SMALL]
+    chosen = ["turbulence=measured", f"turbulence.measured={path}", "fps=120", *SMALL]
     pipeline = build.build_pipeline(config("simulate", tmp_path, *chosen), "test")
     assert isinstance(pipeline.turbulence, SimulatedTurbulence)
     (drawn,) = simulate(pipeline, [0]).parameters
