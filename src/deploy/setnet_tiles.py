@@ -22,18 +22,17 @@ from src.deploy.setnet_clock import (
 from src.deploy.setnet_context import CONTEXT_TILE, ContextTiles, WholeContext
 from src.deploy.setnet_layers import DecoderLayers, MemoryLayers, WholeDecoder, WholeWindow
 from src.deploy.tile_batches import Backend, TileModule
-from src.models.setnet import BACKGROUND, CELL_PX, REVEALING_EVENTS, SetNet
+from src.models.setnet import BACKGROUND, BACKGROUND_CELLS, CELL_PX, REVEALING_EVENTS, SetNet
 from src.sim.optics import Position
 
 BATCHES = 32, 128  # sizes of batches, in tiles
 # Share of the frame in tiles from which on all of it is computed at once, which takes no longer.
 WHOLE_MEMORY, WHOLE_CONTEXT, WHOLE_DECODER = 0.3, 0.25, 0.6
-BLEND = np.float32(REVEALING_EVENTS), np.float32(BACKGROUND)  # of pixels, as SetNet does
 
 
 class TileState:
-    """What lives from window to window, advanced in place: maps (rows, columns, channels) and the
-    frame (h, w)."""
+    """What lives from window to window, advanced in place: maps (rows, columns, channels), pixels
+    and the frame (h, w)."""
 
     def __init__(self, network: SetNet, height: int, width: int):
         rows, columns = height // CELL_PX, width // CELL_PX
@@ -41,7 +40,22 @@ class TileState:
         self.hidden, self.spare_hidden = _zeros(hidden), _zeros(hidden)
         self.smoothed, self.levels = _zeros(context), len(network.context.downs)
         self.hold(_zeros(context), *map(_zeros, network.context.map_sizes(rows, columns)))
+        self.revealed = np.zeros((rows, columns), np.float32)  # how far cells are, in [0, 1]
+        self.light = np.zeros((height, width), np.float32)  # of pixels, times that
+        self.totals = np.zeros(2)  # of `revealed`, and of `light` in cells
         self.frame = np.full((height, width), BACKGROUND, np.float32)
+
+    def write_pixels(self, pixels: np.ndarray, corners: np.ndarray, evidence: np.ndarray) -> None:
+        """Write tiles of pixels into `light`; `add_background` writes `frame`."""
+        shown = self.revealed, self.light, self.totals
+        half = np.float32(REVEALING_EVENTS)
+        tiles_numba.write_pixels(pixels, corners, evidence, half, *shown)
+
+    def add_background(self) -> None:
+        """Bring `frame` up to date, as models.setnet.blend_background does."""
+        cells, light = self.totals + (BACKGROUND_CELLS, BACKGROUND_CELLS * BACKGROUND)
+        background = np.float32(light / cells)
+        tiles_numba.add_background(self.light, self.revealed, background, self.frame)
 
     def hold(self, context: np.ndarray, *held: np.ndarray) -> None:
         """Hold a context and maps in the order of ContextPyramid.map_sizes."""
@@ -109,6 +123,8 @@ class SetNetTiles:
             self.whole.draw(maps, clock.evidence)
         else:
             self._draw(tick.changed_tiles)
+        if is_most or len(tick.changed_tiles):
+            maps.add_background()
         return maps.frame
 
     def _smooth(self, tick: Tick) -> None:
@@ -154,7 +170,7 @@ class SetNetTiles:
 
         def write(part: slice, pixels: np.ndarray) -> None:
             corners = QUARTER * tiles[part]
-            tiles_numba.write_pixels(pixels, corners, evidence, *BLEND, state.frame)
+            state.write_pixels(pixels, corners, evidence)
 
         self.decoder.run(len(tiles), read, write)
 
@@ -198,14 +214,14 @@ class WholeFrame:
         maps.hold(*made)
 
     def draw(self, maps: TileState, evidence: np.ndarray) -> None:
-        """Draw the frame."""
+        """Draw the pixels."""
         self.decoder.run([maps.hidden[None], maps.smoothed[None]], [self.pixels])
         self.show(maps, evidence)
 
     def show(self, maps: TileState, evidence: np.ndarray) -> None:
-        """Write the frame that was drawn last."""
+        """Write the pixels that were drawn last."""
         corner = np.zeros((1, 2), np.int32)
-        tiles_numba.write_pixels(self.pixels, corner, evidence, *BLEND, maps.frame)
+        maps.write_pixels(self.pixels, corner, evidence)
 
 
 def _zeros(size: tuple[int, int, int]) -> Float[np.ndarray, "h w c"]:

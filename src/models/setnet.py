@@ -38,7 +38,8 @@ divided by k.  Right column: fields of SetNetState.
   rates.
 * A clock for each cell: it runs near events that others support, and by at most 4 ms in all after
   the last; then the cell's state is held.  Where much of the picture is active the camera moves,
-  and all clocks run.  What no event has revealed yet is BACKGROUND.
+  and all clocks run.
+* Background: what no event has revealed yet has one brightness, the mean of what events have.
 * Context: events lie at edges, so the brightness of a uniform area follows from edges that may be
   far; the pyramid provides the receptive field.  The context is updated at most 30 times a second
   and low-pass filtered, so that the frame does not change in steps.
@@ -90,7 +91,8 @@ STATIC_SHARE = 0.35  # of active cells, up to which the others stand still: a st
 MOVING_SHARE = 0.5  # from which on the clock of all cells advances: a moving camera
 REVEALING_EVENTS = 0.05  # supported events per cell so far, at which a frame is half the background
 REVEALING_S = 0.02  # the same in seconds of a moving camera
-BACKGROUND = 0.45  # brightness of what no event has revealed
+BACKGROUND = 0.45  # brightness of what no event has revealed, before anything is
+BACKGROUND_CELLS = 5  # revealed cells whose mean brightness has as much weight as BACKGROUND
 SETTLING = math.exp(-2)  # context recency above which the context of a cell is still smoothed
 CONTEXT_INTERVAL_S = 1 / 30  # shortest time between two context updates
 UPDATE_RECENCY = math.exp(-0.98)  # an update is due at or below it: 0.98 intervals, for rounding
@@ -170,6 +172,18 @@ def spread_evidence(supported: Float[Tensor, "m 1 h2 w2"]) -> Float[Tensor, "m 1
     for _ in range(REACH_CELLS):  # each with its own padding: ONNX Runtime takes no larger one
         spread = functional.avg_pool2d(functional.pad(spread, [2] * 4), 3, 1)
     return spread[..., REACH_CELLS:-REACH_CELLS, REACH_CELLS:-REACH_CELLS]
+
+
+def blend_background(
+    pixels: Float[Tensor, "m pixels h2 w2"], revealed: Float[Tensor, "m 1 h2 w2"]
+) -> Float[Tensor, "m pixels h2 w2"]:
+    """Return the pixels of each cell as far as it is `revealed`, in [0, 1], the rest of it with the
+    mean brightness of all that is revealed (BACKGROUND has the weight of BACKGROUND_CELLS cells).
+    """
+    cells = revealed.sum((2, 3), keepdim=True) + BACKGROUND_CELLS
+    light = (revealed * pixels.mean(1, keepdim=True)).sum((2, 3), keepdim=True)
+    background = (light + BACKGROUND_CELLS * BACKGROUND) / cells
+    return background + revealed * (pixels - background)
 
 
 class SetNet(EventToVideoNetwork):
@@ -280,7 +294,7 @@ class SetNet(EventToVideoNetwork):
             )
         revealed = evidence / (evidence + REVEALING_EVENTS)
         drawn = self.decode_logits(features, smoothed).sigmoid()
-        frames = functional.pixel_shuffle(BACKGROUND + revealed * (drawn - BACKGROUND), CELL_PX)
+        frames = functional.pixel_shuffle(blend_background(drawn, revealed), CELL_PX)
         frames = frames[..., top : top + height, left : left + width]
         frames = frames.unflatten(0, (-1, n)).transpose(0, 1)
         return frames, after._replace(

@@ -15,6 +15,7 @@ from src.models.network import MAX_WINDOWS, unroll
 from src.models.setnet import (
     ACTIVITY_TAU_S,
     BACKGROUND,
+    BACKGROUND_CELLS,
     CONTEXT_TAU_S,
     MIN_ACTIVITY,
     MIN_SUPPORT,
@@ -25,6 +26,7 @@ from src.models.setnet import (
     SetNet,
     SetNetState,
     TimeGatedMemory,
+    blend_background,
     smooth_context,
 )
 from src.sim.optics import layout
@@ -198,9 +200,23 @@ def test_what_a_still_camera_has_not_seen_is_exactly_the_background():
     # Evidence reaches as far as activity.
     known = far_from(*BLOCK, REACH_CELLS).repeat_interleave(2, 0).repeat_interleave(2, 1)
     unseen = frames[..., known]
-    assert torch.equal(unseen, torch.full_like(unseen, BACKGROUND))
-    assert bool((frames[0, -1, 0][~known] != BACKGROUND).all())
-    assert float((frames[0, -1, 0][~known] - BACKGROUND).abs().max()) > 0.01
+    background = unseen[..., :1]  # one value for a frame
+    assert torch.equal(unseen, background.expand_as(unseen))
+    revealed = frames[0, -1, 0][~known]
+    assert bool((revealed != background[0, -1, 0]).all())
+    assert float((revealed - background[0, -1, 0]).abs().max()) > 0.01
+
+
+def test_the_background_is_the_mean_of_what_is_revealed():
+    pixels, revealed = torch.rand(2, 4, 40, 40), torch.zeros(2, 1, 40, 40)
+    revealed[0, 0, 3:30, 5:20] = 1
+    bright, none = blend_background(pixels, revealed)
+    seen = pixels[0, :, 3:30, 5:20]
+    n = 27 * 15 + BACKGROUND_CELLS
+    expected = (27 * 15 * seen.mean() + BACKGROUND_CELLS * BACKGROUND) / n
+    torch.testing.assert_close(bright[:, 35:], expected.expand(4, 5, 40))
+    assert torch.equal(bright[:, 3:30, 5:20], seen)
+    torch.testing.assert_close(none, torch.full_like(none, BACKGROUND))
 
 
 @pytest.mark.parametrize(("cells", "is_moving"), [(11, False), (18, True)])

@@ -129,29 +129,49 @@ def smooth(context, corners, cells, kept, smoothed):
 
 
 @njit(nogil=True, cache=True)
-def write_pixels(tiles, corners, evidence, half, background, frame):
-    """Write tiles (n, t, t, pixels) of the pixels of 2 x 2 cells, row by row, into `frame`, more of
-    them and less of the `background` the more `evidence` a cell has, `half` for half of each;
-    `corners`: in 2 x 2 cells."""
+def write_pixels(tiles, corners, evidence, half, revealed, light, totals):
+    """Write tiles (n, t, t, pixels) of the pixels of 2 x 2 cells, row by row, into `light`, times
+    how far `evidence` has `revealed` their cell, `half` for half of it; `corners`: in 2 x 2 cells;
+    `totals` follow the sums of `revealed` and, in cells, of `light`."""
     side = 2 * CELL
-    squares_down, squares_across = len(frame) // side, frame.shape[1] // side
+    squares_down, squares_across = len(light) // side, light.shape[1] // side
     across, of, n = tiles.shape[2], tiles.reshape(-1), np.uint64(CELL)
     for i in range(len(corners)):
         r0, c0 = corners[i]
+        gained = 0.0  # float64: no drift
         for k in range(min(tiles.shape[1], squares_down - r0)):
             for a in range(side):
-                row, known = frame[side * (r0 + k) + a], evidence[2 * (r0 + k) + a // CELL]
+                cells = 2 * (r0 + k) + a // CELL
+                row, known, now = light[side * (r0 + k) + a], evidence[cells], revealed[cells]
                 to, cell = np.uint64(side * c0), np.uint64(2 * c0)
                 at = np.uint64(((i * tiles.shape[1] + k) * across * side + a) * side)
                 for _ in range(min(across, squares_across - c0)):
                     for _ in range(2):
-                        revealed = known[cell] / (known[cell] + half)
+                        part = known[cell] / (known[cell] + half)
                         for b in range(n):
-                            row[to + b] = background + revealed * (of[at + b] - background)
+                            new = part * of[at + b]
+                            gained += np.float64(new) - np.float64(row[to + b])
+                            row[to + b] = new
+                        if a % CELL == 0:
+                            totals[0] += np.float64(part) - np.float64(now[cell])
+                            now[cell] = part
                         cell += np.uint64(1)
                         to += n
                         at += n
                     at += np.uint64(side * side - side)
+        totals[1] += gained / CELL**2
+
+
+@njit(nogil=True, cache=True)
+def add_background(light, revealed, background, frame):
+    """Write `light` into `frame`, and `background` as far as a cell is not `revealed`."""
+    for r in range(len(revealed)):
+        for a in range(CELL):
+            row, of, known = frame[CELL * r + a], light[CELL * r + a], revealed[r]
+            for c in range(len(known)):
+                hidden = (f32(1) - known[c]) * background
+                for b in range(CELL):
+                    row[CELL * c + b] = of[CELL * c + b] + hidden
 
 
 @njit(nogil=True, cache=True)
