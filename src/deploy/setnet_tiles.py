@@ -53,8 +53,9 @@ class TileState:
 
     def add_background(self) -> None:
         """Bring `frame` up to date, as models.setnet.blend_background does."""
-        cells, light = self.totals + (BACKGROUND_CELLS, BACKGROUND_CELLS * BACKGROUND)
-        background = np.float32(light / cells)
+        cells, light = self.totals
+        light += BACKGROUND_CELLS * BACKGROUND
+        background = np.float32(light / (cells + BACKGROUND_CELLS))
         tiles_numba.add_background(self.light, self.revealed, background, self.frame)
 
     def hold(self, context: np.ndarray, *held: np.ndarray) -> None:
