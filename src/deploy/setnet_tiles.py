@@ -22,7 +22,7 @@ from src.deploy.setnet_clock import (
 from src.deploy.setnet_context import CONTEXT_TILE, ContextTiles, WholeContext
 from src.deploy.setnet_layers import DecoderLayers, MemoryLayers, WholeDecoder, WholeWindow
 from src.deploy.tile_batches import Backend, TileModule
-from src.models.setnet import BACKGROUND, BACKGROUND_CELLS, CELL_PX, REVEALING_EVENTS, SetNet
+from src.models.setnet import BACKGROUND, BACKGROUND_WEIGHT, CELL_PX, REVEALING_EVENTS, SetNet
 from src.sim.optics import Position
 
 BATCHES = 32, 128  # sizes of batches, in tiles
@@ -42,7 +42,7 @@ class TileState:
         self.hold(_zeros(context), *map(_zeros, network.context.map_sizes(rows, columns)))
         self.revealed = np.zeros((rows, columns), np.float32)  # how far cells are, in [0, 1]
         self.light = np.zeros((height, width), np.float32)  # of pixels, times that
-        self.totals = np.zeros(2)  # of `revealed`, and of `light` in cells
+        self.totals = np.zeros(2)  # of weights and of light, of blend_background
         self.frame = np.full((height, width), BACKGROUND, np.float32)
 
     def write_pixels(self, pixels: np.ndarray, corners: np.ndarray, evidence: np.ndarray) -> None:
@@ -53,9 +53,9 @@ class TileState:
 
     def add_background(self) -> None:
         """Bring `frame` up to date, as models.setnet.blend_background does."""
-        cells, light = self.totals
-        light += BACKGROUND_CELLS * BACKGROUND
-        background = np.float32(light / (cells + BACKGROUND_CELLS))
+        weight, light = self.totals
+        light += BACKGROUND_WEIGHT * BACKGROUND
+        background = np.float32(light / (weight + BACKGROUND_WEIGHT))
         tiles_numba.add_background(self.light, self.revealed, background, self.frame)
 
     def hold(self, context: np.ndarray, *held: np.ndarray) -> None:

@@ -39,7 +39,7 @@ divided by k.  Right column: fields of SetNetState.
 * A clock for each cell: it runs near events that others support, and by at most 4 ms in all after
   the last; then the cell's state is held.  Where much of the picture is active the camera moves,
   and all clocks run.
-* Background: what no event has revealed yet has one brightness, the mean of what events have.
+* Background: what no event has revealed yet has one brightness, that at the rim of what events have.
 * Context: events lie at edges, so the brightness of a uniform area follows from edges that may be
   far; the pyramid provides the receptive field.  The context is updated at most 30 times a second
   and low-pass filtered, so that the frame does not change in steps.
@@ -92,7 +92,7 @@ MOVING_SHARE = 0.5  # from which on the clock of all cells advances: a moving ca
 REVEALING_EVENTS = 0.05  # supported events per cell so far, at which a frame is half the background
 REVEALING_S = 0.02  # the same in seconds of a moving camera
 BACKGROUND = 0.45  # brightness of what no event has revealed, before anything is
-BACKGROUND_CELLS = 5  # revealed cells whose mean brightness has as much weight as BACKGROUND
+BACKGROUND_WEIGHT = 1  # of BACKGROUND in the mean of blend_background
 SETTLING = math.exp(-2)  # context recency above which the context of a cell is still smoothed
 CONTEXT_INTERVAL_S = 1 / 30  # shortest time between two context updates
 UPDATE_RECENCY = math.exp(-0.98)  # an update is due at or below it: 0.98 intervals, for rounding
@@ -178,11 +178,12 @@ def blend_background(
     pixels: Float[Tensor, "m pixels h2 w2"], revealed: Float[Tensor, "m 1 h2 w2"]
 ) -> Float[Tensor, "m pixels h2 w2"]:
     """Return the pixels of each cell as far as it is `revealed`, in [0, 1], the rest of it with the
-    mean brightness of all that is revealed (BACKGROUND has the weight of BACKGROUND_CELLS cells).
+    mean brightness of cells that are so in part: r (1 - r) is their weight.
     """
-    cells = revealed.sum((2, 3), keepdim=True) + BACKGROUND_CELLS
-    light = (revealed * pixels.mean(1, keepdim=True)).sum((2, 3), keepdim=True)
-    background = (light + BACKGROUND_CELLS * BACKGROUND) / cells
+    weight = revealed * (1 - revealed)
+    light = (weight * pixels.mean(1, keepdim=True)).sum((2, 3), keepdim=True)
+    total = weight.sum((2, 3), keepdim=True) + BACKGROUND_WEIGHT
+    background = (light + BACKGROUND_WEIGHT * BACKGROUND) / total
     return background + revealed * (pixels - background)
 
 

@@ -15,7 +15,7 @@ from src.models.network import MAX_WINDOWS, unroll
 from src.models.setnet import (
     ACTIVITY_TAU_S,
     BACKGROUND,
-    BACKGROUND_CELLS,
+    BACKGROUND_WEIGHT,
     CONTEXT_TAU_S,
     MIN_ACTIVITY,
     MIN_SUPPORT,
@@ -207,15 +207,17 @@ def test_what_a_still_camera_has_not_seen_is_exactly_the_background():
     assert float((revealed - background[0, -1, 0]).abs().max()) > 0.01
 
 
-def test_the_background_is_the_mean_of_what_is_revealed():
+def test_the_background_is_that_at_the_rim_of_what_is_revealed():
     pixels, revealed = torch.rand(2, 4, 40, 40), torch.zeros(2, 1, 40, 40)
     revealed[0, 0, 3:30, 5:20] = 1
+    revealed[0, 0, 30] = 0.25
     bright, none = blend_background(pixels, revealed)
-    seen = pixels[0, :, 3:30, 5:20]
-    n = 27 * 15 + BACKGROUND_CELLS
-    expected = (27 * 15 * seen.mean() + BACKGROUND_CELLS * BACKGROUND) / n
+    weight = 40 * 0.25 * 0.75
+    light = weight * pixels[0, :, 30].mean() + BACKGROUND_WEIGHT * BACKGROUND
+    expected = light / (weight + BACKGROUND_WEIGHT)
     torch.testing.assert_close(bright[:, 35:], expected.expand(4, 5, 40))
-    torch.testing.assert_close(bright[:, 3:30, 5:20], seen)
+    torch.testing.assert_close(bright[:, 3:30, 5:20], pixels[0, :, 3:30, 5:20])
+    torch.testing.assert_close(bright[:, 30], 0.25 * pixels[0, :, 30] + 0.75 * expected)
     torch.testing.assert_close(none, torch.full_like(none, BACKGROUND))
 
 

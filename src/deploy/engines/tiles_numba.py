@@ -132,13 +132,13 @@ def smooth(context, corners, cells, kept, smoothed):
 def write_pixels(tiles, corners, evidence, half, revealed, light, totals):
     """Write tiles (n, t, t, pixels) of the pixels of 2 x 2 cells, row by row, into `light`, times
     how far `evidence` has `revealed` their cell, `half` for half of it; `corners`: in 2 x 2 cells;
-    `totals` follow the sums of `revealed` and, in cells, of `light`."""
+    `totals` follow the sums over cells of the weight and the light of blend_background."""
     side = 2 * CELL
     squares_down, squares_across = len(light) // side, light.shape[1] // side
     across, of, n = tiles.shape[2], tiles.reshape(-1), np.uint64(CELL)
     for i in range(len(corners)):
         r0, c0 = corners[i]
-        gained = 0.0  # float64: no drift
+        weight, gained = 0.0, 0.0  # float64: no drift
         for k in range(min(tiles.shape[1], squares_down - r0)):
             for a in range(side):
                 cells = 2 * (r0 + k) + a // CELL
@@ -147,18 +147,20 @@ def write_pixels(tiles, corners, evidence, half, revealed, light, totals):
                 at = np.uint64(((i * tiles.shape[1] + k) * across * side + a) * side)
                 for _ in range(min(across, squares_across - c0)):
                     for _ in range(2):
-                        part = known[cell] / (known[cell] + half)
+                        part, old = known[cell] / (known[cell] + half), now[cell]
+                        rest, old_rest = np.float64(1) - part, np.float64(1) - old
                         for b in range(n):
                             new = part * of[at + b]
-                            gained += np.float64(new) - np.float64(row[to + b])
+                            gained += rest * new - old_rest * row[to + b]
                             row[to + b] = new
-                        if a % CELL == 0:
-                            totals[0] += np.float64(part) - np.float64(now[cell])
+                        if a % CELL == CELL - 1:
+                            weight += rest * part - old_rest * old
                             now[cell] = part
                         cell += np.uint64(1)
                         to += n
                         at += n
                     at += np.uint64(side * side - side)
+        totals[0] += weight
         totals[1] += gained / CELL**2
 
 
