@@ -39,7 +39,7 @@ divided by k.  Right column: fields of SetNetState.
 * A clock for each cell: it runs near events that others support, and by at most 4 ms in all after
   the last; then the cell's state is held.  Where much of the picture is active the camera moves,
   and all clocks run.
-* Background: what no event has revealed yet has one brightness, that at the rim of what events have.
+* Background: what no event has revealed yet has one brightness, that at the rim of what is.
 * Context: events lie at edges, so the brightness of a uniform area follows from edges that may be
   far; the pyramid provides the receptive field.  The context is updated at most 30 times a second
   and low-pass filtered, so that the frame does not change in steps.
