@@ -1,4 +1,5 @@
-# make train: set up what is missing, train the light-field network for minutes, show what it learned.
+# make:       set up what is missing.
+# make train: set up what is missing, train the one-view network on nine views for minutes, show what it learned.
 # make test:  set up what is missing, run the fast tests.     make test-all: the slow ones too.
 # make demo:  set up what is missing, simulate a recording once, play it live in the browser.
 # make docs:  the site of docs/ in out/site; REPO_URL=https://... where its links to code lead.
@@ -10,9 +11,11 @@ LPIPS := .cache/lpips/alex.safetensors
 DEMO := out/demo
 SITE := .cache/docs
 
-.PHONY: train test test-all demo docs lint clean
+.PHONY: setup train test test-all demo docs lint clean
+setup: $(READY) $(LPIPS)
+
 train: $(READY) $(LPIPS)
-	$(PY) -m src.train experiment=lf3x3
+	$(PY) -m src.train experiment=lf3x3 budget=fine_tuning
 
 test: $(READY) $(LPIPS)
 	OMP_NUM_THREADS=1 $(PY) -m pytest -q -n 2 -m "not slow and not gpu"

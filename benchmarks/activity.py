@@ -2,17 +2,20 @@
 
 One line for each network and size: milliseconds, the median of some windows, with events in 0, 5,
 10, 25, 50, 75 and 100 % of the tiles of 32 x 32 pixels, a block around the middle, 300 events a
-window in each.
+window in each.  `--figure FILE` draws them.
 """
 
 import argparse
 import math
 import statistics
 import time
+from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from src.deploy.runtime import EventListRuntime, fastest_form
+from src.figures import plots
 from src.models import load
 from src.sim.optics import layout
 
@@ -56,6 +59,21 @@ def milliseconds(live: EventListRuntime, played: list, seconds: float) -> float:
     return statistics.median(times)
 
 
+def draw(path: Path, measured: dict[tuple[str, str], list[float]]) -> None:
+    """Draw milliseconds against the share, a panel for each size and a line for each network."""
+    sizes = list(dict.fromkeys(size for _, size in measured))
+    figure = Figure(figsize=(3.2 * len(sizes), 2.8), layout="constrained")
+    panels = figure.subplots(1, len(sizes), squeeze=False)[0]
+    for size, axes in zip(sizes, panels, strict=True):
+        for (name, its_size), times in measured.items():
+            if its_size == size:
+                axes.plot([100 * share for share in SHARES], times, marker="o", label=name)
+        axes.set(title=size, xlabel="share of the frame with events, %", ylim=(0, None))
+    panels[0].set_ylabel("ms a window")
+    panels[0].legend(frameon=False)
+    plots.save_figure(figure, path)
+
+
 def main() -> None:
     """Print the lines."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -63,20 +81,25 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=1.0)
     parser.add_argument("--windows", type=int, default=24)
+    parser.add_argument("--figure", type=Path, help="a file for the figure, .png or .svg")
     given = parser.parse_args()
-    form = fastest_form()
+    form, measured = fastest_form(), {}
     print(f"{form}, {given.threads} threads; ms at", *(f"{share:.0%}" for share in SHARES))
     for name in given.names:
         network = load(name)
         for views, height, width, fps in SIZES:
-            size = {"positions": layout(views), "height": height, "width": width}
-            live = EventListRuntime(network, **size, threads=given.threads, form=form)
+            how = {"positions": layout(views), "height": height, "width": width}
+            live = EventListRuntime(network, **how, threads=given.threads, form=form)
             found = []
             for share in SHARES:
                 live.reset()
                 played = windows(share, views, height, width, fps, given.windows)
-                found.append(f"{milliseconds(live, played, given.seconds):7.2f}")
-            print(f"{name}, {views} x {height}x{width} at {fps:.0f}/s:", *found, flush=True)
+                found.append(milliseconds(live, played, given.seconds))
+            size = f"{views} x {width} x {height}"
+            print(f"{name}, {size} at {fps:.0f}/s:", *(f"{ms:7.2f}" for ms in found), flush=True)
+            measured[name, size] = found
+    if given.figure:
+        draw(given.figure, measured)
 
 
 if __name__ == "__main__":

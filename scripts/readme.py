@@ -1,19 +1,22 @@
-"""The README's picture, and shipped weights measured: python -m scripts.readme --root PHOTOS.
+"""The README's film, and shipped weights measured: python -m scripts.readme --root PHOTOS.
 
-Made anew: docs/figures/nine_views.png, and the section between the README's marks `report:results`,
-scores of test clips of the photographs in PHOTOS (data=test_photos), each simulated once for all
-networks, beside the published ones whose weights are in `--published`.  Without PHOTOS only the
-picture.  The same for docs/results.md of data=test_footage, with `--footage`, a still scene through
-air, and, what differs, of sensors with random faults (sensor=randomized).  The cards are given
+Made anew: docs/figures/nine_views.webp, and the sections between the marks `report:...` of README,
+docs/tables.md and docs/results.md: scores of test clips of the photographs in PHOTOS
+(data=test_photos), each simulated once for all networks, beside the published ones whose weights
+are in `--published`; of data=test_footage, with `--footage`, a still scene through air; and of
+sensors with random faults (sensor=randomized).  Without PHOTOS only the film.  The cards are given
 the scores, too, and those of data=test_targets.
 """
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
+from jaxtyping import Float
 from omegaconf import DictConfig
+from PIL import Image
 from torch import Tensor
 
 from src import models
@@ -21,21 +24,24 @@ from src.app import build
 from src.app.compose import compose_config
 from src.app.instantiate import build_part
 from src.bench.candidates import Candidate
-from src.figures import plots
+from src.figures import samples
 from src.metrics.bootstrap import bootstrap_interval
 from src.metrics.table import METRICS, Column
 from src.models import files
+from src.recordings.output import round_codes
 from src.records import results
+from src.records.atomic import atomic_path
 from src.reports.writers import replace_section
 from src.sim.optics import layout
 from src.sim.pipeline import Sample, simulate
 
 HOME = Path(__file__).resolve().parents[1]
-ONE, NINE = ("setnet_small", 1), ("setnet_small", 9)  # of the picture
+ONE, NINE = ("setnet_medium", 1), ("setnet_medium", 9)  # of the film
+WINDOWS = 72
 # Local air, whose parts of a view are displaced apart.
 AIR = ("turbulence=strong", "turbulence.atmosphere.tilt_correlation_half_length_px=[10,20]",
        "turbulence.atmosphere.global_tilt_probability=0.0")  # fmt: skip
-PAPER = "nine views, E2VID (the paper's method)"
+PAPER, ONE_VIEW = "nine views, E2VID (the paper's method)", "one view, E2VID"
 LARGE, MEDIUM = "nine views, SetNet large", "nine views, SetNet medium"
 SMALL, SINGLE = "nine views, SetNet small", "one view, SetNet medium"
 ROWS = {  # what it is: a network in weights/, how many of the nine views it is given
@@ -44,7 +50,7 @@ ROWS = {  # what it is: a network in weights/, how many of the nine views it is 
     SMALL: ("setnet_small", 9),
     PAPER: ("lf3x3", 9),
     SINGLE: ("setnet_medium", 1),
-    "one view, E2VID": ("single256", 1),
+    ONE_VIEW: ("single256", 1),
     "one view, E2VID+ trained without turbulence": ("clean/e2vid_plus", 1),
 }
 BASELINES = {  # their files in the folder of published weights
@@ -54,14 +60,17 @@ BASELINES = {  # their files in the folder of published weights
     "pienet_lite": ["PIE-Net/model_lite.pth"],
     "highpass": [],
 }
+FIRENET, LITE = "one view, published FireNet+", "one view, published PIE-Net-Lite"
 OTHERS = {
-    "one view, published FireNet+": ("firenet_plus", 1),
+    FIRENET: ("firenet_plus", 1),
     "one view, published CISTA-TC": ("cista", 1),
     "one view, published PIE-Net": ("pienet", 1),
-    "one view, published PIE-Net-Lite": ("pienet_lite", 1),
+    LITE: ("pienet_lite", 1),
 }
+HEADLINE = (LARGE, SMALL, PAPER, ONE_VIEW, LITE, FIRENET)  # rows of the README
+SCORES = ("lpips", "ssim", "psnr_aligned")  # its columns
 VIEWS = {  # differences, clip by clip: of nine views and one
-    "Δ (9 − 1 views), E2VID": (PAPER, "one view, E2VID"),
+    "Δ (9 − 1 views), E2VID": (PAPER, ONE_VIEW),
     "Δ (9 − 1 views), SetNet medium": (MEDIUM, SINGLE),
 }
 BEST = {"Δ nine views, SetNet medium − E2VID": (MEDIUM, PAPER)}
@@ -69,13 +78,33 @@ NETWORKS = BEST | {  # of networks
     "Δ nine views, SetNet small − E2VID": (SMALL, PAPER),
     "Δ nine views, SetNet large − medium": (LARGE, MEDIUM),
 }
-TABLES = {  # of what is measured: document, section, whether scores are in it, differences
+
+
+class Table(NamedTuple):
+    """A section of a document: rows whose scores are in it, differences, columns."""
+
+    document: str
+    section: str
+    rows: tuple[str, ...]
+    pairs: dict[str, tuple[str, str]]
+    metrics: tuple[str, ...] = tuple(metric.name for metric in METRICS)
+
+
+TABLES = {  # of what is measured
     "data=test_photos": (
-        ("README.md", "results", True, VIEWS),
-        ("docs/results.md", "differences", False, NETWORKS),
+        Table("README.md", "results", HEADLINE, {}, SCORES),
+        Table("docs/tables.md", "photos", (*ROWS, *OTHERS), VIEWS),
+        Table("docs/results.md", "differences", (), NETWORKS),
     ),
-    "data=test_footage": (("docs/results.md", "footage", False, VIEWS | BEST),),
-    "data=test_photos sensor=randomized": (("docs/results.md", "drawn", False, VIEWS | BEST),),
+    "data=test_footage": (
+        Table("docs/tables.md", "footage", tuple(ROWS), {}),
+        Table("docs/results.md", "footage", (), VIEWS | BEST),
+    ),
+    "data=test_photos sensor=randomized": (
+        Table("docs/tables.md", "drawn", tuple(ROWS), {}),
+        Table("docs/results.md", "drawn", (), VIEWS | BEST),
+    ),
+    "data=test_targets": (Table("docs/tables.md", "targets", tuple(ROWS), VIEWS),),
 }
 
 
@@ -114,31 +143,36 @@ def score_clips_into_metrics(
     return values
 
 
-def format_table(
-    values: dict[str, list[dict[str, float]]], rows: bool, pairs: dict[str, tuple[str, str]]
-) -> str:
-    """Return the scores of `values` as Markdown, where `rows` says so, and differences of pairs."""
-    heads = [metric.title for metric in METRICS]
+def format_table(values: dict[str, list[dict[str, float]]], table: Table) -> str:
+    """Return what `table` says of the scores `values` as Markdown, without rows not in them."""
+    columns = [metric for metric in METRICS if metric.name in table.metrics]
+    heads = [metric.title for metric in columns]
     lines = ["| | " + " | ".join(heads) + " |", "|---|" + "---|" * len(heads)]
-    for row, clips in values.items() if rows else ():
-        lines.append(f"| {row} | " + " | ".join(format_means(clips)) + " |")
-    for name, (first, second) in pairs.items():
+    for row in table.rows:
+        if row in values:
+            lines.append(f"| {row} | " + " | ".join(format_means(values[row], columns)) + " |")
+    for name, (first, second) in table.pairs.items():
         if {first, second} <= set(values):
-            cells = format_differences(values[first], values[second])
+            cells = format_differences(values[first], values[second], columns)
             lines.append(f"| *{name}* | " + " | ".join(cells) + " |")
-    note = "mean (95 % bootstrap CI); Δ: paired differences."
-    return "\n".join([*lines, "", f"{len(next(iter(values.values())))} clips; {note}"])
+    paired = "; Δ: paired differences" if table.pairs else ""
+    clips = len(next(iter(values.values())))
+    return "\n".join([*lines, "", f"{clips} clips; mean (95 % bootstrap CI){paired}."])
 
 
-def format_means(clips: list[dict[str, float]]) -> list[str]:
+def format_means(clips: list[dict[str, float]], columns: Sequence[Column] = METRICS) -> list[str]:
     """Return the scores of clips, per metric."""
-    return [format_mean(m, [clip[m.name] for clip in clips]) for m in METRICS]
+    return [format_mean(m, [clip[m.name] for clip in clips]) for m in columns]
 
 
-def format_differences(first: list[dict[str, float]], second: list[dict[str, float]]) -> list[str]:
+def format_differences(
+    first: list[dict[str, float]],
+    second: list[dict[str, float]],
+    columns: Sequence[Column] = METRICS,
+) -> list[str]:
     """Return by how much the scores of the same clips differ, per metric."""
     pairs = list(zip(first, second, strict=True))
-    return [format_mean(m, [a[m.name] - b[m.name] for a, b in pairs], "+") for m in METRICS]
+    return [format_mean(m, [a[m.name] - b[m.name] for a, b in pairs], "+") for m in columns]
 
 
 def format_mean(metric: Column, values: list[float], sign: str = "") -> str:
@@ -160,30 +194,39 @@ def update_card(card: Path, protocol: str, commit: str, clips: list[dict[str, fl
     results.write_text(card, "\n".join(lines) + "\n")
 
 
-def draw_figure(path: Path, index: int, windows: int) -> None:
-    """Draw a clip through strong local air: the last frame and the x-t slice of its middle row."""
+def write_film(path: Path, index: int) -> None:
+    """Write a film of a clip through strong local turbulence, below each panel the x-t slice of its
+    middle row so far."""
     cfg = compose_config("simulate", *AIR, "fps=120", "scene.height=192", "scene.width=192",
-                 "sensor.threshold=0.15", f"data.test_windows={windows}")  # fmt: skip
-    sample = simulate(build.build_pipeline(cfg, "test"), [index])
+                 "sensor.threshold=0.15", f"data.test_windows={WINDOWS}")  # fmt: skip
+    pipeline = build.build_pipeline(cfg, "test")
+    sample = simulate(pipeline, [index])
+    counts = sample.voxels[0, :, pipeline.optics.centre].sum(1).numpy()
+    one, nine = (reconstruct_clip(load_shipped(*what), sample) for what in (ONE, NINE))
     panels = {
-        "what one view sees": sample.turbulent[0],
-        "one view, reconstructed": reconstruct_clip(load_shipped(*ONE), sample),
-        "nine views, reconstructed": reconstruct_clip(load_shipped(*NINE), sample),
-        "ground truth": sample.target[0],
+        "events of the centre view": samples.render_events(counts),
+        "one view": one[:, 0].numpy(),
+        "nine views": nine[:, 0].numpy(),
+        "ground truth": sample.target[0, :, 0].numpy(),
     }
-    figure = Figure(figsize=(10, 4.1), layout="constrained")
-    grid = figure.subplots(2, len(panels), height_ratios=(3, 1))
-    for (name, video), (above, below) in zip(panels.items(), grid.T, strict=True):
-        film = video[:, 0].numpy()
-        middle = film.shape[1] // 2
-        above.imshow(film[-1], cmap="gray", vmin=0, vmax=1)
-        above.axhline(middle, color="gold", linewidth=0.8)
-        above.set_title(name, fontsize=10)
-        below.imshow(film[:, middle], cmap="gray", vmin=0, vmax=1, aspect="auto")
-        for axes in (above, below):
-            axes.set(xticks=[], yticks=[])
-    grid[1, 0].set_ylabel("time, down", fontsize=8)
-    plots.save_figure(figure, path)
+    film = samples.join_panels({name: append_slice(video) for name, video in panels.items()})
+    first, *rest = map(Image.fromarray, round_codes(film))
+    time = {"duration": round(1000 / samples.PLAYBACK_FPS), "loop": 0}
+    with atomic_path(path) as partial:
+        first.save(partial, "WEBP", save_all=True, append_images=rest, quality=70, **time)
+
+
+def append_slice(
+    video: Float[np.ndarray, "frames h w *rgb"],
+) -> Float[np.ndarray, "frames hslice w *rgb"]:
+    """Return the video with the x-t slice of its middle row below, in each frame as far as time has
+    come, the rest white."""
+    frames, height, width, *rgb = video.shape
+    slices = np.ones((frames, frames, width, *rgb), video.dtype)
+    for frame in range(frames):
+        slices[frame, : frame + 1] = video[: frame + 1, height // 2]
+    gap = np.ones((frames, samples.GAP_PX, width, *rgb), video.dtype)
+    return np.concatenate([video, gap, slices], axis=1)
 
 
 def main() -> None:
@@ -192,12 +235,12 @@ def main() -> None:
     parser.add_argument("--root", help="a folder of photographs that no network was trained on")
     parser.add_argument("--footage", help="a video or folder of frames: a still scene through air")
     parser.add_argument("--published", type=Path, help="a folder of published weights")
-    parser.add_argument("--index", type=int, default=0, help="the clip of the picture")
+    parser.add_argument("--index", type=int, default=0, help="the clip of the film")
     given = parser.parse_args()
     if given.footage and not given.root:
         parser.error("--footage needs --root, the photographs that it moves")
     commit = results.git_commit()  # before anything is written
-    draw_figure(HOME / "docs" / "figures" / "nine_views.png", given.index, 40)
+    write_film(HOME / "docs" / "figures" / "nine_views.webp", given.index)
     if not given.root:
         return
     photos = [f"scene.root={given.root}"]
@@ -215,8 +258,8 @@ def main() -> None:
         values = score_clips_into_metrics(
             compose_config("eval", *protocol.split(), *overrides), rows
         )
-        for document, section, whole, pairs in TABLES.get(protocol, ()):
-            replace_section(HOME / document, section, format_table(values, whole, pairs))
+        for table in TABLES[protocol]:
+            replace_section(HOME / table.document, table.section, format_table(values, table))
         for name, row in cards.items():
             update_card(files.WEIGHTS / f"{name}.md", protocol, commit, values[row])
 

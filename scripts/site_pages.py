@@ -1,5 +1,6 @@
-"""Hook of mkdocs.yml: pages of the site from files outside docs/, links as on GitHub."""
+"""Hook of mkdocs.yml: pages from files outside docs/ and from notebooks, links as on GitHub."""
 
+import json
 import re
 from os.path import dirname, join, normpath, relpath
 from pathlib import Path
@@ -9,6 +10,7 @@ from mkdocs.structure.files import File, InclusionLevel
 ROOT = Path(__file__).resolve().parents[1]
 LINK = re.compile(r"(?<=\]\()(?![a-z]+:|#)([^)\s#]+)")
 CODE = re.compile(r"(^```.*?^```$|^    .*?$)", re.M | re.S)
+COLAB = "https://colab.research.google.com/github"
 
 
 def on_files(files, config):
@@ -36,6 +38,12 @@ def on_page_markdown(markdown, page, config, files):
     uri, pages = page.file.src_uri, config.extra["pages"]
     sources = {site: path for path, site in pages.items()}
     home = sources.get(uri, uri if uri.startswith("weights/") else f"docs/{uri}")
+    if home.endswith(".ipynb"):
+        repository = config.repo_url.removeprefix("https://github.com")
+        places = {"Download the notebook": Path(home).name}
+        if repository != config.repo_url:
+            places["Open in Colab"] = f"{COLAB}{repository}/blob/main/{home}"
+        markdown = format_notebook(json.loads(markdown), places)
 
     def rewrite(link):
         path = normpath(join(dirname(home), link[1]))
@@ -49,3 +57,27 @@ def on_page_markdown(markdown, page, config, files):
 
     parts = CODE.split(markdown)  # text, code, text ...
     return "".join(part if n % 2 else LINK.sub(rewrite, part) for n, part in enumerate(parts))
+
+
+def format_notebook(notebook, places):
+    """Return the cells of a notebook and their outputs as Markdown; below the title links to
+    `places`, {words: address}."""
+    links = " · ".join(f'<a href="{address}">{words}</a>' for words, address in places.items())
+    parts = []
+    for cell in notebook["cells"]:
+        text = "".join(cell["source"])
+        parts.append(text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```")
+        parts += map(_format_output, cell.get("outputs", ()))
+    title, rest = "\n\n".join(parts).split("\n", 1)
+    return f"{title}\n\n{links}\n{rest}\n"
+
+
+def _format_output(output):
+    shown = output.get("data", {})
+    for kind in (kind for kind in shown if kind.startswith("image/")):
+        data = "".join(shown[kind]).strip()
+        return f'<img alt="picture that the cell above draws" src="data:{kind};base64,{data}">'
+    if "text/html" in shown:
+        return "".join(shown["text/html"])
+    text = "".join(output.get("text") or shown["text/plain"]).strip()
+    return f"```text\n{text}\n```"

@@ -45,7 +45,9 @@ def report(cfg: DictConfig) -> list[tables.Table]:
     results.write_text(out / "report.md", text)
     results.write_text(out / "report.csv", writers.format_csv_tables(shown))
     size = int(cfg.media_mib * 2**20)
-    html = page.format_html(title, shown, groups, figures, commands=commands, media_bytes=size)
+    html = page.format_html(
+        title, shown, groups, figures, commands=commands, folder=out, media_bytes=size
+    )
     results.write_text(out / "report.html", html)
     if cfg.into:
         writers.replace_section(Path(cfg.into), title, text)

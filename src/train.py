@@ -9,7 +9,7 @@ import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from omegaconf import DictConfig
 
-from src.app import build, entry_point, hardware
+from src.app import build, entry_point, hardware, start_weights
 from src.app.instantiate import as_dict, build_part
 from src.figures import samples
 from src.models import files
@@ -22,7 +22,7 @@ from src.training.step_guard import NonFiniteError
 
 
 def train(cfg: DictConfig) -> dict:
-    """Fit, test beside the untrained network and the high-pass baseline, write `results.json`.
+    """Fit, test beside what it began as, the `references` and the high-pass, write `results.json`.
 
     Everything goes below `cfg.paths.run`.  Returns the content of `results.json`; of several
     processes that train together all but the first train only, and return {}.
@@ -32,7 +32,10 @@ def train(cfg: DictConfig) -> dict:
     hardware.retain_freed_memory(cfg)
     hardware.fill_in_precision(cfg)
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
+    first_weights, references = start_weights.adopt_start(cfg), start_weights.load_references(cfg)
     net, spec = build.build_network_and_spec(cfg)
+    if first_weights:
+        files.restore_weights(net, first_weights)
     start_from = files.find_checkpoint(cfg.ckpt, spec) if cfg.ckpt else None
     module, data = build.build_reconstructor(cfg, net, spec), build.build_data_module(cfg)
     trainer = build.build_trainer(cfg)
@@ -40,7 +43,8 @@ def train(cfg: DictConfig) -> dict:
         fit(trainer, module, data, start_from)
         return {}
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
-    untrained = build.test_method(cfg, "untrained", module.method, data, module.metrics)
+    beginning = start_weights.name_beginning(cfg, first_weights)
+    before = build.test_method(cfg, beginning, module.method, data, module.metrics)
     tracking.log_config(trainer.loggers, as_dict(cfg))
     try:
         fit(trainer, module, data, start_from)
@@ -51,10 +55,11 @@ def train(cfg: DictConfig) -> dict:
     # As it is when it is loaded again.
     module.method.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
     trained = build.test_method(cfg, cfg.name, module.method, data, module.metrics)
-    baseline = build_part(cfg, "reference_baseline.method")
-    reference = build.test_method(cfg, cfg.reference_baseline.name, baseline, data, module.metrics)
-    pictures = samples.write_samples(run / "samples", module.method, data.pipelines["test"])
-    rows, facts = [trained, untrained, reference], entry_point.run_metadata(cfg, start)
+    references[cfg.reference_baseline.name] = build_part(cfg, "reference_baseline.method")
+    others = [build.test_method(cfg, *o, data, module.metrics) for o in references.items()]
+    drawn = data.pipelines["test"], cfg.sample_clips
+    pictures = samples.write_samples(run / "samples", module.method, *drawn)
+    rows, facts = [trained, before, *others], entry_point.run_metadata(cfg, start)
     record = results.write_and_print_results(run, entry_point.resolved_yaml(cfg), rows, **facts)
     tracking.log_results(trainer.loggers, record, pictures)
     return record

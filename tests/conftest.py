@@ -8,6 +8,7 @@ from jaxtyping import install_import_hook
 
 import src  # noqa: F401 - sets OpenCV's limits before a test imports it
 import tests.typecheck  # noqa: F401 - the hook below names it in a string
+from tests.faults.harness import leave_slices_out
 
 ROOT = Path(__file__).resolve().parents[1]
 # A shell starts what runs in its background with Ctrl-C ignored, and so would be what tests start.
@@ -25,6 +26,15 @@ def checked_modules() -> list[str]:
 
 
 install_import_hook(checked_modules(), "tests.typecheck.check")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def no_slices():
+    """Trainings and evaluations draw no slices, which take longer than they do themselves; those of
+    test_readme.py do."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("src.figures.samples.draw_comparison", leave_slices_out)
+        yield
 
 
 @pytest.fixture(scope="session")

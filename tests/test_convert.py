@@ -1,15 +1,10 @@
 """src.convert: the same events in another format, in pieces, whole or not at all."""
 
-import re
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
 from src import convert as entry
 from src.recordings.files.recording import open_recording, read_events
-from tests.conftest import ROOT
 from tests.recordings.files import tables
 from tests.recordings.files.test_prophesee_file import evt2
 from tests.recordings.files.test_recording import made_up
@@ -101,16 +96,6 @@ def test_what_cannot_be_is_named(tmp_path, convert, monkeypatch, overrides, word
     with pytest.raises(ValueError, match=words):
         convert("recording=in.csv", *overrides)
     assert not (tmp_path / "a.h5").exists()
-
-
-def test_the_command_ends_with_one_line(tmp_path):
-    tables.write_events(tmp_path / "in.csv", made_up(30), width=640, height=480)
-    command = [sys.executable, "-m", "src.convert", f"recording={tmp_path}/in.csv"]
-    command += [f"out={tmp_path}/a.npz", f"paths.out={tmp_path}/out"]
-    said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    assert re.fullmatch(
-        r"30 events, 0\.0\d+ s, 640x480, \d+ bytes: .*a\.npz", said.splitlines()[-1]
-    )
 
 
 def test_a_part_without_events_is_refused_and_leaves_no_file(tmp_path, convert):

@@ -121,7 +121,7 @@ def leases(tmp_path_factory):
     words = {
         "whole": [[str(home / "all" / "plan.yaml"), "--minutes", "9"], False],
         "killed": [[str(cut), "--minutes", "9"], False],
-        "hangs": [[str(plan(home / "hang", **short)), "--minutes", "0.3"], True],
+        "hangs": [[str(plan(home / "hang", **short)), "--minutes", "0.2"], True],
     }
     for name, (line, _) in words.items():
         line.append(f"out={home / f'{name}.out'}")
@@ -195,4 +195,4 @@ def test_a_lease_ends_in_time_whatever_holds_it_up(leases):
     log = leases.logs["hangs"]
     assert leases.codes["hangs"] == 1 and "trained: nothing" in log
     (end,) = (line for line in log.splitlines() if "the lease is over" in line)
-    assert 15 <= float(end.split()[1]) <= 17, "three seconds before the end of 18"
+    assert 9 <= float(end.split()[1]) <= 11, "three seconds before the end of 12"

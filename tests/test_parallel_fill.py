@@ -13,14 +13,27 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from torch.utils.data import DataLoader
 
 from scripts import parallel_fill
 from scripts.parallel_fill import FillReport, fill
 from src.sim.pipeline import Pipeline
 from src.training.clip_cache import CachedClip
 from src.training.disk_cache import DiskClipCache
+from tests.faults.harness import FORKS
 from tests.training.cache_sources import Broken, Growing, Other, Telling, source
 from tests.training.test_disk_cache import runs, until
+
+
+@pytest.fixture
+def imported(monkeypatch) -> None:
+    """Let those who draw be forked from a process that has imported all they need."""
+
+    def loader(*arguments, multiprocessing_context, **options) -> DataLoader:
+        context = multiprocessing_context and FORKS
+        return DataLoader(*arguments, multiprocessing_context=context, **options)
+
+    monkeypatch.setattr(parallel_fill, "DataLoader", loader)
 
 
 def made(of: Pipeline, indices: Iterable[int], **kw) -> tuple[dict[int, CachedClip], FillReport]:
@@ -48,7 +61,7 @@ def test_clips_are_those_of_a_disk_cache_and_drawn_without_the_device(tmp_path):
         assert json.loads(json.dumps(metadata)) == clip.metadata
 
 
-def test_turbulence_that_is_prepared_elsewhere_gives_the_same_clips(monkeypatch):
+def test_turbulence_that_is_prepared_elsewhere_gives_the_same_clips(imported, monkeypatch):
     """As for a GPU: turbulence comes from those who draw, and all views are computed at once."""
     of = source(Growing(frames=7))
     monkeypatch.setattr(parallel_fill, "prepares_turbulence", lambda device: True)
@@ -59,7 +72,9 @@ def test_turbulence_that_is_prepared_elsewhere_gives_the_same_clips(monkeypatch)
         assert (views != expected).float().mean() < 0.02  # rounded the other way
 
 
-def test_turbulence_that_cannot_be_prepared_is_computed_here_and_a_failure_named(monkeypatch):
+def test_turbulence_that_cannot_be_prepared_is_computed_here_and_a_failure_named(
+    imported, monkeypatch
+):
     of, stored = source(turbulence=Other({"severity": "weak"})), {}
     monkeypatch.setattr(parallel_fill, "prepares_turbulence", lambda device: True)
     with pytest.raises(RuntimeError, match="clip 2: MemoryError: no room"):
@@ -76,7 +91,9 @@ def test_turbulence_that_cannot_be_prepared_is_computed_here_and_a_failure_named
         (True, RuntimeError, r"DataLoader worker .* (exited unexpectedly|killed by signal)"),
     ],
 )
-def test_a_clip_that_cannot_be_drawn_is_an_error_and_nothing_hangs(killed, error, message):
+def test_a_clip_that_cannot_be_drawn_is_an_error_and_nothing_hangs(killed, error, message, request):
+    if not killed:  # the death of a process that another forked is noticed later
+        request.getfixturevalue("imported")
     stored: dict[int, CachedClip] = {}
     with pytest.raises(error, match=message):
         fill(source(Broken(killed)), range(6), stored.__setitem__, device="cpu", workers=2)
@@ -91,7 +108,7 @@ def test_an_error_that_is_no_refusal_says_its_kind():
     assert isinstance(error, RuntimeError) and str(error).startswith("clip 0: AttributeError: ")
 
 
-def test_what_store_raises_ends_all_and_is_raised():
+def test_what_store_raises_ends_all_and_is_raised(imported):
     def store(*_) -> None:
         raise OSError("disk full")
 
@@ -100,7 +117,7 @@ def test_what_store_raises_ends_all_and_is_raised():
     until(nobody_draws)
 
 
-def test_it_stops_in_time_without_a_gap(monkeypatch):
+def test_it_stops_in_time_without_a_gap(imported, monkeypatch):
     stored: dict[int, CachedClip] = {}
     clock = SimpleNamespace(monotonic=lambda: len(stored))
     monkeypatch.setattr(parallel_fill, "time", clock)

@@ -1,14 +1,36 @@
-"""Every code block of docs/python.md runs, in order, in one namespace; and does what it says."""
+"""Every code block of docs/python.md, and every cell of docs/notebooks, runs, in order, in one
+namespace; and does what it says.
+"""
 
+import importlib.util
+import json
 import re
+import subprocess
+import sys
 
 import numpy as np
+import pytest
 
 from src.recordings.files import videos
 from src.recordings.files.event_writers import write_events
 from src.recordings.output import write_video
 from tests.conftest import ROOT
+from tests.test_docs import BANNED, LINE, LINK
+from tests.test_entry_points import run_here
 from tests.test_simulate_own import textured
+
+NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
+LARGEST_BYTES = 400_000
+SMALLER = {  # what a notebook says, and what is run here: seconds instead of minutes
+    "SECONDS = 0.4": "SECONDS = 0.1",
+    "SIDE_PX = 256": "SIDE_PX = 96",
+    "FILM_S = 2.0": "FILM_S = 0.5",
+    "END_S = 0.24": "END_S = 0.1",
+    "STEPS = 40": "STEPS = 1",
+    "CLIPS = 12": "CLIPS = 2",
+    "SIDE_PX = 128": "SIDE_PX = 64",
+    "data.test_windows=20": "data.test_windows=8",
+}
 
 
 def blocks() -> list[str]:
@@ -34,3 +56,88 @@ def test_the_page_runs_as_it_stands(tmp_path, monkeypatch):
     assert np.abs(np.stack(frames) - np.stack(fast)).max() < 0.1  # bf16 or float32
     assert len(list(videos.read_video(tmp_path / "film.mp4"))) == 48
     assert len(space["recorded"]) == 300
+
+
+def cells(notebook, kind: str) -> list[dict]:
+    return [c for c in json.loads(notebook.read_text())["cells"] if c["cell_type"] == kind]
+
+
+@pytest.fixture
+def run_notebook(tmp_path, monkeypatch, capfd):
+    """Run the code cells of the notebook of a name, made small; return their namespace."""
+
+    def run_command(words, **options):  # in this process, which has imported PyTorch
+        if words[1] != "-m":
+            return ordinary(words, **options)
+        capfd.readouterr()
+        code = run_here(words[2].removeprefix("src."), *words[3:])
+        return subprocess.CompletedProcess(words, code, *capfd.readouterr())
+
+    ordinary = subprocess.run
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    monkeypatch.setattr(subprocess, "run", run_command)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.chdir(ROOT / "docs" / "notebooks")
+
+    def run(name: str) -> dict:
+        (notebook,) = (path for path in NOTEBOOKS if path.stem == name)
+        space: dict = {}
+        for number, cell in enumerate(cells(notebook, "code")):
+            code = "".join(cell["source"])
+            for large, small in SMALLER.items():
+                code = code.replace(large, small)
+            code = code.replace('Path("out/notebooks', f'Path("{tmp_path}')
+            if "IPython" not in code or importlib.util.find_spec("IPython"):
+                exec(compile(code, f"{name}, code cell {number}", "exec"), space)
+        return space
+
+    yield run
+    if pyplot := sys.modules.get("matplotlib.pyplot"):
+        pyplot.close("all")
+
+
+def test_the_notebook_that_simulates(run_notebook):
+    found = run_notebook("1_simulate")
+    assert found["views"].shape == (9, 13, 64, 96) and len(found["events"]) > 1000
+    assert 0.1 < found["tilt"].std() < 0.6
+    measured = found["mine"].drawn["tilt_px"]
+    assert 0.2 < measured / found["site"].tilt.std() < 5 and (found["OUT"] / "air.yaml").is_file()
+    assert abs(found["mine"].views[0] - found["mine"].clean).mean() > 0.005
+
+
+def test_the_notebook_that_reconstructs(run_notebook):
+    found = run_notebook("2_reconstruct")
+    one, nine = found["one"], found["nine"]
+    assert len(found["events"]) == 59197 and one.shape == nine.shape == (12, 128, 128)
+    assert abs(one - nine).mean() > 0.01 and np.ptp(nine[-1]) > 0.9  # tone=auto
+
+
+def test_the_notebook_that_trains(run_notebook):
+    found = run_notebook("3_train_for_your_site")
+    records = {name: json.loads((found["OUT"] / name / "results.json").read_text())
+               for name in ("trained", "shipped")}  # fmt: skip
+    means = {name: record["test"]["psnr_aligned"]["mean"] for name, record in records.items()}
+    gain = means["trained"] - means["shipped"]
+    assert len(found["won"]) == 2 and gain != 0
+    assert np.mean(found["won"]) == pytest.approx(gain, abs=1e-6)
+    assert f"| {gain:+.3f} |" in (found["OUT"] / "report" / "report.md").read_text()
+
+
+def test_every_setting_that_is_made_small_is_in_a_notebook():
+    text = "".join("".join(cell["source"]) for n in NOTEBOOKS for cell in cells(n, "code"))
+    assert len(NOTEBOOKS) == 3 and [large for large in SMALLER if large not in text] == []
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_is_short_and_shows_what_it_draws(notebook):
+    code, prose = cells(notebook, "code"), cells(notebook, "markdown")
+    assert 6 <= len(code) + len(prose) <= 13 and notebook.stat().st_size < LARGEST_BYTES
+    assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
+    kinds = [kind for cell in code for out in cell["outputs"] for kind in out.get("data", ())]
+    assert kinds.count("image/jpeg") >= 2
+    assert not [o for c in code for o in c["outputs"] if o.get("name") == "stderr"]
+    text = "\n".join("".join(cell["source"]) for cell in prose)
+    assert [line for line in text.splitlines() if len(line) > LINE and line[0] != " "] == []
+    assert [word for word in BANNED if re.search(word, text, re.I)] == []
+    links = [link.partition("#")[0] for link in LINK.findall(text)]
+    assert links and [link for link in links if not (notebook.parent / link).exists()] == []

@@ -211,7 +211,7 @@ def test_turbulence_of_a_film_of_dots(folder, found, tmp_path):
     at_full = views.Views(there.sensor, (SIDE, SIDE), there.field, there.views)
     grid = np.array([[x, y] for y in (30.0, 60.0, 90.0) for x in (30.0, 60.0, 90.0)])
     rng = np.random.default_rng(0)
-    for name, spread, frames in (("still", 0.0, 8), ("dots", 0.7, 24)):
+    for name, spread, frames in (("still", 0.0, 4), ("dots", 0.7, 12)):
         centres = grid + spread * rng.normal(size=(frames, 9, 2))
         film = pictures.dot_grid(
             centres, np.full((frames, 9), 3.0), np.full((frames, 9), -0.6), SIDE

@@ -5,6 +5,7 @@ import csv
 import pytest
 
 from src.stress import stress
+from tests.faults.harness import FORKS
 from tests.test_train import config
 
 HIGHPASS = "{baseline: {_target_: baselines.highpass.HighPass, view_reduction: median}, views: 9}"
@@ -61,7 +62,8 @@ def test_an_entry_of_networks_without_views_is_named(tmp_path):
         stress(tiny(tmp_path, "+networks={bad: {ckpt: nowhere}}"))
 
 
-def test_two_processes_find_what_one_does(tmp_path):
+def test_two_processes_find_what_one_does(tmp_path, monkeypatch):
+    monkeypatch.setattr("src.stress.get_context", lambda _: FORKS)  # the imports are done
     one = "one: {baseline: {_target_: baselines.highpass.HighPass}, views: 1}"
     networks = f"+networks={{median: {HIGHPASS}, {one}}}"
     stress(tiny(tmp_path / "a", networks))

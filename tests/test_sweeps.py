@@ -1,7 +1,6 @@
 """Every sweep is a multirun whose jobs compose, and whose last job runs, tiny."""
 
 import json
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -18,7 +17,7 @@ from src.records import results
 from src.stress import stress
 from src.train import train
 from tests.conftest import ROOT
-from tests.test_entry_points import command, environment
+from tests.test_entry_points import run_here
 from tests.test_train import TINY, config
 
 SWEEPS = sorted((ROOT / "sweeps").glob("*.yaml"))
@@ -47,17 +46,19 @@ def composed(path: Path, run: Path, *overrides: str) -> DictConfig:
     return cfg
 
 
-@pytest.fixture
-def weights(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
     """Files of tiny, untrained networks under the names of weights/."""
-    monkeypatch.setattr(files, "WEIGHTS", tmp_path / "weights")
-    narrow = {"width=4", "~callbacks.progress"}
+    folder, narrow = tmp_path_factory.mktemp("weights"), ("width=4", "~callbacks.progress")
     for name in ("lf3x3", "single256", "setnet_medium", "mambatm", *(f"clean/{n}" for n in CLEAN)):
-        path = files.WEIGHTS / f"{name}.safetensors"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        cfg = config("train", tmp_path, f"experiment={name}", *narrow)
+        path = folder / f"{name}.safetensors"
+        path.parent.mkdir(exist_ok=True)
+        cfg = config("train", folder, f"experiment={name}", *narrow)
         network, spec = build.build_network_and_spec(cfg)
         files.save(path, network, spec, {})
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(files, "WEIGHTS", folder)
+        yield
 
 
 @pytest.mark.parametrize("path", SWEEPS, ids=lambda path: path.stem)
@@ -84,24 +85,18 @@ def test_every_job_composes_and_the_last_runs(path, tmp_path, weights):
 SCORED = ["-m", "baseline=highpass", "debug=fdr", "metrics.lpips=null"]
 
 
-def sweep(folder: Path, *overrides: str) -> subprocess.CompletedProcess:
-    line = command("eval", *SCORED, *overrides, f"paths.out={folder}")
-    return subprocess.run(line, cwd=ROOT, env=environment(), capture_output=True, text=True)
-
-
-def test_a_failed_job_is_named_and_the_rest_stands(tmp_path):
-    first = sweep(tmp_path, "data.test_crop=1000,32")
-    assert first.returncode == 1 and "Traceback" not in first.stderr
-    assert "error: 1 failed" in first.stderr and "data.test_crop=1000" in first.stderr
-    done = sorted(tmp_path.rglob("results.json"))
+def test_a_failed_job_is_named_and_the_rest_stands(tmp_path, capsys):
+    assert run_here("eval", *SCORED, "data.test_crop=1000,32", f"paths.out={tmp_path}") == 1
+    said = capsys.readouterr().err
+    assert "error: 1 failed" in said and "data.test_crop=1000" in said and "Traceback" not in said
+    (done,) = tmp_path.rglob("results.json")
     (failed,) = tmp_path.rglob("failed.txt")
-    assert len(done) == 1 and "Traceback" in failed.read_text()
-    times = [file.stat().st_mtime_ns for file in done]
+    assert "Traceback" in failed.read_text()
+    time = done.stat().st_mtime_ns
 
-    second = sweep(tmp_path, "data.test_crop=32")
-    assert second.returncode == 0, second.stderr
-    assert second.stdout.count("skipped, its results stand") == 1
-    assert [file.stat().st_mtime_ns for file in done] == times
+    assert run_here("eval", *SCORED, "data.test_crop=32", f"paths.out={tmp_path}") == 0
+    assert capsys.readouterr().out.count("skipped, its results stand") == 1
+    assert done.stat().st_mtime_ns == time
 
 
 CONFIG = "task: {task}\nckpt: {ckpt}\nlr: {lr}\npaths:\n  run: {run}\nlogger:\n  dir: {run}/logs\n"

@@ -121,6 +121,8 @@ class EvrealBenchmark:
 def _load_network(cfg: DictConfig) -> EventToVideoNetwork:
     if cfg.get("postprocess") or cfg.get("backward_warmup_s"):
         raise ValueError("data=evreal needs postprocess=none and backward_warmup_s=0.0")
+    if own := sorted(set(cfg.metrics) - set(build.SHIPPED_METRIC_KEYS)):
+        raise ValueError(f"data=evreal has the metrics of its protocol only, got metrics.{own[0]}")
     network = as_event_network(build.load_network(cfg))
     if network.views not in (None, 1):
         raise ValueError(f"ckpt must take one view for data=evreal, got one of {network.views}")

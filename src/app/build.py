@@ -9,6 +9,7 @@ from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.callbacks import ProgressBar
 from omegaconf import DictConfig
 from torch import nn
+from torchmetrics import Metric
 
 import src.models
 from baselines.postprocess import Postprocessed
@@ -41,6 +42,7 @@ from src.training.teachers import TeacherEnsemble
 DATA_OPTIONS = (
     "batch_size", "batch_reuse", "epoch_clips", "val_clips", "test_clips", "workers", "simulate_on",
 )  # fmt: skip
+SHIPPED_METRIC_KEYS = ("lpips", "resolution_scale")
 
 
 def build_data_module(
@@ -139,9 +141,21 @@ def build_video_method(cfg: DictConfig) -> VideoMethod:
 
 
 def build_metrics(cfg: DictConfig) -> VideoMetrics:
-    """Return the metrics of validation and test: without `metrics.lpips`, all but LPIPS."""
+    """Return the metrics of validation and test: those of the project, LPIPS if `metrics.lpips` is
+    given, and every further part of `metrics`, the user's own; ValueError for what is none.
+    """
     lpips = build_part(cfg, "metrics.lpips") if cfg.metrics.lpips else None
-    return VideoMetrics(lpips, cfg.metrics.resolution_scale)
+    names = [name for name in cfg.metrics if name not in SHIPPED_METRIC_KEYS and cfg.metrics[name]]
+    own = {str(name): _build_own_metric(cfg, str(name)) for name in names}
+    return VideoMetrics(lpips, cfg.metrics.resolution_scale, own)
+
+
+def _build_own_metric(cfg: DictConfig, name: str) -> Metric:
+    metric = build_part(cfg, f"metrics.{name}")
+    if not isinstance(metric, Metric):
+        got = f"{type(metric).__module__}.{type(metric).__name__}"
+        raise ValueError(f"metrics.{name}._target_ must be a torchmetrics.Metric, got {got}")
+    return metric
 
 
 def build_loss(cfg: DictConfig) -> TrainingLoss:

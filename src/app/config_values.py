@@ -37,12 +37,13 @@ KINDS: dict[str, tuple[str, ...]] = {
          "data.batch_reuse", "data.epoch_clips", "data.windows", "data.substeps", "data.workers",
          "data.test_windows", "data.test_clips", "data.val_clips", "data.unscored_windows",
          "data.loss_from", "data.events_per_window", "optics.views", "width", "scene.height",
-         "scene.width"),
+         "scene.width", "sample_clips"),
         (WHOLE,),
     ),
     **dict.fromkeys(("sensor_size", "resolution", "line", "circle", "spin"), (LIST, NULL)),
     **dict.fromkeys(("videos", "offered_networks", "allowed_origins"), (LIST,)),
     **dict.fromkeys(("teachers", "against", "chart:ckpt", "stress:ckpt"), (WORD, LIST, NULL)),
+    "train:start": (WORD, NULL),
     "run": (WORD, LIST),
     "names": (LIST, NULL),
     "live:threads": (WHOLE,),
@@ -65,7 +66,8 @@ KINDS: dict[str, tuple[str, ...]] = {
 # Parts whose own classes check whether a number, a range of numbers or null does.
 RANGES = ("augment.", "optics.", "scene.", "sensor.", "target.", "turbulence.")
 SIZES = ("sensor_size", "resolution", "camera.sensor")  # [height, width]
-OPEN = ("callbacks", "logger", "loss", "networks", "scene.parts", "stress_tests")  # more entries do
+# More entries do.
+OPEN = ("callbacks", "logger", "loss", "networks", "references", "scene.parts", "stress_tests")
 
 
 def check_values(cfg: DictConfig) -> None:

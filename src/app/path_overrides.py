@@ -18,9 +18,11 @@ PATH_KEYS = frozenset({
     "save_dir", "teachers", "title", "extra_train_root", "video", "video_root", "videos", "weights",
     "write",
 })  # fmt: skip
-WHOLE_KEYS = frozenset({"hydra.run.dir", "hydra.sweep.dir", "views", "calibrate:still"})
+WHOLE_KEYS = frozenset({
+    "hydra.run.dir", "hydra.sweep.dir", "views", "calibrate:still", "train:start",
+})  # fmt: skip
 SWEEP_FUNCTION = re.compile(r"(choice|range|interval|glob|sort|shuffle|tag)\s*\(.*\)", re.DOTALL)
-MAX_FOLDER_BYTES = 200
+MAX_FOLDER_BYTES = 60
 QUOTED = re.compile(r"""'([^'\\]|\\.)*'|"([^"\\]|\\.)*\"""", re.DOTALL)
 
 
@@ -119,16 +121,23 @@ def name_job_folder(overrides: Iterable[str]) -> str:
     """Return the overrides of a sweep's job as the name of one folder, at most MAX_FOLDER_BYTES:
     `experiment-lf3x3_seed-0`, so that it may be given as ckpt= without quotes.
 
-    Different overrides have different names: where a name could stand for others too, or is cut, a
-    hash of the overrides ends it.
+    Longer ones have the last words of the keys, or the values alone.  Different overrides have
+    different names: where a name could stand for others too, or is not whole, a hash of the
+    overrides ends it.
     """
     pairs = [override.partition("=")[::2] for override in sorted(overrides)]
     pairs = [(key, _as_typed(value)) for key, value in pairs if key != "paths.out"]
-    plain = "_".join(f"{key}={value}" for key, value in pairs)
-    name = re.sub(r"[/=\\\n]", "-", plain)
+    name = _join_for_folder(f"{key}={value}" for key, value in pairs)
     others = any(f"_{key}" in value for _, value in pairs for key, _ in pairs)
     signs = any(sign in value for _, value in pairs for sign in "/=\\\n")
     if not (others or signs or len(name.encode()) > MAX_FOLDER_BYTES):
         return name
-    kept = name.encode()[: MAX_FOLDER_BYTES - 9].decode(errors="ignore")
+    shorter = _join_for_folder(f"{key.split('.')[-1]}={value}" for key, value in pairs)
+    values, room = _join_for_folder(value for _, value in pairs), MAX_FOLDER_BYTES - 9
+    fitting = [text for text in (name, shorter, values) if len(text.encode()) <= room]
+    kept = [*fitting, values.encode()[:room].decode(errors="ignore")][0]
     return f"{kept}_{hashlib.sha256(repr(pairs).encode()).hexdigest()[:8]}"
+
+
+def _join_for_folder(texts: Iterable[str]) -> str:
+    return re.sub(r"[/=\\\n]", "-", "_".join(texts)).lstrip("-.")

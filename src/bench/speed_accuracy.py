@@ -11,7 +11,7 @@ import torch
 from src.bench.candidates import Candidate
 from src.bench.speed import FORMS, SpeedMeasurement
 from src.deploy.forms import convert_to_form
-from src.metrics.table import METRICS
+from src.metrics.table import METRICS, NAMES, own_column
 from src.metrics.video_metrics import VideoMetrics
 from src.records.results import format_csv
 from src.sim.pipeline import Pipeline, simulate
@@ -127,7 +127,9 @@ def format_chart_summary(
     recommended: Mapping[str, str], side: int,
 ) -> str:  # fmt: skip
     """Return the recommended networks and a table of means over all clips, as Markdown."""
-    metrics = [metric for metric in METRICS if scores and metric.name in scores[0].values]
+    values = scores[0].values if scores else {}
+    metrics = [metric for metric in METRICS if metric.name in values]
+    metrics += [own_column(name, 0) for name in values if name not in NAMES]
     heads = [metric.heading for metric in metrics]
     lines = ["# Speed against accuracy\n"]
     lines += [f"- {severity} turbulence: take {name}." for severity, name in recommended.items()]

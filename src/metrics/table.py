@@ -37,3 +37,8 @@ METRICS = (
     Column("temporal_jitter_px", "temporal jitter px", 2, -1),
 )
 NAMES = tuple(metric.name for metric in METRICS)
+
+
+def own_column(name: str, better: int) -> Column:
+    """Return the column of a metric that a config has added, under its key there."""
+    return Column(name, name, 3, better)

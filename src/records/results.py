@@ -16,7 +16,7 @@ from rich.console import RenderableType
 from rich.table import Table
 
 from src.metrics.bootstrap import bootstrap_interval
-from src.metrics.table import METRICS, NAMES
+from src.metrics.table import METRICS, NAMES, Column
 from src.records import safe_yaml
 from src.records.atomic import write_text
 
@@ -26,13 +26,16 @@ LEAST_FREE_BYTES = 200 * 2**20
 
 @dataclass(frozen=True)
 class ScoreRow:
-    """A network of a table: scores and drawn parameters of every clip, and its cost."""
+    """A network of a table: scores and drawn parameters of every clip, and its cost;
+    `own_metrics`: those of the scores that a config has added.
+    """
 
     name: str
     clips: list[dict]
     params: int
     macs_per_frame: int
     latency_ms: dict[str, float]
+    own_metrics: tuple[Column, ...] = ()
 
 
 def create_run_folder(run: Path, config: str) -> None:
@@ -83,10 +86,11 @@ def has_results(run: Path, config: str) -> bool:
     return True
 
 
-def summarize_scores(clips: list[dict]) -> dict:
+def summarize_scores(clips: list[dict], own_metrics: Iterable[Column] = ()) -> dict:
     """Return {clips, metric: {mean, std, interval}} over clips; `interval`: 95 % bootstrap CI."""
     summary: dict = {"clips": len(clips)}
-    for metric in (name for name in NAMES if clips and name in clips[0]):
+    names = (*NAMES, *(metric.name for metric in own_metrics))
+    for metric in (name for name in names if clips and name in clips[0]):
         values = [clip[metric] for clip in clips]
         mean, std = statistics.fmean(values), statistics.pstdev(values)
         summary[metric] = {"mean": mean, "std": std, "interval": bootstrap_interval(values)}
@@ -110,10 +114,12 @@ def write_and_print_results(
         "git": git_commit(),
         "config_sha256": hash_config(config),
         "model": model,
-        "test": summarize_scores(first.clips),
+        "test": summarize_scores(first.clips, first.own_metrics),
         "latency_ms": first.latency_ms,
-        "compared": {row.name: summarize_scores(row.clips) for row in rows[1:]},
+        "compared": {row.name: summarize_scores(row.clips, row.own_metrics) for row in rows[1:]},
     }
+    if first.own_metrics:  # a report has no other way to know which values are better
+        record["own_metrics"] = {metric.name: metric.better for metric in first.own_metrics}
     columns = list(first.clips[0])
     values = [[clip[name] for name in columns] for clip in first.clips]
     write_text(run / "clips.csv", format_csv(columns, values))
@@ -136,12 +142,13 @@ def build_rich_score_table(rows: list[ScoreRow]) -> Table:
     """Return mean scores over clips, one line per network; arrows point to better values."""
     picture = Table(title=f"{len(rows[0].clips)} test clips, mean of per-frame values")
     picture.add_column("network", overflow="fold")
-    for metric in METRICS:
+    metrics = (*METRICS, *rows[0].own_metrics)
+    for metric in metrics:
         picture.add_column(metric.title, justify="right", overflow="fold")
     picture.add_column("ms/frame", justify="right", overflow="fold")
     for row in rows:
-        means = summarize_scores(row.clips)
-        cells = [m.format_value(means.get(m.name, {}).get("mean")) for m in METRICS]
+        means = summarize_scores(row.clips, row.own_metrics)
+        cells = [m.format_value(means.get(m.name, {}).get("mean")) for m in metrics]
         picture.add_row(row.name, *cells, f"{next(iter(row.latency_ms.values())):.1f}")
     return picture
 

@@ -3,12 +3,23 @@
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from src.records.runs import Run, SweepPlan
 
 FIRST_KEYS = ("task", "method", "experiment", "resolution", "postprocess", "baseline", "optics")
 LAST_KEYS = ("budget", "debug")
+# What the test clips and their scores follow from: a key, or the beginning of several.
+TEST_CONDITIONS = (
+    "scene.", "turbulence.", "sensor.", "fps", "metrics.resolution_scale", "metrics.lpips.",
+    "data.test_", "data.unscored_windows", "data.substeps", "data.benchmark", "data.window",
+    "data.events_per_window", "data.part_s", "data.tolerance_ms", "data.start_s", "data.end_s",
+    "data.warm_up_s", "data.histogram",
+)  # fmt: skip
+NO_CONDITIONS = (  # the first is told by the run, the others are of training
+    "data.test_seed", "data.windows", "scene.extra_train_root",
+)  # fmt: skip
 
 
 @dataclass
@@ -23,6 +34,25 @@ class RunGroup:
     runs: list[Run]
     missing: int = 0
     older: int = 0
+
+    @cached_property
+    def test_conditions(self) -> tuple:
+        """The settings and seeds that the test clips follow from: scores of groups in which they
+        are equal can be compared.
+        """
+        found = {
+            (key, format_setting(value))
+            for run in self.runs
+            for key, value in run.settings.items()
+            if key.startswith(TEST_CONDITIONS) and key not in NO_CONDITIONS
+        }
+        return frozenset(found), frozenset(run.test_seed for run in self.runs)
+
+    @cached_property
+    def timing_conditions(self) -> tuple:
+        """The sizes of the timed frames and the devices."""
+        sizes = frozenset(size for run in self.runs for size in run.record["latency_ms"])
+        return sizes, frozenset(run.record["device"] for run in self.runs)
 
 
 def group_runs(

@@ -5,11 +5,11 @@ of two sets of runs.
 import math
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from src.metrics.bootstrap import bootstrap_difference_interval
-from src.metrics.table import METRICS, Column
+from src.metrics.table import METRICS, Column, own_column
 from src.records.runs import Run
 from src.reports.run_groups import RunGroup, find_published
 
@@ -35,19 +35,35 @@ class Table:
     rows: list[list[TableCell]]
     labels: int
     note: str = ""
+    groups: list[RunGroup] = field(default_factory=list)  # one per row
 
     def add_row(self, group: RunGroup, cells: Iterable[TableCell]) -> None:
         """Add a row of the group's label and `cells`."""
         self.rows.append([*(TableCell(text=text) for text in group.label), *cells])
+        self.groups.append(group)
 
-    def is_best(self, place: int, cell: TableCell) -> bool:
-        """Return whether `cell` is the best of column `place`, as printed."""
-        head = self.columns[place]
-        means = [row[place].mean for row in self.rows]
-        printed = {round(mean, head.digits) for mean in means if mean is not None}
-        if head.better == 0 or len(printed) < 2 or cell.mean is None:
+    def is_best(self, number: int, place: int) -> bool:
+        """Return whether row `number` is the best in column `place`, as printed, of the rows with
+        equal test conditions; of times, with equal frames and devices.
+        """
+        head, mean = self.columns[place], self.rows[number][place].mean
+        if head.better == 0 or mean is None:
             return False
-        return round(cell.mean, head.digits) == (max if head.better > 0 else min)(printed)
+        kind = "timing_conditions" if head.name == "ms" else "test_conditions"
+        asked = getattr(self.groups[number], kind)
+        rows = zip(self.rows, self.groups, strict=True)
+        means = [row[place].mean for row, group in rows if getattr(group, kind) == asked]
+        printed = {round(value, head.digits) for value in means if value is not None}
+        best = (max if head.better > 0 else min)(printed)
+        return len(printed) > 1 and round(mean, head.digits) == best
+
+
+def list_metrics(runs: Iterable[Run]) -> tuple[Column, ...]:
+    """Return the project's metrics and those that the configs of `runs` have added."""
+    added = {
+        name: better for run in runs for name, better in run.record.get("own_metrics", {}).items()
+    }
+    return (*METRICS, *(own_column(name, better) for name, better in added.items()))
 
 
 COSTS: tuple[tuple[Column, Callable[[Run], float]], ...] = (
@@ -67,14 +83,15 @@ def build_score_table(
     """
     found = [find_published(group.runs[0], published) if group.runs else {} for group in groups]
     theirs = [score for score in METRICS if any(score.name in row for row in found)]
-    columns = [*(Column(key, key) for key in keys), *METRICS, *(column for column, _ in COSTS)]
+    metrics = list_metrics(run for group in groups for run in group.runs)
+    columns = [*(Column(key, key) for key in keys), *metrics, *(column for column, _ in COSTS)]
     columns.append(Column("n", "n"))
     for c in theirs:
         digits = c.digits + (c.digits == 3)
         columns.append(Column(f"paper_{c.name}", c.heading, digits, group=published["source"]))
     table = Table(title, columns, [], len(keys))
     for group, row in zip(groups, found, strict=True):
-        cells = [_mean_over_seeds(group.runs, _score(column.name)) for column in METRICS]
+        cells = [_mean_over_seeds(group.runs, _score(column.name)) for column in metrics]
         cells += [_mean_over_seeds(group.runs, cost, column.better != 0) for column, cost in COSTS]
         done, asked = len(group.runs), len(group.runs) + group.missing
         count = str(done) if not group.missing else f"{done} of {asked}" if done else "missing"
@@ -105,12 +122,13 @@ def build_reference_methods_table(
     title: str, keys: Sequence[str], groups: Sequence[RunGroup]
 ) -> Table | None:
     """Return each network and what else its runs scored, such as the untrained one."""
-    columns = [*(Column(key, key) for key in keys), Column("network", "network"), *METRICS]
+    metrics = list_metrics(run for group in groups for run in group.runs)
+    columns = [*(Column(key, key) for key in keys), Column("network", "network"), *metrics]
     table = Table(title, columns, [], len(keys) + 1)
     for group in groups:
         others = dict.fromkeys(n for run in group.runs for n in run.record.get("compared", {}))
         for name in (None, *others) if others else ():
-            cells = [_mean_over_seeds(group.runs, _score(c.name, name)) for c in METRICS]
+            cells = [_mean_over_seeds(group.runs, _score(c.name, name)) for c in metrics]
             table.add_row(group, [TableCell(text=name or "trained"), *cells])
     return table if table.rows else None
 
@@ -129,7 +147,7 @@ def build_difference_table(
     heads = ("metric", "ours", "theirs", "ours - theirs", "95 % bootstrap CI", "published")
     table = Table(title, [Column(head, head) for head in heads], [], 1)
     rows = [find_published(side[0], published) for side in (ours, theirs)]
-    for metric in METRICS:
+    for metric in list_metrics([*ours, *theirs]):
         if not all(metric.name in clip for run in [*ours, *theirs] for clip in run.clips):
             continue
         sides = [[[float(clip[metric.name]) for clip in run.clips] for run in side]
@@ -191,6 +209,8 @@ def _describe_measurement(groups: Sequence[RunGroup]) -> str:
     unlike = " Rows differ in the seed of their test clips." if len(seeds) > 1 else ""
     if older := sum(group.older for group in groups):
         unlike += f" {older} older runs of the same seeds are left out."
+    if len({group.test_conditions for group in groups if group.runs}) > 1:
+        unlike += " Bold: the best of the rows with equal scene, turbulence, sensor and clips."
     return (
         f"{clips} test clips; ms and GMAC of one frame of {sizes}; ± is the "
         f"sample standard deviation over n seeds; {devices}.{unlike}"

@@ -15,11 +15,11 @@ def format_markdown(tables: Sequence[Table], commands: Sequence[str] = ()) -> st
         rules = ["---" if place < table.labels else "--:" for place in range(len(table.columns))]
         heads = [f"{c.group}: " * bool(c.group) + c.title for c in table.columns]
         lines = [f"**{_escape(table.title)}**", "", _format_line(heads), _format_line(rules)]
-        for row in table.rows:
+        for number, row in enumerate(table.rows):
             texts = []
             for place, cell in enumerate(row):
                 text = _escape(format_cell(cell, table.columns[place]))
-                texts.append(f"**{text}**" if table.is_best(place, cell) else text)
+                texts.append(f"**{text}**" if table.is_best(number, place) else text)
             lines.append(_format_line(texts))
         parts += ["\n".join(lines), *([_escape(table.note)] if table.note else [])]
     return "\n\n".join(parts) + "\n"

@@ -38,6 +38,7 @@ def test_network(
         params=sum(parameter.numel() for parameter in network.parameters()),
         macs_per_frame=macs_of_frame,
         latency_ms={f"{height}x{width}": milliseconds},
+        own_metrics=metrics.own_columns,
     )
 
 

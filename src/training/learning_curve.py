@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from lightning import Callback, Trainer
 
-from src.metrics.table import NAMES
 from src.models import files
 from src.records.atomic import write_text
 from src.records.results import format_csv
@@ -119,7 +118,7 @@ def mean_scores(trainer: Trainer, module: Reconstructor) -> dict[str, float]:
         clips = [scores for sample in samples for scores in module.score_clips_into_metrics(sample)]
     module.metrics.reset()
     module.train()
-    return {name: fmean(clip[name] for clip in clips) for name in NAMES if name in module.metrics}
+    return {name: fmean(clip[name] for clip in clips) for name in module.metrics.names}
 
 
 def read_training_progress(path: Path) -> dict:

@@ -165,7 +165,13 @@ class Reconstructor(LightningModule):
             frames = self.method.reconstruct_clip(sample)
         scored = slice(self.unscored_windows, None)
         clips = zip(frames[:, scored], sample.target[:, scored], sample.parameters, strict=True)
-        return [drawn | self.metrics(ours, truth) for ours, truth, drawn in clips]
+        scored_clips = []
+        for ours, truth, drawn in clips:
+            if taken := sorted(drawn.keys() & set(self.metrics.names)):
+                why = "a parameter of the clips has that name"
+                raise ValueError(f"metrics.{taken[0]} must be called otherwise: {why}")
+            scored_clips.append(drawn | self.metrics(ours, truth))
+        return scored_clips
 
     def configure_optimizers(self):
         assert self.make_optimizer is not None

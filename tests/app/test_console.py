@@ -5,7 +5,6 @@ import os
 import pty
 import re
 import select
-import subprocess
 import sys
 import time
 from unittest.mock import Mock
@@ -19,6 +18,7 @@ from src.app.help import help_text
 from src.records.results import ScoreRow, build_rich_score_table
 from src.training.progress import TrainingProgress
 from tests.conftest import ROOT
+from tests.test_entry_points import run_here
 from tests.test_train import config
 
 SMALL = [
@@ -42,10 +42,10 @@ def test_help_shows_keys_with_their_comments_and_the_choices_of_groups():
 
 
 @pytest.mark.parametrize("command", ["simulate", "train"])
-def test_every_command_has_help(command):
-    run = [sys.executable, "-m", f"src.{command}", "--help"]
-    done = subprocess.run(run, cwd=ROOT, check=True, capture_output=True, text=True, timeout=300)
-    assert "seed: 0  " in done.stdout and f"python -m src.{command}" in done.stdout
+def test_every_command_has_help(command, capsys):
+    assert run_here(command, "--help") == 0
+    said = capsys.readouterr().out
+    assert "seed: 0  " in said and f"python -m src.{command}" in said
 
 
 @pytest.mark.parametrize(

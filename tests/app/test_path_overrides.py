@@ -85,6 +85,23 @@ def test_names_of_jobs_differ_as_their_overrides_do():
     assert name_job_folder(plain) == "experiment-lf3x3_seed-0"
 
 
+@pytest.mark.parametrize(
+    ("job", "name"),
+    [
+        (["turbulence.atmosphere.tilt_and_blur_px.strong=[2.0,2.0]", "method=lf3x3"],
+         "method-lf3x3_strong-[2.0,2.0]_"),
+        (["turbulence.atmosphere.tilt_correlation_half_length_px=[7,7]", "method=lf3x3",
+          "turbulence.atmosphere.tilt_and_blur_px.strong=[2.0,2.0]"], "lf3x3_[2.0,2.0]_[7,7]_"),
+        (["ckpt='/data/runs/one'", "turbulence.atmosphere.tilt_and_blur_px.strong=[2.0,2.0]"],
+         "ckpt--data-runs-one_strong-[2.0,2.0]_"),
+        ([f"ckpt='/data/{'r' * 99}'"], f"data-{'r' * 46}_"),
+    ],
+)  # fmt: skip
+def test_a_long_job_has_a_short_name_that_says_what_is_varied(job, name):
+    made = name_job_folder(job)
+    assert made.startswith(name) and len(made) == len(name) + 8 <= 60
+
+
 @pytest.mark.parametrize("locale", [{"PYTHONIOENCODING": "latin-1"}, {"PYTHONIOENCODING": "ascii"}])
 def test_a_console_of_few_signs_ends_no_job(locale, tmp_path):
     text = "from src.app import console; console.prepare_streams(); print('größe • ━ ↑ 日')"

@@ -1,8 +1,5 @@
 """A key of an earlier version ends in one line that names the new key, wherever it was given."""
 
-import subprocess
-import sys
-
 import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
@@ -43,16 +40,3 @@ def test_no_entry_point_has_a_former_key(entry_point):
     with initialize_config_dir(str(ROOT / "conf"), version_base=None):
         cfg = compose(entry_point)
     renamed_keys.check_keys(cfg)
-
-
-@pytest.mark.parametrize(
-    ("entry_point", "override"),
-    [("train", "calm=1"), ("eval", "+calm=1"), ("report", "++calm=1"), ("chart", "~calm")],
-)
-def test_the_command_line_gets_one_line_and_exit_code_2(entry_point, override, tmp_path):
-    command = [sys.executable, "-m", f"src.{entry_point}", override, f"paths.out={tmp_path}"]
-    if entry_point == "report":
-        command.append("run=nowhere")
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 2
-    assert done.stderr.splitlines() == ["error: calm is now loss.static_flicker.weight"]

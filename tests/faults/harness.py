@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 
+import cv2
+import numpy as np
 import torch
 from omegaconf import OmegaConf
 
@@ -82,6 +84,11 @@ class Run:
         return self.log.read_text(errors="replace")
 
 
+def leave_slices_out(_rows: object, path: Path, **_: object) -> None:
+    """Leave a picture of one pixel."""
+    path.write_bytes(cv2.imencode(".png", np.zeros((1, 1), np.uint8))[1].tobytes())
+
+
 def _work(log: str, work: Callable, arguments: tuple) -> None:
     file = os.open(log, os.O_WRONLY | os.O_APPEND)
     for number, name in ((1, "stdout"), (2, "stderr")):
@@ -91,7 +98,9 @@ def _work(log: str, work: Callable, arguments: tuple) -> None:
     multiprocessing.set_start_method("fork", force=True)  # for loaders' workers, as of a run
     torch.set_num_threads(1)
     from src.app import entry_point
+    from src.figures import samples
 
+    samples.draw_comparison = leave_slices_out
     entry_point.run_main(lambda: work(*arguments))
 
 

@@ -2,17 +2,17 @@
 
 import csv
 import io
+import json
 import math
-from html.parser import HTMLParser
 
 import pytest
 from omegaconf import OmegaConf
 
 from src.records import runs
 from src.report import report
-from src.reports import page, run_groups, tables, writers
+from src.reports import run_groups, tables, writers
 from tests.conftest import ROOT
-from tests.reports.runs import clips_of, write_run, write_samples, write_sweep
+from tests.reports.runs import clips_of, write_run, write_sweep
 from tests.test_train import config
 
 NO_PAPER = {"source": "none", "rows": []}
@@ -106,8 +106,34 @@ def test_the_best_of_a_column_is_what_is_printed_best(tmp_path):
         write_run(tmp_path / name, name, scores={"psnr": psnr})
     table, _, _ = built(tmp_path)
     place = [column.name for column in table.columns].index("psnr")
-    marked = [table.is_best(place, row[place]) for row in table.rows]
-    assert marked == [True, True, False]
+    assert [table.is_best(row, place) for row in range(3)] == [True, True, False]
+
+
+def test_the_best_is_one_of_the_rows_with_equal_conditions(tmp_path):
+    for strength, better in (("weak", 20.0), ("strong", 15.0)):
+        for name in ("lf3x3", "single256"):
+            asked = {"settings": {"turbulence": {"severity": strength}, "width": len(name)}}
+            scores = {"psnr": better + (name == "lf3x3")}
+            write_run(tmp_path / f"{strength}{name}", name, scores=scores, **asked)
+    write_run(tmp_path / "alone", "alone", seed=7, scores={"psnr": 30.0}, task="eval")
+    table, _, _ = built(tmp_path)
+    best = [row for row in range(5) if table.is_best(row, table.columns.index(tables.METRICS[2]))]
+    found = {(table.rows[row][0].text, table.rows[row][1].text) for row in best}
+    assert sorted(value(table, row, "psnr").mean for row in best) == [16.0, 21.0]
+    assert all("lf3x3" in names for names in found) and "Bold: the best of the rows" in table.note
+    text = writers.format_markdown([table])
+    assert "**21.00**" in text and "**16.00**" in text and "**30.00**" not in text
+
+
+def test_times_are_compared_on_equal_frames_whatever_the_turbulence(tmp_path):
+    for place, (size, ms) in enumerate([("128x128", 9.0), ("128x128", 5.0), ("64x64", 1.0)]):
+        run = write_run(tmp_path / str(place), f"net{place}", settings={"fps": 100 + place})
+        record = json.loads((run / "results.json").read_text()) | {"latency_ms": {size: ms}}
+        (run / "results.json").write_text(json.dumps(record))
+    table, _, _ = built(tmp_path)
+    place = [column.name for column in table.columns].index("ms")
+    best = [table.rows[row][place].mean for row in range(3) if table.is_best(row, place)]
+    assert best == [5.0]
 
 
 def test_csv_has_full_precision_and_mean_and_spread_apart(tmp_path):
@@ -173,54 +199,6 @@ def test_the_most_specific_row_of_the_paper_stands_beside_a_run(tmp_path):
     table, keys, _ = built(tmp_path, paper)
     assert keys == ("postprocess",)
     assert [value(table, row, "paper_psnr").mean for row in (0, 1)] == [1.0, 2.0]
-
-
-class Seen(HTMLParser):
-    """The tags and the addresses of a page; fails where a tag is left open."""
-
-    def __init__(self, text: str):
-        super().__init__()
-        self.open, self.tags, self.addresses = [], [], []
-        self.feed(text)
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append(tag)
-        self.addresses += [value for key, value in attrs if key in ("src", "href")]
-        if tag not in ("meta", "img"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-
-def test_the_page_needs_nothing_from_elsewhere_and_keeps_names_harmless(tmp_path):
-    run = write_run(tmp_path / "a", "<script>alert(1)</script>{{body}}")
-    write_samples(run)
-    (tmp_path / "chart.svg").write_text("<svg xmlns='http://www.w3.org/2000/svg'/>")
-    table, _, made = built(tmp_path)
-    text = page.format_html(
-        "t", [table], made, runs.find_figures([tmp_path]), commands=[], media_bytes=1 << 20
-    )
-    seen = Seen(text)
-    assert seen.open == [] and seen.tags.count("script") == 1 and seen.tags.count("img") == 3
-    assert all(address.startswith("data:image/") for address in seen.addresses)
-
-
-def test_a_chart_alone_makes_a_page(tmp_path):
-    (tmp_path / "runs").mkdir()
-    for suffix in ("png", "svg"):
-        (tmp_path / "runs" / f"stress.{suffix}").write_text("<svg/>")
-    assert report(config("report", tmp_path / "out", f"run={tmp_path / 'runs'}")) == []
-    text = (tmp_path / "out" / "report.html").read_text()
-    assert text.count("<img") == 1 and "data:image/svg+xml;base64" in text and "Stress" in text
-
-
-def test_pictures_beyond_the_bound_are_named(tmp_path):
-    run = write_run(tmp_path / "a")
-    write_samples(run, size=64)
-    table, _, made = built(tmp_path)
-    text = page.format_html("t", [table], made, [], commands=[], media_bytes=100)
-    assert "<img" not in text and "Left out" in text and "clip0.gif" in text
 
 
 def test_the_entry_point_writes_three_files_and_the_section(tmp_path):

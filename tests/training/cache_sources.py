@@ -1,8 +1,9 @@
-"""What test_parallel_fill.py has drawn by other processes, which need not load the tests for it."""
+"""What tests of caches have drawn by other processes, which need not load the tests for it."""
 
 import multiprocessing
 import os
 import signal
+import time
 from pathlib import Path
 
 import torch
@@ -12,6 +13,7 @@ from src.sim.optics import Optics
 from src.sim.pipeline import Pipeline
 from src.sim.sensor import EventSensor
 from src.sim.turbulence.simulated import SimulatedTurbulence
+from src.training.disk_cache import BackgroundFiller, DiskClipCache
 from tests.sim.test_pipeline import Waves
 
 MIXED = SimulatedTurbulence({"severity": "mixed"}, temporal_model="mixed")
@@ -22,6 +24,17 @@ def source(scene=None, turbulence=MIXED) -> Pipeline:
         scene or Waves(frames=7, side=40), Optics(9), turbulence, EventSensor(), split="train",
         crop=24, random_crop=True,
     )  # fmt: skip
+
+
+class Slow(Waves):
+    """Waves that take their time."""
+
+    def __init__(self):
+        super().__init__(frames=7, side=40)
+
+    def clip(self, index: int):
+        time.sleep(0.2)
+        return super().clip(index)
 
 
 class Telling(Waves):
@@ -90,3 +103,11 @@ def fill_for_ever(told: str) -> None:
         part.rename(told)
 
     fill(source(), range(10**6), store, device="cpu", workers=2)
+
+
+def start_filler(cache: DiskClipCache, told: Path) -> None:
+    """Start a filler, as a training does, and hang; the filler's number is in the file `told`."""
+    filler = BackgroundFiller(cache)
+    filler.start()
+    told.write_text(str(filler.process.pid))
+    time.sleep(600)

@@ -29,9 +29,11 @@ from src.training.disk_cache import (
     hash_file_lists,
     hash_simulation_code,
 )
+from tests.faults.harness import FORKS
 from tests.faults.test_surroundings import small_files
 from tests.sim.test_pipeline import Waves
 from tests.test_train import TINY, config
+from tests.training.cache_sources import Slow, start_filler
 from tests.training.test_datamodule import FakeTrainer
 
 WEAK = SimulatedTurbulence({"severity": "weak"})
@@ -40,14 +42,6 @@ DRAWN = {
     "initial_reference_error": 1.0,
     "random": {"threshold": [0.1, 0.3], "dark_noise_hz": [0, 5]},
 }
-
-
-class Slow(Waves):
-    """Waves that take their time."""
-
-    def clip(self, index: int):
-        time.sleep(0.2)
-        return super().clip(index)
 
 
 def source(optics=None, turbulence=WEAK, scene=None, **kwargs) -> Pipeline:
@@ -333,8 +327,8 @@ def work(of: DiskClipCache) -> None:
 
 
 def test_killed_again_and_again_the_cache_is_the_same(tmp_path):
-    (alone := disk_cache(tmp_path / "alone", scene=Slow(frames=7, side=40))).fill()
-    of = disk_cache(tmp_path / "killed", scene=Slow(frames=7, side=40))
+    (alone := disk_cache(tmp_path / "alone", scene=Slow())).fill()
+    of = disk_cache(tmp_path / "killed", scene=Slow())
     forks = multiprocessing.get_context("fork")
     for pause in (0.05, 0.25, 0.3, 0.1):
         process = forks.Process(target=work, args=(of,))
@@ -348,7 +342,7 @@ def test_killed_again_and_again_the_cache_is_the_same(tmp_path):
 
 
 def test_who_needs_a_clip_that_another_makes_waits_for_it(tmp_path, monkeypatch):
-    of = disk_cache(tmp_path, scene=Slow(frames=7, side=40), clips=1)
+    of = disk_cache(tmp_path, scene=Slow(), clips=1)
     process = multiprocessing.get_context("fork").Process(target=work, args=(of,))
     process.start()
     while not (of.folder / "clips.lock").exists():
@@ -359,24 +353,20 @@ def test_who_needs_a_clip_that_another_makes_waits_for_it(tmp_path, monkeypatch)
     process.join()
 
 
-def test_several_processes_fill_a_cache_beforehand(tmp_path, capsys):
+def test_several_processes_fill_a_cache_beforehand(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(multiprocessing, "get_context", lambda _: FORKS)  # the imports are done
     of = disk_cache(tmp_path, clips=4)
     fill_clip_cache(of, 2)
     assert not of.missing() and all(is_intact(of.path(index)) for index in range(4))
     assert "0 of 4 clips" in (printed := capsys.readouterr().out) and "4 of 4 clips" in printed
 
 
-def start_filler(root: Path) -> None:
-    filler = BackgroundFiller(disk_cache(root, clips=500, scene=Slow(frames=7, side=40)))
-    filler.start()
-    (root / "pid").write_text(str(filler.process.pid))
-    time.sleep(600)
-
-
 def test_a_filler_ends_with_the_training_that_started_it(tmp_path):
-    training = multiprocessing.get_context("spawn").Process(target=start_filler, args=(tmp_path,))
+    of = disk_cache(tmp_path, clips=500, scene=Slow())
+    spawn = multiprocessing.get_context("spawn")
+    training = spawn.Process(target=start_filler, args=(of, tmp_path / "pid"))
     training.start()
-    until(lambda: list(tmp_path.glob("*/*.pt")))
+    until(lambda: list(of.folder.glob("*.pt")))
     filler = int((tmp_path / "pid").read_text())
     os.kill(training.pid, signal.SIGKILL)
     training.join()
@@ -384,9 +374,7 @@ def test_a_filler_ends_with_the_training_that_started_it(tmp_path):
 
 
 def test_of_two_fillers_one_fills_and_the_other_takes_over_and_ends(tmp_path):
-    first, second = (
-        BackgroundFiller(disk_cache(tmp_path, 6, scene=Slow(frames=7, side=40))) for _ in range(2)
-    )
+    first, second = (BackgroundFiller(disk_cache(tmp_path, 6, scene=Slow())) for _ in range(2))
     first.start()
     until(lambda: list(tmp_path.glob("*/*.pt")))
     second.start()

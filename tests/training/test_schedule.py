@@ -21,8 +21,8 @@ from tests.test_train import TINY, config
 HOUR = 3600.0  # by the clock below every step is one hour
 
 
-@pytest.fixture(autouse=True)
-def steps_take_an_hour(monkeypatch):
+@pytest.fixture(autouse=True, scope="module")
+def steps_take_an_hour():
     class Ticks:
         at = 0.0
 
@@ -30,7 +30,17 @@ def steps_take_an_hour(monkeypatch):
             self.at += HOUR
             return self.at
 
-    monkeypatch.setitem(schedule.CLOCKS, "wall", Ticks())
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setitem(schedule.CLOCKS, "wall", Ticks())
+        yield
+
+
+@pytest.fixture(scope="module")
+def three_hours(tmp_path_factory) -> Path:
+    """The folder of a training of three hours, exported to now/net.safetensors."""
+    folder = tmp_path_factory.mktemp("three")
+    run(folder, "train_hours=3", f"export={folder / 'now/net.safetensors'}")
+    return folder
 
 
 RECIPE = [
@@ -46,6 +56,10 @@ RECIPE += ["trainer.limit_val_batches=0", "augment.noise_std=0.1", "channels_las
 
 def run(folder: Path, *overrides: str) -> dict:
     train(config("train", folder, *TINY, *RECIPE, *overrides))
+    return checkpoint(folder)
+
+
+def checkpoint(folder: Path) -> dict:
     return torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
 
 
@@ -85,20 +99,19 @@ def test_more_hours_go_on_along_the_longer_cosine(tmp_path):
     assert same["global_step"] == 8, "its hours are over"
 
 
-def test_the_mean_is_exported_and_read_from_a_checkpoint(tmp_path):
-    last = run(tmp_path / "run", "train_hours=3", f"export={tmp_path / 'now' / 'net.safetensors'}")
-    shipped = files.load(tmp_path / "now" / "net.safetensors")
-    mean = files.load(tmp_path / "run" / "checkpoints" / "last.ckpt")
+def test_the_mean_is_exported_and_read_from_a_checkpoint(three_hours):
+    shipped = files.load(three_hours / "now/net.safetensors")
+    mean = files.load(three_hours / "checkpoints" / "last.ckpt")
+    last = checkpoint(three_hours)
     head = last["state_dict"]["network.head.weight"]
     assert not torch.equal(head, last["current_model_state"]["network.head.weight"])
     assert torch.equal(mean.head.weight, head)
     assert torch.allclose(shipped.head.weight, head, atol=1e-3)
 
 
-def test_exported_weights_go_on_where_no_checkpoint_is_left(tmp_path):
-    now = tmp_path / "now" / "net.safetensors"
-    first = run(tmp_path / "first", "train_hours=3", f"export={now}")
-    before = curve(tmp_path / "first")
+def test_exported_weights_go_on_where_no_checkpoint_is_left(three_hours, tmp_path):
+    now = three_hours / "now/net.safetensors"
+    first, before = checkpoint(three_hours), curve(three_hours)
     rise = ["callbacks.schedule.warmup_steps=4", "seed=1"]
     second = run(tmp_path / "second", "train_hours=6", f"ckpt={now}", *rise)
     assert second["seconds"] == 6 * HOUR and second["global_step"] == 3 and second["steps"] == 6
@@ -142,20 +155,17 @@ def test_a_training_that_has_collapsed_ends_and_keeps_what_it_had(tmp_path, monk
     assert files.read_card(now)["hours"] == 0
 
 
-def test_what_goes_on_with_another_loss_has_not_collapsed(tmp_path):
-    now = tmp_path / "now.safetensors"
-    run(tmp_path / "first", "train_hours=3", f"export={now}")
-    _, spec = build.build_network_and_spec(config("train", tmp_path, *TINY))
-    card = files.read_card(now)
+def test_what_goes_on_with_another_loss_has_not_collapsed(three_hours, tmp_path):
+    before, now = three_hours / "now/net.safetensors", tmp_path / "now.safetensors"
+    card = files.read_card(before)
     card["curve"][-1]["loss"] = 1e-6
-    files.save(now, files.load(now), spec, card)
+    files.save(now, files.load(before), files.network_spec(before), card)
     run(tmp_path / "second", "train_hours=6", f"ckpt={now}")
     assert len(curve(tmp_path / "second")) == len(card["curve"]) + 1
 
 
-def test_restored_weights_are_those_that_were_exported(tmp_path):
-    now = tmp_path / "now.safetensors"
-    run(tmp_path / "first", "train_hours=3", f"export={now}")
+def test_restored_weights_are_those_that_were_exported(three_hours, tmp_path):
+    now = three_hours / "now/net.safetensors"
     cfg = config("train", tmp_path / "second", *TINY, *RECIPE)
     network, _ = build.build_network_and_spec(cfg)
     files.restore_weights(network, now)

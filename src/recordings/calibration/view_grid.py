@@ -116,7 +116,8 @@ def find_axis(gram: Gram) -> ViewAxis:
     tried = [(seam, pitch) for pitch in pitches for seam in np.arange(0.0, pitch)]
     shared = np.array([_shared(gram, *fold).sum() for fold in tried])
     size = np.sqrt(np.maximum(np.diag(gram), 0))
-    possible = np.array([_shared(np.outer(size, size), *fold).sum() for fold in tried])
+    largest = np.outer(size, size)
+    possible = np.array([_shared(largest, *fold).sum() for fold in tried])
     best = int(np.argmax(shared * np.abs(shared) / np.maximum(possible, 1e-9)))  # many and alike
     axis = _whole_views(gram, *tried[best], score=float(shared[best]) / total)
     return axis if axis.score >= MIN_SCORE and axis.count > 1 else ViewAxis(0.0, n, 1, axis.score)

@@ -32,16 +32,18 @@ class Mixture(SceneBase):
     """Clip `index` is that of one of `parts`, drawn by their shares.
 
     A part holds `scene`, a class of scenes with its own arguments filled in; `share`, any number
-    from 0 on, 0 leaves it out; and `splits`, those that it serves (None: all).  `flicker_share`: of
-    the clips whose light flickers with the mains, by a share out of `percent_flicker`; none does
-    below 480 frames (windows times substeps) a second, where it would alias.  `root`,
-    `extra_train_root` and `video_root` are there for the parts' configs to refer to.
+    from 0 on, 0 leaves it out; and `splits`, those that it serves (None: all).  `in_turn`: of
+    validation and test clip k is of part k modulo their number, so that a few clips show all.
+    `flicker_share`: of the clips whose light flickers with the mains, by a share out of
+    `percent_flicker`; none does below 480 frames (windows times substeps) a second, where it would
+    alias.  The parts' configs refer to `root`, `extra_train_root` and `video_root`.
     """
 
     parts: Mapping[str, Mapping[str, Any]]
     root: Root = None
     extra_train_root: Root = None
     video_root: str | None = None
+    in_turn: bool = False
     flicker_share: float = 0.0
     percent_flicker: Sequence[float] = (0.05, 0.4)
 
@@ -69,6 +71,8 @@ class Mixture(SceneBase):
     def clip(self, index: int) -> Clip:
         draw = float(noise.uniform(self.key, torch.tensor(index)))
         place = bisect(self.cumulative_shares, draw * self.cumulative_shares[-1])
+        if self.in_turn and self.split != "train":
+            place = index % len(self.scenes)
         clip = self.scenes[place].clip(index)
         rng = np.random.default_rng(noise.key(self.key, "flicker", index))
         if clip.fps < LEAST_FPS or rng.uniform() >= self.flicker_share:

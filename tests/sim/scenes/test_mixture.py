@@ -39,6 +39,14 @@ def test_a_mixture_is_drawn_by_its_shares():
     assert kinds(mixture(0, 2), 20) == 20
 
 
+@pytest.mark.parametrize(("split", "dots"), [("train", 0), ("val", 3), ("test", 3)])
+def test_parts_in_turn_alternate_where_nothing_is_trained(split, dots):
+    parts = {"photos": {"share": 1, "scene": PHOTOS}, "dots": {"share": 1e-6, "scene": DOTS}}
+    scene = Mixture(parts=parts, split=split, in_turn=True, **FRAME)
+    shown = [scene.clip(index).name.startswith("DotGrid") for index in range(6)]
+    assert shown == [False, dots > 0] * 3
+
+
 def test_a_clip_of_a_mixture_is_that_of_its_part_whatever_the_length():
     scene, longer = mixture(1, 1, seed=3), mixture(1, 1, seed=3, frames=5)
     parts = [part(split="train", seed=3, **FRAME) for part in (PHOTOS, DOTS)]

@@ -1,0 +1,82 @@
+"""The weights that a training begins from, and the networks that it is compared with at its end."""
+
+import warnings
+from pathlib import Path
+
+from omegaconf import DictConfig, OmegaConf
+
+import src.models
+from src.app.instantiate import allowed_packages, as_dict
+from src.models import files
+from src.models.network import VideoMethod
+
+FROM_NOTHING = (None, "none")
+
+
+def adopt_start(cfg: DictConfig) -> Path | None:
+    """Return the file that `start` names, None for a training from nothing, and make `cfg.model`
+    its network: width, stem and all that follows from the weights.
+
+    An E2VID on one view is given those of `optics`.  Raises ValueError for a file that is not there
+    or holds weights of another class, number of bins or number of views.
+    """
+    if cfg.start in FROM_NOTHING:
+        return None
+    path = _find_file(cfg.start)
+    try:
+        spec = files.network_spec(path)
+    except ValueError as error:
+        raise ValueError(f"start must be weights to begin from: {error}") from error
+    wanted, got = cfg.model._target_.removesuffix(".preset"), spec["target"]
+    if got != wanted:
+        raise ValueError(f"start must be weights of {wanted}, got {got} in {path}")
+    kwargs = dict(spec["kwargs"])
+    if kwargs.get("bins", cfg.bins) != cfg.bins:
+        raise ValueError(f"start must be weights for bins={cfg.bins}, got {kwargs['bins']}")
+    if got == files.WIDENABLE:
+        views = cfg.optics.views
+        if kwargs.get("views", 1) not in (1, views):
+            raise ValueError(f"start must be weights of 1 or {views} views, got {kwargs['views']}")
+        kwargs["views"] = views
+    OmegaConf.update(cfg, "model", {"_target_": got, **kwargs}, merge=False)
+    return path
+
+
+def name_beginning(cfg: DictConfig, path: Path | None) -> str:
+    """Return what the table calls the network before its training."""
+    if path is None:
+        return "untrained"
+    before = files.network_spec(path)["kwargs"].get("views")
+    given = f" given {cfg.optics.views} views" if before == 1 != cfg.optics.views else ""
+    return f"{cfg.start}{given}, before training"
+
+
+def load_references(cfg: DictConfig) -> dict[str, VideoMethod]:
+    """Return the networks of `references` by their names in the table; those that take other views
+    than `optics` has are left out with a warning.
+
+    Raises ValueError, naming the key, for one that cannot be loaded.
+    """
+    networks, views = {}, cfg.optics.views
+    for name, weights in as_dict(cfg.references).items():
+        try:
+            network = src.models.load(weights, allowed_packages(cfg))
+        except ValueError as error:
+            raise ValueError(f"references.{name} must be a network: {error}") from error
+        if not isinstance(network, VideoMethod):
+            raise ValueError(f"references.{name} must be a network for events, {weights} is none")
+        if network.views not in (None, views):
+            wanted = f"optics.views={network.views}, got {views}"
+            warnings.warn(f"references.{name} is left out: it takes {wanted}", stacklevel=2)
+            continue
+        networks[name] = network
+    return networks
+
+
+def _find_file(name: str) -> Path:
+    path, shipped = Path(name), files.WEIGHTS / f"{name}.safetensors"
+    path = path if path.is_file() or not shipped.is_file() else shipped
+    if not path.is_file() or not files.is_weights_file(path):
+        names = ", ".join(sorted(file.stem for file in files.WEIGHTS.glob("*.safetensors")))
+        raise ValueError(f"start must be none, one of weights/ ({names}) or a file, got {name}")
+    return path

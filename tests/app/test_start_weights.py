@@ -1,0 +1,88 @@
+"""A training begins as the weights that `start` names, and is compared with `references`."""
+
+import pytest
+import torch
+
+from src.app import build, start_weights
+from src.models import files, load
+from src.models.e2vid import E2VID
+from src.models.network import unroll
+from src.train import train
+from tests.test_train import TINY, config
+
+ONE_VIEW = {"views": 1, "bins": 5, "base_channels": 4, "stem_channels": 6, "spectral_norm": False}
+SPEC = {"target": "src.models.e2vid.E2VID", "kwargs": ONE_VIEW}
+
+
+def write_weights(path, **other):
+    torch.manual_seed(0)
+    kwargs = ONE_VIEW | other
+    files.save(path, E2VID(**kwargs), SPEC | {"kwargs": kwargs}, {})
+    return path
+
+
+@torch.no_grad()
+def test_nine_views_begin_exactly_as_the_shipped_network_on_one(tmp_path):
+    cfg = config("train", tmp_path, "budget=fine_tuning")
+    assert (cfg.start, cfg.width) == ("single256", 8)  # the width is that of the weights
+    path = start_weights.adopt_start(cfg)
+    net, spec = build.build_network_and_spec(cfg)
+    files.restore_weights(net, path)
+    one_view = files.network_spec(path)
+    assert spec == one_view | {"kwargs": one_view["kwargs"] | {"views": 9}}
+    seen = torch.randn(1, 4, 9, 5, 32, 32)
+    ours, theirs = unroll(net.eval(), seen)[0], unroll(load("single256"), seen[:, :, 4:5])[0]
+    assert torch.equal(ours, theirs) and ours.std() > 0.01
+    name = start_weights.name_beginning(cfg, path)
+    assert name == "single256 given 9 views, before training"
+
+
+@pytest.mark.parametrize("start", ["none", "null"])
+def test_without_a_start_the_network_is_that_of_the_config(start, tmp_path):
+    cfg = config("train", tmp_path, "budget=fine_tuning", f"start={start}")
+    assert start_weights.adopt_start(cfg) is None
+    assert build.build_network_and_spec(cfg)[0].head.out_channels == cfg.width == 8
+    assert start_weights.name_beginning(cfg, None) == "untrained"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["start=nowhere"], r"start must be none, one of weights/ \(.*single256.*\) or a file"),
+        (["start=setnet_small"], "start must be weights of src.models.e2vid.E2VID, got .*SetNet"),
+        (["start=single256", "bins=3"], "start must be weights for bins=3, got 5"),
+        (["start=lf3x3", "optics=lf2x2"], "start must be weights of 1 or 4 views, got 9"),
+        (["start={tmp}/no.safetensors"], "start must be weights to begin from: ckpt must be"),
+    ],
+)
+def test_a_wrong_start_is_one_line_that_names_it(overrides, said, tmp_path):
+    (tmp_path / "no.safetensors").write_bytes(b"none")
+    cfg = config("train", tmp_path, *(given.format(tmp=tmp_path) for given in overrides))
+    with pytest.raises(ValueError, match=said):
+        start_weights.adopt_start(cfg)
+
+
+def test_references_are_loaded_by_their_names_or_refused(tmp_path):
+    path = write_weights(tmp_path / "two.safetensors", views=2)
+    cfg = config("train", tmp_path, f"+references={{two: {path}, small: setnet_small}}")
+    with pytest.warns(UserWarning, match="references.two is left out: it takes optics.views=2"):
+        assert list(start_weights.load_references(cfg)) == ["small"]
+    cfg.references = {"restorer": "mambatm"}
+    with pytest.raises(ValueError, match="references.restorer must be a network for events"):
+        start_weights.load_references(cfg)
+    cfg.references = {"none": "nowhere"}
+    with pytest.raises(ValueError, match="references.none must be a network: .*nowhere"):
+        start_weights.load_references(cfg)
+
+
+def test_a_training_from_weights_is_compared_with_its_beginning(tmp_path):
+    path = write_weights(tmp_path / "one.safetensors")
+    asked = [f"start={path}", f"+references.again={path}", "optics=single", "sample_clips=1"]
+    record = train(config("train", tmp_path / "run", *TINY, *asked))
+    names = [f"{path}, before training", "again", "high-pass, centre view"]
+    assert list(record["compared"]) == names
+    before, again = (record["compared"][name]["ssim"]["mean"] for name in names[:2])
+    assert before == pytest.approx(again, abs=1e-5)  # `again` is what it began as
+    assert record["test"]["ssim"]["mean"] != pytest.approx(before, abs=1e-5)
+    samples = sorted(file.name for file in (tmp_path / "run" / "samples").iterdir())
+    assert samples == ["clip0.gif", "clip0_slice.png"]
