@@ -267,7 +267,7 @@ class SetNet(EventToVideoNetwork):
         seconds = _durations(window_s, voxels)
         padded, (top, left) = pad_centred_to_multiple(voxels.flatten(0, 2), 8)
         voxels = padded.unflatten(0, (n, windows, views)).transpose(0, 1).float()
-        counts = _sum_cells(torch.linalg.vector_norm(voxels, 1, 3).flatten(0, 1))
+        counts = _sum_cells(voxels.abs().sum(3).flatten(0, 1))
         before = self._checked_state(state, counts[:n])
 
         tick, after = self.run_clock(counts, seconds, before)
