@@ -25,6 +25,10 @@ from src.models.network import WINDOW_S, EventToVideoNetwork
 from src.models.setnet import SetNet
 from src.sim.optics import Position
 
+# The package would report over the network that it was imported, in a process of its own; it goes
+# on without.  Before torch.compile, which imports it too.
+sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
+
 
 def is_installed() -> bool:
     """Return whether the package is there."""
@@ -149,13 +153,7 @@ class OpenVinoNetwork(EventToVideoNetwork):
         return self.compiled[which]
 
 
-@cache
 def _package() -> Any:
-    """Return the package, kept from reporting over the network that it was imported: it starts a
-    process for that, which is also in the way of what is timed.
-    """
-    # It goes on without it.
-    sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
     import openvino
 
     return openvino
