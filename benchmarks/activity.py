@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks.runtime import milliseconds
 from src.deploy.runtime import EventListRuntime, fastest_form
 from src.figures import plots
 from src.models import load
@@ -43,20 +44,6 @@ def windows(share: float, views: int, height: int, width: int, fps: float, count
         p, view = 2 * rng.integers(0, 2, n) - 1, rng.integers(0, views, n)
         made.append((np.sort(rng.uniform(*edges, n)), x, y, p, view, *edges))
     return made
-
-
-def milliseconds(live: EventListRuntime, played: list, seconds: float) -> float:
-    """Return the median time of a window over `seconds`, after a first round."""
-    times, until = list[float](), 0.0
-    while time.perf_counter() < until or not times:
-        for window in played:
-            start = time.perf_counter()
-            live.step(*window)
-            times.append(1e3 * (time.perf_counter() - start))
-        if not until:
-            until = time.perf_counter() + seconds
-            times = times[-1:]
-    return statistics.median(times)
 
 
 def draw(path: Path, measured: dict[tuple[str, str], list[float]]) -> None:
@@ -94,7 +81,8 @@ def main() -> None:
             for share in SHARES:
                 live.reset()
                 played = windows(share, views, height, width, fps, given.windows)
-                found.append(milliseconds(live, played, given.seconds))
+                times = milliseconds(live.step, played, given.seconds, time.perf_counter)
+                found.append(statistics.median(times))
             size = f"{views} x {width} x {height}"
             print(f"{name}, {size} at {fps:.0f}/s:", *(f"{ms:7.2f}" for ms in found), flush=True)
             measured[name, size] = found

@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 from omegaconf import DictConfig
-from PIL import Image
 from torch import Tensor
 
 from src import models
@@ -28,9 +27,7 @@ from src.figures import samples
 from src.metrics.bootstrap import bootstrap_interval
 from src.metrics.table import METRICS, Column
 from src.models import files
-from src.recordings.output import round_codes
 from src.records import results
-from src.records.atomic import atomic_path
 from src.reports.writers import replace_section
 from src.sim.optics import layout
 from src.sim.pipeline import Sample, simulate
@@ -210,10 +207,7 @@ def write_film(path: Path, index: int) -> None:
         "ground truth": sample.target[0, :, 0].numpy(),
     }
     film = samples.join_panels({name: append_slice(video) for name, video in panels.items()})
-    first, *rest = map(Image.fromarray, round_codes(film))
-    time = {"duration": round(1000 / samples.PLAYBACK_FPS), "loop": 0}
-    with atomic_path(path) as partial:
-        first.save(partial, "WEBP", save_all=True, append_images=rest, quality=70, **time)
+    samples.write_video(path, film, samples.PLAYBACK_FPS)
 
 
 def append_slice(

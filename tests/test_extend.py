@@ -70,6 +70,7 @@ def copy(tmp_path_factory, page) -> Path:
 
 def commands(page: str) -> list[list[str]]:
     """The commands of the page, made small."""
+    page = page.replace("\\\n", " ")
     lines = [
         line for block in re.findall(r"```sh\n(.*?)```", page, re.S) for line in block.split("\n")
     ]

@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import TypeVar
 
 import lightning
 import torch
@@ -43,6 +44,7 @@ DATA_OPTIONS = (
     "batch_size", "batch_reuse", "epoch_clips", "val_clips", "test_clips", "workers", "simulate_on",
 )  # fmt: skip
 SHIPPED_METRIC_KEYS = ("lpips", "resolution_scale")
+Method = TypeVar("Method", bound=VideoMethod)
 
 
 def build_data_module(
@@ -77,17 +79,24 @@ def build_teachers(cfg: DictConfig, views: int) -> TeacherEnsemble:
     """
     networks = {}
     for name in [cfg.teachers] if isinstance(cfg.teachers, str) else cfg.teachers:
-        try:
-            net = src.models.load(name, allowed_packages(cfg))
-        except ValueError as error:
-            raise ValueError(f"teachers must be networks: {error}") from error
-        if not isinstance(net, EventToVideoNetwork):
-            raise ValueError(f"teachers must be networks for events, {name} is none")
+        net = load_for_events(cfg, name, EventToVideoNetwork, "teachers must be networks")
         if net.views not in (None, views):
             raise ValueError(f"teachers must take optics.views={views}, {name} takes {net.views}")
         networks[name] = net
     rates = tuple(cfg.data.rates or ())
     return TeacherEnsemble(networks, cfg.distillation_cache, cfg.fps, rates)
+
+
+def load_for_events(cfg: DictConfig, name: str, kind: type[Method], asked: str) -> Method:
+    """Return the network `name`, as `ckpt` may name one; ValueError, which begins with `asked`,
+    where it is not there or no `kind`."""
+    try:
+        network = src.models.load(name, allowed_packages(cfg))
+    except ValueError as error:
+        raise ValueError(f"{asked}: {error}") from error
+    if not isinstance(network, kind):
+        raise ValueError(f"{asked} for events, {name} is none")
+    return network
 
 
 def build_network_and_spec(

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-import src.models
-from src.app.instantiate import allowed_packages, as_dict
+from src.app import build
+from src.app.instantiate import as_dict
 from src.models import files
 from src.models.network import VideoMethod
 
@@ -59,12 +59,8 @@ def load_references(cfg: DictConfig) -> dict[str, VideoMethod]:
     """
     networks, views = {}, cfg.optics.views
     for name, weights in as_dict(cfg.references).items():
-        try:
-            network = src.models.load(weights, allowed_packages(cfg))
-        except ValueError as error:
-            raise ValueError(f"references.{name} must be a network: {error}") from error
-        if not isinstance(network, VideoMethod):
-            raise ValueError(f"references.{name} must be a network for events, {weights} is none")
+        asked = f"references.{name} must be a network"
+        network = build.load_for_events(cfg, weights, VideoMethod, asked)
         if network.views not in (None, views):
             wanted = f"optics.views={network.views}, got {views}"
             warnings.warn(f"references.{name} is left out: it takes {wanted}", stacklevel=2)
@@ -74,9 +70,8 @@ def load_references(cfg: DictConfig) -> dict[str, VideoMethod]:
 
 
 def _find_file(name: str) -> Path:
-    path, shipped = Path(name), files.WEIGHTS / f"{name}.safetensors"
-    path = path if path.is_file() or not shipped.is_file() else shipped
+    path = files.locate(name)
     if not path.is_file() or not files.is_weights_file(path):
-        names = ", ".join(sorted(file.stem for file in files.WEIGHTS.glob("*.safetensors")))
-        raise ValueError(f"start must be none, one of weights/ ({names}) or a file, got {name}")
+        where = f"weights/ ({files.list_shipped()})"
+        raise ValueError(f"start must be none, one of {where} or a file, got {name}")
     return path

@@ -1,6 +1,7 @@
 """Pictures of a run: films of panels side by side (GIF, PNG), space-time slices, and the views."""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ PLAYBACK_FPS = 15.0
 TITLE_PX = 18  # height of the strip with a panel's name
 GAP_PX = 4
 MAX_VIEW_PX = 160  # longest side of a view in views.gif
+WEBP_QUALITY = 70
 MIN_HEIGHT_PX = 160  # lower panels are enlarged by a whole factor
 
 Video = Float[np.ndarray, "_frames _h _w *_rgb"]
@@ -139,15 +141,18 @@ def join_panels(panels: dict[str, Video]) -> Video:
 
 
 def write_video(path: Path, frames: Video, fps: float) -> None:
-    """Write a GIF (or, of the first frame, what else the suffix says) whole or not at all.
+    """Write a GIF or WebP (or, of the first frame, what else the suffix says) whole or not at all.
 
-    Values are clipped to [0, 1]; GIFs keep time to hundredths of a second.
+    Values are clipped to [0, 1]; GIFs keep time to hundredths of a second, WebP to thousandths.
     """
-    pictures = [Image.fromarray(frame) for frame in round_codes(frames)]
+    pictures, kind = list(map(Image.fromarray, round_codes(frames))), path.suffix[1:].upper()
+    options: dict[str, Any] = {}
+    if kind == "GIF":
+        pictures = [picture.quantize(128, dither=Image.Dither.NONE) for picture in pictures]
+        options = {"duration": 1000 / fps, "loop": 0}
+    elif kind == "WEBP":
+        options = {"duration": round(1000 / fps), "loop": 0, "quality": WEBP_QUALITY}
+    if options:
+        options |= {"save_all": True, "append_images": pictures[1:]}
     with atomic_path(path) as partial:
-        if path.suffix == ".gif":
-            first, *rest = (p.quantize(128, dither=Image.Dither.NONE) for p in pictures)
-            time = {"duration": 1000 / fps, "loop": 0}
-            first.save(partial, "GIF", save_all=True, append_images=rest, **time)
-        else:
-            pictures[0].save(partial, Image.registered_extensions()[path.suffix])
+        pictures[0].save(partial, kind, **options)

@@ -37,15 +37,12 @@ def load(name_or_path: str | Path, allowed_packages: Sequence[str] = ()) -> nn.M
     the packages `allowed_packages`.  Raises ValueError, beginning with `ckpt`, for a file that is
     not there, is no such file, or holds other weights than its network has.
     """
-    path = Path(name_or_path)
-    shipped = WEIGHTS / f"{name_or_path}.safetensors"
-    if not path.is_file() and shipped.is_file():
-        path = shipped
+    path = locate(name_or_path)
     if path.is_dir():
         path = newest_checkpoint(path)
     if not path.is_file():
-        names = ", ".join(sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))) or "none yet"
-        raise ValueError(f"ckpt must be a file or one of weights/ ({names}), got {name_or_path}")
+        where = f"weights/ ({list_shipped()})"
+        raise ValueError(f"ckpt must be a file or one of {where}, got {name_or_path}")
     spec, weights = (_exported if is_weights_file(path) else _checkpoint)(path)[:2]
     check_weights_stored_whole(weights, path, "ckpt")
     with torch.device("meta"):  # without memory: a small file may name a huge network
@@ -55,6 +52,17 @@ def load(name_or_path: str | Path, allowed_packages: Sequence[str] = ()) -> nn.M
     network.load_state_dict(weights)
     fold_parametrizations(network)
     return network.float().eval()
+
+
+def locate(name: str | Path) -> Path:
+    """Return the path `name`, or the file of `weights/` of that name where it is no file."""
+    path, shipped = Path(name), WEIGHTS / f"{name}.safetensors"
+    return shipped if not path.is_file() and shipped.is_file() else path
+
+
+def list_shipped() -> str:
+    """Return the names in `weights/`, for a message."""
+    return ", ".join(sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))) or "none yet"
 
 
 def find_checkpoint(name: str | Path, spec: dict) -> Path:

@@ -86,11 +86,7 @@ class DiskClipCache(ClipCache):
                         warnings.warn(str(error), stacklevel=2)
                     return clip._replace(metadata=json.loads(json.dumps(clip.metadata)))
         content = torch.load(self.path(index), mmap=True, weights_only=True)
-        return CachedClip(
-            content["views"],
-            content["clean"],
-            json.loads(content.get("metadata") or content["facts"]),
-        )
+        return CachedClip(content["views"], content["clean"], json.loads(content["metadata"]))
 
     def fill(self) -> None:
         """Simulate what is missing and no other process simulates, on the CPU.
