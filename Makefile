@@ -13,6 +13,7 @@ SITE := .cache/docs
 
 .PHONY: setup train test test-all demo docs lint clean
 setup: $(READY) $(LPIPS)
+	@echo "ready: .venv with all packages, and the network of LPIPS; next: source .venv/bin/activate"
 
 train: $(READY) $(LPIPS)
 	$(PY) -m src.train experiment=lf3x3 budget=fine_tuning
@@ -23,7 +24,7 @@ test: $(READY) $(LPIPS)
 test-all: $(READY) $(LPIPS)
 	$(PY) -m pytest -q
 
-demo: $(READY) $(DEMO)
+demo: $(READY) $(DEMO)/cap.views.yaml
 	$(PY) -m src.live recording=$(DEMO)/cap.raw views=$(DEMO)/cap.views.yaml ckpt=setnet_small \
 		fps=600 playback_speed=0.2 threads=2 loop=true
 
@@ -48,11 +49,10 @@ $(SITE)/ready: pyproject.toml constraints.txt
 		--constraint constraints.txt --requirement $(SITE)/requirements.txt
 	touch $@
 
-# The folder is there only when the recording in it is whole.
-$(DEMO): | $(READY)
+# The views are written last, when the recording beside them is whole.
+$(DEMO)/cap.views.yaml: | $(READY)
 	@echo "simulating a recording of nine views, once"
-	$(PY) -m src.simulate --config-name demo write=$(DEMO).partial/cap.raw
-	mv $(DEMO).partial $@
+	$(PY) -m src.simulate --config-name demo write=$(DEMO)/cap.raw
 
 $(LPIPS):
 	$(PY) -m scripts.fetch_lpips_backbone

@@ -20,6 +20,7 @@ class CentreViewNetwork(EventToVideoNetwork):
     """
 
     side_multiple = 1
+    uses_centre_view_only = True
 
     def __init__(self, bins: int, normalise: str, output: str):
         super().__init__()

@@ -41,7 +41,7 @@ class CISTA(CentreViewNetwork):
         self.events, self.previous = _conv(bins, channels), _conv(1, channels)
         self.mix = _conv(both, both, stride=2)
         self.code = _conv(both, code)
-        self.steps = nn.ModuleList(Step(both, code) for _ in range(steps))
+        self.steps = nn.ModuleList(ISTAStep(both, code) for _ in range(steps))
         self.agree_before, self.agree_now = _conv(code, 1), _conv(code, 1)
         self.pulls = nn.ParameterList(1e-3 * torch.rand(1, code, 1, 1) for _ in range(steps))
         self.decoder = _conv(code, both)
@@ -69,7 +69,7 @@ class CISTA(CentreViewNetwork):
         return z
 
 
-class Step(nn.Module):
+class ISTAStep(nn.Module):
     """One step of iterative shrinkage with learned synthesis D, analysis P and thresholds."""
 
     def __init__(self, features: int, code: int):

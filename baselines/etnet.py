@@ -38,14 +38,16 @@ class ETNet(CentreViewNetwork):
         super().__init__(bins, normalise, output)
         self.net = E2VID(1, bins, base_channels, final_activation="none")
         self.net.resblocks = nn.Sequential()
-        self.pyramid = Pyramid([base_channels * 2**scale for scale in range(SCALES, 0, -1)])
+        self.pyramid = TokenPyramidAggregation(
+            [base_channels * 2**scale for scale in range(SCALES, 0, -1)]
+        )
 
     def predict_before_activation(self, grid: Tensor, state: Any) -> tuple[Tensor, Any]:
         head, skips, after = self.net.encode(self.net.first_layer(grid), state)
         return self.net.decode_logits(self.pyramid(skips[::-1]), head, skips), after
 
 
-class Pyramid(nn.Module):
+class TokenPyramidAggregation(nn.Module):
     """Tokens of each scale attend to themselves and to the next coarser scale.
 
     `widths`: channels of the maps, coarsest first; the tokens have as many as the coarsest.
@@ -58,9 +60,12 @@ class Pyramid(nn.Module):
             nn.Conv2d(inputs, width, 2**scale, 2**scale)
             for scale, inputs in enumerate(widths[1:], 1)
         )
-        self.own = nn.ModuleList(nn.Sequential(*(Layer(width) for _ in range(3))) for _ in widths)
+        self.own = nn.ModuleList(
+            nn.Sequential(*(TransformerLayer(width) for _ in range(3))) for _ in widths
+        )
         self.across = nn.ModuleList(
-            nn.ModuleList(Layer(width, crossed=True) for _ in range(2)) for _ in widths
+            nn.ModuleList(TransformerLayer(width, with_cross_attention=True) for _ in range(2))
+            for _ in widths
         )
         for parameter in chain(self.own.parameters(), self.across.parameters()):
             if parameter.dim() > 1:
@@ -70,7 +75,7 @@ class Pyramid(nn.Module):
         """Return the map at the coarsest resolution; `maps` are finest last."""
         coarse = [maps[0]] + [s(x) for s, x in zip(self.split, maps[1:], strict=True)]
         tokens = [x.flatten(2).transpose(1, 2) for x in coarse]
-        places = sinusoids(tokens[0].shape[1], tokens[0].shape[2]).to(tokens[0])
+        places = sinusoidal_position_encoding(tokens[0].shape[1], tokens[0].shape[2]).to(tokens[0])
         seen = [layers(x + places) for layers, x in zip(self.own, tokens, strict=True)]
         compared = []
         for layers, (memory, x) in zip(self.across, pairwise([seen[0], *seen]), strict=True):
@@ -80,17 +85,17 @@ class Pyramid(nn.Module):
         return torch.stack(seen + compared).mean(0).transpose(1, 2).view_as(maps[0])
 
 
-class Layer(nn.Module):
-    """Self-attention, attention to a memory if `crossed`, and a two-layer perceptron, each
-    normalised before and added.
+class TransformerLayer(nn.Module):
+    """Self-attention, attention to a memory if `with_cross_attention`, and a two-layer perceptron,
+    each normalised before and added.
     """
 
-    def __init__(self, width: int, crossed: bool = False):
+    def __init__(self, width: int, with_cross_attention: bool = False):
         super().__init__()
-        self.norm, self.attention = nn.LayerNorm(width), Attention(width)
-        if crossed:
+        self.norm, self.attention = nn.LayerNorm(width), MultiHeadAttention(width)
+        if with_cross_attention:
             self.asker_norm, self.memory_norm = nn.LayerNorm(width), nn.LayerNorm(width)
-            self.cross = Attention(width)
+            self.cross = MultiHeadAttention(width)
         self.mlp = ResidualMLP(width)
 
     def forward(self, x: Tokens, memory: Tokens | None = None) -> Tokens:
@@ -101,7 +106,7 @@ class Layer(nn.Module):
         return self.mlp(x)
 
 
-class Attention(nn.Module):
+class MultiHeadAttention(nn.Module):
     """Attention with eight heads (Vaswani et al. 2017), fused."""
 
     def __init__(self, width: int):
@@ -134,7 +139,7 @@ class ResidualMLP(nn.Module):
         return x + functional.dropout(self.back(hidden), DROPOUT, self.training)
 
 
-def sinusoids(tokens: int, width: int) -> Float[Tensor, "tokens width"]:
+def sinusoidal_position_encoding(tokens: int, width: int) -> Float[Tensor, "tokens width"]:
     """Return the position code of tokens 0 .. tokens - 1 (Vaswani et al. 2017, section 3.5)."""
     pitch = 10_000.0 ** (-torch.arange(0, width, 2, dtype=torch.float64) / width)
     angles = torch.arange(tokens, dtype=torch.float64)[:, None] * pitch

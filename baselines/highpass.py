@@ -25,6 +25,7 @@ class HighPass(EventToVideoNetwork):
         if (got := view_reduction) not in ("centre", "median"):
             raise ValueError(f"baseline.view_reduction must be centre or median, got {got}")
         self.decay, self.gain, self.view_reduction = decay, gain, view_reduction
+        self.uses_centre_view_only = view_reduction == "centre"
 
     def forward(
         self,

@@ -69,7 +69,10 @@ class DynamicDecoder(nn.Module):
             nn.BatchNorm2d(mixes),
             nn.Tanh(),
         )
-        small, large = fourier_bessel(1)[:FUNCTIONS], fourier_bessel(2)[:FUNCTIONS]
+        small, large = (
+            fourier_bessel_functions(1)[:FUNCTIONS],
+            fourier_bessel_functions(2)[:FUNCTIONS],
+        )
         functions = torch.cat([functional.pad(small, (1, 1, 1, 1)), large])
         self.register_buffer("functions", functions.flatten(1))
         self.compose = nn.Conv2d(inputs * ATOMS, outputs, 1)
@@ -96,7 +99,7 @@ class DynamicDecoder(nn.Module):
         return torch.stack([part.movedim(1, 3) for part in maps], 3)
 
 
-def fourier_bessel(reach: int) -> Float[Tensor, "functions side side"]:
+def fourier_bessel_functions(reach: int) -> Float[Tensor, "functions side side"]:
     """Return harmonics of the disc of radius reach + 1/2, sampled on 2 reach + 1 pixels a side.
 
     J_k(z r) times 1, cos(k a), sin(k a), in order of the zeros z of J_k, as far as the sampling

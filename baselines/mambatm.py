@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from baselines.hilbert import hilbert_order
-from baselines.selective_scan import Mixer
+from baselines.selective_scan import BidirectionalMamba
 from baselines.stabilise import estimate_jitter, warp_video
 from src.models.layers import pad_centred_to_multiple
 from src.models.network import FramePostprocessor, split_windows
@@ -55,19 +55,19 @@ class MambaTM(FramePostprocessor):
                 raise ValueError(f"postprocess.{name} must be >= {least}, got {value}")
         width = base_channels * 2**SCALES
         self.frame_channels, self.stabilise_input = frame_channels, stabilise_input
-        self.encoder = Encoder((1 + stabilise_input) * frame_channels, base_channels)
-        self.distortion_encoder = Encoder(DISTORTION, base_channels)
+        self.encoder = FrameEncoder((1 + stabilise_input) * frame_channels, base_channels)
+        self.distortion_encoder = FrameEncoder(DISTORTION, base_channels)
         self.distortion_width = nn.Conv2d(width, width, 1)
-        self.distortion_decoder = Decoder(DISTORTION, base_channels)
-        self.decoder = Decoder(frame_channels, base_channels)
+        self.distortion_decoder = FrameDecoder(DISTORTION, base_channels)
+        self.decoder = FrameDecoder(frame_channels, base_channels)
         for parameter in self.decoder.out[-1].parameters():
             nn.init.zeros_(parameter)  # what is added to the input begins with nothing
         if stabilise_input:
             for parameter in self.distortion_decoder.out[-1].parameters():
                 nn.init.zeros_(parameter[:2])  # and takes out the jitter that was found
         free = range(3 * (scan_blocks - 1))
-        self.free = nn.ModuleList(Layer(width, states, guided=False) for _ in free)
-        self.guided = nn.ModuleList(Layer(width, states, guided=True) for _ in range(3))
+        self.free = nn.ModuleList(MambaLayer(width, states, takes_guide=False) for _ in free)
+        self.guided = nn.ModuleList(MambaLayer(width, states, takes_guide=True) for _ in range(3))
 
     def forward(
         self, frames: Float[Tensor, "n frames c h w"]
@@ -116,15 +116,15 @@ def scan_orders(frames: int, height: int, width: int) -> list[Int[Tensor, " cell
     return [raster, in_time, hilbert_order(frames, height, width)]
 
 
-class Layer(nn.Module):
+class MambaLayer(nn.Module):
     """A selective state space along an order of the tokens, then a perceptron with a depthwise
     3x3x3 convolution inside; both normalised before and added.
     """
 
-    def __init__(self, width: int, states: int, guided: bool):
+    def __init__(self, width: int, states: int, takes_guide: bool):
         super().__init__()
-        self.norm, self.mixer = nn.LayerNorm(width), Mixer(width, states, guided)
-        if guided:
+        self.norm, self.mixer = nn.LayerNorm(width), BidirectionalMamba(width, states, takes_guide)
+        if takes_guide:
             self.guide_norm = nn.LayerNorm(width)
         self.mlp_norm = nn.LayerNorm(width)
         self.wide, self.back = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
@@ -142,7 +142,7 @@ class Layer(nn.Module):
         return tokens + self.back(hidden)
 
 
-class Encoder(nn.Module):
+class FrameEncoder(nn.Module):
     """Maps of a frame at 1, 1/2, 1/4 and 1/8, each through a residual dense block."""
 
     def __init__(self, channels: int, features: int):
@@ -180,7 +180,7 @@ class DenseBlock(nn.Module):
         return x + self.back(seen)
 
 
-class Decoder(nn.Module):
+class FrameDecoder(nn.Module):
     """From 1/8 back to full resolution, fused at each scale with what the encoder saw."""
 
     def __init__(self, channels: int, features: int):
@@ -190,7 +190,7 @@ class Decoder(nn.Module):
             nn.ConvTranspose2d(2 * width if scale == 0 else 4 * width, width, 3, 2, 1, 1)
             for scale, width in enumerate(widths)
         )
-        self.fuse = nn.ModuleList(Fusion(2 * width) for width in widths)
+        self.fuse = nn.ModuleList(ChannelAttentionBlock(2 * width) for width in widths)
         self.out = nn.Sequential(
             nn.Conv2d(2 * features, features, 3, padding=1),
             nn.Conv2d(features, channels, 3, padding=1),
@@ -205,7 +205,7 @@ class Decoder(nn.Module):
         return self.out(x)
 
 
-class Fusion(nn.Module):
+class ChannelAttentionBlock(nn.Module):
     """Two convolutions whose outcome is weighed channel by channel and added."""
 
     def __init__(self, width: int):
@@ -222,7 +222,9 @@ class Fusion(nn.Module):
         return x + weights * outcome
 
 
-def _decode(decoder: "Decoder", deep: Tensor, skips: list[Tensor], parts: list[slice]) -> Tensor:
+def _decode(
+    decoder: "FrameDecoder", deep: Tensor, skips: list[Tensor], parts: list[slice]
+) -> Tensor:
     return torch.cat([decoder(deep[part], [skip[part] for skip in skips]) for part in parts])
 
 

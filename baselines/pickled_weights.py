@@ -15,7 +15,7 @@ from src.models.files import check_weights_stored_whole
 PICKLES = 5  # at the beginning of a checkpoint of PyTorch before 1.6, the weights' storages behind
 
 
-class Inert:
+class UnpickledPlaceholder:
     """Stands for an object of an unknown class: takes anything, does nothing."""
 
     def __init__(self, *args: Any, **kwargs: Any):
@@ -25,7 +25,7 @@ class Inert:
         pass
 
 
-def read_tensors(path: Path) -> dict[str, Tensor]:
+def read_pickled_tensors(path: Path) -> dict[str, Tensor]:
     """Return the state dict of a torch checkpoint.
 
     Raises ValueError, beginning with `baseline.weights`, when there is no such file, when it is no
@@ -36,7 +36,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     try:
         if zipfile.is_zipfile(path) and is_compressed_zip(path):
             raise ValueError("packed, it could fill the memory")
-        with safe_globals([(Inert, name) for name in _unknown_globals(path)]):
+        with safe_globals([(UnpickledPlaceholder, name) for name in _unknown_globals(path)]):
             content = torch.load(path, "cpu", weights_only=True)
     except Exception as error:  # libraries raise all kinds on a broken file
         allowed = "an unpacked torch checkpoint"

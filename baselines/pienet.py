@@ -53,10 +53,11 @@ class PIENet(CentreViewNetwork):
         scales = list(zip(inputs, channels, pools, strict=True))
         self.events, self.previous = ConvNorm(bins, base_channels), ConvNorm(1, base_channels)
         self.encoders = nn.ModuleList(
-            Encoder(finer, width, pool, 2 * base_channels, refine) for finer, width, pool in scales
+            FiLMConvLSTM(finer, width, pool, 2 * base_channels, refine)
+            for finer, width, pool in scales
         )
         self.decoders = nn.ModuleList(
-            Decoder(width, finer, pool) for finer, width, pool in reversed(scales)
+            VarianceGatedDecoder(width, finer, pool) for finer, width, pool in reversed(scales)
         )
         self.pred = nn.Conv2d(base_channels, 3, 1)
         self.offset = ConvNorm(3, 1)
@@ -86,10 +87,10 @@ class PIENet(CentreViewNetwork):
         return level * mean - offset, level.square() * variance
 
 
-class Encoder(nn.Module):
+class FiLMConvLSTM(nn.Module):
     """A memory whose hidden map is scaled and shifted by the summary of events and frame."""
 
-    def __init__(self, inputs: int, width: int, pool: int, summary: int, refine: bool):
+    def __init__(self, inputs: int, width: int, pool: int, summary_channels: int, refine: bool):
         super().__init__()
         self.width, self.pool = width, pool
         both = inputs + width
@@ -99,7 +100,7 @@ class Encoder(nn.Module):
         )
         self.hidden_norm, self.cell_norm = Float32GroupNorm(4, width), Float32GroupNorm(4, width)
         self.refine = ConvNorm(width, width) if refine else None
-        self.modulate = nn.Conv2d(summary, 2 * width, 1)
+        self.modulate = nn.Conv2d(summary_channels, 2 * width, 1)
 
     def forward(
         self, x: Map, memory: Memory | None, summary: Float[Tensor, "n s 1 1"]
@@ -116,10 +117,10 @@ class Encoder(nn.Module):
         seen = hidden if self.refine is None else hidden + self.refine(hidden)
         scale, shift = self.modulate(summary).chunk(2, 1)
         seen = seen * (1 + scale) + shift
-        return functional.max_pool2d(seen, fit_pool(self.pool, seen)), seen, (hidden, cell)
+        return functional.max_pool2d(seen, limit_pool_size(self.pool, seen)), seen, (hidden, cell)
 
 
-class Decoder(nn.Module):
+class VarianceGatedDecoder(nn.Module):
     """Grows a map to the size of its skip, which the variance of the last frame gates."""
 
     def __init__(self, inputs: int, outputs: int, pool: int):
@@ -131,7 +132,7 @@ class Decoder(nn.Module):
         height, width = skip.shape[-2:]
         gate = self.gate(resize(variance, height, width)).sigmoid()
         skip = torch.where(begun > 0, gate, 1.0) * skip
-        factor = fit_pool(self.pool, skip)
+        factor = limit_pool_size(self.pool, skip)
         x = resize(x, factor * x.shape[2], factor * x.shape[3])
         rows, columns = height - x.shape[2], width - x.shape[3]  # that pooling has left over
         edges = (columns // 2, columns - columns // 2, rows // 2, rows - rows // 2)
@@ -178,6 +179,6 @@ def resize(x: Map, height: int, width: int) -> Map:
     return functional.interpolate(x, (height, width), mode="bilinear", align_corners=True)
 
 
-def fit_pool(pool: int, x: Tensor) -> int:
+def limit_pool_size(pool: int, x: Tensor) -> int:
     """Return the side of what is pooled: `pool`, or less on a map that is smaller."""
     return min(pool, *x.shape[-2:])

@@ -51,7 +51,7 @@ class Postprocessed(VideoMethod):
     ):
         super().__init__()
         if isinstance(postprocessor, str):
-            postprocessor = load(postprocessor, allowed_packages)
+            postprocessor = load_postprocessor(postprocessor, allowed_packages)
         self.source, self.postprocessor = source, postprocessor
         self.views = source.views
 
@@ -64,7 +64,7 @@ class Postprocessed(VideoMethod):
         return restored.repeat_interleave(step, 1)[:, : frames.shape[1]]
 
 
-def load(weights: str, allowed_packages: Sequence[str] = ()) -> FramePostprocessor:
+def load_postprocessor(weights: str, allowed_packages: Sequence[str] = ()) -> FramePostprocessor:
     """Return the frozen post-processor of a name in weights/ or a path.
 
     Raises ValueError, which says how to make it, where there is none.

@@ -12,7 +12,7 @@ from baselines.e2vid_plus import E2VIDPlus
 from baselines.etnet import ETNet
 from baselines.firenet import FireNet
 from baselines.hypere2vid import HyperE2VID
-from baselines.pickled_weights import read_tensors
+from baselines.pickled_weights import read_pickled_tensors
 from baselines.pienet import PIENet
 from src.models import files
 
@@ -110,7 +110,7 @@ PIENET = (
 OURS = (".safetensors", ".ckpt")  # what src.models.files reads
 
 
-class Published(NamedTuple):
+class PublishedNetwork(NamedTuple):
     """A published network; its width, `width_argument`, is the outputs of `first_layer`.
 
     `left_out`: names, a regular expression, of weights in the checkpoint that it does not have.
@@ -127,19 +127,29 @@ class Published(NamedTuple):
 NORMALISED, RAW = {"normalise": "nonzero"}, {"normalise": "none", "output": "clip"}
 PIE_NET = PIENET, "events.conv", "base_channels"
 NETWORKS = {
-    "e2vid": Published(
+    "e2vid": PublishedNetwork(
         E2VIDPlus, NORMALISED | {"output": "sigmoid"}, UNET, "net.head", "base_channels"
     ),
-    "e2vid_plus": Published(E2VIDPlus, RAW, UNET, "net.head", "base_channels"),
-    "firenet": Published(FireNet, NORMALISED | {"output": "none"}, FIRENET, "head", "channels"),
-    "firenet_plus": Published(FireNet, RAW, FIRENET_PLUS, "head", "channels"),
-    "etnet": Published(ETNet, RAW | {"output": "sigmoid"}, ETNET, "net.head", "base_channels"),
-    "hypere2vid": Published(HyperE2VID, RAW, HYPER, "net.head", "base_channels"),
-    "cista": Published(CISTA, NORMALISED | {"output": "sigmoid"}, CISTA_TC, "events", "channels"),
-    "pienet": Published(PIENet, RAW, *PIE_NET),
-    "pienet_lite": Published(PIENet, RAW | {"channels": (16, 24), "pools": (2, 2)}, *PIE_NET),
+    "e2vid_plus": PublishedNetwork(E2VIDPlus, RAW, UNET, "net.head", "base_channels"),
+    "firenet": PublishedNetwork(
+        FireNet, NORMALISED | {"output": "none"}, FIRENET, "head", "channels"
+    ),
+    "firenet_plus": PublishedNetwork(FireNet, RAW, FIRENET_PLUS, "head", "channels"),
+    "etnet": PublishedNetwork(
+        ETNet, RAW | {"output": "sigmoid"}, ETNET, "net.head", "base_channels"
+    ),
+    "hypere2vid": PublishedNetwork(HyperE2VID, RAW, HYPER, "net.head", "base_channels"),
+    "cista": PublishedNetwork(
+        CISTA, NORMALISED | {"output": "sigmoid"}, CISTA_TC, "events", "channels"
+    ),
+    "pienet": PublishedNetwork(PIENet, RAW, *PIE_NET),
+    "pienet_lite": PublishedNetwork(
+        PIENet, RAW | {"channels": (16, 24), "pools": (2, 2)}, *PIE_NET
+    ),
     # What event-pienet 1.1.3 runs of the checkpoint of PIE-Net.
-    "pienet_package": Published(PIENet, RAW | {"refine": False}, *PIE_NET, r"\.out\.mbconv_0\."),
+    "pienet_package": PublishedNetwork(
+        PIENet, RAW | {"refine": False}, *PIE_NET, r"\.out\.mbconv_0\."
+    ),
 }
 
 
@@ -175,29 +185,29 @@ def load_published(architecture: str, path: Path) -> nn.Module:
     extra names when the weights are another network's.
     """
     network_class, options, rules, first_layer, width, unused = _find_architecture(architecture)
-    weights = read_tensors(path)
+    weights = read_pickled_tensors(path)
     weights = {k: v for k, v in weights.items() if not (unused and re.search(unused, k))}
-    head, sizes = weights.get(rename(f"{first_layer}.weight", rules)), {}
+    head, sizes = weights.get(published_name(f"{first_layer}.weight", rules)), {}
     if head is not None and head.dim() == 4 and head.numel() > 0:
         sizes = {"bins": head.shape[1], width: head.shape[0]}
     with torch.device("meta"):  # without memory: a small file may ask for a huge network
         own = network_class(**sizes, **options).state_dict()
-    names = {ours: rename(ours, rules) for ours in own}
+    names = {ours: published_name(ours, rules) for ours in own}
     wanted = {names[ours]: value for ours, value in own.items()}
-    files.check_fit(f"baseline.weights are not those of {architecture}", wanted, weights)
+    files.check_weights_fit(f"baseline.weights are not those of {architecture}", wanted, weights)
     network = network_class(**sizes, **options)
     network.load_state_dict({ours: weights[theirs] for ours, theirs in names.items()})
     return network.eval().requires_grad_(False)
 
 
-def rename(ours: str, rules: tuple[tuple[str, str], ...]) -> str:
+def published_name(ours: str, rules: tuple[tuple[str, str], ...]) -> str:
     """Return the published name of a weight of ours."""
     for pattern, published in rules:
         ours = re.sub(pattern, published, ours)
     return ours
 
 
-def _find_architecture(architecture: str) -> Published:
+def _find_architecture(architecture: str) -> PublishedNetwork:
     if architecture not in NETWORKS:
         names = ", ".join(NETWORKS)
         raise ValueError(f"baseline.architecture must be one of {names}, got {architecture}")

@@ -1,8 +1,8 @@
 """Selective state spaces (Gu & Dao 2023, Mamba) in plain PyTorch, in both directions of a sequence.
 
-    state <- exp(step * rate) * state + step * enter * x        read = leave . state
+    state <- exp(delta * A) * state + delta * B * x        read = C . state
 
-per channel with its own few states; step, enter and leave follow from the input.
+per channel with its own few states; delta, B and C follow from the input.
 """
 
 import math
@@ -19,25 +19,25 @@ States = Float[Tensor, "n length s"]
 BLOCK = 16384  # positions whose states are kept at once: 64 MiB at 128 channels of 8 states
 
 
-def scan(
-    x: Tokens, step: Tokens, rate: Float[Tensor, "c s"], enter: States, leave: States
+def selective_scan(
+    x: Tokens, delta: Tokens, a: Float[Tensor, "c s"], b: States, c: States
 ) -> Tokens:
-    """Return what each channel reads; `rate` < 0, `step` > 0, so no decay exceeds one.
+    """Return what each channel reads; `a` < 0, `delta` > 0, so no decay exceeds one.
 
     Block after block, so that the memory of states is that of one block.
     """
-    blocks = zip(*(part.split(BLOCK, 1) for part in (x, step, enter, leave)), strict=True)
-    state, read = x.new_zeros(len(x), *rate.shape), []
-    for x, step, enter, leave in blocks:
-        piece, state = _block(x, step, rate, enter, leave, state)
+    blocks = zip(*(part.split(BLOCK, 1) for part in (x, delta, b, c)), strict=True)
+    state, read = x.new_zeros(len(x), *a.shape), []
+    for x, delta, b, c in blocks:
+        piece, state = _block(x, delta, a, b, c, state)
         read.append(piece)
     return torch.cat(read, 1)
 
 
 def _block(
-    x: Tensor, step: Tensor, rate: Tensor, enter: Tensor, leave: Tensor, state: Tensor
+    x: Tensor, delta: Tensor, a: Tensor, b: Tensor, c: Tensor, state: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return `scan` from `state` (n, c, s) on, and the last state.
+    """Return `selective_scan` from `state` (n, c, s) on, and the last state.
 
     In two levels: pieces of about sqrt(length) run side by side from zero, then each piece gets
     what the ones before it left, decayed.  2 sqrt(length) steps in a row instead of `length`.
@@ -45,18 +45,18 @@ def _block(
     length = x.shape[1]
     piece = math.ceil(math.sqrt(length))
     missing = -length % piece
-    if missing:  # step 0 changes nothing
+    if missing:  # delta 0 changes nothing
         padding = (0, 0, 0, missing)
-        x, step, enter, leave = (functional.pad(a, padding) for a in (x, step, enter, leave))
-    decay = torch.exp(step[..., None] * rate).unflatten(1, (-1, piece))
-    drive = ((step * x)[..., None] * enter[:, :, None]).unflatten(1, (-1, piece))
+        x, delta, b, c = (functional.pad(part, padding) for part in (x, delta, b, c))
+    decay = torch.exp(delta[..., None] * a).unflatten(1, (-1, piece))
+    drive = ((delta * x)[..., None] * b[:, :, None]).unflatten(1, (-1, piece))
     states, decays = _run(decay, drive, 2)
     lasts, fades = states[:, :, -1], decays[:, :, -1]
     first = lasts[:, :1] + fades[:, :1] * state[:, None]
     carried, _ = _run(fades, torch.cat([first, lasts[:, 1:]], 1), 1)
     before = torch.cat([state[:, None], carried[:, :-1]], 1)
     states = (states + decays * before[:, :, None]).flatten(1, 2)
-    return torch.einsum("nlcs,nls->nlc", states, leave)[:, :length], carried[:, -1]
+    return torch.einsum("nlcs,nls->nlc", states, c)[:, :length], carried[:, -1]
 
 
 def _run(decay: Tensor, drive: Tensor, axis: int) -> tuple[Tensor, Tensor]:
@@ -71,17 +71,17 @@ def _run(decay: Tensor, drive: Tensor, axis: int) -> tuple[Tensor, Tensor]:
     return torch.stack(states, axis), torch.stack(products, axis)
 
 
-class Direction(nn.Module):
+class DirectionalScan(nn.Module):
     """One direction of a sequence: causal convolution, then the scan.
 
-    `guided`: step, enter and leave follow from a guide instead of from the input.
+    `takes_guide`: delta, B and C follow from a guide instead of from the input.
     """
 
-    def __init__(self, channels: int, states: int, rank: int, guided: bool):
+    def __init__(self, channels: int, states: int, rank: int, takes_guide: bool):
         super().__init__()
         self.rank, self.states = rank, states
         self.conv = nn.Conv1d(channels, channels, TAPS, padding=TAPS - 1, groups=channels)
-        if guided:
+        if takes_guide:
             self.guide_conv = nn.Conv1d(channels, channels, TAPS, padding=TAPS - 1, groups=channels)
         self.select = nn.Linear(channels, rank + 2 * states, bias=False)
         self.step = nn.Linear(rank, channels)
@@ -98,23 +98,23 @@ class Direction(nn.Module):
         x = _causal(self.conv, x)
         chooser = x if guide is None else _causal(self.guide_conv, guide)
         sizes = [self.rank, self.states, self.states]
-        step, enter, leave = self.select(chooser).float().split(sizes, dim=-1)
-        step = functional.softplus(self.step(step.to(x.dtype)).float())
-        read = scan(x.float(), step, -self.log_rate.float().exp(), enter, leave)
+        delta, b, c = self.select(chooser).float().split(sizes, dim=-1)
+        delta = functional.softplus(self.step(delta.to(x.dtype)).float())
+        read = selective_scan(x.float(), delta, -self.log_rate.float().exp(), b, c)
         return (read + self.through * x).to(x.dtype)
 
 
-class Mixer(nn.Module):
+class BidirectionalMamba(nn.Module):
     """A gated selective state space in both directions, with or without a guide."""
 
-    def __init__(self, width: int, states: int = 16, guided: bool = False):
+    def __init__(self, width: int, states: int = 16, takes_guide: bool = False):
         super().__init__()
         inner, rank = EXPAND * width, math.ceil(width / 16)
-        self.enter = nn.Linear(width, inner if guided else 2 * inner, bias=False)
-        if guided:
+        self.enter = nn.Linear(width, inner if takes_guide else 2 * inner, bias=False)
+        if takes_guide:
             self.enter_guide = nn.Linear(2 * width, 2 * inner, bias=False)
-        self.ahead = Direction(inner, states, rank, guided)
-        self.back = Direction(inner, states, rank, guided)
+        self.ahead = DirectionalScan(inner, states, rank, takes_guide)
+        self.back = DirectionalScan(inner, states, rank, takes_guide)
         self.leave = nn.Linear(inner, width, bias=False)
 
     def forward(self, x: Tokens, guide: Tokens | None = None) -> Tokens:

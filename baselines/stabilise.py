@@ -29,7 +29,9 @@ def estimate_jitter(frames: Video) -> Float[Tensor, "n frames 2 h w"]:
 def _clip_jitter(clip: Float[Tensor, "frames 1 h w"]) -> Float[Tensor, "frames 2 h w"]:
     steps = _with_neighbours(*temporal.estimate_block_displacement(clip[1:], clip[:-1]))
     path = functional.pad(steps.cumsum(0), (0, 0, 0, 0, 0, 0, 1, 0))
-    shake = path - torch.einsum("ts,s...->t...", linear_smoother(len(path)).to(path), path)
+    shake = path - torch.einsum(
+        "ts,s...->t...", local_linear_smoothing_matrix(len(path)).to(path), path
+    )
     power = shake.square().mean((0, 1))
     shake = shake * power / (power + ERROR**2)
     return functional.interpolate(shake, clip.shape[-2:], mode="bilinear")
@@ -50,7 +52,7 @@ def _with_neighbours(
     return whole + torch.cat(moved, 1) / (total + 1e-9)
 
 
-def linear_smoother(frames: int) -> Float[Tensor, "frames frames"]:
+def local_linear_smoothing_matrix(frames: int) -> Float[Tensor, "frames frames"]:
     """Return the matrix that fits a straight line around each moment, weighed by a Gaussian, and
     takes its value there: constants and straight lines come through as they are.
     """

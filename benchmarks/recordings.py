@@ -68,7 +68,7 @@ def end_to_end(path: Path, seconds: float) -> None:
         chunks = recording.iter_events(path, seconds=0.05)
         parts, frames, events = event_windows.cut_windows(chunks, views, rule), 0, 0
         for frame in reconstruction.reconstruct_frames(parts, net.eval()):
-            frames, events = frames + 1, events + frame.events + frame.outside
+            frames, events = frames + 1, events + frame.events + frame.events_outside
         cpu = time.process_time() - start
         print(
             f"file to {frames} frames, {fps} fps, {name}, one thread:"

@@ -175,7 +175,7 @@ def launches() -> None:
     for prepared in prepare_clips():
         with Work() as work:
             device.select_engine = lambda device, work=work: kernels(work)
-            clip_rendering.render_views(frames[0], prepared.plans, compiled=False)
+            clip_rendering.render_views(frames[0], prepared.plans, use_cpu_engines=False)
         ms = [work.launches * LAUNCH_S, work.bytes / BYTES_S, work.products / PRODUCTS_S]
         done.append((work.launches, work.bytes / 1e9, work.products / 1e9, 1e3 * math.fsum(ms)))
     device.select_engine = chosen

@@ -15,12 +15,14 @@ def main() -> None:
     """Run `src.<command>` with the rest of the command line."""
     import src
 
+    src.shorten_interruption()
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if name not in COMMANDS:
         print(f"usage: lightfield-events {{{','.join(COMMANDS)}}} [key=value ...]")
         sys.exit(0 if name in ("-h", "--help") else 2)
     if find_spec("lightning") is None:
-        print('error: commands need pip install "lightfield-events[train]"', file=sys.stderr)
+        where = "in the folder of the repository"
+        print(f'error: commands need pip install ".[train]" {where}', file=sys.stderr)
         sys.exit(1)
     file = str(Path(src.__path__[0]) / f"{name}.py")
     sys.argv[:2] = [file]

@@ -140,7 +140,7 @@ def draw_from_measurement(found: TurbulenceFile, k: int) -> Atmosphere:
     """Return an atmosphere drawn from what was found."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "air.yaml"
-        file.write_text(found.text())
+        file.write_text(found.to_yaml())
         return draw_from_file(file, k)
 
 

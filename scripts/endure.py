@@ -22,7 +22,7 @@ from hydra import compose, initialize_config_dir
 from src.app import build, entry_point
 from src.models.e2vid import E2VID
 from src.recordings import event_windows, output, reconstruction, sensor_lookup
-from src.recordings.files import contract, event_writers, sources
+from src.recordings.files import event_file, event_writers, sources
 from src.recordings.views import Views
 from src.records import results
 from src.train import fit
@@ -127,7 +127,7 @@ def reconstruct(events: int, run: Path) -> dict:
 
 def _recording() -> np.ndarray:
     draw = np.random.default_rng(0)
-    made = np.zeros(EVENTS, contract.EVENT)
+    made = np.zeros(EVENTS, event_file.EVENT)
     made["t"] = np.sort(draw.integers(0, 2_000_000, EVENTS))
     made["x"], made["y"] = draw.integers(0, SIDE, (2, EVENTS))
     made["p"] = draw.choice([-1, 1], EVENTS)

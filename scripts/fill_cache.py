@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 
 from scripts.parallel_fill import fill
 from src.app import entry_point, simulation
-from src.training.disk_cache import DiskClipCache, init_worker
+from src.training.disk_cache import DiskClipCache, prepare_worker_process
 
 REPORT_S = 10.0  # between two lines
 
@@ -44,7 +44,7 @@ def fill_clip_cache(cache: DiskClipCache, workers: int, device: str = "cpu") -> 
 
 
 def _run_worker(cache: DiskClipCache) -> None:
-    init_worker()
+    prepare_worker_process()
     cache.fill()
 
 

@@ -20,11 +20,11 @@ from scripts.readme import BASELINES, baseline_overrides
 from src.app import build
 from src.app.compose import compose_config
 from src.figures import plots
-from src.metrics.invented_contrast import find_unseen, invented_contrast
-from src.reconstruct import choose_views, video_frames
+from src.metrics.invented_contrast import find_unseen_pixels, invented_contrast
+from src.reconstruct import choose_views, reconstruct_video_frames
 from src.recordings.files import sources, videos
 from src.recordings.noise_filter import find_supported_pixels
-from src.recordings.reconstruction import Frame, as_event_network
+from src.recordings.reconstruction import Frame, require_event_network
 
 FPS = 120
 WIDE = 2.4  # inches: width of a panel
@@ -37,8 +37,8 @@ def last(recording: str, network: str, published: Path | None) -> Frame:
     chosen = baseline_overrides(network, published) if network in BASELINES else [f"ckpt={network}"]
     sensor = [f"sensor_size=[{size.replace('x', ',')}]"] if size else []
     cfg = compose_config("reconstruct", f"recording={path}", f"fps={FPS}", *chosen, *sensor)
-    loaded = as_event_network(build.load_network(cfg))
-    frames, _ = video_frames(cfg, loaded, choose_views(cfg, loaded))
+    loaded = require_event_network(build.load_network(cfg))
+    frames, _ = reconstruct_video_frames(cfg, loaded, choose_views(cfg, loaded))
     *_, frame = frames
     return frame
 
@@ -56,7 +56,7 @@ def camera(recording: str, time_s: float) -> Float[np.ndarray, "h w"] | None:
 def unseen(recording: str, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
     """Return where no event that is not noise was ever near."""
     events = sources.iter_recording(recording.partition("@")[0], size, 0.05)
-    return find_unseen(find_supported_pixels(events, size))
+    return find_unseen_pixels(find_supported_pixels(events, size))
 
 
 def gallery(recordings: list[str], networks: list[str], published: Path | None) -> Figure:

@@ -188,7 +188,7 @@ def _psf_errors(band: PSFBand, strength: float) -> Tensor:
     among = torch.einsum("af,qf,rf->aqr", seen, shapes, shapes.conj()).real
     out = []
     for network in band.networks:
-        merged = network.merge_layers(network.modes - 2, strength)
+        merged = network.merge_into_few_matrices(network.modes - 2, strength)
         found = [merged(place[:, 2:].T)[1:].T]
         for corners in nodes:
             found.append(_interpolated(merged(corners.flatten(0, 1)[:, 2:].T)[1:].T, shares))

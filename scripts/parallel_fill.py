@@ -25,7 +25,7 @@ from src.sim.turbulence.clip_rendering import render_tilt, render_views
 from src.sim.turbulence.contract import Crop
 from src.sim.turbulence.engines.device import copy_to_device
 from src.training.clip_cache import CachedClip, clip_metadata
-from src.training.disk_cache import init_worker
+from src.training.disk_cache import prepare_worker_process
 
 MAX_QUEUED_CLIPS = 2  # on the device
 
@@ -201,7 +201,7 @@ def _unchanged(clip: Any) -> Any:
 
 
 def _init_worker(worker: int) -> None:
-    init_worker()
+    prepare_worker_process()
     os.environ["CUDA_VISIBLE_DEVICES"] = ""  # the device is for the process that asks
     cv2.setNumThreads(1)
 

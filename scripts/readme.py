@@ -64,7 +64,7 @@ OTHERS = {
     "one view, published PIE-Net": ("pienet", 1),
     LITE: ("pienet_lite", 1),
 }
-HEADLINE = (LARGE, SMALL, PAPER, ONE_VIEW, LITE, FIRENET)  # rows of the README
+HEADLINE = (LARGE, MEDIUM, SMALL, PAPER, ONE_VIEW, LITE, FIRENET)  # rows of the README
 SCORES = ("lpips", "ssim", "psnr_aligned")  # its columns
 VIEWS = {  # differences, clip by clip: of nine views and one
     "Δ (9 − 1 views), E2VID": (PAPER, ONE_VIEW),

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Make .venv with the dependencies of pyproject.toml, those of training, live view and tests
 # included, and OpenVINO, on which networks are fastest, where this machine has a wheel of it.
-# The repository itself is run from its root and not installed.
+# The repository is installed as it lies there: `import lightfield_events` works in any folder.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -34,3 +34,5 @@ PY
 openvino=$(sed -n 's/^openvino = \["\(.*\)"\].*/\1/p' pyproject.toml)
 "${pip[@]}" --only-binary=:all: "$openvino" ||
   echo "OpenVINO is not there (no wheel for this machine?): networks run in PyTorch, slower" >&2
+
+"${pip[@]}" --no-deps --no-build-isolation --editable .

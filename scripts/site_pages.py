@@ -80,4 +80,4 @@ def _format_output(output):
     if "text/html" in shown:
         return "".join(shown["text/html"])
     text = "".join(output.get("text") or shown["text/plain"]).strip()
-    return f"```text\n{text}\n```"
+    return f"```output\n{text}\n```"

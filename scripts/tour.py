@@ -14,7 +14,7 @@ from src.app import build
 from src.app.compose import compose_config
 from src.figures.samples import join_panels, render_events, tile_views
 from src.recordings import simulated_recording
-from src.recordings.output import round_codes
+from src.recordings.output import round_to_uint8
 from src.records.atomic import atomic_path
 from src.sim.pipeline import ClipParameters, Pipeline
 
@@ -32,7 +32,7 @@ def save(name: str, panels: dict[str, np.ndarray], scale: int = 2) -> None:
     large = {
         title: picture[None].repeat(scale, 1).repeat(scale, 2) for title, picture in panels.items()
     }
-    eight = round_codes(join_panels(large)[0, ..., ::-1])
+    eight = round_to_uint8(join_panels(large)[0, ..., ::-1])
     path = OUT / f"{name}.png"
     with atomic_path(path) as partial:
         packed = cv2.imencode(".png", eight, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]

@@ -22,7 +22,9 @@ from src.sim.turbulence import Atmosphere, sample_atmosphere
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 COUNT, WIDTH = 400, 256
-COLOURS = {"weak": "tab:green", "medium": "tab:orange", "strong": "tab:red"}
+COLOURS = {
+    "weak": "tab:green", "medium": "tab:orange", "strong": "tab:red", "extreme": "tab:purple"
+}  # fmt: skip
 FARTHEST = 2000.0  # px; what is longer is drawn there
 COLUMNS = {
     "tilt, px": lambda path: path.tilt_std_px(WIDTH),
@@ -50,7 +52,7 @@ def draw_test_atmospheres() -> dict[str, list[Atmosphere]]:
         cfg = compose("eval", overrides=["data=test_photos", "paths.run=."])
     pipeline = build.build_pipeline(cfg, "test")
     paths = [pipeline.draw(number).turbulence for number in range(cfg.data.test_clips)]
-    names = sorted({path.severity for path in paths}, key=("weak", "medium", "strong").index)
+    names = sorted({path.severity for path in paths}, key=list(COLOURS).index)
     return {f"test, {n}": [path for path in paths if path.severity == n] for n in names}
 
 

@@ -1,6 +1,8 @@
 """Packages and entry points of the project."""
 
 import os
+import sys
+from types import TracebackType
 
 # The largest picture that is read: OpenCV looks at this when it is imported, so before all else.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**27))
@@ -13,3 +15,22 @@ HOME = __name__.removesuffix("src")
 def importable_name(name: str) -> str:
     """Return the name by which is imported what configs and weights call src.* or baselines.*."""
     return HOME + name if name.split(".")[0] in ("src", "baselines") else name
+
+
+def shorten_interruption() -> None:
+    """Make Ctrl-C that nothing catches, as in the seconds of imports, one line on stderr; the
+    process still ends by SIGINT, exit code 130 of a shell."""
+    sys.excepthook = _show_exception
+
+
+def _show_exception(
+    kind: type[BaseException], error: BaseException, trace: TracebackType | None
+) -> None:
+    if issubclass(kind, KeyboardInterrupt):
+        print("stopped", file=sys.stderr)
+    else:
+        sys.__excepthook__(kind, error, trace)
+
+
+if sys.argv[:1] == ["-m"]:  # while Python looks for the module of `python -m src.<name>`
+    shorten_interruption()

@@ -10,11 +10,11 @@ from src.app import build, calibrations, entry_point
 from src.app.instantiate import build_part
 from src.recordings.calibration.scene_alignment import SceneTarget
 from src.recordings.files.event_file import ReadOptions
-from src.recordings.reconstruction import as_event_network
+from src.recordings.reconstruction import require_event_network
 from src.records import results
 
 
-def find_views(cfg: DictConfig, run: Path) -> dict:
+def calibrate_views(cfg: DictConfig, run: Path) -> dict:
     """Find the views and their homographies: `views.yaml`, also at `cfg.save`."""
     given: dict[str, Any] = {key: cfg[key] for key in ("resolution", "sensor_size")}
     given["options"] = ReadOptions.from_keys(cfg)
@@ -33,7 +33,7 @@ def find_views(cfg: DictConfig, run: Path) -> dict:
     return summary
 
 
-def find_threshold(cfg: DictConfig, run: Path) -> dict:
+def find_contrast_threshold(cfg: DictConfig, run: Path) -> dict:
     """Find the contrast threshold by comparing event rates with the configured simulation's."""
     pipeline = build.build_pipeline(cfg, "test")
     clips = [pipeline.render_views([pipeline.draw(index)])[0] for index in range(cfg.clips)]
@@ -44,10 +44,10 @@ def find_threshold(cfg: DictConfig, run: Path) -> dict:
     return {"ON (value, low, high)": estimate.on, "OFF": estimate.off}
 
 
-def measure_dots(cfg: DictConfig, run: Path) -> dict:
+def measure_dot_statistics(cfg: DictConfig, run: Path) -> dict:
     """Measure tilt, blur and scintillation of a dot grid against the same without turbulence."""
     given = cfg.ckpt or cfg.get("baseline")
-    network = as_event_network(build.load_network(cfg)) if given else None
+    network = require_event_network(build.load_network(cfg)) if given else None
     statistics = calibrations.measure_dot_grid(
         cfg.recording, cfg.still, run, fps=cfg.fps, network=network, views=cfg.views,
         sensor_size=cfg.sensor_size, options=ReadOptions.from_keys(cfg), **cfg.dots,
@@ -55,17 +55,19 @@ def measure_dots(cfg: DictConfig, run: Path) -> dict:
     return statistics.summary()
 
 
-def measure_video(cfg: DictConfig, run: Path) -> dict:
+def measure_turbulence_in_video(cfg: DictConfig, run: Path) -> dict:
     """Measure the turbulence in front of a still scene: `air.yaml`, also at `cfg.save`."""
     if OmegaConf.is_missing(cfg, "video"):
         raise ValueError("video must be a video of a still scene, got none")
-    measured = calibrations.measure_film(cfg.video, run, fps=cfg.fps, save=cfg.save, **cfg.air)
+    measured = calibrations.measure_turbulence_in_video(
+        cfg.video, run, fps=cfg.fps, save=cfg.save, **cfg.air
+    )
     return {name: str(value) for name, value in vars(measured.found).items()}
 
 
 TASKS = {
-    "views": find_views, "threshold": find_threshold, "turbulence": measure_dots,
-    "air": measure_video,
+    "views": calibrate_views, "threshold": find_contrast_threshold,
+    "turbulence": measure_dot_statistics, "air": measure_turbulence_in_video,
 }  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from src.figures import frontier
 from src.records import results
 
 
-def chart(cfg: DictConfig) -> dict[str, str]:
+def draw_speed_accuracy_chart(cfg: DictConfig) -> dict[str, str]:
     """Time and score every network; write figures, `speed.csv`, `scores.csv` and `chart.md`.
 
     Returns {severity: the cheapest network within one standard error of the best}.  Raises
@@ -28,7 +28,7 @@ def chart(cfg: DictConfig) -> dict[str, str]:
     results.write_text(run / "speed.csv", speed_accuracy.format_speeds_csv(speeds))
     pipelines = {name: compared_networks.pipeline_at_severity(cfg, name) for name in cfg.severities}
     scored = {"warmup": cfg.data.unscored_windows, "forms": cfg.forms}
-    scores = speed_accuracy.score_candidates(
+    scores = speed_accuracy.score_accuracy(
         candidates, pipelines, cfg.clips, build.build_metrics(cfg), **scored
     )
     results.write_text(run / "scores.csv", speed_accuracy.format_scores_csv(scores))
@@ -45,4 +45,4 @@ def chart(cfg: DictConfig) -> dict[str, str]:
 
 
 if __name__ == "__main__":
-    entry_point.run_command(chart, "chart")
+    entry_point.run_command(draw_speed_accuracy_chart, "chart")

@@ -25,12 +25,12 @@ def convert(cfg: DictConfig) -> Path:
         if written.exists() and source.exists() and written.samefile(source):
             raise ValueError(f"out must be another file than recording, got {out}")
     options = ReadOptions.from_keys(cfg)
-    height, width = sources.sensor_size(source, cfg.sensor_size, options)
+    height, width = sources.find_sensor_size(source, cfg.sensor_size, options)
     how = {"width": width, "height": height, "version": cfg.version, "layout": cfg.layout}
-    event_writers.find_kind(out, **how)
+    event_writers.choose_file_kind(out, **how)
     opened = recording.open_recording(source, (width, height), options)
     frames = frames_to_write(opened, (height, width), cfg) if cfg.layout == "evreal" else None
-    events = cut(opened, cfg.start_s, cfg.end_s)
+    events = cut_time_range(opened, cfg.start_s, cfg.end_s)
     count, seconds = event_writers.write_pieces(out, events, **how, frames=frames)
     size = sum(file.stat().st_size for file in (out, *out.rglob("*")) if file.is_file())
     print(f"{count} events, {seconds:.6f} s, {width}x{height}, {size} bytes: {out}")
@@ -56,7 +56,9 @@ def frames_to_write(
     return frames if len(frames.times_us) else None
 
 
-def cut(pieces: Iterable[np.ndarray], start_s: float, end_s: float) -> Iterator[np.ndarray]:
+def cut_time_range(
+    pieces: Iterable[np.ndarray], start_s: float, end_s: float
+) -> Iterator[np.ndarray]:
     """Yield the events from `start_s` to `end_s`, seconds after the first of `pieces`."""
     if not 0 <= start_s < end_s:
         raise ValueError(f"start_s must be >= 0 and before end_s, got {start_s}, {end_s}")

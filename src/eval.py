@@ -16,7 +16,7 @@ def evaluate(cfg: DictConfig) -> dict:
     Everything goes below `cfg.paths.run`.  Returns the content of `results.json`.
     """
     if cfg.data.get("benchmark") == "evreal":
-        return benchmark.evaluate_recordings(cfg)
+        return benchmark.evaluate_on_evreal(cfg)
     run, start = Path(cfg.paths.run), time.perf_counter()
     hardware.reserve_worker_cores(cfg)
     net = build.build_video_method(cfg)

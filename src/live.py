@@ -20,7 +20,7 @@ from src.live_view.page_server import PageServer
 from src.live_view.status import FaultLog
 from src.models.network import EventToVideoNetwork
 from src.recordings.files.event_file import ReadOptions
-from src.recordings.reconstruction import as_event_network, takes_all_views
+from src.recordings.reconstruction import require_event_network, takes_all_views
 from src.recordings.views import load_views, views_or_whole_sensor
 
 
@@ -61,10 +61,10 @@ def load_offered_networks(cfg: DictConfig, name: str, views: int) -> dict[str, E
     networks: dict[str, EventToVideoNetwork] = {}
     for other in dict.fromkeys([*cfg.offered_networks, name]):
         if other == name:
-            networks[name] = as_event_network(build.load_network(cfg))
+            networks[name] = require_event_network(build.load_network(cfg))
             takes_all_views(networks[name], views)
         else:
-            network = as_event_network(src.models.load(other, allowed_packages(cfg)))
+            network = require_event_network(src.models.load(other, allowed_packages(cfg)))
             if network.views in (None, 1, views):
                 networks[other] = network
     return networks

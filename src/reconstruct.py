@@ -40,15 +40,15 @@ def reconstruct(cfg: DictConfig) -> Path:
     """
     run, ready_s = Path(cfg.paths.run), []
     hardware.check_device(cfg.device)
-    curve = tone.curve_for_output(cfg.tone, cfg.tone_time_constant_s, cfg.output_format)
-    network = reconstruction.as_event_network(build.load_network(cfg))
+    make_tone_curve(cfg)  # refused before the work
+    network = reconstruction.require_event_network(build.load_network(cfg))
     views = choose_views(cfg, network)
-    make = film_frames if cfg.output_format == "film" else video_frames
+    make = reconstruct_film_frames if cfg.output_format == "film" else reconstruct_video_frames
     start = time.perf_counter()
     frames, size = make(cfg, network, views)
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     with output.open_video_writer(cfg.output_format, run, size, cfg.playback_fps) as write:
-        for frame in tone.apply_to_frames(show_frames(frames), curve):
+        for frame in show_progress(frames, cfg.start_s + 1 / cfg.fps):
             write(frame)
             ready_s.append(time.perf_counter() - start)
     print(describe_run(run / output.KINDS[cfg.output_format][1], views, ready_s))
@@ -61,39 +61,43 @@ def describe_run(video: Path, views: Views, ready_s: list[float]) -> str:
     """
     (height, width), number, count = views.model, len(views.views), len(ready_s)
     later_s = ready_s[-1] - ready_s[0]
-    speed = f", {(count - 1) / later_s:.1f} frames/s after the first" if later_s else ""
+    rate = f"{(count - 1) / later_s:.1f} frames per second of wall time" if later_s else ""
+    speed = f", after the first frame {rate}, reading and writing included" if later_s else ""
     return (
         f"{video}: {count} frames, {width}x{height} px, {number} view{'s' * (number > 1)}; "
         f"{ready_s[-1]:.1f} s{speed}; times in {video.parent / 'frames.csv'}"
     )
 
 
-def show_frames(frames: Iterable[Frame]) -> Iterator[Frame]:
-    """Yield `frames`, and show how many there were and how far in the recording they are."""
+def show_progress(frames: Iterable[Frame], first_s: float) -> Iterator[Frame]:
+    """Yield `frames`, and show how many there were and how far in the recording they are, the first
+    `first_s` after its beginning, whatever its clock."""
     columns = "{task.description}", BarColumn(), "{task.completed:.0f} frames,", "{task.fields[at]}"
     with Progress(*columns, TimeElapsedColumn()) as progress:
         task = progress.add_task("reconstruction", total=None, at="0.00 s")
+        start_s = None
         for frame in frames:
             yield frame
-            progress.update(task, advance=1, at=f"{frame.time_s:.2f} s")
+            start_s = frame.time_s - first_s if start_s is None else start_s
+            progress.update(task, advance=1, at=f"{frame.time_s - start_s:.2f} s")
         progress.update(task, total=progress.tasks[0].completed)
 
 
 def choose_views(cfg: DictConfig, network: EventToVideoNetwork) -> Views:
     """Return the views of the recording that the network takes."""
-    sensor = sources.sensor_size(cfg.recording, cfg.sensor_size, ReadOptions.from_keys(cfg))
+    sensor = sources.find_sensor_size(cfg.recording, cfg.sensor_size, ReadOptions.from_keys(cfg))
     views = views_or_whole_sensor(cfg.views, sensor, cfg.resolution)
     all_of_them = reconstruction.takes_all_views(network, len(views.views))
     return views if all_of_them else views.select([(0, 0)])
 
 
-def video_frames(
+def reconstruct_video_frames(
     cfg: DictConfig, network: EventToVideoNetwork, views: Views
 ) -> tuple[Iterator[Frame], tuple[int, int]]:
-    """Return the frames of the recording and their size."""
+    """Return the frames of the recording, as `tone` shows them, and their size."""
     given = cfg.form, cfg.device, views, cfg.bins
     runnable = reconstruction.build_runnable_network(network, *given)
-    rule = build_rule(cfg, network)
+    rule = build_window_rule(cfg, network)
     rule = replace(rule, as_lists=isinstance(runnable, EventListRuntime))
 
     def read() -> Iterator[np.ndarray]:
@@ -101,10 +105,15 @@ def video_frames(
 
     options = views, rule, cfg.backward_warmup_s
     frames = reconstruction.reconstruct_recording(read, runnable, *options, device=cfg.device)
-    return frames, views.model
+    return tone.apply_to_frames(frames, make_tone_curve(cfg)), views.model
 
 
-def build_rule(cfg: DictConfig, network: EventToVideoNetwork) -> WindowRule:
+def make_tone_curve(cfg: DictConfig) -> tone.ToneCurve:
+    """Return the curve of `tone`; raises ValueError where frames are data."""
+    return tone.curve_for_output(cfg.tone, cfg.tone_time_constant_s, cfg.output_format)
+
+
+def build_window_rule(cfg: DictConfig, network: EventToVideoNetwork) -> WindowRule:
     """Return how the recording is cut into windows for `network`."""
     length = cfg.window_length or reconstruction.default_window_length(network)
     settings = {key: cfg[key] for key in RULE_KEYS}
@@ -120,7 +129,7 @@ def read_events(cfg: DictConfig, views: Views) -> Iterator[np.ndarray]:
     return filter(len, map(NoiseFilter(views.sensor, cfg.noise_filter_s), events))
 
 
-def film_frames(
+def reconstruct_film_frames(
     cfg: DictConfig, network: EventToVideoNetwork, views: Views
 ) -> tuple[Iterator[Frame], tuple[int, int]]:
     """Return the frames of the film, panels beside each other, and their size.
@@ -129,23 +138,23 @@ def film_frames(
     network for another number of views.
     """
     number, centre = len(views.views), views
-    methods = {f"{number} views": video_frames(cfg, network, views)[0]}
+    methods = {f"{number} views": reconstruct_video_frames(cfg, network, views)[0]}
     if number == 1:
         methods = {"one view": methods["1 views"]}
     else:
         centre = views.select([(0, 0)])
         if network.views is None:
-            methods = {"one view": video_frames(cfg, network, centre)[0]} | methods
-    rule = replace(build_rule(cfg, network), bins=1)
+            methods = {"one view": reconstruct_video_frames(cfg, network, centre)[0]} | methods
+    rule = replace(build_window_rule(cfg, network), bins=1)
     windows = cut_windows(read_events(cfg, views), build_lookup(centre), rule)
-    clean = truth_file.read_clean(Path(cfg.recording))
-    frames = join_frames(windows, methods, clean)
+    clean = truth_file.read_clean_clip(Path(cfg.recording))
+    frames = join_film_panels(windows, methods, clean)
     first = next(frames)
     height, width = first.picture.shape[:2]
     return chain([first], frames), (height, width)
 
 
-def join_frames(
+def join_film_panels(
     windows: Iterator[Window], methods: dict[str, Iterator[Frame]], clean: CleanClip | None
 ) -> Iterator[Frame]:
     """Yield frames of panels: the events of each window, the frames of the methods and, where it is
@@ -153,10 +162,12 @@ def join_frames(
     """
     for window, *shown in zip(windows, *methods.values(), strict=False):
         assert window.voxels is not None
-        panels = {"events": samples.render_events(window.voxels[0], full=1.0)}
+        panels = {samples.EVENTS_TITLE: samples.render_events(window.voxels[0], full=1.0)}
         panels |= {name: one.picture[None] for name, one in zip(methods, shown, strict=True)}
         if clean is not None:
-            panels["clean"] = clean.frame_at(window.end_us * 1e-6, shown[-1].picture.shape)[None]
+            panels["clean"] = clean.nearest_frame(window.end_us * 1e-6, shown[-1].picture.shape)[
+                None
+            ]
         yield replace(shown[-1], picture=samples.join_panels(panels)[0])
 
 

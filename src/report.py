@@ -1,11 +1,14 @@
 """Tables and one HTML page of runs: python -m src.report run=out/sweep/table1."""
 
+import re
+from dataclasses import replace
 from pathlib import Path
 
 from omegaconf import DictConfig, ListConfig
 
 from src.app import entry_point
 from src.app.instantiate import as_dict
+from src.app.path_overrides import unquote_override
 from src.records import results, runs
 from src.reports import page, run_groups, tables, writers
 
@@ -16,7 +19,7 @@ def report(cfg: DictConfig) -> list[tables.Table]:
     With `into`, the Markdown also replaces that file's section of the same title.
     """
     folders, out = _list_folders(cfg.run), Path(cfg.paths.run)
-    found, plans = runs.find_runs(folders), runs.find_sweeps(folders)
+    found, plans = runs.find_runs(folders), list(map(_as_typed, runs.find_sweeps(folders)))
     names = {run.record.get("asked", {}).get("config", "") for run in found}
     title = cfg.title or (names.pop() if len(names) == 1 else "") or "runs"
     published = as_dict(cfg.paper)
@@ -53,6 +56,12 @@ def report(cfg: DictConfig) -> list[tables.Table]:
         writers.replace_section(Path(cfg.into), title, text)
     print(f"{text}\nin {out}: report.md, report.csv, report.html")
     return shown
+
+
+def _as_typed(plan: runs.SweepPlan) -> runs.SweepPlan:
+    """Return a sweep without the quotes that its paths have for Hydra, as its runs name them."""
+    jobs = [list(map(unquote_override, job)) for job in plan.jobs]
+    return replace(plan, command=re.sub(r"'([\w.+/~-]+)'", r"\1", plan.command), jobs=jobs)
 
 
 def _list_folders(given: str | ListConfig) -> list[Path]:

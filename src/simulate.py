@@ -20,7 +20,7 @@ from src.app.own_simulation import OwnSimulation, SimulatedPart
 from src.figures import samples
 from src.recordings.files import event_writers
 from src.recordings.simulated_recording import kaleidoscope_views, write_recording
-from src.recordings.truth_file import open_truth
+from src.recordings.truth_file import create_truth_file
 from src.recordings.views import Views
 from src.records import results, safe_yaml
 from src.sim.optics import Position
@@ -48,19 +48,23 @@ def simulate(cfg: DictConfig) -> dict:
     if cfg.like and own:
         raise ValueError(f"like must be null with video or photo, got {cfg.like}")
     if cfg.write:  # refused before minutes of work
-        height, width = cfg.camera.sensor
-        event_writers.find_kind(Path(cfg.write), None, width, height, "evt3")
+        height, width = cfg.camera.sensor_size
+        event_writers.choose_file_kind(Path(cfg.write), None, width, height, "evt3")
     return simulate_own_clip(cfg) if own else simulate_scene(cfg)
 
 
 def simulate_own_clip(cfg: DictConfig) -> dict:
     """Simulate all of `video` or `photo` and record it, to `write` or into the run's folder."""
+    own_simulation.set_own_sensor(cfg, entry_point.command_line().get("overrides", []))
     run, clip = Path(cfg.paths.run), own_simulation.read_own_clip(cfg)
     work = OwnSimulation(cfg, clip)
     if not hasattr(work.sensor, "events"):
         kind = type(work.sensor).__name__
         raise ValueError(f"sensor must be one of events for video and photo, got {kind}")
-    camera, drawn = place_views(cfg, work.optics.positions, clip.size, work.key), work.record()
+    camera, drawn = (
+        place_views(cfg, work.optics.positions, clip.size, work.key),
+        work.drawn_parameters(),
+    )
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     print(work.describe())
     if cfg.photo and not cfg.speed_widths_per_s:
@@ -68,8 +72,8 @@ def simulate_own_clip(cfg: DictConfig) -> dict:
     path, shown = Path(cfg.write or run / f"{clip.name}.raw"), []
     path.parent.mkdir(parents=True, exist_ok=True)
     views, count = work.allocate_views(path.parent), 0
-    with open_truth(path, camera, len(clip.frames), clip.fps, drawn) as truth:
-        for part in work.parts(views, track):
+    with create_truth_file(path, camera, len(clip.frames), clip.fps, drawn) as truth:
+        for part in work.simulate_parts(views, track):
             truth.add(part.clean, part.views, part.tilt)
             shown += [part] if count <= DRAWN_FRAMES else []
             count += len(part.clean)
@@ -114,7 +118,7 @@ def simulate_scene(cfg: DictConfig) -> dict:
     path, size = Path(cfg.write), (views.shape[-2], views.shape[-1])
     camera, fps = place_views(cfg, pipeline.positions, size, draw.key), draw.clip.fps
     sensor: Any = draw.sensor  # one with `events`
-    with open_truth(path, camera, len(clean), fps / step, drawn) as truth:
+    with create_truth_file(path, camera, len(clean), fps / step, drawn) as truth:
         codes = encode_srgb(views) if pipeline.decodes_srgb else views
         truth.add(clean, codes[:, ::step], tilt[:, ::step])
         events = write_recording(path, views, fps, camera, sensor, track)
@@ -126,7 +130,7 @@ def place_views(
     cfg: DictConfig, positions: Sequence[Position], model: tuple[int, int], key: int
 ) -> Views:
     """Return where the camera of the config has the views, each of `model` (h, w) pixels."""
-    camera = {"sensor": tuple(cfg.camera.sensor), "tile_px": cfg.camera.tile_px}
+    camera = {"sensor": tuple(cfg.camera.sensor_size), "tile_px": cfg.camera.tile_px}
     return kaleidoscope_views(list(positions), model=model, key=key, **camera)
 
 
@@ -147,7 +151,8 @@ def print_files(path: Path, events: np.ndarray, pictures: list[Path]) -> None:
     print(f"{len(events)} events in {path}, geometry in {views}")
     print(f"clean frames, views and tilt in {truth} ({size:.1f} MB)")
     print(f"pictures: {', '.join(map(str, pictures))}")
-    print(f"next: python -m src.reconstruct recording={path} views={views} ckpt=setnet_small")
+    if len(events):
+        print(f"next: python -m src.reconstruct recording={path} views={views} ckpt=setnet_small")
 
 
 def take_clip_config_from_run(cfg: DictConfig) -> DictConfig:

@@ -32,7 +32,10 @@ def train(cfg: DictConfig) -> dict:
     hardware.retain_freed_memory(cfg)
     hardware.fill_in_precision(cfg)
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
-    first_weights, references = start_weights.adopt_start(cfg), start_weights.load_references(cfg)
+    first_weights, references = (
+        start_weights.set_model_from_start_weights(cfg),
+        start_weights.load_reference_networks(cfg),
+    )
     net, spec = build.build_network_and_spec(cfg)
     if first_weights:
         files.restore_weights(net, first_weights)
@@ -43,9 +46,9 @@ def train(cfg: DictConfig) -> dict:
         fit(trainer, module, data, start_from)
         return {}
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
-    beginning = start_weights.name_beginning(cfg, first_weights)
+    beginning = start_weights.describe_start_weights(cfg, first_weights)
     before = build.test_method(cfg, beginning, module.method, data, module.metrics)
-    tracking.log_config(trainer.loggers, as_dict(cfg))
+    tracking.log_config_to_wandb(trainer.loggers, as_dict(cfg))
     try:
         fit(trainer, module, data, start_from)
     except NonFiniteError as error:
@@ -60,8 +63,9 @@ def train(cfg: DictConfig) -> dict:
     drawn = data.pipelines["test"], cfg.sample_clips
     pictures = samples.write_samples(run / "samples", module.method, *drawn)
     rows, facts = [trained, before, *others], entry_point.run_metadata(cfg, start)
+    facts["note"] = results.describe_difference(trained, before)
     record = results.write_and_print_results(run, entry_point.resolved_yaml(cfg), rows, **facts)
-    tracking.log_results(trainer.loggers, record, pictures)
+    tracking.log_results_to_wandb(trainer.loggers, record, pictures)
     return record
 
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from src.app.benchmark import average_over_frames
+from src.app.benchmark import average_by_data_set
 from src.convert import convert
 from src.eval import evaluate
 from src.report import report
@@ -124,7 +124,7 @@ def test_a_known_sequence_has_its_range_and_its_peers(tmp_path, run, capsys):
 def test_the_mean_of_a_data_set_is_over_its_frames():
     clips = [{"data_set": "A", "frames": 1, "mse": 0.1}, {"data_set": "B", "frames": 5, "mse": 0.4},
              {"data_set": "A", "frames": 3, "mse": 0.5}]  # fmt: skip
-    found = average_over_frames(clips)
+    found = average_by_data_set(clips)
     assert found["A"] == {"sequences": 2, "frames": 4, "mse": pytest.approx(0.4)}
     assert found["B"] == {"sequences": 1, "frames": 5, "mse": pytest.approx(0.4)}
 

@@ -7,7 +7,7 @@ import torch
 
 from baselines.mambatm import MambaTM
 from src.app.compared_networks import load_candidates
-from src.chart import chart
+from src.chart import draw_speed_accuracy_chart
 from src.models import save
 from tests.test_train import config
 
@@ -29,7 +29,9 @@ def tiny(tmp_path, *overrides: str):
 
 
 def test_figures_and_tables_are_written_and_untrained_networks_timed_only(tmp_path):
-    found = chart(tiny(tmp_path, f"+networks={{highpass: {HIGHPASS}, ours: {SETNET}}}"))
+    found = draw_speed_accuracy_chart(
+        tiny(tmp_path, f"+networks={{highpass: {HIGHPASS}, ours: {SETNET}}}")
+    )
     assert found == {"weak": "highpass"}
     for name in ("chart.png", "chart.svg", "machine.png", "machine.svg", "chart.md"):
         assert (tmp_path / name).is_file()
@@ -49,7 +51,9 @@ def test_a_post_processor_is_scored_and_paid_for(tmp_path):
     spec = {"target": "baselines.mambatm.MambaTM", "kwargs": {}}
     save(file, MambaTM(), spec, {})
     behind = HIGHPASS.replace("views: 1", f"views: 1, postprocessor: {file}")
-    chart(tiny(tmp_path, f"+networks={{plain: {HIGHPASS}, behind: {behind}}}", "forms=[float32]"))
+    draw_speed_accuracy_chart(
+        tiny(tmp_path, f"+networks={{plain: {HIGHPASS}, behind: {behind}}}", "forms=[float32]")
+    )
     speeds = list(csv.DictReader((tmp_path / "speed.csv").read_text().splitlines()))
     cost = {row["network"]: row for row in speeds}
     for what in ("ms", "gmac", "params"):
@@ -71,7 +75,7 @@ def test_a_post_processor_is_scored_and_paid_for(tmp_path):
 )
 def test_what_cannot_be_measured_is_named(tmp_path, override, message):
     with pytest.raises(ValueError, match=message):
-        chart(tiny(tmp_path, "+networks={}", override))
+        draw_speed_accuracy_chart(tiny(tmp_path, "+networks={}", override))
 
 
 @pytest.mark.parametrize("found", [True, False])

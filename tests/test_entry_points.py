@@ -1,6 +1,7 @@
 """What a user meets at an entry point: one line and exit code 2, a checkpoint after Ctrl-C."""
 
 import logging
+import os
 import runpy
 import signal
 import subprocess
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from src.app.entry_point import run_main
 from tests.conftest import ROOT
 from tests.faults.harness import Run, run_entry_point
 from tests.faults.test_kills import resolved
@@ -42,6 +44,33 @@ def test_a_wrong_value_is_one_line_and_exit_code_2_of_the_process(tmp_path):
     (line,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert "data.crop must be in 8..64" in line and "Traceback" not in done.stderr
     assert not list(tmp_path.rglob("results.json"))
+
+
+@pytest.mark.parametrize("command", [["-m", "src.train"], ["-m", "lightfield_events", "train"]])
+def test_ctrl_c_while_modules_are_imported_is_one_line(command, tmp_path):
+    (tmp_path / "torch.py").write_text("raise KeyboardInterrupt\n")  # found before the package
+    environment = os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
+    ask = {"cwd": ROOT, "env": environment, "capture_output": True, "text": True}
+    done = subprocess.run([sys.executable, "-P", *command], **ask)
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, "stopped\n")  # of a shell: 130
+
+
+def test_a_program_that_uses_the_package_keeps_its_own_errors():
+    code = (
+        "import sys, lightfield_events as l; l.layout; assert sys.excepthook is sys.__excepthook__"
+    )
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
+
+
+def test_ctrl_c_later_is_one_line_and_exit_code_130(monkeypatch, capsys):
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    monkeypatch.setattr(sys, "argv", ["reconstruct.py"])
+    with pytest.raises(SystemExit) as end:
+        run_main(stop)
+    assert end.value.code == 130 and capsys.readouterr().err == "stopped\n"
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import lightfield_events
+import lightfield_events.__main__
 from setup import rename_imports
 from src import models
 from src.deploy.runtime import EventListRuntime
@@ -96,13 +97,33 @@ def test_the_built_package_works_beside_another_src(tmp_path):
     check_package(tmp_path / "p", tmp_path / "user", compiled=False)
 
 
-@pytest.mark.slow
-def test_pip_installs_it_into_an_empty_folder(tmp_path):
+def copy_tree(tmp_path: Path) -> Path:
     tree = tmp_path / "tree"  # pip leaves files where it builds
     for name in ("src", "baselines", "conf", "weights", "lightfield_events"):
         shutil.copytree(ROOT / name, tree / name)
     for name in ("setup.py", "pyproject.toml", "README.md", "LICENSE"):
         shutil.copyfile(ROOT / name, tree / name)
+    return tree
+
+
+@pytest.mark.slow
+def test_the_editable_installation_of_make_works_in_any_folder(tmp_path):
+    tree, place = copy_tree(tmp_path), tmp_path / "venv"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", place], check=True)
+    (site,) = place.glob("lib/python*/site-packages")
+    (site / "packages.pth").write_text(sysconfig.get_paths()["purelib"])
+    python, asked = place / "bin" / "python", (ROOT / "scripts" / "setup.sh").read_text()
+    (options,) = re.findall(r"(--no-deps --no-build-isolation --editable \.)$", asked, re.M)
+    install = [python, "-m", "pip", "install", "--quiet", "--no-index", *options.split()]
+    subprocess.run(install, cwd=tree, check=True, capture_output=True, timeout=300)
+    code = "import lightfield_events as l; print(l.__file__); l.layout"
+    done = subprocess.run([python, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout.strip() == str(tree / "lightfield_events/__init__.py")
+
+
+@pytest.mark.slow
+def test_pip_installs_it_into_an_empty_folder(tmp_path):
+    tree = copy_tree(tmp_path)
     options = ["--no-deps", "--no-build-isolation", "--quiet", "--target", str(tmp_path / "p")]
     command = [sys.executable, "-m", "pip", "install", ".", *options]
     subprocess.run(command, cwd=tree, check=True, capture_output=True, timeout=600)
@@ -110,6 +131,16 @@ def test_pip_installs_it_into_an_empty_folder(tmp_path):
     assert not names & {"src", "conf", "baselines", "weights"}
     (tmp_path / "user").mkdir()
     check_package(tmp_path / "p", tmp_path / "user", compiled=True)
+
+
+def test_commands_without_their_packages_say_what_to_install(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["lightfield-events", "simulate"])
+    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
+    monkeypatch.setattr(lightfield_events.__main__, "find_spec", lambda name: None)
+    with pytest.raises(SystemExit, match="1"):
+        lightfield_events.__main__.main()
+    said = 'error: commands need pip install ".[train]" in the folder of the repository\n'
+    assert capsys.readouterr().err == said
 
 
 def test_imports_are_renamed_and_nothing_else():

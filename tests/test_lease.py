@@ -106,7 +106,7 @@ def test_cut_anywhere_an_export_is_whole_or_named_as_lost(two_fit, tmp_path, mon
 def leases(tmp_path_factory):
     """Three leases side by side: a whole one, one that is killed and one whose training hangs."""
     home = tmp_path_factory.mktemp("leases")
-    here = plan(home / "plan", budget_mib=8, file_mib=1.5, networks=[
+    here = plan(home / "plan", max_export_total_mib=8, max_export_file_mib=1.5, networks=[
         {"name": "lf3x3", "minutes": 0.04},
         {"name": "single256", "minutes": 0.04, "start": "../begun.safetensors"},
     ])  # fmt: skip

@@ -68,8 +68,14 @@ def three() -> list[SizedNetwork]:
     ("changes", "said"),
     [
         ({"margin_s": 170}, r"minutes must be >= 3.\d\d: 0.12 of training .*margin 170 s\), got 3"),
-        ({"budget_mib": 1}, r"budget_mib must be >= 1.15 \(lf3x3 0.45, single256 0.45\), got 1"),
-        ({"files": 5}, r"files must be >= 6 \(lf3x3 2, single256 2, curves.*json\), got 5"),
+        (
+            {"max_export_total_mib": 1},
+            r"max_export_total_mib must be >= 1.15 \(lf3x3 0.45, single256 0.45\), got 1",
+        ),
+        (
+            {"max_export_files": 5},
+            r"max_export_files must be >= 6 \(lf3x3 2, single256 2, curves.*json\), got 5",
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused_with_the_numbers(changes, said, three, tmp_path):
@@ -82,8 +88,12 @@ def test_what_does_not_fit_is_refused_with_the_numbers(changes, said, three, tmp
     ("changes", "said"),
     [
         ({"marginals": 3}, "Key .marginals. not in .Plan."),
+        ({"files": 3}, "^lease.files is now lease.max_export_files$"),
         ({"fill": {"minutes": 1}}, "missing value: fill.clips|missing.*clips"),
-        ({"fill": {"minutes": 1, "clips": 8, "least": 9}}, "fill: clips must be >= 9, got 8"),
+        (
+            {"fill": {"minutes": 1, "clips": 8, "warn_below_clips": 9}},
+            "fill: clips must be >= 9, got 8",
+        ),
         ({"check_s": -1}, "check_s must be > 0, got -1"),
         ({"scenes": "no.pack"}, "scenes must be a file, got no.pack, which is not in"),
         ({"networks": []}, "networks must have names of their own"),
@@ -102,7 +112,10 @@ def test_a_file_that_is_no_plan_is_refused(changes, said, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"file_mib": 0.1}, "file_mib must be >= 0.20 for lf3x3, one tensor of which has 0.14 MiB"),
+        (
+            {"max_export_file_mib": 0.1},
+            "max_export_file_mib must be >= 0.20 for lf3x3, one tensor of which has 0.14 MiB",
+        ),
         ({"networks": [{"name": "nowhere", "minutes": 1}]}, "networks: nowhere cannot be trained"),
         ({"common": ["budget=lease", "trainer=cpu", "loss=l1", "width=0"]}, "lf3x3 cannot be"),
     ],
@@ -125,8 +138,8 @@ def test_what_is_optional_comes_only_where_it_fits(three, tmp_path):
     two, all_of_them = select_networks(found, three, 3), select_networks(found, three, 9)
     assert list(two.left_out) == ["single768"] and two.networks == three[:2]
     assert all_of_them.networks == three and not all_of_them.left_out
-    small = select_networks(plans.load_plan(plan(tmp_path, budget_mib=1.3)), three, 9)
-    assert "budget_mib must be >= 1.5" in small.left_out["single768"]
+    small = select_networks(plans.load_plan(plan(tmp_path, max_export_total_mib=1.3)), three, 9)
+    assert "max_export_total_mib must be >= 1.5" in small.left_out["single768"]
     with pytest.raises(ValueError, match="none fits: minutes must be"):
         select_networks(found, three[2:], 3)
     with pytest.raises(ValueError, match="only must be of lf3x3, single256, single768, got two"):

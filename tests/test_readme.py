@@ -40,7 +40,7 @@ RUN = {  # door: what runs it, and what makes it tiny
     "train": (train, [*TINY, "logger=none", "data.cache_clips=null"]),
     "eval": (evaluate_and_draw, [*SMALL, "data.test_clips=1", "data.unscored_windows=1",
                                  "data.workers=0", "metrics.lpips=null"]),
-    "simulate": (simulate, [*SMALL, "camera.sensor=[360,640]", "camera.tile_px=116"]),
+    "simulate": (simulate, [*SMALL, "camera.sensor_size=[360,640]", "camera.tile_px=116"]),
     "reconstruct": (reconstruct, ["end_s=0.05"]),
     "calibrate": (calibrate, []),
 }  # fmt: skip

@@ -1,6 +1,7 @@
 """From a simulated recording to views.yaml to video to statistics, through the doors."""
 
 import csv
+import re
 from pathlib import Path
 
 import cv2
@@ -12,8 +13,8 @@ from hydra import compose, initialize_config_dir
 
 from src.calibrate import calibrate
 from src.compare import compare
-from src.reconstruct import reconstruct
-from src.recordings import sensor_lookup, simulated_recording, truth_file, views
+from src.reconstruct import reconstruct, show_progress
+from src.recordings import reconstruction, sensor_lookup, simulated_recording, truth_file, views
 from src.sim.optics import layout
 from src.sim.sensor.sensor import EventSensor
 from tests.conftest import ROOT
@@ -126,16 +127,18 @@ def test_the_reconstructed_dot_moves_as_the_true_one(folder, found, tmp_path):
     assert np.corrcoef(x[5:], np.arange(len(x) - 5))[0, 1] > 0.99
 
 
-def test_a_film_shows_events_one_view_all_views_and_the_clean_clip(folder, found, tmp_path, capsys):
+@pytest.mark.parametrize("toning", ["none", "auto"])
+def test_a_film_shows_events_one_view_all_views_and_the_clean_clip(
+    folder, found, tmp_path, capsys, toning
+):
     (tmp_path / "dot.raw").symlink_to(folder / "dot.raw")
     truth = views.load_views(found)
-    with truth_file.open_truth(tmp_path / "dot.raw", truth, 31, 300.0, {}) as file:
+    with truth_file.create_truth_file(tmp_path / "dot.raw", truth, 31, 300.0, {}) as file:
         clean = torch.linspace(0, 1, 31)[:, None, None].expand(31, 88, 88)
         file.add(clean, clean.expand(9, -1, -1, -1), torch.zeros(9, 31, 2, 88, 88))
     chosen = [f"recording={tmp_path}/dot.raw", f"views={found}", "ckpt=setnet_small", "fps=300"]
-    run = reconstruct(
-        config("reconstruct", tmp_path / "run", *chosen, "output_format=film", "end_s=0.05")
-    )
+    chosen += ["output_format=film", "end_s=0.05", f"tone={toning}"]
+    run = reconstruct(config("reconstruct", tmp_path / "run", *chosen))
     file, frames = cv2.VideoCapture(str(run / "film.mp4")), []
     while (read := file.read())[0]:
         frames.append(read[1])
@@ -144,10 +147,17 @@ def test_a_film_shows_events_one_view_all_views_and_the_clean_clip(folder, found
     shown = panels[3].mean((1, 2, 3)) / 255
     assert np.allclose(shown, (np.arange(15) + 1) / 30, atol=0.04)  # the frame at the window's end
     assert panels[0].mean() > 200 and np.ptp(panels[0][..., 0] - panels[0][..., 2]) > 50  # colours
+    assert [np.ptp(panel[5:]) > 230 for panel in panels[1:3]] == [toning == "auto"] * 2
     assert np.abs(panels[1] - panels[2]).mean() > 0.5  # one view is not nine
     (line,) = [one for one in capsys.readouterr().out.splitlines() if "film.mp4" in one]
     assert line.startswith(f"{run}/film.mp4: 15 frames, 88x88 px, 9 views; ")
-    assert "frames/s after the first" in line
+    assert re.search(r", after the first frame \d+\.\d frames per second of wall time, read", line)
+
+
+def test_progress_counts_from_the_start_of_the_recording_on_any_clock(capsys):
+    frames = (reconstruction.Frame(1605537494 + k / 100, np.zeros((2, 2)), 1, 0) for k in (1, 2, 3))
+    assert len(list(show_progress(frames, 0.5 + 0.01))) == 3  # start_s=0.5, fps=100
+    assert capsys.readouterr().out.splitlines()[-1].split("frames, ")[1].startswith("0.53 s")
 
 
 def test_without_other_numbers_of_views_the_panel_is_left_out(folder, found, tmp_path):
@@ -174,6 +184,7 @@ def test_without_views_the_sensor_is_one_view(folder, tmp_path):
         ("form=half", "form must be one of"),
         ("form=bf16", "form must be float32 for a network without parameters"),
         ("start_s=3.0 end_s=2.0", "start_s must be"),
+        ("start_s=10", "start_s must be below the length of the recording, 0.1"),
         ("ckpt=null", "must name a network"),
         ("backward_warmup_s=-1", "must be >= 0 seconds"),
         ("noise_filter_s=0", "noise_filter_s must be > 0 seconds or null, got 0"),

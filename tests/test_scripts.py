@@ -76,7 +76,7 @@ def test_weights_of_a_stage_are_shipped_with_the_card_of_a_run(tmp_path, monkeyp
     for parameter in doubled.parameters():
         parameter.data *= 2
     other = tmp_path / "stage.safetensors"
-    files.save(other, doubled, files.network_spec(first), {"mean_of": {"a": 0.5, "b": 0.5}})
+    files.save(other, doubled, files.read_network_spec(first), {"mean_of": {"a": 0.5, "b": 0.5}})
     path = ship(run, "mean", [], Given("lf3x3", other, tmp_path / "weights"))
     for name, value in files.load(path).state_dict().items():
         assert torch.allclose(value, doubled.state_dict()[name], atol=2e-3), name

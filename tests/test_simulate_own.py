@@ -1,5 +1,9 @@
 """Your own video and photograph through src.simulate, and the same from Python."""
 
+import re
+import subprocess
+
+import cv2
 import h5py
 import numpy as np
 import pytest
@@ -16,10 +20,11 @@ from src.sim import noise
 from src.sim.scenes.own_material import clip_from_array
 from src.sim.turbulence.operator import Turbulence
 from src.simulate import simulate
+from tests.conftest import ROOT
 from tests.sim.scenes.test_own_material import LEVELS, write_film
 from tests.test_recording_entry_points import config
 
-SMALL = ["camera.sensor=[120,160]", "turbulence=strong"]
+SMALL = ["camera.sensor_size=[120,160]", "turbulence=strong"]
 
 
 def textured(frames: int = 5, size=(40, 56)) -> np.ndarray:
@@ -35,9 +40,10 @@ def test_a_video_gives_events_geometry_and_truth_of_all_its_frames(tmp_path, cap
     assert line.startswith(
         "my: 64x36 px, 30 frames/s, all of 12 frames; simulated as 9 views of 64x"
     )
-    assert f"turbulence strong ({drawn['tilt_and_blur_px']:.2f} px" in line
-    assert line.endswith(f"at 120 frames/s; {line[line.index('turbulence') :]}")
-    assert f"contrast threshold {drawn['threshold']:.3f}" in line
+    tilt, blur = map(float, re.search(r"strong: tilt (\S+) px, blur (\S+) px rms;", line).groups())
+    assert tilt == pytest.approx(drawn["tilt_px"], abs=0.006)
+    assert np.hypot(tilt, blur) == pytest.approx(drawn["tilt_and_blur_px"], abs=0.01)
+    assert line.endswith("; code values decoded from sRGB, contrast threshold 0.200")
     events = read_events(tmp_path / "run" / "my.raw")
     views = load_views(tmp_path / "run" / "my.views.yaml")
     assert len(events) > 500 and events["t"].max() < 11 / 30 * 1e6 and views.model == (36, 64)
@@ -58,9 +64,9 @@ def test_parts_are_those_of_the_whole_clip(tmp_path, monkeypatch):
     assert work.substeps == 2 and work.frames == 9 and isinstance(work.turbulence, Turbulence)
     monkeypatch.setattr(own_simulation, "PART_BYTES", 4 * 3 * 40 * 56 * 2)  # two frames
     seen = work.allocate_views(tmp_path)
-    parts = list(work.parts(seen))
+    parts = list(work.simulate_parts(seen))
     key = noise.key(work.key, "turbulence")
-    clean = clip.blend(0, 9, 2)[None]
+    clean = clip.interpolate_frames(0, 9, 2)[None]
     whole = work.turbulence.degrade(clean, noise.generator(key))[0]
     tilt = work.turbulence.tilt(9, noise.generator(key))
     assert len(parts) == 5 and (seen.float() - whole).abs().max() < 1e-3
@@ -86,12 +92,54 @@ def test_from_python_the_result_is_that_of_the_command(tmp_path):
 def test_without_turbulence_events_are_the_threshold_crossings_of_the_clip():
     ramp = np.exp(np.linspace(np.log(0.1), np.log(0.8), 25))[:, None, None]
     frames = np.broadcast_to(ramp, (25, 20, 24)).astype(np.float32)
-    sensor = ["sensor.threshold=0.25"]
+    sensor = ["sensor.threshold=0.25", "sensor.input=linear"]
     clip = simulate_arrays(frames, "none", 1, fps=240, sensor="ideal", overrides=sensor)
     assert (clip.views[0] == clip.clean).all() and not clip.tilt.any()
     assert len(clip.events) == 20 * 24 * int(np.log(8) / 0.25) and (clip.events["p"] == 1).all()
     first = clip.events["t"][0] * 1e-6 * 240  # frames until the light has grown by exp(0.25)
     assert first == pytest.approx(24 * 0.25 / np.log(8), abs=0.02)
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_photograph_gives_events_by_default(tmp_path, seed):
+    cv2.imwrite(str(tmp_path / "cat.png"), 255 * textured(2, (96, 128))[0])
+    given = [f"photo={tmp_path}/cat.png", "seconds=0.2", f"seed={seed}", "optics.views=3"]
+    drawn = simulate(config("simulate", tmp_path / "run", *given, "turbulence=strong"))
+    events = read_events(tmp_path / "run" / "cat.raw")
+    assert len(events) > 5000 and drawn["threshold"] == pytest.approx(0.2)
+    assert 0.2 < (events["p"] > 0).mean() < 0.8
+    assert "input: srgb" in (tmp_path / "run" / "config.yaml").read_text()
+
+
+@pytest.mark.parametrize(
+    "overrides, threshold, light",
+    [
+        ([], 0.2, "srgb"),
+        (["sensor=noisy"], 0.2, "srgb"),
+        (["sensor.threshold=0.35"], 0.35, "srgb"),
+        (["sensor.threshold=[0.1,0.7]", "sensor.input=linear"], [0.1, 0.7], "linear"),
+        (["~own_sensor.threshold"], [0.1, 0.7], "srgb"),
+        (["+own_sensor.off_ratio=1.5"], 0.2, "srgb"),
+    ],
+)
+def test_the_sensor_of_own_material_is_what_is_set_else_its_own(overrides, threshold, light):
+    cfg, scenes = compose_config("simulate", *overrides), compose_config("simulate")
+    assert (scenes.sensor.threshold, scenes.sensor.input) == ([0.1, 0.7], "linear")
+    own_simulation.set_own_sensor(cfg, overrides)
+    assert (cfg.sensor.threshold, cfg.sensor.input) == (threshold, light)
+    assert cfg.sensor.off_ratio == (1.5 if "off_ratio" in str(overrides) else 1.0)
+
+
+def test_without_events_all_the_rest_is_there(tmp_path, capsys):
+    cv2.imwrite(str(tmp_path / "cat.png"), np.full((96, 128), 90, np.uint8))
+    given = [f"photo={tmp_path}/cat.png", "seconds=0.1", "turbulence=none"]
+    with pytest.warns(UserWarning, match=r"no events.*sensor.threshold= .*seconds= .*turbulence="):
+        simulate(config("simulate", tmp_path / "run", *given))
+    names = {path.name for path in (tmp_path / "run").iterdir()}
+    wanted = {"cat.raw", "cat.views.yaml", "cat.truth.h5", "views.gif", "views.png"}
+    assert wanted <= names and len(read_events(tmp_path / "run" / "cat.raw")) == 0
+    said = capsys.readouterr().out
+    assert "0 events in" in said and "next:" not in said
 
 
 def test_a_seed_draws_anew_and_the_same_seed_the_same():
@@ -130,6 +178,12 @@ def test_a_wrong_argument_is_one_line_and_leaves_hydra_as_it_was(options, messag
 def test_keys_that_do_not_go_together(given, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         simulate(config("simulate", tmp_path / "run", *given))
+
+
+def test_the_demo_is_recorded_where_it_is_played(tmp_path):
+    given = ["make", "-n", "demo", f"DEMO={tmp_path}/demo"]
+    told = subprocess.run(given, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert f"write={tmp_path}/demo/cap.raw" in told and f"recording={tmp_path}/demo/cap.raw" in told
 
 
 def test_a_full_disk_is_told_before_the_work(tmp_path, monkeypatch):

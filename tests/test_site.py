@@ -49,3 +49,10 @@ def test_all_public_names_are_in_the_reference():
     page = (ROOT / "docs/reference/package.md").read_text()
     shown = re.findall(r"^::: lightfield_events\.(\w+)$", page, re.M)
     assert sorted(shown) == sorted(lightfield_events.__all__)
+
+
+def test_commands_are_wrapped_and_outputs_of_notebooks_are_not():
+    style, hook = (ROOT / "docs" / SITE["extra_css"][0]).read_text(), SITE["hooks"][0]
+    assert {"pymdownx.highlight": {"pygments_lang_class": True}} in SITE["markdown_extensions"]
+    assert ":is(.language-text, .language-sh) code { white-space: pre-wrap; }" in style
+    assert 'return f"```output' in (ROOT / hook).read_text()

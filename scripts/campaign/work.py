@@ -168,4 +168,4 @@ def average(shares: dict[Path, float], export: Path) -> None:
     networks[-1].load_state_dict(mean)
     last = list(shares)[-1]
     card = files.read_card(last) | {"mean_of": {path.stem: share for path, share in shares.items()}}
-    files.save(export, networks[-1], files.network_spec(last), card)
+    files.save(export, networks[-1], files.read_network_spec(last), card)

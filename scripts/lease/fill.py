@@ -49,6 +49,10 @@ def _fill_cache(
     if not report.clips:
         raise ValueError(f"fill: minutes must be > {plan.minutes:g}: no clip was made")
     cache.clips = report.clips
-    few = "" if report.clips >= plan.least else f"; less than fill: least = {plan.least}"
+    few = (
+        ""
+        if report.clips >= plan.warn_below_clips
+        else f"; less than fill: warn_below_clips = {plan.warn_below_clips}"
+    )
     log(f"cache: {report}{few}")
     return {"clips": report.clips, "clips_per_second": report.clips_per_second}

@@ -12,6 +12,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from scripts.pack_scenes import verify_pack
+from src.app.renamed_keys import check_keys
 from src.models import files
 from src.training.learning_curve import read_training_progress
 
@@ -52,13 +53,15 @@ class Fill:
 
     minutes: float = MISSING
     clips: int = MISSING
-    least: int = 16
+    warn_below_clips: int = 16
     workers: int | None = None
 
     def __post_init__(self) -> None:
         _check(self.minutes > 0, "fill: minutes", "> 0", self)
-        _check(self.least >= 1, "fill: least", ">= 1", self)
-        _check(self.clips >= self.least, "fill: clips", f">= {self.least}", self)
+        _check(self.warn_below_clips >= 1, "fill: warn_below_clips", ">= 1", self)
+        _check(
+            self.clips >= self.warn_below_clips, "fill: clips", f">= {self.warn_below_clips}", self
+        )
         _check(self.workers is None or self.workers >= 0, "fill: workers", ">= 0", self)
 
 
@@ -68,11 +71,11 @@ class Validate:
     network that this may take."""
 
     clips: int = 8
-    times: int = 4
+    count: int = 4
     seconds: float = 20.0
 
     def __post_init__(self) -> None:
-        for key in ("clips", "times", "seconds"):
+        for key in ("clips", "count", "seconds"):
             _check(getattr(self, key) > 0, f"validate: {key}", "> 0", self)
 
 
@@ -90,14 +93,20 @@ class Plan:
     check_s: float = 60.0
     export_s: float = 60.0
     margin_s: float = 40.0
-    budget_mib: float = 64.0
-    file_mib: float = 16.0
-    files: int = 8
+    max_export_total_mib: float = 64.0
+    max_export_file_mib: float = 16.0
+    max_export_files: int = 8
 
     def __post_init__(self) -> None:
-        for key in ("check_s", "export_s", "margin_s", "budget_mib", "file_mib"):
+        for key in (
+            "check_s",
+            "export_s",
+            "margin_s",
+            "max_export_total_mib",
+            "max_export_file_mib",
+        ):
             _check(getattr(self, key) > 0, key, "> 0", self)
-        _check(self.files >= 3, "files", ">= 3", self)
+        _check(self.max_export_files >= 3, "max_export_files", ">= 3", self)
         names = [network.name for network in self.networks]
         if len(set(names)) < len(names) or not names:
             raise ValueError(f"networks must have names of their own, got {', '.join(names)}")
@@ -134,7 +143,9 @@ class Plan:
         if self.lpips is not None:
             for node in (cfg.loss.get("lpips"), cfg.metrics.lpips):
                 if node is not None:
-                    OmegaConf.update(node, "backbone", str(self.path(self.lpips)), force_add=True)
+                    OmegaConf.update(
+                        node, "backbone_weights", str(self.path(self.lpips)), force_add=True
+                    )
         return cfg
 
     def earlier_hours(self, network: Network) -> float:
@@ -149,7 +160,9 @@ def load_plan(path: Path) -> Plan:
     damaged.
     """
     try:
-        content = OmegaConf.merge(OmegaConf.structured(Plan), OmegaConf.load(path))
+        given = OmegaConf.load(path)
+        check_keys(OmegaConf.create({"lease": given}))
+        content = OmegaConf.merge(OmegaConf.structured(Plan), given)
         content.folder = path.resolve().parent
         plan = OmegaConf.to_object(content)
     except (OSError, OmegaConfBaseException, TypeError) as error:

@@ -202,6 +202,10 @@ def run_lease(plan: Plan, selection: Selection, minutes: float, start: float, ou
         logging.getLogger(name).setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", module=r"lightning\.pytorch")  # what it says of every run
     device = probe.probe_device(selection.networks[0].cfg)
-    sizes = int(plan.file_mib * MIB), int(plan.budget_mib * MIB), plan.files
+    sizes = (
+        int(plan.max_export_file_mib * MIB),
+        int(plan.max_export_total_mib * MIB),
+        plan.max_export_files,
+    )
     exports = Exports(out, *sizes)
     return Lease(plan, selection, minutes, start, exports, device).run()

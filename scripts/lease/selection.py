@@ -60,11 +60,12 @@ def size_network(plan: Plan, network: Network) -> SizedNetwork:
         reason = " ".join(str(error).split())
         raise ValueError(f"networks: {network.name} cannot be trained: {reason}") from error
     sizes = {name: 2 * value.numel() for name, value in inference_copy(net).state_dict().items()}
-    limit = int(plan.file_mib * MIB) - HEADER_BYTES
+    limit = int(plan.max_export_file_mib * MIB) - HEADER_BYTES
     if (largest := max(sizes.values())) > limit:
         raise ValueError(
-            f"file_mib must be >= {(largest + HEADER_BYTES) / MIB:.2f} for {network.name}, one "
-            f"tensor of which has {largest / MIB:.2f} MiB, got {plan.file_mib:g}"
+            f"max_export_file_mib must be >= {(largest + HEADER_BYTES) / MIB:.2f} for "
+            f"{network.name}, one tensor of which has {largest / MIB:.2f} MiB, "
+            f"got {plan.max_export_file_mib:g}"
         )
     params = sum(parameter.numel() for parameter in net.parameters())
     parts = len(split_into_parts(sizes, limit))
@@ -110,13 +111,15 @@ def find_excess(plan: Plan, networks: Sequence[SizedNetwork], minutes: float) ->
             f"{plan.validate.seconds:g} s, margin {plan.margin_s:g} s), got {minutes:g}"
         )
     size = sum(one.weights_bytes for one in networks) + TABLES_BYTES
-    if size > plan.budget_mib * MIB:
+    if size > plan.max_export_total_mib * MIB:
         asked = each([f"{one.weights_bytes / MIB:.2f}" for one in networks])
-        return f"budget_mib must be >= {size / MIB:.2f} ({asked}), got {plan.budget_mib:g}"
+        got = f"got {plan.max_export_total_mib:g}"
+        return f"max_export_total_mib must be >= {size / MIB:.2f} ({asked}), {got}"
     count = sum(one.parts for one in networks) + len(TABLES)
-    if count > plan.files:
+    if count > plan.max_export_files:
         asked = each([str(one.parts) for one in networks])
-        return f"files must be >= {count} ({asked}, {', '.join(TABLES)}), got {plan.files}"
+        needed = f"{count} ({asked}, {', '.join(TABLES)})"
+        return f"max_export_files must be >= {needed}, got {plan.max_export_files}"
     return ""
 
 

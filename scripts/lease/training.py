@@ -112,7 +112,7 @@ def train_network(
     simulate = data.validation_samples
     data.validation_samples = functools.cache(lambda: list(simulate()))  # kept on the device
     export = folder / f"{one.name}.safetensors"
-    curve = ExportingCurve(export, seconds / 3600 / plan.validate.times, plan.export_s, publish)
+    curve = ExportingCurve(export, seconds / 3600 / plan.validate.count, plan.export_s, publish)
     options = OmegaConf.to_container(cfg.callbacks.schedule, resolve=True)
     options.pop("_target_")
     average = [] if cfg.ema_decay is None else [WeightEMA(cfg.ema_decay)]

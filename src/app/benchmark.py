@@ -25,18 +25,19 @@ from src.recordings.evreal_protocol import (
 )
 from src.recordings.evreal_sequences import find_sequences, open_as_evreal, sequence_name
 from src.recordings.files.evreal_folder import EvrealSequence, is_evreal_folder, open_sequence
-from src.recordings.reconstruction import as_event_network
+from src.recordings.reconstruction import require_event_network
 from src.records import results
 from src.records.atomic import write_text
 from src.training import evaluation
 
 SCORES = {"mse": "MSE ↓", "ssim": "SSIM ↑", "lpips": "LPIPS ↓"}
 RULE_KEYS = (
-    "window", "events_per_window", "window_s", "part_s", "histogram", "tolerance_ms", "warm_up_s",
+    "window", "events_per_window", "window_s", "max_grid_s", "histogram", "tolerance_ms",
+    "warm_up_s",
 )  # fmt: skip
 
 
-def evaluate_recordings(cfg: DictConfig) -> dict:
+def evaluate_on_evreal(cfg: DictConfig) -> dict:
     """Score the network of `ckpt` or `baseline` on the sequences below `cfg.scene.root`.
 
     Writes `results.json`, `clips.csv` (a line per sequence) and `frames.csv` below
@@ -46,16 +47,16 @@ def evaluate_recordings(cfg: DictConfig) -> dict:
     benchmark = EvrealBenchmark(cfg)
     sources = find_sequences(cfg.scene.root)
     for folder in filter(is_evreal_folder, sources):  # what is wrong is said before hours of work
-        benchmark.check(folder, open_sequence(folder))
+        benchmark.check_scored_range(folder, open_sequence(folder))
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     clips, lines = [], []
     for source in sources:
-        clip, scored = benchmark.score(source, run)
+        clip, scored = benchmark.score_sequence(source, run)
         clips.append(clip)
         lines += scored
         print(f"{clip['name']}: {clip['frames']} frames, {_format_scores(clip)}")
     write_text(run / "frames.csv", results.format_csv(lines[0], [line.values() for line in lines]))
-    means, row = average_over_frames(clips), benchmark.row(clips)
+    means, row = average_by_data_set(clips), benchmark.build_score_row(clips)
     return results.write_and_print_results(
         run, entry_point.resolved_yaml(cfg), [row], _tables(row.name, means, cfg.data),
         benchmarks=means, **entry_point.run_metadata(cfg, start),
@@ -74,12 +75,12 @@ class EvrealBenchmark:
         lpips = build_part(cfg, "metrics.lpips") if cfg.metrics.lpips else None
         self.lpips, self.size = lpips and lpips.to(self.device), (0, 0)
 
-    def check(self, source: Path, sequence: EvrealSequence) -> None:
+    def check_scored_range(self, source: Path, sequence: EvrealSequence) -> None:
         """Raise ValueError for a sequence of which no frame can be scored."""
         _, first_s, last_s = find_scored_range(self.cfg.data, source)
         check_scored_range(sequence, self.rule.window, first_s, last_s)
 
-    def score(self, source: Path, run: Path) -> tuple[dict, list[dict]]:
+    def score_sequence(self, source: Path, run: Path) -> tuple[dict, list[dict]]:
         """Return the mean scores of a sequence, and a line of each frame's."""
         data_set, first_s, last_s = find_scored_range(self.cfg.data, source)
         facts: dict[str, Any] = {
@@ -88,7 +89,7 @@ class EvrealBenchmark:
         }
         lines = []
         with open_as_evreal(source, run) as sequence:
-            self.check(source, sequence)
+            self.check_scored_range(source, sequence)
             self.size = sequence.size
             for frame in score_sequence(
                 sequence, self.network, self.rule, bins=self.cfg.bins, start_s=first_s,
@@ -104,11 +105,11 @@ class EvrealBenchmark:
         names = [name for name in SCORES if name in lines[0]]
         return facts | {name: _mean(line[name] for line in lines) for name in names}, lines
 
-    def row(self, clips: list[dict]) -> results.ScoreRow:
+    def build_score_row(self, clips: list[dict]) -> results.ScoreRow:
         """Return the scores with the network's cost for frames of the last sequence's size."""
         (height, width), bins = self.size, self.cfg.bins
         window = torch.zeros(1, 1, bins, height, width, device=self.device)
-        macs, milliseconds = evaluation.measure_frame_cost(self.network, window)
+        macs, milliseconds = evaluation.measure_frame_macs_and_ms(self.network, window)
         return results.ScoreRow(
             build.method_name(self.cfg),
             clips,
@@ -123,7 +124,7 @@ def _load_network(cfg: DictConfig) -> EventToVideoNetwork:
         raise ValueError("data=evreal needs postprocess=none and backward_warmup_s=0.0")
     if own := sorted(set(cfg.metrics) - set(build.SHIPPED_METRIC_KEYS)):
         raise ValueError(f"data=evreal has the metrics of its protocol only, got metrics.{own[0]}")
-    network = as_event_network(build.load_network(cfg))
+    network = require_event_network(build.load_network(cfg))
     if network.views not in (None, 1):
         raise ValueError(f"ckpt must take one view for data=evreal, got one of {network.views}")
     return network.eval()
@@ -156,9 +157,10 @@ def find_scored_range(data: DictConfig, source: Path) -> tuple[str, float, float
 
 
 def _line(frame: ScoredFrame) -> dict:
-    given = frame.given
-    facts = {"window": frame.window, "frame": given.frame, "time_s": round(given.time_s, 6)}
-    return facts | {"events": given.last - given.first} | frame.scores
+    window = frame.evreal_window
+    facts = {"window": frame.window_index, "frame": window.camera_frame}
+    times = {"time_s": round(window.time_s, 6)}
+    return facts | times | {"events": window.stop_event - window.first_event} | frame.scores
 
 
 def _mean(values: Iterator[float]) -> float:
@@ -167,7 +169,7 @@ def _mean(values: Iterator[float]) -> float:
     return float(np.mean(finite)) if finite else math.nan
 
 
-def average_over_frames(clips: Sequence[Mapping[str, Any]]) -> dict[str, dict]:
+def average_by_data_set(clips: Sequence[Mapping[str, Any]]) -> dict[str, dict]:
     """Return {data set: {sequences, frames, mse, ssim, lpips}}; a sequence counts by its frames."""
     means = {}
     for data_set in dict.fromkeys(clip["data_set"] for clip in clips):
@@ -187,7 +189,7 @@ def _format_scores(scores: Mapping[str, Any]) -> str:
 def _save(folder: Path, frame: ScoredFrame) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     levels = np.rint(frame.picture * 255).astype(np.uint8)
-    name = folder / f"frame_{frame.window:010d}.png"
+    name = folder / f"frame_{frame.window_index:010d}.png"
     if not cv2.imwrite(str(name), levels):
         raise OSError(f"{name} cannot be written; is the disk full?")
 

@@ -79,7 +79,7 @@ def build_teachers(cfg: DictConfig, views: int) -> TeacherEnsemble:
     """
     networks = {}
     for name in [cfg.teachers] if isinstance(cfg.teachers, str) else cfg.teachers:
-        net = load_for_events(cfg, name, EventToVideoNetwork, "teachers must be networks")
+        net = load_network_for_events(cfg, name, EventToVideoNetwork, "teachers must be networks")
         if net.views not in (None, views):
             raise ValueError(f"teachers must take optics.views={views}, {name} takes {net.views}")
         networks[name] = net
@@ -87,7 +87,7 @@ def build_teachers(cfg: DictConfig, views: int) -> TeacherEnsemble:
     return TeacherEnsemble(networks, cfg.distillation_cache, cfg.fps, rates)
 
 
-def load_for_events(cfg: DictConfig, name: str, kind: type[Method], asked: str) -> Method:
+def load_network_for_events(cfg: DictConfig, name: str, kind: type[Method], asked: str) -> Method:
     """Return the network `name`, as `ckpt` may name one; ValueError, which begins with `asked`,
     where it is not there or no `kind`."""
     try:

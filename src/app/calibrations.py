@@ -100,7 +100,7 @@ def calibrate_contrast_threshold(
 ) -> contrast_threshold.ThresholdEstimate:
     """Match the recording's event rate with that of `sensor` looking at `clips`; write
     `threshold.csv` and `threshold.png`."""
-    size = sources.sensor_size(recording, sensor_size, options)
+    size = sources.find_sensor_size(recording, sensor_size, options)
     there = views_or_whole_sensor(views, size)
     events = open_recording(recording, size[::-1], options)
     measured = contrast_threshold.measure_event_rates(
@@ -150,7 +150,7 @@ def measure_dot_grid(
     return fitted
 
 
-def measure_film(
+def measure_turbulence_in_video(
     video: str,
     folder: Path,
     *,
@@ -179,7 +179,7 @@ def measure_film(
     rate = videos.read_fps(video, "video", max_frames) if fps is None else fps
     air = turbulence_meter.measure_turbulence(np.stack(film), rate)
     text = f"# The air of {Path(video).name}, {air.frames} frames; pixels of a frame whose smaller"
-    text += f" side is {SIDE}.\n{air.found.text()}"
+    text += f" side is {SIDE}.\n{air.found.to_yaml()}"
     calibration_figures.draw_measured_turbulence(air, Path(video).name, folder / "air.png")
     for path in (folder / "air.yaml", *([Path(save)] if save else [])):
         results.write_text(path, text)
@@ -199,7 +199,7 @@ def _films(
         return np.stack([there.warp_to_model(f) if there else f[None] for f in frames], axis=1)
     if network is None:
         raise ValueError(f"ckpt or baseline must reconstruct the events of {path}, got neither")
-    sensor = sources.sensor_size(path, sensor_size, options)
+    sensor = sources.find_sensor_size(path, sensor_size, options)
     span = event_windows.frames_per_window("trained", fps)
     table = sensor_lookup.build_lookup(there or Views.single_view(sensor, sensor))
     rule = event_windows.WindowRule(fps=fps, frames_per_window=span)

@@ -8,7 +8,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from torch import nn
 
 import src.models
-from baselines.postprocess import load as load_postprocessor
+from baselines.postprocess import load_postprocessor
 from src.app.instantiate import allowed_packages, as_dict, build_part, instantiate_node
 from src.app.simulation import build_pipeline
 from src.bench.candidates import Candidate
@@ -64,7 +64,7 @@ def _load_entry(name: str, entry: Mapping, packages: Sequence[str]) -> Candidate
         return Candidate(name, events, views, postprocessor=post)
     if "model" in entry and "postprocessor" not in entry:
         network = instantiate_node(entry["model"], packages).eval()
-    return Candidate(name, network, views, trained=False, missing=missing)
+    return Candidate(name, network, views, trained=False, missing_reason=missing)
 
 
 def _require_event_network(name: str, network: nn.Module) -> EventToVideoNetwork:

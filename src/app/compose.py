@@ -5,8 +5,10 @@ from pathlib import Path
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+
+from src.app.renamed_keys import explain_refused_key, flatten_keys
 
 CONF = str(Path(__file__).resolve().parents[2] / "conf")
 
@@ -27,6 +29,22 @@ def compose_config(name: str, *overrides: str) -> DictConfig:
         with initialize_config_dir(CONF, version_base=None):
             return compose(name, list(overrides))
     except (HydraException, OmegaConfBaseException) as error:
-        raise ValueError(" ".join(str(error).split())) from None
+        raise ValueError(describe_config_error(error, name)) from None
     finally:
         GlobalHydra.instance().hydra = outer
+
+
+def describe_config_error(error: Exception, name: str) -> str:
+    """Return in one line what is wrong with the overrides of conf/<name>.yaml, without the folders
+    that Hydra has searched."""
+    message = str(error)
+    explained = explain_refused_key(message, _list_keys(name) if "Could not" in message else ())
+    return " ".join((explained or message.partition("Config search path:")[0]).split())
+
+
+def _list_keys(name: str) -> list[str]:
+    """Return the groups, and the keys of conf/<name>.yaml where there is one."""
+    groups = [folder.name for folder in Path(CONF).iterdir() if folder.is_dir()]
+    if not (Path(CONF) / f"{name}.yaml").is_file():
+        return groups
+    return [*groups, *flatten_keys(OmegaConf.to_container(compose_config(name), resolve=False))]

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from src.app.path_overrides import is_path_key
-from src.app.renamed_keys import LISTED
+from src.app.renamed_keys import describe_unknown_key, flatten_keys
 
 NUMBER, WHOLE, WORD, FLAG = "a number", "a whole number", "a word", "true or false"
 LIST, MAPPING, NULL = "a list", "a mapping", "null"
@@ -23,7 +23,7 @@ KINDS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(
         ("noise_filter_s", "train_hours", "grad_clip_norm", "ema_decay", "state_rounding_step",
          "loss_spike_factor", "turbulence.wind_m_s", "turbulence.baseline_m",
-         "callbacks.learning_curve.interval_h", "data.part_s", "data.start_s", "data.end_s"),
+         "callbacks.learning_curve.interval_h", "data.max_grid_s", "data.start_s", "data.end_s"),
         (NUMBER, NULL),
     ),
     **dict.fromkeys(
@@ -47,7 +47,9 @@ KINDS: dict[str, tuple[str, ...]] = {
     "run": (WORD, LIST),
     "names": (LIST, NULL),
     "live:threads": (WHOLE,),
-    **dict.fromkeys(("calibrate:fps", "simulate:fps", "camera.tile_px"), (NUMBER, NULL)),
+    **dict.fromkeys(
+        ("calibrate:fps", "simulate:fps", "camera.tile_px", "white_level"), (NUMBER, NULL)
+    ),
     "compare:still": (NUMBER, NULL),
     "data.rates": (LIST, NULL),
     "data.crop": (NUMBER, LIST, NULL),
@@ -64,8 +66,8 @@ KINDS: dict[str, tuple[str, ...]] = {
     "trainer.deterministic": (WORD, FLAG),
 }  # fmt: skip
 # Parts whose own classes check whether a number, a range of numbers or null does.
-RANGES = ("augment.", "optics.", "scene.", "sensor.", "target.", "turbulence.")
-SIZES = ("sensor_size", "resolution", "camera.sensor")  # [height, width]
+RANGES = ("augment.", "optics.", "own_sensor.", "scene.", "sensor.", "target.", "turbulence.")
+SIZES = ("sensor_size", "resolution", "camera.sensor_size")  # [height, width]
 # More entries do.
 OPEN = ("callbacks", "logger", "loss", "networks", "references", "scene.parts", "stress_tests")
 
@@ -119,7 +121,7 @@ def _check_mapping(given: dict, shipped: DictConfig, entry_point: str, cfg: _Con
     defaults, plain = _Config(shipped), OmegaConf.to_container(shipped, resolve=False)
     for key, value in _walk(given, cast(dict, plain)):
         if not _is_known(key, value, given, cast(dict, plain)):
-            raise ValueError(f"{key} is no key of the configuration; {LISTED}")
+            raise ValueError(describe_unknown_key(key, list(flatten_keys(plain))))
         if isinstance(value, str) and "${" in value:
             if value == _at(cast(dict, plain), key):  # what it refers to is looked at there
                 continue

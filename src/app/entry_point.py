@@ -23,11 +23,11 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.syntax import Syntax
 
 from src.app import console
-from src.app.compose import CONF
+from src.app.compose import CONF, describe_config_error
 from src.app.config_values import check_values
 from src.app.help import help_text
 from src.app.path_overrides import name_job_folder, quote_paths, unquote_override
-from src.app.renamed_keys import check_keys, check_overrides, explain_refused_key
+from src.app.renamed_keys import check_keys, check_overrides
 from src.records import results, tracking
 
 FAILURE_FILE = "failed.txt"  # in the folder of a sweep's job: why it failed
@@ -82,15 +82,18 @@ def run_main(main: Callable[[], None]) -> None:
         _print_failed_jobs(Path(str(error)), start)
         sys.exit(1)
     except (ValueError, HydraException, OmegaConfBaseException, OSError) as error:
-        message = explain_refused_key(str(error)) or str(error)
-        print("error: " + " ".join(message.split()), file=sys.stderr)
+        message = describe_config_error(error, Path(sys.argv[0]).stem)
+        print(f"error: {message}", file=sys.stderr)
         is_io = isinstance(error, OSError) and not isinstance(error, HydraException)
         sys.exit(1 if is_io else 2)  # 1: a full disk, a file that may not be read
     except (KeyboardInterrupt, SIGTERMException) as error:  # Lightning's would end with exit code 0
         interrupted = isinstance(error, KeyboardInterrupt)
+        print("stopped", file=sys.stderr)
         sys.exit(128 + (signal.SIGINT if interrupted else signal.SIGTERM))
     except SystemExit as error:  # Lightning makes an exit code 1 of Ctrl-C
         interrupted = isinstance(error.__context__, KeyboardInterrupt)
+        if interrupted:
+            print("stopped", file=sys.stderr)
         sys.exit(128 + signal.SIGINT if interrupted else error.code)
 
 

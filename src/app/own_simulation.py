@@ -3,7 +3,7 @@
 import math
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -87,29 +87,29 @@ class OwnSimulation:
         size = {"height": height, "width": width}
         return model.operator(drawn, views=self.optics.positions, fps=self.fps, **size)
 
-    def record(self) -> dict[str, Any]:
+    def drawn_parameters(self) -> dict[str, Any]:
         """Return what was drawn."""
         own = {"name": self.clip.name, "threshold": self.sensor.threshold}
         return own | {"simulated_fps": self.fps} | dict(self.turbulence.metadata)
 
     def describe(self) -> str:
         """Return size, rate, frames, turbulence and threshold in one line."""
-        (height, width), drawn = self.clip.size, self.record()
-        strength = drawn.get("tilt_and_blur_px")
-        strong = f" ({strength:.2f} px tilt and blur)" if strength else ""
+        (height, width), drawn = self.clip.size, self.drawn_parameters()
+        light = "decoded from sRGB" if decodes_srgb(self.cfg) else "taken as intensity"
         return (
             f"{self.clip.name}: {self.clip.source}; simulated as {self.optics.views} views of "
             f"{width}x{height} px at {self.fps:.6g} frames/s; turbulence {drawn['severity']}"
-            f"{strong}, contrast threshold {self.sensor.threshold:.3f}"
+            f"{describe_strength(drawn)}; code values {light}, contrast threshold "
+            f"{self.sensor.threshold:.3f}"
         )
 
-    def parts(
+    def simulate_parts(
         self, views: Float[Tensor, "views frames h w"], progress: Progress = without_progress
     ) -> Iterator[SimulatedPart]:
         """Yield the clip part by part, and write what all views see, light, to `views`."""
         starts = range(0, self.frames, self._frames_per_part())
         spans = [(first, min(first + starts.step, self.frames)) for first in starts]
-        blended = (self.clip.blend(*span, self.substeps) for span in spans)
+        blended = (self.clip.interpolate_frames(*span, self.substeps) for span in spans)
         seen = self._see(self._to_light(part) for part in blended)
         for number in progress(range(len(spans)), "turbulence"):
             (first, stop), (lights, tilt) = spans[number], next(seen)
@@ -117,7 +117,7 @@ class OwnSimulation:
             own = slice(-first % self.substeps, None, self.substeps)
             codes = encode_srgb(lights[:, own]) if decodes_srgb(self.cfg) else lights[:, own]
             yield SimulatedPart(
-                self.clip.blend(first, stop, self.substeps)[own], codes, tilt[:, own]
+                self.clip.interpolate_frames(first, stop, self.substeps)[own], codes, tilt[:, own]
             )
 
     def _frames_per_part(self) -> int:
@@ -157,11 +157,30 @@ class OwnSimulation:
             return torch.from_numpy(np.memmap(file, np.float16, "w+", shape=shape))
 
 
+def describe_strength(drawn: Mapping[str, Any]) -> str:
+    """Return how far turbulence moves and spreads a point of the clip, pixels, along one axis."""
+    if not (tilt := drawn.get("tilt_px")):
+        return ""
+    both = drawn.get("tilt_and_blur_px")
+    blur = math.sqrt(max(both**2 - tilt**2, 0.0)) if both else drawn.get("blur_px", 0.0)
+    return f": tilt {tilt:.2f} px, blur {blur:.2f} px rms"
+
+
+def set_own_sensor(cfg: DictConfig, overrides: Iterable[str]) -> None:
+    """Give `sensor` the values of `own_sensor`, as photographs and films need them, but for the
+    keys that `overrides`, such as sensor.threshold=0.3, set.
+    """
+    given = {override.lstrip("+").partition("=")[0] for override in overrides}
+    for key, value in cfg.own_sensor.items():
+        if key in cfg.sensor and f"sensor.{key}" not in given:
+            cfg.sensor[key] = value
+
+
 def read_own_clip(cfg: DictConfig) -> OwnClip:
     """Return the clip that `video` or `photo` names; ValueError for both and for wrong values."""
     if cfg.video and cfg.photo:
         raise ValueError(f"video must be null with photo={cfg.photo}, got {cfg.video}")
-    options = {"fps": cfg.fps, "longest_side_px": cfg.longest_side_px}
+    options = {key: cfg[key] for key in ("fps", "longest_side_px", "white_level")}
     if cfg.video:
         return own_material.read_video(cfg.video, start_s=cfg.start_s, end_s=cfg.end_s, **options)
     motion = {"speed_widths_per_s": cfg.speed_widths_per_s, "seed": cfg.seed}

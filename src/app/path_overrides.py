@@ -12,11 +12,11 @@ from pathlib import Path
 
 # Keys whose values are files, folders, weights or free text; of a dotted key its last word.
 PATH_KEYS = frozenset({
-    "against", "allowed_origins", "backbone", "cache_root", "ckpt", "corners", "distillation_cache",
-    "export", "into", "like", "measured", "name", "names", "offered_networks", "out",
-    "photo", "postprocessor", "published", "recording", "reference_images", "root", "run", "save",
-    "save_dir", "teachers", "title", "extra_train_root", "video", "video_root", "videos", "weights",
-    "write",
+    "against", "allowed_origins", "backbone_weights", "cache_root", "ckpt", "corners",
+    "distillation_cache", "export", "into", "like", "measured", "name", "names",
+    "offered_networks", "out", "photo", "postprocessor", "published", "recording",
+    "reference_images", "root", "run", "save", "save_dir", "teachers", "title",
+    "extra_train_root", "video", "video_root", "videos", "weights", "write",
 })  # fmt: skip
 WHOLE_KEYS = frozenset({
     "hydra.run.dir", "hydra.sweep.dir", "views", "calibrate:still", "train:start",

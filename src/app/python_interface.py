@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from src.app.compose import compose_config, config_choices
-from src.app.own_simulation import OwnSimulation, read_own_clip
+from src.app.own_simulation import OwnSimulation, read_own_clip, set_own_sensor
 from src.sim.optics import Position, view_id
 from src.sim.scenes import own_material
 from src.sim.scenes.own_material import OwnClip
@@ -56,15 +56,18 @@ def simulate(
 
     `photo_or_video`: a path, of a picture, a video or a folder of frames, or an array, (h, w) or
     (frames, h, w), uint8 or floats in [0, 1].  `turbulence`: none, weak, medium, strong or mixed.
-    `sensor`: paper, ideal, noisy, evk4 ...; `fps`: None for that of the file, 120 for a photograph,
-    which lasts `seconds`.  `overrides`: keys of conf/simulate.yaml as on the command line.  The
-    result is a function of the arguments.  Raises ValueError for values outside their range.
+    `sensor`: paper, ideal, noisy, evk4 ..., for sRGB and with a contrast threshold of 0.2 unless
+    `overrides` set sensor.input and sensor.threshold.  `fps`: None for that of the file, 120 for a
+    photograph, which lasts `seconds`.  `overrides`: keys of conf/simulate.yaml as on the command
+    line.  The result is a function of the arguments.  Raises ValueError for values outside their
+    range.
     """
     for group, choice in (("turbulence", turbulence), ("sensor", sensor)):
         if choice not in (names := config_choices(group)):
             raise ValueError(f"{group} must be one of {', '.join(names)}, got {choice}")
     chosen = [f"turbulence={turbulence}", f"optics.views={views}", f"sensor={sensor}"]
     cfg = compose_config("simulate", *chosen, f"seed={seed}", *overrides)
+    set_own_sensor(cfg, overrides)
     options: dict[str, Any] = {"fps": fps, "seconds": seconds, "longest_side_px": longest_side_px}
     if isinstance(photo_or_video, str | Path):
         path = Path(photo_or_video)
@@ -72,7 +75,7 @@ def simulate(
         cfg.update(options | {"start_s": start_s, "end_s": end_s, key: str(path)})
         clip = read_own_clip(cfg)
     else:
-        clip = own_material.clip_from_array(photo_or_video, **options)
+        clip = own_material.clip_from_array(photo_or_video, white_level=cfg.white_level, **options)
     return simulate_clip(OwnSimulation(cfg, clip))
 
 
@@ -84,12 +87,12 @@ def simulate_clip(work: OwnSimulation) -> SimulatedClip:
     views = np.empty((work.optics.views, count, *shape), np.float32)
     tilt = np.empty((work.optics.views, count, 2, *shape), np.float32)
     seen, first = work.allocate_views(Path(tempfile.gettempdir())), 0
-    for part in work.parts(seen):
+    for part in work.simulate_parts(seen):
         at = slice(first, first + len(part.clean))
         clean[at], views[:, at], tilt[:, at] = part.clean, part.views, part.tilt
         first = at.stop
     events, positions = detect_events(work, seen), work.optics.positions
-    return SimulatedClip(clean, views, tilt, events, clip.fps, positions, work.record())
+    return SimulatedClip(clean, views, tilt, events, clip.fps, positions, work.drawn_parameters())
 
 
 def detect_events(work: OwnSimulation, views: Float[Tensor, "views frames h w"]) -> np.ndarray:

@@ -1,7 +1,8 @@
-"""Config keys and choices of earlier versions: an error that names the new one."""
+"""Config keys and choices that are none: an error that names the new or the nearest one."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from difflib import get_close_matches
 from pathlib import Path
 
 import yaml
@@ -16,20 +17,46 @@ REFUSED_KEY = r"Could not (?:override|delete from config\.) '([\w./]+)'"  # Hydr
 LISTED = "--cfg job lists the keys"
 MISSING_VALUE = r"Missing mandatory value: ([\w.]+)"
 REFUSED_CHOICE = r"Could not find '([\w/]+)/(\w+)'"
+CHOICES = r"Could not find '([\w/]+)'\s+Available options in '([\w/]+)':(.*?)Config search path"
+NEAR = 0.65  # of SequenceMatcher.ratio: two swapped letters of three
 
 
-def explain_refused_key(message: str) -> str | None:
+def explain_refused_key(message: str, keys: Collection[str] = ()) -> str | None:
     """Return what became of the key or choice that Hydra refuses in `message`, that there is no
-    such key, or that it must be given; None for any other error.
+    such one, with the nearest of `keys` or choices, or that it must be given; None for any other
+    error.
     """
     if found := re.search(MISSING_VALUE, message):
         return f"{found[1]} must be given: {found[1]}=..."
     if found := re.search(REFUSED_CHOICE, message):
-        return describe_renaming(f"{found[1]}={found[2]}")
+        return describe_renaming(f"{found[1]}={found[2]}") or _describe_choices(message)
     if found := re.search(REFUSED_KEY, message):
         key = found[1].replace("/", ".")
-        return describe_renaming(key) or f"{key} is no key of the configuration; {LISTED}"
+        return describe_renaming(key) or describe_unknown_key(key, keys)
     return None
+
+
+def describe_unknown_key(key: str, keys: Collection[str]) -> str:
+    """Return that `key` is none, and its nearest neighbour in `keys` or how to list them."""
+    parent = key.rpartition(".")[0]
+    hint = _ask_for_nearest(key, [k for k in keys if k.rpartition(".")[0] == parent], len(parent))
+    hint = hint or f"; {LISTED}"
+    return f"{key} is no key of the configuration{hint}"
+
+
+def _describe_choices(message: str) -> str | None:
+    found = re.search(CHOICES, message, re.S)
+    if found is None:
+        return None
+    choices, got = found[3].split(), found[1].removeprefix(f"{found[2]}/")
+    listed = f"{found[2]} must be one of {', '.join(choices)}, got {got}"
+    return listed + _ask_for_nearest(got, choices)
+
+
+def _ask_for_nearest(name: str, names: Collection[str], start: int = 0) -> str:
+    """Compare the names from their letter `start` on."""
+    near = get_close_matches(name[start:], [other[start:] for other in names], 1, NEAR)
+    return f"; did you mean {name[:start]}{near[0]}?" if near else ""
 
 
 def check_overrides(arguments: Iterable[str]) -> None:
@@ -44,7 +71,7 @@ def check_overrides(arguments: Iterable[str]) -> None:
 
 def check_keys(cfg: DictConfig) -> None:
     """Raise ValueError for a former key in `cfg`, such as one of a user's config file."""
-    for key in _flatten_keys(OmegaConf.to_container(cfg, resolve=False)):
+    for key in flatten_keys(_drop_other_classes(OmegaConf.to_container(cfg, resolve=False))):
         if explanation := describe_renaming(key):
             raise ValueError(explanation)
 
@@ -58,11 +85,18 @@ def describe_renaming(key: str) -> str | None:
     return None
 
 
-def _flatten_keys(node: object, prefix: str = "") -> Iterator[str]:
-    """Yield the dotted key of every node in nested dicts but those of a class of the user's own."""
+def flatten_keys(node: object, prefix: str = "") -> Iterator[str]:
+    """Yield the dotted key of every node in nested dicts."""
     if isinstance(node, Mapping):
-        if not str(node.get("_target_", "src.")).startswith(("src.", "baselines.")):
-            return
         for name, child in node.items():
             yield f"{prefix}{name}"
-            yield from _flatten_keys(child, f"{prefix}{name}.")
+            yield from flatten_keys(child, f"{prefix}{name}.")
+
+
+def _drop_other_classes(node: object) -> object:
+    """Return nested dicts without the arguments of classes that are not of this project."""
+    if not isinstance(node, Mapping):
+        return node
+    if not str(node.get("_target_", "src.")).startswith(("src.", "baselines.")):
+        return None
+    return {name: _drop_other_classes(child) for name, child in node.items()}

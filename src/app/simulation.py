@@ -53,7 +53,7 @@ def build_pipeline(cfg: DictConfig, split: str, optics: Optics | None = None) ->
         bins=_count(cfg, "bins"),
         crop=crop,
         batch_size=_count(cfg, "data.batch_size"),
-        independent=cfg.turbulence.get("views_correlation", "independent") == "independent",
+        shuffle_views=cfg.turbulence.get("views_correlation", "independent") == "independent",
         clips=clips,
     )
 

@@ -13,7 +13,7 @@ from src.models.network import VideoMethod
 FROM_NOTHING = (None, "none")
 
 
-def adopt_start(cfg: DictConfig) -> Path | None:
+def set_model_from_start_weights(cfg: DictConfig) -> Path | None:
     """Return the file that `start` names, None for a training from nothing, and make `cfg.model`
     its network: width, stem and all that follows from the weights.
 
@@ -24,7 +24,7 @@ def adopt_start(cfg: DictConfig) -> Path | None:
         return None
     path = _find_file(cfg.start)
     try:
-        spec = files.network_spec(path)
+        spec = files.read_network_spec(path)
     except ValueError as error:
         raise ValueError(f"start must be weights to begin from: {error}") from error
     wanted, got = cfg.model._target_.removesuffix(".preset"), spec["target"]
@@ -42,16 +42,16 @@ def adopt_start(cfg: DictConfig) -> Path | None:
     return path
 
 
-def name_beginning(cfg: DictConfig, path: Path | None) -> str:
+def describe_start_weights(cfg: DictConfig, path: Path | None) -> str:
     """Return what the table calls the network before its training."""
     if path is None:
         return "untrained"
-    before = files.network_spec(path)["kwargs"].get("views")
+    before = files.read_network_spec(path)["kwargs"].get("views")
     given = f" given {cfg.optics.views} views" if before == 1 != cfg.optics.views else ""
     return f"{cfg.start}{given}, before training"
 
 
-def load_references(cfg: DictConfig) -> dict[str, VideoMethod]:
+def load_reference_networks(cfg: DictConfig) -> dict[str, VideoMethod]:
     """Return the networks of `references` by their names in the table; those that take other views
     than `optics` has are left out with a warning.
 
@@ -60,7 +60,7 @@ def load_references(cfg: DictConfig) -> dict[str, VideoMethod]:
     networks, views = {}, cfg.optics.views
     for name, weights in as_dict(cfg.references).items():
         asked = f"references.{name} must be a network"
-        network = build.load_for_events(cfg, weights, VideoMethod, asked)
+        network = build.load_network_for_events(cfg, weights, VideoMethod, asked)
         if network.views not in (None, views):
             wanted = f"optics.views={network.views}, got {views}"
             warnings.warn(f"references.{name} is left out: it takes {wanted}", stacklevel=2)

@@ -17,22 +17,22 @@ class Candidate:
     """A network of a comparison, None where it is missing.
 
     `views`: how many views of the light field it is given (1: the centre view).  `trained`: its
-    weights are here; without them only its speed is measured.  `missing`: why there is no network.
-    `postprocessor`: run on its frames.
+    weights are here; without them only its speed is measured.  `missing_reason`: why there is no
+    network.  `postprocessor`: run on its frames.
     """
 
     name: str
     network: EventToVideoNetwork | None
     views: int
     trained: bool = True
-    missing: str = ""
+    missing_reason: str = ""
     postprocessor: FramePostprocessor | None = None
 
     @property
     def loaded(self) -> EventToVideoNetwork:
         """The network; raises ValueError where it is missing."""
         if self.network is None:
-            raise ValueError(self.missing)
+            raise ValueError(self.missing_reason)
         return self.network
 
     def select_views(

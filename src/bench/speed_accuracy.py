@@ -11,7 +11,7 @@ import torch
 from src.bench.candidates import Candidate
 from src.bench.speed import FORMS, SpeedMeasurement
 from src.deploy.forms import convert_to_form
-from src.metrics.table import METRICS, NAMES, own_column
+from src.metrics.table import METRICS, NAMES, make_user_metric_column
 from src.metrics.video_metrics import VideoMetrics
 from src.records.results import format_csv
 from src.sim.pipeline import Pipeline, simulate
@@ -47,7 +47,7 @@ class ClipScore:
 
 
 @torch.no_grad()
-def score_candidates(
+def score_accuracy(
     candidates: Sequence[Candidate], pipelines: Mapping[str, Pipeline], clips: int,
     measure: VideoMetrics, *, warmup: int, forms: Sequence[str],
 ) -> list[ClipScore]:  # fmt: skip
@@ -129,7 +129,7 @@ def format_chart_summary(
     """Return the recommended networks and a table of means over all clips, as Markdown."""
     values = scores[0].values if scores else {}
     metrics = [metric for metric in METRICS if metric.name in values]
-    metrics += [own_column(name, 0) for name in values if name not in NAMES]
+    metrics += [make_user_metric_column(name, 0) for name in values if name not in NAMES]
     heads = [metric.heading for metric in metrics]
     lines = ["# Speed against accuracy\n"]
     lines += [f"- {severity} turbulence: take {name}." for severity, name in recommended.items()]

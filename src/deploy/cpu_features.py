@@ -6,6 +6,8 @@ from functools import cache, partial
 import torch
 from torch.nn import functional
 
+from src.deploy.cost import torch_threads
+
 TIMED_CONVOLUTIONS = 20  # of each type, the first of which are slow
 
 
@@ -31,9 +33,11 @@ def _has_any(*names: str) -> bool:
 
 
 def time_convolution_s(dtype: torch.dtype) -> float:
-    """Return the seconds of a convolution of 85 MMAC, channels last, the shortest of some."""
+    """Return the seconds of a convolution of 85 MMAC, channels last, the shortest of some: on one
+    thread, as what another job computes on a second core would decide which type is faster.
+    """
     maps = torch.ones(1, 64, 48, 48, dtype=dtype).to(memory_format=torch.channels_last)
     kernel = torch.ones(64, 64, 3, 3, dtype=dtype).to(memory_format=torch.channels_last)
-    with torch.inference_mode():
+    with torch.inference_mode(), torch_threads(1):
         convolve = partial(functional.conv2d, maps, kernel, padding=1)
         return min(timeit.repeat(convolve, number=1, repeat=TIMED_CONVOLUTIONS))

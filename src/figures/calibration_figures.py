@@ -18,7 +18,7 @@ from src.recordings.files.turbulence_file import SIDE, IntervalEstimate
 from src.recordings.views import Views
 from src.sim.optics import Position
 
-RESIDUAL_SCALE = 60  # residuals are drawn this many times too long
+RESIDUAL_SCALE, RESIDUAL_PX = 60, 12  # residuals are drawn so many times too long, or as so long
 LABEL: dict[str, Any] = {
     "color": "black", "ha": "center", "fontsize": 8,
     "bbox": {"facecolor": "white", "edgecolor": "none", "pad": 1.5},
@@ -46,12 +46,14 @@ def draw_view_residuals(
     """Draw the outline of every view, its error, and its residuals as lines from each point."""
     figure, axes = _show_sensor(picture)
     _draw_outlines(axes, alignment.views)
+    largest = max(view.error_px for view in alignment.views.views)
+    scale = min(RESIDUAL_SCALE, round(RESIDUAL_PX / max(largest, 0.01)))
     for view in alignment.views.views:
         points, residuals = alignment.points[view.position], alignment.residuals[view.position]
         inward = residuals @ np.linalg.inv(view.homography[:2, :2]).T  # to this view's pixels
-        ends = points + RESIDUAL_SCALE * inward
+        ends = points + scale * inward
         axes.plot(*np.stack([points, ends]).transpose(2, 0, 1), color="red", linewidth=1.4)
-    axes.set_title(f"views in sensor pixels; residuals in red, {RESIDUAL_SCALE} times too long")
+    axes.set_title(f"views in sensor pixels; residuals in red, {scale} times too long")
     save_figure(figure, path)
 
 
@@ -85,7 +87,7 @@ def draw_event_rates(estimate: ThresholdEstimate, path: Path) -> None:
     figure = Figure(figsize=(6, 4))
     axes = figure.subplots()
     ratio = estimate.curve.off_ratio
-    for side, (name, colour) in enumerate((("ON", "tab:blue"), ("OFF", "tab:red"))):
+    for side, (name, colour) in enumerate((("ON", "tab:red"), ("OFF", "tab:blue"))):
         at = estimate.curve.thresholds * (ratio if side else 1.0)
         axes.loglog(at, estimate.curve.rates[:, side], color=colour, label=f"simulated {name}")
         axes.axhspan(*estimate.interval[:, side], color=colour, alpha=0.2)

@@ -36,7 +36,7 @@ def draw_comparison(
     """
     shortest = min(len(row.video) for row in rows)
     picks = np.linspace(0, shortest - 1, samples).astype(int)
-    columns = samples + 2  # samples, slice, note
+    columns = samples + 1 + any(row.note for row in rows)  # samples, slice, note
     height, width = rows[0].video.shape[1:]
     panel_height = max(PANEL_WIDTH_IN * height / width, MIN_PANEL_HEIGHT_IN)
     size = (PANEL_WIDTH_IN * columns + 0.5, (panel_height + 0.2) * len(rows) + 0.4)
@@ -49,12 +49,13 @@ def draw_comparison(
         axes[0].plot(*line.T, color=LINE_COLOUR, linewidth=1)
         axes[0].set_ylabel(row.name, fontsize=min(9, 100 * panel_height / max(len(row.name), 1)))
         extent = (0, row.slice.shape[1], 1e3 * length_s, 0)
-        axes[-2].imshow(row.slice, aspect="auto", extent=extent, vmin=0, vmax=1)
-        axes[-2].tick_params(labelsize=6)
-        axes[-1].set_axis_off()
-        axes[-1].text(0, 1, row.note, fontsize=8, va="top", transform=axes[-1].transAxes)
+        axes[samples].imshow(row.slice, aspect="auto", extent=extent, vmin=0, vmax=1)
+        axes[samples].tick_params(labelsize=6)
+        for beside in axes[samples + 1 :]:
+            beside.set_axis_off()
+            beside.text(0, 1, row.note, fontsize=8, va="top", transform=beside.transAxes)
     for sample, panel in zip(picks, grid[0], strict=False):
         time_ms = 1e3 * length_s * sample / max(shortest - 1, 1)
         panel.set_title(f"{time_ms:.1f} ms", fontsize=8)
-    grid[0, -2].set_title(f"{axis}-t, {1e3 * length_s:.0f} ms", fontsize=8)
+    grid[0, samples].set_title(f"{axis}-t, {1e3 * length_s:.0f} ms", fontsize=8)
     save_figure(figure, path)

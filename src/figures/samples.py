@@ -11,7 +11,7 @@ from PIL import Image
 
 from src.figures.comparison import VideoRow, draw_comparison
 from src.models.network import VideoMethod
-from src.recordings.output import round_codes
+from src.recordings.output import round_to_uint8
 from src.records.atomic import atomic_path
 from src.sim.optics import Optics
 from src.sim.pipeline import Pipeline, simulate
@@ -22,6 +22,7 @@ GAP_PX = 4
 MAX_VIEW_PX = 160  # longest side of a view in views.gif
 WEBP_QUALITY = 70
 MIN_HEIGHT_PX = 160  # lower panels are enlarged by a whole factor
+EVENTS_TITLE = "events: brighter red, darker blue"
 
 Video = Float[np.ndarray, "_frames _h _w *_rgb"]
 
@@ -43,7 +44,7 @@ def write_samples(
         videos = {name: part[0, :, 0].cpu().numpy() for name, part in parts.items()}
         gif, slices = folder / f"clip{index}.gif", folder / f"clip{index}_slice.png"
         counts = sample.voxels[0, :, pipeline.optics.centre].sum(1).cpu().numpy()
-        events = {"events": render_events(counts), "reconstruction": videos["reconstruction"]}
+        events = {EVENTS_TITLE: render_events(counts), "reconstruction": videos["reconstruction"]}
         first = {name: videos[name] for name in ("clean", "centre view")}
         write_video(gif, join_panels(first | events), PLAYBACK_FPS)
         windows, height, width = videos["clean"].shape
@@ -63,18 +64,19 @@ def write_light_field(
     light, in [0, 1], its tilt and its sums of polarity, in the arrangement of the views; pictures
     longer than MAX_VIEW_PX shrunk to that.
 
-    `tilt`, in pixels, is drawn as the mean of both axes: blue where the picture is pushed right or
-    down, red where left or up.
+    `tilt`, in pixels, is drawn as the mean of both axes: red where the picture is pushed right or
+    down, blue where left or up.  The clean clip is as high as all views together.
     """
-    clean, (views, tilt, counts) = _shrink(clean), map(_shrink, (views, tilt, counts))
+    views, tilt, counts = map(_shrink, (views, tilt, counts))
+    seen = tile_views(list(views), optics)
     events = [render_events(part) for part in counts]
     reach = max(float(np.abs(tilt).max()), 1e-6)
     pushed = [render_events(part.mean(1), full=reach) for part in tilt]
     panels = {
-        "clean": clean,
-        "views": tile_views(list(views), optics),
+        "clean": resize_pictures(clean, seen.shape[1]),
+        "views": seen,
         f"tilt, +-{reach:.1f} px": tile_views(pushed, optics),
-        "events": tile_views(events, optics),
+        EVENTS_TITLE: tile_views(events, optics),
     }
     frames = join_panels(panels)
     paths = [folder / "views.gif", folder / "views.png"]
@@ -89,10 +91,21 @@ def _shrink(pictures: Float[np.ndarray, "*n h w"]) -> Float[np.ndarray, "*n h2 w
     shrink = MAX_VIEW_PX / max(height, width)
     if shrink >= 1:
         return pictures
-    size = max(1, round(width * shrink)), max(1, round(height * shrink))
-    flat = pictures.reshape(-1, height, width)
-    small = [cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in flat]
-    return np.stack(small).reshape(*shape, *size[::-1])
+    small = resize_pictures(pictures.reshape(-1, height, width), max(1, round(height * shrink)))
+    return small.reshape(*shape, *small.shape[1:])
+
+
+def resize_pictures(
+    pictures: Float[np.ndarray, "n h w"], height_px: int
+) -> Float[np.ndarray, "n height_px w2"]:
+    """Return grey pictures `height_px` high, in proportion: shrunk by means over areas, enlarged by
+    cubic interpolation, which keeps their range of values."""
+    _, height, width = pictures.shape
+    size = max(1, round(width * height_px / height)), height_px
+    if height_px <= height:
+        return np.stack([cv2.resize(one, size, interpolation=cv2.INTER_AREA) for one in pictures])
+    large = [cv2.resize(one, size, interpolation=cv2.INTER_CUBIC) for one in pictures]
+    return np.stack(large).clip(pictures.min(), pictures.max())
 
 
 def tile_views(videos: list[Video], optics: Optics) -> Video:
@@ -110,27 +123,30 @@ def tile_views(videos: list[Video], optics: Optics) -> Video:
 def render_events(
     counts: Float[np.ndarray, "frames h w"], full: float = 3.0
 ) -> Float[np.ndarray, "frames h w 3"]:
-    """Return sums of polarity as colours on white: ON blue, OFF red, solid from `full` events."""
+    """Return sums of polarity as colours on white: ON, brighter, red and OFF, darker, blue, solid
+    from `full` events."""
     strength = np.clip(np.abs(counts) / full, 0, 1)[..., None]
-    ink = np.where(counts[..., None] > 0, (0.1, 0.3, 0.9), (0.9, 0.15, 0.1))
+    ink = np.where(counts[..., None] > 0, (0.9, 0.15, 0.1), (0.1, 0.3, 0.9))
     return (1 - strength * (1 - ink)).astype(np.float32)
 
 
 def join_panels(panels: dict[str, Video]) -> Video:
     """Return the panels side by side, equally high, each under its name; white between them.
 
-    All have the same number of frames; heights differ by whole factors; grey ones have no colours.
+    All have the same number of frames; heights differ by whole factors.  Grey ones, (frames, h, w),
+    are interpolated where they are enlarged; of those with colours, events, pixels are repeated.
     """
     tallest = max(MIN_HEIGHT_PX, *(video.shape[1] for video in panels.values()))
     columns = []
     for name, video in panels.items():
         factor = max(tallest // video.shape[1], 1)
-        video = video.repeat(factor, axis=1).repeat(factor, axis=2)
-        video = video if video.ndim == 4 else np.repeat(video[..., None], 3, axis=-1)
-        strip = np.full((TITLE_PX, video.shape[2], 3), 255, np.uint8)
-        font, place = cv2.FONT_HERSHEY_SIMPLEX, (3, TITLE_PX - 5)
-        drawn = cv2.putText(strip, name, place, font, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
-        above = np.broadcast_to((drawn / 255).astype(np.float32), (len(video), *strip.shape))
+        if video.ndim == 3:
+            large = resize_pictures(video, factor * video.shape[1]) if factor > 1 else video
+            video = np.repeat(large[..., None], 3, axis=-1)
+        else:
+            video = video.repeat(factor, axis=1).repeat(factor, axis=2)
+        strip = _draw_title(name, video.shape[2])
+        above = np.broadcast_to(strip, (len(video), *strip.shape))
         columns.append(np.concatenate([above, video], axis=1))
     height = max(column.shape[1] for column in columns)
     columns = [
@@ -140,12 +156,22 @@ def join_panels(panels: dict[str, Video]) -> Video:
     return np.concatenate(columns, axis=2)[:, :, :-GAP_PX]
 
 
+def _draw_title(name: str, width: int) -> Float[np.ndarray, "title_px width 3"]:
+    """Return the strip above a panel; of a name too long for it only what is before the colon."""
+    font, black = (cv2.FONT_HERSHEY_SIMPLEX, 0.42), (0, 0, 0)
+    fits = cv2.getTextSize(name, *font, 1)[0][0] + 3 <= width
+    strip = np.full((TITLE_PX, width, 3), 255, np.uint8)
+    text, place = name if fits else name.partition(":")[0], (3, TITLE_PX - 5)
+    drawn = cv2.putText(strip, text, place, *font, black, 1, cv2.LINE_AA)
+    return (drawn / 255).astype(np.float32)
+
+
 def write_video(path: Path, frames: Video, fps: float) -> None:
     """Write a GIF or WebP (or, of the first frame, what else the suffix says) whole or not at all.
 
     Values are clipped to [0, 1]; GIFs keep time to hundredths of a second, WebP to thousandths.
     """
-    pictures, kind = list(map(Image.fromarray, round_codes(frames))), path.suffix[1:].upper()
+    pictures, kind = list(map(Image.fromarray, round_to_uint8(frames))), path.suffix[1:].upper()
     options: dict[str, Any] = {}
     if kind == "GIF":
         pictures = [picture.quantize(128, dither=Image.Dither.NONE) for picture in pictures]

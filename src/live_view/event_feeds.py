@@ -59,7 +59,7 @@ def open_feed(
     if recording.startswith("camera://"):
         return CameraFeed(faults)
     if not recording.startswith("udp://"):
-        size = sources.sensor_size(recording, sensor, options)
+        size = sources.find_sensor_size(recording, sensor, options)
         if lines := open_recording(recording, options=options).messages:
             faults.report("reading", "; ".join(lines), until_cleared=True)
         return FileFeed(recording, size, loop, options)

@@ -10,7 +10,7 @@ import numpy as np
 from src.live_view.status import FaultLog
 from src.recordings.files.event_arrays import concatenate_events, count_before
 from src.recordings.files.event_file import EVENT
-from src.recordings.files.event_order import BUFFER_US, EventOrder
+from src.recordings.files.event_order import BUFFER_US, EventSorter
 from src.recordings.views import Size
 
 FEW_LIVE_EVENTS = 16  # with times far from the others; more of them are a clock that restarts
@@ -34,7 +34,7 @@ class EventWindow:
 class WindowCutter:
     """Keeps events until a window of 1 / `fps` is whole; reports to `faults` what is wrong.
 
-    What `is_live` is put in order by the rule of files (EventOrder), but nothing waits for it: an
+    What `is_live` is put in order by the rule of files (EventSorter), but nothing waits for it: an
     event whose window is over is dropped.  The events of a file are in order.  Raises ValueError
     for an `fps` out of range.
     """
@@ -44,7 +44,7 @@ class WindowCutter:
             raise ValueError(f"fps must be in (0, 1e5], got {fps}")
         self.sensor, self.period_us, self.faults = sensor, 1e6 / fps, faults
         self.buffer_us = BUFFER_US if is_live else ANY_GAP_US
-        self.order = EventOrder(self.buffer_us, FEW_LIVE_EVENTS, None)
+        self.order = EventSorter(self.buffer_us, FEW_LIVE_EVENTS, None)
         self.origin_us: float | None = None  # start of the first window
         self.windows_cut = 0  # since the origin
         self.starts_scene = True
@@ -56,7 +56,7 @@ class WindowCutter:
 
     def restart(self, *, new_scene: bool = True) -> None:
         """Forget the clock: the next event starts a window, of a new scene or not."""
-        self.order = EventOrder(self.buffer_us, FEW_LIVE_EVENTS, None)
+        self.order = EventSorter(self.buffer_us, FEW_LIVE_EVENTS, None)
         self._forget_windows(new_scene)
 
     def _forget_windows(self, new_scene: bool) -> None:
@@ -95,7 +95,7 @@ class WindowCutter:
             return
         over = int((until_us - self.origin_us) / self.period_us) - self.windows_cut
         ends = (end_us + self.period_us * np.arange(max(over, 1))).tolist()
-        self.order.settle(until_us)
+        self.order.accept_silence(until_us)
         ready = self.order.release(ends[-1])
         events = concatenate_events(ready) if ready else np.empty(0, EVENT)
         stops = [count_before(events, end) for end in ends]

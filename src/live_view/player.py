@@ -31,6 +31,7 @@ class Player:
         self.running: NetworkRunner | None = None  # of the newest window
         self.running_one_view: NetworkRunner | None = None
         self.one_view: np.ndarray | None = None  # newest frame of the network on one view
+        self.shown_us: float | None = None  # recorded time of the newest frame
         self.begun: queue.Queue[tuple[EventWindow, Finish, Finish | None]] = queue.Queue(1)
         self.stopped = threading.Event()
         self.threads = [
@@ -103,6 +104,7 @@ class Player:
                 self.one_view = None
             else:
                 self.one_view = self.one_view_tone.apply(picture, window.end_us * 1e-6)
+            self.shown_us = window.end_us
             end = time.perf_counter()
             self.meters.add_busy_time("network", end - start)
             self.meters.add_frame(end - window.due_s, len(window.events))
@@ -113,12 +115,16 @@ class Player:
         (running.clear if paused else running.set)()
 
     def _suggest_fps(self, reached: float, asked: float) -> str | None:
-        """Return what to set where windows are dropped now; None where they are not."""
+        """Return what to set where windows are dropped now, in frames per second of recorded time;
+        None where they are not.  `reached` and `asked` are per second of the clock on the wall.
+        """
         suggested = math.floor(SPARED * reached / self.reader.clock.speed)
         is_short = self.reader.state == "playing" and math.isfinite(asked)
         if not (is_short and self.reader.waiting.dropped and reached < SPARED * asked):
             return None
-        return f"fps={suggested} would drop nothing on this machine" if suggested else None
+        if not suggested:
+            return None
+        return f"fps={suggested} (of recorded time) would drop nothing on this machine"
 
     def status(self) -> dict:
         """Return what `GET /status` answers, all but the page's own."""
@@ -139,5 +145,5 @@ class Player:
             "network": runner.name if runner else None,
             "views": len(runner.views.views) if runner else None,
             "load": self.meters.stage_cpu_shares(),
-            "time_s": round(reader.cutter.last_us * 1e-6, 3),
+            "time_s": None if self.shown_us is None else round(self.shown_us * 1e-6, 3),
         }

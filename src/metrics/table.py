@@ -39,6 +39,6 @@ METRICS = (
 NAMES = tuple(metric.name for metric in METRICS)
 
 
-def own_column(name: str, better: int) -> Column:
+def make_user_metric_column(name: str, better: int) -> Column:
     """Return the column of a metric that a config has added, under its key there."""
     return Column(name, name, 3, better)

@@ -10,7 +10,7 @@ from torchmetrics import MeanMetric, Metric, MetricCollection
 
 from src.metrics.image import aligned_psnr, psnr, ssim
 from src.metrics.lpips import LPIPS
-from src.metrics.table import NAMES, Column, own_column
+from src.metrics.table import NAMES, Column, make_user_metric_column
 from src.metrics.temporal import Video, temporal_jitter_px
 
 SCORES = {  # name in table.py: a value per frame, or per step from a frame to the next
@@ -38,7 +38,7 @@ class ClipMean(MeanMetric):
         super().update(score(frames, target).mean())
 
 
-class OwnScore:
+class UserMetricScore:
     """The value that a torchmetrics metric, `metrics.<name>` of the config, has on one clip alone.
 
     Its `update` is given frames and target, (frames, 1, h, w) in [0, 1]; `compute` gives one number
@@ -59,7 +59,7 @@ class OwnScore:
 
 class VideoMetrics(MetricCollection):
     """PSNR, aligned PSNR, SSIM, temporal jitter and, if a network is given, LPIPS of clips; and
-    those of `own`, by name, each as OwnScore.
+    those of `own`, by name, each as UserMetricScore.
 
     Frames are clipped to [0, 1]; the data range is 1.  `resolution_scale`: frames and targets are
     scored at so many times their own resolution, temporal jitter in pixels of the scored frame.
@@ -80,15 +80,15 @@ class VideoMetrics(MetricCollection):
         if taken := [name for name in own if name in NAMES or hasattr(MetricCollection, name)]:
             raise ValueError(f"metrics.{taken[0]} must be called otherwise: the name is taken")
         scores = SCORES if lpips is None else SCORES | {"lpips": lpips}
-        scores = scores | {name: OwnScore(name, metric) for name, metric in own.items()}
+        scores = scores | {name: UserMetricScore(name, metric) for name, metric in own.items()}
         metrics: dict[str, Metric | MetricCollection]
         metrics = {name: ClipMean(score) for name, score in scores.items()}
         # Groups would merge scores that are equal on the first clip.
         super().__init__(metrics, compute_groups=False)
         self.resolution_scale = scale
         self.names = (*(name for name in NAMES if name in scores), *own)
-        self.own_columns: tuple[Column, ...] = tuple(
-            own_column(name, {None: 0, True: 1, False: -1}[metric.higher_is_better])
+        self.user_metric_columns: tuple[Column, ...] = tuple(
+            make_user_metric_column(name, {None: 0, True: 1, False: -1}[metric.higher_is_better])
             for name, metric in own.items()
         )
 

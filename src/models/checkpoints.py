@@ -10,7 +10,7 @@ import torch
 from src.records.atomic import atomic_path
 
 
-def save_whole(content: Any, path: Path) -> None:
+def save_atomically(content: Any, path: Path) -> None:
     """Write `content` as torch.save does; it is on the disk, whole, when this returns, and an
     OSError leaves what was there before.
     """

@@ -47,7 +47,9 @@ def load(name_or_path: str | Path, allowed_packages: Sequence[str] = ()) -> nn.M
     check_weights_stored_whole(weights, path, "ckpt")
     with torch.device("meta"):  # without memory: a small file may name a huge network
         empty = _build(spec, path, allowed_packages)
-    check_fit(f"ckpt does not fit {type(empty).__name__} in {path}", empty.state_dict(), weights)
+    check_weights_fit(
+        f"ckpt does not fit {type(empty).__name__} in {path}", empty.state_dict(), weights
+    )
     network = _build(spec, path, allowed_packages)
     network.load_state_dict(weights)
     fold_parametrizations(network)
@@ -61,8 +63,10 @@ def locate(name: str | Path) -> Path:
 
 
 def list_shipped() -> str:
-    """Return the names in `weights/`, for a message."""
-    return ", ".join(sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))) or "none yet"
+    """Return the names in `weights/`, those of its folders last, for a message."""
+    paths = (file.relative_to(WEIGHTS) for file in WEIGHTS.rglob("*.safetensors"))
+    names = (path.with_suffix("").as_posix() for path in paths)
+    return ", ".join(sorted(names, key=lambda name: (name.count("/"), name))) or "none yet"
 
 
 def find_checkpoint(name: str | Path, spec: dict) -> Path:
@@ -104,7 +108,7 @@ def read_card(path: Path) -> dict:
     return _exported(path)[2]
 
 
-def network_spec(path: Path) -> dict:
+def read_network_spec(path: Path) -> dict:
     """Return `target` and `kwargs` of the network of a file of `save`; ValueError as `load`."""
     return _exported(path)[0]
 
@@ -120,7 +124,7 @@ def restore_weights(network: nn.Module, path: Path) -> None:
     if isinstance(network, E2VID) and spec["kwargs"].get("views", 1) == 1:
         weights = network.widen_state_dict(weights)
     own = inference_copy(network).state_dict()
-    check_fit(f"ckpt does not fit {type(network).__name__} in {path}", own, weights)
+    check_weights_fit(f"ckpt does not fit {type(network).__name__} in {path}", own, weights)
     for prefix, module in network.named_modules():
         if parametrize.is_parametrized(module, "weight"):
             module.weight = weights.pop(f"{prefix}.weight")
@@ -215,7 +219,7 @@ def check_weights_stored_whole(weights: dict[str, Tensor], path: Path, key: str)
         raise ValueError(f"{key} must hold its weights whole, got {got}")
 
 
-def check_fit(error: str, own: dict[str, Tensor], weights: dict[str, Tensor]) -> None:
+def check_weights_fit(error: str, own: dict[str, Tensor], weights: dict[str, Tensor]) -> None:
     """Raise ValueError, beginning with `error`, unless names and shapes are those of `own`."""
     missing, extra = sorted(own.keys() - weights.keys()), sorted(weights.keys() - own.keys())
     other = sorted(n for n in own.keys() & weights.keys() if own[n].shape != weights[n].shape)

@@ -31,10 +31,12 @@ class EventToVideoNetwork(VideoMethod):
 
     A subclass implements `forward`; `warm_up` and `sequence` may be replaced by faster ones that
     give the same.  The state, a tensor or nested tuples, lists and dicts of tensors, is never kept
-    inside.  `uses_window_length`: whether windows may last longer or shorter than in training.
+    inside.  `uses_window_length`: whether windows may last longer or shorter than in training;
+    `uses_centre_view_only`: whether the other views it is given change nothing.
     """
 
     uses_window_length = False
+    uses_centre_view_only = False
 
     def forward(
         self,

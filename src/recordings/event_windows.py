@@ -7,6 +7,8 @@ phases is the reconstruction at the trained rate, and every event counts once pe
 microseconds of the recording's clock in float64.
 """
 
+import math
+import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -35,7 +37,8 @@ class VoxelContributions(NamedTuple):
 
 @dataclass(frozen=True)
 class Window:
-    """The events in [start_us, end_us): the number of `events` in views and `outside` of all.
+    """The events in [start_us, end_us): the number of `events` in views, and of
+    `events_outside` of all views.
 
     They lie in `voxels` or, for an EventListRuntime, in `event_list`.
     """
@@ -43,7 +46,7 @@ class Window:
     start_us: float
     end_us: float
     events: int
-    outside: int
+    events_outside: int
     voxels: Float[np.ndarray, "views bins h w"] | None = None
     event_list: VoxelContributions | None = None
 
@@ -104,14 +107,48 @@ Cut = tuple[np.ndarray, float, float]  # events of a window, its start and end i
 def cut_windows(
     chunks: Iterable[np.ndarray], lookup: SensorLookup, rule: WindowRule
 ) -> Iterator[Window]:
-    """Cut chunks of events (t x y p, in order of time) into windows.  Raises ValueError for time
-    running backwards, an event off the sensor, or less than one window."""
-    is_empty = True
-    for events, start_us, end_us in _cut(chunks, lookup, rule):
+    """Cut chunks of events (t x y p, in order of time) into windows; warns of an `end_s` after the
+    last event.  Raises ValueError for time running backwards, an event off the sensor, or less than
+    one window."""
+    span, is_empty = _TimeSpan(), True
+    for events, start_us, end_us in _cut(span.watch(chunks), lookup, rule):
         yield fill_window(events, lookup, rule, start_us, end_us)
         is_empty = False
     if is_empty:
-        raise ValueError(f"recording must be longer than one window of 1/{rule.fps} s, got less")
+        raise ValueError(_explain_no_window(rule, span.length_s))
+    if span.length_s + 1 / rule.fps < rule.end_s < math.inf:
+        wanted = f"end_s must be at most the length of the recording, {span.length_s:.3f} s"
+        warnings.warn(f"{wanted}, got {rule.end_s:g}; it is read to its end", stacklevel=1)
+
+
+class _TimeSpan:
+    """Notes the first and the last time of what `watch` passes on, in us."""
+
+    def __init__(self) -> None:
+        self.first_us: int | None = None
+        self.last_us = 0
+
+    def watch(self, chunks: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+        for chunk in filter(len, chunks):
+            self.first_us = int(chunk["t"][0]) if self.first_us is None else self.first_us
+            self.last_us = int(chunk["t"][-1])
+            yield chunk
+
+    @property
+    def length_s(self) -> float:
+        """From the first event to the last; 0 without events."""
+        return 0.0 if self.first_us is None else (self.last_us - self.first_us) * 1e-6
+
+
+def _explain_no_window(rule: WindowRule, length_s: float) -> str:
+    """Return why a recording of `length_s` has no window."""
+    if 0 < length_s <= rule.start_s:
+        wanted = f"below the length of the recording, {length_s:.3f} s"
+        return f"start_s must be {wanted}, got {rule.start_s:g}"
+    if length_s > 1 / rule.fps and (rule.start_s or rule.end_s < math.inf):
+        wanted = f"leave one window of 1/{rule.fps:g} s of the recording, {length_s:.3f} s long"
+        return f"start_s and end_s must {wanted}, got {rule.start_s:g} and {rule.end_s:g}"
+    return f"recording must be longer than one window of 1/{rule.fps} s, got less"
 
 
 def cut_windows_backward(

@@ -45,7 +45,7 @@ class EvrealRule:
     window: str = "frames"
     events_per_window: int = 10_000
     window_s: float = 0.04
-    part_s: float | None = None
+    max_grid_s: float | None = None
     grid_edges: str = "events"
     output_normalisation: str = "none"
     histogram: str = "none"
@@ -56,7 +56,7 @@ class EvrealRule:
         for name, known in CHOICES.items():
             if (value := getattr(self, name)) not in known:
                 raise ValueError(f"data.{name} must be one of {', '.join(known)}, got {value}")
-        for name in ("events_per_window", "window_s", "part_s"):
+        for name in ("events_per_window", "window_s", "max_grid_s"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
                 raise ValueError(f"data.{name} must be > 0, got {value}")
@@ -66,22 +66,22 @@ class EvrealRule:
 
 
 class EvrealWindow(NamedTuple):
-    """Events first .. last - 1 of a sequence, between `start_s` and `end_s`; the frame of the
-    camera that is nearest to `time_s`, at which the network's frame counts."""
+    """Events first_event .. stop_event - 1 of a sequence, between `start_s` and `end_s`; the frame
+    of the camera that is nearest to `time_s`, at which the network's frame counts."""
 
-    first: int
-    last: int
+    first_event: int
+    stop_event: int
     start_s: float
     end_s: float
     time_s: float
-    frame: int
+    camera_frame: int
 
 
 class ScoredFrame(NamedTuple):
-    """A reconstruction (h, w) in [0, 1] and its scores; `window`: its number in the sequence."""
+    """A reconstruction (h, w) in [0, 1] and its scores; `window_index`: in the sequence."""
 
-    window: int
-    given: EvrealWindow
+    window_index: int
+    evreal_window: EvrealWindow
     picture: Picture
     scores: dict[str, float]
 
@@ -160,10 +160,10 @@ def score_sequence(
         if window.time_s > end_s:
             break
         frame, state = _reconstruct(sequence, window, network, state, rule, bins, device)
-        distance_ms = 1e3 * abs(float(sequence.frame_t[window.frame]) - window.time_s)
+        distance_ms = 1e3 * abs(float(sequence.frame_t[window.camera_frame]) - window.time_s)
         if window.time_s >= start_s and distance_ms <= rule.tolerance_ms:
             picture = normalise_output(frame, rule.output_normalisation).clip(0, 1)
-            truth = sequence.images[window.frame][..., 0].astype(np.float32) / 255
+            truth = sequence.images[window.camera_frame][..., 0].astype(np.float32) / 255
             scores = score_frame(picture, truth, rule.histogram, lpips, device)
             yield ScoredFrame(number, window, picture, scores)
 
@@ -174,10 +174,11 @@ def _reconstruct(
 ) -> tuple[Picture, Any]:  # fmt: skip
     """Return the frame at the end of a window, which is given in parts where they are wanted."""
     length = window.end_s - window.start_s
-    parts = math.ceil(length / rule.part_s - 1e-6) if rule.part_s and length > 0 else 1
+    parts = math.ceil(length / rule.max_grid_s - 1e-6) if rule.max_grid_s and length > 0 else 1
     edges = np.linspace(window.start_s, window.end_s, parts + 1)
-    inside = window.first + np.searchsorted(sequence.t[window.first : window.last], edges[1:-1])
-    cuts = [window.first, *inside.tolist(), window.last]
+    first, stop = window.first_event, window.stop_event
+    inside = first + np.searchsorted(sequence.t[first:stop], edges[1:-1])
+    cuts = [first, *inside.tolist(), stop]
     window_s = length / parts if length > 0 else WINDOW_S
     for k in range(parts):
         span = (edges[k], edges[k + 1]) if rule.grid_edges == "window" else None
@@ -187,23 +188,24 @@ def _reconstruct(
 
 
 def fill_evreal_grid(
-    sequence: EvrealSequence, first: int, last: int, bins: int,
+    sequence: EvrealSequence, first_event: int, stop_event: int, bins: int,
     span: tuple[float, float] | None = None,
 ) -> Float[Tensor, "bins h w"]:  # fmt: skip
-    """Return the voxel grid of events first .. last - 1 between the first and the last of them, or
-    between the two times of `span`, in seconds.  Raises ValueError for an event off the sensor."""
+    """Return the voxel grid of events first_event .. stop_event - 1 between the first and last of
+    them, or between the two times of `span`, in seconds.  Raises ValueError for an event off the
+    sensor."""
     height, width = sequence.size
-    t = np.array(sequence.t[first:last], np.float64)
+    t = np.array(sequence.t[first_event:stop_event], np.float64)
     if not len(t):
         return torch.zeros(bins, height, width)
     start, end = (t[0], t[-1]) if span is None else span
     t = np.clip(t - start, 0, max(end - start, 0))
     if end - start < SHORTEST_S:
         t, start, end = np.linspace(0, 1, len(t)), 0.0, 1.0
-    x, y = np.array(sequence.xy[first:last]).T
-    sign = np.where(np.array(sequence.p[first:last]) > 0, 1, -1).astype(np.int8)
+    x, y = np.array(sequence.xy[first_event:stop_event]).T
+    sign = np.where(np.array(sequence.p[first_event:stop_event]) > 0, 1, -1).astype(np.int8)
     try:
         sides = {"height": height, "width": width}
         return voxel_grid(t, x, y, sign, t0=0.0, t1=float(end - start), bins=bins, **sides)
     except ValueError as error:
-        raise ValueError(f"{sequence.path}: from event {first} on, {error}") from None
+        raise ValueError(f"{sequence.path}: from event {first_event} on, {error}") from None

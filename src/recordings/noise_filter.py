@@ -6,7 +6,7 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Bool
 
-from src.recordings.engines.event_passes import LONG_AGO_US, find_supported
+from src.recordings.engines.event_passes import LONG_AGO_US, mark_supported_events
 from src.recordings.views import Size
 
 SUPPORT_S = 0.005  # of `find_supported_pixels`
@@ -33,7 +33,9 @@ class NoiseFilter:
     def __call__(self, events: np.ndarray) -> np.ndarray:
         """Return those of `events` (t x y p), in order of time, that are kept."""
         kept = np.empty(len(events), bool)
-        find_supported(events["t"], events["x"], events["y"], self.latest_us, self.support_us, kept)
+        mark_supported_events(
+            events["t"], events["x"], events["y"], self.latest_us, self.support_us, kept
+        )
         return events[kept]
 
 

@@ -60,8 +60,8 @@ def open_video_writer(
             # HDF5's library crashes when it cannot write.
             if shutil.disk_usage(folder).free < LEAST_FREE_BYTES:
                 raise OSError(errno.ENOSPC, f"No space left for another frame in {folder}")
-            add(round_codes(frame.picture), frame)
-            table.writerow([frames, f"{frame.time_s:.6f}", frame.events, frame.outside])
+            add(round_to_uint8(frame.picture), frame)
+            table.writerow([frames, f"{frame.time_s:.6f}", frame.events, frame.events_outside])
             frames += 1
 
         yield write
@@ -96,7 +96,7 @@ def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> i
             for frame in chain([first], given):
                 if frame.shape != first.shape:
                     raise ValueError(f"frames must be of one size {first.shape}, got {frame.shape}")
-                add(round_codes(frame), None)
+                add(round_to_uint8(frame), None)
                 count += 1
         _check_mp4(partial, count)
         os.replace(partial, path)
@@ -105,7 +105,7 @@ def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> i
     return count
 
 
-def round_codes(picture: np.ndarray) -> UInt8[np.ndarray, "*shape"]:
+def round_to_uint8(picture: np.ndarray) -> UInt8[np.ndarray, "*shape"]:
     """Return code values, floats in [0, 1] or uint8, as uint8."""
     if picture.dtype == np.uint8:
         return picture

@@ -25,12 +25,12 @@ RunnableNetwork = EventToVideoNetwork | EventListRuntime
 @dataclass(frozen=True)
 class Frame:
     """A picture (h, w), or (h, w, 3) of a film, float32 in [0, 1] at `time_s`, the end of its
-    window; its window's number of `events` in views and `outside` of all."""
+    window; its window's number of `events` in views and `events_outside` of all."""
 
     time_s: float
     picture: Float[np.ndarray, "h w *rgb"]
     events: int
-    outside: int
+    events_outside: int
 
 
 class ReconstructionState:
@@ -48,7 +48,7 @@ class ReconstructionState:
         self.frames = 0
 
 
-def as_event_network(method: nn.Module) -> EventToVideoNetwork:
+def require_event_network(method: nn.Module) -> EventToVideoNetwork:
     """Return `method`; raises ValueError unless it is a network that events can be fed to."""
     if not isinstance(method, EventToVideoNetwork):
         name = type(method).__name__
@@ -65,7 +65,7 @@ def takes_all_views(network: EventToVideoNetwork, views: int) -> bool:
     if wants not in (None, 1, views):
         has = f"the recording has {views}; give views=views.yaml"
         raise ValueError(f"ckpt wants {wants} views, {has}")
-    return wants != 1 or views == 1
+    return views == 1 or (wants != 1 and not network.uses_centre_view_only)
 
 
 def default_window_length(network: EventToVideoNetwork) -> str:
@@ -134,7 +134,7 @@ def reconstruct_frames(
                 size = _voxels(window).shape[-2:]
             state.picture = np.full(size, 0.5, np.float32)
         state.frames += 1
-        yield Frame(window.end_us * 1e-6, state.picture, window.events, window.outside)
+        yield Frame(window.end_us * 1e-6, state.picture, window.events, window.events_outside)
 
 
 def _run(

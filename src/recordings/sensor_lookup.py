@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from functools import cached_property
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -96,18 +95,18 @@ def build_lookup(views: Views) -> SensorLookup:
     """Return the lookup of `views`; where two overlap, the one whose centre is nearer wins."""
     height, width = views.sensor
     y, x = np.mgrid[:height, :width].astype(np.float64)
-    sensor = np.stack([x, y], axis=-1)
+    sensor = np.stack([x.ravel(), y.ravel()], axis=1)
     best = np.full((height, width), np.inf)
     owner = np.full((height, width), -1, np.int16)
     model_xy = np.zeros((height, width, 2), np.float32)
     middle = (np.array(views.model[::-1]) - 1) / 2
     half = np.array(views.model[::-1]) / 2
     for index, view in enumerate(views.views):
-        matrix = views.to_model(view)
-        uv = cv2.perspectiveTransform(sensor, matrix)
+        uv = views.to_model(view, sensor).reshape(height, width, 2)
         # Beyond the homography's horizon the plane comes again.
-        depth = sensor @ matrix[2, :2] + matrix[2, 2]
-        front = depth * (views.outline(view).mean(0) @ matrix[2, :2] + matrix[2, 2]) > 0
+        a, b, c = view.homography[2]
+        depth = a * x + b * y + c
+        front = depth * (views.outline(view).mean(0) @ (a, b) + c) > 0
         distance = np.abs((uv - middle) / half).max(-1)
         mine = front & (distance <= 1) & (distance < best)
         best[mine], owner[mine], model_xy[mine] = distance[mine], index, uv[mine]

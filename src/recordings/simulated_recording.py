@@ -1,5 +1,6 @@
 """A simulated recording: nine mirrored, misaligned, vignetted views on one event sensor."""
 
+import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -136,13 +137,16 @@ def write_recording(
 ) -> np.ndarray:  # fmt: skip
     """Record `frames` as `record_events`, write the events as an event file and return them.
 
-    Beside `cap.raw` comes `cap.views.yaml`, the true geometry.  Raises ValueError for a clip
-    without events.
+    Beside `cap.raw` comes `cap.views.yaml`, the true geometry.  A clip without events gives a file
+    without events, and a warning.
     """
     path = Path(path)
     events = record_events(frames, fps, views, sensor, progress)
     if not len(events):
-        raise ValueError(f"write: the clip gives no events, nothing is written to {path}")
+        more = "sensor.threshold= (lower), seconds= (longer) or turbulence= (stronger)"
+        warnings.warn(
+            f"the clip gives no events, {path} holds none; {more} gives some", stacklevel=2
+        )
     height, width = views.sensor
     write_events(path, events, width=width, height=height)
     views.save(path.with_suffix(".views.yaml"))

@@ -65,7 +65,7 @@ class ToneCurve:
 
 def curve_for_output(tone: str, tone_time_constant_s: float, output_format: str) -> ToneCurve:
     """Return the curve of a video; raises ValueError for tone=auto where frames are data."""
-    if tone == "auto" and output_format not in ("mp4", "gif"):
+    if tone == "auto" and output_format not in ("mp4", "gif", "film"):
         raise ValueError(f"tone must be none for output_format={output_format}, got {tone}")
     return ToneCurve(tone, tone_time_constant_s)
 

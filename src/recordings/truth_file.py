@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from src.recordings.output import round_codes
+from src.recordings.output import round_to_uint8
 from src.recordings.views import Views
 from src.records.atomic import atomic_path
 
@@ -47,14 +47,14 @@ class TruthWriter:
     ) -> None:  # fmt: skip
         """Write the next frames: code values in [0, 1] and pixels."""
         at = slice(self.written, self.written + len(clean))
-        self.file["clean"][at] = round_codes(clean.numpy())
-        self.file["views"][:, at] = round_codes(views.numpy())
-        self.file["tilt"][:, at] = round_tilt(tilt)
+        self.file["clean"][at] = round_to_uint8(clean.numpy())
+        self.file["views"][:, at] = round_to_uint8(views.numpy())
+        self.file["tilt"][:, at] = round_tilt_to_float16(tilt)
         self.written = at.stop
 
 
 @contextmanager
-def open_truth(
+def create_truth_file(
     recording: Path, views: Views, frames: int, fps: float, facts: Mapping[str, Any]
 ) -> Iterator[TruthWriter]:
     """Open the truth beside `recording`, a clip of `frames` frames at `fps`; `facts`: attributes.
@@ -69,7 +69,7 @@ def open_truth(
         yield TruthWriter(file, len(views.positions), frames, views.model)
 
 
-def round_tilt(tilt: Float[Tensor, "*shape"]) -> np.ndarray:
+def round_tilt_to_float16(tilt: Float[Tensor, "*shape"]) -> np.ndarray:
     """Return pixels as float16, rounded to 1/32, so that they pack well."""
     return ((tilt * TILT_STEPS_PER_PX).round() / TILT_STEPS_PER_PX).half().numpy()
 
@@ -81,15 +81,17 @@ class CleanClip:
     frames: UInt8[np.ndarray, "frames h w"]
     times_s: Float[np.ndarray, " frames"]
 
-    def frame_at(self, time_s: float, size: tuple[int, ...]) -> Float[np.ndarray, "h w"]:
+    def nearest_frame(self, time_s: float, size: tuple[int, ...]) -> Float[np.ndarray, "h w"]:
         """Return the frame nearest to `time_s`, in [0, 1], brought to `size` (h, w)."""
         frame = self.frames[int(np.abs(self.times_s - time_s).argmin())].astype(np.float32) / 255
         if frame.shape == size[:2]:
             return frame
-        return cv2.resize(frame, (size[1], size[0]), interpolation=cv2.INTER_AREA)
+        shrinks = size[0] <= frame.shape[0]
+        how = cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC  # areas enlarge to blocks
+        return cv2.resize(frame, (size[1], size[0]), interpolation=how).clip(0, 1)
 
 
-def read_clean(recording: Path) -> CleanClip | None:
+def read_clean_clip(recording: Path) -> CleanClip | None:
     """Return the clean clip beside a simulated recording; None where there is no such file."""
     path = recording.with_suffix(".truth.h5")
     if not path.is_file():

@@ -7,7 +7,7 @@ top left pixel; x runs right, y down.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -15,6 +15,7 @@ import numpy as np
 import yaml
 from jaxtyping import Float
 
+from src.recordings.corner_fold import CornerFold, Points
 from src.recordings.files.sources import Size
 from src.records import safe_yaml
 from src.records.atomic import write_text
@@ -29,12 +30,23 @@ class View:
     """One sub-aperture: grid position (row, col) relative to the centre view and its homography,
     from sensor pixels (x, y, 1) to those of the centre view (determinant < 0: mirrored).
     `error_px`: rms residual of the `points` it was fitted to, in pixels of the centre view.
-    """
+    `fold`: of a corner view, the halves that mirrors which are not at a right angle turn."""
 
     position: tuple[int, int]
     homography: Float[np.ndarray, "3 3"]
     error_px: float = 0.0
     points: int = 0
+    fold: CornerFold | None = None
+
+    def to_centre(self, points: Points) -> Points:
+        """Return the places in the centre view of sensor pixels of this one."""
+        placed = _transform(self.homography, points)
+        return self.fold.turn(placed) if self.fold else placed
+
+    def to_sensor(self, points: Points) -> Points:
+        """Return the inverse of `to_centre`."""
+        placed = self.fold.turn_back(points) if self.fold else points
+        return _transform(np.linalg.inv(self.homography), placed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +55,7 @@ class Views:
     view, in sensor pixels, that becomes the model picture.
 
     Raises ValueError where a size is out of range, a number is not finite, a position comes twice
-    or less than three quarters of a view lies on the sensor.
-    """
+    or less than three quarters of a view lies on the sensor."""
 
     sensor: Size
     model: Size
@@ -93,12 +104,14 @@ class Views:
     def positions(self) -> list[tuple[int, int]]:
         return [view.position for view in self.views]
 
-    def to_model(self, view: View) -> Float[np.ndarray, "3 3"]:
-        """Return the homography from sensor pixels of `view` to pixels of the model picture."""
+    def to_model(self, view: View, points: Points) -> Points:
+        """Return the places in the model picture of sensor pixels of `view`."""
         left, top, right, bottom = self.field
         a, b = self.model[1] / (right - left), self.model[0] / (bottom - top)
         scale = np.array([[a, 0, -left * a - 0.5], [0, b, -top * b - 0.5], [0, 0, 1]])
-        return scale @ view.homography
+        if view.fold:
+            return _transform(scale, view.to_centre(points))
+        return _transform(scale @ view.homography, points)
 
     def outline(self, view: View) -> Float[np.ndarray, "4 2"]:
         """Return the corners of `view` on the sensor: the field's, clockwise from top left."""
@@ -121,14 +134,15 @@ class Views:
         self, picture: Float[np.ndarray, "sensor_h sensor_w"]
     ) -> Float[np.ndarray, "views h w"]:
         """Return every view of one sensor picture in model pixels (bilinear, float32)."""
-        flat, size = picture.astype(np.float32), self.model[::-1]
-        return np.stack([cv2.warpPerspective(flat, self.to_model(v), size) for v in self.views])
+        (height, width), (left, top, right, bottom) = self.model, self.field
+        x = left + (np.arange(width) + 0.5) * (right - left) / width
+        y = top + (np.arange(height) + 0.5) * (bottom - top) / height
+        flat, places = picture.astype(np.float32), list_pairs(x, y)
+        return np.stack([sample(flat, v.to_sensor(places), self.model) for v in self.views])
 
-    def _field_on_sensor(self, view: View, side: int) -> np.ndarray:
-        left, top, right, bottom = self.field
-        x, y = np.meshgrid(np.linspace(left, right, side), np.linspace(top, bottom, side))
-        points = np.stack([x.ravel(), y.ravel()], axis=1)
-        return cv2.perspectiveTransform(points[None], np.linalg.inv(view.homography))[0]
+    def _field_on_sensor(self, view: View, side: int) -> Points:
+        x, y = np.linspace(self.field[:2], self.field[2:], side).T
+        return view.to_sensor(list_pairs(x, y))
 
     def save(self, path: Path | str) -> None:
         """Write a YAML file that `load_views` reads back exactly."""
@@ -140,6 +154,7 @@ class Views:
                 "points": view.points,
                 "homography": view.homography.tolist(),
             }
+            | ({"fold": asdict(view.fold)} if view.fold else {})
             for view in self.views
         ]
         content = {
@@ -158,6 +173,7 @@ HEADER = """\
 # position: [row, col] relative to the centre view; mirrored: [in x, in y];
 # homography: sensor pixels of this view -> sensor pixels of the centre view;
 # error_px: rms residual over the calibration's points, sensor pixels of the centre view.
+# fold: then turned about corner by angle_rad / 2, away from the line through towards, either side.
 """
 
 
@@ -166,8 +182,7 @@ def views_or_whole_sensor(
 ) -> Views:
     """Return the views of the file `path` or, without one, the whole sensor as one view.
 
-    `resolution`: (height, width) of the model picture instead of that of the file or the sensor.
-    """
+    `resolution`: (height, width) of the model picture instead of that of the file or the sensor."""
     views = load_views(path, sensor) if path else Views.single_view(sensor, sensor)
     return replace(views, model=(resolution[0], resolution[1])) if resolution else views
 
@@ -176,8 +191,7 @@ def load_views(path: Path | str, sensor: Size | None = None) -> Views:
     """Read a file of `Views.save` or one by hand (`mirrored`, `error_px`, `points` are optional).
 
     Raises ValueError for what is no such file, a value out of range, a `mirrored` its homography
-    contradicts, or another sensor than `sensor` (height, width).
-    """
+    contradicts, or another sensor than `sensor` (height, width)."""
     try:
         content = safe_yaml.read(path)
         views = Views(
@@ -205,7 +219,13 @@ def _parse_view(entry: dict) -> View:
     matrix = np.array([_parse_numbers(row, float, 3) for row in rows])
     (error,) = _parse_numbers([entry.get("error_px", 0.0)], float, 1)
     (points,) = _parse_numbers([entry.get("points", 0)], int, 1)
-    return View(_parse_numbers(entry["position"], int, 2), matrix, error, points)
+    fold = _parse_fold(entry["fold"]) if "fold" in entry else None
+    return View(_parse_numbers(entry["position"], int, 2), matrix, error, points, fold)
+
+
+def _parse_fold(entry: dict) -> CornerFold:
+    ends = [_parse_numbers(entry[end], float, 2) for end in ("corner", "towards")]
+    return CornerFold(ends[0], ends[1], *_parse_numbers([entry["angle_rad"]], float, 1))
 
 
 def _parse_numbers(values: list, kind: type, count: int) -> tuple:
@@ -213,3 +233,18 @@ def _parse_numbers(values: list, kind: type, count: int) -> tuple:
     if not numbers or any(type(value) not in (int, kind) for value in values):
         raise TypeError(f"expected a list of {count} x {kind.__name__}")
     return tuple(kind(value) for value in values)
+
+
+def sample(picture: Float[np.ndarray, "h w"], places: Points, size: Size) -> np.ndarray:
+    """Return `picture` at `places`, bilinear, 0 outside, as a picture of `size` (height, width)."""
+    x, y = places.T.astype(np.float32)
+    return cv2.remap(picture, x.reshape(size), y.reshape(size), cv2.INTER_LINEAR)
+
+
+def list_pairs(x: np.ndarray, y: np.ndarray) -> Points:
+    """Return the (x, y) of a grid, row by row, of its columns' x and its rows' y."""
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).astype(np.float64)
+
+
+def _transform(matrix: Float[np.ndarray, "3 3"], points: Points) -> Points:
+    return cv2.perspectiveTransform(points[None], matrix)[0]

@@ -4,6 +4,7 @@ import csv
 import hashlib
 import io
 import json
+import re
 import shutil
 import statistics
 import subprocess
@@ -12,10 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import rich
+from rich import box
 from rich.console import RenderableType
 from rich.table import Table
 
-from src.metrics.bootstrap import bootstrap_interval
+from src.metrics.bootstrap import bootstrap_difference_interval, bootstrap_interval
 from src.metrics.table import METRICS, NAMES, Column
 from src.records import safe_yaml
 from src.records.atomic import write_text
@@ -98,10 +100,11 @@ def summarize_scores(clips: list[dict], own_metrics: Iterable[Column] = ()) -> d
 
 
 def write_and_print_results(
-    run: Path, config: str, rows: list[ScoreRow], table: RenderableType | None = None, **facts
-) -> dict:
+    run: Path, config: str, rows: list[ScoreRow], table: RenderableType | None = None,
+    note: str = "", **facts,
+) -> dict:  # fmt: skip
     """Write `results.json` and `clips.csv` of the first row into `run` and print all rows, or
-    `table` for them.
+    `table` for them, with the line `note` below.
 
     `facts`: further entries of `results.json` (task, experiment, seed, wall_s, device ...), whose
     content is returned.
@@ -125,6 +128,8 @@ def write_and_print_results(
     write_text(run / "clips.csv", format_csv(columns, values))
     write_text(run / "results.json", json.dumps(record, indent=2) + "\n")
     rich.print(table or build_rich_score_table(rows))
+    if note:
+        print(note)
     found = [*run.glob("*.*"), *run.glob("*/*.*")]  # not the thousands of saved frames below
     files = sorted(str(file.relative_to(run)) for file in found if file.is_file())
     rich.print(f"in {run}: " + ", ".join(file for file in files if not file.startswith(".")))
@@ -140,17 +145,38 @@ def format_csv(heads: Iterable, rows: Iterable[Iterable]) -> str:
 
 def build_rich_score_table(rows: list[ScoreRow]) -> Table:
     """Return mean scores over clips, one line per network; arrows point to better values."""
-    picture = Table(title=f"{len(rows[0].clips)} test clips, mean of per-frame values")
+    title = f"{len(rows[0].clips)} test clips, mean of per-frame values"
+    picture = Table(title=title, box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
     picture.add_column("network", overflow="fold")
     metrics = (*METRICS, *rows[0].own_metrics)
     for metric in metrics:
-        picture.add_column(metric.title, justify="right", overflow="fold")
+        heading = re.sub(r" (?![↑↓])", "\n", metric.title)  # narrow: names take the rest
+        picture.add_column(heading, justify="right", overflow="fold")
     picture.add_column("ms/frame", justify="right", overflow="fold")
     for row in rows:
         means = summarize_scores(row.clips, row.own_metrics)
         cells = [m.format_value(means.get(m.name, {}).get("mean")) for m in metrics]
         picture.add_row(row.name, *cells, f"{next(iter(row.latency_ms.values())):.1f}")
     return picture
+
+
+def describe_difference(ours: ScoreRow, theirs: ScoreRow) -> str:
+    """Return a line of the first metric that both have: its difference over the same clips with the
+    95 % bootstrap CI; "" for fewer than two clips."""
+    metric = next(
+        (m for m in METRICS if m.name in ours.clips[0] and m.name in theirs.clips[0]), None
+    )
+    if metric is None or len(ours.clips) < 2:
+        return ""
+    sides = [[float(clip[metric.name]) for clip in row.clips] for row in (ours, theirs)]
+    change = statistics.fmean(sides[0]) - statistics.fmean(sides[1])
+    low, high = bootstrap_difference_interval(sides[:1], sides[1:])
+    digits = metric.digits + 1
+    said = ": it holds 0, so no difference is shown" if low <= 0 <= high else ""
+    return (
+        f"{metric.heading}, {ours.name} less {theirs.name}: {change:+.{digits}f}, "
+        f"95 % CI {low:+.{digits}f} to {high:+.{digits}f}{said}"
+    )
 
 
 def git_commit() -> str:

@@ -44,7 +44,7 @@ class Run:
         return self.record.get("asked", {}).get("overrides", [])
 
     @property
-    def settings_without_seed(self) -> dict[str, Any]:
+    def result_settings_without_seed(self) -> dict[str, Any]:
         """The settings that numbers depend on but the seed, as {dotted key: value}."""
         # Where nothing is trained the seed is that of the test clips.
         same = (*MACHINE, *(["data.test_seed"] if self.record["task"] != "train" else []))
@@ -98,14 +98,16 @@ def find_figures(folders: list[Path]) -> list[Path]:
     return list(pictures.values())
 
 
-def flatten(node: Any, prefix: str = "") -> dict[str, Any]:
+def flatten_settings(node: Any, prefix: str = "") -> dict[str, Any]:
     """Return {dotted key: value} of nested dicts; lists are values."""
     if not isinstance(node, dict) or not node:
         return {prefix: node}
     return {
         key: value
         for name, child in node.items()
-        for key, value in flatten(child, f"{prefix}.{name}" if prefix else str(name)).items()
+        for key, value in flatten_settings(
+            child, f"{prefix}.{name}" if prefix else str(name)
+        ).items()
     }
 
 
@@ -113,7 +115,7 @@ def _read(file: Path) -> Run:
     try:
         record = json.loads(file.read_text())
         schema, config = record["schema"], (file.parent / "config.yaml").read_text()
-        settings = flatten(results.settings_affecting_results(config))
+        settings = flatten_settings(results.settings_affecting_results(config))
     except (OSError, ValueError, KeyError, TypeError, RecursionError, yaml.YAMLError) as error:
         raise ValueError(f"run must hold whole results, got {file}: {error}") from error
     if schema != results.SCHEMA:

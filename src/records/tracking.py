@@ -7,13 +7,13 @@ from pathlib import Path
 from lightning.pytorch.loggers import Logger, WandbLogger
 
 
-def log_config(loggers: Iterable[Logger], config: dict) -> None:
+def log_config_to_wandb(loggers: Iterable[Logger], config: dict) -> None:
     """Store `config` with the run of W&B, where it is among `loggers`."""
     for logger in _wandb(loggers):
         logger.log_hyperparams(config)
 
 
-def log_results(loggers: Iterable[Logger], record: dict, pictures: Iterable[Path]) -> None:
+def log_results_to_wandb(loggers: Iterable[Logger], record: dict, pictures: Iterable[Path]) -> None:
     """Store the mean scores of `record`, the content of results.json, and sample pictures."""
     means = {name: value["mean"] for name, value in record["test"].items() if name != "clips"}
     for logger in _wandb(loggers):

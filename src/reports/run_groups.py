@@ -14,7 +14,7 @@ LAST_KEYS = ("budget", "debug")
 TEST_CONDITIONS = (
     "scene.", "turbulence.", "sensor.", "fps", "metrics.resolution_scale", "metrics.lpips.",
     "data.test_", "data.unscored_windows", "data.substeps", "data.benchmark", "data.window",
-    "data.events_per_window", "data.part_s", "data.tolerance_ms", "data.start_s", "data.end_s",
+    "data.events_per_window", "data.max_grid_s", "data.tolerance_ms", "data.start_s", "data.end_s",
     "data.warm_up_s", "data.histogram",
 )  # fmt: skip
 NO_CONDITIONS = (  # the first is told by the run, the others are of training
@@ -113,7 +113,7 @@ def _label_values(run: Run, overridden: Sequence[str], across: Sequence[str]) ->
     """Return the choices, the settings of the `overridden` keys, and all other settings."""
     first = {k: v for k, v in run.choices.items() if k not in LAST_KEYS}
     settings = {
-        k: format_setting(v) for k, v in run.settings_without_seed.items() if k not in across
+        k: format_setting(v) for k, v in run.result_settings_without_seed.items() if k not in across
     }
     for key in (key for key in overridden if key not in (*run.choices, *across)):
         inside = [v for k, v in settings.items() if k == key or k.startswith(key + ".")]

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from src.metrics.bootstrap import bootstrap_difference_interval
-from src.metrics.table import METRICS, Column, own_column
+from src.metrics.table import METRICS, Column, make_user_metric_column
 from src.records.runs import Run
 from src.reports.run_groups import RunGroup, find_published
 
-SEVERITIES = ("none", "weak", "medium", "strong")
+SEVERITIES = ("none", "weak", "medium", "strong", "extreme")
 SPLIT_METRICS = ("lpips", "psnr_aligned", "temporal_jitter_px")  # of the table by severity
 
 
@@ -63,7 +63,7 @@ def list_metrics(runs: Iterable[Run]) -> tuple[Column, ...]:
     added = {
         name: better for run in runs for name, better in run.record.get("own_metrics", {}).items()
     }
-    return (*METRICS, *(own_column(name, better) for name, better in added.items()))
+    return (*METRICS, *(make_user_metric_column(name, better) for name, better in added.items()))
 
 
 COSTS: tuple[tuple[Column, Callable[[Run], float]], ...] = (

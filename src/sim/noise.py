@@ -31,7 +31,7 @@ def generator(key: int) -> torch.Generator:
     return torch.Generator().manual_seed(key)
 
 
-def base_key(generator: torch.Generator) -> int:
+def draw_base_key(generator: torch.Generator) -> int:
     """Draw one 62-bit number from `generator`, to derive the keys of views and stages from."""
     return int(torch.randint(2**62, (), generator=generator))
 

@@ -15,7 +15,7 @@ from src.sim import noise
 from src.sim.optics import Position, layout
 from src.sim.pipeline import Sample, allocate_float32, concatenate_samples
 from src.training.clip_transforms import ClipTransform, transform_batch, transform_clips
-from src.training.voxel_noise import add_noisy_pixels, draw_normals, draw_pixel_offsets
+from src.training.voxel_noise import add_firing_pixels, draw_normals, draw_pixel_offsets
 
 NOISY_PIXEL_RATE_HZ = (10.0, 2000.0)  # each pixel has one of its own, log-uniform
 
@@ -103,7 +103,7 @@ class Augment:
         if self.max_firing_pixel_fraction:
             counts = [[rate * window for rate in NOISY_PIXEL_RATE_HZ] for window in window_s]
             noise_keys = [noise.key(key, "firing") for key in keys]
-            add_noisy_pixels(voxels, self.max_firing_pixel_fraction, counts, noise_keys)
+            add_firing_pixels(voxels, self.max_firing_pixel_fraction, counts, noise_keys)
 
 
 def draw_pauses(
@@ -152,10 +152,10 @@ def draw_view_shifts(
     return [(view, up, left) for view, draw, up, left in triples if draw < probability]
 
 
-def draw_kept_views(views: int, probability: float, key: int) -> list[int]:
-    """Return which views a batch has: with `probability` some are lost; how many is uniform."""
+def draw_kept_views(views: int, dropout_probability: float, key: int) -> list[int]:
+    """Return which views a batch has: with `dropout_probability` it loses some."""
     chance, share, *order = noise.uniforms(key, 2 + views)
-    if chance >= probability or views == 1:
+    if chance >= dropout_probability or views == 1:
         return list(range(views))
     count = 1 + int(share * (views - 1))
     return sorted(sorted(range(views), key=order.__getitem__)[:count])

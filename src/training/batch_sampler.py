@@ -10,16 +10,16 @@ from src.sim.pipeline import ClipParameters, Pipeline
 
 
 class SampleId(NamedTuple):
-    """Sample `number` of a stream, of clip `clip`; `stream` 0: the usual crops, 1: `data.large`."""
+    """Sample `number` of a stream, of clip `clip`.  `crop_stream` 0: usual, 1: `data.large`."""
 
     clip: int
     number: int
-    stream: int = 0
+    crop_stream: int = 0
 
     @property
     def augmentation_key(self) -> tuple[int, ...]:
         """What its augmentation is drawn from: the same number in another stream is another."""
-        return (self.number,) if self.stream == 0 else (self.stream, self.number)
+        return (self.number,) if self.crop_stream == 0 else (self.crop_stream, self.number)
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class DrawDataset(Dataset):
         self.streams = streams
 
     def __getitem__(self, sample: SampleId) -> tuple[SampleId, ClipParameters]:
-        return sample, self.streams[sample.stream].draw(sample.clip)
+        return sample, self.streams[sample.crop_stream].draw(sample.clip)
 
 
 @dataclass(eq=False, kw_only=True)
@@ -60,7 +60,7 @@ class StepSampler(Sampler[list[SampleId]]):
 
     batch_size: int
     steps_per_epoch: int
-    step: Callable[[], int]
+    current_step: Callable[[], int]
     batch_reuse: int = 1
     rank: int = 0
     world: int = 1
@@ -71,7 +71,7 @@ class StepSampler(Sampler[list[SampleId]]):
         return self.steps_per_epoch
 
     def __iter__(self) -> Iterator[list[SampleId]]:
-        first = self.step()
+        first = self.current_step()
         for step in range(first, (first // self.steps_per_epoch + 1) * self.steps_per_epoch):
             yield self.batch(step)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from src.models.checkpoints import save_whole
+from src.models.checkpoints import save_atomically
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -16,4 +16,4 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
     def save_checkpoint(self, checkpoint: dict, path: Any, storage_options: Any = None) -> None:
         """Write `checkpoint` to `path`; an OSError leaves what was there before."""
-        save_whole(checkpoint, Path(path))
+        save_atomically(checkpoint, Path(path))

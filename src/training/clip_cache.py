@@ -148,17 +148,17 @@ class CachedPipeline(Pipeline):
     Sample n is a function of (config, n), whatever the cache holds already: it is of one of the
     first FIRST_CLIPS + n / SAMPLES_PER_CLIP clips, the order in which a cache is filled; of fewer
     samples than SAMPLES_PER_CLIP for a clip, all clips see some.  Drawn by n as well: `windows`
-    neighbouring windows, forwards or backwards, the crop, the order of the views (where their
-    turbulence is `independent`), the sensor and its noise.  `clips`: how many different samples
-    there are (None: all are).  `crop` = [low, high]: the side in pixels, a multiple of CROP_STEP
-    above low, is the same for `batch_size` neighbouring numbers.  Raises ValueError for a range the
-    clips do not hold and for `clips` that are no whole batches.
+    neighbouring windows, forwards or backwards, the crop, the order of the views (with
+    `shuffle_views`, where their turbulence is independent), the sensor and its noise.  `clips`: how
+    many different samples there are (None: all are).  `crop` = [low, high]: the side in pixels, a
+    multiple of CROP_STEP above low, is the same for `batch_size` neighbouring numbers.  Raises
+    ValueError for a range the clips do not hold and for `clips` that are no whole batches.
     """
 
     def __init__(
         self, cache: ClipCache, optics: Optics, sensor: Sensor, *, windows: int, bins: int = 5,
         crop: int | float | Sequence[float] | None = None, batch_size: int = 1,
-        independent: bool = True, clips: int | None = None,
+        shuffle_views: bool = True, clips: int | None = None,
     ):  # fmt: skip
         source = cache.source
         super().__init__(
@@ -166,7 +166,7 @@ class CachedPipeline(Pipeline):
             bins=bins, substeps=source.substeps, crop=None if isinstance(crop, Sequence) else crop,
             random_crop=True, clips=clips, decodes_srgb=source.decodes_srgb,
         )  # fmt: skip
-        self.shuffles_views = independent
+        self.shuffles_views = shuffle_views
         self.cache, self.frames = cache, windows * source.substeps + 1
         self.sides, self.batch_size = self._crop_sides(crop), batch_size
         if self.sides and clips is not None and clips % batch_size:

@@ -70,6 +70,7 @@ class LightFieldData(LightningDataModule):
             self.filler.start()
 
     def teardown(self, stage: str) -> None:
+        """Stop filling the caches after a training (`fit`); nothing else is taken down."""
         if stage == "fit" and self.filler is not None:
             self.filler.stop()
 
@@ -79,7 +80,7 @@ class LightFieldData(LightningDataModule):
         sampler = StepSampler(
             batch_size=self.batch_size,
             steps_per_epoch=max(1, self.epoch_clips // (self.batch_size * trainer.world_size)),
-            step=lambda: cast(int, module.total_steps),
+            current_step=lambda: cast(int, module.total_steps),
             batch_reuse=self.batch_reuse,
             rank=trainer.global_rank,
             world=trainer.world_size,
@@ -159,9 +160,9 @@ class BatchSimulator:
 
     def __call__(self, numbered: Sequence[tuple[SampleId, ClipParameters]]) -> Sample:
         ids, draws = zip(*numbered, strict=True)
-        names = [(sample.stream, draw.key, draw.crop) for sample, draw in numbered]
+        names = [(sample.crop_stream, draw.key, draw.crop) for sample, draw in numbered]
         if self.last[0] != names:
-            self.last = (names, self._simulate(self.streams[ids[0].stream], draws, names))
+            self.last = (names, self._simulate(self.streams[ids[0].crop_stream], draws, names))
         samples = self.last[1]
         if self.augment is None:
             return concatenate_samples(samples)

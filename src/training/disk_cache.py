@@ -24,7 +24,7 @@ from typing import Any
 import torch
 
 import src.sim
-from src.models.checkpoints import is_intact, save_whole
+from src.models.checkpoints import is_intact, save_atomically
 from src.records.atomic import write_text
 from src.sim.pipeline import Pipeline
 from src.training.clip_cache import GIB, CachedClip, ClipCache, simulate_clip
@@ -68,7 +68,7 @@ class DiskClipCache(ClipCache):
         metadata = json.dumps(clip.metadata)
         content = {"views": clip.views.cpu(), "clean": clip.clean.cpu(), "metadata": metadata}
         try:
-            save_whole(content, self.path(index))
+            save_atomically(content, self.path(index))
         except (OSError, RuntimeError) as error:  # PyTorch's writer has an error of its own
             raise OSError(f"{self.folder}: clip {index} cannot be stored: {error}") from error
 
@@ -154,7 +154,7 @@ class BackgroundFiller:
             self.process = None
 
 
-def init_worker() -> None:
+def prepare_worker_process() -> None:
     """Let this process compute in one thread, leave Ctrl-C to its parent and end with it."""
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -170,7 +170,7 @@ def _exit_with_parent() -> None:
 
 def _fill_caches(caches: Sequence[DiskClipCache]) -> None:
     os.nice(19)
-    init_worker()
+    prepare_worker_process()
     for cache in caches:
         with (cache.folder / "filler.lock").open("ab") as file:
             fcntl.flock(file, fcntl.LOCK_EX)

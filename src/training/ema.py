@@ -36,7 +36,7 @@ class WeightEMA(WeightAveraging):
 
 
 @contextmanager
-def averaged_weights(module: LightningModule) -> Iterator[None]:
+def use_averaged_weights(module: LightningModule) -> Iterator[None]:
     """Give `module` the averaged weights within the context, where its trainer has a WeightEMA."""
     averages = _find_averages(module.trainer)
     for ema in averages:

@@ -30,7 +30,7 @@ def test_network(
     trainer.test(module, data, verbose=False)
     if trainer.received_sigterm:
         raise SIGTERMException
-    macs_of_frame, milliseconds = measure_cost(network, module.sample)
+    macs_of_frame, milliseconds = measure_macs_and_ms(network, module.sample)
     height, width = module.sample.target.shape[-2:]
     return ScoreRow(
         name,
@@ -38,12 +38,12 @@ def test_network(
         params=sum(parameter.numel() for parameter in network.parameters()),
         macs_per_frame=macs_of_frame,
         latency_ms={f"{height}x{width}": milliseconds},
-        own_metrics=metrics.own_columns,
+        own_metrics=metrics.user_metric_columns,
     )
 
 
 @torch.no_grad()
-def measure_cost(network: VideoMethod, sample: Sample) -> tuple[int, float]:
+def measure_macs_and_ms(network: VideoMethod, sample: Sample) -> tuple[int, float]:
     """Return multiply-accumulates and milliseconds of a frame, the first window of the first clip.
 
     A method that makes a whole video at once is given all of `sample`, and its cost shared out.
@@ -52,7 +52,7 @@ def measure_cost(network: VideoMethod, sample: Sample) -> tuple[int, float]:
     positions, threads = sample.positions, torch.get_num_threads()
     if isinstance(network, EventToVideoNetwork):
         device = next((parameter.device for parameter in network.parameters()), torch.device("cpu"))
-        return measure_frame_cost(network, sample.voxels[:1, 0].to(device), positions)
+        return measure_frame_macs_and_ms(network, sample.voxels[:1, 0].to(device), positions)
     now = select_timing_clock(threads, sample.voxels.device)
     frames, start = sample.target.shape[:2].numel(), now()
     network.reconstruct_clip(sample)
@@ -61,7 +61,7 @@ def measure_cost(network: VideoMethod, sample: Sample) -> tuple[int, float]:
 
 
 @torch.no_grad()
-def measure_frame_cost(
+def measure_frame_macs_and_ms(
     network: EventToVideoNetwork, window: Float[Tensor, "1 views bins h w"],
     positions: Sequence[Position] | None = None,
 ) -> tuple[int, float]:  # fmt: skip

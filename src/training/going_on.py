@@ -9,7 +9,7 @@ from torch import nn
 from torch.optim import Optimizer
 
 
-def follow_config(
+def apply_config_to_optimizer_state(
     checkpoint: dict,
     parameters: Callable[[], Iterable[nn.Parameter]],
     make_optimizer: Callable[..., Optimizer],
@@ -41,7 +41,7 @@ def follow_config(
     return kept
 
 
-def check_steps(max_steps: int, done: int) -> None:
+def check_max_steps(max_steps: int, done: int) -> None:
     """Raise ValueError where a training has taken more steps than it shall (-1: no limit)."""
     if 0 <= max_steps < done:
         raise ValueError(f"trainer.max_steps must be >= {done}, the steps of ckpt, got {max_steps}")

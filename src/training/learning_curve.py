@@ -12,7 +12,7 @@ from lightning import Callback, Trainer
 from src.models import files
 from src.records.atomic import write_text
 from src.records.results import format_csv
-from src.training.ema import averaged_weights
+from src.training.ema import use_averaged_weights
 from src.training.reconstructor import Reconstructor
 
 COLLAPSE_FACTOR = 1.5  # of the mean loss over the least of all rows so far
@@ -87,7 +87,7 @@ class LearningCurve(Callback):
                 text += f"; {self.export} holds the weights of {self.rows[-1]['hours']:.2f} hours"
             self.export = None  # so that these are kept
             raise ValueError(f"the training has collapsed: {text}")
-        self.rows.append(row | mean_scores(trainer, module))
+        self.rows.append(row | mean_validation_scores(trainer, module))
         self.loss, self.steps = 0.0, 0
         self._write()
         self.export_weights(module)
@@ -99,7 +99,7 @@ class LearningCurve(Callback):
             return
         reached = {"hours": module.clock.hours, "windows": module.windows_seen}
         card = reached | {"steps": module.total_steps, "loss": self.loss, "curve": self.rows}
-        with averaged_weights(module):
+        with use_averaged_weights(module):
             # A copy: spectral norm is folded in eval mode, and the training continues in its own.
             files.save(self.export, deepcopy(module.network), module.network_spec, card)
 
@@ -110,10 +110,10 @@ class LearningCurve(Callback):
 
 
 @torch.no_grad()
-def mean_scores(trainer: Trainer, module: Reconstructor) -> dict[str, float]:
+def mean_validation_scores(trainer: Trainer, module: Reconstructor) -> dict[str, float]:
     """Return the mean of every score over the validation clips, of the averaged weights."""
     module.eval()
-    with averaged_weights(module):
+    with use_averaged_weights(module):
         samples = trainer.datamodule.validation_samples()  # type: ignore[attr-defined]
         clips = [scores for sample in samples for scores in module.score_clips_into_metrics(sample)]
     module.metrics.reset()

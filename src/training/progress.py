@@ -90,8 +90,9 @@ class TrainingProgress(ProgressBar):
         if self.bar is None:
             return
         self.bar.update(self.task, completed=done, said=said)
-        now = time.monotonic()
-        if not self.bar.console.is_terminal and now - self.line_s > LINE_EVERY_S:
+        now, total = time.monotonic(), self.bar.tasks[0].total
+        is_last = total is not None and done >= total  # `_close` prints it
+        if not (self.bar.console.is_terminal or is_last) and now - self.line_s > LINE_EVERY_S:
             self.line_s = now
             print(f"{self.bar.tasks[0].description}: {said}", flush=True)
 

@@ -123,7 +123,7 @@ class Reconstructor(LightningModule):
         self.manual_backward(frames, gradient)
         total = self.all_gather(loss).mean()  # type: ignore[union-attr]
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
-        self.guard.limit(gradients, total, self.global_step, sample.parameters)
+        self.guard.check_and_scale(gradients, total, self.global_step, sample.parameters)
         optimizer.step()
         if self.make_scheduler is not None:
             self.lr_schedulers().step()  # type: ignore[union-attr]
@@ -191,8 +191,8 @@ class Reconstructor(LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
         if self.make_optimizer is not None:  # else nothing is trained
-            going_on.check_steps(self.trainer.max_steps, checkpoint["global_step"])
-            kept = going_on.follow_config(
+            going_on.check_max_steps(self.trainer.max_steps, checkpoint["global_step"])
+            kept = going_on.apply_config_to_optimizer_state(
                 checkpoint, self.network.parameters, self.make_optimizer, self.make_scheduler
             )
             start = checkpoint.get("optimizer_start", 0)

@@ -21,7 +21,7 @@ class StepGuard:
     """Scales the gradients of a step down.
 
     `loss_spike_factor`: a loss more than so many times the median of the last 100 losses moves the
-    weights no more than that median would, after the first `least` losses; None: off.
+    weights no more than that median would, after the first `min_losses` losses; None: off.
     `grad_clip_norm`: largest Euclidean norm over all gradients; None: any.  Raises ValueError for a
     factor <= 1 or a norm <= 0.
     """
@@ -30,17 +30,17 @@ class StepGuard:
         self,
         loss_spike_factor: float | None = None,
         grad_clip_norm: float | None = None,
-        least: int = 20,
+        min_losses: int = 20,
     ):
         if loss_spike_factor is not None and not loss_spike_factor > 1:
             raise ValueError(f"loss_spike_factor must be > 1 or null, got {loss_spike_factor}")
         if grad_clip_norm is not None and not grad_clip_norm > 0:
             raise ValueError(f"grad_clip_norm must be > 0 or null, got {grad_clip_norm}")
         self.loss_spike_factor, self.grad_clip_norm = loss_spike_factor, grad_clip_norm
-        self.least = least
+        self.min_losses = min_losses
         self.losses: deque[float] = deque(maxlen=100)
 
-    def limit(
+    def check_and_scale(
         self, gradients: Sequence[Tensor], loss: Tensor, step: int, drawn: list[dict]
     ) -> None:
         """Scale `gradients` in place.  Raises NonFiniteError, naming the clips `drawn`, before."""
@@ -57,7 +57,7 @@ class StepGuard:
 
     def gradient_scale(self, loss: float) -> float:
         """Return the factor, in (0, 1], for the gradients of a step of this loss; remember it."""
-        usual = median(self.losses) if len(self.losses) >= self.least else math.inf
+        usual = median(self.losses) if len(self.losses) >= self.min_losses else math.inf
         is_spike = self.loss_spike_factor is not None and loss > self.loss_spike_factor * usual
         self.losses.append(usual if is_spike else loss)
         return usual / loss if is_spike else 1.0

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from src.deploy.cpu_features import is_bf16_faster
-from src.models.checkpoints import is_intact, save_whole
+from src.models.checkpoints import is_intact, save_atomically
 from src.models.network import EventToVideoNetwork
 from src.sim.pipeline import Sample
 
@@ -22,22 +22,23 @@ LEVELS = 255  # of a cached frame
 class TeacherEnsemble:
     """The `networks`, by name, all of which take the views of the samples.
 
-    One without `uses_window_length` teaches windows of 1 / `rate` seconds only, as it was trained
-    with.  `cache`: a folder for their frames, 8 bits a pixel, so that a sample that comes again, in
-    this training or another, is not reconstructed again; files are named by a hash of the weights
-    and the sample.  Raises ValueError, naming `teachers`, where no network takes one of `rates`.
+    One without `uses_window_length` teaches windows of 1 / `trained_rate_hz` seconds only, as it
+    was trained with.  `cache`: a folder for their frames, 8 bits a pixel, so that a sample that
+    comes again, in this training or another, is not reconstructed again; files are named by a hash
+    of the weights and the sample.  Raises ValueError, naming `teachers`, where no network takes one
+    of `required_rates_hz`.
     """
 
     def __init__(
         self,
         networks: Mapping[str, EventToVideoNetwork],
         cache: str | Path,
-        rate: float,
-        rates: tuple[float, ...] = (),
+        trained_rate_hz: float,
+        required_rates_hz: tuple[float, ...] = (),
     ):
         self.networks = {name: net.eval() for name, net in networks.items()}
-        self.cache, self.rate = Path(cache), rate
-        for other in rates:
+        self.cache, self.trained_rate_hz = Path(cache), trained_rate_hz
+        for other in required_rates_hz:
             if not self._names_at(other):
                 raise ValueError(
                     f"teachers must have one that takes windows of any length, as a SetNet does, "
@@ -63,12 +64,12 @@ class TeacherEnsemble:
         else:
             frames = (LEVELS * self._mean_frames(sample, names)).round().to("cpu", torch.uint8)
             path.parent.mkdir(parents=True, exist_ok=True)
-            save_whole({"pictures": frames}, path)
+            save_atomically({"pictures": frames}, path)
         return frames.to(sample.voxels.device).float() / LEVELS
 
     def _names_at(self, rate: float) -> list[str]:
         """Return the names of the networks that teach at `rate` windows a second."""
-        is_usual = math.isclose(rate, self.rate, rel_tol=1e-3)
+        is_usual = math.isclose(rate, self.trained_rate_hz, rel_tol=1e-3)
         return [name for name, net in self.networks.items() if is_usual or net.uses_window_length]
 
     @torch.no_grad()

@@ -49,16 +49,20 @@ def draw_pixel_offsets(size: Sequence[int], max_fraction: float, key: int) -> Fl
     return image.reshape(*size)
 
 
-def add_noisy_pixels(
-    voxels: Tensor, max_fraction: float, window_counts: Sequence[Sequence[float]], keys: list[int]
+def add_firing_pixels(
+    voxels: Tensor,
+    max_fraction: float,
+    events_per_window_ranges: Sequence[Sequence[float]],
+    keys: list[int],
 ) -> None:
     """Let up to `max_fraction` of the pixels of each clip's views fire without a change of light.
 
     `voxels`: (n, windows, views, bins, h, w).  Each has as many events a window as a Poisson
-    process with a mean log-uniform in the clip's `window_counts` = (low, high), each ON or OFF.
+    process with a mean log-uniform in the clip's `events_per_window_ranges` = (low, high), each ON
+    or OFF.
     """
     places, events = [], []
-    for clip, (counts, key) in enumerate(zip(window_counts, keys, strict=True)):
+    for clip, (counts, key) in enumerate(zip(events_per_window_ranges, keys, strict=True)):
         generator = np.random.Generator(np.random.SFC64(key))
         for view in range(voxels.shape[2]):
             pixels, own = _draw_noisy_pixels(voxels.shape, max_fraction, counts, generator)

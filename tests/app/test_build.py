@@ -114,7 +114,7 @@ def test_a_post_processor_of_ones_own_is_loaded(own, tmp_path):
     cfg = config("eval", tmp_path, "postprocess=mambatm", named, "baseline=frames", *own)
     assert type(build.build_video_method(cfg).postprocessor).__name__ == "MyMambaTM"
     with pytest.raises(ValueError, match="allowed_packages="):
-        postprocess.load(f"{tmp_path}/mine.safetensors")
+        postprocess.load_postprocessor(f"{tmp_path}/mine.safetensors")
 
 
 def test_a_network_and_a_baseline_are_not_both_taken(tmp_path):
@@ -186,9 +186,9 @@ def test_a_missing_size_is_asked_for_by_its_key(tmp_path):
     event_writers.write_events(tmp_path / "a.raw", events, width=8, height=8)
     (tmp_path / "a.txt").write_text("0 1 1 1\n5e-6 2 2 0\n")
     with pytest.raises(ValueError, match=r"give sensor_size=\[height,width\]"):
-        sources.sensor_size(tmp_path / "a.txt")
+        sources.find_sensor_size(tmp_path / "a.txt")
     with pytest.raises(ValueError, match=r"sensor_size must be \(8, 8\)"):
-        sources.sensor_size(tmp_path / "a.raw", [4, 4])
+        sources.find_sensor_size(tmp_path / "a.raw", [4, 4])
 
 
 def test_views_that_stand_anywhere_are_scored_and_timed(tmp_path):

@@ -59,7 +59,7 @@ def test_a_recording_that_cannot_be_written_is_refused_before_it_is_made(tmp_pat
     cfg = OmegaConf.create({
         "paths": {"run": str(tmp_path)}, "index": 0, "write": "a.xyz", "like": None,
         "video": None, "photo": None,
-        "camera": {"sensor": [360, 640]},
+        "camera": {"sensor_size": [360, 640]},
     })  # fmt: skip
     with pytest.raises(ValueError, match="a.xyz: cannot write .xyz"):
         simulate.simulate(cfg)

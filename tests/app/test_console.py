@@ -15,7 +15,7 @@ from rich.console import Console
 
 from src.app import build
 from src.app.help import help_text
-from src.records.results import ScoreRow, build_rich_score_table
+from src.records.results import ScoreRow, build_rich_score_table, describe_difference
 from src.training.progress import TrainingProgress
 from tests.conftest import ROOT
 from tests.test_entry_points import run_here
@@ -37,7 +37,7 @@ def test_help_shows_keys_with_their_comments_and_the_choices_of_groups():
     assert "defaults:" not in text and "paths" not in text.splitlines()[3]
     groups = help_text("simulate", "")
     assert re.search(
-        r"^  turbulence=mixed +or measured, medium, none, recorded, strong", groups, re.M
+        r"^  turbulence=mixed +or extreme, measured, medium, none, recorded, strong", groups, re.M
     )
 
 
@@ -63,12 +63,25 @@ def test_a_table_names_the_method_asked_for(given, name, tmp_path):
 
 def test_a_table_cuts_no_name_and_no_number():
     scores = {"ssim": 0.512, "psnr": 16.25}
-    row = ScoreRow("published/a_long_name_of_a_network", [scores], 1, 1, {"a": 103.2})
+    scores |= {"lpips": 0.3, "psnr_aligned": 20.1, "temporal_jitter_px": 0.85}
+    row = ScoreRow("single256 given 9 views, before training", [scores], 1, 1, {"a": 103.2})
     console = Console(width=80, record=True, file=io.StringIO())
     console.print(build_rich_score_table([row]))
     text = console.export_text()
-    first = "".join(line.split("│")[1].strip() for line in text.splitlines() if "│" in line)
-    assert first == row.name and "0.512" in text and "16.25" in text and "103.2" in text
+    first, second = text.splitlines()[-2:]
+    assert f"{first[:24]} {second.strip()}" == row.name
+    assert first.split()[-6:] == ["0.300", "0.512", "16.25", "20.10", "0.85", "103.2"]
+
+
+def test_a_difference_that_may_be_none_is_said_to_be_none():
+    ours, less, more = (
+        ScoreRow(name, [{"lpips": value} for value in values], 1, 1, {})
+        for name, values in {"a": (0.3, 0.2), "b": (0.1, 0.3), "c": (0.5, 0.5)}.items()
+    )
+    none = "LPIPS, a less b: +0.0500, 95 % CI -0.1000 to +0.2000: it holds 0, so no difference is"
+    assert describe_difference(ours, less) == f"{none} shown"
+    said = "LPIPS, a less c: -0.2500, 95 % CI -0.3000 to -0.2000"
+    assert describe_difference(ours, more) == said
 
 
 def test_progress_counts_the_steps_asked_for(capsys):
@@ -85,6 +98,17 @@ def test_progress_counts_the_steps_asked_for(capsys):
     shown.on_test_end(trainer, None)
     lines = capsys.readouterr().out.splitlines()
     assert lines == ["training: step 30 of 30 loss 0.500", "testing untrained: 2 of 2"]
+
+
+def test_the_last_clip_is_printed_once_however_long_it_took(capsys, monkeypatch):
+    monkeypatch.setattr("src.training.progress.LINE_EVERY_S", -1.0)
+    shown = TrainingProgress(tested="it")
+    trainer = Mock(spec=Trainer, num_test_batches=[2])
+    shown.on_test_start(trainer, None)
+    for _ in range(2):
+        shown.on_test_batch_end(trainer, None)
+    shown.on_test_end(trainer, None)
+    assert capsys.readouterr().out.splitlines() == ["testing it: 1 of 2", "testing it: 2 of 2"]
 
 
 def read_until(terminal: int, word: bytes, seconds: float) -> bytes:

@@ -5,6 +5,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from src.app import renamed_keys
+from src.app.compose import compose_config
 from tests.conftest import ROOT
 
 ENTRY_POINTS = sorted(file.stem for file in (ROOT / "conf").glob("*.yaml"))
@@ -33,6 +34,24 @@ def test_the_longest_former_key_wins_and_a_removed_one_says_so(monkeypatch):
 def test_a_former_key_in_a_config_file_is_refused():
     with pytest.raises(ValueError, match="^calm is now loss.static_flicker.weight$"):
         renamed_keys.check_keys(OmegaConf.create({"seed": 0, "calm": 1}))
+
+
+@pytest.mark.parametrize(
+    ("name", "override", "said"),
+    [
+        ("simulate", "vidoe=x", "vidoe is no key of the configuration; did you mean video?"),
+        ("simulate", "data.unknown=1", "data.unknown is no key of the configuration; --cfg job"),
+        ("train", "optimizer.lrr=1", "optimizer.lrr is no key of the configuration; did you mean"
+                                     " optimizer.lr?"),
+        ("train", "experiment=clean/x", "experiment must be one of lf3x3, mambatm, "),
+        ("live", "reading=defalt", "reading must be one of default, got defalt; did you mean"
+                                   " default?"),
+    ],
+)  # fmt: skip
+def test_a_key_or_choice_that_is_none_is_told_the_nearest(name, override, said):
+    with pytest.raises(ValueError) as caught:
+        compose_config(name, override)
+    assert str(caught.value).startswith(said) and "provider" not in str(caught.value)
 
 
 @pytest.mark.parametrize("entry_point", ENTRY_POINTS)

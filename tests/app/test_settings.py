@@ -12,7 +12,7 @@ from tests.test_train import config, names
 SMALL = ["scene.height=64", "scene.width=64", "data.test_windows=2", "data.test_crop=16"]
 
 
-@pytest.mark.parametrize("choice", ["none", "weak", "medium", "strong", "mixed"])
+@pytest.mark.parametrize("choice", ["none", "weak", "medium", "strong", "extreme", "mixed"])
 def test_every_setting_of_turbulence_can_be_set_whatever_its_strength(choice, tmp_path):
     settings = ["turbulence.tolerance=0.5", "turbulence.temporal_model=frozen_flow"]
     cfg = config("simulate", tmp_path, f"turbulence={choice}", "fps=120", *settings, *SMALL)

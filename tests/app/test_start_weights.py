@@ -25,24 +25,24 @@ def write_weights(path, **other):
 def test_nine_views_begin_exactly_as_the_shipped_network_on_one(tmp_path):
     cfg = config("train", tmp_path, "budget=fine_tuning")
     assert (cfg.start, cfg.width) == ("single256", 8)  # the width is that of the weights
-    path = start_weights.adopt_start(cfg)
+    path = start_weights.set_model_from_start_weights(cfg)
     net, spec = build.build_network_and_spec(cfg)
     files.restore_weights(net, path)
-    one_view = files.network_spec(path)
+    one_view = files.read_network_spec(path)
     assert spec == one_view | {"kwargs": one_view["kwargs"] | {"views": 9}}
     seen = torch.randn(1, 4, 9, 5, 32, 32)
     ours, theirs = unroll(net.eval(), seen)[0], unroll(load("single256"), seen[:, :, 4:5])[0]
     assert torch.equal(ours, theirs) and ours.std() > 0.01
-    name = start_weights.name_beginning(cfg, path)
+    name = start_weights.describe_start_weights(cfg, path)
     assert name == "single256 given 9 views, before training"
 
 
 @pytest.mark.parametrize("start", ["none", "null"])
 def test_without_a_start_the_network_is_that_of_the_config(start, tmp_path):
     cfg = config("train", tmp_path, "budget=fine_tuning", f"start={start}")
-    assert start_weights.adopt_start(cfg) is None
+    assert start_weights.set_model_from_start_weights(cfg) is None
     assert build.build_network_and_spec(cfg)[0].head.out_channels == cfg.width == 8
-    assert start_weights.name_beginning(cfg, None) == "untrained"
+    assert start_weights.describe_start_weights(cfg, None) == "untrained"
 
 
 @pytest.mark.parametrize(
@@ -59,20 +59,20 @@ def test_a_wrong_start_is_one_line_that_names_it(overrides, said, tmp_path):
     (tmp_path / "no.safetensors").write_bytes(b"none")
     cfg = config("train", tmp_path, *(given.format(tmp=tmp_path) for given in overrides))
     with pytest.raises(ValueError, match=said):
-        start_weights.adopt_start(cfg)
+        start_weights.set_model_from_start_weights(cfg)
 
 
 def test_references_are_loaded_by_their_names_or_refused(tmp_path):
     path = write_weights(tmp_path / "two.safetensors", views=2)
     cfg = config("train", tmp_path, f"+references={{two: {path}, small: setnet_small}}")
     with pytest.warns(UserWarning, match="references.two is left out: it takes optics.views=2"):
-        assert list(start_weights.load_references(cfg)) == ["small"]
+        assert list(start_weights.load_reference_networks(cfg)) == ["small"]
     cfg.references = {"restorer": "mambatm"}
     with pytest.raises(ValueError, match="references.restorer must be a network for events"):
-        start_weights.load_references(cfg)
+        start_weights.load_reference_networks(cfg)
     cfg.references = {"none": "nowhere"}
     with pytest.raises(ValueError, match="references.none must be a network: .*nowhere"):
-        start_weights.load_references(cfg)
+        start_weights.load_reference_networks(cfg)
 
 
 def test_a_training_from_weights_is_compared_with_its_beginning(tmp_path):

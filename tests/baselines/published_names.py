@@ -2,10 +2,10 @@
 
 from torch import Tensor, nn
 
-from baselines.published import NETWORKS, rename
+from baselines.published import NETWORKS, published_name
 
 
 def published_state_dict(variant: str, network: nn.Module) -> dict[str, Tensor]:
     """Return the weights of `network` as a checkpoint of the published network names them."""
     rules = NETWORKS[variant].rename_rules
-    return {rename(ours, rules): value for ours, value in network.state_dict().items()}
+    return {published_name(ours, rules): value for ours, value in network.state_dict().items()}

@@ -10,7 +10,7 @@ from baselines.e2vid_plus import E2VIDPlus
 from baselines.etnet import ETNet
 from baselines.firenet import FireNet
 from baselines.highpass import HighPass
-from baselines.hypere2vid import DynamicDecoder, HyperE2VID, fourier_bessel
+from baselines.hypere2vid import DynamicDecoder, HyperE2VID, fourier_bessel_functions
 from baselines.pienet import PIENet
 from src.models.network import unroll
 from src.sim.optics import Optics
@@ -120,7 +120,11 @@ def test_other_bins_are_refused(kind):
 
 @torch.no_grad()
 def test_fused_attention_is_attention():
-    layer, x, memory = etnet.Attention(16).eval(), torch.randn(2, 7, 16), torch.randn(2, 7, 16)
+    layer, x, memory = (
+        etnet.MultiHeadAttention(16).eval(),
+        torch.randn(2, 7, 16),
+        torch.randn(2, 7, 16),
+    )
     plain = torch.nn.MultiheadAttention(16, etnet.HEADS, batch_first=True).eval()
     plain.in_proj_weight.copy_(layer.project.weight)
     plain.in_proj_bias.copy_(layer.project.bias)
@@ -129,7 +133,7 @@ def test_fused_attention_is_attention():
 
 
 def test_sinusoids_start_with_sine_zero_and_cosine_one():
-    table = etnet.sinusoids(5, 8)
+    table = etnet.sinusoidal_position_encoding(5, 8)
     assert table.shape == (5, 8)
     assert table[0].tolist() == [0, 1] * 4
     torch.testing.assert_close(table[:, 0], torch.arange(5.0).sin())
@@ -150,7 +154,7 @@ def test_dynamic_convolution_is_one_with_a_kernel_for_each_pixel():
 
 
 def test_fourier_bessel_functions():
-    small, large = fourier_bessel(1), fourier_bessel(2)
+    small, large = fourier_bessel_functions(1), fourier_bessel_functions(2)
     assert small.shape == (6, 3, 3) and large.shape == (14, 5, 5)
     # The first is J0, positive, highest in the middle; the published values are these.
     assert float(small[0, 1, 1]) == pytest.approx(0.6731, abs=1e-4)

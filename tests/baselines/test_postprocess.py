@@ -13,7 +13,7 @@ from src.losses.terms import L1Term, TrainingLoss
 from src.models import files
 from src.models.network import FramePostprocessor, unroll
 from src.sim.pipeline import Sample
-from src.training.evaluation import measure_cost
+from src.training.evaluation import measure_macs_and_ms
 from src.training.reconstructor import PostprocessorTraining
 
 
@@ -65,7 +65,7 @@ def test_it_gets_what_the_network_makes_of_the_events():
 def test_the_cost_is_that_of_the_pair():
     given, network, restorer = sample(4), FireNet().eval(), MambaTM(states=2).eval()
     alone, behind_camera, pair = (
-        measure_cost(method, given)[0]
+        measure_macs_and_ms(method, given)[0]
         for method in (
             network,
             Postprocessed(CameraFrames(), restorer),
@@ -73,7 +73,7 @@ def test_the_cost_is_that_of_the_pair():
         )
     )
     assert pair == pytest.approx(alone + behind_camera, rel=0.2)  # the first frame has no state
-    assert measure_cost(CameraFrames(), given)[0] == 0
+    assert measure_macs_and_ms(CameraFrames(), given)[0] == 0
 
 
 def test_training_changes_the_post_processor_and_not_its_source():

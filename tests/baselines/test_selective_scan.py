@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from baselines import selective_scan
 from baselines.hilbert import hilbert_order
-from baselines.selective_scan import Mixer, scan
+from baselines.selective_scan import BidirectionalMamba, selective_scan
 
 
 def loop(x, step, rate, enter, leave):
@@ -26,18 +25,18 @@ def inputs(length: int, n: int = 2, channels: int = 3, states: int = 4):
 
 @pytest.mark.parametrize("length", [1, 2, 9, 16, 57, 300])
 def test_scan_is_the_loop(length):
-    torch.testing.assert_close(scan(*inputs(length)), loop(*inputs(length)))
+    torch.testing.assert_close(selective_scan(*inputs(length)), loop(*inputs(length)))
 
 
 @pytest.mark.parametrize("block", [1, 7, 57])
 def test_blocks_go_on_from_each_other(block, monkeypatch):
-    monkeypatch.setattr(selective_scan, "BLOCK", block)
-    torch.testing.assert_close(scan(*inputs(57)), loop(*inputs(57)))
+    monkeypatch.setattr("baselines.selective_scan.BLOCK", block)
+    torch.testing.assert_close(selective_scan(*inputs(57)), loop(*inputs(57)))
 
 
 def test_gradients_are_the_loop_s():
     ours, theirs = inputs(30), inputs(30)
-    for run, given in ((scan, ours), (loop, theirs)):
+    for run, given in ((selective_scan, ours), (loop, theirs)):
         for part in given:
             part.requires_grad_()
         run(*given).sin().sum().backward()
@@ -47,13 +46,13 @@ def test_gradients_are_the_loop_s():
 
 def test_long_decays_stay_finite():
     x, step, rate, enter, leave = inputs(2000)
-    assert torch.isfinite(scan(x, step * 1e4, rate, enter, leave)).all()
+    assert torch.isfinite(selective_scan(x, step * 1e4, rate, enter, leave)).all()
 
 
 @torch.no_grad()
 def test_each_direction_sees_one_side_and_both_see_all():
     torch.manual_seed(0)
-    mixer, x = Mixer(8, 2), torch.randn(1, 20, 8)
+    mixer, x = BidirectionalMamba(8, 2), torch.randn(1, 20, 8)
     other = x.clone()
     other[:, 10] += 1
     first, second = mixer.ahead(*_inner(mixer, x)), mixer.ahead(*_inner(mixer, other))
@@ -63,14 +62,14 @@ def test_each_direction_sees_one_side_and_both_see_all():
     assert changed.all()
 
 
-def _inner(mixer: Mixer, x: torch.Tensor) -> tuple[torch.Tensor, None]:
+def _inner(mixer: BidirectionalMamba, x: torch.Tensor) -> tuple[torch.Tensor, None]:
     return mixer.enter(x).chunk(2, -1)[0], None
 
 
 @torch.no_grad()
 def test_a_guide_chooses():
     torch.manual_seed(0)
-    mixer, x = Mixer(8, 2, guided=True), torch.randn(1, 12, 8)
+    mixer, x = BidirectionalMamba(8, 2, takes_guide=True), torch.randn(1, 12, 8)
     assert not torch.allclose(mixer(x, torch.zeros_like(x)), mixer(x, torch.ones_like(x)))
 
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from baselines.stabilise import ERROR, estimate_jitter, linear_smoother, warp_video
+from baselines.stabilise import ERROR, estimate_jitter, local_linear_smoothing_matrix, warp_video
 
 
 def scene(paths: torch.Tensor, side: int = 96) -> torch.Tensor:
@@ -27,7 +27,7 @@ def shake(frames: int, px: float) -> torch.Tensor:
 
 def rest(path: torch.Tensor) -> torch.Tensor:
     """Return what of a path (frames, 2) is no smooth motion."""
-    return path - linear_smoother(len(path)) @ path
+    return path - local_linear_smoothing_matrix(len(path)) @ path
 
 
 def inner(field: torch.Tensor) -> torch.Tensor:
@@ -59,7 +59,7 @@ def test_pulling_takes_the_shake_out():
 
 def test_straight_paths_come_through_the_smoother():
     line = torch.stack([torch.ones(9), torch.arange(9.0)], 1)
-    torch.testing.assert_close(linear_smoother(9) @ line, line, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(local_linear_smoothing_matrix(9) @ line, line, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3])

@@ -19,7 +19,7 @@ def test_no_clip_is_made_by_two_processes_and_none_is_left_out():
         sampler = StepSampler(
             batch_size=size,
             steps_per_epoch=6,
-            step=lambda: 0,
+            current_step=lambda: 0,
             batch_reuse=1,
             rank=rank,
             world=world,

@@ -15,7 +15,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from src.models.checkpoints import is_intact, newest_checkpoint, save_whole
+from src.models.checkpoints import is_intact, newest_checkpoint, save_atomically
 from src.recordings import output
 from src.recordings.output import open_video_writer, partial_path
 from src.recordings.reconstruction import Frame
@@ -27,7 +27,7 @@ NOBODY = 65534
 
 
 def written(path: Path, number: float) -> None:
-    save_whole({"state_dict": {"a": torch.full((50_000,), number)}}, path)
+    save_atomically({"state_dict": {"a": torch.full((50_000,), number)}}, path)
 
 
 @contextmanager
@@ -109,7 +109,7 @@ READERS = {
     "photo.png": "src.sim.scenes.photo_files.read_photograph",
     "net.ckpt": "src.models.files.load",
     "net.safetensors": "src.models.files.load",
-    "old.pth": "baselines.pickled_weights.read_tensors",
+    "old.pth": "baselines.pickled_weights.read_pickled_tensors",
 }
 
 

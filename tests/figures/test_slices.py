@@ -4,7 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from src.figures.comparison import VideoRow, draw_comparison
 from src.figures.slices import circle_points, line_points, rotating_ray_xy, sample_points
 
 Y, X = np.mgrid[:40, :60].astype(float)
@@ -54,3 +56,15 @@ def test_points_are_at_most_a_pixel_apart():
 def test_outside_is_refused():
     with pytest.raises(ValueError, match=r"60x40 px, got \(70.0, 3.0\)"):
         sample_points(np.zeros((2, 40, 60)), np.array([[5.0, 3.0], [70.0, 3.0]]))
+
+
+@pytest.mark.parametrize("note", ["", "SSIM 0.5"])
+def test_a_comparison_ends_with_its_slices_or_with_notes_where_there_are_some(tmp_path, note):
+    video = np.zeros((6, 40, 40))
+    rows = [VideoRow(name, video, video[:, 20], note) for name in ("a", "b")]
+    draw_comparison(
+        rows, tmp_path / "a.png", line=np.array([[0.0, 20.0], [39.0, 20.0]]), length_s=0.1
+    )
+    shown = np.asarray(Image.open(tmp_path / "a.png").convert("L")) < 100
+    end = np.flatnonzero(shown[shown.shape[0] // 4]).max() / shown.shape[1]
+    assert end < 0.9 if note else end > 0.97

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from src.figures.samples import GAP_PX, TITLE_PX, join_panels, render_events, write_video
+from src.figures.samples import (
+    EVENTS_TITLE,
+    GAP_PX,
+    TITLE_PX,
+    join_panels,
+    render_events,
+    resize_pictures,
+    write_video,
+)
 
 
 def ramp(frames: int, height: int, width: int) -> np.ndarray:
@@ -12,15 +20,15 @@ def ramp(frames: int, height: int, width: int) -> np.ndarray:
     return np.repeat(grey, 3, axis=-1).astype(np.float32)
 
 
-def test_events_are_blue_on_and_red_off_on_white():
+def test_events_are_red_where_brighter_and_blue_where_darker_on_white():
     off, none, on = render_events(np.array([[[-3.0, 0.0, 3.0]]]))[0, 0]
     assert none.tolist() == [1, 1, 1]
-    assert on.argmax() == 2 and off.argmax() == 0
+    assert on.argmax() == 0 and off.argmax() == 2
     assert np.allclose(render_events(np.array([[[9.0]]]))[0, 0], on)
 
 
 def test_fainter_events_are_paler():
-    one, two, three = render_events(np.array([[[1.0, 2.0, 3.0]]]))[0, 0, :, 0]
+    one, two, three = render_events(np.array([[[1.0, 2.0, 3.0]]]))[0, 0, :, 2]
     assert 1 > one > two > three
 
 
@@ -35,6 +43,31 @@ def test_panels_stand_side_by_side_under_their_names():
 
 def test_small_panels_are_enlarged():
     assert join_panels({"small": ramp(1, 32, 32)}).shape[1] == TITLE_PX + 160
+
+
+def test_pictures_are_enlarged_to_slopes_and_keep_their_range():
+    edge = np.repeat([[[0.2] * 20 + [0.8] * 20]], 40, axis=1).astype(np.float32)
+    large, small = (resize_pictures(edge, height)[0] for height in (160, 20))
+    assert large.shape == (160, 160) and large.min() >= 0.2 and large.max() <= np.float32(0.8)
+    between = (large > 0.3) & (large < 0.7)
+    assert between[:, 76:84].any(1).all() and np.unique(small).size == 2
+
+
+def test_grey_panels_are_interpolated_and_events_are_not():
+    edge = np.repeat([[[0.0] * 20 + [1.0] * 20]], 40, axis=1).astype(np.float32)
+    grey, events = (
+        join_panels({"panel": panel})[0, TITLE_PX + 80, :, 0]
+        for panel in (edge, np.repeat(edge[..., None], 3, -1))
+    )
+    assert len(np.unique(grey)) > 2 and np.unique(events).tolist() == [0, 1]
+
+
+def test_a_title_too_long_for_its_panel_ends_before_the_colon():
+    narrow, short = (
+        join_panels({name: ramp(1, 160, 100)})[0, :TITLE_PX] for name in (EVENTS_TITLE, "events")
+    )
+    wide = join_panels({EVENTS_TITLE: ramp(1, 160, 300)})[0, :TITLE_PX]
+    assert np.array_equal(narrow, short) and (wide[:, 120:] < 0.5).any()
 
 
 def test_a_gif_keeps_frames_grey_levels_and_time(tmp_path):

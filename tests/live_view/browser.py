@@ -86,6 +86,15 @@ class Browser:
             name,
         )
 
+    def imitate_phone(self, width: int = 390, height: int = 844) -> None:
+        """Show pages as a phone does: at its width, with two pixels for one, for fingers."""
+        size = {"width": width, "height": height, "deviceScaleFactor": 2, "mobile": True}
+        for name, values in (
+            ("DeviceMetricsOverride", size),
+            ("TouchEmulationEnabled", {"enabled": True}),
+        ):
+            self.call("goog/cdp/execute", cmd=f"Emulation.set{name}", params=values)
+
     def screenshot(self) -> bytes:
         """Return the page as PNG."""
         with urlopen(f"{self.base}/screenshot", timeout=60) as answer:

@@ -267,6 +267,23 @@ def test_as_fast_as_it_goes_every_picture_is_that_of_reconstruct(recording):
     assert len(wanted) - screen.count in (0, 1)
 
 
+def test_the_recorded_time_is_that_of_the_frame_shown_also_while_nothing_moves(recording, tmp_path):
+    events = read_events(recording)
+    start_us = int(events["t"][0])
+    events["t"][events["t"] > start_us + 100_000] += 8_000_000
+    height, width = scenes.SENSOR
+    write_events(tmp_path / "still.raw", events, width=width, height=height)
+    made = served(str(tmp_path / "still.raw"), {"net": HighPass()})
+    player, screen = made.page.player, made.page.frames
+    assert player.status()["time_s"] is None
+    player.start()
+    _until(lambda: screen.count >= 30)
+    count, status = screen.count, player.status()
+    player.stop()
+    assert count / 100 - 1e-3 <= status["time_s"] - start_us * 1e-6 < 5  # the next event: at 8 s
+    assert np.array_equal(screen.ring[20], screen.ring[29])
+
+
 def test_what_cannot_keep_up_drops_windows_and_keeps_its_latency(recording):
     class Slow(HighPass):
         def forward(self, *args, **kwargs):
@@ -280,9 +297,8 @@ def test_what_cannot_keep_up_drops_windows_and_keeps_its_latency(recording):
     status = player.status()
     player.stop()
     player.reader.state = "playing"
-    fps = int(
-        re.fullmatch(r"fps=(\d+) would drop nothing on this machine", player.status()["hint"])[1]
-    )
+    hint = r"fps=(\d+) \(of recorded time\) would drop nothing on this machine"
+    fps = int(re.fullmatch(hint, player.status()["hint"])[1])
     assert 0 < fps < 30
     assert status["dropped"] > 50 and status["waiting"] <= 4
     assert status["latency_ms"]["median"] < 2000  # four windows and the network, on a busy machine

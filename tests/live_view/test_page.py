@@ -199,6 +199,21 @@ def test_a_picture_for_those_who_ask_and_none_for_other_sites(server, dot):
         assert refused.value.code == 403
 
 
+def test_on_a_phone_nothing_is_cut_and_a_finger_hits_every_control(server):
+    if missing := browser.missing():
+        pytest.skip(f"no {' and no '.join(missing)} on this machine")
+    with browser.browser() as phone:
+        phone.imitate_phone()
+        phone.open(server.address)
+        phone.wait("return document.getElementById('network').value === 'setnet_medium'")
+        width = phone.run("return [innerWidth, document.documentElement.scrollWidth]")
+        heights = phone.run(
+            "return Array.from(document.querySelectorAll('button, select, label.tick, #contrast'))"
+            ".map(one => one.getBoundingClientRect().height)"
+        )
+    assert width == [390, 390] and len(heights) == 8 and min(heights) >= 44
+
+
 def test_ctrl_c_leaves_no_process_and_no_port(server):
     assert "this machine only" in server.text()
     server.process.send_signal(signal.SIGINT)
@@ -208,6 +223,12 @@ def test_ctrl_c_leaves_no_process_and_no_port(server):
         with socket.socket(socket.AF_INET, kind) as again:
             again.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             again.bind(("127.0.0.1", port))
+
+
+def test_a_page_whose_server_is_gone_says_so(server, page):
+    page.wait(STATE.format("disconnected"))
+    page.wait(FAULT.format("trying again"))
+    assert page.run("return document.querySelector('main').inert")
 
 
 def _until(seen, seconds: float = 60.0) -> None:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from src.metrics.invented_contrast import find_unseen, invented_contrast
+from src.metrics.invented_contrast import find_unseen_pixels, invented_contrast
 
 
 def scene() -> tuple[np.ndarray, np.ndarray]:
@@ -19,20 +19,20 @@ def scene() -> tuple[np.ndarray, np.ndarray]:
 
 def test_unseen_begins_beyond_12_px_of_events():
     _, has_events = scene()
-    unseen = find_unseen(has_events)
+    unseen = find_unseen_pixels(has_events)
     assert unseen[:, 52:].all() and not unseen[:, 8:52].any() and unseen[:, :8].all()
 
 
 def test_one_value_is_nothing_invented():
     frame, has_events = scene()
     frame[:, :8] = 0.5
-    assert invented_contrast(frame, find_unseen(has_events)) == 0
+    assert invented_contrast(frame, find_unseen_pixels(has_events)) == 0
 
 
 @pytest.mark.parametrize("amplitude", [0.01, 0.2])
 def test_clouds_count_with_their_standard_deviation(amplitude):
     frame, has_events = scene()
-    unseen = find_unseen(has_events)
+    unseen = find_unseen_pixels(has_events)
     clouds = np.where(np.arange(unseen.sum()) % 2, amplitude, -amplitude)
     frame[unseen] = 0.5 + clouds
     assert invented_contrast(frame, unseen) == pytest.approx(amplitude)
@@ -40,5 +40,5 @@ def test_clouds_count_with_their_standard_deviation(amplitude):
 
 def test_all_seen_and_nothing_seen_have_none():
     frame, has_events = scene()
-    for mask in (np.zeros_like(has_events), find_unseen(np.zeros_like(has_events))):
+    for mask in (np.zeros_like(has_events), find_unseen_pixels(np.zeros_like(has_events))):
         assert math.isnan(invented_contrast(frame, mask))

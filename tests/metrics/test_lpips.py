@@ -82,14 +82,14 @@ def test_without_weights_the_ways_to_get_them_are_named(tmp_path, monkeypatch):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     with pytest.raises(ValueError, match=r"\(1\).*\(2\).*loss=l1"):
         LPIPS("alex")
-    with pytest.raises(ValueError, match="lpips.backbone"):
-        LPIPS("alex", backbone=str(tmp_path / "absent.pth"))
+    with pytest.raises(ValueError, match="lpips.backbone_weights"):
+        LPIPS("alex", backbone_weights=str(tmp_path / "absent.pth"))
 
 
 def test_another_file_is_not_taken_for_the_backbone(tmp_path):
     torch.save({"features.0.weight": torch.zeros(1)}, tmp_path / "other.pth")
-    with pytest.raises(ValueError, match=r"lpips.backbone.*features.0.weight"):
-        LPIPS("alex", backbone=str(tmp_path / "other.pth"))
+    with pytest.raises(ValueError, match=r"lpips.backbone_weights.*features.0.weight"):
+        LPIPS("alex", backbone_weights=str(tmp_path / "other.pth"))
 
 
 def test_torchvision_s_own_file_loads(tmp_path):
@@ -101,6 +101,6 @@ def test_torchvision_s_own_file_loads(tmp_path):
         for part in ("weight", "bias")
     }
     torch.save(named | {"classifier.1.weight": torch.zeros(2)}, tmp_path / "alexnet.pth")
-    again = LPIPS("alex", backbone=str(tmp_path / "alexnet.pth"))
+    again = LPIPS("alex", backbone_weights=str(tmp_path / "alexnet.pth"))
     a, b = torch.rand(2, 1, 1, 32, 32)
     assert torch.equal(ours(a, b), again(a, b))

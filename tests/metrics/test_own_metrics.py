@@ -96,7 +96,7 @@ def test_its_value_is_that_of_each_clip_alone():
         frames, target = clip(seed)
         wanted = (frames - target).square().mean().sqrt().item()
         assert metrics(frames, target)["rmse"] == pytest.approx(wanted, rel=1e-5)
-    assert metrics.names[-1] == "rmse" and metrics.own_columns[0].title == "rmse ↓"
+    assert metrics.names[-1] == "rmse" and metrics.user_metric_columns[0].title == "rmse ↓"
 
 
 class Several(Metric):

@@ -1,11 +1,13 @@
 """Windows do not depend on how the file is read; states are carried; pictures are held."""
 
 import itertools
+import warnings
 
 import numpy as np
 import pytest
 import torch
 
+from baselines.highpass import HighPass
 from src.models.network import EventToVideoNetwork
 from src.recordings import event_windows, reconstruction, sensor_lookup, views
 from src.recordings.event_windows import WindowRule
@@ -120,6 +122,29 @@ def test_a_recording_that_cannot_be_cut_is_refused(made, rule, message):
         list(event_windows.cut_windows([made], TABLE, rule))
 
 
+@pytest.mark.parametrize(
+    "rule, message",
+    [
+        ({"start_s": 10}, "start_s must be below the length of the recording, 0.100 s, got 10"),
+        ({"start_s": 0.0995}, "leave one window of 1/200 s of the recording, 0.100 s long, got"),
+    ],
+)
+def test_a_part_beyond_the_end_is_refused_with_the_length(rule, message):
+    with pytest.raises(ValueError, match=message):
+        list(event_windows.cut_windows([events(4000, 100_000)], TABLE, WindowRule(200, **rule)))
+
+
+@pytest.mark.parametrize("end_s, warned", [(0.3, True), (0.1, False), (0.05, False)])
+def test_an_end_after_the_last_event_is_told_once(end_s, warned):
+    made, rule = events(4000, 100_000), WindowRule(200, end_s=end_s)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = list(event_windows.cut_windows(chunks(made, 700), TABLE, rule))
+    assert len(found) == min(20, round(end_s * 200))
+    told = "end_s must be at most the length of the recording, 0.100 s, got 0.3"
+    assert [str(one.message).startswith(told) for one in caught] == [True] * warned
+
+
 def test_time_running_backwards_between_chunks_is_refused():
     made = events(100, 10_000)
     with pytest.raises(ValueError, match="backwards"):
@@ -232,6 +257,11 @@ def test_a_network_gets_the_views_it_wants(wants, there, all_views):
     network = Leaky()
     network.views = wants
     assert reconstruction.takes_all_views(network, there) == all_views
+
+
+def test_a_network_that_looks_at_the_centre_view_gets_no_other():
+    centre, median = HighPass(), HighPass(view_reduction="median")
+    assert [reconstruction.takes_all_views(net, 9) for net in (centre, median)] == [False, True]
 
 
 def test_nine_view_weights_with_one_view_are_refused():

@@ -53,17 +53,19 @@ def test_windows_between_frames_are_evreals(sequence):
     ends = [int((sequence.t <= time).sum()) - 1 for time in (0.03, 0.06, 0.09)]
     # The first window is empty, the last frame has none.
     spans = [(0, 0), (0, ends[0]), (ends[0], ends[1]), (ends[1], ends[2])]
-    assert [(w.first, w.last) for w in windows] == spans
-    assert [w.frame for w in windows] == [0, 1, 2, 3]
+    assert [(w.first_event, w.stop_event) for w in windows] == spans
+    assert [w.camera_frame for w in windows] == [0, 1, 2, 3]
     assert [w.time_s for w in windows] == pytest.approx([0, 0.03, 0.06, 0.09])
 
 
 def test_windows_of_a_number_of_events(sequence):
     windows = list(cut_evreal_windows(sequence, EvrealRule(window="events", events_per_window=700)))
-    assert [(w.first, w.last) for w in windows] == [(k, k + 700) for k in (0, 700, 1400, 2100)]
+    assert [(w.first_event, w.stop_event) for w in windows] == [
+        (k, k + 700) for k in (0, 700, 1400, 2100)
+    ]
     assert [w.time_s for w in windows] == [sequence.t[k + 699] for k in (0, 700, 1400, 2100)]
     nearest = [int(np.abs(sequence.frame_t - w.time_s).argmin()) for w in windows]
-    assert [w.frame for w in windows] == nearest
+    assert [w.camera_frame for w in windows] == nearest
 
 
 def test_windows_of_a_length_of_time(sequence):
@@ -71,7 +73,7 @@ def test_windows_of_a_length_of_time(sequence):
     edges = sequence.t[0] + 0.02 * np.arange(5)
     spans = [(int((sequence.t < a).sum()), int((sequence.t < b).sum()))
              for a, b in itertools.pairwise(edges)]  # fmt: skip
-    assert [(w.first, w.last) for w in windows] == spans
+    assert [(w.first_event, w.stop_event) for w in windows] == spans
     assert [w.time_s for w in windows] == [sequence.t[last - 1] for _, last in spans]
 
 
@@ -86,7 +88,7 @@ def test_windows_of_a_length_of_time(sequence):
 )
 def test_which_frames_are_scored(sequence, rule, extra, frames):
     scored = list(score_sequence(sequence, Sum(), EvrealRule(**rule), **(ALL | extra)))
-    assert [frame.given.frame for frame in scored] == frames
+    assert [frame.evreal_window.camera_frame for frame in scored] == frames
 
 
 def test_a_network_reads_the_warm_up_and_no_more(sequence):
@@ -94,12 +96,12 @@ def test_a_network_reads_the_warm_up_and_no_more(sequence):
         network = Sum()
         rule = EvrealRule(warm_up_s=warm_up_s)
         (frame,) = score_sequence(sequence, network, rule, start_s=0.09, end_s=0.1)
-        assert (len(network.seen), frame.window) == (read, 3)
+        assert (len(network.seen), frame.window_index) == (read, 3)
 
 
 def test_scores_are_those_of_the_pictures(sequence):
     frames = list(score_sequence(sequence, Sum(), EvrealRule(), **ALL))
-    expected = (0.5 + 0.01 * image_of(sequence, 0, frames[-1].given.last)).clip(0, 1)
+    expected = (0.5 + 0.01 * image_of(sequence, 0, frames[-1].evreal_window.stop_event)).clip(0, 1)
     assert np.allclose(frames[-1].picture, expected, atol=1e-5)
     truth = make_frames()[3] / 255
     assert frames[-1].scores["mse"] == pytest.approx(np.mean((expected - truth) ** 2), abs=1e-6)
@@ -132,14 +134,14 @@ def test_events_of_one_time_are_spread_in_their_order(sequence):
 def test_parts_are_the_same_events_in_equal_lengths(sequence):
     whole, parts = Sum(), Sum()
     rule = {"grid_edges": "window"}
-    last = [list(score_sequence(sequence, network, EvrealRule(**rule, part_s=part_s), **ALL))[-1]
-            for network, part_s in ((whole, None), (parts, 0.01))]  # fmt: skip
+    last = [list(score_sequence(sequence, network, EvrealRule(**rule, max_grid_s=most), **ALL))[-1]
+            for network, most in ((whole, None), (parts, 0.01))]  # fmt: skip
     assert np.allclose(last[0].picture, last[1].picture, atol=1e-5)
     assert [len(network.seen) for network in (whole, parts)] == [4, 10]  # 1 + 3 x 3
     assert [window_s for _, window_s in parts.seen[1:]] == pytest.approx([0.01] * 9)
-    given = last[1].given
-    inside = (sequence.t[given.first : given.last] < 0.07).sum()
-    expected = image_of(sequence, given.first, given.first + inside)
+    given = last[1].evreal_window
+    inside = (sequence.t[given.first_event : given.stop_event] < 0.07).sum()
+    expected = image_of(sequence, given.first_event, given.first_event + inside)
     assert np.allclose(parts.seen[7][0].sum(0).numpy(), expected, atol=1e-4)
 
 
@@ -184,7 +186,7 @@ def test_histograms_of_both_pictures_are_equalised(monkeypatch):
         ({"histogram": "x"}, "data.histogram must be one of none, global, local, clahe, got x"),
         ({"events_per_window": 0}, "data.events_per_window must be > 0, got 0"),
         ({"window_s": -1.0}, "data.window_s must be > 0, got -1"),
-        ({"part_s": 0.0}, "data.part_s must be > 0, got 0"),
+        ({"max_grid_s": 0.0}, "data.max_grid_s must be > 0, got 0"),
         ({"tolerance_ms": -1.0}, "data.tolerance_ms must be >= 0, got -1"),
         ({"warm_up_s": -1.0}, "data.warm_up_s must be >= 0, got -1"),
     ],

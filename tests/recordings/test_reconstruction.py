@@ -60,7 +60,11 @@ def test_the_frames_are_those_from_grids(name, cut):
         found += reconstruct_frames([window], runtime, state=state)
     assert len(found) == len(dense) > 5
     for one, other in zip(dense, found, strict=True):
-        assert (one.time_s, one.events, one.outside) == (other.time_s, other.events, other.outside)
+        assert (one.time_s, one.events, one.events_outside) == (
+            other.time_s,
+            other.events,
+            other.events_outside,
+        )
         np.testing.assert_allclose(one.picture, other.picture, atol=1e-5)
 
 

@@ -8,8 +8,8 @@ import torch
 from src.recordings import sensor_lookup, simulated_recording, views
 from src.recordings.calibration import dot_statistics, gaussian_dots, view_alignment
 from src.recordings.calibration.boards import Charuco, Checkerboard, Circles
-from src.recordings.files import recording, sources
-from src.recordings.truth_file import open_truth
+from src.recordings.files import event_writers, recording, sources
+from src.recordings.truth_file import create_truth_file
 from src.sim.optics import layout
 from src.sim.sensor.sensor import EventSensor
 from tests.recordings import pictures
@@ -67,7 +67,7 @@ def test_a_blinking_screen_calibrates_the_views(truth, target, picture, tmp_path
     )
     assert aligned.views.positions == list(layout(9))
     assert max(distance_px(aligned.views, truth).values()) < 0.3
-    saved = views.load_views(tmp_path / "board.views.yaml", sources.sensor_size(path))
+    saved = views.load_views(tmp_path / "board.views.yaml", sources.find_sensor_size(path))
     assert [saved.mirrored_xy(view) for view in saved.views] == [
         aligned.views.mirrored_xy(view) for view in aligned.views.views
     ]
@@ -128,11 +128,15 @@ def test_a_still_scene_makes_no_event(truth):
     assert len(simulated_recording.record_events(still, 60.0, truth, ideal)) == 0
 
 
-def test_no_file_is_written_without_an_event(truth, tmp_path):
+@pytest.mark.parametrize("end", [*event_writers.BINARY, ".csv", ".npz", ".h5"])
+def test_without_an_event_the_file_holds_none_and_one_warning_says_so(truth, tmp_path, end):
     still, ideal = torch.full((9, 3, SIDE, SIDE), 0.6), EventSensor(0.2, refractory_s=0.0)
-    with pytest.raises(ValueError, match="write: the clip gives no events"):
-        simulated_recording.write_recording(tmp_path / "a.raw", still, 60.0, truth, ideal)
-    assert not list(tmp_path.iterdir())
+    with pytest.warns(
+        UserWarning, match=f"no events, .*a{end} holds none; sensor.threshold= "
+    ) as w:
+        simulated_recording.write_recording(tmp_path / f"a{end}", still, 60.0, truth, ideal)
+    assert len(w) == 1 and len(recording.read_events(tmp_path / f"a{end}")) == 0
+    assert views.load_views(tmp_path / "a.views.yaml").positions == truth.positions
 
 
 def test_the_geometry_lies_beside_the_recording_and_the_truth_packs_what_is_seen(truth, tmp_path):
@@ -142,7 +146,7 @@ def test_the_geometry_lies_beside_the_recording_and_the_truth_packs_what_is_seen
     saved = views.load_views(tmp_path / "cap.views.yaml")
     assert saved.positions == truth.positions
     tilt = torch.linspace(-3, 3, 9 * 3 * 2 * SIDE * SIDE).reshape(9, 3, 2, SIDE, SIDE)
-    with open_truth(path, truth, 3, 60.0, {"threshold": 0.4}) as file:
+    with create_truth_file(path, truth, 3, 60.0, {"threshold": 0.4}) as file:
         for part in (slice(0, 2), slice(2, 3)):
             file.add(frames[0, part], frames[:, part], tilt[:, part])
     with h5py.File(tmp_path / "cap.truth.h5") as file:

@@ -1,8 +1,8 @@
 """The calibration finds what the simulated kaleidoscope is; the lookup splits without loss."""
 
 import re
+from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -10,6 +10,7 @@ import torch
 from src.recordings import sensor_lookup, simulated_recording, views
 from src.recordings.calibration import view_alignment
 from src.recordings.calibration.boards import Charuco, Checkerboard, Circles
+from src.recordings.corner_fold import CornerFold
 from src.sim.optics import layout
 from src.sim.voxel import voxel_grid
 from tests.recordings import pictures
@@ -31,6 +32,20 @@ def truth() -> views.Views:
     )
 
 
+def fold_corners(truth: views.Views, angle_rad: float, off_px: float = 0.0) -> views.Views:
+    """Return the views with corner views in halves, whose lines cross `off_px` right of and half
+    as far above the middle of the field."""
+    left, top, right, bottom = truth.field
+    towards = (left + right) / 2 + off_px, (top + bottom - off_px) / 2
+    turned = []
+    for view in truth.views:
+        row, col = view.position
+        corner = right if col > 0 else left, bottom if row > 0 else top
+        fold = CornerFold(corner, towards, angle_rad * col)  # right apart, left over each other
+        turned.append(replace(view, fold=fold) if row and col else view)
+    return replace(truth, views=tuple(turned))
+
+
 def shown(
     truth: views.Views, picture: np.ndarray, keep=range(9), noise: float = 0.02
 ) -> np.ndarray:
@@ -47,14 +62,12 @@ def shown(
 
 def distance_px(found: views.Views, truth: views.Views) -> dict:
     """Return the mean distance over the field between the true and the found place of a pixel."""
-    true = {view.position: view.homography for view in truth.views}
+    true = {view.position: view for view in truth.views}
     left, top, right, bottom = found.field
-    field = np.stack(np.meshgrid(np.linspace(left, right, 9), np.linspace(top, bottom, 9)), -1)
-    field = field.reshape(-1, 2)
+    field = views.list_pairs(np.linspace(left, right, 9), np.linspace(top, bottom, 9))
     far = {}
     for view in found.views:
-        on_sensor = cv2.perspectiveTransform(field[None], np.linalg.inv(true[view.position]))
-        offset = cv2.perspectiveTransform(on_sensor, view.homography)[0] - field
+        offset = view.to_centre(true[view.position].to_sensor(field)) - field
         far[view.position] = np.linalg.norm(offset, axis=1).mean()
     return far
 
@@ -125,6 +138,11 @@ def test_file_comes_back_exactly(truth, tmp_path):
     for mine, true in zip(back.views, truth.views, strict=True):
         assert np.array_equal(mine.homography, true.homography)
     assert not list(tmp_path.glob("views.yaml?*"))
+    folded = fold_corners(truth, 0.02)
+    folded.save(tmp_path / "views.yaml")
+    back = views.load_views(tmp_path / "views.yaml", SENSOR)
+    assert [view.fold for view in back.views] == [view.fold for view in folded.views]
+    assert sum(view.fold is not None for view in back.views) == 4
 
 
 @pytest.mark.parametrize(
@@ -149,6 +167,51 @@ def test_a_spoilt_file_is_refused_in_one_line(truth, tmp_path, change, message):
     path.write_text(text)
     with pytest.raises(ValueError, match=message):
         views.load_views(path)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (("angle_rad: [^\n]*", "angle_rad: 0.4"), r"angle_rad must be in -0\.3\.\.0\.3, got 0\.4"),
+        (("angle_rad: [^\n]*", "angle_rad: .nan"), "fold must be finite"),
+        (("    corner: [^\n]*\n", ""), "KeyError 'corner'"),
+    ],
+)
+def test_a_spoilt_fold_is_refused_in_one_line(truth, tmp_path, change, message):
+    path = tmp_path / "views.yaml"
+    fold_corners(truth, 0.02).save(path)
+    path.write_text(re.sub(*change, path.read_text(), count=1))
+    with pytest.raises(ValueError, match=message):
+        views.load_views(path)
+
+
+@pytest.mark.parametrize("angle", [0.1, -0.1])
+def test_the_halves_of_a_corner_view_are_turned_apart_or_over_each_other(angle):
+    fold = CornerFold((100.0, 50.0), (0.0, 50.0), angle)  # the line runs left from the corner
+    seen = fold.turn(np.array([[0.0, 50.5], [0.0, 49.5], [100.0, 50.0]]))
+    assert np.allclose(seen[2], fold.corner) and seen[0, 0] == pytest.approx(seen[1, 0])
+    apart = np.cos(angle / 2) + 200 * np.sin(angle / 2)
+    assert seen[0, 1] - seen[1, 1] == pytest.approx(apart)
+    away = np.array([[0.0, 70.0], [0.0, 30.0], [60.0, 90.0]])
+    assert np.allclose(fold.turn(fold.turn_back(away)), away)
+
+
+def test_lookup_and_registration_follow_the_halves(truth):
+    folded, picture = fold_corners(truth, 0.03), pictures.circles(5, 7)
+    table = sensor_lookup.build_lookup(folded)
+    y, x = np.nonzero(table.view == 8)
+    expected = folded.to_model(folded.views[8], np.stack([x, y], axis=1).astype(float))
+    plain = truth.to_model(truth.views[8], np.stack([x, y], axis=1).astype(float))
+    assert np.abs(table.model_xy[y, x] - expected).max() < 1e-3
+    assert 1 < np.linalg.norm(expected - plain, axis=1).mean() < 3  # 0.015 rad at 100 px
+    registered = folded.warp_to_model(shown(folded, picture, noise=0.0) / 255.0)
+    inner = np.s_[60:-60, 60:-60]
+    likeness = [
+        np.corrcoef(view[inner].ravel(), picture[inner].ravel())[0, 1] for view in registered
+    ]
+    assert min(likeness) > 0.95
+    unaware = truth.warp_to_model(shown(folded, picture, noise=0.0) / 255.0)[8]
+    assert np.corrcoef(unaware[inner].ravel(), picture[inner].ravel())[0, 1] < min(likeness)
 
 
 def test_views_of_another_sensor_are_refused(truth, tmp_path):

@@ -94,3 +94,4 @@ def test_on_a_phone_only_tables_scroll_sideways(tmp_path):
     assert text.count("<table>") == text.count('<div class="wide"><table>') >= 2
     assert ".wide { overflow-x: auto }" in text
     assert "h1, h2, p, code, figcaption { overflow-wrap: anywhere }" in text
+    assert "@media (pointer: coarse) { th button { padding: .7rem 0 } }" in text

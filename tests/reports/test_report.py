@@ -239,6 +239,19 @@ def test_of_several_sweeps_one_without_results_is_missing_too(tmp_path):
     assert missing.text == "missing"
 
 
+def test_jobs_whose_paths_were_quoted_for_hydra_are_not_missing(tmp_path):
+    quoted = ("ckpt='lf3x3','/a b/net.ckpt'", "scene.root='/data/photographs'")
+    write_sweep(tmp_path / "runs", {"experiment": "lf3x3", "seed": "0"}, quoted)
+    for place, ckpt in enumerate(("lf3x3", "/a b/net.ckpt")):
+        asked = (f"ckpt={ckpt}", "scene.root=/data/photographs")
+        settings = {"ckpt": ckpt}
+        write_run(tmp_path / "runs" / str(place), overrides=asked, settings=settings, task="eval")
+    table = report(config("report", tmp_path / "out", f"run={tmp_path}/runs"))[0]
+    assert [value(table, row, "n").text for row in range(len(table.rows))] == ["1", "1"]
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert "ckpt=lf3x3,'/a b/net.ckpt' scene.root=/data/photographs`" in text
+
+
 def test_an_empty_folder_is_refused_and_nothing_is_written(tmp_path):
     (tmp_path / "runs").mkdir()
     with pytest.raises(ValueError, match="run must hold results.json"):

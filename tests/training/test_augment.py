@@ -16,7 +16,7 @@ from src.training.augment import (
     flipped_view_order,
 )
 from src.training.clip_transforms import flip_frames, shift_views
-from src.training.voxel_noise import add_noisy_pixels, draw_normals, draw_pixel_offsets
+from src.training.voxel_noise import add_firing_pixels, draw_normals, draw_pixel_offsets
 
 OFF = {
     "noise_std": 0.0,
@@ -157,7 +157,7 @@ def test_small_crops_have_a_hot_pixel_as_often_as_their_part_of_one_is_large():
 
 def test_small_crops_have_a_firing_pixel_as_often_too():
     voxels = torch.zeros(1, 2, 1000, 1, 64, 64)  # each view draws its own
-    add_noisy_pixels(voxels, 1e-4, [(1000.0, 1000.0)], [0])
+    add_firing_pixels(voxels, 1e-4, [(1000.0, 1000.0)], [0])
     counts = (voxels[0] != 0).any(0).sum((1, 2, 3))
     assert counts.max() == 1
     assert abs(float(counts.float().mean()) - 0.2048) < 4 * math.sqrt(0.2 * 0.8 / 1000)

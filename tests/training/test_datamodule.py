@@ -64,7 +64,7 @@ def test_a_batch_used_again_is_augmented_anew():
 
 
 def sampler(batch_size: int, steps: int, step, **options) -> StepSampler:
-    return StepSampler(batch_size=batch_size, steps_per_epoch=steps, step=step, **options)
+    return StepSampler(batch_size=batch_size, steps_per_epoch=steps, current_step=step, **options)
 
 
 def numbers(batches: StepSampler) -> list[list[int]]:
@@ -109,10 +109,10 @@ def test_large_batches_come_evenly_and_count_their_own():
         sampler(4, 100, lambda: 0, large_share=0.3, large_batch_size=2).batch(step)
         for step in range(10)
     ]
-    assert [batch[0].stream for batch in batches] == [0, 0, 0, 1, 0, 0, 1, 0, 0, 1]
-    large = [item.clip for batch in batches for item in batch if item.stream]
+    assert [batch[0].crop_stream for batch in batches] == [0, 0, 0, 1, 0, 0, 1, 0, 0, 1]
+    large = [item.clip for batch in batches for item in batch if item.crop_stream]
     assert large == [0, 1, 2, 3, 4, 5]
-    usual = [item.clip for batch in batches for item in batch if not item.stream]
+    usual = [item.clip for batch in batches for item in batch if not item.crop_stream]
     assert len(set(usual)) == len(usual) == 28
 
 

@@ -147,7 +147,7 @@ def test_law_3_a_batch_changes_nothing(tmp_path):
 
 
 def test_views_that_share_their_air_keep_their_places(tmp_path):
-    shared = cached(disk_cache(tmp_path), independent=False)
+    shared = cached(disk_cache(tmp_path), shuffle_views=False)
     assert shared.draw(0).view_order == tuple(range(9))
 
 

@@ -10,7 +10,7 @@ from torch.optim import SGD, Adam, AdamW
 from torch.optim.lr_scheduler import CosineAnnealingLR
 
 from src.train import train
-from src.training.going_on import check_steps, follow_config
+from src.training.going_on import apply_config_to_optimizer_state, check_max_steps
 from tests.test_train import TINY, config
 
 STEPS = 4
@@ -41,7 +41,7 @@ def cosine(rate: float, step: int, t_max: int) -> float:
 def test_numbers_and_schedule_are_the_configs_and_moments_stay(change):
     saved = checkpoint(partial(Adam, lr=1e-3))
     moments = saved["optimizer_states"][0]["state"][0]["exp_avg"].clone()
-    kept = follow_config(
+    kept = apply_config_to_optimizer_state(
         saved,
         network().parameters,
         partial(Adam, lr=0.1, **change),
@@ -70,10 +70,10 @@ def test_the_state_of_another_optimiser_is_dropped_and_said(other, kept):
     saved = checkpoint(partial(Adam, lr=1e-3))
     net = network()
     if kept:
-        assert follow_config(saved, net.parameters, other, None)
+        assert apply_config_to_optimizer_state(saved, net.parameters, other, None)
     else:
         with pytest.warns(UserWarning, match="ckpt holds the state of another optimiser"):
-            assert not follow_config(saved, net.parameters, other, None)
+            assert not apply_config_to_optimizer_state(saved, net.parameters, other, None)
     optimizer = other(net.parameters())
     optimizer.load_state_dict(saved["optimizer_states"][0])
     assert bool(optimizer.state) == kept and saved["lr_schedulers"] == []
@@ -107,8 +107,8 @@ def test_a_run_that_goes_on_obeys_its_config(before, after, rate, schedules, tmp
 
 def test_fewer_steps_than_were_taken_are_refused():
     for allowed in (-1, STEPS, STEPS + 1):
-        check_steps(allowed, STEPS)
+        check_max_steps(allowed, STEPS)
     with pytest.raises(
         ValueError, match="trainer.max_steps must be >= 4, the steps of ckpt, got 2"
     ):
-        check_steps(2, STEPS)
+        check_max_steps(2, STEPS)

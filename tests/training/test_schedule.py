@@ -159,7 +159,7 @@ def test_what_goes_on_with_another_loss_has_not_collapsed(three_hours, tmp_path)
     before, now = three_hours / "now/net.safetensors", tmp_path / "now.safetensors"
     card = files.read_card(before)
     card["curve"][-1]["loss"] = 1e-6
-    files.save(now, files.load(before), files.network_spec(before), card)
+    files.save(now, files.load(before), files.read_network_spec(before), card)
     run(tmp_path / "second", "train_hours=6", f"ckpt={now}")
     assert len(curve(tmp_path / "second")) == len(card["curve"]) + 1
 

@@ -7,21 +7,21 @@ from src.training.step_guard import NonFiniteError, StepGuard
 
 
 def test_a_spike_counts_no_more_than_the_median():
-    guard = StepGuard(10.0, least=4)
+    guard = StepGuard(10.0, min_losses=4)
     assert [guard.gradient_scale(loss) for loss in (1.0, 2.0, 500.0, 3.0)] == [1.0] * 4
     assert guard.gradient_scale(100.0) == pytest.approx(2.5 / 100)
     assert list(guard.losses)[-1] == 2.5, "a spike must not become usual"
     assert guard.gradient_scale(24.0) == 1.0
-    off = StepGuard(None, least=1)
+    off = StepGuard(None, min_losses=1)
     assert [off.gradient_scale(loss) for loss in (1.0, 1e9)] == [1.0, 1.0]
 
 
 def test_gradients_are_limited_by_both():
-    guard, loss = StepGuard(10.0, 0.5, least=1), torch.tensor(1.0)
+    guard, loss = StepGuard(10.0, 0.5, min_losses=1), torch.tensor(1.0)
     first, second = [torch.full((4,), 1.0)], [torch.full((4,), 1.0)]
-    guard.limit(first, loss, 0, [])
+    guard.check_and_scale(first, loss, 0, [])
     assert float(first[0].norm()) == pytest.approx(0.5)
-    guard.limit(second, 100 * loss, 1, [])
+    guard.check_and_scale(second, 100 * loss, 1, [])
     assert float(second[0].norm()) == pytest.approx(0.02), "after the spike it is short enough"
 
 
@@ -35,7 +35,9 @@ def test_factors_that_would_always_act_are_refused():
 def test_the_error_names_the_clips():
     clips = [{"clip": 14, "threshold": 0.2}, {"clip": 15}]
     with pytest.raises(NonFiniteError, match="step 7.*'threshold': 0.2") as caught:
-        StepGuard().limit([torch.zeros(2)], torch.tensor(float("nan")), 7, clips)
+        StepGuard().check_and_scale([torch.zeros(2)], torch.tensor(float("nan")), 7, clips)
     assert caught.value.clips == [14, 15]
     with pytest.raises(NonFiniteError, match="a gradient is not finite"):
-        StepGuard().limit([torch.tensor([1.0, float("inf")])], torch.tensor(1.0), 7, clips)
+        StepGuard().check_and_scale(
+            [torch.tensor([1.0, float("inf")])], torch.tensor(1.0), 7, clips
+        )

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from src.bench.candidates import Candidate
 from src.bench.stress_tests.event_clips import ClipConditions, EventClip, StressBench, require_type
-from src.bench.stress_tests.stress_results import StressResult, worst_loss
+from src.bench.stress_tests.stress_results import StressResult, build_worst_loss_result
 from src.metrics.image import aligned_psnr
 from src.sim import noise
 from src.sim.optics import centre_view_index, layout
@@ -32,11 +32,14 @@ def measure_worst_psnr_loss(
     d_over_r0, `sensor.<argument>` of EventSensor or `turbulence.<argument>` of SimulatedTurbulence.
     `fixed` is set with every value; the loss is against clips of the `reference` settings.
     """
-    base, curve = bench.psnr(network, ClipConditions.from_settings(reference or {})), []
+    base, curve = (
+        bench.mean_aligned_psnr(network, ClipConditions.from_settings(reference or {})),
+        [],
+    )
     for value in values:
         conditions = ClipConditions.from_settings({parameter: value, **(fixed or {})})
-        curve.append((value, base - bench.psnr(network, conditions)))
-    return worst_loss(curve, limit_db=limit_db, varied=parameter)
+        curve.append((value, base - bench.mean_aligned_psnr(network, conditions)))
+    return build_worst_loss_result(curve, limit_db=limit_db, varied=parameter)
 
 
 def measure_correlated_views_loss(
@@ -56,7 +59,9 @@ def measure_correlated_views_loss(
         fixed={"turbulence.views_correlation": "baseline"},
     )  # fmt: skip
     curve = [(spacing, loss) for spacing, (_, loss) in zip(spacings, found.curve, strict=True)]
-    return worst_loss(curve, limit_db=limit_db, varied="sub-aperture spacing in diameters")
+    return build_worst_loss_result(
+        curve, limit_db=limit_db, varied="sub-aperture spacing in diameters"
+    )
 
 
 def measure_window_rate_loss(
@@ -86,7 +91,7 @@ def measure_window_rate_loss(
         own = score(clip, clip.fps)
         totals += torch.tensor([own - score(clip, rate_hz) for rate_hz in rates_hz])
     curve = list(zip(rates_hz, (totals / len(bench.clips())).tolist(), strict=True))
-    return worst_loss(curve, limit_db=limit_db, varied="windows a second")
+    return build_worst_loss_result(curve, limit_db=limit_db, varied="windows a second")
 
 
 def measure_event_dropout_loss(
@@ -100,7 +105,7 @@ def measure_event_dropout_loss(
         generator = noise.generator(noise.key("probes", "share", str(share)))
         return lambda voxels: voxels * (torch.rand(voxels.shape, generator=generator) < share)
 
-    curve = bench.psnr_losses(network, {share: thin(share) for share in kept_shares})
+    curve = bench.aligned_psnr_losses(network, {share: thin(share) for share in kept_shares})
     return StressResult(curve[-1][1], "dB", limit_db, curve, "share of events kept")
 
 
@@ -120,14 +125,14 @@ def measure_view_dropout_loss(
     A network that takes any number of views is given the others; one of a fixed number sees zeros.
     """
     require_views(network, max(counts) + 1)
-    base, rng, curve = bench.psnr(network), np.random.default_rng(0), []
+    base, rng, curve = bench.mean_aligned_psnr(network), np.random.default_rng(0), []
     middle = centre_view_index(layout(network.views))
     for count in counts:
         lost = [rng.permutation(network.views)[:count].tolist() for _ in range(draws)]
         lost[0] = [middle, *(v for v in lost[0] if v != middle)][:count]  # the centre view, too
         losses = [base - _psnr_without_views(network, bench, views) for views in lost]
         curve.append((count, max(losses)))
-    return worst_loss(curve, limit_db=limit_db, varied="views lost")
+    return build_worst_loss_result(curve, limit_db=limit_db, varied="views lost")
 
 
 def _psnr_without_views(network: Candidate, bench: StressBench, lost: list[int]) -> float:
@@ -144,7 +149,7 @@ def _psnr_without_views(network: Candidate, bench: StressBench, lost: list[int])
                 given, views = positions, views.index_fill(1, torch.tensor(lost), 0.0)
             frame, state = network.step(views, state, given, 1 / clip.fps)
             frames.append(frame)
-        scores.append(bench.score(torch.cat(frames), clip))
+        scores.append(bench.clip_aligned_psnr(torch.cat(frames), clip))
     return fmean(scores)
 
 
@@ -165,7 +170,7 @@ def measure_view_shift_loss(
         everywhere = {i: (px * row, px * col) for i, (row, col) in enumerate(positions)}
         shifts = everywhere if parallax else {moved: (0, px)}
         changes[px] = partial(shift_views, shifts_px=shifts)
-    curve = bench.psnr_losses(network, changes)
+    curve = bench.aligned_psnr_losses(network, changes)
     return StressResult(dict(curve)[judged_px], "dB", limit_db, curve, "px of shift")
 
 

@@ -40,15 +40,15 @@ Video = Float[Tensor, "windows 1 h w"]
 class ClipConditions:
     """How a clip differs from the standard one.
 
-    `d_over_r0`: turbulence strength, 0 for none (None: as drawn).  `moving_share`: the share of the
-    clip after which the scene stands still.  `view_gain_std`: standard deviation of each view's log
-    gain, an AR(1) process over frames.  `turbulence`, `sensor`: arguments of SimulatedTurbulence
-    and EventSensor that are replaced.
+    `d_over_r0`: turbulence strength, 0 for none (None: as drawn).  `stop_after_share`: the share of
+    the clip after which the scene stands still.  `view_log_gain_std`: standard deviation of each
+    view's log gain, an AR(1) process over frames.  `turbulence`, `sensor`: arguments of
+    SimulatedTurbulence and EventSensor that are replaced.
     """
 
     d_over_r0: float | None = None
-    moving_share: float = 1.0
-    view_gain_std: float = 0.0
+    stop_after_share: float = 1.0
+    view_log_gain_std: float = 0.0
     turbulence: Mapping[str, Any] = field(default_factory=dict)
     sensor: Mapping[str, Any] = field(default_factory=dict)
 
@@ -130,8 +130,8 @@ def simulate_event_clip(pipeline: Pipeline, index: int, conditions: ClipConditio
         simulated = require_type("turbulence", pipeline.turbulence, SimulatedTurbulence)
         options = simulated.options | dict(conditions.turbulence)
         variant.turbulence = SimulatedTurbulence(simulated.atmosphere, **options)
-    if conditions.moving_share < 1:
-        last = int(conditions.moving_share * (len(draw.clip.frames) - 1))
+    if conditions.stop_after_share < 1:
+        last = int(conditions.stop_after_share * (len(draw.clip.frames) - 1))
         kept = torch.arange(len(draw.clip.frames)).clamp(max=last)
         draw = replace(draw, clip=replace(draw.clip, frames=draw.clip.frames[kept]))
     if conditions.d_over_r0 == 0:
@@ -141,8 +141,8 @@ def simulate_event_clip(pipeline: Pipeline, index: int, conditions: ClipConditio
             raise ValueError("turbulence must be on for a stress test of its strength, got none")
         draw = replace(draw, turbulence=draw.turbulence.with_d_over_r0(conditions.d_over_r0))
     views = variant.render_views([draw])[0]
-    if conditions.view_gain_std:
-        views = _apply_gain(views, conditions.view_gain_std, noise.key(draw.key, "gain"))
+    if conditions.view_log_gain_std:
+        views = _apply_gain(views, conditions.view_log_gain_std, noise.key(draw.key, "gain"))
     changes = {"threshold": draw.sensor.threshold} | dict(conditions.sensor)
     sensor = replace(require_type("sensor", pipeline.sensor, EventSensor), **changes)
     fps, ids = draw.clip.fps, pipeline.optics.random_key_ids
@@ -191,7 +191,7 @@ class StressBench:
             self._clips[name] = [simulate(index) for index in self.indices]
         return self._clips[name]
 
-    def psnr(
+    def mean_aligned_psnr(
         self, network: Candidate, conditions: ClipConditions = ClipConditions(),
         change: Callable[[Tensor], Tensor] | None = None,
     ) -> float:  # fmt: skip
@@ -206,18 +206,20 @@ class StressBench:
         scores = []
         for clip in self.clips(conditions):
             windows = map(change, clip.windows()) if change else clip.windows()
-            scores.append(self.score(clip.reconstruct(network, windows)[0], clip))
+            scores.append(self.clip_aligned_psnr(clip.reconstruct(network, windows)[0], clip))
         if change is None:
             self._psnr[key] = fmean(scores)
         return fmean(scores)
 
-    def psnr_losses(
+    def aligned_psnr_losses(
         self, network: Candidate, changes: Mapping[Any, Callable[[Tensor], Tensor]]
     ) -> Curve:
         """Return (setting, dB lost) for each change of the windows of the standard clips."""
-        base = self.psnr(network)
-        return [(name, base - self.psnr(network, change=c)) for name, c in changes.items()]
+        base = self.mean_aligned_psnr(network)
+        return [
+            (name, base - self.mean_aligned_psnr(network, change=c)) for name, c in changes.items()
+        ]
 
-    def score(self, frames: Video, clip: EventClip) -> float:
+    def clip_aligned_psnr(self, frames: Video, clip: EventClip) -> float:
         """Return the mean aligned PSNR of the frames after the warm-up."""
         return float(aligned_psnr(frames[self.warmup :], clip.truth[self.warmup :]).mean())

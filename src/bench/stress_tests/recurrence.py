@@ -12,7 +12,7 @@ from torch import Tensor
 
 from src.bench.candidates import Candidate
 from src.bench.stress_tests.event_clips import ClipConditions, StressBench
-from src.bench.stress_tests.stress_results import StressResult, mean_result
+from src.bench.stress_tests.stress_results import StressResult, build_mean_result
 from src.deploy.forms import convert_to_form
 from src.metrics.image import aligned_psnr
 from src.metrics.temporal import temporal_jitter_px
@@ -71,45 +71,45 @@ def measure_convergence_windows(
     a clip that never gets there counts its length.
     """
     scores = [aligned_psnr(clip.reconstruct(network)[0], clip.truth) for clip in bench.clips()]
-    return mean_result(
-        [measure_settling_time(s, within_db) for s in scores], "windows", limit_windows
+    return build_mean_result(
+        [count_settling_windows(s, within_db) for s in scores], "windows", limit_windows
     )
 
 
 def measure_flicker_recovery(
-    network: Candidate, bench: StressBench, *, limit_windows: float, length: int = 10,
-    events: float = 3.0, within_db: float = 1.0,
+    network: Candidate, bench: StressBench, *, limit_windows: float, flicker_windows: int = 10,
+    events_per_pixel: float = 3.0, within_db: float = 1.0,
 ) -> StressResult:  # fmt: skip
-    """Return the windows until the frame is back within `within_db` after `length` windows in which
-    every pixel makes `events` ON events, in the next as many OFF events.
+    """Return the windows until the frame is back within `within_db` after `flicker_windows`
+    windows in which every pixel makes `events_per_pixel` ON events, in the next as many OFF events.
     """
     times = []
     for clip in bench.clips():
         windows, truth = list(clip.windows()), clip.truth
         half = len(windows) // 2
-        flash = torch.full_like(windows[0], events / windows[0].shape[2])
-        flashes = [(-1) ** k * flash for k in range(length)]
+        flash = torch.full_like(windows[0], events_per_pixel / windows[0].shape[2])
+        flashes = [(-1) ** k * flash for k in range(flicker_windows)]
         plain, _ = clip.reconstruct(network, windows)
         disturbed, _ = clip.reconstruct(network, chain(windows[:half], flashes, windows[half:]))
-        after = aligned_psnr(disturbed[half + length :], truth[half:])
+        after = aligned_psnr(disturbed[half + flicker_windows :], truth[half:])
         losses = aligned_psnr(plain[half:], truth[half:]) - after
-        times.append(windows_to_last_exceedance(losses, within_db))
-    return mean_result(times, "windows", limit_windows)
+        times.append(count_windows_to_last_exceedance(losses, within_db))
+    return build_mean_result(times, "windows", limit_windows)
 
 
 def measure_static_scene_jitter_percent(
-    network: Candidate, bench: StressBench, *, limit_percent: float, moving_share: float = 0.0
+    network: Candidate, bench: StressBench, *, limit_percent: float, stop_after_share: float = 0.0
 ) -> StressResult:
     """Return the temporal jitter of a static scene's video, in % of what turbulence does to one
     view.
 
-    `moving_share`: the share of the clip in which the scene moves before it stops; at 0 all events
-    come from turbulence.  At 100 % the light of one view would be as steady.
+    `stop_after_share`: the share of the clip in which the scene moves before it stops; at 0 all
+    events come from turbulence.  At 100 % the light of one view would be as steady.
     """
     shares = []
-    for clip in bench.clips(ClipConditions(moving_share=moving_share)):
+    for clip in bench.clips(ClipConditions(stop_after_share=stop_after_share)):
         truth = clip.truth
-        start = int(moving_share * len(truth)) + bench.warmup
+        start = int(stop_after_share * len(truth)) + bench.warmup
         if start > len(truth) - 2:
             raise ValueError(f"data.test_windows must be > {start + 1}, got {len(truth)}")
         one_view, ours = (
@@ -117,17 +117,17 @@ def measure_static_scene_jitter_percent(
             for video in (clip.turbulent[1:, None].clone(), clip.reconstruct(network)[0])
         )
         shares.append(100 * float(ours / one_view.clamp(min=1e-9)))
-    return mean_result(shares, "%", limit_percent)
+    return build_mean_result(shares, "%", limit_percent)
 
 
 def measure_perturbation_growth(
     network: Candidate, bench: StressBench, *, limit_growth_per_window: float,
-    perturbation_rms: float = 1e-3, skip: int = 3,
+    perturbation_rms: float = 1e-3, skipped_windows: int = 3,
 ) -> StressResult:  # fmt: skip
     """Return the growth exponent, per window, of a perturbation of `perturbation_rms` in one.
 
     Fitted to the logarithm of the rms difference of the frames (a Lyapunov exponent); above 0 the
-    perturbation grows.  The first `skip` windows after it do not count.
+    perturbation grows.  The first `skipped_windows` windows after it do not count.
     """
     exponents = []
     for clip in bench.clips():
@@ -139,10 +139,12 @@ def measure_perturbation_growth(
         plain, _ = clip.reconstruct(network, windows)
         changed = [*windows[:start], perturbed, *windows[start + 1 :]]
         other, _ = clip.reconstruct(network, changed)
-        difference = (plain - other)[start + skip :].double().square().mean((1, 2, 3)).sqrt()
+        difference = (
+            (plain - other)[start + skipped_windows :].double().square().mean((1, 2, 3)).sqrt()
+        )
         logs = difference.clamp(min=1e-12).log()
         exponents.append(float(np.polyfit(np.arange(len(logs)), logs.numpy(), 1)[0]))
-    return mean_result(exponents, "per window", limit_growth_per_window)
+    return build_mean_result(exponents, "per window", limit_growth_per_window)
 
 
 def measure_adversarial_gain(
@@ -199,16 +201,16 @@ def measure_bf16_psnr_difference(
     return StressResult(gaps[-1], "dB", limit_db, curve, "windows")
 
 
-def measure_settling_time(scores: Float[Tensor, " windows"], within_db: float) -> float:
+def count_settling_windows(scores: Float[Tensor, " windows"], within_db: float) -> float:
     """Return the first window from which on the scores, averaged over five windows, stay within
     `within_db` of the mean of their second half.
     """
     plateau = scores[len(scores) // 2 :].mean()
     smooth = scores.unfold(0, 5, 1).mean(1) if len(scores) >= 5 else scores
-    return windows_to_last_exceedance(plateau - smooth[: len(scores) // 2], within_db)
+    return count_windows_to_last_exceedance(plateau - smooth[: len(scores) // 2], within_db)
 
 
-def windows_to_last_exceedance(losses: Float[Tensor, " windows"], limit: float) -> float:
+def count_windows_to_last_exceedance(losses: Float[Tensor, " windows"], limit: float) -> float:
     """Return how many windows pass until `losses` is above `limit` for the last time."""
     beyond = (losses > limit).nonzero()
     return float(beyond[-1] + 1) if len(beyond) else 0.0

@@ -10,7 +10,7 @@ import numpy as np
 from src.bench.candidates import Candidate
 from src.bench.stress_tests.event_clips import EventClip, StressBench, require_type
 from src.bench.stress_tests.stress_results import StressResult
-from src.metrics.invented_contrast import find_unseen, invented_contrast
+from src.metrics.invented_contrast import find_unseen_pixels, invented_contrast
 from src.recordings.noise_filter import find_supported_pixels
 from src.sim.optics import layout
 from src.sim.scenes.photographs import Photographs
@@ -60,4 +60,4 @@ def _invented_contrast(network: Candidate, clip: EventClip) -> float:
     height, width = clip.target.shape[-2:]
     seen = [find_supported_pixels([events], (height, width)) for events in clip.events]
     frames, _ = clip.reconstruct(replace(network, views=len(clip.positions)))
-    return invented_contrast(frames[-1, 0].numpy(), find_unseen(np.any(seen, axis=0)))
+    return invented_contrast(frames[-1, 0].numpy(), find_unseen_pixels(np.any(seen, axis=0)))

@@ -42,12 +42,12 @@ class StressResult:
 StressTest = Callable[[Candidate, StressBench], StressResult]
 
 
-def worst_loss(curve: Curve, *, limit_db: float, varied: str) -> StressResult:
+def build_worst_loss_result(curve: Curve, *, limit_db: float, varied: str) -> StressResult:
     """Return the result whose value is the largest of the curve, in dB."""
     return StressResult(max(value for _, value in curve), "dB", limit_db, curve, varied)
 
 
-def mean_result(values: Sequence[float], unit: str, limit: float) -> StressResult:
+def build_mean_result(values: Sequence[float], unit: str, limit: float) -> StressResult:
     """Return the result whose value is the mean over clips."""
     return StressResult(fmean(values), unit, limit)
 
@@ -66,7 +66,7 @@ def run_stress_tests(
     on the standard clips (None: the network does not run).
     """
     if candidate.network is None or not candidate.trained:
-        reason = candidate.missing
+        reason = candidate.missing_reason
         reason = reason if candidate.network is None else f"it has no weights: {reason}"
         return dict.fromkeys(tests, reason), None
     outcomes: dict[str, Outcome] = {}
@@ -77,7 +77,7 @@ def run_stress_tests(
             outcomes[name] = test(candidate, bench)
         except ValueError as error:
             outcomes[name] = str(error)
-    return outcomes, bench.psnr(candidate)
+    return outcomes, bench.mean_aligned_psnr(candidate)
 
 
 def format_outcomes_csv(outcomes: Outcomes, titles: Mapping[str, str]) -> str:

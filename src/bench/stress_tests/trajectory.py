@@ -29,18 +29,18 @@ def measure_trajectory_deviation(
     """
 
     def deviation(clip: EventClip) -> float:
-        return measure_deviation(clip.reconstruct(network)[0][:, 0], clip.target[1:])
+        return measure_track_deviation_px(clip.reconstruct(network)[0][:, 0], clip.target[1:])
 
     clips = bench.clips()
     without = fmean(map(deviation, bench.clips(ClipConditions(d_over_r0=0.0))))
-    light = fmean(measure_deviation(c.turbulent[1:], c.target[1:]) for c in clips)
+    light = fmean(measure_track_deviation_px(c.turbulent[1:], c.target[1:]) for c in clips)
     deviations = list(map(deviation, clips))
     named = [(f"clip {n}", d) for n, d in zip(bench.indices, deviations, strict=True)]
     curve = [("no turbulence", without), ("light of one view", light), *named]
     return StressResult(fmean(deviations), "px", limit_px, curve, "video")
 
 
-def measure_deviation(frames: Film, truth: Film) -> float:
+def measure_track_deviation_px(frames: Film, truth: Film) -> float:
     """Return the rms distance, in pixels, of the front in `frames` from its line in `truth`.
 
     Raises ValueError for fewer than four frames that count.

@@ -49,7 +49,7 @@ def read_activity_pictures(
         return 255 * videos.read_gray_picture(path)[None, None].astype(np.float32)
     if not sources.has_events(path):
         return _average_film(videos.read_video(path))
-    size = sources.sensor_size(path, sensor, options)
+    size = sources.find_sensor_size(path, sensor, options)
     return _count_events(sources.iter_recording(path, size, FIRST_WINDOW_US * 1e-6, options), size)
 
 

@@ -53,16 +53,16 @@ def measure_lateness(t, latest):
 
 
 @njit(nogil=True, cache=True)
-def label_events(t, first, latest, count, buffer_us, few, at_end, labels):
+def label_events(t, first, latest, count, buffer_us, min_part_events, at_end, labels):
     """Write KEPT or DROPPED to `labels` of events in their order; return (decided, latest, count,
     restarted): those from `decided` on wait for what follows or, `restarted`, for another clock.
 
     `first`, `latest`, `count` are of the events kept so far.  An event within `buffer_us` of the
     latest is kept.  One further away opens a challenge: it and those that go on from it are rivals,
-    those that go on from the latest return.  `few` rivals win: later ones are kept as after a
-    silence, earlier ones are a clock that restarts.  Returned events win when they are as many.
-    The others are outliers.  `at_end` nothing follows: later rivals win, unless they are few and
-    far (LAST_GAP), earlier ones are outliers.
+    those that go on from the latest return.  `min_part_events` rivals win: later ones are kept as
+    after a silence, earlier ones are a clock that restarts.  Returned events win when they are as
+    many.  The others are outliers.  `at_end` nothing follows: later rivals win, unless they are few
+    and far (LAST_GAP), earlier ones are outliers.
     """
     i, begin, aside = 0, -1, -1  # the challenge, and the first event in it that is neither
     later, rival, ours, rivals, returned = False, latest, latest, 0, 0
@@ -85,17 +85,19 @@ def label_events(t, first, latest, count, buffer_us, few, at_end, labels):
                 else:
                     labels[i], aside = NEITHER, i if aside < 0 else aside
             i += 1
-            if begin >= 0 and (rivals >= few or returned >= rivals):
+            if begin >= 0 and (rivals >= min_part_events or returned >= rivals):
                 break
         if begin < 0:
             return t.size, latest, count, False
-        if i == t.size and rivals < few and returned < rivals and not at_end:
+        if i == t.size and rivals < min_part_events and returned < rivals and not at_end:
             return begin, latest, count, False
         gap = t[begin] - latest
-        wins = rivals >= few or (at_end and returned < rivals and later)
-        if rivals >= few and (not later or (count < few and gap > ALONE_US)):
+        wins = rivals >= min_part_events or (at_end and returned < rivals and later)
+        if rivals >= min_part_events and (
+            not later or (count < min_part_events and gap > ALONE_US)
+        ):
             return begin, latest, count, True
-        if rivals < few and gap > max(LAST_GAP_US, LAST_GAP * (latest - first)):
+        if rivals < min_part_events and gap > max(LAST_GAP_US, LAST_GAP * (latest - first)):
             wins = wins and rivals * 100 > count
         winner, end = (RIVAL, i) if wins else (RETURNED, i if aside < 0 else aside)
         for k in range(begin, end):
@@ -124,7 +126,7 @@ def sort_slightly_late(t, order, most_moves):
 
 
 @njit(nogil=True, cache=True)
-def find_supported(t, x, y, latest_us, support_us, kept):
+def mark_supported_events(t, x, y, latest_us, support_us, kept):
     """Write to `kept` which events are supported, and their times to `latest_us` (h + 2, w + 2)."""
     for i in range(t.size):
         row, column = y[i] + 1, x[i] + 1

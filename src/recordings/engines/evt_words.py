@@ -2,7 +2,7 @@
 
 Time comes in two words: its high bits alone, which count on from 0 when they are full, and its low
 bits.  Before the first high bits the time of an event is not known: it is counted, not given out.
-`state` is carried from block to block, (8,) int64 from `new_state`.
+`state` is carried from block to block, (8,) int64 from `new_decoder_state`.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ BASE, HIGH, LOW, ROW, COLUMN, ON, TRIGGERS, LOST = range(8)  # places in `state`
 TIME, TRIGGER = 8, 10  # kinds of words: high bits of time, an edge on a trigger input
 
 
-def new_state() -> np.ndarray:
+def new_decoder_state() -> np.ndarray:
     """Return the state before a file's first word."""
     state = np.zeros(8, np.int64)
     state[HIGH] = -1

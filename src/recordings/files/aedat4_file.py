@@ -20,7 +20,7 @@ import numpy as np
 from src.recordings.files.clocks import merge_small_pieces
 from src.recordings.files.event_file import EventFile, RawEvents, ReadOptions
 from src.recordings.files.streams import EventStream, choose_stream
-from src.recordings.files.unpacking import LARGEST_PACKET, unpack
+from src.recordings.files.unpacking import LARGEST_PACKET, decompress
 
 MAGIC = b"#!AER-DAT4.0\r\n"
 DEEPEST = 50  # elements within each other in a description; cameras write five
@@ -79,7 +79,7 @@ class Aedat4File(EventFile):
             if stream == self._id:
                 try:
                     packing = PACKINGS.get(self._header.compression)
-                    events = _read_events(unpack(packet, packing) if packing else packet)
+                    events = _read_events(decompress(packet, packing) if packing else packet)
                 except Exception as error:  # the libraries raise all kinds
                     raise ValueError(f"{self.path}: cannot be decoded: {error}") from error
                 yield RawEvents(*(events[name] for name in "txyp"))

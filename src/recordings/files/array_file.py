@@ -10,11 +10,11 @@ import numpy as np
 from src.recordings.files.columns import (
     as_integers,
     as_times,
-    check_claim,
     check_lengths,
+    check_unpacked_size,
     find_columns,
-    match_columns,
-    pick_columns,
+    find_columns_by_name,
+    find_keys_by_name,
 )
 from src.recordings.files.event_file import PIECE_EVENTS, EventFile, RawEvents, ReadOptions
 from src.recordings.files.streams import EventStream, choose_stream
@@ -33,7 +33,7 @@ class ArrayFile(EventFile):
                 self._columns = split_table(np.load(path, mmap_mode="r"), options.columns)
             else:
                 with zipfile.ZipFile(path) as archive:
-                    check_claim(path, sum(part.file_size for part in archive.infolist()))
+                    check_unpacked_size(path, sum(part.file_size for part in archive.infolist()))
                 with np.load(path) as file:
                     self.size = _stated_size(file)
                     self._columns, self.notes = _columns_of(path, file, options)
@@ -54,7 +54,7 @@ def split_table(table: Any, order: str | None) -> dict[str, Any]:
     slices can be taken; `order`: columns=.  Raises ValueError for another array."""
     names = table.dtype.names
     if names is not None:
-        keys = pick_columns(dict.fromkeys(names))
+        keys = find_keys_by_name(dict.fromkeys(names))
         if keys is None or table.ndim != 1:
             raise ValueError(f"fields must be t, x, y, p of one dimension, got {', '.join(names)}")
         return {name: _Field(table, key) for name, key in keys.items()}
@@ -116,7 +116,7 @@ def _columns_of(
     path: Path, file: Any, options: ReadOptions
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Return the columns t, x, y, p of an .npz, and a note of other arrays of events in it."""
-    keys = pick_columns(dict.fromkeys(file.files))
+    keys = find_keys_by_name(dict.fromkeys(file.files))
     if keys is not None:
         columns = {name: _flat(file[key]) for name, key in keys.items()}
         if any(column.ndim != 1 for column in columns.values()):
@@ -134,7 +134,9 @@ def _columns_of(
 
 def _is_table(table: np.ndarray) -> bool:
     fields = table.dtype.names
-    return bool(fields and match_columns(fields)) or (table.ndim == 2 and table.shape[1] == 4)
+    return bool(fields and find_columns_by_name(fields)) or (
+        table.ndim == 2 and table.shape[1] == 4
+    )
 
 
 def _flat(column: np.ndarray) -> np.ndarray:

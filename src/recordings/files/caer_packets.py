@@ -16,7 +16,7 @@ TIME_HIGH, TIME_LOW, COLUMN, ROW, FIRST_ROW, ROWS = range(6)  # kinds of words o
 CLOCK_BITS = 31  # of libcaer's microseconds
 
 
-def split_libcaer(words: np.ndarray, start_ns: int) -> RawEvents:
+def decode_libcaer(words: np.ndarray, start_ns: int) -> RawEvents:
     """Return the events of a packet (2 n,) uint32, times in nanoseconds; raises ValueError for a
     packet that ends within an event."""
     pixel, t = words.reshape(-1, 2).T
@@ -25,7 +25,7 @@ def split_libcaer(words: np.ndarray, start_ns: int) -> RawEvents:
     return RawEvents(times * 1000 + start_ns, x, y, pixel >> 1 & 1)
 
 
-def split_libcaer_cmp(words: np.ndarray, start_ns: int) -> RawEvents:
+def decode_compressed_libcaer(words: np.ndarray, start_ns: int) -> RawEvents:
     """Return the events of a packet (n,) uint16, times in nanoseconds; raises ValueError for words
     of another kind and events without a place."""
     kinds, values = words >> 12, (words & 0xFFF).astype(np.int64)

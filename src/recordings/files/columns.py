@@ -18,7 +18,7 @@ UNIT = re.compile(r"[ _]?[\[(]?(us|µs|μs|ns|ms|s|sec|seconds|px|pixel|pixels)[
 TIME_UNIT = re.compile(r"[ _\[(](us|µs|μs|ns|ms|s|sec|seconds)[\])]?$")
 
 
-def match_columns(names: Sequence[str]) -> dict[str, int] | None:
+def find_columns_by_name(names: Sequence[str]) -> dict[str, int] | None:
     """Return the place of t, x, y and p among column names of any case, or None.
 
     A name may end in its unit (`timestamp_us`) or state the sensor's side (`x@640`).
@@ -33,20 +33,20 @@ def match_columns(names: Sequence[str]) -> dict[str, int] | None:
     return places
 
 
-def pick_columns(table: Mapping[str, Any]) -> dict[str, str] | None:
+def find_keys_by_name(table: Mapping[str, Any]) -> dict[str, str] | None:
     """Return the keys of t, x, y and p in a mapping, or None."""
     keys = list(table)
-    places = match_columns(keys)
+    places = find_columns_by_name(keys)
     return None if places is None else {letter: keys[place] for letter, place in places.items()}
 
 
-def stated_unit(name: str) -> str | None:
+def parse_unit_suffix(name: str) -> str | None:
     """Return the unit that the name of a column of times ends in (`t_ns`, `time [ms]`), or None."""
     found = TIME_UNIT.search(name.strip().strip("\"'").lower())
     return None if found is None else {"n": "ns", "m": "ms", "s": "s"}.get(found[1][0], "us")
 
 
-def stated_columns(order: str, width: int) -> dict[str, int]:
+def parse_column_order(order: str, width: int) -> dict[str, int]:
     """Return the places that `columns=` states; raises ValueError where a table is too narrow."""
     places = {letter: order.index(letter) for letter in "txyp"}
     if max(places.values()) >= width:
@@ -54,7 +54,7 @@ def stated_columns(order: str, width: int) -> dict[str, int]:
     return places
 
 
-def guess_columns(sample: np.ndarray) -> dict[str, int]:
+def find_columns_by_values(sample: np.ndarray) -> dict[str, int]:
     """Return the places of t, x, y and p in a table without names, by its values (rows, columns).
 
     Polarity is -1, 0 or 1 throughout; coordinates are whole numbers in 0..65535; time is what
@@ -86,7 +86,11 @@ def guess_columns(sample: np.ndarray) -> dict[str, int]:
 
 def find_columns(sample: np.ndarray, order: str | None) -> dict[str, int]:
     """Return the places of t, x, y and p: as `order` states them, or by the values."""
-    return guess_columns(sample) if order is None else stated_columns(order, sample.shape[1])
+    return (
+        find_columns_by_values(sample)
+        if order is None
+        else parse_column_order(order, sample.shape[1])
+    )
 
 
 def as_times(t: np.ndarray) -> np.ndarray:
@@ -121,7 +125,7 @@ def check_lengths(columns: Mapping[str, Any]) -> None:
         raise ValueError(f"columns t, x, y, p differ in length: {lengths}")
 
 
-def check_claim(path: Path, size: int) -> None:
+def check_unpacked_size(path: Path, size: int) -> None:
     """Raise ValueError for a file that unpacks to more than MAX_PACKING times its size."""
     most = MAX_PACKING * path.stat().st_size + 2**24
     if size > most:

@@ -1,10 +1,10 @@
 """One rule for events that come out of order, in files and live.
 
-Events up to `buffer_us` late are sorted, in their order where times are equal.  Fewer than `few`
-events with times further from those around them are outliers: dropped and counted.  More of them
-earlier are a clock that restarts and begin another part; later ones are a silence.  A file is
-refused where more than MAX_DROPPED of its events are outliers, or its clock restarts more than
-MAX_PARTS times.
+Events up to `buffer_us` late are sorted, in their order where times are equal.  Fewer than
+`min_part_events` events with times further from those around them are outliers: dropped and
+counted.  More of them earlier are a clock that restarts and begin another part; later ones are a
+silence.  A file is refused where more than MAX_DROPPED of its events are outliers, or its clock
+restarts more than MAX_PARTS times.
 """
 
 import math
@@ -23,8 +23,8 @@ from src.recordings.engines.event_passes import (
 from src.recordings.files.event_arrays import (
     concatenate_events,
     count_before,
+    event_times,
     sort_events,
-    times_of,
 )
 
 BUFFER_US = 50_000  # by which events may be late
@@ -44,16 +44,20 @@ class ClockPart:
     last_us: int = LONG_AGO_US
 
 
-class EventOrder:
+class EventSorter:
     """Takes events (n,) EVENT, or times (n,) int64 us alone, as they come; gives them in order.
 
-    `part`: the one that is given, 0 the first; None: always the newest, of which no event goes
-    before `release` is called (live).  `parts`, `dropped`, `late` (events that were sorted) and
-    `most_late_us` tell what was found.
+    `kept_part`: the number of the one part that is given, 0 the first; None: always the newest, of
+    which no event goes before `release` is called (live).  `parts`, `dropped`, `late` (events that
+    were sorted) and `most_late_us` tell what was found.
     """
 
-    def __init__(self, buffer_us: int = BUFFER_US, few: int = FEW_EVENTS, part: int | None = 0):
-        self.buffer_us, self.few, self._part = buffer_us, few, part
+    def __init__(
+        self, buffer_us: int = BUFFER_US, min_part_events: int = FEW_EVENTS,
+        kept_part: int | None = 0,
+    ):  # fmt: skip
+        self.buffer_us, self.min_part_events = buffer_us, min_part_events
+        self._kept_part = kept_part
         self.parts, self.count = [ClockPart()], 0
         self.dropped = self.late = self.most_late_us = 0
         self._undecided: np.ndarray | None = None
@@ -67,32 +71,32 @@ class EventOrder:
 
     def add(self, events: np.ndarray) -> list[np.ndarray]:
         """Take events; return those that are in order for good."""
-        start = 2 * self.few
-        if self.parts[-1].count < self.few and len(events) > 2 * start:
+        start = 2 * self.min_part_events
+        if self.parts[-1].count < self.min_part_events and len(events) > 2 * start:
             return [*self.add(events[:start]), *self.add(events[start:])]
         self.count += len(events)
         if self._undecided is not None:
             events = concatenate_events([self._undecided, events])
-        return self._decide(events, self.few, at_end=False)
+        return self._decide(events, self.min_part_events, at_end=False)
 
     def finish(self) -> list[np.ndarray]:
         """Return the events that are left, after the last."""
-        few = min(self.few, max(LEAST_FEW, self.count // FEW_SHARE))
+        least = min(self.min_part_events, max(LEAST_FEW, self.count // FEW_SHARE))
         undecided, ready = self._undecided, []
         if undecided is not None:
-            ready = self._decide(undecided, few, at_end=True)
+            ready = self._decide(undecided, least, at_end=True)
         return [*ready, *self.release(2**63 - 1)]
 
-    def settle(self, until_us: float) -> None:
+    def accept_silence(self, until_us: float) -> None:
         """Take later events for a silence's end, without waiting for more, if before `until_us`."""
         waiting = self._undecided
-        if waiting is not None and self.last_us < times_of(waiting).min() <= until_us:
-            self._decide(waiting, self.few, at_end=True)
+        if waiting is not None and self.last_us < event_times(waiting).min() <= until_us:
+            self._decide(waiting, self.min_part_events, at_end=True)
 
     def release(self, until_us: float) -> list[np.ndarray]:
         """Return the events before `until_us`; what comes later and is earlier is dropped."""
         ready: list[np.ndarray] = []
-        while self._held and times_of(self._held[0])[-1] < until_us:
+        while self._held and event_times(self._held[0])[-1] < until_us:
             ready.append(self._held.pop(0))
         if self._held and (cut := count_before(self._held[0], until_us)):
             ready.append(self._held[0][:cut])
@@ -100,67 +104,67 @@ class EventOrder:
         self._released_us = max(self._released_us, math.ceil(min(until_us, 2**62)))
         return ready
 
-    def _decide(self, events: np.ndarray, few: int, *, at_end: bool) -> list[np.ndarray]:
+    def _decide(self, events: np.ndarray, least: int, *, at_end: bool) -> list[np.ndarray]:
         ready: list[np.ndarray] = []
         while len(events):
-            if self._goes_on(events, few):
+            if self._goes_on(events, least):
                 ready += self._keep(events, 0, 0)
                 events = events[:0]
                 break
             part, labels = self.parts[-1], np.empty(len(events), np.int8)
-            t = np.ascontiguousarray(times_of(events))
+            t = np.ascontiguousarray(event_times(events))
             state = part.first_us, part.last_us, part.count
-            done, _, _, restarted = label_events(t, *state, self.buffer_us, few, at_end, labels)
+            done, _, _, restarted = label_events(t, *state, self.buffer_us, least, at_end, labels)
             kept = labels[:done] == KEPT
             self.dropped += int(done - kept.sum())
             ready += self._keep_some(events[:done] if kept.all() else events[:done][kept])
             events = events[done:]
             if not restarted:
                 break
-            ready += self._restart(few)
+            ready += self._restart(least)
         self._undecided = events if len(events) else None
         return ready
 
-    def _goes_on(self, events: np.ndarray, few: int) -> bool:
+    def _goes_on(self, events: np.ndarray, least: int) -> bool:
         """Return whether all events are in order and none of the last ones could be an outlier."""
-        t, part = times_of(events), self.parts[-1]
-        if part.count < few or len(t) <= few or t[0] < part.last_us:
+        t, part = event_times(events), self.parts[-1]
+        if part.count < least or len(t) <= least or t[0] < part.last_us:
             return False
         return (
-            bool(np.diff(t[-few - 1 :]).max() <= self.buffer_us)
+            bool(np.diff(t[-least - 1 :]).max() <= self.buffer_us)
             and not measure_lateness(t, part.last_us)[0]
         )
 
     def _keep_some(self, events: np.ndarray) -> list[np.ndarray]:
-        late = measure_lateness(times_of(events), self.parts[-1].last_us)
+        late = measure_lateness(event_times(events), self.parts[-1].last_us)
         return self._keep(events, *late) if len(events) else []
 
     def _keep(self, events: np.ndarray, late: int, most: int) -> list[np.ndarray]:
         """Hold events of the part's clock, `late` of them by `most` us at most; return those that
         are in order for good."""
-        part, t = self.parts[-1], times_of(events)
+        part, t = self.parts[-1], event_times(events)
         if late:
             self.late, self.most_late_us = self.late + late, max(self.most_late_us, most)
             events = self._drop_released(events)
         part.first_us = part.first_us if part.count else int(t[0])
         part.last_us = max(part.last_us, int(t.max() if late else t[-1]))
         part.count += len(t)
-        if self._part is not None and self._part != len(self.parts) - 1:
+        if self._kept_part is not None and self._kept_part != len(self.parts) - 1:
             return []
         self._hold(events, late > 0)
-        if self._part is None or part.count < self.few:
+        if self._kept_part is None or part.count < self.min_part_events:
             return []
         return self.release(self._bound_us(part.last_us - self.buffer_us))
 
     def _drop_released(self, events: np.ndarray) -> np.ndarray:
-        gone = times_of(events) < self._released_us
+        gone = event_times(events) < self._released_us
         self.dropped += (count := int(gone.sum()))
         return events[~gone] if count else events
 
     def _hold(self, events: np.ndarray, unsorted: bool) -> None:
         if unsorted:
-            first = times_of(events).min()
-            after = [part for part in self._held if times_of(part)[-1] > first]
+            first = event_times(events).min()
+            after = [part for part in self._held if event_times(part)[-1] > first]
             self._held = self._held[: len(self._held) - len(after)]
             events = sort_events(concatenate_events([*after, events]))
         if len(events):
@@ -172,27 +176,27 @@ class EventOrder:
         for part in self._held:
             if excess < 0:
                 break
-            until_us = max(until_us, int(times_of(part)[min(excess, len(part) - 1)]))
+            until_us = max(until_us, int(event_times(part)[min(excess, len(part) - 1)]))
             excess -= len(part)
         return until_us
 
-    def _restart(self, few: int) -> list[np.ndarray]:
+    def _restart(self, least: int) -> list[np.ndarray]:
         """Begin another part; too few events of one before it are outliers."""
         ready, self._released_us = [], LONG_AGO_US
-        if self.parts[-1].count < few:
+        if self.parts[-1].count < least:
             self.dropped += self.parts.pop().count
-        elif self._part is not None:
+        elif self._kept_part is not None:
             ready = self.release(2**63 - 1)
             self._released_us = LONG_AGO_US
         self._held = []
         self.parts.append(ClockPart())
         return ready
 
-    def is_whole(self) -> bool:
+    def is_in_order(self) -> bool:
         """Return whether all events came in order and of one clock."""
         return not (self.late or self.dropped) and len(self.parts) == 1
 
-    def fault(self) -> str | None:
+    def reason_to_refuse(self) -> str | None:
         """Return why a file like this cannot be read as it is; None where it can."""
         if self.dropped > max(1, MAX_DROPPED * self.count):
             share = f"{100 * self.dropped / self.count:.3g} % of {self.count} events"
@@ -207,7 +211,7 @@ class EventOrder:
         if part > most:
             raise ValueError(f"part must be in 0..{most}, the parts of {path}, got {part}")
 
-    def lines(self, path: Path, *, part: int | None) -> Iterator[str]:
+    def describe_disorder(self, path: Path, *, part: int | None) -> Iterator[str]:
         """Yield what the user is told; `part`: the one that was asked for."""
         if self.dropped:
             yield f"{path}: {self.dropped} of {self.count} events far out of order of time, dropped"

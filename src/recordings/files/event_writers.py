@@ -61,7 +61,7 @@ def write_pieces(
     `layout` evreal writes a folder, as EVREAL reads it, with `frames` of the sensor's size.
     """
     path = Path(path)
-    kind = find_kind(path, layout, width, height, version)
+    kind = choose_file_kind(path, layout, width, height, version)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = partial_path(path)
     _remove(partial)
@@ -80,7 +80,7 @@ def write_pieces(
     return checked.count, checked.span_us * 1e-6
 
 
-def find_kind(path: Path, layout: str | None, width: int, height: int, version: str) -> str:
+def choose_file_kind(path: Path, layout: str | None, width: int, height: int, version: str) -> str:
     """Return the ending that says how `path` is written, or evreal; raises ValueError for what
     cannot be, before anything is written."""
     suffix = path.suffix.lower()

@@ -23,7 +23,7 @@ from src.recordings.files.event_file import (
     RawFrames,
     ReadOptions,
 )
-from src.recordings.files.frame_files import stored_frames
+from src.recordings.files.frame_files import wrap_frame_array
 
 EVENT_FILES = ("events_ts.npy", "events_xy.npy", "events_p.npy")
 FRAME_FILES = ("images.npy", "images_ts.npy", "image_event_indices.npy")
@@ -105,7 +105,7 @@ class EvrealFolder(EventFile):
 
     def frames(self) -> RawFrames | None:
         images, times = self._held.images, self._held.frame_t
-        return None if images is None or times is None else stored_frames(images, times)
+        return None if images is None or times is None else wrap_frame_array(images, times)
 
 
 def _load(path: Path) -> np.ndarray:

@@ -20,7 +20,7 @@ class EvtDecoder:
 
     def __init__(self, kind: str, order: str | None = None):
         self.kind, self._order = kind, order
-        self._state = evt_words.new_state()
+        self._state = evt_words.new_decoder_state()
 
     @property
     def triggers(self) -> int:

@@ -16,7 +16,7 @@ PICTURE_FOLDERS = ("images_corrected", "images")  # of TimeLens's recordings, be
 TIME_FILES = ("timestamp.txt", "timestamps.txt")
 
 
-def listed_frames(listing: Path) -> RawFrames | None:
+def find_listed_frames(listing: Path) -> RawFrames | None:
     """Return the pictures of a text file with a line for each, seconds and file; None where there
     is no such file (images.txt of the Event Camera Dataset)."""
     if not listing.is_file():
@@ -29,14 +29,14 @@ def listed_frames(listing: Path) -> RawFrames | None:
     return _pictures([listing.parent / name.strip() for _, name in rows], times, "s")
 
 
-def numbered_frames(folder: Path) -> RawFrames | None:
+def find_timelens_frames(events_folder: Path) -> RawFrames | None:
     """Return the pictures of TimeLens's layout, in a folder beside that of the events: in order of
     name, with a line of timestamp.txt for each, in the events' unit of time."""
-    found = [p for name in PICTURE_FOLDERS if (p := folder.parent / name).is_dir()]
+    found = [p for name in PICTURE_FOLDERS if (p := events_folder.parent / name).is_dir()]
     if not found:
         return None
     names = sort_by_name(p for p in found[0].iterdir() if p.suffix.lower() in PICTURE_SUFFIXES)
-    places = [place / name for place in (found[0], folder.parent) for name in TIME_FILES]
+    places = [place / name for place in (found[0], events_folder.parent) for name in TIME_FILES]
     listing = next((place for place in places if place.is_file()), None)
     if listing is None:
         warnings.warn(
@@ -52,7 +52,7 @@ def numbered_frames(folder: Path) -> RawFrames | None:
     return _pictures(names, times, None)
 
 
-def stored_frames(pictures: Any, times: np.ndarray, unit: str | None = None) -> RawFrames:
+def wrap_frame_array(pictures: Any, times: np.ndarray, unit: str | None = None) -> RawFrames:
     """Return the frames of an array (n, h, w) or (n, h, w, 1), which are read one by one."""
     if pictures.ndim not in (3, 4) or len(pictures) != len(times):
         raise ValueError(f"{len(times)} times for frames of shape {pictures.shape}")

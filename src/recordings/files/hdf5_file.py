@@ -24,13 +24,13 @@ from src.recordings.files.array_file import (
 )
 from src.recordings.files.columns import (
     as_times,
-    check_claim,
     check_lengths,
-    match_columns,
-    pick_columns,
+    check_unpacked_size,
+    find_columns_by_name,
+    find_keys_by_name,
 )
 from src.recordings.files.event_file import EventFile, RawEvents, RawFrames, ReadOptions
-from src.recordings.files.frame_files import stored_frames, to_gray
+from src.recordings.files.frame_files import to_gray, wrap_frame_array
 from src.recordings.files.streams import EventStream, choose_stream
 
 HDF5_ENDINGS = (".h5", ".hdf5", ".hdf")
@@ -71,7 +71,7 @@ class Hdf5File(EventFile):
         for name in ("image_raw", "images"):
             held = self._beside.get(name)
             if isinstance(held, h5py.Dataset) and f"{name}_ts" in self._beside:
-                return stored_frames(held, self._beside[f"{name}_ts"][:])
+                return wrap_frame_array(held, self._beside[f"{name}_ts"][:])
             if isinstance(held, h5py.Group) and len(held):
                 pictures = [held[key] for key in sorted(held)]
                 times = np.array([picture.attrs["timestamp"] for picture in pictures])
@@ -81,7 +81,7 @@ class Hdf5File(EventFile):
         return None
 
     def _open(self, node: Any, options: ReadOptions) -> None:
-        check_claim(self.path, _claimed_bytes(node))
+        check_unpacked_size(self.path, _claimed_bytes(node))
         check_codec(node)
         group = node if isinstance(node, h5py.Group) else node.parent
         self._beside = node.parent
@@ -157,7 +157,7 @@ def check_codec(node: Any) -> None:
 
 def _has_columns(group: Any) -> bool:
     """Return whether the group holds t, x, y, p of one dimension."""
-    keys = pick_columns(group)
+    keys = find_keys_by_name(group)
     if keys is None:
         return False
     return all(
@@ -167,12 +167,12 @@ def _has_columns(group: Any) -> bool:
 
 def _is_table(name: str, node: Any) -> bool:
     if node.dtype.names is not None:
-        return node.ndim == 1 and match_columns(node.dtype.names) is not None
+        return node.ndim == 1 and find_columns_by_name(node.dtype.names) is not None
     return node.ndim == 2 and node.shape[1] == 4 and "event" in name.lower()
 
 
 def _columns_of(group: Any) -> dict[str, Any]:
-    columns = {name: group[key] for name, key in (pick_columns(group) or {}).items()}
+    columns = {name: group[key] for name, key in (find_keys_by_name(group) or {}).items()}
     check_lengths(columns)
     return columns
 

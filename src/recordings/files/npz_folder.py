@@ -12,7 +12,7 @@ import numpy as np
 
 from src.recordings.files.array_file import ArrayFile
 from src.recordings.files.event_file import EventFile, RawEvents, RawFrames, ReadOptions
-from src.recordings.files.frame_files import numbered_frames, sort_by_name
+from src.recordings.files.frame_files import find_timelens_frames, sort_by_name
 
 EVENT_FOLDERS = (".", "events", "events_aligned")
 FRACTIONS = 32  # of a pixel in which BS-ERGB has x and y, in 16 bits
@@ -53,7 +53,7 @@ class NpzFolder(EventFile):
 
     @cached_property
     def _frames(self) -> RawFrames | None:
-        return numbered_frames(self._folder)
+        return find_timelens_frames(self._folder)
 
     @cached_property
     def _has_fractions(self) -> bool:

@@ -19,7 +19,7 @@ from src.recordings.files.array_file import ArrayFile
 from src.recordings.files.es_file import EsFile
 from src.recordings.files.event_arrays import concatenate_events, count_before
 from src.recordings.files.event_file import EVENT, EventFile, RawEvents, ReadOptions
-from src.recordings.files.event_order import EventOrder, merge_in_time
+from src.recordings.files.event_order import EventSorter, merge_in_time
 from src.recordings.files.evreal_folder import EvrealFolder, is_evreal_folder
 from src.recordings.files.hdf5_file import HDF5_ENDINGS, Hdf5File
 from src.recordings.files.npz_folder import NpzFolder, find_npz_folder
@@ -135,7 +135,8 @@ class _Reading:
 
     def __init__(self, recording: EventRecording, part: int):
         self._recording, self._path, self._part = recording, recording.path, part
-        self._order = EventOrder(recording.survey.buffer_us, recording.survey.min_part_events, part)
+        survey = recording.survey
+        self._order = EventSorter(survey.buffer_us, survey.min_part_events, part)
         self._count, self._outside, self._most = 0, 0, np.zeros(2, np.int64)
 
     def __iter__(self) -> Iterator[np.ndarray]:
@@ -155,7 +156,7 @@ class _Reading:
         recording = self._recording
         for raw in recording.survey.pieces or recording.file.pieces():
             unit = recording.survey.unit
-            if not recording.survey.is_whole and (raw.t.dtype != np.int64 or unit != "us"):
+            if not recording.survey.covers_all_times and (raw.t.dtype != np.int64 or unit != "us"):
                 check_times(raw.t, unit, self._path)
             t = to_us(raw.t, unit)
             x, y, p = _plain(raw)
@@ -175,13 +176,13 @@ class _Reading:
         raise ValueError(f"{self._path}: x and y must be in 0..{MAX_SIDE - 1}, got {x}, {y}")
 
     def _check(self, least: int = 0) -> None:
-        fault = self._order.fault() if self._order.count > least else None
+        fault = self._order.reason_to_refuse() if self._order.count > least else None
         if fault:
             raise ValueError(f"{self._path}: {fault}")
 
     def _tell_at_end(self) -> None:
         size = self._recording.size
-        if not self._recording.survey.is_whole:
+        if not self._recording.survey.covers_all_times:
             self._order.check_part(self._part, self._path)
         if self._outside and size is not None:
             width, height = size
@@ -193,8 +194,8 @@ class _Reading:
                 )
             outside = f"{self._outside} of {self._count} events outside {width}x{height}, dropped"
             _tell((f"{self._path}: {outside}",))
-        if not self._recording.survey.is_whole:
-            _tell(self._order.lines(self._path, part=self._recording.options.part))
+        if not self._recording.survey.covers_all_times:
+            _tell(self._order.describe_disorder(self._path, part=self._recording.options.part))
 
 
 def _plain(raw: RawEvents) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -17,7 +17,7 @@ import numpy as np
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from src.recordings.files.caer_packets import split_libcaer, split_libcaer_cmp
+from src.recordings.files.caer_packets import decode_compressed_libcaer, decode_libcaer
 from src.recordings.files.event_file import RawEvents
 from src.recordings.files.evt_decoder import EvtDecoder
 from src.recordings.files.frame_files import to_gray
@@ -70,9 +70,9 @@ class EventMessage:
         if self._start_ns > LAST_START_NS:
             raise ValueError(f"time_base must be in 0..{LAST_START_NS} ns, got {self._start_ns}")
         if self.encoding == "libcaer":
-            return split_libcaer(packed, self._start_ns)
+            return decode_libcaer(packed, self._start_ns)
         if self.encoding == "libcaer_cmp":
-            return split_libcaer_cmp(packed, self._start_ns)
+            return decode_compressed_libcaer(packed, self._start_ns)
         packed = packed.astype(np.uint64)
         t = (packed & 0xFFFFFFFF).astype(np.int64) + self._start_ns
         x, y = (packed >> 32).astype(np.uint16), (packed >> 48).astype(np.uint16)
@@ -119,7 +119,7 @@ class EventMessage:
         return table
 
 
-def read_image(content: bytes, cdr: bool) -> tuple[int, np.ndarray]:
+def decode_time_ns_and_gray_image(content: bytes, cdr: bool) -> tuple[int, np.ndarray]:
     """Return the time in nanoseconds and the grey picture (h, w) of a sensor_msgs/Image.
 
     Raises ValueError for an encoding of other than 8 bits.

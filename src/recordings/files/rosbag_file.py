@@ -22,18 +22,25 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from src.recordings.files.clocks import merge_small_pieces
 from src.recordings.files.event_file import EventFile, RawEvents, RawFrames, ReadOptions
 from src.recordings.files.evt_decoder import EvtDecoder
-from src.recordings.files.ros_messages import ARRAYS, IMAGE, PACKETS, EventMessage, read_image
+from src.recordings.files.ros_messages import (
+    ARRAYS,
+    IMAGE,
+    PACKETS,
+    EventMessage,
+    decode_time_ns_and_gray_image,
+)
 from src.recordings.files.streams import EventStream, choose_stream
-from src.recordings.files.unpacking import unpack
+from src.recordings.files.unpacking import decompress
 
 READERS: dict[str, Any] = {".bag": Ros1Reader, ".db3": Sqlite3Reader, ".mcap": mcap.McapReader}
 Messages = Generator[tuple[str, EventMessage], None, None]  # of a topic, its name first
 ZSTD = b"\x28\xb5\x2f\xfd"  # how a message begins that is packed alone
 
 # rosbags itself unpacks without bound.
-ros1.decompressors.update({kind: partial(unpack, kind=kind) for kind in ("lz4", "bz2")})
+ros1.decompressors.update({kind: partial(decompress, kind=kind) for kind in ("lz4", "bz2")})
 mcap.DECOMPRESSORS.update(
-    lz4=lambda packed, _: unpack(packed, "lz4"), zstd=lambda packed, _: unpack(packed, "zstd")
+    lz4=lambda packed, _: decompress(packed, "lz4"),
+    zstd=lambda packed, _: decompress(packed, "zstd"),
 )
 
 
@@ -90,7 +97,7 @@ class RosbagFile(EventFile):
 
         def images() -> Iterator[tuple[int, np.ndarray]]:
             for _, content in self._contents((IMAGE,), topic):
-                yield read_image(content, self._ros2)
+                yield decode_time_ns_and_gray_image(content, self._ros2)
 
         _, first = next(images())
         times = np.array([time for time, _ in images()])
@@ -138,7 +145,7 @@ class RosbagFile(EventFile):
                 wanted = [link for link in links if topic in (None, link.topic)]
                 for link, _, content in part.messages(wanted) if wanted else ():
                     packed = content[:4] == ZSTD
-                    yield link, unpack(content, "zstd") if packed else content
+                    yield link, decompress(content, "zstd") if packed else content
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:

@@ -18,7 +18,7 @@ from src.sim.scenes.video_files import PICTURE_SUFFIXES, VIDEO_SUFFIXES
 Size = tuple[int, int]  # height, width
 
 
-def sensor_size(
+def find_sensor_size(
     path: Path | str,
     sensor: Sequence[int] | None = None,
     options: ReadOptions = ReadOptions(),
@@ -71,7 +71,7 @@ def read_sensor_picture(
         for frame in frames:
             total, count = total + frame, count + 1
         return total / count
-    counts = np.zeros(sensor_size(path, sensor, options))
+    counts = np.zeros(find_sensor_size(path, sensor, options))
     for chunk in iter_recording(path, counts.shape, options=options):
         pixels = np.ravel_multi_index((chunk["y"], chunk["x"]), counts.shape)
         counts += np.bincount(pixels, minlength=counts.size).reshape(counts.shape)

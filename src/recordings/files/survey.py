@@ -13,7 +13,7 @@ from src.recordings.files.event_order import (
     FEW_SHARE,
     LEAST_FEW,
     MAX_DROPPED,
-    EventOrder,
+    EventSorter,
 )
 from src.recordings.files.time_unit import UNITS_US, TimeSample, check_times, find_unit, to_us
 
@@ -24,12 +24,12 @@ Part = TypeVar("Part", np.ndarray, RawEvents)
 
 
 class TimeSurvey(NamedTuple):
-    """The unit of the times, the buffer and the least events of a part (EventOrder), whether the
+    """The unit of the times, the buffer and the least events of a part (EventSorter), whether the
     two parts are ON and OFF, and lines for the user.
 
-    `is_whole`: all times were looked at; else they are while the file is read.  `is_ordered`: they
-    are in order and of one clock.  `times` or `pieces`: what was read for this and is little enough
-    to be kept.
+    `covers_all_times`: all times were looked at; else they are while the file is read.
+    `is_ordered`: they are in order and of one clock.  `times` or `pieces`: what was read for this
+    and is little enough to be kept.
     """
 
     unit: str
@@ -37,7 +37,7 @@ class TimeSurvey(NamedTuple):
     min_part_events: int = FEW_EVENTS
     parts_are_on_and_off: bool = False
     messages: tuple[str, ...] = ()
-    is_whole: bool = True
+    covers_all_times: bool = True
     is_ordered: bool = False
     times: list[np.ndarray] | None = None
     pieces: list[RawEvents] | None = None
@@ -47,7 +47,7 @@ def survey_times(file: EventFile, options: ReadOptions) -> TimeSurvey:
     """Return what the times of a file tell where its format does not define their unit, or where
     they can be read alone.
 
-    Raises ValueError, which names the file, for one that is refused (find_order).
+    Raises ValueError, which names the file, for one that is refused (sort_with_smallest_buffer).
     """
     times = pieces = None
     if file.times() is not None:
@@ -55,7 +55,7 @@ def survey_times(file: EventFile, options: ReadOptions) -> TimeSurvey:
     elif file.time_unit is None:
         pieces = _keep(file.pieces)
     else:
-        return TimeSurvey(file.time_unit, is_whole=False)
+        return TimeSurvey(file.time_unit, covers_all_times=False)
 
     def read_times() -> Iterable[np.ndarray]:
         return times or file.times() or (piece.t for piece in pieces or file.pieces())
@@ -79,7 +79,9 @@ def _judge(
             yield to_us(t, unit)
 
     try:
-        order = find_order(read_us, sample.count, sample.span() * UNITS_US[unit])
+        order = sort_with_smallest_buffer(
+            read_us, sample.count, sample.trimmed_span() * UNITS_US[unit]
+        )
     except ValueError as error:
         raise ValueError(_named(path, str(error))) from None
     order.check_part(options.part or 0, path)
@@ -89,15 +91,15 @@ def _judge(
         lines.append(f"{path}: all events of one polarity come before the others, sorted by time")
     else:
         merged = False
-        lines += order.lines(path, part=options.part)
-    shape = order.buffer_us, order.few, merged
-    return TimeSurvey(unit, *shape, tuple(lines), is_ordered=order.is_whole())
+        lines += order.describe_disorder(path, part=options.part)
+    shape = order.buffer_us, order.min_part_events, merged
+    return TimeSurvey(unit, *shape, tuple(lines), is_ordered=order.is_in_order())
 
 
-def find_order(
+def sort_with_smallest_buffer(
     read_times: Callable[[], Iterable[np.ndarray]], count: int, span_us: float
-) -> EventOrder:
-    """Return the EventOrder, of the smallest buffer that is enough, that took all times of a file.
+) -> EventSorter:
+    """Return the EventSorter, of the smallest buffer that is enough, that took all times of a file.
 
     `read_times` yields them, int64 us, from the beginning each time; `count` and `span_us` are of
     the file.  The buffer is an eighth of the span, in LEAST_BUFFER_US..BUFFER_US, and grows up to
@@ -105,13 +107,13 @@ def find_order(
     frames is sorted.  Raises ValueError for a file that is refused.
     """
     buffer_us = int(min(max(span_us / 8, LEAST_BUFFER_US), BUFFER_US))
-    few, fault, best = min(FEW_EVENTS, max(LEAST_FEW, count // FEW_SHARE)), "", None
+    min_part_events, fault, best = min(FEW_EVENTS, max(LEAST_FEW, count // FEW_SHARE)), "", None
     while buffer_us <= LARGEST_BUFFER_US:
-        order = EventOrder(buffer_us, few)
+        order = EventSorter(buffer_us, min_part_events)
         for t in read_times():
             order.add(t)
         order.finish()
-        if (found := order.fault()) is not None:
+        if (found := order.reason_to_refuse()) is not None:
             fault = found
         elif best is None or order.dropped < best.dropped:
             best = order

@@ -13,7 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from src.recordings.files.columns import MAX_COORDINATE, as_integers, check_claim, find_columns
+from src.recordings.files.columns import (
+    MAX_COORDINATE,
+    as_integers,
+    check_unpacked_size,
+    find_columns,
+)
 from src.recordings.files.event_file import (
     PIECE_EVENTS,
     EventFile,
@@ -21,7 +26,7 @@ from src.recordings.files.event_file import (
     RawFrames,
     ReadOptions,
 )
-from src.recordings.files.frame_files import listed_frames
+from src.recordings.files.frame_files import find_listed_frames
 from src.recordings.files.text_layout import (
     COMMENTS,
     MAX_LINE,
@@ -64,11 +69,11 @@ class TextFile(EventFile):
             yield np.array(self._events["t"][first : first + PIECE_EVENTS])
 
     def frames(self) -> RawFrames | None:
-        return listed_frames(self.path.parent / "images.txt")
+        return find_listed_frames(self.path.parent / "images.txt")
 
     def _read(self, options: ReadOptions) -> np.ndarray:
         """Return all events, (n,) of t in the file's unit, x, y, p, as they stand in the file."""
-        places = self._layout.places if options.columns is None else None
+        places = self._layout.column_places if options.columns is None else None
         with _Spool() as spool:
             for block, number, is_last in self._blocks():
                 table = self._parse(block, number, is_last)
@@ -81,13 +86,13 @@ class TextFile(EventFile):
 
     def _blocks(self) -> Iterator[tuple[str, int, bool]]:
         """Yield lines of events, how many come before them, and whether they end the file."""
-        number, rest, size = self._layout.lines, "", 0
+        number, rest, size = self._layout.header_lines, "", 0
         with open_text(self.path) as file:
             for _ in range(number):
                 file.readline(MAX_LINE)
             while chunk := file.read(CHUNK):
                 size += len(chunk)
-                check_claim(self.path, size)
+                check_unpacked_size(self.path, size)
                 if len(chunk) < CHUNK:  # the end: these are the last lines
                     break
                 body, newline, rest = (rest + chunk).rpartition("\n")
@@ -107,7 +112,7 @@ class TextFile(EventFile):
             except ValueError:
                 continue
         wrong = self._find_broken(tidy)
-        if is_last and wrong == len(tidy) - 1 and number + wrong > self._layout.lines:
+        if is_last and wrong == len(tidy) - 1 and number + wrong > self._layout.header_lines:
             self.notes = (f"{self.path}: its last line is cut, left out",)
             return self._parse("\n".join(tidy[:-1]), number, False)
         raise ValueError(f"line {number + wrong + 1} is no event: {tidy[wrong][:40]!r}")

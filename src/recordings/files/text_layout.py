@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from src.recordings.files.columns import match_columns, stated_unit
+from src.recordings.files.columns import find_columns_by_name, parse_unit_suffix
 
 TEXT_ENDINGS = (".txt", ".csv", ".tsv")
 MAX_LINE = 2**23  # characters; a longer line is none of events
@@ -26,18 +26,18 @@ GEOMETRY = re.compile(
 
 class TextLayout(NamedTuple):
     """How the lines of a file are read: the `width` of the table, `separator` (None: any blanks),
-    whether a comma is the decimal point, whether polarity is a word, the `places` of t, x, y, p
-    where names tell them, the unit of time in these, and (width, height).  `lines` come before
-    the events."""
+    whether a comma is the decimal point, whether polarity is a word, the `column_places` of t,
+    x, y, p where names tell them, the unit of time in these, and (width, height).  `header_lines`
+    come before the events."""
 
     width: int
     separator: str | None
     has_decimal_comma: bool
     has_words: bool
-    places: dict[str, int] | None
+    column_places: dict[str, int] | None
     time_unit: str | None
     size: tuple[int, int] | None
-    lines: int
+    header_lines: int
 
 
 @contextmanager
@@ -109,16 +109,16 @@ def read_layout(file: io.TextIOBase) -> TextLayout:
             has_words = not all(map(is_number, words))
             if names is not None and len(names) != len(words):
                 names = None
-            places = None if names is None else match_columns(names)
-            unit = stated_unit(names[places["t"]]) if names and places else None
+            places = None if names is None else find_columns_by_name(names)
+            unit = parse_unit_suffix(names[places["t"]]) if names and places else None
             how = separator, has_decimal_comma, has_words
             return TextLayout(len(words), *how, places, unit, size, number)
         here = _stated_size(bare)
         size = here or size
         title = bare.lstrip("#%/; ").encode("latin-1").decode(errors="replace")  # it may have µs
         found = split_line(title, _find_separator(title)[0])
-        names = found if match_columns(found) else names
-        if bare and not (bare.startswith(COMMENTS) or here or match_columns(found)):
+        names = found if find_columns_by_name(found) else names
+        if bare and not (bare.startswith(COMMENTS) or here or find_columns_by_name(found)):
             strange = strange or bare
     raise ValueError(f"no line of numbers t x y p among the first {MAX_HEADER_LINES}")
 

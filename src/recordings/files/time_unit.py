@@ -35,28 +35,28 @@ class TimeSample:
     """Some of a file's times in its unit, from all its pieces, and whether all are whole."""
 
     def __init__(self) -> None:
-        self.count, self.is_whole = 0, True
+        self.count, self.are_whole_numbers = 0, True
         self._values: list[np.ndarray] = []
 
     def add(self, t: np.ndarray) -> None:
         """Take the times (n,) of a piece."""
         self.count += len(t)
         self._values.append(np.array(t[:: max(1, len(t) // SAMPLES)]))
-        if t.dtype.kind == "f" and self.is_whole:
-            self.is_whole = bool((t == np.rint(t)).all())
+        if t.dtype.kind == "f" and self.are_whole_numbers:
+            self.are_whole_numbers = bool((t == np.rint(t)).all())
 
-    def is_fine(self) -> bool:
+    def has_over_three_decimals(self) -> bool:
         """Return whether half of the times or more have above three digits behind the point."""
-        if self.is_whole or not self._values:
+        if self.are_whole_numbers or not self._values:
             return False
         thousands = np.concatenate(self._values) * 1e3
         return bool(np.mean(np.abs(thousands - np.rint(thousands)) > 1e-3) >= 0.5)
 
-    def span(self) -> float:
+    def trimmed_span(self) -> float:
         """Return the span of the times in the file's unit, less the first and last hundredth."""
         return self._low_span()[1]
 
-    def date(self) -> float:
+    def early_time(self) -> float:
         """Return an early time in the file's unit."""
         return self._low_span()[0]
 
@@ -75,9 +75,9 @@ class TimeSample:
 def find_unit(sample: TimeSample, stated: str) -> tuple[str, str]:
     """Return the unit (`stated`, where it is not auto), and what the user is told of it, or ""."""
     if sample.count < FEW_TIMES:
-        return (("us" if sample.is_whole else "s") if stated == "auto" else stated), ""
-    span, losses = sample.span(), PRIOR[sample.is_whole]
-    fine = FINE * sample.is_fine()
+        return (("us" if sample.are_whole_numbers else "s") if stated == "auto" else stated), ""
+    span, losses = sample.trimmed_span(), PRIOR[sample.are_whole_numbers]
+    fine = FINE * sample.has_over_three_decimals()
     points = {unit: _judge(sample, unit) - losses[unit] - fine * (unit != "s") for unit in UNITS_US}
     best, second = sorted(points, key=lambda unit: -points[unit])[:2]
     unit = best if stated == "auto" else stated
@@ -113,7 +113,7 @@ def to_us(t: np.ndarray, unit: str) -> np.ndarray:
 
 
 def _judge(sample: TimeSample, unit: str) -> float:
-    duration_s = sample.span() * UNITS_US[unit] * 1e-6
+    duration_s = sample.trimmed_span() * UNITS_US[unit] * 1e-6
     if not duration_s:
         return 0.0
     points = -_decades(duration_s, DURATION_S) - _decades(sample.count / duration_s, RATE_HZ)
@@ -121,7 +121,7 @@ def _judge(sample: TimeSample, unit: str) -> float:
 
 
 def _is_date(sample: TimeSample, unit: str) -> bool:
-    return EPOCH_S[0] < sample.date() * UNITS_US[unit] * 1e-6 < EPOCH_S[1]
+    return EPOCH_S[0] < sample.early_time() * UNITS_US[unit] * 1e-6 < EPOCH_S[1]
 
 
 def _decades(value: float, allowed: Range) -> float:
@@ -132,6 +132,6 @@ def _decades(value: float, allowed: Range) -> float:
 
 
 def _describe(sample: TimeSample, unit: str) -> str:
-    duration_s = sample.span() * UNITS_US[unit] * 1e-6
+    duration_s = sample.trimmed_span() * UNITS_US[unit] * 1e-6
     rate = sample.count / duration_s if duration_s else np.inf
     return f"{duration_s:.3g} s and {rate:.3g} events/s"

@@ -74,7 +74,7 @@ class TurbulenceFile:
             if known != sorted(known):
                 raise ValueError(f"{name} must lie in its interval, got {estimate}")
 
-    def text(self) -> str:
+    def to_yaml(self) -> str:
         """Return the content of the file."""
         content = {}
         for name, one in vars(self).items():

@@ -13,7 +13,7 @@ UNPACKERS: dict[str, Any] = {
 }  # fmt: skip
 
 
-def unpack(content: bytes, kind: str) -> bytes:
+def decompress(content: bytes, kind: str) -> bytes:
     """Return what one frame of lz4, zstd or bz2 holds.
 
     Raises ValueError for more than LARGEST_PACKET bytes; errors of the libraries go through.

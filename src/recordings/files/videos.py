@@ -18,25 +18,27 @@ from src.sim.scenes.video_index import index_video
 
 
 def read_video(
-    path: Path | str, key: str = "recording", most: int | None = None
+    path: Path | str, config_key: str = "recording", max_frames: int | None = None
 ) -> Iterator[Float[np.ndarray, "h w"]]:
     """Yield the grey frames in [0, 1], float32, of a film, a folder of pictures or our `video.h5`;
-    of a film that is long at most its first `most` frames.
+    of a film that is long at most its first `max_frames` frames.
 
-    Raises ValueError, which names `key`, for a file that cannot be read or has no frame.
+    Raises ValueError, which names `config_key`, for a file that cannot be read or has no frame.
     """
     frame = None
-    for frame in islice(_frames(Path(path), key, most), most):
+    for frame in islice(_frames(Path(path), config_key, max_frames), max_frames):
         yield frame
     if frame is None:
-        raise ValueError(f"{key} must be a film or a folder of pictures, got {path}")
+        raise ValueError(f"{config_key} must be a film or a folder of pictures, got {path}")
 
 
-def read_fps(path: Path | str, key: str = "video", most: int | None = None) -> float | None:
-    """Return the frames a second of a film, of its first `most` frames: what it states, or what its
-    time stamps say where that differs; None for pictures and for a film without time stamps.
+def read_fps(
+    path: Path | str, config_key: str = "video", max_frames: int | None = None
+) -> float | None:
+    """Return the frames a second of a film, of its first `max_frames`: what it states, or what
+    its time stamps say where that differs; None for pictures and for a film without time stamps.
 
-    Raises ValueError, which names `key`, for a film that cannot be read.
+    Raises ValueError, which names `config_key`, for a film that cannot be read.
     """
     path = Path(path)
     if path.is_dir():
@@ -46,10 +48,10 @@ def read_fps(path: Path | str, key: str = "video", most: int | None = None) -> f
             times = file["time_s"][:2] if "time_s" in file else []
         known = len(times) == 2 and times[1] > times[0]
         return float(1 / (times[1] - times[0])) if known else None
-    return index_video(path, key, most).fps
+    return index_video(path, config_key, max_frames).fps
 
 
-def _frames(path: Path, key: str, most: int | None) -> Iterator[np.ndarray]:
+def _frames(path: Path, config_key: str, max_frames: int | None) -> Iterator[np.ndarray]:
     if path.is_dir():
         names = sorted(name for name in path.iterdir() if name.suffix.lower() in PICTURE_SUFFIXES)
         yield from (read_gray_picture(name) for name in names if name.name[0] != ".")
@@ -62,8 +64,8 @@ def _frames(path: Path, key: str, most: int | None) -> Iterator[np.ndarray]:
                 raise ValueError(f"frames must have {LARGEST_PIXELS} pixels at most")
             yield from (frame.astype(np.float32) / 255 for frame in frames)
     else:
-        index = index_video(path, key, most)
-        for frame in index.read(0, len(index.shown), key):
+        index = index_video(path, config_key, max_frames)
+        for frame in index.read(0, len(index.shown_frames), config_key):
             yield frame.astype(np.float32) / 255
 
 

@@ -35,8 +35,8 @@ class Mixture(SceneBase):
     from 0 on, 0 leaves it out; and `splits`, those that it serves (None: all).  `in_turn`: of
     validation and test clip k is of part k modulo their number, so that a few clips show all.
     `flicker_share`: of the clips whose light flickers with the mains, by a share out of
-    `percent_flicker`; none does below 480 frames (windows times substeps) a second, where it would
-    alias.  The parts' configs refer to `root`, `extra_train_root` and `video_root`.
+    `flicker_modulation_depth`; none does below 480 frames (windows times substeps) a second,
+    where it would alias.  The parts' configs refer to `root`, `extra_train_root` and `video_root`.
     """
 
     parts: Mapping[str, Mapping[str, Any]]
@@ -45,13 +45,13 @@ class Mixture(SceneBase):
     video_root: str | None = None
     in_turn: bool = False
     flicker_share: float = 0.0
-    percent_flicker: Sequence[float] = (0.05, 0.4)
+    flicker_modulation_depth: Sequence[float] = (0.05, 0.4)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 <= self.percent_flicker[0] <= self.percent_flicker[1] < 1:
-            allowed, got = "a range 0 <= low <= high < 1", list(self.percent_flicker)
-            raise ValueError(f"scene.percent_flicker must be {allowed}, got {got}")
+        if not 0 <= self.flicker_modulation_depth[0] <= self.flicker_modulation_depth[1] < 1:
+            allowed, got = "a range 0 <= low <= high < 1", list(self.flicker_modulation_depth)
+            raise ValueError(f"scene.flicker_modulation_depth must be {allowed}, got {got}")
         served = []
         for name, part in self.parts.items():
             share, splits = part["share"], part.get("splits") or SPLITS
@@ -78,7 +78,7 @@ class Mixture(SceneBase):
         if clip.fps < LEAST_FPS or rng.uniform() >= self.flicker_share:
             return clip
         times_s = np.arange(len(clip.frames)) / clip.fps
-        size, depth = tuple(clip.frames.shape[1:]), self.percent_flicker
+        size, depth = tuple(clip.frames.shape[1:]), self.flicker_modulation_depth
         return replace(clip, illumination=draw_flicker(rng, times_s, size, depth))
 
 

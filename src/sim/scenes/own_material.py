@@ -4,6 +4,7 @@ Grey values are luminance code values.  Pictures are only shrunk, with an area f
 """
 
 import math
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ from src.sim.scenes.video_files import VideoSource, find_videos, read_picture
 
 LARGEST_SIDE_PX = 512  # of the frames, where nothing else is asked for
 LEAST_SIDE_PX = 16
+ALL_BITS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+DARK_SHARE = 1 / 8  # of full scale: a picture below this has data of fewer bits than its file
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +42,9 @@ class OwnClip:
         """Height and width, pixels."""
         return self.frames.shape[1], self.frames.shape[2]
 
-    def blend(self, first: int, stop: int, substeps: int) -> Float[Tensor, "count h w"]:
+    def interpolate_frames(
+        self, first: int, stop: int, substeps: int
+    ) -> Float[Tensor, "count h w"]:
         """Return frames first .. stop - 1 of the clip at `substeps` times its rate, float32: linear
         blends between two frames.
         """
@@ -54,15 +59,18 @@ class OwnClip:
 
 def read_video(
     path: Path | str, *, fps: float | None = None, start_s: float = 0.0, end_s: float = math.inf,
-    longest_side_px: int | None = None,
+    longest_side_px: int | None = None, white_level: float | None = None,
 ) -> OwnClip:  # fmt: skip
     """Return a video file, or a folder of frames, from `start_s` to `end_s`.
 
     `fps`: that it is taken for (None: as the file says); `longest_side_px` of its frames (None:
-    their own, at most LARGEST_SIDE_PX).  Raises ValueError for what is no video, says no rate, or
-    has less than two frames there.
+    their own, at most LARGEST_SIDE_PX); `white_level`: value of frames that is white (None: the
+    largest their type holds).  Raises ValueError for what is no video, says no rate, or has less
+    than two frames there.
     """
     source = _find_one_video(Path(path))
+    if white_level is not None and source.index:
+        raise ValueError(f"white_level must be null for a video file, 8 bits, got {white_level}")
     rate = fps or (source.index.fps if source.index else None)
     if rate is None:
         raise ValueError(f"fps must be given, frames a second, for {path}, which states none")
@@ -75,10 +83,12 @@ def read_video(
     if stop - first < 2:
         lasts = f"{source.count / rate:.3f} s"
         raise ValueError(f"start_s and end_s must leave two frames or more of {path}, {lasts} long")
-    frames, shape = [], (0, 0)
-    for picture in source.read(first, stop):
-        shape = picture.shape
-        frames.append(_shrink(picture, longest_side_px).astype(np.float16))
+    frames, shape, largest, kind = [], (0, 0), 0.0, np.dtype(np.uint8)
+    for picture in source.read(first, stop, ALL_BITS):
+        shape, kind, largest = picture.shape, picture.dtype, max(largest, float(picture.max()))
+        values = scale_to_white(picture, white_level)
+        frames.append(_shrink(values, longest_side_px).astype(np.float16))
+    _warn_of_darkness(path, kind, largest, white_level)
     part = "all" if stop - first == source.count else f"frames {first} to {stop - 1}"
     facts = f"{shape[1]}x{shape[0]} px, {rate:.6g} frames/s, {part} of {source.count} frames"
     return OwnClip(source.name, np.stack(frames), rate, facts)
@@ -86,23 +96,26 @@ def read_video(
 
 def read_photograph(
     path: Path | str, *, fps: float | None = None, seconds: float = 1.0,
-    longest_side_px: int | None = None, speed_widths_per_s: float = 0.0, seed: int = 0,
+    longest_side_px: int | None = None, white_level: float | None = None,
+    speed_widths_per_s: float = 0.0, seed: int = 0,
 ) -> OwnClip:  # fmt: skip
     """Return a photograph for `seconds` at `fps` (None: 120): at rest, or in a smooth motion, drawn
-    from `seed`, of `speed_widths_per_s` frame widths a second.
+    from `seed`, of `speed_widths_per_s` frame widths a second.  `white_level` as in `read_video`.
 
     Raises ValueError for what is no picture and for values outside their range.
     """
-    picture = read_picture(Path(path)) if Path(path).is_file() else None
+    picture = read_picture(Path(path), ALL_BITS) if Path(path).is_file() else None
     if picture is None:
         raise ValueError(f"photo must be a picture that can be read (a film: video=), got {path}")
     facts = f"photograph of {picture.shape[1]}x{picture.shape[0]} px"
-    clip = hold_photograph(_shrink(picture, longest_side_px), fps or 120.0, seconds, facts)
+    values = _shrink(scale_to_white(picture, white_level), longest_side_px)
+    clip = hold_photograph(values, fps or 120.0, seconds, facts)
     if not 0 <= speed_widths_per_s < math.inf:
         raise ValueError(f"speed_widths_per_s must be >= 0, got {speed_widths_per_s}")
     frames = clip.frames
     if speed_widths_per_s:
         frames = _move(frames[0], len(frames), clip.fps, speed_widths_per_s, seed)
+    _warn_of_darkness(path, picture.dtype, float(picture.max()), white_level)
     return OwnClip(Path(path).stem, frames, clip.fps, facts)
 
 
@@ -119,10 +132,10 @@ def hold_photograph(
 
 def clip_from_array(
     values: Any, *, fps: float | None = None, seconds: float = 1.0,
-    longest_side_px: int | None = None,
+    longest_side_px: int | None = None, white_level: float | None = None,
 ) -> OwnClip:  # fmt: skip
     """Return an array as a clip: (h, w), a photograph, or (frames, h, w), a video at `fps`, of
-    uint8 or of floats in [0, 1].
+    uint8 or of floats in [0, 1].  `white_level` as in `read_video`.
 
     Raises ValueError for another shape, for values outside and for a video without `fps`.
     """
@@ -135,6 +148,7 @@ def clip_from_array(
     ):
         raise ValueError("photo_or_video must be uint8 or floats in [0, 1]")
     facts = "x".join(map(str, array.shape[:-3:-1])) + " px"
+    array = scale_to_white(array, white_level)
     if array.ndim == 2:
         return hold_photograph(_shrink(array, longest_side_px), fps or 120.0, seconds, facts)
     if fps is None:
@@ -164,17 +178,44 @@ def _check_rate(fps: float) -> None:
         raise ValueError(f"fps must be in [0.1, 1e6] frames a second, got {fps}")
 
 
-def _shrink(picture: NDArray, longest_side_px: int | None) -> Float[np.ndarray, "h w"]:
-    """Return float32 in [0, 1], at most `longest_side_px` long."""
+def scale_to_white(
+    values: NDArray, white_level: float | None = None
+) -> Float[np.ndarray, "*shape"]:
+    """Return values of a file as float32 in [0, 1]: 1 is `white_level`, or the largest value of
+    their type, 1 of floats.  Raises ValueError for a `white_level` that is not in (0, that].
+    """
+    full = _largest_value(values.dtype)
+    white = full if white_level is None else white_level
+    if not (isinstance(white, int | float) and 0 < white <= full):
+        raise ValueError(f"white_level must be in (0, {full:g}] or null, got {white_level}")
+    return np.clip(values.astype(np.float32) / white, 0, 1)
+
+
+def _largest_value(kind: np.dtype) -> float:
+    return float(np.iinfo(kind).max) if kind.kind in "iu" else 1.0
+
+
+def _warn_of_darkness(
+    path: Path | str, kind: np.dtype, largest: float, white_level: float | None
+) -> None:
+    """Warn of values of more than 8 bits that are nearly black, as those of 12 bits are in 16."""
+    full = _largest_value(kind)
+    if white_level is None and kind.itemsize > 1 and 0 < largest < DARK_SHARE * full:
+        bits = 2 ** int(largest).bit_length() - 1
+        way = f"; white_level={bits} makes {bits} white" if full > 1 else ""
+        warnings.warn(f"{path}: its largest value is {largest:g} of {full:g}{way}", stacklevel=3)
+
+
+def _shrink(values: Float[np.ndarray, "h w"], longest_side_px: int | None) -> NDArray:
+    """Return values at most `longest_side_px` long."""
     wanted = LARGEST_SIDE_PX if longest_side_px is None else longest_side_px
     if not (isinstance(wanted, int) and wanted >= LEAST_SIDE_PX):
         raise ValueError(f"longest_side_px must be >= {LEAST_SIDE_PX} or null, got {wanted}")
-    shrink = min(1.0, wanted / max(picture.shape))
-    size = [round(side * shrink) for side in picture.shape]
+    shrink = min(1.0, wanted / max(values.shape))
+    size = [round(side * shrink) for side in values.shape]
     if min(size) < LEAST_SIDE_PX:
         got = f"{size[1]}x{size[0]}"
         raise ValueError(f"frames must be {LEAST_SIDE_PX} px or more on either side, got {got}")
-    values: NDArray = picture.astype(np.float32) / (255 if picture.dtype == np.uint8 else 1)
     if shrink < 1:
         values = cv2.resize(values, size[::-1], interpolation=cv2.INTER_AREA)
     return np.clip(values, 0, 1)

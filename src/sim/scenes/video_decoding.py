@@ -25,10 +25,10 @@ class DamagedVideo(Exception):
 
 
 @contextmanager
-def opened_video(path: Path, key: str) -> Iterator[tuple[Any, Any]]:
-    """Open the first video stream of a file; raises ValueError, which names `key`."""
-    wanted = f"{key} must be a video that FFmpeg can read, with frames of at most {LARGEST_PIXELS}"
-    refusal = f"{wanted} pixels, got {path}"
+def open_video(path: Path, config_key: str) -> Iterator[tuple[Any, Any]]:
+    """Open the first video stream of a file; raises ValueError, which names `config_key`."""
+    wanted = f"{config_key} must be a video that FFmpeg can read"
+    refusal = f"{wanted}, with frames of at most {LARGEST_PIXELS} pixels, got {path}"
     options = {"protocol_whitelist": "file"}  # a playlist may not fetch from elsewhere
     try:
         container = av.open(f"file:{path}", options=options, metadata_errors="replace")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Shaped
 from numpy.typing import NDArray
 
 from src.sim.scenes.video_index import VideoIndex, index_video
@@ -23,68 +23,76 @@ VIDEO_SUFFIXES = {
 @dataclass(frozen=True)
 class VideoSource:
     """One video of `count` frames: a file of `index`, or the pictures `frames`, all of `size`
-    (h, w) or as large as the first.  Errors name `key`.
+    (h, w) or as large as the first.  Errors name `config_key`.
     """
 
     name: str
     count: int
-    key: str
+    config_key: str
     index: VideoIndex | None = None
     frames: tuple[Path, ...] = ()
     size: tuple[int, ...] | None = None
 
-    def read(self, first: int, stop: int) -> Iterator[UInt8[np.ndarray, "h w"]]:
-        """Yield frames first .. stop - 1; raises ValueError for one that cannot be read or is of
-        another size.
+    def read(
+        self, first: int, stop: int, flags: int = cv2.IMREAD_GRAYSCALE
+    ) -> Iterator[Shaped[np.ndarray, "h w"]]:
+        """Yield frames first .. stop - 1, of 8 bits; pictures as `flags` of OpenCV say.
+
+        Raises ValueError for one that cannot be read or is of another size.
         """
         if self.index is not None:
-            yield from self.index.read(first, stop, self.key)
+            yield from self.index.read(first, stop, self.config_key)
         size = self.size
         for path in self.frames[first:stop]:
-            picture = read_picture(path)
+            picture = read_picture(path, flags)
             if picture is None:
-                raise ValueError(f"{self.key} must hold frames that can be read, got {path}")
+                raise ValueError(f"{self.config_key} must hold frames that can be read, got {path}")
             size = size or picture.shape
             if picture.shape != size:
                 wanted, (height, width) = f"{size[1]}x{size[0]} px", picture.shape
                 raise ValueError(
-                    f"{self.key} must hold frames of {wanted}, got {width}x{height} in {path}"
+                    f"{self.config_key} must hold frames of {wanted}, "
+                    f"got {width}x{height} in {path}"
                 )
             yield picture
 
 
-def find_videos(root: Path, key: str = "scene.root") -> list[VideoSource]:
+def find_videos(root: Path, config_key: str = "scene.root") -> list[VideoSource]:
     """Return the videos at `root` by name.
 
-    Raises ValueError, which names `key`, where there are none.
+    Raises ValueError, which names `config_key`, where there are none.
     """
     if root.is_file():
-        return [_file_source(root, key)]
+        return [_file_source(root, config_key)]
     entries = sorted(path for path in root.iterdir() if path.name[0] != ".")
     files = [path for path in entries if path.suffix.lower() in VIDEO_SUFFIXES]
-    videos = _folder_sources(root, key)
+    videos = _folder_sources(root, config_key)
     if not videos:
         with ThreadPoolExecutor() as pool:  # each file is decoded once
-            videos = list(pool.map(partial(_file_source, key=key), files))
-        videos += [one for path in entries if path.is_dir() for one in _folder_sources(path, key)]
+            videos = list(pool.map(partial(_file_source, config_key=config_key), files))
+        videos += [
+            one for path in entries if path.is_dir() for one in _folder_sources(path, config_key)
+        ]
     if not videos:
-        raise ValueError(f"{key} must hold videos or folders of frames, got none in {root}")
+        raise ValueError(f"{config_key} must hold videos or folders of frames, got none in {root}")
     return videos
 
 
-def _folder_sources(path: Path, key: str) -> list[VideoSource]:
+def _folder_sources(path: Path, config_key: str) -> list[VideoSource]:
     """Return the folder as one video, none where no frames are in it."""
     names = sorted(path.iterdir())
     frames = [p for p in names if p.suffix.lower() in PICTURE_SUFFIXES and p.name[0] != "."]
-    return [VideoSource(path.name, len(frames), key, frames=tuple(frames))] if frames else []
+    return [VideoSource(path.name, len(frames), config_key, frames=tuple(frames))] if frames else []
 
 
-def _file_source(path: Path, key: str) -> VideoSource:
-    index = index_video(path, key)
-    count = len(index.shown)
+def _file_source(path: Path, config_key: str) -> VideoSource:
+    index = index_video(path, config_key)
+    count = len(index.shown_frames)
     if count < 2:
-        raise ValueError(f"{key} must be a video of two frames or more, got {count} in {path}")
-    return VideoSource(path.stem, count, key, index=index)
+        raise ValueError(
+            f"{config_key} must be a video of two frames or more, got {count} in {path}"
+        )
+    return VideoSource(path.stem, count, config_key, index=index)
 
 
 def read_picture(source: Path | bytes, flags: int = cv2.IMREAD_GRAYSCALE) -> NDArray | None:

@@ -24,7 +24,7 @@ from src.sim.scenes.video_decoding import (
     Gray,
     GrayConverter,
     decode_frames,
-    opened_video,
+    open_video,
 )
 
 MAX_FPS = 1e7  # that is believed
@@ -38,42 +38,42 @@ RATE_ERROR = 0.01  # of the rate that a file states; else it is measured
 class VideoIndex:
     """The frames of a video file.
 
-    `times`: of its whole frames, in ticks of the file, none where it has no usable ones; `keys`:
-    numbers of the key frames.  `shown`: the number of the whole frame that each frame of the video
-    at the constant rate `fps` (None: unknown) shows.
+    `times`: of its whole frames, in ticks of the file, none where it has no usable ones;
+    `keyframes`: their numbers.  `shown_frames`: the number of the whole frame that each frame of
+    the video at the constant rate `fps` (None: unknown) shows.
     """
 
     path: Path
     times: Int[np.ndarray, " frames"]
-    keys: Int[np.ndarray, " keys"]
-    shown: Int[np.ndarray, " count"]
+    keyframes: Int[np.ndarray, " keys"]
+    shown_frames: Int[np.ndarray, " count"]
     fps: float | None
 
-    def read(self, first: int, stop: int, key: str) -> Iterator[Gray]:
-        """Yield frames first .. stop - 1; raises ValueError, which names `key`, for a file that is
-        another one by now.
+    def read(self, first: int, stop: int, config_key: str) -> Iterator[Gray]:
+        """Yield frames first .. stop - 1; raises ValueError, which names `config_key`, for a
+        file that is another one by now.
         """
-        wanted = self.shown[first:stop]
+        wanted = self.shown_frames[first:stop]
         if not len(wanted):
             return
-        frames = self._read_whole(int(wanted[0]), key)
+        frames = self._read_whole(int(wanted[0]), config_key)
         number, frame = int(wanted[0]), next(frames)
         for target in wanted:
             while number < target:
                 number, frame = number + 1, next(frames)
             yield frame
 
-    def _read_whole(self, first: int, key: str) -> Iterator[Gray]:
+    def _read_whole(self, first: int, config_key: str) -> Iterator[Gray]:
         """Yield the whole frames from `first` on, by way of the key frame before it."""
-        before = self.keys[self.keys <= first] if len(self.times) else self.keys[:0]
+        before = self.keyframes[self.keyframes <= first] if len(self.times) else self.keyframes[:0]
         for start in dict.fromkeys([*before[-1:].tolist(), 0]):
-            with opened_video(self.path, key) as (container, stream):
+            with open_video(self.path, config_key) as (container, stream):
                 frames = self._enter(container, stream, start, first)
                 if frames is not None:
                     with suppress(DamagedVideo):
                         yield from map(GrayConverter(), frames)
                     break
-        raise ValueError(f"{key} must not change while it is read, got {self.path}")
+        raise ValueError(f"{config_key} must not change while it is read, got {self.path}")
 
     def _enter(self, container: Any, stream: Any, start: int, first: int) -> Iterator[Any] | None:
         """Return the frames from `first` on, decoded from the key frame `start` on; None where the
@@ -94,28 +94,28 @@ class VideoIndex:
         return chain([found], frames) if found.pts == self.times[first] else None
 
 
-def index_video(path: Path, key: str, most: int | None = None) -> VideoIndex:
-    """Return the index of a video file, of its first `most` frames (None: all).
+def index_video(path: Path, config_key: str, max_frames: int | None = None) -> VideoIndex:
+    """Return the index of a video file, of its first `max_frames` frames (None: all).
 
     Warns of a file that is cut or damaged, whose frames before that place count, and of a variable
-    frame rate.  Raises ValueError, which names `key`, for a file that is no video, shows no whole
-    frame, or has frames of several sizes or of more than LARGEST_PIXELS.
+    frame rate.  Raises ValueError, which names `config_key`, for a file that is no video, shows no
+    whole frame, or has frames of several sizes or of more than LARGEST_PIXELS.
     """
     try:
         state = path.stat()
     except OSError as error:
-        raise ValueError(f"{key} must be a video that exists, got {path}") from error
-    return _index(path, key, most, state.st_mtime_ns, state.st_size)
+        raise ValueError(f"{config_key} must be a video that exists, got {path}") from error
+    return _index(path, config_key, max_frames, state.st_mtime_ns, state.st_size)
 
 
 @lru_cache(maxsize=4096)
-def _index(path: Path, key: str, most: int | None, *version: int) -> VideoIndex:
-    with opened_video(path, key) as (container, stream):
-        times, keys, fault = _list_frames(container, stream, path, key, most)
+def _index(path: Path, config_key: str, max_frames: int | None, *version: int) -> VideoIndex:
+    with open_video(path, config_key) as (container, stream):
+        times, keys, fault = _list_frames(container, stream, path, config_key, max_frames)
         known = None not in times and bool(np.all(np.diff(np.array(times, float)) > 0))
         ticks, count = _numbers(times if known else []), len(times)
         shown, fps, uneven = _at_constant_rate(ticks, count, stream)
-        if not fault and most is None and _ends_early(ticks, count, fps, container, stream):
+        if not fault and max_frames is None and _ends_early(ticks, count, fps, container, stream):
             fault = "it ends before its stated end"
             ticks = ticks[: _find_hole_at_end(ticks)]
             count = len(ticks) or count
@@ -124,7 +124,8 @@ def _index(path: Path, key: str, most: int | None, *version: int) -> VideoIndex:
             keys = []
     if len(shown) > MOST_FRAMES:
         raise ValueError(
-            f"{key} must show at most {MOST_FRAMES} frames, got more by the time stamps of {path}"
+            f"{config_key} must show at most {MOST_FRAMES} frames, got more by the time stamps of "
+            f"{path}"
         )
     if fault:
         message = f"{path} is cut or damaged ({fault}): its first {count} frames are read"
@@ -136,7 +137,7 @@ def _index(path: Path, key: str, most: int | None, *version: int) -> VideoIndex:
 
 
 def _list_frames(
-    container: Any, stream: Any, path: Path, key: str, most: int | None
+    container: Any, stream: Any, path: Path, config_key: str, max_frames: int | None
 ) -> tuple[list[int | None], list[int], str]:
     """Return the time stamps of the whole frames, the numbers of key frames and what ends them."""
     times: list[int | None] = []
@@ -144,7 +145,7 @@ def _list_frames(
     sizes: set[tuple[int, int]] = set()
     fault = ""
     try:
-        for frame in islice(decode_frames(container, stream), most):
+        for frame in islice(decode_frames(container, stream), max_frames):
             if frame.key_frame:
                 keys.append(len(times))
             times.append(frame.pts)
@@ -152,9 +153,11 @@ def _list_frames(
     except DamagedVideo as error:
         fault = str(error)
     if not times:
-        raise ValueError(f"{key} must be a video with a whole frame, got none in {path}")
+        raise ValueError(f"{config_key} must be a video with a whole frame, got none in {path}")
     if len(sizes) > 1:
-        raise ValueError(f"{key} must have frames of one size, got {sorted(sizes)} in {path}")
+        raise ValueError(
+            f"{config_key} must have frames of one size, got {sorted(sizes)} in {path}"
+        )
     return times, keys, fault
 
 

@@ -47,7 +47,7 @@ def response_table(
     zero below code value 20, the logarithm of the code value above.  `source` says what the
     intensities are: `linear`, taken as they are, or `srgb`, decoded to linear light first.
     """
-    x, slope = nodes(source), math.log(20.0) / 20.0
+    x, slope = table_nodes(source), math.log(20.0) / 20.0
     linlog = np.where(x <= LINLOG_KNEE, 255.0 * x * slope, np.log(255.0 * x))
     y = linlog if response == "linlog" else np.log(np.maximum(x, floor))
     return torch.from_numpy(_scaled(y)).to(device)
@@ -61,7 +61,7 @@ def low_pass_table(cutoff_hz: float, fps: float, encoding: str) -> NDArray[np.in
     a level that moves linearly by D in an interval dt and a/tau = 2 pi f dt the exact solution
     is y1 + (filtered0 - y0) exp(-a) - D (1 - exp(-a)) / a, whatever the interval.
     """
-    a = 2 * math.pi * cutoff_hz / fps * (255 * nodes(encoding) + 20) / 275
+    a = 2 * math.pi * cutoff_hz / fps * (255 * table_nodes(encoding) + 20) / 275
     return _scaled(np.stack([np.exp(-a), -np.expm1(-a) / a]))
 
 
@@ -69,7 +69,7 @@ def _scaled(curves: NDArray[np.float64]) -> NDArray[np.int32]:
     return np.rint(curves * UNIT * 2**EXTRA).astype(np.int32)
 
 
-def nodes(source: str) -> np.ndarray:
+def table_nodes(source: str) -> np.ndarray:
     """Return the light at the table's nodes, 2**-14 to 2 of what `source` says, float64."""
     bits = FIRST + (np.arange((OCTAVES + 1) * NODES + 1, dtype=np.int64) << CELL)
     x = bits.astype(np.int32).view(np.float32).astype(np.float64)

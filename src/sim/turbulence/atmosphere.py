@@ -5,6 +5,7 @@ radians, pixels of a frame `width_px` wide.  k = 2 pi / wavelength.
 """
 
 import math
+from bisect import bisect
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -15,7 +16,8 @@ from torch import Tensor
 from src.sim.turbulence import outer_scale
 from src.sim.turbulence.contract import check_option
 
-WEAK_BELOW_PX, STRONG_FROM_PX = 0.5, 1.2  # spread in px of a frame 256 wide; see docs/simulation.md
+# Tilt and blur, in px of a frame 256 wide, from which on turbulence is medium, strong, extreme.
+WEAK_BELOW_PX, STRONG_FROM_PX, EXTREME_FROM_PX = 0.5, 1.2, 3.5
 AR1_FPS = 120.0  # the frame rate that `ar1_coefficient` is stated for
 REFERENCE_WIDTH_PX = 256  # the width of the frame that severities speak of
 TILT_VARIANCE = 0.448879  # of Noll's a2 and a3 at D/r0 = 1, in rad^2
@@ -84,11 +86,11 @@ class Atmosphere:
 
     @property
     def severity(self) -> str:
-        """What is seen: `weak`, `medium` or `strong`, by `tilt_and_blur_px` of a frame 256 wide."""
+        """What is seen: `weak`, `medium`, `strong` or `extreme`, by `tilt_and_blur_px` of a frame
+        256 wide."""
         spread = self.tilt_and_blur_px(REFERENCE_WIDTH_PX)
-        if spread < WEAK_BELOW_PX:
-            return "weak"
-        return "medium" if spread < STRONG_FROM_PX else "strong"
+        limits = WEAK_BELOW_PX, STRONG_FROM_PX, EXTREME_FROM_PX
+        return ("weak", "medium", "strong", "extreme")[bisect(limits, spread)]
 
     @cached_property
     def normalised_profile(self) -> tuple[float, ...]:
@@ -140,7 +142,7 @@ class Atmosphere:
         Tilt and blur in quadrature; of the blur what exceeds diffraction, as the standard
         deviation of the Gaussian that holds half of its light within the same radius.
         """
-        blur = outer_scale.turbulence_blur(self.blur_equivalent_d_over_r0)
+        blur = outer_scale.turbulence_blur_std_in_lambda_over_d(self.blur_equivalent_d_over_r0)
         return math.hypot(self.tilt_std_px(width_px), self.lambda_over_d_px(width_px) * blur)
 
     def tilt_correlation_half_length_px(self, width_px: int) -> float:
@@ -158,7 +160,7 @@ class Atmosphere:
 
     def _variance_ratio(self, modes: str) -> float:
         ratio = self.aperture_over_outer_scale
-        return outer_scale.variance_ratio(ratio, self.normalised_profile, modes)
+        return outer_scale.variance_over_kolmogorov(ratio, self.normalised_profile, modes)
 
     @property
     def _k(self) -> float:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
 
-from src.sim.turbulence.coefficient_grid import Grid, GridAxis, omit_weak_waves
+from src.sim.turbulence.coefficient_grid import Grid, GridAxis, zero_weak_responses
 from src.sim.turbulence.contract import Crop
 from src.sim.turbulence.engines.device import copy_to_device
 from src.sim.turbulence.fidelity import Fidelity
@@ -71,7 +71,7 @@ class TilePlan:
     psfs: FittedPSFs
     halo_share: float
 
-    def of_frames(self, first: int, stop: int, frames: int) -> "TilePlan":
+    def select_frames(self, first: int, stop: int, frames: int) -> "TilePlan":
         """Return the plan of frames first .. stop - 1 of the clip's `frames`."""
         by_view = self.amplitudes.unflatten(0, (-1, frames))
         return replace(self, amplitudes=by_view[:, first:stop].flatten(0, 1))
@@ -94,8 +94,8 @@ def plan_tile(
     response = torch.view_as_complex(waves.response).to(torch.complex64)
     tables = _wave_tables("tilt", tilt_grid, waves, frame_size)
     tables |= _wave_tables("psf", psf_grid, waves, frame_size)
-    tables["tilt_response"] = tables["tilt_response"] * omit_weak_waves(response[:2], 0)
-    tables["psf_response"] = tables["psf_response"] * omit_weak_waves(response[2:], 2)
+    tables["tilt_response"] = tables["tilt_response"] * zero_weak_responses(response[:2], 0)
+    tables["psf_response"] = tables["psf_response"] * zero_weak_responses(response[2:], 2)
     if tilt_grid[0].pitch > 1:
         tables["tilt_down"] = tilt_grid[0].interpolation_matrix()
         tables["tilt_across"] = tilt_grid[1].interpolation_matrix().T
@@ -103,7 +103,7 @@ def plan_tile(
         tables["psf_across"] = psf_grid[1].interpolation_matrix().T
     names = "halo_rows", "halo_columns", "halo_spectrum"
     tables |= zip(names, halo.transform(frame_size, tile), strict=True)
-    network = psfs.network.merge_layers(len(response) - 2, psfs.d_over_r0)
+    network = psfs.network.merge_into_few_matrices(len(response) - 2, psfs.d_over_r0)
     tables |= {"basis": psfs.basis.flatten(1).T} | network._asdict()
     packed, drawn = PackedTensors(tables), amplitudes.flatten(0, 1)
     return TilePlan(tile, drawn, packed, psf_grid, fidelity, psfs, halo.share)
@@ -115,7 +115,7 @@ def _wave_tables(
     """Return each wave, conjugated, along the rows of a grid and along its columns from the middle
     one on, and its factor at the middle column; the axis of the camera is the frame's middle.
     """
-    (rows, columns), (height, width) = (axis.pixels for axis in grid), frame_size
+    (rows, columns), (height, width) = (axis.node_pixels for axis in grid), frame_size
     middle = (columns[0] + columns[-1]) / 2
     along_x, along_y = waves.frequency_per_px.double().split(1, 1)
     return {

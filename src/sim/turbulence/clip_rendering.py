@@ -22,7 +22,7 @@ from torch import Tensor
 from src.sim.turbulence.clip_plan import TilePlan
 from src.sim.turbulence.coefficient_grid import WaveSum, evaluate_waves, sum_waves
 from src.sim.turbulence.engines import device as devices
-from src.sim.turbulence.engines.network_numba import evaluate_network
+from src.sim.turbulence.engines.network_numba import evaluate_psf_network
 from src.sim.turbulence.engines.scatter_numba import scatter_psfs
 from src.sim.turbulence.engines.warp_numba import PaddedFrames, pad_frames, warp_frames
 from src.sim.turbulence.p2s import FoldedNetwork
@@ -36,14 +36,15 @@ def render_views(
     frames: Float[Tensor, "frames height width"],
     plans: Sequence[TilePlan],
     *,
-    compiled: bool | None = None,
+    use_cpu_engines: bool | None = None,
 ) -> Float[Tensor, "views frames h w"]:
     """Return every view in the plans' tiles together, on the device of `frames`.
 
-    `compiled`: whether by the engines of the CPU; None: where `frames` are there.
+    `use_cpu_engines`: whether by the engines of the CPU; None: where `frames` are there.
     """
-    compiled = frames.device.type == "cpu" if compiled is None else compiled
-    padded = pad_frames(frames) if compiled else None
+    if use_cpu_engines is None:
+        use_cpu_engines = frames.device.type == "cpu"
+    padded = pad_frames(frames) if use_cpu_engines else None
     out, parts = _allocate_tiles(plans, frames, len(plans[0].amplitudes))
     for plan, part in zip(plans, parts, strict=True):
         _render_tile(frames, padded, plan, part)
@@ -121,7 +122,7 @@ def _make_network(tables: dict[str, Tensor], *, on_cpu: bool) -> Callable[[Tenso
     matrices = [matrix.numpy() for matrix in network._replace(last=network.last[1:])]
 
     def weigh(phase: Tensor) -> Tensor:
-        weights = evaluate_network(phase.flatten(1).numpy(), *matrices)
+        weights = evaluate_psf_network(phase.flatten(1).numpy(), *matrices)
         return torch.from_numpy(weights).unflatten(1, phase.shape[1:])
 
     return weigh
@@ -148,7 +149,7 @@ def _blur_on_cpu(
     """Write the frames from `first` on, warped by `tilt` and spread by their PSFs, to `out`."""
     (rows, columns), nodes = plan.psf_grid, weights.numpy()
     basis = plan.psfs.quarter, np.array(plan.psfs.parity_ends)
-    lattice = rows.offset, columns.offset, rows.pitch
+    lattice = rows.offset_from_first_node_px, columns.offset_from_first_node_px, rows.pitch
     for index, image in enumerate(warp_frames(padded, first, tilt, rows.start, columns.start)):
         halo = tables["halo"][first + index].numpy(), plan.halo_share
         out[index] = torch.from_numpy(scatter_psfs(image, nodes, index, *basis, *lattice, *halo))
@@ -184,13 +185,13 @@ def _view_parts(plan: TilePlan, pictures: int, frames: int) -> Iterator[tuple[in
 def _numbers_per_picture(plan: TilePlan, engine: ModuleType) -> int:
     """Return how many numbers a device holds for a picture, about."""
     (rows, columns), fidelity = plan.psf_grid, plan.fidelity
-    nodes, pixels = rows.nodes * columns.nodes, rows.count * columns.count
+    nodes, pixels = rows.node_count * columns.node_count, rows.count * columns.count
     psf = fidelity.psf_size_px**2
     sizes = [plan.tables.tensors[name].shape for name in ("first", "common", "gates", "last")]
     network = sum(map(sum, sizes)) - sizes[0][1]
     return (
         (fidelity.zernike_modes - 2 + network) * nodes
-        + (1 + fidelity.psf_rank + psf) * rows.nodes * columns.count
+        + (1 + fidelity.psf_rank + psf) * rows.node_count * columns.count
         + (4 + engine.WARP_NUMBERS + engine.SCATTER_NUMBERS * psf) * pixels
     )
 

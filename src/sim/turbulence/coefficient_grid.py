@@ -30,70 +30,72 @@ GridWaves = Float[Tensor, "twice_the_waves rows columns"]
 class GridAxis:
     """The nodes along one axis that pixels start .. start + count - 1 need.
 
-    `order` 1 interpolates linearly between two nodes, 3 by Lagrange's cubic through four.
+    `interpolation_order` 1 is linear between two nodes, 3 Lagrange's cubic through four.
     """
 
     start: int
     count: int
     pitch: int
-    order: int
+    interpolation_order: int
 
     @property
-    def first(self) -> int:
-        """The number of the first node; it lies on pixel first * pitch."""
-        return self.start // self.pitch - (self.order == 3 and self.pitch > 1)
+    def first_node(self) -> int:
+        """The number of the first node; it lies on pixel first_node * pitch."""
+        return self.start // self.pitch - (self.interpolation_order == 3 and self.pitch > 1)
 
     @property
-    def nodes(self) -> int:
+    def node_count(self) -> int:
         if self.pitch == 1:
             return self.count
-        last = (self.start + self.count - 1) // self.pitch + (2 if self.order == 3 else 1)
-        return last + 1 - self.first
+        last = (self.start + self.count - 1) // self.pitch + (
+            2 if self.interpolation_order == 3 else 1
+        )
+        return last + 1 - self.first_node
 
     @property
-    def pixels(self) -> Int[Tensor, " nodes"]:
-        return (torch.arange(self.nodes) + self.first) * self.pitch
+    def node_pixels(self) -> Int[Tensor, " nodes"]:
+        return (torch.arange(self.node_count) + self.first_node) * self.pitch
 
     @property
-    def offset(self) -> int:
+    def offset_from_first_node_px(self) -> int:
         """How many pixels the first pixel lies after the first node."""
-        return self.start - self.first * self.pitch
+        return self.start - self.first_node * self.pitch
 
     def interpolation_matrix(self) -> Float[Tensor, "count nodes"]:
         """Return the weight of every node in every pixel; rows sum to 1."""
         if self.pitch == 1:
             return torch.eye(self.count)
-        pixel = torch.arange(self.count) + self.offset
+        pixel = torch.arange(self.count) + self.offset_from_first_node_px
         cell = torch.div(pixel, self.pitch, rounding_mode="floor")
         t = (pixel - cell * self.pitch).double() / self.pitch
         near, taps = torch.arange(2), [1 - t, t]
-        if self.order == 3:  # Lagrange's weights of the nodes -1, 0, 1, 2
+        if self.interpolation_order == 3:  # Lagrange's weights of the nodes -1, 0, 1, 2
             near, below, above = torch.arange(-1, 3), t + 1, t - 2
             taps = [-t * (t - 1) * above / 6, below * (t - 1) * above / 2]
             taps += [-below * t * above / 2, below * t * (t - 1) / 6]
-        weights = torch.zeros(self.count, self.nodes, dtype=torch.float64)
+        weights = torch.zeros(self.count, self.node_count, dtype=torch.float64)
         return weights.scatter_(1, cell[:, None] + near, torch.stack(taps, dim=-1)).float()
 
 
 Grid = tuple[GridAxis, GridAxis]  # rows and columns
 
 
-def omit_weak_waves(response: Response, first_mode: int) -> Response:
+def zero_weak_responses(response: Response, first_mode: int) -> Response:
     """Return `response` with 0 for waves that hardly count for a radial order (OMITTED_VARIANCE).
 
     Row 0 is mode `first_mode`, 0 being x-tilt.
     """
     strongest = torch.zeros_like(response)
-    for rows in radial_orders(first_mode, len(response)):
+    for rows in slices_by_radial_order(first_mode, len(response)):
         power, rank = response[rows].abs().square().sum(0).sort()
         waves = rank[power.cumsum(0) > OMITTED_VARIANCE[first_mode > 1] * power.sum()]
         strongest[rows, waves] = response[rows, waves]
     return strongest
 
 
-def radial_orders(first: int, modes: int) -> list[slice]:
-    """Return the modes of each radial order n, as slices; mode 0 of them is `first`."""
-    order = [noll_index(mode + 2)[0] for mode in range(first, first + modes)]
+def slices_by_radial_order(first_mode: int, modes: int) -> list[slice]:
+    """Return the modes of each radial order n, as slices; mode 0 of them is `first_mode`."""
+    order = [noll_index(mode + 2)[0] for mode in range(first_mode, first_mode + modes)]
     edges = [i for i in range(modes + 1) if i in (0, modes) or order[i] != order[i - 1]]
     return [slice(*pair) for pair in pairwise(edges)]
 
@@ -103,20 +105,20 @@ class WaveSum:
 
     A wave on a grid is its rows times its columns.  There is a product for all modes of a radial
     order, over the waves that it sees, for what is even about the middle column and for what is
-    odd.  `response`: that of `omit_weak_waves`, row 0 being mode `first`; `rows`, `columns`:
-    exp(-2 pi i f x) from the middle of the grid on.
+    odd.  `response`: that of `zero_weak_responses`, row 0 being mode `first_mode`; `rows`,
+    `columns`: exp(-2 pi i f x) from the middle of the grid on.
     """
 
-    def __init__(self, response: Response, rows: WaveRows, columns: WaveColumns, first: int):
+    def __init__(self, response: Response, rows: WaveRows, columns: WaveColumns, first_mode: int):
         half = columns[:, columns.shape[1] // 2 :]
         half = pad(half, (0, -half.shape[1] % PADDED_COLUMNS))
-        self.orders: list[tuple[slice, list[np.ndarray], Tensor, Tensor]] = []
-        for modes in radial_orders(first, len(response)):
+        self.interpolation_orders: list[tuple[slice, list[np.ndarray], Tensor, Tensor]] = []
+        for modes in slices_by_radial_order(first_mode, len(response)):
             waves = (response[modes] != 0).any(0).nonzero()[:, 0]
             weights = torch.view_as_real(response[modes, waves].contiguous()).numpy()
             down = [part[waves].T.contiguous().numpy() for part in (rows.real, -rows.imag)]
             across = half.real[waves], -half.imag[waves]
-            self.orders.append((modes, [weights, waves.numpy(), *down], *across))
+            self.interpolation_orders.append((modes, [weights, waves.numpy(), *down], *across))
         self.shape = len(response), rows.shape[1], columns.shape[1]
 
     def __call__(
@@ -126,7 +128,7 @@ class WaveSum:
         modes, rows, columns = self.shape
         out = torch.empty(modes, len(amplitudes), rows, columns)
         drawn = torch.view_as_real(amplitudes.contiguous()).numpy()
-        for order, (weights, waves, cos_y, sin_y), cos_x, sin_x in self.orders:
+        for order, (weights, waves, cos_y, sin_y), cos_x, sin_x in self.interpolation_orders:
             even, odd = split_even_odd(weights, drawn, waves, cos_y, sin_y)
             even, odd = torch.from_numpy(even) @ cos_x, torch.from_numpy(odd) @ sin_x
             join_even_odd(even.numpy(), odd.numpy(), out[order].view(-1, columns).numpy())

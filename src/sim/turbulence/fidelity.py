@@ -111,7 +111,7 @@ def choose_fidelity(atmosphere: Atmosphere, width_px: int, tolerance: float) -> 
     )
 
 
-def mean_psf(d_over_r0: float) -> Float[Tensor, "fine fine"]:
+def mean_short_exposure_psf(d_over_r0: float) -> Float[Tensor, "fine fine"]:
     """Return the mean PSF at `d_over_r0`, tilt removed, as stored."""
     return interpolate_log(error_table("mean"), error_table("strength"), d_over_r0)
 

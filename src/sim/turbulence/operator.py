@@ -15,7 +15,7 @@ from src.sim.turbulence.atmosphere import Atmosphere
 from src.sim.turbulence.clip_plan import TilePlan, plan_tile
 from src.sim.turbulence.clip_rendering import render_tilt, render_views
 from src.sim.turbulence.contract import Crop, Frames, Tilt, Views, check_option
-from src.sim.turbulence.fidelity import Fidelity, choose_fidelity, mean_psf
+from src.sim.turbulence.fidelity import Fidelity, choose_fidelity, mean_short_exposure_psf
 from src.sim.turbulence.p2s import FittedPSFs, find_psf_band
 from src.sim.turbulence.plane_waves import WaveDynamics, draw_plane_waves
 from src.sim.turbulence.psf import PSFHalo
@@ -58,7 +58,10 @@ class Turbulence:
             strength, unit = fidelity.blur_equivalent_d_over_r0, fidelity.lambda_over_d_px
             size, network = fidelity.psf_size_px, (fidelity.psf_network, fidelity.psf_rank)
             self.psfs = FittedPSFs(find_psf_band(strength), *network, unit, size, strength)
-            self.fidelity, self.halo = fidelity, PSFHalo(mean_psf(strength), unit, size)
+            self.fidelity, self.halo = (
+                fidelity,
+                PSFHalo(mean_short_exposure_psf(strength), unit, size),
+            )
 
     @property
     def metadata(self) -> dict[str, float | int | str]:
@@ -99,7 +102,7 @@ class Turbulence:
         plans = [] if self.is_identity else self.plan(frames, generator, window)
         for part in parts:
             stop = first + len(part)
-            own = [plan.of_frames(first, stop, frames) for plan in plans]
+            own = [plan.select_frames(first, stop, frames) for plan in plans]
             if own:
                 yield render_views(part.float(), own), render_tilt(own, len(part))
             else:
@@ -111,7 +114,7 @@ class Turbulence:
         self, frames: int, generator: Generator, window: Crop, device: torch.device | str = "cpu"
     ) -> list[TilePlan]:
         """Return the plans of the tiles of one clip, drawn on `device`; not of the identity."""
-        atmosphere, key = self.atmosphere, noise.base_key(generator)
+        atmosphere, key = self.atmosphere, noise.draw_base_key(generator)
         assert atmosphere is not None  # else it is the identity
         modes, wave_key = self.fidelity.zernike_modes, noise.key(key, "waves")
         waves = draw_plane_waves(

@@ -36,7 +36,9 @@ BLUR_RADII = np.geomspace(0.4, 60, 200)  # lambda / D
 GAUSSIAN_HALF_LIGHT = math.sqrt(2 * math.log(2))  # half-light radius over standard deviation
 
 
-def variance_ratio(aperture_over_outer_scale: float, profile: Cn2Profile, modes: str) -> float:
+def variance_over_kolmogorov(
+    aperture_over_outer_scale: float, profile: Cn2Profile, modes: str
+) -> float:
     """Return the share of the variance of `modes`, `tilt` or `higher` (all modes beyond tilt), that
     an outer scale L0 = D / `aperture_over_outer_scale` leaves."""
     place, weight = _path(profile)
@@ -81,8 +83,10 @@ def tilt_decay_distance(
     return float(np.exp(np.interp(-level, -correlation[ends], np.log(LAGS[ends]))))
 
 
-def global_tilt_share(aperture_over_outer_scale: float, profile: Cn2Profile, view: float) -> float:
-    """Return the share of the tilt's variance that moves all of a square view, `view` D a side.
+def global_tilt_share(
+    aperture_over_outer_scale: float, profile: Cn2Profile, view_side_over_d: float
+) -> float:
+    """Return the share of the tilt's variance that moves all of a square view of that side.
 
     The mean correlation of two of its points; the density of their distance: Philip (2007).
     """
@@ -91,7 +95,7 @@ def global_tilt_share(aperture_over_outer_scale: float, profile: Cn2Profile, vie
     beyond = 4 * far - apart**2 - 2 + math.pi - 4 * np.arctan(far)
     weight = apart * np.where(apart < 1, apart**2 - 4 * apart + math.pi, beyond)
     known = _correlation_over_lags(aperture_over_outer_scale, profile, False)
-    correlation = np.interp(np.log(apart * view), np.log(LAGS), known)
+    correlation = np.interp(np.log(apart * view_side_over_d), np.log(LAGS), known)
     return float(weight @ correlation / weight.sum())
 
 
@@ -142,7 +146,7 @@ def short_exposure_half_light_radius(d_over_r0: float) -> float:
     return float(np.interp(d_over_r0, BLUR_D_OVER_R0, _half_light_radii()))
 
 
-def turbulence_blur(d_over_r0: float) -> float:
+def turbulence_blur_std_in_lambda_over_d(d_over_r0: float) -> float:
     """Return by how much turbulence blurs beyond diffraction, tilt removed, in lambda / D.
 
     The standard deviation along one axis of the Gaussian whose half-light radius, added in squares

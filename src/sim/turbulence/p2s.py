@@ -80,8 +80,8 @@ class PhaseToSpaceNetwork:
         }
         return replace(self, layers=layers)
 
-    def merge_layers(self, given: int, d_over_r0: float) -> "FoldedNetwork":
-        """Return few large matrices that do the same; modes beyond the `given` first are zero."""
+    def merge_into_few_matrices(self, input_modes: int, d_over_r0: float) -> "FoldedNetwork":
+        """Return few large matrices that do the same; modes from `input_modes` on are zero."""
         weight = {name.removesuffix(".weight"): part for name, part in self.layers.items()}
         few, width = weight["pairs"].shape[0], weight["common"].shape[0]
         forms = [(parity, weight[f"forms.{parity}"]) for parity in range(4)]
@@ -107,7 +107,7 @@ class PhaseToSpaceNetwork:
             (weight[name], weight[f"{name}.bias"]) for name in ("pair_gates", "gates.0", "gates.1")
         ]
         return FoldedNetwork(
-            torch.cat(first)[:, :given].contiguous(),
+            torch.cat(first)[:, :input_modes].contiguous(),
             torch.cat([weight["common"][:, :-1], constant[:, None]], 1),
             torch.cat([torch.cat([gate, bias[:, None]], 1) for gate, bias in gates]),
             torch.cat([weight["pairs"]] * 2),

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from src.sim.turbulence import outer_scale
 from src.sim.turbulence.atmosphere import (
     AR1_FPS,
+    EXTREME_FROM_PX,
     REFERENCE_WIDTH_PX,
     STRONG_FROM_PX,
     TILT_VARIANCE,
@@ -27,6 +28,7 @@ TILT_AND_BLUR_PX = {
     "weak": (0.1, WEAK_BELOW_PX),
     "medium": (WEAK_BELOW_PX, STRONG_FROM_PX),
     "strong": (STRONG_FROM_PX, 3.0),
+    "extreme": (EXTREME_FROM_PX, 7.0),
 }
 PROFILES = {"uniform": (0, 1), "camera": (0, 0.1), "middle": (1 / 3, 2 / 3), "object": (0.7, 1)}
 PROFILE_POINTS = 121
@@ -71,14 +73,15 @@ def sample_atmosphere(
     tilt_correlation_time_s: Range = (0.02, 0.25),
     **cameras,
 ) -> Atmosphere | None:
-    """Draw an atmosphere of `severity`: weak, medium, strong or mixed (10/30/60 %).
+    """Draw an atmosphere of `severity`: weak, medium, strong, extreme or mixed (10/30/60 % of the
+    first three).
 
     All ranges are log-uniform, in pixels of a frame 256 wide; `tilt_and_blur_px` for each severity;
     at `global_tilt_probability` the half length is that of turbulence that moves the whole view.
     What no camera shows is drawn again.  `cameras`: see `sample_matching_atmosphere`.  `none` gives
     None.  Raises ValueError for an unknown severity or ranges that nothing meets.
     """
-    names = ["none", *SEVERITY_SHARES, "mixed"]
+    names = ["none", *TILT_AND_BLUR_PX, "mixed"]
     check_option(severity in names, "atmosphere.severity", ", ".join(names), severity)
     if severity == "none":
         return None
@@ -257,7 +260,9 @@ def _mismatch(
 @cache
 def _blur_table() -> tuple[np.ndarray, np.ndarray]:
     strengths = np.concatenate([[0.0], D_OVER_R0])
-    return strengths, np.array([outer_scale.turbulence_blur(strength) for strength in strengths])
+    return strengths, np.array(
+        [outer_scale.turbulence_blur_std_in_lambda_over_d(strength) for strength in strengths]
+    )
 
 
 @cache
@@ -270,7 +275,7 @@ def _path_statistics(profile: tuple[float, ...], ratio: float) -> tuple[float, f
     scatter = (strength * (place * (1 - place)) ** (5 / 6)).sum()
     return (
         outer_scale.tilt_decay_distance(ratio, profile),
-        outer_scale.variance_ratio(ratio, profile, "tilt"),
-        outer_scale.variance_ratio(ratio, profile, "higher"),
+        outer_scale.variance_over_kolmogorov(ratio, profile, "tilt"),
+        outer_scale.variance_over_kolmogorov(ratio, profile, "higher"),
         float(scatter / (strength * (1 - place) ** (5 / 3)).sum()),
     )

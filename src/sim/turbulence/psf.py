@@ -54,7 +54,7 @@ class PSFHalo:
         sides = []
         for first, count, pixels in zip(window[:2], window[2:], frame_size, strict=True):
             fast = next_fast_len(count + 2 * self.reach, real=True)
-            sides.append(symmetric_index(torch.arange(fast) + first - self.reach, pixels))
+            sides.append(reflect_index(torch.arange(fast) + first - self.reach, pixels))
         psf = self.psf.new_zeros(len(sides[0]), len(sides[1]))
         psf[: len(self.psf), : len(self.psf)] = self.psf
         far = -2 * self.reach  # the first pixel gets light from the sources 0 .. 2 reach
@@ -74,7 +74,7 @@ def convolve_halo(
     return light[:, : size[0], : size[1]].clamp(min=0)
 
 
-def symmetric_index(index: Int[Tensor, "..."], size: int) -> Int[Tensor, "..."]:
+def reflect_index(index: Int[Tensor, "..."], size: int) -> Int[Tensor, "..."]:
     """Return the pixel of the frame whose mirror image lies at `index` (the border is doubled)."""
     folded = torch.remainder(index, 2 * size)
     return torch.minimum(folded, 2 * size - 1 - folded)

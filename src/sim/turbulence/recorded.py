@@ -117,7 +117,7 @@ class RecordedTurbulenceOperator:
 
     def tilt(self, frames: int, generator: Generator, *, crop: Crop | None = None) -> Tilt:
         """Return the displacement of `degrade`; `crop` may reach beyond the frame."""
-        key = noise.base_key(generator)
+        key = noise.draw_base_key(generator)
         pieces = noise.uniform(noise.key(key, "pieces"), torch.arange(PLACES**2 * TIMES))
         order, window = pieces.argsort().tolist(), crop or (0, 0, *self.size)
         return torch.stack([self._view(one, frames, order, key, window) for one in self.views])

@@ -72,12 +72,16 @@ def test_every_rate_shows_the_same_events(bench):
 
 
 def test_a_still_scene_without_turbulence_makes_no_event(bench):
-    found = simulate_event_clip(bench.pipeline, 0, ClipConditions(moving_share=0.0, d_over_r0=0.0))
+    found = simulate_event_clip(
+        bench.pipeline, 0, ClipConditions(stop_after_share=0.0, d_over_r0=0.0)
+    )
     assert sum(map(len, found.events)) == 0
 
 
 def test_a_scene_that_stops_makes_no_event_afterwards(bench):
-    found = simulate_event_clip(bench.pipeline, 0, ClipConditions(moving_share=0.5, d_over_r0=0.0))
+    found = simulate_event_clip(
+        bench.pipeline, 0, ClipConditions(stop_after_share=0.5, d_over_r0=0.0)
+    )
     half = int(0.5 * (len(found.target) - 1))
     assert all(torch.equal(frame, found.target[half]) for frame in found.target[half:])
     times = np.concatenate([events["t"] for events in found.events])
@@ -173,7 +177,7 @@ def test_every_stress_test_runs_on_a_set_network(bench):
     for measure, settings in tests.items():
         found = measure(subject, bench, **settings)
         assert found.value == found.value and found.limit is not None, measure
-    varied = {"parameter": "view_gain_std", "values": [0.05], "limit_db": 1.0}
+    varied = {"parameter": "view_log_gain_std", "values": [0.05], "limit_db": 1.0}
     found = conditions.measure_worst_psnr_loss(subject, bench, **varied)
     assert found.value == found.value
 
@@ -187,8 +191,8 @@ def test_shifting_brings_nothing_in():
 
 def test_settling_is_the_last_time_beyond():
     scores = torch.cat([torch.linspace(0, 20, 21), torch.full((39,), 20.0)])
-    assert recurrence.measure_settling_time(scores, 1.0) == 18  # averaged over five windows
-    assert recurrence.windows_to_last_exceedance(torch.tensor([3.0, 0.5, 2.0, 0.5]), 1.0) == 3
+    assert recurrence.count_settling_windows(scores, 1.0) == 18  # averaged over five windows
+    assert recurrence.count_windows_to_last_exceedance(torch.tensor([3.0, 0.5, 2.0, 0.5]), 1.0) == 3
 
 
 class Cloudy(Running):

@@ -1,5 +1,7 @@
 """Views found without a board: of simulated kaleidoscopes, whose geometry is known."""
 
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from src.recordings.calibration.scene_alignment import SceneTarget, align_scene
 from src.recordings.files.event_writers import write_events
 from src.sim.optics import layout
 from src.sim.sensor.sensor import EventSensor
-from tests.recordings.test_views import distance_px
+from tests.recordings.test_views import distance_px, fold_corners
 
 SENSOR, SIDE, TILE = (360, 640), 120, 116.0
 
@@ -38,10 +40,11 @@ def moving_scene(shift_px: float = 0.0, frames: int = 17) -> np.ndarray:
     return 0.9 * np.stack(film) + 0.05
 
 
-def record(path, positions, films, key: int = 5):
+def record(path, positions, films, key: int = 5, angle_rad: float = 0.0):
     truth = simulated_recording.kaleidoscope_views(
         list(positions), model=(SIDE, SIDE), sensor=SENSOR, tile_px=TILE, key=key
     )
+    truth = fold_corners(truth, angle_rad, off_px=8.0) if angle_rad else truth
     sensor = EventSensor(
         0.3, refractory_s=5e-4, mismatch=0.03, dark_noise_hz=1.0, leak_event_hz=0.1,
         hot_pixel_fraction=1e-4, hot_pixel_hz=60.0,
@@ -62,11 +65,27 @@ def test_any_scene_finds_the_views_of_a_kaleidoscope(views, tmp_path):
     assert there.positions == list(layout(views))
     assert max(distance_px(there, truth).values()) < 0.3
     assert max(found.held_out_px.values()) < 0.3 and min(found.matched.values()) > 0.9
+    assert not any(view.fold for view in there.views)
     assert [there.mirrored_xy(v) for v in there.views] == [
         (bool(col % 2), bool(row % 2)) for row, col in layout(views)
     ]
     left, top, right, bottom = np.array(there.field) - truth.field
     assert min(left, top, -right, -bottom) > -6 and max(left, top, -right, -bottom) < 16
+
+
+def test_mirrors_off_the_right_angle_give_corner_views_in_halves(tmp_path):
+    path = tmp_path / "scene.raw"
+    truth = record(path, layout(9), [moving_scene()], key=9, angle_rad=0.03)
+    pictures = activity_pictures.read_activity_pictures(path)
+    found = align_scene(pictures, SceneTarget(), (88, 88))
+    there = found.aligned.views
+    assert re.search(r"halves 1\.[5-9] degrees apart", found.summary()["view (1, 1)"])
+    assert max(distance_px(there, truth).values()) < 0.3
+    for view, true in zip(there.views, truth.views, strict=True):
+        assert (view.fold is None) == (true.fold is None)
+        if view.fold:
+            assert view.fold.angle_rad == pytest.approx(true.fold.angle_rad, abs=0.004)
+            assert np.abs(np.subtract(view.fold.corner, true.fold.corner)).max() < 3
 
 
 def test_a_folder_of_frames_finds_them_too(tmp_path):

@@ -184,7 +184,7 @@ def test_the_door_writes_a_file_and_a_figure(folder, tmp_path):
     assert found.decay_s == IntervalEstimate(None, None, None)  # pictures have no frame rate
     assert save.read_text() == (run / "air.yaml").read_text()
     assert cv2.imread(str(run / "air.png")).std() > 10
-    timed = calibrations.measure_film(str(folder), tmp_path, fps=50.0)
+    timed = calibrations.measure_turbulence_in_video(str(folder), tmp_path, fps=50.0)
     assert timed.found.decay_s.value == pytest.approx(timed.tilt.decay_frames / 50)
     assert timed.found.rms_px.value == pytest.approx(found.rms_px.value, rel=1e-3)
 

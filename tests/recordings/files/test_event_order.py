@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from src.recordings.files.event_file import EVENT
-from src.recordings.files.event_order import BUFFER_US, EventOrder, merge_in_time
-from src.recordings.files.survey import find_order
+from src.recordings.files.event_order import BUFFER_US, EventSorter, merge_in_time
+from src.recordings.files.survey import sort_with_smallest_buffer
 
 
 def numbered(times) -> np.ndarray:
@@ -18,7 +18,7 @@ def numbered(times) -> np.ndarray:
     return events
 
 
-def taken(order: EventOrder, events: np.ndarray, g: np.random.Generator) -> np.ndarray:
+def taken(order: EventSorter, events: np.ndarray, g: np.random.Generator) -> np.ndarray:
     """Return what comes out of `order`, given `events` in pieces of random length."""
     found = []
     for piece in np.split(events, np.sort(g.integers(0, len(events), int(g.integers(1, 40))))):
@@ -38,7 +38,7 @@ def disordered(g: np.random.Generator, n: int, rate_hz: float) -> np.ndarray:
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 3000), rate=st.floats(1, 1e7))
 def test_any_order_within_the_buffer_comes_back_sorted_and_complete(seed, n, rate):
     g = np.random.default_rng(seed)
-    events, order = disordered(g, n, rate), EventOrder()
+    events, order = disordered(g, n, rate), EventSorter()
     found = taken(order, events, g)
     assert np.array_equal(found, events[np.argsort(events["t"], kind="stable")])
     assert (order.dropped, len(order.parts)) == (0, 1)
@@ -53,7 +53,7 @@ def test_single_wild_times_are_dropped_and_counted(seed, n, wild):
     places = np.sort(g.integers(1, n, wild))
     jumps = g.choice([-1, 1], wild) * g.integers(2 * 10**6, 10**9, wild)
     mixed = np.insert(times, places, times[places] + jumps)
-    order = EventOrder()
+    order = EventSorter()
     assert np.array_equal(taken(order, numbered(mixed), g)["t"], times)
     assert (order.dropped, order.late, len(order.parts)) == (wild, 0, 1)
 
@@ -66,7 +66,7 @@ def test_a_clock_that_restarts_makes_parts(seed, lengths):
     parts = parts[::-1]  # each begins before the one before it
     whole = numbered(np.concatenate(parts))
     for chosen, part in enumerate(parts):
-        order = EventOrder(part=chosen)
+        order = EventSorter(kept_part=chosen)
         assert np.array_equal(taken(order, whole, g)["t"], part)
         assert [one.count for one in order.parts] == lengths and order.dropped == 0
         assert [(one.first_us, one.last_us) for one in order.parts] == [
@@ -77,7 +77,7 @@ def test_a_clock_that_restarts_makes_parts(seed, lengths):
 @pytest.mark.parametrize("first", [0, 3 * 10**15])
 def test_a_wild_first_time_is_no_recording(first):
     times = np.arange(2000) * 100 + 16 * 10**14
-    order = EventOrder()
+    order = EventSorter()
     found = taken(order, numbered([first, *times]), np.random.default_rng(0))
     assert np.array_equal(found["t"], times) and (order.dropped, len(order.parts)) == (1, 1)
 
@@ -85,12 +85,12 @@ def test_a_wild_first_time_is_no_recording(first):
 def test_a_last_event_after_a_silence_stays_and_a_wild_one_does_not():
     times = np.arange(2000) * 100
     for last, kept in ((900_000, True), (3_600_000_000, False)):
-        found = taken(EventOrder(), numbered([*times, last]), np.random.default_rng(0))
+        found = taken(EventSorter(), numbered([*times, last]), np.random.default_rng(0))
         assert (found["t"][-1] == last) == kept and len(found) == 2000 + kept
 
 
 def test_a_silence_of_years_is_none_of_these():
-    order = EventOrder()
+    order = EventSorter()
     found = taken(order, numbered([0, 1, 10**15, 10**15 + 1]), np.random.default_rng(0))
     assert len(found) == 4 and (order.dropped, len(order.parts)) == (0, 1)
 
@@ -101,7 +101,9 @@ def test_frames_that_go_pixel_by_pixel_are_given_a_buffer_that_holds_them():
         frames = [g.integers(0, frame_us, 3000) + k * frame_us for k in range(8)]
         times = np.concatenate(frames)
         pieces = np.array_split(times, 7)
-        order = find_order(lambda read=pieces: read, len(times), float(np.ptp(times)))
+        order = sort_with_smallest_buffer(
+            lambda read=pieces: read, len(times), float(np.ptp(times))
+        )
         assert 0.99 * frame_us < order.most_late_us <= order.buffer_us < 8 * frame_us
         assert (order.dropped, len(order.parts)) == (0, 1)
 
@@ -110,12 +112,12 @@ def test_a_shuffled_recording_is_refused_with_its_share():
     g = np.random.default_rng(0)
     times = g.permutation(np.arange(20_000) * 5_000)  # 100 s
     with pytest.raises(ValueError, match=r"% of 20000 events are more than .* s out of order"):
-        find_order(lambda: [times], len(times), 1e8)
+        sort_with_smallest_buffer(lambda: [times], len(times), 1e8)
 
 
 def test_memory_is_bounded_and_what_comes_too_late_is_counted(monkeypatch):
     monkeypatch.setattr("src.recordings.files.event_order.BUFFER_EVENTS", 1000)
-    order, times = EventOrder(), np.arange(3000)
+    order, times = EventSorter(), np.arange(3000)
     assert sum(map(len, order.add(numbered(times)))) == 2000
     left = [*order.add(numbered([1500, 2500])), *order.finish()]
     assert order.dropped == 1
@@ -140,7 +142,7 @@ def test_whatever_comes_every_event_is_given_dropped_or_of_another_part(seed, n,
     times = np.where(g.random(n) < g.random(), walk, g.normal(0, scale * 10, n)).astype(np.int64)
     whole, total = numbered(times), 0
     for part in range(10**6):
-        order = EventOrder(few=few, part=part)
+        order = EventSorter(min_part_events=few, kept_part=part)
         found = taken(order, whole, np.random.default_rng(seed))
         assert (np.diff(found["t"]) >= 0).all()
         assert len(np.unique(found[["x", "y"]])) == len(found)

@@ -35,7 +35,7 @@ def written(tmp_path, request):
 
 def test_events_and_frames_of_each_layout(written):
     path, events, frames, zero = written
-    assert sources.sensor_size(path) == SIZE
+    assert sources.find_sensor_size(path) == SIZE
     found = read_events(path, SIZE[::-1])
     assert np.array_equal(found["t"], events["t"] - zero)
     for name in "xyp":
@@ -67,8 +67,8 @@ def test_each_layout_becomes_evreals(written, tmp_path, convert):  # noqa: F811
 def test_a_sensors_size_from_frames_is_told(tmp_path):
     path = write_recording(tmp_path / "cap", "timelens", make_events(), make_frames())
     with pytest.warns(UserWarning, match="a sensor of 48x40, as its frames"):
-        assert sources.sensor_size(path) == SIZE
-    assert sources.sensor_size(path, (60, 70)) == (60, 70)
+        assert sources.find_sensor_size(path) == SIZE
+    assert sources.find_sensor_size(path, (60, 70)) == (60, 70)
 
 
 def test_a_part_has_the_frames_of_its_time(tmp_path, convert):  # noqa: F811

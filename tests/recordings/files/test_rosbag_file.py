@@ -154,7 +154,7 @@ def test_a_folder_is_a_recording(tmp_path):
     with Bag(tmp_path / "2026_11_26", "mcap") as bag:
         bag.add_array("/dvs/events", listed)
     assert sources.has_events(tmp_path / "2026_11_26") and not sources.has_events(tmp_path)
-    assert sources.sensor_size(tmp_path / "2026_11_26") == (480, 640)
+    assert sources.find_sensor_size(tmp_path / "2026_11_26") == (480, 640)
     assert np.array_equal(read_events(tmp_path / "2026_11_26"), events)
 
 

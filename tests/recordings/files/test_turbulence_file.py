@@ -41,10 +41,10 @@ def site(path, **changes) -> str:
 
 def test_a_file_is_read_as_it_was_written(tmp_path):
     written = TurbulenceFile(**{key: IntervalEstimate(*row) for key, row in SITE.items()})
-    (tmp_path / "air.yaml").write_text(written.text())
+    (tmp_path / "air.yaml").write_text(written.to_yaml())
     assert read_turbulence_file(tmp_path / "air.yaml") == written
     bound = TurbulenceFile(**vars(written) | {"decay_s": IntervalEstimate(None, None, 0.04)})
-    (tmp_path / "air.yaml").write_text(bound.text())
+    (tmp_path / "air.yaml").write_text(bound.to_yaml())
     assert read_turbulence_file(tmp_path / "air.yaml") == bound
 
 

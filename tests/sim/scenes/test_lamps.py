@@ -80,10 +80,13 @@ def test_no_clip_flickers_at_rates_where_it_would_alias():
     [
         ({"flicker_share": 1.2}, r"scene.flicker_share must be in \[0, 1\], got 1.2"),
         (
-            {"percent_flicker": (0.3, 1.0)},
-            "scene.percent_flicker must be a range 0 <= low <= high < 1",
+            {"flicker_modulation_depth": (0.3, 1.0)},
+            "scene.flicker_modulation_depth must be a range 0 <= low <= high < 1",
         ),
-        ({"percent_flicker": (0.3, 0.1)}, "scene.percent_flicker must be a range"),
+        (
+            {"flicker_modulation_depth": (0.3, 0.1)},
+            "scene.flicker_modulation_depth must be a range",
+        ),
     ],
 )
 def test_wrong_values_name_their_key(wrong, message):

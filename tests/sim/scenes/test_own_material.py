@@ -1,5 +1,6 @@
 """A user's own video and photograph: every frame, uncropped, at the rate of the file."""
 
+import warnings
 from pathlib import Path
 
 import av
@@ -42,9 +43,9 @@ def test_a_part_and_another_rate(tmp_path):
 
 def test_between_two_frames_lies_their_blend(tmp_path):
     clip = own_material.read_video(write_film(tmp_path / "a.mkv"))
-    seen = clip.blend(3, 9, 4)[:, 0, 9].numpy() * 255
+    seen = clip.interpolate_frames(3, 9, 4)[:, 0, 9].numpy() * 255
     assert np.allclose(seen, [25, 30, 35, 40, 45, 50], atol=0.05)
-    assert len(clip.blend(40, 45, 4)) == 5  # up to the last frame
+    assert len(clip.interpolate_frames(40, 45, 4)) == 5  # up to the last frame
 
 
 def test_a_large_picture_is_shrunk_and_keeps_its_proportions(tmp_path):
@@ -74,6 +75,24 @@ def test_arrays_are_clips(tmp_path):
     assert own_material.clip_from_array(frames[0] / 255.0).frames.shape == (121, 20, 30)
 
 
+@pytest.mark.parametrize("white, shown", [(None, 0.0625), (4095, 1.0), (8190, 0.5)])
+def test_16_bits_are_kept_and_white_is_what_is_given(tmp_path, white, shown):
+    picture = np.repeat(np.arange(0, 4096, 65, dtype=np.uint16)[None], 20, axis=0)
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), picture)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        still = own_material.read_photograph(tmp_path / "0.png", seconds=0.1, white_level=white)
+        film = own_material.read_video(tmp_path, fps=120, white_level=white)
+    wanted = np.minimum(picture[0] / (white or 65535), 1)
+    assert np.allclose(still.frames[5, 0], wanted, atol=1e-6)  # not the 16 levels of 8 bits
+    assert (
+        np.allclose(film.frames[2, 0], wanted, atol=5e-4) and abs(still.frames.max() - shown) < 1e-4
+    )
+    told = "its largest value is 4095 of 65535; white_level=4095 makes 4095 white"
+    assert [told in str(one.message) for one in caught] == [True] * (2 if white is None else 0)
+
+
 @pytest.mark.parametrize(
     "call, message",
     [
@@ -85,6 +104,15 @@ def test_arrays_are_clips(tmp_path):
         (lambda p: own_material.read_video(p / "a.mkv", start_s=2, end_s=1), "start_s must be"),
         (lambda p: own_material.read_video(p / "a.mkv", longest_side_px=8), "longest_side_px must"),
         (lambda p: own_material.read_photograph(p / "a.mkv"), r"a film: video=\)"),
+        (lambda p: own_material.read_video(p / "a.mkv", white_level=9), "must be null for a video"),
+        (
+            lambda p: own_material.read_photograph(p / "a.png", white_level=256),
+            r"white_level must be in \(0, 255\] or null, got 256",
+        ),
+        (
+            lambda p: own_material.read_photograph(p / "a.png", white_level=0),
+            r"white_level must be in \(0, 255\] or null, got 0",
+        ),
         (lambda p: own_material.read_photograph(p / "a.png", seconds=0), "seconds must be 0.0166"),
         (lambda p: own_material.clip_from_array(np.zeros((3, 20, 30))), "fps must be given"),
         (lambda p: own_material.clip_from_array(np.full((20, 30), 7.0)), r"floats in \[0, 1\]"),

@@ -16,8 +16,9 @@ def test_pixels_follow_from_focal_length_distance_and_scene_width():
 
 
 def test_severity_is_what_is_seen():
-    weak, medium, strong = (PATH.with_d_over_r0(d_over_r0) for d_over_r0 in (0.5, 1.4, 4.0))
-    assert [path.severity for path in (weak, medium, strong)] == ["weak", "medium", "strong"]
+    paths = [PATH.with_d_over_r0(d_over_r0) for d_over_r0 in (0.5, 1.4, 4.0, 16.0)]
+    assert [path.severity for path in paths] == ["weak", "medium", "strong", "extreme"]
+    _, medium, strong, _ = paths
     assert strong.d_over_r0 == pytest.approx(4.0)
     enlarged = replace(medium, scene_width_m=1.0)  # the same air through a longer lens
     assert enlarged.severity == "strong"

@@ -37,7 +37,7 @@ def agree() -> None:
         rows = GridAxis(-3, 13, pitch, 1)
         frames, tilt = torch.rand(2, 6, 11), 3 * torch.randn(2, 3, 13, 12)
         psfs, halo = (
-            torch.rand(size**2, 3, rows.nodes, 12) - 0.3,
+            torch.rand(size**2, 3, rows.node_count, 12) - 0.3,
             torch.rand(2, 14 - size, 13 - size),
         )
         one, other = (e.warp(frames, tilt, -3, 2, 1) for e in (blur_triton, blur_torch))
@@ -95,11 +95,11 @@ def test_kernels_that_fail_or_differ_are_not_used_and_that_is_said(apart, monkey
     with pytest.warns(UserWarning, match="turbulence without Triton's kernels, slower: .*Error: "):
         assert device.select_engine.__wrapped__(CUDA) is blur_torch  # there is no such device
     monkeypatch.setitem(sys.modules, "src.sim.turbulence.engines.blur_triton", blur_torch)
-    monkeypatch.setattr(device, "max_abs_difference", lambda *_: apart)
+    monkeypatch.setattr(device, "max_difference_from_torch", lambda *_: apart)
     with pytest.warns(UserWarning, match="slower: they differ by"):
         assert device.select_engine.__wrapped__(CUDA) is blur_torch
 
 
 def test_an_engine_does_not_differ_from_itself():
     cpu = torch.device("cpu")
-    assert device.max_abs_difference(blur_torch, 3, cpu) == 0.0
+    assert device.max_difference_from_torch(blur_torch, 3, cpu) == 0.0

@@ -18,8 +18,8 @@ from src.sim.turbulence.coefficient_grid import (
     GridAxis,
     WaveSum,
     evaluate_waves,
-    omit_weak_waves,
     sum_waves,
+    zero_weak_responses,
 )
 from src.sim.turbulence.engines import blur_torch, device
 from src.sim.turbulence.engines.device import full_float32
@@ -36,7 +36,7 @@ CROP = (9, 17, 30, 40)
 
 def render_on_device(frames: torch.Tensor, plans) -> torch.Tensor:
     """Return what a device without Triton renders."""
-    return clip_rendering.render_views(frames[0], plans, compiled=False)[None]
+    return clip_rendering.render_views(frames[0], plans, use_cpu_engines=False)[None]
 
 
 def both(turbulence: Turbulence, frames: torch.Tensor, crop=CROP) -> tuple[torch.Tensor, ...]:
@@ -150,7 +150,7 @@ def test_torch_expressions_equal_the_compiled_ones(pitch):
     rows, columns = GridAxis(-3, 40, pitch, 1), GridAxis(2, 37, pitch, 1)
     frames, tilt = torch.rand(2, 30, 41), 3 * torch.randn(2, 6, 40, 37)
     psfs = FittedPSFs(load_bands_by_d_over_r0()[2], 0, 20, 1.3, 7, 3.0)
-    weights = 0.5 * torch.randn(20, 6, rows.nodes, columns.nodes)
+    weights = 0.5 * torch.randn(20, 6, rows.node_count, columns.node_count)
     one = torch.ones_like(weights[:1])
     pixels = torch.einsum("rij,rnyx->ijnyx", psfs.basis, torch.cat([one, weights])).flatten(0, 1)
     halo = 0.2 * torch.rand(2, 34, 31)
@@ -162,7 +162,13 @@ def test_torch_expressions_equal_the_compiled_ones(pitch):
     for picture in range(6):
         view = tilt[:, picture : picture + 1].contiguous()
         [warped] = warp_frames(padded, picture % 2, view, rows.start, columns.start)
-        given = *basis, rows.offset, columns.offset, pitch, halo[picture % 2].numpy()
+        given = (
+            *basis,
+            rows.offset_from_first_node_px,
+            columns.offset_from_first_node_px,
+            pitch,
+            halo[picture % 2].numpy(),
+        )
         theirs = torch.from_numpy(scatter_psfs(warped, weights.numpy(), picture, *given, 0.1))
         torch.testing.assert_close(ours[picture], theirs, atol=5e-6, rtol=0)
 
@@ -182,11 +188,11 @@ def test_both_sums_of_waves_equal_the_definition(pitch, columns):
     grid = GridAxis(-3, 20, pitch, 1), GridAxis(2, columns, pitch, 1)
     amplitudes = torch.randn(2, 100, dtype=torch.complex64)
     tables = _wave_tables("psf", grid, waves, (64, 64))
-    response = omit_weak_waves(torch.view_as_complex(waves.response).to(torch.complex64)[2:], 2)
+    response = zero_weak_responses(torch.view_as_complex(waves.response).to(torch.complex64)[2:], 2)
     turned = response * tables["psf_response"]
     along = tables["psf_rows"], tables["psf_columns"]
     found = sum_waves(turned, amplitudes, evaluate_waves(*along))
-    y, x = (axis.pixels.double() - 31.5 for axis in grid)
+    y, x = (axis.node_pixels.double() - 31.5 for axis in grid)
     turns = (
         waves.frequency_per_px[:, 1, None, None] * y[:, None]
         + waves.frequency_per_px[:, 0, None, None] * x

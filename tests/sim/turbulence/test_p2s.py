@@ -7,7 +7,7 @@ from torch.nn import functional
 
 from scripts.exact_psf import fraunhofer_psf
 from scripts.p2s_training import TrainableNetwork
-from src.sim.turbulence.engines.network_numba import BLOCK, evaluate_network
+from src.sim.turbulence.engines.network_numba import BLOCK, evaluate_psf_network
 from src.sim.turbulence.p2s import (
     PhaseToSpaceNetwork,
     basis_parities,
@@ -64,7 +64,7 @@ def test_half_a_turn_and_another_sign_change_nothing():
 def test_few_large_matrices_equal_the_network(modes, width, given):
     net, phase = network(modes, width), phases(max(modes, given + 2))[:, :given]
     known = functional.pad(phase, (0, max(0, modes - 2 - given)))[:, : modes - 2]
-    one, *found = stored(net).merge_layers(given, 3.0)(phase.T.contiguous())
+    one, *found = stored(net).merge_into_few_matrices(given, 3.0)(phase.T.contiguous())
     assert torch.equal(one, torch.ones(len(phase)))
     found = torch.stack(found, 1)
     torch.testing.assert_close(found, net(known, 3.0), atol=2e-5, rtol=1e-4)
@@ -76,7 +76,7 @@ def test_a_cut_network_gives_the_first_functions_of_each_kind(counts):
     kept = [np.arange(k) + start for k, start in zip(counts, (0, 5, 8, 10), strict=True)]
     whole = net(phase, 2.0)[:, np.concatenate(kept)]
     cut = stored(net).truncate(counts)
-    torch.testing.assert_close(cut.merge_layers(18, 2.0)(phase.T)[1:].T, whole)
+    torch.testing.assert_close(cut.merge_into_few_matrices(18, 2.0)(phase.T)[1:].T, whole)
     assert cut.count_macs(sum(counts)) <= stored(net).count_macs(13)
 
 
@@ -84,10 +84,10 @@ def test_a_cut_network_gives_the_first_functions_of_each_kind(counts):
 @pytest.mark.parametrize("counts", [[5, 3, 2, 3], [1, 0, 0, 0]])
 def test_the_compiled_network_equals_the_matrices(modes, width, given, counts):
     torch.manual_seed(0)
-    folded = stored(network(modes, width)).truncate(counts).merge_layers(given, 3.0)
+    folded = stored(network(modes, width)).truncate(counts).merge_into_few_matrices(given, 3.0)
     phase = torch.randn(given, 2 * BLOCK + 7)
     matrices = folded._replace(last=folded.last[1:])
-    found = evaluate_network(phase.numpy(), *(matrix.numpy() for matrix in matrices))
+    found = evaluate_psf_network(phase.numpy(), *(matrix.numpy() for matrix in matrices))
     expected = folded(phase)[1:]
     torch.testing.assert_close(torch.from_numpy(found), expected, atol=2e-5, rtol=1e-4)
 

@@ -11,6 +11,7 @@ from src.sim.turbulence import sample_atmosphere
 from src.sim.turbulence.outer_scale import short_exposure_half_light_radius
 from src.sim.turbulence.prior import (
     TILT_AND_BLUR_PX,
+    NoCameraError,
     TargetImageStatistics,
     cn2_profile,
     sample_matching_atmosphere,
@@ -32,6 +33,20 @@ def test_draws_are_what_was_asked_for(severity):
         assert 0.4 <= path.lambda_over_d_px(256) <= 2.0
         assert 1 <= path.aperture_m / path.pixel_size_at_object_m(256) <= 60
         assert path.rytov_variance <= 3.05 and 0.05 <= path.d_over_r0 <= 10.01
+
+
+def test_extreme_turbulence_needs_more_than_weak_scintillation():
+    """Large tilt over short lengths: no path below a Rytov variance of 3 shows it."""
+    half_length = {"tilt_correlation_half_length_px": (7.0, 15.0), "global_tilt_probability": 0.0}
+    with pytest.raises(NoCameraError):
+        sample_atmosphere(
+            "extreme", generator(0), tilt_and_blur_px={"extreme": (5, 7)}, **half_length
+        )
+    for seed in range(10):
+        path = sample_atmosphere("extreme", generator(seed), **half_length, max_rytov_variance=30)
+        assert path.severity == "extreme"
+        assert 3.4 <= path.tilt_and_blur_px(256) <= 7.1
+        assert 6.9 <= path.tilt_correlation_half_length_px(256) <= 15.1
 
 
 def test_half_lengths_are_log_uniform_and_some_of_whole_views():

@@ -73,7 +73,9 @@ def exact_and_fitted(strength: float, number: int) -> tuple[torch.Tensor, torch.
         points=1,
     )
     network = band.networks[number]
-    weights = network.merge_layers(network.modes - 2, strength)(coefficients[:, 2:].T)[1:].T
+    weights = network.merge_into_few_matrices(network.modes - 2, strength)(coefficients[:, 2:].T)[
+        1:
+    ].T
     basis = band.basis[basis_parities(band.basis).argsort(stable=True)]
     return exact.flatten(1), band.mean.flatten() + weights @ basis.flatten(1)
 

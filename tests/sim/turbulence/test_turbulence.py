@@ -8,7 +8,7 @@ import torch
 
 from src.sim.turbulence import Atmosphere, sample_atmosphere
 from src.sim.turbulence.coefficient_grid import GridAxis
-from src.sim.turbulence.fidelity import mean_psf
+from src.sim.turbulence.fidelity import mean_short_exposure_psf
 from src.sim.turbulence.operator import Turbulence
 from src.sim.turbulence.psf import PSFHalo, convolve_halo
 from tests.sim.turbulence.theory import degrade_with_exact_psfs
@@ -159,7 +159,7 @@ def test_accuracy_against_exact_psfs_at_every_pixel(strength, decibels, pixel):
     turbulence = Turbulence(path, views=1, height=128, width=128)
     turbulence.fidelity = replace(turbulence.fidelity, zernike_modes=119)
     picture, crop = leaves(128), (24, 24, 80, 80)
-    assert PSFHalo(mean_psf(strength), 1.0, 23).share == 0
+    assert PSFHalo(mean_short_exposure_psf(strength), 1.0, 23).share == 0
     seen = turbulence.degrade(picture[None, None], seed(3), crop=crop)[0, 0, 0]
     exact = degrade_with_exact_psfs(turbulence, picture, seed(3), crop, 23)
     error = (seen - exact).square().mean()
@@ -186,7 +186,7 @@ def test_fidelity_follows_the_scene():
 @pytest.mark.parametrize("order", [1, 3])
 def test_interpolation_reproduces_straight_lines(order):
     lattice = GridAxis(-7, 30, 4, order)
-    line = lattice.interpolation_matrix() @ lattice.pixels.float()
+    line = lattice.interpolation_matrix() @ lattice.node_pixels.float()
     torch.testing.assert_close(line, torch.arange(-7.0, 23.0))
 
 
@@ -218,7 +218,7 @@ def test_bf16_frames_are_simulated_in_float32():
 @pytest.mark.parametrize("airy", [0.3, 1.0, 1.7])
 @pytest.mark.parametrize("kernel", [1, 7, 41])
 def test_halo_is_the_light_beyond_the_kernel(airy, kernel):
-    whole, halo = (PSFHalo(mean_psf(3.0), airy, size) for size in (1, kernel))
+    whole, halo = (PSFHalo(mean_short_exposure_psf(3.0), airy, size) for size in (1, kernel))
     assert 0 <= halo.share <= 1 - whole.psf[whole.reach, whole.reach]
     spark = torch.zeros(1, 101, 101)
     spark[0, 50, 50] = 1

@@ -14,7 +14,7 @@ import torch
 from scripts.exact_psf import fraunhofer_psf, noll_covariance
 from src.sim import noise
 from src.sim.turbulence.atmosphere import Atmosphere
-from src.sim.turbulence.fidelity import mean_psf
+from src.sim.turbulence.fidelity import mean_short_exposure_psf
 from src.sim.turbulence.operator import WAVES, Turbulence
 from src.sim.turbulence.p2s import FittedPSFs, load_bands_by_d_over_r0
 from src.sim.turbulence.plane_waves import PlaneWaves, advect_waves, draw_plane_waves
@@ -272,7 +272,7 @@ def test_16_psf_energy():
         ).sum((1, 2))
         assert inside.max() < 1.001
         torch.testing.assert_close(found, inside, atol=0.15, rtol=0)
-        halo = PSFHalo(mean_psf(band.max_d_over_r0), 1.0, 15).share
+        halo = PSFHalo(mean_short_exposure_psf(band.max_d_over_r0), 1.0, 15).share
         assert found.mean() + halo == pytest.approx(1.0, abs=0.02)  # the cut of negative light
 
 

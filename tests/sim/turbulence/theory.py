@@ -78,7 +78,7 @@ def structure_variance() -> float:
 
 def compute_fitted_psfs(psfs: FittedPSFs, phase: torch.Tensor) -> torch.Tensor:
     """Return the PSFs (pixels, n) of Noll 4, 5, ... (blurmodes, n) in rad, none of it negative."""
-    weights = psfs.network.merge_layers(len(phase), psfs.d_over_r0)(phase)
+    weights = psfs.network.merge_into_few_matrices(len(phase), psfs.d_over_r0)(phase)
     return (psfs.basis.flatten(1).T @ weights).clamp(min=0)
 
 

@@ -70,7 +70,7 @@ def append_linear_events(
     `noise_u` is the time of a noise event, above 1 for none.  All is seen along the level's way:
     `span` is its length, `at` the reference's place on it.
     """
-    who, when, sign = batch
+    pixels, times, signs = batch
     along = 1 if l1 >= l0 else -1
     ahead, behind = (on, off) if l1 >= l0 else (off, on)
     span, at = abs(l1 - l0), (ref - l0) * along
@@ -84,13 +84,13 @@ def append_linear_events(
         moved = False
         if not holding:
             now = start if mode == DELETE else max(start, dead)
-            u, step = next_crossing(span, at, ahead, behind, now)
+            u, step = find_next_crossing(span, at, ahead, behind, now)
             if u <= stop:
                 moved = True
                 at += step
                 start = u
                 if u >= dead:
-                    who[count], when[count], sign[count] = x, u, along if step > 0 else -along
+                    pixels[count], times[count], signs[count] = x, u, along if step > 0 else -along
                     count += 1
                     dead = u + wait
                     holding = mode == HOLD and wait > 0
@@ -99,7 +99,7 @@ def append_linear_events(
         if stop != noise_u:
             return count, l0 + at * along, dead
         if noise_u >= dead:
-            who[count], when[count], sign[count] = x, noise_u, noise_sign
+            pixels[count], times[count], signs[count] = x, noise_u, noise_sign
             count += 1
             at = level_change(span, noise_u)
             dead = noise_u + wait
@@ -108,7 +108,7 @@ def append_linear_events(
 
 
 @inline_kernel
-def next_crossing(span, at, ahead, behind, now):
+def find_next_crossing(span, at, ahead, behind, now):
     """Return time and step of the first threshold exceeded at or after `now`; time 2 if none."""
     if at >= behind and f32(at - behind) >= now * f32(span):  # exceeded before, and still so
         return now, -behind
@@ -119,7 +119,7 @@ def next_crossing(span, at, ahead, behind, now):
 
 
 @inline_kernel
-def v2e_crossings(l0, l1, ref, dead, on, off, mode):
+def count_v2e_crossings(l0, l1, ref, dead, on, off, mode):
     """Return (thresholds between the reference and the frame's level, reference)."""
     if mode == HOLD and dead > 1:
         return 0, ref
@@ -129,16 +129,18 @@ def v2e_crossings(l0, l1, ref, dead, on, off, mode):
 
 
 @inline_kernel
-def v2e_events(x, l0, l1, ref, dead, on, off, wait, mode, steps, noise_u, noise_sign, batch, count):
+def append_v2e_events(
+    x, l0, l1, ref, dead, on, off, wait, mode, steps, noise_u, noise_sign, batch, count
+):
     """The same with v2e's time stamps, `steps` in the whole view: the most crossings of a pixel.
 
     The pixel's first crossings take the first stamps; a stamp within the dead time is refused
     (compute_events of v2e's emulator).  Where a stamp interval is longer than the refractory
     period, v2e neither tests nor records it.  Noise is stamped at the interval's end.
     """
-    who, when, sign = batch
+    pixels, times, signs = batch
     tested = wait * f32(steps) > 1
-    crossings, ref = v2e_crossings(l0, l1, ref, dead, on, off, mode)
+    crossings, ref = count_v2e_crossings(l0, l1, ref, dead, on, off, mode)
     for i in range(1, crossings + 1):
         stamp = f32(i) / f32(steps)
         s = 1 if l1 - ref >= on else (-1 if ref - l1 >= off else 0)
@@ -146,7 +148,7 @@ def v2e_events(x, l0, l1, ref, dead, on, off, wait, mode, steps, noise_u, noise_
             break
         kept = not tested or stamp > dead
         if kept:
-            who[count], when[count], sign[count] = x, stamp, s
+            pixels[count], times[count], signs[count] = x, stamp, s
             count += 1
             if tested:
                 dead = stamp + wait
@@ -157,7 +159,7 @@ def v2e_events(x, l0, l1, ref, dead, on, off, wait, mode, steps, noise_u, noise_
                 break
             ref = l0 + level_change(l1 - l0, dead)
     if noise_u <= 1:
-        who[count], when[count], sign[count] = x, f32(1), noise_sign
+        pixels[count], times[count], signs[count] = x, f32(1), noise_sign
         count += 1
         ref = l1
     return count, ref, dead
@@ -170,8 +172,8 @@ def fixed_point_table_position(intensity_bits):
 
 
 @inline_kernel
-def read_table(table, place):
-    cell, inside = uint32(place) >> uint32(13), i32(place & i32(8191))
+def read_table(table, position):
+    cell, inside = uint32(position) >> uint32(13), i32(position & i32(8191))
     left = table[cell]
     part = i32(i32(table[cell + uint32(1)] - left) * inside) >> i32(13)
     return i32(i32(left + i32(part) + i32(8)) >> i32(4))
@@ -220,7 +222,7 @@ def apply_low_pass(decay, lag, intensity, old_level, old_source, level):
 
 
 @kernel
-def number_pixels(clip, width, first, pixel):
+def fill_pixel_numbers(clip, width, first, pixel):
     for x in range(pixel.size):
         row, column = (first + x) // width, (first + x) % width
         pixel[x] = (clip.top + row) * clip.full_width + clip.left + column
@@ -272,7 +274,7 @@ def prehash_pixels(key, pixel, mixed):
 
 
 @kernel
-def mark_noise(clip, hot_count, work, key, frame, intensity):
+def mark_noisy_pixels(clip, hot_count, work, key, frame, intensity):
     """Mark the pixels with a noise event in interval `frame`; white has a quarter (v2e)."""
     mixed, noisy = work.mixed, work.noisy
     upper = uint32(uint64(key) >> uint64(32)) + uint32(uint32(frame) * uint32(0x9E3779B9))
@@ -287,11 +289,11 @@ def mark_noise(clip, hot_count, work, key, frame, intensity):
 
 
 @kernel
-def draw_noise_times(work, key, frame, last):
+def draw_noise_events(work, key, frame, active_count):
     """Fill times and polarities of the noise events of the active pixels; time 2 for none."""
     pixel, noisy, active = work.pixel, work.noisy, work.active
     noise_u, noise_sign = work.noise_u, work.noise_sign
-    for x in active[:last]:
+    for x in active[:active_count]:
         at = random_uint32(key, frame, uint32(2) * uint32(pixel[x]) + uint32(1))
         u = (f32(at >> uint32(9)) + f32(0.5)) * f32(2.0**-23)
         noise_u[x] = u if noisy[x] else f32(2)
@@ -299,7 +301,7 @@ def draw_noise_times(work, key, frame, last):
 
 
 @kernel
-def compute_leak(leak, work, frame):
+def compute_leak_drift(leak, work, frame):
     """Fill how far the references leak in interval `frame`, by the whole units leaked so far."""
     on, drift = work.on, work.drift
     for x in range(on.size):
@@ -317,13 +319,13 @@ def count_v2e_steps(mode, work):
         l1, ref, up, down = np.int64(new[x]) + drift[x], np.int64(reference[x]), on[x], off[x]
         more = (l1 - ref >= (steps + 1) * up) | (ref - l1 >= (steps + 1) * down)
         if more | (mode == HOLD and dead[x] > 0):  # else a division for nothing
-            crossings, _ = v2e_crossings(np.int64(level[x]), l1, ref, dead[x], up, down, mode)
+            crossings, _ = count_v2e_crossings(np.int64(level[x]), l1, ref, dead[x], up, down, mode)
             steps = max(steps, crossings)
     return steps
 
 
 @kernel
-def find_active(mode, work):
+def list_active_pixels(mode, work):
     """List the pixels that have something to do in `work.active`; return how many."""
     # Without a branch per pixel: which are quiet is not predictable.  But eight in a row often are.
     level, reference, dead = work.level, work.reference, work.dead
@@ -346,7 +348,7 @@ def find_active(mode, work):
 
 
 @kernel
-def find_events(given, wait, work, steps, done, last):
+def advance_active_pixels(given, wait, work, steps, done, last):
     """Take the active pixels `done` .. `last` - 1 through an interval, until the batch is full;
     return the number of events in it and of the pixels that are done.
     """
@@ -361,7 +363,7 @@ def find_events(given, wait, work, steps, done, last):
         l0, l1, ref = np.int64(level[x]), np.int64(new[x]) + drift[x], np.int64(reference[x])
         u, s = noise_u[x], np.int64(noise_sign[x])
         if v2e:
-            count, ref, dead[x] = v2e_events(
+            count, ref, dead[x] = append_v2e_events(
                 x, l0, l1, ref, dead[x], on, off, wait, mode, steps, u, s, batch, count
             )
         else:
@@ -374,34 +376,34 @@ def find_events(given, wait, work, steps, done, last):
 
 
 @kernel
-def write_events(output, place, width, work, number, clock):
+def write_events(output, place, width, work, count, clock):
     unit, c, v, first, _ = place
-    who, when, sign = work.event_pixel, work.event_u, work.event_sign
+    pixels, times, signs = work.event_pixel, work.event_u, work.event_sign
     grids, tally, events = output
     if grids.size:
-        add_to_grid(grids[c, clock[0], v, :, first:], who, when, sign, number, clock)
+        add_events_to_grid(grids[c, clock[0], v, :, first:], pixels, times, signs, count, clock)
     elif events.size:
-        for i in range(number):
-            at, pixel = tally[unit, 0] + i, first + who[i]
-            events[at].t, events[at].p = timestamp_us(when[i], clock), sign[i]
+        for i in range(count):
+            at, pixel = tally[unit, 0] + i, first + pixels[i]
+            events[at].t, events[at].p = timestamp_us(times[i], clock), signs[i]
             events[at].x, events[at].y = pixel % width, pixel // width
-        tally[unit, 0] += number
+        tally[unit, 0] += count
     else:
-        for i in range(number):
-            tally[unit, 0 if sign[i] > 0 else 1] += 1
+        for i in range(count):
+            tally[unit, 0 if signs[i] > 0 else 1] += 1
 
 
 @kernel
-def add_to_grid(grid, who, when, sign, number, clock):
+def add_events_to_grid(grid, pixels, times, signs, count, clock):
     """Add events to a unit's grid (bins, pixels), bilinear in time."""
     origin, scale, bins = clock[1], clock[2], grid.shape[0]
-    for i in range(number):
-        tau = f32(f32(timestamp_us(when[i], clock) - origin) * scale)
+    for i in range(count):
+        tau = f32(f32(timestamp_us(times[i], clock) - origin) * scale)
         b = min(np.int64(tau), bins - 1)
         late = f32(np.rint((tau - f32(b)) * f32(2**20)) * f32(2.0**-20))
-        grid[b, who[i]] += f32(sign[i]) * (f32(1) - late)
+        grid[b, pixels[i]] += f32(signs[i]) * (f32(1) - late)
         if late > 0 and b + 1 < bins:
-            grid[b + 1, who[i]] += f32(sign[i]) * late
+            grid[b + 1, pixels[i]] += f32(signs[i]) * late
 
 
 @inline_kernel
@@ -411,7 +413,7 @@ def timestamp_us(u, clock):
 
 
 @kernel
-def initialise_memory(clip, key, work):
+def initialise_pixel_state(clip, key, work):
     """Let the memory begin with its levels, the references off from them by a drawn error."""
     level, reference, drawn = work.level, work.reference, work.drawn
     work.source[:], reference[:], work.dead[:] = level, level, f32(0)
@@ -444,15 +446,15 @@ def advance_interval(given, clip, hot_count, work, output, place, intensity, key
         tables = given.low_pass_tables[clip.low_pass_row]
         apply_low_pass(tables[0], tables[1], intensity, level, work.source, new)
     if clip.dark_noise or hot_count:
-        mark_noise(clip, hot_count, work, key, frame, intensity)
+        mark_noisy_pixels(clip, hot_count, work, key, frame, intensity)
     if clip.leak:
-        compute_leak(clip.leak, work, frame)
+        compute_leak_drift(clip.leak, work, frame)
     steps = count_v2e_steps(mode, work) if given.v2e_stamps else np.int64(1)
-    done, last = 0, find_active(mode, work)
+    done, last = 0, list_active_pixels(mode, work)
     if clip.dark_noise or clip.hot_noise:
-        draw_noise_times(work, key, frame, last)
+        draw_noise_events(work, key, frame, last)
     while done < last:
-        number, done = find_events(given, f32(clip.refractory), work, steps, done, last)
+        number, done = advance_active_pixels(given, f32(clip.refractory), work, steps, done, last)
         write_events(output, place, given.width, work, number, clock)
     if clip.leak:
         for x in range(level.size):
@@ -498,11 +500,11 @@ def simulate_pixel_blocks(
         clip, keys, place = given.clips[c], given.keys[c, v], (unit, c, v, a, b)
         key, edges_us = keys[NOISE_KEY], given.edges_us[c]
         work = make_workspace(b - a, min(clip.on, clip.off))
-        number_pixels(clip, given.width, a, work.pixel)
+        fill_pixel_numbers(clip, given.width, a, work.pixel)
         hot_count = draw_thresholds_and_hot_pixels(clip, keys, normals, work)
         prehash_pixels(key, work.pixel, work.mixed)
         doubtful |= read_frame(given, half_frames, place, 0, work, work.level)[1]
-        initialise_memory(clip, keys[REFERENCE_KEY], work)
+        initialise_pixel_state(clip, keys[REFERENCE_KEY], work)
         for i in range(edges_us.size - 1):
             # The interval's window, where that begins, bins per microsecond, and both edges.
             window, step = i // given.substeps, given.substeps

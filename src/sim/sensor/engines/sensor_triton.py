@@ -90,7 +90,7 @@ def _simulate(
     intensity = tl.load(frame, own, 0.0).to(tl.float32)
     bad = is_outside(intensity)
     level = read_table(level_table, fixed_point_table_position(intensity))
-    ref = level - draw_reference_error(clip, keys, pixel, on, off)
+    ref = level - draw_level_minus_reference(clip, keys, pixel, on, off)
     source, dead = level, tl.zeros([BLOCK], tl.float32)
     frame += frame_step
     decay = low_pass_tables + 2 * nodes * tl.load(clip + LOW_PASS_ROW)
@@ -107,7 +107,7 @@ def _simulate(
         new = read
         if FILTERED:
             kept, lag = read_table(decay, place), read_table(decay + nodes, place)
-            new = apply_low_pass(read, level, source, kept, lag)
+            new = apply_low_pass(kept, lag, level, source, read)
         drift = ((leak * (zero + i + 1) >> 24) - (leak * (zero + i) >> 24)).to(tl.int32)
         delta = new + drift - level
         along = tl.where(delta >= 0, 1, -1)
@@ -223,7 +223,7 @@ def draw_pixel_threshold(threshold, mismatch, normals, drawn):
 
 
 @triton.jit
-def draw_reference_error(clip, keys, pixel, on, off):
+def draw_level_minus_reference(clip, keys, pixel, on, off):
     """Return how far a reference is below the first level."""
     drawn = random_uint32(tl.load(keys + REFERENCE_KEY), tl.full((), 0, tl.int64), pixel)
     share = ((drawn >> 9).to(tl.float32) + 0.5) * (1 / 8388608.0)
@@ -245,15 +245,15 @@ def fixed_point_table_position(intensity):
 
 
 @triton.jit
-def read_table(table, place):
-    left, right = tl.load(table + (place >> 13)), tl.load(table + (place >> 13) + 1)
-    return (left + (((right - left) * (place & 8191)) >> 13) + 8) >> 4
+def read_table(table, position):
+    left, right = tl.load(table + (position >> 13)), tl.load(table + (position >> 13) + 1)
+    return (left + (((right - left) * (position & 8191)) >> 13) + 8) >> 4
 
 
 @triton.jit
-def apply_low_pass(read, level, source, decay, lag):
-    kept = (level - source).to(tl.int64) * decay - (read - source).to(tl.int64) * lag
-    return read + ((kept + 524288) >> 20).to(tl.int32)
+def apply_low_pass(decay, lag, old_level, old_source, source):
+    kept = (old_level - old_source).to(tl.int64) * decay - (source - old_source).to(tl.int64) * lag
+    return source + ((kept + 524288) >> 20).to(tl.int32)
 
 
 @triton.jit

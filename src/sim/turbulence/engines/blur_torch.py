@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from src.sim.turbulence.coefficient_grid import GridAxis
-from src.sim.turbulence.psf import symmetric_index
+from src.sim.turbulence.psf import reflect_index
 
 # Keys' cubic (a = -1/2): the weights of the pixels -1, 0, 1, 2 as polynomials in the place between.
 CUBIC_KERNEL = (
@@ -44,10 +44,10 @@ def warp(
     zero, one, two, three = torch.tensor(CUBIC_KERNEL, device=device).T[..., None, None, None]
     taps = torch.addcmul(zero, place, torch.addcmul(one, place, torch.addcmul(two, place, three)))
     at = whole[:, None].int() + torch.arange(-1, 3, device=device)[:, None, None, None]
-    x = symmetric_index(at[0] + torch.arange(left, left + tilt.shape[-1], device=device), width)
+    x = reflect_index(at[0] + torch.arange(left, left + tilt.shape[-1], device=device), width)
     y = torch.arange(top, top + tilt.shape[-2], device=device)[:, None]
     frame = torch.arange(first, first + tilt.shape[1], device=device) % count
-    y = symmetric_index(at[1] + y, height) * width + (frame * (height * width))[:, None, None]
+    y = reflect_index(at[1] + y, height) * width + (frame * (height * width))[:, None, None]
     found = frames.take((y[:, None] + x).long())  # rows, columns, n, h, w
     light = ((found * taps[0]).sum(1) * taps[1]).sum(0)
     low, high = (limit[frame][:, None, None] for limit in torch.aminmax(frames.flatten(1), dim=1))

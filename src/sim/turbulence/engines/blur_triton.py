@@ -29,15 +29,15 @@ def warp(frames: Tensor, tilt: Tensor, top: int, left: int, first: int = 0) -> T
 
 
 def scatter(
-    image: Tensor, psfs: Tensor, rows: GridAxis, halo: Tensor, share: float, first: int = 0
+    image: Tensor, psfs: Tensor, rows: GridAxis, halo: Tensor, halo_share: float, first: int = 0
 ) -> Tensor:
     (frames, height, width), n = halo.shape, len(image)
     out = image.new_empty(n, height, width)
     with torch.cuda.device_of(out):
         _scatter[(triton.cdiv(out.numel(), BLOCK),)](
-            image.contiguous(), psfs.contiguous(), halo.contiguous(), out, share, frames, n, height,
-            width, psfs.shape[2], rows.pitch, rows.offset, first, math.isqrt(len(psfs)),
-            rows.pitch > 1, BLOCK,
+            image.contiguous(), psfs.contiguous(), halo.contiguous(), out, halo_share, frames, n,
+            height, width, psfs.shape[2], rows.pitch, rows.offset_from_first_node_px, first,
+            math.isqrt(len(psfs)), rows.pitch > 1, BLOCK,
         )  # fmt: skip
     return out
 

@@ -44,7 +44,7 @@ def select_engine(device: torch.device) -> ModuleType:
     try:
         from src.sim.turbulence.engines import blur_triton  # here, as Triton is not everywhere
 
-        apart = [max_abs_difference(blur_triton, pitch, device) for pitch in TESTED_PITCHES]
+        apart = [max_difference_from_torch(blur_triton, pitch, device) for pitch in TESTED_PITCHES]
         if all(part < LARGEST_DIFFERENCE for part in apart):  # a NaN is no agreement
             return blur_triton
         reason = f"they differ by {max(apart):.2g}"
@@ -54,12 +54,12 @@ def select_engine(device: torch.device) -> ModuleType:
     return blur_torch
 
 
-def max_abs_difference(engine: ModuleType, pitch: int, device: torch.device) -> float:
+def max_difference_from_torch(engine: ModuleType, pitch: int, device: torch.device) -> float:
     """Return how much pictures of another engine differ from those of plain torch, at most."""
     generator, rows = torch.Generator().manual_seed(pitch), GridAxis(-3, 40, pitch, 1)
     frames, halo = (torch.rand(2, *size, generator=generator) for size in ((30, 90), (34, 71)))
     tilt = 3 * torch.randn(2, 5, 40, 77, generator=generator)
-    psfs = torch.rand(49, 5, rows.nodes, 77, generator=generator) - 0.3
+    psfs = torch.rand(49, 5, rows.node_count, 77, generator=generator) - 0.3
     frames, halo, tilt, psfs = (part.to(device) for part in (frames, halo, tilt, psfs))
     warped, made = [], []
     for one in (engine, blur_torch):

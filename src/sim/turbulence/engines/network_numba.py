@@ -8,7 +8,7 @@ ZERO, THREE, SIX, SIXTH = (np.float32(number) for number in (0, 3, 6, 1 / 6))
 
 
 @njit(nogil=True, cache=True, fastmath=True)
-def evaluate_network(phase, first, common, gates, pairs, last):
+def evaluate_psf_network(phase, first, common, gates, pairs, last):
     """Return what a FoldedNetwork (p2s.py) of these matrices gives for `phase` (blurmodes, nodes).
 
     Most numbers of the matrices are 0, and passed over.

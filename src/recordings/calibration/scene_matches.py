@@ -1,0 +1,93 @@
+"""Places with structure in the centre view, looked for in another view."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from src.recordings.calibration.activity_pictures import (
+    Pictures,
+    describe_structure,
+    shrink_pictures,
+)
+from src.recordings.calibration.boards import Points
+from src.recordings.calibration.patch_matching import choose_places, find_patches
+from src.recordings.calibration.view_alignment import Rectangle
+from src.recordings.views import View, list_pairs, sample
+
+MIN_PLACES = 12  # with structure, in the centre view
+GROUPS = 4  # of windows, each one picture a kind
+
+
+@dataclass(frozen=True)
+class ViewMatches:
+    """Places of the centre view `at` which another view shows them, in its own pixels, and the
+    `offset` from where it should, in pixels of the centre view; NaN where not found.  A patch
+    reaches `half_px` from its place."""
+
+    places: Points
+    at: Points
+    offset: Points
+    half_px: float
+
+    @property
+    def found(self) -> Bool[np.ndarray, " places"]:
+        return np.isfinite(self.offset[:, 0])
+
+    @property
+    def distance_px(self) -> Float[np.ndarray, " places"]:
+        return np.where(self.found, np.linalg.norm(self.offset, axis=1), np.inf)
+
+    def keep(self, kept: Bool[np.ndarray, " places"]) -> "ViewMatches":
+        return ViewMatches(self.places[kept], self.at[kept], self.offset[kept], self.half_px)
+
+
+class MatchedPictures:
+    """Pictures of windows in groups, shrunk by a whole factor `scale`, and the places with
+    structure in the centre view's `tile`.
+
+    `patches`: how many fit along its shorter side.  `apart`: a place is looked for in each group
+    by itself, as what moves may be nearer than what rests; else in all at once.  Raises ValueError
+    for fewer than MIN_PLACES.
+    """
+
+    def __init__(
+        self, pictures: Pictures, tile: Rectangle, patches: int, scale: int = 1, apart: bool = False
+    ):
+        groups = np.array_split(pictures, min(GROUPS, len(pictures)))
+        joined = [shrink_pictures(group.sum(0), scale) for group in groups]
+        structure = [describe_structure(each, 1.2, 8.0) for each in joined]
+        self._stacks = structure if apart else [np.concatenate(structure)]
+        self._scale, self._middle = scale, (scale - 1) / 2
+        edges = np.array(tile) / scale
+        self.half = int(np.clip(min(edges[2:] - edges[:2]) / 2 / patches, 8, 40))
+        self._origin = np.maximum(np.floor(edges[:2]) - self.half, 0).astype(int)
+        x, y = self._origin
+        right, bottom = np.ceil(edges[2:]).astype(int) + self.half
+        self._centre = [stack[:, y:bottom, x:right] for stack in self._stacks]
+        inside = tuple(edges - np.tile(self._origin, 2))
+        self._places = [choose_places(stack, inside, self.half) for stack in self._centre]
+        if sum(map(len, self._places)) < MIN_PLACES:
+            needed = f"structure at {MIN_PLACES} or more places of the centre view"
+            got = sum(map(len, self._places))
+            raise ValueError(f"recording must show {needed}, got {got}")
+
+    def match(self, view: View, reach: int) -> ViewMatches:
+        """Look for the places in `view`, up to `reach` off along x and y, in pixels of these
+        pictures."""
+        size = self._centre[0].shape[1:]
+        there = view.to_sensor(self._to_full(list_pairs(*map(np.arange, size[::-1]))))
+        there = (there - self._middle) / self._scale
+        offsets = []
+        for centre, stack, places in zip(self._centre, self._stacks, self._places, strict=True):
+            if len(places):
+                seen = np.stack([sample(picture, there, size) for picture in stack])
+                offsets.append(find_patches(centre, seen, places, self.half, reach))
+        placed = self._to_full(np.concatenate(self._places))
+        offset = self._scale * np.concatenate(offsets)
+        at = view.to_sensor(placed + offset)
+        return ViewMatches(placed, at, offset, float(self.half * self._scale))
+
+    def _to_full(self, points: np.ndarray) -> Points:
+        """Return where pixels of the cut, shrunk centre view lie on the sensor."""
+        return (points + self._origin) * float(self._scale) + self._middle
