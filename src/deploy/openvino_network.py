@@ -53,8 +53,6 @@ class CompiledModule:
     that was given back stays as it is.  Raises ValueError for what OpenVINO cannot express.
     """
 
-    RUNS_SIDE_BY_SIDE = True  # in two threads
-
     def __init__(self, module: nn.Module, example: Sequence[Tensor], threads: int):
         model = _convert(module, tuple(example))
         options = {

@@ -80,8 +80,6 @@ class StatefulRunner:
 class EagerBackend:
     """A module on PyTorch: arrays and a state in, an array and a state out."""
 
-    RUNS_SIDE_BY_SIDE = False  # in two threads: torch's number of threads is the process's
-
     def __init__(self, module: nn.Module, example: list[Tensor], threads: int):
         self.module = module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.example, self.threads = example, threads

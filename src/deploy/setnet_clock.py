@@ -15,7 +15,6 @@ from src.deploy.engines.clock_numba import QUARTER, TILE
 from src.deploy.first_layer import event_patches, patch_spans
 from src.models.setnet import (
     ACTIVITY_TAU_S,
-    CELL_BORDER,
     CELL_PX,
     CONTEXT_INTERVAL_S,
     CONTEXT_TAU_S,
@@ -82,8 +81,6 @@ class Tick(NamedTuple):
     smoothed_cells: UInt8[np.ndarray, "k q q"]
     smoothing_kept: np.float32  # of its distance from the context
     changed_tiles: Int[np.ndarray, "d 2"]  # whose pixels may change
-    active_box: Int[np.ndarray, "2 2"]  # (first, stop) of rows and columns of such cells
-    changed_box: Int[np.ndarray, "2 2"]
 
 
 class ClockState:
@@ -117,21 +114,15 @@ class SetNetClock:
 
     def tick(self, pixels: EventPixels, now: ClockState) -> Tick:
         """Bring `now` to the end of a window."""
-        changed, sides = np.zeros_like(self.near_tiles), np.array(self.is_near.shape)[:, None]
-        box = np.where([True, False], sides, 0)  # none
-        longest_s = self._advance(pixels, now, changed, box)
-        active_box = box.copy()
-        smoothed, update = self._advance_context(longest_s, now, changed, box)
-        changed_box = np.clip(box + np.array([-CELL_BORDER, CELL_BORDER]), 0, sides)
+        changed = np.zeros_like(self.near_tiles)
+        longest_s = self._advance(pixels, now, changed)
+        smoothed, update = self._advance_context(longest_s, now, changed)
         kept = exp_float32(-longest_s / np.float32(CONTEXT_TAU_S))
         tiles = (np.argwhere(part).astype(np.int32) for part in (now.active_tiles, changed))
         active_tiles, changed_tiles = tiles
-        boxes = active_box, changed_box
-        return Tick(active_tiles, update, *smoothed, kept, changed_tiles, *boxes)
+        return Tick(active_tiles, update, *smoothed, kept, changed_tiles)
 
-    def _advance(
-        self, pixels: EventPixels, now: ClockState, changed: np.ndarray, box: np.ndarray
-    ) -> np.float32:
+    def _advance(self, pixels: EventPixels, now: ClockState, changed: np.ndarray) -> np.float32:
         places, voxels, window_s = pixels
         kept, trace_kept = (
             exp_float32(-window_s / np.float32(tau)) for tau in (ACTIVITY_TAU_S, TRACE_TAU_S)
@@ -144,7 +135,7 @@ class SetNetClock:
         tiles = self.is_near, self.near_tiles, now.active_tiles
         cells = now.activity, now.elapsed_s, now.is_pending
         longest_s, active = clock.advance(
-            window_s, *fading, *tiles, *cells, now.pending_tiles, changed, box
+            window_s, *fading, *tiles, *cells, now.pending_tiles, changed
         )
         share = np.float32(active) / np.float32(now.activity.size)
         pace = (share - np.float32(STATIC_SHARE)) / np.float32(MOVING_SHARE - STATIC_SHARE)
@@ -155,11 +146,10 @@ class SetNetClock:
         clock.advance_all(moving_s, gained, now.elapsed_s, now.evidence, now.is_pending)
         for part in (now.active_tiles, now.pending_tiles, changed):
             part[:] = 1
-        box[:, 0], box[:, 1] = 0, self.is_near.shape
         return np.float32(longest_s)
 
     def _advance_context(
-        self, longest_s: np.float32, now: ClockState, changed: np.ndarray, box: np.ndarray
+        self, longest_s: np.float32, now: ClockState, changed: np.ndarray
     ) -> tuple[tuple[np.ndarray, np.ndarray], ContextUpdate | None]:
         if longest_s == 0:
             none = np.zeros((0, QUARTER, QUARTER), np.uint8)
@@ -169,7 +159,7 @@ class SetNetClock:
         clock.fade(kept, now.recency.reshape(-1))
         tiles = now.pending_tiles, now.settling_tiles
         given = now.recency, np.float32(SETTLING), now.is_pending
-        smoothed = clock.find_smoothed(*given, *tiles, changed, box)
+        smoothed = clock.find_smoothed(*given, *tiles, changed)
         is_due = now.update_recency <= np.float32(UPDATE_RECENCY)
         return smoothed, self._start_update(now) if is_due else None
 
@@ -219,10 +209,7 @@ class EventMaps:
         work, is_much = (pixels, clocks, state), len(pixels.places) > SIDE_BY_SIDE
         sums = self.pool.submit(self._advance_sums, *work) if self.pool and is_much else None
         self._make_voxel_map(pixels, clocks)
-        if sums and not sums.cancel():
-            sums.result()
-        else:
-            self._advance_sums(*work)
+        sums.result() if sums else self._advance_sums(*work)
 
     def _make_voxel_map(self, pixels: EventPixels, clocks: ClockState) -> None:
         places, voxels, window_s = pixels

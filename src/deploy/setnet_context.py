@@ -18,13 +18,13 @@ from torch.nn import functional
 from src.deploy.engines import tiles_numba
 from src.deploy.setnet_clock import ContextUpdate
 from src.deploy.setnet_layers import channels_first, channels_last
-from src.deploy.tile_batches import TileModule, Workers
+from src.deploy.tile_batches import TileModule
 from src.models.layers import PreActivationBlock
 from src.models.setnet import ContextPyramid, SetNet
 
 BLOCK_HALO = 2  # cells that the two convolutions of a PreActivationBlock take in on each side
 CONTEXT_TILE = 8  # side of a tile of any scale, in its cells
-CONTEXT_BATCHES = (4, 16)  # sizes of batches, in tiles
+CONTEXT_BATCHES = (16,)  # sizes of batches, in tiles
 
 
 class WholeContext(nn.Module):
@@ -131,7 +131,7 @@ class ContextLayers(FusionLayers):
     ) -> Float[Tensor, "b u u o"]:
         """Return the context after the update."""
         new = self.last(self.fuse(finer, coarser, is_inside).relu()).float()
-        keep = torch.exp(self.rate * channels_first(recency).log())  # a power takes much longer
+        keep = channels_first(recency) ** self.rate
         return channels_last(torch.lerp(new, channels_first(context), keep))
 
 
@@ -162,12 +162,12 @@ class TileBlock(nn.Module):
 class ContextTiles:
     """Updates the context of a TileState, scale by scale.  Raises ValueError for a single scale."""
 
-    def __init__(self, network: SetNet, dtype: torch.dtype, workers: Workers):
+    def __init__(self, network: SetNet, dtype: torch.dtype, *how: Any):
         pyramid = network.context
         widths = [c for c, *_ in pyramid.map_sizes(2, 2)[: len(pyramid.downs)]]
         if len(widths) < 2:
             raise ValueError(f"context_channels must be at least 2 for event lists, got {widths}")
-        how = workers, CONTEXT_BATCHES
+        how = *how, CONTEXT_BATCHES
         inner, outer = CONTEXT_TILE + 2 * BLOCK_HALO, 2 * (CONTEXT_TILE + 2 * BLOCK_HALO) + 1
         self.down, self.fuse = list[TileModule](), list[TileModule]()
         for scale, channels in enumerate([network.channels, *widths[:-1]]):

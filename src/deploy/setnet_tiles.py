@@ -21,15 +21,13 @@ from src.deploy.setnet_clock import (
 )
 from src.deploy.setnet_context import CONTEXT_TILE, ContextTiles, WholeContext
 from src.deploy.setnet_layers import DecoderLayers, MemoryLayers, WholeDecoder, WholeWindow
-from src.deploy.tile_batches import Backend, TileModule, Workers
+from src.deploy.tile_batches import Backend, TileModule
 from src.models.setnet import BACKGROUND, BACKGROUND_WEIGHT, CELL_PX, REVEALING_EVENTS, SetNet
 from src.sim.optics import Position
 
-BATCHES = 8, 32  # sizes of batches, in tiles
-BLOCK = 32  # side of a block, in cells: what changes in a small part of the frame fits in one
-BLOCK_TILES = 12  # tiles that take as long
+BATCHES = 32, 128  # sizes of batches, in tiles
 # Share of the frame in tiles from which on all of it is computed at once, which takes no longer.
-WHOLE_MEMORY, WHOLE_CONTEXT, WHOLE_DECODER = 0.75, 0.45, 0.75
+WHOLE_MEMORY, WHOLE_CONTEXT, WHOLE_DECODER = 0.3, 0.25, 0.6
 
 
 class TileState:
@@ -47,19 +45,14 @@ class TileState:
         self.totals = np.zeros(2)  # of weights and of light, of blend_background
         self.frame = np.full((height, width), BACKGROUND, np.float32)
 
-    def write_pixels(
-        self, pixels: np.ndarray, corners: np.ndarray, evidence: np.ndarray
-    ) -> tuple[float, float]:
-        """Write tiles of pixels into `light`; return what `add_background`, which writes `frame`,
-        is to add."""
-        shown = self.revealed, self.light
+    def write_pixels(self, pixels: np.ndarray, corners: np.ndarray, evidence: np.ndarray) -> None:
+        """Write tiles of pixels into `light`; `add_background` writes `frame`."""
+        shown = self.revealed, self.light, self.totals
         half = np.float32(REVEALING_EVENTS)
-        return tiles_numba.write_pixels(pixels, corners, evidence, half, *shown)
+        tiles_numba.write_pixels(pixels, corners, evidence, half, *shown)
 
-    def add_background(self, gained: list[tuple[float, float]]) -> None:
+    def add_background(self) -> None:
         """Bring `frame` up to date, as models.setnet.blend_background does."""
-        for more in gained:
-            self.totals += more
         weight, light = self.totals
         light += BACKGROUND_WEIGHT * BACKGROUND
         background = np.float32(light / (weight + BACKGROUND_WEIGHT))
@@ -91,19 +84,17 @@ class SetNetTiles:
         self, network: SetNet, positions: Sequence[Position], padded: tuple[int, int],
         dtype: torch.dtype, backend: Backend, threads: int,
     ):  # fmt: skip
-        self.network, self.padded, workers = network, padded, Workers(backend, threads)
+        self.network, self.padded, how = network, padded, (backend, threads)
         memory, decoder = MemoryLayers(network, positions, dtype), DecoderLayers(network, dtype)
         self.events = EventMaps(network, positions, memory.mixture_code, padded, threads)
         views, rows, columns, mixtures = self.events.size
         self.clock = SetNetClock(views, rows, columns, len(network.context.downs))
-        self.memory, self.decoder, c = {}, {}, network.channels
-        for side, sizes in ((TILE, BATCHES), (BLOCK, (1,))):
-            near, far = (side + 2, side + 2), (side + 4, side + 4)
-            shapes = [(*near, c), (*far, mixtures), (*near, 1), (side, side, c)]
-            self.memory[side] = TileModule(memory, shapes, workers, sizes)
-            self.decoder[side] = TileModule(decoder, [(*far, c)], workers, sizes)
-        self.context = ContextTiles(network, dtype, workers)
-        self.whole = WholeFrame(network, positions, padded, dtype, backend, threads)
+        c, near, far = network.channels, TILE + 2, TILE + 4
+        shapes = [(near, near, c), (far, far, mixtures), (near, near, 1), (TILE, TILE, c)]
+        self.memory = TileModule(memory, shapes, *how, BATCHES)
+        self.decoder = TileModule(decoder, [(far, far, c)], *how, BATCHES)
+        self.context = ContextTiles(network, dtype, *how)
+        self.whole = WholeFrame(network, positions, padded, dtype, *how)
         self.reset()
 
     def reset(self) -> None:
@@ -123,26 +114,19 @@ class SetNetTiles:
         if is_most:
             self.whole.remember(self.events.voxel_map, sums.mixtures, clock.elapsed_s, maps)
         else:
-            self._remember(*self._cover(tick.active_tiles, tick.active_box))
+            self._remember(tick.active_tiles)
         if tick.update:
             self._update_context(tick.update)
             self._smooth(tick)
         if is_most and not tick.update:
-            maps.add_background(self.whole.show(maps, clock.evidence))
+            self.whole.show(maps, clock.evidence)
         elif self._is_most(TILE, len(tick.changed_tiles), WHOLE_DECODER):
-            maps.add_background(self.whole.draw(maps, clock.evidence))
-        elif len(tick.changed_tiles):
-            maps.add_background(self._draw(*self._cover(tick.changed_tiles, tick.changed_box)))
+            self.whole.draw(maps, clock.evidence)
+        else:
+            self._draw(tick.changed_tiles)
+        if is_most or len(tick.changed_tiles):
+            maps.add_background()
         return maps.frame
-
-    def _cover(self, tiles: np.ndarray, box: np.ndarray) -> tuple[int, np.ndarray]:
-        """Return the side, in cells, and the first cells (n, 2) of the `tiles`, by (row, column),
-        or, where that takes less time, of a block over the `box`: (first, stop) of rows and of
-        columns."""
-        first = box[:, 0] // 2 * 2
-        if len(tiles) > BLOCK_TILES and (box[:, 1] - first <= BLOCK).all():
-            return BLOCK, first[None].astype(np.int32)
-        return TILE, TILE * tiles
 
     def _smooth(self, tick: Tick) -> None:
         maps, corners = self.state.maps, QUARTER * tick.smoothed_tiles
@@ -161,9 +145,9 @@ class SetNetTiles:
         else:
             self.context.update(self.state.maps, update)
 
-    def _remember(self, side: int, corners: np.ndarray) -> None:
+    def _remember(self, tiles: np.ndarray) -> None:
         clock, sums, maps = self.state
-        elapsed_s, events = clock.elapsed_s[..., None], self.events
+        corners, elapsed_s, events = TILE * tiles, clock.elapsed_s[..., None], self.events
         near, far = np.int32(MemoryLayers.VOXEL_HALO), np.int32(MemoryLayers.MIXTURE_HALO)
 
         def read(part: slice, inputs: list[np.ndarray]) -> None:
@@ -175,19 +159,21 @@ class SetNetTiles:
         def write(part: slice, after: np.ndarray) -> None:
             tiles_numba.scatter(after, corners[part], clock.elapsed_s, maps.hidden)
 
-        self.memory[side].run(len(corners), read, write)
+        self.memory.run(len(corners), read, write)
 
-    def _draw(self, side: int, corners: np.ndarray) -> list[tuple[float, float]]:
+    def _draw(self, tiles: np.ndarray) -> None:
         state, halo = self.state.maps, np.int32(DecoderLayers.HALO)
         evidence = self.state.clock.evidence
 
         def read(part: slice, inputs: list[np.ndarray]) -> None:
-            tiles_numba.gather_sum(state.hidden, state.smoothed, corners[part] - halo, inputs[0])
+            corners = TILE * tiles[part] - halo
+            tiles_numba.gather_sum(state.hidden, state.smoothed, corners, inputs[0])
 
-        def write(part: slice, pixels: np.ndarray) -> tuple[float, float]:
-            return state.write_pixels(pixels, corners[part] // 2, evidence)
+        def write(part: slice, pixels: np.ndarray) -> None:
+            corners = QUARTER * tiles[part]
+            state.write_pixels(pixels, corners, evidence)
 
-        return self.decoder[side].run(len(corners), read, write)
+        self.decoder.run(len(tiles), read, write)
 
 
 class WholeFrame:
@@ -228,14 +214,15 @@ class WholeFrame:
         made, self.spare = self.spare, [maps.context, *held]
         maps.hold(*made)
 
-    def draw(self, maps: TileState, evidence: np.ndarray) -> list[tuple[float, float]]:
+    def draw(self, maps: TileState, evidence: np.ndarray) -> None:
         """Draw the pixels."""
         self.decoder.run([maps.hidden[None], maps.smoothed[None]], [self.pixels])
-        return self.show(maps, evidence)
+        self.show(maps, evidence)
 
-    def show(self, maps: TileState, evidence: np.ndarray) -> list[tuple[float, float]]:
+    def show(self, maps: TileState, evidence: np.ndarray) -> None:
         """Write the pixels that were drawn last."""
-        return [maps.write_pixels(self.pixels, np.zeros((1, 2), np.int32), evidence)]
+        corner = np.zeros((1, 2), np.int32)
+        maps.write_pixels(self.pixels, corner, evidence)
 
 
 def _zeros(size: tuple[int, int, int]) -> Float[np.ndarray, "h w c"]:

@@ -169,20 +169,6 @@ def test_from_tiles_to_the_whole_frame_and_back(backend, in_float32):
     assert min(ways.values()) >= 4
 
 
-@pytest.mark.parametrize("backend", FORMS)
-@pytest.mark.parametrize("corner", [(7, 9), (61, 37), (100, 198)])
-def test_a_small_part_of_the_frame_is_one_block(backend, corner, in_float32):
-    windows = scene([EVERYWHERE] * 9 + [BLOB, QUIET, ALONE], 4, 2, 40, 38, 600.0)
-    windows = [(t, x + corner[1], y + corner[0], *rest) for t, x, y, *rest in windows]
-    live = EventListRuntime(
-        NETWORKS["medium"], positions=positions(2), height=144, width=240, form=form(backend)
-    )
-    drawn, draw = [], live.runner._draw
-    live.runner._draw = lambda side, corners: drawn.append(side) or draw(side, corners)
-    assert largest_gap(NETWORKS["medium"], live, windows, 2) < EXACT
-    assert drawn.count(setnet_tiles.BLOCK) >= 9
-
-
 @pytest.mark.parametrize("share", [0.0, 9.0])
 def test_either_way_all_the_time(share, monkeypatch):
     """Whole maps although little changes, tiles although all does."""

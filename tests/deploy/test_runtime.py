@@ -307,8 +307,7 @@ def test_openvino_computes_in_bytes_what_is_to_be(unchecked):
     if not has_int8_dot_product():
         pytest.skip("this CPU has no instructions for bytes")
     live = runtime(network("setnet_in_bytes"), "openvino")
-    tiles = [part for made in live.runner.decoder.values() for part in made.compiled.values()]
-    for part in (live.runner.whole.decoder, *tiles):
+    for part in (live.runner.whole.decoder, *live.runner.decoder.compiled.values()):
         nodes = part.request.get_compiled_model().get_runtime_model().get_ordered_ops()
         told = [
             {key: node.get_rt_info()[key].astype(str) for key in ("layerType", "primitiveType")}

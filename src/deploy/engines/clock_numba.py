@@ -8,7 +8,6 @@ Thresholds and times are arguments: a compiled function that is kept on disk kee
 import numpy as np
 from numba import njit
 
-from src.models.setnet import CELL_BORDER as REACH
 from src.models.setnet import CELL_PX as SIDE
 
 f32, u8 = np.float32, np.uint8
@@ -140,12 +139,12 @@ def spread(supported, spans, weights, evidence, is_near, near_tiles):
 
 @njit(nogil=True, cache=True)
 def advance(window_s, kept, tau_s, floor, is_near, near_tiles, active_tiles, activity, elapsed_s,
-            is_pending, pending_tiles, changed, box):  # fmt: skip
+            is_pending, pending_tiles, changed):  # fmt: skip
     """Advance the clock of every cell; return by how much at most, in seconds, and how many cells
     are active then.  `is_near` is cleared, and `near_tiles`.
 
     `active_tiles`: before and after, which tiles have a cell whose clock advances; `changed`: the
-    tiles within the decoder's reach of one; `box`: grows around what it reaches.
+    tiles within the decoder's reach of one.
     """
     longest, total = f32(0), 0
     columns_used = np.empty(TILE, f32)
@@ -180,7 +179,7 @@ def advance(window_s, kept, tau_s, floor, is_near, near_tiles, active_tiles, act
         if last >= 0:
             active_tiles[i, j] = pending_tiles[i, j] = 1
             used = np.flatnonzero(columns_used)
-            mark_reached(r0 + first, r0 + last, c0 + used[0], c0 + used[-1], changed, box)
+            mark_reached(r0 + first, r0 + last, c0 + used[0], c0 + used[-1], changed)
     return longest, total
 
 
@@ -196,22 +195,18 @@ def advance_all(moving_s, evidence_per_s, elapsed_s, evidence, is_pending):
 
 
 @njit(nogil=True, cache=True)
-def mark_reached(top, bottom, left, right, changed, box):
-    """Set the tiles of `changed` within the decoder's reach of a rectangle; let `box`, (first,
-    stop) of rows and of columns, grow around it."""
-    box[0, 0], box[0, 1] = min(box[0, 0], top), max(box[0, 1], bottom + 1)
-    box[1, 0], box[1, 1] = min(box[1, 0], left), max(box[1, 1], right + 1)
-    top, left = max(top - REACH, 0), max(left - REACH, 0)
-    for i in range(top // TILE, min((bottom + REACH) // TILE + 1, len(changed))):
-        for j in range(left // TILE, min((right + REACH) // TILE + 1, changed.shape[1])):
+def mark_reached(top, bottom, left, right, changed):
+    """Set the tiles of `changed` within two cells of a rectangle."""
+    for i in range(max(top - 2, 0) // TILE, min((bottom + 2) // TILE + 1, len(changed))):
+        for j in range(max(left - 2, 0) // TILE, min((right + 2) // TILE + 1, changed.shape[1])):
             changed[i, j] = 1
 
 
 @njit(nogil=True, cache=True)
-def find_smoothed(recency, settling, is_pending, pending_tiles, settling_tiles, changed, box):
+def find_smoothed(recency, settling, is_pending, pending_tiles, settling_tiles, changed):
     """Return the tiles (n, 2), and in each the cells (n, QUARTER, QUARTER), in which the smoothed
     context advances: pending ones, and those with a `recency` above `settling`; mark what they
-    change, as `advance` does.  `settling_tiles`: where any did without an update.
+    change.  `settling_tiles`: where any did without an update.
     """
     most = np.count_nonzero(pending_tiles | settling_tiles)
     tiles = np.empty((most, 2), np.int32)
@@ -235,8 +230,9 @@ def find_smoothed(recency, settling, is_pending, pending_tiles, settling_tiles, 
             tiles[count, 0], tiles[count, 1] = i, j
             count += 1
             r0, c0 = i * TILE, j * TILE
-            rows, columns = (r0 + 2 * top, r0 + 2 * bottom + 1), (c0 + 2 * left, c0 + 2 * right + 1)
-            mark_reached(rows[0], rows[1], columns[0], columns[1], changed, box)
+            mark_reached(
+                r0 + 2 * top, r0 + 2 * bottom + 1, c0 + 2 * left, c0 + 2 * right + 1, changed
+            )
     return tiles[:count], cells[:count]
 
 

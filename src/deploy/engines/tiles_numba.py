@@ -129,16 +129,16 @@ def smooth(context, corners, cells, kept, smoothed):
 
 
 @njit(nogil=True, cache=True)
-def write_pixels(tiles, corners, evidence, half, revealed, light):
+def write_pixels(tiles, corners, evidence, half, revealed, light, totals):
     """Write tiles (n, t, t, pixels) of the pixels of 2 x 2 cells, row by row, into `light`, times
     how far `evidence` has `revealed` their cell, `half` for half of it; `corners`: in 2 x 2 cells;
-    return by how much the sums over cells of the weight and the light of blend_background grow."""
+    `totals` follow the sums over cells of the weight and the light of blend_background."""
     side = 2 * CELL
     squares_down, squares_across = len(light) // side, light.shape[1] // side
     across, of, n = tiles.shape[2], tiles.reshape(-1), np.uint64(CELL)
-    weight, gained = 0.0, 0.0  # float64: no drift
     for i in range(len(corners)):
         r0, c0 = corners[i]
+        weight, gained = 0.0, 0.0  # float64: no drift
         for k in range(min(tiles.shape[1], squares_down - r0)):
             for a in range(side):
                 cells = 2 * (r0 + k) + a // CELL
@@ -160,7 +160,8 @@ def write_pixels(tiles, corners, evidence, half, revealed, light):
                         to += n
                         at += n
                     at += np.uint64(side * side - side)
-    return weight, gained / CELL**2
+        totals[0] += weight
+        totals[1] += gained / CELL**2
 
 
 @njit(nogil=True, cache=True)

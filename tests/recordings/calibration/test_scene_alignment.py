@@ -55,7 +55,14 @@ def record(path, positions, films, key: int = 5, angle_rad: float = 0.0):
     return truth
 
 
-@pytest.mark.parametrize("views", [3, 4, 9], ids=["1x3", "2x2", "3x3"])
+@pytest.mark.parametrize(
+    "views",  # 3 x 3 is the test of halves, too
+    [
+        pytest.param(3, id="1x3"),
+        pytest.param(4, id="2x2"),
+        pytest.param(9, id="3x3", marks=pytest.mark.slow),
+    ],
+)
 def test_any_scene_finds_the_views_of_a_kaleidoscope(views, tmp_path):
     path = tmp_path / "scene.raw"
     truth = record(path, layout(views), [moving_scene()], key=views)
