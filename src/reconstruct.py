@@ -165,9 +165,8 @@ def join_film_panels(
         panels = {samples.EVENTS_TITLE: samples.render_events(window.voxels[0], full=1.0)}
         panels |= {name: one.picture[None] for name, one in zip(methods, shown, strict=True)}
         if clean is not None:
-            panels["clean"] = clean.nearest_frame(window.end_us * 1e-6, shown[-1].picture.shape)[
-                None
-            ]
+            size = shown[-1].picture.shape
+            panels["clean"] = clean.nearest_frame(window.end_us * 1e-6, size)[None]
         yield replace(shown[-1], picture=samples.join_panels(panels)[0])
 
 

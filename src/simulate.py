@@ -61,10 +61,8 @@ def simulate_own_clip(cfg: DictConfig) -> dict:
     if not hasattr(work.sensor, "events"):
         kind = type(work.sensor).__name__
         raise ValueError(f"sensor must be one of events for video and photo, got {kind}")
-    camera, drawn = (
-        place_views(cfg, work.optics.positions, clip.size, work.key),
-        work.drawn_parameters(),
-    )
+    camera = place_views(cfg, work.optics.positions, clip.size, work.key)
+    drawn = work.drawn_parameters()
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     print(work.describe())
     if cfg.photo and not cfg.speed_widths_per_s:

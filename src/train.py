@@ -32,10 +32,8 @@ def train(cfg: DictConfig) -> dict:
     hardware.retain_freed_memory(cfg)
     hardware.fill_in_precision(cfg)
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
-    first_weights, references = (
-        start_weights.set_model_from_start_weights(cfg),
-        start_weights.load_reference_networks(cfg),
-    )
+    first_weights = start_weights.set_model_from_start_weights(cfg)
+    references = start_weights.load_reference_networks(cfg)
     net, spec = build.build_network_and_spec(cfg)
     if first_weights:
         files.restore_weights(net, first_weights)
@@ -63,8 +61,9 @@ def train(cfg: DictConfig) -> dict:
     drawn = data.pipelines["test"], cfg.sample_clips
     pictures = samples.write_samples(run / "samples", module.method, *drawn)
     rows, facts = [trained, before, *others], entry_point.run_metadata(cfg, start)
-    facts["note"] = results.describe_difference(trained, before)
-    record = results.write_and_print_results(run, entry_point.resolved_yaml(cfg), rows, **facts)
+    note = results.describe_score_difference(trained, before)
+    config = entry_point.resolved_yaml(cfg)
+    record = results.write_and_print_results(run, config, rows, note=note, **facts)
     tracking.log_results_to_wandb(trainer.loggers, record, pictures)
     return record
 

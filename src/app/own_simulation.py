@@ -99,7 +99,7 @@ class OwnSimulation:
         return (
             f"{self.clip.name}: {self.clip.source}; simulated as {self.optics.views} views of "
             f"{width}x{height} px at {self.fps:.6g} frames/s; turbulence {drawn['severity']}"
-            f"{describe_strength(drawn)}; code values {light}, contrast threshold "
+            f"{describe_turbulence(drawn)}; code values {light}, contrast threshold "
             f"{self.sensor.threshold:.3f}"
         )
 
@@ -157,7 +157,7 @@ class OwnSimulation:
             return torch.from_numpy(np.memmap(file, np.float16, "w+", shape=shape))
 
 
-def describe_strength(drawn: Mapping[str, Any]) -> str:
+def describe_turbulence(drawn: Mapping[str, Any]) -> str:
     """Return how far turbulence moves and spreads a point of the clip, pixels, along one axis."""
     if not (tilt := drawn.get("tilt_px")):
         return ""

@@ -55,12 +55,12 @@ def simulate(
     """Return what a light field of `views` views and an event sensor see of your material.
 
     `photo_or_video`: a path, of a picture, a video or a folder of frames, or an array, (h, w) or
-    (frames, h, w), uint8 or floats in [0, 1].  `turbulence`: none, weak, medium, strong or mixed.
-    `sensor`: paper, ideal, noisy, evk4 ..., for sRGB and with a contrast threshold of 0.2 unless
-    `overrides` set sensor.input and sensor.threshold.  `fps`: None for that of the file, 120 for a
-    photograph, which lasts `seconds`.  `overrides`: keys of conf/simulate.yaml as on the command
-    line.  The result is a function of the arguments.  Raises ValueError for values outside their
-    range.
+    (frames, h, w), uint8 or floats in [0, 1].  `turbulence`: none, weak, medium, strong, extreme or
+    mixed.  `sensor`: paper, ideal, noisy, evk4 ..., for sRGB and with a contrast threshold of 0.2
+    unless `overrides` set sensor.input and sensor.threshold.  `fps`: None for that of the file, 120
+    for a photograph, which lasts `seconds`.  `overrides`: keys of conf/simulate.yaml as on the
+    command line.  The result is a function of the arguments.  Raises ValueError for values outside
+    their range.
     """
     for group, choice in (("turbulence", turbulence), ("sensor", sensor)):
         if choice not in (names := config_choices(group)):

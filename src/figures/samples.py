@@ -11,7 +11,7 @@ from PIL import Image
 
 from src.figures.comparison import VideoRow, draw_comparison
 from src.models.network import VideoMethod
-from src.recordings.output import round_to_uint8
+from src.recordings.output import resize_picture, round_to_uint8
 from src.records.atomic import atomic_path
 from src.sim.optics import Optics
 from src.sim.pipeline import Pipeline, simulate
@@ -101,11 +101,9 @@ def resize_pictures(
     """Return grey pictures `height_px` high, in proportion: shrunk by means over areas, enlarged by
     cubic interpolation, which keeps their range of values."""
     _, height, width = pictures.shape
-    size = max(1, round(width * height_px / height)), height_px
-    if height_px <= height:
-        return np.stack([cv2.resize(one, size, interpolation=cv2.INTER_AREA) for one in pictures])
-    large = [cv2.resize(one, size, interpolation=cv2.INTER_CUBIC) for one in pictures]
-    return np.stack(large).clip(pictures.min(), pictures.max())
+    size = height_px, max(1, round(width * height_px / height))
+    resized = np.stack([resize_picture(one, size) for one in pictures])
+    return resized.clip(pictures.min(), pictures.max())
 
 
 def tile_views(videos: list[Video], optics: Optics) -> Video:

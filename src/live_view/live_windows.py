@@ -95,7 +95,7 @@ class WindowCutter:
             return
         over = int((until_us - self.origin_us) / self.period_us) - self.windows_cut
         ends = (end_us + self.period_us * np.arange(max(over, 1))).tolist()
-        self.order.accept_silence(until_us)
+        self.order.resume_after_silence(until_us)
         ready = self.order.release(ends[-1])
         events = concatenate_events(ready) if ready else np.empty(0, EVENT)
         stops = [count_before(events, end) for end in ends]

@@ -42,7 +42,7 @@ class CornerFold:
         """Return the inverse of `turn`; the nearer half shows what both show or none does."""
         return self._turn(points, -self.angle_rad / 2)
 
-    def distance(self, points: Points) -> Float[np.ndarray, " n"]:
+    def signed_distance_px(self, points: Points) -> Float[np.ndarray, " n"]:
         """Return how far points lie from the line, in pixels; below 0 on the one side of it."""
         across, along = np.subtract(self.towards, self.corner)
         x, y = (points - self.corner).T
@@ -50,5 +50,5 @@ class CornerFold:
 
     def _turn(self, points: Points, angle: float) -> Points:
         x, y = (points - self.corner).T
-        sine, cosine = np.sign(self.distance(points)) * np.sin(angle), np.cos(angle)
+        sine, cosine = np.sign(self.signed_distance_px(points)) * np.sin(angle), np.cos(angle)
         return np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=1) + self.corner

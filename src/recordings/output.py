@@ -19,7 +19,7 @@ import av
 import cv2
 import h5py
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from PIL import GifImagePlugin, Image
 
 from src.recordings.reconstruction import Frame
@@ -110,6 +110,16 @@ def round_to_uint8(picture: np.ndarray) -> UInt8[np.ndarray, "*shape"]:
     if picture.dtype == np.uint8:
         return picture
     return (np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def resize_picture(
+    picture: Float[np.ndarray, "h w"], size: tuple[int, ...]
+) -> Float[np.ndarray, "h2 w2"]:
+    """Return a grey picture of `size` (h2, w2): shrunk by means over areas, enlarged by cubic
+    interpolation, which may leave its range of values.
+    """
+    how = cv2.INTER_AREA if size[0] <= picture.shape[0] else cv2.INTER_CUBIC  # areas leave blocks
+    return cv2.resize(picture, (size[1], size[0]), interpolation=how)
 
 
 def partial_path(path: Path) -> Path:

@@ -15,13 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import h5py
 import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from src.recordings.output import round_to_uint8
+from src.recordings.output import resize_picture, round_to_uint8
 from src.recordings.views import Views
 from src.records.atomic import atomic_path
 
@@ -86,9 +85,7 @@ class CleanClip:
         frame = self.frames[int(np.abs(self.times_s - time_s).argmin())].astype(np.float32) / 255
         if frame.shape == size[:2]:
             return frame
-        shrinks = size[0] <= frame.shape[0]
-        how = cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC  # areas enlarge to blocks
-        return cv2.resize(frame, (size[1], size[0]), interpolation=how).clip(0, 1)
+        return resize_picture(frame, size).clip(0, 1)
 
 
 def read_clean_clip(recording: Path) -> CleanClip | None:

@@ -109,9 +109,7 @@ class Views:
         left, top, right, bottom = self.field
         a, b = self.model[1] / (right - left), self.model[0] / (bottom - top)
         scale = np.array([[a, 0, -left * a - 0.5], [0, b, -top * b - 0.5], [0, 0, 1]])
-        if view.fold:
-            return _transform(scale, view.to_centre(points))
-        return _transform(scale @ view.homography, points)
+        return _transform(scale, view.to_centre(points))
 
     def outline(self, view: View) -> Float[np.ndarray, "4 2"]:
         """Return the corners of `view` on the sensor: the field's, clockwise from top left."""
@@ -138,7 +136,8 @@ class Views:
         x = left + (np.arange(width) + 0.5) * (right - left) / width
         y = top + (np.arange(height) + 0.5) * (bottom - top) / height
         flat, places = picture.astype(np.float32), list_pairs(x, y)
-        return np.stack([sample(flat, v.to_sensor(places), self.model) for v in self.views])
+        seen = (view.to_sensor(places) for view in self.views)
+        return np.stack([sample_bilinear(flat, at, self.model) for at in seen])
 
     def _field_on_sensor(self, view: View, side: int) -> Points:
         x, y = np.linspace(self.field[:2], self.field[2:], side).T
@@ -235,7 +234,7 @@ def _parse_numbers(values: list, kind: type, count: int) -> tuple:
     return tuple(kind(value) for value in values)
 
 
-def sample(picture: Float[np.ndarray, "h w"], places: Points, size: Size) -> np.ndarray:
+def sample_bilinear(picture: Float[np.ndarray, "h w"], places: Points, size: Size) -> np.ndarray:
     """Return `picture` at `places`, bilinear, 0 outside, as a picture of `size` (height, width)."""
     x, y = places.T.astype(np.float32)
     return cv2.remap(picture, x.reshape(size), y.reshape(size), cv2.INTER_LINEAR)

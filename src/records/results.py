@@ -160,7 +160,7 @@ def build_rich_score_table(rows: list[ScoreRow]) -> Table:
     return picture
 
 
-def describe_difference(ours: ScoreRow, theirs: ScoreRow) -> str:
+def describe_score_difference(ours: ScoreRow, theirs: ScoreRow) -> str:
     """Return a line of the first metric that both have: its difference over the same clips with the
     95 % bootstrap CI; "" for fewer than two clips."""
     metric = next(

@@ -123,7 +123,7 @@ class Reconstructor(LightningModule):
         self.manual_backward(frames, gradient)
         total = self.all_gather(loss).mean()  # type: ignore[union-attr]
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
-        self.guard.check_and_scale(gradients, total, self.global_step, sample.parameters)
+        self.guard.scale_gradients(gradients, total, self.global_step, sample.parameters)
         optimizer.step()
         if self.make_scheduler is not None:
             self.lr_schedulers().step()  # type: ignore[union-attr]

@@ -40,7 +40,7 @@ class StepGuard:
         self.min_losses = min_losses
         self.losses: deque[float] = deque(maxlen=100)
 
-    def check_and_scale(
+    def scale_gradients(
         self, gradients: Sequence[Tensor], loss: Tensor, step: int, drawn: list[dict]
     ) -> None:
         """Scale `gradients` in place.  Raises NonFiniteError, naming the clips `drawn`, before."""

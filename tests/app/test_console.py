@@ -15,7 +15,7 @@ from rich.console import Console
 
 from src.app import build
 from src.app.help import help_text
-from src.records.results import ScoreRow, build_rich_score_table, describe_difference
+from src.records.results import ScoreRow, build_rich_score_table, describe_score_difference
 from src.training.progress import TrainingProgress
 from tests.conftest import ROOT
 from tests.test_entry_points import run_here
@@ -79,9 +79,9 @@ def test_a_difference_that_may_be_none_is_said_to_be_none():
         for name, values in {"a": (0.3, 0.2), "b": (0.1, 0.3), "c": (0.5, 0.5)}.items()
     )
     none = "LPIPS, a less b: +0.0500, 95 % CI -0.1000 to +0.2000: it holds 0, so no difference is"
-    assert describe_difference(ours, less) == f"{none} shown"
+    assert describe_score_difference(ours, less) == f"{none} shown"
     said = "LPIPS, a less c: -0.2500, 95 % CI -0.3000 to -0.2000"
-    assert describe_difference(ours, more) == said
+    assert describe_score_difference(ours, more) == said
 
 
 def test_progress_counts_the_steps_asked_for(capsys):

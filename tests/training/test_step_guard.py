@@ -19,9 +19,9 @@ def test_a_spike_counts_no_more_than_the_median():
 def test_gradients_are_limited_by_both():
     guard, loss = StepGuard(10.0, 0.5, min_losses=1), torch.tensor(1.0)
     first, second = [torch.full((4,), 1.0)], [torch.full((4,), 1.0)]
-    guard.check_and_scale(first, loss, 0, [])
+    guard.scale_gradients(first, loss, 0, [])
     assert float(first[0].norm()) == pytest.approx(0.5)
-    guard.check_and_scale(second, 100 * loss, 1, [])
+    guard.scale_gradients(second, 100 * loss, 1, [])
     assert float(second[0].norm()) == pytest.approx(0.02), "after the spike it is short enough"
 
 
@@ -35,9 +35,9 @@ def test_factors_that_would_always_act_are_refused():
 def test_the_error_names_the_clips():
     clips = [{"clip": 14, "threshold": 0.2}, {"clip": 15}]
     with pytest.raises(NonFiniteError, match="step 7.*'threshold': 0.2") as caught:
-        StepGuard().check_and_scale([torch.zeros(2)], torch.tensor(float("nan")), 7, clips)
+        StepGuard().scale_gradients([torch.zeros(2)], torch.tensor(float("nan")), 7, clips)
     assert caught.value.clips == [14, 15]
     with pytest.raises(NonFiniteError, match="a gradient is not finite"):
-        StepGuard().check_and_scale(
+        StepGuard().scale_gradients(
             [torch.tensor([1.0, float("inf")])], torch.tensor(1.0), 7, clips
         )

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from src.bench.candidates import Candidate
 from src.bench.stress_tests.event_clips import ClipConditions, EventClip, StressBench, require_type
-from src.bench.stress_tests.stress_results import StressResult, build_worst_loss_result
+from src.bench.stress_tests.stress_results import StressResult, build_worst_psnr_loss_result
 from src.metrics.image import aligned_psnr
 from src.sim import noise
 from src.sim.optics import centre_view_index, layout
@@ -39,7 +39,7 @@ def measure_worst_psnr_loss(
     for value in values:
         conditions = ClipConditions.from_settings({parameter: value, **(fixed or {})})
         curve.append((value, base - bench.mean_aligned_psnr(network, conditions)))
-    return build_worst_loss_result(curve, limit_db=limit_db, varied=parameter)
+    return build_worst_psnr_loss_result(curve, limit_db=limit_db, varied=parameter)
 
 
 def measure_correlated_views_loss(
@@ -59,7 +59,7 @@ def measure_correlated_views_loss(
         fixed={"turbulence.views_correlation": "baseline"},
     )  # fmt: skip
     curve = [(spacing, loss) for spacing, (_, loss) in zip(spacings, found.curve, strict=True)]
-    return build_worst_loss_result(
+    return build_worst_psnr_loss_result(
         curve, limit_db=limit_db, varied="sub-aperture spacing in diameters"
     )
 
@@ -91,7 +91,7 @@ def measure_window_rate_loss(
         own = score(clip, clip.fps)
         totals += torch.tensor([own - score(clip, rate_hz) for rate_hz in rates_hz])
     curve = list(zip(rates_hz, (totals / len(bench.clips())).tolist(), strict=True))
-    return build_worst_loss_result(curve, limit_db=limit_db, varied="windows a second")
+    return build_worst_psnr_loss_result(curve, limit_db=limit_db, varied="windows a second")
 
 
 def measure_event_dropout_loss(
@@ -132,7 +132,7 @@ def measure_view_dropout_loss(
         lost[0] = [middle, *(v for v in lost[0] if v != middle)][:count]  # the centre view, too
         losses = [base - _psnr_without_views(network, bench, views) for views in lost]
         curve.append((count, max(losses)))
-    return build_worst_loss_result(curve, limit_db=limit_db, varied="views lost")
+    return build_worst_psnr_loss_result(curve, limit_db=limit_db, varied="views lost")
 
 
 def _psnr_without_views(network: Candidate, bench: StressBench, lost: list[int]) -> float:

@@ -42,7 +42,7 @@ class StressResult:
 StressTest = Callable[[Candidate, StressBench], StressResult]
 
 
-def build_worst_loss_result(curve: Curve, *, limit_db: float, varied: str) -> StressResult:
+def build_worst_psnr_loss_result(curve: Curve, *, limit_db: float, varied: str) -> StressResult:
     """Return the result whose value is the largest of the curve, in dB."""
     return StressResult(max(value for _, value in curve), "dB", limit_db, curve, varied)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from src.recordings.calibration.activity_pictures import Pictures
 from src.recordings.calibration.boards import Points
-from src.recordings.calibration.scene_matches import MatchedPictures, ViewMatches
+from src.recordings.calibration.scene_matches import PatchMatcher, ViewMatches
 from src.recordings.calibration.view_alignment import AlignedViews, Rectangle, cut_field
 from src.recordings.calibration.view_fit import find_folds, fit_view
 from src.recordings.calibration.view_grid import ViewGrid, find_grid
@@ -78,10 +78,9 @@ def align_scene(pictures: Pictures, scene: SceneTarget, model: Size) -> SceneAli
     """
     grid = find_grid(pictures)
     held_out = _hold_out(pictures, grid) if len(pictures) > 1 else {}
-    fitted = _find_views(pictures, grid)
-    fine = MatchedPictures(pictures, grid.tile, FINE_PATCHES, apart=True)
+    fitted, fine = _find_views(pictures, grid)
     matches = _match_views(fine, fitted)
-    good = {at: match.distance_px <= scene.error_px for at, match in matches.items()}
+    good = {at: match.residual_px <= scene.error_px for at, match in matches.items()}
     matched = {at: float(each.mean()) for at, each in good.items()}
     _check_matched(matched, scene)
     points = {at: match.at[good[at]] for at, match in matches.items()}
@@ -91,7 +90,7 @@ def align_scene(pictures: Pictures, scene: SceneTarget, model: Size) -> SceneAli
 
 
 def _match_views(
-    pictures: MatchedPictures, views: FoundViews, reach: int = REACH_PX
+    pictures: PatchMatcher, views: FoundViews, reach: int = REACH_PX
 ) -> dict[Position, ViewMatches]:
     return {at: pictures.match(view, reach) for at, view in views.items()}
 
@@ -107,28 +106,28 @@ def _fit_views(
     }
 
 
-def _find_views(pictures: Pictures, grid: ViewGrid) -> dict[Position, View]:
-    """Return the views after rounds in small pictures and in full ones; the last two with halves of
-    corner views."""
+def _find_views(pictures: Pictures, grid: ViewGrid) -> tuple[dict[Position, View], PatchMatcher]:
+    """Return the views after rounds in small pictures and in full ones, the last two with halves of
+    corner views; and the full ones."""
     views, tile = {at: View(at, grid.homography(at)) for at in grid.positions}, grid.tile
     for pitch in COARSE_PITCHES:
         scale = max(1, round(min(grid.x.pitch, grid.y.pitch) / pitch))
-        small = MatchedPictures(pictures, tile, COARSE_PATCHES, scale)
+        small = PatchMatcher(pictures, tile, COARSE_PATCHES, scale)
         views = _fit_views(_match_views(small, views, small.half), views, tile)
-    fine = MatchedPictures(pictures, tile, FINE_PATCHES, apart=True)
+    fine = PatchMatcher(pictures, tile, FINE_PATCHES, apart=True)
     views = _fit_views(_match_views(fine, views), views, tile)
     matches = _match_views(fine, views)
     folds = find_folds(matches, tile, _between_seams(views, tile))
     views = _fit_views(matches, views, tile, folds)
-    return _fit_views(_match_views(fine, views), views, tile, folds)
+    return _fit_views(_match_views(fine, views), views, tile, folds), fine
 
 
 def _hold_out(pictures: Pictures, grid: ViewGrid) -> dict[Position, float]:
     """Fit to every second window, and return the median distance found in the others."""
-    fitted = _find_views(pictures[::2], grid)
-    others = MatchedPictures(pictures[1::2], grid.tile, FINE_PATCHES, apart=True)
+    fitted, _ = _find_views(pictures[::2], grid)
+    others = PatchMatcher(pictures[1::2], grid.tile, FINE_PATCHES, apart=True)
     matches = _match_views(others, fitted)
-    return {at: float(np.median(m.distance_px[m.found])) for at, m in matches.items()}
+    return {at: float(np.median(m.residual_px[m.found])) for at, m in matches.items()}
 
 
 def _check_matched(matched: Mapping[Position, float], scene: SceneTarget) -> None:

@@ -13,7 +13,7 @@ from src.recordings.calibration.activity_pictures import (
 from src.recordings.calibration.boards import Points
 from src.recordings.calibration.patch_matching import choose_places, find_patches
 from src.recordings.calibration.view_alignment import Rectangle
-from src.recordings.views import View, list_pairs, sample
+from src.recordings.views import View, list_pairs, sample_bilinear
 
 MIN_PLACES = 12  # with structure, in the centre view
 GROUPS = 4  # of windows, each one picture a kind
@@ -35,14 +35,14 @@ class ViewMatches:
         return np.isfinite(self.offset[:, 0])
 
     @property
-    def distance_px(self) -> Float[np.ndarray, " places"]:
+    def residual_px(self) -> Float[np.ndarray, " places"]:
         return np.where(self.found, np.linalg.norm(self.offset, axis=1), np.inf)
 
     def keep(self, kept: Bool[np.ndarray, " places"]) -> "ViewMatches":
         return ViewMatches(self.places[kept], self.at[kept], self.offset[kept], self.half_px)
 
 
-class MatchedPictures:
+class PatchMatcher:
     """Pictures of windows in groups, shrunk by a whole factor `scale`, and the places with
     structure in the centre view's `tile`.
 
@@ -81,7 +81,7 @@ class MatchedPictures:
         offsets = []
         for centre, stack, places in zip(self._centre, self._stacks, self._places, strict=True):
             if len(places):
-                seen = np.stack([sample(picture, there, size) for picture in stack])
+                seen = np.stack([sample_bilinear(picture, there, size) for picture in stack])
                 offsets.append(find_patches(centre, seen, places, self.half, reach))
         placed = self._to_full(np.concatenate(self._places))
         offset = self._scale * np.concatenate(offsets)

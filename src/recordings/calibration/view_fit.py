@@ -31,7 +31,7 @@ def fit_view(
     than MIN_FOUND places.
     """
     if fold:
-        off = fold.distance(match.places)
+        off = fold.signed_distance_px(match.places)
         halves = [match.found & (side * off > match.half_px) for side in (-1, 1)]
         if min(half.sum() for half in halves) >= MIN_FOUND:
             clear = match.keep(halves[0] | halves[1])

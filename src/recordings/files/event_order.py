@@ -87,7 +87,7 @@ class EventSorter:
             ready = self._decide(undecided, least, at_end=True)
         return [*ready, *self.release(2**63 - 1)]
 
-    def accept_silence(self, until_us: float) -> None:
+    def resume_after_silence(self, until_us: float) -> None:
         """Take later events for a silence's end, without waiting for more, if before `until_us`."""
         waiting = self._undecided
         if waiting is not None and self.last_us < event_times(waiting).min() <= until_us:
@@ -211,7 +211,7 @@ class EventSorter:
         if part > most:
             raise ValueError(f"part must be in 0..{most}, the parts of {path}, got {part}")
 
-    def describe_disorder(self, path: Path, *, part: int | None) -> Iterator[str]:
+    def describe_time_faults(self, path: Path, *, part: int | None) -> Iterator[str]:
         """Yield what the user is told; `part`: the one that was asked for."""
         if self.dropped:
             yield f"{path}: {self.dropped} of {self.count} events far out of order of time, dropped"

@@ -195,7 +195,7 @@ class _Reading:
             outside = f"{self._outside} of {self._count} events outside {width}x{height}, dropped"
             _tell((f"{self._path}: {outside}",))
         if not self._recording.survey.covers_all_times:
-            _tell(self._order.describe_disorder(self._path, part=self._recording.options.part))
+            _tell(self._order.describe_time_faults(self._path, part=self._recording.options.part))
 
 
 def _plain(raw: RawEvents) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

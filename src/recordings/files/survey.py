@@ -91,7 +91,7 @@ def _judge(
         lines.append(f"{path}: all events of one polarity come before the others, sorted by time")
     else:
         merged = False
-        lines += order.describe_disorder(path, part=options.part)
+        lines += order.describe_time_faults(path, part=options.part)
     shape = order.buffer_us, order.min_part_events, merged
     return TimeSurvey(unit, *shape, tuple(lines), is_ordered=order.is_in_order())
 

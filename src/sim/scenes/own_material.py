@@ -201,8 +201,8 @@ def _warn_of_darkness(
     """Warn of values of more than 8 bits that are nearly black, as those of 12 bits are in 16."""
     full = _largest_value(kind)
     if white_level is None and kind.itemsize > 1 and 0 < largest < DARK_SHARE * full:
-        bits = 2 ** int(largest).bit_length() - 1
-        way = f"; white_level={bits} makes {bits} white" if full > 1 else ""
+        white = 2 ** int(largest).bit_length() - 1  # the least number of bits that holds it
+        way = f"; white_level={white} makes {white} white" if full > 1 else ""
         warnings.warn(f"{path}: its largest value is {largest:g} of {full:g}{way}", stacklevel=3)
 
 

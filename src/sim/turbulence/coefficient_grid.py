@@ -112,13 +112,13 @@ class WaveSum:
     def __init__(self, response: Response, rows: WaveRows, columns: WaveColumns, first_mode: int):
         half = columns[:, columns.shape[1] // 2 :]
         half = pad(half, (0, -half.shape[1] % PADDED_COLUMNS))
-        self.interpolation_orders: list[tuple[slice, list[np.ndarray], Tensor, Tensor]] = []
+        self.radial_orders: list[tuple[slice, list[np.ndarray], Tensor, Tensor]] = []
         for modes in slices_by_radial_order(first_mode, len(response)):
             waves = (response[modes] != 0).any(0).nonzero()[:, 0]
             weights = torch.view_as_real(response[modes, waves].contiguous()).numpy()
             down = [part[waves].T.contiguous().numpy() for part in (rows.real, -rows.imag)]
             across = half.real[waves], -half.imag[waves]
-            self.interpolation_orders.append((modes, [weights, waves.numpy(), *down], *across))
+            self.radial_orders.append((modes, [weights, waves.numpy(), *down], *across))
         self.shape = len(response), rows.shape[1], columns.shape[1]
 
     def __call__(
@@ -128,7 +128,7 @@ class WaveSum:
         modes, rows, columns = self.shape
         out = torch.empty(modes, len(amplitudes), rows, columns)
         drawn = torch.view_as_real(amplitudes.contiguous()).numpy()
-        for order, (weights, waves, cos_y, sin_y), cos_x, sin_x in self.interpolation_orders:
+        for order, (weights, waves, cos_y, sin_y), cos_x, sin_x in self.radial_orders:
             even, odd = split_even_odd(weights, drawn, waves, cos_y, sin_y)
             even, odd = torch.from_numpy(even) @ cos_x, torch.from_numpy(odd) @ sin_x
             join_even_odd(even.numpy(), odd.numpy(), out[order].view(-1, columns).numpy())
