@@ -8,7 +8,7 @@ from torch import Tensor
 
 from src.models.layers import pad_centred_to_multiple
 from src.models.network import WINDOW_S, EventToVideoNetwork
-from src.sim.optics import Position, centre_view_index, layout
+from src.sim.optics import Position, layout, most_central_view_index
 from src.sim.voxel import normalise_nonzero
 
 
@@ -43,7 +43,7 @@ class CentreViewNetwork(EventToVideoNetwork):
         if voxels.shape[2] != self.bins:
             raise ValueError(f"bins must be {self.bins} for this network, got {voxels.shape[2]}")
         height, width = voxels.shape[-2:]
-        view = voxels[:, centre_view_index(positions or layout(voxels.shape[1]))]
+        view = voxels[:, most_central_view_index(positions or layout(voxels.shape[1]))]
         view = normalise_nonzero(view) if self.normalise == "nonzero" else view
         grid, (top, left) = pad_centred_to_multiple(view, self.side_multiple)
         frame, state = self.predict_before_activation(grid, state)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from src.models.network import WINDOW_S, EventToVideoNetwork
-from src.sim.optics import Position, centre_view_index, layout
+from src.sim.optics import Position, layout, most_central_view_index
 
 
 class HighPass(EventToVideoNetwork):
@@ -38,7 +38,7 @@ class HighPass(EventToVideoNetwork):
         """Return the frame in [0, 1] and the leaky sum (n, 1, h, w)."""
         events = voxels.sum(2)
         if self.view_reduction == "centre":
-            change = events[:, centre_view_index(positions or layout(events.shape[1])), None]
+            change = events[:, most_central_view_index(positions or layout(events.shape[1])), None]
         else:
             change = events.median(dim=1, keepdim=True).values
         state = change if state is None else self.decay * state + change

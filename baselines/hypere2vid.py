@@ -69,10 +69,7 @@ class DynamicDecoder(nn.Module):
             nn.BatchNorm2d(mixes),
             nn.Tanh(),
         )
-        small, large = (
-            fourier_bessel_functions(1)[:FUNCTIONS],
-            fourier_bessel_functions(2)[:FUNCTIONS],
-        )
+        small, large = (fourier_bessel_functions(reach)[:FUNCTIONS] for reach in (1, 2))
         functions = torch.cat([functional.pad(small, (1, 1, 1, 1)), large])
         self.register_buffer("functions", functions.flatten(1))
         self.compose = nn.Conv2d(inputs * ATOMS, outputs, 1)

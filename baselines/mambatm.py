@@ -19,9 +19,9 @@ from torch.nn import functional
 
 from baselines.hilbert import hilbert_order
 from baselines.selective_scan import BidirectionalMamba
-from baselines.stabilise import estimate_jitter, warp_video
+from baselines.stabilise import backward_warp_video, estimate_jitter
 from src.models.layers import pad_centred_to_multiple
-from src.models.network import FramePostprocessor, split_windows
+from src.models.network import FramePostprocessor
 
 DISTORTION = 4  # channels: tilt down and right, mean and log-variance of the blur latent
 SCALES = 3
@@ -79,35 +79,37 @@ class MambaTM(FramePostprocessor):
         n, count, given, height, width = frames.shape
         frames = frames.expand(-1, -1, self.frame_channels, -1, -1)
         shift = estimate_jitter(frames) if self.stabilise_input else None
-        seen = frames if shift is None else torch.cat([frames, warp_video(frames, shift)], 2)
+        seen = (
+            frames if shift is None else torch.cat([frames, backward_warp_video(frames, shift)], 2)
+        )
         flat, (top, left) = pad_centred_to_multiple(seen.flatten(0, 1), 2**SCALES)
-        limit = 0 if torch.is_grad_enabled() else max(1, PIXELS // flat[0, 0].numel())
-        parts = list(split_windows(len(flat), limit))
-        maps = zip(*(self.encoder(flat[part]) for part in parts), strict=True)
+        whole = torch.is_grad_enabled()
+        limit = len(flat) if whole else max(1, PIXELS // flat[0, 0].numel())
+        maps = zip(*map(self.encoder, flat.split(limit)), strict=True)
         *skips, deep = [torch.cat(scale) for scale in maps]
         grid = (count, *deep.shape[-2:])
-        orders = [order.to(frames.device) for order in scan_orders(*grid)]
+        orders = [order.to(frames.device) for order in row_time_hilbert_orders(*grid)]
         tokens = _tokens(deep, count)
         for i, layer in enumerate(self.free):
             tokens = layer(tokens, grid, orders[i % 3])
         latent = self.distortion_width(_maps(tokens, grid))
-        distortion = _decode(self.distortion_decoder, latent, skips, parts)
-        guide = torch.cat([self.distortion_encoder(distortion[part])[-1] for part in parts])
-        guide = _tokens(guide, count)
+        distortion = _decode(self.distortion_decoder, latent, skips, limit)
+        guides = [self.distortion_encoder(part)[-1] for part in distortion.split(limit)]
+        guide = _tokens(torch.cat(guides), count)
         for i, layer in enumerate(self.guided):
             tokens = layer(tokens, grid, orders[i], guide)
-        added = _decode(self.decoder, _maps(tokens, grid), skips, parts)
+        added = _decode(self.decoder, _maps(tokens, grid), skips, limit)
         added, distortion = (
             part[..., top : top + height, left : left + width].unflatten(0, (n, count))
             for part in (added, distortion)
         )
         if shift is not None:
-            frames = warp_video(frames, 2 * distortion[:, :, :2].sigmoid() * shift)
+            frames = backward_warp_video(frames, 2 * distortion[:, :, :2].sigmoid() * shift)
         clean = frames + added
         return (clean.mean(2, keepdim=True) if given == 1 else clean), distortion
 
 
-def scan_orders(frames: int, height: int, width: int) -> list[Int[Tensor, " cells"]]:
+def row_time_hilbert_orders(frames: int, height: int, width: int) -> list[Int[Tensor, " cells"]]:
     """Return the flat indices of a (frames, height, width) box row by row, column of time by
     column of time, and along a Hilbert curve.
     """
@@ -222,10 +224,9 @@ class ChannelAttentionBlock(nn.Module):
         return x + weights * outcome
 
 
-def _decode(
-    decoder: "FrameDecoder", deep: Tensor, skips: list[Tensor], parts: list[slice]
-) -> Tensor:
-    return torch.cat([decoder(deep[part], [skip[part] for skip in skips]) for part in parts])
+def _decode(decoder: FrameDecoder, deep: Tensor, skips: list[Tensor], limit: int) -> Tensor:
+    parts = zip(*(maps.split(limit) for maps in (deep, *skips)), strict=True)
+    return torch.cat([decoder(x, seen) for x, *seen in parts])
 
 
 def _tokens(maps: Tensor, frames: int) -> Tensor:

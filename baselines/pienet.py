@@ -117,7 +117,8 @@ class FiLMConvLSTM(nn.Module):
         seen = hidden if self.refine is None else hidden + self.refine(hidden)
         scale, shift = self.modulate(summary).chunk(2, 1)
         seen = seen * (1 + scale) + shift
-        return functional.max_pool2d(seen, limit_pool_size(self.pool, seen)), seen, (hidden, cell)
+        pool = min(self.pool, *seen.shape[-2:])  # less on a map that is smaller
+        return functional.max_pool2d(seen, pool), seen, (hidden, cell)
 
 
 class VarianceGatedDecoder(nn.Module):
@@ -132,7 +133,7 @@ class VarianceGatedDecoder(nn.Module):
         height, width = skip.shape[-2:]
         gate = self.gate(resize(variance, height, width)).sigmoid()
         skip = torch.where(begun > 0, gate, 1.0) * skip
-        factor = limit_pool_size(self.pool, skip)
+        factor = min(self.pool, height, width)
         x = resize(x, factor * x.shape[2], factor * x.shape[3])
         rows, columns = height - x.shape[2], width - x.shape[3]  # that pooling has left over
         edges = (columns // 2, columns - columns // 2, rows // 2, rows - rows // 2)
@@ -156,10 +157,8 @@ class ConvNorm(nn.Module):
 
     def __init__(self, inputs: int, outputs: int):
         super().__init__()
-        self.conv, self.norm = (
-            nn.Conv2d(inputs, outputs, 3, padding=1),
-            Float32GroupNorm(1, outputs),
-        )
+        self.conv = nn.Conv2d(inputs, outputs, 3, padding=1)
+        self.norm = Float32GroupNorm(1, outputs)
 
     def forward(self, x: Map) -> Map:
         return functional.silu(self.norm(self.conv(x)))
@@ -177,8 +176,3 @@ class Float32GroupNorm(nn.GroupNorm):
 def resize(x: Map, height: int, width: int) -> Map:
     """Return the map at another size, its corners kept."""
     return functional.interpolate(x, (height, width), mode="bilinear", align_corners=True)
-
-
-def limit_pool_size(pool: int, x: Tensor) -> int:
-    """Return the side of what is pooled: `pool`, or less on a map that is smaller."""
-    return min(pool, *x.shape[-2:])

@@ -119,26 +119,22 @@ class PublishedNetwork(NamedTuple):
     network_class: type[nn.Module]
     options: dict
     rename_rules: tuple
-    first_layer: str
-    width_argument: str
+    first_layer: str = "net.head"
+    width_argument: str = "base_channels"
     left_out: str | None = None
 
 
 NORMALISED, RAW = {"normalise": "nonzero"}, {"normalise": "none", "output": "clip"}
 PIE_NET = PIENET, "events.conv", "base_channels"
 NETWORKS = {
-    "e2vid": PublishedNetwork(
-        E2VIDPlus, NORMALISED | {"output": "sigmoid"}, UNET, "net.head", "base_channels"
-    ),
-    "e2vid_plus": PublishedNetwork(E2VIDPlus, RAW, UNET, "net.head", "base_channels"),
+    "e2vid": PublishedNetwork(E2VIDPlus, NORMALISED | {"output": "sigmoid"}, UNET),
+    "e2vid_plus": PublishedNetwork(E2VIDPlus, RAW, UNET),
     "firenet": PublishedNetwork(
         FireNet, NORMALISED | {"output": "none"}, FIRENET, "head", "channels"
     ),
     "firenet_plus": PublishedNetwork(FireNet, RAW, FIRENET_PLUS, "head", "channels"),
-    "etnet": PublishedNetwork(
-        ETNet, RAW | {"output": "sigmoid"}, ETNET, "net.head", "base_channels"
-    ),
-    "hypere2vid": PublishedNetwork(HyperE2VID, RAW, HYPER, "net.head", "base_channels"),
+    "etnet": PublishedNetwork(ETNet, RAW | {"output": "sigmoid"}, ETNET),
+    "hypere2vid": PublishedNetwork(HyperE2VID, RAW, HYPER),
     "cista": PublishedNetwork(
         CISTA, NORMALISED | {"output": "sigmoid"}, CISTA_TC, "events", "channels"
     ),
@@ -160,10 +156,10 @@ def load_pretrained(architecture: str, weights: str | None) -> nn.Module:
     or the path of the published checkpoint.  Raises ValueError, which says where to get them, when
     there are none, and when they are another network's.
     """
-    network_class, path = _find_architecture(architecture).network_class, Path(weights or "")
-    shipped = (files.WEIGHTS / f"{weights}.safetensors").is_file()
-    if shipped or (path.is_file() and path.suffix in OURS):
-        network = files.load(path if path.is_file() else str(weights)).requires_grad_(False)
+    network_class = _find_architecture(architecture).network_class
+    path = files.locate(weights or "")
+    if path.is_file() and path.suffix in OURS:
+        network = files.load(path).requires_grad_(False)
         if not isinstance(network, network_class):
             got = f"a {type(network).__name__} is in {weights}"
             raise ValueError(f"baseline.weights are not those of {architecture}: {got}")

@@ -64,7 +64,7 @@ def local_linear_smoothing_matrix(frames: int) -> Float[Tensor, "frames frames"]
     return weight * (second - first * lag) / spread if frames > 1 else torch.ones(1, 1)
 
 
-def warp_video(frames: Video, shift: Float[Tensor, "n frames 2 h w"]) -> Video:
+def backward_warp_video(frames: Video, shift: Float[Tensor, "n frames 2 h w"]) -> Video:
     """Return the frames with what lies `shift` (x, y), in pixels, from each pixel brought there."""
     every, away = (part.float().flatten(0, 1) for part in (frames, shift))
-    return temporal.warp_by_shift(every, away, "bicubic").unflatten(0, frames.shape[:2])
+    return temporal.backward_warp(every, away, "bicubic").unflatten(0, frames.shape[:2])

@@ -19,7 +19,8 @@ import torch
 
 import src.models
 from benchmarks.recordings import MODEL, SENSOR, events
-from src.live_view import assembly, event_feeds
+from src.live import GIL_SWITCH_S, assemble
+from src.live_view import event_feeds
 from src.live_view.network_runner import RunSettings
 from src.live_view.page_server import PageServer
 from src.live_view.status import FaultLog
@@ -97,9 +98,9 @@ def main() -> None:
         networks = {asked.ckpt: src.models.load(asked.ckpt)}
         how = RunSettings(asked.fps, form=asked.form)
         feed = event_feeds.open_feed(str(path), None, faults, loop=True)
-        server = assembly.assemble(feed, networks, views, how, faults, port=PORT)
+        server = assemble(feed, networks, views, how, faults, port=PORT)
         server.page.controls.choose(asked.ckpt, "all")
-        sys.setswitchinterval(assembly.GIL_SWITCH_S)
+        sys.setswitchinterval(GIL_SWITCH_S)
         found = asyncio.run(measure(server, asked.seconds))
     report(asked, found)
 

@@ -16,26 +16,24 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
-import torch
 from omegaconf import OmegaConf
 
+from benchmarks.runtime import from_grids
 from src.app.instantiate import instantiate_node
 from src.deploy import openvino_network
 from src.deploy.cost import torch_threads
 from src.deploy.cpu_features import is_bf16_faster
-from src.deploy.forms import convert_to_form
 from src.deploy.runtime import EventListRuntime, fastest_form
 from src.models import load
 from src.recordings.files.recording import read_events
-from src.sim.voxel import voxel_grid
 
-FPS, EVENTS_PER_PIXEL, BINS, WINDOWS, WARMUP = 120, 0.1, 5, 3, 2
+FPS, EVENTS_PER_PIXEL, WINDOWS, WARMUP = 120, 0.1, 3, 2
 SLOW_MS = 8e3  # a frame: no further windows and forms are timed
 RECORDING = Path("../shared/data/events/gen3_640x480_evt2.raw")
 NETWORKS = Path(__file__).resolve().parents[1] / "conf" / "networks" / "published.yaml"
 OURS = ("setnet_small", "setnet_medium", "single256")
 SIZES = ("240x180", "346x260", "1280x720")
-Window = tuple  # t in s, x, y, p, t0, t1
+Window = tuple  # t in s, x, y, p, view, t0, t1
 
 
 def cut_windows(path: Path, width: int, height: int) -> list[Window]:
@@ -46,37 +44,14 @@ def cut_windows(path: Path, width: int, height: int) -> list[Window]:
         for axis, side in (("x", width), ("y", height))
     )
     number = int(EVENTS_PER_PIXEL * width * height)
-    made = []
+    made, view = [], np.zeros(number, np.uint8)
     for first in range(0, max(len(events) - number, 1), number):
         part, k = slice(first, first + number), len(made)
         own = (events["t"][part] - events["t"][first]).astype(float)
         t = (k + own / (own[-1] + 1)) / FPS
-        made.append((t, x[part], y[part], events["p"][part], k / FPS, (k + 1) / FPS))
+        fields = t, x[part], y[part], events["p"][part], view[: len(t)]
+        made.append((*fields, k / FPS, (k + 1) / FPS))
     return made
-
-
-def from_grids(network: torch.nn.Module, form: str, width: int, height: int) -> Callable:
-    """Return a step from a window's events through a grid and `network` in `form`."""
-    fast, state = convert_to_form(network, form), None
-    size = {"bins": BINS, "height": height, "width": width}
-
-    @torch.no_grad()
-    def step(t, x, y, p, t0, t1):
-        nonlocal state
-        grid = voxel_grid(t, x, y, p, t0=t0, t1=t1, **size)
-        frame, state = fast(grid[None, None], state, window_s=1 / FPS)
-        return frame.numpy()
-
-    return step
-
-
-def from_lists(name: str, width: int, height: int, threads: int) -> Callable:
-    """Return a step from a window's events through a network of ours."""
-    live = EventListRuntime(
-        load(name), positions=[(0, 0)], height=height, width=width, threads=threads
-    )
-    views = np.zeros(int(EVENTS_PER_PIXEL * width * height), np.uint8)
-    return lambda t, x, y, p, t0, t1: live.step(t, x, y, p, views[: len(t)], t0, t1)
 
 
 def least_ms(step: Callable, windows: Sequence[Window], seconds: float) -> float:
@@ -111,12 +86,13 @@ def measure(name: str, size: str, path: Path, threads: int, seconds: float) -> s
     forms = list_forms()
     with torch_threads(threads):
         if name in OURS:
-            step = from_lists(name, width, height, threads)
-            return f"{least_ms(step, windows, seconds):.1f} {fastest_form()}"
+            size_px = {"height": height, "width": width, "threads": threads}
+            live = EventListRuntime(load(name), positions=[(0, 0)], **size_px)
+            return f"{least_ms(live.step, windows, seconds):.1f} {fastest_form()}"
         network = instantiate_node(OmegaConf.load(NETWORKS)[name].model).eval()
         for form in forms:
             try:
-                step = from_grids(network, form, width, height)
+                step = from_grids(network, form, 1, height, width, FPS)
                 found[form] = least_ms(step, windows, seconds)
             except ValueError as error:  # OpenVINO cannot express it
                 print(f"{name}, {form}: {error}", file=sys.stderr)

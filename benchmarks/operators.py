@@ -10,11 +10,10 @@ import sys
 
 import lightning
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils.data import DataLoader
 
 from benchmarks.training import config
+from scripts.lease.probe import train_on_batch
 from src.app import build
-from src.app.instantiate import instantiate_node
 from src.sim import noise
 
 SMALL = [
@@ -76,13 +75,8 @@ def count_simulation(cfg, batched: bool) -> tuple[int, int, object]:
 
 def count_step(cfg, batch) -> int:
     """Return the operators of a step on a batch."""
-    count, module = (
-        StepCounter(),
-        build.build_reconstructor(cfg, *build.build_network_and_spec(cfg)),
-    )
-    quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
-    trainer = instantiate_node(cfg.trainer, callbacks=[count], max_steps=2, plugins=[], **quiet)
-    trainer.fit(module, DataLoader([batch] * 2, collate_fn=lambda items: items[0]))
+    count = StepCounter()
+    train_on_batch(cfg, batch, count, 2)
     return count.operators
 
 

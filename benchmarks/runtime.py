@@ -70,20 +70,20 @@ def milliseconds(
     return times
 
 
-def on_pytorch(network: torch.nn.Module) -> Callable:
-    """Return a step from a list of events through dense grids and PyTorch."""
-    fast, state = convert_to_form(network, FORM), None
-    size = {"bins": 5, "height": SIDE, "width": SIDE}
+def from_grids(
+    network: torch.nn.Module, form: str, views: int, height: int, width: int, fps: float
+) -> Callable:
+    """Return a step from a window's events through dense grids and `network` in `form`."""
+    fast, state = convert_to_form(network, form), None
+    size = {"bins": 5, "height": height, "width": width}
 
+    @torch.no_grad()
     def step(t, x, y, p, view, t0, t1):
         nonlocal state
-        parts = []
-        for index in range(9):
-            mine = view == index
-            events = t[mine], x[mine], y[mine], p[mine]
-            parts.append(voxel_grid(*events, t0=t0, t1=t1, **size))
-        frame, state = fast(torch.stack(parts)[None], state, window_s=1 / FPS)
-        return frame
+        parts = [slice(None)] if views == 1 else [view == index for index in range(views)]
+        grids = [voxel_grid(t[k], x[k], y[k], p[k], t0=t0, t1=t1, **size) for k in parts]
+        frame, state = fast(torch.stack(grids)[None], state, window_s=1 / fps)
+        return frame.numpy()
 
     return step
 
@@ -114,7 +114,7 @@ def measured(name: str, engine: str, count: int, played: list[tuple], seconds: f
         step = EventListRuntime(network, **size, threads=count, form="openvino").step
     else:
         giga = macs_per_frame(network, SIDE, SIDE, views=9) / 1e9
-        step = on_pytorch(network)
+        step = from_grids(network, FORM, 9, SIDE, SIDE, FPS)
     clock = time.process_time if count == 1 else time.perf_counter
     with torch_threads(count):
         times = milliseconds(step, played, seconds, clock)

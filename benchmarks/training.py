@@ -11,21 +11,19 @@ windows of single clips.
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
+from itertools import pairwise
 
 import lightning
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 from torch.nn.utils import parametrize
-from torch.utils.data import DataLoader
 
 from benchmarks.timing import least
+from scripts.lease.probe import make_up_batch, train_on_batch
 from src.app import build, hardware
-from src.app.instantiate import instantiate_node
-from src.sim.pipeline import Sample, simulate
+from src.app.compose import compose_config
+from src.sim.pipeline import simulate
 
-ROOT = Path(__file__).resolve().parents[1]
 BEFORE = ["channels_last=false", "optimizer.fused=false", "ema_decay=null"]
 CHANGES = {
     "as before": [],
@@ -38,8 +36,6 @@ CHANGES = {
     "crop 96, batch 2": ["data.crop=96", "data.batch_size=2"],
     "channels-last, fused, mean": ["channels_last=true", "optimizer.fused=true", "ema_decay=0.999"],
 }
-
-
 NETWORKS = {
     **{f"lf3x3, base {width}": ["experiment=lf3x3", f"width={width}"] for width in (8, 12, 16)},
     "lf3x3, base 8, stem 32": ["experiment=lf3x3", "width=8", "stem=32"],
@@ -50,8 +46,7 @@ NETWORKS = {
 
 def config(overrides: list[str]) -> DictConfig:
     """Return the config of src.train."""
-    with initialize_config_dir(str(ROOT / "conf"), version_base=None):
-        cfg = compose("train", overrides)
+    cfg = compose_config("train", *overrides)
     hardware.fill_in_precision(cfg)
     return cfg
 
@@ -61,11 +56,9 @@ def split(overrides: list[str]) -> tuple[dict[str, Callable[[], object]], int, i
     simulated batch.
     """
     cfg = config(overrides)
-    network, spec = build.build_network_and_spec(cfg)
-    module, pipeline = (
-        build.build_reconstructor(cfg, network, spec),
-        build.build_pipeline(cfg, "train"),
-    )
+    network, spec = build.build_untrained_network(cfg)
+    module = build.build_reconstructor(cfg, network, spec)
+    pipeline = build.build_pipeline(cfg, "train")
     clips = list(range(cfg.data.batch_size))
     sample = simulate(pipeline, clips)
     half = torch.autocast("cpu", torch.bfloat16, enabled="bf16" in str(cfg.trainer.precision))
@@ -104,20 +97,9 @@ class Steps(lightning.Callback):
 def step(overrides: list[str], steps: int = 3) -> tuple[float, int]:
     """Return the least seconds of a whole training step and the pixels of its clip-windows."""
     cfg = config(["budget=hours", "data.cache_clips=null", "train_hours=null", *overrides])
-    module = build.build_reconstructor(cfg, *build.build_network_and_spec(cfg))
-    shape = (cfg.data.batch_size, cfg.data.windows)
-    grid = (*shape, cfg.optics.views, cfg.bins, cfg.data.crop, cfg.data.crop)
-    target = torch.rand(*shape, 1, cfg.data.crop, cfg.data.crop)
-    voxels = torch.randn(grid) * (torch.rand(grid) < 0.1)
-    known = {"parameters": [{}] * shape[0], "window_s": torch.full((shape[0],), 1 / cfg.fps)}
-    sample, seen = Sample(voxels, target, target, **known), Steps()
-    quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
-    trainer = instantiate_node(
-        cfg.trainer, callbacks=[seen], max_steps=steps + 1, plugins=[], **quiet
-    )
-    trainer.fit(module, DataLoader([sample] * (steps + 1), collate_fn=lambda batch: batch[0]))
-    taken = [end - start for start, end in zip(seen.ends, seen.ends[1:], strict=False)]
-    return min(taken), target.numel()
+    batch, seen = make_up_batch(cfg), Steps()
+    train_on_batch(cfg, batch, seen, steps + 1)
+    return min(end - start for start, end in pairwise(seen.ends)), batch.target.numel()
 
 
 def rate(overrides: list[str]) -> float:

@@ -36,7 +36,7 @@ PIXELS, STRENGTHS = (0.04, 0.08, 0.16, 0.4), (0.5, 2.0, 4.0)  # of D at the obje
 CLIPS = 20
 CACHED, CROP = (1, 41, 256, 256), (56, 56, 144, 144)  # a clip of a cache: frames, what is kept
 LAUNCH_S, BYTES_S, PRODUCTS_S = 10e-6, 2e12, 20e12  # a launch; bytes and float32 products a second
-FREE = ("empty", "new_empty", "_unsafe_view", "detach", "lift_fresh", "arange")  # no work
+FREE = {"empty", "new_empty", "empty_strided", "_unsafe_view", "detach", "lift_fresh", "arange"}
 
 
 def local_atmosphere(pixel: float, d_over_r0: float) -> list:
@@ -154,15 +154,16 @@ def kernels(work: Work) -> ModuleType:
     """Return an engine that costs what Triton's two kernels do, and gives nothing of use."""
     engine = ModuleType("kernels")
 
-    def warp(frames: Tensor, tilt: Tensor, *_) -> Tensor:
+    def warp_cubic(frames: Tensor, tilt: Tensor, *_) -> Tensor:
         torch.aminmax(frames.flatten(1), dim=1)
         return tilt[0] + tilt[1]
 
-    def scatter(image: Tensor, psfs: Tensor, rows, halo: Tensor, *_) -> Tensor:
+    def scatter_normalised(image: Tensor, psfs: Tensor, rows, halo: Tensor, *_) -> Tensor:
         work.bytes += psfs.nbytes
         return image[:, : halo.shape[1], : halo.shape[2]] + 1
 
-    engine.WARP_NUMBERS, engine.SCATTER_NUMBERS, engine.warp, engine.scatter = 8, 0, warp, scatter
+    engine.WARP_NUMBERS, engine.SCATTER_NUMBERS = 8, 0
+    engine.warp_cubic, engine.scatter_normalised = warp_cubic, scatter_normalised
     return engine
 
 
@@ -171,14 +172,14 @@ def launches() -> None:
     from src.sim.turbulence import clip_rendering
     from src.sim.turbulence.engines import device
 
-    frames, done, chosen = torch.rand(CACHED), [], device.select_engine
+    frames, done, chosen = torch.rand(CACHED), [], device.select_blur_engine
     for prepared in prepare_clips():
         with Work() as work:
-            device.select_engine = lambda device, work=work: kernels(work)
+            device.select_blur_engine = lambda device, work=work: kernels(work)
             clip_rendering.render_views(frames[0], prepared.plans, use_cpu_engines=False)
         ms = [work.launches * LAUNCH_S, work.bytes / BYTES_S, work.products / PRODUCTS_S]
         done.append((work.launches, work.bytes / 1e9, work.products / 1e9, 1e3 * math.fsum(ms)))
-    device.select_engine = chosen
+    device.select_blur_engine = chosen
     count, gb, products, ms = map(statistics.mean, zip(*done, strict=True))
     print(f"a clip: {count:.0f} launches, {gb:.1f} GB, {products:.0f} G products: {ms:.1f} ms")
     print(f"most: {max(one[0] for one in done)} launches, {max(one[-1] for one in done):.1f} ms")
@@ -204,7 +205,7 @@ def cuda() -> None:
             prepared.degrade(frames, torch.Generator(), crop=CROP)
         torch.cuda.synchronize()
         taken.append((time.perf_counter() - start) / len(clips))
-    engine = device.select_engine(frames.device).__name__.rpartition(".")[2]
+    engine = device.select_blur_engine(frames.device).__name__.rpartition(".")[2]
     print(f"CUDA: {1e3 * min(taken):.1f} ms for a clip of a cache ({engine})")
 
 

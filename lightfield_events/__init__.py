@@ -40,10 +40,10 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from src import importable_name
+    from src import add_package_prefix
 
     module, _, there = _HOMES[name].rpartition(".")
-    return getattr(import_module(importable_name(module)), there)
+    return getattr(import_module(add_package_prefix(module)), there)
 
 
 def __dir__() -> list[str]:

@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from hydra import compose, initialize_config_dir
 
 from src.app import build, entry_point
+from src.app.compose import compose_config
 from src.models.e2vid import E2VID
 from src.recordings import event_windows, output, reconstruction, sensor_lookup
 from src.recordings.files import event_file, event_writers, sources
@@ -27,7 +27,6 @@ from src.recordings.views import Views
 from src.records import results
 from src.train import fit
 
-ROOT = Path(__file__).resolve().parents[1]
 SMALL = ["debug=fdr", "loss=l1", "metrics.lpips=null", "logger=csv", "~callbacks.progress"]
 SMALL += ["data.workers=1", "data.epoch_clips=40", "data.batch_reuse=1", "trainer.max_steps=-1"]
 SIDE, EVENTS = 64, 200_000  # of the recording: pixels, events in 2 s
@@ -94,19 +93,14 @@ def _files(pid: int) -> int:
 
 def train(minutes: float, run: Path) -> dict:
     """Train for `minutes`; returns the slopes and the number of steps."""
-    with initialize_config_dir(str(ROOT / "conf"), version_base=None):
-        limit = f"+trainer.max_time={{minutes: {minutes}}}"
-        cfg = compose("train", [*SMALL, limit, f"paths.run={run}"])
-    network, spec = build.build_network_and_spec(cfg)
+    limit = f"+trainer.max_time={{minutes: {minutes}}}"
+    cfg = compose_config("train", *SMALL, limit, f"paths.run={run}")
+    network, spec = build.build_untrained_network(cfg)
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     trainer = build.build_trainer(cfg)
+    module, data = build.build_reconstructor(cfg, network, spec), build.build_data_module(cfg)
     with Watch() as watch:
-        fit(
-            trainer,
-            build.build_reconstructor(cfg, network, spec),
-            build.build_data_module(cfg),
-            None,
-        )
+        fit(trainer, module, data, None)
     return watch.slope() | {"steps": trainer.global_step}
 
 

@@ -14,11 +14,15 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from scripts.exact_psf import fraunhofer_psf, noll_covariance
-from scripts.p2s_errors import ALL_MODES, measure_error_tables, picture_metric, symmetrise_psf
+from scripts.p2s_errors import (
+    draw_phase,
+    exact_psfs,
+    measure_error_tables,
+    picture_metric,
+    symmetrise_psf,
+)
 from scripts.p2s_training import TrainableNetwork
 from src.sim.turbulence.p2s import EDGE_MARGIN, FILE, basis_parities
-from src.sim.turbulence.psf import SAMPLES_PER_LAMBDA_OVER_D
 
 
 @dataclass(frozen=True)
@@ -68,7 +72,7 @@ def fit_band(plan: BandPlan, steps: int) -> dict[str, Tensor]:
     """Return mean, basis and the layers of the networks of one band."""
     torch.manual_seed(int(1000 * plan.edge))
     strength = plan.start + (EDGE_MARGIN * plan.edge - plan.start) * torch.rand(plan.samples, 1)
-    phase = draw_phase(strength)
+    phase = draw_phase(plan.samples, strength)
     some = exact_psfs(phase[:12_000], plan.fine)
     mean, basis, project = principal_basis(some, plan.rank)
     weights = torch.cat(
@@ -79,22 +83,6 @@ def fit_band(plan: BandPlan, steps: int) -> dict[str, Tensor]:
         net = train_network(phase, strength, weights, size, basis_parities(basis), plan.edge, steps)
         found |= {f"{number}.{name}": value.half() for name, value in net.state_dict().items()}
     return found
-
-
-def draw_phase(strength: Tensor) -> Tensor:
-    """Return Noll 2..ALL_MODES + 1 (count, modes), no tilt, for D/r0 = `strength` (count, 1)."""
-    mix = torch.linalg.cholesky(noll_covariance(ALL_MODES)).float()
-    phase = torch.randn(len(strength), ALL_MODES) @ mix.T * strength ** (5 / 6)
-    phase[:, :2] = 0
-    return phase
-
-
-def exact_psfs(phase: Tensor, fine: int) -> Tensor:
-    """Return the exact PSFs, sampled as the basis is."""
-    pupil = fine - 3  # aliases fall outside the window by their own width
-    return fraunhofer_psf(
-        phase, lambda_over_d_px=SAMPLES_PER_LAMBDA_OVER_D, size=fine, pupil=pupil, points=1
-    )
 
 
 def principal_basis(psfs: Tensor, rank: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -37,7 +37,7 @@ def last(recording: str, network: str, published: Path | None) -> Frame:
     chosen = baseline_overrides(network, published) if network in BASELINES else [f"ckpt={network}"]
     sensor = [f"sensor_size=[{size.replace('x', ',')}]"] if size else []
     cfg = compose_config("reconstruct", f"recording={path}", f"fps={FPS}", *chosen, *sensor)
-    loaded = require_event_network(build.load_network(cfg))
+    loaded = require_event_network(build.load_ckpt_or_baseline(cfg))
     frames, _ = reconstruct_video_frames(cfg, loaded, choose_views(cfg, loaded))
     *_, frame = frames
     return frame

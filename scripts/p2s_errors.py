@@ -56,10 +56,10 @@ def measure_error_tables() -> dict[str, Tensor]:
 
 
 def _row(strength: float) -> dict[str, Tensor]:
-    phase = _draw(600, ALL_MODES, strength)
-    full = _exact(phase)
+    phase = draw_phase(600, strength)
+    full = exact_psfs(phase)
     power = _power(full - full.mean(0))
-    modes = [_power(_exact(phase[:, :count]) - full) / power for count in MODES]
+    modes = [_power(exact_psfs(phase[:, :count]) - full) / power for count in MODES]
     mean = symmetrise_psf(full.mean(0))
     kernel = [_kernel_error(full, mean, reach, strength) / power for reach in REACHES]
     return {
@@ -72,16 +72,19 @@ def _row(strength: float) -> dict[str, Tensor]:
     }
 
 
-def _draw(count: int, modes: int, strength: float) -> Tensor:
-    mix = torch.linalg.cholesky(noll_covariance(modes)).float()
-    phase = torch.randn(count, modes) @ mix.T * strength ** (5 / 6)
+def draw_phase(count: int, d_over_r0: float | Tensor) -> Tensor:
+    """Return Noll 2..ALL_MODES + 1 (count, modes) in rad, no tilt; `d_over_r0`: or (count, 1)."""
+    mix = torch.linalg.cholesky(noll_covariance(ALL_MODES)).float()
+    phase = torch.randn(count, ALL_MODES) @ mix.T * d_over_r0 ** (5 / 6)
     phase[:, :2] = 0
     return phase
 
 
-def _exact(phase: Tensor, fine: int = FINE) -> Tensor:
+def exact_psfs(phase: Tensor, fine: int = FINE) -> Tensor:
+    """Return the exact PSFs (n, fine, fine), sampled as the basis is."""
+    pupil = fine - 3  # aliases fall outside the window by their own width
     return fraunhofer_psf(
-        phase, lambda_over_d_px=SAMPLES_PER_LAMBDA_OVER_D, size=fine, pupil=fine - 3, points=1
+        phase, lambda_over_d_px=SAMPLES_PER_LAMBDA_OVER_D, size=fine, pupil=pupil, points=1
     )
 
 
@@ -144,8 +147,8 @@ def _phase(response: Tensor, frequency: Tensor, places: Tensor) -> Tensor:
 def _pitch_error(strength: float) -> Tensor:
     """Return the power of linear interpolation of exact PSFs between nodes, per pitch."""
     place, nodes, shares = _places(strength)
-    truth = _exact(place)
-    found = (_interpolated(_exact(corners.flatten(0, 1)), shares) for corners in nodes)
+    truth = exact_psfs(place)
+    found = (_interpolated(exact_psfs(corners.flatten(0, 1)), shares) for corners in nodes)
     return torch.stack([_power(psfs - truth) for psfs in found])
 
 
@@ -179,7 +182,7 @@ def _psf_errors(band: PSFBand, strength: float) -> Tensor:
     What a pixel gets is the network's PSF interpolated between its nodes, against the exact one.
     """
     place, nodes, shares = _places(strength)
-    psfs = _exact(place, band.mean.shape[-1]) - band.mean
+    psfs = exact_psfs(place, band.mean.shape[-1]) - band.mean
     random = _power(psfs - psfs.mean(0)).float()
     order = basis_parities(band.basis).argsort(stable=True)
     truth, shapes, seen = _spectrum(psfs), _spectrum(band.basis[order]), _seen().float()

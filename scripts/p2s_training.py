@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from src.sim.turbulence.p2s import EVEN, ODD_X, ODD_XY, ODD_Y, modes_by_parity
+from src.sim.turbulence.p2s import EVEN, ODD_X, ODD_XY, ODD_Y, group_modes_by_symmetry
 
 
 class TrainableNetwork(nn.Module):
@@ -19,7 +19,7 @@ class TrainableNetwork(nn.Module):
 
     def __init__(self, modes: int, width: int, counts: list[int], max_d_over_r0: float):
         super().__init__()
-        self.own = modes_by_parity(modes)
+        self.own = group_modes_by_symmetry(modes)
         self.modes, self.width, self.counts = modes, width, list(counts)
         self.max_d_over_r0 = max_d_over_r0
         few = 3 * width // 16

@@ -180,7 +180,6 @@ def _draw_clips(
         batch_size=None,
         sampler=indices,
         num_workers=workers,
-        collate_fn=_unchanged,
         worker_init_fn=_init_worker,
         multiprocessing_context="spawn" if workers else None,  # a fork would take CUDA along
         generator=torch.Generator(),  # or the loader would draw from that of the training
@@ -194,10 +193,6 @@ def _draw_clips(
         if isinstance(clip, Exception):
             raise clip
         yield index, *clip
-
-
-def _unchanged(clip: Any) -> Any:
-    return clip
 
 
 def _init_worker(worker: int) -> None:

@@ -38,7 +38,7 @@ WINDOWS = 72
 # Local air, whose parts of a view are displaced apart.
 AIR = ("turbulence=strong", "turbulence.atmosphere.tilt_correlation_half_length_px=[10,20]",
        "turbulence.atmosphere.global_tilt_probability=0.0")  # fmt: skip
-PAPER, ONE_VIEW = "nine views, E2VID (the paper's method)", "one view, E2VID"
+PAPER, ONE_VIEW = "nine views, E2VID", "one view, E2VID"
 LARGE, MEDIUM = "nine views, SetNet large", "nine views, SetNet medium"
 SMALL, SINGLE = "nine views, SetNet small", "one view, SetNet medium"
 ROWS = {  # what it is: a network in weights/, how many of the nine views it is given
@@ -48,7 +48,7 @@ ROWS = {  # what it is: a network in weights/, how many of the nine views it is 
     PAPER: ("lf3x3", 9),
     SINGLE: ("setnet_medium", 1),
     ONE_VIEW: ("single256", 1),
-    "one view, E2VID+ trained without turbulence": ("clean/e2vid_plus", 1),
+    "one view, E2VID+, no turbulence, 0.24 h": ("clean/e2vid_plus", 1),
 }
 BASELINES = {  # their files in the folder of published weights
     "firenet_plus": ["FireNet+/firenet_plus_state_dict.pth"],
@@ -64,7 +64,7 @@ OTHERS = {
     "one view, published PIE-Net": ("pienet", 1),
     LITE: ("pienet_lite", 1),
 }
-HEADLINE = (LARGE, MEDIUM, SMALL, PAPER, ONE_VIEW, LITE, FIRENET)  # rows of the README
+HEADLINE = (LARGE, MEDIUM, SMALL, PAPER, SINGLE, ONE_VIEW, LITE, FIRENET)  # rows of the README
 SCORES = ("lpips", "ssim", "psnr_aligned")  # its columns
 VIEWS = {  # differences, clip by clip: of nine views and one
     "Δ (9 − 1 views), E2VID": (PAPER, ONE_VIEW),
@@ -150,7 +150,9 @@ def format_table(values: dict[str, list[dict[str, float]]], table: Table) -> str
             lines.append(f"| {row} | " + " | ".join(format_means(values[row], columns)) + " |")
     for name, (first, second) in table.pairs.items():
         if {first, second} <= set(values):
-            cells = format_differences(values[first], values[second], columns)
+            pairs = list(zip(values[first], values[second], strict=True))
+            gains = [[a[m.name] - b[m.name] for a, b in pairs] for m in columns]
+            cells = [format_mean(m, own, "+") for m, own in zip(columns, gains, strict=True)]
             lines.append(f"| *{name}* | " + " | ".join(cells) + " |")
     paired = "; Δ: paired differences" if table.pairs else ""
     clips = len(next(iter(values.values())))
@@ -160,16 +162,6 @@ def format_table(values: dict[str, list[dict[str, float]]], table: Table) -> str
 def format_means(clips: list[dict[str, float]], columns: Sequence[Column] = METRICS) -> list[str]:
     """Return the scores of clips, per metric."""
     return [format_mean(m, [clip[m.name] for clip in clips]) for m in columns]
-
-
-def format_differences(
-    first: list[dict[str, float]],
-    second: list[dict[str, float]],
-    columns: Sequence[Column] = METRICS,
-) -> list[str]:
-    """Return by how much the scores of the same clips differ, per metric."""
-    pairs = list(zip(first, second, strict=True))
-    return [format_mean(m, [a[m.name] - b[m.name] for a, b in pairs], "+") for m in columns]
 
 
 def format_mean(metric: Column, values: list[float], sign: str = "") -> str:
@@ -207,7 +199,7 @@ def write_film(path: Path, index: int) -> None:
         "ground truth": sample.target[0, :, 0].numpy(),
     }
     film = samples.join_panels({name: append_slice(video) for name, video in panels.items()})
-    samples.write_video(path, film, samples.PLAYBACK_FPS)
+    samples.write_animation(path, film, samples.PLAYBACK_FPS)
 
 
 def append_slice(
@@ -244,7 +236,7 @@ def main() -> None:
         "data=test_targets": [],
     }
     if given.footage:
-        asked["data=test_footage"] = [f"turbulence.root={given.footage}", *photos]
+        asked["data=test_footage"] = [f"turbulence.footage={given.footage}", *photos]
     chosen = ROWS | (OTHERS if given.published else {})
     rows = {row: load_shipped(*what, given.published) for row, what in chosen.items()}
     cards = {name: row for row, (name, _) in reversed(ROWS.items())}  # the row of most views

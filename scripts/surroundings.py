@@ -75,7 +75,7 @@ def held(
 
 def new_context(network: SetNet, maps: Float[Tensor, "m c h2 w2"]) -> Float[Tensor, "m c h4 w4"]:
     """Return the context of the maps, each a clip of its own, updated everywhere."""
-    sizes = network.context.map_sizes(*maps.shape[2:])
+    sizes = network.context.held_map_sizes(*maps.shape[2:])
     nothing = tuple(maps.new_zeros(len(maps), *size) for size in sizes)
     return network.context(maps, nothing, torch.ones_like(maps[:, :1]) > 0)[0]
 
@@ -121,7 +121,7 @@ def teach(cfg: DictConfig, clips: int, steps: int) -> None:
         raise ValueError(f"clips and steps must be whole numbers >= 1, got {clips} and {steps}")
     hardware.reserve_worker_cores(cfg)
     hardware.retain_freed_memory(cfg)
-    _, spec = build.build_network_and_spec(cfg)
+    _, spec = build.build_untrained_network(cfg)
     source, start = files.find_checkpoint(cfg.ckpt, spec), time.process_time()
     before = files.load(source)
     if not isinstance(before, SetNet):

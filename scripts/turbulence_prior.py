@@ -11,16 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from hydra import compose, initialize_config_dir
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from src.app import build
+from src.app.compose import compose_config
 from src.figures.plots import save_figure
 from src.records import safe_yaml
 from src.sim.turbulence import Atmosphere, sample_atmosphere
 
-CONF = Path(__file__).resolve().parents[1] / "conf"
 COUNT, WIDTH = 400, 256
 COLOURS = {
     "weak": "tab:green", "medium": "tab:orange", "strong": "tab:red", "extreme": "tab:purple"
@@ -48,8 +47,7 @@ def draw_atmospheres() -> dict[str, list[Atmosphere]]:
 
 def draw_test_atmospheres() -> dict[str, list[Atmosphere]]:
     """Return the atmospheres of the clips of data=test_photos, by severity."""
-    with initialize_config_dir(str(CONF), version_base=None):
-        cfg = compose("eval", overrides=["data=test_photos", "paths.run=."])
+    cfg = compose_config("eval", "data=test_photos", "paths.run=.")
     pipeline = build.build_pipeline(cfg, "test")
     paths = [pipeline.draw(number).turbulence for number in range(cfg.data.test_clips)]
     names = sorted({path.severity for path in paths}, key=list(COLOURS).index)
@@ -64,9 +62,8 @@ def format_table(found: Mapping[str, Sequence[Atmosphere]]) -> str:
         cells = []
         for column in COLUMNS.values():
             values = np.percentile([column(path) for path in paths], [10, 50, 90])
-            cells.append(
-                " / ".join(f"{value:.2g}" if value < 100 else f"{value:.0f}" for value in values)
-            )
+            texts = (f"{value:.2g}" if value < 100 else f"{value:.0f}" for value in values)
+            cells.append(" / ".join(texts))
         lines.append(f"| {name} ({len(paths)}) | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -81,9 +78,8 @@ def plot_prior(
         x = [min(each.tilt_correlation_half_length_px(WIDTH), FARTHEST) for each in found[name]]
         y = [each.tilt_std_px(WIDTH) for each in found[name]]
         axes.plot(x, y, ".", ms=4, alpha=0.6, color=COLOURS[name], label=name)
-    x = np.percentile(
-        [each.tilt_correlation_half_length_px(WIDTH) for each in found["mixed"]], [10, 90]
-    )
+    lengths = [each.tilt_correlation_half_length_px(WIDTH) for each in found["mixed"]]
+    x = np.percentile(lengths, [10, 90])
     y = np.percentile([each.tilt_std_px(WIDTH) for each in found["mixed"]], [10, 90])
     box = Rectangle((x[0], y[0]), *np.diff(x), *np.diff(y), fill=False, ls="--", lw=1.2)
     box.set_label("central 80 % of mixed")

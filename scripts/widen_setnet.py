@@ -127,7 +127,7 @@ def begin(cfg: DictConfig) -> None:
     if not (cfg.ckpt and cfg.export and files.is_weights_file(Path(cfg.export))):
         got = f"{cfg.ckpt} and {cfg.export}"
         raise ValueError(f"ckpt and export must be files, export a .safetensors, got {got}")
-    wide, spec = build.build_network_and_spec(cfg)
+    wide, spec = build.build_untrained_network(cfg)
     source = Path(cfg.ckpt)
     old = files.load(source)
     if not (isinstance(old, SetNet) and isinstance(wide, SetNet)):

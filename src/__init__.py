@@ -12,7 +12,7 @@ os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**27))
 HOME = __name__.removesuffix("src")
 
 
-def importable_name(name: str) -> str:
+def add_package_prefix(name: str) -> str:
     """Return the name by which is imported what configs and weights call src.* or baselines.*."""
     return HOME + name if name.split(".")[0] in ("src", "baselines") else name
 

@@ -1,74 +1,197 @@
-"""Calibrate: python -m src.calibrate task=views|threshold|turbulence|air recording=...|video=..."""
+"""Calibrate: python -m src.calibrate task=views|threshold|turbulence|air recording=...|video=...
 
+Each task writes its file, its table and its picture into the folder of the run.
+"""
+
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import rich
+from jaxtyping import Float
 from omegaconf import DictConfig, OmegaConf
 
-from src.app import build, calibrations, entry_point
+from src.app import build, entry_point
 from src.app.instantiate import build_part
-from src.recordings.calibration.scene_alignment import SceneTarget
+from src.figures import calibration_figures
+from src.models.network import EventToVideoNetwork
+from src.recordings import event_windows, reconstruction, sensor_lookup
+from src.recordings.calibration import (
+    activity_pictures,
+    contrast_threshold,
+    dot_statistics,
+    gaussian_dots,
+    scene_alignment,
+    turbulence_meter,
+    view_alignment,
+)
+from src.recordings.calibration.boards import Target
+from src.recordings.files import sources, videos
 from src.recordings.files.event_file import ReadOptions
-from src.recordings.reconstruction import require_event_network
+from src.recordings.files.recording import open_recording
+from src.recordings.files.turbulence_file import SIDE
+from src.recordings.views import Views, load_views, views_or_whole_sensor
 from src.records import results
 
 
-def calibrate_views(cfg: DictConfig, run: Path) -> dict:
-    """Find the views and their homographies: `views.yaml`, also at `cfg.save`."""
-    given: dict[str, Any] = {key: cfg[key] for key in ("resolution", "sensor_size")}
-    given["options"] = ReadOptions.from_keys(cfg)
+def calibrate_views(cfg: DictConfig, run: Path) -> dict[str, str]:
+    """Find the views and their homographies; write `views.yaml`, also at `cfg.save`, and
+    `views.png`.  Return a line per view."""
     target = build_part(cfg, "target")
-    if isinstance(target, SceneTarget) and not cfg.corners:
-        if not cfg.mirrors:
-            raise ValueError("mirrors must be true for target=scene, got false")
-        found = calibrations.calibrate_views_on_scene(cfg.recording, run, target, **given)
-        views, summary = found.aligned.views, found.summary()
+    if isinstance(target, scene_alignment.SceneTarget) and not cfg.corners:
+        views, summary = _find_views_in_scene(cfg, run, target)
     else:
-        given |= {key: cfg[key] for key in ("mirrors", "corners")}
-        views = calibrations.calibrate_views(cfg.recording, run, target, **given)
+        views = _find_views_of_board(cfg, run, target)
         summary = {f"error_px of {v.position}": f"{v.error_px:.3f}" for v in views.views}
-    if cfg.save:
-        views.save(cfg.save)
+    for path in filter(None, (run / "views.yaml", cfg.save)):
+        views.save(path)
     return summary
 
 
-def find_contrast_threshold(cfg: DictConfig, run: Path) -> dict:
-    """Find the contrast threshold by comparing event rates with the configured simulation's."""
-    pipeline = build.build_pipeline(cfg, "test")
+def _find_views_of_board(cfg: DictConfig, run: Path, target: Target) -> Views:
+    """Find the views by a board, or by `cfg.corners`, a file of corners given by hand.
+
+    Of a calibration that fails, with the ValueError of `view_alignment.fit_homographies`,
+    `found.png` remains.
+    """
+    options = ReadOptions.from_keys(cfg)
+    seen = sources.read_picture_or_event_counts(cfg.recording, cfg.sensor_size, options)
+    picture = view_alignment.repair_picture(seen)
+    sizes = {"sensor": picture.shape, "model": tuple(cfg.resolution)}
+    if cfg.corners:
+        corners = view_alignment.read_corners(cfg.corners)
+        views = view_alignment.views_from_corners(corners, **sizes)
+        calibration_figures.draw_views(picture, views, run / "views.png")
+        return views
+    found = view_alignment.find_target(picture, target, cfg.mirrors)
+    calibration_figures.draw_found_target(picture, found, run / "found.png")
+    aligned = view_alignment.fit_homographies(found, **sizes)
+    calibration_figures.draw_view_residuals(picture, aligned, run / "views.png")
+    return aligned.views
+
+
+def _find_views_in_scene(
+    cfg: DictConfig, run: Path, scene: scene_alignment.SceneTarget
+) -> tuple[Views, dict[str, str]]:
+    """Find the views of a kaleidoscope in whatever it shows; also write `overlay.png`.
+
+    Raises ValueError as `scene_alignment.align_views_by_scene` does.
+    """
+    if not cfg.mirrors:
+        raise ValueError("mirrors must be true for target=scene, got false")
+    pictures = activity_pictures.read_activity_pictures(
+        cfg.recording, cfg.sensor_size, ReadOptions.from_keys(cfg)
+    )
+    found = scene_alignment.align_views_by_scene(pictures, scene, tuple(cfg.resolution))
+    views, total = found.aligned.views, pictures.sum((0, 1))
+    shown = view_alignment.repair_picture(np.log1p(total))
+    calibration_figures.draw_view_residuals(shown, found.aligned, run / "views.png")
+    calibration_figures.draw_views_over_centre(total, views, found.matched, run / "overlay.png")
+    return views, found.summary()
+
+
+def find_contrast_threshold(cfg: DictConfig, run: Path) -> dict[str, tuple]:
+    """Match the recording's event rate with that of the configured simulation; write
+    `threshold.csv` and `threshold.png`."""
+    options, pipeline = ReadOptions.from_keys(cfg), build.build_pipeline(cfg, "test")
     clips = [pipeline.render_views([pipeline.draw(index)])[0] for index in range(cfg.clips)]
-    estimate = calibrations.calibrate_contrast_threshold(
-        cfg.recording, run, clips, cfg.fps * cfg.data.substeps, pipeline.sensor,
-        views=cfg.views, sensor_size=cfg.sensor_size, options=ReadOptions.from_keys(cfg),
-    )  # fmt: skip
+    size = sources.find_sensor_size(cfg.recording, cfg.sensor_size, options)
+    lookup = sensor_lookup.build_lookup(views_or_whole_sensor(cfg.views, size))
+    events = open_recording(cfg.recording, size[::-1], options)
+    measured = contrast_threshold.measure_event_rates(events, lookup.view)
+    estimate = contrast_threshold.estimate_contrast_threshold(
+        measured, clips, cfg.fps * cfg.data.substeps, pipeline.sensor
+    )
+    contrast_threshold.write_threshold_csv(estimate, measured, run / "threshold.csv")
+    calibration_figures.draw_event_rates(estimate, run / "threshold.png")
     return {"ON (value, low, high)": estimate.on, "OFF": estimate.off}
 
 
-def measure_dot_statistics(cfg: DictConfig, run: Path) -> dict:
-    """Measure tilt, blur and scintillation of a dot grid against the same without turbulence."""
+def measure_dot_statistics(cfg: DictConfig, run: Path) -> dot_statistics.DotStatistics:
+    """Measure tilt, blur and scintillation of a dot grid against the same without turbulence;
+    write `turbulence.csv`, `.png`.
+
+    A recording of events is reconstructed first, each view by itself, by a network of one view.
+    """
+    if not cfg.still:
+        raise ValueError("still must be the same dots without turbulence, got none")
     given = cfg.ckpt or cfg.get("baseline")
-    network = require_event_network(build.load_network(cfg)) if given else None
-    statistics = calibrations.measure_dot_grid(
-        cfg.recording, cfg.still, run, fps=cfg.fps, network=network, views=cfg.views,
-        sensor_size=cfg.sensor_size, options=ReadOptions.from_keys(cfg), **cfg.dots,
-    )  # fmt: skip
-    return statistics.summary()
+    network = (
+        reconstruction.require_event_network(build.load_ckpt_or_baseline(cfg)) if given else None
+    )
+    views, dots = load_views(cfg.views) if cfg.views else None, cfg.dots
+    positions = views.positions if views else [(0, 0)]
+    calm, moving = (_read_films(cfg, path, views, network) for path in (cfg.still, cfg.recording))
+    centre = positions.index((0, 0))
+    places = dot_statistics.find_dots(calm[centre].mean(0), dots.rows, dots.cols, dots.dark)
+    reach = dots.fit_radius_px or dot_statistics.choose_fit_radius(places)
+    if dots.dark:  # the vignette of a bright ground would pass for a part of the dots
+        grounds = [dot_statistics.fit_background(film.mean(0), places, reach) for film in calm]
+        light = np.stack(grounds)[:, None]
+        calm, moving = calm / light, moving / light
+    turbulent = [gaussian_dots.fit_gaussians(film, places, reach) for film in moving]
+    still = [gaussian_dots.fit_gaussians(film, places, reach) for film in calm]
+    fitted = dot_statistics.compare_with_still(turbulent, still, fps=cfg.fps, centre_view=centre)
+    dot_statistics.write_view_dot_csv(fitted, run / "turbulence.csv", positions)
+    calibration_figures.draw_dot_statistics(fitted, positions, run / "turbulence.png")
+    return fitted
 
 
-def measure_turbulence_in_video(cfg: DictConfig, run: Path) -> dict:
-    """Measure the turbulence in front of a still scene: `air.yaml`, also at `cfg.save`."""
+def _read_films(
+    cfg: DictConfig, path: str, views: Views | None, network: EventToVideoNetwork | None
+) -> Float[np.ndarray, "views frames h w"]:
+    if not sources.has_events(path):
+        frames = videos.read_video(path)
+        return np.stack([views.warp_to_model(f) if views else f[None] for f in frames], axis=1)
+    if network is None:
+        raise ValueError(f"ckpt or baseline must reconstruct the events of {path}, got neither")
+    options = ReadOptions.from_keys(cfg)
+    sensor = sources.find_sensor_size(path, cfg.sensor_size, options)
+    span = event_windows.count_frames_per_window("trained", cfg.fps)
+    table = sensor_lookup.build_lookup(views or Views.single_view(sensor, sensor))
+    rule = event_windows.WindowRule(fps=cfg.fps, frames_per_window=span)
+    events = sources.iter_recording(path, sensor, options=options)
+    windows = event_windows.cut_windows(events, table, rule)
+    return np.stack(list(reconstruction.reconstruct_each_view(windows, network, span)), axis=1)
+
+
+def measure_turbulence_in_video(
+    cfg: DictConfig, run: Path
+) -> turbulence_meter.TurbulenceMeasurement:
+    """Measure the turbulence in front of a still scene; write `air.yaml`, also at `cfg.save`, and
+    `air.png`.
+
+    Raises ValueError for a video that cannot be read or shows too little; then nothing is written.
+    """
     if OmegaConf.is_missing(cfg, "video"):
         raise ValueError("video must be a video of a still scene, got none")
-    measured = calibrations.measure_turbulence_in_video(
-        cfg.video, run, fps=cfg.fps, save=cfg.save, **cfg.air
-    )
-    return {name: str(value) for name, value in vars(measured.found).items()}
+    video, most, fps = cfg.video, cfg.air.max_frames, cfg.fps
+    if not Path(video).exists():
+        raise ValueError(f"video must be a film or a folder of pictures, got {video}")
+    if fps is not None and not 0 < fps < np.inf:
+        raise ValueError(f"fps must be > 0 frames a second, got {fps}")
+    if most < (least := turbulence_meter.MIN_FRAMES):
+        raise ValueError(f"air.max_frames must be at least {least}, got {most}")
+    frames = videos.read_video(video, "video", most)
+    film = list(map(turbulence_meter.limit_shorter_side, frames))
+    if len({frame.shape for frame in film}) > 1:
+        raise ValueError(f"video must hold frames of one size, got several in {video}")
+    rate = videos.read_fps(video, "video", most) if fps is None else fps
+    air = turbulence_meter.measure_turbulence(np.stack(film), rate)
+    text = f"# The air of {Path(video).name}, {air.frames} frames; pixels of a frame whose smaller"
+    text += f" side is {SIDE}.\n{air.found.to_yaml()}"
+    calibration_figures.draw_measured_turbulence(air, Path(video).name, run / "air.png")
+    for path in filter(None, (run / "air.yaml", cfg.save)):
+        results.write_text(Path(path), text)
+    return air
 
 
-TASKS = {
-    "views": calibrate_views, "threshold": find_contrast_threshold,
-    "turbulence": measure_dot_statistics, "air": measure_turbulence_in_video,
-}  # fmt: skip
+TASKS: dict[str, Callable[[DictConfig, Path], dict]] = {
+    "views": calibrate_views,
+    "threshold": find_contrast_threshold,
+    "turbulence": lambda *given: measure_dot_statistics(*given).summary(),
+    "air": lambda *given: measure_turbulence_in_video(*given).summary(),
+}
 
 
 def calibrate(cfg: DictConfig) -> dict:

@@ -72,7 +72,7 @@ def compare(cfg: DictConfig) -> dict:
         notes = [NOTES[measure].format(value) for measure, value in scores[name].items()]
         rows.append(comparison.VideoRow(name, film, across, "\n".join(notes)))
     comparison.draw_comparison(
-        rows, run / "comparison.png", line=points, axis=cfg.axis, samples=cfg.samples,
+        rows, run / "comparison.png", line=points, axis=cfg.axis_label, samples=cfg.frames_shown,
         length_s=min(map(len, films)) / cfg.fps,
     )  # fmt: skip
     rich.print(scores, f"in {run}")

@@ -10,8 +10,9 @@ from omegaconf import DictConfig
 from src.app import entry_point
 from src.recordings.files import event_writers, recording, sources
 from src.recordings.files.event_arrays import count_before
-from src.recordings.files.event_file import ReadOptions
+from src.recordings.files.event_file import HeightWidth, ReadOptions
 from src.recordings.files.recorded_frames import RecordedFrames, find_frames
+from src.records.atomic import partial_path
 
 
 def convert(cfg: DictConfig) -> Path:
@@ -21,7 +22,7 @@ def convert(cfg: DictConfig) -> Path:
     hold it, and where the one would be written over the other.
     """
     source, out = Path(cfg.recording), Path(cfg.out)
-    for written in (out, event_writers.partial_path(out)):
+    for written in (out, partial_path(out)):
         if written.exists() and source.exists() and written.samefile(source):
             raise ValueError(f"out must be another file than recording, got {out}")
     options = ReadOptions.from_keys(cfg)
@@ -29,7 +30,9 @@ def convert(cfg: DictConfig) -> Path:
     how = {"width": width, "height": height, "version": cfg.version, "layout": cfg.layout}
     event_writers.choose_file_kind(out, **how)
     opened = recording.open_recording(source, (width, height), options)
-    frames = frames_to_write(opened, (height, width), cfg) if cfg.layout == "evreal" else None
+    frames = (
+        find_frames_to_convert(opened, (height, width), cfg) if cfg.layout == "evreal" else None
+    )
     events = cut_time_range(opened, cfg.start_s, cfg.end_s)
     count, seconds = event_writers.write_pieces(out, events, **how, frames=frames)
     size = sum(file.stat().st_size for file in (out, *out.rglob("*")) if file.is_file())
@@ -37,16 +40,16 @@ def convert(cfg: DictConfig) -> Path:
     return out
 
 
-def frames_to_write(
-    opened: recording.EventRecording, size: sources.Size, cfg: DictConfig
+def find_frames_to_convert(
+    opened: recording.EventRecording, sensor: HeightWidth, cfg: DictConfig
 ) -> RecordedFrames | None:
     """Return the frames of a recording from `start_s` on; None, with a warning, for frames of
     another size than the sensor's."""
     frames = find_frames(opened)
     if frames is None:
         return None
-    if frames.size != size:
-        (height, width), (wanted_height, wanted_width) = frames.size, size
+    if frames.size != sensor:
+        (height, width), (wanted_height, wanted_width) = frames.size, sensor
         found = f"{opened.path}: frames of {width}x{height} are left out"
         warnings.warn(f"{found}, the sensor is {wanted_width}x{wanted_height}", stacklevel=2)
         return None

@@ -19,7 +19,7 @@ def evaluate(cfg: DictConfig) -> dict:
         return benchmark.evaluate_on_evreal(cfg)
     run, start = Path(cfg.paths.run), time.perf_counter()
     hardware.reserve_worker_cores(cfg)
-    net = build.build_video_method(cfg)
+    net = build.load_method_with_postprocess(cfg)
     data = build.build_data_module(cfg, splits=("test",), optics=simulation.select_optics(cfg, net))
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     row = build.test_method(cfg, build.method_name(cfg), net, data, build.build_metrics(cfg))

@@ -6,22 +6,32 @@
 """
 
 import asyncio
+import signal
+import sys
+from collections.abc import Mapping, Sequence
 
 import torch
 from omegaconf import DictConfig
 
 import src.models
 from src.app import build, entry_point
-from src.app.instantiate import allowed_packages
-from src.live_view.assembly import assemble, play_and_serve
-from src.live_view.event_feeds import open_feed
-from src.live_view.network_runner import RunSettings
-from src.live_view.page_server import PageServer
-from src.live_view.status import FaultLog
+from src.app.instantiate import read_user_packages
+from src.live_view.event_feeds import Feed, open_feed
+from src.live_view.feed_reader import FeedReader, PlaybackClock
+from src.live_view.frame_buffer import FrameRing, PolarityAccumulator
+from src.live_view.live_windows import WindowCutter, WindowQueue
+from src.live_view.network_runner import Controls, RunSettings
+from src.live_view.page_server import THIS_MACHINE, LivePage, PageServer
+from src.live_view.player import Player
+from src.live_view.status import FaultLog, Meters
 from src.models.network import EventToVideoNetwork
 from src.recordings.files.event_file import ReadOptions
+from src.recordings.noise_filter import NoiseFilter
 from src.recordings.reconstruction import require_event_network, takes_all_views
-from src.recordings.views import load_views, views_or_whole_sensor
+from src.recordings.sensor_lookup import build_lookup
+from src.recordings.views import Views, load_views, views_or_whole_sensor
+
+GIL_SWITCH_S = 2e-4  # Python's own 5 ms between two threads is longer than a window
 
 
 def live(cfg: DictConfig) -> None:
@@ -58,16 +68,65 @@ def load_offered_networks(cfg: DictConfig, name: str, views: int) -> dict[str, E
 
     Raises ValueError where that one wants another number of `views`; others that do are left out.
     """
-    networks: dict[str, EventToVideoNetwork] = {}
+    networks, packages = {}, read_user_packages(cfg)
     for other in dict.fromkeys([*cfg.offered_networks, name]):
-        if other == name:
-            networks[name] = require_event_network(build.load_network(cfg))
-            takes_all_views(networks[name], views)
-        else:
-            network = require_event_network(src.models.load(other, allowed_packages(cfg)))
-            if network.views in (None, 1, views):
-                networks[other] = network
-    return networks
+        is_own = other == name
+        loaded = build.load_ckpt_or_baseline(cfg) if is_own else src.models.load(other, packages)
+        networks[other] = require_event_network(loaded)
+    takes_all_views(networks[name], views)
+    return {other: net for other, net in networks.items() if net.views in (None, 1, views)}
+
+
+def assemble(
+    feed: Feed,
+    networks: Mapping[str, EventToVideoNetwork],
+    views: Views,
+    settings: RunSettings,
+    faults: FaultLog,
+    *,
+    playback_speed: float = 1.0,
+    max_waiting_windows: int = 16,
+    noise_filter_s: float | None = None,
+    tone: str = "none",
+    tone_time_constant_s: float = 0.5,
+    host: str = "127.0.0.1",
+    port: int = 8600,
+    allowed_origins: Sequence[str] = (),
+) -> PageServer:
+    """Return the server of a page on which `feed` is played through one of `networks`.
+
+    Raises ValueError for a value out of range.
+    """
+    clock, counter = PlaybackClock(playback_speed), PolarityAccumulator(build_lookup(views))
+    cutter = WindowCutter(views.sensor, settings.fps, faults, is_live=feed.is_live)
+    waiting = WindowQueue(max_waiting_windows, lossless=playback_speed == float("inf"))
+    noise_filter = None if noise_filter_s is None else NoiseFilter(views.sensor, noise_filter_s)
+    reader = FeedReader(feed, cutter, waiting, counter, clock, Meters(), faults, noise_filter)
+    player = Player(reader, Controls(networks, views, settings), FrameRing(views.model))
+    player.set_tone(tone, tone_time_constant_s)
+    return PageServer(LivePage(player, views.positions), host, port, allowed_origins)
+
+
+async def play_and_serve(server: PageServer) -> None:
+    """Play and serve until SIGINT (Ctrl-C) or SIGTERM; leaves no thread and no port."""
+    stop, player = asyncio.Event(), server.page.player
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+
+    def start() -> None:
+        player.start()
+        host = f"[{server.host}]" if ":" in server.host else server.host
+        is_local = server.host in THIS_MACHINE
+        seen = "this machine only" if is_local else "other machines can see it too"
+        print(f"watch at http://{host}:{server.port} ({seen}); Ctrl-C ends it", flush=True)
+
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(GIL_SWITCH_S)
+    try:
+        await server.run(start, stop)
+    finally:
+        player.stop()
+        sys.setswitchinterval(before)
 
 
 if __name__ == "__main__":

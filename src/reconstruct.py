@@ -20,9 +20,9 @@ from src.deploy.runtime import EventListRuntime
 from src.figures import samples
 from src.models.network import EventToVideoNetwork
 from src.recordings import output, reconstruction, tone, truth_file
-from src.recordings.event_windows import Window, WindowRule, cut_windows, frames_per_window
+from src.recordings.event_windows import Window, WindowRule, count_frames_per_window, cut_windows
 from src.recordings.files import sources
-from src.recordings.files.event_file import ReadOptions
+from src.recordings.files.event_file import HeightWidth, ReadOptions
 from src.recordings.noise_filter import NoiseFilter
 from src.recordings.reconstruction import Frame
 from src.recordings.sensor_lookup import build_lookup
@@ -40,8 +40,7 @@ def reconstruct(cfg: DictConfig) -> Path:
     """
     run, ready_s = Path(cfg.paths.run), []
     hardware.check_device(cfg.device)
-    make_tone_curve(cfg)  # refused before the work
-    network = reconstruction.require_event_network(build.load_network(cfg))
+    network = reconstruction.require_event_network(build.load_ckpt_or_baseline(cfg))
     views = choose_views(cfg, network)
     make = reconstruct_film_frames if cfg.output_format == "film" else reconstruct_video_frames
     start = time.perf_counter()
@@ -93,34 +92,31 @@ def choose_views(cfg: DictConfig, network: EventToVideoNetwork) -> Views:
 
 def reconstruct_video_frames(
     cfg: DictConfig, network: EventToVideoNetwork, views: Views
-) -> tuple[Iterator[Frame], tuple[int, int]]:
+) -> tuple[Iterator[Frame], HeightWidth]:
     """Return the frames of the recording, as `tone` shows them, and their size."""
+    curve = tone.build_output_curve(cfg.tone, cfg.tone_time_constant_s, cfg.output_format)
     given = cfg.form, cfg.device, views, cfg.bins
     runnable = reconstruction.build_runnable_network(network, *given)
     rule = build_window_rule(cfg, network)
     rule = replace(rule, as_lists=isinstance(runnable, EventListRuntime))
 
     def read() -> Iterator[np.ndarray]:
-        return read_events(cfg, views)
+        return read_filtered_events(cfg, views)
 
     options = views, rule, cfg.backward_warmup_s
     frames = reconstruction.reconstruct_recording(read, runnable, *options, device=cfg.device)
-    return tone.apply_to_frames(frames, make_tone_curve(cfg)), views.model
-
-
-def make_tone_curve(cfg: DictConfig) -> tone.ToneCurve:
-    """Return the curve of `tone`; raises ValueError where frames are data."""
-    return tone.curve_for_output(cfg.tone, cfg.tone_time_constant_s, cfg.output_format)
+    shown = (replace(one, picture=curve.apply(one.picture, one.time_s)) for one in frames)
+    return shown, views.model
 
 
 def build_window_rule(cfg: DictConfig, network: EventToVideoNetwork) -> WindowRule:
     """Return how the recording is cut into windows for `network`."""
     length = cfg.window_length or reconstruction.default_window_length(network)
     settings = {key: cfg[key] for key in RULE_KEYS}
-    return WindowRule(**settings, frames_per_window=frames_per_window(length, cfg.fps))
+    return WindowRule(**settings, frames_per_window=count_frames_per_window(length, cfg.fps))
 
 
-def read_events(cfg: DictConfig, views: Views) -> Iterator[np.ndarray]:
+def read_filtered_events(cfg: DictConfig, views: Views) -> Iterator[np.ndarray]:
     """Yield the events of the recording, without noise where the config says so."""
     options = ReadOptions.from_keys(cfg)
     events = sources.iter_recording(cfg.recording, views.sensor, options=options)
@@ -131,7 +127,7 @@ def read_events(cfg: DictConfig, views: Views) -> Iterator[np.ndarray]:
 
 def reconstruct_film_frames(
     cfg: DictConfig, network: EventToVideoNetwork, views: Views
-) -> tuple[Iterator[Frame], tuple[int, int]]:
+) -> tuple[Iterator[Frame], HeightWidth]:
     """Return the frames of the film, panels beside each other, and their size.
 
     The panel of one view shows what the same network makes of the centre view; there is none of a
@@ -146,7 +142,7 @@ def reconstruct_film_frames(
         if network.views is None:
             methods = {"one view": reconstruct_video_frames(cfg, network, centre)[0]} | methods
     rule = replace(build_window_rule(cfg, network), bins=1)
-    windows = cut_windows(read_events(cfg, views), build_lookup(centre), rule)
+    windows = cut_windows(read_filtered_events(cfg, views), build_lookup(centre), rule)
     clean = truth_file.read_clean_clip(Path(cfg.recording))
     frames = join_film_panels(windows, methods, clean)
     first = next(frames)

@@ -42,7 +42,7 @@ def report(cfg: DictConfig) -> list[tables.Table]:
         title_of = "Differences on the same clips"
         candidates.append(tables.build_difference_table(title_of, found, theirs, published))
     shown = [table for table in candidates if table and table.rows]
-    commands, figures = [plan.command for plan in plans], runs.find_figures(folders)
+    commands, figures = [plan.command for plan in plans], runs.find_charts_and_stress_maps(folders)
     text = writers.format_markdown(shown, commands)
     results.create_run_folder(out, entry_point.resolved_yaml(cfg))
     results.write_text(out / "report.md", text)

@@ -55,7 +55,7 @@ def simulate(cfg: DictConfig) -> dict:
 
 def simulate_own_clip(cfg: DictConfig) -> dict:
     """Simulate all of `video` or `photo` and record it, to `write` or into the run's folder."""
-    own_simulation.set_own_sensor(cfg, entry_point.command_line().get("overrides", []))
+    own_simulation.set_own_sensor(cfg, entry_point.describe_hydra_command().get("overrides", []))
     run, clip = Path(cfg.paths.run), own_simulation.read_own_clip(cfg)
     work = OwnSimulation(cfg, clip)
     if not hasattr(work.sensor, "events"):
@@ -76,7 +76,7 @@ def simulate_own_clip(cfg: DictConfig) -> dict:
             shown += [part] if count <= DRAWN_FRAMES else []
             count += len(part.clean)
         written = draw_own_clip(run, work, views, shown)
-        events = write_recording(path, views, work.fps, camera, work.sensor, track)
+        events = write_recording(path, views, work.simulated_fps, camera, work.sensor, track)
     print_files(path, events, written)
     return drawn
 
@@ -90,8 +90,10 @@ def draw_own_clip(
     seen = torch.cat([part.views for part in parts], 1)[:, shown].numpy()
     tilt = torch.cat([part.tilt for part in parts], 1)[:, shown].numpy()
     light = views[None, :, : len(clean) * work.substeps + 1].float()
-    counts = work.sensor.voxels(light, work.fps, 1, substeps=work.substeps)[0, :, :, 0].numpy()
-    return samples.write_light_field(run, clean, seen, tilt, counts, work.optics)
+    counts = work.sensor.voxels(light, work.simulated_fps, 1, substeps=work.substeps)[
+        0, :, :, 0
+    ].numpy()
+    return samples.write_light_field_panels(run, clean, seen, tilt, counts, work.optics)
 
 
 def simulate_scene(cfg: DictConfig) -> dict:
@@ -109,12 +111,12 @@ def simulate_scene(cfg: DictConfig) -> dict:
     seen = views[:, step::step].numpy(), tilt[:, step::step].numpy(), counts
     clean = crop_frames(draw.clip.frames, draw.crop)[::step]
     print(describe_clip(cfg, drawn, clean.shape, draw.clip.fps / step))
-    written = samples.write_light_field(run, clean[1:].numpy(), *seen, pipeline.optics)
+    written = samples.write_light_field_panels(run, clean[1:].numpy(), *seen, pipeline.optics)
     if not cfg.write:
         print(f"written: {', '.join(map(str, written))}")
         return drawn
     path, size = Path(cfg.write), (views.shape[-2], views.shape[-1])
-    camera, fps = place_views(cfg, pipeline.positions, size, draw.key), draw.clip.fps
+    camera, fps = place_views(cfg, pipeline.optics.positions, size, draw.key), draw.clip.fps
     sensor: Any = draw.sensor  # one with `events`
     with create_truth_file(path, camera, len(clean), fps / step, drawn) as truth:
         codes = encode_srgb(views) if pipeline.decodes_srgb else views

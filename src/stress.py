@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from src.app import build, compared_networks, entry_point, hardware
 from src.app.instantiate import build_part
 from src.bench.candidates import Candidate
-from src.bench.stress_tests import stress_results as stress_results
+from src.bench.stress_tests import stress_results
 from src.bench.stress_tests.event_clips import StressBench
 from src.figures.stress_map import draw_stress_map
 from src.records import results
@@ -44,7 +44,7 @@ def stress(cfg: DictConfig) -> stress_results.Outcomes:
             standard_psnr[candidate.name] = psnr
         results.write_text(run / "stress.csv", stress_results.format_outcomes_csv(outcomes, titles))
         print(f"{candidate.name} is done", flush=True)
-    text = stress_results.format_markdown_summary(outcomes, titles, standard_psnr)
+    text = stress_results.format_summary_per_network(outcomes, titles, standard_psnr)
     results.write_text(run / "stress.md", text)
     for suffix in ("png", "svg"):
         draw_stress_map(run / f"stress.{suffix}", outcomes, titles, standard_psnr)

@@ -16,7 +16,7 @@ from src.models import files
 from src.records import results, tracking
 from src.training.datamodule import LightFieldData
 from src.training.ema import load_ema_weights
-from src.training.learning_curve import restore_training_progress
+from src.training.learning_curve import continue_from_weights
 from src.training.reconstructor import Reconstructor
 from src.training.step_guard import NonFiniteError
 
@@ -34,21 +34,21 @@ def train(cfg: DictConfig) -> dict:
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
     first_weights = start_weights.set_model_from_start_weights(cfg)
     references = start_weights.load_reference_networks(cfg)
-    net, spec = build.build_network_and_spec(cfg)
+    net, spec = build.build_untrained_network(cfg)
     if first_weights:
         files.restore_weights(net, first_weights)
-    start_from = files.find_checkpoint(cfg.ckpt, spec) if cfg.ckpt else None
+    ckpt = files.find_checkpoint(cfg.ckpt, spec) if cfg.ckpt else None
     module, data = build.build_reconstructor(cfg, net, spec), build.build_data_module(cfg)
     trainer = build.build_trainer(cfg)
     if trainer.global_rank:
-        fit(trainer, module, data, start_from)
+        fit(trainer, module, data, ckpt)
         return {}
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
-    beginning = start_weights.describe_start_weights(cfg, first_weights)
+    beginning = start_weights.label_before_training(cfg, first_weights)
     before = build.test_method(cfg, beginning, module.method, data, module.metrics)
     tracking.log_config_to_wandb(trainer.loggers, as_dict(cfg))
     try:
-        fit(trainer, module, data, start_from)
+        fit(trainer, module, data, ckpt)
     except NonFiniteError as error:
         same = f"python -m src.simulate like={run}/config.yaml split=train index={error.clips[0]}"
         raise ValueError(f"{error}; seed {cfg.seed}; to see the clip: {same}") from error
@@ -69,17 +69,17 @@ def train(cfg: DictConfig) -> dict:
 
 
 def fit(
-    trainer: lightning.Trainer, module: Reconstructor, data: LightFieldData, start_from: Path | None
+    trainer: lightning.Trainer, module: Reconstructor, data: LightFieldData, ckpt: Path | None
 ) -> None:
     """Train; when that is cut short, whatever by, print what to continue from."""
     checkpoint = trainer.checkpoint_callback
     assert isinstance(checkpoint, ModelCheckpoint) and checkpoint.dirpath
     last = Path(checkpoint.dirpath) / "last.ckpt"
-    if start_from and files.is_weights_file(start_from):
-        restore_training_progress(module, trainer.callbacks, start_from)  # type: ignore[attr-defined]
-        start_from = None
+    if ckpt and files.is_weights_file(ckpt):
+        continue_from_weights(module, trainer.callbacks, ckpt)  # type: ignore[attr-defined]
+        ckpt = None
     try:
-        trainer.fit(module, data, ckpt_path=start_from)
+        trainer.fit(module, data, ckpt_path=ckpt)
         if not last.is_file():  # nothing was left to do
             trainer.save_checkpoint(last)
     except BaseException:

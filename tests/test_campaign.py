@@ -46,8 +46,8 @@ while steps < 10 * float(hours):
 def fakes(monkeypatch):
     real = Training.command
 
-    def command(self) -> list[str]:
-        words = real(self)
+    def command(self, overrides, start) -> list[str]:
+        words = real(self, overrides, start)
         (folder,) = (word.split("=", 1)[1] for word in words if word.startswith("hydra.run.dir"))
         rest = [word for word in words if word.startswith("ckpt=")]
         return [sys.executable, "-c", FAKE, folder, str(self.hours), *rest]
@@ -121,9 +121,9 @@ def test_stages_run_in_order_and_go_on_from_each_other(tmp_path, fakes):
     assert run([work]) == 0
     assert [steps for _, steps in order(tmp_path)] == [1, 2, 3, 1, 2, 3, 4, 5]
     assert work.shipped.read_text() == "long"
-    second = work.trainings["long"]
-    assert second.start_from == str((tmp_path / "a" / "short.safetensors").resolve())
-    assert second.overrides == ["experiment=lf3x3", "seed=4", "x=1"]
+    second = work.recipe.stages[1]
+    assert work._start(second) == str((tmp_path / "a" / "short.safetensors").resolve())
+    assert work._overrides(second) == ["experiment=lf3x3", "seed=4", "x=1"]
 
 
 def test_a_recipe_waits_for_the_networks_that_it_names(tmp_path, fakes):
@@ -133,7 +133,7 @@ def test_a_recipe_waits_for_the_networks_that_it_names(tmp_path, fakes):
     assert run([second, first]) == 0
     assert [name for name, _ in order(tmp_path)] == ["a"] * 10 + ["b"] * 10
     taught = f"teachers=[{tmp_path / 'weights' / 'a.safetensors'}]"
-    assert taught in second.trainings["training"].overrides
+    assert taught in second._overrides(stage)
     whole, shipped = tmp_path / "whole", recipe(tmp_path, "d")._replace(after=["lf3x3"])
     whole.mkdir()
     given = [RecipeWork(shipped, Settings(whole, 2, 1, 0, 3)), *works(whole, "lf3x3")]
@@ -151,7 +151,7 @@ def test_a_training_outlives_its_campaign_and_is_found_again(tmp_path, fakes):
     code = f"import sys; sys.path.insert(0, {str(ROOT)!r})\n" + (
         "from pathlib import Path\nfrom scripts.campaign import driver\n"
         "from tests.test_campaign import FAKE, Training, works\n"
-        "Training.command = lambda self: [sys.executable, '-c', FAKE, "
+        "Training.command = lambda self, *_: [sys.executable, '-c', FAKE, "
         "str(self.folder / 'part000'), str(self.hours)]\n"
         f"given = works(Path({str(tmp_path)!r}), 'a', hours=15)\n"
         "driver.run(given[0].settings, given)"
@@ -293,9 +293,7 @@ def until(seen) -> None:
 def test_the_command_of_a_training_is_one_of_src_train(tmp_path):
     work = RecipeWork(read("lf3x3", ["scene.root=x"]), Settings(tmp_path))
     stage = work.recipe.stages[0]
-    training = work.trainings[stage.name]
-    training.overrides = work._overrides(stage)
-    words = training.command()
+    words = work.trainings[stage.name].command(work._overrides(stage), None)
     assert "campaign-child" in " ".join(words) and "experiment=lf3x3" in words
     assert "scene.root=x" in words
     assert words[:3] == ["nice", "-n", "19"] and os.access(words[3], os.X_OK)
@@ -318,7 +316,7 @@ def test_every_shipped_network_has_a_recipe():
 
 TINY = [
     "scene=photos", "scene.height=64", "scene.width=64", "data.windows=8", "data.crop=32",
-    "data.loss_pairs=2", "data.loss_from=2", "data.batch_size=2", "data.clips=null",
+    "data.loss_pairs=2", "data.loss_from=2", "data.batch_size=2", "data.train_clips=null",
     "data.cache_clips=null", "data.batch_reuse=1", "data.val_clips=1", "data.test_clips=1",
     "data.test_windows=8", "data.unscored_windows=1", "callbacks.learning_curve.interval_h=0.001",
 ]  # fmt: skip

@@ -113,11 +113,11 @@ def leases(tmp_path_factory):
     begun(home / "begun.safetensors", 0.5)
     scenes = {"scenes": pack(home / "photos.pack")}
     assert lease.run_command(["folder", home / "all", here], scenes, 0) == 0
-    short = {"check_s": 1, "margin_s": 4, "validate": {"seconds": 1}}
+    short = {"check_s": 1, "margin_s": 4, "validate": {"total_s": 1}}
     row = {"name": "single256", "minutes": 0.02, "overrides": ["data.cache_clips=null"]}
     short["networks"] = [row]
     two = OmegaConf.to_container(OmegaConf.load(DRY))["networks"][:2]
-    cut = plan(home / "cut", export_s=0.05, check_s=1, networks=two)
+    cut = plan(home / "cut", export_interval_s=0.05, check_s=1, networks=two)
     words = {
         "whole": [[str(home / "all" / "plan.yaml"), "--minutes", "9"], False],
         "killed": [[str(cut), "--minutes", "9"], False],

@@ -54,7 +54,7 @@ def begun(path: Path, hours: float) -> Path:
     network = plans.load_plan(DRY).networks[1]
     row = {"hours": hours, "steps": 5, "windows": 40, "loss": 0.5}
     card = row | {"curve": [row]}
-    files.save(path, *build.build_network_and_spec(plans.load_plan(DRY).config(network)), card)
+    files.save(path, *build.build_untrained_network(plans.load_plan(DRY).config(network)), card)
     return path
 
 

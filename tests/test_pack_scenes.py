@@ -11,7 +11,7 @@ import pytest
 from scripts import pack_scenes
 from scripts.pack_scenes import MIB, WORST, verify_pack, write_pack
 from src.sim.scenes.clip import SPLITS
-from src.sim.scenes.photo_files import list_photographs, read_photograph
+from src.sim.scenes.photo_files import decode_photograph, list_photographs
 from src.sim.scenes.photographs import Photographs
 from tests.conftest import ROOT
 
@@ -60,9 +60,9 @@ def test_pictures_are_those_of_the_folders_made_smaller_never_larger(folders, tm
         for ours, theirs in zip(
             list_photographs(str(out), "train"), list_photographs(folders[:1], "train"), strict=True
         ):
-            whole = cv2.resize(read_photograph(theirs), shape[::-1], interpolation=cv2.INTER_AREA)
-            assert read_photograph(ours).shape == shape
-            assert np.abs(read_photograph(ours).astype(float) - whole).mean() < 2.5
+            whole = cv2.resize(decode_photograph(theirs), shape[::-1], interpolation=cv2.INTER_AREA)
+            assert decode_photograph(ours).shape == shape
+            assert np.abs(decode_photograph(ours).astype(float) - whole).mean() < 2.5
 
 
 def test_the_quality_is_the_best_that_fits(folders, tmp_path):

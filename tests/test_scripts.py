@@ -128,7 +128,7 @@ def test_what_lies_around_is_taught_while_the_memory_rests(tmp_path):
     start, export = tmp_path / "start.safetensors", tmp_path / "taught.safetensors"
     given = "experiment=setnet_small", f"ckpt={start}", f"export={export}"
     cfg = config("train", tmp_path, *TINY, *given)
-    network, spec = build.build_network_and_spec(cfg)
+    network, spec = build.build_untrained_network(cfg)
     files.save(start, network, spec, {"hours": 1.0, "curve": []})
     surroundings.teach(cfg, clips=3, steps=2)
     before, taught = files.load(start).state_dict(), files.load(export).state_dict()
@@ -181,7 +181,7 @@ def test_a_widened_network_draws_what_it_was_begun_as_and_its_copies_part(before
 
 def test_a_size_begins_as_a_smaller_one_with_its_hours(tmp_path):
     start, export = tmp_path / "start.safetensors", tmp_path / "wide.safetensors"
-    small, spec = build.build_network_and_spec(
+    small, spec = build.build_untrained_network(
         config("train", tmp_path, *TINY, "experiment=setnet_small")
     )
     files.save(start, small, spec, {"hours": 1.0, "curve": []})

@@ -61,7 +61,11 @@ def test_parts_are_those_of_the_whole_clip(tmp_path, monkeypatch):
     clip = clip_from_array(textured(), fps=60)
     cfg = compose_config("simulate", "turbulence=strong", "optics.views=3")
     work = OwnSimulation(cfg, clip)
-    assert work.substeps == 2 and work.frames == 9 and isinstance(work.turbulence, Turbulence)
+    assert (
+        work.substeps == 2
+        and work.simulated_frame_count == 9
+        and isinstance(work.turbulence, Turbulence)
+    )
     monkeypatch.setattr(own_simulation, "PART_BYTES", 4 * 3 * 40 * 56 * 2)  # two frames
     seen = work.allocate_views(tmp_path)
     parts = list(work.simulate_parts(seen))

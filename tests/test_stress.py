@@ -16,7 +16,7 @@ FUNCTIONS = {
     "retention": (
         "recurrence.measure_contrast_retention_percent, windows: [2, 4], limit_percent: 90"
     ),
-    "dropout": "conditions.measure_view_dropout_loss, counts: [1], draws: 1, limit_db: 0.5",
+    "dropout": "conditions.measure_worst_view_dropout_loss, counts: [1], draws: 1, limit_db: 0.5",
     "fast": "conditions.measure_window_rate_loss, rates_hz: [1200], limit_db: 1.0",
 }
 ROWS = [

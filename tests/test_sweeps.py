@@ -54,7 +54,7 @@ def weights(tmp_path_factory):
         path = folder / f"{name}.safetensors"
         path.parent.mkdir(exist_ok=True)
         cfg = config("train", folder, f"experiment={name}", *narrow)
-        network, spec = build.build_network_and_spec(cfg)
+        network, spec = build.build_untrained_network(cfg)
         files.save(path, network, spec, {})
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(files, "WEIGHTS", folder)

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -38,48 +39,39 @@ class Settings(NamedTuple):
 class Training:
     """A training in `folder`, with a folder for every part it came in, a lock and a log.
 
-    `start`: weights that the first part goes on from; `weights`: the file of its newest weights.
+    `weights`: the file of its newest weights.
     """
 
-    def __init__(
-        self,
-        settings: Settings,
-        folder: Path,
-        hours: float,
-        overrides: list[str],
-        start: str | None,
-    ):
+    def __init__(self, settings: Settings, folder: Path, hours: float):
         self.settings, self.folder, self.hours = settings, folder, hours
-        self.overrides, self.start_from = overrides, start
         self.weights = folder.with_suffix(".safetensors")
         self.failures, self.began = 0, 0.0
         self.process: subprocess.Popen | None = None
 
-    def command(self) -> list[str]:
-        """Return the command of the next part."""
+    def command(self, overrides: Sequence[str], start: str | None) -> list[str]:
+        """Return the command of the next part; `start`: weights that the first goes on from."""
         parts = sorted(self.folder.glob("part*"))
         number = int(parts[-1].name[4:]) + 1 if parts else 0
-        start: object = self.start_from
         if self.weights.exists():
-            start = self.weights
+            start = str(self.weights)
         if any(self.folder.rglob("*.ckpt")):
-            start = self.folder
+            start = str(self.folder)
         return [
             "nice", "-n", str(self.settings.nice), sys.executable, "-W", MARK, "-m", "src.train",
-            *self.overrides, f"train_hours={self.hours}", f"export={self.weights}",
+            *overrides, f"train_hours={self.hours}", f"export={self.weights}",
             f"hydra.run.dir={self.folder / f'part{number:03}'}", "~callbacks.progress",
             *([f"ckpt={start}"] if start else []),
         ]  # fmt: skip
 
-    def start(self) -> None:
-        """Start the next part; it holds the lock until it ends."""
+    def start(self, overrides: Sequence[str], start: str | None) -> None:
+        """Start the next part, as `command` says; it holds the lock until it ends."""
         self.folder.mkdir(parents=True, exist_ok=True)
         self._remove_old_checkpoints()
         lock = os.open(self.folder / "lock", os.O_RDWR | os.O_CREAT)
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         environment = os.environ | {"OMP_NUM_THREADS": str(self.settings.threads)}
         with (self.folder / "log.txt").open("a") as log:
-            command, self.began = self.command(), time.time()
+            command, self.began = self.command(overrides, start), time.time()
             self.process = subprocess.Popen(
                 command, cwd=ROOT, env=environment, stdin=subprocess.DEVNULL, stdout=log,
                 stderr=log, pass_fds=(lock,), start_new_session=True,

@@ -22,7 +22,9 @@ class RecipeWork:
         self.recipe, self.settings = recipe, settings
         self.name, self.folder = recipe.name, settings.out / recipe.name
         self.trainings = {
-            stage.name: self._training(stage) for stage in recipe.stages if stage.hours is not None
+            stage.name: Training(settings, self.folder / stage.name, stage.hours)
+            for stage in recipe.stages
+            if stage.hours is not None
         }
 
     @property
@@ -37,7 +39,7 @@ class RecipeWork:
         training = self.trainings.get(self._stage().name)
         return training.state() if training and training.state() != "done" else "waiting"
 
-    def ready(self, unfinished: Collection[str] = ()) -> bool:
+    def ready(self, unfinished: Collection[str]) -> bool:
         """Return whether the networks that the stages name are there, and none of them is among the
         `unfinished` recipes of this campaign.
         """
@@ -56,25 +58,20 @@ class RecipeWork:
 
     def start(self) -> None:
         """Start the training of the next stage."""
-        training = self.trainings[self._stage().name]
-        training.overrides = self._overrides(self._stage())
-        training.start_from = self._start(self._stage())
-        training.start()
+        stage = self._stage()
+        self.trainings[stage.name].start(self._overrides(stage), self._start(stage))
 
     def line(self) -> str:
         """Return the line of `status`."""
         state, stage = self.state(), self._stage()
         training = self.trainings.get(stage.name)
-        return f"{self.name}: {state}, {stage.name}" + (
-            f", {training.progress()}" if training else ""
-        )
+        progress = f", {training.progress()}" if training else ""
+        return f"{self.name}: {state}, {stage.name}{progress}"
 
     def _stage(self) -> Stage:
         """Return the first stage that is not done, or the last."""
-        for stage in self.recipe.stages:
-            if not self._done(stage):
-                return stage
-        return self.recipe.stages[-1]
+        stages = self.recipe.stages
+        return next((stage for stage in stages if not self._done(stage)), stages[-1])
 
     def _done(self, stage: Stage) -> bool:
         if stage.name in self.trainings:
@@ -84,18 +81,11 @@ class RecipeWork:
     def _weights(self, stage: str) -> Path:
         return self.folder / f"{stage}.safetensors"
 
-    def _training(self, stage: Stage) -> Training:
-        return Training(self.settings, self.folder / stage.name, stage.hours or 0.0, [], None)
-
     def _network(self, name: str) -> str | None:
         """Return the weights of a stage, of a recipe of this campaign, or the shipped ones."""
-        own = self._weights(name)
-        of_campaign = self.settings.out / "weights" / f"{name}.safetensors"
-        for path in (own, of_campaign):
-            if path.is_file():
-                return str(path.resolve())
-        shipped = files.WEIGHTS / f"{name}.safetensors"
-        return str(shipped) if shipped.is_file() else None
+        folders = self.folder, self.settings.out / "weights", files.WEIGHTS
+        paths = (folder / f"{name}.safetensors" for folder in folders)
+        return next((str(path.resolve()) for path in paths if path.is_file()), None)
 
     def _overrides(self, stage: Stage) -> list[str]:
         """Return the overrides of a training, names in braces replaced by weights."""
@@ -112,9 +102,8 @@ class RecipeWork:
         if stage.start is not None:
             found = self._network(stage.start)
             if found is None:
-                raise ValueError(
-                    f"start of stage {stage.name} must be a network, got {stage.start}"
-                )
+                name = stage.name
+                raise ValueError(f"start of stage {name} must be a network, got {stage.start}")
             return found
         before = self.recipe.stages[: self.recipe.stages.index(stage)]
         return str(self._weights(before[-1].name).resolve()) if before else None

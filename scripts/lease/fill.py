@@ -41,18 +41,13 @@ def fill_caches(
 def _fill_cache(
     cache: DeviceClipCache, plan: Fill, device: str, until: float, log: Callable
 ) -> dict[str, float]:
-    workers = plan.workers
-    if workers is None:
-        workers = max(1, min(MAX_WORKERS, (os.cpu_count() or 1) - 1))
+    most = max(1, min(MAX_WORKERS, (os.cpu_count() or 1) - 1))
+    workers = most if plan.workers is None else plan.workers
     clips = range(cache.clips)
     report = fill(cache.source, clips, cache.store, device=device, workers=workers, until=until)
     if not report.clips:
         raise ValueError(f"fill: minutes must be > {plan.minutes:g}: no clip was made")
     cache.clips = report.clips
-    few = (
-        ""
-        if report.clips >= plan.warn_below_clips
-        else f"; less than fill: warn_below_clips = {plan.warn_below_clips}"
-    )
-    log(f"cache: {report}{few}")
+    few = f"; less than fill: warn_below_clips = {plan.warn_below_clips}"
+    log(f"cache: {report}{few * (report.clips < plan.warn_below_clips)}")
     return {"clips": report.clips, "clips_per_second": report.clips_per_second}

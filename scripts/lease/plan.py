@@ -7,16 +7,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hydra import compose, initialize_config_dir
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from scripts.pack_scenes import verify_pack
-from src.app.renamed_keys import check_keys
+from src.app.compose import compose_config
+from src.app.renamed_keys import refuse_renamed_keys
 from src.models import files
 from src.training.learning_curve import read_training_progress
 
-CONF = Path(__file__).resolve().parents[2] / "conf"
 MIB = 2**20
 
 
@@ -72,10 +71,10 @@ class Validate:
 
     clips: int = 8
     count: int = 4
-    seconds: float = 20.0
+    total_s: float = 20.0
 
     def __post_init__(self) -> None:
-        for key in ("clips", "count", "seconds"):
+        for key in ("clips", "count", "total_s"):
             _check(getattr(self, key) > 0, f"validate: {key}", "> 0", self)
 
 
@@ -91,21 +90,16 @@ class Plan:
     scenes: str | None = None
     lpips: str | None = None
     check_s: float = 60.0
-    export_s: float = 60.0
+    export_interval_s: float = 60.0
     margin_s: float = 40.0
     max_export_total_mib: float = 64.0
     max_export_file_mib: float = 16.0
     max_export_files: int = 8
 
     def __post_init__(self) -> None:
-        for key in (
-            "check_s",
-            "export_s",
-            "margin_s",
-            "max_export_total_mib",
-            "max_export_file_mib",
-        ):
-            _check(getattr(self, key) > 0, key, "> 0", self)
+        for key, value in vars(self).items():
+            if isinstance(value, float):  # seconds and MiB
+                _check(value > 0, key, "> 0", self)
         _check(self.max_export_files >= 3, "max_export_files", ">= 3", self)
         names = [network.name for network in self.networks]
         if len(set(names)) < len(names) or not names:
@@ -131,21 +125,19 @@ class Plan:
     def config(self, network: Network) -> DictConfig:
         """Return the config that `network` is trained with; hours and folder are not in it yet.
 
-        Raises the exceptions of Hydra and OmegaConf where it is none.
+        Raises ValueError where it is none, OmegaConfBaseException for a key that it lacks.
         """
-        with initialize_config_dir(str(CONF), version_base=None):
-            cfg = compose("train", self.overrides(network))
+        cfg = compose_config("train", *self.overrides(network))
         cfg.data.val_clips = self.validate.clips
         if cfg.data.cache_clips is not None:
             cfg.data.cache_clips = self.fill.clips
         if self.scenes is not None:
             cfg.scene.root = str(self.path(self.scenes))
         if self.lpips is not None:
+            weights = str(self.path(self.lpips))
             for node in (cfg.loss.get("lpips"), cfg.metrics.lpips):
                 if node is not None:
-                    OmegaConf.update(
-                        node, "backbone_weights", str(self.path(self.lpips)), force_add=True
-                    )
+                    OmegaConf.update(node, "backbone_weights", weights, force_add=True)
         return cfg
 
     def earlier_hours(self, network: Network) -> float:
@@ -161,7 +153,7 @@ def load_plan(path: Path) -> Plan:
     """
     try:
         given = OmegaConf.load(path)
-        check_keys(OmegaConf.create({"lease": given}))
+        refuse_renamed_keys(OmegaConf.create({"lease": given}))
         content = OmegaConf.merge(OmegaConf.structured(Plan), given)
         content.folder = path.resolve().parent
         plan = OmegaConf.to_object(content)

@@ -125,21 +125,33 @@ class StepTimer(Callback):
         trainer.should_stop |= time.monotonic() > self.until
 
 
-def _time_steps(cfg: DictConfig, kind: str, until: float) -> Trial:
-    hardware.fill_in_precision(cfg)
-    module = build.build_reconstructor(cfg, *build.build_network_and_spec(cfg))
+def make_up_batch(cfg: DictConfig, device: str = "cpu") -> Sample:
+    """Return a batch of random grids, a tenth of them not 0, and random frames."""
     n, windows = cfg.data.batch_size, cfg.data.windows
     side = cfg.data.crop if isinstance(cfg.data.crop, int) else max(cfg.data.crop)
-    target = torch.rand(n, windows, 1, side, side, device=kind)
-    voxels = torch.randn(n, windows, cfg.optics.views, cfg.bins, side, side, device=kind)
+    target = torch.rand(n, windows, 1, side, side, device=device)
+    voxels = torch.randn(n, windows, cfg.optics.views, cfg.bins, side, side, device=device)
     voxels *= torch.rand_like(target[:, :, None]) < 0.1
     window_s = torch.full((n,), 1 / cfg.fps)
-    sample = Sample(voxels, target, target, window_s, parameters=[{}] * n)
-    timer, quiet = StepTimer(until), {"logger": False, "enable_checkpointing": False}
-    quiet |= {"enable_progress_bar": False, "max_steps": TRIAL_STEPS, "plugins": []}
-    trainer = build_part(cfg, "trainer", callbacks=[timer], **quiet)
-    trainer.fit(module, DataLoader([sample] * TRIAL_STEPS, collate_fn=lambda batch: batch[0]))
+    return Sample(voxels, target, target, window_s, parameters=[{}] * n)
+
+
+def train_on_batch(
+    cfg: DictConfig, batch: Sample, callback: Callback, steps: int
+) -> lightning.LightningModule:
+    """Return the module of the training `cfg` after `steps` steps on one batch."""
+    module = build.build_reconstructor(cfg, *build.build_untrained_network(cfg))
+    quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+    trainer = build_part(cfg, "trainer", callbacks=[callback], max_steps=steps, plugins=[], **quiet)
+    trainer.fit(module, DataLoader([batch] * steps, collate_fn=lambda batches: batches[0]))
+    return module
+
+
+def _time_steps(cfg: DictConfig, kind: str, until: float) -> Trial:
+    hardware.fill_in_precision(cfg)
+    timer = StepTimer(until)
+    module = train_on_batch(cfg, make_up_batch(cfg, kind), timer, TRIAL_STEPS)
     graphs = module.graphs is not None and bool(module.graphs.graphs)
     memory = torch.cuda.max_memory_allocated() if kind == "cuda" else 0
     spans = [end - start for start, end in pairwise(timer.ends)]
-    return Trial(n, 1 / min(spans) if spans else None, graphs, memory)
+    return Trial(cfg.data.batch_size, 1 / min(spans) if spans else None, graphs, memory)

@@ -128,7 +128,7 @@ class Lease:
         def publish(curve: ExportingCurve, module: LightningModule) -> None:
             self._export(one, curve, module)
 
-        deadline = until + self.plan.validate.seconds
+        deadline = until + self.plan.validate.total_s
         while True:
             times = {"seconds": until - time.monotonic(), "deadline": deadline}
             try:
@@ -149,14 +149,14 @@ class Lease:
             generation = self.exports.export_weights(one.name, curve.export, card)
             self.networks[one.name] |= {
                 "hours": module.clock.hours,
-                "steps": module.total_steps,
+                "steps": module.steps_so_far,
                 "trained": module.global_step,
                 "windows": module.windows_seen,
                 "generation": generation,
             }
             self._export_tables()
         self.log(
-            f"{one.name}: {module.total_steps} steps, {module.windows_seen} windows, "
+            f"{one.name}: {module.steps_so_far} steps, {module.windows_seen} windows, "
             f"{module.clock.hours * 60:.2f} min of training, generation {generation}"
         )
 
@@ -202,10 +202,8 @@ def run_lease(plan: Plan, selection: Selection, minutes: float, start: float, ou
         logging.getLogger(name).setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", module=r"lightning\.pytorch")  # what it says of every run
     device = probe.probe_device(selection.networks[0].cfg)
-    sizes = (
-        int(plan.max_export_file_mib * MIB),
-        int(plan.max_export_total_mib * MIB),
-        plan.max_export_files,
+    file_bytes, total_bytes = (
+        int(mib * MIB) for mib in (plan.max_export_file_mib, plan.max_export_total_mib)
     )
-    exports = Exports(out, *sizes)
+    exports = Exports(out, file_bytes, total_bytes, plan.max_export_files)
     return Lease(plan, selection, minutes, start, exports, device).run()

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
-from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
@@ -53,10 +52,10 @@ def size_network(plan: Plan, network: Network) -> SizedNetwork:
     try:
         cfg = plan.config(network)
         with torch.device("meta"):
-            net, spec = build.build_network_and_spec(cfg)
+            net, spec = build.build_untrained_network(cfg)
         build.build_reconstructor(cfg, net, spec)
         caches = _device_caches(build.build_data_module(cfg, ("train", "val")))
-    except (HydraException, OmegaConfBaseException, ValueError) as error:
+    except (OmegaConfBaseException, ValueError) as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"networks: {network.name} cannot be trained: {reason}") from error
     sizes = {name: 2 * value.numel() for name, value in inference_copy(net).state_dict().items()}
@@ -108,7 +107,7 @@ def find_excess(plan: Plan, networks: Sequence[SizedNetwork], minutes: float) ->
             f"minutes must be >= {training + fixed:.2f}: {training:.2f} of training ({asked}) and "
             f"{fixed:.2f} beside it (check {plan.check_s:g} s, cache {count_fills(networks)} x "
             f"{60 * plan.fill.minutes:g} s, validation {len(networks)} x "
-            f"{plan.validate.seconds:g} s, margin {plan.margin_s:g} s), got {minutes:g}"
+            f"{plan.validate.total_s:g} s, margin {plan.margin_s:g} s), got {minutes:g}"
         )
     size = sum(one.weights_bytes for one in networks) + TABLES_BYTES
     if size > plan.max_export_total_mib * MIB:
@@ -132,7 +131,7 @@ def count_fills(networks: Sequence[SizedNetwork]) -> int:
 def overhead_s(plan: Plan, networks: Sequence[SizedNetwork]) -> float:
     """Return the seconds of a lease in which nothing is trained."""
     filling = 60 * plan.fill.minutes * count_fills(networks)
-    return plan.check_s + filling + plan.validate.seconds * len(networks) + plan.margin_s
+    return plan.check_s + filling + plan.validate.total_s * len(networks) + plan.margin_s
 
 
 def allot_seconds(networks: Sequence[Network], seconds: float) -> list[float]:

@@ -13,10 +13,10 @@ from omegaconf import OmegaConf
 from scripts.lease.plan import Plan
 from scripts.lease.selection import SizedNetwork
 from src.app import build, hardware
-from src.app.instantiate import allowed_packages, build_part, instantiate_node
+from src.app.instantiate import build_part, instantiate_node, read_user_packages
 from src.models import files
 from src.training.ema import WeightEMA
-from src.training.learning_curve import LearningCurve, restore_training_progress
+from src.training.learning_curve import LearningCurve, continue_from_weights
 from src.training.schedule import CosineSchedule
 
 REPLACED_CALLBACKS = ("checkpoint", "rotation", "progress", "learning_curve", "schedule")
@@ -106,25 +106,27 @@ def train_network(
     hardware.retain_freed_memory(cfg)
     hardware.fill_in_precision(cfg)
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
-    net, spec = build.build_network_and_spec(cfg)
+    net, spec = build.build_untrained_network(cfg)
     module = build.build_reconstructor(cfg, net, spec)
     data = build.build_data_module(cfg, ("train", "val"))
     simulate = data.validation_samples
     data.validation_samples = functools.cache(lambda: list(simulate()))  # kept on the device
     export = folder / f"{one.name}.safetensors"
-    curve = ExportingCurve(export, seconds / 3600 / plan.validate.count, plan.export_s, publish)
+    curve = ExportingCurve(
+        export, seconds / 3600 / plan.validate.count, plan.export_interval_s, publish
+    )
     options = OmegaConf.to_container(cfg.callbacks.schedule, resolve=True)
     options.pop("_target_")
     average = [] if cfg.ema_decay is None else [WeightEMA(cfg.ema_decay)]
     callbacks = [*average, DeadlineSchedule(earlier, deadline, curve, **options), curve]
     callbacks += [
-        instantiate_node(node, allowed_packages(cfg))
+        instantiate_node(node, read_user_packages(cfg))
         for name, node in cfg.callbacks.items()
         if name not in REPLACED_CALLBACKS
     ]
     if one.network.start:
         weights = files.find_checkpoint(plan.path(one.network.start), spec)
-        restore_training_progress(module, callbacks, weights)
+        continue_from_weights(module, callbacks, weights)
     quiet = {"logger": False, "enable_checkpointing": False}
     trainer = build_part(cfg, "trainer", callbacks=callbacks, **quiet)
     trainer.fit(module, data)

@@ -24,7 +24,7 @@ from src.recordings.evreal_protocol import (
     score_sequence,
 )
 from src.recordings.evreal_sequences import find_sequences, open_as_evreal, sequence_name
-from src.recordings.files.evreal_folder import EvrealSequence, is_evreal_folder, open_sequence
+from src.recordings.files.evreal_folder import is_evreal_folder, open_sequence
 from src.recordings.reconstruction import require_event_network
 from src.records import results
 from src.records.atomic import write_text
@@ -47,14 +47,16 @@ def evaluate_on_evreal(cfg: DictConfig) -> dict:
     benchmark = EvrealBenchmark(cfg)
     sources = find_sequences(cfg.scene.root)
     for folder in filter(is_evreal_folder, sources):  # what is wrong is said before hours of work
-        benchmark.check_scored_range(folder, open_sequence(folder))
+        _, first_s, last_s = find_scored_range(cfg.data, folder)
+        check_scored_range(open_sequence(folder), benchmark.rule.window, first_s, last_s)
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     clips, lines = [], []
     for source in sources:
         clip, scored = benchmark.score_sequence(source, run)
         clips.append(clip)
         lines += scored
-        print(f"{clip['name']}: {clip['frames']} frames, {_format_scores(clip)}")
+        shown = ", ".join(f"{s.upper()} {clip[s]:.4f}" for s in SCORES if s in clip)
+        print(f"{clip['name']}: {clip['frames']} frames, {shown}")
     write_text(run / "frames.csv", results.format_csv(lines[0], [line.values() for line in lines]))
     means, row = average_by_data_set(clips), benchmark.build_score_row(clips)
     return results.write_and_print_results(
@@ -75,35 +77,27 @@ class EvrealBenchmark:
         lpips = build_part(cfg, "metrics.lpips") if cfg.metrics.lpips else None
         self.lpips, self.size = lpips and lpips.to(self.device), (0, 0)
 
-    def check_scored_range(self, source: Path, sequence: EvrealSequence) -> None:
-        """Raise ValueError for a sequence of which no frame can be scored."""
-        _, first_s, last_s = find_scored_range(self.cfg.data, source)
-        check_scored_range(sequence, self.rule.window, first_s, last_s)
-
     def score_sequence(self, source: Path, run: Path) -> tuple[dict, list[dict]]:
         """Return the mean scores of a sequence, and a line of each frame's."""
         data_set, first_s, last_s = find_scored_range(self.cfg.data, source)
-        facts: dict[str, Any] = {
-            "name": f"{data_set}/{sequence_name(source)}",
-            "data_set": data_set,
-        }
-        lines = []
+        name, lines = f"{data_set}/{sequence_name(source)}", []
         with open_as_evreal(source, run) as sequence:
-            self.check_scored_range(source, sequence)
+            check_scored_range(sequence, self.rule.window, first_s, last_s)
             self.size = sequence.size
             for frame in score_sequence(
                 sequence, self.network, self.rule, bins=self.cfg.bins, start_s=first_s,
                 end_s=last_s, lpips=self.lpips, device=self.device,
             ):  # fmt: skip
-                lines.append({"sequence": facts["name"], **_line(frame)})
+                lines.append({"sequence": name, **_line(frame)})
                 if self.cfg.data.save_frames:
-                    _save(run / "frames" / facts["name"], frame)
+                    _save(run / "frames" / name, frame)
         if not lines:
             raise ValueError(f"{source}: no window ends within data.tolerance_ms of a frame")
         times = [line["time_s"] for line in lines]
-        facts |= {"frames": len(lines), "first_s": min(times), "last_s": max(times)}
-        names = [name for name in SCORES if name in lines[0]]
-        return facts | {name: _mean(line[name] for line in lines) for name in names}, lines
+        facts = {"name": name, "data_set": data_set, "frames": len(lines)}
+        facts |= {"first_s": min(times), "last_s": max(times)}
+        scores = [score for score in SCORES if score in lines[0]]
+        return facts | {score: _mean(line[score] for line in lines) for score in scores}, lines
 
     def build_score_row(self, clips: list[dict]) -> results.ScoreRow:
         """Return the scores with the network's cost for frames of the last sequence's size."""
@@ -115,7 +109,7 @@ class EvrealBenchmark:
             clips,
             params=sum(part.numel() for part in self.network.parameters()),
             macs_per_frame=macs,
-            latency_ms={f"{height}x{width}": milliseconds},
+            latency_ms_by_size={f"{height}x{width}": milliseconds},
         )
 
 
@@ -124,7 +118,7 @@ def _load_network(cfg: DictConfig) -> EventToVideoNetwork:
         raise ValueError("data=evreal needs postprocess=none and backward_warmup_s=0.0")
     if own := sorted(set(cfg.metrics) - set(build.SHIPPED_METRIC_KEYS)):
         raise ValueError(f"data=evreal has the metrics of its protocol only, got metrics.{own[0]}")
-    network = require_event_network(build.load_network(cfg))
+    network = require_event_network(build.load_ckpt_or_baseline(cfg))
     if network.views not in (None, 1):
         raise ValueError(f"ckpt must take one view for data=evreal, got one of {network.views}")
     return network.eval()
@@ -158,7 +152,7 @@ def find_scored_range(data: DictConfig, source: Path) -> tuple[str, float, float
 
 def _line(frame: ScoredFrame) -> dict:
     window = frame.evreal_window
-    facts = {"window": frame.window_index, "frame": window.camera_frame}
+    facts = {"window": frame.window_index, "frame": window.nearest_camera_frame}
     times = {"time_s": round(window.time_s, 6)}
     return facts | times | {"events": window.stop_event - window.first_event} | frame.scores
 
@@ -180,10 +174,6 @@ def average_by_data_set(clips: Sequence[Mapping[str, Any]]) -> dict[str, dict]:
             for name in SCORES if name in group[0]
         }  # fmt: skip
     return means
-
-
-def _format_scores(scores: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name.upper()} {scores[name]:.4f}" for name in SCORES if name in scores)
 
 
 def _save(folder: Path, frame: ScoredFrame) -> None:

@@ -14,12 +14,13 @@ from torchmetrics import Metric
 
 import src.models
 from baselines.postprocess import Postprocessed
+from src.app.hardware import uses_cuda_graphs
 from src.app.instantiate import (
-    allowed_packages,
     as_dict,
     build_part,
     check_contract,
     instantiate_node,
+    read_user_packages,
 )
 from src.app.simulation import build_large_crop_stream, build_pipeline
 from src.losses.terms import TrainingLoss
@@ -32,7 +33,7 @@ from src.sim.optics import Optics
 from src.training import evaluation
 from src.training.clip_cache import CachedPipeline
 from src.training.datamodule import LightFieldData
-from src.training.disk_cache import BackgroundFiller, DiskClipCache
+from src.training.disk_cache import CacheFillerProcess, DiskClipCache
 from src.training.ema import WeightEMA
 from src.training.progress import TrainingProgress
 from src.training.reconstructor import PostprocessorTraining, Reconstructor
@@ -44,6 +45,7 @@ DATA_OPTIONS = (
     "batch_size", "batch_reuse", "epoch_clips", "val_clips", "test_clips", "workers", "simulate_on",
 )  # fmt: skip
 SHIPPED_METRIC_KEYS = ("lpips", "resolution_scale")
+Trainable = EventToVideoNetwork | FramePostprocessor
 Method = TypeVar("Method", bound=VideoMethod)
 
 
@@ -66,7 +68,7 @@ def build_data_module(
         build_part(cfg, "augment") if train else None,
         **{name: cfg.data[name] for name in DATA_OPTIONS},
         seed=cfg.seed,
-        filler=BackgroundFiller(*on_disk) if on_disk else None,
+        filler=CacheFillerProcess(*on_disk) if on_disk else None,
         large=large,
         teachers=build_teachers(cfg, train.optics.views) if train and cfg.get("teachers") else None,
     )
@@ -79,7 +81,7 @@ def build_teachers(cfg: DictConfig, views: int) -> TeacherEnsemble:
     """
     networks = {}
     for name in [cfg.teachers] if isinstance(cfg.teachers, str) else cfg.teachers:
-        net = load_network_for_events(cfg, name, EventToVideoNetwork, "teachers must be networks")
+        net = load_network_of_kind(EventToVideoNetwork, cfg, name, "teachers must be networks")
         if net.views not in (None, views):
             raise ValueError(f"teachers must take optics.views={views}, {name} takes {net.views}")
         networks[name] = net
@@ -87,36 +89,36 @@ def build_teachers(cfg: DictConfig, views: int) -> TeacherEnsemble:
     return TeacherEnsemble(networks, cfg.distillation_cache, cfg.fps, rates)
 
 
-def load_network_for_events(cfg: DictConfig, name: str, kind: type[Method], asked: str) -> Method:
-    """Return the network `name`, as `ckpt` may name one; ValueError, which begins with `asked`,
-    where it is not there or no `kind`."""
+def load_network_of_kind(
+    kind: type[Method], cfg: DictConfig, weights: str, error_prefix: str
+) -> Method:
+    """Return the network of `weights`, a file or a name as of `ckpt`; ValueError where it is not
+    there or no `kind`."""
     try:
-        network = src.models.load(name, allowed_packages(cfg))
+        network = src.models.load(weights, read_user_packages(cfg))
     except ValueError as error:
-        raise ValueError(f"{asked}: {error}") from error
+        raise ValueError(f"{error_prefix}: {error}") from error
     if not isinstance(network, kind):
-        raise ValueError(f"{asked} for events, {name} is none")
+        raise ValueError(f"{error_prefix} for events, {weights} is none")
     return network
 
 
-def build_network_and_spec(
-    cfg: DictConfig,
-) -> tuple[EventToVideoNetwork | FramePostprocessor, dict]:
+def build_untrained_network(cfg: DictConfig) -> tuple[Trainable, dict]:
     """Return a fresh network and the plain dict (target, kwargs) that builds it again."""
     node = as_dict(cfg.model)
-    net = check_contract("model", instantiate_node(node, allowed_packages(cfg)))
+    net = check_contract("model", instantiate_node(node, read_user_packages(cfg)))
     target = node.pop("_target_")
     if isinstance(net, SetNet):  # the arguments that a preset stands for
         return net, {"target": target.removesuffix(".preset"), "kwargs": net.init_kwargs}
     return net, {"target": target, "kwargs": node}
 
 
-def load_network(cfg: DictConfig) -> VideoMethod:
+def load_ckpt_or_baseline(cfg: DictConfig) -> VideoMethod:
     """Return the network that `ckpt` or `baseline` names, in eval mode; ValueError for both."""
     if cfg.ckpt and cfg.get("baseline"):
         raise ValueError(f"ckpt must be null with baseline=..., got {cfg.ckpt}")
     if cfg.ckpt:
-        net = src.models.load(cfg.ckpt, allowed_packages(cfg))
+        net = src.models.load(cfg.ckpt, read_user_packages(cfg))
         if not isinstance(net, VideoMethod):
             use = f"baseline=frames postprocess=mambatm postprocess.postprocessor={cfg.ckpt}"
             raise ValueError(f"ckpt must be a network for events, got a post-processor; use {use}")
@@ -139,11 +141,11 @@ def method_name(cfg: DictConfig) -> str:
     return choices.get("baseline") or str(cfg.baseline._target_).rpartition(".")[2]
 
 
-def build_video_method(cfg: DictConfig) -> VideoMethod:
-    """Return the network of `load_network`, with the backward warm-up and the frame post-processor
-    that the config asks for.
+def load_method_with_postprocess(cfg: DictConfig) -> VideoMethod:
+    """Return the network of `ckpt` or `baseline`, with the backward warm-up and the frame
+    post-processor that the config asks for.
     """
-    net = load_network(cfg)
+    net = load_ckpt_or_baseline(cfg)
     if cfg.get("backward_warmup_s"):
         net = BackwardWarmup(net, cfg.backward_warmup_s)
     return build_part(cfg, "postprocess", source=net) if cfg.get("postprocess") else net
@@ -181,9 +183,7 @@ def build_loss(cfg: DictConfig) -> TrainingLoss:
     return TrainingLoss(terms)
 
 
-def build_reconstructor(
-    cfg: DictConfig, net: EventToVideoNetwork | FramePostprocessor, spec: dict
-) -> Reconstructor:
+def build_reconstructor(cfg: DictConfig, net: Trainable, spec: dict) -> Reconstructor:
     """Return the Lightning module that trains and tests `net`; with a `source`, on its frames."""
     data = cfg.data
     if not 0 <= data.loss_from < (windows := data.windows):
@@ -213,28 +213,16 @@ def build_reconstructor(
         loss_pairs=pairs,
         guard=StepGuard(cfg.loss_spike_factor, cfg.grad_clip_norm),
         clock=TrainingClock(cfg.train_clock),
-        cuda_graphs=_use_cuda_graphs(cfg),
+        cuda_graphs=uses_cuda_graphs(cfg),
         unscored_windows=data.unscored_windows,
     )
-
-
-def _use_cuda_graphs(cfg: DictConfig) -> bool:
-    """Return whether a step runs as CUDA graphs; raises ValueError where it should and cannot."""
-    if cfg.cuda_graphs not in ("auto", True, False):
-        raise ValueError(f"cuda_graphs must be one of auto, true, false, got {cfg.cuda_graphs}")
-    possible = cfg.trainer.accelerator != "cpu" and torch.cuda.is_available()
-    possible &= cfg.trainer.devices == 1 and not cfg.get("source")
-    if cfg.cuda_graphs is True and not possible:
-        where = "without a GPU, on several and for a post-processor"
-        raise ValueError(f"cuda_graphs must be auto or false {where}, got true")
-    return bool(cfg.cuda_graphs) and possible
 
 
 def build_trainer(cfg: DictConfig) -> lightning.Trainer:
     """Return the trainer with its loggers and callbacks."""
     # Part of trainer.deterministic that finds mistakes and changes no result, for 4 % of a step.
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
-    packages = allowed_packages(cfg)
+    packages = read_user_packages(cfg)
     loggers = [instantiate_node(node, packages) for node in cfg.logger.values()]
     callbacks = [instantiate_node(node, packages) for node in cfg.callbacks.values()]
     if cfg.ema_decay is not None:  # first, so that what the others see is of the same step

@@ -9,7 +9,7 @@ from torch import nn
 
 import src.models
 from baselines.postprocess import load_postprocessor
-from src.app.instantiate import allowed_packages, as_dict, build_part, instantiate_node
+from src.app.instantiate import as_dict, build_part, instantiate_node, read_user_packages
 from src.app.simulation import build_pipeline
 from src.bench.candidates import Candidate
 from src.models.network import EventToVideoNetwork
@@ -25,7 +25,7 @@ def load_candidates(cfg: DictConfig) -> list[Candidate]:
     what its `model` is, else one with nothing but the reason.  Raises ValueError for a `ckpt` or a
     `baseline` that cannot be loaded, and for entries that are none.
     """
-    packages = allowed_packages(cfg)
+    packages = read_user_packages(cfg)
     names = cfg.ckpt if isinstance(cfg.ckpt, ListConfig) else [cfg.ckpt] if cfg.ckpt else []
     loaded = {
         Path(name).stem if Path(name).suffix else name: src.models.load(name, packages)

@@ -19,52 +19,40 @@ from src.app.renamed_keys import describe_unknown_key, flatten_keys
 
 NUMBER, WHOLE, WORD, FLAG = "a number", "a whole number", "a word", "true or false"
 LIST, MAPPING, NULL = "a list", "a mapping", "null"
-KINDS: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys(
-        ("noise_filter_s", "train_hours", "grad_clip_norm", "ema_decay", "state_rounding_step",
-         "loss_spike_factor", "turbulence.wind_m_s", "turbulence.baseline_m",
-         "callbacks.learning_curve.interval_h", "data.max_grid_s", "data.start_s", "data.end_s"),
-        (NUMBER, NULL),
-    ),
-    **dict.fromkeys(
-        ("data.clips", "data.cache_clips", "data.loss_pairs", "dots.fit_radius_px", "last", "stem",
-         "longest_side_px"),
-        (WHOLE, NULL),
-    ),
-    **dict.fromkeys(
-        ("bins", "seed", "index", "clips", "processes", "port", "max_waiting_windows", "samples",
-         "first", "air.max_frames", "dots.rows", "dots.cols", "data.batch_size", "data.test_seed",
-         "data.batch_reuse", "data.epoch_clips", "data.windows", "data.substeps", "data.workers",
-         "data.test_windows", "data.test_clips", "data.val_clips", "data.unscored_windows",
-         "data.loss_from", "data.events_per_window", "optics.views", "width", "scene.height",
-         "scene.width", "sample_clips"),
-        (WHOLE,),
-    ),
-    **dict.fromkeys(("sensor_size", "resolution", "line", "circle", "spin"), (LIST, NULL)),
-    **dict.fromkeys(("videos", "offered_networks", "allowed_origins"), (LIST,)),
-    **dict.fromkeys(("teachers", "against", "chart:ckpt", "stress:ckpt"), (WORD, LIST, NULL)),
-    "train:start": (WORD, NULL),
-    "run": (WORD, LIST),
-    "names": (LIST, NULL),
-    "live:threads": (WHOLE,),
-    **dict.fromkeys(
-        ("calibrate:fps", "simulate:fps", "camera.tile_px", "white_level"), (NUMBER, NULL)
-    ),
-    "compare:still": (NUMBER, NULL),
-    "data.rates": (LIST, NULL),
-    "data.crop": (NUMBER, LIST, NULL),
-    "data.test_crop": (NUMBER, NULL),
-    **dict.fromkeys(
-        ("data.test_set", "data.grid_edges", "data.output_normalisation"), (WORD, NULL)
-    ),
-    "window_length": (WORD, NULL),
-    "form": (WORD, NULL),
-    "cuda_graphs": (WORD, FLAG),
-    "views_used": (WORD, WHOLE),
-    "trainer.precision": (WORD, NUMBER, NULL),
-    "trainer.devices": (NUMBER, WORD, LIST),
-    "trainer.deterministic": (WORD, FLAG),
-}  # fmt: skip
+KEYS: dict[tuple[str, ...], str] = {
+    (NUMBER, NULL): """
+        noise_filter_s train_hours grad_clip_norm ema_decay state_rounding_step
+        loss_spike_factor turbulence.wind_m_s turbulence.baseline_m
+        callbacks.learning_curve.interval_h data.max_grid_s data.start_s data.end_s
+        calibrate:fps simulate:fps camera.tile_px white_level compare:still data.test_crop
+    """,
+    (WHOLE, NULL): """
+        data.train_clips data.cache_clips data.loss_pairs dots.fit_radius_px last stem
+        longest_side_px
+    """,
+    (WHOLE,): """
+        bins seed index clips processes port max_waiting_windows samples first
+        air.max_frames dots.rows dots.cols data.batch_size data.test_seed data.batch_reuse
+        data.epoch_clips data.windows data.substeps data.workers data.test_windows
+        data.test_clips data.val_clips data.unscored_windows data.loss_from
+        data.events_per_window optics.views width scene.height scene.width sample_clips
+        live:threads
+    """,
+    (LIST, NULL): "sensor_size resolution line circle spin names data.rates",
+    (LIST,): "videos offered_networks allowed_origins",
+    (WORD, LIST, NULL): "teachers against chart:ckpt stress:ckpt",
+    (WORD, NULL): """
+        train:start data.test_set data.grid_edges data.output_normalisation window_length
+        form
+    """,
+    (WORD, LIST): "run",
+    (NUMBER, LIST, NULL): "data.crop",
+    (WORD, FLAG): "cuda_graphs trainer.deterministic",
+    (WORD, WHOLE): "views_used",
+    (WORD, NUMBER, NULL): "trainer.precision",
+    (NUMBER, WORD, LIST): "trainer.devices",
+}
+KINDS = {key: kinds for kinds, keys in KEYS.items() for key in keys.split()}
 # Parts whose own classes check whether a number, a range of numbers or null does.
 RANGES = ("augment.", "optics.", "own_sensor.", "scene.", "sensor.", "target.", "turbulence.")
 SIZES = ("sensor_size", "resolution", "camera.sensor_size")  # [height, width]
@@ -74,28 +62,36 @@ OPEN = ("callbacks", "logger", "loss", "networks", "references", "scene.parts", 
 
 def check_values(cfg: DictConfig) -> None:
     """Raise ValueError for a value of another kind than its key's, and for a key that is none."""
-    shipped = _shipped_config()
+    if (shipped := _shipped_config()) is None:
+        return
     entry_point = HydraConfig.get().job.name  # that of a sweep's config too
-    if shipped is not None:
-        given = OmegaConf.to_container(cfg, resolve=False)
-        _check_mapping(cast(dict, given), shipped, entry_point, _Config(cfg))
-
-
-class _Config:
-    """A config whose interpolations are resolved where they can be."""
-
-    def __init__(self, cfg: DictConfig):
-        self.cfg = cfg
-
-    def value(self, key: str) -> Any:
-        """Return a value as plain data; raises ValueError, which names the key, where what it
-        refers to is not there.
-        """
+    given, plain = (
+        cast(dict, OmegaConf.to_container(config, resolve=False)) for config in (cfg, shipped)
+    )
+    for key, value in _walk(given, plain):
+        if not _is_known(key, value, given, plain):
+            raise ValueError(describe_unknown_key(key, list(flatten_keys(plain))))
+        unresolved = _at(plain, key)
+        if isinstance(value, str) and "${" in value:
+            if value == unresolved:  # what it refers to is looked at there
+                continue
+            value = _resolve(cfg, key)
         try:
-            found = OmegaConf.select(self.cfg, key, throw_on_missing=False)
-        except OmegaConfBaseException as error:
-            raise ValueError(f"{key}: {error}") from error
-        return OmegaConf.to_container(found, resolve=False) if OmegaConf.is_config(found) else found
+            default = _resolve(shipped, key)
+        except ValueError:
+            default = None
+        _check_value(key, value, default, entry_point, is_required=unresolved == "???")
+
+
+def _resolve(cfg: DictConfig, key: str) -> Any:
+    """Return a value as plain data; raises ValueError, which names the key, where what it refers to
+    is not there.
+    """
+    try:
+        found = OmegaConf.select(cfg, key, throw_on_missing=False)
+    except OmegaConfBaseException as error:
+        raise ValueError(f"{key}: {error}") from error
+    return OmegaConf.to_container(found, resolve=False) if OmegaConf.is_config(found) else found
 
 
 def _shipped_config() -> DictConfig | None:
@@ -106,32 +102,12 @@ def _shipped_config() -> DictConfig | None:
         return None
     job, loader = HydraConfig.get(), GlobalHydra.instance().config_loader()
     parser = OverridesParser.create()
-    chosen = []
-    for line in job.overrides.task:
-        group = parser.parse_override(line).key_or_group
-        if loader.get_group_options(group):
-            chosen.append(line)
+    given = [(line, parser.parse_override(line).key_or_group) for line in job.overrides.task]
+    chosen = [line for line, group in given if loader.get_group_options(group)]
     shipped = loader.load_configuration(job.job.config_name, chosen, RunMode.RUN)
     OmegaConf.set_struct(shipped, False)
     shipped.pop("hydra", None)
     return shipped
-
-
-def _check_mapping(given: dict, shipped: DictConfig, entry_point: str, cfg: _Config) -> None:
-    defaults, plain = _Config(shipped), OmegaConf.to_container(shipped, resolve=False)
-    for key, value in _walk(given, cast(dict, plain)):
-        if not _is_known(key, value, given, cast(dict, plain)):
-            raise ValueError(describe_unknown_key(key, list(flatten_keys(plain))))
-        if isinstance(value, str) and "${" in value:
-            if value == _at(cast(dict, plain), key):  # what it refers to is looked at there
-                continue
-            value = cfg.value(key)
-        try:
-            default = defaults.value(key)
-        except ValueError:
-            default = None
-        is_required = _at(cast(dict, plain), key) == "???"
-        _check_value(key, value, default, entry_point, is_required)
 
 
 def _at(node: Any, key: str) -> Any:

@@ -6,17 +6,7 @@ import warnings
 from pathlib import Path
 from typing import TextIO
 
-NEAREST = {
-    "•": "*",
-    "…": "...",
-    "—": "-",
-    "–": "-",
-    "━": "-",
-    "╸": "-",
-    "╺": "-",
-    "↑": "^",
-    "↓": "v",
-}
+NEAREST = {"…": "..."} | dict(zip("•—–━╸╺↑↓", "*-----^v", strict=True))
 
 
 def prepare_streams() -> None:

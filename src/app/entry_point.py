@@ -27,7 +27,7 @@ from src.app.compose import CONF, describe_config_error
 from src.app.config_values import check_values
 from src.app.help import help_text
 from src.app.path_overrides import name_job_folder, quote_paths, unquote_override
-from src.app.renamed_keys import check_keys, check_overrides
+from src.app.renamed_keys import refuse_renamed_keys, refuse_renamed_overrides
 from src.records import results, tracking
 
 FAILURE_FILE = "failed.txt"  # in the folder of a sweep's job: why it failed
@@ -76,7 +76,7 @@ def run_main(main: Callable[[], None]) -> None:
     console.prepare_streams()
     sys.argv[1:] = quote_paths(sys.argv[1:], Path(sys.argv[0]).stem)
     try:
-        check_overrides(sys.argv[1:])
+        refuse_renamed_overrides(sys.argv[1:])
         main()
     except JobFailed as error:
         _print_failed_jobs(Path(str(error)), start)
@@ -103,7 +103,7 @@ def run_job(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:
 
     A job of a sweep is skipped where its results stand; its error is stored.
     """
-    check_keys(cfg)
+    refuse_renamed_keys(cfg)
     job = HydraConfig.get()
     cfg.paths.run = job.runtime.output_dir
     check_values(cfg)
@@ -148,22 +148,22 @@ def resolved_yaml(cfg: DictConfig) -> str:
     return OmegaConf.to_yaml(cfg, resolve=True)
 
 
-def run_metadata(cfg: DictConfig, start: float) -> dict:
-    """Return what `results.json` says of a run besides its numbers; `start` by perf_counter."""
+def run_metadata(cfg: DictConfig, perf_counter_start_s: float) -> dict:
+    """Return what `results.json` says of a run besides its numbers."""
     gpu = cfg.trainer.accelerator == "gpu" and torch.cuda.is_available()
     cpu = f"cpu, {torch.get_num_threads()} threads"
     return {
         "task": cfg.task,
         "experiment": cfg.name,
         "seed": cfg.seed,
-        "asked": command_line(),
+        "asked": describe_hydra_command(),
         "resumed_from": cfg.ckpt if cfg.task == "train" else None,
-        "wall_s": round(time.perf_counter() - start, 1),
+        "wall_s": round(time.perf_counter() - perf_counter_start_s, 1),
         "device": torch.cuda.get_device_name() if gpu else cpu,
     }
 
 
-def command_line() -> dict:
+def describe_hydra_command() -> dict:
     """Return the config, group choices and overrides of the command line; {} without one."""
     if not HydraConfig.initialized():
         return {}

@@ -1,4 +1,4 @@
-"""Threads, freed memory and precision, chosen for the machine that a run is on."""
+"""Threads, freed memory, precision and CUDA graphs, chosen for the machine that a run is on."""
 
 import ctypes
 import os
@@ -34,6 +34,18 @@ def fill_in_precision(cfg: DictConfig) -> None:
     if cfg.trainer.precision is None:
         fast_bf16 = cfg.trainer.accelerator != "cpu" or is_bf16_faster()
         cfg.trainer.precision = "bf16-mixed" if fast_bf16 else "32-true"
+
+
+def uses_cuda_graphs(cfg: DictConfig) -> bool:
+    """Return whether a step runs as CUDA graphs; raises ValueError where it should and cannot."""
+    if cfg.cuda_graphs not in ("auto", True, False):
+        raise ValueError(f"cuda_graphs must be one of auto, true, false, got {cfg.cuda_graphs}")
+    possible = cfg.trainer.accelerator != "cpu" and torch.cuda.is_available()
+    possible &= cfg.trainer.devices == 1 and not cfg.get("source")
+    if cfg.cuda_graphs is True and not possible:
+        where = "without a GPU, on several and for a post-processor"
+        raise ValueError(f"cuda_graphs must be auto or false {where}, got true")
+    return bool(cfg.cuda_graphs) and possible
 
 
 def check_device(device: str) -> None:

@@ -4,7 +4,7 @@
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, Protocol, cast
 
 from hydra.errors import InstantiationException
@@ -12,7 +12,7 @@ from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from baselines.published import load_pretrained
-from src import HOME, importable_name
+from src import HOME, add_package_prefix
 from src.models.network import EventToVideoNetwork, FramePostprocessor, VideoMethod
 from src.models.setnet import SetNet
 from src.sim.scenes.clip import Scene
@@ -37,7 +37,7 @@ CONTRACTS: dict[str, tuple[type, ...]] = {  # key of the config: what its object
 }
 
 
-def allowed_packages(cfg: DictConfig) -> tuple[str, ...]:
+def read_user_packages(cfg: DictConfig) -> tuple[str, ...]:
     """Return the user's packages whose classes this config may name too.
 
     Raises ValueError for an `allowed_packages` that is no list of package names.
@@ -55,7 +55,7 @@ def build_part(cfg: DictConfig, key: str, **kwargs) -> Any:
     Raises ValueError as `instantiate_node` does, and for a class that lacks what `key` needs.
     """
     node = OmegaConf.select(cfg, key)
-    return check_contract(key, instantiate_node(node, allowed_packages(cfg), **kwargs))
+    return check_contract(key, instantiate_node(node, read_user_packages(cfg), **kwargs))
 
 
 def as_dict(node: Any) -> dict[str, Any]:
@@ -88,39 +88,27 @@ def instantiate_node(node: Any, extra_packages: Sequence[str] = (), **kwargs) ->
     plain = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
     if not isinstance(plain, dict) or "_target_" not in plain:
         raise ValueError(f"a part of the config must name its class (_target_), got {plain}")
-    for target in _find_targets(plain):
-        _check_target(target, extra_packages)
+    named = _import_targets(plain, extra_packages)
     try:
-        return instantiate(_rename_targets(plain) if HOME else node, _convert_="all", **kwargs)
+        return instantiate(named, _convert_="all", **kwargs)
     except InstantiationException as error:
         if isinstance(error.__cause__, ValueError):
             raise error.__cause__ from None
         raise ValueError(f"{plain['_target_']} takes no such values: {error.__cause__}") from error
 
 
-def _find_targets(node: Any) -> Iterator[str]:
-    """Yield every `_target_` in nested dicts and lists."""
+def _import_targets(node: Any, packages: Sequence[str]) -> Any:
+    """Return nested dicts and lists with every `_target_`, once checked, as it is imported."""
     if isinstance(node, dict):
-        yield from (str(value) for key, value in node.items() if key == "_target_")
-    if isinstance(node, dict | list):
-        for value in node.values() if isinstance(node, dict) else node:
-            yield from _find_targets(value)
+        named = {name: _import_targets(value, packages) for name, value in node.items()}
+        if "_target_" in node:
+            named["_target_"] = _check_target(str(node["_target_"]), packages)
+        return named
+    return [_import_targets(value, packages) for value in node] if isinstance(node, list) else node
 
 
-def _rename_targets(node: Any) -> Any:
-    """Return nested dicts and lists with every `_target_` as it is imported."""
-    if isinstance(node, dict):
-        renamed = {name: _rename_targets(value) for name, value in node.items()}
-        return (
-            renamed | {"_target_": importable_name(node["_target_"])}
-            if "_target_" in node
-            else renamed
-        )
-    return [_rename_targets(value) for value in node] if isinstance(node, list) else node
-
-
-def _check_target(target: str, packages: Sequence[str]) -> None:
-    """Raise ValueError unless `target` is a class that an allowed package defines.
+def _check_target(target: str, packages: Sequence[str]) -> str:
+    """Return the name to import; raises ValueError unless it is a class of an allowed package.
 
     A name alone says little: `torch.optim.adam.torch.load` begins like an optimiser.
     """
@@ -132,10 +120,11 @@ def _check_target(target: str, packages: Sequence[str]) -> None:
     if not target.startswith(("src.", "baselines.", "torch.optim.", "lightning.", *own)):
         raise ValueError(refusal)
     try:
-        named = get_object(importable_name(target))
+        named = get_object(imported := add_package_prefix(target))
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f"_target_ must name a class, got {target}") from error
     module = f"{getattr(named, '__module__', '')}.".removeprefix(HOME)
     defined_here = isinstance(named, type) and module.startswith(ALLOWED_PACKAGES + own)
     if named not in FACTORIES and not defined_here and not module.startswith(FUNCTIONS):
         raise ValueError(refusal)
+    return imported

@@ -4,7 +4,7 @@ import math
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -31,11 +31,6 @@ FREE_BYTES = 1 << 28  # that are left on the disk
 Progress = Callable[[range, str], Iterable[int]]
 
 
-def without_progress(parts: range, name: str) -> Iterable[int]:
-    """Return `parts`: nothing is printed."""
-    return parts
-
-
 @dataclass(frozen=True)
 class SimulatedPart:
     """Those of the clip's own frames that a part of the simulated ones holds: `clean` (n, h, w) and
@@ -47,7 +42,6 @@ class SimulatedPart:
     tilt: Tensor
 
 
-@dataclass(eq=False)
 class OwnSimulation:
     """What the config `cfg` makes of `clip`: turbulence and sensor are drawn from its seed.
 
@@ -55,28 +49,22 @@ class OwnSimulation:
     range.
     """
 
-    cfg: DictConfig
-    clip: OwnClip
-    substeps: int = field(init=False)
-    optics: Optics = field(init=False)
-
-    def __post_init__(self) -> None:
-        cfg, least = self.cfg, self.cfg.least_simulated_fps
+    def __init__(self, cfg: DictConfig, clip: OwnClip):
+        least = cfg.least_simulated_fps
         if not 0 < least <= 1e5:
             raise ValueError(f"least_simulated_fps must be in (0, 1e5], got {least}")
-        self.substeps = max(1, math.ceil(round(least / self.clip.fps, 6)))
-        self.optics = build_part(cfg, "optics")
+        self.cfg, self.clip = cfg, clip
+        self.substeps = max(1, math.ceil(round(least / clip.fps, 6)))
+        self.optics: Optics = build_part(cfg, "optics")
         self.key = noise.key(cfg.seed, "own material", cfg.index)
         self.sensor: Any = build_sensor(cfg, cfg.seed).draw(self.key)
 
     @property
-    def fps(self) -> float:
-        """Rate of the simulated frames."""
+    def simulated_fps(self) -> float:
         return self.clip.fps * self.substeps
 
     @property
-    def frames(self) -> int:
-        """Number of simulated frames."""
+    def simulated_frame_count(self) -> int:
         return (len(self.clip.frames) - 1) * self.substeps + 1
 
     @cached_property
@@ -85,59 +73,55 @@ class OwnSimulation:
         drawn = model.draw(noise.generator(noise.key(self.key, "atmosphere")))
         height, width = self.clip.size
         size = {"height": height, "width": width}
-        return model.operator(drawn, views=self.optics.positions, fps=self.fps, **size)
+        return model.operator(drawn, views=self.optics.positions, fps=self.simulated_fps, **size)
 
     def drawn_parameters(self) -> dict[str, Any]:
         """Return what was drawn."""
         own = {"name": self.clip.name, "threshold": self.sensor.threshold}
-        return own | {"simulated_fps": self.fps} | dict(self.turbulence.metadata)
+        return own | {"simulated_fps": self.simulated_fps} | dict(self.turbulence.metadata)
 
     def describe(self) -> str:
         """Return size, rate, frames, turbulence and threshold in one line."""
-        (height, width), drawn = self.clip.size, self.drawn_parameters()
+        (height, width), drawn, fps = self.clip.size, self.drawn_parameters(), self.simulated_fps
         light = "decoded from sRGB" if decodes_srgb(self.cfg) else "taken as intensity"
         return (
             f"{self.clip.name}: {self.clip.source}; simulated as {self.optics.views} views of "
-            f"{width}x{height} px at {self.fps:.6g} frames/s; turbulence {drawn['severity']}"
+            f"{width}x{height} px at {fps:.6g} frames/s; turbulence {drawn['severity']}"
             f"{describe_turbulence(drawn)}; code values {light}, contrast threshold "
             f"{self.sensor.threshold:.3f}"
         )
 
     def simulate_parts(
-        self, views: Float[Tensor, "views frames h w"], progress: Progress = without_progress
+        self, views: Float[Tensor, "views frames h w"], progress: Progress = lambda parts, _: parts
     ) -> Iterator[SimulatedPart]:
         """Yield the clip part by part, and write what all views see, light, to `views`."""
-        starts = range(0, self.frames, self._frames_per_part())
-        spans = [(first, min(first + starts.step, self.frames)) for first in starts]
+        count = self.simulated_frame_count
+        starts = range(0, count, max(1, PART_BYTES // (4 * views[:, 0].numel())))
+        spans = [(first, min(first + starts.step, count)) for first in starts]
         blended = (self.clip.interpolate_frames(*span, self.substeps) for span in spans)
-        seen = self._see(self._to_light(part) for part in blended)
+        is_srgb = decodes_srgb(self.cfg)
+        seen = self._see(map(decode_srgb, blended) if is_srgb else blended)
         for number in progress(range(len(spans)), "turbulence"):
             (first, stop), (lights, tilt) = spans[number], next(seen)
             views[:, first:stop] = lights
             own = slice(-first % self.substeps, None, self.substeps)
-            codes = encode_srgb(lights[:, own]) if decodes_srgb(self.cfg) else lights[:, own]
+            codes = encode_srgb(lights[:, own]) if is_srgb else lights[:, own]
             yield SimulatedPart(
                 self.clip.interpolate_frames(first, stop, self.substeps)[own], codes, tilt[:, own]
             )
-
-    def _frames_per_part(self) -> int:
-        numbers = self.optics.views * math.prod(self.clip.size)
-        return max(1, PART_BYTES // (4 * numbers))
-
-    def _to_light(self, clean: Tensor) -> Tensor:
-        return decode_srgb(clean) if decodes_srgb(self.cfg) else clean
 
     def _see(self, parts: Iterable[Tensor]) -> Iterator[tuple[Tensor, Tensor]]:
         """Yield what all views see of each part, and its tilt; classes that know the contract only
         are asked for all frames at once.
         """
         operator, key = self.turbulence, noise.key(self.key, "turbulence")
+        count = self.simulated_frame_count
         if isinstance(operator, Turbulence):
-            yield from operator.degrade_parts(parts, self.frames, noise.generator(key))
+            yield from operator.degrade_parts(parts, count, noise.generator(key))
             return
         clean = list(parts)
         views = operator.degrade(torch.cat(clean)[None], noise.generator(key))[0]
-        tilt = operator.tilt(self.frames, noise.generator(key))
+        tilt = operator.tilt(count, noise.generator(key))
         sizes = [len(part) for part in clean]
         yield from zip(views.split(sizes, 1), tilt.split(sizes, 1), strict=True)
 
@@ -145,7 +129,7 @@ class OwnSimulation:
         """Return float16 memory for all views, in a file of `folder` that vanishes when it is no
         longer used.  Raises ValueError where the disk has no room for it and for what comes.
         """
-        shape = (self.optics.views, self.frames, *self.clip.size)
+        shape = (self.optics.views, self.simulated_frame_count, *self.clip.size)
         needed = 2 * math.prod(shape) + FREE_BYTES
         needed += 2 * math.prod(shape) // self.substeps  # of the truth, at most about
         free = shutil.disk_usage(folder).free

@@ -13,7 +13,7 @@ from pathlib import Path
 # Keys whose values are files, folders, weights or free text; of a dotted key its last word.
 PATH_KEYS = frozenset({
     "against", "allowed_origins", "backbone_weights", "cache_root", "ckpt", "corners",
-    "distillation_cache", "export", "into", "like", "measured", "name", "names",
+    "distillation_cache", "export", "footage", "into", "like", "measured", "name", "names",
     "offered_networks", "out", "photo", "postprocessor", "published", "recording",
     "reference_images", "root", "run", "save", "save_dir", "teachers", "title",
     "extra_train_root", "video", "video_root", "videos", "weights", "write",
@@ -40,17 +40,13 @@ def unquote(value: str) -> str:
     """Return the text of a quoted value, any other as it is."""
     if not QUOTED.fullmatch(value):
         return value
-    return re.sub(rf"(\\+)(?={value[0]}|$)", _halve, value[1:-1])
+    return re.sub(rf"(\\+)(?={value[0]}|$)", lambda f: f[1][: len(f[1]) // 2], value[1:-1])
 
 
 def unquote_override(override: str) -> str:
     """Return `key=value` with the value as `quote_paths` found it."""
     key, equals, value = override.partition("=")
     return f"{key}{equals}{unquote(value)}"
-
-
-def _halve(found: re.Match) -> str:
-    return found[1][: len(found[1]) // 2]
 
 
 def is_path_key(key: str, entry_point: str) -> bool:
@@ -121,9 +117,9 @@ def name_job_folder(overrides: Iterable[str]) -> str:
     """Return the overrides of a sweep's job as the name of one folder, at most MAX_FOLDER_BYTES:
     `experiment-lf3x3_seed-0`, so that it may be given as ckpt= without quotes.
 
-    Longer ones have the last words of the keys, or the values alone.  Different overrides have
-    different names: where a name could stand for others too, or is not whole, a hash of the
-    overrides ends it.
+    Longer ones have the last words of the keys, the values alone, or their ends.  Different
+    overrides have different names: where a name could stand for others too, or is not whole, a hash
+    of the overrides ends it.
     """
     pairs = [override.partition("=")[::2] for override in sorted(overrides)]
     pairs = [(key, _as_typed(value)) for key, value in pairs if key != "paths.out"]
@@ -133,9 +129,10 @@ def name_job_folder(overrides: Iterable[str]) -> str:
     if not (others or signs or len(name.encode()) > MAX_FOLDER_BYTES):
         return name
     shorter = _join_for_folder(f"{key.split('.')[-1]}={value}" for key, value in pairs)
-    values, room = _join_for_folder(value for _, value in pairs), MAX_FOLDER_BYTES - 9
-    fitting = [text for text in (name, shorter, values) if len(text.encode()) <= room]
-    kept = [*fitting, values.encode()[:room].decode(errors="ignore")][0]
+    ends = (_join_for_folder(value[-most:] for _, value in pairs) for most in (250, 40, 20, 10, 5))
+    room = MAX_FOLDER_BYTES - 9
+    fitting = (text for text in (name, shorter, *ends) if len(text.encode()) <= room)
+    kept = next(fitting, name.encode()[:room].decode(errors="ignore"))
     return f"{kept}_{hashlib.sha256(repr(pairs).encode()).hexdigest()[:8]}"
 
 

@@ -15,7 +15,6 @@ from src.app.compose import compose_config, config_choices
 from src.app.own_simulation import OwnSimulation, read_own_clip, set_own_sensor
 from src.sim.optics import Position, view_id
 from src.sim.scenes import own_material
-from src.sim.scenes.own_material import OwnClip
 from src.sim.scenes.video_files import PICTURE_SUFFIXES
 
 VIEW_EVENT = np.dtype(
@@ -81,8 +80,7 @@ def simulate(
 
 def simulate_clip(work: OwnSimulation) -> SimulatedClip:
     """Return all that `work` makes."""
-    clip: OwnClip = work.clip
-    shape, count = clip.size, len(clip.frames)
+    clip, count, shape = work.clip, len(work.clip.frames), work.clip.size
     clean = np.empty((count, *shape), np.float32)
     views = np.empty((work.optics.views, count, *shape), np.float32)
     tilt = np.empty((work.optics.views, count, 2, *shape), np.float32)
@@ -91,20 +89,19 @@ def simulate_clip(work: OwnSimulation) -> SimulatedClip:
         at = slice(first, first + len(part.clean))
         clean[at], views[:, at], tilt[:, at] = part.clean, part.views, part.tilt
         first = at.stop
-    events, positions = detect_events(work, seen), work.optics.positions
+    events, positions = simulate_all_view_events(work, seen), work.optics.positions
     return SimulatedClip(clean, views, tilt, events, clip.fps, positions, work.drawn_parameters())
 
 
-def detect_events(work: OwnSimulation, views: Float[Tensor, "views frames h w"]) -> np.ndarray:
+def simulate_all_view_events(
+    work: OwnSimulation, views: Float[Tensor, "views frames h w"]
+) -> np.ndarray:
     """Return the events of all views in order of time."""
     parts = []
     for index, position in enumerate(work.optics.positions):
         light, place = views[index].float(), {"clip": work.key, "view": view_id(position)}
-        own = work.sensor.events(light, work.fps, **place)
-        part = np.empty(len(own), VIEW_EVENT)
-        for name in "txyp":
-            part[name] = own[name]
-        part["view"] = index
-        parts.append(part)
+        own = work.sensor.events(light, work.simulated_fps, **place)
+        parts.append(np.empty(len(own), VIEW_EVENT))
+        parts[-1][[*"txyp"]], parts[-1]["view"] = own[[*"txyp"]], index
     events = np.concatenate(parts)
     return events[np.argsort(events["t"], kind="stable")]

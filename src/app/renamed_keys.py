@@ -59,7 +59,7 @@ def _ask_for_nearest(name: str, names: Collection[str], start: int = 0) -> str:
     return f"; did you mean {name[:start]}{near[0]}?" if near else ""
 
 
-def check_overrides(arguments: Iterable[str]) -> None:
+def refuse_renamed_overrides(arguments: Iterable[str]) -> None:
     """Raise ValueError for a former key or choice among the overrides of a command line."""
     for argument in arguments:
         name, _, value = argument.lstrip("+~").partition("=")
@@ -69,7 +69,7 @@ def check_overrides(arguments: Iterable[str]) -> None:
                 raise ValueError(explanation)
 
 
-def check_keys(cfg: DictConfig) -> None:
+def refuse_renamed_keys(cfg: DictConfig) -> None:
     """Raise ValueError for a former key in `cfg`, such as one of a user's config file."""
     for key in flatten_keys(_drop_other_classes(OmegaConf.to_container(cfg, resolve=False))):
         if explanation := describe_renaming(key):

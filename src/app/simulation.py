@@ -42,7 +42,7 @@ def build_pipeline(cfg: DictConfig, split: str, optics: Optics | None = None) ->
     """Return the simulation of one split: train, val or test; `optics`: others than `cfg`'s."""
     optics, test = optics or build_part(cfg, "optics"), "" if split == "train" else "test_"
     windows, crop = _count(cfg, f"data.{test}windows"), _side(cfg, f"data.{test}crop")
-    clips = None if test or cfg.data.clips is None else _count(cfg, "data.clips")
+    clips = None if test or cfg.data.train_clips is None else _count(cfg, "data.train_clips")
     if test or cfg.data.get("cache_clips") is None:
         return _build_uncached_pipeline(cfg, split, optics, windows, crop, clips)
     return CachedPipeline(

@@ -10,8 +10,6 @@ from src.app.instantiate import as_dict
 from src.models import files
 from src.models.network import VideoMethod
 
-FROM_NOTHING = (None, "none")
-
 
 def set_model_from_start_weights(cfg: DictConfig) -> Path | None:
     """Return the file that `start` names, None for a training from nothing, and make `cfg.model`
@@ -20,9 +18,12 @@ def set_model_from_start_weights(cfg: DictConfig) -> Path | None:
     An E2VID on one view is given those of `optics`.  Raises ValueError for a file that is not there
     or holds weights of another class, number of bins or number of views.
     """
-    if cfg.start in FROM_NOTHING:
+    if cfg.start in (None, "none"):
         return None
-    path = _find_file(cfg.start)
+    path = files.locate(cfg.start)
+    if not path.is_file() or not files.is_weights_file(path):
+        where = f"weights/ ({files.list_shipped()})"
+        raise ValueError(f"start must be none, one of {where} or a file, got {cfg.start}")
     try:
         spec = files.read_network_spec(path)
     except ValueError as error:
@@ -42,7 +43,7 @@ def set_model_from_start_weights(cfg: DictConfig) -> Path | None:
     return path
 
 
-def describe_start_weights(cfg: DictConfig, path: Path | None) -> str:
+def label_before_training(cfg: DictConfig, path: Path | None) -> str:
     """Return what the table calls the network before its training."""
     if path is None:
         return "untrained"
@@ -59,19 +60,11 @@ def load_reference_networks(cfg: DictConfig) -> dict[str, VideoMethod]:
     """
     networks, views = {}, cfg.optics.views
     for name, weights in as_dict(cfg.references).items():
-        asked = f"references.{name} must be a network"
-        network = build.load_network_for_events(cfg, weights, VideoMethod, asked)
+        prefix = f"references.{name} must be a network"
+        network = build.load_network_of_kind(VideoMethod, cfg, weights, prefix)
         if network.views not in (None, views):
             wanted = f"optics.views={network.views}, got {views}"
             warnings.warn(f"references.{name} is left out: it takes {wanted}", stacklevel=2)
             continue
         networks[name] = network
     return networks
-
-
-def _find_file(name: str) -> Path:
-    path = files.locate(name)
-    if not path.is_file() or not files.is_weights_file(path):
-        where = f"weights/ ({files.list_shipped()})"
-        raise ValueError(f"start must be none, one of {where} or a file, got {name}")
-    return path

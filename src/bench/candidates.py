@@ -48,26 +48,24 @@ class Candidate:
         return voxels[:, [positions.index(place) for place in chosen]], chosen
 
     @torch.no_grad()
-    def step(
-        self, voxels: Tensor, state: Any, positions: Sequence[Position], window_s: float
-    ) -> tuple[Float[Tensor, "1 1 h w"], Any]:
-        """Return the frame of one window, float32 in [0, 1], and the state."""
-        frame, state = self.loaded(voxels, state, window_s=window_s, positions=positions)
-        return frame.float().clamp(0, 1), state
-
     def reconstruct(
         self, windows: Iterable[Float[Tensor, "1 views bins h w"]], positions: Sequence[Position],
         window_s: float, state: Any = None,
     ) -> tuple[Float[Tensor, "windows 1 h w"], Any]:  # fmt: skip
-        """Return the frames of `windows`, one by one, and the state after them."""
+        """Return the frames of `windows`, one by one, float32 in [0, 1], post-processed as one
+        video, and the state after them.
+        """
         frames = []
         for voxels in windows:
             chosen, places = self.select_views(voxels, positions)
-            frame, state = self.step(chosen, state, places, window_s)
-            frames.append(frame)
-        return torch.cat(frames), state
+            frame, state = self.loaded(chosen, state, window_s=window_s, positions=places)
+            frames.append(frame.float().clamp(0, 1))
+        video = torch.cat(frames)
+        if self.postprocessor is not None:
+            video = self.postprocessor.restore(video[None])[0]
+        return video, state
 
-    def require_parameters(self, consequence: str) -> None:
+    def require_float_parameters(self, consequence: str) -> None:
         """Raise ValueError, with its `consequence`, unless it has parameters to differentiate."""
         if not any(p.is_floating_point() for p in self.loaded.parameters()):
             raise ValueError(f"it has no parameters, {consequence}")

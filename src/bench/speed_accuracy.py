@@ -11,7 +11,7 @@ import torch
 from src.bench.candidates import Candidate
 from src.bench.speed import FORMS, SpeedMeasurement
 from src.deploy.forms import convert_to_form
-from src.metrics.table import METRICS, NAMES, make_user_metric_column
+from src.metrics.table import METRICS, NAMES, Column
 from src.metrics.video_metrics import VideoMetrics
 from src.records.results import format_csv
 from src.sim.pipeline import Pipeline, simulate
@@ -71,18 +71,16 @@ def score_accuracy(
             truth = sample.target[0, warmup:]
             for form, candidate in variants:
                 frames, _ = candidate.reconstruct(windows, list(sample.positions or ()), window_s)
-                if (post := candidate.postprocessor) is not None:
-                    frames = post.restore(frames[None])[0]
                 values = measure(frames[warmup:], truth)
                 scores.append(ClipScore(candidate.name, form, severity, clip, values))
         print(f"scored on {severity} turbulence")
     return scores
 
 
-def find_pareto_front(points: Mapping[Name, tuple[float, float]]) -> list[Name]:
+def find_pareto_front(costs_and_errors: Mapping[Name, tuple[float, float]]) -> list[Name]:
     """Return the names, cheapest first, of the (cost, error) that none beats in both."""
     names, least = [], math.inf
-    for name, (_, error) in sorted(points.items(), key=lambda item: item[1]):
+    for name, (_, error) in sorted(costs_and_errors.items(), key=lambda item: item[1]):
         if error < least:
             names.append(name)
             least = error
@@ -129,7 +127,7 @@ def format_chart_summary(
     """Return the recommended networks and a table of means over all clips, as Markdown."""
     values = scores[0].values if scores else {}
     metrics = [metric for metric in METRICS if metric.name in values]
-    metrics += [make_user_metric_column(name, 0) for name in values if name not in NAMES]
+    metrics += [Column(name, name, 3) for name in values if name not in NAMES]
     heads = [metric.heading for metric in metrics]
     lines = ["# Speed against accuracy\n"]
     lines += [f"- {severity} turbulence: take {name}." for severity, name in recommended.items()]

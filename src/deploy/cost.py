@@ -3,7 +3,7 @@
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -42,12 +42,12 @@ def count_macs(work: Callable[[], object]) -> int:
 
 
 class Timing(NamedTuple):
-    """Milliseconds of a frame, median and least of `frames`; `clock`: thread or wall."""
+    """Milliseconds of a frame, median and least of `frames`."""
 
     median_ms: float
     least_ms: float
     frames: int
-    clock: str
+    clock: Literal["thread", "wall"]
 
 
 def select_timing_clock(threads: int, device: torch.device | str = "cpu") -> Callable[[], float]:
@@ -100,5 +100,5 @@ def time_frame(
             state = advance(state)
             times.append(1e3 * (now() - start))
     times.sort()
-    clock = "thread" if now is time.thread_time else "wall"
+    clock: Literal["thread", "wall"] = "thread" if now is time.thread_time else "wall"
     return Timing(times[len(times) // 2], times[0], len(times), clock)

@@ -33,7 +33,7 @@ class Int8Conv(nn.Module):
         self.weight, self.bias = conv.weight.detach().float(), conv.bias.detach().float()
         self.scale = self.weight.abs().amax((1, 2, 3)).clamp_min(1e-12) / WEIGHT_LEVELS
         self.zeros = torch.zeros(len(self.scale), dtype=torch.int32)
-        self.padding = int(conv.padding[0])
+        self.padding = conv.padding
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n o _h _w"]:
         weight = torch.fake_quantize_per_channel_affine(
@@ -41,5 +41,5 @@ class Int8Conv(nn.Module):
         )
         step = MAX_ACTIVATION / ACTIVATION_LEVELS
         seen = torch.fake_quantize_per_tensor_affine(x.float(), step, 0, 0, ACTIVATION_LEVELS)
-        seen = functional.pad(seen, (self.padding,) * 4, mode="replicate")
+        seen = functional.pad(seen, (int(self.padding[0]),) * 4, mode="replicate")
         return functional.conv2d(seen, weight, self.bias).to(x.dtype)

@@ -35,7 +35,7 @@ def is_installed() -> bool:
     return find_spec("openvino") is not None
 
 
-def best_dtype() -> torch.dtype:
+def fastest_dtype() -> torch.dtype:
     """Return what to compute in here: bfloat16, or float32 on a CPU that is no faster in it.
 
     Raises ValueError, saying how to get it, without the package.
@@ -107,7 +107,7 @@ class OpenVinoNetwork(EventToVideoNetwork):
 
     def __init__(self, network: EventToVideoNetwork):
         super().__init__()
-        dtype = best_dtype()
+        dtype = fastest_dtype()
         # Weights are read in the order in which they lie.
         self.inner = inference_copy(network).to(dtype)
         self.inner.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]

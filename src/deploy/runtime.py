@@ -17,11 +17,10 @@ from torch import nn
 from src.deploy import openvino_network
 from src.deploy.cpu_features import is_bf16_faster
 from src.deploy.engines import events_numba as kernels
-from src.deploy.first_layer import DTYPES, EventFirstLayer
+from src.deploy.first_layer import E2VIDOverEvents
 from src.deploy.int8 import quantise_decoder_conv
-from src.deploy.remaining_layers import E2VIDRemainder, EagerBackend, StatefulRunner
-from src.deploy.setnet_clock import SetNetEvents
 from src.deploy.setnet_tiles import SetNetTiles
+from src.deploy.tile_batches import EagerBackend
 from src.models.e2vid import E2VID
 from src.models.folding import inference_copy
 from src.models.setnet import SetNet
@@ -30,13 +29,7 @@ from src.sim.optics import Position
 FORMS = ("float32", "bf16", "openvino")
 SIDE_MULTIPLE = 8  # sides are padded to it by reflection, as the networks do
 MIN_SIDE = 8  # side that can be padded so
-EVENT_ERRORS = {
-    kernels.BACKWARDS: "be in order of time",
-    kernels.OFF_SENSOR: "have x in 0..{w} and y in 0..{h}",
-    kernels.NO_VIEW: "have view in 0..{views}, an index into positions",
-    kernels.NO_NUMBER: "have finite t and p",
-    kernels.NO_SIGN: "have p in -1, 1 (or weights, as floats)",
-}
+DTYPES = (np.float64, np.int64, np.int64, np.float32, np.int64)  # of t, x, y, p, view
 
 
 def fastest_form() -> str:
@@ -86,22 +79,20 @@ class EventListRuntime:
         self.padding = [(more // 2, more - more // 2) for more in missing]
         padded = height + sum(self.padding[0]), width + sum(self.padding[1])
         dtype = {"float32": torch.float32, "bf16": torch.bfloat16}.get(form)
-        dtype = openvino_network.best_dtype() if dtype is None else dtype
+        dtype = openvino_network.fastest_dtype() if dtype is None else dtype
         copied = inference_copy(network).cpu()
         backend = openvino_network.CompiledModule if form == "openvino" else EagerBackend
-        self.first_layer: EventFirstLayer | SetNetEvents
-        self.runner: StatefulRunner | SetNetTiles
+        self.runner: E2VIDOverEvents | SetNetTiles
         if isinstance(copied, SetNet):
             where = copied.checked_positions(self.views, copied.bins, positions)
             if form == "openvino":
                 quantise_decoder_conv(copied)
-            self.first_layer = SetNetEvents(self.views, padded, copied.bins)
             self.runner = SetNetTiles(copied, where, padded, dtype, backend, threads)
         else:
             assert isinstance(copied, E2VID)
-            remainder = E2VIDRemainder(copied, positions, padded, dtype)
-            self.first_layer = EventFirstLayer(remainder, padded)
-            self.runner = StatefulRunner(remainder, self.first_layer.example(), backend, threads)
+            if (given := self.views) != (views := copied.views):
+                raise ValueError(f"optics.views must be {views} for this network, got {given}")
+            self.runner = E2VIDOverEvents(copied, padded, dtype, backend, threads)
 
     def step(self, t, x, y, p, view, t0: float, t1: float) -> Float[np.ndarray, "h w"]:
         """Return the frame at `t1`, float32, as the network's `forward` gives it.
@@ -119,7 +110,7 @@ class EventListRuntime:
         """
         events = self._checked(t, x, y, p, view, t0, t1)
         t, x, y, p, view = self._reflected(*events)
-        return self.first_layer.add(t, x, y, p, view, float(t0), float(t1))
+        return self.runner.collect_events(t, x, y, p, view, float(t0), float(t1))
 
     def finish(self, begun: Any) -> Float[np.ndarray, "h w"]:
         """Return the frame of a window that was begun; in the order in which they were."""
@@ -129,7 +120,6 @@ class EventListRuntime:
 
     def reset(self) -> None:
         """Forget everything: the next window is the first."""
-        self.first_layer.reset()
         self.runner.reset()
 
     @property
@@ -137,14 +127,14 @@ class EventListRuntime:
         """What lives from window to window, for `state = ...`; later windows advance it in place,
         so that going back to it takes a `copy.deepcopy`.
         """
-        return self.first_layer.state, self.runner.state
+        return self.runner.state
 
     @state.setter
     def state(self, state: Any) -> None:
         if state is None:
             self.reset()
         else:
-            self.first_layer.state, self.runner.state = state
+            self.runner.state = state
 
     def _checked(self, t, x, y, p, view, t0, t1) -> list[np.ndarray]:
         given = [np.asarray(part) for part in (t, x, y, p, view)]
@@ -159,14 +149,28 @@ class EventListRuntime:
             raise ValueError(f"x, y and view must be whole numbers, got {', '.join(kinds)}")
         is_sign, typed = p.dtype.kind != "f", zip(given, DTYPES, strict=True)
         t, x, y, p, view = (np.ascontiguousarray(part, dtype) for part, dtype in typed)
-        at, wrong = kernels.find_bad_event(t, x, y, p, view, self.views, *self.size, is_sign)
-        if at >= 0:
-            reach = {"h": self.size[0] - 1, "w": self.size[1] - 1, "views": self.views - 1}
-            raise ValueError(
-                f"events must {EVENT_ERRORS[wrong].format(**reach)}, got event {at} with t={t[at]} "
-                f"x={x[at]} y={y[at]} p={p[at]} view={view[at]}"
-            )
+        if kernels.has_event_error(t, x, y, p, view, self.views, *self.size, is_sign):
+            raise ValueError(self._describe_error(t, x, y, p, view, is_sign))
         return [t, x, y, p, view]
+
+    def _describe_error(self, t, x, y, p, view, is_sign: bool) -> str:
+        """Return what is wrong with the first event that `has_event_error`."""
+        height, width = self.size
+        good = {
+            "have finite t and p": np.isfinite(t) & np.isfinite(p),
+            "be in order of time": np.append(True, ~(t[1:] < t[:-1])),
+            f"have x in 0..{width - 1} and y in 0..{height - 1}": (
+                (x >= 0) & (x < width) & (y >= 0) & (y < height)
+            ),
+            f"have view in 0..{self.views - 1}, an index into positions": (
+                (view >= 0) & (view < self.views)
+            ),
+            "have p in -1, 1 (or weights, as floats)": (abs(p) == 1) | (not is_sign),
+        }
+        first = {rule: int(is_good.argmin()) for rule, is_good in good.items() if not is_good.all()}
+        rule, at = min(first.items(), key=lambda found: found[1])
+        got = f"t={t[at]} x={x[at]} y={y[at]} p={p[at]} view={view[at]}"
+        return f"events must {rule}, got event {at} with {got}"
 
     def _reflected(self, t, x, y, p, view) -> list[np.ndarray]:
         """Return the events in padded pixels, those near a padded edge once more behind it."""

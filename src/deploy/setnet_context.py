@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 from torch.nn import functional
 
 from src.deploy.engines import tiles_numba
-from src.deploy.setnet_clock import ContextUpdate
-from src.deploy.setnet_layers import channels_first, channels_last
+from src.deploy.setnet_clock import ContextUpdate, max_of_squares
+from src.deploy.setnet_layers import channels_first, channels_last, unpadded
 from src.deploy.tile_batches import TileModule
 from src.models.layers import PreActivationBlock
 from src.models.setnet import ContextPyramid, SetNet
@@ -114,11 +114,11 @@ class FusionLayers(nn.Module):
         return new if self.block is None else self.block(new, inside)
 
 
-class ContextLayers(FusionLayers):
+class ContextUpdateLayers(FusionLayers):
     """The FusionLayers of the finest scale, and the update of the context from their sum."""
 
-    def __init__(self, pyramid: ContextPyramid, dtype: torch.dtype):
-        super().__init__(pyramid, 0, dtype)
+    def __init__(self, pyramid: ContextPyramid, scale: int, dtype: torch.dtype):
+        super().__init__(pyramid, scale, dtype)
         self.last, self.rate = deepcopy(pyramid.ups[0]).to(dtype), pyramid.log_rate.float().exp()
 
     def forward(  # type: ignore[override]
@@ -133,14 +133,6 @@ class ContextLayers(FusionLayers):
         new = self.last(self.fuse(finer, coarser, is_inside).relu()).float()
         keep = channels_first(recency) ** self.rate
         return channels_last(torch.lerp(new, channels_first(context), keep))
-
-
-def unpadded(conv: nn.Module) -> nn.Conv2d:
-    """Return a copy of a convolution that pads nothing."""
-    assert isinstance(conv, nn.Conv2d)
-    copied = deepcopy(conv)
-    copied.padding, copied.padding_mode = (0, 0), "zeros"
-    return copied
 
 
 class TileBlock(nn.Module):
@@ -164,7 +156,7 @@ class ContextTiles:
 
     def __init__(self, network: SetNet, dtype: torch.dtype, *how: Any):
         pyramid = network.context
-        widths = [c for c, *_ in pyramid.map_sizes(2, 2)[: len(pyramid.downs)]]
+        widths = [c for c, *_ in pyramid.held_map_sizes(2, 2)[: len(pyramid.downs)]]
         if len(widths) < 2:
             raise ValueError(f"context_channels must be at least 2 for event lists, got {widths}")
         how = *how, CONTEXT_BATCHES
@@ -174,7 +166,8 @@ class ContextTiles:
             shapes = [(outer, outer, channels), (inner, inner, 1)]
             self.down.append(TileModule(ScaleLayers(pyramid, scale, dtype), shapes, *how))
         for scale, (finer, coarser) in enumerate(pairwise(widths)):
-            layers = FusionLayers(pyramid, scale, dtype) if scale else ContextLayers(pyramid, dtype)
+            kind = FusionLayers if scale else ContextUpdateLayers
+            layers = kind(pyramid, scale, dtype)
             self.halo = layers.halo
             side = CONTEXT_TILE + 2 * layers.halo
             shapes = [(side, side, n) for n in (finer, coarser, 1)]
@@ -184,7 +177,7 @@ class ContextTiles:
 
     def update(self, state: Any, update: ContextUpdate) -> None:
         """Bring the context of `state`, a TileState, up to date in the cells of `update`."""
-        corners = [tiles_numba.find_tiles(cells, CONTEXT_TILE) for cells in update.cells]
+        corners = [find_tiles(cells) for cells in update.cells]
         finer = [state.hidden, *state.scales]
         for scale, module in enumerate(self.down):
             self._make_scale(
@@ -194,12 +187,12 @@ class ContextTiles:
             self._fuse(scale, state, corners[scale], update)
 
     def _make_scale(self, module: TileModule, source, corners, cells, target) -> None:
-        size = target.shape[:2]
+        frame = np.ones((*target.shape[:2], 1), np.float32)
 
         def read(part: slice, inputs: list[np.ndarray]) -> None:
             x, inside = inputs
             tiles_numba.gather(source, 2 * corners[part] - np.int32(2 * BLOCK_HALO + 1), x)
-            tiles_numba.mark_inside(size, corners[part] - np.int32(BLOCK_HALO), inside)
+            tiles_numba.gather(frame, corners[part] - np.int32(BLOCK_HALO), inside)
 
         def write(part: slice, made: np.ndarray) -> None:
             tiles_numba.scatter(made, corners[part], cells, target)
@@ -209,14 +202,14 @@ class ContextTiles:
     def _fuse(self, scale, state, corners, update) -> None:
         finer, coarser = state.scales[scale], state.fused[scale + 1]
         target = state.fused[scale] if scale else state.context
-        size = finer.shape[:2]
-        rows, columns = map(interpolation_spans, coarser.shape[:2], size)
+        frame = np.ones((*finer.shape[:2], 1), np.float32)
+        rows, columns = map(interpolation_spans, coarser.shape[:2], finer.shape[:2])
 
         def read(part: slice, inputs: list[np.ndarray]) -> None:
             first = corners[part] - np.int32(self.halo)
             tiles_numba.gather(finer, first, inputs[0])
             tiles_numba.gather_interpolated(coarser, rows, columns, first, inputs[1])
-            tiles_numba.mark_inside(size, first, inputs[2])
+            tiles_numba.gather(frame, first, inputs[2])
             if not scale:
                 tiles_numba.gather(state.context, corners[part], inputs[3])
                 tiles_numba.gather(update.recency[..., None], corners[part], inputs[4])
@@ -225,6 +218,11 @@ class ContextTiles:
             tiles_numba.scatter(made, corners[part], update.cells[scale], target)
 
         self.fuse[scale].run(len(corners), read, write)
+
+
+def find_tiles(mask: UInt8[np.ndarray, "_h _w"]) -> Int[np.ndarray, "n 2"]:
+    """Return first row and column of the tiles of a scale that have a cell of `mask`."""
+    return CONTEXT_TILE * np.argwhere(max_of_squares(mask, CONTEXT_TILE)).astype(np.int32)
 
 
 @lru_cache(64)

@@ -108,13 +108,8 @@ class DecoderLayers(nn.Module):
         super().__init__()
         assert isinstance(network.pixel_conv, EqualDCConv)
         self.pixel_conv = TwoByTwoCellConv(network.pixel_conv, CELL_PX).to(dtype)
-        conv = deepcopy(network.decoder_conv).to(dtype)
-        if not is_whole and isinstance(conv, Int8Conv):
-            conv.padding = 0
-        elif not is_whole:
-            assert isinstance(conv, nn.Conv2d)
-            conv.padding, conv.padding_mode = (0, 0), "zeros"
-        self.decoder_conv, self.dtype = conv, dtype
+        conv = deepcopy(network.decoder_conv) if is_whole else unpadded(network.decoder_conv)
+        self.decoder_conv, self.dtype = conv.to(dtype), dtype
 
     def forward(self, x: Float[Tensor, "b h w c"]) -> Float[Tensor, "b hq wq pixels"]:
         """Return the pixels; `x`: the sum of both, after its ReLU."""
@@ -131,7 +126,6 @@ class WholeDecoder(DecoderLayers):
     def forward(  # type: ignore[override]
         self, hidden: Float[Tensor, "1 h w c"], context: Float[Tensor, "1 hq wq c"]
     ) -> Float[Tensor, "1 hq wq pixels"]:
-        """Return the pixels."""
         return self.draw(channels_first(hidden), context)
 
     def draw(self, hidden: Tensor, context: Tensor) -> Tensor:
@@ -184,11 +178,19 @@ class TwoByTwoCellConv(nn.Module):
         return functional.conv2d(x, self.weight, self.bias, 2)
 
 
+def unpadded(conv: nn.Module) -> nn.Module:
+    """Return a copy of a convolution, in bytes or not, that pads nothing."""
+    assert isinstance(conv, nn.Conv2d | Int8Conv)
+    copied = deepcopy(conv)
+    copied.padding = (0, 0)
+    if isinstance(copied, nn.Conv2d):
+        copied.padding_mode = "zeros"
+    return copied
+
+
 def channels_first(x: Float[Tensor, "n h w c"]) -> Float[Tensor, "n c h w"]:
-    """Return a view of `x`."""
     return x.permute(0, 3, 1, 2)
 
 
 def channels_last(x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n h w c"]:
-    """Return a view of `x`."""
     return x.permute(0, 2, 3, 1)

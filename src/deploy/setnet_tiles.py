@@ -8,18 +8,17 @@ import torch
 from jaxtyping import Float
 from torch import nn
 
-from src.deploy.engines import tiles_numba
+from src.deploy.engines import clock_numba, tiles_numba
 from src.deploy.engines.clock_numba import QUARTER, TILE
 from src.deploy.setnet_clock import (
-    ClockState,
     ContextUpdate,
     EventMaps,
     EventPixels,
+    LeakySumState,
     SetNetClock,
-    SumState,
     Tick,
 )
-from src.deploy.setnet_context import CONTEXT_TILE, ContextTiles, WholeContext
+from src.deploy.setnet_context import CONTEXT_TILE, ContextTiles, WholeContext, find_tiles
 from src.deploy.setnet_layers import DecoderLayers, MemoryLayers, WholeDecoder, WholeWindow
 from src.deploy.tile_batches import Backend, TileModule
 from src.models.setnet import BACKGROUND, BACKGROUND_WEIGHT, CELL_PX, REVEALING_EVENTS, SetNet
@@ -35,11 +34,12 @@ class TileState:
     and the frame (h, w)."""
 
     def __init__(self, network: SetNet, height: int, width: int):
-        rows, columns = height // CELL_PX, width // CELL_PX
-        hidden, context, _ = network.map_sizes(height, width)
+        rows, columns, c = height // CELL_PX, width // CELL_PX, network.channels
+        hidden, context = (c, rows, columns), (c, rows // 2, columns // 2)
         self.hidden, self.spare_hidden = _zeros(hidden), _zeros(hidden)
         self.smoothed, self.levels = _zeros(context), len(network.context.downs)
-        self.hold(_zeros(context), *map(_zeros, network.context.map_sizes(rows, columns)))
+        held = network.context.held_map_sizes(rows, columns)
+        self.set_context_maps(_zeros(context), *map(_zeros, held))
         self.revealed = np.zeros((rows, columns), np.float32)  # how far cells are, in [0, 1]
         self.light = np.zeros((height, width), np.float32)  # of pixels, times that
         self.totals = np.zeros(2)  # of weights and of light, of blend_background
@@ -58,13 +58,13 @@ class TileState:
         background = np.float32(light / (weight + BACKGROUND_WEIGHT))
         tiles_numba.add_background(self.light, self.revealed, background, self.frame)
 
-    def hold(self, context: np.ndarray, *held: np.ndarray) -> None:
-        """Hold a context and maps in the order of ContextPyramid.map_sizes."""
+    def set_context_maps(self, context: np.ndarray, *held: np.ndarray) -> None:
+        """Hold a context and maps in the order of ContextPyramid.held_map_sizes."""
         self.context, self.scales = context, list(held[: self.levels])
         # The sums with coarser scales, by scale; the coarsest has none, the finest is not held.
         self.fused: list[Any] = [None, *reversed(held[self.levels :]), held[self.levels - 1]]
 
-    def held(self) -> list[np.ndarray]:
+    def pyramid_maps(self) -> list[np.ndarray]:
         """Return the maps in that order."""
         return self.scales + self.fused[-2:0:-1]
 
@@ -72,8 +72,8 @@ class TileState:
 class SetNetState(NamedTuple):
     """All that lives from window to window, advanced in place."""
 
-    clock: ClockState
-    sums: SumState
+    clock: SetNetClock
+    sums: LeakySumState
     maps: TileState
 
 
@@ -85,10 +85,10 @@ class SetNetTiles:
         dtype: torch.dtype, backend: Backend, threads: int,
     ):  # fmt: skip
         self.network, self.padded, how = network, padded, (backend, threads)
+        self.slot_of = np.zeros((len(positions), *padded), np.int32)
         memory, decoder = MemoryLayers(network, positions, dtype), DecoderLayers(network, dtype)
         self.events = EventMaps(network, positions, memory.mixture_code, padded, threads)
-        views, rows, columns, mixtures = self.events.size
-        self.clock = SetNetClock(views, rows, columns, len(network.context.downs))
+        mixtures = self.events.size[3]
         c, near, far = network.channels, TILE + 2, TILE + 4
         shapes = [(near, near, c), (far, far, mixtures), (near, near, 1), (TILE, TILE, c)]
         self.memory = TileModule(memory, shapes, *how, BATCHES)
@@ -97,29 +97,37 @@ class SetNetTiles:
         self.whole = WholeFrame(network, positions, padded, dtype, *how)
         self.reset()
 
+    def collect_events(self, t, x, y, p, view, t0: float, t1: float) -> EventPixels:
+        """Return the pixels of a window's events; `t`, `t0` and `t1` in seconds."""
+        places = np.empty((len(t), 3), np.int32)
+        voxels = np.empty((len(t), self.network.bins), np.float32)
+        count = clock_numba.collect_pixels(t, x, y, p, view, t0, t1, self.slot_of, places, voxels)
+        return EventPixels(places[:count], voxels[:count], np.float32(t1 - t0))
+
     def reset(self) -> None:
-        sums = SumState(*self.events.size)
-        maps = TileState(self.network, *self.padded)
-        self.state = SetNetState(ClockState(*self.events.size[:3]), sums, maps)
+        views, rows, columns, mixtures = self.events.size
+        clock = SetNetClock(views, rows, columns, len(self.network.context.downs))
+        sums = LeakySumState(views, rows, columns, mixtures)
+        self.state = SetNetState(clock, sums, TileState(self.network, *self.padded))
 
     def __call__(self, pixels: EventPixels) -> Float[np.ndarray, "h w"]:
         """Return the frame, padded, valid until the next window."""
         clock, sums, maps = self.state
-        tick = self.clock.tick(pixels, clock)
+        tick = clock.tick(pixels)
         is_most = self._is_most(TILE, len(tick.active_tiles), WHOLE_MEMORY)
         if not tick.update:
             self._smooth(tick)
         if len(tick.active_tiles):
             self.events.add(pixels, clock, sums)
         if is_most:
-            self.whole.remember(self.events.voxel_map, sums.mixtures, clock.elapsed_s, maps)
+            self.whole.advance_and_draw(self.events.voxel_map, sums.mixtures, clock.elapsed_s, maps)
         else:
             self._remember(tick.active_tiles)
         if tick.update:
             self._update_context(tick.update)
             self._smooth(tick)
         if is_most and not tick.update:
-            self.whole.show(maps, clock.evidence)
+            self.whole.write_drawn_pixels(maps, clock.evidence)
         elif self._is_most(TILE, len(tick.changed_tiles), WHOLE_DECODER):
             self.whole.draw(maps, clock.evidence)
         else:
@@ -139,7 +147,7 @@ class SetNetTiles:
         return tiles * side_cells**2 > share * rows * columns
 
     def _update_context(self, update: ContextUpdate) -> None:
-        tiles = len(tiles_numba.find_tiles(update.cells[0], CONTEXT_TILE))
+        tiles = len(find_tiles(update.cells[0]))
         if self._is_most(2 * CONTEXT_TILE, tiles, WHOLE_CONTEXT):
             self.whole.update_context(update, self.state.maps)
         else:
@@ -167,7 +175,7 @@ class SetNetTiles:
 
         def read(part: slice, inputs: list[np.ndarray]) -> None:
             corners = TILE * tiles[part] - halo
-            tiles_numba.gather_sum(state.hidden, state.smoothed, corners, inputs[0])
+            tiles_numba.gather_relu_sum(state.hidden, state.smoothed, corners, inputs[0])
 
         def write(part: slice, pixels: np.ndarray) -> None:
             corners = QUARTER * tiles[part]
@@ -185,7 +193,7 @@ class WholeFrame:
     ):  # fmt: skip
         c, (rows, columns) = network.channels, (side // CELL_PX for side in padded)
         near, far = (rows, columns), (rows // 2, columns // 2)
-        held = [size[1:] + size[:1] for size in network.context.map_sizes(*near)]
+        held = [size[1:] + size[:1] for size in network.context.held_map_sizes(*near)]
 
         def compile_module(module: nn.Module, *shapes: tuple[int, ...]) -> Any:
             return backend(module, [torch.zeros(1, *shape) for shape in shapes], threads)
@@ -199,27 +207,27 @@ class WholeFrame:
         self.spare = [np.zeros(shape, np.float32) for shape in [(*far, c), *held]]
         self.pixels = np.empty((1, *far, (2 * CELL_PX) ** 2), np.float32)
 
-    def remember(self, voxel_map, mixtures, elapsed_s, maps: TileState) -> None:
-        """Advance the hidden map, and draw what `show` writes: with the context as it is."""
+    def advance_and_draw(self, voxel_map, mixtures, elapsed_s, maps: TileState) -> None:
+        """Advance the hidden map, and draw with the context as it is what `write_drawn_pixels`
+        writes."""
         given = voxel_map, mixtures, elapsed_s[..., None], maps.hidden, maps.smoothed
         self.window.run([part[None] for part in given], [maps.spare_hidden[None], self.pixels])
         maps.hidden, maps.spare_hidden = maps.spare_hidden, maps.hidden
 
     def update_context(self, update: ContextUpdate, maps: TileState) -> None:
         """Bring the maps of the context up to date in the cells of `update`."""
-        held = maps.held()
+        held = maps.pyramid_maps()
         is_updated = update.cells[0].astype(np.float32)[..., None]
         given = maps.hidden, maps.context, update.recency[..., None], is_updated, *held
         self.context.run([part[None] for part in given], [part[None] for part in self.spare])
         made, self.spare = self.spare, [maps.context, *held]
-        maps.hold(*made)
+        maps.set_context_maps(*made)
 
     def draw(self, maps: TileState, evidence: np.ndarray) -> None:
-        """Draw the pixels."""
         self.decoder.run([maps.hidden[None], maps.smoothed[None]], [self.pixels])
-        self.show(maps, evidence)
+        self.write_drawn_pixels(maps, evidence)
 
-    def show(self, maps: TileState, evidence: np.ndarray) -> None:
+    def write_drawn_pixels(self, maps: TileState, evidence: np.ndarray) -> None:
         """Write the pixels that were drawn last."""
         corner = np.zeros((1, 2), np.int32)
         maps.write_pixels(self.pixels, corner, evidence)

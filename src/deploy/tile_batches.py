@@ -1,4 +1,6 @@
-"""A module on any number of tiles: in batches of a few fixed sizes, the last one filled up."""
+"""A module on any number of tiles: in batches of a few fixed sizes, the last one filled up; and
+PyTorch as what computes it.
+"""
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
@@ -7,6 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
+
+from src.deploy.cost import torch_threads
 
 CALL_COST = 8  # what a call costs beside its tiles, in tiles
 Backend = Callable[[nn.Module, list[Tensor], int], Any]  # EagerBackend or CompiledModule
@@ -21,6 +25,31 @@ def split_into_batches(tiles: int, sizes: tuple[int, ...]) -> tuple[int, ...]:
         return sizes[-1], *split_into_batches(tiles - sizes[-1], sizes)
     ways = [(size, *split_into_batches(tiles - size, sizes)) for size in sizes]
     return min(ways, key=lambda way: sum(way) + CALL_COST * len(way))
+
+
+class EagerBackend:
+    """A module on PyTorch: arrays and a state in, an array and a state out."""
+
+    def __init__(self, module: nn.Module, example: list[Tensor], threads: int):
+        self.module = module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.example, self.threads = example, threads
+
+    @torch.inference_mode()
+    def __call__(self, inputs: list[np.ndarray], state: list[Tensor]) -> list:
+        with torch_threads(self.threads):
+            output, *state = self.module(*map(torch.from_numpy, inputs), *state)
+        return [output.numpy(), *state]
+
+    @torch.inference_mode()
+    def run(self, inputs: list[np.ndarray], outputs: list[np.ndarray]) -> None:
+        """Write the outputs of a module that takes no state: arrays, contiguous and float32."""
+        with torch_threads(self.threads):
+            made = self.module(*map(torch.from_numpy, inputs))
+        for part, output in zip(made if isinstance(made, tuple) else (made,), outputs, strict=True):
+            output[...] = part.numpy()
+
+    def zeros(self, first: int) -> list[Tensor]:
+        return [torch.zeros_like(part) for part in self.example[first:]]
 
 
 class TileModule:

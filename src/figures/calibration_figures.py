@@ -64,7 +64,7 @@ def draw_views(picture: UInt8[np.ndarray, "h w"], views: Views, path: Path) -> N
     save_figure(figure, path)
 
 
-def draw_view_overlays(
+def draw_views_over_centre(
     picture: Float[np.ndarray, "h w"], views: Views, matched: Mapping[Position, float], path: Path
 ) -> None:
     """Draw each view of a sensor picture over the centre one: what coincides is white, what only
@@ -112,24 +112,23 @@ def draw_dot_statistics(
     within the centre view and across views, blur over time, intensity over time."""
     figure = Figure(figsize=(17, 3.6))
     tilt, within, across, blur, intensity = figure.subplots(1, 5)
-    view, dot = statistics.centre, statistics.middle
-    decay_s = decay_time_s(statistics.autocorrelation, statistics.fps)
-    tilt.plot(statistics.lags_s, statistics.autocorrelation)
+    view, dot = statistics.centre_view, statistics.middle_dot
+    decay_s = decay_time_s(statistics.middle_dot_autocorrelation, statistics.fps)
+    tilt.plot(statistics.lags_s, statistics.middle_dot_autocorrelation)
     tilt.axhline(0, color="gray", linewidth=0.5)
     tilt.set(
         xlabel="lag (s)", ylabel="correlation", ylim=(-0.6, 1.05),
         title=f"(a) tilt in time, 1/e at {decay_s:.3f} s",
     )  # fmt: skip
     dots, names = range(statistics.tilt.shape[2]), [f"{row},{col}" for row, col in positions]
-    _show_correlations(
-        within, statistics.centre_view_correlation, "(b) tilt between dots, centre view", dots
-    )
+    title = "(b) tilt between dots, centre view"
+    _show_correlations(within, statistics.centre_view_correlation, title, dots)
     title = "(c) tilt between views, middle dot"
     _show_correlations(across, statistics.tilt_correlation_across_views, title, names)
     for axes, series, label in (
         (blur, statistics.blur, "turbulence"),
-        (intensity, statistics.intensity, "turbulence"),
-        (intensity, statistics.still_intensity, "without"),
+        (intensity, statistics.relative_intensity, "turbulence"),
+        (intensity, statistics.still_relative_intensity, "without"),
     ):
         time_s = np.arange(series.shape[1]) / statistics.fps
         axes.plot(time_s, series[view, :, dot], linewidth=0.8, label=label)
@@ -193,7 +192,8 @@ def draw_measured_turbulence(measured: TurbulenceMeasurement, title: str, path: 
     finite = np.isfinite(tilt.correlation)
     at_px = measured.distance_px[finite]
     distance.plot(at_px, tilt.correlation[finite], "o", ms=4, label="pairs of points")
-    distance.plot(measured.fitted_px, tilt.fitted, color="tab:orange", label="fit")
+    fit = measured.fitted_distance_px, tilt.fitted_correlation
+    distance.plot(*fit, color="tab:orange", label="fit")
     distance.axhline(0.5, color="gray", lw=0.6)
     _mark_estimate(distance, found.half_length_px, "half length", "px")
     distance.set_xscale("symlog", linthresh=2)

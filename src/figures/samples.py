@@ -46,7 +46,7 @@ def write_samples(
         counts = sample.voxels[0, :, pipeline.optics.centre].sum(1).cpu().numpy()
         events = {EVENTS_TITLE: render_events(counts), "reconstruction": videos["reconstruction"]}
         first = {name: videos[name] for name in ("clean", "centre view")}
-        write_video(gif, join_panels(first | events), PLAYBACK_FPS)
+        write_animation(gif, join_panels(first | events), PLAYBACK_FPS)
         windows, height, width = videos["clean"].shape
         line = np.array([[0, height // 2], [width - 1, height // 2]], dtype=float)
         rows = [VideoRow(name, video, video[:, height // 2]) for name, video in videos.items()]
@@ -55,7 +55,7 @@ def write_samples(
     return paths
 
 
-def write_light_field(
+def write_light_field_panels(
     folder: Path, clean: Video, views: Float[np.ndarray, "views windows h w"],
     tilt: Float[np.ndarray, "views windows 2 h w"],
     counts: Float[np.ndarray, "views windows h w"], optics: Optics,
@@ -80,8 +80,8 @@ def write_light_field(
     }
     frames = join_panels(panels)
     paths = [folder / "views.gif", folder / "views.png"]
-    write_video(paths[0], frames, PLAYBACK_FPS)
-    write_video(paths[1], frames[-1:], PLAYBACK_FPS)
+    write_animation(paths[0], frames, PLAYBACK_FPS)
+    write_animation(paths[1], frames[-1:], PLAYBACK_FPS)
     return paths
 
 
@@ -164,7 +164,7 @@ def _draw_title(name: str, width: int) -> Float[np.ndarray, "title_px width 3"]:
     return (drawn / 255).astype(np.float32)
 
 
-def write_video(path: Path, frames: Video, fps: float) -> None:
+def write_animation(path: Path, frames: Video, fps: float) -> None:
     """Write a GIF or WebP (or, of the first frame, what else the suffix says) whole or not at all.
 
     Values are clipped to [0, 1]; GIFs keep time to hundredths of a second, WebP to thousandths.

@@ -28,8 +28,8 @@ def cut_slice(
     """
     if spin:
         x, y, radius, turns, degrees = spin
-        angles = math.radians(degrees) + 2 * math.pi * turns * np.arange(len(video)) / fps
-        points = rotating_ray_xy((x, y), angles, np.arange(0, radius + 1e-9))
+        angles_rad = math.radians(degrees) + 2 * math.pi * turns * np.arange(len(video)) / fps
+        points = rotating_ray_xy((x, y), angles_rad, np.arange(0, radius + 1e-9))
     elif circle:
         points = circle_points(circle[:2], circle[2])
     else:
@@ -71,18 +71,18 @@ def circle_points(centre: Sequence[float], radius: float, places: int | None = N
     The angle grows from +x towards +y, clockwise as seen; point k stands at 2 pi k / places.
     """
     places = places or math.ceil(2 * math.pi * radius)
-    angles = 2 * math.pi * np.arange(places) / places
-    return rotating_ray_xy(centre, angles, np.array([float(radius)]))[:, 0]
+    angles_rad = 2 * math.pi * np.arange(places) / places
+    return rotating_ray_xy(centre, angles_rad, np.array([float(radius)]))[:, 0]
 
 
 def rotating_ray_xy(
-    centre: Sequence[float], angles: Float[np.ndarray, " frames"],
+    centre: Sequence[float], angles_rad: Float[np.ndarray, " frames"],
     radii: Float[np.ndarray, " places"],
 ) -> Float[np.ndarray, "frames places 2"]:  # fmt: skip
-    """Return points `radii` pixels from `centre` towards `angles[k]` (radians, as in
+    """Return points `radii` pixels from `centre` towards `angles_rad[k]` (radians, as in
     `circle_points`): of a dot that circles with these angles the r-t slice is a straight line.
     """
-    rays = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    rays = np.stack([np.cos(angles_rad), np.sin(angles_rad)], axis=1)
     return np.array(centre) + radii[None, :, None] * rays[:, None]
 
 

@@ -15,7 +15,7 @@ from src.recordings.files import sources
 from src.recordings.files.clocks import TimestampUnwrapper
 from src.recordings.files.event_file import EVENT, ReadOptions
 from src.recordings.files.recording import open_recording
-from src.recordings.views import LARGEST_SIDE, Size
+from src.recordings.views import LARGEST_SIDE, HeightWidth
 
 Chunks = Iterator[tuple[np.ndarray, float]]  # events (t x y p), wall time of their arrival in s
 FILE_CHUNK_S = 0.005  # of a file, read at a time: a long one would hold the other threads up
@@ -35,7 +35,7 @@ class Feed(ABC):
     """`is_live`: whether events come while they happen.  `sensor`: (height, width) in pixels."""
 
     is_live = True
-    sensor: Size
+    sensor: HeightWidth
 
     @abstractmethod
     def iter_event_chunks(self, stopped: threading.Event) -> Chunks:
@@ -76,22 +76,23 @@ class FileFeed(Feed):
 
     is_live = False
 
-    def __init__(self, path: str, sensor: Size, loop: bool, options: ReadOptions = ReadOptions()):
+    def __init__(
+        self, path: str, sensor: HeightWidth, loop: bool, options: ReadOptions = ReadOptions()
+    ):
         self.path, self.sensor, self.loop, self.options = path, sensor, loop, options
 
     def iter_event_chunks(self, stopped: threading.Event) -> Chunks:
         """Yield the file's events; raises ValueError where it cannot be decoded."""
         while not stopped.is_set():
             is_empty = True
-            for events in self._read():
+            for events in sources.iter_recording(
+                self.path, self.sensor, FILE_CHUNK_S, self.options
+            ):
                 is_empty = False
                 yield events, time.perf_counter()
             if not self.loop or is_empty:
                 return
             yield np.empty(0, EVENT), time.perf_counter()
-
-    def _read(self) -> Iterator[np.ndarray]:
-        return sources.iter_recording(self.path, self.sensor, FILE_CHUNK_S, self.options)
 
 
 class UdpFeed(Feed):
@@ -100,7 +101,7 @@ class UdpFeed(Feed):
     Raises ValueError for an address that cannot be listened at.
     """
 
-    def __init__(self, url: str, sensor: Size, packet_format: str, faults: FaultLog):
+    def __init__(self, url: str, sensor: HeightWidth, packet_format: str, faults: FaultLog):
         if packet_format not in PACKETS:
             allowed = ", ".join(PACKETS)
             raise ValueError(f"udp_format must be one of {allowed}, got {packet_format}")

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int, UInt8
 
 from src.recordings.engines.splat import count_polarity
 from src.recordings.sensor_lookup import SensorLookup
-from src.recordings.views import Size
+from src.recordings.views import HeightWidth
 from src.sim.optics import Position
 
 MAX_BYTES = 1 << 26  # of frames kept
@@ -34,7 +34,7 @@ class FrameRing:
     `ring` holds them, the newest at (`count` - 1) modulo its length.
     """
 
-    def __init__(self, size: Size):
+    def __init__(self, size: HeightWidth):
         self.size = size
         kept = max(2, min(MAX_FRAMES, MAX_BYTES // (size[0] * size[1])))
         self.ring = np.zeros((kept, *size), np.uint8)
@@ -105,7 +105,7 @@ class PolarityAccumulator:
         if self.is_watched:
             x, y, p = (events[name] for name in "xyp")
             with self.lock:
-                count_polarity(x, y, p, self.lookup.nearest_pixel, self.counts)
+                count_polarity(x, y, p, self.lookup.nearest_model_pixel, self.counts)
                 self.windows += 1
 
     def take(self) -> Int[np.ndarray, "views h w"]:

@@ -11,7 +11,7 @@ from src.live_view.status import FaultLog
 from src.recordings.files.event_arrays import concatenate_events, count_before
 from src.recordings.files.event_file import EVENT
 from src.recordings.files.event_order import BUFFER_US, EventSorter
-from src.recordings.views import Size
+from src.recordings.views import HeightWidth
 
 FEW_LIVE_EVENTS = 16  # with times far from the others; more of them are a clock that restarts
 ANY_GAP_US = 2**61
@@ -39,12 +39,12 @@ class WindowCutter:
     for an `fps` out of range.
     """
 
-    def __init__(self, sensor: Size, fps: float, faults: FaultLog, *, is_live: bool = True):
+    def __init__(self, sensor: HeightWidth, fps: float, faults: FaultLog, *, is_live: bool = True):
         if not 0 < fps <= 1e5:
             raise ValueError(f"fps must be in (0, 1e5], got {fps}")
         self.sensor, self.period_us, self.faults = sensor, 1e6 / fps, faults
         self.buffer_us = BUFFER_US if is_live else ANY_GAP_US
-        self.order = EventSorter(self.buffer_us, FEW_LIVE_EVENTS, None)
+        self.order = EventSorter(self.buffer_us, FEW_LIVE_EVENTS, "newest")
         self.origin_us: float | None = None  # start of the first window
         self.windows_cut = 0  # since the origin
         self.starts_scene = True
@@ -56,7 +56,7 @@ class WindowCutter:
 
     def restart(self, *, new_scene: bool = True) -> None:
         """Forget the clock: the next event starts a window, of a new scene or not."""
-        self.order = EventSorter(self.buffer_us, FEW_LIVE_EVENTS, None)
+        self.order = EventSorter(self.buffer_us, FEW_LIVE_EVENTS, "newest")
         self._forget_windows(new_scene)
 
     def _forget_windows(self, new_scene: bool) -> None:
@@ -95,7 +95,7 @@ class WindowCutter:
             return
         over = int((until_us - self.origin_us) / self.period_us) - self.windows_cut
         ends = (end_us + self.period_us * np.arange(max(over, 1))).tolist()
-        self.order.resume_after_silence(until_us)
+        self.order.accept_events_after_gap(until_us)
         ready = self.order.release(ends[-1])
         events = concatenate_events(ready) if ready else np.empty(0, EVENT)
         stops = [count_before(events, end) for end in ends]

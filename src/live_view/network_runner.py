@@ -17,7 +17,7 @@ from jaxtyping import Float
 from src.deploy.runtime import EventListRuntime, fastest_form, supports_event_lists
 from src.live_view.live_windows import EventWindow
 from src.models.network import EventToVideoNetwork
-from src.recordings.event_windows import Window, WindowRule, fill_window, frames_per_window
+from src.recordings.event_windows import Window, WindowRule, count_frames_per_window, fill_window
 from src.recordings.files.event_arrays import concatenate_events, count_before
 from src.recordings.files.event_file import EVENT
 from src.recordings.reconstruction import (
@@ -56,7 +56,7 @@ class NetworkRunner:
     ):
         self.name, self.views, fps = name, views, settings.fps
         length = settings.window_length or default_window_length(network)
-        self.frames_per_window = frames_per_window(length, fps)
+        self.frames_per_window = count_frames_per_window(length, fps)
         form = settings.form or (fastest_form() if supports_event_lists(network) else "float32")
         self.network = build_runnable_network(network, form, "cpu", views, settings.bins)
         is_runtime = isinstance(self.network, EventListRuntime)
@@ -88,8 +88,6 @@ class NetworkRunner:
         filled = fill_window(events, self.lookup, self.rule, start_us, window.end_us)
         if not self.is_pipelined or not isinstance(self.network, EventListRuntime):
             return partial(self._run, filled, restart)
-        if restart:
-            self.network.first_layer.reset()
         begun = None
         if filled.events and filled.event_list is not None:
             begun = self.network.begin(*filled.event_list, 0.0, filled.length_s)
@@ -106,7 +104,7 @@ class NetworkRunner:
     ) -> Float[np.ndarray, "h w"]:
         """Run the rest of the network on a window that was begun; None, without events, holds."""
         if restart:
-            runtime.runner.reset()
+            runtime.reset()
             self.picture = np.full(self.views.model, 0.5, np.float32)
         if begun is not None:
             self.picture = runtime.finish(begun).clip(0, 1)

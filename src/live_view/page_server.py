@@ -122,6 +122,7 @@ class PageServer:
     def __init__(self, page: LivePage, host: str, port: int, allowed_origins: Sequence[str] = ()):
         self.page, self.host, self.port = page, host, port
         self.origins = {_parse_origin(origin) for origin in allowed_origins}
+        self.proxies = {origin.partition("://")[2] for origin in self.origins}
         self.visitors: set[asyncio.Queue] = set()
         self.app = web.Application(
             middlewares=[self._own_pages_only], client_max_size=MAX_REQUEST_BYTES
@@ -171,18 +172,15 @@ class PageServer:
     async def _own_pages_only(self, request: web.Request, handler) -> web.StreamResponse:
         """Refuse requests that another site's page makes in a visitor's browser."""
         host = request.host.rsplit(":", 1)[0].strip("[]")
-        local = self.host in THIS_MACHINE and request.host not in self._proxies()
+        local = self.host in THIS_MACHINE and request.host not in self.proxies
         origin = request.headers.get("Origin")
         known = origin in (None, f"http://{request.host}") or origin in self.origins
         if not known or (local and host not in THIS_MACHINE):
             raise web.HTTPForbidden(text="this page serves its own address only")
         return await handler(request)
 
-    def _proxies(self) -> set[str]:
-        return {origin.partition("://")[2] for origin in self.origins}
-
     async def _page(self, request: web.Request) -> web.Response:
-        streams = " ".join(f"ws://{host} wss://{host}" for host in sorted(self._proxies()))
+        streams = " ".join(f"ws://{host} wss://{host}" for host in sorted(self.proxies))
         policy = (
             "default-src 'none'; img-src 'self' blob: data:; style-src 'unsafe-inline'; "
             f"script-src 'unsafe-inline'; connect-src 'self' ws://{request.host} {streams}"

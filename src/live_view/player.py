@@ -97,13 +97,9 @@ class Player:
                 window, finish, beside = self.begun.get(timeout=0.1)
             except queue.Empty:
                 continue
-            start = time.perf_counter()
-            self.frames.push(self.tone.apply(finish(), window.end_us * 1e-6))
-            picture = None if beside is None else beside()
-            if picture is None:
-                self.one_view = None
-            else:
-                self.one_view = self.one_view_tone.apply(picture, window.end_us * 1e-6)
+            start, end_s = time.perf_counter(), window.end_us * 1e-6
+            self.frames.push(self.tone.apply(finish(), end_s))
+            self.one_view = None if beside is None else self.one_view_tone.apply(beside(), end_s)
             self.shown_us = window.end_us
             end = time.perf_counter()
             self.meters.add_busy_time("network", end - start)
@@ -119,10 +115,8 @@ class Player:
         None where they are not.  `reached` and `asked` are per second of the clock on the wall.
         """
         suggested = math.floor(SPARED * reached / self.reader.clock.speed)
-        is_short = self.reader.state == "playing" and math.isfinite(asked)
-        if not (is_short and self.reader.waiting.dropped and reached < SPARED * asked):
-            return None
-        if not suggested:
+        is_short = self.reader.state == "playing" and reached < SPARED * asked < math.inf
+        if not (is_short and self.reader.waiting.dropped and suggested):
             return None
         return f"fps={suggested} (of recorded time) would drop nothing on this machine"
 

@@ -1,7 +1,7 @@
 """The training loss: the weighted sum of terms, each `loss.<term>: {_target_, weight, ...}`."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import partial, reduce
 from itertools import pairwise
 
 import torch
@@ -103,10 +103,7 @@ class Distillation(LossTerm):
 
 def weighted_sum(terms: Sequence[FrameTerm], frames: Frames, target: Frames) -> FrameValues:
     """Return the sum of frame terms times their weights, one value per frame."""
-    total = terms[0].weight * terms[0](frames, target)
-    for term in terms[1:]:
-        total = total + term.weight * term(frames, target)
-    return total
+    return reduce(torch.add, (term.weight * term(frames, target) for term in terms))
 
 
 class TrainingLoss(nn.Module):

@@ -128,15 +128,11 @@ def _build_stages(net: str) -> list[nn.Sequential]:
 
 def _copy_backbone(stages: list[nn.Sequential], weights: dict[str, Tensor], net: str) -> None:
     """Copy `features.<i>.weight` and `.bias` into the convolutions, in their order."""
-    for place, layer in enumerate(chain.from_iterable(stages)):
-        if isinstance(layer, nn.Conv2d):
-            for part in ("weight", "bias"):
-                name = f"features.{place}.{part}"
-                if name not in weights or weights[name].shape != getattr(layer, part).shape:
-                    raise ValueError(
-                        f"lpips.backbone_weights must be torchvision's {net}; {name} is not"
-                    )
-                getattr(layer, part).data.copy_(weights[name])
+    for place, own in nn.Sequential(*chain.from_iterable(stages)).named_parameters():
+        name = f"features.{place}"
+        if name not in weights or weights[name].shape != own.shape:
+            raise ValueError(f"lpips.backbone_weights must be torchvision's {net}; {name} is not")
+        own.data.copy_(weights[name])
 
 
 def _read_backbone(net: str, path: str | None) -> dict[str, Tensor]:

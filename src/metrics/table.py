@@ -10,7 +10,7 @@ from dataclasses import dataclass
 class Column:
     """`name`: its key in results.json and clips.csv.  `better`: 1 where more is better, -1 where
     less is, 0 where neither; `group` stands above the columns that have it, such as the source of
-    published numbers.
+    published numbers.  A metric that a config adds has its key there as name and heading.
     """
 
     name: str
@@ -37,8 +37,3 @@ METRICS = (
     Column("temporal_jitter_px", "temporal jitter px", 2, -1),
 )
 NAMES = tuple(metric.name for metric in METRICS)
-
-
-def make_user_metric_column(name: str, better: int) -> Column:
-    """Return the column of a metric that a config has added, under its key there."""
-    return Column(name, name, 3, better)

@@ -38,7 +38,7 @@ def estimate_block_displacement(
     return shift * (weight > 0)[:, None], weight
 
 
-def warp_by_shift(
+def backward_warp(
     frames: Float[Tensor, "n c h w"], shift: Float[Tensor, "n 2 h w"], mode: str = "bilinear"
 ) -> Float[Tensor, "n c h w"]:
     """Return the frames with what lies `shift` (x, y), in pixels, from each pixel brought there."""
@@ -71,7 +71,7 @@ def _step(frames: Tensor, target: Tensor, shift: Tensor) -> Tensor:
     x, y = _gradients(target)
     a, b, c = _structure(x, y)
     smooth = functional.interpolate(shift, frames.shape[-2:], mode="bilinear")
-    difference = _matched(warp_by_shift(frames, smooth), target) - target
+    difference = _matched(backward_warp(frames, smooth), target) - target
     u, v = _blocks(torch.cat([x * difference, y * difference], dim=1)).unbind(1)
     determinant = (a * c - b * b).clamp(min=1e-12)
     return torch.stack([b * v - c * u, b * u - a * v], dim=1) / determinant[:, None]

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -10,7 +11,7 @@ from torchmetrics import MeanMetric, Metric, MetricCollection
 
 from src.metrics.image import aligned_psnr, psnr, ssim
 from src.metrics.lpips import LPIPS
-from src.metrics.table import NAMES, Column, make_user_metric_column
+from src.metrics.table import NAMES, Column
 from src.metrics.temporal import Video, temporal_jitter_px
 
 SCORES = {  # name in table.py: a value per frame, or per step from a frame to the next
@@ -38,28 +39,23 @@ class ClipMean(MeanMetric):
         super().update(score(frames, target).mean())
 
 
-class UserMetricScore:
-    """The value that a torchmetrics metric, `metrics.<name>` of the config, has on one clip alone.
+def score_by_user_metric(name: str, metric: Metric, frames: Tensor, target: Tensor) -> Tensor:
+    """Return the value that a torchmetrics metric, `metrics.<name>` of the config, has on one clip.
 
     Its `update` is given frames and target, (frames, 1, h, w) in [0, 1]; `compute` gives one number
     or one per frame.  Raises ValueError for something else.
     """
-
-    def __init__(self, name: str, metric: Metric):
-        self.name, self.metric = name, metric
-
-    def __call__(self, frames: Tensor, target: Tensor) -> Tensor:
-        value = self.metric.to(frames.device)(frames, target)
-        self.metric.reset()
-        if not isinstance(value, Tensor) or not value.numel() or value.is_complex():
-            got = f"{type(value).__name__} {value}"[:60]
-            raise ValueError(f"metrics.{self.name} must compute a tensor of numbers, got {got}")
-        return value.float()
+    value = metric.to(frames.device)(frames, target)
+    metric.reset()
+    if not isinstance(value, Tensor) or not value.numel() or value.is_complex():
+        got = f"{type(value).__name__} {value}"[:60]
+        raise ValueError(f"metrics.{name} must compute a tensor of numbers, got {got}")
+    return value.float()
 
 
 class VideoMetrics(MetricCollection):
     """PSNR, aligned PSNR, SSIM, temporal jitter and, if a network is given, LPIPS of clips; and
-    those of `own`, by name, each as UserMetricScore.
+    those of `own`, by name, each as score_by_user_metric.
 
     Frames are clipped to [0, 1]; the data range is 1.  `resolution_scale`: frames and targets are
     scored at so many times their own resolution, temporal jitter in pixels of the scored frame.
@@ -80,7 +76,7 @@ class VideoMetrics(MetricCollection):
         if taken := [name for name in own if name in NAMES or hasattr(MetricCollection, name)]:
             raise ValueError(f"metrics.{taken[0]} must be called otherwise: the name is taken")
         scores = SCORES if lpips is None else SCORES | {"lpips": lpips}
-        scores = scores | {name: UserMetricScore(name, metric) for name, metric in own.items()}
+        scores = scores | {k: partial(score_by_user_metric, k, m) for k, m in own.items()}
         metrics: dict[str, Metric | MetricCollection]
         metrics = {name: ClipMean(score) for name, score in scores.items()}
         # Groups would merge scores that are equal on the first clip.
@@ -88,7 +84,7 @@ class VideoMetrics(MetricCollection):
         self.resolution_scale = scale
         self.names = (*(name for name in NAMES if name in scores), *own)
         self.user_metric_columns: tuple[Column, ...] = tuple(
-            make_user_metric_column(name, {None: 0, True: 1, False: -1}[metric.higher_is_better])
+            Column(name, name, 3, {None: 0, True: 1, False: -1}[metric.higher_is_better])
             for name, metric in own.items()
         )
 

@@ -17,7 +17,7 @@ from torch.nn.utils.parametrizations import spectral_norm as normalise_spectrum
 
 from src.models.layers import ConvGRU, ConvLSTM, ResidualBlock, pad_centred_to_multiple
 from src.models.network import WINDOW_S, EventToVideoNetwork
-from src.sim.optics import Position, centre_view_index, layout
+from src.sim.optics import Position, layout, most_central_view_index
 
 CELLS = {"convlstm": ConvLSTM, "convgru": ConvGRU}
 ACTIVATIONS = {"sigmoid": torch.sigmoid, "none": lambda x: x}
@@ -119,7 +119,7 @@ class E2VID(EventToVideoNetwork):
         centre view as before and the others not yet, so that the frames are one view's.
         """
         first = "head.weight" if self.stem is None else "stem.weight"
-        before = centre_view_index(layout(self.views)) * self.bins
+        before = most_central_view_index(layout(self.views)) * self.bins
         behind = (self.views - 1) * self.bins - before
         padding = (0, 0, 0, 0, before, behind)
         return {n: functional.pad(w, padding) if n == first else w for n, w in weights.items()}

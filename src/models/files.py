@@ -16,7 +16,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from src import importable_name
+from src import add_package_prefix
 from src.models.checkpoints import is_intact, newest_checkpoint
 from src.models.e2vid import E2VID
 from src.models.folding import fold_parametrizations, inference_copy
@@ -191,7 +191,7 @@ def _build(spec: dict, path: Path, allowed_packages: Sequence[str] = ()) -> nn.M
     _check_numbers(kwargs, path)
     room, _, name = target.rpartition(".")
     try:
-        kind = getattr(import_module(importable_name(room)), name)
+        kind = getattr(import_module(add_package_prefix(room)), name)
         if not issubclass(kind, nn.Module):
             raise TypeError(f"{target} is no network")
         return kind(**kwargs)

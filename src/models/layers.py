@@ -113,7 +113,7 @@ class EqualDCConv(nn.Conv2d):
 
 
 def require_bias(layer: nn.Conv2d | nn.Linear) -> Tensor:
-    """Return the bias of a layer that has one."""
+    """Return the bias, which the layer must have."""
     assert layer.bias is not None
     return layer.bias
 

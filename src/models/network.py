@@ -1,6 +1,6 @@
 """The contract of every network here, and how one is run over a sequence of windows."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -124,20 +124,12 @@ def unroll(
     output_windows: Sequence[int] | None = None,
 ) -> tuple[Float[Tensor, "n outputs 1 h w"], Any]:
     """Return what `network.sequence` does, of a sequence of any length: MAX_WINDOWS at a time."""
-    frames = []
-    for part in split_windows(voxels.shape[1], MAX_WINDOWS):
-        wanted = output_windows
-        if wanted is not None:  # counted from the first of the part
-            wanted = [k - part.start for k in wanted if part.start <= k < part.stop]
+    frames, wanted = [], output_windows
+    for k, part in enumerate(voxels.split(MAX_WINDOWS, 1)):
+        if output_windows is not None:  # counted from the first of the part
+            wanted = [w % MAX_WINDOWS for w in output_windows if w // MAX_WINDOWS == k]
         some, state = network.sequence(
-            voxels[:, part], state, window_s=window_s, positions=positions, output_windows=wanted
+            part, state, window_s=window_s, positions=positions, output_windows=wanted
         )
         frames.append(some)
     return torch.cat(frames, dim=1), state
-
-
-def split_windows(windows: int, length: int) -> Iterator[slice]:
-    """Yield slices of at most `length` windows (0: all at once) that cover `windows`."""
-    length = length or windows
-    for start in range(0, windows, length):
-        yield slice(start, min(start + length, windows))

@@ -1,31 +1,40 @@
 """SetNet: video from the events of a set of 1 to 25 views, at any window length.
 
-One window of events and the state in, one frame and the new state out.  n: clips, m: windows * n in
-order of time, c: `channels` (16, 40 or 64), hk and wk: height and width, padded to a multiple of 8,
-divided by k.  Right column: fields of SetNetState.
+One window of events and the state in, one frame and the new state out.  Voxels: sums of polarity in
+`bins` slices of the window, views registered to the centre view; frame: code values in [0, 1].
+n: clips, m: windows * n in order of time, c: `channels` (16, 40 or 64), hk and wk: height and
+width, padded by reflection to a multiple of 8, divided by k.  Right column: fields of SetNetState.
 
     voxels (n, views, bins, h, w)
+      |
+      +-> clock of each cell: trace of the events, support  (n, views, h2, w2)     event_trace
+      |     speed, elapsed time, 0: the cell stands still   (n, 1, h2, w2)         activity
+      |     supported events nearby so far                  (n, 1, h2, w2)         evidence
+      |
+    voxels of cells whose clock advances, of others 0
       |            |
-      |          sum over bins and 2 x 2 pixels               (n, views, h2, w2)
-      |          leaky sums, tau 0.05 s and 0.5 s             (n, views, 2, h2, w2)  view_sums
+      |          sum over bins and 2 x 2 pixels             (n, views, h2, w2)
+      |          leaky sums, tau 0.05 s and 0.5 s           (n, views, 2, h2, w2)  view_sums
       |            |            |
       |            |          mean absolute deviation
-      |            |          from the mean of the views      (n, 2, h2, w2)
+      |            |          from the mean of the views    (n, 2, h2, w2)
       |            |            |
     5 x 5, /2    3 x 3        3 x 3     convolutions, each to (n, c, h2, w2)
     per 1/120 s    |            |
       +--- sum ----+------------+
-            | ReLU                                            (n, c, h2, w2)
-    time-gated memory: input 3 x 3, state 1 x 1               (n, c, h2, w2)         hidden
+            | ReLU                                          (n, c, h2, w2)
+    time-gated memory: input 3 x 3, state 1 x 1             (n, c, h2, w2)         hidden
             |
             +-----------------+
-            |          context pyramid: /4, /8, /16 and back, at most every 1/30 s
-            |          moving average                         (n, c, h4, w4)  context_average
-            |          low-pass, tau 1/60 s                   (n, c, h4, w4)  context_smoothed
+            |          context pyramid: /4, /8, /16 and back, at most every 1/30 s  scales
+            |          moving average                       (n, c, h4, w4)         context_average
+            |          low-pass, tau 1/60 s                 (n, c, h4, w4)         context_smoothed
             |                 |
-            + sum <- nearest -+                               (n, c, h2, w2)
-            | ReLU, 3 x 3, ReLU, 3 x 3 with equal DC response (n, 4, h2, w2)
-            | pixel shuffle, sigmoid
+            + sum <- nearest -+                             (n, c, h2, w2)
+            | ReLU, 3 x 3, ReLU, 3 x 3 with equal DC response, sigmoid
+            |                                               (n, 4, h2, w2)
+            | blended with the background by the evidence
+            | pixel shuffle, crop
     frame (n, 1, h, w)
 
 * Set of views: the views are stacked as channels of one convolution, and the kernel of each is a
@@ -34,12 +43,14 @@ divided by k.  Right column: fields of SetNetState.
   scene, common to all.
 * Leaky sums: the polarities of a pixel sum to its change of log intensity, in thresholds; the leak
   bounds the accumulated error.
-* Any window length: all state decays exponentially in time, not per window, and voxel counts become
-  rates.
-* A clock for each cell: it runs near events that others support, and by at most 4 ms in all after
-  the last; then the cell's state is held.  Where much of the picture is active the camera moves,
-  and all clocks run.
-* Background: what no event has revealed yet has one brightness, that at the rim of what is.
+* Window length: memory, sums, trace and activity decay exponentially in time, not per window, and
+  voxel counts become rates.  A supported event advances a cell by its whole window.
+* Clock: a cell's runs near supported events (others fell in the 8 cells around, of the same view),
+  and by at most 3.75 ms in all after the last; then its memory and sums are held, its context after
+  a last update.  Memory and sums age by that clock, the context by the fastest one.  Where much of
+  the picture is active the camera moves, and all clocks run.
+* Background: what no event has revealed yet has one brightness, the mean at the rim of what is,
+  begun at 0.45.
 * Context: events lie at edges, so the brightness of a uniform area follows from edges that may be
   far; the pyramid provides the receptive field.  The context is updated at most 30 times a second
   and low-pass filtered, so that the frame does not change in steps.
@@ -78,6 +89,7 @@ SIZES: dict[str, dict[str, Any]] = {  # GMAC at 176 x 176, 9 views, context incl
     },
 }  # fmt: skip
 MAX_VIEWS = 25
+KERNEL_RANKS = 5  # basis kernels that the position of a view weighs, beside one of all views
 CELL_PX = 2  # a cell: CELL_PX x CELL_PX pixels, one place of the half-resolution maps
 CELL_BORDER = 2  # padding, in cells, of the decoder's two 3 x 3 convolutions together
 REFERENCE_HZ = 120.0  # window rate in training; unit of time of rates and gates: 1 / REFERENCE_HZ
@@ -110,12 +122,12 @@ class SetNetState(NamedTuple):
     view_sums: Float[Tensor, "n views taus h2 w2"]  # leaky polarity sums, per view and cell
     event_trace: Float[Tensor, "n views h2 w2"]  # events of a cell, decaying by TRACE_TAU_S
     activity: Float[Tensor, "n 1 h2 w2"]  # clock speed: 1 near supported events, decaying without
-    evidence: Float[Tensor, "n 1 h2 w2"]  # supported events nearby so far, per cell and view
+    evidence: Float[Tensor, "n 1 h2 w2"]  # supported events nearby so far, of the view with most
     is_pending: Float[Tensor, "n 1 h2 w2"]  # 1: was active since the last context update
     update_recency: Float[Tensor, "n 1 1 1"]  # exp(-age / CONTEXT_INTERVAL_S) of the last update
     context_recency: Float[Tensor, "n 1 h4 w4"]  # the same of each cell's own; 0: no context yet
     hidden: Float[Tensor, "n c h2 w2"]  # memory, in [-1, 1]
-    scales: tuple[Tensor, ...]  # maps of the pyramid, those of ContextPyramid.map_sizes
+    scales: tuple[Tensor, ...]  # maps of the pyramid, those of ContextPyramid.held_map_sizes
     context_average: Context  # moving average of the pyramid's output
     context_smoothed: Context  # the same, low-pass filtered in time
 
@@ -130,7 +142,7 @@ class ClockTick(NamedTuple):
     smoothing_s: Float[Tensor, "m 1 h4 w4"]  # time by which the smoothed context advances
 
 
-def advance_activity(
+def advance_cell_clocks(
     is_near_events: Tensor, window_s: Tensor, activity: Float[Tensor, "n 1 h2 w2"]
 ) -> tuple[Float[Tensor, "n 1 h2 w2"], Float[Tensor, "n 1 h2 w2"]]:
     """Return by how many seconds the clock of each cell advances in a window, and its activity.
@@ -145,7 +157,7 @@ def advance_activity(
     return elapsed_s, torch.where(is_near_events, 1.0, remaining)
 
 
-def pace_of_all_cells(activity: Float[Tensor, "n 1 h2 w2"]) -> Float[Tensor, "n 1 1 1"]:
+def moving_camera_pace(activity: Float[Tensor, "n 1 h2 w2"]) -> Float[Tensor, "n 1 1 1"]:
     """Return the speed of all clocks relative to that of the most active cell: 0 up to STATIC_SHARE
     of active cells, 1 from MOVING_SHARE on."""
     share = (activity > 0).sum((2, 3), keepdim=True).float() / activity[0].numel()
@@ -155,12 +167,12 @@ def pace_of_all_cells(activity: Float[Tensor, "n 1 h2 w2"]) -> Float[Tensor, "n 
 def find_supported_events(
     counts: Float[Tensor, "m views h2 w2"], trace: Float[Tensor, "m views h2 w2"]
 ) -> Float[Tensor, "m 1 h2 w2"]:
-    """Return the number of events of each cell that others support, in the view that has most."""
+    """Return the supported events of each cell (sum of |voxels|), of the view that has most."""
     support = 9 * functional.avg_pool2d(trace, 3, 1, 1) - trace
     return (counts * (support > MIN_SUPPORT)).amax(1, keepdim=True)
 
 
-def find_active_cells(supported: Float[Tensor, "m 1 h2 w2"]) -> Tensor:
+def active_cell_mask(supported: Float[Tensor, "m 1 h2 w2"]) -> Tensor:
     """Return (m, 1, h2, w2) bool: cells within REACH_CELLS of a supported event of any view."""
     size = 2 * REACH_CELLS + 1
     return functional.max_pool2d((supported > 0).float(), size, 1, REACH_CELLS) > 0
@@ -280,7 +292,9 @@ class SetNet(EventToVideoNetwork):
             lambda sums, decay, new: decay * sums + new, before.view_sums, decay, cells[:, :, None]
         )
         stem = self.stem(voxels, sums, seconds, where)
-        features, hidden = self.run_memory(stem, is_active, before.hidden, tick.elapsed_s)
+        inputs = self.relu(stem) * is_active
+        features, hidden = self.memory(inputs, before.hidden, REFERENCE_HZ * tick.elapsed_s)
+        features = features.to(stem.dtype)
         new, scales = self.context(features, before.scales, tick.is_updated)
         contexts, context = self.average_context(new, before.context_average, tick)
         smoothed, context_smoothed = scan_windows(
@@ -315,14 +329,14 @@ class SetNet(EventToVideoNetwork):
         kept = torch.exp(-seconds / TRACE_TAU_S)
         traces, trace = scan_windows(lambda old, new: kept * old + new, state.event_trace, counts)
         supported = find_supported_events(counts, traces)
-        near, gain = find_active_cells(supported), spread_evidence(supported)
+        near, gain = active_cell_mask(supported), spread_evidence(supported)
         activity, evidence, pending = state.activity, state.evidence, state.is_pending
         recency, cell_recency, ticks = state.update_recency, state.context_recency, []
         n = len(activity)
         for is_near, more in zip(near.split(n), gain.split(n), strict=True):
-            elapsed_s, activity = advance_activity(is_near, seconds, activity)
+            elapsed_s, activity = advance_cell_clocks(is_near, seconds, activity)
             longest_s = elapsed_s.amax((2, 3), keepdim=True)
-            moving_s = pace_of_all_cells(activity) * longest_s
+            moving_s = moving_camera_pace(activity) * longest_s
             elapsed_s = torch.maximum(elapsed_s, moving_s)
             evidence = evidence + more + REVEALING_EVENTS / REVEALING_S * moving_s
             kept_recency = torch.exp(-longest_s / CONTEXT_INTERVAL_S)
@@ -330,7 +344,7 @@ class SetNet(EventToVideoNetwork):
             pending = torch.maximum(pending, (elapsed_s > 0).float())
             due = (recency <= UPDATE_RECENCY) & (longest_s > 0)
             is_updated = due & (pending > 0)
-            coarse = _any_of_cells(pending)
+            coarse = functional.max_pool2d(pending, 2)
             smoothing_s = longest_s * ((coarse > 0) | (cell_recency > SETTLING))
             ticks.append(ClockTick(evidence, elapsed_s, is_updated, cell_recency, smoothing_s))
             cell_recency = torch.where(due & (coarse > 0), 1.0, cell_recency)
@@ -361,24 +375,17 @@ class SetNet(EventToVideoNetwork):
         rates = counts * scale.repeat(len(counts) // len(scale), 1, 1, 1).to(counts.dtype)
         return rates + functional.conv2d(sums, sum_kernel, bias, 1, 1)
 
-    def run_memory(
-        self, stem: Maps, is_active: Tensor, hidden: Tensor, elapsed_s: Float[Tensor, "m 1 h2 w2"]
-    ) -> tuple[Maps, Tensor]:
-        """Return the hidden map after each window, in the type of `stem`, and after the last."""
-        inputs = self.relu(stem) * is_active
-        features, hidden = self.memory(inputs, hidden, REFERENCE_HZ * elapsed_s)
-        return features.to(stem.dtype), hidden
-
     def average_context(
         self, new: Float[Tensor, "m c h4 w4"], context: Tensor, tick: ClockTick
     ) -> tuple[Float[Tensor, "m c h4 w4"], Context]:
         """Return the moving average after each window and after the last, float32."""
 
         def step(before: Tensor, new: Tensor, recency: Tensor, updated: Tensor) -> Tensor:
-            average = self.context.moving_average(before, new, recency)
+            # `recency`: exp(-age / interval) of the context before
+            average = torch.lerp(new, before, recency ** self.context.log_rate.float().exp())
             return torch.where(updated, average, before)
 
-        updated = _any_of_cells(tick.is_updated.float()) > 0
+        updated = functional.max_pool2d(tick.is_updated.float(), 2) > 0
         return scan_windows(step, context, new.float(), tick.context_recency, updated)
 
     def decode_logits(
@@ -420,15 +427,10 @@ class SetNet(EventToVideoNetwork):
             raise ValueError(f"optics.positions must be {views} (row, col), got {positions}")
         return tuple((int(row), int(column)) for row, column in positions)
 
-    def map_sizes(self, height: int, width: int) -> list[tuple[int, int, int]]:
-        """Return the sizes (c, h, w) of hidden and of both contexts of a picture."""
-        return [(self.channels, height // k, width // k) for k in (2, 4, 4)]
-
     def _checked_state(self, state: SetNetState | None, cells: Tensor) -> SetNetState:
         """Return `state`, or zeros of the right sizes; ValueError when they are not right."""
         n, views, rows, columns = cells.shape
-        maps = self.map_sizes(CELL_PX * rows, CELL_PX * columns)
-        half, quarter = (rows, columns), maps[1][1:]
+        half, quarter = (rows, columns), (rows // 2, columns // 2)
         zeros = SetNetState(
             view_sums=cells.new_zeros(n, views, len(SUM_TAUS_S), *half),
             event_trace=cells.new_zeros(n, views, *half),
@@ -437,10 +439,10 @@ class SetNet(EventToVideoNetwork):
             is_pending=cells.new_zeros(n, 1, *half),
             update_recency=cells.new_zeros(n, 1, 1, 1),
             context_recency=cells.new_zeros(n, 1, *quarter),
-            hidden=cells.new_zeros(n, *maps[0]),
-            scales=tuple(cells.new_zeros(n, *size) for size in self.context.map_sizes(*half)),
-            context_average=cells.new_zeros(n, *maps[1]),
-            context_smoothed=cells.new_zeros(n, *maps[2]),
+            hidden=cells.new_zeros(n, self.channels, *half),
+            scales=tuple(cells.new_zeros(n, *size) for size in self.context.held_map_sizes(*half)),
+            context_average=cells.new_zeros(n, self.channels, *quarter),
+            context_smoothed=cells.new_zeros(n, self.channels, *quarter),
         )
         if state is None:
             return zeros
@@ -457,13 +459,13 @@ class ViewKernels(nn.Module):
     as many ranks as views it can equal any convolution of the stacked views of one layout.
     """
 
-    def __init__(self, inputs: int, outputs: int, kernel_size: int, ranks: int = 5):
+    def __init__(self, inputs: int, outputs: int, kernel_size: int):
         super().__init__()
-        shape = ((ranks + 1) * outputs, inputs, kernel_size, kernel_size)
+        shape = ((KERNEL_RANKS + 1) * outputs, inputs, kernel_size, kernel_size)
         bound = 1 / math.sqrt(inputs * kernel_size**2)
         self.basis = nn.Parameter(torch.empty(shape).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.zeros(outputs))
-        self.code = nn.Sequential(nn.Linear(3, 16), nn.Tanh(), nn.Linear(16, ranks))
+        self.code = nn.Sequential(nn.Linear(3, 16), nn.Tanh(), nn.Linear(16, KERNEL_RANKS))
 
     def kernel(
         self, positions: Float[Tensor, "views 2"]
@@ -540,7 +542,7 @@ class ContextPyramid(nn.Module):
         initial = torch.full((channels, 1, 1), math.log(INITIAL_CONTEXT_RATE))
         self.log_rate = nn.Parameter(initial)  # log decay rate of the moving average, per channel
 
-    def map_sizes(self, rows: int, columns: int) -> list[tuple[int, int, int]]:
+    def held_map_sizes(self, rows: int, columns: int) -> list[tuple[int, int, int]]:
         """Return the sizes (c, h, w) of the maps that are held: those of the scales, finest first,
         then the sums with the coarser ones but the finest, coarsest first."""
         sizes = []
@@ -587,10 +589,6 @@ class ContextPyramid(nn.Module):
         coarser = functional.interpolate(x, finer.shape[-2:], mode="bilinear")
         return self.fusion_blocks[scale](finer + coarser)
 
-    def moving_average(self, before: Context, new: Context, recency: Tensor) -> Context:
-        """Return the moving average with `new`; `recency` (n, 1, h4, w4): exp(-age / interval)."""
-        return torch.lerp(new, before, recency ** self.log_rate.float().exp())
-
 
 def scan_windows(
     step: Callable[..., Tensor], state: Float[Tensor, "n ..."], *maps: Shaped[Tensor, "m ..."]
@@ -629,10 +627,6 @@ def _sum_cells(x: Float[Tensor, "m views h w"]) -> Float[Tensor, "m views h2 w2"
     """Return the sums of 2 x 2 pixels; avg_pool2d is slower on a CPU."""
     rows = x[..., ::2, :] + x[..., 1::2, :]
     return rows[..., ::2] + rows[..., 1::2]
-
-
-def _any_of_cells(mask: Float[Tensor, "n 1 h2 w2"]) -> Float[Tensor, "n 1 h4 w4"]:
-    return functional.max_pool2d(mask, 2)
 
 
 def _sizes(state: SetNetState) -> list:

@@ -34,12 +34,12 @@ class CornerFold:
             got = f"must be in -{MAX_ANGLE_RAD}..{MAX_ANGLE_RAD}, got {self.angle_rad}"
             raise ValueError(f"views: fold.angle_rad {got}")
 
-    def turn(self, points: Points) -> Points:
+    def turn_halves(self, points: Points) -> Points:
         """Return the places in the centre view of points under the view's homography."""
         return self._turn(points, self.angle_rad / 2)
 
-    def turn_back(self, points: Points) -> Points:
-        """Return the inverse of `turn`; the nearer half shows what both show or none does."""
+    def turn_halves_back(self, points: Points) -> Points:
+        """Return the inverse of `turn_halves`; what both halves or none show is in the nearer."""
         return self._turn(points, -self.angle_rad / 2)
 
     def signed_distance_px(self, points: Points) -> Float[np.ndarray, " n"]:

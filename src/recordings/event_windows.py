@@ -91,14 +91,12 @@ class WindowRule:
             )
 
 
-def frames_per_window(window_length: str, fps: float) -> int:
-    """Return how many frames a window spans: `frame` one; `trained` TRAINED_WINDOW_S, if longer.
-
-    Raises ValueError for another `window_length`.
-    """
-    if window_length not in ("frame", "trained"):
-        raise ValueError(f"window_length must be frame or trained, got {window_length}")
-    return max(1, round(TRAINED_WINDOW_S * fps)) if window_length == "trained" else 1
+def count_frames_per_window(frame_or_trained: str, fps: float) -> int:
+    """Return how many frames a window of `window_length` spans: `frame` one; `trained`
+    TRAINED_WINDOW_S, if longer.  Raises ValueError for another."""
+    if frame_or_trained not in ("frame", "trained"):
+        raise ValueError(f"window_length must be frame or trained, got {frame_or_trained}")
+    return max(1, round(TRAINED_WINDOW_S * fps)) if frame_or_trained == "trained" else 1
 
 
 Cut = tuple[np.ndarray, float, float]  # events of a window, its start and end in us
@@ -110,38 +108,42 @@ def cut_windows(
     """Cut chunks of events (t x y p, in order of time) into windows; warns of an `end_s` after the
     last event.  Raises ValueError for time running backwards, an event off the sensor, or less than
     one window."""
-    span, is_empty = _TimeSpan(), True
-    for events, start_us, end_us in _cut(span.watch(chunks), lookup, rule):
+    checked, is_empty = _OrderedChunks(chunks), True
+    for events, start_us, end_us in _cut(checked, rule):
         yield fill_window(events, lookup, rule, start_us, end_us)
         is_empty = False
     if is_empty:
-        raise ValueError(_explain_no_window(rule, span.length_s))
-    if span.length_s + 1 / rule.fps < rule.end_s < math.inf:
-        wanted = f"end_s must be at most the length of the recording, {span.length_s:.3f} s"
+        raise ValueError(_explain_no_window(rule, checked.length_s))
+    if checked.length_s + 1 / rule.fps < rule.end_s < math.inf:
+        wanted = f"end_s must be at most the length of the recording, {checked.length_s:.3f} s"
         warnings.warn(f"{wanted}, got {rule.end_s:g}; it is read to its end", stacklevel=1)
 
 
-class _TimeSpan:
-    """Notes the first and the last time of what `watch` passes on, in us."""
+class _OrderedChunks:
+    """Chunks of events, none empty, in order of time; the first and the last time so far, in us."""
 
-    def __init__(self) -> None:
-        self.first_us: int | None = None
-        self.last_us = 0
+    def __init__(self, chunks: Iterable[np.ndarray]):
+        self._chunks = chunks
+        self.first_us, self.last_us = math.nan, math.nan
 
-    def watch(self, chunks: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-        for chunk in filter(len, chunks):
-            self.first_us = int(chunk["t"][0]) if self.first_us is None else self.first_us
-            self.last_us = int(chunk["t"][-1])
+    def __iter__(self) -> Iterator[np.ndarray]:
+        for chunk in filter(len, self._chunks):
+            t = chunk["t"]
+            if (np.diff(t) < 0).any() or t[0] < self.last_us:
+                raise ValueError(
+                    "recording must not run backwards in time, an event is before the last"
+                )
+            self.first_us = float(t[0]) if math.isnan(self.first_us) else self.first_us
+            self.last_us = float(t[-1])
             yield chunk
 
     @property
     def length_s(self) -> float:
         """From the first event to the last; 0 without events."""
-        return 0.0 if self.first_us is None else (self.last_us - self.first_us) * 1e-6
+        return 0.0 if math.isnan(self.first_us) else (self.last_us - self.first_us) * 1e-6
 
 
 def _explain_no_window(rule: WindowRule, length_s: float) -> str:
-    """Return why a recording of `length_s` has no window."""
     if 0 < length_s <= rule.start_s:
         wanted = f"below the length of the recording, {length_s:.3f} s"
         return f"start_s must be {wanted}, got {rule.start_s:g}"
@@ -159,24 +161,22 @@ def cut_windows_backward(
     phase its state.  Raises ValueError as `cut_windows` and for an impossible length of time.
     """
     end_s = min(rule.end_s, rule.start_s + check_backward_warmup_s(seconds))
-    cuts = list(_cut(chunks, lookup, replace(rule, end_s=end_s)))
+    cuts = list(_cut(_OrderedChunks(chunks), replace(rule, end_s=end_s)))
     whole = len(cuts) // rule.frames_per_window * rule.frames_per_window
     for events, start_us, end_us in reversed(cuts[:whole]):
         yield fill_window(events, lookup, rule, start_us, end_us).reversed()
 
 
-def _cut(chunks: Iterable[np.ndarray], lookup: SensorLookup, rule: WindowRule) -> Iterator[Cut]:
+def _cut(chunks: _OrderedChunks, rule: WindowRule) -> Iterator[Cut]:
     def cut(k: int) -> Cut:
         to = start + k * 1e6 / rule.fps
         since = start + (k - rule.frames_per_window) * 1e6 / rule.fps
         return events[count_before(events, since) : count_before(events, to)], since, to
 
-    period, k, last, end = 1e6 / rule.fps, 1, -np.inf, np.inf
+    period, k = 1e6 / rule.fps, 1
     pending: list[np.ndarray] = []
-    for chunk in _check_chunks(chunks, lookup):
-        if not np.isfinite(last):
-            start, end = chunk["t"][0] + 1e6 * np.array([rule.start_s, rule.end_s])
-            last = start
+    for chunk in chunks:
+        start, end = chunks.first_us + 1e6 * np.array([rule.start_s, rule.end_s])
         chunk = chunk[count_before(chunk, start) :]
         if not len(chunk):
             continue
@@ -192,19 +192,6 @@ def _cut(chunks: Iterable[np.ndarray], lookup: SensorLookup, rule: WindowRule) -
     while pending and start + (k - 1 + COVERED) * period <= last:
         yield cut(k)
         k += 1
-
-
-def _check_chunks(chunks: Iterable[np.ndarray], lookup: SensorLookup) -> Iterator[np.ndarray]:
-    last = None
-    for chunk in filter(len, chunks):
-        t = chunk["t"]
-        if (np.diff(t) < 0).any() or (last is not None and t[0] < last):
-            raise ValueError(
-                "recording must not run backwards in time, an event is before the last"
-            )
-        last = t[-1]
-        lookup.check_on_sensor(chunk)
-        yield chunk
 
 
 def fill_window(

@@ -6,7 +6,6 @@ scored, and a network reads empty windows too.
 """
 
 import math
-from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -74,7 +73,7 @@ class EvrealWindow(NamedTuple):
     start_s: float
     end_s: float
     time_s: float
-    camera_frame: int
+    nearest_camera_frame: int
 
 
 class ScoredFrame(NamedTuple):
@@ -88,42 +87,32 @@ class ScoredFrame(NamedTuple):
 
 def cut_evreal_windows(sequence: EvrealSequence, rule: EvrealRule) -> Iterator[EvrealWindow]:
     """Yield the windows of a sequence with frames."""
-    t, frame_t = sequence.t, sequence.frame_t
-    assert frame_t is not None and sequence.event_index is not None
+    t, frame_t, index = sequence.t, sequence.frame_t, sequence.last_event_index
+    assert frame_t is not None and index is not None
     if rule.window == "frames":
-        ends = sequence.event_index
-        for k in range(len(frame_t) - 1):
-            before = max(k - 1, 0)
-            times = float(frame_t[before]), float(frame_t[k])
-            yield EvrealWindow(int(ends[before]), int(ends[k]), *times, times[1], k)
+        camera_frames = np.arange(len(frame_t) - 1)
+        before = np.maximum(camera_frames - 1, 0)
+        first, stop, start_s, end_s = index[before], index[:-1], frame_t[before], frame_t[:-1]
+        time_s = end_s
     elif rule.window == "events":
-        for first in range(0, len(t) - rule.events_per_window + 1, rule.events_per_window):
-            last = first + rule.events_per_window
-            times = float(t[first]), float(t[last - 1])
-            yield EvrealWindow(first, last, *times, times[1], _nearest(frame_t, times[1]))
+        first = np.arange(0, len(t) - rule.events_per_window + 1, rule.events_per_window)
+        stop = first + rule.events_per_window
+        start_s, end_s = t[first], t[stop - 1]
+        time_s = end_s
     else:
-        yield from _windows_of_one_length(t, frame_t, rule.window_s)
-
-
-def _windows_of_one_length(t: np.ndarray, frame_t: np.ndarray, length: float) -> Iterator:
-    start, first = float(t[0]), 0
-    for k in range(int((float(t[-1]) - start) / length)):
-        begin = length * k + start
-        last = int(np.searchsorted(t, begin + length))
-        if last > first:
-            time = float(t[last - 1])
-        else:
-            time = float(t[first - 1]) + length if first else 0.0
-        yield EvrealWindow(first, last, begin, begin + length, time, _nearest(frame_t, time))
-        first = last
-
-
-def _nearest(frame_t: np.ndarray, time_s: float) -> int:
-    """Return the frame nearest in time, of two as near the earlier."""
-    place = bisect_left(frame_t, time_s)
-    if place in (0, len(frame_t)):
-        return min(place, len(frame_t) - 1)
-    return place - int(frame_t[place] - time_s >= time_s - frame_t[place - 1])
+        count = int((float(t[-1]) - float(t[0])) / rule.window_s)
+        start_s = rule.window_s * np.arange(count) + float(t[0])
+        end_s = start_s + rule.window_s
+        stop = np.searchsorted(t, end_s)
+        first = np.append(0, stop)[:-1]
+        held_s = np.where(
+            first > 0, t[first - 1] + np.float64(rule.window_s), 0.0
+        )  # of an empty window
+        time_s = np.where(stop > first, t[stop - 1], held_s)
+    if rule.window != "frames":  # of two as near the earlier
+        camera_frames = np.array([np.abs(frame_t - time).argmin() for time in time_s], np.int64)
+    columns = first, stop, start_s, end_s, time_s, camera_frames
+    yield from map(EvrealWindow, *(column.tolist() for column in columns))
 
 
 def check_scored_range(sequence: EvrealSequence, window: str, start_s: float, end_s: float) -> None:
@@ -160,10 +149,12 @@ def score_sequence(
         if window.time_s > end_s:
             break
         frame, state = _reconstruct(sequence, window, network, state, rule, bins, device)
-        distance_ms = 1e3 * abs(float(sequence.frame_t[window.camera_frame]) - window.time_s)
+        distance_ms = 1e3 * abs(
+            float(sequence.frame_t[window.nearest_camera_frame]) - window.time_s
+        )
         if window.time_s >= start_s and distance_ms <= rule.tolerance_ms:
             picture = normalise_output(frame, rule.output_normalisation).clip(0, 1)
-            truth = sequence.images[window.camera_frame][..., 0].astype(np.float32) / 255
+            truth = sequence.images[window.nearest_camera_frame][..., 0].astype(np.float32) / 255
             scores = score_frame(picture, truth, rule.histogram, lpips, device)
             yield ScoredFrame(number, window, picture, scores)
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from src.recordings.engines.event_passes import LONG_AGO_US, mark_supported_events
-from src.recordings.views import Size
+from src.recordings.views import HeightWidth
 
 SUPPORT_S = 0.005  # of `find_supported_pixels`
 
@@ -19,7 +19,7 @@ class NoiseFilter:
     `sensor`: (height, width).  Raises ValueError unless `support_s` is above 0.
     """
 
-    def __init__(self, sensor: Size, support_s: float):
+    def __init__(self, sensor: HeightWidth, support_s: float):
         if not 0 < support_s < math.inf:
             raise ValueError(f"noise_filter_s must be > 0 seconds or null, got {support_s}")
         height, width = sensor
@@ -39,7 +39,9 @@ class NoiseFilter:
         return events[kept]
 
 
-def find_supported_pixels(pieces: Iterable[np.ndarray], sensor: Size) -> Bool[np.ndarray, "h w"]:
+def find_supported_pixels(
+    pieces: Iterable[np.ndarray], sensor: HeightWidth
+) -> Bool[np.ndarray, "h w"]:
     """Return the pixels that had an event a NoiseFilter of SUPPORT_S keeps."""
     has_events, keep = np.zeros(sensor, bool), NoiseFilter(sensor, SUPPORT_S)
     for kept in map(keep, pieces):

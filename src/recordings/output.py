@@ -22,7 +22,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import GifImagePlugin, Image
 
+from src.recordings.files.event_file import HeightWidth
 from src.recordings.reconstruction import Frame
+from src.records.atomic import partial_path
 
 LEAST_FREE_BYTES = 32 * 2**20
 VP9 = {"crf": "12", "b": "0", "deadline": "realtime", "cpu-used": "6"}  # error of 1 level, rms
@@ -34,7 +36,7 @@ Add = Callable[[Picture, Frame | None], None]
 
 @contextmanager
 def open_video_writer(
-    kind: str, folder: Path, size: tuple[int, int], playback_fps: float = 30.0
+    kind: str, folder: Path, size: HeightWidth, playback_fps: float = 30.0
 ) -> Iterator[Callable[[Frame], None]]:
     """Open `video.mp4`, `video.gif`, `frames/`, `video.h5` or `film.mp4` in `folder`; yield
     `write(frame)`.
@@ -122,11 +124,6 @@ def resize_picture(
     return cv2.resize(picture, (size[1], size[0]), interpolation=how)
 
 
-def partial_path(path: Path) -> Path:
-    """Return the name of a file while it is written: `video.partial.mp4`, `frames.partial`."""
-    return path.with_name(f"{path.stem}.partial{path.suffix}")
-
-
 def _check_mp4(path: Path, written: int) -> None:
     """Raise OSError unless `written` frames are in it: an encoder may be silent on a full disk."""
     with av.open(str(path)) as file:
@@ -136,7 +133,7 @@ def _check_mp4(path: Path, written: int) -> None:
 
 
 @contextmanager
-def _mp4(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
+def _mp4(path: Path, size: HeightWidth, fps: float) -> Iterator[Add]:
     rate = Fraction(fps).limit_denominator(1001)
     with av.open(str(path), "w") as file:
         stream = file.add_stream("libvpx-vp9", rate=rate, options=VP9)  # browsers and OpenCV know
@@ -159,7 +156,7 @@ def _mp4(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
 
 
 @contextmanager
-def _gif(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
+def _gif(path: Path, size: HeightWidth, fps: float) -> Iterator[Add]:
     hundredths = max(2, round(100 / fps))
     with open(path, "wb") as file:
         blank = Image.new("L", size[::-1])
@@ -176,7 +173,7 @@ def _gif(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
 
 
 @contextmanager
-def _png(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
+def _png(path: Path, size: HeightWidth, fps: float) -> Iterator[Add]:
     if path.is_dir():
         shutil.rmtree(path)  # what a stopped run left
     path.mkdir()
@@ -191,7 +188,7 @@ def _png(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
 
 
 @contextmanager
-def _hdf5(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
+def _hdf5(path: Path, size: HeightWidth, fps: float) -> Iterator[Add]:
     with h5py.File(path, "w", rdcc_nbytes=CACHE_BYTES) as file:
         shapes = {"maxshape": (None, *size), "chunks": (1, *size)}
         frames = file.create_dataset("frames", (0, *size), np.uint8, compression="lzf", **shapes)

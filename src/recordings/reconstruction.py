@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import cycle
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -68,7 +68,7 @@ def takes_all_views(network: EventToVideoNetwork, views: int) -> bool:
     return views == 1 or (wants != 1 and not network.uses_centre_view_only)
 
 
-def default_window_length(network: EventToVideoNetwork) -> str:
+def default_window_length(network: EventToVideoNetwork) -> Literal["frame", "trained"]:
     """Return `frame` for a network that uses its window's length, else `trained`: most fade when
     fed shorter windows than in training."""
     return "frame" if network.uses_window_length else "trained"

@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from src.recordings.engines.splat import (
-    list_bilinear_parts,
-    list_nearest_pixels,
+    list_bilinear_contributions,
+    list_nearest_contributions,
     splat_and_count_outside,
 )
-from src.recordings.views import Size, Views
+from src.recordings.views import HeightWidth, Views
 
 MIN_DENSITY = 0.1  # where fewer sensor pixels than this map to a model pixel, no scaling up
 
@@ -24,7 +24,7 @@ class SensorLookup:
     view: Int[np.ndarray, "h w"]
     model_xy: Float[np.ndarray, "h w 2"]
     views: int
-    model: Size
+    model: HeightWidth
 
     def empty_grid(self, bins: int) -> Float[np.ndarray, "views bins h w"]:
         return np.zeros((self.views, bins, *self.model), np.float32)
@@ -56,15 +56,15 @@ class SensorLookup:
         index, u, v, which, weight = made = [np.empty(count, dtype) for dtype in dtypes]
         x, y, p = (events[name] for name in "xyp")
         if nearest:
-            geometry = self.nearest_pixel, density[:, 0]
-            entries, outside = list_nearest_pixels(x, y, p, *geometry, *made)
+            geometry = self.nearest_model_pixel, density[:, 0]
+            entries, outside = list_nearest_contributions(x, y, p, *geometry, *made)
         else:
             parts = self.view, self.model_xy, density[:, 0]
-            entries, outside = list_bilinear_parts(x, y, p, *parts, *made)
+            entries, outside = list_bilinear_contributions(x, y, p, *parts, *made)
         return tuple(part[:entries] for part in (index, u, v, weight, which)), outside
 
     @cached_property
-    def nearest_pixel(self) -> Int[np.ndarray, "h w"]:
+    def nearest_model_pixel(self) -> Int[np.ndarray, "h w"]:
         """For each sensor pixel its nearest model pixel, counted through all views; -1: none."""
         limit = np.array(self.model[::-1]) - 1
         column, row = np.clip((self.model_xy + 0.5).astype(np.int32), 0, limit).transpose(2, 0, 1)

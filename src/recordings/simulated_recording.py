@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from src.recordings.files.event_arrays import concatenate_events
+from src.recordings.files.event_arrays import concatenate_events, sort_events
 from src.recordings.files.event_writers import write_events
 from src.recordings.sensor_lookup import SensorLookup, build_lookup
-from src.recordings.views import Size, View, Views
+from src.recordings.views import HeightWidth, View, Views
 from src.sim import noise
 from src.sim.optics import view_id
 from src.sim.sensor.sensor import EventSensor
@@ -26,7 +26,7 @@ DARK = 0.02  # share of light that a sensor pixel gets without any
 
 
 def kaleidoscope_views(
-    positions: list[tuple[int, int]], *, model: Size, sensor: Size = (720, 1280),
+    positions: list[tuple[int, int]], *, model: HeightWidth, sensor: HeightWidth = (720, 1280),
     tile_px: float | None = None, homography_error_px: float = 3.0, key: int = 0,
 ) -> Views:  # fmt: skip
     """Return the views of a kaleidoscope whose tiles are `tile_px` wide (None: as wide as all fit
@@ -127,8 +127,7 @@ def record_events(
         part = sensor.events(seen, fps, origin=(top, 0), full_width=width)
         part["y"] += top
         parts.append(part)
-    events = concatenate_events(parts)
-    return events[np.argsort(events["t"], kind="stable")]
+    return sort_events(concatenate_events(parts))
 
 
 def write_recording(

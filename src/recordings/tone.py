@@ -1,26 +1,13 @@
 """Tone of pictures to look at: dark and light ends stretched to black and white, slowly."""
 
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
-from src.recordings.reconstruction import Frame
-
-TONES = ("auto", "none")
 PERCENTILES = (1.0, 99.0)
 LARGEST_GAIN = 4.0
 LEAST_SPREAD = 1 / 255  # between the percentiles; a flatter picture is empty
-
-
-def check_tone(tone: str, tone_time_constant_s: float) -> None:
-    """Raise ValueError for values that `tone` and `tone_time_constant_s` cannot have."""
-    if tone not in TONES:
-        raise ValueError(f"tone must be auto or none, got {tone}")
-    if not 0 < tone_time_constant_s < math.inf:
-        raise ValueError(f"tone_time_constant_s must be > 0, got {tone_time_constant_s}")
 
 
 class ToneCurve:
@@ -28,10 +15,14 @@ class ToneCurve:
 
     The percentiles follow the pictures as a first-order filter in recorded time; the first picture
     sets them, one that is empty or equal to the last leaves them.  For display, never for scores.
+    Raises ValueError for values that `tone` and `tone_time_constant_s` cannot have.
     """
 
     def __init__(self, tone: str = "none", tone_time_constant_s: float = 0.5):
-        check_tone(tone, tone_time_constant_s)
+        if tone not in ("auto", "none"):
+            raise ValueError(f"tone must be auto or none, got {tone}")
+        if not 0 < tone_time_constant_s < math.inf:
+            raise ValueError(f"tone_time_constant_s must be > 0, got {tone_time_constant_s}")
         self.tone, self.time_constant_s = tone, tone_time_constant_s
         self.ends: np.ndarray | None = None  # the two percentiles, filtered
         self.last: tuple[float, np.ndarray] | None = None  # time in s and picture
@@ -63,14 +54,8 @@ class ToneCurve:
         self.ends = self.ends + share * (ends - self.ends)
 
 
-def curve_for_output(tone: str, tone_time_constant_s: float, output_format: str) -> ToneCurve:
+def build_output_curve(tone: str, tone_time_constant_s: float, output_format: str) -> ToneCurve:
     """Return the curve of a video; raises ValueError for tone=auto where frames are data."""
     if tone == "auto" and output_format not in ("mp4", "gif", "film"):
         raise ValueError(f"tone must be none for output_format={output_format}, got {tone}")
     return ToneCurve(tone, tone_time_constant_s)
-
-
-def apply_to_frames(frames: Iterable[Frame], curve: ToneCurve) -> Iterator[Frame]:
-    """Yield `frames` with their pictures as they are shown."""
-    for frame in frames:
-        yield replace(frame, picture=curve.apply(frame.picture, frame.time_s))

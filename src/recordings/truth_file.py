@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from src.recordings.files.event_file import HeightWidth
 from src.recordings.output import resize_picture, round_to_uint8
 from src.recordings.views import Views
 from src.records.atomic import atomic_path
@@ -30,7 +31,7 @@ TILT_STEPS_PER_PX = 32  # what is left out is below the error of the simulated t
 class TruthWriter:
     """Takes the frames of a clip, some at a time."""
 
-    def __init__(self, file: h5py.File, views: int, frames: int, size: tuple[int, int]):
+    def __init__(self, file: h5py.File, views: int, frames: int, size: HeightWidth):
         self.file, self.written = file, 0
         gzip: dict[str, Any] = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
         for name, shape, kind, chunk in (
@@ -48,7 +49,9 @@ class TruthWriter:
         at = slice(self.written, self.written + len(clean))
         self.file["clean"][at] = round_to_uint8(clean.numpy())
         self.file["views"][:, at] = round_to_uint8(views.numpy())
-        self.file["tilt"][:, at] = round_tilt_to_float16(tilt)
+        self.file["tilt"][:, at] = (
+            ((tilt * TILT_STEPS_PER_PX).round() / TILT_STEPS_PER_PX).half().numpy()
+        )
         self.written = at.stop
 
 
@@ -68,11 +71,6 @@ def create_truth_file(
         yield TruthWriter(file, len(views.positions), frames, views.model)
 
 
-def round_tilt_to_float16(tilt: Float[Tensor, "*shape"]) -> np.ndarray:
-    """Return pixels as float16, rounded to 1/32, so that they pack well."""
-    return ((tilt * TILT_STEPS_PER_PX).round() / TILT_STEPS_PER_PX).half().numpy()
-
-
 @dataclass(frozen=True, eq=False)
 class CleanClip:
     """`frames` (frames, h, w) uint8 at `times_s`, on the clock of the events."""
@@ -83,8 +81,6 @@ class CleanClip:
     def nearest_frame(self, time_s: float, size: tuple[int, ...]) -> Float[np.ndarray, "h w"]:
         """Return the frame nearest to `time_s`, in [0, 1], brought to `size` (h, w)."""
         frame = self.frames[int(np.abs(self.times_s - time_s).argmin())].astype(np.float32) / 255
-        if frame.shape == size[:2]:
-            return frame
         return resize_picture(frame, size).clip(0, 1)
 
 

@@ -16,7 +16,7 @@ import yaml
 from jaxtyping import Float
 
 from src.recordings.corner_fold import CornerFold, Points
-from src.recordings.files.sources import Size
+from src.recordings.files.event_file import HeightWidth
 from src.records import safe_yaml
 from src.records.atomic import write_text
 
@@ -41,11 +41,11 @@ class View:
     def to_centre(self, points: Points) -> Points:
         """Return the places in the centre view of sensor pixels of this one."""
         placed = _transform(self.homography, points)
-        return self.fold.turn(placed) if self.fold else placed
+        return self.fold.turn_halves(placed) if self.fold else placed
 
     def to_sensor(self, points: Points) -> Points:
         """Return the inverse of `to_centre`."""
-        placed = self.fold.turn_back(points) if self.fold else points
+        placed = self.fold.turn_halves_back(points) if self.fold else points
         return _transform(np.linalg.inv(self.homography), placed)
 
 
@@ -57,8 +57,8 @@ class Views:
     Raises ValueError where a size is out of range, a number is not finite, a position comes twice
     or less than three quarters of a view lies on the sensor."""
 
-    sensor: Size
-    model: Size
+    sensor: HeightWidth
+    model: HeightWidth
     field: tuple[float, float, float, float]
     views: tuple[View, ...]
 
@@ -94,7 +94,7 @@ class Views:
             )
 
     @classmethod
-    def single_view(cls, sensor: Size, model: Size) -> "Views":
+    def single_view(cls, sensor: HeightWidth, model: HeightWidth) -> "Views":
         """Return the whole sensor as one view, resampled to the model picture."""
         height, width = sensor
         whole = (-0.5, -0.5, width - 0.5, height - 0.5)
@@ -107,9 +107,8 @@ class Views:
     def to_model(self, view: View, points: Points) -> Points:
         """Return the places in the model picture of sensor pixels of `view`."""
         left, top, right, bottom = self.field
-        a, b = self.model[1] / (right - left), self.model[0] / (bottom - top)
-        scale = np.array([[a, 0, -left * a - 0.5], [0, b, -top * b - 0.5], [0, 0, 1]])
-        return _transform(scale, view.to_centre(points))
+        scale = np.array([self.model[1] / (right - left), self.model[0] / (bottom - top)])
+        return view.to_centre(points) * scale - (scale * (left, top) + 0.5)
 
     def outline(self, view: View) -> Float[np.ndarray, "4 2"]:
         """Return the corners of `view` on the sensor: the field's, clockwise from top left."""
@@ -135,13 +134,13 @@ class Views:
         (height, width), (left, top, right, bottom) = self.model, self.field
         x = left + (np.arange(width) + 0.5) * (right - left) / width
         y = top + (np.arange(height) + 0.5) * (bottom - top) / height
-        flat, places = picture.astype(np.float32), list_pairs(x, y)
+        flat, places = picture.astype(np.float32), list_grid_points(x, y)
         seen = (view.to_sensor(places) for view in self.views)
         return np.stack([sample_bilinear(flat, at, self.model) for at in seen])
 
     def _field_on_sensor(self, view: View, side: int) -> Points:
         x, y = np.linspace(self.field[:2], self.field[2:], side).T
-        return view.to_sensor(list_pairs(x, y))
+        return view.to_sensor(list_grid_points(x, y))
 
     def save(self, path: Path | str) -> None:
         """Write a YAML file that `load_views` reads back exactly."""
@@ -177,7 +176,7 @@ HEADER = """\
 
 
 def views_or_whole_sensor(
-    path: Path | str | None, sensor: Size, resolution: Sequence[int] | None = None
+    path: Path | str | None, sensor: HeightWidth, resolution: Sequence[int] | None = None
 ) -> Views:
     """Return the views of the file `path` or, without one, the whole sensor as one view.
 
@@ -186,7 +185,7 @@ def views_or_whole_sensor(
     return replace(views, model=(resolution[0], resolution[1])) if resolution else views
 
 
-def load_views(path: Path | str, sensor: Size | None = None) -> Views:
+def load_views(path: Path | str, sensor: HeightWidth | None = None) -> Views:
     """Read a file of `Views.save` or one by hand (`mirrored`, `error_px`, `points` are optional).
 
     Raises ValueError for what is no such file, a value out of range, a `mirrored` its homography
@@ -234,13 +233,15 @@ def _parse_numbers(values: list, kind: type, count: int) -> tuple:
     return tuple(kind(value) for value in values)
 
 
-def sample_bilinear(picture: Float[np.ndarray, "h w"], places: Points, size: Size) -> np.ndarray:
-    """Return `picture` at `places`, bilinear, 0 outside, as a picture of `size` (height, width)."""
+def sample_bilinear(
+    picture: Float[np.ndarray, "h w"], places: Points, out_size: HeightWidth
+) -> np.ndarray:
+    """Return `picture` at `places`, bilinear, 0 outside, as a picture of `out_size`."""
     x, y = places.T.astype(np.float32)
-    return cv2.remap(picture, x.reshape(size), y.reshape(size), cv2.INTER_LINEAR)
+    return cv2.remap(picture, x.reshape(out_size), y.reshape(out_size), cv2.INTER_LINEAR)
 
 
-def list_pairs(x: np.ndarray, y: np.ndarray) -> Points:
+def list_grid_points(x: np.ndarray, y: np.ndarray) -> Points:
     """Return the (x, y) of a grid, row by row, of its columns' x and its rows' y."""
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).astype(np.float64)
 

@@ -25,6 +25,11 @@ def atomic_path(path: Path) -> Iterator[Path]:
         raise
 
 
+def partial_path(path: Path) -> Path:
+    """Return the name of a file or folder while it is written: `cap.partial.raw`."""
+    return path.with_name(f"{path.stem}.partial{path.suffix}")
+
+
 def write_text(path: Path, text: str) -> None:
     """Write `text` to `path`, whole or not at all."""
     with atomic_path(path) as partial:

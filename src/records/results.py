@@ -28,15 +28,15 @@ LEAST_FREE_BYTES = 200 * 2**20
 
 @dataclass(frozen=True)
 class ScoreRow:
-    """A network of a table: scores and drawn parameters of every clip, and its cost;
-    `own_metrics`: those of the scores that a config has added.
+    """A network of a table: scores and drawn parameters of every clip, and its cost; times by frame
+    size, such as 128x128; `own_metrics`: those of the scores that a config has added.
     """
 
     name: str
     clips: list[dict]
     params: int
     macs_per_frame: int
-    latency_ms: dict[str, float]
+    latency_ms_by_size: dict[str, float]
     own_metrics: tuple[Column, ...] = ()
 
 
@@ -56,7 +56,7 @@ def create_run_folder(run: Path, config: str) -> None:
     write_text(run / "config.yaml", config)
 
 
-def settings_affecting_results(config: str) -> dict:
+def parse_settings_without_paths(config: str) -> dict:
     """Return the settings of a resolved `config` (YAML) that the numbers depend on: all but
     `paths`, `verbose` and, for training, the `ckpt` it resumed from."""
     settings = safe_yaml.parse(config)
@@ -69,8 +69,8 @@ def settings_affecting_results(config: str) -> dict:
 
 
 def hash_config(config: str) -> str:
-    """Return the SHA-256 of `settings_affecting_results(config)`: the same in every folder."""
-    settings = json.dumps(settings_affecting_results(config), sort_keys=True)
+    """Return the SHA-256 of `parse_settings_without_paths(config)`: the same in every folder."""
+    settings = json.dumps(parse_settings_without_paths(config), sort_keys=True)
     return hashlib.sha256(settings.encode()).hexdigest()
 
 
@@ -118,7 +118,7 @@ def write_and_print_results(
         "config_sha256": hash_config(config),
         "model": model,
         "test": summarize_scores(first.clips, first.own_metrics),
-        "latency_ms": first.latency_ms,
+        "latency_ms": first.latency_ms_by_size,
         "compared": {row.name: summarize_scores(row.clips, row.own_metrics) for row in rows[1:]},
     }
     if first.own_metrics:  # a report has no other way to know which values are better
@@ -156,7 +156,7 @@ def build_rich_score_table(rows: list[ScoreRow]) -> Table:
     for row in rows:
         means = summarize_scores(row.clips, row.own_metrics)
         cells = [m.format_value(means.get(m.name, {}).get("mean")) for m in metrics]
-        picture.add_row(row.name, *cells, f"{next(iter(row.latency_ms.values())):.1f}")
+        picture.add_row(row.name, *cells, f"{next(iter(row.latency_ms_by_size.values())):.1f}")
     return picture
 
 

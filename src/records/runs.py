@@ -76,7 +76,7 @@ def find_runs(folders: list[Path]) -> list[Run]:
         if not folder.is_dir():
             raise ValueError(f"run must be folders of runs, got {folder}: no such folder")
         files = list(folder.rglob("results.json"))
-        if not files and not find_figures([folder]):
+        if not files and not find_charts_and_stress_maps([folder]):
             raise ValueError(f"run must hold results.json, got {folder}: empty or not finished")
         unique |= {file.resolve(): file for file in files}
     runs = map(_read, unique.values())
@@ -89,7 +89,7 @@ def find_sweeps(folders: list[Path]) -> list[SweepPlan]:
     return [_plan(safe_yaml.read(file)["hydra"]) for file in sorted(files)]
 
 
-def find_figures(folders: list[Path]) -> list[Path]:
+def find_charts_and_stress_maps(folders: list[Path]) -> list[Path]:
     """Return the charts and heat maps at or below `folders`; the vector picture where both are."""
     pictures: dict[tuple[Path, str], Path] = {}
     for folder in folders:
@@ -102,20 +102,17 @@ def flatten_settings(node: Any, prefix: str = "") -> dict[str, Any]:
     """Return {dotted key: value} of nested dicts; lists are values."""
     if not isinstance(node, dict) or not node:
         return {prefix: node}
-    return {
-        key: value
-        for name, child in node.items()
-        for key, value in flatten_settings(
-            child, f"{prefix}.{name}" if prefix else str(name)
-        ).items()
-    }
+    flat: dict[str, Any] = {}
+    for name, child in node.items():
+        flat |= flatten_settings(child, f"{prefix}.{name}" if prefix else str(name))
+    return flat
 
 
 def _read(file: Path) -> Run:
     try:
         record = json.loads(file.read_text())
         schema, config = record["schema"], (file.parent / "config.yaml").read_text()
-        settings = flatten_settings(results.settings_affecting_results(config))
+        settings = flatten_settings(results.parse_settings_without_paths(config))
     except (OSError, ValueError, KeyError, TypeError, RecursionError, yaml.YAMLError) as error:
         raise ValueError(f"run must hold whole results, got {file}: {error}") from error
     if schema != results.SCHEMA:

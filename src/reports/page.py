@@ -137,16 +137,12 @@ def _format_films(groups: Sequence[RunGroup], budget: MediaBudget) -> list[str]:
         for group, folder in folders:
             caption = ", ".join(group.label) + f", seed {group.runs[0].record['seed']}"
             files = {"film": folder / f"{name}.gif", "slice": folder / f"{name}_slice.png"}
-            pictures = "".join(
-                budget.show(file, kind, f"{kind} of {caption}")
-                for kind, file in files.items()
-                if file.is_file()
-            )
-            if pictures:
-                figures.append(
-                    f"<figure><figcaption>{escape(caption)}</figcaption>{pictures}</figure>"
-                )
-        if figures:
-            body = "\n".join(figures)
-            sections.append(f'<h2>{escape(name)}</h2>\n<div class="films">\n{body}\n</div>')
+            parts = [f"<figcaption>{escape(caption)}</figcaption>"]
+            for kind, file in files.items():
+                if file.is_file():
+                    parts.append(budget.show(file, kind, f"{kind} of {caption}"))
+            if len(parts) > 1:
+                figures.append(f"<figure>{''.join(parts)}</figure>")
+        body = "\n".join(figures)
+        sections.append(f'<h2>{escape(name)}</h2>\n<div class="films">\n{body}\n</div>')
     return sections

@@ -49,7 +49,7 @@ class RunGroup:
         return frozenset(found), frozenset(run.test_seed for run in self.runs)
 
     @cached_property
-    def timing_conditions(self) -> tuple:
+    def frame_sizes_and_devices(self) -> tuple:
         """The sizes of the timed frames and the devices."""
         sizes = frozenset(size for run in self.runs for size in run.record["latency_ms"])
         return sizes, frozenset(run.record["device"] for run in self.runs)
@@ -96,11 +96,11 @@ def find_published(run: Run, published: Mapping[str, Any]) -> dict[str, float]:
     choice or setting of its `when`.
     """
     settings = {key: format_setting(value) for key, value in run.settings.items()} | run.choices
-    fitting = [
-        row
-        for row in published["rows"]
-        if all(settings.get(key) == format_setting(value) for key, value in row["when"].items())
-    ]
+
+    def fits(row: dict) -> bool:
+        return all(settings.get(key) == format_setting(value) for key, value in row["when"].items())
+
+    fitting = filter(fits, published["rows"])
     best: dict = max(fitting, key=lambda row: len(row["when"]), default={})
     return {metric: value for metric, value in best.items() if metric != "when"}
 

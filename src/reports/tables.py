@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from src.metrics.bootstrap import bootstrap_difference_interval
-from src.metrics.table import METRICS, Column, make_user_metric_column
+from src.metrics.table import METRICS, Column
 from src.records.runs import Run
 from src.reports.run_groups import RunGroup, find_published
 
@@ -49,7 +49,7 @@ class Table:
         head, mean = self.columns[place], self.rows[number][place].mean
         if head.better == 0 or mean is None:
             return False
-        kind = "timing_conditions" if head.name == "ms" else "test_conditions"
+        kind = "frame_sizes_and_devices" if head.name == "ms" else "test_conditions"
         asked = getattr(self.groups[number], kind)
         rows = zip(self.rows, self.groups, strict=True)
         means = [row[place].mean for row, group in rows if getattr(group, kind) == asked]
@@ -60,10 +60,8 @@ class Table:
 
 def list_metrics(runs: Iterable[Run]) -> tuple[Column, ...]:
     """Return the project's metrics and those that the configs of `runs` have added."""
-    added = {
-        name: better for run in runs for name, better in run.record.get("own_metrics", {}).items()
-    }
-    return (*METRICS, *(make_user_metric_column(name, better) for name, better in added.items()))
+    added = dict(item for run in runs for item in run.record.get("own_metrics", {}).items())
+    return (*METRICS, *(Column(name, name, 3, better) for name, better in added.items()))
 
 
 COSTS: tuple[tuple[Column, Callable[[Run], float]], ...] = (
@@ -184,10 +182,8 @@ def _score(
         if severity is None:
             test = run.record["compared"].get(compared, {}) if compared else run.record["test"]
             return test.get(metric, {}).get("mean")
-        scores = [
-            float(c[metric]) for c in run.clips if c.get("severity") == severity and metric in c
-        ]
-        return statistics.fmean(scores) if scores else None
+        clips = [clip for clip in run.clips if clip.get("severity") == severity and metric in clip]
+        return statistics.fmean(float(clip[metric]) for clip in clips) if clips else None
 
     return measure
 
@@ -197,14 +193,12 @@ def _describe_measurement(groups: Sequence[RunGroup]) -> str:
     runs = [run for group in groups for run in group.runs]
     if not runs:
         return ""
-    clips, sizes, devices = (
-        " or ".join(map(str, sorted(values)))
-        for values in (
-            {run.record["test"]["clips"] for run in runs},
-            {size for run in runs for size in run.record["latency_ms"]},
-            {run.record["device"] for run in runs},
-        )
+    found = (
+        {run.record["test"]["clips"] for run in runs},
+        {size for run in runs for size in run.record["latency_ms"]},
+        {run.record["device"] for run in runs},
     )
+    clips, sizes, devices = (" or ".join(map(str, sorted(values))) for values in found)
     seeds = {frozenset(run.test_seed for run in group.runs) for group in groups if group.runs}
     unlike = " Rows differ in the seed of their test clips." if len(seeds) > 1 else ""
     if older := sum(group.older for group in groups):

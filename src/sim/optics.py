@@ -36,7 +36,7 @@ def layout(views: int) -> tuple[Position, ...]:
     return tuple((row, col) for row in axis for col in axis)
 
 
-def centre_view_index(positions: Sequence[Position]) -> int:
+def most_central_view_index(positions: Sequence[Position]) -> int:
     """Return the index of the view nearest to (0, 0): what one camera alone would see."""
     return min(range(len(positions)), key=lambda i: sum(axis**2 for axis in positions[i]))
 
@@ -70,7 +70,7 @@ class Optics:
 
     @property
     def centre(self) -> int:
-        return centre_view_index(self.positions)
+        return most_central_view_index(self.positions)
 
     def select_views(self, positions: Sequence[Position]) -> "Optics":
         """Return these optics with the views at `positions` alone."""

@@ -6,7 +6,7 @@ on the draws of view i only.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,9 @@ from src.sim.sensor.engines.records import Grids
 from src.sim.sensor.engines.run import zeros
 from src.sim.sensor.response import decode_srgb, encode_srgb
 from src.sim.sensor.sensor import Sensor, ViewFrames, simulate_voxels
-from src.sim.turbulence.contract import ClipTurbulence, Crop, TurbulenceModel
+from src.sim.turbulence.contract import ClipTurbulence, Crop, Tilt, TurbulenceModel
+
+Pictures = Float[Tensor, "n windows 1 h w"]  # code values in [0, 1]
 
 
 @dataclass(frozen=True)
@@ -44,20 +46,19 @@ class ClipParameters:
 class Sample:
     """A batch of simulated clips.
 
-    `voxels` (n, windows, views, bins, h, w); `target` (n, windows, 1, h, w), the clean frame at the
-    end of each window; `turbulent`, the same instants as the centre view shows them, code values
-    too; `window_s` (n,), how long a window lasts; `positions`, the (row, col) of every view, None:
-    those of `optics.layout`; `teacher_frames`, as `target`, of the teachers, if asked for;
-    `parameters`, what was drawn for each clip.
+    `target`: the clean frame at the end of each window; `turbulent`: the same instants as the
+    centre view shows them, code values too; `window_s`: how long a window lasts; `positions`: the
+    (row, col) of every view, None: those of `optics.layout`; `teacher_frames`: of the teachers, if
+    asked for; `parameters`: what was drawn for each clip.
     """
 
-    voxels: Tensor
-    target: Tensor
-    turbulent: Tensor
-    window_s: Tensor
+    voxels: Grids
+    target: Pictures
+    turbulent: Pictures
+    window_s: Float[Tensor, " n"]
     positions: Sequence[Position] | None = None
     parameters: list[dict] = field(default_factory=list)
-    teacher_frames: Tensor | None = None
+    teacher_frames: Pictures | None = None
 
     def tensors(self) -> dict[str, Tensor]:
         return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
@@ -68,6 +69,7 @@ class Sample:
         return replace(self, **moved)
 
 
+@dataclass(eq=False)
 class Pipeline:
     """From the number of a clip to a sample.
 
@@ -77,27 +79,19 @@ class Pipeline:
     else in the middle.  Number k shows clip k modulo `clips` (None: every number is a new clip).
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        optics: Optics,
-        turbulence: TurbulenceModel,
-        sensor: Sensor,
-        *,
-        split: str,
-        seed: int = 0,
-        bins: int = 5,
-        substeps: int = 1,
-        crop: int | float | None = None,
-        random_crop: bool = False,
-        clips: int | None = None,
-        decodes_srgb: bool = False,
-    ):
-        self.scene, self.optics, self.turbulence, self.sensor = scene, optics, turbulence, sensor
-        self.positions = tuple(optics.positions)
-        self.split, self.seed, self.decodes_srgb = split, seed, decodes_srgb
-        self.bins, self.substeps = bins, substeps
-        self.crop, self.random_crop, self.clips = crop, random_crop, clips
+    scene: Scene
+    optics: Optics
+    turbulence: TurbulenceModel
+    sensor: Sensor
+    _: KW_ONLY
+    split: str
+    seed: int = 0
+    bins: int = 5
+    substeps: int = 1
+    crop: int | float | None = None
+    random_crop: bool = False
+    clips: int | None = None
+    decodes_srgb: bool = False
 
     def draw(self, number: int) -> ClipParameters:
         """Draw everything random about clip `number`."""
@@ -166,12 +160,12 @@ class Pipeline:
             target=clean.to(views.device)[:, :, None],
             turbulent=turbulent[:, :, None],
             window_s=torch.tensor([step / clip.fps for clip in clips]),
-            positions=self.positions,
+            positions=self.optics.positions,
             parameters=[self._record(draw) for draw in draws],
         )
 
-    def tilt(self, draw: ClipParameters) -> Float[Tensor, "views frames 2 h w"]:
-        """Return how far every view sees each pixel displaced (x, y), pixels."""
+    def tilt(self, draw: ClipParameters) -> Tilt:
+        """Return how far every view sees each pixel displaced."""
         frames, generator = len(draw.clip.frames), self.turbulence_generator(draw)
         return self.turbulence_operator(draw).tilt(frames, generator, crop=draw.crop)
 
@@ -180,13 +174,14 @@ class Pipeline:
         drawn, (height, width) = draw.turbulence, draw.clip.frames.shape[-2:]
         if isinstance(drawn, ClipTurbulence):
             return drawn
-        options: Any = {"views": self.positions, "fps": draw.clip.fps}
+        options: Any = {"views": self.optics.positions, "fps": draw.clip.fps}
         return self.turbulence.operator(drawn, height=height, width=width, **options)
 
     def turbulence_generator(self, draw: ClipParameters) -> torch.Generator:
         return noise.generator(noise.key(draw.key, "turbulence"))
 
     def turbulence_record(self, draw: ClipParameters) -> dict:
+        """Return the parameters of a clip's turbulence; a cache holds its own."""
         return dict(self.turbulence_operator(draw).metadata)
 
     def _record(self, draw: ClipParameters) -> dict:

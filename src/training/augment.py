@@ -30,7 +30,7 @@ class Augment:
     `pause_probability_when_running`, `.._when_paused`: that the next window has no events.
     `flip_probability`: for each axis.  The views of a grid change places with their images.
     `view_shift_probability`: of a view to be shifted by up to `max_view_shift_px` whole pixels in
-    each axis.  `view_dropout_probability`: of a batch to lose views, any of them but never all.
+    each axis.  `batch_view_dropout_probability`: of a batch to lose views, any but never all.
     """
 
     noise_std: float = 0.4
@@ -41,7 +41,7 @@ class Augment:
     flip_probability: float = 0.5
     view_shift_probability: float = 0.0
     max_view_shift_px: int = 2
-    view_dropout_probability: float = 0.0
+    batch_view_dropout_probability: float = 0.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -61,7 +61,8 @@ class Augment:
         first = samples[0]
         windows, views, *grid = first.voxels.shape[1:]
         positions = first.positions or layout(views)
-        kept = draw_kept_views(views, self.view_dropout_probability, noise.key(keys[0], "dropped"))
+        dropout = self.batch_view_dropout_probability, noise.key(keys[0], "dropped")
+        kept = draw_kept_views(views, *dropout)
         transforms = [self._draw_transform(key, windows, positions, kept) for key in keys]
         voxels = allocate_float32((len(keys), windows, len(kept), *grid), first.voxels.device)
         if voxels.device.type != "cpu" if batched is None else batched:
@@ -141,21 +142,21 @@ def flipped_view_order(positions: Sequence[Position], axes: list[int]) -> Int[Te
 def draw_view_shifts(
     views: int, probability: float, max_shift_px: int, key: int
 ) -> list[tuple[int, int, int]]:
-    """Return (view, rows, columns) of the views that are shifted, each with `probability`, in whole
+    """Return (view, down, right) of the views that are shifted, each with `probability`, in whole
     pixels up to `max_shift_px` either way.
     """
     if probability == 0:
         return []
     draws = noise.uniforms(key, 3 * views)
-    px = [int(share * (2 * max_shift_px + 1)) - max_shift_px for share in draws]
+    px = [max_shift_px - int(share * (2 * max_shift_px + 1)) for share in draws]
     triples = zip(range(views), draws[::3], px[1::3], px[2::3], strict=True)
-    return [(view, up, left) for view, draw, up, left in triples if draw < probability]
+    return [(view, down, right) for view, draw, down, right in triples if draw < probability]
 
 
-def draw_kept_views(views: int, dropout_probability: float, key: int) -> list[int]:
-    """Return which views a batch has: with `dropout_probability` it loses some."""
+def draw_kept_views(views: int, batch_dropout_probability: float, key: int) -> list[int]:
+    """Return which views a batch has: with `batch_dropout_probability` it loses some."""
     chance, share, *order = noise.uniforms(key, 2 + views)
-    if chance >= dropout_probability or views == 1:
+    if chance >= batch_dropout_probability or views == 1:
         return list(range(views))
     count = 1 + int(share * (views - 1))
     return sorted(sorted(range(views), key=order.__getitem__)[:count])

@@ -83,9 +83,8 @@ class ClipCache(ABC):
         """Return what the views of `draws`, of one crop size, see: light, float16."""
         parts = []
         for draw in draws:
-            crop = crop_frames(self.clip(draw.index).views, draw.crop).transpose(0, 1)
-            frames = select_frames(crop, draw.frames)
-            parts.append(frames[:, list(draw.view_order)].transpose(0, 1))
+            crop = crop_frames(self.clip(draw.index).views, draw.crop)
+            parts.append(select_frames(crop, draw.frames, dim=1)[list(draw.view_order)])
         return torch.stack(parts).to(device)
 
 
@@ -136,10 +135,10 @@ def clip_metadata(source: Pipeline, draw: ClipParameters) -> dict[str, Any]:
     return {"name": draw.clip.name, "fps": draw.clip.fps, "record": source.turbulence_record(draw)}
 
 
-def select_frames(video: Tensor, frames: range) -> Tensor:
-    """Return `frames`, neighbours forwards or backwards, of the first axis of a video."""
-    part = video[min(frames) :][: len(frames)]
-    return part.flip(0) if frames.step < 0 else part
+def select_frames(video: Tensor, frames: range, dim: int = 0) -> Tensor:
+    """Return `frames`, neighbours forwards or backwards, along `dim` of a video."""
+    part = video.narrow(dim, min(frames), len(frames))
+    return part.flip(dim) if frames.step < 0 else part
 
 
 class CachedPipeline(Pipeline):
@@ -171,7 +170,7 @@ class CachedPipeline(Pipeline):
         self.sides, self.batch_size = self._crop_sides(crop), batch_size
         if self.sides and clips is not None and clips % batch_size:
             allowed = f"a multiple of data.batch_size={batch_size} where data.crop is a range"
-            raise ValueError(f"data.clips must be {allowed}, got {clips}")
+            raise ValueError(f"data.train_clips must be {allowed}, got {clips}")
         if self.frames > cache.frames:
             most = (cache.frames - 1) // source.substeps
             raise ValueError(f"data.windows must be <= data.cache_windows, {most}, got {windows}")
@@ -215,8 +214,7 @@ class CachedPipeline(Pipeline):
     def tilt(self, draw: ClipParameters) -> Tensor:
         draw, source = cast(CachedDraw, draw), self.cache.source
         tilt = source.tilt(source.draw(draw.index))[list(draw.view_order)]
-        crop = crop_frames(tilt, draw.crop).transpose(0, 1)
-        return select_frames(crop, draw.frames).transpose(0, 1)
+        return select_frames(crop_frames(tilt, draw.crop), draw.frames, dim=1)
 
     def turbulence_record(self, draw: ClipParameters) -> dict:
         return cast(CachedDraw, draw).record

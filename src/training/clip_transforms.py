@@ -22,7 +22,7 @@ FRAMES = {"target", "turbulent", "teacher_frames"}  # of a sample, transformed l
 class ClipTransform(NamedTuple):
     """What a clip becomes: its `source_windows` (windows,), without events where `paused`
     (windows,), flipped along `flip_axes`; the views are those of `view_order` (kept,), of which
-    some (view, rows, columns) in `view_shifts` lie so many pixels further up and left.
+    some (view, rows, columns) in `view_shifts` are moved so many pixels down and right.
     """
 
     source_windows: Int[Tensor, " windows"]
@@ -105,11 +105,9 @@ def flip_frames(frames: Tensor, axes: list[int]) -> Tensor:
 
 
 def shift_views(voxels: ClipGrids, shifts: Sequence[tuple[int, int, int]]) -> ClipGrids:
-    """Shift (view, rows, columns) up and left, in place; zeros come in at the border."""
+    """Move (view, rows, columns) down and right, in place; zeros come in at the border."""
     height, width = voxels.shape[-2:]
-    for view, up, left in shifts:
-        reach = max(abs(up), abs(left))
-        padded = functional.pad(voxels[:, view], (reach,) * 4)
-        rows, columns = slice(reach + up, reach + up + height), slice(reach + left, None)
-        voxels[:, view] = padded[..., rows, columns][..., :width]
+    for view, down, right in shifts:
+        y, x = max(-height, min(down, height)), max(-width, min(right, width))
+        voxels[:, view] = functional.pad(voxels[:, view], (x, -x, y, -y))  # negative: cropped
     return voxels

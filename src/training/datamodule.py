@@ -1,6 +1,5 @@
 """Batches for training, validation and test, simulated on the fly: number -> draw -> sample."""
 
-import signal
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, cast
@@ -13,7 +12,7 @@ from src.sim import noise
 from src.sim.pipeline import ClipParameters, Pipeline, Sample, concatenate_samples
 from src.training.augment import Augment
 from src.training.batch_sampler import DrawDataset, LargeCropStream, SampleId, StepSampler
-from src.training.disk_cache import BackgroundFiller
+from src.training.disk_cache import CacheFillerProcess, prepare_worker_process
 from src.training.teachers import TeacherEnsemble
 
 
@@ -45,7 +44,7 @@ class LightFieldData(LightningDataModule):
         workers: int = 0,
         simulate_on: str = "worker",
         seed: int = 0,
-        filler: BackgroundFiller | None = None,
+        filler: CacheFillerProcess | None = None,
         teachers: TeacherEnsemble | None = None,
         large: LargeCropStream | None = None,
     ):
@@ -80,7 +79,7 @@ class LightFieldData(LightningDataModule):
         sampler = StepSampler(
             batch_size=self.batch_size,
             steps_per_epoch=max(1, self.epoch_clips // (self.batch_size * trainer.world_size)),
-            current_step=lambda: cast(int, module.total_steps),
+            current_step=lambda: cast(int, module.steps_so_far),
             batch_reuse=self.batch_reuse,
             rank=trainer.global_rank,
             world=trainer.world_size,
@@ -119,7 +118,7 @@ class LightFieldData(LightningDataModule):
             DrawDataset(*self._streams(split)),
             num_workers=self.workers,
             collate_fn=self._simulator(split, "cpu") if on_worker else list,
-            worker_init_fn=_prepare_worker,
+            worker_init_fn=prepare_worker_process,
             persistent_workers=self.workers > 0,
             **sampling,
         )
@@ -179,9 +178,3 @@ class BatchSimulator:
             return samples
         pairs = zip(samples, names, strict=True)
         return [replace(one, teacher_frames=self.teachers(one, name)) for one, name in pairs]
-
-
-def _prepare_worker(worker: int) -> None:
-    """Compute in one thread, and leave Ctrl-C, which a terminal sends to all, to the training."""
-    torch.set_num_threads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -128,7 +128,7 @@ class DiskClipCache(ClipCache):
         return True
 
 
-class BackgroundFiller:
+class CacheFillerProcess:
     """A process of lowest priority that simulates the missing clips of caches, one after the other.
 
     Of all trainings that share a cache one fills it; when it ends, another takes over.  It ends
@@ -154,8 +154,10 @@ class BackgroundFiller:
             self.process = None
 
 
-def prepare_worker_process() -> None:
-    """Let this process compute in one thread, leave Ctrl-C to its parent and end with it."""
+def prepare_worker_process(worker: int = 0) -> None:
+    """Let this process, of any number, compute in one thread, leave Ctrl-C, which a terminal sends
+    to all, to its parent and end with it.
+    """
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_exit_with_parent, daemon=True).start()

@@ -37,7 +37,7 @@ def test_network(
         module.clips,
         params=sum(parameter.numel() for parameter in network.parameters()),
         macs_per_frame=macs_of_frame,
-        latency_ms={f"{height}x{width}": milliseconds},
+        latency_ms_by_size={f"{height}x{width}": milliseconds},
         own_metrics=metrics.user_metric_columns,
     )
 

@@ -41,28 +41,27 @@ def apply_config_to_optimizer_state(
     return kept
 
 
-def check_max_steps(max_steps: int, done: int) -> None:
+def check_max_steps(max_steps: int, steps_done: int) -> None:
     """Raise ValueError where a training has taken more steps than it shall (-1: no limit)."""
-    if 0 <= max_steps < done:
-        raise ValueError(f"trainer.max_steps must be >= {done}, the steps of ckpt, got {max_steps}")
+    if 0 <= max_steps < steps_done:
+        least = f"{steps_done}, the steps of ckpt"
+        raise ValueError(f"trainer.max_steps must be >= {least}, got {max_steps}")
 
 
 def _fits(saved: dict, fresh: dict, make_optimizer: Callable[..., Optimizer]) -> bool:
-    """Return whether the state of every parameter has the names that the optimiser works with."""
+    """Return whether the state of every parameter has the names that the optimiser stores, which a
+    step on a parameter of its own shows.
+    """
     numbers = [group["params"] for group in saved["param_groups"]]
     if numbers != [group["params"] for group in fresh["param_groups"]]:
         return False
-    wanted = _state_names(make_optimizer)
-    return all(set(state) == wanted for state in saved["state"].values())
-
-
-def _state_names(make_optimizer: Callable[..., Optimizer]) -> set[str]:
-    """Return what the optimiser stores for a parameter, found by a step on one of its own."""
     parameter = nn.Parameter(torch.zeros(1))
     parameter.grad = torch.zeros(1)
     optimizer = make_optimizer([parameter])
     optimizer.step()
-    return set(optimizer.state[parameter])
+    return all(
+        state.keys() == optimizer.state[parameter].keys() for state in saved["state"].values()
+    )
 
 
 def _at_step(scheduler: Any, steps: int) -> Any:

@@ -32,9 +32,8 @@ class LearningCurve(Callback):
 
     def __init__(self, path: str, interval_h: float | None = None, export: str | None = None):
         if interval_h is not None and not interval_h > 0:
-            raise ValueError(
-                f"callbacks.learning_curve.interval_h must be > 0 or null, got {interval_h}"
-            )
+            key = "callbacks.learning_curve.interval_h"
+            raise ValueError(f"{key} must be > 0 or null, got {interval_h}")
         if export is not None and Path(export).suffix != ".safetensors":
             raise ValueError(f"export must be a .safetensors file or null, got {export}")
         self.path, self.interval_h = Path(path), interval_h
@@ -55,28 +54,27 @@ class LearningCurve(Callback):
         if self.rows:
             self._write()
         else:
-            self.add_row(trainer, pl_module)
+            self.score_and_export(trainer, pl_module)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
         if self.interval_h is None or not trainer.is_global_zero:
             return
         self.loss += float(trainer.callback_metrics["train/loss"])
         self.steps += 1
-        is_due = (
-            pl_module.clock.hours // self.interval_h > self.rows[-1]["hours"] // self.interval_h
-        )
+        before, now = self.rows[-1]["hours"], pl_module.clock.hours
+        is_due = now // self.interval_h > before // self.interval_h
         if is_due or trainer.should_stop or trainer.global_step == trainer.max_steps:
-            self.add_row(trainer, pl_module)
+            self.score_and_export(trainer, pl_module)
 
     def on_exception(self, trainer: Trainer, pl_module: Any, exception: BaseException) -> None:
         if self.rows and trainer.is_global_zero:
             self.export_weights(pl_module)
 
-    def add_row(self, trainer: Trainer, module: Reconstructor) -> None:
+    def score_and_export(self, trainer: Trainer, module: Reconstructor) -> None:
         """Score the validation clips, write the row, export the weights."""
         row = {
             "hours": module.clock.hours,
-            "steps": module.total_steps,
+            "steps": module.steps_so_far,
             "windows": module.windows_seen,
             "loss": self.loss / self.steps if self.steps else "",
         }
@@ -98,7 +96,7 @@ class LearningCurve(Callback):
         if self.export is None:
             return
         reached = {"hours": module.clock.hours, "windows": module.windows_seen}
-        card = reached | {"steps": module.total_steps, "loss": self.loss, "curve": self.rows}
+        card = reached | {"steps": module.steps_so_far, "loss": self.loss, "curve": self.rows}
         with use_averaged_weights(module):
             # A copy: spectral norm is folded in eval mode, and the training continues in its own.
             files.save(self.export, deepcopy(module.network), module.network_spec, card)
@@ -121,27 +119,28 @@ def mean_validation_scores(trainer: Trainer, module: Reconstructor) -> dict[str,
     return {name: fmean(clip[name] for clip in clips) for name in module.metrics.names}
 
 
-def read_training_progress(path: Path) -> dict:
+def read_training_progress(weights: Path) -> dict:
     """Return hours, windows, steps, the loss since the last row of the curve, and the curve so far
-    of the weights `path`: a LearningCurve's export, or shipped weights of a training with one.
+    of the file `weights`: a LearningCurve's export, or shipped weights of a training with one.
 
     Raises ValueError for weights that were written otherwise.
     """
-    card = files.read_card(path)
+    card = files.read_card(weights)
     card = card.get(TRAINING_STATE, card)
     if "curve" not in card:
-        raise ValueError(f"ckpt must be a checkpoint or weights with a learning curve, got {path}")
+        allowed = "a checkpoint or weights with a learning curve"
+        raise ValueError(f"ckpt must be {allowed}, got {weights}")
     return card
 
 
-def restore_training_progress(
-    module: Reconstructor, callbacks: Iterable[Callback], path: Path
+def continue_from_weights(
+    module: Reconstructor, callbacks: Iterable[Callback], weights: Path
 ) -> None:
     """Give `module` the weights, time, steps and windows, and the curve among `callbacks` the rows
-    of `path`; the optimiser starts anew.  Raises ValueError as `read_training_progress` does.
+    of the file `weights`; the optimiser starts anew.  Raises as `read_training_progress` does.
     """
-    before = read_training_progress(path)
-    files.restore_weights(module.network, path)
+    before = read_training_progress(weights)
+    files.restore_weights(module.network, weights)
     module.clock.seconds, module.windows_seen = 3600 * before["hours"], before["windows"]
     module.earlier_steps = before["steps"]
     for curve in (found for found in callbacks if isinstance(found, LearningCurve)):

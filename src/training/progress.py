@@ -27,15 +27,6 @@ class TrainingProgress(ProgressBar):
         """Show nothing: Lightning calls it in all processes but the first."""
         self.is_enabled = False
 
-    def enable(self) -> None:
-        """Show what happens."""
-        self.is_enabled = True
-
-    def print(self, *args: Any, **kwargs: Any) -> None:
-        """Print beside the bar."""
-        if self.is_enabled:
-            (self.bar.console.print if self.bar else print)(*args, **kwargs)
-
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
         total = self.train_hours or (trainer.max_steps if trainer.max_steps > 0 else None)
         self._open("training", total)
@@ -59,9 +50,6 @@ class TrainingProgress(ProgressBar):
         if self.bar:
             self.bar.update(self.task, description="training")
 
-    def on_train_end(self, trainer: Trainer, pl_module: Any) -> None:
-        self._close()
-
     def on_test_start(self, trainer: Trainer, pl_module: Any) -> None:
         self.clips, self.total = 0, sum(map(int, trainer.num_test_batches))
         self._open(f"testing {self.tested}", self.total)
@@ -70,21 +58,14 @@ class TrainingProgress(ProgressBar):
         self.clips += 1
         self._show(self.clips, f"{self.clips} of {self.total}")
 
-    def on_test_end(self, trainer: Trainer, pl_module: Any) -> None:
-        self._close()
-
-    def on_exception(self, trainer: Trainer, pl_module: Any, exception: BaseException) -> None:
-        self._close()
-
     def _open(self, name: str, total: float | None) -> None:
         if not self.is_enabled:
             return
         times = TimeElapsedColumn(), "left", TimeRemainingColumn()
-        bar = Progress("{task.description}", BarColumn(20), "{task.fields[said]}", *times)
-        self.bar, self.line_s = bar, time.monotonic()
-        self.task = bar.add_task(name, total=total, said="")
-        if bar.console.is_terminal:
-            bar.start()
+        self.bar = Progress("{task.description}", BarColumn(20), "{task.fields[said]}", *times)
+        self.task, self.line_s = self.bar.add_task(name, total=total, said=""), time.monotonic()
+        if self.bar.console.is_terminal:
+            self.bar.start()
 
     def _show(self, done: float, said: str) -> None:
         if self.bar is None:
@@ -96,7 +77,7 @@ class TrainingProgress(ProgressBar):
             self.line_s = now
             print(f"{self.bar.tasks[0].description}: {said}", flush=True)
 
-    def _close(self) -> None:
+    def _close(self, *_: Any) -> None:
         if self.bar is not None:
             task = self.bar.tasks[0]
             if self.bar.console.is_terminal:
@@ -104,3 +85,5 @@ class TrainingProgress(ProgressBar):
             else:
                 print(f"{task.description}: {task.fields['said']}", flush=True)
             self.bar = None
+
+    on_train_end = on_test_end = on_exception = _close  # type: ignore[assignment]

@@ -82,7 +82,7 @@ class Reconstructor(LightningModule):
         return method
 
     @property
-    def total_steps(self) -> int:
+    def steps_so_far(self) -> int:
         """Steps so far, those of the training whose exported weights this continues included."""
         return self.earlier_steps + self.global_step
 
@@ -113,13 +113,9 @@ class Reconstructor(LightningModule):
         else:
             with parametrize.cached():  # spectral norm iterates once, not once per window
                 frames = self.reconstruct_windows(sample, outputs)
-        teachers = sample.teacher_frames
-        loss, gradient = self.loss.value_and_gradient(
-            frames,
-            sample.target[:, outputs],
-            outputs,
-            None if teachers is None else teachers[:, outputs],
-        )
+        target, taught = sample.target[:, outputs], sample.teacher_frames
+        taught = None if taught is None else taught[:, outputs]
+        loss, gradient = self.loss.value_and_gradient(frames, target, outputs, taught)
         self.manual_backward(frames, gradient)
         total = self.all_gather(loss).mean()  # type: ignore[union-attr]
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
@@ -186,7 +182,7 @@ class Reconstructor(LightningModule):
         checkpoint["network"] = self.network_spec  # plain data: loads with weights_only=True
         checkpoint["losses"] = list(self.guard.losses)
         checkpoint["seconds"], checkpoint["windows"] = self.clock.seconds, self.windows_seen
-        checkpoint["steps"] = self.total_steps
+        checkpoint["steps"] = self.steps_so_far
         checkpoint["optimizer_start"] = self.optimizer_start
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:

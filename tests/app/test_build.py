@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 from baselines import postprocess
 from src.app import build, compared_networks, hardware
-from src.app.instantiate import allowed_packages
+from src.app.instantiate import read_user_packages
 from src.eval import evaluate
 from src.models import files
 from src.recordings.files import event_file, event_writers, sources
@@ -112,7 +112,7 @@ def test_a_post_processor_of_ones_own_is_loaded(own, tmp_path):
     files.save(tmp_path / "mine.safetensors", parts.MyMambaTM(1, 8), spec, {})
     named = f"postprocess.postprocessor={tmp_path}/mine.safetensors"
     cfg = config("eval", tmp_path, "postprocess=mambatm", named, "baseline=frames", *own)
-    assert type(build.build_video_method(cfg).postprocessor).__name__ == "MyMambaTM"
+    assert type(build.load_method_with_postprocess(cfg).postprocessor).__name__ == "MyMambaTM"
     with pytest.raises(ValueError, match="allowed_packages="):
         postprocess.load_postprocessor(f"{tmp_path}/mine.safetensors")
 
@@ -120,13 +120,13 @@ def test_a_post_processor_of_ones_own_is_loaded(own, tmp_path):
 def test_a_network_and_a_baseline_are_not_both_taken(tmp_path):
     cfg = config("reconstruct", tmp_path, "recording=a.raw", "ckpt=any", "baseline=highpass")
     with pytest.raises(ValueError, match="^ckpt must be null with baseline=..., got any"):
-        build.load_network(cfg)
+        build.load_ckpt_or_baseline(cfg)
 
 
 @pytest.mark.parametrize("given", ["mypackage", "[1a]", "[..]", "['']"])
 def test_allowed_packages_are_a_list_of_names(given, tmp_path):
     with pytest.raises(ValueError, match="allowed_packages must be a list of packages"):
-        allowed_packages(config("eval", tmp_path, f"allowed_packages={given}"))
+        read_user_packages(config("eval", tmp_path, f"allowed_packages={given}"))
 
 
 ENTRY_POINTS = ("train", "eval", "simulate", "reconstruct", "calibrate", "chart", "stress", "live")

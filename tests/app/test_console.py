@@ -130,7 +130,7 @@ def test_ctrl_c_at_a_terminal_ends_in_one_line(tmp_path):
     if child == 0:
         os.chdir(ROOT)
         os.execv(sys.executable, [sys.executable, "-W", "ignore", "-m", "src.train", *words])
-    before = read_until(terminal, b"step 6 of 5000", 400)
+    before = read_until(terminal, b" of 5000 loss", 400)
     os.write(terminal, b"\x03")
     after = read_until(terminal, b"never", 100).decode()
     _, status = os.waitpid(child, 0)

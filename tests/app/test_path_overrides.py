@@ -94,7 +94,10 @@ def test_names_of_jobs_differ_as_their_overrides_do():
           "turbulence.atmosphere.tilt_and_blur_px.strong=[2.0,2.0]"], "lf3x3_[2.0,2.0]_[7,7]_"),
         (["ckpt='/data/runs/one'", "turbulence.atmosphere.tilt_and_blur_px.strong=[2.0,2.0]"],
          "ckpt--data-runs-one_strong-[2.0,2.0]_"),
-        ([f"ckpt='/data/{'r' * 99}'"], f"data-{'r' * 46}_"),
+        ([f"ckpt='/data/{'r' * 99}'"], f"{'r' * 40}_"),
+        (["ckpt='lf3x3'", "turbulence=none",
+          "scene.root=['/data/photographs/a','/data/photographs/b']"],
+         "lf3x3_ta-photographs-a','-data-photographs-b']_none_"),
     ],
 )  # fmt: skip
 def test_a_long_job_has_a_short_name_that_says_what_is_varied(job, name):

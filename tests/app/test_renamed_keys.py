@@ -33,7 +33,7 @@ def test_the_longest_former_key_wins_and_a_removed_one_says_so(monkeypatch):
 
 def test_a_former_key_in_a_config_file_is_refused():
     with pytest.raises(ValueError, match="^calm is now loss.static_flicker.weight$"):
-        renamed_keys.check_keys(OmegaConf.create({"seed": 0, "calm": 1}))
+        renamed_keys.refuse_renamed_keys(OmegaConf.create({"seed": 0, "calm": 1}))
 
 
 @pytest.mark.parametrize(
@@ -58,4 +58,4 @@ def test_a_key_or_choice_that_is_none_is_told_the_nearest(name, override, said):
 def test_no_entry_point_has_a_former_key(entry_point):
     with initialize_config_dir(str(ROOT / "conf"), version_base=None):
         cfg = compose(entry_point)
-    renamed_keys.check_keys(cfg)
+    renamed_keys.refuse_renamed_keys(cfg)

@@ -26,14 +26,14 @@ def test_nine_views_begin_exactly_as_the_shipped_network_on_one(tmp_path):
     cfg = config("train", tmp_path, "budget=fine_tuning")
     assert (cfg.start, cfg.width) == ("single256", 8)  # the width is that of the weights
     path = start_weights.set_model_from_start_weights(cfg)
-    net, spec = build.build_network_and_spec(cfg)
+    net, spec = build.build_untrained_network(cfg)
     files.restore_weights(net, path)
     one_view = files.read_network_spec(path)
     assert spec == one_view | {"kwargs": one_view["kwargs"] | {"views": 9}}
     seen = torch.randn(1, 4, 9, 5, 32, 32)
     ours, theirs = unroll(net.eval(), seen)[0], unroll(load("single256"), seen[:, :, 4:5])[0]
     assert torch.equal(ours, theirs) and ours.std() > 0.01
-    name = start_weights.describe_start_weights(cfg, path)
+    name = start_weights.label_before_training(cfg, path)
     assert name == "single256 given 9 views, before training"
 
 
@@ -41,8 +41,8 @@ def test_nine_views_begin_exactly_as_the_shipped_network_on_one(tmp_path):
 def test_without_a_start_the_network_is_that_of_the_config(start, tmp_path):
     cfg = config("train", tmp_path, "budget=fine_tuning", f"start={start}")
     assert start_weights.set_model_from_start_weights(cfg) is None
-    assert build.build_network_and_spec(cfg)[0].head.out_channels == cfg.width == 8
-    assert start_weights.describe_start_weights(cfg, None) == "untrained"
+    assert build.build_untrained_network(cfg)[0].head.out_channels == cfg.width == 8
+    assert start_weights.label_before_training(cfg, None) == "untrained"
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,8 @@ import torch
 from omegaconf import OmegaConf
 
 from baselines import mambatm
-from baselines.mambatm import MambaTM, scan_orders
-from baselines.stabilise import estimate_jitter, warp_video
+from baselines.mambatm import MambaTM, row_time_hilbert_orders
+from baselines.stabilise import backward_warp_video, estimate_jitter
 from src.app.instantiate import instantiate_node
 from src.models.network import FramePostprocessor
 from tests.conftest import ROOT
@@ -28,7 +28,7 @@ def test_it_begins_as_the_identity():
 @torch.no_grad()
 def test_stabilise_input_it_begins_as_the_frames_held_still():
     frames = torch.rand(1, 4, 1, 32, 32)
-    still = warp_video(frames, estimate_jitter(frames))
+    still = backward_warp_video(frames, estimate_jitter(frames))
     torch.testing.assert_close(MambaTM(states=2, stabilise_input=True)(frames)[0], still)
 
 
@@ -102,7 +102,7 @@ def test_windows_give_their_inner_frames():
 
 
 def test_orders_are_permutations_of_the_box():
-    raster, in_time, curve = scan_orders(3, 4, 5)
+    raster, in_time, curve = row_time_hilbert_orders(3, 4, 5)
     for order in (raster, in_time, curve):
         assert torch.equal(order.sort().values, torch.arange(60))
     assert in_time[:4].tolist() == [0, 20, 40, 5]  # all times of a place, then the place below

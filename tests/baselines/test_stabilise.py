@@ -3,7 +3,12 @@
 import pytest
 import torch
 
-from baselines.stabilise import ERROR, estimate_jitter, local_linear_smoothing_matrix, warp_video
+from baselines.stabilise import (
+    ERROR,
+    backward_warp_video,
+    estimate_jitter,
+    local_linear_smoothing_matrix,
+)
 
 
 def scene(paths: torch.Tensor, side: int = 96) -> torch.Tensor:
@@ -51,7 +56,7 @@ def test_steady_flight_is_no_jitter():
 def test_pulling_takes_the_shake_out():
     path, still = shake(12, 0.5), scene(torch.zeros(12, 2))
     shaken = scene(rest(path))
-    steady = warp_video(shaken, estimate_jitter(shaken))
+    steady = backward_warp_video(shaken, estimate_jitter(shaken))
     middle = (..., slice(24, -24), slice(24, -24))
     before, after = ((video - still)[middle].square().mean() for video in (shaken, steady))
     assert float(after) < 0.1 * float(before)

@@ -112,7 +112,7 @@ def unchecked():
 @pytest.fixture
 def in_float32(monkeypatch):
     """OpenVINO in float32, whatever the processor is fast in."""
-    monkeypatch.setattr(openvino_network, "best_dtype", lambda: torch.float32)
+    monkeypatch.setattr(openvino_network, "fastest_dtype", lambda: torch.float32)
 
 
 @pytest.mark.parametrize("backend", FORMS)
@@ -154,7 +154,7 @@ def test_from_tiles_to_the_whole_frame_and_back(backend, in_float32):
         net, positions=positions(4), height=96, width=128, threads=2, form=form(backend)
     )
     ways = {"whole": 0, "tiles": 0}
-    whole, tiles = live.runner.whole.remember, live.runner._remember
+    whole, tiles = live.runner.whole.advance_and_draw, live.runner._remember
 
     def count(name, work):
         def counted(*given):
@@ -163,7 +163,7 @@ def test_from_tiles_to_the_whole_frame_and_back(backend, in_float32):
 
         return counted
 
-    live.runner.whole.remember = count("whole", whole)
+    live.runner.whole.advance_and_draw = count("whole", whole)
     live.runner._remember = count("tiles", tiles)
     assert largest_gap(net, live, windows, 4) < EXACT
     assert min(ways.values()) >= 4

@@ -12,13 +12,13 @@ import pytest
 from lz4.frame import LZ4FrameCompressor
 
 from src.recordings.files import read_events, unpacking
-from src.recordings.files.aedat2_file import Aedat2File
+from src.recordings.files.aedat1to3_file import Aedat1To3File
 from src.recordings.files.aedat4_file import Aedat4File
 from src.recordings.files.event_file import ReadOptions
 from src.recordings.files.rosbag_file import RosbagFile
 from tests.recordings.files.bags import Bag
-from tests.recordings.files.test_aedat2_file import aedat3, dvs128, words
-from tests.recordings.files.test_aedat2_file import packet as polarity
+from tests.recordings.files.test_aedat1to3_file import aedat3, dvs128, words
+from tests.recordings.files.test_aedat1to3_file import packet as polarity
 from tests.recordings.files.test_aedat_file import LEFT, made, packet
 from tests.recordings.files.test_prophesee_file import evt2, evt21
 from tests.recordings.files.test_recording import made_up, mutated
@@ -98,7 +98,7 @@ def test_a_description_that_grows_is_refused(tmp_path):
 @pytest.mark.parametrize(("size", "count"), [(8, 2**30), (-8, 5), (0, 2**31 - 1), (2**30, 2**30)])
 def test_aedat3(tmp_path, size, count):
     content = aedat3(struct.pack("<hhiiiiii", 1, 1, size, 4, 0, count, count, count) + bytes(99))
-    refuse(Aedat2File, tmp_path / "a.aedat", content, "cannot be")
+    refuse(Aedat1To3File, tmp_path / "a.aedat", content, "cannot be")
 
 
 @pytest.mark.parametrize(("plugin", "packing"), [

@@ -58,8 +58,8 @@ def read_corners(path: Path) -> None:
 
 
 def read_picture(path: Path) -> None:
-    sources.read_sensor_picture(path)
-    photo_files.read_photograph(path)
+    sources.read_picture_or_event_counts(path)
+    photo_files.decode_photograph(path)
 
 
 def read_video(path: Path) -> None:

@@ -147,7 +147,7 @@ def test_reconstruction_repeats_its_frames(tmp_path, seed):
 
 def write_results_forever(run: str) -> None:
     clips = [{"name": f"clip{n}", "psnr": 20.0 + n, "ssim": 0.5} for n in range(300)]
-    row = ScoreRow("net", clips, params=1, macs_per_frame=1, latency_ms={"64x64": 1.0})
+    row = ScoreRow("net", clips, params=1, macs_per_frame=1, latency_ms_by_size={"64x64": 1.0})
     for seed in range(10**9):
         results.write_and_print_results(
             Path(run), "a: 1", [row], task="train", experiment="x", seed=seed

@@ -106,7 +106,7 @@ READERS = {
     "cap.txt": "src.recordings.files.recording.read_events",
     "cap.h5": "src.recordings.files.recording.read_events",
     "views.yaml": "src.recordings.views.load_views",
-    "photo.png": "src.sim.scenes.photo_files.read_photograph",
+    "photo.png": "src.sim.scenes.photo_files.decode_photograph",
     "net.ckpt": "src.models.files.load",
     "net.safetensors": "src.models.files.load",
     "old.pth": "baselines.pickled_weights.read_pickled_tensors",

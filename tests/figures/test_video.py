@@ -11,7 +11,7 @@ from src.figures.samples import (
     join_panels,
     render_events,
     resize_pictures,
-    write_video,
+    write_animation,
 )
 
 
@@ -72,7 +72,7 @@ def test_a_title_too_long_for_its_panel_ends_before_the_colon():
 
 def test_a_gif_keeps_frames_grey_levels_and_time(tmp_path):
     frames = ramp(4, 16, 24)
-    write_video(tmp_path / "a.gif", frames, fps=20.0)
+    write_animation(tmp_path / "a.gif", frames, fps=20.0)
     with Image.open(tmp_path / "a.gif") as image:
         assert (image.n_frames, image.info["duration"]) == (4, 50)
         shown = np.stack([np.array(f.convert("RGB")) for f in ImageSequence.Iterator(image)])
@@ -81,15 +81,15 @@ def test_a_gif_keeps_frames_grey_levels_and_time(tmp_path):
 
 def test_a_picture_is_the_first_frame(tmp_path):
     frames = ramp(2, 16, 24)
-    write_video(tmp_path / "a.png", frames, fps=20.0)
+    write_animation(tmp_path / "a.png", frames, fps=20.0)
     with Image.open(tmp_path / "a.png") as image:
         assert np.array_equal(np.array(image), (frames[0] * 255 + 0.5).astype(np.uint8))
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "a.gif"
-    write_video(path, ramp(2, 16, 24), fps=20.0)
+    write_animation(path, ramp(2, 16, 24), fps=20.0)
     before = path.read_bytes()
     with pytest.raises(TypeError):
-        write_video(path, np.zeros((2, 16, 24, 7)), fps=20.0)
+        write_animation(path, np.zeros((2, 16, 24, 7)), fps=20.0)
     assert path.read_bytes() == before

@@ -14,7 +14,8 @@ import torch
 from aiohttp import ClientSession, WSMsgType
 
 from baselines.highpass import HighPass
-from src.live_view import assembly, event_feeds
+from src import live
+from src.live_view import event_feeds
 from src.live_view.feed_reader import STALL_S, FeedReader, PlaybackClock
 from src.live_view.frame_buffer import PolarityAccumulator
 from src.live_view.live_windows import WindowCutter, WindowQueue
@@ -241,7 +242,7 @@ def served(recording: str, networks, **how) -> PageServer:
     views, faults = scenes.views(), FaultLog()
     running = RunSettings(how.pop("fps", 100.0), form="float32")
     feed = event_feeds.open_feed(recording, None, faults)
-    made = assembly.assemble(feed, networks, views, running, faults, port=free_port(), **how)
+    made = live.assemble(feed, networks, views, running, faults, port=free_port(), **how)
     made.page.controls.choose(next(iter(networks)), "all")
     return made
 
@@ -366,7 +367,7 @@ def test_a_page_s_port_in_use_is_refused(recording):
         taken.bind(("127.0.0.1", made.port))
         taken.listen()
         with pytest.raises(ValueError, match=f"port={made.port} cannot be used"):
-            asyncio.run(assembly.play_and_serve(made))
+            asyncio.run(live.play_and_serve(made))
 
 
 @pytest.mark.parametrize("use", [2, "many", 0])

@@ -84,7 +84,7 @@ def test_other_weights_are_listed(tmp_path):
     "target",
     [
         "os.system",
-        "src.app.build.build_network_and_spec",
+        "src.app.build.build_untrained_network",
         "src.models.files.save",
         "src.models.absent.X",
         "baselines.",

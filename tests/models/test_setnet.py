@@ -80,7 +80,7 @@ def test_cost_and_config_of_each_size(size, giga):
 
 @pytest.mark.parametrize("size", SIZES)
 def test_a_preset_is_stored_as_what_it_stands_for(size, tmp_path):
-    _, spec = build.build_network_and_spec(config("train", tmp_path, f"experiment=setnet_{size}"))
+    _, spec = build.build_untrained_network(config("train", tmp_path, f"experiment=setnet_{size}"))
     assert spec == {"target": "src.models.setnet.SetNet", "kwargs": FULL | SIZES[size]}
 
 
@@ -90,8 +90,9 @@ def test_any_number_of_views_and_any_size(views):
     frame, state = small()(voxels(2, 1, views, 19)[:, 0], None)
     assert frame.shape == (2, 1, 19, 19) and 0 <= float(frame.min()) <= float(frame.max()) <= 1
     maps = state.hidden, state.context_average, state.context_smoothed
-    assert [tuple(part.shape[1:]) for part in maps] == small().map_sizes(24, 24)
-    scales = small().context.map_sizes(12, 12)
+    channels = small().channels
+    assert [tuple(part.shape[1:]) for part in maps] == [(channels, k, k) for k in (12, 6, 6)]
+    scales = small().context.held_map_sizes(12, 12)
     assert [tuple(part.shape[1:]) for part in state.scales] == scales
 
 

@@ -209,7 +209,7 @@ def still_after_motion(noise_hz: float) -> np.ndarray:
 def test_a_still_scene_at_12000_fps_fades_no_more_than_at_the_trained_rate(noise_hz):
     made = still_after_motion(noise_hz)
     slow = pictures(made, WindowRule(fps=120))
-    overlap = event_windows.frames_per_window("trained", 12_000)
+    overlap = event_windows.count_frames_per_window("trained", 12_000)
     fast = pictures(made, WindowRule(fps=12_000, frames_per_window=overlap))
     contrast = [found[-1].std() / found[len(found) // 5].std() for found in (slow, fast)]
     assert contrast[1] == pytest.approx(contrast[0], rel=0.15)
@@ -219,7 +219,7 @@ def test_a_still_scene_at_12000_fps_fades_no_more_than_at_the_trained_rate(noise
 
 
 def test_a_still_scene_at_12000_fps_does_not_flicker():
-    overlap = event_windows.frames_per_window("trained", 12_000)
+    overlap = event_windows.count_frames_per_window("trained", 12_000)
     rule = WindowRule(fps=12_000, frames_per_window=overlap)
     fast = pictures(still_after_motion(0.0), rule)
     assert np.abs(np.diff(fast[2400:-1], axis=0)).max() == 0  # an event ends the recording
@@ -227,13 +227,13 @@ def test_a_still_scene_at_12000_fps_does_not_flicker():
 
 @pytest.mark.parametrize("fps, frames", [(60, 1), (120, 1), (600, 5), (1000, 8), (12_000, 100)])
 def test_a_window_spans_the_trained_length(fps, frames):
-    assert event_windows.frames_per_window("trained", fps) == frames
-    assert event_windows.frames_per_window("frame", fps) == 1
+    assert event_windows.count_frames_per_window("trained", fps) == frames
+    assert event_windows.count_frames_per_window("frame", fps) == 1
 
 
 def test_another_span_is_refused():
     with pytest.raises(ValueError, match="window_length must be"):
-        event_windows.frames_per_window("long", 120)
+        event_windows.count_frames_per_window("long", 120)
 
 
 def test_a_network_is_given_the_window_and_the_positions():

@@ -54,7 +54,7 @@ def test_windows_between_frames_are_evreals(sequence):
     # The first window is empty, the last frame has none.
     spans = [(0, 0), (0, ends[0]), (ends[0], ends[1]), (ends[1], ends[2])]
     assert [(w.first_event, w.stop_event) for w in windows] == spans
-    assert [w.camera_frame for w in windows] == [0, 1, 2, 3]
+    assert [w.nearest_camera_frame for w in windows] == [0, 1, 2, 3]
     assert [w.time_s for w in windows] == pytest.approx([0, 0.03, 0.06, 0.09])
 
 
@@ -65,7 +65,7 @@ def test_windows_of_a_number_of_events(sequence):
     ]
     assert [w.time_s for w in windows] == [sequence.t[k + 699] for k in (0, 700, 1400, 2100)]
     nearest = [int(np.abs(sequence.frame_t - w.time_s).argmin()) for w in windows]
-    assert [w.camera_frame for w in windows] == nearest
+    assert [w.nearest_camera_frame for w in windows] == nearest
 
 
 def test_windows_of_a_length_of_time(sequence):
@@ -88,7 +88,7 @@ def test_windows_of_a_length_of_time(sequence):
 )
 def test_which_frames_are_scored(sequence, rule, extra, frames):
     scored = list(score_sequence(sequence, Sum(), EvrealRule(**rule), **(ALL | extra)))
-    assert [frame.evreal_window.camera_frame for frame in scored] == frames
+    assert [frame.evreal_window.nearest_camera_frame for frame in scored] == frames
 
 
 def test_a_network_reads_the_warm_up_and_no_more(sequence):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from baselines.highpass import HighPass
-from src.live_view.assembly import assemble
+from src.live import assemble
 from src.live_view.event_feeds import FileFeed
 from src.live_view.network_runner import RunSettings
 from src.live_view.status import FaultLog

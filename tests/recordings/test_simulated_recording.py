@@ -61,7 +61,7 @@ def blinking(picture: torch.Tensor, frames: int = 5) -> torch.Tensor:
 def test_a_blinking_screen_calibrates_the_views(truth, target, picture, tmp_path):
     path = tmp_path / "board.raw"
     simulated_recording.write_recording(path, blinking(half(picture)), 60.0, truth, noisy_sensor())
-    seen = view_alignment.repair_picture(sources.read_sensor_picture(path))
+    seen = view_alignment.repair_picture(sources.read_picture_or_event_counts(path))
     aligned = view_alignment.fit_homographies(
         view_alignment.find_target(seen, target), sensor=SENSOR, model=(88, 88)
     )
@@ -202,11 +202,11 @@ def test_statistics_are_those_of_the_simulated_turbulence(truth):
     )  # fmt: skip
     still, places = fits_of(torch.from_numpy(calm).float()[None].expand(9, -1, -1, -1), truth)
     turbulent, _ = fits_of(films, truth, places)
-    found = dot_statistics.compare_with_still(turbulent, still, fps=60.0, centre=3)
+    found = dot_statistics.compare_with_still(turbulent, still, fps=60.0, centre_view=3)
     assert found.failed.sum() == 0
     error = sampling_error(tilt[:, 4, 4])  # 0.09: of these 120 frames
     true = dot_statistics.autocorrelate(tilt[:, 4, 4], 20)
-    assert np.abs(found.autocorrelation[:20] - true).max() < error
+    assert np.abs(found.middle_dot_autocorrelation[:20] - true).max() < error
     centre = dot_statistics.tilt_correlation(tilt[:, 4, DOTS])
     assert np.abs(found.centre_view_correlation - centre).max() < error
     across = dot_statistics.tilt_correlation(tilt[:, VIEWS, 4])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from src.recordings.tone import ToneCurve, curve_for_output
+from src.recordings.tone import ToneCurve, build_output_curve
 
 RAMP = np.linspace(0.4, 0.8, 101, dtype=np.float32).reshape(1, 101)
 
@@ -47,4 +47,4 @@ def test_wrong_values_are_refused(tone, seconds):
 
 def test_data_is_not_toned():
     with pytest.raises(ValueError, match="tone must be none for output_format=hdf5, got auto"):
-        curve_for_output("auto", 0.5, "hdf5")
+        build_output_curve("auto", 0.5, "hdf5")

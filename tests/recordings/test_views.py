@@ -64,7 +64,7 @@ def distance_px(found: views.Views, truth: views.Views) -> dict:
     """Return the mean distance over the field between the true and the found place of a pixel."""
     true = {view.position: view for view in truth.views}
     left, top, right, bottom = found.field
-    field = views.list_pairs(np.linspace(left, right, 9), np.linspace(top, bottom, 9))
+    field = views.list_grid_points(np.linspace(left, right, 9), np.linspace(top, bottom, 9))
     far = {}
     for view in found.views:
         offset = view.to_centre(true[view.position].to_sensor(field)) - field
@@ -101,7 +101,7 @@ def test_field_is_the_centre_tile_less_its_margin(truth):
 
 def test_charuco_finds_unmirrored_views_by_itself(truth):
     target, picture = TARGETS["charuco"]
-    found = calibrate(shown(truth, picture), target, mirrors=False)
+    found = calibrate(shown(truth, picture), target, are_mirrored=False)
     assert max(distance_px(found, truth).values()) < 0.3
 
 
@@ -188,12 +188,12 @@ def test_a_spoilt_fold_is_refused_in_one_line(truth, tmp_path, change, message):
 @pytest.mark.parametrize("angle", [0.1, -0.1])
 def test_the_halves_of_a_corner_view_are_turned_apart_or_over_each_other(angle):
     fold = CornerFold((100.0, 50.0), (0.0, 50.0), angle)  # the line runs left from the corner
-    seen = fold.turn(np.array([[0.0, 50.5], [0.0, 49.5], [100.0, 50.0]]))
+    seen = fold.turn_halves(np.array([[0.0, 50.5], [0.0, 49.5], [100.0, 50.0]]))
     assert np.allclose(seen[2], fold.corner) and seen[0, 0] == pytest.approx(seen[1, 0])
     apart = np.cos(angle / 2) + 200 * np.sin(angle / 2)
     assert seen[0, 1] - seen[1, 1] == pytest.approx(apart)
     away = np.array([[0.0, 70.0], [0.0, 30.0], [60.0, 90.0]])
-    assert np.allclose(fold.turn(fold.turn_back(away)), away)
+    assert np.allclose(fold.turn_halves(fold.turn_halves_back(away)), away)
 
 
 def test_lookup_and_registration_follow_the_halves(truth):
@@ -262,7 +262,7 @@ def test_an_event_of_every_pixel_is_flat_per_sensor_pixel(truth, kind):
 
 def split(table: sensor_lookup.SensorLookup, events: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the events inside views, at their nearest model pixel, and the view of each."""
-    pixel = table.nearest_pixel[events["y"], events["x"]]
+    pixel = table.nearest_model_pixel[events["y"], events["x"]]
     kept = events[pixel >= 0].copy()
     view, kept["y"], kept["x"] = np.unravel_index(pixel[pixel >= 0], (table.views, *table.model))
     return kept, view

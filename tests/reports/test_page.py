@@ -40,7 +40,9 @@ def test_the_page_needs_nothing_from_elsewhere_and_keeps_names_harmless(tmp_path
     write_samples(run)
     (tmp_path / "chart.svg").write_text("<svg xmlns='http://www.w3.org/2000/svg'/>")
     table, _, made = built(tmp_path)
-    text = page.format_html("t", [table], made, runs.find_figures([tmp_path]), commands=[], **MEDIA)
+    text = page.format_html(
+        "t", [table], made, runs.find_charts_and_stress_maps([tmp_path]), commands=[], **MEDIA
+    )
     seen = Seen(text)
     assert seen.open == [] and seen.tags.count("script") == 1 and seen.tags.count("img") == 3
     assert all(address.startswith("data:image/") for address in seen.addresses)

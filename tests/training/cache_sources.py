@@ -13,7 +13,7 @@ from src.sim.optics import Optics
 from src.sim.pipeline import Pipeline
 from src.sim.sensor import EventSensor
 from src.sim.turbulence.simulated import SimulatedTurbulence
-from src.training.disk_cache import BackgroundFiller, DiskClipCache
+from src.training.disk_cache import CacheFillerProcess, DiskClipCache
 from tests.sim.test_pipeline import Waves
 
 MIXED = SimulatedTurbulence({"severity": "mixed"}, temporal_model="mixed")
@@ -107,7 +107,7 @@ def fill_for_ever(told: str) -> None:
 
 def start_filler(cache: DiskClipCache, told: Path) -> None:
     """Start a filler, as a training does, and hang; the filler's number is in the file `told`."""
-    filler = BackgroundFiller(cache)
+    filler = CacheFillerProcess(cache)
     filler.start()
     told.write_text(str(filler.process.pid))
     time.sleep(600)

@@ -193,12 +193,18 @@ def test_a_misplaced_view_moves_whole_and_leaves_nothing_behind():
     assert torch.equal(shift_views(view.clone(), draw_view_shifts(3, 0.0, 2, key=4)), view)
 
 
+def test_shifting_brings_nothing_in():
+    moved = shift_views(torch.ones(1, 9, 5, 8, 8), [(2, 1, -2)])
+    assert moved[:, 2].sum() == 5 * 7 * 6 and moved[:, 3].all()
+    assert not moved[0, 2, 0, 0].any() and not moved[0, 2, 0, :, -2:].any()
+
+
 def test_dropped_views_take_their_positions_along_and_some_view_stays():
     places = tuple((0, column) for column in range(4))
     voxels = torch.arange(4.0).reshape(1, 1, 4, 1, 1, 1)
     picture = torch.zeros(1, 1, 1, 1, 1)
     sample = Sample(voxels, picture, picture, torch.tensor([1 / 120]), places)
-    lossy = Augment(**OFF, view_dropout_probability=1.0)
+    lossy = Augment(**OFF, batch_view_dropout_probability=1.0)
     counts = set()
     for key in range(60):
         left = lossy([sample], [key])
@@ -212,7 +218,7 @@ def test_a_view_that_stays_shows_the_picture_of_its_turned_place():
     voxels = torch.arange(9.0).reshape(1, 1, 9, 1, 1, 1)
     picture = torch.zeros(1, 1, 1, 1, 1)
     sample = Sample(voxels, picture, picture, torch.tensor([1 / 120]), layout(9))
-    mirror = Augment(**OFF | {"flip_probability": 1.0}, view_dropout_probability=1.0)
+    mirror = Augment(**OFF | {"flip_probability": 1.0}, batch_view_dropout_probability=1.0)
     for key in range(10):
         left = mirror([sample], [key])
         shown = [layout(9)[int(view)] for view in left.voxels.flatten()]
@@ -228,7 +234,7 @@ def test_a_view_that_stays_shows_the_picture_of_its_turned_place():
         {"max_offset_pixel_fraction": 2},
         {"view_shift_probability": 2},
         {"max_view_shift_px": -1},
-        {"view_dropout_probability": 1.5},
+        {"batch_view_dropout_probability": 1.5},
         {"max_firing_pixel_fraction": -1},
     ],
 )
@@ -262,7 +268,7 @@ STRONG = {
     [
         {},
         {"view_shift_probability": 0.5},
-        {"view_dropout_probability": 1.0, "view_shift_probability": 1.0},
+        {"batch_view_dropout_probability": 1.0, "view_shift_probability": 1.0},
     ],
 )
 @pytest.mark.parametrize("teacher_frames", [False, True])

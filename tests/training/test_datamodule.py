@@ -17,7 +17,7 @@ class FakeTrainer:
     global_rank, world_size = 0, 1
 
     def __init__(self, steps: int = 0):
-        self.lightning_module = SimpleNamespace(total_steps=steps)
+        self.lightning_module = SimpleNamespace(steps_so_far=steps)
 
 
 def chain():

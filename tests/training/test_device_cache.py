@@ -77,7 +77,9 @@ def test_a_range_that_the_clips_do_not_hold_is_refused(wrong):
 
 
 def test_samples_that_come_again_keep_their_batches():
-    with pytest.raises(ValueError, match="data.clips must be a multiple of data.batch_size=3"):
+    with pytest.raises(
+        ValueError, match="data.train_clips must be a multiple of data.batch_size=3"
+    ):
         cached(cache(), crop=[8, 24], batch_size=3, clips=10)
     chain = cached(cache(), crop=[8, 24], batch_size=3, clips=9)
     assert [chain.draw(n).crop for n in range(9)] == [chain.draw(n).crop for n in range(9, 18)]
@@ -150,7 +152,7 @@ def test_wrong_values_are_one_line(wrong, message, tmp_path):
     cfg = config("train", tmp_path, *SMALL, "data.cache_device=device", "data.workers=0", wrong)
     with pytest.raises(ValueError, match=message):
         build.build_data_module(cfg)
-        build.build_reconstructor(cfg, *build.build_network_and_spec(cfg))
+        build.build_reconstructor(cfg, *build.build_untrained_network(cfg))
 
 
 def test_a_training_of_two_sizes_takes_steps(tmp_path):

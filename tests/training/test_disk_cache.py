@@ -24,7 +24,7 @@ from src.training.augment import Augment
 from src.training.clip_cache import FIRST_CLIPS, SAMPLES_PER_CLIP, CachedPipeline
 from src.training.datamodule import LightFieldData
 from src.training.disk_cache import (
-    BackgroundFiller,
+    CacheFillerProcess,
     DiskClipCache,
     hash_file_lists,
     hash_simulation_code,
@@ -374,7 +374,7 @@ def test_a_filler_ends_with_the_training_that_started_it(tmp_path):
 
 
 def test_of_two_fillers_one_fills_and_the_other_takes_over_and_ends(tmp_path):
-    first, second = (BackgroundFiller(disk_cache(tmp_path, 6, scene=Slow())) for _ in range(2))
+    first, second = (CacheFillerProcess(disk_cache(tmp_path, 6, scene=Slow())) for _ in range(2))
     first.start()
     until(lambda: list(tmp_path.glob("*/*.pt")))
     second.start()

@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 
 from src.losses import terms
 from src.losses.terms import FrameTerm, StaticFlicker, TemporalConsistency, TrainingLoss
-from src.models.network import EventToVideoNetwork, split_windows, unroll
+from src.models.network import EventToVideoNetwork, unroll
 from src.sim.pipeline import Sample
 from src.training import reconstructor
 from src.training.reconstructor import Reconstructor, select_loss_windows
@@ -157,11 +157,6 @@ def test_pairs_stay_in_their_parts_and_are_drawn_anew_every_step():
             assert second == first + 1
             assert 3 + part * 37 // 4 <= first and second < 3 + (part + 1) * 37 // 4
     assert seen == set(range(3, 40))
-
-
-def test_chunks_cover_every_window_once():
-    assert list(split_windows(5, 2)) == [slice(0, 2), slice(2, 4), slice(4, 5)]
-    assert list(split_windows(5, 0)) == [slice(0, 5)]
 
 
 def test_two_chunks_with_the_state_carried_over_equal_one():

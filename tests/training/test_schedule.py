@@ -167,7 +167,7 @@ def test_what_goes_on_with_another_loss_has_not_collapsed(three_hours, tmp_path)
 def test_restored_weights_are_those_that_were_exported(three_hours, tmp_path):
     now = three_hours / "now/net.safetensors"
     cfg = config("train", tmp_path / "second", *TINY, *RECIPE)
-    network, _ = build.build_network_and_spec(cfg)
+    network, _ = build.build_untrained_network(cfg)
     files.restore_weights(network, now)
     ours, theirs = inference_copy(network).state_dict(), files.load(now).state_dict()
     assert ours.keys() == theirs.keys()
@@ -180,8 +180,8 @@ def test_restored_weights_are_those_that_were_exported(three_hours, tmp_path):
 
 def test_weights_of_another_network_are_refused(tmp_path):
     now = tmp_path / "now.safetensors"
-    network, spec = build.build_network_and_spec(config("train", tmp_path, *TINY, *RECIPE))
-    other, _ = build.build_network_and_spec(config("train", tmp_path, *TINY, *RECIPE, "width=8"))
+    network, spec = build.build_untrained_network(config("train", tmp_path, *TINY, *RECIPE))
+    other, _ = build.build_untrained_network(config("train", tmp_path, *TINY, *RECIPE, "width=8"))
     files.save(now, network, spec, {})
     with pytest.raises(ValueError, match="ckpt does not fit E2VID"):
         files.restore_weights(other, now)

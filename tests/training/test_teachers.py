@@ -117,4 +117,4 @@ def test_wrong_values_are_one_line(asked, message, tmp_path):
     cfg = config("train", tmp_path, "experiment=setnet_small", "teachers=lf3x3", *asked)
     with pytest.raises(ValueError, match=message):
         build.build_data_module(cfg)
-        build.build_reconstructor(cfg, *build.build_network_and_spec(cfg))
+        build.build_reconstructor(cfg, *build.build_untrained_network(cfg))

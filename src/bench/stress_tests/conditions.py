@@ -1,24 +1,23 @@
 """Stress tests of the conditions of a clip: turbulence, sensor, window rate, views."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from dataclasses import replace
 from statistics import fmean
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from src.bench.candidates import Candidate
 from src.bench.stress_tests.event_clips import ClipConditions, EventClip, StressBench, require_type
 from src.bench.stress_tests.stress_results import StressResult, build_worst_psnr_loss_result
 from src.metrics.image import aligned_psnr
+from src.models.network import unroll
 from src.sim import noise
-from src.sim.optics import centre_view_index, layout
+from src.sim.optics import layout, most_central_view_index
 from src.sim.turbulence.simulated import SimulatedTurbulence
-
-Voxels = Float[Tensor, "n views bins h w"]
+from src.training.clip_transforms import shift_views
 
 
 def measure_worst_psnr_loss(
@@ -32,36 +31,35 @@ def measure_worst_psnr_loss(
     d_over_r0, `sensor.<argument>` of EventSensor or `turbulence.<argument>` of SimulatedTurbulence.
     `fixed` is set with every value; the loss is against clips of the `reference` settings.
     """
-    base, curve = (
-        bench.mean_aligned_psnr(network, ClipConditions.from_settings(reference or {})),
-        [],
-    )
-    for value in values:
-        conditions = ClipConditions.from_settings({parameter: value, **(fixed or {})})
-        curve.append((value, base - bench.mean_aligned_psnr(network, conditions)))
+
+    def psnr(settings: Mapping[str, Any]) -> float:
+        return bench.mean_aligned_psnr(network, ClipConditions.from_settings(settings))
+
+    base = psnr(reference or {})
+    curve = [(value, base - psnr({parameter: value, **(fixed or {})})) for value in values]
     return build_worst_psnr_loss_result(curve, limit_db=limit_db, varied=parameter)
 
 
 def measure_correlated_views_loss(
-    network: Candidate, bench: StressBench, *, limit_db: float, spacings: Sequence[float]
-) -> StressResult:
+    network: Candidate, bench: StressBench, *, limit_db: float,
+    spacings_over_aperture: Sequence[float],
+) -> StressResult:  # fmt: skip
     """Return the aligned PSNR lost as the views look through more and more of the same turbulence,
     against views of independent turbulence.
 
-    `spacings`: distance between neighbouring sub-apertures in diameters of one; at 0 all views are
-    distorted alike.
+    `spacings_over_aperture`: distance between neighbouring sub-apertures in diameters of one; at 0
+    all views are distorted alike.
     """
     require_type("turbulence", bench.pipeline.turbulence, SimulatedTurbulence)
     aperture_m = bench.pipeline.draw(bench.indices[0]).turbulence.aperture_m
     found = measure_worst_psnr_loss(
         network, bench, limit_db=limit_db, parameter="turbulence.baseline_m",
-        values=[spacing * aperture_m for spacing in spacings],
+        values=[spacing * aperture_m for spacing in spacings_over_aperture],
         fixed={"turbulence.views_correlation": "baseline"},
     )  # fmt: skip
-    curve = [(spacing, loss) for spacing, (_, loss) in zip(spacings, found.curve, strict=True)]
-    return build_worst_psnr_loss_result(
-        curve, limit_db=limit_db, varied="sub-aperture spacing in diameters"
-    )
+    losses = [loss for _, loss in found.curve]
+    curve = list(zip(spacings_over_aperture, losses, strict=True))
+    return replace(found, curve=curve, varied="sub-aperture spacing in diameters")
 
 
 def measure_window_rate_loss(
@@ -86,15 +84,13 @@ def measure_window_rate_loss(
         truth = (instants * (clip.fps / slowest)).round().long()
         return float(aligned_psnr(frames[at], clip.target[truth, None]).mean())
 
-    totals = torch.zeros(len(rates_hz))
-    for clip in bench.clips():
-        own = score(clip, clip.fps)
-        totals += torch.tensor([own - score(clip, rate_hz) for rate_hz in rates_hz])
-    curve = list(zip(rates_hz, (totals / len(bench.clips())).tolist(), strict=True))
+    clips = bench.clips()
+    base = fmean(score(clip, clip.fps) for clip in clips)
+    curve = [(rate, base - fmean(score(clip, rate) for clip in clips)) for rate in rates_hz]
     return build_worst_psnr_loss_result(curve, limit_db=limit_db, varied="windows a second")
 
 
-def measure_event_dropout_loss(
+def measure_voxel_dropout_loss(
     network: Candidate, bench: StressBench, *, limit_db: float, kept_shares: Sequence[float]
 ) -> StressResult:
     """Return the aligned PSNR lost when only a share of the entries of the grids is kept, at
@@ -115,7 +111,7 @@ def require_views(network: Candidate, least: int) -> None:
         raise ValueError("it is given the centre view only")
 
 
-def measure_view_dropout_loss(
+def measure_worst_view_dropout_loss(
     network: Candidate, bench: StressBench, *, limit_db: float, counts: Sequence[int],
     draws: int = 4,
 ) -> StressResult:  # fmt: skip
@@ -126,7 +122,7 @@ def measure_view_dropout_loss(
     """
     require_views(network, max(counts) + 1)
     base, rng, curve = bench.mean_aligned_psnr(network), np.random.default_rng(0), []
-    middle = centre_view_index(layout(network.views))
+    middle = most_central_view_index(layout(network.views))
     for count in counts:
         lost = [rng.permutation(network.views)[:count].tolist() for _ in range(draws)]
         lost[0] = [middle, *(v for v in lost[0] if v != middle)][:count]  # the centre view, too
@@ -135,29 +131,26 @@ def measure_view_dropout_loss(
     return build_worst_psnr_loss_result(curve, limit_db=limit_db, varied="views lost")
 
 
+@torch.no_grad()
 def _psnr_without_views(network: Candidate, bench: StressBench, lost: list[int]) -> float:
-    positions = list(layout(network.views))
+    positions, scores = list(layout(network.views)), []
     kept = [i for i in range(network.views) if i not in lost]
-    scores = []
     for clip in bench.clips():
-        state, frames = None, []
-        for window in clip.windows():
-            views, _ = network.select_views(window, clip.positions)
-            if network.loaded.views is None:
-                given, views = [positions[i] for i in kept], views[:, kept]
-            else:
-                given, views = positions, views.index_fill(1, torch.tensor(lost), 0.0)
-            frame, state = network.step(views, state, given, 1 / clip.fps)
-            frames.append(frame)
-        scores.append(bench.clip_aligned_psnr(torch.cat(frames), clip))
+        views = [network.select_views(window, clip.positions)[0] for window in clip.windows()]
+        voxels = torch.stack(views, 1).index_fill(2, torch.tensor(lost), 0.0)
+        given = positions
+        if network.loaded.views is None:
+            given, voxels = [positions[i] for i in kept], voxels[:, :, kept]
+        frames, _ = unroll(network.loaded, voxels, window_s=1 / clip.fps, positions=given)
+        scores.append(bench.clip_aligned_psnr(frames[0].float().clamp(0, 1), clip))
     return fmean(scores)
 
 
 def measure_view_shift_loss(
     network: Candidate, bench: StressBench, *, limit_db: float, parallax: bool = False,
-    shifts_px: Sequence[int] = (1, 2, 4), judged_px: int,
+    shifts_px: Sequence[int] = (1, 2, 4), judged_shift_px: int,
 ) -> StressResult:  # fmt: skip
-    """Return the aligned PSNR lost when views are displaced by `judged_px`.
+    """Return the aligned PSNR lost when views are displaced by `judged_shift_px`.
 
     One view beside the centre is displaced by `shifts_px`; with `parallax` all, by so much between
     neighbouring views: the scene is nearer than the plane that the views are registered for.
@@ -165,22 +158,12 @@ def measure_view_shift_loss(
     require_views(network, 2)
     changes, positions = {}, bench.clips()[0].positions
     own = layout(network.views)
-    moved = positions.index(own[centre_view_index(own) - 1])  # the last one: the centre comes first
+    moved = positions.index(
+        own[most_central_view_index(own) - 1]
+    )  # the last one: the centre comes first
     for px in shifts_px:
-        everywhere = {i: (px * row, px * col) for i, (row, col) in enumerate(positions)}
-        shifts = everywhere if parallax else {moved: (0, px)}
-        changes[px] = partial(shift_views, shifts_px=shifts)
+        everywhere = [(i, px * row, px * col) for i, (row, col) in enumerate(positions)]
+        shifts = everywhere if parallax else [(moved, 0, px)]
+        changes[px] = lambda voxels, shifts=shifts: shift_views(voxels.clone(), shifts)
     curve = bench.aligned_psnr_losses(network, changes)
-    return StressResult(dict(curve)[judged_px], "dB", limit_db, curve, "px of shift")
-
-
-def shift_views(voxels: Voxels, shifts_px: dict[int, tuple[int, int]]) -> Voxels:
-    """Return the grids with view i moved by shifts_px[i] (down, right), zeros at the edges."""
-    moved = voxels.clone()
-    for view, shift in shifts_px.items():
-        pairs = list(zip(shift, voxels.shape[-2:], strict=True))
-        to = [slice(max(px, 0), length + min(px, 0)) for px, length in pairs]
-        source = [slice(max(-px, 0), length + min(-px, 0)) for px, length in pairs]
-        moved[:, view] = 0
-        moved[:, view, :, to[0], to[1]] = voxels[:, view, :, source[0], source[1]]
-    return moved
+    return StressResult(dict(curve)[judged_shift_px], "dB", limit_db, curve, "px of shift")

@@ -20,6 +20,7 @@ from src.bench.candidates import Candidate
 from src.metrics.image import aligned_psnr
 from src.models.backward_warmup import reverse_voxels
 from src.sim import noise
+from src.sim.optics import Position
 from src.sim.pipeline import Pipeline, crop_frames
 from src.sim.sensor import EventSensor
 from src.sim.turbulence.simulated import SimulatedTurbulence
@@ -74,7 +75,7 @@ class EventClip:
     target: Film
     turbulent: Film
     fps: float
-    positions: tuple[tuple[int, int], ...]
+    positions: Sequence[Position]
 
     @property
     def duration_s(self) -> float:
@@ -151,7 +152,7 @@ def simulate_event_clip(pipeline: Pipeline, index: int, conditions: ClipConditio
         for i, view in zip(ids, views, strict=True)
     ]
     target, turbulent = crop_frames(draw.clip.frames, draw.crop), views[pipeline.optics.centre]
-    return EventClip(events, target, turbulent, fps, pipeline.positions)
+    return EventClip(events, target, turbulent, fps, pipeline.optics.positions)
 
 
 def require_type(key: str, part: object, kind: type[Part]) -> Part:

@@ -4,6 +4,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain, cycle, islice
+from statistics import fmean
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,10 +14,11 @@ from torch import Tensor
 
 from src.bench.candidates import Candidate
 from src.bench.stress_tests.event_clips import ClipConditions, StressBench
-from src.bench.stress_tests.stress_results import StressResult, build_mean_result
+from src.bench.stress_tests.stress_results import StressResult
 from src.deploy.forms import convert_to_form
 from src.metrics.image import aligned_psnr
 from src.metrics.temporal import temporal_jitter_px
+from src.models.network import unroll
 from src.sim import noise
 
 SCORED_EVERY = 4  # windows of a long run
@@ -71,9 +74,8 @@ def measure_convergence_windows(
     a clip that never gets there counts its length.
     """
     scores = [aligned_psnr(clip.reconstruct(network)[0], clip.truth) for clip in bench.clips()]
-    return build_mean_result(
-        [count_settling_windows(s, within_db) for s in scores], "windows", limit_windows
-    )
+    times = [count_settling_windows(s, within_db) for s in scores]
+    return StressResult(fmean(times), "windows", limit_windows)
 
 
 def measure_flicker_recovery(
@@ -94,7 +96,7 @@ def measure_flicker_recovery(
         after = aligned_psnr(disturbed[half + flicker_windows :], truth[half:])
         losses = aligned_psnr(plain[half:], truth[half:]) - after
         times.append(count_windows_to_last_exceedance(losses, within_db))
-    return build_mean_result(times, "windows", limit_windows)
+    return StressResult(fmean(times), "windows", limit_windows)
 
 
 def measure_static_scene_jitter_percent(
@@ -117,10 +119,10 @@ def measure_static_scene_jitter_percent(
             for video in (clip.turbulent[1:, None].clone(), clip.reconstruct(network)[0])
         )
         shares.append(100 * float(ours / one_view.clamp(min=1e-9)))
-    return build_mean_result(shares, "%", limit_percent)
+    return StressResult(fmean(shares), "%", limit_percent)
 
 
-def measure_perturbation_growth(
+def measure_input_perturbation_growth(
     network: Candidate, bench: StressBench, *, limit_growth_per_window: float,
     perturbation_rms: float = 1e-3, skipped_windows: int = 3,
 ) -> StressResult:  # fmt: skip
@@ -139,12 +141,10 @@ def measure_perturbation_growth(
         plain, _ = clip.reconstruct(network, windows)
         changed = [*windows[:start], perturbed, *windows[start + 1 :]]
         other, _ = clip.reconstruct(network, changed)
-        difference = (
-            (plain - other)[start + skipped_windows :].double().square().mean((1, 2, 3)).sqrt()
-        )
-        logs = difference.clamp(min=1e-12).log()
+        difference = (plain - other)[start + skipped_windows :].double()
+        logs = difference.square().mean((1, 2, 3)).sqrt().clamp(min=1e-12).log()
         exponents.append(float(np.polyfit(np.arange(len(logs)), logs.numpy(), 1)[0]))
-    return build_mean_result(exponents, "per window", limit_growth_per_window)
+    return StressResult(fmean(exponents), "per window", limit_growth_per_window)
 
 
 def measure_adversarial_gain(
@@ -157,20 +157,19 @@ def measure_adversarial_gain(
     The perturbation, of `perturbation_rms`, is added to the first of `windows` windows and found by
     `steps` of gradient ascent (Tanay et al., arXiv 2010.05099).
     """
-    network.require_parameters("its response is linear")
+    network.require_float_parameters("its response is linear")
     clip = bench.clips()[0]
     given = list(islice(clip.windows(), bench.warmup + windows))
     _, start_state = clip.reconstruct(network, given[: bench.warmup])
     selected = [network.select_views(window, clip.positions) for window in given[bench.warmup :]]
+    first, *later = (voxels for voxels, _ in selected)
+    options: Any = {"window_s": 1 / clip.fps, "positions": selected[0][1]}
 
     def last_frame(extra: Tensor) -> Tensor:
-        state = start_state
-        for k, (window, positions) in enumerate(selected):
-            voxels, options = window + extra if k == 0 else window, {"positions": positions}
-            frame, state = network.loaded(voxels, state, window_s=1 / clip.fps, **options)
-        return frame
+        voxels = torch.stack([first + extra, *later], 1)
+        return unroll(network.loaded, voxels, start_state, **options)[0][:, -1]
 
-    plain, extra = last_frame(torch.zeros(())), _draw_normal(selected[0][0], "worst")
+    plain, extra = last_frame(torch.zeros(())), _draw_normal(first, "worst")
     curve = []
     for step in range(steps):
         extra = (extra * perturbation_rms / extra.square().mean().sqrt()).detach().requires_grad_()
@@ -187,7 +186,7 @@ def measure_bf16_psnr_difference(
     """Return the mean difference of aligned PSNR, in dB, between bf16 and float32 in the last
     quarter of a long run.
     """
-    network.require_parameters("there is nothing to round")
+    network.require_float_parameters("there is nothing to round")
     clip, quarter = bench.clips()[0], windows // 4
     loop, truth = clip.back_and_forth()
     half = replace(network, network=convert_to_form(network.loaded, "bf16"))

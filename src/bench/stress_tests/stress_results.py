@@ -1,9 +1,8 @@
 """What a stress test returns: a value with its limit; results of all tests, table and summary."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from statistics import fmean
 from typing import Any
 
 from src.bench.candidates import Candidate
@@ -45,11 +44,6 @@ StressTest = Callable[[Candidate, StressBench], StressResult]
 def build_worst_psnr_loss_result(curve: Curve, *, limit_db: float, varied: str) -> StressResult:
     """Return the result whose value is the largest of the curve, in dB."""
     return StressResult(max(value for _, value in curve), "dB", limit_db, curve, varied)
-
-
-def build_mean_result(values: Sequence[float], unit: str, limit: float) -> StressResult:
-    """Return the result whose value is the mean over clips."""
-    return StressResult(fmean(values), unit, limit)
 
 
 Outcome = StressResult | str  # or why there is none
@@ -98,7 +92,7 @@ def format_outcomes_csv(outcomes: Outcomes, titles: Mapping[str, str]) -> str:
     return format_csv(CSV_COLUMNS, lines)
 
 
-def format_markdown_summary(
+def format_summary_per_network(
     outcomes: Outcomes, titles: Mapping[str, str], standard_psnr: Mapping[str, float]
 ) -> str:
     """Return Markdown: for each network the tests it fails and passes."""

@@ -7,15 +7,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from src.bench.candidates import Candidate
-from src.bench.stress_tests.event_clips import ClipConditions, EventClip, StressBench
+from src.bench.stress_tests.event_clips import ClipConditions, EventClip, Film, StressBench
 from src.bench.stress_tests.stress_results import StressResult
 
 LAG_FRAMES = 6  # over which brightening is measured
 GATE_PX = 24.0  # around the true front
 MARGIN_PX = 12.0  # from the frame's border, within which the true front does not count
 WARMUP_FRAMES = 32  # until the target has left its first place, which no event tells
-
-Film = Float[Tensor, "frames h w"]
 
 
 def measure_trajectory_deviation(
@@ -29,18 +27,18 @@ def measure_trajectory_deviation(
     """
 
     def deviation(clip: EventClip) -> float:
-        return measure_track_deviation_px(clip.reconstruct(network)[0][:, 0], clip.target[1:])
+        return measure_cross_track_error_px(clip.reconstruct(network)[0][:, 0], clip.target[1:])
 
     clips = bench.clips()
     without = fmean(map(deviation, bench.clips(ClipConditions(d_over_r0=0.0))))
-    light = fmean(measure_track_deviation_px(c.turbulent[1:], c.target[1:]) for c in clips)
+    light = fmean(measure_cross_track_error_px(c.turbulent[1:], c.target[1:]) for c in clips)
     deviations = list(map(deviation, clips))
     named = [(f"clip {n}", d) for n, d in zip(bench.indices, deviations, strict=True)]
     curve = [("no turbulence", without), ("light of one view", light), *named]
     return StressResult(fmean(deviations), "px", limit_px, curve, "video")
 
 
-def measure_track_deviation_px(frames: Film, truth: Film) -> float:
+def measure_cross_track_error_px(frames: Film, truth: Film) -> float:
     """Return the rms distance, in pixels, of the front in `frames` from its line in `truth`.
 
     Raises ValueError for fewer than four frames that count.

@@ -56,7 +56,7 @@ def fade(kept, values):
 
 
 @njit(nogil=True, cache=True)
-def find_supported(places, grid, kept, least, counts, trace, supported):
+def count_supported_events(places, grid, kept, least, counts, trace, supported):
     """Bring `trace` (views, rows + 2, columns + 2), zero at its border, to the end of the window,
     and write into `supported` (rows, columns), zeros, how many events of a cell have support, more
     than `least`, in the view that has most.  Return (rows, 2), from where to where in each row.
@@ -138,8 +138,10 @@ def spread(supported, spans, weights, evidence, is_near, near_tiles):
 
 
 @njit(nogil=True, cache=True)
-def advance(window_s, kept, tau_s, floor, is_near, near_tiles, active_tiles, activity, elapsed_s,
-            is_pending, pending_tiles, changed):  # fmt: skip
+def advance_clocks(
+    window_s, kept, tau_s, floor, is_near, near_tiles, active_tiles, activity, elapsed_s,
+    is_pending, pending_tiles, changed,
+):  # fmt: skip
     """Advance the clock of every cell; return by how much at most, in seconds, and how many cells
     are active then.  `is_near` is cleared, and `near_tiles`.
 
@@ -179,31 +181,20 @@ def advance(window_s, kept, tau_s, floor, is_near, near_tiles, active_tiles, act
         if last >= 0:
             active_tiles[i, j] = pending_tiles[i, j] = 1
             used = np.flatnonzero(columns_used)
-            mark_reached(r0 + first, r0 + last, c0 + used[0], c0 + used[-1], changed)
+            mark_tiles_near_box(r0 + first, r0 + last, c0 + used[0], c0 + used[-1], changed)
     return longest, total
 
 
 @njit(nogil=True, cache=True)
-def advance_all(moving_s, evidence_per_s, elapsed_s, evidence, is_pending):
-    """Advance the clock of every cell by at least `moving_s`, and add to its evidence."""
-    elapsed, known, pending = elapsed_s.reshape(-1), evidence.reshape(-1), is_pending.reshape(-1)
-    more = f32(evidence_per_s * moving_s)
-    for i in range(np.uint64(elapsed.size)):
-        elapsed[i] = max(elapsed[i], moving_s)
-        known[i] += more
-        pending[i] = u8(1)
+def mark_tiles_near_box(first_row, last_row, first_column, last_column, changed):
+    """Set the tiles of `changed` within two cells of a rectangle of cells."""
+    top, stop = max(first_row - 2, 0) // TILE, (last_row + 2) // TILE + 1
+    left, end = max(first_column - 2, 0) // TILE, (last_column + 2) // TILE + 1
+    changed[top:stop, left:end] = 1
 
 
 @njit(nogil=True, cache=True)
-def mark_reached(top, bottom, left, right, changed):
-    """Set the tiles of `changed` within two cells of a rectangle."""
-    for i in range(max(top - 2, 0) // TILE, min((bottom + 2) // TILE + 1, len(changed))):
-        for j in range(max(left - 2, 0) // TILE, min((right + 2) // TILE + 1, changed.shape[1])):
-            changed[i, j] = 1
-
-
-@njit(nogil=True, cache=True)
-def find_smoothed(recency, settling, is_pending, pending_tiles, settling_tiles, changed):
+def find_cells_to_smooth(recency, settling, is_pending, pending_tiles, settling_tiles, changed):
     """Return the tiles (n, 2), and in each the cells (n, QUARTER, QUARTER), in which the smoothed
     context advances: pending ones, and those with a `recency` above `settling`; mark what they
     change.  `settling_tiles`: where any did without an update.
@@ -230,7 +221,7 @@ def find_smoothed(recency, settling, is_pending, pending_tiles, settling_tiles, 
             tiles[count, 0], tiles[count, 1] = i, j
             count += 1
             r0, c0 = i * TILE, j * TILE
-            mark_reached(
+            mark_tiles_near_box(
                 r0 + 2 * top, r0 + 2 * bottom + 1, c0 + 2 * left, c0 + 2 * right + 1, changed
             )
     return tiles[:count], cells[:count]
@@ -242,24 +233,3 @@ def _has_pending(is_pending, row, column):
     return (
         is_pending[r, c] or is_pending[r, c + 1] or is_pending[r + 1, c] or is_pending[r + 1, c + 1]
     )
-
-
-@njit(nogil=True, cache=True)
-def halve(mask):
-    """Return where a mask is set in 2 x 2 cells; at an odd end in what there is."""
-    rows, columns = mask.shape
-    half = np.zeros(((rows + 1) // 2, (columns + 1) // 2), u8)
-    for r in range(rows):
-        for c in range(columns):
-            half[r // 2, c // 2] |= mask[r, c]
-    return half
-
-
-@njit(nogil=True, cache=True)
-def note_update(coarse, recency, settling_tiles):
-    """Set the recency of the cells `coarse`, whose context is updated, to 1."""
-    for r in range(len(coarse)):
-        for c in range(coarse.shape[1]):
-            if coarse[r, c]:
-                recency[r, c] = 1
-                settling_tiles[r // QUARTER, c // QUARTER] = 1

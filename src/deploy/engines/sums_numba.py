@@ -27,8 +27,8 @@ def fill_tiles(active_tiles, values, out):
 
 
 @njit(nogil=True, cache=True)
-def add_patches(places, grid, weight, elapsed_s, row_spans, column_spans, patches, out):
-    """Add the patches of all pixels, times `weight`, to `out` (rows, columns, channels).
+def add_patches(places, grid, rate_scale, elapsed_s, row_spans, column_spans, patches, out):
+    """Add the patches of all pixels, times `rate_scale`, to `out` (rows, columns, channels).
 
     `patches`, `row_spans`, `column_spans`: of `src.deploy.first_layer`.
     """
@@ -47,12 +47,12 @@ def add_patches(places, grid, weight, elapsed_s, row_spans, column_spans, patche
         corner = row[0] * pitch + column[0] * channels
         n, b = np.uint64(column[2] * channels), 0
         while b < bins:
-            early = weight * grid[i, b]
+            early = rate_scale * grid[i, b]
             if early == 0:
                 b += 1
                 continue
             more = b + 1 < bins
-            late = weight * grid[i, b + 1] if more else f32(0)
+            late = rate_scale * grid[i, b + 1] if more else f32(0)
             k, after, o = start + b * each, each if more else 0, corner
             for _ in range(row[2]):
                 here, one, two = np.uint64(o), np.uint64(k), np.uint64(k + after)
@@ -64,24 +64,24 @@ def add_patches(places, grid, weight, elapsed_s, row_spans, column_spans, patche
 
 
 @njit(nogil=True, cache=True)
-def add_to_cells(places, grid, elapsed_s, new, totals):
-    """Add what the pixels sum to, to `new` (rows, views, columns) and write it into `totals` (n,),
-    0 where the cell stands still."""
+def add_to_cells(places, grid, elapsed_s, cell_sums, pixel_sums):
+    """Add what the pixels sum to, to `cell_sums` (rows, views, columns) and write it into
+    `pixel_sums` (n,), 0 where the cell stands still."""
     for i in range(len(places)):
         v, r, c = places[i, 0], places[i, 1] // SIDE, places[i, 2] // SIDE
         total = f32(0)
         if elapsed_s[r, c] > 0:
             for b in range(grid.shape[1]):
                 total += grid[i, b]
-            new[r, v, c] += total
-        totals[i] = total
+            cell_sums[r, v, c] += total
+        pixel_sums[i] = total
 
 
 @njit(nogil=True, cache=True)
-def leak(active_tiles, elapsed_s, taus_s, new, sums, mixed):
-    """Advance `sums` (rows, views, taus, columns) by `elapsed_s` in active tiles and add `new`
-    (rows, views, columns), which is cleared; let `mixed` (rows, columns, mixtures) leak, and write
-    the spread of the views behind its mixtures.
+def leak(active_tiles, elapsed_s, taus_s, cell_sums, sums, mixed):
+    """Advance `sums` (rows, views, taus, columns) by `elapsed_s` in active tiles and add
+    `cell_sums` (rows, views, columns), which are cleared; let `mixed` (rows, columns, mixtures)
+    leak, and write the spread of the views behind its mixtures.
     """
     columns = elapsed_s.shape[1]
     decay = np.empty((taus_s.size, columns), f32)
@@ -98,7 +98,7 @@ def leak(active_tiles, elapsed_s, taus_s, new, sums, mixed):
             last = min(j * TILE, columns)
             for r in range(i * TILE, min((i + 1) * TILE, len(elapsed_s))):
                 _write_decays(elapsed_s[r, first:last], taus_s, decay)
-                _leak_row(first, last, decay, new[r], sums[r], mixed[r], middle, far)
+                _leak_row(first, last, decay, cell_sums[r], sums[r], mixed[r], middle, far)
 
 
 @njit(nogil=True, cache=True)
@@ -145,11 +145,11 @@ def _leak_row(first, last, decay, new, sums, mixed, middle, far):
 
 
 @njit(nogil=True, cache=True)
-def add_to_mixtures(places, totals, code, mixed):
-    """Add the `totals` of pixels to the mixtures of their cells, `code` (views, mixtures)."""
+def add_to_mixtures(places, pixel_sums, code, mixed):
+    """Add the `pixel_sums` to the mixtures of their cells, `code` (views, mixtures)."""
     n, to, shares = np.uint64(code.shape[1]), mixed.reshape(-1), code.reshape(-1)
     for i in range(len(places)):
-        total = totals[i]
+        total = pixel_sums[i]
         if total != 0:
             r, c = places[i, 1] // SIDE, places[i, 2] // SIDE
             here = np.uint64((r * mixed.shape[1] + c) * mixed.shape[2])

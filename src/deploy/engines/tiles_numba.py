@@ -38,7 +38,7 @@ def gather(source, corners, out):
 
 
 @njit(nogil=True, cache=True)
-def gather_sum(near, far, corners, out):
+def gather_relu_sum(near, far, corners, out):
     """Write the tiles of relu(near + far) into `out`, `far` of half the size; borders go on."""
     rows, columns, channels = near.shape
     side, a, b, to = out.shape[1], near.reshape(-1), far.reshape(-1), out.reshape(-1)
@@ -80,17 +80,6 @@ def gather_interpolated(source, row_spans, column_spans, corners, out):
                     above = (f32(1) - right) * max(a[m], zero) + right * max(b[m], zero)
                     below = (f32(1) - right) * max(c[m], zero) + right * max(d[m], zero)
                     to[m] = (f32(1) - down) * above + down * below
-
-
-@njit(nogil=True, cache=True)
-def mark_inside(size, corners, out):
-    """Write 1 into the cells of the tiles that lie in a map of `size`, 0 into the others."""
-    rows, columns = size
-    for i in range(len(corners)):
-        for k in range(out.shape[1]):
-            for q in range(out.shape[2]):
-                row, column = corners[i, 0] + k, corners[i, 1] + q
-                out[i, k, q, 0] = 0 <= row < rows and 0 <= column < columns
 
 
 @njit(nogil=True, cache=True)
@@ -174,20 +163,3 @@ def add_background(light, revealed, background, frame):
                 hidden = (f32(1) - known[c]) * background
                 for b in range(CELL):
                     row[CELL * c + b] = of[CELL * c + b] + hidden
-
-
-@njit(nogil=True, cache=True)
-def find_tiles(mask, side):
-    """Return (n, 2): first row and column of the tiles of `side` that have a cell of `mask`."""
-    down, across = (len(mask) + side - 1) // side, (mask.shape[1] + side - 1) // side
-    has = np.zeros((down, across), np.uint8)
-    for r in range(len(mask)):
-        for c in range(mask.shape[1]):
-            if mask[r, c]:
-                has[r // side, c // side] = 1
-    corners, count = np.empty((down * across, 2), np.int32), 0
-    for i, j in np.ndindex(has.shape):
-        if has[i, j]:
-            corners[count, 0], corners[count, 1] = side * i, side * j
-            count += 1
-    return corners[:count]

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from src.recordings.files import sources, videos
 from src.recordings.files.event_file import ReadOptions
-from src.recordings.views import Size
+from src.recordings.views import HeightWidth
 from src.sim.scenes.video_files import PICTURE_SUFFIXES
 
 WINDOWS = 16
@@ -21,23 +21,22 @@ FIRST_WINDOW_US = 5000
 Pictures = Float[np.ndarray, "windows kinds h w"]
 
 
-class WindowSums:
-    """Sums of pictures (kinds, h, w) over windows of one length, of which `windows` is the list."""
+class DoublingWindowSums:
+    """Sums of pictures (kinds, h, w) over up to WINDOWS windows of one `length`, in order."""
 
     def __init__(self, shape: tuple[int, ...], length: int):
         self.shape, self.length = shape, length
         self.windows: list[np.ndarray] = []
 
-    def window(self, time: int) -> np.ndarray:
-        """Return the sum of the window of `time`, to be added to; `time` is 0 or more, in the unit
-        of `length`."""
+    def add(self, time: int, picture: np.ndarray) -> None:
+        """Add a picture to the window that holds `time`, 0 or more, in the unit of `length`."""
         while time // self.length >= WINDOWS:
             pairs = range(0, len(self.windows), 2)
             self.windows = [np.sum(self.windows[first : first + 2], axis=0) for first in pairs]
             self.length *= 2
         while len(self.windows) <= time // self.length:
             self.windows.append(np.zeros(self.shape, np.float32))
-        return self.windows[time // self.length]
+        self.windows[time // self.length] += picture
 
 
 def read_activity_pictures(
@@ -63,37 +62,38 @@ def shrink_pictures(
     return cut.reshape(-1, height, factor, width, factor).mean((2, 4))
 
 
-def describe_structure(
-    pictures: Float[np.ndarray, "n h w"], fine_px: float, coarse_px: float
+def band_pass_log(
+    pictures: Float[np.ndarray, "n h w"], fine_sigma_px: float, coarse_sigma_px: float
 ) -> Float[np.ndarray, "n h w"]:
-    """Return the logarithm of pictures between two scales, sigmas in pixels; a pixel far above its
-    neighbours, a hot one, counts as three times their median."""
-
-    def describe(picture: np.ndarray) -> np.ndarray:
+    """Return the logarithm of pictures between two scales, sigmas of Gaussians; a pixel far above
+    its neighbours, a hot one, counts as three times their median."""
+    bands = []
+    for picture in pictures:
         capped = np.log1p(np.minimum(picture, 3 + 3 * cv2.medianBlur(picture, 5)))
-        fine, coarse = (cv2.GaussianBlur(capped, (0, 0), sigma) for sigma in (fine_px, coarse_px))
-        return fine - coarse
-
-    return np.stack([describe(picture) for picture in pictures])
+        fine, coarse = (
+            cv2.GaussianBlur(capped, (0, 0), s) for s in (fine_sigma_px, coarse_sigma_px)
+        )
+        bands.append(fine - coarse)
+    return np.stack(bands)
 
 
 def _average_film(frames: Iterator[np.ndarray]) -> Pictures:
     sums = None
     for index, frame in enumerate(frames):
-        sums = sums or WindowSums((2, *frame.shape), 1)  # of code values, and of frames
+        sums = sums or DoublingWindowSums((2, *frame.shape), 1)  # of code values, and of frames
         if frame.shape != sums.shape[1:]:
             got = f"{frame.shape} after {sums.shape[1:]}"
             raise ValueError(f"recording must hold frames of one size, got {got}")
-        sums.window(index)[:] += np.stack([255 * frame, np.ones_like(frame)])
+        sums.add(index, np.stack([255 * frame, np.ones_like(frame)]))
     assert sums is not None, "read_video yields a frame or raises"
     return np.stack([window[:1] / window[1:] for window in sums.windows])
 
 
-def _count_events(chunks: Iterator[np.ndarray], size: Size) -> Pictures:
-    sums, start = WindowSums((2, *size), FIRST_WINDOW_US), None
+def _count_events(chunks: Iterator[np.ndarray], size: HeightWidth) -> Pictures:
+    sums, start = DoublingWindowSums((2, *size), FIRST_WINDOW_US), None
     for events in chunks:
         start = int(events["t"][0]) if start is None else start
         place = np.ravel_multi_index((events["p"] > 0, events["y"], events["x"]), sums.shape)
         added = np.bincount(place, minlength=int(np.prod(sums.shape)))
-        sums.window(int(events["t"][0]) - start)[:] += added.reshape(sums.shape)
+        sums.add(int(events["t"][0]) - start, added.reshape(sums.shape))
     return np.stack([window for window in sums.windows if window.any()])

@@ -2,8 +2,8 @@
 
 `detect_candidate_points` finds points of a kind of target anywhere in a picture that shows it many
 times, mirrored or not; `find_points` those of the one target in a crop row by row, NaN where one is
-not seen, or None.  `shape`: (rows, columns) of these; `count`: features of a whole target; one that
-is `ordered` knows which point is which and is not found in a mirrored picture.
+not seen, or None.  `shape`: (rows, columns) of these; `candidate_count`: candidates on a whole
+target; one that is `ordered` knows which point is which and is not found in a mirrored picture.
 Pictures are (h, w) uint8; points are (x, y) pixels, (0, 0) the centre of the top left pixel.
 """
 
@@ -37,7 +37,7 @@ class _Grid:
         return self.rows, self.cols
 
     @property
-    def count(self) -> int:
+    def candidate_count(self) -> int:
         return self.rows * self.cols
 
 
@@ -57,7 +57,7 @@ class Checkerboard(_Grid):
         contrast += 0.1 * np.percentile(contrast, 99)
         saddle = (yx**2 - yy * np.gradient(dx, axis=1)) / np.maximum(contrast, 1e-9)
         peaks = saddle == ndimage.maximum_filter(saddle, size=7)
-        strongest = np.sort(saddle[peaks])[::-1][: 4 * self.count]
+        strongest = np.sort(saddle[peaks])[::-1][: 4 * self.candidate_count]
         y, x = np.nonzero(peaks & (saddle > 0.5 * np.median(strongest)))
         return np.stack([x, y], axis=1).astype(np.float64)
 
@@ -118,7 +118,7 @@ class Charuco(_Grid):
         return self.rows - 1, self.cols - 1
 
     @property
-    def count(self) -> int:
+    def candidate_count(self) -> int:
         return self.rows * self.cols // 2
 
     def detect_candidate_points(self, picture: Picture) -> Points:

@@ -29,11 +29,11 @@ GRID = tuple(np.geomspace(0.05, 2.0, 24).round(4).tolist())
 @dataclass(frozen=True)
 class EventRates:
     """`events` (slices, views, 2) ON and OFF in slices of `slice_s`; `pixels` of each view that
-    count, `hot` ones left out."""
+    count, `hot_pixels` left out."""
 
     events: Int[np.ndarray, "slices views 2"]
     pixels: Int[np.ndarray, " views"]
-    hot: Int[np.ndarray, " views"]
+    hot_pixels: Int[np.ndarray, " views"]
     slice_s: float
 
     @property
@@ -45,7 +45,7 @@ class EventRates:
     def pooled(self) -> Float[np.ndarray, " 2"]:
         return self.events.sum((0, 1)) / (self.pixels.sum() * len(self.events) * self.slice_s)
 
-    def bootstrap(self, draws: int = 1000) -> Float[np.ndarray, "draws 2"]:
+    def bootstrap_pooled_rates(self, draws: int = 1000) -> Float[np.ndarray, "draws 2"]:
         """Return pooled rates of recordings put together from this one's blocks of n ** (1/3)
         successive slices, wrapping around (circular block bootstrap, Politis and Romano 1992)."""
         n = len(self.events)
@@ -151,13 +151,13 @@ def estimate_contrast_threshold(
     The geometric mean of ON and OFF rate gives their size; the quotient gives the ratio of OFF to
     ON, as what rises has to fall.  Raises ValueError for a rate that the grid does not make.
     """
-    measured, drawn = rates.pooled, np.maximum(rates.bootstrap(), 1e-12)
+    measured, drawn = rates.pooled, np.maximum(rates.bootstrap_pooled_rates(), 1e-12)
     if not (measured > 0).all():
         raise ValueError(f"the recording's rates above the background are not positive: {measured}")
     ratio = 1.0
     for _ in range(ROUNDS):
         curve = simulate_event_rates(clips, fps, sensor, thresholds, off_ratio=ratio)
-        on = float(find_threshold(curve, measured))
+        on = float(find_on_threshold(curve, measured))
         if not np.isfinite(on):
             low, high = np.sqrt(np.prod(curve.rates[[-1, 0]], axis=1))
             raise ValueError(
@@ -165,7 +165,7 @@ def estimate_contrast_threshold(
                 f" thresholds {thresholds[0]} to {thresholds[-1]} makes, {low:.3g} to {high:.3g}"
             )
         ratio = float(np.clip(ratio * _excess_quotient(curve, on, measured), 0.1, 10))
-    on_drawn = find_threshold(curve, drawn)
+    on_drawn = find_on_threshold(curve, drawn)
     off_drawn = on_drawn * curve.off_ratio * _excess_quotient(curve, on_drawn, drawn)
     bounds = np.nanpercentile([on_drawn, off_drawn], (2.5, 97.5), axis=1).T.tolist()
     (on_low, on_high), (off_low, off_high) = bounds
@@ -173,7 +173,7 @@ def estimate_contrast_threshold(
     return ThresholdEstimate(*on_off, curve, measured, np.percentile(drawn, (2.5, 97.5), axis=0))
 
 
-def find_threshold(
+def find_on_threshold(
     curve: RateCurve, rates: Float[np.ndarray, "*draws 2"]
 ) -> Float[np.ndarray, "*draws"]:
     """Return the ON threshold with the geometric mean of `rates`, nan where the grid ends.

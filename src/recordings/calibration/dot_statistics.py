@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial.distance import pdist
 
 from src.recordings.calibration.boards import Circles
 from src.recordings.calibration.gaussian_dots import GaussianFits
@@ -23,15 +24,15 @@ from src.records.results import format_csv, write_text
 @dataclass(frozen=True)
 class DotStatistics:
     """Tilt, blur and relative intensity with turbulence, `still_` ones without; NaN where a fit
-    failed.  Dots are in order row by row; `centre`: the index of the centre view."""
+    failed.  Dots are in order row by row; `centre_view`: the index of the centre view."""
 
     fps: float
-    centre: int
+    centre_view: int
     tilt: Float[np.ndarray, "views frames dots 2"]
     blur: Float[np.ndarray, "views frames dots"]
-    intensity: Float[np.ndarray, "views frames dots"]
+    relative_intensity: Float[np.ndarray, "views frames dots"]
     still_blur: Float[np.ndarray, "views dots"]
-    still_intensity: Float[np.ndarray, "views still dots"]
+    still_relative_intensity: Float[np.ndarray, "views still dots"]
 
     @property
     def failed(self) -> Int[np.ndarray, "views dots"]:
@@ -43,48 +44,46 @@ class DotStatistics:
 
     @property
     def scintillation(self) -> Float[np.ndarray, "views dots"]:
-        return scintillation_index(self.intensity)
+        return scintillation_index(self.relative_intensity)
 
     @property
     def still_scintillation(self) -> Float[np.ndarray, "views dots"]:  # of noise and fit alone
-        return scintillation_index(self.still_intensity)
+        return scintillation_index(self.still_relative_intensity)
 
     @property
     def lags_s(self) -> Float[np.ndarray, " lags"]:
-        """Lags of `autocorrelation`, up to a quarter of the recording."""
+        """Lags of `middle_dot_autocorrelation`, up to a quarter of the recording."""
         return np.arange(max(self.tilt.shape[1] // 4, 2)) / self.fps
 
     @property
-    def autocorrelation(self) -> Float[np.ndarray, " lags"]:
+    def middle_dot_autocorrelation(self) -> Float[np.ndarray, " lags"]:
         """Of the tilt of the middle dot of the centre view."""
-        return autocorrelate(self.tilt[self.centre, :, self.middle], len(self.lags_s))
+        return autocorrelate(self.tilt[self.centre_view, :, self.middle_dot], len(self.lags_s))
 
     @property
     def centre_view_correlation(self) -> Float[np.ndarray, "dots dots"]:
         """Correlation of tilt between the dots of the centre view."""
-        return tilt_correlation(self.tilt[self.centre])
+        return tilt_correlation(self.tilt[self.centre_view])
 
     @property
     def tilt_correlation_across_views(self) -> Float[np.ndarray, "views views"]:
         """Correlation of tilt between the views, of the middle dot."""
-        return tilt_correlation(self.tilt[:, :, self.middle].swapaxes(0, 1))
+        return tilt_correlation(self.tilt[:, :, self.middle_dot].swapaxes(0, 1))
 
     @property
-    def middle(self) -> int:
+    def middle_dot(self) -> int:
         return self.tilt.shape[2] // 2
 
     def summary(self) -> dict[str, float]:
         """Return the main numbers of the middle dot of the centre view."""
-        dot, view = self.middle, self.centre
+        dot, view = self.middle_dot, self.centre_view
         off = ~np.eye(len(self.tilt), dtype=bool)
         return {
             "frames": self.tilt.shape[1],
             "failed": int(self.failed.sum()),
             "tilt_rms_px": float(np.sqrt(_mean(self.tilt[view, :, dot] ** 2, None))),
-            "tilt_decay_s": float(decay_time_s(self.autocorrelation, self.fps)),
-            "across_views": float(self.tilt_correlation_across_views[off].mean())
-            if off.any()
-            else float("nan"),
+            "tilt_decay_s": float(decay_time_s(self.middle_dot_autocorrelation, self.fps)),
+            "across_views": float(_mean(self.tilt_correlation_across_views[off], None)),
             "blur_over_still": float(self.blur_over_still[view, dot]),
             "scintillation": float(self.scintillation[view, dot]),
             "still_scintillation": float(self.still_scintillation[view, dot]),
@@ -92,14 +91,20 @@ class DotStatistics:
 
 
 def compare_with_still(
-    turbulent: Sequence[GaussianFits], still: Sequence[GaussianFits], *, fps: float, centre: int
+    turbulent: Sequence[GaussianFits],
+    still: Sequence[GaussianFits],
+    *,
+    fps: float,
+    centre_view: int,
 ) -> DotStatistics:
     """Compare the fits of every view with those of the recording without turbulence.
 
     Raises ValueError for a dot that was never fitted: it has no reference.
     """
     reference = np.stack([_mean(fits.centres, 0) for fits in still])
-    lost = ~np.isfinite(reference).all(-1) | ~np.stack([fits.ok.any(0) for fits in turbulent])
+    lost = ~np.isfinite(reference).all(-1) | ~np.stack(
+        [fits.is_fitted.any(0) for fits in turbulent]
+    )
     if lost.any():
         raise ValueError(
             f"turbulence: every dot must be fitted in some frame, got none for (view, dot)"
@@ -107,12 +112,12 @@ def compare_with_still(
         )
     return DotStatistics(
         fps=fps,
-        centre=centre,
+        centre_view=centre_view,
         tilt=np.stack([fits.centres for fits in turbulent]) - reference[:, None],
         blur=np.stack([fits.blur for fits in turbulent]),
-        intensity=np.stack([fits.flux / _mean(fits.flux, 0) for fits in turbulent]),
+        relative_intensity=np.stack([fits.flux / _mean(fits.flux, 0) for fits in turbulent]),
         still_blur=np.stack([_mean(fits.blur, 0) for fits in still]),
-        still_intensity=np.stack([fits.flux / _mean(fits.flux, 0) for fits in still]),
+        still_relative_intensity=np.stack([fits.flux / _mean(fits.flux, 0) for fits in still]),
     )
 
 
@@ -132,8 +137,7 @@ def find_dots(
 
 def choose_fit_radius(centres: Float[np.ndarray, "dots 2"]) -> int:
     """Return a third of the least distance of two dots, in pixels: room for one that moves."""
-    apart = np.linalg.norm(centres[:, None] - centres, axis=-1)
-    return max(3, round(apart[apart > 0].min() / 3))
+    return max(3, round(pdist(centres).min() / 3))
 
 
 def fit_background(

@@ -28,7 +28,7 @@ class GaussianFits:
     flux: Float[np.ndarray, "frames dots"]
 
     @property
-    def ok(self) -> Bool[np.ndarray, "frames dots"]:
+    def is_fitted(self) -> Bool[np.ndarray, "frames dots"]:
         return np.isfinite(self.blur)
 
 

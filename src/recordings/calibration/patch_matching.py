@@ -31,7 +31,7 @@ def choose_places(pictures: Stack, tile: Rectangle, half: int) -> Pixels:
     return places[enough & (weak > MIN_ROUNDNESS * strong)]
 
 
-def find_patches(
+def measure_patch_offsets(
     pictures: Stack, others: Stack, places: Pixels, half: int, reach: int
 ) -> Float[np.ndarray, "places 2"]:
     """Return how far from its place each patch of `pictures` lies in `others`, (x, y) in pixels, at

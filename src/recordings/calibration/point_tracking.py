@@ -31,7 +31,7 @@ class PointTracks:
     `place`: x and y in the mean frame; `moved`: the displacement from there, estimated twice;
     `sharp`, twice: how much of the mean frame's gradient a window shows (1: all, more: sharper);
     `texture`: the power of that gradient; `seen`: in which frames a point was found, others hold 0;
-    `window_px2`: the variance along one axis of what a displacement is the mean over.
+    `window_variance_px2`: the variance along one axis of what a displacement is the mean over.
     """
 
     place: Float[np.ndarray, "points 2"]
@@ -39,13 +39,13 @@ class PointTracks:
     sharp: Float[np.ndarray, "2 frames points"]
     texture: Float[np.ndarray, " points"]
     seen: Bool[np.ndarray, "frames points"]
-    window_px2: float
+    window_variance_px2: float
 
     def select(self, chosen: Bool[np.ndarray, " points"]) -> "PointTracks":
         """Return the tracks of some of the points."""
         moved, sharp = self.moved[:, :, chosen], self.sharp[:, :, chosen]
         place, texture, seen = self.place[chosen], self.texture[chosen], self.seen[:, chosen]
-        return PointTracks(place, moved, sharp, texture, seen, self.window_px2)
+        return PointTracks(place, moved, sharp, texture, seen, self.window_variance_px2)
 
 
 def find_corners(picture: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "points 2"]:
@@ -89,7 +89,7 @@ def track_points(
         sharp=np.where(seen, sharp.swapaxes(0, 1), 0),
         texture=fine.texture,
         seen=seen,
-        window_px2=fine.window_px2,
+        window_variance_px2=fine.window_variance_px2,
     )
 
 
@@ -140,7 +140,7 @@ class _Windows:
         share = power * self.weight
         share /= np.maximum(share.sum(1, keepdims=True), 1e-12)
         spread = share @ (u**2 + v**2) - (share @ u) ** 2 - (share @ v) ** 2
-        self.window_px2 = float(spread.mean() / 2)
+        self.window_variance_px2 = float(spread.mean() / 2)
 
     def step(
         self, frame: np.ndarray, moved: np.ndarray, colour: int | None = None

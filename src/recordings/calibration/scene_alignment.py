@@ -19,7 +19,7 @@ from src.recordings.calibration.view_alignment import AlignedViews, Rectangle, c
 from src.recordings.calibration.view_fit import find_folds, fit_view
 from src.recordings.calibration.view_grid import ViewGrid, find_grid
 from src.recordings.corner_fold import CornerFold
-from src.recordings.views import Size, View, Views
+from src.recordings.views import HeightWidth, View, Views
 from src.sim.optics import Position
 
 FoundViews = Mapping[Position, View]
@@ -69,7 +69,9 @@ class SceneAlignment:
         return lines
 
 
-def align_scene(pictures: Pictures, scene: SceneTarget, model: Size) -> SceneAlignment:
+def align_views_by_scene(
+    pictures: Pictures, scene: SceneTarget, model: HeightWidth
+) -> SceneAlignment:
     """Find the views in pictures of a recording's windows and fit their homographies, and the
     halves of corner views.
 
@@ -85,7 +87,7 @@ def align_scene(pictures: Pictures, scene: SceneTarget, model: Size) -> SceneAli
     _check_matched(matched, scene)
     points = {at: match.at[good[at]] for at, match in matches.items()}
     residuals = {at: match.offset[good[at]] for at, match in matches.items()}
-    views = _build_views(fitted, residuals, grid.tile, pictures.shape[2:], model)
+    views = _build_views(fitted, residuals, grid.centre_view_edges, pictures.shape[2:], model)
     return SceneAlignment(AlignedViews(views, points, residuals), matched, held_out)
 
 
@@ -109,12 +111,15 @@ def _fit_views(
 def _find_views(pictures: Pictures, grid: ViewGrid) -> tuple[dict[Position, View], PatchMatcher]:
     """Return the views after rounds in small pictures and in full ones, the last two with halves of
     corner views; and the full ones."""
-    views, tile = {at: View(at, grid.homography(at)) for at in grid.positions}, grid.tile
+    views, tile = (
+        {at: View(at, grid.homography(at)) for at in grid.positions},
+        grid.centre_view_edges,
+    )
     for pitch in COARSE_PITCHES:
         scale = max(1, round(min(grid.x.pitch, grid.y.pitch) / pitch))
         small = PatchMatcher(pictures, tile, COARSE_PATCHES, scale)
         views = _fit_views(_match_views(small, views, small.half), views, tile)
-    fine = PatchMatcher(pictures, tile, FINE_PATCHES, apart=True)
+    fine = PatchMatcher(pictures, tile, FINE_PATCHES, match_groups_apart=True)
     views = _fit_views(_match_views(fine, views), views, tile)
     matches = _match_views(fine, views)
     folds = find_folds(matches, tile, _between_seams(views, tile))
@@ -125,7 +130,9 @@ def _find_views(pictures: Pictures, grid: ViewGrid) -> tuple[dict[Position, View
 def _hold_out(pictures: Pictures, grid: ViewGrid) -> dict[Position, float]:
     """Fit to every second window, and return the median distance found in the others."""
     fitted, _ = _find_views(pictures[::2], grid)
-    others = PatchMatcher(pictures[1::2], grid.tile, FINE_PATCHES, apart=True)
+    others = PatchMatcher(
+        pictures[1::2], grid.centre_view_edges, FINE_PATCHES, match_groups_apart=True
+    )
     matches = _match_views(others, fitted)
     return {at: float(np.median(m.residual_px[m.found])) for at, m in matches.items()}
 
@@ -141,8 +148,8 @@ def _check_matched(matched: Mapping[Position, float], scene: SceneTarget) -> Non
 
 
 def _build_views(
-    fitted: FoundViews, residuals: Mapping[Position, Points], tile: Rectangle, sensor: Size,
-    model: Size,
+    fitted: FoundViews, residuals: Mapping[Position, Points], tile: Rectangle, sensor: HeightWidth,
+    model: HeightWidth,
 ) -> Views:  # fmt: skip
     views = []
     for at, view in fitted.items():
@@ -154,17 +161,14 @@ def _build_views(
 def _between_seams(views: FoundViews, tile: Rectangle) -> Rectangle:
     """Return where the centre view begins and ends: a seam lies half way between a pixel and its
     mirror image; a side without a neighbour is as far from the other as in the grid."""
-    edges, known = list(tile), []
+    whole, edges = np.array(tile), np.full(4, np.nan)
     for side, at in enumerate(((0, -1), (-1, 0), (0, 1), (1, 0))):
         if at in views:
             pixels = np.linspace(tile[:2], tile[2:], 9)
             pixels[:, side % 2] = tile[side]
-            between = (pixels + views[at].to_sensor(pixels)) / 2
-            edges[side] = float(between[:, side % 2].mean())
-            known.append(side)
-    for side in known:
-        opposite = (side + 2) % 4
-        if opposite not in known:
-            edges[opposite] = edges[side] + tile[opposite] - tile[side]
-    left, top, right, bottom = edges
+            edges[side] = (pixels + views[at].to_sensor(pixels))[:, side % 2].mean() / 2
+    from_opposite = np.roll(edges - whole, 2) + whole
+    for other in (from_opposite, whole):
+        edges = np.where(np.isnan(edges), other, edges)
+    left, top, right, bottom = edges.tolist()
     return left, top, right, bottom

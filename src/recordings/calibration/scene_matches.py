@@ -7,13 +7,13 @@ from jaxtyping import Bool, Float
 
 from src.recordings.calibration.activity_pictures import (
     Pictures,
-    describe_structure,
+    band_pass_log,
     shrink_pictures,
 )
 from src.recordings.calibration.boards import Points
-from src.recordings.calibration.patch_matching import choose_places, find_patches
+from src.recordings.calibration.patch_matching import choose_places, measure_patch_offsets
 from src.recordings.calibration.view_alignment import Rectangle
-from src.recordings.views import View, list_pairs, sample_bilinear
+from src.recordings.views import View, list_grid_points, sample_bilinear
 
 MIN_PLACES = 12  # with structure, in the centre view
 GROUPS = 4  # of windows, each one picture a kind
@@ -46,21 +46,22 @@ class PatchMatcher:
     """Pictures of windows in groups, shrunk by a whole factor `scale`, and the places with
     structure in the centre view's `tile`.
 
-    `patches`: how many fit along its shorter side.  `apart`: a place is looked for in each group
-    by itself, as what moves may be nearer than what rests; else in all at once.  Raises ValueError
-    for fewer than MIN_PLACES.
+    `patches_per_side`: how many fit along its shorter side.  `match_groups_apart`: a place is
+    looked for in each group by itself, as what moves may be nearer than what rests; else in all at
+    once.  Raises ValueError for fewer than MIN_PLACES.
     """
 
     def __init__(
-        self, pictures: Pictures, tile: Rectangle, patches: int, scale: int = 1, apart: bool = False
-    ):
+        self, pictures: Pictures, tile: Rectangle, patches_per_side: int, scale: int = 1, *,
+        match_groups_apart: bool = False,
+    ):  # fmt: skip
         groups = np.array_split(pictures, min(GROUPS, len(pictures)))
         joined = [shrink_pictures(group.sum(0), scale) for group in groups]
-        structure = [describe_structure(each, 1.2, 8.0) for each in joined]
-        self._stacks = structure if apart else [np.concatenate(structure)]
+        structure = [band_pass_log(each, 1.2, 8.0) for each in joined]
+        self._stacks = structure if match_groups_apart else [np.concatenate(structure)]
         self._scale, self._middle = scale, (scale - 1) / 2
         edges = np.array(tile) / scale
-        self.half = int(np.clip(min(edges[2:] - edges[:2]) / 2 / patches, 8, 40))
+        self.half = int(np.clip(min(edges[2:] - edges[:2]) / 2 / patches_per_side, 8, 40))
         self._origin = np.maximum(np.floor(edges[:2]) - self.half, 0).astype(int)
         x, y = self._origin
         right, bottom = np.ceil(edges[2:]).astype(int) + self.half
@@ -76,13 +77,13 @@ class PatchMatcher:
         """Look for the places in `view`, up to `reach` off along x and y, in pixels of these
         pictures."""
         size = self._centre[0].shape[1:]
-        there = view.to_sensor(self._to_full(list_pairs(*map(np.arange, size[::-1]))))
+        there = view.to_sensor(self._to_full(list_grid_points(*map(np.arange, size[::-1]))))
         there = (there - self._middle) / self._scale
         offsets = []
         for centre, stack, places in zip(self._centre, self._stacks, self._places, strict=True):
             if len(places):
                 seen = np.stack([sample_bilinear(picture, there, size) for picture in stack])
-                offsets.append(find_patches(centre, seen, places, self.half, reach))
+                offsets.append(measure_patch_offsets(centre, seen, places, self.half, reach))
         placed = self._to_full(np.concatenate(self._places))
         offset = self._scale * np.concatenate(offsets)
         at = view.to_sensor(placed + offset)

@@ -43,19 +43,19 @@ class CovarianceSums:
 
 @dataclass(frozen=True)
 class TiltStatistics:
-    """`power` along one axis in px^2; `half_px`, where the covariance is half of it, inf beyond the
-    frame; `uniform_share`, the share that moves the whole square view; `decay_frames`, the time to
-    1/e, inf beyond the video; `correlation` over distance (nan: too few pairs), `lag_correlation`;
-    `fitted`: the correlation over the model's `fitted_px`.
+    """`power_px2` along one axis; `half_length_px`, where the covariance is half of it, inf beyond
+    the frame; `whole_view_share`, the share that moves the whole square view; `decay_frames`, the
+    time to 1/e, inf beyond the video; `correlation` over distance (nan: too few pairs),
+    `lag_correlation`; `fitted_correlation`: that over the model's `fitted_distance_px`.
     """
 
-    power: float
-    half_px: float
-    uniform_share: float
+    power_px2: float
+    half_length_px: float
+    whole_view_share: float
     decay_frames: float
     correlation: Distances
     lag_correlation: Float[np.ndarray, " lags"]
-    fitted: Float[np.ndarray, " k"]
+    fitted_correlation: Float[np.ndarray, " k"]
 
 
 def frame_squares(tracks: PointTracks, size: tuple[int, int]) -> Int[np.ndarray, " points"]:
@@ -118,10 +118,10 @@ def sum_autocovariance(tracks: PointTracks, size: tuple[int, int]) -> Covariance
 class CovarianceModel:
     """A sum of Gaussians of `lengths` for the covariance over distance in a frame of `size`."""
 
-    def __init__(self, distance: np.ndarray, window_px2: float, size: tuple[int, int]):
-        self.distance, self.window, self.side = distance, window_px2, min(size)
+    def __init__(self, distance: np.ndarray, window_variance_px2: float, size: tuple[int, int]):
+        self.distance, self.window, self.side = distance, window_variance_px2, min(size)
         self.lengths = np.append(np.geomspace(MIN_LENGTH_PX, self.side, 30), 100 * self.side)
-        self.fitted_px = np.geomspace(0.25, 1.4 * self.side, 1200)
+        self.fitted_distance_px = np.geomspace(0.25, 1.4 * self.side, 1200)
         points = np.random.default_rng(0).uniform(0, self.side, (2, 20000, 2))
         self.pairs = np.hypot(*(points[0] - points[1]).T)  # of a square view
 
@@ -134,27 +134,27 @@ class CovarianceModel:
         through = self._gaussians(np.zeros(1), self.window)[0] @ weights
         lag_correlation, kept = _correlation_over_lags(lags, through, frames)
         power = weights.sum()
-        curve = self._gaussians(self.fitted_px, 0.0) @ weights / max(power, 1e-12)
+        curve = self._gaussians(self.fitted_distance_px, 0.0) @ weights / max(power, 1e-12)
         correlation = product / max(power, 1e-12)
-        fitted = np.interp(self.distance, self.fitted_px, curve)
+        fitted = np.interp(self.distance, self.fitted_distance_px, curve)
         filled_correlation = np.where(count > MIN_PAIRS, correlation, fitted)
         # Beyond the shortest distances what was measured is taken as it is, negative values too.
         far = np.interp(self.pairs, self.distance[1:], filled_correlation[1:])
-        near = np.interp(self.pairs, self.fitted_px, curve)
+        near = np.interp(self.pairs, self.fitted_distance_px, curve)
         uniform = float(np.where(self.pairs < 4 * SPREAD, near, far).mean())
         # A film's own mean was taken off: 1 - kept of the power, at every distance alike.
         return TiltStatistics(
-            power=float(power / kept),
-            half_px=float(find_first_fall(self.fitted_px, curve, 0.5)),
-            uniform_share=float(np.clip(uniform, 0, 1)),
+            power_px2=float(power / kept),
+            half_length_px=float(find_first_fall(self.fitted_distance_px, curve, 0.5)),
+            whole_view_share=float(np.clip(uniform, 0, 1)),
             decay_frames=float(find_first_fall(np.arange(len(lags)), lag_correlation, np.exp(-1))),
             correlation=np.where(count > MIN_PAIRS, correlation, np.nan),
             lag_correlation=lag_correlation,
-            fitted=curve,
+            fitted_correlation=curve,
         )
 
-    def _gaussians(self, distance: np.ndarray, window_px2: float) -> np.ndarray:
-        wide = self.lengths**2 + 2 * window_px2
+    def _gaussians(self, distance: np.ndarray, window_variance_px2: float) -> np.ndarray:
+        wide = self.lengths**2 + 2 * window_variance_px2
         return self.lengths**2 / wide * np.exp(-(distance[:, None] ** 2) / (2 * wide))
 
     def _fit(self, product: np.ndarray, count: np.ndarray) -> np.ndarray:

@@ -36,20 +36,25 @@ METHOD_ERROR = {"rms_px": 0.15, "half_length_px": 0.3}
 class TurbulenceMeasurement:
     """What was `found`, and the curves behind it, lengths in pixels of a frame of SIDE.
 
-    `tilt` holds curves over `distance_px`, over `fitted_px` and over lags in frames; `rms_px` of
-    every point at `place` (x, y), in pixels of `picture`; `corners`: how many were tried.
+    `tilt` holds curves over `distance_px`, over `fitted_distance_px` and over lags in frames;
+    `rms_px` of every point at `place` (x, y), in pixels of `picture`; `corners`: how many were
+    tried.
     """
 
     found: TurbulenceFile
     tilt: TiltStatistics
     distance_px: Float[np.ndarray, " distances"]
-    fitted_px: Float[np.ndarray, " k"]
+    fitted_distance_px: Float[np.ndarray, " k"]
     picture: Float[np.ndarray, "h w"]
     place: Float[np.ndarray, "points 2"]
     rms_px: Float[np.ndarray, " points"]
     frames: int
     corners: int
     fps: float | None
+
+    def summary(self) -> dict[str, str]:
+        """Return each number of `found` with its interval, for a person."""
+        return {name: str(value) for name, value in vars(self.found).items()}
 
 
 def measure_turbulence(
@@ -70,14 +75,14 @@ def measure_turbulence(
     unit = SIDE / min(size)
     pairs = tilt_covariance.sum_over_distance(tracks, size)
     lags = tilt_covariance.sum_autocovariance(tracks, size)
-    model = CovarianceModel(pairs.at, tracks.window_px2, size)
+    model = CovarianceModel(pairs.at, tracks.window_variance_px2, size)
 
     def describe(*weights: np.ndarray) -> TiltStatistics:
         over_lags, _ = lags.weighted_mean_and_count(*weights)
         return model.describe_tilt(*pairs.weighted_mean_and_count(*weights), over_lags, len(frames))
 
     tilt = describe(np.ones(len(frames)), np.ones(CELLS**2))
-    rms_px = tilt.power**0.5 * unit
+    rms_px = tilt.power_px2**0.5 * unit
     if rms_px < MIN_RMS_PX:
         raise ValueError(
             f"video must show a scene through turbulent air, got a tilt of {rms_px:.3f} px rms"
@@ -90,7 +95,7 @@ def measure_turbulence(
         found=TurbulenceFile(**numbers),
         tilt=tilt,
         distance_px=pairs.at * unit,
-        fitted_px=model.fitted_px * unit,
+        fitted_distance_px=model.fitted_distance_px * unit,
         picture=frames.mean(0),
         place=tracks.place,
         rms_px=np.sqrt(np.maximum(tilt_covariance.tilt_variance_per_axis(tracks), 0)) * unit,
@@ -127,12 +132,12 @@ def _width_ratio(sums: Float[np.ndarray, "3"]) -> float:
     return max(math.sqrt(usual / sharpest), 1.0)
 
 
-def shrink_frame(frame: np.ndarray, largest: int = SIZES[0]) -> Float[np.ndarray, "_h _w"]:
-    """Return a frame whose smaller side has `largest` pixels at most: so large it is worked on."""
+def limit_shorter_side(frame: np.ndarray, max_px: int = SIZES[0]) -> Float[np.ndarray, "_h _w"]:
+    """Return a frame whose shorter side has `max_px` at most: so large it is worked on."""
     least = min(frame.shape)
-    if least <= largest:
+    if least <= max_px:
         return frame
-    height, width = (round(side * largest / least) for side in frame.shape)
+    height, width = (round(side * max_px / least) for side in frame.shape)
     return cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA)
 
 
@@ -142,7 +147,7 @@ def _track_at_side(frames: np.ndarray, tracks: PointTracks) -> tuple[PointTracks
     size = frames.shape[1:]
     if min(size) <= SIDE:
         return tracks, size
-    small = np.stack([shrink_frame(frame, SIDE) for frame in frames])
+    small = np.stack([limit_shorter_side(frame, SIDE) for frame in frames])
     place = np.round(tracks.place * SIDE / min(size)).astype(np.float32)
     again = track_points(small, place)
     return again.select(again.seen.mean(0) >= MIN_FOUND), small.shape[1:]
@@ -153,7 +158,7 @@ def _track_corners(frames: np.ndarray) -> tuple[np.ndarray, PointTracks]:
     may move fine frames by more pixels than a corner can be tracked over."""
     least, found = min(frames.shape[1:]), None
     for side in (min(least, SIZES[0]), *(side for side in SIZES[1:] if side < least)):
-        small = np.stack([shrink_frame(frame, side) for frame in frames])
+        small = np.stack([limit_shorter_side(frame, side) for frame in frames])
         place = find_corners(small.mean(0))
         if len(place) < MIN_POINTS:
             break
@@ -205,12 +210,12 @@ def _summarize_tilt(
     tilt: TiltStatistics, drawn: list[TiltStatistics], unit: float, fps: float | None, lags: int
 ) -> dict[str, IntervalEstimate]:
     """Return the numbers of the tilt; where a time or a length is beyond reach, what bounds it."""
-    lengths = [one.half_px * unit for one in drawn]
-    half = _estimate("half_length_px", tilt.half_px * unit, lengths, most=float(SIDE))
+    lengths = [one.half_length_px * unit for one in drawn]
+    half = _estimate("half_length_px", tilt.half_length_px * unit, lengths, most=float(SIDE))
     if half.value is not None and half.value < 1.3 * tilt_covariance.MIN_LENGTH_PX * unit:
         half = half._replace(low=ALLOWED["half_length_px"][0])  # shorter ones look alike
-    spreads = [one.power**0.5 * unit for one in drawn]
-    shares = [one.uniform_share for one in drawn]
+    spreads = [one.power_px2**0.5 * unit for one in drawn]
+    shares = [one.whole_view_share for one in drawn]
     if fps is None:
         decay = IntervalEstimate(None, None, None)
     elif tilt.decay_frames < 1:  # within the first frame it has no value but a bound
@@ -219,9 +224,9 @@ def _summarize_tilt(
         times = [max(one.decay_frames, 0.5) / fps for one in drawn]
         decay = _estimate("decay_s", tilt.decay_frames / fps, times, most=(lags - 1) / fps)
     return {
-        "rms_px": _estimate("rms_px", tilt.power**0.5 * unit, spreads),
+        "rms_px": _estimate("rms_px", tilt.power_px2**0.5 * unit, spreads),
         "half_length_px": half,
-        "whole_share": _estimate("whole_share", tilt.uniform_share, shares),
+        "whole_share": _estimate("whole_share", tilt.whole_view_share, shares),
         "decay_s": decay,
     }
 

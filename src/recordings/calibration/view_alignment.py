@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 import yaml
 from jaxtyping import Float, UInt8
+from scipy.spatial import cKDTree
 
 from src.recordings.calibration.boards import Points, Target, cluster_points
-from src.recordings.views import Size, View, Views
+from src.recordings.views import HeightWidth, View, Views
 from src.records import safe_yaml
 from src.sim.optics import Position
 
@@ -37,18 +38,18 @@ def repair_picture(counts: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]
 
 
 def find_target(
-    picture: UInt8[np.ndarray, "h w"], target: Target, mirrors: bool = True
+    picture: UInt8[np.ndarray, "h w"], target: Target, are_mirrored: bool = True
 ) -> dict[Position, Points]:
     """Return the points of `target` in each view of a sensor picture in which it is found, row by
-    row, NaN where one is not seen.  `mirrors`: the view at (row, col) is mirrored in x for odd col
-    and in y for odd row; a target that knows its hand (ChArUco) decides itself.
+    row, NaN where one is not seen.  `are_mirrored`: the view at (row, col) is mirrored in x for odd
+    col and in y for odd row; a target that knows its hand (ChArUco) decides itself.
     """
-    clusters = cluster_points(target.detect_candidate_points(picture), target.count)
+    clusters = cluster_points(target.detect_candidate_points(picture), target.candidate_count)
     places = _sort_into_grid(np.array([cluster.mean(0) for cluster in clusters]), picture.shape)
     points, mirrored = {}, {}
     for position, cluster in zip(places, clusters, strict=True):
         row, col = position
-        physical = (bool(mirrors and col % 2), bool(mirrors and row % 2))
+        physical = (bool(are_mirrored and col % 2), bool(are_mirrored and row % 2))
         for flip in FLIPS if target.ordered else (physical,):
             seen = _find_flipped(picture, cluster, target, flip)
             if seen is not None:
@@ -75,13 +76,11 @@ def _find_flipped(picture: np.ndarray, cluster: Points, target: Target, flip) ->
     return np.where(flip, last - points, points) + np.array([left, top])
 
 
-def _sort_into_grid(centres: np.ndarray, sensor: Size) -> list[Position]:
+def _sort_into_grid(centres: np.ndarray, sensor: HeightWidth) -> list[Position]:
     """Sort centres (k, 2) into (row, col) about the middle of a full 3x3, else of the sensor."""
     if len(centres) < 2:
         return [(0, 0)] * len(centres)
-    apart = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
-    np.fill_diagonal(apart, np.inf)
-    pitch = np.median(apart.min(0))
+    pitch = np.median(cKDTree(centres).query(centres, k=2)[0][:, 1])
     middle = (centres.max(0) + centres.min(0)) / 2
     whole = np.abs(np.ptp(centres, axis=0) - 2 * pitch) < 0.5 * pitch
     middle = np.where(whole, middle, (np.array(sensor[::-1]) - 1) / 2)
@@ -113,7 +112,7 @@ class AlignedViews:
 
 
 def fit_homographies(
-    found: Mapping[Position, Points], *, sensor: Size, model: Size
+    found: Mapping[Position, Points], *, sensor: HeightWidth, model: HeightWidth
 ) -> AlignedViews:
     """Fit the homography of every view to the centre view, by RANSAC.
 
@@ -149,24 +148,20 @@ def fit_homographies(
 def _between_boards(found: Mapping[Position, Points]) -> Rectangle:
     """Return the centre tile: bounded half way between a point and its image in each neighbour."""
     centre = found[0, 0]
-    middle = np.nanmean(centre, axis=0)
-    sides = {}
-    for at in ((0, -1), (-1, 0), (0, 1), (1, 0)):
-        axis = 0 if at[0] == 0 else 1
+    middle = np.tile(np.nanmean(centre, axis=0), 2)
+    edges = np.full(4, np.nan)
+    for side, at in enumerate(((0, -1), (-1, 0), (0, 1), (1, 0))):
         if at in found:
-            between = np.nanmean((centre + found[at]) / 2, axis=0)[axis]
-            sides[at] = abs(between - middle[axis]), between
-    if not sides:
+            edges[side] = np.nanmean((centre + found[at]) / 2, axis=0)[side % 2]
+    if np.isnan(edges).all():
         raise ValueError("calibrate: the target must be seen beside the centre view, got none")
-    reach = np.median([distance for distance, _ in sides.values()])
-    left, top, right, bottom = (
-        sides[at][1] if at in sides else middle[axis] + sign * reach
-        for at, axis, sign in (((0, -1), 0, -1), ((-1, 0), 1, -1), ((0, 1), 0, 1), ((1, 0), 1, 1))
-    )
-    return float(left), float(top), float(right), float(bottom)
+    reach = np.nanmedian(np.abs(edges - middle))
+    edges = np.where(np.isnan(edges), middle + reach * np.array([-1, -1, 1, 1]), edges)
+    left, top, right, bottom = edges.tolist()
+    return left, top, right, bottom
 
 
-def cut_field(tile: Rectangle, model: Size) -> Rectangle:
+def cut_field(tile: Rectangle, model: HeightWidth) -> Rectangle:
     """Return the largest rectangle of the model's aspect in the middle of `tile`, less MARGIN."""
     left, top, right, bottom = tile
     scale = min((right - left) / model[1], (bottom - top) / model[0]) * (1 - 2 * MARGIN) / 2
@@ -175,7 +170,9 @@ def cut_field(tile: Rectangle, model: Size) -> Rectangle:
     return x - across, y - along, x + across, y + along
 
 
-def views_from_corners(corners: Mapping[Position, Points], *, sensor: Size, model: Size) -> Views:
+def views_from_corners(
+    corners: Mapping[Position, Points], *, sensor: HeightWidth, model: HeightWidth
+) -> Views:
     """Return the views whose four corners, those of one rectangle of the scene, are given.
 
     The field is the bounding rectangle of the centre view's.  Raises ValueError without the centre

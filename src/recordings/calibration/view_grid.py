@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from src.recordings.calibration.activity_pictures import describe_structure, shrink_pictures
+from src.recordings.calibration.activity_pictures import band_pass_log, shrink_pictures
 from src.sim.optics import Position
 
 LINES = 160  # at least so many along the longer side of the pictures that are folded
@@ -41,7 +41,7 @@ class ViewAxis:
         return (self.count - 1) // 2
 
     @property
-    def tile(self) -> tuple[float, float]:
+    def centre_view_edges(self) -> tuple[float, float]:
         """Where the centre view begins and ends."""
         begin = self.start + self.centre_index * self.pitch
         return begin, begin + self.pitch
@@ -49,7 +49,7 @@ class ViewAxis:
     def mirror(self, offset: int) -> tuple[float, float]:
         """Return (a, b): pixel x of the view `offset` from the centre one shows what pixel
         a x + b of the centre one does."""
-        begin, end = self.tile
+        begin, end = self.centre_view_edges
         if offset % 2:
             return -1.0, begin + end + offset * self.pitch
         return 1.0, -offset * self.pitch
@@ -69,9 +69,9 @@ class ViewGrid:
         return [(row, col) for row in rows for col in cols]
 
     @property
-    def tile(self) -> tuple[float, float, float, float]:
+    def centre_view_edges(self) -> tuple[float, float, float, float]:
         """The centre view's left, top, right and bottom edge."""
-        (left, right), (top, bottom) = self.x.tile, self.y.tile
+        (left, right), (top, bottom) = self.x.centre_view_edges, self.y.centre_view_edges
         return left, top, right, bottom
 
     def homography(self, position: Position) -> Float[np.ndarray, "3 3"]:
@@ -86,7 +86,7 @@ def find_grid(pictures: Float[np.ndarray, "*windows h w"]) -> ViewGrid:
     Raises ValueError where neither columns nor rows of views repeat.
     """
     step = max(1, max(pictures.shape[-2:]) // LINES)
-    small = _level(describe_structure(shrink_pictures(pictures, step), 1.2, 2.5))
+    small = _level(band_pass_log(shrink_pictures(pictures, step), 1.2, 2.5))
     x = find_axis(np.einsum("kyx,kyz->xz", small, small, optimize=True))
     y = find_axis(np.einsum("kyx,kzx->yz", small, small, optimize=True))
     if x.count == 1 and y.count == 1:

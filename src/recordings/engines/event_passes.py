@@ -11,16 +11,16 @@ LAST_GAP = 10
 
 
 @njit(nogil=True, cache=True)
-def convert_events(t, x, y, p, width, height, found, out):
+def copy_events_on_sensor(t, x, y, p, width, height, largest_xy, out):
     """Fill `out` with the events on the sensor; return (kept, outside, wrong).
 
     `t` int64 us; `p` is ON where positive, else OFF.  One outside `width` x `height` (0: not known)
     is left out and counted.  `wrong`: the place of the first event whose time is beyond 2^62 us,
     whose polarity is none of -1, 0, 1 or, where the size is not known, whose x or y is not in
-    0..65535; -1 for none.  `found`: largest x and y so far, (2,) int64.
+    0..65535; -1 for none.  `largest_xy`: so far, (2,) int64.
     """
     kept = outside = 0
-    most_x, most_y = found[0], found[1]
+    most_x, most_y = largest_xy[0], largest_xy[1]
     for i in range(t.size):
         now, column, row, sign = t[i], np.int64(x[i]), np.int64(y[i]), p[i]
         if sign < -1 or sign > 1 or now <= LONG_AGO_US or now >= -LONG_AGO_US:
@@ -35,25 +35,12 @@ def convert_events(t, x, y, p, width, height, found, out):
         out[kept].t, out[kept].x, out[kept].y = now, column, row
         out[kept].p = 1 if sign > 0 else -1
         kept += 1
-    found[0], found[1] = most_x, most_y
+    largest_xy[0], largest_xy[1] = most_x, most_y
     return kept, outside, -1
 
 
 @njit(nogil=True, cache=True)
-def measure_lateness(t, latest):
-    """Return how many of `t` are before one before them or before `latest`, and by how much at
-    most."""
-    late = most = 0
-    for now in t:
-        if now < latest:
-            late, most = late + 1, max(most, latest - now)
-        else:
-            latest = now
-    return late, most
-
-
-@njit(nogil=True, cache=True)
-def label_events(t, first, latest, count, buffer_us, min_part_events, at_end, labels):
+def label_kept_or_dropped(t, first, latest, count, buffer_us, min_part_events, at_end, labels):
     """Write KEPT or DROPPED to `labels` of events in their order; return (decided, latest, count,
     restarted): those from `decided` on wait for what follows or, `restarted`, for another clock.
 
@@ -106,23 +93,6 @@ def label_events(t, first, latest, count, buffer_us, min_part_events, at_end, la
             if labels[k] == KEPT:
                 latest, count = max(latest, t[k]), count + 1
         i, begin = end, -1
-
-
-@njit(nogil=True, cache=True)
-def sort_slightly_late(t, order, most_moves):
-    """Sort `t` (n,) and `order`, its places, by insertion, those that are equal as they are; return
-    whether `most_moves` were enough."""
-    moves = 0
-    for i in range(1, t.size):
-        now, place, k = t[i], order[i], i
-        while k > 0 and t[k - 1] > now:
-            t[k], order[k] = t[k - 1], order[k - 1]
-            k -= 1
-        t[k], order[k] = now, place
-        moves += i - k
-        if moves > most_moves:
-            return False
-    return True
 
 
 @njit(nogil=True, cache=True)

@@ -20,13 +20,13 @@ def new_decoder_state() -> np.ndarray:
 
 
 @njit(nogil=True, cache=True)
-def decode_evt2(heads, masks, state, t, x, y, p):
+def decode_evt2_and_21(upper_words, masks, state, t, x, y, p):
     """Write the events of EVT2.1's words, their upper and lower 32 bits (n,), to t, x, y, p
     (32 n,); return how many.  A word of EVT2 is an upper half with a mask of 1: one event.
     """
     found, base, high = 0, state[BASE], state[HIGH]
-    for i in range(heads.size):
-        word, mask = heads[i], masks[i]
+    for i in range(upper_words.size):
+        word, mask = upper_words[i], masks[i]
         kind = word >> 28
         if kind < 2:
             now, start = base + (high << 6) + np.int64(word >> 22 & 63), found

@@ -47,7 +47,7 @@ def splat_and_count_outside(t, x, y, p, view, model_xy, grid, t0, t1, nearest):
 
 
 @njit(nogil=True, cache=True)
-def list_bilinear_parts(x, y, p, view, model_xy, density, index, u, v, which, weight):
+def list_bilinear_contributions(x, y, p, view, model_xy, density, index, u, v, which, weight):
     """List what `splat_and_count_outside` adds, bilinearly: for each part the index of its event,
     its pixel (u, v), its view and its weight over `density` (views, h, w); return the number of
     parts and of events in no view.
@@ -74,8 +74,8 @@ def list_bilinear_parts(x, y, p, view, model_xy, density, index, u, v, which, we
 
 
 @njit(nogil=True, cache=True)
-def list_nearest_pixels(x, y, p, nearest, density, index, u, v, which, weight):
-    """As `list_bilinear_parts`, at the nearest pixel; `nearest`: `SensorLookup.nearest_pixel`."""
+def list_nearest_contributions(x, y, p, nearest, density, index, u, v, which, weight):
+    """As `list_bilinear_contributions`, at `nearest`: SensorLookup.nearest_model_pixel."""
     _, height, width = density.shape
     flat = density.reshape(-1)
     pixels, densities = np.empty(BATCH, np.int64), np.empty(BATCH, np.float32)

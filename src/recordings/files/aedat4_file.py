@@ -18,8 +18,14 @@ from xml.etree import ElementTree
 import numpy as np
 
 from src.recordings.files.clocks import merge_small_pieces
-from src.recordings.files.event_file import EventFile, RawEvents, ReadOptions
-from src.recordings.files.streams import EventStream, choose_stream
+from src.recordings.files.event_file import (
+    EventFile,
+    EventStream,
+    RawEvents,
+    ReadOptions,
+    choose_stream,
+    name_file_in_errors,
+)
 from src.recordings.files.unpacking import LARGEST_PACKET, decompress
 
 MAGIC = b"#!AER-DAT4.0\r\n"
@@ -77,11 +83,9 @@ class Aedat4File(EventFile):
     def _events(self) -> Iterator[RawEvents]:
         for stream, packet in self._packets():
             if stream == self._id:
-                try:
+                with name_file_in_errors(self.path, "cannot be decoded"):
                     packing = PACKINGS.get(self._header.compression)
                     events = _read_events(decompress(packet, packing) if packing else packet)
-                except Exception as error:  # the libraries raise all kinds
-                    raise ValueError(f"{self.path}: cannot be decoded: {error}") from error
                 yield RawEvents(*(events[name] for name in "txyp"))
 
     def _packets(self) -> Iterator[tuple[int, bytes]]:
@@ -139,10 +143,8 @@ def _read_header(path: Path) -> Aedat4Header:
         if len(start) + length > path.stat().st_size:
             raise ValueError(f"{path}: a header of {length} bytes is longer than the file")
         header = file.read(length)
-    try:
+    with name_file_in_errors(path, "its header cannot be read"):
         return _parse_header(header, len(start) + length)
-    except (struct.error, ValueError) as error:
-        raise ValueError(f"{path}: its header cannot be read: {error}") from error
 
 
 def _parse_header(header: bytes, start: int) -> Aedat4Header:
@@ -165,7 +167,7 @@ def _parse_header(header: bytes, start: int) -> Aedat4Header:
 def _read_streams(path: Path, description: str) -> list[tuple[str, EventStream]]:
     """Return the kind of each stream (EVTS, FRME, ...) and the stream."""
     depth, found = 0, []
-    try:
+    with name_file_in_errors(path, "its description cannot be read"):
         for event, node in ElementTree.iterparse(io.StringIO(description), ("start", "end")):
             depth += 1 if event == "start" else -1
             if depth > DEEPEST:
@@ -173,8 +175,6 @@ def _read_streams(path: Path, description: str) -> list[tuple[str, EventStream]]
             kind = node.findtext("attr[@key='typeIdentifier']") if event == "end" else None
             if kind and node.get("name", "x")[:9].isdecimal():
                 found.append((kind, _read_stream(node)))
-    except ElementTree.ParseError as error:
-        raise ValueError(f"{path}: its description cannot be read: {error}") from error
     return found
 
 

@@ -1,10 +1,24 @@
-"""Pieces of events: counters of time that begin anew, and small pieces joined to larger ones."""
+"""Pieces of a file: its words, its counter of time, and small pieces joined to larger ones."""
 
+import warnings
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
 from src.recordings.files.event_file import PIECE_EVENTS, RawEvents
+
+
+def read_whole_words(
+    path: Path, start: int, word_bytes: int, block_words: int = PIECE_EVENTS
+) -> Iterator[bytes]:
+    """Yield the words of a file from byte `start` on, in blocks; warns of a cut last one."""
+    with path.open("rb") as file:
+        file.seek(start)
+        while block := file.read(word_bytes * block_words):
+            if cut := len(block) % word_bytes:
+                warnings.warn(f"{path}: ends within an event, it is truncated", stacklevel=4)
+            yield block[: len(block) - cut]
 
 
 class TimestampUnwrapper:

@@ -1,14 +1,18 @@
 """Columns of tables of events: which is which, by name or by values, and their types."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from src.recordings.files.event_file import WidthHeight
+
 MAX_PACKING = 200  # most that the columns of a recording shrink when they are packed
 MAX_COORDINATE = 65535
+SIZE_NAMES = ("size", "geometry", "sensor_size")  # width, height
+SHAPE_NAMES = ("sensor_resolution", "resolution")  # height, width
 IN_ORDER = 0.99  # of the steps of a column that time may be
 NAMES = {
     "t": ("t", "ts", "time", "times", "timestamp", "timestamps"), "x": ("x", "xs", "col", "column"),
@@ -33,9 +37,9 @@ def find_columns_by_name(names: Sequence[str]) -> dict[str, int] | None:
     return places
 
 
-def find_keys_by_name(table: Mapping[str, Any]) -> dict[str, str] | None:
-    """Return the keys of t, x, y and p in a mapping, or None."""
-    keys = list(table)
+def find_keys_by_name(names: Iterable[str]) -> dict[str, str] | None:
+    """Return the names of t, x, y and p among `names`, or None."""
+    keys = list(names)
     places = find_columns_by_name(keys)
     return None if places is None else {letter: keys[place] for letter, place in places.items()}
 
@@ -44,14 +48,6 @@ def parse_unit_suffix(name: str) -> str | None:
     """Return the unit that the name of a column of times ends in (`t_ns`, `time [ms]`), or None."""
     found = TIME_UNIT.search(name.strip().strip("\"'").lower())
     return None if found is None else {"n": "ns", "m": "ms", "s": "s"}.get(found[1][0], "us")
-
-
-def parse_column_order(order: str, width: int) -> dict[str, int]:
-    """Return the places that `columns=` states; raises ValueError where a table is too narrow."""
-    places = {letter: order.index(letter) for letter in "txyp"}
-    if max(places.values()) >= width:
-        raise ValueError(f"columns must name columns of a table of {width}, got {order}")
-    return places
 
 
 def find_columns_by_values(sample: np.ndarray) -> dict[str, int]:
@@ -85,23 +81,27 @@ def find_columns_by_values(sample: np.ndarray) -> dict[str, int]:
 
 
 def find_columns(sample: np.ndarray, order: str | None) -> dict[str, int]:
-    """Return the places of t, x, y and p: as `order` states them, or by the values."""
-    return (
-        find_columns_by_values(sample)
-        if order is None
-        else parse_column_order(order, sample.shape[1])
-    )
+    """Return the places of t, x, y and p: as `order` (columns=) states them, or by the values.
+
+    Raises ValueError for a table too narrow for `order`, or as `find_columns_by_values`.
+    """
+    if order is None:
+        return find_columns_by_values(sample)
+    places = {letter: order.index(letter) for letter in "txyp"}
+    if max(places.values()) >= (width := sample.shape[1]):
+        raise ValueError(f"columns must name columns of a table of {width}, got {order}")
+    return places
 
 
 def as_times(t: np.ndarray) -> np.ndarray:
-    """Return times as int64 or float64; raises ValueError for another kind of values."""
+    """Return times as contiguous int64 or float64; raises ValueError for another kind of values."""
     if t.dtype.kind == "f":
-        return np.asarray(t, np.float64)
+        return np.ascontiguousarray(t, np.float64)
     if t.dtype.kind not in "iu":
         raise ValueError(f"times must be numbers, got {t.dtype}")
     if t.dtype == np.uint64 and t.size and t.max() >= 2**63:
         raise ValueError(f"times must be below 2^63, got {t.max()}")
-    return np.asarray(t).astype(np.int64, copy=False)
+    return np.ascontiguousarray(t, np.int64)
 
 
 def as_integers(name: str, values: np.ndarray) -> np.ndarray:
@@ -118,6 +118,30 @@ def as_integers(name: str, values: np.ndarray) -> np.ndarray:
     return values.astype(np.int64)
 
 
+def find_stated_size(known: Mapping[str, Any]) -> WidthHeight | None:
+    """Return (width, height) as one of SIZE_NAMES or SHAPE_NAMES, or `width` and `height` state it:
+    `640x480`, (640, 480) or 640, 480.  Arrays of more than four numbers are something else."""
+    for name in (*SIZE_NAMES, *SHAPE_NAMES):
+        sides = _whole_numbers(known[name]) if name in known else []
+        if len(sides) == 2:
+            has_width_first = name in SIZE_NAMES or "x" in str(known[name]).lower()  # 640x480
+            return (sides[0], sides[1]) if has_width_first else (sides[1], sides[0])
+    width, height = (_whole_numbers(known.get(name)) for name in ("width", "height"))
+    return (width[0], height[0]) if len(width) == len(height) == 1 else None
+
+
+def _whole_numbers(value: Any) -> list[int]:
+    """Return the first two numbers of a value; none for another."""
+    if isinstance(value, str | bytes):
+        text = value.decode("latin-1") if isinstance(value, bytes) else value
+        value = re.split(r"[\sx,;]+", text.strip().lower())
+    try:
+        numbers = np.asarray(value if np.size(value) <= 4 else None).ravel()[:2].astype(np.float64)
+    except (TypeError, ValueError):  # words, or nothing
+        return []
+    return [int(n) for n in numbers.tolist() if n >= 1 and n == int(n)]
+
+
 def check_lengths(columns: Mapping[str, Any]) -> None:
     """Raise ValueError unless the columns t, x, y, p are equally long."""
     lengths = [len(columns[name]) for name in "txyp"]
@@ -125,11 +149,11 @@ def check_lengths(columns: Mapping[str, Any]) -> None:
         raise ValueError(f"columns t, x, y, p differ in length: {lengths}")
 
 
-def check_unpacked_size(path: Path, size: int) -> None:
+def check_unpacking_ratio(path: Path, unpacked_bytes: int) -> None:
     """Raise ValueError for a file that unpacks to more than MAX_PACKING times its size."""
     most = MAX_PACKING * path.stat().st_size + 2**24
-    if size > most:
-        raise ValueError(f"it unpacks to {size} bytes, more than the {most} believed")
+    if unpacked_bytes > most:
+        raise ValueError(f"it unpacks to {unpacked_bytes} bytes, more than the {most} believed")
 
 
 def _is_coordinate(values: np.ndarray) -> bool:

@@ -5,10 +5,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from src.recordings.engines.event_passes import sort_slightly_late
-
-MOVES = 8  # of each event, beyond which sorting by insertion is slow
-
 
 def concatenate_events(parts: Sequence[np.ndarray]) -> np.ndarray:
     """Return the events of `parts`, each contiguous; of a single part itself, not a copy."""
@@ -29,10 +25,5 @@ def count_before(events: np.ndarray, time_us: float) -> int:
 
 def sort_events(events: np.ndarray) -> np.ndarray:
     """Return events, or times alone, by time, those of one time in their order."""
-    times = event_times(events)
-    t, order = np.array(times, np.int64), np.arange(len(events))
-    if sort_slightly_late(t, order, MOVES * len(t)):
-        moved, by_time = np.flatnonzero(order != np.arange(len(order))), events.copy()
-        by_time[moved] = events[order[moved]]
-        return by_time
-    return events[np.argsort(times, kind="stable")]
+    times = np.ascontiguousarray(event_times(events))
+    return events.take(np.argsort(times, kind="stable"))

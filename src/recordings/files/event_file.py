@@ -1,7 +1,8 @@
 """What a format's reader gives to the recording that is read from it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +13,8 @@ EVENT = np.dtype([("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.
 TIME_UNITS = ("auto", "s", "ms", "us", "ns")
 RAW_FORMATS = ("evt2", "evt21", "evt3")
 PIECE_EVENTS = 2**18  # events in a piece
+HeightWidth = tuple[int, int]
+WidthHeight = tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -70,9 +73,51 @@ class RawFrames(NamedTuple):
     None: that of the events; `size`: (height, width); `pictures()` yields them, uint8 (h, w)."""
 
     t: np.ndarray
-    size: tuple[int, int]
+    size: HeightWidth
     pictures: Callable[[], Iterator[np.ndarray]]
     unit: str | None = None
+
+
+class EventStream(NamedTuple):
+    """Events of one camera: its number in the file, its name, and (width, height) or None."""
+
+    id: int
+    name: str
+    size: WidthHeight | None
+
+
+def choose_stream(
+    path: Path, streams: Sequence[EventStream], wanted: str | int | None, default: int = 0
+) -> tuple[EventStream, tuple[str, ...]]:
+    """Return the stream `wanted`, its place in `streams` or its name, and a note of the others.
+
+    Without `wanted` it is `streams[default]`.  Raises ValueError where there is no such stream.
+    """
+    names = ", ".join(f"{place} ({stream.name})" for place, stream in enumerate(streams))
+    if wanted is None:
+        place = default
+    else:
+        known = {stream.name: place for place, stream in reversed(list(enumerate(streams)))}
+        known |= {str(place): place for place in range(len(streams))}
+        if str(wanted) not in known:
+            raise ValueError(f"{path}: stream must be one of {names}, got {wanted}")
+        place = known[str(wanted)]
+    note = f"{path}: holds {len(streams)} event streams, {names}; read is {place} (stream={place})"
+    return streams[place], (note,) if len(streams) > 1 else ()
+
+
+@contextmanager
+def name_file_in_errors(path: Path, wrong: str) -> Iterator[None]:
+    """Raise every error of the block, a panic of compiled code too, as a ValueError of one line,
+    `{path}: {wrong}: {error}`; one that begins with the path keeps its text."""
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit, GeneratorExit):
+        raise
+    except BaseException as error:
+        text = str(error).split("\n")[0] or type(error).__name__
+        whole = text if text.startswith(f"{path}: ") else f"{path}: {wrong}: {text}"
+        raise ValueError(whole) from error
 
 
 class EventFile(ABC):
@@ -86,7 +131,7 @@ class EventFile(ABC):
     """
 
     path: Path
-    size: tuple[int, int] | None = None
+    size: WidthHeight | None = None
     time_unit: str | None = None
     notes: tuple[str, ...] = ()
     kept_times: list[np.ndarray] | None = None

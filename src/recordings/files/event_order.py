@@ -11,15 +11,11 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
-from src.recordings.engines.event_passes import (
-    KEPT,
-    LONG_AGO_US,
-    label_events,
-    measure_lateness,
-)
+from src.recordings.engines.event_passes import KEPT, LONG_AGO_US, label_kept_or_dropped
 from src.recordings.files.event_arrays import (
     concatenate_events,
     count_before,
@@ -47,17 +43,18 @@ class ClockPart:
 class EventSorter:
     """Takes events (n,) EVENT, or times (n,) int64 us alone, as they come; gives them in order.
 
-    `kept_part`: the number of the one part that is given, 0 the first; None: always the newest, of
+    `kept_part`: the number of the one part that is given, 0 the first; newest: always the last, of
     which no event goes before `release` is called (live).  `parts`, `dropped`, `late` (events that
     were sorted) and `most_late_us` tell what was found.
     """
 
     def __init__(
         self, buffer_us: int = BUFFER_US, min_part_events: int = FEW_EVENTS,
-        kept_part: int | None = 0,
+        kept_part: int | Literal["newest"] = 0,
     ):  # fmt: skip
         self.buffer_us, self.min_part_events = buffer_us, min_part_events
         self._kept_part = kept_part
+        self._is_live = kept_part == "newest"
         self.parts, self.count = [ClockPart()], 0
         self.dropped = self.late = self.most_late_us = 0
         self._undecided: np.ndarray | None = None
@@ -87,7 +84,7 @@ class EventSorter:
             ready = self._decide(undecided, least, at_end=True)
         return [*ready, *self.release(2**63 - 1)]
 
-    def resume_after_silence(self, until_us: float) -> None:
+    def accept_events_after_gap(self, until_us: float) -> None:
         """Take later events for a silence's end, without waiting for more, if before `until_us`."""
         waiting = self._undecided
         if waiting is not None and self.last_us < event_times(waiting).min() <= until_us:
@@ -108,16 +105,18 @@ class EventSorter:
         ready: list[np.ndarray] = []
         while len(events):
             if self._goes_on(events, least):
-                ready += self._keep(events, 0, 0)
+                ready += self._keep(events, are_in_order=True)
                 events = events[:0]
                 break
             part, labels = self.parts[-1], np.empty(len(events), np.int8)
             t = np.ascontiguousarray(event_times(events))
             state = part.first_us, part.last_us, part.count
-            done, _, _, restarted = label_events(t, *state, self.buffer_us, least, at_end, labels)
+            done, _, _, restarted = label_kept_or_dropped(
+                t, *state, self.buffer_us, least, at_end, labels
+            )
             kept = labels[:done] == KEPT
             self.dropped += int(done - kept.sum())
-            ready += self._keep_some(events[:done] if kept.all() else events[:done][kept])
+            ready += self._keep(events[:done] if kept.all() else events[:done][kept])
             events = events[done:]
             if not restarted:
                 break
@@ -130,36 +129,30 @@ class EventSorter:
         t, part = event_times(events), self.parts[-1]
         if part.count < least or len(t) <= least or t[0] < part.last_us:
             return False
-        return (
-            bool(np.diff(t[-least - 1 :]).max() <= self.buffer_us)
-            and not measure_lateness(t, part.last_us)[0]
-        )
+        return bool(np.diff(t[-least - 1 :]).max() <= self.buffer_us and (t[1:] >= t[:-1]).all())
 
-    def _keep_some(self, events: np.ndarray) -> list[np.ndarray]:
-        late = measure_lateness(event_times(events), self.parts[-1].last_us)
-        return self._keep(events, *late) if len(events) else []
-
-    def _keep(self, events: np.ndarray, late: int, most: int) -> list[np.ndarray]:
-        """Hold events of the part's clock, `late` of them by `most` us at most; return those that
-        are in order for good."""
-        part, t = self.parts[-1], event_times(events)
-        if late:
-            self.late, self.most_late_us = self.late + late, max(self.most_late_us, most)
-            events = self._drop_released(events)
-        part.first_us = part.first_us if part.count else int(t[0])
-        part.last_us = max(part.last_us, int(t.max() if late else t[-1]))
-        part.count += len(t)
-        if self._kept_part is not None and self._kept_part != len(self.parts) - 1:
+    def _keep(self, events: np.ndarray, *, are_in_order: bool = False) -> list[np.ndarray]:
+        """Hold events of the part's clock; return those that are in order for good."""
+        if not len(events):
             return []
-        self._hold(events, late > 0)
-        if self._kept_part is None or part.count < self.min_part_events:
+        part, t = self.parts[-1], event_times(events)
+        if not are_in_order:
+            late_us = np.maximum.accumulate(np.maximum(t, part.last_us)) - t
+            are_in_order = not late_us.any()
+            self.late += int(np.count_nonzero(late_us))
+            self.most_late_us = max(self.most_late_us, int(late_us.max()))
+            is_gone = t < self._released_us
+            self.dropped += int(is_gone.sum())
+            events = events[~is_gone] if is_gone.any() else events
+        part.first_us = part.first_us if part.count else int(t[0])
+        part.last_us = max(part.last_us, int(t.max()))
+        part.count += len(t)
+        if not self._is_live and self._kept_part != len(self.parts) - 1:
+            return []
+        self._hold(events, not are_in_order)
+        if self._is_live or part.count < self.min_part_events:
             return []
         return self.release(self._bound_us(part.last_us - self.buffer_us))
-
-    def _drop_released(self, events: np.ndarray) -> np.ndarray:
-        gone = event_times(events) < self._released_us
-        self.dropped += (count := int(gone.sum()))
-        return events[~gone] if count else events
 
     def _hold(self, events: np.ndarray, unsorted: bool) -> None:
         if unsorted:
@@ -185,7 +178,7 @@ class EventSorter:
         ready, self._released_us = [], LONG_AGO_US
         if self.parts[-1].count < least:
             self.dropped += self.parts.pop().count
-        elif self._kept_part is not None:
+        elif not self._is_live:
             ready = self.release(2**63 - 1)
             self._released_us = LONG_AGO_US
         self._held = []

@@ -14,8 +14,9 @@ import numpy as np
 from faery.file_encoder import events_to_file
 
 from src.recordings.files import table_writers
-from src.recordings.files.event_file import PIECE_EVENTS
+from src.recordings.files.event_file import PIECE_EVENTS, WidthHeight
 from src.recordings.files.recorded_frames import RecordedFrames
+from src.records.atomic import partial_path
 
 BINARY = {".raw": "evt", ".dat": "dat", ".aedat4": "aedat", ".es": "es"}
 TABLES: dict[str, Callable] = {
@@ -103,11 +104,6 @@ def choose_file_kind(path: Path, layout: str | None, width: int, height: int, ve
     return kind
 
 
-def partial_path(path: Path) -> Path:
-    """Return the name of a file while it is written: `cap.partial.raw`."""
-    return path.with_name(f"{path.stem}.partial{path.suffix}")
-
-
 def _remove(path: Path) -> None:
     if path.is_dir():
         shutil.rmtree(path)
@@ -117,9 +113,7 @@ def _remove(path: Path) -> None:
 class _Checked:
     """Pieces that can be written; `count` and `span_us` are of those that came so far."""
 
-    def __init__(
-        self, path: Path, kind: str, pieces: Iterable, size: tuple[int, int], version: str
-    ):
+    def __init__(self, path: Path, kind: str, pieces: Iterable, size: WidthHeight, version: str):
         self.count, self.span_us = 0, 0
         self._path, self._kind, self._pieces, self._size = path, kind, pieces, size
         self._silence_us = MOST_SILENCE_US[version] if kind == ".raw" else 2**62
@@ -164,7 +158,7 @@ class _Checked:
 
 
 def _write_binary(
-    path: Path, kind: str, pieces: Iterator[np.ndarray], size: tuple[int, int], version: str
+    path: Path, kind: str, pieces: Iterator[np.ndarray], size: WidthHeight, version: str
 ) -> None:
     number = {".raw": version, ".dat": "dat2"}.get(kind)
     how = {"file_type": BINARY[kind], "zero_t0": kind != ".es", "use_write_suffix": False}

@@ -17,13 +17,15 @@ from pathlib import Path
 import numpy as np
 
 from src.recordings.files.event_file import (
-    PIECE_EVENTS,
     EventFile,
+    HeightWidth,
     RawEvents,
     RawFrames,
     ReadOptions,
+    name_file_in_errors,
 )
 from src.recordings.files.frame_files import wrap_frame_array
+from src.recordings.files.numpy_file import slice_columns, slice_times
 
 EVENT_FILES = ("events_ts.npy", "events_xy.npy", "events_p.npy")
 FRAME_FILES = ("images.npy", "images_ts.npy", "image_event_indices.npy")
@@ -35,17 +37,17 @@ class EvrealSequence:
     """The arrays of a folder, read from the disk where they are used.
 
     Events: `t` (n,) in seconds, `xy` (n, 2), `p` (n,); frames: `images` (m, h, w, 1), `frame_t`
-    (m,) in seconds, `event_index` (m,), all None for events alone.  `size`: (height, width).
+    (m,) in seconds, `last_event_index` (m,), all None for events alone.  `size`: (height, width).
     """
 
     path: Path
     t: np.ndarray
     xy: np.ndarray
     p: np.ndarray
-    size: tuple[int, int]
+    size: HeightWidth
     images: np.ndarray | None = None
     frame_t: np.ndarray | None = None
-    event_index: np.ndarray | None = None
+    last_event_index: np.ndarray | None = None
 
 
 def is_evreal_folder(path: Path) -> bool:
@@ -93,15 +95,11 @@ class EvrealFolder(EventFile):
         self.size = self._held.size[::-1]
 
     def pieces(self) -> Iterator[RawEvents]:
-        held = self._held
-        for first in range(0, len(held.t), PIECE_EVENTS):
-            part = slice(first, first + PIECE_EVENTS)
-            x, y = np.array(held.xy[part]).T
-            yield RawEvents(np.array(held.t[part], np.float64), x, y, np.array(held.p[part]))
+        t, p, (x, y) = self._held.t, self._held.p, self._held.xy.T
+        yield from slice_columns(self.path, {"t": t, "x": x, "y": y, "p": p}, self.kept_times)
 
     def times(self) -> Iterator[np.ndarray]:
-        for first in range(0, len(self._held.t), PIECE_EVENTS):
-            yield np.array(self._held.t[first : first + PIECE_EVENTS], np.float64)
+        yield from slice_times(self.path, self._held.t)
 
     def frames(self) -> RawFrames | None:
         images, times = self._held.images, self._held.frame_t
@@ -111,10 +109,8 @@ class EvrealFolder(EventFile):
 def _load(path: Path) -> np.ndarray:
     if not path.is_file():
         raise ValueError(f"{path.parent}: {path.name} is missing")
-    try:
+    with name_file_in_errors(path, "cannot be read as an array"):
         return np.load(path, mmap_mode="r")
-    except (ValueError, EOFError, OSError) as error:
-        raise ValueError(f"{path}: cannot be read as an array: {error}") from error
 
 
 def _check_lengths(path: Path, names: tuple[str, ...], arrays: tuple[np.ndarray, ...]) -> None:
@@ -134,7 +130,7 @@ def _check_frames(path: Path, images: np.ndarray, index: np.ndarray, events: int
         raise ValueError(f"{path}: image_event_indices.npy must {wanted}, got {index[:3]}...")
 
 
-def _size(path: Path, xy: np.ndarray, images: np.ndarray | None) -> tuple[int, int]:
+def _size(path: Path, xy: np.ndarray, images: np.ndarray | None) -> HeightWidth:
     """Return (height, width) as metadata.json states it, else that of the frames or events."""
     shown = None if images is None else images.shape[1:3]
     file = path / "metadata.json"

@@ -32,14 +32,14 @@ class EvtDecoder:
         """Return how many events came before the first time, which were left out."""
         return int(self._state[evt_words.LOST])
 
-    def decode(self, block: bytes) -> RawEvents:
-        """Return the events of whole little-endian words, times in microseconds."""
-        room = len(block) // WORD_BYTES[self.kind] * MOST_EVENTS[self.kind]
+    def decode(self, whole_words: bytes) -> RawEvents:
+        """Return the events of little-endian words, times in microseconds."""
+        room = len(whole_words) // WORD_BYTES[self.kind] * MOST_EVENTS[self.kind]
         events = [np.empty(room, kind) for kind in ("i8", "u2", "u2", "i1")]
         if self.kind == "evt3":
-            count = evt_words.decode_evt3(np.frombuffer(block, "<u2"), self._state, *events)
+            count = evt_words.decode_evt3(np.frombuffer(whole_words, "<u2"), self._state, *events)
         else:
-            count = evt_words.decode_evt2(*self._halves(block), self._state, *events)
+            count = evt_words.decode_evt2_and_21(*self._halves(whole_words), self._state, *events)
         return RawEvents(*(part[:count] for part in events))
 
     def _halves(self, block: bytes) -> tuple[np.ndarray, np.ndarray]:

@@ -6,8 +6,7 @@ Known layouts: DSEC (events/{x, y, t, p} in us after `t_offset`; Gehrig et al. 2
 """
 
 import math
-import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,28 +15,30 @@ import h5py
 import hdf5plugin  # noqa: F401 - its codecs are registered by the import
 import numpy as np
 
-from src.recordings.files.array_file import (
-    SlicedColumn,
-    slice_columns,
-    slice_times,
-    split_table,
-)
 from src.recordings.files.columns import (
     as_times,
     check_lengths,
-    check_unpacked_size,
+    check_unpacking_ratio,
     find_columns_by_name,
     find_keys_by_name,
+    find_stated_size,
 )
-from src.recordings.files.event_file import EventFile, RawEvents, RawFrames, ReadOptions
+from src.recordings.files.event_file import (
+    EventFile,
+    EventStream,
+    RawEvents,
+    RawFrames,
+    ReadOptions,
+    WidthHeight,
+    choose_stream,
+    name_file_in_errors,
+)
 from src.recordings.files.frame_files import to_gray, wrap_frame_array
-from src.recordings.files.streams import EventStream, choose_stream
+from src.recordings.files.numpy_file import LazyColumn, slice_columns, slice_times, split_table
 
 HDF5_ENDINGS = (".h5", ".hdf5", ".hdf")
 MAX_CHUNK_BYTES = 2**28  # bytes of HDF5 that are unpacked at a time
 ECF_CODEC = 36559  # the number of Prophesee's codec
-SIZE_NAMES = ("size", "geometry", "sensor_size")  # width, height
-SHAPE_NAMES = ("sensor_resolution", "resolution")  # height, width
 
 
 class Hdf5File(EventFile):
@@ -45,19 +46,15 @@ class Hdf5File(EventFile):
 
     def __init__(self, path: Path, options: ReadOptions):
         self.path = path
-        try:
+        with name_file_in_errors(path, "cannot be read as events"):
             self._file = h5py.File(path)
-            check_no_external_data(self._file)
+            check_hdf5_safety(self._file)
             streams = find_streams(self._file)
             if not streams:
                 raise ValueError("no columns t, x, y, p and no array of events (n, 4) in it")
             listed = [EventStream(k, name, None) for k, name in enumerate(streams)]
             chosen, self.notes = choose_stream(path, listed, options.stream)
             self._open(streams[chosen.name], options)
-        except Exception as error:  # HDF5 raises all kinds on a broken file
-            is_named = str(error).startswith(str(path))
-            text = "" if is_named else f"{path}: cannot be read as events: "
-            raise ValueError(f"{text}{error}") from error
 
     def pieces(self) -> Iterator[RawEvents]:
         yield from slice_columns(self.path, self._columns, self.kept_times)
@@ -81,27 +78,28 @@ class Hdf5File(EventFile):
         return None
 
     def _open(self, node: Any, options: ReadOptions) -> None:
-        check_unpacked_size(self.path, _claimed_bytes(node))
-        check_codec(node)
-        group = node if isinstance(node, h5py.Group) else node.parent
-        self._beside = node.parent
-        self.size = _stated_size(node) or _stated_size(group) or _stated_size(self._file)
-        self._has_own_times = isinstance(node, h5py.Group)
-        self._columns: dict[str, Any] = (
-            _columns_of(node) if self._has_own_times else split_table(node, options.columns)
-        )
+        self._beside, self._has_own_times = node.parent, isinstance(node, h5py.Group)
+        parts = [*node.values()] if self._has_own_times else [node]
+        parts = [part for part in parts if isinstance(part, h5py.Dataset)]
+        check_unpacking_ratio(self.path, sum(part.nbytes for part in parts))
+        refuse_ecf_codec(parts)
+        places = (node, self._file) if self._has_own_times else (node, node.parent, self._file)
+        self.size = next(filter(None, map(_stated_size, places)), None)
+        if self._has_own_times:
+            keys = find_keys_by_name(node) or {}
+            self._columns: dict[str, Any] = {name: node[key] for name, key in keys.items()}
+            check_lengths(self._columns)
+        else:
+            self._columns = split_table(node, options.columns)
         if "t_offset" in self._file:
-            offset = _single_number(self._file["t_offset"])
-            self._columns["t"] = _ShiftedTimes(self._columns["t"], offset)
+            offset = self._file["t_offset"]
+            if offset.size != 1:
+                raise ValueError(f"t_offset must be one number, got {offset.shape}")
+            start = int(np.asarray(offset).item())
+            t = self._columns["t"]
+            self._columns["t"] = LazyColumn(t, lambda t: as_times(np.asarray(t)) + start)
         if "t_offset" in self._file or "ms_to_idx" in self._file:  # DSEC's layout
             self.time_unit = "us"
-
-
-class _ShiftedTimes(SlicedColumn):
-    """Times after an offset, `place`, in their unit."""
-
-    def __getitem__(self, part: slice) -> np.ndarray:
-        return as_times(np.asarray(self.table[part])) + self.place
 
 
 def find_streams(file: h5py.File) -> dict[str, Any]:
@@ -121,7 +119,7 @@ def find_streams(file: h5py.File) -> dict[str, Any]:
     return {name or "/": found[name] for name in names}
 
 
-def check_no_external_data(file: h5py.File) -> None:
+def check_hdf5_safety(file: h5py.File) -> None:
     """Raise ValueError where a part of the file is another file, as a path leads anywhere, or comes
     in chunks beyond MAX_CHUNK_BYTES, which are unpacked whole.
     """
@@ -142,13 +140,11 @@ def check_no_external_data(file: h5py.File) -> None:
         raise ValueError(fault)
 
 
-def check_codec(node: Any) -> None:
-    """Raise ValueError for events packed with Prophesee's own codec."""
-    parts = node.values() if isinstance(node, h5py.Group) else [node]
+def refuse_ecf_codec(parts: Iterable[Any]) -> None:
+    """Raise ValueError where one of the datasets is packed with Prophesee's own codec."""
     for part in parts:
-        plan = part.id.get_create_plist() if isinstance(part, h5py.Dataset) else None
-        codecs = [plan.get_filter(k)[0] for k in range(plan.get_nfilters())] if plan else []
-        if ECF_CODEC in codecs:
+        plan = part.id.get_create_plist()
+        if ECF_CODEC in [plan.get_filter(k)[0] for k in range(plan.get_nfilters())]:
             raise ValueError(
                 "Prophesee HDF5 is packed with the vendor's own codec (ECF); export the recording "
                 "as RAW (EVT3) or as events/{x,y,t,p}"
@@ -171,47 +167,6 @@ def _is_table(name: str, node: Any) -> bool:
     return node.ndim == 2 and node.shape[1] == 4 and "event" in name.lower()
 
 
-def _columns_of(group: Any) -> dict[str, Any]:
-    columns = {name: group[key] for name, key in (find_keys_by_name(group) or {}).items()}
-    check_lengths(columns)
-    return columns
-
-
-def _claimed_bytes(node: Any) -> int:
-    parts = node.values() if isinstance(node, h5py.Group) else [node]
-    return sum(part.nbytes for part in parts if isinstance(part, h5py.Dataset))
-
-
-def _single_number(node: Any) -> int:
-    if node.size != 1:
-        raise ValueError(f"t_offset must be one number, got {node.shape}")
-    return int(np.asarray(node).item())
-
-
-def _stated_size(node: Any) -> tuple[int, int] | None:
-    """Return (width, height) as attributes or small arrays state it."""
-    held = node if isinstance(node, h5py.Group) else {}
-    known = {**{k: held[k] for k in held if _is_small(held[k])}, **node.attrs}
-    for name in (*SIZE_NAMES, *SHAPE_NAMES):
-        sides = _whole_numbers(known[name]) if name in known else []
-        if len(sides) == 2:
-            has_width_first = name in SIZE_NAMES or "x" in str(known[name]).lower()  # 640x480
-            return (sides[0], sides[1]) if has_width_first else (sides[1], sides[0])
-    width, height = (_whole_numbers(known.get(name)) for name in ("width", "height"))
-    return (width[0], height[0]) if len(width) == len(height) == 1 else None
-
-
-def _whole_numbers(value: Any) -> list[int]:
-    """Return the numbers of a value such as `640x480`, (640, 480) or 640; none for another."""
-    if isinstance(value, str | bytes):
-        text = value.decode("latin-1") if isinstance(value, bytes) else value
-        value = re.split(r"[\sx,;]+", text.strip().lower())
-    try:
-        numbers = np.asarray(value).ravel()[:2].astype(np.float64).tolist()
-    except (TypeError, ValueError):  # words, or nothing
-        return []
-    return [int(n) for n in numbers if n >= 1 and n == int(n)]
-
-
-def _is_small(node: Any) -> bool:
-    return isinstance(node, h5py.Dataset) and node.size <= 4
+def _stated_size(node: Any) -> WidthHeight | None:
+    """Return (width, height) as attributes or small arrays of a node state it."""
+    return find_stated_size((dict(node) if isinstance(node, h5py.Group) else {}) | dict(node.attrs))

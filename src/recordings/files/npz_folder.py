@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from src.recordings.files.array_file import ArrayFile
 from src.recordings.files.event_file import EventFile, RawEvents, RawFrames, ReadOptions
 from src.recordings.files.frame_files import find_timelens_frames, sort_by_name
+from src.recordings.files.numpy_file import NumpyFile
 
 EVENT_FOLDERS = (".", "events", "events_aligned")
 FRACTIONS = 32  # of a pixel in which BS-ERGB has x and y, in 16 bits
@@ -36,17 +36,17 @@ class NpzFolder(EventFile):
         self.path, self._options = path, options
         self._folder = find_npz_folder(path) or path
         self._names = sort_by_name(self._folder.glob("*.npz"))
-        first = ArrayFile(self._names[0], options)
+        first = NumpyFile(self._names[0], options)
         self.size, self.notes = first.size, first.notes
 
     def pieces(self) -> Iterator[RawEvents]:
         for name in self._names:
-            for t, x, y, p in ArrayFile(name, self._options).pieces():
+            for t, x, y, p in NumpyFile(name, self._options).pieces():
                 yield RawEvents(t, *self._whole_pixels(x, y), p)
 
     def times(self) -> Iterator[np.ndarray]:
         for name in self._names:
-            yield from ArrayFile(name, self._options).times()
+            yield from NumpyFile(name, self._options).times()
 
     def frames(self) -> RawFrames | None:
         return self._frames
@@ -61,7 +61,7 @@ class NpzFolder(EventFile):
             return False
         seen, largest = 0, 0
         for name in self._names:
-            for piece in ArrayFile(name, self._options).pieces():
+            for piece in NumpyFile(name, self._options).pieces():
                 seen, largest = seen + len(piece.x), max(largest, piece.x.max(initial=0))
             if seen >= ENOUGH_EVENTS:
                 break

@@ -11,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from src.recordings.files.clocks import TimestampUnwrapper
+from src.recordings.files.clocks import TimestampUnwrapper, read_whole_words
 from src.recordings.files.event_file import (
     PIECE_EVENTS,
     RAW_FORMATS,
     EventFile,
     RawEvents,
     ReadOptions,
+    WidthHeight,
 )
 from src.recordings.files.evt_decoder import MOST_EVENTS, WORD_BYTES, WORD_ORDERS, EvtDecoder
 
@@ -58,7 +59,7 @@ class PropheseeFile(EventFile):
             if len(events.t):
                 yield events._replace(t=events.t + self._start_us) if self._start_us else events
 
-    def _read_size(self, text: str) -> tuple[int, int] | None:
+    def _read_size(self, text: str) -> WidthHeight | None:
         geometry = re.match(r"(\d{1,9}) *x *(\d{1,9})", self._lines.get("geometry", ""))
         if geometry:
             return int(geometry[1]), int(geometry[2])
@@ -85,22 +86,12 @@ class PropheseeFile(EventFile):
             raise ValueError(f"{self.path}: format must be {said} as its header, got {stated}")
         return said or str(stated)
 
-    def _blocks(self, word: int, start: int, most: int = 1) -> Iterator[bytes]:
-        """Yield whole words in blocks of about PIECE_EVENTS events; warns of a cut word."""
-        with self.path.open("rb") as file:
-            file.seek(start)
-            while block := file.read(word * (PIECE_EVENTS // max(1, most // 2))):
-                if cut := len(block) % word:
-                    warnings.warn(
-                        f"{self.path}: the file ends within a word, it is truncated", stacklevel=4
-                    )
-                yield block[: len(block) - cut]
-
     def _raw_pieces(self) -> Iterator[RawEvents]:
         kind, found = str(self._format), 0
         order = re.search(r"endianness=(\w+)", self._lines.get("format", ""))
         decoder = EvtDecoder(kind, order[1] if order and order[1] in WORD_ORDERS else None)
-        for block in self._blocks(WORD_BYTES[kind], self._start, MOST_EVENTS[kind]):
+        words = PIECE_EVENTS // max(1, MOST_EVENTS[kind] // 2)
+        for block in read_whole_words(self.path, self._start, WORD_BYTES[kind], words):
             events = decoder.decode(block)
             found += len(events.t)
             yield events
@@ -125,7 +116,7 @@ class PropheseeFile(EventFile):
             raise ValueError(f"{self.path}: DAT of type {head.hex(' ')} is not read, but 0 and 12")
         x_bits, y_bits = (9, 8) if self._lines.get("version") in ("0", "1") else (14, 14)
         clock = TimestampUnwrapper()
-        for block in self._blocks(8, self._start + 2):
+        for block in read_whole_words(self.path, self._start + 2, 8):
             t, word = np.frombuffer(block, "<u4").reshape(-1, 2).T
             x, y = word & (1 << x_bits) - 1, word >> x_bits & (1 << y_bits) - 1
             on = word >> (x_bits + y_bits) & 15

@@ -7,9 +7,9 @@ from itertools import compress
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from src.recordings.files.event_file import RawFrames
+from src.recordings.files.event_file import HeightWidth, RawFrames, name_file_in_errors
 from src.recordings.files.recording import EventRecording
 from src.recordings.files.time_unit import UNITS_US
 
@@ -20,14 +20,14 @@ class RecordedFrames:
     `pictures()` yields them, uint8 (h, w), one after the other."""
 
     times_us: Float[np.ndarray, " n"]
-    size: tuple[int, int]
+    size: HeightWidth
     pictures: Callable[[], Iterator[np.ndarray]]
 
-    def select(self, chosen: np.ndarray) -> "RecordedFrames":
-        """Return the frames where `chosen` (n,) is true."""
+    def select(self, mask: Bool[np.ndarray, " n"]) -> "RecordedFrames":
+        """Return the frames where `mask` is true."""
         pictures = self.pictures
         return replace(
-            self, times_us=self.times_us[chosen], pictures=lambda: compress(pictures(), chosen)
+            self, times_us=self.times_us[mask], pictures=lambda: compress(pictures(), mask)
         )
 
 
@@ -39,11 +39,8 @@ def find_frames(recording: EventRecording) -> RecordedFrames | None:
     cannot be read or whose times do not ascend even then.
     """
     path = recording.path
-    try:
+    with name_file_in_errors(path, "its frames cannot be read"):
         raw = recording.file.frames()
-    except Exception as error:  # libraries raise all kinds on a broken file
-        text = str(error).removeprefix(f"{path}: ")
-        raise ValueError(f"{path}: its frames cannot be read: {text}") from error
     if raw is None or not len(raw.t):
         return None
     times = np.array(raw.t, np.float64).ravel() * UNITS_US[raw.unit or recording.survey.unit]

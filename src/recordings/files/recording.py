@@ -12,17 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
-from src.recordings.engines.event_passes import convert_events
-from src.recordings.files.aedat2_file import Aedat2File
+from src.recordings.engines.event_passes import copy_events_on_sensor
+from src.recordings.files.aedat1to3_file import Aedat1To3File
 from src.recordings.files.aedat4_file import Aedat4File
-from src.recordings.files.array_file import ArrayFile
 from src.recordings.files.es_file import EsFile
 from src.recordings.files.event_arrays import concatenate_events, count_before
-from src.recordings.files.event_file import EVENT, EventFile, RawEvents, ReadOptions
+from src.recordings.files.event_file import EVENT, EventFile, RawEvents, ReadOptions, WidthHeight
 from src.recordings.files.event_order import EventSorter, merge_in_time
 from src.recordings.files.evreal_folder import EvrealFolder, is_evreal_folder
 from src.recordings.files.hdf5_file import HDF5_ENDINGS, Hdf5File
 from src.recordings.files.npz_folder import NpzFolder, find_npz_folder
+from src.recordings.files.numpy_file import NumpyFile
 from src.recordings.files.prophesee_file import PropheseeFile
 from src.recordings.files.rosbag_file import RosbagFile, is_bag_folder
 from src.recordings.files.survey import TimeSurvey, survey_times
@@ -32,9 +32,9 @@ from src.recordings.files.time_unit import check_times, to_us
 
 Reader = Callable[[Path, ReadOptions], EventFile]
 READERS: dict[str, Reader] = {  # by the ending, in small letters
-    ".raw": PropheseeFile, ".dat": PropheseeFile, ".aedat4": Aedat4File, ".aedat": Aedat2File,
-    ".es": EsFile, ".bag": RosbagFile, ".db3": RosbagFile, ".mcap": RosbagFile, ".npy": ArrayFile,
-    ".npz": ArrayFile, **dict.fromkeys(HDF5_ENDINGS, Hdf5File),
+    ".raw": PropheseeFile, ".dat": PropheseeFile, ".aedat4": Aedat4File, ".aedat": Aedat1To3File,
+    ".es": EsFile, ".bag": RosbagFile, ".db3": RosbagFile, ".mcap": RosbagFile, ".npy": NumpyFile,
+    ".npz": NumpyFile, **dict.fromkeys(HDF5_ENDINGS, Hdf5File),
     **dict.fromkeys((*TEXT_ENDINGS, ".gz", ".zip"), TextFile),
 }  # fmt: skip
 OF_ONE_CAMERA = (PropheseeFile, EsFile, TextFile)
@@ -46,7 +46,7 @@ class EventRecording:
     """An event file: `size` is its (width, height) in pixels, None where the file does not say."""
 
     path: Path
-    size: tuple[int, int] | None
+    size: WidthHeight | None
     options: ReadOptions
     file: EventFile
     survey: TimeSurvey
@@ -59,14 +59,13 @@ class EventRecording:
     def __iter__(self) -> Iterator[np.ndarray]:
         """Yield the events in pieces, not empty, in order of time; warn of what was wrong."""
         if self.survey.parts_are_on_and_off:
-            both = (iter(_Reading(self, part)) for part in (0, 1))
-            yield from merge_in_time(*both)
+            yield from merge_in_time(_read_part(self, 0), _read_part(self, 1))
         else:
-            yield from _Reading(self, self.options.part or 0)
+            yield from _read_part(self, self.options.part or 0)
 
 
 def open_recording(
-    path: str | Path, size: tuple[int, int] | None = None, options: ReadOptions = ReadOptions()
+    path: str | Path, size: WidthHeight | None = None, options: ReadOptions = ReadOptions()
 ) -> EventRecording:
     """Return the recording at `path`; `size` (width, height) for a file that does not say.
 
@@ -90,7 +89,7 @@ def open_recording(
 
 
 def read_events(
-    path: str | Path, size: tuple[int, int] | None = None, options: ReadOptions = ReadOptions()
+    path: str | Path, size: WidthHeight | None = None, options: ReadOptions = ReadOptions()
 ) -> np.ndarray:
     """Return all events of a file, (n,) of t int64 us, x, y uint16, p int8 in {-1, 1}, in order of
     time.
@@ -107,7 +106,7 @@ def iter_events(
     path: str | Path,
     *,
     seconds: float = 0.1,
-    size: tuple[int, int] | None = None,
+    size: WidthHeight | None = None,
     options: ReadOptions = ReadOptions(),
 ) -> Iterator[np.ndarray]:
     """Yield the events of a file in chunks of `seconds` from the first event, those without events
@@ -130,72 +129,57 @@ def iter_events(
         yield concatenate_events(held)
 
 
-class _Reading:
-    """The events of one part of a recording; the numbers are of those that came so far."""
+def _read_part(recording: EventRecording, part: int) -> Iterator[np.ndarray]:
+    """Yield the events of one part on the sensor, in order; warn at the end of what was wrong."""
+    path, survey, size = recording.path, recording.survey, recording.size
+    order = EventSorter(survey.buffer_us, survey.min_part_events, part)
+    count, outside, largest_xy = 0, 0, np.zeros(2, np.int64)
+    for raw in survey.pieces or recording.file.pieces():
+        events, off_sensor = _convert(raw, recording, largest_xy)
+        count, outside = count + len(raw.t), outside + off_sensor
+        is_ordered = survey.is_ordered and part == 0
+        yield from filter(len, [events] if is_ordered else order.add(events))
+        if order.count > 2**20:
+            _refuse_disorder(order, path)
+    yield from filter(len, order.finish())
+    _refuse_disorder(order, path)
+    if not survey.covers_all_times:
+        order.check_part(part, path)
+    if outside and size is not None:
+        width, height = size
+        if outside == count:
+            x, y = largest_xy + 1
+            raise ValueError(
+                f"{path}: all {count} events are off the {width}x{height} sensor, "
+                f"they need {x}x{y}; is sensor_size=[height,width] right?"
+            )
+        _tell((f"{path}: {outside} of {count} events outside {width}x{height}, dropped",))
+    if not survey.covers_all_times:
+        _tell(order.describe_time_faults(path, part=recording.options.part))
 
-    def __init__(self, recording: EventRecording, part: int):
-        self._recording, self._path, self._part = recording, recording.path, part
-        survey = recording.survey
-        self._order = EventSorter(survey.buffer_us, survey.min_part_events, part)
-        self._count, self._outside, self._most = 0, 0, np.zeros(2, np.int64)
 
-    def __iter__(self) -> Iterator[np.ndarray]:
-        if self._recording.survey.is_ordered and self._part == 0:
-            yield from filter(len, self._converted())
-        else:
-            for events in self._converted():
-                yield from filter(len, self._order.add(events))
-                self._check(2**20)
-            yield from filter(len, self._order.finish())
-            self._check()
-        self._tell_at_end()
-
-    def _converted(self) -> Iterator[np.ndarray]:
-        """Yield the events on the sensor as the file has them."""
-        width, height = self._recording.size or (0, 0)
-        recording = self._recording
-        for raw in recording.survey.pieces or recording.file.pieces():
-            unit = recording.survey.unit
-            if not recording.survey.covers_all_times and (raw.t.dtype != np.int64 or unit != "us"):
-                check_times(raw.t, unit, self._path)
-            t = to_us(raw.t, unit)
-            x, y, p = _plain(raw)
-            events = np.empty(len(t), EVENT)
-            found = convert_events(t, x, y, p, width, height, self._most, events)
-            kept, outside, wrong = found
-            if wrong >= 0:
-                self._refuse(raw, wrong)
-            self._count, self._outside = self._count + len(t), self._outside + outside
-            yield events[:kept]
-
-    def _refuse(self, raw: RawEvents, place: int) -> None:
-        check_times(raw.t[place : place + 1], self._recording.survey.unit, self._path)
-        x, y, p = (part[place] for part in raw[1:])
+def _convert(
+    raw: RawEvents, recording: EventRecording, largest_xy: np.ndarray
+) -> tuple[np.ndarray, int]:
+    """Return the events of a piece on the sensor, as the file has them, and how many are off it."""
+    path, unit = recording.path, recording.survey.unit
+    if not recording.survey.covers_all_times and (raw.t.dtype != np.int64 or unit != "us"):
+        check_times(raw.t, unit, path)
+    events, (width, height) = np.empty(len(raw.t), EVENT), recording.size or (0, 0)
+    columns = to_us(raw.t, unit), *_plain(raw)
+    kept, outside, wrong = copy_events_on_sensor(*columns, width, height, largest_xy, events)
+    if wrong >= 0:
+        check_times(raw.t[wrong : wrong + 1], unit, path)
+        x, y, p = (part[wrong] for part in raw[1:])
         if p not in (-1, 0, 1):
-            raise ValueError(f"{self._path}: polarity must be in -1, 0, 1, got {p}")
-        raise ValueError(f"{self._path}: x and y must be in 0..{MAX_SIDE - 1}, got {x}, {y}")
+            raise ValueError(f"{path}: polarity must be in -1, 0, 1, got {p}")
+        raise ValueError(f"{path}: x and y must be in 0..{MAX_SIDE - 1}, got {x}, {y}")
+    return events[:kept], outside
 
-    def _check(self, least: int = 0) -> None:
-        fault = self._order.reason_to_refuse() if self._order.count > least else None
-        if fault:
-            raise ValueError(f"{self._path}: {fault}")
 
-    def _tell_at_end(self) -> None:
-        size = self._recording.size
-        if not self._recording.survey.covers_all_times:
-            self._order.check_part(self._part, self._path)
-        if self._outside and size is not None:
-            width, height = size
-            if self._outside == self._count:
-                x, y = self._most + 1
-                raise ValueError(
-                    f"{self._path}: all {self._count} events are off the {width}x{height} sensor, "
-                    f"they need {x}x{y}; is sensor_size=[height,width] right?"
-                )
-            outside = f"{self._outside} of {self._count} events outside {width}x{height}, dropped"
-            _tell((f"{self._path}: {outside}",))
-        if not self._recording.survey.covers_all_times:
-            _tell(self._order.describe_time_faults(self._path, part=self._recording.options.part))
+def _refuse_disorder(order: EventSorter, path: Path) -> None:
+    if fault := order.reason_to_refuse():
+        raise ValueError(f"{path}: {fault}")
 
 
 def _plain(raw: RawEvents) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

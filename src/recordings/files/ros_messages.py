@@ -79,7 +79,7 @@ class EventMessage:
         return RawEvents(t, x, y & 0x7FFF, y >> 15)
 
     @property
-    def size_bytes(self) -> int:
+    def event_bytes(self) -> int:
         """Return how many bytes the events take."""
         return len(self._content) - self._at
 

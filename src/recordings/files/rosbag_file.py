@@ -20,7 +20,15 @@ from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from src.recordings.files.clocks import merge_small_pieces
-from src.recordings.files.event_file import EventFile, RawEvents, RawFrames, ReadOptions
+from src.recordings.files.event_file import (
+    EventFile,
+    EventStream,
+    RawEvents,
+    RawFrames,
+    ReadOptions,
+    choose_stream,
+    name_file_in_errors,
+)
 from src.recordings.files.evt_decoder import EvtDecoder
 from src.recordings.files.ros_messages import (
     ARRAYS,
@@ -29,7 +37,6 @@ from src.recordings.files.ros_messages import (
     EventMessage,
     decode_time_ns_and_gray_image,
 )
-from src.recordings.files.streams import EventStream, choose_stream
 from src.recordings.files.unpacking import decompress
 
 READERS: dict[str, Any] = {".bag": Ros1Reader, ".db3": Sqlite3Reader, ".mcap": mcap.McapReader}
@@ -104,16 +111,13 @@ class RosbagFile(EventFile):
         return RawFrames(times, first.shape, lambda: (picture for _, picture in images()), "ns")
 
     def _events(self, decoder: EvtDecoder) -> Iterator[RawEvents]:
-        for _, message in self._messages(self._topic):
-            try:
+        with name_file_in_errors(self.path, f"topic {self._topic}"):
+            for _, message in self._messages(self._topic):
                 if message.encoding != self._encoding:
                     raise ValueError(f"encoding changes to {message.encoding}")
                 yield message.read_events(decoder)
-            except ValueError as error:
-                raise ValueError(f"{self.path}: topic {self._topic}: {error}") from error
 
     def _find_topics(self) -> list[str]:
-        """Return the names of the topics with messages of events."""
         with self._opened() as reader:
             topics = {link.topic: link.msgtype for link in reader.connections if link.msgcount}
         found = sorted(topic for topic, kind in topics.items() if kind in (*ARRAYS, *PACKETS))
@@ -123,10 +127,9 @@ class RosbagFile(EventFile):
         return found
 
     def _count_bytes(self) -> Counter:
-        """Return how many bytes of events each topic has."""
         sizes: Counter = Counter()
         for topic, message in self._messages():
-            sizes[topic] += message.size_bytes
+            sizes[topic] += message.event_bytes
         return sizes
 
     def _messages(self, topic: str | None = None) -> Messages:
@@ -151,12 +154,8 @@ class RosbagFile(EventFile):
     def _opened(self) -> Iterator[Any]:
         """Open the bag; what rosbags raises of a broken one, of all kinds, names the file."""
         kind = DirectoryReader if self.path.is_dir() else READERS[self.path.suffix.lower()]
-        try:
+        with name_file_in_errors(self.path, "cannot be read as a bag"):
             reader = kind(self.path)
             reader.open()
-            try:
+            with closing(reader):
                 yield reader
-            finally:
-                reader.close()
-        except Exception as error:
-            raise ValueError(f"{self.path}: cannot be read as a bag: {error}") from error

@@ -10,19 +10,15 @@ import numpy as np
 from jaxtyping import Float
 
 from src.recordings.files import recording
-from src.recordings.files.event_file import ReadOptions
+from src.recordings.files.event_file import HeightWidth, ReadOptions
 from src.recordings.files.recorded_frames import find_frames
 from src.recordings.files.videos import read_gray_picture, read_video
 from src.sim.scenes.video_files import PICTURE_SUFFIXES, VIDEO_SUFFIXES
 
-Size = tuple[int, int]  # height, width
-
 
 def find_sensor_size(
-    path: Path | str,
-    sensor: Sequence[int] | None = None,
-    options: ReadOptions = ReadOptions(),
-) -> Size:
+    path: Path | str, sensor: Sequence[int] | None = None, options: ReadOptions = ReadOptions()
+) -> HeightWidth:
     """Return (height, width) of the recording's sensor; `sensor` for a file that does not say,
     which is else that of the frames beside its events, with a warning.
 
@@ -43,7 +39,7 @@ def find_sensor_size(
 
 def iter_recording(
     path: Path | str,
-    sensor: Size,
+    sensor: HeightWidth,
     seconds: float = 0.05,
     options: ReadOptions = ReadOptions(),
 ) -> Iterator[np.ndarray]:
@@ -55,10 +51,8 @@ def iter_recording(
         raise ValueError(f"{path}: holds no events")
 
 
-def read_sensor_picture(
-    path: Path | str,
-    sensor: Sequence[int] | None = None,
-    options: ReadOptions = ReadOptions(),
+def read_picture_or_event_counts(
+    path: Path | str, sensor: Sequence[int] | None = None, options: ReadOptions = ReadOptions()
 ) -> Float[np.ndarray, "h w"]:
     """Return a picture in [0, 1], the mean of a film, or the number of events of each pixel, which
     shows a target that blinks on a dark screen.  Raises ValueError for what cannot be read."""

@@ -1,12 +1,11 @@
 """What all times of a table tell before it is read: their unit, and whether they are in order."""
 
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from src.recordings.files.event_file import EventFile, RawEvents, ReadOptions
+from src.recordings.files.event_file import EventFile, RawEvents, ReadOptions, name_file_in_errors
 from src.recordings.files.event_order import (
     BUFFER_US,
     FEW_EVENTS,
@@ -78,14 +77,11 @@ def _judge(
             check_times(t, unit, path)
             yield to_us(t, unit)
 
-    try:
-        order = sort_with_smallest_buffer(
-            read_us, sample.count, sample.trimmed_span() * UNITS_US[unit]
-        )
-    except ValueError as error:
-        raise ValueError(_named(path, str(error))) from None
+    span_us = sample.early_time_and_span()[1] * UNITS_US[unit]
+    with name_file_in_errors(path, "its times cannot be read"):
+        order = sort_with_smallest_buffer(read_us, sample.count, span_us)
     order.check_part(options.part or 0, path)
-    lines = [_named(path, line)] if line else []
+    lines = [f"{path}: {line}"] if line else []
     merged = options.part is None and len(order.parts) == 2
     if merged and _is_on_then_off(file, order.parts[0].count, order.parts[-1].count, sample.count):
         lines.append(f"{path}: all events of one polarity come before the others, sorted by time")
@@ -149,7 +145,3 @@ def _keep(read: Callable[[], Iterable[Part]]) -> list[Part] | None:
             return None
         kept.append(part)
     return kept
-
-
-def _named(path: Path, text: str) -> str:
-    return text if text.startswith(str(path)) else f"{path}: {text}"

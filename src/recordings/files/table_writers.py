@@ -17,6 +17,7 @@ import h5py
 import numpy as np
 from numpy.lib.format import open_memmap
 
+from src.recordings.files.event_file import WidthHeight
 from src.recordings.files.recorded_frames import RecordedFrames
 
 EVREAL_TIMES = "events_ts.npy"
@@ -24,7 +25,7 @@ CHUNK_EVENTS = 2**16  # in HDF5
 Pieces = Iterator[np.ndarray]
 
 
-def write_csv(path: Path, pieces: Pieces, size: tuple[int, int]) -> None:
+def write_csv(path: Path, pieces: Pieces, size: WidthHeight) -> None:
     """Write `t,x,y,p` a line, behind a first line that names them and the sensor's sides."""
     with path.open("w") as file:
         file.write(f"t,x@{size[0]},y@{size[1]},p\n")
@@ -34,7 +35,7 @@ def write_csv(path: Path, pieces: Pieces, size: tuple[int, int]) -> None:
             file.writelines(f"{t},{x},{y},{p}\n" for t, x, y, p in rows)
 
 
-def write_npz(path: Path, pieces: Pieces, size: tuple[int, int]) -> None:
+def write_npz(path: Path, pieces: Pieces, size: WidthHeight) -> None:
     """Write the arrays t int64, x, y uint16, p uint8 and size (width, height)."""
     kinds = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8}
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".partial") as folder:
@@ -50,7 +51,7 @@ def write_npz(path: Path, pieces: Pieces, size: tuple[int, int]) -> None:
 
 
 def write_evreal(
-    path: Path, pieces: Pieces, size: tuple[int, int], frames: RecordedFrames | None = None
+    path: Path, pieces: Pieces, size: WidthHeight, frames: RecordedFrames | None = None
 ) -> None:
     """Write a folder as EVREAL reads one (evreal_folder.py), with the frames up to the first at or
     after the last event; the clock starts at 0 with the first event or frame."""
@@ -91,7 +92,7 @@ def _write_evreal_frames(path: Path, frames: RecordedFrames, zero_us: float) -> 
     np.save(path / "image_event_indices.npy", index.clip(0, len(t) - 1))
 
 
-def write_dsec(path: Path, pieces: Pieces, size: tuple[int, int]) -> None:
+def write_dsec(path: Path, pieces: Pieces, size: WidthHeight) -> None:
     """Write HDF5 as DSEC (Gehrig et al. 2021) has it: events/x, y, p, t (microseconds after
     t_offset), ms_to_idx (the first event at or after each millisecond), and the sensor's (height,
     width) as the attribute sensor_resolution."""

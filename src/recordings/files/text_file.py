@@ -8,25 +8,26 @@ may be the decimal point); polarity is 0 / 1, -1 / 1, True / False or ON / OFF.
 import re
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from numpy.lib.recfunctions import structured_to_unstructured
 
 from src.recordings.files.columns import (
     MAX_COORDINATE,
     as_integers,
-    check_unpacked_size,
+    check_unpacking_ratio,
     find_columns,
 )
 from src.recordings.files.event_file import (
-    PIECE_EVENTS,
     EventFile,
     RawEvents,
     RawFrames,
     ReadOptions,
+    name_file_in_errors,
 )
 from src.recordings.files.frame_files import find_listed_frames
+from src.recordings.files.numpy_file import slice_columns, slice_times
 from src.recordings.files.text_layout import (
     COMMENTS,
     MAX_LINE,
@@ -39,7 +40,9 @@ from src.recordings.files.text_layout import (
 )
 
 CHUNK = 2**22  # characters read at a time
-SPOOL = {"names": ["t", "x", "y", "p"], "offsets": [0, 8, 10, 12], "itemsize": 16}
+SPOOL = np.dtype(
+    [("whole_t", "i8"), ("float_t", "f8"), ("x", "u2"), ("y", "u2"), ("p", "i1")], align=True
+)
 
 
 class TextFile(EventFile):
@@ -51,28 +54,25 @@ class TextFile(EventFile):
 
     def __init__(self, path: Path, options: ReadOptions):
         self.path, self.notes = path, ()
-        with _named(path):
+        with name_file_in_errors(path, "cannot be read as text of events"):
             with open_text(path) as file:
                 self._layout = read_layout(file)
             self.size = self._layout.size
             names_hold = options.time_unit == "auto" and options.columns is None
             self.time_unit = self._layout.time_unit if names_hold else None
-            self._events = self._read(options)
+            self._columns = self._read(options)
 
     def pieces(self) -> Iterator[RawEvents]:
-        for first in range(0, len(self._events), PIECE_EVENTS):
-            piece = np.array(self._events[first : first + PIECE_EVENTS])
-            yield RawEvents(*(piece[name] for name in "txyp"))
+        yield from slice_columns(self.path, self._columns)
 
     def times(self) -> Iterator[np.ndarray]:
-        for first in range(0, len(self._events), PIECE_EVENTS):
-            yield np.array(self._events["t"][first : first + PIECE_EVENTS])
+        yield from slice_times(self.path, self._columns["t"])
 
     def frames(self) -> RawFrames | None:
         return find_listed_frames(self.path.parent / "images.txt")
 
-    def _read(self, options: ReadOptions) -> np.ndarray:
-        """Return all events, (n,) of t in the file's unit, x, y, p, as they stand in the file."""
+    def _read(self, options: ReadOptions) -> dict[str, np.ndarray]:
+        """Return the columns t, in the file's unit, x, y, p (n,), as they stand in the file."""
         places = self._layout.column_places if options.columns is None else None
         with _Spool() as spool:
             for block, number, is_last in self._blocks():
@@ -80,7 +80,9 @@ class TextFile(EventFile):
                 if not len(table):
                     continue
                 if places is None:
-                    places = find_columns(_as_floats(table), options.columns)
+                    places = find_columns(
+                        structured_to_unstructured(table, np.float64), options.columns
+                    )
                 spool.add(*(table[f"f{places[name]}"] for name in "txyp"))
             return spool.mapped()
 
@@ -92,7 +94,7 @@ class TextFile(EventFile):
                 file.readline(MAX_LINE)
             while chunk := file.read(CHUNK):
                 size += len(chunk)
-                check_unpacked_size(self.path, size)
+                check_unpacking_ratio(self.path, size)
                 if len(chunk) < CHUNK:  # the end: these are the last lines
                     break
                 body, newline, rest = (rest + chunk).rpartition("\n")
@@ -118,7 +120,6 @@ class TextFile(EventFile):
         raise ValueError(f"line {number + wrong + 1} is no event: {tidy[wrong][:40]!r}")
 
     def _find_broken(self, lines: list[str]) -> int:
-        """Return the place of the first line that is no event."""
         for place, line in enumerate(lines):
             words = split_line(line, self._layout.separator)
             if line and not (len(words) == self._layout.width and all(map(is_number, words))):
@@ -147,17 +148,12 @@ def _load(lines: list[str], layout: TextLayout, kind: type) -> np.ndarray:
     return np.loadtxt(lines, dtype, comments=None, delimiter=layout.separator, ndmin=1)
 
 
-def _as_floats(table: np.ndarray) -> np.ndarray:
-    return np.stack([table[name].astype(np.float64) for name in table.dtype.names or ()], 1)
-
-
 class _Spool:
     """Events in a temporary file; times are integers as long as all of them are."""
 
     def __init__(self) -> None:
         self.file = tempfile.TemporaryFile()  # noqa: SIM115 - closed by __exit__
-        self.kind: np.dtype = np.dtype(np.int64)
-        self.count = 0
+        self.times, self.count = "whole_t", 0
 
     def __enter__(self) -> "_Spool":
         return self
@@ -167,10 +163,12 @@ class _Spool:
 
     def add(self, t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> None:
         """Add columns; raises ValueError for a place or polarity that is none."""
-        if self.kind.kind == "i" and t.dtype.kind == "f":
-            self._use_float_times()
-        events = np.zeros(len(t), self._dtype())
-        events["t"] = t
+        events = np.zeros(len(t), SPOOL)
+        events["float_t"] = t
+        if t.dtype.kind == "f":
+            self.times = "float_t"
+        else:
+            events["whole_t"] = t
         for name, column in (("x", x), ("y", y)):
             values = as_integers(name, column)
             low, high = values.min(), values.max()
@@ -184,32 +182,10 @@ class _Spool:
         self.file.write(events.tobytes())
         self.count += len(events)
 
-    def mapped(self) -> np.ndarray:
-        """Return the events, (n,)."""
+    def mapped(self) -> dict[str, np.ndarray]:
+        """Return the columns t, x, y, p (n,) of the events."""
         self.file.flush()
-        if not self.count:
-            return np.empty(0, self._dtype())
-        return np.memmap(self.file, self._dtype(), "r", shape=(self.count,))  # type: ignore[call-overload]
-
-    def _dtype(self) -> np.dtype:
-        formats = [self.kind, np.uint16, np.uint16, np.int8]
-        return np.dtype({**SPOOL, "formats": formats})  # type: ignore[call-overload]
-
-    def _use_float_times(self) -> None:
-        before, self.kind = self.mapped(), np.dtype(np.float64)
-        self.file.close()
-        self.file, self.count = tempfile.TemporaryFile(), 0  # noqa: SIM115
-        for first in range(0, len(before), PIECE_EVENTS):
-            piece = before[first : first + PIECE_EVENTS]
-            self.add(piece["t"].astype(np.float64), piece["x"], piece["y"], piece["p"])
-
-
-@contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """Errors name the file."""
-    try:
-        yield
-    except (KeyboardInterrupt, MemoryError):
-        raise
-    except Exception as error:  # libraries raise all kinds on a broken file
-        raise ValueError(f"{path}: cannot be read as text of events: {error}") from error
+        events = (
+            np.memmap(self.file, SPOOL, "r", shape=self.count) if self.count else np.empty(0, SPOOL)
+        )
+        return {"t": events[self.times], **{name: events[name] for name in "xyp"}}

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from src.recordings.files.columns import find_columns_by_name, parse_unit_suffix
+from src.recordings.files.event_file import WidthHeight
 
 TEXT_ENDINGS = (".txt", ".csv", ".tsv")
 MAX_LINE = 2**23  # characters; a longer line is none of events
@@ -36,7 +37,7 @@ class TextLayout(NamedTuple):
     has_words: bool
     column_places: dict[str, int] | None
     time_unit: str | None
-    size: tuple[int, int] | None
+    size: WidthHeight | None
     header_lines: int
 
 
@@ -93,7 +94,7 @@ class _UpToCut(io.RawIOBase):
 
 def read_layout(file: io.TextIOBase) -> TextLayout:
     """Return how the lines are read, from those up to the first event."""
-    size: tuple[int, int] | None = None
+    size: WidthHeight | None = None
     names: list[str] | None = None
     strange: str | None = None
     for number in range(MAX_HEADER_LINES):
@@ -123,7 +124,7 @@ def read_layout(file: io.TextIOBase) -> TextLayout:
     raise ValueError(f"no line of numbers t x y p among the first {MAX_HEADER_LINES}")
 
 
-def _stated_size(line: str) -> tuple[int, int] | None:
+def _stated_size(line: str) -> WidthHeight | None:
     """Return (width, height) of `640 480`, `%geometry:640,480` or `t x@640 y@480 p`."""
     sides = dict(re.findall(r"\b([xy])@(\d+)", line))
     if len(sides) == 2:

@@ -52,15 +52,9 @@ class TimeSample:
         thousands = np.concatenate(self._values) * 1e3
         return bool(np.mean(np.abs(thousands - np.rint(thousands)) > 1e-3) >= 0.5)
 
-    def trimmed_span(self) -> float:
-        """Return the span of the times in the file's unit, less the first and last hundredth."""
-        return self._low_span()[1]
-
-    def early_time(self) -> float:
-        """Return an early time in the file's unit."""
-        return self._low_span()[0]
-
-    def _low_span(self) -> tuple[float, float]:
+    def early_time_and_span(self) -> tuple[float, float]:
+        """Return an early time and the span of the times, less the first and last hundredth, in the
+        file's unit."""
         values = np.concatenate(self._values) if self._values else np.zeros(0)
         values = values[np.isfinite(values)]
         if not len(values):
@@ -72,24 +66,43 @@ class TimeSample:
         return float(low), float(high - low) / 0.98
 
 
+class _Reading:
+    """What a file's times are in a unit: its duration, its event rate, whether they are dates."""
+
+    def __init__(self, sample: TimeSample, unit: str):
+        early_s, self.duration_s = (
+            value * UNITS_US[unit] * 1e-6 for value in sample.early_time_and_span()
+        )
+        self.rate_hz = sample.count / self.duration_s if self.duration_s else np.inf
+        self.is_date = EPOCH_S[0] < early_s < EPOCH_S[1]
+
+    def __str__(self) -> str:
+        return f"{self.duration_s:.3g} s and {self.rate_hz:.3g} events/s"
+
+    def points(self) -> float:
+        if not self.duration_s:
+            return 0.0
+        lost = _decades(self.duration_s, DURATION_S) + _decades(self.rate_hz, RATE_HZ)
+        return EPOCH * self.is_date - lost
+
+
 def find_unit(sample: TimeSample, stated: str) -> tuple[str, str]:
     """Return the unit (`stated`, where it is not auto), and what the user is told of it, or ""."""
+    is_auto = stated == "auto"
     if sample.count < FEW_TIMES:
-        return (("us" if sample.are_whole_numbers else "s") if stated == "auto" else stated), ""
-    span, losses = sample.trimmed_span(), PRIOR[sample.are_whole_numbers]
-    fine = FINE * sample.has_over_three_decimals()
-    points = {unit: _judge(sample, unit) - losses[unit] - fine * (unit != "s") for unit in UNITS_US}
+        return (("us" if sample.are_whole_numbers else "s") if is_auto else stated), ""
+    read = {unit: _Reading(sample, unit) for unit in UNITS_US}
+    losses, fine = PRIOR[sample.are_whole_numbers], FINE * sample.has_over_three_decimals()
+    points = {unit: read[unit].points() - losses[unit] - fine * (unit != "s") for unit in UNITS_US}
     best, second = sorted(points, key=lambda unit: -points[unit])[:2]
-    unit = best if stated == "auto" else stated
-    near = stated == "auto" and points[best] - points[second] < NEAR
-    duration_s = span * UNITS_US[unit] * 1e-6
-    rate_hz = sample.count / duration_s if duration_s else np.inf
-    unusual = stated == "auto" and losses[unit] > 0 and not _is_date(sample, unit)
-    absurd = _decades(duration_s, ABSURD_S) + _decades(rate_hz, ABSURD_HZ) > 0
-    if not (near or unusual or absurd):
+    unit = best if is_auto else stated
+    is_near = is_auto and points[best] - points[second] < NEAR
+    is_unusual = is_auto and losses[unit] > 0 and not read[unit].is_date
+    absurd = _decades(read[unit].duration_s, ABSURD_S) + _decades(read[unit].rate_hz, ABSURD_HZ)
+    if not (is_near or is_unusual or absurd > 0):
         return unit, ""
     other = second if unit == best else best
-    seen = f"times in {unit} give {_describe(sample, unit)}, in {other} {_describe(sample, other)}"
+    seen = f"times in {unit} give {read[unit]}, in {other} {read[other]}"
     return unit, f"{seen}: read as {unit}; if it is another, give time_unit=s, ms, us or ns"
 
 
@@ -112,26 +125,8 @@ def to_us(t: np.ndarray, unit: str) -> np.ndarray:
     return t if unit == "us" else t * int(UNITS_US[unit])
 
 
-def _judge(sample: TimeSample, unit: str) -> float:
-    duration_s = sample.trimmed_span() * UNITS_US[unit] * 1e-6
-    if not duration_s:
-        return 0.0
-    points = -_decades(duration_s, DURATION_S) - _decades(sample.count / duration_s, RATE_HZ)
-    return points + EPOCH * _is_date(sample, unit)
-
-
-def _is_date(sample: TimeSample, unit: str) -> bool:
-    return EPOCH_S[0] < sample.early_time() * UNITS_US[unit] * 1e-6 < EPOCH_S[1]
-
-
 def _decades(value: float, allowed: Range) -> float:
     """Return by how many factors of ten a value is outside."""
     if not 0 < value < np.inf:
         return np.inf
     return float(max(0.0, np.log10(allowed[0] / value), np.log10(value / allowed[1])))
-
-
-def _describe(sample: TimeSample, unit: str) -> str:
-    duration_s = sample.trimmed_span() * UNITS_US[unit] * 1e-6
-    rate = sample.count / duration_s if duration_s else np.inf
-    return f"{duration_s:.3g} s and {rate:.3g} events/s"

@@ -11,7 +11,8 @@ import h5py
 import numpy as np
 from jaxtyping import Float
 
-from src.recordings.files.hdf5_file import check_no_external_data
+from src.recordings.files.event_file import name_file_in_errors
+from src.recordings.files.hdf5_file import check_hdf5_safety
 from src.sim.scenes.video_decoding import LARGEST_PIXELS
 from src.sim.scenes.video_files import PICTURE_SUFFIXES, read_picture
 from src.sim.scenes.video_index import index_video
@@ -65,19 +66,16 @@ def _frames(path: Path, config_key: str, max_frames: int | None) -> Iterator[np.
             yield from (frame.astype(np.float32) / 255 for frame in frames)
     else:
         index = index_video(path, config_key, max_frames)
-        for frame in index.read(0, len(index.shown_frames), config_key):
+        for frame in index.read(0, len(index.constant_rate_frames), config_key):
             yield frame.astype(np.float32) / 255
 
 
 @contextmanager
 def _opened_h5(path: Path) -> Iterator[h5py.File]:
     """Open our `video.h5`; errors in the block are ValueErrors that name it."""
-    try:
-        with h5py.File(path) as file:
-            check_no_external_data(file)
-            yield file
-    except Exception as error:  # HDF5 raises all kinds on a broken file
-        raise ValueError(f"{path}: cannot be read as a video: {error}") from error
+    with name_file_in_errors(path, "cannot be read as a video"), h5py.File(path) as file:
+        check_hdf5_safety(file)
+        yield file
 
 
 def read_gray_picture(path: Path) -> Float[np.ndarray, "h w"]:

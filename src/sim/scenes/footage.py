@@ -46,7 +46,7 @@ class Footage(SceneBase):
     root: str | None = field(default=None, kw_only=False)
     footage_fps: float = 120.0
     disjoint_splits: bool = True
-    min_scale: ClassVar[float] = 1.0
+    min_footage_px_per_px: ClassVar[float] = 1.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -91,9 +91,9 @@ class Footage(SceneBase):
 
     def _fit(self, picture: NDArray) -> NDArray[np.float32]:
         """Return the middle of a picture, (h, w) in [0, 1], as much of it as fits; raises
-        ValueError where a pixel would be less than `min_scale` of the picture's.
+        ValueError where a pixel would be less than `min_footage_px_per_px` of the picture's.
         """
-        (tall, wide), (height, width), least = picture.shape, self.size, self.min_scale
+        (tall, wide), (height, width), least = picture.shape, self.size, self.min_footage_px_per_px
         scale = min(tall / height, wide / width)
         if scale < least:
             sides = f"{math.ceil(width * least)}x{math.ceil(height * least)} px or more"
@@ -117,7 +117,7 @@ class Reds(Footage):
 
     footage_fps: float = field(default=REDS_FPS, init=False)
     disjoint_splits: bool = field(default=True, init=False)
-    min_scale: ClassVar[float] = 0.5
+    min_footage_px_per_px: ClassVar[float] = 0.5
 
     def _find_segments(self, root: Path, span: int) -> list[Segment]:
         if span >= REDS_FRAMES:

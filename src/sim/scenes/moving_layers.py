@@ -30,45 +30,39 @@ class SimilarityMotion:
         """Stay as it is at t = 0."""
         self.drift, self.amplitude = 0 * self.drift, 0 * self.amplitude
 
-    def pose_at(self, time_s: float) -> tuple[NDArray, float, float]:
+    def shift_angle_log_zoom(self, time_s: float) -> tuple[NDArray, float, float]:
         """Return the shift (x, y) in frame widths, the angle in rad and the logarithm of zoom."""
         wave = self.amplitude * (np.sin(self.pace * time_s + self.phase) - np.sin(self.phase))
         return self.drift * time_s + wave[:2], self.angle + wave[2], wave[3]
 
 
-class RestSchedule:
-    """A clip's way through its motion: in spells with rests between, until it stops, or never."""
-
-    def __init__(self, rng: np.random.Generator):
-        self.kind = ("pauses", "stops", "never")[rng.integers(3)]
-        self.moving_s, self.resting_s = rng.uniform(*MOVING_S), rng.uniform(*RESTING_S)
-        self.phase_s = rng.uniform(0, self.moving_s + self.resting_s)
-        self.stop_s = rng.uniform(*STOP_S)
-
-    def motion_time_s(self, time_s: float) -> float:
-        """Return how long the clip has moved by `time_s`."""
-        if self.kind == "never":
-            return 0.0
-        if self.kind == "stops":
-            return min(time_s, self.stop_s)
-        return self._moved(self.phase_s + time_s) - self._moved(self.phase_s)
-
-    def _moved(self, time_s: float) -> float:
-        spells, rest = divmod(time_s, self.moving_s + self.resting_s)
-        return spells * self.moving_s + min(rest, self.moving_s)
+def draw_motion_times_s(
+    rng: np.random.Generator, times_s: Float[np.ndarray, " frames"]
+) -> Float[np.ndarray, " frames"]:
+    """Return how long a clip that rests has moved by `times_s`: a third of the clips move in spells
+    with rests between, a third until they stop, a third never.
+    """
+    kind, moving_s, resting_s = rng.integers(3), rng.uniform(*MOVING_S), rng.uniform(*RESTING_S)
+    phase_s, stop_s = rng.uniform(0, moving_s + resting_s), rng.uniform(*STOP_S)
+    if kind > 0:
+        return np.minimum(times_s, stop_s if kind == 1 else 0)
+    spells, rest = np.divmod(phase_s + np.append(0, times_s), moving_s + resting_s)
+    moved = spells * moving_s + np.minimum(rest, moving_s)
+    return moved[1:] - moved[0]
 
 
 @dataclass(frozen=True)
 class MovingLayer:
-    """A `picture`, and a `mask` where it is a cut-out; `centre`: the picture's point in the middle
-    of the frame at t = 0; `zoom`: picture pixels per frame pixel; `reenters`: it turns about its
-    own middle and, once it has left the frame on one side, comes in on the other.
+    """A `picture`, and a `mask` where it is a cut-out; `frame_centre_in_picture`: its point (x, y)
+    in the middle of the frame at t = 0, in its pixels; `picture_px_per_px` of the frame;
+    `reenters`: it turns about its own middle and, once it has left the frame on one side, comes in
+    on the other.
     """
 
     picture: NDArray
     mask: NDArray | None
-    centre: NDArray
-    zoom: float
+    frame_centre_in_picture: NDArray
+    picture_px_per_px: float
     motion: SimilarityMotion
     reenters: bool = False
 
@@ -76,16 +70,18 @@ class MovingLayer:
         self, time_s: float, size: tuple[int, int]
     ) -> Float[np.ndarray, "2 3"]:
         """Return the map from frame pixels (x, y) to picture pixels."""
-        (height, width), (shift, angle, log_zoom) = size, self.motion.pose_at(time_s)
+        (height, width), scale = size, self.picture_px_per_px
+        shift, angle, log_zoom = self.motion.shift_angle_log_zoom(time_s)
         cos, sin = math.cos(angle), math.sin(angle)
-        turn = self.zoom * math.exp(log_zoom) * np.array([[cos, -sin], [sin, cos]])
+        turn = scale * math.exp(log_zoom) * np.array([[cos, -sin], [sin, cos]])
+        start = self.frame_centre_in_picture
         middle = np.array([(width - 1) / 2, (height - 1) / 2])
         if not self.reenters:
-            return np.column_stack([turn, self.centre - shift * width * self.zoom - turn @ middle])
+            return np.column_stack([turn, start - shift * width * scale - turn @ middle])
         own = np.array(self.picture.shape[::-1]) / 2
         reach = max(self.picture.shape) / np.linalg.norm(turn[0])  # half of it is beyond the edge
         period = np.array([width, height]) + reach
-        place = (own - self.centre) / self.zoom + shift * width + period / 2
+        place = (own - start) / scale + shift * width + period / 2
         return np.column_stack([turn, own - turn @ (place % period - period / 2 + middle)])
 
 
@@ -106,12 +102,12 @@ def render_frame(
     return frame
 
 
-def blur_for_sampling(picture: NDArray, zoom: float) -> NDArray:
-    """Return float32 in [0, 1], blurred for sampling every `zoom` pixels without aliasing, and so
-    that the bilinear interpolation does not flicker as the picture moves.
+def blur_for_sampling(picture: NDArray, step_px: float) -> NDArray:
+    """Return float32 in [0, 1], blurred for sampling every `step_px` without aliasing, and so that
+    the bilinear interpolation does not flicker as the picture moves.
     """
     scale = 255 if picture.dtype == np.uint8 else 1
-    return cv2.GaussianBlur(picture.astype(np.float32) / scale, (0, 0), max(0.6, 0.5 * zoom))
+    return cv2.GaussianBlur(picture.astype(np.float32) / scale, (0, 0), max(0.6, 0.5 * step_px))
 
 
 def random_outline_mask(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray:

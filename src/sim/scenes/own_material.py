@@ -43,12 +43,12 @@ class OwnClip:
         return self.frames.shape[1], self.frames.shape[2]
 
     def interpolate_frames(
-        self, first: int, stop: int, substeps: int
+        self, first_substep: int, stop_substep: int, substeps: int
     ) -> Float[Tensor, "count h w"]:
-        """Return frames first .. stop - 1 of the clip at `substeps` times its rate, float32: linear
-        blends between two frames.
+        """Return frames first_substep .. stop_substep - 1 of the clip at `substeps` times its rate,
+        float32: linear blends between two frames.
         """
-        before, rest = np.divmod(np.arange(first, stop), substeps)
+        before, rest = np.divmod(np.arange(first_substep, stop_substep), substeps)
         share = (rest / substeps).astype(np.float32)[:, None, None]
         one, next_one = (
             self.frames[np.minimum(at, len(self.frames) - 1)].astype(np.float32)
@@ -109,25 +109,14 @@ def read_photograph(
         raise ValueError(f"photo must be a picture that can be read (a film: video=), got {path}")
     facts = f"photograph of {picture.shape[1]}x{picture.shape[0]} px"
     values = _shrink(scale_to_white(picture, white_level), longest_side_px)
-    clip = hold_photograph(values, fps or 120.0, seconds, facts)
+    fps = fps or 120.0
+    frames = _hold(values, fps, seconds)
     if not 0 <= speed_widths_per_s < math.inf:
         raise ValueError(f"speed_widths_per_s must be >= 0, got {speed_widths_per_s}")
-    frames = clip.frames
     if speed_widths_per_s:
-        frames = _move(frames[0], len(frames), clip.fps, speed_widths_per_s, seed)
+        frames = _move(values, len(frames), fps, speed_widths_per_s, seed)
     _warn_of_darkness(path, picture.dtype, float(picture.max()), white_level)
-    return OwnClip(Path(path).stem, frames, clip.fps, facts)
-
-
-def hold_photograph(
-    picture: Float[np.ndarray, "h w"], fps: float, seconds: float, source: str
-) -> OwnClip:
-    """Return a picture that stands still for `seconds` at `fps`."""
-    _check_rate(fps)
-    if not (isinstance(seconds, int | float) and 2 / fps <= seconds < 1e6):
-        raise ValueError(f"seconds must be {2 / fps:.4g} (two frames) or more, got {seconds}")
-    count = round(seconds * fps) + 1
-    return OwnClip("photograph", np.broadcast_to(picture, (count, *picture.shape)), fps, source)
+    return OwnClip(Path(path).stem, frames, fps, facts)
 
 
 def clip_from_array(
@@ -150,7 +139,9 @@ def clip_from_array(
     facts = "x".join(map(str, array.shape[:-3:-1])) + " px"
     array = scale_to_white(array, white_level)
     if array.ndim == 2:
-        return hold_photograph(_shrink(array, longest_side_px), fps or 120.0, seconds, facts)
+        fps = fps or 120.0
+        frames = _hold(_shrink(array, longest_side_px), fps, seconds)
+        return OwnClip("photograph", frames, fps, facts)
     if fps is None:
         raise ValueError("fps must be given for an array of frames, frames a second")
     _check_rate(fps)
@@ -164,10 +155,8 @@ def _find_one_video(path: Path) -> VideoSource:
     try:
         videos = find_videos(path, "video")
     except ValueError as error:
-        hint = (
-            "; a photograph is photo=" if path.is_file() and read_picture(path) is not None else ""
-        )
-        raise ValueError(f"{error}{hint}") from None
+        is_picture = path.is_file() and read_picture(path) is not None
+        raise ValueError(f"{error}{'; a photograph is photo=' * is_picture}") from None
     if len(videos) != 1:
         raise ValueError(f"video must be one video or one folder of frames, got {path}")
     return videos[0]
@@ -176,6 +165,14 @@ def _find_one_video(path: Path) -> VideoSource:
 def _check_rate(fps: float) -> None:
     if not 0.1 <= fps <= 1e6:
         raise ValueError(f"fps must be in [0.1, 1e6] frames a second, got {fps}")
+
+
+def _hold(picture: NDArray, fps: float, seconds: float) -> Float[np.ndarray, "frames h w"]:
+    """Return the frames of a picture that stands still for `seconds` at `fps`."""
+    _check_rate(fps)
+    if not (isinstance(seconds, int | float) and 2 / fps <= seconds < 1e6):
+        raise ValueError(f"seconds must be {2 / fps:.4g} (two frames) or more, got {seconds}")
+    return np.broadcast_to(picture, (round(seconds * fps) + 1, *picture.shape))
 
 
 def scale_to_white(
@@ -229,5 +226,4 @@ def _move(
     motion.angle = 0.0  # upright at the start
     centre = np.array([(side - 1) / 2 for side in picture.shape[::-1]])
     layer = MovingLayer(picture, None, centre, 1.0, motion)
-    size = picture.shape[0], picture.shape[1]
-    return np.stack([render_frame([layer], k / fps, size) for k in range(count)])
+    return np.stack([render_frame([layer], k / fps, picture.shape) for k in range(count)])

@@ -16,7 +16,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import cv2
-from numpy.typing import NDArray
+import numpy as np
+from jaxtyping import UInt8
 from safetensors import SafetensorError, safe_open
 
 from src.sim.scenes.clip import check_split
@@ -76,15 +77,16 @@ def list_photographs(root: Root, split: str) -> list[Photograph]:
     return [photo for one in _roots("root", root) for photo in _share(one, split)]
 
 
-def list_train_only_photographs(extra_train_root: Root, root: Root) -> list[Photograph]:
+def list_train_only_photographs(extra_train_root: Root, scene_root: Root) -> list[Photograph]:
     """Return the photographs that serve training only: all of a folder, of a pack its share.
 
     Raises ValueError where there are none, and where one of the two is within the other, as what
-    `root` keeps for validation and test would be trained on.
+    `scene_root` keeps for validation and test would be trained on.
     """
     if extra_train_root is None:
         return []
-    places = [] if root is None else [one.resolve() for one in _roots("root", root)]
+    other = [] if scene_root is None else _roots("root", scene_root)
+    places = [one.resolve() for one in other]
     found: list[Photograph] = []
     for one in _roots("extra_train_root", extra_train_root):
         here = one.resolve()
@@ -114,7 +116,7 @@ def open_photo_pack(path: Path) -> tuple[Any, dict[str, dict[str, list]]]:
 
 
 @lru_cache(maxsize=512)
-def read_photograph(photo: Photograph) -> NDArray:
+def decode_photograph(photo: Photograph) -> UInt8[np.ndarray, "h w"]:
     """Return a photograph's luminance as uint8, at most LARGEST_SIDE long.
 
     Raises ValueError for one that cannot be read or is damaged, and for a side below 16 px.

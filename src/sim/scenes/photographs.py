@@ -13,17 +13,17 @@ from src.sim import noise
 from src.sim.scenes.clip import Clip, SceneBase
 from src.sim.scenes.moving_layers import (
     MovingLayer,
-    RestSchedule,
     SimilarityMotion,
     blur_for_sampling,
+    draw_motion_times_s,
     random_outline_mask,
     render_frame,
 )
 from src.sim.scenes.photo_files import (
     Root,
+    decode_photograph,
     list_photographs,
     list_train_only_photographs,
-    read_photograph,
 )
 
 REFERENCE_WIDTH = 256  # of the frame that `photo_px_per_px` speaks of
@@ -63,10 +63,14 @@ class PhotographScene(SceneBase):
         motion = SimilarityMotion(rng, speed_widths_per_s)
         return MovingLayer(blur_for_sampling(photo, zoom), None, centre, zoom, motion)
 
+    def read_random_photograph(self, rng: np.random.Generator) -> tuple[str, NDArray]:
+        """Return the name of a photograph and its pixels, uint8 (h, w)."""
+        photo = self.photos[rng.integers(len(self.photos))]
+        return photo.stem, decode_photograph(photo)
+
     def motion_times_s(self, rests: bool, rng: np.random.Generator) -> list[float]:
         """Return how long the clip has moved at every frame, with rests or without."""
-        times = self.times_s.tolist()
-        return list(map(RestSchedule(rng).motion_time_s, times)) if rests else times
+        return (draw_motion_times_s(rng, self.times_s) if rests else self.times_s).tolist()
 
 
 @dataclass(kw_only=True, eq=False)
@@ -91,8 +95,8 @@ class Photographs(PhotographScene):
         rng_rests = np.random.default_rng(noise.key(key, "tempo"))  # `rng` draws as without rests
         shares = self.static_camera_share, self.paused_clip_share
         static, rests = (rng_rests.uniform(size=2) < shares).tolist()
-        name, picture = self._read_random_photo(rng)
-        layers = [self.background_layer(picture, rng, self.speed_widths_per_s)]
+        name, photo = self.read_random_photograph(rng)
+        layers = [self.background_layer(photo, rng, self.speed_widths_per_s)]
         if static:
             layers[0].motion.stop()
         objects = max(int(rng.integers(self.max_cutouts + 1)), int(static and self.max_cutouts > 0))
@@ -103,12 +107,8 @@ class Photographs(PhotographScene):
         frames = np.clip(0.5 + offset + gain * (frames - 0.5), 0, 1).astype(np.float32)
         return Clip(torch.from_numpy(frames), self.fps, f"{name}-{index}")
 
-    def _read_random_photo(self, rng: np.random.Generator) -> tuple[str, NDArray]:
-        photo = self.photos[rng.integers(len(self.photos))]
-        return photo.stem, read_photograph(photo)
-
     def _cutout_layer(self, rng: np.random.Generator) -> MovingLayer:
-        _, photo = self._read_random_photo(rng)
+        _, photo = self.read_random_photograph(rng)
         top, left = (rng.integers(max(1, n - CUTOUT_SIDE)) for n in photo.shape)
         texture = photo[top : top + CUTOUT_SIDE, left : left + CUTOUT_SIDE]
         low, high = self.cutout_widths

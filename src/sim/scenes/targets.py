@@ -52,9 +52,8 @@ def checkerboard(canvas: Canvas, rng: Rng, *, squares=8.0, speed_px_per_s=0.0) -
     def draw(time):
         x = x0 + speed_px_per_s * math.cos(heading) * time
         y = y0 + speed_px_per_s * math.sin(heading) * time
-        across = antialiased_stripes(canvas.x[0] - x, pitch)
-        down = antialiased_stripes(canvas.y[:, 0] - y, pitch)
-        board = 0.5 + 0.5 * down[:, None] * across
+        across = antialiased_square_wave(canvas.x[:1] - x, pitch)
+        board = 0.5 + 0.5 * antialiased_square_wave(canvas.y[:, :1] - y, pitch) * across
         return board, np.ones_like(board), (x, y)
 
     return draw
@@ -85,8 +84,7 @@ def spinning_stripe(
     def draw(time):
         angle = start + TURN * turns_per_s * time
         along, across = to_body_coordinates(*canvas.relative_to(*canvas.centre), angle)
-        ends, sides = length / 2 - abs(along), width / 2 - abs(across)
-        shape = edge_coverage(ends) * edge_coverage(sides)
+        shape = edge_coverage(length / 2 - abs(along)) * edge_coverage(width / 2 - abs(across))
         return shape, shape, point_at(canvas.centre, length / 2, angle)
 
     return draw
@@ -127,7 +125,7 @@ def bouncing_ball(
         y = floor - height * (1 - (2 * ((phase + bounces_per_s * time) % 1) - 1) ** 2)
         along, _ = to_body_coordinates(*canvas.relative_to(x, y), angle + speed * time / radius)
         ball = disc_coverage(*canvas.relative_to(x, y), radius)
-        return (0.7 + 0.3 * antialiased_stripes(along, radius / 2)) * ball, ball, (x, y)
+        return (0.7 + 0.3 * antialiased_square_wave(along, radius / 2)) * ball, ball, (x, y)
 
     return draw
 
@@ -246,13 +244,13 @@ def disc_coverage(x: Map, y: Map, radius: float) -> Map:
     return edge_coverage(radius - np.hypot(x, y))
 
 
-def antialiased_stripes(place: Map, width: float) -> Map:
-    """Return the mean over a pixel of stripes of +1 (from 0 on) and -1, each `width` wide; exact
-    where the stripes run along rows or columns.
+def antialiased_square_wave(place: Map, half_period: float) -> Map:
+    """Return the mean over a pixel of stripes of +1 (from 0 on) and -1, each `half_period` wide;
+    exact where the stripes run along rows or columns.
     """
 
     def integral(x: Map) -> Map:
-        return width - abs(x % (2 * width) - width)
+        return half_period - abs(x % (2 * half_period) - half_period)
 
     return integral(place + 0.5) - integral(place - 0.5)
 

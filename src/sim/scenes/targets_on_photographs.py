@@ -13,7 +13,6 @@ from src.sim import noise
 from src.sim.checks import is_range
 from src.sim.scenes.clip import Clip
 from src.sim.scenes.moving_layers import render_frame
-from src.sim.scenes.photo_files import read_photograph
 from src.sim.scenes.photographs import PhotographScene
 from src.sim.scenes.targets import TARGETS, Canvas, DrawFunction, check_arguments
 
@@ -55,8 +54,8 @@ class TargetsOnPhotographs(PhotographScene):
 
     def clip(self, index: int) -> Clip:
         rng = np.random.default_rng(noise.key(self.seed, self.split, "on photographs", index))
-        photo = self.photos[rng.integers(len(self.photos))]
-        layer = self.background_layer(read_photograph(photo), rng, (1.0, 1.0))
+        name, photo = self.read_random_photograph(rng)
+        layer = self.background_layer(photo, rng, (1.0, 1.0))
         background = render_frame([layer], 0.0, self.size)
         targets = [self._draw_target(rng) for _ in range(rng.integers(1, self.max_targets + 1))]
         frames = []
@@ -67,7 +66,7 @@ class TargetsOnPhotographs(PhotographScene):
                 frame += cover * (dim - frame) + (bright - dim) * shape
             frames.append(frame)
         clipped = np.clip(np.stack(frames), 0, 1).astype(np.float32)
-        return Clip(torch.from_numpy(clipped), self.fps, f"targets-{photo.stem}-{index}")
+        return Clip(torch.from_numpy(clipped), self.fps, f"targets-{name}-{index}")
 
     def _draw_target(self, rng: np.random.Generator) -> tuple[DrawFunction, float, float]:
         """Return a target's drawing, and the grey levels it has where it is dim and bright."""

@@ -1,7 +1,7 @@
 """Frames of a video file, decoded with FFmpeg (PyAV) up to its first fault; grey as OpenCV's."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -48,21 +48,17 @@ def decode_frames(container: Any, stream: Any) -> Iterator[Any]:
     first is left out.  Raises DamagedVideo at the first fault after it.
     """
     some = False
-    for packet in _packets(container, stream):
-        frames, fault = _decode_packet(packet)
-        for frame in frames:
-            if frame.is_corrupt and some:
-                raise DamagedVideo("a frame has errors")
-            if not frame.is_corrupt:
-                some = True
-                yield frame
-        if fault and some:
-            raise DamagedVideo(fault)
-
-
-def _packets(container: Any, stream: Any) -> Iterator[Any]:
     try:
-        yield from container.demux(stream)
+        for packet in container.demux(stream):
+            frames, fault = _decode_packet(packet)
+            for frame in frames:
+                if frame.is_corrupt and some:
+                    raise DamagedVideo("a frame has errors")
+                if not frame.is_corrupt:
+                    some = True
+                    yield frame
+            if fault and some:
+                raise DamagedVideo(fault)
     except av.FFmpegError as error:
         raise DamagedVideo(error.strerror) from error
 
@@ -77,14 +73,11 @@ def _decode_packet(packet: Any) -> tuple[list, str]:
         return [], str(error.strerror)
 
 
-class GrayConverter:
-    """Turns frames into grey pictures, uint8 (h, w), upright, as OpenCV does: by way of BGR."""
-
-    def __init__(self) -> None:
-        self.reformatter = VideoReformatter()
-
-    def __call__(self, frame: Any) -> Gray:
-        bgr = self.reformatter.reformat(frame, format="bgr24", interpolation=Interpolation.BICUBIC)
+def convert_to_gray(frames: Iterable[Any]) -> Iterator[Gray]:
+    """Yield grey pictures, uint8 (h, w), upright, as OpenCV does: by way of BGR."""
+    to_bgr = VideoReformatter().reformat  # one for all frames keeps its tables
+    for frame in frames:
+        bgr = to_bgr(frame, format="bgr24", interpolation=Interpolation.BICUBIC)
         gray = cv2.cvtColor(bgr.to_ndarray(), cv2.COLOR_BGR2GRAY)
         turn = TURNS.get(round(frame.rotation))
-        return gray if turn is None else cv2.rotate(gray, turn)
+        yield gray if turn is None else cv2.rotate(gray, turn)

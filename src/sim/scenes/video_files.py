@@ -87,7 +87,7 @@ def _folder_sources(path: Path, config_key: str) -> list[VideoSource]:
 
 def _file_source(path: Path, config_key: str) -> VideoSource:
     index = index_video(path, config_key)
-    count = len(index.shown_frames)
+    count = len(index.constant_rate_frames)
     if count < 2:
         raise ValueError(
             f"{config_key} must be a video of two frames or more, got {count} in {path}"

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from src.sim.scenes.video_decoding import (
     DamagedVideo,
     Gray,
-    GrayConverter,
+    convert_to_gray,
     decode_frames,
     open_video,
 )
@@ -38,22 +38,22 @@ RATE_ERROR = 0.01  # of the rate that a file states; else it is measured
 class VideoIndex:
     """The frames of a video file.
 
-    `times`: of its whole frames, in ticks of the file, none where it has no usable ones;
-    `keyframes`: their numbers.  `shown_frames`: the number of the whole frame that each frame of
-    the video at the constant rate `fps` (None: unknown) shows.
+    `times_ticks`: of its whole frames, in ticks of the file, none where it has no usable ones;
+    `keyframes`: their numbers.  `constant_rate_frames`: the number of the whole frame that each
+    frame of the video at the constant rate `fps` (None: unknown) shows.
     """
 
     path: Path
-    times: Int[np.ndarray, " frames"]
+    times_ticks: Int[np.ndarray, " frames"]
     keyframes: Int[np.ndarray, " keys"]
-    shown_frames: Int[np.ndarray, " count"]
+    constant_rate_frames: Int[np.ndarray, " count"]
     fps: float | None
 
     def read(self, first: int, stop: int, config_key: str) -> Iterator[Gray]:
         """Yield frames first .. stop - 1; raises ValueError, which names `config_key`, for a
         file that is another one by now.
         """
-        wanted = self.shown_frames[first:stop]
+        wanted = self.constant_rate_frames[first:stop]
         if not len(wanted):
             return
         frames = self._read_whole(int(wanted[0]), config_key)
@@ -65,13 +65,13 @@ class VideoIndex:
 
     def _read_whole(self, first: int, config_key: str) -> Iterator[Gray]:
         """Yield the whole frames from `first` on, by way of the key frame before it."""
-        before = self.keyframes[self.keyframes <= first] if len(self.times) else self.keyframes[:0]
-        for start in dict.fromkeys([*before[-1:].tolist(), 0]):
+        before = self.keyframes[self.keyframes <= first].tolist() if len(self.times_ticks) else []
+        for start in dict.fromkeys([*before[-1:], 0]):
             with open_video(self.path, config_key) as (container, stream):
                 frames = self._enter(container, stream, start, first)
                 if frames is not None:
                     with suppress(DamagedVideo):
-                        yield from map(GrayConverter(), frames)
+                        yield from convert_to_gray(frames)
                     break
         raise ValueError(f"{config_key} must not change while it is read, got {self.path}")
 
@@ -83,15 +83,15 @@ class VideoIndex:
         if start == 0:
             return islice(frames, first, None)
         try:
-            container.seek(int(self.times[start]), stream=stream)
-            found = next(frame for frame in frames if frame.pts >= self.times[start])
+            container.seek(int(self.times_ticks[start]), stream=stream)
+            found = next(frame for frame in frames if frame.pts >= self.times_ticks[start])
             for number in range(start, first):
-                if found.pts != self.times[number]:
+                if found.pts != self.times_ticks[number]:
                     return None
                 found = next(frames)
         except (av.FFmpegError, DamagedVideo, StopIteration, TypeError):
             return None
-        return chain([found], frames) if found.pts == self.times[first] else None
+        return chain([found], frames) if found.pts == self.times_ticks[first] else None
 
 
 def index_video(path: Path, config_key: str, max_frames: int | None = None) -> VideoIndex:
@@ -113,7 +113,7 @@ def _index(path: Path, config_key: str, max_frames: int | None, *version: int) -
     with open_video(path, config_key) as (container, stream):
         times, keys, fault = _list_frames(container, stream, path, config_key, max_frames)
         known = None not in times and bool(np.all(np.diff(np.array(times, float)) > 0))
-        ticks, count = _numbers(times if known else []), len(times)
+        ticks, count = np.array(times if known else [], np.int64), len(times)
         shown, fps, uneven = _at_constant_rate(ticks, count, stream)
         if not fault and max_frames is None and _ends_early(ticks, count, fps, container, stream):
             fault = "it ends before its stated end"
@@ -133,7 +133,7 @@ def _index(path: Path, config_key: str, max_frames: int | None, *version: int) -
     if uneven:
         message = f"{path} has a variable frame rate: its {count} frames are brought to "
         warnings.warn(f"{message}{fps:.6g} frames/s by their time stamps", stacklevel=3)
-    return VideoIndex(path, ticks, _numbers(keys), shown, fps)
+    return VideoIndex(path, ticks, np.array(keys, np.int64), shown, fps)
 
 
 def _list_frames(
@@ -170,10 +170,6 @@ def _find_hole_at_end(ticks: NDArray[np.int64]) -> int:
         return len(ticks)
     holes = np.flatnonzero(gaps[-REORDERED:] > 1.5 * np.median(gaps))
     return len(gaps[:-REORDERED]) + int(holes[0]) + 1 if len(holes) else len(ticks)
-
-
-def _numbers(values: list) -> NDArray[np.int64]:
-    return np.array(values, np.int64)
 
 
 def _at_constant_rate(

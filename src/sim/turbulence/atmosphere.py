@@ -154,8 +154,7 @@ class Atmosphere:
     def with_d_over_r0(self, d_over_r0: float) -> "Atmosphere":
         """Return the same path and camera with Cn2 scaled to give `d_over_r0`."""
         check_option(0 <= d_over_r0 < math.inf, "atmosphere.d_over_r0", ">= 0", d_over_r0)
-        unit = replace(self, cn2=tuple(value or 0.0 for value in self.cn2_profile))
-        scale = (d_over_r0 / unit.d_over_r0) ** (5 / 3)
+        scale = (d_over_r0 / self.d_over_r0) ** (5 / 3)
         return replace(self, cn2=tuple(value * scale for value in self.cn2_profile))
 
     def _variance_ratio(self, modes: str) -> float:

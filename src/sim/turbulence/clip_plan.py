@@ -102,8 +102,9 @@ def plan_tile(
     if psf_grid[1].pitch > 1:
         tables["psf_across"] = psf_grid[1].interpolation_matrix().T
     names = "halo_rows", "halo_columns", "halo_spectrum"
-    tables |= zip(names, halo.transform(frame_size, tile), strict=True)
-    network = psfs.network.merge_into_few_matrices(len(response) - 2, psfs.d_over_r0)
+    tables |= zip(names, halo.sources_and_spectrum(frame_size, tile), strict=True)
+    strength = fidelity.blur_equivalent_d_over_r0
+    network = psfs.network.merge_into_few_matrices(len(response) - 2, strength)
     tables |= {"basis": psfs.basis.flatten(1).T} | network._asdict()
     packed, drawn = PackedTensors(tables), amplitudes.flatten(0, 1)
     return TilePlan(tile, drawn, packed, psf_grid, fidelity, psfs, halo.share)

@@ -23,7 +23,7 @@ from src.sim.turbulence.clip_plan import TilePlan
 from src.sim.turbulence.coefficient_grid import WaveSum, evaluate_waves, sum_waves
 from src.sim.turbulence.engines import device as devices
 from src.sim.turbulence.engines.network_numba import evaluate_psf_network
-from src.sim.turbulence.engines.scatter_numba import scatter_psfs
+from src.sim.turbulence.engines.scatter_numba import scatter_normalised
 from src.sim.turbulence.engines.warp_numba import PaddedFrames, pad_frames, warp_frames
 from src.sim.turbulence.p2s import FoldedNetwork
 from src.sim.turbulence.psf import convolve_halo
@@ -51,7 +51,7 @@ def render_views(
     return out.unflatten(0, (-1, len(frames)))
 
 
-def render_tilt(plans: Sequence[TilePlan], frames: int) -> Float[Tensor, "views frames 2 h w"]:
+def render_tilt(plans: Sequence[TilePlan], frames: int) -> Float[Tensor, "views frames xy=2 h w"]:
     """Return the displacement (x, y) in pixels in the plans' tiles, on the CPU."""
     views = len(plans[0].amplitudes) // frames
     out, parts = _allocate_tiles(plans, torch.empty(0), views, frames, 2)
@@ -60,7 +60,7 @@ def render_tilt(plans: Sequence[TilePlan], frames: int) -> Float[Tensor, "views 
         sum_tilt = _make_wave_sum(tables, "tilt", 0, on_cpu=True)
         y, x = (slice(reach, reach + size) for size in plan.tile[2:])
         for view, drawn in enumerate(plan.amplitudes.cpu().split(frames)):
-            part[view] = _tilt(plan, tables, sum_tilt(drawn))[..., y, x].transpose(0, 1)
+            part[view] = _interpolate_tilt(plan, tables, sum_tilt(drawn))[..., y, x].transpose(0, 1)
     return out
 
 
@@ -87,7 +87,7 @@ def _render_tile(
 
     def render(first: int, stop: int) -> None:
         drawn = amplitudes[first:stop]
-        tilt, weights = _tilt(plan, tables, sum_tilt(drawn)), weigh(sum_psf(drawn))
+        tilt, weights = _interpolate_tilt(plan, tables, sum_tilt(drawn)), weigh(sum_psf(drawn))
         if padded is not None:
             _blur_on_cpu(padded, first % len(frames), tilt, weights, plan, tables, out[first:stop])
         else:
@@ -97,7 +97,7 @@ def _render_tile(
         if padded is not None:
             run_in_threads(render, _view_parts(plan, len(amplitudes), len(frames)))
             return
-        engine = devices.select_engine(frames.device)
+        engine = devices.select_blur_engine(frames.device)
         step = max(1, DEVICE_BYTES // (4 * _numbers_per_picture(plan, engine)))
         for first in range(0, len(amplitudes), step):
             render(first, min(first + step, len(amplitudes)))
@@ -128,9 +128,9 @@ def _make_network(tables: dict[str, Tensor], *, on_cpu: bool) -> Callable[[Tenso
     return weigh
 
 
-def _tilt(
-    plan: TilePlan, tables: dict[str, Tensor], nodes: Float[Tensor, "2 n rows columns"]
-) -> Float[Tensor, "2 n h w"]:
+def _interpolate_tilt(
+    plan: TilePlan, tables: dict[str, Tensor], nodes: Float[Tensor, "xy=2 n rows columns"]
+) -> Float[Tensor, "xy=2 n h w"]:
     """Return the displacement (x, y) in pixels of every pixel, from Noll's a2 and a3 in rad."""
     if "tilt_down" in tables:
         nodes = tables["tilt_down"] @ nodes @ tables["tilt_across"]
@@ -140,7 +140,7 @@ def _tilt(
 def _blur_on_cpu(
     padded: PaddedFrames,
     first: int,
-    tilt: Float[Tensor, "2 n h w"],
+    tilt: Float[Tensor, "xy=2 n h w"],
     weights: Float[Tensor, "rank n rows columns"],
     plan: TilePlan,
     tables: dict[str, Tensor],
@@ -152,13 +152,14 @@ def _blur_on_cpu(
     lattice = rows.offset_from_first_node_px, columns.offset_from_first_node_px, rows.pitch
     for index, image in enumerate(warp_frames(padded, first, tilt, rows.start, columns.start)):
         halo = tables["halo"][first + index].numpy(), plan.halo_share
-        out[index] = torch.from_numpy(scatter_psfs(image, nodes, index, *basis, *lattice, *halo))
+        seen = scatter_normalised(image, nodes, index, *basis, *lattice, *halo)
+        out[index] = torch.from_numpy(seen)
 
 
 def _blur_on_device(
     frames: Float[Tensor, "frames height width"],
     first: int,
-    tilt: Float[Tensor, "2 n h w"],
+    tilt: Float[Tensor, "xy=2 n h w"],
     weights: Float[Tensor, "one_and_rank n rows columns"],
     plan: TilePlan,
     tables: dict[str, Tensor],
@@ -168,9 +169,9 @@ def _blur_on_device(
         weights = weights @ tables["psf_across"]
     psfs = (tables["basis"] @ weights.flatten(1)).unflatten(1, weights.shape[1:])
     rows, columns = plan.psf_grid
-    engine = devices.select_engine(frames.device)
-    seen = engine.warp(frames, tilt, rows.start, columns.start, first)
-    return engine.scatter(seen, psfs, rows, tables["halo"], plan.halo_share, first)
+    engine = devices.select_blur_engine(frames.device)
+    seen = engine.warp_cubic(frames, tilt, rows.start, columns.start, first)
+    return engine.scatter_normalised(seen, psfs, rows, tables["halo"], plan.halo_share, first)
 
 
 def _view_parts(plan: TilePlan, pictures: int, frames: int) -> Iterator[tuple[int, int]]:

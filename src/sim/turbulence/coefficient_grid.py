@@ -47,10 +47,8 @@ class GridAxis:
     def node_count(self) -> int:
         if self.pitch == 1:
             return self.count
-        last = (self.start + self.count - 1) // self.pitch + (
-            2 if self.interpolation_order == 3 else 1
-        )
-        return last + 1 - self.first_node
+        beyond = 2 if self.interpolation_order == 3 else 1
+        return (self.start + self.count - 1) // self.pitch + beyond + 1 - self.first_node
 
     @property
     def node_pixels(self) -> Int[Tensor, " nodes"]:

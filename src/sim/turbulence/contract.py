@@ -14,7 +14,7 @@ from src.sim.optics import Position
 Crop = tuple[int, int, int, int]  # top, left, height, width
 Frames = Float[Tensor, "n frames h w"]  # linear light
 Views = Float[Tensor, "n views frames hc wc"]
-Tilt = Float[Tensor, "views frames 2 hc wc"]  # (x, y) in pixels
+Tilt = Float[Tensor, "views frames xy=2 hc wc"]  # pixels
 
 
 @runtime_checkable

@@ -76,15 +76,15 @@ class Fidelity:
     error: float = 0.0
 
 
-def choose_fidelity(atmosphere: Atmosphere, width_px: int, tolerance: float) -> Fidelity:
-    """Return the cheapest fidelity whose errors keep within `tolerance` of the random power.
+def choose_fidelity(atmosphere: Atmosphere, width_px: int, max_error_share: float) -> Fidelity:
+    """Return the cheapest fidelity whose errors keep within `max_error_share` of the random power.
 
     An rms error of half a grey level of 256 is always allowed.
     Raises ValueError for turbulence that is too strong.
     """
     unit, strength = atmosphere.lambda_over_d_px(width_px), atmosphere.blur_equivalent_d_over_r0
     power = _random_power(strength, unit)
-    allowed = max(tolerance, (UNSEEN / CONTRAST) ** 2 / power)
+    allowed = max(max_error_share, (UNSEEN / CONTRAST) ** 2 / power)
     pixel = atmosphere.pixel_size_at_object_m(width_px) / atmosphere.aperture_m
     patch = pixel / _isoplanatic_patch_ratio(atmosphere)
     psf = choose_psf_settings(p2s.find_psf_band(strength), strength, unit, patch, allowed)
@@ -143,8 +143,10 @@ def _tilt_pitch(
 
 def _random_power(d_over_r0: float, lambda_over_d_px: float) -> float:
     """Return the power of the random change of a picture of unit contrast; grows as d^(5/3)."""
-    weak = min(d_over_r0 / float(error_table("strength")[0]), 1.0) ** (5 / 3)
-    return max(float(interpolate_table("power", d_over_r0, lambda_over_d_px)) * weak, 1e-30)
+    table, strengths = error_table("power"), error_table("strength")
+    weak = min(d_over_r0 / float(strengths[0]), 1.0) ** (5 / 3)
+    power = float(interpolate_table(table, strengths, d_over_r0, lambda_over_d_px))
+    return max(power * weak, 1e-30)
 
 
 def choose_psf_settings(
@@ -157,14 +159,14 @@ def choose_psf_settings(
     """
     optics, number = (d_over_r0, lambda_over_d_px), p2s.load_bands_by_d_over_r0().index(band)
     table, strengths = (error_table(name)[number] for name in ("psf", "psf_strength"))
-    psf = _errors_at_pitches(_interpolate(table, strengths, *optics), pixel_d)
+    psf = _errors_at_pitches(interpolate_table(table, strengths, *optics), pixel_d)
     ranks = [min(int(rank), len(band.basis)) for rank in error_table("rank_axis")]
     widest = band.mean.shape[-1] / SAMPLES_PER_LAMBDA_OVER_D / 2
     sizes = [  # odd numbers of pixels
         2 * math.floor(min(reach + 0.5 / lambda_over_d_px, widest) * lambda_over_d_px) + 1
         for reach in error_table("kernel_axis").tolist()
     ]
-    kernel = interpolate_table("kernel", *optics)
+    kernel = interpolate_table(error_table("kernel"), error_table("strength"), *optics)
     total = psf[..., None] + kernel  # networks, pitches, ranks, kernels
     cost = _nanoseconds(band.networks, ranks, torch.tensor(sizes))
     within = total <= allowed
@@ -222,15 +224,9 @@ def _node_nanoseconds(
 
 
 def interpolate_table(
-    name: str, d_over_r0: float, lambda_over_d_px: float
-) -> Float[Tensor, "*axis"]:
-    """Interpolate a table (D/r0, ..., lambda / D) in the logarithm of both."""
-    return _interpolate(error_table(name), error_table("strength"), d_over_r0, lambda_over_d_px)
-
-
-def _interpolate(
     table: Tensor, strengths: Tensor, d_over_r0: float, lambda_over_d_px: float
-) -> Tensor:
+) -> Float[Tensor, "*axis"]:
+    """Interpolate a table (D/r0 as `strengths`, ..., lambda / D) in the logarithm of both."""
     rows = interpolate_log(table, strengths, d_over_r0)
     return interpolate_log(rows.movedim(-1, 0), error_table("airy"), lambda_over_d_px)
 

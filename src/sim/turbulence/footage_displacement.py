@@ -41,13 +41,13 @@ class UnitRmsDisplacement:
     time the footage is played to and fro.
     """
 
-    nodes: Float[Tensor, "frames 2 rows columns"]
+    nodes: Float[Tensor, "frames xy=2 rows columns"]
     height_px: float
     width_px: float
 
     def sample(
         self, time: Float[NDArray, " time"], y: Float[NDArray, " y"], x: Float[NDArray, " x"]
-    ) -> Float[Tensor, "time 2 y x"]:
+    ) -> Float[Tensor, "time xy=2 y x"]:
         """Return the displacement at `time`, in frames of the footage, at every (y, x)."""
         frames, _, rows, columns = self.nodes.shape
         when = _spline_weights(frames, time)
@@ -57,25 +57,25 @@ class UnitRmsDisplacement:
 
 
 @lru_cache(maxsize=4)
-def load_displacement_fields(root: Path) -> UnitRmsDisplacement:
-    """Return the displacement fields of the footage at `root`, a video or a folder of frames.
+def track_displacement_fields(footage: Path) -> UnitRmsDisplacement:
+    """Return the displacement fields of `footage`, a video or a folder of frames.
 
     Raises ValueError where there is not one video, it is too short, or too few of its corners stay.
     """
-    videos = find_videos(root, "turbulence.root")
+    videos = find_videos(footage, "turbulence.footage")
     allowed = "one video or one folder of frames"
-    check_option(len(videos) == 1, "root", allowed, len(videos))
-    footage = list(islice(videos[0].read(0, videos[0].count), MOST_FRAMES))
+    check_option(len(videos) == 1, "footage", allowed, len(videos))
+    frames = list(islice(videos[0].read(0, videos[0].count), MOST_FRAMES))
     allowed = f"footage of {FEWEST_FRAMES} frames or more"
-    check_option(len(footage) >= FEWEST_FRAMES, "root", allowed, len(footage))
-    displacement, at, tried = _track_corners(footage)
+    check_option(len(frames) >= FEWEST_FRAMES, "footage", allowed, len(frames))
+    displacement, at, tried = _track_corners(frames)
     allowed = f"a still scene of which {FEWEST_CORNERS} corners or more can be followed"
-    got = f"{len(at)} of {tried} in {root}"
-    check_option(len(at) >= FEWEST_CORNERS, "root", allowed, got)
-    return interpolate_tracks(displacement, at)
+    got = f"{len(at)} of {tried} in {footage}"
+    check_option(len(at) >= FEWEST_CORNERS, "footage", allowed, got)
+    return fit_displacement_field(displacement, at)
 
 
-def interpolate_tracks(
+def fit_displacement_field(
     displacement: Float[NDArray, "frames corners 2"], at: Float[NDArray, "corners 2"]
 ) -> UnitRmsDisplacement:
     """Return fields over the rectangle that the corners at places `at` (x, y) fill."""

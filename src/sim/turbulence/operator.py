@@ -54,14 +54,11 @@ class Turbulence:
         self.is_identity = atmosphere is None or atmosphere.d_over_r0 == 0
         self.fidelity = Fidelity()
         if atmosphere is not None and not self.is_identity:
-            fidelity = choose_fidelity(atmosphere, width, tolerance)
+            self.fidelity = fidelity = choose_fidelity(atmosphere, width, tolerance)
             strength, unit = fidelity.blur_equivalent_d_over_r0, fidelity.lambda_over_d_px
             size, network = fidelity.psf_size_px, (fidelity.psf_network, fidelity.psf_rank)
-            self.psfs = FittedPSFs(find_psf_band(strength), *network, unit, size, strength)
-            self.fidelity, self.halo = (
-                fidelity,
-                PSFHalo(mean_short_exposure_psf(strength), unit, size),
-            )
+            self.psfs = FittedPSFs(find_psf_band(strength), *network, unit, size)
+            self.halo = PSFHalo(mean_short_exposure_psf(strength), unit, size)
 
     @property
     def metadata(self) -> dict[str, float | int | str]:

@@ -41,11 +41,7 @@ def variance_over_kolmogorov(
 ) -> float:
     """Return the share of the variance of `modes`, `tilt` or `higher` (all modes beyond tilt), that
     an outer scale L0 = D / `aperture_over_outer_scale` leaves."""
-    place, weight = _path(profile)
-    powers = np.interp(
-        _log(aperture_over_outer_scale * (1 - place)), _log(KAPPA0), _variances()[modes]
-    )
-    return float(weight @ powers / _variances()[modes][0])
+    return _variance(aperture_over_outer_scale, profile, modes) / float(_variances()[modes][0])
 
 
 def tilt_correlation(
@@ -59,11 +55,7 @@ def tilt_correlation(
     apart = np.multiply.outer(lags, (1 if wind else place) / (1 - place))
     kappa0 = np.broadcast_to(aperture_over_outer_scale * (1 - place), apart.shape)
     covariance = _covariance()((_log(kappa0), np.log(apart.clip(1e-6, 1e7)))) @ weight
-    power = (
-        np.interp(_log(aperture_over_outer_scale * (1 - place)), _log(KAPPA0), _variances()["tilt"])
-        @ weight
-    )
-    return covariance / power
+    return covariance / _variance(aperture_over_outer_scale, profile, "tilt")
 
 
 @lru_cache(maxsize=4096)
@@ -117,6 +109,12 @@ def _variances() -> dict[str, Float[np.ndarray, " scales"]]:
     return {"tilt": _spectra() @ TILT, "higher": _spectra() @ HIGHER}
 
 
+def _variance(aperture_over_outer_scale: float, profile: Cn2Profile, modes: str) -> float:
+    place, weight = _path(profile)
+    kappa0 = aperture_over_outer_scale * (1 - place)
+    return float(weight @ np.interp(_log(kappa0), _log(KAPPA0), _variances()[modes]))
+
+
 @cache
 def _covariance() -> RegularGridInterpolator:
     """Return the tilt's covariance over log kappa0 and log of the distance in footprints."""
@@ -152,11 +150,8 @@ def turbulence_blur_std_in_lambda_over_d(d_over_r0: float) -> float:
     The standard deviation along one axis of the Gaussian whose half-light radius, added in squares
     to that of diffraction, gives `short_exposure_half_light_radius`.
     """
-    squares = (
-        short_exposure_half_light_radius(d_over_r0) ** 2
-        - short_exposure_half_light_radius(0.0) ** 2
-    )
-    return math.sqrt(squares) / GAUSSIAN_HALF_LIGHT
+    blurred, sharp = (short_exposure_half_light_radius(s) for s in (d_over_r0, 0.0))
+    return math.sqrt(blurred**2 - sharp**2) / GAUSSIAN_HALF_LIGHT
 
 
 @cache

@@ -42,7 +42,7 @@ def mirror_symmetry_class(mode: int) -> int:
     return ODD_X if m > 0 else ODD_Y
 
 
-def modes_by_parity(modes: int) -> list[list[int]]:
+def group_modes_by_symmetry(modes: int) -> list[list[int]]:
     """Return which of Noll 4..modes + 1, counted from 0, are of each parity."""
     parities = [mirror_symmetry_class(mode) for mode in range(4, modes + 2)]
     return [[i for i, parity in enumerate(parities) if parity == one] for one in range(4)]
@@ -87,7 +87,7 @@ class PhaseToSpaceNetwork:
         forms = [(parity, weight[f"forms.{parity}"]) for parity in range(4)]
         forms += [(parity, weight[f"factors.{parity}"]) for parity in (EVEN, ODD_X, ODD_XY, ODD_Y)]
         forms += [(ODD_Y, weight["thirds.0"]), (ODD_X, weight["thirds.1"])]
-        own = modes_by_parity(self.modes)
+        own = group_modes_by_symmetry(self.modes)
         first = [part.new_zeros(len(part), self.modes - 2) for _, part in forms]
         for rows, (parity, part) in zip(first, forms, strict=True):
             rows[:, own[parity]] = part
@@ -186,8 +186,8 @@ def load_bands_by_d_over_r0() -> tuple[PSFBand, ...]:
 def find_psf_band(d_over_r0: float) -> PSFBand:
     """Return the weakest band that covers `d_over_r0`; raises ValueError beyond the last."""
     bands = load_bands_by_d_over_r0()
-    if d_over_r0 > EDGE_MARGIN * bands[-1].max_d_over_r0:
-        limit = EDGE_MARGIN * bands[-1].max_d_over_r0
+    limit = EDGE_MARGIN * bands[-1].max_d_over_r0
+    if d_over_r0 > limit:
         raise ValueError(f"turbulence: D/r0 of the blur must be <= {limit:g}, got {d_over_r0:g}")
     return next(band for band in bands if d_over_r0 <= EDGE_MARGIN * band.max_d_over_r0)
 
@@ -201,19 +201,11 @@ class FittedPSFs:
     `parity_ends`: where each of the four parities ends.
     """
 
-    def __init__(
-        self,
-        band: PSFBand,
-        network: int,
-        rank: int,
-        lambda_over_d_px: float,
-        size: int,
-        d_over_r0: float,
-    ):
+    def __init__(self, band: PSFBand, network: int, rank: int, lambda_over_d_px: float, size: int):
         step = SAMPLES_PER_LAMBDA_OVER_D / lambda_over_d_px
         grid = pixel_integration_matrix(size, band.mean.shape[-1], step).float()
         self.network, self.parity_ends, basis = _truncate(band, network, rank)
-        self.basis, self.d_over_r0 = grid @ basis @ grid.T, d_over_r0
+        self.basis = grid @ basis @ grid.T
         quarter = self.basis[:, size // 2 :, size // 2 :]
         self.quarter = quarter.permute(1, 2, 0).contiguous().numpy()
 

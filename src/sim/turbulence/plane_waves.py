@@ -172,9 +172,8 @@ def _filter_ar1(
     share[0] = 1
     state, span = white * share, 1
     while span < state.shape[1]:  # it holds the draws of the last `span` frames, then of twice that
-        state = torch.cat(
-            [state[:, :span], state[:, span:] + coefficient**span * state[:, :-span]], dim=1
-        )
+        later = state[:, span:] + coefficient**span * state[:, :-span]
+        state = torch.cat([state[:, :span], later], dim=1)
         span *= 2
     return torch.view_as_complex(state)
 

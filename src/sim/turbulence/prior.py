@@ -132,7 +132,7 @@ def sample_matching_atmosphere(
     Beyond `max_rytov_variance` scintillation, which is left out, is too strong.
     Raises ValueError for wrong ranges, NoCameraError where no camera is found.
     """
-    profiles = [cn2_profile(one) for one in cn2_profiles]
+    profiles = [unnormalised_cn2_profile(one) for one in cn2_profiles]
     for _ in range(ROUNDS):
         u = torch.rand(CANDIDATES, 6, generator=generator, dtype=torch.float64).numpy()
         unit = log_uniform(u[:, 0], lambda_over_d_px, "lambda_over_d_px")
@@ -168,7 +168,7 @@ def sample_matching_atmosphere(
     raise NoCameraError(f"turbulence.atmosphere: no camera within its ranges shows {wanted}")
 
 
-def cn2_profile(shape: str | Sequence[float]) -> tuple[float, ...]:
+def unnormalised_cn2_profile(shape: str | Sequence[float]) -> tuple[float, ...]:
     """Return Cn2 along the path, in any unit: of a name of PROFILES, or a table as it is.
 
     Raises ValueError for another name and for a table that is not positive somewhere.
@@ -244,11 +244,8 @@ def _mismatch(
     """Return how far each candidate is off: 0.1 is 10 % of blur, or of the tilt's variance."""
     total = np.zeros(len(blur))
     if wanted.psf_width_ratio is not None:
-        sharp = (
-            unit
-            * outer_scale.short_exposure_half_light_radius(0.0)
-            / outer_scale.GAUSSIAN_HALF_LIGHT
-        )
+        radius = outer_scale.short_exposure_half_light_radius(0.0)
+        sharp = unit * radius / outer_scale.GAUSSIAN_HALF_LIGHT
         total += np.abs(np.log(np.hypot(1, blur / sharp) / wanted.psf_width_ratio))
     if wanted.global_tilt_share is not None:
         given = zip(ratio, shapes, REFERENCE_WIDTH_PX / aperture, strict=True)
@@ -259,10 +256,8 @@ def _mismatch(
 
 @cache
 def _blur_table() -> tuple[np.ndarray, np.ndarray]:
-    strengths = np.concatenate([[0.0], D_OVER_R0])
-    return strengths, np.array(
-        [outer_scale.turbulence_blur_std_in_lambda_over_d(strength) for strength in strengths]
-    )
+    strengths, blur = np.append(0.0, D_OVER_R0), outer_scale.turbulence_blur_std_in_lambda_over_d
+    return strengths, np.array([blur(strength) for strength in strengths])
 
 
 @cache

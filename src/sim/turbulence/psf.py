@@ -45,7 +45,7 @@ class PSFHalo:
         self.psf[core, core] = 0
         self.reach, self.share = reach, float(self.psf.sum())
 
-    def transform(
+    def sources_and_spectrum(
         self, frame_size: Sequence[int], window: tuple[int, int, int, int]
     ) -> tuple[Int[Tensor, " rows"], Int[Tensor, " columns"], Complex[Tensor, "rows half"]]:
         """Return the rows and columns of a frame that send light to `window` (top, left, h, w), and
@@ -63,13 +63,13 @@ class PSFHalo:
 
 def convolve_halo(
     frames: Float[Tensor, "frames height width"],
-    rows: Int[Tensor, " rows"],
-    columns: Int[Tensor, " columns"],
+    source_rows: Int[Tensor, " rows"],
+    source_columns: Int[Tensor, " columns"],
     spectrum: Complex[Tensor, "rows half"],
     size: Sequence[int],
 ) -> Float[Tensor, "frames h w"]:
-    """Return the halo's light on a window of `size` (h, w), given PSFHalo.transform."""
-    sources = frames[:, rows[:, None], columns]
+    """Return the halo's light on a window of `size` (h, w), given PSFHalo.sources_and_spectrum."""
+    sources = frames[:, source_rows[:, None], source_columns]
     light = torch.fft.irfft2(torch.fft.rfft2(sources) * spectrum, s=sources.shape[1:])
     return light[:, : size[0], : size[1]].clamp(min=0)
 

@@ -17,26 +17,18 @@ from src.sim import noise
 from src.sim.optics import Position, view_id
 from src.sim.turbulence.clip_rendering import run_in_threads
 from src.sim.turbulence.contract import Crop, Frames, Tilt, Views, check_option
-from src.sim.turbulence.engines.device import select_engine
+from src.sim.turbulence.engines.device import select_blur_engine
 from src.sim.turbulence.engines.warp_numba import pad_frames, warp_frames
-from src.sim.turbulence.footage_displacement import UnitRmsDisplacement, load_displacement_fields
+from src.sim.turbulence.footage_displacement import UnitRmsDisplacement, track_displacement_fields
 
 PLACES, TIMES = 2, 3  # pieces of the footage: PLACES x PLACES in the picture, TIMES in time
 LARGEST_TILT_PX = 8.0  # rms
 
 
-@dataclass(frozen=True)
-class DrawnTilt:
-    """What is drawn for a clip: the name of a strength and the tilt's rms along an axis, pixels."""
-
-    severity: str
-    tilt_rms_px: float
-
-
 class RecordedTurbulence:
     """A turbulence model (contract.py) that moves frames as turbulence in real footage did.
 
-    `root`: a video or a folder of frames of a still scene through turbulence, its smaller side
+    `footage`: a video or a folder of frames of a still scene through turbulence, its smaller side
     taken for 256 pixels.  `tilt_rms_px`: names of strengths with the tilt's rms along an axis;
     `severity`: one of the names, or `mixed`: each as often.  `footage_fps`: what the footage is
     taken for.  `blur_over_tilt`: standard deviation of a Gaussian, in units of the rms tilt.
@@ -46,7 +38,7 @@ class RecordedTurbulence:
 
     def __init__(
         self,
-        root: str | None,
+        footage: str | None,
         *,
         tilt_rms_px: Mapping[str, float],
         severity: str = "mixed",
@@ -61,35 +53,37 @@ class RecordedTurbulence:
         check_option(0 < footage_fps < math.inf, "footage_fps", "> 0", footage_fps)
         valid = 0 <= blur_over_tilt <= 2
         check_option(valid, "blur_over_tilt", "in [0, 2] times the tilt", blur_over_tilt)
-        footage = Path(root or "/").resolve()
+        is_there = bool(footage) and Path(str(footage)).exists()
         expected = "a video or folder of frames of a still scene through turbulence"
-        check_option(bool(root) and footage.exists(), "root", expected, root)
+        check_option(is_there, "footage", expected, footage)
         self.names = list(tilt_rms_px) if severity == "mixed" else [severity]
         self.tilt_rms_px, self.footage_fps = dict(tilt_rms_px), footage_fps
         self.blur_over_tilt = blur_over_tilt
-        self.fields = load_displacement_fields(footage)
+        self.fields = track_displacement_fields(Path(str(footage)).resolve())
 
-    def draw(self, generator: Generator) -> DrawnTilt:
-        name = self.names[int(torch.randint(len(self.names), (), generator=generator))]
-        return DrawnTilt(name, self.tilt_rms_px[name])
+    def draw(self, generator: Generator) -> str:
+        """Draw the name of a strength."""
+        return self.names[int(torch.randint(len(self.names), (), generator=generator))]
 
     def operator(
-        self, drawn: DrawnTilt, *, views: Sequence[Position], height: int, width: int, fps: float
+        self, drawn: str, *, views: Sequence[Position], height: int, width: int, fps: float
     ) -> "RecordedTurbulenceOperator":
-        step, blur_px = self.footage_fps / fps, self.blur_over_tilt * drawn.tilt_rms_px
-        size = height, width
-        return RecordedTurbulenceOperator(self.fields, drawn, views, size, step, blur_px)
+        rms, size, step = self.tilt_rms_px[drawn], (height, width), self.footage_fps / fps
+        blur_px = self.blur_over_tilt * rms
+        return RecordedTurbulenceOperator(self.fields, drawn, rms, views, size, step, blur_px)
 
 
 @dataclass(frozen=True)
 class RecordedTurbulenceOperator:
     """The operator of a clip (contract.py): every view has a piece of the footage of its own.
 
-    `size` (h, w) of frames; `step`: footage frames per frame; `blur_px`: standard deviation.
+    `tilt_rms_px`: along an axis; `size` (h, w) of frames; `step`: footage frames per frame;
+    `blur_px`: standard deviation.
     """
 
     fields: UnitRmsDisplacement
-    drawn: DrawnTilt
+    severity: str
+    tilt_rms_px: float
     views: Sequence[Position]
     size: tuple[int, int]
     step: float
@@ -97,8 +91,8 @@ class RecordedTurbulenceOperator:
 
     @property
     def metadata(self) -> dict[str, float | str]:
-        tilt = self.drawn.tilt_rms_px
-        return {"severity": self.drawn.severity, "tilt_px": tilt, "blur_px": self.blur_px}
+        tilt, blur = self.tilt_rms_px, self.blur_px
+        return {"severity": self.severity, "tilt_px": tilt, "blur_px": blur}
 
     @torch.no_grad()
     def degrade(self, frames: Frames, generator: Generator, *, crop: Crop | None = None) -> Views:
@@ -124,7 +118,7 @@ class RecordedTurbulenceOperator:
 
     def _view(
         self, position: Position, frames: int, order: list[int], key: int, window: Crop
-    ) -> Float[Tensor, "frames 2 h w"]:
+    ) -> Float[Tensor, "frames xy=2 h w"]:
         """Return what one view's piece does, mirrored, turned and played as drawn for this view;
         views of a 3x3 block have different pieces, which are shuffled into `order`.
         """
@@ -145,19 +139,19 @@ class RecordedTurbulenceOperator:
             moved = self.fields.sample(time, below + x, right + y).transpose(-1, -2).flip(1)
         else:
             moved = self.fields.sample(time, below + y, right + x)
-        return self.drawn.tilt_rms_px * torch.tensor(sign)[:, None, None] * moved
+        return self.tilt_rms_px * torch.tensor(sign)[:, None, None] * moved
 
 
 def _warp_views(
     frames: Float[Tensor, "frames height width"],
-    tilt: Float[Tensor, "views 2 frames h w"],
+    tilt: Float[Tensor, "views xy=2 frames h w"],
     top: int,
     left: int,
 ) -> Float[Tensor, "views frames h w"]:
     """Return the frames from (top, left) on, perhaps outside, displaced as in every view."""
     if frames.device.type != "cpu":
-        warp = select_engine(frames.device).warp
-        return torch.stack([warp(frames, view, top, left) for view in tilt])
+        warp_cubic = select_blur_engine(frames.device).warp_cubic
+        return torch.stack([warp_cubic(frames, view, top, left) for view in tilt])
     padded, out = pad_frames(frames), torch.empty(len(tilt), *tilt.shape[2:])
 
     def warp_view(view: int) -> None:

@@ -35,7 +35,7 @@ def bench() -> StressBench:
     return StressBench(pipeline(), [0], warmup=4)
 
 
-one_view_shifted = partial(conditions.measure_view_shift_loss, judged_px=2, limit_db=0.3)
+one_view_shifted = partial(conditions.measure_view_shift_loss, judged_shift_px=2, limit_db=0.3)
 
 
 class Running(EventToVideoNetwork):
@@ -115,7 +115,7 @@ def test_a_sum_comes_back_at_any_rate_and_after_any_loop(bench):
 
 
 def test_a_difference_in_a_sum_neither_grows_nor_fades(bench):
-    growth = partial(recurrence.measure_perturbation_growth, limit_growth_per_window=0.0)
+    growth = partial(recurrence.measure_input_perturbation_growth, limit_growth_per_window=0.0)
     assert abs(growth(running(), bench).value) < 1e-3
     assert growth(Candidate("leaky", HighPass(), 1), bench).value < -0.05
 
@@ -138,7 +138,7 @@ def test_without_a_middle_the_centre_view_is_that_of_the_optics(views):
         Candidate("centre", HighPass(), views),
     )
     lost = {"counts": [1], "draws": 1, "limit_db": 0.5}
-    assert conditions.measure_view_dropout_loss(subject, bench, **lost).value != 0
+    assert conditions.measure_worst_view_dropout_loss(subject, bench, **lost).value != 0
     assert one_view_shifted(subject, bench).value == 0
 
 
@@ -156,7 +156,7 @@ def test_every_stress_test_runs_on_a_set_network(bench):
         recurrence.measure_convergence_windows: {"limit_windows": 1.0},
         recurrence.measure_flicker_recovery: {"limit_windows": 1.0},
         recurrence.measure_static_scene_jitter_percent: {"limit_percent": 1.0},
-        recurrence.measure_perturbation_growth: {"limit_growth_per_window": 1.0},
+        recurrence.measure_input_perturbation_growth: {"limit_growth_per_window": 1.0},
         recurrence.measure_adversarial_gain: {"windows": 2, "steps": 2, "limit_gain": 1.0},
         recurrence.measure_bf16_psnr_difference: {"windows": 8, "limit_db": 1.0},
         conditions.measure_window_rate_loss: {
@@ -164,10 +164,17 @@ def test_every_stress_test_runs_on_a_set_network(bench):
             "duration_s": 0.1,
             "limit_db": 1.0,
         },
-        conditions.measure_event_dropout_loss: {"kept_shares": [0.1], "limit_db": 1.0},
-        conditions.measure_view_dropout_loss: {"counts": [4], "draws": 1, "limit_db": 1.0},
-        conditions.measure_view_shift_loss: {"judged_px": 1, "parallax": True, "limit_db": 1.0},
-        conditions.measure_correlated_views_loss: {"spacings": [0.0], "limit_db": 1.0},
+        conditions.measure_voxel_dropout_loss: {"kept_shares": [0.1], "limit_db": 1.0},
+        conditions.measure_worst_view_dropout_loss: {"counts": [4], "draws": 1, "limit_db": 1.0},
+        conditions.measure_view_shift_loss: {
+            "judged_shift_px": 1,
+            "parallax": True,
+            "limit_db": 1.0,
+        },
+        conditions.measure_correlated_views_loss: {
+            "spacings_over_aperture": [0.0],
+            "limit_db": 1.0,
+        },
         conditions.measure_worst_psnr_loss: {
             "parameter": "sensor.threshold",
             "values": [0.3],
@@ -180,13 +187,6 @@ def test_every_stress_test_runs_on_a_set_network(bench):
     varied = {"parameter": "view_log_gain_std", "values": [0.05], "limit_db": 1.0}
     found = conditions.measure_worst_psnr_loss(subject, bench, **varied)
     assert found.value == found.value
-
-
-def test_shifting_brings_nothing_in():
-    voxels = torch.ones(1, 9, 5, 8, 8)
-    moved = conditions.shift_views(voxels, {2: (1, -2)})
-    assert moved[:, 2].sum() == 5 * 7 * 6 and torch.equal(moved[:, 3], voxels[:, 3])
-    assert not moved[0, 2, 0, 0].any() and not moved[0, 2, 0, :, -2:].any()
 
 
 def test_settling_is_the_last_time_beyond():

@@ -8,7 +8,7 @@ import torch
 from src.bench.candidates import Candidate
 from src.bench.stress_tests.event_clips import StressBench
 from src.bench.stress_tests.trajectory import (
-    measure_track_deviation_px,
+    measure_cross_track_error_px,
     measure_trajectory_deviation,
 )
 from src.sim.optics import Optics
@@ -34,23 +34,23 @@ def film(stray: float = 0.0, trail: float = 0.0) -> torch.Tensor:
 
 
 def test_a_straight_flight_does_not_stray():
-    assert measure_track_deviation_px(film(), film()) < 0.01
+    assert measure_cross_track_error_px(film(), film()) < 0.01
 
 
 def test_a_front_that_strays_is_measured():
-    assert measure_track_deviation_px(film(stray=1.0), film()) == pytest.approx(1.0, rel=0.25)
-    assert measure_track_deviation_px(film(stray=2.0), film()) > 1.7 * measure_track_deviation_px(
-        film(stray=1.0), film()
-    )
+    assert measure_cross_track_error_px(film(stray=1.0), film()) == pytest.approx(1.0, rel=0.25)
+    assert measure_cross_track_error_px(
+        film(stray=2.0), film()
+    ) > 1.7 * measure_cross_track_error_px(film(stray=1.0), film())
 
 
 def test_a_trail_that_stays_does_not_count():
-    assert measure_track_deviation_px(film(trail=0.98), film()) < 0.05
+    assert measure_cross_track_error_px(film(trail=0.98), film()) < 0.05
 
 
 def test_a_clip_that_shows_too_little_of_a_flight_is_named():
     with pytest.raises(ValueError, match=r"data\.test_windows must show more of a flight"):
-        measure_track_deviation_px(film()[:40], film()[:40])
+        measure_cross_track_error_px(film()[:40], film()[:40])
 
 
 def test_a_network_is_compared_with_no_turbulence_and_with_the_light():

@@ -96,8 +96,8 @@ def test_hot_pixels_do_not_count():
         )
         for hot in ({}, {"hot_pixel_fraction": 0.004, "hot_pixel_hz": 119.0})
     )
-    assert plain.hot.sum() == 0
-    assert 2 <= broken.hot.sum() <= 20
+    assert plain.hot_pixels.sum() == 0
+    assert 2 <= broken.hot_pixels.sum() <= 20
     assert np.abs(np.log(broken.pooled / plain.pooled)).max() < 0.05
 
 
@@ -105,7 +105,7 @@ def test_the_bootstrap_has_the_spread_of_a_poisson_process():
     """The deviation of a deviation from n / n^(1/3) blocks is a tenth here: three of them."""
     events = np.random.default_rng(0).poisson(50.0, (4000, 1, 2))
     made = contrast_threshold.EventRates(events, np.array([100]), np.array([0]), 0.01)
-    spread = made.bootstrap(1000).std(0) / made.pooled
+    spread = made.bootstrap_pooled_rates(1000).std(0) / made.pooled
     assert np.abs(spread * np.sqrt(4000 * 50) - 1).max() < 0.3
 
 

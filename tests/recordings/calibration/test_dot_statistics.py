@@ -42,7 +42,7 @@ def noisy_grid(frames: int, noise: float, seed: int = 0):
 def test_fits_reach_the_cramer_rao_bound():
     centres, sigma, amplitude, pictures = noisy_grid(60, noise=0.02)
     fits = gaussian_dots.fit_gaussians(pictures, GRID, radius=12)
-    assert fits.ok.all()
+    assert fits.is_fitted.all()
     # For a Gaussian on many pixels the bound on the centre is sqrt(2 / pi) noise / |A|.
     bound = np.sqrt(2 / np.pi) * 0.02 / 0.6
     assert (fits.centres - centres).std() == pytest.approx(bound, rel=0.15)
@@ -55,14 +55,14 @@ def test_a_dot_that_leaves_is_a_failure_and_not_a_number():
     centres, sigma, amplitude, _ = noisy_grid(20, noise=0.0)
     centres[10:, 4] += 60.0
     fits = gaussian_dots.fit_gaussians(dot_grid(centres, sigma, amplitude), GRID, radius=12)
-    assert not fits.ok[10:, 4].any()
-    assert fits.ok[:10].all() and fits.ok[:, [0, 1, 2, 3, 5, 6, 7]].all()
+    assert not fits.is_fitted[10:, 4].any()
+    assert fits.is_fitted[:10].all() and fits.is_fitted[:, [0, 1, 2, 3, 5, 6, 7]].all()
 
 
 def test_a_frame_that_is_not_finite_fails_alone():
     pictures = noisy_grid(4, noise=0.01)[3]
     pictures[2] = np.nan
-    ok = gaussian_dots.fit_gaussians(pictures, GRID, radius=12).ok
+    ok = gaussian_dots.fit_gaussians(pictures, GRID, radius=12).is_fitted
     assert not ok[2].any() and ok[[0, 1, 3]].all()
 
 
@@ -123,7 +123,9 @@ def measured(frames: int = 40):
     rng = np.random.default_rng(3)
     still = dot_grid(calm, np.full((10, 9), 2.0), np.full((10, 9), -0.6))
     reference = gaussian_dots.fit_gaussians(still + rng.normal(0, 0.01, still.shape), GRID, 12)
-    return dot_statistics.compare_with_still(turbulent, [reference, reference], fps=60.0, centre=0)
+    return dot_statistics.compare_with_still(
+        turbulent, [reference, reference], fps=60.0, centre_view=0
+    )
 
 
 def test_measure_compares_with_the_still_recording():
@@ -143,7 +145,7 @@ def test_measure_rejects_a_dot_without_a_reference():
     good = gaussian_dots.fit_gaussians(pictures, GRID, 12)
     empty = gaussian_dots.fit_gaussians(np.zeros_like(pictures), GRID, 12)
     with pytest.raises(ValueError, match="every dot must be fitted"):
-        dot_statistics.compare_with_still([good], [empty], fps=60.0, centre=0)
+        dot_statistics.compare_with_still([good], [empty], fps=60.0, centre_view=0)
 
 
 def test_csv_has_a_row_per_view_and_dot(tmp_path):

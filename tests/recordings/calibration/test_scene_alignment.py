@@ -9,7 +9,7 @@ import torch
 
 from src.recordings import simulated_recording
 from src.recordings.calibration import activity_pictures, view_grid
-from src.recordings.calibration.scene_alignment import SceneTarget, align_scene
+from src.recordings.calibration.scene_alignment import SceneTarget, align_views_by_scene
 from src.recordings.files.event_writers import write_events
 from src.sim.optics import layout
 from src.sim.sensor.sensor import EventSensor
@@ -67,7 +67,7 @@ def test_any_scene_finds_the_views_of_a_kaleidoscope(views, tmp_path):
     path = tmp_path / "scene.raw"
     truth = record(path, layout(views), [moving_scene()], key=views)
     pictures = activity_pictures.read_activity_pictures(path)
-    found = align_scene(pictures, SceneTarget(), (88, 88))
+    found = align_views_by_scene(pictures, SceneTarget(), (88, 88))
     there = found.aligned.views
     assert there.positions == list(layout(views))
     assert max(distance_px(there, truth).values()) < 0.3
@@ -84,7 +84,7 @@ def test_mirrors_off_the_right_angle_give_corner_views_in_halves(tmp_path):
     path = tmp_path / "scene.raw"
     truth = record(path, layout(9), [moving_scene()], key=9, angle_rad=0.03)
     pictures = activity_pictures.read_activity_pictures(path)
-    found = align_scene(pictures, SceneTarget(), (88, 88))
+    found = align_views_by_scene(pictures, SceneTarget(), (88, 88))
     there = found.aligned.views
     assert re.search(r"halves 1\.[5-9] degrees apart", found.summary()["view (1, 1)"])
     assert max(distance_px(there, truth).values()) < 0.3
@@ -109,7 +109,7 @@ def test_a_folder_of_frames_finds_them_too(tmp_path):
     assert (
         pictures.shape == (3, 1, 352, 364) and abs(pictures[1, 0] - 255 * seen[1].numpy()).max() < 1
     )
-    there = align_scene(pictures, SceneTarget(), (88, 88)).aligned.views
+    there = align_views_by_scene(pictures, SceneTarget(), (88, 88)).aligned.views
     assert there.positions == list(layout(9))
     assert max(distance_px(there, truth).values()) < 0.5  # dark gaps at the seams disturb
 
@@ -121,15 +121,15 @@ def test_views_of_another_place_or_with_parallax_are_refused(tmp_path):
     record(path, layout(9), films)
     pictures = activity_pictures.read_activity_pictures(path)
     with pytest.raises(ValueError, match=r"view \(1, 1\) (matches at|shows)"):
-        align_scene(pictures, SceneTarget(), (88, 88))
+        align_views_by_scene(pictures, SceneTarget(), (88, 88))
 
 
 def test_a_scene_without_repetition_or_events_is_refused():
     once = np.stack([texture(k, 160) for k in range(2)])[:, None] * 50
     with pytest.raises(ValueError, match="must show mirrored views side by side"):
-        align_scene(once, SceneTarget(), (88, 88))
+        align_views_by_scene(once, SceneTarget(), (88, 88))
     with pytest.raises(ValueError, match=r"share 0\.00 of what they show"):
-        align_scene(np.zeros((1, 2, 90, 120), np.float32), SceneTarget(), (88, 88))
+        align_views_by_scene(np.zeros((1, 2, 90, 120), np.float32), SceneTarget(), (88, 88))
 
 
 def test_the_views_at_the_borders_are_left_out():
@@ -138,13 +138,13 @@ def test_the_views_at_the_borders_are_left_out():
     whole = np.concatenate([row[::-1], row, row[::-1]])[21:, 7:-22]
     grid = view_grid.find_grid(200 * whole[None, None])
     assert grid.positions == [(row, col) for row in (0, 1) for col in (0, 1)]
-    assert np.abs(np.subtract(grid.tile, (48.5, 34.5, 104.5, 90.5))).max() < 3
+    assert np.abs(np.subtract(grid.centre_view_edges, (48.5, 34.5, 104.5, 90.5))).max() < 3
 
 
 def test_windows_share_a_recording_of_any_length():
-    sums = activity_pictures.WindowSums((1,), 5)
+    sums = activity_pictures.DoublingWindowSums((1,), 5)
     for time in range(0, 1000, 5):
-        sums.window(time)[:] += 1
+        sums.add(time, np.ones(1))
     assert sums.length == 80 and [float(window[0]) for window in sums.windows] == [16.0] * 12 + [
         8.0
     ]

@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from src.app import calibrations
-from src.calibrate import calibrate
+from src.calibrate import calibrate, measure_turbulence_in_video
 from src.recordings.calibration import point_tracking, turbulence_meter
 from src.recordings.files import videos
 from src.recordings.files.turbulence_file import IntervalEstimate, read_turbulence_file
@@ -129,7 +128,7 @@ def test_blur_is_that_of_a_frame_of_256_px():
         cv2.resize(frame, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
         for frame in blurred(1.4)
     ])  # fmt: skip
-    small = np.stack([turbulence_meter.shrink_frame(frame, 256) for frame in large])
+    small = np.stack([turbulence_meter.limit_shorter_side(frame, 256) for frame in large])
     found, wanted = (
         turbulence_meter.measure_turbulence(frames).found.blur_ratio for frames in (large, small)
     )
@@ -184,7 +183,8 @@ def test_the_door_writes_a_file_and_a_figure(folder, tmp_path):
     assert found.decay_s == IntervalEstimate(None, None, None)  # pictures have no frame rate
     assert save.read_text() == (run / "air.yaml").read_text()
     assert cv2.imread(str(run / "air.png")).std() > 10
-    timed = calibrations.measure_turbulence_in_video(str(folder), tmp_path, fps=50.0)
+    again = config("calibrate", run, "task=air", f"video={folder}", "fps=50.0")
+    timed = measure_turbulence_in_video(again, run)
     assert timed.found.decay_s.value == pytest.approx(timed.tilt.decay_frames / 50)
     assert timed.found.rms_px.value == pytest.approx(found.rms_px.value, rel=1e-3)
 
@@ -218,4 +218,6 @@ def test_footage_of_a_building_and_of_a_panning_camera(shared_data):
 
 
 def _frames(path) -> np.ndarray:
-    return np.stack([turbulence_meter.shrink_frame(frame) for frame in videos.read_video(path)])
+    return np.stack(
+        [turbulence_meter.limit_shorter_side(frame) for frame in videos.read_video(path)]
+    )

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from src.app import calibrations
+from src.calibrate import measure_dot_statistics
 from src.recordings import sensor_lookup, simulated_recording
 from src.recordings.calibration import dot_statistics, gaussian_dots
 from src.sim import noise
@@ -20,6 +20,7 @@ from src.sim.turbulence.atmosphere import AR1_FPS, Atmosphere
 from src.sim.turbulence.operator import Turbulence
 from tests.recordings import pictures
 from tests.recordings.calibration.test_dot_statistics import sampling_error
+from tests.test_recording_entry_points import config
 
 pytestmark = pytest.mark.slow  # 6480 pictures through turbulence
 
@@ -109,8 +110,10 @@ def case(request, tmp_path_factory) -> Case:
     camera.save(folder / "views.yaml")
     write(folder / "dots.h5", views, camera)
     write(folder / "still.h5", calm.expand(9, 12, -1, -1), camera)
-    moving, still, there = (str(folder / name) for name in ("dots.h5", "still.h5", "views.yaml"))
-    found = calibrations.measure_dot_grid(moving, still, folder, fps=FPS, views=there)
+    names = {"recording": "dots.h5", "still": "still.h5", "views": "views.yaml"}
+    given = [f"{key}={folder / name}" for key, name in names.items()]
+    cfg = config("calibrate", folder, "task=turbulence", f"fps={FPS}", *given)
+    found = measure_dot_statistics(cfg, folder)
     assert found.failed.sum() < 0.01 * found.blur.size
     return Case(alpha, alike, turbulence, views, found)
 

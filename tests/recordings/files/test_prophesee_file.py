@@ -174,7 +174,7 @@ def test_what_is_dropped_or_cut_is_counted(tmp_path):
         ("a.raw", b"% evt 2.0\n" + evt2(events).tobytes()),
         ("a.dat", dat(events)),
     ):
-        with pytest.warns(UserWarning, match="ends within a word, it is truncated"):
+        with pytest.warns(UserWarning, match="ends within an event, it is truncated"):
             assert equal(read(tmp_path / name, content[:-3])[1], events[:-1])
 
 

@@ -40,7 +40,7 @@ def test_events_and_frames_of_each_layout(written):
     assert np.array_equal(found["t"], events["t"] - zero)
     for name in "xyp":
         assert np.array_equal(found[name], events[name]), name
-    counts = sources.read_sensor_picture(path)  # as src.calibrate reads it
+    counts = sources.read_picture_or_event_counts(path)  # as src.calibrate reads it
     assert counts.shape == SIZE and counts.sum() == len(events)
     beside = find_frames(open_recording(path))
     assert beside.size == SIZE

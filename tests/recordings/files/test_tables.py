@@ -207,6 +207,15 @@ def test_numpy_files(tmp_path, events):
         assert_read(tmp_path / name, events, (WIDTH, HEIGHT))
 
 
+def test_a_structured_array_of_several_pieces_out_of_order_is_sorted(tmp_path, monkeypatch, events):
+    monkeypatch.setattr("src.recordings.files.numpy_file.PIECE_EVENTS", 400)
+    late = events.copy()
+    late["t"][::50] -= 700
+    np.save(tmp_path / "a.npy", late)
+    found = read_events(tmp_path / "a.npy")
+    assert np.array_equal(found, late[np.argsort(late["t"], kind="stable")])
+
+
 @pytest.mark.parametrize(
     "packing",
     [

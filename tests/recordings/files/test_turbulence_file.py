@@ -14,7 +14,7 @@ from src.recordings.files.turbulence_file import (
 )
 from src.sim.pipeline import simulate
 from src.sim.turbulence import outer_scale
-from src.sim.turbulence.prior import cn2_profile
+from src.sim.turbulence.prior import unnormalised_cn2_profile
 from src.sim.turbulence.simulated import SimulatedTurbulence
 from tests.test_train import config
 
@@ -125,10 +125,10 @@ def test_the_whole_share_is_the_mean_correlation_of_two_points():
     rng = np.random.default_rng(0)
     apart = np.hypot(*(rng.uniform(0, 20, (2, 4000)) - rng.uniform(0, 20, (2, 4000))))
     for shape in ("uniform", "object"):
-        expected = outer_scale.tilt_correlation(0.1, cn2_profile(shape), apart).mean()
-        assert outer_scale.global_tilt_share(0.1, cn2_profile(shape), 20.0) == pytest.approx(
-            expected, abs=0.01
-        )
+        expected = outer_scale.tilt_correlation(0.1, unnormalised_cn2_profile(shape), apart).mean()
+        assert outer_scale.global_tilt_share(
+            0.1, unnormalised_cn2_profile(shape), 20.0
+        ) == pytest.approx(expected, abs=0.01)
 
 
 SMALL = ["scene.height=64", "scene.width=64", "data.test_windows=2", "data.test_crop=16"]

@@ -15,7 +15,7 @@ from safetensors.numpy import save
 from scripts.pack_scenes import EncodedPicture, build_pack, verify_pack
 from src.sim.scenes import photo_files
 from src.sim.scenes.clip import SPLITS
-from src.sim.scenes.photo_files import PackedPhotograph, list_photographs, read_photograph
+from src.sim.scenes.photo_files import PackedPhotograph, decode_photograph, list_photographs
 from src.sim.scenes.photographs import Photographs
 from tests.conftest import ROOT
 
@@ -46,7 +46,7 @@ def test_a_pack_gives_back_its_pictures_in_order_by_split(pack):
     assert [len(photos[split]) for split in SPLITS] == [7, 2, 3]
     assert names == [one.name for one in pictures()] and photos["train"][0].stem == "11"
     for number, photo in enumerate(photo for split in SPLITS for photo in photos[split]):
-        assert np.array_equal(read_photograph(photo), picture(number))
+        assert np.array_equal(decode_photograph(photo), picture(number))
 
 
 def test_clips_of_a_pack_are_those_of_the_files_in_it(pack, tmp_path):
@@ -101,8 +101,8 @@ def test_a_damaged_picture_is_named_with_its_file(pack):
         verify_pack(bad)
     photos = list_photographs(str(bad), "train")
     with pytest.raises(ValueError, match=message):
-        read_photograph(photos[4])
-    assert np.array_equal(read_photograph(photos[5]), picture(5))
+        decode_photograph(photos[4])
+    assert np.array_equal(decode_photograph(photos[5]), picture(5))
 
 
 def test_a_damaged_index_is_named(pack):
@@ -132,4 +132,4 @@ def test_a_picture_that_opencv_cannot_read_is_named(tmp_path):
     path = tmp_path / "odd.pack"
     path.write_bytes(build_pack([EncodedPicture("a.jpg", "train", b"not a picture", (40, 48))]))
     with pytest.raises(ValueError, match=r"scene.root must hold readable .*odd.pack: a.jpg"):
-        read_photograph(PackedPhotograph(path, "a.jpg"))
+        decode_photograph(PackedPhotograph(path, "a.jpg"))

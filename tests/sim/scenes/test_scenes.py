@@ -1,37 +1,54 @@
-"""Photographs in motion: reproducible, smooth, a function of time, disjoint splits."""
+"""Scenes are functions of index and time; photographs move smoothly and have disjoint splits."""
+
+from functools import partial
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
-from src.sim.scenes.clip import FrameRateMixture
+from src.sim.scenes.clip import Clip, FrameRateMixture
 from src.sim.scenes.photo_files import EMBEDDED, list_photographs
 from src.sim.scenes.photographs import Photographs
+from src.sim.scenes.targets import TARGETS, Targets
+from src.sim.scenes.targets_on_photographs import TargetsOnPhotographs
+from tests.sim.scenes.test_static_camera import ALL, SMALL
+
+SCENES = {
+    "photographs": Photographs,
+    "static camera": partial(Photographs, **SMALL, paused_clip_share=0.5),
+    "rests": partial(Photographs, paused_clip_share=1.0, static_camera_share=0.5),
+    "targets": partial(TargetsOnPhotographs, kinds=ALL, paused_clip_share=0.5, max_targets=3),
+    **{kind: partial(Targets, kinds=[kind]) for kind in TARGETS},
+}
 
 
-def test_a_clip_is_a_function_of_seed_split_and_index():
-    first, again = Photographs(frames=3).clip(4), Photographs(frames=3).clip(4)
+@pytest.mark.parametrize("kind", SCENES)
+def test_a_clip_is_a_function_of_seed_split_and_index(kind):
+    def clip(index=3, **options) -> Clip:
+        return SCENES[kind](frames=4, height=64, width=80, **options).clip(index)
+
+    first, again = clip(), clip()
     assert torch.equal(first.frames, again.frames) and first.name == again.name
-    others = [
-        Photographs(frames=3).clip(5),
-        Photographs(frames=3, seed=1).clip(4),
-        Photographs(frames=3, split="test").clip(4),
-    ]
-    assert all(not torch.equal(first.frames, other.frames) for other in others)
+    assert first.frames.shape == (4, 64, 80) and first.frames.dtype == torch.float32
+    assert float(first.frames.min()) >= 0 and float(first.frames.max()) <= 1 and first.fps == 120.0
+    for other in (clip(4), clip(seed=1), clip(split="test")):
+        name = "frames" if first.path_px is None else "path_px"
+        assert not torch.equal(getattr(first, name), getattr(other, name))
 
 
-def test_frames_are_code_values():
-    clip = Photographs(frames=4, height=64, width=96).clip(0)
-    assert clip.frames.shape == (4, 64, 96) and clip.frames.dtype == torch.float32
-    assert 0 <= float(clip.frames.min()) < float(clip.frames.max()) <= 1
-    assert clip.fps == 120.0
-
-
-def test_a_finer_clip_holds_the_coarse_one():
-    coarse = Photographs(frames=4, fps=120.0).clip(2).frames
-    fine = Photographs(frames=10, fps=360.0).clip(2).frames
-    assert torch.equal(coarse, fine[::3])
+@pytest.mark.parametrize("kind", SCENES)
+def test_a_clip_is_a_function_of_time(kind):
+    """A finer clip holds the coarse one, a longer one the shorter."""
+    size = {"height": 64, "width": 80}
+    for index in range(4):
+        clip = SCENES[kind](frames=5, fps=120.0, **size).clip(index)
+        fine = SCENES[kind](frames=13, fps=360.0, **size).clip(index)
+        longer = SCENES[kind](frames=9, fps=120.0, **size).clip(index)
+        torch.testing.assert_close(clip.frames, fine.frames[::3], atol=1e-5, rtol=0)
+        assert torch.equal(longer.frames[:5], clip.frames)
+        if clip.path_px is not None:
+            torch.testing.assert_close(clip.path_px, fine.path_px[::3], atol=1e-4, rtol=0)
 
 
 def test_motion_is_smooth_and_of_the_stated_speed():
@@ -39,10 +56,8 @@ def test_motion_is_smooth_and_of_the_stated_speed():
     given = {"frames": 9, "speed_widths_per_s": (0.5, 0.5), "max_cutouts": 0}
     slow, fast = Photographs(fps=120.0, **given), Photographs(fps=240.0, **given)
     for index in range(4):
-        steps = [
-            float((clip.frames[1:] - clip.frames[:-1]).abs().mean())
-            for clip in (slow.clip(index), fast.clip(index))
-        ]
+        pair = (scene.clip(index).frames for scene in (slow, fast))
+        steps = [float(frames.diff(dim=0).abs().mean()) for frames in pair]
         assert 1.5 < steps[0] / steps[1] < 2.2
 
 
@@ -60,9 +75,8 @@ def test_splits_are_disjoint_embedded_and_in_a_folder(tmp_path):
         parts = [set(list_photographs(root, split)) for split in ("train", "val", "test")]
         assert all(parts) and sum(map(len, parts)) == len(set.union(*parts))
         assert len(parts[0]) > len(parts[2]) >= len(parts[1])
-    assert len(set(" ".join(EMBEDDED.values()).split())) == sum(
-        len(names.split()) for names in EMBEDDED.values()
-    )
+    names = " ".join(EMBEDDED.values()).split()
+    assert len(set(names)) == len(names)
 
 
 @pytest.mark.parametrize(
@@ -74,6 +88,11 @@ def test_splits_are_disjoint_embedded_and_in_a_folder(tmp_path):
         ({"fps": 0.0}, "fps"),
         ({"speed_widths_per_s": (2.0, 1.0)}, "scene.speed_widths_per_s"),
         ({"photo_px_per_px": (0.0, 1.0)}, "scene.photo_px_per_px"),
+        ({"cutout_widths": (0.3, 0.1)}, "scene.cutout_widths must be a range 0 < low <= high"),
+        ({"cutout_widths": (0.1, float("nan"))}, "scene.cutout_widths must be a range"),
+        ({"static_camera_share": -0.1}, r"scene.static_camera_share must be in \[0, 1\]"),
+        ({"paused_clip_share": 1.1}, r"scene.paused_clip_share must be in \[0, 1\]"),
+        ({"paused_clip_share": float("nan")}, r"scene.paused_clip_share must be in \[0, 1\]"),
         ({"max_cutouts": -1}, "scene.max_cutouts"),
         ({"split": "exam"}, "split"),
     ],
@@ -115,12 +134,8 @@ GREYS = {  # of frame 8, every 80 pixels from (40, 40) on, of clips 0 to 2: as i
 
 @pytest.mark.parametrize("kind", GREYS)
 def test_clips_are_those_that_published_numbers_are_of(kind):
-    settings = (
-        {"static_camera_share": 1.0, "paused_clip_share": 1.0, "max_cutouts": 4}
-        if kind == "still"
-        else {}
-    )
-    scene = Photographs(frames=9, extra_train_root=None, **settings)
+    still = {"static_camera_share": 1.0, "paused_clip_share": 1.0, "max_cutouts": 4}
+    scene = Photographs(frames=9, **(still if kind == "still" else {}))
     for index, greys in enumerate(GREYS[kind]):
         frame = scene.clip(index).frames[-1, 40::80, 40::80]
         assert torch.allclose(frame.flatten(), torch.tensor(greys), atol=2e-3)

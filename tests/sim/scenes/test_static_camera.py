@@ -56,27 +56,6 @@ def test_small_cut_outs_take_the_room_that_their_sizes_say():
     assert len(spans) == 24 and max(spans) <= 0.92 * 12 * 1.2 + 2 and np.median(spans) > 6
 
 
-@pytest.mark.parametrize("kind", ["small", "targets"])
-def test_clips_are_functions_of_the_index_and_of_time(kind):
-    def scene(**more):
-        frame = FRAME | more
-        if kind == "small":
-            return Photographs(**frame, **SMALL, paused_clip_share=0.5)
-        return TargetsOnPhotographs(kinds=ALL, **frame, paused_clip_share=0.5, max_targets=3)
-
-    for index in range(5):
-        clip = scene().clip(index)
-        assert torch.equal(clip.frames, scene().clip(index).frames) and clip.fps == 120.0
-        assert float(clip.frames.min()) >= 0 and float(clip.frames.max()) <= 1
-        fine = scene(frames=13, fps=360.0).clip(index).frames
-        torch.testing.assert_close(clip.frames, fine[::3], atol=1e-5, rtol=0)
-        longer = scene(frames=9).clip(index).frames
-        assert torch.equal(longer[:5], clip.frames)
-    first = scene().clip(0).frames
-    others = (scene().clip(1), scene(seed=1).clip(0), scene(split="test").clip(0))
-    assert not any(torch.equal(first, other.frames) for other in others)
-
-
 def speck(speed: float) -> MovingLayer:
     """Return a white disc in a square of 16 px that starts in the middle and drifts."""
     motion = SimilarityMotion(np.random.default_rng(3), (speed, speed))
@@ -91,9 +70,8 @@ def test_a_cut_out_that_left_comes_in_again_on_the_other_side():
     layer, size = speck(1.0), (64, 96)
     black, middle = np.zeros((64, 96), np.float32), np.array([48.0, 32.0])
     ground = MovingLayer(black, None, middle, 1.0, speck(1e-9).motion, True)
-    frames = np.stack(
-        [render_frame([ground, layer], time, size) for time in np.arange(0, 12, 0.01)]
-    )
+    times = np.arange(0, 12, 0.01)
+    frames = np.stack([render_frame([ground, layer], time, size) for time in times])
     seen = frames.sum((1, 2))
     y, x = np.mgrid[:64, :96]
     first = frames[0]
@@ -139,12 +117,6 @@ def test_targets_are_drawn_before_the_photograph_and_only_there():
 def test_wrong_values_name_their_key(wrong, message):
     with pytest.raises(ValueError, match=message):
         TargetsOnPhotographs(**{"kinds": ALL} | FRAME | wrong)
-
-
-@pytest.mark.parametrize("sizes", [(0.0, 0.1), (0.3, 0.1), (0.1, float("nan"))])
-def test_sizes_of_cut_outs_that_are_no_range_are_refused(sizes):
-    with pytest.raises(ValueError, match="scene.cutout_widths must be a range 0 < low <= high"):
-        Photographs(cutout_widths=sizes)
 
 
 def test_sectors_cover_what_a_fine_grid_says():

@@ -90,7 +90,8 @@ def test_an_uneven_rate_is_made_even_by_the_time_stamps_and_said_once(tmp_path):
         index = index_video(path, "video")
     nearest = [int(np.abs(times - k / 25).argmin()) for k in range(46)]
     assert (
-        numbers(index.read(0, 99, "video"))[::3] == nearest[::3] and len(index.shown_frames) == 46
+        numbers(index.read(0, 99, "video"))[::3] == nearest[::3]
+        and len(index.constant_rate_frames) == 46
     )
     assert numbers(index.read(11, 13, "video")) == nearest[11:13]
     with warnings.catch_warnings():
@@ -133,7 +134,7 @@ def test_damage_in_the_middle_is_found_before_the_first_clip(tmp_path):
     path.write_bytes(content)
     with pytest.warns(UserWarning, match="cut or damaged"):
         index = index_video(path, "video")
-    frames = list(index.read(0, len(index.shown_frames), "video"))
+    frames = list(index.read(0, len(index.constant_rate_frames), "video"))
     assert 2 <= len(frames) < COUNT and numbers(frames) == list(range(len(frames)))
 
 
@@ -156,7 +157,7 @@ def test_text_is_no_film(tmp_path):
 
 def test_names_that_ffmpeg_takes_for_addresses_are_files(tmp_path):
     path = write_video(tmp_path / "http: größe %03d.mp4")
-    assert len(index_video(path, "video").shown_frames) == COUNT
+    assert len(index_video(path, "video").constant_rate_frames) == COUNT
 
 
 @pytest.mark.parametrize(
@@ -166,5 +167,7 @@ def test_names_that_ffmpeg_takes_for_addresses_are_files(tmp_path):
 def test_reported_files_show_all_their_frames(shared_data, name, count, fps):
     index = index_video(shared_data / "reported" / name, "video")
     frames = list(index.read(0, count, "video"))
-    assert len(index.shown_frames) == len(frames) == count and index.fps == pytest.approx(fps)
+    assert len(index.constant_rate_frames) == len(frames) == count and index.fps == pytest.approx(
+        fps
+    )
     assert np.array_equal(list(index.read(77, 79, "video")), frames[77:79])

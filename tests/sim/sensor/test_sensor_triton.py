@@ -6,6 +6,7 @@ Each in a process of its own, because Triton reads TRITON_INTERPRET when it is i
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from importlib.util import find_spec
 from types import ModuleType, SimpleNamespace
 
@@ -22,21 +23,19 @@ from tests.sim.sensor.test_sensor import FPS
 pytestmark = pytest.mark.skipif(not find_spec("triton"), reason="triton is not installed")
 
 
-def in_a_process(check: str, **environment: str) -> None:
-    """Call a function of this file in a process of its own."""
-    done = subprocess.run(
-        [sys.executable, "-c", f"from tests.sim.sensor import test_sensor_triton as t; t.{check}"],
-        env=os.environ | environment, capture_output=True, text=True,
-    )  # fmt: skip
+def in_a_process(check: Callable, **environment: str) -> None:
+    """Call a function of a test file in a process of its own."""
+    code = f"import {check.__module__} as tests; tests.{check.__name__}()"
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
 def simulated(engine: ModuleType, many: list[EventSensor], frames: torch.Tensor) -> torch.Tensor:
     """Grids of two intervals each."""
     given = build_engine_input(sensor_clips(many), frames, VIEWS, substeps=2)
-    return engine.voxels(
-        given, torch.zeros(4, (frames.shape[2] - 1) // 2, 2, 5, *frames.shape[-2:])
-    )
+    grids = torch.zeros(4, (frames.shape[2] - 1) // 2, 2, 5, *frames.shape[-2:])
+    return engine.voxels(given, grids)
 
 
 def agree() -> None:
@@ -90,11 +89,11 @@ def compiles() -> None:
 
 
 def test_the_kernel_is_the_cpus_bit_for_bit():
-    in_a_process("agree()", TRITON_INTERPRET="1")
+    in_a_process(agree, TRITON_INTERPRET="1")
 
 
 def test_the_kernel_says_what_is_no_intensity():
-    in_a_process("refuses()", TRITON_INTERPRET="1")
+    in_a_process(refuses, TRITON_INTERPRET="1")
 
 
 def test_cuda_is_given_to_the_kernel_and_v2es_stamps_to_the_cpu():
@@ -105,4 +104,4 @@ def test_cuda_is_given_to_the_kernel_and_v2es_stamps_to_the_cpu():
 
 
 def test_the_kernel_compiles_for_a_gpu():
-    in_a_process("compiles()")
+    in_a_process(compiles)

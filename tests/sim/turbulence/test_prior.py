@@ -5,21 +5,17 @@ from collections import Counter
 
 import numpy as np
 import pytest
-import torch
 
+from src.sim.noise import generator
 from src.sim.turbulence import sample_atmosphere
 from src.sim.turbulence.outer_scale import short_exposure_half_light_radius
 from src.sim.turbulence.prior import (
     TILT_AND_BLUR_PX,
     NoCameraError,
     TargetImageStatistics,
-    cn2_profile,
     sample_matching_atmosphere,
+    unnormalised_cn2_profile,
 )
-
-
-def generator(seed: int) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 @pytest.mark.parametrize("severity", ["weak", "medium", "strong"])
@@ -39,9 +35,8 @@ def test_extreme_turbulence_needs_more_than_weak_scintillation():
     """Large tilt over short lengths: no path below a Rytov variance of 3 shows it."""
     half_length = {"tilt_correlation_half_length_px": (7.0, 15.0), "global_tilt_probability": 0.0}
     with pytest.raises(NoCameraError):
-        sample_atmosphere(
-            "extreme", generator(0), tilt_and_blur_px={"extreme": (5, 7)}, **half_length
-        )
+        tilt_and_blur_px = {"extreme": (5, 7)}
+        sample_atmosphere("extreme", generator(0), tilt_and_blur_px=tilt_and_blur_px, **half_length)
     for seed in range(10):
         path = sample_atmosphere("extreme", generator(seed), **half_length, max_rytov_variance=30)
         assert path.severity == "extreme"
@@ -50,12 +45,8 @@ def test_extreme_turbulence_needs_more_than_weak_scintillation():
 
 
 def test_half_lengths_are_log_uniform_and_some_of_whole_views():
-    lengths = np.array(
-        [
-            sample_atmosphere("mixed", generator(s)).tilt_correlation_half_length_px(256)
-            for s in range(600)
-        ]
-    )
+    paths = [sample_atmosphere("mixed", generator(seed)) for seed in range(600)]
+    lengths = np.array([path.tilt_correlation_half_length_px(256) for path in paths])
     rigid = (lengths > 100).mean()
     assert rigid == pytest.approx(0.15, abs=4 * math.sqrt(0.15 * 0.85 / 600) + 0.02)
     local = np.log(lengths[lengths < 100] / 5) / math.log(20)
@@ -133,7 +124,7 @@ def test_ranges_that_cannot_be_met_and_bad_ranges(settings, message):
 
 
 def test_profiles_by_name_and_by_table():
-    assert sum(cn2_profile("camera")[:13]) == sum(cn2_profile("camera"))
-    assert cn2_profile([0, 2.5]) == (0.0, 2.5)
+    assert sum(unnormalised_cn2_profile("camera")[:13]) == sum(unnormalised_cn2_profile("camera"))
+    assert unnormalised_cn2_profile([0, 2.5]) == (0.0, 2.5)
     path = sample_atmosphere("medium", generator(0), cn2_profiles=[[0.0, 1.0, 3.0]])
     assert path.cn2_profile[2] == pytest.approx(3 * path.cn2_profile[1])

@@ -5,26 +5,19 @@ import math
 import pytest
 import torch
 
-from scripts.exact_psf import fraunhofer_psf, noll_covariance
+from scripts.exact_psf import fraunhofer_psf
+from scripts.p2s_errors import exact_psfs
 from src.sim.turbulence.p2s import (
     FILE,
-    SAMPLES_PER_LAMBDA_OVER_D,
     FittedPSFs,
     basis_parities,
     find_psf_band,
     load_bands_by_d_over_r0,
 )
 from src.sim.turbulence.psf import pixel_integration_matrix
-from tests.sim.turbulence.theory import compute_fitted_psfs
+from tests.sim.turbulence.theory import compute_fitted_psfs, draw_phases
 
 MODES = 119  # that carry what blurs
-
-
-def phases(count: int, d_over_r0: float, modes: int) -> torch.Tensor:
-    mix = torch.linalg.cholesky(noll_covariance(modes)).float() * d_over_r0 ** (5 / 6)
-    out = torch.randn(count, modes, generator=torch.Generator().manual_seed(3)) @ mix.T
-    out[:, :2] = 0
-    return out
 
 
 def test_clear_pupil_is_airys_pattern():
@@ -41,17 +34,15 @@ def test_tilt_moves_the_light_the_way_it_says():
     psf = fraunhofer_psf(tilt, lambda_over_d_px=2.0, size=63, points=1)
     straight = fraunhofer_psf(torch.zeros(2), lambda_over_d_px=2.0, size=63, points=1)
     moved = psf.flatten().argmax()
-    assert (moved % 63 - 31, moved // 63 - 31) == (
-        round(1.5 * 4 / math.pi),
-        round(-0.8 * 4 / math.pi),
-    )
+    assert moved % 63 - 31 == round(1.5 * 4 / math.pi)
+    assert moved // 63 - 31 == round(-0.8 * 4 / math.pi)
     assert straight.argmax() == 31 * 63 + 31
 
 
 @pytest.mark.parametrize("airy", [0.5, 0.7, 1.0, 2.0])
 def test_resampling_equals_integration_over_pixels(airy):
     size = 2 * int(4 * airy) + 1
-    coefficients = phases(8, 2.0, 35)
+    coefficients = draw_phases(8, 2.0, 35)
     fine = fraunhofer_psf(coefficients, lambda_over_d_px=2.0, size=65, pupil=64, points=1)
     grid = pixel_integration_matrix(size, 65, 2.0 / airy).float()
     ours = grid @ fine @ grid.T
@@ -63,19 +54,12 @@ def test_resampling_equals_integration_over_pixels(airy):
 def exact_and_fitted(strength: float, number: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Return PSFs (300, fine^2) of all modes, and what network `number` makes of its own."""
     band = find_psf_band(strength)
-    coefficients = phases(300, strength, MODES)
+    coefficients = draw_phases(300, strength, MODES)
     size = band.mean.shape[-1]
-    exact = fraunhofer_psf(
-        coefficients,
-        lambda_over_d_px=SAMPLES_PER_LAMBDA_OVER_D,
-        size=size,
-        pupil=size - 3,
-        points=1,
-    )
+    exact = exact_psfs(coefficients, size)
     network = band.networks[number]
-    weights = network.merge_into_few_matrices(network.modes - 2, strength)(coefficients[:, 2:].T)[
-        1:
-    ].T
+    merged = network.merge_into_few_matrices(network.modes - 2, strength)
+    weights = merged(coefficients[:, 2:].T)[1:].T
     basis = band.basis[basis_parities(band.basis).argsort(stable=True)]
     return exact.flatten(1), band.mean.flatten() + weights @ basis.flatten(1)
 
@@ -107,8 +91,8 @@ def test_basis_is_even_or_odd_under_both_mirrors():
 
 
 def test_fitted_psf_without_phase_is_diffraction():
-    psfs = FittedPSFs(load_bands_by_d_over_r0()[0], -1, 24, 1.0, 17, 0.0)
-    ours = compute_fitted_psfs(psfs, torch.zeros(25, 1)).reshape(17, 17)
+    psfs = FittedPSFs(load_bands_by_d_over_r0()[0], -1, 24, 1.0, 17)
+    ours = compute_fitted_psfs(psfs, torch.zeros(25, 1), 0.0).reshape(17, 17)
     exact = fraunhofer_psf(torch.zeros(2), lambda_over_d_px=1.0, size=17, points=9)
     assert (ours - exact).abs().max() < 0.01 * exact.max()
 
@@ -122,10 +106,9 @@ def test_we_are_closer_than_the_public_network(shared_data):
     """Relative error at D/r0 = 4, at the sampling of the public basis (3.8 pixels a lambda / D)."""
     state = torch.load(shared_data / "p2s_reference/P2S_state.pt", map_location="cpu")
     known = torch.load(shared_data / "p2s_reference/kernel_PCA.pt", map_location="cpu")
-    coefficients = phases(300, 4.0, MODES)
-    exact = fraunhofer_psf(coefficients, lambda_over_d_px=3.8, size=65, pupil=64, points=1).flatten(
-        1
-    )
+    coefficients = draw_phases(300, 4.0, MODES)
+    exact = fraunhofer_psf(coefficients, lambda_over_d_px=3.8, size=65, pupil=64, points=1)
+    exact = exact.flatten(1)
     layers = list(state.values())
     x = coefficients[:, 2:35]
     for index in (0, 2, 4):
@@ -133,8 +116,8 @@ def test_we_are_closer_than_the_public_network(shared_data):
         x = torch.nn.functional.leaky_relu(x, 0.01) if index < 4 else x
     public = known["mu"].reshape(1, -1) + x @ known["dictionary"].reshape(len(x.T), -1)
     band = find_psf_band(4.0)
-    psfs = FittedPSFs(band, -1, len(band.basis), 3.8, 65, 4.0)
-    ours = compute_fitted_psfs(psfs, coefficients[:, 2 : psfs.network.modes].T).T
+    psfs = FittedPSFs(band, -1, len(band.basis), 3.8, 65)
+    ours = compute_fitted_psfs(psfs, coefficients[:, 2 : psfs.network.modes].T, 4.0).T
 
     def error(psf):
         psf, truth = (p / p.sum(1, keepdim=True) for p in (psf, exact))

@@ -10,10 +10,10 @@ from src.sim.optics import layout
 from src.sim.turbulence.contract import ClipTurbulence, TurbulenceModel
 from src.sim.turbulence.footage_displacement import (
     UnitRmsDisplacement,
-    interpolate_tracks,
-    load_displacement_fields,
+    fit_displacement_field,
+    track_displacement_fields,
 )
-from src.sim.turbulence.recorded import DrawnTilt, RecordedTurbulence, RecordedTurbulenceOperator
+from src.sim.turbulence.recorded import RecordedTurbulence, RecordedTurbulenceOperator
 
 RMS = {"weak": 0.5, "medium": 1.0, "strong": 2.0}
 SIDE, FRAMES = 256, 12
@@ -51,7 +51,7 @@ def model(footage):
 
 
 def test_the_fields_are_the_warps_that_the_footage_was_made_with(footage):
-    found = load_displacement_fields(footage)
+    found = track_displacement_fields(footage)
     left, top = (round((SIDE - size) / 2) for size in (found.width_px, found.height_px))
     assert max(left, top) < 16  # corners fill the frame but for a margin
     place = np.arange(40.0, 216.0, 4.0)
@@ -72,7 +72,7 @@ def test_between_corners_and_frames_the_fields_are_smooth_and_pass_through_them(
     corners = rng.uniform(0, 100, (60, 2))
     corners[:4] = [[0, 0], [100, 0], [0, 100], [100, 100]]
     slope = np.stack([0.02 * corners[:, 0] - 1, 0.01 * corners[:, 1]], -1)
-    found = interpolate_tracks(slope * np.sin(np.arange(9))[:, None, None], corners)
+    found = fit_displacement_field(slope * np.sin(np.arange(9))[:, None, None], corners)
     whole = at(found, 3.0, *np.arange(0, 101, 10.0))[0]
     assert torch.allclose(whole[0, :, 10] / whole[0, :, 0], torch.tensor(-1.0), atol=1e-2)
     assert found.nodes.square().mean().sqrt() == pytest.approx(1.0, abs=1e-5)
@@ -100,12 +100,12 @@ def test_both_sides_of_the_contract_are_kept(model):
     assert (
         air.metadata["tilt_px"] == RMS[strength] and air.metadata["blur_px"] == 0.4 * RMS[strength]
     )
-    drawn = {model.draw(generator(k)).severity for k in range(30)}
+    drawn = {model.draw(generator(k)) for k in range(30)}
     assert drawn == set(RMS)
 
 
 def test_a_view_depends_on_its_own_position_and_a_crop_is_that_part_of_the_whole(model):
-    frames, strong = torch.rand(1, 3, 64, 64), DrawnTilt("strong", 2.0)
+    frames, strong = torch.rand(1, 3, 64, 64), "strong"
     nine = model.operator(strong, views=layout(9), **RUN)
     one = model.operator(strong, views=layout(1), **RUN)
     whole = nine.degrade(frames, generator(3))
@@ -118,7 +118,7 @@ def test_a_view_depends_on_its_own_position_and_a_crop_is_that_part_of_the_whole
 def test_the_picture_moves_as_tilt_says_and_a_flat_one_stays_flat(model):
     y, x = torch.meshgrid(torch.arange(64.0), torch.arange(64.0), indexing="ij")
     frames = (x + 2 * y).expand(1, 4, 64, 64) / 200
-    air = model.operator(DrawnTilt("medium", 1.0), views=layout(4), **RUN)
+    air = model.operator("medium", views=layout(4), **RUN)
     seen, tilt = air.degrade(frames, generator(5)), air.tilt(4, generator(5))
     inner = (..., slice(8, 56), slice(8, 56))
     expected = frames[:, None] - (tilt[:, :, 0] + 2 * tilt[:, :, 1]) / 200
@@ -129,18 +129,14 @@ def test_the_picture_moves_as_tilt_says_and_a_flat_one_stays_flat(model):
 
 def test_a_point_is_blurred_as_stated():
     still = UnitRmsDisplacement(torch.zeros(3, 2, 4, 4), 10.0, 10.0)
-    air = RecordedTurbulenceOperator(
-        still, DrawnTilt("strong", 2.0), layout(1), (33, 33), 0.25, 1.2
-    )
+    air = RecordedTurbulenceOperator(still, "strong", 2.0, layout(1), (33, 33), 0.25, 1.2)
     frames = torch.zeros(1, 1, 33, 33)
     frames[..., 16, 16] = 1
     spot = air.degrade(frames, generator(0))[0, 0, 0]
     away = torch.arange(33) - 16.0
     assert float(spot.sum()) == pytest.approx(1, abs=1e-4)
     assert float((spot.sum(0) * away**2).sum()) == pytest.approx(1.2**2, rel=0.05)
-    sharp = RecordedTurbulenceOperator(
-        still, DrawnTilt("weak", 0.0), layout(1), (33, 33), 0.25, 0.0
-    )
+    sharp = RecordedTurbulenceOperator(still, "weak", 0.0, layout(1), (33, 33), 0.25, 0.0)
     assert torch.equal(sharp.degrade(frames, generator(0))[0], frames)
 
 
@@ -153,7 +149,8 @@ def test_nine_views_look_through_nine_pieces():
     nodes[:, 1] = (place // 32)[:, None] * 2 + place // 32
     air = RecordedTurbulenceOperator(
         UnitRmsDisplacement(nodes, 63.0, 63.0),
-        DrawnTilt("weak", 1.0),
+        "weak",
+        1.0,
         layout(9),
         (256, 256),
         0.25,
@@ -172,7 +169,7 @@ def test_nine_views_look_through_nine_pieces():
 def test_about_half_of_the_views_play_their_piece_backwards():
     clock = torch.arange(40.0)[:, None, None, None].expand(40, 2, 8, 8)
     seen = UnitRmsDisplacement(clock, 63.0, 63.0)
-    air = RecordedTurbulenceOperator(seen, DrawnTilt("weak", 1.0), layout(9), (16, 16), 0.25, 0.0)
+    air = RecordedTurbulenceOperator(seen, "weak", 1.0, layout(9), (16, 16), 0.25, 0.0)
     backwards = 0
     for seed in range(10):
         time = air.tilt(40, generator(seed)).abs().mean((2, 3, 4))
@@ -188,7 +185,7 @@ def test_mirrored_and_turned_pieces_stay_gradients():
     hill = torch.stack([torch.cos(x / 9) * torch.sin(y / 7) / 9,
                         torch.sin(x / 9) * torch.cos(y / 7) / 7])  # fmt: skip
     seen = UnitRmsDisplacement(hill.expand(4, 2, 65, 65), 64.0, 64.0)
-    air = RecordedTurbulenceOperator(seen, DrawnTilt("weak", 1.0), layout(9), (16, 16), 0.1, 0.0)
+    air = RecordedTurbulenceOperator(seen, "weak", 1.0, layout(9), (16, 16), 0.1, 0.0)
     tilt = air.tilt(2, generator(1))
     down = tilt[:, :, 0, 2:, 1:-1] - tilt[:, :, 0, :-2, 1:-1]
     across = tilt[:, :, 1, 1:-1, 2:] - tilt[:, :, 1, 1:-1, :-2]
@@ -210,8 +207,8 @@ def moving(folder, count=10):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"root": None}, "turbulence.root must be a video or folder of frames .*got None"),
-        ({"root": "/nowhere"}, "turbulence.root must be .*got /nowhere"),
+        ({"footage": None}, "turbulence.footage must be a video or folder of frames .*got None"),
+        ({"footage": "/nowhere"}, "turbulence.footage must be .*got /nowhere"),
         ({"severity": "wild"}, "turbulence.severity must be mixed, weak, medium, strong, got wild"),
         (
             {"tilt_rms_px": {"weak": -1.0}},
@@ -223,31 +220,33 @@ def moving(folder, count=10):
 )
 def test_a_wrong_value_names_its_key(footage, options, said):
     with pytest.raises(ValueError, match=said):
-        RecordedTurbulence(**{"root": str(footage), "tilt_rms_px": RMS} | options)
+        RecordedTurbulence(**{"footage": str(footage), "tilt_rms_px": RMS} | options)
 
 
 def test_footage_that_will_not_do_is_refused(tmp_path, footage):
-    with pytest.raises(ValueError, match="turbulence.root must hold videos or folders"):
-        load_displacement_fields(tmp_path)
-    with pytest.raises(ValueError, match="turbulence.root must be a still scene of which 20 cor"):
-        load_displacement_fields(moving(tmp_path / "pan"))
+    with pytest.raises(ValueError, match="turbulence.footage must hold videos or folders"):
+        track_displacement_fields(tmp_path)
+    with pytest.raises(
+        ValueError, match="turbulence.footage must be a still scene of which 20 cor"
+    ):
+        track_displacement_fields(moving(tmp_path / "pan"))
     moving(tmp_path / "short", count=7)
     with pytest.raises(
-        ValueError, match="turbulence.root must be footage of 8 frames or more, got 7"
+        ValueError, match="turbulence.footage must be footage of 8 frames or more, got 7"
     ):
-        load_displacement_fields(tmp_path / "short")
+        track_displacement_fields(tmp_path / "short")
     with pytest.raises(ValueError, match="one video or one folder of frames, got 2"):
-        load_displacement_fields(tmp_path)
+        track_displacement_fields(tmp_path)
     flat = tmp_path / "flat"
     flat.mkdir()
     for k in range(9):
         cv2.imwrite(str(flat / f"{k}.png"), np.full((64, 64), 90, np.uint8))
     with pytest.raises(ValueError, match="got 0 of 0 in"):
-        load_displacement_fields(flat)
+        track_displacement_fields(flat)
 
 
 def test_the_real_footage_moves_locally(shared_data):
-    found = load_displacement_fields(shared_data / "turbulence" / "building")
+    found = track_displacement_fields(shared_data / "turbulence" / "building")
     assert found.nodes.shape[0] == 40 and min(found.width_px, found.height_px) > 190
     power = found.nodes.square().mean((0, 1))
     assert float(power.max().sqrt()) < 2 and float(power.min().sqrt()) > 0.5

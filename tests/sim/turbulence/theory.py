@@ -10,6 +10,7 @@ from scipy import optimize, special
 from torch.nn import functional
 
 from scripts.exact_psf import fraunhofer_psf, noll_covariance
+from src.sim import noise
 from src.sim.turbulence import clip_rendering
 from src.sim.turbulence.atmosphere import Atmosphere
 from src.sim.turbulence.coefficient_grid import WaveSum
@@ -76,9 +77,17 @@ def structure_variance() -> float:
     return float(structure / 2 * 8 / math.pi * mean)
 
 
-def compute_fitted_psfs(psfs: FittedPSFs, phase: torch.Tensor) -> torch.Tensor:
+def draw_phases(count: int, d_over_r0: float, modes: int, tilt: bool = False) -> torch.Tensor:
+    """Return Noll 2..modes + 1 (count, modes) in rad, always the same; without `tilt` that is 0."""
+    mix = torch.linalg.cholesky(noll_covariance(modes)).float() * d_over_r0 ** (5 / 6)
+    phases = torch.randn(count, modes, generator=noise.generator(3)) @ mix.T
+    phases[:, :2] *= tilt
+    return phases
+
+
+def compute_fitted_psfs(psfs: FittedPSFs, phase: torch.Tensor, d_over_r0: float) -> torch.Tensor:
     """Return the PSFs (pixels, n) of Noll 4, 5, ... (blurmodes, n) in rad, none of it negative."""
-    weights = psfs.network.merge_into_few_matrices(len(phase), psfs.d_over_r0)(phase)
+    weights = psfs.network.merge_into_few_matrices(len(phase), d_over_r0)(phase)
     return (psfs.basis.flatten(1).T @ weights).clamp(min=0)
 
 
@@ -99,9 +108,9 @@ def degrade_with_exact_psfs(
         for grid, first in (("tilt", 0), ("psf", 2))
     )
     rows, columns = plan.psf_grid
-    tilt = clip_rendering._tilt(plan, tables, tilt)
-    warped = blur_torch.warp(frame[None], tilt, rows.start, columns.start)
+    tilt = clip_rendering._interpolate_tilt(plan, tables, tilt)
+    warped = blur_torch.warp_cubic(frame[None], tilt, rows.start, columns.start)
     coefficients = functional.pad(phase.permute(1, 2, 3, 0), (2, 0))
     psfs = fraunhofer_psf(coefficients, lambda_over_d_px=unit, size=size, normalise_plane=True)
     psfs = psfs.flatten(3).permute(3, 0, 1, 2)
-    return blur_torch.scatter(warped, psfs, rows, torch.zeros(1, *crop[2:]), 0.0)[0]
+    return blur_torch.scatter_normalised(warped, psfs, rows, torch.zeros(1, *crop[2:]), 0.0)[0]

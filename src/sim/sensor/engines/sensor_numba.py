@@ -56,9 +56,9 @@ def random_uint32(key, high, low):
 
 
 @inline_kernel
-def level_change(delta, u):
-    """Return how far a level that moves by `delta` in an interval has come at fraction `u`."""
-    return np.int64(np.rint(f32(u) * f32(delta)))
+def level_change_at(change, fraction):
+    """Return how far a level that moves by `change` in an interval has come at `fraction`."""
+    return np.int64(np.rint(f32(fraction) * f32(change)))
 
 
 @inline_kernel
@@ -79,7 +79,7 @@ def append_linear_events(
     holding = mode == HOLD and dead > start
     while True:
         if holding and dead <= stop:  # the reset ends
-            at = level_change(span, dead)
+            at = level_change_at(span, dead)
             holding = False
         moved = False
         if not holding:
@@ -101,7 +101,7 @@ def append_linear_events(
         if noise_u >= dead:
             pixels[count], times[count], signs[count] = x, noise_u, noise_sign
             count += 1
-            at = level_change(span, noise_u)
+            at = level_change_at(span, noise_u)
             dead = noise_u + wait
             holding = mode == HOLD and wait > 0
         start, stop, noise_u = noise_u, f32(1), f32(2)
@@ -124,7 +124,7 @@ def count_v2e_crossings(l0, l1, ref, dead, on, off, mode):
     if mode == HOLD and dead > 1:
         return 0, ref
     if mode == HOLD and dead > 0:
-        ref = l0 + level_change(l1 - l0, dead)
+        ref = l0 + level_change_at(l1 - l0, dead)
     return (l1 - ref) // on if l1 >= ref else (ref - l1) // off, ref
 
 
@@ -157,7 +157,7 @@ def append_v2e_events(
         if kept and tested and mode == HOLD:
             if dead > 1:
                 break
-            ref = l0 + level_change(l1 - l0, dead)
+            ref = l0 + level_change_at(l1 - l0, dead)
     if noise_u <= 1:
         pixels[count], times[count], signs[count] = x, f32(1), noise_sign
         count += 1
@@ -192,7 +192,7 @@ def read_levels(table, intensity, levels):
 
 
 @kernel
-def read_half_levels(table, halves, intensity, levels):
+def read_float16_levels(table, halves, intensity, levels):
     """The same of the bits of float16, whose lights are the table's nodes; widened in `intensity`.
 
     In a float32's place the exponent is too small by 127 - 15: exact also below 2**-14.
@@ -234,12 +234,12 @@ def draw_thresholds_and_hot_pixels(clip, keys, normals, work):
     on, off, hot, pixel, drawn = work.on, work.off, work.hot, work.pixel, work.drawn
     on[:], off[:], hot_count = clip.on, clip.off, 0
     if clip.mismatch > 0:
-        draw_bits(keys[MISMATCH_KEY], 2, 0, pixel, drawn)
+        draw_uint32_per_pixel(keys[MISMATCH_KEY], 2, 0, pixel, drawn)
         spread_thresholds(clip.on, clip.mismatch, normals, drawn, on)
-        draw_bits(keys[MISMATCH_KEY], 2, 1, pixel, drawn)
+        draw_uint32_per_pixel(keys[MISMATCH_KEY], 2, 1, pixel, drawn)
         spread_thresholds(clip.off, clip.mismatch, normals, drawn, off)
     if clip.hot_fraction > 0:
-        draw_bits(keys[HOT_PIXEL_KEY], 1, 0, pixel, drawn)
+        draw_uint32_per_pixel(keys[HOT_PIXEL_KEY], 1, 0, pixel, drawn)
         for x in range(pixel.size):
             if drawn[x] < clip.hot_fraction:
                 hot[hot_count] = x
@@ -248,7 +248,7 @@ def draw_thresholds_and_hot_pixels(clip, keys, normals, work):
 
 
 @kernel
-def draw_bits(key, words, word, pixel, drawn):
+def draw_uint32_per_pixel(key, words, word, pixel, drawn):
     """Fill random_uint32(key, 0, words * pixel + word); a pixel has so many words."""
     for x in range(pixel.size):
         drawn[x] = random_uint32(key, 0, uint32(words) * uint32(pixel[x]) + uint32(word))
@@ -348,7 +348,7 @@ def list_active_pixels(mode, work):
 
 
 @kernel
-def advance_active_pixels(given, wait, work, steps, done, last):
+def advance_active_pixels(given, wait, work, v2e_steps, done, last):
     """Take the active pixels `done` .. `last` - 1 through an interval, until the batch is full;
     return the number of events in it and of the pixels that are done.
     """
@@ -364,7 +364,7 @@ def advance_active_pixels(given, wait, work, steps, done, last):
         u, s = noise_u[x], np.int64(noise_sign[x])
         if v2e:
             count, ref, dead[x] = append_v2e_events(
-                x, l0, l1, ref, dead[x], on, off, wait, mode, steps, u, s, batch, count
+                x, l0, l1, ref, dead[x], on, off, wait, mode, v2e_steps, u, s, batch, count
             )
         else:
             count, ref, dead[x] = append_linear_events(
@@ -376,7 +376,7 @@ def advance_active_pixels(given, wait, work, steps, done, last):
 
 
 @kernel
-def write_events(output, place, width, work, count, clock):
+def add_events_to_output(output, place, width, work, count, clock):
     unit, c, v, first, _ = place
     pixels, times, signs = work.event_pixel, work.event_u, work.event_sign
     grids, tally, events = output
@@ -418,7 +418,7 @@ def initialise_pixel_state(clip, key, work):
     level, reference, drawn = work.level, work.reference, work.drawn
     work.source[:], reference[:], work.dead[:] = level, level, f32(0)
     if clip.reference_error > 0:
-        draw_bits(key, 1, 0, work.pixel, drawn)
+        draw_uint32_per_pixel(key, 1, 0, work.pixel, drawn)
         for x in range(level.size):
             uniform = (f32(drawn[x] >> uint32(9)) + f32(0.5)) * f32(2.0**-23)
             away = np.float64(f32(2) * uniform - f32(1)) * clip.reference_error
@@ -432,7 +432,7 @@ def read_frame(given, half_frames, place, frame, work, levels):
     _, c, v, first, last = place
     if half_frames.size:
         seen, halves = work.intensity, half_frames[c, v, frame, first:last]
-        return seen, read_half_levels(given.level_table, halves, seen, levels)
+        return seen, read_float16_levels(given.level_table, halves, seen, levels)
     seen = given.frames[c, v, frame, first:last]
     return seen, read_levels(given.level_table, seen, levels)
 
@@ -455,7 +455,7 @@ def advance_interval(given, clip, hot_count, work, output, place, intensity, key
         draw_noise_events(work, key, frame, last)
     while done < last:
         number, done = advance_active_pixels(given, f32(clip.refractory), work, steps, done, last)
-        write_events(output, place, given.width, work, number, clock)
+        add_events_to_output(output, place, given.width, work, number, clock)
     if clip.leak:
         for x in range(level.size):
             reference[x] -= drift[x]

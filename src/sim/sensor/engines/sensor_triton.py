@@ -126,7 +126,7 @@ def _simulate(
             )  # fmt: skip
             fired = (u <= 1) & (u >= dead)
             grid = _add_to_grid(grid, fired, u, sign, begin, ticks, scale, column, BINS)
-            mark = tl.where(fired, level_change(span, u), mark)
+            mark = tl.where(fired, level_change_at(span, u), mark)
             dead = tl.where(fired, u + wait, dead)
             holding = holding | (fired & (MODE == HOLD) & (wait > 0))
             start = stop
@@ -162,7 +162,7 @@ def _add_events(
     going = own
     while tl.max(going.to(tl.int32), 0) > 0:
         ends = holding & (dead <= stop)  # the reset ends
-        mark = tl.where(ends, level_change(span, dead), mark)
+        mark = tl.where(ends, level_change_at(span, dead), mark)
         holding = holding & (dead > stop)
         now = start
         if MODE != DELETE:
@@ -257,9 +257,9 @@ def apply_low_pass(decay, lag, old_level, old_source, source):
 
 
 @triton.jit
-def level_change(span, u):
-    """Return how far a level that moves by `span` in an interval has come at fraction `u`."""
-    return round_half_even(u * span.to(tl.float32)).to(tl.int32)
+def level_change_at(change, fraction):
+    """Return how far a level that moves by `change` in an interval has come at `fraction`."""
+    return round_half_even(fraction * change.to(tl.float32)).to(tl.int32)
 
 
 @triton.jit

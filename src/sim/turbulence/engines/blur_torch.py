@@ -25,9 +25,9 @@ CUBIC_KERNEL = (
 WARP_NUMBERS, SCATTER_NUMBERS = 70, 3  # held at a time, for a pixel and for one of its PSF
 
 
-def warp(
+def warp_cubic(
     frames: Float[Tensor, "frames height width"],
-    tilt: Float[Tensor, "2 n h w"],
+    tilt: Float[Tensor, "xy=2 n h w"],
     top: int,
     left: int,
     first: int = 0,
@@ -54,7 +54,7 @@ def warp(
     return light.clamp(low, high)
 
 
-def scatter(
+def scatter_normalised(
     image: Float[Tensor, "n h w"],
     psfs: Float[Tensor, "pixels n rows w"],
     rows: GridAxis,

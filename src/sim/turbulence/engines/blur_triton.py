@@ -16,7 +16,7 @@ WARP_NUMBERS, SCATTER_NUMBERS = 8, 0  # held at a time, for a pixel and for one 
 BLOCK = 256  # pixels of a program
 
 
-def warp(frames: Tensor, tilt: Tensor, top: int, left: int, first: int = 0) -> Tensor:
+def warp_cubic(frames: Tensor, tilt: Tensor, top: int, left: int, first: int = 0) -> Tensor:
     _, n, height, width = tilt.shape
     out = tilt.new_empty(n, height, width)
     low, high = torch.aminmax(frames.flatten(1), dim=1)
@@ -28,7 +28,7 @@ def warp(frames: Tensor, tilt: Tensor, top: int, left: int, first: int = 0) -> T
     return out
 
 
-def scatter(
+def scatter_normalised(
     image: Tensor, psfs: Tensor, rows: GridAxis, halo: Tensor, halo_share: float, first: int = 0
 ) -> Tensor:
     (frames, height, width), n = halo.shape, len(image)

@@ -37,7 +37,7 @@ def copy_to_device(tensor: Tensor, device: torch.device) -> Tensor:
 
 
 @cache
-def select_engine(device: torch.device) -> ModuleType:
+def select_blur_engine(device: torch.device) -> ModuleType:
     """Return Triton's kernels on CUDA where they do what plain torch does, else plain torch."""
     if device.type != "cuda" or not find_spec("triton"):
         return blur_torch
@@ -64,6 +64,6 @@ def max_difference_from_torch(engine: ModuleType, pitch: int, device: torch.devi
     warped, made = [], []
     for one in (engine, blur_torch):
         with full_float32():
-            warped.append(one.warp(frames, tilt, -3, 2, 1))
-            made.append(one.scatter(warped[-1], psfs, rows, halo, 0.1, 1))
+            warped.append(one.warp_cubic(frames, tilt, -3, 2, 1))
+            made.append(one.scatter_normalised(warped[-1], psfs, rows, halo, 0.1, 1))
     return max(float((a - b).abs().max()) for a, b in (warped, made))

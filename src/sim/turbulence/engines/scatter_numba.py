@@ -5,7 +5,7 @@ from numba import njit
 
 
 @njit(nogil=True, cache=True, fastmath=True)
-def scatter_psfs(image, nodes, frame, basis, ends, row, column, pitch, halo, share):
+def scatter_normalised(image, nodes, frame, basis, ends, row, column, pitch, halo, share):
     """Return the light of `image` (h, w) spread by PSFs over what white light would give.
 
     `nodes` (rank, frames, rows, columns) holds the weights of the basis functions of `frame`,

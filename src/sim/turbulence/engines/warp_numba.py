@@ -31,7 +31,7 @@ def pad_frames(frames: Float[Tensor, "frames height width"]) -> PaddedFrames:
 
 
 def warp_frames(
-    padded: PaddedFrames, first: int, tilt: Float[Tensor, "2 n h w"], top: int, left: int
+    padded: PaddedFrames, first: int, tilt: Float[Tensor, "xy=2 n h w"], top: int, left: int
 ) -> Iterator[Float[np.ndarray, "h w"]]:
     """Yield the frames from `first` on, displaced by `tilt` (x, y) in pixels: see warp_frame."""
     for index in range(tilt.shape[1]):

@@ -15,10 +15,16 @@ from pathlib import Path
 
 import numpy as np
 
-from src.recordings.files.aedat3_packets import iter_polarity
-from src.recordings.files.clocks import TimestampUnwrapper, merge_small_pieces
-from src.recordings.files.event_file import PIECE_EVENTS, EventFile, RawEvents, ReadOptions
-from src.recordings.files.streams import EventStream, choose_stream
+from src.recordings.files.clocks import TimestampUnwrapper, merge_small_pieces, read_whole_words
+from src.recordings.files.event_file import (
+    EventFile,
+    EventStream,
+    RawEvents,
+    ReadOptions,
+    WidthHeight,
+    choose_stream,
+)
+from src.recordings.files.unpacking import LARGEST_PACKET
 
 LARGEST_HEADER = 2**24  # bytes; jAER's settings are in it
 LINE = re.compile(rb"#[^\n\x00-\x08\x0e-\x1f]*\n")
@@ -29,9 +35,14 @@ SENSORS = {
     "davis346": (346, 260), "davis640": (640, 480),
 }  # fmt: skip
 DAVIS_OTHERS = 1 << 31 | 1 << 10  # bits of what is no event of a pixel
+PACKET_HEADER = np.dtype(
+    [("kind", "<i2"), ("source", "<i2"), ("bytes", "<i4"), ("time_at", "<i4"), ("rounds", "<i4"),
+     ("room", "<i4"), ("count", "<i4"), ("valid", "<i4")]
+)  # fmt: skip
+POLARITY = 1  # kind of a packet of events
 
 
-class Aedat2File(EventFile):
+class Aedat1To3File(EventFile):
     """An `.aedat` file of version 1.0, 2.0 or 3.1; times are microseconds.
 
     Which camera it was is read in its header, else told by its addresses, which `notes` says.
@@ -65,7 +76,7 @@ class Aedat2File(EventFile):
         """Yield the events; warns of a file that ends within one; raises ValueError for a file of
         nothing but frames, motion or triggers, and for packets that cannot be."""
         if self._version == "3.1":
-            yield from merge_small_pieces(iter_polarity(self.path, self._start, self._source))
+            yield from merge_small_pieces(_iter_polarity(self.path, self._start, self._source))
             return
         found, words, clock = 0, 0, TimestampUnwrapper()
         for address, t in self._words():
@@ -78,16 +89,9 @@ class Aedat2File(EventFile):
     def _words(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield addresses and times, (n,) uint32 each."""
         kind = np.dtype([("address", ">u2" if self._version == "1.0" else ">u4"), ("t", ">u4")])
-        with self.path.open("rb") as file:
-            file.seek(self._start)
-            while block := file.read(kind.itemsize * PIECE_EVENTS):
-                count, cut = divmod(len(block), kind.itemsize)
-                if cut:
-                    warnings.warn(
-                        f"{self.path}: ends within an event, it is truncated", stacklevel=3
-                    )
-                words = np.frombuffer(block, kind, count)
-                yield words["address"].astype(np.uint32), words["t"].astype(np.uint32)
+        for block in read_whole_words(self.path, self._start, kind.itemsize):
+            words = np.frombuffer(block, kind)
+            yield words["address"].astype(np.uint32), words["t"].astype(np.uint32)
 
     def _split(self, address: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return ON, x and y as jAER shows them, and which are pixels; (n,) each."""
@@ -99,7 +103,7 @@ class Aedat2File(EventFile):
             pixel = address & DAVIS_OTHERS == 0
         return on, width - 1 - x.astype(np.int32), height - 1 - y.astype(np.int32), pixel
 
-    def _guess_size(self) -> tuple[int, int] | None:
+    def _guess_size(self) -> WidthHeight | None:
         """Return the smallest sensor that holds all addresses; None where there are none."""
         largest = np.zeros(3, np.int64)
         for address, _ in self._words():
@@ -118,7 +122,7 @@ def _split_davis(address: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return address >> 11 & 1, address >> 12 & 1023, address >> 22 & 511
 
 
-def _find_size(text: str) -> tuple[int, int] | None:
+def _find_size(text: str) -> WidthHeight | None:
     name = re.search("|".join(SENSORS), text)
     return SENSORS[name.group()] if name else None
 
@@ -133,3 +137,48 @@ def _read_lines(path: Path) -> tuple[str, int]:
         if LAST_LINE.match(line.group()):
             break
     return content[:at].decode("latin-1").lower(), at
+
+
+def _iter_polarity(path: Path, start: int, source: int) -> Iterator[RawEvents]:
+    """Yield the valid events of a camera, packet by packet from byte `start`, times in us.
+
+    An event has 32 bits (from the lowest 1 valid, 1 ON, 15 of y, 15 of x) and its time.  Warns of a
+    file that ends within a packet.  Raises ValueError for a packet that cannot be, and where only
+    packets of other kinds come.
+    """
+    found, others, left = 0, 0, path.stat().st_size - start
+    with path.open("rb") as file:
+        file.seek(start)
+        while left >= PACKET_HEADER.itemsize:
+            head = np.frombuffer(file.read(PACKET_HEADER.itemsize), PACKET_HEADER)[0]
+            size = _packet_bytes(path, head)
+            left -= PACKET_HEADER.itemsize + size
+            if left < 0:
+                break
+            content = file.read(size)
+            if head["kind"] == POLARITY and head["source"] == source:
+                found += int(head["count"])
+                yield _polarity_events(content, int(head["rounds"]))
+            else:
+                others += 1
+    if left:
+        warnings.warn(f"{path}: ends within a packet, it is truncated", stacklevel=3)
+    if others and not found:
+        raise ValueError(f"{path}: holds no events, only {others} packets of other kinds")
+
+
+def _packet_bytes(path: Path, head: np.void) -> int:
+    size = int(head["bytes"]) * int(head["count"])
+    least = 8 if head["kind"] == POLARITY else 0
+    if head["bytes"] < least or head["count"] < 0 or not 0 <= size <= LARGEST_PACKET:
+        raise ValueError(
+            f"{path}: a packet of {head['count']} events of {head['bytes']} bytes cannot be"
+        )
+    return size
+
+
+def _polarity_events(content: bytes, rounds: int) -> RawEvents:
+    words = np.frombuffer(content, "<u4").reshape(-1, 2)
+    data, t = words[words[:, 0] & 1 == 1].T
+    x, y = (data >> 17).astype(np.uint16), (data >> 2 & 0x7FFF).astype(np.uint16)
+    return RawEvents(t.astype(np.int64) + (rounds << 31), x, y, data >> 1 & 1)

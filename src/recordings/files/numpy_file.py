@@ -1,7 +1,8 @@
 """Events in NumPy files: .npy and .npz, nothing of which is executed."""
 
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +12,24 @@ from src.recordings.files.columns import (
     as_integers,
     as_times,
     check_lengths,
-    check_unpacked_size,
+    check_unpacking_ratio,
     find_columns,
     find_columns_by_name,
     find_keys_by_name,
+    find_stated_size,
 )
-from src.recordings.files.event_file import PIECE_EVENTS, EventFile, RawEvents, ReadOptions
-from src.recordings.files.streams import EventStream, choose_stream
+from src.recordings.files.event_file import (
+    PIECE_EVENTS,
+    EventFile,
+    EventStream,
+    RawEvents,
+    ReadOptions,
+    choose_stream,
+    name_file_in_errors,
+)
 
 
-class ArrayFile(EventFile):
+class NumpyFile(EventFile):
     """A structured array, an array (n, 4), or an .npz with these or with columns of their own.
 
     An .npz may state `size` (width, height), or `width` and `height`.
@@ -28,19 +37,16 @@ class ArrayFile(EventFile):
 
     def __init__(self, path: Path, options: ReadOptions):
         self.path = path
-        try:
+        with name_file_in_errors(path, "cannot be read as arrays of events"):
             if path.suffix.lower() == ".npy":
                 self._columns = split_table(np.load(path, mmap_mode="r"), options.columns)
             else:
                 with zipfile.ZipFile(path) as archive:
-                    check_unpacked_size(path, sum(part.file_size for part in archive.infolist()))
+                    check_unpacking_ratio(path, sum(part.file_size for part in archive.infolist()))
                 with np.load(path) as file:
-                    self.size = _stated_size(file)
+                    self.size = find_stated_size(file)
                     self._columns, self.notes = _columns_of(path, file, options)
             check_lengths(self._columns)
-        except Exception as error:  # libraries raise all kinds on a broken file
-            text = str(error).split("\n")[0].removeprefix(f"{path}: ")  # of choose_stream
-            raise ValueError(f"{path}: cannot be read as arrays of events: {text}") from error
 
     def pieces(self) -> Iterator[RawEvents]:
         yield from slice_columns(self.path, self._columns)
@@ -54,28 +60,28 @@ def split_table(table: Any, order: str | None) -> dict[str, Any]:
     slices can be taken; `order`: columns=.  Raises ValueError for another array."""
     names = table.dtype.names
     if names is not None:
-        keys = find_keys_by_name(dict.fromkeys(names))
+        keys = find_keys_by_name(names)
         if keys is None or table.ndim != 1:
             raise ValueError(f"fields must be t, x, y, p of one dimension, got {', '.join(names)}")
-        return {name: _Field(table, key) for name, key in keys.items()}
+        return {name: LazyColumn(table, itemgetter(key)) for name, key in keys.items()}
     if table.ndim != 2 or table.shape[1] < 4:
         raise ValueError(f"an array must be (n, 4) or have fields t, x, y, p, got {table.shape}")
     sample = np.asarray(table[:PIECE_EVENTS])
     if sample.dtype.kind not in "iufb":
         raise ValueError(f"an array must hold numbers, got {sample.dtype}")
     if not len(sample):
-        return {name: SlicedColumn(table, 0) for name in "txyp"}
+        return dict.fromkeys("txyp", np.empty(0))
     places = find_columns(sample.astype(np.float64), order)
-    return {name: SlicedColumn(table, place) for name, place in places.items()}
+    return {
+        name: LazyColumn(table, itemgetter((slice(None), place))) for name, place in places.items()
+    }
 
 
 def slice_times(path: Path, t: Any) -> Iterator[np.ndarray]:
     """Yield the times of the pieces of `slice_columns`."""
-    for first in range(0, len(t), PIECE_EVENTS):
-        try:
+    with name_file_in_errors(path, "times cannot be read"):
+        for first in range(0, len(t), PIECE_EVENTS):
             yield as_times(np.asarray(t[first : first + PIECE_EVENTS]))
-        except Exception as error:  # a broken chunk, or values that are no times
-            raise ValueError(f"{path}: times cannot be read: {error}") from error
 
 
 def slice_columns(
@@ -84,39 +90,30 @@ def slice_columns(
     """Yield pieces of columns; `times`: those of the pieces, if they were read before."""
     for number, first in enumerate(range(0, len(columns["t"]), PIECE_EVENTS)):
         part = slice(first, first + PIECE_EVENTS)
-        try:
+        with name_file_in_errors(path, f"events from {first} on cannot be read"):
             t = times[number] if times is not None else as_times(np.asarray(columns["t"][part]))
             x, y, p = (as_integers(name, np.asarray(columns[name][part])) for name in "xyp")
-        except Exception as error:  # a broken chunk, or values that are no events
-            raise ValueError(f"{path}: events from {first} on cannot be read: {error}") from error
         yield RawEvents(t, x, y, p)
 
 
-class SlicedColumn:
-    """Column `place` of an array (n, columns) of which slices are taken."""
+class LazyColumn:
+    """A column of `table`, of which slices are read and given to `pick_column`."""
 
-    def __init__(self, table: Any, place: int | str):
-        self.table, self.place = table, place
+    def __init__(self, table: Any, pick_column: Callable[[Any], Any]):
+        self.table, self.pick_column = table, pick_column
 
     def __len__(self) -> int:
         return len(self.table)
 
     def __getitem__(self, part: slice) -> np.ndarray:
-        return self.table[part, self.place]
-
-
-class _Field(SlicedColumn):
-    """Field `place` of a structured array."""
-
-    def __getitem__(self, part: slice) -> np.ndarray:
-        return self.table[part][self.place]
+        return self.pick_column(self.table[part])
 
 
 def _columns_of(
     path: Path, file: Any, options: ReadOptions
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Return the columns t, x, y, p of an .npz, and a note of other arrays of events in it."""
-    keys = find_keys_by_name(dict.fromkeys(file.files))
+    keys = find_keys_by_name(file.files)
     if keys is not None:
         columns = {name: _flat(file[key]) for name, key in keys.items()}
         if any(column.ndim != 1 for column in columns.values()):
@@ -142,13 +139,3 @@ def _is_table(table: np.ndarray) -> bool:
 def _flat(column: np.ndarray) -> np.ndarray:
     """Return (n, 1) or (1, n), as MATLAB has columns, as (n,); others as they are."""
     return column.ravel() if column.ndim == 2 and 1 in column.shape else column
-
-
-def _stated_size(file: Any) -> tuple[int, int] | None:
-    if "size" in file:
-        width, height = file["size"].ravel().tolist()
-    elif "width" in file and "height" in file:
-        width, height = file["width"].item(), file["height"].item()
-    else:
-        return None
-    return int(width), int(height)

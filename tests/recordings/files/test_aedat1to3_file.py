@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 
-from src.recordings.files.aedat2_file import Aedat2File
+from src.recordings.files.aedat1to3_file import Aedat1To3File
 from src.recordings.files.event_file import RawEvents, ReadOptions
 from tests.recordings.files.test_recording import made_up
 from tests.recordings.files.test_rosbag_file import equal
@@ -13,9 +13,9 @@ from tests.recordings.files.test_rosbag_file import equal
 DAVIS = b"#!AER-DAT2.0\r\n# HardwareInterface: DAViSFX3\r\n# AEChip: eu.seebetter.ini.chips.davis."
 
 
-def read(path, content: bytes, **options) -> tuple[Aedat2File, RawEvents]:
+def read(path, content: bytes, **options) -> tuple[Aedat1To3File, RawEvents]:
     path.write_bytes(content)
-    file = Aedat2File(path, ReadOptions(**options))
+    file = Aedat1To3File(path, ReadOptions(**options))
     return file, RawEvents(*map(np.concatenate, zip(*file.pieces(), strict=True)))
 
 
