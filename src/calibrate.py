@@ -121,17 +121,23 @@ def measure_dot_statistics(cfg: DictConfig, run: Path) -> dot_statistics.DotStat
     )
     views, dots = load_views(cfg.views) if cfg.views else None, cfg.dots
     positions = views.positions if views else [(0, 0)]
-    calm, moving = (_read_films(cfg, path, views, network) for path in (cfg.still, cfg.recording))
+    still_films, turbulent_films = (
+        _read_films(cfg, path, views, network) for path in (cfg.still, cfg.recording)
+    )
     centre = positions.index((0, 0))
-    places = dot_statistics.find_dots(calm[centre].mean(0), dots.rows, dots.cols, dots.dark)
+    places = dot_statistics.find_dots(still_films[centre].mean(0), dots.rows, dots.cols, dots.dark)
     reach = dots.fit_radius_px or dot_statistics.choose_fit_radius(places)
     if dots.dark:  # the vignette of a bright ground would pass for a part of the dots
-        grounds = [dot_statistics.fit_background(film.mean(0), places, reach) for film in calm]
+        grounds = [
+            dot_statistics.fit_background(film.mean(0), places, reach) for film in still_films
+        ]
         light = np.stack(grounds)[:, None]
-        calm, moving = calm / light, moving / light
-    turbulent = [gaussian_dots.fit_gaussians(film, places, reach) for film in moving]
-    still = [gaussian_dots.fit_gaussians(film, places, reach) for film in calm]
-    fitted = dot_statistics.compare_with_still(turbulent, still, fps=cfg.fps, centre_view=centre)
+        still_films, turbulent_films = still_films / light, turbulent_films / light
+    turbulent_fits = [gaussian_dots.fit_gaussians(film, places, reach) for film in turbulent_films]
+    still_fits = [gaussian_dots.fit_gaussians(film, places, reach) for film in still_films]
+    fitted = dot_statistics.compare_with_still(
+        turbulent_fits, still_fits, fps=cfg.fps, centre_view=centre
+    )
     dot_statistics.write_view_dot_csv(fitted, run / "turbulence.csv", positions)
     calibration_figures.draw_dot_statistics(fitted, positions, run / "turbulence.png")
     return fitted

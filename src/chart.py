@@ -27,10 +27,8 @@ def draw_speed_accuracy_chart(cfg: DictConfig) -> dict[str, str]:
     speeds = [row for candidate in candidates for row in benchmark.measure(candidate, *measured)]
     results.write_text(run / "speed.csv", speed_accuracy.format_speeds_csv(speeds))
     pipelines = {name: compared_networks.pipeline_at_severity(cfg, name) for name in cfg.severities}
-    scored = {"warmup": cfg.data.unscored_windows, "forms": cfg.forms}
-    scores = speed_accuracy.score_accuracy(
-        candidates, pipelines, cfg.clips, build.build_metrics(cfg), **scored
-    )
+    metrics, warmup = build.build_metrics(cfg), cfg.data.unscored_windows
+    scores = speed_accuracy.score_accuracy(candidates, pipelines, cfg.clips, metrics, warmup=warmup)
     results.write_text(run / "scores.csv", speed_accuracy.format_scores_csv(scores))
     recommended = speed_accuracy.recommend_network_per_severity(speeds, scores, side)
     text = speed_accuracy.format_chart_summary(speeds, scores, recommended, side)

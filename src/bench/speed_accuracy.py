@@ -3,14 +3,13 @@
 import math
 import statistics
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import astuple, dataclass, fields
 from typing import TypeVar
 
 import torch
 
 from src.bench.candidates import Candidate
 from src.bench.speed import FORMS, SpeedMeasurement
-from src.deploy.forms import convert_to_form
 from src.metrics.table import METRICS, NAMES, Column
 from src.metrics.video_metrics import VideoMetrics
 from src.records.results import format_csv
@@ -37,10 +36,9 @@ def check_chart_options(sizes, threads, forms, devices, severities, clips: int) 
 
 @dataclass(frozen=True)
 class ClipScore:
-    """The scores of one network in one form on one clip."""
+    """The scores of one network on one clip."""
 
     network: str
-    form: str
     severity: str
     clip: int
     values: Mapping[str, float]
@@ -49,32 +47,35 @@ class ClipScore:
 @torch.no_grad()
 def score_accuracy(
     candidates: Sequence[Candidate], pipelines: Mapping[str, Pipeline], clips: int,
-    measure: VideoMetrics, *, warmup: int, forms: Sequence[str],
+    measure: VideoMetrics, *, warmup: int,
 ) -> list[ClipScore]:  # fmt: skip
-    """Return the scores of all trained networks on the same `clips` clips of every severity; bf16
-    only of those with parameters and without a post-processor.
+    """Return the scores of all trained networks, in float32, on the same `clips` clips of every
+    severity.
     """
-    variants = []
-    for candidate in candidates:
-        if candidate.network is None or not candidate.trained:
-            continue
-        variants.append(("float32", candidate))
-        learned = any(True for _ in candidate.network.parameters())
-        if "bf16" in forms and learned and candidate.postprocessor is None:
-            half = replace(candidate, network=convert_to_form(candidate.network, "bf16"))
-            variants.append(("bf16", half))
-    scores = []
+    trained, scores = [one for one in candidates if one.network is not None and one.trained], []
     for severity, pipeline in pipelines.items():
         for clip in range(clips):
             sample = simulate(pipeline, [clip])
             windows, window_s = sample.voxels[0, :, None], float(sample.window_s[0])
             truth = sample.target[0, warmup:]
-            for form, candidate in variants:
+            for candidate in trained:
                 frames, _ = candidate.reconstruct(windows, list(sample.positions or ()), window_s)
                 values = measure(frames[warmup:], truth)
-                scores.append(ClipScore(candidate.name, form, severity, clip, values))
+                scores.append(ClipScore(candidate.name, severity, clip, values))
         print(f"scored on {severity} turbulence")
     return scores
+
+
+def find_fastest_forms(
+    speeds: Sequence[SpeedMeasurement], side: int
+) -> dict[str, SpeedMeasurement]:
+    """Return each network's fastest form on frames of `side`, by one CPU thread's time."""
+    fastest: dict[str, SpeedMeasurement] = {}
+    for s in speeds:
+        if s.ms and (s.side, s.threads, s.device) == (side, 1, "cpu"):
+            before = fastest.setdefault(s.network, s)
+            fastest[s.network] = min(before, s, key=lambda one: one.ms or math.inf)
+    return fastest
 
 
 def find_pareto_front(costs_and_errors: Mapping[Name, tuple[float, float]]) -> list[Name]:
@@ -106,15 +107,14 @@ def recommend_network_per_severity(
 ) -> dict[str, str]:
     """Return {severity: the cheapest network within one standard error of the best}.
 
-    By LPIPS, else by 1 - SSIM; the cost is thread time in ms on frames of `side`, float32.
+    By LPIPS, else by 1 - SSIM; the cost is the thread time in ms on frames of `side`, in the
+    fastest form.
     """
-    which = (side, "float32", 1, "cpu")
-    timed = [s for s in speeds if (s.side, s.form, s.threads, s.device) == which]
-    costs = {s.network: s.ms for s in timed if s.ms}
+    costs = {name: s.ms or math.inf for name, s in find_fastest_forms(speeds, side).items()}
     errors: dict[str, dict[str, list[float]]] = {}
     for score in scores:
         row = errors.setdefault(score.severity, {})
-        if score.form == "float32" and score.network in costs:
+        if score.network in costs:
             error = score.values.get("lpips", 1 - score.values["ssim"])
             row.setdefault(score.network, []).append(error)
     return {name: select_by_one_standard_error(costs, row) for name, row in errors.items() if row}
@@ -125,21 +125,21 @@ def format_chart_summary(
     recommended: Mapping[str, str], side: int,
 ) -> str:  # fmt: skip
     """Return the recommended networks and a table of means over all clips, as Markdown."""
-    values = scores[0].values if scores else {}
+    values, fastest = scores[0].values if scores else {}, find_fastest_forms(speeds, side)
     metrics = [metric for metric in METRICS if metric.name in values]
     metrics += [Column(name, name, 3) for name in values if name not in NAMES]
     heads = [metric.heading for metric in metrics]
     lines = ["# Speed against accuracy\n"]
     lines += [f"- {severity} turbulence: take {name}." for severity, name in recommended.items()]
     lines += [
-        f"\nMean over all clips; ms a frame of {side}x{side}, computed by one CPU thread.  "
-        "Without scores: no weights, timed only.\n",
+        f"\nMs a frame of {side}x{side} by one CPU thread; in the row of the fastest form the means "
+        "over all clips, in float32.  No weights: timed only.\n",
         "| " + " | ".join(["network", "form", "ms", "GMAC", "parameters", *heads]) + " |",
         "|---|---|" + "---:|" * (3 + len(metrics)),
     ]
     for s in speeds:
         if s.threads == 1 and s.side == side and s.device == "cpu":
-            rows = [r.values for r in scores if (r.network, r.form) == (s.network, s.form)]
+            rows = [r.values for r in scores if s is fastest.get(r.network)]
             means = [m.format_value(sum(r[m.name] for r in rows) / len(rows)) if rows else ""
                      for m in metrics]  # fmt: skip
             time = s.reason if s.ms is None else f"{s.ms:.2f}"
@@ -156,6 +156,6 @@ def format_speeds_csv(rows: Sequence[SpeedMeasurement]) -> str:
 
 def format_scores_csv(rows: Sequence[ClipScore]) -> str:
     """Return one line per network, form and clip."""
-    heads = ["network", "form", "severity", "clip", *(rows[0].values if rows else [])]
-    lines = [[r.network, r.form, r.severity, r.clip, *r.values.values()] for r in rows]
+    heads = ["network", "severity", "clip", *(rows[0].values if rows else [])]
+    lines = [[r.network, r.severity, r.clip, *r.values.values()] for r in rows]
     return format_csv(heads, lines)

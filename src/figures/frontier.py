@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from src.bench.speed import SpeedMeasurement
-from src.bench.speed_accuracy import ClipScore, find_pareto_front
+from src.bench.speed_accuracy import ClipScore, find_fastest_forms, find_pareto_front
 from src.figures.plots import MARKERS, save_figure
 from src.metrics.table import METRICS, Column
 
@@ -31,23 +31,23 @@ def draw_accuracy_against_time(
     path: Path, speeds: Sequence[SpeedMeasurement], scores: Sequence[ClipScore], *, side: int,
     title: str,
 ) -> Path:  # fmt: skip
-    """Draw every scored network at its thread time on frames of `side`, filled in float32, open in
-    bf16; the dashed line is the Pareto front.
+    """Draw the float32 scores of every network at the thread time of its fastest form on frames of
+    `side`; the dashed line is the Pareto front.
     """
     names = list(dict.fromkeys(score.network for score in scores))
-    single = [s for s in speeds if (s.side, s.threads, s.device) == (side, 1, "cpu")]
-    times = {(s.network, s.form): s.ms for s in single if s.ms is not None}
+    fastest = find_fastest_forms(speeds, side)
     metrics = [metric for metric in DRAWN if scores and metric.name in scores[0].values]
     rows = max(2, (len(metrics) + 1) // 2)
     figure = Figure(figsize=(11, 4.1 * rows))
     panels = figure.subplots(rows, 2).flat
     for metric, axes in zip(metrics, panels, strict=False):
-        _draw_metric(axes, names, times, scores, metric)
+        _draw_metric(axes, names, fastest, scores, metric)
     for axes in panels:  # those that are left
         axes.set_visible(False)
-    figure.supxlabel(f"ms a frame of {side}x{side}, one CPU thread")
+    figure.supxlabel(f"ms a frame of {side}x{side}, one CPU thread, fastest form")
     figure.suptitle(title)
-    _draw_legend(figure, names, ["float32", "bf16"], ())
+    forms = [form for form in FILL_STYLES if any(s.form == form for s in fastest.values())]
+    _draw_legend(figure, names, forms, ())
     return save_figure(figure, path)
 
 
@@ -85,22 +85,20 @@ def draw_time_over_macs(
 
 
 def _draw_metric(
-    axes, names: list[str], times: Mapping, scores: Sequence[ClipScore], metric: Column
-) -> None:
-    points: dict[tuple[str, str], tuple[float, float]] = {}
+    axes, names: list[str], fastest: Mapping[str, SpeedMeasurement], scores: Sequence[ClipScore],
+    metric: Column,
+) -> None:  # fmt: skip
+    points: dict[str, tuple[float, float]] = {}
     for index, name in enumerate(names):
-        for form in ("float32", "bf16"):
-            values = [r.values[metric.name] for r in scores if (r.network, r.form) == (name, form)]
-            if values and (name, form) in times:
-                points[name, form] = times[name, form], fmean(values)
-                axes.plot(*points[name, form], linestyle="none", **_style(index, form))
-        pair = np.array([point for key, point in points.items() if key[0] == name]).reshape(-1, 2)
-        axes.plot(*pair.T, color=PALETTE[index % len(PALETTE)], lw=0.8, alpha=0.6)
+        if (timed := fastest.get(name)) and timed.ms:
+            values = [score.values[metric.name] for score in scores if score.network == name]
+            points[name] = timed.ms, fmean(values)
+            axes.plot(*points[name], linestyle="none", **_style(index, timed.form))
     errors = {key: (ms, -metric.better * value) for key, (ms, value) in points.items()}
     front = np.array([points[key] for key in find_pareto_front(errors)]).reshape(-1, 2)
     axes.plot(*front.T, color="0.35", ls="--", lw=1.2, zorder=0)
     place = {"rotation": 90, "fontsize": 7, "color": "0.4", "ha": "right", "va": "top"}
-    for ms, text in ((PAPER_MS, "the paper, on a GPU: 3.4 ms"), (LIVE_MS, "600 fps live")):
+    for ms, text in ((PAPER_MS, "the paper: 3.4 ms"), (LIVE_MS, "600 fps live")):
         axes.axvline(ms, color="0.6", lw=0.8, ls=":")
         axes.text(ms, 0.985, f"{text} ", transform=axes.get_xaxis_transform(), **place)
     side = "higher" if metric.better > 0 else "lower"

@@ -2,7 +2,14 @@
 
 import torch
 
-from src.bench.speed_accuracy import find_pareto_front, select_by_one_standard_error
+from src.bench.speed import SpeedMeasurement
+from src.bench.speed_accuracy import (
+    ClipScore,
+    find_fastest_forms,
+    find_pareto_front,
+    recommend_network_per_severity,
+    select_by_one_standard_error,
+)
 from src.deploy.cost import time_frame
 from src.models.network import EventToVideoNetwork
 
@@ -17,6 +24,19 @@ def test_the_choice_is_the_cheapest_within_one_standard_error():
     costs = {"best": 9.0, "near": 3.0, "far": 1.0}
     assert select_by_one_standard_error(costs, errors) == "near"
     assert select_by_one_standard_error(costs, {"best": [1.0], "near": [1.1]}) == "best"
+
+
+def test_a_network_costs_what_its_fastest_form_takes_on_one_thread():
+    def timed(network, form, ms, side=64, threads=1):
+        return SpeedMeasurement(network, True, 9, side, "cpu", threads, form, ms=ms)
+
+    speeds = [timed("a", "float32", 5.0), timed("a", "openvino", 2.0), timed("b", "float32", 3.0)]
+    speeds += [timed("b", "openvino", None), timed("b", "bf16", 1.0, threads=2)]
+    speeds += [timed("b", "bf16", 1.0, side=32)]
+    found = find_fastest_forms(speeds, 64)
+    assert {name: s.form for name, s in found.items()} == {"a": "openvino", "b": "float32"}
+    scores = [ClipScore(name, "weak", clip, {"ssim": 0.5}) for name in "ab" for clip in (0, 1)]
+    assert recommend_network_per_severity(speeds, scores, 64) == {"weak": "a"}
 
 
 class Doubling(EventToVideoNetwork):
