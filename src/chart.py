@@ -13,7 +13,7 @@ from src.records import results
 
 
 def draw_speed_accuracy_chart(cfg: DictConfig) -> dict[str, str]:
-    """Time and score every network; write figures, `speed.csv`, `scores.csv` and `chart.md`.
+    """Time and score networks; write `chart.png`, `chart.svg`, `chart.md` and two tables (`*.csv`).
 
     Returns {severity: the cheapest network within one standard error of the best}.  Raises
     ValueError for networks, sizes, forms or severities that are none.
@@ -36,7 +36,6 @@ def draw_speed_accuracy_chart(cfg: DictConfig) -> dict[str, str]:
     for suffix in ("png", "svg"):
         path = run / f"chart.{suffix}"
         frontier.draw_accuracy_against_time(path, speeds, scores, side=side, title=title)
-        frontier.draw_time_over_macs(run / f"machine.{suffix}", speeds, benchmark.peaks)
     results.write_text(run / "chart.md", text)
     rich.print(text, f"in {run}")
     return recommended

@@ -33,13 +33,12 @@ def test_figures_and_tables_are_written_and_untrained_networks_timed_only(tmp_pa
         tiny(tmp_path, f"+networks={{highpass: {HIGHPASS}, ours: {SETNET}}}")
     )
     assert found == {"weak": "highpass"}
-    for name in ("chart.png", "chart.svg", "machine.png", "machine.svg", "chart.md"):
+    for name in ("chart.png", "chart.svg", "chart.md"):
         assert (tmp_path / name).is_file()
     speeds = list(csv.DictReader((tmp_path / "speed.csv").read_text().splitlines()))
     ours = [row for row in speeds if row["network"] == "ours"]
     assert {row["form"] for row in ours} == {"float32", "bf16"}
     assert all(float(row["ms"]) > 0 and row["trained"] == "False" for row in ours)
-    assert all(float(row["roofline_ms"]) > 0 for row in ours)
     scored = list(csv.DictReader((tmp_path / "scores.csv").read_text().splitlines()))
     assert {row["network"] for row in scored} == {"highpass"} and len(scored) == 2
     assert "ours (no weights)" in (tmp_path / "chart.md").read_text()

@@ -37,9 +37,7 @@ ACTIVE_SHARE = 0.05  # of a grid's entries that are not zero, as in our streams
 
 @dataclass(frozen=True)
 class SpeedMeasurement:
-    """One network in one form on frames `side` pixels square; `roofline_ms`: what the arithmetic
-    alone takes at the peak of the machine.  `reason`: why there is no time.
-    """
+    """One network in one form on frames `side` pixels square; `reason`: why there is no time."""
 
     network: str
     trained: bool
@@ -54,7 +52,6 @@ class SpeedMeasurement:
     clock: str = ""
     gmac: float | None = None
     params: int | None = None
-    roofline_ms: float | None = None
     reason: str = ""
 
 
@@ -67,7 +64,7 @@ class SpeedBenchmark:
 
     def __init__(self, folder: Path, *, seconds: float, bins: int):
         self.folder, self.seconds, self.bins = folder, seconds, bins
-        self.peaks: dict[tuple[str, int], float] = {}  # MAC/s of (form, threads)
+        self._peak_macs_per_s = cache(measure_peak_conv_macs_per_s)
         self._macs = cache(self._count_macs)
         self._postprocessor_ms = cache(time_postprocessor)
 
@@ -95,12 +92,8 @@ class SpeedBenchmark:
             params = sum(p.numel() for module in modules for p in module.parameters())
             entry = replace(entry, gmac=macs / 1e9, params=params)
             if entry.device == "cpu":
-                key, dtype = (entry.form, entry.threads), FORM_DTYPES[entry.form]
-                if key not in self.peaks:
-                    self.peaks[key] = measure_peak_conv_macs_per_s(dtype, threads=entry.threads)
-                limit_s = macs / self.peaks[key]
-                entry = replace(entry, roofline_ms=1e3 * limit_s)
-                if limit_s > LONGEST_S:
+                peak = self._peak_macs_per_s(FORM_DTYPES[entry.form], threads=entry.threads)
+                if macs / peak > LONGEST_S:
                     raise ValueError(f"more than {LONGEST_S:g} s a frame by arithmetic alone")
             return self._time(candidate, entry)
         except ValueError as error:

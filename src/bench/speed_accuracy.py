@@ -132,7 +132,7 @@ def format_chart_summary(
     lines = ["# Speed against accuracy\n"]
     lines += [f"- {severity} turbulence: take {name}." for severity, name in recommended.items()]
     lines += [
-        f"\nMs a frame of {side}x{side} by one CPU thread; in the row of the fastest form the means "
+        f"\nMs a frame of {side}x{side} by one CPU thread; in rows of the fastest form the means "
         "over all clips, in float32.  No weights: timed only.\n",
         "| " + " | ".join(["network", "form", "ms", "GMAC", "parameters", *heads]) + " |",
         "|---|---|" + "---:|" * (3 + len(metrics)),

@@ -1,6 +1,6 @@
-"""Accuracy against time, a panel for each metric with its Pareto front; time against arithmetic."""
+"""Accuracy against time, a panel for each metric with its Pareto front."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 
@@ -15,7 +15,6 @@ from src.figures.plots import MARKERS, save_figure
 from src.metrics.table import METRICS, Column
 
 PAPER_MS, LIVE_MS = 3.4, 1000 / 600
-MIN_GMAC = 1e-3
 DRAWN = tuple(metric for metric in METRICS if metric.name != "psnr")  # aligned PSNR stands for it
 # Twelve that stay apart, also for the colour-blind, in pairs of dark and light.
 PALETTE = (
@@ -47,40 +46,7 @@ def draw_accuracy_against_time(
     figure.supxlabel(f"ms a frame of {side}x{side}, one CPU thread, fastest form")
     figure.suptitle(title)
     forms = [form for form in FILL_STYLES if any(s.form == form for s in fastest.values())]
-    _draw_legend(figure, names, forms, ())
-    return save_figure(figure, path)
-
-
-def draw_time_over_macs(
-    path: Path, speeds: Sequence[SpeedMeasurement], peaks: Mapping[tuple[str, int], float]
-) -> Path:
-    """Draw milliseconds over multiply-accumulates, a panel for each number of threads.
-
-    `peaks`: MAC/s by (form, threads), drawn as lines.  Networks without weights carry an asterisk;
-    those that hardly multiply, as the high-pass, are left out.
-    """
-    timed = [s for s in speeds if s.ms and (s.gmac or 0) > MIN_GMAC and s.device == "cpu"]
-    thread_counts = sorted({s.threads for s in timed}) or [1]
-    names = list(dict.fromkeys(s.network for s in speeds))
-    untrained = {s.network for s in speeds if not s.trained}
-    figure = Figure(figsize=(5.2 * len(thread_counts) + 2.4, 5.6))
-    panels = figure.subplots(1, len(thread_counts), squeeze=False)[0]
-    for axes, threads in zip(panels, thread_counts, strict=True):
-        for s in (s for s in timed if s.threads == threads):
-            axes.plot(s.gmac, s.ms, linestyle="none", **_style(names.index(s.network), s.form))
-        gmacs = [s.gmac or 0.0 for s in timed]
-        for form, line in (("float32", "-"), ("bf16", "--")):
-            if speed := peaks.get((form, threads), 0.0) / 1e9:
-                ends = np.array([min(gmacs), max(gmacs)] if gmacs else [1, 10])
-                label = f"{form} limit: {speed:.0f} GMAC/s"
-                axes.plot(ends, 1e3 * ends / speed, color="0.4", ls=line, lw=1, label=label)
-        if axes.get_legend_handles_labels()[0]:
-            axes.legend(loc="lower right", frameon=False)
-        title = f"{threads} thread{'s' * (threads > 1)}"
-        axes.set(xlabel="GMAC a frame", ylabel="ms a frame", title=title)
-        _set_log_scales(axes, "x", "y")
-    forms = [form for form in FILL_STYLES if any(s.form == form for s in timed)]
-    _draw_legend(figure, names, forms, untrained)
+    _draw_legend(figure, names, forms)
     return save_figure(figure, path)
 
 
@@ -103,15 +69,10 @@ def _draw_metric(
         axes.text(ms, 0.985, f"{text} ", transform=axes.get_xaxis_transform(), **place)
     side = "higher" if metric.better > 0 else "lower"
     axes.set_title(f"{metric.heading}  ({side} is better)")
-    _set_log_scales(axes, "x")
-
-
-def _set_log_scales(axes, *names: str) -> None:
-    axes.set(**{f"{name}scale": "log" for name in names})
-    for axis in (getattr(axes, f"{name}axis") for name in names):
-        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axis.set_major_formatter("{x:g}")
-        axis.set_minor_formatter(NullFormatter())
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.grid(alpha=0.25)
 
 
@@ -123,13 +84,11 @@ def _style(index: int, form: str) -> dict:
     }  # fmt: skip
 
 
-def _draw_legend(
-    figure: Figure, names: list[str], forms: Sequence[str], untrained: Collection[str]
-) -> None:
-    handles = []
-    for i, name in enumerate(names):
-        label = name.replace("_", " ") + ("  * no weights" if name in untrained else "")
-        handles.append(Line2D([], [], linestyle="none", **_style(i, "float32"), label=label))
+def _draw_legend(figure: Figure, names: Sequence[str], forms: Sequence[str]) -> None:
+    handles = [
+        Line2D([], [], linestyle="none", **_style(i, "float32"), label=name.replace("_", " "))
+        for i, name in enumerate(names)
+    ]
     for form in forms:
         style = _style(0, form) | {"color": "0.3", "markeredgecolor": "0.3"}
         handles.append(Line2D([], [], linestyle="none", **style, label=form))
