@@ -40,6 +40,8 @@ def reconstruct(cfg: DictConfig) -> Path:
     """
     run, ready_s = Path(cfg.paths.run), []
     hardware.check_device(cfg.device)
+    given = cfg.tone, cfg.tone_time_constant_s, cfg.output_format
+    tone.build_output_curve(*given)  # refused before the work
     network = reconstruction.require_event_network(build.load_ckpt_or_baseline(cfg))
     views = choose_views(cfg, network)
     make = reconstruct_film_frames if cfg.output_format == "film" else reconstruct_video_frames

@@ -17,6 +17,7 @@ from yaml import YAMLError
 
 from src.app import build, entry_point, own_simulation
 from src.app.own_simulation import OwnSimulation, SimulatedPart
+from src.app.renamed_keys import refuse_renamed_keys
 from src.figures import samples
 from src.recordings.files import event_writers
 from src.recordings.simulated_recording import kaleidoscope_views, write_recording
@@ -158,7 +159,7 @@ def print_files(path: Path, events: np.ndarray, pictures: list[Path]) -> None:
 def take_clip_config_from_run(cfg: DictConfig) -> DictConfig:
     """Return `cfg` with all that makes a clip taken from the run whose config is `cfg.like`.
 
-    Raises ValueError for a file that is no such config.
+    Raises ValueError for a file that is no such config, and for a former key in it.
     """
     try:
         other = OmegaConf.create(dict(safe_yaml.read(cfg.like)))
@@ -167,6 +168,7 @@ def take_clip_config_from_run(cfg: DictConfig) -> DictConfig:
             raise TypeError("a section must be a mapping")
     except (OSError, YAMLError, KeyError, TypeError, ValueError, OmegaConfBaseException):
         raise ValueError(f"like must be the config.yaml of a run, got {cfg.like}") from None
+    refuse_renamed_keys(OmegaConf.create(parts))
     merged = cfg.copy()
     merged.update(parts)
     return merged

@@ -3,10 +3,12 @@
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
 import pytest
+from lightning import Trainer
 from omegaconf import OmegaConf
 
 from scripts.lease import __main__ as lease
@@ -19,10 +21,11 @@ from scripts.lease.selection import (
     select_networks,
     size_network,
 )
-from scripts.lease.training import DeadlineSchedule
+from scripts.lease.training import DeadlineSchedule, ExportingCurve
 from scripts.pack_scenes import EncodedPicture, build_pack
 from src.app import build
 from src.models import files
+from src.training.learning_curve import LearningCurve
 from tests.conftest import ROOT
 
 DRY = ROOT / "conf" / "lease" / "dry.yaml"
@@ -156,6 +159,13 @@ def test_what_a_lease_would_do_is_told_without_one(capsys):
 def test_minutes_left_over_go_by_shares_and_missing_ones_shorten_all():
     pair = [Network(name="a", minutes=1, share=1), Network(name="b", minutes=2, share=3)]
     assert allot_seconds(pair, 220) == [70, 150] and allot_seconds(pair, 90) == [30, 60]
+
+
+def test_a_curve_knows_how_long_its_last_scoring_took(tmp_path, monkeypatch):
+    monkeypatch.setattr(LearningCurve, "score_and_export", lambda *_: time.sleep(0.05))
+    curve = ExportingCurve(tmp_path / "a.safetensors", 0.1, 60, print)
+    curve.on_train_start(Mock(spec=Trainer, is_global_zero=True), None)
+    assert curve.scoring_s >= 0.05
 
 
 def test_the_rate_ends_with_the_time_there_is():

@@ -49,10 +49,10 @@ class ExportingCurve(LearningCurve):
         if time.monotonic() - self.exported_at >= self.export_interval_s:
             self.export_weights(pl_module)
 
-    def add_row(self, trainer: Trainer, module: LightningModule) -> None:
+    def score_and_export(self, trainer: Trainer, module: LightningModule) -> None:
         """Note how long scoring takes."""
         start = time.monotonic()
-        super().add_row(trainer, module)
+        super().score_and_export(trainer, module)
         self.scoring_s = time.monotonic() - start
 
     def export_weights(self, module: LightningModule) -> None:

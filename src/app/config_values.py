@@ -31,7 +31,7 @@ KEYS: dict[tuple[str, ...], str] = {
         longest_side_px
     """,
     (WHOLE,): """
-        bins seed index clips processes port max_waiting_windows samples first
+        bins seed index clips processes port max_waiting_windows frames_shown first
         air.max_frames dots.rows dots.cols data.batch_size data.test_seed data.batch_reuse
         data.epoch_clips data.windows data.substeps data.workers data.test_windows
         data.test_clips data.val_clips data.unscored_windows data.loss_from

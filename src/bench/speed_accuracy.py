@@ -155,7 +155,7 @@ def format_speeds_csv(rows: Sequence[SpeedMeasurement]) -> str:
 
 
 def format_scores_csv(rows: Sequence[ClipScore]) -> str:
-    """Return one line per network, form and clip."""
+    """Return one line per network and clip."""
     heads = ["network", "severity", "clip", *(rows[0].values if rows else [])]
     lines = [[r.network, r.severity, r.clip, *r.values.values()] for r in rows]
     return format_csv(heads, lines)

@@ -76,7 +76,7 @@ class SetNetClock:
         longest_s = self._advance(pixels, changed)
         smoothed, update = self._advance_context(longest_s, changed)
         kept = exp_float32(-longest_s / np.float32(setnet.CONTEXT_TAU_S))
-        tiles = (np.argwhere(part).astype(np.int32) for part in (self.active_tiles, changed))
+        tiles = (list_places(part) for part in (self.active_tiles, changed))
         active_tiles, changed_tiles = tiles
         return Tick(active_tiles, update, *smoothed, kept, changed_tiles)
 
@@ -187,6 +187,11 @@ class EventMaps:
         passed = clock.active_tiles, clock.elapsed_s, self.taus_s
         sums_numba.leak(*passed, self.cell_sums, state.sums, state.mixtures)
         sums_numba.add_to_mixtures(places, pixel_sums, self.code, state.mixtures)
+
+
+def list_places(mask: np.ndarray) -> Int[np.ndarray, "n 2"]:
+    """Return (row, column) of what is not 0, in rows: numba compiles for one layout."""
+    return np.ascontiguousarray(np.argwhere(mask), np.int32)
 
 
 def max_of_squares(mask: np.ndarray, side: int) -> np.ndarray:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from src.deploy.engines import tiles_numba
-from src.deploy.setnet_clock import ContextUpdate, max_of_squares
+from src.deploy.setnet_clock import ContextUpdate, list_places, max_of_squares
 from src.deploy.setnet_layers import channels_first, channels_last, unpadded
 from src.deploy.tile_batches import TileModule
 from src.models.layers import PreActivationBlock
@@ -222,7 +222,7 @@ class ContextTiles:
 
 def find_tiles(mask: UInt8[np.ndarray, "_h _w"]) -> Int[np.ndarray, "n 2"]:
     """Return first row and column of the tiles of a scale that have a cell of `mask`."""
-    return CONTEXT_TILE * np.argwhere(max_of_squares(mask, CONTEXT_TILE)).astype(np.int32)
+    return np.int32(CONTEXT_TILE) * list_places(max_of_squares(mask, CONTEXT_TILE))
 
 
 @lru_cache(64)

@@ -106,8 +106,8 @@ def cut_windows(
     chunks: Iterable[np.ndarray], lookup: SensorLookup, rule: WindowRule
 ) -> Iterator[Window]:
     """Cut chunks of events (t x y p, in order of time) into windows; warns of an `end_s` after the
-    last event.  Raises ValueError for time running backwards, an event off the sensor, or less than
-    one window."""
+    last event.  Raises ValueError for time running backwards, an event of a window that is off the
+    sensor, or less than one window."""
     checked, is_empty = _OrderedChunks(chunks), True
     for events, start_us, end_us in _cut(checked, rule):
         yield fill_window(events, lookup, rule, start_us, end_us)

@@ -196,8 +196,8 @@ def hash_simulation_code() -> str:
 
 
 def hash_file_lists(config: Any) -> str:
-    """Return a hash of names and sizes of the files below every `root` or `extra_train_root` in a
-    plain config: a folder, a file (a pack of photographs) or a list of these.
+    """Return a hash of names and sizes of the files below every `root`, `extra_train_root` or
+    `footage` in a plain config: a folder, a file (a pack of photographs) or a list of these.
     """
     digest = hashlib.sha256()
     for root in _roots(config):
@@ -208,7 +208,7 @@ def hash_file_lists(config: Any) -> str:
 
 
 def _roots(node: Any, key: str = "") -> Iterator[str]:
-    if isinstance(node, str) and key in ("root", "extra_train_root"):
+    if isinstance(node, str) and key in ("root", "extra_train_root", "footage"):
         yield node
     items = [(key, value) for value in node] if isinstance(node, list) else []
     for name, value in node.items() if isinstance(node, dict) else items:

@@ -101,6 +101,24 @@ def test_an_event_whose_window_is_over_is_dropped_and_counted(cutter, faults):
     assert "events came too late or far out of order: dropped (1 events)" in faults.current()
 
 
+def test_a_packet_late_as_a_whole_ends_no_stream(cutter, faults):
+    cutter.add(some(range(0, 25_000, 500)))
+    list(cutter.pop_windows(40_000))
+    cutter.add(some([20_000, 21_000, 21_500]))
+    assert "events came too late or far out of order: dropped (3 events)" in faults.current()
+    cutter.add(some(range(41_000, 60_000, 500)))
+    assert sum(len(window.events) for window in cutter.pop_windows(60_000)) == 38
+
+
+def test_events_in_order_go_into_the_next_window_when_theirs_is_over(cutter, faults):
+    cutter.add(some(range(0, 25_000, 500)))
+    list(cutter.pop_windows(40_000))
+    cutter.add(some(range(26_000, 31_000, 1000)))
+    cutter.add(some(range(41_000, 60_000, 500)))
+    assert sum(len(window.events) for window in cutter.pop_windows(60_000)) == 43
+    assert faults.current() == []
+
+
 def test_a_wild_time_moves_no_window(cutter, faults):
     cutter.add(some([0, 500, 3_600_000_000, 700, 1500]))
     (found,) = cutter.pop_windows(cutter.last_us)

@@ -404,8 +404,9 @@ def runs(pid: int) -> bool:
 def test_files_of_a_scene_are_part_of_what_made_a_disk_cache(tmp_path):
     (tmp_path / "a.png").write_bytes(b"1")
     node = {"parts": [{"root": [str(tmp_path)]}, {"root": None}]}
+    footage = {"turbulence": {"footage": str(tmp_path)}}
     before = hash_file_lists(node)
-    assert before == hash_file_lists(node) == hash_file_lists({"root": str(tmp_path)})
+    assert before == hash_file_lists(footage) == hash_file_lists({"root": str(tmp_path)})
     (tmp_path / "b.png").write_bytes(b"1")
-    assert hash_file_lists(node) != before
+    assert hash_file_lists(node) != before and hash_file_lists(footage) != before
     assert hash_simulation_code() == hash_simulation_code() != ""

@@ -139,6 +139,7 @@ class EventSorter:
         if not are_in_order:
             late_us = np.maximum.accumulate(np.maximum(t, part.last_us)) - t
             are_in_order = not late_us.any()
+        if not are_in_order:
             self.late += int(np.count_nonzero(late_us))
             self.most_late_us = max(self.most_late_us, int(late_us.max()))
             is_gone = t < self._released_us
@@ -155,7 +156,7 @@ class EventSorter:
         return self.release(self._bound_us(part.last_us - self.buffer_us))
 
     def _hold(self, events: np.ndarray, unsorted: bool) -> None:
-        if unsorted:
+        if unsorted and len(events):
             first = event_times(events).min()
             after = [part for part in self._held if event_times(part)[-1] > first]
             self._held = self._held[: len(self._held) - len(after)]

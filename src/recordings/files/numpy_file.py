@@ -16,7 +16,6 @@ from src.recordings.files.columns import (
     find_columns,
     find_columns_by_name,
     find_keys_by_name,
-    find_stated_size,
 )
 from src.recordings.files.event_file import (
     PIECE_EVENTS,
@@ -24,6 +23,7 @@ from src.recordings.files.event_file import (
     EventStream,
     RawEvents,
     ReadOptions,
+    WidthHeight,
     choose_stream,
     name_file_in_errors,
 )
@@ -44,7 +44,7 @@ class NumpyFile(EventFile):
                 with zipfile.ZipFile(path) as archive:
                     check_unpacking_ratio(path, sum(part.file_size for part in archive.infolist()))
                 with np.load(path) as file:
-                    self.size = find_stated_size(file)
+                    self.size = find_npz_size(file)
                     self._columns, self.notes = _columns_of(path, file, options)
             check_lengths(self._columns)
 
@@ -53,6 +53,18 @@ class NumpyFile(EventFile):
 
     def times(self) -> Iterator[np.ndarray]:
         yield from slice_times(self.path, self._columns["t"])
+
+
+def find_npz_size(file: Any) -> WidthHeight | None:
+    """Return what `size`, or `width` and `height`, of an .npz states; ValueError for other than two
+    numbers."""
+    if "size" not in file and not ("width" in file and "height" in file):
+        return None
+    names = ["size"] if "size" in file else ["width", "height"]
+    sides = np.concatenate([file[name].ravel() for name in names]).tolist()
+    if len(sides) != 2:
+        raise ValueError(f"size must be (width, height), got {sides}")
+    return int(sides[0]), int(sides[1])
 
 
 def split_table(table: Any, order: str | None) -> dict[str, Any]:

@@ -293,6 +293,15 @@ def test_one_of_two_cameras_is_read_and_the_other_is_told_of(tmp_path, events):
         read_events(tmp_path / "a.h5", options=ReadOptions(stream="up"))
 
 
+def test_an_npz_states_its_size_in_two_numbers_or_not_at_all(tmp_path, events):
+    columns = {name: events[name] for name in "txyp"}
+    np.savez(tmp_path / "other.npz", **columns, resolution=(WIDTH, HEIGHT))
+    assert open_recording(tmp_path / "other.npz", (WIDTH, HEIGHT)).size == (WIDTH, HEIGHT)
+    np.savez(tmp_path / "three.npz", **columns, size=(WIDTH, HEIGHT, 3))
+    with pytest.raises(ValueError, match=r"size must be \(width, height\), got"):
+        open_recording(tmp_path / "three.npz")
+
+
 def test_one_of_two_cameras_in_an_npz(tmp_path, events):
     right = events[:100]
     np.savez(tmp_path / "a.npz", left=table(events, "txyp"), right=table(right, "txyp"))

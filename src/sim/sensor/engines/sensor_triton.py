@@ -239,7 +239,7 @@ def is_outside(intensity):
 
 @triton.jit
 def fixed_point_table_position(intensity):
-    """Return the place in the tables of an intensity, as src.sim.sensor.response.lookup has it."""
+    """Return the place of an intensity in the tables of src.sim.sensor.response."""
     bits = intensity.to(tl.int32, bitcast=True)
     return tl.minimum(tl.maximum(bits, 0x38800000), 0x3FFFFFFF) - 0x38800000
 
