@@ -19,7 +19,7 @@ import torch
 
 import src.models
 from benchmarks.recordings import MODEL, SENSOR, events
-from src.live import GIL_SWITCH_S, assemble
+from src.live import GIL_SWITCH_S, assemble_server
 from src.live_view import event_feeds
 from src.live_view.network_runner import RunSettings
 from src.live_view.page_server import PageServer
@@ -98,7 +98,7 @@ def main() -> None:
         networks = {asked.ckpt: src.models.load(asked.ckpt)}
         how = RunSettings(asked.fps, form=asked.form)
         feed = event_feeds.open_feed(str(path), None, faults, loop=True)
-        server = assemble(feed, networks, views, how, faults, port=PORT)
+        server = assemble_server(feed, networks, views, how, faults, port=PORT)
         server.page.controls.choose(asked.ckpt, "all")
         sys.setswitchinterval(GIL_SWITCH_S)
         found = asyncio.run(measure(server, asked.seconds))

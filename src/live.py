@@ -58,7 +58,9 @@ def build_server(cfg: DictConfig) -> PageServer:
         "playback_speed", "max_waiting_windows", "noise_filter_s", "host", "port",
         "allowed_origins", "tone", "tone_time_constant_s",
     )  # fmt: skip
-    server = assemble(feed, networks, views, settings, faults, **{key: cfg[key] for key in keys})
+    server = assemble_server(
+        feed, networks, views, settings, faults, **{key: cfg[key] for key in keys}
+    )
     server.page.controls.choose(name, cfg.views_used)
     return server
 
@@ -77,7 +79,7 @@ def load_offered_networks(cfg: DictConfig, name: str, views: int) -> dict[str, E
     return {other: net for other, net in networks.items() if net.views in (None, 1, views)}
 
 
-def assemble(
+def assemble_server(
     feed: Feed,
     networks: Mapping[str, EventToVideoNetwork],
     views: Views,

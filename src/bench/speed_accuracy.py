@@ -70,12 +70,9 @@ def find_fastest_forms(
     speeds: Sequence[SpeedMeasurement], side: int
 ) -> dict[str, SpeedMeasurement]:
     """Return each network's fastest form on frames of `side`, by one CPU thread's time."""
-    fastest: dict[str, SpeedMeasurement] = {}
-    for s in speeds:
-        if s.ms and (s.side, s.threads, s.device) == (side, 1, "cpu"):
-            before = fastest.setdefault(s.network, s)
-            fastest[s.network] = min(before, s, key=lambda one: one.ms or math.inf)
-    return fastest
+    timed = [s for s in speeds if s.ms and (s.side, s.threads, s.device) == (side, 1, "cpu")]
+    slowest_first = sorted(timed, key=lambda s: s.ms or 0.0, reverse=True)
+    return {s.network: s for s in slowest_first}
 
 
 def find_pareto_front(costs_and_errors: Mapping[Name, tuple[float, float]]) -> list[Name]:

@@ -242,7 +242,7 @@ def served(recording: str, networks, **how) -> PageServer:
     views, faults = scenes.views(), FaultLog()
     running = RunSettings(how.pop("fps", 100.0), form="float32")
     feed = event_feeds.open_feed(recording, None, faults)
-    made = live.assemble(feed, networks, views, running, faults, port=free_port(), **how)
+    made = live.assemble_server(feed, networks, views, running, faults, port=free_port(), **how)
     made.page.controls.choose(next(iter(networks)), "all")
     return made
 

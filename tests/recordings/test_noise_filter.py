@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from baselines.highpass import HighPass
-from src.live import assemble
+from src.live import assemble_server
 from src.live_view.event_feeds import FileFeed
 from src.live_view.network_runner import RunSettings
 from src.live_view.status import FaultLog
@@ -64,7 +64,7 @@ def test_a_live_feed_is_filtered(tmp_path):
     path, views = tmp_path / "few.csv", Views.single_view((8, 8), (8, 8))
     write_events(path, events((0, 3, 3), (1000, 4, 4), (20_000, 0, 0)), width=8, height=8)
     settings = RunSettings(100.0, form="float32")
-    server = assemble(
+    server = assemble_server(
         FileFeed(str(path), (8, 8), loop=False), {"net": HighPass()}, views, settings, FaultLog(),
         noise_filter_s=0.005,
     )  # fmt: skip

@@ -158,9 +158,8 @@ def measure_view_shift_loss(
     require_views(network, 2)
     changes, positions = {}, bench.clips()[0].positions
     own = layout(network.views)
-    moved = positions.index(
-        own[most_central_view_index(own) - 1]
-    )  # the last one: the centre comes first
+    # The last one where the centre comes first.
+    moved = positions.index(own[most_central_view_index(own) - 1])
     for px in shifts_px:
         everywhere = [(i, px * row, px * col) for i, (row, col) in enumerate(positions)]
         shifts = everywhere if parallax else [(moved, 0, px)]

@@ -111,10 +111,8 @@ def _fit_views(
 def _find_views(pictures: Pictures, grid: ViewGrid) -> tuple[dict[Position, View], PatchMatcher]:
     """Return the views after rounds in small pictures and in full ones, the last two with halves of
     corner views; and the full ones."""
-    views, tile = (
-        {at: View(at, grid.homography(at)) for at in grid.positions},
-        grid.centre_view_edges,
-    )
+    views = {at: View(at, grid.homography(at)) for at in grid.positions}
+    tile = grid.centre_view_edges
     for pitch in COARSE_PITCHES:
         scale = max(1, round(min(grid.x.pitch, grid.y.pitch) / pitch))
         small = PatchMatcher(pictures, tile, COARSE_PATCHES, scale)

@@ -7,12 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from src.recordings.files.event_file import WidthHeight
-
 MAX_PACKING = 200  # most that the columns of a recording shrink when they are packed
 MAX_COORDINATE = 65535
-SIZE_NAMES = ("size", "geometry", "sensor_size")  # width, height
-SHAPE_NAMES = ("sensor_resolution", "resolution")  # height, width
 IN_ORDER = 0.99  # of the steps of a column that time may be
 NAMES = {
     "t": ("t", "ts", "time", "times", "timestamp", "timestamps"), "x": ("x", "xs", "col", "column"),
@@ -116,30 +112,6 @@ def as_integers(name: str, values: np.ndarray) -> np.ndarray:
     if values.size and float(np.abs(values).max()) > 2**31:  # float16 cannot hold the bound
         raise ValueError(f"{name} must be in 0..{MAX_COORDINATE}, got {np.abs(values).max():.0f}")
     return values.astype(np.int64)
-
-
-def find_stated_size(known: Mapping[str, Any]) -> WidthHeight | None:
-    """Return (width, height) as one of SIZE_NAMES or SHAPE_NAMES, or `width` and `height` state it:
-    `640x480`, (640, 480) or 640, 480.  Arrays of more than four numbers are something else."""
-    for name in (*SIZE_NAMES, *SHAPE_NAMES):
-        sides = _whole_numbers(known[name]) if name in known else []
-        if len(sides) == 2:
-            has_width_first = name in SIZE_NAMES or "x" in str(known[name]).lower()  # 640x480
-            return (sides[0], sides[1]) if has_width_first else (sides[1], sides[0])
-    width, height = (_whole_numbers(known.get(name)) for name in ("width", "height"))
-    return (width[0], height[0]) if len(width) == len(height) == 1 else None
-
-
-def _whole_numbers(value: Any) -> list[int]:
-    """Return the first two numbers of a value; none for another."""
-    if isinstance(value, str | bytes):
-        text = value.decode("latin-1") if isinstance(value, bytes) else value
-        value = re.split(r"[\sx,;]+", text.strip().lower())
-    try:
-        numbers = np.asarray(value if np.size(value) <= 4 else None).ravel()[:2].astype(np.float64)
-    except (TypeError, ValueError):  # words, or nothing
-        return []
-    return [int(n) for n in numbers.tolist() if n >= 1 and n == int(n)]
 
 
 def check_lengths(columns: Mapping[str, Any]) -> None:

@@ -6,6 +6,7 @@ Known layouts: DSEC (events/{x, y, t, p} in us after `t_offset`; Gehrig et al. 2
 """
 
 import math
+import re
 from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
@@ -21,7 +22,6 @@ from src.recordings.files.columns import (
     check_unpacking_ratio,
     find_columns_by_name,
     find_keys_by_name,
-    find_stated_size,
 )
 from src.recordings.files.event_file import (
     EventFile,
@@ -37,6 +37,8 @@ from src.recordings.files.frame_files import to_gray, wrap_frame_array
 from src.recordings.files.numpy_file import LazyColumn, slice_columns, slice_times, split_table
 
 HDF5_ENDINGS = (".h5", ".hdf5", ".hdf")
+SIZE_NAMES = ("size", "geometry", "sensor_size")  # width, height
+SHAPE_NAMES = ("sensor_resolution", "resolution")  # height, width
 MAX_CHUNK_BYTES = 2**28  # bytes of HDF5 that are unpacked at a time
 ECF_CODEC = 36559  # the number of Prophesee's codec
 
@@ -168,5 +170,26 @@ def _is_table(name: str, node: Any) -> bool:
 
 
 def _stated_size(node: Any) -> WidthHeight | None:
-    """Return (width, height) as attributes or small arrays of a node state it."""
-    return find_stated_size((dict(node) if isinstance(node, h5py.Group) else {}) | dict(node.attrs))
+    """Return (width, height) as attributes or small arrays of a node, of SIZE_NAMES or SHAPE_NAMES
+    or `width` and `height`, state it: `640x480`, (640, 480) or 640, 480.  Arrays of more than four
+    numbers are something else."""
+    known = (dict(node) if isinstance(node, h5py.Group) else {}) | dict(node.attrs)
+    for name in (*SIZE_NAMES, *SHAPE_NAMES):
+        sides = _whole_numbers(known[name]) if name in known else []
+        if len(sides) == 2:
+            has_width_first = name in SIZE_NAMES or "x" in str(known[name]).lower()  # 640x480
+            return (sides[0], sides[1]) if has_width_first else (sides[1], sides[0])
+    width, height = (_whole_numbers(known.get(name)) for name in ("width", "height"))
+    return (width[0], height[0]) if len(width) == len(height) == 1 else None
+
+
+def _whole_numbers(value: Any) -> list[int]:
+    """Return the first two numbers of a value; none for another."""
+    if isinstance(value, str | bytes):
+        text = value.decode("latin-1") if isinstance(value, bytes) else value
+        value = re.split(r"[\sx,;]+", text.strip().lower())
+    try:
+        numbers = np.asarray(value if np.size(value) <= 4 else None).ravel()[:2].astype(np.float64)
+    except (TypeError, ValueError):  # words, or nothing
+        return []
+    return [int(n) for n in numbers.tolist() if n >= 1 and n == int(n)]
