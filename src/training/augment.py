@@ -12,7 +12,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from src.sim import noise
-from src.sim.optics import Position, layout
+from src.sim.optics import Position, layout, most_central_view_index
 from src.sim.pipeline import Sample, allocate_float32, concatenate_samples
 from src.training.clip_transforms import ClipTransform, transform_batch, transform_clips
 from src.training.voxel_noise import add_firing_pixels, draw_normals, draw_pixel_offsets
@@ -62,7 +62,7 @@ class Augment:
         windows, views, *grid = first.voxels.shape[1:]
         positions = first.positions or layout(views)
         dropout = self.batch_view_dropout_probability, noise.key(keys[0], "dropped")
-        kept = draw_kept_views(views, *dropout)
+        kept = draw_kept_views(positions, *dropout)
         transforms = [self._draw_transform(key, windows, positions, kept) for key in keys]
         voxels = allocate_float32((len(keys), windows, len(kept), *grid), first.voxels.device)
         if voxels.device.type != "cpu" if batched is None else batched:
@@ -153,10 +153,17 @@ def draw_view_shifts(
     return [(view, down, right) for view, draw, down, right in triples if draw < probability]
 
 
-def draw_kept_views(views: int, batch_dropout_probability: float, key: int) -> list[int]:
-    """Return which views a batch has: with `batch_dropout_probability` it loses some."""
+def draw_kept_views(
+    positions: Sequence[Position], batch_dropout_probability: float, key: int
+) -> list[int]:
+    """Return which of the views at `positions` a batch has: with `batch_dropout_probability` it
+    loses some.  Few are left more often than many; one alone is the centre view.
+    """
+    views = len(positions)
     chance, share, *order = noise.uniforms(key, 2 + views)
     if chance >= batch_dropout_probability or views == 1:
         return list(range(views))
-    count = 1 + int(share * (views - 1))
+    count = 1 + int(share**2 * (views - 1))
+    if count == 1:
+        return [most_central_view_index(positions)]
     return sorted(sorted(range(views), key=order.__getitem__)[:count])

@@ -1,6 +1,7 @@
 """A training sequence as CUDA graphs: one launch forward, one backward, instead of thousands."""
 
 from collections.abc import Callable, Sequence
+from threading import Lock
 from typing import Any
 
 import torch
@@ -11,7 +12,8 @@ from torch.nn.utils import parametrize
 from src.models.network import EventToVideoNetwork, unroll
 
 MAX_GRAPHS = 24
-TOLERANCE = 0.02  # of frames in [0, 1]: a graph that differs by more, in bf16 too, is not used
+CAPTURE_LOCK = Lock()  # held during a capture, which fails where another thread uses the device
+TOLERANCE = 0.005  # mean difference, frames in [0, 1], above which a graph is not used; bf16: 0.001
 
 
 class UnrolledNetwork(nn.Module):
@@ -58,7 +60,8 @@ class GraphedUnroll:
             self.seen.add(name)
             return plain(voxels, window_s)
         try:
-            graph = self._capture(plain, voxels, window_s)
+            with CAPTURE_LOCK:
+                graph = self._capture(plain, voxels, window_s)
         except Exception as error:  # whatever a driver, a kernel or the memory says
             self.disabled, self.graphs = True, {}
             torch.cuda.empty_cache()
@@ -80,7 +83,7 @@ class GraphedUnroll:
             example = voxels.clone(), window_s.clone()
             graph = torch.cuda.make_graphed_callables(plain, example, pool=self.pool)
             with torch.no_grad():
-                difference = (graph(voxels, window_s) - expected).abs().max()
+                difference = (graph(voxels, window_s) - expected).abs().mean()
         if not difference < TOLERANCE:
             raise RuntimeError(f"frames of a graph differ by {float(difference):.3g}")
         return graph

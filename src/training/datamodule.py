@@ -12,6 +12,7 @@ from src.sim import noise
 from src.sim.pipeline import ClipParameters, Pipeline, Sample, concatenate_samples
 from src.training.augment import Augment
 from src.training.batch_sampler import DrawDataset, LargeCropStream, SampleId, StepSampler
+from src.training.device_prefetch import DevicePrefetcher
 from src.training.disk_cache import CacheFillerProcess, prepare_worker_process
 from src.training.teachers import TeacherEnsemble
 
@@ -73,7 +74,7 @@ class LightFieldData(LightningDataModule):
         if stage == "fit" and self.filler is not None:
             self.filler.stop()
 
-    def train_dataloader(self) -> DataLoader:
+    def train_dataloader(self) -> DataLoader | DevicePrefetcher:
         """Return endless clips, from the training's step on: a resumed training sees others."""
         trainer, module = self.trainer, self.trainer.lightning_module
         sampler = StepSampler(
@@ -86,7 +87,10 @@ class LightFieldData(LightningDataModule):
             large_share=self.large.share if self.large else 0.0,
             large_batch_size=self.large.batch_size if self.large else 1,
         )
-        return self._loader("train", batch_sampler=sampler)
+        loader = self._loader("train", batch_sampler=sampler)
+        if self.simulate_on == "worker":
+            return loader
+        return DevicePrefetcher(loader, lambda draws: self._simulate_on_device("train", draws))
 
     def val_dataloader(self) -> DataLoader:
         return self._loader("val", sampler=[SampleId(k, k) for k in range(self.val_clips)])

@@ -1,6 +1,7 @@
 """The semantics of every augmentation on hand-made sequences."""
 
 import math
+from collections import Counter
 
 import pytest
 import torch
@@ -200,18 +201,20 @@ def test_shifting_brings_nothing_in():
 
 
 def test_dropped_views_take_their_positions_along_and_some_view_stays():
-    places = tuple((0, column) for column in range(4))
+    places = tuple((0, column) for column in (-1, 0, 1, 2))
     voxels = torch.arange(4.0).reshape(1, 1, 4, 1, 1, 1)
     picture = torch.zeros(1, 1, 1, 1, 1)
     sample = Sample(voxels, picture, picture, torch.tensor([1 / 120]), places)
     lossy = Augment(**OFF, batch_view_dropout_probability=1.0)
-    counts = set()
-    for key in range(60):
+    counts = Counter()
+    for key in range(200):
         left = lossy([sample], [key])
         kept = left.voxels.flatten().tolist()
         assert [places[int(view)] for view in kept] == list(left.positions)
-        counts.add(len(kept))
-    assert counts == {1, 2, 3} and draw_kept_views(4, 0.0, 1) == [0, 1, 2, 3]
+        counts[len(kept)] += 1
+        assert len(kept) > 1 or kept == [1]
+    assert set(counts) == {1, 2, 3} and counts[1] > counts[2] > counts[3]
+    assert draw_kept_views(places, 0.0, 1) == [0, 1, 2, 3]
 
 
 def test_a_view_that_stays_shows_the_picture_of_its_turned_place():
