@@ -4,6 +4,7 @@ The processes draw clips and, for a GPU, prepare their turbulence; this one comp
 all views.  The processes are those of a DataLoader, which keeps the order and notices their death.
 """
 
+import multiprocessing
 import os
 import pickle
 import time
@@ -181,7 +182,7 @@ def _draw_clips(
         sampler=indices,
         num_workers=workers,
         worker_init_fn=_init_worker,
-        multiprocessing_context="spawn" if workers else None,  # a fork would take CUDA along
+        multiprocessing_context=_forkserver() if workers else None,
         generator=torch.Generator(),  # or the loader would draw from that of the training
     )
     clips = iter(loader)
@@ -193,6 +194,15 @@ def _draw_clips(
         if isinstance(clip, Exception):
             raise clip
         yield index, *clip
+
+
+def _forkserver() -> multiprocessing.context.BaseContext:
+    """Return a context whose processes are forks of one that has imported what they need, once: a
+    fork of this process would take CUDA along, and new ones would all import at the same time.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__, "src.app.simulation"])
+    return context
 
 
 def _init_worker(worker: int) -> None:

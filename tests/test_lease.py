@@ -22,7 +22,7 @@ from tests.conftest import ROOT
 from tests.test_lease_plan import DRY, begun, pack, plan
 from tests.test_train import config
 
-NOT_NEEDED = ("wandb", "kornia", "faery", "aiohttp", "h5py")
+NOT_NEEDED = ("wandb", "kornia", "faery", "aiohttp", "h5py", "av", "rosbags", "hdf5plugin")
 # Imports once; each lease, {name: [its words, whether training hangs]}, is a child of its own.
 DRIVER = """
 import json, os, sys, time

@@ -16,9 +16,12 @@ import torch
 from torch.utils.data import DataLoader
 
 from scripts import parallel_fill
+from scripts.lease import fill as lease_fill
+from scripts.lease.plan import Fill
+from scripts.lease.probe import Device, Trial
 from scripts.parallel_fill import FillReport, fill
 from src.sim.pipeline import Pipeline
-from src.training.clip_cache import CachedClip
+from src.training.clip_cache import CachedClip, DeviceClipCache
 from src.training.disk_cache import DiskClipCache
 from tests.faults.harness import FORKS
 from tests.training.cache_sources import Broken, Growing, Other, Telling, source
@@ -148,3 +151,19 @@ def test_stopped_from_outside_all_end(how, tmp_path):
         asking.terminate()
     assert asking.wait(600) != 0
     until(lambda: not any(map(runs, drawing)))
+
+
+def test_where_processes_make_no_clip_in_their_time_the_lease_draws_itself(monkeypatch):
+    tried, said = [], []
+
+    def fill_with(source, clips, store, *, device, workers, until) -> FillReport:
+        tried.append(workers)
+        return FillReport(clips=0 if workers else 3, seconds=1.0, waiting_s=0.0)
+
+    monkeypatch.setattr(lease_fill, "fill", fill_with)
+    cache = DeviceClipCache(source(), device="cpu", clips=7, frames=7, gib=1.0)
+    plan = Fill(minutes=0.01, clips=7, warn_below_clips=1, workers=4)
+    device = Device("cpu", "a CPU", 2**33, False, False)
+    (report,) = lease_fill.fill_caches([cache], plan, device, Trial(2), said.append)
+    assert tried == [4, 0] and cache.clips == report["clips"] == 3
+    assert said[0].startswith("cache: no clip by 4 processes in 1 s")

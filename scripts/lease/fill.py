@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 from scripts.lease.plan import Fill
 from scripts.lease.probe import GIB, MEMORY_FACTOR, UNUSED_GIB, Device, Trial, free_memory
-from scripts.parallel_fill import fill
+from scripts.parallel_fill import FillReport, fill
 from src.training.clip_cache import DeviceClipCache
 
 MAX_WORKERS = 15
@@ -33,18 +33,28 @@ def fill_caches(
         if most < cache.clips:
             log(f"the memory holds {most} of {cache.clips} clips")
         cache.clips = most
-        until = time.monotonic() + 60 * share * plan.minutes
-        reports.append(_fill_cache(cache, plan, device.kind, until, log))
+        reports.append(_fill_cache(cache, plan, device.kind, 60 * share * plan.minutes, log))
     return reports
 
 
 def _fill_cache(
-    cache: DeviceClipCache, plan: Fill, device: str, until: float, log: Callable
+    cache: DeviceClipCache, plan: Fill, device: str, seconds: float, log: Callable
 ) -> dict[str, float]:
+    """Fill `cache` for `seconds`; where the processes that draw made no clip in this time (their
+    imports may take longer), this one draws for as long again.
+    """
+
+    def fill_with(workers: int) -> FillReport:
+        until = time.monotonic() + seconds
+        clips = range(cache.clips)
+        return fill(cache.source, clips, cache.store, device=device, workers=workers, until=until)
+
     most = max(1, min(MAX_WORKERS, (os.cpu_count() or 1) - 1))
     workers = most if plan.workers is None else plan.workers
-    clips = range(cache.clips)
-    report = fill(cache.source, clips, cache.store, device=device, workers=workers, until=until)
+    report = fill_with(workers)
+    if workers and not report.clips:
+        log(f"cache: no clip by {workers} processes in {seconds:.0f} s; this one draws now")
+        report = fill_with(0)
     if not report.clips:
         raise ValueError(f"fill: minutes must be > {plan.minutes:g}: no clip was made")
     cache.clips = report.clips

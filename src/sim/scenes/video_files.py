@@ -5,13 +5,15 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from jaxtyping import Shaped
 from numpy.typing import NDArray
 
-from src.sim.scenes.video_index import VideoIndex, index_video
+if TYPE_CHECKING:
+    from src.sim.scenes.video_index import VideoIndex
 
 PICTURE_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff"}
 VIDEO_SUFFIXES = {
@@ -29,7 +31,7 @@ class VideoSource:
     name: str
     count: int
     config_key: str
-    index: VideoIndex | None = None
+    index: "VideoIndex | None" = None
     frames: tuple[Path, ...] = ()
     size: tuple[int, ...] | None = None
 
@@ -86,6 +88,8 @@ def _folder_sources(path: Path, config_key: str) -> list[VideoSource]:
 
 
 def _file_source(path: Path, config_key: str) -> VideoSource:
+    from src.sim.scenes.video_index import index_video  # PyAV: not where only pictures are read
+
     index = index_video(path, config_key)
     count = len(index.constant_rate_frames)
     if count < 2:
