@@ -65,7 +65,7 @@ def transform_batch(
     window = torch.stack([transform.source_windows for transform in transforms]).to(device)
     paused = torch.stack([transform.paused for transform in transforms]).to(device)
     view = torch.stack([transform.view_order for transform in transforms]).to(device)
-    pixel, is_inside = (part.to(device) for part in source_pixels(transforms, height, width))
+    pixel, is_inside = source_pixels(transforms, height, width, device)
     grids = sample.voxels.flatten(-2)[
         clip[:, None, None, None, None], window[:, :, None, None, None],
         view[:, None, :, None, None], bins[:, None], pixel[:, None, :, None],
@@ -74,7 +74,7 @@ def transform_batch(
     out.flatten(-2).copy_(grids.masked_fill_(is_empty, 0))
     if any(transform.view_shifts for transform in transforms):  # frames are not shifted
         unshifted = [transform._replace(view_shifts=[]) for transform in transforms]
-        pixel = source_pixels(unshifted, height, width)[0].to(device)
+        pixel = source_pixels(unshifted, height, width, device)[0]
     place = clip[:, None, None], window[:, :, None], pixel
     return {
         name: getattr(sample, name).flatten(2)[place].unflatten(-1, (1, height, width))
@@ -83,20 +83,26 @@ def transform_batch(
 
 
 def source_pixels(
-    transforms: Sequence[ClipTransform], height: int, width: int
+    transforms: Sequence[ClipTransform], height: int, width: int, device: torch.device
 ) -> tuple[Int[Tensor, "n views pixels"], Bool[Tensor, "n views pixels"]]:
     """Return which pixel each pixel of each view comes from (one view for all, where none is
-    shifted), and whether there is one.
+    shifted), and whether there is one, on `device`.
     """
-    numbers = torch.arange(1, height * width + 1).view(1, 1, 1, height, width)
     has_shifts = any(transform.view_shifts for transform in transforms)
-    sources = []
-    for transform in transforms:
-        pixels = flip_frames(numbers, transform.flip_axes)
-        views = pixels.repeat(1, len(transform.view_order) if has_shifts else 1, 1, 1, 1)
-        sources.append(shift_views(views, transform.view_shifts).flatten(3)[0, :, 0] - 1)
-    source = torch.stack(sources)
-    return source.clamp(min=0), source >= 0
+    shifts = torch.zeros(len(transforms), len(transforms[0].view_order) if has_shifts else 1, 2)
+    for clip, transform in zip(shifts, transforms, strict=True):
+        for view, *down_right in transform.view_shifts:
+            clip[view] = torch.tensor(down_right)
+    flips = torch.tensor([[axis in one.flip_axes for axis in (-2, -1)] for one in transforms])
+    shifts, flips = shifts.long().to(device), flips[:, None].to(device)
+    places, inside = [], []
+    for axis, size in enumerate((height, width)):
+        place = torch.arange(size, device=device) - shifts[..., axis, None]
+        inside.append((place >= 0) & (place < size))
+        place = torch.where(flips[..., axis, None], size - 1 - place, place)
+        places.append(place.clamp(0, size - 1))
+    pixel = places[0][..., None] * width + places[1][..., None, :]
+    return pixel.flatten(2), (inside[0][..., None] & inside[1][..., None, :]).flatten(2)
 
 
 def flip_frames(frames: Tensor, axes: list[int]) -> Tensor:

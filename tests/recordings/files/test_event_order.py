@@ -6,7 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from src.recordings.files.event_file import EVENT
-from src.recordings.files.event_order import BUFFER_US, EventSorter, merge_in_time
+from src.recordings.files.event_order import (
+    BUFFER_US,
+    FEW_SHARE,
+    LEAST_FEW,
+    EventSorter,
+    merge_in_time,
+)
 from src.recordings.files.survey import sort_with_smallest_buffer
 
 
@@ -27,8 +33,11 @@ def taken(order: EventSorter, events: np.ndarray, g: np.random.Generator) -> np.
 
 
 def disordered(g: np.random.Generator, n: int, rate_hz: float) -> np.ndarray:
-    """Return events whose order is wrong by BUFFER_US at most, over silences too."""
-    gaps = g.exponential(1e6 / rate_hz, n) + (g.random(n) < 0.01) * g.integers(0, 10**7, n)
+    """Return events whose order is wrong by BUFFER_US at most, over silences too; after none are
+    the events so few that they could be outliers.
+    """
+    is_silent = (g.random(n) < 0.01) & (np.arange(n) < n - n // FEW_SHARE - LEAST_FEW)
+    gaps = g.exponential(1e6 / rate_hz, n) + is_silent * g.integers(0, 10**7, n)
     times = np.sort(np.cumsum(gaps).astype(np.int64) + int(g.integers(0, 2**50)))
     late = np.argsort(times + g.integers(0, BUFFER_US + 1, n), kind="stable")
     return numbered(times[late])
