@@ -185,11 +185,12 @@ def _draw_clips(
         multiprocessing_context=_forkserver() if workers else None,
         generator=torch.Generator(),  # or the loader would draw from that of the training
     )
-    clips = iter(loader)
+    clips = None
     for index in indices:
         try:
+            clips = clips or iter(loader)
             clip = pickle.loads(next(clips))
-        except RuntimeError as error:
+        except (RuntimeError, EOFError) as error:  # of a process that draws, or of their server
             raise RuntimeError(f"waiting for clip {index}: {error}") from error
         if isinstance(clip, Exception):
             raise clip

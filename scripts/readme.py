@@ -86,6 +86,11 @@ class Table(NamedTuple):
     pairs: dict[str, tuple[str, str]]
     metrics: tuple[str, ...] = tuple(metric.name for metric in METRICS)
 
+    @property
+    def all_rows(self) -> set[str]:
+        """The rows and those that differences are of."""
+        return {*self.rows, *(row for pair in self.pairs.values() for row in pair)}
+
 
 TABLES = {  # of what is measured
     "data=test_photos": (
@@ -241,8 +246,10 @@ def main() -> None:
     rows = {row: load_shipped(*what, given.published) for row, what in chosen.items()}
     cards = {name: row for row, (name, _) in reversed(ROWS.items())}  # the row of most views
     for protocol, overrides in asked.items():
+        shown = {row for table in TABLES[protocol] for row in table.all_rows}
         values = score_clips_into_metrics(
-            compose_config("eval", *protocol.split(), *overrides), rows
+            compose_config("eval", *protocol.split(), *overrides),
+            {row: network for row, network in rows.items() if row in shown},
         )
         for table in TABLES[protocol]:
             replace_section(HOME / table.document, table.section, format_table(values, table))

@@ -153,11 +153,14 @@ def test_stopped_from_outside_all_end(how, tmp_path):
     until(lambda: not any(map(runs, drawing)))
 
 
-def test_where_processes_make_no_clip_in_their_time_the_lease_draws_itself(monkeypatch):
+@pytest.mark.parametrize("dies", [False, True])
+def test_where_processes_make_no_clip_the_lease_draws_itself(dies, monkeypatch):
     tried, said = [], []
 
     def fill_with(source, clips, store, *, device, workers, until) -> FillReport:
         tried.append(workers)
+        if workers and dies:
+            raise RuntimeError("waiting for clip 0: a process died")
         return FillReport(clips=0 if workers else 3, seconds=1.0, waiting_s=0.0)
 
     monkeypatch.setattr(lease_fill, "fill", fill_with)
@@ -166,4 +169,4 @@ def test_where_processes_make_no_clip_in_their_time_the_lease_draws_itself(monke
     device = Device("cpu", "a CPU", 2**33, False, False)
     (report,) = lease_fill.fill_caches([cache], plan, device, Trial(2), said.append)
     assert tried == [4, 0] and cache.clips == report["clips"] == 3
-    assert said[0].startswith("cache: no clip by 4 processes in 1 s")
+    assert said[dies].startswith("cache: no clip by 4 processes in 1 s")

@@ -41,7 +41,7 @@ def _fill_cache(
     cache: DeviceClipCache, plan: Fill, device: str, seconds: float, log: Callable
 ) -> dict[str, float]:
     """Fill `cache` for `seconds`; where the processes that draw made no clip in this time (their
-    imports may take longer), this one draws for as long again.
+    imports may take longer) or died, this one draws for as long again.
     """
 
     def fill_with(workers: int) -> FillReport:
@@ -51,7 +51,11 @@ def _fill_cache(
 
     most = max(1, min(MAX_WORKERS, (os.cpu_count() or 1) - 1))
     workers = most if plan.workers is None else plan.workers
-    report = fill_with(workers)
+    try:
+        report = fill_with(workers)
+    except RuntimeError as error:
+        log(f"cache: {error}")
+        report = FillReport(clips=0, seconds=0.0, waiting_s=0.0)
     if workers and not report.clips:
         log(f"cache: no clip by {workers} processes in {seconds:.0f} s; this one draws now")
         report = fill_with(0)

@@ -30,7 +30,7 @@ class Augment:
     `pause_probability_when_running`, `.._when_paused`: that the next window has no events.
     `flip_probability`: for each axis.  The views of a grid change places with their images.
     `view_shift_probability`: of a view to be shifted by up to `max_view_shift_px` whole pixels in
-    each axis.  `batch_view_dropout_probability`: of a batch to lose views, any but never all.
+    each axis.  `batch_view_dropout_probability`: of a batch to lose views, see draw_kept_views.
     """
 
     noise_std: float = 0.4

@@ -13,7 +13,7 @@ from src.models.network import EventToVideoNetwork, unroll
 
 MAX_GRAPHS = 24
 CAPTURE_LOCK = Lock()  # held during a capture, which fails where another thread uses the device
-TOLERANCE = 0.005  # mean difference, frames in [0, 1], above which a graph is not used; bf16: 0.001
+TOLERANCE = 0.005  # mean difference of frames in [0, 1], above which a graph is not used
 
 
 class UnrolledNetwork(nn.Module):

@@ -90,7 +90,11 @@ class LightFieldData(LightningDataModule):
         loader = self._loader("train", batch_sampler=sampler)
         if self.simulate_on == "worker":
             return loader
-        return DevicePrefetcher(loader, lambda draws: self._simulate_on_device("train", draws))
+        return DevicePrefetcher(
+            loader,
+            lambda draws: self._simulate_on_device("train", draws),
+            self.trainer.strategy.root_device,
+        )
 
     def val_dataloader(self) -> DataLoader:
         return self._loader("val", sampler=[SampleId(k, k) for k in range(self.val_clips)])

@@ -1,9 +1,12 @@
 """Batches that are simulated one ahead, in a thread."""
 
+import gc
+import multiprocessing
 import threading
 
 import pytest
 import torch
+from lightning.pytorch.utilities.combined_loader import _shutdown_workers_and_reset_iterator
 from torch.utils.data import DataLoader
 
 from src.sim.pipeline import Sample
@@ -11,8 +14,9 @@ from src.training.cuda_graphs import CAPTURE_LOCK
 from src.training.device_prefetch import DevicePrefetcher
 
 
-def draws(batches: int) -> DataLoader:
-    return DataLoader(range(batches), collate_fn=list)
+def prefetcher(batches: int, simulate, device: str = "cpu", **loading) -> DevicePrefetcher:
+    loader = DataLoader(range(batches), collate_fn=list, **loading)
+    return DevicePrefetcher(loader, simulate, torch.device(device))
 
 
 def sample(number: int) -> Sample:
@@ -34,7 +38,7 @@ def test_the_next_batch_is_made_while_the_one_before_is_used():
         is_made[batch[0]].set()
         return sample(batch[0])
 
-    ahead = DevicePrefetcher(draws(4), simulate)
+    ahead = prefetcher(4, simulate)
     assert len(ahead) == 4
     for k, batch in enumerate(ahead):
         assert number(batch) == k
@@ -51,7 +55,7 @@ def test_what_is_raised_reaches_the_reader_and_the_thread_ends():
         return sample(batch[0])
 
     before = threading.active_count()
-    batches = iter(DevicePrefetcher(draws(2), simulate))
+    batches = iter(prefetcher(2, simulate))
     assert number(next(batches)) == 0
     with pytest.raises(ValueError, match="no clip"):
         next(batches)
@@ -60,7 +64,7 @@ def test_what_is_raised_reaches_the_reader_and_the_thread_ends():
 
 def test_a_reader_that_stops_early_leaves_no_thread():
     before = threading.active_count()
-    batches = iter(DevicePrefetcher(draws(9), lambda batch: sample(batch[0])))
+    batches = iter(prefetcher(9, lambda batch: sample(batch[0])))
     next(batches)
     batches.close()
     assert threading.active_count() == before
@@ -73,12 +77,22 @@ def test_nothing_is_simulated_during_a_capture():
         is_made.set()
         return sample(batch[0])
 
-    reader = threading.Thread(target=lambda: list(DevicePrefetcher(draws(1), simulate)))
+    reader = threading.Thread(target=lambda: list(prefetcher(1, simulate)))
     with CAPTURE_LOCK:
         reader.start()
         assert not is_made.wait(0.3)
     reader.join(10)
     assert is_made.is_set() and not reader.is_alive()
+
+
+def test_processes_that_draw_end_with_the_training():
+    ahead = prefetcher(
+        3, lambda batch: sample(int(batch[0])), num_workers=1, persistent_workers=True
+    )
+    assert [number(batch) for batch in ahead] == [0, 1, 2]
+    _shutdown_workers_and_reset_iterator(ahead)
+    gc.collect()
+    assert ahead.loader._iterator is None and not multiprocessing.active_children()
 
 
 @pytest.mark.gpu
@@ -90,5 +104,5 @@ def test_on_a_gpu_batches_are_whole_when_they_are_used():
         frame = slow[None, None, None]
         return Sample(slow[None, None, None, None] * batch[0], frame, frame, slow[0, :1])
 
-    for k, batch in enumerate(DevicePrefetcher(draws(6), simulate)):
+    for k, batch in enumerate(prefetcher(6, simulate, "cuda")):
         assert bool((batch.voxels == k).all())
