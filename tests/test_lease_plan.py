@@ -87,6 +87,12 @@ def test_what_does_not_fit_is_refused_with_the_numbers(changes, said, three, tmp
         select_networks(plans.load_plan(plan(tmp_path, **changes)), three, 3)
 
 
+def test_a_network_starts_from_shipped_weights_by_name(tmp_path):
+    one = {"name": "setnet_small", "minutes": 0.1, "start": "setnet_small"}
+    found = plans.load_plan(plan(tmp_path, networks=[one]))
+    assert found.earlier_hours(found.networks[0]) > 10
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [

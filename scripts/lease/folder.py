@@ -30,6 +30,7 @@ def gather_files(folder: Path, plan: Path, given: Mapping[str, Path], max_mib: f
     for network in content.networks:
         if network.get("start"):
             source = plan.parent / network.start
+            source = source if source.is_file() else files.locate(network.start)
             names[source] = network.start = f"start-{network.name}.safetensors"
     if missing := [str(source) for source in names if not source.is_file()]:
         raise ValueError(f"{plan} names missing files: {', '.join(missing)}")

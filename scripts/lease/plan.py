@@ -22,8 +22,8 @@ MIB = 2**20
 @dataclass
 class Network:
     """One training: `minutes` of it at least, and of the minutes that are left over in proportion
-    to `share`; `optional`: only where it fits.  `start`: weights to continue from, with their
-    hours; the cosine of the learning rate begins anew.
+    to `share`; `optional`: only where it fits.  `start`: weights to continue from, a file or the
+    name of shipped ones, with their hours; the cosine of the learning rate begins anew.
     """
 
     name: str = MISSING
@@ -109,6 +109,10 @@ class Plan:
         """Return the file of the plan's folder that is called `name`."""
         return (self.folder / name).resolve()
 
+    def start_path(self, start: str) -> Path:
+        """Return the file of weights that a network's `start` names."""
+        return path if (path := self.path(start)).is_file() else files.locate(start)
+
     def select(self, names: Sequence[str]) -> "Plan":
         """Return the plan with these networks; ValueError for a name that is none of them."""
         known = [network.name for network in self.networks]
@@ -142,7 +146,8 @@ class Plan:
 
     def earlier_hours(self, network: Network) -> float:
         """Return the hours that the weights it continues from were trained."""
-        return read_training_progress(self.path(network.start))["hours"] if network.start else 0.0
+        start = network.start
+        return read_training_progress(self.start_path(start))["hours"] if start else 0.0
 
 
 def load_plan(path: Path) -> Plan:
@@ -167,7 +172,7 @@ def load_plan(path: Path) -> Plan:
         verify_pack(plan.path(plan.scenes))
     for network in plan.networks:
         if network.start is not None:
-            start, name = plan.path(network.start), network.name
+            start, name = plan.start_path(network.start), network.name
             if not files.is_weights_file(start) or not start.is_file():
                 raise ValueError(f"networks: start of {name} must be exported weights, got {start}")
             read_training_progress(start)

@@ -125,7 +125,7 @@ def train_network(
         if name not in REPLACED_CALLBACKS
     ]
     if one.network.start:
-        weights = files.find_checkpoint(plan.path(one.network.start), spec)
+        weights = files.find_checkpoint(plan.start_path(one.network.start), spec)
         continue_from_weights(module, callbacks, weights)
     quiet = {"logger": False, "enable_checkpointing": False}
     trainer = build_part(cfg, "trainer", callbacks=callbacks, **quiet)
