@@ -188,7 +188,7 @@ def _draw_clips(
     clips = None
     for index in indices:
         try:
-            clips = clips or iter(loader)
+            clips = iter(loader) if clips is None else clips
             clip = pickle.loads(next(clips))
         except (RuntimeError, EOFError) as error:  # of a process that draws, or of their server
             raise RuntimeError(f"waiting for clip {index}: {error}") from error

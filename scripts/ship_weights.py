@@ -24,6 +24,7 @@ from src.records import results
 from src.training.learning_curve import TRAINING_STATE
 
 LARGEST = 16 * 2**20  # bytes of a file
+CURVE = "The curve jumps where a stage has other validation clips."
 
 
 class Given(NamedTuple):
@@ -161,7 +162,7 @@ def describe(
         "|---|---|",
         *(f"| {key} | {value} |" for key, value in card.items() if key != TRAINING_STATE),
         "",
-        *([f"![learning curve]({Path(name).name}.png)", ""] if drawn else []),
+        *([f"![learning curve]({Path(name).name}.png)", "", CURVE, ""] if drawn else []),
         "| tested on | clips | " + " | ".join(metric.heading for metric in METRICS) + " |",
         "|---|---|" + "---|" * len(METRICS),
         *(_tested(record, cfg) for record, cfg in tests),

@@ -170,3 +170,14 @@ def test_where_processes_make_no_clip_the_lease_draws_itself(dies, monkeypatch):
     (report,) = lease_fill.fill_caches([cache], plan, device, Trial(2), said.append)
     assert tried == [4, 0] and cache.clips == report["clips"] == 3
     assert said[dies].startswith("cache: no clip by 4 processes in 1 s")
+
+
+def test_a_clip_that_fails_in_the_lease_itself_is_named(monkeypatch):
+    def fails(*_, **__):
+        raise RuntimeError("clip 3: no light")
+
+    monkeypatch.setattr(lease_fill, "fill", fails)
+    cache = DeviceClipCache(source(), device="cpu", clips=7, frames=7, gib=1.0)
+    plan = Fill(minutes=0.01, clips=7, warn_below_clips=1, workers=0)
+    with pytest.raises(RuntimeError, match="clip 3: no light"):
+        lease_fill.fill_caches([cache], plan, Device("cpu", "", 0, False, False), Trial(2), print)

@@ -54,6 +54,8 @@ def _fill_cache(
     try:
         report = fill_with(workers)
     except RuntimeError as error:
+        if not workers:
+            raise
         log(f"cache: {error}")
         report = FillReport(clips=0, seconds=0.0, waiting_s=0.0)
     if workers and not report.clips:

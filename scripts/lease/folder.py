@@ -6,7 +6,7 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from scripts.lease.plan import MIB, Plan, load_plan
+from scripts.lease.plan import MIB, Plan, load_plan, start_path
 from scripts.lease.selection import Selection, allot_seconds, overhead_s
 from src.metrics.lpips import BACKBONE_FOLDER
 from src.models import files
@@ -29,8 +29,7 @@ def gather_files(folder: Path, plan: Path, given: Mapping[str, Path], max_mib: f
         names[source] = content[key] = source.name
     for network in content.networks:
         if network.get("start"):
-            source = plan.parent / network.start
-            source = source if source.is_file() else files.locate(network.start)
+            source = start_path(plan.parent, network.start)
             names[source] = network.start = f"start-{network.name}.safetensors"
     if missing := [str(source) for source in names if not source.is_file()]:
         raise ValueError(f"{plan} names missing files: {', '.join(missing)}")

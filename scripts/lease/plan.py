@@ -109,10 +109,6 @@ class Plan:
         """Return the file of the plan's folder that is called `name`."""
         return (self.folder / name).resolve()
 
-    def start_path(self, start: str) -> Path:
-        """Return the file of weights that a network's `start` names."""
-        return path if (path := self.path(start)).is_file() else files.locate(start)
-
     def select(self, names: Sequence[str]) -> "Plan":
         """Return the plan with these networks; ValueError for a name that is none of them."""
         known = [network.name for network in self.networks]
@@ -147,7 +143,13 @@ class Plan:
     def earlier_hours(self, network: Network) -> float:
         """Return the hours that the weights it continues from were trained."""
         start = network.start
-        return read_training_progress(self.start_path(start))["hours"] if start else 0.0
+        return read_training_progress(start_path(self.folder, start))["hours"] if start else 0.0
+
+
+def start_path(folder: Path, start: str) -> Path:
+    """Return the file of weights that `start` names: in the plan's `folder`, else a shipped one."""
+    path = (folder / start).resolve()
+    return path if path.is_file() else files.locate(start)
 
 
 def load_plan(path: Path) -> Plan:
@@ -172,7 +174,7 @@ def load_plan(path: Path) -> Plan:
         verify_pack(plan.path(plan.scenes))
     for network in plan.networks:
         if network.start is not None:
-            start, name = plan.start_path(network.start), network.name
+            start, name = start_path(plan.folder, network.start), network.name
             if not files.is_weights_file(start) or not start.is_file():
                 raise ValueError(f"networks: start of {name} must be exported weights, got {start}")
             read_training_progress(start)

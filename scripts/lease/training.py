@@ -10,7 +10,7 @@ import lightning
 from lightning import LightningModule, Trainer
 from omegaconf import OmegaConf
 
-from scripts.lease.plan import Plan
+from scripts.lease.plan import Plan, start_path
 from scripts.lease.selection import SizedNetwork
 from src.app import build, hardware
 from src.app.instantiate import build_part, instantiate_node, read_user_packages
@@ -125,7 +125,7 @@ def train_network(
         if name not in REPLACED_CALLBACKS
     ]
     if one.network.start:
-        weights = files.find_checkpoint(plan.start_path(one.network.start), spec)
+        weights = files.find_checkpoint(start_path(plan.folder, one.network.start), spec)
         continue_from_weights(module, callbacks, weights)
     quiet = {"logger": False, "enable_checkpointing": False}
     trainer = build_part(cfg, "trainer", callbacks=callbacks, **quiet)

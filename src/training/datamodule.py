@@ -109,11 +109,10 @@ class LightFieldData(LightningDataModule):
             yield sample.to(self.trainer.strategy.root_device)
 
     def on_after_batch_transfer(self, batch: Sample | list, dataloader_idx: int) -> Sample:
-        """Simulate drawn clips on the training device when no worker has."""
+        """Simulate drawn clips of a validation or a test on the training device."""
         if isinstance(batch, Sample):
             return batch
-        split = "train" if self.trainer.training else "test" if self.trainer.testing else "val"
-        return self._simulate_on_device(split, batch)
+        return self._simulate_on_device("test" if self.trainer.testing else "val", batch)
 
     def transfer_batch_to_device(
         self, batch: Sample | list, device: torch.device, dataloader_idx: int
