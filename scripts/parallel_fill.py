@@ -9,7 +9,7 @@ import os
 import pickle
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -53,6 +53,67 @@ class FillReport:
         )
 
 
+class SimulatedClips(Iterator[tuple[int, CachedClip]]):
+    """The clips `indices` of `source` with their numbers, in order, simulated on `device`.
+
+    `workers`: the processes that draw, until `close`; 0: this one.  `waiting_s`: the seconds that
+    this one has waited for draws.  Raises ValueError for a clip that is refused, RuntimeError for
+    one that fails, both naming the clip, and RuntimeError where a process died.
+    """
+
+    def __init__(
+        self, source: Pipeline, indices: Sequence[int], *, device: torch.device | str, workers: int
+    ):
+        if type(workers) is not int or workers < 0:
+            raise ValueError(f"workers must be a whole number >= 0, got {workers}")
+        self.source, self.device, self.waiting_s = source, torch.device(device), 0.0
+        self._drawn = _draw_clips(source, indices, min(workers, len(indices)), self.device)
+        self._queued = deque[torch.cuda.Event]()
+
+    def __next__(self) -> tuple[int, CachedClip]:
+        while len(self._queued) > MAX_QUEUED_CLIPS:
+            self._queued.popleft().synchronize()
+        start = time.monotonic()
+        index, draw, metadata = next(self._drawn)
+        self.waiting_s += time.monotonic() - start
+        frames = _simulate_drawn(self.source, index, draw, self.device)
+        if self.device.type == "cuda":
+            self._queued.append(torch.cuda.Event())
+            self._queued[-1].record()
+        return index, CachedClip(*frames, metadata)
+
+    def synchronize(self) -> None:
+        """Wait until the device is done with the clips so far."""
+        if self._queued:
+            self._queued[-1].synchronize()
+
+    def close(self) -> None:
+        """End the processes that draw."""
+        self._drawn.close()
+
+
+def store_clips(
+    clips: SimulatedClips,
+    store: Callable[[int, CachedClip], None],
+    *,
+    count: int | None = None,
+    until: float | None = None,
+) -> FillReport:
+    """Store the next `count` of `clips` (None: all), until the time `until` of time.monotonic; a
+    clip that is ready later is dropped.
+    """
+    start, waited, stored = time.monotonic(), clips.waiting_s, 0
+    while count is None or stored < count:
+        if (clip := next(clips, None)) is None:
+            break
+        if until is not None and time.monotonic() >= until:
+            break
+        store(*clip)
+        stored += 1
+    clips.synchronize()
+    return FillReport(stored, time.monotonic() - start, clips.waiting_s - waited)
+
+
 def fill(
     source: Pipeline,
     indices: Iterable[int],
@@ -62,35 +123,14 @@ def fill(
     workers: int,
     until: float | None = None,
 ) -> FillReport:
-    """Simulate the clips `indices` on `device` and `store` them in order, until the time `until` of
-    time.monotonic; a clip that is drawn later is dropped.
-
-    `workers`: the processes that draw; 0: this one.  Raises ValueError for a clip that is refused,
-    RuntimeError for one that fails, both naming the clip, RuntimeError where a process died, and
-    what `store` raises.
+    """Simulate the clips `indices` on `device` and `store` them in order, see SimulatedClips and
+    store_clips; raises what they do, and what `store` raises.
     """
-    indices, device = list(indices), torch.device(device)
-    if type(workers) is not int or workers < 0:
-        raise ValueError(f"workers must be a whole number >= 0, got {workers}")
-    count, waiting_s, queued = 0, 0.0, deque[torch.cuda.Event]()
-    start = lap = time.monotonic()
-    drawn = _draw_clips(source, indices, min(workers, len(indices)), device)
-    for index, draw, metadata in drawn:
-        waiting_s += time.monotonic() - lap
-        if until is not None and time.monotonic() >= until:
-            break
-        store(index, CachedClip(*_simulate_drawn(source, index, draw, device), metadata))
-        count += 1
-        if device.type == "cuda":
-            queued.append(torch.cuda.Event())
-            queued[-1].record()
-            if len(queued) > MAX_QUEUED_CLIPS:
-                queued.popleft().synchronize()
-        lap = time.monotonic()
-    drawn.close()  # ends the processes
-    if queued:
-        queued[-1].synchronize()
-    return FillReport(count, time.monotonic() - start, waiting_s)
+    clips = SimulatedClips(source, list(indices), device=device, workers=workers)
+    try:
+        return store_clips(clips, store, until=until)
+    finally:
+        clips.close()
 
 
 @dataclass
@@ -169,7 +209,7 @@ def prepares_turbulence(device: torch.device) -> bool:
 
 
 def _draw_clips(
-    source: Pipeline, indices: list[int], workers: int, device: torch.device
+    source: Pipeline, indices: Sequence[int], workers: int, device: torch.device
 ) -> Generator[tuple[int, ClipParameters, dict[str, Any]]]:
     """Yield clips in order with draw and metadata; the `workers` processes that draw them end with
     the generator.

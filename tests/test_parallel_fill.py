@@ -20,8 +20,10 @@ from scripts.lease import fill as lease_fill
 from scripts.lease.plan import Fill
 from scripts.lease.probe import Device, Trial
 from scripts.parallel_fill import FillReport, fill
-from src.sim.pipeline import Pipeline
-from src.training.clip_cache import CachedClip, DeviceClipCache
+from src.sim.optics import Optics
+from src.sim.pipeline import Pipeline, crop_frames
+from src.sim.sensor import EventSensor
+from src.training.clip_cache import CachedClip, CachedPipeline, DeviceClipCache
 from src.training.disk_cache import DiskClipCache
 from tests.faults.harness import FORKS
 from tests.training.cache_sources import Broken, Growing, Other, Telling, source
@@ -153,31 +155,64 @@ def test_stopped_from_outside_all_end(how, tmp_path):
     until(lambda: not any(map(runs, drawing)))
 
 
+def lease_cache() -> DeviceClipCache:
+    return DeviceClipCache(source(), device="cpu", clips=3, frames=7, gib=1.0)
+
+
+def fill_for_lease(cache: DeviceClipCache, workers: int, log=print) -> dict[str, float]:
+    plan = Fill(minutes=0.5 if workers else 0.05, clips=7, warn_below_clips=1, workers=workers)
+    device = Device("cpu", "a CPU", 2**33, False, False)
+    return lease_fill.fill_caches([cache], plan, device, Trial(2), log)[0]
+
+
 @pytest.mark.parametrize("dies", [False, True])
 def test_where_processes_make_no_clip_the_lease_draws_itself(dies, monkeypatch):
     tried, said = [], []
 
-    def fill_with(source, clips, store, *, device, workers, until) -> FillReport:
-        tried.append(workers)
-        if workers and dies:
+    def store_clips(clips, store, **_) -> FillReport:
+        tried.append(clips.workers)
+        if clips.workers and dies:
             raise RuntimeError("waiting for clip 0: a process died")
-        return FillReport(clips=0 if workers else 3, seconds=1.0, waiting_s=0.0)
+        return FillReport(clips=0 if clips.workers else 2, seconds=1.0, waiting_s=0.0)
 
-    monkeypatch.setattr(lease_fill, "fill", fill_with)
-    cache = DeviceClipCache(source(), device="cpu", clips=7, frames=7, gib=1.0)
-    plan = Fill(minutes=0.01, clips=7, warn_below_clips=1, workers=4)
-    device = Device("cpu", "a CPU", 2**33, False, False)
-    (report,) = lease_fill.fill_caches([cache], plan, device, Trial(2), said.append)
-    assert tried == [4, 0] and cache.clips == report["clips"] == 3
-    assert said[dies].startswith("cache: no clip by 4 processes in 1 s")
+    def simulated_clips(*_, workers, **__) -> SimpleNamespace:
+        return SimpleNamespace(workers=workers, close=lambda: None)
+
+    monkeypatch.setattr(lease_fill, "store_clips", store_clips)
+    monkeypatch.setattr(lease_fill, "SimulatedClips", simulated_clips)
+    report = fill_for_lease(cache := lease_cache(), 4, said.append)
+    assert tried == [4, 0] and cache.clips == report["clips"] == 2
+    assert said[dies].startswith("cache: no clip by 4 processes in 30 s")
 
 
 def test_a_clip_that_fails_in_the_lease_itself_is_named(monkeypatch):
     def fails(*_, **__):
         raise RuntimeError("clip 3: no light")
 
-    monkeypatch.setattr(lease_fill, "fill", fails)
-    cache = DeviceClipCache(source(), device="cpu", clips=7, frames=7, gib=1.0)
-    plan = Fill(minutes=0.01, clips=7, warn_below_clips=1, workers=0)
+    monkeypatch.setattr(lease_fill, "store_clips", fails)
     with pytest.raises(RuntimeError, match="clip 3: no light"):
-        lease_fill.fill_caches([cache], plan, Device("cpu", "", 0, False, False), Trial(2), print)
+        fill_for_lease(lease_cache(), 0)
+
+
+def test_a_lease_renews_its_clips_the_oldest_first(imported):
+    said, cache = [], lease_cache()
+    assert fill_for_lease(cache, 1, said.append)["clips"] == 3
+    draws = [CachedPipeline(cache, Optics(9), EventSensor(), windows=4, crop=8).draw(0)]
+    expected = cache.source.draw
+    for later in range(3, 7):
+        cache.read_views(draws, "cpu")
+        clean = crop_frames(expected(later).clip.frames, expected(later).crop).half()
+        assert torch.equal(cache.clip(later % 3).clean, clean)
+    cache.clear()
+    assert said[-1].startswith("cache: 4 clips renewed")
+    until(nobody_draws)
+
+
+def test_a_clip_that_fails_later_ends_the_renewal_but_not_the_training(imported):
+    said: list[str] = []
+    cache = DeviceClipCache(source(Broken(False)), device="cpu", clips=2, frames=7, gib=1.0)
+    fill_for_lease(cache, 1, said.append)
+    draws = [CachedPipeline(cache, Optics(9), EventSensor(), windows=4, crop=8).draw(0)]
+    before = cache.read_views(draws, "cpu")
+    assert torch.equal(cache.read_views(draws, "cpu"), before)
+    assert "cache: renewed no more: clip 2: scene.root must hold readable photographs" in said[-2]

@@ -2,14 +2,15 @@
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 
 from scripts.lease.plan import Fill
 from scripts.lease.probe import GIB, MEMORY_FACTOR, UNUSED_GIB, Device, Trial, free_memory
-from scripts.parallel_fill import FillReport, fill
-from src.training.clip_cache import DeviceClipCache
+from scripts.parallel_fill import FillReport, SimulatedClips, store_clips
+from src.training.clip_cache import CachedClip, DeviceClipCache
 
 MAX_WORKERS = 15
+ENDLESS = range(2**31)  # numbers of clips
 
 
 def fill_caches(
@@ -40,30 +41,55 @@ def fill_caches(
 def _fill_cache(
     cache: DeviceClipCache, plan: Fill, device: str, seconds: float, log: Callable
 ) -> dict[str, float]:
-    """Fill `cache` for `seconds`; where the processes that draw made no clip in this time (their
-    imports may take longer) or died, this one draws for as long again.
+    """Fill `cache` for `seconds`; those who draw go on to renew it while it is trained on.
+
+    Where the processes that draw made no clip in this time (their imports may take longer) or died,
+    this one draws for as long again, and nothing is renewed.
     """
-
-    def fill_with(workers: int) -> FillReport:
-        until = time.monotonic() + seconds
-        clips = range(cache.clips)
-        return fill(cache.source, clips, cache.store, device=device, workers=workers, until=until)
-
     most = max(1, min(MAX_WORKERS, (os.cpu_count() or 1) - 1))
     workers = most if plan.workers is None else plan.workers
+
+    def fill_with(workers: int) -> tuple[SimulatedClips, FillReport]:
+        clips = SimulatedClips(cache.source, ENDLESS, device=device, workers=workers)
+        until = time.monotonic() + seconds
+        try:
+            return clips, store_clips(clips, cache.store, count=cache.clips, until=until)
+        except BaseException:
+            clips.close()
+            raise
+
     try:
-        report = fill_with(workers)
+        clips, report = fill_with(workers)
     except RuntimeError as error:
         if not workers:
             raise
         log(f"cache: {error}")
         report = FillReport(clips=0, seconds=0.0, waiting_s=0.0)
+    else:
+        if workers and report.clips and plan.renews:
+            cache.renew(_renewing(clips, log))
+        else:
+            clips.close()
     if workers and not report.clips:
         log(f"cache: no clip by {workers} processes in {seconds:.0f} s; this one draws now")
-        report = fill_with(0)
+        clips, report = fill_with(0)
+        clips.close()
     if not report.clips:
         raise ValueError(f"fill: minutes must be > {plan.minutes:g}: no clip was made")
     cache.clips = report.clips
     few = f"; less than fill: warn_below_clips = {plan.warn_below_clips}"
     log(f"cache: {report}{few * (report.clips < plan.warn_below_clips)}")
     return {"clips": report.clips, "clips_per_second": report.clips_per_second}
+
+
+def _renewing(clips: SimulatedClips, log: Callable) -> Generator[CachedClip]:
+    """Yield `clips` until one fails, which is reported; a training goes on without new ones."""
+    renewed = 0
+    try:
+        for renewed, (_, clip) in enumerate(clips, 1):  # noqa: B007
+            yield clip
+    except (RuntimeError, ValueError) as error:
+        log(f"cache: renewed no more: {error}")
+    finally:
+        clips.close()
+        log(f"cache: {renewed} clips renewed, {clips.waiting_s:.1f} s in all waiting for draws")

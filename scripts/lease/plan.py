@@ -47,13 +47,15 @@ class Network:
 class Fill:
     """How long each pre-simulated cache is filled, the clips it is filled with at most, those with
     which training is worth while, and the processes that draw scenes (None: as many as there are
-    cores but one, 15 at most; 0: none beside this one).
+    cores but one, 15 at most; 0: none beside this one).  `renews`: with every batch that is
+    simulated, a new clip of these processes takes the place of the oldest.
     """
 
     minutes: float = MISSING
     clips: int = MISSING
     warn_below_clips: int = 16
     workers: int | None = None
+    renews: bool = True
 
     def __post_init__(self) -> None:
         _check(self.minutes > 0, "fill: minutes", "> 0", self)

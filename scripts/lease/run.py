@@ -71,6 +71,8 @@ class Lease:
             except Exception as error:  # whatever becomes of one, the others are trained
                 traceback.print_exc()
                 self._note_unfinished(one.name, _in_one_line(error))
+        for cache in self.filled:
+            cache.clear()  # ends those who draw
         self._export_tables()
         self.exports.close()
         return self._exit_code()
@@ -153,6 +155,7 @@ class Lease:
                 "trained": module.global_step,
                 "windows": module.windows_seen,
                 "generation": generation,
+                "cuda_graphs": len(module.graphs.graphs) if module.graphs else 0,
             }
             self._export_tables()
         self.log(

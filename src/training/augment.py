@@ -30,7 +30,8 @@ class Augment:
     `pause_probability_when_running`, `.._when_paused`: that the next window has no events.
     `flip_probability`: for each axis.  The views of a grid change places with their images.
     `view_shift_probability`: of a view to be shifted by up to `max_view_shift_px` whole pixels in
-    each axis.  `batch_view_dropout_probability`: of a batch to lose views, see draw_kept_views.
+    each axis.  `batch_view_dropout_probability`: of a batch to lose views,
+    `batch_centre_view_probability`: of a batch to have the centre view alone, see draw_kept_views.
     """
 
     noise_std: float = 0.4
@@ -42,6 +43,7 @@ class Augment:
     view_shift_probability: float = 0.0
     max_view_shift_px: int = 2
     batch_view_dropout_probability: float = 0.0
+    batch_centre_view_probability: float = 0.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -61,8 +63,8 @@ class Augment:
         first = samples[0]
         windows, views, *grid = first.voxels.shape[1:]
         positions = first.positions or layout(views)
-        dropout = self.batch_view_dropout_probability, noise.key(keys[0], "dropped")
-        kept = draw_kept_views(positions, *dropout)
+        chances = self.batch_view_dropout_probability, self.batch_centre_view_probability
+        kept = draw_kept_views(positions, *chances, noise.key(keys[0], "dropped"))
         transforms = [self._draw_transform(key, windows, positions, kept) for key in keys]
         voxels = allocate_float32((len(keys), windows, len(kept), *grid), first.voxels.device)
         if voxels.device.type != "cpu" if batched is None else batched:
@@ -154,14 +156,17 @@ def draw_view_shifts(
 
 
 def draw_kept_views(
-    positions: Sequence[Position], batch_dropout_probability: float, key: int
+    positions: Sequence[Position], loss_probability: float, centre_probability: float, key: int
 ) -> list[int]:
-    """Return which of the views at `positions` a batch has: with `batch_dropout_probability` it
-    loses some.  Few are left more often than many; one alone is the centre view.
+    """Return which of the views at `positions` a batch has: with `centre_probability` the centre
+    view alone, else with `loss_probability` some.  Few are left more often than many; one alone is
+    the centre view.
     """
     views = len(positions)
     chance, share, *order = noise.uniforms(key, 2 + views)
-    if chance >= batch_dropout_probability or views == 1:
+    if chance >= 1 - centre_probability and views > 1:
+        return [most_central_view_index(positions)]
+    if chance >= loss_probability * (1 - centre_probability) or views == 1:
         return list(range(views))
     count = 1 + int(share**2 * (views - 1))
     if count == 1:

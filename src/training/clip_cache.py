@@ -6,7 +6,7 @@ function of the config and of i, so it does not matter which process simulates i
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
@@ -98,6 +98,7 @@ class DeviceClipCache(ClipCache):
 
     def clear(self) -> None:
         """Give the memory back; all clips are missing again."""
+        self.renew(iter(()))
         self.metadata: dict[int, dict[str, Any]] = {}
         self.views = self.clean = torch.empty(0)
 
@@ -113,6 +114,19 @@ class DeviceClipCache(ClipCache):
         self.views[index].copy_(clip.views)
         self.clean[index].copy_(clip.clean)
         self.metadata[index] = dict(clip.metadata)
+
+    def renew(self, clips: Iterator[CachedClip]) -> None:
+        """Let the next of `clips` take the place of the oldest, each time that views are read."""
+        self.new_clips, self.renewed = clips, 0
+
+    def read_views(
+        self, draws: Sequence[CachedDraw], device: torch.device | str
+    ) -> Float[Tensor, "n views frames h w"]:
+        views = super().read_views(draws, device)
+        if (clip := next(self.new_clips, None)) is not None:
+            self.store(self.renewed % self.clips, clip)
+            self.renewed += 1
+        return views
 
     def clip(self, index: int) -> CachedClip:
         if not self.has(index):

@@ -37,7 +37,7 @@ class GraphedUnroll:
     output windows operator by operator, those that follow as a CUDA graph.
 
     At most MAX_GRAPHS are made, all of one pool of memory.  The first time that a graph cannot be
-    made, runs out of memory or gives other frames, graphs are disabled, and one line is printed.
+    made, runs out of memory or gives other frames, one line is printed and no more are made.
     """
 
     def __init__(self, network: EventToVideoNetwork):
@@ -45,7 +45,7 @@ class GraphedUnroll:
         self.seen: set[tuple] = set()
         self.graphs: dict[tuple, Callable] = {}
         self.pool: Any = None
-        self.disabled = False
+        self.is_full = False
 
     def __call__(
         self, voxels: Tensor, window_s: Tensor, positions: Sequence | None, outputs: Sequence[int]
@@ -56,16 +56,17 @@ class GraphedUnroll:
         if name in self.graphs:
             return self.graphs[name](voxels, window_s)
         plain = UnrolledNetwork(self.network, positions, outputs)
-        if self.disabled or name not in self.seen or len(self.graphs) >= MAX_GRAPHS:
+        if self.is_full or name not in self.seen or len(self.graphs) >= MAX_GRAPHS:
             self.seen.add(name)
             return plain(voxels, window_s)
         try:
             with CAPTURE_LOCK:
                 graph = self._capture(plain, voxels, window_s)
         except Exception as error:  # whatever a driver, a kernel or the memory says
-            self.disabled, self.graphs = True, {}
+            self.is_full = True
             torch.cuda.empty_cache()
-            print(f"cuda_graphs: none, operators one by one: {' '.join(str(error).split())}")
+            made, why = len(self.graphs) or "none", " ".join(str(error).split())
+            print(f"cuda_graphs: {made}, other batches operator by operator: {why}")
             return plain(voxels, window_s)
         self.graphs[name] = graph
         return graph(voxels, window_s)

@@ -214,7 +214,11 @@ def test_dropped_views_take_their_positions_along_and_some_view_stays():
         counts[len(kept)] += 1
         assert len(kept) > 1 or kept == [1]
     assert set(counts) == {1, 2, 3} and counts[1] > counts[2] > counts[3]
-    assert draw_kept_views(places, 0.0, 1) == [0, 1, 2, 3]
+    assert draw_kept_views(places, 0.0, 0.0, 1) == [0, 1, 2, 3]
+    drawn = [draw_kept_views(places, 0.5, 0.25, key) for key in range(800)]
+    assert 330 < drawn.count([1]) < 415  # of 800 * (0.25 + 0.75 * 0.5 * 0.577)
+    assert 250 < drawn.count([0, 1, 2, 3]) < 350  # of 800 * (1 - 0.25) * (1 - 0.5)
+    assert all(draw_kept_views(places, 0.0, 1.0, key) == [1] for key in range(20))
 
 
 def test_a_view_that_stays_shows_the_picture_of_its_turned_place():
@@ -238,6 +242,7 @@ def test_a_view_that_stays_shows_the_picture_of_its_turned_place():
         {"view_shift_probability": 2},
         {"max_view_shift_px": -1},
         {"batch_view_dropout_probability": 1.5},
+        {"batch_centre_view_probability": 1.5},
         {"max_firing_pixel_fraction": -1},
     ],
 )

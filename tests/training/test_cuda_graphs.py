@@ -53,8 +53,22 @@ def test_where_no_graph_can_be_made_the_training_goes_on_and_says_so(monkeypatch
     ours = unrolled(network, monkeypatch, capture)
     plain = unroll(network, batch()[0], output_windows=[2])[0]
     assert all(torch.equal(ours(*batch(), None, [2]), plain) for _ in range(4))
-    line = "cuda_graphs: none, operators one by one: CUDA error: operation not permitted\n"
+    why = "CUDA error: operation not permitted"
+    line = f"cuda_graphs: none, other batches operator by operator: {why}\n"
     assert capsys.readouterr().out == line
+
+
+def test_graphs_that_were_made_stay_where_the_memory_holds_no_other(monkeypatch, capsys):
+    def capture(plain: UnrolledNetwork, *_):
+        if plain.output_windows == [1]:
+            raise torch.OutOfMemoryError("CUDA out of memory.\n Tried to allocate")
+        return plain
+
+    ours = unrolled(Leaky(), monkeypatch, capture)
+    for shown in ([0], [0], [1], [1], [2], [2]):
+        ours(*batch(), None, shown)
+    assert [name[-1] for name in ours.graphs] == [(0,)]
+    assert capsys.readouterr().out.startswith("cuda_graphs: 1, other batches operator by operator:")
 
 
 def test_there_are_no_more_graphs_than_asked_for(monkeypatch):
