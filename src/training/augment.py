@@ -156,17 +156,17 @@ def draw_view_shifts(
 
 
 def draw_kept_views(
-    positions: Sequence[Position], loss_probability: float, centre_probability: float, key: int
+    positions: Sequence[Position], drop_probability: float, centre_probability: float, key: int
 ) -> list[int]:
     """Return which of the views at `positions` a batch has: with `centre_probability` the centre
-    view alone, else with `loss_probability` some.  Few are left more often than many; one alone is
+    view alone, else with `drop_probability` some.  Few are left more often than many; one alone is
     the centre view.
     """
     views = len(positions)
     chance, share, *order = noise.uniforms(key, 2 + views)
     if chance >= 1 - centre_probability and views > 1:
         return [most_central_view_index(positions)]
-    if chance >= loss_probability * (1 - centre_probability) or views == 1:
+    if chance >= drop_probability * (1 - centre_probability) or views == 1:
         return list(range(views))
     count = 1 + int(share**2 * (views - 1))
     if count == 1:
