@@ -67,7 +67,7 @@ def _fill_cache(
         report = FillReport(clips=0, seconds=0.0, waiting_s=0.0)
     else:
         if workers and report.clips and plan.renews:
-            cache.renew(_renewing(clips, log))
+            cache.renew_from(_renewing(clips, log))
         else:
             clips.close()
     if workers and not report.clips:

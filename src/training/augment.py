@@ -164,11 +164,12 @@ def draw_kept_views(
     """
     views = len(positions)
     chance, share, *order = noise.uniforms(key, 2 + views)
-    if chance >= 1 - centre_probability and views > 1:
-        return [most_central_view_index(positions)]
-    if chance >= drop_probability * (1 - centre_probability) or views == 1:
-        return list(range(views))
-    count = 1 + int(share**2 * (views - 1))
+    if chance >= 1 - centre_probability:
+        count = 1
+    elif chance >= drop_probability * (1 - centre_probability):
+        count = views
+    else:
+        count = 1 + int(share**2 * (views - 1))
     if count == 1:
         return [most_central_view_index(positions)]
     return sorted(sorted(range(views), key=order.__getitem__)[:count])

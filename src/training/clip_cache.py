@@ -98,7 +98,7 @@ class DeviceClipCache(ClipCache):
 
     def clear(self) -> None:
         """Give the memory back; all clips are missing again."""
-        self.renew(iter(()))
+        self.renew_from(iter(()))
         self.metadata: dict[int, dict[str, Any]] = {}
         self.views = self.clean = torch.empty(0)
 
@@ -115,7 +115,7 @@ class DeviceClipCache(ClipCache):
         self.clean[index].copy_(clip.clean)
         self.metadata[index] = dict(clip.metadata)
 
-    def renew(self, clips: Iterator[CachedClip]) -> None:
+    def renew_from(self, clips: Iterator[CachedClip]) -> None:
         """Let the next of `clips` take the place of the oldest, each time that views are read."""
         self.new_clips, self.renewed = clips, 0
 

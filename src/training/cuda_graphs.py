@@ -45,7 +45,7 @@ class GraphedUnroll:
         self.seen: set[tuple] = set()
         self.graphs: dict[tuple, Callable] = {}
         self.pool: Any = None
-        self.is_full = False
+        self.max_graphs = MAX_GRAPHS
 
     def __call__(
         self, voxels: Tensor, window_s: Tensor, positions: Sequence | None, outputs: Sequence[int]
@@ -56,16 +56,16 @@ class GraphedUnroll:
         if name in self.graphs:
             return self.graphs[name](voxels, window_s)
         plain = UnrolledNetwork(self.network, positions, outputs)
-        if self.is_full or name not in self.seen or len(self.graphs) >= MAX_GRAPHS:
+        if name not in self.seen or len(self.graphs) >= self.max_graphs:
             self.seen.add(name)
             return plain(voxels, window_s)
         try:
             with CAPTURE_LOCK:
                 graph = self._capture(plain, voxels, window_s)
         except Exception as error:  # whatever a driver, a kernel or the memory says
-            self.is_full = True
+            self.max_graphs = len(self.graphs)
             torch.cuda.empty_cache()
-            made, why = len(self.graphs) or "none", " ".join(str(error).split())
+            made, why = self.max_graphs or "none", " ".join(str(error).split())
             print(f"cuda_graphs: {made}, other batches operator by operator: {why}")
             return plain(voxels, window_s)
         self.graphs[name] = graph
