@@ -3,9 +3,9 @@
 Made anew: docs/figures/nine_views.webp, and the sections between the marks `report:...` of README,
 docs/tables.md and docs/results.md: scores of test clips of the photographs in PHOTOS
 (data=test_photos), each simulated once for all networks, beside the published ones whose weights
-are in `--published`; of data=test_footage, with `--footage`, a still scene through air; and of
-sensors with random faults (sensor=randomized).  Without PHOTOS only the film.  The cards are given
-the scores, too, and those of data=test_targets.
+are in `--published`, without which their rows stay as they are; of data=test_footage, with
+`--footage`, a still scene through air; and of sensors with random faults (sensor=randomized).
+Without PHOTOS only the film.  The cards are given the scores, too, and those of data=test_targets.
 """
 
 import argparse
@@ -145,14 +145,19 @@ def score_clips_into_metrics(
     return values
 
 
-def format_table(values: dict[str, list[dict[str, float]]], table: Table) -> str:
-    """Return what `table` says of the scores `values` as Markdown, without rows not in them."""
+def format_table(values: dict[str, list[dict[str, float]]], table: Table, before: str = "") -> str:
+    """Return what `table` says of the scores `values` as Markdown, without rows not in them but for
+    those of published networks in the document as it was `before`.
+    """
+    kept = {line.split(" | ")[0].strip("| "): line for line in before.splitlines()}
     columns = [metric for metric in METRICS if metric.name in table.metrics]
     heads = [metric.title for metric in columns]
     lines = ["| | " + " | ".join(heads) + " |", "|---|" + "---|" * len(heads)]
     for row in table.rows:
         if row in values:
             lines.append(f"| {row} | " + " | ".join(format_means(values[row], columns)) + " |")
+        elif row in OTHERS and row in kept:
+            lines.append(kept[row])
     for name, (first, second) in table.pairs.items():
         if {first, second} <= set(values):
             pairs = list(zip(values[first], values[second], strict=True))
@@ -252,7 +257,9 @@ def main() -> None:
             {row: network for row, network in rows.items() if row in shown},
         )
         for table in TABLES[protocol]:
-            replace_section(HOME / table.document, table.section, format_table(values, table))
+            document = HOME / table.document
+            text = format_table(values, table, document.read_text())
+            replace_section(document, table.section, text)
         for name, row in cards.items():
             update_card(files.WEIGHTS / f"{name}.md", protocol, commit, values[row])
 

@@ -5,6 +5,7 @@ PSNR, and how many views SetNet needs.  [--out FILE]
 """
 
 import argparse
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -61,15 +62,18 @@ def count_views_needed(grouped: RunsBySetting) -> Cells:
 
 
 def draw_maps(path: Path, maps: Mapping[str, Cells]) -> Path:
-    """Draw a panel for each of `maps`, purple below zero and orange above; cells without a value
-    are grey.
+    """Draw a panel for each of `maps`, two side by side, purple below zero and orange above; cells
+    without a value are grey.
     """
     settings = {setting for cells in maps.values() for setting in cells}
     halves, spreads = (sorted({setting[axis] for setting in settings}) for axis in (0, 1))
-    figure = Figure(figsize=(0.6 + 0.9 * len(halves) * len(maps), 1.5 + 0.6 * len(spreads)),
-                    layout="constrained")  # fmt: skip
-    panels = figure.subplots(1, len(maps), squeeze=False)[0]
-    for axes, (title, cells) in zip(panels, maps.items(), strict=True):
+    rows = math.ceil(len(maps) / 2)
+    size = 0.6 + 1.5 * len(halves), 0.5 + (0.7 + 0.4 * len(spreads)) * rows
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(rows, 2, squeeze=False).flatten()
+    for axes in panels[len(maps) :]:
+        axes.set_axis_off()
+    for axes, (title, cells) in zip(panels, maps.items(), strict=False):
         values = np.full((len(spreads), len(halves)), np.nan)
         for (half, spread), (value, text) in cells.items():
             column, row = halves.index(half), spreads.index(spread)

@@ -101,6 +101,19 @@ def test_scores_take_the_place_of_older_ones_on_a_card(tmp_path):
     assert rows[2:] == ["", "In brackets: the interval."]
 
 
+def test_rows_of_published_networks_that_are_not_scored_again_stay():
+    table = readme.Table("README.md", "results", (readme.PAPER, readme.FIRENET, readme.LITE), {})
+    scored = [{metric.name: 0.5 for metric in METRICS}]
+    before = f"| {readme.PAPER} | 0.4 |\n| {readme.FIRENET} | 0.3 |\n"
+    rows = readme.format_table({readme.PAPER: scored}, table, before).splitlines()[2:]
+    assert rows[0].startswith(f"| {readme.PAPER} | 0.5") and rows[1:3] == [
+        before.splitlines()[1],
+        "",
+    ]
+    rows = readme.format_table({readme.FIRENET: scored}, table, before).splitlines()[2:]
+    assert rows[0].startswith(f"| {readme.FIRENET} | 0.5") and rows[1] == ""
+
+
 def test_the_turbulence_map_shows_where_more_views_help(tmp_path):
     def run(name: str, half: float, spread: float, lpips: list[float]) -> Run:
         settings = {turbulence_map.ATMOSPHERE + ".tilt_correlation_half_length_px": [half, half]}

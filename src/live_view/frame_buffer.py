@@ -20,6 +20,7 @@ MAX_FRAMES = 600  # columns of a slice: a second at 600 fps
 GREY_QUALITY, COLOUR_QUALITY = 88, 80  # of JPEG; coloured dots need less and cost most
 MAX_SIDE = 264  # longer side in pixels of all views side by side, which take turns with the rest
 BACKGROUND, OFF, ON = (24, 21, 19), (255, 150, 70), (90, 190, 255)
+BORDER = (90, 90, 90)  # between views
 FULL_COLOUR = 2  # events at a pixel that are drawn at full colour
 _SHARE = np.abs(np.linspace(-1, 1, 2 * FULL_COLOUR + 1))[:, None] ** 0.6
 _ENDS = np.array([OFF] * FULL_COLOUR + [BACKGROUND] + [ON] * FULL_COLOUR)
@@ -125,17 +126,22 @@ def draw_events(counts: Int[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
 def tile_views(
     counts: Int[np.ndarray, "views h w"], positions: Sequence[Position]
 ) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Return the events of all views where they stand in the light field, made small."""
+    """Return the events of all views where they stand in the light field, made small, a line of one
+    pixel between them.
+    """
     rows, columns = (sorted({place[axis] for place in positions}) for axis in (0, 1))
     _, height, width = counts.shape
-    whole = np.zeros((len(rows) * height, len(columns) * width), counts.dtype)
-    for view, (row, column) in zip(counts, positions, strict=True):
-        top, left = rows.index(row) * height, columns.index(column) * width
-        whole[top : top + height, left : left + width] = view
-    shrink = max(1, -(-max(whole.shape) // MAX_SIDE))
-    rows_kept, columns_kept = (side // shrink for side in whole.shape)
-    kept = whole[: rows_kept * shrink, : columns_kept * shrink]
-    return draw_events(kept.reshape(rows_kept, shrink, columns_kept, shrink).sum((1, 3)))
+    shrink = max(1, -(-max(len(rows) * height, len(columns) * width) // MAX_SIDE))
+    high, wide = height // shrink, width // shrink
+    kept = counts[:, : high * shrink, : wide * shrink]
+    small = kept.reshape(-1, high, shrink, wide, shrink).sum((2, 4))
+    whole = np.zeros((len(rows) * high, len(columns) * wide), counts.dtype)
+    for view, (row, column) in zip(small, positions, strict=True):
+        top, left = rows.index(row) * high, columns.index(column) * wide
+        whole[top : top + high, left : left + wide] = view
+    drawn = draw_events(whole)
+    drawn[high::high] = drawn[:, wide::wide] = BORDER
+    return drawn
 
 
 def encode_jpeg(picture: UInt8[np.ndarray, "..."]) -> bytes:

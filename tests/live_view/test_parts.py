@@ -278,9 +278,11 @@ def test_events_are_drawn_in_two_colours_and_views_where_they_stand():
     assert (drawn[:10] == frame_buffer.ON).all() and (drawn[10:] == frame_buffer.BACKGROUND).all()
     whole = frame_buffer.tile_views(counts, list(layout(9)))
     assert whole.shape == (60, 60, 3)
-    assert (whole[:20, :20] == frame_buffer.OFF).all() and (
-        whole[20:30, 20:40] == frame_buffer.ON
-    ).all()
+    assert (whole[:20, :20] == frame_buffer.OFF).all()
+    assert (whole[21:30, 21:40] == frame_buffer.ON).all()
+    for line in (whole[20], whole[40], whole[:, 20], whole[:, 40]):
+        assert (line == frame_buffer.BORDER).all()
+    assert (whole != frame_buffer.BORDER).any(-1).sum() == 60**2 - 4 * 60 + 4
     assert max(frame_buffer.tile_views(np.zeros((9, 176, 176), np.int32), layout(9)).shape) <= 264
 
 
