@@ -12,11 +12,14 @@ from src.app.path_overrides import unquote_override
 from src.records import results, runs
 from src.reports import page, run_groups, tables, writers
 
+SCORES = "Scores and cost"
+
 
 def report(cfg: DictConfig) -> list[tables.Table]:
     """Write `report.md`, `.csv` and `.html` of the runs below `cfg.run`; return the tables.
 
-    With `into`, the Markdown also replaces that file's section of the same title.
+    With `columns` the Markdown has these of the scores and no other table.  With `into` it also
+    replaces that file's section of the same title.
     """
     folders, out = _list_folders(cfg.run), Path(cfg.paths.run)
     found, plans = runs.find_runs(folders), list(map(_as_typed, runs.find_sweeps(folders)))
@@ -32,7 +35,7 @@ def report(cfg: DictConfig) -> list[tables.Table]:
         keys, made = run_groups.group_runs(own, planned, tuple(cfg.across))
         of = f": {name}" if name and len(sweeps) > 1 else ""
         candidates += [
-            tables.build_score_table(f"Scores and cost{of}", keys, made, published),
+            tables.build_score_table(f"{SCORES}{of}", keys, made, published),
             tables.build_severity_table(f"Scores by severity{of}", keys, made),
             tables.build_reference_methods_table(f"On the same clips{of}", keys, made),
         ]
@@ -43,7 +46,11 @@ def report(cfg: DictConfig) -> list[tables.Table]:
         candidates.append(tables.build_difference_table(title_of, found, theirs, published))
     shown = [table for table in candidates if table and table.rows]
     commands, figures = [plan.command for plan in plans], runs.find_charts_and_stress_maps(folders)
-    text = writers.format_markdown(shown, commands)
+    printed = shown
+    if cfg.columns is not None:
+        scores = [table for table in shown if table.title.startswith(SCORES)]
+        printed = [tables.select_columns(table, cfg.columns) for table in scores]
+    text = writers.format_markdown(printed, commands)
     results.create_run_folder(out, entry_point.resolved_yaml(cfg))
     results.write_text(out / "report.md", text)
     results.write_text(out / "report.csv", writers.format_csv_tables(shown))

@@ -120,7 +120,8 @@ def _label_values(run: Run, overridden: Sequence[str], across: Sequence[str]) ->
         first |= {key: ", ".join(inside)} if inside else {}
     order = {key: place for place, key in enumerate(FIRST_KEYS)}
     first = dict(sorted(first.items(), key=lambda item: order.get(item[0], len(order))))
-    return first | {k: v for k, v in run.choices.items() if k in LAST_KEYS} | settings
+    last = {k: v for k, v in run.choices.items() if k in LAST_KEYS}
+    return first | last | {k: v for k, v in settings.items() if k not in first}
 
 
 def _distinguishing_keys(rows: Sequence[dict[str, str]]) -> tuple[str, ...]:

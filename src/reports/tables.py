@@ -5,7 +5,7 @@ of two sets of runs.
 import math
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from src.metrics.bootstrap import bootstrap_difference_interval
@@ -19,11 +19,15 @@ SPLIT_METRICS = ("lpips", "psnr_aligned", "temporal_jitter_px")  # of the table 
 
 @dataclass(frozen=True)
 class TableCell:
-    """A mean over seeds with its sample standard deviation, None for one seed; or a text."""
+    """A mean over seeds with its sample standard deviation, None for one seed; or a text.
+
+    `published`: a published value, which stands in parentheses.
+    """
 
     mean: float | None = None
     std: float | None = None
     text: str = ""
+    published: float | None = None
 
 
 @dataclass
@@ -97,6 +101,36 @@ def build_score_table(
         table.add_row(group, [*cells, TableCell(text=count), *published_cells])
     table.note = _describe_measurement(groups)
     return table
+
+
+def select_columns(table: Table, names: Sequence[str]) -> Table:
+    """Return the labels and the columns `names` of a score table, such as lpips, published values
+    in parentheses; rows with the same first labels stand together.
+
+    Raises ValueError for a column that is not there.
+    """
+    places = {column.name: place for place, column in enumerate(table.columns)}
+    scores = [name for name in places if places[name] >= table.labels and "paper_" not in name]
+    for name in names:
+        if name not in scores:
+            raise ValueError(f"columns must be of {', '.join(scores)}, got {name}")
+    chosen = [places[name] for name in names]
+    heads = [*table.columns[: table.labels], *(table.columns[place] for place in chosen)]
+    has_cost = any(column.name in names for column, _ in COSTS)
+    note = table.note if has_cost else _describe_measurement(table.groups, with_cost=False)
+    made = Table(table.title, heads, [], table.labels, note)
+    seen: list[dict[str, int]] = [{} for _ in range(table.labels)]
+    order = []
+    for number, group in enumerate(table.groups):
+        turns = zip(seen, group.label, strict=True)
+        order.append(([among.setdefault(label, len(among)) for among, label in turns], number))
+    for _, number in sorted(order):
+        row = table.rows[number]
+        theirs = [row[places[key]].mean if (key := f"paper_{n}") in places else None for n in names]
+        pairs = zip(chosen, theirs, strict=True)
+        cells = [replace(row[place], published=value) for place, value in pairs]
+        made.add_row(table.groups[number], cells)
+    return made
 
 
 def build_severity_table(
@@ -188,8 +222,8 @@ def _score(
     return measure
 
 
-def _describe_measurement(groups: Sequence[RunGroup]) -> str:
-    """Say how many clips there were, and at what size and on what a frame was timed."""
+def _describe_measurement(groups: Sequence[RunGroup], with_cost: bool = True) -> str:
+    """Say how many clips there were and, `with_cost`, at what size and where a frame was timed."""
     runs = [run for group in groups for run in group.runs]
     if not runs:
         return ""
@@ -205,7 +239,7 @@ def _describe_measurement(groups: Sequence[RunGroup]) -> str:
         unlike += f" {older} older runs of the same seeds are left out."
     if len({group.test_conditions for group in groups if group.runs}) > 1:
         unlike += " Bold: the best of the rows with equal scene, turbulence, sensor and clips."
-    return (
-        f"{clips} test clips; ms and GMAC of one frame of {sizes}; ± is the "
-        f"sample standard deviation over n seeds; {devices}.{unlike}"
-    )
+    cost = f"; ms and GMAC of one frame of {sizes}, {devices}" if with_cost else ""
+    spread = "; ± is the sample standard deviation over n seeds"
+    several = with_cost or any(len(group.runs) > 1 for group in groups)
+    return f"{clips} test clips{cost}{spread if several else ''}.{unlike}"

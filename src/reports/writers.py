@@ -60,13 +60,16 @@ def replace_section(document: Path, name: str, text: str) -> None:
 
 
 def format_cell(cell: TableCell, column: Column) -> str:
-    """Return a cell as people read it: a text, a mean, a mean ± its std, or a dash."""
+    """Return a cell as people read it: a text, a mean, a mean ± its std, or a dash; in parentheses
+    what was published.
+    """
     if cell.text:
         return cell.text
     if cell.mean is None:
         return "-"
     number = f"{cell.mean:,.{column.digits}f}"
-    return number if cell.std is None else f"{number} ± {cell.std:.{column.digits}f}"
+    number += "" if cell.std is None else f" ± {cell.std:.{column.digits}f}"
+    return number + ("" if cell.published is None else f" ({cell.published:.{column.digits}f})")
 
 
 def _format_line(cells: Sequence[str]) -> str:

@@ -92,6 +92,26 @@ def test_the_papers_numbers_stand_in_columns_of_their_own(tmp_path):
     assert "paper_ssim" not in [column.name for column in table.columns]
 
 
+def test_chosen_columns_have_the_papers_numbers_in_parentheses_and_equal_labels_together(tmp_path):
+    order = [("lf3x3", "none"), ("single256", "none"), ("lf3x3", "mambatm")]
+    for number, (name, post) in enumerate(order):
+        chosen = {"postprocess": post}
+        settings = {"postprocess": None if post == "none" else {"frames": 4}}
+        write_run(tmp_path / str(number), name, choices=chosen, settings=settings)
+    table = tables.select_columns(built(tmp_path, PAPER)[0], ["psnr", "ssim"])
+    assert [tuple(cell.text for cell in row[:2]) for row in table.rows] == [
+        ("lf3x3", "none"), ("lf3x3", "mambatm"), ("single256", "none")
+    ]  # fmt: skip
+    text = writers.format_markdown([table])
+    assert (
+        "| lf3x3 | none | 17.00 (15.40) | 0.600 |" in text
+        and "| single256 | none | 17.00 |" in text
+    )
+    assert table.note == "9 test clips."
+    with pytest.raises(ValueError, match="columns must be of lpips, .*, got paper_psnr"):
+        tables.select_columns(built(tmp_path, PAPER)[0], ["paper_psnr"])
+
+
 def test_what_else_was_scored_stands_below_its_network(tmp_path):
     write_run(tmp_path / "a", scores={"ssim": 0.7})
     write_run(tmp_path / "b", "eval", task="eval", scores={"ssim": 0.3}, compared={})
@@ -205,7 +225,8 @@ def test_the_entry_point_writes_three_files_and_the_section(tmp_path):
     write_run(tmp_path / "runs" / "a", clips=clips_of())
     document = tmp_path / "results.md"
     document.write_text("<!-- report:table1 -->\n<!-- end:table1 -->\n")
-    cfg = config("report", tmp_path / "out", f"run={tmp_path / 'runs'}", f"into={document}")
+    overrides = f"run={tmp_path / 'runs'}", f"into={document}"
+    cfg = config("report", tmp_path / "out", *overrides)
     assert [table.title for table in report(cfg)] == [
         "Scores and cost",
         "Scores by severity",
@@ -214,6 +235,9 @@ def test_the_entry_point_writes_three_files_and_the_section(tmp_path):
     written = {file.name for file in (tmp_path / "out").iterdir()}
     assert {"report.md", "report.csv", "report.html"} <= written
     assert "| lf3x3 | **" not in document.read_text() and "| lf3x3 |" in document.read_text()
+    report(config("report", tmp_path / "out2", *overrides, "columns=[lpips]"))
+    assert "LPIPS" in document.read_text() and "SSIM" not in document.read_text()
+    assert "ssim" in (tmp_path / "out2" / "report.csv").read_text()
 
 
 def test_each_sweep_has_tables_headed_by_its_own_settings(tmp_path):
