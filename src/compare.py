@@ -27,6 +27,7 @@ NOTES = {
     "flicker": "change from frame to frame: {:.3f} of the contrast",
     "ssim": "SSIM with the camera: {:.3f}",
     "lpips": "LPIPS: {:.3f}",
+    "lpips_aligned": "LPIPS, brightness and contrast aligned: {:.3f}",
     "correlation": "correlation: {:.3f}",
 }
 

@@ -5,16 +5,18 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from src.metrics.image import ssim
+from src.metrics.image import align_brightness, ssim
 from src.metrics.lpips import LPIPS
 from src.recordings.files import videos
 
+NAMES = ("ssim", "lpips", "lpips_aligned", "correlation")
 SETTLING = 2  # first frames of a reconstruction, which are not looked at
 
 
 def score_against_camera(video: Path, listing: Path) -> dict[str, float]:
-    """Return mean `ssim`, `lpips` and `correlation` of a video of src.reconstruct with a camera's
-    frames, each against the frame nearest in time.
+    """Return the mean scores NAMES of a video of src.reconstruct with a camera's frames, each
+    against the frame nearest in time; `lpips_aligned` is after the best gain and offset of each
+    frame, as events carry neither.
 
     `listing`: a line per picture, seconds and file.  Raises ValueError without the video's
     `frames.csv`, or where no picture falls on a frame.
@@ -34,8 +36,11 @@ def score_against_camera(video: Path, listing: Path) -> dict[str, float]:
             truth = next(videos.read_video(listing.parent / name))
             a, b = (torch.from_numpy(p.copy())[None, None] for p in (film[nearest], truth))
             together = np.corrcoef(film[nearest].ravel(), truth.ravel())[0, 1]
-            scores.append([float(ssim(a, b)), float(lpips(a, b)), float(together)])
+            aligned = align_brightness(a, b).clamp(0, 1)
+            scores.append(
+                [ssim(a, b).item(), lpips(a, b).item(), lpips(aligned, b).item(), together]
+            )
     if not scores:
         wanted = "reference_images must have frames within the video's time"
         raise ValueError(f"{wanted}, {listing} has none")
-    return dict(zip(("ssim", "lpips", "correlation"), np.mean(scores, 0).tolist(), strict=True))
+    return dict(zip(NAMES, np.mean(scores, 0).tolist(), strict=True))
