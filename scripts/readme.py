@@ -58,13 +58,24 @@ BASELINES = {  # their files in the folder of published weights
     "highpass": [],
 }
 FIRENET, LITE = "one view, published FireNet+", "one view, published PIE-Net-Lite"
+CISTA = "one view, published CISTA-TC"
 OTHERS = {
     FIRENET: ("firenet_plus", 1),
-    "one view, published CISTA-TC": ("cista", 1),
+    CISTA: ("cista", 1),
     "one view, published PIE-Net": ("pienet", 1),
     LITE: ("pienet_lite", 1),
 }
-HEADLINE = (LARGE, MEDIUM, SMALL, PAPER, SINGLE, ONE_VIEW, LITE, FIRENET)  # rows of the README
+HEADLINE = (
+    LARGE,
+    MEDIUM,
+    SMALL,
+    PAPER,
+    SINGLE,
+    ONE_VIEW,
+    CISTA,
+    LITE,
+    FIRENET,
+)  # rows of the README
 SCORES = ("lpips", "ssim", "psnr_aligned")  # its columns
 VIEWS = {  # differences, clip by clip: of nine views and one
     "Δ (9 − 1 views), E2VID": (PAPER, ONE_VIEW),

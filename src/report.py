@@ -18,8 +18,8 @@ SCORES = "Scores and cost"
 def report(cfg: DictConfig) -> list[tables.Table]:
     """Write `report.md`, `.csv` and `.html` of the runs below `cfg.run`; return the tables.
 
-    With `columns` the Markdown has these of the scores and no other table.  With `into` it also
-    replaces that file's section of the same title.
+    With `columns` the Markdown has these of the scores, no other table and no command.  With
+    `into` it also replaces that file's section of the same title.
     """
     folders, out = _list_folders(cfg.run), Path(cfg.paths.run)
     found, plans = runs.find_runs(folders), list(map(_as_typed, runs.find_sweeps(folders)))
@@ -46,11 +46,11 @@ def report(cfg: DictConfig) -> list[tables.Table]:
         candidates.append(tables.build_difference_table(title_of, found, theirs, published))
     shown = [table for table in candidates if table and table.rows]
     commands, figures = [plan.command for plan in plans], runs.find_charts_and_stress_maps(folders)
-    printed = shown
+    printed, asked = shown, commands
     if cfg.columns is not None:
         scores = [table for table in shown if table.title.startswith(SCORES)]
-        printed = [tables.select_columns(table, cfg.columns) for table in scores]
-    text = writers.format_markdown(printed, commands)
+        printed, asked = [tables.select_columns(table, cfg.columns) for table in scores], []
+    text = writers.format_markdown(printed, asked)
     results.create_run_folder(out, entry_point.resolved_yaml(cfg))
     results.write_text(out / "report.md", text)
     results.write_text(out / "report.csv", writers.format_csv_tables(shown))

@@ -117,8 +117,9 @@ def select_columns(table: Table, names: Sequence[str]) -> Table:
     chosen = [places[name] for name in names]
     heads = [*table.columns[: table.labels], *(table.columns[place] for place in chosen)]
     has_cost = any(column.name in names for column, _ in COSTS)
+    title = table.title if has_cost else table.title.replace(" and cost", "")
     note = table.note if has_cost else _describe_measurement(table.groups, with_cost=False)
-    made = Table(table.title, heads, [], table.labels, note)
+    made = Table(title, heads, [], table.labels, note)
     seen: list[dict[str, int]] = [{} for _ in range(table.labels)]
     order = []
     for number, group in enumerate(table.groups):
