@@ -3,6 +3,7 @@
 import os
 import time
 from collections.abc import Callable, Generator, Sequence
+from contextlib import ExitStack
 
 from scripts.lease.plan import Fill
 from scripts.lease.probe import GIB, MEMORY_FACTOR, UNUSED_GIB, Device, Trial, free_memory
@@ -49,31 +50,27 @@ def _fill_cache(
     most = max(1, min(MAX_WORKERS, (os.cpu_count() or 1) - 1))
     workers = most if plan.workers is None else plan.workers
 
-    def fill_with(workers: int) -> tuple[SimulatedClips, FillReport]:
+    def fill_with(workers: int) -> FillReport:
         clips = SimulatedClips(cache.source, ENDLESS, device=device, workers=workers)
         until = time.monotonic() + seconds
-        try:
-            return clips, store_clips(clips, cache.store, count=cache.clips, until=until)
-        except BaseException:
-            clips.close()
-            raise
+        with ExitStack() as at_end:
+            at_end.callback(clips.close)
+            report = store_clips(clips, cache.store, count=cache.clips, until=until)
+            if workers and report.clips and plan.renews:
+                cache.renew_from(_renewing(clips, log))
+                at_end.pop_all()
+        return report
 
+    report = FillReport(clips=0, seconds=0.0, waiting_s=0.0)
     try:
-        clips, report = fill_with(workers)
+        report = fill_with(workers)
     except RuntimeError as error:
         if not workers:
             raise
         log(f"cache: {error}")
-        report = FillReport(clips=0, seconds=0.0, waiting_s=0.0)
-    else:
-        if workers and report.clips and plan.renews:
-            cache.renew_from(_renewing(clips, log))
-        else:
-            clips.close()
     if workers and not report.clips:
         log(f"cache: no clip by {workers} processes in {seconds:.0f} s; this one draws now")
-        clips, report = fill_with(0)
-        clips.close()
+        report = fill_with(0)
     if not report.clips:
         raise ValueError(f"fill: minutes must be > {plan.minutes:g}: no clip was made")
     cache.clips = report.clips
