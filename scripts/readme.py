@@ -65,17 +65,8 @@ OTHERS = {
     "one view, published PIE-Net": ("pienet", 1),
     LITE: ("pienet_lite", 1),
 }
-HEADLINE = (
-    LARGE,
-    MEDIUM,
-    SMALL,
-    PAPER,
-    SINGLE,
-    ONE_VIEW,
-    CISTA,
-    LITE,
-    FIRENET,
-)  # rows of the README
+OURS = (LARGE, MEDIUM, SMALL, PAPER, SINGLE, ONE_VIEW)
+HEADLINE = (*OURS, CISTA, LITE, FIRENET)  # rows of the README
 SCORES = ("lpips", "ssim", "psnr_aligned")  # its columns
 VIEWS = {  # differences, clip by clip: of nine views and one
     "Δ (9 − 1 views), E2VID": (PAPER, ONE_VIEW),

@@ -49,7 +49,8 @@ def report(cfg: DictConfig) -> list[tables.Table]:
     printed, asked = shown, commands
     if cfg.columns is not None:
         scores = [table for table in shown if table.title.startswith(SCORES)]
-        printed, asked = [tables.select_columns(table, cfg.columns) for table in scores], []
+        chosen = [cfg.columns] if isinstance(cfg.columns, str) else list(cfg.columns)
+        printed, asked = [tables.select_columns(table, chosen) for table in scores], []
     text = writers.format_markdown(printed, asked)
     results.create_run_folder(out, entry_point.resolved_yaml(cfg))
     results.write_text(out / "report.md", text)
