@@ -12,8 +12,6 @@ from src.app.path_overrides import unquote_override
 from src.records import results, runs
 from src.reports import page, run_groups, tables, writers
 
-SCORES = "Scores and cost"
-
 
 def report(cfg: DictConfig) -> list[tables.Table]:
     """Write `report.md`, `.csv` and `.html` of the runs below `cfg.run`; return the tables.
@@ -27,6 +25,7 @@ def report(cfg: DictConfig) -> list[tables.Table]:
     title = cfg.title or (names.pop() if len(names) == 1 else "") or "runs"
     published = as_dict(cfg.paper)
     candidates: list[tables.Table | None] = []
+    scores: dict[str, tables.Table] = {}
     groups = []
     sweeps = dict.fromkeys([*(run.sweep for run in found), *(plan.sweep for plan in plans)])
     for name in sweeps:
@@ -34,8 +33,10 @@ def report(cfg: DictConfig) -> list[tables.Table]:
         planned = [plan for plan in plans if plan.sweep == name]
         keys, made = run_groups.group_runs(own, planned, tuple(cfg.across))
         of = f": {name}" if name and len(sweeps) > 1 else ""
+        score_table = tables.build_score_table(f"Scores and cost{of}", keys, made, published)
+        scores[f"Scores{of}"] = score_table
         candidates += [
-            tables.build_score_table(f"{SCORES}{of}", keys, made, published),
+            score_table,
             tables.build_severity_table(f"Scores by severity{of}", keys, made),
             tables.build_reference_methods_table(f"On the same clips{of}", keys, made),
         ]
@@ -48,9 +49,9 @@ def report(cfg: DictConfig) -> list[tables.Table]:
     commands, figures = [plan.command for plan in plans], runs.find_charts_and_stress_maps(folders)
     printed, asked = shown, commands
     if cfg.columns is not None:
-        scores = [table for table in shown if table.title.startswith(SCORES)]
         chosen = [cfg.columns] if isinstance(cfg.columns, str) else list(cfg.columns)
-        printed, asked = [tables.select_columns(table, chosen) for table in scores], []
+        asked, full = [], [(name, table) for name, table in scores.items() if table.rows]
+        printed = [tables.select_columns(table, chosen, name) for name, table in full]
     text = writers.format_markdown(printed, asked)
     results.create_run_folder(out, entry_point.resolved_yaml(cfg))
     results.write_text(out / "report.md", text)

@@ -103,34 +103,36 @@ def build_score_table(
     return table
 
 
-def select_columns(table: Table, names: Sequence[str]) -> Table:
+def select_columns(table: Table, names: Sequence[str], title: str) -> Table:
     """Return the labels and the columns `names` of a score table, such as lpips, published values
     in parentheses; rows with the same first labels stand together.
 
     Raises ValueError for a column that is not there.
     """
     places = {column.name: place for place, column in enumerate(table.columns)}
-    scores = [name for name in places if places[name] >= table.labels and "paper_" not in name]
+    scores = [
+        name for name in places if places[name] >= table.labels and not name.startswith("paper_")
+    ]
     for name in names:
         if name not in scores:
             raise ValueError(f"columns must be of {', '.join(scores)}, got {name}")
     chosen = [places[name] for name in names]
     heads = [*table.columns[: table.labels], *(table.columns[place] for place in chosen)]
     has_cost = any(column.name in names for column, _ in COSTS)
-    title = table.title if has_cost else table.title.replace(" and cost", "")
     note = table.note if has_cost else _describe_measurement(table.groups, with_cost=False)
     made = Table(title, heads, [], table.labels, note)
-    seen: list[dict[str, int]] = [{} for _ in range(table.labels)]
-    order = []
-    for number, group in enumerate(table.groups):
-        turns = zip(seen, group.label, strict=True)
-        order.append(([among.setdefault(label, len(among)) for among, label in turns], number))
-    for _, number in sorted(order):
-        row = table.rows[number]
+    by_key = zip(*(group.label for group in table.groups), strict=True)
+    seen = [list(dict.fromkeys(labels)) for labels in by_key]
+    rows = zip(table.groups, table.rows, strict=True)
+
+    def turn(row: tuple[RunGroup, list[TableCell]]) -> list[int]:
+        return [labels.index(own) for labels, own in zip(seen, row[0].label, strict=True)]
+
+    for group, row in sorted(rows, key=turn):
         theirs = [row[places[key]].mean if (key := f"paper_{n}") in places else None for n in names]
         pairs = zip(chosen, theirs, strict=True)
         cells = [replace(row[place], published=value) for place, value in pairs]
-        made.add_row(table.groups[number], cells)
+        made.add_row(group, cells)
     return made
 
 

@@ -98,7 +98,7 @@ def test_chosen_columns_have_the_papers_numbers_in_parentheses_and_equal_labels_
         chosen = {"postprocess": post}
         settings = {"postprocess": None if post == "none" else {"frames": 4}}
         write_run(tmp_path / str(number), name, choices=chosen, settings=settings)
-    table = tables.select_columns(built(tmp_path, PAPER)[0], ["psnr", "ssim"])
+    table = tables.select_columns(built(tmp_path, PAPER)[0], ["psnr", "ssim"], "main")
     assert [tuple(cell.text for cell in row[:2]) for row in table.rows] == [
         ("lf3x3", "none"), ("lf3x3", "mambatm"), ("single256", "none")
     ]  # fmt: skip
@@ -107,7 +107,7 @@ def test_chosen_columns_have_the_papers_numbers_in_parentheses_and_equal_labels_
     assert "| single256 | none | 17.00 |" in text
     assert table.note == "9 test clips."
     with pytest.raises(ValueError, match="columns must be of lpips, .*, got paper_psnr"):
-        tables.select_columns(built(tmp_path, PAPER)[0], ["paper_psnr"])
+        tables.select_columns(built(tmp_path, PAPER)[0], ["paper_psnr"], "main")
 
 
 def test_what_else_was_scored_stands_below_its_network(tmp_path):
