@@ -18,11 +18,12 @@ from pathlib import Path
 import numpy as np
 from omegaconf import OmegaConf
 
-from benchmarks.runtime import from_grids
 from src.app.instantiate import instantiate_node
+from src.bench.speed import build_grid_step
 from src.deploy import openvino_network
 from src.deploy.cost import torch_threads
 from src.deploy.cpu_features import is_bf16_faster
+from src.deploy.forms import convert_to_form
 from src.deploy.runtime import EventListRuntime, fastest_form
 from src.models import load
 from src.recordings.files.recording import read_events
@@ -92,7 +93,8 @@ def measure(name: str, size: str, path: Path, threads: int, seconds: float) -> s
         network = instantiate_node(OmegaConf.load(NETWORKS)[name].model).eval()
         for form in forms:
             try:
-                step = from_grids(network, form, 1, height, width, FPS)
+                fast = convert_to_form(network, form)
+                step = build_grid_step(fast, 1, height, width, window_s=1 / FPS)
                 found[form] = least_ms(step, windows, seconds)
             except ValueError as error:  # OpenVINO cannot express it
                 print(f"{name}, {form}: {error}", file=sys.stderr)

@@ -6,7 +6,7 @@ launch or more, each of 5 to 10 us, whatever its size.  Views and allocations ar
 GPU the sensor is one launch more for each call, which here is no operator of torch.
 """
 
-import sys
+import argparse
 
 import lightning
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -82,7 +82,9 @@ def count_step(cfg, batch) -> int:
 
 def main() -> None:
     """Print a Markdown table."""
-    cfg = config([*SMALL, *sys.argv[1:]])
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("overrides", nargs="*", help="key=value of src.train")
+    cfg = config([*SMALL, *parser.parse_args().overrides])
     apart, together = (count_simulation(cfg, batched) for batched in (False, True))
     step = count_step(cfg, together[2])
     print(f"{cfg.name}, {cfg.data.batch_size} clips of {cfg.data.windows} windows\n")

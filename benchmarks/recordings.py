@@ -5,6 +5,7 @@ Events are uniform over a 1280x720 sensor with nine views, the worst case for a 
 is the minimum over repeats of one thread's CPU time; end to end it is the process's.
 """
 
+import argparse
 import multiprocessing
 import resource
 import tempfile
@@ -78,6 +79,7 @@ def end_to_end(path: Path, seconds: float) -> None:
 
 def main() -> None:
     """Print everything; a process of its own reads the file, so that its memory is known."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     splitting()
     with tempfile.TemporaryDirectory() as folder:
         path, count, seconds = Path(folder) / "long.raw", 20_000_000, 4.0

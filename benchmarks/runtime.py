@@ -19,9 +19,8 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from src.bench.speed import FORM_DTYPES, measure_peak_conv_macs_per_s
+from src.bench.speed import FORM_DTYPES, build_grid_step, measure_peak_conv_macs_per_s
 from src.deploy.cost import count_macs, macs_per_frame, torch_threads
 from src.deploy.cpu_features import is_bf16_faster
 from src.deploy.forms import convert_to_form
@@ -29,7 +28,6 @@ from src.deploy.runtime import EventListRuntime
 from src.models import load
 from src.recordings.files.recording import read_events
 from src.sim.optics import layout
-from src.sim.voxel import voxel_grid
 
 SIDE, FPS, RATE = 176, 600, 5e6
 FORM = "bf16" if is_bf16_faster() else "float32"
@@ -70,24 +68,6 @@ def milliseconds(
     return times
 
 
-def from_grids(
-    network: torch.nn.Module, form: str, views: int, height: int, width: int, fps: float
-) -> Callable:
-    """Return a step from a window's events through dense grids and `network` in `form`."""
-    fast, state = convert_to_form(network, form), None
-    size = {"bins": 5, "height": height, "width": width}
-
-    @torch.no_grad()
-    def step(t, x, y, p, view, t0, t1):
-        nonlocal state
-        parts = [slice(None)] if views == 1 else [view == index for index in range(views)]
-        grids = [voxel_grid(t[k], x[k], y[k], p[k], t0=t0, t1=t1, **size) for k in parts]
-        frame, state = fast(torch.stack(grids)[None], state, window_s=1 / fps)
-        return frame.numpy()
-
-    return step
-
-
 def arithmetic(live: EventListRuntime, played: list[tuple]) -> float:
     """Return the multiply-accumulates, in G, of a window behind the first layer, mean of `played`,
     as some windows take more than others.
@@ -114,7 +94,8 @@ def measured(name: str, engine: str, count: int, played: list[tuple], seconds: f
         step = EventListRuntime(network, **size, threads=count, form="openvino").step
     else:
         giga = macs_per_frame(network, SIDE, SIDE, views=9) / 1e9
-        step = from_grids(network, FORM, 9, SIDE, SIDE, FPS)
+        fast = convert_to_form(network, FORM)
+        step = build_grid_step(fast, 9, SIDE, SIDE, window_s=1 / FPS)
     clock = time.process_time if count == 1 else time.perf_counter
     with torch_threads(count):
         times = milliseconds(step, played, seconds, clock)

@@ -8,7 +8,7 @@ the one thread; `networks`: the same of several networks, before and after.  Cli
 windows of single clips.
 """
 
-import sys
+import argparse
 import time
 from collections.abc import Callable
 from itertools import pairwise
@@ -127,12 +127,14 @@ def networks(overrides: list[str]) -> None:
 
 def main() -> None:
     """Print a table, or the split on one thread and on two."""
-    tables = {"changes": changes, "networks": networks}
-    if len(sys.argv) > 1 and sys.argv[1] in tables:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("words", nargs="*", help="changes or networks, then key=value")
+    words, tables = parser.parse_args().words, {"changes": changes, "networks": networks}
+    if words and words[0] in tables:
         torch.set_num_threads(1)
-        tables[sys.argv[1]](sys.argv[2:])
+        tables[words[0]](words[1:])
         return
-    parts, frames, reuse = split(sys.argv[1:])
+    parts, frames, reuse = split(words)
     for threads, clock in ((1, time.thread_time), (2, time.perf_counter)):
         torch.set_num_threads(threads)
         took = {name: least(work, clock, 4) for name, work in parts.items()}

@@ -12,6 +12,7 @@ LAUNCH_S, BYTES_S and PRODUCTS_S make of these, an H100's; limit 8 ms.  With CUD
 are.
 """
 
+import argparse
 import json
 import math
 import os
@@ -209,10 +210,16 @@ def cuda() -> None:
     print(f"CUDA: {1e3 * min(taken):.1f} ms for a clip of a cache ({engine})")
 
 
-def main(words: list[str]) -> None:
+def main() -> None:
     """Run what the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("words", nargs="*", help="table, prior, launches, folders of checkouts")
+    words = parser.parse_args().words
     parts = [word for word in words if word in ("table", "prior", "launches")]
-    roots = [Path.cwd(), *(Path(word).resolve() for word in words if word not in parts)]
+    others = [Path(word).resolve() for word in words if word not in parts]
+    if missing := [str(root) for root in others if not root.is_dir()]:
+        parser.error(f"a word must be table, prior, launches or a folder, got {missing[0]}")
+    roots = [Path.cwd(), *others]
     checkouts = [Checkout(root) for root in roots]
     for part in parts or ("table", "prior"):
         launches() if part == "launches" else {"table": table, "prior": prior}[part](checkouts)
@@ -223,4 +230,4 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    serve() if sys.argv[1:] == ["serve"] else main(sys.argv[1:])
+    serve() if sys.argv[1:] == ["serve"] else main()

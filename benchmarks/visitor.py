@@ -4,8 +4,8 @@ Prints a line for every second: messages and bytes that came.  Imports little, s
 at once and takes next to nothing from what is measured beside it.
 """
 
+import argparse
 import asyncio
-import sys
 import time
 
 from aiohttp import ClientSession
@@ -25,5 +25,12 @@ async def look(port: int) -> None:
                 second, messages, size = time.monotonic(), 0, 0
 
 
+def main() -> None:
+    """Read the arguments."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("port", type=int)
+    asyncio.run(look(parser.parse_args().port))
+
+
 if __name__ == "__main__":
-    asyncio.run(look(int(sys.argv[1])))
+    main()

@@ -1,6 +1,6 @@
 """How well task=air measures turbulence that is known:
 
-    python -m scripts.check_turbulence_meter [clips, 20] [first, 1000] [again | warps | air.yaml]
+    python -m scripts.check_turbulence_meter [again | warps | air.yaml] [--clips 20] [--first 1000]
 
 Clip k is a photograph seen through simulated turbulence with a tilt of 0.25 to 1.5 px rms of 256, a
 half length of 5 to 70 px (both log-uniform) and a correlation time of 0.04 to 0.2 s: 240 frames of
@@ -13,8 +13,8 @@ where the interval holds that.  `again`: besides, a clip drawn from what was mea
 warps instead, new in each of 24 frames of 256 px, of two photographs.
 """
 
+import argparse
 import math
-import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -262,17 +262,26 @@ def clips_like_file(file: Path, numbers: range) -> Iterator[str]:
         yield f"{k} " + ", ".join(f"{key} {one}" for key, one in shown.items())
 
 
-def main(words: Sequence[str]) -> None:
+def main() -> None:
     """Print what the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", nargs="?", help="again, warps or a file of task=air")
+    parser.add_argument("--clips", type=int, default=20)
+    parser.add_argument("--first", type=int, default=1000)
+    given = parser.parse_args()
+    if not (given.what in (None, "again", "warps") or Path(given.what).is_file()):
+        parser.error(f"what must be again, warps or a file of task=air, got {given.what}")
     torch.set_num_threads(1)
-    given_numbers = [int(word) for word in words if word.isdecimal()]
-    count, first = (*given_numbers, *(20, 1000)[len(given_numbers) :])
-    numbers = range(first, first + count)
-    files = [Path(word) for word in words if word.endswith(".yaml")]
-    lines = warp_table() if "warps" in words else simulated_clips(numbers, "again" in words)
-    for line in clips_like_file(files[0], numbers) if files else lines:
+    numbers = range(given.first, given.first + given.clips)
+    if given.what == "warps":
+        lines = warp_table()
+    elif given.what in (None, "again"):
+        lines = simulated_clips(numbers, given.what == "again")
+    else:
+        lines = clips_like_file(Path(given.what), numbers)
+    for line in lines:
         print(line, flush=True)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -6,8 +6,8 @@ files, of the process and its workers, are looked at every second; printed is th
 last two thirds, which leaves out what caches take at first.
 """
 
+import argparse
 import os
-import sys
 import tempfile
 import threading
 import time
@@ -139,10 +139,16 @@ def _over_and_over(path: Path, events: int) -> Iterator[np.ndarray]:
 
 def main() -> None:
     """Do what the command line says and print what grew."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("kind", choices=["train", "events"])
+    parser.add_argument("amount", type=float, help="minutes of training, or events")
+    given = parser.parse_args()
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as run:
-        kind, amount = sys.argv[1], float(sys.argv[2])
-        found = train(amount, Path(run)) if kind == "train" else reconstruct(int(amount), Path(run))
+        if given.kind == "train":
+            found = train(given.amount, Path(run))
+        else:
+            found = reconstruct(int(given.amount), Path(run))
     print(", ".join(f"{name} {value}" for name, value in found.items()))
 
 

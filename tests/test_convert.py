@@ -45,6 +45,25 @@ def test_a_part_of_a_recording(tmp_path, convert):
     assert np.array_equal(read_events(tmp_path / "a.h5"), expected)
 
 
+@pytest.mark.parametrize("out", ["a.csv", "a.raw", "a.h5", "scene"])
+def test_times_before_0_are_written_from_0_on(tmp_path, convert, out):
+    events = made_up(3000)
+    tables.write_events(tmp_path / "in.npz", events, width=640, height=480)
+    with np.load(tmp_path / "in.npz") as file:
+        columns = dict(file)
+    columns["t"] -= 1_500_000
+    np.savez(tmp_path / "in.npz", **columns)
+    given = f"recording={tmp_path}/in.npz", f"out={tmp_path}/{out}"
+    first = int(columns["t"][0])
+    if out == "scene":  # its clock starts at 0 whatever the events
+        convert(*given, "layout=evreal")
+    else:
+        with pytest.warns(UserWarning, match=f"times begin at {first} us, written are those"):
+            convert(*given)
+    events["t"] -= events["t"][0]
+    assert np.array_equal(read_events(tmp_path / out), events)
+
+
 def test_what_the_file_does_not_say_is_stated(tmp_path, convert):
     events = made_up(3000)
     content = b"% plugin_name gen3\n" + evt2(events).tobytes()
@@ -87,9 +106,12 @@ def test_the_input_is_never_written_over(tmp_path, convert):
         (["out=a.mp4"], "cannot write .mp4"),
         (["out=a.h5", "start_s=2", "end_s=1"], "start_s must be >= 0 and before end_s, got 2, 1"),
         (["out=a.h5", "layout=x"], "layout must be null, dsec or evreal, got x"),
-        (["out=a.h5", "sensor_size=[9,9]"], "sensor_size must be"),
+        (["out=a.h5", "sensor_size=[9,9]"], "events are off the 9x9 sensor"),
+        (["out=in.csv/a.h5"], "out must be a path that can be written, got in.csv/a.h5: "),
+        (["out=a.h5", "format=evt3"], "format must be null, as in.csv is no RAW file"),
     ],
 )
+@pytest.mark.filterwarnings("ignore:.*states a sensor of")
 def test_what_cannot_be_is_named(tmp_path, convert, monkeypatch, overrides, words):
     monkeypatch.chdir(tmp_path)
     tables.write_events(tmp_path / "in.csv", made_up(30), width=640, height=480)

@@ -79,6 +79,14 @@ def test_pages_name_modules_that_are_there():
             assert path.with_suffix(".py").is_file() or path.is_dir(), f"{page.name}: {path}"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_commands_of_a_page_can_be_pasted(page):
+    text = page.read_text()
+    used, known = re.findall(r"\$([A-Z])\b", text), re.findall(r"^    ([A-Z])=", text, re.M)
+    assert set(used) <= set(known)
+    assert re.findall(r"python -m [^`\n]* P(?=[ `]|$)", text, re.M) == []
+
+
 def test_sources_name_pages_that_are_there():
     """Paths of docs in code and configs, whole or as docs/decisions/NN."""
     for folder in ("src", "baselines", "scripts", "benchmarks", "conf", "sweeps"):

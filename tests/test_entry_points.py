@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import runpy
 import signal
 import subprocess
@@ -16,24 +17,43 @@ from tests.conftest import ROOT
 from tests.faults.harness import Run, run_entry_point
 from tests.faults.test_kills import resolved
 
+SCRIPTS = [
+    file
+    for folder in ("scripts", "benchmarks")
+    for file in sorted((ROOT / folder).rglob("*.py"))
+    if '__name__ == "__main__"' in file.read_text()
+]
 TINY = ["debug=fdr", "loss=l1", "metrics.lpips=null", "logger=none"]
 
 
 def run_here(entry_point: str, *overrides: str) -> int:
     """Run `python -m src.<entry_point>` in this process, and return its exit code."""
-    root, file = logging.getLogger(), str(ROOT / "src" / f"{entry_point}.py")
+    return run_file(ROOT / "src" / f"{entry_point}.py", *overrides)
+
+
+def run_file(file: Path, *words: str) -> int:
+    """Run a file as the main program in this process, and return its exit code."""
+    root = logging.getLogger()
     handlers, level = root.handlers[:], root.level
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("HYDRA_FULL_ERROR", "1")
-        patched.setattr(sys, "argv", [file, *overrides])
+        patched.setattr(sys, "argv", [str(file), *words])
         try:
-            runpy.run_path(file, run_name="__main__")
+            runpy.run_path(str(file), run_name="__main__")
         except SystemExit as end:
             return end.code
         finally:
             root.handlers[:] = handlers
             root.setLevel(level)
     return 0
+
+
+@pytest.mark.parametrize("file", SCRIPTS, ids=lambda file: str(file.relative_to(ROOT)))
+def test_every_script_prints_its_help_and_refuses_an_unknown_option(file, capsys):
+    assert run_file(file, "--help") == 0
+    assert re.search("usage: |Powered by Hydra", capsys.readouterr().out)
+    assert run_file(file, "--no-such-option") == 2
+    assert "usage: " in capsys.readouterr().err
 
 
 def test_a_wrong_value_is_one_line_and_exit_code_2_of_the_process(tmp_path):

@@ -44,14 +44,26 @@ RUN = {  # door: what runs it, and what makes it tiny
     "reconstruct": (reconstruct, ["end_s=0.05"]),
     "calibrate": (calibrate, []),
 }  # fmt: skip
-PAGES = ("README.md", "docs/evaluate.md", "docs/recordings.md", "docs/chart.md", "docs/training.md")
+PAGES = (
+    "README.md", "docs/chart.md", "docs/evaluate.md", "docs/recordings.md", "docs/results.md",
+    "docs/tables.md", "docs/training.md",
+)  # fmt: skip
 
 
 def commands(page: str) -> list[list[str]]:
-    """The words of every command in the indented blocks of a page."""
-    text = (ROOT / page).read_text().replace("\\\n", " ")
-    lines = re.findall(r"^    ((?:python -m src|make) ?.*)$", text, re.M)
-    return [shlex.split(line, comments=True) for line in lines]
+    """The words of every command in the indented blocks of a page, its shell variables filled in.
+
+    Raises KeyError for a variable that no line before gives a value.
+    """
+    text, values, found = (ROOT / page).read_text().replace("\\\n", " "), {}, []
+    for line in re.findall(r"^    ((?:python -m src|make|[A-Z]=) ?.*)$", text, re.M):
+        line = re.sub(r"\$([A-Z])\b", lambda name, known=dict(values): known[name[1]], line)
+        words = shlex.split(line, comments=True)
+        if "=" in words[0]:
+            values |= dict(word.split("=", 1) for word in words)
+        else:
+            found.append(words)
+    return found
 
 
 def composed(words: list[str], *more: str):

@@ -16,6 +16,7 @@ trainings go on without this.  Each holds a lock while it runs, so that this fin
 command lines have the word campaign-child.  Ctrl-C and SIGTERM stop all, with checkpoints.
 """
 
+import argparse
 import os
 import signal
 import subprocess
@@ -77,9 +78,16 @@ def run(words: list[str]) -> int:
 
 
 def main() -> None:
-    """Turn errors into exit codes."""
+    """Read the command line; turn errors into exit codes."""
+    parser = argparse.ArgumentParser(
+        "python -m scripts.campaign",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("words", nargs="*", help="recipes, status and KEY=VALUE, as above")
+    words = parser.parse_args().words
     try:
-        sys.exit(run(sys.argv[1:]))
+        sys.exit(run(words))
     except ValueError as error:
         print("error: " + " ".join(str(error).split()), file=sys.stderr)
         sys.exit(2)

@@ -13,6 +13,8 @@ needs, 60 MiB at most.  Minutes count from the start of the process; exit code 0
 trained, 1: nothing was, 2: the plan does not fit or is none.
 """
 
+import argparse
+import math
 import signal
 import sys
 import time
@@ -66,19 +68,22 @@ def run_command(words: list[str], options: dict[str, str], minutes: float) -> in
 
 def parse(given: list[str]) -> tuple[list[str], dict[str, str], float]:
     """Return the words, the options key=value and the minutes; exits where they make no command."""
-    given, minutes = list(given), 0.0
-    if "--minutes" in given[:-1]:
-        place = given.index("--minutes")
-        text = given[place + 1]
-        minutes = float(text) if text.replace(".", "", 1).isdecimal() else 0.0
-        del given[place : place + 2]
-    words = [word for word in given if "=" not in word]
-    options = dict(word.split("=", 1) for word in given if "=" in word)
+    parser = argparse.ArgumentParser(
+        "python -m scripts.lease",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("words", nargs="*", help="one of the commands above")
+    parser.add_argument("--minutes", type=float, default=0.0)
+    asked = parser.parse_intermixed_args(given)
+    words = [word for word in asked.words if "=" not in word]
+    options = dict(word.split("=", 1) for word in asked.words if "=" in word)
     count, keys = OPTIONS.get(words[0] if words else "", (1, {"only", "out"}))
     is_timed = not words or words[0] not in ("join", "folder")
-    if len(words) != count or set(options) - keys or is_timed != (minutes > 0):
-        sys.exit(__doc__)
-    return words, options, minutes
+    has_minutes = 0 < asked.minutes < math.inf
+    if len(words) != count or set(options) - keys or is_timed != has_minutes:
+        parser.error("no such command; --help lists them")
+    return words, options, asked.minutes
 
 
 if __name__ == "__main__":

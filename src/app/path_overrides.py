@@ -27,7 +27,8 @@ QUOTED = re.compile(r"""'([^'\\]|\\.)*'|"([^"\\]|\\.)*\"""", re.DOTALL)
 
 
 def quote_paths(arguments: Sequence[str], entry_point: str) -> list[str]:
-    """Return the command line of an entry point with the values of paths quoted.
+    """Return the command line of an entry point with the values of paths quoted, and `.inf`, as a
+    config has it, as Hydra reads it.
 
     `~` is the user's folder.  What is quoted already, null, and `${...}` keep their meaning; in a
     list, and in a sweep (-m), a comma separates, so that a comma in a name needs quotes there.
@@ -58,8 +59,10 @@ def is_path_key(key: str, entry_point: str) -> bool:
 
 def _quote_argument(argument: str, entry_point: str, sweep: bool) -> str:
     key, equals, value = argument.partition("=")
-    if argument.startswith("-") or not equals or not is_path_key(key.lstrip("+"), entry_point):
+    if argument.startswith("-") or not equals:
         return argument
+    if not is_path_key(key.lstrip("+"), entry_point):
+        return f"{key}=inf" if value.strip().lower() == ".inf" else argument
     values = _split(value) if sweep else [value]
     return f"{key}={','.join(map(_quote, values))}"
 

@@ -1,12 +1,18 @@
-"""Speed of networks: every candidate in every form, on frames of every size."""
+"""Speed from the events of a window to a frame: every network in every form and size.
+
+Events fall everywhere, so that no part of a frame can be left out.
+"""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import product
+from itertools import cycle, product
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
+from jaxtyping import Float
 from torch.nn import functional
 
 from src.bench.candidates import Candidate
@@ -14,14 +20,18 @@ from src.deploy.cost import (
     count_macs,
     macs_per_frame,
     select_timing_clock,
-    time_frame,
+    time_calls,
     torch_threads,
 )
 from src.deploy.cpu_features import is_bf16_faster
 from src.deploy.forms import convert_to_form
 from src.deploy.onnx_export import OnnxNetwork, export_onnx
+from src.deploy.runtime import FORMS as LISTED_FORMS
+from src.deploy.runtime import EventListRuntime, supports_event_lists
 from src.models.folding import inference_copy
-from src.models.network import FramePostprocessor
+from src.models.network import WINDOW_S, EventToVideoNetwork, FramePostprocessor
+from src.sim.optics import layout
+from src.sim.voxel import voxel_grid
 
 FORM_DTYPES = {  # what a form computes in
     "float32": torch.float32, "bf16": torch.bfloat16, "compiled": torch.bfloat16,
@@ -32,7 +42,9 @@ FORMS = tuple(FORM_DTYPES)
 LONGEST_S, ONNX_SIDE = 1.0, 176
 PREVIEW_SIDE = 64  # frames that tell what a post-processor costs on larger ones
 PEAK_SIDE, PEAK_CHANNELS = 176, 64  # of the convolution that shows what the machine can do
-ACTIVE_SHARE = 0.05  # of a grid's entries that are not zero, as in our streams
+EVENTS_PER_PIXEL = 0.15  # of each view and window: five million a second of nine views of 176x176
+WINDOWS = 4  # of events, played in turn
+EventStep = Callable[..., Float[np.ndarray, "h w"]]  # of t, x, y, p, view, t0, t1, as a runtime's
 
 
 @dataclass(frozen=True)
@@ -114,29 +126,35 @@ class SpeedBenchmark:
         return macs
 
     def _time(self, candidate: Candidate, entry: SpeedMeasurement) -> SpeedMeasurement:
-        network, after_ms = candidate.loaded, self._time_postprocessor(candidate, entry)
-        size = (1, candidate.views, self.bins, entry.side, entry.side)
-        random = torch.Generator().manual_seed(0)
-        voxels = torch.randn(size, generator=random)
-        voxels = voxels * (torch.rand(size, generator=random) < ACTIVE_SHARE)
-        if entry.form == "float32":
-            ready = inference_copy(network)
-        elif entry.form != "onnx":
-            ready = convert_to_form(network, entry.form)
-        else:
-            path = self.folder / f"{entry.network}_{entry.side}.onnx"
-            if not path.is_file():
-                side, bins = entry.side, self.bins
-                export_onnx(network, path, views=entry.views, height=side, width=side, bins=bins)
-            ready = OnnxNetwork(path, entry.threads)
-        took = time_frame(
-            ready.to(entry.device), voxels.to(entry.device),
-            threads=entry.threads, seconds=self.seconds,
+        after_ms = self._time_postprocessor(candidate, entry)
+        step, windows = self._build_step(candidate.loaded, entry), _draw_windows(entry)
+        played = cycle(windows)
+        took = time_calls(
+            lambda: step(*next(played)),
+            threads=entry.threads, device=entry.device, seconds=self.seconds,
         )  # fmt: skip
         return replace(
             entry, ms=took.median_ms + after_ms, least_ms=took.least_ms + after_ms,
             frames=took.frames, clock=took.clock,
         )  # fmt: skip
+
+    def _build_step(self, network: EventToVideoNetwork, entry: SpeedMeasurement) -> EventStep:
+        """Return what goes from the events of a window to a frame as `src.reconstruct` does."""
+        form, side, threads, views = entry.form, entry.side, entry.threads, entry.views
+        if entry.device == "cpu" and form in LISTED_FORMS and supports_event_lists(network):
+            size = {"height": side, "width": side}
+            runtime = EventListRuntime(
+                network, positions=layout(views), threads=threads, form=form, **size
+            )
+            return runtime.step
+        if form == "onnx":
+            path = self.folder / f"{entry.network}_{side}.onnx"
+            if not path.is_file():
+                export_onnx(network, path, views=views, height=side, width=side, bins=self.bins)
+            network = OnnxNetwork(path, threads)
+        else:
+            network = convert_to_form(inference_copy(network), form)
+        return build_grid_step(network.to(entry.device), views, side, side, bins=self.bins)
 
     def _time_postprocessor(self, candidate: Candidate, entry: SpeedMeasurement) -> float:
         """Return its ms for a frame, 0 without one; raises ValueError where a small frame shows
@@ -150,6 +168,39 @@ class SpeedBenchmark:
         if preview_ms * entry.side**2 / PREVIEW_SIDE**2 > 1e3 * LONGEST_S:
             raise ValueError(f"more than {LONGEST_S:g} s a frame")
         return self._postprocessor_ms(post, entry.side, threads=entry.threads)
+
+
+def build_grid_step(
+    network: EventToVideoNetwork, views: int, height: int, width: int, *, bins: int = 5,
+    window_s: float = WINDOW_S,
+) -> EventStep:  # fmt: skip
+    """Return a step from a window's events through dense grids and `network`, the state kept."""
+    size, state = {"bins": bins, "height": height, "width": width}, None
+    device = next((parameter.device for parameter in network.parameters()), torch.device("cpu"))
+
+    @torch.no_grad()
+    def step(t, x, y, p, view, t0: float, t1: float) -> Float[np.ndarray, "h w"]:
+        nonlocal state
+        parts = [slice(None)] if views == 1 else [view == index for index in range(views)]
+        grids = [voxel_grid(t[k], x[k], y[k], p[k], t0=t0, t1=t1, **size) for k in parts]
+        voxels = torch.stack(grids)[None].to(device)
+        frame, state = network(voxels, state, window_s=window_s)
+        return frame[0, 0].float().cpu().numpy()
+
+    return step
+
+
+def _draw_windows(entry: SpeedMeasurement) -> list[tuple[Any, ...]]:
+    """Return windows of events, as a step takes them, uniform over views and pixels."""
+    rng, side, views = np.random.default_rng(0), entry.side, entry.views
+    count, windows = int(EVENTS_PER_PIXEL * views * side**2), []
+    for k in range(WINDOWS):
+        t0, t1 = k * WINDOW_S, (k + 1) * WINDOW_S
+        t = np.sort(rng.uniform(t0, t1, count))
+        x, y = rng.integers(0, side, (2, count))
+        p, view = rng.choice([-1, 1], count), rng.integers(0, views, count)
+        windows.append((t, x, y, p, view, t0, t1))
+    return windows
 
 
 @torch.no_grad()

@@ -70,6 +70,38 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 @torch.no_grad()
+def time_calls(
+    work: Callable[[], object],
+    *,
+    threads: int = 1,
+    device: torch.device | str = "cpu",
+    seconds: float = 1.0,
+    min_calls: int = 3,
+) -> Timing:
+    """Return the time of a call of `work`, which makes a frame on `device`, on `threads` threads.
+
+    As many calls as fit into `seconds`, at least `min_calls`, after two that warm up.
+    """
+    now, times, is_cuda = select_timing_clock(threads, device), list[float](), "cuda" in str(device)
+
+    def call() -> None:
+        work()
+        if is_cuda:
+            torch.cuda.synchronize(device)
+
+    with torch_threads(threads):
+        call()
+        call()
+        until = time.perf_counter() + seconds
+        while len(times) < min_calls or (time.perf_counter() < until and len(times) < MAX_FRAMES):
+            start = now()
+            call()
+            times.append(1e3 * (now() - start))
+    times.sort()
+    clock: Literal["thread", "wall"] = "thread" if now is time.thread_time else "wall"
+    return Timing(times[len(times) // 2], times[0], len(times), clock)
+
+
 def time_frame(
     network: EventToVideoNetwork,
     voxels: Tensor,
@@ -79,26 +111,16 @@ def time_frame(
     seconds: float = 1.0,
     min_frames: int = 3,
 ) -> Timing:
-    """Return the time of one window (n, views, bins, h, w) on `threads` threads.
+    """Return the time of one window (n, views, bins, h, w), state carried, as `time_calls` does.
 
-    `positions`: (row, col) of each view, None: `optics.layout`.  As many frames as fit into
-    `seconds`, at least `min_frames`, after two that warm up.
+    `positions`: (row, col) of each view, None: `optics.layout`.
     """
-    now, times = select_timing_clock(threads, voxels.device), list[float]()
+    state: Any = None
 
-    def advance(state: Any) -> Any:
+    def advance() -> None:
+        nonlocal state
         _, state = network(voxels, state, positions=positions)
-        if voxels.device.type == "cuda":
-            torch.cuda.synchronize(voxels.device)
-        return state
 
-    with torch_threads(threads):
-        state = advance(advance(None))
-        until = time.perf_counter() + seconds
-        while len(times) < min_frames or (time.perf_counter() < until and len(times) < MAX_FRAMES):
-            start = now()
-            state = advance(state)
-            times.append(1e3 * (now() - start))
-    times.sort()
-    clock: Literal["thread", "wall"] = "thread" if now is time.thread_time else "wall"
-    return Timing(times[len(times) // 2], times[0], len(times), clock)
+    return time_calls(
+        advance, threads=threads, device=voxels.device, seconds=seconds, min_calls=min_frames
+    )

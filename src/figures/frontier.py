@@ -1,29 +1,31 @@
-"""Accuracy against time, a panel for each metric with its Pareto front."""
+"""Accuracy against time, a panel for each of two scores with its Pareto front."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.text import Annotation
 from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.transforms import Bbox
 
 from src.bench.speed import SpeedMeasurement
 from src.bench.speed_accuracy import ClipScore, find_fastest_forms, find_pareto_front
-from src.figures.plots import MARKERS, save_figure
+from src.figures.plots import save_figure
 from src.metrics.table import METRICS, Column
 
 PAPER_MS, LIVE_MS = 3.4, 1000 / 600
-DRAWN = tuple(metric for metric in METRICS if metric.name != "psnr")  # aligned PSNR stands for it
-# Twelve that stay apart, also for the colour-blind, in pairs of dark and light.
-PALETTE = (
-    "#1f5fa8", "#d1571b", "#2f8f4e", "#8a4fa3", "#c2a11a", "#6b6b6b",
-    "#5aa9e6", "#f0a067", "#7fc99a", "#c49ad6", "#8c5a3c", "#000000",
-)  # fmt: skip
-FILL_STYLES = {
-    "float32": "full", "bf16": "none", "compiled": "bottom", "onnx": "left", "openvino": "right",
-}  # fmt: skip
+DRAWN = tuple(metric for metric in METRICS if metric.name in ("lpips", "psnr_aligned"))
+SEVERAL_VIEWS, ONE_VIEW = "#1f5fa8", "#d1571b"
+MARKER_PX, CLEARANCE_PX, NAME_GAP_PT = 4, 1, 6  # half of a marker; around a name; to its point
+# Where a name may stand, in gaps (right, up): right of the point for one thread, above it or below,
+# left of the end of its line.
+NAME_PLACES = tuple((dx, dy) for dy in (0, 1, -1, 2, -2, 3, -3) for dx in (1, 0, -1) if dx or dy)
+Span = tuple[float, float, float]  # least ms of any number of threads, ms of one, score
 
 
 def draw_accuracy_against_time(
@@ -31,40 +33,49 @@ def draw_accuracy_against_time(
     title: str,
 ) -> Path:  # fmt: skip
     """Draw the float32 scores of every network at the thread time of its fastest form on frames of
-    `side`; the dashed line is the Pareto front.
+    `side`, with a line to its fastest time on more threads; the dashed line is the Pareto front.
     """
-    names = list(dict.fromkeys(score.network for score in scores))
-    fastest = find_fastest_forms(speeds, side)
+    timed = find_fastest_forms(speeds, side)
     metrics = [metric for metric in DRAWN if scores and metric.name in scores[0].values]
-    rows = max(2, (len(metrics) + 1) // 2)
-    figure = Figure(figsize=(11, 4.1 * rows))
-    panels = figure.subplots(rows, 2).flat
-    for metric, axes in zip(metrics, panels, strict=False):
-        _draw_metric(axes, names, fastest, scores, metric)
-    for axes in panels:  # those that are left
-        axes.set_visible(False)
-    figure.supxlabel(f"ms a frame of {side}x{side}, one CPU thread, fastest form")
+    figure = Figure(figsize=(14, 6))
+    panels = figure.subplots(1, max(len(metrics), 1), squeeze=False)[0]
+    pairs = list(zip(panels, metrics, strict=False))
+    spans = [_draw_metric(axes, metric, timed, speeds, scores) for axes, metric in pairs]
+    threads = sorted({s.threads for s in speeds if s.threads > 1})
+    more = f"; lines: to {' and '.join(map(str, threads))} threads" if threads else ""
+    figure.supxlabel(f"ms from events to a frame of {side}x{side}, one CPU thread{more}")
     figure.suptitle(title)
-    forms = [form for form in FILL_STYLES if any(s.form == form for s in fastest.values())]
-    _draw_legend(figure, names, forms)
+    _draw_legend(figure, timed)
+    figure.draw_without_rendering()  # places the panels, by which names keep their distance
+    for axes, placed in zip(panels, spans, strict=False):
+        _name_points(axes, placed)
     return save_figure(figure, path)
 
 
 def _draw_metric(
-    axes, names: list[str], fastest: Mapping[str, SpeedMeasurement], scores: Sequence[ClipScore],
-    metric: Column,
-) -> None:  # fmt: skip
-    points: dict[str, tuple[float, float]] = {}
-    for index, name in enumerate(names):
-        if (timed := fastest.get(name)) and timed.ms:
-            values = [score.values[metric.name] for score in scores if score.network == name]
-            points[name] = timed.ms, fmean(values)
-            axes.plot(*points[name], linestyle="none", **_style(index, timed.form))
-    errors = {key: (ms, -metric.better * value) for key, (ms, value) in points.items()}
-    front = np.array([points[key] for key in find_pareto_front(errors)]).reshape(-1, 2)
-    axes.plot(*front.T, color="0.35", ls="--", lw=1.2, zorder=0)
-    place = {"rotation": 90, "fontsize": 7, "color": "0.4", "ha": "right", "va": "top"}
-    for ms, text in ((PAPER_MS, "the paper: 3.4 ms"), (LIVE_MS, "600 fps live")):
+    axes: Axes, metric: Column, timed: Mapping[str, SpeedMeasurement],
+    speeds: Sequence[SpeedMeasurement], scores: Sequence[ClipScore],
+) -> dict[str, Span]:  # fmt: skip
+    """Draw the panel of `metric`, all but names; return where each network is."""
+    spans: dict[str, Span] = {}
+    for name, fastest in timed.items():
+        values = [score.values[metric.name] for score in scores if score.network == name]
+        if values and fastest.ms:
+            least = min(s.ms for s in speeds if s.ms and _is_like(s, fastest))
+            spans[name] = least, fastest.ms, fmean(values)
+            line, colour = ([least, fastest.ms], [spans[name][2]] * 2), _colour(fastest)
+            axes.plot(*line, "o-", markevery=[1], color=colour, lw=1.2)
+    errors = {key: (ms, -metric.better * score) for key, (_, ms, score) in spans.items()}
+    front = np.array([spans[key][1:] for key in find_pareto_front(errors)]).reshape(-1, 2)
+    axes.plot(*front.T, color="0.35", ls="--", lw=1, zorder=0)
+    place: dict[str, Any] = {
+        "rotation": 90,
+        "fontsize": 7,
+        "color": "0.4",
+        "ha": "right",
+        "va": "top",
+    }
+    for ms, text in ((PAPER_MS, "the paper: 3.4 ms"), (LIVE_MS, "600 frames a second")):
         axes.axvline(ms, color="0.6", lw=0.8, ls=":")
         axes.text(ms, 0.985, f"{text} ", transform=axes.get_xaxis_transform(), **place)
     side = "higher" if metric.better > 0 else "lower"
@@ -73,23 +84,53 @@ def _draw_metric(
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.margins(0.12, 0.08)
     axes.grid(alpha=0.25)
+    return spans
 
 
-def _style(index: int, form: str) -> dict:
-    colour = PALETTE[index % len(PALETTE)]
-    return {
-        "color": colour, "marker": MARKERS[index % len(MARKERS)], "markersize": 7,
-        "fillstyle": FILL_STYLES[form], "markerfacecoloralt": "white", "markeredgecolor": colour,
-    }  # fmt: skip
+def _is_like(one: SpeedMeasurement, other: SpeedMeasurement) -> bool:
+    """Return whether both are of a network, a size and a device."""
+    return all(getattr(one, name) == getattr(other, name) for name in ("network", "side", "device"))
 
 
-def _draw_legend(figure: Figure, names: Sequence[str], forms: Sequence[str]) -> None:
-    handles = [
-        Line2D([], [], linestyle="none", **_style(i, "float32"), label=name.replace("_", " "))
-        for i, name in enumerate(names)
-    ]
-    for form in forms:
-        style = _style(0, form) | {"color": "0.3", "markeredgecolor": "0.3"}
-        handles.append(Line2D([], [], linestyle="none", **style, label=form))
-    figure.legend(handles=handles, loc="outside right center", fontsize=9, frameon=False)
+def _colour(timed: SpeedMeasurement) -> str:
+    return SEVERAL_VIEWS if timed.views > 1 else ONE_VIEW
+
+
+def _draw_legend(figure: Figure, timed: Mapping[str, SpeedMeasurement]) -> None:
+    named = {_colour(s): "one view" if s.views == 1 else f"{s.views} views" for s in timed.values()}
+    handles = [Line2D([], [], ls="none", marker="o", color=c, label=n) for c, n in named.items()]
+    handles.append(Line2D([], [], ls="--", lw=1, color="0.35", label="Pareto front"))
+    figure.legend(handles=handles, loc="outside lower right", ncols=3, frameon=False)
+
+
+def _name_points(axes: Axes, spans: Mapping[str, Span]) -> None:
+    """Write each name beside its point, at the first place where it covers nothing, else least."""
+    to_px = axes.transData.transform
+    taken = [_box(to_px((least, score)), to_px((ms, score))) for least, ms, score in spans.values()]
+    for name, span in spans.items():
+        written = [_write(axes, name, span, place) for place in NAME_PLACES]
+        boxes = [text.get_window_extent().padded(CLEARANCE_PX) for text in written]
+        covered = [
+            (box.count_overlaps(taken) + (not axes.bbox.x0 < box.x0 < box.x1 < axes.bbox.x1), k)
+            for k, box in enumerate(boxes)
+        ]
+        _, best = min(covered)
+        taken.append(boxes[best])
+        for text in written[:best] + written[best + 1 :]:
+            text.remove()
+
+
+def _write(axes: Axes, name: str, span: Span, place: tuple[int, int]) -> Annotation:
+    (least, ms, score), (dx, dy) = span, place
+    point, offset = (least if dx < 0 else ms, score), (NAME_GAP_PT * dx, NAME_GAP_PT * dy)
+    return axes.annotate(
+        name.replace("_", " "), point, offset,
+        ha=("center", "left", "right")[dx], va=("center", "bottom", "top")[(dy > 0) - (dy < 0)],
+        textcoords="offset points", fontsize=8, color="0.15",
+    )  # fmt: skip
+
+
+def _box(low: np.ndarray, high: np.ndarray) -> Bbox:
+    return Bbox.from_extents(*(low - MARKER_PX), *(high + MARKER_PX))

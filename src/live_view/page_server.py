@@ -133,7 +133,7 @@ class PageServer:
         self.app.router.add_get("/stream", self._stream)
 
     async def run(self, on_ready: Callable[[], None], stop: asyncio.Event) -> None:
-        """Serve until `stop`; `on_ready` is called once the port is open.
+        """Serve until `stop`; `on_ready` is called once the port is open, of 0 one that is free.
 
         Raises ValueError where the address cannot be used.
         """
@@ -144,6 +144,7 @@ class PageServer:
         except (OSError, OverflowError) as error:
             await runner.cleanup()
             raise ValueError(f"host={self.host} port={self.port} cannot be used: {error}") from None
+        self.port = runner.addresses[0][1]
         try:
             on_ready()
             await self._tick(stop)

@@ -1,6 +1,7 @@
 """Files that appear whole or not at all: written under a temporary name, then renamed."""
 
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +24,18 @@ def atomic_path(path: Path) -> Iterator[Path]:
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
+
+
+def check_writable(path: Path, key: str) -> None:
+    """Raise ValueError, which names `key`, where no file can be made in the folder of `path`, which
+    is created."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        wanted = f"{key} must be a path that can be written"
+        raise ValueError(f"{wanted}, got {path}: {error.strerror}") from error
 
 
 def partial_path(path: Path) -> Path:

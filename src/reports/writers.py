@@ -1,6 +1,7 @@
 """A table as Markdown and CSV; a section of a document replaced between its markers."""
 
 from collections.abc import Sequence
+from decimal import ROUND_HALF_UP, Decimal
 from pathlib import Path
 
 from src.metrics.table import Column
@@ -69,7 +70,13 @@ def format_cell(cell: TableCell, column: Column) -> str:
         return "-"
     number = f"{cell.mean:,.{column.digits}f}"
     number += "" if cell.std is None else f" ± {cell.std:.{column.digits}f}"
-    return number + ("" if cell.published is None else f" ({cell.published:.{column.digits}f})")
+    published = "" if cell.published is None else round_decimal(cell.published, column.digits)
+    return number + f" ({published})" * bool(published)
+
+
+def round_decimal(value: float, digits: int) -> str:
+    """Return `value`, as it is written in decimals, rounded half up: the float 0.5215 is less."""
+    return f"{Decimal(repr(value)).quantize(Decimal(1).scaleb(-digits), ROUND_HALF_UP):f}"
 
 
 def _format_line(cells: Sequence[str]) -> str:

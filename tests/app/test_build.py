@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 from baselines import postprocess
 from src.app import build, compared_networks, hardware
-from src.app.instantiate import read_user_packages
+from src.app.instantiate import instantiate_node, read_user_packages
 from src.eval import evaluate
 from src.models import files
 from src.recordings.files import event_file, event_writers, sources
@@ -154,6 +154,16 @@ def test_a_network_of_nine_views_is_not_given_one(tmp_path):
         evaluate(config("eval", tmp_path, *SMALL, "ckpt=lf3x3", "optics=single"))
 
 
+def test_what_stands_in_for_missing_weights_has_their_layers():
+    entries = OmegaConf.create({"networks": OmegaConf.load(ROOT / "conf/networks/all.yaml")})
+    shipped = [entry for entry in entries.networks.values() if "ckpt" in entry]
+    assert len(shipped) >= 6
+    for entry in shipped:
+        networks = files.load(entry.ckpt), instantiate_node(entry.model)
+        layers = [[(name, p.shape) for name, p in net.state_dict().items()] for net in networks]
+        assert layers[0] == layers[1], entry.ckpt
+
+
 def test_without_a_progress_bar_training_goes_on_without_it(tmp_path):
     bars = []
     for shown in ("true", "false"):
@@ -187,8 +197,8 @@ def test_a_missing_size_is_asked_for_by_its_key(tmp_path):
     (tmp_path / "a.txt").write_text("0 1 1 1\n5e-6 2 2 0\n")
     with pytest.raises(ValueError, match=r"give sensor_size=\[height,width\]"):
         sources.find_sensor_size(tmp_path / "a.txt")
-    with pytest.raises(ValueError, match=r"sensor_size must be \(8, 8\)"):
-        sources.find_sensor_size(tmp_path / "a.raw", [4, 4])
+    with pytest.warns(UserWarning, match=r"states a sensor of 8x8: read as sensor_size=\[4,4\]"):
+        assert sources.find_sensor_size(tmp_path / "a.raw", [4, 4]) == (4, 4)
 
 
 def test_views_that_stand_anywhere_are_scored_and_timed(tmp_path):

@@ -1,5 +1,6 @@
 """Paths reach the entry point as they were typed; two jobs of a sweep never share a folder."""
 
+import math
 import os
 import subprocess
 import sys
@@ -43,6 +44,8 @@ def test_a_path_is_what_was_typed(name):
         ("still=1", "1"),
         ("optics.views=9", 9),
         ("fps=120", 120),
+        ("end_s=.inf", math.inf),
+        ("end_s=inf", math.inf),
     ],
 )
 def test_lists_null_home_and_other_keys(typed, value):

@@ -370,6 +370,14 @@ def test_a_page_s_port_in_use_is_refused(recording):
             asyncio.run(live.play_and_serve(made))
 
 
+def test_port_0_is_a_free_one_that_is_named(recording):
+    made = served(recording, {"net": HighPass()})
+    made.port, stop = 0, asyncio.Event()
+    asyncio.run(made.run(stop.set, stop))
+    made.page.player.stop()
+    assert made.port > 0
+
+
 @pytest.mark.parametrize("use", [2, "many", 0])
 def test_views_that_are_not_there_are_refused(recording, use):
     made = served(recording, {"net": SetNet.preset("small").eval()})

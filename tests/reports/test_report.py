@@ -110,6 +110,15 @@ def test_chosen_columns_have_the_papers_numbers_in_parentheses_and_equal_labels_
         tables.select_columns(built(tmp_path, PAPER)[0], ["paper_psnr"], "main")
 
 
+@pytest.mark.parametrize(
+    ("published", "shown"),
+    [(0.5215, "0.522"), (0.5185, "0.519"), (0.5214, "0.521"), (0.4, "0.400")],
+)
+def test_published_values_are_rounded_half_up(published, shown):
+    cell = tables.TableCell(0.3, published=published)
+    assert writers.format_cell(cell, tables.METRICS[0]) == f"0.300 ({shown})"
+
+
 def test_what_else_was_scored_stands_below_its_network(tmp_path):
     write_run(tmp_path / "a", scores={"ssim": 0.7})
     write_run(tmp_path / "b", "eval", task="eval", scores={"ssim": 0.3}, compared={})

@@ -1,6 +1,7 @@
 """Simulated clips as events of every view, to be cut into windows at any rate.
 
-A clip is simulated once under its `ClipConditions`: turbulence, sensor, motion, gain of a view.
+A clip is simulated once under its `ClipConditions`: turbulence, sensor, motion, gain of a view,
+light of a lamp.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -15,6 +16,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
 from src.bench.candidates import Candidate
 from src.metrics.image import aligned_psnr
@@ -22,6 +24,7 @@ from src.models.backward_warmup import reverse_voxels
 from src.sim import noise
 from src.sim.optics import Position
 from src.sim.pipeline import Pipeline, crop_frames
+from src.sim.scenes.mixture import draw_flicker
 from src.sim.sensor import EventSensor
 from src.sim.turbulence.simulated import SimulatedTurbulence
 from src.sim.voxel import voxel_grid
@@ -30,6 +33,7 @@ Part = TypeVar("Part")
 BINS = 5
 US_PER_S = 1e6
 GAIN_AR1_COEFFICIENT = 0.9  # of a view's log gain, frame by frame
+LAMP_SAMPLES = 8  # of a lamp's light for each frame
 
 
 Curve = list[tuple[Any, float]]  # (setting, value), from easy to hard
@@ -43,13 +47,15 @@ class ClipConditions:
 
     `d_over_r0`: turbulence strength, 0 for none (None: as drawn).  `stop_after_share`: the share of
     the clip after which the scene stands still.  `view_log_gain_std`: standard deviation of each
-    view's log gain, an AR(1) process over frames.  `turbulence`, `sensor`: arguments of
+    view's log gain, an AR(1) process over frames.  `lamp_modulation_depth`: percent flicker, in
+    [0, 1), of a lamp on mains that lights the scene.  `turbulence`, `sensor`: arguments of
     SimulatedTurbulence and EventSensor that are replaced.
     """
 
     d_over_r0: float | None = None
     stop_after_share: float = 1.0
     view_log_gain_std: float = 0.0
+    lamp_modulation_depth: float = 0.0
     turbulence: Mapping[str, Any] = field(default_factory=dict)
     sensor: Mapping[str, Any] = field(default_factory=dict)
 
@@ -147,11 +153,15 @@ def simulate_event_clip(pipeline: Pipeline, index: int, conditions: ClipConditio
     changes = {"threshold": draw.sensor.threshold} | dict(conditions.sensor)
     sensor = replace(require_type("sensor", pipeline.sensor, EventSensor), **changes)
     fps, ids = draw.clip.fps, pipeline.optics.random_key_ids
-    events = [
-        sensor.events(view.contiguous(), fps, clip=index, view=i)
-        for i, view in zip(ids, views, strict=True)
-    ]
     target, turbulent = crop_frames(draw.clip.frames, draw.crop), views[pipeline.optics.centre]
+    light, light_fps = views, fps
+    if depth := conditions.lamp_modulation_depth:
+        light_fps = LAMP_SAMPLES * fps
+        light = _light_by_lamp(views, light_fps, depth, noise.key(draw.key, "lamp"))
+    events = [
+        sensor.events(view.contiguous(), light_fps, clip=index, view=i)
+        for i, view in zip(ids, light, strict=True)
+    ]
     return EventClip(events, target, turbulent, fps, pipeline.optics.positions)
 
 
@@ -171,6 +181,18 @@ def _apply_gain(views: Tensor, std: float, key: int) -> Tensor:
     gains = accumulate(drawn.unbind(1), lambda gain, new: old * gain + innovation * new)
     gain = (std * torch.stack(list(gains), 1)).exp()
     return (views * gain[:, :, None, None]).clamp(0, 1)
+
+
+def _light_by_lamp(views: Tensor, fps: float, depth: float, key: int) -> Tensor:
+    """Return the views (views, frames, h, w) at `fps`, LAMP_SAMPLES times theirs, in the light of a
+    lamp; between two frames light is linear, as the sensor takes it.
+    """
+    frames = (views.shape[1] - 1) * LAMP_SAMPLES + 1
+    pixels = views.flatten(2).transpose(1, 2)
+    dense = functional.interpolate(pixels, size=frames, mode="linear", align_corners=True)
+    times_s, size = np.arange(frames) / fps, (views.shape[2], views.shape[3])
+    lamp = draw_flicker(np.random.default_rng(key), times_s, size, (depth, depth))
+    return dense.transpose(1, 2).unflatten(2, size) * lamp
 
 
 class StressBench:

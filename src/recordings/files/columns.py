@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from src.recordings.files.event_file import ReadOptions
+
 MAX_PACKING = 200  # most that the columns of a recording shrink when they are packed
 MAX_COORDINATE = 65535
 IN_ORDER = 0.99  # of the steps of a column that time may be
@@ -44,6 +46,15 @@ def parse_unit_suffix(name: str) -> str | None:
     """Return the unit that the name of a column of times ends in (`t_ns`, `time [ms]`), or None."""
     found = TIME_UNIT.search(name.strip().strip("\"'").lower())
     return None if found is None else {"n": "ns", "m": "ms", "s": "s"}.get(found[1][0], "us")
+
+
+def find_named_time_unit(names: Iterable[str] | None, options: ReadOptions) -> str | None:
+    """Return the unit that the name of the times among `names` ends in; None where it has none or
+    `options` state the unit or the columns."""
+    keys = find_keys_by_name(names or ())
+    if keys is None or options.time_unit != "auto" or options.columns is not None:
+        return None
+    return parse_unit_suffix(keys["t"])
 
 
 def find_columns_by_values(sample: np.ndarray) -> dict[str, int]:

@@ -28,6 +28,7 @@ BUFFER_EVENTS = 2**24  # that are buffered at most; of more the oldest go
 FEW_EVENTS, LEAST_FEW, FEW_SHARE = 256, 4, 100  # a hundredth of a file, within these bounds
 MAX_DROPPED = 0.01
 MAX_PARTS = 100
+BACKWARD = 0.9  # of the events that come after a later one, and of the steps between events
 TOLD_US = 1000  # events later than that are told of
 
 
@@ -57,6 +58,7 @@ class EventSorter:
         self._is_live = kept_part == "newest"
         self.parts, self.count = [ClockPart()], 0
         self.dropped = self.late = self.most_late_us = 0
+        self._rises = self._falls = 0  # steps among events that come out of order
         self._undecided: np.ndarray | None = None
         self._held: list[np.ndarray] = []  # in order, one after the other
         self._released_us = LONG_AGO_US
@@ -140,6 +142,8 @@ class EventSorter:
             late_us = np.maximum.accumulate(np.maximum(t, part.last_us)) - t
             are_in_order = not late_us.any()
         if not are_in_order:
+            self._rises += int(np.count_nonzero(t[1:] > t[:-1]))
+            self._falls += int(np.count_nonzero(t[1:] < t[:-1]))
             self.late += int(np.count_nonzero(late_us))
             self.most_late_us = max(self.most_late_us, int(late_us.max()))
             is_gone = t < self._released_us
@@ -195,6 +199,11 @@ class EventSorter:
         if self.dropped > max(1, MAX_DROPPED * self.count):
             share = f"{100 * self.dropped / self.count:.3g} % of {self.count} events"
             return f"{share} are more than {self.buffer_us * 1e-6:g} s out of order of time"
+        steps = self._rises + self._falls
+        if len(self.parts) > 1 and self._falls > BACKWARD * steps and (
+            self.late > BACKWARD * self.count
+        ):  # fmt: skip
+            return "its times go backward from event to event"
         if len(self.parts) > MAX_PARTS:
             return f"its clock restarts more than {MAX_PARTS} times"
         return None

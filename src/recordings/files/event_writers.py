@@ -132,7 +132,7 @@ class _Checked:
 
     def _check_times(self, t: np.ndarray, last: int, first: int) -> None:
         gaps = np.diff(t, prepend=last)
-        if t[0] < 0 or (gaps < 0).any():
+        if (t[0] < 0 and self._kind != "evreal") or (gaps < 0).any():
             raise ValueError(f"{self._path}: times must start at 0 or later and not decrease")
         if (gaps >= self._silence_us).any():
             raise ValueError(

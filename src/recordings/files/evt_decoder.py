@@ -8,7 +8,9 @@ from src.recordings.files.event_file import RawEvents
 WORD_BYTES = {"evt2": 4, "evt21": 8, "evt3": 2}
 MOST_EVENTS = {"evt2": 1, "evt21": 32, "evt3": 12}  # of a word
 WORD_ORDERS = ("little", "legacy", "big")  # of EVT2.1; legacy: the halves exchanged
-EVT21_KINDS = (0, 1, 8, 10, 14, 15)  # of words
+EVT21_KINDS = (0, 1, 8, 10, 14, 15)  # of words, of EVT2 too
+EVT3_KINDS = (0, 2, 3, 4, 5, 6, 7, 8, 10, 14, 15)
+FEW_KNOWN, MOST_KNOWN = 0.9, 0.99  # of the words: below and above they are of another format
 
 
 class EvtDecoder:
@@ -55,6 +57,20 @@ class EvtDecoder:
         if self._order == "big":
             return big, pairs[:, 1].byteswap()
         return (little, legacy) if self._order == "little" else (legacy, little)
+
+
+def find_shown_kind(block: bytes, kind: str) -> str:
+    """Return evt2 or evt3 where the words of `block` are of it and not of `kind`, the other one;
+    else `kind`."""
+    block = block[: len(block) // 4 * 4]
+    if kind == "evt21" or not block:
+        return kind
+    known = {
+        "evt2": np.isin(np.frombuffer(block, "<u4") >> 28, EVT21_KINDS).mean(),
+        "evt3": np.isin(np.frombuffer(block, "<u2") >> 12, EVT3_KINDS).mean(),
+    }
+    other = "evt3" if kind == "evt2" else "evt2"
+    return other if known[kind] < FEW_KNOWN and known[other] > MOST_KNOWN else kind
 
 
 def _count_known(heads: np.ndarray) -> tuple[int, int]:

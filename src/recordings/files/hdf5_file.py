@@ -22,6 +22,7 @@ from src.recordings.files.columns import (
     check_unpacking_ratio,
     find_columns_by_name,
     find_keys_by_name,
+    find_named_time_unit,
 )
 from src.recordings.files.event_file import (
     EventFile,
@@ -100,6 +101,9 @@ class Hdf5File(EventFile):
             start = int(np.asarray(offset).item())
             t = self._columns["t"]
             self._columns["t"] = LazyColumn(t, lambda t: as_times(np.asarray(t)) + start)
+        self.time_unit = find_named_time_unit(
+            node if self._has_own_times else node.dtype.names, options
+        )
         if "t_offset" in self._file or "ms_to_idx" in self._file:  # DSEC's layout
             self.time_unit = "us"
 

@@ -1,7 +1,7 @@
 """Events in NumPy files: .npy and .npz, nothing of which is executed."""
 
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from src.recordings.files.columns import (
     find_columns,
     find_columns_by_name,
     find_keys_by_name,
+    find_named_time_unit,
 )
 from src.recordings.files.event_file import (
     PIECE_EVENTS,
@@ -39,13 +40,16 @@ class NumpyFile(EventFile):
         self.path = path
         with name_file_in_errors(path, "cannot be read as arrays of events"):
             if path.suffix.lower() == ".npy":
-                self._columns = split_table(np.load(path, mmap_mode="r"), options.columns)
+                table = np.load(path, mmap_mode="r")
+                self._columns = split_table(table, options.columns)
+                self.time_unit = find_named_time_unit(table.dtype.names, options)
             else:
                 with zipfile.ZipFile(path) as archive:
                     check_unpacking_ratio(path, sum(part.file_size for part in archive.infolist()))
                 with np.load(path) as file:
                     self.size = find_npz_size(file)
-                    self._columns, self.notes = _columns_of(path, file, options)
+                    self._columns, names, self.notes = _columns_of(path, file, options)
+                    self.time_unit = find_named_time_unit(names, options)
             check_lengths(self._columns)
 
     def pieces(self) -> Iterator[RawEvents]:
@@ -123,21 +127,23 @@ class LazyColumn:
 
 def _columns_of(
     path: Path, file: Any, options: ReadOptions
-) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Return the columns t, x, y, p of an .npz, and a note of other arrays of events in it."""
+) -> tuple[dict[str, Any], Sequence[str] | None, tuple[str, ...]]:
+    """Return the columns t, x, y, p of an .npz, the names they are found by (None: by values), and
+    a note of other arrays of events in it."""
     keys = find_keys_by_name(file.files)
     if keys is not None:
         columns = {name: _flat(file[key]) for name, key in keys.items()}
         if any(column.ndim != 1 for column in columns.values()):
             raise ValueError("columns must have one dimension")
-        return columns, ()
+        return columns, file.files, ()
     for is_called_events in (True, False):
         names = [name for name in file.files if ("event" in name.lower()) == is_called_events]
         tables = {name: table for name in names if _is_table(table := file[name])}
         if tables:
             streams = [EventStream(place, name, None) for place, name in enumerate(tables)]
             chosen, notes = choose_stream(path, streams, options.stream)
-            return split_table(tables[chosen.name], options.columns), notes
+            table = tables[chosen.name]
+            return split_table(table, options.columns), table.dtype.names, notes
     raise ValueError(f"no columns t, x, y, p and no array of events among {', '.join(file.files)}")
 
 

@@ -20,7 +20,13 @@ from src.recordings.files.event_file import (
     ReadOptions,
     WidthHeight,
 )
-from src.recordings.files.evt_decoder import MOST_EVENTS, WORD_BYTES, WORD_ORDERS, EvtDecoder
+from src.recordings.files.evt_decoder import (
+    MOST_EVENTS,
+    WORD_BYTES,
+    WORD_ORDERS,
+    EvtDecoder,
+    find_shown_kind,
+)
 
 SENSORS = {
     "gen3": (640, 480), "gen4": (1280, 720), "imx636": (1280, 720), "imx646": (1280, 720),
@@ -34,8 +40,9 @@ DAT_TRIGGER = 14
 class PropheseeFile(EventFile):
     """A `.raw` or `.dat` file; times are microseconds.
 
-    `options.format` is what a RAW file holds that does not say it.  Raises ValueError for one that
-    says nothing without it or says another, and for other formats.
+    `options.format` is what a RAW file holds that does not say it.  Words of EVT2 in a file that
+    says EVT3, or the other way round, are read as what they are, with a note.  Raises ValueError
+    for one that says nothing without `format` or says another, and for other formats.
     """
 
     time_unit = "us"
@@ -84,7 +91,16 @@ class PropheseeFile(EventFile):
             raise ValueError(f"{self.path}: {line.upper()} is not read, but EVT2, EVT2.1 and EVT3")
         if said and stated and stated != said:
             raise ValueError(f"{self.path}: format must be {said} as its header, got {stated}")
-        return said or str(stated)
+        return self._find_kind_of_words(said or str(stated))
+
+    def _find_kind_of_words(self, said: str) -> str:
+        with self.path.open("rb") as file:
+            file.seek(self._start)
+            kind = find_shown_kind(file.read(1 << 16), said)
+        if kind != said:
+            said, shown = said.upper(), kind.upper()
+            self.notes = (f"{self.path}: states {said}, its words are {shown}: read as {shown}",)
+        return kind
 
     def _raw_pieces(self) -> Iterator[RawEvents]:
         kind, found = str(self._format), 0
@@ -97,6 +113,11 @@ class PropheseeFile(EventFile):
             yield events
         if not found and decoder.triggers:
             raise ValueError(f"{self.path}: holds no events, only {decoder.triggers} triggers")
+        if decoder.lost > found:
+            raise ValueError(
+                f"{self.path}: {decoder.lost} of {found + decoder.lost} events come before the "
+                f"first time; is it {kind.upper()}, and whole?"
+            )
         if decoder.lost:
             warnings.warn(
                 f"{self.path}: {decoder.lost} events before the first time, dropped", stacklevel=3

@@ -13,8 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from src.recordings.engines.event_passes import copy_events_on_sensor
+from src.recordings.files import sensor_size
 from src.recordings.files.aedat1to3_file import Aedat1To3File
 from src.recordings.files.aedat4_file import Aedat4File
+from src.recordings.files.clocks import TimestampUnwrapper
 from src.recordings.files.es_file import EsFile
 from src.recordings.files.event_arrays import concatenate_events, count_before
 from src.recordings.files.event_file import EVENT, EventFile, RawEvents, ReadOptions, WidthHeight
@@ -38,23 +40,25 @@ READERS: dict[str, Reader] = {  # by the ending, in small letters
     **dict.fromkeys((*TEXT_ENDINGS, ".gz", ".zip"), TextFile),
 }  # fmt: skip
 OF_ONE_CAMERA = (PropheseeFile, EsFile, TextFile)
-MAX_SIDE = 2**16  # pixels: coordinates have 16 bits
+OF_THE_CAMERA = (PropheseeFile, EsFile, Aedat4File, Aedat1To3File)  # it wrote the sensor's size
 
 
 @dataclass(frozen=True)
 class EventRecording:
-    """An event file: `size` is its (width, height) in pixels, None where the file does not say."""
+    """An event file: `size` is its (width, height) in pixels, None where neither the file nor the
+    user says; `size_messages`: lines for the user where they differ."""
 
     path: Path
     size: WidthHeight | None
     options: ReadOptions
     file: EventFile
     survey: TimeSurvey
+    size_messages: tuple[str, ...] = ()
 
     @property
     def messages(self) -> tuple[str, ...]:
         """Return what the user is told before the file is read."""
-        return *self.file.notes, *self.survey.messages
+        return *self.file.notes, *self.survey.messages, *self.size_messages
 
     def __iter__(self) -> Iterator[np.ndarray]:
         """Yield the events in pieces, not empty, in order of time; warn of what was wrong."""
@@ -67,9 +71,10 @@ class EventRecording:
 def open_recording(
     path: str | Path, size: WidthHeight | None = None, options: ReadOptions = ReadOptions()
 ) -> EventRecording:
-    """Return the recording at `path`; `size` (width, height) for a file that does not say.
+    """Return the recording at `path`; `size` (width, height) comes before what the file states.
 
-    Of a table all times are read here, and what is odd about their unit or order is a warning.
+    Of a table all times are read here, and what is odd about their unit or order is a warning, as
+    is a size that the file states and its events or `size` contradict.
     Raises ValueError for a file that is missing, empty, of an unknown kind or cannot be read.
     """
     path = Path(path)
@@ -77,13 +82,11 @@ def open_recording(
         found = "is a folder, not an event file" if path.is_dir() else "no such file"
         raise ValueError(f"{path}: {'the file is empty' if path.is_file() else found}")
     state = path.stat()
-    kept, survey = _open_and_survey(path, state.st_mtime_ns, state.st_size, options)
+    kept, survey, swapped = _open_and_survey(path, state.st_mtime_ns, state.st_size, options)
     file = _open_file(path, options) if kept is None else kept
     file.kept_times = survey.times
-    size = file.size or size
-    if size is not None and not all(1 <= side <= MAX_SIDE for side in size):
-        raise ValueError(f"{path}: a sensor's sides must be in 1..{MAX_SIDE}, got {size}")
-    recording = EventRecording(path, size, options, file, survey)
+    size, lines = sensor_size.choose_size(path, size, file.size, swapped)
+    recording = EventRecording(path, size, options, file, survey, lines)
     _tell(recording.messages)
     return recording
 
@@ -94,9 +97,10 @@ def read_events(
     """Return all events of a file, (n,) of t int64 us, x, y uint16, p int8 in {-1, 1}, in order of
     time.
 
-    `size`: (width, height) for a file that does not state it; without it no event is off the
-    sensor.  `options`: what the file does not say (ReadOptions).  Raises ValueError for a file that
-    cannot be read; warns of what was sorted or dropped, with the number of events.
+    `size`: (width, height), where the file does not state it or states another; where neither says,
+    no event is off the sensor.  `options`: what the file does not say (ReadOptions).  Raises
+    ValueError for a file that cannot be read; warns of what was sorted or dropped, with the number
+    of events.
     """
     pieces = list(open_recording(path, size, options))
     return concatenate_events(pieces) if pieces else np.empty(0, EVENT)
@@ -134,7 +138,9 @@ def _read_part(recording: EventRecording, part: int) -> Iterator[np.ndarray]:
     path, survey, size = recording.path, recording.survey, recording.size
     order = EventSorter(survey.buffer_us, survey.min_part_events, part)
     count, outside, largest_xy = 0, 0, np.zeros(2, np.int64)
+    clock = TimestampUnwrapper(survey.wrap_bits) if survey.wrap_bits else None
     for raw in survey.pieces or recording.file.pieces():
+        raw = raw if clock is None else raw._replace(t=clock.unwrap(raw.t))
         events, off_sensor = _convert(raw, recording, largest_xy)
         count, outside = count + len(raw.t), outside + off_sensor
         is_ordered = survey.is_ordered and part == 0
@@ -145,15 +151,8 @@ def _read_part(recording: EventRecording, part: int) -> Iterator[np.ndarray]:
     _refuse_disorder(order, path)
     if not survey.covers_all_times:
         order.check_part(part, path)
-    if outside and size is not None:
-        width, height = size
-        if outside == count:
-            x, y = largest_xy + 1
-            raise ValueError(
-                f"{path}: all {count} events are off the {width}x{height} sensor, "
-                f"they need {x}x{y}; is sensor_size=[height,width] right?"
-            )
-        _tell((f"{path}: {outside} of {count} events outside {width}x{height}, dropped",))
+    if size is not None:
+        sensor_size.report_events_outside(path, size, count, outside, largest_xy)
     if not survey.covers_all_times:
         _tell(order.describe_time_faults(path, part=recording.options.part))
 
@@ -173,7 +172,10 @@ def _convert(
         x, y, p = (part[wrong] for part in raw[1:])
         if p not in (-1, 0, 1):
             raise ValueError(f"{path}: polarity must be in -1, 0, 1, got {p}")
-        raise ValueError(f"{path}: x and y must be in 0..{MAX_SIDE - 1}, got {x}, {y}")
+        raise ValueError(f"{path}: x and y must be in 0..{sensor_size.MAX_SIDE - 1}, got {x}, {y}")
+    p = columns[-1]
+    if p.size and p.min() < 0 and not p.all():
+        raise ValueError(f"{path}: polarity must be 0 and 1 or -1 and 1, got -1 and 0")
     return events[:kept], outside
 
 
@@ -210,6 +212,8 @@ def _open_file(path: Path, options: ReadOptions) -> EventFile:
         raise ValueError(f"{path}: unknown kind of event file, known are {', '.join(READERS)}")
     if reader in OF_ONE_CAMERA and options.stream not in (None, 0, "0"):
         raise ValueError(f"stream must be null, as {path} has one camera, got {options.stream}")
+    if options.format is not None and path.suffix.lower() != ".raw":
+        raise ValueError(f"format must be null, as {path} is no RAW file, got {options.format}")
     file = reader(path, options)
     if file.time_unit is not None and options.time_unit not in ("auto", file.time_unit):
         raise ValueError(
@@ -222,11 +226,17 @@ def _open_file(path: Path, options: ReadOptions) -> EventFile:
 @lru_cache(maxsize=1)
 def _open_and_survey(
     path: Path, changed_ns: int, length: int, options: ReadOptions
-) -> tuple[EventFile | None, TimeSurvey]:
-    """Return what is opened, once for a file that does not change, and what its times tell; None
-    for HDF5, of which an open file cannot be written."""
+) -> tuple[EventFile | None, TimeSurvey, WidthHeight | None]:
+    """Return what is opened, once for a file that does not change, what its times tell, and the
+    size that its events show where it is stated the wrong way round (find_swapped_size).
+
+    Instead of an HDF5 file None: an open one cannot be written.
+    """
     file = _open_file(path, options)
-    return (None if isinstance(file, Hdf5File) else file), survey_times(file, options)
+    survey, swapped = survey_times(file, options), None
+    if not isinstance(file, OF_THE_CAMERA):
+        swapped = sensor_size.find_swapped_size(file, survey.pieces or file.pieces())
+    return (None if isinstance(file, Hdf5File) else file), survey, swapped
 
 
 def _tell(lines: Iterable[str]) -> None:

@@ -19,22 +19,20 @@ from src.sim.scenes.video_files import PICTURE_SUFFIXES, VIDEO_SUFFIXES
 def find_sensor_size(
     path: Path | str, sensor: Sequence[int] | None = None, options: ReadOptions = ReadOptions()
 ) -> HeightWidth:
-    """Return (height, width) of the recording's sensor; `sensor` for a file that does not say,
-    which is else that of the frames beside its events, with a warning.
+    """Return (height, width) of the recording's sensor: `sensor`, else what the file states, else
+    that of the frames beside its events, with a warning.
 
-    Raises ValueError where neither says, or both do and differ.
+    Raises ValueError where none says.
     """
-    opened = recording.open_recording(path, options=options)
-    stated = opened.size and opened.size[::-1]
-    given = (sensor[0], sensor[1]) if sensor is not None else stated
-    if given is None and (frames := find_frames(opened)) is not None:
-        given = frames.size
-        warnings.warn(f"{path}: a sensor of {given[1]}x{given[0]}, as its frames", stacklevel=2)
-    if given is None:
+    given = (sensor[1], sensor[0]) if sensor is not None else None
+    opened = recording.open_recording(path, given, options)
+    if opened.size is not None:
+        return opened.size[::-1]
+    if (frames := find_frames(opened)) is None:
         raise ValueError(f"{path} does not state its sensor; give sensor_size=[height,width]")
-    if stated not in (None, given):
-        raise ValueError(f"sensor_size must be {stated}, as {path} states, got {given}")
-    return given
+    height, width = frames.size
+    warnings.warn(f"{path}: a sensor of {width}x{height}, as its frames", stacklevel=2)
+    return frames.size
 
 
 def iter_recording(

@@ -5,6 +5,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from src.recordings.files.clocks import TimestampUnwrapper
 from src.recordings.files.event_file import EventFile, RawEvents, ReadOptions, name_file_in_errors
 from src.recordings.files.event_order import (
     BUFFER_US,
@@ -27,7 +28,8 @@ class TimeSurvey(NamedTuple):
     two parts are ON and OFF, and lines for the user.
 
     `covers_all_times`: all times were looked at; else they are while the file is read.
-    `is_ordered`: they are in order and of one clock.  `times` or `pieces`: what was read for this
+    `is_ordered`: they are in order and of one clock.  `wrap_bits`: of a counter that goes round, 0
+    for none.  `times` or `pieces`: what was read for this
     and is little enough to be kept.
     """
 
@@ -38,6 +40,7 @@ class TimeSurvey(NamedTuple):
     messages: tuple[str, ...] = ()
     covers_all_times: bool = True
     is_ordered: bool = False
+    wrap_bits: int = 0
     times: list[np.ndarray] | None = None
     pieces: list[RawEvents] | None = None
 
@@ -69,19 +72,23 @@ def _judge(
     for t in read_times():
         sample.add(t)
     unit, line = find_unit(sample, options.time_unit)
+    bits = sample.wrap_bits
     if file.time_unit is not None:
         unit, line = file.time_unit, ""
 
     def read_us() -> Iterable[np.ndarray]:
+        clock = TimestampUnwrapper(bits) if bits else None
         for t in read_times():
             check_times(t, unit, path)
-            yield to_us(t, unit)
+            yield to_us(t if clock is None else clock.unwrap(t), unit)
 
     span_us = sample.early_time_and_span()[1] * UNITS_US[unit]
     with name_file_in_errors(path, "its times cannot be read"):
         order = sort_with_smallest_buffer(read_us, sample.count, span_us)
     order.check_part(options.part or 0, path)
     lines = [f"{path}: {line}"] if line else []
+    if bits:
+        lines.append(f"{path}: its counter of {bits} bits goes round, times go on")
     merged = options.part is None and len(order.parts) == 2
     if merged and _is_on_then_off(file, order.parts[0].count, order.parts[-1].count, sample.count):
         lines.append(f"{path}: all events of one polarity come before the others, sorted by time")
@@ -89,7 +96,8 @@ def _judge(
         merged = False
         lines += order.describe_time_faults(path, part=options.part)
     shape = order.buffer_us, order.min_part_events, merged
-    return TimeSurvey(unit, *shape, tuple(lines), is_ordered=order.is_in_order())
+    ordered = order.is_in_order()
+    return TimeSurvey(unit, *shape, tuple(lines), is_ordered=ordered, wrap_bits=bits)
 
 
 def sort_with_smallest_buffer(

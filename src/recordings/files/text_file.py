@@ -1,8 +1,9 @@
 """Events as text, a line each: CSV and its relatives, also packed as .gz or .zip.
 
 Before the events there may be comments (# % // ;), a line `width height`, `%geometry:640,480`, and
-the names of the columns.  Values are separated by spaces, tabs, commas or semicolons (then a comma
-may be the decimal point); polarity is 0 / 1, -1 / 1, True / False or ON / OFF.
+the names of the columns.  Values are separated by spaces, tabs, semicolons (then a comma may be the
+decimal point), commas or several of these, and may have quotes; polarity is 0 / 1, -1 / 1, True /
+False or ON / OFF.
 """
 
 import re
@@ -30,7 +31,9 @@ from src.recordings.files.frame_files import find_listed_frames
 from src.recordings.files.numpy_file import slice_columns, slice_times
 from src.recordings.files.text_layout import (
     COMMENTS,
+    CUT,
     MAX_LINE,
+    TO_BLANKS,
     WORDS,
     TextLayout,
     is_number,
@@ -115,7 +118,9 @@ class TextFile(EventFile):
                 continue
         wrong = self._find_broken(tidy)
         if is_last and wrong == len(tidy) - 1 and number + wrong > self._layout.header_lines:
-            self.notes = (f"{self.path}: its last line is cut, left out",)
+            cut = "gzip stream is cut, what follows is missing"
+            is_packed = tidy[wrong].endswith(CUT.decode())
+            self.notes = (f"{self.path}: its {cut if is_packed else 'last line is cut, left out'}",)
             return self._parse("\n".join(tidy[:-1]), number, False)
         raise ValueError(f"line {number + wrong + 1} is no event: {tidy[wrong][:40]!r}")
 
@@ -130,6 +135,8 @@ class TextFile(EventFile):
         """Return the lines with points, numbers for words, and blank for comments."""
         if self._layout.has_decimal_comma:
             text = text.replace(",", ".")
+        if self._layout.is_mixed:
+            text = text.translate(TO_BLANKS)
         if self._layout.has_words:
             text = re.sub(
                 r"\b(true|false|on|off)\b", lambda m: WORDS[m[0].lower()], text, flags=re.I

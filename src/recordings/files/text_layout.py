@@ -18,6 +18,7 @@ MAX_HEADER_LINES = 1000
 COMMENTS = ("#", "%", "//", ";")
 WORDS = {"true": "1", "false": "0", "on": "1", "off": "0"}  # of polarity
 CUT = b" cut"  # what a packed text ends in where its file is cut: its last line is no event
+TO_BLANKS = str.maketrans({",": " ", ";": " ", '"': " ", "'": " "})
 GEOMETRY = re.compile(
     r"(?:geometry|resolution|size)\D*(?<![\d.])(\d+)"
     r"(?:\s*(?:(?:[x,;*]|by|height)[\s=:]*)+|\s+)(\d+)(?!\d|\.\d)",
@@ -27,13 +28,15 @@ GEOMETRY = re.compile(
 
 class TextLayout(NamedTuple):
     """How the lines of a file are read: the `width` of the table, `separator` (None: any blanks),
-    whether a comma is the decimal point, whether polarity is a word, the `column_places` of t,
+    whether a comma is the decimal point, whether separators are mixed, a line ends in one or values
+    have quotes (TO_BLANKS), whether polarity is a word, the `column_places` of t,
     x, y, p where names tell them, the unit of time in these, and (width, height).  `header_lines`
     come before the events."""
 
     width: int
     separator: str | None
     has_decimal_comma: bool
+    is_mixed: bool
     has_words: bool
     column_places: dict[str, int] | None
     time_unit: str | None
@@ -102,17 +105,20 @@ def read_layout(file: io.TextIOBase) -> TextLayout:
         if not line:
             if strange is not None:
                 raise ValueError(f"no line of numbers t x y p in it, got {strange[:40]!r}")
-            return TextLayout(0, None, False, False, None, None, size, number)
+            return TextLayout(0, None, False, False, False, None, None, size, number)
         bare = line.strip()
         separator, has_decimal_comma = _find_separator(bare)
-        words = split_line(bare.replace(",", ".") if has_decimal_comma else bare, separator)
+        plain = bare.replace(",", ".") if has_decimal_comma else bare
+        if is_mixed := _has_mixed_separators(plain, separator):
+            plain, separator = plain.translate(TO_BLANKS), None
+        words = split_line(plain, separator)
         if len(words) >= 4 and all(map(_is_value, words)):
             has_words = not all(map(is_number, words))
             if names is not None and len(names) != len(words):
                 names = None
             places = None if names is None else find_columns_by_name(names)
             unit = parse_unit_suffix(names[places["t"]]) if names and places else None
-            how = separator, has_decimal_comma, has_words
+            how = separator, has_decimal_comma, is_mixed, has_words
             return TextLayout(len(words), *how, places, unit, size, number)
         here = _stated_size(bare)
         size = here or size
@@ -137,7 +143,17 @@ def _find_separator(line: str) -> tuple[str | None, bool]:
     """Return what separates values (None: blanks), and whether a comma is the decimal point."""
     if ";" in line.lstrip("; "):
         return ";", "," in line
+    if len(line.split()) >= 4 and re.search(r"\d,\d", line):
+        return None, True
     return ("," if "," in line else None), False
+
+
+def _has_mixed_separators(line: str, separator: str | None) -> bool:
+    """Return whether values have quotes, or more than `separator` stands between or behind them."""
+    if '"' in line or "'" in line:
+        return True
+    values = line.split(separator)
+    return separator is not None and (not values[-1] or any(len(v.split()) > 1 for v in values))
 
 
 def split_line(line: str, separator: str | None) -> list[str]:

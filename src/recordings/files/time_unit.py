@@ -2,60 +2,94 @@
 
 A unit is judged by the file's duration and event rate in it.  It loses a point for each factor of
 ten by which the duration is outside 0.02 s..600 s or the rate outside 1e4..3e7 events/s, and those
-of PRIOR, for whole numbers and others.  It gains EPOCH where the times are then dates of 2001 to
-2039.  Where half of the times have more than three digits behind the point, other units than s
-lose FINE: they would be finer than a camera's.  Duration and rate are those between the 1st and
-the 99th of a hundred times, so that single wild ones do not matter.
+of PRIOR, for whole numbers and others; ns lose NS_OF_US where all are apart by thousands.  It gains
+EPOCH where the times are then dates of 2001 to 2039.  Where half of the times have more than three
+digits behind the point, other units than s lose FINE: they would be finer than a camera's.
+Duration and rate are those between the 1st and the 99th of a hundred times, so that single wild
+ones do not matter; a counter that goes round goes on.
 
 The best unit is taken.  The user is told where it is not that of PRIOR 0 or a date, where a second
-one is less than NEAR behind, and where duration or rate are absurd.  Fewer than FEW_TIMES values
-tell too little: they are seconds with a fraction, microseconds without.
+one is less than NEAR behind, where another would be ahead but for FINE though the times are finer
+than a camera's in s, too, and where duration or rate are absurd.  Fewer than FEW_TIMES values tell
+too little: they are seconds with a fraction, microseconds without.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from src.recordings.files.clocks import TimestampUnwrapper
+
 UNITS_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
 PRIOR = {
-    True: {"us": 0.0, "ns": 1.0, "ms": 2.0, "s": 3.0},  # whole numbers
+    True: {"us": 0.0, "ns": 2.0, "ms": 2.0, "s": 3.0},  # whole numbers
     False: {"s": 0.0, "ms": 1.0, "us": 1.0, "ns": 2.0},
 }
-FINE = 3.0
+FINE, NS_OF_US = 3.0, 1.0
 DURATION_S, RATE_HZ, EPOCH_S, EPOCH = (0.02, 600.0), (1e4, 3e7), (1e9, 2.2e9), 3.0
 NEAR = 1.0  # points: a second unit as near is told of
 ABSURD_S, ABSURD_HZ = (1e-3, 86_400.0), (10.0, 1e9)  # outside, duration and rate are told of
 FEW_TIMES = 100
 SAMPLES = 1024  # of a piece
 MAX_TIME_US = 2**62
+COUNTER_BITS = (24, 31, 32)  # of counters that go round
 Range = tuple[float, float]
 
 
 class TimeSample:
-    """Some of a file's times in its unit, from all its pieces, and whether all are whole."""
+    """Some of a file's times in its unit, from all its pieces, and what all of them are: whole
+    numbers, numbers apart by thousands, a counter of `wrap_bits` that goes round (0: none)."""
 
     def __init__(self) -> None:
-        self.count, self.are_whole_numbers = 0, True
+        self.count, self.are_whole_numbers, self.are_apart_by_thousands = 0, True, True
         self._values: list[np.ndarray] = []
+        self._last: Any = None
+        self._steps: Range = (0, 0)  # least and most
+        self._range: Range = (np.inf, -np.inf)
 
     def add(self, t: np.ndarray) -> None:
         """Take the times (n,) of a piece."""
+        if not len(t):
+            return
+        first = t[0] if self._last is None else self._last
         self.count += len(t)
-        self._values.append(np.array(t[:: max(1, len(t) // SAMPLES)]))
-        if t.dtype.kind == "f" and self.are_whole_numbers:
-            self.are_whole_numbers = bool((t == np.rint(t)).all())
+        values = np.array(t[:: max(1, len(t) // SAMPLES)])
+        self._values.append(values)
+        if t.dtype.kind == "f":
+            if self.are_whole_numbers:
+                self.are_whole_numbers = bool((t == np.rint(t)).all())
+        else:
+            steps = np.diff(t, prepend=first)
+            self._steps = _widen(self._steps, steps)
+            self._range = _widen(self._range, t)
+        if self.are_apart_by_thousands:
+            self.are_apart_by_thousands = not (np.diff(values, prepend=first) % 1000).any()
+        self._last = t[-1]
 
-    def has_over_three_decimals(self) -> bool:
-        """Return whether half of the times or more have above three digits behind the point."""
+    @property
+    def wrap_bits(self) -> int:
+        """Return of how many bits a counter is that falls from its end to its beginning; else 0."""
+        (down, up), (least, most) = self._steps, self._range
+        for bits in COUNTER_BITS:
+            turn = 2**bits
+            if most - least < turn and down < -0.9 * turn and up < 0.5 * turn:
+                return bits
+        return 0
+
+    def has_more_decimals(self, digits: int) -> bool:
+        """Return whether half of the times or more have above `digits` behind the point."""
         if self.are_whole_numbers or not self._values:
             return False
-        thousands = np.concatenate(self._values) * 1e3
-        return bool(np.mean(np.abs(thousands - np.rint(thousands)) > 1e-3) >= 0.5)
+        shifted = np.concatenate(self._values) * 10**digits
+        return bool(np.mean(np.abs(shifted - np.rint(shifted)) > 1e-3) >= 0.5)
 
     def early_time_and_span(self) -> tuple[float, float]:
         """Return an early time and the span of the times, less the first and last hundredth, in the
         file's unit."""
         values = np.concatenate(self._values) if self._values else np.zeros(0)
+        if self.wrap_bits:
+            values = TimestampUnwrapper(self.wrap_bits).unwrap(values)
         values = values[np.isfinite(values)]
         if not len(values):
             return 0.0, 0.0
@@ -89,19 +123,28 @@ class _Reading:
 def find_unit(sample: TimeSample, stated: str) -> tuple[str, str]:
     """Return the unit (`stated`, where it is not auto), and what the user is told of it, or ""."""
     is_auto = stated == "auto"
+    usual = ("us" if sample.are_whole_numbers else "s") if is_auto else stated
     if sample.count < FEW_TIMES:
-        return (("us" if sample.are_whole_numbers else "s") if is_auto else stated), ""
+        return usual, ""
+    if not sample.early_time_and_span()[1]:
+        return usual, f"all or nearly all of {sample.count} times are equal"
     read = {unit: _Reading(sample, unit) for unit in UNITS_US}
-    losses, fine = PRIOR[sample.are_whole_numbers], FINE * sample.has_over_three_decimals()
-    points = {unit: read[unit].points() - losses[unit] - fine * (unit != "s") for unit in UNITS_US}
+    losses, fine = dict(PRIOR[sample.are_whole_numbers]), FINE * sample.has_more_decimals(3)
+    if sample.are_whole_numbers and sample.are_apart_by_thousands:
+        losses["ns"] = NS_OF_US
+    plain = {unit: read[unit].points() - losses[unit] for unit in UNITS_US}
+    points = {unit: plain[unit] - fine * (unit != "s") for unit in UNITS_US}
     best, second = sorted(points, key=lambda unit: -points[unit])[:2]
     unit = best if is_auto else stated
-    is_near = is_auto and points[best] - points[second] < NEAR
-    is_unusual = is_auto and losses[unit] > 0 and not read[unit].is_date
+    by_digits = max(plain.values()) > plain[unit] and sample.has_more_decimals(6)
+    is_near = is_auto and (points[best] - points[second] < NEAR or by_digits)
+    is_unusual = is_auto and PRIOR[sample.are_whole_numbers][unit] > 0 and not read[unit].is_date
     absurd = _decades(read[unit].duration_s, ABSURD_S) + _decades(read[unit].rate_hz, ABSURD_HZ)
     if not (is_near or is_unusual or absurd > 0):
         return unit, ""
     other = second if unit == best else best
+    if by_digits:
+        other = max(plain, key=plain.__getitem__)
     seen = f"times in {unit} give {read[unit]}, in {other} {read[other]}"
     return unit, f"{seen}: read as {unit}; if it is another, give time_unit=s, ms, us or ns"
 
@@ -130,3 +173,7 @@ def _decades(value: float, allowed: Range) -> float:
     if not 0 < value < np.inf:
         return np.inf
     return float(max(0.0, np.log10(allowed[0] / value), np.log10(value / allowed[1])))
+
+
+def _widen(bounds: Range, values: np.ndarray) -> Range:
+    return min(bounds[0], int(values.min())), max(bounds[1], int(values.max()))

@@ -9,7 +9,7 @@ from torch import nn
 
 from baselines.highpass import HighPass
 from src.bench.candidates import Candidate
-from src.bench.stress_tests import conditions, recurrence, static_camera
+from src.bench.stress_tests import conditions, faults, recurrence, static_camera
 from src.bench.stress_tests.event_clips import ClipConditions, StressBench, simulate_event_clip
 from src.bench.stress_tests.stress_results import StressResult
 from src.models.network import EventToVideoNetwork
@@ -147,6 +147,36 @@ def test_the_view_beside_the_centre_is_one_the_network_sees(bench):
     assert one_view_shifted(subject, bench).value != 0
 
 
+def test_only_a_fault_that_a_network_sees_costs_it_something(bench):
+    # The running sum looks at the centre view alone.
+    silent = faults.measure_silent_view_loss(running(), bench, limit_db=0.5)
+    assert silent.curve[0][1] > 0.01 and silent.curve[1][1] == pytest.approx(0, abs=1e-6)
+    assert silent.value == silent.curve[0][1]
+    jump = {"jumps_ms": [8.0], "limit_db": 0.5}
+    assert faults.measure_clock_jump_loss(running(), bench, **jump).value == pytest.approx(0)
+    assert faults.measure_view_order_loss(running(), bench, limit_db=0.5).value == pytest.approx(0)
+    median = Candidate("median", HighPass(view_reduction="median"), 9)
+    assert faults.measure_clock_jump_loss(median, bench, **jump).value != 0
+
+
+def test_a_fault_begins_in_the_middle_and_in_one_view(bench):
+    (clip,) = bench.clips()
+    half_us = clip.duration_s / 2 * 1e6
+    changed = faults._change_view(running(), clip, 0, lambda e, half: e[e["t"] < half])
+    for view, (before, after) in enumerate(zip(clip.events, changed.events, strict=True)):
+        kept = before[before["t"] < half_us] if view == 4 else before
+        assert len(kept) and np.array_equal(after, kept)
+
+
+def test_a_lamp_makes_events_on_a_scene_that_stands_still(bench):
+    still = ClipConditions(d_over_r0=0.0, stop_after_share=0.0)
+    lit = ClipConditions(d_over_r0=0.0, stop_after_share=0.0, lamp_modulation_depth=0.4)
+    plain, flickering = (simulate_event_clip(bench.pipeline, 0, one) for one in (still, lit))
+    assert sum(map(len, plain.events)) == 0 and min(map(len, flickering.events)) > 100
+    signs = flickering.events[4]["p"] > 0
+    assert 0.3 < signs.mean() < 0.7 and torch.equal(plain.target, flickering.target)
+
+
 def test_every_stress_test_runs_on_a_set_network(bench):
     torch.manual_seed(0)
     subject = Candidate("setnet", SetNet(channels=4).eval(), 9)
@@ -171,6 +201,9 @@ def test_every_stress_test_runs_on_a_set_network(bench):
             "parallax": True,
             "limit_db": 1.0,
         },
+        faults.measure_silent_view_loss: {"limit_db": 1.0},
+        faults.measure_clock_jump_loss: {"jumps_ms": [8.0], "limit_db": 1.0},
+        faults.measure_view_order_loss: {"limit_db": 1.0},
         conditions.measure_correlated_views_loss: {
             "spacings_over_aperture": [0.0],
             "limit_db": 1.0,
@@ -184,9 +217,10 @@ def test_every_stress_test_runs_on_a_set_network(bench):
     for measure, settings in tests.items():
         found = measure(subject, bench, **settings)
         assert found.value == found.value and found.limit is not None, measure
-    varied = {"parameter": "view_log_gain_std", "values": [0.05], "limit_db": 1.0}
-    found = conditions.measure_worst_psnr_loss(subject, bench, **varied)
-    assert found.value == found.value
+    for name, value in (("view_log_gain_std", 0.05), ("lamp_modulation_depth", 0.2)):
+        varied = {"parameter": name, "values": [value], "limit_db": 1.0}
+        found = conditions.measure_worst_psnr_loss(subject, bench, **varied)
+        assert found.value == found.value
 
 
 def test_settling_is_the_last_time_beyond():

@@ -178,6 +178,28 @@ def test_what_is_dropped_or_cut_is_counted(tmp_path):
             assert equal(read(tmp_path / name, content[:-3])[1], events[:-1])
 
 
+@pytest.mark.parametrize(("said", "held"), [("2.0", "evt3"), ("3.0", "evt2")])
+def test_words_of_another_format_than_the_header_says_are_told_apart(tmp_path, said, held):
+    events = made_up(400)
+    content = f"% evt {said}\n".encode() + ENCODERS[held](events).tobytes()
+    for options in ({}, {"format": f"evt{said[0]}"}):
+        file, found = read(tmp_path / "a.raw", content, **options)
+        assert equal(found, events)
+        assert file.notes[0].endswith(f"states EVT{said[0]}, its words are EVT{held[3]}: read as "
+                                      f"EVT{held[3]}")  # fmt: skip
+    content = f"% evt {held[3]}.0\n".encode() + ENCODERS[held](events).tobytes()
+    assert read(tmp_path / "b.raw", content)[0].notes == ()
+
+
+def test_a_file_whose_times_come_after_most_events_is_refused(tmp_path):
+    events = made_up(400)
+    words = evt2(events)
+    is_event = words >> 28 < 2
+    content = b"% evt 2.0\n" + np.concatenate([words[is_event], words]).tobytes()[:-400]
+    with pytest.raises(ValueError, match=r"400 of \d+ events come before the first time"):
+        read(tmp_path / "a.raw", content)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "options", "words"),
     [

@@ -205,6 +205,24 @@ def test_a_truncated_file_is_counted_or_named(tmp_path):
         assert 0 < len(read_events(tmp_path / "a.raw")) <= len(events)
 
 
+@pytest.mark.parametrize("kind", ["dvs", "atis"])
+def test_an_es_file_that_ends_within_an_event_is_told(tmp_path, kind):
+    """Events after 0 and 200 us; before the second is a byte for the silence."""
+    head = b"Event Stream" + bytes([2, 0, 0, 1 if kind == "dvs" else 2]) + b"\x08\0\x06\0"
+    silence, steps = (b"\xff", (0, 146)) if kind == "dvs" else (b"\xff\xfc", (0, 11 << 2))
+    content = head + bytes([steps[0], 3, 0, 4, 0]) + silence + bytes([steps[1], 5, 0, 2, 0])
+    path = tmp_path / "a.es"
+    for cut in (0, 5):
+        path.write_bytes(content[: len(content) - cut])
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert len(read_events(path)) == 2 - cut // 5
+    for cut in (1, 4, 5 + len(silence) + 2):
+        path.write_bytes(content[:-cut])
+        with pytest.warns(UserWarning, match="a.es: ends within an event, it is truncated"):
+            assert len(read_events(path)) == (cut < 5)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

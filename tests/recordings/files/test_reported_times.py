@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -117,6 +118,20 @@ def test_a_shuffled_file_is_refused_when_it_is_opened(tmp_path):
         open_recording(path)
 
 
+@pytest.mark.parametrize("scale", [1, 50])
+def test_a_reversed_file_is_sorted_or_refused(tmp_path, scale):
+    """Of 0.2 s it is no more out of order than one that goes by frames; of 10 s it is."""
+    events = scene()
+    events["t"] *= scale
+    path = text(tmp_path / "a.txt", events[::-1])
+    if scale == 1:
+        with pytest.warns(UserWarning, match="1499 of 1500 events up to 0.199 s out of order"):
+            assert np.array_equal(read_events(path), events)
+        return
+    with pytest.raises(ValueError, match="times go backward from event to event, it must be sort"):
+        open_recording(path)
+
+
 def test_all_events_off_the_sensor_are_told(tmp_path):
     events = scene()
     events["x"], events["y"] = 320, 2
@@ -171,3 +186,41 @@ def test_reported_files_hold_the_scene(shared_data, name):
     found["t"] += before_us
     assert len(good) == 1500
     assert np.array_equal(np.sort(found), np.sort(good))
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("ms", 1e-3), ("ns", 1e3), ("us", 1.0), ("s", 1e-6)])
+def test_a_unit_in_the_name_of_the_times_holds_in_every_table(tmp_path, unit, scale):
+    """Times of a sparse recording, finer than a microsecond, from which it cannot be told."""
+    events, name = scene(), f"t_{unit}"
+    columns = {name: events["t"] * 100 * scale + 1e-7} | {key: events[key] for key in "xyp"}
+    kinds = [(key, column.dtype) for key, column in columns.items()]
+    table = np.array(list(zip(*columns.values(), strict=True)), kinds)
+    np.savez(tmp_path / "a.npz", **columns)
+    np.savez(tmp_path / "b.npz", events=table)
+    np.save(tmp_path / "a.npy", table)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for key, column in columns.items():
+            file[f"events/{key}"] = column
+    for path in ("a.npz", "b.npz", "a.npy", "a.h5"):
+        assert np.array_equal(quiet_read(tmp_path / path)["t"], events["t"] * 100), path
+
+
+def test_a_stated_unit_is_obeyed_before_one_in_a_name(tmp_path):
+    events = scene()
+    columns = {"t_ms": events["t"] * 1e-3} | {key: events[key] for key in "xyp"}
+    np.savez(tmp_path / "a.npz", **columns)
+    with pytest.warns(UserWarning, match="times in s give 200 s"):
+        found = read_events(tmp_path / "a.npz", options=ReadOptions(time_unit="s"))
+    assert np.array_equal(found["t"], events["t"] * 1000)
+
+
+@pytest.mark.parametrize("kind", [np.uint32, np.int32])
+def test_a_counter_that_goes_round_goes_on(tmp_path, kind):
+    events = scene()
+    start = 2**32 - 100_000 if kind is np.uint32 else 2**31 - 100_000
+    t = ((events["t"] + start) & 0xFFFFFFFF).astype(np.uint32).view(kind)
+    np.savez(tmp_path / "a.npz", t=t, **{key: events[key] for key in "xyp"})
+    with pytest.warns(UserWarning, match="its counter of 32 bits goes round, times go on"):
+        found = read_events(tmp_path / "a.npz")
+    assert np.array_equal(found["t"] - found["t"][0], events["t"] - events["t"][0])
+    assert len(found) == len(events)

@@ -62,6 +62,15 @@ TEXTS = {
     "ON and OFF": lambda e: "t x y p\n" + lines(e, p=lambda p: "ON" if p > 0 else "OFF"),
     "-1 and 1": lambda e: lines(e, p=int),
     "decimal commas": lambda e: lines(e, between=";", t=seconds).replace(".", ","),
+    "decimal commas between tabs": lambda e: lines(e, "txyp", "\t", t=seconds).replace(".", ","),
+    "several separators": lambda e: (
+        "# t x y p\n"
+        + "".join("{}, {}\t{}  {}\n".format(*r.split()) for r in lines(e).splitlines())
+    ),
+    "quotes": lambda e: (
+        '"t","x","y","p"\n' + lines(e, between='","').replace("\n", '"\n"').join('""')[:-2]
+    ),
+    "separators at the end": lambda e: "t,x,y,p,\n" + lines(e, between=",").replace("\n", ",\n"),
     "whole numbers with points": lambda e: lines(e, t=seconds, x=float, y=float, p=float),
     "more columns": lambda e: "n t x y p\n" + "".join(f"7 {s}\n" for s in lines(e).splitlines()),
     "no newline at the end": lambda e: lines(e).rstrip("\n"),
@@ -142,6 +151,20 @@ def test_a_cut_last_line_is_left_out_with_a_warning(tmp_path, events):
     with pytest.warns(UserWarning, match="last line is cut"):
         found = read_events(tmp_path / "a.txt")
     assert np.array_equal(found["x"], events["x"][:-1])
+
+
+@pytest.mark.parametrize("ending", ["txt", "npz"])
+@pytest.mark.parametrize("dtype", [np.int8, np.int64, np.float64])
+def test_polarity_of_three_values_is_refused(tmp_path, events, ending, dtype):
+    p = events["p"].astype(dtype)
+    p[::3] = 0
+    columns = {name: events[name] for name in "txy"} | {"p": p}
+    if ending == "npz":
+        np.savez(tmp_path / "a.npz", **columns)
+    else:
+        np.savetxt(tmp_path / "a.txt", np.stack([*columns.values()], 1), "%d", header="t x y p")
+    with pytest.raises(ValueError, match="polarity must be 0 and 1 or -1 and 1, got -1 and 0"):
+        read_events(tmp_path / f"a.{ending}")
 
 
 BAD_TEXTS = {
@@ -317,6 +340,12 @@ def test_a_stream_of_a_file_of_one_camera_is_refused(tmp_path, events):
     with pytest.raises(ValueError, match="stream must be null, as .* has one camera, got left"):
         read_events(tmp_path / "a.txt", options=ReadOptions(stream="left"))
     assert len(read_events(tmp_path / "a.txt", options=ReadOptions(stream=0))) == len(events)
+
+
+def test_a_format_of_a_file_that_is_not_raw_is_refused(tmp_path, events):
+    (tmp_path / "a.txt").write_text(lines(events))
+    with pytest.raises(ValueError, match="format must be null, as .* is no RAW file, got evt3"):
+        read_events(tmp_path / "a.txt", options=ReadOptions(format="evt3"))
 
 
 def test_a_folder_is_named_as_one(tmp_path):

@@ -56,9 +56,42 @@ def test_dates_tell_their_unit(unit, kind):
 def test_nanoseconds_are_not_taken_for_a_slow_recording():
     unit, line = find_unit(sampled(made_up(0.2, 7500)), "auto")
     assert unit == "ns" and "read as ns; if it is another, give time_unit=" in line
-    unit, line = find_unit(sampled(made_up(2.0, 1e6)), "auto")
+    unit, line = find_unit(sampled(made_up(2.0, 1e6) // 1000 * 1000), "auto")  # of a clock of us
     assert unit == "ns" and "times in ns give 2 s and 1e+06 events/s" in line
     assert "in us 2e+03 s" in line and "time_unit=" in line
+
+
+@pytest.mark.parametrize(("duration", "rate"), [(20.0, 300), (300.0, 1000), (60.0, 500)])
+def test_microseconds_of_a_slow_recording_are_not_taken_for_nanoseconds(duration, rate):
+    assert find_unit(sampled(in_unit(made_up(duration, rate), "us", 0, int)), "auto")[0] == "us"
+
+
+def test_fractions_finer_than_microseconds_are_told_of():
+    """Milliseconds with all digits of a float cannot be told from seconds."""
+    t = np.sort(np.random.default_rng(0).random(6000)) * 300
+    unit, line = find_unit(sampled(t), "auto")
+    assert unit == "s" and "in ms 0.3 s and 2e+04 events/s: read as s" in line
+
+
+@pytest.mark.parametrize(("bits", "duration"), [(24, 40.0), (31, 0.5), (32, 0.5)])
+@pytest.mark.parametrize("pieces", [1, 7])
+def test_a_counter_that_goes_round_is_seen(bits, duration, pieces):
+    t = in_unit(made_up(duration, 1e5), "us", 0, int) + 2**bits - 200_000
+    sample = sampled(t % 2**bits, pieces)
+    assert sample.wrap_bits == bits and find_unit(sample, "auto") == ("us", "")
+    assert sample.early_time_and_span()[1] == pytest.approx(duration * 1e6, rel=0.01)
+
+
+def test_a_single_wild_time_and_a_restart_are_no_counter_that_goes_round():
+    t = in_unit(made_up(0.5, 1e5), "us", 0, int)
+    wild = np.insert(t, len(t) // 2, 2**32 - 1)
+    assert sampled(wild).wrap_bits == sampled(np.concatenate([t, t])).wrap_bits == 0
+
+
+def test_times_that_are_all_equal_are_told_of():
+    assert find_unit(sampled(np.full(8000, 1.6e9 + 0.5)), "auto") == (
+        "s", "all or nearly all of 8000 times are equal",
+    )  # fmt: skip
 
 
 def test_what_is_stated_is_obeyed_and_told_of_where_absurd():

@@ -1,0 +1,79 @@
+"""Sensor sizes that are stated the wrong way round, by the user or not at all."""
+
+import warnings
+
+import h5py
+import numpy as np
+import pytest
+
+from src.recordings.files import open_recording, read_events, sources
+from tests.recordings.files.bags import Bag
+from tests.recordings.files.tables import write_events
+from tests.recordings.files.test_recording import made_up
+
+
+def write_swapped(folder, kind):
+    """Write events of 640x480 that state 480x640; return their path."""
+    events = made_up()
+    if kind == "h5":
+        with h5py.File(path := folder / "a.h5", "w") as file:
+            for name in "txyp":
+                file[f"events/{name}"] = events[name]
+            file.attrs["resolution"] = (640, 480)
+    elif kind == "bag":
+        events["t"] *= 1000
+        with Bag(path := folder / "a.bag", None) as bag:
+            bag.add_array("/dvs/events", events, size=(640, 480))
+    else:
+        rows = "".join(f"{t} {x} {y} {p > 0:d}\n" for t, x, y, p in events.tolist())
+        (path := folder / "a.txt").write_text(f"480 640\n{rows}")
+    return path
+
+
+@pytest.mark.parametrize("kind", ["h5", "bag", "txt"])
+def test_sides_the_wrong_way_round_are_exchanged(tmp_path, kind):
+    path = write_swapped(tmp_path, kind)
+    line = r"states a sensor of 480x640, its events fit 640x480: read as sensor_size=\[480,640\]"
+    for given in (None, (480, 640)):
+        with pytest.warns(UserWarning, match=line):
+            assert sources.find_sensor_size(path, given) == (480, 640)
+    with pytest.warns(UserWarning, match=line):
+        assert np.array_equal(read_events(path), made_up())
+
+
+def test_the_users_size_comes_before_the_files(tmp_path):
+    write_events(tmp_path / "a.raw", made_up(), width=640, height=480)
+    line = r"states a sensor of 640x480: read as sensor_size=\[500,700\]"
+    with pytest.warns(UserWarning, match=line):
+        assert sources.find_sensor_size(tmp_path / "a.raw", [500, 700]) == (500, 700)
+    with pytest.warns(UserWarning, match=line):
+        assert open_recording(tmp_path / "a.raw", (700, 500)).size == (700, 500)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert sources.find_sensor_size(tmp_path / "a.raw", [480, 640]) == (480, 640)
+
+
+def test_a_few_events_outside_exchange_nothing(tmp_path):
+    events = made_up()
+    events["x"], events["y"] = events["x"] % 300, events["y"] % 300
+    events["x"][:10] = 400
+    write_events(tmp_path / "a.npz", events, width=400, height=480)
+    with pytest.warns(UserWarning, match=r"10 of 2000 events outside 400x480, dropped; all fit "):
+        assert len(read_events(tmp_path / "a.npz")) == 1990
+
+
+@pytest.mark.parametrize(("outside", "is_refused"), [(999, False), (1000, True)])
+@pytest.mark.parametrize("ending", [".dat", ".npz"])
+def test_half_of_the_events_off_the_sensor_are_refused(tmp_path, ending, outside, is_refused):
+    events = made_up()
+    events["x"], events["y"] = np.where(np.arange(2000) < outside, 500, 3), 7
+    path = tmp_path / f"a{ending}"
+    write_events(path, events, width=640, height=480)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if not is_refused:
+            assert len(read_events(path, (400, 300))) == 1001
+            return
+        words = "1000 of 2000 events are off the 400x300 sensor, they need 501x8; is sensor_size="
+        with pytest.raises(ValueError, match=words):
+            read_events(path, (400, 300))
