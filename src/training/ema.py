@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 from lightning import LightningModule, Trainer
@@ -14,7 +15,8 @@ class WeightEMA(WeightAveraging):
 
     `decay`, in [0, 1): 0.999 remembers a thousand steps; the first steps count more, 9 / (10 +
     step).  Checkpoints hold the average as `state_dict` and the weights in training as
-    `current_model_state`.  Raises ValueError for another decay.
+    `current_model_state`, also those written during a validation, when the module has the average.
+    Raises ValueError for another decay.
     """
 
     def __init__(self, decay: float):
@@ -26,13 +28,26 @@ class WeightEMA(WeightAveraging):
             torch._foreach_lerp_(list(average), list(weights), rate)
 
         super().__init__(use_buffers=False, multi_avg_fn=update)
+        self.is_swapped = False  # the module has the average, and this the weights in training
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         self._device = trainer.strategy.root_device  # where the module is moved later
         super().setup(trainer, pl_module, stage)
 
+    def on_save_checkpoint(
+        self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        super().on_save_checkpoint(trainer, pl_module, checkpoint)
+        if self.is_swapped:
+            weights, average = checkpoint["state_dict"], checkpoint["current_model_state"]
+            checkpoint["state_dict"], checkpoint["current_model_state"] = average, weights
+
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Keep the weights in training, for checkpoints that are written after this."""
+
+    def _swap_models(self, pl_module: LightningModule) -> None:
+        super()._swap_models(pl_module)
+        self.is_swapped = not self.is_swapped
 
 
 @contextmanager

@@ -4,6 +4,7 @@ A fork server imports the entry points once; each run is forked from it, so that
 once and its signal handlers, limits and open files are its own.
 """
 
+import hashlib
 import json
 import multiprocessing
 import os
@@ -111,11 +112,14 @@ def run_entry_point(name: str, config: str) -> None:
 
 
 def outcome(run: Path) -> dict:
-    """Return the numbers of a whole run: its scores and, of a training, its weights."""
+    """Return the numbers of a whole run: its scores and, of a training, digests of its weights."""
     record = json.loads((run / "results.json").read_text())
     numbers = {"test": record["test"], "compared": record["compared"]}
     last = run / "checkpoints" / "last.ckpt"
     if last.is_file():
         state = torch.load(last, weights_only=True)["state_dict"]
-        numbers["weights"] = {name: value.tolist() for name, value in state.items()}
+        numbers["weights"] = {
+            name: hashlib.sha256(value.numpy().tobytes()).hexdigest()
+            for name, value in state.items()
+        }
     return numbers

@@ -1,6 +1,7 @@
 """Killed, terminated or interrupted anywhere, a run goes on to the numbers of one left alone."""
 
 import json
+import os
 import random
 import signal
 import time
@@ -90,6 +91,36 @@ def test_training_goes_on_to_the_same_numbers(tmp_path, alone, seed):
             folder = tmp_path / f"{seconds:.3f}"
             assert disturb_training(folder, stops, draw, seconds, tally) == numbers
             seconds /= 2
+
+
+def train_and_stop_in_validation(config: str, number: int) -> None:
+    """Run the door train; a signal comes while the first clip is validated at step 4."""
+    from src.training.reconstructor import Reconstructor
+
+    validate = Reconstructor.validation_step
+
+    def step(self, sample, batch_idx: int) -> None:
+        validate(self, sample, batch_idx)
+        if self.global_step == 4 and batch_idx == 0:
+            os.kill(os.getpid(), number)
+
+    Reconstructor.validation_step = step
+    run_entry_point("train", config)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_training_stopped_while_it_validates_goes_on_to_the_same_numbers(tmp_path, alone, number):
+    numbers, _ = alone  # in which the averaged weights stand in for those in training
+    tally = Tally("training, stopped while it validates")
+    with tally.run():
+        tally.injected += 1
+        first = training(tmp_path / "first", "data.val_clips=3")
+        run = Run(tmp_path / "log", train_and_stop_in_validation, first, int(number))
+        assert run.wait() != 0 and "stopped at step 4" in run.text(), run.text()
+        rest = training(tmp_path / "rest", "data.val_clips=3", f"ckpt={tmp_path / 'first'}")
+        again = Run(tmp_path / "rest.log", run_entry_point, "train", rest)
+        assert again.wait() == 0, again.text()
+        assert harness.outcome(tmp_path / "rest") == numbers
 
 
 def stop_and_repeat(
