@@ -18,6 +18,7 @@ from jaxtyping import Float
 from omegaconf import DictConfig
 from torch import Tensor
 
+from scripts.ship_weights import CARD_NOTE
 from src import models
 from src.app import build
 from src.app.compose import compose_config
@@ -187,10 +188,10 @@ def update_card(card: Path, protocol: str, commit: str, clips: list[dict[str, fl
     start, lines = f"| `{protocol}`", card.read_text().splitlines()
     what = f"{start}, by scripts.readme, at {commit} | {len(clips)} | "
     row = what + " | ".join(format_means(clips)) + " |"
-    place = next(n for n, line in enumerate(lines) if line.startswith((start, "In brackets")))
+    place = next(n for n, line in enumerate(lines) if line.startswith((start, CARD_NOTE)))
     if lines[place].startswith(start):
         lines[place] = row
-    else:  # at the end of the table, a blank line before what is said of its brackets
+    else:  # at the end of the table, a blank line before its note
         lines.insert(place - 1, row)
     results.write_text(card, "\n".join(lines) + "\n")
 

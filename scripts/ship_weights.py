@@ -24,6 +24,7 @@ from src.records import results
 from src.training.learning_curve import TRAINING_STATE
 
 LARGEST = 16 * 2**20  # bytes of a file
+CARD_NOTE = "Mean over clips (95 % bootstrap CI)."
 CURVE = "The curve jumps where a stage has other validation clips."
 
 
@@ -73,9 +74,8 @@ def _write_card(
     path: Path, name: str, network: torch.nn.Module, card: dict, tests: list[Path]
 ) -> Path:
     records = [json.loads((test / "results.json").read_text()) for test in tests]
-    configs = [OmegaConf.load(test / "config.yaml") for test in tests]
     drawn = path.with_suffix(".png").is_file()
-    text = describe(name, network, card, list(zip(records, configs, strict=True)), drawn)
+    text = describe(name, network, card, records, drawn)
     path.with_suffix(".md").write_text(text)
     return path
 
@@ -149,9 +149,12 @@ def seen(network: torch.nn.Module) -> str:
 
 
 def describe(
-    name: str, network: torch.nn.Module, card: dict, tests: list[tuple], drawn: bool
+    name: str, network: torch.nn.Module, card: dict, tests: list[dict], drawn: bool
 ) -> str:
-    """Return the model card as Markdown; `drawn`: there is a figure of the learning curve."""
+    """Return the model card as Markdown.
+
+    `tests`: records of src.eval; `drawn`: there is a figure of the learning curve.
+    """
     count = sum(parameter.numel() for parameter in network.parameters())
     lines = [
         f"# {name}",
@@ -165,9 +168,9 @@ def describe(
         *([f"![learning curve]({Path(name).name}.png)", "", CURVE, ""] if drawn else []),
         "| tested on | clips | " + " | ".join(metric.heading for metric in METRICS) + " |",
         "|---|---|" + "---|" * len(METRICS),
-        *(_tested(record, cfg) for record, cfg in tests),
+        *map(_tested, tests),
         "",
-        "In brackets: 95 % bootstrap CI of the mean over clips.",
+        CARD_NOTE,
         "",
         "Limits: simulated turbulence and sensor only, grey pictures, scenes in planar motion.",
         "",
@@ -175,10 +178,11 @@ def describe(
     return "\n".join(lines)
 
 
-def _tested(record: dict, cfg: DictConfig) -> str:
+def _tested(record: dict) -> str:
     scores = record["test"]
     cells = [_cell(metric, scores.get(metric.name)) for metric in METRICS]
-    what = f"{_scenes(cfg)}, {cfg.turbulence.atmosphere.severity} turbulence, at {record['git']}"
+    given = [o for o in record["asked"].get("overrides", []) if not o.startswith("scene.root=")]
+    what = f"`{' '.join(['python -m src.eval', *given])}`, at {record['git']}"
     return f"| {what} | {scores['clips']} | " + " | ".join(cells) + " |"
 
 

@@ -3,14 +3,16 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from omegaconf import DictConfig, ListConfig
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from src.app import entry_point
 from src.app.instantiate import as_dict
 from src.app.path_overrides import unquote_override
 from src.records import results, runs
 from src.reports import page, run_groups, tables, writers
+from src.reports.differences import build_difference_table, build_pair_table
 
 
 def report(cfg: DictConfig) -> list[tables.Table]:
@@ -26,6 +28,8 @@ def report(cfg: DictConfig) -> list[tables.Table]:
     published = as_dict(cfg.paper)
     candidates: list[tables.Table | None] = []
     scores: dict[str, tables.Table] = {}
+    pairs, columns = _list_pairs(cfg.pairs), _list_columns(cfg.columns)
+    differences: list[tables.Table] = []
     groups = []
     sweeps = dict.fromkeys([*(run.sweep for run in found), *(plan.sweep for plan in plans)])
     for name in sweeps:
@@ -41,17 +45,19 @@ def report(cfg: DictConfig) -> list[tables.Table]:
             tables.build_reference_methods_table(f"On the same clips{of}", keys, made),
         ]
         groups += made
+        if pairs:
+            differences.append(build_pair_table(f"Differences{of}", keys, made, pairs, columns))
+    candidates += differences
     if cfg.against:
         theirs = runs.find_runs(_list_folders(cfg.against))
         title_of = "Differences on the same clips"
-        candidates.append(tables.build_difference_table(title_of, found, theirs, published))
+        candidates.append(build_difference_table(title_of, found, theirs, published))
     shown = [table for table in candidates if table and table.rows]
     commands, figures = [plan.command for plan in plans], runs.find_charts_and_stress_maps(folders)
     printed, asked = shown, commands
-    if cfg.columns is not None:
-        chosen = [cfg.columns] if isinstance(cfg.columns, str) else list(cfg.columns)
+    if columns is not None:
         asked, full = [], [(name, table) for name, table in scores.items() if table.rows]
-        printed = [tables.select_columns(table, chosen, name) for name, table in full]
+        printed = differences or [tables.select_columns(t, columns, name) for name, t in full]
     text = writers.format_markdown(printed, asked)
     results.create_run_folder(out, entry_point.resolved_yaml(cfg))
     results.write_text(out / "report.md", text)
@@ -71,6 +77,20 @@ def _as_typed(plan: runs.SweepPlan) -> runs.SweepPlan:
     """Return a sweep without the quotes that its paths have for Hydra, as its runs name them."""
     jobs = [list(map(unquote_override, job)) for job in plan.jobs]
     return replace(plan, command=re.sub(r"'([\w.+/~-]+)'", r"\1", plan.command), jobs=jobs)
+
+
+def _list_columns(given: str | ListConfig | None) -> list[str] | None:
+    if given is None:
+        return None
+    return [given] if isinstance(given, str) else list(given)
+
+
+def _list_pairs(given: Any) -> list[tuple[str, str]]:
+    """Return `pairs`; ValueError where it is no list of two names each."""
+    pairs: Any = OmegaConf.to_container(given) if isinstance(given, ListConfig) else given or []
+    if not (isinstance(pairs, list) and all(isinstance(p, list) and len(p) == 2 for p in pairs)):
+        raise ValueError(f"pairs must be a list of pairs, [[A,B],[C,D]], got {pairs}")
+    return [(str(ours), str(theirs)) for ours, theirs in pairs]
 
 
 def _list_folders(given: str | ListConfig) -> list[Path]:

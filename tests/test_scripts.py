@@ -7,7 +7,7 @@ import torch
 
 from scripts import gallery, readme, surroundings, turbulence_map, widen_setnet
 from scripts.scales import missing
-from scripts.ship_weights import Given, recard, ship
+from scripts.ship_weights import CARD_NOTE, Given, recard, ship
 from src.app import build
 from src.metrics.table import METRICS
 from src.models import files
@@ -90,7 +90,7 @@ def test_weights_of_a_stage_are_shipped_with_the_card_of_a_run(tmp_path, monkeyp
 
 def test_scores_take_the_place_of_older_ones_on_a_card(tmp_path):
     card = tmp_path / "one.md"
-    card.write_text("| tested on |\n|---|\n\nIn brackets: the interval.\n")
+    card.write_text(f"| tested on |\n|---|\n\n{CARD_NOTE}\n")
     scored = {metric.name: 0.5 for metric in METRICS}
     readme.update_card(card, "data=test_photos", "abc", [scored])
     readme.update_card(card, "data=test_photos sensor=randomized", "abc", [scored])
@@ -98,7 +98,7 @@ def test_scores_take_the_place_of_older_ones_on_a_card(tmp_path):
     rows = card.read_text().splitlines()[2:]
     assert rows[0].startswith("| `data=test_photos`, by scripts.readme, at abc | 2 | 0.5")
     assert rows[1].startswith("| `data=test_photos sensor=randomized`") and "| 1 | 0.5" in rows[1]
-    assert rows[2:] == ["", "In brackets: the interval."]
+    assert rows[2:] == ["", CARD_NOTE]
 
 
 def test_rows_of_published_networks_that_are_not_scored_again_stay():

@@ -121,7 +121,7 @@ def _format_cell(table: Table, row: int, place: int) -> str:
     kind = "missing" if cell.text == "missing" else _column_kind(table, place)
     number, *std = format_cell(cell, table.columns[place]).split(" ± ")
     shown = escape(number) if cell.text or cell.mean is not None else "–"
-    shown = f"<b>{shown}</b>" if table.is_best(row, place) else shown
+    shown = f"<b>{shown}</b>" if table.is_bold(row, place) else shown
     shown += f" <small>± {std[0]}</small>" if cell.std is not None else ""
     sort = "" if cell.text else f' data-value="{"" if cell.mean is None else cell.mean!r}"'
     return f'<td class="{kind}"{sort}>{shown}</td>'

@@ -1,6 +1,4 @@
-"""Tables of groups of runs: scores and cost, by severity, networks on the same clips, differences
-of two sets of runs.
-"""
+"""Tables of groups of runs: scores and cost, by severity, networks on the same clips."""
 
 import math
 import statistics
@@ -8,7 +6,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from src.metrics.bootstrap import bootstrap_difference_interval
 from src.metrics.table import METRICS, Column
 from src.records.runs import Run
 from src.reports.run_groups import RunGroup, find_published
@@ -21,13 +18,15 @@ SPLIT_METRICS = ("lpips", "psnr_aligned", "temporal_jitter_px")  # of the table 
 class TableCell:
     """A mean over seeds with its sample standard deviation, None for one seed; or a text.
 
-    `published`: a published value, which stands in parentheses.
+    `published`: a published value, which stands in parentheses.  `interval`: of a difference, its
+    95 % CI.
     """
 
     mean: float | None = None
     std: float | None = None
     text: str = ""
     published: float | None = None
+    interval: tuple[float, float] | None = None
 
 
 @dataclass
@@ -45,6 +44,11 @@ class Table:
         """Add a row of the group's label and `cells`."""
         self.rows.append([*(TableCell(text=text) for text in group.label), *cells])
         self.groups.append(group)
+
+    def is_bold(self, number: int, place: int) -> bool:
+        """Return whether a cell is the best of its column, or a difference whose CI excludes 0."""
+        interval = self.rows[number][place].interval
+        return self.is_best(number, place) if interval is None else interval[0] * interval[1] > 0
 
     def is_best(self, number: int, place: int) -> bool:
         """Return whether row `number` is the best in column `place`, as printed, of the rows with
@@ -166,38 +170,6 @@ def build_reference_methods_table(
             cells = [_mean_over_seeds(group.runs, _score(c.name, name)) for c in metrics]
             table.add_row(group, [TableCell(text=name or "trained"), *cells])
     return table if table.rows else None
-
-
-def build_difference_table(
-    title: str, ours: Sequence[Run], theirs: Sequence[Run], published: Mapping[str, Any]
-) -> Table:
-    """Return the means of `ours` and `theirs`, a run per seed, and their difference with the 95 %
-    bootstrap CI (seeds and clips resampled, clips in pairs); beside it the published difference.
-
-    Raises ValueError where the clips of all runs are not the same.
-    """
-    names = {tuple(clip["name"] for clip in run.clips) for run in [*ours, *theirs]}
-    if len(names) != 1 or () in names:
-        raise ValueError(f"run and against must hold the same clips, got {len(names)} sets of them")
-    heads = ("metric", "ours", "theirs", "ours - theirs", "95 % bootstrap CI", "published")
-    table = Table(title, [Column(head, head) for head in heads], [], 1)
-    rows = [find_published(side[0], published) for side in (ours, theirs)]
-    for metric in list_metrics([*ours, *theirs]):
-        if not all(metric.name in clip for run in [*ours, *theirs] for clip in run.clips):
-            continue
-        sides = [[[float(clip[metric.name]) for clip in run.clips] for run in side]
-                 for side in (ours, theirs)]  # fmt: skip
-        left, right = (sum(map(sum, side)) / sum(map(len, side)) for side in sides)
-        low, high = bootstrap_difference_interval(sides[0], sides[1])
-        first, second = (row.get(metric.name) for row in rows)
-        digits = metric.digits + 1
-        texts = [metric.heading, *(f"{value:.{digits}f}" for value in (left, right))]
-        texts += [f"{left - right:+.{digits}f}", f"{low:+.{digits}f} to {high:+.{digits}f}"]
-        change = None if first is None or second is None else first - second
-        texts.append("-" if change is None else f"{change:+.{digits}f}")
-        table.rows.append([TableCell(text=text) for text in texts])
-    table.note = f"{len(ours[0].clips)} clips; {len(ours)} runs against {len(theirs)}."
-    return table
 
 
 def _mean_over_seeds(

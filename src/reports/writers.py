@@ -20,7 +20,7 @@ def format_markdown(tables: Sequence[Table], commands: Sequence[str] = ()) -> st
             texts = []
             for place, cell in enumerate(row):
                 text = _escape(format_cell(cell, table.columns[place]))
-                texts.append(f"**{text}**" if table.is_best(number, place) else text)
+                texts.append(f"**{text}**" if table.is_bold(number, place) else text)
             lines.append(_format_line(texts))
         parts += ["\n".join(lines), *([_escape(table.note)] if table.note else [])]
     return "\n\n".join(parts) + "\n"
@@ -33,10 +33,13 @@ def format_csv_tables(tables: Sequence[Table]) -> str:
         heads, lines = ["table"], [list[object]([table.title]) for _ in table.rows]
         for column, *cells in zip(table.columns, *table.rows, strict=True):
             with_std = any(cell.std is not None for cell in cells)
-            heads += [column.name, f"{column.name}_std"] if with_std else [column.name]
+            with_interval = any(cell.interval is not None for cell in cells)
+            heads += [column.name, *([f"{column.name}_std"] if with_std else [])]
+            heads += [f"{column.name}_{end}" for end in ("low", "high")] if with_interval else []
             for line, cell in zip(lines, cells, strict=True):
                 line.append(cell.text if cell.mean is None else cell.mean)
                 line += ["" if cell.std is None else cell.std] if with_std else []
+                line += cell.interval or ("", "") if with_interval else []
         text += results.format_csv(heads, lines)
     return text
 
@@ -62,12 +65,15 @@ def replace_section(document: Path, name: str, text: str) -> None:
 
 def format_cell(cell: TableCell, column: Column) -> str:
     """Return a cell as people read it: a text, a mean, a mean ± its std, or a dash; in parentheses
-    what was published.
+    what was published.  A difference has a sign and, in parentheses, its CI.
     """
     if cell.text:
         return cell.text
     if cell.mean is None:
         return "-"
+    if cell.interval is not None:
+        low, high = (f"{value:+.{column.digits}f}" for value in cell.interval)
+        return f"{cell.mean:+.{column.digits}f} ({low} to {high})"
     number = f"{cell.mean:,.{column.digits}f}"
     number += "" if cell.std is None else f" ± {cell.std:.{column.digits}f}"
     published = "" if cell.published is None else round_decimal(cell.published, column.digits)

@@ -48,10 +48,15 @@ def test_a_former_key_in_a_config_file_is_refused():
                                    " default?"),
     ],
 )  # fmt: skip
-def test_a_key_or_choice_that_is_none_is_told_the_nearest(name, override, said):
+def test_a_key_or_choice_that_is_none_names_the_nearest(name, override, said):
     with pytest.raises(ValueError) as caught:
         compose_config(name, override)
     assert str(caught.value).startswith(said) and "provider" not in str(caught.value)
+
+
+def test_a_key_that_only_the_default_choice_has_is_no_neighbour_of_itself():
+    with pytest.raises(ValueError, match="^scene.root is no key of the chosen scene; --cfg job"):
+        compose_config("eval", "scene=targets", "scene.root=x")
 
 
 @pytest.mark.parametrize("entry_point", ENTRY_POINTS)

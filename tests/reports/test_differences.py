@@ -3,8 +3,12 @@
 import pytest
 
 from src.records import runs
-from src.reports.tables import build_difference_table
+from src.report import report
+from src.reports import run_groups
+from src.reports.differences import build_difference_table, build_pair_table
+from src.reports.writers import format_csv_tables, format_markdown
 from tests.reports.runs import SCORES, write_run
+from tests.test_train import config
 
 PAPER = {"source": "paper", "rows": [
     {"when": {"experiment": "lf3x3"}, "lpips": 0.43}, {"when": {"experiment": "one"}, "lpips": 0.46}
@@ -33,3 +37,68 @@ def test_differences_need_the_same_clips(tmp_path):
         build_difference_table(
             "", found(tmp_path, "a", {"a": 1.0}), found(tmp_path, "b", {"b": 1.0}), PAPER
         )
+
+
+def sweep(folder) -> list[runs.Run]:
+    """Runs of two methods, each in two severities, on two clips."""
+    lpips = {"lf3x3": (0.30, 0.42), "one": (0.35, 0.40)}
+    for method, values in lpips.items():
+        for severity, more in (("weak", 0.0), ("strong", 0.1)):
+            clips = [SCORES | {"name": f"c{n}", "lpips": v + more} for n, v in enumerate(values)]
+            choices = {"method": method, "turbulence": severity, "experiment": "x"}
+            write_run(folder / method / severity, "x", choices=choices, clips=clips, task="eval")
+    return runs.find_runs([folder])
+
+
+def test_pairs_of_a_sweep_are_subtracted_clip_by_clip(tmp_path):
+    keys, groups = run_groups.group_runs(sweep(tmp_path))
+    assert keys == ("method", "turbulence")
+    table = build_pair_table("Pairs", keys, groups, [("lf3x3", "one")], ["lpips", "ssim"])
+    assert {row[0].text for row in table.rows} == {"weak", "strong"}
+    assert {row[1].text for row in table.rows} == {"lf3x3 − one"}
+    assert table.rows[0][2].mean == pytest.approx(-0.015)
+    assert table.rows[0][2].interval == pytest.approx((-0.05, 0.02))
+    text = format_markdown([table])
+    assert "| -0.015 (-0.050 to +0.020) | +0.000 (+0.000 to +0.000) |" in text
+    assert "2 test clips; mean (95 % bootstrap CI)" in text
+    heads, first, *_ = format_csv_tables([table]).splitlines()
+    assert heads == "table,turbulence,difference,lpips,lpips_low,lpips_high,ssim,ssim_low,ssim_high"
+    assert first.startswith("Pairs,")
+
+
+def test_a_difference_whose_interval_excludes_zero_is_bold(tmp_path):
+    keys, groups = run_groups.group_runs(sweep(tmp_path))
+    table = build_pair_table("Pairs", keys, groups, [("weak", "strong")], ["lpips"])
+    assert "| lf3x3 | weak − strong | **-0.100 (-0.100 to -0.100)** |" in format_markdown([table])
+
+
+@pytest.mark.parametrize(
+    ("pair", "columns", "message"),
+    [
+        (("lf3x3", "two"), None, "pairs must be two of the runs' settings"),
+        (("lf3x3", "weak"), None, "pairs must be two of the runs' settings"),
+        (("lf3x3", "one"), ["ssmi"], "columns must be of lpips, ssim"),
+    ],
+)
+def test_a_pair_or_a_column_that_is_none_is_refused(tmp_path, pair, columns, message):
+    keys, groups = run_groups.group_runs(sweep(tmp_path))
+    with pytest.raises(ValueError, match=message):
+        build_pair_table("", keys, groups, [pair], columns)
+
+
+def test_the_report_of_a_sweep_writes_its_pairs_into_a_document(tmp_path):
+    sweep(tmp_path / "runs")
+    notes = tmp_path / "notes.md"
+    notes.write_text("<!-- report:severity -->\nformer\n<!-- end:severity -->\n")
+    given = [f"run={tmp_path}/runs", "pairs=[[lf3x3,one]]", "columns=lpips", "title=severity"]
+    report(config("report", tmp_path / "out", *given, f"into={notes}"))
+    text = notes.read_text()
+    assert "| weak | lf3x3 − one | -0.015 (-0.050 to +0.020) |" in text and "former" not in text
+    assert "SSIM" not in text
+
+
+@pytest.mark.parametrize("pairs", ["[lf3x3,one]", "lf3x3", "[[lf3x3]]"])
+def test_pairs_that_are_none_are_refused(tmp_path, pairs):
+    sweep(tmp_path / "runs")
+    with pytest.raises(ValueError, match="pairs must be a list of pairs"):
+        report(config("report", tmp_path / "out", f"run={tmp_path}/runs", f"pairs={pairs}"))
