@@ -9,6 +9,8 @@ from src.app import benchmark, build, entry_point, hardware, simulation
 from src.figures import samples
 from src.records import results
 
+SAMPLE_CLIPS = 2  # the first test clips are drawn as GIF and slices
+
 
 def evaluate(cfg: DictConfig) -> dict:
     """Score the network of `ckpt` or `baseline` on the test clips, write `results.json`.
@@ -23,7 +25,8 @@ def evaluate(cfg: DictConfig) -> dict:
     data = build.build_data_module(cfg, splits=("test",), optics=simulation.select_optics(cfg, net))
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     row = build.test_method(cfg, build.method_name(cfg), net, data, build.build_metrics(cfg))
-    samples.write_samples(run / "samples", net, data.pipelines["test"])
+    centre = data.pipelines["test"].optics.centre
+    samples.write_samples(run / "samples", net, data.test_samples(SAMPLE_CLIPS), centre)
     return results.write_and_print_results(
         run, entry_point.resolved_yaml(cfg), [row], **entry_point.run_metadata(cfg, start)
     )

@@ -7,6 +7,7 @@ from typing import TypeVar
 import lightning
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from lightning.pytorch.callbacks import ProgressBar
 from omegaconf import DictConfig
 from torch import nn
@@ -22,7 +23,11 @@ from src.app.instantiate import (
     instantiate_node,
     read_user_packages,
 )
-from src.app.simulation import build_large_crop_stream, build_pipeline
+from src.app.simulation import (
+    build_large_crop_stream,
+    build_pipeline,
+    describe_test_conditions,
+)
 from src.losses.terms import TrainingLoss
 from src.metrics.video_metrics import VideoMetrics
 from src.models.backward_warmup import BackwardWarmup
@@ -37,6 +42,7 @@ from src.training.disk_cache import CacheFillerProcess, DiskClipCache
 from src.training.ema import WeightEMA
 from src.training.progress import TrainingProgress
 from src.training.reconstructor import PostprocessorTraining, Reconstructor
+from src.training.sample_store import SampleStore
 from src.training.schedule import TrainingClock
 from src.training.step_guard import StepGuard
 from src.training.teachers import TeacherEnsemble
@@ -44,6 +50,7 @@ from src.training.teachers import TeacherEnsemble
 DATA_OPTIONS = (
     "batch_size", "batch_reuse", "epoch_clips", "val_clips", "test_clips", "workers", "simulate_on",
 )  # fmt: skip
+SWEEP_STORE = SampleStore()  # of the jobs of a sweep that run in this process
 SHIPPED_METRIC_KEYS = ("lpips", "resolution_scale")
 Trainable = EventToVideoNetwork | FramePostprocessor
 Method = TypeVar("Method", bound=VideoMethod)
@@ -63,6 +70,8 @@ def build_data_module(
     streams = [*([large.pipeline] if large else []), train]  # the few large clips first
     caches = [stream.cache for stream in streams if isinstance(stream, CachedPipeline)]
     on_disk = [cache for cache in caches if isinstance(cache, DiskClipCache)]
+    in_sweep = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+    test = pipelines.get("test")
     return LightFieldData(
         pipelines,
         build_part(cfg, "augment") if train else None,
@@ -70,6 +79,8 @@ def build_data_module(
         seed=cfg.seed,
         filler=CacheFillerProcess(*on_disk) if on_disk else None,
         large=large,
+        test_store=SWEEP_STORE if in_sweep else None,
+        test_conditions=describe_test_conditions(cfg, test.optics) if in_sweep and test else "",
         teachers=build_teachers(cfg, train.optics.views) if train and cfg.get("teachers") else None,
     )
 

@@ -20,6 +20,7 @@ from src.training.batch_sampler import LargeCropStream
 from src.training.clip_cache import CachedPipeline, ClipCache, DeviceClipCache
 from src.training.disk_cache import DiskClipCache, hash_file_lists
 
+NO_CLIPS = ("test_clips", "workers")  # keys of `data` that test clips do not follow from
 DEVICE_CACHES: dict[str, DeviceClipCache] = {}  # those of this process, by all that makes them
 
 
@@ -56,6 +57,16 @@ def build_pipeline(cfg: DictConfig, split: str, optics: Optics | None = None) ->
         shuffle_views=cfg.turbulence.get("views_correlation", "independent") == "independent",
         clips=clips,
     )
+
+
+def describe_test_conditions(cfg: DictConfig, optics: Optics) -> str:
+    """Return all that makes the test clips of this config, as seen by `optics`."""
+    names = ("scene", "turbulence", "sensor", "optics", "data")
+    parts: dict[str, Any] = {name: as_dict(cfg[name]) for name in names}
+    parts["data"] = {key: value for key, value in parts["data"].items() if key not in NO_CLIPS}
+    given = {key: cfg.get(key) for key in ("fps", "bins", "seed")}
+    files = {"files": hash_file_lists(parts), "measured": _read_measured(parts["turbulence"])}
+    return json.dumps([parts, given, files, optics.positions], sort_keys=True, default=str)
 
 
 def build_clip_cache(cfg: DictConfig) -> ClipCache:
@@ -109,17 +120,22 @@ def build_large_crop_stream(
 def _clip_inputs(cfg: DictConfig, optics: Optics) -> dict:
     """Return all that makes the clips of a cache, as plain data."""
     parts = {name: as_dict(cfg[name]) for name in ("scene", "turbulence")}
-    measured = parts["turbulence"].get("measured")  # a file; what it holds makes the clips
     windows, substeps = cfg.data.cache_windows, cfg.data.substeps
     return parts | {
         "optics": optics.positions,
         "files": hash_file_lists(parts),
-        "measured": Path(measured).read_text() if measured else None,
+        "measured": _read_measured(parts["turbulence"]),
         "decodes_srgb": decodes_srgb(cfg),
         "seed": cfg.seed,
         "rates": _frame_rates(cfg, "train"),
         "frames": {"windows": windows, "substeps": substeps, "crop": cfg.data.cache_crop},
     }
+
+
+def _read_measured(turbulence: dict) -> str | None:
+    """Return what the file of `turbulence.measured` holds, which makes the clips."""
+    measured = turbulence.get("measured")
+    return Path(measured).read_text() if measured else None
 
 
 def _build_uncached_pipeline(

@@ -1,5 +1,6 @@
 """Pictures of a run: films of panels side by side (GIF, PNG), space-time slices, and the views."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from src.models.network import VideoMethod
 from src.recordings.output import resize_picture, round_to_uint8
 from src.records.atomic import atomic_path
 from src.sim.optics import Optics
-from src.sim.pipeline import Pipeline, simulate
+from src.sim.pipeline import Sample
 
 PLAYBACK_FPS = 15.0
 TITLE_PX = 18  # height of the strip with a panel's name
@@ -29,21 +30,22 @@ Video = Float[np.ndarray, "_frames _h _w *_rgb"]
 
 @torch.no_grad()
 def write_samples(
-    folder: Path, network: VideoMethod, pipeline: Pipeline, clips: int = 2
+    folder: Path, network: VideoMethod, samples: Iterable[Sample], centre: int
 ) -> list[Path]:
     """Write `clip<i>.gif` (clean, centre view, events, reconstruction) and `clip<i>_slice.png`
-    (x-t slices of the middle row) of the first `clips` clips; return the paths.
+    (x-t slices of the middle row) of sample i; return the paths.
+
+    `centre`: index of the centre view.
     """
     folder.mkdir(parents=True, exist_ok=True)
     network.eval()
     paths = []
-    for index in range(clips):
-        sample = simulate(pipeline, [index])
+    for index, sample in enumerate(samples):
         parts = {"clean": sample.target, "centre view": sample.turbulent}
         parts["reconstruction"] = network.reconstruct_clip(sample).float().clamp(0, 1)
         videos = {name: part[0, :, 0].cpu().numpy() for name, part in parts.items()}
         gif, slices = folder / f"clip{index}.gif", folder / f"clip{index}_slice.png"
-        counts = sample.voxels[0, :, pipeline.optics.centre].sum(1).cpu().numpy()
+        counts = sample.voxels[0, :, centre].sum(1).cpu().numpy()
         events = {EVENTS_TITLE: render_events(counts), "reconstruction": videos["reconstruction"]}
         first = {name: videos[name] for name in ("clean", "centre view")}
         write_animation(gif, join_panels(first | events), PLAYBACK_FPS)

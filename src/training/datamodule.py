@@ -1,6 +1,6 @@
 """Batches for training, validation and test, simulated on the fly: number -> draw -> sample."""
 
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -9,11 +9,12 @@ from lightning import LightningDataModule, Trainer
 from torch.utils.data import DataLoader
 
 from src.sim import noise
-from src.sim.pipeline import ClipParameters, Pipeline, Sample, concatenate_samples
+from src.sim.pipeline import ClipParameters, Pipeline, Sample, concatenate_samples, simulate
 from src.training.augment import Augment
 from src.training.batch_sampler import DrawDataset, LargeCropStream, SampleId, StepSampler
 from src.training.device_prefetch import DevicePrefetcher
 from src.training.disk_cache import CacheFillerProcess, prepare_worker_process
+from src.training.sample_store import SampleStore, StoredSamples
 from src.training.teachers import TeacherEnsemble
 
 
@@ -28,6 +29,8 @@ class LightFieldData(LightningDataModule):
     `filler`: fills caches on a disk in the background of a training.
     `teachers`: their frames of the training clips are a part of these.
     `large`: a second stream of training batches, of larger crops, spread evenly among the first.
+    `test_store`: keeps test clips for the next network, also of another data module where it has
+    the same `test_conditions`, which name all that makes the clips; None: a store of its own.
     """
 
     trainer: Trainer  # set by Lightning before anything here is called
@@ -48,6 +51,8 @@ class LightFieldData(LightningDataModule):
         filler: CacheFillerProcess | None = None,
         teachers: TeacherEnsemble | None = None,
         large: LargeCropStream | None = None,
+        test_store: SampleStore | None = None,
+        test_conditions: str = "",
     ):
         super().__init__()
         if simulate_on not in ("worker", "device"):
@@ -61,6 +66,8 @@ class LightFieldData(LightningDataModule):
         self.batch_size, self.batch_reuse, self.epoch_clips = batch_size, batch_reuse, epoch_clips
         self.val_clips, self.test_clips = val_clips, test_clips
         self.workers, self.simulate_on = workers, simulate_on
+        self.test_store = SampleStore() if test_store is None else test_store
+        self.test_conditions = test_conditions
         self.simulators: dict[str, BatchSimulator] = {}  # on the training device
 
     def setup(self, stage: str) -> None:
@@ -99,8 +106,21 @@ class LightFieldData(LightningDataModule):
     def val_dataloader(self) -> DataLoader:
         return self._loader("val", sampler=[SampleId(k, k) for k in range(self.val_clips)])
 
-    def test_dataloader(self) -> DataLoader:
-        return self._loader("test", sampler=[SampleId(k, k) for k in range(self.test_clips)])
+    def test_dataloader(self) -> StoredSamples:
+        return self._store_test(
+            self.test_clips, lambda missing: self._loader("test", sampler=missing)
+        )
+
+    def test_samples(self, count: int) -> StoredSamples:
+        """Return the first `count` test clips on the CPU, without a trainer."""
+        pipeline = self.pipelines["test"]
+        return self._store_test(
+            count, lambda missing: (simulate(pipeline, [sample.clip]) for sample in missing)
+        )
+
+    def _store_test(self, count: int, make: Callable[[list[SampleId]], Iterable]) -> StoredSamples:
+        ids = [SampleId(k, k) for k in range(count)]
+        return StoredSamples(ids, self.test_conditions, self.test_store, make)
 
     def validation_samples(self) -> Iterator[Sample]:
         """Yield the validation clips on the training device, within a training too."""
