@@ -25,8 +25,7 @@ def evaluate(cfg: DictConfig) -> dict:
     data = build.build_data_module(cfg, splits=("test",), optics=simulation.select_optics(cfg, net))
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     row = build.test_method(cfg, build.method_name(cfg), net, data, build.build_metrics(cfg))
-    centre = data.pipelines["test"].optics.centre
-    samples.write_samples(run / "samples", net, data.test_samples(SAMPLE_CLIPS), centre)
+    samples.write_samples(run / "samples", net, data.test_samples(SAMPLE_CLIPS))
     return results.write_and_print_results(
         run, entry_point.resolved_yaml(cfg), [row], **entry_point.run_metadata(cfg, start)
     )

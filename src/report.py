@@ -28,7 +28,7 @@ def report(cfg: DictConfig) -> list[tables.Table]:
     published = as_dict(cfg.paper)
     candidates: list[tables.Table | None] = []
     scores: dict[str, tables.Table] = {}
-    pairs, columns = _list_pairs(cfg.pairs), _list_columns(cfg.columns)
+    pairs, columns = _list_pairs(cfg.pairs), cfg.columns and _list_texts(cfg.columns)
     differences: list[tables.Table] = []
     groups = []
     sweeps = dict.fromkeys([*(run.sweep for run in found), *(plan.sweep for plan in plans)])
@@ -79,12 +79,6 @@ def _as_typed(plan: runs.SweepPlan) -> runs.SweepPlan:
     return replace(plan, command=re.sub(r"'([\w.+/~-]+)'", r"\1", plan.command), jobs=jobs)
 
 
-def _list_columns(given: str | ListConfig | None) -> list[str] | None:
-    if given is None:
-        return None
-    return [given] if isinstance(given, str) else list(given)
-
-
 def _list_pairs(given: Any) -> list[tuple[str, str]]:
     """Return `pairs`; ValueError where it is no list of two names each."""
     pairs: Any = OmegaConf.to_container(given) if isinstance(given, ListConfig) else given or []
@@ -94,7 +88,11 @@ def _list_pairs(given: Any) -> list[tuple[str, str]]:
 
 
 def _list_folders(given: str | ListConfig) -> list[Path]:
-    return [Path(str(folder)) for folder in (given if isinstance(given, ListConfig) else [given])]
+    return list(map(Path, _list_texts(given)))
+
+
+def _list_texts(given: str | ListConfig) -> list[str]:
+    return list(map(str, given)) if isinstance(given, ListConfig) else [str(given)]
 
 
 if __name__ == "__main__":

@@ -58,8 +58,8 @@ def train(cfg: DictConfig) -> dict:
     trained = build.test_method(cfg, cfg.name, module.method, data, module.metrics)
     references[cfg.reference_baseline.name] = build_part(cfg, "reference_baseline.method")
     others = [build.test_method(cfg, *o, data, module.metrics) for o in references.items()]
-    drawn = data.test_samples(cfg.sample_clips), data.pipelines["test"].optics.centre
-    pictures = samples.write_samples(run / "samples", module.method, *drawn)
+    drawn = data.test_samples(cfg.sample_clips)
+    pictures = samples.write_samples(run / "samples", module.method, drawn)
     rows, facts = [trained, before, *others], entry_point.run_metadata(cfg, start)
     note = results.describe_score_difference(trained, before)
     config = entry_point.resolved_yaml(cfg)

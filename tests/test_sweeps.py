@@ -68,7 +68,7 @@ def test_every_job_composes_and_the_last_runs(path, tmp_path, weights):
     assert sweep["defaults"][-1] == "_self_" and sweep["hydra"]["mode"] == "MULTIRUN"
     assert "sweep" not in sweep["hydra"]  # the folder follows from the name: conf/hydra
     found = jobs(path)
-    assert len(found) == len({tuple(job) for job in found}) >= 2
+    assert len(found) == len({tuple(job) for job in found}) >= 3
     for override in {override for job in found for override in job}:
         composed(path, tmp_path, override)
     tiny, work = {

@@ -14,7 +14,7 @@ from src.figures.comparison import VideoRow, draw_comparison
 from src.models.network import VideoMethod
 from src.recordings.output import resize_picture, round_to_uint8
 from src.records.atomic import atomic_path
-from src.sim.optics import Optics
+from src.sim.optics import Optics, layout, most_central_view_index
 from src.sim.pipeline import Sample
 
 PLAYBACK_FPS = 15.0
@@ -29,13 +29,9 @@ Video = Float[np.ndarray, "_frames _h _w *_rgb"]
 
 
 @torch.no_grad()
-def write_samples(
-    folder: Path, network: VideoMethod, samples: Iterable[Sample], centre: int
-) -> list[Path]:
+def write_samples(folder: Path, network: VideoMethod, samples: Iterable[Sample]) -> list[Path]:
     """Write `clip<i>.gif` (clean, centre view, events, reconstruction) and `clip<i>_slice.png`
     (x-t slices of the middle row) of sample i; return the paths.
-
-    `centre`: index of the centre view.
     """
     folder.mkdir(parents=True, exist_ok=True)
     network.eval()
@@ -45,6 +41,8 @@ def write_samples(
         parts["reconstruction"] = network.reconstruct_clip(sample).float().clamp(0, 1)
         videos = {name: part[0, :, 0].cpu().numpy() for name, part in parts.items()}
         gif, slices = folder / f"clip{index}.gif", folder / f"clip{index}_slice.png"
+        positions = sample.positions or layout(sample.voxels.shape[2])
+        centre = most_central_view_index(positions)
         counts = sample.voxels[0, :, centre].sum(1).cpu().numpy()
         events = {EVENTS_TITLE: render_events(counts), "reconstruction": videos["reconstruction"]}
         first = {name: videos[name] for name in ("clean", "centre view")}

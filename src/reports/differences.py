@@ -1,6 +1,7 @@
 """Tables of differences on the same clips: of two sets of runs, and of pairs of a sweep's runs."""
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from statistics import fmean
 from typing import Any
 
@@ -8,7 +9,7 @@ from src.metrics.bootstrap import bootstrap_difference_interval
 from src.metrics.table import Column
 from src.records.runs import Run
 from src.reports.run_groups import RunGroup, find_published
-from src.reports.tables import Table, TableCell, list_metrics
+from src.reports.tables import Table, TableCell, check_columns, list_metrics
 
 
 def build_difference_table(
@@ -19,19 +20,15 @@ def build_difference_table(
 
     Raises ValueError where the clips of all runs are not the same.
     """
-    names = {tuple(clip["name"] for clip in run.clips) for run in [*ours, *theirs]}
-    if len(names) != 1 or () in names:
-        raise ValueError(f"run and against must hold the same clips, got {len(names)} sets of them")
+    _check_clips("run and against", ours, theirs)
     heads = ("metric", "ours", "theirs", "ours - theirs", "95 % bootstrap CI", "published")
     table = Table(title, [Column(head, head) for head in heads], [], 1)
     rows = [find_published(side[0], published) for side in (ours, theirs)]
     for metric in list_metrics([*ours, *theirs]):
-        if not all(metric.name in clip for run in [*ours, *theirs] for clip in run.clips):
+        compared = _compare(ours, theirs, metric.name)
+        if compared is None:
             continue
-        sides = [[[float(clip[metric.name]) for clip in run.clips] for run in side]
-                 for side in (ours, theirs)]  # fmt: skip
-        left, right = (sum(map(sum, side)) / sum(map(len, side)) for side in sides)
-        low, high = bootstrap_difference_interval(sides[0], sides[1])
+        left, right, (low, high) = compared
         first, second = (row.get(metric.name) for row in rows)
         digits = metric.digits + 1
         texts = [metric.heading, *(f"{value:.{digits}f}" for value in (left, right))]
@@ -62,19 +59,21 @@ def build_pair_table(
         raise ValueError(f"pairs must be of one setting, got {', '.join(keys[k] for k in places)}")
     finished = {group.label: group.runs for group in groups if group.runs}
     rest = dict.fromkeys((*label[:place], *label[place + 1 :]) for label in finished)
-    columns = [*(Column(key, key) for key in keys), *metrics]
-    columns[place : place + 1] = []
-    columns.insert(len(keys) - 1, Column("difference", "difference"))
-    table, clips = Table(title, columns, [], len(keys)), set()
+    heads = (*keys[:place], *keys[place + 1 :], "difference")
+    table = Table(title, [*(Column(head, head) for head in heads), *metrics], [], len(heads))
+    clips = set()
     for others in rest:
         for pair in pairs:
-            sides = [finished.get((*others[:place], name, *others[place:])) for name in pair]
-            if sides[0] is None or sides[1] is None:
+            labels = [(*others[:place], name, *others[place:]) for name in pair]
+            if not finished.keys() >= set(labels):
                 continue
+            ours, theirs = (finished[label] for label in labels)
+            _check_clips("pairs", ours, theirs)
             texts = [*others, " − ".join(pair)]
-            cells = [_subtract(sides[0], sides[1], metric.name) for metric in metrics]
+            compared = [_compare(ours, theirs, metric.name) for metric in metrics]
+            cells = [TableCell(c[0] - c[1], interval=c[2]) if c else TableCell() for c in compared]
             table.rows.append([*(TableCell(text=text) for text in texts), *cells])
-            clips.add(len(sides[0][0].clips))
+            clips.add(len(ours[0].clips))
     counts = " or ".join(map(str, sorted(clips)))
     table.note = f"{counts} test clips; mean (95 % bootstrap CI); bold: the CI excludes zero."
     return table
@@ -82,10 +81,7 @@ def build_pair_table(
 
 def _choose_metrics(groups: Sequence[RunGroup], names: Sequence[str] | None) -> list[Column]:
     present = list_metrics(run for group in groups for run in group.runs)
-    for name in names or ():
-        if name not in [metric.name for metric in present]:
-            listed = ", ".join(metric.name for metric in present)
-            raise ValueError(f"columns must be of {listed}, got {name}")
+    check_columns(names or (), [metric.name for metric in present])
     return [metric for metric in present if names is None or metric.name in names]
 
 
@@ -99,14 +95,23 @@ def _find_key_of_pair(groups: Sequence[RunGroup], pair: tuple[str, str]) -> int:
     raise ValueError(f"pairs must be two of the runs' settings ({listed}), got {list(pair)}")
 
 
-def _subtract(ours: Sequence[Run], theirs: Sequence[Run], metric: str) -> TableCell:
-    """Return the mean difference of a metric; empty where a clip has none."""
-    clips = {tuple(clip["name"] for clip in run.clips) for run in [*ours, *theirs]}
-    if len(clips) != 1:
-        raise ValueError(f"pairs must have been tested on the same clips, got {len(clips)} sets")
+def _check_clips(keys: str, ours: Sequence[Run], theirs: Sequence[Run]) -> None:
+    """Raise ValueError, beginning with the `keys` of the config, unless all have the same clips."""
+    names = {tuple(clip["name"] for clip in run.clips) for run in [*ours, *theirs]}
+    if len(names) != 1 or () in names:
+        raise ValueError(f"{keys} must hold the same clips, got {len(names)} sets of them")
+
+
+def _compare(
+    ours: Sequence[Run], theirs: Sequence[Run], metric: str
+) -> tuple[float, float, tuple[float, float]] | None:
+    """Return the mean of each side and the CI of their difference; None where a clip has no such
+    score.
+    """
     if not all(metric in clip for run in [*ours, *theirs] for clip in run.clips):
-        return TableCell()
-    sides = [[[float(clip[metric]) for clip in run.clips] for run in side]
-             for side in (ours, theirs)]  # fmt: skip
-    left, right = (fmean(value for run in side for value in run) for side in sides)
-    return TableCell(left - right, interval=bootstrap_difference_interval(sides[0], sides[1]))
+        return None
+    left, right = (
+        [[float(clip[metric]) for clip in run.clips] for run in side] for side in (ours, theirs)
+    )
+    interval = bootstrap_difference_interval(left, right)
+    return fmean(chain(*left)), fmean(chain(*right)), interval

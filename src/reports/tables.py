@@ -117,9 +117,7 @@ def select_columns(table: Table, names: Sequence[str], title: str) -> Table:
     scores = [
         name for name in places if places[name] >= table.labels and not name.startswith("paper_")
     ]
-    for name in names:
-        if name not in scores:
-            raise ValueError(f"columns must be of {', '.join(scores)}, got {name}")
+    check_columns(names, scores)
     chosen = [places[name] for name in names]
     heads = [*table.columns[: table.labels], *(table.columns[place] for place in chosen)]
     has_cost = any(column.name in names for column, _ in COSTS)
@@ -138,6 +136,13 @@ def select_columns(table: Table, names: Sequence[str], title: str) -> Table:
         cells = [replace(row[place], published=value) for place, value in pairs]
         made.add_row(group, cells)
     return made
+
+
+def check_columns(names: Sequence[str], present: Sequence[str]) -> None:
+    """Raise ValueError for a name in `columns` that is none of those `present`."""
+    for name in names:
+        if name not in present:
+            raise ValueError(f"columns must be of {', '.join(present)}, got {name}")
 
 
 def build_severity_table(

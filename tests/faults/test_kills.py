@@ -94,7 +94,7 @@ def test_training_goes_on_to_the_same_numbers(tmp_path, alone, seed):
 
 
 def train_and_stop_in_validation(config: str, number: int) -> None:
-    """Run the door train; a signal comes while the first clip is validated at step 4."""
+    """Run src.train; a signal comes while the first clip is validated at step 4."""
     from src.training.reconstructor import Reconstructor
 
     validate = Reconstructor.validation_step

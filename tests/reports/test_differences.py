@@ -86,6 +86,15 @@ def test_a_pair_or_a_column_that_is_none_is_refused(tmp_path, pair, columns, mes
         build_pair_table("", keys, groups, [pair], columns)
 
 
+@pytest.mark.parametrize("clips", [[SCORES | {"name": "other"}], None])
+def test_a_pair_of_runs_on_other_clips_or_without_any_is_refused(tmp_path, clips):
+    found(tmp_path, "lf3x3", {"a": 0.3})
+    write_run(tmp_path / "one", "one", clips=clips)
+    keys, groups = run_groups.group_runs(runs.find_runs([tmp_path]))
+    with pytest.raises(ValueError, match="pairs must hold the same clips, got 2 sets"):
+        build_pair_table("", keys, groups, [("lf3x3", "one")])
+
+
 def test_the_report_of_a_sweep_writes_its_pairs_into_a_document(tmp_path):
     sweep(tmp_path / "runs")
     notes = tmp_path / "notes.md"
