@@ -24,8 +24,9 @@ def evaluate(cfg: DictConfig) -> dict:
     net = build.load_method_with_postprocess(cfg)
     data = build.build_data_module(cfg, splits=("test",), optics=simulation.select_optics(cfg, net))
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
-    row = build.test_method(cfg, build.method_name(cfg), net, data, build.build_metrics(cfg))
-    samples.write_samples(run / "samples", net, data.test_samples(SAMPLE_CLIPS))
+    name, metrics = build.method_name(cfg), build.build_metrics(cfg)
+    row, drawn = build.test_method(cfg, name, net, data, metrics, SAMPLE_CLIPS)
+    samples.write_samples(run / "samples", drawn)
     return results.write_and_print_results(
         run, entry_point.resolved_yaml(cfg), [row], **entry_point.run_metadata(cfg, start)
     )

@@ -45,7 +45,7 @@ def train(cfg: DictConfig) -> dict:
         return {}
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     beginning = start_weights.label_before_training(cfg, first_weights)
-    before = build.test_method(cfg, beginning, module.method, data, module.metrics)
+    before, _ = build.test_method(cfg, beginning, module.method, data, module.metrics)
     tracking.log_config_to_wandb(trainer.loggers, as_dict(cfg))
     try:
         fit(trainer, module, data, ckpt)
@@ -55,11 +55,11 @@ def train(cfg: DictConfig) -> dict:
     load_ema_weights(trainer, module)
     # As it is when it is loaded again.
     module.method.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
-    trained = build.test_method(cfg, cfg.name, module.method, data, module.metrics)
+    tested = module.method, data, module.metrics
+    trained, drawn = build.test_method(cfg, cfg.name, *tested, cfg.sample_clips)
     references[cfg.reference_baseline.name] = build_part(cfg, "reference_baseline.method")
-    others = [build.test_method(cfg, *o, data, module.metrics) for o in references.items()]
-    drawn = data.test_samples(cfg.sample_clips)
-    pictures = samples.write_samples(run / "samples", module.method, drawn)
+    others = [build.test_method(cfg, *o, data, module.metrics)[0] for o in references.items()]
+    pictures = samples.write_samples(run / "samples", drawn)
     rows, facts = [trained, before, *others], entry_point.run_metadata(cfg, start)
     note = results.describe_score_difference(trained, before)
     config = entry_point.resolved_yaml(cfg)

@@ -10,7 +10,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from lightning.pytorch.callbacks import ProgressBar
 from omegaconf import DictConfig
-from torch import nn
+from torch import Tensor, nn
 from torchmetrics import Metric
 
 import src.models
@@ -35,6 +35,7 @@ from src.models.network import EventToVideoNetwork, FramePostprocessor, VideoMet
 from src.models.setnet import SetNet
 from src.records.results import ScoreRow
 from src.sim.optics import Optics
+from src.sim.pipeline import Sample
 from src.training import evaluation
 from src.training.clip_cache import CachedPipeline
 from src.training.datamodule import LightFieldData
@@ -244,13 +245,15 @@ def build_trainer(cfg: DictConfig) -> lightning.Trainer:
 
 
 def test_method(
-    cfg: DictConfig, name: str, net: VideoMethod, data: LightFieldData, metrics: VideoMetrics
-) -> ScoreRow:
-    """Return the scores of `net` on the test clips; in float32, whatever it was trained in."""
+    cfg: DictConfig, name: str, net: VideoMethod, data: LightFieldData, metrics: VideoMetrics,
+    kept_clips: int = 0,
+) -> tuple[ScoreRow, list[tuple[Sample, Tensor]]]:  # fmt: skip
+    """Return the scores of `net` on the test clips, in float32, whatever it was trained in, and the
+    first `kept_clips` of them, each with its reconstruction."""
     # On SLURM a trainer takes up what a preempted training left in its folder: this one has none.
     options: dict = {"precision": "32-true", "logger": False, "enable_checkpointing": False}
     options |= {"devices": 1, "num_nodes": 1, "strategy": "auto", "default_root_dir": None}
     callbacks = [TrainingProgress(tested=name)] if cfg.trainer.enable_progress_bar else []
     trainer = build_part(cfg, "trainer", callbacks=callbacks, **options)
-    options = {"trainer": trainer, "unscored_windows": cfg.data.unscored_windows}
-    return evaluation.test_network(name, net, data, metrics, **options)
+    options = {"unscored_windows": cfg.data.unscored_windows, "kept_clips": kept_clips}
+    return evaluation.test_network(name, net, data, metrics, trainer=trainer, **options)

@@ -6,12 +6,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float
 from PIL import Image
+from torch import Tensor
 
 from src.figures.comparison import VideoRow, draw_comparison
-from src.models.network import VideoMethod
 from src.recordings.output import resize_picture, round_to_uint8
 from src.records.atomic import atomic_path
 from src.sim.optics import Optics, layout, most_central_view_index
@@ -28,17 +27,16 @@ EVENTS_TITLE = "events: brighter red, darker blue"
 Video = Float[np.ndarray, "_frames _h _w *_rgb"]
 
 
-@torch.no_grad()
-def write_samples(folder: Path, network: VideoMethod, samples: Iterable[Sample]) -> list[Path]:
+def write_samples(folder: Path, clips: Iterable[tuple[Sample, Tensor]]) -> list[Path]:
     """Write `clip<i>.gif` (clean, centre view, events, reconstruction) and `clip<i>_slice.png`
-    (x-t slices of the middle row) of sample i; return the paths.
+    (x-t slices of the middle row) of clip i, a sample and its reconstruction (as `sample.target`);
+    return the paths.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    network.eval()
     paths = []
-    for index, sample in enumerate(samples):
+    for index, (sample, frames) in enumerate(clips):
         parts = {"clean": sample.target, "centre view": sample.turbulent}
-        parts["reconstruction"] = network.reconstruct_clip(sample).float().clamp(0, 1)
+        parts["reconstruction"] = frames.float().clamp(0, 1)
         videos = {name: part[0, :, 0].cpu().numpy() for name, part in parts.items()}
         gif, slices = folder / f"clip{index}.gif", folder / f"clip{index}_slice.png"
         positions = sample.positions or layout(sample.voxels.shape[2])

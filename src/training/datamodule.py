@@ -1,6 +1,6 @@
 """Batches for training, validation and test, simulated on the fly: number -> draw -> sample."""
 
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -9,7 +9,7 @@ from lightning import LightningDataModule, Trainer
 from torch.utils.data import DataLoader
 
 from src.sim import noise
-from src.sim.pipeline import ClipParameters, Pipeline, Sample, concatenate_samples, simulate
+from src.sim.pipeline import ClipParameters, Pipeline, Sample, concatenate_samples
 from src.training.augment import Augment
 from src.training.batch_sampler import DrawDataset, LargeCropStream, SampleId, StepSampler
 from src.training.device_prefetch import DevicePrefetcher
@@ -107,20 +107,11 @@ class LightFieldData(LightningDataModule):
         return self._loader("val", sampler=[SampleId(k, k) for k in range(self.val_clips)])
 
     def test_dataloader(self) -> StoredSamples:
-        return self._store_test(
-            self.test_clips, lambda missing: self._loader("test", sampler=missing)
-        )
-
-    def test_samples(self, count: int) -> StoredSamples:
-        """Return the first `count` test clips on the CPU, without a trainer."""
-        pipeline = self.pipelines["test"]
-        return self._store_test(
-            count, lambda missing: (simulate(pipeline, [sample.clip]) for sample in missing)
-        )
-
-    def _store_test(self, count: int, make: Callable[[list[SampleId]], Iterable]) -> StoredSamples:
-        ids = [SampleId(k, k) for k in range(count)]
-        return StoredSamples(ids, self.test_conditions, self.test_store, make)
+        ids = [SampleId(k, k) for k in range(self.test_clips)]
+        return StoredSamples(
+            ids, self.test_conditions, self.test_store,
+            lambda missing: self._loader("test", sampler=missing),
+        )  # fmt: skip
 
     def validation_samples(self) -> Iterator[Sample]:
         """Yield the validation clips on the training device, within a training too."""

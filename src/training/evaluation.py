@@ -20,19 +20,22 @@ from src.training.reconstructor import Reconstructor
 
 def test_network(
     name: str, network: VideoMethod, data: LightFieldData, metrics: VideoMetrics, *,
-    trainer: lightning.Trainer, unscored_windows: int = 0,
-) -> ScoreRow:  # fmt: skip
-    """Return the row of `network` on the test clips of `data`.
+    trainer: lightning.Trainer, unscored_windows: int = 0, kept_clips: int = 0,
+) -> tuple[ScoreRow, list[tuple[Sample, Tensor]]]:  # fmt: skip
+    """Return the row of `network` on the test clips of `data`, and the first `kept_clips` of them,
+    each with its reconstruction.
 
     Raises SIGTERMException when SIGTERM came, which Lightning forgets during the last clip.
     """
-    module = Reconstructor(network, {}, metrics=metrics, unscored_windows=unscored_windows)
+    module = Reconstructor(
+        network, {}, metrics=metrics, unscored_windows=unscored_windows, kept_clips=kept_clips
+    )
     trainer.test(module, data, verbose=False)
     if trainer.received_sigterm:
         raise SIGTERMException
     macs_of_frame, milliseconds = measure_macs_and_ms(network, module.sample)
     height, width = module.sample.target.shape[-2:]
-    return ScoreRow(
+    row = ScoreRow(
         name,
         module.clips,
         params=sum(parameter.numel() for parameter in network.parameters()),
@@ -40,6 +43,7 @@ def test_network(
         latency_ms_by_size={f"{height}x{width}": milliseconds},
         own_metrics=metrics.user_metric_columns,
     )
+    return row, module.reconstructions
 
 
 @torch.no_grad()

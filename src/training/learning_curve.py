@@ -113,7 +113,7 @@ def mean_validation_scores(trainer: Trainer, module: Reconstructor) -> dict[str,
     module.eval()
     with use_averaged_weights(module):
         samples = trainer.datamodule.validation_samples()  # type: ignore[attr-defined]
-        clips = [scores for sample in samples for scores in module.score_clips_into_metrics(sample)]
+        clips = [scores for sample in samples for scores in module.reconstruct_and_score(sample)[1]]
     module.metrics.reset()
     module.train()
     return {name: fmean(clip[name] for clip in clips) for name in module.metrics.names}

@@ -31,7 +31,8 @@ class Reconstructor(LightningModule):
     are needed to train; `metrics`: of validation and test, None: without LPIPS.  `method`: what is
     validated and tested, None: the network.  `loss_from`, `loss_pairs`: see select_loss_windows.
     `cuda_graphs`: on a GPU a sequence is unrolled as CUDA graphs, of a few selections of windows
-    only.  The first `unscored_windows` of a clip are not scored.
+    only.  The first `unscored_windows` of a clip are not scored.  A test leaves the scores of all
+    clips in `clips`, and the first `kept_clips` samples with their frames in `reconstructions`.
     """
 
     def __init__(
@@ -50,6 +51,7 @@ class Reconstructor(LightningModule):
         clock: TrainingClock | None = None,
         cuda_graphs: bool = False,
         unscored_windows: int = 0,
+        kept_clips: int = 0,
     ):
         super().__init__()
         self.automatic_optimization = False
@@ -58,7 +60,7 @@ class Reconstructor(LightningModule):
         self.make_optimizer, self.make_scheduler = optimizer, scheduler
         self.loss_from, self.loss_pairs = loss_from, loss_pairs
         self.guard, self.clock = guard or StepGuard(), clock or TrainingClock()
-        self.unscored_windows = unscored_windows
+        self.unscored_windows, self.kept_clips = unscored_windows, kept_clips
         self.graphs = GraphedUnroll(network) if cuda_graphs else None  # type: ignore[arg-type]
         self.windows_seen, self.earlier_steps = 0, 0
         self.optimizer_start = 0  # step at which the optimiser's state began
@@ -66,6 +68,7 @@ class Reconstructor(LightningModule):
         # In tuples, so that what is not trained stays out of the parameters and the checkpoint.
         self._loss, self._method = (loss,), (method or network,)
         self.clips: list[dict] = []
+        self.reconstructions: list[tuple[Sample, Tensor]] = []
 
     @property
     def loss(self) -> TrainingLoss:
@@ -137,26 +140,30 @@ class Reconstructor(LightningModule):
         )[0]  # fmt: skip
 
     def validation_step(self, sample: "Sample", batch_idx: int) -> None:
-        self.score_clips_into_metrics(sample)
+        self.reconstruct_and_score(sample)
         self._log_means("val")
 
     def on_test_start(self) -> None:
         """Forget the clips of an earlier test; with one process do not wait for others to test."""
-        self.clips = []
+        self.clips, self.reconstructions = [], []
         for metric in self.metrics.values():
             metric.distributed_available_fn = lambda: self.trainer.world_size > 1
 
     def test_step(self, sample: "Sample", batch_idx: int) -> None:
         self.sample = sample
-        self.clips += self.score_clips_into_metrics(sample)
+        frames, scores = self.reconstruct_and_score(sample)
+        if len(self.reconstructions) < self.kept_clips:
+            self.reconstructions.append((sample, frames))
+        self.clips += scores
         self._log_means("test")
 
     def _log_means(self, split: str) -> None:
         means = {f"{split}/{name}": metric for name, metric in self.metrics.items()}
         self.log_dict(means, on_step=False, on_epoch=True, batch_size=1)
 
-    def score_clips_into_metrics(self, sample: "Sample") -> list[dict]:
-        """Add every clip to `metrics`; return the scores of each with what was drawn for it."""
+    def reconstruct_and_score(self, sample: "Sample") -> tuple[Tensor, list[dict]]:
+        """Add every clip to `metrics`; return the frames, as `sample.target`, and of each clip the
+        scores with what was drawn for it."""
         with parametrize.cached():
             frames = self.method.reconstruct_clip(sample)
         scored = slice(self.unscored_windows, None)
@@ -167,7 +174,7 @@ class Reconstructor(LightningModule):
                 why = "a parameter of the clips has that name"
                 raise ValueError(f"metrics.{taken[0]} must be called otherwise: {why}")
             scored_clips.append(drawn | self.metrics(ours, truth))
-        return scored_clips
+        return frames, scored_clips
 
     def configure_optimizers(self):
         assert self.make_optimizer is not None

@@ -1,4 +1,4 @@
-"""A network on the test clips: what a signal that comes there does."""
+"""A network on the test clips: the frames that are kept, and what a signal does."""
 
 import os
 import signal
@@ -16,23 +16,37 @@ from src.training import evaluation
 from src.training.datamodule import LightFieldData
 
 
-class Terminated(EventToVideoNetwork):
-    """A network whose process is asked to end at its third window."""
+class SumOfEvents(EventToVideoNetwork):
+    """A network that counts its windows."""
 
     views, windows = None, 0
 
     def forward(self, voxels, state=None, *, window_s=1 / 120, positions=None):
         self.windows += 1
-        if self.windows == 3:
-            os.kill(os.getpid(), signal.SIGTERM)
         return voxels.sum((1, 2))[:, None].sigmoid(), state
 
 
-class OneClip(LightFieldData):
-    """One clip without events, not simulated."""
+class Terminated(SumOfEvents):
+    """A network whose process is asked to end at its third window."""
 
-    def __init__(self):
+    def forward(self, *args, **options):
+        if self.windows == 2:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return super().forward(*args, **options)
+
+
+class Clips(LightFieldData):
+    """Clips of three windows, not simulated."""
+
+    def __init__(self, count: int = 1):
         lightning.LightningDataModule.__init__(self)
+        self.samples = [self.draw(f"clip {n}") for n in range(count)]
+
+    @staticmethod
+    def draw(name: str) -> Sample:
+        voxels, target = torch.randn(1, 3, 1, 5, 16, 16), torch.rand(1, 3, 1, 16, 16)
+        window_s = torch.full((1,), 1 / 120)
+        return Sample(voxels, target, target, window_s, parameters=[{"name": name}])
 
     def setup(self, stage):
         pass
@@ -40,18 +54,36 @@ class OneClip(LightFieldData):
     teardown = setup
 
     def test_dataloader(self):
-        voxels, target = torch.zeros(1, 3, 1, 5, 16, 16), torch.rand(1, 3, 1, 16, 16)
-        sample = Sample(
-            voxels, target, target, torch.full((1,), 1 / 120), parameters=[{"name": "a"}]
-        )
-        return DataLoader([sample], batch_size=None)
+        return DataLoader(self.samples, batch_size=None)
 
     def on_after_batch_transfer(self, batch, dataloader_idx):
         return batch
 
 
-def test_sigterm_during_the_last_clip_is_not_forgotten():
+@pytest.fixture
+def trainer() -> lightning.Trainer:
     quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
-    trainer = lightning.Trainer(accelerator="cpu", enable_checkpointing=False, **quiet)
+    return lightning.Trainer(accelerator="cpu", enable_checkpointing=False, **quiet)
+
+
+def test_the_first_clips_are_kept_with_the_frames_that_were_scored(trainer):
+    network, data = SumOfEvents(), Clips(3)
+    row, kept = evaluation.test_network(
+        "any", network, data, VideoMetrics(), trainer=trainer, kept_clips=2
+    )
+    assert len(row.clips) == 3 and len(kept) == 2
+    for (sample, frames), expected in zip(kept, data.samples, strict=False):
+        assert sample.parameters == expected.parameters
+        assert torch.equal(frames, network.reconstruct_clip(expected))
+
+
+def test_no_clip_is_reconstructed_twice_for_its_pictures(trainer, monkeypatch):
+    network = SumOfEvents()
+    monkeypatch.setattr(evaluation, "measure_macs_and_ms", lambda *_: (0, 0.0))
+    evaluation.test_network("any", network, Clips(2), VideoMetrics(), trainer=trainer, kept_clips=2)
+    assert network.windows == 2 * 3
+
+
+def test_sigterm_during_the_last_clip_is_not_forgotten(trainer):
     with pytest.raises(SIGTERMException):
-        evaluation.test_network("any", Terminated(), OneClip(), VideoMetrics(), trainer=trainer)
+        evaluation.test_network("any", Terminated(), Clips(), VideoMetrics(), trainer=trainer)
