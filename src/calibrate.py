@@ -10,6 +10,7 @@ import numpy as np
 import rich
 from jaxtyping import Float
 from omegaconf import DictConfig, OmegaConf
+from rich.progress import track
 
 from src.app import build, entry_point
 from src.app.instantiate import build_part
@@ -94,13 +95,14 @@ def find_contrast_threshold(cfg: DictConfig, run: Path) -> dict[str, tuple]:
     """Match the recording's event rate with that of the configured simulation; write
     `threshold.csv` and `threshold.png`."""
     options, pipeline = ReadOptions.from_keys(cfg), build.build_pipeline(cfg, "test")
-    clips = [pipeline.render_views([pipeline.draw(index)])[0] for index in range(cfg.clips)]
     size = sources.find_sensor_size(cfg.recording, cfg.sensor_size, options)
     lookup = sensor_lookup.build_lookup(views_or_whole_sensor(cfg.views, size))
     events = open_recording(cfg.recording, size[::-1], options)
     measured = contrast_threshold.measure_event_rates(events, lookup.view)
+    drawn = [pipeline.draw(index) for index in range(cfg.clips)]
+    clips = [pipeline.render_views([one])[0] for one in track(drawn, "simulated clips")]
     estimate = contrast_threshold.estimate_contrast_threshold(
-        measured, clips, cfg.fps * cfg.data.substeps, pipeline.sensor
+        measured, clips, cfg.fps * cfg.data.substeps, pipeline.sensor, progress=track
     )
     contrast_threshold.write_threshold_csv(estimate, measured, run / "threshold.csv")
     calibration_figures.draw_event_rates(estimate, run / "threshold.png")

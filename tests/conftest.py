@@ -16,8 +16,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def checked_modules() -> list[str]:
-    """Return the modules of the rooms; not the doors and src/app, which see configs instead of
-    tensors, nor the `engines` packages, whose kernels a wrapper would not compile.
+    """Return the modules of the packages; not the entry points and src/app, which see configs
+    instead of tensors, nor the `engines` packages, whose kernels a wrapper would not compile.
     """
     files = [*(ROOT / "src").glob("*/**/*.py"), *(ROOT / "baselines").rglob("*.py")]
     names = [".".join(file.relative_to(ROOT).with_suffix("").parts) for file in files]

@@ -1,4 +1,4 @@
-"""src.eval data=evreal: sequences of data sets through the door, scores beside the published."""
+"""src.eval data=evreal: sequences of data sets, scores beside the published."""
 
 import csv
 import json
@@ -41,7 +41,7 @@ GOLDEN = [
 
 @pytest.fixture
 def run(tmp_path):
-    """Return a call of the door's function with overrides, on the sequences of tmp_path/data."""
+    """Return a call of src.eval with overrides, on the sequences of tmp_path/data."""
 
     def run(*overrides: str) -> dict:
         given = [*HIGHPASS, f"scene.root={tmp_path}/data", *overrides]

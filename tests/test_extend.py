@@ -50,8 +50,8 @@ def page() -> str:
 def copy(tmp_path_factory, page) -> Path:
     """A copy of the repository in which all that the page says is done."""
     copy = tmp_path_factory.mktemp("copy")
-    for room in ("src", "baselines", "conf"):
-        shutil.copytree(ROOT / room, copy / room)  # with what numba has compiled
+    for folder in ("src", "baselines", "conf"):
+        shutil.copytree(ROOT / folder, copy / folder)  # with what numba has compiled
     for kind, name, line, text in STEP.findall(page):
         path = copy / name
         if kind == "New":

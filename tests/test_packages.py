@@ -51,8 +51,8 @@ def test_imports_go_one_way():
 
 
 def test_entry_points_do_not_import_each_other():
-    doors = {f"src.{file.stem}" for file in (ROOT / "src").glob("*.py")}
-    known = {str(file.relative_to(ROOT)): imports(file) & doors for file in FILES}
+    entry_points = {f"src.{file.stem}" for file in (ROOT / "src").glob("*.py")}
+    known = {str(file.relative_to(ROOT)): imports(file) & entry_points for file in FILES}
     assert {file: names for file, names in known.items() if names} == {}
 
 

@@ -11,7 +11,7 @@ from src.recordings.files import ReadOptions, open_recording, read_events, sourc
 from tests.recordings.files.test_reported_times import quiet_read, scene, text
 from tests.test_recording_entry_points import config
 
-DOORS = {
+ENTRY_POINTS = {
     "reconstruct": (reconstruct, ["baseline=highpass", "resolution=[24,32]"]),
     "live": (build_server, ["baseline=highpass", "offered_networks=[]"]),
     "calibrate": (calibrate, ["task=views"]),
@@ -26,7 +26,7 @@ def joined(tmp_path):
     return text(tmp_path / "a.txt", np.concatenate([whole, whole[whole["t"] < 100_000]]))
 
 
-@pytest.mark.parametrize("door", DOORS)
+@pytest.mark.parametrize("entry_point", ENTRY_POINTS)
 @pytest.mark.parametrize(
     ("given", "words"),
     [
@@ -38,10 +38,10 @@ def joined(tmp_path):
         ("part=x", "part must be a whole number, got x"),
     ],
 )
-def test_a_wrong_value_is_refused(joined, tmp_path, door, given, words):
-    work, more = DOORS[door]
+def test_a_wrong_value_is_refused(joined, tmp_path, entry_point, given, words):
+    work, more = ENTRY_POINTS[entry_point]
     with pytest.raises(ValueError, match=words):
-        work(config(door, tmp_path / "run", f"recording={joined}", *more, given))
+        work(config(entry_point, tmp_path / "run", f"recording={joined}", *more, given))
 
 
 @pytest.mark.parametrize(("part", "frames"), [(0, 23), (1, 11)])
@@ -62,7 +62,7 @@ def test_a_picture_of_the_sensor_and_a_conversion_are_of_the_part_that_is_chosen
 
 
 def test_what_is_odd_is_on_the_live_page(joined, tmp_path):
-    given = [f"recording={joined}", *DOORS["live"][1]]
+    given = [f"recording={joined}", *ENTRY_POINTS["live"][1]]
     with pytest.warns(UserWarning, match="clock restarts"):
         server = build_server(config("live", tmp_path / "run", *given))
     (line,) = server.page.player.reader.faults.current()

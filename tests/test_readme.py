@@ -36,7 +36,7 @@ def evaluate_and_draw(cfg) -> None:
 
 
 SMALL = ["scene.height=64", "scene.width=64", "data.test_windows=4"]
-RUN = {  # door: what runs it, and what makes it tiny
+RUN = {  # entry point: what runs it, and what makes it tiny
     "train": (train, [*TINY, "logger=none", "data.cache_clips=null"]),
     "eval": (evaluate_and_draw, [*SMALL, "data.test_clips=1", "data.unscored_windows=1",
                                  "data.workers=0", "metrics.lpips=null"]),
@@ -68,8 +68,8 @@ def commands(page: str) -> list[list[str]]:
 
 def composed(words: list[str], *more: str):
     """The config that a command asks for."""
-    door, given = words[2].removeprefix("src."), list(words[3:])
-    place, name, search = ROOT / "conf", door, []
+    entry_point, given = words[2].removeprefix("src."), list(words[3:])
+    place, name, search = ROOT / "conf", entry_point, []
     if "--config-name" in given:
         at = given.index("--config-dir")
         _, place, _, name = given[at : at + 4]
@@ -114,16 +114,16 @@ def reader(folder, tmp_path, monkeypatch) -> Path:  # noqa: F811
 def test_every_command_of_the_readme_runs(reader):
     ran, trained = [], None
     for number, words in enumerate(commands("README.md")):
-        door = words[2].removeprefix("src.") if words[0] == "python" else "make"
-        if door not in RUN:
+        entry_point = words[2].removeprefix("src.") if words[0] == "python" else "make"
+        if entry_point not in RUN:
             continue
         words = [re.sub(r"out/\S*<time>", str(trained), word) for word in words]
         words = [word.replace("/data/photographs", str(reader / "photos")) for word in words]
-        work, tiny = RUN[door]
+        work, tiny = RUN[entry_point]
         cfg = composed(words, *tiny, f"paths.out={reader}/out")
         cfg.paths.run = str(reader / "out" / str(number))
         work(cfg)
-        trained = trained or (cfg.paths.run if door == "train" else None)
-        ran.append(door)
+        trained = trained or (cfg.paths.run if entry_point == "train" else None)
+        ran.append(entry_point)
     assert set(ran) == set(RUN) and len(ran) == 7
     assert list(reader.rglob("video.gif")) and (reader / "views.yaml").is_file()

@@ -1,4 +1,4 @@
-"""From a simulated recording to views.yaml to video to statistics, through the doors."""
+"""From a simulated recording to views.yaml to video to statistics, through the entry points."""
 
 import csv
 import re
@@ -52,7 +52,7 @@ def folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def found(folder) -> Path:
-    """Return the views.yaml that the door made of board.raw."""
+    """Return the views.yaml that src.calibrate made of board.raw."""
     path = folder / "views.yaml"
     recording = f"recording={folder}/board.raw"
     calibrate(
@@ -253,7 +253,7 @@ def test_another_task_is_refused(tmp_path):
         calibrate(config("calibrate", tmp_path / "run", "task=guess", "recording=a.raw"))
 
 
-def test_threshold_of_a_recording_is_found_by_the_door(folder, found, tmp_path):
+def test_threshold_of_a_recording_is_found_by_calibrate(folder, found, tmp_path):
     small = [
         "scene.height=64",
         "scene.width=64",

@@ -64,7 +64,7 @@ def weights(tmp_path_factory):
 @pytest.mark.parametrize("path", SWEEPS, ids=lambda path: path.stem)
 def test_every_job_composes_and_the_last_runs(path, tmp_path, weights):
     sweep = content(path)
-    door = sweep["defaults"][0]
+    entry_point = sweep["defaults"][0]
     assert sweep["defaults"][-1] == "_self_" and sweep["hydra"]["mode"] == "MULTIRUN"
     assert "sweep" not in sweep["hydra"]  # the folder follows from the name: conf/hydra
     found = jobs(path)
@@ -76,7 +76,7 @@ def test_every_job_composes_and_the_last_runs(path, tmp_path, weights):
         "eval": (SMALL, evaluate),
         "reconstruct": (["ckpt=lf3x3", "end_s=0.02"], reconstruct),
         "stress": (["ckpt=lf3x3", "clips=1", "processes=1", "data.test_windows=60"], stress),
-    }[door]
+    }[entry_point]
     output = {reconstruct: "video.h5", stress: "stress.csv"}.get(work, "results.json")
     work(composed(path, tmp_path / "last", *found[-1], *tiny))
     assert (tmp_path / "last" / output).is_file()

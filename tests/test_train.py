@@ -1,4 +1,4 @@
-"""The doors train and eval on every config, at a tiny size; resuming; wrong values."""
+"""src.train and src.eval on every config, at a tiny size; resuming; wrong values."""
 
 import json
 import time
@@ -121,8 +121,8 @@ def test_eval_equals_the_test_of_training(tmp_path):
     ]
     evaluate(config("eval", tmp_path / "eval", *same))
     first, second = (
-        json.loads((tmp_path / door / "results.json").read_text())["test"]
-        for door in ("train", "eval")
+        json.loads((tmp_path / entry_point / "results.json").read_text())["test"]
+        for entry_point in ("train", "eval")
     )
     assert first == second
 

@@ -189,9 +189,9 @@ def _build(spec: dict, path: Path, allowed_packages: Sequence[str] = ()) -> nn.M
             "networks of a package of your own are let in by allowed_packages=[<package>]"
         )
     _check_numbers(kwargs, path)
-    room, _, name = target.rpartition(".")
+    module, _, name = target.rpartition(".")
     try:
-        kind = getattr(import_module(add_package_prefix(room)), name)
+        kind = getattr(import_module(add_package_prefix(module)), name)
         if not issubclass(kind, nn.Module):
             raise TypeError(f"{target} is no network")
         return kind(**kwargs)

@@ -34,7 +34,7 @@ def test_no_clip_is_made_by_two_processes_and_none_is_left_out():
 
 
 def as_rank(rank: int, port: int, config: str) -> None:
-    """Run the door train as the process `rank` of two."""
+    """Run src.train as the process `rank` of two."""
     from lightning.pytorch.utilities import rank_zero_only
 
     rank_zero_only.rank = rank

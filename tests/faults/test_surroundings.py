@@ -140,7 +140,7 @@ def test_a_file_that_may_not_be_read_is_named(tmp_path):
 
 
 def train_and_lose_a_worker(config: str) -> None:
-    """Run the door train; the loader's worker that simulates clip 8 dies as if out of memory."""
+    """Run src.train; the loader's worker that simulates clip 8 dies as if out of memory."""
     from src.sim.pipeline import Pipeline
 
     draw, main = Pipeline.draw, os.getpid()
@@ -170,7 +170,7 @@ def test_a_worker_that_dies_ends_the_run_and_it_goes_on(tmp_path, alone):
 
 
 def on_slurm(config: str, folder: str) -> None:
-    """Run the door train as SLURM starts it, with an `scontrol` that writes down its orders."""
+    """Run src.train as SLURM starts it, with an `scontrol` that writes down its orders."""
     os.environ |= {
         "SLURM_JOB_ID": "77", "SLURM_NTASKS": "1", "SLURM_NTASKS_PER_NODE": "1",
         "SLURM_JOB_NAME": "train", "SLURM_PROCID": "0", "SLURM_LOCALID": "0", "SLURM_NODEID": "0",

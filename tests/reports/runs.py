@@ -1,4 +1,4 @@
-"""Run folders made by hand: what the doors write, with numbers chosen by the test."""
+"""Run folders made by hand: what the entry points write, with numbers chosen by the test."""
 
 import json
 from pathlib import Path

@@ -204,11 +204,11 @@ def test_markers_that_are_no_pair_are_refused_and_the_document_stays(content, tm
 
 def test_every_row_of_the_paper_names_choices_that_exist():
     rows = OmegaConf.load(ROOT / "conf" / "paper" / "reds.yaml").rows
-    rooms = {"method": "sweeps", "resolution": "sweeps", "postprocess": "conf"}
+    folders = {"method": "sweeps", "resolution": "sweeps", "postprocess": "conf"}
     for row in rows:
         for group, choice in row.when.items():
             if group != "task":
-                assert (ROOT / rooms.get(group, "conf") / group / f"{choice}.yaml").is_file()
+                assert (ROOT / folders.get(group, "conf") / group / f"{choice}.yaml").is_file()
     assert len(rows) == len({str(row.when) for row in rows}) >= 3 + 19
 
 

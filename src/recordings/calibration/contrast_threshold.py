@@ -6,7 +6,7 @@ moves C by 4 to 10 %, and light taken for code values moves it nearly threefold.
 per pixel of the sensor, not of the warped view, per second, ON and OFF apart.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -145,18 +145,21 @@ def simulate_event_rates(
 def estimate_contrast_threshold(
     rates: EventRates, clips: Sequence[Clip], fps: float, sensor: Sensor,
     thresholds: Sequence[float] = GRID,
+    progress: Callable[[Sequence[Clip], str], Iterable[Clip]] = lambda clips, _: clips,
 ) -> ThresholdEstimate:  # fmt: skip
     """Return the thresholds at which the sensor makes the recording's rates.
 
     The geometric mean of ON and OFF rate gives their size; the quotient gives the ratio of OFF to
-    ON, as what rises has to fall.  Raises ValueError for a rate that the grid does not make.
+    ON, as what rises has to fall.  `progress(clips, name)` yields the clips of each of the ROUNDS,
+    as rich.progress.track does.  Raises ValueError for a rate that the grid does not make.
     """
     measured, drawn = rates.pooled, np.maximum(rates.bootstrap_pooled_rates(), 1e-12)
     if not (measured > 0).all():
         raise ValueError(f"the recording's rates above the background are not positive: {measured}")
     ratio = 1.0
-    for _ in range(ROUNDS):
-        curve = simulate_event_rates(clips, fps, sensor, thresholds, off_ratio=ratio)
+    for number in range(1, ROUNDS + 1):
+        followed = progress(clips, f"event rates, round {number} of {ROUNDS}")
+        curve = simulate_event_rates(followed, fps, sensor, thresholds, off_ratio=ratio)
         on = float(find_on_threshold(curve, measured))
         if not np.isfinite(on):
             low, high = np.sqrt(np.prod(curve.rates[[-1, 0]], axis=1))

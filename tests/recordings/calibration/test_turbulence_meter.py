@@ -176,7 +176,7 @@ def folder(tmp_path_factory):
     return folder
 
 
-def test_the_door_writes_a_file_and_a_figure(folder, tmp_path):
+def test_calibrate_writes_a_file_and_a_figure(folder, tmp_path):
     run, save = tmp_path / "run", tmp_path / "air.yaml"
     calibrate(config("calibrate", run, "task=air", f"video={folder}", f"save={save}"))
     found = read_turbulence_file(save)
@@ -198,7 +198,7 @@ def test_the_door_writes_a_file_and_a_figure(folder, tmp_path):
         ("air.max_frames=16 fps=inf", "fps must be > 0"),
     ],
 )
-def test_the_door_refuses_and_writes_nothing(folder, wrong, message, tmp_path):
+def test_calibrate_refuses_and_writes_nothing(folder, wrong, message, tmp_path):
     chosen = ["task=air", f"video={folder}", f"save={tmp_path}/air.yaml", *wrong.split()]
     with pytest.raises(ValueError, match=message):
         calibrate(config("calibrate", tmp_path / "run", *chosen))
