@@ -163,7 +163,7 @@ def describe(
         "",
         "| trained | |",
         "|---|---|",
-        *(f"| {key} | {value} |" for key, value in card.items() if key != TRAINING_STATE),
+        *(_fact(name, key, value) for key, value in card.items() if key != TRAINING_STATE),
         "",
         *([f"![learning curve]({Path(name).name}.png)", "", CURVE, ""] if drawn else []),
         "| tested on | clips | " + " | ".join(metric.heading for metric in METRICS) + " |",
@@ -176,6 +176,13 @@ def describe(
         "",
     ]
     return "\n".join(lines)
+
+
+def _fact(name: str, key: str, value: object) -> str:
+    if key == "recipe":
+        recipe, comma, rest = str(value).partition(",")
+        value = f"[{recipe}]({'../' * (name.count('/') + 1)}conf/recipe/{recipe}.yaml){comma}{rest}"
+    return f"| {key} | {value} |"
 
 
 def _tested(record: dict) -> str:
