@@ -19,6 +19,8 @@ from src.sim.optics import layout, most_central_view_index
 from src.sim.turbulence.simulated import SimulatedTurbulence
 from src.training.clip_transforms import shift_views
 
+INDEPENDENT_SPACING = 1e3  # diameters between sub-apertures that share no turbulence
+
 
 def measure_worst_psnr_loss(
     network: Candidate, bench: StressBench, *, limit_db: float, parameter: str,
@@ -45,17 +47,19 @@ def measure_correlated_views_loss(
     spacings_over_aperture: Sequence[float],
 ) -> StressResult:  # fmt: skip
     """Return the aligned PSNR lost as the views look through more and more of the same turbulence,
-    against views of independent turbulence.
+    against views too far apart to share any; the centre view sees the same in all of them.
 
     `spacings_over_aperture`: distance between neighbouring sub-apertures in diameters of one; at 0
     all views are distorted alike.
     """
+    require_views(network, 2)
     require_type("turbulence", bench.pipeline.turbulence, SimulatedTurbulence)
     aperture_m = bench.pipeline.draw(bench.indices[0]).turbulence.aperture_m
+    name, fixed = "turbulence.baseline_m", {"turbulence.views_correlation": "baseline"}
     found = measure_worst_psnr_loss(
-        network, bench, limit_db=limit_db, parameter="turbulence.baseline_m",
+        network, bench, limit_db=limit_db, parameter=name, fixed=fixed,
         values=[spacing * aperture_m for spacing in spacings_over_aperture],
-        fixed={"turbulence.views_correlation": "baseline"},
+        reference={name: INDEPENDENT_SPACING * aperture_m, **fixed},
     )  # fmt: skip
     losses = [loss for _, loss in found.curve]
     curve = list(zip(spacings_over_aperture, losses, strict=True))

@@ -131,6 +131,18 @@ def test_what_looks_at_the_centre_alone_minds_no_other_view(bench):
     assert one_view_shifted(running(), bench).value == pytest.approx(0, abs=1e-6)
 
 
+def test_turbulence_in_common_matters_only_to_what_looks_at_several_views(bench):
+    common = {"spacings_over_aperture": [1.0, 0.0], "limit_db": 0.3}
+    centre = conditions.measure_correlated_views_loss(running(), bench, **common)
+    assert [loss for _, loss in centre.curve] == pytest.approx([0, 0], abs=1e-6)
+    median = Candidate("median", HighPass(view_reduction="median"), 9)
+    found = conditions.measure_correlated_views_loss(median, bench, **common)
+    spaced, same = (abs(loss) for _, loss in found.curve)
+    assert same > spaced > 0.01
+    with pytest.raises(ValueError, match="the centre view only"):
+        conditions.measure_correlated_views_loss(running(1), bench, **common)
+
+
 @pytest.mark.parametrize("views", [2, 4])
 def test_without_a_middle_the_centre_view_is_that_of_the_optics(views):
     bench, subject = (
