@@ -13,8 +13,10 @@ MAX_PACKING = 200  # most that the columns of a recording shrink when they are p
 MAX_COORDINATE = 65535
 IN_ORDER = 0.99  # of the steps of a column that time may be
 NAMES = {
-    "t": ("t", "ts", "time", "times", "timestamp", "timestamps"), "x": ("x", "xs", "col", "column"),
-    "y": ("y", "ys", "row"), "p": ("p", "ps", "on", "polarity", "polarities", "pol"),
+    "t": ("t", "ts", "time", "times", "timestamp", "timestamps"),
+    "x": ("x", "xs", "col", "column", "x_coord", "x_coordinate", "x-coordinate", "u"),
+    "y": ("y", "ys", "row", "y_coord", "y_coordinate", "y-coordinate", "v"),
+    "p": ("p", "ps", "on", "polarity", "polarities", "pol"),
 }  # fmt: skip
 UNIT = re.compile(r"[ _]?[\[(]?(us|µs|μs|ns|ms|s|sec|seconds|px|pixel|pixels)[\])]?$")
 TIME_UNIT = re.compile(r"[ _\[(](us|µs|μs|ns|ms|s|sec|seconds)[\])]?$")
@@ -28,10 +30,11 @@ def find_columns_by_name(names: Sequence[str]) -> dict[str, int] | None:
     bare = [name.strip().strip("\"'").split("@")[0].lower() for name in names]
     places = {}
     for letter, known in NAMES.items():
-        found = [k for k, name in enumerate(bare) if name in known or UNIT.sub("", name) in known]
+        plain = [name if name in known else UNIT.sub("", name) for name in bare]
+        found = [word for word in known if word in plain]
         if not found:
             return None
-        places[letter] = found[0]
+        places[letter] = plain.index(found[0])
     return places
 
 
@@ -75,6 +78,10 @@ def find_columns_by_values(sample: np.ndarray) -> dict[str, int]:
         x, y = (k for k in range(4) if k not in (*times, *signs))
         if {x, y} <= set(whole):
             return {"t": times[0], "x": x, "y": y, "p": signs[0]}
+    if times and not signs and len(whole) + len(times) >= width:
+        raise ValueError(
+            f"polarity must be -1, 0 or 1: none of the {width} columns has such values only"
+        )
     fitting = len({*whole, *signs})
     if width > 3 > fitting:
         raise ValueError(

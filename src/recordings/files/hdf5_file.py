@@ -18,7 +18,6 @@ import numpy as np
 
 from src.recordings.files.columns import (
     as_times,
-    check_lengths,
     check_unpacking_ratio,
     find_columns_by_name,
     find_keys_by_name,
@@ -35,11 +34,19 @@ from src.recordings.files.event_file import (
     name_file_in_errors,
 )
 from src.recordings.files.frame_files import to_gray, wrap_frame_array
-from src.recordings.files.numpy_file import LazyColumn, slice_columns, slice_times, split_table
+from src.recordings.files.hdf5_columns import (
+    JoinedColumn,
+    columns_of,
+    find_windows,
+    is_group,
+    starts_whole,
+)
+from src.recordings.files.numpy_file import LazyColumn, slice_columns, slice_times
 
 HDF5_ENDINGS = (".h5", ".hdf5", ".hdf")
 SIZE_NAMES = ("size", "geometry", "sensor_size")  # width, height
 SHAPE_NAMES = ("sensor_resolution", "resolution")  # height, width
+DEFAULT_CACHE_BYTES = 2**20  # of unpacked chunks for each dataset; one larger chunk
 MAX_CHUNK_BYTES = 2**28  # bytes of HDF5 that are unpacked at a time
 ECF_CODEC = 36559  # the number of Prophesee's codec
 
@@ -50,14 +57,20 @@ class Hdf5File(EventFile):
     def __init__(self, path: Path, options: ReadOptions):
         self.path = path
         with name_file_in_errors(path, "cannot be read as events"):
-            self._file = h5py.File(path)
-            check_hdf5_safety(self._file)
+            with h5py.File(path) as file:
+                largest = check_hdf5_safety(file)
+            self._file = h5py.File(path, rdcc_nbytes=max(largest, DEFAULT_CACHE_BYTES))
             streams = find_streams(self._file)
             if not streams:
                 raise ValueError("no columns t, x, y, p and no array of events (n, 4) in it")
-            listed = [EventStream(k, name, None) for k, name in enumerate(streams)]
-            chosen, self.notes = choose_stream(path, listed, options.stream)
-            self._open(streams[chosen.name], options)
+            windows = find_windows(streams) if options.stream is None else []
+            if windows:
+                self.notes: tuple[str, ...] = ()
+            else:
+                listed = [EventStream(k, name, None) for k, name in enumerate(streams)]
+                chosen, self.notes = choose_stream(path, listed, options.stream)
+                windows = [streams[chosen.name]]
+            self._open(windows, options)
 
     def pieces(self) -> Iterator[RawEvents]:
         yield from slice_columns(self.path, self._columns, self.kept_times)
@@ -80,31 +93,34 @@ class Hdf5File(EventFile):
                 return RawFrames(times, (height, width), read)
         return None
 
-    def _open(self, node: Any, options: ReadOptions) -> None:
-        self._beside, self._has_own_times = node.parent, isinstance(node, h5py.Group)
-        parts = [*node.values()] if self._has_own_times else [node]
+    def _open(self, nodes: list[Any], options: ReadOptions) -> None:
+        node = nodes[0]
+        self._beside, self._has_own_times = node.parent, is_group(node)
+        parts = [
+            part for each in nodes for part in (each.values() if self._has_own_times else [each])
+        ]
         parts = [part for part in parts if isinstance(part, h5py.Dataset)]
         check_unpacking_ratio(self.path, sum(part.nbytes for part in parts))
         refuse_ecf_codec(parts)
         places = (node, self._file) if self._has_own_times else (node, node.parent, self._file)
         self.size = next(filter(None, map(_stated_size, places)), None)
-        if self._has_own_times:
-            keys = find_keys_by_name(node) or {}
-            self._columns: dict[str, Any] = {name: node[key] for name, key in keys.items()}
-            check_lengths(self._columns)
-        else:
-            self._columns = split_table(node, options.columns)
+        columns = [columns_of(each, options.columns) for each in nodes]
+        self._columns: dict[str, Any] = columns[0]
+        if len(columns) > 1:
+            self._columns = {name: JoinedColumn([one[name] for one in columns]) for name in "txyp"}
         if "t_offset" in self._file:
             offset = self._file["t_offset"]
             if offset.size != 1:
                 raise ValueError(f"t_offset must be one number, got {offset.shape}")
-            start = int(np.asarray(offset).item())
+            start = np.asarray(offset).item()
+            start = int(start) if start == int(start) else start
             t = self._columns["t"]
             self._columns["t"] = LazyColumn(t, lambda t: as_times(np.asarray(t)) + start)
         self.time_unit = find_named_time_unit(
             node if self._has_own_times else node.dtype.names, options
         )
-        if "t_offset" in self._file or "ms_to_idx" in self._file:  # DSEC's layout
+        is_dsec = "t_offset" in self._file or "ms_to_idx" in self._file
+        if is_dsec and options.time_unit == "auto" and starts_whole(self._columns["t"]):
             self.time_unit = "us"
 
 
@@ -125,10 +141,13 @@ def find_streams(file: h5py.File) -> dict[str, Any]:
     return {name or "/": found[name] for name in names}
 
 
-def check_hdf5_safety(file: h5py.File) -> None:
-    """Raise ValueError where a part of the file is another file, as a path leads anywhere, or comes
+def check_hdf5_safety(file: h5py.File) -> int:
+    """Return the bytes of the largest chunk.
+
+    Raises ValueError where a part of the file is another file, as a path leads anywhere, or comes
     in chunks beyond MAX_CHUNK_BYTES, which are unpacked whole.
     """
+    chunks = [0]
 
     def visit(name: str, link: Any) -> str | None:  # an error raised in here would be lost in HDF5
         if isinstance(link, h5py.ExternalLink):
@@ -138,12 +157,14 @@ def check_hdf5_safety(file: h5py.File) -> None:
             return None
         if part.external or part.is_virtual:
             return f"{name} lies in another file"
-        if part.dtype.itemsize * math.prod(part.chunks or ()) > MAX_CHUNK_BYTES:
+        chunks.append(part.dtype.itemsize * math.prod(part.chunks) if part.chunks else 0)
+        if chunks[-1] > MAX_CHUNK_BYTES:
             return f"{name} is packed in chunks of more than {MAX_CHUNK_BYTES} bytes"
         return None
 
     if fault := file.visititems_links(visit):
         raise ValueError(fault)
+    return max(chunks)
 
 
 def refuse_ecf_codec(parts: Iterable[Any]) -> None:

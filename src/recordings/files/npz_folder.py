@@ -37,7 +37,7 @@ class NpzFolder(EventFile):
         self._folder = find_npz_folder(path) or path
         self._names = sort_by_name(self._folder.glob("*.npz"))
         first = NumpyFile(self._names[0], options)
-        self.size, self.notes = first.size, first.notes
+        self.size, self.notes, self.time_unit = first.size, first.notes, first.time_unit
 
     def pieces(self) -> Iterator[RawEvents]:
         for name in self._names:

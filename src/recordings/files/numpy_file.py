@@ -28,12 +28,16 @@ from src.recordings.files.event_file import (
     choose_stream,
     name_file_in_errors,
 )
+from src.recordings.files.time_unit import UNITS_US
+
+LEAST_COLUMNS = 16  # of a table of four rows, from which these are the columns of events
 
 
 class NumpyFile(EventFile):
     """A structured array, an array (n, 4), or an .npz with these or with columns of their own.
 
-    An .npz may state `size` (width, height), or `width` and `height`.
+    An .npz may state `size` (width, height), or `width` and `height`, and `time_unit` (s, ms, us or
+    ns).
     """
 
     def __init__(self, path: Path, options: ReadOptions):
@@ -41,6 +45,8 @@ class NumpyFile(EventFile):
         with name_file_in_errors(path, "cannot be read as arrays of events"):
             if path.suffix.lower() == ".npy":
                 table = np.load(path, mmap_mode="r")
+                if not isinstance(table, np.ndarray):
+                    raise ValueError("it is an .npz; name it so")
                 self._columns = split_table(table, options.columns)
                 self.time_unit = find_named_time_unit(table.dtype.names, options)
             else:
@@ -49,7 +55,8 @@ class NumpyFile(EventFile):
                 with np.load(path) as file:
                     self.size = find_npz_size(file)
                     self._columns, names, self.notes = _columns_of(path, file, options)
-                    self.time_unit = find_named_time_unit(names, options)
+                    self.time_unit = _find_stated_unit(file, options)
+                    self.time_unit = self.time_unit or find_named_time_unit(names, options)
             check_lengths(self._columns)
 
     def pieces(self) -> Iterator[RawEvents]:
@@ -71,10 +78,23 @@ def find_npz_size(file: Any) -> WidthHeight | None:
     return int(sides[0]), int(sides[1])
 
 
+def _find_stated_unit(file: Any, options: ReadOptions) -> str | None:
+    """Return what the string `time_unit` of an .npz states, where `options` do not."""
+    if "time_unit" not in file or options.time_unit != "auto":
+        return None
+    unit = str(file["time_unit"])
+    if unit not in UNITS_US:
+        raise ValueError(f"time_unit in it must be {', '.join(UNITS_US)}, got {unit}")
+    return unit
+
+
 def split_table(table: Any, order: str | None) -> dict[str, Any]:
     """Return the columns t, x, y, p of a structured array or of one (n, columns), in any of which
-    slices can be taken; `order`: columns=.  Raises ValueError for another array."""
+    slices can be taken; `order`: columns=.  Arrays may also be (4, n) and (n, 1), as MATLAB has
+    them.  Raises ValueError for another array."""
     names = table.dtype.names
+    if isinstance(table, np.ndarray):
+        table = _flat(table) if names else table.T if _has_events_in_columns(table) else table
     if names is not None:
         keys = find_keys_by_name(names)
         if keys is None or table.ndim != 1:
@@ -150,8 +170,12 @@ def _columns_of(
 def _is_table(table: np.ndarray) -> bool:
     fields = table.dtype.names
     return bool(fields and find_columns_by_name(fields)) or (
-        table.ndim == 2 and table.shape[1] == 4
+        table.ndim == 2 and (table.shape[1] == 4 or _has_events_in_columns(table))
     )
+
+
+def _has_events_in_columns(table: np.ndarray) -> bool:
+    return table.ndim == 2 and table.shape[0] == 4 and table.shape[1] >= LEAST_COLUMNS
 
 
 def _flat(column: np.ndarray) -> np.ndarray:

@@ -79,8 +79,7 @@ def open_recording(
     """
     path = Path(path)
     if find_folder_reader(path) is None and (not path.is_file() or path.stat().st_size == 0):
-        found = "is a folder, not an event file" if path.is_dir() else "no such file"
-        raise ValueError(f"{path}: {'the file is empty' if path.is_file() else found}")
+        raise ValueError(f"{path}: {_why_not_a_file(path)}")
     state = path.stat()
     kept, survey, swapped = _open_and_survey(path, state.st_mtime_ns, state.st_size, options)
     file = _open_file(path, options) if kept is None else kept
@@ -194,6 +193,14 @@ def _plain(raw: RawEvents) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         p = np.clip(p, 0 if p.dtype.kind == "u" else -2, 2).astype(np.int8)
     x, y = (np.ascontiguousarray(side, kind) for side in (x, y))
     return x, y, np.ascontiguousarray(p)
+
+
+def _why_not_a_file(path: Path) -> str:
+    if path.is_dir():
+        return "is a folder, not an event file"
+    if path.exists():
+        return "the file is empty" if path.is_file() else "can be read only once; save it as a file"
+    return "no such file"
 
 
 def find_folder_reader(path: Path) -> Reader | None:

@@ -28,7 +28,11 @@ def find_sensor_size(
     opened = recording.open_recording(path, given, options)
     if opened.size is not None:
         return opened.size[::-1]
-    if (frames := find_frames(opened)) is None:
+    try:
+        frames = find_frames(opened)
+    except (ValueError, OSError):  # pictures that cannot be read, or a listing of something else
+        frames = None
+    if frames is None:
         raise ValueError(f"{path} does not state its sensor; give sensor_size=[height,width]")
     height, width = frames.size
     warnings.warn(f"{path}: a sensor of {width}x{height}, as its frames", stacklevel=2)

@@ -26,9 +26,10 @@ Pieces = Iterator[np.ndarray]
 
 
 def write_csv(path: Path, pieces: Pieces, size: WidthHeight) -> None:
-    """Write `t,x,y,p` a line, behind a first line that names them and the sensor's sides."""
+    """Write `t,x,y,p` a line, behind a first line that names them, the unit of t and the sensor's
+    sides."""
     with path.open("w") as file:
-        file.write(f"t,x@{size[0]},y@{size[1]},p\n")
+        file.write(f"t_us,x@{size[0]},y@{size[1]},p\n")
         for events in pieces:
             columns = (events["t"], events["x"], events["y"], events["p"] > 0)
             rows = zip(*(column.astype(np.int64).tolist() for column in columns), strict=True)
@@ -36,7 +37,7 @@ def write_csv(path: Path, pieces: Pieces, size: WidthHeight) -> None:
 
 
 def write_npz(path: Path, pieces: Pieces, size: WidthHeight) -> None:
-    """Write the arrays t int64, x, y uint16, p uint8 and size (width, height)."""
+    """Write the arrays t int64, x, y uint16, p uint8, size (width, height) and time_unit, "us"."""
     kinds = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8}
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".partial") as folder:
         columns = {name: Path(folder) / f"{name}.npy" for name in kinds}
@@ -45,6 +46,7 @@ def write_npz(path: Path, pieces: Pieces, size: WidthHeight) -> None:
             ((part["t"], part["x"], part["y"], part["p"] > 0) for part in pieces),
         )
         np.save(Path(folder) / "size.npy", np.array(size))
+        np.save(Path(folder) / "time_unit.npy", np.array("us"))
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             for column in sorted(Path(folder).iterdir()):
                 archive.write(column, column.name)

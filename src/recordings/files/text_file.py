@@ -61,6 +61,11 @@ class TextFile(EventFile):
             with open_text(path) as file:
                 self._layout = read_layout(file)
             self.size = self._layout.size
+            if self._layout.unknown_header and options.columns is None:
+                self.notes += (
+                    f"{path}: the names in {self._layout.unknown_header[:60]!r} are not known, "
+                    "columns are told by their values; if these are others, give columns=",
+                )
             names_hold = options.time_unit == "auto" and options.columns is None
             self.time_unit = self._layout.time_unit if names_hold else None
             self._columns = self._read(options)

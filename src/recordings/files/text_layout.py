@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from src.recordings.files.columns import find_columns_by_name, parse_unit_suffix
+from src.recordings.files.columns import NAMES, find_columns_by_name, parse_unit_suffix
 from src.recordings.files.event_file import WidthHeight
 
 TEXT_ENDINGS = (".txt", ".csv", ".tsv")
@@ -18,9 +18,11 @@ MAX_HEADER_LINES = 1000
 COMMENTS = ("#", "%", "//", ";")
 WORDS = {"true": "1", "false": "0", "on": "1", "off": "0"}  # of polarity
 CUT = b" cut"  # what a packed text ends in where its file is cut: its last line is no event
+TITLE = re.compile(r"^(?:columns?|format|order|fields|header)\s*[:=]\s*", re.IGNORECASE)
+LEAST_SIDE = 16  # px, of a sensor whose size stands alone in a line
 TO_BLANKS = str.maketrans({",": " ", ";": " ", '"': " ", "'": " "})
 GEOMETRY = re.compile(
-    r"(?:geometry|resolution|size)\D*(?<![\d.])(\d+)"
+    r"(?:geometry|resolution|(?<!pixel )(?<!buffer )(?<!pixel_)(?<!buffer_)size)\D*(?<![\d.])(\d+)"
     r"(?:\s*(?:(?:[x,;*]|by|height)[\s=:]*)+|\s+)(\d+)(?!\d|\.\d)",
     re.IGNORECASE,
 )
@@ -31,7 +33,7 @@ class TextLayout(NamedTuple):
     whether a comma is the decimal point, whether separators are mixed, a line ends in one or values
     have quotes (TO_BLANKS), whether polarity is a word, the `column_places` of t,
     x, y, p where names tell them, the unit of time in these, and (width, height).  `header_lines`
-    come before the events."""
+    come before the events; `unknown_header`: one that seems to name columns, but not all."""
 
     width: int
     separator: str | None
@@ -42,6 +44,7 @@ class TextLayout(NamedTuple):
     time_unit: str | None
     size: WidthHeight | None
     header_lines: int
+    unknown_header: str | None = None
 
 
 @contextmanager
@@ -100,6 +103,7 @@ def read_layout(file: io.TextIOBase) -> TextLayout:
     size: WidthHeight | None = None
     names: list[str] | None = None
     strange: str | None = None
+    unknown: str | None = None
     for number in range(MAX_HEADER_LINES):
         line = file.readline(MAX_LINE)
         if not line:
@@ -119,11 +123,14 @@ def read_layout(file: io.TextIOBase) -> TextLayout:
             places = None if names is None else find_columns_by_name(names)
             unit = parse_unit_suffix(names[places["t"]]) if names and places else None
             how = separator, has_decimal_comma, is_mixed, has_words
-            return TextLayout(len(words), *how, places, unit, size, number)
+            return TextLayout(
+                len(words), *how, places, unit, size, number, None if places else unknown
+            )
         here = _stated_size(bare)
-        size = here or size
+        size = size or here
         title = bare.lstrip("#%/; ").encode("latin-1").decode(errors="replace")  # it may have µs
-        found = split_line(title, _find_separator(title)[0])
+        found = _split_title(title)
+        unknown = bare if len(found) == 4 and not here and _names_some(found) else unknown
         names = found if find_columns_by_name(found) else names
         if bare and not (bare.startswith(COMMENTS) or here or find_columns_by_name(found)):
             strange = strange or bare
@@ -135,8 +142,30 @@ def _stated_size(line: str) -> WidthHeight | None:
     sides = dict(re.findall(r"\b([xy])@(\d+)", line))
     if len(sides) == 2:
         return int(sides["x"]), int(sides["y"])
-    match = re.fullmatch(r"(\d+)[\s,;x]+(\d+)", line.lstrip("#% ")) or GEOMETRY.search(line)
-    return (int(match[1]), int(match[2])) if match else None
+    if match := GEOMETRY.search(line):
+        return int(match[1]), int(match[2])
+    alone = re.fullmatch(r"([1-9]\d*)[\s,;x]+([1-9]\d*)", line)
+    if alone is None or min(int(alone[1]), int(alone[2])) < LEAST_SIDE:
+        return None
+    return int(alone[1]), int(alone[2])
+
+
+def _split_title(title: str) -> list[str]:
+    """Return the names of columns in a line such as `t,x,y,p`, `columns: [t | y | x | p]` or
+    `time (float s), x, y, polarity (0=off)`."""
+    title = TITLE.sub("", title)
+    bare = re.sub(r"[\[\](){}]", "", title).replace("|", ",").strip()
+    for line in (title, bare, re.sub(r"\([^)]*\)", "", title).strip()):
+        names = [name.strip() for name in split_line(line, _find_separator(line)[0])]
+        if find_columns_by_name(names):
+            break
+    return names
+
+
+def _names_some(names: list[str]) -> bool:
+    """Return whether two or more of the columns are known by name."""
+    plain = [re.split(r"[^a-zµ]", name.lower())[0] for name in names]
+    return sum(any(name in known for name in plain) for known in NAMES.values()) >= 2
 
 
 def _find_separator(line: str) -> tuple[str | None, bool]:

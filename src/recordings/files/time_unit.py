@@ -1,17 +1,19 @@
 """The unit of a table's times, told once by all of them, and times in it to int64 microseconds.
 
 A unit is judged by the file's duration and event rate in it.  It loses a point for each factor of
-ten by which the duration is outside 0.02 s..600 s or the rate outside 1e4..3e7 events/s, and those
+ten by which the duration is outside 0.02 s..600 s or the rate outside 3e3..3e6 events/s, and those
 of PRIOR, for whole numbers and others; ns lose NS_OF_US where all are apart by thousands.  It gains
 EPOCH where the times are then dates of 2001 to 2039.  Where half of the times have more than three
 digits behind the point, other units than s lose FINE: they would be finer than a camera's.
-Duration and rate are those between the 1st and the 99th of a hundred times, so that single wild
-ones do not matter; a counter that goes round goes on.
+The duration is that between the 1st and the 99th of a hundred times, so that single wild ones do
+not matter, the rate that of the median step, so that silence does not; a counter that goes round
+goes on.
 
 The best unit is taken.  The user is told where it is not that of PRIOR 0 or a date, where a second
 one is less than NEAR behind, where another would be ahead but for FINE though the times are finer
 than a camera's in s, too, and where duration or rate are absurd.  Fewer than FEW_TIMES values tell
-too little: they are seconds with a fraction, microseconds without.
+too little: they are dates where one unit makes them so, else seconds with a fraction, microseconds
+without.
 """
 
 from pathlib import Path
@@ -26,9 +28,9 @@ PRIOR = {
     True: {"us": 0.0, "ns": 2.0, "ms": 2.0, "s": 3.0},  # whole numbers
     False: {"s": 0.0, "ms": 1.0, "us": 1.0, "ns": 2.0},
 }
-FINE, NS_OF_US = 3.0, 1.0
-DURATION_S, RATE_HZ, EPOCH_S, EPOCH = (0.02, 600.0), (1e4, 3e7), (1e9, 2.2e9), 3.0
-NEAR = 1.0  # points: a second unit as near is told of
+FINE, NS_OF_US = 3.0, 0.8
+DURATION_S, RATE_HZ, EPOCH_S, EPOCH = (0.02, 600.0), (3e3, 3e6), (1e9, 2.2e9), 3.0
+NEAR = 1.25  # points: a second unit as near is told of
 ABSURD_S, ABSURD_HZ = (1e-3, 86_400.0), (10.0, 1e9)  # outside, duration and rate are told of
 FEW_TIMES = 100
 SAMPLES = 1024  # of a piece
@@ -44,6 +46,7 @@ class TimeSample:
     def __init__(self) -> None:
         self.count, self.are_whole_numbers, self.are_apart_by_thousands = 0, True, True
         self._values: list[np.ndarray] = []
+        self._strides: list[int] = []  # of events from one of the values to the next
         self._last: Any = None
         self._steps: Range = (0, 0)  # least and most
         self._range: Range = (np.inf, -np.inf)
@@ -54,8 +57,10 @@ class TimeSample:
             return
         first = t[0] if self._last is None else self._last
         self.count += len(t)
-        values = np.array(t[:: max(1, len(t) // SAMPLES)])
+        stride = max(1, len(t) // SAMPLES)
+        values = np.array(t[::stride])
         self._values.append(values)
+        self._strides.append(stride)
         if t.dtype.kind == "f":
             if self.are_whole_numbers:
                 self.are_whole_numbers = bool((t == np.rint(t)).all())
@@ -84,6 +89,12 @@ class TimeSample:
         shifted = np.concatenate(self._values) * 10**digits
         return bool(np.mean(np.abs(shifted - np.rint(shifted)) > 1e-3) >= 0.5)
 
+    def median_step(self) -> float:
+        """Return the median time from an event to the next, in the file's unit."""
+        pairs = zip(self._values, self._strides, strict=True)
+        steps = [np.diff(values) / stride for values, stride in pairs if len(values) > 1]
+        return float(np.median(np.concatenate(steps))) if steps else 0.0
+
     def early_time_and_span(self) -> tuple[float, float]:
         """Return an early time and the span of the times, less the first and last hundredth, in the
         file's unit."""
@@ -108,6 +119,8 @@ class _Reading:
             value * UNITS_US[unit] * 1e-6 for value in sample.early_time_and_span()
         )
         self.rate_hz = sample.count / self.duration_s if self.duration_s else np.inf
+        step_s = sample.median_step() * UNITS_US[unit] * 1e-6
+        self.active_rate_hz = 1 / step_s if step_s > 0 else self.rate_hz
         self.is_date = EPOCH_S[0] < early_s < EPOCH_S[1]
 
     def __str__(self) -> str:
@@ -116,7 +129,7 @@ class _Reading:
     def points(self) -> float:
         if not self.duration_s:
             return 0.0
-        lost = _decades(self.duration_s, DURATION_S) + _decades(self.rate_hz, RATE_HZ)
+        lost = _decades(self.duration_s, DURATION_S) + _decades(self.active_rate_hz, RATE_HZ)
         return EPOCH * self.is_date - lost
 
 
@@ -125,7 +138,8 @@ def find_unit(sample: TimeSample, stated: str) -> tuple[str, str]:
     is_auto = stated == "auto"
     usual = ("us" if sample.are_whole_numbers else "s") if is_auto else stated
     if sample.count < FEW_TIMES:
-        return usual, ""
+        dated = [unit for unit in UNITS_US if _Reading(sample, unit).is_date] if is_auto else []
+        return (usual if usual in dated or not dated else dated[0]), ""
     if not sample.early_time_and_span()[1]:
         return usual, f"all or nearly all of {sample.count} times are equal"
     read = {unit: _Reading(sample, unit) for unit in UNITS_US}

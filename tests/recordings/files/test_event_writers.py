@@ -48,7 +48,7 @@ def test_npz_and_csv(tmp_path):
         assert all(np.array_equal(file[name], events[name]) for name in "txy")
         assert np.array_equal(file["p"], events["p"] > 0) and file["size"].tolist() == [640, 480]
     table = np.loadtxt(tmp_path / "a.csv", np.int64, delimiter=",", skiprows=1)
-    assert (tmp_path / "a.csv").read_text().startswith("t,x@640,y@480,p\n")
+    assert (tmp_path / "a.csv").read_text().startswith("t_us,x@640,y@480,p\n")
     assert all(np.array_equal(table[:, i], events[name]) for i, name in enumerate("txy"))
     assert np.array_equal(table[:, 3], events["p"] > 0)
 

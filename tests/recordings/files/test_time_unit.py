@@ -66,6 +66,30 @@ def test_microseconds_of_a_slow_recording_are_not_taken_for_nanoseconds(duration
     assert find_unit(sampled(in_unit(made_up(duration, rate), "us", 0, int)), "auto")[0] == "us"
 
 
+@pytest.mark.parametrize(
+    ("duration", "rate"), [(60.0, 50), (20.0, 60), (300.0, 90), (1800.0, 200), (7200.0, 500)]
+)
+def test_microseconds_of_a_night_are_microseconds(duration, rate):
+    assert find_unit(sampled(in_unit(made_up(duration, rate), "us", 0, int)), "auto")[0] == "us"
+
+
+def test_silence_does_not_change_the_unit():
+    t = in_unit(made_up(0.5, 4e4), "us", 0, int)
+    t[len(t) // 2 :] += 300_000_000
+    assert find_unit(sampled(t, 1), "auto") == ("us", "")
+
+
+@pytest.mark.parametrize("duration", [2.0, 5.0, 60.0])
+def test_whole_milliseconds_are_told_of(duration):
+    unit, line = find_unit(sampled(in_unit(made_up(duration, 2e4), "ms", 0, int)), "auto")
+    assert unit in ("us", "ms") and f"in ms {duration:.3g} s" in line and "time_unit=" in line
+
+
+def test_few_times_that_are_dates_tell_their_unit():
+    t = in_unit(made_up(1.0, 80), "ns", DATE_S, int)
+    assert find_unit(sampled(t), "auto") == ("ns", "")
+
+
 def test_fractions_finer_than_microseconds_are_told_of():
     """Milliseconds with all digits of a float cannot be told from seconds."""
     t = np.sort(np.random.default_rng(0).random(6000)) * 300

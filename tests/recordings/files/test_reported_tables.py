@@ -1,0 +1,166 @@
+"""Tables as people have them: what their names, headers, shapes and parts mean."""
+
+import os
+import warnings
+
+import h5py
+import numpy as np
+import pytest
+
+from src.recordings.files import ReadOptions, read_events
+from src.recordings.files.recording import open_recording
+from src.recordings.files.sources import find_sensor_size
+from src.recordings.files.table_writers import write_csv, write_npz
+from tests.recordings.files.test_tables import events, lines
+
+__all__ = ["events"]  # a fixture
+
+
+@pytest.fixture
+def night(events):
+    """An hour with few events: the values alone would tell nanoseconds."""
+    slow = events.copy()
+    slow["t"] = np.linspace(0, 3_600_000_000, len(slow)).astype(np.int64)
+    return slow
+
+
+def quiet_read(path, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return read_events(path, options=ReadOptions(**options))
+
+
+@pytest.mark.parametrize(("name", "write"), [("a.csv", write_csv), ("a.npz", write_npz)])
+def test_what_was_written_here_is_read_back_at_any_rate(tmp_path, night, name, write):
+    write(tmp_path / name, iter([night]), (640, 480))
+    assert np.array_equal(quiet_read(tmp_path / name), night)
+
+
+def test_an_npz_with_an_unknown_unit_is_refused(tmp_path, events):
+    np.savez(tmp_path / "a.npz", time_unit="min", **{n: events[n] for n in "txyp"})
+    with pytest.raises(ValueError, match="time_unit in it must be s, ms, us, ns, got min"):
+        read_events(tmp_path / "a.npz")
+
+
+def test_a_unit_in_a_name_holds_for_a_folder_of_npz(tmp_path, events):
+    for number, part in enumerate(np.array_split(events, 3)):
+        columns = {name: part[name] for name in "xyp"}
+        np.savez(tmp_path / f"{number}.npz", t_ns=part["t"] * 1000, **columns)
+    assert np.array_equal(quiet_read(tmp_path), events)
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        "timestamp,y_coord,x_coord,polarity", "# columns: t y x p", "# (t, y, x, p)",
+        "# format = [t | y | x | p]", "time,v,u,polarity", "t,y-coordinate,x-coordinate,pol",
+    ],
+)  # fmt: skip
+def test_headers_in_other_words_name_the_columns(tmp_path, events, head):
+    rows = np.stack([events[name] for name in "tyxp"], 1).tolist()
+    text = "".join(f"{t},{y},{x},{int(p > 0)}\n" for t, y, x, p in rows)
+    (tmp_path / "a.csv").write_text(f"{head}\n{text}")
+    assert np.array_equal(quiet_read(tmp_path / "a.csv"), events)
+
+
+def test_names_that_are_not_known_are_told_of(tmp_path, events):
+    (tmp_path / "a.csv").write_text("t,across,down,p\n" + lines(events, between=","))
+    with pytest.warns(UserWarning, match=r"names in 't,across,down,p' are not known.*columns="):
+        assert np.array_equal(read_events(tmp_path / "a.csv"), events)
+    assert np.array_equal(quiet_read(tmp_path / "a.csv", columns="txyp"), events)
+
+
+def test_the_size_of_a_pixel_is_not_that_of_the_sensor(tmp_path, events):
+    head = (
+        "# sensor resolution: 640x480\n# pixel size: 15 x 15 um\n# buffer size = 4096, 32\n# 2 30\n"
+    )
+    (tmp_path / "a.txt").write_text(head + lines(events))
+    assert open_recording(tmp_path / "a.txt").size == (640, 480)
+
+
+def test_a_listing_that_is_not_of_pictures_does_not_hide_the_missing_size(tmp_path, events):
+    (tmp_path / "events.txt").write_text(lines(events))
+    (tmp_path / "images.txt").write_text("0.01 images/frame_0.png\n")
+    with pytest.raises(ValueError, match=r"give sensor_size=\[height,width\]"):
+        find_sensor_size(tmp_path / "events.txt")
+
+
+def test_a_table_of_four_rows_has_events_in_its_columns(tmp_path, events):
+    rows = np.stack([events[name].astype(np.int64) for name in "txyp"])
+    np.save(tmp_path / "a.npy", rows)
+    np.savez(tmp_path / "a.npz", events=rows)
+    for name in ("a.npy", "a.npz"):
+        assert np.array_equal(quiet_read(tmp_path / name), events)
+    np.save(tmp_path / "b.npy", events.reshape(-1, 1))
+    assert np.array_equal(quiet_read(tmp_path / "b.npy"), events)
+
+
+def test_polarity_that_is_missing_is_what_the_error_names(tmp_path, events):
+    rows = np.stack([*(events[name] for name in "txy"), (events["p"] > 0) + 1], 1)
+    np.savetxt(tmp_path / "a.csv", rows, "%d", ",")
+    with pytest.raises(ValueError, match="polarity must be -1, 0 or 1: none of the 4 columns"):
+        read_events(tmp_path / "a.csv")
+
+
+def test_a_pipe_is_named_as_what_it_is(tmp_path):
+    os.mkfifo(tmp_path / "a.csv")
+    with pytest.raises(ValueError, match="can be read only once; save it as a file"):
+        read_events(tmp_path / "a.csv")
+
+
+def test_few_dates_tell_their_unit(tmp_path, events):
+    few = events[:80].copy()
+    few["t"] += 1_700_000_000_000_000
+    np.savez(tmp_path / "a.npz", t=few["t"] * 1000, **{name: few[name] for name in "xyp"})
+    assert np.array_equal(read_events(tmp_path / "a.npz"), few)
+
+
+def write_windows(path, names, parts):
+    with h5py.File(path, "w") as file:
+        for name, part in zip(names, parts, strict=True):
+            for column in "txyp":
+                file[f"{name}/{column}"] = part[column]
+
+
+def test_numbered_windows_are_one_recording(tmp_path, events):
+    parts = np.array_split(events, 12)
+    parts.insert(5, events[:0])
+    write_windows(tmp_path / "a.h5", [f"events/{n}" for n in range(13)], parts)
+    assert np.array_equal(quiet_read(tmp_path / "a.h5"), events)
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        for number, part in enumerate(np.array_split(events, 3)):
+            file[f"event_{number:06d}"] = np.stack([part[n].astype(np.int64) for n in "txyp"], 1)
+    assert np.array_equal(quiet_read(tmp_path / "b.h5"), events)
+
+
+def test_cameras_with_numbers_are_several_recordings(tmp_path, events):
+    write_windows(tmp_path / "a.h5", ["camera0", "camera1"], [events, events[::2]])
+    with pytest.warns(UserWarning, match="camera1"):
+        assert np.array_equal(read_events(tmp_path / "a.h5"), events)
+
+
+def test_an_offset_beside_seconds_leaves_them_seconds(tmp_path, events):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["events/t"], file["t_offset"] = events["t"] / 1e6, 0.5
+        for name in "xyp":
+            file[f"events/{name}"] = events[name]
+    found = quiet_read(tmp_path / "a.h5")
+    assert np.array_equal(found["t"], events["t"] + 500_000)
+    assert np.array_equal(quiet_read(tmp_path / "a.h5", time_unit="s"), found)
+
+
+def test_large_chunks_are_unpacked_once(tmp_path, events, monkeypatch):
+    many = np.tile(events, 1400)  # eight pieces
+    many["t"] = np.arange(len(many))
+    opened = []
+    original = h5py.File.__init__
+    monkeypatch.setattr(
+        h5py.File, "__init__",
+        lambda self, *given, **options: opened.append(options) or original(self, *given, **options),
+    )  # fmt: skip
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name in "txyp":
+            chunks = many[name].shape
+            file.create_dataset(f"events/{name}", data=many[name], chunks=chunks, compression=1)
+    assert np.array_equal(quiet_read(tmp_path / "a.h5", time_unit="us"), many)
+    assert max(options.get("rdcc_nbytes", 0) for options in opened) >= many["t"].nbytes
