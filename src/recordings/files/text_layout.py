@@ -19,7 +19,7 @@ COMMENTS = ("#", "%", "//", ";")
 WORDS = {"true": "1", "false": "0", "on": "1", "off": "0"}  # of polarity
 CUT = b" cut"  # what a packed text ends in where its file is cut: its last line is no event
 TITLE = re.compile(r"^(?:columns?|format|order|fields|header)\s*[:=]\s*", re.IGNORECASE)
-LEAST_SIDE = 16  # px, of a sensor whose size stands alone in a line
+LEAST_SIDE = 16  # px, of a sensor whose size stands alone in a comment
 TO_BLANKS = str.maketrans({",": " ", ";": " ", '"': " ", "'": " "})
 GEOMETRY = re.compile(
     r"(?:geometry|resolution|(?<!pixel )(?<!buffer )(?<!pixel_)(?<!buffer_)size)\D*(?<![\d.])(\d+)"
@@ -144,8 +144,8 @@ def _stated_size(line: str) -> WidthHeight | None:
         return int(sides["x"]), int(sides["y"])
     if match := GEOMETRY.search(line):
         return int(match[1]), int(match[2])
-    alone = re.fullmatch(r"([1-9]\d*)[\s,;x]+([1-9]\d*)", line)
-    if alone is None or min(int(alone[1]), int(alone[2])) < LEAST_SIDE:
+    alone = re.fullmatch(r"(\d+)[\s,;x]+(\d+)", line.lstrip("#% "))
+    if alone is None or (line[0] in "#%" and min(int(alone[1]), int(alone[2])) < LEAST_SIDE):
         return None
     return int(alone[1]), int(alone[2])
 
