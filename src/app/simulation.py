@@ -148,7 +148,7 @@ def _build_uncached_pipeline(
     rates = _frame_rates(cfg, split)
     scenes = [build_part(cfg, "scene", fps=rate * substeps, **given) for rate in rates]
     return Pipeline(
-        FrameRateMixture(scenes) if len(scenes) > 1 else scenes[0],
+        FrameRateMixture(scenes, split, seed) if len(scenes) > 1 else scenes[0],
         optics,
         build_part(cfg, "turbulence"),
         build_sensor(cfg, seed),

@@ -21,7 +21,9 @@ def bootstrap_difference_interval(
     """Return the interval of mean(ours) - mean(theirs); rows are seeds, columns the same clips.
 
     Seeds and clips are resampled, a clip in both at once, seeds of each apart.  None stands for
-    zero.  Always the same draws.  Raises ValueError for rows of different lengths.
+    zero.  Always the same draws.  Of two to nine seeds the interval is too narrow: it holds the
+    difference in 76 % of cases with two, 84 % with three, 93 % with ten.  Raises ValueError for
+    rows of different lengths.
     """
     rng = np.random.default_rng(0)
     clips = len(ours[0])

@@ -44,7 +44,7 @@ def measure_static_scene(
     step = line_spacing_px
     inside = film[:, step : film.shape[1] - step, step : film.shape[2] - step]
     if step < 1 or 0 in inside.shape:
-        raise ValueError(f"still must be in 1..{min(film.shape[1:]) // 2} pixels, got {step}")
+        raise ValueError(f"still must be in 1..{(min(film.shape[1:]) - 1) // 2} pixels, got {step}")
     lines = [inside[:, y] for y in range(0, inside.shape[1], step)]
     lines += [inside[:, :, x] for x in range(0, inside.shape[2], step)]
     contrast = float(film.std((1, 2)).mean())

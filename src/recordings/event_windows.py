@@ -182,7 +182,7 @@ def _cut(chunks: _OrderedChunks, rule: WindowRule) -> Iterator[Cut]:
             continue
         events = concatenate_events([*pending, chunk])
         last = min(float(chunk["t"][-1]) + 1, end)
-        while start + k * period < last:
+        while start + k * period <= min(chunk["t"][-1], end):  # more events of that time may come
             yield cut(k)
             k += 1
         oldest = start + (k - rule.frames_per_window) * period

@@ -1,5 +1,6 @@
 """Tables of differences on the same clips: of two sets of runs, and of pairs of a sweep's runs."""
 
+import math
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from statistics import fmean
@@ -10,6 +11,8 @@ from src.metrics.table import Column
 from src.records.runs import Run
 from src.reports.run_groups import RunGroup, find_published
 from src.reports.tables import Table, TableCell, check_columns, list_metrics
+
+FEW_SEEDS = 10  # of three the interval holds the difference in four of five cases, of ten in nine
 
 
 def build_difference_table(
@@ -37,6 +40,8 @@ def build_difference_table(
         texts.append("-" if change is None else f"{change:+.{digits}f}")
         table.rows.append([TableCell(text=text) for text in texts])
     table.note = f"{len(ours[0].clips)} clips; {len(ours)} runs against {len(theirs)}."
+    if 1 < min(len(ours), len(theirs)) < FEW_SEEDS:
+        table.note += f" Of fewer than {FEW_SEEDS} seeds the interval is too narrow."
     return table
 
 
@@ -114,4 +119,6 @@ def _compare(
         [[float(clip[metric]) for clip in run.clips] for run in side] for side in (ours, theirs)
     )
     interval = bootstrap_difference_interval(left, right)
+    if len(left[0]) == 1:  # of one clip there is none
+        interval = math.nan, math.nan
     return fmean(chain(*left)), fmean(chain(*right)), interval

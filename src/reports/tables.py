@@ -180,9 +180,11 @@ def build_reference_methods_table(
 def _mean_over_seeds(
     runs: Sequence[Run], measure: Callable[[Run], float | None], with_std: bool = True
 ) -> TableCell:
-    values = [value for run in runs if (value := measure(run)) is not None and math.isfinite(value)]
-    if not values:
+    values = [value for run in runs if (value := measure(run)) is not None]
+    if not any(map(math.isfinite, values)):  # not measured
         return TableCell()
+    if not all(map(math.isfinite, values)):  # a run that diverged
+        return TableCell(math.nan)
     std = statistics.stdev(values) if with_std and len(values) > 1 else None
     return TableCell(statistics.fmean(values), std)
 

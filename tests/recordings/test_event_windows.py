@@ -53,6 +53,7 @@ RULES = {
     "time": WindowRule(fps=200),
     "overlap": WindowRule(fps=1000, frames_per_window=8),
     "cut": WindowRule(fps=200, start_s=0.021, end_s=0.072),
+    "edges between microseconds": WindowRule(fps=120),
 }
 
 
@@ -60,6 +61,9 @@ RULES = {
 @pytest.mark.parametrize("size", [1, 37, 1000])
 def test_windows_do_not_depend_on_the_chunks(name, size):
     made, rule = events(4000, 100_000), RULES[name]
+    made["t"][100:] = np.maximum(made["t"][100:], 5_008_333)  # many in one, at an edge
+    made["t"][100:1000] = 5_008_333
+    made = made[np.argsort(made["t"], kind="stable")]
     whole = list(event_windows.cut_windows([made], TABLE, rule))
     parts = list(event_windows.cut_windows(chunks(made, size), TABLE, rule))
     assert len(whole) == len(parts) > 3

@@ -111,3 +111,10 @@ def test_pairs_that_are_none_are_refused(tmp_path, pairs):
     sweep(tmp_path / "runs")
     with pytest.raises(ValueError, match="pairs must be a list of pairs"):
         report(config("report", tmp_path / "out", f"run={tmp_path}/runs", f"pairs={pairs}"))
+
+
+def test_one_clip_has_no_interval_and_is_not_bold(tmp_path):
+    both = [*found(tmp_path, "one", {"a": 0.3}), *found(tmp_path, "two", {"a": 0.4})]
+    keys, groups = run_groups.group_runs(both)
+    table = build_pair_table("Pairs", keys, groups, [("one", "two")], ["lpips"])
+    assert "| one − two | -0.100 (+nan to +nan) |" in format_markdown([table])

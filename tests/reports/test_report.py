@@ -46,6 +46,13 @@ def test_one_seed_has_no_spread_and_a_metric_not_taken_is_a_dash(tmp_path):
     assert writers.format_cell(value(table, 0, "lpips"), tables.METRICS[0]) == "-"
 
 
+def test_a_seed_that_diverged_is_not_left_out(tmp_path):
+    for seed, psnr in enumerate((20.0, 22.0, math.nan)):
+        write_run(tmp_path / str(seed), seed=seed, scores={"psnr": psnr})
+    table, _, _ = built(tmp_path)
+    assert math.isnan(value(table, 0, "psnr").mean) and value(table, 0, "ssim").mean == 0.6
+
+
 def test_missing_cells_are_shown(tmp_path):
     write_sweep(tmp_path, {"experiment": "lf3x3,single256", "seed": "range(2)"})
     write_run(tmp_path / "a", "lf3x3", 0)

@@ -131,7 +131,7 @@ def measure_worst_view_dropout_loss(
         lost = [rng.permutation(network.views)[:count].tolist() for _ in range(draws)]
         lost[0] = [middle, *(v for v in lost[0] if v != middle)][:count]  # the centre view, too
         losses = [base - _psnr_without_views(network, bench, views) for views in lost]
-        curve.append((count, max(losses)))
+        curve.append((count, float(np.max(losses))))
     return build_worst_psnr_loss_result(curve, limit_db=limit_db, varied="views lost")
 
 

@@ -150,8 +150,8 @@ def simulate_event_clip(pipeline: Pipeline, index: int, conditions: ClipConditio
     views = variant.render_views([draw])[0]
     if conditions.view_log_gain_std:
         views = _apply_gain(views, conditions.view_log_gain_std, noise.key(draw.key, "gain"))
-    changes = {"threshold": draw.sensor.threshold} | dict(conditions.sensor)
-    sensor = replace(require_type("sensor", pipeline.sensor, EventSensor), **changes)
+    sensor = require_type("sensor", draw.sensor, EventSensor)
+    sensor = replace(sensor, **dict(conditions.sensor))
     fps, ids = draw.clip.fps, pipeline.optics.random_key_ids
     target, turbulent = crop_frames(draw.clip.frames, draw.crop), views[pipeline.optics.centre]
     light, light_fps = views, fps

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from src.bench.candidates import Candidate
 from src.bench.stress_tests.event_clips import ClipConditions, StressBench
-from src.bench.stress_tests.stress_results import StressResult
+from src.bench.stress_tests.stress_results import StressResult, worst_of
 from src.deploy.forms import convert_to_form
 from src.metrics.image import aligned_psnr
 from src.metrics.temporal import temporal_jitter_px
@@ -71,7 +71,7 @@ def measure_convergence_windows(
     network: Candidate, bench: StressBench, *, limit_windows: float, within_db: float = 1.0
 ) -> StressResult:
     """Return the windows until the frame is within `within_db` of the clip's second half, for good;
-    a clip that never gets there counts its length.
+    a clip that never gets there counts half its length.
     """
     scores = [aligned_psnr(clip.reconstruct(network)[0], clip.truth) for clip in bench.clips()]
     times = [count_settling_windows(s, within_db) for s in scores]
@@ -177,7 +177,7 @@ def measure_adversarial_gain(
         (gradient,) = torch.autograd.grad(change, extra)
         curve.append((step, math.sqrt(float(change.detach())) / perturbation_rms))
         extra = gradient + 1e-12
-    return StressResult(max(gain for _, gain in curve), "x", limit_gain, curve, "steps of ascent")
+    return StressResult(worst_of(curve), "x", limit_gain, curve, "steps of ascent")
 
 
 def measure_bf16_psnr_difference(
@@ -210,8 +210,8 @@ def count_settling_windows(scores: Float[Tensor, " windows"], within_db: float) 
 
 
 def count_windows_to_last_exceedance(losses: Float[Tensor, " windows"], limit: float) -> float:
-    """Return how many windows pass until `losses` is above `limit` for the last time."""
-    beyond = (losses > limit).nonzero()
+    """Return how many windows pass until `losses` is above `limit`, or NaN, for the last time."""
+    beyond = (~(losses <= limit)).nonzero()
     return float(beyond[-1] + 1) if len(beyond) else 0.0
 
 

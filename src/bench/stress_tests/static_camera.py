@@ -9,7 +9,7 @@ import numpy as np
 
 from src.bench.candidates import Candidate
 from src.bench.stress_tests.event_clips import EventClip, StressBench, require_type
-from src.bench.stress_tests.stress_results import StressResult
+from src.bench.stress_tests.stress_results import StressResult, worst_of
 from src.metrics.invented_contrast import find_unseen_pixels, invented_contrast
 from src.recordings.noise_filter import find_supported_pixels
 from src.sim.optics import layout
@@ -32,9 +32,8 @@ def measure_invented_contrast(
         simulate = partial(_simulate_clip, bench, *conditions)
         clips = bench.simulate_once(f"static camera {conditions}", simulate)
         shares = [_invented_contrast(network, clip) for clip in clips]
-        curve.append((f"{width}x{height}", float(np.nanmean(shares))))
-    worst = max(value for _, value in curve)
-    return StressResult(worst, "", limit_share, curve, "sensor")
+        curve.append((f"{width}x{height}", float(np.mean(shares))))
+    return StressResult(worst_of(curve), "", limit_share, curve, "sensor")
 
 
 def _simulate_clip(
@@ -49,9 +48,8 @@ def _simulate_clip(
         cutout_widths=(0.05, 0.2), speed_widths_per_s=(0.2, 1.5),
     )  # fmt: skip
     clip = scene.clip(index)
-    plain = require_type("sensor", bench.pipeline.sensor, EventSensor)
-    threshold = bench.pipeline.draw(index).sensor.threshold
-    sensor = replace(plain, **({"threshold": threshold} | dict(changes)))
+    drawn = require_type("sensor", bench.pipeline.draw(index).sensor, EventSensor)
+    sensor = replace(drawn, **dict(changes))
     events = [sensor.events(clip.frames, clip.fps, clip=index, view=k) for k in range(views)]
     return EventClip(events, clip.frames, clip.frames, clip.fps, layout(views))
 

@@ -5,6 +5,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from src.bench.candidates import Candidate
 from src.bench.stress_tests.event_clips import Curve, StressBench
 from src.records.results import format_csv
@@ -43,7 +45,12 @@ StressTest = Callable[[Candidate, StressBench], StressResult]
 
 def build_worst_psnr_loss_result(curve: Curve, *, limit_db: float, varied: str) -> StressResult:
     """Return the result whose value is the largest of the curve, in dB."""
-    return StressResult(max(value for _, value in curve), "dB", limit_db, curve, varied)
+    return StressResult(worst_of(curve), "dB", limit_db, curve, varied)
+
+
+def worst_of(curve: Curve) -> float:
+    """Return the largest value of a curve; NaN where one is."""
+    return float(np.max([value for _, value in curve]))
 
 
 Outcome = StressResult | str  # or why there is none

@@ -82,13 +82,13 @@ class SceneBase:
 
 
 class FrameRateMixture:
-    """Scenes that differ in frame rate: clip k is that of one of them, drawn by its number."""
+    """Scenes that differ in frame rate: clip k is that of one of them, drawn for each clip."""
 
-    def __init__(self, scenes: Sequence[Scene]):
-        self.scenes = list(scenes)
+    def __init__(self, scenes: Sequence[Scene], split: str = "train", seed: int = 0):
+        self.scenes, self._key = list(scenes), noise.key(seed, split, "rate")
 
     def clip(self, index: int) -> Clip:
-        draw = float(noise.uniform(noise.key("rate"), torch.tensor(index)))
+        draw = float(noise.uniform(self._key, torch.tensor(index)))
         return self.scenes[int(draw * len(self.scenes))].clip(index)
 
 

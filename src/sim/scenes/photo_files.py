@@ -64,8 +64,8 @@ Root = str | Sequence[str] | None
 def list_photographs(root: Root, split: str) -> list[Photograph]:
     """Return the photographs of a split: of several folders or packs, each one's own share of it.
 
-    `root` None: those inside scikit-image.  Raises ValueError where there are none, and for a split
-    that is none.
+    `root` None: those inside scikit-image.  Raises ValueError where there are none, for a split
+    that is none, and for a folder within another, whose photographs would be in two splits.
     """
     check_split(split)
     if root is None:
@@ -74,7 +74,12 @@ def list_photographs(root: Root, split: str) -> list[Photograph]:
         folder = Path(spec.origin).parent / "data"
         embedded = {path.stem: path for path in folder.iterdir() if path.suffix in PICTURE_SUFFIXES}
         return [embedded[name] for name in EMBEDDED[split].split()]
-    return [photo for one in _roots("root", root) for photo in _share(one, split)]
+    roots = _roots("root", root)
+    places = [one.resolve() for one in roots]
+    for k, place in enumerate(places):
+        if any(place.is_relative_to(other) for other in (*places[:k], *places[k + 1 :])):
+            raise ValueError(f"scene.root must be folders apart, got {roots[k]} twice")
+    return [photo for one in roots for photo in _share(one, split)]
 
 
 def list_train_only_photographs(extra_train_root: Root, scene_root: Root) -> list[Photograph]:

@@ -94,7 +94,7 @@ def _clip_numbers(clip: SensorClip, low_pass_row: int) -> tuple:
         got = f"the range {low} to {high}"
         raise ValueError(f"sensor.threshold is {got}: `draw` the sensor of each clip first")
     threshold = float(np.float32(low))
-    for name in ("dark_noise_hz", "hot_pixel_hz"):
+    for name in ("dark_noise_hz", "hot_pixel_hz", "leak_event_hz"):
         check_in_range(f"sensor.{name}", getattr(sensor, name), 0, fps)
     return (
         math.floor(threshold * UNIT) - ALLOWANCE,

@@ -154,6 +154,8 @@ class Atmosphere:
     def with_d_over_r0(self, d_over_r0: float) -> "Atmosphere":
         """Return the same path and camera with Cn2 scaled to give `d_over_r0`."""
         check_option(0 <= d_over_r0 < math.inf, "atmosphere.d_over_r0", ">= 0", d_over_r0)
+        if not self.d_over_r0:
+            raise ValueError("atmosphere.cn2 must not be 0 throughout to be scaled")
         scale = (d_over_r0 / self.d_over_r0) ** (5 / 3)
         return replace(self, cn2=tuple(value * scale for value in self.cn2_profile))
 

@@ -96,7 +96,7 @@ def choose_fidelity(atmosphere: Atmosphere, width_px: int, max_error_share: floa
         severity=atmosphere.severity,
         rytov_variance=atmosphere.rytov_variance,
         ar1_coefficient=ar1,
-        tilt_correlation_time_s=-1 / (AR1_FPS * math.log(ar1)) if 0 < ar1 < 1 else 0.0,
+        tilt_correlation_time_s=_ar1_correlation_time_s(ar1),
         tilt_and_blur_px=atmosphere.tilt_and_blur_px(width_px),
         tilt_correlation_half_length_px=atmosphere.tilt_correlation_half_length_px(width_px),
         aperture_px=atmosphere.aperture_m / atmosphere.pixel_size_at_object_m(width_px),
@@ -109,6 +109,12 @@ def choose_fidelity(atmosphere: Atmosphere, width_px: int, max_error_share: floa
         error=math.sqrt(power * (psf["error_psf"] + psf["error_grid"] + psf["error_kernel"])),
         **psf,
     )
+
+
+def _ar1_correlation_time_s(coefficient: float) -> float:
+    if coefficient >= 1:
+        return math.inf
+    return -1 / (AR1_FPS * math.log(coefficient)) if coefficient > 0 else 0.0
 
 
 def mean_short_exposure_psf(d_over_r0: float) -> Float[Tensor, "fine fine"]:

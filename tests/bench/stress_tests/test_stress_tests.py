@@ -9,7 +9,13 @@ from torch import nn
 
 from baselines.highpass import HighPass
 from src.bench.candidates import Candidate
-from src.bench.stress_tests import conditions, faults, recurrence, static_camera
+from src.bench.stress_tests import (
+    conditions,
+    faults,
+    recurrence,
+    static_camera,
+    stress_results,
+)
 from src.bench.stress_tests.event_clips import ClipConditions, StressBench, simulate_event_clip
 from src.bench.stress_tests.stress_results import StressResult
 from src.models.network import EventToVideoNetwork
@@ -91,6 +97,23 @@ def test_a_scene_that_stops_makes_no_event_afterwards(bench):
 @pytest.mark.parametrize(("value", "high", "failed"), [(2, False, True), (2, True, False)])
 def test_a_result_fails_on_its_side(value, high, failed):
     assert StressResult(value, "dB", 1.0, higher_is_better=high).failed == failed
+
+
+def test_what_is_not_a_number_fails_wherever_it_stands():
+    for curve in ([(1, 0.1), (2, torch.nan)], [(1, torch.nan), (2, 0.1)]):
+        found = stress_results.build_worst_psnr_loss_result(curve, limit_db=1.0, varied="")
+        assert found.failed and found.value != found.value
+    scores = torch.full((60,), torch.nan)
+    assert recurrence.count_settling_windows(scores, 1.0) == 30
+
+
+def test_a_stress_clip_has_the_sensor_that_was_drawn():
+    chain, expected = pipeline(), pipeline()
+    chain.sensor = EventSensor(random={"off_ratio": [0.5, 0.8], "refractory_s": [0.01, 0.1]})
+    expected.sensor = chain.draw(0).sensor
+    found, plain = (simulate_event_clip(one, 0, ClipConditions()) for one in (chain, expected))
+    assert expected.sensor.off_ratio < 1 and expected.sensor.refractory_s > 0.01
+    assert all(map(np.array_equal, found.events, plain.events))
 
 
 def test_nothing_known_is_a_failure_and_the_first_break_is_found():

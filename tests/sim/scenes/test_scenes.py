@@ -116,6 +116,8 @@ def test_mixed_rates_draw_the_rate_of_a_clip_from_its_number():
     mixed = FrameRateMixture(scenes)
     rates = [mixed.clip(index).fps for index in range(12)]
     assert set(rates) == {60.0, 600.0} and rates == [mixed.clip(i).fps for i in range(12)]
+    for other in (FrameRateMixture(scenes, seed=1), FrameRateMixture(scenes, "val")):
+        assert rates != [other.clip(i).fps for i in range(12)]
 
 
 GREYS = {  # of frame 8, every 80 pixels from (40, 40) on, of clips 0 to 2: as in version 0.2
@@ -163,6 +165,9 @@ def test_more_photographs_serve_training_only(tmp_path):
 
 def test_photographs_that_validation_or_test_have_are_not_trained_on(tmp_path):
     inner = folder(tmp_path / "b", 12)
+    for roots in ([inner, inner], [str(tmp_path), inner], [inner, str(tmp_path)]):
+        with pytest.raises(ValueError, match="scene.root must be folders apart"):
+            Photographs(roots)
     for root, more in ((inner, inner), (str(tmp_path), inner), (inner, [str(tmp_path)])):
         with pytest.raises(ValueError, match="extra_train_root must be apart from scene.root"):
             Photographs(root, extra_train_root=more)

@@ -244,6 +244,14 @@ def test_the_noise_has_the_rates_it_is_given():
     assert abs(share - 0.01) < 4 * math.sqrt(0.01 / 64**2)
 
 
+def test_noise_beyond_one_event_an_interval_is_refused():
+    frames = torch.zeros(1, 1, 2, 4, 4)
+    for name in ("leak_event_hz", "dark_noise_hz"):
+        assert EventSensor(0.2, refractory_s=0.0, **{name: 1.0}).counts(frames, 1.0).sum() >= 0
+        with pytest.raises(ValueError, match=rf"sensor.{name} must be in 0..1"):
+            EventSensor(0.2, refractory_s=0.0, **{name: 1000.0}).counts(frames, 1.0)
+
+
 def test_noise_comes_at_any_time_of_the_interval():
     sensor = EventSensor(0.3, dark_noise_hz=100.0, refractory_s=0.0)
     events = sensor.events(torch.zeros(2, 64, 64), FPS)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 
 from src.sim.turbulence import Atmosphere
+from src.sim.turbulence.fidelity import choose_fidelity
 
 PATH = Atmosphere(0.05, 0.5, 1000.0, 2.0, 525e-9, 3e-14, 0.9)
 
@@ -54,3 +55,13 @@ def test_no_turbulence_on_the_path():
 def test_values_outside_their_range_are_refused_by_name(field, value):
     with pytest.raises(ValueError, match=rf"turbulence\.atmosphere\.{field} must be .*got"):
         replace(PATH, **{field: value})
+
+
+def test_a_path_without_turbulence_is_not_scaled():
+    with pytest.raises(ValueError, match="cn2 must not be 0"):
+        PATH.with_d_over_r0(0.0).with_d_over_r0(2.0)
+
+
+def test_what_stands_still_has_no_end_of_its_correlation():
+    found = choose_fidelity(replace(PATH, ar1_coefficient=1.0), 256, 0.26)
+    assert found.tilt_correlation_time_s == math.inf
