@@ -248,7 +248,7 @@ def test_noise_beyond_one_event_an_interval_is_refused():
     frames = torch.zeros(1, 1, 2, 4, 4)
     for name in ("leak_event_hz", "dark_noise_hz"):
         assert EventSensor(0.2, refractory_s=0.0, **{name: 1.0}).counts(frames, 1.0).sum() >= 0
-        with pytest.raises(ValueError, match=rf"sensor.{name} must be in 0..1"):
+        with pytest.raises(ValueError, match=rf"sensor.{name} must be in \[0, 1\]"):
             EventSensor(0.2, refractory_s=0.0, **{name: 1000.0}).counts(frames, 1.0)
 
 
