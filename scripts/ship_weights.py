@@ -88,7 +88,7 @@ def facts(run: Path, content: dict, first: DictConfig) -> dict:
     cfg = OmegaConf.create(text)
     return {
         "experiment": cfg.name,
-        "started_from": Path(first.ckpt or "nothing").name,
+        "started_from": _started_from(first),
         "seed": cfg.seed,
         "steps": content.get("steps", content["global_step"]),
         "windows_seen": content["windows"],
@@ -105,6 +105,11 @@ def facts(run: Path, content: dict, first: DictConfig) -> dict:
         "batch_size": cfg.data.batch_size,
         "precision": cfg.trainer.precision,
     }
+
+
+def _started_from(first: DictConfig) -> str:
+    start = first.get("start", "none")
+    return Path(first.ckpt or (start if start != "none" else "nothing")).name
 
 
 def going_on(content: dict) -> dict:
@@ -203,7 +208,8 @@ def _cell(metric: Column, score: dict | None) -> str:
 def _scenes(cfg: DictConfig) -> str:
     kind = str(cfg.scene["_target_"]).rpartition(".")[2]
     root = cfg.scene.get("root")
-    return f"{kind}, {Path(root).name if root else 'embedded'}"
+    roots = [root] if isinstance(root, str) else root or []
+    return f"{kind}, {', '.join(Path(one).name for one in roots) or 'embedded'}"
 
 
 def main() -> None:

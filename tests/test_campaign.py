@@ -342,7 +342,7 @@ def test_each_recipe_runs_from_nothing_to_its_card(name, tmp_path, monkeypatch):
     assert run([work]) == 0, (work.folder / full.stages[0].name / "log.txt").read_text()
     assert work.state() == "done" and files.load(work.shipped).eval()
     card = work.shipped.with_suffix(".md").read_text()
-    assert f"| recipe | {name} |" in card and "-dirty" not in card
+    assert f"| recipe | [{name}](" in card and "-dirty" not in card
 
 
 def commit_of(folder: Path, monkeypatch) -> None:
