@@ -38,7 +38,7 @@ def evaluate_and_draw(cfg) -> None:
 SMALL = ["scene.height=64", "scene.width=64", "data.test_windows=4"]
 RUN = {  # entry point: what runs it, and what makes it tiny
     "train": (train, [*TINY, "logger=none", "data.cache_clips=null"]),
-    "eval": (evaluate_and_draw, [*SMALL, "data.test_clips=1", "data.unscored_windows=1",
+    "eval": (evaluate_and_draw, [*SMALL, "data.test_clips=2", "data.unscored_windows=1",
                                  "data.workers=0", "metrics.lpips=null"]),
     "simulate": (simulate, [*SMALL, "camera.sensor_size=[360,640]", "camera.tile_px=116"]),
     "reconstruct": (reconstruct, ["end_s=0.05"]),

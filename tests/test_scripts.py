@@ -81,7 +81,8 @@ def test_weights_of_a_stage_are_shipped_with_the_card_of_a_run(tmp_path, monkeyp
     for name, value in files.load(path).state_dict().items():
         assert torch.allclose(value, doubled.state_dict()[name], atol=2e-3), name
     card = path.with_suffix(".md").read_text()
-    assert "| recipe | lf3x3 |" in card and "| mean_of | {'a': 0.5, 'b': 0.5} |" in card
+    recipe = "| recipe | [lf3x3](../conf/recipe/lf3x3.yaml) |"
+    assert recipe in card and "| mean_of | {'a': 0.5, 'b': 0.5} |" in card
     monkeypatch.setattr(results, "git_commit", lambda: "abc-dirty")
     (run / "results.json").unlink()
     with pytest.raises(ValueError, match="weights are shipped from a commit, .* is of abc-dirty"):
