@@ -14,7 +14,7 @@ from torch import Tensor
 
 from src.bench.candidates import Candidate
 from src.bench.stress_tests.event_clips import ClipConditions, StressBench
-from src.bench.stress_tests.stress_results import StressResult, worst_of
+from src.bench.stress_tests.stress_results import StressResult, largest_value
 from src.deploy.forms import convert_to_form
 from src.metrics.image import aligned_psnr
 from src.metrics.temporal import temporal_jitter_px
@@ -177,7 +177,7 @@ def measure_adversarial_gain(
         (gradient,) = torch.autograd.grad(change, extra)
         curve.append((step, math.sqrt(float(change.detach())) / perturbation_rms))
         extra = gradient + 1e-12
-    return StressResult(worst_of(curve), "x", limit_gain, curve, "steps of ascent")
+    return StressResult(largest_value(curve), "x", limit_gain, curve, "steps of ascent")
 
 
 def measure_bf16_psnr_difference(

@@ -9,7 +9,7 @@ import numpy as np
 
 from src.bench.candidates import Candidate
 from src.bench.stress_tests.event_clips import EventClip, StressBench, require_type
-from src.bench.stress_tests.stress_results import StressResult, worst_of
+from src.bench.stress_tests.stress_results import StressResult, largest_value
 from src.metrics.invented_contrast import find_unseen_pixels, invented_contrast
 from src.recordings.noise_filter import find_supported_pixels
 from src.sim.optics import layout
@@ -33,7 +33,7 @@ def measure_invented_contrast(
         clips = bench.simulate_once(f"static camera {conditions}", simulate)
         shares = [_invented_contrast(network, clip) for clip in clips]
         curve.append((f"{width}x{height}", float(np.mean(shares))))
-    return StressResult(worst_of(curve), "", limit_share, curve, "sensor")
+    return StressResult(largest_value(curve), "", limit_share, curve, "sensor")
 
 
 def _simulate_clip(

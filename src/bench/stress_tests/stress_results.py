@@ -45,10 +45,10 @@ StressTest = Callable[[Candidate, StressBench], StressResult]
 
 def build_worst_psnr_loss_result(curve: Curve, *, limit_db: float, varied: str) -> StressResult:
     """Return the result whose value is the largest of the curve, in dB."""
-    return StressResult(worst_of(curve), "dB", limit_db, curve, varied)
+    return StressResult(largest_value(curve), "dB", limit_db, curve, varied)
 
 
-def worst_of(curve: Curve) -> float:
+def largest_value(curve: Curve) -> float:
     """Return the largest value of a curve; NaN where one is."""
     return float(np.max([value for _, value in curve]))
 

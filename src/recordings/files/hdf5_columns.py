@@ -1,6 +1,7 @@
 """Columns of events in groups and tables of HDF5, and those of windows one after the other."""
 
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import h5py
@@ -10,43 +11,40 @@ from src.recordings.files.columns import check_lengths, find_keys_by_name
 from src.recordings.files.numpy_file import split_table
 
 
-def is_group(node: Any) -> bool:
-    """Return whether a node is a group, no dataset."""
-    return isinstance(node, h5py.Group)
-
-
-def columns_of(node: Any, order: str | None) -> dict[str, Any]:
-    """Return the columns t, x, y, p of a group or a table."""
-    if not is_group(node):
+def find_event_columns(node: Any, order: str | None) -> dict[str, Any]:
+    """Return the columns t, x, y, p of a group or a table; `order`: columns=."""
+    if not isinstance(node, h5py.Group):
         return split_table(node, order)
     columns = {name: node[key] for name, key in (find_keys_by_name(node) or {}).items()}
     check_lengths(columns)
     return columns
 
 
-def starts_whole(t: Any) -> bool:
-    """Return whether the first times are whole numbers."""
+def has_whole_times(t: Any) -> bool:
+    """Return whether the first thousand times are whole numbers."""
     values = np.asarray(t[:1000])
     return np.array_equal(values, np.rint(values))
 
 
-def find_windows(streams: dict[str, Any]) -> list[Any]:
-    """Return the streams in order of their number where all are parts of one recording: called
-    alike but for a number at the end, each after the other in time; else none."""
-    names = [re.fullmatch(r"(.*?)(\d+)", name) for name in streams]
-    if len(names) < 2 or not all(names) or len({name[1] for name in names if name}) > 1:
+def find_numbered_streams(streams: dict[str, Any]) -> list[Any]:
+    """Return the streams in order of their number where there are several, called alike but for a
+    number at the end; else none."""
+    found = {name: re.fullmatch(r"(.*?)(\d+)", name) for name in streams}
+    numbers = {name: (match[1], int(match[2])) for name, match in found.items() if match}
+    if len(streams) < 2 or len(numbers) < len(streams) or len({n for n, _ in numbers.values()}) > 1:
         return []
-    order = sorted(streams, key=lambda name: int(re.findall(r"\d+", name)[-1]))
-    nodes = [streams[name] for name in order]
+    return [streams[name] for name in sorted(streams, key=numbers.__getitem__)]
+
+
+def follow_in_time(columns: Sequence[dict[str, Any]]) -> bool:
+    """Return whether each of the streams with these columns begins after the one before ends."""
     ends = []
-    for node in nodes:
-        t = columns_of(node, None)["t"]
-        if len(t):
-            ends += [*np.asarray(t[:1]).tolist(), *np.asarray(t[len(t) - 1 :]).tolist()]
-    return nodes if ends == sorted(ends) else []
+    for t in (one["t"] for one in columns if len(one["t"])):
+        ends += [*np.asarray(t[:1]).tolist(), *np.asarray(t[len(t) - 1 :]).tolist()]
+    return ends == sorted(ends)
 
 
-class JoinedColumn:
+class ConcatenatedColumn:
     """Columns one after the other, of which slices can be taken."""
 
     def __init__(self, parts: list[Any]):

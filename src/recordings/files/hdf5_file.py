@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +36,11 @@ from src.recordings.files.event_file import (
 )
 from src.recordings.files.frame_files import to_gray, wrap_frame_array
 from src.recordings.files.hdf5_columns import (
-    JoinedColumn,
-    columns_of,
-    find_windows,
-    is_group,
-    starts_whole,
+    ConcatenatedColumn,
+    find_event_columns,
+    find_numbered_streams,
+    follow_in_time,
+    has_whole_times,
 )
 from src.recordings.files.numpy_file import LazyColumn, slice_columns, slice_times
 
@@ -52,7 +53,8 @@ ECF_CODEC = 36559  # the number of Prophesee's codec
 
 
 class Hdf5File(EventFile):
-    """An HDF5 file with one stream of events or several, one of which is read."""
+    """An HDF5 file with one stream of events, or several, of which one is read; numbered ones that
+    follow in time are one."""
 
     def __init__(self, path: Path, options: ReadOptions):
         self.path = path
@@ -63,14 +65,14 @@ class Hdf5File(EventFile):
             streams = find_streams(self._file)
             if not streams:
                 raise ValueError("no columns t, x, y, p and no array of events (n, 4) in it")
-            windows = find_windows(streams) if options.stream is None else []
-            if windows:
-                self.notes: tuple[str, ...] = ()
-            else:
+            nodes = find_numbered_streams(streams) if options.stream is None else []
+            columns, self.notes = self._find_columns(nodes, options), ()
+            if not nodes or not follow_in_time(columns):
                 listed = [EventStream(k, name, None) for k, name in enumerate(streams)]
                 chosen, self.notes = choose_stream(path, listed, options.stream)
-                windows = [streams[chosen.name]]
-            self._open(windows, options)
+                nodes = [streams[chosen.name]]
+                columns = self._find_columns(nodes, options)
+            self._open(nodes[0], columns, options)
 
     def pieces(self) -> Iterator[RawEvents]:
         yield from slice_columns(self.path, self._columns, self.kept_times)
@@ -93,21 +95,23 @@ class Hdf5File(EventFile):
                 return RawFrames(times, (height, width), read)
         return None
 
-    def _open(self, nodes: list[Any], options: ReadOptions) -> None:
-        node = nodes[0]
-        self._beside, self._has_own_times = node.parent, is_group(node)
-        parts = [
-            part for each in nodes for part in (each.values() if self._has_own_times else [each])
-        ]
-        parts = [part for part in parts if isinstance(part, h5py.Dataset)]
+    def _find_columns(self, nodes: list[Any], options: ReadOptions) -> list[dict[str, Any]]:
+        """Return the columns of each node; refuses before anything is read."""
+        held = [node.values() if isinstance(node, h5py.Group) else [node] for node in nodes]
+        parts = [part for part in chain(*held) if isinstance(part, h5py.Dataset)]
         check_unpacking_ratio(self.path, sum(part.nbytes for part in parts))
         refuse_ecf_codec(parts)
+        return [find_event_columns(node, options.columns) for node in nodes]
+
+    def _open(self, node: Any, columns: list[dict[str, Any]], options: ReadOptions) -> None:
+        """Take the `columns` of all nodes, of which `node` is the first."""
+        self._beside, self._has_own_times = node.parent, isinstance(node, h5py.Group)
         places = (node, self._file) if self._has_own_times else (node, node.parent, self._file)
         self.size = next(filter(None, map(_stated_size, places)), None)
-        columns = [columns_of(each, options.columns) for each in nodes]
         self._columns: dict[str, Any] = columns[0]
         if len(columns) > 1:
-            self._columns = {name: JoinedColumn([one[name] for one in columns]) for name in "txyp"}
+            parts = {name: [one[name] for one in columns] for name in "txyp"}
+            self._columns = {name: ConcatenatedColumn(part) for name, part in parts.items()}
         if "t_offset" in self._file:
             offset = self._file["t_offset"]
             if offset.size != 1:
@@ -120,7 +124,7 @@ class Hdf5File(EventFile):
             node if self._has_own_times else node.dtype.names, options
         )
         is_dsec = "t_offset" in self._file or "ms_to_idx" in self._file
-        if is_dsec and options.time_unit == "auto" and starts_whole(self._columns["t"]):
+        if is_dsec and options.time_unit == "auto" and has_whole_times(self._columns["t"]):
             self.time_unit = "us"
 
 

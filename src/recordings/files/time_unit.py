@@ -46,7 +46,6 @@ class TimeSample:
     def __init__(self) -> None:
         self.count, self.are_whole_numbers, self.are_apart_by_thousands = 0, True, True
         self._values: list[np.ndarray] = []
-        self._strides: list[int] = []  # of events from one of the values to the next
         self._last: Any = None
         self._steps: Range = (0, 0)  # least and most
         self._range: Range = (np.inf, -np.inf)
@@ -57,10 +56,8 @@ class TimeSample:
             return
         first = t[0] if self._last is None else self._last
         self.count += len(t)
-        stride = max(1, len(t) // SAMPLES)
-        values = np.array(t[::stride])
+        values = np.array(t[:: max(1, len(t) // SAMPLES)])
         self._values.append(values)
-        self._strides.append(stride)
         if t.dtype.kind == "f":
             if self.are_whole_numbers:
                 self.are_whole_numbers = bool((t == np.rint(t)).all())
@@ -89,38 +86,38 @@ class TimeSample:
         shifted = np.concatenate(self._values) * 10**digits
         return bool(np.mean(np.abs(shifted - np.rint(shifted)) > 1e-3) >= 0.5)
 
-    def median_step(self) -> float:
+    def median_event_interval(self) -> float:
         """Return the median time from an event to the next, in the file's unit."""
-        pairs = zip(self._values, self._strides, strict=True)
-        steps = [np.diff(values) / stride for values, stride in pairs if len(values) > 1]
-        return float(np.median(np.concatenate(steps))) if steps else 0.0
+        steps = np.diff(self._in_order())
+        return float(np.median(steps)) * (len(steps) + 1) / self.count if len(steps) else 0.0
 
     def early_time_and_span(self) -> tuple[float, float]:
         """Return an early time and the span of the times, less the first and last hundredth, in the
         file's unit."""
+        order = self._in_order()
+        if not len(order):
+            return 0.0, 0.0
+        if self.count < FEW_TIMES:
+            return float(order[0]), float(order[-1] - order[0])
+        low, high = order[len(order) // 100], order[-1 - len(order) // 100]
+        return float(low), float(high - low) / 0.98
+
+    def _in_order(self) -> np.ndarray:
         values = np.concatenate(self._values) if self._values else np.zeros(0)
         if self.wrap_bits:
             values = TimestampUnwrapper(self.wrap_bits).unwrap(values)
-        values = values[np.isfinite(values)]
-        if not len(values):
-            return 0.0, 0.0
-        if self.count < FEW_TIMES:
-            return float(values.min()), float(values.max() - values.min())
-        order = np.sort(values)
-        low, high = order[len(order) // 100], order[-1 - len(order) // 100]
-        return float(low), float(high - low) / 0.98
+        return np.sort(values[np.isfinite(values)])
 
 
 class _Reading:
     """What a file's times are in a unit: its duration, its event rate, whether they are dates."""
 
-    def __init__(self, sample: TimeSample, unit: str):
-        early_s, self.duration_s = (
-            value * UNITS_US[unit] * 1e-6 for value in sample.early_time_and_span()
+    def __init__(self, count: int, early: float, span: float, interval: float, unit: str):
+        early_s, self.duration_s, interval_s = (
+            value * UNITS_US[unit] * 1e-6 for value in (early, span, interval)
         )
-        self.rate_hz = sample.count / self.duration_s if self.duration_s else np.inf
-        step_s = sample.median_step() * UNITS_US[unit] * 1e-6
-        self.active_rate_hz = 1 / step_s if step_s > 0 else self.rate_hz
+        self.rate_hz = count / self.duration_s if self.duration_s else np.inf
+        self.active_rate_hz = 1 / interval_s if interval_s else self.rate_hz
         self.is_date = EPOCH_S[0] < early_s < EPOCH_S[1]
 
     def __str__(self) -> str:
@@ -137,12 +134,14 @@ def find_unit(sample: TimeSample, stated: str) -> tuple[str, str]:
     """Return the unit (`stated`, where it is not auto), and what the user is told of it, or ""."""
     is_auto = stated == "auto"
     usual = ("us" if sample.are_whole_numbers else "s") if is_auto else stated
+    early, span = sample.early_time_and_span()
+    seen = sample.count, early, span, sample.median_event_interval()
+    read = {unit: _Reading(*seen, unit) for unit in UNITS_US}
     if sample.count < FEW_TIMES:
-        dated = [unit for unit in UNITS_US if _Reading(sample, unit).is_date] if is_auto else []
+        dated = [unit for unit in UNITS_US if read[unit].is_date] if is_auto else []
         return (usual if usual in dated or not dated else dated[0]), ""
-    if not sample.early_time_and_span()[1]:
+    if not span:
         return usual, f"all or nearly all of {sample.count} times are equal"
-    read = {unit: _Reading(sample, unit) for unit in UNITS_US}
     losses, fine = dict(PRIOR[sample.are_whole_numbers]), FINE * sample.has_more_decimals(3)
     if sample.are_whole_numbers and sample.are_apart_by_thousands:
         losses["ns"] = NS_OF_US
@@ -159,8 +158,8 @@ def find_unit(sample: TimeSample, stated: str) -> tuple[str, str]:
     other = second if unit == best else best
     if by_digits:
         other = max(plain, key=plain.__getitem__)
-    seen = f"times in {unit} give {read[unit]}, in {other} {read[other]}"
-    return unit, f"{seen}: read as {unit}; if it is another, give time_unit=s, ms, us or ns"
+    both = f"times in {unit} give {read[unit]}, in {other} {read[other]}"
+    return unit, f"{both}: read as {unit}; if it is another, give time_unit=s, ms, us or ns"
 
 
 def check_times(t: np.ndarray, unit: str, path: Path) -> None:

@@ -78,7 +78,7 @@ def list_photographs(root: Root, split: str) -> list[Photograph]:
     places = [one.resolve() for one in roots]
     for k, place in enumerate(places):
         if any(place.is_relative_to(other) for other in (*places[:k], *places[k + 1 :])):
-            raise ValueError(f"scene.root must be folders apart, got {roots[k]} twice")
+            raise ValueError(f"scene.root must be folders apart, got {roots[k]} within another")
     return [photo for one in roots for photo in _share(one, split)]
 
 

@@ -133,6 +133,20 @@ def test_numbered_windows_are_one_recording(tmp_path, events):
     assert np.array_equal(quiet_read(tmp_path / "b.h5"), events)
 
 
+def test_windows_of_tables_have_the_columns_that_are_stated(tmp_path, events):
+    early = events.copy()
+    early["t"] //= 10  # as small as a coordinate
+    early["x"] = np.arange(len(early))  # in order as time is
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for number, part in enumerate(np.array_split(early, 3)):
+            ones = np.stack([np.ones(len(part), int), *(part[n].astype(int) for n in "xyt")], 1)
+            file[f"event_{number}"] = ones
+    with pytest.raises(ValueError, match="columns must say the order"):
+        read_events(tmp_path / "a.h5")
+    found = read_events(tmp_path / "a.h5", options=ReadOptions(columns="pxyt", time_unit="us"))
+    assert np.array_equal(found["t"], early["t"]) and np.array_equal(found["x"], early["x"])
+
+
 def test_cameras_with_numbers_are_several_recordings(tmp_path, events):
     write_windows(tmp_path / "a.h5", ["camera0", "camera1"], [events, events[::2]])
     with pytest.warns(UserWarning, match="camera1"):
