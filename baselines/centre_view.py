@@ -13,7 +13,8 @@ from src.sim.voxel import normalise_nonzero
 
 
 class CentreViewNetwork(EventToVideoNetwork):
-    """The centre view's voxel grids to frames; a subclass has `reconstruct`.
+    """The centre view's voxel grids to frames; a subclass has
+    `predict_before_activation`.
 
     `normalise`: none, or nonzero, the non-zero entries standardised.  `output`: none, clip
     (training sees unclipped frames) or sigmoid.  Sides are padded to multiples of `side_multiple`.

@@ -18,7 +18,7 @@ class CameraFrames(VideoMethod):
     """The turbulent frames themselves, as a camera behind the centre view gives them.
 
     `exposure_frames`: consecutive frames that one exposure lasts; such a camera has one picture for
-    so many windows, repeated in all of them (the paper's figure 7: 4).
+    so many windows, repeated in all of them (the paper's figure 8: 4).
     """
 
     def __init__(self, exposure_frames: int = 1):
@@ -54,12 +54,17 @@ class Postprocessed(VideoMethod):
             postprocessor = load_postprocessor(postprocessor, allowed_packages)
         self.source, self.postprocessor = source, postprocessor
         self.views = source.views
+        self.windows_per_frame = source.exposure_frames if isinstance(source, CameraFrames) else 1
+
+    @torch.no_grad()
+    def source_frames(self, sample: "Sample") -> Float[Tensor, "n windows 1 h w"]:
+        """Return the frames of the source, in [0, 1]."""
+        return self.source.reconstruct_clip(sample).float().clamp(0, 1)
 
     @torch.no_grad()
     def reconstruct_clip(self, sample: "Sample") -> Float[Tensor, "n windows 1 h w"]:
         """Return the restored frame of every window, in [0, 1]."""
-        frames = self.source.reconstruct_clip(sample).float().clamp(0, 1)
-        step = self.source.exposure_frames if isinstance(self.source, CameraFrames) else 1
+        frames, step = self.source_frames(sample), self.windows_per_frame
         restored = self.postprocessor.restore(frames[:, ::step])
         return restored.repeat_interleave(step, 1)[:, : frames.shape[1]]
 

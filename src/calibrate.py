@@ -207,7 +207,9 @@ def calibrate(cfg: DictConfig) -> dict:
     if cfg.task not in TASKS:
         raise ValueError(f"task must be one of {', '.join(TASKS)}, got {cfg.task}")
     if cfg.fps is None and cfg.task != "air":
-        cfg.fps = 120.0
+        is_film = cfg.task == "turbulence" and not sources.has_events(cfg.recording)
+        stated = videos.read_fps(cfg.recording, "recording") if is_film else None
+        cfg.fps = stated or 120.0
     run = Path(cfg.paths.run)
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     rich.print(summary := TASKS[cfg.task](cfg, run), f"in {run}")

@@ -1,6 +1,6 @@
 """Videos under each other with a slice of each: python -m src.compare videos=[a.h5,b.h5] line=...
 
-The layout of the paper's figures 6 to 10: samples, an x-t, r-t or theta-t slice, its deviations.
+The layout of the paper's figures 6, 9 and 11: samples, an x-t, r-t or theta-t slice, deviations.
 """
 
 import math
@@ -68,7 +68,7 @@ def compare(cfg: DictConfig) -> dict:
             )
         if cfg.reference_images:
             scores[name] |= camera_frames.score_against_camera(
-                Path(path), Path(cfg.reference_images)
+                Path(path), Path(cfg.reference_images), slice(cfg.first, cfg.last)
             )
         notes = [NOTES[measure].format(value) for measure, value in scores[name].items()]
         rows.append(comparison.VideoRow(name, film, across, "\n".join(notes)))

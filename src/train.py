@@ -2,6 +2,8 @@
 
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import lightning
@@ -34,6 +36,8 @@ def train(cfg: DictConfig) -> dict:
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
     first_weights = start_weights.set_model_from_start_weights(cfg)
     references = start_weights.load_reference_networks(cfg)
+    if cfg.reference_baseline:
+        references[cfg.reference_baseline.name] = build_part(cfg, "reference_baseline.method")
     net, spec = build.build_untrained_network(cfg)
     if first_weights:
         files.restore_weights(net, first_weights)
@@ -56,9 +60,9 @@ def train(cfg: DictConfig) -> dict:
     # As it is when it is loaded again.
     module.method.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
     tested = module.method, data, module.metrics
-    trained, drawn = build.test_method(cfg, cfg.name, *tested, cfg.sample_clips)
-    references[cfg.reference_baseline.name] = build_part(cfg, "reference_baseline.method")
-    others = [build.test_method(cfg, *o, data, module.metrics)[0] for o in references.items()]
+    with name_checkpoint_on_failure(trainer):
+        trained, drawn = build.test_method(cfg, cfg.name, *tested, cfg.sample_clips)
+        others = [build.test_method(cfg, *o, data, module.metrics)[0] for o in references.items()]
     pictures = samples.write_samples(run / "samples", drawn)
     rows, facts = [trained, before, *others], entry_point.run_metadata(cfg, start)
     note = results.describe_score_difference(trained, before)
@@ -72,20 +76,33 @@ def fit(
     trainer: lightning.Trainer, module: Reconstructor, data: LightFieldData, ckpt: Path | None
 ) -> None:
     """Train; when that is cut short, whatever by, print what to continue from."""
-    checkpoint = trainer.checkpoint_callback
-    assert isinstance(checkpoint, ModelCheckpoint) and checkpoint.dirpath
-    last = Path(checkpoint.dirpath) / "last.ckpt"
+    last = find_checkpoints(trainer) / "last.ckpt"
     if ckpt and files.is_weights_file(ckpt):
         continue_from_weights(module, trainer.callbacks, ckpt)  # type: ignore[attr-defined]
         ckpt = None
-    try:
+    with name_checkpoint_on_failure(trainer):
         trainer.fit(module, data, ckpt_path=ckpt)
         if not last.is_file():  # nothing was left to do
             trainer.save_checkpoint(last)
+
+
+def find_checkpoints(trainer: lightning.Trainer) -> Path:
+    """Return the folder of the checkpoints of a training."""
+    checkpoint = trainer.checkpoint_callback
+    assert isinstance(checkpoint, ModelCheckpoint) and checkpoint.dirpath
+    return Path(checkpoint.dirpath)
+
+
+@contextmanager
+def name_checkpoint_on_failure(trainer: lightning.Trainer) -> Iterator[None]:
+    """Print what to continue from where the training, or the test after it, is cut short."""
+    try:
+        yield
     except BaseException:
-        if any(last.parent.glob("*.ckpt")):
+        folder = find_checkpoints(trainer)
+        if any(folder.glob("*.ckpt")):
             step = trainer.global_step
-            print(f"stopped at step {step}; go on with ckpt={last.parent}", file=sys.stderr)
+            print(f"stopped at step {step}; go on with ckpt={folder}", file=sys.stderr)
         raise
 
 

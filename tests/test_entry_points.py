@@ -66,6 +66,17 @@ def test_a_wrong_value_is_one_line_and_exit_code_2_of_the_process(tmp_path):
     assert not list(tmp_path.rglob("results.json"))
 
 
+@pytest.mark.parametrize("below", ["", "/run"])
+def test_a_file_where_the_folder_of_a_run_should_be_is_one_line(below, tmp_path):
+    (tmp_path / "notes.txt").write_text("kept")
+    folder = f"{tmp_path}/notes.txt{below}"
+    line = [sys.executable, "-m", "src.report", "run=out", f"hydra.run.dir={folder}"]
+    done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True)
+    wanted = f"hydra.run.dir must be a folder, new or there, got {folder}: a file is in the way"
+    assert (done.returncode, done.stderr.strip()) == (2, f"error: {wanted}")
+    assert (tmp_path / "notes.txt").read_text() == "kept"
+
+
 @pytest.mark.parametrize("command", [["-m", "src.train"], ["-m", "lightfield_events", "train"]])
 def test_ctrl_c_while_modules_are_imported_is_one_line(command, tmp_path):
     (tmp_path / "torch.py").write_text("raise KeyboardInterrupt\n")  # found before the package

@@ -260,6 +260,7 @@ def test_threshold_of_a_recording_is_found_by_calibrate(folder, found, tmp_path)
         "data.test_windows=8",
         "turbulence=none",
         "clips=2",
+        "sensor.initial_reference_error=0",
     ]
     chosen = [f"recording={folder}/dot.raw", f"views={found}", *small]
     calibrate(config("calibrate", tmp_path / "run", "task=threshold", *chosen))

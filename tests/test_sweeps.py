@@ -1,6 +1,7 @@
 """Every sweep is a multirun whose jobs compose, and whose last job runs, tiny."""
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from src.app import build
+from src.app import build, entry_point
 from src.eval import evaluate
 from src.models import files
 from src.reconstruct import reconstruct
@@ -121,3 +122,16 @@ def test_results_of_another_configuration_are_not_overwritten(tmp_path):
     assert results.has_results(tmp_path, config)
     with pytest.raises(ValueError, match="paths.out"):
         results.has_results(tmp_path, config.replace("lr: 1", "lr: 2"))
+
+
+def test_results_older_than_the_weights_are_made_again(tmp_path):
+    stored, weights = tmp_path / "results.json", tmp_path / "w.safetensors"
+    stored.write_text("{}")
+    weights.write_text("")
+    cfg = OmegaConf.create({"task": "eval", "ckpt": str(weights)})
+    os.utime(weights, (0, 0))
+    assert not entry_point._has_newer_weights(cfg, stored)
+    os.utime(weights, (2**32, 2**32))
+    assert entry_point._has_newer_weights(cfg, stored)
+    cfg.task = "train"  # of which it is where it began
+    assert not entry_point._has_newer_weights(cfg, stored)

@@ -13,9 +13,11 @@ from omegaconf import DictConfig
 from rich.console import Group
 from rich.table import Table
 
+from baselines import published
 from baselines.centre_view import CentreViewNetwork
 from src.app import build, entry_point
 from src.app.instantiate import as_dict, build_part
+from src.models import files
 from src.models.network import EventToVideoNetwork
 from src.recordings.evreal_protocol import (
     EvrealRule,
@@ -127,8 +129,10 @@ def _load_network(cfg: DictConfig) -> EventToVideoNetwork:
 def _build_rule(cfg: DictConfig) -> EvrealRule:
     """Return the protocol; what is null there follows from the method, as in EVREAL."""
     data = cfg.data
-    edges = data.grid_edges or ("events" if cfg.get("baseline") else "window")
-    kind = cfg.baseline.get("architecture") if cfg.get("baseline") else None
+    baseline = cfg.get("baseline") or {}
+    ours = Path(files.locate(baseline.get("weights") or "")).suffix in published.OURS
+    edges = data.grid_edges or ("events" if baseline and not ours else "window")
+    kind = baseline.get("architecture")
     output = data.output_normalisation or ("robust" if kind == "e2vid" else "none")
     given = {key: data[key] for key in RULE_KEYS}
     return EvrealRule(**given, grid_edges=edges, output_normalisation=output)

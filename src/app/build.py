@@ -52,7 +52,7 @@ DATA_OPTIONS = (
     "batch_size", "batch_reuse", "epoch_clips", "val_clips", "test_clips", "workers", "simulate_on",
 )  # fmt: skip
 SWEEP_STORE = SampleStore()  # of the jobs of a sweep that run in this process
-SHIPPED_METRIC_KEYS = ("lpips", "resolution_scale")
+SHIPPED_METRIC_KEYS = ("lpips", "resolution_scale", "jitter_reduction")
 Trainable = EventToVideoNetwork | FramePostprocessor
 Method = TypeVar("Method", bound=VideoMethod)
 
@@ -64,7 +64,8 @@ def build_data_module(
     """Return the data module with the pipelines of `splits`; `optics`: others than `cfg`'s."""
     unscored, most = cfg.data.unscored_windows, cfg.data.test_windows - 2  # jitter needs two frames
     if not 0 <= unscored <= most:
-        raise ValueError(f"data.unscored_windows must be in 0..{most} (windows), got {unscored}")
+        allowed = f"0..{most} (data.test_windows={most + 2} less two)"
+        raise ValueError(f"data.unscored_windows must be in {allowed}, got {unscored}")
     pipelines = {split: build_pipeline(cfg, split, optics) for split in splits}
     train = pipelines.get("train")
     large = build_large_crop_stream(cfg, optics) if train else None
@@ -170,7 +171,7 @@ def build_metrics(cfg: DictConfig) -> VideoMetrics:
     lpips = build_part(cfg, "metrics.lpips") if cfg.metrics.lpips else None
     names = [name for name in cfg.metrics if name not in SHIPPED_METRIC_KEYS and cfg.metrics[name]]
     own = {str(name): _build_own_metric(cfg, str(name)) for name in names}
-    return VideoMetrics(lpips, cfg.metrics.resolution_scale, own)
+    return VideoMetrics(lpips, cfg.metrics.resolution_scale, own, cfg.metrics.jitter_reduction)
 
 
 def _build_own_metric(cfg: DictConfig, name: str) -> Metric:

@@ -28,6 +28,7 @@ from src.app.config_values import check_values
 from src.app.help import help_text
 from src.app.path_overrides import name_job_folder, quote_paths, unquote_override
 from src.app.renamed_keys import refuse_renamed_keys, refuse_renamed_overrides
+from src.models import files
 from src.records import results, tracking
 
 FAILURE_FILE = "failed.txt"  # in the folder of a sweep's job: why it failed
@@ -82,6 +83,9 @@ def run_main(main: Callable[[], None]) -> None:
         _print_failed_jobs(Path(str(error)), start)
         sys.exit(1)
     except (ValueError, HydraException, OmegaConfBaseException, OSError) as error:
+        if isinstance(error, OSError) and _is_in_the_way_of_run(error):
+            wanted = "hydra.run.dir must be a folder, new or there"
+            error = ValueError(f"{wanted}, got {error.filename}: a file is in the way")
         message = describe_config_error(error, Path(sys.argv[0]).stem)
         print(f"error: {message}", file=sys.stderr)
         is_io = isinstance(error, OSError) and not isinstance(error, HydraException)
@@ -97,11 +101,21 @@ def run_main(main: Callable[[], None]) -> None:
         sys.exit(128 + signal.SIGINT if interrupted else error.code)
 
 
+def _is_in_the_way_of_run(error: OSError) -> bool:
+    """Return whether `error` is of a file where Hydra makes the folder of the run."""
+    if not isinstance(error, FileExistsError | NotADirectoryError):
+        return False
+    files_of_frames = [Path(f.filename) for f in traceback.extract_tb(error.__traceback__)]
+    callers = [file for file in files_of_frames if file.name not in ("pathlib.py", "os.py")]
+    return callers[-1].parts[-3:] == ("hydra", "core", "utils.py")
+
+
 def run_job(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:
     """Run `work` in the folder Hydra made for this job, with `verbose` after the config is printed;
     end W&B's run.
 
-    A job of a sweep is skipped where its results stand; its error is stored.
+    A job of a sweep is skipped where its results stand and the weights it tests are older; its
+    error is stored.
     """
     refuse_renamed_keys(cfg)
     job = HydraConfig.get()
@@ -114,7 +128,8 @@ def run_job(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:
     folder, name = Path(cfg.paths.run), " ".join(map(unquote_override, job.overrides.task))
     (folder / FAILURE_FILE).unlink(missing_ok=True)
     try:
-        if results.has_results(folder, resolved_yaml(cfg)):
+        stored = results.has_results(folder, resolved_yaml(cfg))
+        if stored and not _has_newer_weights(cfg, folder / "results.json"):
             print(f"skipped, its results stand: {name}, in {folder}")
         else:
             _run_work(work, cfg)
@@ -124,6 +139,16 @@ def run_job(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:
         print(f"failed: {name}: {' '.join(str(error).split())}", file=sys.stderr)
         results.write_text(folder / FAILURE_FILE, f"{name}\n{traceback.format_exc()}")
         raise JobFailed(job.sweep.dir) from error
+
+
+def _has_newer_weights(cfg: DictConfig, stored: Path) -> bool:
+    """Return whether a file of the weights that are tested is younger than the results `stored`."""
+    if cfg.get("task") == "train":
+        return False
+    names = [cfg.get("ckpt"), OmegaConf.select(cfg, "baseline.weights")]
+    paths = [files.locate(name) for name in names if isinstance(name, str)]
+    found = [file for path in paths for file in (path.rglob("*.ckpt") if path.is_dir() else [path])]
+    return any(f.stat().st_mtime > stored.stat().st_mtime for f in found if f.is_file())
 
 
 def _run_work(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:

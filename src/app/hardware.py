@@ -30,7 +30,13 @@ def retain_freed_memory(cfg: DictConfig) -> None:
 
 
 def fill_in_precision(cfg: DictConfig) -> None:
-    """Set a `trainer.precision` of null to bf16-mixed, on a CPU without fast bf16 to 32-true."""
+    """Set a `trainer.precision` of null to bf16-mixed, on a CPU without fast bf16 to 32-true.
+
+    Raises ValueError for float16, whose scaled gradients StepGuard would take for the real ones.
+    """
+    if str(cfg.trainer.precision).startswith("16"):
+        allowed = "bf16-mixed, 32-true or null"
+        raise ValueError(f"trainer.precision must be {allowed}, got {cfg.trainer.precision}")
     if cfg.trainer.precision is None:
         fast_bf16 = cfg.trainer.accelerator != "cpu" or is_bf16_faster()
         cfg.trainer.precision = "bf16-mixed" if fast_bf16 else "32-true"

@@ -2,6 +2,7 @@
 
 import math
 import tempfile
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,9 +58,9 @@ def simulate(
     (frames, h, w), uint8 or floats in [0, 1].  `turbulence`: none, weak, medium, strong, extreme or
     mixed.  `sensor`: paper, ideal, noisy, evk4 ..., for sRGB and with a contrast threshold of 0.2
     unless `overrides` set sensor.input and sensor.threshold.  `fps`: None for that of the file, 120
-    for a photograph, which lasts `seconds`.  `overrides`: keys of conf/simulate.yaml as on the
-    command line.  The result is a function of the arguments.  Raises ValueError for values outside
-    their range.
+    for a photograph, which lasts `seconds`; of a video the part from `start_s` to `end_s` is taken.
+    `overrides`: keys of conf/simulate.yaml as on the command line.  The result is a function of the
+    arguments.  Raises ValueError for values outside their range.
     """
     for group, choice in (("turbulence", turbulence), ("sensor", sensor)):
         if choice not in (names := config_choices(group)):
@@ -68,10 +69,11 @@ def simulate(
     cfg = compose_config("simulate", *chosen, f"seed={seed}", *overrides)
     set_own_sensor(cfg, overrides)
     options: dict[str, Any] = {"fps": fps, "seconds": seconds, "longest_side_px": longest_side_px}
+    options |= {"start_s": start_s, "end_s": end_s}
     if isinstance(photo_or_video, str | Path):
         path = Path(photo_or_video)
         key = "photo" if path.suffix.lower() in PICTURE_SUFFIXES else "video"
-        cfg.update(options | {"start_s": start_s, "end_s": end_s, key: str(path)})
+        cfg.update(options | {key: str(path)})
         clip = read_own_clip(cfg)
     else:
         clip = own_material.clip_from_array(photo_or_video, white_level=cfg.white_level, **options)
@@ -90,6 +92,9 @@ def simulate_clip(work: OwnSimulation) -> SimulatedClip:
         clean[at], views[:, at], tilt[:, at] = part.clean, part.views, part.tilt
         first = at.stop
     events, positions = simulate_all_view_events(work, seen), work.optics.positions
+    if not len(events):
+        more = "a lower sensor.threshold, longer seconds or stronger turbulence give some"
+        warnings.warn(f"the clip gives no events; {more}", stacklevel=3)
     return SimulatedClip(clean, views, tilt, events, clip.fps, positions, work.drawn_parameters())
 
 

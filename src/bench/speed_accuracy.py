@@ -89,14 +89,17 @@ def find_pareto_front(costs_and_errors: Mapping[Name, tuple[float, float]]) -> l
 def select_by_one_standard_error(
     costs: Mapping[str, float], errors: Mapping[str, Sequence[float]]
 ) -> str:
-    """Return the cheapest network whose mean error over clips is within one standard error, that of
-    the best network, of the best (the rule of Breiman et al. 1984).
+    """Return the cheapest network whose mean error is within one standard error of the best (the
+    rule of Breiman et al. 1984); `errors` are of the same clips, the standard error that of the
+    difference to the best.
     """
-    means = {name: statistics.fmean(values) for name, values in errors.items()}
-    best = min(means, key=means.__getitem__)
-    values = errors[best]
-    spread = statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else 0.0
-    within = [name for name in means if means[name] <= means[best] + spread]
+    best = min(errors, key=lambda name: statistics.fmean(errors[name]))
+    within = [best]
+    for name, values in errors.items():
+        more = [ours - least for ours, least in zip(values, errors[best], strict=True)]
+        spread = statistics.stdev(more) / math.sqrt(len(more)) if len(more) > 1 else 0.0
+        if statistics.fmean(more) <= spread:
+            within.append(name)
     return min(within, key=costs.__getitem__)
 
 

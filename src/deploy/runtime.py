@@ -6,6 +6,7 @@ map (`first_layer.py`), and what comes behind runs on OpenVINO or PyTorch.  Equa
 or to bf16's rounding (0.02).
 """
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -29,6 +30,7 @@ from src.sim.optics import Position
 FORMS = ("float32", "bf16", "openvino")
 SIDE_MULTIPLE = 8  # sides are padded to it by reflection, as the networks do
 MIN_SIDE = 8  # side that can be padded so
+LEAST_INSIDE = 0.01  # of the events given for a window
 DTYPES = (np.float64, np.int64, np.int64, np.float32, np.int64)  # of t, x, y, p, view
 
 
@@ -99,8 +101,9 @@ class EventListRuntime:
 
         Events of one window in order of time, arrays of one length: `t`, `t0`, `t1` in seconds,
         `x`, `y` in pixels, `view` an index into positions, `p` in {-1, 1} or, as floats, weights.
-        Those outside t0 <= t <= t1 have no part in it.  Raises ValueError, and leaves the state,
-        for events that are out of order, off the sensor or in no view.
+        Those outside t0 <= t <= t1 have no part in it; a warning says so where nearly all are.
+        Raises ValueError, and leaves the state, for events that are out of order, off the sensor or
+        in no view.
         """
         return self.finish(self.begin(t, x, y, p, view, t0, t1))
 
@@ -151,6 +154,11 @@ class EventListRuntime:
         t, x, y, p, view = (np.ascontiguousarray(part, dtype) for part, dtype in typed)
         if kernels.has_event_error(t, x, y, p, view, self.views, *self.size, is_sign):
             raise ValueError(self._describe_error(t, x, y, p, view, is_sign))
+        inside = np.searchsorted(t, t1, "right") - np.searchsorted(t, t0)
+        if len(t) and inside < LEAST_INSIDE * len(t):
+            reach = f"{t[0]:g} to {t[-1]:g}, the window is {t0:g} to {t1:g}"
+            said = f"{inside} of {len(t)} events lie in the window: t is {reach}, in seconds"
+            warnings.warn(said, stacklevel=4)
         return [t, x, y, p, view]
 
     def _describe_error(self, t, x, y, p, view, is_sign: bool) -> str:

@@ -1,4 +1,4 @@
-"""Videos under each other: sample frames of each and its space-time slice (figures 6 to 10)."""
+"""Videos under each other: sample frames of each and its space-time slice (figures 6, 9 and 11)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -62,18 +62,18 @@ def write_light_field_panels(
     light, in [0, 1], its tilt and its sums of polarity, in the arrangement of the views; pictures
     longer than MAX_VIEW_PX shrunk to that.
 
-    `tilt`, in pixels, is drawn as the mean of both axes: red where the picture is pushed right or
-    down, blue where left or up.  The clean clip is as high as all views together.
+    Of `tilt`, in pixels, that in x is drawn: red where the picture is pushed right, blue where
+    left.  The clean clip is as high as all views together.
     """
     views, tilt, counts = map(_shrink, (views, tilt, counts))
     seen = tile_views(list(views), optics)
     events = [render_events(part) for part in counts]
     reach = max(float(np.abs(tilt).max()), 1e-6)
-    pushed = [render_events(part.mean(1), full=reach) for part in tilt]
+    pushed = [render_events(part[:, 0], full=reach) for part in tilt]
     panels = {
         "clean": resize_pictures(clean, seen.shape[1]),
         "views": seen,
-        f"tilt, +-{reach:.1f} px": tile_views(pushed, optics),
+        f"tilt in x, +-{reach:.1f} px": tile_views(pushed, optics),
         EVENTS_TITLE: tile_views(events, optics),
     }
     frames = join_panels(panels)

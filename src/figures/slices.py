@@ -1,7 +1,7 @@
 """Space-time slices of a video: what stands still draws a straight line, what jitters a wavy one.
 
 A slice is the video sampled, between pixels by bilinear interpolation, at the same places of every
-frame: time down, place across (the paper's x-t, y-t, r-t and theta-t plots, figures 6 to 10).
+frame: time down, place across (the paper's x-t, y-t, r-t and theta-t plots, figures 6, 9 and 11).
 Coordinates are (x, y) in pixels, the centre of the first pixel is (0, 0), y points down.
 """
 

@@ -1,8 +1,11 @@
 """Confidence intervals of a mean by bootstrap (Efron & Tibshirani 1993, percentile method).
 
-For one seed as scipy.stats.bootstrap; that cannot resample seeds and clips at once.
+For one seed as scipy.stats.bootstrap.  A mean over several seeds also varies with the seeds, of
+which there are too few to resample: each resample of the clips is moved by Student's t times the
+standard error over seeds.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,10 +23,10 @@ def bootstrap_difference_interval(
 ) -> tuple[float, float]:
     """Return the interval of mean(ours) - mean(theirs); rows are seeds, columns the same clips.
 
-    Seeds and clips are resampled, a clip in both at once, seeds of each apart.  None stands for
-    zero.  Always the same draws.  Of two to nine seeds the interval is too narrow: it holds the
-    difference in 76 % of cases with two, 84 % with three, 93 % with ten.  Raises ValueError for
-    rows of different lengths.
+    Clips are resampled, in both at once; what the seeds add is independent in the two, Student's t
+    of seeds - 1 degrees of freedom (0 for one seed).  None stands for zero.  Always the same draws.
+    Of few clips it is narrow: it holds the mean of one seed in 89 % of cases with 9 clips, in 94 %
+    with 27.  Raises ValueError for rows of different lengths.
     """
     rng = np.random.default_rng(0)
     clips = len(ours[0])
@@ -40,5 +43,8 @@ def bootstrap_difference_interval(
 
 def _means(rows: Sequence[Sequence[float]], picked: np.ndarray, rng: np.random.Generator):
     values = np.asarray(rows, dtype=float)
-    seeds = rng.integers(len(values), size=(len(picked), len(values)))
-    return values[seeds[:, :, None], picked[:, None]].mean((1, 2))
+    means, seeds = values.mean(0)[picked].mean(1), len(values)
+    if seeds > 1:
+        standard_error = values.mean(1).std(ddof=1) / math.sqrt(seeds)
+        means = means + standard_error * rng.standard_t(seeds - 1, len(means))
+    return means

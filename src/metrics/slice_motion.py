@@ -7,17 +7,23 @@ from jaxtyping import Float
 
 ITERATIONS = 5  # of least squares
 MAX_SHIFT = 8.0  # places
+MIN_CORRELATION = 0.5  # of a row with the shifted mean row; below, the row does not show the scene
+MOST_LOST = 0.5  # of the rows
 
 
 def residual_displacement_px(rows: Float[np.ndarray, "frames places"]) -> float:
     """Return the rms shift of each row against the mean row, for a static scene.
 
-    Gradient least squares (Lucas & Kanade 1981) with gain and offset fitted; nan without contrast.
+    Gradient least squares (Lucas & Kanade 1981) with gain and offset fitted, shifts cut at
+    MAX_SHIFT.  Rows that do not show the scene are left out; nan without contrast and where more
+    than MOST_LOST of them do not.
     """
     mean = rows.mean(0)
     if np.ptp(mean) < 1e-3:
         return float("nan")
-    return float(np.std([_shift(row, mean) for row in rows]))
+    shifts = np.array([_shift(row, mean) for row in rows])
+    shown = shifts[np.isfinite(shifts)]
+    return float(np.std(shown)) if len(shown) >= MOST_LOST * len(shifts) else float("nan")
 
 
 def _shift(row: np.ndarray, mean: np.ndarray) -> float:
@@ -27,9 +33,11 @@ def _shift(row: np.ndarray, mean: np.ndarray) -> float:
         design = np.stack([-np.gradient(moved), moved, np.ones_like(moved)], axis=1)
         step, gain, _ = np.linalg.lstsq(design, row, rcond=None)[0]
         if gain <= 0:
-            break
+            return float("nan")
         shift = float(np.clip(shift + step / gain, -MAX_SHIFT, MAX_SHIFT))
-    return shift
+    moved, spread = np.interp(places - shift, places, mean), float(np.std(row))
+    is_shown = spread > 0 and np.corrcoef(moved, row)[0, 1] > MIN_CORRELATION
+    return shift if is_shown else float("nan")
 
 
 def measure_static_scene(

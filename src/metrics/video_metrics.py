@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 from torchmetrics import MeanMetric, Metric, MetricCollection
@@ -18,25 +19,40 @@ SCORES = {  # name in table.py: a value per frame, or per step from a frame to t
     "psnr": psnr,
     "psnr_aligned": aligned_psnr,
     "ssim": ssim,
-    "temporal_jitter_px": temporal_jitter_px,
 }
 
 
 class ClipMean(MeanMetric):
-    """The mean over clips of the mean of `score(frames, target)` over a clip."""
+    """The mean over clips of the mean of `score(frames, target)` over a clip, both `resample`d."""
 
     full_state_update = False
 
-    def __init__(self, score: Callable[[Tensor, Tensor], Tensor]):
+    def __init__(self, score: Callable[[Tensor, Tensor], Tensor], scale: float = 1.0):
         super().__init__(nan_strategy="disable")
         # In a tuple: the parameters of a network that scores are no part of a checkpoint.
-        self._score = (score,)
+        self._score, self.scale = (score,), scale
 
     def update(self, frames: Video, target: Video) -> None:  # type: ignore[override]
         (score,) = self._score
         if isinstance(score, LPIPS):
             score.to(frames.device)
-        super().update(score(frames, target).mean())
+        super().update(score(resample(frames, self.scale), resample(target, self.scale)).mean())
+
+
+def resample(frames: Video, scale: float) -> Float[Tensor, "frames 1 h2 w2"]:
+    """Return frames of `scale` times the resolution: pixels repeated, below 1 areas averaged."""
+    if scale == 1:
+        return frames
+    size = [math.floor(side * scale + 0.5) for side in frames.shape[-2:]]
+    return functional.interpolate(frames, size, mode="nearest" if scale > 1 else "area")
+
+
+def measure_scaled_jitter_px(frames: Video, target: Video, scale: float, reduction: int) -> Tensor:
+    """Return temporal jitter in pixels of frames of `scale` times the resolution, measured on such
+    that are not larger than these and `reduction` times smaller."""
+    measured = min(scale, 1.0) / reduction
+    pair = resample(frames, measured), resample(target, measured)
+    return scale / measured * temporal_jitter_px(*pair)
 
 
 def score_by_user_metric(name: str, metric: Metric, frames: Tensor, target: Tensor) -> Tensor:
@@ -59,15 +75,20 @@ class VideoMetrics(MetricCollection):
 
     Frames are clipped to [0, 1]; the data range is 1.  `resolution_scale`: frames and targets are
     scored at so many times their own resolution, temporal jitter in pixels of the scored frame.
-    Whole numbers repeat pixels, so that PSNR stays; below 1 areas are averaged.  Raises ValueError
-    for another, and for a name in `own` that is taken.
+    Whole numbers repeat pixels, so that PSNR stays, and multiply jitter; below 1 areas are
+    averaged.  `jitter_reduction`: frames are made so many times smaller before jitter is measured,
+    so that its blocks show as much of a larger frame.  Raises ValueError for another, and for a
+    name in `own` that is taken.
     """
 
     def __init__(
         self, lpips: LPIPS | None = None, resolution_scale: float = 1.0,
-        own: Mapping[str, Metric] | None = None,
+        own: Mapping[str, Metric] | None = None, jitter_reduction: int = 1,
     ):  # fmt: skip
         scale = resolution_scale
+        if not (type(jitter_reduction) is int and 1 <= jitter_reduction <= 8):
+            allowed = "one of 1..8"
+            raise ValueError(f"metrics.jitter_reduction must be {allowed}, got {jitter_reduction}")
         if not 0 < scale <= 8 or (scale > 1 and scale != int(scale)):
             raise ValueError(
                 f"metrics.resolution_scale must be in (0, 1] or one of 2..8, got {scale}"
@@ -77,12 +98,13 @@ class VideoMetrics(MetricCollection):
             raise ValueError(f"metrics.{taken[0]} must be called otherwise: the name is taken")
         scores = SCORES if lpips is None else SCORES | {"lpips": lpips}
         scores = scores | {k: partial(score_by_user_metric, k, m) for k, m in own.items()}
+        jitter = partial(measure_scaled_jitter_px, scale=scale, reduction=jitter_reduction)
         metrics: dict[str, Metric | MetricCollection]
-        metrics = {name: ClipMean(score) for name, score in scores.items()}
+        metrics = {name: ClipMean(score, scale) for name, score in scores.items()}
+        metrics["temporal_jitter_px"] = ClipMean(jitter)
         # Groups would merge scores that are equal on the first clip.
         super().__init__(metrics, compute_groups=False)
-        self.resolution_scale = scale
-        self.names = (*(name for name in NAMES if name in scores), *own)
+        self.names = (*(name for name in NAMES if name in metrics), *own)
         self.user_metric_columns: tuple[Column, ...] = tuple(
             Column(name, name, 3, {None: 0, True: 1, False: -1}[metric.higher_is_better])
             for name, metric in own.items()
@@ -91,13 +113,5 @@ class VideoMetrics(MetricCollection):
     @torch.no_grad()
     def forward(self, frames: Video, target: Video) -> dict[str, float]:
         """Add a clip; return its scores by name."""
-        frames = self._resample(frames.float().clamp(0, 1))
-        values = super().forward(frames, self._resample(target))
+        values = super().forward(frames.float().clamp(0, 1), target)
         return {name: float(value) for name, value in values.items()}
-
-    def _resample(self, frames: Tensor) -> Tensor:
-        if self.resolution_scale == 1:
-            return frames
-        size = [math.floor(side * self.resolution_scale + 0.5) for side in frames.shape[-2:]]
-        mode = "nearest" if self.resolution_scale > 1 else "area"
-        return functional.interpolate(frames, size, mode=mode)

@@ -104,10 +104,11 @@ class FramePostprocessor(nn.Module):
         OVERLAP: of two, each gives the half that lies deeper in it.
         """
         count, parts, done = frames.shape[1], [], 0
-        last = max(count - self.WINDOW, 0)  # ends with the video
-        for start in [*range(0, last, self.WINDOW - self.OVERLAP), last]:
+        last = max(count - self.WINDOW, 0)  # ends with the video, and may share more
+        starts = [*range(0, last, self.WINDOW - self.OVERLAP), last]
+        for start, following in zip(starts, [*starts[1:], count], strict=True):
             stop = min(start + self.WINDOW, count)
-            until = count if stop == count else stop - self.OVERLAP // 2
+            until = count if stop == count else (stop + following + 1) // 2
             restored, _ = self(frames[:, start:stop])
             parts.append(restored[:, done - start : until - start])
             done = until

@@ -13,10 +13,10 @@ NAMES = ("ssim", "lpips", "lpips_aligned", "correlation")
 SETTLING = 2  # first frames of a reconstruction, which are not looked at
 
 
-def score_against_camera(video: Path, listing: Path) -> dict[str, float]:
-    """Return the mean scores NAMES of a video of src.reconstruct with a camera's frames, each
-    against the frame nearest in time; `lpips_aligned` is after the best gain and offset of each
-    frame, as events carry neither.
+def score_against_camera(video: Path, listing: Path, part: slice = slice(None)) -> dict[str, float]:
+    """Return the mean scores NAMES of `part` of a video of src.reconstruct with a camera's frames,
+    each against the frame nearest in time; `lpips_aligned` is after the best gain and offset of
+    each frame, as events carry neither.  A frame without contrast has correlation 0.
 
     `listing`: a line per picture, seconds and file.  Raises ValueError without the video's
     `frames.csv`, or where no picture falls on a frame.
@@ -28,14 +28,18 @@ def score_against_camera(video: Path, listing: Path) -> dict[str, float]:
         raise ValueError(f"{wanted}, {missing} is not there")
     clock = np.loadtxt(table, delimiter=",", skiprows=1, usecols=1, ndmin=1)
     film, scores, lpips = list(videos.read_video(video)), [], LPIPS()
+    scored = range(len(film))[part]
     reach = 0.5 * float(np.diff(clock).max(initial=0.0))
     for line in listing.read_text().splitlines():
         second, name = line.split()
         nearest = int(np.abs(clock - float(second)).argmin())
-        if abs(clock[nearest] - float(second)) <= reach and nearest >= SETTLING:
+        is_near = abs(clock[nearest] - float(second)) <= reach
+        if is_near and nearest >= SETTLING and nearest in scored:
             truth = next(videos.read_video(listing.parent / name))
             a, b = (torch.from_numpy(p.copy())[None, None] for p in (film[nearest], truth))
-            together = np.corrcoef(film[nearest].ravel(), truth.ravel())[0, 1]
+            has_contrast = np.ptp(film[nearest]) > 0 and np.ptp(truth) > 0
+            pair = film[nearest].ravel(), truth.ravel()
+            together = np.corrcoef(*pair)[0, 1] if has_contrast else 0.0
             aligned = align_brightness(a, b).clamp(0, 1)
             scores.append(
                 [ssim(a, b).item(), lpips(a, b).item(), lpips(aligned, b).item(), together]

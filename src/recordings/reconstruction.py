@@ -35,17 +35,24 @@ class Frame:
 
 class ReconstructionState:
     """What lives from frame to frame: the recurrent state of each phase of overlapping windows,
-    the last picture and the number of frames so far."""
+    the last picture and the end of the first window."""
 
     def __init__(self, overlapping_windows: int = 1):
         self.states: list[Any] = [None] * overlapping_windows
         self.picture: Float[np.ndarray, "h w"] | None = None
-        self.frames = 0
+        self.first_end_us: float | None = None
+
+    def phase(self, window: Window) -> int:
+        """Return which of `states` is of `window`; windows in between may be missing."""
+        if self.first_end_us is None:
+            self.first_end_us = window.end_us
+        period_us = (window.end_us - window.start_us) / len(self.states)
+        return round(abs(window.end_us - self.first_end_us) / period_us) % len(self.states)
 
     def reverse(self) -> None:
         """After windows backward in time, continue with the same windows forward."""
         self.states.reverse()
-        self.frames = 0
+        self.first_end_us = None
 
 
 def require_event_network(method: nn.Module) -> EventToVideoNetwork:
@@ -122,7 +129,7 @@ def reconstruct_frames(
     """
     state = ReconstructionState() if state is None else state
     for window in windows:
-        phase = state.frames % len(state.states)
+        phase = state.phase(window)
         if window.events:
             before = state.states[phase]
             picture, after = _run(network, window, before, positions, device)
@@ -133,7 +140,6 @@ def reconstruct_frames(
             else:
                 size = _voxels(window).shape[-2:]
             state.picture = np.full(size, 0.5, np.float32)
-        state.frames += 1
         yield Frame(window.end_us * 1e-6, state.picture, window.events, window.events_outside)
 
 

@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import rich
 from rich import box
 from rich.console import RenderableType
@@ -94,7 +95,7 @@ def summarize_scores(clips: list[dict], own_metrics: Iterable[Column] = ()) -> d
     names = (*NAMES, *(metric.name for metric in own_metrics))
     for metric in (name for name in names if clips and name in clips[0]):
         values = [clip[metric] for clip in clips]
-        mean, std = statistics.fmean(values), statistics.pstdev(values)
+        mean, std = statistics.fmean(values), float(np.std(values))
         summary[metric] = {"mean": mean, "std": std, "interval": bootstrap_interval(values)}
     return summary
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -129,7 +130,16 @@ def _plan(hydra: dict) -> SweepPlan:
     parsed = OverridesParser.create().parse_overrides(lines)
     entry_point, config = hydra["job"]["name"], hydra["job"]["config_name"]
     sweep = "" if entry_point == config else config
-    how = f"--config-dir sweeps --config-name {sweep}" if sweep else "-m"
+    how = f"--config-dir {_find_config_dir(hydra)} --config-name {sweep}" if sweep else "-m"
     start = f"python -m src.{entry_point} {how}"
     jobs = BasicSweeper.split_arguments(parsed, None)[0]
     return SweepPlan(sweep, " ".join([start, *asked]), jobs)
+
+
+def _find_config_dir(hydra: dict) -> str:
+    """Return the folder that --config-dir named, from where the sweep was started."""
+    runtime = hydra.get("runtime", {})
+    named = [
+        s["path"] for s in runtime.get("config_sources", ()) if s["provider"] == "command-line"
+    ]
+    return os.path.relpath(named[0], runtime["cwd"]) if named else "sweeps"

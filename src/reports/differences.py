@@ -9,17 +9,16 @@ from typing import Any
 from src.metrics.bootstrap import bootstrap_difference_interval
 from src.metrics.table import Column
 from src.records.runs import Run
-from src.reports.run_groups import RunGroup, find_published
+from src.reports.run_groups import RunGroup, find_differing_conditions, find_published
 from src.reports.tables import Table, TableCell, check_columns, list_metrics
-
-FEW_SEEDS = 10  # of three the interval holds the difference in four of five cases, of ten in nine
 
 
 def build_difference_table(
     title: str, ours: Sequence[Run], theirs: Sequence[Run], published: Mapping[str, Any]
 ) -> Table:
     """Return the means of `ours` and `theirs`, a run per seed, and their difference with the 95 %
-    bootstrap CI (seeds and clips resampled, clips in pairs); beside it the published difference.
+    CI (`bootstrap_difference_interval`); beside it the published difference.  A note names the test
+    conditions that differ.
 
     Raises ValueError where the clips of all runs are not the same.
     """
@@ -40,8 +39,8 @@ def build_difference_table(
         texts.append("-" if change is None else f"{change:+.{digits}f}")
         table.rows.append([TableCell(text=text) for text in texts])
     table.note = f"{len(ours[0].clips)} clips; {len(ours)} runs against {len(theirs)}."
-    if 1 < min(len(ours), len(theirs)) < FEW_SEEDS:
-        table.note += f" Of fewer than {FEW_SEEDS} seeds the interval is too narrow."
+    if differing := find_differing_conditions(ours, theirs):
+        table.note += f" Test conditions differ: {', '.join(differing)}."
     return table
 
 
@@ -66,7 +65,8 @@ def build_pair_table(
     rest = dict.fromkeys((*label[:place], *label[place + 1 :]) for label in finished)
     heads = (*keys[:place], *keys[place + 1 :], "difference")
     table = Table(title, [*(Column(head, head) for head in heads), *metrics], [], len(heads))
-    clips = set()
+    clips: set[int] = set()
+    differing: set[str] = set()
     for others in rest:
         for pair in pairs:
             labels = [(*others[:place], name, *others[place:]) for name in pair]
@@ -74,6 +74,7 @@ def build_pair_table(
                 continue
             ours, theirs = (finished[label] for label in labels)
             _check_clips("pairs", ours, theirs)
+            differing |= _find_other_conditions(keys[place], ours, theirs)
             texts = [*others, " − ".join(pair)]
             compared = [_compare(ours, theirs, metric.name) for metric in metrics]
             cells = [TableCell(c[0] - c[1], interval=c[2]) if c else TableCell() for c in compared]
@@ -81,7 +82,15 @@ def build_pair_table(
             clips.add(len(ours[0].clips))
     counts = " or ".join(map(str, sorted(clips)))
     table.note = f"{counts} test clips; mean (95 % bootstrap CI); bold: the CI excludes zero."
+    if differing:
+        table.note += f" Test conditions differ: {', '.join(sorted(differing))}."
     return table
+
+
+def _find_other_conditions(setting: str, ours: Sequence[Run], theirs: Sequence[Run]) -> set[str]:
+    """Return the test conditions that differ and are not part of `setting`, a key or a group."""
+    found = find_differing_conditions(ours, theirs)
+    return {key for key in found if key.split(".")[0] != setting.split(".")[0]}
 
 
 def _choose_metrics(groups: Sequence[RunGroup], names: Sequence[str] | None) -> list[Column]:

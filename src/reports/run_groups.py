@@ -12,7 +12,8 @@ FIRST_KEYS = ("task", "method", "experiment", "resolution", "postprocess", "base
 LAST_KEYS = ("budget", "debug")
 # What the test clips and their scores follow from: a key, or the beginning of several.
 TEST_CONDITIONS = (
-    "scene.", "turbulence.", "sensor.", "fps", "metrics.resolution_scale", "metrics.lpips.",
+    "scene.", "turbulence.", "sensor.", "fps", "metrics.resolution_scale",
+    "metrics.jitter_reduction", "metrics.lpips.",
     "data.test_", "data.unscored_windows", "data.substeps", "data.benchmark", "data.window",
     "data.events_per_window", "data.max_grid_s", "data.tolerance_ms", "data.start_s", "data.end_s",
     "data.warm_up_s", "data.histogram",
@@ -36,17 +37,11 @@ class RunGroup:
     older: int = 0
 
     @cached_property
-    def test_conditions(self) -> tuple:
+    def test_conditions(self) -> frozenset[tuple[str, str]]:
         """The settings and seeds that the test clips follow from: scores of groups in which they
         are equal can be compared.
         """
-        found = {
-            (key, format_setting(value))
-            for run in self.runs
-            for key, value in run.settings.items()
-            if key.startswith(TEST_CONDITIONS) and key not in NO_CONDITIONS
-        }
-        return frozenset(found), frozenset(run.test_seed for run in self.runs)
+        return _list_test_conditions(self.runs)
 
     @cached_property
     def frame_sizes_and_devices(self) -> tuple:
@@ -61,9 +56,9 @@ def group_runs(
     """Return the keys of the labels, and a group per setting, in the order of the sweeps.
 
     The keys are the fewest that tell the groups apart: first choices and what a command line has
-    set, then any other setting.  Like the seed, the settings `across` do not part groups, such as
+    set, then any other setting.  Like the seeds, the settings `across` do not part groups, such as
     ckpt for networks of several seeds tested on the same clips.  Of two runs with one setting and
-    seed the newer counts.
+    the same seeds the newer counts.
     """
     overridden = sorted({_override_key(override) for run in runs for override in run.overrides})
     rows = [_label_values(run, overridden, across) for run in runs]
@@ -72,12 +67,17 @@ def group_runs(
     newest: dict[tuple[str, ...], dict[tuple, Run]] = defaultdict(dict)
     for run, row in zip(runs, rows, strict=True):  # oldest first: the last one stays
         label = tuple(row.get(key, "-") for key in keys)
-        draw = run.record["seed"], *(str(run.settings.get(key)) for key in across)
+        draw = run.record["seed"], run.test_seed, *(str(run.settings.get(key)) for key in across)
         groups.setdefault(label, RunGroup(label, [])).older += draw in newest[label]
         newest[label][draw] = run
     for label, group in groups.items():
         group.runs = [run for _, run in sorted(newest[label].items())]
     return keys, _count_missing(list(groups.values()), keys, plans)
+
+
+def find_differing_conditions(ours: Sequence[Run], theirs: Sequence[Run]) -> list[str]:
+    """Return the keys of the test conditions that are not the same on both sides."""
+    return sorted({key for key, _ in _list_test_conditions(ours) ^ _list_test_conditions(theirs)})
 
 
 def format_setting(value: Any) -> str:
@@ -103,6 +103,17 @@ def find_published(run: Run, published: Mapping[str, Any]) -> dict[str, float]:
     fitting = filter(fits, published["rows"])
     best: dict = max(fitting, key=lambda row: len(row["when"]), default={})
     return {metric: value for metric, value in best.items() if metric != "when"}
+
+
+def _list_test_conditions(runs: Sequence[Run]) -> frozenset[tuple[str, str]]:
+    """Return (key, value) of every setting of `runs` that test clips follow from."""
+    found = {
+        (key, format_setting(value))
+        for run in runs
+        for key, value in run.settings.items()
+        if key.startswith(TEST_CONDITIONS) and key not in NO_CONDITIONS
+    }
+    return frozenset(found | {("data.test_seed", str(run.test_seed)) for run in runs})
 
 
 def _override_key(override: str) -> str:

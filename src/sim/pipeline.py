@@ -77,6 +77,8 @@ class Pipeline:
     light before the turbulence.  `crop` is the side of the square to simulate: pixels (int), a
     share of the frame (float in (0, 1]) or None for all of it; it lies at random if `random_crop`,
     else in the middle.  Number k shows clip k modulo `clips` (None: every number is a new clip).
+    Pixel mismatch and hot pixels differ between training clips; those of the other splits share
+    one sensor.
     """
 
     scene: Scene
@@ -99,7 +101,9 @@ class Pipeline:
         key, clip = noise.key(self.seed, self.split, index), self.scene.clip(index)
         crop = self._crop_box(clip.frames.shape[-2:], noise.key(key, number, "crop"))
         turbulence = self.turbulence.draw(noise.generator(noise.key(key, "atmosphere")))
-        return ClipParameters(clip, crop, turbulence, self.sensor.draw(key), key, number)
+        pixels = noise.key(key, "chip") if self.split == "train" else None
+        sensor = self.sensor.draw(key, pixel_seed=pixels)
+        return ClipParameters(clip, crop, turbulence, sensor, key, number)
 
     def simulate(
         self, draws: Sequence[ClipParameters], device: torch.device | str = "cpu", *,

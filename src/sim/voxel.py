@@ -5,6 +5,7 @@ floor(tau) and p f to the next, f its fraction.  The edges are the window's, not
 last event, so that all views share one clock and an empty view shifts nothing.
 """
 
+import warnings
 from typing import no_type_check
 
 import numpy as np
@@ -21,7 +22,8 @@ def voxel_grid(
     t: ArrayLike, x: ArrayLike, y: ArrayLike, p: ArrayLike, *, t0: float, t1: float, bins: int,
     height: int, width: int,
 ) -> Float[Tensor, "bins h w"]:  # fmt: skip
-    """Return the grid of the events with t0 <= t <= t1; the others have no part in it.
+    """Return the grid of the events with t0 <= t <= t1; the others have no part in it, and where
+    there are others only a warning says so.
 
     `t`, in the unit of `t0` and `t1` and in any order; `x`, `y` in pixels; `p` in {-1, 1} or
     {0, 1}: arrays or tensors of one length.  Each event's weights are multiples of 2**-20, so
@@ -39,6 +41,11 @@ def voxel_grid(
     grid, t0, t1 = torch.zeros(bins, height, width), float(t0), float(t1)
     if t.size == 0:
         return grid
+    if t.max() < t0 or t.min() > t1:
+        reach = f"{t.min()} to {t.max()}, the window is {t0} to {t1}"
+        warnings.warn(
+            f"no event lies in the window: t is {reach}; is its unit the same?", stacklevel=2
+        )
     times = t.astype(np.int64) if t.dtype.kind in "iu" else t.astype(np.float64)
     scale = np.float32(np.float32(bins - 1) / np.float32(t1 - t0))
     wrong = accumulate_until_bad_event(

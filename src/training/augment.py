@@ -17,6 +17,7 @@ from src.sim.pipeline import Sample, allocate_float32, concatenate_samples
 from src.training.clip_transforms import ClipTransform, transform_batch, transform_clips
 from src.training.voxel_noise import add_firing_pixels, draw_normals, draw_pixel_offsets
 
+LEAST_VIEWS_TO_SHIFT = 3
 NOISY_PIXEL_RATE_HZ = (10.0, 2000.0)  # each pixel has one of its own, log-uniform
 
 
@@ -30,8 +31,9 @@ class Augment:
     `pause_probability_when_running`, `.._when_paused`: that the next window has no events.
     `flip_probability`: for each axis.  The views of a grid change places with their images.
     `view_shift_probability`: of a view to be shifted by up to `max_view_shift_px` whole pixels in
-    each axis.  `batch_view_dropout_probability`: of a batch to lose views,
-    `batch_centre_view_probability`: of a batch to have the centre view alone, see draw_kept_views.
+    each axis, where there are three or more: which of two is displaced, nothing tells.
+    `batch_view_dropout_probability`: of a batch to lose views, `batch_centre_view_probability`: of
+    a batch to have the centre view alone, see draw_kept_views.
     """
 
     noise_std: float = 0.4
@@ -90,7 +92,8 @@ class Augment:
         axes = draw_flip_axes(self.flip_probability, noise.key(key, "flip"))
         order = flipped_view_order(positions, axes)[kept]
         shift = self.view_shift_probability, self.max_view_shift_px
-        shifts = draw_view_shifts(len(kept), *shift, noise.key(key, "misplaced"))
+        several = len(kept) >= LEAST_VIEWS_TO_SHIFT
+        shifts = draw_view_shifts(len(kept), *shift, noise.key(key, "misplaced")) if several else []
         return ClipTransform(source, paused, axes, order, shifts)
 
     def _add_noise(self, voxels: Tensor, window_s: Sequence[float], keys: Sequence[int]) -> None:

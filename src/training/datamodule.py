@@ -177,7 +177,7 @@ class BatchSimulator:
 
     def __call__(self, numbered: Sequence[tuple[SampleId, ClipParameters]]) -> Sample:
         ids, draws = zip(*numbered, strict=True)
-        names = [(sample.crop_stream, draw.key, draw.crop) for sample, draw in numbered]
+        names = [(sample.crop_stream, d.key, d.crop, d.clip.name) for sample, d in numbered]
         if self.last[0] != names:
             self.last = (names, self._simulate(self.streams[ids[0].crop_stream], draws, names))
         samples = self.last[1]

@@ -30,7 +30,8 @@ from src.sim.pipeline import Pipeline
 from src.training.clip_cache import GIB, CachedClip, ClipCache, simulate_clip
 
 INPUTS_FILE = "inputs.json"
-DOWNSTREAM = ("sensor", "voxel.py")  # parts of src/sim that come after the cache
+DOWNSTREAM = ("sensor", "voxel.py")  # parts of src/sim that come after the cache, but
+UPSTREAM = ("sensor/response.py",)  # decodes the frames before
 
 
 class DiskClipCache(ClipCache):
@@ -187,7 +188,9 @@ def hash_simulation_code() -> str:
     home, digest = Path(src.sim.__file__).parent, hashlib.sha256()
     for path in sorted(home.rglob("*")):
         place = path.relative_to(home)
-        if place.parts[0] in DOWNSTREAM or path.suffix not in (".py", ".safetensors"):
+        if place.parts[0] in DOWNSTREAM and place.as_posix() not in UPSTREAM:
+            continue
+        if path.suffix not in (".py", ".safetensors"):
             continue
         is_code = path.suffix == ".py"
         data = ast.dump(ast.parse(path.read_text())).encode() if is_code else path.read_bytes()

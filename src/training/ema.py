@@ -53,7 +53,7 @@ class WeightEMA(WeightAveraging):
 @contextmanager
 def use_averaged_weights(module: LightningModule) -> Iterator[None]:
     """Give `module` the averaged weights within the context, where its trainer has a WeightEMA."""
-    averages = _find_averages(module.trainer)
+    averages = [ema for ema in _find_averages(module.trainer) if not ema.is_swapped]
     for ema in averages:
         ema._swap_models(module)
     try:

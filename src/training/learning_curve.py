@@ -36,6 +36,9 @@ class LearningCurve(Callback):
             raise ValueError(f"{key} must be > 0 or null, got {interval_h}")
         if export is not None and Path(export).suffix != ".safetensors":
             raise ValueError(f"export must be a .safetensors file or null, got {export}")
+        if export is not None and interval_h is None:
+            key = "callbacks.learning_curve.interval_h"
+            raise ValueError(f"{key} must be > 0 where export is given, got null")
         self.path, self.interval_h = Path(path), interval_h
         self.export = Path(export) if export else None
         self.rows: list[dict] = []

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any
 
 import torch
 from lightning import LightningModule
@@ -92,6 +92,7 @@ class Reconstructor(LightningModule):
     def on_fit_start(self) -> None:
         self.loss.to(self.device)  # which is no submodule
         self.train()  # after a test's eval mode
+        self._share_scores_of_all_processes()
 
     def on_train_start(self) -> None:
         self.clock.start()
@@ -144,8 +145,13 @@ class Reconstructor(LightningModule):
         self._log_means("val")
 
     def on_test_start(self) -> None:
-        """Forget the clips of an earlier test; with one process do not wait for others to test."""
+        """Forget the clips of an earlier test."""
         self.clips, self.reconstructions = [], []
+        self._share_scores_of_all_processes()
+
+    def _share_scores_of_all_processes(self) -> None:
+        """Average scores over the processes of this module's trainer, which may be one of several;
+        `metrics` may have been those of another module's test before."""
         for metric in self.metrics.values():
             metric.distributed_available_fn = lambda: self.trainer.world_size > 1
 
@@ -210,10 +216,11 @@ class PostprocessorTraining(Reconstructor):
 
     def reconstruct_windows(self, sample: "Sample", outputs: Sequence[int]) -> Tensor:
         """Return the restored frames `outputs` of the source's frames."""
-        source = cast(VideoMethod, self.method.source).to(self.device)
-        with torch.no_grad():
-            frames = source.reconstruct_clip(sample).float().clamp(0, 1)
-        return self.network(frames)[0][:, outputs]
+        method: Any = self.method
+        method.source.to(self.device)
+        frames, step = method.source_frames(sample), method.windows_per_frame
+        restored = self.network(frames[:, ::step])[0]
+        return restored.repeat_interleave(step, 1)[:, outputs]
 
 
 def select_loss_windows(windows: int, first: int, pairs: int | None, seed: int) -> list[int]:

@@ -40,8 +40,9 @@ class CosineSchedule(Callback):
     """Train for `train_hours` of the module's clock; the learning rate falls by half a cosine of
     that time, from the optimiser's own to 0 (Loshchilov & Hutter 2017).  None: steps decide.
 
-    The time so far is part of checkpoints.  `warmup_steps`: first steps of an optimiser, over which
-    the rate rises from zero.  Raises ValueError for values out of range.
+    The time so far is part of checkpoints, of several processes that of the first.  `warmup_steps`:
+    first steps of an optimiser, over which the rate rises from zero.  Raises ValueError for values
+    out of range and for a warm-up without `train_hours`.
     """
 
     def __init__(self, train_hours: float | None = None, warmup_steps: int = 0):
@@ -50,6 +51,9 @@ class CosineSchedule(Callback):
         if type(warmup_steps) is not int or warmup_steps < 0:
             key = "callbacks.schedule.warmup_steps"
             raise ValueError(f"{key} must be a whole number >= 0, got {warmup_steps}")
+        if train_hours is None and warmup_steps:
+            key = "callbacks.schedule.warmup_steps"
+            raise ValueError(f"{key} must be 0 without train_hours, got {warmup_steps}")
         self.train_hours, self.warmup_steps = train_hours, warmup_steps
 
     def lr_ratio(self, hours: float) -> float:
@@ -58,7 +62,12 @@ class CosineSchedule(Callback):
         return (1 + math.cos(math.pi * min(hours / self.train_hours, 1.0))) / 2
 
     def on_fit_start(self, trainer: Trainer, pl_module: Any) -> None:
-        if self.train_hours is not None and pl_module.clock.hours >= self.train_hours:
+        if self.train_hours is None:
+            return
+        clock = pl_module.clock
+        if trainer.world_size > 1:  # or the weights of the processes would part
+            clock.seconds = trainer.strategy.broadcast(clock.seconds)
+        if clock.hours >= self.train_hours:
             trainer.should_stop = True
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:

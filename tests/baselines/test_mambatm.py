@@ -71,6 +71,23 @@ def test_windows_cover_the_video(frames, starts):
     assert torch.equal(Listed().restore(video), video) and seen == starts
 
 
+@pytest.mark.parametrize("frames", [37, 40, 45, 60])
+def test_each_frame_is_of_the_window_in_which_it_lies_deeper(frames):
+    class Depth(FramePostprocessor):
+        def forward(self, part):
+            inside = torch.arange(part.shape[1])
+            depth = torch.minimum(inside, part.shape[1] - 1 - inside)
+            return (depth / 100).view(1, -1, 1, 1, 1), None
+
+    last = frames - 16
+    starts = [*range(0, last, 12), last]
+    deepest = [
+        max(min(k - s, s + 15 - k) for s in starts if s <= k < s + 16) for k in range(frames)
+    ]
+    found = (100 * Depth().restore(torch.zeros(1, frames, 1, 1, 1))).round().flatten().tolist()
+    assert found == deepest
+
+
 @torch.no_grad()
 def test_frames_encoded_one_by_one_give_the_same(monkeypatch):
     network, frames = small(), torch.rand(1, 3, 1, 16, 24)

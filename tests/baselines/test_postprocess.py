@@ -90,6 +90,16 @@ def test_training_changes_the_post_processor_and_not_its_source():
 
 
 @torch.no_grad()
+def test_training_gets_each_long_exposure_once_as_a_test_does():
+    restorer = MambaTM(states=2).eval()
+    method = Postprocessed(CameraFrames(4), restorer)
+    module = PostprocessorTraining(restorer, {}, method=method)
+    given = sample()
+    trained = module.reconstruct_windows(given, [0, 5, 9]).clamp(0, 1)
+    torch.testing.assert_close(trained, method.reconstruct_clip(given)[:, [0, 5, 9]])
+
+
+@torch.no_grad()
 def test_validation_sees_the_restored_frames():
     restorer = MambaTM(states=2).eval()
     module = PostprocessorTraining(restorer, {}, method=Postprocessed(CameraFrames(), restorer))

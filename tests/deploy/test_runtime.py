@@ -146,6 +146,12 @@ def test_a_pixel_may_weigh_a_part():
     np.testing.assert_allclose(one, two, atol=EXACT)
 
 
+def test_microseconds_for_seconds_are_told_of():
+    window = events(0)
+    with pytest.warns(UserWarning, match="1 of 400 events lie in the window.*in seconds"):
+        runtime(network("e2vid")).step(**window | {"t": 1e6 * window["t"]})
+
+
 def test_events_outside_the_window_have_no_part():
     net, window = network("setnet"), events(1)
     early = {name: window[name] for name in ("x", "y", "p", "view")}

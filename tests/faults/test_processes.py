@@ -60,7 +60,7 @@ def losses(run: Path) -> list[float]:
 
 
 def test_two_processes_train_as_one_with_the_joint_batch(tmp_path):
-    few = ["trainer.max_steps=3", "data.epoch_clips=8", "data.batch_reuse=1", "logger=csv"]
+    few = ["trainer.max_steps=3", "data.epoch_clips=4", "data.batch_reuse=1", "logger=csv"]
     # Adam's first steps have the size of the rate whatever the gradient: rounding would show.
     few += ["optimizer._target_=torch.optim.SGD", "optimizer.lr=0.1", "trainer.precision=32-true"]
     two = training(tmp_path / "two", *few, "trainer=ddp", "data.batch_size=1")
@@ -74,4 +74,15 @@ def test_two_processes_train_as_one_with_the_joint_batch(tmp_path):
     first, second = weights(tmp_path / "two"), weights(tmp_path / "one")
     for name, value in first.items():
         assert torch.allclose(value, second[name], rtol=1e-4, atol=1e-6), name
+    assert (tmp_path / "two" / "results.json").is_file()
+
+
+@pytest.mark.slow
+def test_two_processes_that_train_by_time_stop_together(tmp_path):
+    by_time = ["train_hours=0.001", "scheduler=null", "trainer.max_steps=-1", "data.batch_size=1"]
+    two = training(tmp_path / "two", *by_time, "data.batch_reuse=1", "trainer=ddp")
+    port = free_port()
+    runs = [Run(tmp_path / f"log{rank}", as_rank, rank, port, two) for rank in (0, 1)]
+    for run in runs:
+        assert run.wait() == 0, run.text()
     assert (tmp_path / "two" / "results.json").is_file()

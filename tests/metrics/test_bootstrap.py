@@ -25,10 +25,20 @@ def test_clips_are_paired():
     assert np.diff(bootstrap_interval(hard.tolist()))[0] > 5
 
 
-def test_seeds_count():
+def test_of_few_seeds_it_is_student_s_interval():
     apart = [[0.0] * 9, [1.0] * 9, [2.0] * 9]
+    half = stats.t.ppf(0.975, 2) / np.sqrt(3)
     low, high = bootstrap_difference_interval(apart, None)
-    assert low == pytest.approx(0.0, abs=0.4) and high == pytest.approx(2.0, abs=0.4)
+    assert low == pytest.approx(1 - half, rel=0.1) and high == pytest.approx(1 + half, rel=0.1)
+
+
+def test_of_three_seeds_it_holds_the_difference_as_often_as_it_says():
+    rng, held = np.random.default_rng(4), 0
+    for _ in range(200):
+        ours, theirs = (rng.normal(0, 0.2, (3, 1)) + rng.normal(0, 0.1, (3, 27)) for _ in "ab")
+        low, high = bootstrap_difference_interval((ours + 0.5).tolist(), theirs.tolist())
+        held += low <= 0.5 <= high
+    assert held >= 186
 
 
 def test_it_is_scipy_s_where_there_is_one_seed():

@@ -25,6 +25,24 @@ def test_a_still_slice_does_not_wander_and_a_blank_one_has_no_answer():
     assert np.isnan(slice_motion.residual_displacement_px(np.full((10, 50), 0.5)))
 
 
+@pytest.mark.parametrize("lost", ["grey", "noise", "inverted"])
+def test_rows_without_the_scene_do_not_count(lost):
+    rng = np.random.default_rng(0)
+    shift = 1.5 * rng.normal(size=200)
+    rows = edges(shift)
+    end = {
+        "grey": 0.5 + 0 * rows,
+        "noise": 0.5 + 0.01 * rng.normal(size=rows.shape),
+        "inverted": -rows,
+    }
+    rows[120:] = end[lost][120:]
+    found = slice_motion.residual_displacement_px(rows)
+    assert found == pytest.approx(shift[:120].std(), rel=0.1)
+    rows[90:] = end[lost][90:]
+    if lost != "inverted":  # whose mean row is that of the rest
+        assert np.isnan(slice_motion.residual_displacement_px(rows))
+
+
 @pytest.mark.parametrize("size", [0.0, 0.3, 1.0])
 def test_straightness_is_the_distance_from_the_line_of_uniform_motion(size):
     time, rng = np.arange(60), np.random.default_rng(0)

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from src.metrics.video_metrics import VideoMetrics
+from src.metrics.video_metrics import VideoMetrics, resample
+from tests.metrics.test_temporal import photo, swing
 
 
 def clip(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -37,6 +38,29 @@ def test_repeated_pixels_change_ssim_and_not_psnr():
     assert larger["psnr"] == pytest.approx(own["psnr"], abs=1e-4)
     assert larger["psnr_aligned"] == pytest.approx(own["psnr_aligned"], abs=1e-4)
     assert larger["ssim"] != pytest.approx(own["ssim"], abs=0.01)
+
+
+def moving_pair() -> tuple[torch.Tensor, torch.Tensor]:
+    shifts = swing(1.5)
+    return photo(shifts), photo(torch.zeros_like(shifts))
+
+
+def test_repeated_pixels_multiply_jitter():
+    own, larger = VideoMetrics()(*moving_pair()), VideoMetrics(resolution_scale=3)(*moving_pair())
+    assert own["temporal_jitter_px"] > 1
+    assert larger["temporal_jitter_px"] == pytest.approx(3 * own["temporal_jitter_px"], rel=1e-5)
+
+
+def test_a_reduction_measures_an_enlarged_frame_as_the_small_one():
+    enlarged = [resample(frames, 3.0) for frames in moving_pair()]
+    own, larger = VideoMetrics()(*moving_pair()), VideoMetrics(jitter_reduction=3)(*enlarged)
+    assert larger["temporal_jitter_px"] == pytest.approx(3 * own["temporal_jitter_px"], rel=1e-4)
+
+
+@pytest.mark.parametrize("reduction", [0, 9])
+def test_other_reductions_are_refused(reduction):
+    with pytest.raises(ValueError, match=r"metrics\.jitter_reduction must be one of 1\.\.8"):
+        VideoMetrics(jitter_reduction=reduction)
 
 
 def test_averaged_areas_lose_noise():

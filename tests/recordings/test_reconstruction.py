@@ -68,6 +68,24 @@ def test_the_frames_are_those_from_grids(name, cut):
         np.testing.assert_allclose(one.picture, other.picture, atol=1e-5)
 
 
+@pytest.mark.parametrize("missing", [0, 3, 7])
+def test_a_missing_window_leaves_the_states_of_the_others_alone(missing):
+    torch.manual_seed(0)
+    network, table = E2VID(views=9, base_channels=4).eval(), sensor_lookup.build_lookup(VIEWS)
+    rule = event_windows.WindowRule(fps=600.0, frames_per_window=5)
+    windows = list(event_windows.cut_windows([recording()], table, rule))
+    state = ReconstructionState(5)
+    whole = list(reconstruct_frames(windows, network, VIEWS.positions, state))
+    left = [window for number, window in enumerate(windows) if number != missing]
+    state = ReconstructionState(5)
+    found = list(reconstruct_frames(left, network, VIEWS.positions, state))
+    others = [frame for number, frame in enumerate(whole) if number != missing]
+    for number, (one, other) in enumerate(zip(found, others, strict=True)):
+        number += number >= missing
+        if number < missing or ((number - missing) % 5 and one.events):
+            np.testing.assert_array_equal(one.picture, other.picture)
+
+
 def test_what_is_run_follows_from_network_and_device():
     network = SetNet(channels=4)
     assert isinstance(

@@ -1,5 +1,7 @@
 """What runs are ahead of others by, clip by clip."""
 
+from dataclasses import replace
+
 import pytest
 
 from src.records import runs
@@ -30,6 +32,14 @@ def test_differences_are_ours_minus_theirs_with_an_interval(tmp_path):
         "LPIPS", "3.5000", "2.5000", "+1.0000", "+1.0000 to +1.0000", "-0.0300"
     ]  # fmt: skip
     assert table.rows[1][-1].text == "-"
+
+
+def test_what_was_not_tested_alike_is_named(tmp_path):
+    ours = found(tmp_path, "lf3x3", {"a": 2.0, "b": 5.0})
+    other = [replace(run, settings=run.settings | {"turbulence.severity": "weak"}) for run in ours]
+    table = build_difference_table("", ours, other, PAPER)
+    assert table.note.endswith("Test conditions differ: turbulence.severity.")
+    assert "differ" not in build_difference_table("", ours, ours, PAPER).note
 
 
 def test_differences_need_the_same_clips(tmp_path):

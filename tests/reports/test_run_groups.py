@@ -1,6 +1,7 @@
 """Which runs are one group, what its label says, and what is missing or contradicts itself."""
 
 import pytest
+import yaml
 
 from src.records import runs
 from src.reports.run_groups import group_runs
@@ -128,3 +129,22 @@ def test_an_empty_or_broken_run_folder_is_named(content, said, tmp_path):
 def test_a_folder_that_is_not_there_is_named(tmp_path):
     with pytest.raises(ValueError, match="no such folder"):
         runs.find_runs([tmp_path / "nowhere"])
+
+
+def test_evaluations_of_other_test_seeds_all_count(tmp_path):
+    for seed in (0, 1, 2):
+        more = {"settings": {"data": {"test_seed": seed}}, "task": "eval"}
+        write_run(tmp_path / str(seed), overrides=(f"data.test_seed={seed}",), **more)
+    _, (group,) = grouped(tmp_path)
+    assert len(group.runs) == 3 and group.older == 0
+
+
+def test_a_sweep_of_another_folder_is_printed_with_it(tmp_path):
+    write_sweep(tmp_path, {"seed": "0,1"})
+    file = tmp_path / "multirun.yaml"
+    hydra = yaml.safe_load(file.read_text())
+    source = {"path": "/home/me/mine/sweeps", "provider": "command-line"}
+    hydra["hydra"]["runtime"] = {"cwd": "/home/me", "config_sources": [source]}
+    file.write_text(yaml.safe_dump(hydra))
+    (plan,) = runs.find_sweeps([tmp_path])
+    assert plan.command == "python -m src.train --config-dir mine/sweeps --config-name table1"

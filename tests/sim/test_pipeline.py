@@ -36,7 +36,8 @@ def pipeline(turbulence=CALM, sensor=IDEAL, optics=None, scene=None, **kwargs) -
     srgb = sensor.get("input") == "srgb"
     pixels = EventSensor(**sensor | {"input": "linear"})
     optics, scene = optics or Optics(9), scene or Waves()
-    return Pipeline(scene, optics, turbulence, pixels, split="test", decodes_srgb=srgb, **kwargs)
+    kwargs = {"split": "test", "decodes_srgb": srgb} | kwargs
+    return Pipeline(scene, optics, turbulence, pixels, **kwargs)
 
 
 def test_law_1_without_turbulence_events_follow_the_log_intensity_within_a_threshold():
@@ -185,6 +186,18 @@ def test_finite_clips_come_again_with_other_crops():
     chain = pipeline(STRONG, crop=16, random_crop=True, clips=3)
     first, again = chain.draw(1), chain.draw(4)
     assert first.key == again.key and first.crop != again.crop
+
+
+@pytest.mark.parametrize("split, differ", [("train", True), ("val", False), ("test", False)])
+def test_hot_pixels_lie_elsewhere_in_every_training_clip(split, differ):
+    hot = {"threshold": 0.2, "hot_pixel_fraction": 0.1, "hot_pixel_hz": 100.0}
+    dark = Waves(contrast=0.0)
+    chain = pipeline(sensor=hot, optics=Optics(1), scene=dark, split=split)
+    first, second, again = (simulate(chain, [number]).voxels != 0 for number in (0, 1, 0))
+    places = first.flatten(0, 3).any(0), second.flatten(0, 3).any(0)
+    assert torch.equal(first, again) and places[0].sum() > 50
+    shared = float((places[0] & places[1]).sum() / places[0].sum())
+    assert shared < 0.4 if differ else shared > 0.6
 
 
 @pytest.mark.parametrize("crop", [0, 4, 49, 1.5])

@@ -138,3 +138,11 @@ def test_what_is_wrong_is_named(change, words):
 
 def test_no_events_are_an_empty_grid():
     assert voxel_grid([], [], [], [], t0=0, t1=10, **SIZE).eq(0).all()
+
+
+def test_events_that_all_lie_outside_are_told_of():
+    with pytest.warns(UserWarning, match="no event lies in the window: t is 200.0 to 300.0"):
+        grid = voxel_grid(
+            [200.0, 300.0], [1, 2], [1, 2], [1, -1], t0=0.0, t1=0.1, bins=5, height=4, width=4
+        )
+    assert not grid.any()

@@ -194,6 +194,18 @@ def test_a_misplaced_view_moves_whole_and_leaves_nothing_behind():
     assert torch.equal(shift_views(view.clone(), draw_view_shifts(3, 0.0, 2, key=4)), view)
 
 
+@pytest.mark.parametrize(("views", "is_shifted"), [(1, False), (2, False), (3, True)])
+def test_only_a_view_that_others_tell_to_be_displaced_is_shifted(views, is_shifted):
+    voxels = torch.rand(1, 6, views, 5, 16, 16)
+    frames = torch.rand(1, 6, 1, 16, 16)
+    sample = Sample(voxels, frames, frames, torch.tensor([1 / 120]), layout(views), [{}])
+    off = {"noise_std": 0.0, "max_offset_pixel_fraction": 0.0, "flip_probability": 0.0}
+    off |= {"pause_probability_when_running": 0.0}
+    shifted = Augment(**off, view_shift_probability=1.0, max_view_shift_px=3)([sample], [5])
+    assert torch.equal(shifted.target, frames)
+    assert torch.equal(shifted.voxels, voxels) is not is_shifted
+
+
 def test_shifting_brings_nothing_in():
     moved = shift_views(torch.ones(1, 9, 5, 8, 8), [(2, 1, -2)])
     assert moved[:, 2].sum() == 5 * 7 * 6 and moved[:, 3].all()

@@ -3,9 +3,12 @@
 import csv
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
+from lightning import Trainer
 from torch.optim.swa_utils import AveragedModel
 
 from src.app import build
@@ -147,6 +150,25 @@ def test_a_training_that_is_cut_short_exports_what_it_has_reached(tmp_path, monk
     assert (card["hours"], card["steps"], len(card["curve"])) == (2, 2, 1)
 
 
+def test_a_training_cut_short_in_a_validation_exports_the_average(tmp_path, monkeypatch):
+    now, validate = tmp_path / "now.safetensors", Reconstructor.validation_step
+
+    def interrupted(self, sample, batch_idx):
+        validate(self, sample, batch_idx)
+        if self.global_step == 6:
+            raise OSError("the disk is full")
+
+    monkeypatch.setattr(Reconstructor, "validation_step", interrupted)
+    with pytest.raises(OSError, match="the disk is full"):
+        run(tmp_path / "x", "train_hours=9", f"export={now}", "trainer.limit_val_batches=1.0")
+    stored = checkpoint(tmp_path / "x")["state_dict"]
+    average = files.load(now).state_dict()
+    module, _ = build.build_untrained_network(config("train", tmp_path, *TINY, *RECIPE))
+    module.load_state_dict({k.removeprefix("network."): v for k, v in stored.items()})
+    for name, value in inference_copy(module).state_dict().items():
+        assert torch.allclose(value, average[name].float(), atol=1e-3), name
+
+
 def test_a_training_that_has_collapsed_ends_and_keeps_what_it_had(tmp_path, monkeypatch):
     now = tmp_path / "now.safetensors"
     monkeypatch.setattr("src.training.learning_curve.COLLAPSE_FACTOR", 0.5)
@@ -236,7 +258,10 @@ def test_the_average_forgets_the_start_and_then_moves_slowly():
         (["data.loss_pairs=2", "data.loss_from=0"], "data.loss_pairs must be in 1..1 or null"),
         (["callbacks.learning_curve.interval_h=0"], "callbacks.learning_curve.interval_h"),
         (["callbacks.schedule.warmup_steps=-1"], "callbacks.schedule.warmup_steps must be"),
+        (["callbacks.schedule.warmup_steps=9"], "warmup_steps must be 0 without train_hours"),
         (["export=weights.pt"], "export must be a .safetensors"),
+        (["export=w.safetensors"], "interval_h must be > 0 where export is given"),
+        (["trainer.precision=16-mixed"], "trainer.precision must be bf16-mixed, 32-true or null"),
         (["stem=0"], "model.stem_channels must be >= 1"),
         (["state_rounding_step=2"], "model.state_rounding_step must be in"),
         (
@@ -250,9 +275,36 @@ def test_a_wrong_value_names_its_key(overrides, key, tmp_path):
         train(config("train", tmp_path, *TINY, *overrides))
 
 
+def test_of_several_processes_the_clock_of_the_first_counts():
+    strategy = SimpleNamespace(broadcast=lambda seconds: seconds - 2 * HOUR)
+    trainer = Mock(spec=Trainer, world_size=2, strategy=strategy, should_stop=False)
+    module = SimpleNamespace(clock=TrainingClock())
+    module.clock.seconds = 4 * HOUR
+    CosineSchedule(train_hours=3).on_train_batch_end(trainer, module)
+    assert module.clock.hours == 2 and not trainer.should_stop
+    module.clock.seconds = 6 * HOUR
+    CosineSchedule(train_hours=3).on_train_batch_end(trainer, module)
+    assert module.clock.hours == 4 and trainer.should_stop
+
+
 def test_a_processor_clock_does_not_count_waiting():
     watch = TrainingClock("processor")
     watch.start()
     time.sleep(0.2)
     watch.lap()
     assert watch.seconds < 0.1 and watch.hours == watch.seconds / 3600
+
+
+def test_a_training_stopped_in_its_last_test_names_its_checkpoint(tmp_path, monkeypatch, capsys):
+    test_step = Reconstructor.test_step
+
+    def interrupted(self, sample, batch_idx):
+        if next(iter(tmp_path.rglob("last.ckpt")), None):
+            raise OSError("the disk is full")
+        test_step(self, sample, batch_idx)
+
+    monkeypatch.setattr(Reconstructor, "test_step", interrupted)
+    with pytest.raises(OSError, match="the disk is full"):
+        run(tmp_path, "train_hours=2")
+    said = capsys.readouterr().err
+    assert f"stopped at step 2; go on with ckpt={tmp_path / 'checkpoints'}" in said

@@ -12,12 +12,14 @@ from src.recordings.files.event_file import ReadOptions
 MAX_PACKING = 200  # most that the columns of a recording shrink when they are packed
 MAX_COORDINATE = 65535
 IN_ORDER = 0.99  # of the steps of a column that time may be
+DATES = "mM"  # the kinds of NumPy's timedelta64 and datetime64
 NAMES = {
     "t": ("t", "ts", "time", "times", "timestamp", "timestamps"),
     "x": ("x", "xs", "col", "column", "x_coord", "x_coordinate", "x-coordinate", "u"),
     "y": ("y", "ys", "row", "y_coord", "y_coordinate", "y-coordinate", "v"),
     "p": ("p", "ps", "on", "polarity", "polarities", "pol"),
 }  # fmt: skip
+JOINT = "xy"  # a column (n, 2) of both
 UNIT = re.compile(r"[ _]?[\[(]?(us|µs|μs|ns|ms|s|sec|seconds|px|pixel|pixels)[\])]?$")
 TIME_UNIT = re.compile(r"[ _\[(](us|µs|μs|ns|ms|s|sec|seconds)[\])]?$")
 
@@ -39,10 +41,22 @@ def find_columns_by_name(names: Sequence[str]) -> dict[str, int] | None:
 
 
 def find_keys_by_name(names: Iterable[str]) -> dict[str, str] | None:
-    """Return the names of t, x, y and p among `names`, or None."""
+    """Return the names of t, x, y and p among `names`, or None; that of x and y may be JOINT."""
     keys = list(names)
-    places = find_columns_by_name(keys)
+    joint = [*JOINT] if JOINT in keys else []
+    places = find_columns_by_name([*keys, *joint])
+    keys += [JOINT for _ in joint]
     return None if places is None else {letter: keys[place] for letter, place in places.items()}
+
+
+def pick_column(letter: str, key: str, values: np.ndarray) -> np.ndarray:
+    """Return the column `letter` of the array that is called `key`; ValueError for a JOINT that is
+    not (n, 2)."""
+    if key != JOINT:
+        return values
+    if values.ndim != 2 or values.shape[1] != len(JOINT):
+        raise ValueError(f"{JOINT} must be (n, 2), got {values.shape}")
+    return values[:, JOINT.index(letter)]
 
 
 def parse_unit_suffix(name: str) -> str | None:
@@ -108,7 +122,12 @@ def find_columns(sample: np.ndarray, order: str | None) -> dict[str, int]:
 
 
 def as_times(t: np.ndarray) -> np.ndarray:
-    """Return times as contiguous int64 or float64; raises ValueError for another kind of values."""
+    """Return times as contiguous int64 or float64, NumPy's dates and durations as int64 in us;
+    raises ValueError for another kind of values."""
+    if t.dtype.kind in DATES:
+        if np.datetime_data(t.dtype)[0] == "generic" or np.isnat(t).any():
+            raise ValueError(f"times must have a unit and a value each, got {t.dtype}")
+        return np.ascontiguousarray(t.astype(f"{t.dtype.kind}8[us]").astype(np.int64))
     if t.dtype.kind == "f":
         return np.ascontiguousarray(t, np.float64)
     if t.dtype.kind not in "iu":

@@ -2,20 +2,24 @@
 
 import re
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import h5py
 import numpy as np
 
-from src.recordings.files.columns import check_lengths, find_keys_by_name
-from src.recordings.files.numpy_file import split_table
+from src.recordings.files.columns import check_lengths, find_keys_by_name, pick_column
+from src.recordings.files.numpy_file import LazyColumn, split_table
 
 
 def find_event_columns(node: Any, order: str | None) -> dict[str, Any]:
     """Return the columns t, x, y, p of a group or a table; `order`: columns=."""
     if not isinstance(node, h5py.Group):
         return split_table(node, order)
-    columns = {name: node[key] for name, key in (find_keys_by_name(node) or {}).items()}
+    keys = find_keys_by_name(node) or {}
+    columns = {
+        name: LazyColumn(node[key], partial(pick_column, name, key)) for name, key in keys.items()
+    }
     check_lengths(columns)
     return columns
 

@@ -18,9 +18,9 @@ import hdf5plugin  # noqa: F401 - its codecs are registered by the import
 import numpy as np
 
 from src.recordings.files.columns import (
+    JOINT,
     as_times,
     check_unpacking_ratio,
-    find_columns_by_name,
     find_keys_by_name,
     find_named_time_unit,
 )
@@ -183,18 +183,19 @@ def refuse_ecf_codec(parts: Iterable[Any]) -> None:
 
 
 def _has_columns(group: Any) -> bool:
-    """Return whether the group holds t, x, y, p of one dimension."""
+    """Return whether the group holds t, x, y, p of one dimension; JOINT has two."""
     keys = find_keys_by_name(group)
     if keys is None:
         return False
     return all(
-        isinstance(group.get(key), h5py.Dataset) and group[key].ndim == 1 for key in keys.values()
+        isinstance(group.get(key), h5py.Dataset) and group[key].ndim == (2 if key == JOINT else 1)
+        for key in keys.values()
     )
 
 
 def _is_table(name: str, node: Any) -> bool:
     if node.dtype.names is not None:
-        return node.ndim == 1 and find_columns_by_name(node.dtype.names) is not None
+        return node.ndim == 1 and find_keys_by_name(node.dtype.names) is not None
     return node.ndim == 2 and node.shape[1] == 4 and "event" in name.lower()
 
 

@@ -2,6 +2,7 @@
 
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -9,14 +10,15 @@ from typing import Any
 import numpy as np
 
 from src.recordings.files.columns import (
+    DATES,
     as_integers,
     as_times,
     check_lengths,
     check_unpacking_ratio,
     find_columns,
-    find_columns_by_name,
     find_keys_by_name,
     find_named_time_unit,
+    pick_column,
 )
 from src.recordings.files.event_file import (
     PIECE_EVENTS,
@@ -58,6 +60,8 @@ class NumpyFile(EventFile):
                     self.time_unit = _find_stated_unit(file, options)
                     self.time_unit = self.time_unit or find_named_time_unit(names, options)
             check_lengths(self._columns)
+            if np.asarray(self._columns["t"][:1]).dtype.kind in DATES:
+                self.time_unit = "us"
 
     def pieces(self) -> Iterator[RawEvents]:
         yield from slice_columns(self.path, self._columns)
@@ -99,7 +103,9 @@ def split_table(table: Any, order: str | None) -> dict[str, Any]:
         keys = find_keys_by_name(names)
         if keys is None or table.ndim != 1:
             raise ValueError(f"fields must be t, x, y, p of one dimension, got {', '.join(names)}")
-        return {name: LazyColumn(table, itemgetter(key)) for name, key in keys.items()}
+        return {
+            name: LazyColumn(table, partial(_pick_field, name, key)) for name, key in keys.items()
+        }
     if table.ndim != 2 or table.shape[1] < 4:
         raise ValueError(f"an array must be (n, 4) or have fields t, x, y, p, got {table.shape}")
     sample = np.asarray(table[:PIECE_EVENTS])
@@ -152,7 +158,7 @@ def _columns_of(
     a note of other arrays of events in it."""
     keys = find_keys_by_name(file.files)
     if keys is not None:
-        columns = {name: _flat(file[key]) for name, key in keys.items()}
+        columns = {name: _flat(pick_column(name, key, file[key])) for name, key in keys.items()}
         if any(column.ndim != 1 for column in columns.values()):
             raise ValueError("columns must have one dimension")
         return columns, file.files, ()
@@ -167,9 +173,13 @@ def _columns_of(
     raise ValueError(f"no columns t, x, y, p and no array of events among {', '.join(file.files)}")
 
 
+def _pick_field(letter: str, key: str, rows: np.ndarray) -> np.ndarray:
+    return pick_column(letter, key, rows[key])
+
+
 def _is_table(table: np.ndarray) -> bool:
     fields = table.dtype.names
-    return bool(fields and find_columns_by_name(fields)) or (
+    return bool(fields and find_keys_by_name(fields)) or (
         table.ndim == 2 and (table.shape[1] == 4 or _has_events_in_columns(table))
     )
 

@@ -221,6 +221,9 @@ def _open_file(path: Path, options: ReadOptions) -> EventFile:
         raise ValueError(f"stream must be null, as {path} has one camera, got {options.stream}")
     if options.format is not None and path.suffix.lower() != ".raw":
         raise ValueError(f"format must be null, as {path} is no RAW file, got {options.format}")
+    inner = Path(path.stem).suffix.lower()
+    if path.suffix.lower() == ".gz" and READERS.get(inner, TextFile) is not TextFile:
+        raise ValueError(f"{path}: only text is read from a .gz; unpack {path.stem} first")
     file = reader(path, options)
     if file.time_unit is not None and options.time_unit not in ("auto", file.time_unit):
         raise ValueError(

@@ -64,7 +64,8 @@ def report_events_outside(
             "is sensor_size=[height,width] right, and the file whole?"
         )
     fits = f"; all fit sensor_size=[{width},{height}]" if x <= height and y <= width else ""
-    line = f"{path}: {outside} of {count} events outside {_text(size)}, dropped{fits}"
+    asked = f"sensor_size=[{height},{width}]"
+    line = f"{path}: {outside} of {count} events outside {asked}, dropped{fits}"
     warnings.warn(line, stacklevel=2)
 
 

@@ -20,7 +20,7 @@ from src.sim.scenes.video_files import VideoSource, find_videos
 SHARES = {"train": (0.0, 0.7), "val": (0.7, 0.8), "test": (0.8, 1.0)}
 
 REDS_FPS = 120.0
-REDS_FRAMES = 480  # the 4 s of each sequence's 500 frames that the paper uses
+REDS_FRAMES = 481  # over 4 s, what the paper uses of each sequence's 500
 REDS_SIZE = (720, 1280)
 # The paper splits the 270 sequences 216/27/27 and does not say which; the test is wholly from the
 # official validation part.
@@ -121,7 +121,7 @@ class Reds(Footage):
 
     def _find_segments(self, root: Path, span: int) -> list[Segment]:
         if span >= REDS_FRAMES:
-            raise ValueError(f"a clip of REDS must last at most 3.99 s, got {span / REDS_FPS:.2f}")
+            raise ValueError(f"a clip of REDS must last at most 4 s, got {span / REDS_FPS:.3f}")
         videos = [self._sequence(root, *place) for place in REDS_SPLIT[self.split]]
         starts = range(0, REDS_FRAMES - span, max(span, 1))
         return [(video, start) for start in starts for video in videos]

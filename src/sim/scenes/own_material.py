@@ -75,14 +75,7 @@ def read_video(
     if rate is None:
         raise ValueError(f"fps must be given, frames a second, for {path}, which states none")
     _check_rate(rate)
-    if not 0 <= start_s < end_s:
-        raise ValueError(f"start_s must be >= 0 and below end_s, got {start_s} and {end_s}")
-    first = math.ceil(round(start_s * rate, 6))
-    stop = source.count if end_s == math.inf else math.ceil(round(end_s * rate, 6))
-    stop = min(stop, source.count)
-    if stop - first < 2:
-        lasts = f"{source.count / rate:.3f} s"
-        raise ValueError(f"start_s and end_s must leave two frames or more of {path}, {lasts} long")
+    first, stop = _find_part(source.count, rate, start_s, end_s, str(path))
     frames, shape, largest, kind = [], (0, 0), 0.0, np.dtype(np.uint8)
     for picture in source.read(first, stop, ALL_BITS):
         shape, kind, largest = picture.shape, picture.dtype, max(largest, float(picture.max()))
@@ -92,6 +85,25 @@ def read_video(
     part = "all" if stop - first == source.count else f"frames {first} to {stop - 1}"
     facts = f"{shape[1]}x{shape[0]} px, {rate:.6g} frames/s, {part} of {source.count} frames"
     return OwnClip(source.name, np.stack(frames), rate, facts)
+
+
+def _find_part(count: int, fps: float, start_s: float, end_s: float, name: str) -> tuple[int, int]:
+    """Return the first frame from `start_s` on, and the first from `end_s` on, of `count`."""
+    if not 0 <= start_s < end_s:
+        raise ValueError(f"start_s must be >= 0 and below end_s, got {start_s} and {end_s}")
+    first = math.ceil(round(start_s * fps, 6))
+    stop = count if end_s == math.inf else min(count, math.ceil(round(end_s * fps, 6)))
+    if stop - first < 2:
+        lasts = f"{count / fps:.3f} s"
+        raise ValueError(f"start_s and end_s must leave two frames or more of {name}, {lasts} long")
+    return first, stop
+
+
+def check_photograph_has_no_part(start_s: float, end_s: float) -> None:
+    """Raise ValueError for a part of a video where there is a photograph."""
+    if (start_s, end_s) != (0.0, math.inf):
+        got = f"{start_s} and {end_s}"
+        raise ValueError(f"start_s and end_s are of a video, a photograph has seconds; got {got}")
 
 
 def read_photograph(
@@ -120,16 +132,17 @@ def read_photograph(
 
 
 def clip_from_array(
-    values: Any, *, fps: float | None = None, seconds: float = 1.0,
-    longest_side_px: int | None = None, white_level: float | None = None,
+    values: Any, *, fps: float | None = None, seconds: float = 1.0, start_s: float = 0.0,
+    end_s: float = math.inf, longest_side_px: int | None = None, white_level: float | None = None,
 ) -> OwnClip:  # fmt: skip
     """Return an array as a clip: (h, w), a photograph, or (frames, h, w), a video at `fps`, of
-    uint8 or of floats in [0, 1].  `white_level` as in `read_video`.
+    uint8 or of floats in [0, 1].  `start_s`, `end_s` and `white_level` as in `read_video`.
 
     Raises ValueError for another shape, for values outside and for a video without `fps`.
     """
     array = np.asarray(values)
-    if array.ndim not in (2, 3) or (array.ndim == 3 and len(array) < 2):
+    is_colour = array.ndim == 3 and array.shape[2] <= 4
+    if array.ndim not in (2, 3) or is_colour or (array.ndim == 3 and len(array) < 2):
         wanted = "(h, w), a photograph, or (frames, h, w), grey"
         raise ValueError(f"photo_or_video must be of shape {wanted}, got {array.shape}")
     if array.dtype != np.uint8 and not (
@@ -139,14 +152,16 @@ def clip_from_array(
     facts = "x".join(map(str, array.shape[:-3:-1])) + " px"
     array = scale_to_white(array, white_level)
     if array.ndim == 2:
+        check_photograph_has_no_part(start_s, end_s)
         fps = fps or 120.0
         frames = _hold(_shrink(array, longest_side_px), fps, seconds)
         return OwnClip("photograph", frames, fps, facts)
     if fps is None:
         raise ValueError("fps must be given for an array of frames, frames a second")
     _check_rate(fps)
-    frames = np.stack([_shrink(frame, longest_side_px) for frame in array])
-    return OwnClip("video", frames, fps, f"{facts}, {fps:.6g} frames/s, {len(array)} frames")
+    first, stop = _find_part(len(array), fps, start_s, end_s, "the array")
+    frames = np.stack([_shrink(frame, longest_side_px) for frame in array[first:stop]])
+    return OwnClip("video", frames, fps, f"{facts}, {fps:.6g} frames/s, {len(frames)} frames")
 
 
 def _find_one_video(path: Path) -> VideoSource:

@@ -8,7 +8,7 @@ import torch
 from src.bench.candidates import Candidate
 from src.bench.stress_tests.event_clips import StressBench
 from src.bench.stress_tests.trajectory import (
-    measure_cross_track_error_px,
+    measure_cross_track_error,
     measure_trajectory_deviation,
 )
 from src.sim.optics import Optics
@@ -33,8 +33,29 @@ def film(stray: float = 0.0, trail: float = 0.0) -> torch.Tensor:
     return torch.stack(frames)
 
 
+def measure_cross_track_error_px(frames: torch.Tensor, truth: torch.Tensor) -> float:
+    found = measure_cross_track_error(frames, truth)
+    assert found.lost_share == 0
+    return found.px
+
+
 def test_a_straight_flight_does_not_stray():
     assert measure_cross_track_error_px(film(), film()) < 0.01
+
+
+def test_a_target_that_is_not_there_is_lost():
+    noise = torch.rand(FRAMES, SIDE, SIDE, generator=torch.Generator().manual_seed(0))
+    brightening = (0.005 * torch.arange(FRAMES))[:, None, None].expand(-1, SIDE, SIDE)
+    for empty in (noise, brightening, torch.zeros(FRAMES, SIDE, SIDE), 1 - film()):
+        found = measure_cross_track_error(empty, film())
+        assert found.lost_share == 1 and math.isnan(found.px)
+
+
+def test_of_a_target_that_vanishes_the_frames_before_count():
+    half = film(stray=1.0)
+    half[60:] = half[60:] * 0 + 0.5
+    found, whole = (measure_cross_track_error(frames, film()) for frames in (half, film(stray=1.0)))
+    assert 0.3 < found.lost_share < 0.8 and found.px == pytest.approx(whole.px, rel=0.3)
 
 
 def test_a_front_that_strays_is_measured():
@@ -62,6 +83,7 @@ def test_a_network_is_compared_with_no_turbulence_and_with_the_light():
     pipeline = Pipeline(scene, Optics(1), air, EventSensor(0.2), split="test")
     subject, bench = Candidate("running", Running(), 1), StressBench(pipeline, [0], 0)
     found = measure_trajectory_deviation(subject, bench, limit_px=0.3)
-    (still, calm), (light, seen), (clip, stray) = found.curve
-    assert (still, light, clip) == ("no turbulence", "light of one view", "clip 0")
-    assert found.value == stray and calm < 0.2 and seen > calm
+    (still, calm), (light, seen), (mean, value), (clip, stray) = found.curve
+    assert (still, light) == ("no turbulence (0 % lost)", "light of one view (0 % lost)")
+    assert (mean, clip) == ("mean (0 % lost)", "clip 0 (0 % lost)")
+    assert found.value == value == stray and calm < 0.2 and seen > calm

@@ -97,3 +97,63 @@ def test_a_cut_line_may_be_the_only_one_of_the_last_block(tmp_path, events, monk
     (tmp_path / "a.txt").write_text(text + "200999 1")
     with pytest.warns(UserWarning, match="last line is cut"):
         assert np.array_equal(read_events(tmp_path / "a.txt"), events)
+
+
+def write_joint_npz(path, made, xy):
+    np.savez(path / "a.npz", t=made["t"], xy=xy, p=made["p"])
+    return path / "a.npz"
+
+
+def write_joint_fields(path, made, xy):
+    table = np.zeros(len(made), [("t", "i8"), ("xy", "u2", xy.shape[1:]), ("p", "i1")])
+    table["t"], table["xy"], table["p"] = made["t"], xy, made["p"]
+    np.save(path / "a.npy", table)
+    return path / "a.npy"
+
+
+def write_joint_hdf5(path, made, xy):
+    with h5py.File(path / "a.h5", "w") as file:
+        for name, column in {"t": made["t"], "xy": xy, "p": made["p"]}.items():
+            file[f"events/{name}"] = column
+    return path / "a.h5"
+
+
+JOINT_WRITERS = [write_joint_npz, write_joint_fields, write_joint_hdf5]
+
+
+@pytest.mark.parametrize("write", JOINT_WRITERS)
+def test_x_and_y_may_be_one_column(tmp_path, events, write):
+    path = write(tmp_path, events, np.stack([events["x"], events["y"]], 1))
+    assert np.array_equal(read_events(path), events)
+
+
+@pytest.mark.parametrize("write", JOINT_WRITERS)
+def test_a_joint_column_of_three_is_refused(tmp_path, events, write):
+    path = write(tmp_path, events, np.stack([events["x"], events["y"], events["x"]], 1))
+    with pytest.raises(ValueError, match=r"xy must be \(n, 2\)"):
+        read_events(path)
+
+
+@pytest.mark.parametrize("kind", ["M8[us]", "m8[us]", "m8[ns]"])
+def test_dates_and_durations_have_their_unit(tmp_path, events, kind):
+    slow = slowed(events)
+    t = slow["t"].astype("m8[us]").astype(kind.replace("M", "m"))
+    t = np.datetime64("1970-01-01") + t if kind[0] == "M" else t
+    np.savez(tmp_path / "a.npz", t=t, x=slow["x"], y=slow["y"], p=slow["p"])
+    assert np.array_equal(read_events(tmp_path / "a.npz"), slow)
+    with pytest.raises(ValueError, match="time_unit must be auto or us"):
+        read_events(tmp_path / "a.npz", options=ReadOptions(time_unit="ns"))
+
+
+def test_a_missing_date_is_refused(tmp_path, events):
+    t = events["t"].astype("m8[us]")
+    t[5] = np.timedelta64("NaT")
+    np.savez(tmp_path / "a.npz", t=t, x=events["x"], y=events["y"], p=events["p"])
+    with pytest.raises(ValueError, match="times must have a unit and a value each"):
+        read_events(tmp_path / "a.npz")
+
+
+def test_a_packed_recording_that_is_no_text_is_to_be_unpacked(tmp_path):
+    (tmp_path / "a.raw.gz").write_bytes(gzip.compress(b"% evt 3.0\n" + bytes(100)))
+    with pytest.raises(ValueError, match="unpack a.raw first"):
+        read_events(tmp_path / "a.raw.gz")

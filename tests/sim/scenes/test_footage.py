@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from src.app.compose import compose_config
 from src.sim.scenes.footage import REDS_SPLIT, Footage, Reds
 
 SMALL = {"height": 16, "width": 16, "frames": 4}
@@ -65,6 +66,19 @@ def test_reds_names_what_is_missing(reds, tmp_path):
         Reds(None)
     with pytest.raises(ValueError, match="must last at most"):
         Reds(str(reds), frames=600)
+
+
+def test_the_paper_s_recipe_cuts_reds_into_twelve_and_tests_all_of_it(tmp_path):
+    for part in REDS_SPLIT.values():
+        for home, number in part:
+            (tmp_path / f"{home}_orig" / f"{number:03}").mkdir(parents=True)
+    data = compose_config("train", "experiment=lf3x3", "budget=paper", "scene=reds").data
+    train, test = (
+        Reds(str(tmp_path), split=split, frames=windows + 1, height=32, width=32)
+        for split, windows in (("train", data.windows), ("test", data.test_windows))
+    )
+    assert len(train.segments) == data.epoch_clips == 12 * 216 and len(test.segments) == 27
+    assert max(start for _, start in train.segments) + data.windows == 480 == data.test_windows
 
 
 def test_reds_of_another_size_is_refused(reds):

@@ -68,6 +68,18 @@ def test_a_photograph_moves_when_asked_to_and_starts_as_it_is(tmp_path):
     assert np.abs(moving.frames[-1] - still.frames[0]).mean() > 0.01
 
 
+def test_a_part_of_an_array_is_that_of_a_video():
+    frames = np.repeat(np.arange(60, dtype=np.uint8), 48 * 64).reshape(60, 48, 64)
+    clip = own_material.clip_from_array(frames, fps=120.0, start_s=0.1, end_s=0.2)
+    assert np.round(clip.frames[:, 0, 0] * 255).tolist() == list(range(12, 24))
+    with pytest.raises(ValueError, match=r"must leave two frames or more of the array, 0.500 s"):
+        own_material.clip_from_array(frames, fps=120.0, start_s=99.0)
+    with pytest.raises(ValueError, match="start_s and end_s are of a video, a photograph has sec"):
+        own_material.clip_from_array(frames[0], end_s=0.1)
+    with pytest.raises(ValueError, match="grey"):
+        own_material.clip_from_array(np.zeros((48, 64, 3), np.uint8), fps=60.0)
+
+
 def test_arrays_are_clips(tmp_path):
     frames = np.random.default_rng(0).integers(0, 256, (3, 20, 30), dtype=np.uint8)
     clip = own_material.clip_from_array(frames, fps=50)
