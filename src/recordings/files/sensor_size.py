@@ -63,9 +63,9 @@ def report_events_outside(
             f"{path}: {share} events are off the {_text(size)} sensor, they need {x}x{y}; "
             "is sensor_size=[height,width] right, and the file whole?"
         )
-    fits = f"; all fit sensor_size=[{width},{height}]" if x <= height and y <= width else ""
-    asked = f"sensor_size=[{height},{width}]"
-    line = f"{path}: {outside} of {count} events outside {asked}, dropped{fits}"
+    exchanged = f"; all fit {height}x{width}, sensor_size=[{width},{height}]"
+    fits = exchanged if x <= height and y <= width else ""
+    line = f"{path}: {outside} of {count} events outside {_text(size)}, dropped{fits}"
     warnings.warn(line, stacklevel=2)
 
 
