@@ -57,16 +57,22 @@ class Postprocessed(VideoMethod):
         self.windows_per_frame = source.exposure_frames if isinstance(source, CameraFrames) else 1
 
     @torch.no_grad()
-    def source_frames(self, sample: "Sample") -> Float[Tensor, "n windows 1 h w"]:
-        """Return the frames of the source, in [0, 1]."""
-        return self.source.reconstruct_clip(sample).float().clamp(0, 1)
+    def reconstruct_source(self, sample: "Sample") -> Float[Tensor, "n frames 1 h w"]:
+        """Return each picture of the source once, in [0, 1]."""
+        frames = self.source.reconstruct_clip(sample).float().clamp(0, 1)
+        return frames[:, :: self.windows_per_frame]
+
+    def repeat(
+        self, pictures: Float[Tensor, "n frames 1 h w"], windows: Sequence[int]
+    ) -> Float[Tensor, "n windows 1 h w"]:
+        """Return the picture of each of `windows`."""
+        return pictures[:, [window // self.windows_per_frame for window in windows]]
 
     @torch.no_grad()
     def reconstruct_clip(self, sample: "Sample") -> Float[Tensor, "n windows 1 h w"]:
         """Return the restored frame of every window, in [0, 1]."""
-        frames, step = self.source_frames(sample), self.windows_per_frame
-        restored = self.postprocessor.restore(frames[:, ::step])
-        return restored.repeat_interleave(step, 1)[:, : frames.shape[1]]
+        restored = self.postprocessor.restore(self.reconstruct_source(sample))
+        return self.repeat(restored, range(sample.voxels.shape[1]))
 
 
 def load_postprocessor(weights: str, allowed_packages: Sequence[str] = ()) -> FramePostprocessor:

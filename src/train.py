@@ -60,7 +60,7 @@ def train(cfg: DictConfig) -> dict:
     # As it is when it is loaded again.
     module.method.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
     tested = module.method, data, module.metrics
-    with name_checkpoint_on_failure(trainer):
+    with print_checkpoint_on_failure(trainer):
         trained, drawn = build.test_method(cfg, cfg.name, *tested, cfg.sample_clips)
         others = [build.test_method(cfg, *o, data, module.metrics)[0] for o in references.items()]
     pictures = samples.write_samples(run / "samples", drawn)
@@ -76,17 +76,17 @@ def fit(
     trainer: lightning.Trainer, module: Reconstructor, data: LightFieldData, ckpt: Path | None
 ) -> None:
     """Train; when that is cut short, whatever by, print what to continue from."""
-    last = find_checkpoints(trainer) / "last.ckpt"
+    last = find_checkpoint_folder(trainer) / "last.ckpt"
     if ckpt and files.is_weights_file(ckpt):
         continue_from_weights(module, trainer.callbacks, ckpt)  # type: ignore[attr-defined]
         ckpt = None
-    with name_checkpoint_on_failure(trainer):
+    with print_checkpoint_on_failure(trainer):
         trainer.fit(module, data, ckpt_path=ckpt)
         if not last.is_file():  # nothing was left to do
             trainer.save_checkpoint(last)
 
 
-def find_checkpoints(trainer: lightning.Trainer) -> Path:
+def find_checkpoint_folder(trainer: lightning.Trainer) -> Path:
     """Return the folder of the checkpoints of a training."""
     checkpoint = trainer.checkpoint_callback
     assert isinstance(checkpoint, ModelCheckpoint) and checkpoint.dirpath
@@ -94,12 +94,12 @@ def find_checkpoints(trainer: lightning.Trainer) -> Path:
 
 
 @contextmanager
-def name_checkpoint_on_failure(trainer: lightning.Trainer) -> Iterator[None]:
+def print_checkpoint_on_failure(trainer: lightning.Trainer) -> Iterator[None]:
     """Print what to continue from where the training, or the test after it, is cut short."""
     try:
         yield
     except BaseException:
-        folder = find_checkpoints(trainer)
+        folder = find_checkpoint_folder(trainer)
         if any(folder.glob("*.ckpt")):
             step = trainer.global_step
             print(f"stopped at step {step}; go on with ckpt={folder}", file=sys.stderr)

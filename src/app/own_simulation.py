@@ -167,6 +167,6 @@ def read_own_clip(cfg: DictConfig) -> OwnClip:
     options = {key: cfg[key] for key in ("fps", "longest_side_px", "white_level")}
     if cfg.video:
         return own_material.read_video(cfg.video, start_s=cfg.start_s, end_s=cfg.end_s, **options)
-    own_material.check_photograph_has_no_part(cfg.start_s, cfg.end_s)
+    own_material.refuse_part_of_photograph(cfg.start_s, cfg.end_s)
     motion = {"speed_widths_per_s": cfg.speed_widths_per_s, "seed": cfg.seed}
     return own_material.read_photograph(cfg.photo, seconds=cfg.seconds, **motion, **options)

@@ -94,13 +94,13 @@ def select_by_one_standard_error(
     difference to the best.
     """
     best = min(errors, key=lambda name: statistics.fmean(errors[name]))
-    within = [best]
-    for name, values in errors.items():
+
+    def is_near(values: Sequence[float]) -> bool:
         more = [ours - least for ours, least in zip(values, errors[best], strict=True)]
         spread = statistics.stdev(more) / math.sqrt(len(more)) if len(more) > 1 else 0.0
-        if statistics.fmean(more) <= spread:
-            within.append(name)
-    return min(within, key=costs.__getitem__)
+        return statistics.fmean(more) <= spread
+
+    return min((name for name in errors if is_near(errors[name])), key=costs.__getitem__)
 
 
 def recommend_network_per_severity(

@@ -35,9 +35,15 @@ def _shift(row: np.ndarray, mean: np.ndarray) -> float:
         if gain <= 0:
             return float("nan")
         shift = float(np.clip(shift + step / gain, -MAX_SHIFT, MAX_SHIFT))
-    moved, spread = np.interp(places - shift, places, mean), float(np.std(row))
-    is_shown = spread > 0 and np.corrcoef(moved, row)[0, 1] > MIN_CORRELATION
+    is_shown = correlation(np.interp(places - shift, places, mean), row) > MIN_CORRELATION
     return shift if is_shown else float("nan")
+
+
+def correlation(a: Float[np.ndarray, "*size"], b: Float[np.ndarray, "*size"]) -> float:
+    """Return the correlation of two arrays of one size; 0 where one has no contrast."""
+    if np.ptp(a) == 0 or np.ptp(b) == 0:
+        return 0.0
+    return float(np.corrcoef(a.ravel(), b.ravel())[0, 1])
 
 
 def measure_static_scene(

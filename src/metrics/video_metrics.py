@@ -15,7 +15,7 @@ from src.metrics.lpips import LPIPS
 from src.metrics.table import NAMES, Column
 from src.metrics.temporal import Video, temporal_jitter_px
 
-SCORES = {  # name in table.py: a value per frame, or per step from a frame to the next
+SCORES = {  # name in table.py: a value per frame
     "psnr": psnr,
     "psnr_aligned": aligned_psnr,
     "ssim": ssim,
@@ -23,20 +23,20 @@ SCORES = {  # name in table.py: a value per frame, or per step from a frame to t
 
 
 class ClipMean(MeanMetric):
-    """The mean over clips of the mean of `score(frames, target)` over a clip, both `resample`d."""
+    """The mean over clips of the mean of `score(frames, target)` over a clip."""
 
     full_state_update = False
 
-    def __init__(self, score: Callable[[Tensor, Tensor], Tensor], scale: float = 1.0):
+    def __init__(self, score: Callable[[Tensor, Tensor], Tensor]):
         super().__init__(nan_strategy="disable")
         # In a tuple: the parameters of a network that scores are no part of a checkpoint.
-        self._score, self.scale = (score,), scale
+        self._score = (score,)
 
     def update(self, frames: Video, target: Video) -> None:  # type: ignore[override]
         (score,) = self._score
         if isinstance(score, LPIPS):
             score.to(frames.device)
-        super().update(score(resample(frames, self.scale), resample(target, self.scale)).mean())
+        super().update(score(frames, target).mean())
 
 
 def resample(frames: Video, scale: float) -> Float[Tensor, "frames 1 h2 w2"]:
@@ -47,12 +47,13 @@ def resample(frames: Video, scale: float) -> Float[Tensor, "frames 1 h2 w2"]:
     return functional.interpolate(frames, size, mode="nearest" if scale > 1 else "area")
 
 
-def measure_scaled_jitter_px(frames: Video, target: Video, scale: float, reduction: int) -> Tensor:
-    """Return temporal jitter in pixels of frames of `scale` times the resolution, measured on such
-    that are not larger than these and `reduction` times smaller."""
-    measured = min(scale, 1.0) / reduction
-    pair = resample(frames, measured), resample(target, measured)
-    return scale / measured * temporal_jitter_px(*pair)
+def measure_reduced_jitter_px(
+    frames: Video, target: Video, reduction: int
+) -> Float[Tensor, " frames-1"]:
+    """Return the temporal jitter of frames in their pixels, measured on frames `reduction` times
+    smaller."""
+    smaller = (resample(video, 1 / reduction) for video in (frames, target))
+    return reduction * temporal_jitter_px(*smaller)
 
 
 def score_by_user_metric(name: str, metric: Metric, frames: Tensor, target: Tensor) -> Tensor:
@@ -98,13 +99,14 @@ class VideoMetrics(MetricCollection):
             raise ValueError(f"metrics.{taken[0]} must be called otherwise: the name is taken")
         scores = SCORES if lpips is None else SCORES | {"lpips": lpips}
         scores = scores | {k: partial(score_by_user_metric, k, m) for k, m in own.items()}
-        jitter = partial(measure_scaled_jitter_px, scale=scale, reduction=jitter_reduction)
+        reduction = jitter_reduction * max(1, int(scale))  # repeated pixels show nothing more
+        scores["temporal_jitter_px"] = partial(measure_reduced_jitter_px, reduction=reduction)
         metrics: dict[str, Metric | MetricCollection]
-        metrics = {name: ClipMean(score, scale) for name, score in scores.items()}
-        metrics["temporal_jitter_px"] = ClipMean(jitter)
+        metrics = {name: ClipMean(score) for name, score in scores.items()}
         # Groups would merge scores that are equal on the first clip.
         super().__init__(metrics, compute_groups=False)
-        self.names = (*(name for name in NAMES if name in metrics), *own)
+        self.resolution_scale = scale
+        self.names = (*(name for name in NAMES if name in scores), *own)
         self.user_metric_columns: tuple[Column, ...] = tuple(
             Column(name, name, 3, {None: 0, True: 1, False: -1}[metric.higher_is_better])
             for name, metric in own.items()
@@ -113,5 +115,6 @@ class VideoMetrics(MetricCollection):
     @torch.no_grad()
     def forward(self, frames: Video, target: Video) -> dict[str, float]:
         """Add a clip; return its scores by name."""
-        values = super().forward(frames.float().clamp(0, 1), target)
+        pair = (frames.float().clamp(0, 1), target)
+        values = super().forward(*(resample(video, self.resolution_scale) for video in pair))
         return {name: float(value) for name, value in values.items()}

@@ -7,6 +7,7 @@ import torch
 
 from src.metrics.image import align_brightness, ssim
 from src.metrics.lpips import LPIPS
+from src.metrics.slice_motion import correlation
 from src.recordings.files import videos
 
 NAMES = ("ssim", "lpips", "lpips_aligned", "correlation")
@@ -37,10 +38,8 @@ def score_against_camera(video: Path, listing: Path, part: slice = slice(None)) 
         if is_near and nearest >= SETTLING and nearest in scored:
             truth = next(videos.read_video(listing.parent / name))
             a, b = (torch.from_numpy(p.copy())[None, None] for p in (film[nearest], truth))
-            has_contrast = np.ptp(film[nearest]) > 0 and np.ptp(truth) > 0
-            pair = film[nearest].ravel(), truth.ravel()
-            together = np.corrcoef(*pair)[0, 1] if has_contrast else 0.0
             aligned = align_brightness(a, b).clamp(0, 1)
+            together = correlation(film[nearest], truth)
             scores.append(
                 [ssim(a, b).item(), lpips(a, b).item(), lpips(aligned, b).item(), together]
             )

@@ -42,7 +42,7 @@ class ReconstructionState:
         self.picture: Float[np.ndarray, "h w"] | None = None
         self.first_end_us: float | None = None
 
-    def phase(self, window: Window) -> int:
+    def state_index(self, window: Window) -> int:
         """Return which of `states` is of `window`; windows in between may be missing."""
         if self.first_end_us is None:
             self.first_end_us = window.end_us
@@ -129,11 +129,11 @@ def reconstruct_frames(
     """
     state = ReconstructionState() if state is None else state
     for window in windows:
-        phase = state.phase(window)
+        index = state.state_index(window)
         if window.events:
-            before = state.states[phase]
+            before = state.states[index]
             picture, after = _run(network, window, before, positions, device)
-            state.states[phase], state.picture = after, picture.clip(0, 1)
+            state.states[index], state.picture = after, picture.clip(0, 1)
         elif state.picture is None:
             if isinstance(network, EventListRuntime):
                 size: tuple[int, ...] = network.size

@@ -9,7 +9,7 @@ from typing import Any
 from src.metrics.bootstrap import bootstrap_difference_interval
 from src.metrics.table import Column
 from src.records.runs import Run
-from src.reports.run_groups import RunGroup, find_differing_conditions, find_published
+from src.reports.run_groups import RunGroup, find_differing_test_conditions, find_published
 from src.reports.tables import Table, TableCell, check_columns, list_metrics
 
 
@@ -39,8 +39,7 @@ def build_difference_table(
         texts.append("-" if change is None else f"{change:+.{digits}f}")
         table.rows.append([TableCell(text=text) for text in texts])
     table.note = f"{len(ours[0].clips)} clips; {len(ours)} runs against {len(theirs)}."
-    if differing := find_differing_conditions(ours, theirs):
-        table.note += f" Test conditions differ: {', '.join(differing)}."
+    table.note += _describe_conditions(find_differing_test_conditions(ours, theirs))
     return table
 
 
@@ -82,14 +81,17 @@ def build_pair_table(
             clips.add(len(ours[0].clips))
     counts = " or ".join(map(str, sorted(clips)))
     table.note = f"{counts} test clips; mean (95 % bootstrap CI); bold: the CI excludes zero."
-    if differing:
-        table.note += f" Test conditions differ: {', '.join(sorted(differing))}."
+    table.note += _describe_conditions(differing)
     return table
+
+
+def _describe_conditions(differing: set[str]) -> str:
+    return f" Test conditions differ: {', '.join(sorted(differing))}." if differing else ""
 
 
 def _find_other_conditions(setting: str, ours: Sequence[Run], theirs: Sequence[Run]) -> set[str]:
     """Return the test conditions that differ and are not part of `setting`, a key or a group."""
-    found = find_differing_conditions(ours, theirs)
+    found = find_differing_test_conditions(ours, theirs)
     return {key for key in found if key.split(".")[0] != setting.split(".")[0]}
 
 

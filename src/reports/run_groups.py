@@ -75,9 +75,9 @@ def group_runs(
     return keys, _count_missing(list(groups.values()), keys, plans)
 
 
-def find_differing_conditions(ours: Sequence[Run], theirs: Sequence[Run]) -> list[str]:
+def find_differing_test_conditions(ours: Sequence[Run], theirs: Sequence[Run]) -> set[str]:
     """Return the keys of the test conditions that are not the same on both sides."""
-    return sorted({key for key, _ in _list_test_conditions(ours) ^ _list_test_conditions(theirs)})
+    return {key for key, _ in _list_test_conditions(ours) ^ _list_test_conditions(theirs)}
 
 
 def format_setting(value: Any) -> str:

@@ -177,6 +177,7 @@ class BatchSimulator:
 
     def __call__(self, numbered: Sequence[tuple[SampleId, ClipParameters]]) -> Sample:
         ids, draws = zip(*numbered, strict=True)
+        # Behind a key of a cache that renews its clips is another clip later.
         names = [(sample.crop_stream, d.key, d.crop, d.clip.name) for sample, d in numbered]
         if self.last[0] != names:
             self.last = (names, self._simulate(self.streams[ids[0].crop_stream], draws, names))

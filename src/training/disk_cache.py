@@ -30,8 +30,8 @@ from src.sim.pipeline import Pipeline
 from src.training.clip_cache import GIB, CachedClip, ClipCache, simulate_clip
 
 INPUTS_FILE = "inputs.json"
-DOWNSTREAM = ("sensor", "voxel.py")  # parts of src/sim that come after the cache, but
-UPSTREAM = ("sensor/response.py",)  # decodes the frames before
+DOWNSTREAM = ("sensor", "voxel.py")  # parts of src/sim that come after the cache, except
+UPSTREAM = ("sensor/response.py",)  # which decodes the frames before it
 
 
 class DiskClipCache(ClipCache):

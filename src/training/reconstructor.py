@@ -216,11 +216,9 @@ class PostprocessorTraining(Reconstructor):
 
     def reconstruct_windows(self, sample: "Sample", outputs: Sequence[int]) -> Tensor:
         """Return the restored frames `outputs` of the source's frames."""
-        method: Any = self.method
+        method: Any = self.method  # a Postprocessed, of the baselines
         method.source.to(self.device)
-        frames, step = method.source_frames(sample), method.windows_per_frame
-        restored = self.network(frames[:, ::step])[0]
-        return restored.repeat_interleave(step, 1)[:, outputs]
+        return method.repeat(self.network(method.reconstruct_source(sample))[0], outputs)
 
 
 def select_loss_windows(windows: int, first: int, pairs: int | None, seed: int) -> list[int]:

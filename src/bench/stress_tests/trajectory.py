@@ -33,13 +33,13 @@ def measure_trajectory_deviation(
     network and every clip, each named with the share of frames in which the target is lost.
     """
 
-    def deviation(clip: EventClip) -> CrossTrackError:
+    def measure(clip: EventClip) -> CrossTrackError:
         return measure_cross_track_error(clip.reconstruct(network)[0][:, 0], clip.target[1:])
 
     clips = bench.clips()
-    without = list(map(deviation, bench.clips(ClipConditions(d_over_r0=0.0))))
+    without = list(map(measure, bench.clips(ClipConditions(d_over_r0=0.0))))
     light = [measure_cross_track_error(c.turbulent[1:], c.target[1:]) for c in clips]
-    errors = list(map(deviation, clips))
+    errors = list(map(measure, clips))
     rows = {"no turbulence": without, "light of one view": light, "mean": errors}
     rows |= {f"clip {n}": [error] for n, error in zip(bench.indices, errors, strict=True)}
     means = {name: _mean_error(row) for name, row in rows.items()}

@@ -45,11 +45,11 @@ def find_keys_by_name(names: Iterable[str]) -> dict[str, str] | None:
     keys = list(names)
     joint = [*JOINT] if JOINT in keys else []
     places = find_columns_by_name([*keys, *joint])
-    keys += [JOINT for _ in joint]
+    keys += len(joint) * [JOINT]
     return None if places is None else {letter: keys[place] for letter, place in places.items()}
 
 
-def pick_column(letter: str, key: str, values: np.ndarray) -> np.ndarray:
+def extract_column(letter: str, key: str, values: np.ndarray) -> np.ndarray:
     """Return the column `letter` of the array that is called `key`; ValueError for a JOINT that is
     not (n, 2)."""
     if key != JOINT:

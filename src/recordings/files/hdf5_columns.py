@@ -8,7 +8,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from src.recordings.files.columns import check_lengths, find_keys_by_name, pick_column
+from src.recordings.files.columns import check_lengths, extract_column, find_keys_by_name
 from src.recordings.files.numpy_file import LazyColumn, split_table
 
 
@@ -18,13 +18,14 @@ def find_event_columns(node: Any, order: str | None) -> dict[str, Any]:
         return split_table(node, order)
     keys = find_keys_by_name(node) or {}
     columns = {
-        name: LazyColumn(node[key], partial(pick_column, name, key)) for name, key in keys.items()
+        name: LazyColumn(node[key], partial(extract_column, name, key))
+        for name, key in keys.items()
     }
     check_lengths(columns)
     return columns
 
 
-def has_whole_times(t: Any) -> bool:
+def has_integer_times(t: Any) -> bool:
     """Return whether the first thousand times are whole numbers."""
     values = np.asarray(t[:1000])
     return np.array_equal(values, np.rint(values))
@@ -40,7 +41,7 @@ def find_numbered_streams(streams: dict[str, Any]) -> list[Any]:
     return [streams[name] for name in sorted(streams, key=numbers.__getitem__)]
 
 
-def follow_in_time(columns: Sequence[dict[str, Any]]) -> bool:
+def are_consecutive_in_time(columns: Sequence[dict[str, Any]]) -> bool:
     """Return whether each of the streams with these columns begins after the one before ends."""
     ends = []
     for t in (one["t"] for one in columns if len(one["t"])):

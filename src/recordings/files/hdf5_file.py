@@ -37,10 +37,10 @@ from src.recordings.files.event_file import (
 from src.recordings.files.frame_files import to_gray, wrap_frame_array
 from src.recordings.files.hdf5_columns import (
     ConcatenatedColumn,
+    are_consecutive_in_time,
     find_event_columns,
     find_numbered_streams,
-    follow_in_time,
-    has_whole_times,
+    has_integer_times,
 )
 from src.recordings.files.numpy_file import LazyColumn, slice_columns, slice_times
 
@@ -67,7 +67,7 @@ class Hdf5File(EventFile):
                 raise ValueError("no columns t, x, y, p and no array of events (n, 4) in it")
             nodes = find_numbered_streams(streams) if options.stream is None else []
             columns, self.notes = self._find_columns(nodes, options), ()
-            if not nodes or not follow_in_time(columns):
+            if not nodes or not are_consecutive_in_time(columns):
                 listed = [EventStream(k, name, None) for k, name in enumerate(streams)]
                 chosen, self.notes = choose_stream(path, listed, options.stream)
                 nodes = [streams[chosen.name]]
@@ -124,7 +124,7 @@ class Hdf5File(EventFile):
             node if self._has_own_times else node.dtype.names, options
         )
         is_dsec = "t_offset" in self._file or "ms_to_idx" in self._file
-        if is_dsec and options.time_unit == "auto" and has_whole_times(self._columns["t"]):
+        if is_dsec and options.time_unit == "auto" and has_integer_times(self._columns["t"]):
             self.time_unit = "us"
 
 

@@ -15,10 +15,10 @@ from src.recordings.files.columns import (
     as_times,
     check_lengths,
     check_unpacking_ratio,
+    extract_column,
     find_columns,
     find_keys_by_name,
     find_named_time_unit,
-    pick_column,
 )
 from src.recordings.files.event_file import (
     PIECE_EVENTS,
@@ -104,7 +104,8 @@ def split_table(table: Any, order: str | None) -> dict[str, Any]:
         if keys is None or table.ndim != 1:
             raise ValueError(f"fields must be t, x, y, p of one dimension, got {', '.join(names)}")
         return {
-            name: LazyColumn(table, partial(_pick_field, name, key)) for name, key in keys.items()
+            name: LazyColumn(table, partial(_extract_field, name, key))
+            for name, key in keys.items()
         }
     if table.ndim != 2 or table.shape[1] < 4:
         raise ValueError(f"an array must be (n, 4) or have fields t, x, y, p, got {table.shape}")
@@ -158,7 +159,7 @@ def _columns_of(
     a note of other arrays of events in it."""
     keys = find_keys_by_name(file.files)
     if keys is not None:
-        columns = {name: _flat(pick_column(name, key, file[key])) for name, key in keys.items()}
+        columns = {name: _flat(extract_column(name, key, file[key])) for name, key in keys.items()}
         if any(column.ndim != 1 for column in columns.values()):
             raise ValueError("columns must have one dimension")
         return columns, file.files, ()
@@ -173,8 +174,8 @@ def _columns_of(
     raise ValueError(f"no columns t, x, y, p and no array of events among {', '.join(file.files)}")
 
 
-def _pick_field(letter: str, key: str, rows: np.ndarray) -> np.ndarray:
-    return pick_column(letter, key, rows[key])
+def _extract_field(letter: str, key: str, rows: np.ndarray) -> np.ndarray:
+    return extract_column(letter, key, rows[key])
 
 
 def _is_table(table: np.ndarray) -> bool:

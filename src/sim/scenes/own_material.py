@@ -99,7 +99,7 @@ def _find_part(count: int, fps: float, start_s: float, end_s: float, name: str) 
     return first, stop
 
 
-def check_photograph_has_no_part(start_s: float, end_s: float) -> None:
+def refuse_part_of_photograph(start_s: float, end_s: float) -> None:
     """Raise ValueError for a part of a video where there is a photograph."""
     if (start_s, end_s) != (0.0, math.inf):
         got = f"{start_s} and {end_s}"
@@ -152,7 +152,7 @@ def clip_from_array(
     facts = "x".join(map(str, array.shape[:-3:-1])) + " px"
     array = scale_to_white(array, white_level)
     if array.ndim == 2:
-        check_photograph_has_no_part(start_s, end_s)
+        refuse_part_of_photograph(start_s, end_s)
         fps = fps or 120.0
         frames = _hold(_shrink(array, longest_side_px), fps, seconds)
         return OwnClip("photograph", frames, fps, facts)
