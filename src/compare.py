@@ -4,6 +4,7 @@ The layout of the paper's figures 6, 9 and 11: samples, an x-t, r-t or theta-t s
 """
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -44,9 +45,11 @@ def compare(cfg: DictConfig) -> dict:
     if not cfg.videos:
         raise ValueError("videos must name one file or more, got []")
     check_slice(cfg)
-    names = list(cfg.names or [Path(path).parent.name for path in cfg.videos])
+    names = list(cfg.names or name_videos([Path(path) for path in cfg.videos]))
     if len(names) != len(cfg.videos):
         raise ValueError(f"names must be one per video, got {len(names)} for {len(cfg.videos)}")
+    if len(set(names)) < len(names):
+        raise ValueError(f"names must differ, got {', '.join(names)}")
     read = (np.stack(list(videos.read_video(path, "videos"))) for path in cfg.videos)
     films = [film[cfg.first : cfg.last] for film in read]
     given = {name: cfg[name] for name in slices.KINDS if cfg[name]}
@@ -78,6 +81,14 @@ def compare(cfg: DictConfig) -> dict:
     )  # fmt: skip
     rich.print(scores, f"in {run}")
     return scores
+
+
+def name_videos(paths: Sequence[Path]) -> list[str]:
+    """Return the names of the folders, with those of the files where folders are alike."""
+    folders = [path.parent.name for path in paths]
+    if len(set(folders)) == len(folders):
+        return folders
+    return [f"{path.parent.name}/{path.stem}" for path in paths]
 
 
 def check_slice(cfg: DictConfig) -> None:

@@ -77,7 +77,8 @@ def simulate_own_clip(cfg: DictConfig) -> dict:
             shown += [part] if count <= DRAWN_FRAMES else []
             count += len(part.clean)
         written = draw_own_clip(run, work, views, shown)
-        events = write_recording(path, views, work.simulated_fps, camera, work.sensor, track)
+        fps = work.simulated_fps
+        events = write_recording(path, views, fps, camera, work.sensor, track, key=work.key)
     print_files(path, events, written)
     return drawn
 
@@ -122,7 +123,7 @@ def simulate_scene(cfg: DictConfig) -> dict:
     with create_truth_file(path, camera, len(clean), fps / step, drawn) as truth:
         codes = encode_srgb(views) if pipeline.decodes_srgb else views
         truth.add(clean, codes[:, ::step], tilt[:, ::step])
-        events = write_recording(path, views, fps, camera, sensor, track)
+        events = write_recording(path, views, fps, camera, sensor, track, key=draw.key)
     print_files(path, events, written)
     return drawn
 

@@ -82,7 +82,7 @@ def test_a_folder_for_evreal_and_a_version_of_evt(tmp_path, convert):
     tables.write_events(tmp_path / "in.dat", events, width=640, height=480)
     convert(given, f"out={tmp_path}/scene", "layout=evreal")
     assert np.array_equal(np.load(tmp_path / "scene/events_xy.npy")[:, 1], events["y"])
-    with pytest.raises(ValueError, match="EVT3 cannot hold a silence of .*use evt2"):
+    with pytest.raises(ValueError, match="EVT3 cannot hold a silence of .*use version=evt2"):
         convert(given, f"out={tmp_path}/a.raw")
     assert not list(tmp_path.glob("a*"))
     convert(given, f"out={tmp_path}/a.raw", "version=evt2")

@@ -123,6 +123,8 @@ def test_a_photograph_gives_events_by_default(tmp_path, seed):
         (["sensor.threshold=0.35"], 0.35, "srgb"),
         (["sensor.threshold=[0.1,0.7]", "sensor.input=linear"], [0.1, 0.7], "linear"),
         (["~own_sensor.threshold"], [0.1, 0.7], "srgb"),
+        (["sensor=randomized"], 0.2, "srgb"),
+        (["sensor=any_camera", "sensor.threshold=0.3"], 0.3, "srgb"),
         (["+own_sensor.off_ratio=1.5"], 0.2, "srgb"),
     ],
 )
@@ -131,6 +133,7 @@ def test_the_sensor_of_own_material_is_what_is_set_else_its_own(overrides, thres
     assert (scenes.sensor.threshold, scenes.sensor.input) == ([0.1, 0.7], "linear")
     own_simulation.set_own_sensor(cfg, overrides)
     assert (cfg.sensor.threshold, cfg.sensor.input) == (threshold, light)
+    assert cfg.sensor.response == "log" and "threshold" not in (cfg.sensor.get("random") or {})
     assert cfg.sensor.off_ratio == (1.5 if "off_ratio" in str(overrides) else 1.0)
 
 

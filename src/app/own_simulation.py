@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from omegaconf import DictConfig
+from omegaconf import DictConfig, open_dict
 from torch import Tensor
 
 from src.app.instantiate import build_part
@@ -152,12 +152,19 @@ def describe_turbulence(drawn: Mapping[str, Any]) -> str:
 
 def set_own_sensor(cfg: DictConfig, overrides: Iterable[str]) -> None:
     """Give `sensor` the values of `own_sensor`, as photographs and films need them, but for the
-    keys that `overrides`, such as sensor.threshold=0.3, set.
+    keys that `overrides`, such as sensor.threshold=0.3, set.  Neither kind is drawn at random.
     """
     given = {override.lstrip("+").partition("=")[0] for override in overrides}
     for key, value in cfg.own_sensor.items():
         if key in cfg.sensor and f"sensor.{key}" not in given:
             cfg.sensor[key] = value
+    fixed = {*cfg.own_sensor} | {name.removeprefix("sensor.") for name in given}
+    drawn = {f"random.{name}" for name in cfg.sensor.get("random") or {}}
+    with open_dict(cfg):
+        for key in sorted(drawn):
+            name = key.removeprefix("random.")
+            if name in fixed and f"sensor.{key}" not in given:
+                del cfg.sensor.random[name]
 
 
 def read_own_clip(cfg: DictConfig) -> OwnClip:

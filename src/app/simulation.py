@@ -15,6 +15,7 @@ from src.models.network import VideoMethod
 from src.sim.optics import Optics, layout
 from src.sim.pipeline import Pipeline
 from src.sim.scenes.clip import FrameRateMixture
+from src.sim.sensor.engine_input import NOISE_RATES
 from src.sim.sensor.sensor import Sensor
 from src.training.batch_sampler import LargeCropStream
 from src.training.clip_cache import CachedPipeline, ClipCache, DeviceClipCache
@@ -92,7 +93,8 @@ def build_clip_cache(cfg: DictConfig) -> ClipCache:
         raise ValueError(f"data.cache_device must be disk or device, got {where}")
     if workers := cfg.data.workers:
         raise ValueError(f"data.workers must be 0 for data.cache_device=device, got {workers}")
-    device = "cpu" if cfg.trainer.accelerator == "cpu" else "cuda"
+    accelerator = OmegaConf.select(cfg, "trainer.accelerator") or "cpu"  # none without a trainer
+    device = "cpu" if accelerator == "cpu" else "cuda"
     name = json.dumps([_clip_inputs(cfg, optics), size, device], sort_keys=True)
     if name not in DEVICE_CACHES:
         DEVICE_CACHES[name] = DeviceClipCache(source, device=device, **size)
@@ -146,6 +148,7 @@ def _build_uncached_pipeline(
     seed = _count(cfg, "seed" if split == "train" else "data.test_seed", least=0)
     given = {"split": split, "seed": seed, "frames": windows * substeps + 1}
     rates = _frame_rates(cfg, split)
+    _check_drawn_noise_rates(cfg, min(rates) * substeps)
     scenes = [build_part(cfg, "scene", fps=rate * substeps, **given) for rate in rates]
     return Pipeline(
         FrameRateMixture(scenes, split, seed) if len(scenes) > 1 else scenes[0],
@@ -161,6 +164,17 @@ def _build_uncached_pipeline(
         clips=clips,
         decodes_srgb=decodes_srgb(cfg),
     )
+
+
+def _check_drawn_noise_rates(cfg: DictConfig, fps: float) -> None:
+    """Raise ValueError where `sensor.random` could draw more noise events a second than `fps`."""
+    for name in NOISE_RATES:
+        drawn = OmegaConf.select(cfg, f"sensor.random.{name}")
+        if drawn is not None and (most := max(drawn)) > fps:
+            limit = (
+                f"{fps:g}, the frames a second that are simulated (one event per pixel and frame)"
+            )
+            raise ValueError(f"sensor.random.{name} must be at most {limit}, got up to {most}")
 
 
 def decodes_srgb(cfg: DictConfig) -> bool:

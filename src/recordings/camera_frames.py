@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 import torch
 
@@ -27,16 +28,18 @@ def score_against_camera(video: Path, listing: Path, part: slice = slice(None)) 
         missing = table if listing.is_file() else listing
         wanted = "reference_images must be the list of a camera's frames"
         raise ValueError(f"{wanted}, {missing} is not there")
-    clock = np.loadtxt(table, delimiter=",", skiprows=1, usecols=1, ndmin=1)
     film, scores, lpips = list(videos.read_video(video)), [], LPIPS()
+    clock = _read_clock(video, table, len(film))
     scored = range(len(film))[part]
     reach = 0.5 * float(np.diff(clock).max(initial=0.0))
-    for line in listing.read_text().splitlines():
-        second, name = line.split()
-        nearest = int(np.abs(clock - float(second)).argmin())
-        is_near = abs(clock[nearest] - float(second)) <= reach
+    for second, name in read_listing(listing):
+        nearest = int(np.abs(clock - second).argmin())
+        is_near = abs(clock[nearest] - second) <= reach
         if is_near and nearest >= SETTLING and nearest in scored:
-            truth = next(videos.read_video(listing.parent / name))
+            truth = next(videos.read_video(name))
+            if truth.shape != film[nearest].shape:
+                sizes = f"{film[nearest].shape}, got {truth.shape} in {name}"
+                raise ValueError(f"reference_images must have the video's size (h, w) {sizes}")
             a, b = (torch.from_numpy(p.copy())[None, None] for p in (film[nearest], truth))
             aligned = align_brightness(a, b).clamp(0, 1)
             together = correlation(film[nearest], truth)
@@ -47,3 +50,26 @@ def score_against_camera(video: Path, listing: Path, part: slice = slice(None)) 
         wanted = "reference_images must have frames within the video's time"
         raise ValueError(f"{wanted}, {listing} has none")
     return dict(zip(NAMES, np.mean(scores, 0).tolist(), strict=True))
+
+
+def read_listing(listing: Path) -> list[tuple[float, Path]]:
+    """Return seconds and picture of each line; blank lines and comments (#) are left out."""
+    lines = (line.split("#")[0].split(maxsplit=1) for line in listing.read_text().splitlines())
+    try:
+        return [
+            (float(second), listing.parent / name.strip()) for second, name in filter(len, lines)
+        ]
+    except ValueError:
+        wanted = "reference_images must have seconds and a file in each line"
+        raise ValueError(f"{wanted}, {listing} has not") from None
+
+
+def _read_clock(video: Path, table: Path, frames: int) -> np.ndarray:
+    if video.suffix == ".h5":
+        with h5py.File(video) as file:
+            return file["time_s"][:]
+    clock = np.loadtxt(table, delimiter=",", skiprows=1, usecols=1, ndmin=1)
+    if len(clock) != frames:
+        counts = f"{len(clock)} lines for {frames} frames of {video}"
+        raise ValueError(f"reference_images: {table} is of another video, {counts}")
+    return clock

@@ -8,6 +8,7 @@ the end files have `partial` in their names, so that none that is cut short is t
 import csv
 import errno
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -30,6 +31,7 @@ LEAST_FREE_BYTES = 32 * 2**20
 VP9 = {"crf": "12", "b": "0", "deadline": "realtime", "cpu-used": "6"}  # error of 1 level, rms
 KEY_FRAME_EVERY = 12
 CACHE_BYTES = 2**20  # of HDF5, for each of its datasets
+FRAME_NAME = re.compile(r"\d{7}\.png$")
 Picture = UInt8[np.ndarray, "h w *rgb"]  # grey, or of three colours
 Add = Callable[[Picture, Frame | None], None]
 
@@ -51,6 +53,7 @@ def open_video_writer(
         raise ValueError(f"playback_fps must be in [0.1, 1000], got {playback_fps}")
     folder.mkdir(parents=True, exist_ok=True)
     make, whole = KINDS[kind]
+    _check_only_frames(folder / whole)
     video, table_file = partial_path(folder / whole), partial_path(folder / "frames.csv")
     with open(table_file, "w", newline="") as file, make(video, size, playback_fps) as add:
         table = csv.writer(file)
@@ -80,7 +83,8 @@ def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> i
     return how many.
 
     The file is there when it is whole.  Raises ValueError for another ending of `path`, no frames,
-    frames of several sizes and an `fps` outside [0.1, 1000].
+    frames of several sizes, other values (beyond an overshoot, which is clipped) and an `fps`
+    outside [0.1, 1000].
     """
     path, given = Path(path), map(np.asarray, frames)
     first = next(given, None)
@@ -98,6 +102,7 @@ def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> i
             for frame in chain([first], given):
                 if frame.shape != first.shape:
                     raise ValueError(f"frames must be of one size {first.shape}, got {frame.shape}")
+                _check_values(frame)
                 add(round_to_uint8(frame), None)
                 count += 1
         _check_mp4(partial, count)
@@ -105,6 +110,14 @@ def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> i
     finally:
         partial.unlink(missing_ok=True)
     return count
+
+
+def _check_values(frame: np.ndarray) -> None:
+    low, high = frame.min(initial=0), frame.max(initial=0)
+    is_code = frame.dtype.kind == "f" and np.isfinite([low, high]).all()
+    if frame.dtype != np.uint8 and not (is_code and low >= -0.5 and high <= 1.5):
+        got = f"{frame.dtype} from {low} to {high}"
+        raise ValueError(f"frames must be uint8 or floats in [0, 1], got {got}")
 
 
 def round_to_uint8(picture: np.ndarray) -> UInt8[np.ndarray, "*shape"]:
@@ -122,6 +135,14 @@ def resize_picture(
     """
     how = cv2.INTER_AREA if size[0] <= picture.shape[0] else cv2.INTER_CUBIC  # areas leave blocks
     return cv2.resize(picture, (size[1], size[0]), interpolation=how)
+
+
+def _check_only_frames(folder: Path) -> None:
+    """Raise ValueError for a folder, to be replaced, of other files than frames."""
+    others = folder.is_dir() and [p for p in folder.iterdir() if not FRAME_NAME.match(p.name)]
+    if others:
+        more = f"{min(others)} is there already"
+        raise ValueError(f"output_format=png needs a folder frames/ of its own, {more}")
 
 
 def _check_mp4(path: Path, written: int) -> None:

@@ -110,21 +110,25 @@ def _sample(
 
 def record_events(
     frames: Float[Tensor, "views frames h w"], fps: float, views: Views, sensor: EventSensor,
-    progress: Progress = lambda parts, _: parts,
+    progress: Progress = lambda parts, _: parts, *, key: int = 0,
 ) -> np.ndarray:  # fmt: skip
     """Return the sensor's events (t x y p) in order of time; `frames` are intensities in [0, 1], of
-    16 or 32 bits, also on a disk (np.memmap).
+    16 or 32 bits, also on a disk (np.memmap).  The noise follows from `key`.
 
-    `progress(parts, name)` yields the parts of the work, as rich.progress.track does.
+    The sensor is simulated in bands of rows, in one where its timestamps are v2e's: these depend on
+    the pixel with most events.  `progress(parts, name)` yields the parts of the work, as
+    rich.progress.track does.
     """
     lookup = build_lookup(views)
     light = vignette_gain(lookup)
     height, width = views.sensor
     band = max(1, BAND_BYTES // (4 * width * frames.shape[1]))
+    if sensor.stamps == "v2e":
+        band = height
     parts = []
     for top in progress(range(0, height, band), "events"):
         seen = render_sensor_frames(frames, lookup, light, slice(top, min(top + band, height)))
-        part = sensor.events(seen, fps, origin=(top, 0), full_width=width)
+        part = sensor.events(seen, fps, clip=key, origin=(top, 0), full_width=width)
         part["y"] += top
         parts.append(part)
     return sort_events(concatenate_events(parts))
@@ -132,7 +136,7 @@ def record_events(
 
 def write_recording(
     path: Path | str, frames: Float[Tensor, "views frames h w"], fps: float, views: Views,
-    sensor: EventSensor, progress: Progress = lambda parts, _: parts,
+    sensor: EventSensor, progress: Progress = lambda parts, _: parts, *, key: int = 0,
 ) -> np.ndarray:  # fmt: skip
     """Record `frames` as `record_events`, write the events as an event file and return them.
 
@@ -140,7 +144,7 @@ def write_recording(
     without events, and a warning.
     """
     path = Path(path)
-    events = record_events(frames, fps, views, sensor, progress)
+    events = record_events(frames, fps, views, sensor, progress, key=key)
     if not len(events):
         more = "sensor.threshold= (lower), seconds= (longer) or turbulence= (stronger)"
         warnings.warn(

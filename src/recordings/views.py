@@ -188,6 +188,8 @@ def views_or_whole_sensor(
 def load_views(path: Path | str, sensor: HeightWidth | None = None) -> Views:
     """Read a file of `Views.save` or one by hand (`mirrored`, `error_px`, `points` are optional).
 
+    The views are put in order of position, row by row.
+
     Raises ValueError for what is no such file, a value out of range, a `mirrored` its homography
     contradicts, or another sensor than `sensor` (height, width)."""
     try:
@@ -207,7 +209,7 @@ def load_views(path: Path | str, sensor: HeightWidth | None = None) -> Views:
             raise ValueError(f"{path}: mirrored of {view.position} contradicts its homography")
     if sensor is not None and tuple(sensor) != views.sensor:
         raise ValueError(f"{path}: sensor must be the recording's {sensor}, got {views.sensor}")
-    return views
+    return replace(views, views=tuple(sorted(views.views, key=lambda view: view.position)))
 
 
 def _parse_view(entry: dict) -> View:

@@ -25,6 +25,7 @@ import torch
 
 import src.sim
 from src.models.checkpoints import is_intact, save_atomically
+from src.recordings.files import turbulence_file
 from src.records.atomic import write_text
 from src.sim.pipeline import Pipeline
 from src.training.clip_cache import GIB, CachedClip, ClipCache, simulate_clip
@@ -186,16 +187,21 @@ def _fill_caches(caches: Sequence[DiskClipCache]) -> None:
 def hash_simulation_code() -> str:
     """Return a hash of the code and tables that make clips: comments and layout do not count."""
     home, digest = Path(src.sim.__file__).parent, hashlib.sha256()
+    digest.update(_hash_input(Path(turbulence_file.__file__)))  # draws turbulence=measured
     for path in sorted(home.rglob("*")):
         place = path.relative_to(home)
         if place.parts[0] in DOWNSTREAM and place.as_posix() not in UPSTREAM:
             continue
         if path.suffix not in (".py", ".safetensors"):
             continue
-        is_code = path.suffix == ".py"
-        data = ast.dump(ast.parse(path.read_text())).encode() if is_code else path.read_bytes()
-        digest.update(str(place).encode() + data)
+        digest.update(str(place).encode() + _hash_input(path))
     return digest.hexdigest()[:12]
+
+
+def _hash_input(path: Path) -> bytes:
+    if path.suffix == ".py":
+        return ast.dump(ast.parse(path.read_text())).encode()
+    return path.read_bytes()
 
 
 def hash_file_lists(config: Any) -> str:

@@ -48,6 +48,20 @@ def test_what_is_not_there_or_not_at_the_same_time_is_named(recording):
     video, listing = recording
     with pytest.raises(ValueError, match="reference_images must be the list of a camera's frames"):
         camera_frames.score_against_camera(video, listing.with_name("none.txt"))
+    given = listing.read_text()
+    listing.write_text("a b c")
+    with pytest.raises(ValueError, match="reference_images must have seconds and a file in each"):
+        camera_frames.score_against_camera(video, listing)
+    listing.write_text("# t file\n\n" + given)
+    assert camera_frames.score_against_camera(video, listing)["ssim"] > 0.999
+    cv2.imwrite(str(listing.parent / "0000003.png"), np.zeros((24, 24), np.uint8))
+    with pytest.raises(ValueError, match="reference_images must have the video's size"):
+        camera_frames.score_against_camera(video, listing)
+    table = video.parent / "frames.csv"
+    table.write_text("\n".join(table.read_text().splitlines()[:-2]))
+    with pytest.raises(ValueError, match="frames.csv is of another video, 6 lines for 8 frames"):
+        camera_frames.score_against_camera(video, listing)
     listing.write_text("99.0 0000000.png")
+    table.write_text("frame,time_s\n" + "\n".join(f"{k},{k / FPS}" for k in range(FRAMES)))
     with pytest.raises(ValueError, match="reference_images must have frames within the video"):
         camera_frames.score_against_camera(video, listing)

@@ -129,3 +129,28 @@ def test_no_video_of_wrong_frames(name, shapes, fps, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         write_video(tmp_path / name, [np.zeros(shape) for shape in shapes], fps)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "frame", [np.full(SIZE, 60, np.int64), np.full(SIZE, 60.0), np.full(SIZE, np.nan)]
+)
+def test_values_that_are_no_code_values_are_refused(frame, tmp_path):
+    with pytest.raises(ValueError, match="frames must be uint8 or floats in"):
+        write_video(tmp_path / "a.mp4", [frame], 30)
+    assert not (tmp_path / "a.mp4").exists()
+
+
+def test_a_folder_of_other_frames_is_not_deleted(tmp_path):
+    (tmp_path / "frames").mkdir()
+    (tmp_path / "frames" / "camera_0001.txt").write_text("mine")
+    own = "output_format=png needs a folder frames/ of its own"
+    with pytest.raises(ValueError, match=own), open_video_writer("png", tmp_path, SIZE):
+        pass
+    assert (tmp_path / "frames" / "camera_0001.txt").read_text() == "mine"
+
+
+def test_pictures_are_read_in_the_order_of_their_numbers(tmp_path):
+    for k in (1, 2, 10):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((8, 8), 10 * k, np.uint8))
+    greys = [round(float(frame.mean()) * 255) for frame in videos.read_video(tmp_path)]
+    assert greys == [10, 20, 100]

@@ -122,6 +122,24 @@ def test_bands_of_the_sensor_make_the_same_events(truth, monkeypatch):
     assert (np.diff(bands["t"]) >= 0).all()
 
 
+def test_timestamps_of_v2e_do_not_depend_on_the_memory_of_a_band(truth, monkeypatch):
+    frames, sensor = blinking(half(pictures.circles(5, 7)), 3), noisy_sensor(stamps="v2e")
+    whole = simulated_recording.record_events(frames, 60.0, truth, sensor)
+    monkeypatch.setattr(simulated_recording, "BAND_BYTES", 4 * SENSOR[1] * 3 * 50)
+    assert np.array_equal(whole, simulated_recording.record_events(frames, 60.0, truth, sensor))
+
+
+def test_every_clip_has_noise_of_its_own(truth):
+    still, noisy = torch.full((9, 9, SIDE, SIDE), 0.6), noisy_sensor(dark_noise_hz=5.0)
+    one, again, other = (
+        simulated_recording.record_events(still, 60.0, truth, noisy, key=key) for key in (1, 1, 2)
+    )
+    assert np.array_equal(one, again) and len(one) > 1000
+    fields = ["t", "x", "y"]
+    shared = set(one[fields].tolist()) & set(other[fields].tolist())
+    assert len(shared) < 0.05 * len(one)
+
+
 def test_a_still_scene_makes_no_event(truth):
     still = torch.full((9, 3, SIDE, SIDE), 0.6)
     ideal = EventSensor(0.2, refractory_s=0.0)

@@ -220,6 +220,12 @@ def test_views_of_another_sensor_are_refused(truth, tmp_path):
         views.load_views(tmp_path / "views.yaml", (480, 640))
 
 
+def test_views_are_in_order_of_position(truth, tmp_path):
+    path = tmp_path / "views.yaml"
+    replace(truth, views=truth.views[::-1]).save(path)
+    assert [view.position for view in views.load_views(path).views] == sorted(truth.positions)
+
+
 def test_an_absent_file_is_refused(tmp_path):
     with pytest.raises(ValueError, match="FileNotFoundError"):
         views.load_views(tmp_path / "none.yaml")

@@ -127,12 +127,19 @@ def test_all_that_ask_for_the_same_share_one_of_a_process(tmp_path):
         for more in ([], ["optics=single", "data.crop=24"], ["seed=5"])
     )
     assert isinstance(nine, DeviceClipCache) and nine is one and nine is not other
+    cfg = config("train", tmp_path, *asked)
+    del cfg.trainer  # as in src.simulate like=
+    assert simulations.build_clip_cache(cfg) is nine
 
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
         ("data.cache_device=moon", "data.cache_device must be disk or device, got moon"),
+        (
+            "sensor.random.dark_noise_hz=[0,150]",
+            "dark_noise_hz must be at most 120, .*got up to 150",
+        ),
         ("data.workers=1", "data.workers must be 0 for data.cache_device=device, got 1"),
         ("data.cache_clips=null", "data.crop may be a range of sides with data.cache_clips only"),
         (

@@ -97,6 +97,10 @@ def choose_file_kind(path: Path, layout: str | None, width: int, height: int, ve
         raise ValueError(f"{path}: layout=dsec must have the ending .h5 or .hdf5")
     if path.is_dir() and not (kind == "evreal" and (path / table_writers.EVREAL_TIMES).is_file()):
         raise ValueError(f"{path}: is a folder already, of something else")
+    if path.is_dir() and (
+        more := {file.name for file in path.iterdir()} - table_writers.EVREAL_FILES
+    ):
+        raise ValueError(f"{path}: must hold no other files than EVREAL's, got {min(more)}")
     if kind == "evreal" and path.is_file():
         raise ValueError(f"{path}: layout=evreal writes a folder, this is a file already")
     if max(width, height) > (most := MOST_PIXELS.get(kind, 2**16)):
@@ -137,13 +141,12 @@ class _Checked:
         if (gaps >= self._silence_us).any():
             raise ValueError(
                 f"{self._path}: {self._version} cannot hold a silence of {gaps.max()} us, use "
-                f"{'evt2' if self._version == 'EVT3' else '.npz'}"
+                f"{'version=evt2' if self._version == 'EVT3' else '.npz'}"
             )
         if self._kind == ".es" and t[-1] >= MOST_ES_US:
-            raise ValueError(f"{self._path}: .es cannot hold a time of {t[-1]} us, use .raw")
+            raise ValueError(f"{self._path}: .es cannot hold a time of {t[-1]} us, use .npz")
         if (span := int(t[-1]) - first) >= MOST_US.get(self._kind, 2**62):
-            other = "evt2" if self._kind == ".dat" else ".npz"
-            raise ValueError(f"{self._path}: {self._kind} cannot hold {span} us, use {other}")
+            raise ValueError(f"{self._path}: {self._kind} cannot hold {span} us, use .npz")
 
     def _check_pixels(self, events: np.ndarray) -> None:
         (width, height), x, y, p = self._size, events["x"], events["y"], events["p"]

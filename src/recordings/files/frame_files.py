@@ -1,8 +1,7 @@
 """Frames of a camera beside the event pixels, as files hold them."""
 
-import re
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import cv2
 import numpy as np
 
 from src.recordings.files.event_file import RawFrames
-from src.sim.scenes.video_files import PICTURE_SUFFIXES, read_picture
+from src.sim.scenes.video_files import PICTURE_SUFFIXES, read_picture, sort_by_name
 
 PICTURE_FOLDERS = ("images_corrected", "images")  # of TimeLens's recordings, beside the events
 TIME_FILES = ("timestamp.txt", "timestamps.txt")
@@ -62,16 +61,6 @@ def wrap_frame_array(pictures: Any, times: np.ndarray, unit: str | None = None) 
         yield from (to_gray(np.asarray(pictures[k])) for k in range(len(times)))
 
     return RawFrames(np.asarray(times), (height, width), one_by_one, unit)
-
-
-def sort_by_name(paths: Iterable[Path]) -> list[Path]:
-    """Return paths in order of name, the numbers in names by their value: 2.png before 10.png."""
-    return sorted(
-        paths,
-        key=lambda path: [
-            int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)
-        ],
-    )
 
 
 def to_gray(picture: np.ndarray, rgb: bool = False) -> np.ndarray:

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from src.recordings.files.event_file import EventFile, RawEvents, RawFrames, ReadOptions
-from src.recordings.files.frame_files import find_timelens_frames, sort_by_name
+from src.recordings.files.frame_files import find_timelens_frames
 from src.recordings.files.numpy_file import NumpyFile
+from src.sim.scenes.video_files import sort_by_name
 
 EVENT_FOLDERS = (".", "events", "events_aligned")
 FRACTIONS = 32  # of a pixel in which BS-ERGB has x and y, in 16 bits

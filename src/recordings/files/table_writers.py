@@ -21,6 +21,10 @@ from src.recordings.files.event_file import WidthHeight
 from src.recordings.files.recorded_frames import RecordedFrames
 
 EVREAL_TIMES = "events_ts.npy"
+EVREAL_FILES = {
+    EVREAL_TIMES, "events_xy.npy", "events_p.npy", "metadata.json", "images.npy", "images_ts.npy",
+    "image_event_indices.npy",
+}  # fmt: skip
 CHUNK_EVENTS = 2**16  # in HDF5
 Pieces = Iterator[np.ndarray]
 

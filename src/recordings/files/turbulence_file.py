@@ -3,8 +3,8 @@
 Lengths are in pixels of a frame whose smaller side is 256, times in seconds.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,8 +13,10 @@ import torch
 import yaml
 
 from src.records import safe_yaml
+from src.sim.optics import Position
 from src.sim.turbulence import prior
 from src.sim.turbulence.atmosphere import Atmosphere
+from src.sim.turbulence.operator import Turbulence
 from src.sim.turbulence.prior import Range, TargetImageStatistics, log_uniform
 from src.sim.turbulence.simulated import SimulatedTurbulence
 
@@ -125,6 +127,17 @@ class MeasuredTurbulence(SimulatedTurbulence):
         self.cameras = cameras
         self.lengths = _drawing_range(self.file.half_length_px, (5.0, 600.0))
         self.decays = _drawing_range(self.file.decay_s, unknown)
+
+    def operator(
+        self, drawn: Atmosphere | None, *, views: Sequence[Position], **frames: Any
+    ) -> Turbulence:
+        """Return the operator of an atmosphere that was drawn for a smaller side of SIDE pixels."""
+        if drawn is not None:  # an atmosphere's pixels are of the width
+            covered_m = (
+                drawn.scene_width_m * frames["width"] / min(frames["height"], frames["width"])
+            )
+            drawn = replace(drawn, scene_width_m=covered_m)
+        return super().operator(drawn, views=views, **frames)
 
     def draw(self, generator: torch.Generator) -> Atmosphere:
         """Draw an atmosphere that shows what the file says; raises ValueError where none does."""

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from src.recordings.files.event_file import name_file_in_errors
 from src.recordings.files.hdf5_file import check_hdf5_safety
 from src.sim.scenes.video_decoding import LARGEST_PIXELS
-from src.sim.scenes.video_files import PICTURE_SUFFIXES, read_picture
+from src.sim.scenes.video_files import PICTURE_SUFFIXES, read_picture, sort_by_name
 from src.sim.scenes.video_index import index_video
 
 
@@ -54,8 +54,9 @@ def read_fps(
 
 def _frames(path: Path, config_key: str, max_frames: int | None) -> Iterator[np.ndarray]:
     if path.is_dir():
-        names = sorted(name for name in path.iterdir() if name.suffix.lower() in PICTURE_SUFFIXES)
-        yield from (read_gray_picture(name) for name in names if name.name[0] != ".")
+        found = (name for name in path.iterdir() if name.suffix.lower() in PICTURE_SUFFIXES)
+        names = sort_by_name(name for name in found if name.name[0] != ".")
+        yield from map(read_gray_picture, names)
     elif path.suffix == ".h5":
         with _opened_h5(path) as file:
             frames = file["frames"]

@@ -1,6 +1,7 @@
 """Pictures and videos: a video file, a folder of frames, or a folder of these; grey, 8 bits."""
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -80,9 +81,19 @@ def find_videos(root: Path, config_key: str = "scene.root") -> list[VideoSource]
     return videos
 
 
+def sort_by_name(paths: Iterable[Path]) -> list[Path]:
+    """Return paths in order of name, the numbers in names by their value: 2.png before 10.png."""
+    return sorted(
+        paths,
+        key=lambda path: [
+            int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)
+        ],
+    )
+
+
 def _folder_sources(path: Path, config_key: str) -> list[VideoSource]:
     """Return the folder as one video, none where no frames are in it."""
-    names = sorted(path.iterdir())
+    names = sort_by_name(path.iterdir())
     frames = [p for p in names if p.suffix.lower() in PICTURE_SUFFIXES and p.name[0] != "."]
     return [VideoSource(path.name, len(frames), config_key, frames=tuple(frames))] if frames else []
 

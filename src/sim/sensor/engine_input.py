@@ -36,6 +36,7 @@ RANDOM_RANGES = {  # of the numbers that may be drawn per clip
     "cutoff_hz": (0, 1e6),
     "initial_reference_error": (0, 1),
 }
+NOISE_RATES = ("dark_noise_hz", "hot_pixel_hz", "leak_event_hz")  # at most one event a frame
 FIXED_RANGES = {"floor": (1e-3, 1), "random_share": (0, 1)}
 
 
@@ -94,7 +95,7 @@ def _clip_numbers(clip: SensorClip, low_pass_row: int) -> tuple:
         got = f"the range {low} to {high}"
         raise ValueError(f"sensor.threshold is {got}: `draw` the sensor of each clip first")
     threshold = float(np.float32(low))
-    for name in ("dark_noise_hz", "hot_pixel_hz", "leak_event_hz"):
+    for name in NOISE_RATES:
         check_in_range(f"sensor.{name}", getattr(sensor, name), 0, fps)
     return (
         math.floor(threshold * UNIT) - ALLOWANCE,

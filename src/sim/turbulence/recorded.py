@@ -68,6 +68,11 @@ class RecordedTurbulence:
     def operator(
         self, drawn: str, *, views: Sequence[Position], height: int, width: int, fps: float
     ) -> "RecordedTurbulenceOperator":
+        if len({(row % 3, col % 3) for row, col in views}) < len(views):
+            raise ValueError(
+                f"optics must have at most nine views, within 3x3, for turbulence=recorded: each "
+                f"has a piece of the footage of its own; got {len(views)} views"
+            )
         rms, size, step = self.tilt_rms_px[drawn], (height, width), self.footage_fps / fps
         blur_px = self.blur_over_tilt * rms
         return RecordedTurbulenceOperator(self.fields, drawn, rms, views, size, step, blur_px)

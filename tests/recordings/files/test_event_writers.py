@@ -118,9 +118,9 @@ def test_what_cannot_be_written_is_named_before(tmp_path, name, how, words):
 @pytest.mark.parametrize(
     ("name", "times", "words"),
     [
-        ("a.raw", [0, 2**23], "EVT3 cannot hold a silence of 8388608 us, use evt2"),
-        ("a.es", [0, 2**32], ".es cannot hold a time of 4294967296 us, use .raw"),
-        ("a.dat", [0, 2**32], "cannot hold 4294967296 us, use evt2"),
+        ("a.raw", [0, 2**23], "EVT3 cannot hold a silence of 8388608 us, use version=evt2"),
+        ("a.es", [0, 2**32], ".es cannot hold a time of 4294967296 us, use .npz"),
+        ("a.dat", [0, 2**32], "cannot hold 4294967296 us, use .npz"),
         ("a.h5", [5, 2**32 + 5], "cannot hold 4294967296 us, use .npz"),
         ("a.npz", [-1, 0], "times must start at 0"),
     ],

@@ -106,6 +106,18 @@ def test_clips_show_what_the_file_says(tmp_path):
     assert np.median(np.abs(np.array(shares) - 0.1)) < 0.06
 
 
+@pytest.mark.parametrize("size", [(256, 256), (144, 256), (288, 512), (512, 288)])
+def test_lengths_are_of_a_frame_whose_smaller_side_is_256(size, tmp_path):
+    exact = {"rms_px": [0.5] * 3, "half_length_px": [15.0] * 3, "whole_share": [0.1, 0.0, 0.3]}
+    air = MeasuredTurbulence(site(tmp_path / "air.yaml", **exact), RANGES)
+    height, width = size
+    given = {"views": [(0, 0)], "height": height, "width": width, "fps": 120.0}
+    seen = air.operator(draws(air, 1)[0], **given).metadata
+    assert seen["tilt_px"] == pytest.approx(0.5 * min(size) / 256, rel=0.03)
+    length = seen["tilt_correlation_half_length_px"]
+    assert length == pytest.approx(15 * min(size) / 256, rel=0.1)
+
+
 def test_what_the_file_does_not_know_is_drawn_from_the_ranges(tmp_path):
     unknown = site(tmp_path / "air.yaml", decay_s=[None, None, None])
     decays = [

@@ -245,6 +245,13 @@ def test_footage_that_will_not_do_is_refused(tmp_path, footage):
         track_displacement_fields(flat)
 
 
+def test_views_that_would_share_a_piece_are_refused(model):
+    assert model.operator("weak", views=layout(9), **RUN)
+    for views in (layout(25), [(0, 0), (0, 3)]):
+        with pytest.raises(ValueError, match="optics must have at most nine views, within 3x3"):
+            model.operator("weak", views=views, **RUN)
+
+
 def test_the_real_footage_moves_locally(shared_data):
     found = track_displacement_fields(shared_data / "turbulence" / "building")
     assert found.nodes.shape[0] == 40 and min(found.width_px, found.height_px) > 190
