@@ -63,6 +63,10 @@ def test_a_folder_as_evreal_reads_it(tmp_path):
     assert np.array_equal(p, events["p"] > 0)
     assert json.loads((path / "metadata.json").read_text()) == {"sensor_resolution": [480, 640]}
     assert [file.name for file in tmp_path.iterdir()] == ["scene"]
+    (path / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match="must hold no other files than EVREAL's, got notes.txt"):
+        event_writers.write_pieces(path, in_pieces(events), **SIZE, layout="evreal")
+    assert (path / "notes.txt").read_text() == "mine"
 
 
 @pytest.mark.parametrize(("name", "kind"), [("a.raw", "evt3"), ("a.raw", "evt2"), ("a.dat", "")])
