@@ -25,7 +25,6 @@ import torch
 
 import src.sim
 from src.models.checkpoints import is_intact, save_atomically
-from src.recordings.files import turbulence_file
 from src.records.atomic import write_text
 from src.sim.pipeline import Pipeline
 from src.training.clip_cache import GIB, CachedClip, ClipCache, simulate_clip
@@ -33,6 +32,7 @@ from src.training.clip_cache import GIB, CachedClip, ClipCache, simulate_clip
 INPUTS_FILE = "inputs.json"
 DOWNSTREAM = ("sensor", "voxel.py")  # parts of src/sim that come after the cache, except
 UPSTREAM = ("sensor/response.py",)  # which decodes the frames before it
+MEASURED = "recordings/files/turbulence_file.py"  # in src, draws turbulence=measured
 
 
 class DiskClipCache(ClipCache):
@@ -187,7 +187,7 @@ def _fill_caches(caches: Sequence[DiskClipCache]) -> None:
 def hash_simulation_code() -> str:
     """Return a hash of the code and tables that make clips: comments and layout do not count."""
     home, digest = Path(src.sim.__file__).parent, hashlib.sha256()
-    digest.update(_hash_input(Path(turbulence_file.__file__)))  # draws turbulence=measured
+    digest.update(_hash_input(home.parent / MEASURED))
     for path in sorted(home.rglob("*")):
         place = path.relative_to(home)
         if place.parts[0] in DOWNSTREAM and place.as_posix() not in UPSTREAM:

@@ -410,3 +410,9 @@ def test_files_of_a_scene_are_part_of_what_made_a_disk_cache(tmp_path):
     (tmp_path / "b.png").write_bytes(b"1")
     assert hash_file_lists(node) != before and hash_file_lists(footage) != before
     assert hash_simulation_code() == hash_simulation_code() != ""
+
+
+def test_the_file_that_draws_measured_turbulence_is_in_the_hash(monkeypatch):
+    before = hash_simulation_code()
+    monkeypatch.setattr(disk_caches, "MEASURED", "recordings/files/time_unit.py")
+    assert hash_simulation_code() != before
