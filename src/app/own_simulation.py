@@ -159,11 +159,9 @@ def set_own_sensor(cfg: DictConfig, overrides: Iterable[str]) -> None:
         if key in cfg.sensor and f"sensor.{key}" not in given:
             cfg.sensor[key] = value
     fixed = {*cfg.own_sensor} | {name.removeprefix("sensor.") for name in given}
-    drawn = {f"random.{name}" for name in cfg.sensor.get("random") or {}}
     with open_dict(cfg):
-        for key in sorted(drawn):
-            name = key.removeprefix("random.")
-            if name in fixed and f"sensor.{key}" not in given:
+        for name in [*(cfg.sensor.get("random") or {})]:
+            if name in fixed and f"sensor.random.{name}" not in given:
                 del cfg.sensor.random[name]
 
 
