@@ -45,7 +45,7 @@ def compare(cfg: DictConfig) -> dict:
     if not cfg.videos:
         raise ValueError("videos must name one file or more, got []")
     check_slice(cfg)
-    names = list(cfg.names or name_videos([Path(path) for path in cfg.videos]))
+    names = list(cfg.names or default_video_names([Path(path) for path in cfg.videos]))
     if len(names) != len(cfg.videos):
         raise ValueError(f"names must be one per video, got {len(names)} for {len(cfg.videos)}")
     if len(set(names)) < len(names):
@@ -83,7 +83,7 @@ def compare(cfg: DictConfig) -> dict:
     return scores
 
 
-def name_videos(paths: Sequence[Path]) -> list[str]:
+def default_video_names(paths: Sequence[Path]) -> list[str]:
     """Return the names of the folders, with those of the files where folders are alike."""
     folders = [path.parent.name for path in paths]
     if len(set(folders)) == len(folders):

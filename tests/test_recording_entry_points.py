@@ -12,7 +12,7 @@ import torch
 from hydra import compose, initialize_config_dir
 
 from src.calibrate import calibrate
-from src.compare import compare, name_videos
+from src.compare import compare, default_video_names
 from src.reconstruct import reconstruct, show_progress
 from src.recordings import reconstruction, sensor_lookup, simulated_recording, truth_file, views
 from src.sim.optics import layout
@@ -366,8 +366,8 @@ def test_a_scene_that_stands_wanders_by_its_shifts_whatever_the_size(tmp_path):
 
 
 def test_every_video_of_a_comparison_has_a_name_of_its_own(tmp_path):
-    assert name_videos([Path("a/video.h5"), Path("b/video.h5")]) == ["a", "b"]
-    assert name_videos([Path("a/one.h5"), Path("a/two.h5")]) == ["a/one", "a/two"]
+    assert default_video_names([Path("a/video.h5"), Path("b/video.h5")]) == ["a", "b"]
+    assert default_video_names([Path("a/one.h5"), Path("a/two.h5")]) == ["a/one", "a/two"]
     alike = ["videos=[a/v.h5,b/v.h5]", "names=[n,n]", "line=[[0,8],[17,8]]"]
     with pytest.raises(ValueError, match="names must differ, got n, n"):
         compare(config("compare", tmp_path, *alike))

@@ -148,13 +148,14 @@ def _build_uncached_pipeline(
     seed = _count(cfg, "seed" if split == "train" else "data.test_seed", least=0)
     given = {"split": split, "seed": seed, "frames": windows * substeps + 1}
     rates = _frame_rates(cfg, split)
-    _check_drawn_noise_rates(cfg, min(rates) * substeps)
+    sensor = build_sensor(cfg, seed)
+    _check_drawn_noise_rates(sensor, min(rates) * substeps)
     scenes = [build_part(cfg, "scene", fps=rate * substeps, **given) for rate in rates]
     return Pipeline(
         FrameRateMixture(scenes, split, seed) if len(scenes) > 1 else scenes[0],
         optics,
         build_part(cfg, "turbulence"),
-        build_sensor(cfg, seed),
+        sensor,
         split=split,
         seed=seed,
         bins=_count(cfg, "bins"),
@@ -166,14 +167,12 @@ def _build_uncached_pipeline(
     )
 
 
-def _check_drawn_noise_rates(cfg: DictConfig, fps: float) -> None:
+def _check_drawn_noise_rates(sensor: Sensor, fps: float) -> None:
     """Raise ValueError where `sensor.random` could draw more noise events a second than `fps`."""
     for name in NOISE_RATES:
-        drawn = OmegaConf.select(cfg, f"sensor.random.{name}")
-        if drawn is not None and (most := max(drawn)) > fps:
-            limit = (
-                f"{fps:g}, the frames a second that are simulated (one event per pixel and frame)"
-            )
+        most = max(sensor.random.get(name, (0,)))
+        if most > fps:
+            limit = f"{fps:g}, the frames a second that are simulated"
             raise ValueError(f"sensor.random.{name} must be at most {limit}, got up to {most}")
 
 

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 import torch
 
@@ -10,6 +9,7 @@ from src.metrics.image import align_brightness, ssim
 from src.metrics.lpips import LPIPS
 from src.metrics.slice_motion import correlation
 from src.recordings.files import videos
+from src.recordings.files.frame_files import read_frame_list
 
 NAMES = ("ssim", "lpips", "lpips_aligned", "correlation")
 SETTLING = 2  # first frames of a reconstruction, which are not looked at
@@ -32,7 +32,7 @@ def score_against_camera(video: Path, listing: Path, part: slice = slice(None)) 
     clock = _read_clock(video, table, len(film))
     scored = range(len(film))[part]
     reach = 0.5 * float(np.diff(clock).max(initial=0.0))
-    for second, name in read_listing(listing):
+    for second, name in read_frame_list(listing, "reference_images"):
         nearest = int(np.abs(clock - second).argmin())
         is_near = abs(clock[nearest] - second) <= reach
         if is_near and nearest >= SETTLING and nearest in scored:
@@ -52,23 +52,11 @@ def score_against_camera(video: Path, listing: Path, part: slice = slice(None)) 
     return dict(zip(NAMES, np.mean(scores, 0).tolist(), strict=True))
 
 
-def read_listing(listing: Path) -> list[tuple[float, Path]]:
-    """Return seconds and picture of each line; blank lines and comments (#) are left out."""
-    lines = (line.split("#")[0].split(maxsplit=1) for line in listing.read_text().splitlines())
-    try:
-        return [
-            (float(second), listing.parent / name.strip()) for second, name in filter(len, lines)
-        ]
-    except ValueError:
-        wanted = "reference_images must have seconds and a file in each line"
-        raise ValueError(f"{wanted}, {listing} has not") from None
-
-
 def _read_clock(video: Path, table: Path, frames: int) -> np.ndarray:
-    if video.suffix == ".h5":
-        with h5py.File(video) as file:
-            return file["time_s"][:]
-    clock = np.loadtxt(table, delimiter=",", skiprows=1, usecols=1, ndmin=1)
+    """Return the seconds of the frames: those of a `video.h5`, else of the table `frames.csv`."""
+    clock = videos.read_times(video)
+    if clock is None:
+        clock = np.loadtxt(table, delimiter=",", skiprows=1, usecols=1, ndmin=1)
     if len(clock) != frames:
         counts = f"{len(clock)} lines for {frames} frames of {video}"
         raise ValueError(f"reference_images: {table} is of another video, {counts}")

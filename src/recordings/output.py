@@ -31,7 +31,7 @@ LEAST_FREE_BYTES = 32 * 2**20
 VP9 = {"crf": "12", "b": "0", "deadline": "realtime", "cpu-used": "6"}  # error of 1 level, rms
 KEY_FRAME_EVERY = 12
 CACHE_BYTES = 2**20  # of HDF5, for each of its datasets
-FRAME_NAME = re.compile(r"\d{7}\.png$")
+FRAME_NAME = re.compile(r"\d{7,}\.png$")
 Picture = UInt8[np.ndarray, "h w *rgb"]  # grey, or of three colours
 Add = Callable[[Picture, Frame | None], None]
 

@@ -123,7 +123,7 @@ def record_events(
     light = vignette_gain(lookup)
     height, width = views.sensor
     band = max(1, BAND_BYTES // (4 * width * frames.shape[1]))
-    if sensor.stamps == "v2e":
+    if getattr(sensor, "stamps", None) == "v2e":  # a sensor of your own may have none
         band = height
     parts = []
     for top in progress(range(0, height, band), "events"):

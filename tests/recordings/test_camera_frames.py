@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 
@@ -65,3 +66,20 @@ def test_what_is_not_there_or_not_at_the_same_time_is_named(recording):
     table.write_text("frame,time_s\n" + "\n".join(f"{k},{k / FPS}" for k in range(FRAMES)))
     with pytest.raises(ValueError, match="reference_images must have frames within the video"):
         camera_frames.score_against_camera(video, listing)
+
+
+def test_a_video_h5_has_its_own_clock(recording):
+    folder, listing = recording
+    film = np.stack([cv2.imread(str(path), 0) for path in sorted(folder.iterdir())])
+    with h5py.File(folder.parent / "video.h5", "w") as file:
+        file["frames"], file["time_s"] = film, np.arange(FRAMES) / FPS
+    (folder.parent / "frames.csv").write_text("frame,time_s\n0,7.0\n1,8.0")  # of a later run
+    scores = camera_frames.score_against_camera(folder.parent / "video.h5", listing)
+    assert scores["ssim"] > 0.999 and scores["correlation"] > 0.999
+
+
+def test_a_picture_may_have_any_name(recording):
+    folder, listing = recording
+    (listing.parent / "0000002.png").rename(listing.parent / "take #2.png")
+    listing.write_text(f"{2 / FPS} take #2.png")
+    assert camera_frames.score_against_camera(folder, listing)["ssim"] > 0.999

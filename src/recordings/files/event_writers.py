@@ -95,12 +95,12 @@ def choose_file_kind(path: Path, layout: str | None, width: int, height: int, ve
         raise ValueError(f"{path}: cannot write {suffix or 'no ending'}, but {known}")
     if layout == "dsec" and kind not in (".h5", ".hdf5"):
         raise ValueError(f"{path}: layout=dsec must have the ending .h5 or .hdf5")
-    if path.is_dir() and not (kind == "evreal" and (path / table_writers.EVREAL_TIMES).is_file()):
-        raise ValueError(f"{path}: is a folder already, of something else")
-    if path.is_dir() and (
-        more := {file.name for file in path.iterdir()} - table_writers.EVREAL_FILES
-    ):
-        raise ValueError(f"{path}: must hold no other files than EVREAL's, got {min(more)}")
+    if path.is_dir():
+        present = {file.name for file in path.iterdir()}
+        if kind != "evreal" or table_writers.EVREAL_TIMES not in present:
+            raise ValueError(f"{path}: is a folder already, of something else")
+        if more := present - table_writers.EVREAL_FILES:
+            raise ValueError(f"{path}: must hold no other files than EVREAL's, got {min(more)}")
     if kind == "evreal" and path.is_file():
         raise ValueError(f"{path}: layout=evreal writes a folder, this is a file already")
     if max(width, height) > (most := MOST_PIXELS.get(kind, 2**16)):

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from src.recordings.files.event_file import RawFrames
-from src.sim.scenes.video_files import PICTURE_SUFFIXES, read_picture, sort_by_name
+from src.sim.scenes.video_files import PICTURE_SUFFIXES, read_picture, sort_naturally
 
 PICTURE_FOLDERS = ("images_corrected", "images")  # of TimeLens's recordings, beside the events
 TIME_FILES = ("timestamp.txt", "timestamps.txt")
@@ -20,12 +20,20 @@ def find_listed_frames(listing: Path) -> RawFrames | None:
     is no such file (images.txt of the Event Camera Dataset)."""
     if not listing.is_file():
         return None
-    rows = [line.split(maxsplit=1) for line in listing.read_text().splitlines() if line.strip()]
+    rows = read_frame_list(listing)
+    return _pictures([path for _, path in rows], np.array([second for second, _ in rows]), "s")
+
+
+def read_frame_list(listing: Path, config_key: str | None = None) -> list[tuple[float, Path]]:
+    """Return the seconds and the picture in each line of a text file, but for blank lines and
+    comments (#); raises ValueError, which names the file or `config_key`, for another line."""
+    lines = map(str.strip, listing.read_text().splitlines())
+    rows = [line.split(maxsplit=1) for line in lines if line and line[0] != "#"]
     try:
-        times = np.array([float(second) for second, _ in rows])
+        return [(float(second), listing.parent / name) for second, name in rows]
     except ValueError:
-        raise ValueError(f"{listing} must have seconds and a file in each line") from None
-    return _pictures([listing.parent / name.strip() for _, name in rows], times, "s")
+        wanted = f"{config_key or listing} must have seconds and a file in each line"
+        raise ValueError(f"{wanted}, {listing} has not" if config_key else wanted) from None
 
 
 def find_timelens_frames(events_folder: Path) -> RawFrames | None:
@@ -34,7 +42,7 @@ def find_timelens_frames(events_folder: Path) -> RawFrames | None:
     found = [p for name in PICTURE_FOLDERS if (p := events_folder.parent / name).is_dir()]
     if not found:
         return None
-    names = sort_by_name(p for p in found[0].iterdir() if p.suffix.lower() in PICTURE_SUFFIXES)
+    names = sort_naturally(p for p in found[0].iterdir() if p.suffix.lower() in PICTURE_SUFFIXES)
     places = [place / name for place in (found[0], events_folder.parent) for name in TIME_FILES]
     listing = next((place for place in places if place.is_file()), None)
     if listing is None:

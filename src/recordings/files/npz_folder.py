@@ -13,7 +13,7 @@ import numpy as np
 from src.recordings.files.event_file import EventFile, RawEvents, RawFrames, ReadOptions
 from src.recordings.files.frame_files import find_timelens_frames
 from src.recordings.files.numpy_file import NumpyFile
-from src.sim.scenes.video_files import sort_by_name
+from src.sim.scenes.video_files import sort_naturally
 
 EVENT_FOLDERS = (".", "events", "events_aligned")
 FRACTIONS = 32  # of a pixel in which BS-ERGB has x and y, in 16 bits
@@ -36,7 +36,7 @@ class NpzFolder(EventFile):
     def __init__(self, path: Path, options: ReadOptions):
         self.path, self._options = path, options
         self._folder = find_npz_folder(path) or path
-        self._names = sort_by_name(self._folder.glob("*.npz"))
+        self._names = sort_naturally(self._folder.glob("*.npz"))
         first = NumpyFile(self._names[0], options)
         self.size, self.notes, self.time_unit = first.size, first.notes, first.time_unit
 

@@ -133,10 +133,8 @@ class MeasuredTurbulence(SimulatedTurbulence):
     ) -> Turbulence:
         """Return the operator of an atmosphere that was drawn for a smaller side of SIDE pixels."""
         if drawn is not None:  # an atmosphere's pixels are of the width
-            covered_m = (
-                drawn.scene_width_m * frames["width"] / min(frames["height"], frames["width"])
-            )
-            drawn = replace(drawn, scene_width_m=covered_m)
+            height, width = frames["height"], frames["width"]
+            drawn = replace(drawn, scene_width_m=drawn.scene_width_m * width / min(height, width))
         return super().operator(drawn, views=views, **frames)
 
     def draw(self, generator: torch.Generator) -> Atmosphere:

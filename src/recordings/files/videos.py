@@ -14,7 +14,7 @@ from jaxtyping import Float
 from src.recordings.files.event_file import name_file_in_errors
 from src.recordings.files.hdf5_file import check_hdf5_safety
 from src.sim.scenes.video_decoding import LARGEST_PIXELS
-from src.sim.scenes.video_files import PICTURE_SUFFIXES, read_picture, sort_by_name
+from src.sim.scenes.video_files import PICTURE_SUFFIXES, read_picture, sort_naturally
 from src.sim.scenes.video_index import index_video
 
 
@@ -45,17 +45,28 @@ def read_fps(
     if path.is_dir():
         return None
     if path.suffix == ".h5":
-        with _opened_h5(path) as file:
-            times = file["time_s"][:2] if "time_s" in file else []
-        known = len(times) == 2 and times[1] > times[0]
-        return float(1 / (times[1] - times[0])) if known else None
+        times = read_times(path)
+        if times is None or len(times) < 2 or times[1] <= times[0]:
+            return None
+        return float(1 / (times[1] - times[0]))
     return index_video(path, config_key, max_frames).fps
+
+
+def read_times(path: Path) -> Float[np.ndarray, " frames"] | None:
+    """Return the seconds of the frames of our `video.h5`; None of a video that does not hold them.
+
+    Raises ValueError for an HDF5 that cannot be read.
+    """
+    if path.suffix != ".h5":
+        return None
+    with _opened_h5(path) as file:
+        return np.asarray(file["time_s"], np.float64) if "time_s" in file else None
 
 
 def _frames(path: Path, config_key: str, max_frames: int | None) -> Iterator[np.ndarray]:
     if path.is_dir():
         found = (name for name in path.iterdir() if name.suffix.lower() in PICTURE_SUFFIXES)
-        names = sort_by_name(name for name in found if name.name[0] != ".")
+        names = sort_naturally(name for name in found if name.name[0] != ".")
         yield from map(read_gray_picture, names)
     elif path.suffix == ".h5":
         with _opened_h5(path) as file:

@@ -81,8 +81,8 @@ def find_videos(root: Path, config_key: str = "scene.root") -> list[VideoSource]
     return videos
 
 
-def sort_by_name(paths: Iterable[Path]) -> list[Path]:
-    """Return paths in order of name, the numbers in names by their value: 2.png before 10.png."""
+def sort_naturally(paths: Iterable[Path]) -> list[Path]:
+    """Return paths in natural order of their names, numbers by value: 2.png before 10.png."""
     return sorted(
         paths,
         key=lambda path: [
@@ -93,7 +93,7 @@ def sort_by_name(paths: Iterable[Path]) -> list[Path]:
 
 def _folder_sources(path: Path, config_key: str) -> list[VideoSource]:
     """Return the folder as one video, none where no frames are in it."""
-    names = sort_by_name(path.iterdir())
+    names = sort_naturally(path.iterdir())
     frames = [p for p in names if p.suffix.lower() in PICTURE_SUFFIXES and p.name[0] != "."]
     return [VideoSource(path.name, len(frames), config_key, frames=tuple(frames))] if frames else []
 

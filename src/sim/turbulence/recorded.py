@@ -68,7 +68,7 @@ class RecordedTurbulence:
     def operator(
         self, drawn: str, *, views: Sequence[Position], height: int, width: int, fps: float
     ) -> "RecordedTurbulenceOperator":
-        if len({(row % 3, col % 3) for row, col in views}) < len(views):
+        if len(set(map(_place_in_block, views))) < len(views):
             raise ValueError(
                 f"optics must have at most nine views, within 3x3, for turbulence=recorded: each "
                 f"has a piece of the footage of its own; got {len(views)} views"
@@ -127,8 +127,7 @@ class RecordedTurbulenceOperator:
         """Return what one view's piece does, mirrored, turned and played as drawn for this view;
         views of a 3x3 block have different pieces, which are shuffled into `order`.
         """
-        row, col = position
-        stretch, place = divmod(order[3 * (row % 3) + col % 3], PLACES**2)
+        stretch, place = divmod(order[_place_in_block(position)], PLACES**2)
         drawn = noise.uniform(noise.key(key, view_id(position), "piece"), torch.arange(5)).tolist()
         across, down, turned, back = (u < 0.5 for u in drawn[:4])
         sign = (-1.0 if across else 1.0, -1.0 if down else 1.0)
@@ -145,6 +144,12 @@ class RecordedTurbulenceOperator:
         else:
             moved = self.fields.sample(time, below + y, right + x)
         return self.tilt_rms_px * torch.tensor(sign)[:, None, None] * moved
+
+
+def _place_in_block(position: Position) -> int:
+    """Return which of nine a view is in blocks of 3x3."""
+    row, col = position
+    return 3 * (row % 3) + col % 3
 
 
 def _warp_views(
