@@ -20,7 +20,8 @@ def draw_speed_accuracy_chart(cfg: DictConfig) -> dict[str, str]:
     """
     run, side = Path(cfg.paths.run), cfg.sizes[0] if cfg.sizes else 0
     measured = (cfg.sizes, cfg.threads, cfg.forms, cfg.devices)
-    speed_accuracy.check_chart_options(*measured, cfg.severities, cfg.clips)
+    speed_accuracy.check_chart_options(*measured, cfg.severities, cfg.clips, cfg.seconds)
+    build.check_unscored_windows(cfg)
     candidates = compared_networks.load_candidates(cfg)
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     benchmark = SpeedBenchmark(run, seconds=cfg.seconds, bins=cfg.bins)

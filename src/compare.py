@@ -39,7 +39,8 @@ def compare(cfg: DictConfig) -> dict:
     `residual_displacement_px`, along a line or a ray that turns with the scene, is of what is
     static there, `line_deviation_px` of what moves uniformly along a line or a circle.  With
     `still` the whole scene is static (`slice_motion.measure_static_scene`).  Raises ValueError for
-    a video that cannot be read or has another size than the first, or a slice outside the frame.
+    a video that cannot be read, has another size than the first or another frame rate than `fps`,
+    or a slice outside the frame.
     """
     run = Path(cfg.paths.run)
     if not cfg.videos:
@@ -50,25 +51,24 @@ def compare(cfg: DictConfig) -> dict:
         raise ValueError(f"names must be one per video, got {len(names)} for {len(cfg.videos)}")
     if len(set(names)) < len(names):
         raise ValueError(f"names must differ, got {', '.join(names)}")
+    _check_frame_rate(cfg)
     read = (np.stack(list(videos.read_video(path, "videos"))) for path in cfg.videos)
-    films = [film[cfg.first : cfg.last] for film in read]
-    given = {name: cfg[name] for name in slices.KINDS if cfg[name]}
+    films = [
+        _cut_part(film, cfg.first, cfg.last, name) for name, film in zip(names, read, strict=True)
+    ]
+    given = {name: cfg[name] for name in slices.KINDS if cfg[name] is not None}
     if len(given) != 1:
         raise ValueError(f"give one of line, circle, spin and still, got {given or 'none'}")
-    films = slices.shrink_to_smallest(films) if cfg.still else films
+    films = slices.shrink_to_smallest(films) if "still" in given else films
     sizes = {film.shape[1:] for film in films}
     if len(sizes) > 1:
         raise ValueError(f"videos must be of one size (h, w), got {sorted(sizes)}")
+    cuts = [slices.cut_slice(film, fps=cfg.fps, **given) for film in films]
+    motions = [_measure(film, across, cfg, next(iter(given)))
+               for film, (across, _) in zip(films, cuts, strict=True)]  # fmt: skip
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
-    scores, rows = {}, []
-    for name, path, film in zip(names, cfg.videos, films, strict=True):
-        across, points = slices.cut_slice(film, fps=cfg.fps, **given)
-        if cfg.still:
-            scores[name] = slice_motion.measure_static_scene(film, cfg.still)
-        else:
-            scores[name] = slice_motion.measure_slice_motion(
-                across, next(iter(given)), cfg.moving_object_brightness
-            )
+    scores, rows = dict(zip(names, motions, strict=True)), []
+    for name, path, film, (across, _) in zip(names, cfg.videos, films, cuts, strict=True):
         if cfg.reference_images:
             scores[name] |= camera_frames.score_against_camera(
                 Path(path), Path(cfg.reference_images), slice(cfg.first, cfg.last)
@@ -76,11 +76,33 @@ def compare(cfg: DictConfig) -> dict:
         notes = [NOTES[measure].format(value) for measure, value in scores[name].items()]
         rows.append(comparison.VideoRow(name, film, across, "\n".join(notes)))
     comparison.draw_comparison(
-        rows, run / "comparison.png", line=points, axis=cfg.axis_label, samples=cfg.frames_shown,
-        length_s=min(map(len, films)) / cfg.fps,
+        rows, run / "comparison.png", line=cuts[0][1], axis=cfg.axis_label,
+        samples=cfg.frames_shown, length_s=min(map(len, films)) / cfg.fps,
     )  # fmt: skip
     rich.print(scores, f"in {run}")
     return scores
+
+
+def _check_frame_rate(cfg: DictConfig) -> None:
+    for path in cfg.videos:
+        own = videos.read_fps(path, "videos") if Path(path).suffix == ".h5" else None
+        if own is not None and not math.isclose(own, cfg.fps, rel_tol=0.01):
+            raise ValueError(f"fps must be that of {path}, {own:g}, got {cfg.fps}")
+
+
+def _cut_part(film: np.ndarray, first: int, last: int | None, name: str) -> np.ndarray:
+    part = film[first:last]
+    if not len(part):
+        got = f"{first} and {'null' if last is None else last}"
+        why = f"{name} has {len(film)} frames"
+        raise ValueError(f"first must be before last and in the video, got {got}: {why}")
+    return part
+
+
+def _measure(film: np.ndarray, across: slices.Slice, cfg: DictConfig, kind: str) -> dict:
+    if kind == "still":
+        return slice_motion.measure_static_scene(film, cfg.still)
+    return slice_motion.measure_slice_motion(across, kind, cfg.moving_object_brightness)
 
 
 def default_video_names(paths: Sequence[Path]) -> list[str]:
@@ -92,16 +114,21 @@ def default_video_names(paths: Sequence[Path]) -> list[str]:
 
 
 def check_slice(cfg: DictConfig) -> None:
-    """Raise ValueError for an `fps` or a slice of another form than cut_slice takes."""
+    """Raise ValueError for an `fps`, a number of frames or a slice of another form than
+    `cut_slice` takes."""
     if not 0 < cfg.fps < math.inf:
         raise ValueError(f"fps must be > 0 frames a second, got {cfg.fps}")
     for key, form in FORMS.items():
         try:
-            given = np.array(OmegaConf.to_object(cfg[key]) if cfg[key] else form)
+            given = np.array(form if cfg[key] is None else OmegaConf.to_object(cfg[key]))
         except ValueError:  # rows of several lengths
             given = np.empty(0, str)
         if given.dtype.kind not in "if" or given.shape != np.shape(form):
             raise ValueError(f"{key} must be numbers as in {form}, got {cfg[key]}")
+        if key != "line" and not given[2] >= 1:
+            raise ValueError(f"{key} must have a radius of 1 pixel or more, got {cfg[key]}")
+    if cfg.frames_shown < 1:
+        raise ValueError(f"frames_shown must be >= 1, got {cfg.frames_shown}")
 
 
 if __name__ == "__main__":

@@ -13,9 +13,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from omegaconf import DictConfig
 
-import src.models
 from src.app import build, entry_point
-from src.app.instantiate import read_user_packages
 from src.live_view.event_feeds import Feed, open_feed
 from src.live_view.feed_reader import FeedReader, PlaybackClock
 from src.live_view.frame_buffer import FrameRing, PolarityAccumulator
@@ -70,11 +68,13 @@ def load_offered_networks(cfg: DictConfig, name: str, views: int) -> dict[str, E
 
     Raises ValueError where that one wants another number of `views`; others that do are left out.
     """
-    networks, packages = {}, read_user_packages(cfg)
+    networks = {}
     for other in dict.fromkeys([*cfg.offered_networks, name]):
-        is_own = other == name
-        loaded = build.load_ckpt_or_baseline(cfg) if is_own else src.models.load(other, packages)
-        networks[other] = require_event_network(loaded)
+        if other == name:
+            networks[other] = require_event_network(build.load_ckpt_or_baseline(cfg))
+            continue
+        wanted = "offered_networks must be networks"
+        networks[other] = build.load_network_of_kind(EventToVideoNetwork, cfg, other, wanted)
     takes_all_views(networks[name], views)
     return {other: net for other, net in networks.items() if net.views in (None, 1, views)}
 

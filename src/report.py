@@ -21,21 +21,30 @@ def report(cfg: DictConfig) -> list[tables.Table]:
     With `columns` the Markdown has these of the scores, no other table and no command.  With
     `into` it also replaces that file's section of the same title.
     """
-    folders, out = _list_folders(cfg.run), Path(cfg.paths.run)
+    folders, out = _list_folders("run", cfg.run), Path(cfg.paths.run)
+    if not cfg.media_mib >= 0:
+        raise ValueError(f"media_mib must be >= 0, got {cfg.media_mib}")
     found, plans = runs.find_runs(folders), list(map(_as_typed, runs.find_sweeps(folders)))
     names = {run.record.get("asked", {}).get("config", "") for run in found}
     title = cfg.title or (names.pop() if len(names) == 1 else "") or "runs"
+    if cfg.into:
+        writers.split_at_section(Path(cfg.into), title)
+    across = _list_texts(cfg.across)
+    run_groups.check_across(across, found)
     published = as_dict(cfg.paper)
     candidates: list[tables.Table | None] = []
     scores: dict[str, tables.Table] = {}
-    pairs, columns = _list_pairs(cfg.pairs), cfg.columns and _list_texts(cfg.columns)
+    pairs = _list_pairs(cfg.pairs)
+    columns = None if cfg.columns is None else _list_texts(cfg.columns)
+    if columns == []:
+        raise ValueError("columns must name one score or more, got []")
     differences: list[tables.Table] = []
     groups = []
     sweeps = dict.fromkeys([*(run.sweep for run in found), *(plan.sweep for plan in plans)])
     for name in sweeps:
         own = [run for run in found if run.sweep == name]
         planned = [plan for plan in plans if plan.sweep == name]
-        keys, made = run_groups.group_runs(own, planned, tuple(cfg.across))
+        keys, made = run_groups.group_runs(own, planned, across)
         of = f": {name}" if name and len(sweeps) > 1 else ""
         score_table = tables.build_score_table(f"Scores and cost{of}", keys, made, published)
         scores[f"Scores{of}"] = score_table
@@ -48,10 +57,12 @@ def report(cfg: DictConfig) -> list[tables.Table]:
         if pairs:
             differences.append(build_pair_table(f"Differences{of}", keys, made, pairs, columns))
     candidates += differences
-    if cfg.against:
-        theirs = runs.find_runs(_list_folders(cfg.against))
+    if cfg.against is not None:
+        others = runs.find_runs(_list_folders("against", cfg.against))
+        ours = run_groups.require_one_setting("run", found, across)
+        theirs = run_groups.require_one_setting("against", others, across)
         title_of = "Differences on the same clips"
-        candidates.append(build_difference_table(title_of, found, theirs, published))
+        candidates.append(build_difference_table(title_of, ours, theirs, published))
     shown = [table for table in candidates if table and table.rows]
     commands, figures = [plan.command for plan in plans], runs.find_charts_and_stress_maps(folders)
     printed, asked = shown, commands
@@ -87,8 +98,11 @@ def _list_pairs(given: Any) -> list[tuple[str, str]]:
     return [(str(ours), str(theirs)) for ours, theirs in pairs]
 
 
-def _list_folders(given: str | ListConfig) -> list[Path]:
-    return list(map(Path, _list_texts(given)))
+def _list_folders(key: str, given: str | ListConfig) -> list[Path]:
+    folders = list(map(Path, _list_texts(given)))
+    if not folders:
+        raise ValueError(f"{key} must name one folder or more, got []")
+    return folders
 
 
 def _list_texts(given: str | ListConfig) -> list[str]:

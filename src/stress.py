@@ -26,10 +26,13 @@ def stress(cfg: DictConfig) -> stress_results.Outcomes:
     """Run every stress test on every network; write the map, `stress.csv` and `stress.md`.
 
     Returns the outcomes, test by test and network by network.  Raises ValueError for networks,
-    tests or a number of processes that are none.
+    tests, or numbers of processes, clips or windows that are none.
     """
     if cfg.processes < 1:
         raise ValueError(f"processes must be >= 1, got {cfg.processes}")
+    if cfg.clips < 1:
+        raise ValueError(f"clips must be >= 1, got {cfg.clips}")
+    build.check_unscored_windows(cfg)
     run, config = Path(cfg.paths.run), entry_point.resolved_yaml(cfg)
     candidates, _ = _load(config)
     titles = {name: str(node.title) for name, node in cfg.stress_tests.items()}

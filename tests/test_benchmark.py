@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from src.app.benchmark import average_by_data_set
+from src.app.benchmark import MSE, average_by_data_set
 from src.convert import convert
 from src.eval import evaluate
+from src.records.results import summarize_scores
 from src.report import report
 from tests.recordings.files.frames import LAYOUTS, make_events, make_frames, write_recording
 from tests.test_recording_entry_points import config
@@ -136,8 +137,18 @@ def test_a_report_takes_it(tmp_path, run):
     (page,) = (tmp_path / "report").glob("*.md")
     (row,) = [line for line in page.read_text().splitlines() if line.startswith("| eval |")]
     cells = [cell.strip(" *") for cell in row.split("|")]
-    for name in ("lpips", "ssim"):
+    for name in ("lpips", "ssim", "mse"):
         assert f"{scores[name]['mean']:.3f}" in cells, name
+
+
+def test_sequences_count_by_their_frames_in_every_table():
+    clips = [{"data_set": "A", "frames": 1, "mse": 0.1, "ssim": 0.2},
+             {"data_set": "A", "frames": 3, "mse": 0.5, "ssim": 0.6}]  # fmt: skip
+    found = summarize_scores(clips, (MSE,))
+    assert found["mse"]["mean"] == pytest.approx(average_by_data_set(clips)["A"]["mse"])
+    assert found["ssim"]["mean"] == pytest.approx(0.5)
+    low, high = found["ssim"]["interval"]
+    assert low == pytest.approx(0.2) and high == pytest.approx(0.6)
 
 
 def _remove(name):

@@ -9,6 +9,7 @@ from baselines.mambatm import MambaTM
 from src.app.compared_networks import load_candidates
 from src.chart import draw_speed_accuracy_chart
 from src.models import save
+from src.models.e2vid import E2VID
 from tests.test_train import config
 
 HIGHPASS = "{baseline: {_target_: baselines.highpass.HighPass}, views: 1}"
@@ -70,6 +71,10 @@ def test_a_post_processor_is_scored_and_paid_for(tmp_path):
         ("devices=[tpu]", "devices must be of cpu, cuda"),
         ("severities=[]", "severities must be of"),
         ("clips=0", "clips must be >= 1"),
+        ("seconds=-1", "seconds must be > 0, got -1"),
+        ("threads=[2]", "threads must include 1, got 2"),
+        ("devices=[cuda]", "devices must include cpu, got cuda"),
+        ("data.test_windows=5", "data.unscored_windows must be in 0..3"),
     ],
 )
 def test_what_cannot_be_measured_is_named(tmp_path, override, message):
@@ -88,3 +93,16 @@ def test_published_networks_without_their_weights_are_timed_only(tmp_path, reque
     assert all(one.trained == found and one.network is not None for one in made)
     sizes = {one.name: sum(p.numel() for p in one.loaded.parameters()) for one in made}
     assert (sizes["pienet"], sizes["pienet_lite"]) == (171_121, 78_537)
+
+
+def test_files_of_one_name_are_networks_of_their_own(tmp_path):
+    for name, width in (("a", 4), ("b", 8)):
+        kwargs = {"views": 1, "base_channels": width}
+        (tmp_path / name).mkdir()
+        spec = {"target": "src.models.e2vid.E2VID", "kwargs": kwargs}
+        save(tmp_path / name / "net.safetensors", E2VID(**kwargs), spec, {})
+    files = [f"{tmp_path}/{name}/net.safetensors" for name in "ab"]
+    found = load_candidates(tiny(tmp_path, "+networks={}", f"ckpt=[{','.join(files)}]"))
+    assert [candidate.name for candidate in found] == files
+    (one,) = load_candidates(tiny(tmp_path, "+networks={}", f"ckpt=[{files[0]}]"))
+    assert one.name == "net"

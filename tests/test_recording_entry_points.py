@@ -284,6 +284,8 @@ def test_comparing_videos_draws_them_and_measures_their_slices(folder, found, tm
     numbers = compare(config("compare", tmp_path / "run", *line))
     assert set(numbers) == {"centre", "median"}
     assert (tmp_path / "run" / "comparison.png").is_file()
+    with pytest.raises(ValueError, match="fps must be that of .*centre/video.h5, 300, got 120"):
+        compare(config("compare", tmp_path / "wrong", line[0], line[2], "fps=120"))
 
 
 def test_what_turns_uniformly_is_straight_in_theta_and_still_in_r(tmp_path):
@@ -332,7 +334,14 @@ def test_videos_of_two_sizes_are_not_compared(tmp_path):
     "wrong, message",
     [
         ("line=null", "one of line, circle, spin and still"),
-        ("line=[[0,0],[500,0]]", "must stay"),
+        ("line=[[0,0],[500,0]]", "line must stay"),
+        ("circle=[15,10,60]", "circle must stay"),
+        ("circle=[15,10,-3]", "circle must have a radius of 1 pixel or more"),
+        ("spin=[15,10,-3,1,0]", "spin must have a radius of 1 pixel or more"),
+        ("still=0", r"still must be in 1\.\."),
+        ("line=[[0,0],[9,0]] first=5 last=5", "first must be before last and in the video, got 5"),
+        ("line=[[0,0],[9,0]] first=9", "first must be before last and in the video, got 9"),
+        ("line=[[0,0],[9,0]] frames_shown=0", "frames_shown must be >= 1, got 0"),
         (
             "line=[[0,0],[9,0]] moving_object_brightness=all",
             "moving_object_brightness must be one of",
@@ -345,6 +354,7 @@ def test_a_slice_that_cannot_be_taken_is_refused(wrong, message, tmp_path):
         cv2.imwrite(str(tmp_path / "film" / f"{k}.png"), np.zeros((20, 30), np.uint8))
     with pytest.raises(ValueError, match=message):
         compare(config("compare", tmp_path / "run", f"videos=[{tmp_path}/film]", *wrong.split()))
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_scene_that_stands_wanders_by_its_shifts_whatever_the_size(tmp_path):

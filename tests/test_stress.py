@@ -72,6 +72,14 @@ def test_two_processes_find_what_one_does(tmp_path, monkeypatch):
     assert texts[0] == texts[1]
 
 
-def test_no_process_at_all_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="processes must be >= 1, got 0"):
-        stress(tiny(tmp_path, "+networks={}", "processes=0"))
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ("processes=0", "processes must be >= 1, got 0"),
+        ("clips=0", "clips must be >= 1, got 0"),
+        ("data.test_windows=3", "data.unscored_windows must be in 0..1 .*, got 2"),
+    ],
+)
+def test_numbers_that_leave_nothing_to_test_are_refused(tmp_path, wrong, message):
+    with pytest.raises(ValueError, match=message):
+        stress(tiny(tmp_path, "+networks={}", wrong))

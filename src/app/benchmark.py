@@ -17,6 +17,7 @@ from baselines import published
 from baselines.centre_view import CentreViewNetwork
 from src.app import build, entry_point
 from src.app.instantiate import as_dict, build_part
+from src.metrics.table import Column
 from src.models import files
 from src.models.network import EventToVideoNetwork
 from src.recordings.evreal_protocol import (
@@ -32,7 +33,8 @@ from src.records import results
 from src.records.atomic import write_text
 from src.training import evaluation
 
-SCORES = {"mse": "MSE ↓", "ssim": "SSIM ↑", "lpips": "LPIPS ↓"}
+MSE = Column("mse", "MSE", 3, -1)
+SCORES = {"mse": MSE.title, "ssim": "SSIM ↑", "lpips": "LPIPS ↓"}
 RULE_KEYS = (
     "window", "events_per_window", "window_s", "max_grid_s", "histogram", "tolerance_ms",
     "warm_up_s",
@@ -112,6 +114,7 @@ class EvrealBenchmark:
             params=sum(part.numel() for part in self.network.parameters()),
             macs_per_frame=macs,
             latency_ms_by_size={f"{height}x{width}": milliseconds},
+            own_metrics=(MSE,),
         )
 
 

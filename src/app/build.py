@@ -62,10 +62,7 @@ def build_data_module(
     optics: Optics | None = None,
 ) -> LightFieldData:  # fmt: skip
     """Return the data module with the pipelines of `splits`; `optics`: others than `cfg`'s."""
-    unscored, most = cfg.data.unscored_windows, cfg.data.test_windows - 2  # jitter needs two frames
-    if not 0 <= unscored <= most:
-        allowed = f"0..{most} (data.test_windows={most + 2} less two)"
-        raise ValueError(f"data.unscored_windows must be in {allowed}, got {unscored}")
+    check_unscored_windows(cfg)
     pipelines = {split: build_pipeline(cfg, split, optics) for split in splits}
     train = pipelines.get("train")
     large = build_large_crop_stream(cfg, optics) if train else None
@@ -85,6 +82,14 @@ def build_data_module(
         test_conditions=describe_test_conditions(cfg, test.optics) if in_sweep and test else "",
         teachers=build_teachers(cfg, train.optics.views) if train and cfg.get("teachers") else None,
     )
+
+
+def check_unscored_windows(cfg: DictConfig) -> None:
+    """Raise ValueError unless two windows of a test clip are scored, as many as jitter needs."""
+    unscored, most = cfg.data.unscored_windows, cfg.data.test_windows - 2
+    if not 0 <= unscored <= most:
+        allowed = f"0..{most} (data.test_windows={most + 2} less two)"
+        raise ValueError(f"data.unscored_windows must be in {allowed}, got {unscored}")
 
 
 def build_teachers(cfg: DictConfig, views: int) -> TeacherEnsemble:

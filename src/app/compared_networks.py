@@ -26,15 +26,14 @@ def load_candidates(cfg: DictConfig) -> list[Candidate]:
     `baseline` that cannot be loaded, and for entries that are none.
     """
     packages = read_user_packages(cfg)
-    names = cfg.ckpt if isinstance(cfg.ckpt, ListConfig) else [cfg.ckpt] if cfg.ckpt else []
-    loaded = {
-        Path(name).stem if Path(name).suffix else name: src.models.load(name, packages)
-        for name in names
-    }
+    given = cfg.ckpt if isinstance(cfg.ckpt, ListConfig) else [cfg.ckpt] if cfg.ckpt else []
+    files = list(dict.fromkeys(map(str, given)))
+    shown = zip(_name_networks(files), files, strict=True)
+    loaded = {name: src.models.load(file, packages) for name, file in shown}
     if cfg.get("baseline"):
-        loaded[str(cfg.baseline.get("architecture", "baseline"))] = build_part(
-            cfg, "baseline"
-        ).eval()
+        name = str(cfg.baseline.get("architecture", "baseline"))
+        name = f"baseline {name}" if name in loaded else name
+        loaded[name] = build_part(cfg, "baseline").eval()
     if loaded:
         networks = {name: _require_event_network(name, net) for name, net in loaded.items()}
         return [Candidate(n, net, net.views or cfg.optics.views) for n, net in networks.items()]
@@ -43,6 +42,12 @@ def load_candidates(cfg: DictConfig) -> list[Candidate]:
     if not candidates:
         raise ValueError("networks must name at least one network, got none")
     return candidates
+
+
+def _name_networks(files: Sequence[str]) -> list[str]:
+    """Return the names of the files without their ends; paths where several have one name."""
+    stems = [Path(file).stem if Path(file).suffix else file for file in files]
+    return stems if len(set(stems)) == len(stems) else list(files)
 
 
 def _load_entry(name: str, entry: Mapping, packages: Sequence[str]) -> Candidate:

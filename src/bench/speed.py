@@ -79,6 +79,7 @@ class SpeedBenchmark:
         self._peak_macs_per_s = cache(measure_peak_conv_macs_per_s)
         self._macs = cache(self._count_macs)
         self._postprocessor_ms = cache(time_postprocessor)
+        self._onnx_file = cache(self._export_onnx)
 
     def measure(
         self, candidate: Candidate, sides: Sequence[int], thread_counts: Sequence[int],
@@ -148,13 +149,15 @@ class SpeedBenchmark:
             )
             return runtime.step
         if form == "onnx":
-            path = self.folder / f"{entry.network}_{side}.onnx"
-            if not path.is_file():
-                export_onnx(network, path, views=views, height=side, width=side, bins=self.bins)
-            network = OnnxNetwork(path, threads)
+            network = OnnxNetwork(self._onnx_file(network, entry.network, views, side), threads)
         else:
             network = convert_to_form(inference_copy(network), form)
         return build_grid_step(network.to(entry.device), views, side, side, bins=self.bins)
+
+    def _export_onnx(self, network: EventToVideoNetwork, name: str, views: int, side: int) -> Path:
+        path = self.folder / f"{name.replace('/', '_')}_{side}.onnx"
+        export_onnx(network, path, views=views, height=side, width=side, bins=self.bins)
+        return path
 
     def _time_postprocessor(self, candidate: Candidate, entry: SpeedMeasurement) -> float:
         """Return its ms for a frame, 0 without one; raises ValueError where a small frame shows

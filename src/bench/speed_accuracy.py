@@ -20,7 +20,9 @@ Name = TypeVar("Name", bound=Hashable)
 SEVERITIES = ("weak", "medium", "strong", "mixed")
 
 
-def check_chart_options(sizes, threads, forms, devices, severities, clips: int) -> None:
+def check_chart_options(
+    sizes, threads, forms, devices, severities, clips: int, seconds: float
+) -> None:
     """Raise ValueError, naming the key, for what cannot be measured."""
     rules = {
         "sizes must be multiples of 8 from 16 on": (sizes, lambda s: s >= 16 and s % 8 == 0),
@@ -29,10 +31,16 @@ def check_chart_options(sizes, threads, forms, devices, severities, clips: int) 
         "devices must be of cpu, cuda": (devices, ("cpu", "cuda").__contains__),
         f"severities must be of {', '.join(SEVERITIES)}": (severities, SEVERITIES.__contains__),
         "clips must be >= 1": ([clips], lambda count: count >= 1),
+        "seconds must be > 0": ([seconds], lambda value: 0 < value < math.inf),
     }
     for rule, (values, is_allowed) in rules.items():
         if not len(values) or not all(map(is_allowed, values)):
             raise ValueError(f"{rule}, got {', '.join(map(str, values)) or 'none'}")
+    for key, needed, values in (("threads", 1, threads), ("devices", "cpu", devices)):
+        if needed not in values:  # find_fastest_forms
+            listed = ", ".join(map(str, values))
+            why = "networks are compared by the time of one CPU thread"
+            raise ValueError(f"{key} must include {needed}, got {listed}: {why}")
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,9 @@ def cut_slice(
 ) -> tuple[Slice, Points]:  # fmt: skip
     """Return one slice and its points in the first frame: `line` [[x, y], [x, y]], `circle` [x, y,
     radius] or `spin` [x, y, radius, turns a second, degrees at the first frame]; of a `still` scene
-    the middle row.
+    the middle row.  Raises ValueError, with the name of the slice, where it leaves the frame.
     """
+    key = "spin" if spin else "circle" if circle else "line"
     if spin:
         x, y, radius, turns, degrees = spin
         angles_rad = math.radians(degrees) + 2 * math.pi * turns * np.arange(len(video)) / fps
@@ -35,20 +36,22 @@ def cut_slice(
     else:
         middle = video.shape[1] // 2
         points = line_points(*(line or ((0, middle), (video.shape[2] - 1, middle))))
-    return sample_points(video, points), points.reshape(-1, *points.shape[-2:])[0]
+    return sample_points(video, points, key), points.reshape(-1, *points.shape[-2:])[0]
 
 
 def sample_points(
-    video: Float[np.ndarray, "frames h w"], points: Points | Float[np.ndarray, "frames places 2"]
+    video: Float[np.ndarray, "frames h w"],
+    points: Points | Float[np.ndarray, "frames places 2"],
+    key: str = "a slice",
 ) -> Slice:
     """Return the video at `points`, of every frame or of each, float32; outside the nearest pixel
-    counts.  Raises ValueError for a point further than a pixel outside the frame.
+    counts.  Raises ValueError, with `key`, for a point further than a pixel outside the frame.
     """
     height, width = video.shape[1:]
     outside = (points < -1).any(-1) | (points[..., 0] > width) | (points[..., 1] > height)
     if outside.any():
         x, y = points[outside][0]
-        raise ValueError(f"a slice must stay in {width}x{height} px, got ({x:.1f}, {y:.1f})")
+        raise ValueError(f"{key} must stay in {width}x{height} px, got ({x:.1f}, {y:.1f})")
     places = np.broadcast_to(points, (len(video), *points.shape[-2:])).astype(np.float32)
     rows = [
         cv2.remap(frame.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=BORDER)

@@ -60,7 +60,9 @@ def open_feed(
         return CameraFeed(faults)
     if not recording.startswith("udp://"):
         size = sources.find_sensor_size(recording, sensor, options)
-        if lines := open_recording(recording, size[::-1], options).messages:
+        opened = open_recording(recording, size[::-1], options)
+        opened.check_first_events()
+        if lines := opened.messages:
             faults.report("reading", "; ".join(lines), until_cleared=True)
         return FileFeed(recording, size, loop, options)
     if sensor is None or not all(1 <= side <= LARGEST_SIDE for side in sensor):

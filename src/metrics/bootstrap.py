@@ -13,15 +13,20 @@ import numpy as np
 RESAMPLES, LEVEL = 4000, 0.95
 
 
-def bootstrap_interval(values: Sequence[float]) -> tuple[float, float]:
+def bootstrap_interval(
+    values: Sequence[float], weights: Sequence[float] | None = None
+) -> tuple[float, float]:
     """Return the 95 % interval of the mean of `values`, one per clip; one value has no width."""
-    return bootstrap_difference_interval([values], None)
+    return bootstrap_difference_interval([values], None, weights)
 
 
 def bootstrap_difference_interval(
-    ours: Sequence[Sequence[float]], theirs: Sequence[Sequence[float]] | None
-) -> tuple[float, float]:
+    ours: Sequence[Sequence[float]], theirs: Sequence[Sequence[float]] | None,
+    weights: Sequence[float] | None = None,
+) -> tuple[float, float]:  # fmt: skip
     """Return the interval of mean(ours) - mean(theirs); rows are seeds, columns the same clips.
+
+    `weights`: of the clips in a mean, such as their numbers of frames; None: all alike.
 
     Clips are resampled, in both at once; what the seeds add is independent in the two, Student's t
     of seeds - 1 degrees of freedom (0 for one seed).  None stands for zero.  Always the same draws.
@@ -33,18 +38,22 @@ def bootstrap_difference_interval(
     if any(len(row) != clips for row in [*ours, *(theirs or [])]):
         raise ValueError(f"every seed must have the same {clips} clips")
     picked = rng.integers(clips, size=(RESAMPLES, clips))
-    means = _means(ours, picked, rng)
+    shares = np.ones(clips) if weights is None else np.asarray(weights, dtype=float)
+    means = _means(ours, shares, picked, rng)
     if theirs is not None:
-        means = means - _means(theirs, picked, rng)
+        means = means - _means(theirs, shares, picked, rng)
     tail = 50 * (1 - LEVEL)
     low, high = np.percentile(means, [tail, 100 - tail])
     return float(low), float(high)
 
 
-def _means(rows: Sequence[Sequence[float]], picked: np.ndarray, rng: np.random.Generator):
+def _means(
+    rows: Sequence[Sequence[float]], shares: np.ndarray, picked: np.ndarray,
+    rng: np.random.Generator,
+) -> np.ndarray:  # fmt: skip
     values = np.asarray(rows, dtype=float)
-    means, seeds = values.mean(0)[picked].mean(1), len(values)
+    means, seeds = np.average(values.mean(0)[picked], axis=1, weights=shares[picked]), len(values)
     if seeds > 1:
-        standard_error = values.mean(1).std(ddof=1) / math.sqrt(seeds)
+        standard_error = np.average(values, axis=1, weights=shares).std(ddof=1) / math.sqrt(seeds)
         means = means + standard_error * rng.standard_t(seeds - 1, len(means))
     return means

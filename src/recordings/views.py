@@ -180,9 +180,15 @@ def views_or_whole_sensor(
 ) -> Views:
     """Return the views of the file `path` or, without one, the whole sensor as one view.
 
-    `resolution`: (height, width) of the model picture instead of that of the file or the sensor."""
+    `resolution`: (height, width) of the model picture instead of that of the file or the sensor.
+    Raises ValueError for one out of range."""
     views = load_views(path, sensor) if path else Views.single_view(sensor, sensor)
-    return replace(views, model=(resolution[0], resolution[1])) if resolution else views
+    if not resolution:
+        return views
+    try:
+        return replace(views, model=(resolution[0], resolution[1]))
+    except ValueError as error:
+        raise ValueError(str(error).replace("views.model", "resolution")) from error
 
 
 def load_views(path: Path | str, sensor: HeightWidth | None = None) -> Views:

@@ -44,7 +44,8 @@ class ScoreRow:
 def create_run_folder(run: Path, config: str) -> None:
     """Create the folder `run` and store the resolved `config` (YAML) in it.
 
-    Raises ValueError where the folder cannot be made or the disk is nearly full.
+    Raises ValueError where the folder cannot be made, holds results of another config, or the disk
+    is nearly full.
     """
     try:
         run.mkdir(parents=True, exist_ok=True)
@@ -54,6 +55,7 @@ def create_run_folder(run: Path, config: str) -> None:
     if free < LEAST_FREE_BYTES:
         needed, got = LEAST_FREE_BYTES >> 20, free >> 20
         raise ValueError(f"paths.out must have {needed} MiB free, got {got} MiB at {run}")
+    has_results(run, config)
     write_text(run / "config.yaml", config)
 
 
@@ -78,26 +80,36 @@ def hash_config(config: str) -> str:
 def has_results(run: Path, config: str) -> bool:
     """Return whether `run` holds the results of `config`.
 
-    Raises ValueError where it holds those of another config: a sweep overwrites no result.
+    Raises ValueError where it holds those of another config: no result is overwritten.
     """
     file = run / "results.json"
     if not file.is_file():
         return False
     if json.loads(file.read_text()).get("config_sha256") != hash_config(config):
-        why = "it holds results of another configuration"
-        raise ValueError(f"paths.out must be another folder, or {run} moved away: {why}")
+        keys = "hydra.run.dir, or paths.out of a sweep,"
+        raise ValueError(f"{keys} must be another folder: {run} holds results of another config")
     return True
 
 
 def summarize_scores(clips: list[dict], own_metrics: Iterable[Column] = ()) -> dict:
-    """Return {clips, metric: {mean, std, interval}} over clips; `interval`: 95 % bootstrap CI."""
+    """Return {clips, metric: {mean, std, interval}} over clips; `interval`: 95 % bootstrap CI.
+
+    Clips that state their number of `frames`, as recorded sequences do, count by it.
+    """
     summary: dict = {"clips": len(clips)}
+    weights = frame_weights(clips)
     names = (*NAMES, *(metric.name for metric in own_metrics))
     for metric in (name for name in names if clips and name in clips[0]):
         values = [clip[metric] for clip in clips]
-        mean, std = statistics.fmean(values), float(np.std(values))
-        summary[metric] = {"mean": mean, "std": std, "interval": bootstrap_interval(values)}
+        mean, std = statistics.fmean(values, weights), float(np.std(values))
+        interval = bootstrap_interval(values, weights)
+        summary[metric] = {"mean": mean, "std": std, "interval": interval}
     return summary
+
+
+def frame_weights(clips: list[dict]) -> list[float] | None:
+    """Return the number of frames of each clip where all state it, None: they count alike."""
+    return [float(clip["frames"]) for clip in clips] if all("frames" in c for c in clips) else None
 
 
 def write_and_print_results(

@@ -113,11 +113,14 @@ def _read(file: Path) -> Run:
     try:
         record = json.loads(file.read_text())
         schema, config = record["schema"], (file.parent / "config.yaml").read_text()
+        is_of_config = record.get("config_sha256") == results.hash_config(config)
         settings = flatten_settings(results.parse_settings_without_paths(config))
     except (OSError, ValueError, KeyError, TypeError, RecursionError, yaml.YAMLError) as error:
         raise ValueError(f"run must hold whole results, got {file}: {error}") from error
     if schema != results.SCHEMA:
         raise ValueError(f"schema must be {results.SCHEMA}, got {schema} in {file}")
+    if not is_of_config:
+        raise ValueError(f"run must hold whole results, got {file}: config.yaml is of another run")
     clips = file.parent / "clips.csv"
     rows = list(csv.DictReader(clips.read_text().splitlines())) if clips.is_file() else []
     return Run(file.parent, record, settings, rows)

@@ -2,12 +2,12 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from itertools import chain
 from statistics import fmean
 from typing import Any
 
 from src.metrics.bootstrap import bootstrap_difference_interval
 from src.metrics.table import Column
+from src.records.results import frame_weights
 from src.records.runs import Run
 from src.reports.run_groups import RunGroup, find_differing_test_conditions, find_published
 from src.reports.tables import Table, TableCell, check_columns, list_metrics
@@ -113,7 +113,8 @@ def _find_key_of_pair(groups: Sequence[RunGroup], pair: tuple[str, str]) -> int:
 
 def _check_clips(keys: str, ours: Sequence[Run], theirs: Sequence[Run]) -> None:
     """Raise ValueError, beginning with the `keys` of the config, unless all have the same clips."""
-    names = {tuple(clip["name"] for clip in run.clips) for run in [*ours, *theirs]}
+    runs = [*ours, *theirs]
+    names = {tuple((clip["name"], clip.get("frames")) for clip in run.clips) for run in runs}
     if len(names) != 1 or () in names:
         raise ValueError(f"{keys} must hold the same clips, got {len(names)} sets of them")
 
@@ -129,7 +130,9 @@ def _compare(
     left, right = (
         [[float(clip[metric]) for clip in run.clips] for run in side] for side in (ours, theirs)
     )
-    interval = bootstrap_difference_interval(left, right)
+    weights = frame_weights(ours[0].clips)
+    interval = bootstrap_difference_interval(left, right, weights)
     if len(left[0]) == 1:  # of one clip there is none
         interval = math.nan, math.nan
-    return fmean(chain(*left)), fmean(chain(*right)), interval
+    means = [fmean(fmean(row, weights) for row in side) for side in (left, right)]
+    return means[0], means[1], interval

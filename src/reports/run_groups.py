@@ -75,6 +75,26 @@ def group_runs(
     return keys, _count_missing(list(groups.values()), keys, plans)
 
 
+def require_one_setting(key: str, runs: Sequence[Run], across: Sequence[str] = ()) -> list[Run]:
+    """Return the runs, one per seed, of the one setting that `runs` are of.
+
+    Raises ValueError, with the `key` of the config, where they are of several.
+    """
+    keys, groups = group_runs(runs, across=across)
+    if len(groups) == 1:
+        return groups[0].runs
+    listed = "; ".join(", ".join(group.label) for group in groups)
+    got = f"{', '.join(keys)} of {listed} (across names what may differ)" if groups else "no runs"
+    raise ValueError(f"{key} must be runs of one setting with against, got {got}")
+
+
+def check_across(across: Sequence[str], runs: Sequence[Run]) -> None:
+    """Raise ValueError for a key of `across` that no run has."""
+    for key in across:
+        if not any(key in run.settings for run in runs):
+            raise ValueError(f"across must be settings of the runs, such as ckpt, got {key}")
+
+
 def find_differing_test_conditions(ours: Sequence[Run], theirs: Sequence[Run]) -> set[str]:
     """Return the keys of the test conditions that are not the same on both sides."""
     return {key for key, _ in _list_test_conditions(ours) ^ _list_test_conditions(theirs)}

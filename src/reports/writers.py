@@ -47,20 +47,33 @@ def format_csv_tables(tables: Sequence[Table]) -> str:
 def replace_section(document: Path, name: str, text: str) -> None:
     """Put `text` between the markers `<!-- report:name -->` and `<!-- end:name -->`, atomically.
 
-    A document without them gets a section of that name at its end.  Raises ValueError where the
-    document is not there, or the markers are not one pair.
+    A document without them gets a section of that name at its end.  Raises ValueError as
+    `split_at_section`.
+    """
+    start, end = _markers(name)
+    before, after = split_at_section(document, name)
+    results.write_text(document, f"{before}{start}\n\n{text.strip()}\n\n{end}{after}")
+
+
+def split_at_section(document: Path, name: str) -> tuple[str, str]:
+    """Return what is before and after the section `name`.
+
+    Raises ValueError where the document is not there, or the markers are not one pair.
     """
     if not document.is_file():
         raise ValueError(f"into must be a file, got {document}")
-    start, end = f"<!-- report:{name} -->", f"<!-- end:{name} -->"
+    start, end = _markers(name)
     content = document.read_text()
     if start not in content and end not in content:
         content = f"{content.rstrip()}\n\n## {name}\n\n{start}\n{end}\n"
     if (content.count(start), content.count(end)) != (1, 1) or end not in content.split(start)[1]:
         raise ValueError(f"into must hold {start} and after it {end} once, got {document}")
     before, rest = content.split(start)
-    after = rest.split(end)[1]
-    results.write_text(document, f"{before}{start}\n\n{text.strip()}\n\n{end}{after}")
+    return before, rest.split(end)[1]
+
+
+def _markers(name: str) -> tuple[str, str]:
+    return f"<!-- report:{name} -->", f"<!-- end:{name} -->"
 
 
 def format_cell(cell: TableCell, column: Column) -> str:

@@ -99,6 +99,13 @@ def test_a_feed_that_cannot_be_is_refused(address, sensor, kind, named):
         event_feeds.open_feed(address, sensor, FaultLog(), udp_format=kind)
 
 
+def test_a_recording_off_the_given_sensor_is_refused(tmp_path):
+    lines = [f"{1e-6 * k} {600 + k % 7} {400 + k % 5} 1" for k in range(50)]
+    (tmp_path / "events.txt").write_text("\n".join(lines))
+    with pytest.raises(ValueError, match="all 50 events are off the 10x10 sensor"):
+        event_feeds.open_feed(str(tmp_path / "events.txt"), (10, 10), FaultLog())
+
+
 def test_a_port_in_use_is_refused():
     first = event_feeds.UdpFeed("udp://127.0.0.1:0", (4, 4), "t64_x16_y16_on8", FaultLog())
     port = first.socket.getsockname()[1]

@@ -1,5 +1,6 @@
 """What runs are ahead of others by, clip by clip."""
 
+import os
 from dataclasses import replace
 
 import pytest
@@ -128,3 +129,38 @@ def test_one_clip_has_no_interval_and_is_not_bold(tmp_path):
     keys, groups = run_groups.group_runs(both)
     table = build_pair_table("Pairs", keys, groups, [("one", "two")], ["lpips"])
     assert "| one − two | -0.100 (+nan to +nan) |" in format_markdown([table])
+
+
+def test_an_older_run_of_a_seed_is_no_further_seed(tmp_path):
+    for name, lpips in (("old", 0.9), ("new", 0.3)):
+        clips = [SCORES | {"name": "c0", "lpips": lpips}, SCORES | {"name": "c1", "lpips": lpips}]
+        write_run(tmp_path / "runs" / name, clips=clips)
+        os.utime(tmp_path / "runs" / name / "results.json", (0, 100 if name == "old" else 200))
+    write_run(tmp_path / "peer", "one", clips=[c | {"lpips": 0.5} for c in clips])
+    given = [f"run={tmp_path}/runs", f"against={tmp_path}/peer"]
+    table = report(config("report", tmp_path / "out", *given))[-1]
+    assert [cell.text for cell in table.rows[0][1:4]] == ["0.3000", "0.5000", "-0.2000"]
+    assert "1 runs against 1" in table.note
+
+
+def test_several_settings_have_no_one_difference(tmp_path):
+    found(tmp_path, "lf3x3", {"a": 0.3, "b": 0.3})
+    found(tmp_path, "one", {"a": 0.4, "b": 0.4})
+    given = [f"run=[{tmp_path}/lf3x3,{tmp_path}/one]", f"against={tmp_path}/one"]
+    with pytest.raises(
+        ValueError, match="run must be runs of one setting with against.*lf3x3; one"
+    ):
+        report(config("report", tmp_path / "out", *given))
+    assert not (tmp_path / "out").exists()
+
+
+def test_sequences_count_by_their_frames_on_both_sides(tmp_path):
+    for name, values in (("lf3x3", (0.2, 0.6)), ("one", (0.4, 0.4))):
+        frames = zip(values, (30, 10), strict=True)
+        clips = [
+            SCORES | {"name": f"s{n}", "frames": f, "lpips": v} for v, f in frames for n in [f]
+        ]
+        write_run(tmp_path / name, name, clips=clips)
+    ours, theirs = (runs.find_runs([tmp_path / name]) for name in ("lf3x3", "one"))
+    row = build_difference_table("", ours, theirs, PAPER).rows[0]
+    assert [cell.text for cell in row[:4]] == ["LPIPS", "0.3000", "0.4000", "-0.1000"]

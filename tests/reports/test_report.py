@@ -295,3 +295,29 @@ def test_an_empty_folder_is_refused_and_nothing_is_written(tmp_path):
     with pytest.raises(ValueError, match="run must hold results.json"):
         report(config("report", tmp_path / "out", f"run={tmp_path / 'runs'}"))
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ("run=[]", "run must name one folder or more"),
+        ("against=[]", "against must name one folder or more"),
+        ("columns=[]", "columns must name one score or more"),
+        ("media_mib=-1", "media_mib must be >= 0, got -1"),
+        ("across=[nope]", "across must be settings of the runs, such as ckpt, got nope"),
+        ("into=nowhere.md", "into must be a file, got nowhere.md"),
+    ],
+)
+def test_a_wrong_value_writes_nothing(wrong, message, tmp_path):
+    write_run(tmp_path / "runs" / "a", clips=clips_of())
+    with pytest.raises(ValueError, match=message):
+        report(config("report", tmp_path / "out", f"run={tmp_path / 'runs'}", wrong))
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_folder_of_a_run_takes_no_other_config(tmp_path):
+    folder = write_run(tmp_path / "run", clips=clips_of())
+    before = (folder / "config.yaml").read_text()
+    with pytest.raises(ValueError, match=r"hydra\.run\.dir.*holds results of another config"):
+        report(config("report", folder, f"run={folder}"))
+    assert (folder / "config.yaml").read_text() == before

@@ -126,6 +126,14 @@ def test_an_empty_or_broken_run_folder_is_named(content, said, tmp_path):
     assert str(folder) in str(error.value) and "run" in str(error.value)
 
 
+def test_results_beside_the_config_of_another_run_are_refused(tmp_path):
+    folder = write_run(tmp_path / "run")
+    config = (folder / "config.yaml").read_text()
+    (folder / "config.yaml").write_text(config.replace("lf3x3", "single256"))
+    with pytest.raises(ValueError, match="config.yaml is of another run"):
+        runs.find_runs([folder])
+
+
 def test_a_folder_that_is_not_there_is_named(tmp_path):
     with pytest.raises(ValueError, match="no such folder"):
         runs.find_runs([tmp_path / "nowhere"])

@@ -60,6 +60,16 @@ class EventRecording:
         """Return what the user is told before the file is read."""
         return *self.file.notes, *self.survey.messages, *self.size_messages
 
+    def check_first_events(self) -> None:
+        """Raise ValueError where half of the first events or more are off the sensor."""
+        first = next(iter(self.survey.pieces or self.file.pieces()), None)
+        if self.size is None or first is None or not len(first.t):
+            return
+        (width, height), largest = self.size, np.array([first.x.max(), first.y.max()], int)
+        outside = int(np.sum((first.x >= width) | (first.y >= height)))
+        if outside >= sensor_size.MOST_OUTSIDE * len(first.t):
+            sensor_size.report_events_outside(self.path, self.size, len(first.t), outside, largest)
+
     def __iter__(self) -> Iterator[np.ndarray]:
         """Yield the events in pieces, not empty, in order of time; warn of what was wrong."""
         if self.survey.parts_are_on_and_off:
