@@ -74,7 +74,7 @@ def test_a_post_processor_is_scored_and_paid_for(tmp_path):
         ("seconds=-1", "seconds must be > 0, got -1"),
         ("threads=[2]", "threads must include 1, got 2"),
         ("devices=[cuda]", "devices must include cpu, got cuda"),
-        ("data.test_windows=5", "data.unscored_windows must be in 0..3"),
+        ("data.test_windows=2", "data.unscored_windows must be in 0..0"),
     ],
 )
 def test_what_cannot_be_measured_is_named(tmp_path, override, message):

@@ -354,7 +354,7 @@ def test_a_slice_that_cannot_be_taken_is_refused(wrong, message, tmp_path):
         cv2.imwrite(str(tmp_path / "film" / f"{k}.png"), np.zeros((20, 30), np.uint8))
     with pytest.raises(ValueError, match=message):
         compare(config("compare", tmp_path / "run", f"videos=[{tmp_path}/film]", *wrong.split()))
-    assert not (tmp_path / "run").exists()
+    assert not (tmp_path / "run" / "config.yaml").exists()
 
 
 def test_a_scene_that_stands_wanders_by_its_shifts_whatever_the_size(tmp_path):
