@@ -94,6 +94,8 @@ def _find_views_in_scene(
 def find_contrast_threshold(cfg: DictConfig, run: Path) -> dict[str, tuple]:
     """Match the recording's event rate with that of the configured simulation; write
     `threshold.csv` and `threshold.png`."""
+    if cfg.clips < 1:
+        raise ValueError(f"clips must be >= 1, got {cfg.clips}")
     options, pipeline = ReadOptions.from_keys(cfg), build.build_pipeline(cfg, "test")
     size = sources.find_sensor_size(cfg.recording, cfg.sensor_size, options)
     lookup = sensor_lookup.build_lookup(views_or_whole_sensor(cfg.views, size))

@@ -32,9 +32,8 @@ def train(cfg: DictConfig) -> dict:
     run, start = Path(cfg.paths.run), time.perf_counter()
     hardware.reserve_worker_cores(cfg)
     hardware.retain_freed_memory(cfg)
-    hardware.fill_in_precision(cfg)
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
-    first_weights = start_weights.set_model_from_start_weights(cfg)
+    first_weights = fill_in_settings(cfg)
     references = start_weights.load_reference_networks(cfg)
     if cfg.reference_baseline:
         references[cfg.reference_baseline.name] = build_part(cfg, "reference_baseline.method")
@@ -48,6 +47,7 @@ def train(cfg: DictConfig) -> dict:
         fit(trainer, module, data, ckpt)
         return {}
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
+    tracking.keep_earlier_metrics(run)
     beginning = start_weights.label_before_training(cfg, first_weights)
     before, _ = build.test_method(cfg, beginning, module.method, data, module.metrics)
     tracking.log_config_to_wandb(trainer.loggers, as_dict(cfg))
@@ -70,6 +70,15 @@ def train(cfg: DictConfig) -> dict:
     record = results.write_and_print_results(run, config, rows, note=note, **facts)
     tracking.log_results_to_wandb(trainer.loggers, record, pictures)
     return record
+
+
+def fill_in_settings(cfg: DictConfig) -> Path | None:
+    """Set what follows from the machine and from `start`; return the file of the latter.
+
+    Raises ValueError for a precision or a `start` that cannot be.
+    """
+    hardware.fill_in_precision(cfg)
+    return start_weights.set_model_from_start_weights(cfg)
 
 
 def fit(
@@ -107,4 +116,4 @@ def print_checkpoint_on_failure(trainer: lightning.Trainer) -> Iterator[None]:
 
 
 if __name__ == "__main__":
-    entry_point.run_command(train, "train")
+    entry_point.run_command(train, "train", fill_in_settings)

@@ -62,7 +62,7 @@ def test_a_wrong_value_is_one_line_and_exit_code_2_of_the_process(tmp_path):
     done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 2, done.stderr
     (line,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert "data.crop must be in 8..64" in line and "Traceback" not in done.stderr
+    assert "data.crop must be in 8..72" in line and "Traceback" not in done.stderr
     assert not list(tmp_path.rglob("results.json"))
 
 

@@ -164,6 +164,9 @@ def test_a_seed_draws_anew_and_the_same_seed_the_same():
         ({"sensor": "nosy"}, "sensor must be one of .*, noisy, .*, got nosy"),
         ({"views": 7}, "optics.views must be"),
         ({"overrides": ["foo=1"]}, "foo"),
+        ({"overrides": ["fps=240"]}, "overrides must not set fps: it is the argument fps"),
+        ({"overrides": ["write=a.raw"]}, "must not set write: it is of the command line alone"),
+        ({"seed": 1.5}, "seed must be a whole number, got 1.5"),
         ({"overrides": ["least_simulated_fps=0"]}, "least_simulated_fps must be in"),
     ],
 )
@@ -172,6 +175,18 @@ def test_a_wrong_argument_is_one_line_and_leaves_hydra_as_it_was(options, messag
     with pytest.raises(ValueError, match=message) as error:
         simulate_arrays(textured(2), fps=30, **options)
     assert "\n" not in str(error.value) and GlobalHydra.instance().hydra is before
+
+
+def test_an_array_moves_as_a_photograph_does():
+    still, moving = (
+        simulate_arrays(
+            textured(1)[0], "none", 1, seconds=0.1, overrides=[f"speed_widths_per_s={v}"]
+        )
+        for v in (0, 0.5)
+    )
+    assert len(still.events) == 0 and len(moving.events) > 100
+    with pytest.raises(ValueError, match=r"fps must be in .*got 0"):
+        simulate_arrays(textured(1)[0], "none", 1, fps=0)
 
 
 @pytest.mark.parametrize(

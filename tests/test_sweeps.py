@@ -135,3 +135,29 @@ def test_results_older_than_the_weights_are_made_again(tmp_path):
     assert entry_point._has_newer_weights(cfg, stored)
     cfg.task = "train"  # of which it is where it began
     assert not entry_point._has_newer_weights(cfg, stored)
+
+
+TRAINED = ["-m", "debug=fdr", "metrics.lpips=null", "loss=l1", "logger=none", "seed=0,1"]
+TRAINED += ["reference_baseline=null", "trainer.precision=null"]
+
+
+def test_a_sweep_of_trainings_that_starts_again_skips_what_is_done(tmp_path, capsys):
+    sweep = [*TRAINED, "start=single256", "experiment=single256", f"paths.out={tmp_path}"]
+    for skipped in (0, 2):
+        assert run_here("train", *sweep) == 0, capsys.readouterr().err
+        assert capsys.readouterr().out.count("skipped, its results stand") == skipped
+
+
+def test_results_of_a_training_from_other_weights_do_not_stand(tmp_path):
+    stored = tmp_path / "results.json"
+    for before, now, same in (
+        (None, "run/checkpoints", True), ("a.safetensors", "a.safetensors", True),
+        (None, "a.safetensors", False), ("a.safetensors", None, False),
+    ):  # fmt: skip
+        stored.write_text(json.dumps({"resumed_from": before}))
+        cfg = OmegaConf.create({"ckpt": now})
+        if same:
+            entry_point._check_same_beginning(cfg, stored)
+        else:
+            with pytest.raises(ValueError, match="ckpt must be"):
+                entry_point._check_same_beginning(cfg, stored)

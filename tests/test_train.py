@@ -112,7 +112,7 @@ def test_the_same_seed_gives_the_same_loss_curve(tmp_path):
 def test_eval_equals_the_test_of_training(tmp_path):
     train(config("train", tmp_path / "train", *TINY))
     ckpt = tmp_path / "train" / "checkpoints" / "last.ckpt"
-    same = [f"ckpt={ckpt}", "scene.height=64", "scene.width=64", "data.test_clips=1"]
+    same = [f"ckpt={ckpt}", "scene.height=72", "scene.width=72", "data.test_clips=1"]
     same += [
         "data.test_windows=4",
         "data.unscored_windows=1",

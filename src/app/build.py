@@ -9,7 +9,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from lightning.pytorch.callbacks import ProgressBar
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 from torchmetrics import Metric
 
@@ -211,6 +211,13 @@ def build_reconstructor(cfg: DictConfig, net: Trainable, spec: dict) -> Reconstr
         raise ValueError(f"data.loss_pairs must be in 1..{most} or null, got {pairs}")
     if cfg.train_hours and cfg.scheduler:
         raise ValueError(f"scheduler must be null with train_hours={cfg.train_hours}")
+    if cfg.scheduler and cfg.trainer.max_steps < 1:
+        why = "the scheduler's length follows from it; scheduler=null keeps the rate"
+        raise ValueError(f"trainer.max_steps must be >= 1, got {cfg.trainer.max_steps}: {why}")
+    dropout = "batch_view_dropout_probability"
+    if OmegaConf.select(cfg, f"augment.{dropout}") and getattr(net, "views", None) is not None:
+        takes = f"this network takes {net.views} views"
+        raise ValueError(f"augment.{dropout} must be 0, got {cfg.augment[dropout]}: {takes}")
     if cfg.channels_last:
         for layer in (layer for layer in net.modules() if isinstance(layer, nn.Conv2d)):
             layer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]

@@ -35,7 +35,8 @@ KEYS: dict[tuple[str, ...], str] = {
         air.max_frames dots.rows dots.cols data.batch_size data.test_seed data.batch_reuse
         data.epoch_clips data.windows data.substeps data.workers data.test_windows
         data.test_clips data.val_clips data.unscored_windows data.loss_from
-        data.events_per_window optics.views width scene.height scene.width sample_clips
+        data.events_per_window trainer.max_steps callbacks.rotation.every_n_train_steps
+        optics.views width scene.height scene.width sample_clips
         live:threads
     """,
     (LIST, NULL): "sensor_size resolution line circle spin names data.rates",
@@ -52,6 +53,11 @@ KEYS: dict[tuple[str, ...], str] = {
     (WORD, NUMBER, NULL): "trainer.precision",
     (NUMBER, WORD, LIST): "trainer.devices",
 }
+LEAST = {  # of whole numbers that another class would refuse without their key
+    "bins": 1, "data.test_clips": 1, "data.val_clips": 0, "data.workers": 0, "sample_clips": 0,
+    "seed": 0, "width": 1, "callbacks.rotation.every_n_train_steps": 1,
+}  # fmt: skip
+MOST = {"seed": 2**32 - 1}
 KINDS = {key: kinds for kinds, keys in KEYS.items() for key in keys.split()}
 # Parts whose own classes check whether a number, a range of numbers or null does.
 RANGES = ("augment.", "optics.", "own_sensor.", "scene.", "sensor.", "target.", "turbulence.")
@@ -151,6 +157,10 @@ def _check_value(key: str, value: Any, default: Any, entry_point: str, is_requir
         raise ValueError(f"{key} must be {' or '.join(kinds)}, got {got}")
     if is_required and value == "":
         raise ValueError(f"{key} must be a word, got none")
+    least, most = LEAST.get(key, value), MOST.get(key, value)
+    if key in LEAST and type(value) is int and not least <= value <= most:
+        allowed = f">= {least}" if key not in MOST else f"in {least}..{most}"
+        raise ValueError(f"{key} must be {allowed}, got {value}")
     if key in SIZES and value is not None and not _is_size(value):
         raise ValueError(f"{key} must be [height,width], whole numbers >= 1, got {value}")
 

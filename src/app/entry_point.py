@@ -1,6 +1,7 @@
 """What all entry points share: the folder of a run, errors, exit codes."""
 
 import functools
+import json
 import logging
 import os
 import signal
@@ -40,15 +41,21 @@ class JobFailed(Exception):
     """A job of the sweep in this folder failed; the others ran."""
 
 
-def run_command(work: Callable[[DictConfig], object], config: str) -> None:
-    """Run `work` on `conf/<config>.yaml` and the overrides of the command line, as `run_main`."""
+def run_command(
+    work: Callable[[DictConfig], object], config: str, fill_in: Callable | None = None
+) -> None:
+    """Run `work` on `conf/<config>.yaml` and the overrides of the command line, as `run_main`.
+
+    `fill_in` sets what `work` would set in the config: the results of a sweep's job are compared
+    with it.
+    """
     failures: list[Exception] = []
 
     @hydra.main(version_base=None, config_path=CONF, config_name=config)
     @functools.wraps(work)
     def main(cfg: DictConfig) -> None:
         try:
-            run_job(work, cfg)
+            run_job(work, cfg, fill_in)
         except Exception as error:
             if HydraConfig.get().runtime.choices.get("hydra/launcher") != "basic":
                 raise  # a process of its own
@@ -110,7 +117,9 @@ def _is_in_the_way_of_run(error: OSError) -> bool:
     return callers[-1].parts[-3:] == ("hydra", "core", "utils.py")
 
 
-def run_job(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:
+def run_job(
+    work: Callable[[DictConfig], object], cfg: DictConfig, fill_in: Callable | None = None
+) -> None:
     """Run `work` in the folder Hydra made for this job, with `verbose` after the config is printed;
     end W&B's run.
 
@@ -128,7 +137,11 @@ def run_job(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:
     folder, name = Path(cfg.paths.run), " ".join(map(unquote_override, job.overrides.task))
     (folder / FAILURE_FILE).unlink(missing_ok=True)
     try:
+        if fill_in:
+            fill_in(cfg)
         stored = results.has_results(folder, resolved_yaml(cfg))
+        if stored and cfg.get("task") == "train":
+            _check_same_beginning(cfg, folder / "results.json")
         if stored and not _has_newer_weights(cfg, folder / "results.json"):
             print(f"skipped, its results stand: {name}, in {folder}")
         else:
@@ -139,6 +152,20 @@ def run_job(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:
         print(f"failed: {name}: {' '.join(str(error).split())}", file=sys.stderr)
         results.write_text(folder / FAILURE_FILE, f"{name}\n{traceback.format_exc()}")
         raise JobFailed(job.sweep.dir) from error
+
+
+def _check_same_beginning(cfg: DictConfig, stored: Path) -> None:
+    """Raise ValueError where the training of the results `stored` went on from other weights than
+    `ckpt`; what it was resumed from does not matter."""
+    before = json.loads(stored.read_text()).get("resumed_from")
+    weights = [
+        name if name and files.is_weights_file(files.locate(name)) else None
+        for name in (before, cfg.ckpt)
+    ]
+    if weights[0] != weights[1]:
+        raise ValueError(
+            f"ckpt must be {weights[0]}, as of the results in {stored}, got {cfg.ckpt}"
+        )
 
 
 def _has_newer_weights(cfg: DictConfig, stored: Path) -> bool:

@@ -21,6 +21,11 @@ from src.sim.scenes.video_files import PICTURE_SUFFIXES
 VIEW_EVENT = np.dtype(
     [("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8), ("view", np.uint16)]
 )
+ARGUMENTS = ("fps", "seconds", "start_s", "end_s", "longest_side_px", "seed")
+NO_OVERRIDES = {key: f"it is the argument {key}" for key in ARGUMENTS}
+NO_OVERRIDES |= {"optics.views": "it is the argument views"}
+NO_OVERRIDES |= dict.fromkeys(("photo", "video"), "it is the argument photo_or_video")
+NO_OVERRIDES |= dict.fromkeys(("write", "like", "split"), "it is of the command line alone")
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,9 +64,15 @@ def simulate(
     mixed.  `sensor`: paper, ideal, noisy, evk4 ..., for sRGB and with a contrast threshold of 0.2
     unless `overrides` set sensor.input and sensor.threshold.  `fps`: None for that of the file, 120
     for a photograph, which lasts `seconds`; of a video the part from `start_s` to `end_s` is taken.
-    `overrides`: keys of conf/simulate.yaml as on the command line.  The result is a function of the
-    arguments.  Raises ValueError for values outside their range.
+    `overrides`: other keys of conf/simulate.yaml as on the command line.  The result is a function
+    of the arguments.  Raises ValueError for values outside their range, and for an override of an
+    argument or of a key of the command line alone.
     """
+    for override in overrides:
+        if (key := override.split("=")[0].lstrip("+~")) in NO_OVERRIDES:
+            raise ValueError(f"overrides must not set {key}: {NO_OVERRIDES[key]}")
+    if not isinstance(seed, int | np.integer):
+        raise ValueError(f"seed must be a whole number, got {seed}")
     for group, choice in (("turbulence", turbulence), ("sensor", sensor)):
         if choice not in (names := config_choices(group)):
             raise ValueError(f"{group} must be one of {', '.join(names)}, got {choice}")
@@ -76,6 +87,7 @@ def simulate(
         cfg.update(options | {key: str(path)})
         clip = read_own_clip(cfg)
     else:
+        options |= {"speed_widths_per_s": cfg.speed_widths_per_s, "seed": seed}
         clip = own_material.clip_from_array(photo_or_video, white_level=cfg.white_level, **options)
     return simulate_clip(OwnSimulation(cfg, clip))
 

@@ -21,6 +21,7 @@ from src.training.batch_sampler import LargeCropStream
 from src.training.clip_cache import CachedPipeline, ClipCache, DeviceClipCache
 from src.training.disk_cache import DiskClipCache, hash_file_lists
 
+OF_BOTH_STREAMS = ("loss_from", "loss_pairs", "batch_reuse", "workers", "simulate_on")
 NO_CLIPS = ("test_clips", "workers")  # keys of `data` that test clips do not follow from
 DEVICE_CACHES: dict[str, DeviceClipCache] = {}  # those of this process, by all that makes them
 
@@ -82,7 +83,9 @@ def build_clip_cache(cfg: DictConfig) -> ClipCache:
     if not clear and set(optics.positions) <= set(layout(9)):
         optics = replace(optics, views=9, positions=layout(9))
     windows, substeps = _count(cfg, "data.cache_windows"), _count(cfg, "data.substeps")
-    source = _build_uncached_pipeline(cfg, "train", optics, windows, side)
+    source = _build_uncached_pipeline(
+        cfg, "train", optics, windows, side, crop_key="data.cache_crop"
+    )
     gib, where = cfg.data.cache_gib, cfg.data.cache_device
     if not isinstance(gib, int | float):
         raise ValueError(f"data.cache_gib must be a number, got {gib}")
@@ -112,11 +115,18 @@ def build_large_crop_stream(
         other = cast(DictConfig, OmegaConf.merge(cfg, changes))
     except (OmegaConfBaseException, TypeError, ValueError) as error:
         raise ValueError(f"data.large.overrides must be [key=value, ...]: {error}") from error
-    if not other.data.loss_from < other.data.windows:
-        least = f"> data.loss_from, {other.data.loss_from}"
-        raise ValueError(f"data.large: data.windows must be {least}, got {other.data.windows}")
-    size = _count(other, "data.batch_size")
-    return LargeCropStream(build_pipeline(other, "train", optics), cfg.data.large.share, size)
+    for key in OF_BOTH_STREAMS:
+        if other.data[key] != cfg.data[key]:
+            raise ValueError(f"data.large.overrides must not set data.{key}: it is of both streams")
+    windows, first, pairs = other.data.windows, cfg.data.loss_from, cfg.data.loss_pairs
+    least = first + (2 * pairs if pairs else 1)
+    if type(windows) is not int or windows < least:
+        wanted = f">= {least}, for data.loss_from={first} and data.loss_pairs={pairs}"
+        raise ValueError(f"data.large: data.windows must be {wanted}, got {windows}")
+    share, size = cfg.data.large.share, _count(other, "data.batch_size")
+    if not isinstance(share, int | float):
+        raise ValueError(f"data.large.share must be a number, got {share}")
+    return LargeCropStream(build_pipeline(other, "train", optics), share, size)
 
 
 def _clip_inputs(cfg: DictConfig, optics: Optics) -> dict:
@@ -141,8 +151,9 @@ def _read_measured(turbulence: dict) -> str | None:
 
 
 def _build_uncached_pipeline(
-    cfg: DictConfig, split: str, optics: Optics, windows: int, crop: Any, clips: int | None = None
-) -> Pipeline:
+    cfg: DictConfig, split: str, optics: Optics, windows: int, crop: Any, clips: int | None = None,
+    crop_key: str = "",
+) -> Pipeline:  # fmt: skip
     """Return the pipeline that simulates every clip, out of no cache."""
     substeps = _count(cfg, "data.substeps")
     seed = _count(cfg, "seed" if split == "train" else "data.test_seed", least=0)
@@ -161,6 +172,7 @@ def _build_uncached_pipeline(
         bins=_count(cfg, "bins"),
         substeps=substeps,
         crop=crop,
+        crop_key=crop_key or ("data.crop" if split == "train" else "data.test_crop"),
         random_crop=split == "train",
         clips=clips,
         decodes_srgb=decodes_srgb(cfg),

@@ -23,6 +23,7 @@ from src.sim.optics import Position
 
 PACKAGES = ("onnx", "onnxscript", "onnxruntime")
 TOLERANCE = 1e-4  # largest difference from PyTorch, in grey levels, that an export may show
+USES_WINDOW_LENGTH = "uses_window_length"  # a fact in the file
 CHECKED_WINDOWS = 4  # windows over which it is compared
 
 
@@ -36,6 +37,8 @@ def export_onnx(
     two differ by more than TOLERANCE over a few windows of noise.
     """
     require_onnx()
+    if not Path(path).parent.is_dir():
+        raise ValueError(f"path must be in a folder that is there, got {path}")
     folded = inference_copy(network).cpu()
     voxels = torch.randn(1, views, bins, height, width, generator=torch.Generator().manual_seed(0))
     explicit = ExplicitStateNetwork(folded, positions)
@@ -57,9 +60,10 @@ def require_onnx() -> None:
 
 
 class OnnxNetwork(EventToVideoNetwork):
-    """The network of a file written by `export`, on ONNX Runtime with `threads` threads."""
+    """The network of a file written by `export_onnx`, on ONNX Runtime with `threads` threads.
 
-    uses_window_length = True
+    Raises ValueError without the packages and, called, for voxels of another size or type.
+    """
 
     def __init__(self, path: Path, threads: int = 1):
         require_onnx()
@@ -71,6 +75,9 @@ class OnnxNetwork(EventToVideoNetwork):
         providers = ["CPUExecutionProvider"]
         self.session = onnxruntime.InferenceSession(str(path), options, providers)
         self.inputs = {node.name: node.shape for node in self.session.get_inputs()}
+        self.views = self.inputs["voxels"][1]
+        facts = self.session.get_modelmeta().custom_metadata_map
+        self.uses_window_length = facts.get(USES_WINDOW_LENGTH, "True") == "True"
 
     def forward(
         self,
@@ -81,6 +88,9 @@ class OnnxNetwork(EventToVideoNetwork):
         positions: Sequence[Position] | None = None,
     ) -> tuple[Float[Tensor, "1 1 h w"], list]:
         """Return the frame and the state, arrays; `positions` are those of the export."""
+        if list(voxels.shape) != self.inputs["voxels"] or voxels.dtype != torch.float32:
+            wanted, got = self.inputs["voxels"], f"{voxels.dtype} {list(voxels.shape)}"
+            raise ValueError(f"voxels must be float32 {wanted}, as exported, got {got}")
         names = [name for name in self.inputs if name.startswith("state")]
         if state is None:
             state = [torch.zeros(self.inputs[name]).numpy() for name in names]
@@ -100,10 +110,15 @@ def _write(explicit: ExplicitStateNetwork, example: tuple, path: Path) -> None:
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")  # of the exporter's own parts about each other
-            torch.onnx.export(
-                explicit, example, str(path), dynamo=True, input_names=names, verbose=False,
-                output_names=["frame", *(f"after{k}" for k in states)], external_data=False,
+            program = torch.onnx.export(
+                explicit, example, dynamo=True, input_names=names, verbose=False,
+                output_names=["frame", *(f"after{k}" for k in states)],
             )  # fmt: skip
+            assert program is not None
+            program.model.metadata_props[USES_WINDOW_LENGTH] = str(
+                explicit.network.uses_window_length
+            )
+            program.save(path, external_data=False)
     except torch.onnx.OnnxExporterError as error:
         kind = type(explicit.network).__name__
         raise ValueError(f"{kind} has a part that ONNX cannot express") from error

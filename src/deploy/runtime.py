@@ -31,6 +31,8 @@ FORMS = ("float32", "bf16", "openvino")
 SIDE_MULTIPLE = 8  # sides are padded to it by reflection, as the networks do
 MIN_SIDE = 8  # side that can be padded so
 LEAST_INSIDE = 0.01  # of the events given for a window
+LONGEST_WINDOW_S = 10.0  # beyond, times are hardly in seconds
+LEAST_TIME_STEPS = 1000  # of the type of `t` in a window
 DTYPES = (np.float64, np.int64, np.int64, np.float32, np.int64)  # of t, x, y, p, view
 
 
@@ -95,6 +97,7 @@ class EventListRuntime:
             if (given := self.views) != (views := copied.views):
                 raise ValueError(f"optics.views must be {views} for this network, got {given}")
             self.runner = E2VIDOverEvents(copied, padded, dtype, backend, threads)
+        self.state_sizes = _describe_sizes(self.runner.state)
 
     def step(self, t, x, y, p, view, t0: float, t1: float) -> Float[np.ndarray, "h w"]:
         """Return the frame at `t1`, float32, as the network's `forward` gives it.
@@ -128,7 +131,10 @@ class EventListRuntime:
     @property
     def state(self) -> Any:
         """What lives from window to window, for `state = ...`; later windows advance it in place,
-        so that going back to it takes a `copy.deepcopy`.
+        so that going back to it takes a `copy.deepcopy`.  Set to None it is that of `reset`.
+
+        Raises ValueError where it is set to that of another kind of network, size or number of
+        views.
         """
         return self.runner.state
 
@@ -136,8 +142,13 @@ class EventListRuntime:
     def state(self, state: Any) -> None:
         if state is None:
             self.reset()
-        else:
-            self.runner.state = state
+            return
+        if _describe_sizes(state) != self.state_sizes:
+            raise ValueError(
+                "state must be that of a runtime of the same network, size and number of views, "
+                f"got another {type(state).__name__}"
+            )
+        self.runner.state = state
 
     def _checked(self, t, x, y, p, view, t0, t1) -> list[np.ndarray]:
         given = [np.asarray(part) for part in (t, x, y, p, view)]
@@ -155,11 +166,22 @@ class EventListRuntime:
         if kernels.has_event_error(t, x, y, p, view, self.views, *self.size, is_sign):
             raise ValueError(self._describe_error(t, x, y, p, view, is_sign))
         inside = np.searchsorted(t, t1, "right") - np.searchsorted(t, t0)
+        self._warn_of_units(given[0], t0, t1)
         if len(t) and inside < LEAST_INSIDE * len(t):
             reach = f"{t[0]:g} to {t[-1]:g}, the window is {t0:g} to {t1:g}"
             said = f"{inside} of {len(t)} events lie in the window: t is {reach}, in seconds"
             warnings.warn(said, stacklevel=4)
         return [t, x, y, p, view]
+
+    def _warn_of_units(self, t: np.ndarray, t0: float, t1: float) -> None:
+        if t1 - t0 > LONGEST_WINDOW_S:
+            said = f"a window lasts {t1 - t0:g} s: are t, t0 and t1 in seconds?"
+            warnings.warn(said, stacklevel=5)
+        if len(t) and t.dtype.kind == "f" and t.dtype.itemsize < 8:
+            step = float(np.spacing(np.abs(t[-1])))
+            if step * LEAST_TIME_STEPS > t1 - t0:
+                said = f"t is {t.dtype}, in steps of {step:g} s at {t[-1]:g} s: float64 resolves it"
+                warnings.warn(said, stacklevel=5)
 
     def _describe_error(self, t, x, y, p, view, is_sign: bool) -> str:
         """Return what is wrong with the first event that `has_event_error`."""
@@ -192,3 +214,15 @@ class EventListRuntime:
                 events = [np.concatenate([part, part[low], part[high]]) for part in events]
                 events[axis] = np.concatenate(mirrored) + before
         return events
+
+
+def _describe_sizes(state: Any) -> Any:
+    """Return a state with sizes in place of its arrays, tensors and numbers."""
+    if hasattr(state, "shape"):
+        return tuple(state.shape)
+    if isinstance(state, tuple | list):
+        return type(state).__name__, [_describe_sizes(part) for part in state]
+    if hasattr(state, "__dict__"):
+        parts = {name: _describe_sizes(part) for name, part in vars(state).items()}
+        return type(state).__name__, parts
+    return () if isinstance(state, int | float) else type(state).__name__

@@ -103,7 +103,15 @@ class Distillation(LossTerm):
 
 def weighted_sum(terms: Sequence[FrameTerm], frames: Frames, target: Frames) -> FrameValues:
     """Return the sum of frame terms times their weights, one value per frame."""
-    return reduce(torch.add, (term.weight * term(frames, target) for term in terms))
+    return reduce(torch.add, (term.weight * _per_frame(term, frames, target) for term in terms))
+
+
+def _per_frame(term: FrameTerm, frames: Frames, target: Frames) -> FrameValues:
+    values = term(frames, target)
+    if values.shape != frames.shape[:1]:
+        wanted, got = tuple(frames.shape[:1]), tuple(values.shape)
+        raise ValueError(f"{type(term).__name__} must return a value per frame {wanted}, got {got}")
+    return values
 
 
 class TrainingLoss(nn.Module):

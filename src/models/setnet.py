@@ -77,7 +77,7 @@ from src.models.layers import (
 )
 from src.models.network import EventToVideoNetwork
 from src.models.time_gated_update import TimeGatedUpdate, time_gated_update
-from src.sim.optics import Position, layout
+from src.sim.optics import REACH, Position, layout
 
 SIZES: dict[str, dict[str, Any]] = {  # GMAC at 176 x 176, 9 views, context included: 0.34, 1.2, 3.5
     "small": {"channels": 16, "context_channels": [32, 64, 96]},
@@ -425,7 +425,12 @@ class SetNet(EventToVideoNetwork):
         positions = layout(views) if positions is None else positions
         if len(positions) != views:
             raise ValueError(f"optics.positions must be {views} (row, col), got {positions}")
-        return tuple((int(row), int(column)) for row, column in positions)
+        whole = tuple((int(row), int(column)) for row, column in positions)
+        is_near = all(max(abs(row), abs(column)) <= REACH for row, column in whole)
+        if not is_near or len(set(whole)) < views or whole != tuple(map(tuple, positions)):
+            wanted = f"different whole (row, col) in -{REACH}..{REACH}"
+            raise ValueError(f"optics.positions must be {wanted}, got {positions}")
+        return whole
 
     def _checked_state(self, state: SetNetState | None, cells: Tensor) -> SetNetState:
         """Return `state`, or zeros of the right sizes; ValueError when they are not right."""

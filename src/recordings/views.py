@@ -130,7 +130,12 @@ class Views:
     def warp_to_model(
         self, picture: Float[np.ndarray, "sensor_h sensor_w"]
     ) -> Float[np.ndarray, "views h w"]:
-        """Return every view of one sensor picture in model pixels (bilinear, float32)."""
+        """Return every view of one sensor picture in model pixels (bilinear, float32).
+
+        Raises ValueError for a picture of another size than the sensor."""
+        if picture.shape != tuple(self.sensor):
+            wanted, got = ("x".join(map(str, size[::-1])) for size in (self.sensor, picture.shape))
+            raise ValueError(f"views must be of a sensor of {got}, as the pictures, got {wanted}")
         (height, width), (left, top, right, bottom) = self.model, self.field
         x = left + (np.arange(width) + 0.5) * (right - left) / width
         y = top + (np.arange(height) + 0.5) * (bottom - top) / height

@@ -7,6 +7,15 @@ from pathlib import Path
 from lightning.pytorch.loggers import Logger, WandbLogger
 
 
+def keep_earlier_metrics(run: Path) -> None:
+    """Give the `metrics.csv` of a training in `run` that was cut short a number: the logger of the
+    one that goes on there would delete it."""
+    file = run / "logs" / "metrics.csv"
+    if file.is_file():
+        number = 1 + len(list(file.parent.glob("metrics.*.csv")))
+        file.rename(file.with_suffix(f".{number}.csv"))
+
+
 def log_config_to_wandb(loggers: Iterable[Logger], config: dict) -> None:
     """Store `config` with the run of W&B, where it is among `loggers`."""
     for logger in _wandb(loggers):

@@ -75,10 +75,10 @@ class Pipeline:
 
     `scene.clip(index)` has windows * substeps + 1 frames.  `decodes_srgb`: they are decoded to
     light before the turbulence.  `crop` is the side of the square to simulate: pixels (int), a
-    share of the frame (float in (0, 1]) or None for all of it; it lies at random if `random_crop`,
-    else in the middle.  Number k shows clip k modulo `clips` (None: every number is a new clip).
-    Pixel mismatch and hot pixels differ between training clips; those of the other splits share
-    one sensor.
+    share of the frame (float in (0, 1]) or None for all of it, `crop_key` in errors; it lies at
+    random if `random_crop`, else in the middle.  Number k shows clip k modulo `clips` (None: every
+    number is a new clip).  Pixel mismatch and hot pixels differ between training clips; those of
+    the other splits share one sensor.
     """
 
     scene: Scene
@@ -91,6 +91,7 @@ class Pipeline:
     bins: int = 5
     substeps: int = 1
     crop: int | float | None = None
+    crop_key: str = "data.crop"
     random_crop: bool = False
     clips: int | None = None
     decodes_srgb: bool = False
@@ -200,7 +201,7 @@ class Pipeline:
         least = min(height, width)
         side = round(self.crop * least) if isinstance(self.crop, float) else self.crop
         if not 8 <= side <= least:
-            raise ValueError(f"data.crop must be in 8..{least} (the frame), got {side}")
+            raise ValueError(f"{self.crop_key} must be in 8..{least}, the clip's side, got {side}")
         if not self.random_crop:
             return (height - side) // 2, (width - side) // 2, side, side
         top, left = noise.uniforms(key, 2)

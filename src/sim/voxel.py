@@ -28,19 +28,22 @@ def voxel_grid(
     `t`, in the unit of `t0` and `t1` and in any order; `x`, `y` in pixels; `p` in {-1, 1} or
     {0, 1}: arrays or tensors of one length.  Each event's weights are multiples of 2**-20, so
     that sums of up to 16 events a cell are exact and do not depend on their order.  Raises
-    ValueError for coordinates outside, lengths that differ, t1 <= t0 or another polarity.
+    ValueError for coordinates outside or no whole numbers, lengths that differ, t1 <= t0, edges
+    that are not finite or another polarity.
     """
-    t, x, y, p = (np.asarray(part) for part in (t, x, y, p))
+    t, x, y, p = map(_as_native_array, (t, x, y, p))
     if not t.shape == x.shape == y.shape == p.shape or t.ndim != 1:
         shapes = [part.shape for part in (t, x, y, p)]
         raise ValueError(f"t, x, y, p must be of one length, got shapes {shapes}")
     if bins < 1 or height < 1 or width < 1:
         raise ValueError(f"bins, height, width must be positive, got {bins}, {height}, {width}")
-    if not t1 > t0:
-        raise ValueError(f"voxel_grid needs t0 < t1, got t0={t0}, t1={t1}")
+    if not (t1 > t0 and np.isfinite(t0) and np.isfinite(t1)):
+        raise ValueError(f"voxel_grid needs finite t0 < t1, got t0={t0}, t1={t1}")
     grid, t0, t1 = torch.zeros(bins, height, width), float(t0), float(t1)
     if t.size == 0:
         return grid
+    if x.dtype.kind not in "iu" or y.dtype.kind not in "iu":
+        raise ValueError(f"x and y must be whole numbers, got {x.dtype} and {y.dtype}")
     if t.max() < t0 or t.min() > t1:
         reach = f"{t.min()} to {t.max()}, the window is {t0} to {t1}"
         warnings.warn(
@@ -57,6 +60,11 @@ def voxel_grid(
             f"{{0, 1}}; event {wrong} is x={x[wrong]} y={y[wrong]} p={p[wrong]}"
         )
     return grid
+
+
+def _as_native_array(part: ArrayLike) -> np.ndarray:
+    array = np.asarray(part)
+    return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
 
 
 def normalise_nonzero(grid: Float[Tensor, "*batch bins h w"]) -> Float[Tensor, "*batch bins h w"]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from copy import deepcopy
+from itertools import pairwise
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import torch
 from lightning import Callback, Trainer
 
+from src.losses.terms import TrainingLoss
 from src.models import files
 from src.records.atomic import write_text
 from src.records.results import format_csv
@@ -16,6 +18,7 @@ from src.training.ema import use_averaged_weights
 from src.training.reconstructor import Reconstructor
 
 COLLAPSE_FACTOR = 1.5  # of the mean loss over the least of all rows so far
+LEAST_STEPS = 50  # of a row whose mean loss counts for that
 TRAINING_STATE = "reached"  # key of what a training continues from, in the card of shipped weights
 
 
@@ -27,7 +30,8 @@ class LearningCurve(Callback):
     rows are part of checkpoints.  `export`: also write the weights to this file (.safetensors,
     float16), at each row and when the training is cut short.  Raises ValueError for
     values out of range and, keeping the export of the row before, where the loss has risen to
-    COLLAPSE_FACTOR times its least, as when no gradient reaches the network any more.
+    COLLAPSE_FACTOR times its least over rows of LEAST_STEPS steps, as when no gradient reaches the
+    network any more.
     """
 
     def __init__(self, path: str, interval_h: float | None = None, export: str | None = None):
@@ -44,9 +48,11 @@ class LearningCurve(Callback):
         self.rows: list[dict] = []
         self.loss, self.steps = 0.0, 0  # since the last row
         self.first_row = 0  # whose loss is that of this training
+        self.loss_terms = ""  # of which the loss is the sum
 
     def state_dict(self) -> dict:
-        return {key: getattr(self, key) for key in ("rows", "loss", "steps", "first_row")}
+        kept = ("rows", "loss", "steps", "first_row", "loss_terms")
+        return {key: getattr(self, key) for key in kept}
 
     def load_state_dict(self, state_dict: dict) -> None:
         vars(self).update(state_dict)
@@ -54,6 +60,7 @@ class LearningCurve(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
         if self.interval_h is None or not trainer.is_global_zero:
             return
+        self._forget_other_loss(pl_module.loss)
         if self.rows:
             self._write()
         else:
@@ -81,8 +88,10 @@ class LearningCurve(Callback):
             "windows": module.windows_seen,
             "loss": self.loss / self.steps if self.steps else "",
         }
-        losses = [r["loss"] for r in [*self.rows[self.first_row :], row] if r["loss"] != ""]
-        if losses and losses[-1] > COLLAPSE_FACTOR * min(losses):
+        rows = [*self.rows[max(self.first_row - 1, 0) :], row]
+        losses = [after["loss"] for before, after in pairwise(rows) if _counts(before, after)]
+        is_counted = len(rows) > 1 and _counts(*rows[-2:])
+        if is_counted and losses[-1] > COLLAPSE_FACTOR * min(losses):
             text = f"its mean loss is {losses[-1]:.3g} after {min(losses):.3g}"
             if self.export:
                 text += f"; {self.export} holds the weights of {self.rows[-1]['hours']:.2f} hours"
@@ -93,6 +102,14 @@ class LearningCurve(Callback):
         self._write()
         self.export_weights(module)
         module.clock.start()
+
+    def _forget_other_loss(self, loss: TrainingLoss | None) -> None:
+        """Compare no loss with those of rows before, where it is another sum of terms."""
+        terms = loss.terms.items() if loss is not None else ()
+        now = ", ".join(f"{t.weight:g} {name}: {type(t).__name__}" for name, t in terms)
+        if self.rows and self.loss_terms not in ("", now):
+            self.first_row, self.loss, self.steps = len(self.rows), 0.0, 0
+        self.loss_terms = now
 
     def export_weights(self, module: Reconstructor) -> None:
         """Write the (averaged) weights with all that a training needs to continue from them."""
@@ -108,6 +125,11 @@ class LearningCurve(Callback):
         heads = list(self.rows[-1])
         rows = [[row.get(name, "") for name in heads] for row in self.rows]
         write_text(self.path, format_csv(heads, rows))
+
+
+def _counts(before: dict, row: dict) -> bool:
+    """Return whether the mean loss of `row` is of enough steps since the row `before` it."""
+    return row["loss"] != "" and row["steps"] - before["steps"] >= LEAST_STEPS
 
 
 @torch.no_grad()

@@ -21,7 +21,8 @@ class StepGuard:
     """Scales the gradients of a step down.
 
     `loss_spike_factor`: a loss more than so many times the median of the last 100 losses moves the
-    weights no more than that median would, after the first `min_losses` losses; None: off.
+    weights no more than that median would, after the first `min_losses` losses; it is remembered
+    as so many times the median, which a lasting change moves so.  None: off.
     `grad_clip_norm`: largest Euclidean norm over all gradients; None: any.  Raises ValueError for a
     factor <= 1 or a norm <= 0.
     """
@@ -58,6 +59,6 @@ class StepGuard:
     def gradient_scale(self, loss: float) -> float:
         """Return the factor, in (0, 1], for the gradients of a step of this loss; remember it."""
         usual = median(self.losses) if len(self.losses) >= self.min_losses else math.inf
-        is_spike = self.loss_spike_factor is not None and loss > self.loss_spike_factor * usual
-        self.losses.append(usual if is_spike else loss)
-        return usual / loss if is_spike else 1.0
+        most = math.inf if self.loss_spike_factor is None else self.loss_spike_factor * usual
+        self.losses.append(min(loss, most))
+        return usual / loss if loss > most else 1.0

@@ -26,7 +26,7 @@ WRONG = [
     ("simulate", ["turbulence=rigid"], "turbulence=rigid is now turbulence=mixed turbulence.atm"),
     ("train", ["experiment=lf_firenet"], "experiment=lf_firenet was removed"),
     ("train", ["experiment=lf9x9"], "lf9x9"),
-    ("train", ["trainer.max_steps=abc"], "trainer.max_steps must be a number, got abc"),
+    ("train", ["trainer.max_steps=abc"], "trainer.max_steps must be a whole number, got abc"),
     ("train", ["ckpt=setnet_medium"], "ckpt=setnet_medium must be of the network that is trained"),
     ("train", ["calm=1"], "calm is now loss.static_flicker.weight"),
     ("eval", ["+calm=1"], "calm is now loss.static_flicker.weight"),

@@ -46,7 +46,14 @@ def test_onnx_gives_the_frames_of_the_network_window_by_window(name, tmp_path):
     torch.testing.assert_close(
         frames(found, noise()), frames(network, noise()), atol=1e-4, rtol=1e-3
     )
-    assert isinstance(found, OnnxNetwork)
+    assert isinstance(found, OnnxNetwork) and found.views == 9
+    assert found.uses_window_length == network.uses_window_length
+    with pytest.raises(
+        ValueError, match=r"voxels must be float32 \[1, 9, 5, 32, 32\], as exported"
+    ):
+        found(noise()[0, :, :3])
+    with pytest.raises(ValueError, match="path must be in a folder that is there"):
+        export_onnx(network, tmp_path / "none" / "net.onnx", views=9, height=32, width=32)
 
 
 @pytest.mark.parametrize("name", NETWORKS)

@@ -152,6 +152,33 @@ def test_microseconds_for_seconds_are_told_of():
         runtime(network("e2vid")).step(**window | {"t": 1e6 * window["t"]})
 
 
+def test_times_in_microseconds_throughout_are_told_of():
+    window = events(0)
+    scaled = {name: 1e9 * (1 + window[name]) for name in ("t", "t0", "t1")}
+    with pytest.warns(UserWarning, match="a window lasts 1.66667e.06 s: are t, t0 and t1 in sec"):
+        runtime(network("e2vid")).step(**window | scaled)
+
+
+def test_times_too_coarse_for_the_window_are_told_of():
+    late = {name: 3600 + events(0)[name] for name in ("t", "t0", "t1")}
+    late["t"] = late["t"].clip(late["t0"], late["t1"]).astype(np.float32)
+    with pytest.warns(UserWarning, match="t is float32, in steps of 0.000244141 s at 3600 s"):
+        runtime(network("e2vid")).step(**events(0) | late)
+
+
+@pytest.mark.parametrize("name", ["setnet", "e2vid"])
+def test_a_state_of_another_runtime_is_refused(name):
+    live = runtime(network(name))
+    other = {"setnet": "e2vid", "e2vid": "setnet"}[name]
+    states = [runtime(network(other)).state, runtime(network(name), width=40).state, 5]
+    if name == "setnet":
+        states.append(runtime(network(name), views=3).state)
+    for state in states:
+        with pytest.raises(ValueError, match="state must be that of a runtime of the same network"):
+            live.state = state
+    live.step(**events(0))
+
+
 def test_events_outside_the_window_have_no_part():
     net, window = network("setnet"), events(1)
     early = {name: window[name] for name in ("x", "y", "p", "view")}

@@ -463,3 +463,9 @@ def test_a_state_of_another_size_is_refused():
     _, state = network(voxels()[:, 0], None)
     with pytest.raises(ValueError, match="state must have sizes"):
         network(voxels(side=24)[:, 0], state)
+
+
+@pytest.mark.parametrize("wrong", [[(0, 0), (0, 0)], [(0, 0), (0, 0.5)], [(0, 0), (0, 99)]])
+def test_positions_that_are_none_are_refused(wrong):
+    with pytest.raises(ValueError, match=r"optics.positions must be different whole \(row, col\)"):
+        SetNet(channels=4).checked_positions(2, 5, wrong)

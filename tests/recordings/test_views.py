@@ -320,3 +320,12 @@ def test_registered_views_agree_with_the_scene(truth):
     registered = truth.warp_to_model(shown(truth, picture, noise=0.0) / 255.0)
     inner = (slice(None), slice(60, -60), slice(60, -60))
     assert np.corrcoef(registered[inner].mean(0).ravel(), picture[inner[1:]].ravel())[0, 1] > 0.98
+
+
+def test_pictures_of_another_sensor_are_refused():
+    whole = views.Views.single_view((48, 64), (24, 32))
+    assert whole.warp_to_model(np.zeros((48, 64))).shape == (1, 24, 32)
+    with pytest.raises(
+        ValueError, match="must be of a sensor of 64x32, as the pictures, got 64x48"
+    ):
+        whole.warp_to_model(np.zeros((32, 64)))

@@ -124,10 +124,12 @@ def test_normalising_one_event_is_finite():
         ({"x": [7]}, "x in 0..6"),
         ({"y": [-1]}, "y in 0..5"),
         ({"p": [2]}, "p in"),
-        ({"t1": 0}, "t0 < t1"),
+        ({"t1": 0}, "finite t0 < t1"),
         ({"t1": math.nan}, "t0 < t1"),
         ({"x": [1, 2]}, "one length"),
         ({"bins": 0}, "must be positive"),
+        ({"t1": math.inf}, "finite t0 < t1"),
+        ({"x": [1.5]}, "x and y must be whole numbers, got float64"),
     ],
 )
 def test_what_is_wrong_is_named(change, words):
@@ -146,3 +148,10 @@ def test_events_that_all_lie_outside_are_told_of():
             [200.0, 300.0], [1, 2], [1, 2], [1, -1], t0=0.0, t1=0.1, bins=5, height=4, width=4
         )
     assert not grid.any()
+
+
+def test_the_order_of_bytes_does_not_matter():
+    given = {"t": [1, 5, 9], "x": [1, 2, 3], "y": [0, 1, 2], "p": [1, -1, 1]}
+    swapped = {name: np.array(part, ">i4") for name, part in given.items()}
+    edges = {"t0": 0, "t1": 10, **SIZE}
+    assert (voxel_grid(**swapped, **edges) == voxel_grid(**given, **edges)).all()

@@ -12,11 +12,13 @@ from lightning import Trainer
 from torch.optim.swa_utils import AveragedModel
 
 from src.app import build
+from src.losses.terms import L1Term, TrainingLoss
 from src.models import files
 from src.models.folding import inference_copy
 from src.train import train
 from src.training import schedule
 from src.training.ema import WeightEMA
+from src.training.learning_curve import LearningCurve
 from src.training.reconstructor import Reconstructor
 from src.training.schedule import CosineSchedule, TrainingClock
 from tests.test_train import TINY, config
@@ -172,9 +174,19 @@ def test_a_training_cut_short_in_a_validation_exports_the_average(tmp_path, monk
 def test_a_training_that_has_collapsed_ends_and_keeps_what_it_had(tmp_path, monkeypatch):
     now = tmp_path / "now.safetensors"
     monkeypatch.setattr("src.training.learning_curve.COLLAPSE_FACTOR", 0.5)
+    run(tmp_path / "few_steps", "train_hours=4", f"export={tmp_path / 'few.safetensors'}")
+    monkeypatch.setattr("src.training.learning_curve.LEAST_STEPS", 1)
     with pytest.raises(ValueError, match="collapsed.* holds the weights of 0.00 hours"):
         run(tmp_path / "first", "train_hours=9", f"export={now}")
     assert files.read_card(now)["hours"] == 0
+
+
+def test_losses_of_other_terms_are_not_compared(tmp_path):
+    curve = LearningCurve(str(tmp_path / "c.csv"), 1.0)
+    for weight, first_row in ((1.0, 0), (1.0, 0), (3.0, 2)):
+        curve.rows.append({"loss": 1.0, "steps": 100 * len(curve.rows)})
+        curve._forget_other_loss(TrainingLoss({"l1": L1Term(weight)}))
+        assert curve.first_row == (first_row and len(curve.rows))
 
 
 def test_what_goes_on_with_another_loss_has_not_collapsed(three_hours, tmp_path):

@@ -21,7 +21,12 @@ from src.sim.sensor.sensor import EventSensor, Sensor
 
 HOT_FACTOR = 5.0  # times its neighbours' median plus its view's mean: more than texture makes
 HOT_EVENTS = 10  # beyond that, so that a pixel is not hot by chance
-ROUNDS = 4  # of simulating with the ratio of OFF to ON threshold found so far
+ROUNDS = 10  # of simulating with the ratio of OFF to ON threshold found so far, at most
+OFF_RATIOS = (0.1, 10.0)  # OFF to ON threshold
+# Of the log quotient of ON to OFF rate that is left, over the log ratio of OFF to ON threshold.
+FIRST_GAIN, GAINS = -2.5, (-6.0, -0.8)
+FIRST_STEP = 0.05  # of the log ratio, at least
+ENOUGH, MOST_EXCESS = 0.003, 0.03  # of the log quotient: a round is the last, a fit is refused
 Clip = Float[Tensor, "views frames h w"]
 GRID = tuple(np.geomspace(0.05, 2.0, 24).round(4).tolist())
 
@@ -151,14 +156,55 @@ def estimate_contrast_threshold(
 
     The geometric mean of ON and OFF rate gives their size; the quotient gives the ratio of OFF to
     ON, as what rises has to fall.  `progress(clips, name)` yields the clips of each of the ROUNDS,
-    as rich.progress.track does.  Raises ValueError for a rate that the grid does not make.
+    as rich.progress.track does.  Raises ValueError for a rate that the grid does not make, and for
+    a quotient of rates that no ratio in OFF_RATIOS makes.
     """
     measured, drawn = rates.pooled, np.maximum(rates.bootstrap_pooled_rates(), 1e-12)
     if not (measured > 0).all():
         raise ValueError(f"the recording's rates above the background are not positive: {measured}")
-    ratio = 1.0
+    best, other = _find_off_ratio(measured, clips, fps, sensor, thresholds, progress)
+    moved = other.log_ratio - best.log_ratio
+    gain = float(np.clip((other.excess - best.excess) / moved, *GAINS))
+    on_gain = np.log(other.on / best.on) / moved
+
+    pairs = np.concatenate([measured[None], drawn])
+    ons = find_on_threshold(best.curve, pairs)
+    steps = -_log_excess_quotient(best.curve, ons, pairs) / gain
+    ons = ons * np.exp(on_gain * steps)
+    offs = ons * best.curve.off_ratio * np.exp(steps)
+    on, off = float(ons[0]), float(offs[0])
+    bounds = np.nanpercentile([ons[1:], offs[1:]], (2.5, 97.5), axis=1).T.tolist()
+    (on_low, on_high), (off_low, off_high) = bounds
+    on_off = (on, on_low, on_high), (off, off_low, off_high)
+    return ThresholdEstimate(
+        *on_off, best.curve, measured, np.percentile(drawn, (2.5, 97.5), axis=0)
+    )
+
+
+@dataclass(frozen=True)
+class _Round:
+    """The ON threshold for an OFF ratio, and the log of how much larger the recording's quotient
+    of ON to OFF rate is than that of the simulated curve there."""
+
+    curve: RateCurve
+    on: float
+    excess: float
+
+    @property
+    def log_ratio(self) -> float:
+        return float(np.log(self.curve.off_ratio))
+
+
+def _find_off_ratio(
+    measured: np.ndarray, clips: Sequence[Clip], fps: float, sensor: Sensor,
+    thresholds: Sequence[float], progress: Callable[[Sequence[Clip], str], Iterable[Clip]],
+) -> tuple[_Round, _Round]:  # fmt: skip
+    """Return the round whose OFF ratio makes the quotient of the rates, by the secant method, and
+    the one nearest to it, for slopes.  Raises ValueError where no ratio makes the rates."""
+    log_ratio, gain, rounds = 0.0, FIRST_GAIN, list[_Round]()
     for number in range(1, ROUNDS + 1):
-        followed = progress(clips, f"event rates, round {number} of {ROUNDS}")
+        followed = progress(clips, f"event rates, round {number} of {ROUNDS} at most")
+        ratio = float(np.exp(log_ratio))
         curve = simulate_event_rates(followed, fps, sensor, thresholds, off_ratio=ratio)
         on = float(find_on_threshold(curve, measured))
         if not np.isfinite(on):
@@ -167,13 +213,27 @@ def estimate_contrast_threshold(
                 f"the recording's rate {np.sqrt(np.prod(measured)):.3g} is outside what the grid of"
                 f" thresholds {thresholds[0]} to {thresholds[-1]} makes, {low:.3g} to {high:.3g}"
             )
-        ratio = float(np.clip(ratio * _excess_quotient(curve, on, measured), 0.1, 10))
-    on_drawn = find_on_threshold(curve, drawn)
-    off_drawn = on_drawn * curve.off_ratio * _excess_quotient(curve, on_drawn, drawn)
-    bounds = np.nanpercentile([on_drawn, off_drawn], (2.5, 97.5), axis=1).T.tolist()
-    (on_low, on_high), (off_low, off_high) = bounds
-    on_off = (on, on_low, on_high), (on * ratio, off_low, off_high)
-    return ThresholdEstimate(*on_off, curve, measured, np.percentile(drawn, (2.5, 97.5), axis=0))
+        rounds.append(_Round(curve, on, float(_log_excess_quotient(curve, on, measured))))
+        new, *before = rounds[::-1]
+        if before and abs(new.excess) < ENOUGH:
+            break
+        if before:
+            change = (new.excess - before[0].excess) / (new.log_ratio - before[0].log_ratio)
+            gain = float(np.clip(change, *GAINS))
+        step = -new.excess / gain
+        least = 0.0 if before else FIRST_STEP  # so that there is a slope
+        step = float(np.copysign(max(abs(step), least), step))
+        log_ratio = float(np.clip(new.log_ratio + step, *np.log(OFF_RATIOS)))
+        if log_ratio == new.log_ratio:
+            break
+    best, *others = sorted(rounds, key=lambda one: abs(one.excess))
+    if abs(best.excess) > MOST_EXCESS:
+        quotient, (low, high) = measured[0] / measured[1], OFF_RATIOS
+        raise ValueError(
+            f"the recording's quotient of ON to OFF rate, {quotient:.3g}, is not made by any ratio"
+            f" of OFF to ON threshold in {low:g}..{high:g}: are scene, speed and sensor alike?"
+        )
+    return best, min(others, key=lambda one: abs(one.log_ratio - best.log_ratio))
 
 
 def find_on_threshold(
@@ -190,11 +250,11 @@ def find_on_threshold(
     return np.asarray(np.exp(np.interp(target, falling[::-1], thresholds, np.nan, np.nan)))
 
 
-def _excess_quotient(curve: RateCurve, on: np.ndarray | float, rates: np.ndarray) -> np.ndarray:
-    """Return how much larger the quotient of ON to OFF rate is than the curve's at `on`."""
+def _log_excess_quotient(curve: RateCurve, on: np.ndarray | float, rates: np.ndarray) -> np.ndarray:
+    """Return the log of how much larger the quotient of ON to OFF rate is than the curve's."""
     quotient = np.subtract(*np.log(np.maximum(curve.rates, 1e-15)).T)
     expected = np.interp(np.log(on), np.log(curve.thresholds), quotient)
-    return np.asarray(np.exp(np.log(rates[..., 0] / rates[..., 1]) - expected))
+    return np.asarray(np.log(rates[..., 0] / rates[..., 1]) - expected)
 
 
 def write_threshold_csv(estimate: ThresholdEstimate, rates: EventRates, path: Path) -> None:

@@ -38,9 +38,9 @@ def write_events(
 ) -> None:
     """Write events (n,) of t, x, y, p, in order of time, in the format of the path's ending.
 
-    `width`, `height`: of the sensor in pixels; `version`: evt2 or evt3, of a `.raw`.  Raises
-    ValueError for events that are out of order or off the sensor, a polarity that is not -1 or 1,
-    and what the format cannot hold.
+    Whole numbers, t in us.  `width`, `height`: of the sensor in pixels; `version`: evt2 or evt3,
+    of a `.raw`.  Raises ValueError for other numbers, events that are out of order or off the
+    sensor, a polarity that is not -1 or 1, and what the format cannot hold.
     """
     starts = range(0, len(events), PIECE_EVENTS)
     pieces = (events[start : start + PIECE_EVENTS] for start in starts)
@@ -128,8 +128,8 @@ class _Checked:
         for events in self._pieces:
             if len(events):
                 first = first if self.count else int(events["t"][0])
-                self._check_times(events["t"], last if self.count else first, first)
                 self._check_pixels(events)
+                self._check_times(events["t"], last if self.count else first, first)
                 last = int(events["t"][-1])
                 self.count, self.span_us = self.count + len(events), last - first
                 yield events
@@ -150,10 +150,14 @@ class _Checked:
 
     def _check_pixels(self, events: np.ndarray) -> None:
         (width, height), x, y, p = self._size, events["x"], events["y"], events["p"]
-        if x.max() >= width or y.max() >= height:
-            raise ValueError(
-                f"{self._path}: events must lie on {width}x{height}, got {x.max()}, {y.max()}"
-            )
+        kinds = {name: events[name].dtype for name in "txyp"}
+        if not all(kind.kind in "iu" for kind in kinds.values()):
+            got = ", ".join(f"{name} {kind}" for name, kind in kinds.items())
+            raise ValueError(f"{self._path}: t (us), x, y, p must be whole numbers, got {got}")
+        for place, side in ((x, width), (y, height)):
+            if place.min() < 0 or place.max() >= side:
+                got = f"x in {x.min()}..{x.max()}, y in {y.min()}..{y.max()}"
+                raise ValueError(f"{self._path}: events must lie on {width}x{height}, got {got}")
         if not np.isin(p, (-1, 1)).all():
             raise ValueError(
                 f"{self._path}: polarity must be -1 or 1, got {np.unique(p)[:4].tolist()}"

@@ -22,6 +22,7 @@ from src.sim.scenes.video_files import VideoSource, find_videos, read_picture
 
 LARGEST_SIDE_PX = 512  # of the frames, where nothing else is asked for
 LEAST_SIDE_PX = 16
+PHOTO_FPS = 120.0  # where nothing else is asked for
 ALL_BITS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
 DARK_SHARE = 1 / 8  # of full scale: a picture below this has data of fewer bits than its file
 
@@ -71,7 +72,7 @@ def read_video(
     source = _find_one_video(Path(path))
     if white_level is not None and source.index:
         raise ValueError(f"white_level must be null for a video file, 8 bits, got {white_level}")
-    rate = fps or (source.index.fps if source.index else None)
+    rate = source.index.fps if fps is None and source.index else fps
     if rate is None:
         raise ValueError(f"fps must be given, frames a second, for {path}, which states none")
     _check_rate(rate)
@@ -121,12 +122,8 @@ def read_photograph(
         raise ValueError(f"photo must be a picture that can be read (a film: video=), got {path}")
     facts = f"photograph of {picture.shape[1]}x{picture.shape[0]} px"
     values = _shrink(scale_to_white(picture, white_level), longest_side_px)
-    fps = fps or 120.0
-    frames = _hold(values, fps, seconds)
-    if not 0 <= speed_widths_per_s < math.inf:
-        raise ValueError(f"speed_widths_per_s must be >= 0, got {speed_widths_per_s}")
-    if speed_widths_per_s:
-        frames = _move(values, len(frames), fps, speed_widths_per_s, seed)
+    fps = PHOTO_FPS if fps is None else fps
+    frames = _hold_or_move(values, fps, seconds, speed_widths_per_s, seed)
     _warn_of_darkness(path, picture.dtype, float(picture.max()), white_level)
     return OwnClip(Path(path).stem, frames, fps, facts)
 
@@ -134,9 +131,11 @@ def read_photograph(
 def clip_from_array(
     values: Any, *, fps: float | None = None, seconds: float = 1.0, start_s: float = 0.0,
     end_s: float = math.inf, longest_side_px: int | None = None, white_level: float | None = None,
+    speed_widths_per_s: float = 0.0, seed: int = 0,
 ) -> OwnClip:  # fmt: skip
     """Return an array as a clip: (h, w), a photograph, or (frames, h, w), a video at `fps`, of
-    uint8 or of floats in [0, 1].  `start_s`, `end_s` and `white_level` as in `read_video`.
+    uint8 or of floats in [0, 1].  `start_s`, `end_s` and `white_level` as in `read_video`,
+    `speed_widths_per_s` and `seed` as in `read_photograph`.
 
     Raises ValueError for another shape, for values outside and for a video without `fps`.
     """
@@ -153,8 +152,9 @@ def clip_from_array(
     array = scale_to_white(array, white_level)
     if array.ndim == 2:
         refuse_part_of_photograph(start_s, end_s)
-        fps = fps or 120.0
-        frames = _hold(_shrink(array, longest_side_px), fps, seconds)
+        fps = PHOTO_FPS if fps is None else fps
+        values = _shrink(array, longest_side_px)
+        frames = _hold_or_move(values, fps, seconds, speed_widths_per_s, seed)
         return OwnClip("photograph", frames, fps, facts)
     if fps is None:
         raise ValueError("fps must be given for an array of frames, frames a second")
@@ -182,12 +182,19 @@ def _check_rate(fps: float) -> None:
         raise ValueError(f"fps must be in [0.1, 1e6] frames a second, got {fps}")
 
 
-def _hold(picture: NDArray, fps: float, seconds: float) -> Float[np.ndarray, "frames h w"]:
-    """Return the frames of a picture that stands still for `seconds` at `fps`."""
+def _hold_or_move(
+    picture: NDArray, fps: float, seconds: float, speed: float, seed: int
+) -> Float[np.ndarray, "frames h w"]:
+    """Return the frames of a picture for `seconds` at `fps`, at `speed` widths a second."""
     _check_rate(fps)
+    if not 0 <= speed < math.inf:
+        raise ValueError(f"speed_widths_per_s must be >= 0, got {speed}")
     if not (isinstance(seconds, int | float) and 2 / fps <= seconds < 1e6):
         raise ValueError(f"seconds must be {2 / fps:.4g} (two frames) or more, got {seconds}")
-    return np.broadcast_to(picture, (round(seconds * fps) + 1, *picture.shape))
+    count = round(seconds * fps) + 1
+    if speed:
+        return _move(picture, count, fps, speed, seed)
+    return np.broadcast_to(picture, (count, *picture.shape))
 
 
 def scale_to_white(

@@ -68,6 +68,32 @@ def test_the_same_scene_gives_the_threshold_exactly():
     assert abs(found.on[0] / 0.2 - 1) < 0.02 and abs(found.off[0] / 0.2 - 1) < 0.02
 
 
+@pytest.mark.parametrize(("on", "off_ratio"), [(0.2, 1.4), (0.3, 0.6)])
+def test_thresholds_that_differ_are_found_where_a_faint_scene_trembles(on, off_ratio):
+    """Near the threshold the quotient of rates changes by more than the ratio of thresholds."""
+    shift = 0.3 * torch.randn(40, 1, 1, generator=torch.Generator().manual_seed(1))
+    waves = torch.linspace(0.1, 1.2, 48)[None, :, None] * (torch.arange(48.0) + shift)
+    clip = (0.5 + 0.15 * torch.sin(waves))[None]
+    counts = EventSensor(on, off_ratio=off_ratio).counts(clip[None], FPS, clips=[0])[0].sum(0)
+    events = np.random.default_rng(0).poisson(counts.numpy() / 39, (39, 1, 2))
+    measured = contrast_threshold.EventRates(events, np.array([48**2]), np.array([0]), 1 / FPS)
+    found = contrast_threshold.estimate_contrast_threshold(measured, [clip], FPS, EventSensor())
+    assert abs(found.on[0] / on - 1) < 0.05 and abs(found.off[0] / (on * off_ratio) - 1) < 0.05
+    assert found.on[1] < found.on[0] < found.on[2]
+    assert found.off[1] < found.off[0] < found.off[2]
+
+
+def test_a_quotient_of_rates_that_no_ratio_makes_is_named():
+    clips = [scene(0)]
+    measured = contrast_threshold.measure_event_rates(
+        recorded(EventSensor(0.2), clips), np.zeros((48, 48), np.int64), slices=10
+    )
+    events = measured.events * np.array([400, 1])
+    lopsided = contrast_threshold.EventRates(events, measured.pixels, measured.hot_pixels, 0.02)
+    with pytest.raises(ValueError, match="outside what the grid|is not made by any ratio"):
+        contrast_threshold.estimate_contrast_threshold(lopsided, clips, FPS, EventSensor(), GRID)
+
+
 def test_rates_of_views_are_events_per_pixel_and_second():
     view = np.full((6, 10), -1)
     view[:, :4], view[:3, 6:] = 0, 1

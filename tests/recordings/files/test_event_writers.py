@@ -97,6 +97,22 @@ def test_what_fails_leaves_what_was_there(tmp_path, ending):
     assert sorted((p.name, p.is_dir() or p.read_bytes()) for p in tmp_path.rglob("*")) == before
 
 
+@pytest.mark.parametrize("ending", [".h5", ".csv", ".npz", ".raw", ".dat", ".aedat4", ".es"])
+@pytest.mark.parametrize(
+    ("kind", "first", "words"),
+    [
+        ([("t", "<i8"), ("x", "<i2"), ("y", "<i2"), ("p", "i1")], (5, -3, 0, 1), "x in -3..2"),
+        ([("t", "<f8"), ("x", "<i2"), ("y", "<i2"), ("p", "i1")], (0.5, 0, 0, 1), "got t float64"),
+        ([("t", "<i8"), ("x", "<f4"), ("y", "<i2"), ("p", "i1")], (5, 0.5, 0, 1), "x float32"),
+    ],
+)
+def test_events_off_the_sensor_or_in_fractions_are_refused(tmp_path, ending, kind, first, words):
+    events = np.array([first, (9, 2, 1, 1)], kind)
+    with pytest.raises(ValueError, match=words):
+        event_writers.write_events(tmp_path / f"a{ending}", events, **SIZE)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("name", "how", "words"),
     [
