@@ -240,6 +240,7 @@ def build_reconstructor(cfg: DictConfig, net: Trainable, spec: dict) -> Reconstr
         clock=TrainingClock(cfg.train_clock),
         cuda_graphs=uses_cuda_graphs(cfg),
         unscored_windows=data.unscored_windows,
+        seed=cfg.seed,
     )
 
 

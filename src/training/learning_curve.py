@@ -154,7 +154,7 @@ def read_training_progress(weights: Path) -> dict:
     card = card.get(TRAINING_STATE, card)
     if "curve" not in card:
         allowed = "a checkpoint or weights with a learning curve"
-        raise ValueError(f"ckpt must be {allowed}, got {weights}")
+        raise ValueError(f"ckpt must be {allowed}, got {weights}; start= begins from any weights")
     return card
 
 

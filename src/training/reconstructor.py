@@ -13,6 +13,7 @@ from torch.nn.utils import parametrize
 from src.losses.terms import TrainingLoss
 from src.metrics.video_metrics import VideoMetrics
 from src.models.network import EventToVideoNetwork, FramePostprocessor, VideoMethod, unroll
+from src.sim import noise
 from src.training import going_on
 from src.training.cuda_graphs import GraphedUnroll
 from src.training.schedule import TrainingClock
@@ -29,7 +30,8 @@ class Reconstructor(LightningModule):
 
     `loss`, `optimizer` (of parameters) and `scheduler`, if any (of an optimiser, one step a batch),
     are needed to train; `metrics`: of validation and test, None: without LPIPS.  `method`: what is
-    validated and tested, None: the network.  `loss_from`, `loss_pairs`: see select_loss_windows.
+    validated and tested, None: the network.  `loss_from`, `loss_pairs`: see select_loss_windows,
+    whose draws follow from `seed` and the step.
     `cuda_graphs`: on a GPU a sequence is unrolled as CUDA graphs, of a few selections of windows
     only.  The first `unscored_windows` of a clip are not scored.  A test leaves the scores of all
     clips in `clips`, and the first `kept_clips` samples with their frames in `reconstructions`.
@@ -52,6 +54,7 @@ class Reconstructor(LightningModule):
         cuda_graphs: bool = False,
         unscored_windows: int = 0,
         kept_clips: int = 0,
+        seed: int = 0,
     ):
         super().__init__()
         self.automatic_optimization = False
@@ -60,7 +63,7 @@ class Reconstructor(LightningModule):
         self.make_optimizer, self.make_scheduler = optimizer, scheduler
         self.loss_from, self.loss_pairs = loss_from, loss_pairs
         self.guard, self.clock = guard or StepGuard(), clock or TrainingClock()
-        self.unscored_windows, self.kept_clips = unscored_windows, kept_clips
+        self.unscored_windows, self.kept_clips, self.seed = unscored_windows, kept_clips, seed
         self.graphs = GraphedUnroll(network) if cuda_graphs else None  # type: ignore[arg-type]
         self.windows_seen, self.earlier_steps = 0, 0
         self.optimizer_start = 0  # step at which the optimiser's state began
@@ -107,7 +110,8 @@ class Reconstructor(LightningModule):
         Raises NonFiniteError, with the clips, for a loss or gradient that is not; no step is taken.
         """
         windows = sample.voxels.shape[1]
-        seed = self.global_step if self.graphs is None else self.global_step % GRAPHED_SELECTIONS
+        step = self.steps_so_far if self.graphs is None else self.global_step % GRAPHED_SELECTIONS
+        seed = noise.key(self.seed, "loss windows", step)
         outputs = select_loss_windows(windows, self.loss_from, self.loss_pairs, seed)
         optimizer = self.optimizers()
         assert isinstance(optimizer, LightningOptimizer)

@@ -148,6 +148,16 @@ def test_the_loss_sees_the_selected_windows(monkeypatch):
         assert torch.allclose(mine, other, atol=1e-6)
 
 
+def test_the_windows_that_the_loss_sees_follow_from_the_seed(monkeypatch):
+    drawn = []
+    monkeypatch.setattr(
+        reconstructor, "select_loss_windows", lambda *given: drawn.append(given[-1]) or [1, 2]
+    )
+    for seed in (0, 0, 1):
+        fit(Leaky(), loss_from=1, loss_pairs=1, steps=2, seed=seed)
+    assert drawn[:2] == drawn[2:4] and len({*drawn}) == 4
+
+
 def test_pairs_stay_in_their_parts_and_are_drawn_anew_every_step():
     seen = set()
     for step in range(200):

@@ -159,6 +159,8 @@ def _columns_of(
     a note of other arrays of events in it."""
     keys = find_keys_by_name(file.files)
     if keys is not None:
+        if options.stream not in (None, 0, "0"):
+            raise ValueError(f"stream must be null, as {path} has one camera, got {options.stream}")
         columns = {name: _flat(extract_column(name, key, file[key])) for name, key in keys.items()}
         if any(column.ndim != 1 for column in columns.values()):
             raise ValueError("columns must have one dimension")

@@ -337,8 +337,10 @@ def test_one_of_two_cameras_in_an_npz(tmp_path, events):
 
 def test_a_stream_of_a_file_of_one_camera_is_refused(tmp_path, events):
     (tmp_path / "a.txt").write_text(lines(events))
-    with pytest.raises(ValueError, match="stream must be null, as .* has one camera, got left"):
-        read_events(tmp_path / "a.txt", options=ReadOptions(stream="left"))
+    np.savez(tmp_path / "a.npz", **{name: events[name] for name in "txyp"})
+    for name in ("a.txt", "a.npz"):
+        with pytest.raises(ValueError, match="stream must be null, as .* has one camera, got left"):
+            read_events(tmp_path / name, options=ReadOptions(stream="left"))
     assert len(read_events(tmp_path / "a.txt", options=ReadOptions(stream=0))) == len(events)
 
 
