@@ -170,7 +170,7 @@ def test_minutes_left_over_go_by_shares_and_missing_ones_shorten_all():
 def test_a_curve_knows_how_long_its_last_scoring_took(tmp_path, monkeypatch):
     monkeypatch.setattr(LearningCurve, "score_and_export", lambda *_: time.sleep(0.05))
     curve = ExportingCurve(tmp_path / "a.safetensors", 0.1, 60, print)
-    curve.on_train_start(Mock(spec=Trainer, is_global_zero=True), None)
+    curve.on_train_start(Mock(spec=Trainer, is_global_zero=True), SimpleNamespace(loss=None))
     assert curve.scoring_s >= 0.05
 
 
