@@ -211,9 +211,9 @@ def build_reconstructor(cfg: DictConfig, net: Trainable, spec: dict) -> Reconstr
         raise ValueError(f"data.loss_pairs must be in 1..{most} or null, got {pairs}")
     if cfg.train_hours and cfg.scheduler:
         raise ValueError(f"scheduler must be null with train_hours={cfg.train_hours}")
-    if cfg.scheduler and cfg.trainer.max_steps < 1:
-        why = "the scheduler's length follows from it; scheduler=null keeps the rate"
-        raise ValueError(f"trainer.max_steps must be >= 1, got {cfg.trainer.max_steps}: {why}")
+    if cfg.scheduler and (length := cfg.scheduler.get("T_max")) is not None and length < 1:
+        why = "it follows trainer.max_steps; scheduler=null keeps the rate"
+        raise ValueError(f"scheduler.T_max must be >= 1, got {length}: {why}")
     dropout = "batch_view_dropout_probability"
     if OmegaConf.select(cfg, f"augment.{dropout}") and getattr(net, "views", None) is not None:
         takes = f"this network takes {net.views} views"

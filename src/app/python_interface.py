@@ -21,7 +21,16 @@ from src.sim.scenes.video_files import PICTURE_SUFFIXES
 VIEW_EVENT = np.dtype(
     [("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8), ("view", np.uint16)]
 )
-ARGUMENTS = ("fps", "seconds", "start_s", "end_s", "longest_side_px", "seed")
+ARGUMENTS = (
+    "turbulence",
+    "sensor",
+    "fps",
+    "seconds",
+    "start_s",
+    "end_s",
+    "longest_side_px",
+    "seed",
+)
 NO_OVERRIDES = {key: f"it is the argument {key}" for key in ARGUMENTS}
 NO_OVERRIDES |= {"optics.views": "it is the argument views"}
 NO_OVERRIDES |= dict.fromkeys(("photo", "video"), "it is the argument photo_or_video")
@@ -87,7 +96,7 @@ def simulate(
         cfg.update(options | {key: str(path)})
         clip = read_own_clip(cfg)
     else:
-        options |= {"speed_widths_per_s": cfg.speed_widths_per_s, "seed": seed}
+        options |= {"speed_widths_per_s": cfg.speed_widths_per_s, "seed": cfg.seed}
         clip = own_material.clip_from_array(photo_or_video, white_level=cfg.white_level, **options)
     return simulate_clip(OwnSimulation(cfg, clip))
 

@@ -204,7 +204,7 @@ def _find_off_ratio(
     log_ratio, gain, rounds = 0.0, FIRST_GAIN, list[_Round]()
     for number in range(1, ROUNDS + 1):
         followed = progress(clips, f"event rates, round {number} of {ROUNDS} at most")
-        ratio = float(np.exp(log_ratio))
+        ratio = float(np.clip(np.exp(log_ratio), *OFF_RATIOS))
         curve = simulate_event_rates(followed, fps, sensor, thresholds, off_ratio=ratio)
         on = float(find_on_threshold(curve, measured))
         if not np.isfinite(on):

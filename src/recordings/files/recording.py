@@ -39,7 +39,7 @@ READERS: dict[str, Reader] = {  # by the ending, in small letters
     ".npz": NumpyFile, **dict.fromkeys(HDF5_ENDINGS, Hdf5File),
     **dict.fromkeys((*TEXT_ENDINGS, ".gz", ".zip"), TextFile),
 }  # fmt: skip
-OF_ONE_CAMERA = (PropheseeFile, EsFile, TextFile, NpzFolder, EvrealFolder)
+OF_ONE_CAMERA = (PropheseeFile, EsFile, TextFile, EvrealFolder)
 OF_THE_CAMERA = (PropheseeFile, EsFile, Aedat4File, Aedat1To3File)  # it wrote the sensor's size
 
 
