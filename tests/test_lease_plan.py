@@ -24,6 +24,7 @@ from scripts.lease.selection import (
 from scripts.lease.training import DeadlineSchedule, ExportingCurve
 from scripts.pack_scenes import EncodedPicture, build_pack
 from src.app import build
+from src.losses.terms import L1Term, TrainingLoss
 from src.models import files
 from src.training.learning_curve import LearningCurve
 from tests.conftest import ROOT
@@ -170,7 +171,10 @@ def test_minutes_left_over_go_by_shares_and_missing_ones_shorten_all():
 def test_a_curve_knows_how_long_its_last_scoring_took(tmp_path, monkeypatch):
     monkeypatch.setattr(LearningCurve, "score_and_export", lambda *_: time.sleep(0.05))
     curve = ExportingCurve(tmp_path / "a.safetensors", 0.1, 60, print)
-    curve.on_train_start(Mock(spec=Trainer, is_global_zero=True), SimpleNamespace(loss=None))
+    curve.on_train_start(
+        Mock(spec=Trainer, is_global_zero=True),
+        SimpleNamespace(loss=TrainingLoss({"l1": L1Term()})),
+    )
     assert curve.scoring_s >= 0.05
 
 

@@ -4,6 +4,7 @@ A value must be of the kind that the shipped config has there: number, word, tru
 mapping.  What is null there, or may be of several kinds, is listed below.
 """
 
+import math
 from collections.abc import Iterator
 from typing import Any, cast
 
@@ -53,11 +54,11 @@ KEYS: dict[tuple[str, ...], str] = {
     (WORD, NUMBER, NULL): "trainer.precision",
     (NUMBER, WORD, LIST): "trainer.devices",
 }
-LEAST = {  # of whole numbers that another class would refuse without their key
-    "bins": 1, "data.test_clips": 1, "data.val_clips": 0, "data.workers": 0, "sample_clips": 0,
-    "seed": 0, "width": 1, "callbacks.rotation.every_n_train_steps": 1,
+BOUNDS: dict[str, tuple[int, float]] = {  # of what others would refuse without its key
+    "bins": (1, math.inf), "data.test_clips": (1, math.inf), "data.val_clips": (0, math.inf),
+    "data.workers": (0, math.inf), "sample_clips": (0, math.inf), "seed": (0, 2**32 - 1),
+    "width": (1, math.inf), "callbacks.rotation.every_n_train_steps": (1, math.inf),
 }  # fmt: skip
-MOST = {"seed": 2**32 - 1}
 KINDS = {key: kinds for kinds, keys in KEYS.items() for key in keys.split()}
 # Parts whose own classes check whether a number, a range of numbers or null does.
 RANGES = ("augment.", "optics.", "own_sensor.", "scene.", "sensor.", "target.", "turbulence.")
@@ -157,9 +158,9 @@ def _check_value(key: str, value: Any, default: Any, entry_point: str, is_requir
         raise ValueError(f"{key} must be {' or '.join(kinds)}, got {got}")
     if is_required and value == "":
         raise ValueError(f"{key} must be a word, got none")
-    least, most = LEAST.get(key, value), MOST.get(key, value)
-    if key in LEAST and type(value) is int and not least <= value <= most:
-        allowed = f">= {least}" if key not in MOST else f"in {least}..{most}"
+    least, most = BOUNDS.get(key, (-math.inf, math.inf))
+    if type(value) is int and not least <= value <= most:
+        allowed = f">= {least}" if most == math.inf else f"in {least}..{most}"
         raise ValueError(f"{key} must be {allowed}, got {value}")
     if key in SIZES and value is not None and not _is_size(value):
         raise ValueError(f"{key} must be [height,width], whole numbers >= 1, got {value}")

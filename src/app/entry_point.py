@@ -158,14 +158,11 @@ def _check_same_beginning(cfg: DictConfig, stored: Path) -> None:
     """Raise ValueError where the training of the results `stored` went on from other weights than
     `ckpt`; what it was resumed from does not matter."""
     before = json.loads(stored.read_text()).get("resumed_from")
-    weights = [
-        name if name and files.is_weights_file(files.locate(name)) else None
-        for name in (before, cfg.ckpt)
-    ]
+    paths = [files.locate(name) if name else Path() for name in (before, cfg.ckpt)]
+    weights = [path.resolve() if files.is_weights_file(path) else None for path in paths]
     if weights[0] != weights[1]:
-        raise ValueError(
-            f"ckpt must be {weights[0]}, as of the results in {stored}, got {cfg.ckpt}"
-        )
+        wanted, got = ("no weights" if path is None else path for path in weights)
+        raise ValueError(f"ckpt must be {wanted}, as of the results in {stored}, got {got}")
 
 
 def _has_newer_weights(cfg: DictConfig, stored: Path) -> bool:

@@ -22,15 +22,8 @@ VIEW_EVENT = np.dtype(
     [("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8), ("view", np.uint16)]
 )
 ARGUMENTS = (
-    "turbulence",
-    "sensor",
-    "fps",
-    "seconds",
-    "start_s",
-    "end_s",
-    "longest_side_px",
-    "seed",
-)
+    "turbulence", "sensor", "fps", "seconds", "start_s", "end_s", "longest_side_px", "seed",
+)  # fmt: skip
 NO_OVERRIDES = {key: f"it is the argument {key}" for key in ARGUMENTS}
 NO_OVERRIDES |= {"optics.views": "it is the argument views"}
 NO_OVERRIDES |= dict.fromkeys(("photo", "video"), "it is the argument photo_or_video")

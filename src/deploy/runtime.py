@@ -97,7 +97,7 @@ class EventListRuntime:
             if (given := self.views) != (views := copied.views):
                 raise ValueError(f"optics.views must be {views} for this network, got {given}")
             self.runner = E2VIDOverEvents(copied, padded, dtype, backend, threads)
-        self.state_sizes = _describe_sizes(self.runner.state)
+        self.state_sizes, self.warned = _describe_sizes(self.runner.state), set[str]()
 
     def step(self, t, x, y, p, view, t0: float, t1: float) -> Float[np.ndarray, "h w"]:
         """Return the frame at `t1`, float32, as the network's `forward` gives it.
@@ -133,8 +133,8 @@ class EventListRuntime:
         """What lives from window to window, for `state = ...`; later windows advance it in place,
         so that going back to it takes a `copy.deepcopy`.  Set to None it is that of `reset`.
 
-        Raises ValueError where it is set to that of another kind of network, size or number of
-        views.
+        Raises ValueError where it is set to one of other arrays: of another kind of network, size
+        or, of a SetNet, number of views.  An E2VID's is for the form that it comes from.
         """
         return self.runner.state
 
@@ -175,13 +175,18 @@ class EventListRuntime:
 
     def _warn_of_units(self, t: np.ndarray, t0: float, t1: float) -> None:
         if t1 - t0 > LONGEST_WINDOW_S:
-            said = f"a window lasts {t1 - t0:g} s: are t, t0 and t1 in seconds?"
-            warnings.warn(said, stacklevel=5)
+            self._warn_once("length", f"a window lasts {t1 - t0:g} s: are t, t0 and t1 in seconds?")
         if len(t) and t.dtype.kind == "f" and t.dtype.itemsize < 8:
             step = float(np.spacing(np.abs(t[-1])))
             if step * LEAST_TIME_STEPS > t1 - t0:
                 said = f"t is {t.dtype}, in steps of {step:g} s at {t[-1]:g} s: float64 resolves it"
-                warnings.warn(said, stacklevel=5)
+                self._warn_once("steps", said)
+
+    def _warn_once(self, what: str, said: str) -> None:
+        """Warn; of windows alike once, as the text differs from one to the next."""
+        if what not in self.warned:
+            self.warned.add(what)
+            warnings.warn(said, stacklevel=6)
 
     def _describe_error(self, t, x, y, p, view, is_sign: bool) -> str:
         """Return what is wrong with the first event that `has_event_error`."""

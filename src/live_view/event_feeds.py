@@ -61,7 +61,7 @@ def open_feed(
     if not recording.startswith("udp://"):
         size = sources.find_sensor_size(recording, sensor, options)
         opened = open_recording(recording, size[::-1], options)
-        opened.check_first_events()
+        opened.check_sensor_size()
         if lines := opened.messages:
             faults.report("reading", "; ".join(lines), until_cleared=True)
         return FileFeed(recording, size, loop, options)

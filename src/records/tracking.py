@@ -2,18 +2,19 @@
 
 import sys
 from collections.abc import Iterable
+from itertools import count
 from pathlib import Path
 
 from lightning.pytorch.loggers import Logger, WandbLogger
 
 
 def keep_earlier_metrics(run: Path) -> None:
-    """Give the `metrics.csv` of a training in `run` that was cut short a number: the logger of the
-    one that goes on there would delete it."""
+    """Give the `metrics.csv` of an earlier training in `run` the next free number: the logger of
+    the one that begins there would delete it."""
     file = run / "logs" / "metrics.csv"
+    numbered = (file.with_suffix(f".{number}.csv") for number in count(1))
     if file.is_file():
-        number = 1 + len(list(file.parent.glob("metrics.*.csv")))
-        file.rename(file.with_suffix(f".{number}.csv"))
+        file.rename(next(path for path in numbered if not path.exists()))
 
 
 def log_config_to_wandb(loggers: Iterable[Logger], config: dict) -> None:

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable
 from copy import deepcopy
-from itertools import pairwise
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -47,11 +46,11 @@ class LearningCurve(Callback):
         self.export = Path(export) if export else None
         self.rows: list[dict] = []
         self.loss, self.steps = 0.0, 0  # since the last row
-        self.first_row = 0  # whose loss is that of this training
-        self.loss_terms = ""  # of which the loss is the sum
+        self.losses: list[float] = []  # of rows that are compared
+        self.loss_terms = ""  # of which these are the sum
 
     def state_dict(self) -> dict:
-        kept = ("rows", "loss", "steps", "first_row", "loss_terms")
+        kept = ("rows", "loss", "steps", "losses", "loss_terms")
         return {key: getattr(self, key) for key in kept}
 
     def load_state_dict(self, state_dict: dict) -> None:
@@ -88,27 +87,30 @@ class LearningCurve(Callback):
             "windows": module.windows_seen,
             "loss": self.loss / self.steps if self.steps else "",
         }
-        rows = [*self.rows[max(self.first_row - 1, 0) :], row]
-        losses = [after["loss"] for before, after in pairwise(rows) if _counts(before, after)]
-        is_counted = len(rows) > 1 and _counts(*rows[-2:])
-        if is_counted and losses[-1] > COLLAPSE_FACTOR * min(losses):
-            text = f"its mean loss is {losses[-1]:.3g} after {min(losses):.3g}"
-            if self.export:
-                text += f"; {self.export} holds the weights of {self.rows[-1]['hours']:.2f} hours"
-            self.export = None  # so that these are kept
-            raise ValueError(f"the training has collapsed: {text}")
+        if self.steps >= LEAST_STEPS:
+            self.losses.append(self.loss / self.steps)
+            self._check_collapse()
         self.rows.append(row | mean_validation_scores(trainer, module))
         self.loss, self.steps = 0.0, 0
         self._write()
         self.export_weights(module)
         module.clock.start()
 
-    def _forget_other_loss(self, loss: TrainingLoss | None) -> None:
+    def _check_collapse(self) -> None:
+        now, least = self.losses[-1], min(self.losses)
+        if now > COLLAPSE_FACTOR * least:
+            text = f"its mean loss is {now:.3g} after {least:.3g}"
+            if self.export:
+                text += f"; {self.export} holds the weights of {self.rows[-1]['hours']:.2f} hours"
+            self.export = None  # so that these are kept
+            raise ValueError(f"the training has collapsed: {text}")
+
+    def _forget_other_loss(self, loss: TrainingLoss) -> None:
         """Compare no loss with those of rows before, where it is another sum of terms."""
-        terms = loss.terms.items() if loss is not None else ()
+        terms = loss.terms.items()
         now = ", ".join(f"{t.weight:g} {name}: {type(t).__name__}" for name, t in terms)
-        if self.rows and self.loss_terms not in ("", now):
-            self.first_row, self.loss, self.steps = len(self.rows), 0.0, 0
+        if self.loss_terms not in ("", now):
+            self.losses, self.loss, self.steps = [], 0.0, 0
         self.loss_terms = now
 
     def export_weights(self, module: Reconstructor) -> None:
@@ -125,11 +127,6 @@ class LearningCurve(Callback):
         heads = list(self.rows[-1])
         rows = [[row.get(name, "") for name in heads] for row in self.rows]
         write_text(self.path, format_csv(heads, rows))
-
-
-def _counts(before: dict, row: dict) -> bool:
-    """Return whether the mean loss of `row` is of enough steps since the row `before` it."""
-    return row["loss"] != "" and row["steps"] - before["steps"] >= LEAST_STEPS
 
 
 @torch.no_grad()
@@ -170,5 +167,4 @@ def continue_from_weights(
     module.earlier_steps = before["steps"]
     for curve in (found for found in callbacks if isinstance(found, LearningCurve)):
         curve.rows, curve.loss = list(before["curve"]), before["loss"]
-        curve.first_row = len(curve.rows)  # the loss may have been another one before
         curve.steps = before["steps"] - curve.rows[-1]["steps"]

@@ -183,10 +183,10 @@ def test_a_training_that_has_collapsed_ends_and_keeps_what_it_had(tmp_path, monk
 
 def test_losses_of_other_terms_are_not_compared(tmp_path):
     curve = LearningCurve(str(tmp_path / "c.csv"), 1.0)
-    for weight, first_row in ((1.0, 0), (1.0, 0), (3.0, 2)):
-        curve.rows.append({"loss": 1.0, "steps": 100 * len(curve.rows)})
+    for weight, kept in ((1.0, 1), (1.0, 2), (3.0, 0)):
+        curve.losses.append(1.0)
         curve._forget_other_loss(TrainingLoss({"l1": L1Term(weight)}))
-        assert curve.first_row == (first_row and len(curve.rows))
+        assert curve.losses == kept * [1.0]
 
 
 def test_what_goes_on_with_another_loss_has_not_collapsed(three_hours, tmp_path):

@@ -207,6 +207,9 @@ def _find_off_ratio(
         ratio = float(np.clip(np.exp(log_ratio), *OFF_RATIOS))
         curve = simulate_event_rates(followed, fps, sensor, thresholds, off_ratio=ratio)
         on = float(find_on_threshold(curve, measured))
+        if not np.isfinite(on) and rounds:  # the step was too long
+            log_ratio = (log_ratio + rounds[-1].log_ratio) / 2
+            continue
         if not np.isfinite(on):
             low, high = np.sqrt(np.prod(curve.rates[[-1, 0]], axis=1))
             raise ValueError(

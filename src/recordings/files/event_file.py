@@ -106,6 +106,12 @@ def choose_stream(
     return streams[place], (note,) if len(streams) > 1 else ()
 
 
+def require_no_stream(path: Path, wanted: str | int | None) -> None:
+    """Raise ValueError for a stream other than the first of a file that holds one only."""
+    if wanted not in (None, 0, "0"):
+        raise ValueError(f"stream must be null, as {path} has one camera, got {wanted}")
+
+
 @contextmanager
 def name_file_in_errors(path: Path, wrong: str) -> Iterator[None]:
     """Raise every error of the block, a panic of compiled code too, as a ValueError of one line,

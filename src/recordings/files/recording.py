@@ -19,7 +19,14 @@ from src.recordings.files.aedat4_file import Aedat4File
 from src.recordings.files.clocks import TimestampUnwrapper
 from src.recordings.files.es_file import EsFile
 from src.recordings.files.event_arrays import concatenate_events, count_before
-from src.recordings.files.event_file import EVENT, EventFile, RawEvents, ReadOptions, WidthHeight
+from src.recordings.files.event_file import (
+    EVENT,
+    EventFile,
+    RawEvents,
+    ReadOptions,
+    WidthHeight,
+    require_no_stream,
+)
 from src.recordings.files.event_order import EventSorter, merge_in_time
 from src.recordings.files.evreal_folder import EvrealFolder, is_evreal_folder
 from src.recordings.files.hdf5_file import HDF5_ENDINGS, Hdf5File
@@ -60,7 +67,7 @@ class EventRecording:
         """Return what the user is told before the file is read."""
         return *self.file.notes, *self.survey.messages, *self.size_messages
 
-    def check_first_events(self) -> None:
+    def check_sensor_size(self) -> None:
         """Raise ValueError where half of the first events or more are off the sensor."""
         first = next(iter(self.survey.pieces or self.file.pieces()), None)
         if self.size is None or first is None or not len(first.t):
@@ -227,8 +234,8 @@ def _open_file(path: Path, options: ReadOptions) -> EventFile:
     reader = find_folder_reader(path) or reader
     if reader is None:
         raise ValueError(f"{path}: unknown kind of event file, known are {', '.join(READERS)}")
-    if reader in OF_ONE_CAMERA and options.stream not in (None, 0, "0"):
-        raise ValueError(f"stream must be null, as {path} has one camera, got {options.stream}")
+    if reader in OF_ONE_CAMERA:
+        require_no_stream(path, options.stream)
     if options.format is not None and path.suffix.lower() != ".raw":
         raise ValueError(f"format must be null, as {path} is no RAW file, got {options.format}")
     inner = Path(path.stem).suffix.lower()
