@@ -157,12 +157,13 @@ def _read_films(
         raise ValueError(f"ckpt or baseline must reconstruct the events of {path}, got neither")
     options = ReadOptions.from_keys(cfg)
     sensor = sources.find_sensor_size(path, cfg.sensor_size, options)
-    span = event_windows.count_frames_per_window("trained", cfg.fps)
     table = sensor_lookup.build_lookup(views or Views.single_view(sensor, sensor))
-    rule = event_windows.WindowRule(fps=cfg.fps, frames_per_window=span)
+    rule = event_windows.build_window_rule("trained", fps=cfg.fps)
     events = sources.iter_recording(path, sensor, options=options)
     windows = event_windows.cut_windows(events, table, rule)
-    return np.stack(list(reconstruction.reconstruct_each_view(windows, network, span)), axis=1)
+    return np.stack(
+        list(reconstruction.reconstruct_each_view(windows, network, rule.frames_per_window)), axis=1
+    )
 
 
 def measure_turbulence_in_video(

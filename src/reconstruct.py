@@ -20,7 +20,7 @@ from src.deploy.runtime import EventListRuntime
 from src.figures import samples
 from src.models.network import EventToVideoNetwork
 from src.recordings import output, reconstruction, tone, truth_file
-from src.recordings.event_windows import Window, WindowRule, count_frames_per_window, cut_windows
+from src.recordings.event_windows import Window, WindowRule, build_window_rule, cut_windows
 from src.recordings.files import sources
 from src.recordings.files.event_file import HeightWidth, ReadOptions
 from src.recordings.noise_filter import NoiseFilter
@@ -99,7 +99,7 @@ def reconstruct_video_frames(
     curve = tone.build_output_curve(cfg.tone, cfg.tone_time_constant_s, cfg.output_format)
     given = cfg.form, cfg.device, views, cfg.bins
     runnable = reconstruction.build_runnable_network(network, *given)
-    rule = build_window_rule(cfg, network)
+    rule = rule_of_config(cfg, network)
     rule = replace(rule, as_lists=isinstance(runnable, EventListRuntime))
 
     def read() -> Iterator[np.ndarray]:
@@ -111,11 +111,10 @@ def reconstruct_video_frames(
     return shown, views.model
 
 
-def build_window_rule(cfg: DictConfig, network: EventToVideoNetwork) -> WindowRule:
+def rule_of_config(cfg: DictConfig, network: EventToVideoNetwork) -> WindowRule:
     """Return how the recording is cut into windows for `network`."""
     length = cfg.window_length or reconstruction.default_window_length(network)
-    settings = {key: cfg[key] for key in RULE_KEYS}
-    return WindowRule(**settings, frames_per_window=count_frames_per_window(length, cfg.fps))
+    return build_window_rule(length, **{key: cfg[key] for key in RULE_KEYS})
 
 
 def read_filtered_events(cfg: DictConfig, views: Views) -> Iterator[np.ndarray]:
@@ -143,7 +142,9 @@ def reconstruct_film_frames(
         centre = views.select([(0, 0)])
         if network.views is None:
             methods = {"one view": reconstruct_video_frames(cfg, network, centre)[0]} | methods
-    rule = replace(build_window_rule(cfg, network), bins=1)
+    rule = replace(rule_of_config(cfg, network), bins=1)
+    if rule.grows:  # the panel of events shows those of a frame
+        rule = replace(rule, frames_per_window=1)
     windows = cut_windows(read_filtered_events(cfg, views), build_lookup(centre), rule)
     clean = truth_file.read_clean_clip(Path(cfg.recording))
     frames = join_film_panels(windows, methods, clean)

@@ -3,15 +3,17 @@
 A network trained on windows of 1/120 s that is fed shorter ones gets fewer events and runs its
 recurrence more often: it fades.  So windows may overlap: each spans `frames_per_window` frames and
 continues the recurrent state of the window that ended where it starts.  Each of these interleaved
-phases is the reconstruction at the trained rate, and every event counts once per phase.  Times are
-microseconds of the recording's clock in float64.
+phases is the reconstruction at the trained rate, and every event counts once per phase.  Or windows
+may grow, for a network that uses their length: each begins where the last one of
+`frames_per_window` frames ended, whose state it continues, and the state after it is kept if it
+has as many itself.  Times are microseconds of the recording's clock in float64.
 """
 
 import math
 import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -22,6 +24,8 @@ from src.recordings.sensor_lookup import SensorLookup
 
 COVERED = 0.99  # of the last window, or the recording ends before it
 TRAINED_WINDOW_S = 1 / 120
+GROWN_WINDOW_S = 1 / 3000  # to which windows grow
+WINDOW_LENGTHS_S = {"frame": 0.0, "trained": TRAINED_WINDOW_S, "growing": GROWN_WINDOW_S}
 
 
 class VoxelContributions(NamedTuple):
@@ -40,7 +44,8 @@ class Window:
     """The events in [start_us, end_us): the number of `events` in views, and of
     `events_outside` of all views.
 
-    They lie in `voxels` or, for an EventListRuntime, in `event_list`.
+    They lie in `voxels` or, for an EventListRuntime, in `event_list`.  Not `is_kept`: the window
+    grows on, a network continues from the state before it.
     """
 
     start_us: float
@@ -49,6 +54,7 @@ class Window:
     events_outside: int
     voxels: Float[np.ndarray, "views bins h w"] | None = None
     event_list: VoxelContributions | None = None
+    is_kept: bool = True
 
     @property
     def length_s(self) -> float:
@@ -65,13 +71,15 @@ class Window:
 
 @dataclass(frozen=True)
 class WindowRule:
-    """How windows are cut and filled: each is frames_per_window / fps long and ends 1 / fps after
-    the one before.  `start_s` and `end_s` count from the first event.  `as_lists`: windows hold an
-    event list instead of a grid.  Raises ValueError for a value out of range.
+    """How windows are cut and filled: each ends 1 / fps after the one before and is
+    frames_per_window / fps long or, where it `grows`, up to that.  `start_s` and `end_s` count from
+    the first event.  `as_lists`: windows hold an event list instead of a grid.  Raises ValueError
+    for a value out of range.
     """
 
     fps: float = 120.0
     frames_per_window: int = 1
+    grows: bool = False
     bins: int = 5
     splat: str = "bilinear"
     start_s: float = 0.0
@@ -90,13 +98,33 @@ class WindowRule:
                 f"start_s must be >= 0 and before end_s, got {self.start_s}, {self.end_s}"
             )
 
+    @property
+    def overlapping_windows(self) -> int:
+        """How many windows, each with a state of its own, overlap at any time."""
+        return 1 if self.grows else self.frames_per_window
 
-def count_frames_per_window(frame_or_trained: str, fps: float) -> int:
-    """Return how many frames a window of `window_length` spans: `frame` one; `trained`
-    TRAINED_WINDOW_S, if longer.  Raises ValueError for another."""
-    if frame_or_trained not in ("frame", "trained"):
-        raise ValueError(f"window_length must be frame or trained, got {frame_or_trained}")
-    return max(1, round(TRAINED_WINDOW_S * fps)) if frame_or_trained == "trained" else 1
+    def first_frame(self, last: int) -> int:
+        """Return the frame, counted from 0, with which the window begins that ends before frame
+        `last`; below 0 where it begins before the recording."""
+        n = self.frames_per_window
+        return (last - 1) // n * n if self.grows else last - n
+
+    def is_kept(self, start_us: float, end_us: float) -> bool:
+        """Return whether a network keeps the state after this window."""
+        frames = round((end_us - start_us) * 1e-6 * self.fps)
+        return not self.grows or frames >= self.frames_per_window
+
+
+def build_window_rule(window_length: str, **settings: Any) -> WindowRule:
+    """Return the WindowRule of `settings` whose windows are a `frame` long, overlap (`trained`:
+    TRAINED_WINDOW_S long) or are `growing` up to GROWN_WINDOW_S; a frame long where that is longer.
+    Raises ValueError for another length."""
+    if window_length not in WINDOW_LENGTHS_S:
+        allowed = ", ".join(WINDOW_LENGTHS_S)
+        raise ValueError(f"window_length must be one of {allowed}, got {window_length}")
+    rule = WindowRule(**settings)
+    frames = max(1, round(WINDOW_LENGTHS_S[window_length] * rule.fps))
+    return replace(rule, frames_per_window=frames, grows=window_length == "growing")
 
 
 Cut = tuple[np.ndarray, float, float]  # events of a window, its start and end in us
@@ -156,10 +184,13 @@ def _explain_no_window(rule: WindowRule, length_s: float) -> str:
 def cut_windows_backward(
     chunks: Iterable[np.ndarray], lookup: SensorLookup, rule: WindowRule, seconds: float
 ) -> Iterator[Window]:
-    """Yield the windows of the first `seconds`, the last first, each `reversed`; as many as are a
-    multiple of the rule's `frames_per_window`, so that `ReconstructionState.reverse` gives every
-    phase its state.  Raises ValueError as `cut_windows` and for an impossible length of time.
+    """Yield the windows of the first `seconds`, the last first, each `reversed`; of those that grow
+    the longest only; as many as are a multiple of those that overlap, so that
+    `ReconstructionState.reverse` gives every phase its state.  Raises ValueError as `cut_windows`
+    and for an impossible length of time.
     """
+    if rule.grows:
+        rule = replace(rule, fps=rule.fps / rule.frames_per_window, frames_per_window=1)
     end_s = min(rule.end_s, rule.start_s + check_backward_warmup_s(seconds))
     cuts = list(_cut(_OrderedChunks(chunks), replace(rule, end_s=end_s)))
     whole = len(cuts) // rule.frames_per_window * rule.frames_per_window
@@ -170,7 +201,7 @@ def cut_windows_backward(
 def _cut(chunks: _OrderedChunks, rule: WindowRule) -> Iterator[Cut]:
     def cut(k: int) -> Cut:
         to = start + k * 1e6 / rule.fps
-        since = start + (k - rule.frames_per_window) * 1e6 / rule.fps
+        since = start + rule.first_frame(k) * 1e6 / rule.fps
         return events[count_before(events, since) : count_before(events, to)], since, to
 
     period, k = 1e6 / rule.fps, 1
@@ -185,7 +216,7 @@ def _cut(chunks: _OrderedChunks, rule: WindowRule) -> Iterator[Cut]:
         while start + k * period <= min(chunk["t"][-1], end):  # more events of that time may come
             yield cut(k)
             k += 1
-        oldest = start + (k - rule.frames_per_window) * period
+        oldest = start + rule.first_frame(k) * period
         pending = [events[count_before(events, oldest) :]]
         if last == end:
             break
@@ -202,6 +233,7 @@ def fill_window(
     Both are in events per sensor pixel, as in training, however views are resampled.
     """
     nearest, density = rule.splat == "nearest", lookup.density[rule.splat]
+    is_kept = rule.is_kept(start_us, end_us)
     if rule.as_lists:
         (index, x, y, weight, view), outside = lookup.list_contributions(
             events, density, nearest=nearest
@@ -209,11 +241,11 @@ def fill_window(
         length_s = (end_us - start_us) * 1e-6
         t = np.clip((events["t"] - start_us) * 1e-6, 0, length_s)[index]
         listed = VoxelContributions(t, x, y, weight, view)
-        return Window(start_us, end_us, len(events) - outside, outside, event_list=listed)
+        return Window(start_us, end_us, len(events) - outside, outside, None, listed, is_kept)
     if not events.size:
         empty = np.broadcast_to(np.float32(0), (lookup.views, rule.bins, *lookup.model))
-        return Window(start_us, end_us, 0, 0, empty)
+        return Window(start_us, end_us, 0, 0, empty, None, is_kept)
     grid = lookup.empty_grid(rule.bins)
     outside = lookup.add_to_grid(events, grid, start_us, end_us, nearest=nearest)
     grid /= density
-    return Window(start_us, end_us, len(events) - outside, outside, grid)
+    return Window(start_us, end_us, len(events) - outside, outside, grid, None, is_kept)

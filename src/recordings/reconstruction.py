@@ -1,6 +1,7 @@
 """Windows of a recording to frames: on voxel grids or, where the network can, on event lists."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
 from itertools import cycle
@@ -75,10 +76,10 @@ def takes_all_views(network: EventToVideoNetwork, views: int) -> bool:
     return views == 1 or (wants != 1 and not network.uses_centre_view_only)
 
 
-def default_window_length(network: EventToVideoNetwork) -> Literal["frame", "trained"]:
-    """Return `frame` for a network that uses its window's length, else `trained`: most fade when
+def default_window_length(network: EventToVideoNetwork) -> Literal["growing", "trained"]:
+    """Return `growing` for a network that uses its window's length, else `trained`: most fade when
     fed shorter windows than in training."""
-    return "frame" if network.uses_window_length else "trained"
+    return "growing" if network.uses_window_length else "trained"
 
 
 def build_runnable_network(
@@ -107,7 +108,7 @@ def reconstruct_recording(
 
     The network first reads `backward_warmup_s` backward, so that the first frame shows the scene.
     """
-    lookup, state = build_lookup(views), ReconstructionState(rule.frames_per_window)
+    lookup, state = build_lookup(views), ReconstructionState(rule.overlapping_windows)
     run = partial(reconstruct_frames, network=network, positions=views.positions, state=state)
     if backward_warmup_s:
         windows = cut_windows_backward(read_events(), lookup, rule, backward_warmup_s)
@@ -125,7 +126,7 @@ def reconstruct_frames(
     """Reconstruct one frame per window; a window without events holds the picture at no cost.
 
     `windows` hold lists of events for an EventListRuntime, else grids.  `state`, kept up to date,
-    with the rule's `frames_per_window`, makes this call the continuation of an earlier one.
+    with the rule's `overlapping_windows`, makes this call the continuation of an earlier one.
     """
     state = ReconstructionState() if state is None else state
     for window in windows:
@@ -133,7 +134,9 @@ def reconstruct_frames(
         if window.events:
             before = state.states[index]
             picture, after = _run(network, window, before, positions, device)
-            state.states[index], state.picture = after, picture.clip(0, 1)
+            state.picture = picture.clip(0, 1)
+            if window.is_kept:
+                state.states[index] = after
         elif state.picture is None:
             if isinstance(network, EventListRuntime):
                 size: tuple[int, ...] = network.size
@@ -148,7 +151,7 @@ def _run(
 ) -> tuple[np.ndarray, Any]:
     if isinstance(network, EventListRuntime):
         assert window.event_list is not None
-        network.state = state
+        network.state = state if window.is_kept else deepcopy(state)  # it is advanced in place
         return network.step(*window.event_list, 0.0, window.length_s), network.state
     voxels = torch.from_numpy(_voxels(window))[None].to(device)
     with torch.inference_mode():

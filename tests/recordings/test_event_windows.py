@@ -10,7 +10,7 @@ import torch
 from baselines.highpass import HighPass
 from src.models.network import EventToVideoNetwork
 from src.recordings import event_windows, reconstruction, sensor_lookup, views
-from src.recordings.event_windows import WindowRule
+from src.recordings.event_windows import WindowRule, build_window_rule
 from src.recordings.reconstruction import ReconstructionState, reconstruct_frames
 
 EVENT = np.dtype([("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)])
@@ -52,6 +52,7 @@ class Leaky(EventToVideoNetwork):
 RULES = {
     "time": WindowRule(fps=200),
     "overlap": WindowRule(fps=1000, frames_per_window=8),
+    "growing": WindowRule(fps=1000, frames_per_window=8, grows=True),
     "cut": WindowRule(fps=200, start_s=0.021, end_s=0.072),
     "edges between microseconds": WindowRule(fps=120),
 }
@@ -68,11 +69,8 @@ def test_windows_do_not_depend_on_the_chunks(name, size):
     parts = list(event_windows.cut_windows(chunks(made, size), TABLE, rule))
     assert len(whole) == len(parts) > 3
     for one, other in zip(whole, parts, strict=True):
-        assert (one.start_us, one.end_us, one.events) == (
-            other.start_us,
-            other.end_us,
-            other.events,
-        )
+        for name in ("start_us", "end_us", "events", "is_kept"):
+            assert getattr(one, name) == getattr(other, name)
         assert np.array_equal(one.voxels, other.voxels)
 
 
@@ -103,6 +101,31 @@ def test_each_phase_of_overlapping_windows_counts_an_event_once():
         assert all(a.end_us == b.start_us for a, b in itertools.pairwise(mine))
         last = (made["t"] < mine[-1].end_us).sum()
         assert sum(window.events for window in mine) == last
+
+
+def test_growing_windows_begin_where_the_last_kept_one_ended():
+    rule = WindowRule(fps=1000, frames_per_window=8, grows=True)
+    found = list(event_windows.cut_windows([events(4000, 100_000)], TABLE, rule))
+    assert [round(1e3 * window.length_s) for window in found] == ([*range(1, 9)] * 13)[:100]
+    assert [window.is_kept for window in found] == (([False] * 7 + [True]) * 13)[:100]
+    assert sum(window.events for window in found if window.is_kept) == found[95].events + sum(
+        window.events for window in found[7:95:8]
+    )
+
+
+def test_a_sum_over_growing_windows_is_that_over_frames():
+    made = events(4000, 100_000)
+    made["t"][2000:] += 50_000  # a pause
+    rule = WindowRule(fps=1000, frames_per_window=8, grows=True)
+    np.testing.assert_allclose(
+        pictures(made, rule, Sums()), pictures(made, WindowRule(fps=1000), Sums()), atol=1e-5
+    )
+
+
+def test_a_network_looks_back_in_the_longest_of_growing_windows():
+    rule = WindowRule(fps=1000, frames_per_window=8, grows=True)
+    back = event_windows.cut_windows_backward([events(4000, 100_000)], TABLE, rule, 0.0335)
+    assert [round(window.end_us - 5_000_000) for window in back] == [32_000, 24_000, 16_000, 8000]
 
 
 def test_an_empty_window_takes_no_memory_of_its_own():
@@ -170,7 +193,7 @@ def test_a_wrong_rule_is_refused(wrong, message):
 
 def pictures(made, rule, network=None, state=None):
     found = event_windows.cut_windows([made], TABLE, rule)
-    state = state or ReconstructionState(rule.frames_per_window)
+    state = state or ReconstructionState(rule.overlapping_windows)
     frames = reconstruct_frames(found, network or Leaky(), state=state)
     return np.stack([frame.picture for frame in frames])
 
@@ -213,8 +236,7 @@ def still_after_motion(noise_hz: float) -> np.ndarray:
 def test_a_still_scene_at_12000_fps_fades_no_more_than_at_the_trained_rate(noise_hz):
     made = still_after_motion(noise_hz)
     slow = pictures(made, WindowRule(fps=120))
-    overlap = event_windows.count_frames_per_window("trained", 12_000)
-    fast = pictures(made, WindowRule(fps=12_000, frames_per_window=overlap))
+    fast = pictures(made, build_window_rule("trained", fps=12_000))
     contrast = [found[-1].std() / found[len(found) // 5].std() for found in (slow, fast)]
     assert contrast[1] == pytest.approx(contrast[0], rel=0.15)
     naive = pictures(made, WindowRule(fps=12_000))
@@ -223,21 +245,29 @@ def test_a_still_scene_at_12000_fps_fades_no_more_than_at_the_trained_rate(noise
 
 
 def test_a_still_scene_at_12000_fps_does_not_flicker():
-    overlap = event_windows.count_frames_per_window("trained", 12_000)
-    rule = WindowRule(fps=12_000, frames_per_window=overlap)
-    fast = pictures(still_after_motion(0.0), rule)
+    fast = pictures(still_after_motion(0.0), build_window_rule("trained", fps=12_000))
     assert np.abs(np.diff(fast[2400:-1], axis=0)).max() == 0  # an event ends the recording
 
 
-@pytest.mark.parametrize("fps, frames", [(60, 1), (120, 1), (600, 5), (1000, 8), (12_000, 100)])
-def test_a_window_spans_the_trained_length(fps, frames):
-    assert event_windows.count_frames_per_window("trained", fps) == frames
-    assert event_windows.count_frames_per_window("frame", fps) == 1
+@pytest.mark.parametrize(
+    "fps, trained, grown", [(60, 1, 1), (600, 5, 1), (1000, 8, 1), (6000, 50, 2), (12_000, 100, 4)]
+)
+def test_the_frames_of_a_window(fps, trained, grown):
+    rules = [build_window_rule(length, fps=fps) for length in ("frame", "trained", "growing")]
+    assert [rule.frames_per_window for rule in rules] == [1, trained, grown]
+    assert [rule.overlapping_windows for rule in rules] == [1, trained, 1]
 
 
 def test_another_span_is_refused():
     with pytest.raises(ValueError, match="window_length must be"):
-        event_windows.count_frames_per_window("long", 120)
+        build_window_rule("long", fps=120)
+
+
+@pytest.mark.parametrize("fps", [0, float("nan"), float("inf")])
+@pytest.mark.parametrize("length", ["frame", "trained", "growing"])
+def test_a_wrong_rate_is_refused_for_any_window(fps, length):
+    with pytest.raises(ValueError, match=r"fps must be in \(0, 1e6\]"):
+        build_window_rule(length, fps=fps)
 
 
 def test_a_network_is_given_the_window_and_the_positions():

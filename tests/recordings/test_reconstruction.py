@@ -40,12 +40,13 @@ def recording() -> np.ndarray:
         {"fps": 240.0},
         {"fps": 240.0, "splat": "nearest"},
         {"fps": 600.0, "frames_per_window": 5},
+        {"fps": 1200.0, "frames_per_window": 5, "grows": True},
     ],
 )
 def test_the_frames_are_those_from_grids(name, cut):
     torch.manual_seed(0)
     network, table = NETWORKS[name]().eval(), sensor_lookup.build_lookup(VIEWS)
-    span = cut.get("frames_per_window", 1)
+    span = event_windows.WindowRule(**cut).overlapping_windows
     grids = event_windows.cut_windows([recording()], table, event_windows.WindowRule(**cut))
     dense = list(reconstruct_frames(grids, network, VIEWS.positions, ReconstructionState(span)))
     lists = event_windows.cut_windows(

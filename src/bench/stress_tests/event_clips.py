@@ -97,17 +97,20 @@ class EventClip:
     ) -> Iterator[Float[Tensor, "1 views bins h w"]]:
         """Yield the grids of `rate_hz` windows a second (None: `fps`), for at most `duration_s`."""
         rate = rate_hz or self.fps
+        for k in range(round(min(duration_s or self.duration_s, self.duration_s) * rate)):
+            yield self.grid(k * US_PER_S / rate, (k + 1) * US_PER_S / rate)
+
+    def grid(self, start_us: float, end_us: float) -> Float[Tensor, "1 views bins h w"]:
+        """Return the grids of the window [start_us, end_us)."""
         height, width = self.target.shape[-2:]
         size = {"bins": BINS, "height": height, "width": width}
-        for k in range(round(min(duration_s or self.duration_s, self.duration_s) * rate)):
-            start_us, end_us = k * US_PER_S / rate, (k + 1) * US_PER_S / rate
-            grids = []
-            for events in self.events:
-                # Ticks belong to the window in which they fall, as the sensor has it.
-                ends = np.searchsorted(events["t"], np.ceil([start_us - 1e-6, end_us - 1e-6]))
-                t, x, y, p = (events[slice(*ends)][name] for name in "txyp")
-                grids.append(voxel_grid(t, x, y, p, t0=start_us, t1=end_us + 1e-3, **size))
-            yield torch.stack(grids)[None]
+        grids = []
+        for events in self.events:
+            # Ticks belong to the window in which they fall, as the sensor has it.
+            ends = np.searchsorted(events["t"], np.ceil([start_us - 1e-6, end_us - 1e-6]))
+            t, x, y, p = (events[slice(*ends)][name] for name in "txyp")
+            grids.append(voxel_grid(t, x, y, p, t0=start_us, t1=end_us + 1e-3, **size))
+        return torch.stack(grids)[None]
 
     def back_and_forth(self) -> tuple[list[Tensor], Film]:
         """Return the windows of the clip followed by those of its reverse, and the truth."""
