@@ -10,18 +10,10 @@ import torch
 from torch import Tensor
 
 from src.bench.candidates import Candidate
-from src.bench.stress_tests.event_clips import (
-    US_PER_S,
-    ClipConditions,
-    EventClip,
-    StressBench,
-    Video,
-    require_type,
-)
+from src.bench.stress_tests.event_clips import ClipConditions, EventClip, StressBench, require_type
 from src.bench.stress_tests.stress_results import StressResult, build_worst_psnr_loss_result
 from src.metrics.image import aligned_psnr
 from src.models.network import unroll
-from src.recordings.event_windows import WindowRule, build_window_rule
 from src.sim import noise
 from src.sim.optics import layout, most_central_view_index
 from src.sim.turbulence.simulated import SimulatedTurbulence
@@ -76,13 +68,12 @@ def measure_correlated_views_loss(
 
 def measure_window_rate_loss(
     network: Candidate, bench: StressBench, *, limit_db: float, rates_hz: Sequence[float],
-    duration_s: float = 0.3, window_length: str = "frame",
+    duration_s: float = 0.3,
 ) -> StressResult:  # fmt: skip
     """Return the aligned PSNR lost, at the same instants, when the events are cut at another rate.
 
     `rates_hz`: windows a second, easy to hard; each is a multiple or a whole part of the clip's
-    own.  `duration_s`: how much of the clip is used; its second half is scored.  `window_length`:
-    frame or growing, as of src.reconstruct.
+    own.  `duration_s`: how much of the clip is used; its second half is scored.
     """
 
     def score(clip: EventClip, rate_hz: float) -> float:
@@ -93,32 +84,13 @@ def measure_window_rate_loss(
         instants = torch.arange(count // 2, count) + 1
         at = (instants * (rate_hz / slowest)).round().long()
         truth = (instants * (clip.fps / slowest)).round().long()
-        rule = build_window_rule(window_length, fps=rate_hz)
-        frames = _reconstruct_frames(network, clip, rule, at.tolist())
+        frames = clip.reconstruct_at(network, rate_hz, at.tolist())
         return float(aligned_psnr(frames, clip.target[truth, None]).mean())
 
     clips = bench.clips()
     base = fmean(score(clip, clip.fps) for clip in clips)
     curve = [(rate, base - fmean(score(clip, rate) for clip in clips)) for rate in rates_hz]
     return build_worst_psnr_loss_result(curve, limit_db=limit_db, varied="windows a second")
-
-
-def _reconstruct_frames(
-    network: Candidate, clip: EventClip, rule: WindowRule, numbers: Sequence[int]
-) -> Video:
-    """Return the frames of `numbers`, in order, counted from 1; windows do not overlap."""
-    video, state, period_us = [], None, US_PER_S / rule.fps
-    for k in range(1, numbers[-1] + 1):
-        start_us, end_us = rule.first_frame(k) * period_us, k * period_us
-        if not (is_kept := rule.is_kept(start_us, end_us)) and k not in numbers:
-            continue
-        length_s = (end_us - start_us) / US_PER_S
-        window = clip.grid(start_us, end_us)
-        frame, after = network.reconstruct([window], clip.positions, length_s, state)
-        state = after if is_kept else state
-        if k in numbers:
-            video.append(frame)
-    return torch.cat(video)
 
 
 def measure_voxel_dropout_loss(

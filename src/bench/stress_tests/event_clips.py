@@ -21,6 +21,7 @@ from torch.nn import functional
 from src.bench.candidates import Candidate
 from src.metrics.image import aligned_psnr
 from src.models.backward_warmup import reverse_voxels
+from src.recordings.event_windows import build_window_rule
 from src.sim import noise
 from src.sim.optics import Position
 from src.sim.pipeline import Pipeline, crop_frames
@@ -126,6 +127,25 @@ class EventClip:
         """
         windows = self.windows() if windows is None else windows
         return network.reconstruct(windows, self.positions, 1 / self.fps, state)
+
+    def reconstruct_at(self, network: Candidate, fps: float, numbers: Sequence[int]) -> Video:
+        """Return the frames of `numbers`, in order, counted from 1, of `fps` a second.
+
+        Windows are a frame long; those of a network that uses their length grow, as src.reconstruct
+        has it.
+        """
+        grows = network.loaded.uses_window_length
+        rule = build_window_rule("growing" if grows else "frame", fps=fps)
+        video, state, period_us = [], None, US_PER_S / fps
+        for k in range(1, numbers[-1] + 1):
+            start_us, end_us = rule.first_frame(k) * period_us, k * period_us
+            is_kept, is_wanted = rule.is_kept(start_us, end_us), k in numbers
+            if is_kept or is_wanted:
+                window, length_s = self.grid(start_us, end_us), (end_us - start_us) / US_PER_S
+                frame, after = network.reconstruct([window], self.positions, length_s, state)
+                state = after if is_kept else state
+                video += [frame] if is_wanted else []
+        return torch.cat(video)
 
 
 def simulate_event_clip(pipeline: Pipeline, index: int, conditions: ClipConditions) -> EventClip:

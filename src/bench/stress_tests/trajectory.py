@@ -34,7 +34,8 @@ def measure_trajectory_deviation(
     """
 
     def measure(clip: EventClip) -> CrossTrackError:
-        return measure_cross_track_error(clip.reconstruct(network)[0][:, 0], clip.target[1:])
+        frames = clip.reconstruct_at(network, clip.fps, range(1, len(clip.target)))
+        return measure_cross_track_error(frames[:, 0], clip.target[1:])
 
     clips = bench.clips()
     without = list(map(measure, bench.clips(ClipConditions(d_over_r0=0.0))))
