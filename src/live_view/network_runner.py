@@ -23,7 +23,6 @@ from src.recordings.files.event_file import EVENT
 from src.recordings.reconstruction import (
     ReconstructionState,
     build_runnable_network,
-    default_window_length,
     reconstruct_frames,
 )
 from src.recordings.sensor_lookup import build_lookup
@@ -45,28 +44,6 @@ class RunSettings:
     form: str | None = None
 
 
-class _RecentEvents:
-    """Events of the last frames, for windows of several; of the frames some may be dropped."""
-
-    def __init__(self, rule: WindowRule):
-        self.rule, self.frames = rule, deque[np.ndarray](maxlen=rule.frames_per_window)
-        self.grown_from_us: float | None = None
-
-    def add(self, frame: EventWindow) -> tuple[np.ndarray, float]:
-        """Return the events of the window that ends with `frame`, and its start, in us."""
-        self.frames.append(frame.events)
-        most, period_us = self.rule.frames_per_window, frame.end_us - frame.start_us
-        start_us = frame.end_us - most * period_us
-        if self.rule.grows:
-            since_us = frame.start_us if self.grown_from_us is None else self.grown_from_us
-            grown = round((frame.end_us - since_us) / period_us)
-            start_us = since_us if grown < 2 * most else frame.start_us  # after a gap: anew
-        is_kept = self.rule.is_kept(start_us, frame.end_us)
-        self.grown_from_us = frame.end_us if is_kept else start_us
-        events = concatenate_events(self.frames)
-        return events[count_before(events, start_us) :], start_us
-
-
 class NetworkRunner:
     """`network` on `views`, window after window, as `src.reconstruct` runs it; warm when made.
 
@@ -76,30 +53,39 @@ class NetworkRunner:
     def __init__(
         self, name: str, network: EventToVideoNetwork, views: Views, settings: RunSettings
     ):
-        self.name, self.views = name, views
-        length = settings.window_length or default_window_length(network)
+        self.name, self.views, fps = name, views, settings.fps
+        length = settings.window_length or ("frame" if network.uses_window_length else "trained")
+        if length == "growing":  # at rates that no machine reaches live
+            raise ValueError("window_length must be frame or trained for src.live, got growing")
+        self.frames_per_window = build_window_rule(length, fps=fps).frames_per_window
         form = settings.form or (fastest_form() if supports_event_lists(network) else "float32")
         self.network = build_runnable_network(network, form, "cpu", views, settings.bins)
         is_runtime = isinstance(self.network, EventListRuntime)
-        cut = {"fps": settings.fps, "bins": settings.bins, "splat": settings.splat}
-        self.rule = build_window_rule(length, **cut, as_lists=is_runtime)
+        self.rule = WindowRule(
+            fps=fps, bins=settings.bins, splat=settings.splat, as_lists=is_runtime
+        )
         self.lookup = build_lookup(views)
-        # With windows of one frame it can begin one while another is finished.
-        self.is_pipelined = is_runtime and self.rule.frames_per_window == 1
-        self.recent = _RecentEvents(self.rule)
+        # One without overlapping windows can begin a window while another is finished.
+        self.is_pipelined = is_runtime and self.frames_per_window == 1
+        self.recent: deque[np.ndarray] = deque(maxlen=self.frames_per_window)
         events = np.zeros(1000, EVENT)  # to run on, so that nothing is compiled while windows wait
         events["x"] = np.linspace(0, views.sensor[1] - 1, len(events))
         events["y"], events["p"] = views.sensor[0] // 2, 1
         for _ in range(3):
-            self.begin(EventWindow(0.0, 1e6 / settings.fps, events), restart=True)()
+            self.begin(EventWindow(0.0, 1e6 / fps, events), restart=True)()
 
     def begin(self, window: EventWindow, *, restart: bool = False) -> Finish:
         """Do what the events of `window` ask for; return what gives the picture, in [0, 1], which
         may run in another thread, in order.  The first window has to `restart`: forget all before.
         """
         if restart:
-            self.recent = _RecentEvents(self.rule)
-        events, start_us = self.recent.add(window)
+            self.recent.clear()
+        self.recent.append(window.events)
+        start_us = window.end_us - self.frames_per_window * (window.end_us - window.start_us)
+        events = window.events
+        if self.frames_per_window > 1:  # of the windows in between some may be dropped
+            events = concatenate_events(self.recent)
+            events = events[count_before(events, start_us) :]
         filled = fill_window(events, self.lookup, self.rule, start_us, window.end_us)
         if not self.is_pipelined or not isinstance(self.network, EventListRuntime):
             return partial(self._run, filled, restart)
@@ -110,7 +96,7 @@ class NetworkRunner:
 
     def _run(self, window: Window, restart: bool) -> Float[np.ndarray, "h w"]:
         if restart:
-            self.state = ReconstructionState(self.rule.overlapping_windows)
+            self.state = ReconstructionState(self.frames_per_window)
         frames = reconstruct_frames([window], self.network, self.views.positions, self.state)
         return next(frames).picture
 

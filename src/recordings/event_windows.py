@@ -24,7 +24,7 @@ from src.recordings.sensor_lookup import SensorLookup
 
 COVERED = 0.99  # of the last window, or the recording ends before it
 TRAINED_WINDOW_S = 1 / 120
-GROWN_WINDOW_S = 1 / 3000  # to which windows grow
+GROWN_WINDOW_S = 1 / 2000  # to which windows grow
 WINDOW_LENGTHS_S = {"frame": 0.0, "trained": TRAINED_WINDOW_S, "growing": GROWN_WINDOW_S}
 
 
@@ -103,11 +103,11 @@ class WindowRule:
         """How many windows, each with a state of its own, overlap at any time."""
         return 1 if self.grows else self.frames_per_window
 
-    def first_frame(self, last: int) -> int:
+    def first_frame(self, end: int) -> int:
         """Return the frame, counted from 0, with which the window begins that ends before frame
-        `last`; below 0 where it begins before the recording."""
+        `end`; below 0 where it begins before the recording."""
         n = self.frames_per_window
-        return (last - 1) // n * n if self.grows else last - n
+        return (end - 1) // n * n if self.grows else end - n
 
     def is_kept(self, start_us: float, end_us: float) -> bool:
         """Return whether a network keeps the state after this window."""
@@ -117,8 +117,8 @@ class WindowRule:
 
 def build_window_rule(window_length: str, **settings: Any) -> WindowRule:
     """Return the WindowRule of `settings` whose windows are a `frame` long, overlap (`trained`:
-    TRAINED_WINDOW_S long) or are `growing` up to GROWN_WINDOW_S; a frame long where that is longer.
-    Raises ValueError for another length."""
+    TRAINED_WINDOW_S long) or are `growing` up to GROWN_WINDOW_S; both are rounded to frames, one at
+    least.  Raises ValueError for another length."""
     if window_length not in WINDOW_LENGTHS_S:
         allowed = ", ".join(WINDOW_LENGTHS_S)
         raise ValueError(f"window_length must be one of {allowed}, got {window_length}")
@@ -199,13 +199,14 @@ def cut_windows_backward(
 
 
 def _cut(chunks: _OrderedChunks, rule: WindowRule) -> Iterator[Cut]:
+    def time_us(frame: float) -> float:
+        return start + frame * 1e6 / rule.fps
+
     def cut(k: int) -> Cut:
-        to = start + k * 1e6 / rule.fps
-        since = start + rule.first_frame(k) * 1e6 / rule.fps
+        since, to = time_us(rule.first_frame(k)), time_us(k)
         return events[count_before(events, since) : count_before(events, to)], since, to
 
-    period, k = 1e6 / rule.fps, 1
-    pending: list[np.ndarray] = []
+    k, pending = 1, list[np.ndarray]()
     for chunk in chunks:
         start, end = chunks.first_us + 1e6 * np.array([rule.start_s, rule.end_s])
         chunk = chunk[count_before(chunk, start) :]
@@ -213,14 +214,13 @@ def _cut(chunks: _OrderedChunks, rule: WindowRule) -> Iterator[Cut]:
             continue
         events = concatenate_events([*pending, chunk])
         last = min(float(chunk["t"][-1]) + 1, end)
-        while start + k * period <= min(chunk["t"][-1], end):  # more events of that time may come
+        while time_us(k) <= min(chunk["t"][-1], end):  # more events of that time may come
             yield cut(k)
             k += 1
-        oldest = start + rule.first_frame(k) * period
-        pending = [events[count_before(events, oldest) :]]
+        pending = [events[count_before(events, time_us(rule.first_frame(k))) :]]
         if last == end:
             break
-    while pending and start + (k - 1 + COVERED) * period <= last:
+    while pending and time_us(k - 1 + COVERED) <= last:
         yield cut(k)
         k += 1
 

@@ -19,7 +19,7 @@ from src.live_view import event_feeds
 from src.live_view.feed_reader import STALL_S, FeedReader, PlaybackClock
 from src.live_view.frame_buffer import PolarityAccumulator
 from src.live_view.live_windows import WindowCutter, WindowQueue
-from src.live_view.network_runner import RunSettings
+from src.live_view.network_runner import NetworkRunner, RunSettings
 from src.live_view.page_server import PageServer
 from src.live_view.status import FaultLog, Meters
 from src.models.setnet import SetNet
@@ -290,6 +290,12 @@ def test_the_recorded_time_is_that_of_the_frame_shown_also_while_nothing_moves(r
     player.stop()
     assert count / 100 - 1e-3 <= status["time_s"] - start_us * 1e-6 < 5  # the next event: at 8 s
     assert np.array_equal(screen.ring[20], screen.ring[29])
+
+
+def test_live_windows_do_not_grow():
+    settings = RunSettings(12_000.0, window_length="growing", form="float32")
+    with pytest.raises(ValueError, match="must be frame or trained for src.live, got growing"):
+        NetworkRunner("net", SetNet.preset("small"), scenes.views(), settings)
 
 
 def test_what_cannot_keep_up_drops_windows_and_keeps_its_latency(recording):

@@ -69,8 +69,8 @@ def test_windows_do_not_depend_on_the_chunks(name, size):
     parts = list(event_windows.cut_windows(chunks(made, size), TABLE, rule))
     assert len(whole) == len(parts) > 3
     for one, other in zip(whole, parts, strict=True):
-        for name in ("start_us", "end_us", "events", "is_kept"):
-            assert getattr(one, name) == getattr(other, name)
+        for field in ("start_us", "end_us", "events", "is_kept"):
+            assert getattr(one, field) == getattr(other, field)
         assert np.array_equal(one.voxels, other.voxels)
 
 
@@ -105,12 +105,24 @@ def test_each_phase_of_overlapping_windows_counts_an_event_once():
 
 def test_growing_windows_begin_where_the_last_kept_one_ended():
     rule = WindowRule(fps=1000, frames_per_window=8, grows=True)
-    found = list(event_windows.cut_windows([events(4000, 100_000)], TABLE, rule))
+    made = events(4000, 100_000)
+    found = list(event_windows.cut_windows([made], TABLE, rule))
     assert [round(1e3 * window.length_s) for window in found] == ([*range(1, 9)] * 13)[:100]
     assert [window.is_kept for window in found] == (([False] * 7 + [True]) * 13)[:100]
-    assert sum(window.events for window in found if window.is_kept) == found[95].events + sum(
-        window.events for window in found[7:95:8]
-    )
+    for k, window in enumerate(found[8:], start=8):
+        assert window.start_us == found[k // 8 * 8 - 1].end_us
+    kept = sum(window.events for window in found if window.is_kept)
+    assert kept == (made["t"] < 5_096_000).sum()
+
+
+@pytest.mark.parametrize("grows", [False, True])
+def test_an_event_at_the_edge_of_a_window_is_kept_between_chunks(grows):
+    made = np.zeros(20_000, EVENT)  # one a microsecond
+    made["t"], made["p"] = np.arange(20_000), 1
+    rule = WindowRule(fps=15_000, frames_per_window=5, grows=grows)
+    whole = event_windows.cut_windows([made], TABLE, rule)
+    parts = event_windows.cut_windows(chunks(made, 7), TABLE, rule)
+    assert [one.events for one in whole] == [one.events for one in parts]
 
 
 def test_a_sum_over_growing_windows_is_that_over_frames():
@@ -250,7 +262,7 @@ def test_a_still_scene_at_12000_fps_does_not_flicker():
 
 
 @pytest.mark.parametrize(
-    "fps, trained, grown", [(60, 1, 1), (600, 5, 1), (1000, 8, 1), (6000, 50, 2), (12_000, 100, 4)]
+    "fps, trained, grown", [(60, 1, 1), (600, 5, 1), (1000, 8, 1), (6000, 50, 3), (12_000, 100, 6)]
 )
 def test_the_frames_of_a_window(fps, trained, grown):
     rules = [build_window_rule(length, fps=fps) for length in ("frame", "trained", "growing")]

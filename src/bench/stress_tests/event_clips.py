@@ -129,17 +129,17 @@ class EventClip:
         return network.reconstruct(windows, self.positions, 1 / self.fps, state)
 
     def reconstruct_at(self, network: Candidate, fps: float, numbers: Sequence[int]) -> Video:
-        """Return the frames of `numbers`, in order, counted from 1, of `fps` a second.
+        """Return the frames of `numbers`, counted from 1, of `fps` a second, in order of time.
 
         Windows are a frame long; those of a network that uses their length grow, as src.reconstruct
         has it.
         """
         grows = network.loaded.uses_window_length
         rule = build_window_rule("growing" if grows else "frame", fps=fps)
-        video, state, period_us = [], None, US_PER_S / fps
-        for k in range(1, numbers[-1] + 1):
+        video, state, period_us, wanted = [], None, US_PER_S / fps, set(numbers)
+        for k in range(1, max(wanted) + 1):
             start_us, end_us = rule.first_frame(k) * period_us, k * period_us
-            is_kept, is_wanted = rule.is_kept(start_us, end_us), k in numbers
+            is_kept, is_wanted = rule.is_kept(start_us, end_us), k in wanted
             if is_kept or is_wanted:
                 window, length_s = self.grid(start_us, end_us), (end_us - start_us) / US_PER_S
                 frame, after = network.reconstruct([window], self.positions, length_s, state)
