@@ -99,7 +99,7 @@ def reconstruct_video_frames(
     curve = tone.build_output_curve(cfg.tone, cfg.tone_time_constant_s, cfg.output_format)
     given = cfg.form, cfg.device, views, cfg.bins
     runnable = reconstruction.build_runnable_network(network, *given)
-    rule = build_rule_from_config(cfg, network)
+    rule = build_window_rule_from_config(cfg, network)
     rule = replace(rule, as_lists=isinstance(runnable, EventListRuntime))
 
     def read() -> Iterator[np.ndarray]:
@@ -111,7 +111,7 @@ def reconstruct_video_frames(
     return shown, views.model
 
 
-def build_rule_from_config(cfg: DictConfig, network: EventToVideoNetwork) -> WindowRule:
+def build_window_rule_from_config(cfg: DictConfig, network: EventToVideoNetwork) -> WindowRule:
     """Return how the recording is cut into windows for `network`."""
     length = cfg.window_length or reconstruction.default_window_length(network)
     return build_window_rule(length, **{key: cfg[key] for key in RULE_KEYS})
@@ -142,7 +142,7 @@ def reconstruct_film_frames(
         centre = views.select([(0, 0)])
         if network.views is None:
             methods = {"one view": reconstruct_video_frames(cfg, network, centre)[0]} | methods
-    rule = replace(build_rule_from_config(cfg, network), bins=1)
+    rule = replace(build_window_rule_from_config(cfg, network), bins=1)
     if rule.grows:  # the panel of events shows those of a frame
         rule = replace(rule, frames_per_window=1, grows=False)
     windows = cut_windows(read_filtered_events(cfg, views), build_lookup(centre), rule)

@@ -13,6 +13,7 @@ import math
 import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,7 +25,7 @@ from src.recordings.sensor_lookup import SensorLookup
 
 COVERED = 0.99  # of the last window, or the recording ends before it
 TRAINED_WINDOW_S = 1 / 120
-GROWN_WINDOW_S = 1 / 2000  # to which windows grow
+GROWN_WINDOW_S = 1 / 2000  # to which windows grow: shorter ones lose PSNR, longer ones a fast dart
 WINDOW_LENGTHS_S = {"frame": 0.0, "trained": TRAINED_WINDOW_S, "growing": GROWN_WINDOW_S}
 
 
@@ -44,8 +45,8 @@ class Window:
     """The events in [start_us, end_us): the number of `events` in views, and of
     `events_outside` of all views.
 
-    They lie in `voxels` or, for an EventListRuntime, in `event_list`.  Not `is_kept`: the window
-    grows on, a network continues from the state before it.
+    They lie in `voxels` or, for an EventListRuntime, in `event_list`.  Unless it `keeps_state` the
+    window grows on: a network continues from the state before it.
     """
 
     start_us: float
@@ -54,7 +55,7 @@ class Window:
     events_outside: int
     voxels: Float[np.ndarray, "views bins h w"] | None = None
     event_list: VoxelContributions | None = None
-    is_kept: bool = True
+    keeps_state: bool = True
 
     @property
     def length_s(self) -> float:
@@ -103,13 +104,13 @@ class WindowRule:
         """How many windows, each with a state of its own, overlap at any time."""
         return 1 if self.grows else self.frames_per_window
 
-    def first_frame(self, end: int) -> int:
+    def first_frame_of_window(self, end: int) -> int:
         """Return the frame, counted from 0, with which the window begins that ends before frame
         `end`; below 0 where it begins before the recording."""
         n = self.frames_per_window
         return (end - 1) // n * n if self.grows else end - n
 
-    def is_kept(self, start_us: float, end_us: float) -> bool:
+    def keeps_state(self, start_us: float, end_us: float) -> bool:
         """Return whether a network keeps the state after this window."""
         frames = round((end_us - start_us) * 1e-6 * self.fps)
         return not self.grows or frames >= self.frames_per_window
@@ -203,7 +204,7 @@ def _cut(chunks: _OrderedChunks, rule: WindowRule) -> Iterator[Cut]:
         return start + frame * 1e6 / rule.fps
 
     def cut(k: int) -> Cut:
-        since, to = time_us(rule.first_frame(k)), time_us(k)
+        since, to = time_us(rule.first_frame_of_window(k)), time_us(k)
         return events[count_before(events, since) : count_before(events, to)], since, to
 
     k, pending = 1, list[np.ndarray]()
@@ -217,7 +218,7 @@ def _cut(chunks: _OrderedChunks, rule: WindowRule) -> Iterator[Cut]:
         while time_us(k) <= min(chunk["t"][-1], end):  # more events of that time may come
             yield cut(k)
             k += 1
-        pending = [events[count_before(events, time_us(rule.first_frame(k))) :]]
+        pending = [events[count_before(events, time_us(rule.first_frame_of_window(k))) :]]
         if last == end:
             break
     while pending and time_us(k - 1 + COVERED) <= last:
@@ -233,7 +234,8 @@ def fill_window(
     Both are in events per sensor pixel, as in training, however views are resampled.
     """
     nearest, density = rule.splat == "nearest", lookup.density[rule.splat]
-    is_kept = rule.is_kept(start_us, end_us)
+    keeps_state = rule.keeps_state(start_us, end_us)
+    window = partial(Window, start_us, end_us, keeps_state=keeps_state)
     if rule.as_lists:
         (index, x, y, weight, view), outside = lookup.list_contributions(
             events, density, nearest=nearest
@@ -241,11 +243,12 @@ def fill_window(
         length_s = (end_us - start_us) * 1e-6
         t = np.clip((events["t"] - start_us) * 1e-6, 0, length_s)[index]
         listed = VoxelContributions(t, x, y, weight, view)
-        return Window(start_us, end_us, len(events) - outside, outside, None, listed, is_kept)
+        count = len(events) - outside
+        return window(events=count, events_outside=outside, event_list=listed)
     if not events.size:
         empty = np.broadcast_to(np.float32(0), (lookup.views, rule.bins, *lookup.model))
-        return Window(start_us, end_us, 0, 0, empty, None, is_kept)
+        return window(events=0, events_outside=0, voxels=empty)
     grid = lookup.empty_grid(rule.bins)
     outside = lookup.add_to_grid(events, grid, start_us, end_us, nearest=nearest)
     grid /= density
-    return Window(start_us, end_us, len(events) - outside, outside, grid, None, is_kept)
+    return window(events=len(events) - outside, events_outside=outside, voxels=grid)

@@ -135,7 +135,7 @@ def reconstruct_frames(
             before = state.states[index]
             picture, after = _run(network, window, before, positions, device)
             state.picture = picture.clip(0, 1)
-            if window.is_kept:
+            if window.keeps_state:
                 state.states[index] = after
         elif state.picture is None:
             if isinstance(network, EventListRuntime):
@@ -151,7 +151,7 @@ def _run(
 ) -> tuple[np.ndarray, Any]:
     if isinstance(network, EventListRuntime):
         assert window.event_list is not None
-        network.state = state if window.is_kept else deepcopy(state)  # it is advanced in place
+        network.state = state if window.keeps_state else deepcopy(state)  # it is advanced in place
         return network.step(*window.event_list, 0.0, window.length_s), network.state
     voxels = torch.from_numpy(_voxels(window))[None].to(device)
     with torch.inference_mode():

@@ -69,7 +69,7 @@ def test_windows_do_not_depend_on_the_chunks(name, size):
     parts = list(event_windows.cut_windows(chunks(made, size), TABLE, rule))
     assert len(whole) == len(parts) > 3
     for one, other in zip(whole, parts, strict=True):
-        for field in ("start_us", "end_us", "events", "is_kept"):
+        for field in ("start_us", "end_us", "events", "keeps_state"):
             assert getattr(one, field) == getattr(other, field)
         assert np.array_equal(one.voxels, other.voxels)
 
@@ -108,10 +108,10 @@ def test_growing_windows_begin_where_the_last_kept_one_ended():
     made = events(4000, 100_000)
     found = list(event_windows.cut_windows([made], TABLE, rule))
     assert [round(1e3 * window.length_s) for window in found] == ([*range(1, 9)] * 13)[:100]
-    assert [window.is_kept for window in found] == (([False] * 7 + [True]) * 13)[:100]
+    assert [window.keeps_state for window in found] == (([False] * 7 + [True]) * 13)[:100]
     for k, window in enumerate(found[8:], start=8):
         assert window.start_us == found[k // 8 * 8 - 1].end_us
-    kept = sum(window.events for window in found if window.is_kept)
+    kept = sum(window.events for window in found if window.keeps_state)
     assert kept == (made["t"] < 5_096_000).sum()
 
 

@@ -84,7 +84,7 @@ def measure_window_rate_loss(
         instants = torch.arange(count // 2, count) + 1
         at = (instants * (rate_hz / slowest)).round().long()
         truth = (instants * (clip.fps / slowest)).round().long()
-        frames = clip.reconstruct_at(network, rate_hz, at.tolist())
+        frames = clip.reconstruct_at_rate(network, rate_hz, at.tolist())
         return float(aligned_psnr(frames, clip.target[truth, None]).mean())
 
     clips = bench.clips()

@@ -93,16 +93,13 @@ class EventClip:
         """The true frame at the end of every window."""
         return self.target[1:, None]
 
-    def windows(
-        self, rate_hz: float | None = None, duration_s: float | None = None
-    ) -> Iterator[Float[Tensor, "1 views bins h w"]]:
-        """Yield the grids of `rate_hz` windows a second (None: `fps`), for at most `duration_s`."""
-        rate = rate_hz or self.fps
-        for k in range(round(min(duration_s or self.duration_s, self.duration_s) * rate)):
-            yield self.grid(k * US_PER_S / rate, (k + 1) * US_PER_S / rate)
+    def windows(self) -> Iterator[Float[Tensor, "1 views bins h w"]]:
+        """Yield the voxel grids of `fps` windows a second."""
+        for k in range(len(self.target) - 1):
+            yield self.voxel_grids(k * US_PER_S / self.fps, (k + 1) * US_PER_S / self.fps)
 
-    def grid(self, start_us: float, end_us: float) -> Float[Tensor, "1 views bins h w"]:
-        """Return the grids of the window [start_us, end_us)."""
+    def voxel_grids(self, start_us: float, end_us: float) -> Float[Tensor, "1 views bins h w"]:
+        """Return the grids of all views of the window [start_us, end_us)."""
         height, width = self.target.shape[-2:]
         size = {"bins": BINS, "height": height, "width": width}
         grids = []
@@ -128,7 +125,7 @@ class EventClip:
         windows = self.windows() if windows is None else windows
         return network.reconstruct(windows, self.positions, 1 / self.fps, state)
 
-    def reconstruct_at(self, network: Candidate, fps: float, numbers: Sequence[int]) -> Video:
+    def reconstruct_at_rate(self, network: Candidate, fps: float, numbers: Sequence[int]) -> Video:
         """Return the frames of `numbers`, counted from 1, of `fps` a second, in order of time.
 
         Windows are a frame long; those of a network that uses their length grow, as src.reconstruct
@@ -138,13 +135,16 @@ class EventClip:
         rule = build_window_rule("growing" if grows else "frame", fps=fps)
         video, state, period_us, wanted = [], None, US_PER_S / fps, set(numbers)
         for k in range(1, max(wanted) + 1):
-            start_us, end_us = rule.first_frame(k) * period_us, k * period_us
-            is_kept, is_wanted = rule.is_kept(start_us, end_us), k in wanted
-            if is_kept or is_wanted:
-                window, length_s = self.grid(start_us, end_us), (end_us - start_us) / US_PER_S
-                frame, after = network.reconstruct([window], self.positions, length_s, state)
-                state = after if is_kept else state
-                video += [frame] if is_wanted else []
+            start_us, end_us = rule.first_frame_of_window(k) * period_us, k * period_us
+            keeps_state = rule.keeps_state(start_us, end_us)
+            if not (keeps_state or k in wanted):
+                continue
+            window, length_s = self.voxel_grids(start_us, end_us), (end_us - start_us) / US_PER_S
+            frame, after = network.reconstruct([window], self.positions, length_s, state)
+            if keeps_state:
+                state = after
+            if k in wanted:
+                video.append(frame)
         return torch.cat(video)
 
 

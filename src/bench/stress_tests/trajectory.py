@@ -34,7 +34,7 @@ def measure_trajectory_deviation(
     """
 
     def measure(clip: EventClip) -> CrossTrackError:
-        frames = clip.reconstruct_at(network, clip.fps, range(1, len(clip.target)))
+        frames = clip.reconstruct_at_rate(network, clip.fps, range(1, len(clip.target)))
         return measure_cross_track_error(frames[:, 0], clip.target[1:])
 
     clips = bench.clips()

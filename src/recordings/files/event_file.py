@@ -106,7 +106,7 @@ def choose_stream(
     return streams[place], (note,) if len(streams) > 1 else ()
 
 
-def require_no_stream(path: Path, wanted: str | int | None) -> None:
+def require_default_stream(path: Path, wanted: str | int | None) -> None:
     """Raise ValueError for a stream other than the first of a file that holds one only."""
     if wanted not in (None, 0, "0"):
         raise ValueError(f"stream must be null, as {path} has one camera, got {wanted}")

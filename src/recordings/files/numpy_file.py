@@ -29,7 +29,7 @@ from src.recordings.files.event_file import (
     WidthHeight,
     choose_stream,
     name_file_in_errors,
-    require_no_stream,
+    require_default_stream,
 )
 from src.recordings.files.time_unit import UNITS_US
 
@@ -160,7 +160,7 @@ def _columns_of(
     a note of other arrays of events in it."""
     keys = find_keys_by_name(file.files)
     if keys is not None:
-        require_no_stream(path, options.stream)
+        require_default_stream(path, options.stream)
         columns = {name: _flat(extract_column(name, key, file[key])) for name, key in keys.items()}
         if any(column.ndim != 1 for column in columns.values()):
             raise ValueError("columns must have one dimension")

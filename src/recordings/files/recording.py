@@ -25,7 +25,7 @@ from src.recordings.files.event_file import (
     RawEvents,
     ReadOptions,
     WidthHeight,
-    require_no_stream,
+    require_default_stream,
 )
 from src.recordings.files.event_order import EventSorter, merge_in_time
 from src.recordings.files.evreal_folder import EvrealFolder, is_evreal_folder
@@ -235,7 +235,7 @@ def _open_file(path: Path, options: ReadOptions) -> EventFile:
     if reader is None:
         raise ValueError(f"{path}: unknown kind of event file, known are {', '.join(READERS)}")
     if reader in OF_ONE_CAMERA:
-        require_no_stream(path, options.stream)
+        require_default_stream(path, options.stream)
     if options.format is not None and path.suffix.lower() != ".raw":
         raise ValueError(f"format must be null, as {path} is no RAW file, got {options.format}")
     inner = Path(path.stem).suffix.lower()
