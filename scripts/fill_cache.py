@@ -15,7 +15,8 @@ from omegaconf import DictConfig
 
 from scripts.parallel_fill import fill
 from src.app import entry_point, simulation
-from src.training.disk_cache import DiskClipCache, prepare_worker_process
+from src.training.disk_cache import DiskClipCache
+from src.training.worker_process import prepare_worker_process
 
 REPORT_S = 10.0  # between two lines
 

@@ -1,7 +1,8 @@
 """Filling a pre-simulated turbulence cache fast: one device, and processes that keep it busy.
 
 The processes draw clips and, for a GPU, prepare their turbulence; this one computes the pixels of
-all views.  The processes are those of a DataLoader, which keeps the order and notices their death.
+all views.  Each process has a pipe of its own: in one that they share, as that of a DataLoader, a
+process that is killed while it writes a clip lets the reader wait for ever.
 """
 
 import multiprocessing
@@ -10,14 +11,16 @@ import pickle
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from typing import Any
 
 import cv2
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
 
 from src.sim.pipeline import ClipParameters, Pipeline, crop_frames
 from src.sim.turbulence import Turbulence
@@ -26,9 +29,11 @@ from src.sim.turbulence.clip_rendering import render_tilt, render_views
 from src.sim.turbulence.contract import Crop
 from src.sim.turbulence.engines.device import copy_to_device
 from src.training.clip_cache import CachedClip, clip_metadata
-from src.training.disk_cache import prepare_worker_process
+from src.training.worker_process import prepare_worker_process
 
 MAX_QUEUED_CLIPS = 2  # on the device
+
+DrawnClip = tuple[ClipParameters, dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -133,26 +138,23 @@ def fill(
         clips.close()
 
 
-@dataclass
-class _PickledDraws(Dataset):
-    """Draws of clips with their metadata and, if `prepare`, their turbulence prepared; an exception
-    for one that cannot be drawn.  Pickled, as PyTorch would send tensors from a process through
-    /dev/shm, which is small in containers.
-    """
+@dataclass(frozen=True)
+class _ClipSource:
+    """Draws clips with their metadata and, if `prepare`, their turbulence prepared."""
 
     source: Pipeline
     prepare: bool
 
-    def __getitem__(self, index: int) -> bytes:
-        content: tuple[ClipParameters, dict] | Exception
+    def draw(self, index: int) -> DrawnClip:
+        """Return one clip; ValueError for one that is refused, else RuntimeError, naming it."""
         try:
-            content = self._draw(index)
-        except Exception as error:  # raised by the process that asks
+            return self._draw(index)
+        except Exception as error:
             kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
-            content = (RuntimeError if kind else ValueError)(f"clip {index}: {kind}{error}")
-        return pickle.dumps(content, pickle.HIGHEST_PROTOCOL)
+            message = f"clip {index}: {kind}{error}"
+            raise (RuntimeError if kind else ValueError)(message) from error
 
-    def _draw(self, index: int) -> tuple[ClipParameters, dict[str, Any]]:
+    def _draw(self, index: int) -> DrawnClip:
         draw = self.source.draw(index)
         metadata = clip_metadata(self.source, draw)
         turbulence = self.source.turbulence_operator(draw) if self.prepare else None
@@ -214,27 +216,79 @@ def _draw_clips(
     """Yield clips in order with draw and metadata; the `workers` processes that draw them end with
     the generator.
     """
-    if not indices:
+    clips = _ClipSource(source, prepares_turbulence(device))
+    if not workers:
+        for index in indices:
+            yield index, *clips.draw(index)
         return
-    loader = DataLoader(
-        _PickledDraws(source, prepares_turbulence(device)),
-        batch_size=None,
-        sampler=indices,
-        num_workers=workers,
-        worker_init_fn=_init_worker,
-        multiprocessing_context=_forkserver() if workers else None,
-        generator=torch.Generator(),  # or the loader would draw from that of the training
-    )
-    clips = None
+    with closing(_draw_in_processes(clips, indices, workers)) as drawn:
+        for index, clip in zip(indices, drawn, strict=True):
+            if isinstance(clip, Exception):
+                raise clip
+            yield index, *clip
+
+
+def _draw_in_processes(
+    clips: _ClipSource, indices: Sequence[int], workers: int
+) -> Generator[DrawnClip | Exception]:
+    """Yield what `draw` returns or raises for each of `indices`, drawn in turn by `workers`
+    processes, which end with the generator.  Raises RuntimeError where one of them died.
+    """
+    drawing: list[_DrawingProcess] = []
+    with ExitStack() as at_end:
+        for worker in range(workers):
+            drawing.append(_DrawingProcess(clips, indices[worker::workers]))
+            at_end.callback(drawing[-1].stop)
+        for place, index in enumerate(indices):
+            yield drawing[place % workers].receive(index)
+
+
+class _DrawingProcess:
+    """A process that draws the clips `indices` and sends them, one ahead of what was received.
+
+    Raises RuntimeError where it cannot be started.
+    """
+
+    def __init__(self, clips: _ClipSource, indices: Sequence[int]):
+        context = _forkserver()
+        self.receiver, sender = context.Pipe(duplex=False)
+        arguments = (clips, indices, sender)
+        self.process: BaseProcess = context.Process(target=_send_clips, args=arguments, daemon=True)
+        try:
+            self.process.start()
+        except (EOFError, OSError) as error:  # their server died
+            raise RuntimeError(f"a process that draws cannot be started: {error!r}") from error
+        sender.close()  # now the process alone holds it, so that the pipe ends with it
+
+    def receive(self, index: int) -> DrawnClip | Exception:
+        """Return the next clip, of number `index`, or why it cannot be drawn; RuntimeError where
+        the process died.
+        """
+        try:
+            return pickle.loads(self.receiver.recv_bytes())
+        except (EOFError, OSError) as error:
+            self.process.join()
+            ending = f"a process that draws ended with exit code {self.process.exitcode}"
+            raise RuntimeError(f"waiting for clip {index}: {ending}") from error
+
+    def stop(self) -> None:
+        """End the process, whatever it is doing."""
+        self.process.kill()
+        self.process.join()
+        self.receiver.close()
+
+
+def _send_clips(clips: _ClipSource, indices: Sequence[int], sender: Connection) -> None:
+    prepare_worker_process()
+    os.environ["CUDA_VISIBLE_DEVICES"] = ""  # the device is for the process that asks
+    cv2.setNumThreads(1)
     for index in indices:
         try:
-            clips = iter(loader) if clips is None else clips
-            clip = pickle.loads(next(clips))
-        except (RuntimeError, EOFError) as error:  # of a process that draws, or of their server
-            raise RuntimeError(f"waiting for clip {index}: {error}") from error
-        if isinstance(clip, Exception):
-            raise clip
-        yield index, *clip
+            drawn: DrawnClip | Exception = clips.draw(index)
+        except Exception as error:
+            drawn = error
+        # PyTorch would send tensors through /dev/shm, which is small in containers
+        sender.send_bytes(pickle.dumps(drawn, pickle.HIGHEST_PROTOCOL))
 
 
 def _forkserver() -> multiprocessing.context.BaseContext:
@@ -244,12 +298,6 @@ def _forkserver() -> multiprocessing.context.BaseContext:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__, "src.app.simulation"])
     return context
-
-
-def _init_worker(worker: int) -> None:
-    prepare_worker_process()
-    os.environ["CUDA_VISIBLE_DEVICES"] = ""  # the device is for the process that asks
-    cv2.setNumThreads(1)
 
 
 def _simulate_drawn(

@@ -18,6 +18,7 @@ from src.bench.stress_tests import stress_results
 from src.bench.stress_tests.event_clips import StressBench
 from src.figures.stress_map import draw_stress_map
 from src.records import results
+from src.training.worker_process import end_with_parent
 
 NetworkResults = tuple[dict[str, stress_results.Outcome], float | None]
 
@@ -65,8 +66,13 @@ def _run_tests(cfg: DictConfig, config: str, networks: int) -> Iterator[NetworkR
         yield from map(run, range(networks))
         return
     context = get_context("spawn")  # a fork would inherit threads that are no longer there
-    with ProcessPoolExecutor(cfg.processes, context, torch.set_num_threads, (1,)) as pool:
+    with ProcessPoolExecutor(cfg.processes, context, _prepare_process) as pool:
         yield from pool.map(run, range(networks))
+
+
+def _prepare_process() -> None:
+    torch.set_num_threads(1)
+    end_with_parent()
 
 
 def _test_network(config: str, index: int) -> NetworkResults:

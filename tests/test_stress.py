@@ -1,12 +1,19 @@
 """src.stress at a tiny size: map, table and text; what cannot run says why."""
 
 import csv
+import multiprocessing
+import signal
+import threading
+import time
+from pathlib import Path
 
 import pytest
 
+from src import stress as stress_module
 from src.stress import stress
-from tests.faults.harness import FORKS
+from tests.faults.harness import FORKS, Run
 from tests.test_train import config
+from tests.training.test_disk_cache import runs, until
 
 HIGHPASS = "{baseline: {_target_: baselines.highpass.HighPass, view_reduction: median}, views: 9}"
 ABSENT = "{ckpt: nowhere, views: 9}"
@@ -70,6 +77,33 @@ def test_two_processes_find_what_one_does(tmp_path, monkeypatch):
     stress(tiny(tmp_path / "b", networks, "processes=2"))
     texts = [(tmp_path / name / "stress.csv").read_text() for name in "ab"]
     assert texts[0] == texts[1]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_processes_end_with_their_parent(tmp_path, number):
+    run = Run(tmp_path / "log", stress_and_tell, tmp_path)
+    pids = tmp_path / "pids"
+    assert run.wait_until(pids.exists), run.text()
+    testing = [int(pid) for pid in pids.read_text().split()]
+    assert all(map(runs, testing)) and run.stop(number) == -number
+    until(lambda: not any(map(runs, testing)))
+
+
+def stress_and_tell(folder: Path) -> None:
+    """Test two networks in two processes, whose numbers are in the file `pids`, for ever."""
+    stress_module.get_context = lambda _: FORKS
+
+    def tell() -> None:
+        while len(testing := multiprocessing.active_children()) < 2:
+            time.sleep(0.01)
+        part = folder / "part"  # renamed, so that nobody reads half of it
+        part.write_text(" ".join(str(process.pid) for process in testing))
+        part.rename(folder / "pids")
+
+    threading.Thread(target=tell, daemon=True).start()
+    networks = f"+networks={{one: {HIGHPASS}, other: {HIGHPASS}}}"
+    stress(tiny(folder, networks, "processes=2"))
+    time.sleep(600)
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,10 @@ from src.sim.pipeline import ClipParameters, Pipeline, Sample, concatenate_sampl
 from src.training.augment import Augment
 from src.training.batch_sampler import DrawDataset, LargeCropStream, SampleId, StepSampler
 from src.training.device_prefetch import DevicePrefetcher
-from src.training.disk_cache import CacheFillerProcess, prepare_worker_process
+from src.training.disk_cache import CacheFillerProcess
 from src.training.sample_store import SampleStore, StoredSamples
 from src.training.teachers import TeacherEnsemble
+from src.training.worker_process import prepare_worker_process
 
 
 class LightFieldData(LightningDataModule):

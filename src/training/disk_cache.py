@@ -11,9 +11,7 @@ import json
 import multiprocessing
 import os
 import shutil
-import signal
 import sys
-import threading
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -28,6 +26,7 @@ from src.models.checkpoints import is_intact, save_atomically
 from src.records.atomic import write_text
 from src.sim.pipeline import Pipeline
 from src.training.clip_cache import GIB, CachedClip, ClipCache, simulate_clip
+from src.training.worker_process import prepare_worker_process
 
 INPUTS_FILE = "inputs.json"
 DOWNSTREAM = ("sensor", "voxel.py")  # parts of src/sim that come after the cache, except
@@ -154,22 +153,6 @@ class CacheFillerProcess:
             self.process.kill()
             self.process.join()
             self.process = None
-
-
-def prepare_worker_process(worker: int = 0) -> None:
-    """Let this process, of any number, compute in one thread, leave Ctrl-C, which a terminal sends
-    to all, to its parent and end with it.
-    """
-    torch.set_num_threads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_exit_with_parent, daemon=True).start()
-
-
-def _exit_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
 
 
 def _fill_caches(caches: Sequence[DiskClipCache]) -> None:
