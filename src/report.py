@@ -1,7 +1,7 @@
 """Tables and one HTML page of runs: python -m src.report run=out/sweep/table1."""
 
 import re
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,18 @@ from src.app.path_overrides import unquote_override
 from src.records import results, runs
 from src.reports import page, run_groups, tables, writers
 from src.reports.differences import build_difference_table, build_pair_table
+
+
+@dataclass
+class _ReportTables:
+    """All tables of a report in their order, those of scores by title, those of differences between
+    pairs, and the groups of runs.
+    """
+
+    shown: list[tables.Table] = field(default_factory=list)
+    scores: dict[str, tables.Table] = field(default_factory=dict)
+    differences: list[tables.Table] = field(default_factory=list)
+    groups: list[run_groups.RunGroup] = field(default_factory=list)
 
 
 def report(cfg: DictConfig) -> list[tables.Table]:
@@ -29,59 +41,73 @@ def report(cfg: DictConfig) -> list[tables.Table]:
     title = cfg.title or (names.pop() if len(names) == 1 else "") or "runs"
     if cfg.into:
         writers.split_at_section(Path(cfg.into), title)
-    across = _list_texts(cfg.across)
-    run_groups.check_across(across, found)
-    published = as_dict(cfg.paper)
-    candidates: list[tables.Table | None] = []
-    scores: dict[str, tables.Table] = {}
-    pairs = _list_pairs(cfg.pairs)
     columns = None if cfg.columns is None else _list_texts(cfg.columns)
     if columns == []:
         raise ValueError("columns must name one score or more, got []")
-    differences: list[tables.Table] = []
-    groups = []
-    sweeps = dict.fromkeys([*(run.sweep for run in found), *(plan.sweep for plan in plans)])
-    for name in sweeps:
-        own = [run for run in found if run.sweep == name]
-        planned = [plan for plan in plans if plan.sweep == name]
-        keys, made = run_groups.group_runs(own, planned, across)
-        of = f": {name}" if name and len(sweeps) > 1 else ""
-        score_table = tables.build_score_table(f"Scores and cost{of}", keys, made, published)
-        scores[f"Scores{of}"] = score_table
-        candidates += [
-            score_table,
-            tables.build_severity_table(f"Scores by severity{of}", keys, made),
-            tables.build_reference_methods_table(f"On the same clips{of}", keys, made),
-        ]
-        groups += made
-        if pairs:
-            differences.append(build_pair_table(f"Differences{of}", keys, made, pairs, columns))
-    candidates += differences
-    if cfg.against is not None:
-        others = runs.find_runs(_list_folders("against", cfg.against))
-        ours = run_groups.require_one_setting("run", found, across)
-        theirs = run_groups.require_one_setting("against", others, across)
-        title_of = "Differences on the same clips"
-        candidates.append(build_difference_table(title_of, ours, theirs, published))
-    shown = [table for table in candidates if table and table.rows]
-    commands, figures = [plan.command for plan in plans], runs.find_charts_and_stress_maps(folders)
-    printed, asked = shown, commands
-    if columns is not None:
-        asked, full = [], [(name, table) for name, table in scores.items() if table.rows]
-        printed = differences or [tables.select_columns(t, columns, name) for name, t in full]
-    text = writers.format_markdown(printed, asked)
+    made = _build_tables(cfg, found, plans, columns)
+    commands = [plan.command for plan in plans]
+    text = _format_text(made, commands, columns)
     results.create_run_folder(out, entry_point.resolved_yaml(cfg))
     results.write_text(out / "report.md", text)
-    results.write_text(out / "report.csv", writers.format_csv_tables(shown))
-    size = int(cfg.media_mib * 2**20)
+    results.write_text(out / "report.csv", writers.format_csv_tables(made.shown))
     html = page.format_html(
-        title, shown, groups, figures, commands=commands, folder=out, media_bytes=size
+        title,
+        made.shown,
+        made.groups,
+        runs.find_charts_and_stress_maps(folders),
+        commands=commands,
+        folder=out,
+        media_bytes=int(cfg.media_mib * 2**20),
     )
     results.write_text(out / "report.html", html)
     if cfg.into:
         writers.replace_section(Path(cfg.into), title, text)
     print(f"{text}\nin {out}: report.md, report.csv, report.html")
-    return shown
+    return made.shown
+
+
+def _build_tables(
+    cfg: DictConfig,
+    found: list[runs.Run],
+    plans: list[runs.SweepPlan],
+    columns: list[str] | None,
+) -> _ReportTables:
+    """Return the tables that have rows: those of each sweep, of `pairs`, and with `against`."""
+    across, pairs = _list_texts(cfg.across), _list_pairs(cfg.pairs)
+    run_groups.check_across(across, found)
+    published, report = as_dict(cfg.paper), _ReportTables()
+    sweeps = dict.fromkeys([*(run.sweep for run in found), *(plan.sweep for plan in plans)])
+    for name in sweeps:
+        own = [run for run in found if run.sweep == name]
+        planned = [plan for plan in plans if plan.sweep == name]
+        keys, groups = run_groups.group_runs(own, planned, across)
+        of = f": {name}" if name and len(sweeps) > 1 else ""
+        scores = tables.build_score_table(f"Scores and cost{of}", keys, groups, published)
+        by_severity = tables.build_severity_table(f"Scores by severity{of}", keys, groups)
+        references = tables.build_reference_methods_table(f"On the same clips{of}", keys, groups)
+        built = (scores, by_severity, references)
+        report.shown += [table for table in built if table and table.rows]
+        report.scores |= {f"Scores{of}": scores} if scores.rows else {}
+        report.groups += groups
+        if pairs:
+            table = build_pair_table(f"Differences{of}", keys, groups, pairs, columns)
+            report.differences += [table] if table.rows else []
+    report.shown += report.differences
+    if cfg.against is not None:
+        others = runs.find_runs(_list_folders("against", cfg.against))
+        ours = run_groups.require_one_setting("run", found, across)
+        theirs = run_groups.require_one_setting("against", others, across)
+        title = "Differences on the same clips"
+        report.shown.append(build_difference_table(title, ours, theirs, published))
+    return report
+
+
+def _format_text(made: _ReportTables, commands: list[str], columns: list[str] | None) -> str:
+    """Return the Markdown: all tables, or the `columns` of the scores or of the differences."""
+    if columns is None:
+        return writers.format_markdown(made.shown, commands)
+    scores = [tables.select_columns(table, columns, name) for name, table in made.scores.items()]
+    return writers.format_markdown(made.differences or scores, [])
 
 
 def _as_typed(plan: runs.SweepPlan) -> runs.SweepPlan:
@@ -99,10 +125,10 @@ def _list_pairs(given: Any) -> list[tuple[str, str]]:
 
 
 def _list_folders(key: str, given: str | ListConfig) -> list[Path]:
-    folders = list(map(Path, _list_texts(given)))
-    if not folders:
-        raise ValueError(f"{key} must name one folder or more, got []")
-    return folders
+    names = _list_texts(given)
+    if not names or "" in names:
+        raise ValueError(f"{key} must name one folder or more, got {names}")
+    return list(map(Path, names))
 
 
 def _list_texts(given: str | ListConfig) -> list[str]:

@@ -1,8 +1,9 @@
 """Data, networks, metrics and trainers from a configuration; simulations: simulation.py."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import lightning
 import torch
@@ -221,6 +222,7 @@ def build_reconstructor(cfg: DictConfig, net: Trainable, spec: dict) -> Reconstr
     if cfg.channels_last:
         for layer in (layer for layer in net.modules() if isinstance(layer, nn.Conv2d)):
             layer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    optimizer, scheduler = _build_optimizer(cfg)
     kind, method = Reconstructor, None
     if cfg.get("source"):
         assert isinstance(net, FramePostprocessor)
@@ -230,8 +232,8 @@ def build_reconstructor(cfg: DictConfig, net: Trainable, spec: dict) -> Reconstr
         net,
         spec,
         loss=build_loss(cfg),
-        optimizer=build_part(cfg, "optimizer"),
-        scheduler=build_part(cfg, "scheduler") if cfg.scheduler else None,
+        optimizer=optimizer,
+        scheduler=scheduler,
         metrics=build_metrics(cfg),
         method=method,
         loss_from=data.loss_from,
@@ -242,6 +244,22 @@ def build_reconstructor(cfg: DictConfig, net: Trainable, spec: dict) -> Reconstr
         unscored_windows=data.unscored_windows,
         seed=cfg.seed,
     )
+
+
+def _build_optimizer(cfg: DictConfig) -> tuple[Callable, Callable | None]:
+    """Return what makes the optimiser of parameters and the scheduler, if any, of an optimiser.
+
+    Raises ValueError, before anything is trained, for values that one of them refuses.
+    """
+    trial: Any = [nn.Parameter(torch.zeros(1))]
+    parts = dict[str, Callable]()
+    for key in ("optimizer", "scheduler") if cfg.scheduler else ("optimizer",):
+        parts[key] = build_part(cfg, key)
+        try:
+            trial = parts[key](trial)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{key} takes no such values: {error}") from error
+    return parts["optimizer"], parts.get("scheduler")
 
 
 def build_trainer(cfg: DictConfig) -> lightning.Trainer:

@@ -242,3 +242,18 @@ def test_a_training_on_a_cpu_keeps_the_memory_it_frees():
     ran = subprocess.run([sys.executable, "-c", KEEPING], cwd=ROOT, capture_output=True, text=True)
     given_back, kept = map(int, ran.stdout.split())
     assert kept < 0.01 * given_back
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ("optimizer.lr=-1", "optimizer takes no such values: Invalid learning rate: -1"),
+        ("+optimizer.speed=2", "optimizer takes no such values: .*'speed'"),
+        ("+scheduler.speed=2", "scheduler takes no such values: .*'speed'"),
+    ],
+)
+def test_what_an_optimiser_refuses_is_refused_before_anything_runs(wrong, message, tmp_path):
+    cfg = config("train", tmp_path / "run", *TINY, wrong)
+    with pytest.raises(ValueError, match=message):
+        train(cfg)
+    assert not (tmp_path / "run").exists()

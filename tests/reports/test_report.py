@@ -302,6 +302,7 @@ def test_an_empty_folder_is_refused_and_nothing_is_written(tmp_path):
     [
         ("run=[]", "run must name one folder or more"),
         ("against=[]", "against must name one folder or more"),
+        ("against=''", "against must name one folder or more"),
         ("columns=[]", "columns must name one score or more"),
         ("media_mib=-1", "media_mib must be >= 0, got -1"),
         ("across=[nope]", "across must be settings of the runs, such as ckpt, got nope"),
