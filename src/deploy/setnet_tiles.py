@@ -24,7 +24,7 @@ from src.deploy.tile_batches import Backend, TileModule
 from src.models.setnet import BACKGROUND, BACKGROUND_WEIGHT, CELL_PX, REVEALING_EVENTS, SetNet
 from src.sim.optics import Position
 
-BATCHES = 32, 128  # sizes of batches, in tiles
+BATCHES = 8, 16, 32, 64, 128  # sizes of batches, in tiles
 # Share of the frame in tiles from which on all of it is computed at once, which takes no longer.
 WHOLE_MEMORY, WHOLE_CONTEXT, WHOLE_DECODER = 0.3, 0.25, 0.6
 
