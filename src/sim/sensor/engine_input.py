@@ -109,8 +109,18 @@ def _clip_numbers(clip: SensorClip, low_pass_row: int) -> tuple:
         clip.full_width,
         low_pass_row,
         np.float32(sensor.refractory_s * fps),
-        sensor.initial_reference_error,
+        *_reference_range(sensor),
     )
+
+
+def _reference_range(sensor: Any) -> tuple[float, float]:
+    """Return the middle and span of a sensor's first references; see records.py.
+
+    With leak they lie anywhere on the way to the next ON event, so that these come at their rate
+    from the first moment on, and not all at once.
+    """
+    error = sensor.initial_reference_error
+    return (error / (1 + error), 1 + error) if sensor.leak_event_hz else (0.5, 2 * error)
 
 
 def _noise_keys(clips: Sequence[SensorClip], views: Sequence[int]) -> NDArray[np.int64]:
@@ -125,7 +135,7 @@ def _noise_keys(clips: Sequence[SensorClip], views: Sequence[int]) -> NDArray[np
                 drawn[records.MISMATCH_KEY] = noise.key(sensor.seed, view, "mismatch")
             if sensor.hot_pixel_fraction:
                 drawn[records.HOT_PIXEL_KEY] = noise.key(sensor.seed, view, "hot")
-            if sensor.dark_noise_hz or sensor.hot_pixel_hz or sensor.initial_reference_error:
+            if any(getattr(sensor, name) for name in (*NOISE_RATES, "initial_reference_error")):
                 key = noise.key(sensor.seed, clip_key, view, "shot")
                 drawn[records.NOISE_KEY] = key
                 drawn[records.REFERENCE_KEY] = noise.key(key, "residual")

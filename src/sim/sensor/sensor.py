@@ -78,13 +78,14 @@ class EventSensor:
     with most crossings.  `input`: the frames are taken for intensity (`linear`) or decoded here
     (`srgb`).  `response`: `log` of max(intensity, floor), or `linlog`, v2e's.
     `mismatch`: relative deviation of a pixel's thresholds, fixed per (seed, view, pixel).
-    `leak_event_hz`: ON events of a pixel whose light does not change.  `dark_noise_hz`: noise
-    events of a black pixel (a white one has a quarter).  `hot_pixel_fraction` of the pixels make
-    `hot_pixel_hz` noise events.  `cutoff_hz`: the photoreceptor's low-pass at full intensity, 0 for
-    none.  `initial_reference_error`: how far a pixel's reference is from its first level, uniform
-    up to so many thresholds either way: what it saw before is not known.  `random`: ranges out of
-    which `draw` takes a clip's numbers, log-uniform, or uniform where the range begins with 0; with
-    probability `random_share`, else they are the sensor's own.
+    `leak_event_hz`: ON events of a pixel whose light does not change; references then begin up to
+    one ON threshold below the first level, so that they come from the start.  `dark_noise_hz`:
+    noise events of a black pixel (a white one has a quarter).  `hot_pixel_fraction` of the pixels
+    make `hot_pixel_hz` noise events.  `cutoff_hz`: the photoreceptor's low-pass at full intensity,
+    0 for none.  `initial_reference_error`: how far a pixel's reference is from its first level,
+    uniform up to so many thresholds either way: what it saw before is not known.  `random`: ranges
+    out of which `draw` takes a clip's numbers, log-uniform, or uniform where the range begins with
+    0; with probability `random_share`, else they are the sensor's own.
     """
 
     threshold: float | Sequence[float] = 0.2

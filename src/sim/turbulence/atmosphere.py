@@ -31,7 +31,7 @@ class Atmosphere:
     at the object, `cn2` in m^(-2/3): a number, or values at the camera, ..., at the object, equally
     spaced and joined linearly.  `ar1_coefficient`: correlation of the turbulence from one frame to
     the next at 120 frames per second.  `outer_scale_m` L0: the size of the largest eddies (von
-    Karman); inf is Kolmogorov turbulence.  `wind_m_s`: mean speed of the wind across the path.
+    Karman); inf is Kolmogorov turbulence.  `wind_m_s`: rms speed of the wind across the path.
     Raises ValueError for numbers outside their range.
     """
 

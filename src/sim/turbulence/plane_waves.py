@@ -29,7 +29,7 @@ LOW, HIGH = 0.08, 0.32  # limits of the three power laws that kappa is drawn fro
 DEPTH = 1.0  # waves are drawn with the density Cn2 (1 - z/L)^DEPTH
 SHARES = (0.25, 0.65, 0.10)  # of the waves below LOW, between, above HIGH
 TEMPORAL_MODELS, VIEWS_CORRELATIONS = ("ar1", "frozen_flow", "mixed"), ("independent", "baseline")
-WIND_LAYERS = 4  # of equal strength
+WIND_LAYERS = 4  # of equal integrals of Cn2 (1 - z/L)^DEPTH
 LAYER_WIND_RATIO = 0.5  # rms of a layer's own wind over the wind that all layers share
 
 
@@ -39,14 +39,14 @@ class PlaneWaves:
 
     `frequency_per_px` (waves, 2): f z / L in cycles per pixel at the object along (x, y).
     `frequency_per_m` (waves, 2): f in cycles per metre in the layer; `z_over_l` (waves,);
-    `cumulative_cn2` (waves,): the share of the turbulence that lies nearer to the camera.
+    `nearer_share` (waves,): the share of the integral of Cn2 (1 - z/L) that is nearer the camera.
     `response` (modes, waves, 2): w_m Q_j, real and imaginary part, in rad.
     """
 
     frequency_per_px: Float[Tensor, "waves 2"]
     frequency_per_m: Float[Tensor, "waves 2"]
     z_over_l: Float[Tensor, " waves"]
-    cumulative_cn2: Float[Tensor, " waves"]
+    nearer_share: Float[Tensor, " waves"]
     response: Float[Tensor, "modes waves 2"]
 
 
@@ -81,7 +81,7 @@ def draw_plane_waves(
         frequency_per_px=layer * place[slot, None] * atmosphere.pixel_size_at_object_m(width_px),
         frequency_per_m=layer,
         z_over_l=place[slot],
-        cumulative_cn2=u[:, 2],
+        nearer_share=u[:, 2],
         response=pupil_filter(kappa, angle, modes) * amplitude[:, None],
     )
 
@@ -189,7 +189,7 @@ def advect_waves(
     The layers, from the camera on, have equal shares of the turbulence.  Taylor's hypothesis within
     each: phase(x, t) = phase(x - v t, 0), exact at any time, and smooth in it.
     """
-    layer = (waves.cumulative_cn2 * len(winds)).long().clamp(max=len(winds) - 1)
+    layer = (waves.nearer_share * len(winds)).long().clamp(max=len(winds) - 1)
     cycles_per_s = (waves.frequency_per_m * winds[layer]).sum(-1).to(white.device)
     shift = torch.exp(-2j * math.pi * times_s[:, None] * cycles_per_s)
     return torch.view_as_complex(white) * shift

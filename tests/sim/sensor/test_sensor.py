@@ -1,6 +1,7 @@
 """The sensor against its slow definition, its laws, and the errors it names."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -238,10 +239,22 @@ def test_the_noise_has_the_rates_it_is_given():
     white = EventSensor(0.3, dark_noise_hz=5.0, refractory_s=0.0).counts(frames + 1, FPS).sum()
     assert abs(white - expected_events / 4) < 4 * math.sqrt(expected_events / 4)
     leak = EventSensor(0.3, leak_event_hz=3.5, refractory_s=0.0).counts(frames, FPS)[0, 0]
-    assert leak.tolist() == [3 * 64 * 64, 0]
+    assert abs(leak[0] - 3.5 * 64 * 64) < 4 * math.sqrt(64 * 64 / 4) and leak[1] == 0
     hot = EventSensor(0.3, hot_pixel_fraction=0.01, hot_pixel_hz=60.0, refractory_s=0.0)
     share = hot.counts(frames, FPS).sum() / (60 * 64 * 64)
     assert abs(share - 0.01) < 4 * math.sqrt(0.01 / 64**2)
+
+
+def test_leak_events_come_at_their_rate_from_the_start_and_not_all_at_once():
+    seconds, hz, pixels = 0.5, 0.4, 128 * 128
+    frames = torch.full((int(seconds * FPS) + 1, 128, 128), 0.4)
+    sensor = EventSensor(0.3, leak_event_hz=hz, refractory_s=0.0, mismatch=0.1)
+    counts = [np.histogram(sensor.events(frames, FPS)["t"], 5, (0, 1e6 * seconds))[0]]
+    expected = hz * seconds * pixels / 5
+    assert np.abs(counts[0] - expected).max() < 4 * math.sqrt(expected)
+    after_any_light = replace(sensor, initial_reference_error=1.0)  # half have more than one way
+    counts.append(np.histogram(after_any_light.events(frames, FPS)["t"], 5)[0])
+    assert abs(counts[1].sum() - 2.5 * expected) < 4 * math.sqrt(2.5 * expected)
 
 
 def test_noise_beyond_one_event_an_interval_is_refused():

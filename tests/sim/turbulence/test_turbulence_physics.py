@@ -16,9 +16,13 @@ from src.sim import noise
 from src.sim.turbulence.atmosphere import Atmosphere
 from src.sim.turbulence.fidelity import mean_short_exposure_psf
 from src.sim.turbulence.operator import WAVES, Turbulence
+from src.sim.turbulence.outer_scale import (
+    GAUSSIAN_HALF_LIGHT,
+    turbulence_blur_std_in_lambda_over_d,
+)
 from src.sim.turbulence.p2s import FittedPSFs, load_bands_by_d_over_r0
 from src.sim.turbulence.plane_waves import PlaneWaves, advect_waves, draw_plane_waves
-from src.sim.turbulence.psf import PSFHalo
+from src.sim.turbulence.psf import PSFHalo, pixel_integration_matrix
 from tests.sim.turbulence.theory import (
     compute_fitted_psfs,
     draw_phases,
@@ -172,6 +176,25 @@ def test_12_mean_peak(strength, strehl):
     limit = fraunhofer_psf(torch.zeros(1, 35), lambda_over_d_px=4.0, size=61, points=1)
     peak = psfs_of_band.amax((1, 2)).mean() / limit.max()
     assert peak == pytest.approx(strehl, rel=0.06)
+
+
+@pytest.mark.parametrize("strength, share", [(4.0, 0.93), (6.0, 0.89), (10.0, 0.82)])
+def test_12_blur_of_modes_up_to_120_is_narrower_than_theory(strength, share):
+    """Modes beyond are left out: 0.0047 (D/r0)^(5/3) rad2 (Noll 1976), light in the core."""
+
+    def half_light_radius(d_over_r0: float) -> float:
+        psf = mean_short_exposure_psf(d_over_r0).double()
+        fine = pixel_integration_matrix(10 * len(psf) + 1, len(psf), 0.1)
+        light, edge = torch.as_tensor(fine) @ psf @ torch.as_tensor(fine).T, len(fine) // 2
+        x = (torch.arange(len(fine)) - edge) * 0.05  # lambda / D
+        held, order = torch.hypot(x[:, None], x).flatten().sort()
+        return float(held[int(torch.searchsorted(light.flatten()[order].cumsum(0), 0.5))])
+
+    sharp, blurred = half_light_radius(0.001), half_light_radius(strength)
+    found = math.sqrt(blurred**2 - sharp**2) / GAUSSIAN_HALF_LIGHT
+    ratio = found / turbulence_blur_std_in_lambda_over_d(strength)
+    print(f"D/r0 {strength:g}: blur {ratio:.2f} of theory")
+    assert ratio == pytest.approx(share, abs=0.015)
 
 
 def test_13_isoplanatic_angle():

@@ -414,14 +414,14 @@ def timestamp_us(u, clock):
 
 @kernel
 def initialise_pixel_state(clip, key, work):
-    """Let the memory begin with its levels, the references off from them by a drawn error."""
+    """Let the memory begin with its levels, the references off from them by what is drawn."""
     level, reference, drawn = work.level, work.reference, work.drawn
     work.source[:], reference[:], work.dead[:] = level, level, f32(0)
-    if clip.reference_error > 0:
+    if clip.reference_span > 0:
         draw_uint32_per_pixel(key, 1, 0, work.pixel, drawn)
         for x in range(level.size):
             uniform = (f32(drawn[x] >> uint32(9)) + f32(0.5)) * f32(2.0**-23)
-            away = np.float64(f32(2) * uniform - f32(1)) * clip.reference_error
+            away = (np.float64(uniform) - clip.reference_middle) * clip.reference_span
             threshold = work.on[x] if away > 0 else work.off[x]
             reference[x] = level[x] - i32(away * threshold)
 
