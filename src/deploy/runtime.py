@@ -97,7 +97,7 @@ class EventListRuntime:
             if (given := self.views) != (views := copied.views):
                 raise ValueError(f"optics.views must be {views} for this network, got {given}")
             self.runner = E2VIDOverEvents(copied, padded, dtype, backend, threads)
-        self.state_sizes, self.warned = _describe_sizes(self.runner.state), set[str]()
+        self.state_arrays, self.warned = _describe_arrays(self.runner.state), set[str]()
 
     def step(self, t, x, y, p, view, t0: float, t1: float) -> Float[np.ndarray, "h w"]:
         """Return the frame at `t1`, float32, as the network's `forward` gives it.
@@ -134,7 +134,7 @@ class EventListRuntime:
         so that going back to it takes a `copy.deepcopy`.  Set to None it is that of `reset`.
 
         Raises ValueError where it is set to one of other arrays: of another kind of network, size
-        or, of a SetNet, number of views.  An E2VID's is for the form that it comes from.
+        or, of a SetNet, number of views, of an E2VID, form.
         """
         return self.runner.state
 
@@ -143,10 +143,10 @@ class EventListRuntime:
         if state is None:
             self.reset()
             return
-        if _describe_sizes(state) != self.state_sizes:
+        if _describe_arrays(state) != self.state_arrays:
             raise ValueError(
-                "state must be that of a runtime of the same network, size and number of views, "
-                f"got another {type(state).__name__}"
+                "state must be that of a runtime of the same network, size, number of views and "
+                f"form, got another {type(state).__name__}"
             )
         self.runner.state = state
 
@@ -221,13 +221,13 @@ class EventListRuntime:
         return events
 
 
-def _describe_sizes(state: Any) -> Any:
-    """Return a state with sizes in place of its arrays, tensors and numbers."""
+def _describe_arrays(state: Any) -> Any:
+    """Return a state with types and sizes in place of its arrays, tensors and numbers."""
     if hasattr(state, "shape"):
-        return tuple(state.shape)
+        return type(state).__name__, str(getattr(state, "dtype", "")), tuple(state.shape)
     if isinstance(state, tuple | list):
-        return type(state).__name__, [_describe_sizes(part) for part in state]
+        return type(state).__name__, [_describe_arrays(part) for part in state]
     if hasattr(state, "__dict__"):
-        parts = {name: _describe_sizes(part) for name, part in vars(state).items()}
+        parts = {name: _describe_arrays(part) for name, part in vars(state).items()}
         return type(state).__name__, parts
     return () if isinstance(state, int | float) else type(state).__name__

@@ -173,6 +173,8 @@ def test_a_state_of_another_runtime_is_refused(name):
     states = [runtime(network(other)).state, runtime(network(name), width=40).state, 5]
     if name == "setnet":
         states.append(runtime(network(name), views=3).state)
+    else:
+        states.append(runtime(network(name), "bf16").state)
     for state in states:
         with pytest.raises(ValueError, match="state must be that of a runtime of the same network"):
             live.state = state
