@@ -20,8 +20,10 @@ NAMES = {
     "p": ("p", "ps", "on", "polarity", "polarities", "pol"),
 }  # fmt: skip
 JOINT = "xy"  # a column (n, 2) of both
-UNIT = re.compile(r"[ _]?[\[(]?(us|µs|μs|ns|ms|s|sec|seconds|px|pixel|pixels)[\])]?$")
-TIME_UNIT = re.compile(r"[ _\[(](us|µs|μs|ns|ms|s|sec|seconds)[\])]?$")
+SECONDS = r"(?:n|nano|u|µ|μ|micro|m|milli)?s(?:ec(?:ond)?s?)?"  # of times: us, nsec, seconds, ...
+UNIT = re.compile(rf"[ _]?[\[(]?({SECONDS}|px|pixel|pixels)[\])]?$")
+TIME_UNIT = re.compile(rf"[ _\[(]({SECONDS})[\])]?$")
+NAME_PART = re.compile(r"[A-Z]?[a-z]+|[A-Z]+")
 
 
 def find_columns_by_name(names: Sequence[str]) -> dict[str, int] | None:
@@ -29,7 +31,7 @@ def find_columns_by_name(names: Sequence[str]) -> dict[str, int] | None:
 
     A name may end in its unit (`timestamp_us`) or state the sensor's side (`x@640`).
     """
-    bare = [name.strip().strip("\"'").split("@")[0].lower() for name in names]
+    bare = [_bare(name).split("@")[0] for name in names]
     places = {}
     for letter, known in NAMES.items():
         plain = [name if name in known else UNIT.sub("", name) for name in bare]
@@ -38,6 +40,29 @@ def find_columns_by_name(names: Sequence[str]) -> dict[str, int] | None:
             return None
         places[letter] = plain.index(found[0])
     return places
+
+
+def find_alike_columns(names: Sequence[str]) -> dict[str, list[int]]:
+    """Return the places among column names where t, x, y and p are a part of the name (`event_t`,
+    `pos.y`) or names are alike but for x and y (`xpos`, `ypos`)."""
+    parts = [{part.lower() for part in NAME_PART.findall(name)} for name in names]
+    found = {
+        letter: [place for place, part in enumerate(parts) if part & set(known)]
+        for letter, known in NAMES.items()
+    }
+    if not found["x"] and not found["y"]:
+        bare = [_bare(name) for name in names]
+        twins = [(name, name.replace("x", "y")) for name in bare if "x" in name]
+        twins = [(x, y) for x, y in twins if y in bare]
+        found |= {"xy"[side]: [bare.index(twin[side]) for twin in twins] for side in (0, 1)}
+    return found
+
+
+def find_columns_by_part(names: Sequence[str]) -> dict[str, int] | None:
+    """Return the places of t, x, y and p by `find_alike_columns`; None where they are not four."""
+    found = find_alike_columns(names)
+    places = {letter: alike[0] for letter, alike in found.items() if len(alike) == 1}
+    return places if len(set(places.values())) == len(NAMES) else None
 
 
 def find_keys_by_name(names: Iterable[str]) -> dict[str, str] | None:
@@ -61,17 +86,32 @@ def extract_column(letter: str, key: str, values: np.ndarray) -> np.ndarray:
 
 def parse_unit_suffix(name: str) -> str | None:
     """Return the unit that the name of a column of times ends in (`t_ns`, `time [ms]`), or None."""
-    found = TIME_UNIT.search(name.strip().strip("\"'").lower())
-    return None if found is None else {"n": "ns", "m": "ms", "s": "s"}.get(found[1][0], "us")
+    found = TIME_UNIT.search(_bare(name))
+    if found is None:
+        return None
+    is_us = found[1].startswith(("u", "µ", "μ", "micro"))
+    return "us" if is_us else {"n": "ns", "m": "ms", "s": "s"}[found[1][0]]
+
+
+def parse_time_unit(names: Sequence[str], key: str) -> str | None:
+    """Return the unit that `key`, the name of the times among `names`, ends in, or None; raises
+    ValueError where another column has times of a unit, too: each may be a part of the time."""
+    parts = [
+        name for name in names
+        if parse_unit_suffix(name) and TIME_UNIT.sub("", _bare(name)).rstrip() in NAMES["t"]
+    ]  # fmt: skip
+    if len(parts) > 1 and key in parts:
+        raise ValueError(f"times must be one column, got {', '.join(parts)}; add them up")
+    return parse_unit_suffix(key)
 
 
 def find_named_time_unit(names: Iterable[str] | None, options: ReadOptions) -> str | None:
     """Return the unit that the name of the times among `names` ends in; None where it has none or
-    `options` state the unit or the columns."""
-    keys = find_keys_by_name(names or ())
-    if keys is None or options.time_unit != "auto" or options.columns is not None:
-        return None
-    return parse_unit_suffix(keys["t"])
+    `options` state the unit or the columns.  Raises ValueError as `parse_time_unit` does."""
+    listed = list(names or ())
+    keys = find_keys_by_name(listed)
+    unit = None if keys is None else parse_time_unit(listed, keys["t"])
+    return unit if options.time_unit == "auto" and options.columns is None else None
 
 
 def find_columns_by_values(sample: np.ndarray) -> dict[str, int]:
@@ -163,6 +203,10 @@ def check_unpacking_ratio(path: Path, unpacked_bytes: int) -> None:
     most = MAX_PACKING * path.stat().st_size + 2**24
     if unpacked_bytes > most:
         raise ValueError(f"it unpacks to {unpacked_bytes} bytes, more than the {most} believed")
+
+
+def _bare(name: str) -> str:
+    return name.strip().strip("\"'").lower()
 
 
 def _is_coordinate(values: np.ndarray) -> bool:

@@ -58,6 +58,7 @@ class EventSorter:
         self._is_live = kept_part == "newest"
         self.parts, self.count = [ClockPart()], 0
         self.dropped = self.late = self.most_late_us = 0
+        self._last_dropped, self._last_gap_us = 0, 0  # events at the end, the silence before
         self._rises = self._falls = 0  # steps among events that come out of order
         self._undecided: np.ndarray | None = None
         self._held: list[np.ndarray] = []  # in order, one after the other
@@ -83,7 +84,10 @@ class EventSorter:
         least = min(self.min_part_events, max(LEAST_FEW, self.count // FEW_SHARE))
         undecided, ready = self._undecided, []
         if undecided is not None:
+            before, gap_us = self.dropped, int(event_times(undecided).min()) - self.last_us
             ready = self._decide(undecided, least, at_end=True)
+            if gap_us > 0 and self.dropped == before + len(undecided):
+                self._last_dropped, self._last_gap_us = len(undecided), gap_us
         return [*ready, *self.release(2**63 - 1)]
 
     def accept_events_after_gap(self, until_us: float) -> None:
@@ -216,11 +220,18 @@ class EventSorter:
 
     def describe_time_faults(self, path: Path, *, part: int | None) -> Iterator[str]:
         """Yield what the user is told; `part`: the one that was asked for."""
-        if self.dropped:
-            yield f"{path}: {self.dropped} of {self.count} events far out of order of time, dropped"
-        if self.most_late_us > TOLD_US:
-            reach = f"up to {self.most_late_us * 1e-6:.3g} s"
-            yield f"{path}: {self.late} of {self.count} events {reach} out of order, sorted"
+        last, far = self._last_dropped, self.dropped - self._last_dropped
+        if far:
+            yield f"{path}: {far} of {self.count} events far out of order of time, dropped"
+        if last:
+            silence = f"after a silence of {self._last_gap_us * 1e-6:.3g} s"
+            yield f"{path}: the last {last} of {self.count} events {silence}, dropped"
+        has_low_bits_only = path.suffix.lower() == ".raw" and self.late > BACKWARD * self.count
+        if self.most_late_us > TOLD_US or has_low_bits_only:
+            reach, fault = f"up to {self.most_late_us * 1e-6:.3g} s", "sorted"
+            if has_low_bits_only:
+                fault = "as it lacks high bits of time (words TIME_HIGH): its times are wrong"
+            yield f"{path}: {self.late} of {self.count} events {reach} out of order, {fault}"
         if len(self.parts) > 1 and part is None:
             lengths = ", ".join(
                 f"{k}: {one.count} events, {(one.last_us - one.first_us) * 1e-6:.3g} s"

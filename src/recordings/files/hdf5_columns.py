@@ -2,27 +2,75 @@
 
 import re
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import h5py
 import numpy as np
 
-from src.recordings.files.columns import check_lengths, extract_column, find_keys_by_name
-from src.recordings.files.numpy_file import LazyColumn, split_table
+from src.recordings.files.columns import (
+    JOINT,
+    as_times,
+    check_lengths,
+    extract_column,
+    find_keys_by_name,
+    parse_unit_suffix,
+)
+from src.recordings.files.event_file import ReadOptions
+from src.recordings.files.numpy_file import LazyColumn, has_events_in_columns, split_table
 
 
 def find_event_columns(node: Any, order: str | None) -> dict[str, Any]:
-    """Return the columns t, x, y, p of a group or a table; `order`: columns=."""
-    if not isinstance(node, h5py.Group):
-        return split_table(node, order)
-    keys = find_keys_by_name(node) or {}
-    columns = {
-        name: LazyColumn(node[key], partial(extract_column, name, key))
-        for name, key in keys.items()
-    }
-    check_lengths(columns)
+    """Return the columns t, x, y, p of a group or a table, times after the `t_offset` beside them
+    or of the file; `order`: columns=."""
+    if isinstance(node, h5py.Group):
+        keys = find_keys_by_name(node) or {}
+        columns = {name: _open_column(node[key], name, key) for name, key in keys.items()}
+        check_lengths(columns)
+    else:
+        columns = split_table(_Turned(node) if has_events_in_columns(node) else node, order)
+    start = _find_offset(node)
+    if start is not None:
+        columns["t"] = LazyColumn(columns["t"], lambda t: as_times(np.asarray(t)) + start)
     return columns
+
+
+def has_column_shape(key: str, node: Any) -> bool:
+    """Return whether `node` has the shape of a column of that name: (n,) or, as MATLAB has them,
+    (n, 1) or (1, n); (n, 2) for JOINT, of which another width is an error that is told later."""
+    if not isinstance(node, h5py.Dataset):
+        return False
+    if key == JOINT:
+        return node.ndim == 2
+    return node.ndim == 1 or (node.ndim == 2 and 1 in node.shape)
+
+
+def describe_event_arrays(file: h5py.File) -> str:
+    """Return the shapes of the first three arrays that are called events, "" for none."""
+    found: list[str] = []
+
+    def visit(name: str, node: Any) -> None:
+        if isinstance(node, h5py.Dataset) and "event" in name.lower():
+            found.append(f"{name} {node.shape}")
+
+    file.visititems(visit)
+    return ", ".join(found[:3])
+
+
+def find_stated_unit(node: Any, options: ReadOptions) -> str | None:
+    """Return the unit that the attribute `units` or `unit` of the times of a group states, where
+    `options` do not; raises ValueError for a word that is none."""
+    keys = find_keys_by_name(node) if isinstance(node, h5py.Group) else None
+    if keys is None or options.time_unit != "auto":
+        return None
+    attributes = node[keys["t"]].attrs
+    stated = next((attributes[name] for name in ("units", "unit") if name in attributes), None)
+    if stated is None:
+        return None
+    text = np.ravel(stated).astype(str).item(0)
+    unit = parse_unit_suffix("_".join(["t", *text.split()[:1]]))  # `seconds since ...`, too
+    if unit is None:
+        raise ValueError(f"units of times must be s, ms, us or ns, got {text!r}; give time_unit=")
+    return unit
 
 
 def has_integer_times(t: Any) -> bool:
@@ -67,3 +115,36 @@ class ConcatenatedColumn:
             if start < last and start + len(column) > first
         ]
         return np.concatenate(pieces) if pieces else np.empty(0, np.int64)
+
+
+class _Turned:
+    """An array (columns, n) of a file as (n, columns), of which slices of rows are read."""
+
+    def __init__(self, table: Any):
+        self._table, self.dtype = table, table.dtype
+        self.shape, self.ndim = table.shape[::-1], table.ndim
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, rows: slice) -> np.ndarray:
+        return self._table[:, rows].T
+
+
+def _open_column(node: Any, name: str, key: str) -> LazyColumn:
+    is_row = node.ndim == 2 and node.shape[0] == 1 and key != JOINT
+    return LazyColumn(
+        _Turned(node) if is_row else node, lambda rows: extract_column(name, key, rows).reshape(-1)
+    )
+
+
+def _find_offset(node: Any) -> float | None:
+    """Return the `t_offset` beside the columns of a group or a table, else that of the file."""
+    beside = node if isinstance(node, h5py.Group) else node.parent
+    offset = beside.get("t_offset", node.file.get("t_offset"))
+    if offset is None:
+        return None
+    if offset.size != 1:
+        raise ValueError(f"t_offset must be one number, got {offset.shape}")
+    start = np.asarray(offset).item()
+    return int(start) if start == int(start) else start

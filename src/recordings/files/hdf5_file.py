@@ -18,8 +18,6 @@ import hdf5plugin  # noqa: F401 - its codecs are registered by the import
 import numpy as np
 
 from src.recordings.files.columns import (
-    JOINT,
-    as_times,
     check_unpacking_ratio,
     find_keys_by_name,
     find_named_time_unit,
@@ -38,11 +36,14 @@ from src.recordings.files.frame_files import to_gray, wrap_frame_array
 from src.recordings.files.hdf5_columns import (
     ConcatenatedColumn,
     are_consecutive_in_time,
+    describe_event_arrays,
     find_event_columns,
     find_numbered_streams,
+    find_stated_unit,
+    has_column_shape,
     has_integer_times,
 )
-from src.recordings.files.numpy_file import LazyColumn, slice_columns, slice_times
+from src.recordings.files.numpy_file import has_events_in_columns, slice_columns, slice_times
 
 HDF5_ENDINGS = (".h5", ".hdf5", ".hdf")
 SIZE_NAMES = ("size", "geometry", "sensor_size")  # width, height
@@ -64,7 +65,11 @@ class Hdf5File(EventFile):
             self._file = h5py.File(path, rdcc_nbytes=max(largest, DEFAULT_CACHE_BYTES))
             streams = find_streams(self._file)
             if not streams:
-                raise ValueError("no columns t, x, y, p and no array of events (n, 4) in it")
+                found = describe_event_arrays(self._file)
+                raise ValueError(
+                    "no columns t, x, y, p and no array of events (n, 4) in it"
+                    + (f", but {found}" if found else "")
+                )
             nodes = find_numbered_streams(streams) if options.stream is None else []
             columns, self.notes = self._find_columns(nodes, options), ()
             if not nodes or not are_consecutive_in_time(columns):
@@ -112,20 +117,11 @@ class Hdf5File(EventFile):
         if len(columns) > 1:
             parts = {name: [one[name] for one in columns] for name in "txyp"}
             self._columns = {name: ConcatenatedColumn(part) for name, part in parts.items()}
-        if "t_offset" in self._file:
-            offset = self._file["t_offset"]
-            if offset.size != 1:
-                raise ValueError(f"t_offset must be one number, got {offset.shape}")
-            start = np.asarray(offset).item()
-            start = int(start) if start == int(start) else start
-            t = self._columns["t"]
-            self._columns["t"] = LazyColumn(t, lambda t: as_times(np.asarray(t)) + start)
-        self.time_unit = find_named_time_unit(
-            node if self._has_own_times else node.dtype.names, options
-        )
+        names = node if self._has_own_times else node.dtype.names
         is_dsec = "t_offset" in self._file or "ms_to_idx" in self._file
-        if is_dsec and options.time_unit == "auto" and has_integer_times(self._columns["t"]):
-            self.time_unit = "us"
+        is_dsec = is_dsec and options.time_unit == "auto" and has_integer_times(self._columns["t"])
+        named = "us" if is_dsec else find_named_time_unit(names, options)
+        self.time_unit = find_stated_unit(node, options) or named
 
 
 def find_streams(file: h5py.File) -> dict[str, Any]:
@@ -183,20 +179,15 @@ def refuse_ecf_codec(parts: Iterable[Any]) -> None:
 
 
 def _has_columns(group: Any) -> bool:
-    """Return whether the group holds t, x, y, p of one dimension; JOINT has two."""
     keys = find_keys_by_name(group)
-    if keys is None:
-        return False
-    return all(
-        isinstance(group.get(key), h5py.Dataset) and group[key].ndim == (2 if key == JOINT else 1)
-        for key in keys.values()
-    )
+    return keys is not None and all(has_column_shape(key, group.get(key)) for key in keys.values())
 
 
 def _is_table(name: str, node: Any) -> bool:
     if node.dtype.names is not None:
         return node.ndim == 1 and find_keys_by_name(node.dtype.names) is not None
-    return node.ndim == 2 and node.shape[1] == 4 and "event" in name.lower()
+    is_table = node.ndim == 2 and (node.shape[1] == 4 or has_events_in_columns(node))
+    return is_table and "event" in name.lower()
 
 
 def _stated_size(node: Any) -> WidthHeight | None:

@@ -33,6 +33,7 @@ SENSORS = {
     "genx320": (320, 320),
 }  # fmt: skip
 HEADER = re.compile(rb"(?:% (?!end\s)[\t\r\x20-\x7e\x80-\xff]*\n)*(?:% end[\t\r ]*\n)?")
+ATIS, ATIS_BITS = (304, 240), (9, 8)  # px, and bits of x and y in DAT of versions 0 and 1
 DAT_PIXELS = (0, 12)  # types of DAT whose events lie in pixels
 DAT_TRIGGER = 14
 
@@ -57,7 +58,12 @@ class PropheseeFile(EventFile):
         start_us = self._lines.get("t0", "")  # what faery takes off all times
         self._start_us = int(start_us) if re.fullmatch(r"\d{1,18}", start_us) else 0
         self.size = self._read_size(text)
-        self._format = None if path.suffix.lower() == ".dat" else self._read_format(options.format)
+        self._format = None
+        if path.suffix.lower() != ".dat":
+            self._format = self._read_format(options.format)
+        elif "version" not in self._lines:  # as the first files of ATIS
+            self.size = self.size or ATIS
+            self._lines["version"] = "0" if self.size == ATIS else "2"
 
     def pieces(self) -> Iterator[RawEvents]:
         """Yield the events; warns of a file that ends within a word and of events before the first
@@ -135,7 +141,7 @@ class PropheseeFile(EventFile):
             raise ValueError(f"{self.path}: holds no events, only triggers (DAT of type 14)")
         if head[0] not in DAT_PIXELS or head[1:] != b"\10":
             raise ValueError(f"{self.path}: DAT of type {head.hex(' ')} is not read, but 0 and 12")
-        x_bits, y_bits = (9, 8) if self._lines.get("version") in ("0", "1") else (14, 14)
+        x_bits, y_bits = ATIS_BITS if self._lines.get("version") in ("0", "1") else (14, 14)
         clock = TimestampUnwrapper()
         for block in read_whole_words(self.path, self._start + 2, 8):
             t, word = np.frombuffer(block, "<u4").reshape(-1, 2).T

@@ -42,8 +42,9 @@ from src.recordings.files.time_unit import check_times, to_us
 Reader = Callable[[Path, ReadOptions], EventFile]
 READERS: dict[str, Reader] = {  # by the ending, in small letters
     ".raw": PropheseeFile, ".dat": PropheseeFile, ".aedat4": Aedat4File, ".aedat": Aedat1To3File,
-    ".es": EsFile, ".bag": RosbagFile, ".db3": RosbagFile, ".mcap": RosbagFile, ".npy": NumpyFile,
-    ".npz": NumpyFile, **dict.fromkeys(HDF5_ENDINGS, Hdf5File),
+    ".aedat2": Aedat1To3File, ".es": EsFile, ".bag": RosbagFile, ".db3": RosbagFile,
+    ".mcap": RosbagFile, ".npy": NumpyFile, ".npz": NumpyFile,
+    **dict.fromkeys(HDF5_ENDINGS, Hdf5File),
     **dict.fromkeys((*TEXT_ENDINGS, ".gz", ".zip"), TextFile),
 }  # fmt: skip
 OF_ONE_CAMERA = (PropheseeFile, EsFile, TextFile, EvrealFolder)
@@ -239,7 +240,8 @@ def _open_file(path: Path, options: ReadOptions) -> EventFile:
     if options.format is not None and path.suffix.lower() != ".raw":
         raise ValueError(f"format must be null, as {path} is no RAW file, got {options.format}")
     inner = Path(path.stem).suffix.lower()
-    if path.suffix.lower() == ".gz" and READERS.get(inner, TextFile) is not TextFile:
+    is_other = inner == ".tar" or READERS.get(inner, TextFile) is not TextFile
+    if path.suffix.lower() == ".gz" and is_other:
         raise ValueError(f"{path}: only text is read from a .gz; unpack {path.stem} first")
     file = reader(path, options)
     if file.time_unit is not None and options.time_unit not in ("auto", file.time_unit):
@@ -263,6 +265,8 @@ def _open_and_survey(
     survey, swapped = survey_times(file, options), None
     if not isinstance(file, OF_THE_CAMERA):
         swapped = sensor_size.find_swapped_size(file, survey.pieces or file.pieces())
+        lines = sensor_size.describe_wide_events(file, survey.pieces or file.pieces())
+        survey = survey._replace(messages=survey.messages + lines)
     return (None if isinstance(file, Hdf5File) else file), survey, swapped
 
 

@@ -1,12 +1,12 @@
 """Messages of ROS that hold events, from their bytes, as their definitions lay them out.
 
-dvs_msgs/EventArray, prophesee_event_msgs/EventArray: header, uint32 height, width, a list of
-uint16 x, y, time ts, bool polarity.  event_camera_msgs/EventPacket (event_array_msgs/EventArray was
-its name): header, uint32 height, width, uint64 seq, time_base, string encoding, bool is_bigendian,
-uint8[] events.  Of its encodings evt3 (Prophesee's words), mono (64 bits; from the lowest: 32 of
-nanoseconds after time_base, 16 of x, 15 of y, 1 of polarity) and those of iniVation's cameras
-(caer_packets) are read.  ROS 1 puts one field behind the other, ROS 2 (CDR) each at a multiple of
-its size.
+EventArray of dvs_msgs, dv_ros_msgs and prophesee_event_msgs: header, uint32 height, width, a list
+of uint16 x, y, time ts, bool polarity.  event_camera_msgs/EventPacket (event_array_msgs/EventArray
+was its name): header, uint32 height, width, uint64 seq, time_base, string encoding, bool
+is_bigendian, uint8[] events.  Of its encodings evt3 (Prophesee's words), mono (64 bits; from the
+lowest: 32 of nanoseconds after time_base, 16 of x, 15 of y, 1 of polarity) and those of iniVation's
+cameras (caer_packets) are read.  ROS 1 puts one field behind the other, ROS 2 (CDR) each at a
+multiple of its size.
 """
 
 import struct
@@ -22,7 +22,9 @@ from src.recordings.files.event_file import RawEvents
 from src.recordings.files.evt_decoder import EvtDecoder
 from src.recordings.files.frame_files import to_gray
 
-ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
+ARRAYS = (
+    "dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray", "dv_ros_msgs/msg/EventArray",
+)  # fmt: skip
 IMAGE = "sensor_msgs/msg/Image"
 GRAY, COLOUR = ("mono8", "8UC1"), ("bgr8", "rgb8")  # encodings of images that are read
 WORDS = {"evt3": "u2", "mono": "u8", "libcaer": "u4", "libcaer_cmp": "u2"}  # by the encoding

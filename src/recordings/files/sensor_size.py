@@ -9,6 +9,7 @@ import numpy as np
 from src.recordings.files.event_file import EventFile, RawEvents, WidthHeight
 
 MAX_SIDE = 2**16  # pixels: coordinates have 16 bits
+WIDEST = 4096  # pixels of a sensor
 SWAPPED_SHARE = 0.01  # of the first events outside that show width and height exchanged
 MOST_OUTSIDE = 0.5  # of all events, from which on a recording is refused
 
@@ -26,6 +27,20 @@ def find_swapped_size(file: EventFile, pieces: Iterable[RawEvents]) -> WidthHeig
     if outside <= SWAPPED_SHARE or first.x.max() >= height or first.y.max() >= width:
         return None
     return height, width
+
+
+def describe_wide_events(file: EventFile, pieces: Iterable[RawEvents]) -> tuple[str, ...]:
+    """Return a line for the user where the first of `pieces` of a file that states no size has
+    coordinates beyond WIDEST; else none."""
+    first = next(iter(pieces), None) if file.size is None else None
+    if first is None or not len(first.t):
+        return ()
+    x, y = int(first.x.max()), int(first.y.max())
+    if max(x, y) < WIDEST:
+        return ()
+    told = f"x and y are up to {x} and {y}, beyond any sensor"
+    parts = "parts of a pixel, such as 1/32 of BS-ERGB, are read only beside its images"
+    return (f"{file.path}: {told}; {parts}",)
 
 
 def choose_size(

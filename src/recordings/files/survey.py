@@ -15,7 +15,14 @@ from src.recordings.files.event_order import (
     MAX_DROPPED,
     EventSorter,
 )
-from src.recordings.files.time_unit import UNITS_US, TimeSample, check_times, find_unit, to_us
+from src.recordings.files.time_unit import (
+    UNITS_US,
+    TimeSample,
+    check_times,
+    describe_equal_times,
+    find_unit,
+    to_us,
+)
 
 LEAST_BUFFER_US, WIDER = 1000, 4  # of a short table; by which its buffer grows where that helps
 LARGEST_BUFFER_US = 3_200_000  # of a table, which is sorted by frames of less
@@ -74,7 +81,7 @@ def _judge(
     unit, line = find_unit(sample, options.time_unit)
     bits = sample.wrap_bits
     if file.time_unit is not None:
-        unit, line = file.time_unit, ""
+        unit, line = file.time_unit, describe_equal_times(sample)
 
     def read_us() -> Iterable[np.ndarray]:
         clock = TimestampUnwrapper(bits) if bits else None

@@ -19,6 +19,7 @@ from src.recordings.files.columns import (
     as_integers,
     check_unpacking_ratio,
     find_columns,
+    parse_time_unit,
 )
 from src.recordings.files.event_file import (
     EventFile,
@@ -33,6 +34,7 @@ from src.recordings.files.text_layout import (
     COMMENTS,
     CUT,
     MAX_LINE,
+    QUOTES,
     TO_BLANKS,
     WORDS,
     TextLayout,
@@ -56,19 +58,17 @@ class TextFile(EventFile):
     """
 
     def __init__(self, path: Path, options: ReadOptions):
-        self.path, self.notes = path, ()
+        self.path, self.notes, self._places = path, (), None
         with name_file_in_errors(path, "cannot be read as text of events"):
             with open_text(path) as file:
                 self._layout = read_layout(file)
             self.size = self._layout.size
-            if self._layout.unknown_header and options.columns is None:
-                self.notes += (
-                    f"{path}: the names in {self._layout.unknown_header[:60]!r} are not known, "
-                    "columns are told by their values; if these are others, give columns=",
-                )
-            names_hold = options.time_unit == "auto" and options.columns is None
-            self.time_unit = self._layout.time_unit if names_hold else None
-            self._columns = self._read(options)
+            if options.columns is None:
+                self._use_names(options)
+            elif self._layout.width:
+                none = np.empty((0, self._layout.width))
+                self._places = find_columns(none, options.columns)
+            self._columns = self._read()
 
     def pieces(self) -> Iterator[RawEvents]:
         yield from slice_columns(self.path, self._columns)
@@ -79,19 +79,33 @@ class TextFile(EventFile):
     def frames(self) -> RawFrames | None:
         return find_listed_frames(self.path.parent / "images.txt")
 
-    def _read(self, options: ReadOptions) -> dict[str, np.ndarray]:
+    def _use_names(self, options: ReadOptions) -> None:
+        """Take the places of the columns, and the unit of time, from their names; raises ValueError
+        for names that are not known, but put y before x."""
+        layout = self._layout
+        self._places, header = layout.column_places, (layout.unknown_header or "")[:60]
+        if layout.has_y_first:
+            raise ValueError(f"columns must say which are t, x, y and p, {header!r} does not")
+        if header:
+            self.notes += (
+                f"{self.path}: the names in {header!r} are not known, "
+                "columns are told by their values; if these are others, give columns=",
+            )
+        if self._places is not None:
+            unit = parse_time_unit(layout.names, layout.names[self._places["t"]])
+            self.time_unit = unit if options.time_unit == "auto" else None
+
+    def _read(self) -> dict[str, np.ndarray]:
         """Return the columns t, in the file's unit, x, y, p (n,), as they stand in the file."""
-        places = self._layout.column_places if options.columns is None else None
         with _Spool() as spool:
             for block, number, is_last in self._blocks():
                 table = self._parse(block, number, is_last)
                 if not len(table):
                     continue
-                if places is None:
-                    places = find_columns(
-                        structured_to_unstructured(table, np.float64), options.columns
-                    )
-                spool.add(*(table[f"f{places[name]}"] for name in "txyp"))
+                if self._places is None:
+                    values = structured_to_unstructured(table, np.float64)
+                    self._places = find_columns(values, None)
+                spool.add(*(table[f"f{self._places[name]}"] for name in "txyp"))
             return spool.mapped()
 
     def _blocks(self) -> Iterator[tuple[str, int, bool]]:
@@ -121,13 +135,30 @@ class TextFile(EventFile):
                 return _load(tidy, self._layout, kind)
             except ValueError:
                 continue
+        if (filled := self._fill_blanks(tidy)) != tidy:
+            return self._parse("\n".join(filled), number, is_last)
         wrong = self._find_broken(tidy)
         if is_last and wrong == len(tidy) - 1 and number + wrong > self._layout.header_lines:
             cut = "gzip stream is cut, what follows is missing"
             is_packed = tidy[wrong].endswith(CUT.decode())
-            self.notes = (f"{self.path}: its {cut if is_packed else 'last line is cut, left out'}",)
+            self.notes += (
+                f"{self.path}: its {cut if is_packed else 'last line is cut, left out'}",
+            )
             return self._parse("\n".join(tidy[:-1]), number, False)
         raise ValueError(f"line {number + wrong + 1} is no event: {tidy[wrong][:40]!r}")
+
+    def _fill_blanks(self, lines: list[str]) -> list[str]:
+        """Return the lines with 0 for what is blank in columns that are not read."""
+        used = range(self._layout.width) if self._places is None else self._places.values()
+
+        def fill(line: str) -> str:
+            words = line.split(self._layout.separator)
+            if len(words) != self._layout.width:
+                return line
+            filled = (w if w.strip() or k in used else "0" for k, w in enumerate(words))
+            return str(self._layout.separator).join(filled)
+
+        return [fill(line) for line in lines] if self._layout.separator else lines
 
     def _find_broken(self, lines: list[str]) -> int:
         for place, line in enumerate(lines):
@@ -138,6 +169,8 @@ class TextFile(EventFile):
 
     def _tidy(self, text: str) -> list[str]:
         """Return the lines with points, numbers for words, and blank for comments."""
+        if '"' in text or "'" in text:
+            text = text.translate(QUOTES)
         if self._layout.has_decimal_comma:
             text = text.replace(",", ".")
         if self._layout.is_mixed:

@@ -4,23 +4,29 @@ import gzip
 import io
 import re
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any, NamedTuple
 
-from src.recordings.files.columns import NAMES, find_columns_by_name, parse_unit_suffix
+from src.recordings.files.columns import (
+    find_alike_columns,
+    find_columns_by_name,
+    find_columns_by_part,
+)
 from src.recordings.files.event_file import WidthHeight
 
 TEXT_ENDINGS = (".txt", ".csv", ".tsv")
 MAX_LINE = 2**23  # characters; a longer line is none of events
 MAX_HEADER_LINES = 1000
+MAX_NAMES = 100  # in a line
 COMMENTS = ("#", "%", "//", ";")
 WORDS = {"true": "1", "false": "0", "on": "1", "off": "0"}  # of polarity
 CUT = b" cut"  # what a packed text ends in where its file is cut: its last line is no event
 TITLE = re.compile(r"^(?:columns?|format|order|fields|header)\s*[:=]\s*", re.IGNORECASE)
 LEAST_SIDE = 16  # px, of a sensor whose size stands alone in a comment
-TO_BLANKS = str.maketrans({",": " ", ";": " ", '"': " ", "'": " "})
+TO_BLANKS = str.maketrans({",": " ", ";": " "})
+QUOTES = str.maketrans("", "", "\"'")
 GEOMETRY = re.compile(
     r"(?:geometry|resolution|(?<!pixel )(?<!buffer )(?<!pixel_)(?<!buffer_)size)\D*(?<![\d.])(\d+)"
     r"(?:\s*(?:(?:[x,;*]|by|height)[\s=:]*)+|\s+)(\d+)(?!\d|\.\d)",
@@ -30,30 +36,33 @@ GEOMETRY = re.compile(
 
 class TextLayout(NamedTuple):
     """How the lines of a file are read: the `width` of the table, `separator` (None: any blanks),
-    whether a comma is the decimal point, whether separators are mixed, a line ends in one or values
-    have quotes (TO_BLANKS), whether polarity is a word, the `column_places` of t,
-    x, y, p where names tell them, the unit of time in these, and (width, height).  `header_lines`
-    come before the events; `unknown_header`: one that seems to name columns, but not all."""
+    whether a comma is the decimal point, whether separators are mixed or a line ends in one
+    (TO_BLANKS), whether polarity is a word, the `names` of the columns and the `column_places` of
+    t, x, y, p where these tell them, and (width, height).  `header_lines` come before the events;
+    `unknown_header`: one that seems to name columns, but not all, `has_y_first`: y before x."""
 
-    width: int
-    separator: str | None
-    has_decimal_comma: bool
-    is_mixed: bool
-    has_words: bool
-    column_places: dict[str, int] | None
-    time_unit: str | None
-    size: WidthHeight | None
-    header_lines: int
+    width: int = 0
+    separator: str | None = None
+    has_decimal_comma: bool = False
+    is_mixed: bool = False
+    has_words: bool = False
+    names: Sequence[str] = ()
+    column_places: dict[str, int] | None = None
     unknown_header: str | None = None
+    has_y_first: bool = False
+    size: WidthHeight | None = None
+    header_lines: int = 0
 
 
 @contextmanager
 def open_text(path: Path) -> Iterator[io.TextIOBase]:
     """Open a text file, or the one in a .gz or .zip, without its byte-order mark."""
     with _open_bytes(path) as file:
-        start = file.peek(4)[:4]
+        start = file.peek(512)
         if start[:2] in (b"\xff\xfe", b"\xfe\xff"):
             raise ValueError("it is UTF-16; save it as UTF-8")
+        if start[257:262] == b"ustar":
+            raise ValueError("it is a .tar; unpack it first")
         if start[:3] == b"\xef\xbb\xbf":
             file.read(3)
         yield io.TextIOWrapper(file, encoding="latin-1")
@@ -68,8 +77,9 @@ def _open_bytes(path: Path) -> Iterator[Any]:
     elif ending == ".zip":
         with zipfile.ZipFile(path) as archive:
             names = [n for n in archive.namelist() if n.lower().endswith(TEXT_ENDINGS)]
-            names = [n for n in names if not Path(n).name.startswith("._")]  # of macOS
-            named = [n for n in names if Path(n).stem.lower() == "events"]  # beside images.txt
+            parts = {n: PureWindowsPath(n) for n in names}  # between / or \
+            names = [n for n in names if not parts[n].name.startswith("._")]  # of macOS
+            named = [n for n in names if parts[n].stem.lower() == "events"]  # beside images.txt
             names = names if len(names) == 1 else named
             if len(names) != 1:
                 raise ValueError("a .zip must hold one text file, or one that is called events.txt")
@@ -101,40 +111,87 @@ class _UpToCut(io.RawIOBase):
 def read_layout(file: io.TextIOBase) -> TextLayout:
     """Return how the lines are read, from those up to the first event."""
     size: WidthHeight | None = None
-    names: list[str] | None = None
+    headers: list[tuple[str, list[str]]] = []  # lines that may name columns, and the names
     strange: str | None = None
-    unknown: str | None = None
     for number in range(MAX_HEADER_LINES):
         line = file.readline(MAX_LINE)
         if not line:
             if strange is not None:
                 raise ValueError(f"no line of numbers t x y p in it, got {strange[:40]!r}")
-            return TextLayout(0, None, False, False, False, None, None, size, number)
+            return TextLayout(size=size, header_lines=number)
         bare = line.strip()
-        separator, has_decimal_comma = _find_separator(bare)
-        plain = bare.replace(",", ".") if has_decimal_comma else bare
-        if is_mixed := _has_mixed_separators(plain, separator):
-            plain, separator = plain.translate(TO_BLANKS), None
-        words = split_line(plain, separator)
-        if len(words) >= 4 and all(map(_is_value, words)):
-            has_words = not all(map(is_number, words))
-            if names is not None and len(names) != len(words):
-                names = None
-            places = None if names is None else find_columns_by_name(names)
-            unit = parse_unit_suffix(names[places["t"]]) if names and places else None
-            how = separator, has_decimal_comma, is_mixed, has_words
-            return TextLayout(
-                len(words), *how, places, unit, size, number, None if places else unknown
-            )
+        layout = None if bare.startswith(COMMENTS) else _read_row(bare, headers)
+        if layout is not None:
+            return layout._replace(size=size, header_lines=number)
         here = _stated_size(bare)
         size = size or here
         title = bare.lstrip("#%/; ").encode("latin-1").decode(errors="replace")  # it may have µs
-        found = _split_title(title)
-        unknown = bare if len(found) == 4 and not here and _names_some(found) else unknown
-        names = found if find_columns_by_name(found) else names
-        if bare and not (bare.startswith(COMMENTS) or here or find_columns_by_name(found)):
+        names = _split_title(title)
+        if len(names) <= MAX_NAMES and sum(map(bool, find_alike_columns(names).values())) > 1:
+            headers.append((bare, names))
+        if bare and not (bare.startswith(COMMENTS) or here or find_columns_by_name(names)):
             strange = strange or bare
     raise ValueError(f"no line of numbers t x y p among the first {MAX_HEADER_LINES}")
+
+
+def _read_row(line: str, headers: list[tuple[str, list[str]]]) -> TextLayout | None:
+    """Return how a line of an event is read, below `headers`; None for another line."""
+    separator, has_decimal_comma = _find_separator(line)
+    plain = line.translate(QUOTES)
+    plain = plain.replace(",", ".") if has_decimal_comma else plain
+    words = plain.split(separator)
+    names, places = _find_names(headers, len(words))
+    is_mixed = not _is_event(words, places) and _has_mixed_separators(plain, separator)
+    if is_mixed:
+        separator, words = None, plain.translate(TO_BLANKS).split()
+        names, places = _find_names(headers, len(words))
+    if not _is_event(words, places):
+        return None
+    has_words = not all(is_number(word) for word in words if word.strip())
+    how = separator, has_decimal_comma, is_mixed, has_words
+    unknown, has_y_first = (None, False) if places else _find_unknown(headers, len(words))
+    return TextLayout(len(words), *how, names, places, unknown, has_y_first)
+
+
+def _is_event(words: list[str], places: dict[str, int] | None) -> bool:
+    """Return whether these are values, four or more; others than those at `places` may be blank."""
+    needed = range(len(words)) if places is None else places.values()
+    return len(words) >= 4 and all(
+        _is_value(word) or not (word.strip() or place in needed) for place, word in enumerate(words)
+    )
+
+
+def _find_names(
+    headers: list[tuple[str, list[str]]], width: int
+) -> tuple[list[str], dict[str, int] | None]:
+    """Return the names of `width` columns, where no line has as many also those among other words,
+    and the places of t, x, y, p by them; [] and None where none tell them."""
+    whole = [names for _, names in reversed(headers) if len(names) == width]
+    parts = [
+        names[first : first + width]
+        for _, names in reversed(headers)
+        for first in range(len(names) - width + 1)
+    ]
+    for find, found in ((find_columns_by_name, whole or parts), (find_columns_by_part, whole)):
+        for names in found:
+            if places := find(names):
+                return names, places
+    return [], None
+
+
+def _find_unknown(headers: list[tuple[str, list[str]]], width: int) -> tuple[str | None, bool]:
+    """Return the last line that names `width` columns, but not all of t, x, y and p, and whether
+    one names y before x."""
+    unknown, has_y_first = None, False
+    for line, names in headers:
+        if len(names) != width and find_columns_by_name(names) is None:
+            continue
+        found = find_alike_columns(names)
+        if found["x"] and found["y"] and min(found["y"]) < min(found["x"]):
+            unknown, has_y_first = line, True
+        elif len(names) == width and not has_y_first and not _stated_size(line):
+            unknown = line
+    return unknown, has_y_first
 
 
 def _stated_size(line: str) -> WidthHeight | None:
@@ -162,12 +219,6 @@ def _split_title(title: str) -> list[str]:
     return names
 
 
-def _names_some(names: list[str]) -> bool:
-    """Return whether two or more of the columns are known by name."""
-    plain = [re.split(r"[^a-zµ]", name.lower())[0] for name in names]
-    return sum(any(name in known for name in plain) for known in NAMES.values()) >= 2
-
-
 def _find_separator(line: str) -> tuple[str | None, bool]:
     """Return what separates values (None: blanks), and whether a comma is the decimal point."""
     if ";" in line.lstrip("; "):
@@ -178,9 +229,7 @@ def _find_separator(line: str) -> tuple[str | None, bool]:
 
 
 def _has_mixed_separators(line: str, separator: str | None) -> bool:
-    """Return whether values have quotes, or more than `separator` stands between or behind them."""
-    if '"' in line or "'" in line:
-        return True
+    """Return whether more than `separator` stands between or behind values."""
     values = line.split(separator)
     return separator is not None and (not values[-1] or any(len(v.split()) > 1 for v in values))
 

@@ -11,7 +11,8 @@ goes on.
 
 The best unit is taken.  The user is told where it is not that of PRIOR 0 or a date, where a second
 one is less than NEAR behind, where another would be ahead but for FINE though the times are finer
-than a camera's in s, too, and where duration or rate are absurd.  Fewer than FEW_TIMES values tell
+than a camera's in s, too, where us need more events/s than usual and ms would be ahead but for
+PRIOR, and where duration or rate are absurd.  Fewer than FEW_TIMES values tell
 too little: they are dates where one unit makes them so, else seconds with a fraction, microseconds
 without.
 """
@@ -140,8 +141,8 @@ def find_unit(sample: TimeSample, stated: str) -> tuple[str, str]:
     if sample.count < FEW_TIMES:
         dated = [unit for unit in UNITS_US if read[unit].is_date] if is_auto else []
         return (usual if usual in dated or not dated else dated[0]), ""
-    if not span:
-        return usual, f"all or nearly all of {sample.count} times are equal"
+    if line := describe_equal_times(sample):
+        return usual, line
     losses, fine = dict(PRIOR[sample.are_whole_numbers]), FINE * sample.has_more_decimals(3)
     if sample.are_whole_numbers and sample.are_apart_by_thousands:
         losses["ns"] = NS_OF_US
@@ -153,13 +154,23 @@ def find_unit(sample: TimeSample, stated: str) -> tuple[str, str]:
     is_near = is_auto and (points[best] - points[second] < NEAR or by_digits)
     is_unusual = is_auto and PRIOR[sample.are_whole_numbers][unit] > 0 and not read[unit].is_date
     absurd = _decades(read[unit].duration_s, ABSURD_S) + _decades(read[unit].rate_hz, ABSURD_HZ)
-    if not (is_near or is_unusual or absurd > 0):
+    is_crowded = is_auto and sample.are_whole_numbers and unit == "us" and (
+        read["us"].active_rate_hz > RATE_HZ[1] and read["ms"].points() > read["us"].points()
+    )  # fmt: skip
+    if not (is_near or is_unusual or is_crowded or absurd > 0):
         return unit, ""
-    other = second if unit == best else best
+    other = "ms" if is_crowded else second if unit == best else best
     if by_digits:
         other = max(plain, key=plain.__getitem__)
     both = f"times in {unit} give {read[unit]}, in {other} {read[other]}"
     return unit, f"{both}: read as {unit}; if it is another, give time_unit=s, ms, us or ns"
+
+
+def describe_equal_times(sample: TimeSample) -> str:
+    """Return what the user is told where all times are equal or nearly all; else ""."""
+    if sample.count < FEW_TIMES or sample.early_time_and_span()[1]:
+        return ""
+    return f"all or nearly all of {sample.count} times are equal"
 
 
 def check_times(t: np.ndarray, unit: str, path: Path) -> None:

@@ -14,7 +14,7 @@ PACKET = (
     "std_msgs/Header header\nuint32 height\nuint32 width\nuint64 seq\nuint64 time_base\n"
     "string encoding\nbool is_bigendian\nuint8[] events\n"
 )
-ARRAYS = ("dvs_msgs", "prophesee_event_msgs")
+ARRAYS = ("dvs_msgs", "prophesee_event_msgs", "dv_ros_msgs")
 PACKETS = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
 
 

@@ -5,6 +5,7 @@ import struct
 import numpy as np
 import pytest
 
+from src.recordings.files import read_events
 from src.recordings.files.aedat1to3_file import Aedat1To3File
 from src.recordings.files.event_file import RawEvents, ReadOptions
 from tests.recordings.files.test_recording import made_up
@@ -67,6 +68,13 @@ def test_a_dvs128(tmp_path, version, line):
     content = header + words(addresses, t, ">u2" if version == "1.0" else ">u4")
     file, found = read(tmp_path / "a.aedat", content)
     assert file.size == (128, 128) and len(file.notes) == (not line) and equal(found, events)
+
+
+def test_the_ending_that_jaer_prefers(tmp_path):
+    events = made_up(500, width=128, height=128)
+    header = b"#!AER-DAT2.0\r\n# AEChip: DVS128\r\n"
+    (tmp_path / "a.aedat2").write_bytes(header + words(dvs128(events), events["t"]))
+    assert np.array_equal(read_events(tmp_path / "a.aedat2"), events)
 
 
 def packet(kind: int, source: int, events, rounds: int = 0, valid=1) -> bytes:

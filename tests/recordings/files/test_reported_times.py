@@ -118,6 +118,15 @@ def test_a_shuffled_file_is_refused_when_it_is_opened(tmp_path):
         open_recording(path)
 
 
+def test_last_events_after_a_long_silence_are_called_so(tmp_path):
+    t = np.concatenate([np.arange(20_000) * 50, 12_000_000 + np.arange(199) * 100])
+    np.savez(tmp_path / "a.npz", t=t, x=t % 320, y=t % 240, p=t % 2)
+    words = "the last 199 of 20199 events after a silence of 11 s, dropped"
+    with pytest.warns(UserWarning, match=words) as told:
+        assert len(read_events(tmp_path / "a.npz")) == 20_000
+    assert len(told) == 1
+
+
 @pytest.mark.parametrize("scale", [1, 50])
 def test_a_reversed_file_is_sorted_or_refused(tmp_path, scale):
     """Of 0.2 s it is no more out of order than one that goes by frames; of 10 s it is."""

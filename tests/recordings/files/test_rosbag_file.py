@@ -30,7 +30,9 @@ def bag_at(folder, ending: str):
 
 
 @pytest.mark.parametrize(("ending", "plugin"), KINDS)
-@pytest.mark.parametrize(("name", "frame"), [(ARRAYS[0], "camera"), (ARRAYS[1], "cam")])  # shift
+@pytest.mark.parametrize(
+    ("name", "frame"), [(ARRAYS[0], "camera"), (ARRAYS[1], "cam"), (ARRAYS[2], "c")]
+)  # shift
 def test_arrays_are_what_rosbags_wrote(tmp_path, ending, plugin, name, frame):
     events = made_up(400)
     events["t"] = events["t"] * 1000 + 1_700_000_000_000_000_007

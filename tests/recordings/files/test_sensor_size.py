@@ -77,3 +77,13 @@ def test_half_of_the_events_off_the_sensor_are_refused(tmp_path, ending, outside
         words = "1000 of 2000 events are off the 400x300 sensor, they need 501x8; is sensor_size="
         with pytest.raises(ValueError, match=words):
             read_events(path, (400, 300))
+
+
+def test_parts_of_a_pixel_without_frames_are_told_of(tmp_path):
+    """BS-ERGB's 1/32: a folder, and one file of it."""
+    n = np.arange(500)
+    columns = {"x": n * 32, "y": n % 300 * 32, "timestamp": n * 100, "polarity": n % 2}
+    np.savez(tmp_path / "000000.npz", **columns)
+    for path in (tmp_path, tmp_path / "000000.npz"):
+        with pytest.warns(UserWarning, match="up to 15968 and 9568, beyond any sensor; parts of"):
+            read_events(path)

@@ -1,6 +1,7 @@
 """What tables state of themselves - size, unit, columns - and packed or cut ones, as found."""
 
 import gzip
+import tarfile
 
 import h5py
 import numpy as np
@@ -82,6 +83,63 @@ def test_columns_of_matlab(tmp_path, events):
     assert_read(tmp_path / "a.npz", events)
 
 
+@pytest.mark.parametrize("shape", [(1, -1), (-1, 1)])
+def test_columns_of_matlab_in_hdf5(tmp_path, events, shape):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name in "txyp":
+            file[f"events/{name}"] = events[name].reshape(shape)
+    assert_read(tmp_path / "a.h5", events)
+
+
+def test_a_table_of_four_rows_in_hdf5(tmp_path, events):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["events"] = np.stack([events[name].astype(np.float64) for name in "txyp"])
+    assert_read(tmp_path / "a.h5", events)
+
+
+def test_another_shape_is_named(tmp_path, events):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["events"], file["other"] = np.zeros((100, 5)), np.zeros(3)
+    with pytest.raises(ValueError, match=r"\(n, 4\) in it, but events \(100, 5\)$"):
+        read_events(tmp_path / "a.h5")
+    write_columns(tmp_path / "b.h5", {name: np.zeros((2, 50)) for name in "txyp"})
+    with pytest.raises(ValueError, match=r"but events/p \(2, 50\), events/t \(2, 50\)"):
+        read_events(tmp_path / "b.h5")
+
+
+@pytest.mark.parametrize("name", ["units", "unit"])
+@pytest.mark.parametrize(
+    ("unit", "per_us"),
+    [
+        ("ns", 1000), (b"nanoseconds", 1000), ("us", 1), ("Microseconds", 1), (["us"], 1),
+        ("ms", 1e-3), ("s", 1e-6), ("seconds since 1970-01-01", 1e-6),
+    ],
+)  # fmt: skip
+def test_an_attribute_of_the_times_states_their_unit(tmp_path, events, name, unit, per_us):
+    slow = slowed(events)
+    t = slow["t"] * per_us
+    write_columns(tmp_path / "a.h5", {"t": t, **{key: slow[key] for key in "xyp"}})
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["events/t"].attrs[name] = unit
+    assert np.array_equal(read_events(tmp_path / "a.h5"), slow)
+
+
+def test_an_attribute_that_is_no_unit_is_refused(tmp_path, events):
+    write_columns(tmp_path / "a.h5", events)
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["events/t"].attrs["units"] = "ticks"
+    with pytest.raises(ValueError, match="must be s, ms, us or ns, got 'ticks'; give time_unit="):
+        read_events(tmp_path / "a.h5")
+    assert_read(tmp_path / "a.h5", events, time_unit="us")
+
+
+def test_an_offset_beside_the_columns_is_added(tmp_path, events):
+    write_columns(tmp_path / "a.h5", events)
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["events/t_offset"] = 5_000_000_000
+    assert read_events(tmp_path / "a.h5")["t"][0] == 5_000_000_000 + events["t"][0]
+
+
 def test_a_cut_gz_is_read_up_to_its_last_whole_line(tmp_path, events):
     content = gzip.compress(lines(events, "xypt").encode())
     (tmp_path / "a.txt.gz").write_bytes(content[: len(content) * 7 // 10])
@@ -157,3 +215,15 @@ def test_a_packed_recording_that_is_no_text_is_to_be_unpacked(tmp_path):
     (tmp_path / "a.raw.gz").write_bytes(gzip.compress(b"% evt 3.0\n" + bytes(100)))
     with pytest.raises(ValueError, match="unpack a.raw first"):
         read_events(tmp_path / "a.raw.gz")
+
+
+def test_a_tar_is_to_be_unpacked(tmp_path, events):
+    """Its first line of text would be one of the archive."""
+    (tmp_path / "events.txt").write_text(lines(events))
+    for name in ("a.tar.gz", "a.gz"):
+        with tarfile.open(tmp_path / name, "w:gz") as archive:
+            archive.add(tmp_path / "events.txt", "rec/events.txt")
+    with pytest.raises(ValueError, match=r"unpack a\.tar first"):
+        read_events(tmp_path / "a.tar.gz")
+    with pytest.raises(ValueError, match=r"it is a \.tar; unpack it first"):
+        read_events(tmp_path / "a.gz")

@@ -114,6 +114,14 @@ def test_events_of_a_zip_with_other_texts(tmp_path, events):
     assert_read(tmp_path / "a.zip", events)
 
 
+def test_a_zip_with_backslashes_in_its_names(tmp_path, events):
+    """As .NET packed it."""
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        archive.writestr("rec\\imu.txt", "0 0\n")
+        archive.writestr("rec\\events.txt", lines(events))
+    assert_read(tmp_path / "a.zip", events)
+
+
 @pytest.mark.parametrize(
     ("comment", "size"),
     [

@@ -38,7 +38,7 @@ def test_fractions_are_seconds_whatever_the_first_value(first, duration, rate):
 
 
 @pytest.mark.parametrize("kind", [int, np.round])
-@pytest.mark.parametrize(("duration", "rate"), [(0.2, 7500), (1.0, 1e5), (10.0, 1e5), (0.1, 1e7)])
+@pytest.mark.parametrize(("duration", "rate"), [(0.2, 7500), (1.0, 1e5), (10.0, 1e5), (0.1, 2e6)])
 def test_whole_numbers_are_microseconds_with_a_point_or_without(kind, duration, rate):
     t = in_unit(made_up(duration, rate), "us", 0, int)
     t = t if kind is int else t.astype(float)
@@ -83,6 +83,13 @@ def test_silence_does_not_change_the_unit():
 def test_whole_milliseconds_are_told_of(duration):
     unit, line = find_unit(sampled(in_unit(made_up(duration, 2e4), "ms", 0, int)), "auto")
     assert unit in ("us", "ms") and f"in ms {duration:.3g} s" in line and "time_unit=" in line
+
+
+@pytest.mark.parametrize(("duration", "rate"), [(100.0, 1e4), (300.0, 3333), (60.0, 5000)])
+def test_whole_milliseconds_of_a_long_recording_are_told_of(duration, rate):
+    """Five events and more at a time: 3 to 10 million a second, were they microseconds."""
+    unit, line = find_unit(sampled(in_unit(made_up(duration, rate), "ms", 0, int)), "auto")
+    assert unit == "us" and f"in ms {duration:.3g} s" in line and "time_unit=" in line
 
 
 def test_few_times_that_are_dates_tell_their_unit():

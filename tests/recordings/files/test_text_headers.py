@@ -1,0 +1,112 @@
+"""Headers of texts: names of columns in other words, blank columns, and what is not clear."""
+
+import numpy as np
+import pytest
+
+from src.recordings.files import ReadOptions, read_events
+from tests.recordings.files.test_tables import assert_read, events, lines
+
+__all__ = ["events"]  # a fixture
+
+
+def rows(events, tail=lambda place: "") -> str:
+    """Return lines t,y,x,p with what `tail` says of each behind it."""
+    texts = lines(events, "tyxp", ",").splitlines()
+    return "".join(f"{text}{tail(place)}\n" for place, text in enumerate(texts))
+
+
+@pytest.mark.parametrize(
+    "tail", [lambda k: ",", lambda k: ",7" * (k > 8) or ",", lambda k: ",7" * (k < 9) or ", "]
+)
+@pytest.mark.parametrize("quote", ["", '"'])
+def test_a_blank_column_is_a_missing_value(tmp_path, events, tail, quote):
+    text = "timestamp,y,x,polarity,label\n" + rows(events, tail)
+    quoted = [quote + line.replace(",", f"{quote},{quote}") + quote for line in text.splitlines()]
+    (tmp_path / "a.csv").write_text("\n".join(quoted))
+    assert_read(tmp_path / "a.csv", events)
+
+
+def test_a_blank_column_before_the_others(tmp_path, events):
+    text = "".join(f",{text}\n" for text in rows(events).splitlines())
+    (tmp_path / "a.csv").write_text("label,t,y,x,p\n" + text)
+    assert_read(tmp_path / "a.csv", events)
+
+
+def test_a_blank_time_is_no_event(tmp_path, events):
+    broken = rows(events[:9], lambda k: ",7") + ",1,2,1,7\n" + rows(events[10:], lambda k: ",")
+    (tmp_path / "a.csv").write_text("t,y,x,p,label\n" + broken)
+    with pytest.raises(ValueError, match="line 11 is no event: ',1,2,1,7'"):
+        read_events(tmp_path / "a.csv")
+
+
+def test_a_stated_order_may_skip_a_blank_column(tmp_path, events):
+    (tmp_path / "a.csv").write_text("t,y,x,p,label\n" + rows(events, lambda k: ","))
+    assert_read(tmp_path / "a.csv", events, columns="tyxpl")
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        "event_t,event_y,event_x,event_p", "ev_timestamp,ev_y,ev_x,ev_pol",
+        "event.t,event.y,event.x,event.p", "t,ypos,xpos,p", "t,y_pos,x_pos,p",
+        "t,pixel_y,pixel_x,p", "eventTime,coordY,coordX,polarity", "# each line: t y x p",
+        "# each line: t, y, x, p", "# t y x p of each event", "left_ts,left_row,left_col,left_on",
+    ],
+)  # fmt: skip
+def test_a_part_of_each_name_is_enough(tmp_path, events, head):
+    (tmp_path / "a.csv").write_text(f"{head}\n{rows(events)}")
+    assert_read(tmp_path / "a.csv", events)
+
+
+@pytest.mark.parametrize("head", ["y,x,t,p", "ev_y,ev_x,ev_t,ev_p"])
+def test_a_line_of_as_many_names_goes_before_other_words(tmp_path, events, head):
+    text = f"# {head}\n# made of t x y p by a script\n" + lines(events, "yxtp", ",")
+    (tmp_path / "a.csv").write_text(text)
+    assert_read(tmp_path / "a.csv", events)
+
+
+def test_a_unit_behind_such_a_name_holds(tmp_path, events):
+    slow = events.copy()
+    slow["t"] *= 1500
+    (tmp_path / "a.csv").write_text(f"event_time_us,event_y,event_x,event_p\n{rows(slow)}")
+    assert_read(tmp_path / "a.csv", slow)
+
+
+@pytest.mark.parametrize("head", ["when,yaddr,xaddr,sign", "t0,y0,x0,t1", "tick,y,x,s"])
+def test_y_before_x_among_names_that_are_not_known_is_refused(tmp_path, events, head):
+    (tmp_path / "a.csv").write_text(f"{head}\n{rows(events)}")
+    with pytest.raises(ValueError, match=rf"a\.csv: .*columns must say which .* '{head}'"):
+        read_events(tmp_path / "a.csv")
+    assert_read(tmp_path / "a.csv", events, columns="tyxp")
+
+
+@pytest.mark.parametrize(
+    ("names", "per_s"),
+    [
+        ("timestamp_sec,timestamp_nsec", 10**9),
+        ("t_s,t_ns", 10**9),
+        ("time_sec,time_usec", 10**6),
+        ("ts [s],ts [microseconds]", 10**6),
+    ],
+)
+def test_seconds_and_their_fraction_are_not_added(tmp_path, events, names, per_s):
+    us = events["t"] + 1_600_000_000_000_000
+    parts = [us // 10**6, us % 10**6 * (per_s // 10**6), *(events[n].astype(int) for n in "xyp")]
+    np.savetxt(tmp_path / "a.csv", np.stack(parts, 1), "%d", ",", header=f"{names},x,y,p")
+    table = np.rec.fromarrays(parts, names=[*names.split(","), "x", "y", "p"])
+    np.save(tmp_path / "a.npy", table)
+    for name in ("a.csv", "a.npy"):
+        with pytest.raises(ValueError, match="times must be one column, got t"):
+            read_events(tmp_path / name)
+    unit = "ns" if per_s == 10**9 else "us"
+    chosen = ReadOptions(columns="ntxyp", time_unit=unit)
+    found = read_events(tmp_path / "a.csv", options=chosen)
+    assert np.array_equal(found["x"], events["x"])
+
+
+def test_equal_times_of_a_named_unit_are_told_of(tmp_path, events):
+    still = events.copy()
+    still["t"] = 1_600_000_000
+    (tmp_path / "a.csv").write_text("t_s,x,y,p\n" + lines(still, between=","))
+    with pytest.warns(UserWarning, match="all or nearly all of 1500 times are equal"):
+        read_events(tmp_path / "a.csv")
