@@ -23,7 +23,15 @@ JOINT = "xy"  # a column (n, 2) of both
 SECONDS = r"(?:n|nano|u|µ|μ|micro|m|milli)?s(?:ec(?:ond)?s?)?"  # of times: us, nsec, seconds, ...
 UNIT = re.compile(rf"[ _]?[\[(]?({SECONDS}|px|pixel|pixels)[\])]?$")
 TIME_UNIT = re.compile(rf"[ _\[(]({SECONDS})[\])]?$")
-NAME_PART = re.compile(r"[A-Z]?[a-z]+|[A-Z]+")
+NAME = re.compile(r"[A-Za-z][\w.@-]*( ?[\[(][^\])]*[\])])?")  # one word, its unit in brackets
+BETWEEN_PARTS = re.compile(r"[\W_]+|(?<=[a-z])(?=[A-Z])")
+OTHER_TIMES = {
+    "exposure",
+    "start",
+    "end",
+    "frame",
+    "delta",
+}  # parts of names that are not of events
 
 
 def find_columns_by_name(names: Sequence[str]) -> dict[str, int] | None:
@@ -43,13 +51,18 @@ def find_columns_by_name(names: Sequence[str]) -> dict[str, int] | None:
 
 
 def find_alike_columns(names: Sequence[str]) -> dict[str, list[int]]:
-    """Return the places among column names where t, x, y and p are a part of the name (`event_t`,
-    `pos.y`) or names are alike but for x and y (`xpos`, `ypos`)."""
-    parts = [{part.lower() for part in NAME_PART.findall(name)} for name in names]
+    """Return the places among column names, a word each, where t, x, y and p are a part of the name
+    (`event_t`, `pos.y`) or names are alike but for x and y (`xpos`, `ypos`); none in a sentence."""
+    is_list = all(NAME.fullmatch(name) for name in names)
+    parts = [set(BETWEEN_PARTS.split(name.lower() if name.isupper() else name)) for name in names]
+    parts = [{part.lower() for part in own} for own in parts]
     found = {
-        letter: [place for place, part in enumerate(parts) if part & set(known)]
+        letter: [place for place, own in enumerate(parts) if is_list and own & set(known)]
         for letter, known in NAMES.items()
     }
+    found["t"] = [place for place in found["t"] if not parts[place] & OTHER_TIMES]
+    if not is_list:
+        return found
     if not found["x"] and not found["y"]:
         bare = [_bare(name) for name in names]
         twins = [(name, name.replace("x", "y")) for name in bare if "x" in name]
@@ -87,22 +100,34 @@ def extract_column(letter: str, key: str, values: np.ndarray) -> np.ndarray:
 def parse_unit_suffix(name: str) -> str | None:
     """Return the unit that the name of a column of times ends in (`t_ns`, `time [ms]`), or None."""
     found = TIME_UNIT.search(_bare(name))
-    if found is None:
+    return None if found is None else _short_unit(found[1])
+
+
+def find_unit_in_words(text: str) -> str | None:
+    """Return the unit of time that a text states (`us`, `time in micro seconds`), or None; a number
+    before it would be a part of it."""
+    text = re.sub(r"\b(nano|micro|milli)[ -]+s", r"\1s", text.lower())
+    found = re.search(rf"(?<![^\W\d_]){SECONDS}(?![^\W\d_])", text)
+    if found is None or re.search(r"\d", text[: found.start()]):
         return None
-    is_us = found[1].startswith(("u", "µ", "μ", "micro"))
-    return "us" if is_us else {"n": "ns", "m": "ms", "s": "s"}[found[1][0]]
+    return _short_unit(found[0])
 
 
 def parse_time_unit(names: Sequence[str], key: str) -> str | None:
     """Return the unit that `key`, the name of the times among `names`, ends in, or None; raises
-    ValueError where another column has times of a unit, too: each may be a part of the time."""
-    parts = [
+    ValueError where these are seconds and another column has the fraction, or the time once more.
+    """
+    unit = parse_unit_suffix(key)
+    finer = [
         name for name in names
-        if parse_unit_suffix(name) and TIME_UNIT.sub("", _bare(name)).rstrip() in NAMES["t"]
+        if parse_unit_suffix(name) not in (None, "s")
+        and TIME_UNIT.sub("", _bare(name)).rstrip() in NAMES["t"]
     ]  # fmt: skip
-    if len(parts) > 1 and key in parts:
-        raise ValueError(f"times must be one column, got {', '.join(parts)}; add them up")
-    return parse_unit_suffix(key)
+    if unit == "s" and finer:
+        both = ", ".join([key, *finer])
+        way = f"add them up, or give time_unit=s where {key} is the whole time"
+        raise ValueError(f"times must be one column, got {both}; {way}")
+    return unit
 
 
 def find_named_time_unit(names: Iterable[str] | None, options: ReadOptions) -> str | None:
@@ -110,8 +135,9 @@ def find_named_time_unit(names: Iterable[str] | None, options: ReadOptions) -> s
     `options` state the unit or the columns.  Raises ValueError as `parse_time_unit` does."""
     listed = list(names or ())
     keys = find_keys_by_name(listed)
-    unit = None if keys is None else parse_time_unit(listed, keys["t"])
-    return unit if options.time_unit == "auto" and options.columns is None else None
+    if keys is None or options.time_unit != "auto" or options.columns is not None:
+        return None
+    return parse_time_unit(listed, keys["t"])
 
 
 def find_columns_by_values(sample: np.ndarray) -> dict[str, int]:
@@ -207,6 +233,11 @@ def check_unpacking_ratio(path: Path, unpacked_bytes: int) -> None:
 
 def _bare(name: str) -> str:
     return name.strip().strip("\"'").lower()
+
+
+def _short_unit(word: str) -> str:
+    is_us = word.startswith(("u", "µ", "μ", "micro"))
+    return "us" if is_us else {"n": "ns", "m": "ms", "s": "s"}[word[0]]
 
 
 def _is_coordinate(values: np.ndarray) -> bool:

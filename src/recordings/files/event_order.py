@@ -226,12 +226,9 @@ class EventSorter:
         if last:
             silence = f"after a silence of {self._last_gap_us * 1e-6:.3g} s"
             yield f"{path}: the last {last} of {self.count} events {silence}, dropped"
-        has_low_bits_only = path.suffix.lower() == ".raw" and self.late > BACKWARD * self.count
-        if self.most_late_us > TOLD_US or has_low_bits_only:
-            reach, fault = f"up to {self.most_late_us * 1e-6:.3g} s", "sorted"
-            if has_low_bits_only:
-                fault = "as it lacks high bits of time (words TIME_HIGH): its times are wrong"
-            yield f"{path}: {self.late} of {self.count} events {reach} out of order, {fault}"
+        if self.most_late_us > TOLD_US:
+            reach = f"up to {self.most_late_us * 1e-6:.3g} s"
+            yield f"{path}: {self.late} of {self.count} events {reach} out of order, sorted"
         if len(self.parts) > 1 and part is None:
             lengths = ", ".join(
                 f"{k}: {one.count} events, {(one.last_us - one.first_us) * 1e-6:.3g} s"

@@ -13,7 +13,7 @@ from src.recordings.files.columns import (
     check_lengths,
     extract_column,
     find_keys_by_name,
-    parse_unit_suffix,
+    find_unit_in_words,
 )
 from src.recordings.files.event_file import ReadOptions
 from src.recordings.files.numpy_file import LazyColumn, has_events_in_columns, split_table
@@ -34,14 +34,14 @@ def find_event_columns(node: Any, order: str | None) -> dict[str, Any]:
     return columns
 
 
-def has_column_shape(key: str, node: Any) -> bool:
-    """Return whether `node` has the shape of a column of that name: (n,) or, as MATLAB has them,
-    (n, 1) or (1, n); (n, 2) for JOINT, of which another width is an error that is told later."""
+def has_column_shape(key: str, node: Any, is_matlab: bool) -> bool:
+    """Return whether `node` has the shape of a column of that name: (n,) or, if `is_matlab`, (n, 1)
+    or (1, n); (n, 2) for JOINT, of which another width is an error that is told later."""
     if not isinstance(node, h5py.Dataset):
         return False
     if key == JOINT:
         return node.ndim == 2
-    return node.ndim == 1 or (node.ndim == 2 and 1 in node.shape)
+    return node.ndim == 1 or (is_matlab and node.ndim == 2 and 1 in node.shape)
 
 
 def describe_event_arrays(file: h5py.File) -> str:
@@ -58,19 +58,16 @@ def describe_event_arrays(file: h5py.File) -> str:
 
 def find_stated_unit(node: Any, options: ReadOptions) -> str | None:
     """Return the unit that the attribute `units` or `unit` of the times of a group states, where
-    `options` do not; raises ValueError for a word that is none."""
+    `options` do not, or None."""
     keys = find_keys_by_name(node) if isinstance(node, h5py.Group) else None
     if keys is None or options.time_unit != "auto":
         return None
     attributes = node[keys["t"]].attrs
     stated = next((attributes[name] for name in ("units", "unit") if name in attributes), None)
-    if stated is None:
+    if not isinstance(stated, str | bytes | np.ndarray):
         return None
-    text = np.ravel(stated).astype(str).item(0)
-    unit = parse_unit_suffix("_".join(["t", *text.split()[:1]]))  # `seconds since ...`, too
-    if unit is None:
-        raise ValueError(f"units of times must be s, ms, us or ns, got {text!r}; give time_unit=")
-    return unit
+    words = np.ravel(np.asarray(stated)).astype(str)
+    return find_unit_in_words(words[0]) if len(words) else None
 
 
 def has_integer_times(t: Any) -> bool:
@@ -141,10 +138,11 @@ def _open_column(node: Any, name: str, key: str) -> LazyColumn:
 def _find_offset(node: Any) -> float | None:
     """Return the `t_offset` beside the columns of a group or a table, else that of the file."""
     beside = node if isinstance(node, h5py.Group) else node.parent
-    offset = beside.get("t_offset", node.file.get("t_offset"))
-    if offset is None:
-        return None
-    if offset.size != 1:
-        raise ValueError(f"t_offset must be one number, got {offset.shape}")
-    start = np.asarray(offset).item()
-    return int(start) if start == int(start) else start
+    for place in (beside, node.file):
+        offset = place.get("t_offset")
+        if not isinstance(offset, h5py.Dataset) or offset.dtype.kind not in "iuf":
+            continue
+        if offset.size != 1 or not np.isfinite(start := np.asarray(offset).item()):
+            raise ValueError(f"t_offset must be one finite number, got {np.asarray(offset)}")
+        return int(start) if start == int(start) else start
+    return None

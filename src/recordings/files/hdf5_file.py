@@ -126,19 +126,25 @@ class Hdf5File(EventFile):
 
 def find_streams(file: h5py.File) -> dict[str, Any]:
     """Return the groups with columns of events and the arrays of events of a file by their paths,
-    in alphabetical order, those that are called events first."""
-    found: dict[str, Any] = {"": file} if _has_columns(file) else {}
+    in alphabetical order, those that are called events first; where there are none, those in the
+    shapes of MATLAB."""
+    found = _find_streams(file, False) or _find_streams(file, True)
+    inside = [name for name in found if any(name.startswith(f"{other}/") for other in found)]
+    names = sorted(set(found) - set(inside), key=lambda name: ("event" not in name.lower(), name))
+    return {name or "/": found[name] for name in names}
+
+
+def _find_streams(file: h5py.File, is_matlab: bool) -> dict[str, Any]:
+    found: dict[str, Any] = {"": file} if _has_columns(file, is_matlab) else {}
 
     def visit(name: str, node: Any) -> None:
-        if (isinstance(node, h5py.Group) and _has_columns(node)) or (
-            isinstance(node, h5py.Dataset) and _is_table(name, node)
+        if (isinstance(node, h5py.Group) and _has_columns(node, is_matlab)) or (
+            isinstance(node, h5py.Dataset) and _is_table(name, node, is_matlab)
         ):
             found[name] = node
 
     file.visititems(visit)
-    inside = [name for name in found if any(name.startswith(f"{other}/") for other in found)]
-    names = sorted(set(found) - set(inside), key=lambda name: ("event" not in name.lower(), name))
-    return {name or "/": found[name] for name in names}
+    return found
 
 
 def check_hdf5_safety(file: h5py.File) -> int:
@@ -178,15 +184,18 @@ def refuse_ecf_codec(parts: Iterable[Any]) -> None:
             )
 
 
-def _has_columns(group: Any) -> bool:
+def _has_columns(group: Any, is_matlab: bool) -> bool:
     keys = find_keys_by_name(group)
-    return keys is not None and all(has_column_shape(key, group.get(key)) for key in keys.values())
+    return keys is not None and all(
+        has_column_shape(key, group.get(key), is_matlab) for key in keys.values()
+    )
 
 
-def _is_table(name: str, node: Any) -> bool:
+def _is_table(name: str, node: Any, is_matlab: bool) -> bool:
     if node.dtype.names is not None:
         return node.ndim == 1 and find_keys_by_name(node.dtype.names) is not None
-    is_table = node.ndim == 2 and (node.shape[1] == 4 or has_events_in_columns(node))
+    is_turned = is_matlab and has_events_in_columns(node)
+    is_table = node.ndim == 2 and (node.shape[1] == 4 or is_turned)
     return is_table and "event" in name.lower()
 
 

@@ -61,9 +61,8 @@ class PropheseeFile(EventFile):
         self._format = None
         if path.suffix.lower() != ".dat":
             self._format = self._read_format(options.format)
-        elif "version" not in self._lines:  # as the first files of ATIS
-            self.size = self.size or ATIS
-            self._lines["version"] = "0" if self.size == ATIS else "2"
+        elif "version" not in self._lines and self._has_words_of_atis():
+            self.size, self._lines["version"] = self.size or ATIS, "0"
 
     def pieces(self) -> Iterator[RawEvents]:
         """Yield the events; warns of a file that ends within a word and of events before the first
@@ -128,6 +127,14 @@ class PropheseeFile(EventFile):
             warnings.warn(
                 f"{self.path}: {decoder.lost} events before the first time, dropped", stacklevel=3
             )
+
+    def _has_words_of_atis(self) -> bool:
+        """Return whether the first words have no more bits than those of the first ATIS."""
+        with self.path.open("rb") as file:
+            file.seek(self._start + 2)
+            block = file.read(1 << 16)
+        words = np.frombuffer(block[: len(block) // 8 * 8], "<u4")[1::2]
+        return len(words) > 0 and not (words >> (sum(ATIS_BITS) + 1)).any()
 
     def _dat_pieces(self) -> Iterator[RawEvents]:
         with self.path.open("rb") as file:

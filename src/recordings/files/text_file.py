@@ -91,9 +91,8 @@ class TextFile(EventFile):
                 f"{self.path}: the names in {header!r} are not known, "
                 "columns are told by their values; if these are others, give columns=",
             )
-        if self._places is not None:
-            unit = parse_time_unit(layout.names, layout.names[self._places["t"]])
-            self.time_unit = unit if options.time_unit == "auto" else None
+        if self._places is not None and options.time_unit == "auto":
+            self.time_unit = parse_time_unit(layout.names, layout.names[self._places["t"]])
 
     def _read(self) -> dict[str, np.ndarray]:
         """Return the columns t, in the file's unit, x, y, p (n,), as they stand in the file."""

@@ -10,6 +10,7 @@ from pathlib import Path, PureWindowsPath
 from typing import Any, NamedTuple
 
 from src.recordings.files.columns import (
+    SECONDS,
     find_alike_columns,
     find_columns_by_name,
     find_columns_by_part,
@@ -19,7 +20,6 @@ from src.recordings.files.event_file import WidthHeight
 TEXT_ENDINGS = (".txt", ".csv", ".tsv")
 MAX_LINE = 2**23  # characters; a longer line is none of events
 MAX_HEADER_LINES = 1000
-MAX_NAMES = 100  # in a line
 COMMENTS = ("#", "%", "//", ";")
 WORDS = {"true": "1", "false": "0", "on": "1", "off": "0"}  # of polarity
 CUT = b" cut"  # what a packed text ends in where its file is cut: its last line is no event
@@ -127,9 +127,10 @@ def read_layout(file: io.TextIOBase) -> TextLayout:
         size = size or here
         title = bare.lstrip("#%/; ").encode("latin-1").decode(errors="replace")  # it may have µs
         names = _split_title(title)
-        if len(names) <= MAX_NAMES and sum(map(bool, find_alike_columns(names).values())) > 1:
+        is_named = find_columns_by_name(names) is not None
+        if is_named or sum(map(bool, find_alike_columns(names).values())) > 1:
             headers.append((bare, names))
-        if bare and not (bare.startswith(COMMENTS) or here or find_columns_by_name(names)):
+        if bare and not (bare.startswith(COMMENTS) or here or is_named):
             strange = strange or bare
     raise ValueError(f"no line of numbers t x y p among the first {MAX_HEADER_LINES}")
 
@@ -140,6 +141,8 @@ def _read_row(line: str, headers: list[tuple[str, list[str]]]) -> TextLayout | N
     plain = line.translate(QUOTES)
     plain = plain.replace(",", ".") if has_decimal_comma else plain
     words = plain.split(separator)
+    if not all(_is_value(word) or not word.strip() for word in plain.translate(TO_BLANKS).split()):
+        return None
     names, places = _find_names(headers, len(words))
     is_mixed = not _is_event(words, places) and _has_mixed_separators(plain, separator)
     if is_mixed:
@@ -164,15 +167,10 @@ def _is_event(words: list[str], places: dict[str, int] | None) -> bool:
 def _find_names(
     headers: list[tuple[str, list[str]]], width: int
 ) -> tuple[list[str], dict[str, int] | None]:
-    """Return the names of `width` columns, where no line has as many also those among other words,
-    and the places of t, x, y, p by them; [] and None where none tell them."""
-    whole = [names for _, names in reversed(headers) if len(names) == width]
-    parts = [
-        names[first : first + width]
-        for _, names in reversed(headers)
-        for first in range(len(names) - width + 1)
-    ]
-    for find, found in ((find_columns_by_name, whole or parts), (find_columns_by_part, whole)):
+    """Return the names of `width` columns, and the places of t, x, y, p by them; [] and None where
+    none tell them."""
+    found = [names for _, names in reversed(headers) if len(names) == width]
+    for find in (find_columns_by_name, find_columns_by_part):
         for names in found:
             if places := find(names):
                 return names, places
@@ -181,15 +179,16 @@ def _find_names(
 
 def _find_unknown(headers: list[tuple[str, list[str]]], width: int) -> tuple[str | None, bool]:
     """Return the last line that names `width` columns, but not all of t, x, y and p, and whether
-    one names y before x."""
+    one names y before x: a list, or words that name t or p, too."""
     unknown, has_y_first = None, False
     for line, names in headers:
-        if len(names) != width and find_columns_by_name(names) is None:
+        if len(names) != width or _stated_size(line):
             continue
         found = find_alike_columns(names)
-        if found["x"] and found["y"] and min(found["y"]) < min(found["x"]):
+        is_list = re.search(r"[,;|\t]", line) or found["t"] or found["p"]
+        if is_list and found["x"] and found["y"] and min(found["y"]) < min(found["x"]):
             unknown, has_y_first = line, True
-        elif len(names) == width and not has_y_first and not _stated_size(line):
+        elif is_list and not has_y_first:
             unknown = line
     return unknown, has_y_first
 
@@ -208,11 +207,12 @@ def _stated_size(line: str) -> WidthHeight | None:
 
 
 def _split_title(title: str) -> list[str]:
-    """Return the names of columns in a line such as `t,x,y,p`, `columns: [t | y | x | p]` or
-    `time (float s), x, y, polarity (0=off)`."""
-    title = TITLE.sub("", title)
+    """Return the names of columns in a line such as `t,x,y,p`, `columns: [t | y | x | p]`,
+    `each line: t (us) x y p` or `time (float s), x, y, polarity (0=off)`."""
+    title = re.sub(rf"\s+([\[(]{SECONDS}[\])])", r"\1", TITLE.sub("", title))
+    behind = title.rpartition(":")[2].strip()
     bare = re.sub(r"[\[\](){}]", "", title).replace("|", ",").strip()
-    for line in (title, bare, re.sub(r"\([^)]*\)", "", title).strip()):
+    for line in (behind, title, bare, re.sub(r"\([^)]*\)", "", title).strip()):
         names = [name.strip() for name in split_line(line, _find_separator(line)[0])]
         if find_columns_by_name(names):
             break
@@ -231,7 +231,9 @@ def _find_separator(line: str) -> tuple[str | None, bool]:
 def _has_mixed_separators(line: str, separator: str | None) -> bool:
     """Return whether more than `separator` stands between or behind values."""
     values = line.split(separator)
-    return separator is not None and (not values[-1] or any(len(v.split()) > 1 for v in values))
+    return separator is not None and (
+        not values[-1].strip() or any(len(v.split()) > 1 for v in values)
+    )
 
 
 def split_line(line: str, separator: str | None) -> list[str]:

@@ -4,7 +4,7 @@ import evt3
 import numpy as np
 import pytest
 
-from src.recordings.files import prophesee_file, read_events
+from src.recordings.files import prophesee_file
 from src.recordings.files.event_file import RawEvents, ReadOptions
 from src.recordings.files.prophesee_file import PropheseeFile
 from tests.recordings.files.test_recording import made_up
@@ -174,15 +174,13 @@ def test_a_dat_without_a_version_is_of_the_first_atis(tmp_path, size):
     assert file.size == (304, 240) and equal(found, events)
 
 
-@pytest.mark.parametrize(("version", "pack", "bits"), [("3.0", evt3_words, 12), ("2.0", evt2, 28)])
-def test_a_raw_file_with_one_word_of_high_time_is_told_of(tmp_path, version, pack, bits):
-    words = pack(made_up(3000))
-    is_high = words >> bits == 8
-    is_high[0] = False
-    content = f"% evt {version}\n".encode() + words[~is_high].tobytes()
-    (tmp_path / "a.raw").write_bytes(content)
-    with pytest.warns(UserWarning, match=r"lacks high bits of time \(words TIME_HIGH\): its times"):
-        read_events(tmp_path / "a.raw")
+@pytest.mark.parametrize("size", ["", "% Height 240\n% Width 304\n"])
+def test_a_dat_without_a_version_may_be_of_a_later_camera(tmp_path, size):
+    events = made_up(400, width=304, height=240)
+    body = dat(events, 0, version=2).partition(b"% Width 320\n")[2]
+    (tmp_path / "a.dat").write_bytes(f"% dat_version 2\n{size}".encode() + body)
+    _, found = read(tmp_path / "a.dat", (tmp_path / "a.dat").read_bytes())
+    assert equal(found, events)
 
 
 def test_what_is_dropped_or_cut_is_counted(tmp_path):

@@ -112,7 +112,8 @@ def test_another_shape_is_named(tmp_path, events):
     ("unit", "per_us"),
     [
         ("ns", 1000), (b"nanoseconds", 1000), ("us", 1), ("Microseconds", 1), (["us"], 1),
-        ("ms", 1e-3), ("s", 1e-6), ("seconds since 1970-01-01", 1e-6),
+        ("ms", 1e-3), ("s", 1e-6), ("seconds since 1970-01-01", 1e-6), ("Time (us)", 1),
+        ("time in micro seconds", 1),
     ],
 )  # fmt: skip
 def test_an_attribute_of_the_times_states_their_unit(tmp_path, events, name, unit, per_us):
@@ -124,13 +125,24 @@ def test_an_attribute_of_the_times_states_their_unit(tmp_path, events, name, uni
     assert np.array_equal(read_events(tmp_path / "a.h5"), slow)
 
 
-def test_an_attribute_that_is_no_unit_is_refused(tmp_path, events):
+@pytest.mark.parametrize(
+    "unit", ["", "1", "ticks", "1e-6 s", 1e-6, np.array([], "S2"), h5py.Empty("S1")]
+)
+def test_an_attribute_that_is_no_unit_says_nothing(tmp_path, events, unit):
     write_columns(tmp_path / "a.h5", events)
     with h5py.File(tmp_path / "a.h5", "a") as file:
-        file["events/t"].attrs["units"] = "ticks"
-    with pytest.raises(ValueError, match="must be s, ms, us or ns, got 'ticks'; give time_unit="):
-        read_events(tmp_path / "a.h5")
-    assert_read(tmp_path / "a.h5", events, time_unit="us")
+        file["events/t"].attrs["units"] = unit
+    assert_read(tmp_path / "a.h5", events)
+
+
+@pytest.mark.parametrize("beside", [(4, 100), (4, 346)])
+def test_other_arrays_of_four_rows_are_no_events(tmp_path, events, beside):
+    write_columns(tmp_path / "a.h5", events)
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["event_rates"] = np.random.default_rng(0).random(beside)
+        for name in "txyp":
+            file[f"calib/{name}"] = np.ones((1, 1))
+    assert_read(tmp_path / "a.h5", events)
 
 
 def test_an_offset_beside_the_columns_is_added(tmp_path, events):

@@ -1,5 +1,7 @@
 """Headers of texts: names of columns in other words, blank columns, and what is not clear."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -50,7 +52,8 @@ def test_a_stated_order_may_skip_a_blank_column(tmp_path, events):
         "event_t,event_y,event_x,event_p", "ev_timestamp,ev_y,ev_x,ev_pol",
         "event.t,event.y,event.x,event.p", "t,ypos,xpos,p", "t,y_pos,x_pos,p",
         "t,pixel_y,pixel_x,p", "eventTime,coordY,coordX,polarity", "# each line: t y x p",
-        "# each line: t, y, x, p", "# t y x p of each event", "left_ts,left_row,left_col,left_on",
+        "# each line: t, y, x, p", "# timestamp (us) y x polarity",
+        "left_ts,left_row,left_col,left_on",
     ],
 )  # fmt: skip
 def test_a_part_of_each_name_is_enough(tmp_path, events, head):
@@ -63,6 +66,46 @@ def test_a_line_of_as_many_names_goes_before_other_words(tmp_path, events, head)
     text = f"# {head}\n# made of t x y p by a script\n" + lines(events, "yxtp", ",")
     (tmp_path / "a.csv").write_text(text)
     assert_read(tmp_path / "a.csv", events)
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        "# x right, y down, t in ms, p sign", "# sorted by t, x, y, p", "# x y p sorted by t",
+        "# x in 0..345, y in 0..259, p in 0..1, t in us", "# v2e sensor size 346x260",
+        "# EVK4 v3, 1280x720, 2024-01-05, indoor", "# v1.2 x64 build 77", "# y down x right",
+        "# dvs-player v0.3 linux x86_64", "# ev2txt v3 --flip-x yes", "# one row per column",
+    ],
+)  # fmt: skip
+def test_a_sentence_names_no_columns(tmp_path, events, head):
+    (tmp_path / "a.txt").write_text(f"{head}\n{lines(events)}")
+    assert np.array_equal(read_events(tmp_path / "a.txt"), events)
+
+
+@pytest.mark.parametrize(
+    "head", ["# Events: t y x p label", "# timestamp (us) y x polarity label", "t y x p label"]
+)
+def test_names_behind_a_title_or_with_a_unit_are_as_many_as_the_columns(tmp_path, events, head):
+    text = rows(events, lambda k: ",7").replace(",", " ")
+    (tmp_path / "a.txt").write_text(f"{head}\n{text}")
+    assert_read(tmp_path / "a.txt", events)
+
+
+@pytest.mark.parametrize("head", ["stamp,x,y,polarity,exposure_t", "when,x,y,p,start_time"])
+def test_another_time_is_not_that_of_events(tmp_path, events, head):
+    table = np.stack([*(events[n].astype(int) for n in "txyp"), np.full(len(events), 1000)], 1)
+    np.savetxt(tmp_path / "a.csv", table, "%d", ",", header=head, comments="")
+    with pytest.raises(ValueError, match="columns must say the order of the 5 columns"):
+        read_events(tmp_path / "a.csv")
+
+
+def test_a_header_without_events_is_soon_refused(tmp_path):
+    text = ("# t x " + "a " * 97 + "\n") * 480 + "some words of prose\n" * 480
+    (tmp_path / "a.txt").write_text(text)
+    start = time.process_time()
+    with pytest.raises(ValueError, match="no line of numbers"):
+        read_events(tmp_path / "a.txt")
+    assert time.process_time() - start < 10
 
 
 def test_a_unit_behind_such_a_name_holds(tmp_path, events):
@@ -98,6 +141,8 @@ def test_seconds_and_their_fraction_are_not_added(tmp_path, events, names, per_s
     for name in ("a.csv", "a.npy"):
         with pytest.raises(ValueError, match="times must be one column, got t"):
             read_events(tmp_path / name)
+    with pytest.warns(UserWarning, match="times are equal"):
+        read_events(tmp_path / "a.npy", options=ReadOptions(time_unit="s"))
     unit = "ns" if per_s == 10**9 else "us"
     chosen = ReadOptions(columns="ntxyp", time_unit=unit)
     found = read_events(tmp_path / "a.csv", options=chosen)
