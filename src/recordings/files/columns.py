@@ -25,13 +25,7 @@ UNIT = re.compile(rf"[ _]?[\[(]?({SECONDS}|px|pixel|pixels)[\])]?$")
 TIME_UNIT = re.compile(rf"[ _\[(]({SECONDS})[\])]?$")
 NAME = re.compile(r"[A-Za-z][\w.@-]*( ?[\[(][^\])]*[\])])?")  # one word, its unit in brackets
 BETWEEN_PARTS = re.compile(r"[\W_]+|(?<=[a-z])(?=[A-Z])")
-OTHER_TIMES = {
-    "exposure",
-    "start",
-    "end",
-    "frame",
-    "delta",
-}  # parts of names that are not of events
+OTHER_TIMES = {"exposure", "start", "end", "frame", "delta"}  # `start_time` is not of events
 
 
 def find_columns_by_name(names: Sequence[str]) -> dict[str, int] | None:
@@ -53,16 +47,14 @@ def find_columns_by_name(names: Sequence[str]) -> dict[str, int] | None:
 def find_alike_columns(names: Sequence[str]) -> dict[str, list[int]]:
     """Return the places among column names, a word each, where t, x, y and p are a part of the name
     (`event_t`, `pos.y`) or names are alike but for x and y (`xpos`, `ypos`); none in a sentence."""
-    is_list = all(NAME.fullmatch(name) for name in names)
-    parts = [set(BETWEEN_PARTS.split(name.lower() if name.isupper() else name)) for name in names]
-    parts = [{part.lower() for part in own} for own in parts]
+    if not all(map(NAME.fullmatch, names)):
+        return {letter: [] for letter in NAMES}
+    parts = [{part.lower() for part in BETWEEN_PARTS.split(name)} for name in names]
     found = {
-        letter: [place for place, own in enumerate(parts) if is_list and own & set(known)]
+        letter: [place for place, own in enumerate(parts) if own & set(known)]
         for letter, known in NAMES.items()
     }
     found["t"] = [place for place in found["t"] if not parts[place] & OTHER_TIMES]
-    if not is_list:
-        return found
     if not found["x"] and not found["y"]:
         bare = [_bare(name) for name in names]
         twins = [(name, name.replace("x", "y")) for name in bare if "x" in name]

@@ -142,7 +142,10 @@ def _find_offset(node: Any) -> float | None:
         offset = place.get("t_offset")
         if not isinstance(offset, h5py.Dataset) or offset.dtype.kind not in "iuf":
             continue
-        if offset.size != 1 or not np.isfinite(start := np.asarray(offset).item()):
-            raise ValueError(f"t_offset must be one finite number, got {np.asarray(offset)}")
+        if offset.size != 1:
+            raise ValueError(f"t_offset must be one number, got {offset.shape}")
+        start = np.asarray(offset).item()
+        if not np.isfinite(start):
+            raise ValueError(f"t_offset must be finite, got {start}")
         return int(start) if start == int(start) else start
     return None

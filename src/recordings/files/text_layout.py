@@ -141,7 +141,7 @@ def _read_row(line: str, headers: list[tuple[str, list[str]]]) -> TextLayout | N
     plain = line.translate(QUOTES)
     plain = plain.replace(",", ".") if has_decimal_comma else plain
     words = plain.split(separator)
-    if not all(_is_value(word) or not word.strip() for word in plain.translate(TO_BLANKS).split()):
+    if not all(map(_is_value, plain.translate(TO_BLANKS).split())):
         return None
     names, places = _find_names(headers, len(words))
     is_mixed = not _is_event(words, places) and _has_mixed_separators(plain, separator)

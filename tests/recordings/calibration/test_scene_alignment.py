@@ -40,13 +40,13 @@ def moving_scene(shift_px: float = 0.0, frames: int = 17) -> np.ndarray:
     return 0.9 * np.stack(film) + 0.05
 
 
-def record(path, positions, films, key: int = 5, angle_rad: float = 0.0):
+def record(path, positions, films, key: int = 5, angle_rad: float = 0.0, leak_hz: float = 0.0):
     truth = simulated_recording.kaleidoscope_views(
         list(positions), model=(SIDE, SIDE), sensor=SENSOR, tile_px=TILE, key=key
     )
     truth = fold_corners(truth, angle_rad, off_px=8.0) if angle_rad else truth
     sensor = EventSensor(
-        0.3, refractory_s=5e-4, mismatch=0.03, dark_noise_hz=1.0, leak_event_hz=0.1,
+        0.3, refractory_s=5e-4, mismatch=0.03, dark_noise_hz=1.0, leak_event_hz=leak_hz,
         hot_pixel_fraction=1e-4, hot_pixel_hz=60.0,
     )  # fmt: skip
     frames = torch.from_numpy(np.stack(films)).float().expand(len(positions), -1, -1, -1)
@@ -78,6 +78,16 @@ def test_any_scene_finds_the_views_of_a_kaleidoscope(views, tmp_path):
     ]
     left, top, right, bottom = np.array(there.field) - truth.field
     assert min(left, top, -right, -bottom) > -6 and max(left, top, -right, -bottom) < 16
+
+
+def test_leak_leaves_the_views_in_place(tmp_path):
+    """References anywhere between two thresholds blur the pictures of events: the field is smaller,
+    the error of held-out points larger, the views where they are."""
+    truth = record(tmp_path / "a.raw", layout(3), [moving_scene()], key=3, leak_hz=0.1)
+    pictures = activity_pictures.read_activity_pictures(tmp_path / "a.raw")
+    found = align_views_by_scene(pictures, SceneTarget(), (88, 88))
+    assert max(distance_px(found.aligned.views, truth).values()) < 0.3
+    assert max(found.held_out_px.values()) < 0.5
 
 
 def test_mirrors_off_the_right_angle_give_corner_views_in_halves(tmp_path):
