@@ -11,7 +11,7 @@ import pickle
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -213,34 +213,18 @@ def prepares_turbulence(device: torch.device) -> bool:
 def _draw_clips(
     source: Pipeline, indices: Sequence[int], workers: int, device: torch.device
 ) -> Generator[tuple[int, ClipParameters, dict[str, Any]]]:
-    """Yield clips in order with draw and metadata; the `workers` processes that draw them end with
-    the generator.
+    """Yield clips in order with draw and metadata; the `workers` processes that draw them in turn
+    end with the generator.
     """
     clips = _ClipSource(source, prepares_turbulence(device))
-    if not workers:
-        for index in indices:
-            yield index, *clips.draw(index)
-        return
-    with closing(_draw_in_processes(clips, indices, workers)) as drawn:
-        for index, clip in zip(indices, drawn, strict=True):
-            if isinstance(clip, Exception):
-                raise clip
-            yield index, *clip
-
-
-def _draw_in_processes(
-    clips: _ClipSource, indices: Sequence[int], workers: int
-) -> Generator[DrawnClip | Exception]:
-    """Yield what `draw` returns or raises for each of `indices`, drawn in turn by `workers`
-    processes, which end with the generator.  Raises RuntimeError where one of them died.
-    """
     drawing: list[_DrawingProcess] = []
     with ExitStack() as at_end:
         for worker in range(workers):
             drawing.append(_DrawingProcess(clips, indices[worker::workers]))
             at_end.callback(drawing[-1].stop)
         for place, index in enumerate(indices):
-            yield drawing[place % workers].receive(index)
+            draw = drawing[place % workers].receive if workers else clips.draw
+            yield index, *draw(index)
 
 
 class _DrawingProcess:
@@ -260,16 +244,19 @@ class _DrawingProcess:
             raise RuntimeError(f"a process that draws cannot be started: {error!r}") from error
         sender.close()  # now the process alone holds it, so that the pipe ends with it
 
-    def receive(self, index: int) -> DrawnClip | Exception:
-        """Return the next clip, of number `index`, or why it cannot be drawn; RuntimeError where
+    def receive(self, index: int) -> DrawnClip:
+        """Return the next clip, of number `index`; raises what `draw` does, and RuntimeError where
         the process died.
         """
         try:
-            return pickle.loads(self.receiver.recv_bytes())
+            drawn = pickle.loads(self.receiver.recv_bytes())
         except (EOFError, OSError) as error:
             self.process.join()
             ending = f"a process that draws ended with exit code {self.process.exitcode}"
             raise RuntimeError(f"waiting for clip {index}: {ending}") from error
+        if isinstance(drawn, Exception):
+            raise drawn
+        return drawn
 
     def stop(self) -> None:
         """End the process, whatever it is doing."""

@@ -75,7 +75,7 @@ def _build_tables(
     """Return the tables that have rows: those of each sweep, of `pairs`, and with `against`."""
     across, pairs = _list_texts(cfg.across), _list_pairs(cfg.pairs)
     run_groups.check_across(across, found)
-    published, report = as_dict(cfg.paper), _ReportTables()
+    published, made = as_dict(cfg.paper), _ReportTables()
     sweeps = dict.fromkeys([*(run.sweep for run in found), *(plan.sweep for plan in plans)])
     for name in sweeps:
         own = [run for run in found if run.sweep == name]
@@ -86,20 +86,20 @@ def _build_tables(
         by_severity = tables.build_severity_table(f"Scores by severity{of}", keys, groups)
         references = tables.build_reference_methods_table(f"On the same clips{of}", keys, groups)
         built = (scores, by_severity, references)
-        report.shown += [table for table in built if table and table.rows]
-        report.scores |= {f"Scores{of}": scores} if scores.rows else {}
-        report.groups += groups
+        made.shown += [table for table in built if table and table.rows]
+        made.scores |= {f"Scores{of}": scores} if scores.rows else {}
+        made.groups += groups
         if pairs:
             table = build_pair_table(f"Differences{of}", keys, groups, pairs, columns)
-            report.differences += [table] if table.rows else []
-    report.shown += report.differences
+            made.differences += [table] if table.rows else []
+    made.shown += made.differences
     if cfg.against is not None:
         others = runs.find_runs(_list_folders("against", cfg.against))
         ours = run_groups.require_one_setting("run", found, across)
         theirs = run_groups.require_one_setting("against", others, across)
         title = "Differences on the same clips"
-        report.shown.append(build_difference_table(title, ours, theirs, published))
-    return report
+        made.shown.append(build_difference_table(title, ours, theirs, published))
+    return made
 
 
 def _format_text(made: _ReportTables, commands: list[str], columns: list[str] | None) -> str:

@@ -18,7 +18,7 @@ from src.bench.stress_tests import stress_results
 from src.bench.stress_tests.event_clips import StressBench
 from src.figures.stress_map import draw_stress_map
 from src.records import results
-from src.training.worker_process import end_with_parent
+from src.training.worker_process import exit_with_parent
 
 NetworkResults = tuple[dict[str, stress_results.Outcome], float | None]
 
@@ -72,7 +72,7 @@ def _run_tests(cfg: DictConfig, config: str, networks: int) -> Iterator[NetworkR
 
 def _prepare_process() -> None:
     torch.set_num_threads(1)
-    end_with_parent()
+    exit_with_parent()
 
 
 def _test_network(config: str, index: int) -> NetworkResults:

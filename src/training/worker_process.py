@@ -14,10 +14,10 @@ def prepare_worker_process(worker: int = 0) -> None:
     """
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
+    exit_with_parent()
 
 
-def end_with_parent() -> None:
+def exit_with_parent() -> None:
     """End this process, which another one started, as soon as that one has ended in any way."""
     threading.Thread(target=_exit_after_parent, daemon=True).start()
 

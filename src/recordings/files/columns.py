@@ -44,7 +44,7 @@ def find_columns_by_name(names: Sequence[str]) -> dict[str, int] | None:
     return places
 
 
-def find_alike_columns(names: Sequence[str]) -> dict[str, list[int]]:
+def find_candidate_columns(names: Sequence[str]) -> dict[str, list[int]]:
     """Return the places among column names, a word each, where t, x, y and p are a part of the name
     (`event_t`, `pos.y`) or names are alike but for x and y (`xpos`, `ypos`); none in a sentence."""
     if not all(map(NAME.fullmatch, names)):
@@ -64,8 +64,8 @@ def find_alike_columns(names: Sequence[str]) -> dict[str, list[int]]:
 
 
 def find_columns_by_part(names: Sequence[str]) -> dict[str, int] | None:
-    """Return the places of t, x, y and p by `find_alike_columns`; None where they are not four."""
-    found = find_alike_columns(names)
+    """Return the places of t, x, y and p by `find_candidate_columns`, or None if not one each."""
+    found = find_candidate_columns(names)
     places = {letter: alike[0] for letter, alike in found.items() if len(alike) == 1}
     return places if len(set(places.values())) == len(NAMES) else None
 
@@ -95,7 +95,7 @@ def parse_unit_suffix(name: str) -> str | None:
     return None if found is None else _short_unit(found[1])
 
 
-def find_unit_in_words(text: str) -> str | None:
+def find_time_unit_in_text(text: str) -> str | None:
     """Return the unit of time that a text states (`us`, `time in micro seconds`), or None; a number
     before it would be a part of it."""
     text = re.sub(r"\b(nano|micro|milli)[ -]+s", r"\1s", text.lower())
@@ -105,7 +105,7 @@ def find_unit_in_words(text: str) -> str | None:
     return _short_unit(found[0])
 
 
-def parse_time_unit(names: Sequence[str], key: str) -> str | None:
+def parse_time_column_unit(names: Sequence[str], key: str) -> str | None:
     """Return the unit that `key`, the name of the times among `names`, ends in, or None; raises
     ValueError where these are seconds and another column has the fraction, or the time once more.
     """
@@ -124,12 +124,12 @@ def parse_time_unit(names: Sequence[str], key: str) -> str | None:
 
 def find_named_time_unit(names: Iterable[str] | None, options: ReadOptions) -> str | None:
     """Return the unit that the name of the times among `names` ends in; None where it has none or
-    `options` state the unit or the columns.  Raises ValueError as `parse_time_unit` does."""
+    `options` state the unit or the columns.  Raises ValueError as `parse_time_column_unit` does."""
     listed = list(names or ())
     keys = find_keys_by_name(listed)
     if keys is None or options.time_unit != "auto" or options.columns is not None:
         return None
-    return parse_time_unit(listed, keys["t"])
+    return parse_time_column_unit(listed, keys["t"])
 
 
 def find_columns_by_values(sample: np.ndarray) -> dict[str, int]:

@@ -13,10 +13,10 @@ from src.recordings.files.columns import (
     check_lengths,
     extract_column,
     find_keys_by_name,
-    find_unit_in_words,
+    find_time_unit_in_text,
 )
 from src.recordings.files.event_file import ReadOptions
-from src.recordings.files.numpy_file import LazyColumn, has_events_in_columns, split_table
+from src.recordings.files.numpy_file import LazyColumn, has_event_per_column, split_table
 
 
 def find_event_columns(node: Any, order: str | None) -> dict[str, Any]:
@@ -27,7 +27,7 @@ def find_event_columns(node: Any, order: str | None) -> dict[str, Any]:
         columns = {name: _open_column(node[key], name, key) for name, key in keys.items()}
         check_lengths(columns)
     else:
-        columns = split_table(_Turned(node) if has_events_in_columns(node) else node, order)
+        columns = split_table(_Turned(node) if has_event_per_column(node) else node, order)
     start = _find_offset(node)
     if start is not None:
         columns["t"] = LazyColumn(columns["t"], lambda t: as_times(np.asarray(t)) + start)
@@ -44,7 +44,7 @@ def has_column_shape(key: str, node: Any, is_matlab: bool) -> bool:
     return node.ndim == 1 or (is_matlab and node.ndim == 2 and 1 in node.shape)
 
 
-def describe_event_arrays(file: h5py.File) -> str:
+def list_event_array_shapes(file: h5py.File) -> str:
     """Return the shapes of the first three arrays that are called events, "" for none."""
     found: list[str] = []
 
@@ -56,7 +56,7 @@ def describe_event_arrays(file: h5py.File) -> str:
     return ", ".join(found[:3])
 
 
-def find_stated_unit(node: Any, options: ReadOptions) -> str | None:
+def read_units_attribute(node: Any, options: ReadOptions) -> str | None:
     """Return the unit that the attribute `units` or `unit` of the times of a group states, where
     `options` do not, or None."""
     keys = find_keys_by_name(node) if isinstance(node, h5py.Group) else None
@@ -67,7 +67,7 @@ def find_stated_unit(node: Any, options: ReadOptions) -> str | None:
     if not isinstance(stated, str | bytes | np.ndarray):
         return None
     words = np.ravel(np.asarray(stated)).astype(str)
-    return find_unit_in_words(words[0]) if len(words) else None
+    return find_time_unit_in_text(words[0]) if len(words) else None
 
 
 def has_integer_times(t: Any) -> bool:

@@ -36,14 +36,14 @@ from src.recordings.files.frame_files import to_gray, wrap_frame_array
 from src.recordings.files.hdf5_columns import (
     ConcatenatedColumn,
     are_consecutive_in_time,
-    describe_event_arrays,
     find_event_columns,
     find_numbered_streams,
-    find_stated_unit,
     has_column_shape,
     has_integer_times,
+    list_event_array_shapes,
+    read_units_attribute,
 )
-from src.recordings.files.numpy_file import has_events_in_columns, slice_columns, slice_times
+from src.recordings.files.numpy_file import has_event_per_column, slice_columns, slice_times
 
 HDF5_ENDINGS = (".h5", ".hdf5", ".hdf")
 SIZE_NAMES = ("size", "geometry", "sensor_size")  # width, height
@@ -65,7 +65,7 @@ class Hdf5File(EventFile):
             self._file = h5py.File(path, rdcc_nbytes=max(largest, DEFAULT_CACHE_BYTES))
             streams = find_streams(self._file)
             if not streams:
-                found = describe_event_arrays(self._file)
+                found = list_event_array_shapes(self._file)
                 raise ValueError(
                     "no columns t, x, y, p and no array of events (n, 4) in it"
                     + (f", but {found}" if found else "")
@@ -121,7 +121,7 @@ class Hdf5File(EventFile):
         is_dsec = "t_offset" in self._file or "ms_to_idx" in self._file
         is_dsec = is_dsec and options.time_unit == "auto" and has_integer_times(self._columns["t"])
         named = "us" if is_dsec else find_named_time_unit(names, options)
-        self.time_unit = find_stated_unit(node, options) or named
+        self.time_unit = read_units_attribute(node, options) or named
 
 
 def find_streams(file: h5py.File) -> dict[str, Any]:
@@ -185,6 +185,7 @@ def refuse_ecf_codec(parts: Iterable[Any]) -> None:
 
 
 def _has_columns(group: Any, is_matlab: bool) -> bool:
+    """Return whether the group holds t, x, y, p in the shapes of `has_column_shape`."""
     keys = find_keys_by_name(group)
     return keys is not None and all(
         has_column_shape(key, group.get(key), is_matlab) for key in keys.values()
@@ -194,7 +195,7 @@ def _has_columns(group: Any, is_matlab: bool) -> bool:
 def _is_table(name: str, node: Any, is_matlab: bool) -> bool:
     if node.dtype.names is not None:
         return node.ndim == 1 and find_keys_by_name(node.dtype.names) is not None
-    is_turned = is_matlab and has_events_in_columns(node)
+    is_turned = is_matlab and has_event_per_column(node)
     is_table = node.ndim == 2 and (node.shape[1] == 4 or is_turned)
     return is_table and "event" in name.lower()
 

@@ -99,7 +99,7 @@ def split_table(table: Any, order: str | None) -> dict[str, Any]:
     them.  Raises ValueError for another array."""
     names = table.dtype.names
     if isinstance(table, np.ndarray):
-        table = _flat(table) if names else table.T if has_events_in_columns(table) else table
+        table = _flat(table) if names else table.T if has_event_per_column(table) else table
     if names is not None:
         keys = find_keys_by_name(names)
         if keys is None or table.ndim != 1:
@@ -183,11 +183,11 @@ def _extract_field(letter: str, key: str, rows: np.ndarray) -> np.ndarray:
 def _is_table(table: np.ndarray) -> bool:
     fields = table.dtype.names
     return bool(fields and find_keys_by_name(fields)) or (
-        table.ndim == 2 and (table.shape[1] == 4 or has_events_in_columns(table))
+        table.ndim == 2 and (table.shape[1] == 4 or has_event_per_column(table))
     )
 
 
-def has_events_in_columns(table: Any) -> bool:
+def has_event_per_column(table: Any) -> bool:
     """Return whether an array has an event in each column: (4, n), not (n, 4)."""
     return table.ndim == 2 and table.shape[0] == 4 and table.shape[1] >= LEAST_COLUMNS
 

@@ -265,7 +265,7 @@ def _open_and_survey(
     survey, swapped = survey_times(file, options), None
     if not isinstance(file, OF_THE_CAMERA):
         swapped = sensor_size.find_swapped_size(file, survey.pieces or file.pieces())
-        lines = sensor_size.describe_wide_events(file, survey.pieces or file.pieces())
+        lines = sensor_size.describe_oversized_coordinates(file, survey.pieces or file.pieces())
         survey = survey._replace(messages=survey.messages + lines)
     return (None if isinstance(file, Hdf5File) else file), survey, swapped
 

@@ -29,7 +29,7 @@ def find_swapped_size(file: EventFile, pieces: Iterable[RawEvents]) -> WidthHeig
     return height, width
 
 
-def describe_wide_events(file: EventFile, pieces: Iterable[RawEvents]) -> tuple[str, ...]:
+def describe_oversized_coordinates(file: EventFile, pieces: Iterable[RawEvents]) -> tuple[str, ...]:
     """Return a line for the user where the first of `pieces` of a file that states no size has
     coordinates beyond WIDEST; else none."""
     first = next(iter(pieces), None) if file.size is None else None

@@ -19,7 +19,7 @@ from src.recordings.files.columns import (
     as_integers,
     check_unpacking_ratio,
     find_columns,
-    parse_time_unit,
+    parse_time_column_unit,
 )
 from src.recordings.files.event_file import (
     EventFile,
@@ -92,7 +92,7 @@ class TextFile(EventFile):
                 "columns are told by their values; if these are others, give columns=",
             )
         if self._places is not None and options.time_unit == "auto":
-            self.time_unit = parse_time_unit(layout.names, layout.names[self._places["t"]])
+            self.time_unit = parse_time_column_unit(layout.names, layout.names[self._places["t"]])
 
     def _read(self) -> dict[str, np.ndarray]:
         """Return the columns t, in the file's unit, x, y, p (n,), as they stand in the file."""

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from src.recordings.files.columns import (
     SECONDS,
-    find_alike_columns,
+    find_candidate_columns,
     find_columns_by_name,
     find_columns_by_part,
 )
@@ -128,7 +128,7 @@ def read_layout(file: io.TextIOBase) -> TextLayout:
         title = bare.lstrip("#%/; ").encode("latin-1").decode(errors="replace")  # it may have µs
         names = _split_title(title)
         is_named = find_columns_by_name(names) is not None
-        if is_named or sum(map(bool, find_alike_columns(names).values())) > 1:
+        if is_named or sum(map(bool, find_candidate_columns(names).values())) > 1:
             headers.append((bare, names))
         if bare and not (bare.startswith(COMMENTS) or here or is_named):
             strange = strange or bare
@@ -184,7 +184,7 @@ def _find_unknown(headers: list[tuple[str, list[str]]], width: int) -> tuple[str
     for line, names in headers:
         if len(names) != width or _stated_size(line):
             continue
-        found = find_alike_columns(names)
+        found = find_candidate_columns(names)
         is_list = re.search(r"[,;|\t]", line) or found["t"] or found["p"]
         if is_list and found["x"] and found["y"] and min(found["y"]) < min(found["x"]):
             unknown, has_y_first = line, True

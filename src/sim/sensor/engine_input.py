@@ -114,7 +114,7 @@ def _clip_numbers(clip: SensorClip, low_pass_row: int) -> tuple:
 
 
 def _reference_range(sensor: Any) -> tuple[float, float]:
-    """Return the middle and span of a sensor's first references; see records.py.
+    """Return the zero and the span of a sensor's first references; see records.py.
 
     With leak they lie anywhere on the way to the next ON event, so that these come at their rate
     from the first moment on, and not all at once.

@@ -19,13 +19,13 @@ LOWEST, HIGHEST = -1e-4, 1 + 1e-4  # intensities that a sensor takes: [0, 1] and
 # hot_fraction: share of hot pixels, 2**-32.  leak: per interval, 2**-24 thresholds.  dark_noise,
 # hot_noise: probabilities of a noise event per interval, 2**-32.  top, left: the crop's place in a
 # frame full_width wide.  low_pass_row: of low_pass_tables.  refractory: the dead time in intervals,
-# a float32's value.  A reference begins (u - reference_middle) * reference_span thresholds below
+# a float32's value.  A reference begins (u - reference_zero) * reference_span thresholds below
 # the first level, u uniform in [0, 1).
 WHOLE = (
     "on", "off", "mismatch", "hot_fraction", "leak", "dark_noise", "hot_noise", "top", "left",
     "full_width", "low_pass_row",
 )  # fmt: skip
-FIELDS = (*WHOLE, "refractory", "reference_middle", "reference_span")
+FIELDS = (*WHOLE, "refractory", "reference_zero", "reference_span")
 CLIP = np.dtype([(name, np.int64 if name in WHOLE else np.float64) for name in FIELDS])
 Grids = Float[Tensor, "n windows views bins h w"]
 EVENT = np.dtype([("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)])

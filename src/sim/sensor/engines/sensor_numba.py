@@ -421,7 +421,7 @@ def initialise_pixel_state(clip, key, work):
         draw_uint32_per_pixel(key, 1, 0, work.pixel, drawn)
         for x in range(level.size):
             uniform = (f32(drawn[x] >> uint32(9)) + f32(0.5)) * f32(2.0**-23)
-            away = (np.float64(uniform) - clip.reference_middle) * clip.reference_span
+            away = (np.float64(uniform) - clip.reference_zero) * clip.reference_span
             threshold = work.on[x] if away > 0 else work.off[x]
             reference[x] = level[x] - i32(away * threshold)
 

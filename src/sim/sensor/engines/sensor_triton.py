@@ -24,7 +24,7 @@ NEVER = tl.constexpr(2.0)  # a time after the interval
 FIELDS, KEYS = tl.constexpr(len(records.FIELDS)), tl.constexpr(records.KEYS)
 (
     ON, OFF, MISMATCH, HOT_FRACTION, LEAK, DARK_NOISE, HOT_NOISE, TOP, LEFT, FULL_WIDTH,
-    LOW_PASS_ROW, REFRACTORY, REFERENCE_MIDDLE, REFERENCE_SPAN,
+    LOW_PASS_ROW, REFRACTORY, REFERENCE_ZERO, REFERENCE_SPAN,
 ) = map(tl.constexpr, range(len(records.FIELDS)))  # fmt: skip
 MISMATCH_KEY, HOT_PIXEL_KEY, NOISE_KEY, REFERENCE_KEY = map(tl.constexpr, range(records.KEYS))
 BLOCK = 128  # pixels of a program
@@ -227,8 +227,8 @@ def draw_level_minus_reference(clip, keys, pixel, on, off):
     """Return how far a reference is below the first level."""
     drawn = random_uint32(tl.load(keys + REFERENCE_KEY), tl.full((), 0, tl.int64), pixel)
     share = ((drawn >> 9).to(tl.float32) + 0.5) * (1 / 8388608.0)
-    middle = load_int64_as_float64(clip + REFERENCE_MIDDLE)
-    away = (share.to(tl.float64) - middle) * load_int64_as_float64(clip + REFERENCE_SPAN)
+    zero = load_int64_as_float64(clip + REFERENCE_ZERO)
+    away = (share.to(tl.float64) - zero) * load_int64_as_float64(clip + REFERENCE_SPAN)
     return (away * tl.where(away > 0, on, off).to(tl.float64)).to(tl.int32)
 
 
