@@ -121,9 +121,10 @@ def bouncing_ball(
     def draw(time):
         # The way to and fro is a triangle wave; between bounces the height is a parabola.
         way = (place + speed * time / free) % 2
-        x = radius + free * min(way, 2 - way)
+        along_floor = free * min(way, 2 - way)
+        x = radius + along_floor
         y = floor - height * (1 - (2 * ((phase + bounces_per_s * time) % 1) - 1) ** 2)
-        along, _ = to_body_coordinates(*canvas.relative_to(x, y), angle + speed * time / radius)
+        along, _ = to_body_coordinates(*canvas.relative_to(x, y), angle + along_floor / radius)
         ball = disc_coverage(*canvas.relative_to(x, y), radius)
         return (0.7 + 0.3 * antialiased_square_wave(along, radius / 2)) * ball, ball, (x, y)
 

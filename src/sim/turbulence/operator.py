@@ -57,7 +57,7 @@ class Turbulence:
             self.fidelity = fidelity = choose_fidelity(atmosphere, width, tolerance)
             strength, unit = fidelity.blur_equivalent_d_over_r0, fidelity.lambda_over_d_px
             size, network = fidelity.psf_size_px, (fidelity.psf_network, fidelity.psf_rank)
-            self.psfs = FittedPSFs(find_psf_band(strength), *network, unit, size)
+            self.psfs = FittedPSFs(find_psf_band(strength), *network, unit, size, strength)
             self.halo = PSFHalo(mean_short_exposure_psf(strength), unit, size)
 
     @property

@@ -16,7 +16,7 @@ from functools import cache, lru_cache
 
 import numpy as np
 from jaxtyping import Float
-from scipy import special
+from scipy import special, stats
 from scipy.interpolate import RegularGridInterpolator
 
 Cn2Profile = tuple[float, ...]  # Cn2 at equally spaced points from the camera to the object
@@ -29,6 +29,7 @@ KAPPA0 = np.concatenate([[0.0], np.geomspace(1e-4, 100, 61)])
 TILT = (2 * special.jv(2, math.pi * KAPPA) / (math.pi * KAPPA)) ** 2
 PISTON = (2 * special.jv(1, math.pi * KAPPA) / (math.pi * KAPPA)) ** 2
 HIGHER = np.where(KAPPA > 1e-3, 1 - PISTON - 4 * TILT, 0)  # of the modes beyond tilt; kappa^4 at 0
+LAYER_WIND_RATIO = 0.5  # rms of a layer's own wind over the wind that all layers share
 NEAREST, FARTHEST = 1e-3, 1e4  # D; the ends of what is tabulated as a length
 LAGS = np.geomspace(NEAREST, FARTHEST, 141)
 BLUR_D_OVER_R0 = np.concatenate([[0.0], np.geomspace(0.05, 40, 60)])
@@ -62,9 +63,10 @@ def tilt_correlation(
 def tilt_decay_distance(
     aperture_over_outer_scale: float, profile: Cn2Profile, *, wind: bool = False
 ) -> float:
-    """Return the distance in D at which the tilt's correlation falls to 1/2, with `wind` to 1 / e.
+    """Return the distance in D at which the tilt's correlation falls to 1/2.
 
-    NEAREST to FARTHEST, which stands for any longer one.
+    With `wind`, to 1 / e: the way of a wind of the rms speed, in the mean over winds that differ
+    from layer to layer (LAYER_WIND_RATIO).  NEAREST to FARTHEST, which stands for any longer one.
     """
     level = math.exp(-1) if wind else 0.5
     correlation = _correlation_over_lags(aperture_over_outer_scale, profile, wind)
@@ -95,7 +97,19 @@ def global_tilt_share(
 def _correlation_over_lags(
     aperture_over_outer_scale: float, profile: Cn2Profile, wind: bool
 ) -> Lags:
-    return tilt_correlation(aperture_over_outer_scale, profile, LAGS, wind=wind)
+    known = tilt_correlation(aperture_over_outer_scale, profile, LAGS, wind=wind)
+    if not wind:
+        return known
+    ways = np.log(LAGS[:, None] * _relative_wind_speeds())
+    return np.interp(ways, np.log(LAGS), known).mean(1)
+
+
+@cache
+def _relative_wind_speeds() -> Float[np.ndarray, " quantiles"]:
+    """Return speeds of a layer's wind, as likely as each other, over the rms speed (Rice's law)."""
+    quantile, spread = (np.arange(32) + 0.5) / 32, LAYER_WIND_RATIO / math.sqrt(2)
+    speeds = stats.rice.ppf(quantile, 1 / spread, scale=spread)
+    return speeds / math.sqrt(1 + LAYER_WIND_RATIO**2)
 
 
 @cache

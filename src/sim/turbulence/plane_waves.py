@@ -23,6 +23,7 @@ from src.sim import noise
 from src.sim.optics import Position, view_id
 from src.sim.turbulence.atmosphere import AR1_FPS, Atmosphere
 from src.sim.turbulence.contract import check_option
+from src.sim.turbulence.outer_scale import LAYER_WIND_RATIO
 from src.sim.turbulence.zernike import SPECTRUM, pupil_filter
 
 LOW, HIGH = 0.08, 0.32  # limits of the three power laws that kappa is drawn from; HIGH per (n + 1)
@@ -30,7 +31,6 @@ DEPTH = 1.0  # waves are drawn with the density Cn2 (1 - z/L)^DEPTH
 SHARES = (0.25, 0.65, 0.10)  # of the waves below LOW, between, above HIGH
 TEMPORAL_MODELS, VIEWS_CORRELATIONS = ("ar1", "frozen_flow", "mixed"), ("independent", "baseline")
 WIND_LAYERS = 4  # of equal integrals of Cn2 (1 - z/L)^DEPTH
-LAYER_WIND_RATIO = 0.5  # rms of a layer's own wind over the wind that all layers share
 
 
 @dataclass(frozen=True)

@@ -151,7 +151,7 @@ def sample_matching_atmosphere(
         i = int(np.where(fits, mismatch, np.inf).argmin())
         length = float(log_uniform(u[i, 3], distance_m, "distance_m"))
         diameter = math.sqrt(wavelength_m * length * aperture[i] / unit[i])
-        # Of the wind, in D, after which the tilt's correlation is 1 / e.
+        # Of the wind, in D, after which the tilt's mean correlation is 1 / e.
         way = outer_scale.tilt_decay_distance(1 / scale[i], shapes[i], wind=True)
         time_s = wanted.tilt_correlation_time_s
         return Atmosphere(

@@ -32,7 +32,7 @@ def pixel_integration_matrix(size: int, fine: int, step: float) -> Float[Tensor,
 class PSFHalo:
     """The light that a point sends beyond its kernel, the same for all points and views.
 
-    The mean PSF (fine, fine) without its `kernel` x `kernel` pixels of
+    The mean PSF (fine, fine), whose light is 1, without its `kernel` x `kernel` pixels of
     lambda / D / `lambda_over_d_px`; `share` of the light of a white scene comes from it.
     """
 
@@ -40,7 +40,7 @@ class PSFHalo:
         widest = int(mean.shape[-1] / SAMPLES_PER_LAMBDA_OVER_D / 2 * lambda_over_d_px)
         reach, step = max(widest, kernel // 2), SAMPLES_PER_LAMBDA_OVER_D / lambda_over_d_px
         grid = pixel_integration_matrix(2 * reach + 1, mean.shape[-1], step).float()
-        self.psf = (grid @ (mean / mean.sum()) @ grid.T).clamp(min=0)
+        self.psf = (grid @ mean @ grid.T).clamp(min=0)
         core = slice(reach - kernel // 2, reach + kernel // 2 + 1)
         self.psf[core, core] = 0
         self.reach, self.share = reach, float(self.psf.sum())

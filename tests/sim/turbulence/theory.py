@@ -18,6 +18,8 @@ from src.sim.turbulence.contract import Crop
 from src.sim.turbulence.engines import blur_torch
 from src.sim.turbulence.operator import Turbulence
 from src.sim.turbulence.p2s import FittedPSFs
+from src.sim.turbulence.psf import SAMPLES_PER_LAMBDA_OVER_D, pixel_integration_matrix
+from src.sim.turbulence.unresolved_blur import blur_by_unresolved_modes
 
 
 def isoplanatic_angle_rad(path: Atmosphere) -> float:
@@ -91,6 +93,23 @@ def compute_fitted_psfs(psfs: FittedPSFs, phase: torch.Tensor, d_over_r0: float)
     return (psfs.basis.flatten(1).T @ weights).clamp(min=0)
 
 
+def exact_psfs_of_all_modes(
+    coefficients: torch.Tensor, turbulence: Turbulence, size: int
+) -> torch.Tensor:
+    """Return exact PSFs (*n, size, size) of Noll 2..modes + 1, blurred by those beyond 120."""
+    fine, fidelity = 79, turbulence.fidelity
+    step = SAMPLES_PER_LAMBDA_OVER_D / fidelity.lambda_over_d_px
+    grid, psfs = pixel_integration_matrix(size, fine, step).float(), []
+    for part in coefficients.flatten(0, -2).split(1000):
+        stored = fraunhofer_psf(
+            part, lambda_over_d_px=SAMPLES_PER_LAMBDA_OVER_D, size=fine, pupil=fine - 3, points=1,
+            normalise_plane=True,
+        )  # fmt: skip
+        blurred = blur_by_unresolved_modes(stored, fidelity.blur_equivalent_d_over_r0, fine)
+        psfs.append(grid @ blurred @ grid.T)
+    return torch.cat(psfs).reshape(*coefficients.shape[:-1], size, size)
+
+
 def degrade_with_exact_psfs(
     turbulence: Turbulence, frame: torch.Tensor, generator: torch.Generator, crop: Crop, size: int
 ) -> torch.Tensor:
@@ -101,7 +120,7 @@ def degrade_with_exact_psfs(
     exact = copy.copy(turbulence)
     exact.fidelity = replace(turbulence.fidelity, psf_grid_pitch_px=1, psf_size_px=size)
     [plan] = exact.plan(1, generator, crop)
-    tables, unit = plan.tables.to(torch.device("cpu")), turbulence.fidelity.lambda_over_d_px
+    tables = plan.tables.to(torch.device("cpu"))
     names = "response", "rows", "columns"
     tilt, phase = (
         WaveSum(*(tables[f"{grid}_{name}"] for name in names), first)(plan.amplitudes)
@@ -111,6 +130,5 @@ def degrade_with_exact_psfs(
     tilt = clip_rendering._interpolate_tilt(plan, tables, tilt)
     warped = blur_torch.warp_cubic(frame[None], tilt, rows.start, columns.start)
     coefficients = functional.pad(phase.permute(1, 2, 3, 0), (2, 0))
-    psfs = fraunhofer_psf(coefficients, lambda_over_d_px=unit, size=size, normalise_plane=True)
-    psfs = psfs.flatten(3).permute(3, 0, 1, 2)
+    psfs = exact_psfs_of_all_modes(coefficients, turbulence, size).flatten(3).permute(3, 0, 1, 2)
     return blur_torch.scatter_normalised(warped, psfs, rows, torch.zeros(1, *crop[2:]), 0.0)[0]
