@@ -15,6 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.runtime import milliseconds
+from src.app.script import positive_number, run_script, whole_number
 from src.deploy.runtime import EventListRuntime, fastest_form
 from src.figures import plots
 from src.models import load
@@ -65,9 +66,9 @@ def main() -> None:
     """Print the lines."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", default=("setnet_small", "setnet_medium"))
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--seconds", type=float, default=1.0)
-    parser.add_argument("--windows", type=int, default=24)
+    parser.add_argument("--threads", type=whole_number, default=2)
+    parser.add_argument("--seconds", type=positive_number, default=1.0)
+    parser.add_argument("--windows", type=whole_number, default=24)
     parser.add_argument("--figure", type=Path, help="a file for the figure, .png or .svg")
     given = parser.parse_args()
     form, measured = fastest_form(), {}
@@ -91,4 +92,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

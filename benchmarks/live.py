@@ -19,6 +19,7 @@ import torch
 
 import src.models
 from benchmarks.recordings import MODEL, SENSOR, events
+from src.app.script import positive_number, run_script, whole_number
 from src.live import GIL_SWITCH_S, assemble_server
 from src.live_view import event_feeds
 from src.live_view.network_runner import RunSettings
@@ -84,11 +85,11 @@ def _resident() -> float:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--fps", type=float, default=600.0)
-    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--fps", type=positive_number, default=600.0)
+    parser.add_argument("--seconds", type=positive_number, default=60.0)
     parser.add_argument("--ckpt", default="setnet_small")
     parser.add_argument("--form", default=None)
-    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--threads", type=whole_number, default=1)
     asked = parser.parse_args()
     torch.set_num_threads(asked.threads)
     views, faults = kaleidoscope_views(list(layout(9)), model=MODEL, sensor=SENSOR), FaultLog()
@@ -127,4 +128,4 @@ def report(asked: argparse.Namespace, found: dict) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

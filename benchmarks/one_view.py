@@ -19,6 +19,7 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from src.app.instantiate import instantiate_node
+from src.app.script import positive_number, run_script, whole_number
 from src.bench.speed import build_grid_step
 from src.deploy import openvino_network
 from src.deploy.cost import torch_threads
@@ -111,8 +112,10 @@ def main() -> None:
     parser.add_argument("names", nargs="*", default=[*OURS, *published])
     parser.add_argument("--sizes", nargs="+", default=SIZES, help="width x height in pixels")
     parser.add_argument("--recording", type=Path, default=RECORDING)
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--seconds", type=float, default=2.0, help="of each size and form")
+    parser.add_argument("--threads", type=whole_number, default=2)
+    parser.add_argument(
+        "--seconds", type=positive_number, default=2.0, help="of each size and form"
+    )
     given = parser.parse_args()
     print("| ms a frame | " + " | ".join(given.sizes) + " |")
     print("|---|" + "---:|" * len(given.sizes))
@@ -124,4 +127,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -14,6 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from benchmarks.training import config
 from scripts.lease.probe import train_on_batch
 from src.app import build
+from src.app.script import run_script
 from src.sim import noise
 
 SMALL = [
@@ -95,4 +96,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from benchmarks.timing import least
+from src.app.script import run_script
 from src.models.e2vid import E2VID
 from src.models.setnet import SetNet
 from src.recordings import event_windows, reconstruction, sensor_lookup
@@ -94,4 +95,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

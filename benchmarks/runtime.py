@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from src.app.script import positive_number, run_script, whole_number
 from src.bench.speed import FORM_DTYPES, build_grid_step, measure_peak_conv_macs_per_s
 from src.deploy.cost import count_macs, macs_per_frame, torch_threads
 from src.deploy.cpu_features import is_bf16_faster
@@ -107,8 +108,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", default=NAMES)
     parser.add_argument("--recording", type=Path, default=RECORDING)
-    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--seconds", type=float, default=4.0)
+    parser.add_argument("--threads", type=whole_number, nargs="+", default=[1, 2])
+    parser.add_argument("--seconds", type=positive_number, default=4.0)
     given = parser.parse_args()
     played = windows(given.recording)
     mean = statistics.mean(len(window[0]) for window in played)
@@ -123,4 +124,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -18,6 +18,7 @@ from torch.nn import functional
 from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.timing import least
+from src.app.script import run_script, whole_number
 from src.recordings.files.event_writers import write_events
 from src.recordings.files.recording import iter_events
 from src.sim.sensor import EventSensor
@@ -160,9 +161,11 @@ def files(repeats: int) -> None:
 def main() -> None:
     """Print everything."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=20)
-    parser.add_argument("--frames", type=int, default=11)
-    parser.add_argument("--batch", type=int, help="time so many clips of different sensors only")
+    parser.add_argument("--repeats", type=whole_number, default=20)
+    parser.add_argument("--frames", type=whole_number, default=11)
+    parser.add_argument(
+        "--batch", type=whole_number, help="time so many clips of different sensors only"
+    )
     parser.add_argument("--device", default="cpu", help="where --batch runs")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -174,4 +177,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -22,6 +22,7 @@ from benchmarks.timing import least
 from scripts.lease.probe import make_up_batch, train_on_batch
 from src.app import build, hardware
 from src.app.compose import compose_config
+from src.app.script import run_script
 from src.sim.pipeline import simulate
 
 BEFORE = ["channels_last=false", "optimizer.fused=false", "ema_decay=null"]
@@ -146,4 +147,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

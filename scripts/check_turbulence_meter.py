@@ -25,6 +25,7 @@ import torch
 from jaxtyping import Float
 from omegaconf import OmegaConf
 
+from src.app.script import run_script
 from src.recordings.calibration import turbulence_meter
 from src.recordings.calibration.tilt_covariance import find_first_fall
 from src.recordings.calibration.turbulence_meter import TurbulenceMeasurement
@@ -284,4 +285,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

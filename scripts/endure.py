@@ -20,6 +20,7 @@ import torch
 
 from src.app import build, entry_point
 from src.app.compose import compose_config
+from src.app.script import run_script
 from src.models.e2vid import E2VID
 from src.recordings import event_windows, output, reconstruction, sensor_lookup
 from src.recordings.files import event_file, event_writers, sources
@@ -154,4 +155,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -22,6 +22,7 @@ from scripts.p2s_errors import (
     symmetrise_psf,
 )
 from scripts.p2s_training import TrainableNetwork
+from src.app.script import run_script
 from src.sim.turbulence.p2s import EDGE_MARGIN, FILE, basis_parities
 
 
@@ -150,8 +151,11 @@ def main() -> None:
     """Read the arguments."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("steps", type=int, nargs="?", default=12_000, help="0: tables only")
-    fit_file(parser.parse_args().steps)
+    steps = parser.parse_args().steps
+    if steps < 0:
+        parser.error(f"steps must be >= 0, got {steps}")
+    fit_file(steps)
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

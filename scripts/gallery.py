@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from scripts.readme import BASELINES, baseline_overrides
 from src.app import build
 from src.app.compose import compose_config
+from src.app.script import run_script
 from src.figures import plots
 from src.metrics.invented_contrast import find_unseen_pixels, invented_contrast
 from src.reconstruct import choose_views, reconstruct_video_frames
@@ -106,4 +107,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from src.app.script import run_script
 from src.figures.plots import MARKERS, save_figure
 from src.metrics.table import METRICS
 
@@ -60,4 +61,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

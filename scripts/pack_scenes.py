@@ -9,7 +9,6 @@ folders `train_only` serves training only.  The format: src/sim/scenes/photo_fil
 
 import argparse
 import json
-import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256
@@ -21,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
+from src.app.script import run_script
 from src.records.atomic import atomic_path
 from src.sim.scenes.clip import SPLITS
 from src.sim.scenes.photo_files import (
@@ -180,12 +180,8 @@ def main() -> None:
     if others := sorted(set(given) - {"side", "mib", "train_only"}):
         parser.error(f"key must be side, mib or train_only, got {others[0]}")
     only = [value for key, value in pairs if key == "train_only"]
-    try:
-        side, mib = _number("side", given["side"], int), _number("mib", given["mib"], float)
-        print(write_pack(places[:-1], Path(places[-1]), side=side, mib=mib, train_only=only))
-    except (ValueError, OSError) as error:
-        print("error: " + " ".join(str(error).split()), file=sys.stderr)
-        sys.exit(2)
+    side, mib = _number("side", given["side"], int), _number("mib", given["mib"], float)
+    print(write_pack(places[:-1], Path(places[-1]), side=side, mib=mib, train_only=only))
 
 
 def _number(key: str, text: str, kind: type) -> int | float:
@@ -196,4 +192,4 @@ def _number(key: str, text: str, kind: type) -> int | float:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

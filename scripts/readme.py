@@ -23,6 +23,7 @@ from src import models
 from src.app import build
 from src.app.compose import compose_config
 from src.app.instantiate import build_part
+from src.app.script import run_script
 from src.bench.candidates import Candidate
 from src.figures import samples
 from src.metrics.bootstrap import bootstrap_interval
@@ -268,4 +269,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -17,6 +17,7 @@ from torch.nn import functional
 from src import models
 from src.app import build
 from src.app.compose import compose_config
+from src.app.script import run_script
 from src.metrics.image import align_brightness
 from src.sim.pipeline import simulate
 
@@ -67,4 +68,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -9,7 +9,6 @@ stage where they are not those of RUN, and a folder --to write to instead of wei
 
 import argparse
 import json
-import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +16,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from scripts.learning_curves import draw_curves, read_curve
+from src.app.script import run_script
 from src.metrics.table import METRICS, Column
 from src.models import files
 from src.models.network import FramePostprocessor
@@ -228,11 +228,8 @@ def main() -> None:
         return
     name = arguments.name or first_config(arguments.run).name
     given = Given(arguments.recipe, arguments.weights, arguments.to)
-    try:
-        print(ship(arguments.run, name, arguments.test, given))
-    except ValueError as error:
-        sys.exit(f"error: {error}")
+    print(ship(arguments.run, name, arguments.test, given))
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -12,6 +12,7 @@ import torch
 from scripts.readme import AIR, HOME, NINE, ONE, load_shipped, reconstruct_clip
 from src.app import build
 from src.app.compose import compose_config
+from src.app.script import run_script
 from src.figures.samples import join_panels, render_events, tile_views
 from src.recordings import simulated_recording
 from src.recordings.output import round_to_uint8
@@ -108,4 +109,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from src.app.script import run_script
 from src.figures.plots import save_figure
 from src.metrics.bootstrap import bootstrap_difference_interval
 from src.records import runs
@@ -108,4 +109,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -16,6 +16,7 @@ from matplotlib.patches import Rectangle
 
 from src.app import build
 from src.app.compose import compose_config
+from src.app.script import run_script
 from src.figures.plots import save_figure
 from src.records import safe_yaml
 from src.sim.turbulence import Atmosphere, sample_atmosphere
@@ -111,4 +112,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -18,7 +18,6 @@ command lines have the word campaign-child.  Ctrl-C and SIGTERM stop all, with c
 
 import argparse
 import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -27,6 +26,7 @@ from scripts.campaign import driver
 from scripts.campaign.recipe import ROOT, names, read
 from scripts.campaign.training import Settings
 from scripts.campaign.work import RecipeWork
+from src.app.script import run_script
 from src.records.results import git_commit
 
 OWN = ("out", "clone", *Settings._fields[1:])
@@ -78,7 +78,7 @@ def run(words: list[str]) -> int:
 
 
 def main() -> None:
-    """Read the command line; turn errors into exit codes."""
+    """Read the command line."""
     parser = argparse.ArgumentParser(
         "python -m scripts.campaign",
         description=__doc__,
@@ -86,14 +86,8 @@ def main() -> None:
     )
     parser.add_argument("words", nargs="*", help="recipes, status and KEY=VALUE, as above")
     words = parser.parse_args().words
-    try:
-        sys.exit(run(words))
-    except ValueError as error:
-        print("error: " + " ".join(str(error).split()), file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(128 + signal.SIGINT)
+    sys.exit(run(words))
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

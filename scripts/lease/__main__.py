@@ -15,10 +15,11 @@ trained, 1: nothing was, 2: the plan does not fit or is none.
 
 import argparse
 import math
-import signal
 import sys
 import time
 from pathlib import Path
+
+from src.app.script import run_script
 
 START = time.monotonic()  # before the imports below, which take seconds
 DEFAULT_OUT, MAX_FOLDER_MIB = "out/lease", 60
@@ -26,17 +27,8 @@ OPTIONS = {"join": (2, {"to"}), "folder": (3, {"scenes", "lpips"}), "check": (2,
 
 
 def main() -> None:
-    """Turn errors into exit codes."""
-    try:
-        sys.exit(run_command(*parse(sys.argv[1:])))
-    except ValueError as error:
-        print("error: " + " ".join(str(error).split()), file=sys.stderr)
-        sys.exit(2)
-    except OSError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(1)
-    except KeyboardInterrupt:  # before a training, which exports and ends
-        sys.exit(128 + signal.SIGINT)
+    """Do what the command line says and exit with its code."""
+    sys.exit(run_command(*parse(sys.argv[1:])))
 
 
 def run_command(words: list[str], options: dict[str, str], minutes: float) -> int:
@@ -87,4 +79,4 @@ def parse(given: list[str]) -> tuple[list[str], dict[str, str], float]:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)
