@@ -101,6 +101,7 @@ def find_contrast_threshold(cfg: DictConfig, run: Path) -> dict[str, tuple]:
     lookup = sensor_lookup.build_lookup(views_or_whole_sensor(cfg.views, size))
     events = open_recording(cfg.recording, size[::-1], options)
     measured = contrast_threshold.measure_event_rates(events, lookup.view)
+    contrast_threshold.require_both_polarities(measured)
     drawn = [pipeline.draw(index) for index in range(cfg.clips)]
     clips = [pipeline.render_views([one])[0] for one in track(drawn, "simulated clips")]
     estimate = contrast_threshold.estimate_contrast_threshold(

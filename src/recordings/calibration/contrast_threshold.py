@@ -2,10 +2,11 @@
 
 The simulator's rate over a grid of thresholds is inverted at the recording's rate.  This supposes
 that simulated and real scene agree in texture, speed and turbulence: a rate that is wrong by 10 %
-moves C by 4 to 10 %, and light taken for code values moves it nearly threefold.  Rates are events
+moves C by 4 to 10 %, and code values taken for light move it nearly threefold.  Rates are events
 per pixel of the sensor, not of the warped view, per second, ON and OFF apart.
 """
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -105,19 +106,49 @@ def find_hot_pixels(totals: Int[np.ndarray, "h w"], view: Int[np.ndarray, "h w"]
     return (view >= 0) & (totals > HOT_FACTOR * (median_filter(totals, 3) + mean) + HOT_EVENTS)
 
 
+def require_both_polarities(rates: EventRates) -> None:
+    """Raise ValueError for a recording without ON or without OFF events outside hot pixels."""
+    on, off = rates.events.sum((0, 1)).tolist()
+    if not on or not off:
+        raise ValueError(f"recording must have ON and OFF events, got {on} ON and {off} OFF")
+
+
 @dataclass(frozen=True)
 class RateCurve:
-    """Simulated rates (thresholds, 2), ON and OFF in events / pixel / s, over the ON threshold."""
+    """Simulated rates of each clip (clips, thresholds, 2), ON and OFF in events / pixel / s, over
+    the ON threshold."""
 
     thresholds: Float[np.ndarray, " k"]
-    rates: Float[np.ndarray, "k 2"]
+    clip_rates: Float[np.ndarray, "clips k 2"]
     off_ratio: float
+
+    @property
+    def rates(self) -> Float[np.ndarray, "k 2"]:
+        return self.clip_rates.mean(0)
+
+    def draw_scene_factors(self, on: float, draws: int) -> Float[np.ndarray, "draws 2"]:
+        """Return ON and OFF rate of one scene over the mean of the clips, both drawn at random.
+
+        A bootstrap at the ON threshold `on`: the recording is taken for one more scene like the
+        clips.  1 where there is one clip.
+        """
+        count = len(self.clip_rates)
+        at = [
+            [np.interp(np.log(on), np.log(self.thresholds), one) for one in clip.T]
+            for clip in self.clip_rates
+        ]
+        rates = np.maximum(at, 1e-12 * np.max(at) + 1e-300)
+        picks = np.random.default_rng(1).integers(count, size=(draws, count + 1))
+        spread = math.sqrt(count / max(count - 1, 1))  # a mean of few is nearer to each of them
+        scene = np.exp(spread * np.log(rates[picks[:, 0]] / rates.mean(0)))
+        return scene * rates.mean(0) / rates[picks[:, 1:]].mean(1)
 
 
 @dataclass(frozen=True)
 class ThresholdEstimate:
-    """`on` and `off` thresholds: (value, low, high), the last two a 95 % bootstrap CI; the measured
-    `rates` (ON, OFF) with their `interval` (low and high, ON and OFF)."""
+    """`on` and `off` thresholds: (value, low, high), the last two a 95 % bootstrap CI over time and
+    scenes; the measured `rates` (ON, OFF) with their `interval` over time (low and high, ON and
+    OFF)."""
 
     on: tuple[float, float, float]
     off: tuple[float, float, float]
@@ -132,19 +163,21 @@ def simulate_event_rates(
 ) -> RateCurve:  # fmt: skip
     """Return the rates of a sensor that sees `clips`, at all thresholds with the same noise.
 
-    Its own `threshold` and `off_ratio` are not used.  Raises ValueError for another sensor.
+    Its own `threshold` and `off_ratio` are not used, and none of its pixels is hot: those of a
+    recording are left out.  Raises ValueError for another sensor.
     """
     if not isinstance(sensor, EventSensor):
         raise ValueError(f"sensor must be an EventSensor, got {type(sensor).__name__}")
     grid = torch.tensor(thresholds, dtype=torch.float32)
-    sensors = [replace(sensor, threshold=c, off_ratio=off_ratio) for c in thresholds]
-    events, exposure = torch.zeros(len(grid), 2, dtype=torch.float64), 0.0
+    cool = replace(sensor, off_ratio=off_ratio, hot_pixel_fraction=0.0)
+    sensors = [replace(cool, threshold=c) for c in thresholds]
+    rates = []
     for index, frames in enumerate(clips):
         views, count, h, w = frames.shape
         counts = [one.counts(frames[None], fps, clips=[index])[0] for one in sensors]
-        events += torch.stack(counts).sum(1)
-        exposure += views * h * w * (count - 1) / fps
-    return RateCurve(grid.double().numpy(), (events / exposure).numpy(), off_ratio)
+        exposure = views * h * w * (count - 1) / fps
+        rates.append((torch.stack(counts).sum(1).double() / exposure).numpy())
+    return RateCurve(grid.double().numpy(), np.stack(rates), off_ratio)
 
 
 def estimate_contrast_threshold(
@@ -155,20 +188,20 @@ def estimate_contrast_threshold(
     """Return the thresholds at which the sensor makes the recording's rates.
 
     The geometric mean of ON and OFF rate gives their size; the quotient gives the ratio of OFF to
-    ON, as what rises has to fall.  `progress(clips, name)` yields the clips of each of the ROUNDS,
-    as rich.progress.track does.  Raises ValueError for a rate that the grid does not make, and for
-    a quotient of rates that no ratio in OFF_RATIOS makes.
+    ON, as what rises has to fall.  Intervals end where the grid does.  `progress(clips, name)`
+    yields the clips of each of the ROUNDS, as rich.progress.track does.  Raises ValueError for a
+    rate that the grid does not make, and for a quotient of rates that no ratio in OFF_RATIOS makes.
     """
+    require_both_polarities(rates)
     measured, drawn = rates.pooled, np.maximum(rates.bootstrap_pooled_rates(), 1e-12)
-    if not (measured > 0).all():
-        raise ValueError(f"the recording's rates above the background are not positive: {measured}")
     best, other = _find_off_ratio(measured, clips, fps, sensor, thresholds, progress)
     moved = other.log_ratio - best.log_ratio
     gain = float(np.clip((other.excess - best.excess) / moved, *GAINS))
     on_gain = np.log(other.on / best.on) / moved
 
-    pairs = np.concatenate([measured[None], drawn])
-    ons = find_on_threshold(best.curve, pairs)
+    scenes = best.curve.draw_scene_factors(best.on, len(drawn))
+    pairs = np.concatenate([measured[None], drawn * scenes])
+    ons = find_on_threshold(best.curve, pairs, at_ends=True)
     steps = -_log_excess_quotient(best.curve, ons, pairs) / gain
     ons = ons * np.exp(on_gain * steps)
     offs = ons * best.curve.off_ratio * np.exp(steps)
@@ -240,17 +273,19 @@ def _find_off_ratio(
 
 
 def find_on_threshold(
-    curve: RateCurve, rates: Float[np.ndarray, "*draws 2"]
+    curve: RateCurve, rates: Float[np.ndarray, "*draws 2"], *, at_ends: bool = False
 ) -> Float[np.ndarray, "*draws"]:
-    """Return the ON threshold with the geometric mean of `rates`, nan where the grid ends.
+    """Return the ON threshold with the geometric mean of `rates`.
 
-    Linear in log rate over log threshold, the simulated rates made monotone first.
+    Beyond the grid it is nan, with `at_ends` the end of the grid.  Linear in log rate over log
+    threshold, the simulated rates made monotone first.
     """
     mean = np.sqrt(np.maximum(np.prod(curve.rates, axis=1), 1e-30))
     falling = np.minimum.accumulate(np.log(mean))
     target = 0.5 * np.log(np.prod(rates, axis=-1))
     thresholds = np.log(curve.thresholds)[::-1]
-    return np.asarray(np.exp(np.interp(target, falling[::-1], thresholds, np.nan, np.nan)))
+    ends = (None, None) if at_ends else (np.nan, np.nan)
+    return np.asarray(np.exp(np.interp(target, falling[::-1], thresholds, *ends)))
 
 
 def _log_excess_quotient(curve: RateCurve, on: np.ndarray | float, rates: np.ndarray) -> np.ndarray:

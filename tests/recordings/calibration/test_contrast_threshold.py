@@ -137,6 +137,41 @@ def test_the_bootstrap_has_the_spread_of_a_poisson_process():
     assert np.abs(spread * np.sqrt(4000 * 50) - 1).max() < 0.3
 
 
+def test_the_interval_holds_the_draw_of_the_scene():
+    """Scenes of one kind, whose contrast differs threefold: the recording shows one of them."""
+    contrasts = np.random.default_rng(0).uniform(0.4, 1.2, 16)
+    scenes = [0.45 + c * (scene(seed) - 0.45) for seed, c in enumerate(contrasts)]
+    view, held, apart = np.zeros((48, 48), np.int64), 0, 0
+    for index in range(8):
+        pieces = recorded(EventSensor(0.2), [scenes[index]])
+        measured = contrast_threshold.measure_event_rates(pieces, view, slices=40)
+        found = contrast_threshold.estimate_contrast_threshold(
+            measured, scenes[8:], FPS, EventSensor(), GRID
+        )
+        held += found.on[1] < 0.2 < found.on[2]
+        apart += abs(np.log(found.on[0] / 0.2)) > 0.1
+    assert apart >= 3
+    assert held >= 7
+
+
+def test_hot_pixels_are_not_simulated():
+    clips = [scene(0)]
+    hot = EventSensor(hot_pixel_fraction=0.05, hot_pixel_hz=100.0)
+    rates = [
+        contrast_threshold.simulate_event_rates(clips, FPS, sensor, GRID).rates
+        for sensor in (hot, EventSensor())
+    ]
+    assert np.allclose(*rates, rtol=1e-6)
+
+
+def test_a_recording_of_one_polarity_is_named():
+    [events] = recorded(EventSensor(0.2), [scene(0)])
+    rising = events[events["p"] > 0]
+    measured = contrast_threshold.measure_event_rates([rising], np.zeros((48, 48), np.int64))
+    with pytest.raises(ValueError, match="must have ON and OFF events, got .* ON and 0 OFF"):
+        contrast_threshold.require_both_polarities(measured)
+
+
 def test_a_rate_that_no_threshold_makes_is_named():
     recording = recorded(EventSensor(0.2), [scene(0)])
     measured = contrast_threshold.measure_event_rates(
