@@ -17,7 +17,9 @@ from src.recordings.views import HeightWidth
 from src.sim.scenes.video_files import PICTURE_SUFFIXES
 
 WINDOWS = 16
+LINES = 160  # at least so many along the longer side of pictures that are shrunk
 FIRST_WINDOW_US = 5000
+MIN_CONTRAST = 0.05  # of the window with the largest; windows of noise have less
 Pictures = Float[np.ndarray, "windows kinds h w"]
 
 
@@ -75,6 +77,31 @@ def band_pass_log(
         )
         bands.append(fine - coarse)
     return np.stack(bands)
+
+
+def find_coarse_structure(
+    pictures: Float[np.ndarray, "*windows h w"],
+) -> tuple[Float[np.ndarray, "n small_h small_w"], int]:
+    """Return the edges of pictures shrunk to LINES or more, and the factor in pixels."""
+    factor = max(1, max(pictures.shape[-2:]) // LINES)
+    return band_pass_log(shrink_pictures(pictures, factor), 1.2, 2.5), factor
+
+
+def keep_windows_with_motion(pictures: Pictures) -> Float[np.ndarray, "kept kinds h w"]:
+    """Return the windows whose contrast is MIN_CONTRAST or more of the largest; all if none has.
+
+    Its square is the product of two pictures of every second pixel each: both show the scene, and
+    noise, which differs from pixel to pixel, cancels.
+    """
+    y, x = np.indices(pictures.shape[-2:])
+    every_second = ((y + x) % 2).astype(np.float32)
+    one, other = (
+        find_coarse_structure(pictures * kept)[0].reshape(len(pictures), -1)
+        for kept in (every_second, 1 - every_second)
+    )
+    square = (one * other).mean(1)
+    kept = square >= MIN_CONTRAST**2 * square.max()
+    return pictures[kept] if kept.any() else pictures
 
 
 def _average_film(frames: Iterator[np.ndarray]) -> Pictures:

@@ -12,7 +12,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from src.recordings.calibration.activity_pictures import Pictures
+from src.recordings.calibration.activity_pictures import Pictures, keep_windows_with_motion
 from src.recordings.calibration.boards import Points
 from src.recordings.calibration.scene_matches import PatchMatcher, ViewMatches
 from src.recordings.calibration.view_alignment import AlignedViews, Rectangle, cut_field
@@ -50,7 +50,7 @@ class SceneTarget:
 class SceneAlignment:
     """`aligned`: the views, and their points within SceneTarget's `error_px`.  `matched`: these
     points' share of the places with structure.  `held_out_px`: the median distance at places of
-    every second window from a fit to the others; empty for a recording of one window."""
+    every second window from a fit to the others; empty where one window alone shows motion."""
 
     aligned: AlignedViews
     matched: Mapping[Position, float]
@@ -78,6 +78,7 @@ def align_views_by_scene(
     Raises ValueError where no views repeat, the centre one shows too little or another does not
     match it.
     """
+    pictures = keep_windows_with_motion(pictures)
     grid = find_grid(pictures)
     held_out = _hold_out(pictures, grid) if len(pictures) > 1 else {}
     fitted, fine = _find_views(pictures, grid)

@@ -11,10 +11,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from src.recordings.calibration.activity_pictures import band_pass_log, shrink_pictures
+from src.recordings.calibration.activity_pictures import find_coarse_structure
 from src.sim.optics import Position
 
-LINES = 160  # at least so many along the longer side of the pictures that are folded
 MIN_SCORE = 0.2  # of the energy that neighbours share; other scenes have 0.1 at most
 MIN_LIKENESS = 0.2  # of a view and its neighbour, 1 for equal ones
 MIN_PITCH, MAX_VIEWS = 24, 10  # px, and along an axis
@@ -85,15 +84,16 @@ def find_grid(pictures: Float[np.ndarray, "*windows h w"]) -> ViewGrid:
 
     Raises ValueError where neither columns nor rows of views repeat.
     """
-    step = max(1, max(pictures.shape[-2:]) // LINES)
-    small = _level(band_pass_log(shrink_pictures(pictures, step), 1.2, 2.5))
+    structure, step = find_coarse_structure(pictures)
+    small = _level(structure)
     x = find_axis(np.einsum("kyx,kyz->xz", small, small, optimize=True))
     y = find_axis(np.einsum("kyx,kzx->yz", small, small, optimize=True))
     if x.count == 1 and y.count == 1:
         best = f"{max(x.score, y.score):.2f}"
         raise ValueError(
             f"recording must show mirrored views side by side: neighbours share {best} of what"
-            f" they show, {MIN_SCORE} is needed; record more motion, or use a board (target=)"
+            f" they show, {MIN_SCORE} is needed; record more motion, as windows without any do not"
+            " help, or use a board (target=)"
         )
     if y.count == 1:
         y = _one_view(small, x, y.score)

@@ -90,6 +90,26 @@ def test_leak_leaves_the_views_in_place(tmp_path):
     assert max(found.held_out_px.values()) < 0.5
 
 
+@pytest.mark.parametrize("window", [0, 9])
+def test_a_short_pass_in_a_long_recording_with_noise(tmp_path, window):
+    truth = record(tmp_path / "a.raw", layout(3), [moving_scene()], key=3)
+    short_pass = activity_pictures.read_activity_pictures(tmp_path / "a.raw").sum(0)
+    noise = np.random.default_rng(0).poisson(0.002, (16, *short_pass.shape))  # in 80 ms, 0.05 Hz
+    pictures = noise.astype(np.float32)
+    pictures[window] += short_pass
+    assert len(activity_pictures.keep_windows_with_motion(pictures)) == 1
+    found = align_views_by_scene(pictures, SceneTarget(), (88, 88))
+    assert found.aligned.views.positions == list(layout(3)) and not found.held_out_px
+    assert max(distance_px(found.aligned.views, truth).values()) < 0.3
+
+
+def test_windows_of_noise_alone_are_refused():
+    noise = np.random.default_rng(0).poisson(0.01, (4, 2, 180, 320)).astype(np.float32)
+    assert len(activity_pictures.keep_windows_with_motion(np.zeros_like(noise))) == 4
+    with pytest.raises(ValueError, match="as windows without any do not help"):
+        align_views_by_scene(noise, SceneTarget(), (88, 88))
+
+
 def test_mirrors_off_the_right_angle_give_corner_views_in_halves(tmp_path):
     path = tmp_path / "scene.raw"
     truth = record(path, layout(9), [moving_scene()], key=9, angle_rad=0.03)
