@@ -60,7 +60,7 @@ def _find_views_of_board(cfg: DictConfig, run: Path, target: Target) -> Views:
     picture = view_alignment.repair_picture(seen)
     sizes = {"sensor": picture.shape, "model": tuple(cfg.resolution)}
     if cfg.corners:
-        corners = view_alignment.read_corners(cfg.corners)
+        corners = view_alignment.read_corners(cfg.corners, cfg.mirrors)
         views = view_alignment.views_from_corners(corners, **sizes)
         calibration_figures.draw_views(picture, views, run / "views.png")
         return views

@@ -4,17 +4,18 @@ The targets are found anywhere on the sensor, sorted into a grid, un-mirrored an
 the centre view.  Points are (x, y) in sensor pixels, float64.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import yaml
 from jaxtyping import Float, UInt8
-from scipy.spatial import cKDTree
 
 from src.recordings.calibration.boards import Points, Target, cluster_points
+from src.recordings.calibration.view_numbering import number_views
 from src.recordings.views import HeightWidth, View, Views
 from src.records import safe_yaml
 from src.sim.optics import Position
@@ -43,22 +44,49 @@ def find_target(
     """Return the points of `target` in each view of a sensor picture in which it is found, row by
     row, NaN where one is not seen.  `are_mirrored`: the view at (row, col) is mirrored in x for odd
     col and in y for odd row; a target that knows its hand (ChArUco) decides itself.
+
+    Raises ValueError where two targets have one position.
     """
     clusters = cluster_points(target.detect_candidate_points(picture), target.candidate_count)
-    places = _sort_into_grid(np.array([cluster.mean(0) for cluster in clusters]), picture.shape)
-    points, mirrored = {}, {}
-    for position, cluster in zip(places, clusters, strict=True):
+    clusters = [cluster for cluster in clusters if _shows_target(picture, cluster, target)]
+    points: dict[Position, Points] = {}
+    mirrored: dict[Position, tuple[bool, bool]] = {}
+    positions = number_views(clusters, picture.shape)
+    for position, cluster in zip(positions, clusters, strict=True):
         row, col = position
         physical = (bool(are_mirrored and col % 2), bool(are_mirrored and row % 2))
         for flip in FLIPS if target.ordered else (physical,):
             seen = _find_flipped(picture, cluster, target, flip)
             if seen is not None:
-                points[position], mirrored[position] = seen, flip
+                known = points.get(position)
+                points[position] = seen if known is None else _choose_fuller(position, known, seen)
+                mirrored[position] = flip
                 break
     if (0, 0) in points and not target.ordered:
         model = points[0, 0].reshape(*target.shape, 2)
         points = {at: _reorder_like(model, seen, mirrored[at]) for at, seen in points.items()}
     return points
+
+
+def _shows_target(picture: np.ndarray, cluster: Points, target: Target) -> bool:
+    """Return whether `target` is found around `cluster`, mirrored or not."""
+    return any(_find_flipped(picture, cluster, target, flip) is not None for flip in FLIPS)
+
+
+def _choose_fuller(position: Position, one: Points, other: Points) -> Points:
+    """Return of one target found twice the points of which more are seen.
+
+    Raises ValueError for two targets.
+    """
+    places = [np.nanmean(points, axis=0) for points in (one, other)]
+    size = np.nanmax(one, axis=0) - np.nanmin(one, axis=0)
+    if (np.abs(places[1] - places[0]) >= size).any():
+        there = " and ".join(f"({x:.0f}, {y:.0f})" for x, y in places)
+        raise ValueError(
+            f"calibrate: view {position} must show one target, got two at pixels (x, y) {there};"
+            " rows and columns of views must lie along those of the sensor"
+        )
+    return max(one, other, key=lambda points: np.isfinite(points).sum())
 
 
 def _find_flipped(picture: np.ndarray, cluster: Points, target: Target, flip) -> Points | None:
@@ -74,17 +102,6 @@ def _find_flipped(picture: np.ndarray, cluster: Points, target: Target, flip) ->
         return None
     last = np.array(crop.shape[::-1]) - 1
     return np.where(flip, last - points, points) + np.array([left, top])
-
-
-def _sort_into_grid(centres: np.ndarray, sensor: HeightWidth) -> list[Position]:
-    """Sort centres (k, 2) into (row, col) about the middle of a full 3x3, else of the sensor."""
-    if len(centres) < 2:
-        return [(0, 0)] * len(centres)
-    pitch = np.median(cKDTree(centres).query(centres, k=2)[0][:, 1])
-    middle = (centres.max(0) + centres.min(0)) / 2
-    whole = np.abs(np.ptp(centres, axis=0) - 2 * pitch) < 0.5 * pitch
-    middle = np.where(whole, middle, (np.array(sensor[::-1]) - 1) / 2)
-    return [(int(row), int(col)) for col, row in np.round((centres - middle) / pitch)]
 
 
 def _reorder_like(model: np.ndarray, seen: Points, mirrored: tuple[bool, bool]) -> Points:
@@ -155,16 +172,18 @@ def _between_boards(found: Mapping[Position, Points]) -> Rectangle:
             edges[side] = np.nanmean((centre + found[at]) / 2, axis=0)[side % 2]
     if np.isnan(edges).all():
         raise ValueError("calibrate: the target must be seen beside the centre view, got none")
-    reach = np.nanmedian(np.abs(edges - middle))
+    edges = np.where(np.isnan(edges), 2 * middle - np.roll(edges, 2), edges)
+    reach = np.nanmedian(np.abs(edges - middle))  # where views have one row or column
     edges = np.where(np.isnan(edges), middle + reach * np.array([-1, -1, 1, 1]), edges)
     left, top, right, bottom = edges.tolist()
     return left, top, right, bottom
 
 
-def cut_field(tile: Rectangle, model: HeightWidth) -> Rectangle:
-    """Return the largest rectangle of the model's aspect in the middle of `tile`, less MARGIN."""
+def cut_field(tile: Rectangle, model: HeightWidth, margin: float = MARGIN) -> Rectangle:
+    """Return the largest rectangle of the model's aspect in the middle of `tile`, less `margin` of
+    its side at each edge."""
     left, top, right, bottom = tile
-    scale = min((right - left) / model[1], (bottom - top) / model[0]) * (1 - 2 * MARGIN) / 2
+    scale = min((right - left) / model[1], (bottom - top) / model[0]) * (1 - 2 * margin) / 2
     x, y = (left + right) / 2, (top + bottom) / 2
     across, along = scale * model[1], scale * model[0]
     return x - across, y - along, x + across, y + along
@@ -175,8 +194,8 @@ def views_from_corners(
 ) -> Views:
     """Return the views whose four corners, those of one rectangle of the scene, are given.
 
-    The field is the bounding rectangle of the centre view's.  Raises ValueError without the centre
-    view, or for other than four finite corners.
+    The field is the bounding rectangle of the centre view's, cut to the model's aspect.  Raises
+    ValueError without the centre view, or for other than four finite corners.
     """
     for at, quad in corners.items():
         if np.shape(quad) != (4, 2) or not np.isfinite(quad).all():
@@ -190,21 +209,63 @@ def views_from_corners(
         for at in sorted(corners)
     ]
     field = (*centre.min(0).tolist(), *centre.max(0).tolist())
-    return Views(sensor, model, field, tuple(views))
+    return Views(sensor, model, cut_field(field, model, margin=0.0), tuple(views))
 
 
-def read_corners(path: Path | str) -> dict[Position, Points]:
+def read_corners(path: Path | str, are_mirrored: bool = True) -> dict[Position, Points]:
     """Read corners given by hand: a YAML list of {position: [row, col], corners: four [x, y]}.
 
-    Raises ValueError for anything else.
+    Raises ValueError for anything else: a position that comes twice, corners that are not those of
+    a convex quadrilateral one after the other, or, with `are_mirrored`, of the wrong hand.
     """
-    found = {}
     try:
-        for entry in safe_yaml.read(path):
-            row, column = map(int, entry["position"])
-            corners = [(float(x), float(y)) for x, y in entry["corners"]]
-            found[row, column] = np.array(corners).reshape(-1, 2)
+        entries = [
+            (entry["position"], np.array([(float(x), float(y)) for x, y in entry["corners"]]))
+            for entry in safe_yaml.read(path)
+        ]
     except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, OverflowError) as error:
         got = f"{path}: {type(error).__name__} {error}"
         raise ValueError(f"corners must be a list of position and corners, got {got}") from None
+    try:
+        corners = _collect_corners(entries)
+        if are_mirrored:
+            _check_hands(corners)
+    except ValueError as error:
+        raise ValueError(f"corners={path}: {error}") from None
+    return corners
+
+
+def _collect_corners(entries: Sequence[tuple[Any, np.ndarray]]) -> dict[Position, Points]:
+    found: dict[Position, Points] = {}
+    for at, quad in entries:
+        is_pair = isinstance(at, list) and len(at) == 2
+        if not is_pair or any(type(number) is not int for number in at):
+            raise ValueError(f"position must be two whole numbers, [row, col], got {at}")
+        if (position := (at[0], at[1])) in found:
+            raise ValueError(f"view {position} must be there once, got it twice")
+        if _find_turn(quad) == 0:
+            needed = "four corners of a convex quadrilateral, one after the other"
+            raise ValueError(f"view {position} must have {needed}, got {quad.tolist()}")
+        found[position] = quad
     return found
+
+
+def _check_hands(corners: Mapping[Position, Points]) -> None:
+    """Raise ValueError for a view that is not mirrored against the centre one as its position is:
+    once for an odd sum of row and column."""
+    for position, quad in corners.items():
+        is_odd, centre = sum(position) % 2 == 1, corners.get((0, 0))
+        if centre is not None and (_find_turn(quad) != _find_turn(centre)) != is_odd:
+            needed = "mirrored in one axis" if is_odd else "mirrored in both axes or in none"
+            got = f"corners that are {'not' if is_odd else 'mirrored in one'}, {quad.tolist()}"
+            raise ValueError(f"view {position} must be {needed} with mirrors=true, got {got}")
+
+
+def _find_turn(quad: Float[np.ndarray, "..."]) -> int:
+    """Return 1 or -1, the way in which corners of a convex quadrilateral turn, or 0 for others."""
+    if quad.shape != (4, 2) or not np.isfinite(quad).all():
+        return 0
+    edges = np.roll(quad, -1, axis=0) - quad
+    following = np.roll(edges, -1, axis=0)
+    turns = np.sign(edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0])
+    return int(turns[0]) if (turns == turns[0]).all() else 0
