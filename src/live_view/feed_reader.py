@@ -139,7 +139,7 @@ class FeedReader:
                     if self.noise_filter:
                         self.noise_filter.reset()
                     continue
-                kept = self.noise_filter(events) if self.noise_filter else events
+                kept = self._filter_noise(events)
                 self.meters.add_busy_time("decode", time.thread_time() - start)
                 if kept.size:
                     self._offer((kept, arrival_s), stopped)
@@ -148,6 +148,11 @@ class FeedReader:
             self.faults.report("file", str(error), until_cleared=True)
             end = "broken"
         self._offer(end, stopped)
+
+    def _filter_noise(self, events: np.ndarray) -> np.ndarray:
+        if self.noise_filter is None:
+            return events
+        return self.noise_filter(self.cutter.drop_off_sensor(events))
 
     def _offer(self, chunk: tuple[np.ndarray, float] | str, stopped: threading.Event) -> None:
         """Queue a chunk or the last state; a live stream loses its oldest chunk, a file waits."""

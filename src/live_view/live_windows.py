@@ -66,7 +66,7 @@ class WindowCutter:
     def add(self, events: np.ndarray) -> bool:
         """Take a chunk, less events off the sensor; return whether the clock restarted, as after a
         jump back in time."""
-        events = self._on_sensor(events)
+        events = self.drop_off_sensor(events)
         order = self.order
         part, last_us, before = order.parts[-1], order.last_us, (order.late, order.dropped)
         order.add(events)
@@ -106,7 +106,8 @@ class WindowCutter:
             yield EventWindow(end - self.period_us, end, part, starts_scene=starts_scene)
             starts_scene, start = False, stop
 
-    def _on_sensor(self, events: np.ndarray) -> np.ndarray:
+    def drop_off_sensor(self, events: np.ndarray) -> np.ndarray:
+        """Return the events on the sensor; reports how many are not."""
         height, width = self.sensor
         if not events.size or (events["x"].max() < width and events["y"].max() < height):
             return events

@@ -31,11 +31,18 @@ class NoiseFilter:
         self.latest_us.fill(LONG_AGO_US)
 
     def __call__(self, events: np.ndarray) -> np.ndarray:
-        """Return those of `events` (t x y p), in order of time, that are kept."""
+        """Return those of `events` (t x y p), in order of time, that are kept.
+
+        Raises ValueError for an event off the sensor.
+        """
         kept = np.empty(len(events), bool)
-        mark_supported_events(
+        wrong = mark_supported_events(
             events["t"], events["x"], events["y"], self.latest_us, self.support_us, kept
         )
+        if wrong >= 0:
+            height, width = (side - 2 for side in self.latest_us.shape)
+            place = f"x={events['x'][wrong]}, y={events['y'][wrong]}"
+            raise ValueError(f"events must be on the {width}x{height} sensor, got {place}")
         return events[kept]
 
 

@@ -7,7 +7,8 @@ import pytest
 
 from baselines.highpass import HighPass
 from src.live import assemble_server
-from src.live_view.event_feeds import FileFeed
+from src.live_view.event_feeds import Chunks, Feed, FileFeed
+from src.live_view.feed_reader import FeedReader
 from src.live_view.network_runner import RunSettings
 from src.live_view.status import FaultLog
 from src.recordings.files.event_file import EVENT
@@ -60,15 +61,45 @@ def test_a_wrong_time_names_its_key(seconds):
         NoiseFilter((8, 8), seconds)
 
 
-def test_a_live_feed_is_filtered(tmp_path):
-    path, views = tmp_path / "few.csv", Views.single_view((8, 8), (8, 8))
-    write_events(path, events((0, 3, 3), (1000, 4, 4), (20_000, 0, 0)), width=8, height=8)
-    settings = RunSettings(100.0, form="float32")
+@pytest.mark.parametrize(("x", "y"), [(8, 3), (3, 6), (65_535, 65_535)])
+def test_an_event_off_the_sensor_is_refused_and_nothing_written(x, y):
+    with pytest.raises(ValueError, match=f"must be on the 8x6 sensor, got x={x}, y={y}"):
+        NoiseFilter((6, 8), 0.005)(events((0, 7, 5), (10, x, y)))
+
+
+def filtered_reader(feed: Feed, faults: FaultLog) -> FeedReader:
+    """Return the reader of a page whose feed is filtered, on a sensor of 8x8."""
     server = assemble_server(
-        FileFeed(str(path), (8, 8), loop=False), {"net": HighPass()}, views, settings, FaultLog(),
-        noise_filter_s=0.005,
+        feed, {"net": HighPass()}, Views.single_view((8, 8), (8, 8)),
+        RunSettings(100.0, form="float32"), faults, noise_filter_s=0.005,
     )  # fmt: skip
-    reader = server.page.player.reader
+    return server.page.player.reader
+
+
+class OnePacket(Feed):
+    """Sends one chunk of events, live."""
+
+    def __init__(self, packet: np.ndarray):
+        self.sensor, self.packet = (8, 8), packet
+
+    def iter_event_chunks(self, stopped: threading.Event) -> Chunks:
+        yield self.packet, 0.0
+
+
+def test_events_of_a_live_feed_off_the_sensor_are_counted_and_not_filtered():
+    faults = FaultLog()
+    packet = events((0, 3, 3), (500, 60_000, 60_000), (1000, 4, 4), (1100, 4, 8))
+    reader = filtered_reader(OnePacket(packet), faults)
+    reader.decode(threading.Event())
+    kept, _ = reader.chunks.get_nowait()
+    assert kept["t"].tolist() == [1000]
+    assert faults.current() == ["events up to 60001x60001 are off the 8x8 sensor (2 events)"]
+
+
+def test_a_live_feed_is_filtered(tmp_path):
+    path = tmp_path / "few.csv"
+    write_events(path, events((0, 3, 3), (1000, 4, 4), (20_000, 0, 0)), width=8, height=8)
+    reader = filtered_reader(FileFeed(str(path), (8, 8), loop=False), FaultLog())
     reader.decode(threading.Event())
     kept, _ = reader.chunks.get_nowait()
     assert kept["t"].tolist() == [1000] and reader.chunks.get_nowait() == "ended"

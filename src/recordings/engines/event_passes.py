@@ -97,9 +97,15 @@ def label_kept_or_dropped(t, first, latest, count, buffer_us, min_part_events, a
 
 @njit(nogil=True, cache=True)
 def mark_supported_events(t, x, y, latest_us, support_us, kept):
-    """Write to `kept` which events are supported, and their times to `latest_us` (h + 2, w + 2)."""
+    """Write to `kept` which events are supported, and their times to `latest_us` (h + 2, w + 2).
+
+    Return the place of the first event off the sensor, from which on nothing is done; -1 for none.
+    """
+    height, width = latest_us.shape[0] - 2, latest_us.shape[1] - 2
     for i in range(t.size):
-        row, column = y[i] + 1, x[i] + 1
+        row, column = np.int64(y[i]) + 1, np.int64(x[i]) + 1
+        if not (0 < row <= height and 0 < column <= width):
+            return i
         own = latest_us[row, column]
         latest_us[row, column] = LONG_AGO_US
         newest = LONG_AGO_US
@@ -108,3 +114,4 @@ def mark_supported_events(t, x, y, latest_us, support_us, kept):
                 newest = max(newest, latest_us[r, c])
         kept[i] = t[i] - newest <= support_us
         latest_us[row, column] = max(own, t[i])
+    return -1
