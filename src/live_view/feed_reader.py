@@ -18,6 +18,7 @@ from src.live_view.frame_buffer import PolarityAccumulator
 from src.live_view.live_windows import EventWindow, WindowCutter, WindowQueue
 from src.live_view.status import FaultLog, Meters
 from src.recordings.event_windows import COVERED
+from src.recordings.files.event_order import BUFFER_US
 from src.recordings.noise_filter import NoiseFilter
 
 NAP_S = 0.02  # how long a wait goes on before it looks whether it is still wanted
@@ -25,7 +26,10 @@ MAX_DRIFT = 1e-4  # by which a camera's clock may run slow against ours: 100 ppm
 MAX_AHEAD_US = 1_000_000  # of a camera's clock ahead of ours is a jump, not a silence
 MAX_CHUNKS = 16  # that wait to be cut
 POLL_S = 0.002  # between two looks at the clock while nothing comes
-PATIENCE_S = 0.003  # for which events of a window may be on their way when it is over
+PATIENCE_S = 0.003  # by which events may come later than those before them
+MAX_DELAY_S = BUFFER_US * 1e-6  # of events that come in packets, for which windows wait
+DELAY_HALVES_S = 1.0  # in which a delay that does not recur is half forgotten
+BEHIND_S = 0.2  # for which all events come after their windows are over, before time restarts
 AGAIN = "again"  # in place of a chunk: the recording starts again
 STALL_S = 1.0  # without events, a live stream is said to have stalled
 
@@ -79,18 +83,22 @@ class CameraClock:
     """The wall time of a camera's clock, after the events that came soonest.
 
     What travels and is buffered comes late by changing spans; the least of them is taken for none.
+    `delay_s`: by how much later, of late, the first events of a chunk came.
     """
 
     def __init__(self):
         self.offset_s = math.nan  # wall minus recorded
-        self.observed_s = 0.0
+        self.observed_s = self.delay_s = 0.0
 
-    def observe(self, recorded_us: float, wall_s: float) -> None:
-        """An event of `recorded_us` came at `wall_s`."""
+    def observe(self, recorded_us: float, wall_s: float, first_us: float | None = None) -> None:
+        """Events up to `recorded_us`, from `first_us` on, came at `wall_s`."""
         offset_s = wall_s - recorded_us * 1e-6
         if not math.isnan(self.offset_s):
             offset_s = min(offset_s, self.offset_s + MAX_DRIFT * (wall_s - self.observed_s))
+        self.delay_s *= 0.5 ** ((wall_s - self.observed_s) / DELAY_HALVES_S)
         self.offset_s, self.observed_s = offset_s, wall_s
+        if first_us is not None:
+            self.delay_s = max(self.delay_s, min(wall_s - self.wall_s(first_us), MAX_DELAY_S))
 
     def wall_s(self, recorded_us: float) -> float:
         """Return the wall time of `recorded_us`; nan before the first event."""
@@ -127,6 +135,7 @@ class FeedReader:
         self.chunks: queue.Queue = queue.Queue(MAX_CHUNKS)
         self.camera_clock = CameraClock()
         self.arrival_s: float | None = None  # wall time of the newest live chunk
+        self.behind_since_s: float | None = None  # wall time; None: not all events come too late
         self.state = "waiting"
 
     def decode(self, stopped: threading.Event) -> None:
@@ -168,12 +177,13 @@ class FeedReader:
         """Cut what was decoded, and hand each window on when it is over."""
         start = time.thread_time()
         while not stopped.is_set() and self.state not in ("ended", "broken"):
+            now_s = time.perf_counter()
             try:
                 chunk = self.chunks.get(timeout=POLL_S if self.feed.is_live else 0.1)
             except queue.Empty:
                 chunk = None
             if self.feed.is_live:
-                self._cut_live(chunk, stopped)
+                self._cut_live(chunk, now_s, stopped)
             elif chunk is not None:
                 self._cut_file(chunk, stopped)
             now = time.thread_time()
@@ -200,28 +210,32 @@ class FeedReader:
             self.state = chunk
 
     def _cut_live(
-        self, chunk: tuple[np.ndarray, float] | str | None, stopped: threading.Event
+        self, chunk: tuple[np.ndarray, float] | str | None, now_s: float, stopped: threading.Event
     ) -> None:
-        now = time.perf_counter()
+        """Take a live chunk, or None where all that came before `now_s` is taken; hand on what is
+        over."""
         if not self.clock.running.is_set():  # a pause: what comes is not kept
             self._restart()
             return
         if chunk is not None and not isinstance(chunk, str):
             self._add_live(*chunk)
+            now_s = chunk[1]  # what came later may wait behind it
         if self.arrival_s is None:
             return
-        if now - self.arrival_s > STALL_S:
+        if now_s - self.arrival_s > STALL_S:
             self.state = "stalled"
-            silent = math.floor(now - self.arrival_s)
+            silent = math.floor(now_s - self.arrival_s)
             self.faults.report("stall", f"no events for {silent} s, waiting")
         elif self.cutter.origin_us is not None:
             self.state = "playing"
-            until_us = max(self.cutter.last_us, self.camera_clock.recorded_us(now - PATIENCE_S))
+            over_s = now_s - self.camera_clock.delay_s - PATIENCE_S
+            until_us = max(self.cutter.last_us, self.camera_clock.recorded_us(over_s))
             for window in self.cutter.pop_windows(until_us):
                 self._hand_on(window, self.camera_clock.wall_s(window.end_us), stopped)
 
     def _add_live(self, events: np.ndarray, arrival_s: float) -> None:
-        """Take a live chunk; after a silence or a jump of the camera's clock, time restarts."""
+        """Take a live chunk; after a silence, a jump of the camera's clock, or where all events
+        come after their windows are over, time restarts."""
         if self.arrival_s is not None:
             ahead_us = float(events["t"][len(events) // 2]) - self.camera_clock.recorded_us(
                 arrival_s
@@ -232,12 +246,24 @@ class FeedReader:
         self.arrival_s = arrival_s
         if self.cutter.add(events):
             self.camera_clock = CameraClock()
-        if self.cutter.origin_us is not None:
-            self.camera_clock.observe(self.cutter.last_us, arrival_s)
+        if self._is_long_behind(arrival_s):
+            text = f"events came too late for {BEHIND_S:g} s: started anew"
+            self.faults.report("time", text)
+            self._restart(new_scene=True)
+        elif self.cutter.origin_us is not None:
+            self.camera_clock.observe(self.cutter.last_us, arrival_s, float(events["t"][0]))
 
-    def _restart(self) -> None:
-        self.cutter.restart(new_scene=False)
-        self.camera_clock = CameraClock()
+    def _is_long_behind(self, arrival_s: float) -> bool:
+        """Return whether no event since BEHIND_S came before its window was over."""
+        if not self.cutter.is_behind:
+            self.behind_since_s = None
+        elif self.behind_since_s is None:
+            self.behind_since_s = arrival_s
+        return self.behind_since_s is not None and arrival_s - self.behind_since_s > BEHIND_S
+
+    def _restart(self, *, new_scene: bool = False) -> None:
+        self.cutter.restart(new_scene=new_scene)
+        self.camera_clock, self.behind_since_s = CameraClock(), None
 
     def _hand_on(self, window: EventWindow, due_s: float, stopped: threading.Event) -> None:
         self.counter.add(window.events)

@@ -45,6 +45,7 @@ class WindowCutter:
         self.sensor, self.period_us, self.faults = sensor, 1e6 / fps, faults
         self.buffer_us = BUFFER_US if is_live else ANY_GAP_US
         self.order = EventSorter(self.buffer_us, FEW_LIVE_EVENTS, "newest")
+        self.reported = (0, 0)  # of `order`: events that were late, and dropped
         self.origin_us: float | None = None  # start of the first window
         self.windows_cut = 0  # since the origin
         self.starts_scene = True
@@ -54,9 +55,17 @@ class WindowCutter:
         """Return the time of the newest event that is no outlier."""
         return float(self.order.last_us)
 
+    @property
+    def is_behind(self) -> bool:
+        """Return whether the newest event's window is over, by the clock."""
+        if self.origin_us is None:
+            return False
+        return self.last_us < self.origin_us + self.windows_cut * self.period_us
+
     def restart(self, *, new_scene: bool = True) -> None:
         """Forget the clock: the next event starts a window, of a new scene or not."""
         self.order = EventSorter(self.buffer_us, FEW_LIVE_EVENTS, "newest")
+        self.reported = (0, 0)
         self._forget_windows(new_scene)
 
     def _forget_windows(self, new_scene: bool) -> None:
@@ -68,19 +77,26 @@ class WindowCutter:
         jump back in time."""
         events = self.drop_off_sensor(events)
         order = self.order
-        part, last_us, before = order.parts[-1], order.last_us, (order.late, order.dropped)
+        part, last_us = order.parts[-1], order.last_us
         order.add(events)
-        self._report(order.late - before[0], order.dropped - before[1])
+        self._report_disorder()
         if order.parts[-1] is not part:
-            back_s = (last_us - order.parts[-1].first_us) * 1e-6
-            self.faults.report("time", f"time jumped back by {back_s:.3g} s: started anew")
+            self.report_jump_back(last_us - order.parts[-1].first_us)
             self._forget_windows(True)
         if self.origin_us is not None or not order.parts[-1].count:
             return False
         self.origin_us = float(order.parts[-1].first_us)
         return True
 
-    def _report(self, late: int, dropped: int) -> None:
+    def report_jump_back(self, back_us: float) -> None:
+        """Say that time jumped back."""
+        self.faults.report("time", f"time jumped back by {back_us * 1e-6:.3g} s: started anew")
+
+    def _report_disorder(self) -> None:
+        """Say how many events were late or dropped since the last call."""
+        counts = (self.order.late, self.order.dropped)
+        late, dropped = (now - before for now, before in zip(counts, self.reported, strict=True))
+        self.reported = counts
         if late:
             self.faults.report("order", "events came out of order: sorted", late)
         if dropped:
@@ -96,6 +112,7 @@ class WindowCutter:
         over = int((until_us - self.origin_us) / self.period_us) - self.windows_cut
         ends = (end_us + self.period_us * np.arange(max(over, 1))).tolist()
         self.order.accept_events_after_gap(until_us)
+        self._report_disorder()
         ready = self.order.release(ends[-1])
         events = concatenate_events(ready) if ready else np.empty(0, EVENT)
         stops = [count_before(events, end) for end in ends]

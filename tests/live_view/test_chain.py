@@ -16,7 +16,7 @@ from aiohttp import ClientSession, WSMsgType
 from baselines.highpass import HighPass
 from src import live
 from src.live_view import event_feeds
-from src.live_view.feed_reader import STALL_S, FeedReader, PlaybackClock
+from src.live_view.feed_reader import BEHIND_S, STALL_S, FeedReader, PlaybackClock
 from src.live_view.frame_buffer import PolarityAccumulator
 from src.live_view.live_windows import WindowCutter, WindowQueue
 from src.live_view.network_runner import NetworkRunner, RunSettings
@@ -227,6 +227,41 @@ def test_a_stream_that_comes_back_goes_on_from_there():
     starts = np.array([one.start_us for one in windows])
     assert (starts >= 9_000_000).sum() >= 3 and not ((starts > 1.5e6) & (starts < 9e6)).any()
     assert [one.starts_scene for one in windows].count(True) == 1  # the picture is not thrown away
+
+
+def packets(at_s: float, first_us: int, count: int, length_us: int = 5000) -> list:
+    """Return steps of a Script: packets one after the other, each sent at its end."""
+    return [
+        (at_s + (k + 1) * length_us * 1e-6, range(start, start + length_us, 500))
+        for k, start in enumerate(range(first_us, first_us + count * length_us, length_us))
+    ]
+
+
+def all_in_their_windows(windows) -> bool:
+    """Return whether every event lies in the window that holds it."""
+    return all(
+        ((one.events["t"] >= one.start_us) & (one.events["t"] < one.end_us)).all()
+        for one in windows
+    )
+
+
+def test_a_stream_that_falls_behind_starts_anew_and_says_so():
+    faults = FaultLog()
+    feed = Script(*packets(0, 0, 40), *packets(0.7, 200_000, 160))
+    windows, _ = live_windows(feed, 1.5, faults)
+    assert all_in_their_windows(windows)
+    assert any("dropped" in line for line in faults.current())
+    assert f"events came too late for {BEHIND_S:g} s: started anew" in faults.current()
+    assert [one.starts_scene for one in windows].count(True) >= 2
+    assert sum(len(one.events) > 0 for one in windows[-30:]) > 15
+
+
+def test_packets_longer_than_a_window_lose_no_event():
+    faults = FaultLog()
+    windows, _ = live_windows(Script(*packets(0, 0, 20, 40_000)), 1.0, faults)
+    assert all_in_their_windows(windows)
+    assert sum(len(one.events) for one in windows) >= 19 * 80
+    assert faults.current() == []
 
 
 def test_a_camera_s_clock_that_leaps_does_not_make_windows_without_end():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from src.live_view import frame_buffer
-from src.live_view.feed_reader import CameraClock, PlaybackClock
+from src.live_view.feed_reader import MAX_DELAY_S, CameraClock, PlaybackClock
 from src.live_view.frame_buffer import (
     MAX_BYTES,
     MAX_FRAMES,
@@ -110,13 +110,23 @@ def test_a_packet_late_as_a_whole_ends_no_stream(cutter, faults):
     assert sum(len(window.events) for window in cutter.pop_windows(60_000)) == 38
 
 
-def test_events_in_order_go_into_the_next_window_when_theirs_is_over(cutter, faults):
+def test_events_in_order_are_dropped_and_counted_when_their_window_is_over(cutter, faults):
     cutter.add(some(range(0, 25_000, 500)))
     list(cutter.pop_windows(40_000))
     cutter.add(some(range(26_000, 31_000, 1000)))
-    cutter.add(some(range(41_000, 60_000, 500)))
-    assert sum(len(window.events) for window in cutter.pop_windows(60_000)) == 43
-    assert faults.current() == []
+    assert cutter.is_behind
+    cutter.add(some(range(39_000, 60_000, 500)))
+    assert not cutter.is_behind
+    assert sum(len(window.events) for window in cutter.pop_windows(60_000)) == 40
+    assert faults.current() == ["events came too late or far out of order: dropped (7 events)"]
+
+
+def test_a_single_event_after_a_silence_whose_window_is_over_is_counted(cutter, faults):
+    cutter.add(some([0]))
+    list(cutter.pop_windows(200_000))
+    cutter.add(some([100_000]))
+    list(cutter.pop_windows(201_000))
+    assert faults.current() == ["events came too late or far out of order: dropped (1 events)"]
 
 
 def test_a_wild_time_moves_no_window(cutter, faults):
@@ -222,6 +232,18 @@ def test_a_camera_s_clock_follows_what_came_soonest_and_drifts():
         clock.observe(k * 10_000, wall + 0.005 * ((k * 7) % 10) / 10)
     assert clock.wall_s(10**7) == pytest.approx(110.0005, abs=2e-3)
     assert clock.recorded_us(clock.wall_s(123.0)) == pytest.approx(123.0, abs=1e-3)
+
+
+def test_a_camera_s_clock_knows_how_late_the_first_events_of_a_packet_come():
+    clock = CameraClock()
+    for k in range(1, 20):
+        clock.observe(20_000 * k, 100 + 0.02 * k, 20_000 * (k - 1))
+    assert clock.delay_s == pytest.approx(0.02)
+    for k in range(20, 520):
+        clock.observe(20_000 * k, 100 + 0.02 * k, 20_000 * k - 1000)
+    assert clock.delay_s == pytest.approx(0.001, abs=1e-4)
+    clock.observe(10_400_000, 110.4, 0)
+    assert clock.delay_s == MAX_DELAY_S
 
 
 def test_views_to_choose_from():

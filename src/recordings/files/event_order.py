@@ -150,6 +150,7 @@ class EventSorter:
             self._falls += int(np.count_nonzero(t[1:] < t[:-1]))
             self.late += int(np.count_nonzero(late_us))
             self.most_late_us = max(self.most_late_us, int(late_us.max()))
+        if not are_in_order or t[0] < self._released_us:
             is_gone = t < self._released_us
             self.dropped += int(is_gone.sum())
             events = events[~is_gone] if is_gone.any() else events
