@@ -237,11 +237,7 @@ class FeedReader:
         """Take a live chunk; after a silence, a jump of the camera's clock, or where all events
         come after their windows are over, time restarts."""
         if self.arrival_s is not None:
-            ahead_us = float(events["t"][len(events) // 2]) - self.camera_clock.recorded_us(
-                arrival_s
-            )
-            if arrival_s - self.arrival_s > STALL_S or ahead_us > MAX_AHEAD_US:
-                self._restart()
+            self._restart_after_silence_or_jump(events, arrival_s, arrival_s - self.arrival_s)
         self.faults.clear("stall")
         self.arrival_s = arrival_s
         if self.cutter.add(events):
@@ -252,6 +248,22 @@ class FeedReader:
             self._restart(new_scene=True)
         elif self.cutter.origin_us is not None:
             self.camera_clock.observe(self.cutter.last_us, arrival_s, float(events["t"][0]))
+
+    def _restart_after_silence_or_jump(
+        self, events: np.ndarray, arrival_s: float, silent_s: float
+    ) -> None:
+        """Restart before a chunk after a silence, or whose times are far ahead of the clock; a new
+        scene where they are earlier than those before the silence."""
+        middle_us = float(events["t"][len(events) // 2])
+        back_us = self.cutter.last_us - middle_us
+        is_after_silence = silent_s > STALL_S
+        if is_after_silence and back_us > BUFFER_US:
+            self.cutter.report_jump_back(back_us)
+            self._restart(new_scene=True)
+        elif is_after_silence or (
+            middle_us - self.camera_clock.recorded_us(arrival_s) > MAX_AHEAD_US
+        ):
+            self._restart()
 
     def _is_long_behind(self, arrival_s: float) -> bool:
         """Return whether no event since BEHIND_S came before its window was over."""

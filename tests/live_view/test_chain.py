@@ -229,6 +229,14 @@ def test_a_stream_that_comes_back_goes_on_from_there():
     assert [one.starts_scene for one in windows].count(True) == 1  # the picture is not thrown away
 
 
+def test_a_stream_that_comes_back_with_an_earlier_clock_starts_anew_and_says_so():
+    later, faults = 0.1 + STALL_S + 0.3, FaultLog()
+    feed = Script((0, [9_000_000]), (0.1, [9_100_000]), *packets(later, 0, 40))
+    windows, _ = live_windows(feed, later + 0.4, faults)
+    assert [one.starts_scene for one in windows].count(True) == 2
+    assert "time jumped back by 9.1 s: started anew" in faults.current()
+
+
 def packets(at_s: float, first_us: int, count: int, length_us: int = 5000) -> list:
     """Return steps of a Script: packets one after the other, each sent at its end."""
     return [
