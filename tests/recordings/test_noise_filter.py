@@ -34,6 +34,19 @@ def test_a_pixel_does_not_support_itself_nor_the_border_the_border():
     assert NoiseFilter((8, 8), 0.005)(hot).size == 0
 
 
+def test_what_came_before_the_clock_jumped_back_supports_nothing():
+    keep = NoiseFilter((8, 8), 0.005)
+    keep(events((10**7, 3, 3), (10**7 + 10, 4, 4), (10**7 + 20, 6, 6)))
+    assert keep(events((1000, 4, 3), (20_000, 2, 2), (30_000, 4, 4), (40_000, 5, 5))).size == 0
+    assert keep(events((50_000, 6, 6), (50_100, 6, 5)))["t"].tolist() == [50_100]
+
+
+def test_a_neighbour_with_a_later_time_hides_no_other():
+    keep = NoiseFilter((8, 8), 0.005)
+    keep(events((10**7, 2, 2)))
+    assert keep(events((1000, 4, 4), (1010, 3, 3)))["t"].tolist() == [1010]
+
+
 def test_chunks_change_nothing():
     drawer = np.random.default_rng(0)
     many = np.zeros(5000, EVENT)

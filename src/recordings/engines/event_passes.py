@@ -106,12 +106,10 @@ def mark_supported_events(t, x, y, latest_us, support_us, kept):
         row, column = np.int64(y[i]) + 1, np.int64(x[i]) + 1
         if not (0 < row <= height and 0 < column <= width):
             return i
-        own = latest_us[row, column]
         latest_us[row, column] = LONG_AGO_US
-        newest = LONG_AGO_US
+        kept[i] = False
         for r in range(row - 1, row + 2):
             for c in range(column - 1, column + 2):
-                newest = max(newest, latest_us[r, c])
-        kept[i] = t[i] - newest <= support_us
-        latest_us[row, column] = max(own, t[i])
+                kept[i] |= 0 <= t[i] - latest_us[r, c] <= support_us
+        latest_us[row, column] = t[i]
     return -1
