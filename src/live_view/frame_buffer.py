@@ -127,20 +127,24 @@ def tile_views(
     counts: Int[np.ndarray, "views h w"], positions: Sequence[Position]
 ) -> UInt8[np.ndarray, "rows columns 3"]:
     """Return the events of all views where they stand in the light field, made small, a line of one
-    pixel between them.
+    pixel between them; each view keeps two pixels of a side, where it has them.
     """
     rows, columns = (sorted({place[axis] for place in positions}) for axis in (0, 1))
     _, height, width = counts.shape
     shrink = max(1, -(-max(len(rows) * height, len(columns) * width) // MAX_SIDE))
-    high, wide = height // shrink, width // shrink
-    kept = counts[:, : high * shrink, : wide * shrink]
-    small = kept.reshape(-1, high, shrink, wide, shrink).sum((2, 4))
+    down, across = (min(shrink, max(1, side // 2)) for side in (height, width))
+    high, wide = height // down, width // across
+    kept = counts[:, : high * down, : wide * across]
+    small = kept.reshape(-1, high, down, wide, across).sum((2, 4))
     whole = np.zeros((len(rows) * high, len(columns) * wide), counts.dtype)
     for view, (row, column) in zip(small, positions, strict=True):
         top, left = rows.index(row) * high, columns.index(column) * wide
         whole[top : top + high, left : left + wide] = view
     drawn = draw_events(whole)
-    drawn[high::high] = drawn[:, wide::wide] = BORDER
+    if high > 1:
+        drawn[high::high] = BORDER
+    if wide > 1:
+        drawn[:, wide::wide] = BORDER
     return drawn
 
 

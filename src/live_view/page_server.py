@@ -9,7 +9,7 @@ import json
 import math
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -42,8 +42,17 @@ class LivePage:
         self.status_sent = 0.0  # wall time
 
     def message(self, *, whole: bool = False) -> bytes | None:
-        """Return what is new since the last call, or everything; None where nothing is."""
-        pictures = self._pictures(whole)
+        """Return what is new since the last call, or everything; None where nothing is.
+
+        Where one picture cannot be drawn, it and those after it are left out: a fault.
+        """
+        pictures = []
+        try:
+            for picture in self._draw_pictures(whole):
+                pictures.append(picture)
+        except Exception as error:  # one picture must not end the page
+            text = f"pictures cannot be drawn: {type(error).__name__}: {error}"
+            self.player.faults.report("pictures", text)
         header: dict = {"pictures": [[name, len(data)] for name, data in pictures]}
         now = time.perf_counter()
         if whole or now - self.status_sent >= STATUS_S:
@@ -66,24 +75,24 @@ class LivePage:
             "chosen": self.controls.chosen,
         }
 
-    def _pictures(self, whole: bool) -> list[tuple[str, bytes]]:
+    def _draw_pictures(self, whole: bool) -> Iterator[tuple[str, bytes]]:
+        """Yield the name and the JPEG of each picture that is new, or of all."""
         count, newest = self.frames.count, self.frames.newest()
         if newest is None:
-            return []
-        pictures = []
+            return
         if whole or count != self.frames_sent:
             self.frames_sent = count
-            pictures.append(("frame", encode_jpeg(newest)))
+            yield "frame", encode_jpeg(newest)
             if (one_view := self.player.one_view) is not None:
-                pictures.append(("one-view", encode_jpeg(cv2.convertScaleAbs(one_view, alpha=255))))
+                yield "one-view", encode_jpeg(cv2.convertScaleAbs(one_view, alpha=255))
         if whole or self.counter.windows:
             counts = self.counter.take()
             centre = self.positions.index((0, 0)) if (0, 0) in self.positions else 0
-            pictures.append(("events", encode_jpeg(draw_events(counts[centre]))))
+            yield "events", encode_jpeg(draw_events(counts[centre]))
             if self.all_views:
-                pictures.append(("views", encode_jpeg(tile_views(counts, self.positions))))
-        drawn = self.slice.draw(always=whole)
-        return pictures if drawn is None else [*pictures, ("slice", encode_jpeg(drawn))]
+                yield "views", encode_jpeg(tile_views(counts, self.positions))
+        if (drawn := self.slice.draw(always=whole)) is not None:
+            yield "slice", encode_jpeg(drawn)
 
     def handle_request(self, request: dict) -> None:
         """Do what a visitor asks; raises ValueError for what makes no sense."""

@@ -417,6 +417,32 @@ def test_the_server_answers_and_takes_only_what_makes_sense(recording):
     assert any("views_used must be one of" in fault for one in headers for fault in one["faults"])
 
 
+def test_pictures_that_cannot_be_drawn_are_a_fault_and_the_page_goes_on(recording, monkeypatch):
+    def fail(*args):
+        raise ZeroDivisionError("no pixels")
+
+    made = served(recording, {"net": HighPass()}, fps=200.0)
+    monkeypatch.setattr("src.live_view.page_server.draw_events", fail)
+
+    async def visit() -> list[dict]:
+        stop = asyncio.Event()
+        running = asyncio.create_task(made.run(made.page.player.start, stop))
+        await asyncio.sleep(0.5)
+        address = f"http://127.0.0.1:{made.port}/stream"
+        async with ClientSession() as session, session.ws_connect(address) as socket:
+            headers = [await _header(socket) for _ in range(5)]
+        assert not running.done()
+        stop.set()
+        await running
+        return headers
+
+    headers = asyncio.run(visit())
+    made.page.player.stop()
+    assert headers[0]["pictures"][0][0] == "frame" and len(headers[0]["pictures"]) == 1
+    fault = "pictures cannot be drawn: ZeroDivisionError: no pixels"
+    assert fault in headers[0]["status"]["faults"]
+
+
 def test_a_page_s_port_in_use_is_refused(recording):
     made = served(recording, {"net": HighPass()})
     with socket.socket() as taken:

@@ -308,6 +308,15 @@ def test_events_are_drawn_in_two_colours_and_views_where_they_stand():
     assert max(frame_buffer.tile_views(np.zeros((9, 176, 176), np.int32), layout(9)).shape) <= 264
 
 
+@pytest.mark.parametrize("size", [(10, 1280), (1280, 10), (1, 2000), (3, 2000), (2, 2)])
+def test_views_long_and_narrow_are_drawn(size):
+    counts = np.zeros((9, *size), np.int32)
+    counts[0] = 3
+    drawn = frame_buffer.tile_views(counts, list(layout(9)))
+    assert max(drawn.shape) <= 264 and (drawn[0, 0] == frame_buffer.ON).all()
+    assert (drawn[-1, -1] == frame_buffer.BACKGROUND).all()
+
+
 def test_meters_say_rates_and_latency_of_the_last_seconds():
     meters = Meters(span_s=5.0)
     assert (
