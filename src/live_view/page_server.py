@@ -231,7 +231,7 @@ class PageServer:
             if not isinstance(request, dict):
                 raise ValueError(f"a request must be a mapping, got {request}")
             await asyncio.to_thread(self.page.handle_request, request)
-        except ValueError as error:
+        except (ValueError, OverflowError, RecursionError) as error:
             self.page.player.faults.report("request", str(error))
 
 
