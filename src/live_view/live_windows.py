@@ -15,6 +15,7 @@ from src.recordings.views import HeightWidth
 
 FEW_LIVE_EVENTS = 16  # with times far from the others; more of them are a clock that restarts
 ANY_GAP_US = 2**61
+MAX_BLOCK = 1024  # windows that are cut at a time
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,8 @@ class WindowCutter:
     def __init__(self, sensor: HeightWidth, fps: float, faults: FaultLog, *, is_live: bool = True):
         if not 0 < fps <= 1e5:
             raise ValueError(f"fps must be in (0, 1e5], got {fps}")
-        self.sensor, self.period_us, self.faults = sensor, 1e6 / fps, faults
+        self.sensor, self.fps, self.faults = sensor, fps, faults
+        self.period_us = 1e6 / fps
         self.buffer_us = BUFFER_US if is_live else ANY_GAP_US
         self.order = EventSorter(self.buffer_us, FEW_LIVE_EVENTS, "newest")
         self.reported = (0, 0)  # of `order`: events that were late, and dropped
@@ -58,9 +60,7 @@ class WindowCutter:
     @property
     def is_behind(self) -> bool:
         """Return whether the newest event's window is over, by the clock."""
-        if self.origin_us is None:
-            return False
-        return self.last_us < self.origin_us + self.windows_cut * self.period_us
+        return self.origin_us is not None and self.last_us < self._end_us(self.windows_cut)
 
     def restart(self, *, new_scene: bool = True) -> None:
         """Forget the clock: the next event starts a window, of a new scene or not."""
@@ -104,24 +104,33 @@ class WindowCutter:
 
     def pop_windows(self, until_us: float) -> Iterator[EventWindow]:
         """Yield the windows that are over at `until_us`, each without its `due_s`."""
-        if self.origin_us is None:
-            return
-        end_us = self.origin_us + (self.windows_cut + 1) * self.period_us
-        if end_us > until_us:
-            return
-        over = int((until_us - self.origin_us) / self.period_us) - self.windows_cut
-        ends = (end_us + self.period_us * np.arange(max(over, 1))).tolist()
-        self.order.accept_events_after_gap(until_us)
-        self._report_disorder()
-        ready = self.order.release(ends[-1])
-        events = concatenate_events(ready) if ready else np.empty(0, EVENT)
-        stops = [count_before(events, end) for end in ends]
-        self.windows_cut += len(ends)
-        starts_scene, self.starts_scene, start = self.starts_scene, False, 0
-        for end, stop in zip(ends, stops, strict=True):
-            part = events[start:stop]
-            yield EventWindow(end - self.period_us, end, part, starts_scene=starts_scene)
-            starts_scene, start = False, stop
+        while self.origin_us is not None and (ends := self._next_ends(until_us)):
+            self.order.accept_events_after_gap(until_us)
+            self._report_disorder()
+            ready = self.order.release(ends[-1])
+            events = concatenate_events(ready) if ready else np.empty(0, EVENT)
+            start_us, start = self._end_us(self.windows_cut), 0
+            self.windows_cut += len(ends)
+            for end_us in ends:
+                stop = count_before(events, end_us)
+                starts_scene, self.starts_scene = self.starts_scene, False
+                yield EventWindow(start_us, end_us, events[start:stop], starts_scene=starts_scene)
+                start_us, start = end_us, stop
+
+    def _next_ends(self, until_us: float) -> list[float]:
+        """Return the ends of the next windows that are over at `until_us`, MAX_BLOCK at most."""
+        ends: list[float] = []
+        while len(ends) < MAX_BLOCK:
+            end_us = self._end_us(self.windows_cut + len(ends) + 1)
+            if end_us > until_us:
+                break
+            ends.append(end_us)
+        return ends
+
+    def _end_us(self, windows: int) -> float:
+        """Return the end of the last of so many windows, as `src.reconstruct` computes it."""
+        assert self.origin_us is not None
+        return self.origin_us + windows * 1e6 / self.fps
 
     def drop_off_sensor(self, events: np.ndarray) -> np.ndarray:
         """Return the events on the sensor; reports how many are not."""

@@ -1,7 +1,9 @@
 """The parts of the chain by themselves: clocks, cutting, dropping, slices, meters."""
 
+import itertools
 import threading
 import time
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -65,6 +67,28 @@ def test_windows_hold_every_event_once_however_it_came(cutter, chunks):
     assert [one.starts_scene for one in found] == [True] + [False] * (len(found) - 1)
     held = np.concatenate([one.events["t"] for one in found])
     assert np.array_equal(held, times[: len(held)]) and times[-1] - held[-1] <= 1000
+
+
+def test_a_long_silence_of_a_file_takes_no_memory(faults):
+    cutter = WindowCutter((4, 6), 1e5, faults, is_live=False)
+    cutter.add(some([0, 30_000_000]))
+    tracemalloc.start()
+    found = list(itertools.islice(cutter.pop_windows(cutter.last_us), 5000))
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 10**7 and [len(one.events) for one in found] == [1] + [0] * 4999
+    assert found[-1].end_us == 50_000
+
+
+def test_windows_end_where_those_of_reconstruct_do(faults):
+    fps, origin = 333.3, 12_345_678
+    cutter = WindowCutter((4, 6), fps, faults, is_live=False)
+    cutter.add(some([origin, origin + 20_000_000]))
+    found = list(cutter.pop_windows(cutter.last_us))
+    assert [one.end_us for one in found] == [
+        origin + k * 1e6 / fps for k in range(1, len(found) + 1)
+    ]
+    assert all(one.end_us == two.start_us for one, two in itertools.pairwise(found))
 
 
 def test_a_window_without_events_is_cut_too(cutter):
