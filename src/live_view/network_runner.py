@@ -67,7 +67,7 @@ class NetworkRunner:
         self.lookup = build_lookup(views)
         # One without overlapping windows can begin a window while another is finished.
         self.is_pipelined = is_runtime and self.frames_per_window == 1
-        self.recent: deque[np.ndarray] = deque(maxlen=self.frames_per_window)
+        self.recent: deque[EventWindow] = deque(maxlen=self.frames_per_window)
         events = np.zeros(1000, EVENT)  # to run on, so that nothing is compiled while windows wait
         events["x"] = np.linspace(0, views.sensor[1] - 1, len(events))
         events["y"], events["p"] = views.sensor[0] // 2, 1
@@ -80,11 +80,10 @@ class NetworkRunner:
         """
         if restart:
             self.recent.clear()
-        self.recent.append(window.events)
-        start_us = window.end_us - self.frames_per_window * (window.end_us - window.start_us)
-        events = window.events
+        self.recent.append(window)
+        start_us, events = self._start_us(), window.events
         if self.frames_per_window > 1:  # of the windows in between some may be dropped
-            events = concatenate_events(self.recent)
+            events = concatenate_events([one.events for one in self.recent])
             events = events[count_before(events, start_us) :]
         filled = fill_window(events, self.lookup, self.rule, start_us, window.end_us)
         if not self.is_pipelined or not isinstance(self.network, EventListRuntime):
@@ -93,6 +92,15 @@ class NetworkRunner:
         if filled.events and filled.event_list is not None:
             begun = self.network.begin(*filled.event_list, 0.0, filled.length_s)
         return partial(self._finish, self.network, begun, restart)
+
+    def _start_us(self) -> float:
+        """Return where the network's window begins: where one of the recent windows does, to the
+        last bit, unless that was dropped or there are too few."""
+        newest = self.recent[-1]
+        period_us = newest.end_us - newest.start_us
+        start_us = newest.end_us - self.frames_per_window * period_us
+        oldest_us = self.recent[0].start_us
+        return oldest_us if abs(oldest_us - start_us) < period_us / 2 else start_us
 
     def _run(self, window: Window, restart: bool) -> Float[np.ndarray, "h w"]:
         if restart:

@@ -335,6 +335,26 @@ def test_the_recorded_time_is_that_of_the_frame_shown_also_while_nothing_moves(r
     assert np.array_equal(screen.ring[20], screen.ring[29])
 
 
+def test_windows_that_overlap_are_those_of_reconstruct_to_the_event():
+    fps, origin = 1200.0, 1_000_003  # every third frame ends at a whole microsecond
+    times = np.arange(origin, origin + 100_000, 5)
+    made = np.zeros(len(times), EVENT)
+    made["t"], made["x"], made["y"], made["p"] = times, 320, 180, 1
+    settings = RunSettings(fps, window_length="trained", form="float32")
+    runner = NetworkRunner("net", HighPass(), scenes.views(), settings)
+    rule = event_windows.build_window_rule("trained", fps=fps, splat="nearest")
+    wanted = event_windows.cut_windows([made], build_lookup(scenes.views()), rule)
+    cutter = WindowCutter(scenes.SENSOR, fps, FaultLog(), is_live=False)
+    cutter.add(made)
+    for k, (window, one) in enumerate(
+        zip(cutter.pop_windows(float(times[-1])), wanted, strict=False)
+    ):
+        filled = runner.begin(window, restart=k == 0).args[0]
+        assert (filled.events, filled.end_us) == (one.events, one.end_us), k
+        assert filled.start_us == one.start_us or one.start_us < origin, k
+    assert k > 100
+
+
 def test_live_windows_do_not_grow():
     settings = RunSettings(12_000.0, window_length="growing", form="float32")
     with pytest.raises(ValueError, match="must be frame or trained for src.live, got growing"):
