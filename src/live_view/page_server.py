@@ -51,8 +51,8 @@ class LivePage:
             for picture in self._draw_pictures(whole):
                 pictures.append(picture)
         except Exception as error:  # one picture must not end the page
-            text = f"pictures cannot be drawn: {type(error).__name__}: {error}"
-            self.player.faults.report("pictures", text)
+            fault = f"pictures cannot be drawn: {type(error).__name__}: {error}"
+            self.player.faults.report("pictures", fault)
         header: dict = {"pictures": [[name, len(data)] for name, data in pictures]}
         now = time.perf_counter()
         if whole or now - self.status_sent >= STATUS_S:
