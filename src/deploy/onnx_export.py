@@ -19,6 +19,7 @@ from torch import Tensor
 from src.deploy.explicit_state import ExplicitStateNetwork
 from src.models.folding import inference_copy
 from src.models.network import WINDOW_S, EventToVideoNetwork
+from src.records.atomic import atomic_path
 from src.sim.optics import Position
 
 PACKAGES = ("onnx", "onnxscript", "onnxruntime")
@@ -34,21 +35,23 @@ def export_onnx(
     """Write `network` to `path`, spectral norm folded; return what runs it, checked against it.
 
     Raises ValueError without the packages, for a network that ONNX cannot express, and where the
-    two differ by more than TOLERANCE over a few windows of noise.
+    two differ by more than TOLERANCE over a few windows of noise; then `path` is as it was.
     """
     require_onnx()
-    if not Path(path).parent.is_dir():
+    path = Path(path)
+    if not path.parent.is_dir():
         raise ValueError(f"path must be in a folder that is there, got {path}")
     folded = inference_copy(network).cpu()
     voxels = torch.randn(1, views, bins, height, width, generator=torch.Generator().manual_seed(0))
     explicit = ExplicitStateNetwork(folded, positions)
     with torch.no_grad():
         started = explicit.initial_state(voxels)
-        _write(explicit, (voxels, torch.full((1,), WINDOW_S), *started), path)
-    exported = OnnxNetwork(path)
-    gap = _largest_difference(exported, folded, voxels, positions)
-    if not gap <= TOLERANCE:
-        raise ValueError(f"export must give PyTorch's frames within {TOLERANCE}, got {gap:.2g}")
+    with atomic_path(path) as partial:
+        _write(explicit, (voxels, torch.full((1,), WINDOW_S), *started), partial)
+        exported = OnnxNetwork(partial)
+        gap = _largest_difference(exported, folded, voxels, positions)
+        if not gap <= TOLERANCE:
+            raise ValueError(f"export must give PyTorch's frames within {TOLERANCE}, got {gap:.2g}")
     return exported
 
 
@@ -101,6 +104,7 @@ class OnnxNetwork(EventToVideoNetwork):
         return torch.from_numpy(frame), after
 
 
+@torch.no_grad()
 def _write(explicit: ExplicitStateNetwork, example: tuple, path: Path) -> None:
     states = range(len(example) - 2)
     names = ["voxels", "window_s", *(f"state{k}" for k in states)]

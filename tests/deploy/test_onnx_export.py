@@ -9,6 +9,7 @@ import torch
 
 from baselines.firenet import FireNet
 from baselines.highpass import HighPass
+from src.deploy import onnx_export
 from src.deploy.forms import Bf16Network, convert_to_form
 from src.deploy.onnx_export import OnnxNetwork, export_onnx
 from src.models.e2vid import E2VID
@@ -109,3 +110,21 @@ def test_what_onnx_cannot_express_is_said(tmp_path):
         export_onnx(
             HighPass(view_reduction="median"), tmp_path / "a.onnx", views=9, height=16, width=16
         )
+
+
+def test_a_file_that_is_refused_leaves_the_one_before(tmp_path, monkeypatch):
+    """Without the packages: the parts that need them are stand-ins."""
+    monkeypatch.setattr(onnx_export, "require_onnx", lambda: None)
+    monkeypatch.setattr(onnx_export, "_write", lambda *given: given[-1].write_bytes(b"refused"))
+    monkeypatch.setattr(onnx_export, "OnnxNetwork", lambda path: NETWORKS["setnet"]())
+    monkeypatch.setattr(onnx_export, "_largest_difference", lambda *given: 0.3)
+    good, size = tmp_path / "good.onnx", {"views": 9, "height": 16, "width": 16}
+    good.write_bytes(b"good")
+    for path in (good, tmp_path / "new.onnx"):
+        with pytest.raises(ValueError, match=r"PyTorch's frames within 0\.0001, got 0\.3"):
+            export_onnx(NETWORKS["setnet"](), path, **size)
+    assert [path.name for path in tmp_path.iterdir()] == ["good.onnx"]
+    assert good.read_bytes() == b"good"
+    monkeypatch.setattr(onnx_export, "_largest_difference", lambda *given: 0.0)
+    export_onnx(NETWORKS["setnet"](), good, **size)
+    assert good.read_bytes() == b"refused"
