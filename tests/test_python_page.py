@@ -7,13 +7,17 @@ import json
 import re
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+import lightfield_events
 from src.recordings.files import videos
 from src.recordings.files.event_writers import write_events
 from src.recordings.output import write_video
+from src.sim.optics import layout
+from src.sim.voxel import voxel_grid
 from tests.conftest import ROOT
 from tests.test_docs import BANNED, LINE, LINK
 from tests.test_entry_points import run_here
@@ -56,6 +60,36 @@ def test_the_page_runs_as_it_stands(tmp_path, monkeypatch):
     assert np.abs(np.stack(frames) - np.stack(fast)).max() < 0.1  # bf16 or float32
     assert len(list(videos.read_video(tmp_path / "film.mp4"))) == 48
     assert len(space["recorded"]) == 300
+
+
+class GridRuntime:
+    """A stand-in for Runtime: the grids of the events that it is given."""
+
+    def __init__(self, net, *, positions, height, width):
+        self.views, self.size = len(positions), {"bins": 5, "height": height, "width": width}
+
+    def step(self, t, x, y, p, view, t0: float, t1: float) -> np.ndarray:
+        assert not len(t) or t0 <= t[0] <= t[-1] <= t1
+        mine = [tuple(part[view == k] for part in (t, x, y, p)) for k in range(self.views)]
+        return np.stack([voxel_grid(*part, t0=t0, t1=t1, **self.size) for part in mine])
+
+
+def test_the_lists_of_the_page_are_its_grids(monkeypatch):
+    """Of events at both edges of every window, some of which are rounded in seconds."""
+    monkeypatch.setattr(lightfield_events, "Runtime", GridRuntime)
+    edges_us = np.ceil(np.arange(49) * 1e6 / 120).astype(np.int64)
+    t = np.sort(np.concatenate([edges_us, edges_us[1:] - 1, np.arange(0, 400_000, 700)]))
+    names = [("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8), ("view", int)]
+    events = np.zeros(len(t), names)
+    events["t"], events["x"], events["p"], events["view"] = t, t % 7, 1 - t % 2 * 2, t % 9
+    clip = SimpleNamespace(positions=layout(9))
+    space = {"events": events, "clean": np.zeros((1, 8, 8)), "clip": clip, "net": None}
+    space |= {"np": np}
+    for words in ("def grid", "runtime.step"):
+        (block,) = (block for block in blocks() if words in block)
+        exec(compile(block, "docs/python.md", "exec"), space)
+    grids = [[space["grid"](k, view) for view in range(9)] for k in range(48)]
+    np.testing.assert_allclose(np.stack(space["fast"]), grids, atol=1e-4)
 
 
 def cells(notebook, kind: str) -> list[dict]:

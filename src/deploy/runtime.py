@@ -33,6 +33,7 @@ MIN_SIDE = 8  # side that can be padded so
 LEAST_INSIDE = 0.01  # of the events given for a window
 LONGEST_WINDOW_S = 10.0  # beyond, times are hardly in seconds
 LEAST_TIME_STEPS = 1000  # of the type of `t` in a window
+EDGE_STEPS = 4  # of float64, by which rounding puts an event of an edge outside
 DTYPES = (np.float64, np.int64, np.int64, np.float32, np.int64)  # of t, x, y, p, view
 
 
@@ -104,7 +105,8 @@ class EventListRuntime:
 
         Events of one window in order of time, arrays of one length: `t`, `t0`, `t1` in seconds,
         `x`, `y` in pixels, `view` an index into positions, `p` in {-1, 1} or, as floats, weights.
-        Those outside t0 <= t <= t1 have no part in it; a warning says so where nearly all are.
+        Those outside t0 <= t <= t1, but for rounding, have no part in it; a warning says so where
+        nearly all are.
         Raises ValueError, and leaves the state, for events that are out of order, off the sensor or
         in no view.
         """
@@ -165,6 +167,7 @@ class EventListRuntime:
         t, x, y, p, view = (np.ascontiguousarray(part, dtype) for part, dtype in typed)
         if kernels.has_event_error(t, x, y, p, view, self.views, *self.size, is_sign):
             raise ValueError(self._describe_error(t, x, y, p, view, is_sign))
+        t = _clip_rounded(t, float(t0), float(t1))
         inside = np.searchsorted(t, t1, "right") - np.searchsorted(t, t0)
         self._warn_of_units(given[0], t0, t1)
         if len(t) and inside < LEAST_INSIDE * len(t):
@@ -219,6 +222,15 @@ class EventListRuntime:
                 events = [np.concatenate([part, part[low], part[high]]) for part in events]
                 events[axis] = np.concatenate(mirrored) + before
         return events
+
+
+def _clip_rounded(t: np.ndarray, t0: float, t1: float) -> np.ndarray:
+    """Return ordered `t`; what lies outside t0..t1 by rounding alone lies on the edge."""
+    if not len(t) or (t[0] >= t0 and t[-1] <= t1):
+        return t
+    slack = EDGE_STEPS * np.spacing(max(abs(t0), abs(t1)))
+    is_near = (t >= t0 - slack) & (t <= t1 + slack)
+    return np.where(is_near, t.clip(t0, t1), t)
 
 
 def _describe_arrays(state: Any) -> Any:

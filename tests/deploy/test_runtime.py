@@ -189,6 +189,22 @@ def test_events_outside_the_window_have_no_part():
     np.testing.assert_array_equal(runtime(net).step(**window), runtime(net).step(**window | more))
 
 
+@pytest.mark.parametrize("name", ["setnet", "e2vid"])
+def test_an_event_of_an_edge_is_not_rounded_out_of_its_window(name):
+    """As 25000 * 1e-6 is below 3 / 120; an event a nanosecond outside has no part in it."""
+    net, window = network(name), events(30)
+    rounded, outside = window["t"].copy(), window["t"].copy()
+    rounded[0], rounded[-1] = np.nextafter(rounded[0], 0), np.nextafter(rounded[-1], 1)
+    given = rounded.copy()
+    found = runtime(net).step(**window | {"t": given})
+    np.testing.assert_array_equal(found, runtime(net).step(**window))
+    np.testing.assert_array_equal(given, rounded)
+    outside[0] -= 1e-9
+    later = {part: window[part][1:] for part in ("t", "x", "y", "p", "view")}
+    expected = runtime(net).step(**window | later)
+    np.testing.assert_array_equal(runtime(net).step(**window | {"t": outside}), expected)
+
+
 @pytest.mark.parametrize("rounded", ["float32", *FORMS])
 @pytest.mark.parametrize("name", ["setnet", "e2vid"])
 def test_reset_forgets_and_a_state_goes_on(name, rounded):
