@@ -25,9 +25,10 @@ from src.live_view.status import FaultLog, Meters
 from src.models.network import EventToVideoNetwork
 from src.recordings.files.event_file import ReadOptions
 from src.recordings.noise_filter import NoiseFilter
-from src.recordings.reconstruction import require_event_network, takes_all_views
+from src.recordings.reconstruction import fits_views, require_event_network, takes_all_views
 from src.recordings.sensor_lookup import build_lookup
 from src.recordings.views import Views, load_views, views_or_whole_sensor
+from src.sim.optics import Position
 
 GIL_SWITCH_S = 2e-4  # Python's own 5 ms between two threads is longer than a window
 
@@ -50,7 +51,7 @@ def build_server(cfg: DictConfig) -> PageServer:
     how = {"loop": cfg.loop, "udp_format": cfg.udp_format, "options": ReadOptions.from_keys(cfg)}
     feed = open_feed(cfg.recording, sensor, faults, **how)
     views = views_or_whole_sensor(cfg.views, feed.sensor, cfg.resolution)
-    networks = load_offered_networks(cfg, name, len(views.views))
+    networks = load_offered_networks(cfg, name, views.positions)
     settings = RunSettings(cfg.fps, cfg.bins, cfg.splat, cfg.window_length, cfg.form)
     keys = (
         "playback_speed", "max_waiting_windows", "noise_filter_s", "host", "port",
@@ -63,10 +64,13 @@ def build_server(cfg: DictConfig) -> PageServer:
     return server
 
 
-def load_offered_networks(cfg: DictConfig, name: str, views: int) -> dict[str, EventToVideoNetwork]:
+def load_offered_networks(
+    cfg: DictConfig, name: str, positions: Sequence[Position]
+) -> dict[str, EventToVideoNetwork]:
     """Return the networks to choose from; `name` is the key of the configured one.
 
-    Raises ValueError where that one wants another number of `views`; others that do are left out.
+    Raises ValueError where that one wants other views than those at `positions`; others that do are
+    left out.
     """
     networks = {}
     for other in dict.fromkeys([*cfg.offered_networks, name]):
@@ -75,8 +79,8 @@ def load_offered_networks(cfg: DictConfig, name: str, views: int) -> dict[str, E
             continue
         wanted = "offered_networks must be networks"
         networks[other] = build.load_network_of_kind(EventToVideoNetwork, cfg, other, wanted)
-    takes_all_views(networks[name], views)
-    return {other: net for other, net in networks.items() if net.views in (None, 1, views)}
+    takes_all_views(networks[name], positions)
+    return {other: net for other, net in networks.items() if fits_views(net, positions)}
 
 
 def assemble_server(

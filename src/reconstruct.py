@@ -88,7 +88,7 @@ def choose_views(cfg: DictConfig, network: EventToVideoNetwork) -> Views:
     """Return the views of the recording that the network takes."""
     sensor = sources.find_sensor_size(cfg.recording, cfg.sensor_size, ReadOptions.from_keys(cfg))
     views = views_or_whole_sensor(cfg.views, sensor, cfg.resolution)
-    all_of_them = reconstruction.takes_all_views(network, len(views.views))
+    all_of_them = reconstruction.takes_all_views(network, views.positions)
     return views if all_of_them else views.select([(0, 0)])
 
 

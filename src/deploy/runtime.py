@@ -25,7 +25,7 @@ from src.deploy.tile_batches import EagerBackend
 from src.models.e2vid import E2VID
 from src.models.folding import inference_copy
 from src.models.setnet import SetNet
-from src.sim.optics import Position
+from src.sim.optics import Position, is_arranged_as_layout, layout
 
 FORMS = ("float32", "bf16", "openvino")
 SIDE_MULTIPLE = 8  # sides are padded to it by reflection, as the networks do
@@ -55,7 +55,8 @@ class EventListRuntime:
     `positions`: (row, col) of each view; `height`, `width`: of a view's picture and of the frame.
     `form`: openvino, float32 or bf16 (PyTorch); default: the `fastest_form`.
     `threads`: of what comes behind the first layer, which takes one or two.  Raises ValueError for
-    another network, form or size and for a number of views that the network does not take.
+    another network, form or size and for views of a number that the network does not take or, of an
+    E2VID, that do not stand to each other as in `layout`.
     """
 
     def __init__(
@@ -97,6 +98,9 @@ class EventListRuntime:
             assert isinstance(copied, E2VID)
             if (given := self.views) != (views := copied.views):
                 raise ValueError(f"optics.views must be {views} for this network, got {given}")
+            if not is_arranged_as_layout(positions):
+                wanted = f"arranged as {list(layout(views))} for this network"
+                raise ValueError(f"optics.positions must be {wanted}, got {list(positions)}")
             self.runner = E2VIDOverEvents(copied, padded, dtype, backend, threads)
         self.state_arrays, self.warned = _describe_arrays(self.runner.state), set[str]()
 

@@ -18,7 +18,7 @@ from src.models.network import EventToVideoNetwork
 from src.recordings.event_windows import Window, WindowRule, cut_windows, cut_windows_backward
 from src.recordings.sensor_lookup import build_lookup
 from src.recordings.views import Views
-from src.sim.optics import Position
+from src.sim.optics import Position, is_arranged_as_layout, layout
 
 RunnableNetwork = EventToVideoNetwork | EventListRuntime
 
@@ -64,15 +64,24 @@ def require_event_network(method: nn.Module) -> EventToVideoNetwork:
     return method
 
 
-def takes_all_views(network: EventToVideoNetwork, views: int) -> bool:
-    """Return whether `network` takes all `views`; False: it takes the centre view alone.
-
-    Raises ValueError where it wants another number of views.
-    """
+def fits_views(network: EventToVideoNetwork, positions: Sequence[Position]) -> bool:
+    """Return whether `network` can be given views at `positions`, or the centre one of them."""
     wants = network.views
+    return wants in (None, 1) or (wants == len(positions) and is_arranged_as_layout(positions))
+
+
+def takes_all_views(network: EventToVideoNetwork, positions: Sequence[Position]) -> bool:
+    """Return whether `network` takes all views, at `positions`; False: the centre view alone.
+
+    Raises ValueError where it wants another number of views, or others than are there.
+    """
+    wants, views = network.views, len(positions)
     if wants not in (None, 1, views):
         has = f"the recording has {views}; give views=views.yaml"
         raise ValueError(f"ckpt wants {wants} views, {has}")
+    if not fits_views(network, positions):
+        arranged = f"arranged as {list(layout(views))}"
+        raise ValueError(f"ckpt wants views {arranged}, the recording has {list(positions)}")
     return views == 1 or (wants != 1 and not network.uses_centre_view_only)
 
 

@@ -36,6 +36,21 @@ def layout(views: int) -> tuple[Position, ...]:
     return tuple((row, col) for row in axis for col in axis)
 
 
+def is_arranged_as_layout(positions: Sequence[Position]) -> bool:
+    """Return whether `positions` stand to each other, in order, as those of `layout`, whatever
+    their spacing; True where their number has no layout."""
+    try:
+        wanted = layout(len(positions))
+    except ValueError:
+        return True
+    return _axis_ranks(positions) == _axis_ranks(wanted)
+
+
+def _axis_ranks(positions: Sequence[Position]) -> list[list[int]]:
+    axes = [[position[axis] for position in positions] for axis in range(2)]
+    return [[sorted(set(places)).index(place) for place in places] for places in axes]
+
+
 def most_central_view_index(positions: Sequence[Position]) -> int:
     """Return the index of the view nearest to (0, 0): what one camera alone would see."""
     return min(range(len(positions)), key=lambda i: sum(axis**2 for axis in positions[i]))

@@ -261,6 +261,7 @@ def go_on(live: EventListRuntime, state, **window) -> np.ndarray:
 
 
 CROWD = {"positions": [(0, k) for k in range(26)]}
+ROW = {"positions": [(0, k) for k in range(9)]}
 
 
 @pytest.mark.parametrize(
@@ -268,6 +269,9 @@ CROWD = {"positions": [(0, k) for k in range(26)]}
     [
         ("setnet", CROWD, r"optics.views must be in 1\.\.25, got 26"),
         ("e2vid", {"positions": layout(4)}, "optics.views must be 9 for this network, got 4"),
+        ("e2vid", ROW, "optics.positions must be arranged as .* for this network, got .*, 8"),
+        ("e2vid", {"positions": [(0, 0)] * 9}, "optics.positions must be arranged as"),
+        ("e2vid", {"positions": layout(9)[::-1]}, "optics.positions must be arranged as"),
         ("setnet", {"height": 7}, "height and width must be >= 8"),
         ("setnet", {"threads": 0}, "threads >= 1"),
         ("setnet", {"form": "float16"}, "form must be one of float32, bf16, openvino"),
@@ -277,6 +281,14 @@ def test_what_does_not_fit_is_named(name, options, words):
     size = {"positions": layout(9), "height": 24, "width": 32}
     with pytest.raises(ValueError, match=words):
         EventListRuntime(network(name), **size | options)
+
+
+def test_a_square_of_any_spacing_is_what_an_e2vid_takes():
+    how = {"height": 24, "width": 32, "form": "float32", "threads": 1}
+    far = [(2 * row, 5 * column + 1) for row, column in layout(9)]
+    live = EventListRuntime(network("e2vid"), positions=far, **how)
+    expected = runtime(network("e2vid")).step(**events(0))
+    np.testing.assert_array_equal(live.step(**events(0)), expected)
 
 
 def test_another_network_is_refused():

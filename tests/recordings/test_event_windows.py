@@ -12,6 +12,7 @@ from src.models.network import EventToVideoNetwork
 from src.recordings import event_windows, reconstruction, sensor_lookup, views
 from src.recordings.event_windows import WindowRule, build_window_rule
 from src.recordings.reconstruction import ReconstructionState, reconstruct_frames
+from src.sim.optics import layout
 
 EVENT = np.dtype([("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)])
 SIZE = (12, 16)
@@ -302,19 +303,31 @@ def test_view_by_view_a_network_is_given_the_window_too():
 def test_a_network_gets_the_views_it_wants(wants, there, all_views):
     network = Leaky()
     network.views = wants
-    assert reconstruction.takes_all_views(network, there) == all_views
+    assert reconstruction.takes_all_views(network, layout(there)) == all_views
 
 
 def test_a_network_that_looks_at_the_centre_view_gets_no_other():
     centre, median = HighPass(), HighPass(view_reduction="median")
-    assert [reconstruction.takes_all_views(net, 9) for net in (centre, median)] == [False, True]
+    taken = [reconstruction.takes_all_views(net, layout(9)) for net in (centre, median)]
+    assert taken == [False, True]
 
 
 def test_nine_view_weights_with_one_view_are_refused():
     network = Leaky()
     network.views = 9
     with pytest.raises(ValueError, match="wants 9 views, the recording has 1"):
-        reconstruction.takes_all_views(network, 1)
+        reconstruction.takes_all_views(network, layout(1))
+
+
+def test_nine_view_weights_take_a_square_alone():
+    network = Leaky()
+    network.views = 9
+    row, wide = [(0, k) for k in range(-4, 5)], [(2 * a, 3 * b) for a, b in layout(9)]
+    assert reconstruction.takes_all_views(network, wide)
+    with pytest.raises(ValueError, match=r"wants views arranged as .* recording has \[\(0, -4"):
+        reconstruction.takes_all_views(network, row)
+    network.views = 1
+    assert not reconstruction.takes_all_views(network, row)
 
 
 def test_pictures_are_in_range_for_any_events():
