@@ -7,7 +7,8 @@ convolution is in bytes where the CPU has instructions for them); what a network
 
 import sys
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from importlib.util import find_spec
 from typing import Any
@@ -54,7 +55,8 @@ class CompiledModule:
     """
 
     def __init__(self, module: nn.Module, example: Sequence[Tensor], threads: int):
-        model = _convert(module, tuple(example))
+        graph = _trace(module, tuple(example))
+        model = _convert(module, graph, example)
         options = {
             # What computes in bf16 says so itself: nothing else is rounded.
             "INFERENCE_PRECISION_HINT": "f32",
@@ -65,7 +67,7 @@ class CompiledModule:
         compiled = _core().compile_model(model, "CPU", options)
         self.request = compiled.create_infer_request()
         self.bound: list[list[np.ndarray]] = []
-        self.module = module  # whose weights it may read where they lie
+        self.weights = module, graph  # which it may read where they lie
         self.outputs = [(part.element_type, list(part.shape)) for part in compiled.outputs]
         self.starts = [(part.element_type, list(part.shape)) for part in compiled.inputs]
 
@@ -168,8 +170,20 @@ def _share(array: np.ndarray) -> Any:
     return _package().Tensor(array, shared_memory=True)
 
 
-def _convert(module: nn.Module, example: tuple[Tensor, ...]) -> Any:
-    """Return OpenVINO's model of `module`, what does not depend on its inputs computed.
+def _trace(module: nn.Module, example: tuple[Tensor, ...]) -> Any:
+    """Return the graph of `module`, its weights constants.
+
+    One of `torch.jit.trace` would stay in memory for good.
+    """
+    with warnings.catch_warnings(), torch.no_grad(), _explained(module):
+        warnings.simplefilter("ignore")  # of tracing, about itself
+        module.eval().requires_grad_(False)
+        # Tensors of a function are constants of the graph, those of a module would be inputs.
+        return torch.jit._get_trace_graph(lambda *given: module(*given), example, strict=False)[0]
+
+
+def _convert(module: nn.Module, graph: Any, example: Sequence[Tensor]) -> Any:
+    """Return OpenVINO's model of a `graph`, what does not depend on its inputs computed.
 
     A model of `openvino.convert_model` takes 15 to 30 % longer.
     """
@@ -177,17 +191,22 @@ def _convert(module: nn.Module, example: tuple[Tensor, ...]) -> Any:
     from openvino.frontend.pytorch.ts_decoder import TorchScriptPythonDecoder
     from openvino.passes import ConstantFolding, Manager
 
-    with warnings.catch_warnings(), torch.no_grad():
-        warnings.simplefilter("ignore")  # of tracing, about itself
-        try:
-            frontend = FrontEndManager().load_by_framework("pytorch")
-            decoder = TorchScriptPythonDecoder(module.eval(), example_input=example)
-            model = frontend.convert(frontend.load(decoder))
-        except Exception as error:  # of tracing and of OpenVINO
-            kind = type(getattr(module, "network", module)).__name__
-            raise ValueError(f"{kind} has a part that OpenVINO cannot express") from error
+    with _explained(module):
+        frontend = FrontEndManager().load_by_framework("pytorch")
+        decoder = TorchScriptPythonDecoder(module, graph, alias_db=graph.alias_db())
+        model = frontend.convert(frontend.load(decoder))
     model.reshape({k: list(part.shape) for k, part in enumerate(example)})
     passes = Manager()  # bounds of bytes are then constants, without which none are computed in
     passes.register_pass(ConstantFolding())
     passes.run_passes(model)
     return model
+
+
+@contextmanager
+def _explained(module: nn.Module) -> Iterator[None]:
+    """Raise ValueError, which names `module`, for an error of tracing or of OpenVINO."""
+    try:
+        yield
+    except Exception as error:
+        kind = type(getattr(module, "network", module)).__name__
+        raise ValueError(f"{kind} has a part that OpenVINO cannot express") from error

@@ -1,7 +1,10 @@
 """From a list of events to a frame: what the dense grid gives, without the grid."""
 
 import copy
+import gc
+import os
 import sys
+from pathlib import Path
 
 import jaxtyping
 import numpy as np
@@ -12,7 +15,7 @@ from baselines.firenet import FireNet
 from src.deploy import int8, openvino_network
 from src.deploy.cpu_features import has_int8_dot_product
 from src.deploy.int8 import MAX_ACTIVATION, MIN_CHANNELS, Int8Conv, quantise_decoder_conv
-from src.deploy.openvino_network import OpenVinoNetwork
+from src.deploy.openvino_network import CompiledModule, OpenVinoNetwork
 from src.deploy.runtime import EventListRuntime
 from src.models.e2vid import E2VID
 from src.models.setnet import SetNet
@@ -332,6 +335,29 @@ def test_openvino_refuses_a_state_of_another_size_and_a_batch(unchecked):
         found(torch.zeros(1, 9, 5, 24, 24), state)
     with pytest.raises(ValueError, match="form=openvino takes one clip on device=cpu, got 2"):
         found(torch.zeros(2, 9, 5, 16, 16))
+
+
+def resident_mb() -> float:
+    gc.collect()
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+@OPENVINO
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux")
+def test_what_was_compiled_leaves_no_memory_behind():
+    """A graph of torch.jit.trace stays for good, with these weights of 16 MB."""
+    example = [torch.zeros(1, 2048)]
+    CompiledModule(torch.nn.Linear(2048, 2048), example, 1)
+    before = resident_mb()
+    for _ in range(6):
+        CompiledModule(torch.nn.Linear(2048, 2048), example, 1)
+    assert resident_mb() - before < 40
+
+
+@OPENVINO
+def test_a_part_that_openvino_cannot_express_is_named():
+    with pytest.raises(ValueError, match="Identity has a part that OpenVINO cannot express"):
+        CompiledModule(torch.nn.Identity(3), [torch.zeros(1), torch.zeros(1)], 1)
 
 
 def test_bytes_round_to_half_a_step():
