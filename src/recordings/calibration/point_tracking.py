@@ -2,11 +2,12 @@
 
 The template is the mean frame, shifted; frames are never interpolated.  A window of a frame, a
 shift and a change of contrast and brightness of the template are fitted to each other by
-Gauss-Newton steps from OpenCV's optical flow.  The last step is taken twice, from the two colours
-of a chessboard of pixels: their noise is independent, so that the product of the two displacements
-estimates the power of the motion without that of the noise.
+Gauss-Newton steps from OpenCV's optical flow.  From there the two colours of a chessboard of pixels
+are fitted each by itself until it converges: their noise is independent, so that the product of the
+two displacements estimates the power of the motion without that of the noise.
 """
 
+import copy
 from dataclasses import dataclass
 
 import cv2
@@ -14,7 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 SPREAD, REACH = 2.0, 5  # pixels: deviation and half width of the Gaussian window
-STEPS = 4
+STEPS, COLOUR_STEPS = 4, 8  # of both colours together, then of each by itself at most
+CONVERGED_PX = 0.005  # a point whose step is shorter is done
 MAX_STEP = 2.0  # pixels
 MIN_EXPLAINED = 0.8  # of a window's variance, or the point is lost in that frame
 MAX_RELATIVE = 4.0  # times the typical displacement: further off is another part of the scene
@@ -121,9 +123,27 @@ def _refine(
     """Return displacement (2, points, 2), sharpness (2, points), explained variance (points,)."""
     for _ in range(STEPS):
         moved = moved + windows.step(frame, moved)[0]
-    halves = [moved + windows.step(frame, moved, colour)[0] for colour in (0, 1)]
+    halves = [_refine_colour(windows, frame, moved, colour) for colour in (0, 1)]
     sharp = [windows.sharpness(frame, moved, colour) for colour in (0, 1)]
     return np.stack(halves), np.stack(sharp), windows.step(frame, moved)[1]
+
+
+def _refine_colour(
+    windows: "_Windows", frame: np.ndarray, start: np.ndarray, colour: int
+) -> np.ndarray:
+    """Return the displacements (points, 2) in pixels at which the pixels of one `colour` fit best.
+
+    One step from `start`, the optimum of both colours, is not enough: central differences are less
+    than the slope of an edge, so that it is too long, and the noise of the two is anticorrelated.
+    """
+    moved, moving = start.copy(), np.arange(len(start))
+    for _ in range(COLOUR_STEPS):
+        step = windows.select(moving).step(frame, moved[moving], colour)[0]
+        moved[moving] += step
+        moving = moving[np.hypot(*step.T) > CONVERGED_PX]
+        if not moving.size:
+            break
+    return moved
 
 
 class _Windows:
@@ -141,6 +161,12 @@ class _Windows:
         share /= np.maximum(share.sum(1, keepdims=True), 1e-12)
         spread = share @ (u**2 + v**2) - (share @ u) ** 2 - (share @ v) ** 2
         self.window_variance_px2 = float(spread.mean() / 2)
+
+    def select(self, points: np.ndarray) -> "_Windows":
+        """Return the windows of some of the points, to take steps with."""
+        some = copy.copy(self)
+        some.home, some.place = self.home[points], self.place[points]
+        return some
 
     def step(
         self, frame: np.ndarray, moved: np.ndarray, colour: int | None = None

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from src.calibrate import calibrate, measure_turbulence_in_video
-from src.recordings.calibration import point_tracking, turbulence_meter
+from src.recordings.calibration import point_tracking, tilt_covariance, turbulence_meter
 from src.recordings.files import videos
 from src.recordings.files.turbulence_file import IntervalEstimate, read_turbulence_file
 from tests.test_recording_entry_points import config
@@ -142,6 +142,22 @@ def test_points_lie_on_corners_not_on_edges():
     assert len(found) > 0
     apart = np.hypot(found[:, 0] - 30, np.minimum(abs(found[:, 1] - 40), abs(found[:, 1] - 90)))
     assert apart.max() < 5
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.03])
+def test_noise_of_the_two_displacements_is_independent(noise):
+    frames = film(np.zeros((30, 2, SIDE, SIDE)), noise)
+    tracks = point_tracking.track_points(frames, point_tracking.find_corners(frames.mean(0)))
+    first, second = tilt_covariance.centre_displacements(
+        tracks.select(tracks.seen.mean(0) > turbulence_meter.MIN_FOUND)
+    )
+    assert abs((first * second).mean()) < 0.1 * (first**2).mean()
+
+
+def test_weak_tilt_in_noise_is_not_underestimated():
+    push = fields(10 / UNIT, 0.12 / UNIT, 0.5, 40)
+    found = turbulence_meter.measure_turbulence(film(push, 0.03)).found.rms_px
+    assert found.value == pytest.approx(0.12, rel=0.3)
 
 
 def pan(px: float) -> np.ndarray:
