@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from src.deploy.explicit_state import ExplicitStateNetwork
+from src.deploy.picture_size import check_sides
 from src.models.folding import inference_copy
 from src.models.network import WINDOW_S, EventToVideoNetwork
 from src.records.atomic import atomic_path
@@ -34,10 +35,12 @@ def export_onnx(
 ) -> "OnnxNetwork":  # fmt: skip
     """Write `network` to `path`, spectral norm folded; return what runs it, checked against it.
 
-    Raises ValueError without the packages, for a network that ONNX cannot express, and where the
-    two differ by more than TOLERANCE over a few windows of noise; then `path` is as it was.
+    Raises ValueError without the packages, for sides below 8, for a network that ONNX cannot
+    express, and where the two differ by more than TOLERANCE over a few windows of noise; then
+    `path` is as it was.
     """
     require_onnx()
+    check_sides(height, width)
     path = Path(path)
     if not path.parent.is_dir():
         raise ValueError(f"path must be in a folder that is there, got {path}")

@@ -20,6 +20,7 @@ from src.deploy.cpu_features import is_bf16_faster
 from src.deploy.engines import events_numba as kernels
 from src.deploy.first_layer import E2VIDOverEvents
 from src.deploy.int8 import quantise_decoder_conv
+from src.deploy.picture_size import check_sides
 from src.deploy.setnet_tiles import SetNetTiles
 from src.deploy.tile_batches import EagerBackend
 from src.models.e2vid import E2VID
@@ -29,7 +30,6 @@ from src.sim.optics import Position, is_arranged_as_layout, layout
 
 FORMS = ("float32", "bf16", "openvino")
 SIDE_MULTIPLE = 8  # sides are padded to it by reflection, as the networks do
-MIN_SIDE = 8  # side that can be padded so
 LEAST_INSIDE = 0.01  # of the events given for a window
 LONGEST_WINDOW_S = 10.0  # beyond, times are hardly in seconds
 LEAST_TIME_STEPS = 1000  # of the type of `t` in a window
@@ -75,11 +75,9 @@ class EventListRuntime:
         if not supports_event_lists(network):
             kind = type(network).__name__
             raise ValueError(f"a list of events needs a SetNet or an E2VID, got {kind}")
-        if min(height, width) < MIN_SIDE or threads < 1:
-            raise ValueError(
-                f"height and width must be >= {MIN_SIDE} and threads >= 1, got {height}, {width}"
-                f" and {threads}"
-            )
+        check_sides(height, width)
+        if threads < 1:
+            raise ValueError(f"threads must be >= 1, got {threads}")
         self.views, self.size = len(positions), (height, width)
         missing = [-side % SIDE_MULTIPLE for side in self.size]  # as pad_centred_to_multiple
         self.padding = [(more // 2, more - more // 2) for more in missing]

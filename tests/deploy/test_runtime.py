@@ -275,8 +275,12 @@ ROW = {"positions": [(0, k) for k in range(9)]}
         ("e2vid", ROW, "optics.positions must be arranged as .* for this network, got .*, 8"),
         ("e2vid", {"positions": [(0, 0)] * 9}, "optics.positions must be arranged as"),
         ("e2vid", {"positions": layout(9)[::-1]}, "optics.positions must be arranged as"),
-        ("setnet", {"height": 7}, "height and width must be >= 8"),
-        ("setnet", {"threads": 0}, "threads >= 1"),
+        (
+            "setnet",
+            {"height": 7},
+            "must be >= 8 px .*resolution, else sensor_size.*, got 7 and",
+        ),
+        ("setnet", {"threads": 0}, "threads must be >= 1, got 0"),
         ("setnet", {"form": "float16"}, "form must be one of float32, bf16, openvino"),
     ],
 )
