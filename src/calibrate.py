@@ -120,6 +120,12 @@ def measure_dot_statistics(cfg: DictConfig, run: Path) -> dot_statistics.DotStat
     """
     if not cfg.still:
         raise ValueError("still must be the same dots without turbulence, got none")
+    for key in ("still", "recording"):
+        if not Path(cfg[key]).exists():
+            raise ValueError(
+                f"{key} must be a film, a folder of pictures or events, got {cfg[key]}, which"
+                f" does not exist"
+            )
     given = cfg.ckpt or cfg.get("baseline")
     network = (
         reconstruction.require_event_network(build.load_ckpt_or_baseline(cfg)) if given else None
@@ -129,6 +135,12 @@ def measure_dot_statistics(cfg: DictConfig, run: Path) -> dot_statistics.DotStat
     still_films, turbulent_films = (
         _read_films(cfg, path, views, network) for path in (cfg.still, cfg.recording)
     )
+    size, still_size = turbulent_films.shape[2:], still_films.shape[2:]
+    if size != still_size:
+        raise ValueError(
+            f"still must have pictures of the size of the recording's, {size[0]}x{size[1]}, got"
+            f" {still_size[0]}x{still_size[1]}"
+        )
     centre = positions.index((0, 0))
     places = dot_statistics.find_dots(still_films[centre].mean(0), dots.rows, dots.cols, dots.dark)
     reach = dots.fit_radius_px or dot_statistics.choose_fit_radius(places)
@@ -180,8 +192,6 @@ def measure_turbulence_in_video(
     video, most, fps = cfg.video, cfg.air.max_frames, cfg.fps
     if not Path(video).exists():
         raise ValueError(f"video must be a film or a folder of pictures, got {video}")
-    if fps is not None and not 0 < fps < np.inf:
-        raise ValueError(f"fps must be > 0 frames a second, got {fps}")
     if most < (least := turbulence_meter.MIN_FRAMES):
         raise ValueError(f"air.max_frames must be at least {least}, got {most}")
     frames = videos.read_video(video, "video", most)
@@ -207,9 +217,14 @@ TASKS: dict[str, Callable[[DictConfig, Path], dict]] = {
 
 
 def calibrate(cfg: DictConfig) -> dict:
-    """Do `cfg.task`; everything goes below `cfg.paths.run`.  Raises ValueError for another task."""
+    """Do `cfg.task`; everything goes below `cfg.paths.run`.
+
+    Raises ValueError for another task and for an `fps` that is not a number > 0.
+    """
     if cfg.task not in TASKS:
         raise ValueError(f"task must be one of {', '.join(TASKS)}, got {cfg.task}")
+    if cfg.fps is not None and not 0 < cfg.fps < np.inf:
+        raise ValueError(f"fps must be > 0 frames a second, got {cfg.fps}")
     if cfg.fps is None and cfg.task != "air":
         is_film = cfg.task == "turbulence" and not sources.has_events(cfg.recording)
         stated = videos.read_fps(cfg.recording, "recording") if is_film else None

@@ -1,7 +1,8 @@
 """Turbulence statistics of a dot grid seen by several views (the paper's supplement).
 
-Tilt is a dot's displacement from where it lies without turbulence, blur the mean spread of its
-Gaussian, intensity its flux over the flux's mean in time.  Lengths are pixels of the pictures
+Tilt is a dot's displacement from where it lies without turbulence, less how far the whole grid
+moved between the two recordings (as a camera that was touched moves it), blur the mean spread of
+its Gaussian, intensity its flux over the flux's mean in time.  Lengths are pixels of the pictures
 given, times seconds.  Frames in which a fit failed are left out of every mean and counted.
 """
 
@@ -24,13 +25,17 @@ from src.records.results import format_csv, write_text
 @dataclass(frozen=True)
 class DotStatistics:
     """Tilt, blur and relative intensity with turbulence, `still_` ones without; NaN where a fit
-    failed.  Dots are in order row by row; `centre_view`: the index of the centre view."""
+    failed.  Dots are in order row by row; `centre_view`: the index of the centre view;
+    `mean_displacement`: of a view's grid between the recordings, in pixels, not part of the tilt.
+    """
 
     fps: float
     centre_view: int
     tilt: Float[np.ndarray, "views frames dots 2"]
     blur: Float[np.ndarray, "views frames dots"]
     relative_intensity: Float[np.ndarray, "views frames dots"]
+    mean_displacement: Float[np.ndarray, "views 2"]
+    still_tilt: Float[np.ndarray, "views still dots 2"]
     still_blur: Float[np.ndarray, "views dots"]
     still_relative_intensity: Float[np.ndarray, "views still dots"]
 
@@ -82,6 +87,8 @@ class DotStatistics:
             "frames": self.tilt.shape[1],
             "failed": int(self.failed.sum()),
             "tilt_rms_px": float(np.sqrt(_mean(self.tilt[view, :, dot] ** 2, None))),
+            "still_tilt_rms_px": float(np.sqrt(_mean(self.still_tilt[view, :, dot] ** 2, None))),
+            "mean_displacement_px": float(np.hypot(*self.mean_displacement[view])),
             "tilt_decay_s": float(decay_time_s(self.middle_dot_autocorrelation, self.fps)),
             "across_views": float(_mean(self.tilt_correlation_across_views[off], None)),
             "blur_over_still": float(self.blur_over_still[view, dot]),
@@ -110,10 +117,15 @@ def compare_with_still(
             f"turbulence: every dot must be fitted in some frame, got none for (view, dot)"
             f" {np.argwhere(lost).tolist()}; look at the picture, change dots.fit_radius_px"
         )
+    displaced = np.stack([fits.centres for fits in turbulent]) - reference[:, None]
+    # Dots count alike, however many frames of them failed.
+    mean_displacement = _mean(displaced, 1).mean(1)
     return DotStatistics(
         fps=fps,
         centre_view=centre_view,
-        tilt=np.stack([fits.centres for fits in turbulent]) - reference[:, None],
+        tilt=displaced - mean_displacement[:, None, None],
+        mean_displacement=mean_displacement,
+        still_tilt=np.stack([fits.centres for fits in still]) - reference[:, None],
         blur=np.stack([fits.blur for fits in turbulent]),
         relative_intensity=np.stack([fits.flux / _mean(fits.flux, 0) for fits in turbulent]),
         still_blur=np.stack([_mean(fits.blur, 0) for fits in still]),

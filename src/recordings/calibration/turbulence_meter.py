@@ -25,6 +25,7 @@ MIN_SHARE = 0.2  # of the corners must be tracked: where the camera moves, fewer
 MAX_RELATIVE_POWER = 9.0  # times the median power: such a point moves by itself
 MAX_DRIFT_PX = 4.0  # between the quarters of a video: more is a camera that moves
 MIN_RMS_PX = 0.01  # less is the error of tracking
+MIN_OVER_NOISE = 0.15  # of the power of tilt over that of noise: up to 0.09 is found without tilt
 DRAWS = 200
 SHARPEST = 0.1  # the sharpest tenth
 # Errors of the method at 95 %, of the logarithm, added to the intervals, from clips of known
@@ -84,10 +85,7 @@ def measure_turbulence(
     tilt = describe(np.ones(len(frames)), np.ones(CELLS**2))
     rms_px = tilt.power_px2**0.5 * unit
     if rms_px < MIN_RMS_PX:
-        raise ValueError(
-            f"video must show a scene through turbulent air, got a tilt of {rms_px:.3f} px rms"
-            f" of {SIDE} at {len(tracks.place)} points, which is none"
-        )
+        raise _no_tilt(rms_px, len(tracks.place), "which is none")
     drawn = [describe(*chosen) for chosen in _resampled(len(frames), 2 * tilt.decay_frames)]
     numbers = _summarize_tilt(tilt, drawn, unit, fps, len(lags.at))
     numbers["blur_ratio"] = estimate_blur_ratio(*_track_at_side(frames, tracks))
@@ -190,8 +188,35 @@ def _select_still(tracks: PointTracks, size: tuple[int, int]) -> PointTracks:
             f"video must show a scene that stands still, got one that moves by {drift:.0f} px of"
             f" {SIDE}; {share}"
         )
+    return _select_alike(tracks, SIDE / min(size))
+
+
+def _select_alike(tracks: PointTracks, unit: float) -> PointTracks:
+    """Return the points that move about as much as most do; raises ValueError where noise hides
+    that or fewer than MIN_POINTS are left.  `unit`: pixels of SIDE in a pixel of the frames."""
     power = tilt_covariance.tilt_variance_per_axis(tracks)
-    return tracks.select(power < MAX_RELATIVE_POWER * np.median(power))
+    typical = float(np.median(power))
+    if typical <= 0:  # half of the points show noise alone
+        raise _no_tilt(0.0, len(power), "which is none")
+    alike = power < MAX_RELATIVE_POWER * typical
+    if alike.sum() < MIN_POINTS:
+        wanted = f"at least {MIN_POINTS} points are wanted"
+        raise _no_tilt(math.sqrt(typical) * unit, int(alike.sum()), wanted)
+    tracks = tracks.select(alike)
+    first, second = tilt_covariance.centre_displacements(tracks)
+    tilt, noise = float((first * second).mean()), float(((first - second) ** 2).mean() / 2)
+    if tilt < MIN_OVER_NOISE * noise:
+        rms_px = math.sqrt(max(tilt, 0.0)) * unit
+        raise _no_tilt(rms_px, len(tracks.place), "which is none beside the noise")
+    return tracks
+
+
+def _no_tilt(rms_px: float, points: int, reason: str) -> ValueError:
+    """Return the error of footage without tilt that can be measured; `rms_px` of SIDE."""
+    return ValueError(
+        f"video must show a scene through turbulent air, got a tilt of {rms_px:.3f} px rms"
+        f" of {SIDE} at {points} points, {reason}"
+    )
 
 
 def _resampled(frames: int, block: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -2,11 +2,14 @@
 
 import csv
 
+import cv2
 import numpy as np
 import pytest
 
+from src.calibrate import calibrate
 from src.recordings.calibration import dot_statistics, gaussian_dots
 from tests.recordings.pictures import dot_grid
+from tests.test_recording_entry_points import config
 
 GRID = np.array([[x, y] for y in (20.0, 48.0, 76.0) for x in (20.0, 48.0, 76.0)])
 
@@ -140,6 +143,19 @@ def test_measure_compares_with_the_still_recording():
     ) and found.tilt_correlation_across_views.shape == (2, 2)
 
 
+def test_a_grid_that_lies_elsewhere_is_not_tilted():
+    fits = []
+    for frames, away in ((10, 0.0), (40, 1.5)):
+        centres = np.broadcast_to(GRID + away, (frames, 9, 2))
+        seen = dot_grid(centres, np.full((frames, 9), 2.0), np.full((frames, 9), -0.6))
+        seen = seen + np.random.default_rng(frames).normal(0, 0.01, seen.shape)
+        fits.append(gaussian_dots.fit_gaussians(seen, GRID, 12))
+    still, moved = fits
+    found = dot_statistics.compare_with_still([moved], [still], fps=60.0, centre_view=0).summary()
+    assert found["tilt_rms_px"] < 0.05 and found["still_tilt_rms_px"] < 0.05
+    assert found["mean_displacement_px"] == pytest.approx(1.5 * np.sqrt(2), rel=0.02)
+
+
 def test_measure_rejects_a_dot_without_a_reference():
     pictures = noisy_grid(5, 0.01)[3]
     good = gaussian_dots.fit_gaussians(pictures, GRID, 12)
@@ -165,6 +181,36 @@ def test_find_dots_orders_row_by_row():
 def test_find_dots_rejects_a_picture_without_them():
     with pytest.raises(ValueError, match="3x3 grid"):
         dot_statistics.find_dots(np.random.default_rng(0).random((96, 96)), 3, 3)
+
+
+def write_film(folder, frames: int, side: int = 96):
+    """Return a folder of `frames` pictures of the dots, with `side` pixels a side."""
+    folder.mkdir()
+    sigma, depth = np.full((frames, 9), 2.5), np.full((frames, 9), -0.6)
+    seen = dot_grid(np.broadcast_to(GRID, (frames, 9, 2)), sigma, depth, side)
+    for number, picture in enumerate(seen):
+        cv2.imwrite(str(folder / f"{number:03}.png"), np.round(picture.clip(0, 1) * 255))
+    return folder
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        ("fps=0", "fps must be > 0 frames a second, got 0"),
+        ("fps=inf", "fps must be > 0 frames a second, got inf"),
+        ("still={folder}/larger", r"still must have pictures of the size .* 96x96, got 120x120"),
+        ("still={folder}/nowhere", "still must be .*, got .*nowhere, which does not exist"),
+    ],
+)
+def test_calibrate_refuses_wrong_films_before_it_fits(wrong, message, tmp_path, monkeypatch):
+    monkeypatch.delattr(gaussian_dots, "fit_gaussians")
+    dots, still = (write_film(tmp_path / name, 2) for name in ("dots", "still"))
+    write_film(tmp_path / "larger", 2, 120)
+    given = ["task=turbulence", f"recording={dots}", f"still={still}", "fps=60"]
+    given.append(wrong.format(folder=tmp_path))
+    with pytest.raises(ValueError, match=message) as caught:
+        calibrate(config("calibrate", tmp_path / "run", *given))
+    assert "\n" not in str(caught.value)
 
 
 def test_ground_follows_the_vignette_under_the_dots():

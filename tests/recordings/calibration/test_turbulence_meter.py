@@ -154,6 +154,13 @@ def test_noise_of_the_two_displacements_is_independent(noise):
     assert abs((first * second).mean()) < 0.1 * (first**2).mean()
 
 
+@pytest.mark.parametrize("noise", [0.03, 0.05])
+def test_noise_alone_is_no_tilt(noise):
+    frames = film(np.zeros((60, 2, SIDE, SIDE)), noise)
+    with pytest.raises(ValueError, match=r"turbulent air, got a tilt of 0.0\d* .* at \d\d+ points"):
+        turbulence_meter.measure_turbulence(frames, 30.0)
+
+
 def test_weak_tilt_in_noise_is_not_underestimated():
     push = fields(10 / UNIT, 0.12 / UNIT, 0.5, 40)
     found = turbulence_meter.measure_turbulence(film(push, 0.03)).found.rms_px
