@@ -3,7 +3,7 @@
 The dense grid is never made: an event adds its patch of the first layer's kernel to that layer's
 map (`first_layer.py`), and what comes behind runs on OpenVINO or PyTorch.  Equal to the network's
 `forward` on `voxel_grid`s up to the order of sums in float32 (1e-5 in a frame, `form="float32"`)
-or to bf16's rounding (0.02).
+or to bf16's rounding (0.04).
 """
 
 import warnings
@@ -135,7 +135,8 @@ class EventListRuntime:
     @property
     def state(self) -> Any:
         """What lives from window to window, for `state = ...`; later windows advance it in place,
-        so that going back to it takes a `copy.deepcopy`.  Set to None it is that of `reset`.
+        so that going back to it takes a `copy.deepcopy`.  Set to None it is that of `reset`.  An
+        E2VID's on OpenVINO holds OpenVINO's tensors, which cannot be pickled.
 
         Raises ValueError where it is set to one of other arrays: of another kind of network, size
         or, of a SetNet, number of views, of an E2VID, form.
