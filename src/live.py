@@ -25,7 +25,7 @@ from src.live_view.status import FaultLog, Meters
 from src.models.network import EventToVideoNetwork
 from src.recordings.files.event_file import ReadOptions
 from src.recordings.noise_filter import NoiseFilter
-from src.recordings.reconstruction import fits_views, require_event_network, takes_all_views
+from src.recordings.reconstruction import accepts_views, require_event_network, takes_all_views
 from src.recordings.sensor_lookup import build_lookup
 from src.recordings.views import Views, load_views, views_or_whole_sensor
 from src.sim.optics import Position
@@ -80,7 +80,7 @@ def load_offered_networks(
         wanted = "offered_networks must be networks"
         networks[other] = build.load_network_of_kind(EventToVideoNetwork, cfg, other, wanted)
     takes_all_views(networks[name], positions)
-    return {other: net for other, net in networks.items() if fits_views(net, positions)}
+    return {other: net for other, net in networks.items() if accepts_views(net, positions)}
 
 
 def assemble_server(

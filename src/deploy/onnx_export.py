@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from src.deploy.explicit_state import ExplicitStateNetwork
-from src.deploy.picture_size import check_sides
+from src.deploy.picture_size import check_picture_size
 from src.models.folding import inference_copy
 from src.models.network import WINDOW_S, EventToVideoNetwork
 from src.records.atomic import atomic_path
@@ -40,7 +40,7 @@ def export_onnx(
     `path` is as it was.
     """
     require_onnx()
-    check_sides(height, width)
+    check_picture_size(height, width)
     path = Path(path)
     if not path.parent.is_dir():
         raise ValueError(f"path must be in a folder that is there, got {path}")

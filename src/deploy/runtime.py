@@ -20,7 +20,7 @@ from src.deploy.cpu_features import is_bf16_faster
 from src.deploy.engines import events_numba as kernels
 from src.deploy.first_layer import E2VIDOverEvents
 from src.deploy.int8 import quantise_decoder_conv
-from src.deploy.picture_size import check_sides
+from src.deploy.picture_size import check_picture_size
 from src.deploy.setnet_tiles import SetNetTiles
 from src.deploy.tile_batches import EagerBackend
 from src.models.e2vid import E2VID
@@ -75,7 +75,7 @@ class EventListRuntime:
         if not supports_event_lists(network):
             kind = type(network).__name__
             raise ValueError(f"a list of events needs a SetNet or an E2VID, got {kind}")
-        check_sides(height, width)
+        check_picture_size(height, width)
         if threads < 1:
             raise ValueError(f"threads must be >= 1, got {threads}")
         self.views, self.size = len(positions), (height, width)

@@ -161,7 +161,7 @@ class FeedReader:
     def _filter_noise(self, events: np.ndarray) -> np.ndarray:
         if self.noise_filter is None:
             return events
-        return self.noise_filter(self.cutter.drop_off_sensor(events))
+        return self.noise_filter(self.cutter.drop_events_off_sensor(events))
 
     def _offer(self, chunk: tuple[np.ndarray, float] | str, stopped: threading.Event) -> None:
         """Queue a chunk or the last state; a live stream loses its oldest chunk, a file waits."""

@@ -75,7 +75,7 @@ class WindowCutter:
     def add(self, events: np.ndarray) -> bool:
         """Take a chunk, less events off the sensor; return whether the clock restarted, as after a
         jump back in time."""
-        events = self.drop_off_sensor(events)
+        events = self.drop_events_off_sensor(events)
         order = self.order
         part, last_us = order.parts[-1], order.last_us
         order.add(events)
@@ -132,7 +132,7 @@ class WindowCutter:
         assert self.origin_us is not None
         return self.origin_us + windows * 1e6 / self.fps
 
-    def drop_off_sensor(self, events: np.ndarray) -> np.ndarray:
+    def drop_events_off_sensor(self, events: np.ndarray) -> np.ndarray:
         """Return the events on the sensor; reports how many are not."""
         height, width = self.sensor
         if not events.size or (events["x"].max() < width and events["y"].max() < height):

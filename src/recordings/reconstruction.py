@@ -64,7 +64,7 @@ def require_event_network(method: nn.Module) -> EventToVideoNetwork:
     return method
 
 
-def fits_views(network: EventToVideoNetwork, positions: Sequence[Position]) -> bool:
+def accepts_views(network: EventToVideoNetwork, positions: Sequence[Position]) -> bool:
     """Return whether `network` can be given views at `positions`, or the centre one of them."""
     wants = network.views
     return wants in (None, 1) or (wants == len(positions) and is_arranged_as_layout(positions))
@@ -79,7 +79,7 @@ def takes_all_views(network: EventToVideoNetwork, positions: Sequence[Position])
     if wants not in (None, 1, views):
         has = f"the recording has {views}; give views=views.yaml"
         raise ValueError(f"ckpt wants {wants} views, {has}")
-    if not fits_views(network, positions):
+    if not accepts_views(network, positions):
         arranged = f"arranged as {list(layout(views))}"
         raise ValueError(f"ckpt wants views {arranged}, the recording has {list(positions)}")
     return views == 1 or (wants != 1 and not network.uses_centre_view_only)

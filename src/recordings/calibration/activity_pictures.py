@@ -79,7 +79,7 @@ def band_pass_log(
     return np.stack(bands)
 
 
-def find_coarse_structure(
+def extract_coarse_edges(
     pictures: Float[np.ndarray, "*windows h w"],
 ) -> tuple[Float[np.ndarray, "n small_h small_w"], int]:
     """Return the edges of pictures shrunk to LINES or more, and the factor in pixels."""
@@ -96,7 +96,7 @@ def keep_windows_with_motion(pictures: Pictures) -> Float[np.ndarray, "kept kind
     y, x = np.indices(pictures.shape[-2:])
     every_second = ((y + x) % 2).astype(np.float32)
     one, other = (
-        find_coarse_structure(pictures * kept)[0].reshape(len(pictures), -1)
+        extract_coarse_edges(pictures * kept)[0].reshape(len(pictures), -1)
         for kept in (every_second, 1 - every_second)
     )
     square = (one * other).mean(1)

@@ -15,7 +15,7 @@ import yaml
 from jaxtyping import Float, UInt8
 
 from src.recordings.calibration.boards import Points, Target, cluster_points
-from src.recordings.calibration.view_numbering import number_views
+from src.recordings.calibration.view_numbering import assign_view_positions
 from src.recordings.views import HeightWidth, View, Views
 from src.records import safe_yaml
 from src.sim.optics import Position
@@ -51,7 +51,7 @@ def find_target(
     clusters = [cluster for cluster in clusters if _shows_target(picture, cluster, target)]
     points: dict[Position, Points] = {}
     mirrored: dict[Position, tuple[bool, bool]] = {}
-    positions = number_views(clusters, picture.shape)
+    positions = assign_view_positions(clusters, picture.shape)
     for position, cluster in zip(positions, clusters, strict=True):
         row, col = position
         physical = (bool(are_mirrored and col % 2), bool(are_mirrored and row % 2))

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from src.recordings.calibration.activity_pictures import find_coarse_structure
+from src.recordings.calibration.activity_pictures import extract_coarse_edges
 from src.sim.optics import Position
 
 MIN_SCORE = 0.2  # of the energy that neighbours share; other scenes have 0.1 at most
@@ -84,7 +84,7 @@ def find_grid(pictures: Float[np.ndarray, "*windows h w"]) -> ViewGrid:
 
     Raises ValueError where neither columns nor rows of views repeat.
     """
-    structure, step = find_coarse_structure(pictures)
+    structure, step = extract_coarse_edges(pictures)
     small = _level(structure)
     x = find_axis(np.einsum("kyx,kyz->xz", small, small, optimize=True))
     y = find_axis(np.einsum("kyx,kzx->yz", small, small, optimize=True))

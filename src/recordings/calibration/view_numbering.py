@@ -14,7 +14,7 @@ MISSING_LINE = 0.2  # a gap is two pitches from 1.7 on, as targets off the middl
 Places = Float[np.ndarray, " k"]
 
 
-def number_views(targets: Sequence[Points], sensor: HeightWidth) -> list[Position]:
+def assign_view_positions(targets: Sequence[Points], sensor: HeightWidth) -> list[Position]:
     """Return (row, col) from the centre view for the points of the target in each view: rows and
     columns apart, as views need not be square."""
     if not targets:

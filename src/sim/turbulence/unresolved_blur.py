@@ -35,7 +35,7 @@ def blur_by_unresolved_modes(
     count = next_fast_len(2 * max(size, fine), real=True)
     nu = torch.fft.fftfreq(count, dtype=torch.float64) * SAMPLES_PER_LAMBDA_OVER_D
     distance = torch.hypot(nu[:, None], nu[: count // 2 + 1])
-    structure = np.interp(distance.numpy(), DISTANCES, structure_function())
+    structure = np.interp(distance.numpy(), DISTANCES, unresolved_structure_function())
     transfer = torch.from_numpy(np.exp(-structure / 2 * d_over_r0 ** (5 / 3)))
     spectrum = torch.fft.rfft2(psfs, s=(count, count)) * transfer.to(psfs)
     middle = size // 2 - fine // 2
@@ -44,7 +44,7 @@ def blur_by_unresolved_modes(
 
 
 @cache
-def structure_function() -> Float[np.ndarray, " distances"]:
+def unresolved_structure_function() -> Float[np.ndarray, " distances"]:
     """Return the structure function of the modes beyond, at D/r0 = 1 and DISTANCES, in rad^2."""
     power, step = SPECTRUM * KAPPA ** (-11 / 3), math.log(KAPPA[1] / KAPPA[0])
     resolved = sum(

@@ -8,7 +8,7 @@ import pytest
 from src.recordings.calibration import view_alignment
 from src.recordings.calibration.boards import Checkerboard
 from src.recordings.calibration.view_grid import ViewAxis, ViewGrid
-from src.recordings.calibration.view_numbering import number_views
+from src.recordings.calibration.view_numbering import assign_view_positions
 from src.recordings.views import Views
 from tests.recordings import pictures
 
@@ -78,14 +78,14 @@ def show_targets(rows, cols, tile, sensor, turn_degrees=0.0, off=(0.0, 0.0), mis
 def test_targets_off_the_middle_of_their_views(rows, cols, width, off):
     sensor = (240 * rows, width * cols)
     targets, positions = show_targets(rows, cols, (240, width), sensor, off=off)
-    assert number_views(targets, sensor) == positions
+    assert assign_view_positions(targets, sensor) == positions
 
 
 @pytest.mark.parametrize("degrees", [-20, 10, 20])
 @pytest.mark.parametrize("tile", [(230, 230), (240, 426)])
 def test_views_turned_on_the_sensor(tile, degrees):
     targets, positions = show_targets(3, 3, tile, (720, 1280), degrees)
-    assert number_views(targets, (720, 1280)) == positions
+    assert assign_view_positions(targets, (720, 1280)) == positions
 
 
 ROW, COL = [(1, col) for col in (-1, 0, 1)], [(row, -1) for row in (-1, 0, 1)]
@@ -97,17 +97,19 @@ ROW, COL = [(1, col) for col in (-1, 0, 1)], [(row, -1) for row in (-1, 0, 1)]
 @pytest.mark.parametrize("tile", [(230, 230), (240, 426)])
 def test_views_that_do_not_show_the_target_keep_the_numbers_of_others(tile, missing):
     targets, positions = show_targets(3, 3, tile, (720, 1280), missing=missing)
-    assert number_views(targets, (720, 1280)) == positions
+    assert assign_view_positions(targets, (720, 1280)) == positions
 
 
 @pytest.mark.parametrize("missing", [-2, 1, 2])
 def test_a_row_of_views_with_one_that_does_not_show_the_target(missing):
     targets, positions = show_targets(1, 5, (240, 240), (300, 1200), missing=[(0, missing)])
-    assert number_views(targets, (300, 1200)) == positions
+    assert assign_view_positions(targets, (300, 1200)) == positions
 
 
 def test_two_targets_at_one_position_are_refused(monkeypatch):
-    monkeypatch.setattr(view_alignment, "number_views", lambda targets, _: [(0, 0)] * len(targets))
+    monkeypatch.setattr(
+        view_alignment, "assign_view_positions", lambda targets, _: [(0, 0)] * len(targets)
+    )
     message = r"view \(0, 0\) must show one target, got two at pixels \(x, y\) \(\d+, \d+\) and"
     with pytest.raises(ValueError, match=message):
         view_alignment.find_target(show_boards(1, 2), Checkerboard(5, 7))

@@ -4,14 +4,17 @@ import pytest
 import torch
 
 from scripts.exact_psf import fraunhofer_psf
-from src.sim.turbulence.unresolved_blur import blur_by_unresolved_modes, structure_function
+from src.sim.turbulence.unresolved_blur import (
+    blur_by_unresolved_modes,
+    unresolved_structure_function,
+)
 from tests.sim.turbulence.theory import draw_phases, noll_residual
 
 FINE = 79
 
 
 def test_variance_is_what_noll_leaves():
-    assert structure_function()[-1] / 2 == pytest.approx(noll_residual(120), rel=0.03)
+    assert unresolved_structure_function()[-1] / 2 == pytest.approx(noll_residual(120), rel=0.03)
 
 
 def mean_transfer(modes: int, d_over_r0: float, unresolved: float) -> torch.Tensor:
