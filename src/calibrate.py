@@ -201,7 +201,10 @@ def measure_turbulence_in_video(
     rate = videos.read_fps(video, "video", most) if fps is None else fps
     air = turbulence_meter.measure_turbulence(np.stack(film), rate)
     text = f"# The air of {Path(video).name}, {air.frames} frames; pixels of a frame whose smaller"
-    text += f" side is {SIDE}.\n{air.found.to_yaml()}"
+    text += f" side is {SIDE}.\n"
+    if air.camera_drift_px:
+        text += f"# A camera drift of {air.camera_drift_px:.2g} px over the film was removed.\n"
+    text += air.found.to_yaml()
     calibration_figures.draw_measured_turbulence(air, Path(video).name, run / "air.png")
     for path in filter(None, (run / "air.yaml", cfg.save)):
         results.write_text(Path(path), text)

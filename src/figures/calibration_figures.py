@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from src.figures.plots import save_figure
 from src.recordings.calibration.contrast_threshold import ThresholdEstimate
 from src.recordings.calibration.dot_statistics import DotStatistics, decay_time_s
-from src.recordings.calibration.turbulence_meter import TurbulenceMeasurement
+from src.recordings.calibration.turbulence_meter import TurbulenceMeasurement, longest_decay_frames
 from src.recordings.calibration.view_alignment import AlignedViews
 from src.recordings.files.turbulence_file import SIDE, IntervalEstimate
 from src.recordings.views import Views
@@ -208,8 +208,12 @@ def draw_measured_turbulence(measured: TurbulenceMeasurement, title: str, path: 
     for level in (0, np.exp(-1)):
         lag.axhline(level, color="gray", lw=0.6)
     _mark_estimate(lag, found.decay_s, "1/e", "s")
-    beyond = not np.isfinite(tilt.decay_frames)
-    text = "1/e beyond the film" if beyond else f"1/e after {tilt.decay_frames:.1f} frames"
+    text, longest = (
+        f"1/e after {tilt.decay_frames:.1f} frames",
+        longest_decay_frames(measured.frames),
+    )
+    if tilt.decay_frames > longest:
+        text = f"1/e after {longest:.0f} frames or more"
     unit = "lag, frames" if fps is None else "lag, s"
     lag.set(xlabel=unit, ylabel="correlation of the tilt", ylim=(-0.5, 1.05), title=text)
     figure.suptitle(title)

@@ -45,7 +45,8 @@ class CovarianceSums:
 class TiltStatistics:
     """`power_px2` along one axis; `half_length_px`, where the covariance is half of it, inf beyond
     the frame; `whole_view_share`, the share that moves the whole square view; `decay_frames`, the
-    time to 1/e, inf beyond the video; `correlation` over distance (nan: too few pairs),
+    time to 1/e, inf beyond the video; `left_share`, the share of the power that is left after the
+    mean of the video was taken off; `correlation` over distance (nan: too few pairs),
     `lag_correlation`; `fitted_correlation`: that over the model's `fitted_distance_px`.
     """
 
@@ -53,6 +54,7 @@ class TiltStatistics:
     half_length_px: float
     whole_view_share: float
     decay_frames: float
+    left_share: float
     correlation: Distances
     lag_correlation: Float[np.ndarray, " lags"]
     fitted_correlation: Float[np.ndarray, " k"]
@@ -132,7 +134,7 @@ class CovarianceModel:
         over lags, in a film of so many `frames`."""
         weights = self._fit(product, count)
         through = self._gaussians(np.zeros(1), self.window)[0] @ weights
-        lag_correlation, kept = _correlation_over_lags(lags, through, frames)
+        lag_correlation, left = _correlation_over_lags(lags, through, frames)
         power = weights.sum()
         curve = self._gaussians(self.fitted_distance_px, 0.0) @ weights / max(power, 1e-12)
         correlation = product / max(power, 1e-12)
@@ -142,12 +144,13 @@ class CovarianceModel:
         far = np.interp(self.pairs, self.distance[1:], filled_correlation[1:])
         near = np.interp(self.pairs, self.fitted_distance_px, curve)
         uniform = float(np.where(self.pairs < 4 * SPREAD, near, far).mean())
-        # A film's own mean was taken off: 1 - kept of the power, at every distance alike.
+        # A film's own mean was taken off: 1 - left of the power, at every distance alike.
         return TiltStatistics(
-            power_px2=float(power / kept),
+            power_px2=float(power / left),
             half_length_px=float(find_first_fall(self.fitted_distance_px, curve, 0.5)),
             whole_view_share=float(np.clip(uniform, 0, 1)),
             decay_frames=float(find_first_fall(np.arange(len(lags)), lag_correlation, np.exp(-1))),
+            left_share=left,
             correlation=np.where(count > MIN_PAIRS, correlation, np.nan),
             lag_correlation=lag_correlation,
             fitted_correlation=curve,

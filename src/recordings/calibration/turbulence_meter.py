@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from src.recordings.calibration import tilt_covariance
+from src.recordings.calibration.camera_drift import remove_camera_drift
 from src.recordings.calibration.point_tracking import PointTracks, find_corners, track_points
 from src.recordings.calibration.tilt_covariance import CELLS, CovarianceModel, TiltStatistics
 from src.recordings.files.turbulence_file import ALLOWED, SIDE, IntervalEstimate, TurbulenceFile
@@ -28,6 +29,9 @@ MIN_RMS_PX = 0.01  # less is the error of tracking
 MIN_OVER_NOISE = 0.15  # of the power of tilt over that of noise: up to 0.09 is found without tilt
 DRAWS = 200
 SHARPEST = 0.1  # the sharpest tenth
+FILM_OVER_DECAY = 8.0  # a decay that is more than the film over this is known by its lower bound
+# Share of the power left after taking off a film's mean, of correlation exp(-time / the film).
+LEFT_OF_SLOW = 1 - 2 / math.e
 # Errors of the method at 95 %, of the logarithm, added to the intervals, from clips of known
 # turbulence (scripts/check_turbulence_meter.py): windows average, random blur shifts corners.
 METHOD_ERROR = {"rms_px": 0.15, "half_length_px": 0.3}
@@ -39,7 +43,7 @@ class TurbulenceMeasurement:
 
     `tilt` holds curves over `distance_px`, over `fitted_distance_px` and over lags in frames;
     `rms_px` of every point at `place` (x, y), in pixels of `picture`; `corners`: how many were
-    tried.
+    tried; `camera_drift_px`: the longest way over the film that was taken off as the camera's.
     """
 
     found: TurbulenceFile
@@ -52,10 +56,14 @@ class TurbulenceMeasurement:
     frames: int
     corners: int
     fps: float | None
+    camera_drift_px: float
 
     def summary(self) -> dict[str, str]:
-        """Return each number of `found` with its interval, for a person."""
-        return {name: str(value) for name, value in vars(self.found).items()}
+        """Return each number of `found` with its interval, for a person; a drift, if there is."""
+        numbers = {name: str(value) for name, value in vars(self.found).items()}
+        if self.camera_drift_px:
+            numbers["camera_drift_px"] = f"{self.camera_drift_px:.2g}, removed"
+        return numbers
 
 
 def measure_turbulence(
@@ -72,7 +80,7 @@ def measure_turbulence(
     frames = (frames * (level.mean() / np.maximum(level, 1e-6))).astype(np.float32)
     frames, tracks = _track_corners(frames)
     size, corners = frames.shape[1:], len(tracks.place)
-    tracks = _select_still(tracks, size)
+    tracks, drift = _select_still(tracks, size)
     unit = SIDE / min(size)
     pairs = tilt_covariance.sum_over_distance(tracks, size)
     lags = tilt_covariance.sum_autocovariance(tracks, size)
@@ -87,7 +95,7 @@ def measure_turbulence(
     if rms_px < MIN_RMS_PX:
         raise _no_tilt(rms_px, len(tracks.place), "which is none")
     drawn = [describe(*chosen) for chosen in _resampled(len(frames), 2 * tilt.decay_frames)]
-    numbers = _summarize_tilt(tilt, drawn, unit, fps, len(lags.at))
+    numbers = _summarize_tilt(tilt, drawn, unit, fps, len(frames))
     numbers["blur_ratio"] = estimate_blur_ratio(*_track_at_side(frames, tracks))
     return TurbulenceMeasurement(
         found=TurbulenceFile(**numbers),
@@ -100,6 +108,7 @@ def measure_turbulence(
         frames=len(frames),
         corners=corners,
         fps=fps,
+        camera_drift_px=drift * unit,
     )
 
 
@@ -168,8 +177,9 @@ def _track_corners(frames: np.ndarray) -> tuple[np.ndarray, PointTracks]:
     return found
 
 
-def _select_still(tracks: PointTracks, size: tuple[int, int]) -> PointTracks:
-    """Return the points that only turbulence moves; raises ValueError where few do."""
+def _select_still(tracks: PointTracks, size: tuple[int, int]) -> tuple[PointTracks, float]:
+    """Return the points that only turbulence moves, and the drift of the camera that was taken off,
+    in pixels over the film; raises ValueError where few do."""
     tracked = tracks.seen.mean(0) >= MIN_FOUND
     share = f"{tracked.mean():.0%} of {len(tracked)} corners could be tracked"
     if tracked.mean() < MIN_SHARE or tracked.sum() < MIN_POINTS:
@@ -188,7 +198,8 @@ def _select_still(tracks: PointTracks, size: tuple[int, int]) -> PointTracks:
             f"video must show a scene that stands still, got one that moves by {drift:.0f} px of"
             f" {SIDE}; {share}"
         )
-    return _select_alike(tracks, SIDE / min(size))
+    tracks, way = remove_camera_drift(tracks)
+    return _select_alike(tracks, SIDE / min(size)), way
 
 
 def _select_alike(tracks: PointTracks, unit: float) -> PointTracks:
@@ -232,14 +243,25 @@ def _resampled(frames: int, block: float) -> Iterator[tuple[np.ndarray, np.ndarr
 
 
 def _summarize_tilt(
-    tilt: TiltStatistics, drawn: list[TiltStatistics], unit: float, fps: float | None, lags: int
+    tilt: TiltStatistics, drawn: list[TiltStatistics], unit: float, fps: float | None, frames: int
 ) -> dict[str, IntervalEstimate]:
-    """Return the numbers of the tilt; where a time or a length is beyond reach, what bounds it."""
+    """Return the numbers of the tilt in so many `frames`; where a time or a length is beyond reach,
+    what bounds it.
+
+    Of turbulence as slow as the film a part is lost with the mean, which the film does not tell:
+    its rms is bounded by that of a decay as long as the film.
+    """
     lengths = [one.half_length_px * unit for one in drawn]
     half = _estimate("half_length_px", tilt.half_length_px * unit, lengths, most=float(SIDE))
     if half.value is not None and half.value < 1.3 * tilt_covariance.MIN_LENGTH_PX * unit:
         half = half._replace(low=ALLOWED["half_length_px"][0])  # shorter ones look alike
     spreads = [one.power_px2**0.5 * unit for one in drawn]
+    rms = _estimate("rms_px", tilt.power_px2**0.5 * unit, spreads)
+    longest = longest_decay_frames(frames)
+    if tilt.decay_frames > longest:
+        assert rms.high is not None, "an rms is bounded"
+        slow = [(one.power_px2 * one.left_share / LEFT_OF_SLOW) ** 0.5 * unit for one in drawn]
+        rms = rms._replace(high=max(rms.high, float(np.percentile(slow, 97.5))))
     shares = [one.whole_view_share for one in drawn]
     if fps is None:
         decay = IntervalEstimate(None, None, None)
@@ -247,13 +269,18 @@ def _summarize_tilt(
         decay = IntervalEstimate(None, None, 1 / fps)
     else:
         times = [max(one.decay_frames, 0.5) / fps for one in drawn]
-        decay = _estimate("decay_s", tilt.decay_frames / fps, times, most=(lags - 1) / fps)
+        decay = _estimate("decay_s", tilt.decay_frames / fps, times, most=longest / fps)
     return {
-        "rms_px": _estimate("rms_px", tilt.power_px2**0.5 * unit, spreads),
+        "rms_px": rms,
         "half_length_px": half,
         "whole_share": _estimate("whole_share", tilt.whole_view_share, shares),
         "decay_s": decay,
     }
+
+
+def longest_decay_frames(frames: int) -> float:
+    """Return the longest decay that a film of so many frames can give a value for."""
+    return min(frames / FILM_OVER_DECAY, tilt_covariance.MAX_LAG - 1)
 
 
 def _estimate(

@@ -81,9 +81,9 @@ def test_tilt_of_many_pixels_of_a_large_frame_is_followed_in_a_smaller_one():
 
 
 def test_decay_and_the_share_of_the_whole_view_are_found():
-    local = fields(8, 0.4, 0.8, 48)
+    local = fields(8, 0.4, 0.8, 80)
     rng, whole = np.random.default_rng(5), [np.zeros(2)]
-    for _ in range(47):
+    for _ in range(79):
         whole.append(0.8 * whole[-1] + 0.6 * rng.standard_normal(2))
     whole = 0.4 * np.array(whole) / np.std(whole)
     push = local + whole[:, :, None, None]
@@ -165,6 +165,43 @@ def test_weak_tilt_in_noise_is_not_underestimated():
     push = fields(10 / UNIT, 0.12 / UNIT, 0.5, 40)
     found = turbulence_meter.measure_turbulence(film(push, 0.03)).found.rms_px
     assert found.value == pytest.approx(0.12, rel=0.3)
+
+
+def drift(frames: int, x_px: float, y_px: float, zoom: float, roll: float) -> np.ndarray:
+    """Return (frames, 2, h, w): a shift in pixels, a growth and a rotation over the whole film."""
+    y, x = np.mgrid[:SIDE, :SIDE] - (SIDE - 1) / 2
+    whole = np.stack([x_px + zoom * x - roll * y, y_px + zoom * y + roll * x])
+    return np.linspace(-0.5, 0.5, frames)[:, None, None, None] * whole
+
+
+@pytest.mark.parametrize("moved", [(1.5, 0, 0, 0), (0, -1.5, 0.02, 0), (0, 0, 0, 0.02)])
+def test_drift_of_the_camera_is_taken_off(moved):
+    push, slow = fields(10 / UNIT, 0.4 / UNIT, 0.5, 40), drift(40, *moved)
+    alone, found = (
+        turbulence_meter.measure_turbulence(film(shown), 30.0) for shown in (push, push + slow)
+    )
+    assert alone.camera_drift_px == 0 and "camera_drift_px" not in alone.summary()
+    inside = slice(12, -12)  # where corners are looked for
+    way = np.hypot(*(slow[-1] - slow[0])[:, inside, inside]).max() * UNIT
+    assert found.camera_drift_px == pytest.approx(way, rel=0.3)
+    assert found.found.rms_px.value == pytest.approx(alone.found.rms_px.value, rel=0.05)
+    assert found.found.whole_share.value < 0.1
+    assert found.found.decay_s.value == pytest.approx(alone.found.decay_s.value, rel=0.15)
+
+
+def test_drift_alone_is_no_tilt():
+    with pytest.raises(ValueError, match="a tilt of 0.0"):
+        turbulence_meter.measure_turbulence(film(drift(40, 1.0, 0, 0, 0)), 30.0)
+
+
+def test_turbulence_as_slow_as_the_film_is_known_by_bounds():
+    push = fields(6, 0.4, np.exp(-1 / 30), 60)  # 1/e after half of the film
+    found = turbulence_meter.measure_turbulence(film(push), 30.0)
+    assert found.camera_drift_px == 0  # its trends differ from point to point
+    decay, rms = found.found.decay_s, found.found.rms_px
+    assert decay.value is None and decay.high is None and 0.1 < decay.low < 1.0
+    assert rms.low < 0.4 * UNIT < rms.high  # a part goes with the mean
+    assert rms.high > 1.6 * rms.value
 
 
 def pan(px: float) -> np.ndarray:
