@@ -93,6 +93,18 @@ def test_a_program_that_uses_the_package_keeps_its_own_errors():
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
 
 
+def test_a_warning_of_ours_is_one_line():
+    code = (
+        "import warnings; from src.app import entry_point as e; e.run_main(lambda: ["
+        "warnings.warn_explicit(f'late in {file}', UserWarning, file, 3)"
+        " for file in (e.__file__, '/site-packages/other.py')])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    ours, other = done.stderr.splitlines()
+    assert ours.startswith("warning: late in /")
+    assert other.startswith("/site-packages/other.py:3: UserWarning: ")
+
+
 def test_ctrl_c_later_is_one_line_and_exit_code_130(monkeypatch, capsys):
     def stop() -> None:
         raise KeyboardInterrupt

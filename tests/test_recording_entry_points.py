@@ -83,6 +83,25 @@ def test_reconstructing_gives_a_picture_and_a_time_per_window(folder, found, ext
         assert len(list(csv.DictReader(file))) == len(frames)
 
 
+def test_a_stopped_run_leaves_the_video_before_with_its_config(
+    folder, found, tmp_path, monkeypatch
+):
+    chosen = [f"recording={folder}/dot.raw", f"views={found}", HIGHPASS, "output_format=hdf5"]
+    run = reconstruct(config("reconstruct", tmp_path / "run", *chosen, "fps=120"))
+    whole = {path.name: path.read_bytes() for path in run.iterdir()}
+
+    def stop(frames, first_s):
+        yield next(iter(frames))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("src.reconstruct.show_progress", stop)
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(config("reconstruct", run, *chosen, "fps=240"))
+    assert {name: (run / name).read_bytes() for name in whole} == whole
+    left = sorted(path.name for path in run.iterdir() if path.name not in whole)
+    assert left == ["config.partial.yaml", "frames.partial.csv", "video.partial.h5"]
+
+
 def test_a_faster_form_gives_nearly_the_same_frames(folder, found, tmp_path):
     chosen = [
         f"recording={folder}/dot.raw",

@@ -6,6 +6,7 @@ import warnings
 from pathlib import Path
 from typing import TextIO
 
+SOURCE = Path(__file__).parents[1]
 NEAREST = {"…": "..."} | dict(zip("•—–━╸╺↑↓", "*-----^v", strict=True))
 
 
@@ -29,6 +30,8 @@ def _show_warning(
     file: TextIO | None = None, line: str | None = None,
 ) -> None:  # fmt: skip
     text = warnings.formatwarning(message, category, filename, lineno, line)
-    if category is UserWarning and "site-packages" not in Path(filename).parts:
+    path = Path(filename)  # an installed package lies in site-packages, too
+    is_ours = "site-packages" not in path.parts or path.is_relative_to(SOURCE)
+    if category is UserWarning and is_ours:
         text = f"warning: {' '.join(str(message).split())}\n"
     print(text, end="", file=file or sys.stderr)

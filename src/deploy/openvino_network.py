@@ -208,5 +208,7 @@ def _explained(module: nn.Module) -> Iterator[None]:
     try:
         yield
     except Exception as error:
+        if "KeyboardInterrupt" in str(error):  # OpenVINO makes another error of Ctrl-C
+            raise KeyboardInterrupt from error
         kind = type(getattr(module, "network", module)).__name__
         raise ValueError(f"{kind} has a part that OpenVINO cannot express") from error

@@ -166,6 +166,8 @@ class EventListRuntime:
         if len(t) and not all(part.dtype.kind in "iu" for part in (x, y, view)):
             kinds = [str(part.dtype) for part in (x, y, view)]
             raise ValueError(f"x, y and view must be whole numbers, got {', '.join(kinds)}")
+        if len(t) and (t.dtype.kind not in "iuf" or p.dtype.kind not in "iufb"):
+            raise ValueError(f"t and p must be real numbers, got {t.dtype} and {p.dtype}")
         is_sign, typed = p.dtype.kind != "f", zip(given, DTYPES, strict=True)
         t, x, y, p, view = (np.ascontiguousarray(part, dtype) for part, dtype in typed)
         if kernels.has_event_error(t, x, y, p, view, self.views, *self.size, is_sign):

@@ -6,7 +6,6 @@ the end files have `partial` in their names, so that none that is cut short is t
 """
 
 import csv
-import errno
 import os
 import re
 import shutil
@@ -25,9 +24,8 @@ from PIL import GifImagePlugin, Image
 
 from src.recordings.files.event_file import HeightWidth
 from src.recordings.reconstruction import Frame
-from src.records.atomic import partial_path
+from src.records.atomic import check_free_space, name_path_in_errors, partial_path
 
-LEAST_FREE_BYTES = 32 * 2**20
 VP9 = {"crf": "12", "b": "0", "deadline": "realtime", "cpu-used": "6"}  # error of 1 level, rms
 KEY_FRAME_EVERY = 12
 CACHE_BYTES = 2**20  # of HDF5, for each of its datasets
@@ -55,16 +53,18 @@ def open_video_writer(
     make, whole = KINDS[kind]
     _check_only_frames(folder / whole)
     video, table_file = partial_path(folder / whole), partial_path(folder / "frames.csv")
-    with open(table_file, "w", newline="") as file, make(video, size, playback_fps) as add:
+    with (
+        name_path_in_errors(folder / whole),
+        open(table_file, "w", newline="") as file,
+        make(video, size, playback_fps) as add,
+    ):
         table = csv.writer(file)
         table.writerow(["frame", "time_s", "events", "outside"])
         frames = 0
 
         def write(frame: Frame) -> None:
             nonlocal frames
-            # HDF5's library crashes when it cannot write.
-            if shutil.disk_usage(folder).free < LEAST_FREE_BYTES:
-                raise OSError(errno.ENOSPC, f"No space left for another frame in {folder}")
+            check_free_space(folder)
             add(round_to_uint8(frame.picture), frame)
             table.writerow([frames, f"{frame.time_s:.6f}", frame.events, frame.events_outside])
             frames += 1

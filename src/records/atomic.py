@@ -1,10 +1,14 @@
 """Files that appear whole or not at all: written under a temporary name, then renamed."""
 
+import errno
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+LEAST_FREE_BYTES = 32 * 2**20
 
 
 @contextmanager
@@ -36,6 +40,28 @@ def check_writable(path: Path, key: str) -> None:
     except OSError as error:
         wanted = f"{key} must be a path that can be written"
         raise ValueError(f"{wanted}, got {path}: {error.strerror}") from error
+
+
+def check_free_space(folder: Path) -> None:
+    """Raise OSError where the disk of `folder` is nearly full.
+
+    HDF5's library crashes where it cannot write, which a quota or `ulimit -f` can still cause.
+    """
+    if shutil.disk_usage(folder).free < LEAST_FREE_BYTES:
+        raise OSError(
+            errno.ENOSPC, f"No space left beyond {LEAST_FREE_BYTES >> 20} MiB", str(folder)
+        )
+
+
+@contextmanager
+def name_path_in_errors(path: Path) -> Iterator[None]:
+    """Raise errors of the disk that name no file, such as that of a full one, with `path`."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is None or error.filename is not None:
+            raise
+        raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
 
 
 def partial_path(path: Path) -> Path:

@@ -24,6 +24,7 @@ from src.records import safe_yaml
 from src.records.atomic import write_text
 
 SCHEMA = 1
+CONFIG_FILE = "config.yaml"
 LEAST_FREE_BYTES = 200 * 2**20
 
 
@@ -41,8 +42,8 @@ class ScoreRow:
     own_metrics: tuple[Column, ...] = ()
 
 
-def create_run_folder(run: Path, config: str) -> None:
-    """Create the folder `run` and store the resolved `config` (YAML) in it.
+def create_run_folder(run: Path, config: str, name: str = CONFIG_FILE) -> None:
+    """Create the folder `run` and store the resolved `config` (YAML) in it, as `name`.
 
     Raises ValueError where the folder cannot be made, holds results of another config, or the disk
     is nearly full.
@@ -56,7 +57,7 @@ def create_run_folder(run: Path, config: str) -> None:
         needed, got = LEAST_FREE_BYTES >> 20, free >> 20
         raise ValueError(f"paths.out must have {needed} MiB free, got {got} MiB at {run}")
     has_results(run, config)
-    write_text(run / "config.yaml", config)
+    write_text(run / name, config)
 
 
 def parse_settings_without_paths(config: str) -> dict:

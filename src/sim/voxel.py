@@ -29,7 +29,7 @@ def voxel_grid(
     {0, 1}: arrays or tensors of one length.  Each event's weights are multiples of 2**-20, so
     that sums of up to 16 events a cell are exact and do not depend on their order.  Raises
     ValueError for coordinates outside or no whole numbers, lengths that differ, t1 <= t0, edges
-    that are not finite or another polarity.
+    that are not finite, times that are no finite numbers or another polarity.
     """
     t, x, y, p = map(_as_native_array, (t, x, y, p))
     if not t.shape == x.shape == y.shape == p.shape or t.ndim != 1:
@@ -44,12 +44,17 @@ def voxel_grid(
         return grid
     if x.dtype.kind not in "iu" or y.dtype.kind not in "iu":
         raise ValueError(f"x and y must be whole numbers, got {x.dtype} and {y.dtype}")
+    if t.dtype.kind not in "iuf" or p.dtype.kind not in "iufb":
+        raise ValueError(f"t and p must be real numbers, got {t.dtype} and {p.dtype}")
+    if t.dtype.kind == "f" and not np.isfinite(t).all():
+        raise ValueError(f"t must be finite, event {int(np.isfinite(t).argmin())} is not")
     if t.max() < t0 or t.min() > t1:
         reach = f"{t.min()} to {t.max()}, the window is {t0} to {t1}"
         warnings.warn(
             f"no event lies in the window: t is {reach}; is its unit the same?", stacklevel=2
         )
     times = t.astype(np.int64) if t.dtype.kind in "iu" else t.astype(np.float64)
+    p = p.astype(np.float32) if p.dtype == np.float16 else p
     scale = np.float32(np.float32(bins - 1) / np.float32(t1 - t0))
     wrong = accumulate_until_bad_event(
         times, x, y, p, t0, t1, scale, bool(p.min() >= 0), grid.numpy()

@@ -244,6 +244,7 @@ WRONG = {
     "finite t and p": {"p": lambda p: p * np.nan},
     "t, x, y, p, view must be of one length": {"x": lambda x: x[1:]},
     "x, y and view must be whole numbers": {"x": lambda x: x + 0.5},
+    "t and p must be real numbers": {"t": lambda t: (t * 1e6).astype("datetime64[us]")},
     "a window must have t0 < t1": {"t1": lambda t1: -1.0},
 }
 
@@ -362,6 +363,16 @@ def test_what_was_compiled_leaves_no_memory_behind():
 def test_a_part_that_openvino_cannot_express_is_named():
     with pytest.raises(ValueError, match="Identity has a part that OpenVINO cannot express"):
         CompiledModule(torch.nn.Identity(3), [torch.zeros(1), torch.zeros(1)], 1)
+
+
+@OPENVINO
+def test_ctrl_c_while_openvino_compiles_is_no_error_of_the_network():
+    class Interrupted(torch.nn.Module):
+        def forward(self, *given):
+            raise RuntimeError("KeyboardInterrupt: ")  # OpenVINO's own error of it
+
+    with pytest.raises(KeyboardInterrupt):
+        CompiledModule(Interrupted(), [torch.zeros(1), torch.zeros(1)], 1)
 
 
 def test_bytes_round_to_half_a_step():

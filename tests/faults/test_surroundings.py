@@ -17,8 +17,11 @@ from omegaconf import OmegaConf
 
 from src.models.checkpoints import is_intact, newest_checkpoint, save_atomically
 from src.recordings import output
+from src.recordings.files.event_file import EVENT
+from src.recordings.files.event_writers import write_events
 from src.recordings.output import open_video_writer, partial_path
 from src.recordings.reconstruction import Frame
+from src.records import atomic
 from tests.faults import harness
 from tests.faults.harness import Run, Tally
 from tests.faults.test_kills import STEPS, training
@@ -100,6 +103,24 @@ def test_a_full_disk_is_no_whole_video(kind, tmp_path, monkeypatch):
         monkeypatch.setattr(output.shutil, "disk_usage", lambda path: usage._replace(free=1 << 20))
         write(Frame(0.1, picture, 1, 0))
     assert not [file for file in tmp_path.iterdir() if "partial" not in file.name]
+
+
+@pytest.mark.parametrize("name", ["a.raw", "a.dat", "a.aedat4", "a.es", "a.csv", "a.npz"])
+def test_a_full_disk_is_no_recording_and_names_it(name, tmp_path):
+    events = np.zeros(200_000, EVENT)
+    events["t"] = np.arange(0, 3 * len(events), 3)
+    events["x"], events["p"] = np.arange(len(events)) % 97, 1
+    with small_files(40_000), pytest.raises(OSError, match=f"File too large.*{name}"):
+        write_events(tmp_path / name, events, width=97, height=5)
+    assert not list(tmp_path.iterdir())
+
+
+def test_hdf5_stops_before_the_disk_is_full(tmp_path, monkeypatch):
+    usage = atomic.shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(atomic.shutil, "disk_usage", lambda path: usage._replace(free=1 << 20))
+    with pytest.raises(OSError, match="No space left"):
+        write_events(tmp_path / "a.h5", np.ones(9, EVENT), width=97, height=5)
+    assert not list(tmp_path.iterdir())
 
 
 READERS = {

@@ -56,6 +56,28 @@ def test_seconds_and_microseconds_give_one_grid():
     assert (a - b).abs().max() < 1e-4
 
 
+@pytest.mark.parametrize(
+    "t, p, words",
+    [
+        ([0.1, np.nan], [1, 1], "t must be finite, event 1 is not"),
+        (np.array([1, 2], "datetime64[us]"), [1, 1], "real numbers, got datetime64"),
+        ([0.1, 0.2], [1j, 1], "real numbers, got float64 and complex128"),
+    ],
+)
+def test_times_and_polarities_are_finite_real_numbers(t, p, words):
+    with pytest.raises(ValueError, match=words):
+        voxel_grid(t, [1, 1], [0, 0], p, t0=0, t1=1, **SIZE)
+
+
+def test_polarity_in_half_precision_counts_as_in_float32():
+    t, x, y, p = random_events(300)
+    grids = [
+        voxel_grid(t, x, y, p.astype(kind), t0=0, t1=10000, **SIZE)
+        for kind in (np.float16, np.float32)
+    ]
+    assert torch.equal(*grids)
+
+
 @settings(max_examples=30, deadline=None)
 @given(
     n=st.integers(0, 60), seed=st.integers(0, 2**31), bins=st.integers(1, 12), zero=st.booleans()

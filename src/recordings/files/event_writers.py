@@ -5,6 +5,7 @@ RAW (EVT2, EVT3), DAT, AEDAT4 and ES are written by faery; CSV, npz, HDF5 and EV
 """
 
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -16,7 +17,7 @@ from faery.file_encoder import events_to_file
 from src.recordings.files import table_writers
 from src.recordings.files.event_file import PIECE_EVENTS, WidthHeight
 from src.recordings.files.recorded_frames import RecordedFrames
-from src.records.atomic import partial_path
+from src.records.atomic import name_path_in_errors, partial_path
 
 BINARY = {".raw": "evt", ".dat": "dat", ".aedat4": "aedat", ".es": "es"}
 TABLES: dict[str, Callable] = {
@@ -30,6 +31,7 @@ MOST_PIXELS = {".raw": 2**11, ".dat": 2**14, "evreal": 2**15}  # of a side, by i
 MOST_US = {".dat": 2**32, ".h5": 2**32, ".hdf5": 2**32}  # between the first and the last event
 MOST_ES_US = 2**32  # ES writes all time since 0, a byte for each 127 us without events
 # RAW counts time in 24 and 34 bits; that it went round shows where it falls by more than half.
+OS_ERROR = re.compile(r"\(os error (\d+)\)")
 MOST_SILENCE_US = {"evt3": 2**23, "evt2": 2**33}
 
 
@@ -68,11 +70,12 @@ def write_pieces(
     _remove(partial)
     checked = _Checked(path, kind, pieces, (width, height), version)
     try:
-        if kind in BINARY:
-            _write_binary(partial, kind, iter(checked), (width, height), version)
-        else:
-            given = {"frames": frames} if kind == "evreal" else {}
-            TABLES[kind](partial, iter(checked), (width, height), **given)
+        with name_path_in_errors(path):
+            if kind in BINARY:
+                _write_binary(partial, kind, iter(checked), (width, height), version)
+            else:
+                given = {"frames": frames} if kind == "evreal" else {}
+                TABLES[kind](partial, iter(checked), (width, height), **given)
         if kind == "evreal":
             _remove(path)
         os.replace(partial, path)
@@ -169,7 +172,12 @@ def _write_binary(
 ) -> None:
     number = {".raw": version, ".dat": "dat2"}.get(kind)
     how = {"file_type": BINARY[kind], "zero_t0": kind != ".es", "use_write_suffix": False}
-    events_to_file((_as_faery(events) for events in pieces), path, size, version=number, **how)
+    try:
+        events_to_file((_as_faery(events) for events in pieces), path, size, version=number, **how)
+    except RuntimeError as error:  # of faery's encoders, for one of the disk
+        if (found := OS_ERROR.search(str(error))) is None:
+            raise
+        raise OSError(int(found[1]), str(error)) from error
 
 
 def _as_faery(events: np.ndarray) -> np.ndarray:

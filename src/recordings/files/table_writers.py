@@ -19,6 +19,7 @@ from numpy.lib.format import open_memmap
 
 from src.recordings.files.event_file import WidthHeight
 from src.recordings.files.recorded_frames import RecordedFrames
+from src.records.atomic import check_free_space
 
 EVREAL_TIMES = "events_ts.npy"
 EVREAL_FILES = {
@@ -109,6 +110,7 @@ def write_dsec(path: Path, pieces: Pieces, size: WidthHeight) -> None:
         marks = _growing(file, "ms_to_idx", np.uint64)
         count, offset = 0, 0
         for events in pieces:
+            check_free_space(path.parent)
             offset = offset if count else int(events["t"][0])
             t = events["t"] - offset
             due = np.arange(len(marks), t[-1] // 1000 + 1) * 1000

@@ -1,0 +1,70 @@
+"""Signals end a command with its blocks closed, one line and 128 + the number."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from src.app.stop_signals import TERMINATING, Stopped, stop_by_signals
+
+ROOT = Path(__file__).resolve().parents[2]
+DROPPED = """
+import signal, time, weakref
+from src.app import entry_point
+
+class Kept: pass
+
+def work():
+    kept = Kept()
+    reference = weakref.ref(kept, lambda _: signal.raise_signal(NUMBER))
+    del kept  # Python drops what the callback raises
+    time.sleep(20)
+
+entry_point.run_main(work)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, *TERMINATING])
+def test_a_signal_in_a_callback_of_python_is_not_lost(number):
+    code = DROPPED.replace("NUMBER", str(int(number)))
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (128 + number, "stopped\n")
+
+
+@pytest.mark.parametrize("number", TERMINATING)
+def test_open_blocks_are_left_and_the_handler_goes(number):
+    closed = False
+    with pytest.raises(Stopped) as stopped, stop_by_signals():
+        try:
+            signal.raise_signal(number)
+        finally:
+            closed = True
+    assert closed and stopped.value.code == 128 + number
+    assert signal.getsignal(number) == signal.SIG_DFL
+
+
+def test_a_hangup_that_is_ignored_stays_ignored():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with stop_by_signals():
+            signal.raise_signal(signal.SIGHUP)
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_a_forked_worker_ends_without_closing_what_is_its_parents(tmp_path):
+    with stop_by_signals():
+        child = os.fork()
+        if child == 0:
+            try:
+                signal.raise_signal(signal.SIGTERM)
+            finally:
+                (tmp_path / "closed").touch()
+                os._exit(0)
+        _, status = os.waitpid(child, 0)
+    assert os.waitstatus_to_exitcode(status) == -signal.SIGTERM
+    assert not (tmp_path / "closed").exists()
