@@ -5,7 +5,6 @@ Writes the video and `frames.csv`: the time stamp and the events of each frame. 
 clean clip, side by side.
 """
 
-import os
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -30,7 +29,6 @@ from src.recordings.sensor_lookup import build_lookup
 from src.recordings.truth_file import CleanClip
 from src.recordings.views import Views, views_or_whole_sensor
 from src.records import results
-from src.records.atomic import partial_path
 
 RULE_KEYS = ("fps", "bins", "splat", "start_s", "end_s")
 
@@ -49,14 +47,13 @@ def reconstruct(cfg: DictConfig) -> Path:
     make = reconstruct_film_frames if cfg.output_format == "film" else reconstruct_video_frames
     start = time.perf_counter()
     frames, size = make(cfg, network, views)
-    config_file = run / results.CONFIG_FILE
-    unfinished = partial_path(config_file)  # the video of an earlier run keeps its config
-    results.create_run_folder(run, entry_point.resolved_yaml(cfg), unfinished.name)
-    with output.open_video_writer(cfg.output_format, run, size, cfg.playback_fps) as write:
+    with (
+        results.store_config_when_whole(run, entry_point.resolved_yaml(cfg)),
+        output.open_video_writer(cfg.output_format, run, size, cfg.playback_fps) as write,
+    ):
         for frame in show_progress(frames, cfg.start_s + 1 / cfg.fps):
             write(frame)
             ready_s.append(time.perf_counter() - start)
-    os.replace(unfinished, config_file)
     print(describe_run(run / output.KINDS[cfg.output_format][1], views, ready_s))
     return run
 

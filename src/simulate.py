@@ -64,14 +64,16 @@ def simulate_own_clip(cfg: DictConfig) -> dict:
         raise ValueError(f"sensor must be one of events for video and photo, got {kind}")
     camera = place_views(cfg, work.optics.positions, clip.size, work.key)
     drawn = work.drawn_parameters()
-    results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     print(work.describe())
     if cfg.photo and not cfg.speed_widths_per_s:
         print("at rest, so that only turbulence makes events; speed_widths_per_s=0.3 moves it")
     path, shown = Path(cfg.write or run / f"{clip.name}.raw"), []
     path.parent.mkdir(parents=True, exist_ok=True)
     views, count = work.allocate_views(path.parent), 0
-    with create_truth_file(path, camera, len(clip.frames), clip.fps, drawn) as truth:
+    with (
+        results.store_config_when_whole(run, entry_point.resolved_yaml(cfg)),
+        create_truth_file(path, camera, len(clip.frames), clip.fps, drawn) as truth,
+    ):
         for part in work.simulate_parts(views, track):
             truth.add(part.clean, part.views, part.tilt)
             shown += [part] if count <= DRAWN_FRAMES else []

@@ -4,11 +4,13 @@ import csv
 import hashlib
 import io
 import json
+import os
 import re
 import shutil
 import statistics
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +23,7 @@ from rich.table import Table
 from src.metrics.bootstrap import bootstrap_difference_interval, bootstrap_interval
 from src.metrics.table import METRICS, NAMES, Column
 from src.records import safe_yaml
-from src.records.atomic import write_text
+from src.records.atomic import partial_path, write_text
 
 SCHEMA = 1
 CONFIG_FILE = "config.yaml"
@@ -40,6 +42,19 @@ class ScoreRow:
     macs_per_frame: int
     latency_ms_by_size: dict[str, float]
     own_metrics: tuple[Column, ...] = ()
+
+
+@contextmanager
+def store_config_when_whole(run: Path, config: str) -> Iterator[None]:
+    """As `create_run_folder`, but until the block has ended the config is `config.partial.yaml`.
+
+    What an earlier run left there keeps its own config where the block fails.
+    """
+    whole = run / CONFIG_FILE
+    partial = partial_path(whole)
+    create_run_folder(run, config, partial.name)
+    yield
+    os.replace(partial, whole)
 
 
 def create_run_folder(run: Path, config: str, name: str = CONFIG_FILE) -> None:
