@@ -208,11 +208,8 @@ def draw_measured_turbulence(measured: TurbulenceMeasurement, title: str, path: 
     for level in (0, np.exp(-1)):
         lag.axhline(level, color="gray", lw=0.6)
     _mark_estimate(lag, found.decay_s, "1/e", "s")
-    text, longest = (
-        f"1/e after {tilt.decay_frames:.1f} frames",
-        longest_decay_frames(measured.frames),
-    )
-    if tilt.decay_frames > longest:
+    text = f"1/e after {tilt.decay_frames:.1f} frames"
+    if tilt.decay_frames > (longest := longest_decay_frames(measured.frames)):
         text = f"1/e after {longest:.0f} frames or more"
     unit = "lag, frames" if fps is None else "lag, s"
     lag.set(xlabel=unit, ylabel="correlation of the tilt", ylim=(-0.5, 1.05), title=text)

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 LEAST_FREE_BYTES = 32 * 2**20
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @contextmanager
@@ -55,11 +56,11 @@ def check_free_space(folder: Path) -> None:
 
 @contextmanager
 def name_path_in_errors(path: Path) -> Iterator[None]:
-    """Raise errors of the disk that name no file, such as that of a full one, with `path`."""
+    """Raise the errors of a full disk that name no file with `path`."""
     try:
         yield
     except OSError as error:
-        if error.errno is None or error.filename is not None:
+        if error.errno not in FULL or error.filename is not None:
             raise
         raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
 
