@@ -25,7 +25,8 @@ def stop_by_signals() -> Iterator[None]:
     """Raise Stopped in the block for the signals of TERMINATING that would end the process.
 
     Where Python drops a Stopped or a KeyboardInterrupt, as in callbacks of weak references, it is
-    raised again soon after.  Outside of the main thread, which gets no signals, nothing changes.
+    raised again soon after.  A handler that takes a signal over in the block decides: Lightning's
+    waits for the end of a step.  Outside of the main thread nothing changes.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -36,7 +37,8 @@ def stop_by_signals() -> Iterator[None]:
         if os.getpid() != owner:  # a forked worker: what is open is its parent's
             signal.signal(number, signal.SIG_DFL)
             signal.raise_signal(number)
-        raise Stopped(number)
+        if signal.getsignal(number) is stop:  # else another handler, Lightning's, calls this one
+            raise Stopped(number)
 
     def raise_again(dropped: "sys.UnraisableHookArgs") -> None:
         error = dropped.exc_value

@@ -17,6 +17,9 @@ from src.app import entry_point
 
 class Kept: pass
 
+if NUMBER != signal.SIGINT:
+    signal.signal(NUMBER, signal.SIG_DFL)  # not ignored as under nohup
+
 def work():
     kept = Kept()
     reference = weakref.ref(kept, lambda _: signal.raise_signal(NUMBER))
@@ -34,6 +37,14 @@ def test_a_signal_in_a_callback_of_python_is_not_lost(number):
     assert (done.returncode, done.stderr) == (128 + number, "stopped\n")
 
 
+@pytest.fixture(autouse=True)
+def default_handlers():
+    before = [signal.signal(number, signal.SIG_DFL) for number in TERMINATING]
+    yield
+    for number, handler in zip(TERMINATING, before, strict=True):
+        signal.signal(number, handler)
+
+
 @pytest.mark.parametrize("number", TERMINATING)
 def test_open_blocks_are_left_and_the_handler_goes(number):
     closed = False
@@ -47,13 +58,24 @@ def test_open_blocks_are_left_and_the_handler_goes(number):
 
 
 def test_a_hangup_that_is_ignored_stays_ignored():
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        with stop_by_signals():
-            signal.raise_signal(signal.SIGHUP)
-        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGHUP, before)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    with stop_by_signals():
+        signal.raise_signal(signal.SIGHUP)
+    assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+
+
+def test_a_handler_that_takes_over_decides():
+    seen = []
+    with stop_by_signals():
+        ours = signal.getsignal(signal.SIGTERM)
+
+        def lightnings(number, frame):
+            seen.append(number)
+            ours(number, frame)  # as it calls those that it finds
+
+        signal.signal(signal.SIGTERM, lightnings)
+        signal.raise_signal(signal.SIGTERM)
+        assert seen == [signal.SIGTERM]
 
 
 def test_a_forked_worker_ends_without_closing_what_is_its_parents(tmp_path):
