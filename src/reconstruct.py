@@ -48,7 +48,7 @@ def reconstruct(cfg: DictConfig) -> Path:
     start = time.perf_counter()
     frames, size = make(cfg, network, views)
     with (
-        results.store_config_when_whole(run, entry_point.resolved_yaml(cfg)),
+        results.store_config_when_done(run, entry_point.resolved_yaml(cfg)),
         output.open_video_writer(cfg.output_format, run, size, cfg.playback_fps) as write,
     ):
         for frame in show_progress(frames, cfg.start_s + 1 / cfg.fps):

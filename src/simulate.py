@@ -71,7 +71,7 @@ def simulate_own_clip(cfg: DictConfig) -> dict:
     path.parent.mkdir(parents=True, exist_ok=True)
     views, count = work.allocate_views(path.parent), 0
     with (
-        results.store_config_when_whole(run, entry_point.resolved_yaml(cfg)),
+        results.store_config_when_done(run, entry_point.resolved_yaml(cfg)),
         create_truth_file(path, camera, len(clip.frames), clip.fps, drawn) as truth,
     ):
         for part in work.simulate_parts(views, track):

@@ -1,13 +1,12 @@
 """The loop of a campaign: recipes side by side, each stage by stage."""
 
 import fcntl
-import signal
-import sys
 import time
 from pathlib import Path
 
 from scripts.campaign.training import Settings, Training
 from scripts.campaign.work import RecipeWork
+from src.app.stop_signals import stop_by_signals
 
 POLL_S, PATIENCE_S = 5.0, 120.0  # between two looks; for a training to store itself
 
@@ -24,12 +23,12 @@ def run(settings: Settings, recipes: list[RecipeWork]) -> int:
         except BlockingIOError as error:
             reason = f"out must be a folder that no campaign works in, got {settings.out}"
             raise ValueError(reason) from error
-        signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-        try:
-            while _turn(settings, recipes):
-                time.sleep(POLL_S)
-        finally:
-            _end([training for work in recipes for training in work.trainings.values()])
+        with stop_by_signals():
+            try:
+                while _turn(settings, recipes):
+                    time.sleep(POLL_S)
+            finally:
+                _end([training for work in recipes for training in work.trainings.values()])
     print("\n".join(work.line() for work in recipes))
     return int(any(work.state() == "failed" for work in recipes))
 

@@ -29,7 +29,7 @@ from src.app.config_values import check_values
 from src.app.help import help_text
 from src.app.path_overrides import name_job_folder, quote_paths, unquote_override
 from src.app.renamed_keys import refuse_renamed_keys, refuse_renamed_overrides
-from src.app.stop_signals import Stopped, stop_by_signals
+from src.app.stop_signals import StoppedBySignal, stop_by_signals
 from src.models import files
 from src.records import results, tracking
 
@@ -105,7 +105,7 @@ def run_main(main: Callable[[], None]) -> None:
         sys.exit(128 + (signal.SIGINT if interrupted else signal.SIGTERM))
     except SystemExit as error:  # Lightning makes an exit code 1 of Ctrl-C
         interrupted = isinstance(error.__context__, KeyboardInterrupt)
-        if interrupted or isinstance(error, Stopped):
+        if interrupted or isinstance(error, StoppedBySignal):
             print("stopped", file=sys.stderr)
         sys.exit(128 + signal.SIGINT if interrupted else error.code)
 

@@ -12,7 +12,7 @@ TERMINATING = (signal.SIGTERM, signal.SIGHUP)
 AGAIN_AFTER_S = 0.05
 
 
-class Stopped(SystemExit):
+class StoppedBySignal(SystemExit):
     """A signal of TERMINATING arrived, which `number` is; the exit code is 128 + that."""
 
     def __init__(self, number: int):
@@ -22,11 +22,11 @@ class Stopped(SystemExit):
 
 @contextmanager
 def stop_by_signals() -> Iterator[None]:
-    """Raise Stopped in the block for the signals of TERMINATING that would end the process.
+    """Raise StoppedBySignal in the block for the signals of TERMINATING that would end the process.
 
-    Where Python drops a Stopped or a KeyboardInterrupt, as in callbacks of weak references, it is
-    raised again soon after.  A handler that takes a signal over in the block decides: Lightning's
-    waits for the end of a step.  Outside of the main thread nothing changes.
+    Where Python drops it or a KeyboardInterrupt, as in callbacks of weak references, it is raised
+    again soon after.  A handler that takes a signal over in the block decides: Lightning's waits
+    for the end of a step.  Outside of the main thread nothing changes.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -38,14 +38,14 @@ def stop_by_signals() -> Iterator[None]:
             signal.signal(number, signal.SIG_DFL)
             signal.raise_signal(number)
         if signal.getsignal(number) is stop:  # else another handler, Lightning's, calls this one
-            raise Stopped(number)
+            raise StoppedBySignal(number)
 
     def raise_again(dropped: "sys.UnraisableHookArgs") -> None:
         error = dropped.exc_value
-        if not isinstance(error, KeyboardInterrupt | Stopped):
+        if not isinstance(error, KeyboardInterrupt | StoppedBySignal):
             report_dropped(dropped)
             return
-        number = error.number if isinstance(error, Stopped) else signal.SIGINT
+        number = error.number if isinstance(error, StoppedBySignal) else signal.SIGINT
         timer = threading.Timer(AGAIN_AFTER_S, os.kill, (owner, number))
         timer.daemon = True
         timer.start()

@@ -45,7 +45,7 @@ class ScoreRow:
 
 
 @contextmanager
-def store_config_when_whole(run: Path, config: str) -> Iterator[None]:
+def store_config_when_done(run: Path, config: str) -> Iterator[None]:
     """As `create_run_folder`, but until the block has ended the config is `config.partial.yaml`.
 
     What an earlier run left there keeps its own config where the block fails.

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from src.app.stop_signals import TERMINATING, Stopped, stop_by_signals
+from src.app.stop_signals import TERMINATING, StoppedBySignal, stop_by_signals
 
 ROOT = Path(__file__).resolve().parents[2]
 DROPPED = """
@@ -48,7 +48,7 @@ def default_handlers():
 @pytest.mark.parametrize("number", TERMINATING)
 def test_open_blocks_are_left_and_the_handler_goes(number):
     closed = False
-    with pytest.raises(Stopped) as stopped, stop_by_signals():
+    with pytest.raises(StoppedBySignal) as stopped, stop_by_signals():
         try:
             signal.raise_signal(number)
         finally:
