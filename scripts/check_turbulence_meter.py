@@ -1,6 +1,7 @@
 """How well task=air measures turbulence that is known:
 
-    python -m scripts.check_turbulence_meter [again | warps | air.yaml] [--clips 20] [--first 1000]
+    python -m scripts.check_turbulence_meter [again | warps | compressed | air.yaml]
+        [--clips 20] [--first 1000]
 
 Clip k is a photograph seen through simulated turbulence with a tilt of 0.25 to 1.5 px rms of 256, a
 half length of 5 to 70 px (both log-uniform) and a correlation time of 0.04 to 0.2 s: 240 frames of
@@ -10,15 +11,18 @@ footage shows no more) and over what its atmosphere gives on average ("of atmosp
 where the interval holds that.  `again`: besides, a clip drawn from what was measured
 (turbulence=measured) is measured, over what was found first; of `blur_ratio`, its excess of one.
 `air.yaml`: clips drawn from that file instead, and what is found.  `warps`: a table of Gaussian
-warps instead, new in each of 24 frames of 256 px, of two photographs.
+warps instead, new in each of 24 frames of 256 px, of two photographs.  `compressed`: a table of
+such footage of a half length of 13.3 px, compressed.
 """
 
 import argparse
+import io
 import math
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import torch
@@ -43,6 +47,7 @@ CONF = Path(__file__).resolve().parents[1] / "conf/turbulence/measured.yaml"
 SIDE, FILM, FRAMES, FPS, NOISE = 256, 512, 240, 30.0, 0.01
 RMS, HALF, DECAY, TIMES = (0.25, 1.5), (5.0, 70.0), (0.04, 0.2), ("ar1", "frozen_flow")
 WARPS = (3.3, 6.7, 13.3, 26.6, 53.3), (0.25, 0.75, 1.5)  # half lengths, rms
+COMPRESSED_WARPS = 13.3, (0.0, 0.1, 0.25, 0.5)  # half length, rms
 KEYS = ("rms_px", "half_length_px", "whole_share", "decay_s", "blur_ratio")
 
 
@@ -101,6 +106,33 @@ def warp_photograph(
         for dx, dy in tilt
     ]
     return _recorded(np.stack(frames), k), tilt
+
+
+def compress_as_jpeg(frames: Float[np.ndarray, "n h w"], quality: int) -> np.ndarray:
+    """Return the frames, each read back from a JPEG of that quality."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    files = (cv2.imencode(".jpg", frame, options)[1] for frame in _as_bytes(frames))
+    read = [cv2.imdecode(file, cv2.IMREAD_GRAYSCALE) for file in files]
+    return np.stack(read).astype(np.float32) / 255
+
+
+def compress_as_h264(frames: Float[np.ndarray, "n h w"], crf: int) -> np.ndarray:
+    """Return the frames read back from an H.264 video of that constant rate factor (x264)."""
+    file = io.BytesIO()
+    with av.open(file, "w", format="mp4") as video:
+        stream = video.add_stream("libx264", rate=round(FPS), options={"crf": str(crf)})
+        stream.height, stream.width = frames.shape[1:]
+        for frame in _as_bytes(frames):
+            video.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="gray")))
+        video.mux(stream.encode())
+    file.seek(0)
+    with av.open(file) as video:
+        read = [frame.to_ndarray(format="gray") for frame in video.decode(video=0)]
+    return np.stack(read).astype(np.float32) / 255
+
+
+def _as_bytes(frames: np.ndarray) -> np.ndarray:
+    return np.round(frames * 255).astype(np.uint8)
 
 
 def _recorded(seen: np.ndarray, k: int) -> np.ndarray:
@@ -217,18 +249,36 @@ def summarise(rows: Sequence[Mapping[str, float]]) -> Iterator[str]:
 def warp_table() -> Iterator[str]:
     """Yield the rows of the table of warps, as Markdown."""
     for half in WARPS[0]:
-        cells = []
-        for rms in WARPS[1]:
-            rows = []
-            for k in range(2):
-                frames, tilt = warp_photograph(load_photograph(k, SIDE), half, rms, k)
-                found, known = measure_or_refusal(frames), describe_tilt(tilt)
-                if not isinstance(found, str):
-                    length = _number(found.found.half_length_px)
-                    rows.append((found.found.rms_px.value / known[0], length / known[1]))
-            ranges = ("-".join(f"{v:.2f}" for v in sorted(v)) for v in zip(*rows, strict=True))
-            cells.append(", ".join(ranges) or "refused")
+        cells = (measure_warps(half, rms) for rms in WARPS[1])
         yield f"| {half} | " + " | ".join(cells) + " |"
+
+
+def compression_table() -> Iterator[str]:
+    """Yield the rows of the table of compressed footage, as Markdown."""
+    half, spreads = COMPRESSED_WARPS
+    ways: dict[str, Callable[[np.ndarray], np.ndarray]] = {"none": lambda frames: frames}
+    for quality in (75, 50):
+        ways[f"JPEG {quality}"] = lambda frames, q=quality: compress_as_jpeg(frames, q)
+    for crf in (23, 28):
+        ways[f"H.264 {crf}"] = lambda frames, c=crf: compress_as_h264(frames, c)
+    for name, way in ways.items():
+        cells = (measure_warps(half, rms, way) for rms in spreads)
+        yield f"| {name} | " + " | ".join(cells) + " |"
+
+
+def measure_warps(
+    half: float, rms: float, compress: Callable[[np.ndarray], np.ndarray] = lambda frames: frames
+) -> str:
+    """Return what is found over what is known in footage of two photographs."""
+    rows = []
+    for k in range(2):
+        frames, tilt = warp_photograph(load_photograph(k, SIDE), half, rms, k)
+        found = measure_or_refusal(compress(frames))
+        if not isinstance(found, str):
+            known, length = describe_tilt(tilt), _number(found.found.half_length_px)
+            rows.append((found.found.rms_px.value / known[0], length / known[1]))
+    ranges = ("-".join(f"{v:.2f}" for v in sorted(v)) for v in zip(*rows, strict=True))
+    return ", ".join(ranges) or "refused"
 
 
 def simulated_clips(numbers: range, again: bool) -> Iterator[str]:
@@ -266,16 +316,18 @@ def clips_like_file(file: Path, numbers: range) -> Iterator[str]:
 def main() -> None:
     """Print what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", nargs="?", help="again, warps or a file of task=air")
+    parser.add_argument("what", nargs="?", help="again, warps, compressed or a file of task=air")
     parser.add_argument("--clips", type=int, default=20)
     parser.add_argument("--first", type=int, default=1000)
     given = parser.parse_args()
-    if not (given.what in (None, "again", "warps") or Path(given.what).is_file()):
-        parser.error(f"what must be again, warps or a file of task=air, got {given.what}")
+    tables = {"warps": warp_table, "compressed": compression_table}
+    if not (given.what in (None, "again", *tables) or Path(given.what).is_file()):
+        allowed = f"again, {', '.join(tables)} or a file of task=air"
+        parser.error(f"what must be {allowed}, got {given.what}")
     torch.set_num_threads(1)
     numbers = range(given.first, given.first + given.clips)
-    if given.what == "warps":
-        lines = warp_table()
+    if given.what in tables:
+        lines = tables[given.what]()
     elif given.what in (None, "again"):
         lines = simulated_clips(numbers, given.what == "again")
     else:

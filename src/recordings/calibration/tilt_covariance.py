@@ -149,7 +149,7 @@ class CovarianceModel:
             power_px2=float(power / left),
             half_length_px=float(find_first_fall(self.fitted_distance_px, curve, 0.5)),
             whole_view_share=float(np.clip(uniform, 0, 1)),
-            decay_frames=float(find_first_fall(np.arange(len(lags)), lag_correlation, np.exp(-1))),
+            decay_frames=float(find_decay(lag_correlation)),
             left_share=left,
             correlation=np.where(count > MIN_PAIRS, correlation, np.nan),
             lag_correlation=lag_correlation,
@@ -185,6 +185,13 @@ def _correlation_over_lags(
         positive = np.logical_and.accumulate(true > 0)
         lost = min(1 / frames + float(share @ (true * positive)[1:]), 0.9)
     return lost + (1 - lost) * measured, 1 - lost
+
+
+def find_decay(correlation: Float[np.ndarray, " lags"]) -> float:
+    """Return the lag at which a correlation over lags first falls to 1/e, inf if nowhere: joined by
+    exponentials, as it falls within a frame or two."""
+    logarithms = np.log(np.maximum(correlation, 1e-6))
+    return find_first_fall(np.arange(len(correlation)), logarithms, -1.0)
 
 
 def find_first_fall(at: np.ndarray, curve: np.ndarray, level: float) -> float:

@@ -27,6 +27,8 @@ MAX_RELATIVE_POWER = 9.0  # times the median power: such a point moves by itself
 MAX_DRIFT_PX = 4.0  # between the quarters of a video: more is a camera that moves
 MIN_RMS_PX = 0.01  # less is the error of tracking
 MIN_OVER_NOISE = 0.15  # of the power of tilt over that of noise: up to 0.09 is found without tilt
+MIN_HALF_LENGTH_PX = 4.0  # of the frame that is worked on: what JPEG adds is correlated over less
+FLICKER_SHARE = 1 / 32  # deviation of a Gaussian; bands of lamps are a third of a frame and more
 DRAWS = 200
 SHARPEST = 0.1  # the sharpest tenth
 FILM_OVER_DECAY = 8.0  # a decay that is more than the film over this is known by its lower bound
@@ -71,14 +73,12 @@ def measure_turbulence(
 ) -> TurbulenceMeasurement:
     """Measure the turbulence in a video of a still scene, grey in [0, 1]; `fps` None: not known.
 
-    Raises ValueError for a video that is too short, has no texture or moves.
+    Raises ValueError for a video that is too short, has no texture, moves, or shows no tilt that
+    can be told from the error of tracking.
     """
     if len(frames) < MIN_FRAMES:
         raise ValueError(f"video must have at least {MIN_FRAMES} frames, got {len(frames)}")
-    level = frames.mean((1, 2), keepdims=True)
-    # To one mean brightness: flicker is not turbulence.
-    frames = (frames * (level.mean() / np.maximum(level, 1e-6))).astype(np.float32)
-    frames, tracks = _track_corners(frames)
+    frames, tracks = _track_corners(remove_flicker(frames))
     size, corners = frames.shape[1:], len(tracks.place)
     tracks, drift = _select_still(tracks, size)
     unit = SIDE / min(size)
@@ -94,6 +94,9 @@ def measure_turbulence(
     rms_px = tilt.power_px2**0.5 * unit
     if rms_px < MIN_RMS_PX:
         raise _no_tilt(rms_px, len(tracks.place), "which is none")
+    if tilt.half_length_px < MIN_HALF_LENGTH_PX:
+        reach = f"correlated over {tilt.half_length_px * unit:.1f} px, as errors of compression are"
+        raise _no_tilt(rms_px, len(tracks.place), reach)
     drawn = [describe(*chosen) for chosen in _resampled(len(frames), 2 * tilt.decay_frames)]
     numbers = _summarize_tilt(tilt, drawn, unit, fps, len(frames))
     numbers["blur_ratio"] = estimate_blur_ratio(*_track_at_side(frames, tracks))
@@ -137,6 +140,14 @@ def _width_ratio(sums: Float[np.ndarray, "3"]) -> float:
     """Return the ratio of widths for sums of slopes (all moments, the sharpest) and weights."""
     usual, sharpest = (max(2 / (total / sums[2]) ** 2 - 1, 1e-3) for total in sums[:2])
     return max(math.sqrt(usual / sharpest), 1.0)
+
+
+def remove_flicker(frames: Float[np.ndarray, "frames h w"]) -> Float[np.ndarray, "frames h w"]:
+    """Return the frames at the mean brightness of every place, averaged over FLICKER_SHARE of the
+    side: what lamps change, also in the bands of a rolling shutter, is not turbulence."""
+    spread = FLICKER_SHARE * min(frames.shape[1:])
+    level = np.stack([cv2.GaussianBlur(frame, (0, 0), spread) for frame in frames])
+    return (frames * (level.mean(0) / np.maximum(level, 1e-3))).astype(np.float32)
 
 
 def limit_shorter_side(frame: np.ndarray, max_px: int = SIZES[0]) -> Float[np.ndarray, "_h _w"]:
@@ -253,8 +264,6 @@ def _summarize_tilt(
     """
     lengths = [one.half_length_px * unit for one in drawn]
     half = _estimate("half_length_px", tilt.half_length_px * unit, lengths, most=float(SIDE))
-    if half.value is not None and half.value < 1.3 * tilt_covariance.MIN_LENGTH_PX * unit:
-        half = half._replace(low=ALLOWED["half_length_px"][0])  # shorter ones look alike
     spreads = [one.power_px2**0.5 * unit for one in drawn]
     rms = _estimate("rms_px", tilt.power_px2**0.5 * unit, spreads)
     longest = longest_decay_frames(frames)

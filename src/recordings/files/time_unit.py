@@ -3,17 +3,19 @@
 A unit is judged by the file's duration and event rate in it.  It loses a point for each factor of
 ten by which the duration is outside 0.02 s..600 s or the rate outside 3e3..3e6 events/s, and those
 of PRIOR, for whole numbers and others; ns lose NS_OF_US where all are apart by thousands.  It gains
-EPOCH where the times are then dates of 2001 to 2039.  Where half of the times have more than three
-digits behind the point, other units than s lose FINE: they would be finer than a camera's.
+EPOCH where the times are then dates of 2001 to 2039, whole ms EPOCH_OF_MS, as they may be us of a
+clock that has run for weeks, and loses EPOCH where they are later.  Where half of the times have
+more than three digits behind the point, other units than s lose FINE: they would be finer than a
+camera's.
 The duration is that between the 1st and the 99th of a hundred times, so that single wild ones do
 not matter, the rate that of the median step, so that silence does not; a counter that goes round
 goes on.
 
 The best unit is taken.  The user is told where it is not that of PRIOR 0 or a date, where a second
-one is less than NEAR behind, where another would be ahead but for FINE though the times are finer
-than a camera's in s, too, where us need more events/s than usual and ms would be ahead but for
-PRIOR, and where duration or rate are absurd.  Fewer than FEW_TIMES values tell
-too little: they are dates where one unit makes them so, else seconds with a fraction, microseconds
+one is less than NEAR behind, dates counted or not, where another would be ahead but for FINE though
+the times are finer than a camera's in s, too, where us need more events/s than usual and ms would
+be ahead but for PRIOR, and where duration or rate are absurd.  Fewer than FEW_TIMES values tell too
+little: they are dates where one unit makes them so, else seconds with a fraction, microseconds
 without.
 """
 
@@ -29,7 +31,7 @@ PRIOR = {
     True: {"us": 0.0, "ns": 2.0, "ms": 2.0, "s": 3.0},  # whole numbers
     False: {"s": 0.0, "ms": 1.0, "us": 1.0, "ns": 2.0},
 }
-FINE, NS_OF_US = 3.0, 0.8
+FINE, NS_OF_US, EPOCH_OF_MS = 3.0, 0.8, 1.5
 DURATION_S, RATE_HZ, EPOCH_S, EPOCH = (0.02, 600.0), (3e3, 3e6), (1e9, 2.2e9), 3.0
 NEAR = 1.25  # points: a second unit as near is told of
 ABSURD_S, ABSURD_HZ = (1e-3, 86_400.0), (10.0, 1e9)  # outside, duration and rate are told of
@@ -120,6 +122,7 @@ class _Reading:
         self.rate_hz = count / self.duration_s if self.duration_s else np.inf
         self.active_rate_hz = 1 / interval_s if interval_s else self.rate_hz
         self.is_date = EPOCH_S[0] < early_s < EPOCH_S[1]
+        self.is_later = early_s >= EPOCH_S[1]
 
     def __str__(self) -> str:
         return f"{self.duration_s:.3g} s and {self.rate_hz:.3g} events/s"
@@ -128,7 +131,7 @@ class _Reading:
         if not self.duration_s:
             return 0.0
         lost = _decades(self.duration_s, DURATION_S) + _decades(self.active_rate_hz, RATE_HZ)
-        return EPOCH * self.is_date - lost
+        return -lost - EPOCH * self.is_later
 
 
 def find_unit(sample: TimeSample, stated: str) -> tuple[str, str]:
@@ -146,12 +149,18 @@ def find_unit(sample: TimeSample, stated: str) -> tuple[str, str]:
     losses, fine = dict(PRIOR[sample.are_whole_numbers]), FINE * sample.has_more_decimals(3)
     if sample.are_whole_numbers and sample.are_apart_by_thousands:
         losses["ns"] = NS_OF_US
-    plain = {unit: read[unit].points() - losses[unit] for unit in UNITS_US}
+    dates = {unit: EPOCH * read[unit].is_date for unit in UNITS_US}
+    if sample.are_whole_numbers:
+        dates["ms"] = EPOCH_OF_MS * read["ms"].is_date
+    plain = {unit: read[unit].points() + dates[unit] - losses[unit] for unit in UNITS_US}
     points = {unit: plain[unit] - fine * (unit != "s") for unit in UNITS_US}
     best, second = sorted(points, key=lambda unit: -points[unit])[:2]
     unit = best if is_auto else stated
     by_digits = max(plain.values()) > plain[unit] and sample.has_more_decimals(6)
-    is_near = is_auto and (points[best] - points[second] < NEAR or by_digits)
+    undated = {one: points[one] - dates[one] for one in UNITS_US if one != best}
+    rival = max(undated, key=undated.__getitem__)
+    by_date = points[best] - dates[best] - undated[rival] < NEAR
+    is_near = is_auto and (points[best] - points[second] < NEAR or by_digits or by_date)
     is_unusual = is_auto and PRIOR[sample.are_whole_numbers][unit] > 0 and not read[unit].is_date
     absurd = _decades(read[unit].duration_s, ABSURD_S) + _decades(read[unit].rate_hz, ABSURD_HZ)
     is_crowded = is_auto and sample.are_whole_numbers and unit == "us" and (
@@ -160,6 +169,8 @@ def find_unit(sample: TimeSample, stated: str) -> tuple[str, str]:
     if not (is_near or is_unusual or is_crowded or absurd > 0):
         return unit, ""
     other = "ms" if is_crowded else second if unit == best else best
+    if by_date and unit == best and not is_crowded:
+        other = rival
     if by_digits:
         other = max(plain, key=plain.__getitem__)
     both = f"times in {unit} give {read[unit]}, in {other} {read[other]}"

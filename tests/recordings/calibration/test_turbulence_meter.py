@@ -123,6 +123,22 @@ def test_blur_is_that_of_a_typical_moment_over_the_sharpest_tenth(ratio):
     assert found.value == pytest.approx(typical, rel=0.2)
 
 
+def test_bands_of_lamps_are_no_blur():
+    """A rolling shutter under mains lamps: bands that run over the frame."""
+    frames, row = film(fields(10 / UNIT, 0.5 / UNIT, 0.0, 20)), np.arange(SIDE)[:, None]
+    lit = [f * (1 + 0.2 * np.sin(row / 14 + 2.3 * k)) / 1.2 for k, f in enumerate(frames)]
+    found = turbulence_meter.measure_turbulence(np.stack(lit).astype(np.float32), 50.0).found
+    plain = turbulence_meter.measure_turbulence(frames, 50.0).found
+    assert found.blur_ratio.value == pytest.approx(plain.blur_ratio.value, abs=0.06)
+
+
+@pytest.mark.parametrize("frames", [1.44, 2.0, 6.3])
+def test_a_decay_of_a_frame_or_two_is_that_of_its_exponential(frames):
+    correlation = np.exp(-np.arange(20) / frames)
+    assert tilt_covariance.find_decay(correlation) == pytest.approx(frames, rel=1e-6)
+    assert tilt_covariance.find_decay(correlation[:1]) == np.inf
+
+
 def test_blur_is_that_of_a_frame_of_256_px():
     large = np.stack([
         cv2.resize(frame, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
@@ -159,6 +175,17 @@ def test_noise_alone_is_no_tilt(noise):
     frames = film(np.zeros((60, 2, SIDE, SIDE)), noise)
     with pytest.raises(ValueError, match=r"turbulent air, got a tilt of 0.0\d* .* at \d\d+ points"):
         turbulence_meter.measure_turbulence(frames, 30.0)
+
+
+@pytest.mark.parametrize("quality", [50, 75])
+def test_what_compression_adds_is_no_tilt(quality):
+    files = [
+        cv2.imencode(".jpg", np.uint8(255 * frame), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+        for frame in film(np.zeros((40, 2, SIDE, SIDE)))
+    ]
+    frames = [cv2.imdecode(file, cv2.IMREAD_GRAYSCALE) for file in files]
+    with pytest.raises(ValueError, match=r"a tilt of 0.0\d* .* px, as errors of compression are"):
+        turbulence_meter.measure_turbulence(np.stack(frames).astype(np.float32) / 255, 30.0)
 
 
 def test_weak_tilt_in_noise_is_not_underestimated():

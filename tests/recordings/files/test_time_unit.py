@@ -53,6 +53,23 @@ def test_dates_tell_their_unit(unit, kind):
         assert find_unit(sampled(t), "auto")[0] == unit
 
 
+@pytest.mark.parametrize("start_us", [10**12, 2 * 10**12])
+@pytest.mark.parametrize(("duration", "rate"), [(0.4, 1.6e6), (0.05, 4e6), (2.0, 5e5), (30.0, 1e5)])
+def test_microseconds_of_a_clock_that_has_run_for_weeks(start_us, duration, rate):
+    t = in_unit(made_up(duration, rate), "us", 0, int) + start_us  # in ms a date of 2001 or later
+    assert find_unit(sampled(t), "auto")[0] == "us"
+
+
+def test_a_date_that_decides_is_told_of():
+    t = made_up(1.0, 1e6) // 1000 * 1000 + 15 * 10**14  # ns of a clock that has run for 17 days
+    unit, line = find_unit(sampled(t), "auto")
+    assert unit == "us" and "in ns 1 s and 1e+06 events/s" in line and "time_unit=" in line
+    date = in_unit(made_up(1.0, 1e6), "us", DATE_S, int)
+    assert find_unit(sampled(date), "auto") == ("us", "")
+    date = in_unit(made_up(0.3, 1e6), "ns", DATE_S, int) // 1000 * 1000
+    assert find_unit(sampled(date), "auto") == ("ns", "")
+
+
 def test_nanoseconds_are_not_taken_for_a_slow_recording():
     unit, line = find_unit(sampled(made_up(0.2, 7500)), "auto")
     assert unit == "ns" and "read as ns; if it is another, give time_unit=" in line
