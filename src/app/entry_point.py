@@ -27,7 +27,12 @@ from src.app import console
 from src.app.compose import CONF, describe_config_error
 from src.app.config_values import check_values
 from src.app.help import help_text
-from src.app.path_overrides import name_job_folder, quote_paths, unquote_override
+from src.app.path_overrides import (
+    name_job_folder,
+    quote_paths,
+    refuse_empty_paths,
+    unquote_override,
+)
 from src.app.renamed_keys import refuse_renamed_keys, refuse_renamed_overrides
 from src.app.stop_signals import StoppedBySignal, stop_by_signals
 from src.models import files
@@ -86,6 +91,7 @@ def run_main(main: Callable[[], None]) -> None:
     sys.argv[1:] = quote_paths(sys.argv[1:], Path(sys.argv[0]).stem)
     try:
         with stop_by_signals():
+            refuse_empty_paths(sys.argv[1:], Path(sys.argv[0]).stem)
             refuse_renamed_overrides(sys.argv[1:])
             main()
     except JobFailed as error:

@@ -21,6 +21,7 @@ PATH_KEYS = frozenset({
 WHOLE_KEYS = frozenset({
     "hydra.run.dir", "hydra.sweep.dir", "views", "calibrate:still", "train:start",
 })  # fmt: skip
+MAY_BE_EMPTY = ("name", "title")  # free text
 SWEEP_FUNCTION = re.compile(r"(choice|range|interval|glob|sort|shuffle|tag)\s*\(.*\)", re.DOTALL)
 MAX_FOLDER_BYTES = 60
 QUOTED = re.compile(r"""'([^'\\]|\\.)*'|"([^"\\]|\\.)*\"""", re.DOTALL)
@@ -55,6 +56,17 @@ def is_path_key(key: str, entry_point: str) -> bool:
     return key.split(".")[-1] in PATH_KEYS or not {key, f"{entry_point}:{key}"}.isdisjoint(
         WHOLE_KEYS
     )
+
+
+def refuse_empty_paths(arguments: Iterable[str], entry_point: str) -> None:
+    """Raise ValueError for a path without a letter, as an unset variable of the shell gives it;
+    before Hydra, which would make the folder of the run at the root of the disk.
+    """
+    for argument in arguments:
+        key, equals, value = argument.lstrip("+").partition("=")
+        may_be_empty = not is_path_key(key, entry_point) or key.split(".")[-1] in MAY_BE_EMPTY
+        if equals and unquote(value.strip()) == "" and not may_be_empty:
+            raise ValueError(f"{key} must be a path, got ''")
 
 
 def _quote_argument(argument: str, entry_point: str, sweep: bool) -> str:

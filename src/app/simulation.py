@@ -207,7 +207,7 @@ def _count(cfg: DictConfig, key: str, least: int = 1) -> int:
 
 def _side(cfg: DictConfig, key: str) -> Any:
     value = OmegaConf.select(cfg, key)
-    if value is None or type(value) in (int, float):
+    if value is None or type(value) is int or (type(value) is float and 0 < value <= 1):
         return value
     if not isinstance(value, Sequence) or isinstance(value, str):
         wanted = "pixels (128), a share of the frame (0.5) or null"

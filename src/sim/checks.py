@@ -2,13 +2,15 @@
 
 import math
 from collections.abc import Sequence
+from numbers import Real
 from typing import Any
 
 
-def check_in_range(key: str, value: float, low: float, high: float) -> None:
-    """Raise ValueError for a value of `key` outside [low, high], or nan."""
-    if not low <= value <= high:
-        bounds = f">= {low:.3g}" if high == math.inf else f"in [{low:.3g}, {high:.3g}]"
+def check_in_range(key: str, value: Any, low: float, high: float) -> None:
+    """Raise ValueError for a value of `key` that is no number in [low, high]."""
+    is_number = isinstance(value, Real)
+    if not (is_number and low <= value <= high):
+        bounds = f">= {low:.5g}" if high == math.inf else f"in [{low:.5g}, {high:.5g}]"
         raise ValueError(f"{key} must be {bounds}, got {value}")
 
 

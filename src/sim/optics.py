@@ -7,6 +7,7 @@ sub-apertures; rows count downwards.  Axes: see docs/conventions.md.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from numbers import Integral
 from typing import Any
 
 Position = tuple[int, int]
@@ -56,6 +57,11 @@ def most_central_view_index(positions: Sequence[Position]) -> int:
     return min(range(len(positions)), key=lambda i: sum(axis**2 for axis in positions[i]))
 
 
+def _is_position(value: Any) -> bool:
+    is_pair = isinstance(value, Sequence) and len(value) == 2
+    return is_pair and all(isinstance(axis, Integral) for axis in value)
+
+
 def view_id(position: Position) -> int:
     """Return the number that keys the random draws of the view at `position` (centre: 144)."""
     row, col = position
@@ -73,6 +79,9 @@ class Optics:
 
     def __post_init__(self):
         chosen = self.positions or layout(self.views)
+        if not (isinstance(chosen, Sequence) and all(map(_is_position, chosen))):
+            allowed = "a list of (row, col), whole numbers"
+            raise ValueError(f"optics.positions must be {allowed}, got {chosen}")
         positions = tuple((int(row), int(col)) for row, col in chosen)
         if len(positions) != self.views or len(set(positions)) != self.views:
             allowed = f"{self.views} different (row, col)"

@@ -9,8 +9,15 @@ from pathlib import Path
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from src.app.path_overrides import MAX_FOLDER_BYTES, name_job_folder, quote_paths, unquote_override
+from src.app.path_overrides import (
+    MAX_FOLDER_BYTES,
+    name_job_folder,
+    quote_paths,
+    refuse_empty_paths,
+    unquote_override,
+)
 from tests.conftest import ROOT
+from tests.test_entry_points import run_here
 
 NAMES = [
     "größe.txt", "cap (1).txt", "run=3.txt", "cap#1.txt", "a,b.txt", "it's.txt", 'a"b.txt',
@@ -115,3 +122,23 @@ def test_a_console_of_few_signs_ends_no_job(locale, tmp_path):
         [sys.executable, "-c", text], cwd=ROOT, env=os.environ | locale, capture_output=True
     )
     assert done.returncode == 0 and done.stdout.endswith(b" * - ^ ?\n")
+
+
+@pytest.mark.parametrize(
+    "typed", ["photo=", "views=''", '+scene.root=""', "paths.out= ", "hydra.run.dir=", "ckpt="]
+)
+def test_an_empty_path_is_refused(typed):
+    key = typed.partition("=")[0].lstrip("+")
+    with pytest.raises(ValueError, match=f"^{key} must be a path, got ''$"):
+        refuse_empty_paths(quote_paths(["seed=1", typed], "simulate"), "simulate")
+
+
+@pytest.mark.parametrize("typed", ["title=", "logger.csv.name=''", "photo=null", "fps=", "still="])
+def test_what_is_no_path_may_be_empty(typed):
+    refuse_empty_paths(quote_paths([typed], "report"), "report")
+
+
+def test_an_empty_folder_of_runs_is_refused_before_it_is_made(capsys, monkeypatch):
+    monkeypatch.setattr("pathlib.Path.mkdir", None)
+    assert run_here("simulate", "paths.out=") == 2
+    assert capsys.readouterr().err == "error: paths.out must be a path, got ''\n"

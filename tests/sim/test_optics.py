@@ -27,8 +27,17 @@ def test_unknown_layout_names_the_key(views):
 
 
 @pytest.mark.parametrize(
-    ("positions", "key"), [([(0, 0), (0, 0)], "positions"), ([(0, 0), (0, 9)], "positions")]
+    ("positions", "message"),
+    [
+        ([(0, 0), (0, 0)], r"be 2 different \(row, col\)"),
+        ([(0, 0), (0, 9)], "lie in -8..8"),
+        ([1, 2, 3], r"be a list of \(row, col\), whole numbers, got \[1, 2, 3\]"),
+        (["a", "b"], r"be a list of \(row, col\)"),
+        ([(0, 0), (0, "1")], r"be a list of \(row, col\)"),
+        ([(0, 0), (0, float("inf"))], r"be a list of \(row, col\)"),
+        ([(0, 0), (0, 1, 2)], r"be a list of \(row, col\)"),
+    ],
 )
-def test_wrong_positions(positions, key):
-    with pytest.raises(ValueError, match=f"optics.{key}"):
+def test_wrong_positions(positions, message):
+    with pytest.raises(ValueError, match=f"optics.positions must {message}"):
         _ = Optics(2, positions).random_key_ids

@@ -12,20 +12,26 @@ from torch import Tensor
 
 from src.sim import noise
 from src.sim.checks import check_in_range, is_range
+from src.sim.scenes.moving_layers import FASTEST_WIDTHS_PER_S
 
 SPLITS = ("train", "val", "test")
 RANGES = {  # of what scenes take; a share is one of the clips
-    "height": (8, math.inf),
-    "width": (8, math.inf),
+    "height": (8, 16384),
+    "width": (8, 16384),
     "frames": (2, math.inf),
     "contrast": (0, 1),
     "paused_clip_share": (0, 1),
     "static_camera_share": (0, 1),
     "flicker_share": (0, 1),
-    "max_cutouts": (0, math.inf),
-    "max_targets": (1, math.inf),
+    "max_cutouts": (0, 100),
+    "max_targets": (1, 100),
 }
-INTERVALS = ("photo_px_per_px", "speed_widths_per_s", "cutout_widths")  # of positive numbers
+WHOLE = ("height", "width", "frames", "max_cutouts", "max_targets")
+INTERVALS = {  # what ranges of numbers are above, and up to
+    "photo_px_per_px": (0, 100),
+    "speed_widths_per_s": (0, FASTEST_WIDTHS_PER_S),
+    "cutout_widths": (0.001, 100),
+}
 
 
 @dataclass(frozen=True)
@@ -73,10 +79,13 @@ class SceneBase:
         given = vars(self)
         for name in RANGES.keys() & given:
             check_in_range(f"scene.{name}", given[name], *RANGES[name])
-        for name in given.keys() & INTERVALS:
-            ends = list(given[name])
-            if not is_range(ends) or not 0 < ends[0] <= ends[1] < math.inf:
-                raise ValueError(f"scene.{name} must be a range 0 < low <= high, got {ends}")
+            if name in WHOLE and type(given[name]) is not int:
+                raise ValueError(f"scene.{name} must be a whole number, got {given[name]}")
+        for name in INTERVALS.keys() & given:
+            ends, (above, most) = given[name], INTERVALS[name]
+            if not (is_range(ends) and above < ends[0] and ends[1] <= most):
+                allowed = f"a range {above} < low <= high <= {most:g}"
+                raise ValueError(f"scene.{name} must be {allowed}, got {ends}")
         self.size = self.height, self.width
         self.times_s = np.arange(self.frames) / self.fps
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from src.sim import noise
+from src.sim.checks import is_range
 from src.sim.scenes.clip import SPLITS, Clip, SceneBase
 from src.sim.scenes.photo_files import Root
 
@@ -49,9 +50,10 @@ class Mixture(SceneBase):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 <= self.flicker_modulation_depth[0] <= self.flicker_modulation_depth[1] < 1:
-            allowed, got = "a range 0 <= low <= high < 1", list(self.flicker_modulation_depth)
-            raise ValueError(f"scene.flicker_modulation_depth must be {allowed}, got {got}")
+        depths = self.flicker_modulation_depth
+        if not (is_range(depths) and depths[0] >= 0 and depths[1] < 1):
+            allowed = "a range 0 <= low <= high < 1"
+            raise ValueError(f"scene.flicker_modulation_depth must be {allowed}, got {depths}")
         served = []
         for name, part in self.parts.items():
             share, splits = part["share"], part.get("splits") or SPLITS

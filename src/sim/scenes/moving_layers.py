@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 MOVING_S, RESTING_S = (0.05, 0.4), (0.05, 0.3)  # how long a spell of motion and a rest last
 STOP_S = (0.05, 0.3)  # when a clip stops
+FASTEST_WIDTHS_PER_S = 100.0  # frame widths a second that may be asked for
 
 
 class SimilarityMotion:

@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from src.sim import noise
-from src.sim.scenes.moving_layers import MovingLayer, SimilarityMotion, render_frame
+from src.sim.checks import check_in_range
+from src.sim.scenes.moving_layers import (
+    FASTEST_WIDTHS_PER_S,
+    MovingLayer,
+    SimilarityMotion,
+    render_frame,
+)
 from src.sim.scenes.video_files import VideoSource, find_videos, read_picture
 
 LARGEST_SIDE_PX = 512  # of the frames, where nothing else is asked for
@@ -187,10 +193,8 @@ def _hold_or_move(
 ) -> Float[np.ndarray, "frames h w"]:
     """Return the frames of a picture for `seconds` at `fps`, at `speed` widths a second."""
     _check_rate(fps)
-    if not 0 <= speed < math.inf:
-        raise ValueError(f"speed_widths_per_s must be >= 0, got {speed}")
-    if not (isinstance(seconds, int | float) and 2 / fps <= seconds < 1e6):
-        raise ValueError(f"seconds must be {2 / fps:.4g} (two frames) or more, got {seconds}")
+    check_in_range("speed_widths_per_s", speed, 0, FASTEST_WIDTHS_PER_S)
+    check_in_range("seconds", seconds, 2 / fps, 1e6)  # two frames or more
     count = round(seconds * fps) + 1
     if speed:
         return _move(picture, count, fps, speed, seed)

@@ -142,11 +142,12 @@ def _noise_keys(clips: Sequence[SensorClip], views: Sequence[int]) -> NDArray[np
     return keys
 
 
-def threshold_range(threshold: float | Sequence[float]) -> tuple[float, float]:
+def threshold_range(threshold: Any) -> tuple[float, float]:
     """Return (low, high) of `sensor.threshold`, a number or a range."""
-    ends = [threshold, threshold] if isinstance(threshold, int | float) else list(threshold)
-    if len(ends) != 2 or ends[0] > ends[1]:
-        raise ValueError(f"sensor.threshold must be a number or [low, high], got {ends}")
+    is_number = isinstance(threshold, int | float)
+    if not (is_number or is_range(threshold)):
+        raise ValueError(f"sensor.threshold must be a number or [low, high], got {threshold}")
+    ends = [threshold, threshold] if is_number else threshold
     for end in ends:
         check_in_range("sensor.threshold", end, *RANDOM_RANGES["threshold"])
     return float(ends[0]), float(ends[1])

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -79,7 +80,8 @@ def sample_atmosphere(
     All ranges are log-uniform, in pixels of a frame 256 wide; `tilt_and_blur_px` for each severity;
     at `global_tilt_probability` the half length is that of turbulence that moves the whole view.
     What no camera shows is drawn again.  `cameras`: see `sample_matching_atmosphere`.  `none` gives
-    None.  Raises ValueError for an unknown severity or ranges that nothing meets.
+    None.  Raises ValueError for an unknown severity or ranges that nothing meets; what each setting
+    may be is checked by `SimulatedTurbulence`.
     """
     names = ["none", *TILT_AND_BLUR_PX, "mixed"]
     check_option(severity in names, "atmosphere.severity", ", ".join(names), severity)
@@ -90,12 +92,10 @@ def sample_atmosphere(
         limits = SEVERITY_SHARES["weak"], 1 - SEVERITY_SHARES["strong"]
         severity = list(SEVERITY_SHARES)[int(np.searchsorted(limits, drawn, side="right"))]
     spreads = (TILT_AND_BLUR_PX | dict(tilt_and_blur_px or {}))[severity]
-    share, name = global_tilt_probability, "atmosphere.global_tilt_probability"
-    check_option(0 <= share <= 1, name, "in [0, 1]", share)
     for _ in range(32):
         u = torch.rand(4, generator=generator, dtype=torch.float64).numpy()
         lengths = (tilt_correlation_half_length_px, "tilt_correlation_half_length_px")
-        if u[0] < share:
+        if u[0] < global_tilt_probability:
             lengths = (global_tilt_half_length_px, "global_tilt_half_length_px")
         wanted = TargetImageStatistics(
             float(log_uniform(u[1], *lengths)),
@@ -168,7 +168,7 @@ def sample_matching_atmosphere(
     raise NoCameraError(f"turbulence.atmosphere: no camera within its ranges shows {wanted}")
 
 
-def unnormalised_cn2_profile(shape: str | Sequence[float]) -> tuple[float, ...]:
+def unnormalised_cn2_profile(shape: Any) -> tuple[float, ...]:
     """Return Cn2 along the path, in any unit: of a name of PROFILES, or a table as it is.
 
     Raises ValueError for another name and for a table that is not positive somewhere.
@@ -179,11 +179,11 @@ def unnormalised_cn2_profile(shape: str | Sequence[float]) -> tuple[float, ...]:
         place = np.linspace(0, 1, PROFILE_POINTS)
         low, high = PROFILES[shape]
         return tuple(((place >= low) & (place <= high)).astype(float).tolist())
-    values = tuple(float(value) for value in shape)
-    valid = min(values, default=-1) >= 0 and 0 < sum(values) < math.inf
-    allowed = "tables of Cn2 >= 0, somewhere > 0"
-    check_option(valid, "atmosphere.cn2_profiles", allowed, list(values))
-    return values
+    is_table = isinstance(shape, Sequence) and all(isinstance(one, int | float) for one in shape)
+    valid = is_table and min(shape, default=-1) >= 0 and 0 < sum(shape) < math.inf
+    allowed = "names or tables of Cn2 >= 0, somewhere > 0"
+    check_option(valid, "atmosphere.cn2_profiles", allowed, shape)
+    return tuple(map(float, shape))
 
 
 def log_uniform(
@@ -202,10 +202,7 @@ def log_uniform(
 
 def _draw_outer_scales(u: Candidates, limits: Range, kolmogorov: float) -> Candidates:
     """Return L0 / D: OUTER_SCALES within `limits` alike, and inf at a probability `kolmogorov`."""
-    (low, high), name = limits, "atmosphere.kolmogorov_probability"
-    check_option(0 <= kolmogorov <= 1, name, "in [0, 1]", kolmogorov)
-    name = "atmosphere.outer_scale_over_aperture"
-    check_option(0 < low <= high, name, "a range above 0", list(limits))
+    low, high = limits
     inside = OUTER_SCALES[(low * 0.999 <= OUTER_SCALES) & (high * 1.001 >= OUTER_SCALES)]
     inside = inside if len(inside) else np.array([math.sqrt(low * high)])
     index = ((u - kolmogorov) / max(1 - kolmogorov, 1e-9) * len(inside)).astype(int)

@@ -87,6 +87,10 @@ def test_no_clip_flickers_at_rates_where_it_would_alias():
             {"flicker_modulation_depth": (0.3, 0.1)},
             "scene.flicker_modulation_depth must be a range",
         ),
+        (
+            {"flicker_modulation_depth": []},
+            r"scene.flicker_modulation_depth must be .*, got \[\]",
+        ),
     ],
 )
 def test_wrong_values_name_their_key(wrong, message):

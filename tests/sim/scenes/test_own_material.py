@@ -1,5 +1,7 @@
 """A user's own video and photograph: every frame, uncropped, at the rate of the file."""
 
+import math
+import re
 import warnings
 from pathlib import Path
 
@@ -125,7 +127,6 @@ def test_16_bits_are_kept_and_white_is_what_is_given(tmp_path, white, shown):
             lambda p: own_material.read_photograph(p / "a.png", white_level=0),
             r"white_level must be in \(0, 255\] or null, got 0",
         ),
-        (lambda p: own_material.read_photograph(p / "a.png", seconds=0), "seconds must be 0.0166"),
         (lambda p: own_material.clip_from_array(np.zeros((3, 20, 30))), "fps must be given"),
         (lambda p: own_material.clip_from_array(np.full((20, 30), 7.0)), r"floats in \[0, 1\]"),
         (lambda p: own_material.clip_from_array(np.zeros((1, 1, 2, 3))), "must be of shape"),
@@ -138,3 +139,14 @@ def test_wrong_material_is_one_line(call, message, tmp_path):
     with pytest.raises(ValueError, match=message) as error:
         call(tmp_path)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("key", "allowed", "value"),
+    [("seconds", "[0.016667, 1e+06]", wrong) for wrong in (0, 0.01, 1e30, math.inf, math.nan)]
+    + [("speed_widths_per_s", "[0, 100]", wrong) for wrong in (-1, 1e30, math.inf, math.nan)],
+)
+def test_numbers_of_a_photograph_outside_their_range_are_named(key, allowed, value, tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((20, 30), np.uint8))
+    with pytest.raises(ValueError, match=re.escape(f"{key} must be in {allowed}, got {value}")):
+        own_material.read_photograph(tmp_path / "a.png", **{key: value})

@@ -1,13 +1,15 @@
 """Scenes are functions of index and time; photographs move smoothly and have disjoint splits."""
 
+from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
-from src.sim.scenes.clip import Clip, FrameRateMixture
+from src.sim.scenes.clip import Clip, FrameRateMixture, SceneBase
 from src.sim.scenes.photo_files import EMBEDDED, list_photographs
 from src.sim.scenes.photographs import Photographs
 from src.sim.scenes.targets import TARGETS, Targets
@@ -88,18 +90,46 @@ def test_splits_are_disjoint_embedded_and_in_a_folder(tmp_path):
         ({"fps": 0.0}, "fps"),
         ({"speed_widths_per_s": (2.0, 1.0)}, "scene.speed_widths_per_s"),
         ({"photo_px_per_px": (0.0, 1.0)}, "scene.photo_px_per_px"),
-        ({"cutout_widths": (0.3, 0.1)}, "scene.cutout_widths must be a range 0 < low <= high"),
+        ({"cutout_widths": (0.3, 0.1)}, "scene.cutout_widths must be a range 0.001 < low <= hi"),
         ({"cutout_widths": (0.1, float("nan"))}, "scene.cutout_widths must be a range"),
         ({"static_camera_share": -0.1}, r"scene.static_camera_share must be in \[0, 1\]"),
         ({"paused_clip_share": 1.1}, r"scene.paused_clip_share must be in \[0, 1\]"),
         ({"paused_clip_share": float("nan")}, r"scene.paused_clip_share must be in \[0, 1\]"),
         ({"max_cutouts": -1}, "scene.max_cutouts"),
+        ({"max_cutouts": 10**11}, r"scene.max_cutouts must be in \[0, 100\], got 100000000000"),
+        ({"height": 10**11}, r"scene.height must be in \[8, 16384\], got 100000000000"),
+        ({"photo_px_per_px": [1e30, 1e30]}, "photo_px_per_px must be a range 0 < low <= high <= 1"),
+        ({"speed_widths_per_s": [1e30, 1e30]}, "scene.speed_widths_per_s must be a range 0 < lo"),
+        ({"cutout_widths": [1e-9, 0.1]}, "scene.cutout_widths must be a range 0.001 < low <= hi"),
         ({"split": "exam"}, "split"),
     ],
 )
 def test_wrong_values_name_their_key(wrong, key):
     with pytest.raises(ValueError, match=key):
         Photographs(**wrong)
+
+
+@dataclass(kw_only=True, eq=False)
+class AnyScene(SceneBase):
+    """A scene that takes values of any type, as a config may give."""
+
+    max_cutouts: Any = 3
+    speed_widths_per_s: Any = (0.1, 1.5)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"max_cutouts": float("inf")}, r"scene.max_cutouts must be in \[0, 100\], got inf"),
+        ({"max_cutouts": [1, 2]}, r"scene.max_cutouts must be in \[0, 100\], got \[1, 2\]"),
+        ({"max_cutouts": 2.5}, "scene.max_cutouts must be a whole number, got 2.5"),
+        ({"speed_widths_per_s": 3}, "scene.speed_widths_per_s must be a range .*, got 3"),
+        ({"speed_widths_per_s": None}, "scene.speed_widths_per_s must be a range .*, got None"),
+    ],
+)
+def test_values_of_another_type_name_their_key(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        AnyScene(**wrong)
 
 
 def test_empty_folder_and_unreadable_photographs(tmp_path):

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from src.sim.sensor import response
+from src.sim.sensor.engine_input import threshold_range
 from src.sim.sensor.engines import sensor_cpu, sensor_numba
 from src.sim.sensor.engines.records import NORMALS
 from src.sim.sensor.sensor import EventSensor
@@ -333,6 +334,12 @@ def test_levels_are_the_logarithm_to_one_unit():
 def test_settings_outside_their_range_are_named(settings_, words):
     with pytest.raises(ValueError, match=words):
         EventSensor(**settings_)
+
+
+@pytest.mark.parametrize("threshold", [["a", "b"], [[0.1, 0.2], 0.3], [0.1], [], "a", None])
+def test_a_threshold_that_is_no_number_and_no_range_is_named(threshold):
+    with pytest.raises(ValueError, match=r"^sensor.threshold must be a number or \[low, high\], g"):
+        threshold_range(threshold)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """How atmospheres are drawn: what is seen is what was asked for."""
 
 import math
+import re
 from collections import Counter
 
 import numpy as np
@@ -16,6 +17,7 @@ from src.sim.turbulence.prior import (
     sample_matching_atmosphere,
     unnormalised_cn2_profile,
 )
+from src.sim.turbulence.simulated import INTERVALS, SimulatedTurbulence
 
 
 @pytest.mark.parametrize("severity", ["weak", "medium", "strong"])
@@ -96,31 +98,49 @@ def test_none_and_unknown_severities():
         sample_atmosphere("hopeless", generator(0))
 
 
+def test_ranges_that_nothing_meets():
+    with pytest.raises(NoCameraError, match="no camera within its ranges shows"):
+        sample_atmosphere("strong", generator(0), allowed_aperture_px=(1e-6, 1e-5))
+
+
+@pytest.mark.parametrize("name", INTERVALS)
+@pytest.mark.parametrize(
+    "wrong", [[1, 2, 3], [], ["a", "b"], [[1, 2], 3], [5, 1], [-2, -1], [math.nan] * 2, 3, None]
+)
+def test_every_range_is_checked_at_once_whatever_is_drawn(name, wrong):
+    group, _, severity = name.partition(".")
+    given = {group: {severity: wrong} if severity else wrong}
+    with pytest.raises(
+        ValueError, match=rf"^turbulence.atmosphere.{name} must be a range .*, got "
+    ):
+        SimulatedTurbulence({"severity": "medium"} | given)
+
+
 @pytest.mark.parametrize(
     "settings, message",
     [
-        ({"allowed_aperture_px": (1e-6, 1e-5)}, "no camera within its ranges shows"),
-        (
-            {"tilt_correlation_half_length_px": (0.0, 5.0)},
-            "tilt_correlation_half_length_px must be a range above 0",
-        ),
-        (
-            {"tilt_correlation_time_s": (0.5, 0.1)},
-            "tilt_correlation_time_s must be a range low <= high",
-        ),
-        ({"global_tilt_probability": 1.5}, r"global_tilt_probability must be in \[0, 1\], got 1.5"),
-        (
-            {"outer_scale_over_aperture": (0.0, 1.0)},
-            "outer_scale_over_aperture must be a range above 0",
-        ),
-        ({"cn2_profiles": ["upwards"]}, "cn2_profiles must be of uniform, camera.*got upwards"),
-        ({"cn2_profiles": [[0.0, 0.0]]}, "cn2_profiles must be tables of Cn2 >= 0, somewhere > 0"),
-        ({"cn2_profiles": [[1.0, -1.0]]}, "cn2_profiles must be tables of Cn2 >= 0, somewhere > 0"),
+        ({"distance_m": [1e30, 1e30]}, "distance_m must be a range 0.001 <= low <= high <= 1e+06"),
+        ({"tilt_correlation_time_s": [0.0, 5.0]}, "tilt_correlation_time_s must be a range 1e-06"),
+        ({"f_number": [1e30, 1e30]}, "f_number must be a range 0.1 <= low <= high <= 10000, got"),
+        ({"global_tilt_probability": 1.5}, "global_tilt_probability must be in [0, 1], got 1.5"),
+        ({"kolmogorov_probability": [1]}, "kolmogorov_probability must be in [0, 1], got [1]"),
+        ({"max_rytov_variance": 0}, "max_rytov_variance must be >= 1e-06, got 0"),
+        ({"max_rytov_variance": math.nan}, "max_rytov_variance must be >= 1e-06, got nan"),
+        ({"wavelength_m": -1}, "wavelength_m must be in [1e-07, 0.0001], got -1"),
+        ({"wavelength_m": 1e11}, "wavelength_m must be in [1e-07, 0.0001], got 100000000000.0"),
+        ({"width_px": math.inf}, "width_px must be in [1, 1e+05], got inf"),
+        ({"width_px": None}, "width_px must be in [1, 1e+05], got None"),
+        ({"cn2_profiles": []}, "cn2_profiles must be a list of names or tables, got []"),
+        ({"cn2_profiles": [1, 2]}, "cn2_profiles must be names or tables of Cn2 >= 0, somewhere >"),
+        ({"cn2_profiles": [["a"]]}, "cn2_profiles must be names or tables of Cn2 >= 0, somewhere"),
+        ({"cn2_profiles": ["upwards"]}, "cn2_profiles must be of uniform, camera, middle, object"),
+        ({"cn2_profiles": [[0.0, 0.0]]}, "cn2_profiles must be names or tables of Cn2 >= 0, some"),
+        ({"cn2_profiles": [[1.0, -1.0]]}, "cn2_profiles must be names or tables of Cn2 >= 0, som"),
     ],
 )
-def test_ranges_that_cannot_be_met_and_bad_ranges(settings, message):
-    with pytest.raises(ValueError, match=rf"turbulence\.atmosphere.*{message}"):
-        sample_atmosphere("strong", generator(0), **{"global_tilt_probability": 0.0} | settings)
+def test_settings_outside_their_range_are_named(settings, message):
+    with pytest.raises(ValueError, match=re.escape(f"turbulence.atmosphere.{message}")):
+        SimulatedTurbulence({"severity": "none"} | settings)
 
 
 def test_profiles_by_name_and_by_table():
