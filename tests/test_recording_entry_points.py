@@ -206,13 +206,24 @@ def test_without_views_the_sensor_is_one_view(folder, tmp_path):
         ("start_s=10", "start_s must be below the length of the recording, 0.1"),
         ("ckpt=null", "must name a network"),
         ("backward_warmup_s=-1", "must be >= 0 seconds"),
-        ("noise_filter_s=0", "noise_filter_s must be > 0 seconds or null, got 0"),
+        ("noise_filter_s=0", r"noise_filter_s must be in \(0, 1e6\] seconds or null, got 0"),
+        ("noise_filter_s=1e30", r"noise_filter_s must be in \(0, 1e6\] seconds or null, got 1e"),
+        ("playback_fps=1e30", r"playback_fps must be in \[0\.1, 1000\], got 1e\+30"),
     ],
 )
-def test_wrong_values_are_refused(folder, wrong, message, tmp_path):
+def test_wrong_values_are_refused_and_leave_no_file(folder, wrong, message, tmp_path):
     chosen = [f"recording={folder}/dot.raw", *([HIGHPASS] if wrong != "ckpt=null" else [])]
     with pytest.raises(ValueError, match=message):
         reconstruct(config("reconstruct", tmp_path / "run", *chosen, *wrong.split()))
+    assert not list((tmp_path / "run").iterdir())
+
+
+@pytest.mark.parametrize(
+    "wrong", ["output_format=avi", "playback_fps=0", "noise_filter_s=0", "backward_warmup_s=-1"]
+)
+def test_a_wrong_value_is_refused_before_the_network_is_loaded(wrong, tmp_path):
+    with pytest.raises(ValueError, match=f"{wrong.split('=')[0]} must be"):
+        reconstruct(config("reconstruct", tmp_path / "run", "recording=x", "ckpt=nowhere", wrong))
 
 
 def test_a_calibration_that_fails_leaves_what_was_found(folder, tmp_path):
