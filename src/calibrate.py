@@ -31,7 +31,7 @@ from src.recordings.files import sources, videos
 from src.recordings.files.event_file import ReadOptions
 from src.recordings.files.recording import open_recording
 from src.recordings.files.turbulence_file import SIDE
-from src.recordings.views import Views, load_views, views_or_whole_sensor
+from src.recordings.views import Views, load_views
 from src.records import results
 
 
@@ -79,7 +79,10 @@ def _find_views_in_scene(
     Raises ValueError as `scene_alignment.align_views_by_scene` does.
     """
     if not cfg.mirrors:
-        raise ValueError("mirrors must be true for target=scene, got false")
+        raise ValueError(
+            "mirrors must be true for target=scene, got false: the views of a lens array are found"
+            " by a board, target=checkerboard"
+        )
     pictures = activity_pictures.read_activity_pictures(
         cfg.recording, cfg.sensor_size, ReadOptions.from_keys(cfg)
     )
@@ -97,9 +100,9 @@ def find_contrast_threshold(cfg: DictConfig, run: Path) -> dict[str, tuple]:
     if cfg.clips < 1:
         raise ValueError(f"clips must be >= 1, got {cfg.clips}")
     options, pipeline = ReadOptions.from_keys(cfg), build.build_pipeline(cfg, "test")
-    size = sources.find_sensor_size(cfg.recording, cfg.sensor_size, options)
-    lookup = sensor_lookup.build_lookup(views_or_whole_sensor(cfg.views, size))
-    events = open_recording(cfg.recording, size[::-1], options)
+    views = sources.find_views(cfg.recording, cfg.views, cfg.sensor_size, options)
+    lookup = sensor_lookup.build_lookup(views)
+    events = open_recording(cfg.recording, views.sensor[::-1], options)
     measured = contrast_threshold.measure_event_rates(events, lookup.view)
     contrast_threshold.require_both_polarities(measured)
     drawn = [pipeline.draw(index) for index in range(cfg.clips)]
@@ -130,7 +133,7 @@ def measure_dot_statistics(cfg: DictConfig, run: Path) -> dot_statistics.DotStat
     network = (
         reconstruction.require_event_network(build.load_ckpt_or_baseline(cfg)) if given else None
     )
-    views, dots = load_views(cfg.views) if cfg.views else None, cfg.dots
+    views, dots = None if cfg.views is None else load_views(cfg.views), cfg.dots
     positions = views.positions if views else [(0, 0)]
     still_films, turbulent_films = (
         _read_films(cfg, path, views, network) for path in (cfg.still, cfg.recording)
@@ -169,11 +172,10 @@ def _read_films(
     if network is None:
         raise ValueError(f"ckpt or baseline must reconstruct the events of {path}, got neither")
     options = ReadOptions.from_keys(cfg)
-    sensor = sources.find_sensor_size(path, cfg.sensor_size, options)
-    table = sensor_lookup.build_lookup(views or Views.single_view(sensor, sensor))
+    seen = sources.find_views(path, cfg.views, cfg.sensor_size, options)
     rule = event_windows.build_window_rule("trained", fps=cfg.fps)
-    events = sources.iter_recording(path, sensor, options=options)
-    windows = event_windows.cut_windows(events, table, rule)
+    events = sources.iter_recording(path, seen.sensor, options=options)
+    windows = event_windows.cut_windows(events, sensor_lookup.build_lookup(seen), rule)
     return np.stack(
         list(reconstruction.reconstruct_each_view(windows, network, rule.frames_per_window)), axis=1
     )

@@ -28,7 +28,7 @@ from src.recordings.noise_filter import NoiseFilter, check_support_s
 from src.recordings.reconstruction import Frame
 from src.recordings.sensor_lookup import build_lookup
 from src.recordings.truth_file import CleanClip
-from src.recordings.views import Views, views_or_whole_sensor
+from src.recordings.views import Views
 from src.records import results
 
 RULE_KEYS = ("fps", "bins", "splat", "start_s", "end_s")
@@ -99,8 +99,8 @@ def show_progress(frames: Iterable[Frame], first_s: float) -> Iterator[Frame]:
 
 def choose_views(cfg: DictConfig, network: EventToVideoNetwork) -> Views:
     """Return the views of the recording that the network takes."""
-    sensor = sources.find_sensor_size(cfg.recording, cfg.sensor_size, ReadOptions.from_keys(cfg))
-    views = views_or_whole_sensor(cfg.views, sensor, cfg.resolution)
+    given = cfg.sensor_size, ReadOptions.from_keys(cfg), cfg.resolution
+    views = sources.find_views(cfg.recording, cfg.views, *given)
     all_of_them = reconstruction.takes_all_views(network, views.positions)
     return views if all_of_them else views.select([(0, 0)])
 

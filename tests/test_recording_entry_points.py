@@ -13,8 +13,10 @@ from hydra import compose, initialize_config_dir
 
 from src.calibrate import calibrate
 from src.compare import compare, default_video_names
+from src.live import build_server
 from src.reconstruct import reconstruct, show_progress
 from src.recordings import reconstruction, sensor_lookup, simulated_recording, truth_file, views
+from src.recordings.files import read_events
 from src.sim.optics import layout
 from src.sim.sensor.sensor import EventSensor
 from tests.conftest import ROOT
@@ -34,7 +36,8 @@ def config(name: str, run: Path, *overrides: str):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """Return a folder with board.raw, a blinking board, and dot.raw, a moving dot."""
+    """Return a folder with board.raw, a blinking board, dot.raw, a moving dot, and dot.npz, the
+    same without the sensor's size."""
     folder = tmp_path_factory.mktemp("camera")
     truth = simulated_recording.kaleidoscope_views(
         list(layout(9)), model=(SIDE, SIDE), sensor=SENSOR, tile_px=116.0
@@ -47,6 +50,8 @@ def folder(tmp_path_factory) -> Path:
     for name, film in (("board", blink), ("dot", torch.from_numpy(dot).float().clamp(0, 1))):
         frames = film[None].expand(9, -1, -1, -1)
         simulated_recording.write_recording(folder / f"{name}.raw", frames, 300.0, truth, sensor)
+    events = read_events(folder / "dot.raw")
+    np.savez(folder / "dot.npz", **{name: events[name] for name in "txyp"})
     return folder
 
 
@@ -208,6 +213,7 @@ def test_without_views_the_sensor_is_one_view(folder, tmp_path):
         ("backward_warmup_s=-1", "must be >= 0 seconds"),
         ("noise_filter_s=0", r"noise_filter_s must be in \(0, 1e6\] seconds or null, got 0"),
         ("noise_filter_s=1e30", r"noise_filter_s must be in \(0, 1e6\] seconds or null, got 1e"),
+        ("views=", "views must be a file of calibrate task=views, got none: No such file"),
         ("playback_fps=1e30", r"playback_fps must be in \[0\.1, 1000\], got 1e\+30"),
     ],
 )
@@ -278,6 +284,26 @@ def test_turbulence_of_a_film_of_dots(folder, found, tmp_path):
     assert (tmp_path / "run" / "turbulence.png").is_file()
 
 
+def test_the_sensor_of_a_recording_that_states_none_is_that_of_its_views(folder, found, tmp_path):
+    here = f"recording={folder}/dot.npz"
+    chosen = [here, f"views={found}", HIGHPASS, "output_format=hdf5"]
+    run = reconstruct(config("reconstruct", tmp_path / "run", *chosen))
+    with h5py.File(run / "video.h5") as file:
+        assert file["frames"].shape[1:] == (88, 88)
+    server = build_server(config("live", tmp_path, *chosen[:3], "offered_networks=[]"))
+    assert server.page.player.reader.feed.sensor == SENSOR
+    with pytest.raises(ValueError, match=r"must be the recording's \(400, 640\)"):
+        reconstruct(config("reconstruct", tmp_path / "wrong", *chosen, "sensor_size=[400,640]"))
+    with pytest.raises(ValueError, match="does not state its sensor; give sensor_size="):
+        reconstruct(config("reconstruct", tmp_path / "none", here, HIGHPASS))
+
+
+def test_a_lens_array_is_sent_to_a_board(folder, tmp_path):
+    chosen = ["task=views", f"recording={folder}/dot.raw", "target=scene", "mirrors=false"]
+    with pytest.raises(ValueError, match="mirrors must be true .* got false: .* target=checkerbo"):
+        calibrate(config("calibrate", tmp_path / "run", *chosen))
+
+
 def test_another_task_is_refused(tmp_path):
     with pytest.raises(ValueError, match="task must be one of"):
         calibrate(config("calibrate", tmp_path / "run", "task=guess", "recording=a.raw"))
@@ -292,7 +318,7 @@ def test_threshold_of_a_recording_is_found_by_calibrate(folder, found, tmp_path)
         "clips=2",
         "sensor.initial_reference_error=0",
     ]
-    chosen = [f"recording={folder}/dot.raw", f"views={found}", *small]
+    chosen = [f"recording={folder}/dot.npz", f"views={found}", *small]
     calibrate(config("calibrate", tmp_path / "run", "task=threshold", *chosen))
     assert (tmp_path / "run" / "threshold.csv").is_file()
     assert (tmp_path / "run" / "threshold.png").is_file()

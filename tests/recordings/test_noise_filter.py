@@ -70,7 +70,9 @@ def test_an_edge_that_moves_keeps_its_events_among_noise():
 
 @pytest.mark.parametrize("seconds", [0, -1, 1e30, float("nan"), float("inf")])
 def test_a_wrong_time_names_its_key(seconds):
-    with pytest.raises(ValueError, match=r"noise_filter_s must be in \(0, 1e6\] seconds or null, got"):
+    with pytest.raises(
+        ValueError, match=r"noise_filter_s must be in \(0, 1e6\] seconds or null, got"
+    ):
         NoiseFilter((8, 8), seconds)
 
 
