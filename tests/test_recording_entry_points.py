@@ -236,7 +236,7 @@ def test_a_calibration_that_fails_leaves_what_was_found(folder, tmp_path):
     chosen = ["task=views", f"recording={folder}/dot.raw"]
     with pytest.raises(ValueError, match="seen in 4 or more views"):
         calibrate(config("calibrate", tmp_path / "run", *chosen))
-    assert (tmp_path / "run" / "found.png").is_file()
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["found.png"]
 
 
 def test_corners_by_hand_replace_the_target(folder, found, tmp_path):
@@ -302,6 +302,13 @@ def test_a_lens_array_is_sent_to_a_board(folder, tmp_path):
     chosen = ["task=views", f"recording={folder}/dot.raw", "target=scene", "mirrors=false"]
     with pytest.raises(ValueError, match="mirrors must be true .* got false: .* target=checkerbo"):
         calibrate(config("calibrate", tmp_path / "run", *chosen))
+
+
+def test_views_as_small_as_no_network_takes_are_not_calibrated(folder, tmp_path):
+    chosen = ["task=views", f"recording={folder}/board.raw", "resolution=[5,1]"]
+    with pytest.raises(ValueError, match="must be >= 8 px .*resolution, .* got 5 and 1"):
+        calibrate(config("calibrate", tmp_path / "run", *chosen))
+    assert not list((tmp_path / "run").iterdir())
 
 
 def test_another_task_is_refused(tmp_path):

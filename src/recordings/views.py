@@ -213,9 +213,8 @@ def load_views(path: Path | str, sensor: HeightWidth | None = None) -> Views:
         )
         stated = [entry.get("mirrored") for entry in content["views"]]
     except (OSError, yaml.YAMLError, KeyError, TypeError, OverflowError) as error:
-        is_io = isinstance(error, OSError)
-        why = error.strerror if is_io else f"{type(error).__name__} {error}"
-        got = f"{path or 'none'}: {why}"
+        fault = f"{type(error).__name__} {error}"
+        got = f"{path or 'none'}: {error.strerror if isinstance(error, OSError) else fault}"
         raise ValueError(f"views must be a file of calibrate task=views, got {got}") from None
     for view, mirrored in zip(views.views, stated, strict=True):
         if mirrored not in (None, list(views.mirrored_xy(view))):
