@@ -72,6 +72,8 @@ def load_offered_networks(
     Raises ValueError where that one wants other views than those at `positions`; others that do are
     left out.
     """
+    if any(not isinstance(other, str) for other in cfg.offered_networks):
+        raise ValueError(f"offered_networks must be a list of words, got {cfg.offered_networks}")
     networks = {}
     for other in dict.fromkeys([*cfg.offered_networks, name]):
         if other == name:

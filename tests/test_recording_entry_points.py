@@ -298,6 +298,12 @@ def test_the_sensor_of_a_recording_that_states_none_is_that_of_its_views(folder,
         reconstruct(config("reconstruct", tmp_path / "none", here, HIGHPASS))
 
 
+def test_offered_networks_are_words(folder, tmp_path):
+    chosen = [f"recording={folder}/dot.raw", HIGHPASS, "offered_networks=[[1,2],[3,4]]"]
+    with pytest.raises(ValueError, match="offered_networks must be a list of words, got"):
+        build_server(config("live", tmp_path, *chosen))
+
+
 def test_a_lens_array_is_sent_to_a_board(folder, tmp_path):
     chosen = ["task=views", f"recording={folder}/dot.raw", "target=scene", "mirrors=false"]
     with pytest.raises(ValueError, match="mirrors must be true .* got false: .* target=checkerbo"):
