@@ -30,6 +30,7 @@ from src.recordings.sensor_lookup import build_lookup
 from src.recordings.views import Views, load_views, views_or_whole_sensor
 from src.sim.optics import Position
 
+MOST_THREADS = 1024
 GIL_SWITCH_S = 2e-4  # Python's own 5 ms between two threads is longer than a window
 
 
@@ -38,8 +39,8 @@ def live(cfg: DictConfig) -> None:
 
     Raises ValueError for a recording, views, network or address that cannot be used.
     """
-    if cfg.threads < 1:
-        raise ValueError(f"threads must be >= 1, got {cfg.threads}")
+    if not 1 <= cfg.threads <= MOST_THREADS:
+        raise ValueError(f"threads must be in 1..{MOST_THREADS}, got {cfg.threads}")
     torch.set_num_threads(cfg.threads)
     asyncio.run(play_and_serve(build_server(cfg)))
 

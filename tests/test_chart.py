@@ -85,6 +85,12 @@ def test_what_cannot_be_measured_is_named(tmp_path, override, message):
     assert not list(tmp_path.iterdir())
 
 
+def test_other_bins_than_a_network_has_are_refused_before_the_timing(tmp_path):
+    with pytest.raises(ValueError, match="bins must be 5 for setnet_small, got 3"):
+        draw_speed_accuracy_chart(tiny(tmp_path, "+networks={}", "ckpt=[setnet_small]", "bins=3"))
+    assert not list(tmp_path.iterdir())
+
+
 def test_clips_that_cannot_be_simulated_are_refused_before_the_timing(tmp_path):
     with pytest.raises(ValueError, match="fps must be > 0 windows a second, got nan"):
         draw_speed_accuracy_chart(tiny(tmp_path, f"+networks={{highpass: {HIGHPASS}}}", "fps=nan"))

@@ -45,7 +45,8 @@ WRONG = [
     ("reconstruct", ["recording=x", "ckpt=setnet_small"], "recording must be an event file, got x"),
     ("calibrate", ["recording=x", "task=views"], "recording must be an event file, got x: no such"),
     ("live", ["recording=x", "ckpt=setnet_small"], "recording must be an event file, got x: no su"),
-    ("live", ["recording=x", "threads=0"], "threads must be >= 1, got 0"),
+    ("live", ["recording=x", "threads=0"], "threads must be in 1..1024, got 0"),
+    ("live", ["recording=x", "threads=100000000000"], "threads must be in 1..1024, got 1000000000"),
     ("live", ["recording=x", "host=1.5"], "host must be a word, got 1.5"),
 ]  # fmt: skip
 
