@@ -14,6 +14,7 @@ from rich.progress import track
 
 from src.app import build, entry_point
 from src.app.instantiate import build_part
+from src.deploy.picture_size import check_picture_size
 from src.figures import calibration_figures
 from src.models.network import EventToVideoNetwork
 from src.recordings import event_windows, reconstruction, sensor_lookup
@@ -26,18 +27,20 @@ from src.recordings.calibration import (
     turbulence_meter,
     view_alignment,
 )
-from src.recordings.calibration.boards import Target
+from src.recordings.calibration.boards import Circles, Target
 from src.recordings.files import sources, videos
 from src.recordings.files.event_file import ReadOptions
 from src.recordings.files.recording import open_recording
 from src.recordings.files.turbulence_file import SIDE
-from src.recordings.views import Views, load_views, views_or_whole_sensor
+from src.recordings.views import Views, load_views
 from src.records import results
+from src.records.atomic import check_writable
 
 
 def calibrate_views(cfg: DictConfig, run: Path) -> dict[str, str]:
     """Find the views and their homographies; write `views.yaml`, also at `cfg.save`, and
     `views.png`.  Return a line per view."""
+    check_picture_size(*cfg.resolution)
     target = build_part(cfg, "target")
     if isinstance(target, scene_alignment.SceneTarget) and not cfg.corners:
         views, summary = _find_views_in_scene(cfg, run, target)
@@ -79,7 +82,8 @@ def _find_views_in_scene(
     Raises ValueError as `scene_alignment.align_views_by_scene` does.
     """
     if not cfg.mirrors:
-        raise ValueError("mirrors must be true for target=scene, got false")
+        how = "the views of a lens array are found by a board, target=checkerboard"
+        raise ValueError(f"mirrors must be true for target=scene, got false: {how}")
     pictures = activity_pictures.read_activity_pictures(
         cfg.recording, cfg.sensor_size, ReadOptions.from_keys(cfg)
     )
@@ -97,9 +101,9 @@ def find_contrast_threshold(cfg: DictConfig, run: Path) -> dict[str, tuple]:
     if cfg.clips < 1:
         raise ValueError(f"clips must be >= 1, got {cfg.clips}")
     options, pipeline = ReadOptions.from_keys(cfg), build.build_pipeline(cfg, "test")
-    size = sources.find_sensor_size(cfg.recording, cfg.sensor_size, options)
-    lookup = sensor_lookup.build_lookup(views_or_whole_sensor(cfg.views, size))
-    events = open_recording(cfg.recording, size[::-1], options)
+    views = sources.find_views(cfg.recording, cfg.views, cfg.sensor_size, options)
+    lookup = sensor_lookup.build_lookup(views)
+    events = open_recording(cfg.recording, views.sensor[::-1], options)
     measured = contrast_threshold.measure_event_rates(events, lookup.view)
     contrast_threshold.require_both_polarities(measured)
     drawn = [pipeline.draw(index) for index in range(cfg.clips)]
@@ -122,25 +126,24 @@ def measure_dot_statistics(cfg: DictConfig, run: Path) -> dot_statistics.DotStat
         raise ValueError("still must be the same dots without turbulence, got none")
     for key in ("still", "recording"):
         if not Path(cfg[key]).exists():
-            raise ValueError(
-                f"{key} must be a film, a folder of pictures or events, got {cfg[key]}, which"
-                f" does not exist"
-            )
+            wanted = f"{key} must be a film, a folder of pictures or events"
+            raise ValueError(f"{wanted}, got {cfg[key]}, which does not exist")
+    try:
+        Circles(cfg.dots.rows, cfg.dots.cols)
+    except ValueError as error:
+        raise ValueError(str(error).replace("target.", "dots.")) from error
     given = cfg.ckpt or cfg.get("baseline")
     network = (
         reconstruction.require_event_network(build.load_ckpt_or_baseline(cfg)) if given else None
     )
-    views, dots = load_views(cfg.views) if cfg.views else None, cfg.dots
+    views, dots = None if cfg.views is None else load_views(cfg.views), cfg.dots
     positions = views.positions if views else [(0, 0)]
     still_films, turbulent_films = (
-        _read_films(cfg, path, views, network) for path in (cfg.still, cfg.recording)
+        _read_films(cfg, key, views, network) for key in ("still", "recording")
     )
-    size, still_size = turbulent_films.shape[2:], still_films.shape[2:]
-    if size != still_size:
-        raise ValueError(
-            f"still must have pictures of the size of the recording's, {size[0]}x{size[1]}, got"
-            f" {still_size[0]}x{still_size[1]}"
-        )
+    wanted, got = ("x".join(map(str, film.shape[2:])) for film in (turbulent_films, still_films))
+    if wanted != got:
+        raise ValueError(f"still must have pictures of the recording's size, {wanted}, got {got}")
     centre = positions.index((0, 0))
     places = dot_statistics.find_dots(still_films[centre].mean(0), dots.rows, dots.cols, dots.dark)
     reach = dots.fit_radius_px or dot_statistics.choose_fit_radius(places)
@@ -161,19 +164,19 @@ def measure_dot_statistics(cfg: DictConfig, run: Path) -> dot_statistics.DotStat
 
 
 def _read_films(
-    cfg: DictConfig, path: str, views: Views | None, network: EventToVideoNetwork | None
+    cfg: DictConfig, key: str, views: Views | None, network: EventToVideoNetwork | None
 ) -> Float[np.ndarray, "views frames h w"]:
+    path = cfg[key]
     if not sources.has_events(path):
-        frames = videos.read_video(path)
+        frames = videos.read_video(path, key)
         return np.stack([views.warp_to_model(f) if views else f[None] for f in frames], axis=1)
     if network is None:
         raise ValueError(f"ckpt or baseline must reconstruct the events of {path}, got neither")
     options = ReadOptions.from_keys(cfg)
-    sensor = sources.find_sensor_size(path, cfg.sensor_size, options)
-    table = sensor_lookup.build_lookup(views or Views.single_view(sensor, sensor))
+    seen = sources.find_views(path, cfg.views, cfg.sensor_size, options)
     rule = event_windows.build_window_rule("trained", fps=cfg.fps)
-    events = sources.iter_recording(path, sensor, options=options)
-    windows = event_windows.cut_windows(events, table, rule)
+    events = sources.iter_recording(path, seen.sensor, options=options)
+    windows = event_windows.cut_windows(events, sensor_lookup.build_lookup(seen), rule)
     return np.stack(
         list(reconstruction.reconstruct_each_view(windows, network, rule.frames_per_window)), axis=1
     )
@@ -222,19 +225,24 @@ TASKS: dict[str, Callable[[DictConfig, Path], dict]] = {
 def calibrate(cfg: DictConfig) -> dict:
     """Do `cfg.task`; everything goes below `cfg.paths.run`.
 
-    Raises ValueError for another task and for an `fps` that is not a number > 0.
+    Raises ValueError for another task, an `fps` that is no rate and a `save` that is no file.
     """
     if cfg.task not in TASKS:
         raise ValueError(f"task must be one of {', '.join(TASKS)}, got {cfg.task}")
-    if cfg.fps is not None and not 0 < cfg.fps < np.inf:
-        raise ValueError(f"fps must be > 0 frames a second, got {cfg.fps}")
+    if cfg.fps is not None and not 0.02 <= cfg.fps <= 1e5:  # decays of air.yaml are 1e-5 to 60 s
+        raise ValueError(f"fps must be in [0.02, 1e5] frames a second, got {cfg.fps}")
+    if cfg.save and Path(cfg.save).is_dir():
+        raise ValueError(f"save must be a file to write, got {cfg.save}: a folder")
+    if cfg.save:
+        check_writable(Path(cfg.save), "save")
     if cfg.fps is None and cfg.task != "air":
         is_film = cfg.task == "turbulence" and not sources.has_events(cfg.recording)
         stated = videos.read_fps(cfg.recording, "recording") if is_film else None
         cfg.fps = stated or 120.0
     run = Path(cfg.paths.run)
-    results.create_run_folder(run, entry_point.resolved_yaml(cfg))
-    rich.print(summary := TASKS[cfg.task](cfg, run), f"in {run}")
+    with results.store_config_when_done(run, entry_point.resolved_yaml(cfg)):
+        summary = TASKS[cfg.task](cfg, run)
+    rich.print(summary, f"in {run}")
     return summary
 
 

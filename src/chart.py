@@ -23,12 +23,12 @@ def draw_speed_accuracy_chart(cfg: DictConfig) -> dict[str, str]:
     speed_accuracy.check_chart_options(*measured, cfg.severities, cfg.clips, cfg.seconds)
     build.check_unscored_windows(cfg)
     candidates = compared_networks.load_candidates(cfg)
+    pipelines = {name: compared_networks.pipeline_at_severity(cfg, name) for name in cfg.severities}
+    metrics, warmup = build.build_metrics(cfg), cfg.data.unscored_windows
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     benchmark = SpeedBenchmark(run, seconds=cfg.seconds, bins=cfg.bins)
     speeds = [row for candidate in candidates for row in benchmark.measure(candidate, *measured)]
     results.write_text(run / "speed.csv", speed_accuracy.format_speeds_csv(speeds))
-    pipelines = {name: compared_networks.pipeline_at_severity(cfg, name) for name in cfg.severities}
-    metrics, warmup = build.build_metrics(cfg), cfg.data.unscored_windows
     scores = speed_accuracy.score_accuracy(candidates, pipelines, cfg.clips, metrics, warmup=warmup)
     results.write_text(run / "scores.csv", speed_accuracy.format_scores_csv(scores))
     recommended = speed_accuracy.recommend_network_per_severity(speeds, scores, side)

@@ -21,6 +21,8 @@ from src.records import results
 FORMS: dict[str, list] = {
     "line": [[0, 88], [175, 88]], "circle": [88, 88, 40], "spin": [88, 88, 40, 2.5, 90],
 }  # fmt: skip
+LARGEST_NUMBER = 1e5  # of a slice: pixels, turns a second, degrees
+MOST_SHOWN = 100
 NOTES = {
     "residual_displacement_px": "residual displacement, static: {:.2f} px",
     "line_deviation_px": "deviation from a line, moving: {:.2f} px",
@@ -43,9 +45,8 @@ def compare(cfg: DictConfig) -> dict:
     or a slice outside the frame.
     """
     run = Path(cfg.paths.run)
-    if not cfg.videos:
-        raise ValueError("videos must name one file or more, got []")
     check_slice(cfg)
+    check_videos(cfg)
     names = list(cfg.names or default_video_names([Path(path) for path in cfg.videos]))
     if len(names) != len(cfg.videos):
         raise ValueError(f"names must be one per video, got {len(names)} for {len(cfg.videos)}")
@@ -66,7 +67,6 @@ def compare(cfg: DictConfig) -> dict:
     cuts = [slices.cut_slice(film, fps=cfg.fps, **given) for film in films]
     motions = [_measure(film, across, cfg, next(iter(given)))
                for film, (across, _) in zip(films, cuts, strict=True)]  # fmt: skip
-    results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     scores, rows = dict(zip(names, motions, strict=True)), []
     for name, path, film, (across, _) in zip(names, cfg.videos, films, cuts, strict=True):
         if cfg.reference_images:
@@ -75,10 +75,11 @@ def compare(cfg: DictConfig) -> dict:
             )
         notes = [NOTES[measure].format(value) for measure, value in scores[name].items()]
         rows.append(comparison.VideoRow(name, film, across, "\n".join(notes)))
-    comparison.draw_comparison(
-        rows, run / "comparison.png", line=cuts[0][1], axis=cfg.axis_label,
-        samples=cfg.frames_shown, length_s=min(map(len, films)) / cfg.fps,
-    )  # fmt: skip
+    with results.store_config_when_done(run, entry_point.resolved_yaml(cfg)):
+        comparison.draw_comparison(
+            rows, run / "comparison.png", line=cuts[0][1], axis=cfg.axis_label,
+            samples=cfg.frames_shown, length_s=min(map(len, films)) / cfg.fps,
+        )  # fmt: skip
     rich.print(scores, f"in {run}")
     return scores
 
@@ -113,6 +114,20 @@ def default_video_names(paths: Sequence[Path]) -> list[str]:
     return [f"{path.parent.name}/{path.stem}" for path in paths]
 
 
+def check_videos(cfg: DictConfig) -> None:
+    """Raise ValueError for videos, names or a list of a camera's frames that cannot be used."""
+    for key in ("videos", "names"):
+        if any(not isinstance(name, str) for name in cfg[key] or ()):
+            raise ValueError(f"{key} must be a list of words, got {cfg[key]}")
+    if not cfg.videos:
+        raise ValueError("videos must name one file or more, got []")
+    for path in map(Path, cfg.videos):
+        if not path.exists():
+            raise ValueError(f"videos must be films or folders of pictures that exist, got {path}")
+        if cfg.reference_images:
+            camera_frames.check_camera_frames(path, Path(cfg.reference_images))
+
+
 def check_slice(cfg: DictConfig) -> None:
     """Raise ValueError for an `fps`, a number of frames or a slice of another form than
     `cut_slice` takes."""
@@ -125,10 +140,17 @@ def check_slice(cfg: DictConfig) -> None:
             given = np.empty(0, str)
         if given.dtype.kind not in "if" or given.shape != np.shape(form):
             raise ValueError(f"{key} must be numbers as in {form}, got {cfg[key]}")
+        if not np.abs(given).max() <= LARGEST_NUMBER:
+            allowed = f"[-{LARGEST_NUMBER:g}, {LARGEST_NUMBER:g}]"
+            raise ValueError(f"{key} must have numbers in {allowed}, got {cfg[key]}")
+        if key == "line" and (given[0] == given[1]).all():
+            raise ValueError(f"line must have two ends that differ, got {cfg.line}")
         if key != "line" and not given[2] >= 1:
             raise ValueError(f"{key} must have a radius of 1 pixel or more, got {cfg[key]}")
-    if cfg.frames_shown < 1:
-        raise ValueError(f"frames_shown must be >= 1, got {cfg.frames_shown}")
+    if isinstance(cfg.still, float):
+        raise ValueError(f"still must be a whole number of pixels or null, got {cfg.still}")
+    if not 1 <= cfg.frames_shown <= MOST_SHOWN:
+        raise ValueError(f"frames_shown must be in 1..{MOST_SHOWN}, got {cfg.frames_shown}")
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ from src.recordings.sensor_lookup import build_lookup
 from src.recordings.views import Views, load_views, views_or_whole_sensor
 from src.sim.optics import Position
 
+MOST_THREADS = 1024
 GIL_SWITCH_S = 2e-4  # Python's own 5 ms between two threads is longer than a window
 
 
@@ -38,8 +39,8 @@ def live(cfg: DictConfig) -> None:
 
     Raises ValueError for a recording, views, network or address that cannot be used.
     """
-    if cfg.threads < 1:
-        raise ValueError(f"threads must be >= 1, got {cfg.threads}")
+    if not 1 <= cfg.threads <= MOST_THREADS:
+        raise ValueError(f"threads must be in 1..{MOST_THREADS}, got {cfg.threads}")
     torch.set_num_threads(cfg.threads)
     asyncio.run(play_and_serve(build_server(cfg)))
 
@@ -47,7 +48,7 @@ def live(cfg: DictConfig) -> None:
 def build_server(cfg: DictConfig) -> PageServer:
     """Return the server of the page, with the network and the number of views chosen."""
     faults, name = FaultLog(), str(cfg.ckpt or "baseline")
-    sensor = cfg.sensor_size or (load_views(cfg.views).sensor if cfg.views else None)
+    sensor = cfg.sensor_size or (None if cfg.views is None else load_views(cfg.views).sensor)
     how = {"loop": cfg.loop, "udp_format": cfg.udp_format, "options": ReadOptions.from_keys(cfg)}
     feed = open_feed(cfg.recording, sensor, faults, **how)
     views = views_or_whole_sensor(cfg.views, feed.sensor, cfg.resolution)
@@ -72,6 +73,8 @@ def load_offered_networks(
     Raises ValueError where that one wants other views than those at `positions`; others that do are
     left out.
     """
+    if any(not isinstance(other, str) for other in cfg.offered_networks):
+        raise ValueError(f"offered_networks must be a list of words, got {cfg.offered_networks}")
     networks = {}
     for other in dict.fromkeys([*cfg.offered_networks, name]):
         if other == name:

@@ -18,16 +18,17 @@ from rich.progress import BarColumn, Progress, TimeElapsedColumn
 from src.app import build, entry_point, hardware
 from src.deploy.runtime import EventListRuntime
 from src.figures import samples
+from src.models.backward_warmup import check_backward_warmup_s
 from src.models.network import EventToVideoNetwork
 from src.recordings import output, reconstruction, tone, truth_file
 from src.recordings.event_windows import Window, WindowRule, build_window_rule, cut_windows
 from src.recordings.files import sources
 from src.recordings.files.event_file import HeightWidth, ReadOptions
-from src.recordings.noise_filter import NoiseFilter
+from src.recordings.noise_filter import NoiseFilter, check_support_s
 from src.recordings.reconstruction import Frame
 from src.recordings.sensor_lookup import build_lookup
 from src.recordings.truth_file import CleanClip
-from src.recordings.views import Views, views_or_whole_sensor
+from src.recordings.views import Views
 from src.records import results
 
 RULE_KEYS = ("fps", "bins", "splat", "start_s", "end_s")
@@ -39,23 +40,33 @@ def reconstruct(cfg: DictConfig) -> Path:
     Raises ValueError for a recording, views, network or window that do not go together.
     """
     run, ready_s = Path(cfg.paths.run), []
-    hardware.check_device(cfg.device)
-    given = cfg.tone, cfg.tone_time_constant_s, cfg.output_format
-    tone.build_output_curve(*given)  # refused before the work
+    check_settings(cfg)
     network = reconstruction.require_event_network(build.load_ckpt_or_baseline(cfg))
     views = choose_views(cfg, network)
     make = reconstruct_film_frames if cfg.output_format == "film" else reconstruct_video_frames
     start = time.perf_counter()
     frames, size = make(cfg, network, views)
+    shown = show_progress(frames, cfg.start_s + 1 / cfg.fps)
+    first = next(shown)  # what is refused is so before a file is made
     with (
         results.store_config_when_done(run, entry_point.resolved_yaml(cfg)),
         output.open_video_writer(cfg.output_format, run, size, cfg.playback_fps) as write,
     ):
-        for frame in show_progress(frames, cfg.start_s + 1 / cfg.fps):
+        for frame in chain([first], shown):
             write(frame)
             ready_s.append(time.perf_counter() - start)
     print(describe_run(run / output.KINDS[cfg.output_format][1], views, ready_s))
     return run
+
+
+def check_settings(cfg: DictConfig) -> None:
+    """Raise ValueError for a device, a filter, a warmup or a video that cannot be."""
+    hardware.check_device(cfg.device)
+    output.check_video(cfg.output_format, Path(cfg.paths.run), cfg.playback_fps)
+    tone.build_output_curve(cfg.tone, cfg.tone_time_constant_s, cfg.output_format)
+    check_backward_warmup_s(cfg.backward_warmup_s)
+    if cfg.noise_filter_s is not None:
+        check_support_s(cfg.noise_filter_s)
 
 
 def describe_run(video: Path, views: Views, ready_s: list[float]) -> str:
@@ -88,8 +99,8 @@ def show_progress(frames: Iterable[Frame], first_s: float) -> Iterator[Frame]:
 
 def choose_views(cfg: DictConfig, network: EventToVideoNetwork) -> Views:
     """Return the views of the recording that the network takes."""
-    sensor = sources.find_sensor_size(cfg.recording, cfg.sensor_size, ReadOptions.from_keys(cfg))
-    views = views_or_whole_sensor(cfg.views, sensor, cfg.resolution)
+    given = cfg.sensor_size, ReadOptions.from_keys(cfg), cfg.resolution
+    views = sources.find_views(cfg.recording, cfg.views, *given)
     all_of_them = reconstruction.takes_all_views(network, views.positions)
     return views if all_of_them else views.select([(0, 0)])
 

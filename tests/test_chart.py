@@ -65,7 +65,9 @@ def test_a_post_processor_is_scored_and_paid_for(tmp_path):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("sizes=[30]", "sizes must be multiples of 8"),
+        ("sizes=[30]", r"sizes must be multiples of 8 in 16\.\.4096, got 30"),
+        ("sizes=[[1,2]]", r"sizes must be multiples of 8 in 16\.\.4096, got \[1, 2\]"),
+        ("sizes=[100000000000]", r"sizes must be multiples of 8 in 16\.\.4096, got 1"),
         ("forms=[int8]", "forms must be of float32"),
         ("threads=[0]", "threads must be numbers >= 1"),
         ("devices=[tpu]", "devices must be of cpu, cuda"),
@@ -80,6 +82,19 @@ def test_a_post_processor_is_scored_and_paid_for(tmp_path):
 def test_what_cannot_be_measured_is_named(tmp_path, override, message):
     with pytest.raises(ValueError, match=message):
         draw_speed_accuracy_chart(tiny(tmp_path, "+networks={}", override))
+    assert not list(tmp_path.iterdir())
+
+
+def test_other_bins_than_a_network_has_are_refused_before_the_timing(tmp_path):
+    with pytest.raises(ValueError, match="bins must be 5 for setnet_small, got 3"):
+        draw_speed_accuracy_chart(tiny(tmp_path, "+networks={}", "ckpt=[setnet_small]", "bins=3"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_clips_that_cannot_be_simulated_are_refused_before_the_timing(tmp_path):
+    with pytest.raises(ValueError, match="fps must be > 0 windows a second, got nan"):
+        draw_speed_accuracy_chart(tiny(tmp_path, f"+networks={{highpass: {HIGHPASS}}}", "fps=nan"))
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("found", [True, False])

@@ -13,8 +13,10 @@ from hydra import compose, initialize_config_dir
 
 from src.calibrate import calibrate
 from src.compare import compare, default_video_names
+from src.live import build_server
 from src.reconstruct import reconstruct, show_progress
 from src.recordings import reconstruction, sensor_lookup, simulated_recording, truth_file, views
+from src.recordings.files import read_events
 from src.sim.optics import layout
 from src.sim.sensor.sensor import EventSensor
 from tests.conftest import ROOT
@@ -34,7 +36,8 @@ def config(name: str, run: Path, *overrides: str):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """Return a folder with board.raw, a blinking board, and dot.raw, a moving dot."""
+    """Return a folder with board.raw, a blinking board, dot.raw, a moving dot, and dot.npz, the
+    same without the sensor's size."""
     folder = tmp_path_factory.mktemp("camera")
     truth = simulated_recording.kaleidoscope_views(
         list(layout(9)), model=(SIDE, SIDE), sensor=SENSOR, tile_px=116.0
@@ -47,6 +50,8 @@ def folder(tmp_path_factory) -> Path:
     for name, film in (("board", blink), ("dot", torch.from_numpy(dot).float().clamp(0, 1))):
         frames = film[None].expand(9, -1, -1, -1)
         simulated_recording.write_recording(folder / f"{name}.raw", frames, 300.0, truth, sensor)
+    events = read_events(folder / "dot.raw")
+    np.savez(folder / "dot.npz", **{name: events[name] for name in "txyp"})
     return folder
 
 
@@ -206,20 +211,32 @@ def test_without_views_the_sensor_is_one_view(folder, tmp_path):
         ("start_s=10", "start_s must be below the length of the recording, 0.1"),
         ("ckpt=null", "must name a network"),
         ("backward_warmup_s=-1", "must be >= 0 seconds"),
-        ("noise_filter_s=0", "noise_filter_s must be > 0 seconds or null, got 0"),
+        ("noise_filter_s=0", r"noise_filter_s must be in \(0, 1e6\] seconds or null, got 0"),
+        ("noise_filter_s=1e30", r"noise_filter_s must be in \(0, 1e6\] seconds or null, got 1e"),
+        ("views=", "views must be a file of calibrate task=views, got none: No such file"),
+        ("playback_fps=1e30", r"playback_fps must be in \[0\.1, 1000\], got 1e\+30"),
     ],
 )
-def test_wrong_values_are_refused(folder, wrong, message, tmp_path):
+def test_wrong_values_are_refused_and_leave_no_file(folder, wrong, message, tmp_path):
     chosen = [f"recording={folder}/dot.raw", *([HIGHPASS] if wrong != "ckpt=null" else [])]
     with pytest.raises(ValueError, match=message):
         reconstruct(config("reconstruct", tmp_path / "run", *chosen, *wrong.split()))
+    assert not list((tmp_path / "run").iterdir())
+
+
+@pytest.mark.parametrize(
+    "wrong", ["output_format=avi", "playback_fps=0", "noise_filter_s=0", "backward_warmup_s=-1"]
+)
+def test_a_wrong_value_is_refused_before_the_network_is_loaded(wrong, tmp_path):
+    with pytest.raises(ValueError, match=f"{wrong.split('=')[0]} must be"):
+        reconstruct(config("reconstruct", tmp_path / "run", "recording=x", "ckpt=nowhere", wrong))
 
 
 def test_a_calibration_that_fails_leaves_what_was_found(folder, tmp_path):
     chosen = ["task=views", f"recording={folder}/dot.raw"]
     with pytest.raises(ValueError, match="seen in 4 or more views"):
         calibrate(config("calibrate", tmp_path / "run", *chosen))
-    assert (tmp_path / "run" / "found.png").is_file()
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["found.png"]
 
 
 def test_corners_by_hand_replace_the_target(folder, found, tmp_path):
@@ -267,6 +284,39 @@ def test_turbulence_of_a_film_of_dots(folder, found, tmp_path):
     assert (tmp_path / "run" / "turbulence.png").is_file()
 
 
+def test_the_sensor_of_a_recording_that_states_none_is_that_of_its_views(folder, found, tmp_path):
+    here = f"recording={folder}/dot.npz"
+    chosen = [here, f"views={found}", HIGHPASS, "output_format=hdf5"]
+    run = reconstruct(config("reconstruct", tmp_path / "run", *chosen))
+    with h5py.File(run / "video.h5") as file:
+        assert file["frames"].shape[1:] == (88, 88)
+    server = build_server(config("live", tmp_path, *chosen[:3], "offered_networks=[]"))
+    assert server.page.player.reader.feed.sensor == SENSOR
+    with pytest.raises(ValueError, match=r"must be the recording's \(400, 640\)"):
+        reconstruct(config("reconstruct", tmp_path / "wrong", *chosen, "sensor_size=[400,640]"))
+    with pytest.raises(ValueError, match="does not state its sensor; give sensor_size="):
+        reconstruct(config("reconstruct", tmp_path / "none", here, HIGHPASS))
+
+
+def test_offered_networks_are_words(folder, tmp_path):
+    chosen = [f"recording={folder}/dot.raw", HIGHPASS, "offered_networks=[[1,2],[3,4]]"]
+    with pytest.raises(ValueError, match="offered_networks must be a list of words, got"):
+        build_server(config("live", tmp_path, *chosen))
+
+
+def test_a_lens_array_is_sent_to_a_board(folder, tmp_path):
+    chosen = ["task=views", f"recording={folder}/dot.raw", "target=scene", "mirrors=false"]
+    with pytest.raises(ValueError, match="mirrors must be true .* got false: .* target=checkerbo"):
+        calibrate(config("calibrate", tmp_path / "run", *chosen))
+
+
+def test_views_as_small_as_no_network_takes_are_not_calibrated(folder, tmp_path):
+    chosen = ["task=views", f"recording={folder}/board.raw", "resolution=[5,1]"]
+    with pytest.raises(ValueError, match="must be >= 8 px .*resolution, .* got 5 and 1"):
+        calibrate(config("calibrate", tmp_path / "run", *chosen))
+    assert not list((tmp_path / "run").iterdir())
+
+
 def test_another_task_is_refused(tmp_path):
     with pytest.raises(ValueError, match="task must be one of"):
         calibrate(config("calibrate", tmp_path / "run", "task=guess", "recording=a.raw"))
@@ -281,7 +331,7 @@ def test_threshold_of_a_recording_is_found_by_calibrate(folder, found, tmp_path)
         "clips=2",
         "sensor.initial_reference_error=0",
     ]
-    chosen = [f"recording={folder}/dot.raw", f"views={found}", *small]
+    chosen = [f"recording={folder}/dot.npz", f"views={found}", *small]
     calibrate(config("calibrate", tmp_path / "run", "task=threshold", *chosen))
     assert (tmp_path / "run" / "threshold.csv").is_file()
     assert (tmp_path / "run" / "threshold.png").is_file()
@@ -360,7 +410,17 @@ def test_videos_of_two_sizes_are_not_compared(tmp_path):
         ("still=0", r"still must be in 1\.\."),
         ("line=[[0,0],[9,0]] first=5 last=5", "first must be before last and in the video, got 5"),
         ("line=[[0,0],[9,0]] first=9", "first must be before last and in the video, got 9"),
-        ("line=[[0,0],[9,0]] frames_shown=0", "frames_shown must be >= 1, got 0"),
+        ("line=[[0,0],[9,0]] frames_shown=0", r"frames_shown must be in 1\.\.100, got 0"),
+        ("line=[[0,0],[9,0]] frames_shown=10000000", r"frames_shown must be in 1\.\.100, got 1"),
+        ("line=[[5,5],[5,5]]", "line must have two ends that differ"),
+        ("line=[[inf,5],[5,5]]", r"line must have numbers in \[-100000, 100000\], got"),
+        ("circle=[nan,16,5]", "circle must have numbers in"),
+        ("spin=[16,16,5,1e30,0]", "spin must have numbers in"),
+        ("still=1.5", "still must be a whole number of pixels or null, got 1.5"),
+        ("still=2 videos=[[1,2],[3,4]]", "videos must be a list of words, got"),
+        ("still=2 names=[[1,2]]", "names must be a list of words, got"),
+        ("still=2 videos=[/no/a,/no/b]", "videos must be films or .* that exist, got /no/a"),
+        ("still=2 reference_images=/no/images.txt", "reference_images .*, /no/images.txt is not"),
         (
             "line=[[0,0],[9,0]] moving_object_brightness=all",
             "moving_object_brightness must be one of",
@@ -373,7 +433,7 @@ def test_a_slice_that_cannot_be_taken_is_refused(wrong, message, tmp_path):
         cv2.imwrite(str(tmp_path / "film" / f"{k}.png"), np.zeros((20, 30), np.uint8))
     with pytest.raises(ValueError, match=message):
         compare(config("compare", tmp_path / "run", f"videos=[{tmp_path}/film]", *wrong.split()))
-    assert not (tmp_path / "run" / "config.yaml").exists()
+    assert not list((tmp_path / "run").iterdir())
 
 
 def test_a_scene_that_stands_wanders_by_its_shifts_whatever_the_size(tmp_path):
@@ -397,6 +457,6 @@ def test_a_scene_that_stands_wanders_by_its_shifts_whatever_the_size(tmp_path):
 def test_every_video_of_a_comparison_has_a_name_of_its_own(tmp_path):
     assert default_video_names([Path("a/video.h5"), Path("b/video.h5")]) == ["a", "b"]
     assert default_video_names([Path("a/one.h5"), Path("a/two.h5")]) == ["a/one", "a/two"]
-    alike = ["videos=[a/v.h5,b/v.h5]", "names=[n,n]", "line=[[0,8],[17,8]]"]
+    alike = [f"videos=[{tmp_path},{tmp_path}]", "names=[n,n]", "line=[[0,8],[17,8]]"]
     with pytest.raises(ValueError, match="names must differ, got n, n"):
         compare(config("compare", tmp_path, *alike))

@@ -23,7 +23,8 @@ def load_candidates(cfg: DictConfig) -> list[Candidate]:
 
     An entry of `networks` whose weights are missing is a candidate without weights where it says
     what its `model` is, else one with nothing but the reason.  Raises ValueError for a `ckpt` or a
-    `baseline` that cannot be loaded, and for entries that are none.
+    `baseline` that cannot be loaded, for other `bins` than a network has, and for entries that are
+    none.
     """
     packages = read_user_packages(cfg)
     given = cfg.ckpt if isinstance(cfg.ckpt, ListConfig) else [cfg.ckpt] if cfg.ckpt else []
@@ -35,10 +36,10 @@ def load_candidates(cfg: DictConfig) -> list[Candidate]:
         name = f"baseline {name}" if name in loaded else name
         loaded[name] = build_part(cfg, "baseline").eval()
     if loaded:
-        networks = {name: _require_event_network(name, net) for name, net in loaded.items()}
+        networks = {n: _require_event_network(n, net, cfg.bins) for n, net in loaded.items()}
         return [Candidate(n, net, net.views or cfg.optics.views) for n, net in networks.items()]
     entries = as_dict(cfg.networks).items()
-    candidates = [_load_entry(name, entry, packages) for name, entry in entries if entry]
+    candidates = [_load_entry(n, entry, packages, cfg.bins) for n, entry in entries if entry]
     if not candidates:
         raise ValueError("networks must name at least one network, got none")
     return candidates
@@ -50,7 +51,7 @@ def _name_networks(files: Sequence[str]) -> list[str]:
     return stems if len(set(stems)) == len(stems) else list(files)
 
 
-def _load_entry(name: str, entry: Mapping, packages: Sequence[str]) -> Candidate:
+def _load_entry(name: str, entry: Mapping, packages: Sequence[str], bins: int) -> Candidate:
     if not isinstance(entry, Mapping) or set(entry) - KEYS or "views" not in entry:
         allowed = ", ".join(sorted(KEYS))
         raise ValueError(f"networks.{name} must have views and of {allowed}, got {entry}")
@@ -65,16 +66,21 @@ def _load_entry(name: str, entry: Mapping, packages: Sequence[str]) -> Candidate
     except ValueError as error:
         missing = str(error)
     if network is not None:
-        events = _require_event_network(f"networks.{name}", network)
+        events = _require_event_network(f"networks.{name}", network, bins)
         return Candidate(name, events, views, postprocessor=post)
     if "model" in entry and "postprocessor" not in entry:
         network = instantiate_node(entry["model"], packages).eval()
     return Candidate(name, network, views, trained=False, missing_reason=missing)
 
 
-def _require_event_network(name: str, network: nn.Module) -> EventToVideoNetwork:
+def _require_event_network(name: str, network: nn.Module, bins: int) -> EventToVideoNetwork:
+    """Return `network`; raises ValueError for one that takes no events, or another number of
+    `bins` where it has one."""
     if not isinstance(network, EventToVideoNetwork):
         raise ValueError(f"{name} must be a network for events, got {type(network).__name__}")
+    wanted = getattr(network, "bins", bins)
+    if wanted != bins:
+        raise ValueError(f"bins must be {wanted} for {name}, got {bins}")
     return network
 
 

@@ -17,6 +17,7 @@ from src.records.results import format_csv
 from src.sim.pipeline import Pipeline, simulate
 
 Name = TypeVar("Name", bound=Hashable)
+LARGEST_SIDE = 4096  # pixels of a frame that is timed
 SEVERITIES = ("weak", "medium", "strong", "mixed")
 
 
@@ -25,7 +26,7 @@ def check_chart_options(
 ) -> None:
     """Raise ValueError, naming the key, for what cannot be measured."""
     rules = {
-        "sizes must be multiples of 8 from 16 on": (sizes, lambda s: s >= 16 and s % 8 == 0),
+        f"sizes must be multiples of 8 in 16..{LARGEST_SIDE}": (sizes, _is_side),
         "threads must be numbers >= 1": (threads, lambda count: count >= 1),
         f"forms must be of {', '.join(FORMS)}": (forms, FORMS.__contains__),
         "devices must be of cpu, cuda": (devices, ("cpu", "cuda").__contains__),
@@ -41,6 +42,10 @@ def check_chart_options(
             listed = ", ".join(map(str, values))
             why = "networks are compared by the time of one CPU thread"
             raise ValueError(f"{key} must include {needed}, got {listed}: {why}")
+
+
+def _is_side(side: object) -> bool:
+    return isinstance(side, int) and 16 <= side <= LARGEST_SIDE and side % 8 == 0
 
 
 @dataclass(frozen=True)

@@ -20,14 +20,10 @@ def score_against_camera(video: Path, listing: Path, part: slice = slice(None)) 
     each against the frame nearest in time; `lpips_aligned` is after the best gain and offset of
     each frame, as events carry neither.  A frame without contrast has correlation 0.
 
-    `listing`: a line per picture, seconds and file.  Raises ValueError without the video's
-    `frames.csv`, or where no picture falls on a frame.
+    `listing`: a line per picture, seconds and file.  Raises ValueError as `check_camera_frames`
+    does, and where no picture falls on a frame.
     """
-    table = video.parent / "frames.csv"
-    if not table.is_file() or not listing.is_file():
-        missing = table if listing.is_file() else listing
-        wanted = "reference_images must be the list of a camera's frames"
-        raise ValueError(f"{wanted}, {missing} is not there")
+    table = check_camera_frames(video, listing)
     film, scores, lpips = list(videos.read_video(video)), [], LPIPS()
     clock = _read_clock(video, table, len(film))
     scored = range(len(film))[part]
@@ -50,6 +46,17 @@ def score_against_camera(video: Path, listing: Path, part: slice = slice(None)) 
         wanted = "reference_images must have frames within the video's time"
         raise ValueError(f"{wanted}, {listing} has none")
     return dict(zip(NAMES, np.mean(scores, 0).tolist(), strict=True))
+
+
+def check_camera_frames(video: Path, listing: Path) -> Path:
+    """Return the table `frames.csv` of a video; raises ValueError where it or `listing` is not
+    there."""
+    table = video.parent / "frames.csv"
+    if not table.is_file() or not listing.is_file():
+        missing = table if listing.is_file() else listing
+        wanted = "reference_images must be the list of a camera's frames"
+        raise ValueError(f"{wanted}, {missing} is not there")
+    return table
 
 
 def _read_clock(video: Path, table: Path, frames: int) -> np.ndarray:

@@ -1,6 +1,5 @@
 """Events that no neighbour supports: background activity (Delbruck 2008) and hot pixels."""
 
-import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -9,19 +8,25 @@ from jaxtyping import Bool
 from src.recordings.engines.event_passes import LONG_AGO_US, mark_supported_events
 from src.recordings.views import HeightWidth
 
+LONGEST_S = 1e6
 SUPPORT_S = 0.005  # of `find_supported_pixels`
+
+
+def check_support_s(seconds: float) -> None:
+    """Raise ValueError for what no noise filter can look back."""
+    if not 0 < seconds <= LONGEST_S:
+        raise ValueError(f"noise_filter_s must be in (0, 1e6] seconds or null, got {seconds}")
 
 
 class NoiseFilter:
     """Keeps an event if one of its eight neighbours, of whatever view and polarity, had one at most
     `support_s` before, in this call or an earlier one.
 
-    `sensor`: (height, width).  Raises ValueError unless `support_s` is above 0.
+    `sensor`: (height, width).  Raises ValueError as `check_support_s` does.
     """
 
     def __init__(self, sensor: HeightWidth, support_s: float):
-        if not 0 < support_s < math.inf:
-            raise ValueError(f"noise_filter_s must be > 0 seconds or null, got {support_s}")
+        check_support_s(support_s)
         height, width = sensor
         self.latest_us = np.full((height + 2, width + 2), LONG_AGO_US)  # with a border
         self.support_us = round(1e6 * support_s)

@@ -43,15 +43,11 @@ def open_video_writer(
 
     `size`: (height, width); `film`: frames with colours; `playback_fps`: of an MP4 or GIF.
     `frames.csv` gets each frame's index, time in s, events in views and outside.  Raises ValueError
-    for another `kind`, or where the file cannot be written.
+    as `check_video` does, or where the file cannot be written.
     """
-    if kind not in KINDS:
-        raise ValueError(f"output_format must be one of {', '.join(KINDS)}, got {kind}")
-    if not 0.1 <= playback_fps <= 1000:
-        raise ValueError(f"playback_fps must be in [0.1, 1000], got {playback_fps}")
+    check_video(kind, folder, playback_fps)
     folder.mkdir(parents=True, exist_ok=True)
     make, whole = KINDS[kind]
-    _check_only_frames(folder / whole)
     video, table_file = partial_path(folder / whole), partial_path(folder / "frames.csv")
     with (
         name_path_in_errors(folder / whole),
@@ -76,6 +72,16 @@ def open_video_writer(
         shutil.rmtree(folder / whole)  # frames of an earlier run into the same folder
     os.replace(video, folder / whole)
     os.replace(table_file, folder / "frames.csv")
+
+
+def check_video(kind: str, folder: Path, playback_fps: float) -> None:
+    """Raise ValueError for what `open_video_writer` cannot open: another `kind`, a `playback_fps`
+    out of range, or a `frames/` in `folder` with other files than frames."""
+    if kind not in KINDS:
+        raise ValueError(f"output_format must be one of {', '.join(KINDS)}, got {kind}")
+    if not 0.1 <= playback_fps <= 1000:
+        raise ValueError(f"playback_fps must be in [0.1, 1000], got {playback_fps}")
+    _check_only_frames(folder / KINDS[kind][1])
 
 
 def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> int:

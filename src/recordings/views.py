@@ -187,7 +187,7 @@ def views_or_whole_sensor(
 
     `resolution`: (height, width) of the model picture instead of that of the file or the sensor.
     Raises ValueError for one out of range."""
-    views = load_views(path, sensor) if path else Views.single_view(sensor, sensor)
+    views = load_views(path, sensor) if path is not None else Views.single_view(sensor, sensor)
     if not resolution:
         return views
     try:
@@ -213,8 +213,9 @@ def load_views(path: Path | str, sensor: HeightWidth | None = None) -> Views:
         )
         stated = [entry.get("mirrored") for entry in content["views"]]
     except (OSError, yaml.YAMLError, KeyError, TypeError, OverflowError) as error:
-        why = f"{path}: {type(error).__name__} {error}"
-        raise ValueError(f"views must be a file of calibrate task=views, got {why}") from None
+        fault = f"{type(error).__name__} {error}"
+        got = f"{path or 'none'}: {error.strerror if isinstance(error, OSError) else fault}"
+        raise ValueError(f"views must be a file of calibrate task=views, got {got}") from None
     for view, mirrored in zip(views.views, stated, strict=True):
         if mirrored not in (None, list(views.mirrored_xy(view))):
             raise ValueError(f"{path}: mirrored of {view.position} contradicts its homography")

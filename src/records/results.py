@@ -48,12 +48,17 @@ class ScoreRow:
 def store_config_when_done(run: Path, config: str) -> Iterator[None]:
     """As `create_run_folder`, but until the block has ended the config is `config.partial.yaml`.
 
-    What an earlier run left there keeps its own config where the block fails.
+    What an earlier run left there keeps its own config where the block fails.  Where it raises
+    ValueError, a refusal, no config is left.
     """
     whole = run / CONFIG_FILE
     partial = partial_path(whole)
     create_run_folder(run, config, partial.name)
-    yield
+    try:
+        yield
+    except ValueError:
+        partial.unlink()
+        raise
     os.replace(partial, whole)
 
 

@@ -51,7 +51,12 @@ WRONG = [
     ("compare", ["videos=[a.h5]", "circle=[1]"], "circle must be numbers as in [88, 88, 40], got"),
     ("compare", ["videos=[a.h5]", "spin=[[1,2],3]"], "spin must be numbers as in [88, 88, 40, 2.5"),
     ("convert", ["recording=x"], "out must be given: out=..."),
-    ("live", ["recording=x", "threads=0"], "threads must be >= 1, got 0"),
+    ("convert", ["recording=x", "out=y.h5"], "recording must be an event file, got x: no such"),
+    ("reconstruct", ["recording=x", "ckpt=setnet_small"], "recording must be an event file, got x"),
+    ("calibrate", ["recording=x", "task=views"], "recording must be an event file, got x: no such"),
+    ("live", ["recording=x", "ckpt=setnet_small"], "recording must be an event file, got x: no su"),
+    ("live", ["recording=x", "threads=0"], "threads must be in 1..1024, got 0"),
+    ("live", ["recording=x", "threads=100000000000"], "threads must be in 1..1024, got 1000000000"),
     ("live", ["recording=x", "host=1.5"], "host must be a word, got 1.5"),
 ]  # fmt: skip
 

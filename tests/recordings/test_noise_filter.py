@@ -68,9 +68,11 @@ def test_an_edge_that_moves_keeps_its_events_among_noise():
     assert len(left & (set(noise) - set(edge))) < 0.5 * len(noise)
 
 
-@pytest.mark.parametrize("seconds", [0, -1, float("nan"), float("inf")])
+@pytest.mark.parametrize("seconds", [0, -1, 1e30, float("nan"), float("inf")])
 def test_a_wrong_time_names_its_key(seconds):
-    with pytest.raises(ValueError, match="noise_filter_s must be > 0 seconds or null, got"):
+    with pytest.raises(
+        ValueError, match=r"noise_filter_s must be in \(0, 1e6\] seconds or null, got"
+    ):
         NoiseFilter((8, 8), seconds)
 
 

@@ -204,14 +204,24 @@ def estimate_contrast_threshold(
     ons = find_on_threshold(best.curve, pairs, at_ends=True)
     steps = -_log_excess_quotient(best.curve, ons, pairs) / gain
     ons = ons * np.exp(on_gain * steps)
-    offs = ons * best.curve.off_ratio * np.exp(steps)
-    on, off = float(ons[0]), float(offs[0])
-    bounds = np.nanpercentile([ons[1:], offs[1:]], (2.5, 97.5), axis=1).T.tolist()
-    (on_low, on_high), (off_low, off_high) = bounds
-    on_off = (on, on_low, on_high), (off, off_low, off_high)
+    ratios = best.curve.off_ratio * np.exp(steps)
+    on, off = float(ons[0]), float(ons[0] * ratios[0])
+    drawn_on = np.clip(ons[1:], thresholds[0], thresholds[-1])
+    drawn_off = drawn_on * np.clip(ratios[1:], *OFF_RATIOS)
+    on_off = (_bound(on, drawn_on, thresholds), _bound(off, drawn_off, thresholds))
     return ThresholdEstimate(
         *on_off, best.curve, measured, np.percentile(drawn, (2.5, 97.5), axis=0)
     )
+
+
+def _bound(
+    value: float, drawn: Float[np.ndarray, " draws"], thresholds: Sequence[float]
+) -> tuple[float, float, float]:
+    """Return `value` with the middle 95 % of what was drawn, which ends where the grid does, or at
+    a value beyond it."""
+    ends = min(thresholds[0], value), max(thresholds[-1], value)
+    low, high = np.clip(np.nanpercentile(drawn, (2.5, 97.5)), *ends).tolist()
+    return value, low, high
 
 
 @dataclass(frozen=True)

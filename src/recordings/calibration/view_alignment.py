@@ -224,7 +224,8 @@ def read_corners(path: Path | str, are_mirrored: bool = True) -> dict[Position, 
             for entry in safe_yaml.read(path)
         ]
     except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, OverflowError) as error:
-        got = f"{path}: {type(error).__name__} {error}"
+        fault = f"{type(error).__name__} {error}"
+        got = f"{path}: {error.strerror if isinstance(error, OSError) else fault}"
         raise ValueError(f"corners must be a list of position and corners, got {got}") from None
     try:
         corners = _collect_corners(entries)

@@ -97,7 +97,7 @@ def open_recording(
     """
     path = Path(path)
     if find_folder_reader(path) is None and (not path.is_file() or path.stat().st_size == 0):
-        raise ValueError(f"{path}: {_why_not_a_file(path)}")
+        raise ValueError(f"recording must be an event file, got {path}: {_why_not_a_file(path)}")
     state = path.stat()
     kept, survey, swapped = _open_and_survey(path, state.st_mtime_ns, state.st_size, options)
     file = _open_file(path, options) if kept is None else kept
@@ -215,7 +215,7 @@ def _plain(raw: RawEvents) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _why_not_a_file(path: Path) -> str:
     if path.is_dir():
-        return "is a folder, not an event file"
+        return "a folder"
     if path.exists():
         return "the file is empty" if path.is_file() else "can be read only once; save it as a file"
     return "no such file"

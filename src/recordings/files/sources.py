@@ -13,14 +13,32 @@ from src.recordings.files import recording
 from src.recordings.files.event_file import HeightWidth, ReadOptions
 from src.recordings.files.recorded_frames import find_frames
 from src.recordings.files.videos import read_gray_picture, read_video
+from src.recordings.views import Views, load_views, views_or_whole_sensor
 from src.sim.scenes.video_files import PICTURE_SUFFIXES, VIDEO_SUFFIXES
 
 
+def find_views(
+    path: Path | str,
+    views: Path | str | None,
+    sensor: Sequence[int] | None = None,
+    options: ReadOptions = ReadOptions(),
+    resolution: Sequence[int] | None = None,
+) -> Views:
+    """Return the views of the file `views` on the sensor of the recording at `path`, or all of it
+    as one view; raises ValueError as `find_sensor_size` and `views_or_whole_sensor` do."""
+    in_views = None if views is None else load_views(views).sensor
+    size = find_sensor_size(path, sensor, options, in_views)
+    return views_or_whole_sensor(views, size, resolution)
+
+
 def find_sensor_size(
-    path: Path | str, sensor: Sequence[int] | None = None, options: ReadOptions = ReadOptions()
+    path: Path | str,
+    sensor: Sequence[int] | None = None,
+    options: ReadOptions = ReadOptions(),
+    in_views: HeightWidth | None = None,
 ) -> HeightWidth:
     """Return (height, width) of the recording's sensor: `sensor`, else what the file states, else
-    that of the frames beside its events, with a warning.
+    that of its views, else that of the frames beside its events, with a warning.
 
     Raises ValueError where none says.
     """
@@ -28,6 +46,8 @@ def find_sensor_size(
     opened = recording.open_recording(path, given, options)
     if opened.size is not None:
         return opened.size[::-1]
+    if in_views is not None:
+        return in_views
     try:
         frames = find_frames(opened)
     except (ValueError, OSError):  # pictures that cannot be read, or a listing of something else

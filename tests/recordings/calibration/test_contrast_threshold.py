@@ -154,6 +154,20 @@ def test_the_interval_holds_the_draw_of_the_scene():
     assert held >= 7
 
 
+@pytest.mark.parametrize("off_ratio", [1.0, 1.4])  # of the second OFF is beyond the grid itself
+def test_intervals_end_where_the_grid_does_and_hold_their_value(off_ratio):
+    contrasts = np.random.default_rng(0).uniform(0.4, 1.2, 6)
+    scenes = [0.45 + c * (scene(seed) - 0.45) for seed, c in enumerate(contrasts)]
+    pieces = recorded(EventSensor(0.7, off_ratio=off_ratio), [scenes[0]])
+    measured = contrast_threshold.measure_event_rates(pieces, np.zeros((48, 48), int), slices=10)
+    found = contrast_threshold.estimate_contrast_threshold(
+        measured, scenes[1:], FPS, EventSensor(), GRID
+    )
+    for value, low, high in (found.on, found.off):
+        assert min(GRID[0], value) <= low < high <= max(GRID[-1], value)
+    assert GRID[-1] in found.on or GRID[0] in found.on
+
+
 def test_hot_pixels_are_not_simulated():
     clips = [scene(0)]
     hot = EventSensor(hot_pixel_fraction=0.05, hot_pixel_hz=100.0)

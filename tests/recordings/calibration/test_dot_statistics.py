@@ -196,9 +196,12 @@ def write_film(folder, frames: int, side: int = 96):
 @pytest.mark.parametrize(
     "wrong, message",
     [
-        ("fps=0", "fps must be > 0 frames a second, got 0"),
-        ("fps=inf", "fps must be > 0 frames a second, got inf"),
-        ("still={folder}/larger", r"still must have pictures of the size .* 96x96, got 120x120"),
+        ("fps=0", r"fps must be in \[0.02, 1e5\] frames a second, got 0"),
+        ("fps=inf", r"fps must be in \[0.02, 1e5\] frames a second, got inf"),
+        ("fps=1e30", r"fps must be in \[0.02, 1e5\] frames a second, got 1e\+30"),
+        ("dots.rows=0", r"dots.rows and dots.cols must be in 3\.\.100, got 0 and 3"),
+        ("still={folder}/none", "still must be a film or a folder of pictures, got .*none"),
+        ("still={folder}/larger", r"still must have pictures of the .* size, 96x96, got 120x120"),
         ("still={folder}/nowhere", "still must be .*, got .*nowhere, which does not exist"),
     ],
 )
@@ -206,11 +209,13 @@ def test_calibrate_refuses_wrong_films_before_it_fits(wrong, message, tmp_path, 
     monkeypatch.delattr(gaussian_dots, "fit_gaussians")
     dots, still = (write_film(tmp_path / name, 2) for name in ("dots", "still"))
     write_film(tmp_path / "larger", 2, 120)
+    (tmp_path / "none").mkdir()
     given = ["task=turbulence", f"recording={dots}", f"still={still}", "fps=60"]
     given.append(wrong.format(folder=tmp_path))
     with pytest.raises(ValueError, match=message) as caught:
         calibrate(config("calibrate", tmp_path / "run", *given))
     assert "\n" not in str(caught.value)
+    assert not list((tmp_path / "run").iterdir())
 
 
 def test_ground_follows_the_vignette_under_the_dots():

@@ -280,16 +280,18 @@ def test_calibrate_writes_a_file_and_a_figure(folder, tmp_path):
     "wrong, message",
     [
         ("video=nowhere", "video must be a film or a folder of pictures, got nowhere"),
-        ("fps=0", "fps must be > 0"),
+        ("fps=0", "fps must be in"),
+        ("fps=1e30", r"fps must be in \[0.02, 1e5\] frames a second, got 1e\+30"),
+        ("save=/tmp", "save must be a file to write, got /tmp: a folder"),
         ("air.max_frames=5", "air.max_frames must be at least 16"),
-        ("air.max_frames=16 fps=inf", "fps must be > 0"),
+        ("air.max_frames=16 fps=inf", "fps must be in"),
     ],
 )
 def test_calibrate_refuses_and_writes_nothing(folder, wrong, message, tmp_path):
     chosen = ["task=air", f"video={folder}", f"save={tmp_path}/air.yaml", *wrong.split()]
     with pytest.raises(ValueError, match=message):
         calibrate(config("calibrate", tmp_path / "run", *chosen))
-    assert not (tmp_path / "air.yaml").exists() and not (tmp_path / "run" / "air.yaml").exists()
+    assert not (tmp_path / "air.yaml").exists() and not list((tmp_path / "run").iterdir())
 
 
 def test_footage_of_a_building_and_of_a_panning_camera(shared_data):

@@ -148,7 +148,9 @@ def test_a_file_that_is_none_is_named(tmp_path, ending, content):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(ValueError, match="no such file"):
+    with pytest.raises(
+        ValueError, match="recording must be an event file, got .*a.raw: no such file"
+    ):
         read_events(tmp_path / "a.raw")
 
 

@@ -359,5 +359,5 @@ def test_a_format_of_a_file_that_is_not_raw_is_refused(tmp_path, events):
 
 
 def test_a_folder_is_named_as_one(tmp_path):
-    with pytest.raises(ValueError, match="is a folder, not an event file"):
+    with pytest.raises(ValueError, match="must be an event file, got .*: a folder"):
         read_events(tmp_path)
