@@ -108,7 +108,7 @@ def test_targets_are_drawn_before_the_photograph_and_only_there():
             {"kinds": {"dart": {"speed_px_per_s": [1, 1e6]}}},
             r"scene.speed_px_per_s must be in \[0, 2",
         ),
-        ({"max_targets": 0}, "scene.max_targets must be >= 1, got 0"),
+        ({"max_targets": 0}, r"scene.max_targets must be in \[1, 100\], got 0"),
         ({"paused_clip_share": 1.5}, r"scene.paused_clip_share must be in \[0, 1\], got 1.5"),
         ({"photo_px_per_px": [0, 1]}, "scene.photo_px_per_px must be a range"),
         ({"root": "/nowhere"}, "scene.root must be a folder or a pack"),
