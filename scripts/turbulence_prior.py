@@ -1,8 +1,10 @@
-"""What atmospheres the prior draws: python -m scripts.turbulence_prior [air.yaml ...].
+"""What atmospheres the prior draws:
 
-Prints quantiles of the draws of each severity and of the clips of data=test_photos, and draws
-docs/figures/turbulence_prior.png: rms tilt against its half length.  `air.yaml` files are those of
-`python -m src.calibrate task=air`, shown with their intervals.
+    python -m scripts.turbulence_prior [air.yaml ...] [--figure FILE]
+
+Prints quantiles of the draws of each severity and of the clips of data=test_photos, and draws rms
+tilt against its half length (out/turbulence_prior.png).  `air.yaml` files are those of `python -m
+src.calibrate task=air`, shown with their intervals.
 """
 
 import argparse
@@ -29,7 +31,7 @@ FARTHEST = 2000.0  # px; what is longer is drawn there
 COLUMNS = {
     "tilt, px": lambda path: path.tilt_std_px(WIDTH),
     "half length, px": lambda path: path.tilt_correlation_half_length_px(WIDTH),
-    "spread, px": lambda path: path.tilt_and_blur_px(WIDTH),
+    "tilt and blur, px": lambda path: path.tilt_and_blur_px(WIDTH),
     "D/r0": lambda path: path.d_over_r0,
     "lambda/D, px": lambda path: path.lambda_over_d_px(WIDTH),
     "D, px at the object": lambda path: path.aperture_m / path.pixel_size_at_object_m(WIDTH),
@@ -105,10 +107,11 @@ def main() -> None:
     """Read the arguments."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("measured", type=Path, nargs="*", help="files of task=air")
+    parser.add_argument("--figure", type=Path, default=Path("out/turbulence_prior.png"))
     given = parser.parse_args()
     atmospheres = draw_atmospheres()
     print(format_table(atmospheres | draw_test_atmospheres()))
-    plot_prior(atmospheres, given.measured, Path("docs/figures/turbulence_prior.png"))
+    plot_prior(atmospheres, given.measured, given.figure)
 
 
 if __name__ == "__main__":

@@ -46,7 +46,8 @@ def test_the_page_runs_as_it_stands(tmp_path, monkeypatch):
     write_video(tmp_path / "my.mp4", textured(16, (40, 56)), fps=30)
     events = np.zeros(300, [("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)])
     events["t"], events["p"] = np.arange(300) * 50, 1
-    write_events(tmp_path / "cap.csv", events, width=64, height=48)
+    for name in ("cap.csv", "left.csv", "right.csv"):
+        write_events(tmp_path / name, events, width=64, height=48)
     assert len(blocks()) >= 7
     space: dict = {}
     for block in blocks():
@@ -57,6 +58,8 @@ def test_the_page_runs_as_it_stands(tmp_path, monkeypatch):
     )
     assert space["still"].tilt.shape == (1, 13, 2, 64, 96) and space["film"].fps == 60
     assert len(frames) == len(fast) == 48 and frames[-1].std() > 0.01
+    joined = lightfield_events.read_events(tmp_path / "array.npz")
+    assert len(joined) == 600 and (joined["t"][0], joined["x"][0]) == (-1250, 64)
     assert np.abs(np.stack(frames) - np.stack(fast)).max() < 0.1  # bf16 or float32
     assert len(list(videos.read_video(tmp_path / "film.mp4"))) == 48
     assert len(space["recorded"]) == 300

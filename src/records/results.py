@@ -49,7 +49,7 @@ def store_config_when_done(run: Path, config: str) -> Iterator[None]:
     """As `create_run_folder`, but until the block has ended the config is `config.partial.yaml`.
 
     What an earlier run left there keeps its own config where the block fails.  Where it raises
-    ValueError, a refusal, no config is left.
+    ValueError with no file written, a refusal, no config is left.
     """
     whole = run / CONFIG_FILE
     partial = partial_path(whole)
@@ -57,7 +57,8 @@ def store_config_when_done(run: Path, config: str) -> Iterator[None]:
     try:
         yield
     except ValueError:
-        partial.unlink()
+        if all(file == partial or file.name.startswith(".") for file in run.iterdir()):
+            partial.unlink()
         raise
     os.replace(partial, whole)
 

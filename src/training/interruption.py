@@ -10,13 +10,14 @@ from lightning import Callback, Trainer
 
 from src.training.step_guard import NonFiniteError
 
-DEFERRED = (signal.SIGINT, signal.SIGUSR1)  # Lightning itself defers SIGTERM
+DEFERRED = (signal.SIGINT, signal.SIGHUP, signal.SIGUSR1)  # Lightning itself defers SIGTERM
 
 
 class DeferredSignals(Callback):
-    """Ctrl-C and SLURM's SIGUSR1 act before the next step, a second one at once, as Lightning has
-    it: stop with a checkpoint, or store one and requeue the job.  An error in the middle of a step,
-    such as a worker's death, leaves no checkpoint: the one before stays the newest.
+    """Ctrl-C, SIGHUP and SLURM's SIGUSR1 act before the next step, a second one at once, as
+    Lightning has it: stop with a checkpoint, or store one and requeue the job.  An error in the
+    middle of a step, such as a worker's death, leaves no checkpoint: the one before stays the
+    newest.
     """
 
     def __init__(self) -> None:
@@ -62,6 +63,8 @@ class DeferredSignals(Callback):
     def _deliver(self) -> None:
         pending, self.pending = self.pending, []
         for number in pending:
+            if number == signal.SIGHUP:  # its handler acts where it is the handler
+                signal.signal(number, self.handlers[number])
             self.handlers[number](number, None)
 
     def _restore_handlers(self) -> None:

@@ -119,7 +119,8 @@ def read_photograph(
     speed_widths_per_s: float = 0.0, seed: int = 0,
 ) -> OwnClip:  # fmt: skip
     """Return a photograph for `seconds` at `fps` (None: 120): at rest, or in a smooth motion, drawn
-    from `seed`, of `speed_widths_per_s` frame widths a second.  `white_level` as in `read_video`.
+    from `seed`, of `speed_widths_per_s` frame widths a second (`SimilarityMotion`).  `white_level`
+    as in `read_video`.
 
     Raises ValueError for what is no picture and for values outside their range.
     """

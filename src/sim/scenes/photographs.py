@@ -77,7 +77,7 @@ class PhotographScene(SceneBase):
 class Photographs(PhotographScene):
     """Endless clips of photographs in motion.
 
-    `speed_widths_per_s`: range of the drift, in frame widths; `max_cutouts`: most foreground
+    `speed_widths_per_s`: range of the speed, see `SimilarityMotion`; `max_cutouts`: most foreground
     objects, `cutout_widths` the range of their sides in frame widths; `cutouts_reenter`: they turn
     about their own middle and come in again opposite where they left.  `static_camera_share`: of
     the clips in which only they move.

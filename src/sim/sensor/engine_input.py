@@ -116,8 +116,9 @@ def _clip_numbers(clip: SensorClip, low_pass_row: int) -> tuple:
 def _reference_range(sensor: Any) -> tuple[float, float]:
     """Return the zero and the span of a sensor's first references; see records.py.
 
-    With leak they lie anywhere on the way to the next ON event, so that these come at their rate
-    from the first moment on, and not all at once.
+    With leak they lie anywhere on the way to the next ON event, so that these come from the first
+    moment on, and not all at once: at their rate, with an initial error e at 1 / (1 + e) of it
+    until the drift has passed a threshold.
     """
     error = sensor.initial_reference_error
     return (error / (1 + error), 1 + error) if sensor.leak_event_hz else (0.5, 2 * error)

@@ -34,7 +34,7 @@ TILT_AND_BLUR_PX = {
 PROFILES = {"uniform": (0, 1), "camera": (0, 0.1), "middle": (1 / 3, 2 / 3), "object": (0.7, 1)}
 PROFILE_POINTS = 121
 CANDIDATES, ROUNDS = 128, 4  # cameras proposed at a time, and how often
-OUTER_SCALES = np.geomspace(1, 100, 17)  # L0 / D that are drawn from, and infinity
+OUTER_SCALES = 17  # values of L0 / D in a range that are drawn from, and infinity
 D_OVER_R0 = np.geomspace(0.05, 10, 100)  # that are drawn from
 Range = Sequence[float]
 Candidates = Float[np.ndarray, " candidates"]
@@ -201,12 +201,11 @@ def log_uniform(
 
 
 def _draw_outer_scales(u: Candidates, limits: Range, kolmogorov: float) -> Candidates:
-    """Return L0 / D: OUTER_SCALES within `limits` alike, and inf at a probability `kolmogorov`."""
-    low, high = limits
-    inside = OUTER_SCALES[(low * 0.999 <= OUTER_SCALES) & (high * 1.001 >= OUTER_SCALES)]
-    inside = inside if len(inside) else np.array([math.sqrt(low * high)])
-    index = ((u - kolmogorov) / max(1 - kolmogorov, 1e-9) * len(inside)).astype(int)
-    return np.where(u < kolmogorov, math.inf, inside[index.clip(0, len(inside) - 1)])
+    """Return L0 / D: OUTER_SCALES values, log-uniform in `limits`, alike, and inf at a probability
+    `kolmogorov`."""
+    scales = np.geomspace(*limits, OUTER_SCALES)
+    index = ((u - kolmogorov) / max(1 - kolmogorov, 1e-9) * OUTER_SCALES).astype(int)
+    return np.where(u < kolmogorov, math.inf, scales[index.clip(0, OUTER_SCALES - 1)])
 
 
 def _solve_d_over_r0(

@@ -92,6 +92,16 @@ def test_the_blur_that_is_wanted_is_the_nearest_there_is():
     assert psf_width_ratio(1.8) == pytest.approx(1.8, rel=0.15)
 
 
+@pytest.mark.parametrize("limits", [(0.1, 1.0), (1.0, 1000.0), (50.0, 60.0)])
+def test_outer_scales_are_log_uniform_in_their_range(limits):
+    given = {"outer_scale_over_aperture": limits, "kolmogorov_probability": 0.0}
+    paths = [sample_atmosphere("medium", generator(seed), **given) for seed in range(60)]
+    drawn = np.log([1 / path.aperture_over_outer_scale for path in paths])
+    low, high = np.log(limits)
+    assert low - 1e-6 <= drawn.min() < low + 0.4 * (high - low)
+    assert high + 1e-6 >= drawn.max() > high - 0.4 * (high - low)
+
+
 def test_none_and_unknown_severities():
     assert sample_atmosphere("none", generator(0)) is None
     with pytest.raises(ValueError, match=r"severity must be none, weak.*got hopeless"):

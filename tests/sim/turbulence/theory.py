@@ -132,3 +132,31 @@ def degrade_with_exact_psfs(
     coefficients = functional.pad(phase.permute(1, 2, 3, 0), (2, 0))
     psfs = exact_psfs_of_all_modes(coefficients, turbulence, size).flatten(3).permute(3, 0, 1, 2)
     return blur_torch.scatter_normalised(warped, psfs, rows, torch.zeros(1, *crop[2:]), 0.0)[0]
+
+
+def short_exposure_blur_std(
+    d_over_r0: float, outer_scale_over_d: float, tilt_share: float
+) -> float:
+    """Return the blur beyond diffraction of von Karman turbulence at the aperture, in lambda / D.
+
+    From the structure function of the phase (Voitsekhovich 1995) less that of the tilt, of whose
+    variance the outer scale leaves `tilt_share`.
+    """
+    nu, order = (np.arange(4000) + 0.5) / 4000, 5 / 6
+    near = 2 * math.pi * nu / outer_scale_over_d
+    constant = (24 / 5 * special.gamma(6 / 5)) ** order * special.gamma(11 / 6) / math.pi ** (8 / 3)
+    reach = special.gamma(order) - 2 ** (1 / 6) * near**order * special.kv(order, near)
+    structure = constant * (outer_scale_over_d * d_over_r0) ** (5 / 3) * reach
+    exponent = structure / 2 - 3.44 * d_over_r0 ** (5 / 3) * tilt_share * nu**2
+    aperture = 2 / math.pi * (np.arccos(nu) - nu * np.sqrt(1 - nu**2))
+    sharp, blurred = (
+        _half_light_radius(nu, one) for one in (aperture, aperture * np.exp(-exponent))
+    )
+    return math.sqrt(blurred**2 - sharp**2) / math.sqrt(2 * math.log(2))
+
+
+def _half_light_radius(nu: np.ndarray, transfer: np.ndarray) -> float:
+    radii = np.geomspace(0.2, 40, 400)
+    held = [2 * math.pi * r * float((special.j1(2 * math.pi * r * nu) * transfer).mean())
+            for r in radii]  # fmt: skip
+    return float(np.interp(0.5, held, radii))
