@@ -107,6 +107,9 @@ def simulate_scene(cfg: DictConfig) -> dict:
         cfg.fps = SCENE_FPS
     pipeline, step = build.build_pipeline(cfg, cfg.split), cfg.data.substeps
     draw = pipeline.draw(cfg.index)
+    camera = (
+        place_views(cfg, pipeline.optics.positions, draw.crop[2:], draw.key) if cfg.write else None
+    )
     views = pipeline.render_views([draw])[0].float()
     sample = pipeline.simulate_sensor([draw], views[None])
     tilt, drawn = pipeline.tilt(draw), sample.parameters[0]
@@ -116,11 +119,10 @@ def simulate_scene(cfg: DictConfig) -> dict:
     clean = crop_frames(draw.clip.frames, draw.crop)[::step]
     print(describe_clip(cfg, drawn, clean.shape, draw.clip.fps / step))
     written = samples.write_light_field_panels(run, clean[1:].numpy(), *seen, pipeline.optics)
-    if not cfg.write:
+    if camera is None:
         print(f"written: {', '.join(map(str, written))}")
         return drawn
-    path, size = Path(cfg.write), (views.shape[-2], views.shape[-1])
-    camera, fps = place_views(cfg, pipeline.optics.positions, size, draw.key), draw.clip.fps
+    path, fps = Path(cfg.write), draw.clip.fps
     sensor: Any = draw.sensor  # one with `events`
     with create_truth_file(path, camera, len(clean), fps / step, drawn) as truth:
         codes = encode_srgb(views) if pipeline.decodes_srgb else views
@@ -133,9 +135,19 @@ def simulate_scene(cfg: DictConfig) -> dict:
 def place_views(
     cfg: DictConfig, positions: Sequence[Position], model: tuple[int, int], key: int
 ) -> Views:
-    """Return where the camera of the config has the views, each of `model` (h, w) pixels."""
-    camera = {"sensor": tuple(cfg.camera.sensor_size), "tile_px": cfg.camera.tile_px}
-    return kaleidoscope_views(list(positions), model=model, key=key, **camera)
+    """Return where the camera of the config has the views, each of `model` (h, w) pixels.
+
+    Raises ValueError where the views do not lie on its sensor.
+    """
+    sensor, tile_px = tuple(cfg.camera.sensor_size), cfg.camera.tile_px
+    try:
+        return kaleidoscope_views(
+            list(positions), model=model, sensor=sensor, tile_px=tile_px, key=key
+        )
+    except ValueError as error:
+        got = f"{list(sensor)} and {tile_px}"
+        wanted = "camera.sensor_size and camera.tile_px must hold all views"
+        raise ValueError(f"{wanted}, got {got}: {error}") from error
 
 
 def describe_clip(cfg: DictConfig, drawn: dict, shape: Sequence[int], fps: float) -> str:

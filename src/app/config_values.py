@@ -53,13 +53,15 @@ KEYS: dict[tuple[str, ...], str] = {
     (WORD, WHOLE): "views_used",
     (WORD, NUMBER, NULL): "trainer.precision",
     (NUMBER, WORD, LIST): "trainer.devices",
+    (MAPPING, NULL): "data.large",
 }
 BOUNDS: dict[str, tuple[int, float]] = {  # of what others would refuse without its key
     "bins": (1, 1000), "data.substeps": (1, 10_000), "data.windows": (1, 10**6),
     "data.test_windows": (1, 10**6), "data.cache_windows": (1, 10**6),
     "data.test_clips": (1, math.inf), "data.val_clips": (0, math.inf),
-    "data.workers": (0, math.inf), "sample_clips": (0, math.inf), "seed": (0, 2**32 - 1),
-    "width": (1, math.inf), "callbacks.rotation.every_n_train_steps": (1, math.inf),
+    "data.workers": (0, 1024), "trainer.check_val_every_n_epoch": (1, math.inf),
+    "sample_clips": (0, math.inf), "seed": (0, 2**32 - 1), "width": (1, math.inf),
+    "callbacks.rotation.every_n_train_steps": (1, math.inf),
 }  # fmt: skip
 KINDS = {key: kinds for kinds, keys in KEYS.items() for key in keys.split()}
 # Parts whose own classes check whether a number, a range of numbers or null does.

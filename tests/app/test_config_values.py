@@ -58,6 +58,12 @@ WRONG = [
     ("live", ["recording=x", "threads=0"], "threads must be in 1..1024, got 0"),
     ("live", ["recording=x", "threads=100000000000"], "threads must be in 1..1024, got 1000000000"),
     ("live", ["recording=x", "host=1.5"], "host must be a word, got 1.5"),
+    ("train", ["data.large=5"], "data.large must be a mapping or null, got 5"),
+    ("train", ["data.workers=100000"], "data.workers must be in 0..1024, got 100000"),
+    ("train", ["trainer.check_val_every_n_epoch=0"], "check_val_every_n_epoch must be >= 1, got 0"),
+    ("train", ["data.rates=[1e30]"], "data.rates must be in [0.001, 1e6] windows a second, got"),
+    ("simulate", ["write=a.raw", "camera.sensor_size=[10,10]"],
+     "camera.sensor_size and camera.tile_px must hold all views, got [10, 10] and None: views: "),
 ]  # fmt: skip
 
 

@@ -203,7 +203,7 @@ def log_uniform(
 def _draw_outer_scales(u: Candidates, limits: Range, kolmogorov: float) -> Candidates:
     """Return L0 / D: OUTER_SCALES values, log-uniform in `limits`, alike, and inf at a probability
     `kolmogorov`."""
-    scales = np.geomspace(*limits, OUTER_SCALES)
+    scales = np.geomspace(limits[0], limits[1], OUTER_SCALES)
     index = ((u - kolmogorov) / max(1 - kolmogorov, 1e-9) * OUTER_SCALES).astype(int)
     return np.where(u < kolmogorov, math.inf, scales[index.clip(0, OUTER_SCALES - 1)])
 
