@@ -16,8 +16,13 @@ from src.recordings.calibration.activity_pictures import Pictures, keep_windows_
 from src.recordings.calibration.boards import Points
 from src.recordings.calibration.scene_matches import PatchMatcher, ViewMatches
 from src.recordings.calibration.view_alignment import AlignedViews, Rectangle, cut_field
+from src.recordings.calibration.view_coverage import (
+    describe_grid,
+    leave_out_dark_views,
+    share_in_no_view,
+)
 from src.recordings.calibration.view_fit import find_folds, fit_view
-from src.recordings.calibration.view_grid import ViewGrid, find_grid
+from src.recordings.calibration.view_grid import OTHER_GRIDS, ViewGrid, find_grid
 from src.recordings.corner_fold import CornerFold
 from src.recordings.views import HeightWidth, View, Views
 from src.sim.optics import Position
@@ -50,15 +55,17 @@ class SceneTarget:
 class SceneAlignment:
     """`aligned`: the views, and their points within SceneTarget's `error_px`.  `matched`: these
     points' share of the places with structure.  `held_out_px`: the median distance at places of
-    every second window from a fit to the others; empty where one window alone shows motion."""
+    every second window from a fit to the others; empty where one window alone shows motion.
+    `grid`: rows and columns, and the share of the events in no view, for a person."""
 
     aligned: AlignedViews
     matched: Mapping[Position, float]
     held_out_px: Mapping[Position, float]
+    grid: str
 
     def summary(self) -> dict[str, str]:
-        """Return a line per view, for a person."""
-        lines = {}
+        """Return a line for the grid and one per view, for a person."""
+        lines = {"grid": self.grid}
         for view in self.aligned.views.views:
             text = f"error {view.error_px:.2f} px, {self.matched[view.position]:.0%} matched"
             held_out = self.held_out_px.get(view.position)
@@ -75,21 +82,23 @@ def align_views_by_scene(
     """Find the views in pictures of a recording's windows and fit their homographies, and the
     halves of corner views.
 
-    Raises ValueError where no views repeat, the centre one shows too little or another does not
-    match it.
+    Raises ValueError where no views repeat, the centre one shows too little, or another does not
+    match it or lies off it by more than `scene.error_px` in windows left out.
     """
     pictures = keep_windows_with_motion(pictures)
-    grid = find_grid(pictures)
+    grid = leave_out_dark_views(find_grid(pictures), pictures)
+    shown = describe_grid(grid, share_in_no_view(grid, pictures))
     held_out = _hold_out(pictures, grid) if len(pictures) > 1 else {}
     fitted, fine = _find_views(pictures, grid)
     matches = _match_views(fine, fitted)
     good = {at: match.residual_px <= scene.error_px for at, match in matches.items()}
     matched = {at: float(each.mean()) for at, each in good.items()}
     _check_matched(matched, scene)
+    _check_held_out(held_out, scene)
     points = {at: match.at[good[at]] for at, match in matches.items()}
     residuals = {at: match.offset[good[at]] for at, match in matches.items()}
     views = _build_views(fitted, residuals, grid.centre_view_edges, pictures.shape[2:], model)
-    return SceneAlignment(AlignedViews(views, points, residuals), matched, held_out)
+    return SceneAlignment(AlignedViews(views, points, residuals), matched, held_out, shown)
 
 
 def _match_views(
@@ -142,7 +151,17 @@ def _check_matched(matched: Mapping[Position, float], scene: SceneTarget) -> Non
         raise ValueError(
             f"recording must show the same in all views: view {worst} matches at"
             f" {matched[worst]:.0%} of the places, target.min_matched={scene.min_matched} is"
-            " needed; too few events, or parallax of a scene too near"
+            f" needed; too few events, parallax of a scene too near, or {OTHER_GRIDS}"
+        )
+
+
+def _check_held_out(held_out: Mapping[Position, float], scene: SceneTarget) -> None:
+    worst = max(held_out, key=lambda at: held_out[at], default=(0, 0))
+    if held_out and held_out[worst] > scene.error_px:
+        raise ValueError(
+            f"recording must show the same in all views: view {worst} is {held_out[worst]:.2f} px"
+            f" off in windows left out, target.error_px={scene.error_px} is allowed; parallax of a"
+            f" scene too near, or {OTHER_GRIDS} (use a board, target=)"
         )
 
 

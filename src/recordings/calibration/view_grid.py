@@ -6,6 +6,7 @@ pitch: the right ones bring equal columns together.
 """
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ MIN_SCORE = 0.2  # of the energy that neighbours share; other scenes have 0.1 at
 MIN_LIKENESS = 0.2  # of a view and its neighbour, 1 for equal ones
 MIN_PITCH, MAX_VIEWS = 24, 10  # px, and along an axis
 WHOLE = 0.9  # share of a view that must lie on the sensor, or it is left out
+OTHER_GRIDS = "a grid turned by more than a degree or views of unequal size"
 Gram = Float[np.ndarray, "n n"]
 
 
@@ -56,16 +58,18 @@ class ViewAxis:
 
 @dataclass(frozen=True)
 class ViewGrid:
-    """The whole views of a sensor: `x` and `y` are the axes of columns and of rows."""
+    """The whole views of a sensor: `x` and `y` are the axes of columns and of rows; positions
+    `left_out` have no view."""
 
     x: ViewAxis
     y: ViewAxis
+    left_out: tuple[Position, ...] = ()
 
     @property
     def positions(self) -> list[Position]:
         """(row, col) from the centre view, row by row."""
         rows, cols = (range(-a.centre_index, a.count - a.centre_index) for a in (self.y, self.x))
-        return [(row, col) for row in rows for col in cols]
+        return [at for at in product(rows, cols) if at not in self.left_out]
 
     @property
     def centre_view_edges(self) -> tuple[float, float, float, float]:
@@ -82,18 +86,25 @@ class ViewGrid:
 def find_grid(pictures: Float[np.ndarray, "*windows h w"]) -> ViewGrid:
     """Find the views of a sensor in pictures of what it saw.
 
-    Raises ValueError where neither columns nor rows of views repeat.
+    Raises ValueError where neither columns nor rows of views repeat, or repeat in other sizes.
     """
     structure, step = extract_coarse_edges(pictures)
     small = _level(structure)
     x = find_axis(np.einsum("kyx,kyz->xz", small, small, optimize=True))
     y = find_axis(np.einsum("kyx,kzx->yz", small, small, optimize=True))
+    for name, axis in (("columns", x), ("rows", y)):
+        if axis.count == 1 and axis.score >= MIN_SCORE:
+            raise ValueError(
+                f"recording must show {name} of views of one size, within 10 %: neighbours share"
+                f" {axis.score:.2f} of what they show, but less than two views are whole; use a"
+                " board (target=)"
+            )
     if x.count == 1 and y.count == 1:
         best = f"{max(x.score, y.score):.2f}"
         raise ValueError(
             f"recording must show mirrored views side by side: neighbours share {best} of what"
             f" they show, {MIN_SCORE} is needed; record more motion, as windows without any do not"
-            " help, or use a board (target=)"
+            f" help, or use a board (target=) for {OTHER_GRIDS}"
         )
     if y.count == 1:
         y = _one_view(small, x, y.score)

@@ -1,0 +1,84 @@
+"""What a grid of views leaves out is said: events in no view, views that are blocked."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from src.figures.calibration_figures import draw_views_over_centre
+from src.recordings import simulated_recording
+from src.recordings.calibration import scene_alignment, view_grid
+from src.recordings.calibration.view_coverage import leave_out_dark_views, share_in_no_view
+from src.sim.optics import layout
+from tests.recordings.calibration.test_scene_alignment import texture
+
+SIDE = 56
+
+
+def fold_lines(sizes) -> np.ndarray:
+    """Return the lines of a scene that three mirrored views of `sizes` show."""
+    before, centre, after = map(np.arange, sizes)
+    return 60 + np.concatenate([before[::-1], centre, sizes[1] - 1 - after])
+
+
+def show_views(rows=(SIDE,) * 3, cols=(SIDE,) * 3, blocked=()) -> np.ndarray:
+    """Return pictures (2, 1, h, w) of views of these heights and widths."""
+    whole = [200 * texture(seed)[np.ix_(fold_lines(rows), fold_lines(cols))] for seed in (3, 4)]
+    pictures = np.stack(whole)[:, None].astype(np.float32)
+    for row, col in blocked:
+        y, x = SIDE * (row + 1), SIDE * (col + 1)
+        pictures[..., y : y + SIDE, x : x + SIDE] = 100  # as flat as events of noise alone
+    return pictures
+
+
+def test_whole_views_leave_nothing_out():
+    pictures = show_views()
+    grid = view_grid.find_grid(pictures)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert leave_out_dark_views(grid, pictures) is grid
+        assert share_in_no_view(grid, pictures) < 0.05
+
+
+def test_a_row_of_smaller_views_is_named():
+    pictures = show_views(rows=(48, SIDE, SIDE))
+    grid = view_grid.find_grid(pictures)
+    assert grid.y.count == 2
+    with pytest.warns(UserWarning, match=r"^2 x 3 views, 3\d% .* out 0\.8\d of a view above"):
+        assert 0.25 < share_in_no_view(grid, pictures) < 0.4
+
+
+def test_rows_of_unequal_views_are_refused():
+    with pytest.raises(ValueError, match="must show rows of views of one size, within 10 %"):
+        view_grid.find_grid(show_views(rows=(40, SIDE, 40)))
+
+
+def test_a_view_off_in_windows_left_out_is_refused():
+    scene = scene_alignment.SceneTarget(error_px=1.5)
+    scene_alignment._check_held_out({(0, 0): 0.0, (0, 1): 1.4}, scene)
+    with pytest.raises(ValueError, match=r"view \(0, 1\) is 1\.68 px off in windows left out"):
+        scene_alignment._check_held_out({(0, 0): 0.0, (0, 1): 1.68}, scene)
+
+
+def test_a_blocked_view_is_left_out():
+    pictures = show_views(blocked=[(1, 1)])
+    grid = view_grid.find_grid(pictures)
+    with pytest.warns(UserWarning, match=r"^view \(1, 1\) shows next to nothing and is left out"):
+        left = leave_out_dark_views(grid, pictures)
+    assert left.positions == [at for at in grid.positions if at != (1, 1)]
+
+
+def test_a_blocked_centre_view_is_refused():
+    pictures = show_views(blocked=[(0, 0)])
+    grid = view_grid.find_grid(pictures)
+    with pytest.raises(ValueError, match=r"nothing is seen in \(0, 0\) of 9 views, which may be"):
+        leave_out_dark_views(grid, pictures)
+
+
+def test_the_overlay_has_room_for_a_view_left_out(tmp_path):
+    views = simulated_recording.kaleidoscope_views(
+        list(layout(4)), model=(40, 40), sensor=(120, 160), tile_px=40, key=1
+    )
+    seen, shares = views.select(views.positions[:3]), dict.fromkeys(views.positions, 1.0)
+    draw_views_over_centre(np.ones((120, 160)), seen, shares, tmp_path / "overlay.png")
+    assert (tmp_path / "overlay.png").stat().st_size
