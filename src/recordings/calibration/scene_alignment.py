@@ -15,12 +15,13 @@ import numpy as np
 from src.recordings.calibration.activity_pictures import Pictures, keep_windows_with_motion
 from src.recordings.calibration.boards import Points
 from src.recordings.calibration.scene_matches import PatchMatcher, ViewMatches
-from src.recordings.calibration.view_alignment import AlignedViews, Rectangle, cut_field
+from src.recordings.calibration.view_alignment import AlignedViews
 from src.recordings.calibration.view_coverage import (
     describe_grid,
     leave_out_dark_views,
     share_in_no_view,
 )
+from src.recordings.calibration.view_field import Rectangle, cut_field, shrink_field
 from src.recordings.calibration.view_fit import find_folds, fit_view
 from src.recordings.calibration.view_grid import OTHER_GRIDS, ViewGrid, find_grid
 from src.recordings.corner_fold import CornerFold
@@ -173,7 +174,8 @@ def _build_views(
     for at, view in fitted.items():
         error = float(np.sqrt((residuals[at] ** 2).sum(1).mean()))
         views.append(replace(view, error_px=error, points=len(residuals[at])))
-    return Views(sensor, model, cut_field(_between_seams(fitted, tile), model), tuple(views))
+    field = shrink_field(cut_field(_between_seams(fitted, tile), model), views, sensor)
+    return Views(sensor, model, field, tuple(views))
 
 
 def _between_seams(views: FoundViews, tile: Rectangle) -> Rectangle:

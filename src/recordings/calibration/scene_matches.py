@@ -12,7 +12,7 @@ from src.recordings.calibration.activity_pictures import (
 )
 from src.recordings.calibration.boards import Points
 from src.recordings.calibration.patch_matching import choose_places, measure_patch_offsets
-from src.recordings.calibration.view_alignment import Rectangle
+from src.recordings.calibration.view_field import Rectangle
 from src.recordings.views import View, list_grid_points, sample_bilinear
 
 MIN_PLACES = 12  # with structure, in the centre view

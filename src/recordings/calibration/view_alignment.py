@@ -17,15 +17,14 @@ from jaxtyping import Float, UInt8
 
 from src.recordings.calibration.board_order import reorder_like, tells_its_turn
 from src.recordings.calibration.boards import Points, Target, cluster_points
+from src.recordings.calibration.view_field import Rectangle, cut_field, shrink_field
 from src.recordings.calibration.view_numbering import assign_view_positions
 from src.recordings.views import HeightWidth, View, Views
 from src.records import safe_yaml
 from src.sim.optics import Position
 
 MIN_VIEWS = 4
-MARGIN = 0.04  # of a tile's side, cut off at each seam
 MAX_ERROR_PX = 1.5  # a point further off is an outlier of the homography
-Rectangle = tuple[float, float, float, float]  # left, top, right, bottom
 FLIPS = ((False, False), (True, False), (False, True), (True, True))
 
 
@@ -152,7 +151,7 @@ def fit_homographies(
         residuals[at] = cv2.perspectiveTransform(points[None, good], matrix)[0] - onto[good]
         error = float(np.sqrt((residuals[at] ** 2).sum(1).mean()))
         views.append(View(at, matrix, error, len(used[at])))
-    field = cut_field(_between_boards(found), model)
+    field = shrink_field(cut_field(_between_boards(found), model), views, sensor)
     return AlignedViews(Views(sensor, model, field, tuple(views)), used, residuals)
 
 
@@ -171,16 +170,6 @@ def _between_boards(found: Mapping[Position, Points]) -> Rectangle:
     edges = np.where(np.isnan(edges), middle + reach * np.array([-1, -1, 1, 1]), edges)
     left, top, right, bottom = edges.tolist()
     return left, top, right, bottom
-
-
-def cut_field(tile: Rectangle, model: HeightWidth, margin: float = MARGIN) -> Rectangle:
-    """Return the largest rectangle of the model's aspect in the middle of `tile`, less `margin` of
-    its side at each edge."""
-    left, top, right, bottom = tile
-    scale = min((right - left) / model[1], (bottom - top) / model[0]) * (1 - 2 * margin) / 2
-    x, y = (left + right) / 2, (top + bottom) / 2
-    across, along = scale * model[1], scale * model[0]
-    return x - across, y - along, x + across, y + along
 
 
 def views_from_corners(

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
 from src.recordings.calibration.scene_matches import ViewMatches
-from src.recordings.calibration.view_alignment import Rectangle
+from src.recordings.calibration.view_field import Rectangle
 from src.recordings.calibration.view_grid import OTHER_GRIDS
 from src.recordings.corner_fold import CornerFold
 from src.recordings.views import View
