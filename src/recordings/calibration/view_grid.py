@@ -110,8 +110,8 @@ def find_grid(pictures: Float[np.ndarray, "*windows h w"]) -> ViewGrid:
         y = _one_view(small, x, y.score)
     elif x.count == 1:
         x = _one_view(small.transpose(0, 2, 1), y, x.score)
-    in_pixels = (replace(a, start=a.start * step - 0.5, pitch=a.pitch * step) for a in (x, y))
-    return ViewGrid(*in_pixels)
+    x, y = (replace(a, start=a.start * step - 0.5, pitch=a.pitch * step) for a in (x, y))
+    return ViewGrid(x, y)
 
 
 def _level(pictures: Float[np.ndarray, "n h w"]) -> Float[np.ndarray, "n h w"]:

@@ -1,5 +1,6 @@
 """What a grid of views leaves out is said: events in no view, views that are blocked."""
 
+import re
 import warnings
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from src.figures.calibration_figures import draw_views_over_centre
 from src.recordings import simulated_recording
 from src.recordings.calibration import scene_alignment, view_grid
+from src.recordings.calibration.scene_matches import ViewMatches
 from src.recordings.calibration.view_coverage import leave_out_dark_views, share_in_no_view
 from src.sim.optics import layout
 from tests.recordings.calibration.test_scene_alignment import texture
@@ -21,9 +23,9 @@ def fold_lines(sizes) -> np.ndarray:
     return 60 + np.concatenate([before[::-1], centre, sizes[1] - 1 - after])
 
 
-def show_views(rows=(SIDE,) * 3, cols=(SIDE,) * 3, blocked=()) -> np.ndarray:
+def show_views(rows=(SIDE,) * 3, cols=(SIDE,) * 3, blocked=(), seeds=(3, 4)) -> np.ndarray:
     """Return pictures (2, 1, h, w) of views of these heights and widths."""
-    whole = [200 * texture(seed)[np.ix_(fold_lines(rows), fold_lines(cols))] for seed in (3, 4)]
+    whole = [200 * texture(seed)[np.ix_(fold_lines(rows), fold_lines(cols))] for seed in seeds]
     pictures = np.stack(whole)[:, None].astype(np.float32)
     for row, col in blocked:
         y, x = SIDE * (row + 1), SIDE * (col + 1)
@@ -53,11 +55,29 @@ def test_rows_of_unequal_views_are_refused():
         view_grid.find_grid(show_views(rows=(40, SIDE, 40)))
 
 
+def match(off_px: float, found: int = 10) -> ViewMatches:
+    """Return 10 places, `found` of which lie `off_px` off."""
+    offset = np.where(np.arange(10)[:, None] < found, (off_px, 0.0), np.nan)
+    return ViewMatches(np.zeros((10, 2)), np.zeros((10, 2)), offset, 8.0)
+
+
 def test_a_view_off_in_windows_left_out_is_refused():
-    scene = scene_alignment.SceneTarget(error_px=1.5)
-    scene_alignment._check_held_out({(0, 0): 0.0, (0, 1): 1.4}, scene)
+    scene, centre = scene_alignment.SceneTarget(error_px=1.5), {(0, 0): match(0.0)}
+    for allowed in (match(1.4), match(1.68, found=3)):
+        scene_alignment._check_held_out(centre | {(0, 1): allowed}, scene)
     with pytest.raises(ValueError, match=r"view \(0, 1\) is 1\.68 px off in windows left out"):
-        scene_alignment._check_held_out({(0, 0): 0.0, (0, 1): 1.68}, scene)
+        scene_alignment._check_held_out(centre | {(0, 1): match(1.68, found=5)}, scene)
+
+
+@pytest.mark.parametrize("exchanged", [(0, 1), (0, 0)])
+def test_a_view_with_on_and_off_exchanged_is_named(exchanged):
+    pictures = np.concatenate([show_views(), show_views(seeds=(5, 6))], axis=1)
+    grid = view_grid.find_grid(pictures)
+    scene_alignment._check_polarity(pictures, grid)
+    y, x = (slice(SIDE * (at + 1), SIDE * (at + 2)) for at in exchanged)
+    pictures[..., y, x] = pictures[:, ::-1, y, x].copy()
+    with pytest.raises(ValueError, match=re.escape(f"those of view {exchanged} are exchanged;")):
+        scene_alignment._check_polarity(pictures, grid)
 
 
 def test_a_blocked_view_is_left_out():
