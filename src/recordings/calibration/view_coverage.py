@@ -33,7 +33,7 @@ def leave_out_dark_views(grid: ViewGrid, pictures: Pictures) -> ViewGrid:
             f"recording must show the centre view and {MIN_OTHERS} others: next to nothing is seen"
             f" in {names} of {len(shown)} views, which may be blocked"
         )
-    warnings.warn(f"view {names} shows next to nothing and is left out", stacklevel=2)
+    warnings.warn(f"next to nothing is seen in view {names}, which is left out", stacklevel=3)
     return replace(grid, left_out=tuple(dark))
 
 
@@ -54,7 +54,8 @@ def share_in_no_view(grid: ViewGrid, pictures: Pictures) -> float:
 
 def describe_grid(grid: ViewGrid, in_no_view: float) -> str:
     """Return how many views there are and the share of the events in none, for a person."""
-    return f"{grid.y.count} x {grid.x.count} views, {in_no_view:.0%} of the events in none"
+    found = f"{grid.y.count} rows x {grid.x.count} columns of views"
+    return f"{found}, {in_no_view:.0%} of the events in none"
 
 
 def _list_lit_sides(grid: ViewGrid, events: Map) -> list[str]:

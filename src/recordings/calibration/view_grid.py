@@ -11,12 +11,14 @@ from itertools import product
 import cv2
 import numpy as np
 from jaxtyping import Float, Int
+from scipy import ndimage
 
 from src.recordings.calibration.activity_pictures import extract_coarse_edges
 from src.sim.optics import Position
 
 MIN_SCORE = 0.2  # of the energy that neighbours share; other scenes have 0.1 at most
 MIN_LIKENESS = 0.2  # of a view and its neighbour, 1 for equal ones
+SEAM_LIKENESS = 0.5  # of what lies before a seam and behind it; other lines have 0.3
 MIN_PITCH, MAX_VIEWS = 24, 10  # px, and along an axis
 WHOLE = 0.9  # share of a view that must lie on the sensor, or it is left out
 OTHER_GRIDS = "a grid turned by more than a degree or views of unequal size"
@@ -95,8 +97,8 @@ def find_grid(pictures: Float[np.ndarray, "*windows h w"]) -> ViewGrid:
     for name, axis in (("columns", x), ("rows", y)):
         if axis.count == 1 and axis.score >= MIN_SCORE:
             raise ValueError(
-                f"recording must show {name} of views of one size, within 10 %: neighbours share"
-                f" {axis.score:.2f} of what they show, but less than two views are whole; use a"
+                f"recording must show two or more whole {name} of views, of one size within 10 %:"
+                f" neighbours share {axis.score:.2f} of what they show, but less are found; use a"
                 " board (target=)"
             )
     if x.count == 1 and y.count == 1:
@@ -131,7 +133,26 @@ def find_axis(gram: Gram) -> ViewAxis:
     possible = np.array([_shared(largest, *fold).sum() for fold in tried])
     best = int(np.argmax(shared * np.abs(shared) / np.maximum(possible, 1e-9)))  # many and alike
     axis = _whole_views(gram, *tried[best], score=float(shared[best]) / total)
+    if axis.score >= MIN_SCORE and axis.count == 1:
+        axis = _between_two_seams(gram, axis)
     return axis if axis.score >= MIN_SCORE and axis.count > 1 else ViewAxis(0.0, n, 1, axis.score)
+
+
+def _between_two_seams(gram: Gram, axis: ViewAxis) -> ViewAxis:
+    """Return the axis of three views of unequal size, as long as the centre one each, or `axis`
+    where there are not just two lines about which the lines beside them are alike."""
+    n, reach = len(gram), len(gram) // 8
+    away, likeness = np.arange(reach), np.zeros(n)
+    for seam in range(reach, n - reach + 1):
+        before, after = seam - 1 - away, seam + away
+        energy = gram[before, before].sum() * gram[after, after].sum()
+        likeness[seam] = gram[before, after].sum() / max(np.sqrt(energy), 1e-9)
+    highest = likeness == ndimage.maximum_filter1d(likeness, reach)
+    seams = np.flatnonzero(highest & (likeness >= SEAM_LIKENESS)).astype(float)
+    if len(seams) != 2:
+        return axis
+    pitch = float(seams[1] - seams[0])
+    return ViewAxis(float(seams[0]) - pitch, pitch, 3, axis.score)
 
 
 def _fold_lines(n: int, seam: float, pitch: float) -> Int[np.ndarray, "views lines"]:

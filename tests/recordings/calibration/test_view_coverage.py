@@ -46,13 +46,24 @@ def test_a_row_of_smaller_views_is_named():
     pictures = show_views(rows=(48, SIDE, SIDE))
     grid = view_grid.find_grid(pictures)
     assert grid.y.count == 2
-    with pytest.warns(UserWarning, match=r"^2 x 3 views, 3\d% .* out 0\.8\d of a view above"):
+    with pytest.warns(
+        UserWarning, match=r"^2 rows x 3 columns of views, 3\d% .* 0\.8\d of a view above"
+    ):
         assert 0.25 < share_in_no_view(grid, pictures) < 0.4
 
 
-def test_rows_of_unequal_views_are_refused():
-    with pytest.raises(ValueError, match="must show rows of views of one size, within 10 %"):
-        view_grid.find_grid(show_views(rows=(40, SIDE, 40)))
+def test_three_rows_of_unequal_views_are_found_by_their_seams():
+    grid = view_grid.find_grid(show_views(rows=(40, SIDE, 44)))
+    assert grid.positions == [(row, col) for row in (-1, 0, 1) for col in (-1, 0, 1)]
+    assert np.abs(np.subtract(grid.centre_view_edges, (55.5, 39.5, 111.5, 95.5))).max() < 2
+
+
+def test_rows_of_unequal_views_without_clear_seams_are_refused(monkeypatch):
+    monkeypatch.setattr(view_grid, "SEAM_LIKENESS", 2.0)
+    with pytest.raises(
+        ValueError, match="two or more whole rows of views, of one size within 10 %"
+    ):
+        view_grid.find_grid(show_views(rows=(40, SIDE, 44)))
 
 
 def match(off_px: float, found: int = 10) -> ViewMatches:
@@ -83,7 +94,7 @@ def test_a_view_with_on_and_off_exchanged_is_named(exchanged):
 def test_a_blocked_view_is_left_out():
     pictures = show_views(blocked=[(1, 1)])
     grid = view_grid.find_grid(pictures)
-    with pytest.warns(UserWarning, match=r"^view \(1, 1\) shows next to nothing and is left out"):
+    with pytest.warns(UserWarning, match=r"^next to nothing is seen in view \(1, 1\), which is"):
         left = leave_out_dark_views(grid, pictures)
     assert left.positions == [at for at in grid.positions if at != (1, 1)]
 
