@@ -73,7 +73,12 @@ def draw_views_over_centre(
     shape = max(rows) - min(rows) + 1, max(cols) - min(cols) + 1
     seen = dict(zip(views.positions, views.warp_to_model(np.log1p(picture)), strict=True))
     figure = Figure(figsize=(4 * shape[1], 4 * shape[0] * views.model[0] / views.model[1] + 1))
-    for at, axes in zip(views.positions, figure.subplots(*shape, squeeze=False).flat, strict=True):
+    panels = figure.subplots(*shape, squeeze=False)
+    for axes in panels.flat:
+        axes.set_axis_off()
+    for at in views.positions:
+        axes = panels[at[0] - min(rows), at[1] - min(cols)]
+        axes.set_axis_on()
         layers = [seen[key] / np.percentile(seen[key], 99.5) for key in (at, (0, 0), at)]
         axes.imshow(np.clip(np.stack(layers, axis=-1), 0, 1))
         axes.set(xticks=[], yticks=[], title=f"{at}: {matched[at]:.0%} matched")

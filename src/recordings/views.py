@@ -85,8 +85,7 @@ class Views:
             at = view.position
             raise ValueError(f"views: homography of view {at} must be finite and regular")
         height, width = self.sensor
-        x, y = self._field_on_sensor(view, 9).T
-        share = np.mean((x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5))
+        share = share_on_sensor(view, self.field, self.sensor)
         if share < MIN_SHARE_ON_SENSOR:
             raise ValueError(
                 f"views: view {view.position} must lie on the {width}x{height} sensor"
@@ -112,7 +111,7 @@ class Views:
 
     def outline(self, view: View) -> Float[np.ndarray, "4 2"]:
         """Return the corners of `view` on the sensor: the field's, clockwise from top left."""
-        return self._field_on_sensor(view, 2)[[0, 1, 3, 2]]
+        return _field_on_sensor(view, self.field, 2)[[0, 1, 3, 2]]
 
     def mirrored_xy(self, view: View) -> tuple[bool, bool]:
         """Return whether `view` is mirrored in x and in y (both: it is turned by 180 degrees)."""
@@ -142,10 +141,6 @@ class Views:
         flat, places = picture.astype(np.float32), list_grid_points(x, y)
         seen = (view.to_sensor(places) for view in self.views)
         return np.stack([sample_bilinear(flat, at, self.model) for at in seen])
-
-    def _field_on_sensor(self, view: View, side: int) -> Points:
-        x, y = np.linspace(self.field[:2], self.field[2:], side).T
-        return view.to_sensor(list_grid_points(x, y))
 
     def save(self, path: Path | str) -> None:
         """Write a YAML file that `load_views` reads back exactly."""
@@ -258,6 +253,18 @@ def sample_bilinear(
 def list_grid_points(x: np.ndarray, y: np.ndarray) -> Points:
     """Return the (x, y) of a grid, row by row, of its columns' x and its rows' y."""
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).astype(np.float64)
+
+
+def share_on_sensor(view: View, field: Sequence[float], sensor: HeightWidth) -> float:
+    """Return the share of the field's pixels that `view` has on a sensor of (height, width)."""
+    x, y = _field_on_sensor(view, field, 9).T
+    height, width = sensor
+    return float(np.mean((x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)))
+
+
+def _field_on_sensor(view: View, field: Sequence[float], side: int) -> Points:
+    x, y = np.linspace(field[:2], field[2:], side).T
+    return view.to_sensor(list_grid_points(x, y))
 
 
 def _transform(matrix: Float[np.ndarray, "3 3"], points: Points) -> Points:

@@ -87,19 +87,25 @@ def extract_coarse_edges(
     return band_pass_log(shrink_pictures(pictures, factor), 1.2, 2.5), factor
 
 
-def keep_windows_with_motion(pictures: Pictures) -> Float[np.ndarray, "kept kinds h w"]:
-    """Return the windows whose contrast is MIN_CONTRAST or more of the largest; all if none has.
+def square_contrast(
+    pictures: Float[np.ndarray, "*windows h w"],
+) -> tuple[Float[np.ndarray, "n small_h small_w"], int]:
+    """Return the squared edges of pictures shrunk to LINES or more, and the factor in pixels.
 
-    Its square is the product of two pictures of every second pixel each: both show the scene, and
-    noise, which differs from pixel to pixel, cancels.
+    It is the product of two pictures of every second pixel each: both show the scene, and noise,
+    which differs from pixel to pixel, cancels.
     """
     y, x = np.indices(pictures.shape[-2:])
     every_second = ((y + x) % 2).astype(np.float32)
-    one, other = (
-        extract_coarse_edges(pictures * kept)[0].reshape(len(pictures), -1)
-        for kept in (every_second, 1 - every_second)
+    (one, step), (other, _) = (
+        extract_coarse_edges(pictures * kept) for kept in (every_second, 1 - every_second)
     )
-    square = (one * other).mean(1)
+    return one * other, step
+
+
+def keep_windows_with_motion(pictures: Pictures) -> Float[np.ndarray, "kept kinds h w"]:
+    """Return the windows whose contrast is MIN_CONTRAST or more of the largest; all if none has."""
+    square = square_contrast(pictures)[0].reshape(len(pictures), -1).mean(1)
     kept = square >= MIN_CONTRAST**2 * square.max()
     return pictures[kept] if kept.any() else pictures
 

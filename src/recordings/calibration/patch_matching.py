@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from src.recordings.calibration.view_alignment import Rectangle
+from src.recordings.calibration.view_field import Rectangle
 
 MIN_LIKENESS = 0.4  # normalised correlation of a patch and its counterpart
 MIN_STRENGTH = 0.1  # of the structure that the strongest tenth of the places have

@@ -11,8 +11,8 @@ from src.recordings.calibration.activity_pictures import (
     shrink_pictures,
 )
 from src.recordings.calibration.boards import Points
-from src.recordings.calibration.patch_matching import choose_places, measure_patch_offsets
-from src.recordings.calibration.view_alignment import Rectangle
+from src.recordings.calibration.patch_matching import Stack, choose_places, measure_patch_offsets
+from src.recordings.calibration.view_field import Rectangle
 from src.recordings.views import View, list_grid_points, sample_bilinear
 
 MIN_PLACES = 12  # with structure, in the centre view
@@ -55,6 +55,7 @@ class PatchMatcher:
         self, pictures: Pictures, tile: Rectangle, patches_per_side: int, scale: int = 1, *,
         match_groups_apart: bool = False,
     ):  # fmt: skip
+        self._kinds = pictures.shape[1]
         groups = np.array_split(pictures, min(GROUPS, len(pictures)))
         joined = [shrink_pictures(group.sum(0), scale) for group in groups]
         structure = [band_pass_log(each, 1.2, 8.0) for each in joined]
@@ -73,9 +74,9 @@ class PatchMatcher:
             got = sum(map(len, self._places))
             raise ValueError(f"recording must show {needed}, got {got}")
 
-    def match(self, view: View, reach: int) -> ViewMatches:
+    def match(self, view: View, reach: int, swap_polarity: bool = False) -> ViewMatches:
         """Look for the places in `view`, up to `reach` off along x and y, in pixels of these
-        pictures."""
+        pictures; with `swap_polarity` for ON where the centre view shows OFF."""
         size = self._centre[0].shape[1:]
         there = view.to_sensor(self._to_full(list_grid_points(*map(np.arange, size[::-1]))))
         there = (there - self._middle) / self._scale
@@ -83,11 +84,16 @@ class PatchMatcher:
         for centre, stack, places in zip(self._centre, self._stacks, self._places, strict=True):
             if len(places):
                 seen = np.stack([sample_bilinear(picture, there, size) for picture in stack])
+                seen = self._swap_kinds(seen) if swap_polarity else seen
                 offsets.append(measure_patch_offsets(centre, seen, places, self.half, reach))
         placed = self._to_full(np.concatenate(self._places))
         offset = self._scale * np.concatenate(offsets)
         at = view.to_sensor(placed + offset)
         return ViewMatches(placed, at, offset, float(self.half * self._scale))
+
+    def _swap_kinds(self, stack: Stack) -> Stack:
+        groups = stack.reshape(-1, self._kinds, *stack.shape[1:])
+        return groups[:, ::-1].reshape(stack.shape)
 
     def _to_full(self, points: np.ndarray) -> Points:
         """Return where pixels of the cut, shrunk centre view lie on the sensor."""

@@ -4,6 +4,7 @@ The targets are found anywhere on the sensor, sorted into a grid, un-mirrored an
 the centre view.  Points are (x, y) in sensor pixels, float64.
 """
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,16 +15,16 @@ import numpy as np
 import yaml
 from jaxtyping import Float, UInt8
 
+from src.recordings.calibration.board_order import reorder_like, tells_its_turn
 from src.recordings.calibration.boards import Points, Target, cluster_points
+from src.recordings.calibration.view_field import Rectangle, cut_field, shrink_field
 from src.recordings.calibration.view_numbering import assign_view_positions
 from src.recordings.views import HeightWidth, View, Views
 from src.records import safe_yaml
 from src.sim.optics import Position
 
 MIN_VIEWS = 4
-MARGIN = 0.04  # of a tile's side, cut off at each seam
 MAX_ERROR_PX = 1.5  # a point further off is an outlier of the homography
-Rectangle = tuple[float, float, float, float]  # left, top, right, bottom
 FLIPS = ((False, False), (True, False), (False, True), (True, True))
 
 
@@ -63,8 +64,15 @@ def find_target(
                 mirrored[position] = flip
                 break
     if (0, 0) in points and not target.ordered:
-        model = points[0, 0].reshape(*target.shape, 2)
-        points = {at: _reorder_like(model, seen, mirrored[at]) for at, seen in points.items()}
+        points = {
+            at: reorder_like(points[0, 0], seen, target, mirrored[at], picture)
+            for at, seen in points.items()
+        }
+    if not (are_mirrored or tells_its_turn(target)):
+        line = (
+            "views are taken as upright, one turned by 180 degrees would be wrong; target=charuco"
+        )
+        warnings.warn(f"{line} or a checkerboard of one odd and one even side tells", stacklevel=2)
     return points
 
 
@@ -102,21 +110,6 @@ def _find_flipped(picture: np.ndarray, cluster: Points, target: Target, flip) ->
         return None
     last = np.array(crop.shape[::-1]) - 1
     return np.where(flip, last - points, points) + np.array([left, top])
-
-
-def _reorder_like(model: np.ndarray, seen: Points, mirrored: tuple[bool, bool]) -> Points:
-    """Order the lattice `seen` as `model` (rows, cols, 2) is: the nearest of its symmetries."""
-    upright = np.where(mirrored, -seen, seen).reshape(model.shape)
-    upright, model = upright - upright.mean((0, 1)), model - model.mean((0, 1))
-    best, fitting = np.inf, seen
-    for turned in (False, True) if model.shape[0] == model.shape[1] else (False,):
-        for rows, cols in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-            order = np.arange(len(seen)).reshape(model.shape[:2])[::rows, ::cols]
-            order = (order.T if turned else order).ravel()
-            error = np.abs(upright.reshape(-1, 2)[order] - model.reshape(-1, 2)).sum()
-            if error < best:
-                best, fitting = error, seen[order]
-    return fitting
 
 
 @dataclass(frozen=True)
@@ -158,7 +151,7 @@ def fit_homographies(
         residuals[at] = cv2.perspectiveTransform(points[None, good], matrix)[0] - onto[good]
         error = float(np.sqrt((residuals[at] ** 2).sum(1).mean()))
         views.append(View(at, matrix, error, len(used[at])))
-    field = cut_field(_between_boards(found), model)
+    field = shrink_field(cut_field(_between_boards(found), model), views, sensor)
     return AlignedViews(Views(sensor, model, field, tuple(views)), used, residuals)
 
 
@@ -177,16 +170,6 @@ def _between_boards(found: Mapping[Position, Points]) -> Rectangle:
     edges = np.where(np.isnan(edges), middle + reach * np.array([-1, -1, 1, 1]), edges)
     left, top, right, bottom = edges.tolist()
     return left, top, right, bottom
-
-
-def cut_field(tile: Rectangle, model: HeightWidth, margin: float = MARGIN) -> Rectangle:
-    """Return the largest rectangle of the model's aspect in the middle of `tile`, less `margin` of
-    its side at each edge."""
-    left, top, right, bottom = tile
-    scale = min((right - left) / model[1], (bottom - top) / model[0]) * (1 - 2 * margin) / 2
-    x, y = (left + right) / 2, (top + bottom) / 2
-    across, along = scale * model[1], scale * model[0]
-    return x - across, y - along, x + across, y + along
 
 
 def views_from_corners(

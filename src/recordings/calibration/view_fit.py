@@ -9,7 +9,8 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
 from src.recordings.calibration.scene_matches import ViewMatches
-from src.recordings.calibration.view_alignment import Rectangle
+from src.recordings.calibration.view_field import Rectangle
+from src.recordings.calibration.view_grid import OTHER_GRIDS
 from src.recordings.corner_fold import CornerFold
 from src.recordings.views import View
 from src.sim.optics import Position
@@ -78,7 +79,10 @@ def _fit(
     affine = cv2.estimateAffine2D(at, places, ransacReprojThreshold=6.0)[0] if enough else None
     if affine is None:
         got = f"view {position} shows {len(at)} of {len(match.places)} places of the centre view"
-        raise ValueError(f"recording: {got}, {MIN_FOUND} are needed; record more motion")
+        raise ValueError(
+            f"recording: {got}, {MIN_FOUND} are needed; record more motion, unless it is blocked or"
+            f" in {OTHER_GRIDS}"
+        )
     start, shape = np.vstack([affine, [0, 0, 1]]), _normalise(tile)
     shape_px = 1 / np.diag(shape)[:2].mean()
 

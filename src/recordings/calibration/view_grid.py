@@ -6,18 +6,22 @@ pitch: the right ones bring equal columns together.
 """
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int
+from scipy import ndimage
 
 from src.recordings.calibration.activity_pictures import extract_coarse_edges
 from src.sim.optics import Position
 
 MIN_SCORE = 0.2  # of the energy that neighbours share; other scenes have 0.1 at most
 MIN_LIKENESS = 0.2  # of a view and its neighbour, 1 for equal ones
+SEAM_LIKENESS = 0.5  # of what lies before a seam and behind it; other lines have 0.3
 MIN_PITCH, MAX_VIEWS = 24, 10  # px, and along an axis
 WHOLE = 0.9  # share of a view that must lie on the sensor, or it is left out
+OTHER_GRIDS = "a grid turned by more than a degree or views of unequal size"
 Gram = Float[np.ndarray, "n n"]
 
 
@@ -56,16 +60,18 @@ class ViewAxis:
 
 @dataclass(frozen=True)
 class ViewGrid:
-    """The whole views of a sensor: `x` and `y` are the axes of columns and of rows."""
+    """The whole views of a sensor: `x` and `y` are the axes of columns and of rows; positions
+    `left_out` have no view."""
 
     x: ViewAxis
     y: ViewAxis
+    left_out: tuple[Position, ...] = ()
 
     @property
     def positions(self) -> list[Position]:
         """(row, col) from the centre view, row by row."""
         rows, cols = (range(-a.centre_index, a.count - a.centre_index) for a in (self.y, self.x))
-        return [(row, col) for row in rows for col in cols]
+        return [at for at in product(rows, cols) if at not in self.left_out]
 
     @property
     def centre_view_edges(self) -> tuple[float, float, float, float]:
@@ -82,25 +88,32 @@ class ViewGrid:
 def find_grid(pictures: Float[np.ndarray, "*windows h w"]) -> ViewGrid:
     """Find the views of a sensor in pictures of what it saw.
 
-    Raises ValueError where neither columns nor rows of views repeat.
+    Raises ValueError where neither columns nor rows of views repeat, or repeat in other sizes.
     """
     structure, step = extract_coarse_edges(pictures)
     small = _level(structure)
     x = find_axis(np.einsum("kyx,kyz->xz", small, small, optimize=True))
     y = find_axis(np.einsum("kyx,kzx->yz", small, small, optimize=True))
+    for name, axis in (("columns", x), ("rows", y)):
+        if axis.count == 1 and axis.score >= MIN_SCORE:
+            raise ValueError(
+                f"recording must show two or more whole {name} of views, of one size within 10 %:"
+                f" neighbours share {axis.score:.2f} of what they show, but less are found; use a"
+                " board (target=)"
+            )
     if x.count == 1 and y.count == 1:
         best = f"{max(x.score, y.score):.2f}"
         raise ValueError(
             f"recording must show mirrored views side by side: neighbours share {best} of what"
             f" they show, {MIN_SCORE} is needed; record more motion, as windows without any do not"
-            " help, or use a board (target=)"
+            f" help, or use a board (target=) for {OTHER_GRIDS}"
         )
     if y.count == 1:
         y = _one_view(small, x, y.score)
     elif x.count == 1:
         x = _one_view(small.transpose(0, 2, 1), y, x.score)
-    in_pixels = (replace(a, start=a.start * step - 0.5, pitch=a.pitch * step) for a in (x, y))
-    return ViewGrid(*in_pixels)
+    x, y = (replace(a, start=a.start * step - 0.5, pitch=a.pitch * step) for a in (x, y))
+    return ViewGrid(x, y)
 
 
 def _level(pictures: Float[np.ndarray, "n h w"]) -> Float[np.ndarray, "n h w"]:
@@ -120,7 +133,26 @@ def find_axis(gram: Gram) -> ViewAxis:
     possible = np.array([_shared(largest, *fold).sum() for fold in tried])
     best = int(np.argmax(shared * np.abs(shared) / np.maximum(possible, 1e-9)))  # many and alike
     axis = _whole_views(gram, *tried[best], score=float(shared[best]) / total)
+    if axis.score >= MIN_SCORE and axis.count == 1:
+        axis = _between_two_seams(gram, axis)
     return axis if axis.score >= MIN_SCORE and axis.count > 1 else ViewAxis(0.0, n, 1, axis.score)
+
+
+def _between_two_seams(gram: Gram, axis: ViewAxis) -> ViewAxis:
+    """Return the axis of three views of unequal size, as long as the centre one each, or `axis`
+    where there are not just two lines about which the lines beside them are alike."""
+    n, reach = len(gram), len(gram) // 8
+    away, likeness = np.arange(reach), np.zeros(n)
+    for seam in range(reach, n - reach + 1):
+        before, after = seam - 1 - away, seam + away
+        energy = gram[before, before].sum() * gram[after, after].sum()
+        likeness[seam] = gram[before, after].sum() / max(np.sqrt(energy), 1e-9)
+    highest = likeness == ndimage.maximum_filter1d(likeness, reach)
+    seams = np.flatnonzero(highest & (likeness >= SEAM_LIKENESS)).astype(float)
+    if len(seams) != 2:
+        return axis
+    pitch = float(seams[1] - seams[0])
+    return ViewAxis(float(seams[0]) - pitch, pitch, 3, axis.score)
 
 
 def _fold_lines(n: int, seam: float, pitch: float) -> Int[np.ndarray, "views lines"]:

@@ -156,7 +156,9 @@ def test_views_of_another_place_or_with_parallax_are_refused(tmp_path):
 
 def test_a_scene_without_repetition_or_events_is_refused():
     once = np.stack([texture(k, 160) for k in range(2)])[:, None] * 50
-    with pytest.raises(ValueError, match="must show mirrored views side by side"):
+    with pytest.raises(
+        ValueError, match="must show mirrored views side by side.*turned by more than"
+    ):
         align_views_by_scene(once, SceneTarget(), (88, 88))
     with pytest.raises(ValueError, match=r"share 0\.00 of what they show"):
         align_views_by_scene(np.zeros((1, 2, 90, 120), np.float32), SceneTarget(), (88, 88))

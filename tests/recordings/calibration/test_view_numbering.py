@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from src.recordings.calibration import view_alignment
+from src.recordings.calibration import view_alignment, view_field
 from src.recordings.calibration.boards import Checkerboard
 from src.recordings.calibration.view_grid import ViewAxis, ViewGrid
 from src.recordings.calibration.view_numbering import assign_view_positions
-from src.recordings.views import Views
+from src.recordings.views import View, Views, share_on_sensor
 from tests.recordings import pictures
 
 BOARD = (255 * pictures.checkerboard(5, 7)).astype(np.uint8)
@@ -120,3 +120,23 @@ def test_a_target_found_twice_counts_once():
     part = np.where(np.arange(35)[:, None] < 20, whole, np.nan)
     for one, other in ((whole, part), (part, whole)):
         assert view_alignment._choose_fuller((0, 0), one, other) is whole
+
+
+def test_a_larger_centre_view_has_the_field_that_all_views_show():
+    scene = (255 * pictures.checkerboard(5, 7, pitch=11)).astype(np.uint8)
+    whole = np.arange(240)
+    lines = np.concatenate([whole[:170][::-1], whole, whole[70:][::-1]])
+    picture = scene[np.ix_(lines, lines)]
+    with pytest.warns(UserWarning, match="of the centre one only: the field is 4[45]% of it"):
+        there = align(picture, model=(80, 88))
+    assert there.positions == grid_positions(3, 3)
+    assert min(share_on_sensor(v, there.field, there.sensor) for v in there.views) == 1
+    left, top, right, bottom = np.array(there.field) - 170 + 0.5  # of the centre view
+    assert (right - left) / (bottom - top) == pytest.approx(88 / 80)
+    assert 69 < left < 75 and 165 < right < 171
+
+
+def test_a_view_with_less_than_the_middle_of_the_centre_one_is_refused():
+    far = View((0, 1), np.array([[1.0, 0, -90], [0, 1, 0], [0, 0, 1]]))
+    with pytest.raises(ValueError, match=r"view \(0, 1\) has 11% of the centre one on the sensor"):
+        view_field.shrink_field((0, 0, 100, 100), [View((0, 0), np.eye(3)), far], (101, 101))
