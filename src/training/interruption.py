@@ -57,15 +57,18 @@ class DeferredSignals(Callback):
 
     def _defer(self, number: int, frame: FrameType | None) -> None:
         if number in self.pending:
-            self.handlers[number](number, frame)
+            self._act(number, frame)
         self.pending.append(number)
 
     def _deliver(self) -> None:
         pending, self.pending = self.pending, []
         for number in pending:
-            if number == signal.SIGHUP:  # its handler acts where it is the handler
-                signal.signal(number, self.handlers[number])
-            self.handlers[number](number, None)
+            self._act(number, None)
+
+    def _act(self, number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGHUP:  # its handler acts where it is the handler
+            signal.signal(number, self.handlers[number])
+        self.handlers[number](number, frame)
 
     def _restore_handlers(self) -> None:
         for number, handler in self.handlers.items():

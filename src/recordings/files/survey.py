@@ -78,10 +78,14 @@ def _judge(
     path, sample = file.path, TimeSample()
     for t in read_times():
         sample.add(t)
-    unit, line = find_unit(sample, options.time_unit)
     bits = sample.wrap_bits
     if file.time_unit is not None:
         unit, line = file.time_unit, describe_equal_times(sample)
+    else:
+        try:
+            unit, line = find_unit(sample, options.time_unit)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
 
     def read_us() -> Iterable[np.ndarray]:
         clock = TimestampUnwrapper(bits) if bits else None

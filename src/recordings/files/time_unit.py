@@ -3,22 +3,25 @@
 A unit is judged by the file's duration and event rate in it.  It loses a point for each factor of
 ten by which the duration is outside 0.02 s..600 s or the rate outside 3e3..3e6 events/s, and those
 of PRIOR, for whole numbers and others; ns lose NS_OF_US where all are apart by thousands.  It gains
-EPOCH where the times are then dates of 2001 to 2039, whole ms EPOCH_OF_MS, as they may be us of a
-clock that has run for weeks, and loses EPOCH where they are later.  Where half of the times have
-more than three digits behind the point, other units than s lose FINE: they would be finer than a
-camera's.
+EPOCH where the times are then dates of 2001 to 2039 and loses EPOCH where they are later.  Where
+half of the times have more than three digits behind the point, other units than s lose FINE: they
+would be finer than a camera's.
 The duration is that between the 1st and the 99th of a hundred times, so that single wild ones do
 not matter, the rate that of the median step, so that silence does not; a counter that goes round
 goes on.
 
 The best unit is taken.  The user is told where it is not that of PRIOR 0 or a date, where a second
-one is less than NEAR behind, dates counted or not, where another would be ahead but for FINE though
-the times are finer than a camera's in s, too, where us need more events/s than usual and ms would
-be ahead but for PRIOR, and where duration or rate are absurd.  Fewer than FEW_TIMES values tell too
-little: they are dates where one unit makes them so, else seconds with a fraction, microseconds
-without.
+one is less than NEAR behind, where another would be ahead but for FINE though the times are finer
+than a camera's in s, too, where us need more events/s than usual and ms would be ahead but for
+PRIOR, and where duration or rate are absurd.  Fewer than FEW_TIMES values tell too little: they are
+dates where one unit makes them so, else seconds with a fraction, microseconds without.
+
+Whole numbers that are dates in ms are also us of a clock that has run for 12 to 25 days, and dates
+in us, all apart by thousands, ns of such a clock: duration and rate alone decide, the user is told,
+and asked where the two are less than CLEAR apart.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +34,10 @@ PRIOR = {
     True: {"us": 0.0, "ns": 2.0, "ms": 2.0, "s": 3.0},  # whole numbers
     False: {"s": 0.0, "ms": 1.0, "us": 1.0, "ns": 2.0},
 }
-FINE, NS_OF_US, EPOCH_OF_MS = 3.0, 0.8, 1.5
+FINE, NS_OF_US = 3.0, 0.8
 DURATION_S, RATE_HZ, EPOCH_S, EPOCH = (0.02, 600.0), (3e3, 3e6), (1e9, 2.2e9), 3.0
 NEAR = 1.25  # points: a second unit as near is told of
+CLEAR = 1.5  # points by which a date or a clock that has run for days is taken
 ABSURD_S, ABSURD_HZ = (1e-3, 86_400.0), (10.0, 1e9)  # outside, duration and rate are told of
 FEW_TIMES = 100
 SAMPLES = 1024  # of a piece
@@ -131,11 +135,14 @@ class _Reading:
         if not self.duration_s:
             return 0.0
         lost = _decades(self.duration_s, DURATION_S) + _decades(self.active_rate_hz, RATE_HZ)
-        return -lost - EPOCH * self.is_later
+        return EPOCH * (self.is_date - self.is_later) - lost
 
 
 def find_unit(sample: TimeSample, stated: str) -> tuple[str, str]:
-    """Return the unit (`stated`, where it is not auto), and what the user is told of it, or ""."""
+    """Return the unit (`stated`, where it is not auto), and what the user is told of it, or "".
+
+    Raises ValueError for times that may be dates in one unit or of a clock in another.
+    """
     is_auto = stated == "auto"
     usual = ("us" if sample.are_whole_numbers else "s") if is_auto else stated
     early, span = sample.early_time_and_span()
@@ -146,21 +153,20 @@ def find_unit(sample: TimeSample, stated: str) -> tuple[str, str]:
         return (usual if usual in dated or not dated else dated[0]), ""
     if line := describe_equal_times(sample):
         return usual, line
+    if is_auto and sample.are_whole_numbers:
+        if read["ms"].is_date:
+            return _choose_date_or_clock(read, "ms", "us")
+        if read["us"].is_date and sample.are_apart_by_thousands:
+            return _choose_date_or_clock(read, "us", "ns")
     losses, fine = dict(PRIOR[sample.are_whole_numbers]), FINE * sample.has_more_decimals(3)
     if sample.are_whole_numbers and sample.are_apart_by_thousands:
         losses["ns"] = NS_OF_US
-    dates = {unit: EPOCH * read[unit].is_date for unit in UNITS_US}
-    if sample.are_whole_numbers:
-        dates["ms"] = EPOCH_OF_MS * read["ms"].is_date
-    plain = {unit: read[unit].points() + dates[unit] - losses[unit] for unit in UNITS_US}
+    plain = {unit: read[unit].points() - losses[unit] for unit in UNITS_US}
     points = {unit: plain[unit] - fine * (unit != "s") for unit in UNITS_US}
     best, second = sorted(points, key=lambda unit: -points[unit])[:2]
     unit = best if is_auto else stated
     by_digits = max(plain.values()) > plain[unit] and sample.has_more_decimals(6)
-    undated = {one: points[one] - dates[one] for one in UNITS_US if one != best}
-    rival = max(undated, key=undated.__getitem__)
-    by_date = points[best] - dates[best] - undated[rival] < NEAR
-    is_near = is_auto and (points[best] - points[second] < NEAR or by_digits or by_date)
+    is_near = is_auto and (points[best] - points[second] < NEAR or by_digits)
     is_unusual = is_auto and PRIOR[sample.are_whole_numbers][unit] > 0 and not read[unit].is_date
     absurd = _decades(read[unit].duration_s, ABSURD_S) + _decades(read[unit].rate_hz, ABSURD_HZ)
     is_crowded = is_auto and sample.are_whole_numbers and unit == "us" and (
@@ -169,12 +175,26 @@ def find_unit(sample: TimeSample, stated: str) -> tuple[str, str]:
     if not (is_near or is_unusual or is_crowded or absurd > 0):
         return unit, ""
     other = "ms" if is_crowded else second if unit == best else best
-    if by_date and unit == best and not is_crowded:
-        other = rival
     if by_digits:
         other = max(plain, key=plain.__getitem__)
+    return unit, _describe_choice(read, unit, other)
+
+
+def _choose_date_or_clock(read: Mapping[str, _Reading], date: str, clock: str) -> tuple[str, str]:
+    """Return the unit in which times are dates, or that of a clock that has run for days."""
+    ahead = read[clock].points() - (read[date].points() - EPOCH)
+    if abs(ahead) < CLEAR:
+        raise ValueError(
+            f"time_unit must be {date} or {clock}, got auto: times in {date} are dates and give"
+            f" {read[date]}, in {clock} {read[clock]}"
+        )
+    unit, other = (clock, date) if ahead > 0 else (date, clock)
+    return unit, _describe_choice(read, unit, other)
+
+
+def _describe_choice(read: Mapping[str, _Reading], unit: str, other: str) -> str:
     both = f"times in {unit} give {read[unit]}, in {other} {read[other]}"
-    return unit, f"{both}: read as {unit}; if it is another, give time_unit=s, ms, us or ns"
+    return f"{both}: read as {unit}; if it is another, give time_unit=s, ms, us or ns"
 
 
 def describe_equal_times(sample: TimeSample) -> str:

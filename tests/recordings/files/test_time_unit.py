@@ -53,21 +53,38 @@ def test_dates_tell_their_unit(unit, kind):
         assert find_unit(sampled(t), "auto")[0] == unit
 
 
-@pytest.mark.parametrize("start_us", [10**12, 2 * 10**12])
-@pytest.mark.parametrize(("duration", "rate"), [(0.4, 1.6e6), (0.05, 4e6), (2.0, 5e5), (30.0, 1e5)])
-def test_microseconds_of_a_clock_that_has_run_for_weeks(start_us, duration, rate):
-    t = in_unit(made_up(duration, rate), "us", 0, int) + start_us  # in ms a date of 2001 or later
-    assert find_unit(sampled(t), "auto")[0] == "us"
+@pytest.mark.parametrize("start", [10**12, 2 * 10**12])  # us of 12 and 23 days, ms of 2001 and 2033
+def test_a_clock_that_has_run_for_weeks_and_dates_in_milliseconds(start):
+    for slower in (1, 60):
+        t = in_unit(made_up(10.0, 1e5), "us", 0, int) * slower + start
+        unit, line = find_unit(sampled(t), "auto")
+        assert unit == "us" and "in ms " in line and "time_unit=" in line
+    for duration, rate in ((2.0, 1e5), (10.0, 1e5), (0.1, 1e6)):
+        unit, line = find_unit(
+            sampled(in_unit(made_up(duration, rate), "ms", 0, int) + start), "auto"
+        )
+        assert unit == "ms" and "in us " in line and "time_unit=" in line
 
 
-def test_a_date_that_decides_is_told_of():
-    t = made_up(1.0, 1e6) // 1000 * 1000 + 15 * 10**14  # ns of a clock that has run for 17 days
-    unit, line = find_unit(sampled(t), "auto")
-    assert unit == "us" and "in ns 1 s and 1e+06 events/s" in line and "time_unit=" in line
-    date = in_unit(made_up(1.0, 1e6), "us", DATE_S, int)
-    assert find_unit(sampled(date), "auto") == ("us", "")
-    date = in_unit(made_up(0.3, 1e6), "ns", DATE_S, int) // 1000 * 1000
-    assert find_unit(sampled(date), "auto") == ("ns", "")
+@pytest.mark.parametrize(("unit", "duration", "rate"), [("us", 0.4, 1.6e6), ("ms", 60.0, 3000)])
+def test_times_that_may_be_dates_or_of_a_clock_are_asked_about(unit, duration, rate):
+    t = in_unit(made_up(duration, rate), unit, 0, int) + 1_700_000_000_000
+    with pytest.raises(
+        ValueError, match="time_unit must be ms or us, got auto: times in ms are da"
+    ):
+        find_unit(sampled(t), "auto")
+    assert find_unit(sampled(t), unit)[0] == unit
+    t = made_up(0.4, 1e6) // 1000 * 1000 + 15 * 10**14  # ns of a clock that has run for 17 days
+    with pytest.raises(
+        ValueError, match="time_unit must be us or ns, got auto: times in us are da"
+    ):
+        find_unit(sampled(t), "auto")
+
+
+@pytest.mark.parametrize(("unit", "kind"), [("us", int), ("ns", int), ("s", float)])
+def test_dates_of_one_unit_alone_need_no_line(unit, kind):
+    date = in_unit(made_up(1.0, 1e6), unit, DATE_S, kind)
+    assert find_unit(sampled(date), "auto") == (unit, "")
 
 
 def test_nanoseconds_are_not_taken_for_a_slow_recording():
