@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 from torchmetrics import MeanMetric, Metric, MetricCollection
@@ -15,9 +15,17 @@ from src.metrics.lpips import LPIPS
 from src.metrics.table import NAMES, Column
 from src.metrics.temporal import Video, temporal_jitter_px
 
+
+def score_aligned_psnr(frames: Video, target: Video) -> Float[Tensor, " scored"]:
+    """Return the aligned PSNR of the frames whose target has contrast, which any frame equals
+    otherwise; of all where none has."""
+    kept = _have_contrast(target)
+    return aligned_psnr(frames[kept], target[kept])
+
+
 SCORES = {  # name in table.py: a value per frame
     "psnr": psnr,
-    "psnr_aligned": aligned_psnr,
+    "psnr_aligned": score_aligned_psnr,
     "ssim": ssim,
 }
 
@@ -49,11 +57,20 @@ def resample(frames: Video, scale: float) -> Float[Tensor, "frames 1 h2 w2"]:
 
 def measure_reduced_jitter_px(
     frames: Video, target: Video, reduction: int
-) -> Float[Tensor, " frames-1"]:
-    """Return the temporal jitter of frames in their pixels, measured on frames `reduction` times
-    smaller."""
+) -> Float[Tensor, " pairs"]:
+    """Return the temporal jitter of pairs of frames in their pixels, measured on frames `reduction`
+    times smaller; of the pairs whose targets have contrast, of all where none has."""
     smaller = (resample(video, 1 / reduction) for video in (frames, target))
-    return reduction * temporal_jitter_px(*smaller)
+    jitter, seen = temporal_jitter_px(*smaller), _have_contrast(target)
+    both = seen[1:] & seen[:-1]
+    return reduction * (jitter[both] if both.any() else jitter)
+
+
+def _have_contrast(target: Video) -> Bool[Tensor, " frames"]:
+    """Return which frames have more than one value; all where none has."""
+    values = target.flatten(1)
+    seen = values.amax(1) > values.amin(1)
+    return seen if seen.any() else torch.ones_like(seen)
 
 
 def score_by_user_metric(name: str, metric: Metric, frames: Tensor, target: Tensor) -> Tensor:
@@ -72,7 +89,8 @@ def score_by_user_metric(name: str, metric: Metric, frames: Tensor, target: Tens
 
 class VideoMetrics(MetricCollection):
     """PSNR, aligned PSNR, SSIM, temporal jitter and, if a network is given, LPIPS of clips; and
-    those of `own`, by name, each as score_by_user_metric.
+    those of `own`, by name, each as score_by_user_metric.  Aligned PSNR and jitter leave out frames
+    whose target has no contrast.
 
     Frames are clipped to [0, 1]; the data range is 1.  `resolution_scale`: frames and targets are
     scored at so many times their own resolution, temporal jitter in pixels of the scored frame.

@@ -73,3 +73,15 @@ def test_averaged_areas_lose_noise():
 def test_other_scales_are_refused(scale):
     with pytest.raises(ValueError, match=r"metrics\.resolution_scale"):
         VideoMetrics(resolution_scale=scale)
+
+
+def test_frames_without_contrast_have_no_aligned_psnr_and_no_jitter():
+    target = photo(swing(1.0))
+    frames = photo(swing(1.3)) + 0.05 * torch.randn(target.shape)
+    blank = torch.full_like(target[:3], 0.1)
+    scores = VideoMetrics().forward(frames, target)
+    longer = torch.cat([torch.rand_like(blank), frames]), torch.cat([blank, target])
+    with_blank = VideoMetrics().forward(*longer)
+    for name in ("psnr_aligned", "temporal_jitter_px"):
+        assert with_blank[name] == pytest.approx(scores[name], rel=1e-5)
+    assert VideoMetrics().forward(blank, blank)["psnr_aligned"] == 100
