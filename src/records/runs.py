@@ -16,6 +16,9 @@ from src.records import results, safe_yaml
 FIGURES = ("chart", "machine", "stress")  # of src.chart and src.stress
 WITHOUT_NUMBERS = ("seed", "name", "task", "logger", "callbacks", "paths", "hydra")
 MACHINE = ("data.workers", "data.simulate_on", "trainer.accelerator", "trainer.devices")
+READ_ERRORS = (
+    OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -115,15 +118,31 @@ def _read(file: Path) -> Run:
         schema, config = record["schema"], (file.parent / "config.yaml").read_text()
         is_of_config = record.get("config_sha256") == results.hash_config(config)
         settings = flatten_settings(results.parse_settings_without_paths(config))
-    except (OSError, ValueError, KeyError, TypeError, RecursionError, yaml.YAMLError) as error:
+    except READ_ERRORS as error:
         raise ValueError(f"run must hold whole results, got {file}: {error}") from error
     if schema != results.SCHEMA:
         raise ValueError(f"schema must be {results.SCHEMA}, got {schema} in {file}")
     if not is_of_config:
         raise ValueError(f"run must hold whole results, got {file}: config.yaml is of another run")
-    clips = file.parent / "clips.csv"
-    rows = list(csv.DictReader(clips.read_text().splitlines())) if clips.is_file() else []
-    return Run(file.parent, record, settings, rows)
+    try:
+        return Run(file.parent, record, settings, _read_clips(file.parent / "clips.csv", record))
+    except READ_ERRORS as error:
+        raise ValueError(f"run must hold whole results, got {file}: {error}") from error
+
+
+def _read_clips(file: Path, record: dict) -> list[dict[str, str]]:
+    """Return the scores of clips, none where there is no file.  Raises one of READ_ERRORS where the
+    file, or what `record` says of the test, is cut short."""
+    test = record["test"]
+    scores = [score for name, score in test.items() if name != "clips"]
+    if not record["latency_ms"] or any("mean" not in score for score in scores):
+        raise ValueError("scores or times are missing")
+    rows = list(csv.DictReader(file.read_text().splitlines())) if file.is_file() else []
+    if file.is_file() and len(rows) != test["clips"]:
+        raise ValueError(f"{file.name} has {len(rows)} clips, the test had {test['clips']}")
+    if any(None in row or None in row.values() for row in rows):
+        raise ValueError(f"{file.name} is cut short")
+    return rows
 
 
 def _plan(hydra: dict) -> SweepPlan:

@@ -38,7 +38,7 @@ def build_difference_table(
         change = None if first is None or second is None else first - second
         texts.append("-" if change is None else f"{change:+.{digits}f}")
         table.rows.append([TableCell(text=text) for text in texts])
-    table.note = f"{len(ours[0].clips)} clips; {len(ours)} runs against {len(theirs)}."
+    table.note = f"{len(_pool_clips(ours)[0])} clips; {len(ours)} runs against {len(theirs)}."
     table.note += _describe_conditions(find_differing_test_conditions(ours, theirs))
     return table
 
@@ -78,7 +78,7 @@ def build_pair_table(
             compared = [_compare(ours, theirs, metric.name) for metric in metrics]
             cells = [TableCell(c[0] - c[1], interval=c[2]) if c else TableCell() for c in compared]
             table.rows.append([*(TableCell(text=text) for text in texts), *cells])
-            clips.add(len(ours[0].clips))
+            clips.add(len(_pool_clips(ours)[0]))
     counts = " or ".join(map(str, sorted(clips)))
     table.note = f"{counts} test clips; mean (95 % bootstrap CI); bold: the CI excludes zero."
     table.note += _describe_conditions(differing)
@@ -117,6 +117,19 @@ def _check_clips(keys: str, ours: Sequence[Run], theirs: Sequence[Run]) -> None:
     names = {tuple((clip["name"], clip.get("frames")) for clip in run.clips) for run in runs}
     if len(names) != 1 or () in names:
         raise ValueError(f"{keys} must hold the same clips, got {len(names)} sets of them")
+    first, second = (sorted({run.test_seed for run in side}) for side in (ours, theirs))
+    if first != second:
+        raise ValueError(f"{keys} must have clips of the same seeds, got {first} and {second}")
+    if len(first) > 1 and any(len(side) > len(first) for side in (ours, theirs)):
+        raise ValueError(f"{keys} must hold one run for each seed of clips, got more of {first}")
+
+
+def _pool_clips(runs: Sequence[Run]) -> list[list[dict[str, str]]]:
+    """Return the clips of every run, or, where those of each are drawn from another seed, of all as
+    of one run."""
+    if len({run.test_seed for run in runs}) == 1:
+        return [run.clips for run in runs]
+    return [[clip for run in sorted(runs, key=lambda run: run.test_seed) for clip in run.clips]]
 
 
 def _compare(
@@ -128,9 +141,10 @@ def _compare(
     if not all(metric in clip for run in [*ours, *theirs] for clip in run.clips):
         return None
     left, right = (
-        [[float(clip[metric]) for clip in run.clips] for run in side] for side in (ours, theirs)
+        [[float(clip[metric]) for clip in clips] for clips in _pool_clips(side)]
+        for side in (ours, theirs)
     )
-    weights = frame_weights(ours[0].clips)
+    weights = frame_weights(_pool_clips(ours)[0])
     interval = bootstrap_difference_interval(left, right, weights)
     if len(left[0]) == 1:  # of one clip there is none
         interval = math.nan, math.nan

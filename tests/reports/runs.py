@@ -49,7 +49,7 @@ def write_run(
         "git": "abc",
         "config_sha256": results.hash_config(text),
         "model": {"name": experiment, "params": 1234567, "macs_per_frame": 608_000_000},
-        "test": {"clips": 9}
+        "test": {"clips": len(clips or range(9))}
         | {key: found | {"mean": value} for key, value in (SCORES | (scores or {})).items()},
         "latency_ms": {"128x128": 13.8},
         "compared": UNTRAINED if compared is None else compared,

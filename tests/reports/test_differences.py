@@ -18,10 +18,13 @@ PAPER = {"source": "paper", "rows": [
 ]}  # fmt: skip
 
 
-def found(folder, experiment: str, *clips: dict[str, float]) -> list[runs.Run]:
+def found(
+    folder, experiment: str, *clips: dict[str, float], have_own_clips: bool = False
+) -> list[runs.Run]:
     for seed, values in enumerate(clips):
         rows = [SCORES | {"name": name, "lpips": value} for name, value in values.items()]
-        write_run(folder / experiment / str(seed), experiment, seed, clips=rows)
+        settings = {"data": {"test_seed": seed if have_own_clips else 0}}
+        write_run(folder / experiment / str(seed), experiment, seed, clips=rows, settings=settings)
     return runs.find_runs([folder / experiment])
 
 
@@ -33,6 +36,17 @@ def test_differences_are_ours_minus_theirs_with_an_interval(tmp_path):
         "LPIPS", "3.5000", "2.5000", "+1.0000", "+1.0000 to +1.0000", "-0.0300"
     ]  # fmt: skip
     assert table.rows[1][-1].text == "-"
+
+
+def test_clips_of_other_seeds_are_further_clips(tmp_path):
+    """Not the same clips in another training, of which the means vary independently."""
+    ours = found(tmp_path, "a", {"c": 2.0, "d": 5.0}, {"c": 1.0, "d": 9.0}, have_own_clips=True)
+    theirs = found(tmp_path, "b", {"c": 1.0, "d": 4.0}, {"c": 0.0, "d": 8.0}, have_own_clips=True)
+    table = build_difference_table("", ours, theirs, PAPER)
+    assert table.rows[0][3].text == "+1.0000" and table.rows[0][4].text == "+1.0000 to +1.0000"
+    assert table.note.startswith("4 clips; 2 runs against 2.")
+    with pytest.raises(ValueError, match=r"must have clips of the same seeds, got \[0, 1\] and"):
+        build_difference_table("", ours, theirs[:1], PAPER)
 
 
 def test_what_was_not_tested_alike_is_named(tmp_path):

@@ -1,5 +1,7 @@
 """Which runs are one group, what its label says, and what is missing or contradicts itself."""
 
+import json
+
 import pytest
 import yaml
 
@@ -124,6 +126,22 @@ def test_an_empty_or_broken_run_folder_is_named(content, said, tmp_path):
     with pytest.raises(ValueError, match=said) as error:
         runs.find_runs([tmp_path / "run"])
     assert str(folder) in str(error.value) and "run" in str(error.value)
+
+
+@pytest.mark.parametrize("cut", ["a line", "a value", "times", "a score"])
+def test_results_that_are_cut_short_are_refused(cut, tmp_path):
+    clips = [{"name": f"c{k}", "lpips": 0.5, "ssim": 0.5} for k in range(3)]
+    folder = write_run(tmp_path / "run", clips=clips)
+    assert len(runs.find_runs([folder])[0].clips) == 3
+    table, record = folder / "clips.csv", json.loads((folder / "results.json").read_text())
+    lines = table.read_text().splitlines()
+    table.write_text("\n".join(lines[:-1] + (["c2,0.5"] if cut != "a line" else [])))
+    if cut in ("times", "a score"):
+        table.unlink()
+        record |= {"latency_ms": {}} if cut == "times" else {"test": {"clips": 3, "lpips": None}}
+        (folder / "results.json").write_text(json.dumps(record))
+    with pytest.raises(ValueError, match="run must hold whole results, got .*results.json: "):
+        runs.find_runs([folder])
 
 
 def test_results_beside_the_config_of_another_run_are_refused(tmp_path):
