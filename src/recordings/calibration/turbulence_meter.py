@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d
 
 from src.recordings.calibration import tilt_covariance
 from src.recordings.calibration.camera_drift import remove_camera_drift
@@ -28,7 +29,7 @@ MAX_DRIFT_PX = 4.0  # between the quarters of a video: more is a camera that mov
 MIN_RMS_PX = 0.01  # less is the error of tracking
 MIN_OVER_NOISE = 0.15  # of the power of tilt over that of noise: up to 0.09 is found without tilt
 MIN_HALF_LENGTH_PX = 4.0  # of the frame that is worked on: what JPEG adds is correlated over less
-FLICKER_SHARE = 1 / 32  # deviation of a Gaussian; bands of lamps are a third of a frame and more
+FLICKER_SHARE = 1 / 32  # of the side, deviation of a Gaussian: bands of lamps are wider
 DRAWS = 200
 SHARPEST = 0.1  # the sharpest tenth
 FILM_OVER_DECAY = 8.0  # a decay that is more than the film over this is known by its lower bound
@@ -95,7 +96,8 @@ def measure_turbulence(
     if rms_px < MIN_RMS_PX:
         raise _no_tilt(rms_px, len(tracks.place), "which is none")
     if tilt.half_length_px < MIN_HALF_LENGTH_PX:
-        reach = f"correlated over {tilt.half_length_px * unit:.1f} px, as errors of compression are"
+        reach = f"correlated over {tilt.half_length_px * unit:.1f} px: errors of compression, too,"
+        reach += f" are over less than {MIN_HALF_LENGTH_PX * unit:.1f} px of such frames"
         raise _no_tilt(rms_px, len(tracks.place), reach)
     drawn = [describe(*chosen) for chosen in _resampled(len(frames), 2 * tilt.decay_frames)]
     numbers = _summarize_tilt(tilt, drawn, unit, fps, len(frames))
@@ -143,11 +145,12 @@ def _width_ratio(sums: Float[np.ndarray, "3"]) -> float:
 
 
 def remove_flicker(frames: Float[np.ndarray, "frames h w"]) -> Float[np.ndarray, "frames h w"]:
-    """Return the frames at the mean brightness of every place, averaged over FLICKER_SHARE of the
-    side: what lamps change, also in the bands of a rolling shutter, is not turbulence."""
+    """Return the frames with the mean brightness of every row, averaged over rows: what lamps
+    change, also in the bands of a rolling shutter, is not turbulence."""
     spread = FLICKER_SHARE * min(frames.shape[1:])
-    level = np.stack([cv2.GaussianBlur(frame, (0, 0), spread) for frame in frames])
-    return (frames * (level.mean(0) / np.maximum(level, 1e-3))).astype(np.float32)
+    level = gaussian_filter1d(frames.mean(2), spread, axis=1, mode="nearest")
+    gain = level.mean(0) / np.maximum(level, 1e-3)
+    return (frames * gain[..., None]).astype(np.float32)
 
 
 def limit_shorter_side(frame: np.ndarray, max_px: int = SIZES[0]) -> Float[np.ndarray, "_h _w"]:

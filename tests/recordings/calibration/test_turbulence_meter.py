@@ -184,7 +184,7 @@ def test_what_compression_adds_is_no_tilt(quality):
         for frame in film(np.zeros((40, 2, SIDE, SIDE)))
     ]
     frames = [cv2.imdecode(file, cv2.IMREAD_GRAYSCALE) for file in files]
-    with pytest.raises(ValueError, match=r"a tilt of 0.0\d* .* px, as errors of compression are"):
+    with pytest.raises(ValueError, match=r"a tilt of 0.0\d* .* px: errors of compression, too,"):
         turbulence_meter.measure_turbulence(np.stack(frames).astype(np.float32) / 255, 30.0)
 
 
