@@ -34,11 +34,14 @@ def build_difference_table(
         first, second = (row.get(metric.name) for row in rows)
         digits = metric.digits + 1
         texts = [metric.heading, *(f"{value:.{digits}f}" for value in (left, right))]
-        texts += [f"{left - right:+.{digits}f}", f"{low:+.{digits}f} to {high:+.{digits}f}"]
+        interval = "-" if math.isnan(low) else f"{low:+.{digits}f} to {high:+.{digits}f}"
+        texts += [f"{left - right:+.{digits}f}", interval]
         change = None if first is None or second is None else first - second
         texts.append("-" if change is None else f"{change:+.{digits}f}")
         table.rows.append([TableCell(text=text) for text in texts])
     table.note = f"{len(_pool_clips(ours)[0])} clips; {len(ours)} runs against {len(theirs)}."
+    if len(ours) != len(theirs) and 1 in (len(ours), len(theirs)):
+        table.note += " The CI has no spread over seeds of the single run."
     table.note += _describe_conditions(find_differing_test_conditions(ours, theirs))
     return table
 

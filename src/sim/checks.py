@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from numbers import Real
 from typing import Any
 
+import numpy as np
+
 
 def check_in_range(key: str, value: Any, low: float, high: float) -> None:
     """Raise ValueError for a value of `key` that is no number in [low, high]."""
@@ -15,6 +17,6 @@ def check_in_range(key: str, value: Any, low: float, high: float) -> None:
 
 
 def is_range(ends: Any) -> bool:
-    """Return whether `ends` are two numbers [low, high]."""
-    numbers = isinstance(ends, Sequence) and all(isinstance(end, int | float) for end in ends)
-    return numbers and len(ends) == 2 and ends[0] <= ends[1]
+    """Return whether `ends` are two numbers [low, high], a sequence or an array."""
+    is_pair = isinstance(ends, Sequence | np.ndarray) and len(ends) == 2
+    return is_pair and all(isinstance(end, Real) for end in ends) and bool(ends[0] <= ends[1])

@@ -58,7 +58,7 @@ def most_central_view_index(positions: Sequence[Position]) -> int:
 
 
 def _is_position(value: Any) -> bool:
-    is_pair = isinstance(value, Sequence) and len(value) == 2
+    is_pair = hasattr(value, "__len__") and len(value) == 2
     return is_pair and all(isinstance(axis, Integral) for axis in value)
 
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -79,7 +80,7 @@ class SceneBase:
         given = vars(self)
         for name in RANGES.keys() & given:
             check_in_range(f"scene.{name}", given[name], *RANGES[name])
-            if name in WHOLE and type(given[name]) is not int:
+            if name in WHOLE and not isinstance(given[name], Integral):
                 raise ValueError(f"scene.{name} must be a whole number, got {given[name]}")
         for name in INTERVALS.keys() & given:
             ends, (above, most) = given[name], INTERVALS[name]

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -179,7 +180,7 @@ def unnormalised_cn2_profile(shape: Any) -> tuple[float, ...]:
         place = np.linspace(0, 1, PROFILE_POINTS)
         low, high = PROFILES[shape]
         return tuple(((place >= low) & (place <= high)).astype(float).tolist())
-    is_table = isinstance(shape, Sequence) and all(isinstance(one, int | float) for one in shape)
+    is_table = isinstance(shape, Sequence | np.ndarray) and all(isinstance(v, Real) for v in shape)
     valid = is_table and min(shape, default=-1) >= 0 and 0 < sum(shape) < math.inf
     allowed = "names or tables of Cn2 >= 0, somewhere > 0"
     check_option(valid, "atmosphere.cn2_profiles", allowed, shape)
