@@ -103,7 +103,7 @@ def test_scores_take_the_place_of_older_ones_on_a_card(tmp_path):
 
 
 def test_rows_of_published_networks_that_are_not_scored_again_stay():
-    table = readme.Table("README.md", "results", (readme.PAPER, readme.FIRENET, readme.LITE), {})
+    table = readme.Table("README.md", "results", (readme.PAPER, readme.FIRENET, readme.PIENET), {})
     scored = [{metric.name: 0.5 for metric in METRICS}]
     before = f"| {readme.PAPER} | 0.4 |\n| {readme.FIRENET} | 0.3 |\n"
     rows = readme.format_table({readme.PAPER: scored}, table, before).splitlines()[2:]
