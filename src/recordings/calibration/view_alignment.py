@@ -24,6 +24,7 @@ from src.records import safe_yaml
 from src.sim.optics import Position
 
 MIN_VIEWS = 4
+MIN_SPAN = 0.75  # of the board's width and height in the centre view: less is warned of
 MAX_ERROR_PX = 1.5  # a point further off is an outlier of the homography
 FLIPS = ((False, False), (True, False), (False, True), (True, True))
 
@@ -136,7 +137,8 @@ def fit_homographies(
             f" one, got {len(seen)}: {seen}; give corners= by hand or another target="
         )
     centre = found[0, 0]
-    views, used, residuals = [], {}, {}
+    board = np.ptp(centre[np.isfinite(centre).all(1)], axis=0)
+    views, used, residuals, spans = [], {}, {}, {}
     for at in sorted(found):
         both = np.isfinite(found[at]).all(1) & np.isfinite(centre).all(1)
         points, onto = found[at][both], centre[both]
@@ -151,8 +153,22 @@ def fit_homographies(
         residuals[at] = cv2.perspectiveTransform(points[None, good], matrix)[0] - onto[good]
         error = float(np.sqrt((residuals[at] ** 2).sum(1).mean()))
         views.append(View(at, matrix, error, len(used[at])))
+        spans[at] = float((np.ptp(onto[good], axis=0) / board).min())
+    _warn_of_small_spans(spans)
     field = shrink_field(cut_field(_between_boards(found), model), views, sensor)
     return AlignedViews(Views(sensor, model, field, tuple(views)), used, residuals)
+
+
+def _warn_of_small_spans(spans: Mapping[Position, float]) -> None:
+    """Warn of views whose points span little of the board's width or height in the centre view."""
+    small = {at: span for at, span in spans.items() if span < MIN_SPAN}
+    if small:
+        listed = ", ".join(f"view {at} {span:.0%}" for at, span in small.items())
+        warnings.warn(
+            f"points span little of the board's width or height: {listed}; beyond them the"
+            " homography is extrapolated, by a pixel or more",
+            stacklevel=3,
+        )
 
 
 def _between_boards(found: Mapping[Position, Points]) -> Rectangle:

@@ -52,3 +52,14 @@ def test_a_target_without_a_turn_is_said_of_lens_arrays_only(target, are_mirrore
         warnings.simplefilter("always")
         view_alignment.find_target(np.zeros((90, 120), np.uint8), target, are_mirrored)
     assert any("taken as upright" in str(one.message) for one in said) == is_said
+
+
+def test_a_view_that_shows_a_part_of_the_board_is_warned_of():
+    picture, board, sizes = show_boards(5, 6), Checkerboard(5, 6), {"model": (88, 88)}
+    found = dict(view_alignment.find_target(picture, board, are_mirrored=False))
+    sizes |= {"sensor": picture.shape}
+    view_alignment.fit_homographies(found, **sizes)
+    left = found[1, 1].copy()
+    left[left[:, 0] > np.median(left[:, 0])] = np.nan
+    with pytest.warns(UserWarning, match=r"^points span little .* height: view \(1, 1\) \d\d%; be"):
+        view_alignment.fit_homographies(found | {(1, 1): left}, **sizes)
