@@ -24,7 +24,7 @@ from src.recordings import output, reconstruction, tone, truth_file
 from src.recordings.event_windows import Window, WindowRule, build_window_rule, cut_windows
 from src.recordings.files import sources
 from src.recordings.files.event_file import HeightWidth, ReadOptions
-from src.recordings.noise_filter import NoiseFilter, check_support_s
+from src.recordings.noise_filter import NoiseFilter, check_noise_filter_s
 from src.recordings.reconstruction import Frame
 from src.recordings.sensor_lookup import build_lookup
 from src.recordings.truth_file import CleanClip
@@ -62,11 +62,11 @@ def reconstruct(cfg: DictConfig) -> Path:
 def check_settings(cfg: DictConfig) -> None:
     """Raise ValueError for a device, a filter, a warmup or a video that cannot be."""
     hardware.check_device(cfg.device)
-    output.check_video(cfg.output_format, Path(cfg.paths.run), cfg.playback_fps)
+    output.check_video_settings(cfg.output_format, Path(cfg.paths.run), cfg.playback_fps)
     tone.build_output_curve(cfg.tone, cfg.tone_time_constant_s, cfg.output_format)
     check_backward_warmup_s(cfg.backward_warmup_s)
     if cfg.noise_filter_s is not None:
-        check_support_s(cfg.noise_filter_s)
+        check_noise_filter_s(cfg.noise_filter_s)
 
 
 def describe_run(video: Path, views: Views, ready_s: list[float]) -> str:

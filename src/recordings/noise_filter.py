@@ -12,7 +12,7 @@ LONGEST_S = 1e6
 SUPPORT_S = 0.005  # of `find_supported_pixels`
 
 
-def check_support_s(seconds: float) -> None:
+def check_noise_filter_s(seconds: float) -> None:
     """Raise ValueError for what no noise filter can look back."""
     if not 0 < seconds <= LONGEST_S:
         raise ValueError(f"noise_filter_s must be in (0, 1e6] seconds or null, got {seconds}")
@@ -22,11 +22,11 @@ class NoiseFilter:
     """Keeps an event if one of its eight neighbours, of whatever view and polarity, had one at most
     `support_s` before, in this call or an earlier one.
 
-    `sensor`: (height, width).  Raises ValueError as `check_support_s` does.
+    `sensor`: (height, width).  Raises ValueError as `check_noise_filter_s` does.
     """
 
     def __init__(self, sensor: HeightWidth, support_s: float):
-        check_support_s(support_s)
+        check_noise_filter_s(support_s)
         height, width = sensor
         self.latest_us = np.full((height + 2, width + 2), LONG_AGO_US)  # with a border
         self.support_us = round(1e6 * support_s)

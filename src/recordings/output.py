@@ -43,9 +43,9 @@ def open_video_writer(
 
     `size`: (height, width); `film`: frames with colours; `playback_fps`: of an MP4 or GIF.
     `frames.csv` gets each frame's index, time in s, events in views and outside.  Raises ValueError
-    as `check_video` does, or where the file cannot be written.
+    as `check_video_settings` does, or where the file cannot be written.
     """
-    check_video(kind, folder, playback_fps)
+    check_video_settings(kind, folder, playback_fps)
     folder.mkdir(parents=True, exist_ok=True)
     make, whole = KINDS[kind]
     video, table_file = partial_path(folder / whole), partial_path(folder / "frames.csv")
@@ -74,7 +74,7 @@ def open_video_writer(
     os.replace(table_file, folder / "frames.csv")
 
 
-def check_video(kind: str, folder: Path, playback_fps: float) -> None:
+def check_video_settings(kind: str, folder: Path, playback_fps: float) -> None:
     """Raise ValueError for what `open_video_writer` cannot open: another `kind`, a `playback_fps`
     out of range, or a `frames/` in `folder` with other files than frames."""
     if kind not in KINDS:

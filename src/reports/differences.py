@@ -12,6 +12,8 @@ from src.records.runs import Run
 from src.reports.run_groups import RunGroup, find_differing_test_conditions, find_published
 from src.reports.tables import Table, TableCell, check_columns, list_metrics
 
+ClipsOfRuns = list[list[dict[str, str]]]
+
 
 def build_difference_table(
     title: str, ours: Sequence[Run], theirs: Sequence[Run], published: Mapping[str, Any]
@@ -22,12 +24,12 @@ def build_difference_table(
 
     Raises ValueError where the clips of all runs are not the same.
     """
-    _check_clips("run and against", ours, theirs)
+    left_clips, right_clips = _pool_same_clips("run and against", ours, theirs)
     heads = ("metric", "ours", "theirs", "ours - theirs", "95 % bootstrap CI", "published")
     table = Table(title, [Column(head, head) for head in heads], [], 1)
     rows = [find_published(side[0], published) for side in (ours, theirs)]
     for metric in list_metrics([*ours, *theirs]):
-        compared = _compare(ours, theirs, metric.name)
+        compared = _compare(left_clips, right_clips, metric.name)
         if compared is None:
             continue
         left, right, (low, high) = compared
@@ -39,7 +41,7 @@ def build_difference_table(
         change = None if first is None or second is None else first - second
         texts.append("-" if change is None else f"{change:+.{digits}f}")
         table.rows.append([TableCell(text=text) for text in texts])
-    table.note = f"{len(_pool_clips(ours)[0])} clips; {len(ours)} runs against {len(theirs)}."
+    table.note = f"{len(left_clips[0])} clips; {len(ours)} runs against {len(theirs)}."
     if len(ours) != len(theirs) and 1 in (len(ours), len(theirs)):
         table.note += " The CI has no spread over seeds of the single run."
     table.note += _describe_conditions(find_differing_test_conditions(ours, theirs))
@@ -75,13 +77,13 @@ def build_pair_table(
             if not finished.keys() >= set(labels):
                 continue
             ours, theirs = (finished[label] for label in labels)
-            _check_clips("pairs", ours, theirs)
+            pooled = _pool_same_clips("pairs", ours, theirs)
             differing |= _find_other_conditions(keys[place], ours, theirs)
             texts = [*others, " − ".join(pair)]
-            compared = [_compare(ours, theirs, metric.name) for metric in metrics]
+            compared = [_compare(*pooled, metric.name) for metric in metrics]
             cells = [TableCell(c[0] - c[1], interval=c[2]) if c else TableCell() for c in compared]
             table.rows.append([*(TableCell(text=text) for text in texts), *cells])
-            clips.add(len(_pool_clips(ours)[0]))
+            clips.add(len(pooled[0][0]))
     counts = " or ".join(map(str, sorted(clips)))
     table.note = f"{counts} test clips; mean (95 % bootstrap CI); bold: the CI excludes zero."
     table.note += _describe_conditions(differing)
@@ -114,8 +116,14 @@ def _find_key_of_pair(groups: Sequence[RunGroup], pair: tuple[str, str]) -> int:
     raise ValueError(f"pairs must be two of the runs' settings ({listed}), got {list(pair)}")
 
 
-def _check_clips(keys: str, ours: Sequence[Run], theirs: Sequence[Run]) -> None:
-    """Raise ValueError, beginning with the `keys` of the config, unless all have the same clips."""
+def _pool_same_clips(
+    keys: str, ours: Sequence[Run], theirs: Sequence[Run]
+) -> tuple[ClipsOfRuns, ClipsOfRuns]:
+    """Return the clips of every run of both sides, or, where those of each are drawn from another
+    seed, of all as of one run.
+
+    Raises ValueError, beginning with the `keys` of the config, unless all have the same clips.
+    """
     runs = [*ours, *theirs]
     names = {tuple((clip["name"], clip.get("frames")) for clip in run.clips) for run in runs}
     if len(names) != 1 or () in names:
@@ -125,29 +133,27 @@ def _check_clips(keys: str, ours: Sequence[Run], theirs: Sequence[Run]) -> None:
         raise ValueError(f"{keys} must have clips of the same seeds, got {first} and {second}")
     if len(first) > 1 and any(len(side) > len(first) for side in (ours, theirs)):
         raise ValueError(f"{keys} must hold one run for each seed of clips, got more of {first}")
-
-
-def _pool_clips(runs: Sequence[Run]) -> list[list[dict[str, str]]]:
-    """Return the clips of every run, or, where those of each are drawn from another seed, of all as
-    of one run."""
-    if len({run.test_seed for run in runs}) == 1:
-        return [run.clips for run in runs]
-    return [[clip for run in sorted(runs, key=lambda run: run.test_seed) for clip in run.clips]]
+    if len(first) == 1:
+        return [run.clips for run in ours], [run.clips for run in theirs]
+    left, right = (
+        [clip for run in sorted(side, key=lambda run: run.test_seed) for clip in run.clips]
+        for side in (ours, theirs)
+    )
+    return [left], [right]
 
 
 def _compare(
-    ours: Sequence[Run], theirs: Sequence[Run], metric: str
+    ours: ClipsOfRuns, theirs: ClipsOfRuns, metric: str
 ) -> tuple[float, float, tuple[float, float]] | None:
     """Return the mean of each side and the CI of their difference; None where a clip has no such
     score.
     """
-    if not all(metric in clip for run in [*ours, *theirs] for clip in run.clips):
+    if not all(metric in clip for clips in [*ours, *theirs] for clip in clips):
         return None
     left, right = (
-        [[float(clip[metric]) for clip in clips] for clips in _pool_clips(side)]
-        for side in (ours, theirs)
+        [[float(clip[metric]) for clip in clips] for clips in side] for side in (ours, theirs)
     )
-    weights = frame_weights(_pool_clips(ours)[0])
+    weights = frame_weights(ours[0])
     interval = bootstrap_difference_interval(left, right, weights)
     if len(left[0]) == 1:  # of one clip there is none
         interval = math.nan, math.nan

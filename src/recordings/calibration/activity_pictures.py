@@ -87,7 +87,7 @@ def extract_coarse_edges(
     return band_pass_log(shrink_pictures(pictures, factor), 1.2, 2.5), factor
 
 
-def square_contrast(
+def measure_squared_contrast(
     pictures: Float[np.ndarray, "*windows h w"],
 ) -> tuple[Float[np.ndarray, "n small_h small_w"], int]:
     """Return the squared edges of pictures shrunk to LINES or more, and the factor in pixels.
@@ -105,7 +105,7 @@ def square_contrast(
 
 def keep_windows_with_motion(pictures: Pictures) -> Float[np.ndarray, "kept kinds h w"]:
     """Return the windows whose contrast is MIN_CONTRAST or more of the largest; all if none has."""
-    square = square_contrast(pictures)[0].reshape(len(pictures), -1).mean(1)
+    square = measure_squared_contrast(pictures)[0].reshape(len(pictures), -1).mean(1)
     kept = square >= MIN_CONTRAST**2 * square.max()
     return pictures[kept] if kept.any() else pictures
 

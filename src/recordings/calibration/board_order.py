@@ -13,12 +13,12 @@ MIN_COLOUR = 0.5  # correlation of the squares' brightness with black and white
 Lattice = Float[np.ndarray, "rows cols 2"]
 
 
-def tells_its_turn(target: Target) -> bool:
+def shows_half_turn(target: Target) -> bool:
     """Return whether a view turned by 180 degrees can be told from an upright one."""
     return target.ordered or (isinstance(target, Checkerboard) and sum(target.shape) % 2 == 1)
 
 
-def reorder_like(
+def order_points_as_in_centre_view(
     model: Points, seen: Points, target: Target, mirrored: tuple[bool, bool],
     picture: UInt8[np.ndarray, "h w"],
 ) -> Points:  # fmt: skip
@@ -26,7 +26,7 @@ def reorder_like(
     or turned by 180 degrees from it where the colours of squares say so."""
     lattice = model.reshape(*target.shape, 2)
     upright = _find_nearest_symmetry(lattice, seen, mirrored)
-    if not tells_its_turn(target):
+    if not shows_half_turn(target):
         return upright
     colours = [
         _correlate_colours(picture, each.reshape(lattice.shape)) for each in (model, upright)

@@ -18,8 +18,8 @@ from src.recordings.calibration.scene_matches import PatchMatcher, ViewMatches
 from src.recordings.calibration.view_alignment import AlignedViews
 from src.recordings.calibration.view_coverage import (
     describe_grid,
-    leave_out_dark_views,
-    share_in_no_view,
+    leave_out_blocked_views,
+    share_of_events_outside_views,
 )
 from src.recordings.calibration.view_field import Rectangle, cut_field, shrink_field
 from src.recordings.calibration.view_fit import find_folds, fit_view
@@ -88,8 +88,8 @@ def align_views_by_scene(
     out.
     """
     pictures = keep_windows_with_motion(pictures)
-    grid = leave_out_dark_views(find_grid(pictures), pictures)
-    shown = describe_grid(grid, share_in_no_view(grid, pictures))
+    grid = leave_out_blocked_views(find_grid(pictures), pictures)
+    shown = describe_grid(grid, share_of_events_outside_views(grid, pictures))
     _check_polarity(pictures, grid)
     held_out = _hold_out(pictures, grid) if len(pictures) > 1 else {}
     fitted, fine = _find_views(pictures, grid)

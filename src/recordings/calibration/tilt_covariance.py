@@ -149,7 +149,7 @@ class CovarianceModel:
             power_px2=float(power / left),
             half_length_px=float(find_first_fall(self.fitted_distance_px, curve, 0.5)),
             whole_view_share=float(np.clip(uniform, 0, 1)),
-            decay_frames=float(find_decay(lag_correlation)),
+            decay_frames=float(find_decay_lag(lag_correlation)),
             left_share=left,
             correlation=np.where(count > MIN_PAIRS, correlation, np.nan),
             lag_correlation=lag_correlation,
@@ -187,7 +187,7 @@ def _correlation_over_lags(
     return lost + (1 - lost) * measured, 1 - lost
 
 
-def find_decay(correlation: Float[np.ndarray, " lags"]) -> float:
+def find_decay_lag(correlation: Float[np.ndarray, " lags"]) -> float:
     """Return the lag at which a correlation over lags first falls to 1/e, inf if nowhere: joined by
     exponentials, as it falls within a frame or two."""
     logarithms = np.log(np.maximum(correlation, 1e-6))

@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 from jaxtyping import Float, UInt8
 
-from src.recordings.calibration.board_order import reorder_like, tells_its_turn
+from src.recordings.calibration.board_order import order_points_as_in_centre_view, shows_half_turn
 from src.recordings.calibration.boards import Points, Target, cluster_points
 from src.recordings.calibration.view_field import Rectangle, cut_field, shrink_field
 from src.recordings.calibration.view_numbering import assign_view_positions
@@ -66,10 +66,10 @@ def find_target(
                 break
     if (0, 0) in points and not target.ordered:
         points = {
-            at: reorder_like(points[0, 0], seen, target, mirrored[at], picture)
+            at: order_points_as_in_centre_view(points[0, 0], seen, target, mirrored[at], picture)
             for at, seen in points.items()
         }
-    if not (are_mirrored or tells_its_turn(target)):
+    if not (are_mirrored or shows_half_turn(target)):
         line = (
             "views are taken as upright, one turned by 180 degrees would be wrong; target=charuco"
         )

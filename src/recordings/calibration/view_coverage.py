@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from src.recordings.calibration.activity_pictures import Pictures, square_contrast
+from src.recordings.calibration.activity_pictures import Pictures, measure_squared_contrast
 from src.recordings.calibration.view_grid import ViewAxis, ViewGrid
 from src.sim.optics import Position
 
@@ -16,12 +16,12 @@ LIT, PART = 0.5, 0.5  # of a view's events per pixel, and of its width or height
 Map = Float[np.ndarray, "h w"]
 
 
-def leave_out_dark_views(grid: ViewGrid, pictures: Pictures) -> ViewGrid:
+def leave_out_blocked_views(grid: ViewGrid, pictures: Pictures) -> ViewGrid:
     """Return the grid without the views that show next to nothing; warn of them.
 
     Raises ValueError where the centre view is one, or fewer than MIN_OTHERS others are left.
     """
-    squares, step = square_contrast(pictures)
+    squares, step = measure_squared_contrast(pictures)
     shown = {at: _view_mean(squares.sum(0), grid, at, step) for at in grid.positions}
     least = DARK * float(np.median(list(shown.values())))
     dark = [at for at, contrast in shown.items() if contrast < least]
@@ -37,7 +37,7 @@ def leave_out_dark_views(grid: ViewGrid, pictures: Pictures) -> ViewGrid:
     return replace(grid, left_out=tuple(dark))
 
 
-def share_in_no_view(grid: ViewGrid, pictures: Pictures) -> float:
+def share_of_events_outside_views(grid: ViewGrid, pictures: Pictures) -> float:
     """Return the share of the events that lie in no view; warn where parts of views, or smaller
     ones, are left out beside a row or column."""
     events = pictures.sum((0, 1))

@@ -135,8 +135,8 @@ def test_bands_of_lamps_are_no_blur():
 @pytest.mark.parametrize("frames", [1.44, 2.0, 6.3])
 def test_a_decay_of_a_frame_or_two_is_that_of_its_exponential(frames):
     correlation = np.exp(-np.arange(20) / frames)
-    assert tilt_covariance.find_decay(correlation) == pytest.approx(frames, rel=1e-6)
-    assert tilt_covariance.find_decay(correlation[:1]) == np.inf
+    assert tilt_covariance.find_decay_lag(correlation) == pytest.approx(frames, rel=1e-6)
+    assert tilt_covariance.find_decay_lag(correlation[:1]) == np.inf
 
 
 def test_blur_is_that_of_a_frame_of_256_px():

@@ -10,7 +10,10 @@ from src.figures.calibration_figures import draw_views_over_centre
 from src.recordings import simulated_recording
 from src.recordings.calibration import scene_alignment, view_grid
 from src.recordings.calibration.scene_matches import ViewMatches
-from src.recordings.calibration.view_coverage import leave_out_dark_views, share_in_no_view
+from src.recordings.calibration.view_coverage import (
+    leave_out_blocked_views,
+    share_of_events_outside_views,
+)
 from src.sim.optics import layout
 from tests.recordings.calibration.test_scene_alignment import texture
 
@@ -38,8 +41,8 @@ def test_whole_views_leave_nothing_out():
     grid = view_grid.find_grid(pictures)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert leave_out_dark_views(grid, pictures) is grid
-        assert share_in_no_view(grid, pictures) < 0.05
+        assert leave_out_blocked_views(grid, pictures) is grid
+        assert share_of_events_outside_views(grid, pictures) < 0.05
 
 
 def test_a_row_of_smaller_views_is_named():
@@ -49,7 +52,7 @@ def test_a_row_of_smaller_views_is_named():
     with pytest.warns(
         UserWarning, match=r"^2 rows x 3 columns of views, 3\d% .* 0\.8\d of a view above"
     ):
-        assert 0.25 < share_in_no_view(grid, pictures) < 0.4
+        assert 0.25 < share_of_events_outside_views(grid, pictures) < 0.4
 
 
 def test_three_rows_of_unequal_views_are_found_by_their_seams():
@@ -95,7 +98,7 @@ def test_a_blocked_view_is_left_out():
     pictures = show_views(blocked=[(1, 1)])
     grid = view_grid.find_grid(pictures)
     with pytest.warns(UserWarning, match=r"^next to nothing is seen in view \(1, 1\), which is"):
-        left = leave_out_dark_views(grid, pictures)
+        left = leave_out_blocked_views(grid, pictures)
     assert left.positions == [at for at in grid.positions if at != (1, 1)]
 
 
@@ -103,7 +106,7 @@ def test_a_blocked_centre_view_is_refused():
     pictures = show_views(blocked=[(0, 0)])
     grid = view_grid.find_grid(pictures)
     with pytest.raises(ValueError, match=r"nothing is seen in \(0, 0\) of 9 views, which may be"):
-        leave_out_dark_views(grid, pictures)
+        leave_out_blocked_views(grid, pictures)
 
 
 def test_the_overlay_has_room_for_a_view_left_out(tmp_path):
