@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from src.sim.turbulence import outer_scale
+from src.sim.turbulence import outer_scale, short_exposure
 from src.sim.turbulence.contract import check_option
 
 # Tilt and blur, in px of a frame 256 wide, from which on turbulence is medium, strong, extreme.
@@ -102,10 +102,15 @@ class Atmosphere:
     def aperture_over_outer_scale(self) -> float:
         return self.aperture_m / self.outer_scale_m
 
+    @property
+    def scale_and_profile(self) -> tuple[float, tuple[float, ...]]:
+        """D / L0 and the normalised profile of Cn2, which `outer_scale` takes."""
+        return self.aperture_over_outer_scale, self.normalised_profile
+
     @cached_property
     def blur_equivalent_d_over_r0(self) -> float:
-        """D / r0 of the Kolmogorov turbulence whose modes beyond tilt are as strong."""
-        return self.d_over_r0 * self._variance_ratio("higher") ** 0.6
+        """D / r0 of the Kolmogorov turbulence that blurs as much, tilt removed."""
+        return short_exposure.blur_equivalent_d_over_r0(self.d_over_r0, *self.scale_and_profile)
 
     @property
     def rytov_variance(self) -> float:
@@ -132,7 +137,8 @@ class Atmosphere:
         (2 / pi) (lambda / D) sqrt(0.4489 (D/r0)^(5/3)) f / p (Noll 1976; Tyler 1994), times what
         the outer scale leaves of it.
         """
-        variance = TILT_VARIANCE * self._variance_ratio("tilt")
+        left = outer_scale.tilt_variance_over_kolmogorov(*self.scale_and_profile)
+        variance = TILT_VARIANCE * left
         spread = math.sqrt(variance) * self.d_over_r0 ** (5 / 6)
         return 2 / math.pi * self.lambda_over_d_px(width_px) * spread
 
@@ -142,13 +148,13 @@ class Atmosphere:
         Tilt and blur in quadrature; of the blur what exceeds diffraction, as the standard
         deviation of the Gaussian that holds half of its light within the same radius.
         """
-        blur = outer_scale.turbulence_blur_std_in_lambda_over_d(self.blur_equivalent_d_over_r0)
+        strength = self.d_over_r0, *self.scale_and_profile
+        blur = float(short_exposure.blur_std_in_lambda_over_d(*strength))
         return math.hypot(self.tilt_std_px(width_px), self.lambda_over_d_px(width_px) * blur)
 
     def tilt_correlation_half_length_px(self, width_px: int) -> float:
         """The distance at which the correlation of the tilt falls to 1/2, in pixels."""
-        path = self.aperture_over_outer_scale, self.normalised_profile
-        reach_m = outer_scale.tilt_decay_distance(*path) * self.aperture_m
+        reach_m = outer_scale.tilt_decay_distance(*self.scale_and_profile) * self.aperture_m
         return reach_m / self.pixel_size_at_object_m(width_px)
 
     def with_d_over_r0(self, d_over_r0: float) -> "Atmosphere":
@@ -158,10 +164,6 @@ class Atmosphere:
             raise ValueError("atmosphere.cn2 must not be 0 throughout to be scaled")
         scale = (d_over_r0 / self.d_over_r0) ** (5 / 3)
         return replace(self, cn2=tuple(value * scale for value in self.cn2_profile))
-
-    def _variance_ratio(self, modes: str) -> float:
-        ratio = self.aperture_over_outer_scale
-        return outer_scale.variance_over_kolmogorov(ratio, self.normalised_profile, modes)
 
     @property
     def _k(self) -> float:

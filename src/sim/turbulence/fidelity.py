@@ -18,11 +18,10 @@ from jaxtyping import Float
 from safetensors import safe_open
 from torch import Tensor
 
-from src.sim.turbulence import p2s
+from src.sim.turbulence import p2s, short_exposure
 from src.sim.turbulence.atmosphere import AR1_FPS, TILT_VARIANCE, Atmosphere
-from src.sim.turbulence.outer_scale import short_exposure_half_light_radius
 from src.sim.turbulence.psf import SAMPLES_PER_LAMBDA_OVER_D
-from src.sim.turbulence.unresolved_blur import blur_by_unresolved_modes
+from src.sim.turbulence.unresolved_blur import Structure, blur_by_phase
 from src.sim.turbulence.zernike import noll_index
 
 CONTRAST = 0.2  # rms contrast of a natural picture
@@ -105,7 +104,7 @@ def choose_fidelity(atmosphere: Atmosphere, width_px: int, max_error_share: floa
         aperture_over_outer_scale=atmosphere.aperture_over_outer_scale,
         tilt_px=tilt_px,
         lambda_over_d_px=unit,
-        blur_px=unit * short_exposure_half_light_radius(strength),
+        blur_px=unit * float(short_exposure.half_light_radius(strength)),
         tilt_grid_pitch_px=tilt_pitch,
         error_tilt_px=error_tilt,
         error=math.sqrt(power * (psf["error_psf"] + psf["error_grid"] + psf["error_kernel"])),
@@ -119,10 +118,11 @@ def _ar1_correlation_time_s(coefficient: float) -> float:
     return -1 / (AR1_FPS * math.log(coefficient)) if coefficient > 0 else 0.0
 
 
-def mean_short_exposure_psf(d_over_r0: float) -> Float[Tensor, "size size"]:
-    """Return the mean PSF at `d_over_r0`, tilt removed, over MEAN_PSF_SIZE samples."""
+def mean_short_exposure_psf(d_over_r0: float, missing: Structure) -> Float[Tensor, "size size"]:
+    """Return the mean PSF of Noll modes 4..120 at `d_over_r0` over MEAN_PSF_SIZE samples, blurred
+    by phase of the structure function `missing` (unresolved_blur.py)."""
     stored = interpolate_log(error_table("mean"), error_table("strength"), d_over_r0)
-    return blur_by_unresolved_modes(stored / stored.sum(), d_over_r0, MEAN_PSF_SIZE)
+    return blur_by_phase(stored / stored.sum(), missing, MEAN_PSF_SIZE)
 
 
 def _isoplanatic_patch_ratio(atmosphere: Atmosphere) -> float:

@@ -19,6 +19,7 @@ from src.sim.turbulence.fidelity import Fidelity, choose_fidelity, mean_short_ex
 from src.sim.turbulence.p2s import FittedPSFs, find_psf_band
 from src.sim.turbulence.plane_waves import WaveDynamics, draw_plane_waves
 from src.sim.turbulence.psf import PSFHalo
+from src.sim.turbulence.unresolved_blur import missing_structure_function
 
 WAVES = 384
 TILE = 320  # pixels; larger frames are made tile by tile, to bound the memory
@@ -56,9 +57,13 @@ class Turbulence:
         if atmosphere is not None and not self.is_identity:
             self.fidelity = fidelity = choose_fidelity(atmosphere, width, tolerance)
             strength, unit = fidelity.blur_equivalent_d_over_r0, fidelity.lambda_over_d_px
-            size, network = fidelity.psf_size_px, (fidelity.psf_network, fidelity.psf_rank)
-            self.psfs = FittedPSFs(find_psf_band(strength), *network, unit, size, strength)
-            self.halo = PSFHalo(mean_short_exposure_psf(strength), unit, size)
+            size, number, band = fidelity.psf_size_px, fidelity.psf_network, find_psf_band(strength)
+            missing = missing_structure_function(
+                band.networks[number].modes, atmosphere.d_over_r0, strength,
+                *atmosphere.scale_and_profile,
+            )  # fmt: skip
+            self.psfs = FittedPSFs(band, number, fidelity.psf_rank, unit, size, missing)
+            self.halo = PSFHalo(mean_short_exposure_psf(strength, missing), unit, size)
 
     @property
     def metadata(self) -> dict[str, float | int | str]:

@@ -1,4 +1,4 @@
-"""Statistics of von Karman turbulence in closed form: tilt with an outer scale L0, and blur.
+"""Statistics of the tilt of von Karman turbulence in closed form.
 
 The phase of a layer has the power SPECTRUM r0^(-5/3) (f^2 + 1/L0^2)^(-11/6) (von Karman); L0 = inf
 is Kolmogorov's.  A layer at z = u L is seen through a disc of D (1 - u), so with kappa = D (1 - u) f
@@ -27,22 +27,29 @@ KAPPA = np.exp(np.linspace(math.log(1e-14), math.log(30.0), 1600))
 STEP = math.log(KAPPA[1] / KAPPA[0])
 KAPPA0 = np.concatenate([[0.0], np.geomspace(1e-4, 100, 61)])
 TILT = (2 * special.jv(2, math.pi * KAPPA) / (math.pi * KAPPA)) ** 2
-PISTON = (2 * special.jv(1, math.pi * KAPPA) / (math.pi * KAPPA)) ** 2
-HIGHER = np.where(KAPPA > 1e-3, 1 - PISTON - 4 * TILT, 0)  # of the modes beyond tilt; kappa^4 at 0
 LAYER_WIND_RATIO = 0.5  # rms of a layer's own wind over the wind that all layers share
 NEAREST, FARTHEST = 1e-3, 1e4  # D; the ends of what is tabulated as a length
 LAGS = np.geomspace(NEAREST, FARTHEST, 141)
-BLUR_D_OVER_R0 = np.concatenate([[0.0], np.geomspace(0.05, 40, 60)])
-BLUR_RADII = np.geomspace(0.4, 60, 200)  # lambda / D
-GAUSSIAN_HALF_LIGHT = math.sqrt(2 * math.log(2))  # half-light radius over standard deviation
 
 
-def variance_over_kolmogorov(
-    aperture_over_outer_scale: float, profile: Cn2Profile, modes: str
-) -> float:
-    """Return the share of the variance of `modes`, `tilt` or `higher` (all modes beyond tilt), that
-    an outer scale L0 = D / `aperture_over_outer_scale` leaves."""
-    return _variance(aperture_over_outer_scale, profile, modes) / float(_variances()[modes][0])
+def tilt_variance_over_kolmogorov(aperture_over_outer_scale: float, profile: Cn2Profile) -> float:
+    """Return the share of the tilt's variance that an outer scale L0 = D /
+    `aperture_over_outer_scale` leaves."""
+    return _variance(aperture_over_outer_scale, profile) / float(_variances()[0, 0])
+
+
+def average_over_path(
+    table: Float[np.ndarray, "scales columns"],
+    aperture_over_outer_scale: float,
+    profile: Cn2Profile,
+) -> Float[np.ndarray, " columns"]:
+    """Return the mean over a path of a table of layers whose outer scale is D / KAPPA0."""
+    place, weight = _path(profile)
+    known, kappa0 = _log(KAPPA0), _log(aperture_over_outer_scale * (1 - place))
+    high = np.searchsorted(known, kappa0).clip(1, len(known) - 1)
+    share = (kappa0 - known[high - 1]) / (known[high] - known[high - 1])
+    weights = np.bincount(high - 1, weight * (1 - share), len(known))
+    return (weights + np.bincount(high, weight * share, len(known))) @ table
 
 
 def tilt_correlation(
@@ -56,7 +63,7 @@ def tilt_correlation(
     apart = np.multiply.outer(lags, (1 if wind else place) / (1 - place))
     kappa0 = np.broadcast_to(aperture_over_outer_scale * (1 - place), apart.shape)
     covariance = _covariance()((_log(kappa0), np.log(apart.clip(1e-6, 1e7)))) @ weight
-    return covariance / _variance(aperture_over_outer_scale, profile, "tilt")
+    return covariance / _variance(aperture_over_outer_scale, profile)
 
 
 @lru_cache(maxsize=4096)
@@ -113,27 +120,25 @@ def _relative_wind_speeds() -> Float[np.ndarray, " quantiles"]:
 
 
 @cache
-def _spectra() -> Float[np.ndarray, "scales kappa"]:
-    """Return kappa (kappa^2 + kappa0^2)^(-11/6) d kappa."""
+def spectra() -> Float[np.ndarray, "scales kappa"]:
+    """Return kappa (kappa^2 + kappa0^2)^(-11/6) d kappa for each KAPPA0."""
     return KAPPA**2 * (KAPPA**2 + KAPPA0[:, None] ** 2) ** (-11 / 6) * STEP
 
 
 @cache
-def _variances() -> dict[str, Float[np.ndarray, " scales"]]:
-    return {"tilt": _spectra() @ TILT, "higher": _spectra() @ HIGHER}
+def _variances() -> Float[np.ndarray, "scales 1"]:
+    return (spectra() @ TILT)[:, None]
 
 
-def _variance(aperture_over_outer_scale: float, profile: Cn2Profile, modes: str) -> float:
-    place, weight = _path(profile)
-    kappa0 = aperture_over_outer_scale * (1 - place)
-    return float(weight @ np.interp(_log(kappa0), _log(KAPPA0), _variances()[modes]))
+def _variance(aperture_over_outer_scale: float, profile: Cn2Profile) -> float:
+    return float(average_over_path(_variances(), aperture_over_outer_scale, profile)[0])
 
 
 @cache
 def _covariance() -> RegularGridInterpolator:
     """Return the tilt's covariance over log kappa0 and log of the distance in footprints."""
     apart = np.geomspace(1e-6, 1e7, 400)
-    values = (_spectra() * TILT) @ special.j0(2 * math.pi * np.multiply.outer(KAPPA, apart))
+    values = (spectra() * TILT) @ special.j0(2 * math.pi * np.multiply.outer(KAPPA, apart))
     return RegularGridInterpolator((_log(KAPPA0), np.log(apart)), values)
 
 
@@ -147,33 +152,3 @@ def _path(profile: Cn2Profile) -> tuple[np.ndarray, np.ndarray]:
     knots = np.linspace(0, 1, len(profile)) if len(profile) > 1 else [0.5]
     weight = np.interp(place, knots, profile) * (1 - place) ** (5 / 3)
     return place, weight / weight.sum()
-
-
-def short_exposure_half_light_radius(d_over_r0: float) -> float:
-    """Return the radius that holds half of a point's light, tilt removed, in lambda / D.
-
-    From the mean transfer function T(nu) exp(-3.44 (nu D/r0)^(5/3) (1 - nu^(1/3))), nu in units of
-    D / lambda and T that of the aperture (Fried 1966, near field).
-    """
-    return float(np.interp(d_over_r0, BLUR_D_OVER_R0, _half_light_radii()))
-
-
-def turbulence_blur_std_in_lambda_over_d(d_over_r0: float) -> float:
-    """Return by how much turbulence blurs beyond diffraction, tilt removed, in lambda / D.
-
-    The standard deviation along one axis of the Gaussian whose half-light radius, added in squares
-    to that of diffraction, gives `short_exposure_half_light_radius`.
-    """
-    blurred, sharp = (short_exposure_half_light_radius(s) for s in (d_over_r0, 0.0))
-    return math.sqrt(blurred**2 - sharp**2) / GAUSSIAN_HALF_LIGHT
-
-
-@cache
-def _half_light_radii() -> np.ndarray:
-    nu = (np.arange(1500) + 0.5) / 1500
-    aperture = 2 / math.pi * (np.arccos(nu) - nu * np.sqrt(1 - nu**2))
-    turns = 2 * math.pi * BLUR_RADII[:, None]
-    rings = turns * special.j1(turns * nu) / len(nu)
-    decay = -3.44 * nu ** (5 / 3) * (1 - nu ** (1 / 3))
-    light = [rings @ (aperture * np.exp(decay * s ** (5 / 3))) for s in BLUR_D_OVER_R0]
-    return np.array([np.interp(0.5, held, BLUR_RADII) for held in light])

@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from src.sim.turbulence.psf import SAMPLES_PER_LAMBDA_OVER_D, pixel_integration_matrix
-from src.sim.turbulence.unresolved_blur import blur_by_unresolved_modes
+from src.sim.turbulence.unresolved_blur import Structure, blur_by_phase
 from src.sim.turbulence.zernike import noll_index
 
 FILE = Path(__file__).with_suffix(".safetensors")
@@ -196,9 +196,9 @@ def find_psf_band(d_over_r0: float) -> PSFBand:
 class FittedPSFs:
     """The PSFs of one atmosphere on the pixels of one camera, from the basis and a network.
 
-    `rank` basis functions of `band`, blurred by the modes that they lack at `unresolved_d_over_r0`,
-    integrated over `size` x `size` pixels of lambda / D / `lambda_over_d_px`; the light that falls
-    outside them is not in them.
+    `rank` basis functions of `band`, blurred by the phase that they lack, of the structure function
+    `missing` (unresolved_blur.py), integrated over `size` x `size` pixels of lambda / D /
+    `lambda_over_d_px`; the light that falls outside them is not in them.
     `basis` (1 + rank, size, size): the mean, then the functions sorted by parity;
     `parity_ends`: where each of the four parities ends.
     """
@@ -210,13 +210,13 @@ class FittedPSFs:
         rank: int,
         lambda_over_d_px: float,
         size: int,
-        unresolved_d_over_r0: float = 0.0,
+        missing: Structure | None = None,
     ):
         step, fine = SAMPLES_PER_LAMBDA_OVER_D / lambda_over_d_px, band.mean.shape[-1]
         grid = pixel_integration_matrix(size, fine, step).float()
         self.network, self.parity_ends, basis = _truncate(band, network, rank)
-        if unresolved_d_over_r0:
-            basis = blur_by_unresolved_modes(basis, unresolved_d_over_r0, fine)
+        if missing is not None:
+            basis = blur_by_phase(basis, missing, fine)
         self.basis = grid @ basis @ grid.T
         quarter = self.basis[:, size // 2 :, size // 2 :]
         self.quarter = quarter.permute(1, 2, 0).contiguous().numpy()

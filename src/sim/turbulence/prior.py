@@ -5,7 +5,7 @@ and time of the tilt - then a camera, a path and an outer scale that show it.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from numbers import Real
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from src.sim.turbulence import outer_scale
+from src.sim.turbulence import outer_scale, short_exposure
 from src.sim.turbulence.atmosphere import (
     AR1_FPS,
     EXTREME_FROM_PX,
@@ -140,9 +140,10 @@ def sample_matching_atmosphere(
         shapes = [profiles[int(k)] for k in u[:, 1] * len(profiles)]
         scale = _draw_outer_scales(u[:, 2], outer_scale_over_aperture, kolmogorov_probability)
         facts = [_path_statistics(*one) for one in zip(shapes, 1 / scale, strict=True)]
-        reach, tilt, higher, scatter = np.array(facts).T
+        reach, tilt, scatter = np.array(facts).T
         aperture = wanted.tilt_correlation_half_length_px / reach
-        strength, blur = _solve_d_over_r0(wanted, unit, tilt, higher)
+        growth = [_blur_of_strengths(*one) for one in zip(shapes, 1 / scale, strict=True)]
+        strength, blur = _solve_d_over_r0(wanted, unit, tilt, np.array(growth))
         rytov = 5.319 * strength ** (5 / 3) * (2 * math.pi * aperture / unit) ** (-5 / 6) * scatter
         fits = (aperture >= allowed_aperture_px[0]) & (aperture <= allowed_aperture_px[1])
         fits &= (rytov <= max_rytov_variance) & np.isfinite(strength)
@@ -210,15 +211,17 @@ def _draw_outer_scales(u: Candidates, limits: Range, kolmogorov: float) -> Candi
 
 
 def _solve_d_over_r0(
-    wanted: TargetImageStatistics, unit: Candidates, tilt: Candidates, higher: Candidates
+    wanted: TargetImageStatistics,
+    unit: Candidates,
+    tilt: Candidates,
+    growth: Float[np.ndarray, "candidates strengths"],
 ) -> tuple[Candidates, Candidates]:
     """Return the D/r0 that shows what is wanted, nan beyond D_OVER_R0, and its blur in pixels.
 
-    `unit`: lambda / D in pixels; `tilt`, `higher`: what the outer scale leaves of the variance of
-    these modes.
+    `unit`: lambda / D in pixels; `tilt`: what the outer scale leaves of its variance; `growth`: the
+    blur at D_OVER_R0 in lambda / D.
     """
     shift = 2 / math.pi * np.sqrt(TILT_VARIANCE * tilt)[:, None] * D_OVER_R0 ** (5 / 6)
-    growth = np.interp(higher[:, None] ** 0.6 * D_OVER_R0, *_blur_table())
     target, given = wanted.tilt_and_blur_px, np.hypot(shift, growth)
     if target is None:
         target, given = wanted.tilt_px or 0.0, shift
@@ -241,8 +244,8 @@ def _mismatch(
     """Return how far each candidate is off: 0.1 is 10 % of blur, or of the tilt's variance."""
     total = np.zeros(len(blur))
     if wanted.psf_width_ratio is not None:
-        radius = outer_scale.short_exposure_half_light_radius(0.0)
-        sharp = unit * radius / outer_scale.GAUSSIAN_HALF_LIGHT
+        radius = short_exposure.half_light_radius(0.0)
+        sharp = unit * radius / short_exposure.GAUSSIAN_HALF_LIGHT
         total += np.abs(np.log(np.hypot(1, blur / sharp) / wanted.psf_width_ratio))
     if wanted.global_tilt_share is not None:
         given = zip(ratio, shapes, REFERENCE_WIDTH_PX / aperture, strict=True)
@@ -251,23 +254,21 @@ def _mismatch(
     return total
 
 
-@cache
-def _blur_table() -> tuple[np.ndarray, np.ndarray]:
-    strengths, blur = np.append(0.0, D_OVER_R0), outer_scale.turbulence_blur_std_in_lambda_over_d
-    return strengths, np.array([blur(strength) for strength in strengths])
+@lru_cache(maxsize=1024)
+def _blur_of_strengths(profile: tuple[float, ...], ratio: float) -> Float[np.ndarray, " strengths"]:
+    return np.asarray(short_exposure.blur_std_in_lambda_over_d(D_OVER_R0, ratio, profile))
 
 
 @cache
-def _path_statistics(profile: tuple[float, ...], ratio: float) -> tuple[float, float, float, float]:
-    """Return half length in D, the shares that D / L0 = `ratio` leaves of tilt and of higher modes,
-    and the Rytov variance over that of the same D/r0 and Fresnel number, in Atmosphere's constants.
+def _path_statistics(profile: tuple[float, ...], ratio: float) -> tuple[float, float, float]:
+    """Return half length in D, the share of the tilt's variance that D / L0 = `ratio` leaves, and
+    the Rytov variance over that of the same D/r0 and Fresnel number, in Atmosphere's constants.
     """
     place = (np.arange(2048) + 0.5) / 2048
     strength = np.interp(place, np.linspace(0, 1, len(profile)), profile)
     scatter = (strength * (place * (1 - place)) ** (5 / 6)).sum()
     return (
         outer_scale.tilt_decay_distance(ratio, profile),
-        outer_scale.variance_over_kolmogorov(ratio, profile, "tilt"),
-        outer_scale.variance_over_kolmogorov(ratio, profile, "higher"),
+        outer_scale.tilt_variance_over_kolmogorov(ratio, profile),
         float(scatter / (strength * (1 - place) ** (5 / 3)).sum()),
     )

@@ -1,10 +1,10 @@
-"""The blur of Zernike modes beyond those that PSFs are fitted to, the same for every PSF.
+"""The blur of Zernike modes that the fitted PSFs hold none of, the same for every PSF.
 
-Their phase is correlated over far less than the pupil, so that the mean transfer function is that
-of the lower modes times exp(-D(nu) / 2) (Goodman, Statistical Optics, ch. 8), D their structure
-function for points of the pupil nu D apart.  Its spectrum is that of Kolmogorov phase less what
-Zernike orders 0..HIGHEST_ORDER hold of it (Noll 1976).
-"""
+Phase of high order is correlated over far less than the pupil, so that the mean transfer function
+is that of the lower orders times exp(-S(nu) / 2) (Goodman, Statistical Optics, ch. 8), S its
+structure function for points of the pupil nu D apart.  Its spectrum is that of von Karman phase less
+what the lower Zernike orders hold of it (Noll 1976).
+"""  # noqa: E501
 
 import math
 from functools import cache
@@ -16,40 +16,74 @@ from scipy import special
 from scipy.fft import next_fast_len
 from torch import Tensor
 
+from src.sim.turbulence import outer_scale
+from src.sim.turbulence.outer_scale import KAPPA0, Cn2Profile
 from src.sim.turbulence.psf import SAMPLES_PER_LAMBDA_OVER_D
-from src.sim.turbulence.zernike import SPECTRUM
+from src.sim.turbulence.zernike import SPECTRUM, noll_index
 
-HIGHEST_ORDER = 14  # of Noll modes 2..120
+Structure = Float[np.ndarray, " distances"]
+
+HIGHEST_ORDER = 14  # of Noll modes 2..120, which PSFs are fitted to
 KAPPA = np.geomspace(0.01, 3000, 6000)  # cycles per pupil
 DISTANCES = np.linspace(0, math.sqrt(2), 400)  # of points of the pupil, in D
 
 
-def blur_by_unresolved_modes(
-    psfs: Float[Tensor, "*n fine fine"], d_over_r0: float, size: int
+def blur_by_phase(
+    psfs: Float[Tensor, "*n fine fine"], structure: Structure, size: int
 ) -> Float[Tensor, "*n size size"]:
-    """Return PSFs of Noll modes 2..120, sampled as the stored ones, blurred by all beyond.
+    """Return PSFs, sampled as the stored ones, blurred by phase of that structure function.
 
-    The light of a PSF is kept; what falls outside of `size` samples is lost.
+    `structure` at DISTANCES, in rad^2.  The light of a PSF is kept; what falls outside of `size`
+    samples is lost.
     """
     fine = psfs.shape[-1]
     count = next_fast_len(2 * max(size, fine), real=True)
     nu = torch.fft.fftfreq(count, dtype=torch.float64) * SAMPLES_PER_LAMBDA_OVER_D
     distance = torch.hypot(nu[:, None], nu[: count // 2 + 1])
-    structure = np.interp(distance.numpy(), DISTANCES, unresolved_structure_function())
-    transfer = torch.from_numpy(np.exp(-structure / 2 * d_over_r0 ** (5 / 3)))
+    transfer = torch.from_numpy(np.exp(-np.interp(distance.numpy(), DISTANCES, structure) / 2))
     spectrum = torch.fft.rfft2(psfs, s=(count, count)) * transfer.to(psfs)
     middle = size // 2 - fine // 2
     blurred = torch.fft.irfft2(spectrum, s=(count, count)).roll((middle, middle), (-2, -1))
     return blurred[..., :size, :size]
 
 
+def missing_structure_function(
+    input_modes: int,
+    d_over_r0: float,
+    blur_equivalent_d_over_r0: float,
+    aperture_over_outer_scale: float,
+    profile: Cn2Profile,
+) -> Structure:
+    """Return the structure function, in rad^2, of the phase that a network's PSFs are without.
+
+    A network that sees `input_modes` modes from tilt on, of whole Zernike orders, blurs by those up
+    to HIGHEST_ORDER as Kolmogorov turbulence of `blur_equivalent_d_over_r0` does.
+    """
+    order = noll_index(input_modes + 1)[0]
+    unseen = unresolved_structure_function(order, aperture_over_outer_scale, profile)
+    fitted = unresolved_structure_function(order) - unresolved_structure_function(HIGHEST_ORDER)
+    missing = unseen * d_over_r0 ** (5 / 3) - fitted * blur_equivalent_d_over_r0 ** (5 / 3)
+    return np.maximum(missing, 0)
+
+
+def unresolved_structure_function(
+    order: int = HIGHEST_ORDER,
+    aperture_over_outer_scale: float = 0.0,
+    profile: Cn2Profile = (1.0,),
+) -> Structure:
+    """Return the structure function of Zernike orders beyond `order` at D/r0 = 1, in rad^2."""
+    table = _structure_functions(order)
+    return outer_scale.average_over_path(table, aperture_over_outer_scale, profile)
+
+
 @cache
-def unresolved_structure_function() -> Float[np.ndarray, " distances"]:
-    """Return the structure function of the modes beyond, at D/r0 = 1 and DISTANCES, in rad^2."""
-    power, step = SPECTRUM * KAPPA ** (-11 / 3), math.log(KAPPA[1] / KAPPA[0])
+def _structure_functions(order: int) -> Float[np.ndarray, "scales distances"]:
+    """Return those of orders beyond `order` at DISTANCES for the outer scales D / KAPPA0."""
+    power = SPECTRUM * (KAPPA**2 + KAPPA0[:, None] ** 2) ** (-11 / 6)
+    step = math.log(KAPPA[1] / KAPPA[0])
     resolved = sum(
-        (order + 1) ** 2 * (2 * special.jv(order + 1, math.pi * KAPPA) / (math.pi * KAPPA)) ** 2
-        for order in range(HIGHEST_ORDER + 1)
+        (n + 1) ** 2 * (2 * special.jv(n + 1, math.pi * KAPPA) / (math.pi * KAPPA)) ** 2
+        for n in range(order + 1)
     )
     left = np.maximum(1 - resolved, 0) * power * 2 * math.pi * KAPPA**2 * step
-    return 2 * (1 - special.j0(2 * math.pi * np.multiply.outer(DISTANCES, KAPPA))) @ left
+    return left @ (2 * (1 - special.j0(2 * math.pi * np.multiply.outer(KAPPA, DISTANCES))))

@@ -44,7 +44,7 @@ def test_the_waves_that_are_drawn_have_this_variance_and_half_length(place, rati
     path = replace(path, outer_scale_m=PATH.aperture_m / ratio if ratio else math.inf)
     waves = drawn(path)
     power = waves.response[:2].square().sum((0, 2)).numpy() / 2
-    expected = outer_scale.variance_over_kolmogorov(ratio, shape, "tilt") * 0.448879
+    expected = outer_scale.tilt_variance_over_kolmogorov(ratio, shape) * 0.448879
     assert power.sum() == pytest.approx(expected, rel=0.04)
     apart = path.tilt_correlation_half_length_px(256)
     turn = 2 * math.pi * waves.frequency_per_px.norm(dim=-1).numpy() * apart
@@ -52,17 +52,8 @@ def test_the_waves_that_are_drawn_have_this_variance_and_half_length(place, rati
 
 
 def test_the_variance_of_uniform_air_is_the_tables():
-    found = [outer_scale.variance_over_kolmogorov(ratio, (1.0,), "tilt") for ratio in RATIOS]
+    found = [outer_scale.tilt_variance_over_kolmogorov(ratio, (1.0,)) for ratio in RATIOS]
     np.testing.assert_allclose(found, VARIANCES, rtol=0.03)
-
-
-@pytest.mark.parametrize("ratio", [1 / 3, 1.0])
-def test_what_is_left_of_the_modes_that_blur(ratio):
-    kolmogorov = drawn(PATH.with_d_over_r0(1.0), 120).response[2:].square().sum()
-    path = replace(PATH.with_d_over_r0(1.0), outer_scale_m=PATH.aperture_m / ratio)
-    left = drawn(path, 120).response[2:].square().sum() / kolmogorov
-    found = outer_scale.variance_over_kolmogorov(ratio, path.normalised_profile, "higher")
-    assert found == pytest.approx(float(left), rel=0.05)
 
 
 def test_the_fields_of_clips_have_the_half_length():

@@ -9,7 +9,6 @@ import pytest
 
 from src.sim.noise import generator
 from src.sim.turbulence import sample_atmosphere
-from src.sim.turbulence.outer_scale import short_exposure_half_light_radius
 from src.sim.turbulence.prior import (
     TILT_AND_BLUR_PX,
     NoCameraError,
@@ -17,6 +16,7 @@ from src.sim.turbulence.prior import (
     sample_matching_atmosphere,
     unnormalised_cn2_profile,
 )
+from src.sim.turbulence.short_exposure import half_light_radius
 from src.sim.turbulence.simulated import INTERVALS, SimulatedTurbulence
 
 
@@ -83,10 +83,8 @@ def test_the_blur_that_is_wanted_is_the_nearest_there_is():
     def psf_width_ratio(wanted: float) -> float:
         statistics = TargetImageStatistics(20.0, 0.05, tilt_px=0.5, psf_width_ratio=wanted)
         path = sample_matching_atmosphere(statistics, generator(3))
-        sharp, blurred = (
-            short_exposure_half_light_radius(d) for d in (0.0, path.blur_equivalent_d_over_r0)
-        )
-        return blurred / sharp
+        blurred = half_light_radius(path.d_over_r0, *path.scale_and_profile)
+        return float(blurred / half_light_radius(0.0))
 
     assert psf_width_ratio(1.3) == pytest.approx(1.3, rel=0.15)
     assert psf_width_ratio(1.8) == pytest.approx(1.8, rel=0.15)

@@ -11,6 +11,7 @@ from src.sim.turbulence.coefficient_grid import GridAxis
 from src.sim.turbulence.fidelity import mean_short_exposure_psf
 from src.sim.turbulence.operator import Turbulence
 from src.sim.turbulence.psf import PSFHalo, convolve_halo
+from src.sim.turbulence.unresolved_blur import unresolved_structure_function
 from tests.sim.turbulence.theory import degrade_with_exact_psfs
 
 PATH = Atmosphere(0.1, 0.5, 300.0, 0.4, 525e-9, 1e-14, 0.8)
@@ -156,7 +157,8 @@ def test_accuracy_against_exact_psfs_at_every_pixel(strength, decibels, pixel):
     path = path.with_d_over_r0(strength)
     turbulence = Turbulence(path, views=1, height=128, width=128)
     turbulence.fidelity = replace(turbulence.fidelity, zernike_modes=119)
-    mean = mean_short_exposure_psf(strength)[24:-24, 24:-24]  # no halo beyond the exact PSFs
+    beyond = unresolved_structure_function() * strength ** (5 / 3)
+    mean = mean_short_exposure_psf(strength, beyond)[24:-24, 24:-24]  # none beyond the exact PSFs
     turbulence.halo = PSFHalo(mean, 1.0, turbulence.fidelity.psf_size_px)
     assert PSFHalo(mean, 1.0, 23).share == 0
     picture, crop = leaves(128), (24, 24, 80, 80)
@@ -217,7 +219,8 @@ def test_bf16_frames_are_simulated_in_float32():
 @pytest.mark.parametrize("airy", [0.3, 1.0, 1.7])
 @pytest.mark.parametrize("kernel", [1, 7, 41])
 def test_halo_is_the_light_beyond_the_kernel(airy, kernel):
-    whole, halo = (PSFHalo(mean_short_exposure_psf(3.0), airy, size) for size in (1, kernel))
+    mean = mean_short_exposure_psf(3.0, unresolved_structure_function())
+    whole, halo = (PSFHalo(mean, airy, size) for size in (1, kernel))
     assert 0 <= halo.share <= 1 - whole.psf[whole.reach, whole.reach]
     spark = torch.zeros(1, 101, 101)
     spark[0, 50, 50] = 1

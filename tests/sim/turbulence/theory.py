@@ -2,6 +2,7 @@
 
 import copy
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +20,7 @@ from src.sim.turbulence.engines import blur_torch
 from src.sim.turbulence.operator import Turbulence
 from src.sim.turbulence.p2s import FittedPSFs
 from src.sim.turbulence.psf import SAMPLES_PER_LAMBDA_OVER_D, pixel_integration_matrix
-from src.sim.turbulence.unresolved_blur import blur_by_unresolved_modes
+from src.sim.turbulence.unresolved_blur import blur_by_phase, unresolved_structure_function
 
 
 def isoplanatic_angle_rad(path: Atmosphere) -> float:
@@ -100,12 +101,13 @@ def exact_psfs_of_all_modes(
     fine, fidelity = 79, turbulence.fidelity
     step = SAMPLES_PER_LAMBDA_OVER_D / fidelity.lambda_over_d_px
     grid, psfs = pixel_integration_matrix(size, fine, step).float(), []
+    beyond = unresolved_structure_function() * fidelity.d_over_r0 ** (5 / 3)
     for part in coefficients.flatten(0, -2).split(1000):
         stored = fraunhofer_psf(
             part, lambda_over_d_px=SAMPLES_PER_LAMBDA_OVER_D, size=fine, pupil=fine - 3, points=1,
             normalise_plane=True,
         )  # fmt: skip
-        blurred = blur_by_unresolved_modes(stored, fidelity.blur_equivalent_d_over_r0, fine)
+        blurred = blur_by_phase(stored, beyond, fine)
         psfs.append(grid @ blurred @ grid.T)
     return torch.cat(psfs).reshape(*coefficients.shape[:-1], size, size)
 
@@ -134,29 +136,51 @@ def degrade_with_exact_psfs(
     return blur_torch.scatter_normalised(warped, psfs, rows, torch.zeros(1, *crop[2:]), 0.0)[0]
 
 
-def short_exposure_blur_std(
-    d_over_r0: float, outer_scale_over_d: float, tilt_share: float
-) -> float:
-    """Return the blur beyond diffraction of von Karman turbulence at the aperture, in lambda / D.
+def draw_short_exposure_blur(
+    d_over_r0: Sequence[float], outer_scale_over_d: float, pupils: int
+) -> list[float]:
+    """Return the blur beyond diffraction of turbulence at the aperture, no tilt, in lambda / D.
 
-    From the structure function of the phase (Voitsekhovich 1995) less that of the tilt, of whose
-    variance the outer scale leaves `tilt_share`.
+    From the mean PSF of `pupils` von Karman phases over 48 x 48 points, drawn by FFT over 8 D (so
+    for outer scales up to some D), less the plane fitted to each.
     """
-    nu, order = (np.arange(4000) + 0.5) / 4000, 5 / 6
-    near = 2 * math.pi * nu / outer_scale_over_d
-    constant = (24 / 5 * special.gamma(6 / 5)) ** order * special.gamma(11 / 6) / math.pi ** (8 / 3)
-    reach = special.gamma(order) - 2 ** (1 / 6) * near**order * special.kv(order, near)
-    structure = constant * (outer_scale_over_d * d_over_r0) ** (5 / 3) * reach
-    exponent = structure / 2 - 3.44 * d_over_r0 ** (5 / 3) * tilt_share * nu**2
-    aperture = 2 / math.pi * (np.arccos(nu) - nu * np.sqrt(1 - nu**2))
-    sharp, blurred = (
-        _half_light_radius(nu, one) for one in (aperture, aperture * np.exp(-exponent))
-    )
-    return math.sqrt(blurred**2 - sharp**2) / math.sqrt(2 * math.log(2))
+    side, generator = 48, noise.generator(5)
+    x = (torch.arange(side) + 0.5) / side * 2 - 1
+    inside = torch.hypot(x[:, None], x) <= 1
+    down, across = torch.meshgrid(x, x, indexing="ij")
+    planes = torch.stack([torch.ones_like(down), down, across])[:, inside]
+    planes = torch.linalg.qr(planes.T.double())[0]
+    frequency = torch.fft.fftfreq(8 * side, 1 / side, dtype=torch.float64)
+    power = frequency[:, None] ** 2 + frequency**2 + outer_scale_over_d**-2
+    amplitude = (0.022896 * power ** (-11 / 6)).sqrt() / 8 * (8 * side) ** 2
+    phases = []
+    while 32 * len(phases) < pupils:
+        waves = torch.randn(8 * side, 8 * side, dtype=torch.complex128, generator=generator)
+        plane = torch.fft.ifft2(waves * math.sqrt(2) * amplitude)
+        for part in (plane.real, plane.imag):
+            tiles = part.unfold(0, side, 2 * side).unfold(1, side, 2 * side).flatten(0, 1)
+            phases.append(tiles[:, inside])
+    phase = torch.cat(phases)
+    phase = phase - phase @ planes @ planes.T
+    radii = [_half_light_radius(phase * d ** (5 / 6), inside) for d in (0.0, *d_over_r0)]
+    return [math.sqrt(one**2 - radii[0] ** 2) / math.sqrt(2 * math.log(2)) for one in radii[1:]]
 
 
-def _half_light_radius(nu: np.ndarray, transfer: np.ndarray) -> float:
-    radii = np.geomspace(0.2, 40, 400)
-    held = [2 * math.pi * r * float((special.j1(2 * math.pi * r * nu) * transfer).mean())
-            for r in radii]  # fmt: skip
-    return float(np.interp(0.5, held, radii))
+def _half_light_radius(phase: torch.Tensor, inside: torch.Tensor) -> float:
+    count = 256
+    field = torch.zeros(len(phase), *inside.shape, dtype=torch.complex64)
+    field[:, inside] = torch.exp(1j * phase).to(torch.complex64)
+    light = torch.zeros(count, count)
+    for part in field.split(64):
+        light += torch.fft.fft2(part, s=(count, count)).abs().square().sum(0)
+    transfer = torch.fft.ifft2(light / light.sum()).real * count**2
+    nu = torch.fft.fftfreq(count, 1 / count).abs() / len(inside)
+    distance = torch.hypot(nu[:, None], nu).flatten()
+    order = (distance < 1).nonzero()[:, 0]
+    radii = torch.logspace(-0.7, 1.3, 300)
+    turns = 2 * math.pi * radii[:, None] * distance[order]
+    cell = 1 / len(inside) ** 2  # of the plane of nu
+    weight = special.j1(turns.numpy()) / distance[order].clamp(min=1e-6).numpy()
+    held = radii.numpy() * (weight * transfer.flatten()[order].numpy()).sum(1) * cell
+    held += radii.numpy() ** 2 * math.pi * cell  # nu = 0, where J1(x) / nu is pi r
+    return float(np.interp(0.5, held, radii.numpy()))
