@@ -197,17 +197,15 @@ def blur_beyond_diffraction(psf: torch.Tensor, sharp: torch.Tensor, samples: flo
     return math.sqrt(max(radii[0] ** 2 - radii[1] ** 2, 0)) / GAUSSIAN_HALF_LIGHT
 
 
-@pytest.mark.parametrize(
-    "strength, known", [(1.0, 0.9), (2.0, 0.95), (4.0, 1.0), (6.0, 1.0), (10.0, 1.0)]
-)
-def test_12_blur_beyond_diffraction(strength, known):
+@pytest.mark.parametrize("strength", [1.0, 2.0, 4.0, 6.0, 10.0])
+def test_12_blur_beyond_diffraction(strength):
     psf, sharp = (
         mean_short_exposure_psf(d, unresolved_structure_function() * d ** (5 / 3))
         for d in (strength, 0.001)
     )
     ratio = blur_beyond_diffraction(psf, sharp, 2.0) / blur_std_in_lambda_over_d(strength)
     print(f"D/r0 {strength:g}: blur {ratio:.2f} of theory")
-    assert ratio == pytest.approx(known, abs=0.04)
+    assert ratio == pytest.approx(1, abs=0.06)
 
 
 def mean_simulated_psf(turbulence: Turbulence) -> torch.Tensor:
