@@ -104,7 +104,7 @@ class Atmosphere:
 
     @property
     def scale_and_profile(self) -> tuple[float, tuple[float, ...]]:
-        """D / L0 and the normalised profile of Cn2, which `outer_scale` takes."""
+        """D / L0 and the normalised profile of Cn2, as functions of `outer_scale` take them."""
         return self.aperture_over_outer_scale, self.normalised_profile
 
     @cached_property

@@ -21,7 +21,7 @@ from torch import Tensor
 from src.sim.turbulence import p2s, short_exposure
 from src.sim.turbulence.atmosphere import AR1_FPS, TILT_VARIANCE, Atmosphere
 from src.sim.turbulence.psf import SAMPLES_PER_LAMBDA_OVER_D
-from src.sim.turbulence.unresolved_blur import Structure, blur_by_phase
+from src.sim.turbulence.unresolved_blur import StructureFunction, blur_by_phase
 from src.sim.turbulence.zernike import noll_index
 
 CONTRAST = 0.2  # rms contrast of a natural picture
@@ -118,7 +118,9 @@ def _ar1_correlation_time_s(coefficient: float) -> float:
     return -1 / (AR1_FPS * math.log(coefficient)) if coefficient > 0 else 0.0
 
 
-def mean_short_exposure_psf(d_over_r0: float, missing: Structure) -> Float[Tensor, "size size"]:
+def mean_short_exposure_psf(
+    d_over_r0: float, missing: StructureFunction
+) -> Float[Tensor, "size size"]:
     """Return the mean PSF of Noll modes 4..120 at `d_over_r0` over MEAN_PSF_SIZE samples, blurred
     by phase of the structure function `missing` (unresolved_blur.py)."""
     stored = interpolate_log(error_table("mean"), error_table("strength"), d_over_r0)

@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from src.sim.turbulence.psf import SAMPLES_PER_LAMBDA_OVER_D, pixel_integration_matrix
-from src.sim.turbulence.unresolved_blur import Structure, blur_by_phase
+from src.sim.turbulence.unresolved_blur import StructureFunction, blur_by_phase
 from src.sim.turbulence.zernike import noll_index
 
 FILE = Path(__file__).with_suffix(".safetensors")
@@ -210,7 +210,7 @@ class FittedPSFs:
         rank: int,
         lambda_over_d_px: float,
         size: int,
-        missing: Structure | None = None,
+        missing: StructureFunction | None = None,
     ):
         step, fine = SAMPLES_PER_LAMBDA_OVER_D / lambda_over_d_px, band.mean.shape[-1]
         grid = pixel_integration_matrix(size, fine, step).float()

@@ -36,7 +36,7 @@ PROFILES = {"uniform": (0, 1), "camera": (0, 0.1), "middle": (1 / 3, 2 / 3), "ob
 PROFILE_POINTS = 121
 CANDIDATES, ROUNDS = 128, 4  # cameras proposed at a time, and how often
 OUTER_SCALES = 17  # values of L0 / D in a range that are drawn from, and infinity
-D_OVER_R0 = np.geomspace(0.05, 10, 100)  # that are drawn from
+D_OVER_R0 = np.geomspace(0.05, 10, 240)  # that are drawn from
 Range = Sequence[float]
 Candidates = Float[np.ndarray, " candidates"]
 

@@ -20,17 +20,21 @@ from jaxtyping import Float
 from scipy import special
 
 from src.sim.turbulence import outer_scale
+from src.sim.turbulence.contract import check_option
 from src.sim.turbulence.outer_scale import KAPPA, KAPPA0, Cn2Profile
 from src.sim.turbulence.zernike import SPECTRUM
 
 Strengths = Float[np.ndarray, "*strengths"] | float
-UNIFORM = (1.0,)  # a Cn2Profile
+UNIFORM: Cn2Profile = (1.0,)  # for an infinite outer scale, of which the profile changes nothing
 
 NU = (np.arange(800) + 0.5) / 800  # D / wavelength
-D_OVER_R0 = np.concatenate([[0.0], np.geomspace(0.05, 40, 60)])
+# With L0 near D the radius rises steeply between D/r0 2 and 10.
+D_OVER_R0 = np.r_[
+    0.0, np.geomspace(0.05, 1, 30), np.arange(1.05, 12, 0.05), np.geomspace(12, 40, 20)
+]
 RADII = np.geomspace(0.4, 60, 200)  # lambda / D
 PUPIL_RADII = np.linspace(0, 0.5, 61)  # D
-OVERLAP_POINTS = 48  # across half of the pupil, for means over where two shifted pupils overlap
+OVERLAP_POINTS = 48  # a quarter of the overlap of two shifted pupils has about the square of it
 GAUSSIAN_HALF_LIGHT = math.sqrt(2 * math.log(2))  # half-light radius over standard deviation
 
 
@@ -40,8 +44,10 @@ def half_light_radius(
     """Return the radius that holds half of a point's light, tilt removed, in lambda / D.
 
     `d_over_r0` 0..40 for an outer scale L0 = D / `aperture_over_outer_scale` (0: infinite) and Cn2
-    along the path (see outer_scale); shape as `d_over_r0`.
+    along the path (see outer_scale); shape as `d_over_r0`.  Raises ValueError above 40.
     """
+    strongest, most = float(np.max(d_over_r0)), float(D_OVER_R0[-1])
+    check_option(strongest <= most, "atmosphere.d_over_r0", f"<= {most:g}", strongest)
     radii = _half_light_radii(aperture_over_outer_scale, tuple(profile))
     return np.interp(d_over_r0, D_OVER_R0, radii)
 
@@ -66,7 +72,7 @@ def blur_equivalent_d_over_r0(
     return float(np.interp(blurred, _half_light_radii(0.0, UNIFORM), D_OVER_R0))
 
 
-@lru_cache(maxsize=4096)
+@lru_cache(maxsize=256)
 def _half_light_radii(
     aperture_over_outer_scale: float, profile: Cn2Profile
 ) -> Float[np.ndarray, " strengths"]:

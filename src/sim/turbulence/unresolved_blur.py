@@ -21,7 +21,7 @@ from src.sim.turbulence.outer_scale import KAPPA0, Cn2Profile
 from src.sim.turbulence.psf import SAMPLES_PER_LAMBDA_OVER_D
 from src.sim.turbulence.zernike import SPECTRUM, noll_index
 
-Structure = Float[np.ndarray, " distances"]
+StructureFunction = Float[np.ndarray, " distances"]  # at DISTANCES, in rad^2
 
 HIGHEST_ORDER = 14  # of Noll modes 2..120, which PSFs are fitted to
 KAPPA = np.geomspace(0.01, 3000, 6000)  # cycles per pupil
@@ -29,11 +29,11 @@ DISTANCES = np.linspace(0, math.sqrt(2), 400)  # of points of the pupil, in D
 
 
 def blur_by_phase(
-    psfs: Float[Tensor, "*n fine fine"], structure: Structure, size: int
+    psfs: Float[Tensor, "*n fine fine"], structure: StructureFunction, size: int
 ) -> Float[Tensor, "*n size size"]:
     """Return PSFs, sampled as the stored ones, blurred by phase of that structure function.
 
-    `structure` at DISTANCES, in rad^2.  The light of a PSF is kept; what falls outside of `size`
+    The light of a PSF is kept; what falls outside of `size`
     samples is lost.
     """
     fine = psfs.shape[-1]
@@ -53,11 +53,12 @@ def missing_structure_function(
     blur_equivalent_d_over_r0: float,
     aperture_over_outer_scale: float,
     profile: Cn2Profile,
-) -> Structure:
-    """Return the structure function, in rad^2, of the phase that a network's PSFs are without.
+) -> StructureFunction:
+    """Return the structure function of the phase that a network's PSFs are without.
 
     A network that sees `input_modes` modes from tilt on, of whole Zernike orders, blurs by those up
-    to HIGHEST_ORDER as Kolmogorov turbulence of `blur_equivalent_d_over_r0` does.
+    to HIGHEST_ORDER as Kolmogorov turbulence of `blur_equivalent_d_over_r0` does; where that is
+    more than there is, none is missing.
     """
     order = noll_index(input_modes + 1)[0]
     unseen = unresolved_structure_function(order, aperture_over_outer_scale, profile)
@@ -70,8 +71,8 @@ def unresolved_structure_function(
     order: int = HIGHEST_ORDER,
     aperture_over_outer_scale: float = 0.0,
     profile: Cn2Profile = (1.0,),
-) -> Structure:
-    """Return the structure function of Zernike orders beyond `order` at D/r0 = 1, in rad^2."""
+) -> StructureFunction:
+    """Return the structure function of Zernike orders beyond `order` at D/r0 = 1."""
     table = _structure_functions(order)
     return outer_scale.average_over_path(table, aperture_over_outer_scale, profile)
 
@@ -86,4 +87,10 @@ def _structure_functions(order: int) -> Float[np.ndarray, "scales distances"]:
         for n in range(order + 1)
     )
     left = np.maximum(1 - resolved, 0) * power * 2 * math.pi * KAPPA**2 * step
-    return left @ (2 * (1 - special.j0(2 * math.pi * np.multiply.outer(KAPPA, DISTANCES))))
+    return left @ _waves_between_points()
+
+
+@cache
+def _waves_between_points() -> Float[np.ndarray, "kappa distances"]:
+    """Return what a wave of unit power adds to the structure function, mean over directions."""
+    return 2 * (1 - special.j0(2 * math.pi * np.multiply.outer(KAPPA, DISTANCES)))

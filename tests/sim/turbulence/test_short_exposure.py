@@ -9,17 +9,22 @@ from scipy import special
 
 from src.sim.turbulence import short_exposure
 from src.sim.turbulence.outer_scale import KAPPA0, average_over_path
+from src.sim.turbulence.prior import PROFILES, unnormalised_cn2_profile
 from tests.sim.turbulence.theory import draw_short_exposure_blur
 
-CAMERA = (1.0, *[0.0] * 120)  # all turbulence at the aperture
 STRENGTHS = np.array([1.0, 2.0, 4.0, 8.0])
 
 
-@pytest.mark.parametrize("outer_scale", [0.5, 1.0, 3.0])
-def test_blur_is_that_of_drawn_phase(outer_scale):
-    drawn = draw_short_exposure_blur(STRENGTHS.tolist(), outer_scale, 320)
-    found = short_exposure.blur_std_in_lambda_over_d(STRENGTHS, 1 / outer_scale, CAMERA)
-    np.testing.assert_allclose(found, drawn, rtol=0.06)
+@pytest.mark.parametrize(
+    "ratio, path", [(2, "camera"), (1, "camera"), (1, "object"), (1, "uniform")]
+)
+def test_blur_is_that_of_drawn_phase(ratio, path):
+    low, high = PROFILES[path]
+    layers = low + (high - low) * (np.arange(20) + 0.5) / 20
+    drawn = draw_short_exposure_blur(STRENGTHS.tolist(), ratio, layers.tolist(), 320)
+    profile = unnormalised_cn2_profile(path)
+    found = short_exposure.blur_std_in_lambda_over_d(STRENGTHS, ratio, profile)
+    np.testing.assert_allclose(found, drawn, rtol=0.05)
 
 
 def test_strong_kolmogorov_turbulence_blurs_as_in_frieds_form():
@@ -55,6 +60,11 @@ def test_a_smaller_outer_scale_blurs_less():
     assert all(after < before * 1.005 for before, after in pairwise(blur))
     assert blur[-1] < 0.05 * blur[0]
     assert short_exposure.blur_std_in_lambda_over_d(0.0, 1.0, (1.0,)) == 0
+
+
+def test_stronger_turbulence_than_is_tabulated_is_refused():
+    with pytest.raises(ValueError, match="d_over_r0 must be <= 40, got 50"):
+        short_exposure.half_light_radius(50.0)
 
 
 def test_turbulence_near_the_object_has_the_larger_outer_scale_in_footprints():

@@ -19,6 +19,7 @@ from src.sim.turbulence.fidelity import mean_short_exposure_psf
 from src.sim.turbulence.operator import WAVES, Turbulence
 from src.sim.turbulence.p2s import FittedPSFs, load_bands_by_d_over_r0
 from src.sim.turbulence.plane_waves import PlaneWaves, advect_waves, draw_plane_waves
+from src.sim.turbulence.prior import unnormalised_cn2_profile
 from src.sim.turbulence.psf import PSFHalo, pixel_integration_matrix
 from src.sim.turbulence.short_exposure import (
     GAUSSIAN_HALF_LIGHT,
@@ -236,8 +237,8 @@ def mean_simulated_psf(turbulence: Turbulence) -> torch.Tensor:
     ],
 )
 def test_12_blur_with_an_outer_scale(outer_scale, strength, off):
-    """Of the mean of 1,600 simulated PSFs at the default tolerance; turbulence at the aperture."""
-    path = replace(PATH, cn2=(1.0, 1.0, *[0.0] * 120), ar1_coefficient=0.0)
+    """Of the mean of 1,600 simulated PSFs at the default tolerance."""
+    path = replace(PATH, cn2=unnormalised_cn2_profile("camera"), ar1_coefficient=0.0)
     path = replace(path, outer_scale_m=outer_scale * path.aperture_m).with_d_over_r0(strength)
     wide = path.scene_width_m * path.lambda_over_d_px(128) / 4  # 4 px per lambda / D
     path = replace(path, scene_width_m=wide)

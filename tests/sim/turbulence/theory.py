@@ -137,9 +137,12 @@ def degrade_with_exact_psfs(
 
 
 def draw_short_exposure_blur(
-    d_over_r0: Sequence[float], outer_scale_over_d: float, pupils: int
+    d_over_r0: Sequence[float],
+    aperture_over_outer_scale: float,
+    layers: Sequence[float],
+    pupils: int,
 ) -> list[float]:
-    """Return the blur beyond diffraction of turbulence at the aperture, no tilt, in lambda / D.
+    """Return the blur beyond diffraction, no tilt, in lambda / D, of layers at z / L of like Cn2.
 
     From the mean PSF of `pupils` von Karman phases over 48 x 48 points, drawn by FFT over 8 D (so
     for outer scales up to some D), less the plane fitted to each.
@@ -151,8 +154,13 @@ def draw_short_exposure_blur(
     planes = torch.stack([torch.ones_like(down), down, across])[:, inside]
     planes = torch.linalg.qr(planes.T.double())[0]
     frequency = torch.fft.fftfreq(8 * side, 1 / side, dtype=torch.float64)
-    power = frequency[:, None] ** 2 + frequency**2 + outer_scale_over_d**-2
-    amplitude = (0.022896 * power ** (-11 / 6)).sqrt() / 8 * (8 * side) ** 2
+    square = frequency[:, None] ** 2 + frequency**2
+    share = [(1 - place) ** (5 / 3) for place in layers]
+    power = sum(
+        part / sum(share) * (square + (aperture_over_outer_scale * (1 - place)) ** 2) ** (-11 / 6)
+        for part, place in zip(share, layers, strict=True)
+    )
+    amplitude = torch.sqrt(0.022896 * torch.as_tensor(power)) / 8 * (8 * side) ** 2
     phases = []
     while 32 * len(phases) < pupils:
         waves = torch.randn(8 * side, 8 * side, dtype=torch.complex128, generator=generator)
