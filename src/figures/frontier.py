@@ -106,17 +106,21 @@ def _draw_legend(figure: Figure, timed: Mapping[str, SpeedMeasurement]) -> None:
 
 
 def _name_points(axes: Axes, spans: Mapping[str, Span]) -> None:
-    """Write each name beside its point, at the first place where it covers nothing, else least."""
+    """Write each name at the first place where it covers nothing and is nearest to its own point,
+    else where it covers and is near to the fewest others."""
     to_px = axes.transData.transform
-    taken = [_box(to_px((least, score)), to_px((ms, score))) for least, ms, score in spans.values()]
-    for name, span in spans.items():
+    lines = [_box(to_px((least, score)), to_px((ms, score))) for least, ms, score in spans.values()]
+    taken = list(lines)
+    for (name, span), own in zip(spans.items(), lines, strict=True):
         written = [_write(axes, name, span, place) for place in NAME_PLACES]
         boxes = [text.get_window_extent().padded(CLEARANCE_PX) for text in written]
-        covered = [
-            (box.count_overlaps(taken) + (not axes.bbox.x0 < box.x0 < box.x1 < axes.bbox.x1), k)
-            for k, box in enumerate(boxes)
+        faults = [
+            box.count_overlaps(taken)
+            + (not axes.bbox.x0 < box.x0 < box.x1 < axes.bbox.x1)
+            + sum(_gap(box, line) <= _gap(box, own) for line in lines if line is not own)
+            for box in boxes
         ]
-        _, best = min(covered)
+        best = int(np.argmin(faults))
         taken.append(boxes[best])
         for text in written[:best] + written[best + 1 :]:
             text.remove()
@@ -130,6 +134,15 @@ def _write(axes: Axes, name: str, span: Span, place: tuple[int, int]) -> Annotat
         ha=("center", "left", "right")[dx], va=("center", "bottom", "top")[(dy > 0) - (dy < 0)],
         textcoords="offset points", fontsize=8, color="0.15",
     )  # fmt: skip
+
+
+def _gap(one: Bbox, other: Bbox) -> float:
+    """Return the distance between two boxes, 0 where they overlap."""
+    across, down = (
+        max(one.x0 - other.x1, other.x0 - one.x1),
+        max(one.y0 - other.y1, other.y0 - one.y1),
+    )
+    return float(np.hypot(max(across, 0), max(down, 0)))
 
 
 def _box(low: np.ndarray, high: np.ndarray) -> Bbox:
