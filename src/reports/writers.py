@@ -1,5 +1,6 @@
 """A table as Markdown and CSV; a section of a document replaced between its markers."""
 
+import math
 from collections.abc import Sequence
 from decimal import ROUND_HALF_UP, Decimal
 from pathlib import Path
@@ -78,15 +79,15 @@ def _markers(name: str) -> tuple[str, str]:
 
 def format_cell(cell: TableCell, column: Column) -> str:
     """Return a cell as people read it: a text, a mean, a mean ± its std, or a dash; in parentheses
-    what was published.  A difference has a sign and, in parentheses, its CI.
+    what was published.  A difference has a sign and, in parentheses, its CI if it has one.
     """
     if cell.text:
         return cell.text
     if cell.mean is None:
         return "-"
     if cell.interval is not None:
-        low, high = (f"{value:+.{column.digits}f}" for value in cell.interval)
-        return f"{cell.mean:+.{column.digits}f} ({low} to {high})"
+        difference, *ends = (f"{x:+.{column.digits}f}" for x in (cell.mean, *cell.interval))
+        return difference if math.isnan(cell.interval[0]) else f"{difference} ({' to '.join(ends)})"
     number = f"{cell.mean:,.{column.digits}f}"
     number += "" if cell.std is None else f" ± {cell.std:.{column.digits}f}"
     published = "" if cell.published is None else round_decimal(cell.published, column.digits)
