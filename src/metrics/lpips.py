@@ -69,7 +69,8 @@ class LPIPS(nn.Module):
         """
         if min(prediction.shape[-2:]) < SMALLEST_SIDE[self.net]:
             size, least = tuple(prediction.shape[-2:]), SMALLEST_SIDE[self.net]
-            raise ValueError(f"data.crop must be >= {least} for LPIPS ({self.net}), got {size}")
+            keys = "data.crop (or data.test_crop) times metrics.resolution_scale"
+            raise ValueError(f"{keys} must be >= {least} px for LPIPS ({self.net}), got {size}")
         total = torch.zeros(len(prediction), device=prediction.device)
         x, y = prediction, target
         for stage, head in zip([self._first_stage, *self.stages[1:]], self.heads, strict=True):

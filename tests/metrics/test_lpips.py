@@ -73,7 +73,7 @@ def test_small_pictures_and_unknown_nets_are_refused():
     with pytest.raises(ValueError, match="lpips.net must be alex or vgg, got squeeze"):
         LPIPS("squeeze")
     small = torch.rand(1, 1, 16, 16)
-    with pytest.raises(ValueError, match="data.crop must be >= 32"):
+    with pytest.raises(ValueError, match="resolution_scale must be >= 32 px"):
         build("alex")(small, small)
 
 
