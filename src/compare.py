@@ -41,8 +41,8 @@ def compare(cfg: DictConfig) -> dict:
     `residual_displacement_px`, along a line or a ray that turns with the scene, is of what is
     static there, `line_deviation_px` of what moves uniformly along a line or a circle.  With
     `still` the whole scene is static (`slice_motion.measure_static_scene`).  Raises ValueError for
-    a video that cannot be read, has another size than the first or another frame rate than `fps`,
-    or a slice outside the frame.
+    a video that cannot be read, has another size than the first (with `still`: another aspect
+    ratio) or another frame rate than `fps`, or a slice outside the frame.
     """
     run = Path(cfg.paths.run)
     check_slice(cfg)
@@ -60,7 +60,8 @@ def compare(cfg: DictConfig) -> dict:
     given = {name: cfg[name] for name in slices.KINDS if cfg[name] is not None}
     if len(given) != 1:
         raise ValueError(f"give one of line, circle, spin and still, got {given or 'none'}")
-    films = slices.shrink_to_smallest(films) if "still" in given else films
+    if "still" in given:
+        films = list(slices.shrink_to_smallest(dict(zip(names, films, strict=True))).values())
     sizes = {film.shape[1:] for film in films}
     if len(sizes) > 1:
         raise ValueError(f"videos must be of one size (h, w), got {sorted(sizes)}")

@@ -400,6 +400,16 @@ def test_videos_of_two_sizes_are_not_compared(tmp_path):
         compare(config("compare", tmp_path / "run", films, "line=[[0,0],[19,0]]"))
 
 
+def test_videos_of_two_shapes_are_not_stretched(tmp_path):
+    for name, size in (("wide", (20, 30)), ("high", (50, 10))):
+        (tmp_path / name).mkdir()
+        cv2.imwrite(str(tmp_path / name / "0.png"), np.zeros(size, np.uint8))
+    films = f"videos=[{tmp_path}/wide,{tmp_path}/high]"
+    got = r"videos must be of one aspect ratio, got wide 20x30 and high 50x10 \(h x w\)"
+    with pytest.raises(ValueError, match=got):
+        compare(config("compare", tmp_path / "run", films, "names=[wide,high]", "still=2"))
+
+
 @pytest.mark.parametrize(
     "wrong, message",
     [
