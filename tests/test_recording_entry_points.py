@@ -13,6 +13,7 @@ from hydra import compose, initialize_config_dir
 
 from src.calibrate import calibrate
 from src.compare import compare, default_video_names
+from src.figures import comparison
 from src.live import build_server
 from src.reconstruct import reconstruct, show_progress
 from src.recordings import reconstruction, sensor_lookup, simulated_recording, truth_file, views
@@ -358,7 +359,11 @@ def test_comparing_videos_draws_them_and_measures_their_slices(folder, found, tm
         compare(config("compare", tmp_path / "wrong", line[0], line[2], "fps=120"))
 
 
-def test_what_turns_uniformly_is_straight_in_theta_and_still_in_r(tmp_path):
+def test_what_turns_uniformly_is_straight_in_theta_and_still_in_r(tmp_path, monkeypatch):
+    drawn, draw = [], comparison.draw_comparison
+    monkeypatch.setattr(
+        comparison, "draw_comparison", lambda *rows, **how: drawn.append(how) or draw(*rows, **how)
+    )
     (tmp_path / "film").mkdir()
     y, x = np.mgrid[:61, :61]
     for k in range(24):
@@ -371,6 +376,7 @@ def test_what_turns_uniformly_is_straight_in_theta_and_still_in_r(tmp_path):
     still = compare(config("compare", tmp_path / "r", *along))["film"]
     round_ = compare(config("compare", tmp_path / "theta", *film, "circle=[30,30,18]"))["film"]
     assert still["residual_displacement_px"] < 0.1 and round_["line_deviation_px"] < 0.2
+    assert [how["axis"] for how in drawn] == ["r", "theta"]
 
 
 def test_the_tail_behind_a_bright_dot_is_not_followed(tmp_path):

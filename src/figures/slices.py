@@ -41,6 +41,15 @@ def cut_slice(
     return sample_points(video, points, key), points.reshape(-1, *points.shape[-2:])[0]
 
 
+def name_axis(kind: str, points: Points) -> str:
+    """Return the coordinate along a slice of `kind` through `points`: x of a row, y of a column, r
+    along another line or a ray that turns, theta on a circle."""
+    if kind in ("circle", "spin"):
+        return {"circle": "theta", "spin": "r"}[kind]
+    spread_x, spread_y = np.ptp(points, axis=0)
+    return "x" if spread_y == 0 else "y" if spread_x == 0 else "r"
+
+
 def sample_points(
     video: Float[np.ndarray, "frames h w"],
     points: Points | Float[np.ndarray, "frames places 2"],
