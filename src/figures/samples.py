@@ -1,6 +1,7 @@
 """Pictures of a run: films of panels side by side (GIF, PNG), space-time slices, and the views."""
 
 from collections.abc import Iterable
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from src.figures.comparison import VideoRow, draw_comparison
-from src.recordings.output import resize_picture, round_to_uint8
+from src.recordings.output import iter_frame_durations, resize_picture, round_to_uint8
 from src.records.atomic import atomic_path
 from src.sim.optics import Optics, layout, most_central_view_index
 from src.sim.pipeline import Sample
@@ -165,16 +166,19 @@ def _draw_title(name: str, width: int) -> Float[np.ndarray, "title_px width 3"]:
 def write_animation(path: Path, frames: Video, fps: float) -> None:
     """Write a GIF or WebP (or, of the first frame, what else the suffix says) whole or not at all.
 
-    Values are clipped to [0, 1]; GIFs keep time to hundredths of a second, WebP to thousandths.
+    Values are clipped to [0, 1].  GIFs keep time to hundredths of a second, WebP to thousandths, in
+    both `fps` is the mean; players show frames of a GIF above 50 a second slower.
     """
     pictures, kind = list(map(Image.fromarray, round_to_uint8(frames))), path.suffix[1:].upper()
     options: dict[str, Any] = {}
     if kind == "GIF":
         pictures = [picture.quantize(128, dither=Image.Dither.NONE) for picture in pictures]
-        options = {"duration": 1000 / fps, "loop": 0}
+        hundredths = islice(iter_frame_durations(fps, 100), len(pictures))
+        options = {"duration": [10 * one for one in hundredths]}
     elif kind == "WEBP":
-        options = {"duration": round(1000 / fps), "loop": 0, "quality": WEBP_QUALITY}
+        thousandths = islice(iter_frame_durations(fps, 1000), len(pictures))
+        options = {"duration": list(thousandths), "quality": WEBP_QUALITY}
     if options:
-        options |= {"save_all": True, "append_images": pictures[1:]}
+        options |= {"save_all": True, "append_images": pictures[1:], "loop": 0}
     with atomic_path(path) as partial:
         pictures[0].save(partial, kind, **options)
