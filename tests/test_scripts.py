@@ -2,6 +2,8 @@
 
 import shutil
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
@@ -234,6 +236,20 @@ def test_what_is_missing_is_told_by_its_size():
         truth - grey.repeat_interleave(16, 2).repeat_interleave(16, 3), truth
     )
     assert areas > 0.5 and max(details) < 0.05
+
+
+def test_a_camera_frame_is_found_in_a_list_with_comments_and_names_with_spaces(tmp_path):
+    for grey, name in ((50, "a.png"), (200, "the second one.png")):
+        cv2.imwrite(str(tmp_path / name), np.full((8, 8), grey, np.uint8))
+    listing = tmp_path / "images.txt"
+    listing.write_text("# seconds file\n\n0.1 a.png\n0.2 the second one.png\n")
+    recording = f"{tmp_path}/events.txt@8x8"
+    assert [255 * gallery.camera(recording, at).mean() for at in (0, 1)] == pytest.approx([50, 200])
+    listing.write_text("# seconds file\n")
+    assert gallery.camera(recording, 0) is None
+    listing.write_text("a.png\n")
+    with pytest.raises(ValueError, match="must have seconds and a file in each line"):
+        gallery.camera(recording, 0)
 
 
 def test_a_gallery_has_a_row_for_each_recording_and_a_column_for_each_network():
