@@ -5,7 +5,7 @@ Events fall everywhere, so that no part of a frame can be left out.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from itertools import cycle, product
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,7 @@ from src.bench.candidates import Candidate
 from src.deploy.cost import (
     count_macs,
     macs_per_frame,
-    select_timing_clock,
     time_calls,
-    torch_threads,
 )
 from src.deploy.cpu_features import is_bf16_faster
 from src.deploy.forms import convert_to_form
@@ -213,8 +211,8 @@ def time_postprocessor(post: FramePostprocessor, side: int, *, threads: int = 1)
     Its windows of WINDOW frames overlap by OVERLAP: what two of them share is paid for twice.
     """
     frames = torch.rand(1, post.WINDOW, 1, side, side)
-    seconds = _fastest(lambda: post.restore(frames), threads, repeats=2)
-    return 1e3 * seconds / (post.WINDOW - post.OVERLAP)
+    took = time_calls(lambda: post.restore(frames), threads=threads, seconds=0, min_calls=2)
+    return took.least_ms / (post.WINDOW - post.OVERLAP)
 
 
 @torch.no_grad()
@@ -226,17 +224,6 @@ def measure_peak_conv_macs_per_s(dtype: torch.dtype, *, threads: int = 1) -> flo
         torch.randn(size).to(dtype=dtype, memory_format=torch.channels_last)
         for size in ((1, PEAK_CHANNELS, PEAK_SIDE, PEAK_SIDE), (PEAK_CHANNELS, PEAK_CHANNELS, 3, 3))
     )
-    functional.conv2d(x, kernel, padding=1)
-    seconds = _fastest(lambda: functional.conv2d(x, kernel, padding=1), threads, repeats=8)
-    return PEAK_SIDE**2 * PEAK_CHANNELS**2 * 9 / seconds
-
-
-def _fastest(work: Callable[[], object], threads: int, repeats: int) -> float:
-    """Return the least seconds of `repeats` calls of `work` on so many threads."""
-    now, seconds = select_timing_clock(threads), []
-    with torch_threads(threads):
-        for _ in range(repeats):
-            start = now()
-            work()
-            seconds.append(max(now() - start, 1e-9))
-    return min(seconds)
+    convolve = partial(functional.conv2d, x, kernel, padding=1)
+    took = time_calls(convolve, threads=threads, seconds=0, min_calls=8)
+    return PEAK_SIDE**2 * PEAK_CHANNELS**2 * 9 / (took.least_ms / 1e3)
