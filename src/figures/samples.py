@@ -67,15 +67,15 @@ def write_light_field_panels(
     left.  The clean clip is as high as all views together.
     """
     views, tilt, counts = map(_shrink, (views, tilt, counts))
-    seen = tile_views(list(views), optics)
+    seen = place_views_at_apertures(list(views), optics)
     events = [render_events(part) for part in counts]
     reach = max(float(np.abs(tilt).max()), 1e-6)
     pushed = [render_events(part[:, 0], full=reach) for part in tilt]
     panels = {
         "clean": resize_pictures(clean, seen.shape[1]),
         "views": seen,
-        f"tilt in x, +-{reach:.1f} px": tile_views(pushed, optics),
-        EVENTS_TITLE: tile_views(events, optics),
+        f"tilt in x, +-{reach:.1f} px": place_views_at_apertures(pushed, optics),
+        EVENTS_TITLE: place_views_at_apertures(events, optics),
     }
     frames = join_panels(panels)
     paths = [folder / "views.gif", folder / "views.png"]
@@ -105,7 +105,7 @@ def resize_pictures(
     return resized.clip(pictures.min(), pictures.max())
 
 
-def tile_views(videos: list[Video], optics: Optics) -> Video:
+def place_views_at_apertures(videos: list[Video], optics: Optics) -> Video:
     """Place the videos of the views where their apertures are; gaps are white."""
     rows, columns = zip(*optics.positions, strict=True)
     frames, height, width, *rgb = videos[0].shape
