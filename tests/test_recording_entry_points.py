@@ -215,6 +215,7 @@ def test_without_views_the_sensor_is_one_view(folder, tmp_path):
         ("noise_filter_s=0", r"noise_filter_s must be in \(0, 1e6\] seconds or null, got 0"),
         ("noise_filter_s=1e30", r"noise_filter_s must be in \(0, 1e6\] seconds or null, got 1e"),
         ("views=", "views must be a file of calibrate task=views, got none: No such file"),
+        ("output_format=gif playback_fps=60", r"playback_fps must be in \[0.1, 50\] for output_f"),
         ("playback_fps=1e30", r"playback_fps must be in \[0\.1, 1000\], got 1e\+30"),
     ],
 )

@@ -32,10 +32,11 @@ MAX_SIZE = 4096  # any number in the arguments of a network that a file names
 def load(name_or_path: str | Path, allowed_packages: Sequence[str] = ()) -> nn.Module:
     """Return the network of a file, float32, in eval mode, spectral norm folded into its weights.
 
-    A name as `locate` says; a path is a `.safetensors` file written by `save`, a checkpoint of a
-    training run or its folder; its network is of src.models, baselines or one of
-    the packages `allowed_packages`.  Raises ValueError, beginning with `ckpt`, for a file that is
-    not there, is no such file, or holds other weights than its network has.
+    A name of `weights/` is that file, else it is a path (./name, where there is one of that name):
+    a `.safetensors` file written by `save`, a checkpoint of a training run or its folder.  Its
+    network is of src.models, baselines or a package of `allowed_packages`.  Raises ValueError,
+    beginning with `ckpt`, for a file that is not there, is no such file, or holds other weights
+    than its network has.
     """
     path = locate(name_or_path)
     if path.is_dir():
