@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import nn
 
 from src.deploy.forms import convert_to_form
-from src.deploy.runtime import FORMS, EventListRuntime, supports_event_lists
+from src.deploy.runtime import EVENT_LIST_FORMS, EventListRuntime, supports_event_lists
 from src.models.network import EventToVideoNetwork
 from src.recordings.event_windows import Window, WindowRule, cut_windows, cut_windows_backward
 from src.recordings.sensor_lookup import build_lookup
@@ -100,7 +100,7 @@ def build_runnable_network(
     """
     if device != "cpu" and form == "openvino":
         raise ValueError(f"device must be cpu for form=openvino, got {device}")
-    if device != "cpu" or form not in FORMS or not supports_event_lists(network):
+    if device != "cpu" or form not in EVENT_LIST_FORMS or not supports_event_lists(network):
         return convert_to_form(network, form).to(device)
     if bins != network.bins:
         raise ValueError(f"bins must be {network.bins} for this network, got {bins}")
