@@ -28,6 +28,7 @@ from src.recordings.calibration import (
     view_alignment,
 )
 from src.recordings.calibration.boards import Circles, Target
+from src.recordings.calibration.gaussian_dots import GaussianFits
 from src.recordings.files import sources, videos
 from src.recordings.files.event_file import ReadOptions
 from src.recordings.files.recording import open_recording
@@ -35,6 +36,8 @@ from src.recordings.files.turbulence_file import SIDE
 from src.recordings.views import Views, load_views
 from src.records import results
 from src.records.atomic import check_writable
+
+Films = Float[np.ndarray, "views frames h w"]
 
 
 def calibrate_views(cfg: DictConfig, run: Path) -> dict[str, str]:
@@ -122,6 +125,20 @@ def measure_dot_statistics(cfg: DictConfig, run: Path) -> dot_statistics.DotStat
 
     A recording of events is reconstructed first, each view by itself, by a network of one view.
     """
+    _check_dot_options(cfg)
+    views = None if cfg.views is None else load_views(cfg.views)
+    positions = views.positions if views else [(0, 0)]
+    centre = positions.index((0, 0))
+    turbulent_fits, still_fits = _fit_dots(cfg.dots, *_load_dot_films(cfg, views), centre)
+    fitted = dot_statistics.compare_with_still(
+        turbulent_fits, still_fits, fps=cfg.fps, centre_view=centre
+    )
+    dot_statistics.write_view_dot_csv(fitted, run / "turbulence.csv", positions)
+    calibration_figures.draw_dot_statistics(fitted, positions, run / "turbulence.png")
+    return fitted
+
+
+def _check_dot_options(cfg: DictConfig) -> None:
     if not cfg.still:
         raise ValueError("still must be the same dots without turbulence, got none")
     for key in ("still", "recording"):
@@ -132,40 +149,49 @@ def measure_dot_statistics(cfg: DictConfig, run: Path) -> dot_statistics.DotStat
         Circles(cfg.dots.rows, cfg.dots.cols)
     except ValueError as error:
         raise ValueError(str(error).replace("target.", "dots.")) from error
+
+
+def _load_dot_films(cfg: DictConfig, views: Views | None) -> tuple[Films, Films]:
+    """Return the films of `recording` and of `still`; ValueError for pictures of two sizes."""
     given = cfg.ckpt or cfg.get("baseline")
     network = (
         reconstruction.require_event_network(build.load_ckpt_or_baseline(cfg)) if given else None
     )
-    views, dots = None if cfg.views is None else load_views(cfg.views), cfg.dots
-    positions = views.positions if views else [(0, 0)]
-    still_films, turbulent_films = (
-        _read_films(cfg, key, views, network) for key in ("still", "recording")
-    )
-    wanted, got = ("x".join(map(str, film.shape[2:])) for film in (turbulent_films, still_films))
+    still, turbulent = (_read_films(cfg, key, views, network) for key in ("still", "recording"))
+    wanted, got = ("x".join(map(str, films.shape[2:])) for films in (turbulent, still))
     if wanted != got:
         raise ValueError(f"still must have pictures of the recording's size, {wanted}, got {got}")
-    centre = positions.index((0, 0))
-    places = dot_statistics.find_dots(still_films[centre].mean(0), dots.rows, dots.cols, dots.dark)
+    return turbulent, still
+
+
+def _fit_dots(
+    dots: DictConfig, turbulent: Films, still: Films, centre: int
+) -> tuple[list[GaussianFits], list[GaussianFits]]:
+    """Return the fits of the dots in the films of each view, with turbulence and without."""
+    places = dot_statistics.find_dots(still[centre].mean(0), dots.rows, dots.cols, dots.dark)
     reach = dots.fit_radius_px or dot_statistics.choose_fit_radius(places)
-    if dots.dark:  # the vignette of a bright ground would pass for a part of the dots
-        grounds = [
-            dot_statistics.fit_background(film.mean(0), places, reach) for film in still_films
-        ]
-        light = np.stack(grounds)[:, None]
-        still_films, turbulent_films = still_films / light, turbulent_films / light
-    turbulent_fits = [gaussian_dots.fit_gaussians(film, places, reach) for film in turbulent_films]
-    still_fits = [gaussian_dots.fit_gaussians(film, places, reach) for film in still_films]
-    fitted = dot_statistics.compare_with_still(
-        turbulent_fits, still_fits, fps=cfg.fps, centre_view=centre
+    if dots.dark:
+        turbulent, still = _divide_by_background(turbulent, still, places, reach)
+    turbulent_fits, still_fits = (
+        [gaussian_dots.fit_gaussians(film, places, reach) for film in films]
+        for films in (turbulent, still)
     )
-    dot_statistics.write_view_dot_csv(fitted, run / "turbulence.csv", positions)
-    calibration_figures.draw_dot_statistics(fitted, positions, run / "turbulence.png")
-    return fitted
+    return turbulent_fits, still_fits
+
+
+def _divide_by_background(
+    turbulent: Films, still: Films, places: Float[np.ndarray, "dots 2"], reach: int
+) -> tuple[Films, Films]:
+    """Return the films over the bright ground of each view: its vignette would pass for a part of
+    the dots."""
+    grounds = [dot_statistics.fit_background(film.mean(0), places, reach) for film in still]
+    light = np.stack(grounds)[:, None]
+    return turbulent / light, still / light
 
 
 def _read_films(
     cfg: DictConfig, key: str, views: Views | None, network: EventToVideoNetwork | None
-) -> Float[np.ndarray, "views frames h w"]:
+) -> Films:
     path = cfg[key]
     if not sources.has_events(path):
         frames = videos.read_video(path, key)
@@ -177,9 +203,8 @@ def _read_films(
     rule = event_windows.build_window_rule("trained", fps=cfg.fps)
     events = sources.iter_recording(path, seen.sensor, options=options)
     windows = event_windows.cut_windows(events, sensor_lookup.build_lookup(seen), rule)
-    return np.stack(
-        list(reconstruction.reconstruct_each_view(windows, network, rule.frames_per_window)), axis=1
-    )
+    pictures = reconstruction.reconstruct_each_view(windows, network, rule.overlapping_windows)
+    return np.stack(list(pictures), axis=1)
 
 
 def measure_turbulence_in_video(

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from scripts import gallery, readme, surroundings, turbulence_map, widen_setnet
-from scripts.scales import missing
+from scripts import gallery, pretrain_context, readme, turbulence_map, widen_setnet
+from scripts.error_by_detail_size import missing
 from scripts.ship_weights import CARD_NOTE, Given, recard, ship
 from src.app import build
 from src.metrics.table import METRICS
@@ -144,7 +144,7 @@ def test_what_lies_around_is_taught_while_the_memory_rests(tmp_path):
     cfg = config("train", tmp_path, *TINY, *given)
     network, spec = build.build_untrained_network(cfg)
     files.save(start, network, spec, {"hours": 1.0, "curve": []})
-    surroundings.teach(cfg, clips=3, steps=2)
+    pretrain_context.teach(cfg, clips=3, steps=2)
     before, taught = files.load(start).state_dict(), files.load(export).state_dict()
     rested = [torch.equal(before[n], taught[n]) for n in before if n.startswith("memory")]
     assert all(rested) and not torch.equal(
@@ -155,7 +155,7 @@ def test_what_lies_around_is_taught_while_the_memory_rests(tmp_path):
     assert card["hours"] > 1 and card["curve"] == []
     for name in ("ckpt", "export"):
         with pytest.raises(ValueError, match="ckpt and export must be files"):
-            surroundings.teach(config("train", tmp_path, *TINY, *given, f"{name}=null"), 3, 2)
+            pretrain_context.teach(config("train", tmp_path, *TINY, *given, f"{name}=null"), 3, 2)
 
 
 def talkative(**sizes) -> SetNet:
@@ -220,7 +220,7 @@ def test_areas_are_learned_from_what_is_held():
     truth = torch.rand(64, 1, 1, 1).expand(-1, 1, 16, 16)
     maps = torch.randn(64, 4, 8, 8) * 0.1
     maps[:, :, :2, :2] += truth[..., :2, :2]  # told in a corner, wanted everywhere
-    errors = surroundings.learn(network, maps.half(), truth.half(), 300)
+    errors = pretrain_context.learn(network, maps.half(), truth.half(), 300)
     assert sum(errors[-20:]) < 0.6 * sum(errors[:20])
 
 

@@ -24,8 +24,7 @@ from src.deploy.cost import (
 from src.deploy.cpu_features import is_bf16_faster
 from src.deploy.forms import convert_to_form
 from src.deploy.onnx_export import OnnxNetwork, export_onnx
-from src.deploy.runtime import FORMS as LISTED_FORMS
-from src.deploy.runtime import EventListRuntime, supports_event_lists
+from src.deploy.runtime import EVENT_LIST_FORMS, EventListRuntime, supports_event_lists
 from src.models.folding import inference_copy
 from src.models.network import WINDOW_S, EventToVideoNetwork, FramePostprocessor
 from src.sim.optics import layout
@@ -36,7 +35,7 @@ FORM_DTYPES = {  # what a form computes in
     "openvino": torch.bfloat16 if is_bf16_faster() else torch.float32,
     "onnx": torch.float32,
 }  # fmt: skip
-FORMS = tuple(FORM_DTYPES)
+TIMED_FORMS = tuple(FORM_DTYPES)
 LONGEST_S, ONNX_SIDE = 1.0, 176
 PREVIEW_SIDE = 64  # frames that tell what a post-processor costs on larger ones
 PEAK_SIDE, PEAK_CHANNELS = 176, 64  # of the convolution that shows what the machine can do
@@ -140,7 +139,7 @@ class SpeedBenchmark:
     def _build_step(self, network: EventToVideoNetwork, entry: SpeedMeasurement) -> EventStep:
         """Return what goes from the events of a window to a frame as `src.reconstruct` does."""
         form, side, threads, views = entry.form, entry.side, entry.threads, entry.views
-        if entry.device == "cpu" and form in LISTED_FORMS and supports_event_lists(network):
+        if entry.device == "cpu" and form in EVENT_LIST_FORMS and supports_event_lists(network):
             size = {"height": side, "width": side}
             runtime = EventListRuntime(
                 network, positions=layout(views), threads=threads, form=form, **size

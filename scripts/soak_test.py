@@ -1,4 +1,7 @@
-"""What grows in a long run: python -m scripts.endure train 60, python -m scripts.endure events 2e7
+"""What grows in a long run:
+
+    python -m scripts.soak_test train 60
+    python -m scripts.soak_test events 2e7
 
 `train` trains the smallest network for so many minutes, with a worker, validations and checkpoints
 every few steps; `events` reconstructs so many events, a recording over and over.  Memory and open
