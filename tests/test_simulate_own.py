@@ -192,6 +192,8 @@ def test_an_array_moves_as_a_photograph_does():
         (["video=my.mkv", "photo=a.png"], "video must be null with photo=a.png"),
         (["video=my.mkv", "like=config.yaml"], "like must be null with video or photo"),
         (["video=my.mkv", "write=a.txt"], "write"),
+        (["video=my.mkv", "seconds=0.5"], "seconds must be null but for a photograph, .*got 0.5"),
+        (["video=my.mkv", "speed_widths_per_s=1"], "speed_widths_per_s must be 0 but for a photog"),
     ],
 )
 def test_keys_that_do_not_go_together(given, message, tmp_path):

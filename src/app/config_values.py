@@ -25,7 +25,7 @@ KEYS: dict[tuple[str, ...], str] = {
         noise_filter_s train_hours grad_clip_norm ema_decay state_rounding_step
         loss_spike_factor turbulence.wind_m_s turbulence.baseline_m
         callbacks.learning_curve.interval_h data.max_grid_s data.start_s data.end_s
-        calibrate:fps simulate:fps camera.tile_px white_level compare:still data.test_crop
+        calibrate:fps simulate:fps camera.tile_px white_level simulate:seconds compare:still data.test_crop
     """,
     (WHOLE, NULL): """
         data.train_clips data.cache_clips data.loss_pairs dots.fit_radius_px last stem

@@ -171,6 +171,7 @@ def read_own_clip(cfg: DictConfig) -> OwnClip:
         raise ValueError(f"video must be null with photo={cfg.photo}, got {cfg.video}")
     options = {key: cfg[key] for key in ("fps", "longest_side_px", "white_level")}
     if cfg.video:
+        own_material.refuse_motion_of_video(cfg.seconds, cfg.speed_widths_per_s)
         return own_material.read_video(cfg.video, start_s=cfg.start_s, end_s=cfg.end_s, **options)
     own_material.refuse_part_of_photograph(cfg.start_s, cfg.end_s)
     motion = {"speed_widths_per_s": cfg.speed_widths_per_s, "seed": cfg.seed}

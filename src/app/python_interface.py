@@ -56,7 +56,7 @@ class SimulatedClip:
 
 def simulate(
     photo_or_video: Any, turbulence: str = "strong", views: int = 9, *, sensor: str = "paper",
-    fps: float | None = None, seconds: float = 1.0, start_s: float = 0.0, end_s: float = math.inf,
+    fps: float | None = None, seconds: float | None = None, start_s: float = 0.0, end_s: float = math.inf,
     longest_side_px: int | None = None, seed: int = 0, overrides: Sequence[str] = (),
 ) -> SimulatedClip:  # fmt: skip
     """Return what a light field of `views` views and an event sensor see of your material.
@@ -65,7 +65,8 @@ def simulate(
     (frames, h, w), uint8 or floats in [0, 1].  `turbulence`: none, weak, medium, strong, extreme or
     mixed.  `sensor`: paper, ideal, noisy, evk4 ..., for sRGB and with a contrast threshold of 0.2
     unless `overrides` set sensor.input and sensor.threshold.  `fps`: None for that of the file, 120
-    for a photograph, which lasts `seconds`; of a video the part from `start_s` to `end_s` is taken.
+    for a photograph, which lasts `seconds` (None: 1); of a video the part from `start_s` to `end_s` is
+    taken.  Either is refused where the other is given.
     `overrides`: other keys of conf/simulate.yaml as on the command line.  The result is a function
     of the arguments.  Raises ValueError for values outside their range, and for an override of an
     argument or of a key of the command line alone.
