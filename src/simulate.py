@@ -43,8 +43,6 @@ def simulate(cfg: DictConfig) -> dict:
     onto one sensor whose events are written to a file, geometry and truth beside it.  Returns what
     was drawn: D/r0, threshold ...
     """
-    if cfg.index < 0:
-        raise ValueError(f"index must be >= 0, the number of a clip, got {cfg.index}")
     own = cfg.video or cfg.photo
     if cfg.like and own:
         raise ValueError(f"like must be null with video or photo, got {cfg.like}")
@@ -56,7 +54,9 @@ def simulate(cfg: DictConfig) -> dict:
 
 def simulate_own_clip(cfg: DictConfig) -> dict:
     """Simulate all of `video` or `photo` and record it, to `write` or into the run's folder."""
-    own_simulation.set_own_sensor(cfg, entry_point.describe_hydra_command().get("overrides", []))
+    overrides = entry_point.describe_hydra_command().get("overrides", [])
+    own_simulation.refuse_keys_of_scenes(overrides)
+    own_simulation.set_own_sensor(cfg, overrides)
     run, clip = Path(cfg.paths.run), own_simulation.read_own_clip(cfg)
     work = OwnSimulation(cfg, clip)
     if not hasattr(work.sensor, "events"):

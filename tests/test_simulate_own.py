@@ -168,6 +168,24 @@ def test_a_seed_draws_anew_and_the_same_seed_the_same():
         ({"overrides": ["write=a.raw"]}, "must not set write: it is of the command line alone"),
         ({"seed": 1.5}, "seed must be a whole number, got 1.5"),
         ({"overrides": ["least_simulated_fps=0"]}, "least_simulated_fps must be in"),
+        (
+            {"overrides": ["least_simulated_fps=fast"]},
+            "least_simulated_fps must be a number, got f",
+        ),
+        ({"overrides": ["+foo=3"]}, "foo is no key of the configuration"),
+        ({"overrides": ["index=-1"]}, "index must be >= 0, got -1"),
+        (
+            {"overrides": ["camera.tile_px=1"]},
+            "set camera.tile_px: it is of the command line alone",
+        ),
+        ({"overrides": ["scene.height=8"]}, "scene.height must not be given with a video or photo"),
+        ({"overrides": ["data.substeps=9"]}, "data.substeps must not be given with a video or ph"),
+        ({"overrides": ["bins=2"]}, "bins must not be given with a video or photograph"),
+        ({"overrides": ["calm=1"]}, "calm is now loss.static_flicker.weight"),
+        (
+            {"turbulence": "measured", "overrides": ["turbulence.measured=air (1).yaml"]},
+            r"turbulence.measured must be .*air \(1\).yaml",
+        ),
     ],
 )
 def test_a_wrong_argument_is_one_line_and_leaves_hydra_as_it_was(options, message):

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from omegaconf import DictConfig, open_dict
 from torch import Tensor
 
+from src.app.compose import read_override_key
 from src.app.instantiate import build_part
 from src.app.simulation import build_sensor, decodes_srgb
 from src.sim import noise
@@ -27,6 +28,7 @@ from src.sim.turbulence.operator import Turbulence
 
 PART_BYTES = 1 << 27  # of all views at a time
 FREE_BYTES = 1 << 28  # that are left on the disk
+KEYS_OF_SCENES = ("scene", "data", "bins", "split")
 
 Progress = Callable[[range, str], Iterable[int]]
 
@@ -150,11 +152,18 @@ def describe_turbulence(drawn: Mapping[str, Any]) -> str:
     return f": tilt {tilt:.2f} px, blur {blur:.2f} px rms"
 
 
+def refuse_keys_of_scenes(overrides: Iterable[str]) -> None:
+    """Raise ValueError for an override that a video or photograph does not follow from."""
+    for key in map(read_override_key, overrides):
+        if key.partition(".")[0] in KEYS_OF_SCENES:
+            raise ValueError(f"{key} must not be given with a video or photograph: it is of scene")
+
+
 def set_own_sensor(cfg: DictConfig, overrides: Iterable[str]) -> None:
     """Give `sensor` the values of `own_sensor`, as photographs and films need them, but for the
     keys that `overrides`, such as sensor.threshold=0.3, set.  Neither kind is drawn at random.
     """
-    given = {override.lstrip("+").partition("=")[0] for override in overrides}
+    given = set(map(read_override_key, overrides))
     for key, value in cfg.own_sensor.items():
         if key in cfg.sensor and f"sensor.{key}" not in given:
             cfg.sensor[key] = value

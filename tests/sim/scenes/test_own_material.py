@@ -79,7 +79,9 @@ def test_a_part_of_an_array_is_that_of_a_video():
     with pytest.raises(ValueError, match="start_s and end_s are of a video, a photograph has sec"):
         own_material.clip_from_array(frames[0], end_s=0.1)
     for only, value in (("seconds", 0.1), ("speed_widths_per_s", 0.3)):
-        with pytest.raises(ValueError, match=f"{only} must be .* but for a photograph.* got {value}"):
+        with pytest.raises(
+            ValueError, match=f"{only} must be .* but for a photograph.* got {value}"
+        ):
             own_material.clip_from_array(frames, fps=120.0, **{only: value})
     with pytest.raises(ValueError, match="grey"):
         own_material.clip_from_array(np.zeros((48, 64, 3), np.uint8), fps=60.0)
