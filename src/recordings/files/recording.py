@@ -25,6 +25,7 @@ from src.recordings.files.event_file import (
     RawEvents,
     ReadOptions,
     WidthHeight,
+    refuse_column_order,
     require_default_stream,
 )
 from src.recordings.files.event_order import EventSorter, merge_in_time
@@ -48,6 +49,7 @@ READERS: dict[str, Reader] = {  # by the ending, in small letters
     **dict.fromkeys((*TEXT_ENDINGS, ".gz", ".zip"), TextFile),
 }  # fmt: skip
 OF_ONE_CAMERA = (PropheseeFile, EsFile, TextFile, EvrealFolder)
+NO_TABLES = (PropheseeFile, Aedat4File, Aedat1To3File, EsFile, RosbagFile, EvrealFolder)
 OF_THE_CAMERA = (PropheseeFile, EsFile, Aedat4File, Aedat1To3File)  # it wrote the sensor's size
 
 
@@ -237,6 +239,8 @@ def _open_file(path: Path, options: ReadOptions) -> EventFile:
         raise ValueError(f"{path}: unknown kind of event file, known are {', '.join(READERS)}")
     if reader in OF_ONE_CAMERA:
         require_default_stream(path, options.stream)
+    if reader in NO_TABLES:
+        refuse_column_order(options.columns, f"{path} is no table")
     if options.format is not None and path.suffix.lower() != ".raw":
         raise ValueError(f"format must be null, as {path} is no RAW file, got {options.format}")
     inner = Path(path.stem).suffix.lower()
