@@ -103,7 +103,7 @@ def find_contrast_threshold(cfg: DictConfig, run: Path) -> dict[str, tuple]:
     options, pipeline = ReadOptions.from_keys(cfg), build.build_pipeline(cfg, "test")
     views = sources.find_views(cfg.recording, cfg.views, cfg.sensor_size, options)
     lookup = sensor_lookup.build_lookup(views)
-    events = open_recording(cfg.recording, views.sensor[::-1], options)
+    events = open_recording(cfg.recording, views.sensor, options)
     measured = contrast_threshold.measure_event_rates(events, lookup.view)
     contrast_threshold.require_both_polarities(measured)
     drawn = [pipeline.draw(index) for index in range(cfg.clips)]

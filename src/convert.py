@@ -29,7 +29,7 @@ def convert(cfg: DictConfig) -> Path:
     height, width = sources.find_sensor_size(source, cfg.sensor_size, options)
     how = {"width": width, "height": height, "version": cfg.version, "layout": cfg.layout}
     event_writers.choose_file_kind(out, **how)
-    opened = recording.open_recording(source, (width, height), options)
+    opened = recording.open_recording(source, (height, width), options)
     frames = (
         find_frames_to_convert(opened, (height, width), cfg) if cfg.layout == "evreal" else None
     )

@@ -60,7 +60,7 @@ def open_feed(
         return CameraFeed(faults)
     if not recording.startswith("udp://"):
         size = sources.find_sensor_size(recording, sensor, options)
-        opened = open_recording(recording, size[::-1], options)
+        opened = open_recording(recording, size, options)
         opened.check_sensor_size()
         if lines := opened.messages:
             faults.report("reading", "; ".join(lines), until_cleared=True)

@@ -95,7 +95,7 @@ def pickle(path):
         file.writestr("a/version", "3\n")
 
 
-READ = partial(recording.read_events, size=(640, 480))
+READ = partial(recording.read_events, sensor_size=(480, 640))
 FRAMES, PUBLISHED = (lambda path: next(videos.read_video(path)),), whole.read_published
 CASES = [  # name, content or what writes it, words of the refusal, readers
     ("a.h5", partial(table, shape=10**12), "unpacks to", [READ]),

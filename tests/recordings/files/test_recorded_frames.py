@@ -36,7 +36,7 @@ def written(tmp_path, request):
 def test_events_and_frames_of_each_layout(written):
     path, events, frames, zero = written
     assert sources.find_sensor_size(path) == SIZE
-    found = read_events(path, SIZE[::-1])
+    found = read_events(path, sensor_size=SIZE)
     assert np.array_equal(found["t"], events["t"] - zero)
     for name in "xyp":
         assert np.array_equal(found[name], events[name]), name
@@ -98,7 +98,7 @@ def test_pictures_without_times_are_left_out_with_a_word(tmp_path):
     path = write_recording(tmp_path / "cap", "timelens", make_events(), make_frames())
     (path / "images/timestamp.txt").unlink()
     with pytest.warns(UserWarning, match=r"5 frames without timestamp\.txt, left out"):
-        assert find_frames(open_recording(path, SIZE[::-1])) is None
+        assert find_frames(open_recording(path, SIZE)) is None
 
 
 def test_a_time_that_is_wrong_lies_between_its_neighbours(tmp_path):
@@ -145,7 +145,7 @@ def test_frames_that_cannot_be_read_are_named(tmp_path, spoil, words):
     spoil(path)
     with warnings.catch_warnings(), pytest.raises(ValueError, match=words) as error:
         warnings.simplefilter("ignore")
-        list(find_frames(open_recording(path, SIZE[::-1])).pictures())
+        list(find_frames(open_recording(path, SIZE)).pictures())
     assert str(error.value).startswith(str(path))
 
 

@@ -47,7 +47,7 @@ def test_the_users_size_comes_before_the_files(tmp_path):
     with pytest.warns(UserWarning, match=line):
         assert sources.find_sensor_size(tmp_path / "a.raw", [500, 700]) == (500, 700)
     with pytest.warns(UserWarning, match=line):
-        assert open_recording(tmp_path / "a.raw", (700, 500)).size == (700, 500)
+        assert open_recording(tmp_path / "a.raw", (500, 700)).size == (700, 500)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert sources.find_sensor_size(tmp_path / "a.raw", [480, 640]) == (480, 640)
@@ -72,11 +72,11 @@ def test_half_of_the_events_off_the_sensor_are_refused(tmp_path, ending, outside
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         if not is_refused:
-            assert len(read_events(path, (400, 300))) == 1001
+            assert len(read_events(path, sensor_size=(300, 400))) == 1001
             return
         words = "1000 of 2000 events are off the 400x300 sensor, they need 501x8; is sensor_size="
         with pytest.raises(ValueError, match=words):
-            read_events(path, (400, 300))
+            read_events(path, sensor_size=(300, 400))
 
 
 def test_parts_of_a_pixel_without_frames_are_told_of(tmp_path):
@@ -87,3 +87,8 @@ def test_parts_of_a_pixel_without_frames_are_told_of(tmp_path):
     for path in (tmp_path, tmp_path / "000000.npz"):
         with pytest.warns(UserWarning, match="up to 15968 and 9568, beyond any sensor; parts of"):
             read_events(path)
+
+
+def test_the_former_size_is_refused_with_its_new_name(tmp_path):
+    with pytest.raises(ValueError, match=r"is now sensor_size=\(height, width\), got \(640, 480\)"):
+        read_events(tmp_path / "a.raw", size=(640, 480))

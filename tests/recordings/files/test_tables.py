@@ -328,7 +328,7 @@ def test_one_of_two_cameras_is_read_and_the_other_is_told_of(tmp_path, events):
 def test_an_npz_states_its_size_in_two_numbers_or_not_at_all(tmp_path, events):
     columns = {name: events[name] for name in "txyp"}
     np.savez(tmp_path / "other.npz", **columns, resolution=(WIDTH, HEIGHT))
-    assert open_recording(tmp_path / "other.npz", (WIDTH, HEIGHT)).size == (WIDTH, HEIGHT)
+    assert open_recording(tmp_path / "other.npz", (HEIGHT, WIDTH)).size == (WIDTH, HEIGHT)
     np.savez(tmp_path / "three.npz", **columns, size=(WIDTH, HEIGHT, 3))
     with pytest.raises(ValueError, match=r"size must be \(width, height\), got"):
         open_recording(tmp_path / "three.npz")
