@@ -27,7 +27,7 @@ from src.recordings.calibration import (
     turbulence_meter,
     view_alignment,
 )
-from src.recordings.calibration.boards import Circles, Target
+from src.recordings.calibration.boards import Target, check_grid_size
 from src.recordings.files import sources, videos
 from src.recordings.files.event_file import ReadOptions
 from src.recordings.files.recording import open_recording
@@ -128,10 +128,7 @@ def measure_dot_statistics(cfg: DictConfig, run: Path) -> dot_statistics.DotStat
         if not Path(cfg[key]).exists():
             wanted = f"{key} must be a film, a folder of pictures or events"
             raise ValueError(f"{wanted}, got {cfg[key]}, which does not exist")
-    try:
-        Circles(cfg.dots.rows, cfg.dots.cols)
-    except ValueError as error:
-        raise ValueError(str(error).replace("target.", "dots.")) from error
+    check_grid_size(cfg.dots.rows, cfg.dots.cols, "dots")
     given = cfg.ckpt or cfg.get("baseline")
     network = (
         reconstruction.require_event_network(build.load_ckpt_or_baseline(cfg)) if given else None
