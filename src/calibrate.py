@@ -28,7 +28,7 @@ from src.recordings.calibration import (
     view_alignment,
 )
 from src.recordings.calibration.boards import Target, check_grid_size
-from src.recordings.files import sources, videos
+from src.recordings.files import recording_inputs, videos
 from src.recordings.files.event_file import ReadOptions
 from src.recordings.files.recording import open_recording
 from src.recordings.files.turbulence_file import SIDE
@@ -59,7 +59,7 @@ def _find_views_of_board(cfg: DictConfig, run: Path, target: Target) -> Views:
     `found.png` remains.
     """
     options = ReadOptions.from_keys(cfg)
-    seen = sources.read_picture_or_event_counts(cfg.recording, cfg.sensor_size, options)
+    seen = recording_inputs.read_picture_or_event_counts(cfg.recording, cfg.sensor_size, options)
     picture = view_alignment.repair_picture(seen)
     sizes = {"sensor": picture.shape, "model": tuple(cfg.resolution)}
     if cfg.corners:
@@ -101,7 +101,7 @@ def find_contrast_threshold(cfg: DictConfig, run: Path) -> dict[str, tuple]:
     if cfg.clips < 1:
         raise ValueError(f"clips must be >= 1, got {cfg.clips}")
     options, pipeline = ReadOptions.from_keys(cfg), build.build_pipeline(cfg, "test")
-    views = sources.find_views(cfg.recording, cfg.views, cfg.sensor_size, options)
+    views = recording_inputs.find_views(cfg.recording, cfg.views, cfg.sensor_size, options)
     lookup = sensor_lookup.build_lookup(views)
     events = open_recording(cfg.recording, views.sensor, options)
     measured = contrast_threshold.measure_event_rates(events, lookup.view)
@@ -164,15 +164,15 @@ def _read_films(
     cfg: DictConfig, key: str, views: Views | None, network: EventToVideoNetwork | None
 ) -> Float[np.ndarray, "views frames h w"]:
     path = cfg[key]
-    if not sources.has_events(path):
+    if not recording_inputs.has_events(path):
         frames = videos.read_video(path, key)
         return np.stack([views.warp_to_model(f) if views else f[None] for f in frames], axis=1)
     if network is None:
         raise ValueError(f"ckpt or baseline must reconstruct the events of {path}, got neither")
     options = ReadOptions.from_keys(cfg)
-    seen = sources.find_views(path, cfg.views, cfg.sensor_size, options)
+    seen = recording_inputs.find_views(path, cfg.views, cfg.sensor_size, options)
     rule = event_windows.build_window_rule("trained", fps=cfg.fps)
-    events = sources.iter_recording(path, seen.sensor, options=options)
+    events = recording_inputs.iter_recording(path, seen.sensor, options=options)
     windows = event_windows.cut_windows(events, sensor_lookup.build_lookup(seen), rule)
     return np.stack(
         list(reconstruction.reconstruct_each_view(windows, network, rule.frames_per_window)), axis=1
@@ -233,7 +233,7 @@ def calibrate(cfg: DictConfig) -> dict:
     if cfg.save:
         check_writable(Path(cfg.save), "save")
     if cfg.fps is None and cfg.task != "air":
-        is_film = cfg.task == "turbulence" and not sources.has_events(cfg.recording)
+        is_film = cfg.task == "turbulence" and not recording_inputs.has_events(cfg.recording)
         stated = videos.read_fps(cfg.recording, "recording") if is_film else None
         cfg.fps = stated or 120.0
     run = Path(cfg.paths.run)

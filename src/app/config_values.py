@@ -67,7 +67,7 @@ BOUNDS: dict[str, tuple[int, float]] = {  # of what others would refuse without 
 }  # fmt: skip
 KINDS = {key: kinds for kinds, keys in KEYS.items() for key in keys.split()}
 # Parts whose own classes check whether a number, a range of numbers or null does.
-RANGES = ("augment.", "optics.", "own_sensor.", "scene.", "sensor.", "target.", "turbulence.")
+RANGES = ("augment.", "optics.", "user_clip_sensor.", "scene.", "sensor.", "target.", "turbulence.")
 SIZES = ("sensor_size", "resolution", "camera.sensor_size")  # [height, width]
 # More entries do.
 OPEN = ("callbacks", "logger", "loss", "networks", "references", "scene.parts", "stress_tests")

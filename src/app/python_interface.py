@@ -13,14 +13,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from src.app.compose import compose_checked_config, config_choices, read_override_key
-from src.app.own_simulation import (
-    OwnSimulation,
-    read_own_clip,
+from src.app.user_clip_simulation import (
+    UserClipSimulation,
+    read_user_clip,
     refuse_keys_of_scenes,
-    set_own_sensor,
+    set_user_clip_sensor,
 )
+from src.recordings.files.event_arrays import concatenate_events, sort_events
 from src.sim.optics import Position, view_id
-from src.sim.scenes import own_material
+from src.sim.scenes import user_clip
 from src.sim.scenes.video_files import PICTURE_SUFFIXES
 
 VIEW_EVENT = np.dtype(
@@ -95,18 +96,18 @@ def simulate(
             raise ValueError(f"{group} must be one of {', '.join(names)}, got {choice}")
     chosen = [f"turbulence={turbulence}", f"optics.views={views}", f"sensor={sensor}"]
     cfg = compose_checked_config("simulate", [*chosen, f"seed={seed}"], overrides)
-    set_own_sensor(cfg, overrides)
+    set_user_clip_sensor(cfg, overrides)
     options: dict[str, Any] = {"fps": fps, "seconds": seconds, "longest_side_px": longest_side_px}
     options |= {"start_s": start_s, "end_s": end_s}
     if isinstance(photo_or_video, str | Path):
         path = Path(photo_or_video)
         key = "photo" if path.suffix.lower() in PICTURE_SUFFIXES else "video"
         cfg.update(options | {key: str(path)})
-        clip = read_own_clip(cfg)
+        clip = read_user_clip(cfg)
     else:
         options |= {"speed_widths_per_s": cfg.speed_widths_per_s, "seed": cfg.seed}
-        clip = own_material.clip_from_array(photo_or_video, white_level=cfg.white_level, **options)
-    return simulate_clip(OwnSimulation(cfg, clip))
+        clip = user_clip.clip_from_array(photo_or_video, white_level=cfg.white_level, **options)
+    return simulate_clip(UserClipSimulation(cfg, clip))
 
 
 def _refuse_other_overrides(overrides: Sequence[str]) -> None:
@@ -118,7 +119,7 @@ def _refuse_other_overrides(overrides: Sequence[str]) -> None:
     refuse_keys_of_scenes(overrides)
 
 
-def simulate_clip(work: OwnSimulation) -> SimulatedClip:
+def simulate_clip(work: UserClipSimulation) -> SimulatedClip:
     """Return all that `work` makes."""
     clip, count, shape = work.clip, len(work.clip.frames), work.clip.size
     clean = np.empty((count, *shape), np.float32)
@@ -137,7 +138,7 @@ def simulate_clip(work: OwnSimulation) -> SimulatedClip:
 
 
 def simulate_all_view_events(
-    work: OwnSimulation, views: Float[Tensor, "views frames h w"]
+    work: UserClipSimulation, views: Float[Tensor, "views frames h w"]
 ) -> np.ndarray:
     """Return the events of all views in order of time."""
     parts = []
@@ -146,5 +147,4 @@ def simulate_all_view_events(
         own = work.sensor.events(light, work.simulated_fps, **place)
         parts.append(np.empty(len(own), VIEW_EVENT))
         parts[-1][[*"txyp"]], parts[-1]["view"] = own[[*"txyp"]], index
-    events = np.concatenate(parts)
-    return events[np.argsort(events["t"], kind="stable")]
+    return sort_events(concatenate_events(parts))

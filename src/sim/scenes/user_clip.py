@@ -34,7 +34,7 @@ DARK_SHARE = 1 / 8  # of full scale: a picture below this has data of fewer bits
 
 
 @dataclass(frozen=True, eq=False)
-class OwnClip:
+class UserClip:
     """`frames` (frames, h, w), 16 or 32 bit floats in [0, 1], code values, at `fps`; `source`: what
     the material is, in words.
     """
@@ -67,7 +67,7 @@ class OwnClip:
 def read_video(
     path: Path | str, *, fps: float | None = None, start_s: float = 0.0, end_s: float = math.inf,
     longest_side_px: int | None = None, white_level: float | None = None,
-) -> OwnClip:  # fmt: skip
+) -> UserClip:  # fmt: skip
     """Return a video file, or a folder of frames, from `start_s` to `end_s`.
 
     `fps`: that it is taken for (None: as the file says); `longest_side_px` of its frames (None:
@@ -91,7 +91,7 @@ def read_video(
     _warn_of_darkness(path, kind, largest, white_level)
     part = "all" if stop - first == source.count else f"frames {first} to {stop - 1}"
     facts = f"{shape[1]}x{shape[0]} px, {rate:.6g} frames/s, {part} of {source.count} frames"
-    return OwnClip(source.name, np.stack(frames), rate, facts)
+    return UserClip(source.name, np.stack(frames), rate, facts)
 
 
 def _find_part(count: int, fps: float, start_s: float, end_s: float, name: str) -> tuple[int, int]:
@@ -127,7 +127,7 @@ def read_photograph(
     path: Path | str, *, fps: float | None = None, seconds: float | None = None,
     longest_side_px: int | None = None, white_level: float | None = None,
     speed_widths_per_s: float = 0.0, seed: int = 0,
-) -> OwnClip:  # fmt: skip
+) -> UserClip:  # fmt: skip
     """Return a photograph for `seconds` (None: 1) at `fps` (None: 120): at rest, or in a smooth
     motion, drawn from `seed`, of `speed_widths_per_s` frame widths a second (`SimilarityMotion`).
     `white_level` as in `read_video`.
@@ -142,14 +142,14 @@ def read_photograph(
     fps = PHOTO_FPS if fps is None else fps
     frames = _hold_or_move(values, fps, seconds, speed_widths_per_s, seed)
     _warn_of_darkness(path, picture.dtype, float(picture.max()), white_level)
-    return OwnClip(Path(path).stem, frames, fps, facts)
+    return UserClip(Path(path).stem, frames, fps, facts)
 
 
 def clip_from_array(
     values: Any, *, fps: float | None = None, seconds: float | None = None, start_s: float = 0.0,
     end_s: float = math.inf, longest_side_px: int | None = None, white_level: float | None = None,
     speed_widths_per_s: float = 0.0, seed: int = 0,
-) -> OwnClip:  # fmt: skip
+) -> UserClip:  # fmt: skip
     """Return an array as a clip: (h, w), a photograph, or (frames, h, w), a video at `fps`, of
     uint8 or of floats in [0, 1].  `start_s`, `end_s` and `white_level` as in `read_video`,
     `seconds`, `speed_widths_per_s` and `seed` as in `read_photograph`.
@@ -173,14 +173,14 @@ def clip_from_array(
         fps = PHOTO_FPS if fps is None else fps
         values = _shrink(array, longest_side_px)
         frames = _hold_or_move(values, fps, seconds, speed_widths_per_s, seed)
-        return OwnClip("photograph", frames, fps, facts)
+        return UserClip("photograph", frames, fps, facts)
     refuse_motion_of_video(seconds, speed_widths_per_s)
     if fps is None:
         raise ValueError("fps must be given for an array of frames, frames a second")
     _check_rate(fps)
     first, stop = _find_part(len(array), fps, start_s, end_s, "the array")
     frames = np.stack([_shrink(frame, longest_side_px) for frame in array[first:stop]])
-    return OwnClip("video", frames, fps, f"{facts}, {fps:.6g} frames/s, {len(frames)} frames")
+    return UserClip("video", frames, fps, f"{facts}, {fps:.6g} frames/s, {len(frames)} frames")
 
 
 def _find_one_video(path: Path) -> VideoSource:
