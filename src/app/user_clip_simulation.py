@@ -155,7 +155,8 @@ def refuse_keys_of_scenes(overrides: Iterable[str]) -> None:
     """Raise ValueError for an override that a video or photograph does not follow from."""
     for key in map(read_override_key, overrides):
         if key.partition(".")[0] in KEYS_OF_SCENES:
-            raise ValueError(f"{key} must not be given with a video or photograph: it is of scene")
+            wrong = "must not be given with a video or photograph: it is of clips of a scene"
+            raise ValueError(f"{key} {wrong}")
 
 
 def set_user_clip_sensor(cfg: DictConfig, overrides: Iterable[str]) -> None:
