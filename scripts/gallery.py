@@ -23,7 +23,7 @@ from src.app.script import run_script
 from src.figures import plots
 from src.metrics.invented_contrast import find_unseen_pixels, invented_contrast
 from src.reconstruct import choose_views, reconstruct_video_frames
-from src.recordings.files import sources, videos
+from src.recordings.files import recording_inputs, videos
 from src.recordings.files.frame_files import read_frame_list
 from src.recordings.noise_filter import find_supported_pixels
 from src.recordings.reconstruction import Frame, require_event_network
@@ -58,7 +58,7 @@ def camera(recording: str, time_s: float) -> Float[np.ndarray, "h w"] | None:
 
 def unseen(recording: str, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
     """Return where no event that is not noise was ever near."""
-    events = sources.iter_recording(recording.partition("@")[0], size, 0.05)
+    events = recording_inputs.iter_recording(recording.partition("@")[0], size, 0.05)
     return find_unseen_pixels(find_supported_pixels(events, size))
 
 

@@ -27,9 +27,9 @@ from src.recordings.calibration import (
     turbulence_meter,
     view_alignment,
 )
-from src.recordings.calibration.boards import Circles, Target
+from src.recordings.calibration.boards import Target, check_grid_size
 from src.recordings.calibration.gaussian_dots import GaussianFits
-from src.recordings.files import sources, videos
+from src.recordings.files import recording_inputs, videos
 from src.recordings.files.event_file import ReadOptions
 from src.recordings.files.recording import open_recording
 from src.recordings.files.turbulence_file import SIDE
@@ -62,7 +62,7 @@ def _find_views_of_board(cfg: DictConfig, run: Path, target: Target) -> Views:
     `found.png` remains.
     """
     options = ReadOptions.from_keys(cfg)
-    seen = sources.read_picture_or_event_counts(cfg.recording, cfg.sensor_size, options)
+    seen = recording_inputs.read_picture_or_event_counts(cfg.recording, cfg.sensor_size, options)
     picture = view_alignment.repair_picture(seen)
     sizes = {"sensor": picture.shape, "model": tuple(cfg.resolution)}
     if cfg.corners:
@@ -104,9 +104,9 @@ def find_contrast_threshold(cfg: DictConfig, run: Path) -> dict[str, tuple]:
     if cfg.clips < 1:
         raise ValueError(f"clips must be >= 1, got {cfg.clips}")
     options, pipeline = ReadOptions.from_keys(cfg), build.build_pipeline(cfg, "test")
-    views = sources.find_views(cfg.recording, cfg.views, cfg.sensor_size, options)
+    views = recording_inputs.find_views(cfg.recording, cfg.views, cfg.sensor_size, options)
     lookup = sensor_lookup.build_lookup(views)
-    events = open_recording(cfg.recording, views.sensor[::-1], options)
+    events = open_recording(cfg.recording, views.sensor, options)
     measured = contrast_threshold.measure_event_rates(events, lookup.view)
     contrast_threshold.require_both_polarities(measured)
     drawn = [pipeline.draw(index) for index in range(cfg.clips)]
@@ -145,10 +145,7 @@ def _check_dot_options(cfg: DictConfig) -> None:
         if not Path(cfg[key]).exists():
             wanted = f"{key} must be a film, a folder of pictures or events"
             raise ValueError(f"{wanted}, got {cfg[key]}, which does not exist")
-    try:
-        Circles(cfg.dots.rows, cfg.dots.cols)
-    except ValueError as error:
-        raise ValueError(str(error).replace("target.", "dots.")) from error
+    check_grid_size(cfg.dots.rows, cfg.dots.cols, "dots")
 
 
 def _load_dot_films(cfg: DictConfig, views: Views | None) -> tuple[Films, Films]:
@@ -193,15 +190,15 @@ def _read_films(
     cfg: DictConfig, key: str, views: Views | None, network: EventToVideoNetwork | None
 ) -> Films:
     path = cfg[key]
-    if not sources.has_events(path):
+    if not recording_inputs.has_events(path):
         frames = videos.read_video(path, key)
         return np.stack([views.warp_to_model(f) if views else f[None] for f in frames], axis=1)
     if network is None:
         raise ValueError(f"ckpt or baseline must reconstruct the events of {path}, got neither")
     options = ReadOptions.from_keys(cfg)
-    seen = sources.find_views(path, cfg.views, cfg.sensor_size, options)
+    seen = recording_inputs.find_views(path, cfg.views, cfg.sensor_size, options)
     rule = event_windows.build_window_rule("trained", fps=cfg.fps)
-    events = sources.iter_recording(path, seen.sensor, options=options)
+    events = recording_inputs.iter_recording(path, seen.sensor, options=options)
     windows = event_windows.cut_windows(events, sensor_lookup.build_lookup(seen), rule)
     pictures = reconstruction.reconstruct_each_view(windows, network, rule.overlapping_windows)
     return np.stack(list(pictures), axis=1)
@@ -261,7 +258,7 @@ def calibrate(cfg: DictConfig) -> dict:
     if cfg.save:
         check_writable(Path(cfg.save), "save")
     if cfg.fps is None and cfg.task != "air":
-        is_film = cfg.task == "turbulence" and not sources.has_events(cfg.recording)
+        is_film = cfg.task == "turbulence" and not recording_inputs.has_events(cfg.recording)
         stated = videos.read_fps(cfg.recording, "recording") if is_film else None
         cfg.fps = stated or 120.0
     run = Path(cfg.paths.run)

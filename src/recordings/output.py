@@ -93,8 +93,8 @@ def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> i
     return how many.
 
     The file is there when it is whole.  Raises ValueError for another ending of `path`, no frames,
-    frames of several sizes, other values (beyond an overshoot, which is clipped) and an `fps`
-    outside [0.1, 1000].
+    frames of several sizes, floats outside [-0.5, 1.5] (what is beyond [0, 1] is clipped), other
+    types and an `fps` outside [0.1, 1000].
     """
     path, given = Path(path), map(np.asarray, frames)
     first = next(given, None)

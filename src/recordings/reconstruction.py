@@ -25,7 +25,8 @@ RunnableNetwork = EventToVideoNetwork | EventListRuntime
 @dataclass(frozen=True)
 class Frame:
     """A picture (h, w), or (h, w, 3) of a film, float32 in [0, 1] at `time_s`, the end of its
-    window; its window's number of `events` in views and `events_outside` of all."""
+    window; of this window's events the number of those in views, `events`, and of those in no view,
+    `events_outside`."""
 
     time_s: float
     picture: Float[np.ndarray, "h w *rgb"]
