@@ -23,7 +23,8 @@ from src.app.script import run_script
 from src.figures import plots
 from src.metrics.invented_contrast import find_unseen_pixels, invented_contrast
 from src.reconstruct import choose_views, reconstruct_video_frames
-from src.recordings.files import sources, videos
+from src.recordings.files import recording_inputs, videos
+from src.recordings.files.frame_files import read_frame_list
 from src.recordings.noise_filter import find_supported_pixels
 from src.recordings.reconstruction import Frame, require_event_network
 
@@ -45,18 +46,19 @@ def last(recording: str, network: str, published: Path | None) -> Frame:
 
 
 def camera(recording: str, time_s: float) -> Float[np.ndarray, "h w"] | None:
-    """Return the camera's frame nearest to `time_s`, if there is a camera."""
+    """Return the camera's frame nearest to `time_s`, if there is a camera; ValueError for a list of
+    its frames that cannot be read."""
     listing = Path(recording.partition("@")[0]).parent / CAMERA
     if not listing.is_file():
         return None
-    lines = (line.split() for line in listing.read_text().splitlines())
-    _, name = min(lines, key=lambda line: abs(float(line[0]) - time_s))
-    return next(videos.read_video(listing.parent / name))
+    frames = read_frame_list(listing)
+    nearest = min(frames, key=lambda row: abs(row[0] - time_s), default=None)
+    return None if nearest is None else next(videos.read_video(nearest[1]))
 
 
 def unseen(recording: str, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
     """Return where no event that is not noise was ever near."""
-    events = sources.iter_recording(recording.partition("@")[0], size, 0.05)
+    events = recording_inputs.iter_recording(recording.partition("@")[0], size, 0.05)
     return find_unseen_pixels(find_supported_pixels(events, size))
 
 

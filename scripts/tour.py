@@ -13,7 +13,7 @@ from scripts.readme import AIR, HOME, NINE, ONE, load_shipped, reconstruct_clip
 from src.app import build
 from src.app.compose import compose_config
 from src.app.script import run_script
-from src.figures.samples import join_panels, render_events, tile_views
+from src.figures.samples import join_panels, place_views_at_apertures, render_events
 from src.recordings import simulated_recording
 from src.recordings.output import round_to_uint8
 from src.records.atomic import atomic_path
@@ -84,7 +84,9 @@ def draw_all(index: int) -> None:
     save("2_tilt", {f"tilt in x, to {reach:.1f} px": right, "tilt in y": down})
     first, second = map(colours, stars(pipeline, draw)[:, :96, :96])
     save("3_psfs", {"points through one view": first, "through its neighbour": second}, scale=4)
-    grid = tile_views([colours(view[-1:].numpy()) for view in views], pipeline.optics)[0]
+    grid = place_views_at_apertures(
+        [colours(view[-1:].numpy()) for view in views], pipeline.optics
+    )[0]
     save("4_views", {"what the nine views see": grid}, scale=1)
     save("5_sensor", {"events of 1/30 s on one sensor": chip(pipeline, draw, views)}, scale=1)
     events = render_events(voxels.sum(1).numpy())[centre : centre + 2]

@@ -22,7 +22,8 @@ from torch import Tensor, nn
 from src.app import build, entry_point
 from src.models import files
 from src.models.layers import PreActivationBlock
-from src.models.setnet import SetNet, ViewKernels
+from src.models.setnet import SetNet
+from src.models.view_kernels import ViewKernels
 from src.training.learning_curve import read_training_progress
 
 SPREAD = 1.0  # a part is 1 / copies, give or take up to so much

@@ -27,14 +27,17 @@ from src.recordings.calibration import (
     turbulence_meter,
     view_alignment,
 )
-from src.recordings.calibration.boards import Circles, Target
-from src.recordings.files import sources, videos
+from src.recordings.calibration.boards import Target, check_grid_size
+from src.recordings.calibration.gaussian_dots import GaussianFits
+from src.recordings.files import recording_inputs, videos
 from src.recordings.files.event_file import ReadOptions
 from src.recordings.files.recording import open_recording
 from src.recordings.files.turbulence_file import SIDE
 from src.recordings.views import Views, load_views
 from src.records import results
 from src.records.atomic import check_writable
+
+Films = Float[np.ndarray, "views frames h w"]
 
 
 def calibrate_views(cfg: DictConfig, run: Path) -> dict[str, str]:
@@ -59,7 +62,7 @@ def _find_views_of_board(cfg: DictConfig, run: Path, target: Target) -> Views:
     `found.png` remains.
     """
     options = ReadOptions.from_keys(cfg)
-    seen = sources.read_picture_or_event_counts(cfg.recording, cfg.sensor_size, options)
+    seen = recording_inputs.read_picture_or_event_counts(cfg.recording, cfg.sensor_size, options)
     picture = view_alignment.repair_picture(seen)
     sizes = {"sensor": picture.shape, "model": tuple(cfg.resolution)}
     if cfg.corners:
@@ -101,9 +104,9 @@ def find_contrast_threshold(cfg: DictConfig, run: Path) -> dict[str, tuple]:
     if cfg.clips < 1:
         raise ValueError(f"clips must be >= 1, got {cfg.clips}")
     options, pipeline = ReadOptions.from_keys(cfg), build.build_pipeline(cfg, "test")
-    views = sources.find_views(cfg.recording, cfg.views, cfg.sensor_size, options)
+    views = recording_inputs.find_views(cfg.recording, cfg.views, cfg.sensor_size, options)
     lookup = sensor_lookup.build_lookup(views)
-    events = open_recording(cfg.recording, views.sensor[::-1], options)
+    events = open_recording(cfg.recording, views.sensor, options)
     measured = contrast_threshold.measure_event_rates(events, lookup.view)
     contrast_threshold.require_both_polarities(measured)
     drawn = [pipeline.draw(index) for index in range(cfg.clips)]
@@ -122,39 +125,11 @@ def measure_dot_statistics(cfg: DictConfig, run: Path) -> dot_statistics.DotStat
 
     A recording of events is reconstructed first, each view by itself, by a network of one view.
     """
-    if not cfg.still:
-        raise ValueError("still must be the same dots without turbulence, got none")
-    for key in ("still", "recording"):
-        if not Path(cfg[key]).exists():
-            wanted = f"{key} must be a film, a folder of pictures or events"
-            raise ValueError(f"{wanted}, got {cfg[key]}, which does not exist")
-    try:
-        Circles(cfg.dots.rows, cfg.dots.cols)
-    except ValueError as error:
-        raise ValueError(str(error).replace("target.", "dots.")) from error
-    given = cfg.ckpt or cfg.get("baseline")
-    network = (
-        reconstruction.require_event_network(build.load_ckpt_or_baseline(cfg)) if given else None
-    )
-    views, dots = None if cfg.views is None else load_views(cfg.views), cfg.dots
+    _check_dot_options(cfg)
+    views = None if cfg.views is None else load_views(cfg.views)
     positions = views.positions if views else [(0, 0)]
-    still_films, turbulent_films = (
-        _read_films(cfg, key, views, network) for key in ("still", "recording")
-    )
-    wanted, got = ("x".join(map(str, film.shape[2:])) for film in (turbulent_films, still_films))
-    if wanted != got:
-        raise ValueError(f"still must have pictures of the recording's size, {wanted}, got {got}")
     centre = positions.index((0, 0))
-    places = dot_statistics.find_dots(still_films[centre].mean(0), dots.rows, dots.cols, dots.dark)
-    reach = dots.fit_radius_px or dot_statistics.choose_fit_radius(places)
-    if dots.dark:  # the vignette of a bright ground would pass for a part of the dots
-        grounds = [
-            dot_statistics.fit_background(film.mean(0), places, reach) for film in still_films
-        ]
-        light = np.stack(grounds)[:, None]
-        still_films, turbulent_films = still_films / light, turbulent_films / light
-    turbulent_fits = [gaussian_dots.fit_gaussians(film, places, reach) for film in turbulent_films]
-    still_fits = [gaussian_dots.fit_gaussians(film, places, reach) for film in still_films]
+    turbulent_fits, still_fits = _fit_dots(cfg.dots, *_load_dot_films(cfg, views), centre)
     fitted = dot_statistics.compare_with_still(
         turbulent_fits, still_fits, fps=cfg.fps, centre_view=centre
     )
@@ -163,23 +138,70 @@ def measure_dot_statistics(cfg: DictConfig, run: Path) -> dot_statistics.DotStat
     return fitted
 
 
+def _check_dot_options(cfg: DictConfig) -> None:
+    if not cfg.still:
+        raise ValueError("still must be the same dots without turbulence, got none")
+    for key in ("still", "recording"):
+        if not Path(cfg[key]).exists():
+            wanted = f"{key} must be a film, a folder of pictures or events"
+            raise ValueError(f"{wanted}, got {cfg[key]}, which does not exist")
+    check_grid_size(cfg.dots.rows, cfg.dots.cols, "dots")
+
+
+def _load_dot_films(cfg: DictConfig, views: Views | None) -> tuple[Films, Films]:
+    """Return the films of `recording` and of `still`; ValueError for pictures of two sizes."""
+    given = cfg.ckpt or cfg.get("baseline")
+    network = (
+        reconstruction.require_event_network(build.load_ckpt_or_baseline(cfg)) if given else None
+    )
+    still, turbulent = (_read_films(cfg, key, views, network) for key in ("still", "recording"))
+    wanted, got = ("x".join(map(str, films.shape[2:])) for films in (turbulent, still))
+    if wanted != got:
+        raise ValueError(f"still must have pictures of the recording's size, {wanted}, got {got}")
+    return turbulent, still
+
+
+def _fit_dots(
+    dots: DictConfig, turbulent: Films, still: Films, centre: int
+) -> tuple[list[GaussianFits], list[GaussianFits]]:
+    """Return the fits of the dots in the films of each view, with turbulence and without."""
+    places = dot_statistics.find_dots(still[centre].mean(0), dots.rows, dots.cols, dots.dark)
+    reach = dots.fit_radius_px or dot_statistics.choose_fit_radius(places)
+    if dots.dark:
+        turbulent, still = _divide_by_background(turbulent, still, places, reach)
+    turbulent_fits, still_fits = (
+        [gaussian_dots.fit_gaussians(film, places, reach) for film in films]
+        for films in (turbulent, still)
+    )
+    return turbulent_fits, still_fits
+
+
+def _divide_by_background(
+    turbulent: Films, still: Films, places: Float[np.ndarray, "dots 2"], reach: int
+) -> tuple[Films, Films]:
+    """Return the films over the bright ground of each view: its vignette would pass for a part of
+    the dots."""
+    grounds = [dot_statistics.fit_background(film.mean(0), places, reach) for film in still]
+    light = np.stack(grounds)[:, None]
+    return turbulent / light, still / light
+
+
 def _read_films(
     cfg: DictConfig, key: str, views: Views | None, network: EventToVideoNetwork | None
-) -> Float[np.ndarray, "views frames h w"]:
+) -> Films:
     path = cfg[key]
-    if not sources.has_events(path):
+    if not recording_inputs.has_events(path):
         frames = videos.read_video(path, key)
         return np.stack([views.warp_to_model(f) if views else f[None] for f in frames], axis=1)
     if network is None:
         raise ValueError(f"ckpt or baseline must reconstruct the events of {path}, got neither")
     options = ReadOptions.from_keys(cfg)
-    seen = sources.find_views(path, cfg.views, cfg.sensor_size, options)
+    seen = recording_inputs.find_views(path, cfg.views, cfg.sensor_size, options)
     rule = event_windows.build_window_rule("trained", fps=cfg.fps)
-    events = sources.iter_recording(path, seen.sensor, options=options)
+    events = recording_inputs.iter_recording(path, seen.sensor, options=options)
     windows = event_windows.cut_windows(events, sensor_lookup.build_lookup(seen), rule)
-    return np.stack(
-        list(reconstruction.reconstruct_each_view(windows, network, rule.frames_per_window)), axis=1
-    )
+    pictures = reconstruction.reconstruct_each_view(windows, network, rule.overlapping_windows)
+    return np.stack(list(pictures), axis=1)
 
 
 def measure_turbulence_in_video(
@@ -236,7 +258,7 @@ def calibrate(cfg: DictConfig) -> dict:
     if cfg.save:
         check_writable(Path(cfg.save), "save")
     if cfg.fps is None and cfg.task != "air":
-        is_film = cfg.task == "turbulence" and not sources.has_events(cfg.recording)
+        is_film = cfg.task == "turbulence" and not recording_inputs.has_events(cfg.recording)
         stated = videos.read_fps(cfg.recording, "recording") if is_film else None
         cfg.fps = stated or 120.0
     run = Path(cfg.paths.run)

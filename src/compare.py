@@ -41,47 +41,33 @@ def compare(cfg: DictConfig) -> dict:
     `residual_displacement_px`, along a line or a ray that turns with the scene, is of what is
     static there, `line_deviation_px` of what moves uniformly along a line or a circle.  With
     `still` the whole scene is static (`slice_motion.measure_static_scene`).  Raises ValueError for
-    a video that cannot be read, has another size than the first or another frame rate than `fps`,
-    or a slice outside the frame.
+    a video that cannot be read, has another size than the first (with `still`: another aspect
+    ratio) or another frame rate than `fps`, or a slice outside the frame.
     """
     run = Path(cfg.paths.run)
     check_slice(cfg)
     check_videos(cfg)
+    names = _name_videos(cfg)
+    _check_frame_rate(cfg)
+    kind, films = _chosen_slice(cfg), _read_films(cfg, names)
+    cuts = [slices.cut_slice(film, fps=cfg.fps, **{kind: cfg[kind]}) for film in films]
+    scores, rows = {}, []
+    for name, path, film, (across, _) in zip(names, cfg.videos, films, cuts, strict=True):
+        scores[name] = _measure(film, across, cfg, kind) | _score_against_camera(cfg, Path(path))
+        rows.append(comparison.VideoRow(name, film, across, _format_note(scores[name])))
+    with results.store_config_when_done(run, entry_point.resolved_yaml(cfg)):
+        _draw(rows, run / "comparison.png", cfg, kind, line=cuts[0][1])
+    rich.print(scores, f"in {run}")
+    return scores
+
+
+def _name_videos(cfg: DictConfig) -> list[str]:
     names = list(cfg.names or default_video_names([Path(path) for path in cfg.videos]))
     if len(names) != len(cfg.videos):
         raise ValueError(f"names must be one per video, got {len(names)} for {len(cfg.videos)}")
     if len(set(names)) < len(names):
         raise ValueError(f"names must differ, got {', '.join(names)}")
-    _check_frame_rate(cfg)
-    read = (np.stack(list(videos.read_video(path, "videos"))) for path in cfg.videos)
-    films = [
-        _cut_part(film, cfg.first, cfg.last, name) for name, film in zip(names, read, strict=True)
-    ]
-    given = {name: cfg[name] for name in slices.KINDS if cfg[name] is not None}
-    if len(given) != 1:
-        raise ValueError(f"give one of line, circle, spin and still, got {given or 'none'}")
-    films = slices.shrink_to_smallest(films) if "still" in given else films
-    sizes = {film.shape[1:] for film in films}
-    if len(sizes) > 1:
-        raise ValueError(f"videos must be of one size (h, w), got {sorted(sizes)}")
-    cuts = [slices.cut_slice(film, fps=cfg.fps, **given) for film in films]
-    motions = [_measure(film, across, cfg, next(iter(given)))
-               for film, (across, _) in zip(films, cuts, strict=True)]  # fmt: skip
-    scores, rows = dict(zip(names, motions, strict=True)), []
-    for name, path, film, (across, _) in zip(names, cfg.videos, films, cuts, strict=True):
-        if cfg.reference_images:
-            scores[name] |= camera_frames.score_against_camera(
-                Path(path), Path(cfg.reference_images), slice(cfg.first, cfg.last)
-            )
-        notes = [NOTES[measure].format(value) for measure, value in scores[name].items()]
-        rows.append(comparison.VideoRow(name, film, across, "\n".join(notes)))
-    with results.store_config_when_done(run, entry_point.resolved_yaml(cfg)):
-        comparison.draw_comparison(
-            rows, run / "comparison.png", line=cuts[0][1], axis=cfg.axis_label,
-            samples=cfg.frames_shown, length_s=min(map(len, films)) / cfg.fps,
-        )  # fmt: skip
-    rich.print(scores, f"in {run}")
-    return scores
+    return names
 
 
 def _check_frame_rate(cfg: DictConfig) -> None:
@@ -89,6 +75,21 @@ def _check_frame_rate(cfg: DictConfig) -> None:
         own = videos.read_fps(path, "videos") if Path(path).suffix == ".h5" else None
         if own is not None and not math.isclose(own, cfg.fps, rel_tol=0.01):
             raise ValueError(f"fps must be that of {path}, {own:g}, got {cfg.fps}")
+
+
+def _read_films(cfg: DictConfig, names: Sequence[str]) -> list[np.ndarray]:
+    """Return the frames `first` to `last` of every video, of one size."""
+    read = (np.stack(list(videos.read_video(path, "videos"))) for path in cfg.videos)
+    films = {
+        name: _cut_part(film, cfg.first, cfg.last, name)
+        for name, film in zip(names, read, strict=True)
+    }
+    if cfg.still is not None:
+        films = slices.shrink_to_smallest(films)
+    sizes = {film.shape[1:] for film in films.values()}
+    if len(sizes) > 1:
+        raise ValueError(f"videos must be of one size (h, w), got {sorted(sizes)}")
+    return list(films.values())
 
 
 def _cut_part(film: np.ndarray, first: int, last: int | None, name: str) -> np.ndarray:
@@ -100,10 +101,38 @@ def _cut_part(film: np.ndarray, first: int, last: int | None, name: str) -> np.n
     return part
 
 
+def _chosen_slice(cfg: DictConfig) -> str:
+    given = {name: cfg[name] for name in slices.KINDS if cfg[name] is not None}
+    if len(given) != 1:
+        raise ValueError(f"give one of line, circle, spin and still, got {given or 'none'}")
+    return next(iter(given))
+
+
 def _measure(film: np.ndarray, across: slices.Slice, cfg: DictConfig, kind: str) -> dict:
     if kind == "still":
         return slice_motion.measure_static_scene(film, cfg.still)
     return slice_motion.measure_slice_motion(across, kind, cfg.moving_object_brightness)
+
+
+def _score_against_camera(cfg: DictConfig, video: Path) -> dict:
+    if not cfg.reference_images:
+        return {}
+    part = slice(cfg.first, cfg.last)
+    return camera_frames.score_against_camera(video, Path(cfg.reference_images), part)
+
+
+def _format_note(scores: dict) -> str:
+    return "\n".join(NOTES[measure].format(value) for measure, value in scores.items())
+
+
+def _draw(
+    rows: Sequence[comparison.VideoRow], path: Path, cfg: DictConfig, kind: str,
+    line: slices.Points,
+) -> None:  # fmt: skip
+    comparison.draw_comparison(
+        rows, path, line=line, axis=slices.name_axis(kind, line), samples=cfg.frames_shown,
+        length_s=min(len(row.video) for row in rows) / cfg.fps,
+    )  # fmt: skip
 
 
 def default_video_names(paths: Sequence[Path]) -> list[str]:
@@ -130,7 +159,7 @@ def check_videos(cfg: DictConfig) -> None:
 
 def check_slice(cfg: DictConfig) -> None:
     """Raise ValueError for an `fps`, a number of frames or a slice of another form than
-    `cut_slice` takes."""
+    `cut_slice` takes, or unless one slice is given."""
     if not 0 < cfg.fps < math.inf:
         raise ValueError(f"fps must be > 0 frames a second, got {cfg.fps}")
     for key, form in FORMS.items():
@@ -149,6 +178,7 @@ def check_slice(cfg: DictConfig) -> None:
             raise ValueError(f"{key} must have a radius of 1 pixel or more, got {cfg[key]}")
     if isinstance(cfg.still, float):
         raise ValueError(f"still must be a whole number of pixels or null, got {cfg.still}")
+    _chosen_slice(cfg)
     if not 1 <= cfg.frames_shown <= MOST_SHOWN:
         raise ValueError(f"frames_shown must be in 1..{MOST_SHOWN}, got {cfg.frames_shown}")
 

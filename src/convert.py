@@ -8,7 +8,7 @@ import numpy as np
 from omegaconf import DictConfig
 
 from src.app import entry_point
-from src.recordings.files import event_writers, recording, sources
+from src.recordings.files import event_writers, recording, recording_inputs
 from src.recordings.files.event_arrays import count_before
 from src.recordings.files.event_file import HeightWidth, ReadOptions
 from src.recordings.files.recorded_frames import RecordedFrames, find_frames
@@ -26,10 +26,10 @@ def convert(cfg: DictConfig) -> Path:
         if written.exists() and source.exists() and written.samefile(source):
             raise ValueError(f"out must be another file than recording, got {out}")
     options = ReadOptions.from_keys(cfg)
-    height, width = sources.find_sensor_size(source, cfg.sensor_size, options)
+    height, width = recording_inputs.find_sensor_size(source, cfg.sensor_size, options)
     how = {"width": width, "height": height, "version": cfg.version, "layout": cfg.layout}
     event_writers.choose_file_kind(out, **how)
-    opened = recording.open_recording(source, (width, height), options)
+    opened = recording.open_recording(source, (height, width), options)
     frames = (
         find_frames_to_convert(opened, (height, width), cfg) if cfg.layout == "evreal" else None
     )

@@ -22,7 +22,7 @@ from src.models.backward_warmup import check_backward_warmup_s
 from src.models.network import EventToVideoNetwork
 from src.recordings import output, reconstruction, tone, truth_file
 from src.recordings.event_windows import Window, WindowRule, build_window_rule, cut_windows
-from src.recordings.files import sources
+from src.recordings.files import recording_inputs
 from src.recordings.files.event_file import HeightWidth, ReadOptions
 from src.recordings.noise_filter import NoiseFilter, check_noise_filter_s
 from src.recordings.reconstruction import Frame
@@ -100,7 +100,7 @@ def show_progress(frames: Iterable[Frame], first_s: float) -> Iterator[Frame]:
 def choose_views(cfg: DictConfig, network: EventToVideoNetwork) -> Views:
     """Return the views of the recording that the network takes."""
     given = cfg.sensor_size, ReadOptions.from_keys(cfg), cfg.resolution
-    views = sources.find_views(cfg.recording, cfg.views, *given)
+    views = recording_inputs.find_views(cfg.recording, cfg.views, *given)
     all_of_them = reconstruction.takes_all_views(network, views.positions)
     return views if all_of_them else views.select([(0, 0)])
 
@@ -133,7 +133,7 @@ def build_window_rule_from_config(cfg: DictConfig, network: EventToVideoNetwork)
 def read_filtered_events(cfg: DictConfig, views: Views) -> Iterator[np.ndarray]:
     """Yield the events of the recording, without noise where the config says so."""
     options = ReadOptions.from_keys(cfg)
-    events = sources.iter_recording(cfg.recording, views.sensor, options=options)
+    events = recording_inputs.iter_recording(cfg.recording, views.sensor, options=options)
     if cfg.noise_filter_s is None:
         return events
     return filter(len, map(NoiseFilter(views.sensor, cfg.noise_filter_s), events))

@@ -15,9 +15,9 @@ from rich.progress import track
 from torch import Tensor
 from yaml import YAMLError
 
-from src.app import build, entry_point, own_simulation
-from src.app.own_simulation import OwnSimulation, SimulatedPart
+from src.app import build, entry_point, user_clip_simulation
 from src.app.renamed_keys import refuse_renamed_keys
+from src.app.user_clip_simulation import SimulatedPart, UserClipSimulation
 from src.figures import samples
 from src.recordings.files import event_writers
 from src.recordings.simulated_recording import kaleidoscope_views, write_recording
@@ -31,7 +31,7 @@ from src.sim.sensor.response import encode_srgb
 SECTIONS = ("scene", "optics", "turbulence", "sensor", "data")
 CLIP_KEYS = (*SECTIONS, "seed", "fps", "bins")  # what makes a clip
 SCENE_FPS = 120.0  # of a clip of a scene, unless fps says another
-DRAWN_FRAMES = 24  # of your own clip in views.gif
+DRAWN_FRAMES = 24  # of the user's clip in views.gif
 
 
 def simulate(cfg: DictConfig) -> dict:
@@ -43,22 +43,22 @@ def simulate(cfg: DictConfig) -> dict:
     onto one sensor whose events are written to a file, geometry and truth beside it.  Returns what
     was drawn: D/r0, threshold ...
     """
-    if cfg.index < 0:
-        raise ValueError(f"index must be >= 0, the number of a clip, got {cfg.index}")
     own = cfg.video or cfg.photo
     if cfg.like and own:
         raise ValueError(f"like must be null with video or photo, got {cfg.like}")
     if cfg.write:  # refused before minutes of work
         height, width = cfg.camera.sensor_size
         event_writers.choose_file_kind(Path(cfg.write), None, width, height, "evt3")
-    return simulate_own_clip(cfg) if own else simulate_scene(cfg)
+    return simulate_user_clip(cfg) if own else simulate_scene(cfg)
 
 
-def simulate_own_clip(cfg: DictConfig) -> dict:
+def simulate_user_clip(cfg: DictConfig) -> dict:
     """Simulate all of `video` or `photo` and record it, to `write` or into the run's folder."""
-    own_simulation.set_own_sensor(cfg, entry_point.describe_hydra_command().get("overrides", []))
-    run, clip = Path(cfg.paths.run), own_simulation.read_own_clip(cfg)
-    work = OwnSimulation(cfg, clip)
+    overrides = entry_point.describe_hydra_command().get("overrides", [])
+    user_clip_simulation.refuse_keys_of_scenes(overrides)
+    user_clip_simulation.set_user_clip_sensor(cfg, overrides)
+    run, clip = Path(cfg.paths.run), user_clip_simulation.read_user_clip(cfg)
+    work = UserClipSimulation(cfg, clip)
     if not hasattr(work.sensor, "events"):
         kind = type(work.sensor).__name__
         raise ValueError(f"sensor must be one of events for video and photo, got {kind}")
@@ -78,15 +78,15 @@ def simulate_own_clip(cfg: DictConfig) -> dict:
             truth.add(part.clean, part.views, part.tilt)
             shown += [part] if count <= DRAWN_FRAMES else []
             count += len(part.clean)
-        written = draw_own_clip(run, work, views, shown)
+        written = draw_user_clip(run, work, views, shown)
         fps = work.simulated_fps
         events = write_recording(path, views, fps, camera, work.sensor, track, key=work.key)
     print_files(path, events, written)
     return drawn
 
 
-def draw_own_clip(
-    run: Path, work: OwnSimulation, views: Tensor, parts: list[SimulatedPart]
+def draw_user_clip(
+    run: Path, work: UserClipSimulation, views: Tensor, parts: list[SimulatedPart]
 ) -> list[Path]:
     """Draw the first frames as `views.gif` and `views.png`."""
     shown = slice(1, DRAWN_FRAMES + 1)

@@ -149,6 +149,15 @@ def test_sequences_count_by_their_frames_in_every_table():
     assert found["ssim"]["mean"] == pytest.approx(0.5)
     low, high = found["ssim"]["interval"]
     assert low == pytest.approx(0.2) and high == pytest.approx(0.6)
+    assert found["ssim"]["std"] == pytest.approx(np.std([0.2, 0.6, 0.6, 0.6]))
+
+
+def test_the_deviation_of_simulated_clips_is_that_of_numpy_to_the_digit():
+    values = np.random.default_rng(0).random((50, 27))
+    for row in values.tolist():
+        assert summarize_scores([{"ssim": one} for one in row])["ssim"]["std"] == np.std(row)
+        same = [{"ssim": one, "frames": 120} for one in row]
+        assert summarize_scores(same)["ssim"]["std"] == pytest.approx(np.std(row), rel=1e-12)
 
 
 def _remove(name):

@@ -105,7 +105,7 @@ def test_the_input_is_never_written_over(tmp_path, convert):
     [
         (["out=a.mp4"], "cannot write .mp4"),
         (["out=a.h5", "start_s=2", "end_s=1"], "start_s must be >= 0 and before end_s, got 2, 1"),
-        (["out=a.h5", "layout=x"], "layout must be null, dsec or evreal, got x"),
+        (["out=a.h5", "layout=x"], "layout must be null or evreal, got x"),
         (["out=a.h5", "sensor_size=[9,9]"], "events are off the 9x9 sensor"),
         (["out=in.csv/a.h5"], "out must be a path that can be written, got in.csv/a.h5: "),
         (["out=a.h5", "format=evt3"], "format must be null, as in.csv is no RAW file"),

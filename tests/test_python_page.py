@@ -21,7 +21,7 @@ from src.sim.voxel import voxel_grid
 from tests.conftest import ROOT
 from tests.test_docs import BANNED, LINE, LINK
 from tests.test_entry_points import run_here
-from tests.test_simulate_own import textured
+from tests.test_simulate_user_clip import textured
 
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 LARGEST_BYTES = 400_000

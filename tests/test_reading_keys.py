@@ -7,7 +7,7 @@ from src.calibrate import calibrate
 from src.convert import convert
 from src.live import build_server
 from src.reconstruct import reconstruct
-from src.recordings.files import ReadOptions, open_recording, read_events, sources
+from src.recordings.files import ReadOptions, open_recording, read_events, recording_inputs
 from tests.recordings.files.test_reported_times import quiet_read, scene, text
 from tests.test_recording_entry_points import config
 
@@ -53,7 +53,7 @@ def test_the_part_that_is_chosen_is_reconstructed(joined, tmp_path, part, frames
 
 def test_a_picture_of_the_sensor_and_a_conversion_are_of_the_part_that_is_chosen(joined, tmp_path):
     options = ReadOptions(part=1)
-    assert sources.read_picture_or_event_counts(joined, None, options).sum() == len(
+    assert recording_inputs.read_picture_or_event_counts(joined, None, options).sum() == len(
         part := quiet_read(joined, part=1)
     )
     out = tmp_path / "b.npz"

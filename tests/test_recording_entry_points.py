@@ -13,6 +13,7 @@ from hydra import compose, initialize_config_dir
 
 from src.calibrate import calibrate
 from src.compare import compare, default_video_names
+from src.figures import comparison
 from src.live import build_server
 from src.reconstruct import reconstruct, show_progress
 from src.recordings import reconstruction, sensor_lookup, simulated_recording, truth_file, views
@@ -214,6 +215,7 @@ def test_without_views_the_sensor_is_one_view(folder, tmp_path):
         ("noise_filter_s=0", r"noise_filter_s must be in \(0, 1e6\] seconds or null, got 0"),
         ("noise_filter_s=1e30", r"noise_filter_s must be in \(0, 1e6\] seconds or null, got 1e"),
         ("views=", "views must be a file of calibrate task=views, got none: No such file"),
+        ("output_format=gif playback_fps=60", r"playback_fps must be in \[0.1, 50\] for output_f"),
         ("playback_fps=1e30", r"playback_fps must be in \[0\.1, 1000\], got 1e\+30"),
     ],
 )
@@ -358,7 +360,11 @@ def test_comparing_videos_draws_them_and_measures_their_slices(folder, found, tm
         compare(config("compare", tmp_path / "wrong", line[0], line[2], "fps=120"))
 
 
-def test_what_turns_uniformly_is_straight_in_theta_and_still_in_r(tmp_path):
+def test_what_turns_uniformly_is_straight_in_theta_and_still_in_r(tmp_path, monkeypatch):
+    drawn, draw = [], comparison.draw_comparison
+    monkeypatch.setattr(
+        comparison, "draw_comparison", lambda *rows, **how: drawn.append(how) or draw(*rows, **how)
+    )
     (tmp_path / "film").mkdir()
     y, x = np.mgrid[:61, :61]
     for k in range(24):
@@ -371,6 +377,7 @@ def test_what_turns_uniformly_is_straight_in_theta_and_still_in_r(tmp_path):
     still = compare(config("compare", tmp_path / "r", *along))["film"]
     round_ = compare(config("compare", tmp_path / "theta", *film, "circle=[30,30,18]"))["film"]
     assert still["residual_displacement_px"] < 0.1 and round_["line_deviation_px"] < 0.2
+    assert [how["axis"] for how in drawn] == ["r", "theta"]
 
 
 def test_the_tail_behind_a_bright_dot_is_not_followed(tmp_path):
@@ -398,6 +405,16 @@ def test_videos_of_two_sizes_are_not_compared(tmp_path):
     films = f"videos=[{tmp_path}/20,{tmp_path}/30]"
     with pytest.raises(ValueError, match="videos must be of one size"):
         compare(config("compare", tmp_path / "run", films, "line=[[0,0],[19,0]]"))
+
+
+def test_videos_of_two_shapes_are_not_stretched(tmp_path):
+    for name, size in (("wide", (20, 30)), ("high", (50, 10))):
+        (tmp_path / name).mkdir()
+        cv2.imwrite(str(tmp_path / name / "0.png"), np.zeros(size, np.uint8))
+    films = f"videos=[{tmp_path}/wide,{tmp_path}/high]"
+    got = r"videos must be of one aspect ratio, got wide 20x30 and high 50x10 \(h x w\)"
+    with pytest.raises(ValueError, match=got):
+        compare(config("compare", tmp_path / "run", films, "names=[wide,high]", "still=2"))
 
 
 @pytest.mark.parametrize(

@@ -2,11 +2,13 @@
 
 import shutil
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
-from scripts import gallery, readme, surroundings, turbulence_map, widen_setnet
-from scripts.scales import missing
+from scripts import gallery, pretrain_context, readme, turbulence_map, widen_setnet
+from scripts.error_by_detail_size import missing
 from scripts.ship_weights import CARD_NOTE, Given, recard, ship
 from src.app import build
 from src.metrics.table import METRICS
@@ -142,7 +144,7 @@ def test_what_lies_around_is_taught_while_the_memory_rests(tmp_path):
     cfg = config("train", tmp_path, *TINY, *given)
     network, spec = build.build_untrained_network(cfg)
     files.save(start, network, spec, {"hours": 1.0, "curve": []})
-    surroundings.teach(cfg, clips=3, steps=2)
+    pretrain_context.teach(cfg, clips=3, steps=2)
     before, taught = files.load(start).state_dict(), files.load(export).state_dict()
     rested = [torch.equal(before[n], taught[n]) for n in before if n.startswith("memory")]
     assert all(rested) and not torch.equal(
@@ -153,7 +155,7 @@ def test_what_lies_around_is_taught_while_the_memory_rests(tmp_path):
     assert card["hours"] > 1 and card["curve"] == []
     for name in ("ckpt", "export"):
         with pytest.raises(ValueError, match="ckpt and export must be files"):
-            surroundings.teach(config("train", tmp_path, *TINY, *given, f"{name}=null"), 3, 2)
+            pretrain_context.teach(config("train", tmp_path, *TINY, *given, f"{name}=null"), 3, 2)
 
 
 def talkative(**sizes) -> SetNet:
@@ -218,7 +220,7 @@ def test_areas_are_learned_from_what_is_held():
     truth = torch.rand(64, 1, 1, 1).expand(-1, 1, 16, 16)
     maps = torch.randn(64, 4, 8, 8) * 0.1
     maps[:, :, :2, :2] += truth[..., :2, :2]  # told in a corner, wanted everywhere
-    errors = surroundings.learn(network, maps.half(), truth.half(), 300)
+    errors = pretrain_context.learn(network, maps.half(), truth.half(), 300)
     assert sum(errors[-20:]) < 0.6 * sum(errors[:20])
 
 
@@ -234,6 +236,20 @@ def test_what_is_missing_is_told_by_its_size():
         truth - grey.repeat_interleave(16, 2).repeat_interleave(16, 3), truth
     )
     assert areas > 0.5 and max(details) < 0.05
+
+
+def test_a_camera_frame_is_found_in_a_list_with_comments_and_names_with_spaces(tmp_path):
+    for grey, name in ((50, "a.png"), (200, "the second one.png")):
+        cv2.imwrite(str(tmp_path / name), np.full((8, 8), grey, np.uint8))
+    listing = tmp_path / "images.txt"
+    listing.write_text("# seconds file\n\n0.1 a.png\n0.2 the second one.png\n")
+    recording = f"{tmp_path}/events.txt@8x8"
+    assert [255 * gallery.camera(recording, at).mean() for at in (0, 1)] == pytest.approx([50, 200])
+    listing.write_text("# seconds file\n")
+    assert gallery.camera(recording, 0) is None
+    listing.write_text("a.png\n")
+    with pytest.raises(ValueError, match="must have seconds and a file in each line"):
+        gallery.camera(recording, 0)
 
 
 def test_a_gallery_has_a_row_for_each_recording_and_a_column_for_each_network():

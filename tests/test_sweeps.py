@@ -110,6 +110,8 @@ def test_a_digest_knows_numbers_but_no_folders():
         for change in ({}, {"run": "/b c"}, {"ckpt": "x.ckpt"}, {"lr": 2})
     ]
     assert digests[0] == digests[1] == digests[2] != digests[3]
+    earlier = CONFIG.format(**plain) + "verbose: false\n"  # up to 0.6.12
+    assert results.hash_config(earlier) == digests[0]
     evaluated = [CONFIG.format(**plain | {"task": "eval", "ckpt": ckpt}) for ckpt in "ab"]
     assert results.hash_config(evaluated[0]) != results.hash_config(evaluated[1])
 

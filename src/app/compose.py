@@ -1,5 +1,6 @@
 """The folder of the configs, and configs made without a command line."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
@@ -8,7 +9,9 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from src.app.renamed_keys import explain_refused_key, flatten_keys
+from src.app.config_values import check_values_like
+from src.app.path_overrides import quote_paths, refuse_empty_paths
+from src.app.renamed_keys import explain_refused_key, flatten_keys, refuse_renamed_overrides
 
 CONF = str(Path(__file__).resolve().parents[2] / "conf")
 
@@ -32,6 +35,30 @@ def compose_config(name: str, *overrides: str) -> DictConfig:
         raise ValueError(describe_config_error(error, name)) from None
     finally:
         GlobalHydra.instance().hydra = outer
+
+
+def compose_checked_config(
+    name: str, chosen: Sequence[str], overrides: Sequence[str]
+) -> DictConfig:
+    """Return conf/<name>.yaml with `chosen` and with `overrides`, which are quoted and checked as
+    those of a command line.
+
+    Raises ValueError for a key or a choice that is none and for a value of another kind.
+    """
+    refuse_empty_paths(overrides, name)
+    refuse_renamed_overrides(overrides)
+    lines = [*chosen, *quote_paths(overrides, name)]
+    cfg = compose_config(name, *lines)
+    groups = [line for line in lines if config_choices(read_override_key(line).partition("@")[0])]
+    shipped = compose_config(name, *groups)
+    OmegaConf.set_struct(shipped, False)
+    check_values_like(cfg, shipped, name)
+    return cfg
+
+
+def read_override_key(override: str) -> str:
+    """Return the key, or the group, of `key=value`, `+key=value` or `~key`."""
+    return override.partition("=")[0].strip().lstrip("+~")
 
 
 def describe_config_error(error: Exception, name: str) -> str:

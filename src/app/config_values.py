@@ -26,6 +26,7 @@ KEYS: dict[tuple[str, ...], str] = {
         loss_spike_factor turbulence.wind_m_s turbulence.baseline_m
         callbacks.learning_curve.interval_h data.max_grid_s data.start_s data.end_s
         calibrate:fps simulate:fps camera.tile_px white_level compare:still data.test_crop
+        simulate:seconds
     """,
     (WHOLE, NULL): """
         data.train_clips data.cache_clips data.loss_pairs dots.fit_radius_px last stem
@@ -60,22 +61,29 @@ BOUNDS: dict[str, tuple[int, float]] = {  # of what others would refuse without 
     "data.test_windows": (1, 10**6), "data.cache_windows": (1, 10**6),
     "data.test_clips": (1, math.inf), "data.val_clips": (0, math.inf),
     "data.workers": (0, 1024), "trainer.check_val_every_n_epoch": (1, math.inf),
-    "sample_clips": (0, math.inf), "seed": (0, 2**32 - 1), "width": (1, math.inf),
+    "index": (0, math.inf), "sample_clips": (0, math.inf), "seed": (0, 2**32 - 1),
+    "width": (1, math.inf),
     "callbacks.rotation.every_n_train_steps": (1, math.inf),
 }  # fmt: skip
 KINDS = {key: kinds for kinds, keys in KEYS.items() for key in keys.split()}
 # Parts whose own classes check whether a number, a range of numbers or null does.
-RANGES = ("augment.", "optics.", "own_sensor.", "scene.", "sensor.", "target.", "turbulence.")
+RANGES = ("augment.", "optics.", "user_clip_sensor.", "scene.", "sensor.", "target.", "turbulence.")
 SIZES = ("sensor_size", "resolution", "camera.sensor_size")  # [height, width]
 # More entries do.
 OPEN = ("callbacks", "logger", "loss", "networks", "references", "scene.parts", "stress_tests")
 
 
 def check_values(cfg: DictConfig) -> None:
-    """Raise ValueError for a value of another kind than its key's, and for a key that is none."""
-    if (shipped := _shipped_config()) is None:
-        return
-    entry_point = HydraConfig.get().job.name  # that of a sweep's config too
+    """Raise ValueError for a value of another kind than its key's, and for a key that is none, in
+    the config of this job of Hydra's."""
+    if (shipped := _shipped_config()) is not None:
+        check_values_like(cfg, shipped, HydraConfig.get().job.name)  # that of a sweep's config too
+
+
+def check_values_like(cfg: DictConfig, shipped: DictConfig, entry_point: str) -> None:
+    """Raise ValueError as `check_values`; `shipped`: the config of `entry_point` with the choices
+    of groups of `cfg` but no other override.
+    """
     given, plain = (
         cast(dict, OmegaConf.to_container(config, resolve=False)) for config in (cfg, shipped)
     )

@@ -13,7 +13,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import hydra
-import rich
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
@@ -21,7 +20,6 @@ from hydra.types import RunMode
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from rich.syntax import Syntax
 
 from src.app import console
 from src.app.compose import CONF, describe_config_error
@@ -128,8 +126,7 @@ def _is_in_the_way_of_run(error: OSError) -> bool:
 def run_job(
     work: Callable[[DictConfig], object], cfg: DictConfig, fill_in: Callable | None = None
 ) -> None:
-    """Run `work` in the folder Hydra made for this job, with `verbose` after the config is printed;
-    end W&B's run.
+    """Run `work` in the folder Hydra made for this job; end W&B's run.
 
     A job of a sweep is skipped where its results stand and the weights it tests are older; its
     error is stored.
@@ -184,8 +181,6 @@ def _has_newer_weights(cfg: DictConfig, stored: Path) -> bool:
 
 
 def _run_work(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:
-    if cfg.get("verbose"):
-        rich.print(Syntax(resolved_yaml(cfg), "yaml", background_color="default"))
     try:
         work(cfg)
     finally:

@@ -12,10 +12,16 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from src.app.compose import compose_config, config_choices
-from src.app.own_simulation import OwnSimulation, read_own_clip, set_own_sensor
+from src.app.compose import compose_checked_config, config_choices, read_override_key
+from src.app.user_clip_simulation import (
+    UserClipSimulation,
+    read_user_clip,
+    refuse_keys_of_scenes,
+    set_user_clip_sensor,
+)
+from src.recordings.files.event_arrays import concatenate_events, sort_events
 from src.sim.optics import Position, view_id
-from src.sim.scenes import own_material
+from src.sim.scenes import user_clip
 from src.sim.scenes.video_files import PICTURE_SUFFIXES
 
 VIEW_EVENT = np.dtype(
@@ -27,7 +33,7 @@ ARGUMENTS = (
 NO_OVERRIDES = {key: f"it is the argument {key}" for key in ARGUMENTS}
 NO_OVERRIDES |= {"optics.views": "it is the argument views"}
 NO_OVERRIDES |= dict.fromkeys(("photo", "video"), "it is the argument photo_or_video")
-NO_OVERRIDES |= dict.fromkeys(("write", "like", "split"), "it is of the command line alone")
+OF_THE_COMMAND_LINE = ("write", "like", "camera", "name", "task", "verbose", "paths", "hydra")
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +44,12 @@ class SimulatedClip:
     `tilt` (views, frames, 2, h, w): float32, displacement (x, y) in pixels.  `events` (n,), in
     order of time: t in us from the first frame on (int64), x, y in pixels of the view (uint16),
     p -1 or 1 (int8), view, an index into `positions` (uint16).  `fps`: frames a second;
-    `positions`: (row, col) of each view from the centre view; `drawn`: contrast threshold,
-    severity, D/r0 ...
+    `positions`: (row, col) of each view from the centre view.
+
+    `drawn`: what was drawn, among it `threshold` (contrast, nat), `simulated_fps` (frames a
+    second), `severity` (a word), `d_over_r0` (D/r0), `tilt_px` and `tilt_and_blur_px` (rms along
+    an axis, pixels of the clip), `tilt_correlation_half_length_px`, `tilt_correlation_time_s` (to
+    1/e); of turbulence=recorded or of a class of your own what it names.
     """
 
     clean: Float[np.ndarray, "frames h w"]
@@ -56,45 +66,60 @@ class SimulatedClip:
 
 def simulate(
     photo_or_video: Any, turbulence: str = "strong", views: int = 9, *, sensor: str = "paper",
-    fps: float | None = None, seconds: float = 1.0, start_s: float = 0.0, end_s: float = math.inf,
-    longest_side_px: int | None = None, seed: int = 0, overrides: Sequence[str] = (),
+    fps: float | None = None, seconds: float | None = None, start_s: float = 0.0,
+    end_s: float = math.inf, longest_side_px: int | None = None, seed: int = 0,
+    overrides: Sequence[str] = (),
 ) -> SimulatedClip:  # fmt: skip
     """Return what a light field of `views` views and an event sensor see of your material.
 
     `photo_or_video`: a path, of a picture, a video or a folder of frames, or an array, (h, w) or
-    (frames, h, w), uint8 or floats in [0, 1].  `turbulence`: none, weak, medium, strong, extreme or
-    mixed.  `sensor`: paper, ideal, noisy, evk4 ..., for sRGB and with a contrast threshold of 0.2
-    unless `overrides` set sensor.input and sensor.threshold.  `fps`: None for that of the file, 120
-    for a photograph, which lasts `seconds`; of a video the part from `start_s` to `end_s` is taken.
-    `overrides`: other keys of conf/simulate.yaml as on the command line.  The result is a function
-    of the arguments.  Raises ValueError for values outside their range, and for an override of an
-    argument or of a key of the command line alone.
+    (frames, h, w), uint8 or floats in [0, 1].  `turbulence`: none, weak, medium, strong, extreme,
+    mixed, or of footage: measured and recorded, which need `overrides` such as
+    turbulence.measured=air.yaml and turbulence.footage=site.mp4.  `sensor`: a name of conf/sensor,
+    such as paper, ideal, noisy or evk4; code values are taken as sRGB and the contrast threshold is
+    0.2 with any, unless `overrides` set sensor.input and sensor.threshold.
+
+    `fps`: frames a second; None: those of the file, 120 for a photograph.  `seconds`: the length of
+    a photograph (None: 1).  `start_s`, `end_s`: the part of a video, in seconds.
+    `longest_side_px`: of the frames, 16 or more (None: their own, at most 512).  `overrides`: other
+    keys of conf/simulate.yaml, written as on the command line.
+
+    The result is a function of the arguments.  Raises ValueError for values outside their range,
+    for `seconds` of a video and a part of a photograph, and for overrides that are none, are
+    arguments, or have no effect here (of `scene`, or of the command line alone).
     """
-    for override in overrides:
-        if (key := override.split("=")[0].lstrip("+~")) in NO_OVERRIDES:
-            raise ValueError(f"overrides must not set {key}: {NO_OVERRIDES[key]}")
+    _refuse_other_overrides(overrides)
     if not isinstance(seed, int | np.integer):
         raise ValueError(f"seed must be a whole number, got {seed}")
     for group, choice in (("turbulence", turbulence), ("sensor", sensor)):
         if choice not in (names := config_choices(group)):
             raise ValueError(f"{group} must be one of {', '.join(names)}, got {choice}")
     chosen = [f"turbulence={turbulence}", f"optics.views={views}", f"sensor={sensor}"]
-    cfg = compose_config("simulate", *chosen, f"seed={seed}", *overrides)
-    set_own_sensor(cfg, overrides)
+    cfg = compose_checked_config("simulate", [*chosen, f"seed={seed}"], overrides)
+    set_user_clip_sensor(cfg, overrides)
     options: dict[str, Any] = {"fps": fps, "seconds": seconds, "longest_side_px": longest_side_px}
     options |= {"start_s": start_s, "end_s": end_s}
     if isinstance(photo_or_video, str | Path):
         path = Path(photo_or_video)
         key = "photo" if path.suffix.lower() in PICTURE_SUFFIXES else "video"
         cfg.update(options | {key: str(path)})
-        clip = read_own_clip(cfg)
+        clip = read_user_clip(cfg)
     else:
         options |= {"speed_widths_per_s": cfg.speed_widths_per_s, "seed": cfg.seed}
-        clip = own_material.clip_from_array(photo_or_video, white_level=cfg.white_level, **options)
-    return simulate_clip(OwnSimulation(cfg, clip))
+        clip = user_clip.clip_from_array(photo_or_video, white_level=cfg.white_level, **options)
+    return simulate_clip(UserClipSimulation(cfg, clip))
 
 
-def simulate_clip(work: OwnSimulation) -> SimulatedClip:
+def _refuse_other_overrides(overrides: Sequence[str]) -> None:
+    for key in map(read_override_key, overrides):
+        if key in NO_OVERRIDES:
+            raise ValueError(f"overrides must not set {key}: {NO_OVERRIDES[key]}")
+        if key.replace("/", ".").partition(".")[0] in OF_THE_COMMAND_LINE:
+            raise ValueError(f"overrides must not set {key}: it is of the command line alone")
+    refuse_keys_of_scenes(overrides)
+
+
+def simulate_clip(work: UserClipSimulation) -> SimulatedClip:
     """Return all that `work` makes."""
     clip, count, shape = work.clip, len(work.clip.frames), work.clip.size
     clean = np.empty((count, *shape), np.float32)
@@ -113,7 +138,7 @@ def simulate_clip(work: OwnSimulation) -> SimulatedClip:
 
 
 def simulate_all_view_events(
-    work: OwnSimulation, views: Float[Tensor, "views frames h w"]
+    work: UserClipSimulation, views: Float[Tensor, "views frames h w"]
 ) -> np.ndarray:
     """Return the events of all views in order of time."""
     parts = []
@@ -122,5 +147,4 @@ def simulate_all_view_events(
         own = work.sensor.events(light, work.simulated_fps, **place)
         parts.append(np.empty(len(own), VIEW_EVENT))
         parts[-1][[*"txyp"]], parts[-1]["view"] = own[[*"txyp"]], index
-    events = np.concatenate(parts)
-    return events[np.argsort(events["t"], kind="stable")]
+    return sort_events(concatenate_events(parts))

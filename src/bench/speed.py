@@ -5,7 +5,7 @@ Events fall everywhere, so that no part of a frame can be left out.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from itertools import cycle, product
 from pathlib import Path
 from typing import Any
@@ -19,15 +19,12 @@ from src.bench.candidates import Candidate
 from src.deploy.cost import (
     count_macs,
     macs_per_frame,
-    select_timing_clock,
     time_calls,
-    torch_threads,
 )
 from src.deploy.cpu_features import is_bf16_faster
 from src.deploy.forms import convert_to_form
 from src.deploy.onnx_export import OnnxNetwork, export_onnx
-from src.deploy.runtime import FORMS as LISTED_FORMS
-from src.deploy.runtime import EventListRuntime, supports_event_lists
+from src.deploy.runtime import EVENT_LIST_FORMS, EventListRuntime, supports_event_lists
 from src.models.folding import inference_copy
 from src.models.network import WINDOW_S, EventToVideoNetwork, FramePostprocessor
 from src.sim.optics import layout
@@ -38,7 +35,7 @@ FORM_DTYPES = {  # what a form computes in
     "openvino": torch.bfloat16 if is_bf16_faster() else torch.float32,
     "onnx": torch.float32,
 }  # fmt: skip
-FORMS = tuple(FORM_DTYPES)
+TIMED_FORMS = tuple(FORM_DTYPES)
 LONGEST_S, ONNX_SIDE = 1.0, 176
 PREVIEW_SIDE = 64  # frames that tell what a post-processor costs on larger ones
 PEAK_SIDE, PEAK_CHANNELS = 176, 64  # of the convolution that shows what the machine can do
@@ -142,7 +139,7 @@ class SpeedBenchmark:
     def _build_step(self, network: EventToVideoNetwork, entry: SpeedMeasurement) -> EventStep:
         """Return what goes from the events of a window to a frame as `src.reconstruct` does."""
         form, side, threads, views = entry.form, entry.side, entry.threads, entry.views
-        if entry.device == "cpu" and form in LISTED_FORMS and supports_event_lists(network):
+        if entry.device == "cpu" and form in EVENT_LIST_FORMS and supports_event_lists(network):
             size = {"height": side, "width": side}
             runtime = EventListRuntime(
                 network, positions=layout(views), threads=threads, form=form, **size
@@ -213,8 +210,8 @@ def time_postprocessor(post: FramePostprocessor, side: int, *, threads: int = 1)
     Its windows of WINDOW frames overlap by OVERLAP: what two of them share is paid for twice.
     """
     frames = torch.rand(1, post.WINDOW, 1, side, side)
-    seconds = _fastest(lambda: post.restore(frames), threads, repeats=2)
-    return 1e3 * seconds / (post.WINDOW - post.OVERLAP)
+    took = time_calls(lambda: post.restore(frames), threads=threads, seconds=0, min_calls=2)
+    return took.least_ms / (post.WINDOW - post.OVERLAP)
 
 
 @torch.no_grad()
@@ -226,17 +223,6 @@ def measure_peak_conv_macs_per_s(dtype: torch.dtype, *, threads: int = 1) -> flo
         torch.randn(size).to(dtype=dtype, memory_format=torch.channels_last)
         for size in ((1, PEAK_CHANNELS, PEAK_SIDE, PEAK_SIDE), (PEAK_CHANNELS, PEAK_CHANNELS, 3, 3))
     )
-    functional.conv2d(x, kernel, padding=1)
-    seconds = _fastest(lambda: functional.conv2d(x, kernel, padding=1), threads, repeats=8)
-    return PEAK_SIDE**2 * PEAK_CHANNELS**2 * 9 / seconds
-
-
-def _fastest(work: Callable[[], object], threads: int, repeats: int) -> float:
-    """Return the least seconds of `repeats` calls of `work` on so many threads."""
-    now, seconds = select_timing_clock(threads), []
-    with torch_threads(threads):
-        for _ in range(repeats):
-            start = now()
-            work()
-            seconds.append(max(now() - start, 1e-9))
-    return min(seconds)
+    convolve = partial(functional.conv2d, x, kernel, padding=1)
+    took = time_calls(convolve, threads=threads, seconds=0, min_calls=8)
+    return PEAK_SIDE**2 * PEAK_CHANNELS**2 * 9 / (took.least_ms / 1e3)

@@ -10,7 +10,7 @@ from typing import TypeVar
 import torch
 
 from src.bench.candidates import Candidate
-from src.bench.speed import FORMS, SpeedMeasurement
+from src.bench.speed import TIMED_FORMS, SpeedMeasurement
 from src.metrics.table import METRICS, NAMES, Column
 from src.metrics.video_metrics import VideoMetrics
 from src.records.results import format_csv
@@ -28,7 +28,7 @@ def check_chart_options(
     rules = {
         f"sizes must be multiples of 8 in 16..{LARGEST_SIDE}": (sizes, _is_side),
         "threads must be numbers >= 1": (threads, lambda count: count >= 1),
-        f"forms must be of {', '.join(FORMS)}": (forms, FORMS.__contains__),
+        f"forms must be of {', '.join(TIMED_FORMS)}": (forms, TIMED_FORMS.__contains__),
         "devices must be of cpu, cuda": (devices, ("cpu", "cuda").__contains__),
         f"severities must be of {', '.join(SEVERITIES)}": (severities, SEVERITIES.__contains__),
         "clips must be >= 1": ([clips], lambda count: count >= 1),

@@ -1,12 +1,11 @@
 """What this processor computes fast in."""
 
-import timeit
 from functools import cache, partial
 
 import torch
 from torch.nn import functional
 
-from src.deploy.cost import torch_threads
+from src.deploy.cost import time_calls
 
 TIMED_CONVOLUTIONS = 20  # of each type, the first of which are slow
 
@@ -38,6 +37,5 @@ def time_convolution_s(dtype: torch.dtype) -> float:
     """
     maps = torch.ones(1, 64, 48, 48, dtype=dtype).to(memory_format=torch.channels_last)
     kernel = torch.ones(64, 64, 3, 3, dtype=dtype).to(memory_format=torch.channels_last)
-    with torch.inference_mode(), torch_threads(1):
-        convolve = partial(functional.conv2d, maps, kernel, padding=1)
-        return min(timeit.repeat(convolve, number=1, repeat=TIMED_CONVOLUTIONS))
+    convolve = partial(functional.conv2d, maps, kernel, padding=1)
+    return time_calls(convolve, seconds=0, min_calls=TIMED_CONVOLUTIONS).least_ms / 1e3

@@ -15,7 +15,7 @@ from src.models.network import WINDOW_S, EventToVideoNetwork
 from src.models.setnet import SetNet
 from src.sim.optics import Position
 
-FORMS = ("float32", "bf16", "compiled", "openvino")
+NETWORK_FORMS = ("float32", "bf16", "compiled", "openvino")
 
 
 def convert_to_form(network: EventToVideoNetwork, form: str) -> EventToVideoNetwork:
@@ -24,8 +24,8 @@ def convert_to_form(network: EventToVideoNetwork, form: str) -> EventToVideoNetw
 
     Raises ValueError, naming `form`, for another or where it cannot be made.
     """
-    if form not in FORMS:
-        raise ValueError(f"form must be one of {', '.join(FORMS)}, got {form}")
+    if form not in NETWORK_FORMS:
+        raise ValueError(f"form must be one of {', '.join(NETWORK_FORMS)}, got {form}")
     if form == "float32":
         return network
     if not any(True for _ in network.parameters()):

@@ -28,7 +28,7 @@ from src.models.folding import inference_copy
 from src.models.setnet import SetNet
 from src.sim.optics import Position, is_arranged_as_layout, layout
 
-FORMS = ("float32", "bf16", "openvino")
+EVENT_LIST_FORMS = ("float32", "bf16", "openvino")
 SIDE_MULTIPLE = 8  # sides are padded to it by reflection, as the networks do
 LEAST_INSIDE = 0.01  # of the events given for a window
 LONGEST_WINDOW_S = 10.0  # beyond, times are hardly in seconds
@@ -70,8 +70,8 @@ class EventListRuntime:
         form: str | None = None,
     ):
         form = form or fastest_form()
-        if form not in FORMS:
-            raise ValueError(f"form must be one of {', '.join(FORMS)}, got {form}")
+        if form not in EVENT_LIST_FORMS:
+            raise ValueError(f"form must be one of {', '.join(EVENT_LIST_FORMS)}, got {form}")
         if not supports_event_lists(network):
             kind = type(network).__name__
             raise ValueError(f"a list of events needs a SetNet or an E2VID, got {kind}")

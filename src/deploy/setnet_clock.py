@@ -12,13 +12,15 @@ from jaxtyping import Float, Int, UInt8
 from src.deploy.engines import clock_numba, sums_numba
 from src.deploy.engines.clock_numba import QUARTER, TILE
 from src.deploy.first_layer import event_patches, output_spans_of_inputs
-from src.models import setnet
-from src.models.setnet import CELL_PX, SUM_TAUS_S, SetNet
+from src.models import cell_clock
+from src.models.background import REVEALING_EVENTS, REVEALING_S
+from src.models.context_pyramid import CONTEXT_TAU_S
+from src.models.setnet import CELL_PX, REFERENCE_HZ, SUM_TAUS_S, SetNet
 from src.sim.optics import Position
 
 SIDE_BY_SIDE = 2000  # pixels with events from which on two threads take less time
 # Weights of REACH_CELLS averages of three cells, one after the other.
-SMOOTHING = np.float32(reduce(np.convolve, [np.full(3, 1 / 3)] * setnet.REACH_CELLS))
+SMOOTHING = np.float32(reduce(np.convolve, [np.full(3, 1 / 3)] * cell_clock.REACH_CELLS))
 
 
 class EventPixels(NamedTuple):
@@ -75,7 +77,7 @@ class SetNetClock:
         changed = np.zeros_like(self.near_tiles)
         longest_s = self._advance(pixels, changed)
         smoothed, update = self._advance_context(longest_s, changed)
-        kept = exp_float32(-longest_s / np.float32(setnet.CONTEXT_TAU_S))
+        kept = exp_float32(-longest_s / np.float32(CONTEXT_TAU_S))
         tiles = (list_places(part) for part in (self.active_tiles, changed))
         active_tiles, changed_tiles = tiles
         return Tick(active_tiles, update, *smoothed, kept, changed_tiles)
@@ -84,26 +86,26 @@ class SetNetClock:
         places, voxels, window_s = pixels
         kept, trace_kept = (
             exp_float32(-window_s / np.float32(tau))
-            for tau in (setnet.ACTIVITY_TAU_S, setnet.TRACE_TAU_S)
+            for tau in (cell_clock.ACTIVITY_TAU_S, cell_clock.TRACE_TAU_S)
         )
-        events = places, voxels, trace_kept, np.float32(setnet.MIN_SUPPORT)
+        events = places, voxels, trace_kept, np.float32(cell_clock.MIN_SUPPORT)
         spans = clock_numba.count_supported_events(*events, self.counts, self.trace, self.supported)
         near = self.is_near, self.near_tiles
         clock_numba.spread(self.supported, spans, SMOOTHING, self.evidence, *near)
-        fading = kept, np.float32(setnet.ACTIVITY_TAU_S), np.float32(setnet.MIN_ACTIVITY)
+        fading = kept, np.float32(cell_clock.ACTIVITY_TAU_S), np.float32(cell_clock.MIN_ACTIVITY)
         tiles = self.is_near, self.near_tiles, self.active_tiles
         cells = self.activity, self.elapsed_s, self.is_pending
         longest_s, active = clock_numba.advance_clocks(
             window_s, *fading, *tiles, *cells, self.pending_tiles, changed
         )
         share = np.float32(active) / np.float32(self.activity.size)
-        static, moving = setnet.STATIC_SHARE, setnet.MOVING_SHARE
+        static, moving = cell_clock.STATIC_SHARE, cell_clock.MOVING_SHARE
         pace = (share - np.float32(static)) / np.float32(moving - static)
         if pace <= 0:
             return np.float32(longest_s)
         moving_s = min(pace, np.float32(1)) * np.float32(longest_s)
         np.maximum(self.elapsed_s, moving_s, out=self.elapsed_s)
-        self.evidence += np.float32(setnet.REVEALING_EVENTS / setnet.REVEALING_S) * moving_s
+        self.evidence += np.float32(REVEALING_EVENTS / REVEALING_S) * moving_s
         for part in (self.is_pending, self.active_tiles, self.pending_tiles, changed):
             part[:] = 1
         return np.float32(longest_s)
@@ -114,13 +116,13 @@ class SetNetClock:
         if longest_s == 0:
             none = np.zeros((0, QUARTER, QUARTER), np.uint8)
             return (np.zeros((0, 2), np.int32), none), None
-        kept = exp_float32(-longest_s / np.float32(setnet.CONTEXT_INTERVAL_S))
+        kept = exp_float32(-longest_s / np.float32(cell_clock.CONTEXT_INTERVAL_S))
         self.update_recency *= kept
         clock_numba.fade(kept, self.recency.reshape(-1))
         tiles = self.pending_tiles, self.settling_tiles
-        given = self.recency, np.float32(setnet.SETTLING), self.is_pending
+        given = self.recency, np.float32(cell_clock.SETTLING), self.is_pending
         smoothed = clock_numba.find_cells_to_smooth(*given, *tiles, changed)
-        is_due = self.update_recency <= np.float32(setnet.UPDATE_RECENCY)
+        is_due = self.update_recency <= np.float32(cell_clock.UPDATE_RECENCY)
         return smoothed, self._start_update() if is_due else None
 
     def _start_update(self) -> ContextUpdate:
@@ -175,7 +177,7 @@ class EventMaps:
     def _make_voxel_map(self, pixels: EventPixels, clock: SetNetClock) -> None:
         places, voxels, window_s = pixels
         # As SetNet counts them.
-        rate_scale = np.float32(1 / (setnet.REFERENCE_HZ * float(window_s)))
+        rate_scale = np.float32(1 / (REFERENCE_HZ * float(window_s)))
         sums_numba.fill_tiles(clock.active_tiles, self.bias_row, self.voxel_map)
         patch = clock.elapsed_s, *self.spans, self.patches, self.voxel_map
         sums_numba.add_patches(places, voxels, rate_scale, *patch)

@@ -19,8 +19,9 @@ from src.deploy.engines import tiles_numba
 from src.deploy.setnet_clock import ContextUpdate, list_places, max_of_squares
 from src.deploy.setnet_layers import channels_first, channels_last, unpadded
 from src.deploy.tile_batches import TileModule
+from src.models.context_pyramid import ContextPyramid
 from src.models.layers import PreActivationBlock
-from src.models.setnet import ContextPyramid, SetNet
+from src.models.setnet import SetNet
 
 BLOCK_HALO = 2  # cells that the two convolutions of a PreActivationBlock take in on each side
 CONTEXT_TILE = 8  # side of a tile of any scale, in its cells

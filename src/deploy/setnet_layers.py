@@ -16,7 +16,8 @@ from torch.nn import functional
 
 from src.deploy.int8 import Int8Conv
 from src.models.layers import EqualDCConv, require_bias
-from src.models.setnet import CELL_BORDER, CELL_PX, REFERENCE_HZ, SetNet, TimeGatedMemory
+from src.models.setnet import CELL_BORDER, CELL_PX, REFERENCE_HZ, SetNet
+from src.models.time_gated_memory import TimeGatedMemory
 from src.sim.optics import Position
 
 

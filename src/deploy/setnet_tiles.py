@@ -21,7 +21,8 @@ from src.deploy.setnet_clock import (
 from src.deploy.setnet_context import CONTEXT_TILE, ContextTiles, WholeContext, find_tiles
 from src.deploy.setnet_layers import DecoderLayers, MemoryLayers, WholeDecoder, WholeWindow
 from src.deploy.tile_batches import Backend, TileModule
-from src.models.setnet import BACKGROUND, BACKGROUND_WEIGHT, CELL_PX, REVEALING_EVENTS, SetNet
+from src.models.background import BACKGROUND, BACKGROUND_WEIGHT, REVEALING_EVENTS
+from src.models.setnet import CELL_PX, SetNet
 from src.sim.optics import Position
 
 BATCHES = 8, 16, 32, 64, 128  # sizes of batches, in tiles
@@ -52,7 +53,7 @@ class TileState:
         tiles_numba.write_pixels(pixels, corners, evidence, half, *shown)
 
     def add_background(self) -> None:
-        """Bring `frame` up to date, as models.setnet.blend_background does."""
+        """Bring `frame` up to date, as models.background.blend_background does."""
         weight, light = self.totals
         light += BACKGROUND_WEIGHT * BACKGROUND
         background = np.float32(light / (weight + BACKGROUND_WEIGHT))
@@ -69,7 +70,7 @@ class TileState:
         return self.scales + self.fused[-2:0:-1]
 
 
-class SetNetState(NamedTuple):
+class SetNetTilesState(NamedTuple):
     """All that lives from window to window, advanced in place."""
 
     clock: SetNetClock
@@ -78,7 +79,7 @@ class SetNetState(NamedTuple):
 
 
 class SetNetTiles:
-    """Brings a SetNetState forward, window by window; `padded`: (h, w) of a picture."""
+    """Brings a SetNetTilesState forward, window by window; `padded`: (h, w) of a picture."""
 
     def __init__(
         self, network: SetNet, positions: Sequence[Position], padded: tuple[int, int],
@@ -108,7 +109,7 @@ class SetNetTiles:
         views, rows, columns, mixtures = self.events.size
         clock = SetNetClock(views, rows, columns, len(self.network.context.downs))
         sums = LeakySumState(views, rows, columns, mixtures)
-        self.state = SetNetState(clock, sums, TileState(self.network, *self.padded))
+        self.state = SetNetTilesState(clock, sums, TileState(self.network, *self.padded))
 
     def __call__(self, pixels: EventPixels) -> Float[np.ndarray, "h w"]:
         """Return the frame, padded, valid until the next window."""

@@ -1,6 +1,7 @@
 """Pictures of a run: films of panels side by side (GIF, PNG), space-time slices, and the views."""
 
 from collections.abc import Iterable
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from src.figures.comparison import VideoRow, draw_comparison
-from src.recordings.output import resize_picture, round_to_uint8
+from src.recordings.output import iter_frame_durations, resize_picture, round_to_uint8
 from src.records.atomic import atomic_path
 from src.sim.optics import Optics, layout, most_central_view_index
 from src.sim.pipeline import Sample
@@ -66,15 +67,15 @@ def write_light_field_panels(
     left.  The clean clip is as high as all views together.
     """
     views, tilt, counts = map(_shrink, (views, tilt, counts))
-    seen = tile_views(list(views), optics)
+    seen = place_views_at_apertures(list(views), optics)
     events = [render_events(part) for part in counts]
     reach = max(float(np.abs(tilt).max()), 1e-6)
     pushed = [render_events(part[:, 0], full=reach) for part in tilt]
     panels = {
         "clean": resize_pictures(clean, seen.shape[1]),
         "views": seen,
-        f"tilt in x, +-{reach:.1f} px": tile_views(pushed, optics),
-        EVENTS_TITLE: tile_views(events, optics),
+        f"tilt in x, +-{reach:.1f} px": place_views_at_apertures(pushed, optics),
+        EVENTS_TITLE: place_views_at_apertures(events, optics),
     }
     frames = join_panels(panels)
     paths = [folder / "views.gif", folder / "views.png"]
@@ -104,7 +105,7 @@ def resize_pictures(
     return resized.clip(pictures.min(), pictures.max())
 
 
-def tile_views(videos: list[Video], optics: Optics) -> Video:
+def place_views_at_apertures(videos: list[Video], optics: Optics) -> Video:
     """Place the videos of the views where their apertures are; gaps are white."""
     rows, columns = zip(*optics.positions, strict=True)
     frames, height, width, *rgb = videos[0].shape
@@ -165,16 +166,19 @@ def _draw_title(name: str, width: int) -> Float[np.ndarray, "title_px width 3"]:
 def write_animation(path: Path, frames: Video, fps: float) -> None:
     """Write a GIF or WebP (or, of the first frame, what else the suffix says) whole or not at all.
 
-    Values are clipped to [0, 1]; GIFs keep time to hundredths of a second, WebP to thousandths.
+    Values are clipped to [0, 1].  GIFs keep time to hundredths of a second, WebP to thousandths, in
+    both `fps` is the mean; players show frames of a GIF above 50 a second slower.
     """
     pictures, kind = list(map(Image.fromarray, round_to_uint8(frames))), path.suffix[1:].upper()
     options: dict[str, Any] = {}
     if kind == "GIF":
         pictures = [picture.quantize(128, dither=Image.Dither.NONE) for picture in pictures]
-        options = {"duration": 1000 / fps, "loop": 0}
+        hundredths = islice(iter_frame_durations(fps, 100), len(pictures))
+        options = {"duration": [10 * one for one in hundredths]}
     elif kind == "WEBP":
-        options = {"duration": round(1000 / fps), "loop": 0, "quality": WEBP_QUALITY}
+        thousandths = islice(iter_frame_durations(fps, 1000), len(pictures))
+        options = {"duration": list(thousandths), "quality": WEBP_QUALITY}
     if options:
-        options |= {"save_all": True, "append_images": pictures[1:]}
+        options |= {"save_all": True, "append_images": pictures[1:], "loop": 0}
     with atomic_path(path) as partial:
         pictures[0].save(partial, kind, **options)

@@ -6,11 +6,13 @@ Coordinates are (x, y) in pixels, the centre of the first pixel is (0, 0), y poi
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
 from jaxtyping import Float
+
+from src.recordings.output import resize_picture
 
 Points = Float[np.ndarray, "places 2"]
 Slice = Float[np.ndarray, "frames places"]
@@ -37,6 +39,15 @@ def cut_slice(
         middle = video.shape[1] // 2
         points = line_points(*(line or ((0, middle), (video.shape[2] - 1, middle))))
     return sample_points(video, points, key), points.reshape(-1, *points.shape[-2:])[0]
+
+
+def name_axis(kind: str, points: Points) -> str:
+    """Return the coordinate along a slice of `kind` through `points`: x of a row, y of a column, r
+    along another line or a ray that turns, theta on a circle."""
+    if kind in ("circle", "spin"):
+        return {"circle": "theta", "spin": "r"}[kind]
+    spread_x, spread_y = np.ptp(points, axis=0)
+    return "x" if spread_y == 0 else "y" if spread_x == 0 else "r"
 
 
 def sample_points(
@@ -89,10 +100,22 @@ def rotating_ray_xy(
     return np.array(centre) + radii[None, :, None] * rays[:, None]
 
 
-def shrink_to_smallest(videos: Sequence[Float[np.ndarray, "_frames _h _w"]]) -> list[np.ndarray]:
-    """Return the videos shrunk to the size of the smallest, areas averaged."""
-    height, width = min(video.shape[1:] for video in videos)
-    return [
-        np.stack([cv2.resize(f, (width, height), interpolation=cv2.INTER_AREA) for f in video])
-        for video in videos
-    ]
+def shrink_to_smallest(
+    videos: Mapping[str, Float[np.ndarray, "_frames _h _w"]],
+) -> dict[str, np.ndarray]:
+    """Return the videos, by name, shrunk to the size of the smallest, areas averaged.
+
+    Raises ValueError for one of another aspect ratio: shrunk it would miss that size by more than
+    a pixel.
+    """
+    sizes = {name: video.shape[1:] for name, video in videos.items()}
+    smallest = min(sizes, key=lambda name: math.prod(sizes[name]))
+    height, width = sizes[smallest]
+    for name, (own_height, own_width) in sizes.items():
+        if abs(own_width * height - own_height * width) > max(own_height, own_width):
+            got = f"{name} {own_height}x{own_width} and {smallest} {height}x{width} (h x w)"
+            raise ValueError(f"videos must be of one aspect ratio, got {got}")
+    return {
+        name: np.stack([resize_picture(frame, (height, width)) for frame in video])
+        for name, video in videos.items()
+    }

@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from src.live_view.status import FaultLog
-from src.recordings.files import sources
+from src.recordings.files import recording_inputs
 from src.recordings.files.clocks import TimestampUnwrapper
 from src.recordings.files.event_file import EVENT, ReadOptions
 from src.recordings.files.recording import open_recording
@@ -59,8 +59,8 @@ def open_feed(
     if recording.startswith("camera://"):
         return CameraFeed(faults)
     if not recording.startswith("udp://"):
-        size = sources.find_sensor_size(recording, sensor, options)
-        opened = open_recording(recording, size[::-1], options)
+        size = recording_inputs.find_sensor_size(recording, sensor, options)
+        opened = open_recording(recording, size, options)
         opened.check_sensor_size()
         if lines := opened.messages:
             faults.report("reading", "; ".join(lines), until_cleared=True)
@@ -87,7 +87,7 @@ class FileFeed(Feed):
         """Yield the file's events; raises ValueError where it cannot be decoded."""
         while not stopped.is_set():
             is_empty = True
-            for events in sources.iter_recording(
+            for events in recording_inputs.iter_recording(
                 self.path, self.sensor, FILE_CHUNK_S, self.options
             ):
                 is_empty = False

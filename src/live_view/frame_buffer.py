@@ -123,11 +123,12 @@ def draw_events(counts: Int[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
     return cv2.applyColorMap(steps, COLOURS)
 
 
-def tile_views(
+def tile_views_without_gaps(
     counts: Int[np.ndarray, "views h w"], positions: Sequence[Position]
 ) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Return the events of all views where they stand in the light field, made small, a line of one
-    pixel between them; each view keeps two pixels of a side, where it has them.
+    """Return the events of all views in their order in the light field, rows and columns without a
+    view left out, made small, a line of one pixel between them; each view keeps two pixels of a
+    side, where it has them.
     """
     rows, columns = (sorted({place[axis] for place in positions}) for axis in (0, 1))
     _, height, width = counts.shape

@@ -16,7 +16,13 @@ from pathlib import Path
 import cv2
 from aiohttp import WSMsgType, web
 
-from src.live_view.frame_buffer import Line, TimeSlice, draw_events, encode_jpeg, tile_views
+from src.live_view.frame_buffer import (
+    Line,
+    TimeSlice,
+    draw_events,
+    encode_jpeg,
+    tile_views_without_gaps,
+)
 from src.live_view.player import Player
 from src.sim.optics import Position
 
@@ -90,7 +96,7 @@ class LivePage:
             centre = self.positions.index((0, 0)) if (0, 0) in self.positions else 0
             yield "events", encode_jpeg(draw_events(counts[centre]))
             if self.all_views:
-                yield "views", encode_jpeg(tile_views(counts, self.positions))
+                yield "views", encode_jpeg(tile_views_without_gaps(counts, self.positions))
         if (drawn := self.slice.draw(always=whole)) is not None:
             yield "slice", encode_jpeg(drawn)
 

@@ -32,10 +32,11 @@ MAX_SIZE = 4096  # any number in the arguments of a network that a file names
 def load(name_or_path: str | Path, allowed_packages: Sequence[str] = ()) -> nn.Module:
     """Return the network of a file, float32, in eval mode, spectral norm folded into its weights.
 
-    A word names a file of `weights/`; a path is a `.safetensors` file written by `save`, a
-    checkpoint of a training run or its folder; its network is of src.models, baselines or one of
-    the packages `allowed_packages`.  Raises ValueError, beginning with `ckpt`, for a file that is
-    not there, is no such file, or holds other weights than its network has.
+    A name of `weights/` is that file, else it is a path (./name, where there is one of that name):
+    a `.safetensors` file written by `save`, a checkpoint of a training run or its folder.  Its
+    network is of src.models, baselines or a package of `allowed_packages`.  Raises ValueError,
+    beginning with `ckpt`, for a file that is not there, is no such file, or holds other weights
+    than its network has.
     """
     path = locate(name_or_path)
     if path.is_dir():
@@ -57,28 +58,33 @@ def load(name_or_path: str | Path, allowed_packages: Sequence[str] = ()) -> nn.M
 
 
 def locate(name: str | Path) -> Path:
-    """Return the path `name`, or the file of `weights/` of that name where it is no file."""
-    path, shipped = Path(name), WEIGHTS / f"{name}.safetensors"
-    return shipped if not path.is_file() and shipped.is_file() else path
+    """Return the shipped file where `name` is one of `list_shipped`, else the path `name`.
+
+    The shipped one comes first: a file or folder of that name in this folder is `./name`.
+    """
+    return WEIGHTS / f"{name}.safetensors" if str(name) in _shipped_names() else Path(name)
 
 
 def list_shipped() -> str:
     """Return the names in `weights/`, those of its folders last, for a message."""
+    names = sorted(_shipped_names(), key=lambda name: (name.count("/"), name))
+    return ", ".join(names) or "none yet"
+
+
+def _shipped_names() -> set[str]:
     paths = (file.relative_to(WEIGHTS) for file in WEIGHTS.rglob("*.safetensors"))
-    names = (path.with_suffix("").as_posix() for path in paths)
-    return ", ".join(sorted(names, key=lambda name: (name.count("/"), name))) or "none yet"
+    return {path.with_suffix("").as_posix() for path in paths}
 
 
 def find_checkpoint(name: str | Path, spec: dict) -> Path:
-    """Return the file to go on from: `name`, the newest whole checkpoint in the folder `name`, or
-    the file of `weights/` of that name.
+    """Return the file to go on from: that of `locate(name)`, of a folder its newest whole
+    checkpoint.
 
     Raises ValueError unless it is a whole checkpoint, or a file of `save`, of the network `spec`;
     a file of `save` may also be of the same E2VID on one view.
     """
-    path, shipped = Path(name), WEIGHTS / f"{name}.safetensors"
-    if not path.exists() and shipped.is_file():
-        path = shipped
+    path = locate(name)
+    is_shipped = path != Path(name)
     path = newest_checkpoint(path) if path.is_dir() else path
     if not path.is_file():
         raise ValueError(f"ckpt must be a checkpoint to go on from, got {path}")
@@ -89,7 +95,7 @@ def find_checkpoint(name: str | Path, spec: dict) -> Path:
         one_view = {"views": 1} if spec["target"] == WIDENABLE else {}
         wanted = [spec | {"kwargs": kwargs | more} for more in ({}, one_view)]
     if saved not in wanted:
-        if path == shipped:
+        if is_shipped:
             how = f"experiment={name} and the overrides of conf/recipe/{name}.yaml"
             raise ValueError(
                 f"ckpt={name} must be of the network that is trained; go on with {how}"

@@ -1,9 +1,10 @@
 """Layers that recurrent reconstruction networks are made of; state in, state out."""
 
+from collections.abc import Callable
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -110,6 +111,22 @@ class EqualDCConv(nn.Conv2d):
         response = self.weight.mean((2, 3), keepdim=True)  # to a constant input
         weight = self.weight - response + response.mean(0, keepdim=True)
         return weight, require_bias(self).mean().expand(len(weight))
+
+
+def scan_windows(
+    step: Callable[..., Tensor], state: Float[Tensor, "n ..."], *maps: Shaped[Tensor, "m ..."]
+) -> tuple[Float[Tensor, "m ..."], Float[Tensor, "n ..."]]:
+    """Return the state after every window and after the last: state = step(state, *maps of the
+    window), with `maps` of m = windows * n.
+    """
+    if len(maps[0]) == len(state):  # OpenVINO would copy what is split into one
+        state = step(state, *maps)
+        return state, state
+    states = []
+    for now in zip(*(part.split(len(state)) for part in maps), strict=True):
+        state = step(state, *now)
+        states.append(state)
+    return torch.cat(states), state
 
 
 def require_bias(layer: nn.Conv2d | nn.Linear) -> Tensor:

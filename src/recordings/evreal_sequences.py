@@ -66,7 +66,7 @@ def open_as_evreal(source: Path, run: Path) -> Iterator[EvrealSequence]:
     height, width = frames.size
     if opened.size not in (None, (width, height)):
         raise ValueError(f"{path}: frames are {(height, width)}, the sensor {opened.size[::-1]}")
-    opened = recording.open_recording(path, (width, height))
+    opened = recording.open_recording(path, (height, width))
     with tempfile.TemporaryDirectory(dir=run, prefix=".sequence") as folder:
         out = Path(folder) / sequence_name(source)
         event_writers.write_pieces(

@@ -12,7 +12,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
-from itertools import chain, count
+from itertools import chain, count, pairwise
 from pathlib import Path
 
 import av
@@ -29,6 +29,7 @@ from src.records.atomic import check_free_space, name_path_in_errors, partial_pa
 VP9 = {"crf": "12", "b": "0", "deadline": "realtime", "cpu-used": "6"}  # error of 1 level, rms
 KEY_FRAME_EVERY = 12
 CACHE_BYTES = 2**20  # of HDF5, for each of its datasets
+MAX_GIF_FPS = 50  # a frame of less than two hundredths of a second is shown for ten
 FRAME_NAME = re.compile(r"\d{7,}\.png$")
 Picture = UInt8[np.ndarray, "h w *rgb"]  # grey, or of three colours
 Add = Callable[[Picture, Frame | None], None]
@@ -41,7 +42,8 @@ def open_video_writer(
     """Open `video.mp4`, `video.gif`, `frames/`, `video.h5` or `film.mp4` in `folder`; yield
     `write(frame)`.
 
-    `size`: (height, width); `film`: frames with colours; `playback_fps`: of an MP4 or GIF.
+    `size`: (height, width); `film`: frames with colours; `playback_fps`: of an MP4 or GIF,
+    in [0.1, 1000], of a GIF up to 50.
     `frames.csv` gets each frame's index, time in s, events in views and outside.  Raises ValueError
     as `check_video_settings` does, or where the file cannot be written.
     """
@@ -79,8 +81,10 @@ def check_video_settings(kind: str, folder: Path, playback_fps: float) -> None:
     out of range, or a `frames/` in `folder` with other files than frames."""
     if kind not in KINDS:
         raise ValueError(f"output_format must be one of {', '.join(KINDS)}, got {kind}")
-    if not 0.1 <= playback_fps <= 1000:
-        raise ValueError(f"playback_fps must be in [0.1, 1000], got {playback_fps}")
+    highest, whose = (MAX_GIF_FPS, " for output_format=gif") if kind == "gif" else (1000, "")
+    if not 0.1 <= playback_fps <= highest:
+        allowed = f"[0.1, {highest}]{whose}"
+        raise ValueError(f"playback_fps must be in {allowed}, got {playback_fps}")
     _check_only_frames(folder / KINDS[kind][1])
 
 
@@ -89,8 +93,8 @@ def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> i
     return how many.
 
     The file is there when it is whole.  Raises ValueError for another ending of `path`, no frames,
-    frames of several sizes, other values (beyond an overshoot, which is clipped) and an `fps`
-    outside [0.1, 1000].
+    frames of several sizes, floats outside [-0.5, 1.5] (what is beyond [0, 1] is clipped), other
+    types and an `fps` outside [0.1, 1000].
     """
     path, given = Path(path), map(np.asarray, frames)
     first = next(given, None)
@@ -182,16 +186,23 @@ def _mp4(path: Path, size: HeightWidth, fps: float) -> Iterator[Add]:
             file.mux(stream.encode())
 
 
+def iter_frame_durations(fps: float, ticks_per_s: int) -> Iterator[int]:
+    """Yield the ticks that frame after frame is shown: whole, and `fps` frames a second in the
+    mean (of 30 in hundredths of a second 3, 4, 3, 3, ...)."""
+    ends = (int(ticks_per_s * frame / fps + 0.5) for frame in count())
+    return (end - start for start, end in pairwise(ends))
+
+
 @contextmanager
 def _gif(path: Path, size: HeightWidth, fps: float) -> Iterator[Add]:
-    hundredths = max(2, round(100 / fps))
+    hundredths = iter_frame_durations(fps, 100)
     with open(path, "wb") as file:
         blank = Image.new("L", size[::-1])
         file.write(b"".join(GifImagePlugin.getheader(blank, info={"loop": 0})[0]))
 
         def add(picture: Picture, frame: Frame | None) -> None:
             image = Image.fromarray(picture)
-            file.write(b"".join(GifImagePlugin.getdata(image, duration=10 * hundredths)))
+            file.write(b"".join(GifImagePlugin.getdata(image, duration=10 * next(hundredths))))
 
         try:
             yield add

@@ -2,9 +2,8 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from itertools import cycle
 from typing import Any, Literal
 
 import numpy as np
@@ -13,7 +12,7 @@ from jaxtyping import Float
 from torch import nn
 
 from src.deploy.forms import convert_to_form
-from src.deploy.runtime import FORMS, EventListRuntime, supports_event_lists
+from src.deploy.runtime import EVENT_LIST_FORMS, EventListRuntime, supports_event_lists
 from src.models.network import EventToVideoNetwork
 from src.recordings.event_windows import Window, WindowRule, cut_windows, cut_windows_backward
 from src.recordings.sensor_lookup import build_lookup
@@ -26,7 +25,8 @@ RunnableNetwork = EventToVideoNetwork | EventListRuntime
 @dataclass(frozen=True)
 class Frame:
     """A picture (h, w), or (h, w, 3) of a film, float32 in [0, 1] at `time_s`, the end of its
-    window; its window's number of `events` in views and `events_outside` of all."""
+    window; of this window's events the number of those in views, `events`, and of those in no view,
+    `events_outside`."""
 
     time_s: float
     picture: Float[np.ndarray, "h w *rgb"]
@@ -100,7 +100,7 @@ def build_runnable_network(
     """
     if device != "cpu" and form == "openvino":
         raise ValueError(f"device must be cpu for form=openvino, got {device}")
-    if device != "cpu" or form not in FORMS or not supports_event_lists(network):
+    if device != "cpu" or form not in EVENT_LIST_FORMS or not supports_event_lists(network):
         return convert_to_form(network, form).to(device)
     if bins != network.bins:
         raise ValueError(f"bins must be {network.bins} for this network, got {bins}")
@@ -174,14 +174,16 @@ def _voxels(window: Window) -> Float[np.ndarray, "views bins h w"]:
 
 
 def reconstruct_each_view(
-    windows: Iterable[Window], network: EventToVideoNetwork, frames_per_window: int = 1
+    windows: Iterable[Window], network: EventToVideoNetwork, overlapping_windows: int = 1
 ) -> Iterator[Float[np.ndarray, "views h w"]]:
-    """Reconstruct every view by itself, with a network of one view; empty windows hold."""
-    states, pictures = [None] * frames_per_window, None
-    for window, phase in zip(windows, cycle(range(frames_per_window)), strict=False):
-        if window.events or pictures is None:
-            voxels = torch.from_numpy(_voxels(window).copy())[:, None]
-            options = {"window_s": window.length_s, "positions": [(0, 0)]}
-            with torch.inference_mode():
-                pictures, states[phase] = network(voxels, states[phase], **options)
-        yield pictures[:, 0].clamp(0, 1).numpy()
+    """Yield the pictures of each window on a grid, as `reconstruct_frames` of a network of one view
+    gives them for each view by itself; a window without events in all views holds them."""
+    states: list[ReconstructionState] = []
+    for window in windows:
+        views = [replace(window, voxels=view[None]) for view in _voxels(window)]
+        states = states or [ReconstructionState(overlapping_windows) for _ in views]
+        frames = (
+            reconstruct_frames([view], network, [(0, 0)], state)
+            for view, state in zip(views, states, strict=True)
+        )
+        yield np.stack([next(frame).picture for frame in frames])

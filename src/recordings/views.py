@@ -63,13 +63,8 @@ class Views:
     views: tuple[View, ...]
 
     def __post_init__(self):
-        sizes = (("sensor", self.sensor, 1), ("model", self.model, len(self.views)))
-        for name, size, count in sizes:
-            if not all(1 <= side <= LARGEST_SIDE for side in size):
-                raise ValueError(f"views.{name} must be in 1..{LARGEST_SIDE} pixels, got {size}")
-            if count * math.prod(size) > MAX_PIXELS:
-                allowed = f"{MAX_PIXELS} pixels at most"
-                raise ValueError(f"views.{name} must have {allowed}, got {count} x {size}")
+        _check_size("views.sensor", self.sensor)
+        _check_size("views.model", self.model, len(self.views))
         left, top, right, bottom = self.field
         if not (np.isfinite(self.field).all() and right - left >= 1 and bottom - top >= 1):
             raise ValueError(f"views.field must be left, top, right, bottom, got {self.field}")
@@ -175,6 +170,14 @@ HEADER = """\
 """
 
 
+def _check_size(key: str, size: HeightWidth, pictures: int = 1) -> None:
+    """Raise ValueError, which names `key`, where so many pictures of `size` are too large."""
+    if not all(1 <= side <= LARGEST_SIDE for side in size):
+        raise ValueError(f"{key} must be in 1..{LARGEST_SIDE} pixels, got {size}")
+    if pictures * math.prod(size) > MAX_PIXELS:
+        raise ValueError(f"{key} must have {MAX_PIXELS} pixels at most, got {pictures} x {size}")
+
+
 def views_or_whole_sensor(
     path: Path | str | None, sensor: HeightWidth, resolution: Sequence[int] | None = None
 ) -> Views:
@@ -185,10 +188,9 @@ def views_or_whole_sensor(
     views = load_views(path, sensor) if path is not None else Views.single_view(sensor, sensor)
     if not resolution:
         return views
-    try:
-        return replace(views, model=(resolution[0], resolution[1]))
-    except ValueError as error:
-        raise ValueError(str(error).replace("views.model", "resolution")) from error
+    model = resolution[0], resolution[1]
+    _check_size("resolution", model, len(views.views))
+    return replace(views, model=model)
 
 
 def load_views(path: Path | str, sensor: HeightWidth | None = None) -> Views:

@@ -83,9 +83,9 @@ def create_run_folder(run: Path, config: str, name: str = CONFIG_FILE) -> None:
 
 def parse_settings_without_paths(config: str) -> dict:
     """Return the settings of a resolved `config` (YAML) that the numbers depend on: all but
-    `paths`, `verbose` and, for training, the `ckpt` it resumed from."""
+    `paths` and, for training, the `ckpt` it resumed from."""
     settings = safe_yaml.parse(config)
-    settings.pop("verbose", None)
+    settings.pop("verbose", None)  # of versions up to 0.6.12: it printed the config
     run = settings.pop("paths", {}).get("run")
     if settings.get("task") == "train":
         settings.pop("ckpt", None)
@@ -116,17 +116,24 @@ def has_results(run: Path, config: str) -> bool:
 def summarize_scores(clips: list[dict], own_metrics: Iterable[Column] = ()) -> dict:
     """Return {clips, metric: {mean, std, interval}} over clips; `interval`: 95 % bootstrap CI.
 
-    Clips that state their number of `frames`, as recorded sequences do, count by it.
+    `std`: standard deviation of the clips' values.  Clips that state their number of `frames`, as
+    recorded sequences do, count by it in all three.
     """
     summary: dict = {"clips": len(clips)}
     weights = frame_weights(clips)
     names = (*NAMES, *(metric.name for metric in own_metrics))
     for metric in (name for name in names if clips and name in clips[0]):
         values = [clip[metric] for clip in clips]
-        mean, std = statistics.fmean(values, weights), float(np.std(values))
+        mean, std = statistics.fmean(values, weights), _weighted_std(values, weights)
         interval = bootstrap_interval(values, weights)
         summary[metric] = {"mean": mean, "std": std, "interval": interval}
     return summary
+
+
+def _weighted_std(values: list[float], weights: list[float] | None) -> float:
+    """Return the population standard deviation; weights None: all alike, as `np.std`."""
+    deviations = np.asarray(values) - np.average(values, weights=weights)
+    return float(np.sqrt(np.average(deviations**2, weights=weights)))
 
 
 def frame_weights(clips: list[dict]) -> list[float] | None:

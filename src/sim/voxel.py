@@ -22,8 +22,8 @@ def voxel_grid(
     t: ArrayLike, x: ArrayLike, y: ArrayLike, p: ArrayLike, *, t0: float, t1: float, bins: int,
     height: int, width: int,
 ) -> Float[Tensor, "bins h w"]:  # fmt: skip
-    """Return the grid of the events with t0 <= t <= t1; the others have no part in it, and where
-    there are others only a warning says so.
+    """Return the grid, float32, of the events with t0 <= t <= t1; zeros without any.  Warns where
+    events are given and none lies in the window.
 
     `t`, in the unit of `t0` and `t1` and in any order; `x`, `y` in pixels; `p` in {-1, 1} or
     {0, 1}: arrays or tensors of one length.  Each event's weights are multiples of 2**-20, so

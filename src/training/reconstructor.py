@@ -14,7 +14,7 @@ from src.losses.terms import TrainingLoss
 from src.metrics.video_metrics import VideoMetrics
 from src.models.network import EventToVideoNetwork, FramePostprocessor, VideoMethod, unroll
 from src.sim import noise
-from src.training import going_on
+from src.training import resume
 from src.training.cuda_graphs import GraphedUnroll
 from src.training.schedule import TrainingClock
 from src.training.step_guard import StepGuard
@@ -204,8 +204,8 @@ class Reconstructor(LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
         if self.make_optimizer is not None:  # else nothing is trained
-            going_on.check_max_steps(self.trainer.max_steps, checkpoint["global_step"])
-            kept = going_on.apply_config_to_optimizer_state(
+            resume.check_max_steps(self.trainer.max_steps, checkpoint["global_step"])
+            kept = resume.apply_config_to_optimizer_state(
                 checkpoint, self.network.parameters, self.make_optimizer, self.make_scheduler
             )
             start = checkpoint.get("optimizer_start", 0)

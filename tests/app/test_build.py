@@ -14,7 +14,7 @@ from src.app import build, compared_networks, hardware
 from src.app.instantiate import instantiate_node, read_user_packages
 from src.eval import evaluate
 from src.models import files
-from src.recordings.files import event_file, event_writers, sources
+from src.recordings.files import event_file, event_writers, recording_inputs
 from src.train import train
 from tests.conftest import ROOT
 from tests.test_train import TINY, config
@@ -196,9 +196,9 @@ def test_a_missing_size_is_asked_for_by_its_key(tmp_path):
     event_writers.write_events(tmp_path / "a.raw", events, width=8, height=8)
     (tmp_path / "a.txt").write_text("0 1 1 1\n5e-6 2 2 0\n")
     with pytest.raises(ValueError, match=r"give sensor_size=\[height,width\]"):
-        sources.find_sensor_size(tmp_path / "a.txt")
+        recording_inputs.find_sensor_size(tmp_path / "a.txt")
     with pytest.warns(UserWarning, match=r"states a sensor of 8x8: read as sensor_size=\[4,4\]"):
-        assert sources.find_sensor_size(tmp_path / "a.raw", [4, 4]) == (4, 4)
+        assert recording_inputs.find_sensor_size(tmp_path / "a.raw", [4, 4]) == (4, 4)
 
 
 def test_views_that_stand_anywhere_are_scored_and_timed(tmp_path):

@@ -43,6 +43,7 @@ def test_a_former_key_in_a_config_file_is_refused():
         ("simulate", "data.unknown=1", "data.unknown is no key of the configuration; --cfg job"),
         ("train", "optimizer.lrr=1", "optimizer.lrr is no key of the configuration; did you mean"
                                      " optimizer.lr?"),
+        ("eval", "verbose=true", "verbose was removed"),
         ("train", "experiment=clean/x", "experiment must be one of lf3x3, mambatm, "),
         ("live", "reading=defalt", "reading must be one of default, got defalt; did you mean"
                                    " default?"),

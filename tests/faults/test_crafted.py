@@ -19,7 +19,7 @@ from baselines.firenet import FireNet
 from src.models import files
 from src.recordings import views
 from src.recordings.calibration import view_alignment
-from src.recordings.files import recording, sources, videos
+from src.recordings.files import recording, recording_inputs, videos
 from src.records import safe_yaml
 from src.sim.scenes import photo_files, video_decoding, video_files
 from src.sim.scenes.video_decoding import LARGEST_PIXELS
@@ -95,7 +95,7 @@ def pickle(path):
         file.writestr("a/version", "3\n")
 
 
-READ = partial(recording.read_events, size=(640, 480))
+READ = partial(recording.read_events, sensor_size=(480, 640))
 FRAMES, PUBLISHED = (lambda path: next(videos.read_video(path)),), whole.read_published
 CASES = [  # name, content or what writes it, words of the refusal, readers
     ("a.h5", partial(table, shape=10**12), "unpacks to", [READ]),
@@ -111,7 +111,7 @@ CASES = [  # name, content or what writes it, words of the refusal, readers
      "pixels at most", FRAMES),
     ("a.h5", partial(datasets, names=["frames"], shape=(9, 9, 9), dtype="f8"), "uint8", FRAMES),
     ("a.h5", partial(datasets, names=["frames"], shape=400, dtype="u1"), "uint8", FRAMES),
-    ("a.png", picture, "readable picture of at most", [sources.read_picture_or_event_counts]),
+    ("a.png", picture, "readable picture of", [recording_inputs.read_picture_or_event_counts]),
     ("a.png", picture, "readable photographs", [photo_files.decode_photograph]),
     ("a.ckpt", packed_network, "that is whole", [files.load]),
     ("a.ckpt", packed_network, "unpacked", [PUBLISHED]),

@@ -35,7 +35,7 @@ from src.models import files
 from src.models.e2vid import E2VID
 from src.recordings import sensor_lookup, views
 from src.recordings.calibration import view_alignment
-from src.recordings.files import recording, sources, videos
+from src.recordings.files import recording, recording_inputs, videos
 from src.sim.scenes import photo_files, video_files
 from tests.baselines.published_names import published_state_dict
 from tests.faults.harness import Run
@@ -58,7 +58,7 @@ def read_corners(path: Path) -> None:
 
 
 def read_picture(path: Path) -> None:
-    sources.read_picture_or_event_counts(path)
+    recording_inputs.read_picture_or_event_counts(path)
     photo_files.decode_photograph(path)
 
 

@@ -7,7 +7,14 @@ import pytest
 from PIL import Image
 
 from src.figures.comparison import VideoRow, draw_comparison
-from src.figures.slices import circle_points, line_points, rotating_ray_xy, sample_points
+from src.figures.slices import (
+    circle_points,
+    line_points,
+    name_axis,
+    rotating_ray_xy,
+    sample_points,
+    shrink_to_smallest,
+)
 
 Y, X = np.mgrid[:40, :60].astype(float)
 
@@ -56,6 +63,28 @@ def test_points_are_at_most_a_pixel_apart():
 def test_outside_is_refused():
     with pytest.raises(ValueError, match=r"60x40 px, got \(70.0, 3.0\)"):
         sample_points(np.zeros((2, 40, 60)), np.array([[5.0, 3.0], [70.0, 3.0]]))
+
+
+@pytest.mark.parametrize(
+    ("kind", "points", "axis"),
+    [
+        ("line", line_points((0, 12), (59, 12)), "x"),
+        ("still", line_points((0, 12), (59, 12)), "x"),
+        ("line", line_points((7, 0), (7, 39)), "y"),
+        ("line", line_points((30, 20), (50, 30)), "r"),
+        ("circle", circle_points((30, 20), 15), "theta"),
+        ("spin", rotating_ray_xy((30, 20), np.zeros(1), np.arange(9.0))[0], "r"),
+    ],
+)
+def test_a_slice_is_named_by_its_coordinate(kind, points, axis):
+    assert name_axis(kind, points) == axis
+
+
+def test_the_smallest_video_is_that_of_the_fewest_pixels_and_rounded_sides_are_one_shape():
+    videos = {name: np.ones((2, *size)) for name, size in (("a", (720, 1280)), ("b", (176, 313)))}
+    assert [video.shape for video in shrink_to_smallest(videos).values()] == [(2, 176, 313)] * 2
+    with pytest.raises(ValueError, match="a 720x1280 and b 176x310"):
+        shrink_to_smallest(videos | {"b": np.ones((2, 176, 310))})
 
 
 @pytest.mark.parametrize("note", ["", "SSIM 0.5"])

@@ -79,6 +79,20 @@ def test_a_gif_keeps_frames_grey_levels_and_time(tmp_path):
     assert np.abs(shown / 255 - frames).max() < 0.02
 
 
+@pytest.mark.parametrize(("suffix", "durations"), [("gif", {60, 70}), ("webp", {66, 67})])
+def test_an_animation_has_the_rate_that_is_asked_in_the_mean(suffix, durations, tmp_path):
+    path, shown = tmp_path / f"a.{suffix}", []
+    write_animation(path, ramp(12, 16, 24), fps=15.0)
+    with Image.open(path) as image:
+        for frame in range(image.n_frames):
+            image.seek(frame)
+            image.load()
+            shown.append(image.info["duration"])
+    assert len(shown) == 12 and sum(shown) == 800 and set(shown) == durations
+    write_animation(path, ramp(1, 16, 24), fps=15.0)
+    write_animation(path, np.zeros((3, 16, 24)), fps=15.0)  # frames alike
+
+
 def test_a_picture_is_the_first_frame(tmp_path):
     frames = ramp(2, 16, 24)
     write_animation(tmp_path / "a.png", frames, fps=20.0)

@@ -386,7 +386,7 @@ def test_a_file_that_breaks_off_is_told(recording, tmp_path, monkeypatch):
         yield read_events(recording)[:1000]
         raise ValueError(f"{recording}: cannot be decoded: broken")
 
-    monkeypatch.setattr(event_feeds.sources, "iter_recording", broken)
+    monkeypatch.setattr(event_feeds.recording_inputs, "iter_recording", broken)
     made = served(recording, {"net": HighPass()})
     made.page.player.start()
     _until(lambda: made.page.player.status()["state"] == "broken")

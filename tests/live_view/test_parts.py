@@ -322,21 +322,26 @@ def test_events_are_drawn_in_two_colours_and_views_where_they_stand():
     counts[4, :10], counts[0] = 3, -3
     drawn = frame_buffer.draw_events(counts[4])
     assert (drawn[:10] == frame_buffer.ON).all() and (drawn[10:] == frame_buffer.BACKGROUND).all()
-    whole = frame_buffer.tile_views(counts, list(layout(9)))
+    whole = frame_buffer.tile_views_without_gaps(counts, list(layout(9)))
     assert whole.shape == (60, 60, 3)
     assert (whole[:20, :20] == frame_buffer.OFF).all()
     assert (whole[21:30, 21:40] == frame_buffer.ON).all()
     for line in (whole[20], whole[40], whole[:, 20], whole[:, 40]):
         assert (line == frame_buffer.BORDER).all()
     assert (whole != frame_buffer.BORDER).any(-1).sum() == 60**2 - 4 * 60 + 4
-    assert max(frame_buffer.tile_views(np.zeros((9, 176, 176), np.int32), layout(9)).shape) <= 264
+    assert (
+        max(
+            frame_buffer.tile_views_without_gaps(np.zeros((9, 176, 176), np.int32), layout(9)).shape
+        )
+        <= 264
+    )
 
 
 @pytest.mark.parametrize("size", [(10, 1280), (1280, 10), (1, 2000), (3, 2000), (2, 2)])
 def test_views_long_and_narrow_are_drawn(size):
     counts = np.zeros((9, *size), np.int32)
     counts[0] = 3
-    drawn = frame_buffer.tile_views(counts, list(layout(9)))
+    drawn = frame_buffer.tile_views_without_gaps(counts, list(layout(9)))
     assert max(drawn.shape) <= 264 and (drawn[0, 0] == frame_buffer.ON).all()
     assert (drawn[-1, -1] == frame_buffer.BACKGROUND).all()
 

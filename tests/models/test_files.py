@@ -1,5 +1,7 @@
 """Networks on disk: what is saved comes back; what is wrong is named; nothing is executed."""
 
+from pathlib import Path
+
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -48,6 +50,24 @@ def test_a_word_names_shipped_weights(tmp_path, monkeypatch):
     assert isinstance(load("mine"), E2VID)
     with pytest.raises(ValueError, match=r"weights/ \(mine\), got other"):
         load("other")
+
+
+def test_a_shipped_name_comes_before_a_file_or_folder_of_that_name(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "WEIGHTS", tmp_path / "weights")
+    (tmp_path / "weights" / "clean").mkdir(parents=True)
+    for name in ("mine", "clean/mine"):
+        save(tmp_path / f"weights/{name}.safetensors", trained(), SPEC, {})
+    (tmp_path / "mine").mkdir()
+    torch.save({"network": SPEC, "state_dict": trained().state_dict()}, tmp_path / "mine/last.ckpt")
+    (tmp_path / "clean").mkdir()
+    (tmp_path / "clean/mine").touch()
+    monkeypatch.chdir(tmp_path)
+    for name in ("mine", "clean/mine"):
+        shipped = tmp_path / f"weights/{name}.safetensors"
+        assert files.locate(name) == files.find_checkpoint(name, SPEC) == shipped
+    for path in ("./mine", "mine/last.ckpt", "other", tmp_path / "weights/mine"):
+        assert files.locate(path) == Path(path)
+    assert files.find_checkpoint("./mine", SPEC) == Path("mine/last.ckpt")
 
 
 @pytest.mark.parametrize("stem", [None, 6])

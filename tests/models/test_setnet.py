@@ -12,24 +12,20 @@ from src.app import build
 from src.app.instantiate import instantiate_node
 from src.deploy.cost import macs_per_frame
 from src.models import load, save
-from src.models.network import MAX_WINDOWS, unroll
-from src.models.setnet import (
+from src.models.background import BACKGROUND, BACKGROUND_WEIGHT, blend_background
+from src.models.cell_clock import (
     ACTIVITY_TAU_S,
-    BACKGROUND,
-    BACKGROUND_WEIGHT,
-    CONTEXT_TAU_S,
     MIN_ACTIVITY,
     MIN_SUPPORT,
     MOVING_SHARE,
     REACH_CELLS,
-    SIZES,
     STATIC_SHARE,
-    SetNet,
-    SetNetState,
-    TimeGatedMemory,
-    blend_background,
-    smooth_context,
 )
+from src.models.context_pyramid import CONTEXT_TAU_S, smooth_context
+from src.models.network import MAX_WINDOWS, unroll
+from src.models.setnet import SIZES, SetNet
+from src.models.setnet_state import SetNetState
+from src.models.time_gated_memory import TimeGatedMemory
 from src.sim.optics import layout
 from tests.conftest import ROOT
 from tests.test_train import config

@@ -83,7 +83,24 @@ def test_what_was_done_is_kept_when_the_run_fails(kind, tmp_path):
     assert rows[2]["events"] == "20" and rows[2]["outside"] == "2"
 
 
-@pytest.mark.parametrize("kind, playback, message", [("avi", 30, "output"), ("mp4", 0, "playback")])
+@pytest.mark.parametrize("fps", [50, 30, 24, 0.1])
+def test_a_gif_is_as_fast_as_is_asked(fps, tmp_path):
+    with open_video_writer("gif", tmp_path, SIZE, fps) as write:
+        for frame in frames(12):
+            write(frame)
+    with Image.open(tmp_path / "video.gif") as image:
+        durations_ms = [_seek(image, k) is not None and image.info["duration"] for k in range(12)]
+    assert abs(sum(durations_ms) - 12_000 / fps) <= 5 and np.ptp(durations_ms) <= 10
+
+
+@pytest.mark.parametrize(
+    "kind, playback, message",
+    [
+        ("avi", 30, "output"),
+        ("mp4", 0, "playback"),
+        ("gif", 60, r"playback_fps must be in \[0.1, 50\] for output_format=gif, got 60"),
+    ],
+)
 def test_a_wrong_choice_is_refused(kind, playback, message, tmp_path):
     with (
         pytest.raises(ValueError, match=message),

@@ -1,5 +1,7 @@
 """Frames from lists of events are those from grids, resampled views, empty windows and all."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -122,3 +124,18 @@ def test_lists_of_events_backwards_are_the_grids_backwards(name, cut):
                 state.reverse()
         shown.append(np.stack([frame.picture for frame in found]))
     np.testing.assert_allclose(*shown, atol=1e-5)
+
+
+def test_view_by_view_the_pictures_are_those_of_each_view_alone():
+    torch.manual_seed(0)
+    network, table = E2VID(base_channels=4).eval(), sensor_lookup.build_lookup(VIEWS)
+    rule = event_windows.WindowRule(fps=600.0, frames_per_window=5)
+    first, *others = event_windows.cut_windows([recording()], table, rule)
+    windows = [replace(first, events=0, voxels=np.zeros_like(first.voxels)), *others]
+    found = list(reconstruction.reconstruct_each_view(windows, network, 5))
+    assert (found[0] == 0.5).all() and any(window.events == 0 for window in others)
+    for view in range(9):
+        alone = [replace(window, voxels=window.voxels[[view]]) for window in windows]
+        frames = reconstruct_frames(alone, network, [(0, 0)], ReconstructionState(5))
+        pictures = [frame.picture for frame in frames]
+        assert np.array_equal([picture[view] for picture in found], pictures)

@@ -8,7 +8,7 @@ import torch
 from src.recordings import sensor_lookup, simulated_recording, views
 from src.recordings.calibration import dot_statistics, gaussian_dots, view_alignment
 from src.recordings.calibration.boards import Charuco, Checkerboard, Circles
-from src.recordings.files import event_writers, recording, sources
+from src.recordings.files import event_writers, recording, recording_inputs
 from src.recordings.truth_file import create_truth_file
 from src.sim.optics import layout
 from src.sim.sensor.sensor import EventSensor
@@ -61,13 +61,13 @@ def blinking(picture: torch.Tensor, frames: int = 5) -> torch.Tensor:
 def test_a_blinking_screen_calibrates_the_views(truth, target, picture, tmp_path):
     path = tmp_path / "board.raw"
     simulated_recording.write_recording(path, blinking(half(picture)), 60.0, truth, noisy_sensor())
-    seen = view_alignment.repair_picture(sources.read_picture_or_event_counts(path))
+    seen = view_alignment.repair_picture(recording_inputs.read_picture_or_event_counts(path))
     aligned = view_alignment.fit_homographies(
         view_alignment.find_target(seen, target), sensor=SENSOR, model=(88, 88)
     )
     assert aligned.views.positions == list(layout(9))
     assert max(distance_px(aligned.views, truth).values()) < 0.3
-    saved = views.load_views(tmp_path / "board.views.yaml", sources.find_sensor_size(path))
+    saved = views.load_views(tmp_path / "board.views.yaml", recording_inputs.find_sensor_size(path))
     assert [saved.mirrored_xy(view) for view in saved.views] == [
         aligned.views.mirrored_xy(view) for view in aligned.views.views
     ]

@@ -329,3 +329,9 @@ def test_pictures_of_another_sensor_are_refused():
         ValueError, match="must be of a sensor of 64x32, as the pictures, got 64x48"
     ):
         whole.warp_to_model(np.zeros((32, 64)))
+
+
+@pytest.mark.parametrize("resolution", [(100_000, 10), (8000, 8000)])
+def test_a_resolution_that_is_too_large_is_named(resolution):
+    with pytest.raises(ValueError, match="^resolution must "):
+        views.views_or_whole_sensor(None, (48, 64), resolution)

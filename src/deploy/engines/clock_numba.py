@@ -1,4 +1,4 @@
-"""SetNet's clock from the pixels that had events (numba): bit for bit that of `SetNet.run_clock`.
+"""SetNet's clock from the pixels that had events (numba): bit for bit `cell_clock.run_clock`.
 
 Maps are (rows, columns) of cells.  Whatever is dense in here is a pass or two over one map of
 bytes or floats; all else follows the events and the tiles, of TILE x TILE cells, that they reach.

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from src.recordings.files import sources, videos
+from src.recordings.files import recording_inputs, videos
 from src.recordings.files.event_file import ReadOptions
 from src.recordings.views import HeightWidth
 from src.sim.scenes.video_files import PICTURE_SUFFIXES
@@ -48,10 +48,12 @@ def read_activity_pictures(
     255), in up to WINDOWS windows of a recording.  Raises ValueError for what cannot be read."""
     if (path := Path(path)).suffix.lower() in PICTURE_SUFFIXES:
         return 255 * videos.read_gray_picture(path)[None, None].astype(np.float32)
-    if not sources.has_events(path):
+    if not recording_inputs.has_events(path):
         return _average_film(videos.read_video(path))
-    size = sources.find_sensor_size(path, sensor, options)
-    return _count_events(sources.iter_recording(path, size, FIRST_WINDOW_US * 1e-6, options), size)
+    size = recording_inputs.find_sensor_size(path, sensor, options)
+    return _count_events(
+        recording_inputs.iter_recording(path, size, FIRST_WINDOW_US * 1e-6, options), size
+    )
 
 
 def shrink_pictures(

@@ -21,6 +21,13 @@ Picture = UInt8[np.ndarray, "h w"]
 Points = Float[np.ndarray, "_ 2"]
 
 
+def check_grid_size(rows: int, cols: int, config_key: str = "target") -> None:
+    """Raise ValueError, which names the keys below `config_key`, for a grid that is none."""
+    if not (3 <= rows <= 100 and 3 <= cols <= 100):
+        keys = f"{config_key}.rows and {config_key}.cols"
+        raise ValueError(f"{keys} must be in 3..100, got {rows} and {cols}")
+
+
 @dataclass(frozen=True)
 class _Grid:
     rows: int = 5
@@ -28,9 +35,7 @@ class _Grid:
     ordered = False
 
     def __post_init__(self):
-        if not (3 <= self.rows <= 100 and 3 <= self.cols <= 100):
-            got = f"{self.rows} and {self.cols}"
-            raise ValueError(f"target.rows and target.cols must be in 3..100, got {got}")
+        check_grid_size(self.rows, self.cols)
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -21,11 +21,12 @@ WidthHeight = tuple[int, int]
 class ReadOptions:
     """What the user states of a file that does not say it, or of which it has several.
 
-    `time_unit`: auto, s, ms, us or ns.  `columns`: the order of the columns of a table without
-    names, the letters x y p t (other letters are skipped).  `format`: of a RAW file without a
-    line that says it: evt2, evt21 or evt3.  `stream`: number or name of one of several cameras in
-    a file.  `part`: 0, 1, ... of a file whose clock restarts.  Raises ValueError for a value out
-    of range.
+    `time_unit`: auto, s, ms, us or ns.  `columns`: the order of the columns of a table,
+    the letters x y p t (other letters are skipped); names in the file do not count then, nor a unit
+    in them.  `format`: of a RAW file without a line that says it: evt2, evt21 or evt3.  `stream`:
+    number or name of one of several cameras in a file.  `part`: 0, 1, ... of a file whose clock
+    restarts.  Raises ValueError for a value out of range; reading does for one that the file has no
+    use for.
     """
 
     time_unit: str = "auto"
@@ -110,6 +111,12 @@ def require_default_stream(path: Path, wanted: str | int | None) -> None:
     """Raise ValueError for a stream other than the first of a file that holds one only."""
     if wanted not in (None, 0, "0"):
         raise ValueError(f"stream must be null, as {path} has one camera, got {wanted}")
+
+
+def refuse_column_order(order: str | None, why: str) -> None:
+    """Raise ValueError for an order (columns=) of columns that have none; `why`: as ... ."""
+    if order is not None:
+        raise ValueError(f"columns must be null, as {why}, got {order}")
 
 
 @contextmanager

@@ -26,7 +26,7 @@ TABLES: dict[str, Callable] = {
     "evreal": table_writers.write_evreal,
 }  # fmt: skip
 VERSIONS = ("evt2", "evt3")
-LAYOUTS = (None, "dsec", "evreal")
+LAYOUTS = (None, "evreal")
 MOST_PIXELS = {".raw": 2**11, ".dat": 2**14, "evreal": 2**15}  # of a side, by its bits
 MOST_US = {".dat": 2**32, ".h5": 2**32, ".hdf5": 2**32}  # between the first and the last event
 MOST_ES_US = 2**32  # ES writes all time since 0, a byte for each 127 us without events
@@ -89,15 +89,13 @@ def choose_file_kind(path: Path, layout: str | None, width: int, height: int, ve
     cannot be, before anything is written."""
     suffix = path.suffix.lower()
     if layout not in LAYOUTS:
-        raise ValueError(f"layout must be null, dsec or evreal, got {layout}")
+        raise ValueError(f"layout must be null or evreal, got {layout}")
     if version not in VERSIONS:
         raise ValueError(f"{path}: cannot write {suffix} of version {version}, but evt2 and evt3")
     kind = "evreal" if layout == "evreal" else suffix
     if kind not in (*BINARY, *TABLES):
         known = ", ".join((*BINARY, *TABLES))
         raise ValueError(f"{path}: cannot write {suffix or 'no ending'}, but {known}")
-    if layout == "dsec" and kind not in (".h5", ".hdf5"):
-        raise ValueError(f"{path}: layout=dsec must have the ending .h5 or .hdf5")
     if path.is_dir():
         present = {file.name for file in path.iterdir()}
         if kind != "evreal" or table_writers.EVREAL_TIMES not in present:

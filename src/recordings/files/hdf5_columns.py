@@ -15,7 +15,7 @@ from src.recordings.files.columns import (
     find_keys_by_name,
     find_time_unit_in_text,
 )
-from src.recordings.files.event_file import ReadOptions
+from src.recordings.files.event_file import ReadOptions, refuse_column_order
 from src.recordings.files.numpy_file import LazyColumn, has_event_per_column, split_table
 
 
@@ -23,6 +23,7 @@ def find_event_columns(node: Any, order: str | None) -> dict[str, Any]:
     """Return the columns t, x, y, p of a group or a table, times after the `t_offset` beside them
     or of the file; `order`: columns=."""
     if isinstance(node, h5py.Group):
+        refuse_column_order(order, "the arrays in it have names")
         keys = find_keys_by_name(node) or {}
         columns = {name: _open_column(node[key], name, key) for name, key in keys.items()}
         check_lengths(columns)

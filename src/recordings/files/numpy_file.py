@@ -29,6 +29,7 @@ from src.recordings.files.event_file import (
     WidthHeight,
     choose_stream,
     name_file_in_errors,
+    refuse_column_order,
     require_default_stream,
 )
 from src.recordings.files.time_unit import UNITS_US
@@ -95,13 +96,13 @@ def _find_stated_unit(file: Any, options: ReadOptions) -> str | None:
 
 def split_table(table: Any, order: str | None) -> dict[str, Any]:
     """Return the columns t, x, y, p of a structured array or of one (n, columns), in any of which
-    slices can be taken; `order`: columns=.  Arrays may also be (4, n) and (n, 1), as MATLAB has
-    them.  Raises ValueError for another array."""
+    slices can be taken; `order`: columns=, before the names of fields.  Arrays may also be (4, n)
+    and (n, 1), as MATLAB has them.  Raises ValueError for another array."""
     names = table.dtype.names
     if isinstance(table, np.ndarray):
         table = _flat(table) if names else table.T if has_event_per_column(table) else table
     if names is not None:
-        keys = find_keys_by_name(names)
+        keys = find_keys_by_name(names) if order is None else _name_fields(names, order)
         if keys is None or table.ndim != 1:
             raise ValueError(f"fields must be t, x, y, p of one dimension, got {', '.join(names)}")
         return {
@@ -119,6 +120,12 @@ def split_table(table: Any, order: str | None) -> dict[str, Any]:
     return {
         name: LazyColumn(table, itemgetter((slice(None), place))) for name, place in places.items()
     }
+
+
+def _name_fields(names: Sequence[str], order: str) -> dict[str, str]:
+    """Return the names of the fields t, x, y, p that stand in `order`."""
+    places = find_columns(np.empty((0, len(names))), order)
+    return {letter: names[place] for letter, place in places.items()}
 
 
 def slice_times(path: Path, t: Any) -> Iterator[np.ndarray]:
@@ -161,6 +168,7 @@ def _columns_of(
     keys = find_keys_by_name(file.files)
     if keys is not None:
         require_default_stream(path, options.stream)
+        refuse_column_order(options.columns, "the arrays in it have names")
         columns = {name: _flat(extract_column(name, key, file[key])) for name, key in keys.items()}
         if any(column.ndim != 1 for column in columns.values()):
             raise ValueError("columns must have one dimension")

@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from src.recordings.engines.event_passes import copy_events_on_sensor
-from src.recordings.files import sensor_size
 from src.recordings.files.aedat1to3_file import Aedat1To3File
 from src.recordings.files.aedat4_file import Aedat4File
 from src.recordings.files.clocks import TimestampUnwrapper
@@ -22,9 +22,11 @@ from src.recordings.files.event_arrays import concatenate_events, count_before
 from src.recordings.files.event_file import (
     EVENT,
     EventFile,
+    HeightWidth,
     RawEvents,
     ReadOptions,
     WidthHeight,
+    refuse_column_order,
     require_default_stream,
 )
 from src.recordings.files.event_order import EventSorter, merge_in_time
@@ -34,6 +36,14 @@ from src.recordings.files.npz_folder import NpzFolder, find_npz_folder
 from src.recordings.files.numpy_file import NumpyFile
 from src.recordings.files.prophesee_file import PropheseeFile
 from src.recordings.files.rosbag_file import RosbagFile, is_bag_folder
+from src.recordings.files.sensor_size import (
+    MAX_SIDE,
+    MOST_OUTSIDE,
+    choose_size,
+    describe_oversized_coordinates,
+    find_swapped_size,
+    report_events_outside,
+)
 from src.recordings.files.survey import TimeSurvey, survey_times
 from src.recordings.files.text_file import TextFile
 from src.recordings.files.text_layout import TEXT_ENDINGS
@@ -48,6 +58,7 @@ READERS: dict[str, Reader] = {  # by the ending, in small letters
     **dict.fromkeys((*TEXT_ENDINGS, ".gz", ".zip"), TextFile),
 }  # fmt: skip
 OF_ONE_CAMERA = (PropheseeFile, EsFile, TextFile, EvrealFolder)
+NO_TABLES = (PropheseeFile, Aedat4File, Aedat1To3File, EsFile, RosbagFile, EvrealFolder)
 OF_THE_CAMERA = (PropheseeFile, EsFile, Aedat4File, Aedat1To3File)  # it wrote the sensor's size
 
 
@@ -75,8 +86,8 @@ class EventRecording:
             return
         (width, height), largest = self.size, np.array([first.x.max(), first.y.max()], int)
         outside = int(np.sum((first.x >= width) | (first.y >= height)))
-        if outside >= sensor_size.MOST_OUTSIDE * len(first.t):
-            sensor_size.report_events_outside(self.path, self.size, len(first.t), outside, largest)
+        if outside >= MOST_OUTSIDE * len(first.t):
+            report_events_outside(self.path, self.size, len(first.t), outside, largest)
 
     def __iter__(self) -> Iterator[np.ndarray]:
         """Yield the events in pieces, not empty, in order of time; warn of what was wrong."""
@@ -87,12 +98,12 @@ class EventRecording:
 
 
 def open_recording(
-    path: str | Path, size: WidthHeight | None = None, options: ReadOptions = ReadOptions()
+    path: str | Path, sensor_size: HeightWidth | None = None, options: ReadOptions = ReadOptions()
 ) -> EventRecording:
-    """Return the recording at `path`; `size` (width, height) comes before what the file states.
+    """Return the recording at `path`; `sensor_size` comes before what the file states.
 
     Of a table all times are read here, and what is odd about their unit or order is a warning, as
-    is a size that the file states and its events or `size` contradict.
+    is a size that the file states and its events or `sensor_size` contradict.
     Raises ValueError for a file that is missing, empty, of an unknown kind or cannot be read.
     """
     path = Path(path)
@@ -102,24 +113,28 @@ def open_recording(
     kept, survey, swapped = _open_and_survey(path, state.st_mtime_ns, state.st_size, options)
     file = _open_file(path, options) if kept is None else kept
     file.kept_times = survey.times
-    size, lines = sensor_size.choose_size(path, size, file.size, swapped)
+    given = None if sensor_size is None else (sensor_size[1], sensor_size[0])
+    size, lines = choose_size(path, given, file.size, swapped)
     recording = EventRecording(path, size, options, file, survey, lines)
     _tell(recording.messages)
     return recording
 
 
 def read_events(
-    path: str | Path, size: WidthHeight | None = None, options: ReadOptions = ReadOptions()
-) -> np.ndarray:
+    path: str | Path, *, sensor_size: HeightWidth | None = None,
+    options: ReadOptions = ReadOptions(), size: Any = None,
+) -> np.ndarray:  # fmt: skip
     """Return all events of a file, (n,) of t int64 us, x, y uint16, p int8 in {-1, 1}, in order of
     time.
 
-    `size`: (width, height), where the file does not state it or states another; where neither says,
-    no event is off the sensor.  `options`: what the file does not say (ReadOptions).  Raises
-    ValueError for a file that cannot be read; warns of what was sorted or dropped, with the number
-    of events.
+    `sensor_size`: (height, width) in pixels, where the file does not state it or states another;
+    where neither says, no event is off the sensor.  `options`: what the file does not say
+    (ReadOptions).  Raises ValueError for a file that cannot be read, and for the former `size`;
+    warns of what was sorted or dropped, with the number of events.
     """
-    pieces = list(open_recording(path, size, options))
+    if size is not None:
+        raise ValueError(f"size=(width, height) is now sensor_size=(height, width), got {size}")
+    pieces = list(open_recording(path, sensor_size, options))
     return concatenate_events(pieces) if pieces else np.empty(0, EVENT)
 
 
@@ -127,7 +142,7 @@ def iter_events(
     path: str | Path,
     *,
     seconds: float = 0.1,
-    size: WidthHeight | None = None,
+    sensor_size: HeightWidth | None = None,
     options: ReadOptions = ReadOptions(),
 ) -> Iterator[np.ndarray]:
     """Yield the events of a file in chunks of `seconds` from the first event, those without events
@@ -135,7 +150,7 @@ def iter_events(
     if not 1e-6 <= seconds <= 1e6:
         raise ValueError(f"seconds must be in [1e-6, 1e6], got {seconds}")
     span, start, held = round(seconds * 1e6), None, []
-    for events in open_recording(path, size, options):
+    for events in open_recording(path, sensor_size, options):
         start = int(events["t"][0]) if start is None else start
         while len(events):
             cut = count_before(events, start + span)
@@ -169,7 +184,7 @@ def _read_part(recording: EventRecording, part: int) -> Iterator[np.ndarray]:
     if not survey.covers_all_times:
         order.check_part(part, path)
     if size is not None:
-        sensor_size.report_events_outside(path, size, count, outside, largest_xy)
+        report_events_outside(path, size, count, outside, largest_xy)
     if not survey.covers_all_times:
         _tell(order.describe_time_faults(path, part=recording.options.part))
 
@@ -189,7 +204,7 @@ def _convert(
         x, y, p = (part[wrong] for part in raw[1:])
         if p not in (-1, 0, 1):
             raise ValueError(f"{path}: polarity must be in -1, 0, 1, got {p}")
-        raise ValueError(f"{path}: x and y must be in 0..{sensor_size.MAX_SIDE - 1}, got {x}, {y}")
+        raise ValueError(f"{path}: x and y must be in 0..{MAX_SIDE - 1}, got {x}, {y}")
     p = columns[-1]
     if p.size and p.min() < 0 and not p.all():
         raise ValueError(f"{path}: polarity must be 0 and 1 or -1 and 1, got -1 and 0")
@@ -237,6 +252,8 @@ def _open_file(path: Path, options: ReadOptions) -> EventFile:
         raise ValueError(f"{path}: unknown kind of event file, known are {', '.join(READERS)}")
     if reader in OF_ONE_CAMERA:
         require_default_stream(path, options.stream)
+    if reader in NO_TABLES:
+        refuse_column_order(options.columns, f"{path} is no table")
     if options.format is not None and path.suffix.lower() != ".raw":
         raise ValueError(f"format must be null, as {path} is no RAW file, got {options.format}")
     inner = Path(path.stem).suffix.lower()
@@ -264,8 +281,8 @@ def _open_and_survey(
     file = _open_file(path, options)
     survey, swapped = survey_times(file, options), None
     if not isinstance(file, OF_THE_CAMERA):
-        swapped = sensor_size.find_swapped_size(file, survey.pieces or file.pieces())
-        lines = sensor_size.describe_oversized_coordinates(file, survey.pieces or file.pieces())
+        swapped = find_swapped_size(file, survey.pieces or file.pieces())
+        lines = describe_oversized_coordinates(file, survey.pieces or file.pieces())
         survey = survey._replace(messages=survey.messages + lines)
     return (None if isinstance(file, Hdf5File) else file), survey, swapped
 

@@ -67,7 +67,8 @@ def _frames(path: Path, config_key: str, max_frames: int | None) -> Iterator[np.
     if path.is_dir():
         found = (name for name in path.iterdir() if name.suffix.lower() in PICTURE_SUFFIXES)
         names = sort_naturally(name for name in found if name.name[0] != ".")
-        yield from map(read_gray_picture, names)
+        for name in names:
+            yield read_gray_picture(name, config_key)
     elif path.suffix == ".h5":
         with _opened_h5(path) as file:
             frames = file["frames"]
@@ -90,11 +91,11 @@ def _opened_h5(path: Path) -> Iterator[h5py.File]:
         yield file
 
 
-def read_gray_picture(path: Path) -> Float[np.ndarray, "h w"]:
-    """Return a picture in [0, 1], of 8 or 16 bits; raises ValueError for what cannot be read."""
+def read_gray_picture(path: Path, config_key: str = "recording") -> Float[np.ndarray, "h w"]:
+    """Return a picture in [0, 1], of 8 or 16 bits; raises ValueError, which names `config_key`, for
+    what cannot be read."""
     picture = read_picture(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     if picture is None or picture.dtype.kind != "u":
-        raise ValueError(
-            f"recording must be a readable picture of at most {LARGEST_PIXELS} pixels, got {path}"
-        )
+        wanted = f"a readable picture of at most {LARGEST_PIXELS} pixels"
+        raise ValueError(f"{config_key} must be {wanted}, got {path}")
     return picture.astype(np.float32) / np.iinfo(picture.dtype).max

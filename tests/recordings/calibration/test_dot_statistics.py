@@ -202,6 +202,7 @@ def write_film(folder, frames: int, side: int = 96):
         ("dots.rows=0", r"dots.rows and dots.cols must be in 3\.\.100, got 0 and 3"),
         ("still={folder}/none", "still must be a film or a folder of pictures, got .*none"),
         ("still={folder}/larger", r"still must have pictures of the .* size, 96x96, got 120x120"),
+        ("still={folder}/text", "still must be a readable picture of at most .*text/0.png"),
         ("still={folder}/nowhere", "still must be .*, got .*nowhere, which does not exist"),
     ],
 )
@@ -210,6 +211,8 @@ def test_calibrate_refuses_wrong_films_before_it_fits(wrong, message, tmp_path, 
     dots, still = (write_film(tmp_path / name, 2) for name in ("dots", "still"))
     write_film(tmp_path / "larger", 2, 120)
     (tmp_path / "none").mkdir()
+    (tmp_path / "text").mkdir()
+    (tmp_path / "text" / "0.png").write_text("no picture")
     given = ["task=turbulence", f"recording={dots}", f"still={still}", "fps=60"]
     given.append(wrong.format(folder=tmp_path))
     with pytest.raises(ValueError, match=message) as caught:

@@ -22,8 +22,7 @@ def in_pieces(events: np.ndarray):
 def test_hdf5_has_the_layout_of_dsec(tmp_path):
     events = made_up(3000)
     events["t"][1500:] += 20_000
-    how = {**SIZE, "layout": "dsec"}
-    count, seconds = event_writers.write_pieces(tmp_path / "a.h5", in_pieces(events), **how)
+    count, seconds = event_writers.write_pieces(tmp_path / "a.h5", in_pieces(events), **SIZE)
     span = int(events["t"][-1] - events["t"][0])
     assert (count, seconds) == (3000, pytest.approx(span * 1e-6))
     with h5py.File(tmp_path / "a.h5") as file:
@@ -119,8 +118,7 @@ def test_events_off_the_sensor_or_in_fractions_are_refused(tmp_path, ending, kin
         ("a.mp4", {}, "cannot write .mp4"),
         ("a", {}, "cannot write no ending"),
         ("a.raw", {"version": "evt4"}, "of version evt4"),
-        ("a.raw", {"layout": "x"}, "layout must be null, dsec or evreal, got x"),
-        ("a.raw", {"layout": "dsec"}, "must have the ending .h5"),
+        ("a.h5", {"layout": "dsec"}, "layout must be null or evreal, got dsec"),
         ("a.raw", {"width": 2049}, "sides up to 2048, got 2049x480"),
         ("taken", {"layout": "evreal"}, "is a folder already"),
         ("file.h5", {"layout": "evreal"}, "writes a folder, this is a file already"),

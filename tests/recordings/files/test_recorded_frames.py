@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from src.recordings.files import read_events, sources
+from src.recordings.files import read_events, recording_inputs
 from src.recordings.files.recorded_frames import find_frames
 from src.recordings.files.recording import open_recording
 from tests.recordings.files.frames import (
@@ -35,12 +35,12 @@ def written(tmp_path, request):
 
 def test_events_and_frames_of_each_layout(written):
     path, events, frames, zero = written
-    assert sources.find_sensor_size(path) == SIZE
-    found = read_events(path, SIZE[::-1])
+    assert recording_inputs.find_sensor_size(path) == SIZE
+    found = read_events(path, sensor_size=SIZE)
     assert np.array_equal(found["t"], events["t"] - zero)
     for name in "xyp":
         assert np.array_equal(found[name], events[name]), name
-    counts = sources.read_picture_or_event_counts(path)  # as src.calibrate reads it
+    counts = recording_inputs.read_picture_or_event_counts(path)  # as src.calibrate reads it
     assert counts.shape == SIZE and counts.sum() == len(events)
     beside = find_frames(open_recording(path))
     assert beside.size == SIZE
@@ -67,8 +67,8 @@ def test_each_layout_becomes_evreals(written, tmp_path, convert):  # noqa: F811
 def test_a_sensors_size_from_frames_is_told(tmp_path):
     path = write_recording(tmp_path / "cap", "timelens", make_events(), make_frames())
     with pytest.warns(UserWarning, match="a sensor of 48x40, as its frames"):
-        assert sources.find_sensor_size(path) == SIZE
-    assert sources.find_sensor_size(path, (60, 70)) == (60, 70)
+        assert recording_inputs.find_sensor_size(path) == SIZE
+    assert recording_inputs.find_sensor_size(path, (60, 70)) == (60, 70)
 
 
 def test_a_part_has_the_frames_of_its_time(tmp_path, convert):  # noqa: F811
@@ -98,7 +98,7 @@ def test_pictures_without_times_are_left_out_with_a_word(tmp_path):
     path = write_recording(tmp_path / "cap", "timelens", make_events(), make_frames())
     (path / "images/timestamp.txt").unlink()
     with pytest.warns(UserWarning, match=r"5 frames without timestamp\.txt, left out"):
-        assert find_frames(open_recording(path, SIZE[::-1])) is None
+        assert find_frames(open_recording(path, SIZE)) is None
 
 
 def test_a_time_that_is_wrong_lies_between_its_neighbours(tmp_path):
@@ -145,7 +145,7 @@ def test_frames_that_cannot_be_read_are_named(tmp_path, spoil, words):
     spoil(path)
     with warnings.catch_warnings(), pytest.raises(ValueError, match=words) as error:
         warnings.simplefilter("ignore")
-        list(find_frames(open_recording(path, SIZE[::-1])).pictures())
+        list(find_frames(open_recording(path, SIZE)).pictures())
     assert str(error.value).startswith(str(path))
 
 

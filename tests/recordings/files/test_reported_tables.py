@@ -9,7 +9,7 @@ import pytest
 
 from src.recordings.files import ReadOptions, read_events
 from src.recordings.files.recording import open_recording
-from src.recordings.files.sources import find_sensor_size
+from src.recordings.files.recording_inputs import find_sensor_size
 from src.recordings.files.table_writers import write_csv, write_npz
 from tests.recordings.files.test_tables import events, lines
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from src.recordings.files import read_events, sources
+from src.recordings.files import read_events, recording_inputs
 from src.recordings.files.event_file import RawEvents, ReadOptions
 from src.recordings.files.event_writers import write_events
 from src.recordings.files.rosbag_file import RosbagFile
@@ -155,8 +155,10 @@ def test_a_folder_is_a_recording(tmp_path):
     listed["t"] *= 1000
     with Bag(tmp_path / "2026_11_26", "mcap") as bag:
         bag.add_array("/dvs/events", listed)
-    assert sources.has_events(tmp_path / "2026_11_26") and not sources.has_events(tmp_path)
-    assert sources.find_sensor_size(tmp_path / "2026_11_26") == (480, 640)
+    assert recording_inputs.has_events(tmp_path / "2026_11_26") and not recording_inputs.has_events(
+        tmp_path
+    )
+    assert recording_inputs.find_sensor_size(tmp_path / "2026_11_26") == (480, 640)
     assert np.array_equal(read_events(tmp_path / "2026_11_26"), events)
 
 

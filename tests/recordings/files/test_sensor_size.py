@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from src.recordings.files import open_recording, read_events, sources
+from src.recordings.files import open_recording, read_events, recording_inputs
 from tests.recordings.files.bags import Bag
 from tests.recordings.files.tables import write_events
 from tests.recordings.files.test_recording import made_up
@@ -36,7 +36,7 @@ def test_sides_the_wrong_way_round_are_exchanged(tmp_path, kind):
     line = r"states a sensor of 480x640, its events fit 640x480: read as sensor_size=\[480,640\]"
     for given in (None, (480, 640)):
         with pytest.warns(UserWarning, match=line):
-            assert sources.find_sensor_size(path, given) == (480, 640)
+            assert recording_inputs.find_sensor_size(path, given) == (480, 640)
     with pytest.warns(UserWarning, match=line):
         assert np.array_equal(read_events(path), made_up())
 
@@ -45,12 +45,12 @@ def test_the_users_size_comes_before_the_files(tmp_path):
     write_events(tmp_path / "a.raw", made_up(), width=640, height=480)
     line = r"states a sensor of 640x480: read as sensor_size=\[500,700\]"
     with pytest.warns(UserWarning, match=line):
-        assert sources.find_sensor_size(tmp_path / "a.raw", [500, 700]) == (500, 700)
+        assert recording_inputs.find_sensor_size(tmp_path / "a.raw", [500, 700]) == (500, 700)
     with pytest.warns(UserWarning, match=line):
-        assert open_recording(tmp_path / "a.raw", (700, 500)).size == (700, 500)
+        assert open_recording(tmp_path / "a.raw", (500, 700)).size == (700, 500)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert sources.find_sensor_size(tmp_path / "a.raw", [480, 640]) == (480, 640)
+        assert recording_inputs.find_sensor_size(tmp_path / "a.raw", [480, 640]) == (480, 640)
 
 
 def test_a_few_events_outside_exchange_nothing(tmp_path):
@@ -72,11 +72,11 @@ def test_half_of_the_events_off_the_sensor_are_refused(tmp_path, ending, outside
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         if not is_refused:
-            assert len(read_events(path, (400, 300))) == 1001
+            assert len(read_events(path, sensor_size=(300, 400))) == 1001
             return
         words = "1000 of 2000 events are off the 400x300 sensor, they need 501x8; is sensor_size="
         with pytest.raises(ValueError, match=words):
-            read_events(path, (400, 300))
+            read_events(path, sensor_size=(300, 400))
 
 
 def test_parts_of_a_pixel_without_frames_are_told_of(tmp_path):
@@ -87,3 +87,8 @@ def test_parts_of_a_pixel_without_frames_are_told_of(tmp_path):
     for path in (tmp_path, tmp_path / "000000.npz"):
         with pytest.warns(UserWarning, match="up to 15968 and 9568, beyond any sensor; parts of"):
             read_events(path)
+
+
+def test_the_former_size_is_refused_with_its_new_name(tmp_path):
+    with pytest.raises(ValueError, match=r"is now sensor_size=\(height, width\), got \(640, 480\)"):
+        read_events(tmp_path / "a.raw", size=(640, 480))

@@ -12,6 +12,7 @@ import pytest
 
 from src.recordings.files import ReadOptions, open_recording, read_events
 from src.recordings.files.event_file import EVENT
+from tests.recordings.files.tables import write_events
 
 WIDTH, HEIGHT = 320, 240
 
@@ -327,7 +328,7 @@ def test_one_of_two_cameras_is_read_and_the_other_is_told_of(tmp_path, events):
 def test_an_npz_states_its_size_in_two_numbers_or_not_at_all(tmp_path, events):
     columns = {name: events[name] for name in "txyp"}
     np.savez(tmp_path / "other.npz", **columns, resolution=(WIDTH, HEIGHT))
-    assert open_recording(tmp_path / "other.npz", (WIDTH, HEIGHT)).size == (WIDTH, HEIGHT)
+    assert open_recording(tmp_path / "other.npz", (HEIGHT, WIDTH)).size == (WIDTH, HEIGHT)
     np.savez(tmp_path / "three.npz", **columns, size=(WIDTH, HEIGHT, 3))
     with pytest.raises(ValueError, match=r"size must be \(width, height\), got"):
         open_recording(tmp_path / "three.npz")
@@ -356,6 +357,27 @@ def test_a_format_of_a_file_that_is_not_raw_is_refused(tmp_path, events):
     (tmp_path / "a.txt").write_text(lines(events))
     with pytest.raises(ValueError, match="format must be null, as .* is no RAW file, got evt3"):
         read_events(tmp_path / "a.txt", options=ReadOptions(format="evt3"))
+
+
+@pytest.mark.parametrize("ending", [".raw", ".dat", ".aedat4", ".es", ".npz", ".h5"])
+def test_an_order_of_columns_that_have_none_is_refused(tmp_path, events, ending):
+    write_events(path := tmp_path / f"a{ending}", events, width=WIDTH, height=HEIGHT)
+    with pytest.raises(ValueError, match="columns must be null, as .*, got ptxy"):
+        read_events(path, options=ReadOptions(columns="ptxy"))
+
+
+@pytest.mark.parametrize("is_csv", [False, True])
+def test_a_stated_order_comes_before_the_names_of_a_table(tmp_path, events, is_csv):
+    path, names = tmp_path / ("a.csv" if is_csv else "a.npy"), ["t_s", "y", "x", "p"]
+    if is_csv:
+        path.write_text(",".join(names) + "\n" + lines(events).replace(" ", ","))
+    else:
+        table = np.empty(len(events), [(name, np.int64) for name in names])
+        for name, column in zip(names, "txyp", strict=True):
+            table[name] = events[column]
+        np.save(path, table)
+    options = ReadOptions(columns="txyp", time_unit="us")
+    assert np.array_equal(read_events(path, options=options), events)
 
 
 def test_a_folder_is_named_as_one(tmp_path):

@@ -1,4 +1,7 @@
-"""What grows in a long run: python -m scripts.endure train 60, python -m scripts.endure events 2e7
+"""What grows in a long run:
+
+    python -m scripts.soak_test train 60
+    python -m scripts.soak_test events 2e7
 
 `train` trains the smallest network for so many minutes, with a worker, validations and checkpoints
 every few steps; `events` reconstructs so many events, a recording over and over.  Memory and open
@@ -23,7 +26,7 @@ from src.app.compose import compose_config
 from src.app.script import run_script
 from src.models.e2vid import E2VID
 from src.recordings import event_windows, output, reconstruction, sensor_lookup
-from src.recordings.files import event_file, event_writers, sources
+from src.recordings.files import event_file, event_writers, recording_inputs
 from src.recordings.views import Views
 from src.records import results
 from src.train import fit
@@ -134,7 +137,7 @@ def _over_and_over(path: Path, events: int) -> Iterator[np.ndarray]:
     for turn in count():
         if turn * EVENTS >= events:
             return
-        for chunk in sources.iter_recording(path, (SIDE, SIDE)):
+        for chunk in recording_inputs.iter_recording(path, (SIDE, SIDE)):
             chunk["t"] += turn * 2_000_000
             yield chunk
 

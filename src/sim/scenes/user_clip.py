@@ -28,13 +28,13 @@ from src.sim.scenes.video_files import VideoSource, find_videos, read_picture
 
 LARGEST_SIDE_PX = 512  # of the frames, where nothing else is asked for
 LEAST_SIDE_PX = 16
-PHOTO_FPS = 120.0  # where nothing else is asked for
+PHOTO_FPS, PHOTO_S = 120.0, 1.0  # where nothing else is asked for
 ALL_BITS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
 DARK_SHARE = 1 / 8  # of full scale: a picture below this has data of fewer bits than its file
 
 
 @dataclass(frozen=True, eq=False)
-class OwnClip:
+class UserClip:
     """`frames` (frames, h, w), 16 or 32 bit floats in [0, 1], code values, at `fps`; `source`: what
     the material is, in words.
     """
@@ -67,7 +67,7 @@ class OwnClip:
 def read_video(
     path: Path | str, *, fps: float | None = None, start_s: float = 0.0, end_s: float = math.inf,
     longest_side_px: int | None = None, white_level: float | None = None,
-) -> OwnClip:  # fmt: skip
+) -> UserClip:  # fmt: skip
     """Return a video file, or a folder of frames, from `start_s` to `end_s`.
 
     `fps`: that it is taken for (None: as the file says); `longest_side_px` of its frames (None:
@@ -91,7 +91,7 @@ def read_video(
     _warn_of_darkness(path, kind, largest, white_level)
     part = "all" if stop - first == source.count else f"frames {first} to {stop - 1}"
     facts = f"{shape[1]}x{shape[0]} px, {rate:.6g} frames/s, {part} of {source.count} frames"
-    return OwnClip(source.name, np.stack(frames), rate, facts)
+    return UserClip(source.name, np.stack(frames), rate, facts)
 
 
 def _find_part(count: int, fps: float, start_s: float, end_s: float, name: str) -> tuple[int, int]:
@@ -113,14 +113,24 @@ def refuse_part_of_photograph(start_s: float, end_s: float) -> None:
         raise ValueError(f"start_s and end_s are of a video, a photograph has seconds; got {got}")
 
 
+def refuse_motion_of_video(seconds: float | None, speed_widths_per_s: float) -> None:
+    """Raise ValueError for the length or the motion of a photograph where there is a video."""
+    if seconds is not None:
+        way = "a video has start_s and end_s"
+        raise ValueError(f"seconds must be null but for a photograph, {way}; got {seconds}")
+    if speed_widths_per_s:
+        only = "speed_widths_per_s must be 0 but for a photograph"
+        raise ValueError(f"{only}, got {speed_widths_per_s}")
+
+
 def read_photograph(
-    path: Path | str, *, fps: float | None = None, seconds: float = 1.0,
+    path: Path | str, *, fps: float | None = None, seconds: float | None = None,
     longest_side_px: int | None = None, white_level: float | None = None,
     speed_widths_per_s: float = 0.0, seed: int = 0,
-) -> OwnClip:  # fmt: skip
-    """Return a photograph for `seconds` at `fps` (None: 120): at rest, or in a smooth motion, drawn
-    from `seed`, of `speed_widths_per_s` frame widths a second (`SimilarityMotion`).  `white_level`
-    as in `read_video`.
+) -> UserClip:  # fmt: skip
+    """Return a photograph for `seconds` (None: 1) at `fps` (None: 120): at rest, or in a smooth
+    motion, drawn from `seed`, of `speed_widths_per_s` frame widths a second (`SimilarityMotion`).
+    `white_level` as in `read_video`.
 
     Raises ValueError for what is no picture and for values outside their range.
     """
@@ -132,19 +142,20 @@ def read_photograph(
     fps = PHOTO_FPS if fps is None else fps
     frames = _hold_or_move(values, fps, seconds, speed_widths_per_s, seed)
     _warn_of_darkness(path, picture.dtype, float(picture.max()), white_level)
-    return OwnClip(Path(path).stem, frames, fps, facts)
+    return UserClip(Path(path).stem, frames, fps, facts)
 
 
 def clip_from_array(
-    values: Any, *, fps: float | None = None, seconds: float = 1.0, start_s: float = 0.0,
+    values: Any, *, fps: float | None = None, seconds: float | None = None, start_s: float = 0.0,
     end_s: float = math.inf, longest_side_px: int | None = None, white_level: float | None = None,
     speed_widths_per_s: float = 0.0, seed: int = 0,
-) -> OwnClip:  # fmt: skip
+) -> UserClip:  # fmt: skip
     """Return an array as a clip: (h, w), a photograph, or (frames, h, w), a video at `fps`, of
     uint8 or of floats in [0, 1].  `start_s`, `end_s` and `white_level` as in `read_video`,
-    `speed_widths_per_s` and `seed` as in `read_photograph`.
+    `seconds`, `speed_widths_per_s` and `seed` as in `read_photograph`.
 
-    Raises ValueError for another shape, for values outside and for a video without `fps`.
+    Raises ValueError for another shape, for values outside, for a video without `fps` and for what
+    is of the other kind.
     """
     array = np.asarray(values)
     is_colour = array.ndim == 3 and array.shape[2] <= 4
@@ -162,13 +173,14 @@ def clip_from_array(
         fps = PHOTO_FPS if fps is None else fps
         values = _shrink(array, longest_side_px)
         frames = _hold_or_move(values, fps, seconds, speed_widths_per_s, seed)
-        return OwnClip("photograph", frames, fps, facts)
+        return UserClip("photograph", frames, fps, facts)
+    refuse_motion_of_video(seconds, speed_widths_per_s)
     if fps is None:
         raise ValueError("fps must be given for an array of frames, frames a second")
     _check_rate(fps)
     first, stop = _find_part(len(array), fps, start_s, end_s, "the array")
     frames = np.stack([_shrink(frame, longest_side_px) for frame in array[first:stop]])
-    return OwnClip("video", frames, fps, f"{facts}, {fps:.6g} frames/s, {len(frames)} frames")
+    return UserClip("video", frames, fps, f"{facts}, {fps:.6g} frames/s, {len(frames)} frames")
 
 
 def _find_one_video(path: Path) -> VideoSource:
@@ -190,10 +202,11 @@ def _check_rate(fps: float) -> None:
 
 
 def _hold_or_move(
-    picture: NDArray, fps: float, seconds: float, speed: float, seed: int
+    picture: NDArray, fps: float, seconds: float | None, speed: float, seed: int
 ) -> Float[np.ndarray, "frames h w"]:
     """Return the frames of a picture for `seconds` at `fps`, at `speed` widths a second."""
     _check_rate(fps)
+    seconds = PHOTO_S if seconds is None else seconds
     check_in_range("speed_widths_per_s", speed, 0, FASTEST_WIDTHS_PER_S)
     check_in_range("seconds", seconds, 2 / fps, 1e6)  # two frames or more
     count = round(seconds * fps) + 1

@@ -1,6 +1,8 @@
 """Teach a SetNet what lies around, before it is trained as a whole:
 
-    python -m scripts.surroundings experiment=setnet_small ckpt=FILE export=FILE [+clips= +steps=]
+    python -m scripts.pretrain_context experiment=setnet_small ckpt=FILE export=FILE
+
+Further: +clips= and +steps=.
 
 A training step sees a few clips, and of areas they tell little but noise: what follows the memory,
 `SetNet.context` above all, learns nothing from that for hours (docs/decisions/07).  Here the

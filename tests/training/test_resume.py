@@ -10,7 +10,7 @@ from torch.optim import SGD, Adam, AdamW
 from torch.optim.lr_scheduler import CosineAnnealingLR
 
 from src.train import train
-from src.training.going_on import apply_config_to_optimizer_state, check_max_steps
+from src.training.resume import apply_config_to_optimizer_state, check_max_steps
 from tests.test_train import TINY, config
 
 STEPS = 4

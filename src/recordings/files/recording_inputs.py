@@ -42,7 +42,7 @@ def find_sensor_size(
 
     Raises ValueError where none says.
     """
-    given = (sensor[1], sensor[0]) if sensor is not None else None
+    given = (sensor[0], sensor[1]) if sensor is not None else None
     opened = recording.open_recording(path, given, options)
     if opened.size is not None:
         return opened.size[::-1]
@@ -66,8 +66,9 @@ def iter_recording(
     options: ReadOptions = ReadOptions(),
 ) -> Iterator[np.ndarray]:
     """Yield the events of a recording, `seconds` at a time; raises ValueError where it has none."""
-    events, size = None, sensor[::-1]
-    for events in recording.iter_events(path, seconds=seconds, size=size, options=options):
+    events = None
+    chunks = recording.iter_events(path, seconds=seconds, sensor_size=sensor, options=options)
+    for events in chunks:
         yield events
     if events is None:
         raise ValueError(f"{path}: holds no events")

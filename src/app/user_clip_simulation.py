@@ -1,9 +1,9 @@
-"""Your own clip through turbulence, optics and sensor, some frames at a time."""
+"""The user's clip through turbulence, optics and sensor, some frames at a time."""
 
 import math
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,20 +15,21 @@ from jaxtyping import Float
 from omegaconf import DictConfig, open_dict
 from torch import Tensor
 
+from src.app.compose import read_override_key
 from src.app.instantiate import build_part
 from src.app.simulation import build_sensor, decodes_srgb
+from src.recordings.simulated_recording import Progress
 from src.sim import noise
 from src.sim.optics import Optics
-from src.sim.scenes import own_material
-from src.sim.scenes.own_material import OwnClip
+from src.sim.scenes import user_clip
+from src.sim.scenes.user_clip import UserClip
 from src.sim.sensor.response import decode_srgb, encode_srgb
 from src.sim.turbulence.contract import ClipTurbulence
 from src.sim.turbulence.operator import Turbulence
 
 PART_BYTES = 1 << 27  # of all views at a time
 FREE_BYTES = 1 << 28  # that are left on the disk
-
-Progress = Callable[[range, str], Iterable[int]]
+KEYS_OF_SCENES = ("scene", "data", "bins", "split")
 
 
 @dataclass(frozen=True)
@@ -42,14 +43,14 @@ class SimulatedPart:
     tilt: Tensor
 
 
-class OwnSimulation:
+class UserClipSimulation:
     """What the config `cfg` makes of `clip`: turbulence and sensor are drawn from its seed.
 
     `substeps`: simulated frames per frame of the clip.  Raises ValueError for values outside their
     range.
     """
 
-    def __init__(self, cfg: DictConfig, clip: OwnClip):
+    def __init__(self, cfg: DictConfig, clip: UserClip):
         least = cfg.least_simulated_fps
         if not 0 < least <= 1e5:
             raise ValueError(f"least_simulated_fps must be in (0, 1e5], got {least}")
@@ -150,28 +151,37 @@ def describe_turbulence(drawn: Mapping[str, Any]) -> str:
     return f": tilt {tilt:.2f} px, blur {blur:.2f} px rms"
 
 
-def set_own_sensor(cfg: DictConfig, overrides: Iterable[str]) -> None:
-    """Give `sensor` the values of `own_sensor`, as photographs and films need them, but for the
-    keys that `overrides`, such as sensor.threshold=0.3, set.  Neither kind is drawn at random.
+def refuse_keys_of_scenes(overrides: Iterable[str]) -> None:
+    """Raise ValueError for an override that a video or photograph does not follow from."""
+    for key in map(read_override_key, overrides):
+        if key.partition(".")[0] in KEYS_OF_SCENES:
+            wrong = "must not be given with a video or photograph: it is of clips of a scene"
+            raise ValueError(f"{key} {wrong}")
+
+
+def set_user_clip_sensor(cfg: DictConfig, overrides: Iterable[str]) -> None:
+    """Give `sensor` the values of `user_clip_sensor`, as photographs and films need them, but for
+    the keys that `overrides`, such as sensor.threshold=0.3, set.  Neither kind is drawn at random.
     """
-    given = {override.lstrip("+").partition("=")[0] for override in overrides}
-    for key, value in cfg.own_sensor.items():
+    given = set(map(read_override_key, overrides))
+    for key, value in cfg.user_clip_sensor.items():
         if key in cfg.sensor and f"sensor.{key}" not in given:
             cfg.sensor[key] = value
-    fixed = {*cfg.own_sensor} | {name.removeprefix("sensor.") for name in given}
+    fixed = {*cfg.user_clip_sensor} | {name.removeprefix("sensor.") for name in given}
     with open_dict(cfg):
         for name in [*(cfg.sensor.get("random") or {})]:
             if name in fixed and f"sensor.random.{name}" not in given:
                 del cfg.sensor.random[name]
 
 
-def read_own_clip(cfg: DictConfig) -> OwnClip:
+def read_user_clip(cfg: DictConfig) -> UserClip:
     """Return the clip that `video` or `photo` names; ValueError for both and for wrong values."""
     if cfg.video and cfg.photo:
         raise ValueError(f"video must be null with photo={cfg.photo}, got {cfg.video}")
     options = {key: cfg[key] for key in ("fps", "longest_side_px", "white_level")}
     if cfg.video:
-        return own_material.read_video(cfg.video, start_s=cfg.start_s, end_s=cfg.end_s, **options)
-    own_material.refuse_part_of_photograph(cfg.start_s, cfg.end_s)
+        user_clip.refuse_motion_of_video(cfg.seconds, cfg.speed_widths_per_s)
+        return user_clip.read_video(cfg.video, start_s=cfg.start_s, end_s=cfg.end_s, **options)
+    user_clip.refuse_part_of_photograph(cfg.start_s, cfg.end_s)
     motion = {"speed_widths_per_s": cfg.speed_widths_per_s, "seed": cfg.seed}
-    return own_material.read_photograph(cfg.photo, seconds=cfg.seconds, **motion, **options)
+    return user_clip.read_photograph(cfg.photo, seconds=cfg.seconds, **motion, **options)

@@ -1,6 +1,6 @@
 """What of the true picture is missing, by size of detail:
 
-    python -m scripts.scales CKPT ... [--root PHOTOS]
+    python -m scripts.error_by_detail_size CKPT ... [--root PHOTOS]
 
 Of validation clips of nine views, 176 x 176, 40 windows, as networks were trained on
 (budget=hours); a picture counts after the best affine fit of its brightness, from window 10 on.  An

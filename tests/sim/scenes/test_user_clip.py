@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from src.sim.scenes import own_material
+from src.sim.scenes import user_clip
 
 LEVELS = np.arange(10, 250, 20)  # of twelve frames
 
@@ -29,7 +29,7 @@ def write_film(path: Path, levels=LEVELS, size=(36, 64), fps=30) -> Path:
 
 
 def test_all_frames_of_a_video_are_there_uncropped_at_its_rate(tmp_path):
-    clip = own_material.read_video(write_film(tmp_path / "a.mkv"))
+    clip = user_clip.read_video(write_film(tmp_path / "a.mkv"))
     assert clip.frames.shape == (12, 36, 64) and clip.fps == 30
     codes = np.round(clip.frames.astype(float) * 255)
     assert (codes[:, :, 4:] == LEVELS[:, None, None]).all() and (codes[:, :, :4] == 255).all()
@@ -38,13 +38,13 @@ def test_all_frames_of_a_video_are_there_uncropped_at_its_rate(tmp_path):
 
 def test_a_part_and_another_rate(tmp_path):
     path = write_film(tmp_path / "a.mkv")
-    clip = own_material.read_video(path, fps=120, start_s=2 / 120, end_s=5 / 120)
+    clip = user_clip.read_video(path, fps=120, start_s=2 / 120, end_s=5 / 120)
     assert clip.fps == 120 and np.round(clip.frames[:, 0, 9] * 255).tolist() == [50, 70, 90]
     assert clip.source.endswith("frames 2 to 4 of 12 frames")
 
 
 def test_between_two_frames_lies_their_blend(tmp_path):
-    clip = own_material.read_video(write_film(tmp_path / "a.mkv"))
+    clip = user_clip.read_video(write_film(tmp_path / "a.mkv"))
     seen = clip.interpolate_frames(3, 9, 4)[:, 0, 9].numpy() * 255
     assert np.allclose(seen, [25, 30, 35, 40, 45, 50], atol=0.05)
     assert len(clip.interpolate_frames(40, 45, 4)) == 5  # up to the last frame
@@ -52,7 +52,7 @@ def test_between_two_frames_lies_their_blend(tmp_path):
 
 def test_a_large_picture_is_shrunk_and_keeps_its_proportions(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), np.full((600, 1200), 100, np.uint8))
-    clip = own_material.read_photograph(tmp_path / "a.png", seconds=0.1)
+    clip = user_clip.read_photograph(tmp_path / "a.png", seconds=0.1)
     assert clip.frames.shape == (13, 256, 512) and clip.fps == 120
     assert np.allclose(clip.frames, 100 / 255)
 
@@ -62,7 +62,7 @@ def test_a_photograph_moves_when_asked_to_and_starts_as_it_is(tmp_path):
     picture = cv2.GaussianBlur(rng.uniform(0, 255, (64, 96)).astype(np.float32), (0, 0), 3)
     cv2.imwrite(str(tmp_path / "a.png"), picture)
     still, moving = (
-        own_material.read_photograph(tmp_path / "a.png", seconds=0.2, speed_widths_per_s=speed)
+        user_clip.read_photograph(tmp_path / "a.png", seconds=0.2, speed_widths_per_s=speed)
         for speed in (0.0, 0.5)
     )
     assert (still.frames == still.frames[0]).all()
@@ -72,21 +72,26 @@ def test_a_photograph_moves_when_asked_to_and_starts_as_it_is(tmp_path):
 
 def test_a_part_of_an_array_is_that_of_a_video():
     frames = np.repeat(np.arange(60, dtype=np.uint8), 48 * 64).reshape(60, 48, 64)
-    clip = own_material.clip_from_array(frames, fps=120.0, start_s=0.1, end_s=0.2)
+    clip = user_clip.clip_from_array(frames, fps=120.0, start_s=0.1, end_s=0.2)
     assert np.round(clip.frames[:, 0, 0] * 255).tolist() == list(range(12, 24))
     with pytest.raises(ValueError, match=r"must leave two frames or more of the array, 0.500 s"):
-        own_material.clip_from_array(frames, fps=120.0, start_s=99.0)
+        user_clip.clip_from_array(frames, fps=120.0, start_s=99.0)
     with pytest.raises(ValueError, match="start_s and end_s are of a video, a photograph has sec"):
-        own_material.clip_from_array(frames[0], end_s=0.1)
+        user_clip.clip_from_array(frames[0], end_s=0.1)
+    for only, value in (("seconds", 0.1), ("speed_widths_per_s", 0.3)):
+        with pytest.raises(
+            ValueError, match=f"{only} must be .* but for a photograph.* got {value}"
+        ):
+            user_clip.clip_from_array(frames, fps=120.0, **{only: value})
     with pytest.raises(ValueError, match="grey"):
-        own_material.clip_from_array(np.zeros((48, 64, 3), np.uint8), fps=60.0)
+        user_clip.clip_from_array(np.zeros((48, 64, 3), np.uint8), fps=60.0)
 
 
 def test_arrays_are_clips(tmp_path):
     frames = np.random.default_rng(0).integers(0, 256, (3, 20, 30), dtype=np.uint8)
-    clip = own_material.clip_from_array(frames, fps=50)
+    clip = user_clip.clip_from_array(frames, fps=50)
     assert (np.round(clip.frames * 255) == frames).all() and clip.fps == 50
-    assert own_material.clip_from_array(frames[0] / 255.0).frames.shape == (121, 20, 30)
+    assert user_clip.clip_from_array(frames[0] / 255.0).frames.shape == (121, 20, 30)
 
 
 @pytest.mark.parametrize("white, shown", [(None, 0.0625), (4095, 1.0), (8190, 0.5)])
@@ -96,8 +101,8 @@ def test_16_bits_are_kept_and_white_is_what_is_given(tmp_path, white, shown):
         cv2.imwrite(str(tmp_path / f"{k}.png"), picture)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        still = own_material.read_photograph(tmp_path / "0.png", seconds=0.1, white_level=white)
-        film = own_material.read_video(tmp_path, fps=120, white_level=white)
+        still = user_clip.read_photograph(tmp_path / "0.png", seconds=0.1, white_level=white)
+        film = user_clip.read_video(tmp_path, fps=120, white_level=white)
     wanted = np.minimum(picture[0] / (white or 65535), 1)
     assert np.allclose(still.frames[5, 0], wanted, atol=1e-6)  # not the 16 levels of 8 bits
     assert (
@@ -110,26 +115,26 @@ def test_16_bits_are_kept_and_white_is_what_is_given(tmp_path, white, shown):
 @pytest.mark.parametrize(
     "call, message",
     [
-        (lambda p: own_material.read_video(p / "none.mp4"), "video must be a file or a folder"),
-        (lambda p: own_material.read_video(p / "a.png"), "a photograph is photo="),
-        (lambda p: own_material.read_video(p), "fps must be given, frames a second"),
-        (lambda p: own_material.read_video(p / "a.mkv", fps=-1), r"fps must be in \[0.1, 1e6\]"),
-        (lambda p: own_material.read_video(p / "a.mkv", end_s=0.03), "start_s and end_s must"),
-        (lambda p: own_material.read_video(p / "a.mkv", start_s=2, end_s=1), "start_s must be"),
-        (lambda p: own_material.read_video(p / "a.mkv", longest_side_px=8), "longest_side_px must"),
-        (lambda p: own_material.read_photograph(p / "a.mkv"), r"a film: video=\)"),
-        (lambda p: own_material.read_video(p / "a.mkv", white_level=9), "must be null for a video"),
+        (lambda p: user_clip.read_video(p / "none.mp4"), "video must be a file or a folder"),
+        (lambda p: user_clip.read_video(p / "a.png"), "a photograph is photo="),
+        (lambda p: user_clip.read_video(p), "fps must be given, frames a second"),
+        (lambda p: user_clip.read_video(p / "a.mkv", fps=-1), r"fps must be in \[0.1, 1e6\]"),
+        (lambda p: user_clip.read_video(p / "a.mkv", end_s=0.03), "start_s and end_s must"),
+        (lambda p: user_clip.read_video(p / "a.mkv", start_s=2, end_s=1), "start_s must be"),
+        (lambda p: user_clip.read_video(p / "a.mkv", longest_side_px=8), "longest_side_px must"),
+        (lambda p: user_clip.read_photograph(p / "a.mkv"), r"a film: video=\)"),
+        (lambda p: user_clip.read_video(p / "a.mkv", white_level=9), "must be null for a video"),
         (
-            lambda p: own_material.read_photograph(p / "a.png", white_level=256),
+            lambda p: user_clip.read_photograph(p / "a.png", white_level=256),
             r"white_level must be in \(0, 255\] or null, got 256",
         ),
         (
-            lambda p: own_material.read_photograph(p / "a.png", white_level=0),
+            lambda p: user_clip.read_photograph(p / "a.png", white_level=0),
             r"white_level must be in \(0, 255\] or null, got 0",
         ),
-        (lambda p: own_material.clip_from_array(np.zeros((3, 20, 30))), "fps must be given"),
-        (lambda p: own_material.clip_from_array(np.full((20, 30), 7.0)), r"floats in \[0, 1\]"),
-        (lambda p: own_material.clip_from_array(np.zeros((1, 1, 2, 3))), "must be of shape"),
+        (lambda p: user_clip.clip_from_array(np.zeros((3, 20, 30))), "fps must be given"),
+        (lambda p: user_clip.clip_from_array(np.full((20, 30), 7.0)), r"floats in \[0, 1\]"),
+        (lambda p: user_clip.clip_from_array(np.zeros((1, 1, 2, 3))), "must be of shape"),
     ],
 )
 def test_wrong_material_is_one_line(call, message, tmp_path):
@@ -149,4 +154,4 @@ def test_wrong_material_is_one_line(call, message, tmp_path):
 def test_numbers_of_a_photograph_outside_their_range_are_named(key, allowed, value, tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((20, 30), np.uint8))
     with pytest.raises(ValueError, match=re.escape(f"{key} must be in {allowed}, got {value}")):
-        own_material.read_photograph(tmp_path / "a.png", **{key: value})
+        user_clip.read_photograph(tmp_path / "a.png", **{key: value})

@@ -10,18 +10,18 @@ import pytest
 import torch
 from hydra.core.global_hydra import GlobalHydra
 
-from src.app import own_simulation
+from src.app import user_clip_simulation
 from src.app.compose import compose_config
-from src.app.own_simulation import OwnSimulation
 from src.app.python_interface import simulate as simulate_arrays
+from src.app.user_clip_simulation import UserClipSimulation
 from src.recordings.files import read_events
 from src.recordings.views import load_views
 from src.sim import noise
-from src.sim.scenes.own_material import clip_from_array
+from src.sim.scenes.user_clip import clip_from_array
 from src.sim.turbulence.operator import Turbulence
 from src.simulate import simulate
 from tests.conftest import ROOT
-from tests.sim.scenes.test_own_material import LEVELS, write_film
+from tests.sim.scenes.test_user_clip import LEVELS, write_film
 from tests.test_recording_entry_points import config
 
 SMALL = ["camera.sensor_size=[120,160]", "turbulence=strong"]
@@ -60,13 +60,13 @@ def test_a_video_gives_events_geometry_and_truth_of_all_its_frames(tmp_path, cap
 def test_parts_are_those_of_the_whole_clip(tmp_path, monkeypatch):
     clip = clip_from_array(textured(), fps=60)
     cfg = compose_config("simulate", "turbulence=strong", "optics.views=3")
-    work = OwnSimulation(cfg, clip)
+    work = UserClipSimulation(cfg, clip)
     assert (
         work.substeps == 2
         and work.simulated_frame_count == 9
         and isinstance(work.turbulence, Turbulence)
     )
-    monkeypatch.setattr(own_simulation, "PART_BYTES", 4 * 3 * 40 * 56 * 2)  # two frames
+    monkeypatch.setattr(user_clip_simulation, "PART_BYTES", 4 * 3 * 40 * 56 * 2)  # two frames
     seen = work.allocate_views(tmp_path)
     parts = list(work.simulate_parts(seen))
     key = noise.key(work.key, "turbulence")
@@ -122,16 +122,16 @@ def test_a_photograph_gives_events_by_default(tmp_path, seed):
         (["sensor=noisy"], 0.2, "srgb"),
         (["sensor.threshold=0.35"], 0.35, "srgb"),
         (["sensor.threshold=[0.1,0.7]", "sensor.input=linear"], [0.1, 0.7], "linear"),
-        (["~own_sensor.threshold"], [0.1, 0.7], "srgb"),
+        (["~user_clip_sensor.threshold"], [0.1, 0.7], "srgb"),
         (["sensor=randomized"], 0.2, "srgb"),
         (["sensor=any_camera", "sensor.threshold=0.3"], 0.3, "srgb"),
-        (["+own_sensor.off_ratio=1.5"], 0.2, "srgb"),
+        (["+user_clip_sensor.off_ratio=1.5"], 0.2, "srgb"),
     ],
 )
-def test_the_sensor_of_own_material_is_what_is_set_else_its_own(overrides, threshold, light):
+def test_the_sensor_of_a_users_clip_is_what_is_set_else_its_own(overrides, threshold, light):
     cfg, scenes = compose_config("simulate", *overrides), compose_config("simulate")
     assert (scenes.sensor.threshold, scenes.sensor.input) == ([0.1, 0.7], "linear")
-    own_simulation.set_own_sensor(cfg, overrides)
+    user_clip_simulation.set_user_clip_sensor(cfg, overrides)
     assert (cfg.sensor.threshold, cfg.sensor.input) == (threshold, light)
     assert cfg.sensor.response == "log" and "threshold" not in (cfg.sensor.get("random") or {})
     assert cfg.sensor.off_ratio == (1.5 if "off_ratio" in str(overrides) else 1.0)
@@ -168,6 +168,24 @@ def test_a_seed_draws_anew_and_the_same_seed_the_same():
         ({"overrides": ["write=a.raw"]}, "must not set write: it is of the command line alone"),
         ({"seed": 1.5}, "seed must be a whole number, got 1.5"),
         ({"overrides": ["least_simulated_fps=0"]}, "least_simulated_fps must be in"),
+        (
+            {"overrides": ["least_simulated_fps=fast"]},
+            "least_simulated_fps must be a number, got f",
+        ),
+        ({"overrides": ["+foo=3"]}, "foo is no key of the configuration"),
+        ({"overrides": ["index=-1"]}, "index must be >= 0, got -1"),
+        (
+            {"overrides": ["camera.tile_px=1"]},
+            "set camera.tile_px: it is of the command line alone",
+        ),
+        ({"overrides": ["scene.height=8"]}, "scene.height must not be given with a video or photo"),
+        ({"overrides": ["data.substeps=9"]}, "data.substeps must not be given with a video or ph"),
+        ({"overrides": ["bins=2"]}, "bins must not be given with a video or photograph"),
+        ({"overrides": ["calm=1"]}, "calm is now loss.static_flicker.weight"),
+        (
+            {"turbulence": "measured", "overrides": ["turbulence.measured=air (1).yaml"]},
+            r"turbulence.measured must be .*air \(1\).yaml",
+        ),
     ],
 )
 def test_a_wrong_argument_is_one_line_and_leaves_hydra_as_it_was(options, message):
@@ -192,6 +210,8 @@ def test_an_array_moves_as_a_photograph_does():
         (["video=my.mkv", "photo=a.png"], "video must be null with photo=a.png"),
         (["video=my.mkv", "like=config.yaml"], "like must be null with video or photo"),
         (["video=my.mkv", "write=a.txt"], "write"),
+        (["video=my.mkv", "seconds=0.5"], "seconds must be null but for a photograph, .*got 0.5"),
+        (["video=my.mkv", "speed_widths_per_s=1"], "speed_widths_per_s must be 0 but for a photog"),
     ],
 )
 def test_keys_that_do_not_go_together(given, message, tmp_path):
@@ -208,7 +228,7 @@ def test_the_demo_is_recorded_where_it_is_played(tmp_path):
 def test_a_full_disk_is_told_before_the_work(tmp_path, monkeypatch):
     film = write_film(tmp_path / "my.mkv")
     cfg = config("simulate", tmp_path / "run", f"video={film}", *SMALL)
-    monkeypatch.setattr(own_simulation, "FREE_BYTES", 1 << 60)
+    monkeypatch.setattr(user_clip_simulation, "FREE_BYTES", 1 << 60)
     with pytest.raises(ValueError, match=r"write must have .* MiB free"):
         simulate(cfg)
     assert not list(tmp_path.rglob("my.raw*")) and not list(tmp_path.rglob("*.h5*"))
