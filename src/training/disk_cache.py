@@ -31,6 +31,7 @@ from src.training.worker_process import prepare_worker_process
 INPUTS_FILE = "inputs.json"
 DOWNSTREAM = ("sensor", "voxel.py")  # parts of src/sim that come after the cache, except
 UPSTREAM = ("sensor/response.py",)  # which decodes the frames before it
+USER_CLIP = "scenes/user_clip.py"  # no clip of a training comes from it
 MEASURED = "recordings/files/turbulence_file.py"  # in src, draws turbulence=measured
 
 
@@ -175,7 +176,7 @@ def hash_simulation_code() -> str:
         place = path.relative_to(home)
         if place.parts[0] in DOWNSTREAM and place.as_posix() not in UPSTREAM:
             continue
-        if path.suffix not in (".py", ".safetensors"):
+        if path.suffix not in (".py", ".safetensors") or place.as_posix() == USER_CLIP:
             continue
         digest.update(str(place).encode() + _hash_input(path))
     return digest.hexdigest()[:12]
