@@ -15,8 +15,8 @@ from jaxtyping import Float
 from omegaconf import DictConfig, open_dict
 from torch import Tensor
 
-from src.app.compose import read_override_key
 from src.app.instantiate import build_part
+from src.app.renamed_keys import read_override_key
 from src.app.simulation import build_sensor, decodes_srgb
 from src.recordings.simulated_recording import Progress
 from src.sim import noise
@@ -167,8 +167,10 @@ def set_user_clip_sensor(cfg: DictConfig, overrides: Iterable[str]) -> None:
     given = set(map(read_override_key, overrides))
     wanted = cfg.user_clip_sensor or {}
     for key in wanted.keys() & cfg.sensor.keys():
-        taken, left = (wanted, cfg.sensor) if f"sensor.{key}" in given else (cfg.sensor, wanted)
-        taken[key] = left[key]
+        if f"sensor.{key}" in given:
+            wanted[key] = cfg.sensor[key]
+        else:
+            cfg.sensor[key] = wanted[key]
     fixed = {*wanted} | {name.removeprefix("sensor.") for name in given}
     with open_dict(cfg):
         for name in [*(cfg.sensor.get("random") or {})]:
