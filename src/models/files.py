@@ -5,6 +5,7 @@ in a file is executed: only classes of `src.models` and `baselines` are built, f
 """
 
 import json
+import os
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
@@ -63,18 +64,16 @@ def locate(name: str | Path) -> Path:
     The shipped one comes first: a file or folder of that name in this folder is "./name", a string,
     as a Path drops "./".
     """
-    return WEIGHTS / f"{name}.safetensors" if str(name) in _shipped_names() else Path(name)
+    path, shipped = Path(name), WEIGHTS / f"{name}.safetensors"
+    may_be_shipped = not (path.is_absolute() or ".." in path.parts or str(path) != str(name))
+    return shipped if may_be_shipped and os.path.isfile(shipped) else path
 
 
 def list_shipped() -> str:
     """Return the names in `weights/`, those of its folders last, for a message."""
-    names = sorted(_shipped_names(), key=lambda name: (name.count("/"), name))
-    return ", ".join(names) or "none yet"
-
-
-def _shipped_names() -> set[str]:
     paths = (file.relative_to(WEIGHTS) for file in WEIGHTS.rglob("*.safetensors"))
-    return {path.with_suffix("").as_posix() for path in paths}
+    names = (path.with_suffix("").as_posix() for path in paths)
+    return ", ".join(sorted(names, key=lambda name: (name.count("/"), name))) or "none yet"
 
 
 def find_checkpoint(name: str | Path, spec: dict) -> Path:
