@@ -1,13 +1,13 @@
-"""Teach a SetNet what lies around, before it is trained as a whole:
+"""Pre-train the context pyramid of a SetNet, before it is trained as a whole:
 
     python -m scripts.pretrain_context experiment=setnet_small ckpt=FILE export=FILE
 
 Further: +clips= and +steps=.
 
-A training step sees a few clips, and of areas they tell little but noise: what follows the memory,
-`SetNet.context` above all, learns nothing from that for hours (docs/decisions/07).  Here the
-memory of `ckpt` rests.  What it holds in a few windows of many clips is computed once; then what
-follows, begun anew, learns from pictures of many clips a step, by their mean absolute error.
+A training step sees a few clips, too few for the brightness of uniform areas: what follows the
+memory, `SetNet.context` above all, learns nothing from them for hours (docs/decisions/07).  Here
+the memory of `ckpt` is frozen.  Its state in a few windows of many clips is computed once; then
+what follows, begun anew, is trained on pictures of many clips a step, by their mean absolute error.
 `export` is to go on from: `python -m src.train ... ckpt=FILE`.  The config is that of the training.
 """
 
@@ -33,7 +33,7 @@ from src.training.batch_sampler import SampleId
 from src.training.datamodule import BatchSimulator, LightFieldData
 from src.training.learning_curve import read_training_progress
 
-REMEMBERS = ("voxel_kernels", "sum_kernels", "spread_conv", "memory")  # parts that rest
+FROZEN = ("voxel_kernels", "sum_kernels", "spread_conv", "memory")  # parts that are not trained
 EVERY = 7  # windows between two that are learned from; the last one is
 PICTURES = 24  # a step
 RATE, RISE = 1.5e-3, 50  # of Adam, falling by a cosine; steps over which it rises
@@ -48,7 +48,7 @@ def begun_anew(network: SetNet) -> SetNet:
     """Return a fresh network that remembers as `network` does."""
     fresh = type(network)(**network.init_kwargs)
     kept = network.state_dict()
-    known = {name: kept[name] for name in kept if name.split(".")[0] in REMEMBERS}
+    known = {name: kept[name] for name in kept if name.split(".")[0] in FROZEN}
     fresh.load_state_dict(known, strict=False)
     return fresh
 
@@ -84,7 +84,7 @@ def new_context(network: SetNet, maps: Float[Tensor, "m c h2 w2"]) -> Float[Tens
 
 def learn(network: SetNet, maps: Tensor, truth: Tensor, steps: int) -> list[float]:
     """Train what follows the memory on what `held` returns; return the error of every step."""
-    follows = [part for name, part in network.named_children() if name not in (*REMEMBERS, "relu")]
+    follows = [part for name, part in network.named_children() if name not in (*FROZEN, "relu")]
     parameters = [parameter for part in follows for parameter in part.parameters()]
     optimizer, errors = torch.optim.Adam(parameters, RATE), []
     for step in range(steps):

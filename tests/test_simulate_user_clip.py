@@ -135,6 +135,9 @@ def test_the_sensor_of_a_users_clip_is_what_is_set_else_its_own(overrides, thres
     assert (cfg.sensor.threshold, cfg.sensor.input) == (threshold, light)
     assert cfg.sensor.response == "log" and "threshold" not in (cfg.sensor.get("random") or {})
     assert cfg.sensor.off_ratio == (1.5 if "off_ratio" in str(overrides) else 1.0)
+    stored = cfg.copy()  # run again by its config.yaml, without overrides
+    user_clip_simulation.set_user_clip_sensor(stored, [])
+    assert stored.sensor == cfg.sensor
 
 
 def test_without_events_all_the_rest_is_there(tmp_path, capsys):

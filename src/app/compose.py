@@ -11,7 +11,12 @@ from omegaconf.errors import OmegaConfBaseException
 
 from src.app.config_values import check_values_like
 from src.app.path_overrides import quote_paths, refuse_empty_paths
-from src.app.renamed_keys import explain_refused_key, flatten_keys, refuse_renamed_overrides
+from src.app.renamed_keys import (
+    explain_refused_key,
+    flatten_keys,
+    read_override_key,
+    refuse_renamed_overrides,
+)
 
 CONF = str(Path(__file__).resolve().parents[2] / "conf")
 
@@ -49,16 +54,11 @@ def compose_checked_config(
     refuse_renamed_overrides(overrides)
     lines = [*chosen, *quote_paths(overrides, name)]
     cfg = compose_config(name, *lines)
-    groups = [line for line in lines if config_choices(read_override_key(line).partition("@")[0])]
+    groups = [line for line in lines if config_choices(read_override_key(line))]
     shipped = compose_config(name, *groups)
     OmegaConf.set_struct(shipped, False)
     check_values_like(cfg, shipped, name)
     return cfg
-
-
-def read_override_key(override: str) -> str:
-    """Return the key, or the group, of `key=value`, `+key=value` or `~key`."""
-    return override.partition("=")[0].strip().lstrip("+~")
 
 
 def describe_config_error(error: Exception, name: str) -> str:

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from src.app.compose import compose_checked_config, config_choices, read_override_key
+from src.app.compose import compose_checked_config, config_choices
+from src.app.renamed_keys import read_override_key
 from src.app.user_clip_simulation import (
     UserClipSimulation,
     read_user_clip,
@@ -33,7 +34,7 @@ ARGUMENTS = (
 NO_OVERRIDES = {key: f"it is the argument {key}" for key in ARGUMENTS}
 NO_OVERRIDES |= {"optics.views": "it is the argument views"}
 NO_OVERRIDES |= dict.fromkeys(("photo", "video"), "it is the argument photo_or_video")
-OF_THE_COMMAND_LINE = ("write", "like", "camera", "name", "task", "verbose", "paths", "hydra")
+OF_THE_COMMAND_LINE = ("write", "like", "camera", "name", "task", "paths", "hydra")
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +89,7 @@ def simulate(
     for `seconds` of a video and a part of a photograph, and for overrides that are none, are
     arguments, or have no effect here (of `scene`, or of the command line alone).
     """
+    overrides = list(overrides)
     _refuse_other_overrides(overrides)
     if not isinstance(seed, int | np.integer):
         raise ValueError(f"seed must be a whole number, got {seed}")

@@ -64,11 +64,15 @@ def _ask_for_nearest(name: str, names: Collection[str], start: int = 0) -> str:
     return f"; did you mean {name[:start]}{near[0]}?" if near else ""
 
 
+def read_override_key(override: str) -> str:
+    """Return the key, or the group, of `key=value`, `+key=value`, `~key`, `group@package=name`."""
+    return override.partition("=")[0].strip().lstrip("+~").partition("@")[0]
+
+
 def refuse_renamed_overrides(arguments: Iterable[str]) -> None:
     """Raise ValueError for a former key or choice among the overrides of a command line."""
     for argument in arguments:
-        name, _, value = argument.lstrip("+~").partition("=")
-        key = name.split("@")[0].replace("/", ".")
+        key, value = read_override_key(argument).replace("/", "."), argument.partition("=")[2]
         for former in (key, *(f"{key}={choice.strip()}" for choice in value.split(","))):
             if explanation := describe_renaming(former):
                 raise ValueError(explanation)

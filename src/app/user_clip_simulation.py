@@ -15,8 +15,8 @@ from jaxtyping import Float
 from omegaconf import DictConfig, open_dict
 from torch import Tensor
 
-from src.app.compose import read_override_key
 from src.app.instantiate import build_part
+from src.app.renamed_keys import read_override_key
 from src.app.simulation import build_sensor, decodes_srgb
 from src.recordings.simulated_recording import Progress
 from src.sim import noise
@@ -161,13 +161,17 @@ def refuse_keys_of_scenes(overrides: Iterable[str]) -> None:
 
 def set_user_clip_sensor(cfg: DictConfig, overrides: Iterable[str]) -> None:
     """Give `sensor` the values of `user_clip_sensor`, as photographs and films need them, but for
-    the keys that `overrides`, such as sensor.threshold=0.3, set.  Neither kind is drawn at random.
+    the keys that `overrides`, such as sensor.threshold=0.3, set; those go to `user_clip_sensor`, so
+    that the stored config gives the same clip.  Neither kind is drawn at random.
     """
     given = set(map(read_override_key, overrides))
-    for key, value in cfg.user_clip_sensor.items():
-        if key in cfg.sensor and f"sensor.{key}" not in given:
-            cfg.sensor[key] = value
-    fixed = {*cfg.user_clip_sensor} | {name.removeprefix("sensor.") for name in given}
+    wanted = cfg.user_clip_sensor or {}
+    for key in wanted.keys() & cfg.sensor.keys():
+        if f"sensor.{key}" in given:
+            wanted[key] = cfg.sensor[key]
+        else:
+            cfg.sensor[key] = wanted[key]
+    fixed = {*wanted} | {name.removeprefix("sensor.") for name in given}
     with open_dict(cfg):
         for name in [*(cfg.sensor.get("random") or {})]:
             if name in fixed and f"sensor.random.{name}" not in given:

@@ -5,6 +5,7 @@ in a file is executed: only classes of `src.models` and `baselines` are built, f
 """
 
 import json
+import os
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
@@ -60,20 +61,19 @@ def load(name_or_path: str | Path, allowed_packages: Sequence[str] = ()) -> nn.M
 def locate(name: str | Path) -> Path:
     """Return the shipped file where `name` is one of `list_shipped`, else the path `name`.
 
-    The shipped one comes first: a file or folder of that name in this folder is `./name`.
+    The shipped one comes first: a file or folder of that name in this folder is "./name", a string,
+    as a Path drops "./".
     """
-    return WEIGHTS / f"{name}.safetensors" if str(name) in _shipped_names() else Path(name)
+    path, shipped = Path(name), WEIGHTS / f"{name}.safetensors"
+    may_be_shipped = not (path.is_absolute() or ".." in path.parts or str(path) != str(name))
+    return shipped if may_be_shipped and os.path.isfile(shipped) else path
 
 
 def list_shipped() -> str:
     """Return the names in `weights/`, those of its folders last, for a message."""
-    names = sorted(_shipped_names(), key=lambda name: (name.count("/"), name))
-    return ", ".join(names) or "none yet"
-
-
-def _shipped_names() -> set[str]:
     paths = (file.relative_to(WEIGHTS) for file in WEIGHTS.rglob("*.safetensors"))
-    return {path.with_suffix("").as_posix() for path in paths}
+    names = (path.with_suffix("").as_posix() for path in paths)
+    return ", ".join(sorted(names, key=lambda name: (name.count("/"), name))) or "none yet"
 
 
 def find_checkpoint(name: str | Path, spec: dict) -> Path:
@@ -87,7 +87,7 @@ def find_checkpoint(name: str | Path, spec: dict) -> Path:
     is_shipped = path != Path(name)
     path = newest_checkpoint(path) if path.is_dir() else path
     if not path.is_file():
-        raise ValueError(f"ckpt must be a checkpoint to go on from, got {path}")
+        raise ValueError(f"ckpt must be a checkpoint to go on from, got {name}")
     saved, _ = (_exported if is_weights_file(path) else _checkpoint)(path)[:2]
     wanted = [spec]
     if is_weights_file(path):
@@ -97,8 +97,9 @@ def find_checkpoint(name: str | Path, spec: dict) -> Path:
     if saved not in wanted:
         if is_shipped:
             how = f"experiment={name} and the overrides of conf/recipe/{name}.yaml"
+            here = f"; what is here of that name is ckpt=./{name}" if Path(name).exists() else ""
             raise ValueError(
-                f"ckpt={name} must be of the network that is trained; go on with {how}"
+                f"ckpt={name} must be of the network that is trained; go on with {how}{here}"
             )
         raise ValueError(f"ckpt must be of the network {spec} to go on from, got {saved} in {path}")
     return path

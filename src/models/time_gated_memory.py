@@ -13,7 +13,7 @@ Maps = Float[Tensor, "m c h2 w2"]
 class TimeGatedMemory(nn.Module):
     """A recurrent cell with a gate and a candidate in continuous time (`time_gated_update`).
 
-    s' = k s + (1 - k) tanh(candidate), k = exp(-t relu(gate)), t in units of 1 / REFERENCE_HZ: with
+    s' = k s + (1 - k) tanh(candidate), k = exp(-t relu(gate)), t in units of 1/120 s: with
     t = 0 or gate <= 0 the state is held.  The input enters by 3 x 3, the state by 1 x 1
     convolutions, so that nothing spreads in space over time.  `gate_rank`: the 3 x 3 convolution is
     factored into 3 x 3 to so many channels and 1 x 1, which costs less (None: not factored).

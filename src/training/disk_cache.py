@@ -29,8 +29,8 @@ from src.training.clip_cache import GIB, CachedClip, ClipCache, simulate_clip
 from src.training.worker_process import prepare_worker_process
 
 INPUTS_FILE = "inputs.json"
-DOWNSTREAM = ("sensor", "voxel.py")  # parts of src/sim that come after the cache, except
-UPSTREAM = ("sensor/response.py",)  # which decodes the frames before it
+# Parts of src/sim that no cached clip depends on, but for UPSTREAM, which decodes its frames.
+NOT_HASHED, UPSTREAM = ("sensor", "voxel.py", "scenes/user_clip.py"), "sensor/response.py"
 MEASURED = "recordings/files/turbulence_file.py"  # in src, draws turbulence=measured
 
 
@@ -173,7 +173,7 @@ def hash_simulation_code() -> str:
     digest.update(_hash_input(home.parent / MEASURED))
     for path in sorted(home.rglob("*")):
         place = path.relative_to(home)
-        if place.parts[0] in DOWNSTREAM and place.as_posix() not in UPSTREAM:
+        if any(map(place.is_relative_to, NOT_HASHED)) and place.as_posix() != UPSTREAM:
             continue
         if path.suffix not in (".py", ".safetensors"):
             continue

@@ -139,3 +139,12 @@ def test_files_that_are_no_networks(suffix, tmp_path):
     save_file({"a": torch.zeros(1)}, tmp_path / "plain.safetensors")
     with pytest.raises(ValueError, match="ckpt must be a network written by"):
         load(tmp_path / "plain.safetensors")
+
+
+def test_a_path_is_read_where_the_shipped_weights_may_not_be(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise PermissionError(13, "Permission denied", "weights")
+
+    save(tmp_path / "mine.safetensors", trained(), SPEC, {})
+    monkeypatch.setattr(Path, "rglob", refuse)
+    assert isinstance(load(tmp_path / "mine.safetensors"), torch.nn.Module)

@@ -114,7 +114,7 @@ def require_default_stream(path: Path, wanted: str | int | None) -> None:
 
 
 def refuse_column_order(order: str | None, why: str) -> None:
-    """Raise ValueError for an order (columns=) of columns that have none; `why`: as ... ."""
+    """Raise ValueError for an order (columns=) where columns have none, for the reason `why`."""
     if order is not None:
         raise ValueError(f"columns must be null, as {why}, got {order}")
 

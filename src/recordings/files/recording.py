@@ -5,7 +5,7 @@ concerned.
 """
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -22,7 +22,6 @@ from src.recordings.files.event_arrays import concatenate_events, count_before
 from src.recordings.files.event_file import (
     EVENT,
     EventFile,
-    HeightWidth,
     RawEvents,
     ReadOptions,
     WidthHeight,
@@ -98,7 +97,7 @@ class EventRecording:
 
 
 def open_recording(
-    path: str | Path, sensor_size: HeightWidth | None = None, options: ReadOptions = ReadOptions()
+    path: str | Path, sensor_size: Sequence[int] | None = None, options: ReadOptions = ReadOptions()
 ) -> EventRecording:
     """Return the recording at `path`; `sensor_size` comes before what the file states.
 
@@ -113,6 +112,8 @@ def open_recording(
     kept, survey, swapped = _open_and_survey(path, state.st_mtime_ns, state.st_size, options)
     file = _open_file(path, options) if kept is None else kept
     file.kept_times = survey.times
+    if sensor_size is not None and np.shape(sensor_size) != (2,):
+        raise ValueError(f"sensor_size must be (height, width), got {sensor_size}")
     given = None if sensor_size is None else (sensor_size[1], sensor_size[0])
     size, lines = choose_size(path, given, file.size, swapped)
     recording = EventRecording(path, size, options, file, survey, lines)
@@ -121,7 +122,7 @@ def open_recording(
 
 
 def read_events(
-    path: str | Path, *, sensor_size: HeightWidth | None = None,
+    path: str | Path, *, sensor_size: Sequence[int] | None = None,
     options: ReadOptions = ReadOptions(), size: Any = None,
 ) -> np.ndarray:  # fmt: skip
     """Return all events of a file, (n,) of t int64 us, x, y uint16, p int8 in {-1, 1}, in order of
@@ -142,7 +143,7 @@ def iter_events(
     path: str | Path,
     *,
     seconds: float = 0.1,
-    sensor_size: HeightWidth | None = None,
+    sensor_size: Sequence[int] | None = None,
     options: ReadOptions = ReadOptions(),
 ) -> Iterator[np.ndarray]:
     """Yield the events of a file in chunks of `seconds` from the first event, those without events

@@ -90,5 +90,9 @@ def test_parts_of_a_pixel_without_frames_are_told_of(tmp_path):
 
 
 def test_the_former_size_is_refused_with_its_new_name(tmp_path):
+    (tmp_path / "a.csv").write_text("t,x,y,p\n" + "".join(f"{n},{n},1,1\n" for n in range(9)))
+    for wrong in ((480,), [480, 640, 1]):
+        with pytest.raises(ValueError, match=r"sensor_size must be \(height, width\), got"):
+            read_events(tmp_path / "a.csv", sensor_size=wrong)
     with pytest.raises(ValueError, match=r"is now sensor_size=\(height, width\), got \(640, 480\)"):
         read_events(tmp_path / "a.raw", size=(640, 480))
