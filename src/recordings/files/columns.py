@@ -174,7 +174,7 @@ def find_columns(sample: np.ndarray, order: str | None) -> dict[str, int]:
     if order is None:
         return find_columns_by_values(sample)
     places = {letter: order.index(letter) for letter in "txyp"}
-    if max(places.values()) >= (width := sample.shape[1]):
+    if len(order) > (width := sample.shape[1]):
         raise ValueError(f"columns must name columns of a table of {width}, got {order}")
     return places
 

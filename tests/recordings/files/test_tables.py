@@ -359,6 +359,13 @@ def test_a_format_of_a_file_that_is_not_raw_is_refused(tmp_path, events):
         read_events(tmp_path / "a.txt", options=ReadOptions(format="evt3"))
 
 
+@pytest.mark.parametrize("order", ["txypa", "atxyp"])
+def test_an_order_of_more_columns_than_there_are_is_refused(tmp_path, events, order):
+    (tmp_path / "a.txt").write_text(lines(events))
+    with pytest.raises(ValueError, match=f"columns must name columns of a table of 4, got {order}"):
+        read_events(tmp_path / "a.txt", options=ReadOptions(columns=order))
+
+
 @pytest.mark.parametrize("ending", [".raw", ".dat", ".aedat4", ".es", ".npz", ".h5"])
 def test_an_order_of_columns_that_have_none_is_refused(tmp_path, events, ending):
     write_events(path := tmp_path / f"a{ending}", events, width=WIDTH, height=HEIGHT)
