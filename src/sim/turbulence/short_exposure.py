@@ -8,7 +8,7 @@ pupil, r1 and r2 = r1 - nu x, a phase difference of the variance
 S the structure function of the phase.  The mean transfer function is that of the aperture times
 exp(-V(nu) / 2), V the mean of this variance over the points r1 and r2 that the pupil holds.  Fried's
 form of it (1966), 6.88 (nu D/r0)^(5/3) (1 - nu^(1/3)), takes the phase that is left for independent
-of the tilt: at D/r0 below 3 its blur is up to 20 % too large.  V grows as (D/r0)^(5/3); that of a
+of the tilt: at D/r0 below 3 its blur is 12 to 15 % too large.  V grows as (D/r0)^(5/3); that of a
 path is the mean over its layers, each with an outer scale in units of its footprint.
 """  # noqa: E501
 

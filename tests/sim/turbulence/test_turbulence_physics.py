@@ -204,7 +204,7 @@ def blur_beyond_diffraction(psf: torch.Tensor, sharp: torch.Tensor, samples: flo
     return math.sqrt(max(radii[0] ** 2 - radii[1] ** 2, 0)) / GAUSSIAN_HALF_LIGHT
 
 
-@pytest.mark.parametrize("strength", [1.0, 2.0, 4.0, 6.0, 10.0])
+@pytest.mark.parametrize("strength", [1.0, 2.0, 3.0, 4.0, 6.0, 10.0])
 def test_12_blur_beyond_diffraction(strength):
     psf, sharp = (
         mean_short_exposure_psf(d, unresolved_structure_function() * d ** (5 / 3))
@@ -233,29 +233,34 @@ def mean_simulated_psf(turbulence: Turbulence) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(
-    "outer_scale, strength, off",
+    "outer_scale, strength, tolerance",
     [
-        (math.inf, 4.0, 0.03),
-        (math.inf, 8.0, 0.03),
-        (3.0, 8.0, 0.03),
-        (1.0, 4.0, 0.07),
-        (1.0, 8.0, 0.03),
+        (math.inf, 2.0, 1.0),
+        (math.inf, 4.0, 0.26),
+        (math.inf, 8.0, 0.26),
+        (3.0, 4.0, 1.0),
+        (3.0, 8.0, 0.26),
+        (1.0, 2.0, 1.0),
+        (1.0, 4.0, 1.0),
+        (1.0, 8.0, 0.26),
     ],
 )
-def test_12_blur_with_an_outer_scale(outer_scale, strength, off):
-    """Of the mean of 1,600 simulated PSFs at the default tolerance."""
+def test_12_blur_with_an_outer_scale(outer_scale, strength, tolerance):
+    """Of the mean of 1,600 simulated PSFs by networks of many modes and of few."""
     path = replace(PATH, cn2=unnormalised_cn2_profile("camera"), ar1_coefficient=0.0)
     path = replace(path, outer_scale_m=outer_scale * path.aperture_m).with_d_over_r0(strength)
     wide = path.scene_width_m * path.lambda_over_d_px(128) / 4  # 4 px per lambda / D
     path = replace(path, scene_width_m=wide)
-    psf, sharp = (
-        mean_simulated_psf(Turbulence(one, views=1, height=128, width=128))
+    degraded, still = (
+        Turbulence(one, views=1, height=128, width=128, tolerance=tolerance)
         for one in (path, path.with_d_over_r0(0.001))
     )
+    psf, sharp = mean_simulated_psf(degraded), mean_simulated_psf(still)
     theory = blur_std_in_lambda_over_d(strength, *path.scale_and_profile)
     ratio = blur_beyond_diffraction(psf, sharp, 4.0) / theory
-    print(f"L0 {outer_scale:g} D, D/r0 {strength:g}: simulated blur {ratio:.2f} of theory")
-    assert ratio == pytest.approx(1, abs=off)
+    modes = degraded.fidelity.zernike_modes
+    print(f"L0 {outer_scale:g} D, D/r0 {strength:g}, {modes} modes: blur {ratio:.2f} of theory")
+    assert ratio == pytest.approx(1, abs=0.065)
 
 
 def test_13_isoplanatic_angle():
