@@ -30,7 +30,8 @@ ALLOWED = {
 }
 MAY_BE_UNKNOWN = ("half_length_px", "decay_s")  # by a bound only, or not at all
 # The sharpest tenth is blurred too, and so is the scene: in simulated clips of D/r0 1 to 4 a point
-# grows by this many times what edges do between the sharpest tenth and a typical moment.
+# grows by 0.7 to 7 times, typically this, what edges do between the sharpest tenth and a typical
+# moment.
 LUCKY = 2.8
 MAX_DRAWS = 32  # of what a clip shows, until a camera shows it
 WIDENING = 4.0  # times: how far beyond a bound values are drawn whose other bound is not known
