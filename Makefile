@@ -5,8 +5,6 @@
 # make docs:  the site of docs/ in out/site; REPO_URL=https://... where its links to code lead.
 
 PYTHON ?= python3
-# processes that run the tests
-WORKERS ?= 2
 PY := .venv/bin/python
 READY := .venv/ready
 LPIPS := .cache/lpips/alex.safetensors
@@ -21,7 +19,7 @@ train: $(READY) $(LPIPS)
 	$(PY) -m src.train experiment=lf3x3 budget=fine_tuning
 
 test: $(READY) $(LPIPS)
-	OMP_NUM_THREADS=1 $(PY) -m pytest -q -n $(WORKERS) -m "not slow and not gpu"
+	OMP_NUM_THREADS=1 $(PY) -m pytest -q -n 2 -m "not slow and not gpu"
 
 test-all: $(READY) $(LPIPS)
 	$(PY) -m pytest -q
