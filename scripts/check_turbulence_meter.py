@@ -8,7 +8,8 @@ half length of 5 to 70 px (both log-uniform) and a correlation time of 0.04 to 0
 512 px at 30 a second, `ar1` and `frozen_flow` in turn, noise of 1 %, 8 bits.  Printed is what was
 found over what that very clip was given ("of clip": its tilt field less every point's mean, as
 footage shows no more) and over what its atmosphere gives on average ("of atmosphere"); 1 for `held`
-where the interval holds that.  `again`: besides, a clip drawn from what was measured
+where the interval holds that; last, by how many times the width of a point grows what edges do
+(LUCKY of turbulence_file.py).  `again`: besides, a clip drawn from what was measured
 (turbulence=measured) is measured, over what was found first; of `blur_ratio`, its excess of one.
 `air.yaml`: clips drawn from that file instead, and what is found.  `warps`: a table of Gaussian
 warps instead, new in each of 24 frames of 256 px, of two photographs.  `compressed`: a table of
@@ -41,6 +42,7 @@ from src.recordings.files.turbulence_file import (
 from src.sim.turbulence.atmosphere import AR1_FPS, Atmosphere
 from src.sim.turbulence.operator import Turbulence
 from src.sim.turbulence.prior import TargetImageStatistics, log_uniform, sample_matching_atmosphere
+from src.sim.turbulence.short_exposure import half_light_radius
 
 PHOTOGRAPHS = Path("../shared/data/photos/bsds500_val")
 CONF = Path(__file__).resolve().parents[1] / "conf/turbulence/measured.yaml"
@@ -192,6 +194,8 @@ def compare_measurement(
     rms, half, whole, decay = describe_tilt(tilt)
     length = _number(found.half_length_px)
     own, reach = path.tilt_std_px(SIDE), path.tilt_correlation_half_length_px(SIDE)
+    blurred = float(half_light_radius(path.d_over_r0, *path.outer_scale_and_profile))
+    growth = blurred / float(half_light_radius(0.0)) - 1
     return {
         "rms of clip": found.rms_px.value / rms,
         "rms of atmosphere": found.rms_px.value / own,
@@ -202,6 +206,7 @@ def compare_measurement(
         "whole view less clip's": found.whole_share.value - whole,
         "decay of clip": _number(found.decay_s) / decay,
         "decay of atmosphere": _number(found.decay_s) / tilt_correlation_time_s(path),
+        "growth of point over edge's": growth / max(found.blur_ratio.value - 1, 1e-3),
     }
 
 

@@ -103,14 +103,15 @@ class Atmosphere:
         return self.aperture_m / self.outer_scale_m
 
     @property
-    def scale_and_profile(self) -> tuple[float, tuple[float, ...]]:
+    def outer_scale_and_profile(self) -> tuple[float, tuple[float, ...]]:
         """D / L0 and the normalised profile of Cn2, as functions of `outer_scale` take them."""
         return self.aperture_over_outer_scale, self.normalised_profile
 
     @cached_property
     def blur_equivalent_d_over_r0(self) -> float:
         """D / r0 of the Kolmogorov turbulence that blurs as much, tilt removed."""
-        return short_exposure.blur_equivalent_d_over_r0(self.d_over_r0, *self.scale_and_profile)
+        strength = self.d_over_r0, *self.outer_scale_and_profile
+        return short_exposure.blur_equivalent_d_over_r0(*strength)
 
     @property
     def rytov_variance(self) -> float:
@@ -137,7 +138,7 @@ class Atmosphere:
         (2 / pi) (lambda / D) sqrt(0.4489 (D/r0)^(5/3)) f / p (Noll 1976; Tyler 1994), times what
         the outer scale leaves of it.
         """
-        left = outer_scale.tilt_variance_over_kolmogorov(*self.scale_and_profile)
+        left = outer_scale.tilt_variance_over_kolmogorov(*self.outer_scale_and_profile)
         variance = TILT_VARIANCE * left
         spread = math.sqrt(variance) * self.d_over_r0 ** (5 / 6)
         return 2 / math.pi * self.lambda_over_d_px(width_px) * spread
@@ -148,13 +149,13 @@ class Atmosphere:
         Tilt and blur in quadrature; of the blur what exceeds diffraction, as the standard
         deviation of the Gaussian that holds half of its light within the same radius.
         """
-        strength = self.d_over_r0, *self.scale_and_profile
+        strength = self.d_over_r0, *self.outer_scale_and_profile
         blur = float(short_exposure.blur_std_in_lambda_over_d(*strength))
         return math.hypot(self.tilt_std_px(width_px), self.lambda_over_d_px(width_px) * blur)
 
     def tilt_correlation_half_length_px(self, width_px: int) -> float:
         """The distance at which the correlation of the tilt falls to 1/2, in pixels."""
-        reach_m = outer_scale.tilt_decay_distance(*self.scale_and_profile) * self.aperture_m
+        reach_m = outer_scale.tilt_decay_distance(*self.outer_scale_and_profile) * self.aperture_m
         return reach_m / self.pixel_size_at_object_m(width_px)
 
     def with_d_over_r0(self, d_over_r0: float) -> "Atmosphere":

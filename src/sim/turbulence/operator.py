@@ -60,7 +60,7 @@ class Turbulence:
             size, number, band = fidelity.psf_size_px, fidelity.psf_network, find_psf_band(strength)
             missing = missing_structure_function(
                 band.networks[number].modes, atmosphere.d_over_r0, strength,
-                *atmosphere.scale_and_profile,
+                *atmosphere.outer_scale_and_profile,
             )  # fmt: skip
             self.psfs = FittedPSFs(band, number, fidelity.psf_rank, unit, size, missing)
             self.halo = PSFHalo(mean_short_exposure_psf(strength, missing), unit, size)

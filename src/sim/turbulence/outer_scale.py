@@ -120,14 +120,14 @@ def _relative_wind_speeds() -> Float[np.ndarray, " quantiles"]:
 
 
 @cache
-def spectra() -> Float[np.ndarray, "scales kappa"]:
+def von_karman_spectra() -> Float[np.ndarray, "scales kappa"]:
     """Return kappa (kappa^2 + kappa0^2)^(-11/6) d kappa for each KAPPA0."""
     return KAPPA**2 * (KAPPA**2 + KAPPA0[:, None] ** 2) ** (-11 / 6) * STEP
 
 
 @cache
 def _variances() -> Float[np.ndarray, "scales 1"]:
-    return (spectra() @ TILT)[:, None]
+    return (von_karman_spectra() @ TILT)[:, None]
 
 
 def _variance(aperture_over_outer_scale: float, profile: Cn2Profile) -> float:
@@ -138,7 +138,8 @@ def _variance(aperture_over_outer_scale: float, profile: Cn2Profile) -> float:
 def _covariance() -> RegularGridInterpolator:
     """Return the tilt's covariance over log kappa0 and log of the distance in footprints."""
     apart = np.geomspace(1e-6, 1e7, 400)
-    values = (spectra() * TILT) @ special.j0(2 * math.pi * np.multiply.outer(KAPPA, apart))
+    waves = special.j0(2 * math.pi * np.multiply.outer(KAPPA, apart))
+    values = (von_karman_spectra() * TILT) @ waves
     return RegularGridInterpolator((_log(KAPPA0), np.log(apart)), values)
 
 

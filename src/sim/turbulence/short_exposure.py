@@ -77,7 +77,7 @@ def _half_light_radii(
     aperture_over_outer_scale: float, profile: Cn2Profile
 ) -> Float[np.ndarray, " strengths"]:
     variance = outer_scale.average_over_path(
-        residual_variances(), aperture_over_outer_scale, profile
+        _tilt_removed_variances(), aperture_over_outer_scale, profile
     )
     aperture = 2 / math.pi * (np.arccos(NU) - NU * np.sqrt(1 - NU**2))
     transfer = aperture[:, None] * np.exp(-variance[:, None] / 2 * D_OVER_R0 ** (5 / 3))
@@ -92,19 +92,19 @@ def _light_within_radii() -> Float[np.ndarray, "radii nu"]:
 
 
 @cache
-def residual_variances() -> Float[np.ndarray, "scales nu"]:
+def _tilt_removed_variances() -> Float[np.ndarray, "scales nu"]:
     """Return V(nu) at D/r0 = 1 and the outer scales D / KAPPA0, in rad^2."""
-    spectrum = 2 * math.pi * SPECTRUM * outer_scale.spectra()
+    spectrum = 2 * math.pi * SPECTRUM * outer_scale.von_karman_spectra()
     tilt = 4 * special.jv(2, math.pi * KAPPA) / (math.pi * KAPPA)  # what a wave along x gives to a2
     variance = spectrum @ (tilt**2 / 2)
     with_phase = (spectrum * tilt) @ special.j1(2 * math.pi * np.multiply.outer(KAPPA, PUPIL_RADII))
     in_common = with_phase @ _difference_over_overlap().T
-    residual = structure_functions() - 8 * NU * in_common + 16 * NU**2 * variance[:, None]
+    residual = phase_structure_functions() - 8 * NU * in_common + 16 * NU**2 * variance[:, None]
     return np.maximum(residual, 0)
 
 
 @cache
-def structure_functions() -> Float[np.ndarray, "scales nu"]:
+def phase_structure_functions() -> Float[np.ndarray, "scales nu"]:
     """Return the structure function of phase at D/r0 = 1 and the outer scales D / KAPPA0, in rad^2.
 
     6.88 nu^(5/3) (Fried 1966); with an outer scale Voitsekhovich 1995.

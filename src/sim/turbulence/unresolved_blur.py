@@ -33,8 +33,7 @@ def blur_by_phase(
 ) -> Float[Tensor, "*n size size"]:
     """Return PSFs, sampled as the stored ones, blurred by phase of that structure function.
 
-    The light of a PSF is kept; what falls outside of `size`
-    samples is lost.
+    The light of a PSF is kept; what falls outside of `size` samples is lost.
     """
     fine = psfs.shape[-1]
     count = next_fast_len(2 * max(size, fine), real=True)

@@ -83,7 +83,7 @@ def test_the_blur_that_is_wanted_is_the_nearest_there_is():
     def psf_width_ratio(wanted: float) -> float:
         statistics = TargetImageStatistics(20.0, 0.05, tilt_px=0.5, psf_width_ratio=wanted)
         path = sample_matching_atmosphere(statistics, generator(3))
-        blurred = half_light_radius(path.d_over_r0, *path.scale_and_profile)
+        blurred = half_light_radius(path.d_over_r0, *path.outer_scale_and_profile)
         return float(blurred / half_light_radius(0.0))
 
     assert psf_width_ratio(1.3) == pytest.approx(1.3, rel=0.15)

@@ -78,7 +78,7 @@ def test_structure_functions_are_those_of_the_spectrum():
     """Against the integral of 2 (1 - J0) over the spectrum, for L0 = 0.1 D to 1000 D."""
     kappa = np.geomspace(1e-7, 1e5, 40_000)
     step = math.log(kappa[1] / kappa[0])
-    every, places = short_exposure.structure_functions(), [40, 200, 790]
+    every, places = short_exposure.phase_structure_functions(), [40, 200, 790]
     for scale in (17, 30, 46):  # of KAPPA0
         power = 2 * math.pi * 0.022896 * kappa**2 * (kappa**2 + KAPPA0[scale] ** 2) ** (-11 / 6)
         turns = 2 * math.pi * np.multiply.outer(short_exposure.NU[places], kappa)

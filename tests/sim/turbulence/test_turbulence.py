@@ -219,7 +219,7 @@ def test_bf16_frames_are_simulated_in_float32():
 @pytest.mark.parametrize("airy", [0.3, 1.0, 1.7])
 @pytest.mark.parametrize("kernel", [1, 7, 41])
 def test_halo_is_the_light_beyond_the_kernel(airy, kernel):
-    mean = mean_short_exposure_psf(3.0, unresolved_structure_function())
+    mean = mean_short_exposure_psf(3.0, unresolved_structure_function() * 3.0 ** (5 / 3))
     whole, halo = (PSFHalo(mean, airy, size) for size in (1, kernel))
     assert 0 <= halo.share <= 1 - whole.psf[whole.reach, whole.reach]
     spark = torch.zeros(1, 101, 101)

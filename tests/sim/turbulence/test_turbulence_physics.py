@@ -204,15 +204,17 @@ def blur_beyond_diffraction(psf: torch.Tensor, sharp: torch.Tensor, samples: flo
     return math.sqrt(max(radii[0] ** 2 - radii[1] ** 2, 0)) / GAUSSIAN_HALF_LIGHT
 
 
-@pytest.mark.parametrize("strength", [1.0, 2.0, 3.0, 4.0, 6.0, 10.0])
-def test_12_blur_beyond_diffraction(strength):
+@pytest.mark.parametrize(
+    "strength, known", [(1.0, 1.02), (2.0, 1), (3.0, 1), (4.0, 1), (6.0, 1), (10.0, 1)]
+)
+def test_12_blur_beyond_diffraction(strength, known):
     psf, sharp = (
         mean_short_exposure_psf(d, unresolved_structure_function() * d ** (5 / 3))
         for d in (strength, 0.001)
     )
     ratio = blur_beyond_diffraction(psf, sharp, 2.0) / blur_std_in_lambda_over_d(strength)
     print(f"D/r0 {strength:g}: blur {ratio:.2f} of theory")
-    assert ratio == pytest.approx(1, abs=0.06)
+    assert ratio == pytest.approx(known, abs=0.04)
 
 
 def mean_simulated_psf(turbulence: Turbulence) -> torch.Tensor:
@@ -233,19 +235,19 @@ def mean_simulated_psf(turbulence: Turbulence) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(
-    "outer_scale, strength, tolerance",
+    "outer_scale, strength, tolerance, known",
     [
-        (math.inf, 2.0, 1.0),
-        (math.inf, 4.0, 0.26),
-        (math.inf, 8.0, 0.26),
-        (3.0, 4.0, 1.0),
-        (3.0, 8.0, 0.26),
-        (1.0, 2.0, 1.0),
-        (1.0, 4.0, 1.0),
-        (1.0, 8.0, 0.26),
+        (math.inf, 2.0, 1.0, 1.03),
+        (math.inf, 4.0, 0.26, 1.0),
+        (math.inf, 8.0, 0.26, 1.0),
+        (3.0, 4.0, 1.0, 1.0),
+        (3.0, 8.0, 0.26, 1.0),
+        (1.0, 2.0, 1.0, 0.94),
+        (1.0, 4.0, 1.0, 1.04),
+        (1.0, 8.0, 0.26, 1.0),
     ],
 )
-def test_12_blur_with_an_outer_scale(outer_scale, strength, tolerance):
+def test_12_blur_with_an_outer_scale(outer_scale, strength, tolerance, known):
     """Of the mean of 1,600 simulated PSFs by networks of many modes and of few."""
     path = replace(PATH, cn2=unnormalised_cn2_profile("camera"), ar1_coefficient=0.0)
     path = replace(path, outer_scale_m=outer_scale * path.aperture_m).with_d_over_r0(strength)
@@ -256,11 +258,11 @@ def test_12_blur_with_an_outer_scale(outer_scale, strength, tolerance):
         for one in (path, path.with_d_over_r0(0.001))
     )
     psf, sharp = mean_simulated_psf(degraded), mean_simulated_psf(still)
-    theory = blur_std_in_lambda_over_d(strength, *path.scale_and_profile)
+    theory = blur_std_in_lambda_over_d(strength, *path.outer_scale_and_profile)
     ratio = blur_beyond_diffraction(psf, sharp, 4.0) / theory
     modes = degraded.fidelity.zernike_modes
     print(f"L0 {outer_scale:g} D, D/r0 {strength:g}, {modes} modes: blur {ratio:.2f} of theory")
-    assert ratio == pytest.approx(1, abs=0.065)
+    assert ratio == pytest.approx(known, abs=0.03)
 
 
 def test_13_isoplanatic_angle():
