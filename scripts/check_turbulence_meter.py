@@ -8,12 +8,11 @@ half length of 5 to 70 px (both log-uniform) and a correlation time of 0.04 to 0
 512 px at 30 a second, `ar1` and `frozen_flow` in turn, noise of 1 %, 8 bits.  Printed is what was
 found over what that very clip was given ("of clip": its tilt field less every point's mean, as
 footage shows no more) and over what its atmosphere gives on average ("of atmosphere"); 1 for `held`
-where the interval holds that; last, by how many times the width of a point grows what edges do
-(LUCKY of turbulence_file.py).  `again`: besides, a clip drawn from what was measured
-(turbulence=measured) is measured, over what was found first; of `blur_ratio`, its excess of one.
-`air.yaml`: clips drawn from that file instead, and what is found.  `warps`: a table of Gaussian
-warps instead, new in each of 24 frames of 256 px, of two photographs.  `compressed`: a table of
-such footage of a half length of 13.3 px, compressed.
+where the interval holds that.  `again`: besides, a clip drawn from what was measured
+(turbulence=measured) is measured, over what was found first.  `air.yaml`: clips drawn from that
+file instead, and what is found.  `warps`: a table of Gaussian warps instead, new in each of 24
+frames of 256 px, of two photographs.  `compressed`: a table of such footage of a half length of
+13.3 px, compressed.
 """
 
 import argparse
@@ -42,7 +41,6 @@ from src.recordings.files.turbulence_file import (
 from src.sim.turbulence.atmosphere import AR1_FPS, Atmosphere
 from src.sim.turbulence.operator import Turbulence
 from src.sim.turbulence.prior import TargetImageStatistics, log_uniform, sample_matching_atmosphere
-from src.sim.turbulence.short_exposure import half_light_radius
 
 PHOTOGRAPHS = Path("../shared/data/photos/bsds500_val")
 CONF = Path(__file__).resolve().parents[1] / "conf/turbulence/measured.yaml"
@@ -50,7 +48,7 @@ SIDE, FILM, FRAMES, FPS, NOISE = 256, 512, 240, 30.0, 0.01
 RMS, HALF, DECAY, TIMES = (0.25, 1.5), (5.0, 70.0), (0.04, 0.2), ("ar1", "frozen_flow")
 WARPS = (3.3, 6.7, 13.3, 26.6, 53.3), (0.25, 0.75, 1.5)  # half lengths, rms
 COMPRESSED_WARPS = 13.3, (0.0, 0.1, 0.25, 0.5)  # half length, rms
-KEYS = ("rms_px", "half_length_px", "whole_share", "decay_s", "blur_ratio")
+KEYS = ("rms_px", "half_length_px", "whole_share", "decay_s", "blur_px")
 
 
 def load_photograph(k: int, wide: int = FILM) -> Float[np.ndarray, "h w"]:
@@ -194,8 +192,6 @@ def compare_measurement(
     rms, half, whole, decay = describe_tilt(tilt)
     length = _number(found.half_length_px)
     own, reach = path.tilt_std_px(SIDE), path.tilt_correlation_half_length_px(SIDE)
-    blurred = float(half_light_radius(path.d_over_r0, *path.outer_scale_and_profile))
-    growth = blurred / float(half_light_radius(0.0)) - 1
     return {
         "rms of clip": found.rms_px.value / rms,
         "rms of atmosphere": found.rms_px.value / own,
@@ -206,7 +202,8 @@ def compare_measurement(
         "whole view less clip's": found.whole_share.value - whole,
         "decay of clip": _number(found.decay_s) / decay,
         "decay of atmosphere": _number(found.decay_s) / tilt_correlation_time_s(path),
-        "growth of point over edge's": growth / max(found.blur_ratio.value - 1, 1e-3),
+        "blur of atmosphere": found.blur_px.value / path.blur_px(SIDE),
+        "blur held": _holds(found.blur_px, path.blur_px(SIDE)),
     }
 
 
@@ -217,11 +214,8 @@ def measure_again(
     again = measure_or_refusal(simulate_footage(picture, draw_from_measurement(found, k), k)[0])
     if isinstance(again, str):
         return {}
-    ratios = {}
-    for key in KEYS:
-        one, two = (_number(getattr(each, key)) for each in (found, again.found))
-        ratios[f"again {key}"] = (two - 1) / (one - 1) if key == "blur_ratio" else two / one
-    return ratios
+    pairs = {key: (getattr(again.found, key), getattr(found, key)) for key in KEYS}
+    return {f"again {key}": _number(two) / _number(one) for key, (two, one) in pairs.items()}
 
 
 def tilt_correlation_time_s(path: Atmosphere) -> float:

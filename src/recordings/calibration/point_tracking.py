@@ -23,6 +23,7 @@ MAX_RELATIVE = 4.0  # times the typical displacement: further off is another par
 MAX_CORNERS, QUALITY, MIN_DISTANCE = 800, 0.003, 4  # corners: number, weakest over best, px apart
 MIN_ROUNDNESS = 0.2  # of a corner: power along the weaker over that along the stronger direction
 MARGIN = 12  # pixels at the frame's edge without corners
+WINDOW_SIDE = 2 * (REACH + 3) + 1  # pixels of a window of the mean over frames
 COARSEST = 64  # pixels of the shorter side at the coarsest level
 
 
@@ -32,22 +33,26 @@ class PointTracks:
 
     `place`: x and y in the mean frame; `moved`: the displacement from there, estimated twice;
     `sharp`, twice: how much of the mean frame's gradient a window shows (1: all, more: sharper);
-    `texture`: the power of that gradient; `seen`: in which frames a point was found, others hold 0;
-    `window_variance_px2`: the variance along one axis of what a displacement is the mean over.
+    `texture`: the power of that gradient, `curvature`: its product with that of the Laplacian, less
+    than zero (blur by a Gaussian of variance v changes the gradient by v / 2 times that);
+    `seen`: in which frames a point was found, others hold 0; `window_variance_px2`: the variance
+    along one axis of what a displacement is the mean over.
     """
 
     place: Float[np.ndarray, "points 2"]
     moved: Float[np.ndarray, "2 frames points 2"]
     sharp: Float[np.ndarray, "2 frames points"]
     texture: Float[np.ndarray, " points"]
+    curvature: Float[np.ndarray, " points"]
     seen: Bool[np.ndarray, "frames points"]
     window_variance_px2: float
 
     def select(self, chosen: Bool[np.ndarray, " points"]) -> "PointTracks":
         """Return the tracks of some of the points."""
         moved, sharp = self.moved[:, :, chosen], self.sharp[:, :, chosen]
-        place, texture, seen = self.place[chosen], self.texture[chosen], self.seen[:, chosen]
-        return PointTracks(place, moved, sharp, texture, seen, self.window_variance_px2)
+        place, texture, curvature = self.place[chosen], self.texture[chosen], self.curvature[chosen]
+        seen, variance = self.seen[:, chosen], self.window_variance_px2
+        return PointTracks(place, moved, sharp, texture, curvature, seen, variance)
 
 
 def find_corners(picture: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "points 2"]:
@@ -78,7 +83,9 @@ def track_points(
     the mean frame, then with the mean of the windows that were found, which is sharper."""
     picture = frames.mean(0)
     rough = np.stack([_optical_flow(picture, frame, place) for frame in frames])
-    fine = _registered(frames, place, rough)
+    halves = [_registered(frames[k::2], place, rough[k::2]) for k in (0, 1)]
+    home = _window_centres(len(place))
+    fine = _Windows((halves[0] + halves[1]) / 2, home, place)
     refined = [_refine(fine, frame, start) for frame, start in zip(frames, rough, strict=True)]
     moved, sharp, explained = map(np.stack, zip(*refined, strict=True))
     seen = explained > MIN_EXPLAINED
@@ -90,6 +97,7 @@ def track_points(
         moved=np.where(seen[..., None], moved.swapaxes(0, 1), 0),
         sharp=np.where(seen, sharp.swapaxes(0, 1), 0),
         texture=fine.texture,
+        curvature=_curvature(halves, home),
         seen=seen,
         window_variance_px2=fine.window_variance_px2,
     )
@@ -105,16 +113,30 @@ def _optical_flow(picture: np.ndarray, frame: np.ndarray, place: np.ndarray) -> 
     return np.where(is_found, found - place, 0).astype(np.float32)
 
 
-def _registered(frames: np.ndarray, place: np.ndarray, moved: np.ndarray) -> "_Windows":
+def _registered(frames: np.ndarray, place: np.ndarray, moved: np.ndarray) -> np.ndarray:
     """Return the windows' means over the frames, each where it was found, as one tall picture."""
-    half, side = REACH + 3, 2 * (REACH + 3) + 1
+    half = WINDOW_SIDE // 2
     v, u = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1)
-    total = np.zeros((len(place), side * side), np.float32)
+    total = np.zeros((len(place), WINDOW_SIDE**2), np.float32)
     for frame, away in zip(frames, moved, strict=True):
         total = total + _sample(frame, place + away, u, v)
-    tall = (total / len(frames)).reshape(len(place) * side, side)
-    home = np.stack([np.full(len(place), half), np.arange(len(place)) * side + half], axis=1)
-    return _Windows(tall, home, place)
+    return (total / len(frames)).reshape(len(place) * WINDOW_SIDE, WINDOW_SIDE)
+
+
+def _window_centres(points: int) -> np.ndarray:
+    """Return x and y of the windows' centres in the tall picture of `_registered`."""
+    half = WINDOW_SIDE // 2
+    return np.stack([np.full(points, half), np.arange(points) * WINDOW_SIDE + half], axis=1)
+
+
+def _curvature(halves: list[np.ndarray], home: np.ndarray) -> np.ndarray:
+    """Return the product (points,) of gradient and the Laplacian's gradient, in windows of two
+    pictures of the same, whose noise is independent."""
+    v, u = np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1].reshape(2, -1)
+    first, second = halves
+    fields = zip(_gradient(first), _gradient(cv2.Laplacian(second, -1)), strict=True)
+    pairs = [[_sample(field, home, u, v) for field in pair] for pair in fields]
+    return np.sum([ours * theirs for ours, theirs in pairs], axis=(0, 2))
 
 
 def _refine(

@@ -32,12 +32,14 @@ MIN_HALF_LENGTH_PX = 4.0  # of the frame that is worked on: what JPEG adds is co
 FLICKER_SHARE = 1 / 32  # of the side, deviation of a Gaussian: bands of lamps are wider
 DRAWS = 200
 SHARPEST = 0.1  # the sharpest tenth
+SHARPEST_LACKS = 0.65  # of the blur: 0.4 to 1.1 in clips of D/r0 8 to 1
+BLUR_OF_WARPS_PX = 0.3  # that tilt alone, stretching what a window shows, is taken for
 FILM_OVER_DECAY = 8.0  # a decay that is more than the film over this is known by its lower bound
 # Share of the power left after taking off a film's mean, of correlation exp(-time / the film).
 LEFT_OF_SLOW = 1 - 2 / math.e
 # Errors of the method at 95 %, of the logarithm, added to the intervals, from clips of known
 # turbulence (scripts/check_turbulence_meter.py): windows average, random blur shifts corners.
-METHOD_ERROR = {"rms_px": 0.15, "half_length_px": 0.3}
+METHOD_ERROR = {"rms_px": 0.15, "half_length_px": 0.3, "blur_px": 0.5}
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,7 @@ def measure_turbulence(
         raise _no_tilt(rms_px, len(tracks.place), reach)
     drawn = [describe(*chosen) for chosen in _resampled(len(frames), 2 * tilt.decay_frames)]
     numbers = _summarize_tilt(tilt, drawn, unit, fps, len(frames))
-    numbers["blur_ratio"] = estimate_blur_ratio(*_track_at_side(frames, tracks))
+    numbers["blur_px"] = estimate_blur(*_track_at_side(frames, tracks))
     return TurbulenceMeasurement(
         found=TurbulenceFile(**numbers),
         tilt=tilt,
@@ -117,13 +119,16 @@ def measure_turbulence(
     )
 
 
-def estimate_blur_ratio(tracks: PointTracks, size: tuple[int, int]) -> IntervalEstimate:
-    """Return how much wider an edge is at a typical moment than in its sharpest tenth of moments,
-    which up to a D/r0 of about 5 is nearly free of turbulence (Fried 1978, JOSA 68, 1651).
+def estimate_blur(tracks: PointTracks, size: tuple[int, int]) -> IntervalEstimate:
+    """Return the blur of a typical moment beyond diffraction, the standard deviation of a Gaussian,
+    in pixels of SIDE, from what blurs a typical moment beyond the sharpest tenth of moments.
 
-    A moment's sharpness is the slope of its gradient over that of the registered mean.  Between
-    edges blurred by Gaussians of widths s and S that is sqrt(2 S^2 / (s^2 + S^2)), whence s / S.
+    A moment's sharpness is the slope of its gradient over that of the registered mean.  Of an edge
+    that is blurred by a Gaussian of width s, and of width S in that mean, it is
+    sqrt(2 S^2 / (s^2 + S^2)); S^2 is the gradient's power over twice the `curvature`, whence s^2.
     The tenth is chosen by one estimate and measured by the other, so that noise does not choose.
+    It is not free of blur (lucky images: Fried 1978, JOSA 68, 1651): between it and a typical
+    moment is SHARPEST_LACKS of the blur.
     """
     rows = []
     for chosen_by, value in (tracks.sharp, tracks.sharp[::-1]):
@@ -133,15 +138,23 @@ def estimate_blur_ratio(tracks: PointTracks, size: tuple[int, int]) -> IntervalE
         rows.append([(value * of).sum(0) / of.sum(0) for of in (tracks.seen, sharpest)])
     slopes = np.mean(rows, axis=0) * tracks.texture
     where = tilt_covariance.frame_squares(tracks, size)
-    sums = np.stack([np.bincount(where, row, CELLS**2) for row in (*slopes, tracks.texture)])
-    drawn = [_width_ratio(sums @ squares) for _, squares in _resampled(1, 1.0)]
-    return _estimate("blur_ratio", _width_ratio(sums @ np.ones(CELLS**2)), drawn)
+    terms = (*slopes, tracks.texture, tracks.curvature)
+    sums = np.stack([np.bincount(where, row, CELLS**2) for row in terms])
+    unit = SIDE / min(size) / SHARPEST_LACKS
+    drawn = [_sharpest_lack_px(sums @ squares) * unit for _, squares in _resampled(1, 1.0)]
+    blur = _estimate("blur_px", _sharpest_lack_px(sums @ np.ones(CELLS**2)) * unit, drawn)
+    assert blur.low is not None, "_estimate gives one"
+    least = math.sqrt(max(blur.low**2 - BLUR_OF_WARPS_PX**2, ALLOWED["blur_px"][0] ** 2))
+    return blur._replace(low=min(least, blur.low))
 
 
-def _width_ratio(sums: Float[np.ndarray, "3"]) -> float:
-    """Return the ratio of widths for sums of slopes (all moments, the sharpest) and weights."""
-    usual, sharpest = (max(2 / (total / sums[2]) ** 2 - 1, 1e-3) for total in sums[:2])
-    return max(math.sqrt(usual / sharpest), 1.0)
+def _sharpest_lack_px(sums: Float[np.ndarray, "4"]) -> float:
+    """Return what blurs all moments beyond the sharpest, of sums of slopes (all, the sharpest), of
+    texture and of curvature."""
+    usual, sharpest, texture, curvature = sums
+    edge_px2 = texture / (2 * max(-curvature, 1e-12))
+    apart_px2 = 2 * edge_px2 * texture**2 * (1 / usual**2 - 1 / sharpest**2)
+    return math.sqrt(max(apart_px2, 1e-6))
 
 
 def remove_flicker(frames: Float[np.ndarray, "frames h w"]) -> Float[np.ndarray, "frames h w"]:

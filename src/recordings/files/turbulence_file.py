@@ -26,13 +26,9 @@ ALLOWED = {
     "half_length_px": (1.0, 2000.0),
     "whole_share": (0.0, 1.0),
     "decay_s": (0.00001, 60.0),
-    "blur_ratio": (1.0, 10.0),
+    "blur_px": (0.001, 30.0),
 }
 MAY_BE_UNKNOWN = ("half_length_px", "decay_s")  # by a bound only, or not at all
-# The sharpest tenth is blurred too, and so is the scene: in simulated clips of D/r0 1 to 4 a point
-# grows by 0.7 to 7 times, typically this, what edges do between the sharpest tenth and a typical
-# moment.
-LUCKY = 2.8
 MAX_DRAWS = 32  # of what a clip shows, until a camera shows it
 WIDENING = 4.0  # times: how far beyond a bound values are drawn whose other bound is not known
 
@@ -53,7 +49,7 @@ class IntervalEstimate(NamedTuple):
 class TurbulenceFile:
     """What a video showed of its turbulence: rms of the tilt along one axis, the distance at which
     its correlation is 1/2, the share of its power that moves the whole view, its time to 1/e, and
-    how much wider an edge is at a typical moment than in the sharpest tenth of moments.
+    the blur beyond diffraction, the standard deviation of a Gaussian along one axis.
 
     Raises ValueError for numbers outside ALLOWED and for intervals that do not hold their value.
     """
@@ -62,7 +58,7 @@ class TurbulenceFile:
     half_length_px: IntervalEstimate
     whole_share: IntervalEstimate
     decay_s: IntervalEstimate
-    blur_ratio: IntervalEstimate
+    blur_px: IntervalEstimate
 
     def __post_init__(self):
         for name, estimate in vars(self).items():
@@ -142,13 +138,13 @@ class MeasuredTurbulence(SimulatedTurbulence):
         """Draw an atmosphere that shows what the file says; raises ValueError where none does."""
         for _ in range(MAX_DRAWS):
             u = torch.rand(5, generator=generator, dtype=torch.float64).tolist()
-            rms, blur, share = self.file.rms_px, self.file.blur_ratio, self.file.whole_share
+            rms, blur, share = self.file.rms_px, self.file.blur_px, self.file.whole_share
             length = log_uniform(u[0], self.lengths, "half_length_px")
             seen = TargetImageStatistics(
                 tilt_correlation_half_length_px=float(length),
                 tilt_correlation_time_s=float(log_uniform(u[1], self.decays, "decay_s")),
                 tilt_px=float(log_uniform(u[2], _bounds(rms), "rms_px")),
-                psf_width_ratio=1 + LUCKY * (float(np.interp(u[3], (0, 1), _bounds(blur))) - 1),
+                blur_px=float(np.interp(u[3], (0, 1), _bounds(blur))),
                 global_tilt_share=float(np.interp(u[4], (0, 1), _bounds(share))),
             )
             try:

@@ -144,14 +144,19 @@ class Atmosphere:
         return 2 / math.pi * self.lambda_over_d_px(width_px) * spread
 
     def tilt_and_blur_px(self, width_px: int) -> float:
-        """How far turbulence spreads a point over time, along one axis, in pixels (rms).
+        """How far turbulence spreads a point over time, along one axis, in pixels (rms): tilt and
+        blur in quadrature."""
+        return math.hypot(self.tilt_std_px(width_px), self.blur_px(width_px))
 
-        Tilt and blur in quadrature; of the blur what exceeds diffraction, as the standard
-        deviation of the Gaussian that holds half of its light within the same radius.
+    def blur_px(self, width_px: int) -> float:
+        """By how much turbulence blurs beyond diffraction, tilt removed, in pixels.
+
+        The standard deviation along one axis of the Gaussian that holds half of its light within
+        the same radius.
         """
         strength = self.d_over_r0, *self.outer_scale_and_profile
         blur = float(short_exposure.blur_std_in_lambda_over_d(*strength))
-        return math.hypot(self.tilt_std_px(width_px), self.lambda_over_d_px(width_px) * blur)
+        return self.lambda_over_d_px(width_px) * blur
 
     def tilt_correlation_half_length_px(self, width_px: int) -> float:
         """The distance at which the correlation of the tilt falls to 1/2, in pixels."""

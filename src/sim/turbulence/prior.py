@@ -51,16 +51,16 @@ class TargetImageStatistics:
     correlation, its time to 1 / e, and either `tilt_and_blur_px` (see Atmosphere) or `tilt_px`, rms
     along one axis.
 
-    Of all that shows this, wanted most are `psf_width_ratio`, the width of the blurred point over
-    the sharp one, and `global_tilt_share`, the share of the tilt's variance that moves the whole
-    view; None: any.
+    Of all that shows this, wanted most are `blur_px`, the blur beyond diffraction (the standard
+    deviation of a Gaussian along one axis), and `global_tilt_share`, the share of the tilt's
+    variance that moves the whole view; None: any.
     """
 
     tilt_correlation_half_length_px: float
     tilt_correlation_time_s: float
     tilt_and_blur_px: float | None = None
     tilt_px: float | None = None
-    psf_width_ratio: float | None = None
+    blur_px: float | None = None
     global_tilt_share: float | None = None
 
 
@@ -149,7 +149,7 @@ def sample_matching_atmosphere(
         fits &= (rytov <= max_rytov_variance) & np.isfinite(strength)
         if not fits.any():
             continue
-        mismatch = _mismatch(wanted, blur, unit, shapes, 1 / scale, aperture)
+        mismatch = _mismatch(wanted, blur, shapes, 1 / scale, aperture)
         i = int(np.where(fits, mismatch, np.inf).argmin())
         length = float(log_uniform(u[i, 3], distance_m, "distance_m"))
         diameter = math.sqrt(wavelength_m * length * aperture[i] / unit[i])
@@ -236,17 +236,14 @@ def _solve_d_over_r0(
 def _mismatch(
     wanted: TargetImageStatistics,
     blur: Candidates,
-    unit: Candidates,
     shapes: Sequence[tuple[float, ...]],
     ratio: Candidates,
     aperture: Candidates,
 ) -> Candidates:
     """Return how far each candidate is off: 0.1 is 10 % of blur, or of the tilt's variance."""
     total = np.zeros(len(blur))
-    if wanted.psf_width_ratio is not None:
-        radius = short_exposure.half_light_radius(0.0)
-        sharp = unit * radius / short_exposure.GAUSSIAN_HALF_LIGHT
-        total += np.abs(np.log(np.hypot(1, blur / sharp) / wanted.psf_width_ratio))
+    if wanted.blur_px is not None:
+        total += np.abs(np.log(blur / wanted.blur_px))
     if wanted.global_tilt_share is not None:
         given = zip(ratio, shapes, REFERENCE_WIDTH_PX / aperture, strict=True)
         shares = np.array([outer_scale.global_tilt_share(*one) for one in given])

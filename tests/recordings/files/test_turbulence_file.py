@@ -23,7 +23,7 @@ SITE = {
     "half_length_px": [15.0, 12.0, 18.0],
     "whole_share": [0.1, 0.05, 0.15],
     "decay_s": [0.05, 0.04, 0.06],
-    "blur_ratio": [1.2, 1.15, 1.25],
+    "blur_px": [0.4, 0.25, 0.65],
 }
 RANGES = {"tilt_correlation_time_s": (0.1, 0.2)}
 
@@ -58,8 +58,8 @@ def test_a_file_is_read_as_it_was_written(tmp_path):
         ({"whole_share": [0.5, 0.2, 1.5]}, "whole_share must be in 0..1, got 1.5"),
         ({"decay_s": [float("nan"), 0.0, 1.0]}, "decay_s must be in"),
         ({"decay_s": ["fast", 0.1, 1.0]}, "decay_s must hold numbers, got fast"),
-        ({"blur_ratio": [1.2, 0.5, 1.3]}, "blur_ratio must be in 1..10, got 0.5"),
-        ({"blur_ratio": [True, 1.0, 1.3]}, "blur_ratio must hold numbers, got True"),
+        ({"blur_px": [1.2, 0.0, 1.3]}, "blur_px must be in 0.001..30, got 0.0"),
+        ({"blur_px": [True, 1.0, 1.3]}, "blur_px must hold numbers, got True"),
         ({"decay_s": None}, "its keys must be rms_px, half_length_px"),
         ({"more": [1, 1, 1]}, "its keys must be"),
         ({"rms_px": 0.5}, "rms_px must hold value and interval"),
@@ -95,6 +95,8 @@ def test_clips_show_what_the_file_says(tmp_path):
     assert lengths.min() > 12 * 0.9 and lengths.max() < 18 * 1.1 and np.ptp(lengths) > 3
     decays = np.array([-1 / (120 * np.log(path.ar1_coefficient)) for path in paths])
     assert decays.min() > 0.039 and decays.max() < 0.061
+    blurs = np.array([path.blur_px(256) for path in paths])
+    assert blurs.min() > 0.25 * 0.9 and blurs.max() < 0.65 * 1.1 and np.ptp(blurs) > 0.2
     shares = [
         outer_scale.global_tilt_share(
             path.aperture_m / path.outer_scale_m,

@@ -16,7 +16,6 @@ from src.sim.turbulence.prior import (
     sample_matching_atmosphere,
     unnormalised_cn2_profile,
 )
-from src.sim.turbulence.short_exposure import half_light_radius
 from src.sim.turbulence.simulated import INTERVALS, SimulatedTurbulence
 
 
@@ -80,14 +79,10 @@ def test_a_camera_that_shows_measured_turbulence(tilt_px, length_px):
 
 
 def test_the_blur_that_is_wanted_is_the_nearest_there_is():
-    def psf_width_ratio(wanted: float) -> float:
-        statistics = TargetImageStatistics(20.0, 0.05, tilt_px=0.5, psf_width_ratio=wanted)
+    for wanted in (0.3, 0.5, 0.8):
+        statistics = TargetImageStatistics(20.0, 0.05, tilt_px=0.5, blur_px=wanted)
         path = sample_matching_atmosphere(statistics, generator(3))
-        blurred = half_light_radius(path.d_over_r0, *path.outer_scale_and_profile)
-        return float(blurred / half_light_radius(0.0))
-
-    assert psf_width_ratio(1.3) == pytest.approx(1.3, rel=0.15)
-    assert psf_width_ratio(1.8) == pytest.approx(1.8, rel=0.15)
+        assert path.blur_px(256) == pytest.approx(wanted, rel=0.1)
 
 
 @pytest.mark.parametrize("limits", [(0.1, 1.0), (1.0, 1000.0), (50.0, 60.0)])
