@@ -67,7 +67,7 @@ def describe_test_conditions(cfg: DictConfig, optics: Optics) -> str:
     names = ("scene", "turbulence", "sensor", "optics", "data")
     parts: dict[str, Any] = {name: as_dict(cfg[name]) for name in names}
     parts["data"] = {key: value for key, value in parts["data"].items() if key not in NO_CLIPS}
-    given = {key: cfg.get(key) for key in ("fps", "bins", "seed")}
+    given = {key: cfg.get(key) for key in ("fps", "bins")}
     files = {"files": hash_file_lists(parts), "measured": _read_measured(parts["turbulence"])}
     return json.dumps([parts, given, files, optics.positions], sort_keys=True, default=str)
 
