@@ -11,7 +11,7 @@ import rich
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from src.app import build, compared_networks, entry_point, hardware
+from src.app import build, compared_networks, entry_point
 from src.app.instantiate import build_part
 from src.bench.candidates import Candidate
 from src.bench.stress_tests import stress_results
@@ -62,7 +62,6 @@ def _run_tests(cfg: DictConfig, config: str, networks: int) -> Iterator[NetworkR
     """
     run = partial(_test_network, config)
     if cfg.processes == 1:
-        hardware.reserve_worker_cores(cfg)
         yield from map(run, range(networks))
         return
     context = get_context("spawn")  # a fork would inherit threads that are no longer there

@@ -3,6 +3,7 @@
 import json
 import os
 from pathlib import Path
+from weakref import ref
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -98,6 +99,20 @@ def test_a_failed_job_is_named_and_the_rest_stands(tmp_path, capsys):
     assert run_here("eval", *SCORED, "data.test_crop=32", f"paths.out={tmp_path}") == 0
     assert capsys.readouterr().out.count("skipped, its results stand") == 1
     assert done.stat().st_mtime_ns == time
+
+
+def test_what_a_failed_job_made_is_freed(tmp_path, monkeypatch):
+    made, kept = list[ref](), list[bool]()
+
+    def fail(cfg, **_):
+        kept.extend(one() is not None for one in made)
+        own = DictConfig({})
+        made.append(ref(own))
+        raise ValueError(f"seed {cfg.seed}")
+
+    monkeypatch.setattr(build, "build_data_module", fail)
+    assert run_here("eval", *SCORED, "seed=0,1", f"paths.out={tmp_path}") == 1
+    assert kept == [False]
 
 
 CONFIG = "task: {task}\nckpt: {ckpt}\nlr: {lr}\npaths:\n  run: {run}\nlogger:\n  dir: {run}/logs\n"

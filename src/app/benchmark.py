@@ -16,6 +16,7 @@ from rich.table import Table
 from baselines import published
 from baselines.centre_view import CentreViewNetwork
 from src.app import build, entry_point
+from src.app.hardware import first_gpu
 from src.app.instantiate import as_dict, build_part
 from src.metrics.table import Column
 from src.models import files
@@ -74,7 +75,7 @@ class EvrealBenchmark:
 
     def __init__(self, cfg: DictConfig):
         self.cfg, self.rule = cfg, _build_rule(cfg)
-        self.device = "cuda" if cfg.trainer.accelerator == "gpu" else "cpu"
+        self.device = f"cuda:{first_gpu(cfg)}" if cfg.trainer.accelerator == "gpu" else "cpu"
         self.network = _load_network(cfg).to(self.device)
         if self.rule.output_normalisation != "none" and isinstance(self.network, CentreViewNetwork):
             self.network.output = self.network.output.replace("clip", "none")  # clipped after it

@@ -16,7 +16,7 @@ from torchmetrics import Metric
 
 import src.models
 from baselines.postprocess import Postprocessed
-from src.app.hardware import uses_cuda_graphs
+from src.app.hardware import first_gpu, uses_cuda_graphs
 from src.app.instantiate import (
     as_dict,
     build_part,
@@ -281,10 +281,11 @@ def test_method(
     kept_clips: int = 0,
 ) -> tuple[ScoreRow, list[tuple[Sample, Tensor]]]:  # fmt: skip
     """Return the scores of `net` on the test clips, in float32, whatever it was trained in, and the
-    first `kept_clips` of them, each with its reconstruction."""
+    first `kept_clips` of them, each with its reconstruction; on the first of several devices."""
     # On SLURM a trainer takes up what a preempted training left in its folder: this one has none.
     options: dict = {"precision": "32-true", "logger": False, "enable_checkpointing": False}
-    options |= {"devices": 1, "num_nodes": 1, "strategy": "auto", "default_root_dir": None}
+    options |= {"num_nodes": 1, "strategy": "auto", "default_root_dir": None}
+    options["devices"] = [first_gpu(cfg)] if cfg.trainer.accelerator == "gpu" else 1
     callbacks = [TrainingProgress(tested=name)] if cfg.trainer.enable_progress_bar else []
     trainer = build_part(cfg, "trainer", callbacks=callbacks, **options)
     options = {"unscored_windows": cfg.data.unscored_windows, "kept_clips": kept_clips}

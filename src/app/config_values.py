@@ -5,6 +5,7 @@ mapping.  What is null there, or may be of several kinds, is listed below.
 """
 
 import math
+import re
 from collections.abc import Iterator
 from typing import Any, cast
 
@@ -65,6 +66,8 @@ BOUNDS: dict[str, tuple[int, float]] = {  # of what others would refuse without 
     "width": (1, math.inf),
     "callbacks.rotation.every_n_train_steps": (1, math.inf),
 }  # fmt: skip
+DDP_PROCESS = r"_ddp_process_\d+$"  # what Lightning adds to the name of a job
+CHOICES = {"trainer.accelerator": ("cpu", "gpu")}
 KINDS = {key: kinds for kinds, keys in KEYS.items() for key in keys.split()}
 # Parts whose own classes check whether a number, a range of numbers or null does.
 RANGES = ("augment.", "optics.", "user_clip_sensor.", "scene.", "sensor.", "target.", "turbulence.")
@@ -77,7 +80,8 @@ def check_values(cfg: DictConfig) -> None:
     """Raise ValueError for a value of another kind than its key's, and for a key that is none, in
     the config of this job of Hydra's."""
     if (shipped := _shipped_config()) is not None:
-        check_values_like(cfg, shipped, HydraConfig.get().job.name)  # that of a sweep's config too
+        name = HydraConfig.get().job.name  # of the entry point, for a sweep's config too
+        check_values_like(cfg, shipped, re.sub(DDP_PROCESS, "", name))
 
 
 def check_values_like(cfg: DictConfig, shipped: DictConfig, entry_point: str) -> None:
@@ -170,6 +174,8 @@ def _check_value(key: str, value: Any, default: Any, entry_point: str, is_requir
         raise ValueError(f"{key} must be {' or '.join(kinds)}, got {got}")
     if is_required and value == "":
         raise ValueError(f"{key} must be a word, got none")
+    if key in CHOICES and value not in CHOICES[key]:
+        raise ValueError(f"{key} must be {' or '.join(CHOICES[key])}, got {value}")
     least, most = BOUNDS.get(key, (-math.inf, math.inf))
     if type(value) is int and not least <= value <= most:
         allowed = f">= {least}" if most == math.inf else f"in {least}..{most}"

@@ -156,7 +156,9 @@ def run_job(
     except Exception as error:
         print(f"failed: {name}: {' '.join(str(error).split())}", file=sys.stderr)
         results.write_text(folder / FAILURE_FILE, f"{name}\n{traceback.format_exc()}")
-        raise JobFailed(job.sweep.dir) from error
+    else:
+        return
+    raise JobFailed(job.sweep.dir)  # not from `error`, which would keep all that the job made
 
 
 def _check_same_beginning(cfg: DictConfig, stored: Path) -> None:

@@ -3,6 +3,7 @@
 import ctypes
 import os
 import re
+from collections.abc import Sequence
 
 import torch
 from omegaconf import DictConfig
@@ -47,11 +48,35 @@ def uses_cuda_graphs(cfg: DictConfig) -> bool:
     if cfg.cuda_graphs not in ("auto", True, False):
         raise ValueError(f"cuda_graphs must be one of auto, true, false, got {cfg.cuda_graphs}")
     possible = cfg.trainer.accelerator != "cpu" and torch.cuda.is_available()
-    possible &= cfg.trainer.devices == 1 and not cfg.get("source")
+    possible = possible and len(requested_gpus(cfg)) == cfg.trainer.get("num_nodes", 1) == 1
+    possible &= not cfg.get("source")
     if cfg.cuda_graphs is True and not possible:
         where = "without a GPU, on several and for a post-processor"
         raise ValueError(f"cuda_graphs must be auto or false {where}, got true")
     return bool(cfg.cuda_graphs) and possible
+
+
+def requested_gpus(cfg: DictConfig) -> list[int]:
+    """Return the numbers of the GPUs that `trainer.devices` asks for: so many, a list or all.
+
+    Raises ValueError for what is none of these.
+    """
+    devices = cfg.trainer.devices
+    if devices in ("auto", "-1", -1):
+        return list(range(torch.cuda.device_count()))
+    listed = devices.split(",") if isinstance(devices, str) and "," in devices else devices
+    try:
+        if isinstance(listed, Sequence) and not isinstance(listed, str):
+            return [int(number) for number in listed if number != ""]
+        return list(range(int(listed)))
+    except (TypeError, ValueError):
+        wanted = "a number of devices, a list of their numbers or auto"
+        raise ValueError(f"trainer.devices must be {wanted}, got {devices}") from None
+
+
+def first_gpu(cfg: DictConfig) -> int:
+    """Return the number of the first GPU that `trainer.devices` asks for, on which tests run."""
+    return next(iter(requested_gpus(cfg)), 0)
 
 
 def check_device(device: str) -> None:

@@ -39,12 +39,14 @@ def explain_refused_key(message: str, keys: Collection[str] = ()) -> str | None:
 def describe_unknown_key(key: str, keys: Collection[str]) -> str:
     """Return that `key` is none, and its nearest neighbour in `keys` or how to list them.
 
-    `keys`: those of the default choices; one of these is none with what was chosen instead.
+    `keys`: all groups, and those of the default choices; one of these is none with what was chosen
+    instead.
     """
-    if key in keys:
+    if key in keys and "." in key:
         return f"{key} is no key of the chosen {key.partition('.')[0]}; {LISTED}"
     parent = key.rpartition(".")[0]
-    hint = _ask_for_nearest(key, [k for k in keys if k.rpartition(".")[0] == parent], len(parent))
+    others = [k for k in keys if k != key]  # a group of other commands
+    hint = _ask_for_nearest(key, [k for k in others if k.rpartition(".")[0] == parent], len(parent))
     hint = hint or f"; {LISTED}"
     return f"{key} is no key of the configuration{hint}"
 

@@ -1,10 +1,12 @@
 """The simulation that a config asks for: scene, turbulence, optics and sensor of one split."""
 
+import gc
 import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
+from weakref import WeakValueDictionary
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -65,14 +67,15 @@ def describe_test_conditions(cfg: DictConfig, optics: Optics) -> str:
     names = ("scene", "turbulence", "sensor", "optics", "data")
     parts: dict[str, Any] = {name: as_dict(cfg[name]) for name in names}
     parts["data"] = {key: value for key, value in parts["data"].items() if key not in NO_CLIPS}
-    given = {key: cfg.get(key) for key in ("fps", "bins", "seed")}
+    given = {key: cfg.get(key) for key in ("fps", "bins")}
     files = {"files": hash_file_lists(parts), "measured": _read_measured(parts["turbulence"])}
     return json.dumps([parts, given, files, optics.positions], sort_keys=True, default=str)
 
 
 def build_clip_cache(cfg: DictConfig) -> ClipCache:
     """Return the cache of turbulence that `data.cache_clips` asks for, named by all that makes its
-    clips; in a device's memory it is the same one for all that ask for the same in this process.
+    clips; in a device's memory it is the same one for all that ask for the same in this process,
+    where it stays until another is made after its last use.
 
     Nine views or fewer come out of one cache: view i depends on the draws of view i only.  Without
     turbulence all views are alike, so that there are as many as asked for.
@@ -99,8 +102,17 @@ def build_clip_cache(cfg: DictConfig) -> ClipCache:
     device = "cpu" if accelerator == "cpu" else "cuda"
     name = json.dumps([_clip_inputs(cfg, optics), size, device], sort_keys=True)
     if name not in DEVICE_CACHES:
+        _free_unused_device_caches()
         DEVICE_CACHES[name] = DeviceClipCache(source, device=device, **size)
     return DEVICE_CACHES[name]
+
+
+def _free_unused_device_caches() -> None:
+    """Free the caches that no pipeline has any more, of earlier jobs of a sweep."""
+    used = WeakValueDictionary(DEVICE_CACHES)
+    DEVICE_CACHES.clear()
+    gc.collect()  # Lightning's objects refer to each other
+    DEVICE_CACHES.update(used)
 
 
 def build_large_crop_stream(

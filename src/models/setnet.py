@@ -58,7 +58,7 @@ width, padded by reflection to a multiple of 8, divided by k.  Right column: fie
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import torch
@@ -197,7 +197,7 @@ class SetNet(EventToVideoNetwork):
         )
         evidence = tick.evidence
         if output_windows is not None:
-            index = _to_device(tuple(output_windows), features.device)
+            index = _to_device(output_windows, features.device)
             features, smoothed, evidence = (
                 maps.unflatten(0, (-1, n)).index_select(0, index).flatten(0, 1)
                 for maps in (features, smoothed, evidence)
@@ -351,8 +351,16 @@ def _as_conv_input(
     return maps
 
 
-@lru_cache(maxsize=64)
+def _to_device(numbers: Sequence[int | Position], device: torch.device) -> Int[Tensor, "..."]:
+    """Return integers as a tensor."""
+    kept = [_keep_on_device(number, device) for number in numbers]
+    return torch.stack(kept) if kept else torch.empty(0, dtype=torch.long, device=device)
+
+
+@cache
 @torch.inference_mode(False)
-def _to_device(numbers: tuple, device: torch.device) -> Int[Tensor, "..."]:
-    """Return integers as a tensor; cached: a CUDA graph cannot capture the copy from the host."""
-    return torch.tensor(numbers, dtype=torch.long, device=device)
+def _keep_on_device(number: int | Position, device: torch.device) -> Int[Tensor, "..."]:
+    """Return one window's number or one position as a tensor; made once and never freed: a CUDA
+    graph cannot capture the copy from the host, and every replay reads the captured tensor.
+    """
+    return torch.tensor(number, dtype=torch.long, device=device)

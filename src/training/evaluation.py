@@ -48,18 +48,20 @@ def test_network(
 
 @torch.no_grad()
 def measure_macs_and_ms(network: VideoMethod, sample: Sample) -> tuple[int, float]:
-    """Return multiply-accumulates and milliseconds of a frame, the first window of the first clip.
+    """Return multiply-accumulates and milliseconds of a frame, the first window of `sample`, on its
+    device, on which `network` then stays.
 
     A method that makes a whole video at once is given all of `sample`, and its cost shared out.
     """
-    network.eval()
-    positions, threads = sample.positions, torch.get_num_threads()
+    device, threads = sample.voxels.device, torch.get_num_threads()
+    network.eval().to(device)  # Lightning moves it to the CPU after a test
     if isinstance(network, EventToVideoNetwork):
-        device = next((parameter.device for parameter in network.parameters()), torch.device("cpu"))
-        return measure_frame_macs_and_ms(network, sample.voxels[:1, 0].to(device), positions)
-    now = select_timing_clock(threads, sample.voxels.device)
+        return measure_frame_macs_and_ms(network, sample.voxels[:1, 0], sample.positions)
+    now = select_timing_clock(threads, device)
     frames, start = sample.target.shape[:2].numel(), now()
     network.reconstruct_clip(sample)
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
     seconds = now() - start
     return count_macs(lambda: network.reconstruct_clip(sample)) // frames, 1e3 * seconds / frames
 

@@ -218,10 +218,14 @@ class Reconstructor(LightningModule):
 class PostprocessorTraining(Reconstructor):
     """Trains a post-processor on frames; `method` is the network behind its frozen `source`."""
 
+    def on_fit_start(self) -> None:
+        super().on_fit_start()
+        method: Any = self.method
+        method.source.to(self.device)  # which is no submodule
+
     def reconstruct_windows(self, sample: "Sample", outputs: Sequence[int]) -> Tensor:
         """Return the restored frames `outputs` of the source's frames."""
         method: Any = self.method  # a Postprocessed, of the baselines
-        method.source.to(self.device)
         return method.repeat(self.network(method.reconstruct_source(sample))[0], outputs)
 
 

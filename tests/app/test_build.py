@@ -191,6 +191,32 @@ def test_precision_is_what_the_device_is_fast_in(
     assert cfg.trainer.precision == precision
 
 
+@pytest.mark.parametrize(
+    ("devices", "first", "graphs"),
+    [
+        ("1", 0, True), ("[1]", 1, True), ("'1,'", 1, True), ("2", 0, False), ("[1,0]", 1, False),
+        ("auto", 0, False), ("-1", 0, False), ("1 +trainer.num_nodes=2", 0, False),
+    ],
+)  # fmt: skip
+def test_a_test_runs_on_the_first_gpu_and_graphs_are_of_one(
+    devices, first, graphs, tmp_path, monkeypatch
+):
+    options: dict = {}
+    monkeypatch.setattr(build, "build_part", lambda *_, **given: options.update(given))
+    monkeypatch.setattr(build.evaluation, "test_network", lambda *_, **__: None)
+    monkeypatch.setattr(hardware.torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(hardware.torch.cuda, "device_count", lambda: 2)
+    cfg = config("train", tmp_path, "trainer=gpu", *f"trainer.devices={devices}".split())
+    build.test_method(cfg, "any", None, None, None)
+    assert options["devices"] == [first] and hardware.uses_cuda_graphs(cfg) == graphs
+
+
+def test_devices_that_are_none_are_refused(tmp_path):
+    cfg = config("train", tmp_path, "trainer=gpu", "trainer.devices=two")
+    with pytest.raises(ValueError, match=r"trainer.devices must be a number .*, got two"):
+        hardware.requested_gpus(cfg)
+
+
 def test_a_missing_size_is_asked_for_by_its_key(tmp_path):
     events = np.array([(0, 1, 1, 1), (5, 2, 2, -1)], event_file.EVENT)
     event_writers.write_events(tmp_path / "a.raw", events, width=8, height=8)

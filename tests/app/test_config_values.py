@@ -63,6 +63,11 @@ WRONG = [
     ("train", ["data.large=5"], "data.large must be a mapping or null, got 5"),
     ("train", ["data.workers=100000"], "data.workers must be in 0..1024, got 100000"),
     ("train", ["trainer.check_val_every_n_epoch=0"], "check_val_every_n_epoch must be >= 1, got 0"),
+    ("train", ["trainer.accelerator=auto", "data.crop=nan"],
+     "trainer.accelerator must be cpu or gpu, got auto"),
+    ("eval", ["trainer.accelerator=cuda"], "trainer.accelerator must be cpu or gpu, got cuda"),
+    ("train", ["start=null", "hydra.job.name=train_ddp_process_1", "data.crop=nan"],  # as Lightning
+     "data.crop must be pixels (128)"),
     ("train", ["data.rates=[1e30]"], "data.rates must be in [0.001, 1e6] windows a second, got"),
     ("simulate", ["write=a.raw", "camera.sensor_size=[10,10]"],
      "camera.sensor_size and camera.tile_px must hold all views, got [10, 10] and None: views: "),

@@ -44,6 +44,8 @@ def test_a_former_key_in_a_config_file_is_refused():
         ("train", "optimizer.lrr=1", "optimizer.lrr is no key of the configuration; did you mean"
                                      " optimizer.lr?"),
         ("eval", "verbose=true", "verbose was removed"),
+        ("chart", "trainer=gpu", "trainer is no key of the configuration; --cfg job"),
+        ("stress", "trainer=gpu", "trainer is no key of the configuration; --cfg job"),
         ("train", "experiment=clean/x", "experiment must be one of lf3x3, mambatm, "),
         ("live", "reading=defalt", "reading must be one of default, got defalt; did you mean"
                                    " default?"),

@@ -89,6 +89,13 @@ def test_training_changes_the_post_processor_and_not_its_source():
     assert any(float(p.grad.abs().sum()) > 0 for p in restorer.parameters())
 
 
+def test_the_source_is_on_the_training_device_before_anything_is_scored():
+    method, loss = Postprocessed(FireNet(), MambaTM(states=2)), TrainingLoss({"l1": L1Term()})
+    module = PostprocessorTraining(method.postprocessor, {}, method=method, loss=loss).to("meta")
+    module.on_fit_start()
+    assert all(p.is_meta for p in method.source.parameters())
+
+
 @torch.no_grad()
 def test_training_gets_each_long_exposure_once_as_a_test_does():
     restorer = MambaTM(states=2).eval()

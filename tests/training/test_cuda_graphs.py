@@ -1,5 +1,8 @@
 """A training sequence as one CUDA graph."""
 
+from itertools import combinations
+from weakref import ref
+
 import pytest
 import torch
 from torch import nn
@@ -8,6 +11,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from src.models import setnet
 from src.models.network import unroll
 from src.models.setnet import SetNet
+from src.sim.optics import layout
 from src.training import cuda_graphs
 from src.training.cuda_graphs import GraphedUnroll, UnrolledNetwork
 from tests.training.test_reconstructor import Leaky
@@ -82,14 +86,33 @@ def test_there_are_no_more_graphs_than_asked_for(monkeypatch):
 def test_no_shape_and_no_branch_of_a_setnet_depends_on_events(monkeypatch):
     """Else no graph can be made: what is traced has no values."""
     monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)  # as on a GPU
-    setnet._to_device.cache_clear()  # of tensors with values
+    setnet._keep_on_device.cache_clear()  # of tensors with values
     with FakeTensorMode():
         network = SetNet.preset("medium")
         voxels, window_s = torch.zeros(2, 6, 9, 5, 64, 64), torch.full((2,), 1 / 120)
         frames, _ = unroll(network, voxels, window_s=window_s, output_windows=[1, 4])
         frames.sum().backward()
         assert frames.shape == (2, 2, 1, 64, 64)
-    setnet._to_device.cache_clear()  # of tensors without values
+    setnet._keep_on_device.cache_clear()  # of tensors without values
+
+
+def test_what_a_graph_of_a_setnet_reads_is_never_freed(monkeypatch):
+    """Tensors made outside a graph's memory, which replays read and do not ask for again."""
+    network, voxels = SetNet.preset("small"), torch.zeros(1, 3, 4, 5, 8, 8)
+    make, made = torch.tensor, list[ref]()
+
+    def tensor(*args, **options):
+        made.append(ref(new := make(*args, **options)))
+        return new
+
+    setnet._keep_on_device.cache_clear()
+    monkeypatch.setattr(torch, "tensor", tensor)
+    with torch.no_grad():
+        unroll(network, voxels, positions=layout(4), output_windows=[0, 2])
+        count = len(made)
+        for where in combinations(layout(25), 2):
+            network.stem_kernels_and_bias(where)
+    assert count and all(one() is not None for one in made[:count])
 
 
 @pytest.mark.gpu

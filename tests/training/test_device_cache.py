@@ -1,5 +1,7 @@
 """A cache in a device's memory: the samples of one on a disk, gathered a batch at a time."""
 
+from weakref import ref
+
 import pytest
 import torch
 
@@ -130,6 +132,16 @@ def test_all_that_ask_for_the_same_share_one_of_a_process(tmp_path):
     cfg = config("train", tmp_path, *asked)
     del cfg.trainer  # as in src.simulate like=
     assert simulations.build_clip_cache(cfg) is nine
+
+
+def test_one_that_no_pipeline_has_any_more_makes_room_for_the_next(tmp_path):
+    asked = [*SMALL, "data.cache_device=device", "data.workers=0"]
+    first, second, third = (config("train", tmp_path, *asked, f"seed={n}") for n in (11, 12, 13))
+    earlier = ref(simulations.build_clip_cache(first))
+    used = simulations.build_pipeline(second, "train")
+    assert earlier() is None
+    simulations.build_clip_cache(third)
+    assert simulations.build_clip_cache(second) is used.cache
 
 
 @pytest.mark.parametrize(

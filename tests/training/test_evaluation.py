@@ -2,6 +2,7 @@
 
 import os
 import signal
+from dataclasses import replace
 
 import lightning
 import pytest
@@ -9,8 +10,11 @@ import torch
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from torch.utils.data import DataLoader
 
+from baselines.firenet import FireNet
+from baselines.postprocess import Postprocessed
 from src.metrics.video_metrics import VideoMetrics
-from src.models.network import EventToVideoNetwork
+from src.models.backward_warmup import BackwardWarmup
+from src.models.network import EventToVideoNetwork, FramePostprocessor
 from src.sim.pipeline import Sample
 from src.training import evaluation
 from src.training.datamodule import LightFieldData
@@ -87,3 +91,31 @@ def test_no_clip_is_reconstructed_twice_for_its_pictures(trainer, monkeypatch):
 def test_sigterm_during_the_last_clip_is_not_forgotten(trainer):
     with pytest.raises(SIGTERMException):
         evaluation.test_network("any", Terminated(), Clips(), VideoMetrics(), trainer=trainer)
+
+
+class Blurred(FramePostprocessor):
+    """Stands for a post-processor with weights."""
+
+    def __init__(self):
+        super().__init__()
+        self.blur = torch.nn.Conv2d(1, 1, 3, padding=1)
+
+    def forward(self, frames):
+        return self.blur(frames.flatten(0, 1)).unflatten(0, frames.shape[:2]), None
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        lambda network: network,
+        lambda network: BackwardWarmup(network, 0.02),
+        lambda network: Postprocessed(network, Blurred()),
+    ],
+)
+def test_cost_is_measured_on_the_device_of_the_clips(wrap):
+    method, clip = wrap(FireNet()), Clips.draw("clip")  # on a CPU, as Lightning leaves a method
+    seen, there = list[torch.device](), replace(clip.to("meta"), window_s=clip.window_s)
+    for layer in (part for part in method.modules() if isinstance(part, torch.nn.Conv2d)):
+        layer.register_forward_pre_hook(lambda self, given: seen.append(self.weight.device))
+    macs, milliseconds = evaluation.measure_macs_and_ms(method, there)
+    assert macs > 0 and milliseconds > 0 and set(seen) == {torch.device("meta")}

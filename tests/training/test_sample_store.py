@@ -74,8 +74,8 @@ def test_draws_for_a_device_are_not_kept():
     assert list(draws) == [[SampleId(0, 0)]] and store.samples == {}
 
 
-def conditions(tmp_path, *overrides: str) -> str:
-    cfg = config("eval", tmp_path, "data.test_clips=2", *overrides)
+def conditions(tmp_path, *overrides: str, task: str = "eval") -> str:
+    cfg = config(task, tmp_path, "data.test_clips=2", *overrides)
     return describe_test_conditions(cfg, build_part(cfg, "optics"))
 
 
@@ -96,3 +96,8 @@ def test_whatever_makes_other_clips_is_another_condition(tmp_path, other):
 )
 def test_whatever_is_of_the_network_or_its_scores_is_the_same_condition(tmp_path, same):
     assert conditions(tmp_path, same) == conditions(tmp_path)
+
+
+def test_trainings_of_several_seeds_share_their_test_clips(tmp_path):
+    one, other = (conditions(tmp_path, f"seed={seed}", task="train") for seed in (0, 1))
+    assert one == other
