@@ -82,6 +82,11 @@ class SetNetClock:
         active_tiles, changed_tiles = tiles
         return Tick(active_tiles, update, *smoothed, kept, changed_tiles)
 
+    def fade_traces(self, seconds: float) -> None:
+        """Bring a clock by which no cell advances forward by `seconds` without events."""
+        kept = exp_float32(np.float32(-seconds / cell_clock.TRACE_TAU_S))
+        clock_numba.fade(kept, self.trace.reshape(-1))
+
     def _advance(self, pixels: EventPixels, changed: np.ndarray) -> np.float32:
         places, voxels, window_s = pixels
         kept, trace_kept = (

@@ -67,7 +67,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from src.models.background import REVEALING_EVENTS, blend_background
-from src.models.cell_clock import ClockTick, run_clock
+from src.models.cell_clock import TRACE_TAU_S, ClockTick, run_clock
 from src.models.context_pyramid import ContextPyramid, smooth_context
 from src.models.layers import EqualDCConv, pad_centred_to_multiple, scan_windows
 from src.models.network import EventToVideoNetwork
@@ -211,6 +211,14 @@ class SetNet(EventToVideoNetwork):
             view_sums=view_sums, hidden=hidden, scales=scales, context_average=context,
             context_smoothed=context_smoothed,
         )  # fmt: skip
+
+    def is_still(self, state: SetNetState | None) -> bool:
+        """Return whether no clock advances, and so no frame changes, until there are events."""
+        return state is not None and not state.activity.any()
+
+    def age(self, state: SetNetState, seconds: float) -> SetNetState:
+        """Return the state after `seconds` without events, of one that `is_still`: traces decay."""
+        return state._replace(event_trace=state.event_trace * math.exp(-seconds / TRACE_TAU_S))
 
     def stem(
         self,
