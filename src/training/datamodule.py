@@ -196,5 +196,6 @@ class BatchSimulator:
         samples = [pipeline.simulate([draw], self.device) for draw in draws]
         if self.teachers is None:
             return samples
-        pairs = zip(samples, names, strict=True)
-        return [replace(one, teacher_frames=self.teachers(one, name)) for one, name in pairs]
+        keys = names if pipeline.repeats_samples else [None] * len(names)
+        pairs = zip(samples, keys, strict=True)
+        return [replace(one, teacher_frames=self.teachers(one, key)) for one, key in pairs]
