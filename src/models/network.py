@@ -30,8 +30,9 @@ class EventToVideoNetwork(VideoMethod):
     """A recurrent network from event voxel grids to frames in [0, 1], window by window.
 
     A subclass implements `forward`; `warm_up` and `sequence` may be replaced by faster ones that
-    give the same, `is_still` and `age` spare it windows without events.  The state, a tensor or nested tuples, lists and dicts of tensors, is never kept
-    inside.  `uses_window_length`: whether windows may last longer or shorter than in training;
+    give the same, `is_still` and `age` by ones that spare it windows without events.  The state, a
+    tensor or nested tuples, lists and dicts of tensors, is never kept inside.
+    `uses_window_length`: whether windows may last longer or shorter than in training;
     `uses_centre_view_only`: whether the other views it is given change nothing.
     """
 

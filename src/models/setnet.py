@@ -149,7 +149,8 @@ class SetNet(EventToVideoNetwork):
     ) -> tuple[Float[Tensor, "n 1 h w"], SetNetState]:
         """Return the frame at the end of the window, in [0, 1], float32, and the state.
 
-        Raises ValueError for bins, a number of views, a window length or a state that do not fit.
+        Raises ValueError for bins, a number of views, a window length (unless in a tensor on a GPU,
+        which would be synchronised) or a state that do not fit.
         """
         window = voxels[:, None]
         frames, state = self.sequence(window, state, window_s=window_s, positions=positions)
@@ -335,6 +336,10 @@ def _sizes(state: SetNetState) -> list:
 def _durations(window_s: float | Tensor, voxels: Tensor) -> Float[Tensor, "_n 1 1 1"]:
     """Return the length of the window, in seconds, one for each clip or for all."""
     if isinstance(window_s, Tensor):
+        is_traced = torch.jit.is_tracing() or torch.compiler.is_compiling()
+        is_known = window_s.device.type == "cpu" and not is_traced
+        if is_known and not ((window_s > 0) & window_s.isfinite()).all():
+            raise ValueError(f"window_s must be > 0 seconds, got {window_s.tolist()}")
         return window_s.to(voxels.device).float().view(-1, 1, 1, 1)
     if not 0 < window_s < math.inf:
         raise ValueError(f"window_s must be > 0 seconds, got {window_s}")

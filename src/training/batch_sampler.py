@@ -53,9 +53,10 @@ class StepSampler(Sampler[list[SampleId]]):
     """The batch of step s: numbers s * size .. (s + 1) * size - 1.
 
     `batch_reuse` steps in a row are of the same clips, which are numbered on from one simulation to
-    the next.  Starts at the step reached; an epoch ends when the step is a multiple of `steps_per_epoch`.  With `world` processes each takes
-    its own slice of the joint batch.  A `large_share` of the steps, evenly spread, are
-    `large_batch_size` samples of stream 1, which counts its own.
+    the next.  Starts at the step reached; an epoch ends when the step is a multiple of
+    `steps_per_epoch`.  With `world` processes each takes its own slice of the joint batch.  A
+    `large_share` of the steps, evenly spread, are `large_batch_size` samples of stream 1, which
+    counts its own.
     """
 
     batch_size: int

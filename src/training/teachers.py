@@ -26,8 +26,8 @@ class TeacherEnsemble:
     One without `uses_window_length` teaches windows of 1 / `trained_rate_hz` seconds only, as it
     was trained with.  `cache`: a folder for their frames, 8 bits a pixel, so that a sample that
     comes again, in this training or another, is not reconstructed again; files are named by a hash
-    of the networks and the sample.  Raises ValueError, naming `teachers`, where no network takes one
-    of `required_rates_hz`.
+    of the networks and the sample.  Raises ValueError, naming `teachers`, where no network takes
+    one of `required_rates_hz`.
     """
 
     def __init__(

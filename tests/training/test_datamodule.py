@@ -88,12 +88,10 @@ def test_reuse_repeats_clips_but_not_numbers():
 @pytest.mark.parametrize("batch_size, reuse, clips", [(3, 4, 12), (2, 4, 16), (3, 2, 24)])
 def test_a_batch_used_again_leaves_no_clip_out(batch_size, reuse, clips, world):
     steps = 2 * reuse * clips
-    found = [
-        [item for batch in sampler(batch_size, steps, lambda: 0, **how) for item in batch]
-        for rank in range(world)
-        for how in [{"batch_reuse": reuse, "rank": rank, "world": world}]
-    ]
-    items = sum(found, [])
+    items = []
+    for rank in range(world):
+        how = {"batch_reuse": reuse, "rank": rank, "world": world}
+        items += [item for batch in sampler(batch_size, steps, lambda: 0, **how) for item in batch]
     assert {item.clip % clips for item in items} == set(range(clips))
     assert len({item.number for item in items}) == len(items)  # each is augmented anew
 
