@@ -47,11 +47,11 @@ def simulate(cfg: DictConfig) -> dict:
     own = cfg.video or cfg.photo
     if cfg.like and own:
         raise ValueError(f"like must be null with video or photo, got {cfg.like}")
-    if cfg.large and not cfg.like:
-        raise ValueError("large must be false without like, got true")
     if cfg.write:  # refused before minutes of work
         height, width = cfg.camera.sensor_size
         event_writers.choose_file_kind(Path(cfg.write), None, width, height, "evt3")
+    if cfg.large and not cfg.like:
+        raise ValueError("large must be false without like, got true")
     return simulate_user_clip(cfg) if own else simulate_scene(cfg)
 
 

@@ -130,7 +130,7 @@ class EventListRuntime:
 
     def is_still(self, state: Any) -> bool:
         """Return whether, from `state` on, the frame stays as it is until there are events."""
-        return state is not None and self.runner.is_still(state)
+        return self.runner.is_still(state)
 
     def age(self, state: Any, seconds: float) -> Any:
         """Return `state`, one that `is_still`, advanced in place by `seconds` without events."""

@@ -111,8 +111,8 @@ class SetNetTiles:
         sums = LeakySumState(views, rows, columns, mixtures)
         self.state = SetNetTilesState(clock, sums, TileState(self.network, *self.padded))
 
-    def is_still(self, state: SetNetTilesState) -> bool:
-        return not state.clock.active_tiles.any()
+    def is_still(self, state: SetNetTilesState | None) -> bool:
+        return state is not None and state.clock.is_still()
 
     def age(self, state: SetNetTilesState, seconds: float) -> SetNetTilesState:
         state.clock.fade_traces(seconds)
