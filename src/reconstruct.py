@@ -39,7 +39,7 @@ def reconstruct(cfg: DictConfig) -> Path:
 
     Raises ValueError for a recording, views, network or window that do not go together.
     """
-    run, ready_s = Path(cfg.paths.run), []
+    run, count, first_s, last_s = Path(cfg.paths.run), 0, 0.0, 0.0
     check_settings(cfg)
     network = reconstruction.require_event_network(build.load_ckpt_or_baseline(cfg))
     views = choose_views(cfg, network)
@@ -54,8 +54,10 @@ def reconstruct(cfg: DictConfig) -> Path:
     ):
         for frame in chain([first], shown):
             write(frame)
-            ready_s.append(time.perf_counter() - start)
-    print(describe_run(run / output.KINDS[cfg.output_format][1], views, ready_s))
+            last_s, count = time.perf_counter() - start, count + 1
+            first_s = first_s or last_s
+    video = run / output.KINDS[cfg.output_format][1]
+    print(describe_run(video, views, count, first_s, last_s))
     return run
 
 
@@ -69,17 +71,16 @@ def check_settings(cfg: DictConfig) -> None:
         check_noise_filter_s(cfg.noise_filter_s)
 
 
-def describe_run(video: Path, views: Views, ready_s: list[float]) -> str:
-    """Return where the video is and how fast its frames came, the last after `ready_s[-1]`; the
-    first, for which code is compiled, does not count as speed.
+def describe_run(video: Path, views: Views, count: int, first_s: float, last_s: float) -> str:
+    """Return where the video is and how fast its `count` frames came, the last after `last_s`; the
+    first, after `first_s`, for which code is compiled, does not count as speed.
     """
-    (height, width), number, count = views.model, len(views.views), len(ready_s)
-    later_s = ready_s[-1] - ready_s[0]
+    (height, width), number, later_s = views.model, len(views.views), last_s - first_s
     rate = f"{(count - 1) / later_s:.1f} frames per second of wall time" if later_s else ""
     speed = f", after the first frame {rate}, reading and writing included" if later_s else ""
     return (
         f"{video}: {count} frames, {width}x{height} px, {number} view{'s' * (number > 1)}; "
-        f"{ready_s[-1]:.1f} s{speed}; times in {video.parent / 'frames.csv'}"
+        f"{last_s:.1f} s{speed}; times in {video.parent / 'frames.csv'}"
     )
 
 

@@ -15,7 +15,7 @@ from rich.progress import track
 from torch import Tensor
 from yaml import YAMLError
 
-from src.app import build, entry_point, user_clip_simulation
+from src.app import build, entry_point, simulation, user_clip_simulation
 from src.app.renamed_keys import refuse_renamed_keys
 from src.app.user_clip_simulation import SimulatedPart, UserClipSimulation
 from src.figures import samples
@@ -38,7 +38,8 @@ def simulate(cfg: DictConfig) -> dict:
     """Simulate `video` or `photo`, or clip `index` of `split` of a scene; draw clean, views, tilt
     and events as `views.gif`, `.png`.
 
-    With `like`, the config of another run, it is just the clip that run saw (not augmented).
+    With `like`, the config of another run, it is just the clip that run saw (not augmented), with
+    `large` one of its `data.large`.
     A video or photograph, or a clip with `write`, also goes, its views mirrored and misaligned,
     onto one sensor whose events are written to a file, geometry and truth beside it.  Returns what
     was drawn: D/r0, threshold ...
@@ -49,6 +50,8 @@ def simulate(cfg: DictConfig) -> dict:
     if cfg.write:  # refused before minutes of work
         height, width = cfg.camera.sensor_size
         event_writers.choose_file_kind(Path(cfg.write), None, width, height, "evt3")
+    if cfg.large and not cfg.like:
+        raise ValueError("large must be false without like, got true")
     return simulate_user_clip(cfg) if own else simulate_scene(cfg)
 
 
@@ -174,7 +177,8 @@ def print_files(path: Path, events: np.ndarray, pictures: list[Path]) -> None:
 def take_clip_config_from_run(cfg: DictConfig) -> DictConfig:
     """Return `cfg` with all that makes a clip taken from the run whose config is `cfg.like`.
 
-    Raises ValueError for a file that is no such config, and for a former key in it.
+    Raises ValueError for a file that is no such config, for a former key in it, and for `large`
+    where that run has no `data.large`.
     """
     try:
         other = OmegaConf.create(dict(safe_yaml.read(cfg.like)))
@@ -184,8 +188,11 @@ def take_clip_config_from_run(cfg: DictConfig) -> DictConfig:
     except (OSError, YAMLError, KeyError, TypeError, ValueError, OmegaConfBaseException):
         raise ValueError(f"like must be the config.yaml of a run, got {cfg.like}") from None
     refuse_renamed_keys(OmegaConf.create(parts))
+    if cfg.large and not other.data.get("large"):
+        raise ValueError(f"large must be false, the run of {cfg.like} has no data.large; got true")
+    other = simulation.merge_large_overrides(other) if cfg.large else other
     merged = cfg.copy()
-    merged.update(parts)
+    merged.update({name: other[name] for name in CLIP_KEYS})
     return merged
 
 

@@ -97,7 +97,8 @@ def _fit_or_name_bad_clip(cfg: DictConfig, training: Training) -> None:
         fit(*training)
     except NonFiniteError as error:
         config = f"{Path(cfg.paths.run)}/config.yaml"
-        same = f"python -m src.simulate like={config} split=train index={error.clips[0]}"
+        which = f"index={error.clips[0]}{' large=true' if error.is_large else ''}"
+        same = f"python -m src.simulate like={config} split=train {which}"
         raise ValueError(f"{error}; seed {cfg.seed}; to see the clip: {same}") from error
 
 

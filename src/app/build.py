@@ -199,7 +199,18 @@ def build_loss(cfg: DictConfig) -> TrainingLoss:
             raise ValueError(f"loss.{name}.weight must be >= 0, got {weight}")
         if weight:
             terms[name] = build_part(cfg, f"loss.{name}")
+    _check_distillation(cfg)
     return TrainingLoss(terms)
+
+
+def _check_distillation(cfg: DictConfig) -> None:
+    """Raise ValueError for teachers whose frames are compared with nothing, and for a weight that
+    was chosen without teachers."""
+    weight, teachers = OmegaConf.select(cfg, "loss.distillation.weight"), cfg.get("teachers")
+    if teachers and not weight:
+        raise ValueError(f"loss.distillation.weight must be > 0 with teachers, got {weight}")
+    if not teachers and weight not in (None, 0, 1):  # 1: that of conf/loss/terms.yaml
+        raise ValueError(f"loss.distillation.weight must be 0 or 1 without teachers, got {weight}")
 
 
 def build_reconstructor(cfg: DictConfig, net: Trainable, spec: dict) -> Reconstructor:
@@ -215,10 +226,10 @@ def build_reconstructor(cfg: DictConfig, net: Trainable, spec: dict) -> Reconstr
     if cfg.scheduler and (length := cfg.scheduler.get("T_max")) is not None and length < 1:
         why = "it follows trainer.max_steps; scheduler=null keeps the rate"
         raise ValueError(f"scheduler.T_max must be >= 1, got {length}: {why}")
-    dropout = "batch_view_dropout_probability"
-    if OmegaConf.select(cfg, f"augment.{dropout}") and getattr(net, "views", None) is not None:
-        takes = f"this network takes {net.views} views"
-        raise ValueError(f"augment.{dropout} must be 0, got {cfg.augment[dropout]}: {takes}")
+    for key in ("batch_view_dropout_probability", "batch_centre_view_probability"):
+        if OmegaConf.select(cfg, f"augment.{key}") and getattr(net, "views", None) is not None:
+            takes = f"this network takes {net.views} views"
+            raise ValueError(f"augment.{key} must be 0, got {cfg.augment[key]}: {takes}")
     if cfg.channels_last:
         for layer in (layer for layer in net.modules() if isinstance(layer, nn.Conv2d)):
             layer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]

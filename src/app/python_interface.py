@@ -34,7 +34,7 @@ ARGUMENTS = (
 NO_OVERRIDES = {key: f"it is the argument {key}" for key in ARGUMENTS}
 NO_OVERRIDES |= {"optics.views": "it is the argument views"}
 NO_OVERRIDES |= dict.fromkeys(("photo", "video"), "it is the argument photo_or_video")
-OF_THE_COMMAND_LINE = ("write", "like", "camera", "name", "task", "paths", "hydra")
+OF_THE_COMMAND_LINE = ("write", "like", "large", "camera", "name", "task", "paths", "hydra")
 
 
 @dataclass(frozen=True, eq=False)

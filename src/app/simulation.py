@@ -121,11 +121,7 @@ def build_large_crop_stream(
     """Return the second stream of training batches, of this config with `data.large.overrides`."""
     if not cfg.data.large or not cfg.data.large.share:
         return None
-    try:
-        changes = OmegaConf.from_dotlist(list(cfg.data.large.overrides))
-        other = cast(DictConfig, OmegaConf.merge(cfg, changes))
-    except (OmegaConfBaseException, TypeError, ValueError) as error:
-        raise ValueError(f"data.large.overrides must be [key=value, ...]: {error}") from error
+    other = merge_large_overrides(cfg)
     for key in OF_BOTH_STREAMS:
         if other.data[key] != cfg.data[key]:
             raise ValueError(f"data.large.overrides must not set data.{key}: it is of both streams")
@@ -138,6 +134,15 @@ def build_large_crop_stream(
     if not isinstance(share, int | float):
         raise ValueError(f"data.large.share must be a number, got {share}")
     return LargeCropStream(build_pipeline(other, "train", optics), share, size)
+
+
+def merge_large_overrides(cfg: DictConfig) -> DictConfig:
+    """Return this config with `data.large.overrides`."""
+    try:
+        changes = OmegaConf.from_dotlist(list(cfg.data.large.overrides))
+        return cast(DictConfig, OmegaConf.merge(cfg, changes))
+    except (OmegaConfBaseException, TypeError, ValueError) as error:
+        raise ValueError(f"data.large.overrides must be [key=value, ...]: {error}") from error
 
 
 def _clip_inputs(cfg: DictConfig, optics: Optics) -> dict:

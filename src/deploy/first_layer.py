@@ -76,6 +76,12 @@ class E2VIDOverEvents:
         output, *self.state = self.remainder([first], self.state)
         return output[0, 0]
 
+    def is_still(self, state: Any) -> bool:
+        return True  # see EventToVideoNetwork
+
+    def age(self, state: Any, seconds: float) -> Any:
+        return state
+
     def reset(self) -> None:
         self.state = self.remainder.zeros(1)
 

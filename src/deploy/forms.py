@@ -70,3 +70,9 @@ class Bf16Network(EventToVideoNetwork):
         seen = voxels.to(self.input_dtype)
         frame, state = self.inner(seen, state, window_s=window_s, positions=positions)
         return frame.float(), state
+
+    def is_still(self, state: Any) -> bool:
+        return self.inner.is_still(state)
+
+    def age(self, state: Any, seconds: float) -> Any:
+        return self.inner.age(state, seconds)

@@ -111,6 +111,13 @@ class SetNetTiles:
         sums = LeakySumState(views, rows, columns, mixtures)
         self.state = SetNetTilesState(clock, sums, TileState(self.network, *self.padded))
 
+    def is_still(self, state: SetNetTilesState | None) -> bool:
+        return state is not None and state.clock.is_still()
+
+    def age(self, state: SetNetTilesState, seconds: float) -> SetNetTilesState:
+        state.clock.fade_traces(seconds)
+        return state
+
     def __call__(self, pixels: EventPixels) -> Float[np.ndarray, "h w"]:
         """Return the frame, padded, valid until the next window."""
         clock, sums, maps = self.state

@@ -88,10 +88,10 @@ class NetworkRunner:
         filled = fill_window(events, self.lookup, self.rule, start_us, window.end_us)
         if not self.is_pipelined or not isinstance(self.network, EventListRuntime):
             return partial(self._run, filled, restart)
-        begun = None
+        begun, runtime = None, self.network
         if filled.events and filled.event_list is not None:
-            begun = self.network.begin(*filled.event_list, 0.0, filled.length_s)
-        return partial(self._finish, self.network, begun, restart)
+            begun = runtime.begin(*filled.event_list, 0.0, filled.length_s)
+        return partial(self._finish, runtime, filled, begun, restart)
 
     def _start_us(self) -> float:
         """Return where the network's window begins: where one of the recent windows does, to the
@@ -109,14 +109,18 @@ class NetworkRunner:
         return next(frames).picture
 
     def _finish(
-        self, runtime: EventListRuntime, begun: Any, restart: bool
+        self, runtime: EventListRuntime, window: Window, begun: Any, restart: bool
     ) -> Float[np.ndarray, "h w"]:
-        """Run the rest of the network on a window that was begun; None, without events, holds."""
+        """Run the rest of the network on a window that was begun; None: all, unless it is still."""
         if restart:
             runtime.reset()
             self.picture = np.full(self.views.model, 0.5, np.float32)
         if begun is not None:
             self.picture = runtime.finish(begun).clip(0, 1)
+        elif runtime.is_still(runtime.state):
+            runtime.age(runtime.state, window.length_s)
+        elif window.event_list is not None:  # empty: what begins a window can go on meanwhile
+            self.picture = runtime.step(*window.event_list, 0.0, window.length_s).clip(0, 1)
         return self.picture
 
 

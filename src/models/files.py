@@ -178,8 +178,7 @@ def _checkpoint(path: Path) -> tuple[dict, dict[str, Tensor]]:
         content = torch.load(path, map_location="cpu", weights_only=True)
         state = content["state_dict"]
         weights = {n.removeprefix("network."): v for n, v in state.items() if "network." in n}
-        # The running mean of the weights, where the training has kept one, is what is used.
-        return content["network"], content.get("average", weights)
+        return content["network"], weights
     except Exception as error:  # libraries raise all kinds on a broken file
         raise ValueError(f"ckpt must be a checkpoint of src.train, got {path}") from error
 

@@ -67,7 +67,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from src.models.background import REVEALING_EVENTS, blend_background
-from src.models.cell_clock import ClockTick, run_clock
+from src.models.cell_clock import TRACE_TAU_S, ClockTick, run_clock
 from src.models.context_pyramid import ContextPyramid, smooth_context
 from src.models.layers import EqualDCConv, pad_centred_to_multiple, scan_windows
 from src.models.network import EventToVideoNetwork
@@ -149,7 +149,8 @@ class SetNet(EventToVideoNetwork):
     ) -> tuple[Float[Tensor, "n 1 h w"], SetNetState]:
         """Return the frame at the end of the window, in [0, 1], float32, and the state.
 
-        Raises ValueError for bins, a number of views, a window length or a state that do not fit.
+        Raises ValueError for bins, a number of views, a window length (unless in a tensor on a GPU,
+        which would be synchronised) or a state that do not fit.
         """
         window = voxels[:, None]
         frames, state = self.sequence(window, state, window_s=window_s, positions=positions)
@@ -211,6 +212,14 @@ class SetNet(EventToVideoNetwork):
             view_sums=view_sums, hidden=hidden, scales=scales, context_average=context,
             context_smoothed=context_smoothed,
         )  # fmt: skip
+
+    def is_still(self, state: SetNetState | None) -> bool:
+        """Return whether no clock advances, and so no frame changes, until there are events."""
+        return state is not None and not state.activity.any()
+
+    def age(self, state: SetNetState, seconds: float) -> SetNetState:
+        """Return the state after `seconds` without events, of one that `is_still`: traces decay."""
+        return state._replace(event_trace=state.event_trace * math.exp(-seconds / TRACE_TAU_S))
 
     def stem(
         self,
@@ -327,6 +336,10 @@ def _sizes(state: SetNetState) -> list:
 def _durations(window_s: float | Tensor, voxels: Tensor) -> Float[Tensor, "_n 1 1 1"]:
     """Return the length of the window, in seconds, one for each clip or for all."""
     if isinstance(window_s, Tensor):
+        is_traced = torch.jit.is_tracing() or torch.compiler.is_compiling()
+        is_known = window_s.device.type == "cpu" and not is_traced
+        if is_known and not ((window_s > 0) & window_s.isfinite()).all():
+            raise ValueError(f"window_s must be > 0 seconds, got {window_s.tolist()}")
         return window_s.to(voxels.device).float().view(-1, 1, 1, 1)
     if not 0 < window_s < math.inf:
         raise ValueError(f"window_s must be > 0 seconds, got {window_s}")

@@ -132,7 +132,8 @@ def reconstruct_frames(
     positions: Sequence[Position] | None = None, state: ReconstructionState | None = None, *,
     device: torch.device | str = "cpu",
 ) -> Iterator[Frame]:  # fmt: skip
-    """Reconstruct one frame per window; a window without events holds the picture at no cost.
+    """Reconstruct one frame per window; one without events holds the picture, at next to no cost,
+    from where the network `is_still`.
 
     `windows` hold lists of events for an EventListRuntime, else grids.  `state`, kept up to date,
     with the rule's `overlapping_windows`, makes this call the continuation of an earlier one.
@@ -140,13 +141,15 @@ def reconstruct_frames(
     state = ReconstructionState() if state is None else state
     for window in windows:
         index = state.state_index(window)
-        if window.events:
-            before = state.states[index]
+        before = after = state.states[index]
+        if window.events or not network.is_still(before):
             picture, after = _run(network, window, before, positions, device)
             state.picture = picture.clip(0, 1)
-            if window.keeps_state:
-                state.states[index] = after
-        elif state.picture is None:
+        elif window.keeps_state:
+            after = network.age(before, window.length_s)
+        if window.keeps_state:
+            state.states[index] = after
+        if state.picture is None:
             if isinstance(network, EventListRuntime):
                 size: tuple[int, ...] = network.size
             else:
@@ -162,7 +165,8 @@ def _run(
         assert window.event_list is not None
         network.state = state if window.keeps_state else deepcopy(state)  # it is advanced in place
         return network.step(*window.event_list, 0.0, window.length_s), network.state
-    voxels = torch.from_numpy(_voxels(window))[None].to(device)
+    grid = np.require(_voxels(window), requirements="W")  # that of no events is not
+    voxels = torch.from_numpy(grid)[None].to(device)
     with torch.inference_mode():
         picture, state = network(voxels, state, window_s=window.length_s, positions=positions)
     return picture[0, 0].float().cpu().numpy(), state
@@ -177,7 +181,7 @@ def reconstruct_each_view(
     windows: Iterable[Window], network: EventToVideoNetwork, overlapping_windows: int = 1
 ) -> Iterator[Float[np.ndarray, "views h w"]]:
     """Yield the pictures of each window on a grid, as `reconstruct_frames` of a network of one view
-    gives them for each view by itself; a window without events in all views holds them."""
+    gives them for each view by itself; without events is a window that has none in all views."""
     states: list[ReconstructionState] = []
     for window in windows:
         views = [replace(window, voxels=view[None]) for view in _voxels(window)]

@@ -96,6 +96,11 @@ class Pipeline:
     clips: int | None = None
     decodes_srgb: bool = False
 
+    @property
+    def repeats_samples(self) -> bool:
+        """Whether there are only so many samples; a random crop is another one for each number."""
+        return self.clips is not None and (self.crop is None or not self.random_crop)
+
     def draw(self, number: int) -> ClipParameters:
         """Draw everything random about clip `number`."""
         index = number if self.clips is None else number % self.clips

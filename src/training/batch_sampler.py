@@ -52,10 +52,11 @@ class DrawDataset(Dataset):
 class StepSampler(Sampler[list[SampleId]]):
     """The batch of step s: numbers s * size .. (s + 1) * size - 1.
 
-    The clips are those of step s // batch_reuse * batch_reuse.  Starts at the step reached; an
-    epoch ends when the step is a multiple of `steps_per_epoch`.  With `world` processes each takes
-    its own slice of the joint batch.  A `large_share` of the steps, evenly spread, are
-    `large_batch_size` samples of stream 1, which counts its own.
+    `batch_reuse` steps in a row are of the same clips, which are numbered on from one simulation to
+    the next.  Starts at the step reached; an epoch ends when the step is a multiple of
+    `steps_per_epoch`.  With `world` processes each takes its own slice of the joint batch.  A
+    `large_share` of the steps, evenly spread, are `large_batch_size` samples of stream 1, which
+    counts its own.
     """
 
     batch_size: int
@@ -80,8 +81,10 @@ class StepSampler(Sampler[list[SampleId]]):
         simulation, use = divmod(step, self.batch_reuse)
         large = int(simulation * self.large_share)  # simulations of stream 1 before this one
         stream = int((simulation + 1) * self.large_share) - large
-        step = (large if stream else simulation) * self.batch_reuse  # of this stream
+        simulation = large if stream else simulation  # of this stream
         size = self.large_batch_size if stream else self.batch_size
-        first = (step * self.world + self.rank) * size
-        later = use * self.world * size
-        return [SampleId(clip, clip + later, stream) for clip in range(first, first + size)]
+        clip, number = (
+            (count * self.world + self.rank) * size
+            for count in (simulation, simulation * self.batch_reuse + use)
+        )
+        return [SampleId(clip + k, number + k, stream) for k in range(size)]

@@ -191,6 +191,10 @@ class CachedPipeline(Pipeline):
         positions = [tuple(place) for place in source.optics.positions or ()]
         self.cache_views = [positions.index(tuple(place)) for place in optics.positions or ()]
 
+    @property
+    def repeats_samples(self) -> bool:
+        return self.clips is not None
+
     def clip_index(self, number: int) -> int:
         """Return which clip of the cache sample `number` is of."""
         key = noise.key(self.seed, self.split, "banked", number, "clip")

@@ -181,7 +181,11 @@ class BatchSimulator:
         # Behind a key of a cache that renews its clips is another clip later.
         names = [(sample.crop_stream, d.key, d.crop, d.clip.name) for sample, d in numbered]
         if self.last[0] != names:
-            self.last = (names, self._simulate(self.streams[ids[0].crop_stream], draws, names))
+            stream = ids[0].crop_stream
+            samples = self._simulate(self.streams[stream], draws, names)
+            for drawn in (drawn for one in samples if stream for drawn in one.parameters):
+                drawn["large"] = True
+            self.last = (names, samples)
         samples = self.last[1]
         if self.augment is None:
             return concatenate_samples(samples)
@@ -196,5 +200,6 @@ class BatchSimulator:
         samples = [pipeline.simulate([draw], self.device) for draw in draws]
         if self.teachers is None:
             return samples
-        pairs = zip(samples, names, strict=True)
-        return [replace(one, teacher_frames=self.teachers(one, name)) for one, name in pairs]
+        keys = names if pipeline.repeats_samples else [None] * len(names)
+        pairs = zip(samples, keys, strict=True)
+        return [replace(one, teacher_frames=self.teachers(one, key)) for one, key in pairs]

@@ -10,11 +10,14 @@ from torch import Tensor
 
 
 class NonFiniteError(ValueError):
-    """A loss or gradient is NaN or infinite; `clips` are the numbers of the batch's clips."""
+    """A loss or gradient is NaN or infinite; `clips` are the numbers of the batch's clips, of
+    `data.large` if `is_large`."""
 
     def __init__(self, what: str, step: int, drawn: list[dict]):
         self.clips = [clip.get("clip") for clip in drawn]
-        super().__init__(f"{what} at step {step}, clips {self.clips}: {drawn}")
+        self.is_large = any(clip.get("large") for clip in drawn)
+        stream = " of data.large" if self.is_large else ""
+        super().__init__(f"{what} at step {step}, clips {self.clips}{stream}: {drawn}")
 
 
 class StepGuard:

@@ -283,3 +283,10 @@ def test_what_an_optimiser_refuses_is_refused_before_anything_runs(wrong, messag
     with pytest.raises(ValueError, match=message):
         train(cfg)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("key", ["batch_view_dropout_probability", "batch_centre_view_probability"])
+def test_a_network_of_a_fixed_number_of_views_loses_none(key, tmp_path):
+    cfg = config("train", tmp_path, *TINY, "experiment=lf3x3", f"augment.{key}=0.5")
+    with pytest.raises(ValueError, match=f"augment.{key} must be 0, got 0.5: .* takes 9 views"):
+        build.build_reconstructor(cfg, *build.build_untrained_network(cfg))

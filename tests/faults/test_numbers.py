@@ -7,7 +7,8 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from src.app import build
+from src.app import build, entry_point
+from src.app.simulation import merge_large_overrides
 from src.sim.pipeline import Pipeline
 from src.simulate import simulate
 from src.train import train
@@ -18,13 +19,13 @@ QUICK = [*TINY, "logger=none", "optics=single", "data.epoch_clips=4", "trainer.m
 QUICK += ["data.batch_reuse=1"]
 
 
-def poisoned(monkeypatch, clip: int, value: float) -> None:
-    """Make the simulation of one training clip return `value` somewhere."""
+def poisoned(monkeypatch, clip: int, value: float, crop: float | None = None) -> None:
+    """Make the simulation of one training clip, or one of this `crop`, return `value` somewhere."""
     exposed = Pipeline.simulate_sensor
 
     def spoil(self, draws, *args):
         sample = exposed(self, draws, *args)
-        if self.split == "train":
+        if self.split == "train" and crop in (None, self.crop):
             sample.voxels[[draw.number == clip for draw in draws], 0, 0, 0, 0, 0] = value
         return sample
 
@@ -45,10 +46,45 @@ def test_a_number_that_is_none_stops_before_the_step(value, monkeypatch, tmp_pat
     see_the_clip(str(caught.value), tmp_path, run)
 
 
+def test_of_a_large_batch_the_clip_of_its_own_stream_is_named(monkeypatch, tmp_path):
+    large = "data.large={share: 0.5, overrides: ['data.crop=24', 'sensor.threshold=0.9']}"
+    poisoned(monkeypatch, 0, float("nan"), crop=24)
+    run = tmp_path / "run"
+    wanted = r"at step 1, clips \[0\] of data.large: .* index=0 large=true$"
+    with pytest.raises(ValueError, match=wanted) as caught:
+        train(config("train", run, *QUICK, "data.batch_size=1", "data.crop=16", large))
+    monkeypatch.undo()
+    found = run_the_command(str(caught.value), tmp_path)
+    other = merge_large_overrides(OmegaConf.load(run / "config.yaml"))
+    pipeline = build.build_pipeline(other, "train")
+    assert found == pipeline.simulate([pipeline.draw(0)]).parameters[0]
+    usual = config("simulate", tmp_path / "usual", f"like={run}/config.yaml", "split=train")
+    assert found != simulate(usual)
+
+
+def run_the_command(message: str, tmp_path) -> dict:
+    words = shlex.split(re.search(r"python -m src\.simulate (.*)", message).group(1))
+    return simulate(config("simulate", tmp_path / "seen", *words))
+
+
+@pytest.mark.parametrize(
+    "given, message",
+    [
+        ([], "large must be false without like, got true"),
+        (["like={run}/config.yaml"], "large must be false, the run of .* has no data.large"),
+    ],
+)
+def test_large_needs_a_run_with_large_crops(given, message, tmp_path):
+    cfg = config("train", tmp_path, *QUICK)
+    (tmp_path / "config.yaml").write_text(entry_point.resolved_yaml(cfg))
+    words = [word.format(run=tmp_path) for word in given]
+    with pytest.raises(ValueError, match=message):
+        simulate(config("simulate", tmp_path, "large=true", *words))
+
+
 def see_the_clip(message: str, tmp_path, run) -> None:
     """Run the command that the message gives; it simulates the clip of the training."""
-    words = shlex.split(re.search(r"python -m src\.simulate (.*)", message).group(1))
-    found = simulate(config("simulate", tmp_path / "seen", *words))
+    found = run_the_command(message, tmp_path)
     trained = OmegaConf.load(run / "config.yaml")
     pipeline = build.build_pipeline(trained, "train")
     assert found == pipeline.simulate([pipeline.draw(2)]).parameters[0] and found["clip"] == 2

@@ -1,6 +1,7 @@
 """Feeds, the intake that cuts what they give, and the whole chain on a file, without a browser."""
 
 import asyncio
+import dataclasses
 import json
 import re
 import socket
@@ -18,7 +19,7 @@ from src import live
 from src.live_view import event_feeds
 from src.live_view.feed_reader import BEHIND_S, STALL_S, FeedReader, PlaybackClock
 from src.live_view.frame_buffer import PolarityAccumulator
-from src.live_view.live_windows import WindowCutter, WindowQueue
+from src.live_view.live_windows import EventWindow, WindowCutter, WindowQueue
 from src.live_view.network_runner import NetworkRunner, RunSettings
 from src.live_view.page_server import PageServer
 from src.live_view.status import FaultLog, Meters
@@ -316,6 +317,29 @@ def test_as_fast_as_it_goes_every_picture_is_that_of_reconstruct(recording):
     shown = screen.ring[: screen.count].astype(float)
     assert np.abs(shown - wanted[: screen.count]).max() <= 1 and shown.std() > 1
     assert len(wanted) - screen.count in (0, 1)
+
+
+def test_a_silence_is_that_of_the_network_on_every_window():
+    rng, made = np.random.default_rng(0), np.zeros(3100, EVENT)
+    noise = rng.choice(np.arange(120_000, 160_000), 100)
+    made["t"] = np.sort(np.r_[0, rng.choice(20_000, 2999), noise])
+    height, width = scenes.SENSOR
+    made["x"], made["y"] = rng.integers(0, width, 3100), rng.integers(0, height // 3, 3100)
+    made["p"] = rng.integers(0, 2, 3100) * 2 - 1
+    torch.manual_seed(0)
+    settings = RunSettings(fps=600.0, form="float32")
+    runner = NetworkRunner("net", SetNet(channels=4).eval(), scenes.views(), settings)
+    rule = dataclasses.replace(runner.rule, as_lists=True)
+    shown, every = [], runner.network
+    for number in range(95):
+        start_us, end_us = number * 1e6 / 600, (number + 1) * 1e6 / 600
+        cut = made[(made["t"] >= start_us) & (made["t"] < end_us)]
+        shown.append(runner.begin(EventWindow(start_us, end_us, cut), restart=number == 0)())
+    every.reset()
+    windows = event_windows.cut_windows([made], build_lookup(scenes.views()), rule)
+    wanted = [every.step(*one.event_list, 0.0, one.length_s) for one in windows][:95]
+    np.testing.assert_allclose(shown, wanted, atol=1e-5)
+    assert np.ptp(shown[11:20], 0).max() > 1e-4 and not np.ptp(shown[30:60], 0).any()
 
 
 def test_the_recorded_time_is_that_of_the_frame_shown_also_while_nothing_moves(recording, tmp_path):

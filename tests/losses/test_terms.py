@@ -144,6 +144,14 @@ def test_a_config_takes_a_term_of_one_s_own(tmp_path):
         (["loss.l1=1"], r"loss.l1 must be a term \(loss.l1.weight=...\), got 1"),
         (["loss.l1.weight=0"], "loss must have a frame term of weight > 0"),
         (["+loss.x={_target_: src.models.e2vid.E2VID}"], "loss.x._target_ must be a FrameTerm"),
+        (
+            ["loss.distillation.weight=1.5"],
+            "loss.distillation.weight must be 0 or 1 without teachers",
+        ),
+        (
+            ["teachers=lf3x3", "loss.distillation.weight=0"],
+            "loss.distillation.weight must be > 0 with teachers, got 0",
+        ),
     ],
 )
 def test_wrong_terms_are_one_line(overrides, message, tmp_path):

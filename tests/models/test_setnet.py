@@ -1,5 +1,6 @@
 """SetNet: any views in any order, time in seconds, a clock for each cell, a state that is held."""
 
+import math
 from itertools import pairwise
 
 import pytest
@@ -448,6 +449,9 @@ def test_the_file_gives_the_network_back(tmp_path):
         ((1, 7, 3, 16, 16), {}, "optics.views must be"),
         ((1, 9, 3, 16, 16), {"positions": [(0, 0)]}, "optics.positions must be 9"),
         ((1, 9, 3, 16, 16), {"window_s": 0.0}, "window_s must be > 0"),
+        ((2, 9, 3, 16, 16), {"window_s": torch.tensor([0.1, 0.0])}, "window_s must be > 0"),
+        ((1, 9, 3, 16, 16), {"window_s": torch.tensor([math.nan])}, "window_s must be > 0"),
+        ((1, 9, 3, 16, 16), {"window_s": torch.tensor([math.inf])}, "window_s must be > 0"),
     ],
 )
 def test_bad_input_names_its_key(shape, options, message):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from baselines.firenet import FireNet
-from src.deploy.forms import Bf16Network
+from src.deploy.forms import Bf16Network, convert_to_form
 from src.deploy.runtime import EventListRuntime
 from src.models.e2vid import E2VID
 from src.models.setnet import SetNet
@@ -69,6 +69,73 @@ def test_the_frames_are_those_from_grids(name, cut):
             other.events_outside,
         )
         np.testing.assert_allclose(one.picture, other.picture, atol=1e-5)
+
+
+def moving_then_still() -> np.ndarray:
+    """Events of 20 ms in the middle of the sensor, none for 0.1 s, then a few of noise."""
+    rng, made = np.random.default_rng(1), np.empty(3100, EVENT)
+    noise = rng.choice(np.arange(120_000, 160_000), 100)
+    made["t"] = np.sort(np.r_[rng.choice(20_000, 3000), noise])
+    made["x"], made["y"] = rng.integers(30, 90, 3100), rng.integers(24, 72, 3100)
+    made["p"] = rng.integers(0, 2, 3100) * 2 - 1
+    return made
+
+
+def frames_of_every_window(network, windows) -> list[np.ndarray]:
+    """Return what `network` makes of each window, none left out."""
+    found, state = [], None
+    for window in windows:
+        if isinstance(network, EventListRuntime):
+            found.append(network.step(*window.event_list, 0.0, window.length_s))
+            continue
+        voxels = torch.from_numpy(window.voxels.copy())[None]
+        with torch.inference_mode():
+            frame, state = network(
+                voxels, state, window_s=window.length_s, positions=VIEWS.positions
+            )
+        found.append(frame[0, 0].numpy())
+    return found
+
+
+@pytest.mark.parametrize("fps", [120.0, 600.0])
+@pytest.mark.parametrize(
+    "engine, form",
+    [("grids", "float32"), ("grids", "bf16"), ("lists", "float32"), ("lists", "bf16")],
+)
+def test_a_silence_is_that_of_the_network_on_every_window(engine, form, fps):
+    torch.manual_seed(0)
+    network, table = SetNet(channels=4).eval(), sensor_lookup.build_lookup(VIEWS)
+    rule = event_windows.WindowRule(fps=fps, as_lists=engine == "lists")
+    windows = list(event_windows.cut_windows([moving_then_still()], table, rule))
+    empty = [window.events == 0 for window in windows]
+    assert sum(empty) > 0.1 * fps - 2 and not empty[-1]
+
+    def build():
+        if engine == "grids":
+            return convert_to_form(network, form)
+        return reconstruction.build_runnable_network(network, form, "cpu", VIEWS, 5)
+
+    wanted = frames_of_every_window(build(), windows)
+    frames = reconstruct_frames(windows, build(), VIEWS.positions)
+    found = [frame.picture for frame in frames]
+    np.testing.assert_allclose(found, wanted, atol=1e-5)
+    first = empty.index(True)
+    assert np.ptp(found[first - 1 : first + 1], 0).max() > 1e-4  # its areas fade a while
+
+
+@pytest.mark.parametrize("fps, fading", [(120.0, 1), (600.0, 5)])
+def test_of_a_silence_a_network_reads_the_windows_in_which_its_areas_fade(fps, fading):
+    calls, table = [], sensor_lookup.build_lookup(VIEWS)
+
+    class Counted(SetNet):
+        def forward(self, *given, **options):
+            calls.append(options["window_s"])
+            return super().forward(*given, **options)
+
+    rule = event_windows.WindowRule(fps=fps, end_s=0.1)
+    windows = list(event_windows.cut_windows([moving_then_still()], table, rule))
+    list(reconstruct_frames(windows, Counted(channels=4).eval(), VIEWS.positions))
+    assert len(calls) == sum(window.events > 0 for window in windows) + fading < len(windows)
 
 
 @pytest.mark.parametrize("missing", [0, 3, 7])

@@ -81,7 +81,19 @@ def test_sampler_goes_on_where_the_training_stopped():
 def test_reuse_repeats_clips_but_not_numbers():
     batches = list(sampler(2, 4, lambda: 0, batch_reuse=2))
     pairs = [[(item.clip, item.number) for item in batch] for batch in batches[:3]]
-    assert pairs == [[(0, 0), (1, 1)], [(0, 2), (1, 3)], [(4, 4), (5, 5)]]
+    assert pairs == [[(0, 0), (1, 1)], [(0, 2), (1, 3)], [(2, 4), (3, 5)]]
+
+
+@pytest.mark.parametrize("world", [1, 2])
+@pytest.mark.parametrize("batch_size, reuse, clips", [(3, 4, 12), (2, 4, 16), (3, 2, 24)])
+def test_a_batch_used_again_leaves_no_clip_out(batch_size, reuse, clips, world):
+    steps = 2 * reuse * clips
+    items = []
+    for rank in range(world):
+        how = {"batch_reuse": reuse, "rank": rank, "world": world}
+        items += [item for batch in sampler(batch_size, steps, lambda: 0, **how) for item in batch]
+    assert {item.clip % clips for item in items} == set(range(clips))
+    assert len({item.number for item in items}) == len(items)  # each is augmented anew
 
 
 def test_processes_share_a_batch_without_overlap():

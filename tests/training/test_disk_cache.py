@@ -111,6 +111,7 @@ def test_of_few_samples_the_first_come_again(tmp_path):
     again = few.simulate([few.draw(3)]).voxels
     first, third = (many.simulate([many.draw(number)]).voxels for number in (1, 3))
     assert torch.equal(again, first) and not torch.equal(again, third)
+    assert few.repeats_samples and not many.repeats_samples
 
 
 def test_early_numbers_take_the_clips_that_are_filled_first(tmp_path):

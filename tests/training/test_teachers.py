@@ -8,11 +8,14 @@ from torch import nn
 
 from src.app import build
 from src.losses.terms import Distillation, TrainingLoss
+from src.models.e2vid import E2VID
 from src.models.network import EventToVideoNetwork
 from src.models.setnet import SetNet
 from src.sim.pipeline import simulate
 from src.training import teachers as module
 from src.training.augment import Augment
+from src.training.batch_sampler import SampleId
+from src.training.datamodule import BatchSimulator
 from src.training.teachers import TeacherEnsemble
 from tests.sim.test_pipeline import STRONG, pipeline
 from tests.test_train import config
@@ -28,10 +31,14 @@ class Constant(EventToVideoNetwork):
 
     def __init__(self, grey: float):
         super().__init__()
-        self.grey, self.calls = nn.Parameter(torch.tensor(grey)), 0
+        self.grey, self.windows = nn.Parameter(torch.tensor(grey)), []
+
+    @property
+    def calls(self):
+        return len(self.windows)
 
     def forward(self, voxels, state=None, *, window_s=1 / 120, positions=None):
-        self.calls += 1
+        self.windows.append(window_s)
         return self.grey.expand(len(voxels), 1, *voxels.shape[-2:]), state
 
 
@@ -52,17 +59,49 @@ def test_the_picture_is_the_mean_of_the_networks_to_8_bits(clip, tmp_path, monke
 
 def test_a_picture_is_made_once_and_again_where_anything_differs(clip, tmp_path):
     network = Constant(0.25)
-    first = TeacherEnsemble({"a": network}, tmp_path, 120.0)(clip)
+    first = TeacherEnsemble({"a": network}, tmp_path, 120.0)(clip, 0)
     made = network.calls
-    assert torch.equal(TeacherEnsemble({"b": network}, tmp_path, 120.0)(clip), first)
+    assert torch.equal(TeacherEnsemble({"b": network}, tmp_path, 120.0)(clip, 0), first)
     assert network.calls == made
-    TeacherEnsemble({"a": network}, tmp_path, 120.0)(replace(clip, voxels=clip.voxels + 1))
+    TeacherEnsemble({"a": network}, tmp_path, 120.0)(replace(clip, voxels=clip.voxels + 1), 0)
     assert network.calls == 2 * made
-    assert not torch.equal(TeacherEnsemble({"a": Constant(0.75)}, tmp_path, 120.0)(clip), first)
+    assert not torch.equal(TeacherEnsemble({"a": Constant(0.75)}, tmp_path, 120.0)(clip, 0), first)
     (path, *_) = tmp_path.iterdir()
     path.write_bytes(path.read_bytes()[:100])
-    TeacherEnsemble({"a": Constant(0.5)}, tmp_path, 120.0)(clip)  # others beside it do no harm
-    assert torch.equal(TeacherEnsemble({"a": network}, tmp_path, 120.0)(clip), first)
+    TeacherEnsemble({"a": Constant(0.5)}, tmp_path, 120.0)(clip, 0)  # others beside it do no harm
+    assert torch.equal(TeacherEnsemble({"a": network}, tmp_path, 120.0)(clip, 0), first)
+
+
+def test_networks_of_the_same_weights_and_other_arguments_share_no_picture(clip, tmp_path):
+    torch.manual_seed(0)
+    first = E2VID(base_channels=4)
+    clip = replace(clip, voxels=clip.voxels[:, :, :1], positions=[(0, 0)])
+    frames = []
+    for arguments in ({}, {"state_rounding_step": 0.25}, {"final_activation": "none"}):
+        network = E2VID(base_channels=4, **arguments)
+        network.load_state_dict(first.state_dict())
+        frames.append(TeacherEnsemble({"net": network}, tmp_path, 120.0)(clip, 0))
+    assert len(list(tmp_path.iterdir())) == 3
+    assert not torch.equal(frames[0], frames[2])
+
+
+@pytest.mark.parametrize(
+    "settings, repeats",
+    [
+        ({"clips": 2}, True),
+        ({"clips": None}, False),
+        ({"clips": 2, "crop": 16, "random_crop": True}, False),
+    ],
+)
+def test_only_samples_that_come_again_are_kept(settings, repeats, tmp_path):
+    chain, network = pipeline(STRONG, **{"crop": 16} | settings), Constant(0.25)
+    teachers = TeacherEnsemble({"a": network}, tmp_path, 120.0)
+    simulate_batch = BatchSimulator([chain], teachers=teachers)
+    for number in (0, 1, 2):
+        sample = simulate_batch([(SampleId(number, number), chain.draw(number))])
+        assert (sample.teacher_frames - 0.25).abs().max() < 1 / 255
+    assert len(list(tmp_path.iterdir())) == len(teachers.paths) == (2 if repeats else 0)
+    assert network.calls == len(sample.target[0]) * (2 if repeats else 3)
 
 
 def test_a_sample_that_comes_again_by_name_is_not_hashed_again(clip, tmp_path, monkeypatch):
