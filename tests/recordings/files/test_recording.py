@@ -218,7 +218,9 @@ def test_zeros_at_the_end_of_a_file_are_no_events(tmp_path, ending, version):
     for share, most_lost in ((1.0, 2), (0.5, 1700)):
         kept = whole[: int(share * len(whole))].rstrip(b"\0")
         path.write_bytes(kept + bytes(4000))
-        with pytest.warns(UserWarning, match="a.*: its last 4000 bytes are zeros, left out") as said:
+        with pytest.warns(
+            UserWarning, match="a.*: its last 4000 bytes are zeros, left out"
+        ) as said:
             read = read_events(path)
         assert len(said) == 1 and len(events) - most_lost <= len(read) <= len(events)
         assert np.array_equal(read, events[: len(read)])
