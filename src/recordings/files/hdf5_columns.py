@@ -17,6 +17,7 @@ from src.recordings.files.columns import (
 )
 from src.recordings.files.event_file import ReadOptions, refuse_column_order
 from src.recordings.files.numpy_file import LazyColumn, has_event_per_column, split_table
+from src.recordings.files.time_unit import UNITS_US
 
 
 def find_event_columns(node: Any, order: str | None) -> dict[str, Any]:
@@ -69,6 +70,28 @@ def read_units_attribute(node: Any, options: ReadOptions) -> str | None:
         return None
     words = np.ravel(np.asarray(stated)).astype(str)
     return find_time_unit_in_text(words[0]) if len(words) else None
+
+
+def find_unit_by_index(marks: h5py.Dataset, t: Any) -> str | None:
+    """Return the unit of times (n,) whose first event of each millisecond is at `marks` (DSEC's
+    ms_to_idx): the nearest, within a factor of three; else us of whole numbers, None of others."""
+    usual = "us" if has_integer_times(t) else None
+    if marks.ndim != 1 or marks.dtype.kind not in "iu":
+        return None
+    index = marks[:].astype(np.int64)
+    inside = np.flatnonzero((index > 0) & (index < len(t)))
+    if len(inside) < 2:
+        return usual
+    first, last = (int(inside[k]) for k in (0, -1))
+    start, end = (float(np.asarray(t[index[k] : index[k] + 1])[0]) for k in (first, last))
+    if not end > start:
+        return usual
+    off = {
+        unit: abs(np.log10((end - start) * unit_us / (1000 * (last - first))))
+        for unit, unit_us in UNITS_US.items()
+    }
+    unit = min(off, key=off.__getitem__)
+    return unit if off[unit] < 0.5 else usual
 
 
 def has_integer_times(t: Any) -> bool:

@@ -38,8 +38,8 @@ from src.recordings.files.hdf5_columns import (
     are_consecutive_in_time,
     find_event_columns,
     find_numbered_streams,
+    find_unit_by_index,
     has_column_shape,
-    has_integer_times,
     list_event_array_shapes,
     read_units_attribute,
 )
@@ -118,10 +118,12 @@ class Hdf5File(EventFile):
             parts = {name: [one[name] for one in columns] for name in "txyp"}
             self._columns = {name: ConcatenatedColumn(part) for name, part in parts.items()}
         names = node if self._has_own_times else node.dtype.names
-        is_dsec = "t_offset" in self._file or "ms_to_idx" in self._file
-        is_dsec = is_dsec and options.time_unit == "auto" and has_integer_times(self._columns["t"])
-        named = "us" if is_dsec else find_named_time_unit(names, options)
-        self.time_unit = read_units_attribute(node, options) or named
+        self.time_unit = read_units_attribute(node, options) or find_named_time_unit(names, options)
+        if self.time_unit is None and options.time_unit == "auto":
+            marks = self._file.get("ms_to_idx")
+            if isinstance(marks, h5py.Dataset):
+                check_unpacking_ratio(self.path, marks.nbytes)
+                self.time_unit = find_unit_by_index(marks, self._columns["t"])
 
 
 def find_streams(file: h5py.File) -> dict[str, Any]:

@@ -49,13 +49,34 @@ def test_a_stated_unit_goes_before_the_name(tmp_path, events):
     assert np.array_equal(found, events)
 
 
-def test_an_index_by_milliseconds_means_microseconds(tmp_path, events):
+@pytest.mark.parametrize(("per_us", "kind"), [(1, np.int64), (1000, np.int64), (1e-6, float)])
+@pytest.mark.parametrize("slower", [1, SLOW])
+def test_an_index_by_milliseconds_tells_the_unit(tmp_path, events, per_us, kind, slower):
     """DSEC's."""
-    slow = slowed(events)
-    write_columns(tmp_path / "a.h5", slow)
+    slow = events.copy()
+    slow["t"] *= slower
+    columns = {"t": (slow["t"] * per_us).astype(kind), **{name: slow[name] for name in "xyp"}}
+    write_columns(tmp_path / "a.h5", columns)
     with h5py.File(tmp_path / "a.h5", "a") as file:
-        file["ms_to_idx"] = np.searchsorted(slow["t"], np.arange(0, 300_000) * 1000)
+        file["ms_to_idx"] = np.searchsorted(slow["t"], np.arange(0, 200 * slower) * 1000)
     assert np.array_equal(read_events(tmp_path / "a.h5"), slow)
+
+
+def test_an_index_by_milliseconds_of_few_events_means_microseconds(tmp_path, events):
+    few = slowed(events)[::500]
+    write_columns(tmp_path / "a.h5", few)
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["ms_to_idx"] = np.array([0, len(few)])
+    assert np.array_equal(read_events(tmp_path / "a.h5"), few)
+
+
+def test_an_offset_alone_states_no_unit(tmp_path, events):
+    ns = {"t": events["t"] * 1000 + 7, **{name: events[name] for name in "xyp"}}
+    write_columns(tmp_path / "a.h5", ns)
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["t_offset"] = 0
+    with pytest.warns(UserWarning, match="read as ns; if it is another, give time_unit="):
+        assert np.array_equal(read_events(tmp_path / "a.h5")["t"], events["t"])
 
 
 @pytest.mark.parametrize(
