@@ -29,9 +29,14 @@ IN_PROSE = {"t": NAMES["t"], "x": ("x", "xs"), "y": ("y", "ys"), "p": ("p", "pol
 LEAST_SIDE = 16  # px, of a sensor whose size stands alone in a comment
 TO_BLANKS = str.maketrans({",": " ", ";": " "})
 QUOTES = str.maketrans("", "", "\"'")
-GEOMETRY = re.compile(
-    r"(?:geometry|resolution|(?<!pixel )(?<!buffer )(?<!pixel_)(?<!buffer_)size)\D*(?<![\d.])(\d+)"
-    r"(?:\s*(?:(?:[x,;*]|by|height)[\s=:]*)+|\s+)(\d+)(?!\d|\.\d)",
+HEIGHT, WIDTH = r"(?:height|h|rows?)", r"(?:width|w|columns?|cols?)"
+WHOSE = r"(?:\bthe|sensor|camera|image|frame|array|event|(?:davis|dvs|evk|gen|imx)\w*)"
+BETWEEN = rf"(?:{HEIGHT}|{WIDTH}|x|by|px|pixels?|in|is|of|the|sensor|camera)"
+UNIT = r"(?:bytes|[kmg]?b|[nuµm][ms]|events|lines)"
+GEOMETRY = re.compile(  # no other words, as in `file size 1024 2048` or `size of file 123 456`
+    rf"(?:^|[^\w\s]\s*|{WHOSE}[\s_-]*)(?:geometry|resolution|size)(?:[^\w.]|\b{BETWEEN}\b)*?"
+    rf"(\d+)(?:\s*(?:(?:[x,;*]|by|{HEIGHT}|{WIDTH})[\s=:]*)+|\s+)(\d+)"
+    rf"(?!\d|\.\d|\s*{UNIT}\b)(?:[)\]]?\s*\([^)]*\))?",
     re.IGNORECASE,
 )
 
@@ -212,12 +217,16 @@ def _puts_y_first(text: str) -> bool:
 
 
 def _stated_size(line: str) -> WidthHeight | None:
-    """Return (width, height) of `640 480`, `%geometry:640,480` or `t x@640 y@480 p`."""
+    """Return (width, height) of `640 480`, `%geometry:640,480`, `t x@640 y@480 p` or `sensor size
+    (h, w): 480 640`."""
     sides = dict(re.findall(r"\b([xy])@(\d+)", line))
     if len(sides) == 2:
         return int(sides["x"]), int(sides["y"])
     if match := GEOMETRY.search(line):
-        return int(match[1]), int(match[2])
+        labels = (re.search(rf"\b{side}\b", match[0], re.IGNORECASE) for side in (HEIGHT, WIDTH))
+        height, width = (label.start() if label else -1 for label in labels)
+        is_height_first = 0 <= height < width
+        return (int(match[2]), int(match[1])) if is_height_first else (int(match[1]), int(match[2]))
     alone = re.fullmatch(r"(\d+)[\s,;x]+(\d+)", line.lstrip("#% "))
     if alone is None or (line[0] in "#%" and min(int(alone[1]), int(alone[2])) < LEAST_SIDE):
         return None
