@@ -13,7 +13,9 @@ from src.recordings.files.columns import (
     check_lengths,
     extract_column,
     find_keys_by_name,
+    find_time_names,
     find_time_unit_in_text,
+    require_one_time,
 )
 from src.recordings.files.event_file import ReadOptions, refuse_column_order
 from src.recordings.files.numpy_file import LazyColumn, has_event_per_column, split_table
@@ -28,6 +30,9 @@ def find_event_columns(node: Any, order: str | None) -> dict[str, Any]:
         keys = find_keys_by_name(node) or {}
         columns = {name: _open_column(node[key], name, key) for name, key in keys.items()}
         check_lengths(columns)
+        shape = node[keys["t"]].shape
+        times = [name for name in find_time_names(node) if getattr(node[name], "shape", 0) == shape]
+        require_one_time(times)
     else:
         columns = split_table(_Turned(node) if has_event_per_column(node) else node, order)
     start = _find_offset(node)

@@ -260,3 +260,32 @@ def test_a_tar_is_to_be_unpacked(tmp_path, events):
         read_events(tmp_path / "a.tar.gz")
     with pytest.raises(ValueError, match=r"it is a \.tar; unpack it first"):
         read_events(tmp_path / "a.gz")
+
+
+@pytest.mark.parametrize("other", ["timestamp", "time_us", "ts"])
+def test_two_columns_of_times_are_refused(tmp_path, events, other):
+    """The first may be a mere count."""
+    columns = {"t": np.arange(len(events)), other: events["t"], "x": events["x"]}
+    columns |= {"y": events["y"], "p": (events["p"] > 0).astype(int)}
+    table = np.rec.fromarrays([*columns.values()], names=[*columns])
+    np.save(tmp_path / "a.npy", table)
+    np.savez(tmp_path / "a.npz", **columns)
+    np.savetxt(tmp_path / "a.csv", table, "%d", ",", header=",".join(columns), comments="")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name, column in columns.items():
+            file[f"events/{name}"] = column
+    for name in ("a.npy", "a.npz", "a.csv", "a.h5"):
+        with pytest.raises(ValueError, match=rf"{name}: .*one column, got t, {other}; rename one"):
+            read_events(tmp_path / name)
+    for name in ("a.npy", "a.csv"):
+        assert_read(tmp_path / name, events, columns="ntxyp")
+
+
+def test_times_of_something_else_are_no_second_column(tmp_path, events):
+    columns = {name: events[name] for name in "txyp"} | {"timestamps": np.arange(3)}
+    np.savez(tmp_path / "a.npz", **columns)
+    write_columns(tmp_path / "a.h5", events)
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["events/timestamps"] = np.arange(3)
+    for name in ("a.npz", "a.h5"):
+        assert_read(tmp_path / name, events)
