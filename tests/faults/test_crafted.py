@@ -33,11 +33,11 @@ def datasets(path, names, **how):
             file.create_dataset(name, **how)
 
 
-def table(path, offset=None, **column):
+def table(path, beside=None, **column):
     datasets(path, [f"events/{name}" for name in "txyp"], dtype=np.uint16, **column)
-    if offset:
+    for name, shape in (beside or {}).items():
         with h5py.File(path, "a") as file:
-            file.create_dataset("t_offset", shape=offset, dtype="i8")
+            file.create_dataset(name, shape=shape, dtype="i8")
 
 
 def link(path, virtual):
@@ -101,7 +101,8 @@ CASES = [  # name, content or what writes it, words of the refusal, readers
     ("a.h5", partial(table, shape=10**12), "unpacks to", [READ]),
     ("a.h5", partial(table, shape=2**28, chunks=2**28, compression=1), "packed in chunks", [READ]),
     ("a.h5", partial(table, shape=(9, 9)), "no columns t, x, y, p", [READ]),
-    ("a.h5", partial(table, shape=9, offset=(10**10,)), "must be one number", [READ]),
+    ("a.h5", partial(table, shape=9, beside={"t_offset": (10**10,)}), "must be one num", [READ]),
+    ("a.h5", partial(table, shape=9, beside={"ms_to_idx": (10**12,)}), "unpacks to", [READ]),
     ("a.h5", partial(table, shape=8, external=[("bytes", 0, 64)]), r"a\.h5.*other file", [READ]),
     ("a.h5", partial(link, virtual=True), r"a\.h5.*other file", [READ]),
     ("a.h5", partial(link, virtual=False), r"a\.h5.*other file", [READ]),

@@ -5,7 +5,7 @@ from numba import njit
 
 LONG_AGO_US = -(2**62)
 KEPT, DROPPED, RIVAL, RETURNED, NEITHER = range(5)  # labels; the last three are not final
-ALONE_US = 3_600_000_000  # a few first events that long before all others are outliers
+LONGEST_SILENCE_US = 3_600_000_000  # events later by more are of another clock
 LAST_GAP_US = 1_000_000  # a few last events later by more, and by LAST_GAP times the file, too
 LAST_GAP = 10
 
@@ -80,9 +80,7 @@ def label_kept_or_dropped(t, first, latest, count, buffer_us, min_part_events, a
             return begin, latest, count, False
         gap = t[begin] - latest
         wins = rivals >= min_part_events or (at_end and returned < rivals and later)
-        if rivals >= min_part_events and (
-            not later or (count < min_part_events and gap > ALONE_US)
-        ):
+        if rivals >= min_part_events and (not later or gap > LONGEST_SILENCE_US):
             return begin, latest, count, True
         if rivals < min_part_events and gap > max(LAST_GAP_US, LAST_GAP * (latest - first)):
             wins = wins and rivals * 100 > count

@@ -3,9 +3,9 @@
 1.0 and 2.0: lines that begin with `#`, then of each event its address (16 or 32 bits) and its time
 in microseconds (32 bits), big endian.  An address of a DVS128 has, from the lowest bit, 1 bit OFF,
 7 of x, 7 of y, 1 of a trigger; one of a DAVIS 10 of a sample, 1 of a trigger, 1 ON, 10 of x, 9 of
-y, 1 of a sample of its frames or its motion.  Their x counts from the right and y from below: both
-are turned, as jAER shows them.  3.1: packets behind 28 bytes that say what they hold, little
-endian; x and y from the upper left.
+y, 1 of a sample of its frames or its motion; one of a DVS640 1 ON, 10 of x, 10 of y.  Their x
+counts from the right and y from below: both are turned, as jAER shows them.  3.1: packets behind 28
+bytes that say what they hold, little endian; x and y from the upper left.
 """
 
 import re
@@ -29,11 +29,11 @@ from src.recordings.files.unpacking import LARGEST_PACKET
 LARGEST_HEADER = 2**24  # bytes; jAER's settings are in it
 LINE = re.compile(rb"#[^\n\x00-\x08\x0e-\x1f]*\n")
 LAST_LINE = re.compile(rb"#(End Of ASCII|!END-HEADER)", re.IGNORECASE)
-DVS128 = (128, 128)
 SENSORS = {
-    "dvs128": DVS128, "davis208": (208, 192), "davis240": (240, 180), "sbret10": (240, 180),
-    "davis346": (346, 260), "davis640": (640, 480),
+    "dvs128": (128, 128), "dvs640": (640, 480), "davis208": (208, 192), "davis240": (240, 180),
+    "sbret10": (240, 180), "davis346": (346, 260), "davis640": (640, 480),
 }  # fmt: skip
+DVS640_BITS = 21  # a DAVIS has y above
 DAVIS_OTHERS = 1 << 31 | 1 << 10  # bits of what is no event of a pixel
 PACKET_HEADER = np.dtype(
     [("kind", "<i2"), ("source", "<i2"), ("bytes", "<i4"), ("time_at", "<i4"), ("rounds", "<i4"),
@@ -45,7 +45,8 @@ POLARITY = 1  # kind of a packet of events
 class Aedat1To3File(EventFile):
     """An `.aedat` file of version 1.0, 2.0 or 3.1; times are microseconds.
 
-    Which camera it was is read in its header, else told by its addresses, which `notes` says.
+    Which camera it was is read in its header, else told by its addresses, which `notes` says; of
+    such a file places are counted from the far sides of the sensor that the user states.
     `options.stream` is the place or the name of one of several cameras in a file of 3.1.  Raises
     ValueError for a file of another version.
     """
@@ -62,15 +63,29 @@ class Aedat1To3File(EventFile):
             raise ValueError(f"{path}: must be AEDAT 1.0, 2.0 or 3.1, is {found}")
         if self._version == "3.1":
             sources = re.findall(r"#source (\d{1,4}): *([\w-]*)", lines) or [("0", "camera")]
-            streams = [EventStream(int(number), name, _find_size(name)) for number, name in sources]
+            streams = [
+                EventStream(int(number), name, SENSORS.get(_find_camera(name)))
+                for number, name in sources
+            ]
             chosen, self.notes = choose_stream(path, streams, options.stream)
             self._source, self.size = chosen.id, chosen.size
             return
         named = re.findall(r"(?:aechip|hardwareinterface)[^\n]*", lines)
-        self.size = _find_size(" ".join(sorted(named))) or _find_size(lines)
-        if self.size is None:
-            self.size = self._guess_size()
-            self.notes = (f"{path}: names no camera, its addresses fit {self.size}",)
+        camera = _find_camera(" ".join(sorted(named))) or _find_camera(lines)
+        self._is_guess, self._camera = not camera, camera or self._guess_camera()
+        self.size = SENSORS.get(self._camera)
+        self.assume_size(None)
+
+    def assume_size(self, size: WidthHeight | None) -> None:
+        if self._version == "3.1" or not (self._is_guess and self._camera):
+            return
+        self.size, self.notes = size or SENSORS[self._camera], ()
+        if size is None:
+            fitting = "x".join(map(str, SENSORS[self._camera]))
+            self.notes = (
+                f"{self.path}: names no camera, its addresses fit one of {fitting}; "
+                "if it is another, give sensor_size=[height,width]",
+            )
 
     def pieces(self) -> Iterator[RawEvents]:
         """Yield the events; warns of a file that ends within one; raises ValueError for a file of
@@ -95,26 +110,32 @@ class Aedat1To3File(EventFile):
 
     def _split(self, address: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return ON, x and y as jAER shows them, and which are pixels; (n,) each."""
-        width, height = self.size or DVS128
-        if self.size == DVS128:
+        if self._camera == "dvs128":
             on, x, y, pixel = ~address & 1, address >> 1 & 127, address >> 8 & 127, address < 2**15
+        elif self._camera == "dvs640":
+            on, x, y = address & 1, address >> 1 & 1023, address >> 11 & 1023
+            pixel = address < 1 << DVS640_BITS
         else:
             on, x, y = _split_davis(address)
             pixel = address & DAVIS_OTHERS == 0
+        width, height = self.size or (0, 0)
         return on, width - 1 - x.astype(np.int32), height - 1 - y.astype(np.int32), pixel
 
-    def _guess_size(self) -> WidthHeight | None:
-        """Return the smallest sensor that holds all addresses; None where there are none."""
+    def _guess_camera(self) -> str:
+        """Return the smallest camera that holds all addresses; "" where there are none."""
         largest = np.zeros(3, np.int64)
-        for address, _ in self._words():
-            pixels = address[address & DAVIS_OTHERS == 0]
-            if len(pixels):
-                sides = (part.max() for part in _split_davis(pixels)[1:])
-                largest = np.maximum(largest, [address.max(), *sides])
+        with warnings.catch_warnings(action="ignore"):  # said when the events are read
+            for address, _ in self._words():
+                pixels = address[address & DAVIS_OTHERS == 0]
+                if len(pixels):
+                    sides = (part.max() for part in _split_davis(pixels)[1:])
+                    largest = np.maximum(largest, [address.max(), *sides])
         if largest[0] < 2**16:
-            return DVS128 if largest[0] else None
-        fitting = (SENSORS[name] for name in ("davis240", "davis346", "davis640"))
-        return next((size for size in fitting if (largest[1:] < size).all()), SENSORS["davis640"])
+            return "dvs128" if largest[0] else ""
+        if not largest[2]:
+            return "dvs640"
+        fitting = ("davis240", "davis346", "davis640")
+        return next((name for name in fitting if (largest[1:] < SENSORS[name]).all()), fitting[-1])
 
 
 def _split_davis(address: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -122,9 +143,10 @@ def _split_davis(address: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return address >> 11 & 1, address >> 12 & 1023, address >> 22 & 511
 
 
-def _find_size(text: str) -> WidthHeight | None:
+def _find_camera(text: str) -> str:
+    """Return which of SENSORS a text names, "" for none."""
     name = re.search("|".join(SENSORS), text)
-    return SENSORS[name.group()] if name else None
+    return name.group() if name else ""
 
 
 def _read_lines(path: Path) -> tuple[str, int]:

@@ -8,17 +8,47 @@ import numpy as np
 
 from src.recordings.files.event_file import PIECE_EVENTS, RawEvents
 
+BLOCK_BYTES = 2**20
+LEAST_ZEROS = 64  # bytes at the end that are no events: room that was never written
+
 
 def read_whole_words(
     path: Path, start: int, word_bytes: int, block_words: int = PIECE_EVENTS
 ) -> Iterator[bytes]:
-    """Yield the words of a file from byte `start` on, in blocks; warns of a cut last one."""
+    """Yield the whole words of a file from byte `start` on, in blocks, without zeros at its end;
+    warns of these (`find_end_before_zeros`) and of a cut last word."""
+    left, zeros = find_end_before_zeros(path, start)
     with path.open("rb") as file:
         file.seek(start)
-        while block := file.read(word_bytes * block_words):
-            if cut := len(block) % word_bytes:
+        while block := file.read(min(word_bytes * block_words, left)):
+            left -= len(block)
+            if (cut := len(block) % word_bytes) and not zeros:
                 warnings.warn(f"{path}: ends within an event, it is truncated", stacklevel=4)
             yield block[: len(block) - cut]
+    if zeros:
+        warn_of_zeros(path, zeros)
+
+
+def find_end_before_zeros(path: Path, start: int) -> tuple[int, int]:
+    """Return how many bytes of a file come from byte `start` on up to its last one that is not 0,
+    and how many zeros follow; fewer than LEAST_ZEROS may be of events and belong to the bytes."""
+    whole = end = path.stat().st_size
+    with path.open("rb") as file:
+        while end > start:
+            first = max(start, end - BLOCK_BYTES)
+            file.seek(first)
+            held = len(file.read(end - first).rstrip(b"\0"))
+            end = first + held
+            if held:
+                break
+    zeros = whole - end if whole - end >= LEAST_ZEROS else 0
+    return max(0, whole - zeros - start), zeros
+
+
+def warn_of_zeros(path: Path, zeros: int) -> None:
+    """Tell the user of `zeros` bytes of 0 at the end of a file, which are left out."""
+    line = f"{path}: its last {zeros} bytes are zeros, left out: it is truncated"
+    warnings.warn(line, stacklevel=4)
 
 
 class TimestampUnwrapper:

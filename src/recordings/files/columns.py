@@ -70,6 +70,21 @@ def find_columns_by_part(names: Sequence[str]) -> dict[str, int] | None:
     return places if len(set(places.values())) == len(NAMES) else None
 
 
+def find_time_names(names: Iterable[str]) -> list[str]:
+    """Return which of the names may be the times of events."""
+    return [name for name in names if {_bare(name), UNIT.sub("", _bare(name))} & {*NAMES["t"]}]
+
+
+def require_one_time(times: Sequence[str]) -> None:
+    """Raise ValueError for several names of columns that may be the times; seconds and their
+    fraction are left to `parse_time_column_unit`."""
+    if len(times) > 1 and "s" not in map(parse_unit_suffix, times):
+        raise ValueError(
+            f"times must be one column, got {', '.join(times)}; rename one, or give columns= "
+            "for a table"
+        )
+
+
 def find_keys_by_name(names: Iterable[str]) -> dict[str, str] | None:
     """Return the names of t, x, y and p among `names`, or None; that of x and y may be JOINT."""
     keys = list(names)

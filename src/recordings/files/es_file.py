@@ -7,12 +7,11 @@ from pathlib import Path
 import faery
 import numpy as np
 
-from src.recordings.engines.es_bytes import count_missing_bytes
-from src.recordings.files.clocks import read_whole_words
+from src.recordings.engines.es_bytes import LONE_ATIS, LONE_DVS, count_events
+from src.recordings.files.clocks import find_end_before_zeros, read_whole_words
 from src.recordings.files.event_file import EventFile, RawEvents, ReadOptions, name_file_in_errors
 
 HEADER_BYTES, KIND_AT, ATIS = 20, 15, 2
-LONE = {True: 0xFC, False: 0xFE}  # of ATIS or DVS: bytes from it on are no event's first
 
 
 class EsFile(EventFile):
@@ -27,19 +26,28 @@ class EsFile(EventFile):
             self.size = self._decoder.dimensions()
 
     def pieces(self) -> Iterator[RawEvents]:
-        """Yield the events; warns of a file that ends within one; raises ValueError for one that
-        cannot be decoded."""
+        """Yield the events; warns of a file that ends within one or in zeros, which are left out;
+        raises ValueError for one that cannot be decoded."""
+        _, zeros = find_end_before_zeros(self.path, HEADER_BYTES)
+        whole, missing = _count_events(self.path)
         with name_file_in_errors(self.path, "cannot be decoded"):
-            for events in self._decoder:
+            for found in self._decoder:
+                events = found[:whole] if zeros else found
+                whole -= len(events)
                 yield RawEvents(events["t"].view("i8"), events["x"], events["y"], events["on"])
-        if _ends_within_event(self.path):
+        if missing and not zeros:
             warnings.warn(f"{self.path}: ends within an event, it is truncated", stacklevel=2)
 
 
-def _ends_within_event(path: Path) -> bool:
+def _count_events(path: Path) -> tuple[int, int]:
+    """Return how many events a file gives, zeros at its end aside, and how many bytes of the last
+    one are missing."""
     with path.open("rb") as file:
         is_atis = file.read(HEADER_BYTES)[KIND_AT] == ATIS
-    missing = 0
+    count, missing = 0, 0
     for block in read_whole_words(path, HEADER_BYTES, 1, block_words=2**22):
-        missing = count_missing_bytes(np.frombuffer(block, np.uint8), missing, LONE[is_atis])
-    return missing > 0
+        found, missing = count_events(
+            np.frombuffer(block, np.uint8), missing, LONE_ATIS if is_atis else LONE_DVS
+        )
+        count += found
+    return count, missing

@@ -2,9 +2,9 @@
 
 Events up to `buffer_us` late are sorted, in their order where times are equal.  Fewer than
 `min_part_events` events with times further from those around them are outliers: dropped and
-counted.  More of them earlier are a clock that restarts and begin another part; later ones are a
-silence.  A file is refused where more than MAX_DROPPED of its events are outliers, or its clock
-restarts more than MAX_PARTS times.
+counted.  More of them earlier are a clock that restarts and begin another part, as do those that
+are later by more than an hour; other later ones are a silence.  A file is refused where more than
+MAX_DROPPED of its events are outliers, or its clock restarts more than MAX_PARTS times.
 """
 
 import math
@@ -15,7 +15,12 @@ from typing import Literal
 
 import numpy as np
 
-from src.recordings.engines.event_passes import KEPT, LONG_AGO_US, label_kept_or_dropped
+from src.recordings.engines.event_passes import (
+    KEPT,
+    LONG_AGO_US,
+    LONGEST_SILENCE_US,
+    label_kept_or_dropped,
+)
 from src.recordings.files.event_arrays import (
     concatenate_events,
     count_before,
@@ -131,11 +136,14 @@ class EventSorter:
         return ready
 
     def _goes_on(self, events: np.ndarray, least: int) -> bool:
-        """Return whether all events are in order and none of the last ones could be an outlier."""
+        """Return whether all events are in order, without a silence that is too long, and none of
+        the last ones could be an outlier."""
         t, part = event_times(events), self.parts[-1]
         if part.count < least or len(t) <= least or t[0] < part.last_us:
             return False
-        return bool(np.diff(t[-least - 1 :]).max() <= self.buffer_us and (t[1:] >= t[:-1]).all())
+        steps = np.diff(t, prepend=part.last_us)
+        is_near = steps[-least:].max() <= self.buffer_us
+        return bool(is_near and steps.min() >= 0 and steps.max() <= LONGEST_SILENCE_US)
 
     def _keep(self, events: np.ndarray, *, are_in_order: bool = False) -> list[np.ndarray]:
         """Hold events of the part's clock; return those that are in order for good."""

@@ -11,6 +11,7 @@ WORD_ORDERS = ("little", "legacy", "big")  # of EVT2.1; legacy: the halves excha
 EVT21_KINDS = (0, 1, 8, 10, 14, 15)  # of words, of EVT2 too
 EVT3_KINDS = (0, 2, 3, 4, 5, 6, 7, 8, 10, 14, 15)
 FEW_KNOWN, MOST_KNOWN = 0.9, 0.99  # of the words: below and above they are of another format
+MOST_STRANGE = 0.01  # of the words of a block: more are no words, as after a byte that is lost
 
 
 class EvtDecoder:
@@ -43,6 +44,16 @@ class EvtDecoder:
         else:
             count = evt_words.decode_evt2_and_21(*self._halves(whole_words), self._state, *events)
         return RawEvents(*(part[:count] for part in events))
+
+    def count_sound_words(self, whole_words: bytes) -> int:
+        """Return how many words come before the first one of no kind, where more than MOST_STRANGE
+        are of none; else all."""
+        if self.kind == "evt3":
+            known = np.isin(np.arange(16), EVT3_KINDS)[np.frombuffer(whole_words, "<u2") >> 12]
+        else:
+            known = np.isin(np.arange(16), EVT21_KINDS)[self._halves(whole_words)[0] >> 28]
+        is_sound = known.mean() >= 1 - MOST_STRANGE if len(known) else True
+        return len(known) if is_sound else int(known.argmin())
 
     def _halves(self, block: bytes) -> tuple[np.ndarray, np.ndarray]:
         """Return the upper and lower 32 bits of each word, of EVT2 the word and a mask of one."""

@@ -13,10 +13,13 @@ from src.recordings.files.columns import (
     check_lengths,
     extract_column,
     find_keys_by_name,
+    find_time_names,
     find_time_unit_in_text,
+    require_one_time,
 )
 from src.recordings.files.event_file import ReadOptions, refuse_column_order
 from src.recordings.files.numpy_file import LazyColumn, has_event_per_column, split_table
+from src.recordings.files.time_unit import UNITS_US
 
 
 def find_event_columns(node: Any, order: str | None) -> dict[str, Any]:
@@ -27,6 +30,9 @@ def find_event_columns(node: Any, order: str | None) -> dict[str, Any]:
         keys = find_keys_by_name(node) or {}
         columns = {name: _open_column(node[key], name, key) for name, key in keys.items()}
         check_lengths(columns)
+        shape = node[keys["t"]].shape
+        times = [name for name in find_time_names(node) if getattr(node[name], "shape", 0) == shape]
+        require_one_time(times)
     else:
         columns = split_table(_Turned(node) if has_event_per_column(node) else node, order)
     start = _find_offset(node)
@@ -69,6 +75,28 @@ def read_units_attribute(node: Any, options: ReadOptions) -> str | None:
         return None
     words = np.ravel(np.asarray(stated)).astype(str)
     return find_time_unit_in_text(words[0]) if len(words) else None
+
+
+def find_unit_by_index(marks: h5py.Dataset, t: Any) -> str | None:
+    """Return the unit of times (n,) whose first event of each millisecond is at `marks` (DSEC's
+    ms_to_idx): the nearest, within a factor of three; else us of whole numbers, None of others."""
+    usual = "us" if has_integer_times(t) else None
+    if marks.ndim != 1 or marks.dtype.kind not in "iu":
+        return None
+    index = marks[:].astype(np.int64)
+    inside = np.flatnonzero((index > 0) & (index < len(t)))
+    if len(inside) < 2:
+        return usual
+    first, last = (int(inside[k]) for k in (0, -1))
+    start, end = (float(np.asarray(t[index[k] : index[k] + 1])[0]) for k in (first, last))
+    if not end > start:
+        return usual
+    off = {
+        unit: abs(np.log10((end - start) * unit_us / (1000 * (last - first))))
+        for unit, unit_us in UNITS_US.items()
+    }
+    unit = min(off, key=off.__getitem__)
+    return unit if off[unit] < 0.5 else usual
 
 
 def has_integer_times(t: Any) -> bool:

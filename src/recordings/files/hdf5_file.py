@@ -38,8 +38,8 @@ from src.recordings.files.hdf5_columns import (
     are_consecutive_in_time,
     find_event_columns,
     find_numbered_streams,
+    find_unit_by_index,
     has_column_shape,
-    has_integer_times,
     list_event_array_shapes,
     read_units_attribute,
 )
@@ -47,7 +47,7 @@ from src.recordings.files.numpy_file import has_event_per_column, slice_columns,
 
 HDF5_ENDINGS = (".h5", ".hdf5", ".hdf")
 SIZE_NAMES = ("size", "geometry", "sensor_size")  # width, height
-SHAPE_NAMES = ("sensor_resolution", "resolution")  # height, width
+SHAPE_NAMES = ("sensor_resolution", "resolution")  # height, width; of the latter also the reverse
 DEFAULT_CACHE_BYTES = 2**20  # of unpacked chunks for each dataset; one larger chunk
 MAX_CHUNK_BYTES = 2**28  # bytes of HDF5 that are unpacked at a time
 ECF_CODEC = 36559  # the number of Prophesee's codec
@@ -112,16 +112,19 @@ class Hdf5File(EventFile):
         """Take the `columns` of all nodes, of which `node` is the first."""
         self._beside, self._has_own_times = node.parent, isinstance(node, h5py.Group)
         places = (node, self._file) if self._has_own_times else (node, node.parent, self._file)
-        self.size = next(filter(None, map(_stated_size, places)), None)
+        self.size, line = next(filter(None, map(_stated_size, places)), (None, ""))
+        self.notes += (f"{self.path}: {line}",) if line else ()
         self._columns: dict[str, Any] = columns[0]
         if len(columns) > 1:
             parts = {name: [one[name] for one in columns] for name in "txyp"}
             self._columns = {name: ConcatenatedColumn(part) for name, part in parts.items()}
         names = node if self._has_own_times else node.dtype.names
-        is_dsec = "t_offset" in self._file or "ms_to_idx" in self._file
-        is_dsec = is_dsec and options.time_unit == "auto" and has_integer_times(self._columns["t"])
-        named = "us" if is_dsec else find_named_time_unit(names, options)
-        self.time_unit = read_units_attribute(node, options) or named
+        self.time_unit = read_units_attribute(node, options) or find_named_time_unit(names, options)
+        if self.time_unit is None and options.time_unit == "auto":
+            marks = self._file.get("ms_to_idx")
+            if isinstance(marks, h5py.Dataset):
+                check_unpacking_ratio(self.path, marks.nbytes)
+                self.time_unit = find_unit_by_index(marks, self._columns["t"])
 
 
 def find_streams(file: h5py.File) -> dict[str, Any]:
@@ -200,18 +203,22 @@ def _is_table(name: str, node: Any, is_matlab: bool) -> bool:
     return is_table and "event" in name.lower()
 
 
-def _stated_size(node: Any) -> WidthHeight | None:
+def _stated_size(node: Any) -> tuple[WidthHeight, str] | None:
     """Return (width, height) as attributes or small arrays of a node, of SIZE_NAMES or SHAPE_NAMES
-    or `width` and `height`, state it: `640x480`, (640, 480) or 640, 480.  Arrays of more than four
-    numbers are something else."""
+    or `width` and `height`, state it: `640x480`, (640, 480) or 640, 480; and what the user is told
+    of it, or "".  Arrays of more than four numbers are something else."""
     known = (dict(node) if isinstance(node, h5py.Group) else {}) | dict(node.attrs)
     for name in (*SIZE_NAMES, *SHAPE_NAMES):
         sides = _whole_numbers(known[name]) if name in known else []
         if len(sides) == 2:
-            has_width_first = name in SIZE_NAMES or "x" in str(known[name]).lower()  # 640x480
-            return (sides[0], sides[1]) if has_width_first else (sides[1], sides[0])
+            if name in SIZE_NAMES or "x" in str(known[name]).lower():  # 640x480
+                return (sides[0], sides[1]), ""
+            if name == "resolution" and sides[0] > sides[1]:
+                line = f"resolution {sides[0]}, {sides[1]} is read as width, height"
+                return (sides[0], sides[1]), f"{line}; if not, give sensor_size=[height,width]"
+            return (sides[1], sides[0]), ""
     width, height = (_whole_numbers(known.get(name)) for name in ("width", "height"))
-    return (width[0], height[0]) if len(width) == len(height) == 1 else None
+    return ((width[0], height[0]), "") if len(width) == len(height) == 1 else None
 
 
 def _whole_numbers(value: Any) -> list[int]:

@@ -19,6 +19,8 @@ from src.recordings.files.columns import (
     find_columns,
     find_keys_by_name,
     find_named_time_unit,
+    find_time_names,
+    require_one_time,
 )
 from src.recordings.files.event_file import (
     PIECE_EVENTS,
@@ -59,7 +61,7 @@ class NumpyFile(EventFile):
                 with np.load(path) as file:
                     self.size = find_npz_size(file)
                     self._columns, names, self.notes = _columns_of(path, file, options)
-                    self.time_unit = _find_stated_unit(file, options)
+                    self.time_unit = _find_stated_unit(file)
                     self.time_unit = self.time_unit or find_named_time_unit(names, options)
             check_lengths(self._columns)
             if np.asarray(self._columns["t"][:1]).dtype.kind in DATES:
@@ -84,9 +86,9 @@ def find_npz_size(file: Any) -> WidthHeight | None:
     return int(sides[0]), int(sides[1])
 
 
-def _find_stated_unit(file: Any, options: ReadOptions) -> str | None:
-    """Return what the string `time_unit` of an .npz states, where `options` do not."""
-    if "time_unit" not in file or options.time_unit != "auto":
+def _find_stated_unit(file: Any) -> str | None:
+    """Return what the string `time_unit` of an .npz states, None where it has none."""
+    if "time_unit" not in file:
         return None
     unit = str(file["time_unit"])
     if unit not in UNITS_US:
@@ -103,6 +105,7 @@ def split_table(table: Any, order: str | None) -> dict[str, Any]:
         table = _flat(table) if names else table.T if has_event_per_column(table) else table
     if names is not None:
         keys = find_keys_by_name(names) if order is None else _name_fields(names, order)
+        require_one_time(find_time_names(names) if order is None else ())
         if keys is None or table.ndim != 1:
             raise ValueError(f"fields must be t, x, y, p of one dimension, got {', '.join(names)}")
         return {
@@ -172,6 +175,8 @@ def _columns_of(
         columns = {name: _flat(extract_column(name, key, file[key])) for name, key in keys.items()}
         if any(column.ndim != 1 for column in columns.values()):
             raise ValueError("columns must have one dimension")
+        times = find_time_names(file.files)
+        require_one_time([name for name in times if file[name].size == len(columns["t"])])
         return columns, file.files, ()
     for is_called_events in (True, False):
         names = [name for name in file.files if ("event" in name.lower()) == is_called_events]

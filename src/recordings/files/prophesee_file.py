@@ -112,10 +112,16 @@ class PropheseeFile(EventFile):
         order = re.search(r"endianness=(\w+)", self._lines.get("format", ""))
         decoder = EvtDecoder(kind, order[1] if order and order[1] in WORD_ORDERS else None)
         words = PIECE_EVENTS // max(1, MOST_EVENTS[kind] // 2)
-        for block in read_whole_words(self.path, self._start, WORD_BYTES[kind], words):
-            events = decoder.decode(block)
-            found += len(events.t)
+        at, word_bytes = self._start, WORD_BYTES[kind]
+        for block in read_whole_words(self.path, at, word_bytes, words):
+            sound = decoder.count_sound_words(block) * word_bytes
+            events = decoder.decode(block[:sound])
+            at, found = at + sound, found + len(events.t)
             yield events
+            if sound < len(block):
+                line = f"{self.path}: its words are no {kind.upper()} from byte {at} on, left out"
+                warnings.warn(f"{line}: is a byte lost?", stacklevel=3)
+                break
         if not found and decoder.triggers:
             raise ValueError(f"{self.path}: holds no events, only {decoder.triggers} triggers")
         if decoder.lost > found:

@@ -6,6 +6,7 @@ concerned.
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -110,11 +111,12 @@ def open_recording(
         raise ValueError(f"recording must be an event file, got {path}: {_why_not_a_file(path)}")
     state = path.stat()
     kept, survey, swapped = _open_and_survey(path, state.st_mtime_ns, state.st_size, options)
-    file = _open_file(path, options) if kept is None else kept
+    file = _open_file(path, options) if kept is None else copy(kept)
     file.kept_times = survey.times
     if sensor_size is not None and np.shape(sensor_size) != (2,):
         raise ValueError(f"sensor_size must be (height, width), got {sensor_size}")
     given = None if sensor_size is None else (sensor_size[1], sensor_size[0])
+    file.assume_size(given)
     size, lines = choose_size(path, given, file.size, swapped)
     recording = EventRecording(path, size, options, file, survey, lines)
     _tell(recording.messages)

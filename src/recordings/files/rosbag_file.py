@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager
 from functools import partial
+from itertools import islice
 from os.path import commonpath
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,7 @@ from src.recordings.files.unpacking import decompress
 
 READERS: dict[str, Any] = {".bag": Ros1Reader, ".db3": Sqlite3Reader, ".mcap": mcap.McapReader}
 Messages = Generator[tuple[str, EventMessage], None, None]  # of a topic, its name first
+SIZE_MESSAGES = 100  # the first ones, of which one may state the sensor's size
 ZSTD = b"\x28\xb5\x2f\xfd"  # how a message begins that is packed alone
 
 # rosbags itself unpacks without bound.
@@ -72,11 +74,15 @@ class RosbagFile(EventFile):
         streams = [EventStream(place, topic, None) for place, topic in enumerate(topics)]
         chosen, self.notes = choose_stream(path, streams, options.stream, most)
         self._topic = chosen.name
+        first = None
         with closing(self._messages(self._topic)) as messages:
-            _, first = next(messages, ("", None))
+            for _, message in islice(messages, SIZE_MESSAGES):
+                first = first or message
+                if all(message.size):
+                    self.size = message.size
+                    break
         if first is None:
             raise ValueError(f"{path}: topic {self._topic} holds no messages")
-        self.size = first.size if all(first.size) else None
         self._encoding = first.encoding
         self.time_unit = "us" if first.encoding == "evt3" else "ns"
 

@@ -19,7 +19,9 @@ from src.recordings.files.columns import (
     as_integers,
     check_unpacking_ratio,
     find_columns,
+    find_time_names,
     parse_time_column_unit,
+    require_one_time,
 )
 from src.recordings.files.event_file import (
     EventFile,
@@ -91,6 +93,8 @@ class TextFile(EventFile):
                 f"{self.path}: the names in {header!r} are not known, "
                 "columns are told by their values; if these are others, give columns=",
             )
+        if self._places is not None:
+            require_one_time(find_time_names(layout.names))
         if self._places is not None and options.time_unit == "auto":
             self.time_unit = parse_time_column_unit(layout.names, layout.names[self._places["t"]])
 

@@ -10,6 +10,7 @@ from pathlib import Path, PureWindowsPath
 from typing import Any, NamedTuple
 
 from src.recordings.files.columns import (
+    NAMES,
     SECONDS,
     find_candidate_columns,
     find_columns_by_name,
@@ -24,12 +25,18 @@ COMMENTS = ("#", "%", "//", ";")
 WORDS = {"true": "1", "false": "0", "on": "1", "off": "0"}  # of polarity
 CUT = b" cut"  # what a packed text ends in where its file is cut: its last line is no event
 TITLE = re.compile(r"^(?:columns?|format|order|fields|header)\s*[:=]\s*", re.IGNORECASE)
+IN_PROSE = {"t": NAMES["t"], "x": ("x", "xs"), "y": ("y", "ys"), "p": ("p", "pol", "polarity")}
 LEAST_SIDE = 16  # px, of a sensor whose size stands alone in a comment
 TO_BLANKS = str.maketrans({",": " ", ";": " "})
 QUOTES = str.maketrans("", "", "\"'")
-GEOMETRY = re.compile(
-    r"(?:geometry|resolution|(?<!pixel )(?<!buffer )(?<!pixel_)(?<!buffer_)size)\D*(?<![\d.])(\d+)"
-    r"(?:\s*(?:(?:[x,;*]|by|height)[\s=:]*)+|\s+)(\d+)(?!\d|\.\d)",
+HEIGHT, WIDTH = r"(?:height|h|rows?)", r"(?:width|w|columns?|cols?)"
+WHOSE = r"(?:\bthe|sensor|camera|image|frame|array|event|(?:davis|dvs|evk|gen|imx)\w*)"
+BETWEEN = rf"(?:{HEIGHT}|{WIDTH}|x|by|px|pixels?|in|is|of|the|sensor|camera)"
+UNIT = r"(?:bytes|[kmg]?b|[nuµm][ms]|events|lines)"
+GEOMETRY = re.compile(  # no other words, as in `file size 1024 2048` or `size of file 123 456`
+    rf"(?:^|[^\w\s]\s*|{WHOSE}[\s_-]*)(?:geometry|resolution|size)(?:[^\w.]|\b{BETWEEN}\b)*?"
+    rf"(\d+)(?:\s*(?:(?:[x,;*]|by|{HEIGHT}|{WIDTH})[\s=:]*)+|\s+)(\d+)"
+    rf"(?!\d|\.\d|\s*{UNIT}\b)(?:[)\]]?\s*\([^)]*\))?",
     re.IGNORECASE,
 )
 
@@ -39,7 +46,8 @@ class TextLayout(NamedTuple):
     whether a comma is the decimal point, whether separators are mixed or a line ends in one
     (TO_BLANKS), whether polarity is a word, the `names` of the columns and the `column_places` of
     t, x, y, p where these tell them, and (width, height).  `header_lines` come before the events;
-    `unknown_header`: one that seems to name columns, but not all, `has_y_first`: y before x."""
+    `unknown_header`: one that seems to name columns, but not all or not each, `has_y_first`: y
+    before x."""
 
     width: int = 0
     separator: str | None = None
@@ -112,7 +120,7 @@ def read_layout(file: io.TextIOBase) -> TextLayout:
     """Return how the lines are read, from those up to the first event."""
     size: WidthHeight | None = None
     headers: list[tuple[str, list[str]]] = []  # lines that may name columns, and the names
-    strange: str | None = None
+    strange = y_first = None
     for number in range(MAX_HEADER_LINES):
         line = file.readline(MAX_LINE)
         if not line:
@@ -122,16 +130,19 @@ def read_layout(file: io.TextIOBase) -> TextLayout:
         bare = line.strip()
         layout = None if bare.startswith(COMMENTS) else _read_row(bare, headers)
         if layout is not None:
+            if y_first and layout.column_places is None:
+                layout = layout._replace(unknown_header=y_first, has_y_first=True)
             return layout._replace(size=size, header_lines=number)
         here = _stated_size(bare)
         size = size or here
         title = bare.lstrip("#%/; ").encode("latin-1").decode(errors="replace")  # it may have µs
         names = _split_title(title)
+        y_first = bare if _puts_y_first(title) else y_first
         is_named = find_columns_by_name(names) is not None
-        if is_named or sum(map(bool, find_candidate_columns(names).values())) > 1:
+        is_strange = bare and not (bare.startswith(COMMENTS) or here or is_named)
+        strange = bare if is_strange and strange is None else strange
+        if is_named or is_strange or sum(map(bool, find_candidate_columns(names).values())) > 1:
             headers.append((bare, names))
-        if bare and not (bare.startswith(COMMENTS) or here or is_named):
-            strange = strange or bare
     raise ValueError(f"no line of numbers t x y p among the first {MAX_HEADER_LINES}")
 
 
@@ -193,13 +204,29 @@ def _find_unknown(headers: list[tuple[str, list[str]]], width: int) -> tuple[str
     return unknown, has_y_first
 
 
+def _puts_y_first(text: str) -> bool:
+    """Return whether a text names t, x, y and p, y before x, as `each row is (t, y, x, p)` does."""
+    words: list[str] = []
+    for word in re.findall(r"[^\W_]+", re.sub(r"\d\s*x\s*\d", " ", text.lower())):
+        words += word if sorted(word) == [*"ptxy"] else [word]  # tyxp
+    places = {
+        letter: next((k for k, word in enumerate(words) if word in known), -1)
+        for letter, known in IN_PROSE.items()
+    }
+    return min(places.values()) >= 0 and places["y"] < places["x"]
+
+
 def _stated_size(line: str) -> WidthHeight | None:
-    """Return (width, height) of `640 480`, `%geometry:640,480` or `t x@640 y@480 p`."""
+    """Return (width, height) of `640 480`, `%geometry:640,480`, `t x@640 y@480 p` or `sensor size
+    (h, w): 480 640`."""
     sides = dict(re.findall(r"\b([xy])@(\d+)", line))
     if len(sides) == 2:
         return int(sides["x"]), int(sides["y"])
     if match := GEOMETRY.search(line):
-        return int(match[1]), int(match[2])
+        labels = (re.search(rf"\b{side}\b", match[0], re.IGNORECASE) for side in (HEIGHT, WIDTH))
+        height, width = (label.start() if label else -1 for label in labels)
+        is_height_first = 0 <= height < width
+        return (int(match[2]), int(match[1])) if is_height_first else (int(match[1]), int(match[2]))
     alone = re.fullmatch(r"(\d+)[\s,;x]+(\d+)", line.lstrip("#% "))
     if alone is None or (line[0] in "#%" and min(int(alone[1]), int(alone[2])) < LEAST_SIDE):
         return None

@@ -43,6 +43,7 @@ FEW_TIMES = 100
 SAMPLES = 1024  # of a piece
 MAX_TIME_US = 2**62
 COUNTER_BITS = (24, 31, 32)  # of counters that go round
+FALL = 0.99  # of its turn that a counter falls by, at least, before FEW_TIMES others or more
 Range = tuple[float, float]
 
 
@@ -55,6 +56,7 @@ class TimeSample:
         self._values: list[np.ndarray] = []
         self._last: Any = None
         self._steps: Range = (0, 0)  # least and most
+        self._first_fall: int | None = None  # the place of a time that far below the one before
         self._range: Range = (np.inf, -np.inf)
 
     def add(self, t: np.ndarray) -> None:
@@ -62,7 +64,6 @@ class TimeSample:
         if not len(t):
             return
         first = t[0] if self._last is None else self._last
-        self.count += len(t)
         values = np.array(t[:: max(1, len(t) // SAMPLES)])
         self._values.append(values)
         if t.dtype.kind == "f":
@@ -72,17 +73,24 @@ class TimeSample:
             steps = np.diff(t, prepend=first)
             self._steps = _widen(self._steps, steps)
             self._range = _widen(self._range, t)
+            is_fall = steps < -FALL * 2 ** COUNTER_BITS[0]
+            if self._first_fall is None and is_fall.any():
+                self._first_fall = self.count + int(is_fall.argmax())
         if self.are_apart_by_thousands:
             self.are_apart_by_thousands = not (np.diff(values, prepend=first) % 1000).any()
-        self._last = t[-1]
+        self._last, self.count = t[-1], self.count + len(t)
 
     @property
     def wrap_bits(self) -> int:
-        """Return of how many bits a counter is that falls from its end to its beginning; else 0."""
+        """Return of how many bits a counter is that falls from its end to its beginning and goes on
+        from there; else 0."""
         (down, up), (least, most) = self._steps, self._range
+        follow = 0 if self._first_fall is None else self.count - self._first_fall
+        if follow < FEW_TIMES or self._last == least:  # at the end may be zeros
+            return 0
         for bits in COUNTER_BITS:
             turn = 2**bits
-            if most - least < turn and down < -0.9 * turn and up < 0.5 * turn:
+            if most - least < turn and down < -FALL * turn and up < 0.5 * turn:
                 return bits
         return 0
 

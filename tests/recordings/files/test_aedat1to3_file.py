@@ -1,11 +1,12 @@
 """AEDAT 1.0, 2.0 and 3.1: addresses put together here by the formats' own tables."""
 
 import struct
+import warnings
 
 import numpy as np
 import pytest
 
-from src.recordings.files import read_events
+from src.recordings.files import open_recording, read_events
 from src.recordings.files.aedat1to3_file import Aedat1To3File
 from src.recordings.files.event_file import RawEvents, ReadOptions
 from tests.recordings.files.test_recording import made_up
@@ -68,6 +69,30 @@ def test_a_dvs128(tmp_path, version, line):
     content = header + words(addresses, t, ">u2" if version == "1.0" else ">u4")
     file, found = read(tmp_path / "a.aedat", content)
     assert file.size == (128, 128) and len(file.notes) == (not line) and equal(found, events)
+
+
+@pytest.mark.parametrize("line", ["# AEChip: ch.unizh.ini.jaer.chip.retina.DVS640\r\n", ""])
+def test_a_dvs640(tmp_path, line):
+    events = made_up(500)
+    x, y = 639 - events["x"].astype(int), 479 - events["y"].astype(int)
+    addresses = y << 11 | x << 1 | (events["p"] > 0)
+    content = f"#!AER-DAT2.0\r\n{line}".encode() + words(addresses, events["t"])
+    file, found = read(tmp_path / "a.aedat2", content)
+    assert file.size == (640, 480) and len(file.notes) == (not line) and equal(found, events)
+
+
+def test_a_stated_size_counts_for_a_file_that_names_no_camera(tmp_path):
+    events = made_up(500, width=346, height=260)
+    events = events[(events["x"] >= 110) & (events["y"] >= 85)]  # they fit a DAVIS240, too
+    path = tmp_path / "a.aedat2"
+    path.write_bytes(b"#!AER-DAT2.0\r\n" + words(davis(events, 346, 260), events["t"]))
+    with pytest.warns(UserWarning, match="fit one of 240x180; if it is another, give sensor_size"):
+        guessed = open_recording(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.array_equal(read_events(path, sensor_size=(260, 346)), events)
+    (found,) = guessed
+    assert guessed.size == (240, 180) and np.array_equal(found["x"], events["x"] - 106)
 
 
 def test_the_ending_that_jaer_prefers(tmp_path):

@@ -104,6 +104,16 @@ def test_a_silence_of_years_is_none_of_these():
     assert len(found) == 4 and (order.dropped, len(order.parts)) == (0, 1)
 
 
+@pytest.mark.parametrize(("gap_us", "parts"), [(3_500_000_000, 1), (3_700_000_000, 2)])
+def test_what_comes_after_an_hour_is_another_part(gap_us, parts):
+    times = np.arange(1000) * 100
+    whole = np.concatenate([times, times + times[-1] + gap_us])
+    order = EventSorter()
+    found = taken(order, numbered(whole), np.random.default_rng(0))
+    assert (len(order.parts), order.dropped) == (parts, 0)
+    assert np.array_equal(found["t"], whole if parts == 1 else times)
+
+
 def test_frames_that_go_pixel_by_pixel_are_given_a_buffer_that_holds_them():
     g = np.random.default_rng(0)
     for frame_us in (33_000, 200_000, 1_000_000):

@@ -210,6 +210,23 @@ def test_words_of_another_format_than_the_header_says_are_told_apart(tmp_path, s
     assert read(tmp_path / "b.raw", content)[0].notes == ()
 
 
+@pytest.mark.parametrize("kind", ENCODERS)
+def test_what_comes_after_a_lost_byte_is_left_out(tmp_path, kind):
+    events = made_up(2000)
+    content = b"% geometry 640x480\n" + ENCODERS[kind](events).tobytes()
+    half = len(content) // 2
+    for lost in (1, 3):
+        with pytest.warns(UserWarning) as said:
+            _, found = read(
+                tmp_path / "a.raw", content[:half] + content[half + lost :], format=kind
+            )
+        line = f"its words are no {kind.upper()} from byte "
+        at = [int(str(one.message).split(line)[1].split()[0]) for one in said if line in str(one)]
+        assert len(at) == 1 and half - 8 < at[0] < half + 1000
+        assert np.array_equal(found.t[:900], events["t"][:900])
+        assert len(found.t) < 1100 or kind == "evt21"  # of which a word holds up to 32
+
+
 def test_a_file_whose_times_come_after_most_events_is_refused(tmp_path):
     events = made_up(400)
     words = evt2(events)

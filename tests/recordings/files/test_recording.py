@@ -207,6 +207,25 @@ def test_a_truncated_file_is_counted_or_named(tmp_path):
         assert 0 < len(read_events(tmp_path / "a.raw")) <= len(events)
 
 
+@pytest.mark.parametrize(
+    ("ending", "version"), [(".raw", "evt2"), (".raw", "evt3"), (".dat", ""), (".es", "")]
+)
+def test_zeros_at_the_end_of_a_file_are_no_events(tmp_path, ending, version):
+    """Room that a recorder took, but never filled."""
+    events, path = made_up(), tmp_path / f"a{ending}"
+    write_events(path, events, width=640, height=480, **({"version": version} if version else {}))
+    whole = path.read_bytes()
+    for share, most_lost in ((1.0, 2), (0.5, 1700)):
+        kept = whole[: int(share * len(whole))].rstrip(b"\0")
+        path.write_bytes(kept + bytes(4000))
+        with pytest.warns(
+            UserWarning, match="a.*: its last 4000 bytes are zeros, left out"
+        ) as said:
+            read = read_events(path)
+        assert len(said) == 1 and len(events) - most_lost <= len(read) <= len(events)
+        assert np.array_equal(read, events[: len(read)])
+
+
 @pytest.mark.parametrize("kind", ["dvs", "atis"])
 def test_an_es_file_that_ends_within_an_event_is_told(tmp_path, kind):
     """Events after 0 and 200 us; before the second is a byte for the silence."""

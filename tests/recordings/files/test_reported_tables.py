@@ -42,6 +42,14 @@ def test_an_npz_with_an_unknown_unit_is_refused(tmp_path, events):
         read_events(tmp_path / "a.npz")
 
 
+def test_the_unit_that_an_npz_states_is_not_contradicted(tmp_path, events):
+    np.savez(tmp_path / "a.npz", time_unit="us", **{n: events[n] for n in "txyp"})
+    assert np.array_equal(quiet_read(tmp_path / "a.npz", time_unit="us"), events)
+    for path in (tmp_path / "a.npz", tmp_path):
+        with pytest.raises(ValueError, match="time_unit must be auto or us, the unit of .*got ms"):
+            read_events(path, options=ReadOptions(time_unit="ms"))
+
+
 def test_a_unit_in_a_name_holds_for_a_folder_of_npz(tmp_path, events):
     for number, part in enumerate(np.array_split(events, 3)):
         columns = {name: part[name] for name in "xyp"}

@@ -149,6 +149,14 @@ def test_topics_are_streams(tmp_path, plugin):
         read(path, stream="/x")
 
 
+def test_a_later_message_may_state_the_size(tmp_path):
+    parts = np.array_split(made_up(300), 3)
+    with Bag(tmp_path / "a.bag", None) as bag:
+        for size, part in zip([(0, 0), (0, 640), (480, 640)], parts, strict=True):
+            bag.add_array("/dvs/events", part, size=size)
+    assert RosbagFile(tmp_path / "a.bag", ReadOptions()).size == (640, 480)
+
+
 def test_a_folder_is_a_recording(tmp_path):
     events = made_up(300)
     listed = events.copy()

@@ -19,7 +19,7 @@ def write_swapped(folder, kind):
         with h5py.File(path := folder / "a.h5", "w") as file:
             for name in "txyp":
                 file[f"events/{name}"] = events[name]
-            file.attrs["resolution"] = (640, 480)
+            file.attrs["size"] = (480, 640)
     elif kind == "bag":
         events["t"] *= 1000
         with Bag(path := folder / "a.bag", None) as bag:
@@ -39,6 +39,22 @@ def test_sides_the_wrong_way_round_are_exchanged(tmp_path, kind):
             assert recording_inputs.find_sensor_size(path, given) == (480, 640)
     with pytest.warns(UserWarning, match=line):
         assert np.array_equal(read_events(path), made_up())
+
+
+@pytest.mark.parametrize(("stated", "lines"), [((1280, 720), 1), ((720, 1280), 0), ((640, 640), 0)])
+def test_the_larger_side_of_a_resolution_is_the_width(tmp_path, stated, lines):
+    """Of events that fit either way."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name in "txyp":
+            file[f"events/{name}"] = made_up()[name]
+        file.attrs["resolution"] = stated
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        found = open_recording(tmp_path / "a.h5").size
+    assert found == tuple(sorted(stated, reverse=True))
+    assert ["resolution 1280, 720 is read as width, height" in str(one) for one in said] == (
+        [True] * lines
+    )
 
 
 def test_the_users_size_comes_before_the_files(tmp_path):

@@ -49,13 +49,34 @@ def test_a_stated_unit_goes_before_the_name(tmp_path, events):
     assert np.array_equal(found, events)
 
 
-def test_an_index_by_milliseconds_means_microseconds(tmp_path, events):
+@pytest.mark.parametrize(("per_us", "kind"), [(1, np.int64), (1000, np.int64), (1e-6, float)])
+@pytest.mark.parametrize("slower", [1, SLOW])
+def test_an_index_by_milliseconds_tells_the_unit(tmp_path, events, per_us, kind, slower):
     """DSEC's."""
-    slow = slowed(events)
-    write_columns(tmp_path / "a.h5", slow)
+    slow = events.copy()
+    slow["t"] *= slower
+    columns = {"t": (slow["t"] * per_us).astype(kind), **{name: slow[name] for name in "xyp"}}
+    write_columns(tmp_path / "a.h5", columns)
     with h5py.File(tmp_path / "a.h5", "a") as file:
-        file["ms_to_idx"] = np.searchsorted(slow["t"], np.arange(0, 300_000) * 1000)
+        file["ms_to_idx"] = np.searchsorted(slow["t"], np.arange(0, 200 * slower) * 1000)
     assert np.array_equal(read_events(tmp_path / "a.h5"), slow)
+
+
+def test_an_index_by_milliseconds_of_few_events_means_microseconds(tmp_path, events):
+    few = slowed(events)[::500]
+    write_columns(tmp_path / "a.h5", few)
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["ms_to_idx"] = np.array([0, len(few)])
+    assert np.array_equal(read_events(tmp_path / "a.h5"), few)
+
+
+def test_an_offset_alone_states_no_unit(tmp_path, events):
+    ns = {"t": events["t"] * 1000 + 7, **{name: events[name] for name in "xyp"}}
+    write_columns(tmp_path / "a.h5", ns)
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["t_offset"] = 0
+    with pytest.warns(UserWarning, match="read as ns; if it is another, give time_unit="):
+        assert np.array_equal(read_events(tmp_path / "a.h5")["t"], events["t"])
 
 
 @pytest.mark.parametrize(
@@ -239,3 +260,32 @@ def test_a_tar_is_to_be_unpacked(tmp_path, events):
         read_events(tmp_path / "a.tar.gz")
     with pytest.raises(ValueError, match=r"it is a \.tar; unpack it first"):
         read_events(tmp_path / "a.gz")
+
+
+@pytest.mark.parametrize("other", ["timestamp", "time_us", "ts"])
+def test_two_columns_of_times_are_refused(tmp_path, events, other):
+    """The first may be a mere count."""
+    columns = {"t": np.arange(len(events)), other: events["t"], "x": events["x"]}
+    columns |= {"y": events["y"], "p": (events["p"] > 0).astype(int)}
+    table = np.rec.fromarrays([*columns.values()], names=[*columns])
+    np.save(tmp_path / "a.npy", table)
+    np.savez(tmp_path / "a.npz", **columns)
+    np.savetxt(tmp_path / "a.csv", table, "%d", ",", header=",".join(columns), comments="")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name, column in columns.items():
+            file[f"events/{name}"] = column
+    for name in ("a.npy", "a.npz", "a.csv", "a.h5"):
+        with pytest.raises(ValueError, match=rf"{name}: .*one column, got t, {other}; rename one"):
+            read_events(tmp_path / name)
+    for name in ("a.npy", "a.csv"):
+        assert_read(tmp_path / name, events, columns="ntxyp")
+
+
+def test_times_of_something_else_are_no_second_column(tmp_path, events):
+    columns = {name: events[name] for name in "txyp"} | {"timestamps": np.arange(3)}
+    np.savez(tmp_path / "a.npz", **columns)
+    write_columns(tmp_path / "a.h5", events)
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["events/timestamps"] = np.arange(3)
+    for name in ("a.npz", "a.h5"):
+        assert_read(tmp_path / name, events)

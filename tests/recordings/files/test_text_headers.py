@@ -1,5 +1,6 @@
 """Headers of texts: names of columns in other words, blank columns, and what is not clear."""
 
+import re
 import time
 
 import numpy as np
@@ -121,6 +122,36 @@ def test_y_before_x_among_names_that_are_not_known_is_refused(tmp_path, events, 
     with pytest.raises(ValueError, match=rf"a\.csv: .*columns must say which .* '{head}'"):
         read_events(tmp_path / "a.csv")
     assert_read(tmp_path / "a.csv", events, columns="tyxp")
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        "# each row is (t, y, x, p)", "# each row contains: t,y,x,p where p in {0,1}",
+        "# Format: timestamp y x polarity, 0=OFF 1=ON", "# t=timestamp, y=row, x=column, p=sign",
+        "# <t> <y> <x> <p>", "# ts [us] / y [px] / x [px] / pol", "t-y-x-p", "# tyxp",
+        "# of 640 x 480 pixels: t - y - x - p",
+    ],
+)  # fmt: skip
+def test_y_before_x_in_a_sentence_is_refused(tmp_path, events, head):
+    (tmp_path / "a.txt").write_text(f"{head}\n{rows(events)}")
+    with pytest.raises(ValueError, match=f"columns must say which .* {re.escape(repr(head))}"):
+        read_events(tmp_path / "a.txt")
+    assert_read(tmp_path / "a.txt", events, columns="tyxp")
+    (tmp_path / "a.txt").write_text(f"{head}\nt,y,x,p\n{rows(events)}")
+    assert_read(tmp_path / "a.txt", events)
+
+
+@pytest.mark.parametrize("head", ["# each row is (t, x, y, p)", "# xypt"])
+def test_x_before_y_in_a_sentence_is_no_fault(tmp_path, events, head):
+    (tmp_path / "a.txt").write_text(f"{head}\n{lines(events)}")
+    assert_read(tmp_path / "a.txt", events)
+
+
+def test_other_names_are_told_of(tmp_path, events):
+    (tmp_path / "a.csv").write_text("time,line,sample,sign\n" + lines(events, between=","))
+    with pytest.warns(UserWarning, match="the names in 'time,line,sample,sign' are not known"):
+        read_events(tmp_path / "a.csv")
 
 
 @pytest.mark.parametrize(

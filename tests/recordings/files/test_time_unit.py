@@ -153,6 +153,17 @@ def test_a_single_wild_time_and_a_restart_are_no_counter_that_goes_round():
     assert sampled(wild).wrap_bits == sampled(np.concatenate([t, t])).wrap_bits == 0
 
 
+@pytest.mark.parametrize(
+    ("duration", "others", "bits"),
+    [(16.7, 99, 0), (16.7, 100, 24), (15.7, 5000, 0), (16.3, 5000, 0)],
+)
+def test_a_counter_falls_from_its_top_and_goes_on(duration, others, bits):
+    t = in_unit(made_up(duration, 1e4), "us", 0, int)
+    t[-1] = duration * 1e6
+    assert sampled(np.concatenate([t, t[:others]])).wrap_bits == bits
+    assert sampled(np.concatenate([t, np.zeros(others, int)])).wrap_bits == 0
+
+
 def test_times_that_are_all_equal_are_told_of():
     assert find_unit(sampled(np.full(8000, 1.6e9 + 0.5)), "auto") == (
         "s", "all or nearly all of 8000 times are equal",
