@@ -55,7 +55,7 @@ def reconstruct(cfg: DictConfig) -> Path:
         for frame in chain([first], shown):
             write(frame)
             ready_s.append(time.perf_counter() - start)
-    print(describe_run(run / output.KINDS[cfg.output_format][1], views, ready_s))
+    print(describe_run(run / output.KINDS[cfg.output_format][1], size, len(views.views), ready_s))
     return run
 
 
@@ -69,11 +69,11 @@ def check_settings(cfg: DictConfig) -> None:
         check_noise_filter_s(cfg.noise_filter_s)
 
 
-def describe_run(video: Path, views: Views, ready_s: list[float]) -> str:
-    """Return where the video is and how fast its frames came, the last after `ready_s[-1]`; the
-    first, for which code is compiled, does not count as speed.
+def describe_run(video: Path, size: HeightWidth, number: int, ready_s: list[float]) -> str:
+    """Return where the video of `number` views is and how fast its frames came, the last after
+    `ready_s[-1]`; the first, for which code is compiled, does not count as speed.
     """
-    (height, width), number, count = views.model, len(views.views), len(ready_s)
+    (height, width), count = size, len(ready_s)
     later_s = ready_s[-1] - ready_s[0]
     rate = f"{(count - 1) / later_s:.1f} frames per second of wall time" if later_s else ""
     speed = f", after the first frame {rate}, reading and writing included" if later_s else ""
