@@ -201,7 +201,7 @@ def test_without_views_the_sensor_is_one_view(folder, tmp_path):
     "wrong, message",
     [
         ("recording=nowhere.raw", "nowhere.raw"),
-        ("sensor_size=[480,0]", "a sensor's sides must be in 1"),
+        ("sensor_size=[480,0]", "sensor_size must be .height, width., whole numbers in 1"),
         ("fps=1", "longer than one window"),
         ("fps=-1", "fps must be"),
         ("output_format=avi", "output_format must be one of"),

@@ -15,7 +15,8 @@ from src.recordings.files import recording_inputs
 from src.recordings.files.clocks import TimestampUnwrapper
 from src.recordings.files.event_file import EVENT, ReadOptions
 from src.recordings.files.recording import open_recording
-from src.recordings.views import LARGEST_SIDE, HeightWidth
+from src.recordings.files.sensor_size import LARGEST_SIDE
+from src.recordings.views import HeightWidth
 
 Chunks = Iterator[tuple[np.ndarray, float]]  # events (t x y p), wall time of their arrival in s
 FILE_CHUNK_S = 0.005  # of a file, read at a time: a long one would hold the other threads up

@@ -18,6 +18,8 @@ WRONG = [
     ("calibrate", [], "task must be given: task=..."),
     ("reconstruct", ["recording=null"], "recording must be a word, got null"),
     ("reconstruct", ["recording="], "recording must be a path, got ''"),
+    ("reconstruct", ["recording=x", "sensor_size=[8193,320]"],
+     "sensor_size must be [height,width], whole numbers in 1..8192, got [8193, 320]"),
     ("reconstruct", ["recording=x", "ckpt=[a,b]"], "ckpt must be a word or null, got"),
     ("reconstruct", ["recording=x", "ckpt=setnet_small", "device=cuda:99"], "device must be cpu"),
     ("reconstruct", ["recording=x", "+unknown=1"], "unknown is no key of the configuration"),

@@ -17,6 +17,7 @@ from faery.file_encoder import events_to_file
 from src.recordings.files import table_writers
 from src.recordings.files.event_file import PIECE_EVENTS, WidthHeight
 from src.recordings.files.recorded_frames import RecordedFrames
+from src.recordings.files.sensor_size import LARGEST_SIDE
 from src.records.atomic import name_path_in_errors, partial_path
 
 BINARY = {".raw": "evt", ".dat": "dat", ".aedat4": "aedat", ".es": "es"}
@@ -27,7 +28,7 @@ TABLES: dict[str, Callable] = {
 }  # fmt: skip
 VERSIONS = ("evt2", "evt3")
 LAYOUTS = (None, "evreal")
-MOST_PIXELS = {".raw": 2**11, ".dat": 2**14, "evreal": 2**15}  # of a side, by its bits
+RAW_MOST_PIXELS = 2**11  # of a side, by its bits
 MOST_US = {".dat": 2**32, ".h5": 2**32, ".hdf5": 2**32}  # between the first and the last event
 MOST_ES_US = 2**32  # ES writes all time since 0, a byte for each 127 us without events
 # RAW counts time in 24 and 34 bits; that it went round shows where it falls by more than half.
@@ -104,7 +105,7 @@ def choose_file_kind(path: Path, layout: str | None, width: int, height: int, ve
             raise ValueError(f"{path}: must hold no other files than EVREAL's, got {min(more)}")
     if kind == "evreal" and path.is_file():
         raise ValueError(f"{path}: layout=evreal writes a folder, this is a file already")
-    if max(width, height) > (most := MOST_PIXELS.get(kind, 2**16)):
+    if max(width, height) > (most := RAW_MOST_PIXELS if kind == ".raw" else LARGEST_SIDE):
         raise ValueError(f"{path}: {kind} holds sides up to {most}, got {width}x{height}")
     return kind
 

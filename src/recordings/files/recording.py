@@ -38,6 +38,7 @@ from src.recordings.files.rosbag_file import RosbagFile, is_bag_folder
 from src.recordings.files.sensor_size import (
     MAX_SIDE,
     MOST_OUTSIDE,
+    check_sensor_size,
     choose_size,
     describe_oversized_coordinates,
     find_swapped_size,
@@ -112,9 +113,7 @@ def open_recording(
     kept, survey, swapped = _open_and_survey(path, state.st_mtime_ns, state.st_size, options)
     file = _open_file(path, options) if kept is None else kept
     file.kept_times = survey.times
-    if sensor_size is not None and np.shape(sensor_size) != (2,):
-        raise ValueError(f"sensor_size must be (height, width), got {sensor_size}")
-    given = None if sensor_size is None else (sensor_size[1], sensor_size[0])
+    given = None if sensor_size is None else check_sensor_size(sensor_size)
     size, lines = choose_size(path, given, file.size, swapped)
     recording = EventRecording(path, size, options, file, survey, lines)
     _tell(recording.messages)

@@ -42,8 +42,7 @@ def find_sensor_size(
 
     Raises ValueError where none says.
     """
-    given = (sensor[0], sensor[1]) if sensor is not None else None
-    opened = recording.open_recording(path, given, options)
+    opened = recording.open_recording(path, sensor, options)
     if opened.size is not None:
         return opened.size[::-1]
     if in_views is not None:

@@ -120,6 +120,7 @@ def test_events_off_the_sensor_or_in_fractions_are_refused(tmp_path, ending, kin
         ("a.raw", {"version": "evt4"}, "of version evt4"),
         ("a.h5", {"layout": "dsec"}, "layout must be null or evreal, got dsec"),
         ("a.raw", {"width": 2049}, "sides up to 2048, got 2049x480"),
+        ("a.csv", {"width": 8193}, "sides up to 8192, got 8193x480"),
         ("taken", {"layout": "evreal"}, "is a folder already"),
         ("file.h5", {"layout": "evreal"}, "writes a folder, this is a file already"),
     ],
