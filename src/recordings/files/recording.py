@@ -149,8 +149,13 @@ def iter_events(
     left out, in the memory of one chunk.  Raises as `read_events` does."""
     if not 1e-6 <= seconds <= 1e6:
         raise ValueError(f"seconds must be in [1e-6, 1e6], got {seconds}")
+    yield from cut_chunks(open_recording(path, sensor_size, options), seconds)
+
+
+def cut_chunks(pieces: Iterable[np.ndarray], seconds: float) -> Iterator[np.ndarray]:
+    """Yield the events of `pieces`, in order of time, as `iter_events` does those of a file."""
     span, start, held = round(seconds * 1e6), None, []
-    for events in open_recording(path, sensor_size, options):
+    for events in pieces:
         start = int(events["t"][0]) if start is None else start
         while len(events):
             cut = count_before(events, start + span)
