@@ -106,6 +106,8 @@ def open_recording(
     is a size that the file states and its events or `sensor_size` contradict.
     Raises ValueError for a file that is missing, empty, of an unknown kind or cannot be read.
     """
+    if not isinstance(options, ReadOptions):
+        raise ValueError(f"options must be ReadOptions(...), got {options}")
     path = Path(path)
     if find_folder_reader(path) is None and (not path.is_file() or path.stat().st_size == 0):
         raise ValueError(f"recording must be an event file, got {path}: {_why_not_a_file(path)}")
