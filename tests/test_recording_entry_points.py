@@ -242,6 +242,18 @@ def test_a_calibration_that_fails_leaves_what_was_found(folder, tmp_path):
     assert left == {"found.png", "config.partial.yaml"}
 
 
+def test_a_refusal_beside_earlier_results_leaves_no_config(folder, found):
+    before = {path.name: path.read_bytes() for path in (folder / "a").iterdir()}
+    with pytest.raises(ValueError, match="mirrors must be true"):
+        calibrate(
+            config(
+                "calibrate", folder / "a", "task=views", f"recording={folder}/dot.raw",
+                "target=scene", "mirrors=false",
+            )
+        )  # fmt: skip
+    assert {path.name: path.read_bytes() for path in (folder / "a").iterdir()} == before
+
+
 def test_corners_by_hand_replace_the_target(folder, found, tmp_path):
     there = views.load_views(found)
     lines = [
