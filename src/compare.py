@@ -41,8 +41,9 @@ def compare(cfg: DictConfig) -> dict:
     `residual_displacement_px`, along a line or a ray that turns with the scene, is of what is
     static there, `line_deviation_px` of what moves uniformly along a line or a circle.  With
     `still` the whole scene is static (`slice_motion.measure_static_scene`).  Raises ValueError for
-    a video that cannot be read, has another size than the first (with `still`: another aspect
-    ratio) or another frame rate than `fps`, or a slice outside the frame.
+    a video that cannot be read, has fewer than two frames from `first` to `last`, another size than
+    the first (with `still`: another aspect ratio) or another frame rate than `fps`, or a slice
+    outside the frame.
     """
     run = Path(cfg.paths.run)
     check_slice(cfg)
@@ -94,10 +95,10 @@ def _read_films(cfg: DictConfig, names: Sequence[str]) -> list[np.ndarray]:
 
 def _cut_part(film: np.ndarray, first: int, last: int | None, name: str) -> np.ndarray:
     part = film[first:last]
-    if not len(part):
+    if len(part) < 2:
         got = f"{first} and {'null' if last is None else last}"
-        why = f"{name} has {len(film)} frames"
-        raise ValueError(f"first must be before last and in the video, got {got}: {why}")
+        why = f"{name} has {len(film)} frame{'s' * (len(film) != 1)}"
+        raise ValueError(f"first and last must leave two frames or more, got {got}: {why}")
     return part
 
 

@@ -28,7 +28,7 @@ def convert(cfg: DictConfig) -> Path:
     options = ReadOptions.from_keys(cfg)
     height, width = recording_inputs.find_sensor_size(source, cfg.sensor_size, options)
     how = {"width": width, "height": height, "version": cfg.version, "layout": cfg.layout}
-    event_writers.choose_file_kind(out, **how)
+    event_writers.choose_file_kind(out, **how, config_key="out")
     opened = recording.open_recording(source, (height, width), options)
     frames = (
         find_frames_to_convert(opened, (height, width), cfg) if cfg.layout == "evreal" else None

@@ -107,10 +107,12 @@ def assemble_server(
     Raises ValueError for a value out of range.
     """
     clock, counter = PlaybackClock(playback_speed), PolarityAccumulator(build_lookup(views))
-    cutter = WindowCutter(views.sensor, settings.fps, faults, is_live=feed.is_live)
-    waiting = WindowQueue(max_waiting_windows, lossless=playback_speed == float("inf"))
     noise_filter = None if noise_filter_s is None else NoiseFilter(views.sensor, noise_filter_s)
-    reader = FeedReader(feed, cutter, waiting, counter, clock, Meters(), faults, noise_filter)
+    cutter = WindowCutter(
+        views.sensor, settings.fps, faults, is_live=feed.is_live, noise_filter=noise_filter
+    )
+    waiting = WindowQueue(max_waiting_windows, lossless=playback_speed == float("inf"))
+    reader = FeedReader(feed, cutter, waiting, counter, clock, Meters(), faults)
     player = Player(reader, Controls(networks, views, settings), FrameRing(views.model))
     player.set_tone(tone, tone_time_constant_s)
     return PageServer(LivePage(player, views.positions), host, port, allowed_origins)

@@ -24,14 +24,14 @@ from src.recordings import output, reconstruction, tone, truth_file
 from src.recordings.event_windows import Window, WindowRule, build_window_rule, cut_windows
 from src.recordings.files import recording_inputs
 from src.recordings.files.event_file import HeightWidth, ReadOptions
-from src.recordings.noise_filter import NoiseFilter, check_noise_filter_s
+from src.recordings.noise_filter import check_noise_filter_s
 from src.recordings.reconstruction import Frame
 from src.recordings.sensor_lookup import build_lookup
 from src.recordings.truth_file import CleanClip
 from src.recordings.views import Views
 from src.records import results
 
-RULE_KEYS = ("fps", "bins", "splat", "start_s", "end_s")
+RULE_KEYS = ("fps", "bins", "splat", "start_s", "end_s", "noise_filter_s")
 
 
 def reconstruct(cfg: DictConfig) -> Path:
@@ -57,7 +57,7 @@ def reconstruct(cfg: DictConfig) -> Path:
             last_s, count = time.perf_counter() - start, count + 1
             first_s = first_s or last_s
     video = run / output.KINDS[cfg.output_format][1]
-    print(describe_run(video, views, count, first_s, last_s))
+    print(describe_run(video, size, len(views.views), count, first_s, last_s))
     return run
 
 
@@ -71,11 +71,13 @@ def check_settings(cfg: DictConfig) -> None:
         check_noise_filter_s(cfg.noise_filter_s)
 
 
-def describe_run(video: Path, views: Views, count: int, first_s: float, last_s: float) -> str:
-    """Return where the video is and how fast its `count` frames came, the last after `last_s`; the
-    first, after `first_s`, for which code is compiled, does not count as speed.
+def describe_run(
+    video: Path, size: HeightWidth, number: int, count: int, first_s: float, last_s: float
+) -> str:
+    """Return where the video of `number` views is and how fast its `count` frames came, the last
+    after `last_s`; the first, after `first_s`, for which code is compiled, does not count as speed.
     """
-    (height, width), number, later_s = views.model, len(views.views), last_s - first_s
+    (height, width), later_s = size, last_s - first_s
     rate = f"{(count - 1) / later_s:.1f} frames per second of wall time" if later_s else ""
     speed = f", after the first frame {rate}, reading and writing included" if later_s else ""
     return (
@@ -117,7 +119,7 @@ def reconstruct_video_frames(
     rule = replace(rule, as_lists=isinstance(runnable, EventListRuntime))
 
     def read() -> Iterator[np.ndarray]:
-        return read_filtered_events(cfg, views)
+        return read_events(cfg, views)
 
     options = views, rule, cfg.backward_warmup_s
     frames = reconstruction.reconstruct_recording(read, runnable, *options, device=cfg.device)
@@ -131,13 +133,10 @@ def build_window_rule_from_config(cfg: DictConfig, network: EventToVideoNetwork)
     return build_window_rule(length, **{key: cfg[key] for key in RULE_KEYS})
 
 
-def read_filtered_events(cfg: DictConfig, views: Views) -> Iterator[np.ndarray]:
-    """Yield the events of the recording, without noise where the config says so."""
+def read_events(cfg: DictConfig, views: Views) -> Iterator[np.ndarray]:
+    """Yield the events of the recording."""
     options = ReadOptions.from_keys(cfg)
-    events = recording_inputs.iter_recording(cfg.recording, views.sensor, options=options)
-    if cfg.noise_filter_s is None:
-        return events
-    return filter(len, map(NoiseFilter(views.sensor, cfg.noise_filter_s), events))
+    return recording_inputs.iter_recording(cfg.recording, views.sensor, options=options)
 
 
 def reconstruct_film_frames(
@@ -159,7 +158,7 @@ def reconstruct_film_frames(
     rule = replace(build_window_rule_from_config(cfg, network), bins=1)
     if rule.grows:  # the panel of events shows those of a frame
         rule = replace(rule, frames_per_window=1, grows=False)
-    windows = cut_windows(read_filtered_events(cfg, views), build_lookup(centre), rule)
+    windows = cut_windows(read_events(cfg, views), build_lookup(centre), rule)
     clean = truth_file.read_clean_clip(Path(cfg.recording))
     frames = join_film_panels(windows, methods, clean)
     first = next(frames)

@@ -49,7 +49,7 @@ def simulate(cfg: DictConfig) -> dict:
         raise ValueError(f"like must be null with video or photo, got {cfg.like}")
     if cfg.write:  # refused before minutes of work
         height, width = cfg.camera.sensor_size
-        event_writers.choose_file_kind(Path(cfg.write), None, width, height, "evt3")
+        event_writers.choose_file_kind(Path(cfg.write), None, width, height, config_key="write")
     if cfg.large and not cfg.like:
         raise ValueError("large must be false without like, got true")
     return simulate_user_clip(cfg) if own else simulate_scene(cfg)

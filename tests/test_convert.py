@@ -103,7 +103,10 @@ def test_the_input_is_never_written_over(tmp_path, convert):
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        (["out=a.mp4"], "cannot write .mp4"),
+        (["out=a.mp4"], "out must end in one of .raw, .*, got a.mp4"),
+        (["out=q2"], "out must end in one of .raw, .*, .hdf5, got q2"),
+        (["out=a.raw", "version=evt4"], "version must be null, evt2 or evt3, got evt4"),
+        (["out=a.h5", "version=evt2"], "version must be null, as a.h5 is no RAW file, got evt2"),
         (["out=a.h5", "start_s=2", "end_s=1"], "start_s must be >= 0 and before end_s, got 2, 1"),
         (["out=a.h5", "layout=x"], "layout must be null or evreal, got x"),
         (["out=a.h5", "sensor_size=[9,9]"], "events are off the 9x9 sensor"),

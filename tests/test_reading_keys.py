@@ -1,5 +1,7 @@
 """The keys of how a file is read reach the reader from every entry point that reads events."""
 
+import inspect
+
 import numpy as np
 import pytest
 
@@ -24,6 +26,28 @@ def joined(tmp_path):
     """A file of two recordings, of 0.2 s and of 0.1 s."""
     whole = scene()
     return text(tmp_path / "a.txt", np.concatenate([whole, whole[whole["t"] < 100_000]]))
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"columns": 5}, "columns must be a word, got 5"),
+        ({"part": "1"}, "part must be a whole number, got 1"),
+        ({"part": True}, "part must be a whole number, got True"),
+        ({"stream": 0.5}, "stream must be a number or a name, got 0.5"),
+        ({"time_unit": 6}, "time_unit must be a word, got 6"),
+    ],
+)
+def test_another_kind_of_value_is_refused_from_python_too(given, words):
+    make = inspect.unwrap(ReadOptions.__init__)  # without the type checks of tests
+    with pytest.raises(ValueError, match=words):
+        make(object.__new__(ReadOptions), **given)
+
+
+def test_options_are_read_options(joined):
+    opened = inspect.unwrap(open_recording)  # without the type checks of tests
+    with pytest.raises(ValueError, match=r"options must be ReadOptions\(\.\.\.\), got {'part': 1}"):
+        opened(joined, None, {"part": 1})
 
 
 @pytest.mark.parametrize("entry_point", ENTRY_POINTS)

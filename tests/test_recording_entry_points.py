@@ -175,7 +175,7 @@ def test_a_film_shows_events_one_view_all_views_and_the_clean_clip(
     assert [np.ptp(panel[5:]) > 230 for panel in panels[1:3]] == [toning == "auto"] * 2
     assert np.abs(panels[1] - panels[2]).mean() > 0.5  # one view is not nine
     (line,) = [one for one in capsys.readouterr().out.splitlines() if "film.mp4" in one]
-    assert line.startswith(f"{run}/film.mp4: 15 frames, 88x88 px, 9 views; ")
+    assert line.startswith(f"{run}/film.mp4: 15 frames, 364x106 px, 9 views; ")
     assert re.search(r", after the first frame \d+\.\d frames per second of wall time, read", line)
 
 
@@ -201,7 +201,7 @@ def test_without_views_the_sensor_is_one_view(folder, tmp_path):
     "wrong, message",
     [
         ("recording=nowhere.raw", "nowhere.raw"),
-        ("sensor_size=[480,0]", "a sensor's sides must be in 1"),
+        ("sensor_size=[480,0]", "sensor_size must be .height, width., whole numbers in 1"),
         ("fps=1", "longer than one window"),
         ("fps=-1", "fps must be"),
         ("output_format=avi", "output_format must be one of"),
@@ -240,6 +240,18 @@ def test_a_calibration_that_fails_leaves_what_was_found(folder, tmp_path):
         calibrate(config("calibrate", tmp_path / "run", *chosen))
     left = {path.name for path in (tmp_path / "run").iterdir()}
     assert left == {"found.png", "config.partial.yaml"}
+
+
+def test_a_refusal_beside_earlier_results_leaves_no_config(folder, found):
+    before = {path.name: path.read_bytes() for path in (folder / "a").iterdir()}
+    with pytest.raises(ValueError, match="mirrors must be true"):
+        calibrate(
+            config(
+                "calibrate", folder / "a", "task=views", f"recording={folder}/dot.raw",
+                "target=scene", "mirrors=false",
+            )
+        )  # fmt: skip
+    assert {path.name: path.read_bytes() for path in (folder / "a").iterdir()} == before
 
 
 def test_corners_by_hand_replace_the_target(folder, found, tmp_path):
@@ -401,7 +413,8 @@ def test_the_tail_behind_a_bright_dot_is_not_followed(tmp_path):
 def test_videos_of_two_sizes_are_not_compared(tmp_path):
     for side in (20, 30):
         (tmp_path / str(side)).mkdir()
-        cv2.imwrite(str(tmp_path / f"{side}/0.png"), np.zeros((side, side), np.uint8))
+        for k in range(2):
+            cv2.imwrite(str(tmp_path / f"{side}/{k}.png"), np.zeros((side, side), np.uint8))
     films = f"videos=[{tmp_path}/20,{tmp_path}/30]"
     with pytest.raises(ValueError, match="videos must be of one size"):
         compare(config("compare", tmp_path / "run", films, "line=[[0,0],[19,0]]"))
@@ -410,7 +423,8 @@ def test_videos_of_two_sizes_are_not_compared(tmp_path):
 def test_videos_of_two_shapes_are_not_stretched(tmp_path):
     for name, size in (("wide", (20, 30)), ("high", (50, 10))):
         (tmp_path / name).mkdir()
-        cv2.imwrite(str(tmp_path / name / "0.png"), np.zeros(size, np.uint8))
+        for k in range(2):
+            cv2.imwrite(str(tmp_path / name / f"{k}.png"), np.zeros(size, np.uint8))
     films = f"videos=[{tmp_path}/wide,{tmp_path}/high]"
     got = r"videos must be of one aspect ratio, got wide 20x30 and high 50x10 \(h x w\)"
     with pytest.raises(ValueError, match=got):
@@ -426,8 +440,11 @@ def test_videos_of_two_shapes_are_not_stretched(tmp_path):
         ("circle=[15,10,-3]", "circle must have a radius of 1 pixel or more"),
         ("spin=[15,10,-3,1,0]", "spin must have a radius of 1 pixel or more"),
         ("still=0", r"still must be in 1\.\."),
-        ("line=[[0,0],[9,0]] first=5 last=5", "first must be before last and in the video, got 5"),
-        ("line=[[0,0],[9,0]] first=9", "first must be before last and in the video, got 9"),
+        (
+            "line=[[0,0],[9,0]] first=1 last=2",
+            "first and last must leave two frames or more, got 1",
+        ),
+        ("line=[[0,0],[9,0]] first=9", "two frames or more, got 9 and null: .* has 3 frames"),
         ("line=[[0,0],[9,0]] frames_shown=0", r"frames_shown must be in 1\.\.100, got 0"),
         ("line=[[0,0],[9,0]] frames_shown=10000000", r"frames_shown must be in 1\.\.100, got 1"),
         ("line=[[5,5],[5,5]]", "line must have two ends that differ"),

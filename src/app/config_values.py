@@ -18,6 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from src.app.path_overrides import is_path_key
 from src.app.renamed_keys import describe_unknown_key, flatten_keys
+from src.recordings.files.sensor_size import LARGEST_SIDE
 
 NUMBER, WHOLE, WORD, FLAG = "a number", "a whole number", "a word", "true or false"
 LIST, MAPPING, NULL = "a list", "a mapping", "null"
@@ -181,7 +182,8 @@ def _check_value(key: str, value: Any, default: Any, entry_point: str, is_requir
         allowed = f">= {least}" if most == math.inf else f"in {least}..{most}"
         raise ValueError(f"{key} must be {allowed}, got {value}")
     if key in SIZES and value is not None and not _is_size(value):
-        raise ValueError(f"{key} must be [height,width], whole numbers >= 1, got {value}")
+        wanted = f"[height,width], whole numbers in 1..{LARGEST_SIDE}"
+        raise ValueError(f"{key} must be {wanted}, got {value}")
 
 
 def _kinds_like(key: str, default: Any) -> tuple[str, ...]:
@@ -197,7 +199,7 @@ def _kinds_like(key: str, default: Any) -> tuple[str, ...]:
 
 
 def _is_size(value: list) -> bool:
-    return len(value) == 2 and all(type(side) is int and side >= 1 for side in value)
+    return len(value) == 2 and all(type(n) is int and 1 <= n <= LARGEST_SIDE for n in value)
 
 
 def _is_of(value: Any, kinds: tuple[str, ...]) -> bool:

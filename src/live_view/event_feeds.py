@@ -14,8 +14,9 @@ from src.live_view.status import FaultLog
 from src.recordings.files import recording_inputs
 from src.recordings.files.clocks import TimestampUnwrapper
 from src.recordings.files.event_file import EVENT, ReadOptions
-from src.recordings.files.recording import open_recording
-from src.recordings.views import LARGEST_SIDE, HeightWidth
+from src.recordings.files.recording import EventRecording, cut_chunks, open_recording
+from src.recordings.files.sensor_size import LARGEST_SIDE
+from src.recordings.views import HeightWidth
 
 Chunks = Iterator[tuple[np.ndarray, float]]  # events (t x y p), wall time of their arrival in s
 FILE_CHUNK_S = 0.005  # of a file, read at a time: a long one would hold the other threads up
@@ -55,16 +56,21 @@ def open_feed(
     options: ReadOptions = ReadOptions(),
 ) -> Feed:
     """Return the feed of `recording`: a path, `udp://address:port` or `camera://`; `sensor`:
-    (height, width) where it states none.  Raises ValueError for what cannot be read."""
+    (height, width) where it states none.  Raises ValueError for what cannot be read or holds no
+    event, and for a `udp_format` that is none of PACKETS."""
+    if udp_format not in PACKETS:
+        raise ValueError(f"udp_format must be one of {', '.join(PACKETS)}, got {udp_format}")
     if recording.startswith("camera://"):
         return CameraFeed(faults)
     if not recording.startswith("udp://"):
         size = recording_inputs.find_sensor_size(recording, sensor, options)
         opened = open_recording(recording, size, options)
         opened.check_sensor_size()
+        if next(iter(opened), None) is None:
+            raise ValueError(f"{recording}: holds no events")
         if lines := opened.messages:
             faults.report("reading", "; ".join(lines), until_cleared=True)
-        return FileFeed(recording, size, loop, options)
+        return FileFeed(opened, size, loop)
     if sensor is None or not all(1 <= side <= LARGEST_SIDE for side in sensor):
         raise ValueError(
             f"sensor_size must be [height,width] for recording=udp://, got {sensor}; "
@@ -78,21 +84,15 @@ class FileFeed(Feed):
 
     is_live = False
 
-    def __init__(
-        self, path: str, sensor: HeightWidth, loop: bool, options: ReadOptions = ReadOptions()
-    ):
-        self.path, self.sensor, self.loop, self.options = path, sensor, loop, options
+    def __init__(self, opened: EventRecording, sensor: HeightWidth, loop: bool):
+        self.opened, self.sensor, self.loop = opened, sensor, loop
 
     def iter_event_chunks(self, stopped: threading.Event) -> Chunks:
         """Yield the file's events; raises ValueError where it cannot be decoded."""
         while not stopped.is_set():
-            is_empty = True
-            for events in recording_inputs.iter_recording(
-                self.path, self.sensor, FILE_CHUNK_S, self.options
-            ):
-                is_empty = False
+            for events in cut_chunks(self.opened, FILE_CHUNK_S):
                 yield events, time.perf_counter()
-            if not self.loop or is_empty:
+            if not self.loop:
                 return
             yield np.empty(0, EVENT), time.perf_counter()
 
@@ -104,9 +104,6 @@ class UdpFeed(Feed):
     """
 
     def __init__(self, url: str, sensor: HeightWidth, packet_format: str, faults: FaultLog):
-        if packet_format not in PACKETS:
-            allowed = ", ".join(PACKETS)
-            raise ValueError(f"udp_format must be one of {allowed}, got {packet_format}")
         self.sensor, self.packet_format, self.faults = sensor, packet_format, faults
         self.dtype = PACKETS[packet_format]
         self.buffer = memoryview(bytearray(GATHER_BYTES + MAX_PACKET_BYTES))

@@ -19,7 +19,6 @@ from src.live_view.live_windows import EventWindow, WindowCutter, WindowQueue
 from src.live_view.status import FaultLog, Meters
 from src.recordings.event_windows import COVERED
 from src.recordings.files.event_order import BUFFER_US
-from src.recordings.noise_filter import NoiseFilter
 
 NAP_S = 0.02  # how long a wait goes on before it looks whether it is still wanted
 MAX_DRIFT = 1e-4  # by which a camera's clock may run slow against ours: 100 ppm
@@ -112,8 +111,8 @@ class CameraClock:
 class FeedReader:
     """Fills `waiting` with windows of `feed`, and `counter` with their events, until stopped.
 
-    `state`: waiting | playing | stalled | ended | broken.  `noise_filter`: returns the events of a
-    chunk that are kept.  Raises ValueError for a live feed at another playback speed than 1.
+    `state`: waiting | playing | stalled | ended | broken.  Raises ValueError for a live feed at
+    another playback speed than 1.
     """
 
     def __init__(
@@ -125,13 +124,11 @@ class FeedReader:
         clock: PlaybackClock,
         meters: Meters,
         faults: FaultLog,
-        noise_filter: NoiseFilter | None = None,
     ):
         if feed.is_live and clock.speed != 1:
             raise ValueError(f"playback_speed must be 1 for what comes live, got {clock.speed}")
         self.feed, self.cutter, self.waiting, self.counter = feed, cutter, waiting, counter
         self.clock, self.meters, self.faults = clock, meters, faults
-        self.noise_filter = noise_filter
         self.chunks: queue.Queue = queue.Queue(MAX_CHUNKS)
         self.camera_clock = CameraClock()
         self.arrival_s: float | None = None  # wall time of the newest live chunk
@@ -145,23 +142,14 @@ class FeedReader:
             for events, arrival_s in self.feed.iter_event_chunks(stopped):
                 if not events.size:
                     self._offer(AGAIN, stopped)
-                    if self.noise_filter:
-                        self.noise_filter.reset()
                     continue
-                kept = self._filter_noise(events)
                 self.meters.add_busy_time("decode", time.thread_time() - start)
-                if kept.size:
-                    self._offer((kept, arrival_s), stopped)
+                self._offer((events, arrival_s), stopped)
                 start = time.thread_time()
         except ValueError as error:
             self.faults.report("file", str(error), until_cleared=True)
             end = "broken"
         self._offer(end, stopped)
-
-    def _filter_noise(self, events: np.ndarray) -> np.ndarray:
-        if self.noise_filter is None:
-            return events
-        return self.noise_filter(self.cutter.drop_events_off_sensor(events))
 
     def _offer(self, chunk: tuple[np.ndarray, float] | str, stopped: threading.Event) -> None:
         """Queue a chunk or the last state; a live stream loses its oldest chunk, a file waits."""

@@ -11,6 +11,7 @@ from src.live_view.status import FaultLog
 from src.recordings.files.event_arrays import concatenate_events, count_before
 from src.recordings.files.event_file import EVENT
 from src.recordings.files.event_order import BUFFER_US, EventSorter
+from src.recordings.noise_filter import NoiseFilter
 from src.recordings.views import HeightWidth
 
 FEW_LIVE_EVENTS = 16  # with times far from the others; more of them are a clock that restarts
@@ -36,14 +37,18 @@ class WindowCutter:
     """Keeps events until a window of 1 / `fps` is whole; reports to `faults` what is wrong.
 
     What `is_live` is put in order by the rule of files (EventSorter), but nothing waits for it: an
-    event whose window is over is dropped.  The events of a file are in order.  Raises ValueError
-    for an `fps` out of range.
+    event whose window is over is dropped.  The events of a file are in order.  Windows hold the
+    events that `noise_filter` keeps; it moves none.  Raises ValueError for an `fps` out of range.
     """
 
-    def __init__(self, sensor: HeightWidth, fps: float, faults: FaultLog, *, is_live: bool = True):
+    def __init__(
+        self, sensor: HeightWidth, fps: float, faults: FaultLog, *, is_live: bool = True,
+        noise_filter: NoiseFilter | None = None,
+    ):  # fmt: skip
         if not 0 < fps <= 1e5:
             raise ValueError(f"fps must be in (0, 1e5], got {fps}")
         self.sensor, self.fps, self.faults = sensor, fps, faults
+        self.noise_filter = noise_filter
         self.period_us = 1e6 / fps
         self.buffer_us = BUFFER_US if is_live else ANY_GAP_US
         self.order = EventSorter(self.buffer_us, FEW_LIVE_EVENTS, "newest")
@@ -71,11 +76,13 @@ class WindowCutter:
     def _forget_windows(self, new_scene: bool) -> None:
         self.origin_us, self.windows_cut = None, 0
         self.starts_scene = self.starts_scene or new_scene
+        if self.noise_filter:
+            self.noise_filter.reset()
 
     def add(self, events: np.ndarray) -> bool:
         """Take a chunk, less events off the sensor; return whether the clock restarted, as after a
         jump back in time."""
-        events = self.drop_events_off_sensor(events)
+        events = self._drop_events_off_sensor(events)
         order = self.order
         part, last_us = order.parts[-1], order.last_us
         order.add(events)
@@ -109,6 +116,7 @@ class WindowCutter:
             self._report_disorder()
             ready = self.order.release(ends[-1])
             events = concatenate_events(ready) if ready else np.empty(0, EVENT)
+            events = self.noise_filter(events) if self.noise_filter else events
             start_us, start = self._end_us(self.windows_cut), 0
             self.windows_cut += len(ends)
             for end_us in ends:
@@ -132,7 +140,7 @@ class WindowCutter:
         assert self.origin_us is not None
         return self.origin_us + windows * 1e6 / self.fps
 
-    def drop_events_off_sensor(self, events: np.ndarray) -> np.ndarray:
+    def _drop_events_off_sensor(self, events: np.ndarray) -> np.ndarray:
         """Return the events on the sensor; reports how many are not."""
         height, width = self.sensor
         if not events.size or (events["x"].max() < width and events["y"].max() < height):

@@ -16,7 +16,7 @@ from torch.nn import functional
 from torch.nn.utils.parametrizations import spectral_norm as normalise_spectrum
 
 from src.models.layers import ConvGRU, ConvLSTM, ResidualBlock, pad_centred_to_multiple
-from src.models.network import WINDOW_S, EventToVideoNetwork
+from src.models.network import WINDOW_S, EventToVideoNetwork, check_voxel_shape
 from src.sim.optics import Position, layout, most_central_view_index
 
 CELLS = {"convlstm": ConvLSTM, "convgru": ConvGRU}
@@ -92,7 +92,7 @@ class E2VID(EventToVideoNetwork):
         """Return the frame at the end of the window and the state, one entry per scale.
 
         Views are in the order of training; `window_s` and `positions` have no part in it.  Raises
-        ValueError when views or bins are not the network's.
+        ValueError for another shape, or when views or bins are not the network's.
         """
         height, width = voxels.shape[-2:]
         x, (top, left) = self._padded(voxels)
@@ -104,6 +104,7 @@ class E2VID(EventToVideoNetwork):
         return self.encode(self.first_layer(self._padded(voxels)[0]), state)[2]
 
     def _padded(self, voxels: Tensor) -> tuple[Tensor, tuple[int, int]]:
+        check_voxel_shape(voxels)
         if tuple(voxels.shape[1:3]) != (self.views, self.bins):
             wanted, got = (self.views, self.bins), tuple(voxels.shape[1:3])
             raise ValueError(f"optics.views, bins must be {wanted} for this network, got {got}")

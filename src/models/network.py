@@ -97,6 +97,13 @@ class EventToVideoNetwork(VideoMethod):
         return unroll(self, voxels, window_s=window_s, positions=positions)[0]
 
 
+def check_voxel_shape(voxels: Tensor) -> None:
+    """Raise ValueError unless `voxels` has the five sides of a window's grids."""
+    if voxels.ndim != 5:
+        wanted = "voxels must be (clips, views, bins, height, width)"
+        raise ValueError(f"{wanted}, got {tuple(voxels.shape)}")
+
+
 class FramePostprocessor(nn.Module):
     """A network from distorted frames to restored ones; a subclass implements `forward`."""
 

@@ -70,7 +70,7 @@ from src.models.background import REVEALING_EVENTS, blend_background
 from src.models.cell_clock import TRACE_TAU_S, ClockTick, run_clock
 from src.models.context_pyramid import ContextPyramid, smooth_context
 from src.models.layers import EqualDCConv, pad_centred_to_multiple, scan_windows
-from src.models.network import EventToVideoNetwork
+from src.models.network import EventToVideoNetwork, check_voxel_shape
 from src.models.setnet_state import Context, SetNetState
 from src.models.time_gated_memory import TimeGatedMemory
 from src.models.view_kernels import ViewKernels
@@ -149,9 +149,10 @@ class SetNet(EventToVideoNetwork):
     ) -> tuple[Float[Tensor, "n 1 h w"], SetNetState]:
         """Return the frame at the end of the window, in [0, 1], float32, and the state.
 
-        Raises ValueError for bins, a number of views, a window length (unless in a tensor on a GPU,
-        which would be synchronised) or a state that do not fit.
+        Raises ValueError for another shape, bins, a number of views, a window length (unless in a
+        tensor on a GPU, which would be synchronised) or a state that do not fit.
         """
+        check_voxel_shape(voxels)
         window = voxels[:, None]
         frames, state = self.sequence(window, state, window_s=window_s, positions=positions)
         return frames[:, 0], state

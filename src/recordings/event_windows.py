@@ -21,6 +21,7 @@ from jaxtyping import Float
 
 from src.models.backward_warmup import check_backward_warmup_s
 from src.recordings.files.event_arrays import concatenate_events, count_before
+from src.recordings.noise_filter import NoiseFilter, check_noise_filter_s
 from src.recordings.sensor_lookup import SensorLookup
 
 COVERED = 0.99  # of the last window, or the recording ends before it
@@ -74,8 +75,8 @@ class Window:
 class WindowRule:
     """How windows are cut and filled: each ends 1 / fps after the one before and is
     frames_per_window / fps long or, where it `grows`, up to that.  `start_s` and `end_s` count from
-    the first event.  `as_lists`: windows hold an event list instead of a grid.  Raises ValueError
-    for a value out of range.
+    the first event.  `noise_filter_s`: windows hold only what a NoiseFilter keeps.  `as_lists`:
+    windows hold an event list instead of a grid.  Raises ValueError for a value out of range.
     """
 
     fps: float = 120.0
@@ -85,6 +86,7 @@ class WindowRule:
     splat: str = "bilinear"
     start_s: float = 0.0
     end_s: float = float("inf")
+    noise_filter_s: float | None = None
     as_lists: bool = False
 
     def __post_init__(self):
@@ -94,6 +96,8 @@ class WindowRule:
             raise ValueError(f"splat must be bilinear or nearest, got {self.splat}")
         if self.bins < 1:
             raise ValueError(f"bins must be >= 1, got {self.bins}")
+        if self.noise_filter_s is not None:
+            check_noise_filter_s(self.noise_filter_s)
         if not 0 <= self.start_s < self.end_s:
             raise ValueError(
                 f"start_s must be >= 0 and before end_s, got {self.start_s}, {self.end_s}"
@@ -136,24 +140,33 @@ def cut_windows(
 ) -> Iterator[Window]:
     """Cut chunks of events (t x y p, in order of time) into windows; warns of an `end_s` after the
     last event.  Raises ValueError for time running backwards, an event of a window that is off the
-    sensor, or less than one window."""
-    checked, is_empty = _OrderedChunks(chunks), True
+    sensor, less than one window, or a noise filter that keeps nothing."""
+    checked, is_empty = _OrderedChunks(chunks, _build_noise_filter(rule, lookup)), True
     for events, start_us, end_us in _cut(checked, rule):
         yield fill_window(events, lookup, rule, start_us, end_us)
         is_empty = False
     if is_empty:
-        raise ValueError(_explain_no_window(rule, checked.length_s))
+        raise ValueError(_explain_no_window(rule, checked))
     if checked.length_s + 1 / rule.fps < rule.end_s < math.inf:
         wanted = f"end_s must be at most the length of the recording, {checked.length_s:.3f} s"
         warnings.warn(f"{wanted}, got {rule.end_s:g}; it is read to its end", stacklevel=1)
 
 
-class _OrderedChunks:
-    """Chunks of events, none empty, in order of time; the first and the last time so far, in us."""
+def _build_noise_filter(rule: WindowRule, lookup: SensorLookup) -> NoiseFilter | None:
+    if rule.noise_filter_s is None:
+        return None
+    height, width = lookup.view.shape
+    return NoiseFilter((height, width), rule.noise_filter_s)
 
-    def __init__(self, chunks: Iterable[np.ndarray]):
-        self._chunks = chunks
+
+class _OrderedChunks:
+    """Chunks of events in order of time, of each what `noise_filter` keeps, from the first on of
+    which it keeps some; the first and the last time so far, in us, whatever is kept."""
+
+    def __init__(self, chunks: Iterable[np.ndarray], noise_filter: NoiseFilter | None = None):
+        self._chunks, self._noise_filter = chunks, noise_filter
         self.first_us, self.last_us = math.nan, math.nan
+        self.is_all_noise = noise_filter is not None
 
     def __iter__(self) -> Iterator[np.ndarray]:
         for chunk in filter(len, self._chunks):
@@ -164,7 +177,10 @@ class _OrderedChunks:
                 )
             self.first_us = float(t[0]) if math.isnan(self.first_us) else self.first_us
             self.last_us = float(t[-1])
-            yield chunk
+            kept = self._noise_filter(chunk) if self._noise_filter else chunk
+            self.is_all_noise = self.is_all_noise and not len(kept)
+            if not self.is_all_noise:
+                yield kept
 
     @property
     def length_s(self) -> float:
@@ -172,28 +188,36 @@ class _OrderedChunks:
         return 0.0 if math.isnan(self.first_us) else (self.last_us - self.first_us) * 1e-6
 
 
-def _explain_no_window(rule: WindowRule, length_s: float) -> str:
+def _explain_no_window(rule: WindowRule, chunks: _OrderedChunks) -> str:
+    length_s, window = chunks.length_s, f"one window of 1/{rule.fps:g} s"
+    if length_s and chunks.is_all_noise:
+        return f"noise_filter_s must leave events, got {rule.noise_filter_s:g}, which leaves none"
     if 0 < length_s <= rule.start_s:
         wanted = f"below the length of the recording, {length_s:.3f} s"
         return f"start_s must be {wanted}, got {rule.start_s:g}"
-    if length_s > 1 / rule.fps and (rule.start_s or rule.end_s < math.inf):
-        wanted = f"leave one window of 1/{rule.fps:g} s of the recording, {length_s:.3f} s long"
-        return f"start_s and end_s must {wanted}, got {rule.start_s:g} and {rule.end_s:g}"
-    return f"recording must be longer than one window of 1/{rule.fps} s, got less"
+    given = f"got {rule.start_s:g} and {rule.end_s:g}"
+    if rule.start_s + 1 / rule.fps > rule.end_s:  # then it is not read to its end
+        return f"start_s and end_s must be at least {window} apart, {given}"
+    if length_s > 1 / rule.fps and rule.start_s:
+        wanted = f"leave {window} of the recording, {length_s:.3f} s long"
+        return f"start_s and end_s must {wanted}, {given}"
+    return f"recording must be longer than {window}, got {length_s:g} s"
 
 
 def cut_windows_backward(
     chunks: Iterable[np.ndarray], lookup: SensorLookup, rule: WindowRule, seconds: float
 ) -> Iterator[Window]:
-    """Yield the windows of the first `seconds`, the last first, each `reversed`; of those that grow
-    the longest only; as many as are a multiple of those that overlap, so that
-    `ReconstructionState.reverse` gives every phase its state.  Raises ValueError as `cut_windows`
-    and for an impossible length of time.
+    """Yield the windows of the first `seconds`, one length of a window at least, the last first,
+    each `reversed`; of those that grow the longest only; as many as are a multiple of those that
+    overlap, so that `ReconstructionState.reverse` gives every phase its state.  Raises ValueError
+    as `cut_windows` and for an impossible length of time.
     """
     if rule.grows:
         rule = replace(rule, fps=rule.fps / rule.frames_per_window, frames_per_window=1)
-    end_s = min(rule.end_s, rule.start_s + check_backward_warmup_s(seconds))
-    cuts = list(_cut(_OrderedChunks(chunks), replace(rule, end_s=end_s)))
+    seconds = max(check_backward_warmup_s(seconds), rule.frames_per_window / rule.fps)
+    end_s = min(rule.end_s, rule.start_s + seconds)
+    checked = _OrderedChunks(chunks, _build_noise_filter(rule, lookup))
+    cuts = list(_cut(checked, replace(rule, end_s=end_s)))
     whole = len(cuts) // rule.frames_per_window * rule.frames_per_window
     for events, start_us, end_us in reversed(cuts[:whole]):
         yield fill_window(events, lookup, rule, start_us, end_us).reversed()
@@ -210,12 +234,11 @@ def _cut(chunks: _OrderedChunks, rule: WindowRule) -> Iterator[Cut]:
     k, pending = 1, list[np.ndarray]()
     for chunk in chunks:
         start, end = chunks.first_us + 1e6 * np.array([rule.start_s, rule.end_s])
-        chunk = chunk[count_before(chunk, start) :]
-        if not len(chunk):
+        if chunks.last_us < start:
             continue
-        events = concatenate_events([*pending, chunk])
-        last = min(float(chunk["t"][-1]) + 1, end)
-        while time_us(k) <= min(chunk["t"][-1], end):  # more events of that time may come
+        events = concatenate_events([*pending, chunk[count_before(chunk, start) :]])
+        last = min(chunks.last_us + 1, end)
+        while time_us(k) <= min(chunks.last_us, end):  # more events of that time may come
             yield cut(k)
             k += 1
         pending = [events[count_before(events, time_us(rule.first_frame_of_window(k))) :]]

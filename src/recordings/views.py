@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,10 +18,10 @@ from jaxtyping import Float
 
 from src.recordings.corner_fold import CornerFold, Points
 from src.recordings.files.event_file import HeightWidth
+from src.recordings.files.sensor_size import LARGEST_SIDE
 from src.records import safe_yaml
 from src.records.atomic import write_text
 
-LARGEST_SIDE = 8192
 MAX_PIXELS = 2**24  # of a sensor, and of all views' pictures together
 MIN_SHARE_ON_SENSOR = 0.75  # of a view
 
@@ -175,7 +176,8 @@ def _check_size(key: str, size: HeightWidth, pictures: int = 1) -> None:
     if not all(1 <= side <= LARGEST_SIDE for side in size):
         raise ValueError(f"{key} must be in 1..{LARGEST_SIDE} pixels, got {size}")
     if pictures * math.prod(size) > MAX_PIXELS:
-        raise ValueError(f"{key} must have {MAX_PIXELS} pixels at most, got {pictures} x {size}")
+        got = f"{pictures} x {size}" if pictures > 1 else f"{size}"
+        raise ValueError(f"{key} must have {MAX_PIXELS} pixels at most, got {got}")
 
 
 def views_or_whole_sensor(
@@ -185,6 +187,8 @@ def views_or_whole_sensor(
 
     `resolution`: (height, width) of the model picture instead of that of the file or the sensor.
     Raises ValueError for one out of range."""
+    if path is None:
+        _check_size("sensor_size", sensor)
     views = load_views(path, sensor) if path is not None else Views.single_view(sensor, sensor)
     if not resolution:
         return views
@@ -202,16 +206,19 @@ def load_views(path: Path | str, sensor: HeightWidth | None = None) -> Views:
     contradicts, or another sensor than `sensor` (height, width)."""
     try:
         content = safe_yaml.read(path)
+        entries = _get(content, "views")
+        if not isinstance(entries, list):
+            raise TypeError("expected a list of views")
         views = Views(
-            _parse_numbers(content["sensor"], int, 2),
-            _parse_numbers(content["model"], int, 2),
-            _parse_numbers(content["field"], float, 4),
-            tuple(map(_parse_view, content["views"])),
+            _parse_numbers(_get(content, "sensor"), int, 2),
+            _parse_numbers(_get(content, "model"), int, 2),
+            _parse_numbers(_get(content, "field"), float, 4),
+            tuple(map(_parse_view, entries)),
         )
-        stated = [entry.get("mirrored") for entry in content["views"]]
-    except (OSError, yaml.YAMLError, KeyError, TypeError, OverflowError) as error:
-        fault = f"{type(error).__name__} {error}"
-        got = f"{path or 'none'}: {error.strerror if isinstance(error, OSError) else fault}"
+        stated = [entry.get("mirrored") for entry in entries]
+    except (OSError, yaml.YAMLError, TypeError, OverflowError) as error:
+        fault = error.strerror if isinstance(error, OSError) else " ".join(str(error).split())
+        got = f"{path or 'none'}: {fault}"
         raise ValueError(f"views must be a file of calibrate task=views, got {got}") from None
     for view, mirrored in zip(views.views, stated, strict=True):
         if mirrored not in (None, list(views.mirrored_xy(view))):
@@ -221,20 +228,26 @@ def load_views(path: Path | str, sensor: HeightWidth | None = None) -> Views:
     return replace(views, views=tuple(sorted(views.views, key=lambda view: view.position)))
 
 
-def _parse_view(entry: dict) -> View:
-    rows = entry["homography"]
+def _get(entry: Any, key: str) -> Any:
+    if not isinstance(entry, dict) or key not in entry:
+        raise TypeError(f"no entry {key}")
+    return entry[key]
+
+
+def _parse_view(entry: Any) -> View:
+    rows = _get(entry, "homography")
     if not isinstance(rows, list) or len(rows) != 3:
         raise TypeError("homography must have 3 rows")
     matrix = np.array([_parse_numbers(row, float, 3) for row in rows])
     (error,) = _parse_numbers([entry.get("error_px", 0.0)], float, 1)
     (points,) = _parse_numbers([entry.get("points", 0)], int, 1)
     fold = _parse_fold(entry["fold"]) if "fold" in entry else None
-    return View(_parse_numbers(entry["position"], int, 2), matrix, error, points, fold)
+    return View(_parse_numbers(_get(entry, "position"), int, 2), matrix, error, points, fold)
 
 
-def _parse_fold(entry: dict) -> CornerFold:
-    ends = [_parse_numbers(entry[end], float, 2) for end in ("corner", "towards")]
-    return CornerFold(ends[0], ends[1], *_parse_numbers([entry["angle_rad"]], float, 1))
+def _parse_fold(entry: Any) -> CornerFold:
+    ends = [_parse_numbers(_get(entry, end), float, 2) for end in ("corner", "towards")]
+    return CornerFold(ends[0], ends[1], *_parse_numbers([_get(entry, "angle_rad")], float, 1))
 
 
 def _parse_numbers(values: list, kind: type, count: int) -> tuple:

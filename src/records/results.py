@@ -54,13 +54,20 @@ def store_config_when_done(run: Path, config: str) -> Iterator[None]:
     whole = run / CONFIG_FILE
     partial = partial_path(whole)
     create_run_folder(run, config, partial.name)
+    before = _modification_times(run)
     try:
         yield
     except ValueError:
-        if all(file == partial or file.name.startswith(".") for file in run.iterdir()):
+        if _modification_times(run) == before:
             partial.unlink()
         raise
     os.replace(partial, whole)
+
+
+def _modification_times(run: Path) -> dict[str, int]:
+    """Return {name: nanoseconds} of what lies in a run's folder, but for hidden files."""
+    found = (file for file in run.iterdir() if not file.name.startswith("."))
+    return {file.name: file.stat().st_mtime_ns for file in found}
 
 
 def create_run_folder(run: Path, config: str, name: str = CONFIG_FILE) -> None:

@@ -18,6 +18,8 @@ WRONG = [
     ("calibrate", [], "task must be given: task=..."),
     ("reconstruct", ["recording=null"], "recording must be a word, got null"),
     ("reconstruct", ["recording="], "recording must be a path, got ''"),
+    ("reconstruct", ["recording=x", "sensor_size=[8193,320]"],
+     "sensor_size must be [height,width], whole numbers in 1..8192, got [8193, 320]"),
     ("reconstruct", ["recording=x", "ckpt=[a,b]"], "ckpt must be a word or null, got"),
     ("reconstruct", ["recording=x", "ckpt=setnet_small", "device=cuda:99"], "device must be cpu"),
     ("reconstruct", ["recording=x", "+unknown=1"], "unknown is no key of the configuration"),
@@ -89,7 +91,7 @@ def test_a_recording_that_cannot_be_written_is_refused_before_it_is_made(tmp_pat
         "video": None, "photo": None,
         "camera": {"sensor_size": [360, 640]},
     })  # fmt: skip
-    with pytest.raises(ValueError, match="a.xyz: cannot write .xyz"):
+    with pytest.raises(ValueError, match="write must end in one of .raw, .* got a.xyz"):
         simulate.simulate(cfg)
 
 

@@ -83,7 +83,7 @@ def read_config(path: Path) -> None:
         raise ValueError(str(error)) from error
 
 
-def write_events(path: Path, version: str = "evt3") -> None:
+def write_events(path: Path, version: str | None = None) -> None:
     tables.write_events(path, made_up(200), width=640, height=480, version=version)
 
 

@@ -7,6 +7,7 @@ import re
 import socket
 import threading
 import time
+import warnings
 
 import faery
 import numpy as np
@@ -93,6 +94,7 @@ def test_the_turn_of_a_32_bit_clock_is_no_jump():
         ("udp://127.0.0.1:0", (0, 4), "t64_x16_y16_on8", "sensor_size must be"),
         ("udp://127.0.0.1:0", (4, 4), "t8", "udp_format must be one of"),
         ("nowhere.raw", None, "t64_x16_y16_on8", "no such file"),
+        ("nowhere.raw", None, "t8", "udp_format must be one of"),
     ],
 )
 def test_a_feed_that_cannot_be_is_refused(address, sensor, kind, named):
@@ -105,6 +107,20 @@ def test_a_recording_off_the_given_sensor_is_refused(tmp_path):
     (tmp_path / "events.txt").write_text("\n".join(lines))
     with pytest.raises(ValueError, match="all 50 events are off the 10x10 sensor"):
         event_feeds.open_feed(str(tmp_path / "events.txt"), (10, 10), FaultLog())
+
+
+def test_a_recording_without_events_is_refused(tmp_path):
+    np.savez(tmp_path / "none.npz", **dict.fromkeys("txyp", np.zeros(0, np.int64)), size=[64, 48])
+    with pytest.raises(ValueError, match="none.npz: holds no events"):
+        event_feeds.open_feed(str(tmp_path / "none.npz"), None, FaultLog())
+
+
+def test_what_is_odd_about_a_file_is_said_when_it_is_opened_and_not_again(recording):
+    with pytest.warns(UserWarning, match=r"read as sensor_size=\[500,700\]"):
+        feed = event_feeds.open_feed(recording, (500, 700), FaultLog())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert sum(len(chunk) for chunk, _ in feed.iter_event_chunks(threading.Event())) > 1000
 
 
 def test_a_port_in_use_is_refused():
@@ -410,7 +426,7 @@ def test_a_file_that_breaks_off_is_told(recording, tmp_path, monkeypatch):
         yield read_events(recording)[:1000]
         raise ValueError(f"{recording}: cannot be decoded: broken")
 
-    monkeypatch.setattr(event_feeds.recording_inputs, "iter_recording", broken)
+    monkeypatch.setattr(event_feeds, "cut_chunks", broken)
     made = served(recording, {"net": HighPass()})
     made.page.player.start()
     _until(lambda: made.page.player.status()["state"] == "broken")

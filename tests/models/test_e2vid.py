@@ -1,5 +1,7 @@
 """E2VID: published sizes, any frame size, pure state, spectral norm, learning."""
 
+import inspect
+
 import pytest
 import torch
 from torch.nn.utils import parametrize
@@ -116,6 +118,12 @@ def test_views_are_stacked_view_by_view():
 def test_other_views_or_bins_are_refused(shape):
     with pytest.raises(ValueError, match=r"optics.views, bins must be \(2, 3\)"):
         small()(torch.zeros(shape), None)
+
+
+def test_another_shape_is_refused_in_one_line():
+    forward = inspect.unwrap(E2VID.forward)  # without the type checks of tests
+    with pytest.raises(ValueError, match=r"^voxels must be \(clips, .* got \(1, 2, 3, 16\)$"):
+        forward(small(), torch.zeros(1, 2, 3, 16))
 
 
 @pytest.mark.parametrize("wrong", [{"recurrent": "lstm"}, {"final_activation": "tanh"}])

@@ -1,5 +1,6 @@
 """SetNet: any views in any order, time in seconds, a clock for each cell, a state that is held."""
 
+import inspect
 import math
 from itertools import pairwise
 
@@ -457,6 +458,12 @@ def test_the_file_gives_the_network_back(tmp_path):
 def test_bad_input_names_its_key(shape, options, message):
     with pytest.raises(ValueError, match=message):
         small()(torch.zeros(shape), None, **options)
+
+
+def test_another_shape_is_refused_in_one_line():
+    forward = inspect.unwrap(SetNet.forward)  # without the type checks of tests
+    with pytest.raises(ValueError, match=r"^voxels must be \(clips, .* got \(1, 1, 5, 48\)$"):
+        forward(small(), torch.zeros(1, 1, 5, 48))
 
 
 def test_a_state_of_another_size_is_refused():

@@ -167,9 +167,17 @@ def test_a_recording_that_cannot_be_cut_is_refused(made, rule, message):
     [
         ({"start_s": 10}, "start_s must be below the length of the recording, 0.100 s, got 10"),
         ({"start_s": 0.0995}, "leave one window of 1/200 s of the recording, 0.100 s long, got"),
+        (
+            {"start_s": 0.05, "end_s": 0.051},
+            "be at least one window of 1/200 s apart, got 0.05 and",
+        ),
+        (
+            {"end_s": 0.001},
+            "end_s must be at least one window of 1/200 s apart, got 0 and 0.001",
+        ),
     ],
 )
-def test_a_part_beyond_the_end_is_refused_with_the_length(rule, message):
+def test_a_part_without_a_window_is_refused_with_what_it_lacks(rule, message):
     with pytest.raises(ValueError, match=message):
         list(event_windows.cut_windows([events(4000, 100_000)], TABLE, WindowRule(200, **rule)))
 
@@ -342,6 +350,12 @@ class Sums(EventToVideoNetwork):
         change = voxels.sum((1, 2))[:, None]
         state = change if state is None else state + change
         return 0.5 + 1e-3 * state, state
+
+
+@pytest.mark.parametrize("rule", [WindowRule(120), RULES["overlap"], RULES["growing"]])
+def test_a_network_looks_back_one_length_of_a_window_at_least(rule):
+    back = event_windows.cut_windows_backward([events(4000, 100_000)], TABLE, rule, 1e-4)
+    assert len(list(back)) == rule.overlapping_windows
 
 
 @pytest.mark.parametrize("overlap, size", [(1, 4000), (4, 4000), (4, 100)])

@@ -1,20 +1,23 @@
 """What no neighbour supports is taken away, whatever the chunks; edges that move stay."""
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from baselines.highpass import HighPass
 from src.live import assemble_server
-from src.live_view.event_feeds import Chunks, Feed, FileFeed
+from src.live_view.event_feeds import Chunks, Feed
 from src.live_view.feed_reader import FeedReader
+from src.live_view.live_windows import WindowCutter
 from src.live_view.network_runner import RunSettings
 from src.live_view.status import FaultLog
+from src.recordings.event_windows import WindowRule, cut_windows, cut_windows_backward
 from src.recordings.files.event_file import EVENT
 from src.recordings.noise_filter import NoiseFilter
+from src.recordings.sensor_lookup import build_lookup
 from src.recordings.views import Views
-from tests.recordings.files.tables import write_events
 
 
 def events(*rows: tuple[int, int, int]) -> np.ndarray:
@@ -104,17 +107,58 @@ class OnePacket(Feed):
 def test_events_of_a_live_feed_off_the_sensor_are_counted_and_not_filtered():
     faults = FaultLog()
     packet = events((0, 3, 3), (500, 60_000, 60_000), (1000, 4, 4), (1100, 4, 8))
-    reader = filtered_reader(OnePacket(packet), faults)
-    reader.decode(threading.Event())
-    kept, _ = reader.chunks.get_nowait()
-    assert kept["t"].tolist() == [1000]
+    cutter = filtered_reader(OnePacket(packet), faults).cutter
+    cutter.add(packet)
+    assert [one.events["t"].tolist() for one in cutter.pop_windows(10_000)] == [[1000]]
     assert faults.current() == ["events up to 60001x60001 are off the 8x8 sensor (2 events)"]
 
 
-def test_a_live_feed_is_filtered(tmp_path):
-    path = tmp_path / "few.csv"
-    write_events(path, events((0, 3, 3), (1000, 4, 4), (20_000, 0, 0)), width=8, height=8)
-    reader = filtered_reader(FileFeed(str(path), (8, 8), loop=False), FaultLog())
-    reader.decode(threading.Event())
-    kept, _ = reader.chunks.get_nowait()
-    assert kept["t"].tolist() == [1000] and reader.chunks.get_nowait() == "ended"
+def test_a_live_feed_is_filtered_in_the_windows_of_all_its_events():
+    seen = events((0, 3, 3), (20_000, 4, 4), (21_000, 3, 4), (49_950, 0, 0))
+    cutter = WindowCutter((8, 8), 100.0, FaultLog(), noise_filter=NoiseFilter((8, 8), 0.005))
+    for _ in range(2):
+        cutter.add(seen)
+        found = list(cutter.pop_windows(cutter.last_us))
+        assert [one.events["t"].tolist() for one in found] == [[], [], [21_000], []]
+        assert [one.start_us for one in found] == [0, 10_000, 20_000, 30_000]
+        cutter.restart()
+
+
+def noise_before_an_edge() -> np.ndarray:
+    """Events of one pixel from 0.1 s on, of a moving edge from 0.15 s to 0.2 s."""
+    hot = [(100_000 + 5000 * k, 1, 1) for k in range(21)]
+    edge = [(150_000 + 1000 * x, 4 + x % 4, y) for x in range(50) for y in range(4, 8)]
+    return events(*sorted(hot + edge))
+
+
+@pytest.mark.parametrize("size", [1, 7, 1000])
+@pytest.mark.parametrize("cut", [{}, {"start_s": 0.02, "end_s": 0.08}, {"start_s": 0.09}])
+def test_a_filter_moves_no_window(size, cut):
+    made, table = noise_before_an_edge(), build_lookup(Views.single_view((8, 8), (8, 8)))
+    chunks = [made[k : k + size] for k in range(0, len(made), size)]
+    given, kept = [
+        list(cut_windows(chunks, table, WindowRule(200.0, noise_filter_s=seconds, **cut)))
+        for seconds in (None, 0.005)
+    ]
+    assert [(one.start_us, one.end_us) for one in given] == [
+        (one.start_us, one.end_us) for one in kept
+    ]
+    left = NoiseFilter((8, 8), 0.005)(made)["t"]
+    assert 100 < len(left) < len(made) - 20
+    for one in kept:
+        assert one.events == ((left >= one.start_us) & (left < one.end_us)).sum()
+
+
+def test_a_network_looks_back_on_what_is_kept():
+    table = build_lookup(Views.single_view((8, 8), (8, 8)))
+    rule = WindowRule(200.0, noise_filter_s=0.005)
+    back = cut_windows_backward([noise_before_an_edge()], table, rule, 0.06)
+    assert [one.events > 0 for one in back] == [True] * 2 + [False] * 10
+
+
+def test_a_filter_that_keeps_nothing_is_named():
+    hot = noise_before_an_edge()[:10]
+    table, rule = build_lookup(Views.single_view((8, 8), (8, 8))), WindowRule(200.0)
+    assert len(list(cut_windows([hot], table, rule))) == 9
+    with pytest.raises(ValueError, match=r"noise_filter_s must leave events, got 0.005, which"):
+        next(cut_windows([hot], table, replace(rule, noise_filter_s=0.005)))

@@ -151,11 +151,12 @@ def test_file_comes_back_exactly(truth, tmp_path):
         ((r"sensor: \[720, 1280\]", "sensor: [480, 640]"), "lie on the 640x480 sensor"),
         ((r"mirrored: \[true", "mirrored: [false"), "contradicts"),
         ((r"model: \[240", "model: [2400000"), "views.model must be in"),
-        ((r"model: \[240, 240\]", "model: [240]"), "TypeError"),
+        ((r"model: \[240, 240\]", "model: [240]"), "yaml: expected a list of 2 x int"),
         ((r"position: \[-1, -1\]", "position: [0, 0]"), "different positions"),
-        ((r"\nfield: \[", "\nfield: [.nan, "), "TypeError"),
+        ((r"\nfield: \[", "\nfield: [.nan, "), "yaml: expected a list of 4 x float"),
         ((r"  - \[[^,]+", "  - [.inf"), "finite and regular"),
-        (("views:", "windows:"), "KeyError"),
+        (("views:", "windows:"), "yaml: no entry views"),
+        ((r"  homography:", "  matrix:"), "yaml: no entry homography"),
         (("sensor:", "{ sensor:"), "must be a file of calibrate"),
     ],
 )
@@ -174,7 +175,7 @@ def test_a_spoilt_file_is_refused_in_one_line(truth, tmp_path, change, message):
     [
         (("angle_rad: [^\n]*", "angle_rad: 0.4"), r"angle_rad must be in -0\.3\.\.0\.3, got 0\.4"),
         (("angle_rad: [^\n]*", "angle_rad: .nan"), "fold must be finite"),
-        (("    corner: [^\n]*\n", ""), "KeyError 'corner'"),
+        (("    corner: [^\n]*\n", ""), "yaml: no entry corner"),
     ],
 )
 def test_a_spoilt_fold_is_refused_in_one_line(truth, tmp_path, change, message):
@@ -212,6 +213,21 @@ def test_lookup_and_registration_follow_the_halves(truth):
     assert min(likeness) > 0.95
     unaware = truth.warp_to_model(shown(folded, picture, noise=0.0) / 255.0)[8]
     assert np.corrcoef(unaware[inner].ravel(), picture[inner].ravel())[0, 1] < min(likeness)
+
+
+@pytest.mark.parametrize(
+    "text, fault",
+    [
+        ("", "no entry views"), ("words", "no entry views"), ("- 1", "no entry views"),
+        ("views: 5", "expected a list of views"),
+        ("{sensor: [9, 9], model: [9, 9], field: [0, 0, 9, 9], views: [1]}", "no entry homography"),
+    ],
+)  # fmt: skip
+def test_another_yaml_file_is_refused_for_what_it_lacks(tmp_path, text, fault):
+    (tmp_path / "a.yaml").write_text(text)
+    wanted = f"^views must be a file of calibrate task=views, got .*a.yaml: {fault}$"
+    with pytest.raises(ValueError, match=wanted):
+        views.load_views(tmp_path / "a.yaml")
 
 
 def test_views_of_another_sensor_are_refused(truth, tmp_path):
@@ -335,3 +351,5 @@ def test_pictures_of_another_sensor_are_refused():
 def test_a_resolution_that_is_too_large_is_named(resolution):
     with pytest.raises(ValueError, match="^resolution must "):
         views.views_or_whole_sensor(None, (48, 64), resolution)
+    with pytest.raises(ValueError, match="^sensor_size must .* got .100000, 10.$|, 8000.$"):
+        views.views_or_whole_sensor(None, resolution)

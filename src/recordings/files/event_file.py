@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,8 +25,8 @@ class ReadOptions:
     the letters x y p t (other letters are skipped); names in the file do not count then, nor a unit
     in them.  `format`: of a RAW file without a line that says it: evt2, evt21 or evt3.  `stream`:
     number or name of one of several cameras in a file.  `part`: 0, 1, ... of a file whose clock
-    restarts.  Raises ValueError for a value out of range; reading does for one that the file has no
-    use for.
+    restarts.  Raises ValueError for a value out of range or of another kind; reading does for one
+    that the file has no use for.
     """
 
     time_unit: str = "auto"
@@ -36,6 +36,7 @@ class ReadOptions:
     part: int | None = None
 
     def __post_init__(self):
+        _check_option_kinds({field.name: getattr(self, field.name) for field in fields(self)})
         if self.time_unit not in TIME_UNITS:
             raise ValueError(f"time_unit must be auto, s, ms, us or ns, got {self.time_unit}")
         order = self.columns
@@ -51,12 +52,16 @@ class ReadOptions:
         """Return the options from the keys of a config that have their names; raises ValueError
         for one of another kind."""
         given = {field.name: cfg[field.name] for field in fields(cls)}
-        for name, value in given.items():
-            kinds = {"part": (int,), "stream": (int, str)}.get(name, (str,))
-            if value is not None and type(value) not in kinds:
-                expected = {"part": "a whole number", "stream": "a number or a name"}
-                raise ValueError(f"{name} must be {expected.get(name, 'a word')}, got {value}")
+        _check_option_kinds(given)
         return cls(**given)
+
+
+def _check_option_kinds(given: Mapping[str, Any]) -> None:
+    for name, value in given.items():
+        kinds = {"part": (int,), "stream": (int, str)}.get(name, (str,))
+        if value is not None and type(value) not in kinds:
+            expected = {"part": "a whole number", "stream": "a number or a name"}
+            raise ValueError(f"{name} must be {expected.get(name, 'a word')}, got {value}")
 
 
 class RawEvents(NamedTuple):

@@ -17,6 +17,7 @@ from faery.file_encoder import events_to_file
 from src.recordings.files import table_writers
 from src.recordings.files.event_file import PIECE_EVENTS, WidthHeight
 from src.recordings.files.recorded_frames import RecordedFrames
+from src.recordings.files.sensor_size import LARGEST_SIDE
 from src.records.atomic import name_path_in_errors, partial_path
 
 BINARY = {".raw": "evt", ".dat": "dat", ".aedat4": "aedat", ".es": "es"}
@@ -25,9 +26,9 @@ TABLES: dict[str, Callable] = {
     ".h5": table_writers.write_dsec, ".hdf5": table_writers.write_dsec,
     "evreal": table_writers.write_evreal,
 }  # fmt: skip
-VERSIONS = ("evt2", "evt3")
+VERSIONS = (None, "evt2", "evt3")
 LAYOUTS = (None, "evreal")
-MOST_PIXELS = {".raw": 2**11, ".dat": 2**14, "evreal": 2**15}  # of a side, by its bits
+RAW_MOST_PIXELS = 2**11  # of a side, by its bits
 MOST_US = {".dat": 2**32, ".h5": 2**32, ".hdf5": 2**32}  # between the first and the last event
 MOST_ES_US = 2**32  # ES writes all time since 0, a byte for each 127 us without events
 # RAW counts time in 24 and 34 bits; that it went round shows where it falls by more than half.
@@ -36,13 +37,13 @@ MOST_SILENCE_US = {"evt3": 2**23, "evt2": 2**33}
 
 
 def write_events(
-    path: str | Path, events: np.ndarray, *, width: int, height: int, version: str = "evt3"
+    path: str | Path, events: np.ndarray, *, width: int, height: int, version: str | None = None
 ) -> None:
     """Write events (n,) of t, x, y, p, in order of time, in the format of the path's ending.
 
-    Whole numbers, t in us.  `width`, `height`: of the sensor in pixels; `version`: evt2 or evt3,
-    of a `.raw`.  Raises ValueError for other numbers, events that are out of order or off the
-    sensor, a polarity that is not -1 or 1, and what the format cannot hold.
+    Whole numbers, t in us.  `width`, `height`: of the sensor in pixels; `version`: evt2 or evt3
+    (None), of a `.raw`.  Raises ValueError for other numbers, events that are out of order or off
+    the sensor, a polarity that is not -1 or 1, and what the format cannot hold.
     """
     starts = range(0, len(events), PIECE_EVENTS)
     pieces = (events[start : start + PIECE_EVENTS] for start in starts)
@@ -55,7 +56,7 @@ def write_pieces(
     *,
     width: int,
     height: int,
-    version: str = "evt3",
+    version: str | None = None,
     layout: str | None = None,
     frames: RecordedFrames | None = None,
 ) -> tuple[int, float]:
@@ -65,6 +66,7 @@ def write_pieces(
     """
     path = Path(path)
     kind = choose_file_kind(path, layout, width, height, version)
+    version = version or "evt3"
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = partial_path(path)
     _remove(partial)
@@ -84,18 +86,23 @@ def write_pieces(
     return checked.count, checked.span_us * 1e-6
 
 
-def choose_file_kind(path: Path, layout: str | None, width: int, height: int, version: str) -> str:
-    """Return the ending that says how `path` is written, or evreal; raises ValueError for what
-    cannot be, before anything is written."""
+def choose_file_kind(
+    path: Path, layout: str | None, width: int, height: int, version: str | None = None,
+    config_key: str = "path",
+) -> str:  # fmt: skip
+    """Return the ending that says how `path` is written, or evreal; raises ValueError, which names
+    `config_key`, for what cannot be, before anything is written."""
     suffix = path.suffix.lower()
     if layout not in LAYOUTS:
         raise ValueError(f"layout must be null or evreal, got {layout}")
     if version not in VERSIONS:
-        raise ValueError(f"{path}: cannot write {suffix} of version {version}, but evt2 and evt3")
+        raise ValueError(f"version must be null, evt2 or evt3, got {version}")
     kind = "evreal" if layout == "evreal" else suffix
-    if kind not in (*BINARY, *TABLES):
-        known = ", ".join((*BINARY, *TABLES))
-        raise ValueError(f"{path}: cannot write {suffix or 'no ending'}, but {known}")
+    if kind not in (known := (*BINARY, *TABLES)):
+        endings = ", ".join(name for name in known if name[0] == ".")
+        raise ValueError(f"{config_key} must end in one of {endings}, got {path}")
+    if version is not None and kind != ".raw":
+        raise ValueError(f"version must be null, as {path} is no RAW file, got {version}")
     if path.is_dir():
         present = {file.name for file in path.iterdir()}
         if kind != "evreal" or table_writers.EVREAL_TIMES not in present:
@@ -104,7 +111,7 @@ def choose_file_kind(path: Path, layout: str | None, width: int, height: int, ve
             raise ValueError(f"{path}: must hold no other files than EVREAL's, got {min(more)}")
     if kind == "evreal" and path.is_file():
         raise ValueError(f"{path}: layout=evreal writes a folder, this is a file already")
-    if max(width, height) > (most := MOST_PIXELS.get(kind, 2**16)):
+    if max(width, height) > (most := RAW_MOST_PIXELS if kind == ".raw" else LARGEST_SIDE):
         raise ValueError(f"{path}: {kind} holds sides up to {most}, got {width}x{height}")
     return kind
 

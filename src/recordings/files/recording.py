@@ -39,6 +39,7 @@ from src.recordings.files.rosbag_file import RosbagFile, is_bag_folder
 from src.recordings.files.sensor_size import (
     MAX_SIDE,
     MOST_OUTSIDE,
+    check_sensor_size,
     choose_size,
     describe_oversized_coordinates,
     find_swapped_size,
@@ -106,6 +107,8 @@ def open_recording(
     is a size that the file states and its events or `sensor_size` contradict.
     Raises ValueError for a file that is missing, empty, of an unknown kind or cannot be read.
     """
+    if not isinstance(options, ReadOptions):
+        raise ValueError(f"options must be ReadOptions(...), got {options}")
     path = Path(path)
     if find_folder_reader(path) is None and (not path.is_file() or path.stat().st_size == 0):
         raise ValueError(f"recording must be an event file, got {path}: {_why_not_a_file(path)}")
@@ -113,9 +116,7 @@ def open_recording(
     kept, survey, swapped = _open_and_survey(path, state.st_mtime_ns, state.st_size, options)
     file = _open_file(path, options) if kept is None else copy(kept)
     file.kept_times = survey.times
-    if sensor_size is not None and np.shape(sensor_size) != (2,):
-        raise ValueError(f"sensor_size must be (height, width), got {sensor_size}")
-    given = None if sensor_size is None else (sensor_size[1], sensor_size[0])
+    given = None if sensor_size is None else check_sensor_size(sensor_size)
     file.assume_size(given)
     size, lines = choose_size(path, given, file.size, swapped)
     recording = EventRecording(path, size, options, file, survey, lines)
@@ -152,8 +153,13 @@ def iter_events(
     left out, in the memory of one chunk.  Raises as `read_events` does."""
     if not 1e-6 <= seconds <= 1e6:
         raise ValueError(f"seconds must be in [1e-6, 1e6], got {seconds}")
+    yield from cut_chunks(open_recording(path, sensor_size, options), seconds)
+
+
+def cut_chunks(pieces: Iterable[np.ndarray], seconds: float) -> Iterator[np.ndarray]:
+    """Yield the events of `pieces`, in order of time, as `iter_events` does those of a file."""
     span, start, held = round(seconds * 1e6), None, []
-    for events in open_recording(path, sensor_size, options):
+    for events in pieces:
         start = int(events["t"][0]) if start is None else start
         while len(events):
             cut = count_before(events, start + span)

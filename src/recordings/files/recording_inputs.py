@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
 from pathlib import Path
 
 import h5py
@@ -11,6 +10,7 @@ from jaxtyping import Float
 
 from src.recordings.files import recording
 from src.recordings.files.event_file import HeightWidth, ReadOptions
+from src.recordings.files.hdf5_file import HDF5_ENDINGS, check_hdf5_safety, find_streams
 from src.recordings.files.recorded_frames import find_frames
 from src.recordings.files.videos import read_gray_picture, read_video
 from src.recordings.views import Views, load_views, views_or_whole_sensor
@@ -42,8 +42,7 @@ def find_sensor_size(
 
     Raises ValueError where none says.
     """
-    given = (sensor[0], sensor[1]) if sensor is not None else None
-    opened = recording.open_recording(path, given, options)
+    opened = recording.open_recording(path, sensor, options)
     if opened.size is not None:
         return opened.size[::-1]
     if in_views is not None:
@@ -96,12 +95,21 @@ def read_picture_or_event_counts(
 
 
 def has_events(path: Path | str) -> bool:
-    """Return whether `path` is none of: folder of pictures, picture, film, our `video.h5`."""
+    """Return whether `path` is none of: folder of pictures, picture, film, our `video.h5`.  Of HDF5
+    with `frames` and events these are read: a warning says so."""
     path = Path(path)
     if path.is_dir() or path.suffix.lower() in PICTURE_SUFFIXES | VIDEO_SUFFIXES:
         return recording.find_folder_reader(path) is not None
-    try:
-        with h5py.File(path) if path.suffix.lower() == ".h5" else nullcontext({}) as file:
-            return "frames" not in file
-    except OSError:
+    if path.suffix.lower() not in HDF5_ENDINGS:
         return True
+    try:
+        with h5py.File(path) as file:
+            if "frames" not in file:
+                return True
+            check_hdf5_safety(file)
+            has_streams = bool(find_streams(file))
+    except (OSError, ValueError):  # said when it is read
+        return True
+    if has_streams:
+        warnings.warn(f"{path}: read are its events, not its frames", stacklevel=1)
+    return has_streams or path.suffix.lower() != ".h5"

@@ -1,17 +1,30 @@
 """The sides of a recording's sensor: what the user or the file states, and what the events show."""
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from src.recordings.files.event_file import EventFile, RawEvents, WidthHeight
 
 MAX_SIDE = 2**16  # pixels: coordinates have 16 bits
+LARGEST_SIDE = 8192  # pixels of a sensor
 WIDEST = 4096  # pixels of a sensor
 SWAPPED_SHARE = 0.01  # of the first events outside that show width and height exchanged
 MOST_OUTSIDE = 0.5  # of all events, from which on a recording is refused
+
+
+def check_sensor_size(given: Any) -> WidthHeight:
+    """Return `given`, (height, width), as (width, height); raises ValueError unless it is two whole
+    numbers in 1..LARGEST_SIDE."""
+    sides = list(given) if isinstance(given, Sequence | np.ndarray) else []
+    is_whole = all(isinstance(side, int | np.integer) for side in sides)
+    if len(sides) != 2 or not is_whole or not all(1 <= side <= LARGEST_SIDE for side in sides):
+        wanted = f"(height, width), whole numbers in 1..{LARGEST_SIDE}"
+        raise ValueError(f"sensor_size must be {wanted}, got {given}")
+    return int(sides[1]), int(sides[0])
 
 
 def find_swapped_size(file: EventFile, pieces: Iterable[RawEvents]) -> WidthHeight | None:
@@ -54,8 +67,8 @@ def choose_size(
     size = given or swapped or stated
     if size is None:
         return None, ()
-    if not all(1 <= side <= MAX_SIDE for side in size):
-        raise ValueError(f"{path}: a sensor's sides must be in 1..{MAX_SIDE}, got {size}")
+    if not all(1 <= side <= LARGEST_SIDE for side in size):
+        raise ValueError(f"{path}: a sensor's sides must be in 1..{LARGEST_SIDE}, got {size}")
     if stated in (None, size):
         return size, ()
     (width, height), said = size, f"{path}: states a sensor of {_text(stated)}"

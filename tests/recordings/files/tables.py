@@ -11,7 +11,7 @@ TABLES = (".txt", ".csv", ".npz", ".h5", ".hdf5")
 
 
 def write_events(
-    path: Path, events: np.ndarray, *, width: int, height: int, version: str = "evt3"
+    path: Path, events: np.ndarray, *, width: int, height: int, version: str | None = None
 ) -> None:
     """Write events (t x y p) in the format of the path's ending."""
     if path.suffix in TABLES:

@@ -115,11 +115,13 @@ def test_events_off_the_sensor_or_in_fractions_are_refused(tmp_path, ending, kin
 @pytest.mark.parametrize(
     ("name", "how", "words"),
     [
-        ("a.mp4", {}, "cannot write .mp4"),
-        ("a", {}, "cannot write no ending"),
-        ("a.raw", {"version": "evt4"}, "of version evt4"),
+        ("a.mp4", {}, r"path must end in one of .raw, .*, .hdf5, got .*a.mp4"),
+        ("a", {}, "path must end in one of .raw, .*, .hdf5, got .*a$"),
+        ("a.raw", {"version": "evt4"}, "version must be null, evt2 or evt3, got evt4"),
+        ("a.csv", {"version": "evt2"}, "version must be null, as .*a.csv is no RAW file, got evt2"),
         ("a.h5", {"layout": "dsec"}, "layout must be null or evreal, got dsec"),
         ("a.raw", {"width": 2049}, "sides up to 2048, got 2049x480"),
+        ("a.csv", {"width": 8193}, "sides up to 8192, got 8193x480"),
         ("taken", {"layout": "evreal"}, "is a folder already"),
         ("file.h5", {"layout": "evreal"}, "writes a folder, this is a file already"),
     ],

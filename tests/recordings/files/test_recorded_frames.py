@@ -4,6 +4,7 @@ import json
 import warnings
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 
@@ -47,6 +48,20 @@ def test_events_and_frames_of_each_layout(written):
     assert np.allclose(beside.times_us, FRAME_US - zero, rtol=0, atol=0.01)
     for _ in range(2):  # as often as wanted
         assert np.array_equal(np.stack(list(beside.pictures())), frames)
+
+
+@pytest.mark.parametrize("ending", ["h5", "hdf5"])
+def test_of_events_and_an_array_of_frames_the_events_are_read(tmp_path, ending):
+    path, events = tmp_path / f"cap.{ending}", make_events()
+    with h5py.File(path, "w") as file:
+        file.create_group("events").update({name: events[name] for name in "txyp"})
+        file["frames"] = make_frames()
+    with pytest.warns(UserWarning, match=f"cap.{ending}: read are its events, not its frames"):
+        counts = recording_inputs.read_picture_or_event_counts(path, SIZE)
+    assert counts.sum() == len(events)
+    with h5py.File(path, "a") as file:
+        del file["events"]
+    assert recording_inputs.has_events(path) == (ending == "hdf5")  # a film ends in .h5
 
 
 def test_each_layout_becomes_evreals(written, tmp_path, convert):  # noqa: F811

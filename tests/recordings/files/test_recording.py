@@ -157,7 +157,7 @@ def test_a_missing_file_is_named(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("a.csv", b"9" * 30 + b",1\nt,x,y,p\n5,3,3,1\n", "sides must be in 1..65536"),
+        ("a.csv", b"9" * 30 + b",1\nt,x,y,p\n5,3,3,1\n", "sides must be in 1..8192"),
         ("a.aedat4", b"#!AER-DAT4.0\r\n\xb4\x00\x00{" + bytes(99), "longer than the file"),
     ],
 )

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from src.recordings.files import open_recording, read_events, recording_inputs
+from src.recordings.files.sensor_size import check_sensor_size
 from tests.recordings.files.bags import Bag
 from tests.recordings.files.tables import write_events
 from tests.recordings.files.test_recording import made_up
@@ -69,6 +70,20 @@ def test_the_users_size_comes_before_the_files(tmp_path):
         assert recording_inputs.find_sensor_size(tmp_path / "a.raw", [480, 640]) == (480, 640)
 
 
+@pytest.mark.parametrize(
+    "wrong", [480, "480x640", (480.5, 640.0), (480, 640, 3), (0, 640), (8193, 640), ((1,), (2, 3))]
+)
+def test_a_size_that_is_none_is_refused(wrong):
+    words = r"sensor_size must be \(height, width\), whole numbers in 1\.\.8192, got"
+    with pytest.raises(ValueError, match=words):
+        check_sensor_size(wrong)
+
+
+@pytest.mark.parametrize("given", [(480, 8192), [480, 8192], np.array([480, 8192])])
+def test_a_size_may_be_any_sequence(given):
+    assert check_sensor_size(given) == (8192, 480)
+
+
 def test_a_few_events_outside_exchange_nothing(tmp_path):
     events = made_up()
     events["x"], events["y"] = events["x"] % 300, events["y"] % 300
@@ -108,7 +123,9 @@ def test_parts_of_a_pixel_without_frames_are_told_of(tmp_path):
 def test_the_former_size_is_refused_with_its_new_name(tmp_path):
     (tmp_path / "a.csv").write_text("t,x,y,p\n" + "".join(f"{n},{n},1,1\n" for n in range(9)))
     for wrong in ((480,), [480, 640, 1]):
-        with pytest.raises(ValueError, match=r"sensor_size must be \(height, width\), got"):
+        with pytest.raises(
+            ValueError, match=r"sensor_size must be \(height, width\), whole .*, got"
+        ):
             read_events(tmp_path / "a.csv", sensor_size=wrong)
     with pytest.raises(ValueError, match=r"is now sensor_size=\(height, width\), got \(640, 480\)"):
         read_events(tmp_path / "a.raw", size=(640, 480))
