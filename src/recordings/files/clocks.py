@@ -9,7 +9,7 @@ import numpy as np
 from src.recordings.files.event_file import PIECE_EVENTS, RawEvents
 
 BLOCK_BYTES = 2**20
-LEAST_ZEROS = 64  # bytes at the end that are no events: room that was never written
+LEAST_ZEROS = 64  # bytes at the end that are no events, but were never written
 
 
 def read_whole_words(
@@ -26,7 +26,8 @@ def read_whole_words(
                 warnings.warn(f"{path}: ends within an event, it is truncated", stacklevel=4)
             yield block[: len(block) - cut]
     if zeros:
-        warn_of_zeros(path, zeros)
+        line = f"{path}: its last {zeros} bytes are zeros, left out: it is truncated"
+        warnings.warn(line, stacklevel=4)
 
 
 def find_end_before_zeros(path: Path, start: int) -> tuple[int, int]:
@@ -43,12 +44,6 @@ def find_end_before_zeros(path: Path, start: int) -> tuple[int, int]:
                 break
     zeros = whole - end if whole - end >= LEAST_ZEROS else 0
     return max(0, whole - zeros - start), zeros
-
-
-def warn_of_zeros(path: Path, zeros: int) -> None:
-    """Tell the user of `zeros` bytes of 0 at the end of a file, which are left out."""
-    line = f"{path}: its last {zeros} bytes are zeros, left out: it is truncated"
-    warnings.warn(line, stacklevel=4)
 
 
 class TimestampUnwrapper:

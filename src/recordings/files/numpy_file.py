@@ -175,8 +175,9 @@ def _columns_of(
         columns = {name: _flat(extract_column(name, key, file[key])) for name, key in keys.items()}
         if any(column.ndim != 1 for column in columns.values()):
             raise ValueError("columns must have one dimension")
-        times = find_time_names(file.files)
-        require_one_time([name for name in times if file[name].size == len(columns["t"])])
+        others = [name for name in find_time_names(file.files) if name != keys["t"]]
+        count = len(columns["t"])
+        require_one_time([keys["t"], *(name for name in others if file[name].size == count)])
         return columns, file.files, ()
     for is_called_events in (True, False):
         names = [name for name in file.files if ("event" in name.lower()) == is_called_events]

@@ -30,7 +30,7 @@ LEAST_SIDE = 16  # px, of a sensor whose size stands alone in a comment
 TO_BLANKS = str.maketrans({",": " ", ";": " "})
 QUOTES = str.maketrans("", "", "\"'")
 HEIGHT, WIDTH = r"(?:height|h|rows?)", r"(?:width|w|columns?|cols?)"
-WHOSE = r"(?:\bthe|sensor|camera|image|frame|array|event|(?:davis|dvs|evk|gen|imx)\w*)"
+WHOSE = r"(?:\bthe|sensor|camera|image|frame|array|event|\b(?:davis|dvs|evk|gen|imx)[^\W_]*)"
 BETWEEN = rf"(?:{HEIGHT}|{WIDTH}|x|by|px|pixels?|in|is|of|the|sensor|camera)"
 UNIT = r"(?:bytes|[kmg]?b|[nuµm][ms]|events|lines)"
 GEOMETRY = re.compile(  # no other words, as in `file size 1024 2048` or `size of file 123 456`
@@ -208,7 +208,7 @@ def _puts_y_first(text: str) -> bool:
     """Return whether a text names t, x, y and p, y before x, as `each row is (t, y, x, p)` does."""
     words: list[str] = []
     for word in re.findall(r"[^\W_]+", re.sub(r"\d\s*x\s*\d", " ", text.lower())):
-        words += word if sorted(word) == [*"ptxy"] else [word]  # tyxp
+        words += word if len(word) == 4 and {*word} == {*"txyp"} else [word]  # tyxp
     places = {
         letter: next((k for k, word in enumerate(words) if word in known), -1)
         for letter, known in IN_PROSE.items()
