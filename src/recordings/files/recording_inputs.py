@@ -111,5 +111,5 @@ def has_events(path: Path | str) -> bool:
     except (OSError, ValueError):  # said when it is read
         return True
     if has_streams:
-        warnings.warn(f"{path}: read are its events, not its frames", stacklevel=1)
+        warnings.warn(f"{path} holds events and frames: its events are used", stacklevel=1)
     return has_streams or path.suffix.lower() != ".h5"
