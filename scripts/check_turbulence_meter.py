@@ -214,8 +214,11 @@ def measure_again(
     again = measure_or_refusal(simulate_footage(picture, draw_from_measurement(found, k), k)[0])
     if isinstance(again, str):
         return {}
-    pairs = {key: (getattr(again.found, key), getattr(found, key)) for key in KEYS}
-    return {f"again {key}": _number(two) / _number(one) for key, (two, one) in pairs.items()}
+    ratios = {}
+    for key in KEYS:
+        one, two = (_number(getattr(each, key)) for each in (found, again.found))
+        ratios[f"again {key}"] = two / one if one else math.nan
+    return ratios
 
 
 def tilt_correlation_time_s(path: Atmosphere) -> float:
