@@ -90,7 +90,7 @@ def test_what_is_odd_is_on_the_live_page(joined, tmp_path):
     with pytest.warns(UserWarning, match="clock restarts"):
         server = build_server(config("live", tmp_path / "run", *given))
     (line,) = server.page.player.reader.faults.current()
-    assert "its clock restarts, read is part=0 of 2 (0: 1500 events" in line
+    assert "part=0 of 2 is read (0: 1500 events" in line
 
 
 def test_a_recording_of_nothing_says_so(tmp_path):

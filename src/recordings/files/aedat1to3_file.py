@@ -79,13 +79,16 @@ class Aedat1To3File(EventFile):
     def assume_size(self, size: WidthHeight | None) -> None:
         if self._version == "3.1" or not (self._is_guess and self._camera):
             return
-        self.size, self.notes = size or SENSORS[self._camera], ()
-        if size is None:
-            fitting = "x".join(map(str, SENSORS[self._camera]))
-            self.notes = (
-                f"{self.path}: names no camera, its addresses fit one of {fitting}; "
-                "if it is another, give sensor_size=[height,width]",
-            )
+        width, height = guess = SENSORS[self._camera]
+        self.size = guess
+        hint = "; if it is another, give sensor_size=[height,width]"
+        if size is not None:
+            is_davis = size in SENSORS.values() and self._camera.startswith("davis")
+            if is_davis and size[0] >= width and size[1] >= height:
+                self.size = size
+            hint = ""
+        fitting = f"its addresses fit a sensor of {width}x{height}"
+        self.notes = (f"{self.path}: names no camera, {fitting}{hint}",)
 
     def pieces(self) -> Iterator[RawEvents]:
         """Yield the events; warns of a file that ends within one; raises ValueError for a file of

@@ -75,14 +75,12 @@ def find_time_names(names: Iterable[str]) -> list[str]:
     return [name for name in names if {_bare(name), UNIT.sub("", _bare(name))} & {*NAMES["t"]}]
 
 
-def require_one_time(times: Sequence[str]) -> None:
+def require_one_time(times: Sequence[str], *, of_a_table: bool = False) -> None:
     """Raise ValueError for several names of columns that may be the times; seconds and their
-    fraction are left to `parse_time_column_unit`."""
+    fraction are left to `parse_time_column_unit`.  `of_a_table`: `columns=` may choose one."""
     if len(times) > 1 and "s" not in map(parse_unit_suffix, times):
-        raise ValueError(
-            f"times must be one column, got {', '.join(times)}; rename one, or give columns= "
-            "for a table"
-        )
+        way = "rename one, or give columns=" if of_a_table else "rename one"
+        raise ValueError(f"times must be one column, got {', '.join(times)}; {way}")
 
 
 def find_keys_by_name(names: Iterable[str]) -> dict[str, str] | None:

@@ -29,13 +29,13 @@ class EsFile(EventFile):
         """Yield the events; warns of a file that ends within one or in zeros, which are left out;
         raises ValueError for one that cannot be decoded."""
         _, zeros = find_end_before_zeros(self.path, HEADER_BYTES)
-        whole, missing = _count_events(self.path)
+        whole = _count_events(self.path)[0] if zeros else 0
         with name_file_in_errors(self.path, "cannot be decoded"):
             for found in self._decoder:
                 events = found[:whole] if zeros else found
                 whole -= len(events)
                 yield RawEvents(events["t"].view("i8"), events["x"], events["y"], events["on"])
-        if missing and not zeros:
+        if not zeros and _count_events(self.path)[1]:
             warnings.warn(f"{self.path}: ends within an event, it is truncated", stacklevel=2)
 
 

@@ -239,11 +239,12 @@ class EventSorter:
             reach = f"up to {self.most_late_us * 1e-6:.3g} s"
             yield f"{path}: {self.late} of {self.count} events {reach} out of order, sorted"
         if len(self.parts) > 1 and part is None:
+            why = "its clock restarts or leaps by more than an hour"
             lengths = ", ".join(
                 f"{k}: {one.count} events, {(one.last_us - one.first_us) * 1e-6:.3g} s"
                 for k, one in enumerate(self.parts[:10])
             )
-            yield f"{path}: its clock restarts, read is part=0 of {len(self.parts)} ({lengths})"
+            yield f"{path}: {why}, part=0 of {len(self.parts)} is read ({lengths})"
 
 
 def merge_in_time(ones: Iterator[np.ndarray], others: Iterator[np.ndarray]) -> Iterator[np.ndarray]:

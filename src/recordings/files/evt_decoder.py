@@ -11,7 +11,10 @@ WORD_ORDERS = ("little", "legacy", "big")  # of EVT2.1; legacy: the halves excha
 EVT21_KINDS = (0, 1, 8, 10, 14, 15)  # of words, of EVT2 too
 EVT3_KINDS = (0, 2, 3, 4, 5, 6, 7, 8, 10, 14, 15)
 FEW_KNOWN, MOST_KNOWN = 0.9, 0.99  # of the words: below and above they are of another format
-MOST_STRANGE = 0.01  # of the words of a block: more are no words, as after a byte that is lost
+# Of the last words of a block: more of no kind, and of so many kinds or so large a share, are no
+# words, as after a byte that is lost.  Words of a kind that only a camera knows are few.
+LAST_WORDS, MOST_STRANGE, STRANGE_SHARE = 2**12, 0.01, 0.3
+STRANGE_KINDS = {"evt2": 3, "evt21": 2, "evt3": 3}
 
 
 class EvtDecoder:
@@ -46,14 +49,18 @@ class EvtDecoder:
         return RawEvents(*(part[:count] for part in events))
 
     def count_sound_words(self, whole_words: bytes) -> int:
-        """Return how many words come before the first one of no kind, where more than MOST_STRANGE
-        are of none; else all."""
+        """Return how many words come before the first one of no kind, where the last ones are no
+        words; else all."""
         if self.kind == "evt3":
-            known = np.isin(np.arange(16), EVT3_KINDS)[np.frombuffer(whole_words, "<u2") >> 12]
+            words, known, kind_at = np.frombuffer(whole_words, "<u2"), EVT3_KINDS, 12
         else:
-            known = np.isin(np.arange(16), EVT21_KINDS)[self._halves(whole_words)[0] >> 28]
-        is_sound = known.mean() >= 1 - MOST_STRANGE if len(known) else True
-        return len(known) if is_sound else int(known.argmin())
+            words, known, kind_at = self._halves(whole_words)[0], EVT21_KINDS, 28
+        last = words[-LAST_WORDS:] >> kind_at
+        strange = last[~np.isin(last, known)]
+        share, kinds = len(strange) / max(len(last), 1), len(np.unique(strange))
+        if share <= MOST_STRANGE or (kinds < STRANGE_KINDS[self.kind] and share < STRANGE_SHARE):
+            return len(words)
+        return int(np.isin(words >> kind_at, known).argmin())
 
     def _halves(self, block: bytes) -> tuple[np.ndarray, np.ndarray]:
         """Return the upper and lower 32 bits of each word, of EVT2 the word and a mask of one."""

@@ -105,7 +105,7 @@ def split_table(table: Any, order: str | None) -> dict[str, Any]:
         table = _flat(table) if names else table.T if has_event_per_column(table) else table
     if names is not None:
         keys = find_keys_by_name(names) if order is None else _name_fields(names, order)
-        require_one_time(find_time_names(names) if order is None else ())
+        require_one_time(find_time_names(names) if order is None else (), of_a_table=True)
         if keys is None or table.ndim != 1:
             raise ValueError(f"fields must be t, x, y, p of one dimension, got {', '.join(names)}")
         return {

@@ -119,8 +119,9 @@ class PropheseeFile(EventFile):
             at, found = at + sound, found + len(events.t)
             yield events
             if sound < len(block):
-                line = f"{self.path}: its words are no {kind.upper()} from byte {at} on, left out"
-                warnings.warn(f"{line}: is a byte lost?", stacklevel=3)
+                left = f"its last {self.path.stat().st_size - at} bytes are left out"
+                line = f"{self.path}: its words are no {kind.upper()} from byte {at} on: {left}"
+                warnings.warn(f"{line}; is a byte lost, or format= another?", stacklevel=3)
                 break
         if not found and decoder.triggers:
             raise ValueError(f"{self.path}: holds no events, only {decoder.triggers} triggers")

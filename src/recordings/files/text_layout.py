@@ -6,6 +6,7 @@ import re
 import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path, PureWindowsPath
 from typing import Any, NamedTuple
 
@@ -26,19 +27,32 @@ WORDS = {"true": "1", "false": "0", "on": "1", "off": "0"}  # of polarity
 CUT = b" cut"  # what a packed text ends in where its file is cut: its last line is no event
 TITLE = re.compile(r"^(?:columns?|format|order|fields|header)\s*[:=]\s*", re.IGNORECASE)
 IN_PROSE = {"t": NAMES["t"], "x": ("x", "xs"), "y": ("y", "ys"), "p": ("p", "pol", "polarity")}
+LETTERS = {name: letter for letter, names in IN_PROSE.items() for name in names}
+# A name as in `t`, `t [us]`, `<t>` or `t=timestamp`, and what stands between two of a list.
+LISTED = re.compile(
+    rf"(?<![^\W_])({'|'.join(map(re.escape, LETTERS))})(?![^\W_])"
+    r"(?:\s{0,9}=\s{0,9}[a-z]+)?(?:\s{0,9}[\[(]\s{0,9}[a-z]+\s{0,9}[\])])?"
+)
+BETWEEN = re.compile(r"[\s,;|/<>()\[\]_-]+")
 LEAST_SIDE = 16  # px, of a sensor whose size stands alone in a comment
 TO_BLANKS = str.maketrans({",": " ", ";": " "})
 QUOTES = str.maketrans("", "", "\"'")
-HEIGHT, WIDTH = r"(?:height|h|rows?)", r"(?:width|w|columns?|cols?)"
-WHOSE = r"(?:\bthe|sensor|camera|image|frame|array|event|\b(?:davis|dvs|evk|gen|imx)[^\W_]*)"
-BETWEEN = rf"(?:{HEIGHT}|{WIDTH}|x|by|px|pixels?|in|is|of|the|sensor|camera)"
-UNIT = r"(?:bytes|[kmg]?b|[nuµm][ms]|events|lines)"
-GEOMETRY = re.compile(  # no other words, as in `file size 1024 2048` or `size of file 123 456`
-    rf"(?:^|[^\w\s]\s*|{WHOSE}[\s_-]*)(?:geometry|resolution|size)(?:[^\w.]|\b{BETWEEN}\b)*?"
-    rf"(\d+)(?:\s*(?:(?:[x,;*]|by|{HEIGHT}|{WIDTH})[\s=:]*)+|\s+)(\d+)"
-    rf"(?!\d|\.\d|\s*{UNIT}\b)(?:[)\]]?\s*\([^)]*\))?",
+HEIGHT, WIDTH = r"\b(?:height|h|rows?)\b", r"\b(?:width|w|columns?|cols?)\b"
+HEIGHT_FIRST = re.compile(rf"{HEIGHT}\s{{0,9}}(?:[,x*]|by|\s)\s{{0,9}}{WIDTH}", re.IGNORECASE)
+# What a size may be of that is none of the sensor, and units that such a one has.
+OTHERS = (
+    r"(?:file|chunk|pixel|buffer|batch|block|window|page|packet|memory|screen|header|"
+    r"time(?:stamp)?|temporal)"
+)
+UNIT = r"(?:bytes|[kmg]b|[nuµm][ms])"
+GEOMETRY = re.compile(
+    rf"(?:geometry|resolution|size)(\D{{0,80}})(?<![\d.])(\d+)"
+    rf"(?:\s{{0,9}}(?:(?:[x,;*]|by|height|width)[\s=:]{{0,9}}){{1,3}}|\s{{1,9}})(\d+)"
+    rf"(?!\d|\.\d|\s{{0,9}}{UNIT}\b)[)\]]?(?:\s{{0,9}}\(([^()]{{0,40}})\))?",
     re.IGNORECASE,
 )
+OF_OTHERS = re.compile(rf"{OTHERS}[\s_-]*$", re.IGNORECASE)
+ARE_OTHERS = re.compile(rf"\s*of\s+(?:the\s+)?{OTHERS}\b", re.IGNORECASE)
 
 
 class TextLayout(NamedTuple):
@@ -205,15 +219,20 @@ def _find_unknown(headers: list[tuple[str, list[str]]], width: int) -> tuple[str
 
 
 def _puts_y_first(text: str) -> bool:
-    """Return whether a text names t, x, y and p, y before x, as `each row is (t, y, x, p)` does."""
-    words: list[str] = []
-    for word in re.findall(r"[^\W_]+", re.sub(r"\d\s*x\s*\d", " ", text.lower())):
-        words += word if len(word) == 4 and {*word} == {*"txyp"} else [word]  # tyxp
-    places = {
-        letter: next((k for k, word in enumerate(words) if word in known), -1)
-        for letter, known in IN_PROSE.items()
-    }
-    return min(places.values()) >= 0 and places["y"] < places["x"]
+    """Return whether a text lists t, x, y and p, y before x, as `each row is (t, y, x, p)` does."""
+    text = text.lower()
+    found = list(LISTED.finditer(text))
+    orders = ["".join(LETTERS[one[1]] for one in four) for four in _lists_of_four(found, text)]
+    orders += [word for word in re.findall(r"[^\W_]+", text) if len(word) == 4]  # tyxp
+    return any({*order} == {*"txyp"} and order.index("y") < order.index("x") for order in orders)
+
+
+def _lists_of_four(found: list[re.Match], text: str) -> Iterator[list[re.Match]]:
+    for k in range(len(found) - 3):
+        four = found[k : k + 4]
+        gaps = [text[one.end() : other.start()] for one, other in pairwise(four)]
+        if all(BETWEEN.fullmatch(gap) for gap in gaps):
+            yield four
 
 
 def _stated_size(line: str) -> WidthHeight | None:
@@ -222,15 +241,23 @@ def _stated_size(line: str) -> WidthHeight | None:
     sides = dict(re.findall(r"\b([xy])@(\d+)", line))
     if len(sides) == 2:
         return int(sides["x"]), int(sides["y"])
-    if match := GEOMETRY.search(line):
-        labels = (re.search(rf"\b{side}\b", match[0], re.IGNORECASE) for side in (HEIGHT, WIDTH))
-        height, width = (label.start() if label else -1 for label in labels)
-        is_height_first = 0 <= height < width
-        return (int(match[2]), int(match[1])) if is_height_first else (int(match[1]), int(match[2]))
+    for match in GEOMETRY.finditer(line):
+        before = line[max(0, match.start() - 12) : match.start()]
+        if not (OF_OTHERS.search(before) or ARE_OTHERS.match(match[1])):
+            return _in_order(match)
     alone = re.fullmatch(r"(\d+)[\s,;x]+(\d+)", line.lstrip("#% "))
     if alone is None or (line[0] in "#%" and min(int(alone[1]), int(alone[2])) < LEAST_SIDE):
         return None
     return int(alone[1]), int(alone[2])
+
+
+def _in_order(match: re.Match) -> WidthHeight:
+    """Return (width, height) of a GEOMETRY; height first where the labels before the numbers, those
+    in brackets behind them or that of each number say so."""
+    labelled = re.search(rf"{HEIGHT}[\s=:]*$", match[1], re.IGNORECASE) is not None
+    labelled |= HEIGHT_FIRST.search(match[1]) is not None
+    labelled |= HEIGHT_FIRST.fullmatch((match[4] or "").strip()) is not None
+    return (int(match[3]), int(match[2])) if labelled else (int(match[2]), int(match[3]))
 
 
 def _split_title(title: str) -> list[str]:

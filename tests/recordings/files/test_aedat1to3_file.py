@@ -1,7 +1,6 @@
 """AEDAT 1.0, 2.0 and 3.1: addresses put together here by the formats' own tables."""
 
 import struct
-import warnings
 
 import numpy as np
 import pytest
@@ -86,11 +85,15 @@ def test_a_stated_size_counts_for_a_file_that_names_no_camera(tmp_path):
     events = events[(events["x"] >= 110) & (events["y"] >= 85)]  # they fit a DAVIS240, too
     path = tmp_path / "a.aedat2"
     path.write_bytes(b"#!AER-DAT2.0\r\n" + words(davis(events, 346, 260), events["t"]))
-    with pytest.warns(UserWarning, match="fit one of 240x180; if it is another, give sensor_size"):
+    with pytest.warns(UserWarning, match="fit a sensor of 240x180; if it is another, give "):
         guessed = open_recording(path)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with pytest.warns(UserWarning, match="names no camera"):
         assert np.array_equal(read_events(path, sensor_size=(260, 346)), events)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        larger = read_events(path, sensor_size=(480, 600))  # of no camera that writes such files
+    assert np.array_equal(larger["x"], events["x"] - 106)
+    assert any("states a sensor of 240x180: read as" in str(one) for one in said)
     (found,) = guessed
     assert guessed.size == (240, 180) and np.array_equal(found["x"], events["x"] - 106)
 

@@ -227,6 +227,23 @@ def test_what_comes_after_a_lost_byte_is_left_out(tmp_path, kind):
         assert len(found.t) < 1100 or kind == "evt21"  # of which a word holds up to 32
 
 
+@pytest.mark.parametrize("kind", ["evt2", "evt3"])
+def test_words_that_only_a_camera_knows_are_passed_over(tmp_path, kind):
+    """One word in 20 of a kind that the format does not name, and 4 KiB of noise."""
+    events = made_up(20000)
+    words = ENCODERS[kind](events)
+    strange = {"evt2": 3 << 28, "evt3": 12 << 12}[kind]
+    more = np.insert(words, np.arange(40, len(words), 20), strange)
+    header = b"% geometry 640x480\n"
+    _, found = read(tmp_path / "a.raw", header + more.tobytes(), format=kind)
+    assert np.array_equal(found.t, events["t"])
+    noise = np.random.default_rng(0).bytes(4096)
+    middle = len(words) // 2 * words.itemsize
+    content = words.tobytes()[:middle] + noise + words.tobytes()[middle:]
+    _, found = read(tmp_path / "b.raw", header + content, format=kind)
+    assert np.array_equal(found.x[-100:], events["x"][-100:])  # times leap, and make a part
+
+
 def test_a_file_whose_times_come_after_most_events_is_refused(tmp_path):
     events = made_up(400)
     words = evt2(events)

@@ -56,7 +56,9 @@ def test_of_events_and_an_array_of_frames_the_events_are_read(tmp_path, ending):
     with h5py.File(path, "w") as file:
         file.create_group("events").update({name: events[name] for name in "txyp"})
         file["frames"] = make_frames()
-    with pytest.warns(UserWarning, match=f"cap.{ending} holds events and frames: its events are used"):
+    with pytest.warns(
+        UserWarning, match=f"cap.{ending} holds events and frames: its events are used"
+    ):
         counts = recording_inputs.read_picture_or_event_counts(path, SIZE)
     assert counts.sum() == len(events)
     with h5py.File(path, "a") as file:

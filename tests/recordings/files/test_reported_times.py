@@ -94,7 +94,9 @@ def test_pixel_by_pixel_within_frames_is_sorted(tmp_path):
 def test_two_recordings_in_one_file_are_told_and_chosen(tmp_path):
     parts = scene()[:1000], scene()[300:]
     path = text(tmp_path / "a.txt", np.concatenate(parts))
-    with pytest.warns(UserWarning, match=r"clock restarts.* part=0 of 2 \(0: 1000 .*, 1: 1200 "):
+    with pytest.warns(
+        UserWarning, match=r"clock restarts.* part=0 of 2 is read \(0: 1000 .*, 1: 1200 "
+    ):
         assert np.array_equal(read_events(path), parts[0])
     for part in (0, 1):
         assert np.array_equal(quiet_read(path, part=part), parts[part])

@@ -140,6 +140,12 @@ def test_a_zip_with_backslashes_in_its_names(tmp_path, events):
         ("# resolution = (240, 320) (rows, columns)", (WIDTH, HEIGHT)),
         ("# DAVIS346 resolution: 320 by 240 pixels", (WIDTH, HEIGHT)),
         ("# time resolution: 1e-06 s", None),
+        ("# Device resolution: 320x240", (WIDTH, HEIGHT)),
+        ("# simulated, resolution_px 320 240", (WIDTH, HEIGHT)),
+        ("# The resolution of this sensor is 320x240", (WIDTH, HEIGHT)),
+        ("# geometry 320 240 events 1500", (WIDTH, HEIGHT)),
+        ("# sensor size 320 240 (one event per row, columns t x y p)", (WIDTH, HEIGHT)),
+        ("# resolution 320x240 (rows y, columns x)", (WIDTH, HEIGHT)),
     ],
 )
 def test_only_two_sides_in_a_comment_are_a_sensor_size(tmp_path, events, comment, size):

@@ -142,8 +142,19 @@ def test_y_before_x_in_a_sentence_is_refused(tmp_path, events, head):
     assert_read(tmp_path / "a.txt", events)
 
 
-@pytest.mark.parametrize("head", ["# each row is (t, x, y, p)", "# xypt"])
-def test_x_before_y_in_a_sentence_is_no_fault(tmp_path, events, head):
+@pytest.mark.parametrize(
+    "head",
+    [
+        "# each row is (t, x, y, p)", "# xypt",
+        "# the y axis points down, the x axis right; time in us; polarity 0 or 1",
+        "# Events: time, pixel (y counts from the top, x from the left), polarity",
+        "# t = us, p = polarity, y down, x right", "# dataset: y=480 x=640 p=2 t=0",
+        "# time 10:00; mirrored in y and x; polarity on=1",
+        "# recorded by P. Y. Wang at time 12:00, version 2 x",
+        "# polarity p in {0,1}, y in 0..99, x in 0..127, t in us",
+    ],
+)  # fmt: skip
+def test_x_before_y_or_words_in_no_list_are_no_fault(tmp_path, events, head):
     (tmp_path / "a.txt").write_text(f"{head}\n{lines(events)}")
     assert_read(tmp_path / "a.txt", events)
 
