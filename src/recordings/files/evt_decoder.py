@@ -51,10 +51,9 @@ class EvtDecoder:
     def count_sound_words(self, whole_words: bytes) -> int:
         """Return how many words come before the first one of no kind, where the last ones are no
         words; else all."""
-        if self.kind == "evt3":
-            words, known, kind_at = np.frombuffer(whole_words, "<u2"), EVT3_KINDS, 12
-        else:
-            words, known, kind_at = self._halves(whole_words)[0], EVT21_KINDS, 28
+        is_evt3 = self.kind == "evt3"
+        words = np.frombuffer(whole_words, "<u2") if is_evt3 else self._halves(whole_words)[0]
+        known, kind_at = np.array(EVT3_KINDS if is_evt3 else EVT21_KINDS), 12 if is_evt3 else 28
         last = words[-LAST_WORDS:] >> kind_at
         strange = last[~np.isin(last, known)]
         share, kinds = len(strange) / max(len(last), 1), len(np.unique(strange))

@@ -1,6 +1,7 @@
 """AEDAT 1.0, 2.0 and 3.1: addresses put together here by the formats' own tables."""
 
 import struct
+import warnings
 
 import numpy as np
 import pytest
