@@ -43,7 +43,7 @@ FEW_TIMES = 100
 SAMPLES = 1024  # of a piece
 MAX_TIME_US = 2**62
 COUNTER_BITS = (24, 31, 32)  # of counters that go round
-FALL = 0.96  # of its turn that a counter falls by, at least, before FEW_TIMES others or more
+FALL = 0.98  # of its turn that a counter falls by, at least, before FEW_TIMES others or more
 Range = tuple[float, float]
 
 
