@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from src.app.path_overrides import is_path_key
 from src.app.renamed_keys import describe_unknown_key, flatten_keys
-from src.recordings.files.sensor_size import LARGEST_SIDE
+from src.recordings.sensor_limits import LARGEST_SIDE
 
 NUMBER, WHOLE, WORD, FLAG = "a number", "a whole number", "a word", "true or false"
 LIST, MAPPING, NULL = "a list", "a mapping", "null"

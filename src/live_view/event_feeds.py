@@ -15,7 +15,7 @@ from src.recordings.files import recording_inputs
 from src.recordings.files.clocks import TimestampUnwrapper
 from src.recordings.files.event_file import EVENT, ReadOptions
 from src.recordings.files.recording import EventRecording, cut_chunks, open_recording
-from src.recordings.files.sensor_size import LARGEST_SIDE
+from src.recordings.sensor_limits import LARGEST_SIDE
 from src.recordings.views import HeightWidth
 
 Chunks = Iterator[tuple[np.ndarray, float]]  # events (t x y p), wall time of their arrival in s

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from src.recordings.corner_fold import CornerFold, Points
 from src.recordings.files.event_file import HeightWidth
-from src.recordings.files.sensor_size import LARGEST_SIDE
+from src.recordings.sensor_limits import LARGEST_SIDE
 from src.records import safe_yaml
 from src.records.atomic import write_text
 

@@ -73,7 +73,7 @@ def read_published(path: Path) -> None:
 
 
 def read_config(path: Path) -> None:
-    cfg = OmegaConf.create({"like": str(path)})
+    cfg = OmegaConf.create({"like": str(path), "large": False})
     try:
         found = simulate.take_clip_config_from_run(
             OmegaConf.merge(cfg, dict.fromkeys(simulate.CLIP_KEYS))

@@ -161,13 +161,13 @@ def test_a_file_that_may_not_be_read_is_named(tmp_path):
 
 
 def train_and_lose_a_worker(config: str) -> None:
-    """Run src.train; the loader's worker that simulates clip 8 dies as if out of memory."""
+    """Run src.train; the loader's worker that simulates clip 2 dies as if out of memory."""
     from src.sim.pipeline import Pipeline
 
     draw, main = Pipeline.draw, os.getpid()
 
     def die(self, number: int):
-        if self.split == "train" and number == 8 and os.getpid() != main:
+        if self.split == "train" and number == 2 and os.getpid() != main:
             os.kill(os.getpid(), signal.SIGKILL)
         return draw(self, number)
 

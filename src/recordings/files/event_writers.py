@@ -17,7 +17,7 @@ from faery.file_encoder import events_to_file
 from src.recordings.files import table_writers
 from src.recordings.files.event_file import PIECE_EVENTS, WidthHeight
 from src.recordings.files.recorded_frames import RecordedFrames
-from src.recordings.files.sensor_size import LARGEST_SIDE
+from src.recordings.sensor_limits import LARGEST_SIDE
 from src.records.atomic import name_path_in_errors, partial_path
 
 BINARY = {".raw": "evt", ".dat": "dat", ".aedat4": "aedat", ".es": "es"}
