@@ -119,7 +119,7 @@ def reconstruct_video_frames(
     rule = replace(rule, as_lists=isinstance(runnable, EventListRuntime))
 
     def read() -> Iterator[np.ndarray]:
-        return read_events(cfg, views)
+        return iter_recorded_events(cfg, views)
 
     options = views, rule, cfg.backward_warmup_s
     frames = reconstruction.reconstruct_recording(read, runnable, *options, device=cfg.device)
@@ -133,7 +133,7 @@ def build_window_rule_from_config(cfg: DictConfig, network: EventToVideoNetwork)
     return build_window_rule(length, **{key: cfg[key] for key in RULE_KEYS})
 
 
-def read_events(cfg: DictConfig, views: Views) -> Iterator[np.ndarray]:
+def iter_recorded_events(cfg: DictConfig, views: Views) -> Iterator[np.ndarray]:
     """Yield the events of the recording."""
     options = ReadOptions.from_keys(cfg)
     return recording_inputs.iter_recording(cfg.recording, views.sensor, options=options)
@@ -158,7 +158,7 @@ def reconstruct_film_frames(
     rule = replace(build_window_rule_from_config(cfg, network), bins=1)
     if rule.grows:  # the panel of events shows those of a frame
         rule = replace(rule, frames_per_window=1, grows=False)
-    windows = cut_windows(read_events(cfg, views), build_lookup(centre), rule)
+    windows = cut_windows(iter_recorded_events(cfg, views), build_lookup(centre), rule)
     clean = truth_file.read_clean_clip(Path(cfg.recording))
     frames = join_film_panels(windows, methods, clean)
     first = next(frames)

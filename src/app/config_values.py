@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from src.app.path_overrides import is_path_key
 from src.app.renamed_keys import describe_unknown_key, flatten_keys
-from src.recordings.sensor_limits import LARGEST_SIDE
+from src.recordings.sensor_limits import LARGEST_SIDE, are_sensor_sides
 
 NUMBER, WHOLE, WORD, FLAG = "a number", "a whole number", "a word", "true or false"
 LIST, MAPPING, NULL = "a list", "a mapping", "null"
@@ -199,7 +199,7 @@ def _kinds_like(key: str, default: Any) -> tuple[str, ...]:
 
 
 def _is_size(value: list) -> bool:
-    return len(value) == 2 and all(type(n) is int and 1 <= n <= LARGEST_SIDE for n in value)
+    return len(value) == 2 and {*map(type, value)} == {int} and are_sensor_sides(value)
 
 
 def _is_of(value: Any, kinds: tuple[str, ...]) -> bool:

@@ -3,11 +3,13 @@
 import ctypes
 import os
 import re
-from collections.abc import Sequence
 
 import torch
+from lightning.pytorch.accelerators import CUDAAccelerator
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 
+from src.app.instantiate import as_dict
 from src.deploy.cpu_features import is_bf16_faster
 
 TRIM_THRESHOLD, MMAP_MAX = -1, -4  # of mallopt, in malloc.h
@@ -59,19 +61,15 @@ def uses_cuda_graphs(cfg: DictConfig) -> bool:
 def requested_gpus(cfg: DictConfig) -> list[int]:
     """Return the numbers of the GPUs that `trainer.devices` asks for: so many, a list or all.
 
-    Raises ValueError for what is none of these.
+    Raises ValueError for what is none of these, and for a GPU that is not there.
     """
-    devices = cfg.trainer.devices
-    if devices in ("auto", "-1", -1):
-        return list(range(torch.cuda.device_count()))
-    listed = devices.split(",") if isinstance(devices, str) and "," in devices else devices
+    devices = as_dict(cfg.trainer)["devices"]
     try:
-        if isinstance(listed, Sequence) and not isinstance(listed, str):
-            return [int(number) for number in listed if number != ""]
-        return list(range(int(listed)))
-    except (TypeError, ValueError):
+        return CUDAAccelerator.parse_devices(-1 if devices == "auto" else devices) or []
+    except (TypeError, ValueError, MisconfigurationException) as error:
         wanted = "a number of devices, a list of their numbers or auto"
-        raise ValueError(f"trainer.devices must be {wanted}, got {devices}") from None
+        why = " ".join(str(error).split())
+        raise ValueError(f"trainer.devices must be {wanted}, got {devices}: {why}") from error
 
 
 def first_gpu(cfg: DictConfig) -> int:

@@ -45,9 +45,8 @@ def describe_unknown_key(key: str, keys: Collection[str]) -> str:
     if key in keys and "." in key:
         return f"{key} is no key of the chosen {key.partition('.')[0]}; {LISTED}"
     parent = key.rpartition(".")[0]
-    others = [k for k in keys if k != key]  # a group of other commands
-    hint = _ask_for_nearest(key, [k for k in others if k.rpartition(".")[0] == parent], len(parent))
-    hint = hint or f"; {LISTED}"
+    near = [k for k in keys if k.rpartition(".")[0] == parent and k != key]  # key: another's group
+    hint = _ask_for_nearest(key, near, len(parent)) or f"; {LISTED}"
     return f"{key} is no key of the configuration{hint}"
 
 

@@ -76,10 +76,10 @@ class E2VIDOverEvents:
         output, *self.state = self.remainder([first], self.state)
         return output[0, 0]
 
-    def is_still(self, state: Any) -> bool:
+    def is_settled(self, state: Any) -> bool:
         return True  # see EventToVideoNetwork
 
-    def age(self, state: Any, seconds: float) -> Any:
+    def advance_without_events(self, state: Any, seconds: float) -> Any:
         return state
 
     def reset(self) -> None:

@@ -71,8 +71,8 @@ class Bf16Network(EventToVideoNetwork):
         frame, state = self.inner(seen, state, window_s=window_s, positions=positions)
         return frame.float(), state
 
-    def is_still(self, state: Any) -> bool:
-        return self.inner.is_still(state)
+    def is_settled(self, state: Any) -> bool:
+        return self.inner.is_settled(state)
 
-    def age(self, state: Any, seconds: float) -> Any:
-        return self.inner.age(state, seconds)
+    def advance_without_events(self, state: Any, seconds: float) -> Any:
+        return self.inner.advance_without_events(state, seconds)

@@ -128,13 +128,13 @@ class EventListRuntime:
         height, width = self.size
         return self.runner(begun)[top : top + height, left : left + width].copy()
 
-    def is_still(self, state: Any) -> bool:
+    def is_settled(self, state: Any) -> bool:
         """Return whether, from `state` on, the frame stays as it is until there are events."""
-        return self.runner.is_still(state)
+        return self.runner.is_settled(state)
 
-    def age(self, state: Any, seconds: float) -> Any:
-        """Return `state`, one that `is_still`, advanced in place by `seconds` without events."""
-        return self.runner.age(state, seconds)
+    def advance_without_events(self, state: Any, seconds: float) -> Any:
+        """Return `state`, one that `is_settled`, advanced in place by `seconds` without events."""
+        return self.runner.advance_without_events(state, seconds)
 
     def reset(self) -> None:
         """Forget everything: the next window is the first."""

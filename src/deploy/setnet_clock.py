@@ -82,12 +82,12 @@ class SetNetClock:
         active_tiles, changed_tiles = tiles
         return Tick(active_tiles, update, *smoothed, kept, changed_tiles)
 
-    def is_still(self) -> bool:
+    def is_settled(self) -> bool:
         """Return whether no cell advances until there are events."""
         return not (self.active_tiles.any() and self.activity.any())
 
-    def fade_traces(self, seconds: float) -> None:
-        """Bring a clock that `is_still` forward by `seconds` without events."""
+    def decay_traces(self, seconds: float) -> None:
+        """Bring a clock that `is_settled` forward by `seconds` without events."""
         if self.active_tiles.any():  # of the last window, in which some cells advanced
             self.active_tiles[:], self.elapsed_s[:] = 0, 0
         kept = exp_float32(np.float32(-seconds / cell_clock.TRACE_TAU_S))

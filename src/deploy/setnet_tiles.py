@@ -111,11 +111,11 @@ class SetNetTiles:
         sums = LeakySumState(views, rows, columns, mixtures)
         self.state = SetNetTilesState(clock, sums, TileState(self.network, *self.padded))
 
-    def is_still(self, state: SetNetTilesState | None) -> bool:
-        return state is not None and state.clock.is_still()
+    def is_settled(self, state: SetNetTilesState | None) -> bool:
+        return state is not None and state.clock.is_settled()
 
-    def age(self, state: SetNetTilesState, seconds: float) -> SetNetTilesState:
-        state.clock.fade_traces(seconds)
+    def advance_without_events(self, state: SetNetTilesState, seconds: float) -> SetNetTilesState:
+        state.clock.decay_traces(seconds)
         return state
 
     def __call__(self, pixels: EventPixels) -> Float[np.ndarray, "h w"]:

@@ -15,7 +15,7 @@ from src.recordings.files import recording_inputs
 from src.recordings.files.clocks import TimestampUnwrapper
 from src.recordings.files.event_file import EVENT, ReadOptions
 from src.recordings.files.recording import EventRecording, cut_chunks, open_recording
-from src.recordings.sensor_limits import LARGEST_SIDE
+from src.recordings.sensor_limits import are_sensor_sides
 from src.recordings.views import HeightWidth
 
 Chunks = Iterator[tuple[np.ndarray, float]]  # events (t x y p), wall time of their arrival in s
@@ -71,7 +71,7 @@ def open_feed(
         if lines := opened.messages:
             faults.report("reading", "; ".join(lines), until_cleared=True)
         return FileFeed(opened, size, loop)
-    if sensor is None or not all(1 <= side <= LARGEST_SIDE for side in sensor):
+    if sensor is None or not are_sensor_sides(sensor):
         raise ValueError(
             f"sensor_size must be [height,width] for recording=udp://, got {sensor}; "
             "or give views=, which says it"

@@ -117,8 +117,8 @@ class NetworkRunner:
             self.picture = np.full(self.views.model, 0.5, np.float32)
         if begun is not None:
             self.picture = runtime.finish(begun).clip(0, 1)
-        elif runtime.is_still(runtime.state):
-            runtime.age(runtime.state, window.length_s)
+        elif runtime.is_settled(runtime.state):
+            runtime.advance_without_events(runtime.state, window.length_s)
         elif window.event_list is not None:  # empty: what begins a window can go on meanwhile
             self.picture = runtime.step(*window.event_list, 0.0, window.length_s).clip(0, 1)
         return self.picture

@@ -30,8 +30,8 @@ class EventToVideoNetwork(VideoMethod):
     """A recurrent network from event voxel grids to frames in [0, 1], window by window.
 
     A subclass implements `forward`; `warm_up` and `sequence` may be replaced by faster ones that
-    give the same, `is_still` and `age` by ones that spare it windows without events.  The state, a
-    tensor or nested tuples, lists and dicts of tensors, is never kept inside.
+    give the same, `is_settled` and `advance_without_events` by ones that spare it windows without
+    events.  The state, a tensor or nested tuples, lists and dicts of tensors, is never kept inside.
     `uses_window_length`: whether windows may last longer or shorter than in training;
     `uses_centre_view_only`: whether the other views it is given change nothing.
     """
@@ -60,13 +60,13 @@ class EventToVideoNetwork(VideoMethod):
         """Return the state that `forward` returns, for windows whose frame is not wanted."""
         return self(voxels, state, **options)[1]
 
-    def is_still(self, state: Any) -> bool:
+    def is_settled(self, state: Any) -> bool:
         """Return whether the frame stays as it is until there are events: a network that does not
         use the window's length is not run without events."""
         return not self.uses_window_length
 
-    def age(self, state: Any, seconds: float) -> Any:
-        """Return the state after `seconds` without events, of one that `is_still`."""
+    def advance_without_events(self, state: Any, seconds: float) -> Any:
+        """Return the state after `seconds` without events, of one that `is_settled`."""
         return state
 
     def sequence(

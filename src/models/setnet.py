@@ -214,12 +214,12 @@ class SetNet(EventToVideoNetwork):
             context_smoothed=context_smoothed,
         )  # fmt: skip
 
-    def is_still(self, state: SetNetState | None) -> bool:
+    def is_settled(self, state: SetNetState | None) -> bool:
         """Return whether no clock advances, and so no frame changes, until there are events."""
         return state is not None and not state.activity.any()
 
-    def age(self, state: SetNetState, seconds: float) -> SetNetState:
-        """Return the state after `seconds` without events, of one that `is_still`: traces decay."""
+    def advance_without_events(self, state: SetNetState, seconds: float) -> SetNetState:
+        """Return the state, one that `is_settled`, after `seconds` without events: traces decay."""
         return state._replace(event_trace=state.event_trace * math.exp(-seconds / TRACE_TAU_S))
 
     def stem(

@@ -133,7 +133,7 @@ def reconstruct_frames(
     device: torch.device | str = "cpu",
 ) -> Iterator[Frame]:  # fmt: skip
     """Reconstruct one frame per window; one without events holds the picture, at next to no cost,
-    from where the network `is_still`.
+    from where the network `is_settled`.
 
     `windows` hold lists of events for an EventListRuntime, else grids.  `state`, kept up to date,
     with the rule's `overlapping_windows`, makes this call the continuation of an earlier one.
@@ -142,11 +142,11 @@ def reconstruct_frames(
     for window in windows:
         index = state.state_index(window)
         before = after = state.states[index]
-        if window.events or not network.is_still(before):
+        if window.events or not network.is_settled(before):
             picture, after = _run(network, window, before, positions, device)
             state.picture = picture.clip(0, 1)
         elif window.keeps_state:
-            after = network.age(before, window.length_s)
+            after = network.advance_without_events(before, window.length_s)
         if window.keeps_state:
             state.states[index] = after
         if state.picture is None:

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from src.recordings.corner_fold import CornerFold, Points
 from src.recordings.files.event_file import HeightWidth
-from src.recordings.sensor_limits import LARGEST_SIDE
+from src.recordings.sensor_limits import LARGEST_SIDE, are_sensor_sides
 from src.records import safe_yaml
 from src.records.atomic import write_text
 
@@ -173,7 +173,7 @@ HEADER = """\
 
 def _check_size(key: str, size: HeightWidth, pictures: int = 1) -> None:
     """Raise ValueError, which names `key`, where so many pictures of `size` are too large."""
-    if not all(1 <= side <= LARGEST_SIDE for side in size):
+    if not are_sensor_sides(size):
         raise ValueError(f"{key} must be in 1..{LARGEST_SIDE} pixels, got {size}")
     if pictures * math.prod(size) > MAX_PIXELS:
         got = f"{pictures} x {size}" if pictures > 1 else f"{size}"

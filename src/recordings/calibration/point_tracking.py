@@ -84,8 +84,7 @@ def track_points(
     picture = frames.mean(0)
     rough = np.stack([_optical_flow(picture, frame, place) for frame in frames])
     halves = [_registered(frames[k::2], place, rough[k::2]) for k in (0, 1)]
-    home = _window_centres(len(place))
-    fine = _Windows((halves[0] + halves[1]) / 2, home, place)
+    fine = _Windows((halves[0] + halves[1]) / 2, _window_centres(len(place)), place)
     refined = [_refine(fine, frame, start) for frame, start in zip(frames, rough, strict=True)]
     moved, sharp, explained = map(np.stack, zip(*refined, strict=True))
     seen = explained > MIN_EXPLAINED
@@ -97,7 +96,7 @@ def track_points(
         moved=np.where(seen[..., None], moved.swapaxes(0, 1), 0),
         sharp=np.where(seen, sharp.swapaxes(0, 1), 0),
         texture=fine.texture,
-        curvature=_curvature(halves, home),
+        curvature=_curvature(halves, fine),
         seen=seen,
         window_variance_px2=fine.window_variance_px2,
     )
@@ -129,14 +128,15 @@ def _window_centres(points: int) -> np.ndarray:
     return np.stack([np.full(points, half), np.arange(points) * WINDOW_SIDE + half], axis=1)
 
 
-def _curvature(halves: list[np.ndarray], home: np.ndarray) -> np.ndarray:
-    """Return the product (points,) of gradient and the Laplacian's gradient, in windows of two
-    pictures of the same, whose noise is independent."""
-    v, u = np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1].reshape(2, -1)
-    first, second = halves
-    fields = zip(_gradient(first), _gradient(cv2.Laplacian(second, -1)), strict=True)
-    pairs = [[_sample(field, home, u, v) for field in pair] for pair in fields]
-    return np.sum([ours * theirs for ours, theirs in pairs], axis=(0, 2))
+def _curvature(halves: list[np.ndarray], windows: "_Windows") -> np.ndarray:
+    """Return the product (points,) of gradient and the Laplacian's gradient, in the `windows` of
+    two pictures of the same, whose noise is independent."""
+    fields = (_gradient(halves[0]), _gradient(cv2.Laplacian(halves[1], -1)))
+    ours, theirs = (
+        np.stack([_sample(axis, windows.home, windows.u, windows.v) for axis in field])
+        for field in fields
+    )
+    return (ours * theirs).sum((0, 2))
 
 
 def _refine(

@@ -32,7 +32,7 @@ MIN_HALF_LENGTH_PX = 4.0  # of the frame that is worked on: what JPEG adds is co
 FLICKER_SHARE = 1 / 32  # of the side, deviation of a Gaussian: bands of lamps are wider
 DRAWS = 200
 SHARPEST = 0.1  # the sharpest tenth
-SHARPEST_LACKS = 0.65  # of the blur: 0.4 to 1.1 in clips of D/r0 8 to 1
+SHARPEST_LACKS = 0.65  # of the blur, typically: scripts/check_turbulence_meter.py
 BLUR_OF_WARPS_PX = 0.3  # that tilt alone, stretching what a window shows, is taken for
 FILM_OVER_DECAY = 8.0  # a decay that is more than the film over this is known by its lower bound
 # Share of the power left after taking off a film's mean, of correlation exp(-time / the film).
@@ -145,7 +145,7 @@ def estimate_blur(tracks: PointTracks, size: tuple[int, int]) -> IntervalEstimat
     blur = _estimate("blur_px", _sharpest_lack_px(sums @ np.ones(CELLS**2)) * unit, drawn)
     assert blur.low is not None, "_estimate gives one"
     least = math.sqrt(max(blur.low**2 - BLUR_OF_WARPS_PX**2, ALLOWED["blur_px"][0] ** 2))
-    return blur._replace(low=min(least, blur.low))
+    return blur._replace(low=least)
 
 
 def _sharpest_lack_px(sums: Float[np.ndarray, "4"]) -> float:

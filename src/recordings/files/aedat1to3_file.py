@@ -45,8 +45,8 @@ POLARITY = 1  # kind of a packet of events
 class Aedat1To3File(EventFile):
     """An `.aedat` file of version 1.0, 2.0 or 3.1; times are microseconds.
 
-    Which camera it was is read in its header, else told by its addresses, which `notes` says; of
-    such a file places are counted from the far sides of the sensor that the user states.
+    Which camera it was is read in its header, else told by its addresses, which `notes` says; the
+    user may state the sides of a larger DAVIS, from which places are then counted.
     `options.stream` is the place or the name of one of several cameras in a file of 3.1.  Raises
     ValueError for a file of another version.
     """
@@ -74,20 +74,17 @@ class Aedat1To3File(EventFile):
         camera = _find_camera(" ".join(sorted(named))) or _find_camera(lines)
         self._is_guess, self._camera = not camera, camera or self._guess_camera()
         self.size = SENSORS.get(self._camera)
-        self.assume_size(None)
+        self.use_sensor_size(None)
 
-    def assume_size(self, size: WidthHeight | None) -> None:
+    def use_sensor_size(self, size: WidthHeight | None) -> None:
         if self._version == "3.1" or not (self._is_guess and self._camera):
             return
-        width, height = guess = SENSORS[self._camera]
-        self.size = guess
-        hint = "; if it is another, give sensor_size=[height,width]"
-        if size is not None:
-            is_davis = size in SENSORS.values() and self._camera.startswith("davis")
-            if is_davis and size[0] >= width and size[1] >= height:
-                self.size = size
-            hint = ""
-        fitting = f"its addresses fit a sensor of {width}x{height}"
+        guess = SENSORS[self._camera]
+        davises = [SENSORS[name] for name in SENSORS if name.startswith("davis")]
+        is_larger = guess in davises and size in davises and size > guess
+        self.size = size if is_larger else guess
+        hint = "; if it is another, give sensor_size=[height,width]" if size is None else ""
+        fitting = f"its addresses fit a sensor of {guess[0]}x{guess[1]}"
         self.notes = (f"{self.path}: names no camera, {fitting}{hint}",)
 
     def pieces(self) -> Iterator[RawEvents]:

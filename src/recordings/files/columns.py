@@ -70,12 +70,12 @@ def find_columns_by_part(names: Sequence[str]) -> dict[str, int] | None:
     return places if len(set(places.values())) == len(NAMES) else None
 
 
-def find_time_names(names: Iterable[str]) -> list[str]:
+def find_time_column_names(names: Iterable[str]) -> list[str]:
     """Return which of the names may be the times of events."""
     return [name for name in names if {_bare(name), UNIT.sub("", _bare(name))} & {*NAMES["t"]}]
 
 
-def require_one_time(times: Sequence[str], *, of_a_table: bool = False) -> None:
+def require_one_time_column(times: Sequence[str], *, of_a_table: bool = False) -> None:
     """Raise ValueError for several names of columns that may be the times; seconds and their
     fraction are left to `parse_time_column_unit`.  `of_a_table`: `columns=` may choose one."""
     if len(times) > 1 and "s" not in map(parse_unit_suffix, times):

@@ -154,7 +154,7 @@ class EventFile(ABC):
     notes: tuple[str, ...] = ()
     kept_times: list[np.ndarray] | None = None
 
-    def assume_size(self, size: WidthHeight | None) -> None:
+    def use_sensor_size(self, size: WidthHeight | None) -> None:
         """Take the (width, height) that the user states, None where they state none: for a file
         that does not, but counts places from the far sides."""
         return

@@ -48,7 +48,7 @@ class EvtDecoder:
             count = evt_words.decode_evt2_and_21(*self._halves(whole_words), self._state, *events)
         return RawEvents(*(part[:count] for part in events))
 
-    def count_sound_words(self, whole_words: bytes) -> int:
+    def count_valid_words(self, whole_words: bytes) -> int:
         """Return how many words come before the first one of no kind, where the last ones are no
         words; else all."""
         is_evt3 = self.kind == "evt3"

@@ -13,9 +13,9 @@ from src.recordings.files.columns import (
     check_lengths,
     extract_column,
     find_keys_by_name,
-    find_time_names,
+    find_time_column_names,
     find_time_unit_in_text,
-    require_one_time,
+    require_one_time_column,
 )
 from src.recordings.files.event_file import ReadOptions, refuse_column_order
 from src.recordings.files.numpy_file import LazyColumn, has_event_per_column, split_table
@@ -31,8 +31,12 @@ def find_event_columns(node: Any, order: str | None) -> dict[str, Any]:
         columns = {name: _open_column(node[key], name, key) for name, key in keys.items()}
         check_lengths(columns)
         shape = node[keys["t"]].shape
-        times = [name for name in find_time_names(node) if getattr(node[name], "shape", 0) == shape]
-        require_one_time(times)
+        times = [
+            name
+            for name in find_time_column_names(node)
+            if getattr(node[name], "shape", 0) == shape
+        ]
+        require_one_time_column(times)
     else:
         columns = split_table(_Turned(node) if has_event_per_column(node) else node, order)
     start = _find_offset(node)
@@ -77,7 +81,7 @@ def read_units_attribute(node: Any, options: ReadOptions) -> str | None:
     return find_time_unit_in_text(words[0]) if len(words) else None
 
 
-def find_unit_by_index(marks: h5py.Dataset, t: Any) -> str | None:
+def find_time_unit_by_ms_to_idx(marks: h5py.Dataset, t: Any) -> str | None:
     """Return the unit of times (n,) whose first event of each millisecond is at `marks` (DSEC's
     ms_to_idx): the nearest, within a factor of three; else us of whole numbers, None of others."""
     usual = "us" if has_integer_times(t) else None

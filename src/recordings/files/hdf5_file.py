@@ -38,7 +38,7 @@ from src.recordings.files.hdf5_columns import (
     are_consecutive_in_time,
     find_event_columns,
     find_numbered_streams,
-    find_unit_by_index,
+    find_time_unit_by_ms_to_idx,
     has_column_shape,
     list_event_array_shapes,
     read_units_attribute,
@@ -124,7 +124,7 @@ class Hdf5File(EventFile):
             marks = self._file.get("ms_to_idx")
             if isinstance(marks, h5py.Dataset):
                 check_unpacking_ratio(self.path, marks.nbytes)
-                self.time_unit = find_unit_by_index(marks, self._columns["t"])
+                self.time_unit = find_time_unit_by_ms_to_idx(marks, self._columns["t"])
 
 
 def find_streams(file: h5py.File) -> dict[str, Any]:

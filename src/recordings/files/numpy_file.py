@@ -19,8 +19,8 @@ from src.recordings.files.columns import (
     find_columns,
     find_keys_by_name,
     find_named_time_unit,
-    find_time_names,
-    require_one_time,
+    find_time_column_names,
+    require_one_time_column,
 )
 from src.recordings.files.event_file import (
     PIECE_EVENTS,
@@ -105,7 +105,8 @@ def split_table(table: Any, order: str | None) -> dict[str, Any]:
         table = _flat(table) if names else table.T if has_event_per_column(table) else table
     if names is not None:
         keys = find_keys_by_name(names) if order is None else _name_fields(names, order)
-        require_one_time(find_time_names(names) if order is None else (), of_a_table=True)
+        if order is None:
+            require_one_time_column(find_time_column_names(names), of_a_table=True)
         if keys is None or table.ndim != 1:
             raise ValueError(f"fields must be t, x, y, p of one dimension, got {', '.join(names)}")
         return {
@@ -175,9 +176,9 @@ def _columns_of(
         columns = {name: _flat(extract_column(name, key, file[key])) for name, key in keys.items()}
         if any(column.ndim != 1 for column in columns.values()):
             raise ValueError("columns must have one dimension")
-        others = [name for name in find_time_names(file.files) if name != keys["t"]]
+        others = [name for name in find_time_column_names(file.files) if name != keys["t"]]
         count = len(columns["t"])
-        require_one_time([keys["t"], *(name for name in others if file[name].size == count)])
+        require_one_time_column([keys["t"], *(name for name in others if file[name].size == count)])
         return columns, file.files, ()
     for is_called_events in (True, False):
         names = [name for name in file.files if ("event" in name.lower()) == is_called_events]

@@ -114,7 +114,7 @@ class PropheseeFile(EventFile):
         words = PIECE_EVENTS // max(1, MOST_EVENTS[kind] // 2)
         at, word_bytes = self._start, WORD_BYTES[kind]
         for block in read_whole_words(self.path, at, word_bytes, words):
-            sound = decoder.count_sound_words(block) * word_bytes
+            sound = decoder.count_valid_words(block) * word_bytes
             events = decoder.decode(block[:sound])
             at, found = at + sound, found + len(events.t)
             yield events

@@ -117,7 +117,7 @@ def open_recording(
     file = _open_file(path, options) if kept is None else copy(kept)
     file.kept_times = survey.times
     given = None if sensor_size is None else check_sensor_size(sensor_size)
-    file.assume_size(given)
+    file.use_sensor_size(given)
     size, lines = choose_size(path, given, file.size, swapped)
     recording = EventRecording(path, size, options, file, survey, lines)
     _tell(recording.messages)

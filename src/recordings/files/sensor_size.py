@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from src.recordings.files.event_file import EventFile, RawEvents, WidthHeight
-from src.recordings.sensor_limits import LARGEST_SIDE
+from src.recordings.sensor_limits import LARGEST_SIDE, are_sensor_sides
 
 MAX_SIDE = 2**16  # pixels: coordinates have 16 bits
 WIDEST = 4096  # pixels of a sensor
@@ -21,7 +21,7 @@ def check_sensor_size(given: Any) -> WidthHeight:
     numbers in 1..LARGEST_SIDE."""
     sides = list(given) if isinstance(given, Sequence | np.ndarray) else []
     is_whole = all(isinstance(side, int | np.integer) for side in sides)
-    if len(sides) != 2 or not is_whole or not all(1 <= side <= LARGEST_SIDE for side in sides):
+    if len(sides) != 2 or not is_whole or not are_sensor_sides(sides):
         wanted = f"(height, width), whole numbers in 1..{LARGEST_SIDE}"
         raise ValueError(f"sensor_size must be {wanted}, got {given}")
     return int(sides[1]), int(sides[0])
@@ -67,7 +67,7 @@ def choose_size(
     size = given or swapped or stated
     if size is None:
         return None, ()
-    if not all(1 <= side <= LARGEST_SIDE for side in size):
+    if not are_sensor_sides(size):
         raise ValueError(f"{path}: a sensor's sides must be in 1..{LARGEST_SIDE}, got {size}")
     if stated in (None, size):
         return size, ()

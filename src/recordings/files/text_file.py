@@ -19,9 +19,9 @@ from src.recordings.files.columns import (
     as_integers,
     check_unpacking_ratio,
     find_columns,
-    find_time_names,
+    find_time_column_names,
     parse_time_column_unit,
-    require_one_time,
+    require_one_time_column,
 )
 from src.recordings.files.event_file import (
     EventFile,
@@ -94,7 +94,7 @@ class TextFile(EventFile):
                 "columns are told by their values; if these are others, give columns=",
             )
         if self._places is not None:
-            require_one_time(find_time_names(layout.names), of_a_table=True)
+            require_one_time_column(find_time_column_names(layout.names), of_a_table=True)
         if self._places is not None and options.time_unit == "auto":
             self.time_unit = parse_time_column_unit(layout.names, layout.names[self._places["t"]])
 
