@@ -20,7 +20,7 @@ from torch.nn.utils import parametrize
 
 from benchmarks.timing import least
 from scripts.lease.probe import make_up_batch, train_on_batch
-from src.app import build, hardware
+from src.app import build, hardware, simulation
 from src.app.compose import compose_config
 from src.app.script import run_script
 from src.sim.pipeline import simulate
@@ -59,7 +59,7 @@ def split(overrides: list[str]) -> tuple[dict[str, Callable[[], object]], int, i
     cfg = config(overrides)
     network, spec = build.build_untrained_network(cfg)
     module = build.build_reconstructor(cfg, network, spec)
-    pipeline = build.build_pipeline(cfg, "train")
+    pipeline = simulation.build_pipeline(cfg, "train")
     clips = list(range(cfg.data.batch_size))
     sample = simulate(pipeline, clips)
     half = torch.autocast("cpu", torch.bfloat16, enabled="bf16" in str(cfg.trainer.precision))

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from src import models
-from src.app import build
+from src.app import simulation
 from src.app.compose import compose_config
 from src.app.script import run_script
 from src.metrics.image import align_brightness
@@ -53,7 +53,9 @@ def main() -> None:
     parser.add_argument("--root", default="../shared/data/photos")
     given = parser.parse_args()
     overrides = "budget=hours", f"scene.root={given.root}", f"data.test_crop={SIDE}"
-    pipeline = build.build_pipeline(compose_config("train", "experiment=lf3x3", *overrides), "val")
+    pipeline = simulation.build_pipeline(
+        compose_config("train", "experiment=lf3x3", *overrides), "val"
+    )
     networks, rows = [models.load(name) for name in given.ckpts], [[] for _ in given.ckpts]
     for clip in range(CLIPS):
         sample = simulate(pipeline, [clip])

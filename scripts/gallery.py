@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
 from scripts.readme import BASELINES, baseline_overrides
-from src.app import build
+from src.app import methods
 from src.app.compose import compose_config
 from src.app.script import run_script
 from src.figures import plots
@@ -39,7 +39,7 @@ def last(recording: str, network: str, published: Path | None) -> Frame:
     chosen = baseline_overrides(network, published) if network in BASELINES else [f"ckpt={network}"]
     sensor = [f"sensor_size=[{size.replace('x', ',')}]"] if size else []
     cfg = compose_config("reconstruct", f"recording={path}", f"fps={FPS}", *chosen, *sensor)
-    loaded = require_event_network(build.load_ckpt_or_baseline(cfg))
+    loaded = require_event_network(methods.load_ckpt_or_baseline(cfg))
     frames, _ = reconstruct_video_frames(cfg, loaded, choose_views(cfg, loaded))
     *_, frame = frames
     return frame

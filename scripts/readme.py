@@ -20,9 +20,10 @@ from torch import Tensor
 
 from scripts.ship_weights import CARD_NOTE
 from src import models
-from src.app import build
+from src.app import simulation
 from src.app.compose import compose_config
 from src.app.instantiate import build_part
+from src.app.metrics import build_metrics
 from src.app.script import run_script
 from src.bench.candidates import Candidate
 from src.figures import samples
@@ -138,7 +139,7 @@ def score_clips_into_metrics(
     cfg: DictConfig, rows: dict[str, Candidate]
 ) -> dict[str, list[dict[str, float]]]:
     """Return the scores of all `rows` on each of the test clips of `cfg`."""
-    pipeline, measure = build.build_pipeline(cfg, "test"), build.build_metrics(cfg)
+    pipeline, measure = simulation.build_pipeline(cfg, "test"), build_metrics(cfg)
     values, clips = {row: [] for row in rows}, cfg.data.test_clips
     for clip in range(clips):
         sample = simulate(pipeline, [clip])
@@ -202,7 +203,7 @@ def write_film(path: Path, index: int) -> None:
     middle row so far."""
     cfg = compose_config("simulate", *AIR, "fps=120", "scene.height=192", "scene.width=192",
                  "sensor.threshold=0.15", f"data.test_windows={WINDOWS}")  # fmt: skip
-    pipeline = build.build_pipeline(cfg, "test")
+    pipeline = simulation.build_pipeline(cfg, "test")
     sample = simulate(pipeline, [index])
     counts = sample.voxels[0, :, pipeline.optics.centre].sum(1).numpy()
     one, nine = (reconstruct_clip(load_shipped(*what), sample) for what in (ONE, NINE))

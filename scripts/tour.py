@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from scripts.readme import AIR, HOME, NINE, ONE, load_shipped, reconstruct_clip
-from src.app import build
+from src.app import simulation
 from src.app.compose import compose_config
 from src.app.script import run_script
 from src.figures.samples import join_panels, place_views_at_apertures, render_events
@@ -67,7 +67,7 @@ def draw_all(index: int) -> None:
     """Simulate the clip and draw it stage by stage."""
     cfg = compose_config("simulate", *AIR, "fps=120", f"scene.height={SIDE}", f"scene.width={SIDE}",
                  "sensor.threshold=0.15", f"data.test_windows={WINDOWS}")  # fmt: skip
-    pipeline = build.build_pipeline(cfg, "test")
+    pipeline = simulation.build_pipeline(cfg, "test")
     draw, middle = pipeline.draw(index), SIDE // 2
     views = pipeline.render_views([draw])[0]
     sample = pipeline.simulate_sensor([draw], views[None])

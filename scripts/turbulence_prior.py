@@ -16,7 +16,7 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from src.app import build
+from src.app import simulation
 from src.app.compose import compose_config
 from src.app.script import run_script
 from src.figures.plots import save_figure
@@ -51,7 +51,7 @@ def draw_atmospheres() -> dict[str, list[Atmosphere]]:
 def draw_test_atmospheres() -> dict[str, list[Atmosphere]]:
     """Return the atmospheres of the clips of data=test_photos, by severity."""
     cfg = compose_config("eval", "data=test_photos", "paths.run=.")
-    pipeline = build.build_pipeline(cfg, "test")
+    pipeline = simulation.build_pipeline(cfg, "test")
     paths = [pipeline.draw(number).turbulence for number in range(cfg.data.test_clips)]
     names = sorted({path.severity for path in paths}, key=list(COLOURS).index)
     return {f"test, {n}": [path for path in paths if path.severity == n] for n in names}

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from omegaconf import DictConfig, OmegaConf
 from rich.progress import track
 
-from src.app import build, entry_point
+from src.app import entry_point, methods, simulation
 from src.app.instantiate import build_part
 from src.deploy.picture_size import check_picture_size
 from src.figures import calibration_figures
@@ -103,7 +103,7 @@ def find_contrast_threshold(cfg: DictConfig, run: Path) -> dict[str, tuple]:
     `threshold.csv` and `threshold.png`."""
     if cfg.clips < 1:
         raise ValueError(f"clips must be >= 1, got {cfg.clips}")
-    options, pipeline = ReadOptions.from_keys(cfg), build.build_pipeline(cfg, "test")
+    options, pipeline = ReadOptions.from_keys(cfg), simulation.build_pipeline(cfg, "test")
     views = recording_inputs.find_views(cfg.recording, cfg.views, cfg.sensor_size, options)
     lookup = sensor_lookup.build_lookup(views)
     events = open_recording(cfg.recording, views.sensor, options)
@@ -152,7 +152,7 @@ def _load_dot_films(cfg: DictConfig, views: Views | None) -> tuple[Films, Films]
     """Return the films of `recording` and of `still`; ValueError for pictures of two sizes."""
     given = cfg.ckpt or cfg.get("baseline")
     network = (
-        reconstruction.require_event_network(build.load_ckpt_or_baseline(cfg)) if given else None
+        reconstruction.require_event_network(methods.load_ckpt_or_baseline(cfg)) if given else None
     )
     still, turbulent = (_read_films(cfg, key, views, network) for key in ("still", "recording"))
     wanted, got = ("x".join(map(str, films.shape[2:])) for films in (turbulent, still))

@@ -5,7 +5,8 @@ from pathlib import Path
 import rich
 from omegaconf import DictConfig
 
-from src.app import build, compared_networks, entry_point
+from src.app import compared_networks, entry_point, simulation
+from src.app.metrics import build_metrics
 from src.bench import speed_accuracy
 from src.bench.speed import SpeedBenchmark
 from src.figures import frontier
@@ -21,10 +22,10 @@ def draw_speed_accuracy_chart(cfg: DictConfig) -> dict[str, str]:
     run, side = Path(cfg.paths.run), cfg.sizes[0] if cfg.sizes else 0
     measured = (cfg.sizes, cfg.threads, cfg.forms, cfg.devices)
     speed_accuracy.check_chart_options(*measured, cfg.severities, cfg.clips, cfg.seconds)
-    build.check_unscored_windows(cfg)
+    simulation.check_unscored_windows(cfg)
     candidates = compared_networks.load_candidates(cfg)
     pipelines = {name: compared_networks.pipeline_at_severity(cfg, name) for name in cfg.severities}
-    metrics, warmup = build.build_metrics(cfg), cfg.data.unscored_windows
+    metrics, warmup = build_metrics(cfg), cfg.data.unscored_windows
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     benchmark = SpeedBenchmark(run, seconds=cfg.seconds, bins=cfg.bins)
     speeds = [row for candidate in candidates for row in benchmark.measure(candidate, *measured)]

@@ -5,7 +5,8 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from src.app import benchmark, build, entry_point, hardware, simulation
+from src.app import benchmark, build, entry_point, hardware, methods, simulation
+from src.app.metrics import build_metrics
 from src.figures import samples
 from src.records import results
 
@@ -21,10 +22,10 @@ def evaluate(cfg: DictConfig) -> dict:
         return benchmark.evaluate_on_evreal(cfg)
     run, start = Path(cfg.paths.run), time.perf_counter()
     hardware.reserve_worker_cores(cfg)
-    net = build.load_method_with_postprocess(cfg)
+    net = methods.load_method_with_postprocess(cfg)
     data = build.build_data_module(cfg, splits=("test",), optics=simulation.select_optics(cfg, net))
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
-    name, metrics = build.method_name(cfg), build.build_metrics(cfg)
+    name, metrics = methods.method_name(cfg), build_metrics(cfg)
     row, drawn = build.test_method(cfg, name, net, data, metrics, SAMPLE_CLIPS)
     samples.write_samples(run / "samples", drawn)
     return results.write_and_print_results(

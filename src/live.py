@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from omegaconf import DictConfig
 
-from src.app import build, entry_point
+from src.app import entry_point, methods
 from src.live_view.event_feeds import Feed, open_feed
 from src.live_view.feed_reader import FeedReader, PlaybackClock
 from src.live_view.frame_buffer import FrameRing, PolarityAccumulator
@@ -78,10 +78,10 @@ def load_offered_networks(
     networks = {}
     for other in dict.fromkeys([*cfg.offered_networks, name]):
         if other == name:
-            networks[other] = require_event_network(build.load_ckpt_or_baseline(cfg))
+            networks[other] = require_event_network(methods.load_ckpt_or_baseline(cfg))
             continue
         wanted = "offered_networks must be networks"
-        networks[other] = build.load_network_of_kind(EventToVideoNetwork, cfg, other, wanted)
+        networks[other] = methods.load_network_of_kind(EventToVideoNetwork, cfg, other, wanted)
     takes_all_views(networks[name], positions)
     return {other: net for other, net in networks.items() if accepts_views(net, positions)}
 

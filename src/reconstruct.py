@@ -5,6 +5,7 @@ Writes the video and `frames.csv`: the time stamp and the events of each frame. 
 clean clip, side by side.
 """
 
+import re
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -12,10 +13,11 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
+import torch
 from omegaconf import DictConfig
 from rich.progress import BarColumn, Progress, TimeElapsedColumn
 
-from src.app import build, entry_point, hardware
+from src.app import entry_point, methods
 from src.deploy.runtime import EventListRuntime
 from src.figures import samples
 from src.models.backward_warmup import check_backward_warmup_s
@@ -41,7 +43,7 @@ def reconstruct(cfg: DictConfig) -> Path:
     """
     run, count, first_s, last_s = Path(cfg.paths.run), 0, 0.0, 0.0
     check_settings(cfg)
-    network = reconstruction.require_event_network(build.load_ckpt_or_baseline(cfg))
+    network = reconstruction.require_event_network(methods.load_ckpt_or_baseline(cfg))
     views = choose_views(cfg, network)
     make = reconstruct_film_frames if cfg.output_format == "film" else reconstruct_video_frames
     start = time.perf_counter()
@@ -63,12 +65,21 @@ def reconstruct(cfg: DictConfig) -> Path:
 
 def check_settings(cfg: DictConfig) -> None:
     """Raise ValueError for a device, a filter, a warmup or a video that cannot be."""
-    hardware.check_device(cfg.device)
+    check_device(cfg.device)
     output.check_video_settings(cfg.output_format, Path(cfg.paths.run), cfg.playback_fps)
     tone.build_output_curve(cfg.tone, cfg.tone_time_constant_s, cfg.output_format)
     check_backward_warmup_s(cfg.backward_warmup_s)
     if cfg.noise_filter_s is not None:
         check_noise_filter_s(cfg.noise_filter_s)
+
+
+def check_device(device: str) -> None:
+    """Raise ValueError for a `device` other than cpu, cuda or cuda:0, cuda:1, ... of a GPU here."""
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
+        raise ValueError(f"device must be cpu or cuda, got {device}")
+    gpus = torch.cuda.device_count()
+    if device != "cpu" and int(device.partition(":")[2] or 0) >= gpus:
+        raise ValueError(f"device must be cpu, as torch finds {gpus} GPUs here, got {device}")
 
 
 def describe_run(

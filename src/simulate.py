@@ -15,7 +15,7 @@ from rich.progress import track
 from torch import Tensor
 from yaml import YAMLError
 
-from src.app import build, entry_point, simulation, user_clip_simulation
+from src.app import entry_point, simulation, user_clip_simulation
 from src.app.renamed_keys import refuse_renamed_keys
 from src.app.user_clip_simulation import SimulatedPart, UserClipSimulation
 from src.figures import samples
@@ -108,7 +108,7 @@ def simulate_scene(cfg: DictConfig) -> dict:
     run, cfg = Path(cfg.paths.run), take_clip_config_from_run(cfg) if cfg.like else cfg
     if cfg.fps is None:
         cfg.fps = SCENE_FPS
-    pipeline, step = build.build_pipeline(cfg, cfg.split), cfg.data.substeps
+    pipeline, step = simulation.build_pipeline(cfg, cfg.split), cfg.data.substeps
     draw = pipeline.draw(cfg.index)
     camera = (
         place_views(cfg, pipeline.optics.positions, draw.crop[2:], draw.key) if cfg.write else None

@@ -11,7 +11,7 @@ import rich
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from src.app import build, compared_networks, entry_point
+from src.app import compared_networks, entry_point, simulation
 from src.app.instantiate import build_part
 from src.bench.candidates import Candidate
 from src.bench.stress_tests import stress_results
@@ -33,7 +33,7 @@ def stress(cfg: DictConfig) -> stress_results.Outcomes:
         raise ValueError(f"processes must be >= 1, got {cfg.processes}")
     if cfg.clips < 1:
         raise ValueError(f"clips must be >= 1, got {cfg.clips}")
-    build.check_unscored_windows(cfg)
+    simulation.check_unscored_windows(cfg)
     run, config = Path(cfg.paths.run), entry_point.resolved_yaml(cfg)
     candidates, _ = _load(config)
     titles = {name: str(node.title) for name, node in cfg.stress_tests.items()}
@@ -85,7 +85,7 @@ def _load(config: str) -> tuple[list[Candidate], Callable[[Candidate], NetworkRe
     cfg = cast(DictConfig, OmegaConf.create(config))
     keys = {name: f"stress_tests.{name}.test" for name in cfg.stress_tests}
     tests = {name: build_part(cfg, key, _partial_=True) for name, key in keys.items()}
-    pipeline = build.build_pipeline(cfg, "test")
+    pipeline = simulation.build_pipeline(cfg, "test")
     bench = StressBench(pipeline, range(cfg.clips), cfg.data.unscored_windows)
     tester = partial(stress_results.run_stress_tests, tests=tests, bench=bench)
     return compared_networks.load_candidates(cfg), tester

@@ -56,6 +56,16 @@ def test_every_script_prints_its_help_and_refuses_an_unknown_option(file, capsys
     assert "usage: " in capsys.readouterr().err
 
 
+def test_only_what_trains_and_scores_loads_lightning_and_torchmetrics():
+    """They, and the writer of RAW files, take as long to load as all else that a command needs."""
+    commands = "calibrate convert live reconstruct report simulate"
+    code = f"import sys, src.{commands.replace(' ', ', src.')}; print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
+    )
+    assert not {"lightning", "torchmetrics", "faery"} & set(done.stdout.split())
+
+
 def test_a_wrong_value_is_one_line_and_exit_code_2_of_the_process(tmp_path):
     words = [*TINY, "data.crop=1000", f"paths.out={tmp_path}"]
     line = [sys.executable, "-m", "src.train", *words]

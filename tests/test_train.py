@@ -9,9 +9,9 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
+from src.app import entry_point
 from src.eval import evaluate
 from src.recordings.files.recording import read_events
-from src.records import tracking
 from src.simulate import simulate
 from src.train import train
 from tests.conftest import ROOT
@@ -44,7 +44,7 @@ def test_every_experiment_takes_a_step(experiment, tmp_path):
 
 def test_weights_and_biases_holds_config_pictures_and_metrics(tmp_path):
     train(config("train", tmp_path, *TINY, "logger=wandb"))
-    tracking.finish_wandb()
+    entry_point.finish_wandb()
     (run,) = (tmp_path / "wandb").glob("offline-run-*")
     words, late = (b"test/psnr_aligned", b"train/loss", b"epoch_clips"), time.monotonic() + 60
     while not all(word in next(run.glob("*.wandb")).read_bytes() for word in words):

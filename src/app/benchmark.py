@@ -15,9 +15,10 @@ from rich.table import Table
 
 from baselines import published
 from baselines.centre_view import CentreViewNetwork
-from src.app import build, entry_point
+from src.app import entry_point, methods
 from src.app.hardware import first_gpu
 from src.app.instantiate import as_dict, build_part
+from src.app.metrics import SHIPPED_METRIC_KEYS
 from src.metrics.table import Column
 from src.models import files
 from src.models.network import EventToVideoNetwork
@@ -110,7 +111,7 @@ class EvrealBenchmark:
         window = torch.zeros(1, 1, bins, height, width, device=self.device)
         macs, milliseconds = evaluation.measure_frame_macs_and_ms(self.network, window)
         return results.ScoreRow(
-            build.method_name(self.cfg),
+            methods.method_name(self.cfg),
             clips,
             params=sum(part.numel() for part in self.network.parameters()),
             macs_per_frame=macs,
@@ -122,9 +123,9 @@ class EvrealBenchmark:
 def _load_network(cfg: DictConfig) -> EventToVideoNetwork:
     if cfg.get("postprocess") or cfg.get("backward_warmup_s"):
         raise ValueError("data=evreal needs postprocess=none and backward_warmup_s=0.0")
-    if own := sorted(set(cfg.metrics) - set(build.SHIPPED_METRIC_KEYS)):
+    if own := sorted(set(cfg.metrics) - set(SHIPPED_METRIC_KEYS)):
         raise ValueError(f"data=evreal has the metrics of its protocol only, got metrics.{own[0]}")
-    network = require_event_network(build.load_ckpt_or_baseline(cfg))
+    network = require_event_network(methods.load_ckpt_or_baseline(cfg))
     if network.views not in (None, 1):
         raise ValueError(f"ckpt must take one view for data=evreal, got one of {network.views}")
     return network.eval()

@@ -1,9 +1,8 @@
-"""Data, networks, metrics and trainers from a configuration; simulations: simulation.py."""
+"""What trains and tests with Lightning, from a configuration; tested networks: methods.py."""
 
 import math
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import lightning
 import torch
@@ -12,9 +11,7 @@ from hydra.types import RunMode
 from lightning.pytorch.callbacks import ProgressBar
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
-from torchmetrics import Metric
 
-import src.models
 from baselines.postprocess import Postprocessed
 from src.app.hardware import first_gpu, uses_cuda_graphs
 from src.app.instantiate import (
@@ -24,14 +21,16 @@ from src.app.instantiate import (
     instantiate_node,
     read_user_packages,
 )
+from src.app.methods import load_network_of_kind
+from src.app.metrics import build_metrics
 from src.app.simulation import (
     build_large_crop_stream,
     build_pipeline,
+    check_unscored_windows,
     describe_test_conditions,
 )
 from src.losses.terms import TrainingLoss
 from src.metrics.video_metrics import VideoMetrics
-from src.models.backward_warmup import BackwardWarmup
 from src.models.network import EventToVideoNetwork, FramePostprocessor, VideoMethod
 from src.models.setnet import SetNet
 from src.records.results import ScoreRow
@@ -53,9 +52,7 @@ DATA_OPTIONS = (
     "batch_size", "batch_reuse", "epoch_clips", "val_clips", "test_clips", "workers", "simulate_on",
 )  # fmt: skip
 SWEEP_STORE = SampleStore()  # of the jobs of a sweep that run in this process
-SHIPPED_METRIC_KEYS = ("lpips", "resolution_scale", "jitter_reduction")
 Trainable = EventToVideoNetwork | FramePostprocessor
-Method = TypeVar("Method", bound=VideoMethod)
 
 
 def build_data_module(
@@ -85,14 +82,6 @@ def build_data_module(
     )
 
 
-def check_unscored_windows(cfg: DictConfig) -> None:
-    """Raise ValueError unless two windows of a test clip are scored, as many as jitter needs."""
-    unscored, most = cfg.data.unscored_windows, cfg.data.test_windows - 2
-    if not 0 <= unscored <= most:
-        allowed = f"0..{most} (data.test_windows={most + 2} less two)"
-        raise ValueError(f"data.unscored_windows must be in {allowed}, got {unscored}")
-
-
 def build_teachers(cfg: DictConfig, views: int) -> TeacherEnsemble:
     """Return the networks that `teachers` names.
 
@@ -108,20 +97,6 @@ def build_teachers(cfg: DictConfig, views: int) -> TeacherEnsemble:
     return TeacherEnsemble(networks, cfg.distillation_cache, cfg.fps, rates)
 
 
-def load_network_of_kind(
-    kind: type[Method], cfg: DictConfig, weights: str, error_prefix: str
-) -> Method:
-    """Return the network of `weights`, a file or a name as of `ckpt`; ValueError where it is not
-    there or no `kind`."""
-    try:
-        network = src.models.load(weights, read_user_packages(cfg))
-    except ValueError as error:
-        raise ValueError(f"{error_prefix}: {error}") from error
-    if not isinstance(network, kind):
-        raise ValueError(f"{error_prefix} for events, {weights} is none")
-    return network
-
-
 def build_untrained_network(cfg: DictConfig) -> tuple[Trainable, dict]:
     """Return a fresh network and the plain dict (target, kwargs) that builds it again."""
     node = as_dict(cfg.model)
@@ -130,62 +105,6 @@ def build_untrained_network(cfg: DictConfig) -> tuple[Trainable, dict]:
     if isinstance(net, SetNet):  # the arguments that a preset stands for
         return net, {"target": target.removesuffix(".preset"), "kwargs": net.init_kwargs}
     return net, {"target": target, "kwargs": node}
-
-
-def load_ckpt_or_baseline(cfg: DictConfig) -> VideoMethod:
-    """Return the network that `ckpt` or `baseline` names, in eval mode; ValueError for both."""
-    if cfg.ckpt and cfg.get("baseline"):
-        raise ValueError(f"ckpt must be null with baseline=..., got {cfg.ckpt}")
-    if cfg.ckpt:
-        net = src.models.load(cfg.ckpt, read_user_packages(cfg))
-        if not isinstance(net, VideoMethod):
-            use = f"baseline=frames postprocess=mambatm postprocess.postprocessor={cfg.ckpt}"
-            raise ValueError(f"ckpt must be a network for events, got a post-processor; use {use}")
-        return net
-    if cfg.get("baseline"):
-        return build_part(cfg, "baseline").eval()
-    raise ValueError("ckpt or baseline must name a network, got neither")
-
-
-def method_name(cfg: DictConfig) -> str:
-    """Return what a table calls the method of a test: the `name` that was given, else the network
-    or the baseline.
-    """
-    if cfg.name != cfg.task:
-        return cfg.name
-    if cfg.ckpt:
-        path = Path(cfg.ckpt)
-        return path.stem if path.suffix else str(cfg.ckpt).rstrip("/")
-    choices = HydraConfig.get().runtime.choices if HydraConfig.initialized() else {}
-    return choices.get("baseline") or str(cfg.baseline._target_).rpartition(".")[2]
-
-
-def load_method_with_postprocess(cfg: DictConfig) -> VideoMethod:
-    """Return the network of `ckpt` or `baseline`, with the backward warm-up and the frame
-    post-processor that the config asks for.
-    """
-    net = load_ckpt_or_baseline(cfg)
-    if cfg.get("backward_warmup_s"):
-        net = BackwardWarmup(net, cfg.backward_warmup_s)
-    return build_part(cfg, "postprocess", source=net) if cfg.get("postprocess") else net
-
-
-def build_metrics(cfg: DictConfig) -> VideoMetrics:
-    """Return the metrics of validation and test: those of the project, LPIPS if `metrics.lpips` is
-    given, and every further part of `metrics`, the user's own; ValueError for what is none.
-    """
-    lpips = build_part(cfg, "metrics.lpips") if cfg.metrics.lpips else None
-    names = [name for name in cfg.metrics if name not in SHIPPED_METRIC_KEYS and cfg.metrics[name]]
-    own = {str(name): _build_own_metric(cfg, str(name)) for name in names}
-    return VideoMetrics(lpips, cfg.metrics.resolution_scale, own, cfg.metrics.jitter_reduction)
-
-
-def _build_own_metric(cfg: DictConfig, name: str) -> Metric:
-    metric = build_part(cfg, f"metrics.{name}")
-    if not isinstance(metric, Metric):
-        got = f"{type(metric).__module__}.{type(metric).__name__}"
-        raise ValueError(f"metrics.{name}._target_ must be a torchmetrics.Metric, got {got}")
-    return metric
 
 
 def build_loss(cfg: DictConfig) -> TrainingLoss:

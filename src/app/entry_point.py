@@ -17,7 +17,6 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from lightning.pytorch.utilities.exceptions import SIGTERMException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -34,7 +33,7 @@ from src.app.path_overrides import (
 from src.app.renamed_keys import refuse_renamed_keys, refuse_renamed_overrides
 from src.app.stop_signals import StoppedBySignal, stop_by_signals
 from src.models import files
-from src.records import results, tracking
+from src.records import results
 
 FAILURE_FILE = "failed.txt"  # in the folder of a sweep's job: why it failed
 
@@ -103,7 +102,7 @@ def run_main(main: Callable[[], None]) -> None:
         print(f"error: {message}", file=sys.stderr)
         is_io = isinstance(error, OSError) and not isinstance(error, HydraException)
         sys.exit(1 if is_io else 2)  # 1: a full disk, a file that may not be read
-    except (KeyboardInterrupt, SIGTERMException) as error:  # Lightning's would end with exit code 0
+    except _stop_errors() as error:
         interrupted = isinstance(error, KeyboardInterrupt)
         print("stopped", file=sys.stderr)
         sys.exit(128 + (signal.SIGINT if interrupted else signal.SIGTERM))
@@ -112,6 +111,13 @@ def run_main(main: Callable[[], None]) -> None:
         if interrupted or isinstance(error, StoppedBySignal):
             print("stopped", file=sys.stderr)
         sys.exit(128 + signal.SIGINT if interrupted else error.code)
+
+
+def _stop_errors() -> tuple[type[BaseException], ...]:
+    """Return what Ctrl-C and SIGTERM raise: Lightning's, where it is loaded, would end a process
+    with exit code 0."""
+    lightning = sys.modules.get("lightning.pytorch.utilities.exceptions")
+    return (KeyboardInterrupt, *([lightning.SIGTERMException] if lightning else []))
 
 
 def _is_in_the_way_of_run(error: OSError) -> bool:
@@ -151,7 +157,7 @@ def run_job(
             print(f"skipped, its results stand: {name}, in {folder}")
         else:
             _run_work(work, cfg)
-    except SIGTERMException:  # ends the sweep, as Ctrl-C does
+    except _stop_errors():  # ends the sweep
         raise KeyboardInterrupt from None
     except Exception as error:
         print(f"failed: {name}: {' '.join(str(error).split())}", file=sys.stderr)
@@ -186,7 +192,13 @@ def _run_work(work: Callable[[DictConfig], object], cfg: DictConfig) -> None:
     try:
         work(cfg)
     finally:
-        tracking.finish_wandb()
+        finish_wandb()
+
+
+def finish_wandb() -> None:
+    """End the run of W&B, if there is one: the next job of a multirun would write into it."""
+    if "wandb" in sys.modules:
+        sys.modules["wandb"].finish()
 
 
 def _print_failed_jobs(sweep: Path, start: float) -> None:

@@ -2,7 +2,6 @@
 
 import ctypes
 import os
-import re
 
 import torch
 from lightning.pytorch.accelerators import CUDAAccelerator
@@ -75,12 +74,3 @@ def requested_gpus(cfg: DictConfig) -> list[int]:
 def first_gpu(cfg: DictConfig) -> int:
     """Return the number of the first GPU that `trainer.devices` asks for, on which tests run."""
     return next(iter(requested_gpus(cfg)), 0)
-
-
-def check_device(device: str) -> None:
-    """Raise ValueError for a `device` other than cpu, cuda or cuda:0, cuda:1, ... of a GPU here."""
-    if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
-        raise ValueError(f"device must be cpu or cuda, got {device}")
-    gpus = torch.cuda.device_count()
-    if device != "cpu" and int(device.partition(":")[2] or 0) >= gpus:
-        raise ValueError(f"device must be cpu, as torch finds {gpus} GPUs here, got {device}")

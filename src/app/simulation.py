@@ -42,6 +42,14 @@ def select_optics(cfg: DictConfig, net: VideoMethod) -> Optics:
     return whole.select_views(wanted)
 
 
+def check_unscored_windows(cfg: DictConfig) -> None:
+    """Raise ValueError unless two windows of a test clip are scored, as many as jitter needs."""
+    unscored, most = cfg.data.unscored_windows, cfg.data.test_windows - 2
+    if not 0 <= unscored <= most:
+        allowed = f"0..{most} (data.test_windows={most + 2} less two)"
+        raise ValueError(f"data.unscored_windows must be in {allowed}, got {unscored}")
+
+
 def build_pipeline(cfg: DictConfig, split: str, optics: Optics | None = None) -> Pipeline:
     """Return the simulation of one split: train, val or test; `optics`: others than `cfg`'s."""
     optics, test = optics or build_part(cfg, "optics"), "" if split == "train" else "test_"

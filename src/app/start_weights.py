@@ -5,7 +5,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-from src.app import build
+from src.app import methods
 from src.app.instantiate import as_dict
 from src.models import files
 from src.models.network import VideoMethod
@@ -61,7 +61,7 @@ def load_reference_networks(cfg: DictConfig) -> dict[str, VideoMethod]:
     networks, views = {}, cfg.optics.views
     for name, weights in as_dict(cfg.references).items():
         prefix = f"references.{name} must be a network"
-        network = build.load_network_of_kind(VideoMethod, cfg, weights, prefix)
+        network = methods.load_network_of_kind(VideoMethod, cfg, weights, prefix)
         if network.views not in (None, views):
             wanted = f"optics.views={network.views}, got {views}"
             warnings.warn(f"references.{name} is left out: it takes {wanted}", stacklevel=2)

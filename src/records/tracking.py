@@ -1,6 +1,5 @@
 """Config, sample pictures and final metrics of a run for Weights & Biases."""
 
-import sys
 from collections.abc import Iterable
 from itertools import count
 from pathlib import Path
@@ -31,12 +30,6 @@ def log_results_to_wandb(loggers: Iterable[Logger], record: dict, pictures: Iter
         for path in pictures:
             log = logger.log_video if path.suffix == ".gif" else logger.log_image
             log(f"samples/{path.stem}", [str(path)])
-
-
-def finish_wandb() -> None:
-    """End the run of W&B, if there is one: the next job of a multirun would write into it."""
-    if "wandb" in sys.modules:
-        sys.modules["wandb"].finish()
 
 
 def _wandb(loggers: Iterable[Logger]) -> list[WandbLogger]:

@@ -10,7 +10,7 @@ from lightning.pytorch.callbacks import ProgressBar
 from omegaconf import OmegaConf
 
 from baselines import postprocess
-from src.app import build, compared_networks, hardware
+from src.app import build, compared_networks, hardware, methods
 from src.app.instantiate import instantiate_node, read_user_packages
 from src.eval import evaluate
 from src.models import files
@@ -112,7 +112,7 @@ def test_a_post_processor_of_ones_own_is_loaded(own, tmp_path):
     files.save(tmp_path / "mine.safetensors", parts.MyMambaTM(1, 8), spec, {})
     named = f"postprocess.postprocessor={tmp_path}/mine.safetensors"
     cfg = config("eval", tmp_path, "postprocess=mambatm", named, "baseline=frames", *own)
-    assert type(build.load_method_with_postprocess(cfg).postprocessor).__name__ == "MyMambaTM"
+    assert type(methods.load_method_with_postprocess(cfg).postprocessor).__name__ == "MyMambaTM"
     with pytest.raises(ValueError, match="allowed_packages="):
         postprocess.load_postprocessor(f"{tmp_path}/mine.safetensors")
 
@@ -120,7 +120,7 @@ def test_a_post_processor_of_ones_own_is_loaded(own, tmp_path):
 def test_a_network_and_a_baseline_are_not_both_taken(tmp_path):
     cfg = config("reconstruct", tmp_path, "recording=a.raw", "ckpt=any", "baseline=highpass")
     with pytest.raises(ValueError, match="^ckpt must be null with baseline=..., got any"):
-        build.load_ckpt_or_baseline(cfg)
+        methods.load_ckpt_or_baseline(cfg)
 
 
 @pytest.mark.parametrize("given", ["mypackage", "[1a]", "[..]", "['']"])

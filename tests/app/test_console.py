@@ -13,7 +13,7 @@ import pytest
 from lightning import Trainer
 from rich.console import Console
 
-from src.app import build
+from src.app import methods
 from src.app.help import help_text
 from src.records.results import ScoreRow, build_rich_score_table, describe_score_difference
 from src.training.progress import TrainingProgress
@@ -58,7 +58,7 @@ def test_every_command_has_help(command, capsys):
     ],
 )
 def test_a_table_names_the_method_asked_for(given, name, tmp_path):
-    assert build.method_name(config("eval", tmp_path, *given)) == name
+    assert methods.method_name(config("eval", tmp_path, *given)) == name
 
 
 def test_a_table_cuts_no_name_and_no_number():

@@ -4,7 +4,7 @@ import pytest
 import torch
 import yaml
 
-from src.app import build
+from src.app import simulation
 from src.sim.pipeline import ClipParameters, simulate
 from tests.conftest import ROOT
 from tests.test_train import config, names
@@ -16,7 +16,7 @@ SMALL = ["scene.height=64", "scene.width=64", "data.test_windows=2", "data.test_
 def test_every_setting_of_turbulence_can_be_set_whatever_its_strength(choice, tmp_path):
     settings = ["turbulence.tolerance=0.5", "turbulence.temporal_model=frozen_flow"]
     cfg = config("simulate", tmp_path, f"turbulence={choice}", "fps=120", *settings, *SMALL)
-    assert len(simulate(build.build_pipeline(cfg, "test"), [0]).parameters) == 1
+    assert len(simulate(simulation.build_pipeline(cfg, "test"), [0]).parameters) == 1
 
 
 def values(node: object) -> list:
@@ -46,7 +46,7 @@ def test_the_budget_does_not_undo_a_choice_of_augmentation(budget, tmp_path):
 
 
 def drawn(entry_point: str, run, split: str, *overrides: str) -> ClipParameters:
-    return build.build_pipeline(
+    return simulation.build_pipeline(
         config(entry_point, run, *SMALL, "data.crop=16", *overrides), split
     ).draw(0)
 

@@ -30,7 +30,7 @@ from omegaconf.errors import OmegaConfBaseException
 from baselines import published
 from baselines.firenet import FireNet
 from src import simulate
-from src.app import build
+from src.app import simulation
 from src.models import files
 from src.models.e2vid import E2VID
 from src.recordings import sensor_lookup, views
@@ -78,7 +78,7 @@ def read_config(path: Path) -> None:
         found = simulate.take_clip_config_from_run(
             OmegaConf.merge(cfg, dict.fromkeys(simulate.CLIP_KEYS))
         )
-        build.build_pipeline(found, "train")
+        simulation.build_pipeline(found, "train")
     except OmegaConfBaseException as error:  # an entry point prints it in one line
         raise ValueError(str(error)) from error
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from src.app import build, entry_point
+from src.app import entry_point, simulation
 from src.app.simulation import merge_large_overrides
 from src.sim.pipeline import Pipeline
 from src.simulate import simulate
@@ -56,7 +56,7 @@ def test_of_a_large_batch_the_clip_of_its_own_stream_is_named(monkeypatch, tmp_p
     monkeypatch.undo()
     found = run_the_command(str(caught.value), tmp_path)
     other = merge_large_overrides(OmegaConf.load(run / "config.yaml"))
-    pipeline = build.build_pipeline(other, "train")
+    pipeline = simulation.build_pipeline(other, "train")
     assert found == pipeline.simulate([pipeline.draw(0)]).parameters[0]
     usual = config("simulate", tmp_path / "usual", f"like={run}/config.yaml", "split=train")
     assert found != simulate(usual)
@@ -86,7 +86,7 @@ def see_the_clip(message: str, tmp_path, run) -> None:
     """Run the command that the message gives; it simulates the clip of the training."""
     found = run_the_command(message, tmp_path)
     trained = OmegaConf.load(run / "config.yaml")
-    pipeline = build.build_pipeline(trained, "train")
+    pipeline = simulation.build_pipeline(trained, "train")
     assert found == pipeline.simulate([pipeline.draw(2)]).parameters[0] and found["clip"] == 2
     assert (tmp_path / "seen" / "views.png").is_file()
 

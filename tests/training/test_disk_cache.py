@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from scripts.fill_cache import fill_clip_cache
-from src.app import build
 from src.app import simulation as simulations
 from src.models.checkpoints import is_intact
 from src.sim.optics import Optics
@@ -217,7 +216,7 @@ SMALL += ["data.windows=3", "data.crop=16", "turbulence=weak", "sensor=randomize
 def test_wrong_values_of_a_config_are_one_line(wrong, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         asked = ["data.cache_clips=2", f"data.cache_root={tmp_path}", wrong]
-        build.build_pipeline(config("train", tmp_path, *SMALL, *asked), "train")
+        simulations.build_pipeline(config("train", tmp_path, *SMALL, *asked), "train")
 
 
 @pytest.mark.parametrize(
@@ -253,7 +252,7 @@ def test_without_turbulence_a_cache_holds_the_views_asked_for(tmp_path):
         "data.cache_clips=1",
         f"data.cache_root={tmp_path}",
     ]
-    chain = build.build_pipeline(config("train", tmp_path, *asked), "train")
+    chain = simulations.build_pipeline(config("train", tmp_path, *asked), "train")
     assert chain.cache.clip(0).views.shape[0] == 1
     assert chain.simulate([chain.draw(0)]).voxels.shape[2] == 1
 

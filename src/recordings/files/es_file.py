@@ -4,7 +4,6 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-import faery
 import numpy as np
 
 from src.recordings.engines.es_bytes import LONE_ATIS, LONE_DVS, count_events
@@ -21,6 +20,8 @@ class EsFile(EventFile):
 
     def __init__(self, path: Path, options: ReadOptions):
         self.path = path
+        import faery  # here, as loading it takes a tenth of the start of a command
+
         with name_file_in_errors(path, "cannot be decoded"):
             self._decoder = faery.events_stream_from_file(path, file_type="es")
             self.size = self._decoder.dimensions()

@@ -10,9 +10,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
-import faery
 import numpy as np
-from faery.file_encoder import events_to_file
 
 from src.recordings.files import table_writers
 from src.recordings.files.event_file import PIECE_EVENTS, WidthHeight
@@ -175,18 +173,22 @@ class _Checked:
 def _write_binary(
     path: Path, kind: str, pieces: Iterator[np.ndarray], size: WidthHeight, version: str
 ) -> None:
+    import faery  # here, as in es_file.py
+    from faery.file_encoder import events_to_file
+
     number = {".raw": version, ".dat": "dat2"}.get(kind)
     how = {"file_type": BINARY[kind], "zero_t0": kind != ".es", "use_write_suffix": False}
+    listed = (_as_faery(events, faery.EVENTS_DTYPE) for events in pieces)
     try:
-        events_to_file((_as_faery(events) for events in pieces), path, size, version=number, **how)
+        events_to_file(listed, path, size, version=number, **how)
     except RuntimeError as error:  # of faery's encoders, for one of the disk
         if (found := OS_ERROR.search(str(error))) is None:
             raise
         raise OSError(int(found[1]), str(error)) from error
 
 
-def _as_faery(events: np.ndarray) -> np.ndarray:
-    listed = np.empty(len(events), faery.EVENTS_DTYPE)
+def _as_faery(events: np.ndarray, kind: np.dtype) -> np.ndarray:
+    listed = np.empty(len(events), kind)
     for name in "txy":
         listed[name] = events[name]
     listed["on"] = events["p"] > 0

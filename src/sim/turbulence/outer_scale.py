@@ -16,7 +16,7 @@ from functools import cache, lru_cache
 
 import numpy as np
 from jaxtyping import Float
-from scipy import special, stats
+from scipy import special
 from scipy.interpolate import RegularGridInterpolator
 
 Cn2Profile = tuple[float, ...]  # Cn2 at equally spaced points from the camera to the object
@@ -115,7 +115,7 @@ def _correlation_over_lags(
 def _relative_wind_speeds() -> Float[np.ndarray, " quantiles"]:
     """Return speeds of a layer's wind, as likely as each other, over the rms speed (Rice's law)."""
     quantile, spread = (np.arange(32) + 0.5) / 32, LAYER_WIND_RATIO / math.sqrt(2)
-    speeds = stats.rice.ppf(quantile, 1 / spread, scale=spread)
+    speeds = spread * np.sqrt(special.chndtrix(quantile, 2, spread**-2))
     return speeds / math.sqrt(1 + LAYER_WIND_RATIO**2)
 
 

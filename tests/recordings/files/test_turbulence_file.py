@@ -5,7 +5,7 @@ import pytest
 import torch
 import yaml
 
-from src.app import build, simulation
+from src.app import simulation
 from src.recordings.files.turbulence_file import (
     IntervalEstimate,
     MeasuredTurbulence,
@@ -151,7 +151,7 @@ SMALL = ["scene.height=64", "scene.width=64", "data.test_windows=2", "data.test_
 def test_turbulence_measured_simulates(tmp_path):
     path = site(tmp_path / "air.yaml")
     chosen = ["turbulence=measured", f"turbulence.measured={path}", "fps=120", *SMALL]
-    pipeline = build.build_pipeline(config("simulate", tmp_path, *chosen), "test")
+    pipeline = simulation.build_pipeline(config("simulate", tmp_path, *chosen), "test")
     assert isinstance(pipeline.turbulence, SimulatedTurbulence)
     (drawn,) = simulate(pipeline, [0]).parameters
     assert drawn["severity"] in ("weak", "medium")

@@ -6,7 +6,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
-from src.app import build
+from src.app import simulation
 from src.sim.noise import generator
 from src.sim.optics import Optics, layout
 from src.sim.pipeline import Pipeline, simulate
@@ -85,4 +85,4 @@ def config():
 def test_turbulence_must_name_a_class_of_an_allowed_package(config):
     cfg = config("turbulence._target_=os.system")
     with pytest.raises(ValueError, match="_target_ must be a class of"):
-        build.build_pipeline(cfg, "test")
+        simulation.build_pipeline(cfg, "test")
