@@ -10,7 +10,7 @@ cd "$(dirname "$0")/.."
   exit 2
 }
 "${PYTHON:-python3}" -m venv .venv
-pip=(.venv/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt)
+pip=(.venv/bin/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt)
 
 # Without a GPU a plain torch would bring gigabytes of CUDA; the +cpu build is asked for by name,
 # first from where pip is set up to look, then from PyTorch's own index.
@@ -36,3 +36,6 @@ openvino=$(sed -n 's/^openvino = \["\(.*\)"\].*/\1/p' pyproject.toml)
   echo "OpenVINO is not there (no wheel for this machine?): networks run in PyTorch, slower" >&2
 
 "${pip[@]}" --no-deps --no-build-isolation --editable .
+
+# On all cores, where pip compiles file after file; some are of other versions of Python.
+.venv/bin/python -m compileall -qq -j 0 .venv/lib || true
