@@ -5,13 +5,13 @@ import statistics
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
 from itertools import groupby
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 
 from src.bench.candidates import Candidate
 from src.bench.speed import TIMED_FORMS, SpeedMeasurement
-from src.metrics.table import METRICS, NAMES, Column
+from src.metrics.table import METRICS, NAMES, Column, mean_score
 from src.metrics.video_metrics import VideoMetrics
 from src.records.results import format_csv
 from src.sim.pipeline import Pipeline, simulate
@@ -50,12 +50,12 @@ def _is_side(side: object) -> bool:
 
 @dataclass(frozen=True)
 class ClipScore:
-    """The scores of one network on one clip."""
+    """The scores of one network on one clip, None for one that the clip does not have."""
 
     network: str
     severity: str
     clip: int
-    values: Mapping[str, float]
+    values: Mapping[str, Any]
 
 
 @torch.no_grad()
@@ -159,7 +159,7 @@ def format_chart_summary(
         first = next(iter(by_threads.values()))
         is_fastest = fastest.get(network) in by_threads.values()
         rows = [r.values for r in scores if is_fastest and r.network == network]
-        means = [m.format_value(sum(r[m.name] for r in rows) / len(rows)) if rows else ""
+        means = [m.format_value(mean_score(r[m.name] for r in rows)) if rows else ""
                  for m in metrics]  # fmt: skip
         took = [_format_time(by_threads.get(count)) for count in threads]
         size = [f"{first.gmac:.2f}" if first.gmac is not None else "", str(first.params or 0)]

@@ -124,13 +124,14 @@ def summarize_scores(clips: list[dict], own_metrics: Iterable[Column] = ()) -> d
     """Return {clips, metric: {mean, std, interval}} over clips; `interval`: 95 % bootstrap CI.
 
     `std`: standard deviation of the clips' values.  Clips that state their number of `frames`, as
-    recorded sequences do, count by it in all three.
+    recorded sequences do, count by it in all three; clips without a score (None) are left out.
     """
     summary: dict = {"clips": len(clips)}
-    weights = frame_weights(clips)
-    names = (*NAMES, *(metric.name for metric in own_metrics))
-    for metric in (name for name in names if clips and name in clips[0]):
-        values = [clip[metric] for clip in clips]
+    for metric in (*NAMES, *(metric.name for metric in own_metrics)):
+        scored = [clip for clip in clips if clip.get(metric) is not None]
+        if not scored:
+            continue
+        values, weights = [clip[metric] for clip in scored], frame_weights(scored)
         mean, std = statistics.fmean(values, weights), _weighted_std(values, weights)
         interval = bootstrap_interval(values, weights)
         summary[metric] = {"mean": mean, "std": std, "interval": interval}

@@ -12,7 +12,7 @@ from torch import Tensor
 from src.bench.candidates import Candidate
 from src.bench.stress_tests.event_clips import ClipConditions, EventClip, StressBench, require_type
 from src.bench.stress_tests.stress_results import StressResult, build_worst_psnr_loss_result
-from src.metrics.image import aligned_psnr
+from src.metrics.video_metrics import score_aligned_psnr
 from src.models.network import unroll
 from src.sim import noise
 from src.sim.optics import layout, most_central_view_index
@@ -85,7 +85,7 @@ def measure_window_rate_loss(
         at = (instants * (rate_hz / slowest)).round().long()
         truth = (instants * (clip.fps / slowest)).round().long()
         frames = clip.reconstruct_at_rate(network, rate_hz, at.tolist())
-        return float(aligned_psnr(frames, clip.target[truth, None]).mean())
+        return float(score_aligned_psnr(frames, clip.target[truth, None]).mean())
 
     clips = bench.clips()
     base = fmean(score(clip, clip.fps) for clip in clips)

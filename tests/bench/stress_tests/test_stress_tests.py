@@ -1,5 +1,6 @@
 """Event clips against the pipeline; results; networks whose result of a stress test is known."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -124,6 +125,15 @@ def test_a_stress_clip_has_the_sensor_that_was_drawn():
 def test_nothing_known_is_a_failure_and_the_first_break_is_found():
     found = StressResult(float("nan"), "dB", 1.0, [(1, 0.5), (2, 1.5), (3, 0.2)])
     assert found.failed and found.first_failure == 2
+
+
+def test_frames_whose_truth_is_uniform_have_no_aligned_psnr(bench):
+    (clip,) = bench.clips()
+    longer = torch.cat([clip.target, torch.full_like(clip.target, 0.5)])
+    seen = replace(clip, target=longer, turbulent=longer)
+    frames = (seen.truth + 0.1 * torch.randn(seen.truth.shape)).clamp(0, 1)
+    whole, part = (bench.clip_aligned_psnr(frames[:n], c) for n, c in ((None, seen), (16, clip)))
+    assert whole == pytest.approx(part, abs=1e-4)
 
 
 def test_a_sum_holds_and_a_leaky_sum_does_not(bench):
