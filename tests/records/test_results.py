@@ -1,5 +1,6 @@
 """Scores that clips do not have, from the network to the record and back."""
 
+import json
 import math
 
 import pytest
@@ -19,6 +20,16 @@ def test_clips_without_a_score_are_left_out_of_the_mean_and_nan_is_not():
     assert math.isnan(
         results.summarize_scores([*clips, {"psnr_aligned": math.nan}])["psnr_aligned"]["mean"]
     )
+
+
+def test_clips_of_one_photograph_are_no_independent_clips():
+    rows = [{"source": name, "ssim": ssim} for name, ssim in [("a", 0.1), ("a", 0.2), ("b", 0.9)]]
+    drawn = [row | {"source": ""} for row in rows]
+    shared, apart = (results.summarize_scores(clips)["ssim"]["interval"] for clips in (rows, drawn))
+    assert shared == pytest.approx((0.15, 0.9)) and apart[0] < 0.15
+    for clips in (rows[:2], rows[:1]):
+        found = json.dumps(results.summarize_scores(clips)["ssim"])
+        assert json.loads(found)["interval"] is None and "NaN" not in found
 
 
 def test_an_empty_cell_is_a_score_that_a_clip_does_not_have(tmp_path):
