@@ -183,6 +183,14 @@ def test_turbulence_in_common_matters_only_to_what_looks_at_several_views(bench)
         conditions.measure_correlated_views_loss(running(1), bench, **common)
 
 
+def test_more_views_lost_than_there_are_is_said(bench):
+    for views, said in ((1, "the centre view only"), (9, "9 views, 10 are needed")):
+        with pytest.raises(ValueError, match=f"it is given {said}"):
+            conditions.measure_worst_view_dropout_loss(
+                running(views), bench, counts=[1, 9], limit_db=0.5
+            )
+
+
 @pytest.mark.parametrize("views", [2, 4])
 def test_without_a_middle_the_centre_view_is_that_of_the_optics(views):
     bench, subject = (
