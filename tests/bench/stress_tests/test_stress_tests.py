@@ -1,5 +1,6 @@
 """Event clips against the pipeline; results; networks whose result of a stress test is known."""
 
+import csv
 from dataclasses import replace
 from functools import partial
 
@@ -125,6 +126,17 @@ def test_a_stress_clip_has_the_sensor_that_was_drawn():
 def test_nothing_known_is_a_failure_and_the_first_break_is_found():
     found = StressResult(float("nan"), "dB", 1.0, [(1, 0.5), (2, 1.5), (3, 0.2)])
     assert found.failed and found.first_failure == 2
+
+
+def test_a_reference_beyond_the_limit_is_no_failure_of_the_network():
+    found = StressResult(2.0, "px", 1.0, varied="video", unjudged=[("light of one view", 3.0)])
+    titles, outcomes = {"straight": "straight"}, {"straight": {"net": found}}
+    text = stress_results.format_summary_per_network(outcomes, titles, {})
+    assert "- straight: 2.0 px, limit at most 1\n" in text
+    rows = csv.DictReader(stress_results.format_outcomes_csv(outcomes, titles).splitlines())
+    assert [(row["setting"], row["failed"]) for row in rows] == [
+        ("", "True"), ("light of one view", "")
+    ]  # fmt: skip
 
 
 def test_frames_whose_truth_is_uniform_have_no_aligned_psnr(bench):
