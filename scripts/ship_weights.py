@@ -201,8 +201,8 @@ def _tested(record: dict) -> str:
 def _cell(metric: Column, score: dict | None) -> str:
     if score is None:
         return metric.format_value(None)
-    low, high = map(metric.format_value, score["interval"])
-    return f"{metric.format_value(score['mean'])} ({low} to {high})"
+    mean, interval = metric.format_value(score["mean"]), score["interval"]
+    return f"{mean} ({' to '.join(map(metric.format_value, interval))})" if interval else mean
 
 
 def _scenes(cfg: DictConfig) -> str:

@@ -54,7 +54,8 @@ def compare(cfg: DictConfig) -> dict:
     cuts = [slices.cut_slice(film, fps=cfg.fps, **{kind: cfg[kind]}) for film in films]
     scores, rows = {}, []
     for name, path, film, (across, _) in zip(names, cfg.videos, films, cuts, strict=True):
-        scores[name] = _measure(film, across, cfg, kind) | _score_against_camera(cfg, Path(path))
+        camera = _score_against_camera(cfg, Path(path), len(film))
+        scores[name] = _measure(film, across, cfg, kind) | camera
         rows.append(comparison.VideoRow(name, film, across, _format_note(scores[name])))
     with results.store_config_when_done(run, entry_point.resolved_yaml(cfg)):
         _draw(rows, run / "comparison.png", cfg, kind, line=cuts[0][1])
@@ -79,12 +80,17 @@ def _check_frame_rate(cfg: DictConfig) -> None:
 
 
 def _read_films(cfg: DictConfig, names: Sequence[str]) -> list[np.ndarray]:
-    """Return the frames `first` to `last` of every video, of one size."""
+    """Return the frames `first` to `last` of every video, of one size and number."""
     read = (np.stack(list(videos.read_video(path, "videos"))) for path in cfg.videos)
     films = {
         name: _cut_part(film, cfg.first, cfg.last, name)
         for name, film in zip(names, read, strict=True)
     }
+    lengths = {name: len(film) for name, film in films.items()}
+    if (common := min(lengths.values())) < max(lengths.values()):
+        listed = ", ".join(f"{name} {count}" for name, count in lengths.items())
+        print(f"the first {common} of these frames of each are compared: {listed}")
+        films = {name: film[:common] for name, film in films.items()}
     if cfg.still is not None:
         films = slices.shrink_to_smallest(films)
     sizes = {film.shape[1:] for film in films.values()}
@@ -115,11 +121,11 @@ def _measure(film: np.ndarray, across: slices.Slice, cfg: DictConfig, kind: str)
     return slice_motion.measure_slice_motion(across, kind, cfg.moving_object_brightness)
 
 
-def _score_against_camera(cfg: DictConfig, video: Path) -> dict:
+def _score_against_camera(cfg: DictConfig, video: Path, frames: int) -> dict:
     if not cfg.reference_images:
         return {}
     part = slice(cfg.first, cfg.last)
-    return camera_frames.score_against_camera(video, Path(cfg.reference_images), part)
+    return camera_frames.score_against_camera(video, Path(cfg.reference_images), part, frames)
 
 
 def _format_note(scores: dict) -> str:

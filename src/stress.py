@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from functools import cache, partial
+from inspect import signature
 from multiprocessing import get_context
 from pathlib import Path
 from typing import cast
@@ -11,10 +12,11 @@ import rich
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from src import HOME
 from src.app import compared_networks, entry_point, simulation
-from src.app.instantiate import build_part
+from src.app.instantiate import FUNCTIONS, build_part
 from src.bench.candidates import Candidate
-from src.bench.stress_tests import stress_results
+from src.bench.stress_tests import arguments, stress_results
 from src.bench.stress_tests.event_clips import StressBench
 from src.figures.stress_map import draw_stress_map
 from src.records import results
@@ -81,14 +83,28 @@ def _test_network(config: str, index: int) -> NetworkResults:
 
 @cache
 def _load(config: str) -> tuple[list[Candidate], Callable[[Candidate], NetworkResults]]:
-    """Return the networks and what runs the tests on one; ValueError for tests that are none."""
+    """Return the networks and what runs the tests on one; ValueError for tests that are none, and
+    for their arguments."""
     cfg = cast(DictConfig, OmegaConf.create(config))
     keys = {name: f"stress_tests.{name}.test" for name in cfg.stress_tests}
     tests = {name: build_part(cfg, key, _partial_=True) for name, key in keys.items()}
     pipeline = simulation.build_pipeline(cfg, "test")
+    for name, key in keys.items():
+        _check_arguments(key, tests[name], cfg.fps)
     bench = StressBench(pipeline, range(cfg.clips), cfg.data.unscored_windows)
     tester = partial(stress_results.run_stress_tests, tests=tests, bench=bench)
     return compared_networks.load_candidates(cfg), tester
+
+
+def _check_arguments(key: str, test: Callable[..., object], fps: float) -> None:
+    assert isinstance(test, partial)
+    if not test.func.__module__.removeprefix(HOME).startswith(FUNCTIONS):
+        return  # the user's own
+    try:
+        signature(test.func).bind("network", "bench", **test.keywords)
+    except TypeError as error:
+        raise ValueError(f"{key} must have the test's own arguments: {error}") from None
+    arguments.check_arguments(key, test.func.__name__, test.keywords, fps)
 
 
 if __name__ == "__main__":

@@ -420,6 +420,20 @@ def test_videos_of_two_sizes_are_not_compared(tmp_path):
         compare(config("compare", tmp_path / "run", films, "line=[[0,0],[19,0]]"))
 
 
+def test_of_videos_of_two_lengths_the_common_frames_are_compared(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    film = np.repeat(rng.integers(0, 255, (1, 40, 50)), 9, axis=0)
+    film[4:] = rng.integers(0, 255, (5, 40, 50))
+    for name, frames in (("long", 9), ("short", 4)):
+        (tmp_path / name).mkdir()
+        for k, frame in enumerate(film[:frames]):
+            cv2.imwrite(str(tmp_path / name / f"{k}.png"), frame.astype(np.uint8))
+    videos = f"videos=[{tmp_path}/long,{tmp_path}/short]"
+    found = compare(config("compare", tmp_path / "run", videos, "names=[a,b]", "still=8"))
+    assert found["a"] == found["b"] and found["a"]["flicker"] == 0
+    assert "the first 4 of these frames of each are compared: a 9, b 4" in capsys.readouterr().out
+
+
 def test_videos_of_two_shapes_are_not_stretched(tmp_path):
     for name, size in (("wide", (20, 30)), ("high", (50, 10))):
         (tmp_path / name).mkdir()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from scripts import gallery, pretrain_context, readme, turbulence_map, widen_setnet
+from scripts import gallery, pretrain_context, readme, ship_weights, turbulence_map, widen_setnet
 from scripts.error_by_detail_size import missing
 from scripts.ship_weights import CARD_NOTE, Given, recard, ship
 from src.app import build
@@ -89,6 +89,11 @@ def test_weights_of_a_stage_are_shipped_with_the_card_of_a_run(tmp_path, monkeyp
     (run / "results.json").unlink()
     with pytest.raises(ValueError, match="weights are shipped from a commit, .* is of abc-dirty"):
         ship(run, "mean", [], Given(folder=tmp_path))
+
+
+def test_a_mean_without_an_interval_is_written_alone():
+    assert ship_weights._cell(METRICS[0], {"mean": 0.3, "interval": None}) == "0.300"
+    assert ship_weights._cell(METRICS[0], {"mean": 0.3, "interval": [0.2, 0.4]}).endswith("0.400)")
 
 
 def test_scores_take_the_place_of_older_ones_on_a_card(tmp_path):

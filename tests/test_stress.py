@@ -112,9 +112,28 @@ def stress_and_tell(folder: Path) -> None:
     [
         ("processes=0", "processes must be >= 1, got 0"),
         ("clips=0", "clips must be >= 1, got 0"),
+        ("data.test_windows=1", "data.test_windows must be >= 2, of which are scored, got 1"),
         ("data.test_windows=3", "data.unscored_windows must be in 0..1 .*, got 2"),
     ],
 )
 def test_numbers_that_leave_nothing_to_test_are_refused(tmp_path, wrong, message):
     with pytest.raises(ValueError, match=message):
         stress(tiny(tmp_path, "+networks={}", wrong))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (
+            "stress_tests.fast.test.rates_hz=[100]",
+            r"\.rates_hz must be such .*, got \[100\]",
+        ),
+        ("stress_tests.dropout.test.counts=[0]", r"\.counts must be whole .*, got \[0\]"),
+        ("+stress_tests.fast.test.foo=1", " must have the test's own arguments: .*'foo'"),
+        ("~stress_tests.fast.test.rates_hz", " must have the test's own arguments: .*'rates_hz'"),
+    ],
+)
+def test_arguments_of_a_test_are_checked_before_it_runs(tmp_path, wrong, message):
+    with pytest.raises(ValueError, match=r"^stress_tests\.\w*\.test" + message):
+        stress(tiny(tmp_path, "+networks={}", wrong))
+    assert not list(tmp_path.iterdir())

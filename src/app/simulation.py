@@ -45,6 +45,8 @@ def select_optics(cfg: DictConfig, net: VideoMethod) -> Optics:
 def check_unscored_windows(cfg: DictConfig) -> None:
     """Raise ValueError unless two windows of a test clip are scored, as many as jitter needs."""
     unscored, most = cfg.data.unscored_windows, cfg.data.test_windows - 2
+    if most < 0:
+        raise ValueError(f"data.test_windows must be >= 2, of which are scored, got {most + 2}")
     if not 0 <= unscored <= most:
         allowed = f"0..{most} (data.test_windows={most + 2} less two)"
         raise ValueError(f"data.unscored_windows must be in {allowed}, got {unscored}")

@@ -5,13 +5,13 @@ import statistics
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
 from itertools import groupby
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 
 from src.bench.candidates import Candidate
 from src.bench.speed import TIMED_FORMS, SpeedMeasurement
-from src.metrics.table import METRICS, NAMES, Column
+from src.metrics.table import METRICS, NAMES, Column, mean_score
 from src.metrics.video_metrics import VideoMetrics
 from src.records.results import format_csv
 from src.sim.pipeline import Pipeline, simulate
@@ -27,11 +27,11 @@ def check_chart_options(
     """Raise ValueError, naming the key, for what cannot be measured."""
     rules = {
         f"sizes must be multiples of 8 in 16..{LARGEST_SIDE}": (sizes, _is_side),
-        "threads must be numbers >= 1": (threads, lambda count: count >= 1),
+        "threads must be whole numbers >= 1": (threads, _is_count),
         f"forms must be of {', '.join(TIMED_FORMS)}": (forms, TIMED_FORMS.__contains__),
         "devices must be of cpu, cuda": (devices, ("cpu", "cuda").__contains__),
         f"severities must be of {', '.join(SEVERITIES)}": (severities, SEVERITIES.__contains__),
-        "clips must be >= 1": ([clips], lambda count: count >= 1),
+        "clips must be >= 1": ([clips], _is_count),
         "seconds must be > 0": ([seconds], lambda value: 0 < value < math.inf),
     }
     for rule, (values, is_allowed) in rules.items():
@@ -44,18 +44,22 @@ def check_chart_options(
             raise ValueError(f"{key} must include {needed}, got {listed}: {why}")
 
 
+def _is_count(count: object) -> bool:
+    return isinstance(count, int) and count >= 1
+
+
 def _is_side(side: object) -> bool:
     return isinstance(side, int) and 16 <= side <= LARGEST_SIDE and side % 8 == 0
 
 
 @dataclass(frozen=True)
 class ClipScore:
-    """The scores of one network on one clip."""
+    """The scores of one network on one clip, None for one that the clip does not have."""
 
     network: str
     severity: str
     clip: int
-    values: Mapping[str, float]
+    values: Mapping[str, Any]
 
 
 @torch.no_grad()
@@ -103,14 +107,14 @@ def select_by_one_standard_error(
     costs: Mapping[str, float], errors: Mapping[str, Sequence[float]]
 ) -> str:
     """Return the cheapest network whose mean error is within one standard error of the best (the
-    rule of Breiman et al. 1984); `errors` are of the same clips, the standard error that of the
-    difference to the best.
+    rule of Breiman et al. 1984); `errors` are of the same two clips or more, the standard error
+    that of the difference to the best.
     """
     best = min(errors, key=lambda name: statistics.fmean(errors[name]))
 
     def is_near(values: Sequence[float]) -> bool:
         more = [ours - least for ours, least in zip(values, errors[best], strict=True)]
-        spread = statistics.stdev(more) / math.sqrt(len(more)) if len(more) > 1 else 0.0
+        spread = statistics.stdev(more) / math.sqrt(len(more))
         return statistics.fmean(more) <= spread
 
     return min((name for name in errors if is_near(errors[name])), key=costs.__getitem__)
@@ -119,7 +123,8 @@ def select_by_one_standard_error(
 def recommend_network_per_severity(
     speeds: Sequence[SpeedMeasurement], scores: Sequence[ClipScore], side: int
 ) -> dict[str, str]:
-    """Return {severity: the cheapest network within one standard error of the best}.
+    """Return {severity: the cheapest network within one standard error of the best}, none for
+    fewer than two clips, of which there is no standard error.
 
     By LPIPS, else by 1 - SSIM; the cost is the thread time in ms on frames of `side`, in the
     fastest form.
@@ -131,7 +136,11 @@ def recommend_network_per_severity(
         if score.network in costs:
             error = score.values.get("lpips", 1 - score.values["ssim"])
             row.setdefault(score.network, []).append(error)
-    return {name: select_by_one_standard_error(costs, row) for name, row in errors.items() if row}
+    return {
+        name: select_by_one_standard_error(costs, row)
+        for name, row in errors.items()
+        if min(map(len, row.values()), default=0) > 1
+    }
 
 
 def format_chart_summary(
@@ -159,7 +168,7 @@ def format_chart_summary(
         first = next(iter(by_threads.values()))
         is_fastest = fastest.get(network) in by_threads.values()
         rows = [r.values for r in scores if is_fastest and r.network == network]
-        means = [m.format_value(sum(r[m.name] for r in rows) / len(rows)) if rows else ""
+        means = [m.format_value(mean_score(r[m.name] for r in rows)) if rows else ""
                  for m in metrics]  # fmt: skip
         took = [_format_time(by_threads.get(count)) for count in threads]
         size = [f"{first.gmac:.2f}" if first.gmac is not None else "", str(first.params or 0)]

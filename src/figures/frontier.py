@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from matplotlib.transforms import Bbox
 from src.bench.speed import SpeedMeasurement
 from src.bench.speed_accuracy import ClipScore, find_fastest_forms, find_pareto_front
 from src.figures.plots import save_figure
-from src.metrics.table import METRICS, Column
+from src.metrics.table import METRICS, Column, mean_score
 
 PAPER_MS, LIVE_MS = 3.4, 1000 / 600
 DRAWN = tuple(metric for metric in METRICS if metric.name in ("lpips", "psnr_aligned"))
@@ -60,9 +59,10 @@ def _draw_metric(
     spans: dict[str, Span] = {}
     for name, fastest in timed.items():
         values = [score.values[metric.name] for score in scores if score.network == name]
-        if values and fastest.ms:
+        mean = mean_score(values)
+        if mean is not None and fastest.ms:
             least = min(s.ms for s in speeds if s.ms and _is_like(s, fastest))
-            spans[name] = least, fastest.ms, fmean(values)
+            spans[name] = least, fastest.ms, mean
             line, colour = ([least, fastest.ms], [spans[name][2]] * 2), _colour(fastest)
             axes.plot(*line, "o-", markevery=[1], color=colour, lw=1.2)
     errors = {key: (ms, -metric.better * score) for key, (_, ms, score) in spans.items()}

@@ -64,7 +64,7 @@ class LPIPSTerm(FrameTerm):
 
     def __init__(self, weight: float = 1.0, net: str = "alex", backbone_weights: str | None = None):
         super().__init__(weight)
-        self.lpips = LPIPS(net, backbone_weights)
+        self.lpips = LPIPS(net, backbone_weights, key="loss.lpips")
 
     def forward(self, frames: Frames, target: Frames) -> FrameValues:
         return self.lpips(frames, target)

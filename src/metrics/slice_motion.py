@@ -51,7 +51,8 @@ def measure_static_scene(
 ) -> dict[str, float]:
     """Return `residual_displacement_px` of a static scene, the median over rows and columns
     `line_spacing_px` apart and as far from the border, `contrast`, the standard deviation of a
-    frame, and `flicker`, the mean change of a pixel from frame to frame over the contrast.
+    frame, and `flicker`, the mean change of a pixel from frame to frame over the contrast: nan of
+    a blank film.
 
     Raises ValueError where there is no such row or column.
     """
@@ -62,10 +63,11 @@ def measure_static_scene(
     lines = [inside[:, y] for y in range(0, inside.shape[1], step)]
     lines += [inside[:, :, x] for x in range(0, inside.shape[2], step)]
     contrast = float(film.std((1, 2)).mean())
+    change = float(np.abs(np.diff(film, axis=0)).mean())
     return {
         "residual_displacement_px": float(np.nanmedian([*map(residual_displacement_px, lines)])),
         "contrast": contrast,
-        "flicker": float(np.abs(np.diff(film, axis=0)).mean()) / max(contrast, 1e-9),
+        "flicker": change / contrast if contrast > 0 else float("nan"),
     }
 
 

@@ -1,9 +1,11 @@
 """The metrics of a clip as tables, figures and model cards show them, in this order.
 
-They are computed in video_metrics.py; this file imports nothing, so that a report needs no PyTorch.
+They are computed in video_metrics.py; this file needs no PyTorch, so that a report does not.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from statistics import fmean
 
 
 @dataclass(frozen=True)
@@ -37,3 +39,9 @@ METRICS = (
     Column("temporal_jitter_px", "temporal jitter px", 2, -1),
 )
 NAMES = tuple(metric.name for metric in METRICS)
+
+
+def mean_score(values: Iterable[float | None]) -> float | None:
+    """Return the mean over the clips that have a score, None where none has; NaN where one is."""
+    scored = [value for value in values if value is not None]
+    return fmean(scored) if scored else None

@@ -8,7 +8,7 @@ without the scene reads as if it moved with the truth: of a blank picture jitter
 """
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
@@ -28,9 +28,7 @@ def estimate_block_displacement(
 
     Blocks are 16 pixels wide; shifts are cut at 8 pixels.
     """
-    a, b, c = _structure(*_gradients(target))
-    weaker = (a + c) / 2 - ((a - c) ** 2 / 4 + b * b).sqrt()  # eigenvalue of each block's tensor
-    weight = torch.where(weaker > MIN_TEXTURE, weaker, torch.zeros_like(weaker))
+    weight = _texture(target)
     shift = torch.zeros(len(target), 2, *weight.shape[1:], dtype=target.dtype, device=target.device)
     for side in SMOOTHING:
         step = _step(_smooth(frames, side), _smooth(target, side), shift)
@@ -51,16 +49,31 @@ def backward_warp(
     return functional.grid_sample(frames, grid, mode, padding_mode="border", align_corners=False)
 
 
+def find_textured_pairs(target: Video) -> Bool[Tensor, " frames-1"]:
+    """Return which pairs of successive frames have a block with texture in both: those of which
+    there is a jitter."""
+    weights = _texture(target)
+    return (torch.minimum(weights[1:], weights[:-1]) > 0).any(-1).any(-1)
+
+
 def temporal_jitter_px(frames: Video, target: Video) -> Float[Tensor, " frames-1"]:
     """Return the rms change of the displacement from each frame to the next, in pixels per axis.
 
-    A block counts as much as its weaker weight in the two frames.
+    A block counts as much as its weaker weight in the two frames; 0 where `find_textured_pairs`
+    has none.
     """
     shift, weights = estimate_block_displacement(frames, target)
     squared = (shift[1:] - shift[:-1]).square().mean(1)
     weight = torch.minimum(weights[1:], weights[:-1])
     total = weight.sum((1, 2)).clamp(min=1e-12)
     return ((squared * weight).sum((1, 2)) / total).sqrt()
+
+
+def _texture(target: Video) -> Float[Tensor, "frames rows columns"]:
+    """Return each block's mean square gradient along its weaker direction, 0 below MIN_TEXTURE."""
+    a, b, c = _structure(*_gradients(target))
+    weaker = (a + c) / 2 - ((a - c) ** 2 / 4 + b * b).sqrt()  # eigenvalue of each block's tensor
+    return torch.where(weaker > MIN_TEXTURE, weaker, torch.zeros_like(weaker))
 
 
 def _structure(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:

@@ -13,12 +13,14 @@ from torchmetrics import MeanMetric, Metric, MetricCollection
 from src.metrics.image import aligned_psnr, psnr, ssim
 from src.metrics.lpips import LPIPS
 from src.metrics.table import NAMES, Column
-from src.metrics.temporal import Video, temporal_jitter_px
+from src.metrics.temporal import Video, find_textured_pairs, temporal_jitter_px
+
+LEAST_CONTRAST = 0.05  # grey levels: at mid-grey the lowest contrast threshold in use, 0.1
 
 
 def score_aligned_psnr(frames: Video, target: Video) -> Float[Tensor, " scored"]:
-    """Return the aligned PSNR of the frames whose target has contrast, which any frame equals
-    otherwise; of all where none has."""
+    """Return the aligned PSNR in dB of the frames whose target has contrast: any frame equals one
+    without."""
     kept = _have_contrast(target)
     return aligned_psnr(frames[kept], target[kept])
 
@@ -31,7 +33,8 @@ SCORES = {  # name in table.py: a value per frame
 
 
 class ClipMean(MeanMetric):
-    """The mean over clips of the mean of `score(frames, target)` over a clip."""
+    """The mean over clips of the mean of `score(frames, target)` over a clip; clips of which it
+    returns no value are left out."""
 
     full_state_update = False
 
@@ -39,12 +42,16 @@ class ClipMean(MeanMetric):
         super().__init__(nan_strategy="disable")
         # In a tuple: the parameters of a network that scores are no part of a checkpoint.
         self._score = (score,)
+        self.is_clip_scored = False  # the last one
 
     def update(self, frames: Video, target: Video) -> None:  # type: ignore[override]
         (score,) = self._score
         if isinstance(score, LPIPS):
             score.to(frames.device)
-        super().update(score(frames, target).mean())
+        values = score(frames, target)
+        self.is_clip_scored = values.numel() > 0
+        if self.is_clip_scored:
+            super().update(values.mean())
 
 
 def resample(frames: Video, scale: float) -> Float[Tensor, "frames 1 h2 w2"]:
@@ -59,18 +66,17 @@ def measure_reduced_jitter_px(
     frames: Video, target: Video, reduction: int
 ) -> Float[Tensor, " pairs"]:
     """Return the temporal jitter of pairs of frames in their pixels, measured on frames `reduction`
-    times smaller; of the pairs whose targets have contrast, of all where none has."""
-    smaller = (resample(video, 1 / reduction) for video in (frames, target))
-    jitter, seen = temporal_jitter_px(*smaller), _have_contrast(target)
-    both = seen[1:] & seen[:-1]
-    return reduction * (jitter[both] if both.any() else jitter)
+    times smaller; of the pairs whose targets have contrast and a block with texture in both."""
+    smaller = [resample(video, 1 / reduction) for video in (frames, target)]
+    seen = _have_contrast(target)
+    kept = seen[1:] & seen[:-1] & find_textured_pairs(smaller[1])
+    return reduction * temporal_jitter_px(*smaller)[kept]
 
 
 def _have_contrast(target: Video) -> Bool[Tensor, " frames"]:
-    """Return which frames have more than one value; all where none has."""
+    """Return which frames have a range of LEAST_CONTRAST or more."""
     values = target.flatten(1)
-    seen = values.amax(1) > values.amin(1)
-    return seen if seen.any() else torch.ones_like(seen)
+    return values.amax(1) - values.amin(1) >= LEAST_CONTRAST
 
 
 def score_by_user_metric(name: str, metric: Metric, frames: Tensor, target: Tensor) -> Tensor:
@@ -90,7 +96,8 @@ def score_by_user_metric(name: str, metric: Metric, frames: Tensor, target: Tens
 class VideoMetrics(MetricCollection):
     """PSNR, aligned PSNR, SSIM, temporal jitter and, if a network is given, LPIPS of clips; and
     those of `own`, by name, each as score_by_user_metric.  Aligned PSNR and jitter leave out frames
-    whose target has no contrast.
+    whose target has a range (max - min) below 0.05, jitter pairs of frames without a textured
+    block, too; a clip that has no others has no such score.
 
     Frames are clipped to [0, 1]; the data range is 1.  `resolution_scale`: frames and targets are
     scored at so many times their own resolution, temporal jitter in pixels of the scored frame.
@@ -131,8 +138,13 @@ class VideoMetrics(MetricCollection):
         )
 
     @torch.no_grad()
-    def forward(self, frames: Video, target: Video) -> dict[str, float]:
-        """Add a clip; return its scores by name."""
+    def forward(self, frames: Video, target: Video) -> dict[str, float | None]:
+        """Add a clip; return its scores by name, None for one that it does not have."""
         pair = (frames.float().clamp(0, 1), target)
         values = super().forward(*(resample(video, self.resolution_scale) for video in pair))
-        return {name: float(value) for name, value in values.items()}
+        return {k: float(v) if self._is_clip_scored(k) else None for k, v in values.items()}
+
+    def _is_clip_scored(self, name: str) -> bool:
+        mean = self[name]
+        assert isinstance(mean, ClipMean)
+        return mean.is_clip_scored

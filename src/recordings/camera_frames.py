@@ -15,10 +15,13 @@ NAMES = ("ssim", "lpips", "lpips_aligned", "correlation")
 SETTLING = 2  # first frames of a reconstruction, which are not looked at
 
 
-def score_against_camera(video: Path, listing: Path, part: slice = slice(None)) -> dict[str, float]:
-    """Return the mean scores NAMES of `part` of a video of src.reconstruct with a camera's frames,
-    each against the frame nearest in time; `lpips_aligned` is after the best gain and offset of
-    each frame, as events carry neither.  A frame without contrast has correlation 0.
+def score_against_camera(
+    video: Path, listing: Path, part: slice = slice(None), most: int | None = None
+) -> dict[str, float]:
+    """Return the mean scores NAMES of `part` of a video of src.reconstruct, its first `most` frames
+    (None: all), with a camera's frames, each against the frame nearest in time; `lpips_aligned` is
+    after the best gain and offset of each frame, as events carry neither.  A frame without contrast
+    has correlation 0.
 
     `listing`: a line per picture, seconds and file.  Raises ValueError as `check_camera_frames`
     does, and where no picture falls on a frame.
@@ -26,7 +29,7 @@ def score_against_camera(video: Path, listing: Path, part: slice = slice(None)) 
     table = check_camera_frames(video, listing)
     film, scores, lpips = list(videos.read_video(video)), [], LPIPS()
     clock = _read_clock(video, table, len(film))
-    scored = range(len(film))[part]
+    scored = range(len(film))[part][:most]
     reach = 0.5 * float(np.diff(clock).max(initial=0.0))
     for second, name in read_frame_list(listing, "reference_images"):
         nearest = int(np.abs(clock - second).argmin())

@@ -4,6 +4,7 @@ import csv
 import hashlib
 import io
 import json
+import math
 import os
 import re
 import shutil
@@ -124,16 +125,19 @@ def summarize_scores(clips: list[dict], own_metrics: Iterable[Column] = ()) -> d
     """Return {clips, metric: {mean, std, interval}} over clips; `interval`: 95 % bootstrap CI.
 
     `std`: standard deviation of the clips' values.  Clips that state their number of `frames`, as
-    recorded sequences do, count by it in all three.
+    recorded sequences do, count by it in all three; clips without a score (None) are left out.
+    The interval, None of clips of one photograph or video, is over photographs (`list_sources`).
     """
     summary: dict = {"clips": len(clips)}
-    weights = frame_weights(clips)
-    names = (*NAMES, *(metric.name for metric in own_metrics))
-    for metric in (name for name in names if clips and name in clips[0]):
-        values = [clip[metric] for clip in clips]
+    for metric in (*NAMES, *(metric.name for metric in own_metrics)):
+        scored = [clip for clip in clips if clip.get(metric) is not None]
+        if not scored:
+            continue
+        values, weights = [clip[metric] for clip in scored], frame_weights(scored)
         mean, std = statistics.fmean(values, weights), _weighted_std(values, weights)
-        interval = bootstrap_interval(values, weights)
-        summary[metric] = {"mean": mean, "std": std, "interval": interval}
+        interval = bootstrap_interval(values, weights, list_sources(scored))
+        known = None if math.isnan(interval[0]) else interval
+        summary[metric] = {"mean": mean, "std": std, "interval": known}
     return summary
 
 
@@ -146,6 +150,11 @@ def _weighted_std(values: list[float], weights: list[float] | None) -> float:
 def frame_weights(clips: list[dict]) -> list[float] | None:
     """Return the number of frames of each clip where all state it, None: they count alike."""
     return [float(clip["frames"]) for clip in clips] if all("frames" in c for c in clips) else None
+
+
+def list_sources(clips: list[dict]) -> list[str | int]:
+    """Return the photograph or video that each clip shows, a number where it shows none."""
+    return [clip.get("source") or number for number, clip in enumerate(clips)]
 
 
 def write_and_print_results(
@@ -211,15 +220,18 @@ def build_rich_score_table(rows: list[ScoreRow]) -> Table:
 
 def describe_score_difference(ours: ScoreRow, theirs: ScoreRow) -> str:
     """Return a line of the first metric that both have: its difference over the same clips with the
-    95 % bootstrap CI; "" for fewer than two clips."""
+    95 % bootstrap CI; "" without one, as of fewer than two clips."""
     metric = next(
         (m for m in METRICS if m.name in ours.clips[0] and m.name in theirs.clips[0]), None
     )
-    if metric is None or len(ours.clips) < 2:
+    if metric is None:
         return ""
     sides = [[float(clip[metric.name]) for clip in row.clips] for row in (ours, theirs)]
     change = statistics.fmean(sides[0]) - statistics.fmean(sides[1])
-    low, high = bootstrap_difference_interval(sides[:1], sides[1:])
+    groups = list_sources(ours.clips)
+    low, high = bootstrap_difference_interval(sides[:1], sides[1:], groups=groups)
+    if math.isnan(low):
+        return ""
     digits = metric.digits + 1
     said = ": it holds 0, so no difference is shown" if low <= 0 <= high else ""
     return (

@@ -11,6 +11,7 @@ import yaml
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
+from src.metrics.table import NAMES
 from src.records import results, safe_yaml
 
 FIGURES = ("chart", "machine", "stress")  # of src.chart and src.stress
@@ -131,8 +132,9 @@ def _read(file: Path) -> Run:
 
 
 def _read_clips(file: Path, record: dict) -> list[dict[str, str]]:
-    """Return the scores of clips, none where there is no file.  Raises one of READ_ERRORS where the
-    file, or what `record` says of the test, is cut short."""
+    """Return the scores of clips, without those that a clip does not have, none where there is no
+    file.  Raises one of READ_ERRORS where the file, or what `record` says of the test, is cut
+    short."""
     test = record["test"]
     scores = [score for name, score in test.items() if name != "clips"]
     if not record["latency_ms"] or any("mean" not in score for score in scores):
@@ -142,7 +144,7 @@ def _read_clips(file: Path, record: dict) -> list[dict[str, str]]:
         raise ValueError(f"{file.name} has {len(rows)} clips, the test had {test['clips']}")
     if any(None in row or None in row.values() for row in rows):
         raise ValueError(f"{file.name} is cut short")
-    return rows
+    return [{k: text for k, text in row.items() if text or k not in NAMES} for row in rows]
 
 
 def _plan(hydra: dict) -> SweepPlan:

@@ -195,7 +195,8 @@ class Pipeline:
         return dict(self.turbulence_operator(draw).metadata)
 
     def _record(self, draw: ClipParameters) -> dict:
-        drawn = {"clip": draw.number, "name": draw.clip.name, "threshold": draw.sensor.threshold}
+        drawn = {"clip": draw.number, "name": draw.clip.name, "source": draw.clip.source}
+        drawn["threshold"] = draw.sensor.threshold
         drawn |= {name: getattr(draw.sensor, name) for name in self.sensor.random}
         return drawn | self.turbulence_record(draw)
 

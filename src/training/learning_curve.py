@@ -3,13 +3,13 @@
 from collections.abc import Iterable
 from copy import deepcopy
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 import torch
 from lightning import Callback, Trainer
 
 from src.losses.terms import TrainingLoss
+from src.metrics.table import mean_score
 from src.models import files
 from src.records.atomic import write_text
 from src.records.results import format_csv
@@ -130,7 +130,7 @@ class LearningCurve(Callback):
 
 
 @torch.no_grad()
-def mean_validation_scores(trainer: Trainer, module: Reconstructor) -> dict[str, float]:
+def mean_validation_scores(trainer: Trainer, module: Reconstructor) -> dict[str, float | None]:
     """Return the mean of every score over the validation clips, of the averaged weights."""
     module.eval()
     with use_averaged_weights(module):
@@ -138,7 +138,7 @@ def mean_validation_scores(trainer: Trainer, module: Reconstructor) -> dict[str,
         clips = [scores for sample in samples for scores in module.reconstruct_and_score(sample)[1]]
     module.metrics.reset()
     module.train()
-    return {name: fmean(clip[name] for clip in clips) for name in module.metrics.names}
+    return {name: mean_score(clip[name] for clip in clips) for name in module.metrics.names}
 
 
 def read_training_progress(weights: Path) -> dict:

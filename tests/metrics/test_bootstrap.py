@@ -60,8 +60,33 @@ def test_it_is_scipy_s_where_there_is_one_seed():
     )
 
 
-def test_a_single_value_has_no_width():
-    assert bootstrap_interval([0.25]) == (0.25, 0.25)
+def test_clips_of_one_photograph_are_drawn_together():
+    rng, held, apart = np.random.default_rng(6), 0, 0
+    groups = np.repeat(np.arange(20), 5).tolist()
+    for _ in range(200):
+        values = (np.repeat(rng.normal(size=20), 5) + 0.5 * rng.normal(size=100)).tolist()
+        (low, high), (least, most) = (
+            bootstrap_interval(values, None, groups),
+            bootstrap_interval(values),
+        )
+        held, apart = held + (low <= 0 <= high), apart + (least <= 0 <= most)
+    assert held / 200 == pytest.approx(0.93, abs=0.04) and apart / 200 < 0.7
+
+
+def test_weights_count_within_a_photograph():
+    groups = ["a", "a", "b", "c"]
+    merged = bootstrap_interval([2.0, 7.0, 1.0], [4.0, 1.0, 2.0])
+    assert bootstrap_interval([1.0, 3.0, 7.0, 1.0], [2.0, 2.0, 1.0, 2.0], groups) == merged
+
+
+def test_a_photograph_for_each_clip_changes_nothing():
+    values = np.random.default_rng(7).normal(size=9).tolist()
+    assert bootstrap_interval(values, None, list("ihgfedcba")) == bootstrap_interval(values)
+
+
+@pytest.mark.parametrize(("values", "groups"), [([0.25], None), ([0.25, 0.5], ["a", "a"])])
+def test_of_one_clip_or_photograph_there_is_no_interval(values, groups):
+    assert np.isnan(bootstrap_interval(values, None, groups)).all()
 
 
 def test_rows_must_be_of_the_same_clips():

@@ -5,6 +5,7 @@ import pytest
 import torch
 from torch import nn
 
+from src.losses.terms import LPIPSTerm
 from src.metrics import lpips
 from src.metrics.lpips import LPIPS
 
@@ -70,17 +71,21 @@ def test_it_never_trains():
 
 
 def test_small_pictures_and_unknown_nets_are_refused():
-    with pytest.raises(ValueError, match="lpips.net must be alex or vgg, got squeeze"):
+    with pytest.raises(ValueError, match=r"^metrics\.lpips\.net must be alex or vgg, got squeeze"):
         LPIPS("squeeze")
-    small = torch.rand(1, 1, 16, 16)
-    with pytest.raises(ValueError, match="resolution_scale must be >= 32 px"):
+    with pytest.raises(ValueError, match=r"^loss\.lpips\.net must be alex or vgg, got squeeze"):
+        LPIPSTerm(net="squeeze")
+    small, message = torch.rand(1, 1, 16, 16), "resolution_scale must be >= 32 px"
+    with pytest.raises(ValueError, match=rf"^data\.test_crop times metrics\.{message}"):
         build("alex")(small, small)
+    with pytest.raises(ValueError, match=r"^data\.crop must be >= 32 px"):
+        LPIPSTerm()(small, small)
 
 
 def test_without_weights_the_ways_to_get_them_are_named(tmp_path, monkeypatch):
     monkeypatch.setattr(lpips, "BACKBONE_FOLDER", tmp_path)
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    with pytest.raises(ValueError, match=r"\(1\).*\(2\).*loss=l1"):
+    with pytest.raises(ValueError, match=r"\(1\).*\(2\) metrics\.lpips\.backbone.*loss=l1"):
         LPIPS("alex")
     with pytest.raises(ValueError, match="lpips.backbone_weights"):
         LPIPS("alex", backbone_weights=str(tmp_path / "absent.pth"))

@@ -70,6 +70,12 @@ def test_a_slice_in_which_nothing_moves_has_no_straightness():
     assert np.isnan(slice_motion.uniform_rotation_deviation_px(np.full((10, 50), 0.5)))
 
 
+@pytest.mark.filterwarnings("ignore:All-NaN slice")
+def test_a_blank_film_does_not_stand_still():
+    blank = slice_motion.measure_static_scene(np.full((6, 40, 40), 0.5, np.float32), 8)
+    assert np.isnan(blank["flicker"]) and np.isnan(blank["residual_displacement_px"])
+
+
 def test_flicker_is_change_over_contrast():
     scene = np.tile(np.sin(np.arange(40) / 3), (40, 1)).astype(np.float32)
     still = slice_motion.measure_static_scene(np.stack([scene] * 6), 8)

@@ -1,5 +1,7 @@
 """Scores of clips, their means, and another resolution than that of the frames."""
 
+import math
+
 import pytest
 import torch
 
@@ -79,9 +81,33 @@ def test_frames_without_contrast_have_no_aligned_psnr_and_no_jitter():
     target = photo(swing(1.0))
     frames = photo(swing(1.3)) + 0.05 * torch.randn(target.shape)
     blank = torch.full_like(target[:3], 0.1)
+    blank[:, :, 0, 0] += 0.04  # a pixel that is hardly seen
     scores = VideoMetrics().forward(frames, target)
     longer = torch.cat([torch.rand_like(blank), frames]), torch.cat([blank, target])
     with_blank = VideoMetrics().forward(*longer)
     for name in ("psnr_aligned", "temporal_jitter_px"):
         assert with_blank[name] == pytest.approx(scores[name], rel=1e-5)
-    assert VideoMetrics().forward(blank, blank)["psnr_aligned"] == 100
+
+
+def test_a_clip_without_contrast_has_no_such_score_and_no_part_in_the_mean():
+    metrics, blank = VideoMetrics(), torch.full((3, 1, 48, 48), 0.1)
+    seen, unseen = metrics(*moving_pair()), metrics(blank, blank)
+    assert unseen["psnr_aligned"] is None and unseen["temporal_jitter_px"] is None
+    assert unseen["psnr"] == 100 and VideoMetrics()(*moving_pair()) == seen
+    for name in ("psnr_aligned", "temporal_jitter_px"):
+        assert float(metrics.compute()[name]) == pytest.approx(seen[name], rel=1e-6)
+
+
+def test_pairs_of_frames_without_texture_have_no_jitter():
+    frames, target = moving_pair()
+    ramp = torch.linspace(0.3, 0.7, target.shape[-1]).expand_as(target[:3])
+    longer = torch.cat([torch.rand_like(ramp), frames]), torch.cat([ramp, target])
+    jitter = VideoMetrics()(*longer)["temporal_jitter_px"]
+    assert jitter == pytest.approx(VideoMetrics()(frames, target)["temporal_jitter_px"], rel=1e-5)
+    assert VideoMetrics()(torch.rand_like(ramp), ramp)["temporal_jitter_px"] is None
+
+
+def test_a_network_s_own_nan_is_a_score():
+    frames, target = moving_pair()
+    scores = VideoMetrics()(torch.full_like(frames, torch.nan), target)
+    assert all(math.isnan(scores[name]) for name in ("psnr_aligned", "temporal_jitter_px"))

@@ -179,6 +179,7 @@ def test_sub_frame_samples_refine_the_same_windows():
 def test_what_was_drawn_is_recorded():
     drawn = simulate(pipeline(STRONG, sensor={"threshold": [0.1, 0.7]}), [0]).parameters[0]
     assert 4 <= drawn["d_over_r0"] < 10 and 0.1 <= drawn["threshold"] <= 0.7
+    assert drawn["source"] == "", "a scene of no photograph"
     assert drawn["tilt_px"] > 0 and math.isfinite(drawn["tilt_px"])
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from src.bench.candidates import Candidate
 from src.bench.stress_tests.event_clips import ClipConditions, EventClip, StressBench, require_type
 from src.bench.stress_tests.stress_results import StressResult, build_worst_psnr_loss_result
-from src.metrics.image import aligned_psnr
+from src.metrics.video_metrics import score_aligned_psnr
 from src.models.network import unroll
 from src.sim import noise
 from src.sim.optics import layout, most_central_view_index
@@ -72,20 +72,20 @@ def measure_window_rate_loss(
 ) -> StressResult:  # fmt: skip
     """Return the aligned PSNR lost, at the same instants, when the events are cut at another rate.
 
-    `rates_hz`: windows a second, easy to hard; each is a multiple or a whole part of the clip's
-    own.  `duration_s`: how much of the clip is used; its second half is scored.
+    `rates_hz`: windows a second, easy to hard; all and the clip's own are multiples of the lowest
+    of them.  `duration_s`: how much of the clip is used; its second half is scored.
     """
 
     def score(clip: EventClip, rate_hz: float) -> float:
         slowest = min(clip.fps, *rates_hz)  # at whose instants all rates have a frame
         count = int(min(duration_s, clip.duration_s) * slowest)
         if count < 2:
-            raise ValueError(f"stress_tests: {count} instants at {slowest} a second are too few")
+            raise ValueError(f"{count} windows at {slowest:g} a second are too few to score")
         instants = torch.arange(count // 2, count) + 1
         at = (instants * (rate_hz / slowest)).round().long()
         truth = (instants * (clip.fps / slowest)).round().long()
         frames = clip.reconstruct_at_rate(network, rate_hz, at.tolist())
-        return float(aligned_psnr(frames, clip.target[truth, None]).mean())
+        return float(score_aligned_psnr(frames, clip.target[truth, None]).mean())
 
     clips = bench.clips()
     base = fmean(score(clip, clip.fps) for clip in clips)
@@ -96,8 +96,8 @@ def measure_window_rate_loss(
 def measure_voxel_dropout_loss(
     network: Candidate, bench: StressBench, *, limit_db: float, kept_shares: Sequence[float]
 ) -> StressResult:
-    """Return the aligned PSNR lost when only a share of the entries of the grids is kept, at
-    random: that of the last of `kept_shares`.
+    """Return the aligned PSNR lost when only a share of the entries of the voxel grids is kept, at
+    random: that of the last of `kept_shares`.  An event has two entries, which are drawn apart.
     """
 
     def thin(share: float) -> Callable[[Tensor], Tensor]:
@@ -105,13 +105,15 @@ def measure_voxel_dropout_loss(
         return lambda voxels: voxels * (torch.rand(voxels.shape, generator=generator) < share)
 
     curve = bench.aligned_psnr_losses(network, {share: thin(share) for share in kept_shares})
-    return StressResult(curve[-1][1], "dB", limit_db, curve, "share of events kept")
+    return StressResult(curve[-1][1], "dB", limit_db, curve, "share of voxels kept")
 
 
 def require_views(network: Candidate, least: int) -> None:
     """Raise ValueError unless the network is given at least so many views."""
-    if network.views < least:
+    if network.views == 1:
         raise ValueError("it is given the centre view only")
+    if network.views < least:
+        raise ValueError(f"it is given {network.views} views, {least} are needed")
 
 
 def measure_worst_view_dropout_loss(

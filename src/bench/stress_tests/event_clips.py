@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from src.bench.candidates import Candidate
-from src.metrics.image import aligned_psnr
+from src.metrics.video_metrics import score_aligned_psnr
 from src.models.backward_warmup import reverse_voxels
 from src.recordings.event_windows import build_window_rule
 from src.sim import noise
@@ -267,5 +267,6 @@ class StressBench:
         ]
 
     def clip_aligned_psnr(self, frames: Video, clip: EventClip) -> float:
-        """Return the mean aligned PSNR of the frames after the warm-up."""
-        return float(aligned_psnr(frames[self.warmup :], clip.truth[self.warmup :]).mean())
+        """Return the mean of `score_aligned_psnr` over the frames after the warm-up; NaN where no
+        truth has contrast."""
+        return float(score_aligned_psnr(frames[self.warmup :], clip.truth[self.warmup :]).mean())

@@ -11,7 +11,7 @@ from src.bench.candidates import Candidate
 from src.bench.stress_tests.conditions import require_views
 from src.bench.stress_tests.event_clips import US_PER_S, Curve, EventClip, StressBench
 from src.bench.stress_tests.stress_results import StressResult, build_worst_psnr_loss_result
-from src.metrics.image import aligned_psnr
+from src.metrics.video_metrics import score_aligned_psnr
 from src.sim.optics import Position, layout, most_central_view_index
 
 Fault = Callable[[EventClip], EventClip]
@@ -93,7 +93,7 @@ def _second_half_losses(
 
     def score(clip: EventClip) -> float:
         frames, half = clip.reconstruct(network)[0], len(clip.truth) // 2
-        return float(aligned_psnr(frames[half:], clip.truth[half:]).mean())
+        return float(score_aligned_psnr(frames[half:], clip.truth[half:]).mean())
 
     clips = bench.clips()
     base = fmean(map(score, clips))

@@ -46,8 +46,8 @@ def measure_contrast_retention_percent(
 def measure_long_sequence_drift(
     network: Candidate, bench: StressBench, *, limit_db: float, windows: int
 ) -> StressResult:
-    """Return the aligned PSNR in dB lost between the second and the last loop of a clip played back
-    and forth; the curve has one entry a tenth of the run.
+    """Return the aligned PSNR in dB lost between the second and the last loop of the first clip,
+    played back and forth; the curve has one entry a tenth of the run.
     """
     clip = bench.clips()[0]
     loop, truth = clip.back_and_forth()
@@ -155,7 +155,7 @@ def measure_adversarial_gain(
     perturbation.
 
     The perturbation, of `perturbation_rms`, is added to the first of `windows` windows and found by
-    `steps` of gradient ascent (Tanay et al., arXiv 2010.05099).
+    `steps` of gradient ascent (Tanay et al., arXiv 2010.05099), on the first clip.
     """
     network.require_float_parameters("its response is linear")
     clip = bench.clips()[0]
@@ -184,7 +184,7 @@ def measure_bf16_psnr_difference(
     network: Candidate, bench: StressBench, *, limit_db: float, windows: int
 ) -> StressResult:
     """Return the mean difference of aligned PSNR, in dB, between bf16 and float32 in the last
-    quarter of a long run.
+    quarter of a long run of the first clip.
     """
     network.require_float_parameters("there is nothing to round")
     clip, quarter = bench.clips()[0], windows // 4

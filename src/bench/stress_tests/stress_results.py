@@ -16,7 +16,8 @@ from src.records.results import format_csv
 class StressResult:
     """A `value` in `unit` that must not exceed `limit` (`higher_is_better`: not fall below it).
 
-    `curve`: how it went with the `varied` setting.
+    `curve`: how it went with the `varied` setting, from easy to hard; `unjudged`: values of other
+    settings, such as a reference, that are not held to the limit.
     """
 
     value: float
@@ -25,6 +26,7 @@ class StressResult:
     curve: Curve = field(default_factory=list)
     varied: str = ""
     higher_is_better: bool = False
+    unjudged: Curve = field(default_factory=list)
 
     def violates_limit(self, value: float) -> bool:
         """Return whether `value` is beyond the limit; NaN is."""
@@ -82,7 +84,8 @@ def run_stress_tests(
 
 
 def format_outcomes_csv(outcomes: Outcomes, titles: Mapping[str, str]) -> str:
-    """Return CSV: one line for the value of each outcome and for each point of its curve."""
+    """Return CSV: one line for the value of each outcome, each point of its curve and each value
+    that is not judged, of which `failed` is empty."""
     lines: list[list[object]] = []
     for test, row in outcomes.items():
         for network, outcome in row.items():
@@ -93,9 +96,11 @@ def format_outcomes_csv(outcomes: Outcomes, titles: Mapping[str, str]) -> str:
             points = [("", "", outcome.value)]
             points += [(outcome.varied, setting, value) for setting, value in outcome.curve]
             for varied, setting, value in points:
-                failed = outcome.violates_limit(value)
-                tail = [f"{value:.6g}", outcome.unit, outcome.limit, failed, ""]
-                lines.append([*head, varied, setting, *tail])
+                judged = [outcome.limit, outcome.violates_limit(value)]
+                lines.append([*head, varied, setting, f"{value:.6g}", outcome.unit, *judged, ""])
+            for setting, value in outcome.unjudged:
+                unit = outcome.unit
+                lines.append([*head, outcome.varied, setting, f"{value:.6g}", unit, "", "", ""])
     return format_csv(CSV_COLUMNS, lines)
 
 

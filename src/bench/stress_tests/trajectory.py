@@ -29,8 +29,9 @@ def measure_trajectory_deviation(
     frames.
 
     The front is the centroid of what has become brighter in the last frames near where it truly is.
-    The curve has the network's mean without turbulence, that of the light of one view, that of the
-    network and every clip, each named with the share of frames in which the target is lost.
+    Unjudged beside it are the network's mean without turbulence, that of the light of one view,
+    that of the network and every clip, each named with the share of frames in which the target is
+    lost.
     """
 
     def measure(clip: EventClip) -> CrossTrackError:
@@ -44,10 +45,10 @@ def measure_trajectory_deviation(
     rows = {"no turbulence": without, "light of one view": light, "mean": errors}
     rows |= {f"clip {n}": [error] for n, error in zip(bench.indices, errors, strict=True)}
     means = {name: _mean_error(row) for name, row in rows.items()}
-    curve = [(f"{name} ({100 * e.lost_share:.0f} % lost)", e.px) for name, e in means.items()]
+    shown = [(f"{name} ({100 * e.lost_share:.0f} % lost)", e.px) for name, e in means.items()]
     mean = means["mean"]
     value = mean.px if mean.lost_share <= MOST_LOST else math.nan
-    return StressResult(value, "px", limit_px, curve, "video")
+    return StressResult(value, "px", limit_px, varied="video", unjudged=shown)
 
 
 class CrossTrackError(NamedTuple):

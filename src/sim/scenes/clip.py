@@ -39,7 +39,8 @@ INTERVALS = {  # what ranges of numbers are above, and up to
 class Clip:
     """`frames` (frames, h, w) float32 in [0, 1], code values; `path_px`: the path (frames, 2) of a
     known target's centre (x, y), where there is one; `illumination`: the factor in (0, 1] that a
-    flickering lamp puts on the light of each frame, which `frames`, the ground truth, are without.
+    flickering lamp puts on the light of each frame, which `frames`, the ground truth, are without;
+    `source`: the name of the photograph or video that it shows, which other clips may share.
     """
 
     frames: Float[Tensor, "frames h w"]
@@ -47,6 +48,7 @@ class Clip:
     name: str
     path_px: Float[Tensor, "frames 2"] | None = None
     illumination: Float[Tensor, " frames #h #w"] | None = None
+    source: str = ""
 
 
 @runtime_checkable

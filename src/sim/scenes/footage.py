@@ -66,7 +66,9 @@ class Footage(SceneBase):
         before = np.floor(self.times).astype(int)
         share = (self.times - before).astype(np.float32)[:, None, None]
         frames = seen[before] + share * (seen[np.minimum(before + 1, last)] - seen[before])
-        return Clip(torch.from_numpy(frames), self.fps, f"{source.name}-{start}")
+        return Clip(
+            torch.from_numpy(frames), self.fps, f"{source.name}-{start}", source=source.name
+        )
 
     def _find_segments(self, root: Path, span: int) -> list[Segment]:
         """Return where clips start: first the first of every video, then the second, and so on."""

@@ -105,7 +105,7 @@ class Photographs(PhotographScene):
         times = self.motion_times_s(rests, rng_rests)
         frames = np.stack([render_frame(layers, time, self.size) for time in times])
         frames = np.clip(0.5 + offset + gain * (frames - 0.5), 0, 1).astype(np.float32)
-        return Clip(torch.from_numpy(frames), self.fps, f"{name}-{index}")
+        return Clip(torch.from_numpy(frames), self.fps, f"{name}-{index}", source=name)
 
     def _cutout_layer(self, rng: np.random.Generator) -> MovingLayer:
         _, photo = self.read_random_photograph(rng)

@@ -65,8 +65,8 @@ class TargetsOnPhotographs(PhotographScene):
                 shape, cover, _ = draw(time)
                 frame += cover * (dim - frame) + (bright - dim) * shape
             frames.append(frame)
-        clipped = np.clip(np.stack(frames), 0, 1).astype(np.float32)
-        return Clip(torch.from_numpy(clipped), self.fps, f"targets-{name}-{index}")
+        clipped = torch.from_numpy(np.clip(np.stack(frames), 0, 1).astype(np.float32))
+        return Clip(clipped, self.fps, f"targets-{name}-{index}", source=name)
 
     def _draw_target(self, rng: np.random.Generator) -> tuple[DrawFunction, float, float]:
         """Return a target's drawing, and the grey levels it has where it is dim and bright."""

@@ -1,5 +1,7 @@
 """Event clips against the pipeline; results; networks whose result of a stress test is known."""
 
+import csv
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -126,6 +128,26 @@ def test_nothing_known_is_a_failure_and_the_first_break_is_found():
     assert found.failed and found.first_failure == 2
 
 
+def test_a_reference_beyond_the_limit_is_no_failure_of_the_network():
+    found = StressResult(2.0, "px", 1.0, varied="video", unjudged=[("light of one view", 3.0)])
+    titles, outcomes = {"straight": "straight"}, {"straight": {"net": found}}
+    text = stress_results.format_summary_per_network(outcomes, titles, {})
+    assert "- straight: 2.0 px, limit at most 1\n" in text
+    rows = csv.DictReader(stress_results.format_outcomes_csv(outcomes, titles).splitlines())
+    assert [(row["setting"], row["failed"]) for row in rows] == [
+        ("", "True"), ("light of one view", "")
+    ]  # fmt: skip
+
+
+def test_frames_whose_truth_is_uniform_have_no_aligned_psnr(bench):
+    (clip,) = bench.clips()
+    longer = torch.cat([clip.target, torch.full_like(clip.target, 0.5)])
+    seen = replace(clip, target=longer, turbulent=longer)
+    frames = (seen.truth + 0.1 * torch.randn(seen.truth.shape)).clamp(0, 1)
+    whole, part = (bench.clip_aligned_psnr(frames[:n], c) for n, c in ((None, seen), (16, clip)))
+    assert whole == pytest.approx(part, abs=1e-4)
+
+
 def test_a_sum_holds_and_a_leaky_sum_does_not(bench):
     retention = partial(
         recurrence.measure_contrast_retention_percent, windows=[5, 50], limit_percent=90.0
@@ -171,6 +193,14 @@ def test_turbulence_in_common_matters_only_to_what_looks_at_several_views(bench)
     assert same > spaced > 0.01
     with pytest.raises(ValueError, match="the centre view only"):
         conditions.measure_correlated_views_loss(running(1), bench, **common)
+
+
+def test_more_views_lost_than_there_are_is_said(bench):
+    for views, said in ((1, "the centre view only"), (9, "9 views, 10 are needed")):
+        with pytest.raises(ValueError, match=f"it is given {said}"):
+            conditions.measure_worst_view_dropout_loss(
+                running(views), bench, counts=[1, 9], limit_db=0.5
+            )
 
 
 @pytest.mark.parametrize("views", [2, 4])

@@ -53,6 +53,14 @@ def test_a_clip_is_a_function_of_time(kind):
             torch.testing.assert_close(clip.path_px, fine.path_px[::3], atol=1e-4, rtol=0)
 
 
+def test_a_clip_says_which_photograph_it_shows():
+    for index in range(6):
+        clip = Photographs(split="test", frames=2, height=32, width=32).clip(index)
+        assert clip.name == f"{clip.source}-{index}" and clip.source in EMBEDDED["test"].split()
+    drawn = Targets(kinds=["dart"], split="test", frames=2, height=32, width=32).clip(0)
+    assert drawn.source == ""
+
+
 def test_motion_is_smooth_and_of_the_stated_speed():
     """Halving the frame interval halves the change from frame to frame: nothing jumps."""
     given = {"frames": 9, "speed_widths_per_s": (0.5, 0.5), "max_cutouts": 0}
