@@ -6,7 +6,8 @@ import pytest
 import yaml
 
 from src.records import runs
-from src.reports.run_groups import group_runs
+from src.reports.notes import describe_runs
+from src.reports.run_groups import find_unasked_differences, group_runs
 from tests.reports.runs import write_run, write_sweep
 
 
@@ -23,7 +24,46 @@ def test_seeds_of_one_setting_are_one_group_whatever_the_folders_are_called(tmp_
     assert seeds == {("lf3x3",): [0, 1], ("single256",): [0]}
 
 
-def test_the_label_takes_as_few_choices_and_overrides_as_tell_the_groups_apart(tmp_path):
+def test_what_command_lines_set_and_differs_is_in_the_label_whole(tmp_path):
+    for ckpt, turbulence in (("setnet_small", "weak"), ("single256", "strong")):
+        choices, overrides = (
+            {"turbulence": turbulence},
+            (f"ckpt={ckpt}", f"turbulence={turbulence}"),
+        )
+        asked = {"choices": choices, "overrides": overrides, "settings": {"ckpt": ckpt}}
+        write_run(tmp_path / ckpt, "eval", task="eval", **asked)
+    keys, found = grouped(tmp_path)
+    assert keys == ("turbulence", "ckpt")
+    assert {group.label for group in found} == {("weak", "setnet_small"), ("strong", "single256")}
+
+
+def test_settings_that_differ_with_no_word_of_the_command_line_are_in_the_note(tmp_path):
+    for name, width in (("a", 8), ("b", 16)):
+        write_run(tmp_path / name, settings={"lr": width / 10, "width": width, "depth": 2})
+    keys, found = grouped(tmp_path)
+    assert keys == ("lr",) and find_unasked_differences(keys, found) == ["width"]
+    assert " Settings differ that no command line names: width." in describe_runs(keys, found)
+
+
+def test_what_is_averaged_over_is_in_the_note(tmp_path):
+    for ckpt in ("a.ckpt", "b.ckpt"):
+        write_run(tmp_path / ckpt, settings={"ckpt": ckpt}, task="eval")
+    given = runs.find_runs([tmp_path])
+    keys, found = group_runs(given, across=("ckpt", "lr"))
+    assert describe_runs(keys, found) == " Means are over ckpt: a.ckpt, b.ckpt."
+
+
+def test_a_missing_job_has_the_label_that_its_run_would_have(tmp_path):
+    write_sweep(tmp_path, {"experiment": "x", "seed": "0", "threshold": "[0.1,0.7],0.30,0.2"})
+    overrides, settings = ("threshold=0.2",), {"threshold": 0.2}
+    write_run(tmp_path / "a", "x", overrides=overrides, settings=settings)
+    write_run(tmp_path / "b", "x", overrides=("threshold=1",), settings={"threshold": 1})
+    keys, found = grouped(tmp_path)
+    assert keys == ("threshold",)
+    assert [group.label[0] for group in found] == ["[0.1, 0.7]", "0.3", "0.2", "1"]
+
+
+def test_the_label_takes_as_few_choices_as_tell_the_groups_apart(tmp_path):
     place = 0
     for optics in ("single", "lf3x3"):
         for lr in ("0.1", "0.2"):
