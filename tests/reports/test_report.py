@@ -343,6 +343,14 @@ def test_jobs_whose_paths_were_quoted_for_hydra_are_not_missing(tmp_path):
     assert "ckpt=lf3x3,'/a b/net.ckpt' scene.root=/data/photographs`" in text
 
 
+def test_a_run_that_did_not_end_is_named(tmp_path, capsys):
+    write_run(tmp_path / "runs" / "a")
+    (write_run(tmp_path / "runs" / "b", "b") / "results.json").unlink()
+    report(config("report", tmp_path / "out", f"run={tmp_path}/runs"))
+    said = capsys.readouterr().out
+    assert f"left out, without results.json: {tmp_path}/runs/b" in said
+
+
 def test_an_empty_folder_is_refused_and_nothing_is_written(tmp_path):
     (tmp_path / "runs").mkdir()
     with pytest.raises(ValueError, match="run must hold results.json"):

@@ -103,6 +103,32 @@ def test_where_and_on_what_machine_it_ran_makes_no_other_cell(tmp_path):
     assert len(grouped(tmp_path)[1]) == 1
 
 
+@pytest.mark.parametrize(
+    ("weights", "cells"), [("setnet_small", 2), ("net.safetensors", 2), ("x/last.ckpt", 1)]
+)
+def test_a_training_that_went_on_from_weights_is_another_cell(weights, cells, tmp_path):
+    write_run(tmp_path / "a", seed=0)
+    folder = write_run(tmp_path / "b", seed=1, settings={"ckpt": weights})
+    record = json.loads((folder / "results.json").read_text()) | {"resumed_from": weights}
+    (folder / "results.json").write_text(json.dumps(record))
+    keys, found = grouped(tmp_path)
+    assert len(found) == cells and keys == (("ckpt",) if cells == 2 else ("experiment",))
+
+
+@pytest.mark.parametrize(
+    ("task", "other", "cells"),
+    [
+        ("train", {"devices": 8}, 2), ("train", {"devices": [0, 3]}, 1),
+        ("train", {"devices": 2, "num_nodes": 2}, 2), ("eval", {"devices": 8}, 1),
+    ],
+)  # fmt: skip
+def test_trainings_on_another_number_of_devices_are_another_cell(task, other, cells, tmp_path):
+    for seed, trainer in enumerate(({"devices": 2}, other)):
+        settings = {"trainer": trainer}
+        write_run(tmp_path / str(seed), seed=seed, settings=settings, task=task)
+    assert len(grouped(tmp_path)[1]) == cells
+
+
 @pytest.mark.parametrize(("task", "cells"), [("eval", 1), ("train", 2)])
 def test_other_test_clips_are_another_cell_of_trainings_only(task, cells, tmp_path):
     for seed in (0, 1):
@@ -182,6 +208,27 @@ def test_results_that_are_cut_short_are_refused(cut, tmp_path):
         (folder / "results.json").write_text(json.dumps(record))
     with pytest.raises(ValueError, match="run must hold whole results, got .*results.json: "):
         runs.find_runs([folder])
+
+
+def test_clips_whose_means_are_not_those_of_the_test_are_refused(tmp_path):
+    clips = [{"name": f"c{k}", "lpips": 0.1 * k, "ssim": float("nan")} for k in range(3)]
+    folder = write_run(tmp_path / "run", clips=clips)
+    assert len(runs.find_runs([folder])) == 1
+    table = folder / "clips.csv"
+    table.write_text(table.read_text().replace("0.1,", "0.4,"))
+    said = r"got .*run/results\.json: clips\.csv has the mean lpips 0\.2, the test 0\.1"
+    with pytest.raises(ValueError, match=said):
+        runs.find_runs([folder])
+
+
+def test_tests_and_trainings_that_did_not_end_are_found_outside_sweeps(tmp_path):
+    for name in ("done", "half", "other", "sweep/job"):
+        task = "simulate" if name == "other" else "eval"
+        folder = write_run(tmp_path / name, task=task)
+        if name != "done":
+            (folder / "results.json").unlink()
+    write_sweep(tmp_path / "sweep", {"seed": "0,1"})
+    assert runs.find_unfinished([tmp_path]) == [tmp_path / "half"]
 
 
 def test_results_beside_the_config_of_another_run_are_refused(tmp_path):
