@@ -12,7 +12,8 @@ from src.app.instantiate import as_dict
 from src.app.path_overrides import unquote_override
 from src.records import results, runs
 from src.reports import page, run_groups, tables, writers
-from src.reports.differences import build_difference_table, build_pair_table
+from src.reports.differences import build_difference_table
+from src.reports.pairs import build_pair_table
 
 
 @dataclass

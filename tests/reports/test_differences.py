@@ -10,7 +10,8 @@ import pytest
 from src.records import runs
 from src.report import report
 from src.reports import run_groups
-from src.reports.differences import build_difference_table, build_pair_table
+from src.reports.differences import build_difference_table
+from src.reports.pairs import build_pair_table
 from src.reports.tables import METRICS, TableCell
 from src.reports.writers import format_cell, format_csv_tables, format_markdown
 from tests.reports.runs import SCORES, write_run
