@@ -99,6 +99,15 @@ def test_columns_are_those_of_the_differences_from_against_too(tmp_path):
     assert "| LPIPS | 0.3500 | 0.3500 |" in text and "SSIM" not in text
 
 
+def test_arguments_of_an_own_metric_of_both_sides_are_test_conditions(tmp_path):
+    (one,) = found(tmp_path, "a", {"c": 2.0})
+    sides = [replace(one, record=one.record | {"own_metrics": {"blur": 1}},
+                     settings=one.settings | {"metrics.blur.size": size}) for size in (1, 2)]  # fmt: skip
+    note = build_difference_table("", sides[:1], sides[1:], PAPER).note
+    assert "Test conditions differ: metrics.blur.size." in note
+    assert "conditions" not in build_difference_table("", sides[:1], [one], PAPER).note
+
+
 def test_differences_need_the_same_clips(tmp_path):
     with pytest.raises(ValueError, match="run and against must hold the same clips"):
         build_difference_table(
