@@ -101,8 +101,9 @@ def test_columns_are_those_of_the_differences_from_against_too(tmp_path):
 
 def test_arguments_of_an_own_metric_of_both_sides_are_test_conditions(tmp_path):
     (one,) = found(tmp_path, "a", {"c": 2.0})
-    sides = [replace(one, record=one.record | {"own_metrics": {"blur": 1}},
-                     settings=one.settings | {"metrics.blur.size": size}) for size in (1, 2)]  # fmt: skip
+    record = one.record | {"own_metrics": {"blur": 1}}
+    given = [one.settings | {"metrics.blur.size": size} for size in (1, 2)]
+    sides = [replace(one, record=record, settings=settings) for settings in given]
     note = build_difference_table("", sides[:1], sides[1:], PAPER).note
     assert "Test conditions differ: metrics.blur.size." in note
     assert "conditions" not in build_difference_table("", sides[:1], [one], PAPER).note
