@@ -3,9 +3,10 @@
 Made anew: docs/figures/nine_views.webp, and the sections between the marks `report:...` of README,
 docs/tables.md and docs/results.md: scores of test clips of the photographs in PHOTOS
 (data=test_photos), each simulated once for all networks, beside the published ones whose weights
-are in `--published`, without which their rows stay as they are; of data=test_footage, with
-`--footage`, a still scene through air; and of sensors with random faults (sensor=randomized).
-Without PHOTOS only the film.  The cards are given the scores, too, and those of data=test_targets.
+are in `--published`, without which their rows stay as they are and the note says so; of
+data=test_footage, with `--footage`, a still scene through air; and of sensors with random faults
+(sensor=randomized).  Without PHOTOS only the film.  The cards are given the scores, too, and those
+of data=test_targets.
 """
 
 import argparse
@@ -152,9 +153,9 @@ def score_clips_into_metrics(
 
 def format_table(values: dict[str, list[dict[str, float]]], table: Table, before: str = "") -> str:
     """Return what `table` says of the scores `values` as Markdown, without rows not in them but for
-    those of published networks in the document as it was `before`.
+    those of published networks in the document as it was `before`, which the note says.
     """
-    kept = {line.split(" | ")[0].strip("| "): line for line in before.splitlines()}
+    earlier, kept = "", {line.split(" | ")[0].strip("| "): line for line in before.splitlines()}
     columns = [metric for metric in METRICS if metric.name in table.metrics]
     heads = [metric.title for metric in columns]
     lines = ["| | " + " | ".join(heads) + " |", "|---|" + "---|" * len(heads)]
@@ -163,6 +164,7 @@ def format_table(values: dict[str, list[dict[str, float]]], table: Table, before
             lines.append(f"| {row} | " + " | ".join(format_means(values[row], columns)) + " |")
         elif row in OTHERS and row in kept:
             lines.append(kept[row])
+            earlier = " Published networks: measured before."
     for name, (first, second) in table.pairs.items():
         if {first, second} <= set(values):
             pairs = list(zip(values[first], values[second], strict=True))
@@ -171,7 +173,7 @@ def format_table(values: dict[str, list[dict[str, float]]], table: Table, before
             lines.append(f"| *{name}* | " + " | ".join(cells) + " |")
     paired = "; Δ: paired differences" if table.pairs else ""
     clips = len(next(iter(values.values())))
-    return "\n".join([*lines, "", f"{clips} clips; mean (95 % bootstrap CI){paired}."])
+    return "\n".join([*lines, "", f"{clips} clips; mean (95 % bootstrap CI){paired}.{earlier}"])
 
 
 def format_means(clips: list[dict[str, float]], columns: Sequence[Column] = METRICS) -> list[str]:

@@ -17,6 +17,7 @@ from src.figures.plots import save_figure
 from src.metrics.bootstrap import bootstrap_difference_interval
 from src.records import runs
 from src.records.runs import Run
+from src.reports.differences import pool_same_clips
 
 SETNET = {1: "setnet_one", 3: "setnet_three", 5: "setnet_five", 9: "setnet_nine"}
 LPIPS_TOLERANCE = 0.005  # above that of nine views
@@ -28,23 +29,30 @@ Cells = dict[Setting, tuple[float, str]]  # value, text
 
 
 def group_runs(found: Sequence[Run]) -> RunsBySetting:
-    """Return the runs by (half length, spread) in pixels and by name."""
+    """Return the runs by (half length, spread) in pixels and by name; ValueError for a second run
+    of a name at one setting, such as of another seed."""
     grouped: RunsBySetting = {}
     for run in found:
         half = run.settings[f"{ATMOSPHERE}.tilt_correlation_half_length_px"]
         spread = run.settings[f"{ATMOSPHERE}.tilt_and_blur_px.strong"]
-        grouped.setdefault((half[0], spread[0]), {})[run.record["experiment"]] = run
+        by_name, name = grouped.setdefault((half[0], spread[0]), {}), run.record["experiment"]
+        if name in by_name:
+            got = f"{by_name[name].folder} and {run.folder}"
+            raise ValueError(f"folders must hold one run of {name} for each setting, got {got}")
+        by_name[name] = run
     return grouped
 
 
 def compute_differences(
     grouped: RunsBySetting, ours: str, theirs: str, metric: str, digits: int
 ) -> Cells:
-    """Return ours - theirs on the same clips; a star where the 95 % bootstrap CI excludes zero."""
+    """Return ours - theirs; a star where the 95 % bootstrap CI excludes zero.  Raises ValueError
+    where the clips of both are not the same."""
     cells = {}
     for setting, by_name in grouped.items():
         if ours in by_name and theirs in by_name:
-            sides = [[[float(clip[metric]) for clip in by_name[n].clips]] for n in (ours, theirs)]
+            pooled = pool_same_clips("folders", [by_name[ours]], [by_name[theirs]])
+            sides = [[[float(clip[metric]) for clip in clips] for clips in side] for side in pooled]
             value = sum(sides[0][0]) / len(sides[0][0]) - sum(sides[1][0]) / len(sides[1][0])
             low, high = bootstrap_difference_interval(*sides)
             cells[setting] = (value, f"{value:+.{digits}f}" + ("*" if low * high > 0 else ""))

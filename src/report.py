@@ -12,26 +12,28 @@ from src.app.instantiate import as_dict
 from src.app.path_overrides import unquote_override
 from src.records import results, runs
 from src.reports import page, run_groups, tables, writers
-from src.reports.differences import build_difference_table, build_pair_table
+from src.reports.differences import build_difference_table
+from src.reports.pairs import build_pair_table
 
 
 @dataclass
 class _ReportTables:
     """All tables of a report in their order, those of scores by title, those of differences between
-    pairs, and the groups of runs.
+    pairs, that of differences from `against`, and the groups of runs.
     """
 
     shown: list[tables.Table] = field(default_factory=list)
     scores: dict[str, tables.Table] = field(default_factory=dict)
     differences: list[tables.Table] = field(default_factory=list)
+    against: list[tables.Table] = field(default_factory=list)
     groups: list[run_groups.RunGroup] = field(default_factory=list)
 
 
 def report(cfg: DictConfig) -> list[tables.Table]:
     """Write `report.md`, `.csv` and `.html` of the runs below `cfg.run`; return the tables.
 
-    With `columns` the Markdown has these of the scores, no other table and no command.  With
-    `into` it also replaces that file's section of the same title.
+    With `columns` the Markdown has these of the scores or of the differences, no other table and no
+    command.  With `into` it also replaces that file's section of the same title.
     """
     folders, out = _list_folders("run", cfg.run), Path(cfg.paths.run)
     if not cfg.media_mib >= 0:
@@ -63,6 +65,8 @@ def report(cfg: DictConfig) -> list[tables.Table]:
     if cfg.into:
         writers.replace_section(Path(cfg.into), title, text)
     print(f"{text}\nin {out}: report.md, report.csv, report.html")
+    if unfinished := runs.find_unfinished(folders):
+        print(f"left out, without results.json: {', '.join(map(str, unfinished))}")
     return made.shown
 
 
@@ -98,16 +102,20 @@ def _build_tables(
         ours = run_groups.require_one_setting("run", found, across)
         theirs = run_groups.require_one_setting("against", others, across)
         title = "Differences on the same clips"
-        made.shown.append(build_difference_table(title, ours, theirs, published))
+        table = build_difference_table(title, ours, theirs, published, across, columns)
+        made.against += [table] if table.rows else []
+    made.shown += made.against
     return made
 
 
 def _format_text(made: _ReportTables, commands: list[str], columns: list[str] | None) -> str:
-    """Return the Markdown: all tables, or the `columns` of the scores or of the differences."""
+    """Return the Markdown: all tables, or the `columns` of the scores or of the differences between
+    pairs, and of those from `against`.
+    """
     if columns is None:
         return writers.format_markdown(made.shown, commands)
     scores = [tables.select_columns(table, columns, name) for name, table in made.scores.items()]
-    return writers.format_markdown(made.differences or scores, [])
+    return writers.format_markdown([*(made.differences or scores), *made.against], [])
 
 
 def _as_typed(plan: runs.SweepPlan) -> runs.SweepPlan:

@@ -2,17 +2,26 @@
 
 import csv
 import json
+import math
 import shutil
 
 import cv2
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
-from src.app.benchmark import MSE, average_by_data_set
+from src.app.benchmark import (
+    MSE,
+    average_by_data_set,
+    average_frames,
+    describe_other_protocol,
+    find_protocol_changes,
+)
 from src.convert import convert
 from src.eval import evaluate
 from src.records.results import summarize_scores
 from src.report import report
+from tests.conftest import ROOT
 from tests.recordings.files.frames import LAYOUTS, make_events, make_frames, write_recording
 from tests.test_recording_entry_points import config
 
@@ -117,17 +126,63 @@ def test_a_known_sequence_has_its_range_and_its_peers(tmp_path, run, capsys):
         "other": (1, 4), "ECD": (1, 2),
     }  # fmt: skip
     said = capsys.readouterr().out
+    assert "published scores left out" not in said
     assert "ECD: 1 of 7 sequences, 2 frames" in said and "other: 1 sequences, 4 frames" in said
     (line,) = [line for line in said.splitlines() if "PIE-Net " in line and "0.196" in line]
     assert [cell.strip() for cell in line.split("│")[2:6]] == ["0.026", "0.612", "0.196", "PIE-Net"]
 
 
+def test_no_published_scores_beside_a_run_outside_their_protocol(tmp_path, run, capsys):
+    write_recording(tmp_path / "data/ECD/shapes_6dof", "evreal", make_events(), make_frames())
+    run("metrics.lpips=null", "data.start_s=0", "data.end_s=10")
+    said = capsys.readouterr().out
+    assert "PIE-Net" not in said
+    assert "published scores left out: not by their protocol (data.start_s, data.end_s)" in said
+
+
 def test_the_mean_of_a_data_set_is_over_its_frames():
-    clips = [{"data_set": "A", "frames": 1, "mse": 0.1}, {"data_set": "B", "frames": 5, "mse": 0.4},
-             {"data_set": "A", "frames": 3, "mse": 0.5}]  # fmt: skip
+    given = [("A", 1, 0.1), ("B", 5, 0.4), ("A", 3, 0.5)]
+    clips = [{"data_set": s, "frames": n, "left_out": n, "mse": mse} for s, n, mse in given]
     found = average_by_data_set(clips)
-    assert found["A"] == {"sequences": 2, "frames": 4, "mse": pytest.approx(0.4)}
-    assert found["B"] == {"sequences": 1, "frames": 5, "mse": pytest.approx(0.4)}
+    assert found["A"] == {"sequences": 2, "frames": 4, "left_out": 4, "mse": pytest.approx(0.4)}
+    assert found["B"] == {"sequences": 1, "frames": 5, "left_out": 5, "mse": pytest.approx(0.4)}
+
+
+def test_a_frame_without_finite_scores_is_no_part_of_the_mean_nor_of_its_weight():
+    lines = [{"mse": mse, "ssim": 0.5} for mse in (0.1, math.nan, 0.3)]
+    expected = {"frames": 2, "left_out": 1, "mse": pytest.approx(0.2), "ssim": 0.5}
+    assert average_frames(lines) == expected
+    none = average_frames([{"mse": math.nan, "ssim": 0.5}] * 2)
+    assert (none["frames"], none["left_out"]) == (2, 0) and math.isnan(none["ssim"])
+
+
+def test_frames_left_out_are_said(tmp_path, run, capsys):
+    write_recording(tmp_path / "data/own", "evreal", make_events(), make_frames())
+    found = run("data.output_normalisation=robust", "metrics.lpips=null")["benchmarks"]["data"]
+    assert (found["frames"], found["left_out"]) == (3, 1)
+    assert math.isfinite(found["mse"])
+    said = " ".join(capsys.readouterr().out.split())  # the title of a table is folded
+    assert said.count("3 frames (1 without finite scores left out)") == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "left_out"),
+    [
+        ({"start_s": 5.0}, "data.start_s"),
+        ({"window": "events", "histogram": "local"}, "data.window, data.histogram"),
+        ({"max_grid_s": 0.00834}, "data.max_grid_s"),
+        ({"sequences": {"ECD": {"slider_depth": [0.0, 1.0]}}}, "data.sequences.ECD"),
+        ({"sequences": {"MVSEC": {"indoor_flying1_data": [0.0, 1.0]}}}, ""),
+        ({"save_frames": True, "tolerance_ms": 5.0}, ""),
+    ],
+)
+def test_published_scores_stand_beside_runs_of_their_protocol_only(change, left_out):
+    protocol = OmegaConf.load(ROOT / "conf/data/evreal.yaml").data
+    data = OmegaConf.merge(protocol, change)
+    said = f"published scores left out: not by their protocol ({left_out})" if left_out else ""
+    assert describe_other_protocol(data, ["ECD"]) == said
+    assert bool(find_protocol_changes(data, "ECD")) == bool(left_out)
+    assert describe_other_protocol(data, ["mine"]) == ""
 
 
 def test_a_report_takes_it(tmp_path, run):
@@ -142,8 +197,8 @@ def test_a_report_takes_it(tmp_path, run):
 
 
 def test_sequences_count_by_their_frames_in_every_table():
-    clips = [{"data_set": "A", "frames": 1, "mse": 0.1, "ssim": 0.2},
-             {"data_set": "A", "frames": 3, "mse": 0.5, "ssim": 0.6}]  # fmt: skip
+    clips = [{"data_set": "A", "frames": 1, "left_out": 0, "mse": 0.1, "ssim": 0.2},
+             {"data_set": "A", "frames": 3, "left_out": 0, "mse": 0.5, "ssim": 0.6}]  # fmt: skip
     found = summarize_scores(clips, (MSE,))
     assert found["mse"]["mean"] == pytest.approx(average_by_data_set(clips)["A"]["mse"])
     assert found["ssim"]["mean"] == pytest.approx(0.5)

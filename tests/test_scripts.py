@@ -116,17 +116,19 @@ def test_rows_of_published_networks_that_are_not_scored_again_stay():
     rows = readme.format_table({readme.PAPER: scored}, table, before).splitlines()[2:]
     assert rows[0].startswith(f"| {readme.PAPER} | 0.5")
     assert rows[1:3] == [f"| {readme.FIRENET} | 0.3 |", ""]
+    assert rows[3].endswith(" Published networks: measured before.")
     rows = readme.format_table({readme.FIRENET: scored}, table, before).splitlines()[2:]
     assert rows[0].startswith(f"| {readme.FIRENET} | 0.5") and rows[1] == ""
+    assert "before" not in rows[2]
 
 
 def test_the_turbulence_map_shows_where_more_views_help(tmp_path):
     def run(name: str, half: float, spread: float, lpips: list[float]) -> Run:
         settings = {turbulence_map.ATMOSPHERE + ".tilt_correlation_half_length_px": [half, half]}
         settings[turbulence_map.ATMOSPHERE + ".tilt_and_blur_px.strong"] = [spread, spread]
-        clips = [{"lpips": str(value)} for value in lpips]
+        clips = [{"name": f"clip{k}", "lpips": str(value)} for k, value in enumerate(lpips)]
         record = {"experiment": name, "test": {"lpips": {"mean": sum(lpips) / len(lpips)}}}
-        return Run(tmp_path, record, settings, clips)
+        return Run(tmp_path / name, record | {"seed": 0}, settings, clips)
 
     found = [run("single256", 7, 1, [0.5, 0.6]), run("lf3x3", 7, 1, [0.4, 0.5])]
     found += [run("single256", 40, 1, [0.5, 0.6]), run("lf3x3", 40, 1, [0.6, 0.5])]
@@ -138,6 +140,11 @@ def test_the_turbulence_map_shows_where_more_views_help(tmp_path):
         (40, 1): "+0.00",
     }
     assert turbulence_map.count_views_needed(cells) == {(7, 1): (9.0, "9")}
+    with pytest.raises(ValueError, match=r"one run of lf3x3 for each setting, got .*lf3x3 and"):
+        turbulence_map.group_runs([*found, run("lf3x3", 7, 1, [0.4, 0.5])])
+    cells[7, 1]["lf3x3"].clips[0]["name"] = "another"
+    with pytest.raises(ValueError, match="folders must hold the same clips, got 2 sets"):
+        turbulence_map.compute_differences(cells, "lf3x3", "single256", "lpips", 2)
     assert turbulence_map.draw_maps(
         tmp_path / "map.png", {"a": margins, "b": turbulence_map.count_views_needed(cells)}
     ).is_file()

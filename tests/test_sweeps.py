@@ -165,6 +165,15 @@ def test_a_sweep_of_trainings_that_starts_again_skips_what_is_done(tmp_path, cap
         assert capsys.readouterr().out.count("skipped, its results stand") == skipped
 
 
+def test_results_of_other_code_are_named_where_they_stand(tmp_path):
+    stored = tmp_path / "results.json"
+    stored.write_text(json.dumps({"git": "v0"}))
+    now = results.git_commit()
+    assert entry_point._describe_other_code(stored) == f"; of code at v0, which is now at {now}"
+    stored.write_text(json.dumps({"git": now}))
+    assert entry_point._describe_other_code(stored) == ""
+
+
 def test_results_of_a_training_from_other_weights_do_not_stand(tmp_path):
     stored = tmp_path / "results.json"
     for before, now, same in (

@@ -2,20 +2,21 @@
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Group
 from rich.table import Table
 
 from baselines import published
 from baselines.centre_view import CentreViewNetwork
 from src.app import entry_point, methods
+from src.app.compose import CONF
 from src.app.hardware import first_gpu
 from src.app.instantiate import as_dict, build_part
 from src.app.metrics import SHIPPED_METRIC_KEYS
@@ -41,6 +42,7 @@ RULE_KEYS = (
     "window", "events_per_window", "window_s", "max_grid_s", "histogram", "tolerance_ms",
     "warm_up_s",
 )  # fmt: skip
+PROTOCOL_KEYS = ("window", "max_grid_s", "histogram", "warm_up_s", "start_s", "end_s")
 
 
 def evaluate_on_evreal(cfg: DictConfig) -> dict:
@@ -62,12 +64,13 @@ def evaluate_on_evreal(cfg: DictConfig) -> dict:
         clips.append(clip)
         lines += scored
         shown = ", ".join(f"{s.upper()} {clip[s]:.4f}" for s in SCORES if s in clip)
-        print(f"{clip['name']}: {clip['frames']} frames, {shown}")
+        print(f"{clip['name']}: {clip['frames']} frames{_describe_left_out(clip)}, {shown}")
     write_text(run / "frames.csv", results.format_csv(lines[0], [line.values() for line in lines]))
     means, row = average_by_data_set(clips), benchmark.build_score_row(clips)
     return results.write_and_print_results(
         run, entry_point.resolved_yaml(cfg), [row], _tables(row.name, means, cfg.data),
-        benchmarks=means, **entry_point.run_metadata(cfg, start),
+        describe_other_protocol(cfg.data, means), benchmarks=means,
+        **entry_point.run_metadata(cfg, start),
     )  # fmt: skip
 
 
@@ -100,10 +103,8 @@ class EvrealBenchmark:
         if not lines:
             raise ValueError(f"{source}: no window ends within data.tolerance_ms of a frame")
         times = [line["time_s"] for line in lines]
-        facts = {"name": name, "data_set": data_set, "frames": len(lines)}
-        facts |= {"first_s": min(times), "last_s": max(times)}
-        scores = [score for score in SCORES if score in lines[0]]
-        return facts | {score: _mean(line[score] for line in lines) for score in scores}, lines
+        facts = {"name": name, "data_set": data_set, "first_s": min(times), "last_s": max(times)}
+        return facts | average_frames(lines), lines
 
     def build_score_row(self, clips: list[dict]) -> results.ScoreRow:
         """Return the scores with the network's cost for frames of the last sequence's size."""
@@ -166,23 +167,53 @@ def _line(frame: ScoredFrame) -> dict:
     return facts | times | {"events": window.stop_event - window.first_event} | frame.scores
 
 
-def _mean(values: Iterator[float]) -> float:
-    """Return the mean of the finite values; EVREAL leaves others out."""
-    finite = [value for value in values if math.isfinite(value)]
-    return float(np.mean(finite)) if finite else math.nan
+def average_frames(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return {frames, left_out, mse, ssim, lpips}: the means of the frames all of whose scores are
+    finite, their number and that of the others, which EVREAL leaves out, too.  Where no frame has
+    finite scores all count, and the means are NaN."""
+    scores = [score for score in SCORES if score in lines[0]]
+    finite = [line for line in lines if all(math.isfinite(line[score]) for score in scores)]
+    kept = finite or lines
+    means = {s: float(np.mean([line[s] for line in finite])) if finite else math.nan
+             for s in scores}  # fmt: skip
+    return {"frames": len(kept), "left_out": len(lines) - len(kept)} | means
+
+
+def _describe_left_out(found: Mapping[str, Any]) -> str:
+    return f" ({found['left_out']} without finite scores left out)" if found["left_out"] else ""
 
 
 def average_by_data_set(clips: Sequence[Mapping[str, Any]]) -> dict[str, dict]:
-    """Return {data set: {sequences, frames, mse, ssim, lpips}}; a sequence counts by its frames."""
+    """Return {data set: {sequences, frames, left_out, mse, ssim, lpips}}; a sequence counts by its
+    frames."""
     means = {}
     for data_set in dict.fromkeys(clip["data_set"] for clip in clips):
         group = [clip for clip in clips if clip["data_set"] == data_set]
         weights = [clip["frames"] for clip in group]
-        means[data_set] = {"sequences": len(group), "frames": sum(weights)} | {
+        counts = {"sequences": len(group), "frames": sum(weights)}
+        counts["left_out"] = sum(clip["left_out"] for clip in group)
+        means[data_set] = counts | {
             name: float(np.average([clip[name] for clip in group], weights=weights))
             for name in SCORES if name in group[0]
         }  # fmt: skip
     return means
+
+
+def find_protocol_changes(data: DictConfig, data_set: str) -> list[str]:
+    """Return the keys in which a run differs from the protocol of the published scores of a data
+    set: its windows, their equalisation, its range."""
+    protocol = OmegaConf.load(Path(CONF) / "data" / "evreal.yaml").data
+    keys = [*PROTOCOL_KEYS, f"sequences.{data_set}"]
+    return [key for key in keys if OmegaConf.select(data, key) != OmegaConf.select(protocol, key)]
+
+
+def describe_other_protocol(data: DictConfig, data_sets: Iterable[str]) -> str:
+    """Return a line that says why published scores are left out, "" where they are not."""
+    published = {name for entry in data.published_scores for name in entry}
+    changes = {key: None for name in data_sets if name in published
+               for key in find_protocol_changes(data, name)}  # fmt: skip
+    named = ", ".join(f"data.{key}" for key in changes)
+    return f"published scores left out: not by their protocol ({named})" if named else ""
 
 
 def _save(folder: Path, frame: ScoredFrame) -> None:
@@ -194,17 +225,20 @@ def _save(folder: Path, frame: ScoredFrame) -> None:
 
 
 def _tables(name: str, means: Mapping[str, Mapping], data: DictConfig) -> Group:
-    """Return a table for each data set: the scores of this run and what others published."""
+    """Return a table for each data set: the scores of this run and, where it is by their protocol,
+    what others published."""
     tables = []
     for data_set, found in means.items():
         of = f" of {len(data.sequences[data_set])}" if data_set in data.sequences else ""
         counts = f"{found['sequences']}{of} sequences, {found['frames']} frames"
+        counts += _describe_left_out(found)
         table = Table(title=f"{data_set}: {counts}", title_justify="left")
         for head in ("network", *SCORES.values(), "source"):
             table.add_column(head, justify="left" if head in ("network", "source") else "right")
         table.add_row(name, *(f"{found[k]:.3f}" if k in found else "-" for k in SCORES), "this run")
+        is_by_protocol = not find_protocol_changes(data, data_set)
         for entry in map(as_dict, data.published_scores):
-            if data_set in entry:
+            if data_set in entry and is_by_protocol:
                 theirs = [f"{value:.3f}" for value in entry[data_set]]
                 table.add_row(entry["method"], *theirs, entry["source"])
         tables.append(table)

@@ -154,7 +154,8 @@ def run_job(
         if stored and cfg.get("task") == "train":
             _check_same_beginning(cfg, folder / "results.json")
         if stored and not _has_newer_weights(cfg, folder / "results.json"):
-            print(f"skipped, its results stand: {name}, in {folder}")
+            code = _describe_other_code(folder / "results.json")
+            print(f"skipped, its results stand: {name}, in {folder}{code}")
         else:
             _run_work(work, cfg)
     except _stop_errors():  # ends the sweep
@@ -176,6 +177,12 @@ def _check_same_beginning(cfg: DictConfig, stored: Path) -> None:
     if weights[0] != weights[1]:
         wanted, got = ("no weights" if path is None else path for path in weights)
         raise ValueError(f"ckpt must be {wanted}, as of the results in {stored}, got {got}")
+
+
+def _describe_other_code(stored: Path) -> str:
+    """Return the version of the code of the results `stored`, "" where it is the present one."""
+    before, now = json.loads(stored.read_text()).get("git"), results.git_commit()
+    return "" if before == now else f"; of code at {before}, which is now at {now}"
 
 
 def _has_newer_weights(cfg: DictConfig, stored: Path) -> bool:

@@ -91,7 +91,7 @@ def create_run_folder(run: Path, config: str, name: str = CONFIG_FILE) -> None:
 
 def parse_settings_without_paths(config: str) -> dict:
     """Return the settings of a resolved `config` (YAML) that the numbers depend on: all but
-    `paths` and, for training, the `ckpt` it resumed from."""
+    `paths` and, for training, the `ckpt` that it goes on from, which its results state."""
     settings = safe_yaml.parse(config)
     settings.pop("verbose", None)  # of versions up to 0.6.12: it printed the config
     run = settings.pop("paths", {}).get("run")

@@ -2,7 +2,9 @@
 
 import csv
 import json
+import math
 import os
+import statistics
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,8 @@ from src.records import results, safe_yaml
 
 FIGURES = ("chart", "machine", "stress")  # of src.chart and src.stress
 WITHOUT_NUMBERS = ("seed", "name", "task", "logger", "callbacks", "paths", "hydra")
-MACHINE = ("data.workers", "data.simulate_on", "trainer.accelerator", "trainer.devices")
+MACHINE = ("data.workers", "data.simulate_on", "trainer.accelerator")
+PROCESSES = ("trainer.devices", "trainer.num_nodes")  # the joint batch of a training
 READ_ERRORS = (
     OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError,
 )  # fmt: skip
@@ -52,7 +55,8 @@ class Run:
     def result_settings_without_seed(self) -> dict[str, Any]:
         """The settings that numbers depend on but the seed, as {dotted key: value}."""
         # Where nothing is trained the seed is that of the test clips.
-        same = (*MACHINE, *(["data.test_seed"] if self.record["task"] != "train" else []))
+        is_training = self.record["task"] == "train"
+        same = MACHINE if is_training else (*MACHINE, *PROCESSES, "data.test_seed")
         return {
             key: value
             for key, value in self.settings.items()
@@ -88,6 +92,18 @@ def find_runs(folders: list[Path]) -> list[Run]:
     return sorted(runs, key=lambda r: ((r.folder / "results.json").stat().st_mtime, str(r.folder)))
 
 
+def find_unfinished(folders: list[Path]) -> list[Path]:
+    """Return the folders of tests and trainings without results at or below `folders`, but for the
+    jobs of sweeps, which their plans tell."""
+    jobs = {f.parent.resolve() for folder in folders for f in folder.rglob("multirun.yaml")}
+    found = dict.fromkeys(f.parent for folder in folders for f in folder.rglob("config.yaml"))
+    return [
+        run for run in found
+        if not (run / "results.json").is_file() and not jobs & set(run.resolve().parents)
+        and _read_task(run / "config.yaml") in ("train", "eval")
+    ]  # fmt: skip
+
+
 def find_sweeps(folders: list[Path]) -> list[SweepPlan]:
     """Return the sweeps whose `multirun.yaml` lies at or below `folders`."""
     files = {f.resolve() for folder in folders for f in folder.rglob("multirun.yaml")}
@@ -113,12 +129,37 @@ def flatten_settings(node: Any, prefix: str = "") -> dict[str, Any]:
     return flat
 
 
+def _read_task(config: Path) -> str | None:
+    try:
+        return safe_yaml.read(config).get("task")
+    except READ_ERRORS:
+        return None
+
+
+def _find_start_weights(record: dict) -> str | None:
+    """Return the weights that a training went on from; None for those of an earlier part of it, a
+    checkpoint or the folder of a run."""
+    name = record.get("resumed_from")
+    if not name or name.endswith(".ckpt") or Path(name).is_dir():
+        return None
+    return name
+
+
+def _count_processes(devices: Any) -> Any:
+    """Return how many devices `trainer.devices` names: [0, 2] are two; auto stays."""
+    return len(devices) if isinstance(devices, list) else devices
+
+
 def _read(file: Path) -> Run:
     try:
         record = json.loads(file.read_text())
         schema, config = record["schema"], (file.parent / "config.yaml").read_text()
         is_of_config = record.get("config_sha256") == results.hash_config(config)
         settings = flatten_settings(results.parse_settings_without_paths(config))
+        if record.get("task") == "train":
+            settings["ckpt"] = _find_start_weights(record)
+            settings["trainer.devices"] = _count_processes(settings.get("trainer.devices", 1))
+            settings.setdefault("trainer.num_nodes", 1)
     except READ_ERRORS as error:
         raise ValueError(f"run must hold whole results, got {file}: {error}") from error
     if schema != results.SCHEMA:
@@ -134,7 +175,7 @@ def _read(file: Path) -> Run:
 def _read_clips(file: Path, record: dict) -> list[dict[str, str]]:
     """Return the scores of clips, without those that a clip does not have, none where there is no
     file.  Raises one of READ_ERRORS where the file, or what `record` says of the test, is cut
-    short."""
+    short, and where their means differ."""
     test = record["test"]
     scores = [score for name, score in test.items() if name != "clips"]
     if not record["latency_ms"] or any("mean" not in score for score in scores):
@@ -144,7 +185,18 @@ def _read_clips(file: Path, record: dict) -> list[dict[str, str]]:
         raise ValueError(f"{file.name} has {len(rows)} clips, the test had {test['clips']}")
     if any(None in row or None in row.values() for row in rows):
         raise ValueError(f"{file.name} is cut short")
-    return [{k: text for k, text in row.items() if text or k not in NAMES} for row in rows]
+    clips = [{k: text for k, text in row.items() if text or k not in NAMES} for row in rows]
+    for name in test.keys() & {name for clip in clips for name in clip}:
+        _check_mean(name, [clip for clip in clips if name in clip], test[name], file)
+    return clips
+
+
+def _check_mean(name: str, clips: list[dict[str, str]], score: dict, file: Path) -> None:
+    values = [float(clip[name]) for clip in clips]
+    mean, wanted = statistics.fmean(values, results.frame_weights(clips)), float(score["mean"])
+    are_equal = math.isclose(mean, wanted, rel_tol=1e-6, abs_tol=1e-9)
+    if not are_equal and not (math.isnan(mean) and math.isnan(wanted)):
+        raise ValueError(f"{file.name} has the mean {name} {mean:g}, the test {wanted:g}")
 
 
 def _plan(hydra: dict) -> SweepPlan:

@@ -2,6 +2,7 @@
 
 import base64
 import io
+import math
 import os
 import re
 from collections.abc import Sequence
@@ -123,7 +124,8 @@ def _format_cell(table: Table, row: int, place: int) -> str:
     shown = escape(number) if cell.text or cell.mean is not None else "–"
     shown = f"<b>{shown}</b>" if table.is_bold(row, place) else shown
     shown += f" <small>± {std[0]}</small>" if cell.std is not None else ""
-    sort = "" if cell.text else f' data-value="{"" if cell.mean is None else cell.mean!r}"'
+    value = "" if cell.mean is None or math.isnan(cell.mean) else repr(cell.mean)
+    sort = "" if cell.text else f' data-value="{value}"'
     return f'<td class="{kind}"{sort}>{shown}</td>'
 
 

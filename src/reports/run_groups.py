@@ -6,21 +6,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import yaml
+
+from src.records import safe_yaml
 from src.records.runs import Run, SweepPlan
+from src.reports.clip_conditions import format_setting, list_settings, list_test_conditions
 
 FIRST_KEYS = ("task", "method", "experiment", "resolution", "postprocess", "baseline", "optics")
 LAST_KEYS = ("budget", "debug")
-# What the test clips and their scores follow from: a key, or the beginning of several.
-TEST_CONDITIONS = (
-    "scene.", "turbulence.", "sensor.", "fps", "metrics.resolution_scale",
-    "metrics.jitter_reduction", "metrics.lpips.",
-    "data.test_", "data.unscored_windows", "data.substeps", "data.benchmark", "data.window",
-    "data.events_per_window", "data.max_grid_s", "data.tolerance_ms", "data.start_s", "data.end_s",
-    "data.warm_up_s", "data.histogram",
-)  # fmt: skip
-NO_CONDITIONS = (  # the first is told by the run, the others are of training
-    "data.test_seed", "data.windows", "scene.extra_train_root",
-)  # fmt: skip
 
 
 @dataclass
@@ -28,20 +21,21 @@ class RunGroup:
     """Runs of one setting, one per seed.
 
     `missing`: seeds of the sweep that have no results; `older`: runs of a seed that has
-    a newer one.
+    a newer one; `across`: settings in which the runs may differ beside the seed.
     """
 
     label: tuple[str, ...]
     runs: list[Run]
     missing: int = 0
     older: int = 0
+    across: tuple[str, ...] = ()
 
     @cached_property
     def test_conditions(self) -> frozenset[tuple[str, str]]:
         """The settings and seeds that the test clips follow from: scores of groups in which they
         are equal can be compared.
         """
-        return _list_test_conditions(self.runs)
+        return list_test_conditions(self.runs)
 
     @cached_property
     def frame_sizes_and_devices(self) -> tuple:
@@ -49,26 +43,36 @@ class RunGroup:
         sizes = frozenset(size for run in self.runs for size in run.record["latency_ms"])
         return sizes, frozenset(run.record["device"] for run in self.runs)
 
+    def conditions_of(self, column: str) -> tuple:
+        """What must be equal for values of a column to be compared: of times, frames and devices;
+        of scores, test conditions, and arguments where a config has added the metric.
+        """
+        if column == "ms":
+            return self.frame_sizes_and_devices
+        return self.test_conditions, list_settings(self.runs, f"metrics.{column}.")
+
 
 def group_runs(
     runs: Sequence[Run], plans: Sequence[SweepPlan] = (), across: Sequence[str] = ()
 ) -> tuple[tuple[str, ...], list[RunGroup]]:
     """Return the keys of the labels, and a group per setting, in the order of the sweeps.
 
-    The keys are the fewest that tell the groups apart: first choices and what a command line has
-    set, then any other setting.  Like the seeds, the settings `across` do not part groups, such as
-    ckpt for networks of several seeds tested on the same clips.  Of two runs with one setting and
-    the same seeds the newer counts.
+    The keys are all that command lines have set and that differ, then the fewest other choices and
+    settings that tell the groups apart.  Like the seeds, the settings `across` do not part groups,
+    such as ckpt for networks of several seeds tested on the same clips.  Of two runs with one
+    setting and the same seeds the newer counts.
     """
     overridden = sorted({_override_key(override) for run in runs for override in run.overrides})
     rows = [_label_values(run, overridden, across) for run in runs]
-    keys = _distinguishing_keys(rows)
+    keys = _distinguishing_keys(rows, overridden)
     groups: dict[tuple[str, ...], RunGroup] = {}
     newest: dict[tuple[str, ...], dict[tuple, Run]] = defaultdict(dict)
     for run, row in zip(runs, rows, strict=True):  # oldest first: the last one stays
         label = tuple(row.get(key, "-") for key in keys)
         draw = run.record["seed"], run.test_seed, *(str(run.settings.get(key)) for key in across)
-        groups.setdefault(label, RunGroup(label, [])).older += draw in newest[label]
+        groups.setdefault(label, RunGroup(label, [], across=tuple(across))).older += (
+            draw in newest[label]
+        )
         newest[label][draw] = run
     for label, group in groups.items():
         group.runs = [run for _, run in sorted(newest[label].items())]
@@ -95,18 +99,20 @@ def check_across(across: Sequence[str], runs: Sequence[Run]) -> None:
             raise ValueError(f"across must be settings of the runs, such as ckpt, got {key}")
 
 
-def find_differing_test_conditions(ours: Sequence[Run], theirs: Sequence[Run]) -> set[str]:
-    """Return the keys of the test conditions that are not the same on both sides."""
-    return {key for key, _ in _list_test_conditions(ours) ^ _list_test_conditions(theirs)}
-
-
-def format_setting(value: Any) -> str:
-    """Return a setting as a person writes it."""
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    if isinstance(value, list):
-        return "[" + ", ".join(map(format_setting, value)) + "]"
-    return f"{value:g}" if isinstance(value, float) else str(value)
+def find_unasked_differences(keys: Sequence[str], groups: Sequence[RunGroup]) -> list[str]:
+    """Return the settings beside `keys` that differ between groups of equal choices and command
+    lines, as those of another version's defaults do."""
+    alike: dict[tuple, list[Run]] = defaultdict(list)
+    for run in (group.runs[0] for group in groups if group.runs):
+        alike[frozenset(run.choices.items()), _without_seed(run.overrides)].append(run)
+    found = set[str]()
+    for first, *others in alike.values():
+        for other in others:
+            sides = (run.result_settings_without_seed.items() for run in (first, other))
+            ours, theirs = ({(key, format_setting(value)) for key, value in side} for side in sides)
+            found |= {key for key, _ in ours ^ theirs}
+    hidden = {*keys, *(key for group in groups for key in group.across)}
+    return sorted(key for key in found if not any(f"{key}.".startswith(f"{k}.") for k in hidden))
 
 
 def find_published(run: Run, published: Mapping[str, Any]) -> dict[str, float]:
@@ -125,19 +131,19 @@ def find_published(run: Run, published: Mapping[str, Any]) -> dict[str, float]:
     return {metric: value for metric, value in best.items() if metric != "when"}
 
 
-def _list_test_conditions(runs: Sequence[Run]) -> frozenset[tuple[str, str]]:
-    """Return (key, value) of every setting of `runs` that test clips follow from."""
-    found = {
-        (key, format_setting(value))
-        for run in runs
-        for key, value in run.settings.items()
-        if key.startswith(TEST_CONDITIONS) and key not in NO_CONDITIONS
-    }
-    return frozenset(found | {("data.test_seed", str(run.test_seed)) for run in runs})
-
-
 def _override_key(override: str) -> str:
     return override.split("=")[0].lstrip("+~").split("@")[0]
+
+
+def _override_value(override: str) -> str:
+    """Return the value as `format_setting` writes it."""
+    text = override.split("=", 1)[-1]
+    if not text.startswith(tuple("[-.0123456789")):  # `on` is a name, not true
+        return text
+    try:
+        return format_setting(safe_yaml.parse(text))
+    except yaml.YAMLError:
+        return text
 
 
 def _label_values(run: Run, overridden: Sequence[str], across: Sequence[str]) -> dict[str, str]:
@@ -155,15 +161,22 @@ def _label_values(run: Run, overridden: Sequence[str], across: Sequence[str]) ->
     return first | last | {k: v for k, v in settings.items() if k not in first}
 
 
-def _distinguishing_keys(rows: Sequence[dict[str, str]]) -> tuple[str, ...]:
-    """Return the fewest keys, taken in order, that tell apart all rows that differ."""
-    chosen: list[str] = []
-    groups = 1
-    for key in dict.fromkeys(key for row in rows for key in row):
-        split = len({tuple(row.get(k) for k in [*chosen, key]) for row in rows})
-        if split > groups:
-            chosen, groups = [*chosen, key], split
-    return tuple(chosen) or ("experiment",)
+def _distinguishing_keys(
+    rows: Sequence[dict[str, str]], overridden: Sequence[str]
+) -> tuple[str, ...]:
+    """Return the `overridden` keys whose values differ, and the fewest others, taken in order, that
+    tell apart all rows that differ."""
+    present = dict.fromkeys(key for row in rows for key in row)
+    varying = [key for key in present if len({row.get(key) for row in rows}) > 1]
+    chosen = {key for key in varying if key in overridden}
+
+    def count(chosen: set[str]) -> int:
+        return len({tuple(row.get(key) for key in varying if key in chosen) for row in rows})
+
+    for key in varying:
+        if count(chosen | {key}) > count(chosen):
+            chosen.add(key)
+    return tuple(key for key in varying if key in chosen) or ("experiment",)
 
 
 def _count_missing(
@@ -174,7 +187,7 @@ def _count_missing(
     by_setting = {_without_seed(run.overrides): group for group in groups for run in group.runs}
     ordered: dict[int, RunGroup] = {}
     for job in (job for plan in plans for job in plan.jobs):
-        values = {_override_key(override): override.split("=", 1)[-1] for override in job}
+        values = {_override_key(override): _override_value(override) for override in job}
         new = RunGroup(tuple(values.get(key, "-") for key in keys), [])
         group = by_setting.setdefault(_without_seed(job), new)
         group.missing += frozenset(job) not in done

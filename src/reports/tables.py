@@ -8,6 +8,7 @@ from typing import Any
 
 from src.metrics.table import METRICS, Column
 from src.records.runs import Run
+from src.reports.notes import describe_runs
 from src.reports.run_groups import RunGroup, find_published
 
 SEVERITIES = ("none", "weak", "medium", "strong", "extreme")
@@ -55,13 +56,13 @@ class Table:
         equal test conditions; of times, with equal frames and devices.
         """
         head, mean = self.columns[place], self.rows[number][place].mean
-        if head.better == 0 or mean is None:
+        if head.better == 0 or mean is None or math.isnan(mean):
             return False
-        kind = "frame_sizes_and_devices" if head.name == "ms" else "test_conditions"
-        asked = getattr(self.groups[number], kind)
+        asked = self.groups[number].conditions_of(head.name)
         rows = zip(self.rows, self.groups, strict=True)
-        means = [row[place].mean for row, group in rows if getattr(group, kind) == asked]
-        printed = {round(value, head.digits) for value in means if value is not None}
+        means = [row[place].mean for row, group in rows if group.conditions_of(head.name) == asked]
+        numbers = [value for value in means if value is not None and not math.isnan(value)]
+        printed = {round(value, head.digits) for value in numbers}
         best = (max if head.better > 0 else min)(printed)
         return len(printed) > 1 and round(mean, head.digits) == best
 
@@ -103,13 +104,13 @@ def build_score_table(
         count = str(done) if not group.missing else f"{done} of {asked}" if done else "missing"
         published_cells = (TableCell(row.get(score.name)) for score in theirs)
         table.add_row(group, [*cells, TableCell(text=count), *published_cells])
-    table.note = _describe_measurement(groups)
+    table.note = _describe_measurement(keys, groups) + _describe_gaps(groups, metrics)
     return table
 
 
 def select_columns(table: Table, names: Sequence[str], title: str) -> Table:
     """Return the labels and the columns `names` of a score table, such as lpips, published values
-    in parentheses; rows with the same first labels stand together.
+    in parentheses, and n where it is not 1; rows with the same first labels stand together.
 
     Raises ValueError for a column that is not there.
     """
@@ -118,10 +119,14 @@ def select_columns(table: Table, names: Sequence[str], title: str) -> Table:
         name for name in places if places[name] >= table.labels and not name.startswith("paper_")
     ]
     check_columns(names, scores)
+    if "n" not in names and any(len(g.runs) != 1 or g.missing for g in table.groups):
+        names = [*names, "n"]
     chosen = [places[name] for name in names]
     heads = [*table.columns[: table.labels], *(table.columns[place] for place in chosen)]
     has_cost = any(column.name in names for column, _ in COSTS)
-    note = table.note if has_cost else _describe_measurement(table.groups, with_cost=False)
+    keys = [column.name for column in table.columns[: table.labels]]
+    note = _describe_measurement(keys, table.groups, has_cost)
+    note += _describe_gaps(table.groups, [table.columns[place] for place in chosen])
     made = Table(title, heads, [], table.labels, note)
     by_key = zip(*(group.label for group in table.groups), strict=True)
     seen = [list(dict.fromkeys(labels)) for labels in by_key]
@@ -157,8 +162,11 @@ def build_severity_table(
     heads = [Column(f"{s.name}_{name}", name, s.digits, s.better, s.heading) for s, name in split]
     table = Table(title, [*(Column(key, key) for key in keys), *heads], [], len(keys))
     for group in groups:
-        scores = [_score(s.name, severity=severity) for s, severity in split]
-        table.add_row(group, [_mean_over_seeds(group.runs, score) for score in scores])
+        cells = []
+        for score in (_score(s.name, severity=severity) for s, severity in split):
+            drawn_by = [run for run in group.runs if score(run) is not None]
+            cells.append(_mean_over_seeds(drawn_by, score))
+        table.add_row(group, cells)
     return table
 
 
@@ -181,10 +189,10 @@ def _mean_over_seeds(
     runs: Sequence[Run], measure: Callable[[Run], float | None], with_std: bool = True
 ) -> TableCell:
     values = [value for run in runs if (value := measure(run)) is not None]
-    if not any(map(math.isfinite, values)):  # not measured
+    if not values or len(values) < len(runs):  # not measured in all
         return TableCell()
     if not all(map(math.isfinite, values)):  # a run that diverged
-        return TableCell(math.nan)
+        return TableCell(sum(values) / len(values))
     std = statistics.stdev(values) if with_std and len(values) > 1 else None
     return TableCell(statistics.fmean(values), std)
 
@@ -204,8 +212,20 @@ def _score(
     return measure
 
 
-def _describe_measurement(groups: Sequence[RunGroup], with_cost: bool = True) -> str:
-    """Say how many clips there were and, `with_cost`, at what size and where a frame was timed."""
+def _describe_gaps(groups: Sequence[RunGroup], columns: Iterable[Column]) -> str:
+    """Say which scores some of the runs of a group lack."""
+    gaps = []
+    for column in columns:
+        measured = [[_score(column.name)(run) is not None for run in g.runs] for g in groups]
+        gaps += [column.heading] if any(any(row) and not all(row) for row in measured) else []
+    return f" Left out where one of the n runs lacks it: {', '.join(gaps)}." if gaps else ""
+
+
+def _describe_measurement(
+    keys: Sequence[str], groups: Sequence[RunGroup], with_cost: bool = True
+) -> str:
+    """Say how many clips there were and, `with_cost`, at what size and where a frame was timed; and
+    what `describe_runs` says."""
     runs = [run for group in groups for run in group.runs]
     if not runs:
         return ""
@@ -224,4 +244,6 @@ def _describe_measurement(groups: Sequence[RunGroup], with_cost: bool = True) ->
     cost = f"; ms and GMAC of one frame of {sizes}, {devices}" if with_cost else ""
     spread = "; ± is the sample standard deviation over n seeds"
     several = with_cost or any(len(group.runs) > 1 for group in groups)
-    return f"{clips} test clips{cost}{spread if several else ''}.{unlike}"
+    return (
+        f"{clips} test clips{cost}{spread if several else ''}.{unlike}{describe_runs(keys, groups)}"
+    )

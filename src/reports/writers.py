@@ -85,6 +85,8 @@ def format_cell(cell: TableCell, column: Column) -> str:
         return cell.text
     if cell.mean is None:
         return "-"
+    if math.isnan(cell.mean):
+        return "nan"
     if cell.interval is not None:
         difference, *ends = (f"{x:+.{column.digits}f}" for x in (cell.mean, *cell.interval))
         return difference if math.isnan(cell.interval[0]) else f"{difference} ({' to '.join(ends)})"

@@ -1,6 +1,8 @@
 """What runs are ahead of others by, clip by clip."""
 
+import math
 import os
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -8,8 +10,10 @@ import pytest
 from src.records import runs
 from src.report import report
 from src.reports import run_groups
-from src.reports.differences import build_difference_table, build_pair_table
-from src.reports.writers import format_csv_tables, format_markdown
+from src.reports.differences import build_difference_table
+from src.reports.pairs import build_pair_table
+from src.reports.tables import METRICS, TableCell
+from src.reports.writers import format_cell, format_csv_tables, format_markdown
 from tests.reports.runs import SCORES, write_run
 from tests.test_train import config
 
@@ -45,8 +49,21 @@ def test_clips_of_other_seeds_are_further_clips(tmp_path):
     table = build_difference_table("", ours, theirs, PAPER)
     assert table.rows[0][3].text == "+1.0000" and table.rows[0][4].text == "+1.0000 to +1.0000"
     assert table.note.startswith("4 clips; 2 runs against 2.")
-    with pytest.raises(ValueError, match=r"must have clips of the same seeds, got \[0, 1\] and"):
-        build_difference_table("", ours, theirs[:1], PAPER)
+
+
+def test_clips_of_a_seed_that_one_side_lacks_are_left_out_and_it_is_said(tmp_path):
+    ours = found(tmp_path, "a", {"c": 2.0, "d": 5.0}, {"c": 9.0, "d": 9.0}, have_own_clips=True)
+    theirs = found(tmp_path, "b", {"c": 1.0, "d": 4.0}, {"c": 0.0, "d": 8.0}, have_own_clips=True)
+    said = "Left out: clips of seed 1, which one side lacks."
+    table = build_difference_table("", ours, theirs[:1], PAPER)
+    assert table.rows[0][3].text == "+1.0000"
+    assert table.note.startswith(f"2 clips; 1 runs against 1. {said}")
+    tests = [replace(r, record=r.record | {"task": "eval"}) for r in (*ours, *theirs[:1])]
+    keys, groups = run_groups.group_runs(tests)
+    pairs = build_pair_table("", keys, groups, [("a", "b")], ["lpips"])
+    assert pairs.rows[0][1].mean == 1.0 and said in pairs.note
+    with pytest.raises(ValueError, match=r"must have clips of the same seeds, got \[1\] and \[0\]"):
+        build_difference_table("", ours[1:], theirs[:1], PAPER)
 
 
 def test_what_was_not_tested_alike_is_named(tmp_path):
@@ -55,6 +72,41 @@ def test_what_was_not_tested_alike_is_named(tmp_path):
     table = build_difference_table("", ours, other, PAPER)
     assert table.note.endswith("Test conditions differ: turbulence.severity.")
     assert "differ" not in build_difference_table("", ours, ours, PAPER).note
+
+
+def test_settings_and_code_of_both_sides_are_named(tmp_path):
+    def write(ckpt: str, warmup: float) -> runs.Run:
+        settings = {"ckpt": ckpt, "backward_warmup_s": warmup}
+        asked = {"overrides": (f"ckpt={ckpt}",), "settings": settings, "git": ckpt, "task": "eval"}
+        write_run(tmp_path / ckpt, clips=[SCORES | {"name": "a"}], **asked)
+        return runs.find_runs([tmp_path / ckpt])[0]
+
+    ours, theirs = write("net", 0.3), write("old", 0.0)
+    note = build_difference_table("", [ours], [theirs], PAPER).note
+    assert "Settings: ckpt net against old." in note and "The code differs: net, old." in note
+    other = replace(theirs, settings=theirs.settings | {"ckpt": "net"})
+    note = build_difference_table("", [ours], [other], PAPER).note
+    assert "Settings: backward_warmup_s 0.3 against 0." in note
+    assert "Settings" not in build_difference_table("", [ours], [ours], PAPER).note
+
+
+def test_columns_are_those_of_the_differences_from_against_too(tmp_path):
+    for name in ("a", "b"):
+        found(tmp_path, name, {"c": 0.3, "d": 0.4})
+    given = [f"run={tmp_path}/a", f"against={tmp_path}/b", "columns=[lpips]"]
+    report(config("report", tmp_path / "out", *given))
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert "| LPIPS | 0.3500 | 0.3500 |" in text and "SSIM" not in text
+
+
+def test_arguments_of_an_own_metric_of_both_sides_are_test_conditions(tmp_path):
+    (one,) = found(tmp_path, "a", {"c": 2.0})
+    record = one.record | {"own_metrics": {"blur": 1}}
+    given = [one.settings | {"metrics.blur.size": size} for size in (1, 2)]
+    sides = [replace(one, record=record, settings=settings) for settings in given]
+    note = build_difference_table("", sides[:1], sides[1:], PAPER).note
+    assert "Test conditions differ: metrics.blur.size." in note
+    assert "conditions" not in build_difference_table("", sides[:1], [one], PAPER).note
 
 
 def test_differences_need_the_same_clips(tmp_path):
@@ -71,7 +123,11 @@ def sweep(folder) -> list[runs.Run]:
         for severity, more in (("weak", 0.0), ("strong", 0.1)):
             clips = [SCORES | {"name": f"c{n}", "lpips": v + more} for n, v in enumerate(values)]
             choices = {"method": method, "turbulence": severity, "experiment": "x"}
-            write_run(folder / method / severity, "x", choices=choices, clips=clips, task="eval")
+            asked = {
+                "choices": choices,
+                "overrides": (f"method={method}", f"turbulence={severity}"),
+            }
+            write_run(folder / method / severity, "x", clips=clips, task="eval", **asked)
     return runs.find_runs([folder])
 
 
@@ -89,6 +145,45 @@ def test_pairs_of_a_sweep_are_subtracted_clip_by_clip(tmp_path):
     heads, first, *_ = format_csv_tables([table]).splitlines()
     assert heads == "table,turbulence,difference,lpips,lpips_low,lpips_high,ssim,ssim_low,ssim_high"
     assert first.startswith("Pairs,")
+
+
+def test_a_pair_with_a_run_missing_is_a_row_that_says_so(tmp_path):
+    sweep(tmp_path)
+    shutil.rmtree(tmp_path / "one" / "strong")
+    keys, groups = run_groups.group_runs(runs.find_runs([tmp_path]))
+    table = build_pair_table("Pairs", keys, groups, [("lf3x3", "one")], ["lpips"])
+    text = format_markdown([table])
+    assert "| strong | lf3x3 − one | missing |" in text
+    assert "| weak | lf3x3 − one | -0.015 (-0.050 to +0.020) |" in text
+
+
+def test_pairs_without_results_of_both_are_refused_and_the_page_stays(tmp_path):
+    sweep(tmp_path / "runs")
+    shutil.rmtree(tmp_path / "runs" / "one" / "strong")
+    shutil.rmtree(tmp_path / "runs" / "lf3x3" / "weak")
+    notes = tmp_path / "notes.md"
+    notes.write_text("<!-- report:severity -->\nformer\n<!-- end:severity -->\n")
+    given = [f"run={tmp_path}/runs", "pairs=[[lf3x3,one]]", "columns=lpips", "title=severity"]
+    with pytest.raises(ValueError, match="pairs must have results of both .*none of lf3x3 and one"):
+        report(config("report", tmp_path / "out", *given, f"into={notes}"))
+    assert "former" in notes.read_text() and not (tmp_path / "out").exists()
+
+
+def test_what_goes_with_a_pair_is_in_its_row(tmp_path):
+    for ckpt, optics in (("setnet_small", "lf3x3"), ("single256", "single")):
+        asked = {"choices": {"optics": optics}, "settings": {"ckpt": ckpt}, "task": "eval"}
+        clips = [SCORES | {"name": "a"}]
+        overrides = (f"ckpt={ckpt}", f"optics={optics}")
+        write_run(tmp_path / ckpt, "eval", overrides=overrides, clips=clips, **asked)
+    keys, groups = run_groups.group_runs(runs.find_runs([tmp_path]))
+    assert keys == ("optics", "ckpt")
+    table = build_pair_table("", keys, groups, [("setnet_small", "single256")], ["lpips"])
+    labels = [cell.text for cell in table.rows[0][:2]]
+    assert labels == ["lf3x3 − single", "setnet_small − single256"]
+
+
+def test_a_difference_that_is_no_number_is_printed_so():
+    assert format_cell(TableCell(math.nan, interval=(math.nan, math.nan)), METRICS[0]) == "nan"
 
 
 def test_a_difference_whose_interval_excludes_zero_is_bold(tmp_path):

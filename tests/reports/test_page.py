@@ -48,6 +48,13 @@ def test_the_page_needs_nothing_from_elsewhere_and_keeps_names_harmless(tmp_path
     assert all(address.startswith("data:image/") for address in seen.addresses)
 
 
+def test_what_is_no_number_is_sorted_as_missing(tmp_path):
+    write_run(tmp_path / "a", scores={"ssim": float("nan")})
+    table, _, made = built(tmp_path)
+    text = page.format_html("t", [table], made, [], commands=[], **MEDIA)
+    assert '<td class="" data-value="">nan</td>' in text
+
+
 def test_a_chart_alone_makes_a_page(tmp_path):
     (tmp_path / "runs").mkdir()
     for suffix in ("png", "svg"):

@@ -39,11 +39,28 @@ def test_mean_and_sample_deviation_over_seeds(tmp_path):
     assert writers.format_cell(found, tables.METRICS[1]) == "0.600 ± 0.100"
 
 
-def test_one_seed_has_no_spread_and_a_metric_not_taken_is_a_dash(tmp_path):
-    write_run(tmp_path / "a", scores={"lpips": math.nan})
+def test_one_seed_has_no_spread(tmp_path):
+    write_run(tmp_path / "a")
+    assert value(built(tmp_path)[0], 0, "ssim").std is None
+
+
+def test_a_metric_not_taken_is_a_dash_and_one_that_is_no_number_is_not(tmp_path):
+    write_run(tmp_path / "a", "a", scores={"lpips": math.nan})
+    write_run(tmp_path / "b", "b", without=("lpips",))
     table, _, _ = built(tmp_path)
-    assert value(table, 0, "ssim").std is None
-    assert writers.format_cell(value(table, 0, "lpips"), tables.METRICS[0]) == "-"
+    shown = [writers.format_cell(value(table, k, "lpips"), tables.METRICS[0]) for k in (0, 1)]
+    assert shown == ["nan", "-"]
+    assert not table.is_best(0, table.columns.index(tables.METRICS[0]))
+
+
+def test_a_metric_that_one_seed_lacks_has_no_mean_of_the_others(tmp_path):
+    for seed in (0, 1):
+        write_run(tmp_path / str(seed), seed=seed, without=("lpips",) * seed)
+    table, _, _ = built(tmp_path)
+    assert value(table, 0, "lpips").mean is None and value(table, 0, "n").text == "2"
+    assert "Left out where one of the n runs lacks it: LPIPS." in table.note
+    assert "lacks it: LPIPS." in tables.select_columns(table, ["lpips"], "main").note
+    assert "lacks it" not in tables.select_columns(table, ["ssim"], "main").note
 
 
 def test_a_seed_that_diverged_is_not_left_out(tmp_path):
@@ -51,6 +68,42 @@ def test_a_seed_that_diverged_is_not_left_out(tmp_path):
         write_run(tmp_path / str(seed), seed=seed, scores={"psnr": psnr})
     table, _, _ = built(tmp_path)
     assert math.isnan(value(table, 0, "psnr").mean) and value(table, 0, "ssim").mean == 0.6
+
+
+def test_chosen_columns_have_the_number_of_seeds_where_it_is_not_one(tmp_path):
+    write_sweep(tmp_path, {"experiment": "lf3x3,single256", "seed": "range(2)"})
+    for seed in (0, 1):
+        write_run(tmp_path / str(seed), "lf3x3", seed, scores={"ssim": 0.5 + 0.1 * seed})
+    text = writers.format_markdown([tables.select_columns(built(tmp_path)[0], ["ssim"], "main")])
+    assert "| lf3x3 | 0.550 ± 0.071 | 2 |" in text and "| single256 | - | missing |" in text
+
+
+def test_runs_of_other_code_are_named(tmp_path):
+    for name in ("a", "b"):
+        write_run(tmp_path / name, name, git=name)
+    table, _, _ = built(tmp_path)
+    for shown in (table, tables.select_columns(table, ["ssim"], "main")):
+        assert shown.note.endswith(" The code differs: a, b.")
+    assert "code" not in built(tmp_path / "a")[0].note
+
+
+def test_arguments_of_an_own_metric_part_its_best_values_only(tmp_path):
+    for name, size in (("a", 1), ("b", 2)):
+        settings = {"metrics": {"blur": {"size": size}}}
+        scores = {"blur": size / 10, "ssim": size / 10}
+        write_run(tmp_path / name, name, settings=settings, scores=scores, own={"blur": 1})
+    table, _, _ = built(tmp_path)
+    names = [column.name for column in table.columns]
+    best = {k: [table.is_best(row, names.index(k)) for row in (0, 1)] for k in ("ssim", "blur")}
+    assert best == {"ssim": [False, True], "blur": [False, False]}
+
+
+def test_other_ranges_of_sequences_are_other_conditions(tmp_path):
+    for name, end in (("a", 1.0), ("b", 2.0)):
+        settings = {"data": {"sequences": {"ECD": {"slider_depth": [0.0, end]}}}}
+        write_run(tmp_path / name, name, settings=settings, scores={"ssim": end / 10})
+    table, _, _ = built(tmp_path)
+    assert not any(table.is_best(row, table.columns.index(tables.METRICS[1])) for row in (0, 1))
 
 
 def test_missing_cells_are_shown(tmp_path):
@@ -288,6 +341,14 @@ def test_jobs_whose_paths_were_quoted_for_hydra_are_not_missing(tmp_path):
     assert [value(table, row, "n").text for row in range(len(table.rows))] == ["1", "1"]
     text = (tmp_path / "out" / "report.md").read_text()
     assert "ckpt=lf3x3,'/a b/net.ckpt' scene.root=/data/photographs`" in text
+
+
+def test_a_run_that_did_not_end_is_named(tmp_path, capsys):
+    write_run(tmp_path / "runs" / "a")
+    (write_run(tmp_path / "runs" / "b", "b") / "results.json").unlink()
+    report(config("report", tmp_path / "out", f"run={tmp_path}/runs"))
+    said = capsys.readouterr().out
+    assert f"left out, without results.json: {tmp_path}/runs/b" in said
 
 
 def test_an_empty_folder_is_refused_and_nothing_is_written(tmp_path):

@@ -6,7 +6,8 @@ import pytest
 import yaml
 
 from src.records import runs
-from src.reports.run_groups import group_runs
+from src.reports.notes import describe_runs
+from src.reports.run_groups import find_unasked_differences, group_runs
 from tests.reports.runs import write_run, write_sweep
 
 
@@ -23,7 +24,46 @@ def test_seeds_of_one_setting_are_one_group_whatever_the_folders_are_called(tmp_
     assert seeds == {("lf3x3",): [0, 1], ("single256",): [0]}
 
 
-def test_the_label_takes_as_few_choices_and_overrides_as_tell_the_groups_apart(tmp_path):
+def test_what_command_lines_set_and_differs_is_in_the_label_whole(tmp_path):
+    for ckpt, turbulence in (("setnet_small", "weak"), ("single256", "strong")):
+        choices, overrides = (
+            {"turbulence": turbulence},
+            (f"ckpt={ckpt}", f"turbulence={turbulence}"),
+        )
+        asked = {"choices": choices, "overrides": overrides, "settings": {"ckpt": ckpt}}
+        write_run(tmp_path / ckpt, "eval", task="eval", **asked)
+    keys, found = grouped(tmp_path)
+    assert keys == ("turbulence", "ckpt")
+    assert {group.label for group in found} == {("weak", "setnet_small"), ("strong", "single256")}
+
+
+def test_settings_that_differ_with_no_word_of_the_command_line_are_in_the_note(tmp_path):
+    for name, width in (("a", 8), ("b", 16)):
+        write_run(tmp_path / name, settings={"lr": width / 10, "width": width, "depth": 2})
+    keys, found = grouped(tmp_path)
+    assert keys == ("lr",) and find_unasked_differences(keys, found) == ["width"]
+    assert " Settings differ that no command line names: width." in describe_runs(keys, found)
+
+
+def test_what_is_averaged_over_is_in_the_note(tmp_path):
+    for ckpt in ("a.ckpt", "b.ckpt"):
+        write_run(tmp_path / ckpt, settings={"ckpt": ckpt}, task="eval")
+    given = runs.find_runs([tmp_path])
+    keys, found = group_runs(given, across=("ckpt", "lr"))
+    assert describe_runs(keys, found) == " Means are over ckpt: a.ckpt, b.ckpt."
+
+
+def test_a_missing_job_has_the_label_that_its_run_would_have(tmp_path):
+    write_sweep(tmp_path, {"experiment": "x", "seed": "0", "threshold": "[0.1,0.7],0.30,0.2"})
+    overrides, settings = ("threshold=0.2",), {"threshold": 0.2}
+    write_run(tmp_path / "a", "x", overrides=overrides, settings=settings)
+    write_run(tmp_path / "b", "x", overrides=("threshold=1",), settings={"threshold": 1})
+    keys, found = grouped(tmp_path)
+    assert keys == ("threshold",)
+    assert [group.label[0] for group in found] == ["[0.1, 0.7]", "0.3", "0.2", "1"]
+
+
+def test_the_label_takes_as_few_choices_as_tell_the_groups_apart(tmp_path):
     place = 0
     for optics in ("single", "lf3x3"):
         for lr in ("0.1", "0.2"):
@@ -61,6 +101,32 @@ def test_where_and_on_what_machine_it_ran_makes_no_other_cell(tmp_path):
     write_run(tmp_path / "a", seed=0, settings={"data": {"workers": 0}})
     write_run(tmp_path / "b", seed=1, settings={"data": {"workers": 2}, "ckpt": "x.ckpt"})
     assert len(grouped(tmp_path)[1]) == 1
+
+
+@pytest.mark.parametrize(
+    ("weights", "cells"), [("setnet_small", 2), ("net.safetensors", 2), ("x/last.ckpt", 1)]
+)
+def test_a_training_that_went_on_from_weights_is_another_cell(weights, cells, tmp_path):
+    write_run(tmp_path / "a", seed=0)
+    folder = write_run(tmp_path / "b", seed=1, settings={"ckpt": weights})
+    record = json.loads((folder / "results.json").read_text()) | {"resumed_from": weights}
+    (folder / "results.json").write_text(json.dumps(record))
+    keys, found = grouped(tmp_path)
+    assert len(found) == cells and keys == (("ckpt",) if cells == 2 else ("experiment",))
+
+
+@pytest.mark.parametrize(
+    ("task", "other", "cells"),
+    [
+        ("train", {"devices": 8}, 2), ("train", {"devices": [0, 3]}, 1),
+        ("train", {"devices": 2, "num_nodes": 2}, 2), ("eval", {"devices": 8}, 1),
+    ],
+)  # fmt: skip
+def test_trainings_on_another_number_of_devices_are_another_cell(task, other, cells, tmp_path):
+    for seed, trainer in enumerate(({"devices": 2}, other)):
+        settings = {"trainer": trainer}
+        write_run(tmp_path / str(seed), seed=seed, settings=settings, task=task)
+    assert len(grouped(tmp_path)[1]) == cells
 
 
 @pytest.mark.parametrize(("task", "cells"), [("eval", 1), ("train", 2)])
@@ -142,6 +208,27 @@ def test_results_that_are_cut_short_are_refused(cut, tmp_path):
         (folder / "results.json").write_text(json.dumps(record))
     with pytest.raises(ValueError, match="run must hold whole results, got .*results.json: "):
         runs.find_runs([folder])
+
+
+def test_clips_whose_means_are_not_those_of_the_test_are_refused(tmp_path):
+    clips = [{"name": f"c{k}", "lpips": 0.1 * k, "ssim": float("nan")} for k in range(3)]
+    folder = write_run(tmp_path / "run", clips=clips)
+    assert len(runs.find_runs([folder])) == 1
+    table = folder / "clips.csv"
+    table.write_text(table.read_text().replace("0.1,", "0.4,"))
+    said = r"got .*run/results\.json: clips\.csv has the mean lpips 0\.2, the test 0\.1"
+    with pytest.raises(ValueError, match=said):
+        runs.find_runs([folder])
+
+
+def test_tests_and_trainings_that_did_not_end_are_found_outside_sweeps(tmp_path):
+    for name in ("done", "half", "other", "sweep/job"):
+        task = "simulate" if name == "other" else "eval"
+        folder = write_run(tmp_path / name, task=task)
+        if name != "done":
+            (folder / "results.json").unlink()
+    write_sweep(tmp_path / "sweep", {"seed": "0,1"})
+    assert runs.find_unfinished([tmp_path]) == [tmp_path / "half"]
 
 
 def test_results_beside_the_config_of_another_run_are_refused(tmp_path):

@@ -1,0 +1,38 @@
+"""What the note of a table says of its runs beside the numbers: what else differs, what is left
+out."""
+
+from collections.abc import Iterable, Sequence
+
+from src.records.runs import Run
+from src.reports.clip_conditions import format_setting
+from src.reports.run_groups import RunGroup, find_unasked_differences
+
+MOST = 8  # names in a list
+
+
+def describe_runs(keys: Sequence[str], groups: Sequence[RunGroup]) -> str:
+    """Return sentences on the groups under labels of `keys`: over what they are means beside the
+    seed, settings that differ unseen, versions of the code; "" where there is nothing to say."""
+    runs = [run for group in groups for run in group.runs]
+    across = dict.fromkeys(key for group in groups for key in group.across)
+    said = "".join(map(_describe_pooled, across, [runs] * len(across)))
+    if unseen := find_unasked_differences(keys, groups):
+        said += f" Settings differ that no command line names: {_join(unseen)}."
+    commits = sorted({run.record["git"] for run in runs})
+    return said + (f" The code differs: {_join(commits)}." if len(commits) > 1 else "")
+
+
+def describe_conditions(differing: Iterable[str]) -> str:
+    """Return a sentence that names the `differing` test conditions, "" for none."""
+    named = sorted(differing)
+    return f" Test conditions differ: {', '.join(named)}." if named else ""
+
+
+def _describe_pooled(key: str, runs: Sequence[Run]) -> str:
+    values = list(dict.fromkeys(format_setting(run.settings.get(key)) for run in runs))
+    return f" Means are over {key}: {_join(values)}." if len(values) > 1 else ""
+
+
+def _join(names: Sequence[str]) -> str:
+    more = [f"{len(names) - MOST} more"] if len(names) > MOST else []
+    return ", ".join([*names[:MOST], *more])
