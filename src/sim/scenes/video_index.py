@@ -2,7 +2,7 @@
 
 Headers are not believed: edit lists hide frames, browsers write no duration, phones vary the rate.
 A file is decoded once for its index, which stays in memory; then any frame is reached from the key
-frame before it.  Grey values are those of OpenCV's own reader.
+frame before it.  Grey values of 8 bits are those of OpenCV's own reader.
 """
 
 import warnings
@@ -49,21 +49,24 @@ class VideoIndex:
     constant_rate_frames: Int[np.ndarray, " count"]
     fps: float | None
 
-    def read(self, first: int, stop: int, config_key: str) -> Iterator[Gray]:
-        """Yield frames first .. stop - 1; raises ValueError, which names `config_key`, for a
+    def read(
+        self, first: int, stop: int, config_key: str, all_bits: bool = False
+    ) -> Iterator[Gray]:
+        """Yield frames first .. stop - 1, uint8, with `all_bits` uint16 where grey ones have more
+        bits; raises ValueError, which names `config_key`, for a
         file that is another one by now.
         """
         wanted = self.constant_rate_frames[first:stop]
         if not len(wanted):
             return
-        frames = self._read_whole(int(wanted[0]), config_key)
+        frames = self._read_whole(int(wanted[0]), config_key, all_bits)
         number, frame = int(wanted[0]), next(frames)
         for target in wanted:
             while number < target:
                 number, frame = number + 1, next(frames)
             yield frame
 
-    def _read_whole(self, first: int, config_key: str) -> Iterator[Gray]:
+    def _read_whole(self, first: int, config_key: str, all_bits: bool) -> Iterator[Gray]:
         """Yield the whole frames from `first` on, by way of the key frame before it."""
         before = self.keyframes[self.keyframes <= first].tolist() if len(self.times_ticks) else []
         for start in dict.fromkeys([*before[-1:], 0]):
@@ -71,7 +74,7 @@ class VideoIndex:
                 frames = self._enter(container, stream, start, first)
                 if frames is not None:
                     with suppress(DamagedVideo):
-                        yield from convert_to_gray(frames)
+                        yield from convert_to_gray(frames, all_bits)
                     break
         raise ValueError(f"{config_key} must not change while it is read, got {self.path}")
 
