@@ -79,7 +79,11 @@ class UserClipSimulation:
     def drawn_parameters(self) -> dict[str, Any]:
         """Return what was drawn."""
         own = {"name": self.clip.name, "threshold": self.sensor.threshold}
-        return own | {"simulated_fps": self.simulated_fps} | dict(self.turbulence.metadata)
+        operator = self.turbulence
+        drawn = operator.metadata
+        if isinstance(operator, Turbulence):
+            drawn = operator.clip_metadata(noise.generator(noise.key(self.key, "turbulence")))
+        return own | {"simulated_fps": self.simulated_fps} | dict(drawn)
 
     def describe(self) -> str:
         """Return size, rate, frames, turbulence and threshold in one line."""
@@ -146,9 +150,7 @@ def describe_turbulence(drawn: Mapping[str, Any]) -> str:
     """Return how far turbulence moves and spreads a point of the clip, pixels, along one axis."""
     if not (tilt := drawn.get("tilt_px")):
         return ""
-    both = drawn.get("tilt_and_blur_px")
-    blur = math.sqrt(max(both**2 - tilt**2, 0.0)) if both else drawn.get("blur_px", 0.0)
-    return f": tilt {tilt:.2f} px, blur {blur:.2f} px rms"
+    return f": tilt {tilt:.2f} px, blur {drawn.get('blur_px', 0.0):.2f} px rms"
 
 
 def refuse_keys_of_scenes(overrides: Iterable[str]) -> None:

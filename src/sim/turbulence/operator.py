@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import torch
@@ -55,7 +55,8 @@ class Turbulence:
         self.is_identity = atmosphere is None or atmosphere.d_over_r0 == 0
         self.fidelity = Fidelity()
         if atmosphere is not None and not self.is_identity:
-            self.fidelity = fidelity = choose_fidelity(atmosphere, width, tolerance)
+            fidelity = choose_fidelity(atmosphere, width, tolerance)
+            self.fidelity = fidelity = replace(fidelity, **self.dynamics.describe(atmosphere))
             strength, unit = fidelity.blur_equivalent_d_over_r0, fidelity.lambda_over_d_px
             size, number, band = fidelity.psf_size_px, fidelity.psf_network, find_psf_band(strength)
             missing = missing_structure_function(
@@ -68,6 +69,15 @@ class Turbulence:
     @property
     def metadata(self) -> dict[str, float | int | str]:
         return asdict(self.fidelity)
+
+    def clip_metadata(self, generator: Generator) -> dict[str, float | int | str]:
+        """Return the metadata of the clip that `degrade` draws from `generator`: where clips are
+        `mixed`, with the temporal model that it has.
+        """
+        if self.atmosphere is None or self.is_identity:
+            return self.metadata
+        model = self.dynamics.draw_temporal_model(noise.draw_base_key(generator))
+        return self.metadata | replace(self.dynamics, temporal_model=model).describe(self.atmosphere)
 
     @torch.no_grad()
     def degrade(self, frames: Frames, generator: Generator, *, crop: Crop | None = None) -> Views:

@@ -14,6 +14,7 @@ All covariances, between modes, points, times and views, follow from this one su
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Complex, Float
@@ -23,7 +24,7 @@ from src.sim import noise
 from src.sim.optics import Position, view_id
 from src.sim.turbulence.atmosphere import AR1_FPS, Atmosphere
 from src.sim.turbulence.contract import check_option
-from src.sim.turbulence.outer_scale import LAYER_WIND_RATIO
+from src.sim.turbulence.outer_scale import LAYER_WIND_RATIO, tilt_decay_distance
 from src.sim.turbulence.zernike import SPECTRUM, pupil_filter
 
 LOW, HIGH = 0.08, 0.32  # limits of the three power laws that kappa is drawn from; HIGH per (n + 1)
@@ -113,6 +114,29 @@ class WaveDynamics:
         for name, (valid, allowed) in checks.items():
             check_option(valid, name, allowed, getattr(self, name))
 
+    def draw_temporal_model(self, key: int) -> str:
+        """Return `ar1` or `frozen_flow`; where clips are `mixed`, that of the clip of `key`."""
+        if self.temporal_model != "mixed":
+            return self.temporal_model
+        drawn = float(noise.uniform(noise.key(key, "temporal"), torch.tensor(0)))
+        return "frozen_flow" if drawn < 0.5 else "ar1"
+
+    def describe(self, atmosphere: Atmosphere) -> dict[str, Any]:
+        """Return what is recorded: `temporal_model`; `wind_m_s`, the rms speed of frozen flow, 0 of
+        AR(1); `tilt_correlation_time_s`, to 1 / e (`mixed`: that of AR(1)).
+        """
+        coefficient = atmosphere.ar1_coefficient
+        time_s, wind = math.inf if coefficient == 1 else 0.0, 0.0
+        if 0 < coefficient < 1:
+            time_s = -1 / (AR1_FPS * math.log(coefficient))
+        if self.temporal_model != "ar1":
+            wind = atmosphere.wind_m_s if self.wind_m_s is None else float(self.wind_m_s)
+        if self.temporal_model == "frozen_flow":
+            way = tilt_decay_distance(*atmosphere.outer_scale_and_profile, wind=True)
+            time_s = way * atmosphere.aperture_m / wind if wind else math.inf
+        own = {"temporal_model": self.temporal_model, "wind_m_s": wind}
+        return own | {"tilt_correlation_time_s": time_s}
+
     def draw_amplitudes(
         self,
         atmosphere: Atmosphere,
@@ -129,9 +153,7 @@ class WaveDynamics:
         """
         shared = self.views_correlation == "baseline"
         ids = torch.tensor([0 if shared else view_id(position) for position in positions])
-        frozen = self.temporal_model == "frozen_flow"
-        if self.temporal_model == "mixed":
-            frozen = float(noise.uniform(noise.key(key, "temporal"), torch.tensor(0))) < 0.5
+        frozen = self.draw_temporal_model(key) == "frozen_flow"
         steps = 1 if frozen else frames
         counters = torch.arange(steps * 2 * len(waves.z_over_l), device=device)
         counters = counters.reshape(steps, -1, 2) + (ids << 40).to(device)[:, None, None, None]
