@@ -50,7 +50,8 @@ class SimulatedClip:
     `drawn`: what was drawn, among it `threshold` (contrast, nat), `simulated_fps` (frames a
     second), `severity` (a word), `d_over_r0` (D/r0), `tilt_px`, `blur_px` (beyond diffraction) and
     `tilt_and_blur_px` (rms along an axis, pixels of the clip), `tilt_correlation_half_length_px`,
-    `tilt_correlation_time_s` (to 1/e), `temporal_model` and its `wind_m_s` (rms, 0 of ar1); of turbulence=recorded or of a class of your own what it names.
+    `tilt_correlation_time_s` (to 1/e), `temporal_model` and its `wind_m_s` (rms, 0 of ar1); of
+    turbulence=recorded or of a class of your own what it names.
     """
 
     clean: Float[np.ndarray, "frames h w"]

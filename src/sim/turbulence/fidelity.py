@@ -45,10 +45,11 @@ class Fidelity:
 
     `temporal_model`, `wind_m_s`, `tilt_correlation_time_s`: see WaveDynamics.describe;
     `aperture_px`: D at the object; `tilt_px`: standard deviation along one axis; `blur_px`: blur
-    beyond diffraction (Atmosphere.blur_px).  `zernike_modes` from tilt on; `psf_network`: the one that turns them
-    into weights of `psf_rank` basis functions; `*_grid_pitch_px`: pixels between the nodes of the
-    phase.  `error_psf` (modes left out, network and basis), `error_grid`, `error_kernel`: shares of
-    the random power; `error`: the rms error they make together, of an image's contrast.
+    beyond diffraction (Atmosphere.blur_px).  `zernike_modes` from tilt on; `psf_network`: the one
+    that turns them into weights of `psf_rank` basis functions; `*_grid_pitch_px`: pixels between
+    the nodes of the phase.  `error_psf` (modes left out, network and basis), `error_grid`,
+    `error_kernel`: shares of the random power; `error`: the rms error they make together, of an
+    image's contrast.
     """
 
     d_over_r0: float = 0.0

@@ -77,7 +77,9 @@ class Turbulence:
         if self.atmosphere is None or self.is_identity:
             return self.metadata
         model = self.dynamics.draw_temporal_model(noise.draw_base_key(generator))
-        return self.metadata | replace(self.dynamics, temporal_model=model).describe(self.atmosphere)
+        return self.metadata | replace(self.dynamics, temporal_model=model).describe(
+            self.atmosphere
+        )
 
     @torch.no_grad()
     def degrade(self, frames: Frames, generator: Generator, *, crop: Crop | None = None) -> Views:

@@ -101,9 +101,7 @@ def test_a_clip_of_mixed_records_the_temporal_model_that_it_has():
     )
     seen = set()
     for seed in range(6):
-        moves, *own = (
-            one.tilt(3, torch.Generator().manual_seed(seed)) for one in (mixed, *single)
-        )
+        moves, *own = (one.tilt(3, torch.Generator().manual_seed(seed)) for one in (mixed, *single))
         model = mixed.clip_metadata(torch.Generator().manual_seed(seed))["temporal_model"]
         assert torch.equal(moves, own[model == "frozen_flow"])
         assert not torch.equal(moves, own[model == "ar1"])
