@@ -4,7 +4,7 @@ import math
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,14 @@ from torch import Tensor
 
 from src.app.instantiate import build_part
 from src.app.renamed_keys import read_override_key
-from src.app.simulation import build_sensor, decodes_srgb
+from src.app.simulation import build_sensor, check_noise_rates, decodes_srgb
 from src.recordings.simulated_recording import Progress
 from src.sim import noise
 from src.sim.optics import Optics
 from src.sim.scenes import user_clip
 from src.sim.scenes.user_clip import UserClip
 from src.sim.sensor.response import decode_srgb, encode_srgb
+from src.sim.sensor.sensor import EventSensor
 from src.sim.turbulence.contract import ClipTurbulence
 from src.sim.turbulence.operator import Turbulence
 
@@ -58,7 +59,9 @@ class UserClipSimulation:
         self.substeps = max(1, math.ceil(round(least / clip.fps, 6)))
         self.optics: Optics = build_part(cfg, "optics")
         self.key = noise.key(cfg.seed, "own material", cfg.index)
-        self.sensor: Any = build_sensor(cfg, cfg.seed).draw(self.key)
+        sensor = build_sensor(cfg, cfg.seed)
+        check_noise_rates(sensor, self.simulated_fps)
+        self.sensor: Any = sensor.draw(self.key)
 
     @property
     def simulated_fps(self) -> float:
@@ -173,11 +176,21 @@ def set_user_clip_sensor(cfg: DictConfig, overrides: Iterable[str]) -> None:
             wanted[key] = cfg.sensor[key]
         else:
             cfg.sensor[key] = wanted[key]
+            _check_user_clip_sensor(key, wanted[key])
     fixed = {*wanted} | {name.removeprefix("sensor.") for name in given}
     with open_dict(cfg):
         for name in [*(cfg.sensor.get("random") or {})]:
             if name in fixed and f"sensor.random.{name}" not in given:
                 del cfg.sensor.random[name]
+
+
+def _check_user_clip_sensor(key: str, value: Any) -> None:
+    """Raise ValueError, which names `user_clip_sensor`, for a value that an EventSensor refuses."""
+    if key in {one.name for one in fields(EventSensor)}:
+        try:
+            EventSensor(**{key: value})
+        except ValueError as error:
+            raise ValueError(f"user_clip_{error}") from None
 
 
 def read_user_clip(cfg: DictConfig) -> UserClip:

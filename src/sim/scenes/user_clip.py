@@ -5,6 +5,7 @@ Grey values are luminance code values.  Pictures are only shrunk, with an area f
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -101,9 +102,10 @@ def read_video(
     return UserClip(source.name, np.stack(frames), rate, facts)
 
 
-def _find_part(count: int, fps: float, start_s: float, end_s: float, name: str) -> tuple[int, int]:
+def _find_part(count: int, fps: float, start_s: Any, end_s: Any, name: str) -> tuple[int, int]:
     """Return the first frame from `start_s` on, and the first from `end_s` on, of `count`."""
-    if not 0 <= start_s < end_s:
+    are_numbers = isinstance(start_s, Real) and isinstance(end_s, Real)
+    if not (are_numbers and 0 <= start_s < end_s):
         raise ValueError(f"start_s must be >= 0 and below end_s, got {start_s} and {end_s}")
     first = math.ceil(round(start_s * fps, 6))
     stop = count if end_s == math.inf else min(count, math.ceil(round(end_s * fps, 6)))
@@ -174,7 +176,10 @@ def clip_from_array(
     if array.dtype != np.uint8 and not (
         array.dtype.kind == "f" and array.size and 0 <= array.min() <= array.max() <= 1
     ):
-        raise ValueError("photo_or_video must be uint8 or floats in [0, 1]")
+        got = str(array.dtype)
+        if array.dtype.kind == "f" and array.size:
+            got = f"{got} from {array.min():g} to {array.max():g}"
+        raise ValueError(f"photo_or_video must be uint8 or floats in [0, 1], got {got}")
     facts = "x".join(map(str, array.shape[:-3:-1])) + " px"
     array = scale_to_white(array, white_level)
     if array.ndim == 2:
@@ -202,11 +207,13 @@ def _find_one_video(path: Path) -> VideoSource:
         raise ValueError(f"{error}{'; a photograph is photo=' * is_picture}") from None
     if len(videos) != 1:
         raise ValueError(f"video must be one video or one folder of frames, got {path}")
+    if videos[0].count < 2:  # a folder: files are looked at before
+        raise ValueError(f"video must be a folder of two frames or more, got one in {path}")
     return videos[0]
 
 
-def _check_rate(fps: float) -> None:
-    if not 0.1 <= fps <= 1e6:
+def _check_rate(fps: Any) -> None:
+    if not (isinstance(fps, Real) and 0.1 <= fps <= 1e6):
         raise ValueError(f"fps must be in [0.1, 1e6] frames a second, got {fps}")
 
 

@@ -118,6 +118,17 @@ def _file_source(path: Path, config_key: str) -> VideoSource:
     return VideoSource(path.stem, count, config_key, index=index)
 
 
+def is_photograph(path: Path) -> bool:
+    """Return whether a path is a picture: by its name, or a file that is no video by its name, or
+    a GIF of one frame, and that OpenCV reads.
+    """
+    suffix = path.suffix.lower()
+    if suffix in PICTURE_SUFFIXES | VIDEO_SUFFIXES - {".gif"} or not path.is_file():
+        return suffix in PICTURE_SUFFIXES
+    is_picture = read_picture(path) is not None
+    return is_picture and (suffix != ".gif" or cv2.imcount(str(path)) == 1)
+
+
 def read_picture(source: Path | bytes, flags: int = cv2.IMREAD_GRAYSCALE) -> NDArray | None:
     """Return the picture (h, w) of a file or of its bytes, or None where it is none or has too
     many pixels (video_decoding.LARGEST_PIXELS), as a small file could unpack to gigabytes.

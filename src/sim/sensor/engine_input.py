@@ -147,7 +147,8 @@ def threshold_range(threshold: Any) -> tuple[float, float]:
     """Return (low, high) of `sensor.threshold`, a number or a range."""
     is_number = isinstance(threshold, int | float)
     if not (is_number or is_range(threshold)):
-        raise ValueError(f"sensor.threshold must be a number or [low, high], got {threshold}")
+        allowed = "a number or [low, high], low <= high"
+        raise ValueError(f"sensor.threshold must be {allowed}, got {threshold}")
     ends = [threshold, threshold] if is_number else threshold
     for end in ends:
         check_in_range("sensor.threshold", end, *RANDOM_RANGES["threshold"])
@@ -169,7 +170,7 @@ def check_settings(settings: Mapping[str, Any]) -> None:
             names = ", ".join(RANDOM_RANGES)
             raise ValueError(f"sensor.random must hold ranges of {names}, got {name}")
         if not is_range(ends):
-            raise ValueError(f"sensor.random.{name} must be [low, high], got {ends}")
+            raise ValueError(f"sensor.random.{name} must be [low, high], low <= high, got {ends}")
         for end in ends:
             check_in_range(f"sensor.random.{name}", end, *RANDOM_RANGES[name])
 

@@ -42,12 +42,13 @@ class Turbulence:
         height: int,
         width: int,
         fps: float = 120.0,
-        tolerance: float = 0.26,
+        tolerance: Any = 0.26,
         **dynamics: Any,
     ):
         check_option(height >= 1 and width >= 1, "frame", "at least 1 x 1", (height, width))
         check_option(0 < fps < math.inf, "fps", "> 0", fps)
-        check_option(0 < tolerance <= 1, "tolerance", "in (0, 1]", tolerance)
+        is_share = isinstance(tolerance, int | float) and 0 < tolerance <= 1
+        check_option(is_share, "tolerance", "in (0, 1]", tolerance)
         self.dynamics = WaveDynamics(**dynamics)
         self.atmosphere, self.height, self.width, self.fps = atmosphere, height, width, fps
         positions = layout(views) if isinstance(views, int) else views

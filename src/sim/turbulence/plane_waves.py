@@ -107,10 +107,12 @@ class WaveDynamics:
         time, shared = self.temporal_model, self.views_correlation
         checks = {
             "temporal_model": (time in TEMPORAL_MODELS, "ar1, frozen_flow or mixed"),
-            "wind_m_s": (0 <= (self.wind_m_s or 0) < math.inf, ">= 0 or null"),
             "views_correlation": (shared in VIEWS_CORRELATIONS, "independent or baseline"),
-            "baseline_m": (0 <= (self.baseline_m or 0) < math.inf, ">= 0 or null"),
         }
+        for name in ("wind_m_s", "baseline_m"):
+            value = getattr(self, name)
+            valid = value is None or (isinstance(value, int | float) and 0 <= value < math.inf)
+            checks[name] = (valid, ">= 0 or null")
         for name, (valid, allowed) in checks.items():
             check_option(valid, name, allowed, getattr(self, name))
 

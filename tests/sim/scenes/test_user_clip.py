@@ -183,13 +183,19 @@ def test_transparent_pixels_are_told(tmp_path):
             r"white_level must be in \(0, 255\] or null, got 0",
         ),
         (lambda p: user_clip.clip_from_array(np.zeros((3, 20, 30))), "fps must be given"),
-        (lambda p: user_clip.clip_from_array(np.full((20, 30), 7.0)), r"floats in \[0, 1\]"),
+        (lambda p: user_clip.clip_from_array(np.full((20, 30), 7.0)), r"\[0, 1\], .*from 7 to 7"),
+        (lambda p: user_clip.clip_from_array(np.zeros((20, 30), int)), r"\[0, 1\], got int64"),
+        (lambda p: user_clip._check_rate("30"), r"fps must be in .* got 30"),
+        (lambda p: user_clip._find_part(9, 30, "0", 1.0, "a.mkv"), "start_s must be .* got 0 and"),
+        (lambda p: user_clip._find_part(9, 30, 0.0, None, "a.mkv"), "start_s must be .* and None"),
+        (lambda p: user_clip.read_video(p / "one", fps=30), "two frames or more, got one in .*one"),
         (lambda p: user_clip.clip_from_array(np.zeros((1, 1, 2, 3))), "must be of shape"),
     ],
 )
 def test_wrong_material_is_one_line(call, message, tmp_path):
     write_film(tmp_path / "a.mkv")
-    for name in ("a.png", "b.png"):
+    (tmp_path / "one").mkdir()
+    for name in ("a.png", "b.png", "one/a.png"):
         cv2.imwrite(str(tmp_path / name), np.zeros((20, 30), np.uint8))
     with pytest.raises(ValueError, match=message) as error:
         call(tmp_path)
