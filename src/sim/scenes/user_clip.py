@@ -138,7 +138,8 @@ def read_photograph(
     speed_widths_per_s: float = 0.0, seed: int = 0,
 ) -> UserClip:  # fmt: skip
     """Return a photograph for `seconds` (None: 1) at `fps` (None: 120): at rest, or in a smooth
-    motion, drawn from `seed`, of `speed_widths_per_s` frame widths a second (`SimilarityMotion`).
+    motion, drawn from `seed`: its middle moves by 0.67 of `speed_widths_per_s`, frame widths a
+    second, in the mean, and it turns and zooms whatever the speed (`SimilarityMotion`).
     `white_level` as in `read_video`.
 
     Raises ValueError for what is no picture and for values outside their range.

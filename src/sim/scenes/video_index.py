@@ -40,7 +40,8 @@ class VideoIndex:
 
     `times_ticks`: of its whole frames, in ticks of the file, none where it has no usable ones;
     `keyframes`: their numbers.  `constant_rate_frames`: the number of the whole frame that each
-    frame of the video at the constant rate `fps` (None: unknown) shows.
+    frame of the video at the constant rate `fps` (None: unknown) shows.  `notes`: what is warned of
+    whenever the file is opened.
     """
 
     path: Path
@@ -48,6 +49,7 @@ class VideoIndex:
     keyframes: Int[np.ndarray, " keys"]
     constant_rate_frames: Int[np.ndarray, " count"]
     fps: float | None
+    notes: tuple[str, ...] = ()
 
     def read(
         self, first: int, stop: int, config_key: str, all_bits: bool = False
@@ -108,7 +110,10 @@ def index_video(path: Path, config_key: str, max_frames: int | None = None) -> V
         state = path.stat()
     except OSError as error:
         raise ValueError(f"{config_key} must be a video that exists, got {path}") from error
-    return _index(path, config_key, max_frames, state.st_mtime_ns, state.st_size)
+    index = _index(path, config_key, max_frames, state.st_mtime_ns, state.st_size)
+    for note in index.notes:
+        warnings.warn(note, stacklevel=1)  # one place, so that Python tells it once a process
+    return index
 
 
 @lru_cache(maxsize=4096)
@@ -130,13 +135,13 @@ def _index(path: Path, config_key: str, max_frames: int | None, *version: int) -
             f"{config_key} must show at most {MOST_FRAMES} frames, got more by the time stamps of "
             f"{path}"
         )
+    notes = []
     if fault:
-        message = f"{path} is cut or damaged ({fault}): its first {count} frames are read"
-        warnings.warn(message, stacklevel=3)
+        notes += [f"{path} is cut or damaged ({fault}): its first {count} frames are read"]
     if uneven:
-        message = f"{path} has a variable frame rate: its {count} frames are brought to "
-        warnings.warn(f"{message}{fps:.6g} frames/s by their time stamps", stacklevel=3)
-    return VideoIndex(path, ticks, np.array(keys, np.int64), shown, fps)
+        note = f"{path} has a variable frame rate: its {count} frames are brought to "
+        notes += [f"{note}{fps:.6g} frames/s by their time stamps"]
+    return VideoIndex(path, ticks, np.array(keys, np.int64), shown, fps, tuple(notes))
 
 
 def _list_frames(

@@ -118,7 +118,8 @@ def _reference_range(sensor: Any) -> tuple[float, float]:
 
     With leak they lie anywhere on the way to the next ON event, so that these come from the first
     moment on, and not all at once: at their rate, with an initial error e at 1 / (1 + e) of it
-    until the drift has passed a threshold.
+    until the drift has passed a threshold.  From then on, while the light rests, an error between 0
+    and 1 leaves 2 / (1 + e) of the rate for a share e of the way to each event, else 1 / (1 + e).
     """
     error = sensor.initial_reference_error
     return (error / (1 + error), 1 + error) if sensor.leak_event_hz else (0.5, 2 * error)

@@ -84,7 +84,8 @@ class Turbulence:
 
     @torch.no_grad()
     def degrade(self, frames: Frames, generator: Generator, *, crop: Crop | None = None) -> Views:
-        """Return every view of `crop`: only this is simulated; it equals that part of the whole."""
+        """Return every view of `crop`: only this is simulated, and is that part of the whole to
+        rounding."""
         size, given = (self.height, self.width), tuple(frames.shape[-2:])
         check_option(given == size, "frame", f"{size}", given)
         top, left, height, width = crop or (0, 0, *size)
@@ -111,7 +112,8 @@ class Turbulence:
         self, parts: Iterable[Float[Tensor, "part h w"]], frames: int, generator: Generator
     ) -> Iterator[tuple[Float[Tensor, "views part h w"], Tilt]]:
         """Yield every view and the tilt of successive parts of one clip of `frames`, as `degrade`
-        and `tilt` return them for all of it, in the memory of one part.
+        and `tilt` return them for all of it, in the memory of one part and of the amplitudes of all
+        frames: 8 bytes for each of WAVES waves and each view.
         """
         window, first = (0, 0, self.height, self.width), 0
         plans = [] if self.is_identity else self.plan(frames, generator, window)

@@ -31,6 +31,7 @@ LOW, HIGH = 0.08, 0.32  # limits of the three power laws that kappa is drawn fro
 DEPTH = 1.0  # waves are drawn with the density Cn2 (1 - z/L)^DEPTH
 SHARES = (0.25, 0.65, 0.10)  # of the waves below LOW, between, above HIGH
 TEMPORAL_MODELS, VIEWS_CORRELATIONS = ("ar1", "frozen_flow", "mixed"), ("independent", "baseline")
+NUMBERS_AT_A_TIME = 1 << 22  # that are drawn, a few hundred MiB with all that is made of them
 WIND_LAYERS = 4  # of equal integrals of Cn2 (1 - z/L)^DEPTH
 
 
@@ -149,10 +150,23 @@ class WaveDynamics:
         fps: float,
         device: torch.device | str = "cpu",
     ) -> Complex[Tensor, "views frames waves"]:
-        """Return complex64 amplitudes, drawn on `device`.
+        """Return complex64 amplitudes, drawn on `device`; of long clips a few views at a time, which
+        takes less memory.
 
         Every view counts from its own id, or all from 0 where they share the turbulence.
         """
+        together = max(1, NUMBERS_AT_A_TIME // (2 * frames * len(waves.z_over_l)))
+        given = atmosphere, waves, key, frames, fps, device
+        parts = [
+            self._draw_views(positions[first : first + together], *given)
+            for first in range(0, len(positions), together)
+        ]
+        return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+    def _draw_views(
+        self, positions: Sequence[Position], atmosphere: Atmosphere, waves: PlaneWaves, key: int,
+        frames: int, fps: float, device: torch.device | str,
+    ) -> Complex[Tensor, "views frames waves"]:  # fmt: skip
         shared = self.views_correlation == "baseline"
         ids = torch.tensor([0 if shared else view_id(position) for position in positions])
         frozen = self.draw_temporal_model(key) == "frozen_flow"

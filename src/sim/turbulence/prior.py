@@ -142,7 +142,8 @@ def sample_matching_atmosphere(
 
     `allowed_aperture_px`: aperture in pixels at the object; `outer_scale_over_aperture`: L0 / D,
     infinite with `kolmogorov_probability`; `cn2_profiles`: `uniform`, `camera` (the first tenth),
-    `middle` (third), `object` (the last 30 %) or a table of Cn2 from the camera to the object.
+    `middle` (third), `object` (the last 30 %), or a table of Cn2 from the camera to the object,
+    joined linearly, as those of the names are (PROFILE_POINTS: `camera` ends at 0.108 L).
     Beyond `max_rytov_variance` scintillation, which is left out, is too strong.
     Raises ValueError for wrong ranges, NoCameraError where no camera is found.
     """

@@ -106,7 +106,7 @@ def test_mirrored_and_turned_videos_are_shown_as_their_file_says(tmp_path, matri
     assert np.array_equal(seen, shown(stored))
 
 
-def test_an_uneven_rate_is_made_even_by_the_time_stamps_and_said_once(tmp_path):
+def test_an_uneven_rate_is_made_even_by_the_time_stamps_and_said(tmp_path):
     gaps = np.where(np.arange(COUNT - 1) % 10 == 9, 0.12, 0.04)
     times = np.concatenate([[0], np.cumsum(gaps)])
     path = write_video(tmp_path / "phone.mp4", times)
@@ -118,9 +118,12 @@ def test_an_uneven_rate_is_made_even_by_the_time_stamps_and_said_once(tmp_path):
         and len(index.constant_rate_frames) == 46
     )
     assert numbers(index.read(11, 13, "video")) == nearest[11:13]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert videos.read_fps(path) == 25
+    for kind, times_said in (("always", 3), ("default", 1)):  # of Python's own: once a process
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter(kind)
+            assert videos.read_fps(path) == videos.read_fps(path, "recording") == 25
+            index_video(path, "video")
+        assert len(caught) == times_said
 
 
 def test_a_time_base_too_coarse_for_the_rate_is_no_uneven_rate(tmp_path):

@@ -6,11 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from src.sim.turbulence import Atmosphere
+from src.sim.optics import layout
+from src.sim.turbulence import Atmosphere, plane_waves
 from src.sim.turbulence.atmosphere import AR1_FPS
 from src.sim.turbulence.fidelity import choose_fidelity
 from src.sim.turbulence.operator import Turbulence
-from src.sim.turbulence.plane_waves import WaveDynamics
+from src.sim.turbulence.plane_waves import WaveDynamics, draw_plane_waves
 from src.sim.turbulence.prior import sample_atmosphere
 
 PATH = Atmosphere(0.05, 0.5, 1000.0, 2.0, 525e-9, 3e-14, 0.9)
@@ -107,3 +108,14 @@ def test_a_clip_of_mixed_records_the_temporal_model_that_it_has():
         assert not torch.equal(moves, own[model == "ar1"])
         seen.add(model)
     assert seen == {"ar1", "frozen_flow"}
+
+
+@pytest.mark.parametrize("model", ["ar1", "frozen_flow"])
+@pytest.mark.parametrize("views", ["independent", "baseline"])
+def test_views_drawn_one_after_the_other_are_those_drawn_together(model, views, monkeypatch):
+    dynamics = WaveDynamics(model, views_correlation=views)
+    waves = draw_plane_waves(PATH, 5, modes=2, waves=32, width_px=64)
+    given = PATH, waves, 7, layout(4), 37, 120.0
+    together = dynamics.draw_amplitudes(*given)
+    monkeypatch.setattr(plane_waves, "NUMBERS_AT_A_TIME", 1)
+    assert torch.equal(dynamics.draw_amplitudes(*given), together) and len(together) == 4
