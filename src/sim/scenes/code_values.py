@@ -53,7 +53,9 @@ def warn_of_transparency(path: Path) -> None:
     # The kind of colour: a palette, grey or colour with an opacity (PNG, 11.2.2).
     if header[:4] == b"\x89PNG" and header[25] in (3, 4, 6):
         picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if picture.shape[2:] == (4,) and picture[..., 3].min() < np.iinfo(picture.dtype).max:
+        if picture is None or picture.shape[2:] != (4,):
+            return
+        if picture[..., 3].min() < _largest_value(picture.dtype):
             way = "lay the picture on a ground of one colour"
             warnings.warn(f"{path}: transparent pixels show hidden colours; {way}", stacklevel=3)
 

@@ -214,7 +214,7 @@ def _find_one_video(path: Path) -> VideoSource:
 
 
 def _check_rate(fps: Any) -> None:
-    if not (isinstance(fps, Real) and 0.1 <= fps <= 1e6):
+    if not (isinstance(fps, int | float) and 0.1 <= fps <= 1e6):
         raise ValueError(f"fps must be in [0.1, 1e6] frames a second, got {fps}")
 
 

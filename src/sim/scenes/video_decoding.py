@@ -77,7 +77,7 @@ def convert_to_gray(frames: Iterable[Any], all_bits: bool = False) -> Iterator[G
     convert = VideoReformatter().reformat  # one for all frames keeps its tables
     for frame in frames:
         if all_bits and frame.format.name.startswith("gray") and frame.format.bits_per_pixel > 8:
-            gray = convert(frame, format="gray16le").to_ndarray()
+            gray: NDArray = convert(frame, format="gray16le").to_ndarray()
         else:
             bgr = convert(frame, format="bgr24", interpolation=Interpolation.BICUBIC)
             gray = cv2.cvtColor(bgr.to_ndarray(), cv2.COLOR_BGR2GRAY)

@@ -150,8 +150,8 @@ class WaveDynamics:
         fps: float,
         device: torch.device | str = "cpu",
     ) -> Complex[Tensor, "views frames waves"]:
-        """Return complex64 amplitudes, drawn on `device`; of long clips a few views at a time, which
-        takes less memory.
+        """Return complex64 amplitudes, drawn on `device`; of long clips a few views at a time, to
+        save memory.
 
         Every view counts from its own id, or all from 0 where they share the turbulence.
         """

@@ -182,9 +182,9 @@ def sample_matching_atmosphere(
             wind_m_s=way * diameter / time_s,
         ).with_d_over_r0(float(strength[i]))
     seen = ", ".join(f"{k}={v:.3g}" for k, v in vars(wanted).items() if v is not None)
-    way = "wider ones, as of allowed_aperture_px or max_rytov_variance, show more"
+    more = "wider ones, as of allowed_aperture_px or max_rytov_variance, show more"
     wanted_ranges = "ranges within which a camera shows"
-    raise NoCameraError(f"turbulence.atmosphere must be {wanted_ranges} {seen}; {way}")
+    raise NoCameraError(f"turbulence.atmosphere must be {wanted_ranges} {seen}; {more}")
 
 
 def unnormalised_cn2_profile(shape: Any) -> tuple[float, ...]:

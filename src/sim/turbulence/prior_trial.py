@@ -27,7 +27,7 @@ def check_that_cameras_show(settings: Mapping[str, Any]) -> None:
 
     `settings`: as of `sample_atmosphere`.  The draws are always the same ones.
     """
-    severity, least = settings.get("severity"), LEAST_SHARE * TRIALS
+    severity, least = str(settings.get("severity")), LEAST_SHARE * TRIALS
     drawn = tuple(SEVERITY_SHARES) if severity == "mixed" else (severity,)
     if not set(drawn) <= set(TILT_AND_BLUR_PX) or settings.get("global_tilt_probability") == 1:
         return  # no turbulence or a wrong word, or none but global tilt
