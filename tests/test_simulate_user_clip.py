@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from hydra.core.global_hydra import GlobalHydra
+from PIL import Image
 
 from src.app import user_clip_simulation
 from src.app.compose import compose_config
@@ -184,6 +185,12 @@ def test_a_seed_draws_anew_and_the_same_seed_the_same():
         ({"overrides": ["scene.height=8"]}, "scene.height must not be given with a video or photo"),
         ({"overrides": ["data.substeps=9"]}, "data.substeps must not be given with a video or ph"),
         ({"overrides": ["bins=2"]}, "bins must not be given with a video or photograph"),
+        (
+            {"overrides": ["user_clip_sensor.threshold=7"]},
+            r"^user_clip_sensor.threshold must .* 7$",
+        ),
+        ({"overrides": ["sensor.threshold=7"]}, r"^sensor.threshold must be in .* got 7$"),
+        ({"overrides": ["turbulence.tolerance=null"]}, r"turbulence.tolerance must be in \(0, 1\]"),
         ({"overrides": ["calm=1"]}, "calm is now loss.static_flicker.weight"),
         (
             {"turbulence": "measured", "overrides": ["turbulence.measured=air (1).yaml"]},
@@ -196,6 +203,37 @@ def test_a_wrong_argument_is_one_line_and_leaves_hydra_as_it_was(options, messag
     with pytest.raises(ValueError, match=message) as error:
         simulate_arrays(textured(2), fps=30, **options)
     assert "\n" not in str(error.value) and GlobalHydra.instance().hydra is before
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"overrides": ["sensor.dark_noise_hz=500"]}, "sensor.dark_noise_hz must be at most 120, "),
+        *(
+            (
+                {"sensor": "any_camera", "seed": seed, "overrides": ["least_simulated_fps=30"]},
+                "sensor.random.hot_pixel_hz must be at most 30, the frames a second that are",
+            )
+            for seed in range(3)
+        ),
+    ],
+)
+def test_more_noise_than_frames_is_refused_before_rendering(options, message, monkeypatch):
+    monkeypatch.setattr(UserClipSimulation, "simulate_parts", None)
+    with pytest.raises(ValueError, match=f"^{message}"):
+        simulate_arrays(textured(2), fps=30, **options)
+
+
+def test_pictures_are_known_by_what_they_hold(tmp_path):
+    cv2.imwrite(str(tmp_path / "cat.webp"), textured(1)[0])
+    Image.fromarray(textured(1)[0]).save(tmp_path / "one.gif")
+    for name in ("cat.webp", "one.gif"):
+        with pytest.warns(UserWarning, match="the clip gives no events"):
+            seen = simulate_arrays(tmp_path / name, "none", 1, seconds=np.float32(0.1))
+        assert seen.clean.shape == (13, 40, 56)
+    (tmp_path / "cat.txt").write_text("no picture")
+    with pytest.raises(ValueError, match="^video must be a video that FFmpeg can read"):
+        simulate_arrays(tmp_path / "cat.txt")
 
 
 def test_an_array_moves_as_a_photograph_does():

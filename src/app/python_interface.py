@@ -23,7 +23,7 @@ from src.app.user_clip_simulation import (
 from src.recordings.files.event_arrays import concatenate_events, sort_events
 from src.sim.optics import Position, view_id
 from src.sim.scenes import user_clip
-from src.sim.scenes.video_files import PICTURE_SUFFIXES
+from src.sim.scenes.video_files import is_photograph
 
 VIEW_EVENT = np.dtype(
     [("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8), ("view", np.uint16)]
@@ -48,9 +48,10 @@ class SimulatedClip:
     `positions`: (row, col) of each view from the centre view.
 
     `drawn`: what was drawn, among it `threshold` (contrast, nat), `simulated_fps` (frames a
-    second), `severity` (a word), `d_over_r0` (D/r0), `tilt_px` and `tilt_and_blur_px` (rms along
-    an axis, pixels of the clip), `tilt_correlation_half_length_px`, `tilt_correlation_time_s` (to
-    1/e); of turbulence=recorded or of a class of your own what it names.
+    second), `severity` (a word), `d_over_r0` (D/r0), `tilt_px`, `blur_px` (beyond diffraction) and
+    `tilt_and_blur_px` (rms along an axis, pixels of the clip), `tilt_correlation_half_length_px`,
+    `tilt_correlation_time_s` (to 1/e), `temporal_model` and its `wind_m_s` (rms, 0 of ar1); of
+    turbulence=recorded or of a class of your own what it names.
     """
 
     clean: Float[np.ndarray, "frames h w"]
@@ -101,9 +102,12 @@ def simulate(
     set_user_clip_sensor(cfg, overrides)
     options: dict[str, Any] = {"fps": fps, "seconds": seconds, "longest_side_px": longest_side_px}
     options |= {"start_s": start_s, "end_s": end_s}
+    options = {
+        key: one.item() if isinstance(one, np.generic) else one for key, one in options.items()
+    }
     if isinstance(photo_or_video, str | Path):
         path = Path(photo_or_video)
-        key = "photo" if path.suffix.lower() in PICTURE_SUFFIXES else "video"
+        key = "photo" if is_photograph(path) else "video"
         cfg.update(options | {key: str(path)})
         clip = read_user_clip(cfg)
     else:

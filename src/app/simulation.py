@@ -186,7 +186,7 @@ def _build_uncached_pipeline(
     given = {"split": split, "seed": seed, "frames": windows * substeps + 1}
     rates = _frame_rates(cfg, split)
     sensor = build_sensor(cfg, seed)
-    _check_drawn_noise_rates(sensor, min(rates) * substeps)
+    check_noise_rates(sensor, min(rates) * substeps)
     scenes = [build_part(cfg, "scene", fps=rate * substeps, **given) for rate in rates]
     return Pipeline(
         FrameRateMixture(scenes, split, seed) if len(scenes) > 1 else scenes[0],
@@ -205,13 +205,18 @@ def _build_uncached_pipeline(
     )
 
 
-def _check_drawn_noise_rates(sensor: Sensor, fps: float) -> None:
-    """Raise ValueError where `sensor.random` could draw more noise events a second than `fps`."""
+def check_noise_rates(sensor: Sensor, fps: float) -> None:
+    """Raise ValueError where `sensor`, or what is drawn out of its `random`, could have more noise
+    events a second and pixel than `fps`, the frames a second that are simulated.
+    """
+    limit = f"at most {fps:g}, the frames a second that are simulated"
     for name in NOISE_RATES:
-        most = max(sensor.random.get(name, (0,)))
-        if most > fps:
-            limit = f"{fps:g}, the frames a second that are simulated"
-            raise ValueError(f"sensor.random.{name} must be at most {limit}, got up to {most}")
+        drawn = sensor.random.get(name, (0,))
+        if max(drawn) > fps:
+            raise ValueError(f"sensor.random.{name} must be {limit}, got up to {max(drawn)}")
+        own = getattr(sensor, name, 0)
+        if own > fps and name not in sensor.random:
+            raise ValueError(f"sensor.{name} must be {limit}, got {own}")
 
 
 def decodes_srgb(cfg: DictConfig) -> bool:

@@ -4,7 +4,7 @@ import math
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,14 @@ from torch import Tensor
 
 from src.app.instantiate import build_part
 from src.app.renamed_keys import read_override_key
-from src.app.simulation import build_sensor, decodes_srgb
+from src.app.simulation import build_sensor, check_noise_rates, decodes_srgb
 from src.recordings.simulated_recording import Progress
 from src.sim import noise
 from src.sim.optics import Optics
 from src.sim.scenes import user_clip
 from src.sim.scenes.user_clip import UserClip
 from src.sim.sensor.response import decode_srgb, encode_srgb
+from src.sim.sensor.sensor import EventSensor
 from src.sim.turbulence.contract import ClipTurbulence
 from src.sim.turbulence.operator import Turbulence
 
@@ -58,7 +59,9 @@ class UserClipSimulation:
         self.substeps = max(1, math.ceil(round(least / clip.fps, 6)))
         self.optics: Optics = build_part(cfg, "optics")
         self.key = noise.key(cfg.seed, "own material", cfg.index)
-        self.sensor: Any = build_sensor(cfg, cfg.seed).draw(self.key)
+        sensor = build_sensor(cfg, cfg.seed)
+        check_noise_rates(sensor, self.simulated_fps)
+        self.sensor: Any = sensor.draw(self.key)
 
     @property
     def simulated_fps(self) -> float:
@@ -79,7 +82,11 @@ class UserClipSimulation:
     def drawn_parameters(self) -> dict[str, Any]:
         """Return what was drawn."""
         own = {"name": self.clip.name, "threshold": self.sensor.threshold}
-        return own | {"simulated_fps": self.simulated_fps} | dict(self.turbulence.metadata)
+        operator = self.turbulence
+        drawn = operator.metadata
+        if isinstance(operator, Turbulence):
+            drawn = operator.clip_metadata(noise.generator(noise.key(self.key, "turbulence")))
+        return own | {"simulated_fps": self.simulated_fps} | dict(drawn)
 
     def describe(self) -> str:
         """Return size, rate, frames, turbulence and threshold in one line."""
@@ -146,9 +153,7 @@ def describe_turbulence(drawn: Mapping[str, Any]) -> str:
     """Return how far turbulence moves and spreads a point of the clip, pixels, along one axis."""
     if not (tilt := drawn.get("tilt_px")):
         return ""
-    both = drawn.get("tilt_and_blur_px")
-    blur = math.sqrt(max(both**2 - tilt**2, 0.0)) if both else drawn.get("blur_px", 0.0)
-    return f": tilt {tilt:.2f} px, blur {blur:.2f} px rms"
+    return f": tilt {tilt:.2f} px, blur {drawn.get('blur_px', 0.0):.2f} px rms"
 
 
 def refuse_keys_of_scenes(overrides: Iterable[str]) -> None:
@@ -171,11 +176,21 @@ def set_user_clip_sensor(cfg: DictConfig, overrides: Iterable[str]) -> None:
             wanted[key] = cfg.sensor[key]
         else:
             cfg.sensor[key] = wanted[key]
+            _check_user_clip_sensor(key, wanted[key])
     fixed = {*wanted} | {name.removeprefix("sensor.") for name in given}
     with open_dict(cfg):
         for name in [*(cfg.sensor.get("random") or {})]:
             if name in fixed and f"sensor.random.{name}" not in given:
                 del cfg.sensor.random[name]
+
+
+def _check_user_clip_sensor(key: str, value: Any) -> None:
+    """Raise ValueError, which names `user_clip_sensor`, for a value that an EventSensor refuses."""
+    if key in {one.name for one in fields(EventSensor)}:
+        try:
+            EventSensor(**{key: value})
+        except ValueError as error:
+            raise ValueError(f"user_clip_{error}") from None
 
 
 def read_user_clip(cfg: DictConfig) -> UserClip:

@@ -12,6 +12,7 @@ import hashlib
 import math
 from typing import TypeVar
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -20,9 +21,12 @@ MASK = 0xFFFFFFFF
 T = TypeVar("T", int, Tensor)
 
 
-def key(*words: int | str) -> int:
-    """Return the 63-bit key of `words`; stable across processes, machines and Python versions."""
-    text = "\x1f".join(f"{type(word).__name__}:{word}" for word in words)
+def key(*words: int | np.integer | str) -> int:
+    """Return the 63-bit key of `words`, whole numbers of any type alike; stable across processes,
+    machines and Python versions.
+    """
+    plain = (int(word) if isinstance(word, np.integer) else word for word in words)
+    text = "\x1f".join(f"{type(word).__name__}:{word}" for word in plain)
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "big") >> 1
 
 

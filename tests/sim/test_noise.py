@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import torch
 
 from src.sim import noise
@@ -9,6 +10,7 @@ from src.sim import noise
 
 def test_key_is_stable_and_tells_words_apart():
     assert noise.key(0, "train", 3) == noise.key(0, "train", 3)
+    assert noise.key(0, "train", np.int64(3)) == noise.key(np.uint16(0), "train", 3)
     keys = {noise.key(0, "a", 1), noise.key(0, "a", "1"), noise.key(0, "a1"), noise.key("a", 0, 1)}
     assert len(keys) == 4
 

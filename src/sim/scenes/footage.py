@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from src.sim.scenes.clip import Clip, SceneBase
+from src.sim.scenes.code_values import ALL_BITS, scale_to_white, warn_of_darkness
 from src.sim.scenes.video_files import VideoSource, find_videos
 
 SHARES = {"train": (0.0, 0.7), "val": (0.7, 0.8), "test": (0.8, 1.0)}
@@ -38,6 +39,7 @@ class Footage(SceneBase):
     """A video file, a folder of frames, or a folder of either, at `root`.
 
     `footage_fps`: frames per second that the footage is taken for, whatever the file says.
+    `white_level`: value of a frame's file that is white (None: the largest its kind holds).
     `disjoint_splits`: train, val and test get 70, 10 and 20 % of it, by whole videos from ten
     videos on, else by time; otherwise all share everything.  Raises ValueError where `root` is
     missing, holds no footage, cannot be read or is too short for a clip.
@@ -46,6 +48,7 @@ class Footage(SceneBase):
     root: str | None = field(default=None, kw_only=False)
     footage_fps: float = 120.0
     disjoint_splits: bool = True
+    white_level: float | None = None
     min_footage_px_per_px: ClassVar[float] = 1.0
 
     def __post_init__(self) -> None:
@@ -62,7 +65,11 @@ class Footage(SceneBase):
         """Return segment `index` modulo their number; ValueError for frames that do not do."""
         source, start = self.segments[index % len(self.segments)]
         last = math.ceil(self.times[-1])
-        seen = np.stack([self._fit(p) for p in source.read(start, start + last + 1)])
+        pictures = list(source.read(start, start + last + 1, ALL_BITS))
+        seen = np.stack([self._fit(picture) for picture in pictures])
+        largest = max(float(picture.max()) for picture in pictures)
+        key = "scene.white_level"
+        warn_of_darkness(source.name, pictures[0].dtype, largest, self.white_level, key)
         before = np.floor(self.times).astype(int)
         share = (self.times - before).astype(np.float32)[:, None, None]
         frames = seen[before] + share * (seen[np.minimum(before + 1, last)] - seen[before])
@@ -103,7 +110,8 @@ class Footage(SceneBase):
             raise ValueError(f"scene.root must show {sides}, got {wide}x{tall}")
         rows, columns = round(height * scale), round(width * scale)
         top, left = (tall - rows) // 2, (wide - columns) // 2
-        middle = picture[top : top + rows, left : left + columns].astype(np.float32) / 255
+        middle = picture[top : top + rows, left : left + columns]
+        middle = scale_to_white(middle, self.white_level, "scene.white_level")
         kind = cv2.INTER_AREA if scale >= 1 else cv2.INTER_CUBIC
         return np.clip(cv2.resize(middle, (width, height), interpolation=kind), 0, 1)
 
@@ -119,6 +127,7 @@ class Reds(Footage):
 
     footage_fps: float = field(default=REDS_FPS, init=False)
     disjoint_splits: bool = field(default=True, init=False)
+    white_level: float | None = field(default=None, init=False)
     min_footage_px_per_px: ClassVar[float] = 0.5
 
     def _find_segments(self, root: Path, span: int) -> list[Segment]:

@@ -6,8 +6,10 @@ is brightest twice a period: at 100 Hz where the mains have 50 Hz, at 120 Hz whe
 """
 
 import math
+import re
 from bisect import bisect
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from itertools import accumulate
 from typing import Any
@@ -21,6 +23,7 @@ from torch import Tensor
 from src.sim import noise
 from src.sim.checks import is_range
 from src.sim.scenes.clip import SPLITS, Clip, SceneBase
+from src.sim.scenes.footage import Footage
 from src.sim.scenes.photo_files import Root
 
 MAINS_HZ = (50.0, 60.0)
@@ -54,7 +57,7 @@ class Mixture(SceneBase):
         if not (is_range(depths) and depths[0] >= 0 and depths[1] < 1):
             allowed = "a range 0 <= low <= high < 1"
             raise ValueError(f"scene.flicker_modulation_depth must be {allowed}, got {depths}")
-        served = []
+        served = {}
         for name, part in self.parts.items():
             share, splits = part["share"], part.get("splits") or SPLITS
             if not (isinstance(share, int | float) and 0 <= share < math.inf):
@@ -62,12 +65,16 @@ class Mixture(SceneBase):
             if not set(splits) <= set(SPLITS):
                 key, allowed = f"scene.parts.{name}.splits", ", ".join(SPLITS)
                 raise ValueError(f"{key} must be some of {allowed}, got {splits}")
-            served += [part] if share > 0 and self.split in splits else []
+            if share > 0 and self.split in splits:
+                served[name] = part
         if not served:
             raise ValueError(f"scene.parts must have a share > 0 for split={self.split}, got none")
         shared = {one.name: getattr(self, one.name) for one in fields(SceneBase)}
-        self.scenes = [part["scene"](**shared) for part in served]
-        self.cumulative_shares = list(accumulate(part["share"] for part in served))
+        self.names, self.scenes = list(served), []
+        for name, part in served.items():
+            with self._named_part(name):
+                self.scenes.append(part["scene"](**shared))
+        self.cumulative_shares = list(accumulate(part["share"] for part in served.values()))
         self.key = noise.key(self.seed, self.split, "mixture")
 
     def clip(self, index: int) -> Clip:
@@ -75,13 +82,29 @@ class Mixture(SceneBase):
         place = bisect(self.cumulative_shares, draw * self.cumulative_shares[-1])
         if self.in_turn and self.split != "train":
             place = index % len(self.scenes)
-        clip = self.scenes[place].clip(index)
+        with self._named_part(self.names[place]):
+            clip = self.scenes[place].clip(index)
         rng = np.random.default_rng(noise.key(self.key, "flicker", index))
         if clip.fps < LEAST_FPS or rng.uniform() >= self.flicker_share:
             return clip
         times_s = np.arange(len(clip.frames)) / clip.fps
         size, depth = tuple(clip.frames.shape[1:]), self.flicker_modulation_depth
         return replace(clip, illumination=draw_flicker(rng, times_s, size, depth))
+
+    @contextmanager
+    def _named_part(self, name: str) -> Iterator[None]:
+        """Name, in a ValueError of a part, the key that was given."""
+        try:
+            yield
+        except ValueError as error:
+            scene = self.parts[name]["scene"]
+            message, own = str(error), getattr(scene, "keywords", {})
+            _, *keys = re.split(r"^scene\.(\w+)", message, maxsplit=1)
+            if getattr(scene, "func", scene) is Footage and keys[:1] == ["root"]:
+                message = f"scene.video_root{keys[1]}"
+            elif keys and keys[0] in own.keys() - vars(self).keys():
+                message = f"scene.parts.{name}.{message}"
+            raise ValueError(message) from error
 
 
 def draw_flicker(

@@ -189,7 +189,8 @@ class Targets(SceneBase):
             raise ValueError(f"scene.kinds must be some of {', '.join(TARGETS)}, got {unknown}")
         self.canvas = Canvas(self.size)
         for kind in self.kinds:
-            check_arguments(kind, self.options.get(kind, {}), self.canvas)
+            given = self.options.get(kind, {})
+            check_arguments(kind, given, self.canvas, f"scene.options.{kind}")
 
     def clip(self, index: int) -> Clip:
         turn, place = divmod(index, len(self.kinds))
@@ -203,12 +204,14 @@ class Targets(SceneBase):
         return Clip(torch.from_numpy(frames), self.fps, f"{name}-{turn}", path_px)
 
 
-def check_arguments(kind: str, arguments: Mapping[str, Any], canvas: Canvas) -> None:
-    """Raise ValueError for an argument that a kind has not, or that is out of its range."""
+def check_arguments(kind: str, arguments: Mapping[str, Any], canvas: Canvas, key: str) -> None:
+    """Raise ValueError, which names `key` of the config, for an argument that a kind has not, or
+    that is out of its range in frames of this size.
+    """
     parameters = signature(TARGETS[kind]).parameters.items()
     own = {name: one.default for name, one in parameters if one.kind is Parameter.KEYWORD_ONLY}
     if not arguments.keys() <= own.keys():
-        raise ValueError(f"{kind} takes {', '.join(own)}, got {', '.join(arguments)}")
+        raise ValueError(f"{key} must hold {', '.join(own)}, got {', '.join(arguments)}")
     own |= arguments
     px = 1 / canvas.side
     limits = {
@@ -229,8 +232,12 @@ def check_arguments(kind: str, arguments: Mapping[str, Any], canvas: Canvas) -> 
         "speed_widths_per_s": (0.0, FASTEST / canvas.width),
         "turns_per_s": (-FASTEST, FASTEST),
     }
+    frame = f"in frames of {canvas.width}x{canvas.height} px (scene.width, scene.height)"
     for name, value in own.items():
-        check_in_range(f"scene.{name}", value, *limits[name])
+        try:
+            check_in_range(f"{key}.{name}", value, *limits[name])
+        except ValueError as error:
+            raise ValueError(f"{error}, {frame}") from None
 
 
 def edge_coverage(depth: Map) -> Map:

@@ -50,7 +50,8 @@ class TargetsOnPhotographs(PhotographScene):
                     allowed = "a number or [low, high]"
                     raise ValueError(f"scene.kinds.{kind}.{name} must be {allowed}, got {value}")
             for ends in product(*ranges.values()):
-                check_arguments(kind, dict(zip(ranges, ends, strict=True)), self.canvas)
+                one = dict(zip(ranges, ends, strict=True))
+                check_arguments(kind, one, self.canvas, f"scene.kinds.{kind}")
 
     def clip(self, index: int) -> Clip:
         rng = np.random.default_rng(noise.key(self.seed, self.split, "on photographs", index))

@@ -4,8 +4,8 @@ Grey values are luminance code values.  Pictures are only shrunk, with an area f
 """
 
 import math
-import warnings
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,13 @@ from torch import Tensor
 
 from src.sim import noise
 from src.sim.checks import check_in_range
+from src.sim.scenes.code_values import (
+    ALL_BITS,
+    check_float_values,
+    scale_to_white,
+    warn_of_darkness,
+    warn_of_transparency,
+)
 from src.sim.scenes.moving_layers import (
     FASTEST_WIDTHS_PER_S,
     MovingLayer,
@@ -29,8 +36,6 @@ from src.sim.scenes.video_files import VideoSource, find_videos, read_picture
 LARGEST_SIDE_PX = 512  # of the frames, where nothing else is asked for
 LEAST_SIDE_PX = 16
 PHOTO_FPS, PHOTO_S = 120.0, 1.0  # where nothing else is asked for
-ALL_BITS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
-DARK_SHARE = 1 / 8  # of full scale: a picture below this has data of fewer bits than its file
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +81,6 @@ def read_video(
     than two frames there.
     """
     source = _find_one_video(Path(path))
-    if white_level is not None and source.index:
-        raise ValueError(f"white_level must be null for a video file, 8 bits, got {white_level}")
     rate = source.index.fps if fps is None and source.index else fps
     if rate is None:
         raise ValueError(f"fps must be given, frames a second, for {path}, which states none")
@@ -86,17 +89,23 @@ def read_video(
     frames, shape, largest, kind = [], (0, 0), 0.0, np.dtype(np.uint8)
     for picture in source.read(first, stop, ALL_BITS):
         shape, kind, largest = picture.shape, picture.dtype, max(largest, float(picture.max()))
+        if white_level is not None and source.index and kind == np.uint8:
+            wanted = "white_level must be null for a video file of 8 bits or of colour"
+            raise ValueError(f"{wanted}, got {white_level}")
         values = scale_to_white(picture, white_level)
         frames.append(_shrink(values, longest_side_px).astype(np.float16))
-    _warn_of_darkness(path, kind, largest, white_level)
+    warn_of_darkness(path, kind, largest, white_level)
+    if source.frames:
+        warn_of_transparency(source.frames[first])
     part = "all" if stop - first == source.count else f"frames {first} to {stop - 1}"
     facts = f"{shape[1]}x{shape[0]} px, {rate:.6g} frames/s, {part} of {source.count} frames"
     return UserClip(source.name, np.stack(frames), rate, facts)
 
 
-def _find_part(count: int, fps: float, start_s: float, end_s: float, name: str) -> tuple[int, int]:
+def _find_part(count: int, fps: float, start_s: Any, end_s: Any, name: str) -> tuple[int, int]:
     """Return the first frame from `start_s` on, and the first from `end_s` on, of `count`."""
-    if not 0 <= start_s < end_s:
+    are_numbers = isinstance(start_s, Real) and isinstance(end_s, Real)
+    if not (are_numbers and 0 <= start_s < end_s):
         raise ValueError(f"start_s must be >= 0 and below end_s, got {start_s} and {end_s}")
     first = math.ceil(round(start_s * fps, 6))
     stop = count if end_s == math.inf else min(count, math.ceil(round(end_s * fps, 6)))
@@ -129,7 +138,8 @@ def read_photograph(
     speed_widths_per_s: float = 0.0, seed: int = 0,
 ) -> UserClip:  # fmt: skip
     """Return a photograph for `seconds` (None: 1) at `fps` (None: 120): at rest, or in a smooth
-    motion, drawn from `seed`, of `speed_widths_per_s` frame widths a second (`SimilarityMotion`).
+    motion, drawn from `seed`: its middle moves by 0.67 of `speed_widths_per_s`, frame widths a
+    second, in the mean, and it turns and zooms whatever the speed (`SimilarityMotion`).
     `white_level` as in `read_video`.
 
     Raises ValueError for what is no picture and for values outside their range.
@@ -137,11 +147,13 @@ def read_photograph(
     picture = read_picture(Path(path), ALL_BITS) if Path(path).is_file() else None
     if picture is None:
         raise ValueError(f"photo must be a picture that can be read (a film: video=), got {path}")
+    check_float_values(picture, "photo", path)
+    warn_of_transparency(Path(path))
     facts = f"photograph of {picture.shape[1]}x{picture.shape[0]} px"
     values = _shrink(scale_to_white(picture, white_level), longest_side_px)
     fps = PHOTO_FPS if fps is None else fps
     frames = _hold_or_move(values, fps, seconds, speed_widths_per_s, seed)
-    _warn_of_darkness(path, picture.dtype, float(picture.max()), white_level)
+    warn_of_darkness(path, picture.dtype, float(picture.max()), white_level)
     return UserClip(Path(path).stem, frames, fps, facts)
 
 
@@ -165,7 +177,10 @@ def clip_from_array(
     if array.dtype != np.uint8 and not (
         array.dtype.kind == "f" and array.size and 0 <= array.min() <= array.max() <= 1
     ):
-        raise ValueError("photo_or_video must be uint8 or floats in [0, 1]")
+        got = str(array.dtype)
+        if array.dtype.kind == "f" and array.size:
+            got = f"{got} from {array.min():g} to {array.max():g}"
+        raise ValueError(f"photo_or_video must be uint8 or floats in [0, 1], got {got}")
     facts = "x".join(map(str, array.shape[:-3:-1])) + " px"
     array = scale_to_white(array, white_level)
     if array.ndim == 2:
@@ -193,11 +208,13 @@ def _find_one_video(path: Path) -> VideoSource:
         raise ValueError(f"{error}{'; a photograph is photo=' * is_picture}") from None
     if len(videos) != 1:
         raise ValueError(f"video must be one video or one folder of frames, got {path}")
+    if videos[0].count < 2:  # a folder: files are looked at before
+        raise ValueError(f"video must be a folder of two frames or more, got one in {path}")
     return videos[0]
 
 
-def _check_rate(fps: float) -> None:
-    if not 0.1 <= fps <= 1e6:
+def _check_rate(fps: Any) -> None:
+    if not (isinstance(fps, int | float) and 0.1 <= fps <= 1e6):
         raise ValueError(f"fps must be in [0.1, 1e6] frames a second, got {fps}")
 
 
@@ -213,34 +230,6 @@ def _hold_or_move(
     if speed:
         return _move(picture, count, fps, speed, seed)
     return np.broadcast_to(picture, (count, *picture.shape))
-
-
-def scale_to_white(
-    values: NDArray, white_level: float | None = None
-) -> Float[np.ndarray, "*shape"]:
-    """Return values of a file as float32 in [0, 1]: 1 is `white_level`, or the largest value of
-    their type, 1 of floats.  Raises ValueError for a `white_level` that is not in (0, that].
-    """
-    full = _largest_value(values.dtype)
-    white = full if white_level is None else white_level
-    if not (isinstance(white, int | float) and 0 < white <= full):
-        raise ValueError(f"white_level must be in (0, {full:g}] or null, got {white_level}")
-    return np.clip(values.astype(np.float32) / white, 0, 1)
-
-
-def _largest_value(kind: np.dtype) -> float:
-    return float(np.iinfo(kind).max) if kind.kind in "iu" else 1.0
-
-
-def _warn_of_darkness(
-    path: Path | str, kind: np.dtype, largest: float, white_level: float | None
-) -> None:
-    """Warn of values of more than 8 bits that are nearly black, as those of 12 bits are in 16."""
-    full = _largest_value(kind)
-    if white_level is None and kind.itemsize > 1 and 0 < largest < DARK_SHARE * full:
-        white = 2 ** int(largest).bit_length() - 1  # the least number of bits that holds it
-        way = f"; white_level={white} makes {white} white" if full > 1 else ""
-        warnings.warn(f"{path}: its largest value is {largest:g} of {full:g}{way}", stacklevel=3)
 
 
 def _shrink(values: Float[np.ndarray, "h w"], longest_side_px: int | None) -> NDArray:

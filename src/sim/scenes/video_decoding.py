@@ -10,14 +10,11 @@ import av
 import cv2
 import numpy as np
 from av.video.reformatter import Interpolation, VideoReformatter
-from jaxtyping import UInt8
+from jaxtyping import UInt
+from numpy.typing import NDArray
 
 LARGEST_PIXELS = int(os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"])  # src/__init__.py sets 2^27
-TURNS = {
-    90: cv2.ROTATE_90_COUNTERCLOCKWISE, -90: cv2.ROTATE_90_CLOCKWISE,
-    180: cv2.ROTATE_180, -180: cv2.ROTATE_180,
-}  # fmt: skip
-Gray = UInt8[np.ndarray, "h w"]
+Gray = UInt[np.ndarray, "h w"]  # uint8, or uint16 where that is asked for
 
 
 class DamagedVideo(Exception):
@@ -73,11 +70,28 @@ def _decode_packet(packet: Any) -> tuple[list, str]:
         return [], str(error.strerror)
 
 
-def convert_to_gray(frames: Iterable[Any]) -> Iterator[Gray]:
-    """Yield grey pictures, uint8 (h, w), upright, as OpenCV does: by way of BGR."""
-    to_bgr = VideoReformatter().reformat  # one for all frames keeps its tables
+def convert_to_gray(frames: Iterable[Any], all_bits: bool = False) -> Iterator[Gray]:
+    """Yield grey pictures, uint8 (h, w), upright, as OpenCV makes them: by way of BGR; with
+    `all_bits` those of grey frames of more than 8 bits as uint16, full scale 65535.
+    """
+    convert = VideoReformatter().reformat  # one for all frames keeps its tables
     for frame in frames:
-        bgr = to_bgr(frame, format="bgr24", interpolation=Interpolation.BICUBIC)
-        gray = cv2.cvtColor(bgr.to_ndarray(), cv2.COLOR_BGR2GRAY)
-        turn = TURNS.get(round(frame.rotation))
-        yield gray if turn is None else cv2.rotate(gray, turn)
+        if all_bits and frame.format.name.startswith("gray") and frame.format.bits_per_pixel > 8:
+            gray: NDArray = convert(frame, format="gray16le").to_ndarray()
+        else:
+            bgr = convert(frame, format="bgr24", interpolation=Interpolation.BICUBIC)
+            gray = cv2.cvtColor(bgr.to_ndarray(), cv2.COLOR_BGR2GRAY)
+        yield _turn_upright(gray, frame.side_data.get("DISPLAYMATRIX"), frame.rotation)
+
+
+def _turn_upright(picture: NDArray, display_matrix: Any, rotation: float) -> NDArray:
+    """Return a picture as the display matrix of its file says, turned by right angles or mirrored;
+    as it is stored without one and at other angles.
+    """
+    if display_matrix is None or round(rotation) % 90:
+        return picture
+    # ISO 14496-12: x is shown at (a x, b x), y at (c y, d y).
+    (a, b, _), (c, d, _), _ = np.frombuffer(display_matrix, np.int32).reshape(3, 3).tolist()
+    if abs(b) > abs(a):
+        picture, a, d = picture.T, c, b
+    return np.ascontiguousarray(picture[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])

@@ -1,4 +1,4 @@
-"""Pictures and videos: a video file, a folder of frames, or a folder of these; grey, 8 bits."""
+"""Pictures and videos: a video file, a folder of frames, or a folder of these; grey."""
 
 import re
 from collections.abc import Iterable, Iterator
@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Shaped
 from numpy.typing import NDArray
+
+from src.sim.scenes.code_values import ALL_BITS, check_float_values
 
 if TYPE_CHECKING:
     from src.sim.scenes.video_index import VideoIndex
@@ -39,13 +41,14 @@ class VideoSource:
     def read(
         self, first: int, stop: int, flags: int = cv2.IMREAD_GRAYSCALE
     ) -> Iterator[Shaped[np.ndarray, "h w"]]:
-        """Yield frames first .. stop - 1, of 8 bits; pictures as `flags` of OpenCV say.
+        """Yield frames first .. stop - 1, of 8 bits, or as many as they have (ALL_BITS).
 
-        Raises ValueError for one that cannot be read or is of another size.
+        Raises ValueError for one that cannot be read, is of another size or kind than the first,
+        or has floats outside [0, 1].
         """
         if self.index is not None:
-            yield from self.index.read(first, stop, self.config_key)
-        size = self.size
+            yield from self.index.read(first, stop, self.config_key, flags == ALL_BITS)
+        size, kind = self.size, None
         for path in self.frames[first:stop]:
             picture = read_picture(path, flags)
             if picture is None:
@@ -57,6 +60,11 @@ class VideoSource:
                     f"{self.config_key} must hold frames of {wanted}, "
                     f"got {width}x{height} in {path}"
                 )
+            kind = kind or picture.dtype
+            if picture.dtype != kind:
+                wanted = f"{self.config_key} must hold frames of one kind"
+                raise ValueError(f"{wanted}, got {kind} and {picture.dtype} in {path}")
+            check_float_values(picture, self.config_key, path)
             yield picture
 
 
@@ -108,6 +116,17 @@ def _file_source(path: Path, config_key: str) -> VideoSource:
             f"{config_key} must be a video of two frames or more, got {count} in {path}"
         )
     return VideoSource(path.stem, count, config_key, index=index)
+
+
+def is_photograph(path: Path) -> bool:
+    """Return whether a path is a picture: by its name, or a file that is no video by its name, or
+    a GIF of one frame, and that OpenCV reads.
+    """
+    suffix = path.suffix.lower()
+    if suffix in PICTURE_SUFFIXES | VIDEO_SUFFIXES - {".gif"} or not path.is_file():
+        return suffix in PICTURE_SUFFIXES
+    is_picture = read_picture(path) is not None
+    return is_picture and (suffix != ".gif" or cv2.imcount(str(path)) == 1)
 
 
 def read_picture(source: Path | bytes, flags: int = cv2.IMREAD_GRAYSCALE) -> NDArray | None:

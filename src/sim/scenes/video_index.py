@@ -2,7 +2,7 @@
 
 Headers are not believed: edit lists hide frames, browsers write no duration, phones vary the rate.
 A file is decoded once for its index, which stays in memory; then any frame is reached from the key
-frame before it.  Grey values are those of OpenCV's own reader.
+frame before it.  Grey values of 8 bits are those of OpenCV's own reader.
 """
 
 import warnings
@@ -40,7 +40,8 @@ class VideoIndex:
 
     `times_ticks`: of its whole frames, in ticks of the file, none where it has no usable ones;
     `keyframes`: their numbers.  `constant_rate_frames`: the number of the whole frame that each
-    frame of the video at the constant rate `fps` (None: unknown) shows.
+    frame of the video at the constant rate `fps` (None: unknown) shows.  `notes`: what is warned of
+    whenever the file is opened.
     """
 
     path: Path
@@ -48,22 +49,26 @@ class VideoIndex:
     keyframes: Int[np.ndarray, " keys"]
     constant_rate_frames: Int[np.ndarray, " count"]
     fps: float | None
+    notes: tuple[str, ...] = ()
 
-    def read(self, first: int, stop: int, config_key: str) -> Iterator[Gray]:
-        """Yield frames first .. stop - 1; raises ValueError, which names `config_key`, for a
+    def read(
+        self, first: int, stop: int, config_key: str, all_bits: bool = False
+    ) -> Iterator[Gray]:
+        """Yield frames first .. stop - 1, uint8, with `all_bits` uint16 where grey ones have more
+        bits; raises ValueError, which names `config_key`, for a
         file that is another one by now.
         """
         wanted = self.constant_rate_frames[first:stop]
         if not len(wanted):
             return
-        frames = self._read_whole(int(wanted[0]), config_key)
+        frames = self._read_whole(int(wanted[0]), config_key, all_bits)
         number, frame = int(wanted[0]), next(frames)
         for target in wanted:
             while number < target:
                 number, frame = number + 1, next(frames)
             yield frame
 
-    def _read_whole(self, first: int, config_key: str) -> Iterator[Gray]:
+    def _read_whole(self, first: int, config_key: str, all_bits: bool) -> Iterator[Gray]:
         """Yield the whole frames from `first` on, by way of the key frame before it."""
         before = self.keyframes[self.keyframes <= first].tolist() if len(self.times_ticks) else []
         for start in dict.fromkeys([*before[-1:], 0]):
@@ -71,7 +76,7 @@ class VideoIndex:
                 frames = self._enter(container, stream, start, first)
                 if frames is not None:
                     with suppress(DamagedVideo):
-                        yield from convert_to_gray(frames)
+                        yield from convert_to_gray(frames, all_bits)
                     break
         raise ValueError(f"{config_key} must not change while it is read, got {self.path}")
 
@@ -105,7 +110,10 @@ def index_video(path: Path, config_key: str, max_frames: int | None = None) -> V
         state = path.stat()
     except OSError as error:
         raise ValueError(f"{config_key} must be a video that exists, got {path}") from error
-    return _index(path, config_key, max_frames, state.st_mtime_ns, state.st_size)
+    index = _index(path, config_key, max_frames, state.st_mtime_ns, state.st_size)
+    for note in index.notes:
+        warnings.warn(note, stacklevel=1)  # one place, so that Python tells it once a process
+    return index
 
 
 @lru_cache(maxsize=4096)
@@ -127,13 +135,13 @@ def _index(path: Path, config_key: str, max_frames: int | None, *version: int) -
             f"{config_key} must show at most {MOST_FRAMES} frames, got more by the time stamps of "
             f"{path}"
         )
+    notes = []
     if fault:
-        message = f"{path} is cut or damaged ({fault}): its first {count} frames are read"
-        warnings.warn(message, stacklevel=3)
+        notes += [f"{path} is cut or damaged ({fault}): its first {count} frames are read"]
     if uneven:
-        message = f"{path} has a variable frame rate: its {count} frames are brought to "
-        warnings.warn(f"{message}{fps:.6g} frames/s by their time stamps", stacklevel=3)
-    return VideoIndex(path, ticks, np.array(keys, np.int64), shown, fps)
+        note = f"{path} has a variable frame rate: its {count} frames are brought to "
+        notes += [f"{note}{fps:.6g} frames/s by their time stamps"]
+    return VideoIndex(path, ticks, np.array(keys, np.int64), shown, fps, tuple(notes))
 
 
 def _list_frames(

@@ -118,7 +118,8 @@ def _reference_range(sensor: Any) -> tuple[float, float]:
 
     With leak they lie anywhere on the way to the next ON event, so that these come from the first
     moment on, and not all at once: at their rate, with an initial error e at 1 / (1 + e) of it
-    until the drift has passed a threshold.
+    until the drift has passed a threshold.  From then on, while the light rests, an error between 0
+    and 1 leaves 2 / (1 + e) of the rate for a share e of the way to each event, else 1 / (1 + e).
     """
     error = sensor.initial_reference_error
     return (error / (1 + error), 1 + error) if sensor.leak_event_hz else (0.5, 2 * error)
@@ -147,7 +148,8 @@ def threshold_range(threshold: Any) -> tuple[float, float]:
     """Return (low, high) of `sensor.threshold`, a number or a range."""
     is_number = isinstance(threshold, int | float)
     if not (is_number or is_range(threshold)):
-        raise ValueError(f"sensor.threshold must be a number or [low, high], got {threshold}")
+        allowed = "a number or [low, high], low <= high"
+        raise ValueError(f"sensor.threshold must be {allowed}, got {threshold}")
     ends = [threshold, threshold] if is_number else threshold
     for end in ends:
         check_in_range("sensor.threshold", end, *RANDOM_RANGES["threshold"])
@@ -169,7 +171,7 @@ def check_settings(settings: Mapping[str, Any]) -> None:
             names = ", ".join(RANDOM_RANGES)
             raise ValueError(f"sensor.random must hold ranges of {names}, got {name}")
         if not is_range(ends):
-            raise ValueError(f"sensor.random.{name} must be [low, high], got {ends}")
+            raise ValueError(f"sensor.random.{name} must be [low, high], low <= high, got {ends}")
         for end in ends:
             check_in_range(f"sensor.random.{name}", end, *RANDOM_RANGES[name])
 

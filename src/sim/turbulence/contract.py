@@ -22,7 +22,7 @@ class ClipTurbulence(Protocol):
     """The turbulence of one clip, between its clean frames and the views of a light field.
 
     All randomness comes from the generator: the same state gives the same result, on any device.  A
-    view depends on its own position only, and a crop is that part of the whole.
+    view depends on its own position only, and a crop is that part of the whole, to rounding.
     """
 
     @property

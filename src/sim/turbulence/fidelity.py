@@ -18,8 +18,8 @@ from jaxtyping import Float
 from safetensors import safe_open
 from torch import Tensor
 
-from src.sim.turbulence import p2s, short_exposure
-from src.sim.turbulence.atmosphere import AR1_FPS, TILT_VARIANCE, Atmosphere
+from src.sim.turbulence import p2s
+from src.sim.turbulence.atmosphere import TILT_VARIANCE, Atmosphere
 from src.sim.turbulence.psf import SAMPLES_PER_LAMBDA_OVER_D
 from src.sim.turbulence.unresolved_blur import StructureFunction, blur_by_phase
 from src.sim.turbulence.zernike import noll_index
@@ -43,12 +43,13 @@ NS_TAP, NS_BETWEEN = 0.15, 0.2  # a pixel of a PSF at work, on a row of nodes an
 class Fidelity:
     """One atmosphere in pixels, and how it is simulated; names as in Atmosphere mean the same.
 
-    `tilt_correlation_time_s`: to 1 / e, of the AR(1) model; `aperture_px`: D at the object;
-    `tilt_px`: standard deviation along one axis; `blur_px`: the radius that holds half of the light
-    of a point, tilt removed.  `zernike_modes` from tilt on; `psf_network`: the one that turns them
-    into weights of `psf_rank` basis functions; `*_grid_pitch_px`: pixels between the nodes of the
-    phase.  `error_psf` (modes left out, network and basis), `error_grid`, `error_kernel`: shares of
-    the random power; `error`: the rms error they make together, of an image's contrast.
+    `temporal_model`, `wind_m_s`, `tilt_correlation_time_s`: see WaveDynamics.describe;
+    `aperture_px`: D at the object; `tilt_px`: standard deviation along one axis; `blur_px`: blur
+    beyond diffraction (Atmosphere.blur_px).  `zernike_modes` from tilt on; `psf_network`: the one
+    that turns them into weights of `psf_rank` basis functions; `*_grid_pitch_px`: pixels between
+    the nodes of the phase.  `error_psf` (modes left out, network and basis), `error_grid`,
+    `error_kernel`: shares of the random power; `error`: the rms error they make together, of an
+    image's contrast.
     """
 
     d_over_r0: float = 0.0
@@ -56,6 +57,8 @@ class Fidelity:
     severity: str = "none"
     rytov_variance: float = 0.0
     ar1_coefficient: float = 1.0
+    temporal_model: str = "none"
+    wind_m_s: float = 0.0
     tilt_correlation_time_s: float = math.inf
     tilt_and_blur_px: float = 0.0
     tilt_correlation_half_length_px: float = math.inf
@@ -89,33 +92,26 @@ def choose_fidelity(atmosphere: Atmosphere, width_px: int, max_error_share: floa
     pixel = atmosphere.pixel_size_at_object_m(width_px) / atmosphere.aperture_m
     patch = pixel / _isoplanatic_patch_ratio(atmosphere)
     psf = choose_psf_settings(p2s.find_psf_band(strength), strength, unit, patch, allowed)
-    tilt_px, ar1 = atmosphere.tilt_std_px(width_px), atmosphere.ar1_coefficient
+    tilt_px = atmosphere.tilt_std_px(width_px)
     tilt_pitch, error_tilt = _tilt_pitch(patch, tilt_px, unit, atmosphere.d_over_r0)
     return Fidelity(
         d_over_r0=atmosphere.d_over_r0,
         blur_equivalent_d_over_r0=strength,
         severity=atmosphere.severity,
         rytov_variance=atmosphere.rytov_variance,
-        ar1_coefficient=ar1,
-        tilt_correlation_time_s=_ar1_correlation_time_s(ar1),
+        ar1_coefficient=atmosphere.ar1_coefficient,
         tilt_and_blur_px=atmosphere.tilt_and_blur_px(width_px),
         tilt_correlation_half_length_px=atmosphere.tilt_correlation_half_length_px(width_px),
         aperture_px=atmosphere.aperture_m / atmosphere.pixel_size_at_object_m(width_px),
         aperture_over_outer_scale=atmosphere.aperture_over_outer_scale,
         tilt_px=tilt_px,
         lambda_over_d_px=unit,
-        blur_px=unit * float(short_exposure.half_light_radius(strength)),
+        blur_px=atmosphere.blur_px(width_px),
         tilt_grid_pitch_px=tilt_pitch,
         error_tilt_px=error_tilt,
         error=math.sqrt(power * (psf["error_psf"] + psf["error_grid"] + psf["error_kernel"])),
         **psf,
     )
-
-
-def _ar1_correlation_time_s(coefficient: float) -> float:
-    if coefficient >= 1:
-        return math.inf
-    return -1 / (AR1_FPS * math.log(coefficient)) if coefficient > 0 else 0.0
 
 
 def mean_short_exposure_psf(

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import torch
@@ -42,12 +42,13 @@ class Turbulence:
         height: int,
         width: int,
         fps: float = 120.0,
-        tolerance: float = 0.26,
+        tolerance: Any = 0.26,
         **dynamics: Any,
     ):
         check_option(height >= 1 and width >= 1, "frame", "at least 1 x 1", (height, width))
         check_option(0 < fps < math.inf, "fps", "> 0", fps)
-        check_option(0 < tolerance <= 1, "tolerance", "in (0, 1]", tolerance)
+        is_share = isinstance(tolerance, int | float) and 0 < tolerance <= 1
+        check_option(is_share, "tolerance", "in (0, 1]", tolerance)
         self.dynamics = WaveDynamics(**dynamics)
         self.atmosphere, self.height, self.width, self.fps = atmosphere, height, width, fps
         positions = layout(views) if isinstance(views, int) else views
@@ -55,7 +56,8 @@ class Turbulence:
         self.is_identity = atmosphere is None or atmosphere.d_over_r0 == 0
         self.fidelity = Fidelity()
         if atmosphere is not None and not self.is_identity:
-            self.fidelity = fidelity = choose_fidelity(atmosphere, width, tolerance)
+            fidelity = choose_fidelity(atmosphere, width, tolerance)
+            self.fidelity = fidelity = replace(fidelity, **self.dynamics.describe(atmosphere))
             strength, unit = fidelity.blur_equivalent_d_over_r0, fidelity.lambda_over_d_px
             size, number, band = fidelity.psf_size_px, fidelity.psf_network, find_psf_band(strength)
             missing = missing_structure_function(
@@ -69,9 +71,21 @@ class Turbulence:
     def metadata(self) -> dict[str, float | int | str]:
         return asdict(self.fidelity)
 
+    def clip_metadata(self, generator: Generator) -> dict[str, float | int | str]:
+        """Return the metadata of the clip that `degrade` draws from `generator`: where clips are
+        `mixed`, with the temporal model that it has.
+        """
+        if self.atmosphere is None or self.is_identity:
+            return self.metadata
+        model = self.dynamics.draw_temporal_model(noise.draw_base_key(generator))
+        return self.metadata | replace(self.dynamics, temporal_model=model).describe(
+            self.atmosphere
+        )
+
     @torch.no_grad()
     def degrade(self, frames: Frames, generator: Generator, *, crop: Crop | None = None) -> Views:
-        """Return every view of `crop`: only this is simulated; it equals that part of the whole."""
+        """Return every view of `crop`: only this is simulated, and is that part of the whole to
+        rounding."""
         size, given = (self.height, self.width), tuple(frames.shape[-2:])
         check_option(given == size, "frame", f"{size}", given)
         top, left, height, width = crop or (0, 0, *size)
@@ -98,7 +112,8 @@ class Turbulence:
         self, parts: Iterable[Float[Tensor, "part h w"]], frames: int, generator: Generator
     ) -> Iterator[tuple[Float[Tensor, "views part h w"], Tilt]]:
         """Yield every view and the tilt of successive parts of one clip of `frames`, as `degrade`
-        and `tilt` return them for all of it, in the memory of one part.
+        and `tilt` return them for all of it, in the memory of one part and of the amplitudes of all
+        frames: 8 bytes for each of WAVES waves and each view.
         """
         window, first = (0, 0, self.height, self.width), 0
         plans = [] if self.is_identity else self.plan(frames, generator, window)

@@ -14,6 +14,7 @@ All covariances, between modes, points, times and views, follow from this one su
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Complex, Float
@@ -23,13 +24,14 @@ from src.sim import noise
 from src.sim.optics import Position, view_id
 from src.sim.turbulence.atmosphere import AR1_FPS, Atmosphere
 from src.sim.turbulence.contract import check_option
-from src.sim.turbulence.outer_scale import LAYER_WIND_RATIO
+from src.sim.turbulence.outer_scale import LAYER_WIND_RATIO, tilt_decay_distance
 from src.sim.turbulence.zernike import SPECTRUM, pupil_filter
 
 LOW, HIGH = 0.08, 0.32  # limits of the three power laws that kappa is drawn from; HIGH per (n + 1)
 DEPTH = 1.0  # waves are drawn with the density Cn2 (1 - z/L)^DEPTH
 SHARES = (0.25, 0.65, 0.10)  # of the waves below LOW, between, above HIGH
 TEMPORAL_MODELS, VIEWS_CORRELATIONS = ("ar1", "frozen_flow", "mixed"), ("independent", "baseline")
+NUMBERS_AT_A_TIME = 1 << 22  # that are drawn, a few hundred MiB with all that is made of them
 WIND_LAYERS = 4  # of equal integrals of Cn2 (1 - z/L)^DEPTH
 
 
@@ -106,12 +108,37 @@ class WaveDynamics:
         time, shared = self.temporal_model, self.views_correlation
         checks = {
             "temporal_model": (time in TEMPORAL_MODELS, "ar1, frozen_flow or mixed"),
-            "wind_m_s": (0 <= (self.wind_m_s or 0) < math.inf, ">= 0 or null"),
             "views_correlation": (shared in VIEWS_CORRELATIONS, "independent or baseline"),
-            "baseline_m": (0 <= (self.baseline_m or 0) < math.inf, ">= 0 or null"),
         }
+        for name in ("wind_m_s", "baseline_m"):
+            value = getattr(self, name)
+            valid = value is None or (isinstance(value, int | float) and 0 <= value < math.inf)
+            checks[name] = (valid, ">= 0 or null")
         for name, (valid, allowed) in checks.items():
             check_option(valid, name, allowed, getattr(self, name))
+
+    def draw_temporal_model(self, key: int) -> str:
+        """Return `ar1` or `frozen_flow`; where clips are `mixed`, that of the clip of `key`."""
+        if self.temporal_model != "mixed":
+            return self.temporal_model
+        drawn = float(noise.uniform(noise.key(key, "temporal"), torch.tensor(0)))
+        return "frozen_flow" if drawn < 0.5 else "ar1"
+
+    def describe(self, atmosphere: Atmosphere) -> dict[str, Any]:
+        """Return what is recorded: `temporal_model`; `wind_m_s`, the rms speed of frozen flow, 0 of
+        AR(1); `tilt_correlation_time_s`, to 1 / e (`mixed`: that of AR(1)).
+        """
+        coefficient = atmosphere.ar1_coefficient
+        time_s, wind = math.inf if coefficient == 1 else 0.0, 0.0
+        if 0 < coefficient < 1:
+            time_s = -1 / (AR1_FPS * math.log(coefficient))
+        if self.temporal_model != "ar1":
+            wind = atmosphere.wind_m_s if self.wind_m_s is None else float(self.wind_m_s)
+        if self.temporal_model == "frozen_flow":
+            way = tilt_decay_distance(*atmosphere.outer_scale_and_profile, wind=True)
+            time_s = way * atmosphere.aperture_m / wind if wind else math.inf
+        own = {"temporal_model": self.temporal_model, "wind_m_s": wind}
+        return own | {"tilt_correlation_time_s": time_s}
 
     def draw_amplitudes(
         self,
@@ -123,15 +150,26 @@ class WaveDynamics:
         fps: float,
         device: torch.device | str = "cpu",
     ) -> Complex[Tensor, "views frames waves"]:
-        """Return complex64 amplitudes, drawn on `device`.
+        """Return complex64 amplitudes, drawn on `device`; of long clips a few views at a time, to
+        save memory.
 
         Every view counts from its own id, or all from 0 where they share the turbulence.
         """
+        together = max(1, NUMBERS_AT_A_TIME // (2 * frames * len(waves.z_over_l)))
+        given = atmosphere, waves, key, frames, fps, device
+        parts = [
+            self._draw_views(positions[first : first + together], *given)
+            for first in range(0, len(positions), together)
+        ]
+        return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+    def _draw_views(
+        self, positions: Sequence[Position], atmosphere: Atmosphere, waves: PlaneWaves, key: int,
+        frames: int, fps: float, device: torch.device | str,
+    ) -> Complex[Tensor, "views frames waves"]:  # fmt: skip
         shared = self.views_correlation == "baseline"
         ids = torch.tensor([0 if shared else view_id(position) for position in positions])
-        frozen = self.temporal_model == "frozen_flow"
-        if self.temporal_model == "mixed":
-            frozen = float(noise.uniform(noise.key(key, "temporal"), torch.tensor(0))) < 0.5
+        frozen = self.draw_temporal_model(key) == "frozen_flow"
         steps = 1 if frozen else frames
         counters = torch.arange(steps * 2 * len(waves.z_over_l), device=device)
         counters = counters.reshape(steps, -1, 2) + (ids << 40).to(device)[:, None, None, None]

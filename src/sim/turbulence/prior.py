@@ -35,6 +35,7 @@ TILT_AND_BLUR_PX = {
 PROFILES = {"uniform": (0, 1), "camera": (0, 0.1), "middle": (1 / 3, 2 / 3), "object": (0.7, 1)}
 PROFILE_POINTS = 121
 CANDIDATES, ROUNDS = 128, 4  # cameras proposed at a time, and how often
+DRAWS = 32  # of what an image shall show, until a camera shows it
 OUTER_SCALES = 17  # values of L0 / D in a range that are drawn from, and infinity
 D_OVER_R0 = np.geomspace(0.05, 10, 240)  # that are drawn from
 Range = Sequence[float]
@@ -65,24 +66,15 @@ class TargetImageStatistics:
 
 
 def sample_atmosphere(
-    severity: str,
-    generator: torch.Generator,
-    *,
-    tilt_and_blur_px: Mapping[str, Range] | None = None,
-    tilt_correlation_half_length_px: Range = (5.0, 100.0),
-    global_tilt_probability: float = 0.15,
-    global_tilt_half_length_px: Range = (100.0, 600.0),
-    tilt_correlation_time_s: Range = (0.02, 0.25),
-    **cameras,
+    severity: str, generator: torch.Generator, **ranges: Any
 ) -> Atmosphere | None:
     """Draw an atmosphere of `severity`: weak, medium, strong, extreme or mixed (10/30/60 % of the
-    first three).
+    first three); `none` gives None.
 
-    All ranges are log-uniform, in pixels of a frame 256 wide; `tilt_and_blur_px` for each severity;
-    at `global_tilt_probability` the half length is that of turbulence that moves the whole view.
-    What no camera shows is drawn again.  `cameras`: see `sample_matching_atmosphere`.  `none` gives
-    None.  Raises ValueError for an unknown severity or ranges that nothing meets; what each setting
-    may be is checked by `SimulatedTurbulence`.
+    What no camera shows is drawn again as a whole, up to DRAWS times, global tilt or not: cameras
+    show all that the default ranges draw.  `ranges`: see `draw_atmosphere`.  Raises ValueError for
+    an unknown severity or ranges that nothing meets; what each setting may be, and whether cameras
+    show enough of it, is checked by `SimulatedTurbulence`.
     """
     names = ["none", *TILT_AND_BLUR_PX, "mixed"]
     check_option(severity in names, "atmosphere.severity", ", ".join(names), severity)
@@ -92,22 +84,43 @@ def sample_atmosphere(
         drawn = float(torch.rand((), generator=generator, dtype=torch.float64))
         limits = SEVERITY_SHARES["weak"], 1 - SEVERITY_SHARES["strong"]
         severity = list(SEVERITY_SHARES)[int(np.searchsorted(limits, drawn, side="right"))]
-    spreads = (TILT_AND_BLUR_PX | dict(tilt_and_blur_px or {}))[severity]
-    for _ in range(32):
-        u = torch.rand(4, generator=generator, dtype=torch.float64).numpy()
-        lengths = (tilt_correlation_half_length_px, "tilt_correlation_half_length_px")
-        if u[0] < global_tilt_probability:
-            lengths = (global_tilt_half_length_px, "global_tilt_half_length_px")
-        wanted = TargetImageStatistics(
-            float(log_uniform(u[1], *lengths)),
-            float(log_uniform(u[2], tilt_correlation_time_s, "tilt_correlation_time_s")),
-            tilt_and_blur_px=float(log_uniform(u[3], spreads, "tilt_and_blur_px")),
-        )
+    for _ in range(DRAWS):
         try:
-            return sample_matching_atmosphere(wanted, generator, **cameras)
+            return draw_atmosphere(severity, generator, **ranges)
         except NoCameraError as error:
             reason = error
     raise reason
+
+
+def draw_atmosphere(
+    severity: str,
+    generator: torch.Generator,
+    *,
+    tilt_and_blur_px: Mapping[str, Range] | None = None,
+    tilt_correlation_half_length_px: Range = (5.0, 100.0),
+    global_tilt_probability: float = 0.15,
+    global_tilt_half_length_px: Range = (100.0, 600.0),
+    tilt_correlation_time_s: Range = (0.02, 0.25),
+    **cameras: Any,
+) -> Atmosphere:
+    """Draw what an image shall show of `severity`, a key of TILT_AND_BLUR_PX, then an atmosphere.
+
+    All ranges are log-uniform, in pixels of a frame 256 wide; `tilt_and_blur_px` for each severity;
+    at `global_tilt_probability` the half length is that of turbulence that moves the whole view.
+    `cameras`: see `sample_matching_atmosphere`.  Raises ValueError for wrong ranges, NoCameraError
+    where no camera shows what was drawn.
+    """
+    spreads = (TILT_AND_BLUR_PX | dict(tilt_and_blur_px or {}))[severity]
+    u = torch.rand(4, generator=generator, dtype=torch.float64).numpy()
+    lengths = (tilt_correlation_half_length_px, "tilt_correlation_half_length_px")
+    if u[0] < global_tilt_probability:
+        lengths = (global_tilt_half_length_px, "global_tilt_half_length_px")
+    wanted = TargetImageStatistics(
+        float(log_uniform(u[1], *lengths)),
+        float(log_uniform(u[2], tilt_correlation_time_s, "tilt_correlation_time_s")),
+        tilt_and_blur_px=float(log_uniform(u[3], spreads, "tilt_and_blur_px")),
+    )
+    return sample_matching_atmosphere(wanted, generator, **cameras)
 
 
 def sample_matching_atmosphere(
@@ -129,7 +142,8 @@ def sample_matching_atmosphere(
 
     `allowed_aperture_px`: aperture in pixels at the object; `outer_scale_over_aperture`: L0 / D,
     infinite with `kolmogorov_probability`; `cn2_profiles`: `uniform`, `camera` (the first tenth),
-    `middle` (third), `object` (the last 30 %) or a table of Cn2 from the camera to the object.
+    `middle` (third), `object` (the last 30 %), or a table of Cn2 from the camera to the object,
+    joined linearly, as those of the names are (PROFILE_POINTS: `camera` ends at 0.108 L).
     Beyond `max_rytov_variance` scintillation, which is left out, is too strong.
     Raises ValueError for wrong ranges, NoCameraError where no camera is found.
     """
@@ -167,7 +181,10 @@ def sample_matching_atmosphere(
             outer_scale_m=diameter * float(scale[i]),
             wind_m_s=way * diameter / time_s,
         ).with_d_over_r0(float(strength[i]))
-    raise NoCameraError(f"turbulence.atmosphere: no camera within its ranges shows {wanted}")
+    seen = ", ".join(f"{k}={v:.3g}" for k, v in vars(wanted).items() if v is not None)
+    more = "wider ones, as of allowed_aperture_px or max_rytov_variance, show more"
+    wanted_ranges = "ranges within which a camera shows"
+    raise NoCameraError(f"turbulence.atmosphere must be {wanted_ranges} {seen}; {more}")
 
 
 def unnormalised_cn2_profile(shape: Any) -> tuple[float, ...]:

@@ -17,6 +17,7 @@ from src.sim.turbulence.prior import (
     sample_atmosphere,
     unnormalised_cn2_profile,
 )
+from src.sim.turbulence.prior_trial import check_that_cameras_show
 
 INTERVALS = {  # of `sample_atmosphere`: where the ends of its ranges lie
     "tilt_correlation_half_length_px": (0.01, 1e6),
@@ -41,12 +42,17 @@ _cached_turbulence = lru_cache(maxsize=64)(Turbulence)  # one batch is simulated
 class SimulatedTurbulence:
     """`atmosphere`: keyword arguments of `sample_atmosphere`; `options`: those of `Turbulence`.
 
-    Raises ValueError for what is unknown or outside its range, also where no clip draws it.
+    Raises ValueError for what is unknown or outside its range, also where no clip draws it, and for
+    ranges of which cameras show too little (prior_trial.py).
     """
 
     def __init__(self, atmosphere: Mapping[str, Any], **options: Any):
         self.atmosphere, self.options = dict(atmosphere), options
         check_atmosphere_settings(self.atmosphere)
+        try:
+            check_that_cameras_show(self.atmosphere)
+        except TypeError as error:
+            raise ValueError(f"turbulence.atmosphere takes no such values: {error}") from error
         try:
             Turbulence(None, views=1, height=1, width=1, **options)
         except TypeError as error:

@@ -57,6 +57,18 @@ def test_reds_fills_the_largest_size_of_the_paper(reds):
     assert clip.frames.shape == (2, 768, 768)
 
 
+def test_pictures_of_12_bits_are_told_and_white_is_what_is_given(tmp_path):
+    for number in range(4):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((16, 16), 4095, np.uint16))
+    scene = {"root": str(tmp_path), "disjoint_splits": False, **SMALL}
+    told = "largest value is 4095 of 65535; scene.white_level=4095 makes 4095 white"
+    with pytest.warns(UserWarning, match=told):
+        assert np.allclose(Footage(**scene).clip(0).frames, 4095 / 65535)
+    assert (Footage(**scene, white_level=4095).clip(0).frames == 1).all()
+    with pytest.raises(ValueError, match=r"^scene.white_level must be in \(0, 65535\] or null"):
+        Footage(**scene, white_level=0).clip(0)
+
+
 def test_reds_names_what_is_missing(reds, tmp_path):
     with pytest.raises(ValueError, match="scene.root must hold all 27 sequences of split=test"):
         Reds(str(tmp_path), split="test")

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from src.app.instantiate import instantiate_node
+from src.sim.scenes.footage import Footage
 from src.sim.scenes.mixture import Mixture
 from src.sim.scenes.moving_layers import draw_motion_times_s
 from src.sim.scenes.photo_files import list_photographs
@@ -63,6 +64,12 @@ def test_a_clip_of_a_mixture_is_that_of_its_part_whatever_the_length():
         ({"a": {"share": "x", "scene": PHOTOS}}, "scene.parts.a.share must be >= 0, got x"),
         ({"a": {"share": 0, "scene": PHOTOS}}, "scene.parts must have a share > 0 for split=train"),
         ({"a": {"share": 1, "splits": ["exam"], "scene": PHOTOS}}, "scene.parts.a.splits must be"),
+        ({"a": {"share": 1, "scene": partial(Footage, root=None)}}, "^scene.video_root must be"),
+        (
+            {"a": {"share": 1, "scene": partial(DOTS, options={"dot_grid": {"dots": 0}})}},
+            "^scene.parts.a.scene.options.dot_grid.dots must be",
+        ),
+        ({"a": {"share": 1, "scene": partial(PHOTOS, root="/none")}}, "^scene.root must be a fold"),
     ],
 )
 def test_wrong_parts_name_their_key(parts, message):

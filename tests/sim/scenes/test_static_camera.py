@@ -106,7 +106,11 @@ def test_targets_are_drawn_before_the_photograph_and_only_there():
         ({"kinds": {"dart": {"dart_width": "a"}}}, "kinds.dart.dart_width must be .*got a"),
         (
             {"kinds": {"dart": {"speed_px_per_s": [1, 1e6]}}},
-            r"scene.speed_px_per_s must be in \[0, 2",
+            r"scene.kinds.dart.speed_px_per_s must be in \[0, 2",
+        ),
+        (
+            {"kinds": {"bouncing_ball": {"ball_radius": 0.03}}},
+            r"ball_radius must be in .* got 0.03, in frames of 80x64 px \(scene.width",
         ),
         ({"max_targets": 0}, r"scene.max_targets must be in \[1, 100\], got 0"),
         ({"paused_clip_share": 1.5}, r"scene.paused_clip_share must be in \[0, 1\], got 1.5"),

@@ -140,13 +140,31 @@ def test_unknown_kinds_are_refused(kinds, options):
 @pytest.mark.parametrize(
     "make, message",
     [
-        (lambda: target("dart", {"speed_px_per_s": 1e6}), "scene.speed_px_per_s must be in"),
-        (lambda: target("dart", {"speed_px_per_s": math.nan}), "scene.speed_px_per_s must be in"),
-        (lambda: target("rotating_dot", {"dot_radius": 0.0}), "scene.dot_radius must be in"),
-        (lambda: target("checkerboard", {"squares": 0}), "scene.squares must be in"),
-        (lambda: target("bouncing_ball", {"bounce_height": 0.9}), "scene.bounce_height must be in"),
+        (
+            lambda: target("dart", {"speed_px_per_s": 1e6}),
+            "scene.options.dart.speed_px_per_s must be in",
+        ),
+        (
+            lambda: target("dart", {"speed_px_per_s": math.nan}),
+            "scene.options.dart.speed_px_per_s must be in",
+        ),
+        (
+            lambda: target("rotating_dot", {"dot_radius": 0.0}),
+            "scene.options.rotating_dot.dot_radius must be in",
+        ),
+        (
+            lambda: target("checkerboard", {"squares": 0}),
+            "scene.options.checkerboard.squares must be in",
+        ),
+        (
+            lambda: target("bouncing_ball", {"bounce_height": 0.9}),
+            "scene.options.bouncing_ball.bounce_height must be in",
+        ),
         (lambda: target("dot_grid", contrast=1.5), "scene.contrast must be in"),
-        (lambda: target("dart", {"dots": 1}), "dart takes dart_length, dart_width, speed"),
+        (
+            lambda: target("dart", {"dots": 1}),
+            "scene.options.dart must hold dart_length, dart_width",
+        ),
         (lambda: target("dot_grid", split="all"), "split must be one of"),
     ],
 )

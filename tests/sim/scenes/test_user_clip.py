@@ -112,6 +112,56 @@ def test_16_bits_are_kept_and_white_is_what_is_given(tmp_path, white, shown):
     assert [told in str(one.message) for one in caught] == [True] * (2 if white is None else 0)
 
 
+def test_a_grey_video_of_16_bits_keeps_them(tmp_path):
+    picture = np.repeat(np.arange(0, 4096, 65, dtype=np.uint16)[None], 20, axis=0)
+    with av.open(str(tmp_path / "a.mkv"), "w") as file:
+        stream = file.add_stream("ffv1", rate=30)
+        stream.height, stream.width, stream.pix_fmt = *picture.shape, "gray16le"
+        for _ in range(3):
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="gray16le")))
+        file.mux(stream.encode())
+    with pytest.warns(UserWarning, match="largest value is 4095 of 65535; white_level=4095"):
+        dark = user_clip.read_video(tmp_path / "a.mkv").frames
+    bright = user_clip.read_video(tmp_path / "a.mkv", white_level=4095).frames
+    assert np.allclose(dark, picture / 65535, atol=5e-4)
+    assert np.allclose(bright, picture / 4095, atol=5e-4)
+
+
+@pytest.mark.parametrize(
+    ("second", "message"),
+    [
+        (np.zeros((20, 30), np.uint16), "frames of one kind, got uint8 and uint16 in .*1.png"),
+        (np.full((20, 30), 2, np.float32), r"floats in \[0, 1\], got 2 to 2 in .*1.tiff"),
+        (np.full((20, 30), np.nan, np.float32), r"floats in \[0, 1\], got nan to nan in .*1.tiff"),
+    ],
+)
+def test_frames_of_other_values_are_refused_with_their_file(tmp_path, second, message):
+    first = np.zeros((20, 30), np.uint8 if second.dtype == np.uint16 else np.float32)
+    suffix = ".png" if second.dtype == np.uint16 else ".tiff"
+    for number, picture in enumerate((first, second)):
+        cv2.imwrite(str(tmp_path / f"{number}{suffix}"), picture)
+    with pytest.raises(ValueError, match=f"^video must hold .*{message}"):
+        user_clip.read_video(tmp_path, fps=30)
+    if second.dtype == np.float32:
+        with pytest.raises(ValueError, match=f"^photo must hold .*{message}"):
+            user_clip.read_photograph(tmp_path / "1.tiff")
+
+
+def test_transparent_pixels_are_told(tmp_path):
+    picture = np.full((20, 30, 4), 255, np.uint8)
+    cv2.imwrite(str(tmp_path / "1.png"), picture)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        user_clip.read_photograph(tmp_path / "1.png", seconds=0.1)  # all of it is opaque
+    picture[5, 5, 3] = 0
+    cv2.imwrite(str(tmp_path / "1.png"), picture)
+    cv2.imwrite(str(tmp_path / "2.png"), picture)
+    with pytest.warns(UserWarning, match="1.png: transparent pixels show hidden colours"):
+        user_clip.read_photograph(tmp_path / "1.png", seconds=0.1)
+    with pytest.warns(UserWarning, match="1.png: transparent pixels show hidden colours"):
+        user_clip.read_video(tmp_path, fps=30)
+
+
 @pytest.mark.parametrize(
     "call, message",
     [
@@ -133,13 +183,19 @@ def test_16_bits_are_kept_and_white_is_what_is_given(tmp_path, white, shown):
             r"white_level must be in \(0, 255\] or null, got 0",
         ),
         (lambda p: user_clip.clip_from_array(np.zeros((3, 20, 30))), "fps must be given"),
-        (lambda p: user_clip.clip_from_array(np.full((20, 30), 7.0)), r"floats in \[0, 1\]"),
+        (lambda p: user_clip.clip_from_array(np.full((20, 30), 7.0)), r"\[0, 1\], .*from 7 to 7"),
+        (lambda p: user_clip.clip_from_array(np.zeros((20, 30), int)), r"\[0, 1\], got int64"),
+        (lambda p: user_clip._check_rate("30"), r"fps must be in .* got 30"),
+        (lambda p: user_clip._find_part(9, 30, "0", 1.0, "a.mkv"), "start_s must be .* got 0 and"),
+        (lambda p: user_clip._find_part(9, 30, 0.0, None, "a.mkv"), "start_s must be .* and None"),
+        (lambda p: user_clip.read_video(p / "one", fps=30), "two frames or more, got one in .*one"),
         (lambda p: user_clip.clip_from_array(np.zeros((1, 1, 2, 3))), "must be of shape"),
     ],
 )
 def test_wrong_material_is_one_line(call, message, tmp_path):
     write_film(tmp_path / "a.mkv")
-    for name in ("a.png", "b.png"):
+    (tmp_path / "one").mkdir()
+    for name in ("a.png", "b.png", "one/a.png"):
         cv2.imwrite(str(tmp_path / name), np.zeros((20, 30), np.uint8))
     with pytest.raises(ValueError, match=message) as error:
         call(tmp_path)

@@ -82,7 +82,31 @@ def test_a_phone_held_upright_shows_upright_pictures(tmp_path):
     assert frames[0].shape == SIZE[::-1] and np.array_equal(frames, read_with_opencv(path)[:2])
 
 
-def test_an_uneven_rate_is_made_even_by_the_time_stamps_and_said_once(tmp_path):
+@pytest.mark.parametrize(
+    ("matrix", "shown"),
+    [
+        ((1, 0, 0, 1), lambda stored: stored),
+        ((-1, 0, 0, -1), lambda stored: stored[::-1, ::-1]),
+        ((-1, 0, 0, 1), np.fliplr),
+        ((1, 0, 0, -1), np.flipud),
+        ((0, 1, -1, 0), lambda stored: np.rot90(stored, -1)),
+        ((0, -1, 1, 0), np.rot90),
+        ((0, 1, 1, 0), np.transpose),
+        ((0, -1, -1, 0), lambda stored: stored[::-1, ::-1].T),
+    ],
+)
+def test_mirrored_and_turned_videos_are_shown_as_their_file_says(tmp_path, matrix, shown):
+    """A point (x, y) is shown at (a x + c y, b x + d y): ISO 14496-12, 6.2.2."""
+    path = write_video(tmp_path / "h264.mp4")
+    (stored,) = index_video(path, "video").read(9, 10, "video")
+    a, b, c, d = (entry * 65536 for entry in matrix)
+    turn(path, (a, b, 0, c, d, 0, 0, 0, 1 << 30))
+    (seen,) = index_video(path, "video").read(9, 10, "video")
+    assert len({stored.tobytes(), *(one(stored).tobytes() for one in (np.fliplr, np.flipud))}) == 3
+    assert np.array_equal(seen, shown(stored))
+
+
+def test_an_uneven_rate_is_made_even_by_the_time_stamps_and_said(tmp_path):
     gaps = np.where(np.arange(COUNT - 1) % 10 == 9, 0.12, 0.04)
     times = np.concatenate([[0], np.cumsum(gaps)])
     path = write_video(tmp_path / "phone.mp4", times)
@@ -94,9 +118,12 @@ def test_an_uneven_rate_is_made_even_by_the_time_stamps_and_said_once(tmp_path):
         and len(index.constant_rate_frames) == 46
     )
     assert numbers(index.read(11, 13, "video")) == nearest[11:13]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert videos.read_fps(path) == 25
+    for kind, times_said in (("always", 3), ("default", 1)):  # of Python's own: once a process
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter(kind)
+            assert videos.read_fps(path) == videos.read_fps(path, "recording") == 25
+            index_video(path, "video")
+        assert len(caught) == times_said
 
 
 def test_a_time_base_too_coarse_for_the_rate_is_no_uneven_rate(tmp_path):

@@ -338,7 +338,7 @@ def test_settings_outside_their_range_are_named(settings_, words):
 
 @pytest.mark.parametrize("threshold", [["a", "b"], [[0.1, 0.2], 0.3], [0.1], [], "a", None])
 def test_a_threshold_that_is_no_number_and_no_range_is_named(threshold):
-    with pytest.raises(ValueError, match=r"^sensor.threshold must be a number or \[low, high\], g"):
+    with pytest.raises(ValueError, match=r"^sensor.threshold must be a number or \[low, high\], l"):
         threshold_range(threshold)
 
 
@@ -398,7 +398,7 @@ def test_a_share_of_the_clips_keeps_the_sensors_own_numbers():
     [
         ({"color": [0, 1]}, "sensor.random must hold ranges of threshold, .*, got color"),
         ({"floor": [0.01, 0.1]}, "sensor.random must hold ranges of .*, got floor"),
-        ({"threshold": 0.2}, r"sensor.random.threshold must be \[low, high\], got 0.2"),
+        ({"threshold": 0.2}, r"threshold must be \[low, high\], low <= high, got 0.2"),
         ({"threshold": [0.5, 0.1]}, r"sensor.random.threshold must be \[low, high\]"),
         ({"threshold": ["a", "b"]}, r"sensor.random.threshold must be \[low, high\]"),
         ({"threshold": [0.1, 9]}, r"sensor.random.threshold must be in \[0.01, 5\], got 9"),

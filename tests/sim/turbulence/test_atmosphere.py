@@ -4,9 +4,15 @@ import math
 from dataclasses import replace
 
 import pytest
+import torch
 
-from src.sim.turbulence import Atmosphere
+from src.sim.optics import layout
+from src.sim.turbulence import Atmosphere, plane_waves
+from src.sim.turbulence.atmosphere import AR1_FPS
 from src.sim.turbulence.fidelity import choose_fidelity
+from src.sim.turbulence.operator import Turbulence
+from src.sim.turbulence.plane_waves import WaveDynamics, draw_plane_waves
+from src.sim.turbulence.prior import sample_atmosphere
 
 PATH = Atmosphere(0.05, 0.5, 1000.0, 2.0, 525e-9, 3e-14, 0.9)
 
@@ -63,5 +69,53 @@ def test_a_path_without_turbulence_is_not_scaled():
 
 
 def test_what_stands_still_has_no_end_of_its_correlation():
-    found = choose_fidelity(replace(PATH, ar1_coefficient=1.0), 256, 0.26)
-    assert found.tilt_correlation_time_s == math.inf
+    still = replace(PATH, ar1_coefficient=1.0)
+    assert WaveDynamics("ar1").describe(still)["tilt_correlation_time_s"] == math.inf
+    found = WaveDynamics("frozen_flow", wind_m_s=0).describe(PATH)
+    assert found["tilt_correlation_time_s"] == math.inf and found["wind_m_s"] == 0
+
+
+def test_the_blur_that_is_recorded_is_that_beyond_diffraction():
+    found = choose_fidelity(PATH, 256, 0.26)
+    both = math.hypot(found.tilt_px, found.blur_px)
+    assert both == pytest.approx(found.tilt_and_blur_px, rel=1e-6)
+
+
+def test_the_correlation_time_that_is_recorded_is_that_of_the_wind():
+    atmosphere = sample_atmosphere("strong", torch.Generator().manual_seed(1))
+    drawn_s = -1 / (AR1_FPS * math.log(atmosphere.ar1_coefficient))
+    for model in ("ar1", "frozen_flow", "mixed"):
+        found = WaveDynamics(model).describe(atmosphere)
+        assert found["tilt_correlation_time_s"] == pytest.approx(drawn_s, rel=1e-3)
+        assert found["temporal_model"] == model
+        assert found["wind_m_s"] == (0 if model == "ar1" else atmosphere.wind_m_s)
+    twice = WaveDynamics("frozen_flow", wind_m_s=2 * atmosphere.wind_m_s).describe(atmosphere)
+    assert twice["tilt_correlation_time_s"] == pytest.approx(drawn_s / 2, rel=1e-3)
+
+
+def test_a_clip_of_mixed_records_the_temporal_model_that_it_has():
+    atmosphere = sample_atmosphere("weak", torch.Generator().manual_seed(1))
+    options = {"views": 1, "height": 16, "width": 16}
+    mixed, *single = (
+        Turbulence(atmosphere, temporal_model=model, **options)
+        for model in ("mixed", "ar1", "frozen_flow")
+    )
+    seen = set()
+    for seed in range(6):
+        moves, *own = (one.tilt(3, torch.Generator().manual_seed(seed)) for one in (mixed, *single))
+        model = mixed.clip_metadata(torch.Generator().manual_seed(seed))["temporal_model"]
+        assert torch.equal(moves, own[model == "frozen_flow"])
+        assert not torch.equal(moves, own[model == "ar1"])
+        seen.add(model)
+    assert seen == {"ar1", "frozen_flow"}
+
+
+@pytest.mark.parametrize("model", ["ar1", "frozen_flow"])
+@pytest.mark.parametrize("views", ["independent", "baseline"])
+def test_views_drawn_one_after_the_other_are_those_drawn_together(model, views, monkeypatch):
+    dynamics = WaveDynamics(model, views_correlation=views)
+    waves = draw_plane_waves(PATH, 5, modes=2, waves=32, width_px=64)
+    given = PATH, waves, 7, layout(4), 37, 120.0
+    together = dynamics.draw_amplitudes(*given)
+    monkeypatch.setattr(plane_waves, "NUMBERS_AT_A_TIME", 1)
+    assert torch.equal(dynamics.draw_amplitudes(*given), together) and len(together) == 4

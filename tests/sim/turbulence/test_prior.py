@@ -6,9 +6,11 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
+from src.app.compose import compose_config
 from src.sim.noise import generator
-from src.sim.turbulence import sample_atmosphere
+from src.sim.turbulence import prior_trial, sample_atmosphere
 from src.sim.turbulence.prior import (
     TILT_AND_BLUR_PX,
     NoCameraError,
@@ -102,8 +104,41 @@ def test_none_and_unknown_severities():
 
 
 def test_ranges_that_nothing_meets():
-    with pytest.raises(NoCameraError, match="no camera within its ranges shows"):
+    with pytest.raises(NoCameraError) as error:
         sample_atmosphere("strong", generator(0), allowed_aperture_px=(1e-6, 1e-5))
+    number = r"\d+\.?\d{0,3}"  # no more digits than one reads
+    names = "tilt_correlation_half_length_px", "tilt_correlation_time_s", "tilt_and_blur_px"
+    shown = ", ".join(f"{name}={number}" for name in names)
+    assert re.match(
+        f"turbulence.atmosphere must be ranges within which a camera shows {shown}; wider",
+        str(error.value),
+    )
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"tilt_correlation_half_length_px": [1, 2]}, "got [1, 2], of which they show 5 of 64"),
+        (
+            {"tilt_correlation_half_length_px": [0.3, 0.5], "global_tilt_probability": 0},
+            "must be within 2.2 to 1000 for tilt_and_blur_px.strong=[1.2, 3.0] and these cameras",
+        ),
+        ({"allowed_aperture_px": [0, 1e-5]}, "got ranges within which none does"),
+    ],
+)
+def test_ranges_that_cameras_hardly_show_are_refused_before_any_clip(given, message):
+    """Clips of global tilt would stand in for them."""
+    with pytest.raises(ValueError, match=r"^turbulence.atmosphere[. ].*must be") as error:
+        SimulatedTurbulence({"severity": "strong"} | given)
+    assert message in str(error.value)
+
+
+@pytest.mark.parametrize("severity", ["weak", "medium", "strong", "extreme", "mixed"])
+def test_shipped_ranges_are_met_with_margin(severity, monkeypatch):
+    cfg = compose_config("simulate", f"turbulence={severity}")
+    atmosphere = OmegaConf.to_container(cfg.turbulence.atmosphere, resolve=True)
+    monkeypatch.setattr(prior_trial, "LEAST_SHARE", 0.9)
+    SimulatedTurbulence(atmosphere)
 
 
 @pytest.mark.parametrize("name", INTERVALS)

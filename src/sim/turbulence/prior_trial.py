@@ -1,0 +1,63 @@
+"""Whether cameras show what a prior is asked for, tried before the first clip is drawn."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from src.sim import noise
+from src.sim.turbulence.contract import check_option
+from src.sim.turbulence.prior import (
+    SEVERITY_SHARES,
+    TILT_AND_BLUR_PX,
+    NoCameraError,
+    draw_atmosphere,
+)
+
+TRIALS, LEAST_SHARE = 64, 0.2  # of clips that are not of global tilt
+HALF_LENGTHS_PX = np.geomspace(0.1, 1000, 25)  # that are tried to say which can be met
+TRIALS_PER_LENGTH = 5
+HALF_LENGTH = "tilt_correlation_half_length_px"
+
+
+def check_that_cameras_show(settings: Mapping[str, Any]) -> None:
+    """Raise ValueError where cameras show less than LEAST_SHARE of what `draw_atmosphere` draws
+    with `settings` for clips without global tilt: other clips, of global tilt, would stand in for
+    them.
+
+    `settings`: as of `sample_atmosphere`.  The draws are always the same ones.
+    """
+    severity, least = str(settings.get("severity")), LEAST_SHARE * TRIALS
+    drawn = tuple(SEVERITY_SHARES) if severity == "mixed" else (severity,)
+    if not set(drawn) <= set(TILT_AND_BLUR_PX) or settings.get("global_tilt_probability") == 1:
+        return  # no turbulence or a wrong word, or none but global tilt
+    for one in drawn:
+        local = {**settings, "severity": one, "global_tilt_probability": 0.0}
+        if (met := _count_met(local, TRIALS, least)) >= least:
+            continue
+        spreads = (TILT_AND_BLUR_PX | dict(settings.get("tilt_and_blur_px") or {}))[one]
+        shown = [
+            length
+            for length in HALF_LENGTHS_PX.tolist()
+            if _count_met({**local, HALF_LENGTH: (length, length)}, TRIALS_PER_LENGTH, 1)
+        ]
+        asked = f"tilt_and_blur_px.{one}={list(spreads)}"
+        allowed = f"ranges within which cameras show {asked}"
+        check_option(bool(shown), "atmosphere", allowed, "ranges within which none does")
+        given = f"{settings.get(HALF_LENGTH, 'its default')}, of which they show {met} of {TRIALS}"
+        allowed = f"within {min(shown):.2g} to {max(shown):.4g} for {asked} and these cameras"
+        check_option(False, f"atmosphere.{HALF_LENGTH}", allowed, given)
+
+
+def _count_met(settings: Mapping[str, Any], trials: int, enough: float) -> int:
+    """Return how many of `trials` draws a camera shows, or that `enough` are."""
+    generator, met = noise.generator(noise.key("trial of a prior")), 0
+    for _ in range(trials):
+        try:
+            draw_atmosphere(generator=generator, **settings)
+            met += 1
+        except NoCameraError:
+            continue
+        if met >= enough:
+            break
+    return met
