@@ -136,22 +136,22 @@ def reconstruct_clip(network: Candidate, sample: Sample) -> Tensor:
     return network.reconstruct(sample.voxels[0, :, None], positions, float(sample.window_s[0]))[0]
 
 
-def score_clips_into_metrics(
-    cfg: DictConfig, rows: dict[str, Candidate]
-) -> dict[str, list[dict[str, float]]]:
-    """Return the scores of all `rows` on each of the test clips of `cfg`."""
+def score_clips_into_metrics(cfg: DictConfig, rows: dict[str, Candidate]) -> dict[str, list[dict]]:
+    """Return the scores of all `rows` on each of the test clips of `cfg`, and what a clip shows
+    (`source`)."""
     pipeline, measure = simulation.build_pipeline(cfg, "test"), build_metrics(cfg)
     values, clips = {row: [] for row in rows}, cfg.data.test_clips
     for clip in range(clips):
         sample = simulate(pipeline, [clip])
         for row, network in rows.items():
             frames = reconstruct_clip(network, sample)[cfg.data.unscored_windows :]
-            values[row].append(measure(frames, sample.target[0, cfg.data.unscored_windows :]))
+            scores = measure(frames, sample.target[0, cfg.data.unscored_windows :])
+            values[row].append({"source": sample.parameters[0]["source"], **scores})
         print(f"{clip + 1} of {clips} clips", flush=True)
     return values
 
 
-def format_table(values: dict[str, list[dict[str, float]]], table: Table, before: str = "") -> str:
+def format_table(values: dict[str, list[dict]], table: Table, before: str = "") -> str:
     """Return what `table` says of the scores `values` as Markdown, without rows not in them but for
     those of published networks in the document as it was `before`, which the note says.
     """
@@ -167,27 +167,37 @@ def format_table(values: dict[str, list[dict[str, float]]], table: Table, before
             earlier = " Published networks: measured before."
     for name, (first, second) in table.pairs.items():
         if {first, second} <= set(values):
-            pairs = list(zip(values[first], values[second], strict=True))
-            gains = [[a[m.name] - b[m.name] for a, b in pairs] for m in columns]
-            cells = [format_mean(m, own, "+") for m, own in zip(columns, gains, strict=True)]
+            gains = list(map(subtract_scores, values[first], values[second]))
+            cells = format_means(gains, columns, "+")
             lines.append(f"| *{name}* | " + " | ".join(cells) + " |")
     paired = "; Δ: paired differences" if table.pairs else ""
     clips = len(next(iter(values.values())))
     return "\n".join([*lines, "", f"{clips} clips; mean (95 % bootstrap CI){paired}.{earlier}"])
 
 
-def format_means(clips: list[dict[str, float]], columns: Sequence[Column] = METRICS) -> list[str]:
-    """Return the scores of clips, per metric."""
-    return [format_mean(m, [clip[m.name] for clip in clips]) for m in columns]
+def subtract_scores(ours: dict, theirs: dict) -> dict:
+    """Return the differences of the scores of a clip, None where one has none."""
+    pairs = {m.name: (ours.get(m.name), theirs.get(m.name)) for m in METRICS}
+    gains = {name: None if None in pair else pair[0] - pair[1] for name, pair in pairs.items()}
+    return {"source": ours.get("source"), **gains}
 
 
-def format_mean(metric: Column, values: list[float], sign: str = "") -> str:
-    """Return the mean and its interval."""
-    form, (low, high) = f"{sign}.{metric.digits}f", bootstrap_interval(values)
-    return f"{np.mean(values):{form}} ({low:{form}} to {high:{form}})"
+def format_means(
+    clips: list[dict], columns: Sequence[Column] = METRICS, sign: str = ""
+) -> list[str]:
+    """Return the mean of each metric over the clips that have one, with its interval."""
+    return [format_mean(m, [clip for clip in clips if clip[m.name] is not None], sign)
+            for m in columns]  # fmt: skip
 
 
-def update_card(card: Path, protocol: str, commit: str, clips: list[dict[str, float]]) -> None:
+def format_mean(metric: Column, clips: list[dict], sign: str) -> str:
+    values, form = [clip[metric.name] for clip in clips], f"{sign}.{metric.digits}f"
+    low, high = bootstrap_interval(values, groups=results.list_sources(clips))
+    interval = "" if np.isnan(low) else f" ({low:{form}} to {high:{form}})"
+    return f"{np.mean(values):{form}}{interval}"
+
+
+def update_card(card: Path, protocol: str, commit: str, clips: list[dict]) -> None:
     """Put the scores of `clips` on a card, in the place of what was there of their protocol."""
     start, lines = f"| `{protocol}`", card.read_text().splitlines()
     what = f"{start}, by scripts.readme, at {commit} | {len(clips)} | "

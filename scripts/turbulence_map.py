@@ -16,6 +16,7 @@ from src.app.script import run_script
 from src.figures.plots import save_figure
 from src.metrics.bootstrap import bootstrap_difference_interval
 from src.records import runs
+from src.records.results import list_sources
 from src.records.runs import Run
 from src.reports.differences import pool_same_clips
 
@@ -54,7 +55,7 @@ def compute_differences(
             pooled = pool_same_clips("folders", [by_name[ours]], [by_name[theirs]])
             sides = [[[float(clip[metric]) for clip in clips] for clips in side] for side in pooled]
             value = sum(sides[0][0]) / len(sides[0][0]) - sum(sides[1][0]) / len(sides[1][0])
-            low, high = bootstrap_difference_interval(*sides)
+            low, high = bootstrap_difference_interval(*sides, groups=list_sources(pooled[0][0]))
             cells[setting] = (value, f"{value:+.{digits}f}" + ("*" if low * high > 0 else ""))
     return cells
 

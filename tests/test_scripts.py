@@ -109,6 +109,18 @@ def test_scores_take_the_place_of_older_ones_on_a_card(tmp_path):
     assert rows[2:] == ["", CARD_NOTE]
 
 
+def test_intervals_of_a_table_are_over_photographs_and_scores_that_clips_have():
+    values = [0.1, 0.2, 0.6, 0.7]
+    clips = [{"source": source, **{metric.name: value for metric in METRICS}}
+             for source, value in zip("aabb", values, strict=True)]  # fmt: skip
+    clips.append({"source": "c", **clips[0], METRICS[0].name: None})
+    first, second = readme.format_means(clips, METRICS[:2])
+    assert first == "0.400 (0.150 to 0.650)" and second.startswith("0.340 (0.1")
+    gains = [readme.subtract_scores(clip, clips[0]) for clip in clips]
+    assert gains[-1][METRICS[0].name] is None and gains[1]["source"] == "a"
+    assert readme.format_means(gains[:2], METRICS[:1], "+") == ["+0.050"]
+
+
 def test_rows_of_published_networks_that_are_not_scored_again_stay():
     table = readme.Table("README.md", "results", (readme.PAPER, readme.FIRENET, readme.PIENET), {})
     scored = [{metric.name: 0.5 for metric in METRICS}]

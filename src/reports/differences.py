@@ -7,7 +7,7 @@ from typing import Any
 
 from src.metrics.bootstrap import bootstrap_difference_interval
 from src.metrics.table import Column
-from src.records.results import frame_weights
+from src.records.results import frame_weights, list_sources
 from src.records.runs import Run
 from src.reports.clip_conditions import find_differing_test_conditions
 from src.reports.notes import describe_conditions, describe_runs
@@ -103,17 +103,18 @@ def pool_same_clips(
 def compare_clips(
     ours: ClipsOfRuns, theirs: ClipsOfRuns, metric: str
 ) -> tuple[float, float, tuple[float, float]] | None:
-    """Return the mean of each side and the CI of their difference; None where a clip has no such
-    score.
+    """Return the mean of each side over the clips that have such a score in all runs, and the CI of
+    their difference; None where none has.
     """
-    if not all(metric in clip for clips in [*ours, *theirs] for clip in clips):
+    scored = [n for n, same in enumerate(zip(*ours, *theirs, strict=True))
+              if all(metric in clip for clip in same)]  # fmt: skip
+    if not scored:
         return None
     left, right = (
-        [[float(clip[metric]) for clip in clips] for clips in side] for side in (ours, theirs)
+        [[float(clips[n][metric]) for n in scored] for clips in side] for side in (ours, theirs)
     )
-    weights = frame_weights(ours[0])
-    interval = bootstrap_difference_interval(left, right, weights)
-    if len(left[0]) == 1:  # of one clip there is none
-        interval = math.nan, math.nan
+    compared = [ours[0][n] for n in scored]
+    weights, groups = frame_weights(compared), list_sources(compared)
+    interval = bootstrap_difference_interval(left, right, weights, groups)
     means = [fmean(fmean(row, weights) for row in side) for side in (left, right)]
     return means[0], means[1], interval

@@ -10,7 +10,7 @@ import pytest
 from src.records import runs
 from src.report import report
 from src.reports import run_groups
-from src.reports.differences import build_difference_table
+from src.reports.differences import build_difference_table, compare_clips, pool_same_clips
 from src.reports.pairs import build_pair_table
 from src.reports.tables import METRICS, TableCell
 from src.reports.writers import format_cell, format_csv_tables, format_markdown
@@ -238,6 +238,19 @@ def test_one_clip_has_no_interval_and_is_not_bold(tmp_path):
     keys, groups = run_groups.group_runs(both)
     table = build_pair_table("Pairs", keys, groups, [("one", "two")], ["lpips"])
     assert "| one − two | -0.100 |" in format_markdown([table])
+
+
+def test_clips_without_a_score_are_left_out_and_photographs_are_resampled(tmp_path):
+    ours = found(tmp_path, "one", dict.fromkeys("abcd", 0.3))
+    theirs = found(tmp_path, "two", {"a": 0.1, "b": 0.2, "c": 0.4, "d": 0.5})
+    for clip, source in zip(ours[0].clips, "xxyy", strict=True):
+        clip["source"] = source
+    pooled = pool_same_clips("run", ours, theirs)
+    left, right, interval = compare_clips(*pooled, "lpips")
+    assert left - right == pytest.approx(0) and interval == pytest.approx((-0.15, 0.15))
+    del theirs[0].clips[0]["lpips"]
+    left, right, _ = compare_clips(*pooled, "lpips")
+    assert left - right == pytest.approx(0.3 - 1.1 / 3)
 
 
 def test_an_older_run_of_a_seed_is_no_further_seed(tmp_path):
