@@ -242,6 +242,12 @@ def describe_hydra_command() -> dict:
     }
 
 
+def is_typed(key: str) -> bool:
+    """Return whether the command line sets `key`."""
+    overrides = describe_hydra_command().get("overrides", [])
+    return any(override.lstrip("+").startswith(f"{key}=") for override in overrides)
+
+
 def _silence_expected_warnings() -> None:
     """Drop what Lightning warns of in every run and is expected here."""
     for expected in (
