@@ -15,7 +15,8 @@ from src.calibrate import calibrate
 from src.compare import compare, default_video_names
 from src.figures import comparison
 from src.live import build_server
-from src.reconstruct import reconstruct, show_progress
+from src.models import load
+from src.reconstruct import describe_run, reconstruct, show_progress, suggest_faster_form
 from src.recordings import reconstruction, sensor_lookup, simulated_recording, truth_file, views
 from src.recordings.files import read_events
 from src.sim.optics import layout
@@ -179,6 +180,45 @@ def test_a_film_shows_events_one_view_all_views_and_the_clean_clip(
     assert re.search(r", after the first frame \d+\.\d frames per second of wall time, read", line)
 
 
+def test_what_a_run_replaces_is_said_and_no_frame_of_it_stays(folder, tmp_path, capsys):
+    (tmp_path / "run" / "frames").mkdir(parents=True)
+    for number in range(60):
+        (tmp_path / "run" / "frames" / f"{number:07d}.png").touch()
+    chosen = [f"recording={folder}/dot.raw", HIGHPASS, "output_format=png", "resolution=[90,160]"]
+    run = reconstruct(config("reconstruct", tmp_path / "run", *chosen))
+    said = capsys.readouterr().out
+    assert f"{run}/frames, 60 files, is there and will be replaced\n" in said
+    assert 0 < len(list((run / "frames").iterdir())) < 60
+
+
+def test_the_line_of_a_run_counts_one_and_says_what_the_first_frame_took():
+    line = describe_run(Path("run/video.mp4"), (64, 96), 1, 1, 2.5, 2.5)
+    assert line.startswith(
+        "run/video.mp4: 1 frame, 96x64 px, 1 view; 2.5 s, of which 2.5 s prepare"
+    )
+    line = describe_run(Path("run/video.mp4"), (64, 96), 9, 61, 2.0, 14.0)
+    assert "61 frames, 96x64 px, 9 views; 14.0 s, of which 2.0 s prepare the network" in line
+    assert "after the first frame 5.0 frames per second" in line
+
+
+def test_a_faster_form_is_named_after_a_slow_run_that_it_can_run(tmp_path, monkeypatch):
+    net, chosen = load("setnet_small"), ["recording=x", "ckpt=setnet_small"]
+    monkeypatch.setattr("src.reconstruct.fastest_form", lambda: "openvino")
+    cfg = config("reconstruct", tmp_path, *chosen)
+    assert suggest_faster_form(cfg, net, 60.0) == "; form=openvino is faster here"
+    assert not suggest_faster_form(cfg, net, 2.0)
+    assert not suggest_faster_form(cfg, load("clean/etnet"), 60.0)
+    assert not suggest_faster_form(config("reconstruct", tmp_path, *chosen, "form=bf16"), net, 60.0)
+    monkeypatch.setattr("src.reconstruct.fastest_form", lambda: "bf16")
+    assert not suggest_faster_form(cfg, net, 60.0)
+
+
+def test_a_post_processor_is_refused_without_keys_that_are_not_there(tmp_path):
+    cfg = config("reconstruct", tmp_path, "recording=x", "ckpt=mambatm")
+    with pytest.raises(ValueError, match="ckpt must be .* got a post-processor of frames$"):
+        reconstruct(cfg)
+
+
 def test_progress_counts_from_the_start_of_the_recording_on_any_clock(capsys):
     frames = (reconstruction.Frame(1605537494 + k / 100, np.zeros((2, 2)), 1, 0) for k in (1, 2, 3))
     assert len(list(show_progress(frames, 0.5 + 0.01))) == 3  # start_s=0.5, fps=100
@@ -327,7 +367,7 @@ def test_a_lens_array_is_sent_to_a_board(folder, tmp_path):
 
 def test_views_as_small_as_no_network_takes_are_not_calibrated(folder, tmp_path):
     chosen = ["task=views", f"recording={folder}/board.raw", "resolution=[5,1]"]
-    with pytest.raises(ValueError, match="must be >= 8 px .*resolution, .* got 5 and 1"):
+    with pytest.raises(ValueError, match="must be >= 8 px.*resolution, .* got 5 and 1"):
         calibrate(config("calibrate", tmp_path / "run", *chosen))
     assert not list((tmp_path / "run").iterdir())
 
