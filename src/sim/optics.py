@@ -28,10 +28,10 @@ def layout(views: int) -> tuple[Position, ...]:
     """
     if views in SPARSE_LAYOUTS:
         return SPARSE_LAYOUTS[views]
-    side = math.isqrt(max(views, 0))
+    side = math.isqrt(max(views, 0)) if isinstance(views, Integral) else 0
     if side * side != views or not 1 <= side <= 2 * REACH:
-        allowed = f"1, 2, 3, 5 or a square up to {4 * REACH**2}"
-        raise ValueError(f"optics.views must be {allowed}, got {views}")
+        allowed = f"1, 2, 3, 5 or a square up to {4 * REACH**2} (in commands: optics.views)"
+        raise ValueError(f"views must be {allowed}, got {views!r}")
     first = -((side - 1) // 2)
     axis = range(first, first + side)
     return tuple((row, col) for row in axis for col in axis)

@@ -141,6 +141,11 @@ def test_files_that_are_no_networks(suffix, tmp_path):
         load(tmp_path / "plain.safetensors")
 
 
+def test_what_is_no_path_is_refused():
+    with pytest.raises(ValueError, match="ckpt must be a file or one of weights/ .*, got None"):
+        load(None)
+
+
 def test_a_path_is_read_where_the_shipped_weights_may_not_be(tmp_path, monkeypatch):
     def refuse(*_):
         raise PermissionError(13, "Permission denied", "weights")

@@ -26,6 +26,12 @@ def test_unknown_layout_names_the_key(views):
         Optics(views)
 
 
+@pytest.mark.parametrize("views", ["9", 2.5, 7, None])
+def test_a_layout_is_of_a_whole_number(views):
+    with pytest.raises(ValueError, match=r"^views must be 1, 2, 3, 5 or a square .*, got "):
+        layout(views)
+
+
 @pytest.mark.parametrize(
     ("positions", "message"),
     [
