@@ -1,6 +1,7 @@
 """From a simulated recording to views.yaml to video to statistics, through the entry points."""
 
 import csv
+import dataclasses
 import re
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
-from src.calibrate import calibrate
+from src.calibrate import TASKS, calibrate, describe_field
 from src.compare import compare, default_video_names
 from src.figures import comparison
 from src.live import build_server
@@ -292,6 +293,30 @@ def test_a_refusal_beside_earlier_results_leaves_no_config(folder, found):
             )
         )  # fmt: skip
     assert {path.name: path.read_bytes() for path in (folder / "a").iterdir()} == before
+
+
+def test_sides_that_the_aspect_leaves_out_are_said_with_what_keeps_them():
+    wide = simulated_recording.kaleidoscope_views(
+        list(layout(9)), model=(92, 116), sensor=SENSOR, tile_px=116.0
+    )
+    assert describe_field(wide) == "116x92 px"
+    square = describe_field(dataclasses.replace(wide, model=(92, 92)))
+    assert re.fullmatch(
+        r"92x92 px; (1\d|2\d)% of each view is left out, left and right: .*", square
+    )
+    assert 108 <= int(re.search(r"resolution=\[92,(\d+)\] keeps it", square)[1]) <= 120
+    flat = describe_field(dataclasses.replace(wide, model=(46, 116)))
+    assert re.search(r"left out, top and bottom: resolution=\[9\d,116\] keeps it", flat)
+
+
+def test_what_is_measured_is_printed_a_line_each_and_where_it_is_saved(
+    folder, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setitem(TASKS, "air", lambda *given: {"tilt_px": 0.12423904962, "on": (0.2, 1.0)})
+    given = ["task=air", f"video={tmp_path}", f"save={tmp_path}/air.yaml"]
+    calibrate(config("calibrate", tmp_path / ("long" * 20), *given))
+    lines = ["tilt_px: 0.124", "on: 0.2, 1", f"saved in {tmp_path}/air.yaml"]
+    assert capsys.readouterr().out.splitlines() == [*lines, f"in {tmp_path}/{'long' * 20}"]
 
 
 def test_corners_by_hand_replace_the_target(folder, found, tmp_path):

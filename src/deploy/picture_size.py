@@ -5,7 +5,7 @@ from numbers import Integral
 MIN_SIDE = 8  # pixels, so that every side can be padded by reflection
 
 
-def check_picture_size(height: int, width: int) -> None:
+def check_picture_size(height: float, width: float) -> None:
     """Raise ValueError for a side below MIN_SIDE or no whole number, which names the keys of
     commands too."""
     are_whole = isinstance(height, Integral) and isinstance(width, Integral)
