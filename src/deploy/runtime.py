@@ -44,7 +44,7 @@ def fastest_form() -> str:
     return "bf16" if is_bf16_faster() else "float32"
 
 
-def supports_event_lists(network: nn.Module) -> bool:
+def supports_event_lists(network: object) -> bool:
     """Return whether `network` has a first layer that events can be added to one by one."""
     return isinstance(network, SetNet | E2VID)
 
