@@ -10,6 +10,7 @@ from src.app.instantiate import as_dict
 from src.models import files
 from src.models.checkpoints import newest_checkpoint
 from src.models.network import VideoMethod
+from src.records import safe_yaml
 
 
 def set_model_from_start_weights(cfg: DictConfig) -> Path | None:
@@ -55,7 +56,8 @@ def _find_start_of(ckpt: str) -> str:
         return ckpt
     path = newest_checkpoint(path) if path.is_dir() else path
     config = path.parent.parent / "config.yaml"
-    return str(OmegaConf.load(config).get("start", "none")) if config.is_file() else "none"
+    stored = safe_yaml.read(config) if config.is_file() else {}
+    return stored.get("start") or "none"
 
 
 def label_before_training(cfg: DictConfig, path: Path | None) -> str:
