@@ -85,7 +85,7 @@ def test_one_line_and_exit_code_2(name, overrides, said, tmp_path, capsys):
 
 
 def test_a_recording_that_cannot_be_written_is_refused_before_it_is_made(tmp_path, monkeypatch):
-    monkeypatch.setattr(simulate.build, "build_pipeline", None)
+    monkeypatch.setattr(simulate.simulation, "build_pipeline", None)
     cfg = OmegaConf.create({
         "paths": {"run": str(tmp_path)}, "index": 0, "write": "a.xyz", "like": None,
         "video": None, "photo": None,
