@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import rich
 from jaxtyping import Float
 from omegaconf import DictConfig, OmegaConf
 from rich.progress import track
@@ -37,6 +36,7 @@ from src.recordings.views import Views, load_views
 from src.records import results
 from src.records.atomic import check_writable
 
+MOST_LEFT_OUT = 0.05  # of a view, by another aspect, that is not worth a word
 Films = Float[np.ndarray, "views frames h w"]
 
 
@@ -52,7 +52,27 @@ def calibrate_views(cfg: DictConfig, run: Path) -> dict[str, str]:
         summary = {f"error_px of {v.position}": f"{v.error_px:.3f}" for v in views.views}
     for path in filter(None, (run / "views.yaml", cfg.save)):
         views.save(path)
-    return summary
+    return summary | {"resolution": describe_field(views)}
+
+
+def describe_field(views: Views) -> str:
+    """Return the size of a view's picture and, where its aspect leaves out more than MOST_LEFT_OUT
+    of each view, on which sides and the `resolution` that keeps them."""
+    (height, width), (left, top, right, bottom) = views.model, views.field
+    middle, size = np.array([[(left + right) / 2, (top + bottom) / 2]]), f"{width}x{height} px"
+    apart = {view.position: np.abs(view.to_sensor(middle) - middle)[0] for view in views.views}
+    across = [apart[at][0] for at in ((0, -1), (0, 1)) if at in apart]
+    down = [apart[at][1] for at in ((-1, 0), (1, 0)) if at in apart]
+    if not across or not down:
+        return size
+    ratio = float(np.mean(across) / np.mean(down)) * height / width  # of the views to the picture
+    where, kept = "left and right", [height, round(width * ratio)]
+    if ratio < 1:
+        where, kept = "top and bottom", [round(height / ratio), width]
+    lost, keep = 1 - min(ratio, 1 / ratio), f"resolution=[{kept[0]},{kept[1]}] keeps it"
+    if lost < MOST_LEFT_OUT:
+        return size
+    return f"{size}; {lost:.0%} of each view is left out, {where}: {keep}"
 
 
 def _find_views_of_board(cfg: DictConfig, run: Path, target: Target) -> Views:
@@ -242,6 +262,14 @@ TASKS: dict[str, Callable[[DictConfig, Path], dict]] = {
     "turbulence": lambda *given: measure_dot_statistics(*given).summary(),
     "air": lambda *given: measure_turbulence_in_video(*given).summary(),
 }
+SAVED_TASKS = ("views", "air")  # which write a file that `save` has, too
+
+
+def format_value(value: object) -> str:
+    """Return a number with three significant digits, several joined, a text as it is."""
+    if isinstance(value, tuple):
+        return ", ".join(map(format_value, value))
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 def calibrate(cfg: DictConfig) -> dict:
@@ -264,7 +292,11 @@ def calibrate(cfg: DictConfig) -> dict:
     run = Path(cfg.paths.run)
     with results.store_config_when_done(run, entry_point.resolved_yaml(cfg)):
         summary = TASKS[cfg.task](cfg, run)
-    rich.print(summary, f"in {run}")
+    for name, value in summary.items():
+        print(f"{name}: {format_value(value)}")
+    if cfg.save and cfg.task in SAVED_TASKS:
+        print(f"saved in {cfg.save}")
+    print(f"in {run}")
     return summary
 
 

@@ -39,7 +39,8 @@ def draw_speed_accuracy_chart(cfg: DictConfig) -> dict[str, str]:
         path = run / f"chart.{suffix}"
         frontier.draw_accuracy_against_time(path, speeds, scores, side=side, title=title)
     results.write_text(run / "chart.md", text)
-    rich.print(text, f"in {run}")
+    rich.print(text)
+    print(f"in {run}")
     return recommended
 
 

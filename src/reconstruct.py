@@ -17,8 +17,8 @@ import torch
 from omegaconf import DictConfig
 from rich.progress import BarColumn, Progress, TimeElapsedColumn
 
-from src.app import entry_point, methods
-from src.deploy.runtime import EventListRuntime
+from src.app import console, entry_point, methods
+from src.deploy.runtime import EventListRuntime, fastest_form, supports_event_lists
 from src.figures import samples
 from src.models.backward_warmup import check_backward_warmup_s
 from src.models.network import EventToVideoNetwork
@@ -33,6 +33,7 @@ from src.recordings.truth_file import CleanClip
 from src.recordings.views import Views
 from src.records import results
 
+SLOW_RUN_S = 10.0
 RULE_KEYS = ("fps", "bins", "splat", "start_s", "end_s", "noise_filter_s")
 
 
@@ -43,6 +44,7 @@ def reconstruct(cfg: DictConfig) -> Path:
     """
     run, count, first_s, last_s = Path(cfg.paths.run), 0, 0.0, 0.0
     check_settings(cfg)
+    video = run / output.KINDS[cfg.output_format][1]
     network = reconstruction.require_event_network(methods.load_ckpt_or_baseline(cfg))
     views = choose_views(cfg, network)
     make = reconstruct_film_frames if cfg.output_format == "film" else reconstruct_video_frames
@@ -50,6 +52,7 @@ def reconstruct(cfg: DictConfig) -> Path:
     frames, size = make(cfg, network, views)
     shown = show_progress(frames, cfg.start_s + 1 / cfg.fps)
     first = next(shown)  # what is refused is so before a file is made
+    console.say_replaced(video)
     with (
         results.store_config_when_done(run, entry_point.resolved_yaml(cfg)),
         output.open_video_writer(cfg.output_format, run, size, cfg.playback_fps) as write,
@@ -58,8 +61,8 @@ def reconstruct(cfg: DictConfig) -> Path:
             write(frame)
             last_s, count = time.perf_counter() - start, count + 1
             first_s = first_s or last_s
-    video = run / output.KINDS[cfg.output_format][1]
-    print(describe_run(video, size, len(views.views), count, first_s, last_s))
+    said = describe_run(video, size, len(views.views), count, first_s, last_s)
+    print(said + suggest_faster_form(cfg, network, last_s))
     return run
 
 
@@ -91,10 +94,20 @@ def describe_run(
     (height, width), later_s = size, last_s - first_s
     rate = f"{(count - 1) / later_s:.1f} frames per second of wall time" if later_s else ""
     speed = f", after the first frame {rate}, reading and writing included" if later_s else ""
+    frames, views = f"frame{'s' * (count > 1)}", f"view{'s' * (number > 1)}"
     return (
-        f"{video}: {count} frames, {width}x{height} px, {number} view{'s' * (number > 1)}; "
-        f"{last_s:.1f} s{speed}; times in {video.parent / 'frames.csv'}"
+        f"{video}: {count} {frames}, {width}x{height} px, {number} {views}; {last_s:.1f} s, "
+        f"of which {first_s:.1f} s prepare the network and give the first frame{speed}; "
+        f"times in {video.parent / 'frames.csv'}"
     )
+
+
+def suggest_faster_form(cfg: DictConfig, network: EventToVideoNetwork, run_s: float) -> str:
+    """Return what to add to the line of a run of `run_s` that form=openvino would have shortened,
+    else ""."""
+    is_slow = cfg.form == "float32" and cfg.device == "cpu" and run_s > SLOW_RUN_S
+    faster = is_slow and fastest_form() == "openvino" and supports_event_lists(network)
+    return "; form=openvino is faster here" if faster else ""
 
 
 def show_progress(frames: Iterable[Frame], first_s: float) -> Iterator[Frame]:

@@ -3,6 +3,7 @@
 Or a clip of a training, a validation or a test: python -m src.simulate index=3 turbulence=strong.
 """
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from rich.progress import track
 from torch import Tensor
 from yaml import YAMLError
 
-from src.app import entry_point, simulation, user_clip_simulation
+from src.app import console, entry_point, simulation, user_clip_simulation
 from src.app.renamed_keys import refuse_renamed_keys
 from src.app.user_clip_simulation import SimulatedPart, UserClipSimulation
 from src.figures import samples
@@ -71,6 +72,7 @@ def simulate_user_clip(cfg: DictConfig) -> dict:
     if cfg.photo and not cfg.speed_widths_per_s:
         print("at rest, so that only turbulence makes events; speed_widths_per_s=0.3 moves it")
     path, shown = Path(cfg.write or run / f"{clip.name}.raw"), []
+    console.say_replaced(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     views, count = work.allocate_views(path.parent), 0
     with (
@@ -126,6 +128,7 @@ def simulate_scene(cfg: DictConfig) -> dict:
         print(f"written: {', '.join(map(str, written))}")
         return drawn
     path, fps = Path(cfg.write), draw.clip.fps
+    console.say_replaced(path)
     sensor: Any = draw.sensor  # one with `events`
     with create_truth_file(path, camera, len(clean), fps / step, drawn) as truth:
         codes = encode_srgb(views) if pipeline.decodes_srgb else views
@@ -171,7 +174,8 @@ def print_files(path: Path, events: np.ndarray, pictures: list[Path]) -> None:
     print(f"clean frames, views and tilt in {truth} ({size:.1f} MB)")
     print(f"pictures: {', '.join(map(str, pictures))}")
     if len(events):
-        print(f"next: python -m src.reconstruct recording={path} views={views} ckpt=setnet_small")
+        given = shlex.join([f"recording={path}", f"views={views}"])
+        print(f"next: python -m src.reconstruct {given} ckpt=setnet_small")
 
 
 def take_clip_config_from_run(cfg: DictConfig) -> DictConfig:

@@ -54,7 +54,8 @@ def stress(cfg: DictConfig) -> stress_results.Outcomes:
     results.write_text(run / "stress.md", text)
     for suffix in ("png", "svg"):
         draw_stress_map(run / f"stress.{suffix}", outcomes, titles, standard_psnr)
-    rich.print(text, f"in {run}")
+    rich.print(text)
+    print(f"in {run}")
     return outcomes
 
 

@@ -1,5 +1,6 @@
 """Train a network on simulated light fields and test it: python -m src.train experiment=lf3x3."""
 
+import shlex
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -98,7 +99,7 @@ def _fit_or_name_bad_clip(cfg: DictConfig, training: Training) -> None:
     except NonFiniteError as error:
         config = f"{Path(cfg.paths.run)}/config.yaml"
         which = f"index={error.clips[0]}{' large=true' if error.is_large else ''}"
-        same = f"python -m src.simulate like={config} split=train {which}"
+        same = f"python -m src.simulate {shlex.quote(f'like={config}')} split=train {which}"
         raise ValueError(f"{error}; seed {cfg.seed}; to see the clip: {same}") from error
 
 
@@ -178,7 +179,8 @@ def print_checkpoint_on_failure(trainer: lightning.Trainer) -> Iterator[None]:
         folder = find_checkpoint_folder(trainer)
         if any(folder.glob("*.ckpt")):
             step = trainer.global_step
-            print(f"stopped at step {step}; go on with ckpt={folder}", file=sys.stderr)
+            ckpt = shlex.quote(f"ckpt={folder}")
+            print(f"stopped at step {step}; go on with {ckpt}", file=sys.stderr)
         raise
 
 

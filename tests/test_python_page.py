@@ -57,6 +57,9 @@ def test_the_page_runs_as_it_stands(tmp_path, monkeypatch):
         clip.fps == 30 and clip.clean.shape == (15, 40, 56) and clip.drawn["severity"] == "strong"
     )
     assert space["still"].tilt.shape == (1, 13, 2, 64, 96) and space["film"].fps == 60
+    assert len(space["often"]) == 16 and space["often"][-1].std() > 0.01
+    arrived = space["arrived"]
+    assert len(arrived) >= 48 and (np.stack(arrived[:48]) == np.stack(fast)).all()
     assert len(frames) == len(fast) == 48 and frames[-1].std() > 0.01
     joined = lightfield_events.read_events(tmp_path / "array.npz")
     assert len(joined) == 600 and (joined["t"][0], joined["x"][0]) == (-1250, 64)
@@ -88,7 +91,7 @@ def test_the_lists_of_the_page_are_its_grids(monkeypatch):
     clip = SimpleNamespace(positions=layout(9))
     space = {"events": events, "clean": np.zeros((1, 8, 8)), "clip": clip, "net": None}
     space |= {"np": np}
-    for words in ("def grid", "runtime.step"):
+    for words in ("def grid", "def step"):
         (block,) = (block for block in blocks() if words in block)
         exec(compile(block, "docs/python.md", "exec"), space)
     grids = [[space["grid"](k, view) for view in range(9)] for k in range(48)]

@@ -1,6 +1,7 @@
 """From a simulated recording to views.yaml to video to statistics, through the entry points."""
 
 import csv
+import dataclasses
 import re
 from pathlib import Path
 
@@ -11,11 +12,12 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
-from src.calibrate import calibrate
+from src.calibrate import TASKS, calibrate, describe_field
 from src.compare import compare, default_video_names
 from src.figures import comparison
 from src.live import build_server
-from src.reconstruct import reconstruct, show_progress
+from src.models import load
+from src.reconstruct import describe_run, reconstruct, show_progress, suggest_faster_form
 from src.recordings import reconstruction, sensor_lookup, simulated_recording, truth_file, views
 from src.recordings.files import read_events
 from src.sim.optics import layout
@@ -179,6 +181,45 @@ def test_a_film_shows_events_one_view_all_views_and_the_clean_clip(
     assert re.search(r", after the first frame \d+\.\d frames per second of wall time, read", line)
 
 
+def test_what_a_run_replaces_is_said_and_no_frame_of_it_stays(folder, tmp_path, capsys):
+    (tmp_path / "run" / "frames").mkdir(parents=True)
+    for number in range(60):
+        (tmp_path / "run" / "frames" / f"{number:07d}.png").touch()
+    chosen = [f"recording={folder}/dot.raw", HIGHPASS, "output_format=png", "resolution=[90,160]"]
+    run = reconstruct(config("reconstruct", tmp_path / "run", *chosen))
+    said = capsys.readouterr().out
+    assert f"{run}/frames, 60 files, is there and will be replaced\n" in said
+    assert 0 < len(list((run / "frames").iterdir())) < 60
+
+
+def test_the_line_of_a_run_counts_one_and_says_what_the_first_frame_took():
+    line = describe_run(Path("run/video.mp4"), (64, 96), 1, 1, 2.5, 2.5)
+    assert line.startswith(
+        "run/video.mp4: 1 frame, 96x64 px, 1 view; 2.5 s, of which 2.5 s prepare"
+    )
+    line = describe_run(Path("run/video.mp4"), (64, 96), 9, 61, 2.0, 14.0)
+    assert "61 frames, 96x64 px, 9 views; 14.0 s, of which 2.0 s prepare the network" in line
+    assert "after the first frame 5.0 frames per second" in line
+
+
+def test_a_faster_form_is_named_after_a_slow_run_that_it_can_run(tmp_path, monkeypatch):
+    net, chosen = load("setnet_small"), ["recording=x", "ckpt=setnet_small"]
+    monkeypatch.setattr("src.reconstruct.fastest_form", lambda: "openvino")
+    cfg = config("reconstruct", tmp_path, *chosen)
+    assert suggest_faster_form(cfg, net, 60.0) == "; form=openvino is faster here"
+    assert not suggest_faster_form(cfg, net, 2.0)
+    assert not suggest_faster_form(cfg, load("clean/etnet"), 60.0)
+    assert not suggest_faster_form(config("reconstruct", tmp_path, *chosen, "form=bf16"), net, 60.0)
+    monkeypatch.setattr("src.reconstruct.fastest_form", lambda: "bf16")
+    assert not suggest_faster_form(cfg, net, 60.0)
+
+
+def test_a_post_processor_is_refused_without_keys_that_are_not_there(tmp_path):
+    cfg = config("reconstruct", tmp_path, "recording=x", "ckpt=mambatm")
+    with pytest.raises(ValueError, match="ckpt must be .* got a post-processor of frames$"):
+        reconstruct(cfg)
+
+
 def test_progress_counts_from_the_start_of_the_recording_on_any_clock(capsys):
     frames = (reconstruction.Frame(1605537494 + k / 100, np.zeros((2, 2)), 1, 0) for k in (1, 2, 3))
     assert len(list(show_progress(frames, 0.5 + 0.01))) == 3  # start_s=0.5, fps=100
@@ -254,6 +295,30 @@ def test_a_refusal_beside_earlier_results_leaves_no_config(folder, found):
     assert {path.name: path.read_bytes() for path in (folder / "a").iterdir()} == before
 
 
+def test_sides_that_the_aspect_leaves_out_are_said_with_what_keeps_them():
+    wide = simulated_recording.kaleidoscope_views(
+        list(layout(9)), model=(92, 116), sensor=SENSOR, tile_px=116.0
+    )
+    assert describe_field(wide) == "116x92 px"
+    square = describe_field(dataclasses.replace(wide, model=(92, 92)))
+    assert re.fullmatch(
+        r"92x92 px; (1\d|2\d)% of each view is left out, left and right: .*", square
+    )
+    assert 108 <= int(re.search(r"resolution=\[92,(\d+)\] keeps it", square)[1]) <= 120
+    flat = describe_field(dataclasses.replace(wide, model=(46, 116)))
+    assert re.search(r"left out, top and bottom: resolution=\[9\d,116\] keeps it", flat)
+
+
+def test_what_is_measured_is_printed_a_line_each_and_where_it_is_saved(
+    folder, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setitem(TASKS, "air", lambda *given: {"tilt_px": 0.12423904962, "on": (0.2, 1.0)})
+    given = ["task=air", f"video={tmp_path}", f"save={tmp_path}/air.yaml"]
+    calibrate(config("calibrate", tmp_path / ("long" * 20), *given))
+    lines = ["tilt_px: 0.124", "on: 0.2, 1", f"saved in {tmp_path}/air.yaml"]
+    assert capsys.readouterr().out.splitlines() == [*lines, f"in {tmp_path}/{'long' * 20}"]
+
+
 def test_corners_by_hand_replace_the_target(folder, found, tmp_path):
     there = views.load_views(found)
     lines = [
@@ -327,7 +392,7 @@ def test_a_lens_array_is_sent_to_a_board(folder, tmp_path):
 
 def test_views_as_small_as_no_network_takes_are_not_calibrated(folder, tmp_path):
     chosen = ["task=views", f"recording={folder}/board.raw", "resolution=[5,1]"]
-    with pytest.raises(ValueError, match="must be >= 8 px .*resolution, .* got 5 and 1"):
+    with pytest.raises(ValueError, match="must be >= 8 px.*resolution, .* got 5 and 1"):
         calibrate(config("calibrate", tmp_path / "run", *chosen))
     assert not list((tmp_path / "run").iterdir())
 

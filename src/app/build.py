@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import lightning
@@ -36,6 +37,7 @@ from src.models.setnet import SetNet
 from src.records.results import ScoreRow
 from src.sim.optics import Optics
 from src.sim.pipeline import Sample
+from src.sim.scenes.photo_files import decode_photograph
 from src.training import evaluation
 from src.training.clip_cache import CachedPipeline
 from src.training.datamodule import LightFieldData
@@ -52,6 +54,7 @@ DATA_OPTIONS = (
     "batch_size", "batch_reuse", "epoch_clips", "val_clips", "test_clips", "workers", "simulate_on",
 )  # fmt: skip
 SWEEP_STORE = SampleStore()  # of the jobs of a sweep that run in this process
+SMALL_PHOTOGRAPH_BYTES = 4096
 Trainable = EventToVideoNetwork | FramePostprocessor
 
 
@@ -59,9 +62,14 @@ def build_data_module(
     cfg: DictConfig, splits: tuple[str, ...] = ("train", "val", "test"),
     optics: Optics | None = None,
 ) -> LightFieldData:  # fmt: skip
-    """Return the data module with the pipelines of `splits`; `optics`: others than `cfg`'s."""
+    """Return the data module with the pipelines of `splits`; `optics`: others than `cfg`'s.
+
+    Raises ValueError as `check_small_photographs` does.
+    """
     check_unscored_windows(cfg)
     pipelines = {split: build_pipeline(cfg, split, optics) for split in splits}
+    for pipeline in pipelines.values():
+        check_small_photographs(pipeline.scene)
     train = pipelines.get("train")
     large = build_large_crop_stream(cfg, optics) if train else None
     streams = [*([large.pipeline] if large else []), train]  # the few large clips first
@@ -95,6 +103,16 @@ def build_teachers(cfg: DictConfig, views: int) -> TeacherEnsemble:
         networks[name] = net
     rates = tuple(cfg.data.rates or ())
     return TeacherEnsemble(networks, cfg.distillation_cache, cfg.fps, rates)
+
+
+def check_small_photographs(scene: Any) -> None:
+    """Raise ValueError for a file of few bytes among the photographs of `scene` that cannot be read
+    or is below 16 px: a clip would meet it late.  Larger files are read as clips show them."""
+    for part in getattr(scene, "scenes", ()):
+        check_small_photographs(part)
+    for photo in getattr(scene, "photos", ()):
+        if isinstance(photo, Path) and photo.stat().st_size < SMALL_PHOTOGRAPH_BYTES:
+            decode_photograph(photo)
 
 
 def build_untrained_network(cfg: DictConfig) -> tuple[Trainable, dict]:

@@ -9,6 +9,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from src.app import console
 from src.app.config_values import check_values_like
 from src.app.path_overrides import quote_paths, refuse_empty_paths
 from src.app.renamed_keys import (
@@ -63,8 +64,8 @@ def compose_checked_config(
 
 def describe_config_error(error: Exception, name: str) -> str:
     """Return in one line what is wrong with the overrides of conf/<name>.yaml, without the folders
-    that Hydra has searched."""
-    message = str(error)
+    that Hydra has searched; of what a worker of a DataLoader raised its last line."""
+    message = console.cut_worker_traceback(str(error))
     explained = explain_refused_key(message, _list_keys(name) if "Could not" in message else ())
     return " ".join((explained or message.partition("Config search path:")[0]).split())
 

@@ -1,6 +1,8 @@
-"""What is printed, on any terminal: missing signs are replaced, a warning takes one line."""
+"""What is printed, on any terminal: missing signs are replaced, a warning or an error takes one
+line."""
 
 import codecs
+import re
 import sys
 import warnings
 from pathlib import Path
@@ -17,6 +19,21 @@ def prepare_streams() -> None:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="nearest_sign")
     warnings.showwarning = _show_warning
+
+
+def say_replaced(path: Path) -> None:
+    """Print that the file or folder `path`, where it is there, will be replaced."""
+    if path.exists():
+        held = f", {len(list(path.iterdir()))} files," if path.is_dir() else ""
+        print(f"{path}{held} is there and will be replaced")
+
+
+def cut_worker_traceback(message: str) -> str:
+    """Return `message` of an error; of one that a worker of a DataLoader raised, which PyTorch
+    hands on with its traceback, what it said there."""
+    pattern = r"Caught (\w+) in DataLoader worker.*?\nOriginal Traceback.*\n\1: (.*)"
+    found = re.fullmatch(pattern, message, re.DOTALL)
+    return found[2] if found else message
 
 
 def _replace(error: UnicodeError) -> tuple[str, int]:

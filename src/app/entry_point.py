@@ -33,6 +33,7 @@ from src.app.path_overrides import (
 from src.app.renamed_keys import refuse_renamed_keys, refuse_renamed_overrides
 from src.app.stop_signals import StoppedBySignal, stop_by_signals
 from src.models import files
+from src.models.checkpoints import list_checkpoints
 from src.records import results
 
 FAILURE_FILE = "failed.txt"  # in the folder of a sweep's job: why it failed
@@ -161,7 +162,8 @@ def run_job(
     except _stop_errors():  # ends the sweep
         raise KeyboardInterrupt from None
     except Exception as error:
-        print(f"failed: {name}: {' '.join(str(error).split())}", file=sys.stderr)
+        said = " ".join(console.cut_worker_traceback(str(error)).split())
+        print(f"failed: {name}: {said}", file=sys.stderr)
         results.write_text(folder / FAILURE_FILE, f"{name}\n{traceback.format_exc()}")
     else:
         return
@@ -191,7 +193,7 @@ def _has_newer_weights(cfg: DictConfig, stored: Path) -> bool:
         return False
     names = [cfg.get("ckpt"), OmegaConf.select(cfg, "baseline.weights")]
     paths = [files.locate(name) for name in names if isinstance(name, str)]
-    found = [file for path in paths for file in (path.rglob("*.ckpt") if path.is_dir() else [path])]
+    found = [f for path in paths for f in (list_checkpoints(path) if path.is_dir() else [path])]
     return any(f.stat().st_mtime > stored.stat().st_mtime for f in found if f.is_file())
 
 
@@ -247,6 +249,12 @@ def describe_hydra_command() -> dict:
         "choices": {group: choice for group, choice in groups.items() if "hydra/" not in group},
         "overrides": list(map(unquote_override, job.overrides.task)),
     }
+
+
+def is_typed(key: str) -> bool:
+    """Return whether the command line sets `key`."""
+    overrides = describe_hydra_command().get("overrides", [])
+    return any(override.lstrip("+").startswith(f"{key}=") for override in overrides)
 
 
 def _silence_expected_warnings() -> None:

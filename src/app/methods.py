@@ -36,7 +36,8 @@ def load_ckpt_or_baseline(cfg: DictConfig) -> VideoMethod:
         net = src.models.load(cfg.ckpt, read_user_packages(cfg))
         if not isinstance(net, VideoMethod):
             use = f"baseline=frames postprocess=mambatm postprocess.postprocessor={cfg.ckpt}"
-            raise ValueError(f"ckpt must be a network for events, got a post-processor; use {use}")
+            how = f"; use {use}" if "postprocess" in cfg else " of frames"
+            raise ValueError(f"ckpt must be a network for events, got a post-processor{how}")
         return net
     if cfg.get("baseline"):
         return build_part(cfg, "baseline").eval()

@@ -5,19 +5,24 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-from src.app import methods
+from src.app import entry_point, methods
 from src.app.instantiate import as_dict
 from src.models import files
+from src.models.checkpoints import newest_checkpoint
 from src.models.network import VideoMethod
+from src.records import safe_yaml
 
 
 def set_model_from_start_weights(cfg: DictConfig) -> Path | None:
     """Return the file that `start` names, None for a training from nothing, and make `cfg.model`
     its network: width, stem and all that follows from the weights.
 
-    An E2VID on one view is given those of `optics`.  Raises ValueError for a file that is not there
-    or holds weights of another class, number of bins or number of views.
+    Where `ckpt` goes on, the `start` of budget=fine_tuning gives way to what `ckpt` began from; one
+    that is typed stays.  An E2VID on one view is given those of `optics`.  Raises ValueError for a
+    file that is not there or holds weights of another class, number of bins or number of views.
     """
+    if cfg.start not in (None, "none") and cfg.ckpt and not entry_point.is_typed("start"):
+        cfg.start = _find_start_of(cfg.ckpt)
     if cfg.start in (None, "none"):
         return None
     path = files.locate(cfg.start)
@@ -41,6 +46,18 @@ def set_model_from_start_weights(cfg: DictConfig) -> Path | None:
         kwargs["views"] = views
     OmegaConf.update(cfg, "model", {"_target_": got, **kwargs}, merge=False)
     return path
+
+
+def _find_start_of(ckpt: str) -> str:
+    """Return the `start` of the run of `ckpt`, none of one without a config; of a file of weights
+    the file itself."""
+    path = files.locate(ckpt)
+    if files.is_weights_file(path):
+        return ckpt
+    path = newest_checkpoint(path) if path.is_dir() else path
+    config = path.parent.parent / "config.yaml"
+    stored = safe_yaml.read(config) if config.is_file() else {}
+    return stored.get("start") or "none"
 
 
 def label_before_training(cfg: DictConfig, path: Path | None) -> str:

@@ -44,7 +44,7 @@ def fastest_form() -> str:
     return "bf16" if is_bf16_faster() else "float32"
 
 
-def supports_event_lists(network: nn.Module) -> bool:
+def supports_event_lists(network: object) -> bool:
     """Return whether `network` has a first layer that events can be added to one by one."""
     return isinstance(network, SetNet | E2VID)
 
@@ -73,8 +73,10 @@ class EventListRuntime:
         if form not in EVENT_LIST_FORMS:
             raise ValueError(f"form must be one of {', '.join(EVENT_LIST_FORMS)}, got {form}")
         if not supports_event_lists(network):
+            how = f"; use load({network!r})" if isinstance(network, str) else ""
             kind = type(network).__name__
-            raise ValueError(f"a list of events needs a SetNet or an E2VID, got {kind}")
+            raise ValueError(f"a list of events needs a SetNet or an E2VID, got {kind}{how}")
+        _check_positions(positions)
         check_picture_size(height, width)
         if threads < 1:
             raise ValueError(f"threads must be >= 1, got {threads}")
@@ -95,10 +97,11 @@ class EventListRuntime:
         else:
             assert isinstance(copied, E2VID)
             if (given := self.views) != (views := copied.views):
-                raise ValueError(f"optics.views must be {views} for this network, got {given}")
+                wanted = f"{views} (row, col) for this network"
+                raise ValueError(f"positions must be {wanted}, got {given}: {list(positions)}")
             if not is_arranged_as_layout(positions):
                 wanted = f"arranged as {list(layout(views))} for this network"
-                raise ValueError(f"optics.positions must be {wanted}, got {list(positions)}")
+                raise ValueError(f"positions must be {wanted}, got {list(positions)}")
             self.runner = E2VIDOverEvents(copied, padded, dtype, backend, threads)
         self.state_arrays, self.warned = _describe_arrays(self.runner.state), set[str]()
 
@@ -235,6 +238,15 @@ class EventListRuntime:
                 events = [np.concatenate([part, part[low], part[high]]) for part in events]
                 events[axis] = np.concatenate(mirrored) + before
         return events
+
+
+def _check_positions(positions: Any) -> None:
+    try:
+        fits = all(len(position) == 2 for position in positions)
+    except TypeError:
+        fits = False
+    if not fits:
+        raise ValueError(f"positions must be the (row, col) of each view, got {positions}")
 
 
 def _clip_rounded(t: np.ndarray, t0: float, t1: float) -> np.ndarray:

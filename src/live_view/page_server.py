@@ -1,13 +1,16 @@
 """The web server: the page, its stream of messages, `/status` and `/frame.png`.
 
 A message of the stream is the length of a JSON header (uint32, little endian), the header, and the
-JPEGs it lists.  The browser sends JSON: pause, line, network and views, all_views, tone, one_view.
+JPEGs it lists.  The browser sends JSON: pause, line, network and views, all_views, tone, one_view;
+what makes no sense is answered by a header with `refused`, a line.
 """
 
 import asyncio
+import ipaddress
 import json
 import math
 import re
+import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -33,6 +36,7 @@ MAX_REQUEST_BYTES = 4096
 NO_CACHE = {"Cache-Control": "no-store"}
 ORIGIN = re.compile(r"(https?://[a-z0-9.-]+(:\d+)?)/?")
 THIS_MACHINE = ("127.0.0.1", "localhost", "::1")
+ALL_ADDRESSES = ("0.0.0.0", "::")
 
 
 class LivePage:
@@ -65,8 +69,7 @@ class LivePage:
             self.status_sent, header["status"] = now, self.status()
         elif not pictures:
             return None
-        text = json.dumps(header).encode()
-        return len(text).to_bytes(4, "little") + text + b"".join(data for _, data in pictures)
+        return _pack(header) + b"".join(data for _, data in pictures)
 
     def status(self) -> dict:
         """Return the meters, and what is chosen and offered."""
@@ -114,6 +117,11 @@ class LivePage:
             self.slice.line = _parse_line(request["line"])
         if "network" in request:
             self.controls.choose(str(request["network"]), request.get("views", "all"))
+
+
+def _pack(header: dict) -> bytes:
+    text = json.dumps(header).encode()
+    return len(text).to_bytes(4, "little") + text
 
 
 def _parse_line(numbers: object) -> Line:
@@ -186,14 +194,22 @@ class PageServer:
 
     @web.middleware
     async def _own_pages_only(self, request: web.Request, handler) -> web.StreamResponse:
-        """Refuse requests that another site's page makes in a visitor's browser."""
+        """Refuse requests that another site's page makes in a visitor's browser: from its origin,
+        or by its name, which it may have bound to this machine's address."""
         host = request.host.rsplit(":", 1)[0].strip("[]")
-        local = self.host in THIS_MACHINE and request.host not in self.proxies
         origin = request.headers.get("Origin")
         known = origin in (None, f"http://{request.host}") or origin in self.origins
-        if not known or (local and host not in THIS_MACHINE):
-            raise web.HTTPForbidden(text="this page serves its own address only")
+        if not known or not (request.host in self.proxies or self._is_own_name(host)):
+            how = "other names: allowed_origins=[http://<name>:<port>]"
+            raise web.HTTPForbidden(text=f"this page serves its own address only; {how}")
         return await handler(request)
+
+    def _is_own_name(self, host: str) -> bool:
+        """Return whether `host` is an address or the name of this machine."""
+        if host in THIS_MACHINE or self.host in THIS_MACHINE:
+            return host in THIS_MACHINE
+        name = socket.gethostname().lower()
+        return _is_ip_address(host) or host.lower() in (self.host.lower(), name, f"{name}.local")
 
     async def _page(self, request: web.Request) -> web.Response:
         streams = " ".join(f"ws://{host} wss://{host}" for host in sorted(self.proxies))
@@ -215,30 +231,57 @@ class PageServer:
         return web.Response(body=content, content_type="image/png", headers=NO_CACHE)
 
     async def _stream(self, request: web.Request) -> web.WebSocketResponse:
-        socket = web.WebSocketResponse(compress=False, max_msg_size=MAX_REQUEST_BYTES, heartbeat=20)
-        await socket.prepare(request)
+        visitor = web.WebSocketResponse(
+            compress=False, max_msg_size=MAX_REQUEST_BYTES, heartbeat=20
+        )
+        await visitor.prepare(request)
         queue: asyncio.Queue = asyncio.Queue(1)
         queue.put_nowait(self.page.message(whole=True))
         self.visitors.add(queue)
-        sending = asyncio.create_task(_send(socket, queue))
+        sending = asyncio.create_task(_send(visitor, queue))
         try:
-            async for message in socket:
-                if message.type == WSMsgType.TEXT:
-                    await self._handle(message.data)
+            async for message in visitor:
+                if message.type != WSMsgType.TEXT:
+                    continue
+                if refused := await self._handle(message.data):
+                    await visitor.send_bytes(_pack({"pictures": [], "refused": refused}))
         finally:
             self.visitors.discard(queue)
             sending.cancel()
-        return socket
+        return visitor
 
-    async def _handle(self, text: str) -> None:
-        """Do what a visitor asks, in a thread: a network may have to be made ready."""
+    async def _handle(self, text: str) -> str:
+        """Do what a visitor asks, in a thread: a network may have to be made ready.  Return why it
+        is refused, else ""."""
         try:
             request = json.loads(text)
             if not isinstance(request, dict):
                 raise ValueError(f"a request must be a mapping, got {request}")
             await asyncio.to_thread(self.page.handle_request, request)
         except (ValueError, OverflowError, RecursionError) as error:
-            self.page.player.faults.report("request", str(error))
+            return str(error)
+        return ""
+
+
+def find_address(host: str, port: int) -> str:
+    """Return where a page that listens at `host` is found: of all addresses, this machine's in its
+    network, else its name."""
+    if host in ALL_ADDRESSES:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.connect(("192.0.2.1", 9))  # sends nothing: it chooses the way out
+                host = probe.getsockname()[0]
+            except OSError:
+                host = socket.gethostname()
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+
+def _is_ip_address(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
 
 
 def _parse_origin(origin: str) -> str:
@@ -256,9 +299,9 @@ def _replace(queue: asyncio.Queue, message: bytes | None) -> None:
     queue.put_nowait(message)
 
 
-async def _send(socket: web.WebSocketResponse, queue: asyncio.Queue) -> None:
-    """Send what is put into `queue`; None closes the socket."""
+async def _send(visitor: web.WebSocketResponse, queue: asyncio.Queue) -> None:
+    """Send what is put into `queue`; None closes the stream."""
     with suppress(ConnectionError, RuntimeError):  # the visitor has gone
         while (message := await queue.get()) is not None:
-            await socket.send_bytes(message)
-        await socket.close()
+            await visitor.send_bytes(message)
+        await visitor.close()

@@ -40,13 +40,21 @@ def is_compressed_zip(path: Path) -> bool:
         return sum(part.file_size for part in archive.infolist()) > path.stat().st_size
 
 
+def list_checkpoints(folder: Path) -> list[Path]:
+    """Return the checkpoints of a run or of a folder of runs, such as out/train/lf3x3: `*.ckpt` in
+    `folder`, in its `checkpoints/` and in those of each run in it, which holds a `config.yaml`."""
+    runs = [config.parent for config in folder.glob("*/config.yaml")]
+    places = [folder, folder / "checkpoints", *(run / "checkpoints" for run in runs)]
+    return [path for place in places for path in place.glob("*.ckpt")]
+
+
 def newest_checkpoint(run: Path) -> Path:
-    """Return the newest whole checkpoint in the folder `run` or below; warns of damaged ones, and
-    where folders of several runs are there.
+    """Return the newest whole checkpoint of `list_checkpoints`; warns of damaged ones, and where
+    folders of several runs are there.
 
     Raises ValueError, beginning with `ckpt`, where there is none.
     """
-    paths = sorted(run.rglob("*.ckpt"), key=lambda path: path.stat().st_mtime_ns)[::-1]
+    paths = sorted(list_checkpoints(run), key=lambda path: path.stat().st_mtime_ns)[::-1]
     runs = len({path.parent for path in paths})
     for path in paths:
         if is_intact(path):

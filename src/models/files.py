@@ -39,8 +39,9 @@ def load(name_or_path: str | Path, allowed_packages: Sequence[str] = ()) -> nn.M
     beginning with `ckpt`, for a file that is not there, is no such file, or holds other weights
     than its network has.
     """
-    path = locate(name_or_path)
-    if path.is_dir():
+    is_path = isinstance(name_or_path, str | os.PathLike)
+    path = locate(name_or_path) if is_path else Path()
+    if is_path and path.is_dir():
         path = newest_checkpoint(path)
     if not path.is_file():
         where = f"weights/ ({list_shipped()})"

@@ -288,15 +288,18 @@ class SetNet(EventToVideoNetwork):
         if bins != self.bins:
             raise ValueError(f"bins must be {self.bins} for this network, got {bins}")
         if not 1 <= views <= MAX_VIEWS:
-            raise ValueError(f"optics.views must be in 1..{MAX_VIEWS}, got {views}")
+            allowed = f"in 1..{MAX_VIEWS} (in commands: optics.views)"
+            raise ValueError(f"views must be {allowed}, got {views}")
         positions = layout(views) if positions is None else positions
         if len(positions) != views:
-            raise ValueError(f"optics.positions must be {views} (row, col), got {positions}")
+            wanted = f"{views} (row, col) (in commands: optics.positions)"
+            raise ValueError(f"positions must be {wanted}, got {positions}")
         whole = tuple((int(row), int(column)) for row, column in positions)
         is_near = all(max(abs(row), abs(column)) <= REACH for row, column in whole)
         if not is_near or len(set(whole)) < views or whole != tuple(map(tuple, positions)):
             wanted = f"different whole (row, col) in -{REACH}..{REACH}"
-            raise ValueError(f"optics.positions must be {wanted}, got {positions}")
+            keys = "(in commands: optics.positions)"
+            raise ValueError(f"positions must be {wanted} {keys}, got {positions}")
         return whole
 
     def _checked_state(self, state: SetNetState | None, cells: Tensor) -> SetNetState:

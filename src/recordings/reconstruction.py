@@ -77,8 +77,8 @@ def takes_all_views(network: EventToVideoNetwork, positions: Sequence[Position])
     """
     wants, views = network.views, len(positions)
     if wants not in (None, 1, views):
-        has = f"the recording has {views}; give views=views.yaml"
-        raise ValueError(f"ckpt wants {wants} views, {has}")
+        how = "; give views=views.yaml" if views == 1 else ""
+        raise ValueError(f"ckpt wants {wants} views, the recording has {views}{how}")
     if not accepts_views(network, positions):
         arranged = f"arranged as {list(layout(views))}"
         raise ValueError(f"ckpt wants views {arranged}, the recording has {list(positions)}")

@@ -190,7 +190,7 @@ def write_and_print_results(
         print(note)
     found = [*run.glob("*.*"), *run.glob("*/*.*")]  # not the thousands of saved frames below
     files = sorted(str(file.relative_to(run)) for file in found if file.is_file())
-    rich.print(f"in {run}: " + ", ".join(file for file in files if not file.startswith(".")))
+    print(f"in {run}: " + ", ".join(file for file in files if not file.startswith(".")))
     return record
 
 

@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from numbers import Integral
+from operator import index
 from typing import Any
 
 Position = tuple[int, int]
@@ -26,12 +27,16 @@ def layout(views: int) -> tuple[Position, ...]:
     An odd square has its centre view at (0, 0); an even one has (0, 0) up and left of its centre.
     Raises ValueError for a number without a layout.
     """
-    if views in SPARSE_LAYOUTS:
-        return SPARSE_LAYOUTS[views]
-    side = math.isqrt(max(views, 0))
-    if side * side != views or not 1 <= side <= 2 * REACH:
-        allowed = f"1, 2, 3, 5 or a square up to {4 * REACH**2}"
-        raise ValueError(f"optics.views must be {allowed}, got {views}")
+    try:
+        number = index(views)  # of a tensor too, as traced
+    except TypeError:
+        number = 0
+    if number in SPARSE_LAYOUTS:
+        return SPARSE_LAYOUTS[number]
+    side = math.isqrt(max(number, 0))
+    if side * side != number or not 1 <= side <= 2 * REACH:
+        allowed = f"1, 2, 3, 5 or a square up to {4 * REACH**2} (in commands: optics.views)"
+        raise ValueError(f"views must be {allowed}, got {views!r}")
     first = -((side - 1) // 2)
     axis = range(first, first + side)
     return tuple((row, col) for row in axis for col in axis)

@@ -4,6 +4,7 @@ import platform
 import subprocess
 import sys
 
+import cv2
 import numpy as np
 import pytest
 from lightning.pytorch.callbacks import ProgressBar
@@ -290,3 +291,19 @@ def test_a_network_of_a_fixed_number_of_views_loses_none(key, tmp_path):
     cfg = config("train", tmp_path, *TINY, "experiment=lf3x3", f"augment.{key}=0.5")
     with pytest.raises(ValueError, match=f"augment.{key} must be 0, got 0.5: .* takes 9 views"):
         build.build_reconstructor(cfg, *build.build_untrained_network(cfg))
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff\xd8\xff\xe0", "5x5"])
+def test_a_small_file_that_is_no_photograph_is_named_before_anything_runs(content, tmp_path):
+    for number in range(10):
+        photo = np.random.default_rng(number).integers(0, 255, (64, 64), np.uint8)
+        cv2.imwrite(str(tmp_path / f"{number}.png"), photo)
+    build.build_data_module(_of_photographs(tmp_path), ("train",))
+    small = cv2.imencode(".png", np.zeros((5, 5), np.uint8))[1].tobytes()
+    (tmp_path / "3.png").write_bytes(small if content == "5x5" else content)
+    with pytest.raises(ValueError, match="scene.root must hold readable photographs .*3.png"):
+        build.build_data_module(_of_photographs(tmp_path), ("train",))
+
+
+def _of_photographs(root):
+    return config("train", root, f"scene.root={root}")

@@ -10,10 +10,11 @@ import time
 from unittest.mock import Mock
 
 import pytest
+import torch
 from lightning import Trainer
 from rich.console import Console
 
-from src.app import methods
+from src.app import entry_point, methods
 from src.app.help import help_text
 from src.records.results import ScoreRow, build_rich_score_table, describe_score_difference
 from src.training.progress import TrainingProgress
@@ -124,6 +125,22 @@ def read_until(terminal: int, word: bytes, seconds: float) -> bytes:
 
 
 @pytest.mark.slow
+def test_of_an_error_in_a_worker_the_line_is_printed(capsys, monkeypatch):
+    class Broken(torch.utils.data.Dataset):
+        def __len__(self):
+            return 1
+
+        def __getitem__(self, index):
+            raise ValueError("scene.root must hold photographs, got a.png")
+
+    loader = torch.utils.data.DataLoader(Broken(), num_workers=1)
+    monkeypatch.setattr(sys, "argv", ["train"])
+    with pytest.raises(SystemExit) as ended:
+        entry_point.run_main(lambda: next(iter(loader)))
+    said = capsys.readouterr().err
+    assert said == "error: scene.root must hold photographs, got a.png\n" and ended.value.code == 2
+
+
 def test_ctrl_c_at_a_terminal_ends_in_one_line(tmp_path):
     words = [*SMALL, f"hydra.run.dir={tmp_path}"]
     child, terminal = pty.fork()

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from src.app import build, start_weights
+from src.app import build, entry_point, start_weights
 from src.models import files, load
 from src.models.e2vid import E2VID
 from src.models.network import unroll
@@ -61,6 +61,26 @@ def test_a_wrong_start_is_one_line_that_names_it(overrides, said, tmp_path):
     (tmp_path / "no.safetensors").write_bytes(b"none")
     cfg = config("train", tmp_path, *(given.format(tmp=tmp_path) for given in overrides))
     with pytest.raises(ValueError, match=said):
+        start_weights.set_model_from_start_weights(cfg)
+
+
+def test_what_a_resumed_run_began_from_replaces_the_start_of_the_budget(tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    (run / "checkpoints").mkdir(parents=True)
+    (run / "config.yaml").write_text("start: setnet_small\n")
+    (last := run / "checkpoints" / "last.ckpt").touch()
+    resumed = ["experiment=setnet_small", "budget=fine_tuning"]
+    for ckpt in (last, "setnet_small"):
+        cfg = config("train", tmp_path, *resumed, f"ckpt={ckpt}")
+        assert start_weights.set_model_from_start_weights(cfg) == files.locate("setnet_small")
+        assert cfg.start == "setnet_small"  # as the table calls what it began as
+    (run / "config.yaml").unlink()
+    cfg = config("train", tmp_path, *resumed, f"ckpt={last}")
+    assert start_weights.set_model_from_start_weights(cfg) is None
+    typed = {"overrides": ["start=single256"]}
+    monkeypatch.setattr(entry_point, "describe_hydra_command", lambda: typed)
+    cfg = config("train", tmp_path, *resumed, f"ckpt={last}", "start=single256")
+    with pytest.raises(ValueError, match="start must be weights of src.models.setnet.SetNet"):
         start_weights.set_model_from_start_weights(cfg)
 
 

@@ -134,5 +134,5 @@ def test_a_file_that_is_refused_leaves_the_one_before(tmp_path, monkeypatch):
 def test_sides_that_a_runtime_refuses_are_not_exported(height, width, tmp_path, monkeypatch):
     monkeypatch.setattr(onnx_export, "require_onnx", lambda: None)
     size = {"views": 9, "height": height, "width": width}
-    with pytest.raises(ValueError, match=f">= 8 px .*, got {height} and {width}"):
+    with pytest.raises(ValueError, match=f">= 8 px.*, got {height} and {width}"):
         export_onnx(NETWORKS["setnet"](), tmp_path / "a.onnx", **size)

@@ -2,6 +2,7 @@
 
 import copy
 import gc
+import inspect
 import os
 import sys
 from pathlib import Path
@@ -271,15 +272,19 @@ ROW = {"positions": [(0, k) for k in range(9)]}
 @pytest.mark.parametrize(
     ("name", "options", "words"),
     [
-        ("setnet", CROWD, r"optics.views must be in 1\.\.25, got 26"),
-        ("e2vid", {"positions": layout(4)}, "optics.views must be 9 for this network, got 4"),
-        ("e2vid", ROW, "optics.positions must be arranged as .* for this network, got .*, 8"),
-        ("e2vid", {"positions": [(0, 0)] * 9}, "optics.positions must be arranged as"),
-        ("e2vid", {"positions": layout(9)[::-1]}, "optics.positions must be arranged as"),
+        ("setnet", CROWD, r"views must be in 1\.\.25 .*, got 26"),
+        (
+            "e2vid",
+            {"positions": layout(4)},
+            "^positions must be 9 .row, col. for this network, got 4",
+        ),
+        ("e2vid", ROW, "^positions must be arranged as .* for this network, got .*, 8"),
+        ("e2vid", {"positions": [(0, 0)] * 9}, "^positions must be arranged as"),
+        ("e2vid", {"positions": layout(9)[::-1]}, "^positions must be arranged as"),
         (
             "setnet",
             {"height": 7},
-            "must be >= 8 px .*resolution, else sensor_size.*, got 7 and",
+            "must be >= 8 px.*resolution, else sensor_size.*, got 7 and",
         ),
         ("setnet", {"threads": 0}, "threads must be >= 1, got 0"),
         ("setnet", {"form": "float16"}, "form must be one of float32, bf16, openvino"),
@@ -302,6 +307,22 @@ def test_a_square_of_any_spacing_is_what_an_e2vid_takes():
 def test_another_network_is_refused():
     with pytest.raises(ValueError, match="a list of events needs a SetNet or an E2VID, got FireN"):
         EventListRuntime(FireNet(), positions=layout(1), height=24, width=32)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"positions": [0, 0]}, r"positions must be the \(row, col\) of each view, got \[0, 0\]"),
+        ({"positions": 9}, r"positions must be the \(row, col\) of each view, got 9"),
+        ({"height": 64.5}, "height and width must be >= 8 px, whole .*, got 64.5 and 32"),
+        ({"network": "setnet_small"}, r"got str; use load\('setnet_small'\)"),
+    ],
+)
+def test_what_is_of_another_type_is_named(options, words):
+    make = inspect.unwrap(EventListRuntime.__init__)  # without the type checks of tests
+    given = {"network": network("setnet"), "positions": layout(9), "height": 24, "width": 32}
+    with pytest.raises(ValueError, match=words):
+        make(EventListRuntime.__new__(EventListRuntime), **given | options)
 
 
 def test_without_the_package_it_says_how_to_get_it(monkeypatch):

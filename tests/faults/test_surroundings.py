@@ -69,12 +69,17 @@ def test_a_damaged_checkpoint_is_passed_over(tmp_path):
 
 
 def test_a_folder_of_several_runs_says_which_one_is_taken(tmp_path):
-    for number, name in enumerate(("new", "old")):
-        (tmp_path / name).mkdir()
-        written(tmp_path / name / "last.ckpt", 1.0)
-        os.utime(tmp_path / name / "last.ckpt", (9 - number, 9 - number))
-    with pytest.warns(UserWarning, match="holds 2 runs, the newest is taken: .*new/last.ckpt"):
-        assert newest_checkpoint(tmp_path) == tmp_path / "new/last.ckpt"
+    last = [tmp_path / name / "checkpoints" / "last.ckpt" for name in ("new", "old", "no_run")]
+    for path, time in zip(last, (8, 7, 9), strict=True):
+        path.parent.mkdir(parents=True)
+        written(path, 1.0)
+        os.utime(path, (time, time))
+        if time < 9:  # of any other folder no checkpoint is taken
+            (path.parents[1] / "config.yaml").touch()
+    with pytest.warns(UserWarning, match="holds 2 runs, the newest is taken: .*new/checkpoints"):
+        assert newest_checkpoint(tmp_path) == last[0]
+    with pytest.raises(ValueError, match="ckpt must be a folder with a whole checkpoint"):
+        newest_checkpoint(tmp_path.parent)
 
 
 @pytest.mark.parametrize("kind", ["mp4", "png", "gif"])

@@ -468,15 +468,18 @@ def test_the_server_answers_and_takes_only_what_makes_sense(recording):
             async with session.ws_connect("/stream") as socket:
                 for asked in NONSENSE:
                     await socket.send_str(asked)
-                headers = [await _header(socket) for _ in range(12)]
+                headers = [await _header(socket) for _ in range(24)]
         stop.set()
         await running
-        return [header["status"] for header in headers if "status" in header]
+        return headers
 
-    headers = asyncio.run(visit())
+    answers = asyncio.run(visit())
     made.page.player.stop()
+    headers = [answer["status"] for answer in answers if "status" in answer]
     assert headers[-1]["line"] == [0, 0, 87, 87] and headers[-1]["chosen"]["network"] == "net"
-    assert any("views_used must be one of" in fault for one in headers for fault in one["faults"])
+    refused = [answer["refused"] for answer in answers if "refused" in answer]
+    assert any("views_used must be one of" in line for line in refused)
+    assert not any(one["faults"] for one in headers)  # which all visitors see
 
 
 def test_pictures_that_cannot_be_drawn_are_a_fault_and_the_page_goes_on(recording, monkeypatch):

@@ -1,12 +1,13 @@
 """The live page behind a proxy: its stream is for the sites that are named, and for no others."""
 
 import asyncio
+import socket
 
 import pytest
 from aiohttp import web
 from aiohttp.test_utils import make_mocked_request
 
-from src.live_view.page_server import LivePage, PageServer
+from src.live_view.page_server import LivePage, PageServer, find_address
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +39,31 @@ def test_a_proxy_that_is_named_may_use_the_stream(proxied, headers, answered):
     else:
         with pytest.raises(web.HTTPForbidden):
             asyncio.run(asked)
+
+
+@pytest.mark.parametrize(
+    ("headers", "answered"),
+    [
+        ({"Host": "192.168.1.7:8600"}, True),
+        ({"Host": "[fe80::1]:8600"}, True),
+        ({"Host": f"{socket.gethostname()}:8600"}, True),
+        ({"Host": "localhost:8600"}, True),
+        ({"Host": "cam.example.org"}, True),
+        ({"Host": "192.168.1.7:8600", "Origin": "http://192.168.1.7:8600"}, True),
+        ({"Host": "192.168.1.7:8600", "Origin": "http://elsewhere.example"}, False),
+        ({"Host": "elsewhere.example:8600", "Origin": "http://elsewhere.example:8600"}, False),
+        ({"Host": "elsewhere.example:8600"}, False),
+    ],
+)
+def test_a_page_for_other_machines_answers_to_its_addresses_and_names(headers, answered):
+    opened = PageServer(LivePage.__new__(LivePage), "0.0.0.0", 8600, ["https://cam.example.org"])
+    test_a_proxy_that_is_named_may_use_the_stream(opened, headers, answered)
+
+
+def test_the_address_that_is_printed_can_be_opened():
+    host = find_address("0.0.0.0", 8600).removeprefix("http://").rpartition(":")[0]
+    assert host not in ("", "0.0.0.0") and find_address("127.0.0.1", 1) == "http://127.0.0.1:1"
+    assert find_address("::1", 80) == "http://[::1]:80"
 
 
 def test_the_page_of_a_proxy_may_open_its_stream(proxied):

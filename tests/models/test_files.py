@@ -1,5 +1,6 @@
 """Networks on disk: what is saved comes back; what is wrong is named; nothing is executed."""
 
+import inspect
 from pathlib import Path
 
 import pytest
@@ -139,6 +140,11 @@ def test_files_that_are_no_networks(suffix, tmp_path):
     save_file({"a": torch.zeros(1)}, tmp_path / "plain.safetensors")
     with pytest.raises(ValueError, match="ckpt must be a network written by"):
         load(tmp_path / "plain.safetensors")
+
+
+def test_what_is_no_path_is_refused():
+    with pytest.raises(ValueError, match="ckpt must be a file or one of weights/ .*, got None"):
+        inspect.unwrap(load)(None)  # without the type checks of tests
 
 
 def test_a_path_is_read_where_the_shipped_weights_may_not_be(tmp_path, monkeypatch):

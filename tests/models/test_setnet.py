@@ -446,9 +446,9 @@ def test_the_file_gives_the_network_back(tmp_path):
     ("shape", "options", "message"),
     [
         ((1, 9, 5, 16, 16), {}, "bins must be 3"),
-        ((1, 26, 3, 16, 16), {}, "optics.views must be in 1..25"),
-        ((1, 7, 3, 16, 16), {}, "optics.views must be"),
-        ((1, 9, 3, 16, 16), {"positions": [(0, 0)]}, "optics.positions must be 9"),
+        ((1, 26, 3, 16, 16), {}, "views must be in 1..25"),
+        ((1, 7, 3, 16, 16), {}, "views must be 1, 2"),
+        ((1, 9, 3, 16, 16), {"positions": [(0, 0)]}, "positions must be 9"),
         ((1, 9, 3, 16, 16), {"window_s": 0.0}, "window_s must be > 0"),
         ((2, 9, 3, 16, 16), {"window_s": torch.tensor([0.1, 0.0])}, "window_s must be > 0"),
         ((1, 9, 3, 16, 16), {"window_s": torch.tensor([math.nan])}, "window_s must be > 0"),

@@ -1,5 +1,7 @@
 """Arrangement of views."""
 
+import inspect
+
 import pytest
 
 from src.sim.optics import Optics, layout, view_id
@@ -24,6 +26,12 @@ def test_centre_and_ids():
 def test_unknown_layout_names_the_key(views):
     with pytest.raises(ValueError, match="optics.views"):
         Optics(views)
+
+
+@pytest.mark.parametrize("views", ["9", 2.5, 7, None])
+def test_a_layout_is_of_a_whole_number(views):
+    with pytest.raises(ValueError, match=r"^views must be 1, 2, 3, 5 or a square .*, got "):
+        inspect.unwrap(layout)(views)  # without the type checks of tests
 
 
 @pytest.mark.parametrize(
