@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import rich
 from omegaconf import DictConfig, OmegaConf
 
 from src.app import entry_point
@@ -59,7 +58,9 @@ def compare(cfg: DictConfig) -> dict:
         rows.append(comparison.VideoRow(name, film, across, _format_note(scores[name])))
     with results.store_config_when_done(run, entry_point.resolved_yaml(cfg)):
         _draw(rows, run / "comparison.png", cfg, kind, line=cuts[0][1])
-    rich.print(scores, f"in {run}")
+    for name, measured in scores.items():
+        print(f"{name}:", ", ".join(f"{key} {value:.4g}" for key, value in measured.items()))
+    print(f"in {run}")
     return scores
 
 
