@@ -275,12 +275,15 @@ def format_value(value: object) -> str:
 def calibrate(cfg: DictConfig) -> dict:
     """Do `cfg.task`; everything goes below `cfg.paths.run`.
 
-    Raises ValueError for another task, an `fps` that is no rate and a `save` that is no file.
+    Raises ValueError for another task, an `fps` that is no rate and a `save` that is no file or of
+    a task that has none.
     """
     if cfg.task not in TASKS:
         raise ValueError(f"task must be one of {', '.join(TASKS)}, got {cfg.task}")
     if cfg.fps is not None and not 0.02 <= cfg.fps <= 1e5:  # decays of air.yaml are 1e-5 to 60 s
         raise ValueError(f"fps must be in [0.02, 1e5] frames a second, got {cfg.fps}")
+    if cfg.save and cfg.task not in SAVED_TASKS:
+        raise ValueError(f"save must be null for task={cfg.task}, got {cfg.save}")
     if cfg.save and Path(cfg.save).is_dir():
         raise ValueError(f"save must be a file to write, got {cfg.save}: a folder")
     if cfg.save:
@@ -294,7 +297,7 @@ def calibrate(cfg: DictConfig) -> dict:
         summary = TASKS[cfg.task](cfg, run)
     for name, value in summary.items():
         print(f"{name}: {format_value(value)}")
-    if cfg.save and cfg.task in SAVED_TASKS:
+    if cfg.save:
         print(f"saved in {cfg.save}")
     print(f"in {run}")
     return summary

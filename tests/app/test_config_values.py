@@ -57,6 +57,7 @@ WRONG = [
     ("convert", ["recording=x"], "out must be given: out=..."),
     ("convert", ["recording=x", "out=y.h5"], "recording must be an event file, got x: no such"),
     ("reconstruct", ["recording=x", "ckpt=setnet_small"], "recording must be an event file, got x"),
+    ("calibrate", ["recording=x", "task=threshold", "save=a.yaml"], "save must be null for task=t"),
     ("calibrate", ["recording=x", "task=views"], "recording must be an event file, got x: no such"),
     ("live", ["recording=x", "ckpt=setnet_small"], "recording must be an event file, got x: no su"),
     ("live", ["recording=x", "threads=0"], "threads must be in 1..1024, got 0"),
