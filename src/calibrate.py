@@ -52,10 +52,10 @@ def calibrate_views(cfg: DictConfig, run: Path) -> dict[str, str]:
         summary = {f"error_px of {v.position}": f"{v.error_px:.3f}" for v in views.views}
     for path in filter(None, (run / "views.yaml", cfg.save)):
         views.save(path)
-    return summary | {"resolution": describe_field(views)}
+    return summary | {"resolution": describe_resolution(views)}
 
 
-def describe_field(views: Views) -> str:
+def describe_resolution(views: Views) -> str:
     """Return the size of a view's picture and, where its aspect leaves out more than MOST_LEFT_OUT
     of each view, on which sides and the `resolution` that keeps them."""
     (height, width), (left, top, right, bottom) = views.model, views.field

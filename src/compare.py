@@ -58,8 +58,8 @@ def compare(cfg: DictConfig) -> dict:
         rows.append(comparison.VideoRow(name, film, across, _format_note(scores[name])))
     with results.store_config_when_done(run, entry_point.resolved_yaml(cfg)):
         _draw(rows, run / "comparison.png", cfg, kind, line=cuts[0][1])
-    for name, measured in scores.items():
-        print(f"{name}:", ", ".join(f"{key} {value:.4g}" for key, value in measured.items()))
+    for row in rows:
+        print(f"{row.name}: {'; '.join(row.note.splitlines())}")
     print(f"in {run}")
     return scores
 

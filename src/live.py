@@ -19,7 +19,7 @@ from src.live_view.feed_reader import FeedReader, PlaybackClock
 from src.live_view.frame_buffer import FrameRing, PolarityAccumulator
 from src.live_view.live_windows import WindowCutter, WindowQueue
 from src.live_view.network_runner import Controls, RunSettings
-from src.live_view.page_server import THIS_MACHINE, LivePage, PageServer, find_address
+from src.live_view.page_server import THIS_MACHINE, LivePage, PageServer, find_page_address
 from src.live_view.player import Player
 from src.live_view.status import FaultLog, Meters
 from src.models.network import EventToVideoNetwork
@@ -126,7 +126,7 @@ async def play_and_serve(server: PageServer) -> None:
 
     def start() -> None:
         player.start()
-        is_local, address = server.host in THIS_MACHINE, find_address(server.host, server.port)
+        is_local, address = server.host in THIS_MACHINE, find_page_address(server.host, server.port)
         seen = "this machine only" if is_local else "other machines can see it too"
         print(f"watch at {address} ({seen}); Ctrl-C ends it", flush=True)
 

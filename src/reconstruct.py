@@ -52,7 +52,7 @@ def reconstruct(cfg: DictConfig) -> Path:
     frames, size = make(cfg, network, views)
     shown = show_progress(frames, cfg.start_s + 1 / cfg.fps)
     first = next(shown)  # what is refused is so before a file is made
-    console.say_replaced(video)
+    console.print_replaced_path(video)
     with (
         results.store_config_when_done(run, entry_point.resolved_yaml(cfg)),
         output.open_video_writer(cfg.output_format, run, size, cfg.playback_fps) as write,

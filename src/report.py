@@ -65,7 +65,7 @@ def report(cfg: DictConfig) -> list[tables.Table]:
     if cfg.into:
         writers.replace_section(Path(cfg.into), title, text)
     print(f"{text}\nin {out}: report.md, report.csv, report.html")
-    if unfinished := runs.find_unfinished(folders):
+    if unfinished := runs.find_unfinished_runs(folders):
         print(f"left out, without results.json: {', '.join(map(str, unfinished))}")
     return made.shown
 

@@ -72,7 +72,7 @@ def simulate_user_clip(cfg: DictConfig) -> dict:
     if cfg.photo and not cfg.speed_widths_per_s:
         print("at rest, so that only turbulence makes events; speed_widths_per_s=0.3 moves it")
     path, shown = Path(cfg.write or run / f"{clip.name}.raw"), []
-    console.say_replaced(path)
+    console.print_replaced_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     views, count = work.allocate_views(path.parent), 0
     with (
@@ -128,7 +128,7 @@ def simulate_scene(cfg: DictConfig) -> dict:
         print(f"written: {', '.join(map(str, written))}")
         return drawn
     path, fps = Path(cfg.write), draw.clip.fps
-    console.say_replaced(path)
+    console.print_replaced_path(path)
     sensor: Any = draw.sensor  # one with `events`
     with create_truth_file(path, camera, len(clean), fps / step, drawn) as truth:
         codes = encode_srgb(views) if pipeline.decodes_srgb else views

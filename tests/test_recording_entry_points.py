@@ -12,7 +12,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
-from src.calibrate import TASKS, calibrate, describe_field
+from src.calibrate import TASKS, calibrate, describe_resolution
 from src.compare import compare, default_video_names
 from src.figures import comparison
 from src.live import build_server
@@ -299,13 +299,13 @@ def test_sides_that_the_aspect_leaves_out_are_said_with_what_keeps_them():
     wide = simulated_recording.kaleidoscope_views(
         list(layout(9)), model=(92, 116), sensor=SENSOR, tile_px=116.0
     )
-    assert describe_field(wide) == "116x92 px"
-    square = describe_field(dataclasses.replace(wide, model=(92, 92)))
+    assert describe_resolution(wide) == "116x92 px"
+    square = describe_resolution(dataclasses.replace(wide, model=(92, 92)))
     assert re.fullmatch(
         r"92x92 px; (1\d|2\d)% of each view is left out, left and right: .*", square
     )
     assert 108 <= int(re.search(r"resolution=\[92,(\d+)\] keeps it", square)[1]) <= 120
-    flat = describe_field(dataclasses.replace(wide, model=(46, 116)))
+    flat = describe_resolution(dataclasses.replace(wide, model=(46, 116)))
     assert re.search(r"left out, top and bottom: resolution=\[9\d,116\] keeps it", flat)
 
 

@@ -21,7 +21,7 @@ def prepare_streams() -> None:
     warnings.showwarning = _show_warning
 
 
-def say_replaced(path: Path) -> None:
+def print_replaced_path(path: Path) -> None:
     """Print that the file or folder `path`, where it is there, will be replaced."""
     if path.exists():
         held = f", {len(list(path.iterdir()))} files," if path.is_dir() else ""

@@ -30,7 +30,11 @@ from src.app.path_overrides import (
     refuse_empty_paths,
     unquote_override,
 )
-from src.app.renamed_keys import refuse_renamed_keys, refuse_renamed_overrides
+from src.app.renamed_keys import (
+    read_override_key,
+    refuse_renamed_keys,
+    refuse_renamed_overrides,
+)
 from src.app.stop_signals import StoppedBySignal, stop_by_signals
 from src.models import files
 from src.models.checkpoints import list_checkpoints
@@ -251,10 +255,10 @@ def describe_hydra_command() -> dict:
     }
 
 
-def is_typed(key: str) -> bool:
+def is_set_on_command_line(key: str) -> bool:
     """Return whether the command line sets `key`."""
     overrides = describe_hydra_command().get("overrides", [])
-    return any(override.lstrip("+").startswith(f"{key}=") for override in overrides)
+    return key in map(read_override_key, overrides)
 
 
 def _silence_expected_warnings() -> None:

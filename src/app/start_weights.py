@@ -21,7 +21,11 @@ def set_model_from_start_weights(cfg: DictConfig) -> Path | None:
     that is typed stays.  An E2VID on one view is given those of `optics`.  Raises ValueError for a
     file that is not there or holds weights of another class, number of bins or number of views.
     """
-    if cfg.start not in (None, "none") and cfg.ckpt and not entry_point.is_typed("start"):
+    if (
+        cfg.start not in (None, "none")
+        and cfg.ckpt
+        and not entry_point.is_set_on_command_line("start")
+    ):
         cfg.start = _find_start_of(cfg.ckpt)
     if cfg.start in (None, "none"):
         return None

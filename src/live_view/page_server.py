@@ -263,7 +263,7 @@ class PageServer:
         return ""
 
 
-def find_address(host: str, port: int) -> str:
+def find_page_address(host: str, port: int) -> str:
     """Return where a page that listens at `host` is found: of all addresses, this machine's in its
     network, else its name."""
     if host in ALL_ADDRESSES:

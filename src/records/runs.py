@@ -92,7 +92,7 @@ def find_runs(folders: list[Path]) -> list[Run]:
     return sorted(runs, key=lambda r: ((r.folder / "results.json").stat().st_mtime, str(r.folder)))
 
 
-def find_unfinished(folders: list[Path]) -> list[Path]:
+def find_unfinished_runs(folders: list[Path]) -> list[Path]:
     """Return the folders of tests and trainings without results at or below `folders`, but for the
     jobs of sweeps, which their plans tell."""
     jobs = {f.parent.resolve() for folder in folders for f in folder.rglob("multirun.yaml")}

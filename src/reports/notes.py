@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 
 from src.records.runs import Run
 from src.reports.clip_conditions import format_setting
-from src.reports.run_groups import RunGroup, find_unasked_differences
+from src.reports.run_groups import RunGroup, find_differing_defaults
 
 MOST = 8  # names in a list
 
@@ -16,7 +16,7 @@ def describe_runs(keys: Sequence[str], groups: Sequence[RunGroup]) -> str:
     runs = [run for group in groups for run in group.runs]
     across = dict.fromkeys(key for group in groups for key in group.across)
     said = "".join(map(_describe_pooled, across, [runs] * len(across)))
-    if unseen := find_unasked_differences(keys, groups):
+    if unseen := find_differing_defaults(keys, groups):
         said += f" Settings differ that no command line names: {_join(unseen)}."
     commits = sorted({run.record["git"] for run in runs})
     return said + (f" The code differs: {_join(commits)}." if len(commits) > 1 else "")

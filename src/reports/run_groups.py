@@ -43,7 +43,7 @@ class RunGroup:
         sizes = frozenset(size for run in self.runs for size in run.record["latency_ms"])
         return sizes, frozenset(run.record["device"] for run in self.runs)
 
-    def conditions_of(self, column: str) -> tuple:
+    def list_comparison_conditions(self, column: str) -> tuple:
         """What must be equal for values of a column to be compared: of times, frames and devices;
         of scores, test conditions, and arguments where a config has added the metric.
         """
@@ -99,7 +99,7 @@ def check_across(across: Sequence[str], runs: Sequence[Run]) -> None:
             raise ValueError(f"across must be settings of the runs, such as ckpt, got {key}")
 
 
-def find_unasked_differences(keys: Sequence[str], groups: Sequence[RunGroup]) -> list[str]:
+def find_differing_defaults(keys: Sequence[str], groups: Sequence[RunGroup]) -> list[str]:
     """Return the settings beside `keys` that differ between groups of equal choices and command
     lines, as those of another version's defaults do."""
     alike: dict[tuple, list[Run]] = defaultdict(list)

@@ -58,9 +58,13 @@ class Table:
         head, mean = self.columns[place], self.rows[number][place].mean
         if head.better == 0 or mean is None or math.isnan(mean):
             return False
-        asked = self.groups[number].conditions_of(head.name)
+        asked = self.groups[number].list_comparison_conditions(head.name)
         rows = zip(self.rows, self.groups, strict=True)
-        means = [row[place].mean for row, group in rows if group.conditions_of(head.name) == asked]
+        means = [
+            row[place].mean
+            for row, group in rows
+            if group.list_comparison_conditions(head.name) == asked
+        ]
         numbers = [value for value in means if value is not None and not math.isnan(value)]
         printed = {round(value, head.digits) for value in numbers}
         best = (max if head.better > 0 else min)(printed)

@@ -7,7 +7,7 @@ import pytest
 from aiohttp import web
 from aiohttp.test_utils import make_mocked_request
 
-from src.live_view.page_server import LivePage, PageServer, find_address
+from src.live_view.page_server import LivePage, PageServer, find_page_address
 
 
 @pytest.fixture(scope="module")
@@ -61,9 +61,9 @@ def test_a_page_for_other_machines_answers_to_its_addresses_and_names(headers, a
 
 
 def test_the_address_that_is_printed_can_be_opened():
-    host = find_address("0.0.0.0", 8600).removeprefix("http://").rpartition(":")[0]
-    assert host not in ("", "0.0.0.0") and find_address("127.0.0.1", 1) == "http://127.0.0.1:1"
-    assert find_address("::1", 80) == "http://[::1]:80"
+    host = find_page_address("0.0.0.0", 8600).removeprefix("http://").rpartition(":")[0]
+    assert host not in ("", "0.0.0.0") and find_page_address("127.0.0.1", 1) == "http://127.0.0.1:1"
+    assert find_page_address("::1", 80) == "http://[::1]:80"
 
 
 def test_the_page_of_a_proxy_may_open_its_stream(proxied):

@@ -7,7 +7,7 @@ import yaml
 
 from src.records import runs
 from src.reports.notes import describe_runs
-from src.reports.run_groups import find_unasked_differences, group_runs
+from src.reports.run_groups import find_differing_defaults, group_runs
 from tests.reports.runs import write_run, write_sweep
 
 
@@ -41,7 +41,7 @@ def test_settings_that_differ_with_no_word_of_the_command_line_are_in_the_note(t
     for name, width in (("a", 8), ("b", 16)):
         write_run(tmp_path / name, settings={"lr": width / 10, "width": width, "depth": 2})
     keys, found = grouped(tmp_path)
-    assert keys == ("lr",) and find_unasked_differences(keys, found) == ["width"]
+    assert keys == ("lr",) and find_differing_defaults(keys, found) == ["width"]
     assert " Settings differ that no command line names: width." in describe_runs(keys, found)
 
 
@@ -228,7 +228,7 @@ def test_tests_and_trainings_that_did_not_end_are_found_outside_sweeps(tmp_path)
         if name != "done":
             (folder / "results.json").unlink()
     write_sweep(tmp_path / "sweep", {"seed": "0,1"})
-    assert runs.find_unfinished([tmp_path]) == [tmp_path / "half"]
+    assert runs.find_unfinished_runs([tmp_path]) == [tmp_path / "half"]
 
 
 def test_results_beside_the_config_of_another_run_are_refused(tmp_path):

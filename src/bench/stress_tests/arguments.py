@@ -8,7 +8,7 @@ from src.bench.stress_tests.event_clips import ClipConditions
 from src.sim.sensor import EventSensor
 from src.sim.turbulence.plane_waves import WaveDynamics
 
-Rule = tuple[str, Callable[[Any], bool]]  # what is allowed, and whether a value is
+Rule = tuple[str, Callable[[Any], object]]  # what is allowed, and whether a value is
 CONDITIONS = [  # what `parameter`, `fixed` and `reference` may name
     *(f.name for f in fields(ClipConditions) if f.name not in ("turbulence", "sensor")),
     *(f"sensor.{f.name}" for f in fields(EventSensor)),
@@ -29,7 +29,7 @@ def check_arguments(key: str, function: str, given: Mapping[str, Any], fps: floa
 
 def _list_rules(function: str, given: Mapping[str, Any], fps: float) -> dict[str, Rule]:
     """Return the rule of each argument that has one."""
-    one_or_more: Rule = ("one or more", _all(lambda _: True))
+    one_or_more: Rule = ("one or more", len)
     rules = dict.fromkeys(("values", "sizes", "jumps_ms", "spacings_over_aperture"), one_or_more)
     rules["shifts_px"] = one_or_more
     rules |= dict.fromkeys(("draws", "steps", "flicker_windows"), _at_least(1))
@@ -48,7 +48,7 @@ def _list_rules(function: str, given: Mapping[str, Any], fps: float) -> dict[str
     return rules | {"fixed": named, "reference": named}
 
 
-def _is_allowed(rule: Callable[[Any], bool], value: Any) -> bool:
+def _is_allowed(rule: Callable[[Any], object], value: Any) -> bool:
     try:
         return bool(rule(value))
     except TypeError:  # of another kind
@@ -59,7 +59,7 @@ def _at_least(least: int) -> Rule:
     return f"a whole number >= {least}", lambda value: int(value) == value >= least
 
 
-def _all(rule: Callable[[Any], bool]) -> Callable[[Any], bool]:
+def _all(rule: Callable[[Any], object]) -> Callable[[Any], bool]:
     return lambda values: len(values) > 0 and all(map(rule, values))
 
 

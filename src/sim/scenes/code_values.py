@@ -40,8 +40,10 @@ def warn_of_darkness(
 
 def check_float_values(picture: NDArray, key: str, path: Path | str) -> None:
     """Raise ValueError, which names `key`, for a picture of floats that are not in [0, 1]."""
+    if picture.dtype.kind != "f":
+        return
     low, high = picture.min(), picture.max()
-    if picture.dtype.kind == "f" and not 0 <= low <= high <= 1:
+    if not 0 <= low <= high <= 1:
         got = f"{low:g} to {high:g} in {path}"
         raise ValueError(f"{key} must hold whole numbers or floats in [0, 1], got {got}")
 

@@ -72,9 +72,9 @@ def sample_atmosphere(
     first three); `none` gives None.
 
     What no camera shows is drawn again as a whole, up to DRAWS times, global tilt or not: cameras
-    show all that the default ranges draw.  `ranges`: see `draw_atmosphere`.  Raises ValueError for
-    an unknown severity or ranges that nothing meets; what each setting may be, and whether cameras
-    show enough of it, is checked by `SimulatedTurbulence`.
+    show all that the default ranges draw.  `ranges`: see `draw_atmosphere_once`.  Raises ValueError
+    for an unknown severity or ranges that nothing meets; what each setting may be, and whether
+    cameras show enough of it, is checked by `SimulatedTurbulence`.
     """
     names = ["none", *TILT_AND_BLUR_PX, "mixed"]
     check_option(severity in names, "atmosphere.severity", ", ".join(names), severity)
@@ -86,13 +86,13 @@ def sample_atmosphere(
         severity = list(SEVERITY_SHARES)[int(np.searchsorted(limits, drawn, side="right"))]
     for _ in range(DRAWS):
         try:
-            return draw_atmosphere(severity, generator, **ranges)
+            return draw_atmosphere_once(severity, generator, **ranges)
         except NoCameraError as error:
             reason = error
     raise reason
 
 
-def draw_atmosphere(
+def draw_atmosphere_once(
     severity: str,
     generator: torch.Generator,
     *,

@@ -11,7 +11,7 @@ from src.sim.turbulence.prior import (
     SEVERITY_SHARES,
     TILT_AND_BLUR_PX,
     NoCameraError,
-    draw_atmosphere,
+    draw_atmosphere_once,
 )
 
 TRIALS, LEAST_SHARE = 64, 0.2  # of clips that are not of global tilt
@@ -20,10 +20,10 @@ TRIALS_PER_LENGTH = 5
 HALF_LENGTH = "tilt_correlation_half_length_px"
 
 
-def check_that_cameras_show(settings: Mapping[str, Any]) -> None:
-    """Raise ValueError where cameras show less than LEAST_SHARE of what `draw_atmosphere` draws
-    with `settings` for clips without global tilt: other clips, of global tilt, would stand in for
-    them.
+def check_reachable_ranges(settings: Mapping[str, Any]) -> None:
+    """Raise ValueError where cameras show less than LEAST_SHARE of what `draw_atmosphere_once`
+    draws with `settings` for clips without global tilt: other clips, of global tilt, would stand in
+    for them.
 
     `settings`: as of `sample_atmosphere`.  The draws are always the same ones.
     """
@@ -33,13 +33,13 @@ def check_that_cameras_show(settings: Mapping[str, Any]) -> None:
         return  # no turbulence or a wrong word, or none but global tilt
     for one in drawn:
         local = {**settings, "severity": one, "global_tilt_probability": 0.0}
-        if (met := _count_met(local, TRIALS, least)) >= least:
+        if (met := _count_reachable(local, TRIALS, least)) >= least:
             continue
         spreads = (TILT_AND_BLUR_PX | dict(settings.get("tilt_and_blur_px") or {}))[one]
         shown = [
             length
             for length in HALF_LENGTHS_PX.tolist()
-            if _count_met({**local, HALF_LENGTH: (length, length)}, TRIALS_PER_LENGTH, 1)
+            if _count_reachable({**local, HALF_LENGTH: (length, length)}, TRIALS_PER_LENGTH, 1)
         ]
         asked = f"tilt_and_blur_px.{one}={list(spreads)}"
         allowed = f"ranges within which cameras show {asked}"
@@ -49,12 +49,12 @@ def check_that_cameras_show(settings: Mapping[str, Any]) -> None:
         check_option(False, f"atmosphere.{HALF_LENGTH}", allowed, given)
 
 
-def _count_met(settings: Mapping[str, Any], trials: int, enough: float) -> int:
+def _count_reachable(settings: Mapping[str, Any], trials: int, enough: float) -> int:
     """Return how many of `trials` draws a camera shows, or that `enough` are."""
     generator, met = noise.generator(noise.key("trial of a prior")), 0
     for _ in range(trials):
         try:
-            draw_atmosphere(generator=generator, **settings)
+            draw_atmosphere_once(generator=generator, **settings)
             met += 1
         except NoCameraError:
             continue

@@ -17,7 +17,7 @@ from src.sim.turbulence.prior import (
     sample_atmosphere,
     unnormalised_cn2_profile,
 )
-from src.sim.turbulence.prior_trial import check_that_cameras_show
+from src.sim.turbulence.prior_trial import check_reachable_ranges
 
 INTERVALS = {  # of `sample_atmosphere`: where the ends of its ranges lie
     "tilt_correlation_half_length_px": (0.01, 1e6),
@@ -50,7 +50,7 @@ class SimulatedTurbulence:
         self.atmosphere, self.options = dict(atmosphere), options
         check_atmosphere_settings(self.atmosphere)
         try:
-            check_that_cameras_show(self.atmosphere)
+            check_reachable_ranges(self.atmosphere)
         except TypeError as error:
             raise ValueError(f"turbulence.atmosphere takes no such values: {error}") from error
         try:

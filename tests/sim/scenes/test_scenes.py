@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from src.sim.scenes.clip import Clip, FrameRateMixture, SceneBase
+from src.sim.scenes.moving_layers import SimilarityMotion
 from src.sim.scenes.photo_files import EMBEDDED, list_photographs
 from src.sim.scenes.photographs import Photographs
 from src.sim.scenes.targets import TARGETS, Targets
@@ -69,6 +70,19 @@ def test_motion_is_smooth_and_of_the_stated_speed():
         pair = (scene.clip(index).frames for scene in (slow, fast))
         steps = [float(frames.diff(dim=0).abs().mean()) for frames in pair]
         assert 1.5 < steps[0] / steps[1] < 2.2
+
+
+def test_the_middle_moves_by_two_thirds_of_the_speed_and_turn_and_zoom_stay():
+    """Speeds of 1000 motions: of the middle, and of points all over a frame of 3:2 at rest."""
+    moments, rng = [], np.random.default_rng(0)
+    for key in range(1000):
+        motion, time_s = SimilarityMotion(np.random.default_rng(key), (1.0, 1.0)), rng.uniform(0, 2)
+        states = [motion.shift_angle_log_zoom(t) for t in (time_s, time_s + 1e-5)]
+        moments.append([(b - a) / 1e-5 for a, b in zip(*states, strict=True)])
+    shifts, turns, zooms = map(np.array, zip(*moments, strict=True))
+    assert np.hypot(*shifts.T).mean() == pytest.approx(0.67, abs=0.02)
+    places = np.hypot(*rng.uniform([[-0.5], [-1 / 3]], [[0.5], [1 / 3]], (2, len(turns))))
+    assert (np.hypot(turns, zooms) * places).mean() == pytest.approx(0.09, abs=0.01)
 
 
 def test_resolution_shows_the_same_scene():
