@@ -72,6 +72,8 @@ def measure_window_rate_loss(
 ) -> StressResult:  # fmt: skip
     """Return the aligned PSNR lost, at the same instants, when the events are cut at another rate.
 
+    Windows grow for a network that uses their length; those of others are a frame long, where
+    src.reconstruct gives them overlapping ones.
     `rates_hz`: windows a second, easy to hard; all and the clip's own are multiples of the lowest
     of them.  `duration_s`: how much of the clip is used; its second half is scored.
     """
@@ -84,10 +86,11 @@ def measure_window_rate_loss(
         instants = torch.arange(count // 2, count) + 1
         at = (instants * (rate_hz / slowest)).round().long()
         truth = (instants * (clip.fps / slowest)).round().long()
-        frames = clip.reconstruct_at_rate(network, rate_hz, at.tolist())
+        frames = clip.reconstruct_at_rate(network, rate_hz, at.tolist(), window_length)
         return float(score_aligned_psnr(frames, clip.target[truth, None]).mean())
 
     clips = bench.clips()
+    window_length = "growing" if network.loaded.uses_window_length else "frame"
     base = fmean(score(clip, clip.fps) for clip in clips)
     curve = [(rate, base - fmean(score(clip, rate) for clip in clips)) for rate in rates_hz]
     return build_worst_psnr_loss_result(curve, limit_db=limit_db, varied="windows a second")

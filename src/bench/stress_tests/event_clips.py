@@ -125,24 +125,26 @@ class EventClip:
         windows = self.windows() if windows is None else windows
         return network.reconstruct(windows, self.positions, 1 / self.fps, state)
 
-    def reconstruct_at_rate(self, network: Candidate, fps: float, numbers: Sequence[int]) -> Video:
+    def reconstruct_at_rate(
+        self, network: Candidate, fps: float, numbers: Sequence[int], window_length: str
+    ) -> Video:
         """Return the frames of `numbers`, counted from 1, of `fps` a second, in order of time.
 
-        Windows are a frame long; those of a network that uses their length grow, as src.reconstruct
-        has it.
+        `window_length`: `frame`, `trained` or `growing`, as in src.reconstruct.
         """
-        grows = network.loaded.uses_window_length
-        rule = build_window_rule("growing" if grows else "frame", fps=fps)
-        video, state, period_us, wanted = [], None, US_PER_S / fps, set(numbers)
+        rule = build_window_rule(window_length, fps=fps)
+        video, period_us, wanted = [], US_PER_S / fps, set(numbers)
+        states: list[Any] = [None] * rule.overlapping_windows
+        continued = {k % len(states) for k in wanted}
         for k in range(1, max(wanted) + 1):
             start_us, end_us = rule.first_frame_of_window(k) * period_us, k * period_us
-            keeps_state = rule.keeps_state(start_us, end_us)
-            if not (keeps_state or k in wanted):
+            phase, keeps_state = k % len(states), rule.keeps_state(start_us, end_us)
+            if k not in wanted and not (keeps_state and phase in continued):
                 continue
             window, length_s = self.voxel_grids(start_us, end_us), (end_us - start_us) / US_PER_S
-            frame, after = network.reconstruct([window], self.positions, length_s, state)
+            frame, after = network.reconstruct([window], self.positions, length_s, states[phase])
             if keeps_state:
-                state = after
+                states[phase] = after
             if k in wanted:
                 video.append(frame)
         return torch.cat(video)

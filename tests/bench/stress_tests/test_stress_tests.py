@@ -157,6 +157,15 @@ def test_a_sum_holds_and_a_leaky_sum_does_not(bench):
     assert kept.curve[0][1] == pytest.approx(100 * 0.9**5, rel=0.02) and kept.failed
 
 
+@pytest.mark.parametrize("window_length", ["trained", "growing"])
+def test_windows_of_any_length_end_with_the_same_events(bench, window_length):
+    clip, network, asked = bench.clips()[0], running(), [7, 15, 40, 45]
+    frames = clip.reconstruct_at_rate(network, 1200, asked, "frame")
+    assert not torch.allclose(frames[0], frames[-1], atol=0.01)
+    found = clip.reconstruct_at_rate(network, 1200, asked, window_length)
+    torch.testing.assert_close(found, frames, atol=1e-3, rtol=0)
+
+
 def test_a_sum_comes_back_at_any_rate_and_after_any_loop(bench):
     for grows, rates_hz in ((False, [60, 1200]), (True, [40, 6400])):
         rates, network = {"rates_hz": rates_hz, "duration_s": 0.2, "limit_db": 1.0}, running()
