@@ -3,12 +3,12 @@
 import signal
 from pathlib import Path
 
+import jaxtyping
 import pytest
-from jaxtyping import install_import_hook
 
 import src  # noqa: F401 - sets OpenCV's limits before a test imports it
-import tests.typecheck  # noqa: F401 - the hook below names it in a string
 from tests.faults.harness import leave_slices_out
+from tests.typecheck import check_annotations
 
 ROOT = Path(__file__).resolve().parents[1]
 # A shell starts what runs in its background with Ctrl-C ignored, and so would be what tests start.
@@ -25,7 +25,8 @@ def checked_modules() -> list[str]:
     return [name for name in names if not any(part in f"{name}." for part in left_out)]
 
 
-install_import_hook(checked_modules(), "tests.typecheck.check")
+jaxtyping.jaxtyped = check_annotations  # what the hook decorates everything with
+jaxtyping.install_import_hook(checked_modules(), "tests.typecheck.check")
 
 
 @pytest.fixture(autouse=True, scope="session")

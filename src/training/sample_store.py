@@ -53,7 +53,7 @@ class StoredSamples:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def __iter__(self) -> Iterator:
+    def __iter__(self) -> Iterator[Sample]:
         kept = [self.store.get(self.conditions, sample_id) for sample_id in self.ids]
         missing = [n for n, sample in zip(self.ids, kept, strict=True) if sample is None]
         fresh = iter(self.simulate(missing)) if missing else iter(())
