@@ -558,6 +558,52 @@ def test_the_server_answers_and_takes_only_what_makes_sense(recording):
     assert not any(one["faults"] for one in headers)  # which all visitors see
 
 
+def pictures(message: bytes | None) -> list[str]:
+    """Return the names of a message's pictures."""
+    assert message is not None
+    length = int.from_bytes(message[:4], "little")
+    return [name for name, _ in json.loads(message[4 : 4 + length])["pictures"]]
+
+
+@pytest.fixture
+def page_server(recording):
+    made = served(recording, {"net": HighPass()})
+    made.page.counter.is_watched = True
+    yield made
+    made.page.player.reader.feed.close()
+
+
+def show_frame(page) -> None:
+    """Show a frame of a window with an event."""
+    events = np.zeros(1, EVENT)
+    page.frames.push(np.full(page.frames.size, 0.5, np.float32))
+    page.counter.add(events)
+
+
+def test_a_slow_visitor_gets_the_last_frame(page_server):
+    page, slow, quick = page_server.page, asyncio.Queue(1), asyncio.Queue(1)
+    page_server.visitors |= {slow, quick}
+    show_frame(page)
+    page_server._hand_out(page.message())
+    assert pictures(quick.get_nowait()) == ["frame", "events", "slice"]
+    page.status_sent = -np.inf  # nothing new but the status
+    page_server._hand_out(page.message())
+    assert pictures(quick.get_nowait()) == []
+    assert pictures(slow.get_nowait()) == ["frame", "events", "slice"]
+
+
+def test_who_comes_takes_nothing_from_those_who_are_there(page_server):
+    page = page_server.page
+    show_frame(page)
+    assert pictures(page.message()) == ["frame", "events", "slice"]
+    show_frame(page)
+    before = page.status_sent
+    assert pictures(page.message(whole=True)) == ["frame", "events", "slice"]
+    assert page.status_sent == before
+    assert pictures(page.message()) == ["frame", "events", "slice"]
+    assert page.message() is None
+
+
 def test_pictures_that_cannot_be_drawn_are_a_fault_and_the_page_goes_on(recording, monkeypatch):
     def fail(*args):
         raise ZeroDivisionError("no pixels")
