@@ -27,6 +27,7 @@ from src.live_view.frame_buffer import (
     tile_views_without_gaps,
 )
 from src.live_view.player import Player
+from src.recordings.tone import ToneCurve
 from src.sim.optics import Position
 
 HTML = Path(__file__).with_name("live.html")
@@ -36,6 +37,8 @@ MAX_REQUEST_BYTES = 4096
 NO_CACHE = {"Cache-Control": "no-store"}
 ORIGIN = re.compile(r"(https?://[a-z0-9.-]+(:\d+)?)/?")
 THIS_MACHINE = ("127.0.0.1", "localhost", "::1")
+FLAGS = ("pause", "all_views", "one_view")
+REQUESTS = (*FLAGS, "tone", "line", "network", "views")
 ALL_ADDRESSES = ("0.0.0.0", "::")
 
 
@@ -106,19 +109,36 @@ class LivePage:
             yield "slice", encode_jpeg(drawn)
 
     def handle_request(self, request: dict) -> None:
-        """Do what a visitor asks; raises ValueError for what makes no sense."""
-        if "pause" in request:
-            self.player.set_paused(bool(request["pause"]))
-        if "tone" in request:
-            self.player.set_tone(str(request["tone"]))
-        if "one_view" in request:
-            self.controls.compare_one_view(bool(request["one_view"]))
-        if "all_views" in request:
-            self.all_views = bool(request["all_views"])
-        if "line" in request:
-            self.slice.line = _parse_line(request["line"])
+        """Do what a visitor asks; raises ValueError, and does nothing, where a part of it makes no
+        sense."""
+        self._check_request(request)
         if "network" in request:
             self.controls.choose(str(request["network"]), request.get("views", "all"))
+        if "pause" in request:
+            self.player.set_paused(request["pause"])
+        if "tone" in request:
+            self.player.set_tone(request["tone"])
+        if "one_view" in request:
+            self.controls.compare_one_view(request["one_view"])
+        if "all_views" in request:
+            self.all_views = request["all_views"]
+        if "line" in request:
+            self.slice.line = _parse_line(request["line"])
+
+    def _check_request(self, request: dict) -> None:
+        if unknown := request.keys() - set(REQUESTS):
+            raise ValueError(f"a request must be of {', '.join(REQUESTS)}, got {min(unknown)}")
+        for name in FLAGS:
+            if not isinstance(request.get(name, False), bool):
+                raise ValueError(f"{name} must be true or false, got {request[name]}")
+        if "tone" in request:
+            ToneCurve(str(request["tone"]))
+        if "line" in request:
+            _parse_line(request["line"])
+        if "network" in request:
+            self.controls.count_views(str(request["network"]), request.get("views", "all"))
+        elif "views" in request:
+            raise ValueError(f"views must come with network, got views={request['views']} alone")
 
 
 def _pack(header: dict) -> bytes:

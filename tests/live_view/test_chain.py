@@ -604,6 +604,28 @@ def test_who_comes_takes_nothing_from_those_who_are_there(page_server):
     assert page.message() is None
 
 
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"pause": "no"}, "pause must be true or false, got no"),
+        ({"all_views": 1}, "all_views must be true or false, got 1"),
+        ({"one_view": None}, "one_view must be true or false, got None"),
+        ({"pause": True, "tone": "bad"}, "tone must be auto or none, got bad"),
+        ({"pause": True, "all_views": True, "line": [0]}, "line must be x0, y0, x1, y1"),
+        ({"pause": True, "network": "net", "views": 77}, "views_used must be one of"),
+        ({"pause": True, "views": 5}, "views must come with network, got views=5 alone"),
+        ({"pause": True, "paws": 1}, "a request must be of pause, .*, got paws"),
+    ],
+)
+def test_a_request_of_which_a_part_makes_no_sense_does_nothing(page_server, wrong, words):
+    page = page_server.page
+    with pytest.raises(ValueError, match=words):
+        page.handle_request(wrong)
+    assert not page.player.status()["paused"] and not page.all_views
+    page.handle_request({"pause": True, "network": "net", "views": "all"})
+    assert page.player.status()["paused"]
+
+
 def test_pictures_that_cannot_be_drawn_are_a_fault_and_the_page_goes_on(recording, monkeypatch):
     def fail(*args):
         raise ZeroDivisionError("no pixels")
