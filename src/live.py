@@ -14,6 +14,7 @@ import torch
 from omegaconf import DictConfig
 
 from src.app import entry_point, methods
+from src.deploy.runtime import check_thread_count
 from src.live_view.event_feeds import Feed, open_feed
 from src.live_view.feed_reader import FeedReader, PlaybackClock
 from src.live_view.frame_buffer import FrameRing, PolarityAccumulator
@@ -30,7 +31,6 @@ from src.recordings.sensor_lookup import build_lookup
 from src.recordings.views import Views, load_views, views_or_whole_sensor
 from src.sim.optics import Position
 
-MOST_THREADS = 1024
 GIL_SWITCH_S = 2e-4  # Python's own 5 ms between two threads is longer than a window
 
 
@@ -39,8 +39,7 @@ def live(cfg: DictConfig) -> None:
 
     Raises ValueError for a recording, views, network or address that cannot be used.
     """
-    if not 1 <= cfg.threads <= MOST_THREADS:
-        raise ValueError(f"threads must be in 1..{MOST_THREADS}, got {cfg.threads}")
+    check_thread_count(cfg.threads)
     torch.set_num_threads(cfg.threads)
     asyncio.run(play_and_serve(build_server(cfg)))
 

@@ -87,6 +87,14 @@ def test_a_file_where_the_folder_of_a_run_should_be_is_one_line(below, tmp_path)
     assert (tmp_path / "notes.txt").read_text() == "kept"
 
 
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs Linux")
+def test_a_folder_of_a_run_that_cannot_be_made_is_one_line():
+    line = [sys.executable, "-m", "src.report", "run=out", "hydra.run.dir=/proc/nope"]
+    done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True)
+    wanted = "hydra.run.dir must be a folder, new or there, got /proc/nope: it cannot be made there"
+    assert (done.returncode, done.stderr.strip()) == (2, f"error: {wanted}")
+
+
 @pytest.mark.parametrize("command", [["-m", "src.train"], ["-m", "lightfield_events", "train"]])
 def test_ctrl_c_while_modules_are_imported_is_one_line(command, tmp_path):
     (tmp_path / "torch.py").write_text("raise KeyboardInterrupt\n")  # found before the package

@@ -98,6 +98,21 @@ def test_the_lists_of_the_page_are_its_grids(monkeypatch):
     np.testing.assert_allclose(np.stack(space["fast"]), grids, atol=1e-4)
 
 
+@pytest.mark.parametrize("clock_us", [3_600_000_000, 1_800_000_000_000_000])
+def test_the_frames_of_chunks_begin_with_the_first_event(clock_us):
+    names = [("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8), ("view", int)]
+    events, steps = np.zeros(100, names), []
+    events["t"] = clock_us + 1000 * np.arange(100)
+    (block,) = (block for block in blocks() if "def frames_of" in block)
+    space = {"events": events, "np": np, "window_us": 1e6 / 120}
+    space |= {"runtime": SimpleNamespace(reset=lambda: None)}
+    space["step"] = lambda part, start, end: steps.append((len(part), start, end))
+    exec(compile(block, "docs/python.md", "exec"), space)
+    assert 11 <= len(steps) == len(space["arrived"]) <= 12
+    assert steps[0][0] and 0 <= clock_us - steps[0][1] < 1e6 / 120
+    assert sum(count for count, *_ in steps) >= 91
+
+
 def cells(notebook, kind: str) -> list[dict]:
     return [c for c in json.loads(notebook.read_text())["cells"] if c["cell_type"] == kind]
 

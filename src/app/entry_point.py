@@ -100,9 +100,9 @@ def run_main(main: Callable[[], None]) -> None:
         _print_failed_jobs(Path(str(error)), start)
         sys.exit(1)
     except (ValueError, HydraException, OmegaConfBaseException, OSError) as error:
-        if isinstance(error, OSError) and _is_in_the_way_of_run(error):
+        if isinstance(error, OSError) and (why := _reason_against_folder_of_run(error)):
             wanted = "hydra.run.dir must be a folder, new or there"
-            error = ValueError(f"{wanted}, got {error.filename}: a file is in the way")
+            error = ValueError(f"{wanted}, got {error.filename}: {why}")
         message = describe_config_error(error, Path(sys.argv[0]).stem)
         print(f"error: {message}", file=sys.stderr)
         is_io = isinstance(error, OSError) and not isinstance(error, HydraException)
@@ -125,13 +125,17 @@ def _stop_errors() -> tuple[type[BaseException], ...]:
     return (KeyboardInterrupt, *([lightning.SIGTERMException] if lightning else []))
 
 
-def _is_in_the_way_of_run(error: OSError) -> bool:
-    """Return whether `error` is of a file where Hydra makes the folder of the run."""
-    if not isinstance(error, FileExistsError | NotADirectoryError):
-        return False
+def _reason_against_folder_of_run(error: OSError) -> str | None:
+    """Return why Hydra cannot make the folder of the run; None where `error` is another."""
+    if isinstance(error, FileExistsError | NotADirectoryError):
+        why = "a file is in the way"
+    elif isinstance(error, FileNotFoundError | PermissionError):
+        why = "it cannot be made there"
+    else:
+        return None
     files_of_frames = [Path(f.filename) for f in traceback.extract_tb(error.__traceback__)]
     callers = [file for file in files_of_frames if file.name not in ("pathlib.py", "os.py")]
-    return callers[-1].parts[-3:] == ("hydra", "core", "utils.py")
+    return why if callers[-1].parts[-3:] == ("hydra", "core", "utils.py") else None
 
 
 def run_job(

@@ -2,12 +2,13 @@
 
 The dense grid is never made: an event adds its patch of the first layer's kernel to that layer's
 map (`first_layer.py`), and what comes behind runs on OpenVINO or PyTorch.  Equal to the network's
-`forward` on `voxel_grid`s up to the order of sums in float32 (1e-5 in a frame, `form="float32"`)
-or to bf16's rounding (0.04).
+`forward` on `voxel_grid`s up to the order of sums in float32 (`form="float32"`; 1e-5 in a frame or,
+where a step of an E2VID's rounded state falls otherwise, 5e-4) or to bf16's rounding (0.04).
 """
 
 import warnings
 from collections.abc import Sequence
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,8 @@ from src.sim.optics import Position, is_arranged_as_layout, layout
 EVENT_LIST_FORMS = ("float32", "bf16", "openvino")
 SIDE_MULTIPLE = 8  # sides are padded to it by reflection, as the networks do
 LEAST_INSIDE = 0.01  # of the events given for a window
+MOST_THREADS = 1024  # a mistyped number of more would end the process without a word
+WINDOW_RANGE_S = 1e-9, 1e12  # beyond, float32 ends
 LONGEST_WINDOW_S = 10.0  # beyond, times are hardly in seconds
 LEAST_TIME_STEPS = 1000  # of the type of `t` in a window
 EDGE_STEPS = 4  # of float64, by which rounding puts an event of an edge outside
@@ -54,9 +57,9 @@ class EventListRuntime:
 
     `positions`: (row, col) of each view; `height`, `width`: of a view's picture and of the frame.
     `form`: openvino, float32 or bf16 (PyTorch); default: the `fastest_form`.
-    `threads`: of what comes behind the first layer, which takes one or two.  Raises ValueError for
-    another network, form or size and for views of a number that the network does not take or, of an
-    E2VID, that do not stand to each other as in `layout`.
+    `threads`: of what comes behind the first layer, which takes one or two; in 1..MOST_THREADS.
+    Raises ValueError for another network, form, size or number of threads and for views of a number
+    that the network does not take or, of an E2VID, that do not stand to each other as in `layout`.
     """
 
     def __init__(
@@ -78,15 +81,14 @@ class EventListRuntime:
             raise ValueError(f"a list of events needs a SetNet or an E2VID, got {kind}{how}")
         _check_positions(positions)
         check_picture_size(height, width)
-        if threads < 1:
-            raise ValueError(f"threads must be >= 1, got {threads}")
+        check_thread_count(threads)
         self.views, self.size = len(positions), (height, width)
         missing = [-side % SIDE_MULTIPLE for side in self.size]  # as pad_centred_to_multiple
         self.padding = [(more // 2, more - more // 2) for more in missing]
         padded = height + sum(self.padding[0]), width + sum(self.padding[1])
         dtype = {"float32": torch.float32, "bf16": torch.bfloat16}.get(form)
         dtype = openvino_network.fastest_dtype() if dtype is None else dtype
-        copied = inference_copy(network).cpu()
+        copied = inference_copy(network).cpu().float()
         backend = openvino_network.CompiledModule if form == "openvino" else EagerBackend
         self.runner: E2VIDOverEvents | SetNetTiles
         if isinstance(copied, SetNet):
@@ -108,12 +110,13 @@ class EventListRuntime:
     def step(self, t, x, y, p, view, t0: float, t1: float) -> Float[np.ndarray, "h w"]:
         """Return the frame at `t1`, float32, as the network's `forward` gives it.
 
-        Events of one window in order of time, arrays of one length: `t`, `t0`, `t1` in seconds,
-        `x`, `y` in pixels, `view` an index into positions, `p` in {-1, 1} or, as floats, weights.
+        Events of one window in order of time, arrays of one length: `t`, `t0`, `t1` in seconds, the
+        window of a length in WINDOW_RANGE_S, `x`, `y` in pixels, `view` an index into positions,
+        `p` in {-1, 1} or, as floats, weights.
         Those outside t0 <= t <= t1, but for rounding, have no part in it; a warning says so where
         nearly all are.
-        Raises ValueError, and leaves the state, for events that are out of order, off the sensor or
-        in no view.
+        Raises ValueError, and leaves the state, for another window and for events that are out of
+        order, off the sensor or in no view.
         """
         return self.finish(self.begin(t, x, y, p, view, t0, t1))
 
@@ -171,8 +174,7 @@ class EventListRuntime:
         if len({part.shape for part in given}) != 1 or given[0].ndim != 1:
             shapes = [part.shape for part in given]
             raise ValueError(f"t, x, y, p, view must be of one length, got shapes {shapes}")
-        if not (np.isfinite(t0) and np.isfinite(t1) and t0 < t1):
-            raise ValueError(f"a window must have t0 < t1 in seconds, got {t0} and {t1}")
+        _check_window(t0, t1)
         t, x, y, p, view = given
         if len(t) and not all(part.dtype.kind in "iu" for part in (x, y, view)):
             kinds = [str(part.dtype) for part in (x, y, view)]
@@ -238,6 +240,20 @@ class EventListRuntime:
                 events = [np.concatenate([part, part[low], part[high]]) for part in events]
                 events[axis] = np.concatenate(mirrored) + before
         return events
+
+
+def check_thread_count(threads: Any) -> None:
+    """Raise ValueError unless `threads` is a whole number in 1..MOST_THREADS."""
+    if not isinstance(threads, Integral) or not 1 <= int(threads) <= MOST_THREADS:
+        raise ValueError(f"threads must be in 1..{MOST_THREADS}, got {threads}")
+
+
+def _check_window(t0: Any, t1: Any) -> None:
+    ends, (least, most) = [np.asarray(t0), np.asarray(t1)], WINDOW_RANGE_S
+    are_numbers = all(end.ndim == 0 and end.dtype.kind in "iuf" for end in ends)
+    if not are_numbers or not least <= float(t1) - float(t0) <= most:
+        wanted = f"t0 < t1 in seconds, {least:g} to {most:g} s apart"
+        raise ValueError(f"a window must have {wanted}, got {t0} and {t1}")
 
 
 def _check_positions(positions: Any) -> None:

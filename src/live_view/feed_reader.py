@@ -15,9 +15,16 @@ import numpy as np
 
 from src.live_view.event_feeds import Feed
 from src.live_view.frame_buffer import PolarityAccumulator
-from src.live_view.live_windows import EventWindow, WindowCutter, WindowQueue
+from src.live_view.live_windows import (
+    FEW_LIVE_EVENTS,
+    EventWindow,
+    WindowCutter,
+    WindowQueue,
+)
 from src.live_view.status import FaultLog, Meters
 from src.recordings.event_windows import COVERED
+from src.recordings.files.event_arrays import concatenate_events
+from src.recordings.files.event_file import EVENT
 from src.recordings.files.event_order import BUFFER_US
 
 NAP_S = 0.02  # how long a wait goes on before it looks whether it is still wanted
@@ -108,6 +115,24 @@ class CameraClock:
         return (wall_s - self.offset_s) * 1e6
 
 
+class DoubtedEvents:
+    """The newest events that are off the camera's clock, all of one other clock."""
+
+    def __init__(self):
+        self.events = np.empty(0, EVENT)
+        self.ahead_us = np.empty(0)  # of our clock
+
+    def add(self, events: np.ndarray, arrival_s: float) -> int:
+        """Add events; return how many are let go, as later ones are of another clock."""
+        events = concatenate_events([self.events, events])
+        ahead_us = events["t"][len(self.ahead_us) :] - arrival_s * 1e6
+        ahead_us = np.concatenate([self.ahead_us, ahead_us])
+        others = np.flatnonzero(np.abs(ahead_us - ahead_us[-1]) > MAX_AHEAD_US)
+        start = int(others[-1]) + 1 if others.size else 0
+        self.events, self.ahead_us = events[start:], ahead_us[start:]
+        return start
+
+
 class FeedReader:
     """Fills `waiting` with windows of `feed`, and `counter` with their events, until stopped.
 
@@ -131,8 +156,10 @@ class FeedReader:
         self.clock, self.meters, self.faults = clock, meters, faults
         self.chunks: queue.Queue = queue.Queue(MAX_CHUNKS)
         self.camera_clock = CameraClock()
-        self.arrival_s: float | None = None  # wall time of the newest live chunk
+        self.arrival_s: float | None = None  # wall time of the newest live events on the clock
         self.behind_since_s: float | None = None  # wall time; None: not all events come too late
+        self.doubted = DoubtedEvents()
+        self.scene_events = 0  # on the clock, since the scene began
         self.state = "waiting"
 
     def decode(self, stopped: threading.Event) -> None:
@@ -224,10 +251,14 @@ class FeedReader:
     def _add_live(self, events: np.ndarray, arrival_s: float) -> None:
         """Take a live chunk; after a silence, a jump of the camera's clock, or where all events
         come after their windows are over, time restarts."""
-        if self.arrival_s is not None:
-            self._restart_after_silence_or_jump(events, arrival_s, arrival_s - self.arrival_s)
+        events = self.cutter.drop_events_off_sensor(events)
+        if events.size and self.arrival_s is not None:
+            events = self._take_on_clock(events, arrival_s, arrival_s - self.arrival_s)
+        if not events.size:
+            return
         self.faults.clear("stall")
         self.arrival_s = arrival_s
+        self.scene_events += len(events)
         if self.cutter.add(events):
             self.camera_clock = CameraClock()
         if self._is_long_behind(arrival_s):
@@ -237,21 +268,39 @@ class FeedReader:
         elif self.cutter.origin_us is not None:
             self.camera_clock.observe(self.cutter.last_us, arrival_s, float(events["t"][0]))
 
-    def _restart_after_silence_or_jump(
-        self, events: np.ndarray, arrival_s: float, silent_s: float
-    ) -> None:
-        """Restart before a chunk after a silence, or whose times are far ahead of the clock; a new
-        scene where they are earlier than those before the silence."""
-        middle_us = float(events["t"][len(events) // 2])
-        back_us = self.cutter.last_us - middle_us
+    def _take_on_clock(self, events: np.ndarray, arrival_s: float, silent_s: float) -> np.ndarray:
+        """Return the events on the camera's clock, which goes on after a silence.
+
+        Off it are those far ahead and, after a silence, those earlier than what came before it.
+        FEW_LIVE_EVENTS of them, one after the other and of one clock, are a jump, so are as many as
+        the scene had before: time restarts, and they are returned.  Fewer are dropped when others
+        come.
+        """
         is_after_silence = silent_s > STALL_S
-        if is_after_silence and back_us > BUFFER_US:
-            self.cutter.report_jump_back(back_us)
-            self._restart(new_scene=True)
-        elif is_after_silence or (
-            middle_us - self.camera_clock.recorded_us(arrival_s) > MAX_AHEAD_US
-        ):
+        is_off = events["t"] > self.camera_clock.recorded_us(arrival_s) + MAX_AHEAD_US
+        if is_after_silence:
+            is_off |= events["t"] < self.cutter.last_us - BUFFER_US
+        on = np.flatnonzero(~is_off)
+        tail = int(on[-1]) + 1 if on.size else 0  # from there on all are off it
+        if on.size:
+            self.cutter.report_dropped(len(self.doubted.events) + tail - on.size)
+            self.doubted = DoubtedEvents()
+        if tail < len(events):
+            self.cutter.report_dropped(self.doubted.add(events[tail:], arrival_s))
+            if len(self.doubted.events) >= min(FEW_LIVE_EVENTS, self.scene_events):
+                return self._jump()
+        if on.size and is_after_silence:
             self._restart()
+        return events if on.size == len(events) else events[on]
+
+    def _jump(self) -> np.ndarray:
+        """Restart with the doubted events, and return them; back in time they begin a scene."""
+        events, self.doubted = self.doubted.events, DoubtedEvents()
+        back_us = self.cutter.last_us - float(events["t"][0])
+        if is_back := back_us > BUFFER_US:
+            self.cutter.report_jump_back(back_us)
+        self._restart(new_scene=is_back)
+        return events
 
     def _is_long_behind(self, arrival_s: float) -> bool:
         """Return whether no event since BEHIND_S came before its window was over."""
@@ -263,6 +312,7 @@ class FeedReader:
 
     def _restart(self, *, new_scene: bool = False) -> None:
         self.cutter.restart(new_scene=new_scene)
+        self.scene_events = 0 if new_scene else self.scene_events
         self.camera_clock, self.behind_since_s = CameraClock(), None
 
     def _hand_on(self, window: EventWindow, due_s: float, stopped: threading.Event) -> None:

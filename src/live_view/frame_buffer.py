@@ -63,13 +63,18 @@ class TimeSlice:
         height, width = frames.size
         self.line: Line = (0.0, height / 2, width - 1.0, height / 2)
         self.drawn: tuple[Line, int] | None = None  # line and frame count of `picture`
+        self.given: tuple[Line, int] | None = None  # those of the last one that was asked as new
         self.picture = np.zeros((1, len(frames.ring)), np.uint8)
 
     def draw(self, *, always: bool = False) -> UInt8[np.ndarray, "samples frames"] | None:
-        """Return the slice; None where it is still that of the last call, unless `always`."""
+        """Return the slice; None where it is still that of the last call that was not `always`."""
         line, count = self.line, self.frames.count
+        if not always and self.given == (line, count):
+            return None
+        if not always:
+            self.given = line, count
         if self.drawn == (line, count):
-            return self.picture if always else None
+            return self.picture
         kept = len(self.frames.ring)
         before = self.drawn[1] if self.drawn is not None and self.drawn[0] == line else None
         new = min(count if before is None else count - before, kept)
@@ -110,7 +115,7 @@ class PolarityAccumulator:
                 self.windows += 1
 
     def take(self) -> Int[np.ndarray, "views h w"]:
-        """Return the sums and start anew; the array is valid until the next call."""
+        """Return the sums, `taken` until the next call, and start anew."""
         self.taken.fill(0)
         with self.lock:
             self.counts, self.taken, self.windows = self.taken, self.counts, 0

@@ -82,7 +82,7 @@ class WindowCutter:
     def add(self, events: np.ndarray) -> bool:
         """Take a chunk, less events off the sensor; return whether the clock restarted, as after a
         jump back in time."""
-        events = self._drop_events_off_sensor(events)
+        events = self.drop_events_off_sensor(events)
         order = self.order
         part, last_us = order.parts[-1], order.last_us
         order.add(events)
@@ -99,6 +99,12 @@ class WindowCutter:
         """Say that time jumped back."""
         self.faults.report("time", f"time jumped back by {back_us * 1e-6:.3g} s: started anew")
 
+    def report_dropped(self, count: int) -> None:
+        """Say that so many events were dropped, if any."""
+        if count:
+            text = "events came too late or far out of order: dropped"
+            self.faults.report("late", text, count)
+
     def _report_disorder(self) -> None:
         """Say how many events were late or dropped since the last call."""
         counts = (self.order.late, self.order.dropped)
@@ -106,8 +112,7 @@ class WindowCutter:
         self.reported = counts
         if late:
             self.faults.report("order", "events came out of order: sorted", late)
-        if dropped:
-            self.faults.report("late", "events came too late or far out of order: dropped", dropped)
+        self.report_dropped(dropped)
 
     def pop_windows(self, until_us: float) -> Iterator[EventWindow]:
         """Yield the windows that are over at `until_us`, each without its `due_s`."""
@@ -140,7 +145,7 @@ class WindowCutter:
         assert self.origin_us is not None
         return self.origin_us + windows * 1e6 / self.fps
 
-    def _drop_events_off_sensor(self, events: np.ndarray) -> np.ndarray:
+    def drop_events_off_sensor(self, events: np.ndarray) -> np.ndarray:
         """Return the events on the sensor; reports how many are not."""
         height, width = self.sensor
         if not events.size or (events["x"].max() < width and events["y"].max() < height):

@@ -148,16 +148,20 @@ class Controls:
 
         Raises ValueError for what is not offered.
         """
+        count = self.count_views(network, views)
+        self.runner = self._make_runner(network, count)
+        self.chosen = {"network": network, "views": count}
+        self.compare_one_view(self.compares_one_view)
+
+    def count_views(self, network: str, views: int | str) -> int:
+        """Return the number of views, of a number or `all`; ValueError for what is not offered."""
         if network not in self.offered:
             raise ValueError(f"network must be one of {', '.join(self.offered)}, got {network}")
         counts = self.offered[network]
         if views != "all" and views not in counts:
             allowed = ", ".join(map(str, ["all", *counts]))
             raise ValueError(f"views_used must be one of {allowed} for {network}, got {views}")
-        count = max(counts) if views == "all" else int(views)
-        self.runner = self._make_runner(network, count)
-        self.chosen = {"network": network, "views": count}
-        self.compare_one_view(self.compares_one_view)
+        return max(counts) if views == "all" else int(views)
 
     def compare_one_view(self, wanted: bool) -> None:
         """Also run the network on the centre view, where it takes any number and has several."""

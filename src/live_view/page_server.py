@@ -27,6 +27,7 @@ from src.live_view.frame_buffer import (
     tile_views_without_gaps,
 )
 from src.live_view.player import Player
+from src.recordings.tone import ToneCurve
 from src.sim.optics import Position
 
 HTML = Path(__file__).with_name("live.html")
@@ -36,6 +37,8 @@ MAX_REQUEST_BYTES = 4096
 NO_CACHE = {"Cache-Control": "no-store"}
 ORIGIN = re.compile(r"(https?://[a-z0-9.-]+(:\d+)?)/?")
 THIS_MACHINE = ("127.0.0.1", "localhost", "::1")
+FLAGS = ("pause", "all_views", "one_view")
+REQUESTS = (*FLAGS, "tone", "line", "network", "views")
 ALL_ADDRESSES = ("0.0.0.0", "::")
 
 
@@ -52,7 +55,8 @@ class LivePage:
         self.status_sent = 0.0  # wall time
 
     def message(self, *, whole: bool = False) -> bytes | None:
-        """Return what is new since the last call, or everything; None where nothing is.
+        """Return what is new since the last call, None where nothing is; or everything, for one
+        visitor: what is new remains so for the others.
 
         Where one picture cannot be drawn, it and those after it are left out: a fault.
         """
@@ -66,7 +70,8 @@ class LivePage:
         header: dict = {"pictures": [[name, len(data)] for name, data in pictures]}
         now = time.perf_counter()
         if whole or now - self.status_sent >= STATUS_S:
-            self.status_sent, header["status"] = now, self.status()
+            header["status"] = self.status()
+            self.status_sent = self.status_sent if whole else now
         elif not pictures:
             return None
         return _pack(header) + b"".join(data for _, data in pictures)
@@ -90,12 +95,12 @@ class LivePage:
         if newest is None:
             return
         if whole or count != self.frames_sent:
-            self.frames_sent = count
+            self.frames_sent = self.frames_sent if whole else count
             yield "frame", encode_jpeg(newest)
             if (one_view := self.player.one_view) is not None:
                 yield "one-view", encode_jpeg(cv2.convertScaleAbs(one_view, alpha=255))
         if whole or self.counter.windows:
-            counts = self.counter.take()
+            counts = self.counter.taken if whole else self.counter.take()
             centre = self.positions.index((0, 0)) if (0, 0) in self.positions else 0
             yield "events", encode_jpeg(draw_events(counts[centre]))
             if self.all_views:
@@ -104,24 +109,46 @@ class LivePage:
             yield "slice", encode_jpeg(drawn)
 
     def handle_request(self, request: dict) -> None:
-        """Do what a visitor asks; raises ValueError for what makes no sense."""
-        if "pause" in request:
-            self.player.set_paused(bool(request["pause"]))
-        if "tone" in request:
-            self.player.set_tone(str(request["tone"]))
-        if "one_view" in request:
-            self.controls.compare_one_view(bool(request["one_view"]))
-        if "all_views" in request:
-            self.all_views = bool(request["all_views"])
-        if "line" in request:
-            self.slice.line = _parse_line(request["line"])
+        """Do what a visitor asks; raises ValueError, and does nothing, where a part of it makes no
+        sense."""
+        self._check_request(request)
         if "network" in request:
             self.controls.choose(str(request["network"]), request.get("views", "all"))
+        if "pause" in request:
+            self.player.set_paused(request["pause"])
+        if "tone" in request:
+            self.player.set_tone(request["tone"])
+        if "one_view" in request:
+            self.controls.compare_one_view(request["one_view"])
+        if "all_views" in request:
+            self.all_views = request["all_views"]
+        if "line" in request:
+            self.slice.line = _parse_line(request["line"])
+
+    def _check_request(self, request: dict) -> None:
+        if unknown := request.keys() - set(REQUESTS):
+            raise ValueError(f"a request must be of {', '.join(REQUESTS)}, got {min(unknown)}")
+        for name in FLAGS:
+            if not isinstance(request.get(name, False), bool):
+                raise ValueError(f"{name} must be true or false, got {request[name]}")
+        if "tone" in request:
+            ToneCurve(str(request["tone"]))
+        if "line" in request:
+            _parse_line(request["line"])
+        if "network" in request:
+            self.controls.count_views(str(request["network"]), request.get("views", "all"))
+        elif "views" in request:
+            raise ValueError(f"views must come with network, got views={request['views']} alone")
 
 
 def _pack(header: dict) -> bytes:
     text = json.dumps(header).encode()
     return len(text).to_bytes(4, "little") + text
+
+
+def _picture_names(message: bytes) -> set[str]:
+    length = int.from_bytes(message[:4], "little")
+    return {name for name, _ in json.loads(message[4 : 4 + length])["pictures"]}
 
 
 def _parse_line(numbers: object) -> Line:
@@ -173,7 +200,9 @@ class PageServer:
             await self._tick(stop)
         finally:
             for queue in self.visitors:
-                _replace(queue, None)
+                if queue.full():
+                    queue.get_nowait()
+                queue.put_nowait(None)  # the end
             await runner.cleanup()
 
     async def _tick(self, stop: asyncio.Event) -> None:
@@ -183,14 +212,25 @@ class PageServer:
             started = time.perf_counter()
             self.page.counter.is_watched = bool(self.visitors)
             if self.visitors and (message := self.page.message()) is not None:
-                for queue in self.visitors:
-                    _replace(queue, message)
+                self._hand_out(message)
             now = time.thread_time()
             meters.add_busy_time("page", now - before)
             before = now
             left = 1 / PICTURES_HZ - (time.perf_counter() - started)
             with suppress(TimeoutError):
                 await asyncio.wait_for(stop.wait(), max(left, 0.001))
+
+    def _hand_out(self, message: bytes) -> None:
+        """Put `message` into every queue; in place of one with pictures that it lacks, which a slow
+        visitor has not taken, put all there is."""
+        pictures, whole = _picture_names(message), None
+        for queue in self.visitors:
+            untaken = queue.get_nowait() if queue.full() else None
+            if untaken is not None and _picture_names(untaken) - pictures:
+                whole = whole or self.page.message(whole=True)
+                queue.put_nowait(whole)
+            else:
+                queue.put_nowait(message)
 
     @web.middleware
     async def _own_pages_only(self, request: web.Request, handler) -> web.StreamResponse:
@@ -290,13 +330,6 @@ def _parse_origin(origin: str) -> str:
         wanted = "addresses such as https://cam.example.org"
         raise ValueError(f"allowed_origins must be {wanted}, got {origin}")
     return found[1]
-
-
-def _replace(queue: asyncio.Queue, message: bytes | None) -> None:
-    """Put a message into `queue`, in place of one that a slow visitor has not taken."""
-    if queue.full():
-        queue.get_nowait()
-    queue.put_nowait(message)
 
 
 async def _send(visitor: web.WebSocketResponse, queue: asyncio.Queue) -> None:

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.parametrizations import spectral_norm as normalise_spectrum
+from torch.utils import _pytree as pytree
 
 from src.models.layers import ConvGRU, ConvLSTM, ResidualBlock, pad_centred_to_multiple
 from src.models.network import WINDOW_S, EventToVideoNetwork, check_voxel_shape
@@ -92,16 +93,19 @@ class E2VID(EventToVideoNetwork):
         """Return the frame at the end of the window and the state, one entry per scale.
 
         Views are in the order of training; `window_s` and `positions` have no part in it.  Raises
-        ValueError for another shape, or when views or bins are not the network's.
+        ValueError for another shape, or when views, bins or the sizes of the state do not fit.
         """
-        height, width = voxels.shape[-2:]
         x, (top, left) = self._padded(voxels)
+        self._check_state(state, x)
+        height, width = voxels.shape[-2:]
         frame, after = self.after_first_layer(self.first_layer(x), state)
         return frame[..., top : top + height, left : left + width], after
 
     def warm_up(self, voxels: Tensor, state: Any = None, **options: Any) -> tuple:
         """Return the state that `forward` does, without its decoder."""
-        return self.encode(self.first_layer(self._padded(voxels)[0]), state)[2]
+        x, _ = self._padded(voxels)
+        self._check_state(state, x)
+        return self.encode(self.first_layer(x), state)[2]
 
     def _padded(self, voxels: Tensor) -> tuple[Tensor, tuple[int, int]]:
         check_voxel_shape(voxels)
@@ -109,6 +113,20 @@ class E2VID(EventToVideoNetwork):
             wanted, got = (self.views, self.bins), tuple(voxels.shape[1:3])
             raise ValueError(f"optics.views, bins must be {wanted} for this network, got {got}")
         return pad_centred_to_multiple(voxels.flatten(1, 2), 2**SCALES)
+
+    def _check_state(self, state: Any, x: Float[Tensor, "n c h w"]) -> None:
+        """Raise ValueError unless `state` has the sizes that padded voxels `x` leave."""
+        if not state:
+            return
+        found = [tuple(getattr(leaf, "shape", ())) for leaf in pytree.tree_leaves(state)]
+        n, _, height, width = x.shape
+        sizes = []
+        for scale, cell in enumerate(self.cells, start=1):
+            channels = self.encoders[scale - 1].out_channels
+            size = n, channels, height // 2**scale, width // 2**scale
+            sizes += [size] * (2 if isinstance(cell, ConvLSTM) else 1)
+        if found != sizes:
+            raise ValueError(f"state must have sizes {sizes} for these voxels, got {found}")
 
     @property
     def first_layer(self) -> nn.Conv2d:

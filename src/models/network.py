@@ -98,7 +98,9 @@ class EventToVideoNetwork(VideoMethod):
 
 
 def check_voxel_shape(voxels: Tensor) -> None:
-    """Raise ValueError unless `voxels` has the five sides of a window's grids."""
+    """Raise ValueError unless `voxels` is a tensor with the five sides of a window's grids."""
+    if not isinstance(voxels, Tensor):
+        raise ValueError(f"voxels must be a tensor, got {type(voxels).__name__}")
     if voxels.ndim != 5:
         wanted = "voxels must be (clips, views, bins, height, width)"
         raise ValueError(f"{wanted}, got {tuple(voxels.shape)}")

@@ -1,9 +1,11 @@
 """ONNX with explicit state, and the running form: the same frames as the network itself."""
 
+import copy
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -12,7 +14,9 @@ from baselines.highpass import HighPass
 from src.deploy import onnx_export
 from src.deploy.forms import Bf16Network, convert_to_form
 from src.deploy.onnx_export import OnnxNetwork, export_onnx
+from src.models import load
 from src.models.e2vid import E2VID
+from src.models.network import EventToVideoNetwork
 from src.models.setnet import SetNet
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -121,13 +125,71 @@ def test_a_file_that_is_refused_leaves_the_one_before(tmp_path, monkeypatch):
     good, size = tmp_path / "good.onnx", {"views": 9, "height": 16, "width": 16}
     good.write_bytes(b"good")
     for path in (good, tmp_path / "new.onnx"):
-        with pytest.raises(ValueError, match=r"PyTorch's frames within 0\.0001, got 0\.3"):
+        with pytest.raises(ValueError, match=r"frames and states within 0\.0001, got 0\.3"):
             export_onnx(NETWORKS["setnet"](), path, **size)
     assert [path.name for path in tmp_path.iterdir()] == ["good.onnx"]
     assert good.read_bytes() == b"good"
     monkeypatch.setattr(onnx_export, "_largest_difference", lambda *given: 0.0)
     export_onnx(NETWORKS["setnet"](), good, **size)
     assert good.read_bytes() == b"refused"
+
+
+def test_a_shipped_network_that_rounds_its_state_is_exported(tmp_path):
+    pytest.importorskip("onnxruntime", reason="needs the extra onnx")
+    pytest.importorskip("onnxscript", reason="needs the extra onnx")
+    found = export_onnx(load("lf3x3"), tmp_path / "net.onnx", views=9, height=128, width=128)
+    assert found.views == 9
+
+
+class Converted(EventToVideoNetwork):
+    """A stand-in for an exported file: `network` with its state a list of arrays, `change`d."""
+
+    def __init__(self, network, change=lambda state: state):
+        super().__init__()
+        self.network, self.change = network, change
+
+    def forward(self, window, state=None):
+        tensors = [torch.from_numpy(part) for part in state or []]
+        pairs = list(zip(tensors[::2], tensors[1::2], strict=True))
+        frame, after = self.network(window, pairs or None)
+        return frame, self.change([part.numpy() for pair in after for part in pair])
+
+
+@pytest.fixture(scope="module")
+def rounding():
+    network = load("single256").eval()
+    assert network.state_rounding_step == 0.25
+    return network
+
+
+def checked(exported, network) -> float:
+    window = torch.randn(1, 1, 5, 128, 128, generator=torch.Generator().manual_seed(0))
+    return onnx_export._largest_difference(exported, network, window, None)
+
+
+@torch.no_grad()
+def test_a_rounding_step_that_a_last_bit_turns_is_no_difference(rounding):
+    def move(state):
+        return [part + np.float32(1e-5) for part in state]
+
+    window = torch.randn(1, 1, 5, 128, 128, generator=torch.Generator().manual_seed(0))
+    _, state = rounding(window)
+    moved = [(hidden + 1e-5, memory + 1e-5) for hidden, memory in state]
+    turned = rounding(window, moved)[0] - rounding(window, state)[0]
+    assert turned.abs().max() > onnx_export.TOLERANCE
+    assert checked(Converted(rounding, move), rounding) <= 1.1e-5
+
+
+def test_a_conversion_without_the_rounding_or_with_another_state_is_refused(rounding):
+    unrounded = copy.deepcopy(rounding)
+    unrounded.state_rounding_step = None
+    assert checked(Converted(unrounded), rounding) > 10 * onnx_export.TOLERANCE
+    for change in (
+        lambda state: [*state[:-1], state[-1] + np.float32(2e-4)],
+        lambda state: [state[1], state[0], *state[2:]],
+        lambda state: [state[0] * np.nan, *state[1:]],
+    ):
+        assert not checked(Converted(rounding, change), rounding) <= onnx_export.TOLERANCE
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 16), (16, 4)])

@@ -5,6 +5,7 @@ import gc
 import inspect
 import os
 import sys
+import warnings
 from pathlib import Path
 
 import jaxtyping
@@ -286,7 +287,8 @@ ROW = {"positions": [(0, k) for k in range(9)]}
             {"height": 7},
             "must be >= 8 px.*resolution, else sensor_size.*, got 7 and",
         ),
-        ("setnet", {"threads": 0}, "threads must be >= 1, got 0"),
+        ("setnet", {"threads": 0}, r"threads must be in 1\.\.1024, got 0"),
+        ("setnet", {"threads": 10**6}, r"threads must be in 1\.\.1024, got 1000000"),
         ("setnet", {"form": "float16"}, "form must be one of float32, bf16, openvino"),
     ],
 )
@@ -315,6 +317,9 @@ def test_another_network_is_refused():
         ({"positions": [0, 0]}, r"positions must be the \(row, col\) of each view, got \[0, 0\]"),
         ({"positions": 9}, r"positions must be the \(row, col\) of each view, got 9"),
         ({"height": 64.5}, "height and width must be >= 8 px, whole .*, got 64.5 and 32"),
+        ({"threads": "2"}, r"threads must be in 1\.\.1024, got 2"),
+        ({"threads": None}, r"threads must be in 1\.\.1024, got None"),
+        ({"threads": 1.5}, r"threads must be in 1\.\.1024, got 1\.5"),
         ({"network": "setnet_small"}, r"got str; use load\('setnet_small'\)"),
     ],
 )
@@ -323,6 +328,39 @@ def test_what_is_of_another_type_is_named(options, words):
     given = {"network": network("setnet"), "positions": layout(9), "height": 24, "width": 32}
     with pytest.raises(ValueError, match=words):
         make(EventListRuntime.__new__(EventListRuntime), **given | options)
+
+
+@pytest.mark.parametrize("name", ["setnet", "e2vid"])
+@pytest.mark.parametrize(
+    ("t0", "t1"), [("0", 1.0), (None, 1.0), (0.0, None), (0.0, 1e-46), (0.0, 1e300), (0.0, np.inf)]
+)
+def test_a_window_of_another_length_is_named_and_changes_nothing(name, t0, t1):
+    live = runtime(network(name))
+    check = inspect.unwrap(EventListRuntime._checked)  # without the type checks of tests
+    live.step(**events(0))
+    before = copy.deepcopy(live.state)
+    times = {"t0": t0, "t1": t1}
+    wanted = r"a window must have t0 < t1 in seconds, 1e-09 to 1e\+12 s apart, got "
+    with pytest.raises(ValueError, match=wanted):
+        check(live, **events(0, 0) | times)
+    np.testing.assert_array_equal(live.step(**events(1)), go_on(live, before, **events(1)))
+
+
+@pytest.mark.parametrize("length_s", [1e-9, 1e12])
+def test_frames_of_the_shortest_and_the_longest_window_are_finite(length_s):
+    live, window = runtime(network("setnet")), events(0)
+    long = {"t": window["t"] * 600 * length_s, "t0": 0.0, "t1": length_s}
+    with warnings.catch_warnings(action="ignore"):
+        assert np.isfinite(live.step(**window | long)).all()
+    assert np.isfinite(live.step(**events(1))).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float64])
+@pytest.mark.parametrize("name", ["setnet", "e2vid"])
+def test_a_network_of_another_type_runs_in_float32(name, dtype):
+    net = network(name).to(dtype)
+    found = runtime(net).step(**events(0))
+    np.testing.assert_allclose(found, runtime(net.float()).step(**events(0)), atol=EXACT)
 
 
 def test_without_the_package_it_says_how_to_get_it(monkeypatch):

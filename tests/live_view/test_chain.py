@@ -20,7 +20,12 @@ from src import live
 from src.live_view import event_feeds
 from src.live_view.feed_reader import BEHIND_S, STALL_S, FeedReader, PlaybackClock
 from src.live_view.frame_buffer import PolarityAccumulator
-from src.live_view.live_windows import EventWindow, WindowCutter, WindowQueue
+from src.live_view.live_windows import (
+    FEW_LIVE_EVENTS,
+    EventWindow,
+    WindowCutter,
+    WindowQueue,
+)
 from src.live_view.network_runner import NetworkRunner, RunSettings
 from src.live_view.page_server import PageServer
 from src.live_view.status import FaultLog, Meters
@@ -296,6 +301,77 @@ def test_a_camera_s_clock_that_leaps_does_not_make_windows_without_end():
     assert sum(one.start_us >= 10**12 for one in windows) >= 4
 
 
+def quiet(at_s: float, count: int, shift_s: float = 0.0) -> list:
+    """Return chunks of one event each, 2 ms apart, sent at once; their clock is `shift_s` off."""
+    sent = (at_s + 0.002 * np.arange(count)).tolist()
+    return [(at, [round((at + shift_s) * 1e6)]) for at in sent]
+
+
+def cut_quiet(*chunks):
+    """Return the windows at 200 fps of live chunks (wall s, times in us, x) and the faults."""
+    faults, never, waiting = FaultLog(), threading.Event(), WindowQueue(10_000)
+    marks, cutter = (
+        PolarityAccumulator(build_lookup(scenes.views())),
+        WindowCutter(scenes.SENSOR, 200.0, faults),
+    )
+    intake = FeedReader(Script(), cutter, waiting, marks, PlaybackClock(1.0), Meters(), faults)
+    for at, times, *x in chunks:
+        made = np.zeros(len(times), EVENT)
+        made["t"], made["x"], made["p"] = times, x[0] if x else 5, 1
+        intake._cut_live((made, at), at, never)
+    windows = list(waiting.windows)
+    return windows, [one.starts_scene for one in windows].count(True), faults.current()
+
+
+DROPPED = "events came too late or far out of order: dropped ({} events)"
+
+
+@pytest.mark.parametrize("count", [1, 3, FEW_LIVE_EVENTS - 1])
+@pytest.mark.parametrize("shift_s", [50.0, -50.0])
+def test_few_wild_times_alone_in_a_chunk_are_dropped_and_forget_no_scene(count, shift_s):
+    wild = (1.5, [round((1.5 + shift_s) * 1e6)] * count)
+    windows, begun, faults = cut_quiet(*quiet(1.0, 250), wild, *quiet(1.502, 250))
+    assert begun == 1 and faults == [DROPPED.format(count)]
+    assert sum(len(one.events) for one in windows) >= 495
+
+
+def test_wild_times_of_one_clock_alone_are_a_jump():
+    rng = np.random.default_rng(0)
+    wild = [(1.5 + 0.002 * k, [int(rng.integers(10**8, 10**12))]) for k in range(40)]
+    windows, begun, faults = cut_quiet(*quiet(1.0, 250), *wild, *quiet(1.58, 250))
+    assert begun == 1 and faults == [DROPPED.format(40)] and len(windows) < 220
+
+
+def test_a_stale_event_after_a_silence_ends_no_scene_and_no_silence():
+    later = 1.5 + STALL_S + 0.2
+    windows, begun, faults = cut_quiet(*quiet(1.0, 250), (later, [10]), *quiet(later + 0.002, 250))
+    assert begun == 1 and faults == [DROPPED.format(1)] and len(windows) < 200
+
+
+@pytest.mark.parametrize(
+    ("pause_s", "shift_s", "scenes_begun", "said"),
+    [
+        (0.0, 50.0, 1, []),
+        (0.0, -50.0, 2, ["time jumped back by 50 s: started anew"]),
+        (1.2, -50.0, 2, ["time jumped back by 48.8 s: started anew"]),
+    ],
+)
+def test_a_clock_that_jumps_in_a_quiet_scene_restarts_time(pause_s, shift_s, scenes_begun, said):
+    after = quiet(101.5 + pause_s, 250, shift_s)
+    windows, begun, faults = cut_quiet(*quiet(101.0, 250), *after)
+    times = np.concatenate([one.events["t"] for one in windows])
+    jumped = times[np.abs(times - after[0][1][0]) < 10**6]
+    assert begun == scenes_begun and faults == said
+    assert len(windows) < 220 and len(jumped) > 200 and jumped[0] == after[0][1][0]
+
+
+def test_events_off_the_sensor_alone_restart_nothing():
+    off = [(at, times, scenes.SENSOR[1] + 7) for at, times in quiet(1.2, 250)]
+    windows, begun, faults = cut_quiet(*quiet(1.0, 100), *off, *quiet(1.7, 250))
+    assert begun == 1 and faults == ["events up to 648x1 are off the 640x360 sensor (250 events)"]
+    assert sum(len(one.events) for one in windows) >= 345 and len(windows) > 235
+
+
 def test_what_comes_live_is_not_slowed_down():
     parts = (WindowQueue(1), PolarityAccumulator(build_lookup(scenes.views())), PlaybackClock(0.5))
     with pytest.raises(ValueError, match="playback_speed must be 1 for what comes live"):
@@ -480,6 +556,74 @@ def test_the_server_answers_and_takes_only_what_makes_sense(recording):
     refused = [answer["refused"] for answer in answers if "refused" in answer]
     assert any("views_used must be one of" in line for line in refused)
     assert not any(one["faults"] for one in headers)  # which all visitors see
+
+
+def pictures(message: bytes | None) -> list[str]:
+    """Return the names of a message's pictures."""
+    assert message is not None
+    length = int.from_bytes(message[:4], "little")
+    return [name for name, _ in json.loads(message[4 : 4 + length])["pictures"]]
+
+
+@pytest.fixture
+def page_server(recording):
+    made = served(recording, {"net": HighPass()})
+    made.page.counter.is_watched = True
+    yield made
+    made.page.player.reader.feed.close()
+
+
+def show_frame(page) -> None:
+    """Show a frame of a window with an event."""
+    events = np.zeros(1, EVENT)
+    page.frames.push(np.full(page.frames.size, 0.5, np.float32))
+    page.counter.add(events)
+
+
+def test_a_slow_visitor_gets_the_last_frame(page_server):
+    page, slow, quick = page_server.page, asyncio.Queue(1), asyncio.Queue(1)
+    page_server.visitors |= {slow, quick}
+    show_frame(page)
+    page_server._hand_out(page.message())
+    assert pictures(quick.get_nowait()) == ["frame", "events", "slice"]
+    page.status_sent = -np.inf  # nothing new but the status
+    page_server._hand_out(page.message())
+    assert pictures(quick.get_nowait()) == []
+    assert pictures(slow.get_nowait()) == ["frame", "events", "slice"]
+
+
+def test_who_comes_takes_nothing_from_those_who_are_there(page_server):
+    page = page_server.page
+    show_frame(page)
+    assert pictures(page.message()) == ["frame", "events", "slice"]
+    show_frame(page)
+    before = page.status_sent
+    assert pictures(page.message(whole=True)) == ["frame", "events", "slice"]
+    assert page.status_sent == before
+    assert pictures(page.message()) == ["frame", "events", "slice"]
+    assert page.message() is None
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"pause": "no"}, "pause must be true or false, got no"),
+        ({"all_views": 1}, "all_views must be true or false, got 1"),
+        ({"one_view": None}, "one_view must be true or false, got None"),
+        ({"pause": True, "tone": "bad"}, "tone must be auto or none, got bad"),
+        ({"pause": True, "all_views": True, "line": [0]}, "line must be x0, y0, x1, y1"),
+        ({"pause": True, "network": "net", "views": 77}, "views_used must be one of"),
+        ({"pause": True, "views": 5}, "views must come with network, got views=5 alone"),
+        ({"pause": True, "paws": 1}, "a request must be of pause, .*, got paws"),
+    ],
+)
+def test_a_request_of_which_a_part_makes_no_sense_does_nothing(page_server, wrong, words):
+    page = page_server.page
+    with pytest.raises(ValueError, match=words):
+        page.handle_request(wrong)
+    assert not page.player.status()["paused"] and not page.all_views
+    page.handle_request({"pause": True, "network": "net", "views": "all"})
+    assert page.player.status()["paused"]
 
 
 def test_pictures_that_cannot_be_drawn_are_a_fault_and_the_page_goes_on(recording, monkeypatch):

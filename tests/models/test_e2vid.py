@@ -2,13 +2,14 @@
 
 import inspect
 
+import numpy as np
 import pytest
 import torch
 from torch.nn.utils import parametrize
 
 from src.deploy.cost import macs_per_frame
 from src.models.e2vid import E2VID
-from src.models.network import unroll
+from src.models.network import check_voxel_shape, unroll
 
 
 @pytest.mark.parametrize(
@@ -124,6 +125,24 @@ def test_another_shape_is_refused_in_one_line():
     forward = inspect.unwrap(E2VID.forward)  # without the type checks of tests
     with pytest.raises(ValueError, match=r"^voxels must be \(clips, .* got \(1, 2, 3, 16\)$"):
         forward(small(), torch.zeros(1, 2, 3, 16))
+
+
+def test_an_array_is_refused_in_one_line():
+    check = inspect.unwrap(check_voxel_shape)  # without the type checks of tests
+    with pytest.raises(ValueError, match=r"^voxels must be a tensor, got ndarray$"):
+        check(np.zeros((1, 2, 3, 16, 16), np.float32))
+
+
+@pytest.mark.parametrize("recurrent", ["convlstm", "convgru"])
+@pytest.mark.parametrize("shape", [(2, 4, 2, 3, 24, 16), (3, 4, 2, 3, 16, 16)])
+def test_a_state_of_another_size_is_refused(recurrent, shape):
+    network = small(recurrent=recurrent)
+    _, state = network(voxels()[:, 0], None)
+    network(voxels()[:, 1], state)
+    for call in (network, network.warm_up):
+        for wrong in (state, 5):
+            with pytest.raises(ValueError, match=r"^state must have sizes \[\(., 8, .*, got"):
+                call(torch.zeros(shape)[:, 0], wrong)
 
 
 @pytest.mark.parametrize("wrong", [{"recurrent": "lstm"}, {"final_activation": "tanh"}])
