@@ -7,7 +7,7 @@ lists, and in the file's metadata `index_sha256`.  It is mapped, not read.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from hashlib import sha256
@@ -74,7 +74,7 @@ def list_photographs(root: Root, split: str) -> list[Photograph]:
         folder = Path(spec.origin).parent / "data"
         embedded = {path.stem: path for path in folder.iterdir() if path.suffix in PICTURE_SUFFIXES}
         return [embedded[name] for name in EMBEDDED[split].split()]
-    roots = _roots("root", root)
+    roots = list_roots("root", root)
     places = [one.resolve() for one in roots]
     for k, place in enumerate(places):
         if any(place.is_relative_to(other) for other in (*places[:k], *places[k + 1 :])):
@@ -88,12 +88,9 @@ def list_train_only_photographs(extra_train_root: Root, scene_root: Root) -> lis
     Raises ValueError where there are none, and where one of the two is within the other, as what
     `scene_root` keeps for validation and test would be trained on.
     """
-    if extra_train_root is None:
-        return []
-    other = [] if scene_root is None else _roots("root", scene_root)
-    places = [one.resolve() for one in other]
+    places = [one.resolve() for one in list_roots("root", scene_root)]
     found: list[Photograph] = []
-    for one in _roots("extra_train_root", extra_train_root):
+    for one in list_roots("extra_train_root", extra_train_root):
         here = one.resolve()
         if any(here.is_relative_to(place) or place.is_relative_to(here) for place in places):
             raise ValueError(f"scene.extra_train_root must be apart from scene.root, got {one}")
@@ -102,6 +99,53 @@ def list_train_only_photographs(extra_train_root: Root, scene_root: Root) -> lis
             raise ValueError(f"scene.extra_train_root must hold photographs, got none in {one}")
         found += photos
     return found
+
+
+def list_roots(key: str, root: Root) -> list[Path]:
+    """Return the folders and packs that `scene.<key>` names, none for None.
+
+    Raises ValueError for an empty list and for one that does not exist.
+    """
+    if root is None:
+        return []
+    roots = [Path(one) for one in ([root] if isinstance(root, str) else root)]
+    if not roots:
+        raise ValueError(f"scene.{key} must be a folder or a pack, or some, got an empty list")
+    for one in roots:
+        if not one.exists():
+            raise ValueError(f"scene.{key} must be a folder or a pack of photographs, got {one}")
+    return roots
+
+
+def name_roots(roots: Sequence[Path]) -> dict[Path, str]:
+    """Return for each folder or pack its name, after as many folders above it as tell it from the
+    others; "" for the only one."""
+    places = [root.resolve().parts for root in roots]
+    if len(set(places)) < 2:
+        return dict.fromkeys(roots, "")
+    depth = 1
+    while len({parts[-depth:] for parts in places}) < len(set(places)):
+        depth += 1
+    return {root: "/".join(parts[-depth:]) for root, parts in zip(roots, places, strict=True)}
+
+
+def name_source(photo: Photograph, root_names: Mapping[Path, str]) -> str:
+    """Return where a photograph lies below its root, after its root's name, without suffix:
+    `coast/001`; the stem of one of scikit-image's.  Pictures of one stem in one folder are taken
+    for one photograph.
+    """
+    root = find_root(photo, list(root_names))
+    if root is None:
+        return photo.stem
+    inner = photo.name if isinstance(photo, PackedPhotograph) else photo.relative_to(root)
+    return PurePosixPath(root_names[root], inner).with_suffix("").as_posix()
+
+
+def find_root(photo: Photograph, roots: Sequence[Path]) -> Path | None:
+    """Return which of `roots` a photograph was found in, None where in none of them."""
+    place = photo.pack if isinstance(photo, PackedPhotograph) else photo
+    found = [root for root in roots if place.is_relative_to(root)]
+    return max(found, key=lambda root: len(root.parts), default=None)  # a/../b is not within a
 
 
 @lru_cache(maxsize=8)
@@ -133,16 +177,6 @@ def decode_photograph(photo: Photograph) -> UInt8[np.ndarray, "h w"]:
     if shrink < 1:
         picture = cv2.resize(picture, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
     return picture
-
-
-def _roots(key: str, root: str | Sequence[str]) -> list[Path]:
-    roots = [Path(one) for one in ([root] if isinstance(root, str) else root)]
-    if not roots:
-        raise ValueError(f"scene.{key} must be a folder or a pack, or some, got an empty list")
-    for one in roots:
-        if not one.exists():
-            raise ValueError(f"scene.{key} must be a folder or a pack of photographs, got {one}")
-    return roots
 
 
 def _share(root: Path, split: str) -> list[Photograph]:
