@@ -137,7 +137,8 @@ def verify_pack(path: Path) -> int:
 def _read_shrunk(path: Path, side: int) -> NDArray:
     picture = read_picture(path)
     if picture is None or min(picture.shape) < 16:
-        raise ValueError(f"FOLDER must hold readable photographs of 16 px or more, got {path}")
+        wanted = "readable photographs, whole and of 16 px or more"
+        raise ValueError(f"FOLDER must hold {wanted}, got {path}")
     scale = side / min(picture.shape)
     if scale >= 1:
         return picture

@@ -168,12 +168,14 @@ def open_photo_pack(path: Path) -> tuple[Any, dict[str, dict[str, list]]]:
 def decode_photograph(photo: Photograph) -> UInt8[np.ndarray, "h w"]:
     """Return a photograph's luminance as uint8, at most LARGEST_SIDE long.
 
-    Raises ValueError for one that cannot be read or is damaged, and for a side below 16 px.
+    Raises ValueError for one that cannot be read or is cut short, for one of a pack that is not as
+    packed, and for a side below 16 px.
     """
     picture = read_picture(photo.data() if isinstance(photo, PackedPhotograph) else photo)
     shrink = 1 if picture is None else min(1, LARGEST_SIDE / max(picture.shape))
     if picture is None or shrink * min(picture.shape) < 16:
-        raise ValueError(f"scene.root must hold readable photographs of 16 px or more, got {photo}")
+        wanted = "readable photographs, whole and of 16 px or more"
+        raise ValueError(f"scene.root must hold {wanted}, got {photo}")
     if shrink < 1:
         picture = cv2.resize(picture, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
     return picture

@@ -23,6 +23,7 @@ VIDEO_SUFFIXES = {
     ".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".ts", ".mts",
     ".m2ts", ".3gp", ".ogv", ".flv", ".gif",
 }  # fmt: skip
+JPEG_START, JPEG_SCAN, JPEG_END = b"\xff\xd8", b"\xda", b"\xff\xd9"
 
 
 @dataclass(frozen=True)
@@ -130,12 +131,35 @@ def is_photograph(path: Path) -> bool:
 
 
 def read_picture(source: Path | bytes, flags: int = cv2.IMREAD_GRAYSCALE) -> NDArray | None:
-    """Return the picture (h, w) of a file or of its bytes, or None where it is none or has too
-    many pixels (video_decoding.LARGEST_PIXELS), as a small file could unpack to gigabytes.
+    """Return the picture (h, w) of a file or of its bytes, or None where it is none, is cut short
+    or has too many pixels (video_decoding.LARGEST_PIXELS), as a small file could unpack to
+    gigabytes.
     """
+    if is_cut_jpeg(source):
+        return None
     try:
         if isinstance(source, bytes):
             return cv2.imdecode(np.frombuffer(source, np.uint8), flags)
         return cv2.imread(str(source), flags)
     except cv2.error:
         return None
+
+
+def is_cut_jpeg(source: Path | bytes) -> bool:
+    """Return whether a file, or its bytes, is a JPEG without the marker of its end (ISO/IEC
+    10918-1, B.1.1.3), of which OpenCV fills the rest with grey.  Bytes may follow the marker.
+    """
+    if isinstance(source, Path):
+        try:
+            with source.open("rb") as file:
+                source = start + file.read() if (start := file.read(2)) == JPEG_START else b""
+        except OSError:
+            return False
+    place = len(JPEG_START)
+    if not source.startswith(JPEG_START):
+        return False
+    # Up to the first scan: segments of a stated length, in which a thumbnail may have its own end.
+    while source[place : place + 1] == b"\xff" and source[place + 1 : place + 2] != JPEG_SCAN:
+        is_fill = source[place + 1 : place + 2] == b"\xff"
+        place += 1 if is_fill else 2 + int.from_bytes(source[place + 2 : place + 4], "big")
+    return source.find(JPEG_END, place) < 0
