@@ -1,5 +1,6 @@
 """Pictures and videos: a video file, a folder of frames, or a folder of these; grey."""
 
+import os
 import re
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +19,7 @@ from src.sim.scenes.code_values import ALL_BITS, check_float_values
 if TYPE_CHECKING:
     from src.sim.scenes.video_index import VideoIndex
 
-PICTURE_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff"}
+PICTURE_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
 VIDEO_SUFFIXES = {
     ".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".ts", ".mts",
     ".m2ts", ".3gp", ".ogv", ".flv", ".gif",
@@ -88,6 +89,23 @@ def find_videos(root: Path, config_key: str = "scene.root") -> list[VideoSource]
     if not videos:
         raise ValueError(f"{config_key} must hold videos or folders of frames, got none in {root}")
     return videos
+
+
+def walk_files(folder: Path, around: tuple[Path, ...] = ()) -> Iterator[Path]:
+    """Yield the files below a folder, and below folders that it links to, but none whose name or
+    folder's name begins with a dot.  `around`: the folders walked into so far; a link to one of
+    these, or to what holds one, is not followed.
+    """
+    here = folder.resolve()
+    if any(one.is_relative_to(here) for one in around):
+        return
+    with os.scandir(folder) as entries:
+        shown = [entry for entry in entries if entry.name[0] != "."]
+    for entry in shown:
+        if entry.is_dir():
+            yield from walk_files(folder / entry.name, (*around, here))
+        elif entry.is_file():
+            yield folder / entry.name
 
 
 def sort_naturally(paths: Iterable[Path]) -> list[Path]:
