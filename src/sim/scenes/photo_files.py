@@ -101,8 +101,8 @@ def list_train_only_photographs(extra_train_root: Root, scene_root: Root) -> lis
         extra += paths
         photos = _packed(one, "train") if one.is_file() else paths
         if not photos:
-            wanted = f"scene.extra_train_root must hold photographs ({KINDS})"
-            raise ValueError(f"{wanted}, got none in {one}")
+            wanted = "scene.extra_train_root must hold photographs"
+            raise ValueError(f"{wanted}, got none in {one} ({KINDS} count)")
         found += photos
     _refuse_shared_files(extra, scene_roots)
     return found
@@ -232,8 +232,8 @@ def _share(root: Path, paths: list[Path], split: str) -> list[Photograph]:
     names = [os.path.splitext(path)[0] for path in paths]
     places = {name: place for place, name in enumerate(dict.fromkeys(names))}
     if len(places) < 10:
-        found = f"{len(places)} in {root}"
-        raise ValueError(f"scene.root must hold at least 10 photographs ({KINDS}), got {found}")
+        found = f"{len(places)} in {root} ({KINDS} count)"
+        raise ValueError(f"scene.root must hold at least 10 photographs, got {found}")
     pairs = zip(names, paths, strict=True)
     return [path for name, path in pairs if places[name] % 10 in SHARES[split]]
 
