@@ -27,11 +27,12 @@ from src.sim.scenes.photo_files import (
     CHECKSUM,
     INDEX,
     PackedPhotograph,
+    find_root,
     list_photographs,
     list_train_only_photographs,
     open_photo_pack,
+    read_luminance,
 )
-from src.sim.scenes.video_files import read_picture
 
 WORST, BEST = 10, 100  # quality of WebP; below 10 textures are gone
 SIDES = (16, 4096)  # px
@@ -83,8 +84,8 @@ def read_photographs(
     """Return the photographs in the order of the splits' lists, each at most `side` px high and
     wide; raises ValueError naming one that cannot be read, and for folders of the same name.
     """
-    roots = [Path(one).resolve() for one in (*folders, *train_only)]
-    names = [root.name for root in roots]
+    roots = [Path(one) for one in (*folders, *train_only)]
+    names = [root.resolve().name for root in roots]
     if len(set(names)) < len(names):
         raise ValueError(f"FOLDER must differ in name from the others, got {', '.join(names)}")
     chosen = [(path, split) for split in SPLITS for path in list_photographs(folders, split)]
@@ -135,9 +136,10 @@ def verify_pack(path: Path) -> int:
 
 
 def _read_shrunk(path: Path, side: int) -> NDArray:
-    picture = read_picture(path)
+    picture = read_luminance(path)
     if picture is None or min(picture.shape) < 16:
-        raise ValueError(f"FOLDER must hold readable photographs of 16 px or more, got {path}")
+        wanted = "readable photographs of 16 px or more, none cut short"
+        raise ValueError(f"FOLDER must hold {wanted}, got {path}")
     scale = side / min(picture.shape)
     if scale >= 1:
         return picture
@@ -146,9 +148,9 @@ def _read_shrunk(path: Path, side: int) -> NDArray:
 
 def _name(path: Path, roots: Sequence[Path]) -> str:
     """Return the name in the pack: the folder's own and what is below it."""
-    whole = path.resolve()
-    root = next(root for root in roots if whole.is_relative_to(root))
-    return (root.name / whole.relative_to(root)).as_posix()
+    root = find_root(path, roots)
+    assert root is not None
+    return (root.resolve().name / path.relative_to(root)).as_posix()
 
 
 def _encode(sources: Sequence[GreyPhotograph], quality: int) -> list[EncodedPicture]:

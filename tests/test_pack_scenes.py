@@ -53,6 +53,12 @@ def test_the_splits_are_those_of_the_folders_and_training_alone_gets_more(folder
     assert [path.name for path in out.parent.iterdir()] == ["photos.pack"]
 
 
+def test_what_a_link_leads_to_is_named_by_where_it_was_found(folders, tmp_path):
+    (Path(folders[0]) / "link").symlink_to(folders[2])
+    found = pack_scenes.read_photographs([folders[0]], [], 32)
+    assert len(found) == 23 and {"b/00.png", "b/link/inner/10.png"} <= {one.name for one in found}
+
+
 def test_pictures_are_those_of_the_folders_made_smaller_never_larger(folders, tmp_path):
     for side, shape in ((32, (32, 48)), (200, (60, 90))):
         out = tmp_path / f"{side}.pack"

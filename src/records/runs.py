@@ -20,6 +20,7 @@ FIGURES = ("chart", "machine", "stress")  # of src.chart and src.stress
 WITHOUT_NUMBERS = ("seed", "name", "task", "logger", "callbacks", "paths", "hydra")
 MACHINE = ("data.workers", "data.simulate_on", "trainer.accelerator")
 PROCESSES = ("trainer.devices", "trainer.num_nodes")  # the joint batch of a training
+HYDRA_FOLDER = ".hydra"  # in the folder of a run: its config.yaml is no second run's
 READ_ERRORS = (
     OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError,
 )  # fmt: skip
@@ -99,7 +100,8 @@ def find_unfinished_runs(folders: list[Path]) -> list[Path]:
     found = dict.fromkeys(f.parent for folder in folders for f in folder.rglob("config.yaml"))
     return [
         run for run in found
-        if not (run / "results.json").is_file() and not jobs & set(run.resolve().parents)
+        if run.name != HYDRA_FOLDER and not (run / "results.json").is_file()
+        and not jobs & set(run.resolve().parents)
         and _read_task(run / "config.yaml") in ("train", "eval")
     ]  # fmt: skip
 

@@ -25,6 +25,7 @@ import src.sim
 from src.models.checkpoints import is_intact, save_atomically
 from src.records.atomic import write_text
 from src.sim.pipeline import Pipeline
+from src.sim.scenes.video_files import walk_files
 from src.training.clip_cache import GIB, CachedClip, ClipCache, simulate_clip
 from src.training.worker_process import prepare_worker_process
 
@@ -193,7 +194,8 @@ def hash_file_lists(config: Any) -> str:
     """
     digest = hashlib.sha256()
     for root in _roots(config):
-        files = sorted(path for path in [Path(root), *Path(root).rglob("*")] if path.is_file())
+        place = Path(root)
+        files = sorted(walk_files(place)) if place.is_dir() else [place] * place.is_file()
         names = [f"{path.relative_to(root)}:{path.stat().st_size}" for path in files]
         digest.update(json.dumps(names).encode())
     return digest.hexdigest()[:12]

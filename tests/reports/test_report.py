@@ -4,6 +4,8 @@ import csv
 import io
 import json
 import math
+import subprocess
+import sys
 
 import pytest
 from omegaconf import OmegaConf
@@ -383,3 +385,12 @@ def test_the_folder_of_a_run_takes_no_other_config(tmp_path):
     with pytest.raises(ValueError, match=r"hydra\.run\.dir.*holds results of another config"):
         report(config("report", folder, f"run={folder}"))
     assert (folder / "config.yaml").read_text() == before
+
+
+def test_a_test_that_ended_is_not_left_out_and_one_without_results_is(tmp_path):
+    line = [sys.executable, "-m", "src.eval", "baseline=highpass", "debug=fdr"]
+    subprocess.run([*line, f"hydra.run.dir={tmp_path}/run"], cwd=ROOT, check=True)
+    assert (tmp_path / "run/.hydra/config.yaml").is_file()
+    assert runs.find_unfinished_runs([tmp_path]) == []
+    (tmp_path / "run/results.json").unlink()
+    assert runs.find_unfinished_runs([tmp_path]) == [tmp_path / "run"]

@@ -412,6 +412,19 @@ def test_files_of_a_scene_are_part_of_what_made_a_disk_cache(tmp_path):
     assert hash_simulation_code() == hash_simulation_code() != ""
 
 
+def test_files_in_linked_folders_are_in_the_hash_hidden_ones_are_not(tmp_path):
+    root, other = tmp_path / "root", tmp_path / "other"
+    for folder in (root, other):
+        folder.mkdir()
+    (root / "link").symlink_to(other)
+    (root / "loop").symlink_to(root)
+    hashes = []
+    for place in (root / "a.png", root / ".hidden.png", other / "b.png"):
+        place.write_bytes(b"0")
+        hashes.append(hash_file_lists({"root": str(root)}))
+    assert hashes[0] == hashes[1] != hashes[2]
+
+
 def test_the_file_that_draws_measured_turbulence_is_in_the_hash(monkeypatch):
     before = hash_simulation_code()
     monkeypatch.setattr(disk_caches, "MEASURED", "recordings/files/time_unit.py")

@@ -40,7 +40,8 @@ class Clip:
     """`frames` (frames, h, w) float32 in [0, 1], code values; `path_px`: the path (frames, 2) of a
     known target's centre (x, y), where there is one; `illumination`: the factor in (0, 1] that a
     flickering lamp puts on the light of each frame, which `frames`, the ground truth, are without;
-    `source`: the name of the photograph or video that it shows, which other clips may share.
+    `source`: which photograph (its path below `scene.root`, without suffix) or video it shows;
+    other clips may show it, too.
     """
 
     frames: Float[Tensor, "frames h w"]

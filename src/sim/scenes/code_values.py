@@ -28,13 +28,19 @@ def scale_to_white(
 
 def warn_of_darkness(
     path: Path | str, kind: np.dtype, largest: float, white_level: float | None,
-    key: str = "white_level",
+    key: str | None = "white_level",
 ) -> None:  # fmt: skip
-    """Warn of values of more than 8 bits that are nearly black, as those of 12 bits are in 16."""
+    """Warn of values of more than 8 bits that are nearly black, as those of 12 bits are in 16.
+    `key`: the config key of `white_level`, None where there is none."""
     full = _largest_value(kind)
     if white_level is None and kind.itemsize > 1 and 0 < largest < DARK_SHARE * full:
         white = 2 ** int(largest).bit_length() - 1  # the least number of bits that holds it
-        way = f"; {key}={white} makes {white} white" if full > 1 else ""
+        way = (
+            f"{key}={white} makes {white} white"
+            if key
+            else f"times {full / white:.0f} it fills the range"
+        )
+        way = f"; {way}" if full > 1 else ""
         warnings.warn(f"{path}: its largest value is {largest:g} of {full:g}{way}", stacklevel=3)
 
 
@@ -49,11 +55,15 @@ def check_float_values(picture: NDArray, key: str, path: Path | str) -> None:
 
 
 def warn_of_transparency(path: Path) -> None:
-    """Warn of a PNG with transparent pixels: their hidden colours are read."""
+    """Warn of a PNG or WebP with transparent pixels: their hidden colours are read."""
     with path.open("rb") as file:
         header = file.read(26)
-    # The kind of colour: a palette, grey or colour with an opacity (PNG, 11.2.2).
-    if header[:4] == b"\x89PNG" and header[25] in (3, 4, 6):
+    # The kind of colour: a palette, grey or colour with an opacity (PNG, 11.2.2); the flag of
+    # opacity, of a WebP with extras or without loss (RFC 9649, 2.7 and 3.4).
+    is_png = header[:4] == b"\x89PNG" and header[25] in (3, 4, 6)
+    place = {b"VP8X": 20, b"VP8L": 24}.get(header[12:16])
+    is_webp = header[8:12] == b"WEBP" and place is not None and header[place] & 0x10
+    if is_png or is_webp:
         picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if picture is None or picture.shape[2:] != (4,):
             return

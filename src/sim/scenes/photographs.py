@@ -20,10 +20,14 @@ from src.sim.scenes.moving_layers import (
     render_frame,
 )
 from src.sim.scenes.photo_files import (
+    Photograph,
     Root,
     decode_photograph,
     list_photographs,
+    list_roots,
     list_train_only_photographs,
+    name_roots,
+    name_source,
 )
 
 REFERENCE_WIDTH = 256  # of the frame that `photo_px_per_px` speaks of
@@ -50,8 +54,11 @@ class PhotographScene(SceneBase):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.photos = list_photographs(self.root, self.split)
+        roots = list_roots("root", self.root)
         if self.split == "train":
             self.photos += list_train_only_photographs(self.extra_train_root, self.root)
+            roots += list_roots("extra_train_root", self.extra_train_root)
+        self._root_names = name_roots(roots)
 
     def background_layer(
         self, photo: NDArray, rng: np.random.Generator, speed_widths_per_s: Sequence[float]
@@ -63,10 +70,14 @@ class PhotographScene(SceneBase):
         motion = SimilarityMotion(rng, speed_widths_per_s)
         return MovingLayer(blur_for_sampling(photo, zoom), None, centre, zoom, motion)
 
-    def read_random_photograph(self, rng: np.random.Generator) -> tuple[str, NDArray]:
-        """Return the name of a photograph and its pixels, uint8 (h, w)."""
+    def read_random_photograph(self, rng: np.random.Generator) -> tuple[Photograph, NDArray]:
+        """Return a photograph and its pixels, uint8 (h, w)."""
         photo = self.photos[rng.integers(len(self.photos))]
-        return photo.stem, decode_photograph(photo)
+        return photo, decode_photograph(photo)
+
+    def name_source(self, photo: Photograph) -> str:
+        """Return what sets a photograph apart from all others of the scene."""
+        return name_source(photo, self._root_names)
 
     def motion_times_s(self, rests: bool, rng: np.random.Generator) -> list[float]:
         """Return how long the clip has moved at every frame, with rests or without."""
@@ -95,8 +106,8 @@ class Photographs(PhotographScene):
         rng_rests = np.random.default_rng(noise.key(key, "tempo"))  # `rng` draws as without rests
         shares = self.static_camera_share, self.paused_clip_share
         static, rests = (rng_rests.uniform(size=2) < shares).tolist()
-        name, photo = self.read_random_photograph(rng)
-        layers = [self.background_layer(photo, rng, self.speed_widths_per_s)]
+        photo, pixels = self.read_random_photograph(rng)
+        layers = [self.background_layer(pixels, rng, self.speed_widths_per_s)]
         if static:
             layers[0].motion.stop()
         objects = max(int(rng.integers(self.max_cutouts + 1)), int(static and self.max_cutouts > 0))
@@ -105,7 +116,8 @@ class Photographs(PhotographScene):
         times = self.motion_times_s(rests, rng_rests)
         frames = np.stack([render_frame(layers, time, self.size) for time in times])
         frames = np.clip(0.5 + offset + gain * (frames - 0.5), 0, 1).astype(np.float32)
-        return Clip(torch.from_numpy(frames), self.fps, f"{name}-{index}", source=name)
+        name, source = f"{photo.stem}-{index}", self.name_source(photo)
+        return Clip(torch.from_numpy(frames), self.fps, name, source=source)
 
     def _cutout_layer(self, rng: np.random.Generator) -> MovingLayer:
         _, photo = self.read_random_photograph(rng)

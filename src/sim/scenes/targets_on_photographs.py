@@ -55,8 +55,8 @@ class TargetsOnPhotographs(PhotographScene):
 
     def clip(self, index: int) -> Clip:
         rng = np.random.default_rng(noise.key(self.seed, self.split, "on photographs", index))
-        name, photo = self.read_random_photograph(rng)
-        layer = self.background_layer(photo, rng, (1.0, 1.0))
+        photo, pixels = self.read_random_photograph(rng)
+        layer = self.background_layer(pixels, rng, (1.0, 1.0))
         background = render_frame([layer], 0.0, self.size)
         targets = [self._draw_target(rng) for _ in range(rng.integers(1, self.max_targets + 1))]
         frames = []
@@ -67,7 +67,8 @@ class TargetsOnPhotographs(PhotographScene):
                 frame += cover * (dim - frame) + (bright - dim) * shape
             frames.append(frame)
         clipped = torch.from_numpy(np.clip(np.stack(frames), 0, 1).astype(np.float32))
-        return Clip(clipped, self.fps, f"targets-{name}-{index}", source=name)
+        name, source = f"targets-{photo.stem}-{index}", self.name_source(photo)
+        return Clip(clipped, self.fps, name, source=source)
 
     def _draw_target(self, rng: np.random.Generator) -> tuple[DrawFunction, float, float]:
         """Return a target's drawing, and the grey levels it has where it is dim and bright."""

@@ -1,5 +1,6 @@
 """Pictures and videos: a video file, a folder of frames, or a folder of these; grey."""
 
+import os
 import re
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -18,11 +19,12 @@ from src.sim.scenes.code_values import ALL_BITS, check_float_values
 if TYPE_CHECKING:
     from src.sim.scenes.video_index import VideoIndex
 
-PICTURE_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff"}
+PICTURE_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
 VIDEO_SUFFIXES = {
     ".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".ts", ".mts",
     ".m2ts", ".3gp", ".ogv", ".flv", ".gif",
 }  # fmt: skip
+JPEG_START, JPEG_SCAN, JPEG_END = b"\xff\xd8", b"\xda", b"\xff\xd9"
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,23 @@ def find_videos(root: Path, config_key: str = "scene.root") -> list[VideoSource]
     return videos
 
 
+def walk_files(folder: Path, around: tuple[Path, ...] = ()) -> Iterator[Path]:
+    """Yield the files below a folder, and below folders that it links to, but none whose name or
+    folder's name begins with a dot.  `around`: the folders walked into so far; a link to one of
+    these, or to what holds one, is not followed.
+    """
+    here = folder.resolve()
+    if any(one.is_relative_to(here) for one in around):
+        return
+    with os.scandir(folder) as entries:
+        shown = [entry for entry in entries if entry.name[0] != "."]
+    for entry in shown:
+        if entry.is_dir():
+            yield from walk_files(folder / entry.name, (*around, here))
+        elif entry.is_file():
+            yield folder / entry.name
+
+
 def sort_naturally(paths: Iterable[Path]) -> list[Path]:
     """Return paths in natural order of their names, numbers by value: 2.png before 10.png."""
     return sorted(
@@ -130,12 +149,35 @@ def is_photograph(path: Path) -> bool:
 
 
 def read_picture(source: Path | bytes, flags: int = cv2.IMREAD_GRAYSCALE) -> NDArray | None:
-    """Return the picture (h, w) of a file or of its bytes, or None where it is none or has too
-    many pixels (video_decoding.LARGEST_PIXELS), as a small file could unpack to gigabytes.
+    """Return the picture (h, w) of a file or of its bytes, or None where it is none, is cut short
+    or has too many pixels (video_decoding.LARGEST_PIXELS), as a small file could unpack to
+    gigabytes.
     """
+    if is_cut_jpeg(source):
+        return None
     try:
         if isinstance(source, bytes):
             return cv2.imdecode(np.frombuffer(source, np.uint8), flags)
         return cv2.imread(str(source), flags)
     except cv2.error:
         return None
+
+
+def is_cut_jpeg(source: Path | bytes) -> bool:
+    """Return whether a file, or its bytes, is a JPEG without the marker of its end (ISO/IEC
+    10918-1, B.1.1.3), of which OpenCV fills the rest with grey.  Bytes may follow the marker.
+    """
+    if isinstance(source, Path):
+        try:
+            with source.open("rb") as file:
+                source = start + file.read() if (start := file.read(2)) == JPEG_START else b""
+        except OSError:
+            return False
+    place = len(JPEG_START)
+    if not source.startswith(JPEG_START):
+        return False
+    # Up to the first scan: segments of a stated length, in which a thumbnail may have its own end.
+    while source[place : place + 1] == b"\xff" and source[place + 1 : place + 2] != JPEG_SCAN:
+        is_fill = source[place + 1 : place + 2] == b"\xff"
+        place += 1 if is_fill else 2 + int.from_bytes(source[place + 2 : place + 4], "big")
+    return source.find(JPEG_END, place) < 0

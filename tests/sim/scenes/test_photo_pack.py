@@ -2,6 +2,7 @@
 
 import pickle
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -60,6 +61,15 @@ def test_clips_of_a_pack_are_those_of_the_files_in_it(pack, tmp_path):
     for index in range(4):
         ours, theirs = scene.clip(index), files.clip(index)
         assert torch.equal(ours.frames, theirs.frames) and ours.name == theirs.name
+
+
+def test_sources_are_the_names_in_the_pack(pack, tmp_path):
+    other = shutil.copy(pack, tmp_path / "more.pack")
+    for roots, prefix in ((str(pack), ""), ([str(pack), str(other)], "photos.pack/")):
+        scene = Photographs(roots, split="test", frames=2, height=8, width=8)
+        found = {scene.name_source(photo) for photo in scene.photos}
+        assert {f"{prefix}folder/sub/0{number}" for number in range(3)} <= found
+        assert scene.clip(0).source in found
 
 
 def test_a_scene_with_a_pack_travels_to_another_process(pack):

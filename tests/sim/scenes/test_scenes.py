@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -60,6 +61,34 @@ def test_a_clip_says_which_photograph_it_shows():
         assert clip.name == f"{clip.source}-{index}" and clip.source in EMBEDDED["test"].split()
     drawn = Targets(kinds=["dart"], split="test", frames=2, height=32, width=32).clip(0)
     assert drawn.source == ""
+
+
+def sources(root, split="test", **more) -> set[str]:
+    """Return the sources of the photographs, of which three clips show some."""
+    scene = Photographs(root, split=split, frames=2, height=8, width=8, max_cutouts=0, **more)
+    found = {scene.name_source(photo) for photo in scene.photos}
+    for index, clip in enumerate(map(scene.clip, range(3))):
+        assert clip.source in found and clip.name == f"{Path(clip.source).name}-{index}"
+    return found
+
+
+def test_photographs_of_one_name_in_other_folders_are_other_sources(tmp_path):
+    for number in range(20):
+        folder(tmp_path / f"{number:02}", 1)
+    assert sources(str(tmp_path)) == {f"{number:02}/000" for number in (7, 9, 17, 19)}
+
+
+def test_sources_name_their_root_where_there_are_several(tmp_path):
+    for parent in "ab":
+        (tmp_path / parent).mkdir()
+    roots = [folder(tmp_path / place, 10) for place in ("a/x", "b/x", "y")]
+    assert sources(roots[0]) == {"007", "009"}
+    assert sources(roots[1:]) == {f"{name}/00{n}" for name in "xy" for n in (7, 9)}
+    assert sources(roots[:2]) == {f"{name}/x/00{n}" for name in "ab" for n in (7, 9)}
+    lexical = [f"{tmp_path}/a/x", f"{tmp_path}/a/x/../../y"]
+    assert sources(lexical) == {f"{name}/00{n}" for name in "xy" for n in (7, 9)}
+    more = sources(roots[0], "train", extra_train_root=[roots[1], roots[1]])
+    assert more == {f"a/x/00{n}" for n in (0, 1, 2, 3, 5, 6, 8)} | {f"b/x/00{n}" for n in range(10)}
 
 
 def test_motion_is_smooth_and_of_the_stated_speed():
