@@ -100,7 +100,7 @@ def run_main(main: Callable[[], None]) -> None:
     except JobFailed as error:
         _print_failed_jobs(Path(str(error)), start)
         sys.exit(1)
-    except (ValueError, HydraException, OmegaConfBaseException, OSError) as error:
+    except _value_errors() as error:
         if isinstance(error, OSError) and _is_in_the_way_of_run(error):
             wanted = "hydra.run.dir must be a folder, new or there"
             error = ValueError(f"{wanted}, got {error.filename}: a file is in the way")
@@ -117,6 +117,13 @@ def run_main(main: Callable[[], None]) -> None:
         if interrupted or isinstance(error, StoppedBySignal):
             print("stopped", file=sys.stderr)
         sys.exit(128 + signal.SIGINT if interrupted else error.code)
+
+
+def _value_errors() -> tuple[type[Exception], ...]:
+    """Return what a wrong value, or the disk, raises; Lightning's error where it is loaded."""
+    lightning = sys.modules.get("lightning.fabric.utilities.exceptions")
+    ours = (ValueError, HydraException, OmegaConfBaseException, OSError)
+    return (*ours, *([lightning.MisconfigurationException] if lightning else []))
 
 
 def _stop_errors() -> tuple[type[BaseException], ...]:
