@@ -82,7 +82,9 @@ def _build_training(cfg: DictConfig, first_weights: Path | None) -> Training:
         files.restore_weights(net, first_weights)
     ckpt = files.find_checkpoint(cfg.ckpt, spec) if cfg.ckpt else None
     module, data = build.build_reconstructor(cfg, net, spec), build.build_data_module(cfg)
-    return Training(build.build_trainer(cfg), module, data, ckpt)
+    trainer = build.build_trainer(cfg)
+    find_checkpoint_folder(trainer)  # or its error would come late
+    return Training(trainer, module, data, ckpt)
 
 
 def _create_run_folder(cfg: DictConfig) -> None:
@@ -159,14 +161,21 @@ def fit(
         ckpt = None
     with print_checkpoint_on_failure(trainer):
         trainer.fit(module, data, ckpt_path=ckpt)
+        if not module.steps_so_far:
+            limits = "trainer.max_steps, trainer.limit_train_batches and train_hours"
+            raise ValueError(f"{limits} must let a training take a step, got none")
         if not last.is_file():  # nothing was left to do
             trainer.save_checkpoint(last)
 
 
 def find_checkpoint_folder(trainer: lightning.Trainer) -> Path:
-    """Return the folder of the checkpoints of a training."""
+    """Return the folder of the checkpoints of a training.
+
+    Raises ValueError where no callback names one.
+    """
     checkpoint = trainer.checkpoint_callback
-    assert isinstance(checkpoint, ModelCheckpoint) and checkpoint.dirpath
+    if not (isinstance(checkpoint, ModelCheckpoint) and checkpoint.dirpath):
+        raise ValueError("callbacks must have a ModelCheckpoint with a dirpath, got none")
     return Path(checkpoint.dirpath)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from src.app.entry_point import run_main
 from tests.conftest import ROOT
@@ -132,6 +133,15 @@ def test_ctrl_c_later_is_one_line_and_exit_code_130(monkeypatch, capsys):
     with pytest.raises(SystemExit) as end:
         run_main(stop)
     assert end.value.code == 130 and capsys.readouterr().err == "stopped\n"
+
+
+def test_what_lightning_refuses_is_one_line(capsys):
+    def refuse():
+        raise MisconfigurationException("`monitor`\n is missing")
+
+    with pytest.raises(SystemExit) as end:
+        run_main(refuse)
+    assert end.value.code == 2 and capsys.readouterr().err == "error: `monitor` is missing\n"
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])

@@ -139,6 +139,10 @@ def test_results_of_another_configuration_are_not_overwritten(tmp_path):
     assert results.has_results(tmp_path, config)
     with pytest.raises(ValueError, match="paths.out"):
         results.has_results(tmp_path, config.replace("lr: 1", "lr: 2"))
+    row = results.ScoreRow("net", [{"ssim": 0.5}], 1, 1, {"8x8": 1.0})
+    with pytest.raises(ValueError, match="paths.out"):  # that came while it ran
+        results.write_and_print_results(tmp_path, config.replace("lr: 1", "lr: 2"), [row])
+    assert json.loads((tmp_path / "results.json").read_text()) == record
 
 
 def test_results_older_than_the_weights_are_made_again(tmp_path):

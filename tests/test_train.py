@@ -139,6 +139,7 @@ def test_eval_equals_the_test_of_training(tmp_path):
         (["augment.pause_probability_when_running=2"], "augment.pause_probability_when_running"),
         (["data.simulate_on=moon"], "data.simulate_on"),
         (["paths.out=/dev/null/x"], "paths.out"),
+        (["teachers=lf3x3", "distillation_cache=/dev/null/x"], "distillation_cache"),
         (["scene._target_=os.system"], "_target_"),
         (["ckpt=/nowhere.ckpt"], "ckpt"),
     ],
@@ -149,6 +150,13 @@ def test_a_wrong_value_names_its_key(overrides, key, tmp_path):
         cfg.paths.run = "/dev/null/x"
     with pytest.raises(ValueError, match=key):
         train(cfg)
+
+
+def test_a_training_that_takes_no_step_is_refused(tmp_path):
+    cfg = config("train", tmp_path, *TINY, "+trainer.limit_train_batches=0")
+    with pytest.raises(ValueError, match="limit_train_batches and train_hours must let"):
+        train(cfg)
+    assert not (tmp_path / "results.json").exists()
 
 
 @pytest.mark.parametrize("turbulence", ["none", "strong"])

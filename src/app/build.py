@@ -1,6 +1,7 @@
 """What trains and tests with Lightning, from a configuration; tested networks: methods.py."""
 
 import math
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -32,8 +33,10 @@ from src.app.simulation import (
 )
 from src.losses.terms import TrainingLoss
 from src.metrics.video_metrics import VideoMetrics
+from src.models import files
 from src.models.network import EventToVideoNetwork, FramePostprocessor, VideoMethod
 from src.models.setnet import SetNet
+from src.records.atomic import check_writable
 from src.records.results import ScoreRow
 from src.sim.optics import Optics
 from src.sim.pipeline import Sample
@@ -55,6 +58,11 @@ DATA_OPTIONS = (
 )  # fmt: skip
 SWEEP_STORE = SampleStore()  # of the jobs of a sweep that run in this process
 SMALL_PHOTOGRAPH_BYTES = 4096
+FIXED_TRAINER_OPTIONS = {  # the only value, and what is there instead
+    "accumulate_grad_batches": (1, "data.batch_size is that of a step"),
+    "gradient_clip_val": (0, "grad_clip_norm is the largest gradient of a step"),
+    "overfit_batches": (0, "debug=overfit trains on a few clips again and again"),
+}
 Trainable = EventToVideoNetwork | FramePostprocessor
 
 
@@ -101,6 +109,7 @@ def build_teachers(cfg: DictConfig, views: int) -> TeacherEnsemble:
         if net.views not in (None, views):
             raise ValueError(f"teachers must take optics.views={views}, {name} takes {net.views}")
         networks[name] = net
+    check_writable(Path(cfg.distillation_cache) / "frames.pt", "distillation_cache")
     rates = tuple(cfg.data.rates or ())
     return TeacherEnsemble(networks, cfg.distillation_cache, cfg.fps, rates)
 
@@ -116,8 +125,13 @@ def check_small_photographs(scene: Any) -> None:
 
 
 def build_untrained_network(cfg: DictConfig) -> tuple[Trainable, dict]:
-    """Return a fresh network and the plain dict (target, kwargs) that builds it again."""
+    """Return a fresh network and the plain dict (target, kwargs) that builds it again.
+
+    Raises ValueError, naming the key, for values that its file could not be loaded with.
+    """
     node = as_dict(cfg.model)
+    for name, value in node.items():
+        files.check_sizes(str(node.get("_target_")), value, f"model.{name}")
     net = check_contract("model", instantiate_node(node, read_user_packages(cfg)))
     target = node.pop("_target_")
     if isinstance(net, SetNet):  # the arguments that a preset stands for
@@ -201,17 +215,27 @@ def _build_optimizer(cfg: DictConfig) -> tuple[Callable, Callable | None]:
     """
     trial: Any = [nn.Parameter(torch.zeros(1))]
     parts = dict[str, Callable]()
+    trial[0].grad = torch.zeros(1)
     for key in ("optimizer", "scheduler") if cfg.scheduler else ("optimizer",):
         parts[key] = build_part(cfg, key)
         try:
             trial = parts[key](trial)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # the scheduler's optimiser takes no steps
+                trial.step()  # as in training: without a closure or a score
         except (TypeError, ValueError) as error:
             raise ValueError(f"{key} takes no such values: {error}") from error
     return parts["optimizer"], parts.get("scheduler")
 
 
 def build_trainer(cfg: DictConfig) -> lightning.Trainer:
-    """Return the trainer with its loggers and callbacks."""
+    """Return the trainer with its loggers and callbacks.
+
+    Raises ValueError for options of Lightning that steps taken by hand exclude.
+    """
+    for key, (allowed, instead) in FIXED_TRAINER_OPTIONS.items():
+        if (value := cfg.trainer.get(key)) not in (None, allowed):
+            raise ValueError(f"trainer.{key} must be {allowed} or null, got {value}: {instead}")
     # Part of trainer.deterministic that finds mistakes and changes no result, for 4 % of a step.
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
     packages = read_user_packages(cfg)

@@ -18,6 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from src.app.path_overrides import is_path_key
 from src.app.renamed_keys import describe_unknown_key, flatten_keys
+from src.models.files import MAX_SIZE
 from src.recordings.sensor_limits import LARGEST_SIDE, are_sensor_sides
 
 NUMBER, WHOLE, WORD, FLAG = "a number", "a whole number", "a word", "true or false"
@@ -40,7 +41,7 @@ KEYS: dict[tuple[str, ...], str] = {
         data.epoch_clips data.windows data.substeps data.workers data.test_windows
         data.test_clips data.val_clips data.unscored_windows data.loss_from
         data.events_per_window trainer.max_steps callbacks.rotation.every_n_train_steps
-        optics.views width scene.height scene.width sample_clips
+        augment.max_view_shift_px optics.views width scene.height scene.width sample_clips
         live:threads
     """,
     (LIST, NULL): "sensor_size resolution line circle spin names data.rates",
@@ -64,7 +65,7 @@ BOUNDS: dict[str, tuple[int, float]] = {  # of what others would refuse without 
     "data.test_clips": (1, math.inf), "data.val_clips": (0, math.inf),
     "data.workers": (0, 1024), "trainer.check_val_every_n_epoch": (1, math.inf),
     "index": (0, math.inf), "sample_clips": (0, math.inf), "seed": (0, 2**32 - 1),
-    "width": (1, math.inf),
+    "width": (1, MAX_SIZE), "stem": (1, MAX_SIZE),
     "callbacks.rotation.every_n_train_steps": (1, math.inf),
 }  # fmt: skip
 DDP_PROCESS = r"_ddp_process_\d+$"  # what Lightning adds to the name of a job

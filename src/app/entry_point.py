@@ -39,6 +39,7 @@ from src.app.stop_signals import StoppedBySignal, stop_by_signals
 from src.models import files
 from src.models.checkpoints import list_checkpoints
 from src.records import results
+from src.records.run_lock import hold_run_folder
 
 FAILURE_FILE = "failed.txt"  # in the folder of a sweep's job: why it failed
 
@@ -99,7 +100,7 @@ def run_main(main: Callable[[], None]) -> None:
     except JobFailed as error:
         _print_failed_jobs(Path(str(error)), start)
         sys.exit(1)
-    except (ValueError, HydraException, OmegaConfBaseException, OSError) as error:
+    except _value_errors() as error:
         if isinstance(error, OSError) and (why := _reason_against_folder_of_run(error)):
             wanted = "hydra.run.dir must be a folder, new or there"
             error = ValueError(f"{wanted}, got {error.filename}: {why}")
@@ -116,6 +117,13 @@ def run_main(main: Callable[[], None]) -> None:
         if interrupted or isinstance(error, StoppedBySignal):
             print("stopped", file=sys.stderr)
         sys.exit(128 + signal.SIGINT if interrupted else error.code)
+
+
+def _value_errors() -> tuple[type[Exception], ...]:
+    """Return what a wrong value, or the disk, raises; Lightning's error where it is loaded."""
+    lightning = sys.modules.get("lightning.fabric.utilities.exceptions")
+    ours = (ValueError, HydraException, OmegaConfBaseException, OSError)
+    return (*ours, *([lightning.MisconfigurationException] if lightning else []))
 
 
 def _stop_errors() -> tuple[type[BaseException], ...]:
@@ -141,32 +149,24 @@ def _reason_against_folder_of_run(error: OSError) -> str | None:
 def run_job(
     work: Callable[[DictConfig], object], cfg: DictConfig, fill_in: Callable | None = None
 ) -> None:
-    """Run `work` in the folder Hydra made for this job; end W&B's run.
+    """Run `work` in the folder Hydra made for this job, alone in it; end W&B's run.
 
     A job of a sweep is skipped where its results stand and the weights it tests are older; its
-    error is stored.
+    error is stored.  Raises ValueError where another process works in the folder.
     """
     refuse_renamed_keys(cfg)
     job = HydraConfig.get()
     cfg.paths.run = job.runtime.output_dir
     check_values(cfg)
     _silence_expected_warnings()
-    if job.mode != RunMode.MULTIRUN:
-        _run_work(work, cfg)
-        return
     folder, name = Path(cfg.paths.run), " ".join(map(unquote_override, job.overrides.task))
-    (folder / FAILURE_FILE).unlink(missing_ok=True)
-    try:
-        if fill_in:
-            fill_in(cfg)
-        stored = results.has_results(folder, resolved_yaml(cfg))
-        if stored and cfg.get("task") == "train":
-            _check_same_beginning(cfg, folder / "results.json")
-        if stored and not _has_newer_weights(cfg, folder / "results.json"):
-            code = _describe_other_code(folder / "results.json")
-            print(f"skipped, its results stand: {name}, in {folder}{code}")
-        else:
+    if job.mode != RunMode.MULTIRUN:
+        with hold_run_folder(folder):
             _run_work(work, cfg)
+        return
+    try:
+        with hold_run_folder(folder):
+            _run_unless_done(work, cfg, name, fill_in)
     except _stop_errors():  # ends the sweep
         raise KeyboardInterrupt from None
     except Exception as error:
@@ -174,8 +174,26 @@ def run_job(
         print(f"failed: {name}: {said}", file=sys.stderr)
         results.write_text(folder / FAILURE_FILE, f"{name}\n{traceback.format_exc()}")
     else:
+        (folder / FAILURE_FILE).unlink(missing_ok=True)
         return
     raise JobFailed(job.sweep.dir)  # not from `error`, which would keep all that the job made
+
+
+def _run_unless_done(
+    work: Callable[[DictConfig], object], cfg: DictConfig, name: str, fill_in: Callable | None
+) -> None:
+    """Run `work` of the sweep's job `name`; where its results stand print that it is skipped."""
+    if fill_in:
+        fill_in(cfg)
+    folder = Path(cfg.paths.run)
+    stored = results.has_results(folder, resolved_yaml(cfg))
+    if stored and cfg.get("task") == "train":
+        _check_same_beginning(cfg, folder / "results.json")
+    if stored and not _has_newer_weights(cfg, folder / "results.json"):
+        code = _describe_other_code(folder / "results.json")
+        print(f"skipped, its results stand: {name}, in {folder}{code}")
+    else:
+        _run_work(work, cfg)
 
 
 def _check_same_beginning(cfg: DictConfig, stored: Path) -> None:

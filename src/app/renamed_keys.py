@@ -32,22 +32,25 @@ def explain_refused_key(message: str, keys: Collection[str] = ()) -> str | None:
         return describe_renaming(f"{found[1]}={found[2]}") or _describe_choices(message)
     if found := re.search(REFUSED_KEY, message):
         key = found[1].replace("/", ".")
-        return describe_renaming(key) or describe_unknown_key(key, keys)
+        is_added = "Could not override" in message and f"{key.rpartition('.')[0]}._target_" in keys
+        return describe_renaming(key) or describe_unknown_key(key, keys, is_added)
     return None
 
 
-def describe_unknown_key(key: str, keys: Collection[str]) -> str:
+def describe_unknown_key(key: str, keys: Collection[str], is_added: bool = False) -> str:
     """Return that `key` is none, and its nearest neighbour in `keys` or how to list them.
 
     `keys`: all groups, and those of the default choices; one of these is none with what was chosen
-    instead.
+    instead.  `is_added`: whether `+` would add it, as an argument of the class that its node names.
     """
     if key in keys and "." in key:
         return f"{key} is no key of the chosen {key.partition('.')[0]}; {LISTED}"
     parent = key.rpartition(".")[0]
     near = [k for k in keys if k.rpartition(".")[0] == parent and k != key]  # key: another's group
-    hint = _ask_for_nearest(key, near, len(parent)) or f"; {LISTED}"
-    return f"{key} is no key of the configuration{hint}"
+    hint = _ask_for_nearest(key, near, len(parent))
+    if is_added:
+        hint += f"; +{key}=... adds it to the arguments of {parent}"
+    return f"{key} is no key of the configuration{hint or f'; {LISTED}'}"
 
 
 def _describe_choices(message: str) -> str | None:

@@ -22,7 +22,12 @@ from src.training.batch_sampler import LargeCropStream
 from src.training.clip_cache import CachedPipeline, ClipCache, DeviceClipCache
 from src.training.disk_cache import DiskClipCache, hash_file_lists
 
-OF_BOTH_STREAMS = ("loss_from", "loss_pairs", "batch_reuse", "workers", "simulate_on")
+LARGE_PARTS = ("scene.", "sensor.", "turbulence.")  # what data.large.overrides may set
+LARGE_KEYS = (
+    "fps", "seed", "data.batch_size", "data.cache_clips", "data.cache_crop", "data.cache_device",
+    "data.cache_gib", "data.cache_root", "data.cache_windows", "data.crop", "data.rates",
+    "data.substeps", "data.train_clips", "data.windows",
+)  # fmt: skip
 NO_CLIPS = ("test_clips", "workers")  # keys of `data` that test clips do not follow from
 DEVICE_CACHES: dict[str, DeviceClipCache] = {}  # those of this process, by all that makes them
 
@@ -132,9 +137,6 @@ def build_large_crop_stream(
     if not cfg.data.large or not cfg.data.large.share:
         return None
     other = merge_large_overrides(cfg)
-    for key in OF_BOTH_STREAMS:
-        if other.data[key] != cfg.data[key]:
-            raise ValueError(f"data.large.overrides must not set data.{key}: it is of both streams")
     windows, first, pairs = other.data.windows, cfg.data.loss_from, cfg.data.loss_pairs
     least = first + (2 * pairs if pairs else 1)
     if type(windows) is not int or windows < least:
@@ -147,7 +149,15 @@ def build_large_crop_stream(
 
 
 def merge_large_overrides(cfg: DictConfig) -> DictConfig:
-    """Return this config with `data.large.overrides`."""
+    """Return this config with `data.large.overrides`.
+
+    Raises ValueError for overrides that are none, and for a key that both streams have in common.
+    """
+    for key in (str(line).partition("=")[0] for line in cfg.data.large.overrides):
+        if key not in LARGE_KEYS and not key.startswith(LARGE_PARTS):
+            allowed = ", ".join([*(f"{part}*" for part in LARGE_PARTS), *LARGE_KEYS])
+            wanted = f"data.large.overrides must be [key=value, ...] with keys of {allowed}"
+            raise ValueError(f"{wanted}, got {key}")
     try:
         changes = OmegaConf.from_dotlist(list(cfg.data.large.overrides))
         return cast(DictConfig, OmegaConf.merge(cfg, changes))

@@ -114,9 +114,21 @@ def _per_frame(term: FrameTerm, frames: Frames, target: Frames) -> FrameValues:
     return values
 
 
+def _one_value(
+    term: SequenceTerm, frames: Sequences, target: Sequences, is_consecutive: Mask
+) -> Value:
+    """Return the value of `term` times its weight."""
+    value = term(frames, target, is_consecutive)
+    if value.shape != ():
+        got = f"shape {tuple(value.shape)}"
+        raise ValueError(f"{type(term).__name__} must return one value, of shape (), got {got}")
+    return term.weight * value
+
+
 class TrainingLoss(nn.Module):
     """The sum of `terms`, by name.  Raises ValueError for a term of another kind than a frame term,
-    a sequence term or distillation, and where no frame term is left.
+    a sequence term or distillation, for one with parameters to train, which no optimiser is given,
+    and where no frame term is left.
     """
 
     def __init__(self, terms: Mapping[str, LossTerm]):
@@ -126,6 +138,11 @@ class TrainingLoss(nn.Module):
                 raise ValueError(
                     f"loss.{name}._target_ must be a FrameTerm or a SequenceTerm "
                     f"(src.losses.terms), got {type(term).__name__}"
+                )
+            if any(parameter.requires_grad for parameter in term.parameters()):
+                raise ValueError(
+                    f"loss.{name} must have no parameters to train (requires_grad_(False)): only "
+                    "those of the network are trained"
                 )
         self.terms = nn.ModuleDict(terms)
         self.frame_terms = [term for term in terms.values() if isinstance(term, FrameTerm)]
@@ -158,7 +175,7 @@ class TrainingLoss(nn.Module):
         is_consecutive = torch.tensor([b == a + 1 for a, b in pairwise(windows)])
         if self.sequence_terms and is_consecutive.any():
             ours = leaf.unflatten(0, frames.shape[:2])
-            parts = [t.weight * t(ours, target, is_consecutive) for t in self.sequence_terms]
+            parts = [_one_value(t, ours, target, is_consecutive) for t in self.sequence_terms]
             part = torch.stack(parts).sum()
             part.backward()
             value += part.detach()

@@ -27,7 +27,7 @@ WEIGHTS = Path(__file__).resolve().parents[2] / "weights"
 PACKAGES = ("src.models.", "baselines.")
 WIDENABLE = "src.models.e2vid.E2VID"  # goes on from its weights on one view
 POWER_ITERATIONS = 50
-MAX_SIZE = 4096  # any number in the arguments of a network that a file names
+MAX_SIZE = 4096  # any number in the arguments of a network of PACKAGES
 
 
 def load(name_or_path: str | Path, allowed_packages: Sequence[str] = ()) -> nn.Module:
@@ -195,7 +195,7 @@ def _build(spec: dict, path: Path, allowed_packages: Sequence[str] = ()) -> nn.M
             f"ckpt must hold a network of {' or '.join(homes)}, got {target} in {path}; "
             "networks of a package of your own are let in by allowed_packages=[<package>]"
         )
-    _check_numbers(kwargs, path)
+    check_sizes(target, kwargs, "ckpt", f" in {path}")
     module, _, name = target.rpartition(".")
     try:
         kind = getattr(import_module(add_package_prefix(module)), name)
@@ -207,13 +207,17 @@ def _build(spec: dict, path: Path, allowed_packages: Sequence[str] = ()) -> nn.M
         raise ValueError(f"ckpt names a network that is not here: {wanted} in {path}") from error
 
 
-def _check_numbers(value: Any, path: Path) -> None:
-    """Raise ValueError for a number beyond MAX_SIZE: such a network would fill the memory."""
+def check_sizes(target: str, value: Any, key: str, where: str = "") -> None:
+    """Raise ValueError, beginning with `key`, for a number beyond MAX_SIZE in `value`, arguments of
+    the network `target`: it would fill the memory.  Those of other classes than PACKAGES' may be
+    any."""
+    if not target.startswith(PACKAGES):
+        return
     if isinstance(value, dict | list | tuple):
         for part in value.values() if isinstance(value, dict) else value:
-            _check_numbers(part, path)
+            check_sizes(target, part, key, where)
     elif isinstance(value, int | float) and not abs(value) <= MAX_SIZE:
-        raise ValueError(f"ckpt must hold sizes up to {MAX_SIZE}, got {value} in {path}")
+        raise ValueError(f"{key} must hold sizes up to {MAX_SIZE}, got {value}{where}")
 
 
 def check_weights_stored_whole(weights: dict[str, Tensor], path: Path, key: str) -> None:

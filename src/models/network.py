@@ -143,7 +143,10 @@ def unroll(
     positions: Sequence[Position] | None = None,
     output_windows: Sequence[int] | None = None,
 ) -> tuple[Float[Tensor, "n outputs 1 h w"], Any]:
-    """Return what `network.sequence` does, of a sequence of any length: MAX_WINDOWS at a time."""
+    """Return what `network.sequence` does, of a sequence of any length: MAX_WINDOWS at a time.
+
+    Raises ValueError for a network whose frames are not of this shape.
+    """
     frames, wanted = [], output_windows
     for k, part in enumerate(voxels.split(MAX_WINDOWS, 1)):
         if output_windows is not None:  # counted from the first of the part
@@ -151,5 +154,9 @@ def unroll(
         some, state = network.sequence(
             part, state, window_s=window_s, positions=positions, output_windows=wanted
         )
+        size = (len(voxels), 1, *voxels.shape[-2:])
+        if (*some.shape[:1], *some.shape[2:]) != size:
+            kind, got = type(network).__name__, (*some.shape[:1], *some.shape[2:])
+            raise ValueError(f"{kind} must return frames (clips, 1, h, w) = {size}, got {got}")
         frames.append(some)
     return torch.cat(frames, dim=1), state

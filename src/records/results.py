@@ -165,8 +165,9 @@ def write_and_print_results(
     `table` for them, with the line `note` below.
 
     `facts`: further entries of `results.json` (task, experiment, seed, wall_s, device ...), whose
-    content is returned.
+    content is returned.  Raises ValueError where `run` holds results of another config.
     """
+    has_results(run, config)  # of a process that came later, where nothing holds the folder
     first = rows[0]
     model = {name: getattr(first, name) for name in ("name", "params", "macs_per_frame")}
     record = {

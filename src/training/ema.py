@@ -69,6 +69,16 @@ def load_ema_weights(trainer: Trainer, module: LightningModule) -> None:
         ema._copy_average_to_current(module)
 
 
+def select_trained_weights(trainer: Trainer, checkpoint: dict[str, Any]) -> None:
+    """Make the weights in training those of `checkpoint`, in place of their average, where its
+    trainer has no WeightEMA; the moments of the optimiser belong to them."""
+    callbacks = trainer.callbacks  # type: ignore[attr-defined]
+    averages = any(isinstance(callback, WeightEMA) for callback in callbacks)
+    if not averages and "current_model_state" in checkpoint:
+        checkpoint["state_dict"] = checkpoint["current_model_state"]
+        checkpoint["callbacks"].pop(WeightEMA.__name__, None)  # Lightning would warn of its absence
+
+
 def _find_averages(trainer: Trainer) -> list[WeightEMA]:
     callbacks = trainer.callbacks  # type: ignore[attr-defined]
     return [c for c in callbacks if isinstance(c, WeightEMA) and c._average_model is not None]

@@ -16,6 +16,7 @@ from src.models.network import EventToVideoNetwork, FramePostprocessor, VideoMet
 from src.sim import noise
 from src.training import resume
 from src.training.cuda_graphs import GraphedUnroll
+from src.training.ema import select_trained_weights
 from src.training.schedule import TrainingClock
 from src.training.step_guard import StepGuard
 
@@ -121,6 +122,9 @@ class Reconstructor(LightningModule):
         else:
             with parametrize.cached():  # spectral norm iterates once, not once per window
                 frames = self.reconstruct_windows(sample, outputs)
+        if not frames.requires_grad:
+            kind = type(self.network).__name__
+            raise ValueError(f"{kind} must return frames with a gradient (no detach, no_grad)")
         target, taught = sample.target[:, outputs], sample.teacher_frames
         taught = None if taught is None else taught[:, outputs]
         loss, gradient = self.loss.value_and_gradient(frames, target, outputs, taught)
@@ -203,6 +207,7 @@ class Reconstructor(LightningModule):
         checkpoint["optimizer_start"] = self.optimizer_start
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
+        select_trained_weights(self.trainer, checkpoint)
         if self.make_optimizer is not None:  # else nothing is trained
             resume.check_max_steps(self.trainer.max_steps, checkpoint["global_step"])
             kept = resume.apply_config_to_optimizer_state(

@@ -94,6 +94,13 @@ def test_every_part_of_a_training_may_be_a_class_of_ones_own(own, tmp_path):
         evaluate(config("eval", tmp_path / "d", *tested))
 
 
+def test_arguments_of_a_network_of_ones_own_may_be_any_numbers(own, tmp_path):
+    cfg = config("train", tmp_path, *TINY, *NET, "model.gain=5000.0", *own)
+    network, spec = build.build_untrained_network(cfg)
+    files.save(tmp_path / "own.safetensors", network, spec, {})
+    assert files.load(tmp_path / "own.safetensors", ["mypackage"]).gain.item() == 5000
+
+
 @pytest.mark.parametrize("key", [*PARTS, "model"])
 def test_a_class_of_ones_own_is_refused_unless_its_package_is_named(own, key, tmp_path):
     if key == "postprocessor":
@@ -277,10 +284,24 @@ def test_a_training_on_a_cpu_keeps_the_memory_it_frees():
         ("optimizer.lr=-1", "optimizer takes no such values: Invalid learning rate: -1"),
         ("+optimizer.speed=2", "optimizer takes no such values: .*'speed'"),
         ("+scheduler.speed=2", "scheduler takes no such values: .*'speed'"),
+        (
+            "~optimizer +optimizer._target_=torch.optim.LBFGS +optimizer._partial_=true",
+            "optimizer takes no such values: .*'closure'",
+        ),
+        (
+            "~scheduler +scheduler._target_=torch.optim.lr_scheduler.ReduceLROnPlateau "
+            "+scheduler._partial_=true",
+            "scheduler takes no such values: .*'metrics'",
+        ),
+        ("+trainer.accumulate_grad_batches=2", "trainer.accumulate_grad_batches must be 1 or null"),
+        ("+trainer.gradient_clip_val=1", "gradient_clip_val must be 0 .*, got 1: grad_clip_norm"),
+        ("+trainer.overfit_batches=1", "trainer.overfit_batches must be 0 or null, got 1"),
+        ("~callbacks.checkpoint ~callbacks.rotation", "callbacks must have a ModelCheckpoint with"),
+        ("experiment=lf3x3 +model.extra=[5000]", "model.extra must hold sizes up to 4096, got 50"),
     ],
 )
-def test_what_an_optimiser_refuses_is_refused_before_anything_runs(wrong, message, tmp_path):
-    cfg = config("train", tmp_path / "run", *TINY, wrong)
+def test_what_cannot_train_is_refused_before_anything_runs(wrong, message, tmp_path):
+    cfg = config("train", tmp_path / "run", *TINY, *wrong.split())
     with pytest.raises(ValueError, match=message):
         train(cfg)
     assert not (tmp_path / "run").exists()

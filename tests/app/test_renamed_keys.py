@@ -43,6 +43,10 @@ def test_a_former_key_in_a_config_file_is_refused():
         ("simulate", "data.unknown=1", "data.unknown is no key of the configuration; --cfg job"),
         ("train", "optimizer.lrr=1", "optimizer.lrr is no key of the configuration; did you mean"
                                      " optimizer.lr?"),
+        ("train", "callbacks.checkpoint.monitor=x",
+         "callbacks.checkpoint.monitor is no key of the configuration; "
+         "+callbacks.checkpoint.monitor=... adds it to the arguments of callbacks.checkpoint"),
+        ("train", "~optimizer.momentum", "optimizer.momentum is no key of the configuration; --"),
         ("eval", "verbose=true", "verbose was removed"),
         ("chart", "trainer=gpu", "trainer is no key of the configuration; --cfg job"),
         ("stress", "trainer=gpu", "trainer is no key of the configuration; --cfg job"),

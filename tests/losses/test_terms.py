@@ -10,6 +10,7 @@ from src.losses.terms import (
     FrameTerm,
     L1Term,
     LPIPSTerm,
+    SequenceTerm,
     SSIMTerm,
     StaticFlicker,
     TemporalConsistency,
@@ -134,6 +135,34 @@ def test_a_config_takes_a_term_of_one_s_own(tmp_path):
     assert loss.terms["own"].weight == 0.5
     zeros, ones = torch.zeros(1, 1, 8, 8), torch.ones(1, 1, 8, 8)
     assert float(loss(ones, zeros)) == pytest.approx(1.5, abs=1e-5)
+
+
+class PerClip(SequenceTerm):
+    """A term that forgets to average over clips."""
+
+    def forward(self, frames, target, is_consecutive):
+        return (frames - target).abs().mean((1, 2, 3, 4))
+
+
+def test_a_sequence_term_has_one_value():
+    seen, truth = (torch.rand(2, 3, 1, 8, 8) for _ in range(2))
+    loss = TrainingLoss({"l1": L1Term(), "own": PerClip()})
+    with pytest.raises(ValueError, match=r"PerClip must return one value, .*, got shape \(2,\)"):
+        loss.value_and_gradient(seen, truth, [0, 1, 2])
+
+
+class Learned(Charbonnier):
+    """A term with a parameter."""
+
+    def __init__(self, weight: float = 1.0):
+        super().__init__(weight)
+        self.scale = torch.nn.Parameter(torch.ones(()))
+
+
+def test_a_term_with_parameters_to_train_is_refused():
+    with pytest.raises(ValueError, match="loss.own must have no parameters to train"):
+        TrainingLoss({"own": Learned()})
+    assert TrainingLoss({"own": Learned().requires_grad_(False)}).frame_terms
 
 
 @pytest.mark.parametrize(

@@ -174,6 +174,18 @@ def test_wrong_values_are_one_line(wrong, message, tmp_path):
         build.build_reconstructor(cfg, *build.build_untrained_network(cfg))
 
 
+@pytest.mark.parametrize(
+    "line",
+    ["augment.noise_std=99", "optimizer.lr=9", "data.test_clips=7", "data.large.foo=3", "bins=4",
+     "sensor=ideal", "optics.views=3", "data.loss_from=1"],
+)  # fmt: skip
+def test_the_stream_of_large_crops_has_keys_of_its_clips_only(line, tmp_path):
+    large = f'data.large={{share:0.5,overrides:["{line}"]}}'
+    message = rf"data.large.overrides must be .* scene\.\*, .*, got {line.partition('=')[0]}$"
+    with pytest.raises(ValueError, match=message):
+        build.build_data_module(config("train", tmp_path, *TINY, large))
+
+
 def test_a_training_of_two_sizes_takes_steps(tmp_path):
     from src.train import train
 

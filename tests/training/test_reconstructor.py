@@ -118,6 +118,27 @@ def test_the_loss_begins_where_it_is_told_and_gradients_are_clipped():
     assert not torch.allclose(theirs.a, by_hand(0, 0.1).a, atol=1e-6)
 
 
+class Wrong(Leaky):
+    """Frames without an axis of channels."""
+
+    def sequence(self, voxels, state=None, **options):
+        return voxels.sum((2, 3)), None
+
+
+class Constant(Leaky):
+    def forward(self, voxels, state=None, **options):
+        frame, state = super().forward(voxels, state)
+        return frame.detach(), state
+
+
+def test_frames_of_another_shape_or_without_a_gradient_are_refused():
+    message = r"Wrong must return frames \(clips, 1, h, w\) = \(2, 1, 8, 8\), got \(2, 8, 8\)"
+    with pytest.raises(ValueError, match=message):
+        unroll(Wrong(), sample().voxels)
+    with pytest.raises(ValueError, match="Constant must return frames with a gradient"):
+        fit(Constant())
+
+
 def with_term(term) -> TrainingLoss:
     return TrainingLoss({"error": SquaredError(), "term": term})
 

@@ -105,6 +105,19 @@ def test_a_run_that_goes_on_obeys_its_config(before, after, rate, schedules, tmp
     assert found[0] == pytest.approx(rate, rel=1e-4) and found[1] == schedules
 
 
+def test_without_averaging_a_run_goes_on_from_the_weights_in_training(tmp_path):
+    steps = ["trainer.max_steps=2", "optimizer.lr=0.01"]
+    train(config("train", tmp_path / "a", *TINY, *steps, "ema_decay=0.9"))
+    plain = ["ema_decay=null", f"ckpt={tmp_path / 'a'}"]
+    train(config("train", tmp_path / "b", *TINY, *steps, *plain))
+    before, after = (
+        torch.load(tmp_path / run / "checkpoints" / "last.ckpt", weights_only=True) for run in "ab"
+    )
+    for name, value in before["current_model_state"].items():
+        assert torch.equal(after["state_dict"][name], value), name
+    assert any(not torch.equal(after["state_dict"][n], v) for n, v in before["state_dict"].items())
+
+
 def test_fewer_steps_than_were_taken_are_refused():
     for allowed in (-1, STEPS, STEPS + 1):
         check_max_steps(allowed, STEPS)
