@@ -7,7 +7,8 @@ guided by it; a decoder for the picture.
 
 Differs from the published code: backward scans are turned back also in guided layers, the
 convolution of local layers runs on the raster, frames need not be square, fusions are weighed
-through GELU, and the last decoder draws what is added to the input.
+through GELU, the last decoder draws what is added to the input, `stabilise_input` gives it frames
+held still (off in the published size), and no loss here supervises the latent phase distortion.
 """
 
 from itertools import pairwise

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
 
 from scripts.campaign import __main__ as campaign
 from scripts.campaign import driver
@@ -299,14 +300,31 @@ def test_the_command_of_a_training_is_one_of_src_train(tmp_path):
     assert words[:3] == ["nice", "-n", "19"] and os.access(words[3], os.X_OK)
 
 
+def configs(name: str, folder: Path) -> list[DictConfig]:
+    """Those of the stages of a recipe, in order."""
+    work = RecipeWork(read(name), Settings(folder))
+    with initialize_config_dir(str(ROOT / "conf"), version_base=None):
+        return [
+            compose("train", [word.replace("{", "").replace("}", "") for word in overrides])
+            for overrides in map(work._overrides, work.recipe.stages)
+        ]
+
+
 @pytest.mark.parametrize("name", names())
 def test_every_stage_of_every_recipe_is_a_config(name, tmp_path):
-    work = RecipeWork(read(name), Settings(tmp_path))
-    with initialize_config_dir(str(ROOT / "conf"), version_base=None):
-        for stage in work.recipe.stages:
-            words = [word.replace("{", "").replace("}", "") for word in work._overrides(stage)]
-            cfg = compose("train", words)
-            assert cfg.seed == stage.seed and cfg.name == work.recipe.experiment
+    recipe = read(name)
+    for stage, cfg in zip(recipe.stages, configs(name, tmp_path), strict=True):
+        assert cfg.seed == stage.seed and cfg.name == recipe.experiment
+
+
+@pytest.mark.parametrize("name", names())
+def test_a_recipe_shows_what_the_shipped_network_was_shown(name, tmp_path):
+    card = files.read_card(files.WEIGHTS / f"{name}.safetensors")
+    cfg = configs(name, tmp_path)[-1]
+    kind = card["scenes"].split(",")[0]
+    assert cfg.scene["_target_"].endswith(f".{kind}") and cfg.optics.views == card["views"]
+    if kind == "Photographs":  # of a time without drawn sensors and losses of several windows
+        assert not cfg.sensor.random and cfg.loss.temporal_consistency.weight == 0
 
 
 def test_every_shipped_network_has_a_recipe():

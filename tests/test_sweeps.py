@@ -158,6 +158,13 @@ def test_results_older_than_the_weights_are_made_again(tmp_path):
     assert not entry_point._has_newer_weights(cfg, stored)
 
 
+def test_jitter_at_768_is_measured_alike_by_both_tables(tmp_path):
+    table1 = composed(ROOT / "sweeps" / "table1.yaml", tmp_path, "experiment=single768")
+    s1 = composed(ROOT / "sweeps" / "table_s1.yaml", tmp_path, "resolution=native768")
+    assert table1.scene.width == s1.scene.width == 768
+    assert table1.metrics.jitter_reduction == s1.metrics.jitter_reduction == 3
+
+
 TRAINED = ["-m", "debug=fdr", "metrics.lpips=null", "loss=l1", "logger=none", "seed=0,1"]
 TRAINED += ["reference_baseline=null", "trainer.precision=null"]
 

@@ -1,7 +1,9 @@
 """E2VID (Rebecq et al., TPAMI 2019), all of it here, on one or many views.
 
-Views are stacked as channels (channel = view * bins + bin), the only change of the paper:
-head -> three recurrent encoders (stride 2) -> two residual blocks -> three decoders with skip sums
+The paper changes two things: views are stacked as channels (channel = view * bins + bin), and the
+gates have spectral normalisation.
+
+Head -> three recurrent encoders (stride 2) -> two residual blocks -> three decoders with skip sums
 -> skip sum with the head -> one channel.  10,710,401 parameters with 5 input channels and base 32.
 """
 

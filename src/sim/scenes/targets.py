@@ -1,4 +1,4 @@
-"""Scenes whose motion is known exactly: what the paper's laboratory showed (figures 6, 9 to 11).
+"""Scenes whose motion is known exactly: what the paper's laboratory showed (figures 6, 9 and 11).
 
 Every frame is drawn analytically, so that a shape moves by any part of a pixel without flicker.
 Coordinates are pixels, the centre of a pixel is a whole number, y points down, angles are radians

@@ -84,7 +84,9 @@ def test_the_paper_s_recipe_cuts_reds_into_twelve_and_tests_all_of_it(tmp_path):
     for part in REDS_SPLIT.values():
         for home, number in part:
             (tmp_path / f"{home}_orig" / f"{number:03}").mkdir(parents=True)
-    data = compose_config("train", "experiment=lf3x3", "budget=paper", "scene=reds").data
+    cfg = compose_config("train", "experiment=lf3x3", "budget=paper", "scene=reds")
+    assert cfg.loss_spike_factor is None and cfg.grad_clip_norm is None
+    data = cfg.data
     train, test = (
         Reds(str(tmp_path), split=split, frames=windows + 1, height=32, width=32)
         for split, windows in (("train", data.windows), ("test", data.test_windows))
