@@ -12,7 +12,6 @@ from torch import Tensor
 from src.bench.candidates import Candidate
 from src.bench.stress_tests.event_clips import ClipConditions, EventClip, Film, StressBench
 from src.bench.stress_tests.stress_results import StressResult
-from src.recordings.reconstruction import default_window_length
 
 LAG_FRAMES = 6  # over which brightening is measured
 GATE_PX = 24.0  # around the true front
@@ -23,11 +22,12 @@ MOST_LOST = 0.5  # of the frames, beyond which a network does not show the targe
 
 
 def measure_trajectory_deviation(
-    network: Candidate, bench: StressBench, *, limit_px: float, window_length: str | None = None
+    network: Candidate, bench: StressBench, *, limit_px: float, window_length: str = "frame"
 ) -> StressResult:
     """Return the rms distance, in pixels, of the front of a flying target from its line, across it;
     the mean over clips of one target.  NaN where the target is lost in over MOST_LOST of the
-    frames.  `window_length`: `frame`, `trained` or `growing`; None: that of src.reconstruct.
+    frames.  `window_length`, `frame` or `trained`: of a network that does not use its windows'
+    length; those of others grow.
 
     The front is the centroid of what has become brighter in the last frames near where it truly is.
     Unjudged beside it are the network's mean without turbulence, that of the light of one view,
@@ -40,7 +40,7 @@ def measure_trajectory_deviation(
         frames = clip.reconstruct_at_rate(network, clip.fps, numbers, length)
         return measure_cross_track_error(frames[:, 0], clip.target[1:])
 
-    length = window_length or default_window_length(network.loaded)
+    length = "growing" if network.loaded.uses_window_length else window_length
     clips = bench.clips()
     without = list(map(measure, bench.clips(ClipConditions(d_over_r0=0.0))))
     light = [measure_cross_track_error(c.turbulent[1:], c.target[1:]) for c in clips]

@@ -83,8 +83,8 @@ def test_a_network_is_compared_with_no_turbulence_and_with_the_light():
     pipeline = Pipeline(scene, Optics(1), air, EventSensor(0.2), split="test")
     subject, bench = Candidate("running", Running(), 1), StressBench(pipeline, [0], 0)
     found = measure_trajectory_deviation(subject, bench, limit_px=0.3)
-    short = measure_trajectory_deviation(subject, bench, limit_px=0.3, window_length="frame")
-    assert short.value == pytest.approx(found.value, abs=0.01)  # of a sum of all events
+    long = measure_trajectory_deviation(subject, bench, limit_px=0.3, window_length="trained")
+    assert long.value == pytest.approx(found.value, abs=0.01)  # of a sum of all events
     (still, calm), (light, seen), (mean, value), (clip, stray) = found.unjudged
     assert (still, light) == ("no turbulence (0 % lost)", "light of one view (0 % lost)")
     assert (mean, clip) == ("mean (0 % lost)", "clip 0 (0 % lost)")
