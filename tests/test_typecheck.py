@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 from beartype.roar import BeartypeCallHintViolation
-from jaxtyping import Float, TypeCheckError
+from jaxtyping import Float, TypeCheckError, config
 
 from tests.typecheck import check, check_annotations
 
@@ -26,6 +26,11 @@ def test_arguments_and_results_without_shapes_are_checked():
         scale("3")
     with pytest.raises(BeartypeCallHintViolation, match="return"):
         scale(3.0, 0)
+
+
+def test_checks_can_be_switched_off(monkeypatch):
+    monkeypatch.setattr(config, "jaxtyping_disable", True)
+    assert scale("3") == "33"
 
 
 def test_shapes_within_other_annotations_are_checked():

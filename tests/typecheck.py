@@ -5,11 +5,11 @@ around them jaxtyping's where there are shapes of arrays, which cost several tim
 import inspect
 import typing
 from collections.abc import Callable
-from functools import partial
+from functools import partial, wraps
 from typing import Any
 
 from beartype import BeartypeConf, beartype
-from jaxtyping import AbstractArray
+from jaxtyping import AbstractArray, config
 from jaxtyping import jaxtyped as check_shapes
 
 check = beartype(conf=BeartypeConf(is_pep484_tower=True))
@@ -20,8 +20,18 @@ def check_annotations(checked: Any = None, *, typechecker: Callable) -> Any:
     if checked is None:
         return partial(check_annotations, typechecker=typechecker)
     if inspect.isfunction(checked) and not _has_shapes(checked):
-        return check(checked)
+        return _check_unless_disabled(checked)
     return check_shapes(checked, typechecker=typechecker)
+
+
+def _check_unless_disabled(function: Callable) -> Callable:
+    checked = check(function)
+
+    @wraps(function)
+    def call(*args: Any, **options: Any) -> Any:
+        return (function if config.jaxtyping_disable else checked)(*args, **options)
+
+    return call
 
 
 def _has_shapes(function: Callable) -> bool:
