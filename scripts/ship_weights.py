@@ -65,7 +65,8 @@ def ship(run: Path, name: str, tests: list[Path], given: Given | None = None) ->
 
 
 def recard(name: str, tests: list[Path]) -> Path:
-    """Write the card of shipped weights anew, with what `tests` hold; returns the weights' path."""
+    """Write the card of shipped weights anew, with what `tests` hold, less its sections, which are
+    written by hand; returns the weights' path."""
     path = files.WEIGHTS / f"{name}.safetensors"
     return _write_card(path, name, files.load(path), files.read_card(path), tests)
 
@@ -74,10 +75,16 @@ def _write_card(
     path: Path, name: str, network: torch.nn.Module, card: dict, tests: list[Path]
 ) -> Path:
     records = [json.loads((test / "results.json").read_text()) for test in tests]
-    drawn = path.with_suffix(".png").is_file()
-    text = describe(name, network, card, records, drawn)
-    path.with_suffix(".md").write_text(text)
+    drawn, written = path.with_suffix(".png").is_file(), path.with_suffix(".md")
+    text = describe(name, network, card, records, drawn) + _read_sections(written)
+    written.write_text(text)
     return path
+
+
+def _read_sections(card: Path) -> str:
+    """Return what a card has from its first section on, which is written by hand."""
+    _, heading, rest = card.read_text().partition("\n## ") if card.is_file() else ("", "", "")
+    return heading + rest
 
 
 def facts(run: Path, content: dict, first: DictConfig) -> dict:

@@ -64,10 +64,13 @@ def test_a_trained_run_is_shipped_whole_with_its_card(tmp_path, monkeypatch, cle
     (later / "config.yaml").write_text(config_of.replace("ckpt: null", f"ckpt: {first}"))
     gone_on = ship(later, "tiny/later", []).with_suffix(".md").read_text()
     assert "| started_from | one.safetensors |" in gone_on
-    whole = path.read_bytes()
+    whole, by_hand = path.read_bytes(), "\n## A section\n\nWritten by hand.\n"
+    path.with_suffix(".md").write_text(card + by_hand)
     assert recard("tiny/one", [run, run]) == path and path.read_bytes() == whole
-    anew = path.with_suffix(".md").read_text().splitlines()
-    assert len(anew) == len(card.splitlines()) + 1 and set(anew) == set(card.splitlines())
+    text = path.with_suffix(".md").read_text()
+    anew = text.removesuffix(by_hand).splitlines()
+    assert text.endswith(by_hand) and len(anew) == len(card.splitlines()) + 1
+    assert set(anew) == set(card.splitlines())
 
 
 def test_weights_of_a_stage_are_shipped_with_the_card_of_a_run(tmp_path, monkeypatch, clean):
