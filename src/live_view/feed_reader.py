@@ -115,7 +115,7 @@ class CameraClock:
         return (wall_s - self.offset_s) * 1e6
 
 
-class DoubtedEvents:
+class OffClockEvents:
     """The newest events that are off the camera's clock, all of one other clock."""
 
     def __init__(self):
@@ -158,7 +158,7 @@ class FeedReader:
         self.camera_clock = CameraClock()
         self.arrival_s: float | None = None  # wall time of the newest live events on the clock
         self.behind_since_s: float | None = None  # wall time; None: not all events come too late
-        self.doubted = DoubtedEvents()
+        self.off_clock = OffClockEvents()
         self.scene_events = 0  # on the clock, since the scene began
         self.state = "waiting"
 
@@ -283,19 +283,19 @@ class FeedReader:
         on = np.flatnonzero(~is_off)
         tail = int(on[-1]) + 1 if on.size else 0  # from there on all are off it
         if on.size:
-            self.cutter.report_dropped(len(self.doubted.events) + tail - on.size)
-            self.doubted = DoubtedEvents()
+            self.cutter.report_dropped(len(self.off_clock.events) + tail - on.size)
+            self.off_clock = OffClockEvents()
         if tail < len(events):
-            self.cutter.report_dropped(self.doubted.add(events[tail:], arrival_s))
-            if len(self.doubted.events) >= min(FEW_LIVE_EVENTS, self.scene_events):
+            self.cutter.report_dropped(self.off_clock.add(events[tail:], arrival_s))
+            if len(self.off_clock.events) >= min(FEW_LIVE_EVENTS, self.scene_events):
                 return self._jump()
         if on.size and is_after_silence:
             self._restart()
         return events if on.size == len(events) else events[on]
 
     def _jump(self) -> np.ndarray:
-        """Restart with the doubted events, and return them; back in time they begin a scene."""
-        events, self.doubted = self.doubted.events, DoubtedEvents()
+        """Restart with the events off the clock, returned; back in time they begin a scene."""
+        events, self.off_clock = self.off_clock.events, OffClockEvents()
         back_us = self.cutter.last_us - float(events["t"][0])
         if is_back := back_us > BUFFER_US:
             self.cutter.report_jump_back(back_us)
