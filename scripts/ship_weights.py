@@ -65,8 +65,8 @@ def ship(run: Path, name: str, tests: list[Path], given: Given | None = None) ->
 
 
 def recard(name: str, tests: list[Path]) -> Path:
-    """Write the card of shipped weights anew, with what `tests` hold, less its sections, which are
-    written by hand; returns the weights' path."""
+    """Write the card of shipped weights anew, with what `tests` hold; its sections, written by
+    hand, stay.  Returns the weights' path."""
     path = files.WEIGHTS / f"{name}.safetensors"
     return _write_card(path, name, files.load(path), files.read_card(path), tests)
 

@@ -86,11 +86,10 @@ def measure_window_rate_loss(
         instants = torch.arange(count // 2, count) + 1
         at = (instants * (rate_hz / slowest)).round().long()
         truth = (instants * (clip.fps / slowest)).round().long()
-        frames = clip.reconstruct_at_rate(network, rate_hz, at.tolist(), window_length)
+        frames = clip.reconstruct_at_rate(network, rate_hz, at.tolist())
         return float(score_aligned_psnr(frames, clip.target[truth, None]).mean())
 
     clips = bench.clips()
-    window_length = "growing" if network.loaded.uses_window_length else "frame"
     base = fmean(score(clip, clip.fps) for clip in clips)
     curve = [(rate, base - fmean(score(clip, rate) for clip in clips)) for rate in rates_hz]
     return build_worst_psnr_loss_result(curve, limit_db=limit_db, varied="windows a second")

@@ -126,13 +126,15 @@ class EventClip:
         return network.reconstruct(windows, self.positions, 1 / self.fps, state)
 
     def reconstruct_at_rate(
-        self, network: Candidate, fps: float, numbers: Sequence[int], window_length: str
+        self, network: Candidate, fps: float, numbers: Sequence[int], window_length: str = "frame"
     ) -> Video:
         """Return the frames of `numbers`, counted from 1, of `fps` a second, in order of time.
 
-        `window_length`: `frame`, `trained` or `growing`, as in src.reconstruct.
+        `window_length`: `frame`, `trained` or `growing`, as in src.reconstruct; those of a network
+        that uses their length always grow.
         """
-        rule = build_window_rule(window_length, fps=fps)
+        grows = network.loaded.uses_window_length
+        rule = build_window_rule("growing" if grows else window_length, fps=fps)
         video, period_us, wanted = [], US_PER_S / fps, set(numbers)
         states: list[Any] = [None] * rule.overlapping_windows
         continued = {k % len(states) for k in wanted}

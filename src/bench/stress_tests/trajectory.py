@@ -37,10 +37,9 @@ def measure_trajectory_deviation(
 
     def measure(clip: EventClip) -> CrossTrackError:
         numbers = range(1, len(clip.target))
-        frames = clip.reconstruct_at_rate(network, clip.fps, numbers, length)
+        frames = clip.reconstruct_at_rate(network, clip.fps, numbers, window_length)
         return measure_cross_track_error(frames[:, 0], clip.target[1:])
 
-    length = "growing" if network.loaded.uses_window_length else window_length
     clips = bench.clips()
     without = list(map(measure, bench.clips(ClipConditions(d_over_r0=0.0))))
     light = [measure_cross_track_error(c.turbulent[1:], c.target[1:]) for c in clips]
