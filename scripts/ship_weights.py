@@ -26,6 +26,10 @@ from src.training.learning_curve import TRAINING_STATE
 LARGEST = 16 * 2**20  # bytes of a file
 CARD_NOTE = "Mean over clips (95 % bootstrap CI)."
 CURVE = "The curve jumps where a stage has other validation clips."
+LIMITS = """## Limits
+
+Simulated turbulence and sensor only, grey pictures, scenes in planar motion.
+"""
 
 
 class Given(NamedTuple):
@@ -82,9 +86,10 @@ def _write_card(
 
 
 def _read_sections(card: Path) -> str:
-    """Return what a card has from its first section on, which is written by hand."""
+    """Return what a card has from its first section on, which is written by hand; of a network
+    that has no card yet, its limits."""
     _, heading, rest = card.read_text().partition("\n## ") if card.is_file() else ("", "", "")
-    return heading + rest
+    return f"{heading}{rest}" if heading else f"\n{LIMITS}"
 
 
 def facts(run: Path, content: dict, first: DictConfig) -> dict:
@@ -183,8 +188,6 @@ def describe(
         *map(_tested, tests),
         "",
         CARD_NOTE,
-        "",
-        "Limits: simulated turbulence and sensor only, grey pictures, scenes in planar motion.",
         "",
     ]
     return "\n".join(lines)

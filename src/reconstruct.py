@@ -172,10 +172,9 @@ def reconstruct_film_frames(
     network for another number of views.
     """
     number, centre = len(views.views), views
-    methods = {f"{number} views": reconstruct_video_frames(cfg, network, views)[0]}
-    if number == 1:
-        methods = {"one view": methods["1 views"]}
-    else:
+    title = "one view" if number == 1 else f"{number} views"
+    methods = {title: reconstruct_video_frames(cfg, network, views)[0]}
+    if number > 1:
         centre = views.select([(0, 0)])
         if network.views is None:
             methods = {"one view": reconstruct_video_frames(cfg, network, centre)[0]} | methods

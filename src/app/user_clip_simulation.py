@@ -91,9 +91,10 @@ class UserClipSimulation:
     def describe(self) -> str:
         """Return size, rate, frames, turbulence and threshold in one line."""
         (height, width), drawn, fps = self.clip.size, self.drawn_parameters(), self.simulated_fps
+        views = "one view" if self.optics.views == 1 else f"{self.optics.views} views"
         light = "decoded from sRGB" if decodes_srgb(self.cfg) else "taken as intensity"
         return (
-            f"{self.clip.name}: {self.clip.source}; simulated as {self.optics.views} views of "
+            f"{self.clip.name}: {self.clip.source}; simulated as {views} of "
             f"{width}x{height} px at {fps:.6g} frames/s; turbulence {drawn['severity']}"
             f"{describe_turbulence(drawn)}; code values {light}, contrast threshold "
             f"{self.sensor.threshold:.3f}"

@@ -25,7 +25,7 @@ def choose_places(pictures: Stack, tile: Rectangle, half: int) -> Pixels:
     x, y = places.T
     down, across = np.gradient(pictures, axis=(1, 2))
     products = ((across, across), (across, down), (across, down), (down, down))
-    tensor = [_patch_sums(np.einsum("kyx,kyx->yx", *pair), half)[y, x] for pair in products]
+    tensor = [_sum_patches(*pair, half)[y, x] for pair in products]
     weak, strong = np.linalg.eigvalsh(np.stack(tensor, axis=-1).reshape(-1, 2, 2)).T
     enough = weak > MIN_STRENGTH * np.percentile(weak, 90) if len(weak) else weak > 0
     return places[enough & (weak > MIN_ROUNDNESS * strong)]
@@ -41,22 +41,26 @@ def measure_patch_offsets(
     within = np.s_[:, first[1] : last[1], first[0] : last[0]]
     wide = np.pad(others, ((0, 0), (reach, reach), (reach, reach)))
     wide = wide[:, first[1] : last[1] + 2 * reach, first[0] : last[0] + 2 * reach]
-    own, energy = (
-        _patch_sums(np.einsum("kyx,kyx->yx", each, each), half) for each in (pictures[within], wide)
-    )
+    here = pictures[within]
+    own, energy = (_sum_patches(each, each, half) for each in (here, wide))
+    own = own[y, x]
     side = 2 * reach + 1
     likeness = np.empty((len(places), side, side))
     for dy, dx in np.ndindex(side, side):
-        moved = wide[:, dy : dy + height, dx : dx + width]
-        product = _patch_sums(np.einsum("kyx,kyx->yx", pictures[within], moved), half)
-        scale = np.sqrt(np.maximum(own[y, x] * energy[y + dy, x + dx], 1e-9))
+        product = _sum_patches(here, wide[:, dy : dy + height, dx : dx + width], half)
+        scale = np.sqrt(np.maximum(own * energy[y + dy, x + dx], 1e-9))
         likeness[:, dy, dx] = product[y, x] / scale
     return _peaks(likeness)
 
 
-def _patch_sums(picture: Float[np.ndarray, "h w"], half: int) -> Float[np.ndarray, "h w"]:
+def _sum_patches(one: np.ndarray, other: np.ndarray, half: int) -> np.ndarray:
+    """Return the products of two stacks, summed over pictures and patches.
+
+    Tests do not check the shapes, as this runs at every offset of a search.
+    """
     size, border = (2 * half + 1,) * 2, cv2.BORDER_CONSTANT
-    return cv2.boxFilter(picture, cv2.CV_64F, size, normalize=False, borderType=border)
+    products = np.einsum("kyx,kyx->yx", one, other)
+    return cv2.boxFilter(products, cv2.CV_64F, size, normalize=False, borderType=border)
 
 
 def _peaks(likeness: Float[np.ndarray, "places d d"]) -> Float[np.ndarray, "places 2"]:

@@ -23,6 +23,7 @@ MIN_PITCH, MAX_VIEWS = 24, 10  # px, and along an axis
 WHOLE = 0.9  # share of a view that must lie on the sensor, or it is left out
 OTHER_GRIDS = "a grid turned by more than a degree or views of unequal size"
 Gram = Float[np.ndarray, "n n"]
+Seams = float | Float[np.ndarray, " seams"]
 
 
 @dataclass(frozen=True)
@@ -125,14 +126,18 @@ def _level(pictures: Float[np.ndarray, "n h w"]) -> Float[np.ndarray, "n h w"]:
 def find_axis(gram: Gram) -> ViewAxis:
     """Find the views along an axis from the products of its lines; one view where none repeats."""
     n, total = len(gram), max(float(np.trace(gram)), 1e-9)
-    pitches = np.arange(max(n / MAX_VIEWS, 8), n / 2 / WHOLE, 0.5)
-    tried = [(seam, pitch) for pitch in pitches for seam in np.arange(0.0, pitch)]
-    shared = np.array([_shared(gram, *fold).sum() for fold in tried])
     size = np.sqrt(np.maximum(np.diag(gram), 0))
-    largest = np.outer(size, size)
-    possible = np.array([_shared(largest, *fold).sum() for fold in tried])
-    best = int(np.argmax(shared * np.abs(shared) / np.maximum(possible, 1e-9)))  # many and alike
-    axis = _whole_views(gram, *tried[best], score=float(shared[best]) / total)
+    grams = np.stack([gram, np.outer(size, size)])
+    best, score, highest = (0.0, float(n)), 0.0, -np.inf
+    for pitch in np.arange(max(n / MAX_VIEWS, 8), n / 2 / WHOLE, 0.5):
+        seams = np.arange(0.0, pitch)
+        shared, possible = _share(grams, seams, pitch).sum((-2, -1))
+        many_and_alike = shared * np.abs(shared) / np.maximum(possible, 1e-9)
+        seam = int(np.argmax(many_and_alike))
+        if many_and_alike[seam] > highest:
+            best, highest = (float(seams[seam]), float(pitch)), many_and_alike[seam]
+            score = float(shared[seam]) / total
+    axis = _whole_views(gram, *best, score=score)
     if axis.score >= MIN_SCORE and axis.count == 1:
         axis = _between_two_seams(gram, axis)
     return axis if axis.score >= MIN_SCORE and axis.count > 1 else ViewAxis(0.0, n, 1, axis.score)
@@ -155,24 +160,28 @@ def _between_two_seams(gram: Gram, axis: ViewAxis) -> ViewAxis:
     return ViewAxis(float(seams[0]) - pitch, pitch, 3, axis.score)
 
 
-def _fold_lines(n: int, seam: float, pitch: float) -> Int[np.ndarray, "views lines"]:
+def _fold_lines(n: int, seam: Seams, pitch: float) -> Int[np.ndarray, "*seams views lines"]:
     """Return the lines of each view, mirrored in every second; -1 off the sensor."""
-    views = np.arange(-int(np.ceil(seam / pitch)), int(np.ceil((n - seam) / pitch)))[:, None]
+    first, last = np.ceil(np.max(seam) / pitch), np.ceil((n - np.min(seam)) / pitch)
+    views = np.arange(-int(first), int(last))[:, None]
     along = np.arange(int(pitch)) + 0.5
-    lines = np.floor(seam + views * pitch + np.where(views % 2, pitch - along, along)).astype(int)
+    begin = np.asarray(seam)[..., None, None] + views * pitch
+    lines = np.floor(begin + np.where(views % 2, pitch - along, along)).astype(int)
     return np.where((lines >= 0) & (lines < n), lines, -1)
 
 
-def _shared(gram: Gram, seam: float, pitch: float) -> Float[np.ndarray, "pairs lines"]:
+def _share(
+    grams: Float[np.ndarray, "*grams n n"], seam: Seams, pitch: float
+) -> Float[np.ndarray, "*grams_and_seams pairs lines"]:
     """Return the products of each line and its mirror image in the next view."""
-    lines = _fold_lines(len(gram), seam, pitch)
-    one, other = lines[:-1], lines[1:]
-    return gram[one, other] * ((one >= 0) & (other >= 0))
+    lines = _fold_lines(grams.shape[-1], seam, pitch)
+    one, other = lines[..., :-1, :], lines[..., 1:, :]
+    return grams[..., one, other] * ((one >= 0) & (other >= 0))
 
 
 def _whole_views(gram: Gram, seam: float, pitch: float, score: float) -> ViewAxis:
     """Return the axis of the views that are like a neighbour and lie on the sensor."""
-    lines, shared = _fold_lines(len(gram), seam, pitch), _shared(gram, seam, pitch)
+    lines, shared = _fold_lines(len(gram), seam, pitch), _share(gram, seam, pitch)
     energy = np.where(lines >= 0, np.diag(gram)[lines], 0)
     both = np.where((lines[:-1] >= 0) & (lines[1:] >= 0), energy[:-1] * energy[1:], 0)
     pairs = shared.sum(1) > MIN_LIKENESS * np.maximum(np.sqrt(both).sum(1), 1e-9)
